@@ -1,0 +1,401 @@
+"""The Gymnasium environment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, SupportsFloat
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import ArrayLike, NDArray
+
+from tpm_gym import control, kinematics, rewards, tasks
+from tpm_gym.errors import ActionError, ConfigurationError, EpisodeError, ResetOptionError
+from tpm_gym.mechanism import DEFAULT_MOUNT
+from tpm_gym.simulation import Physics, Simulation, Snapshot
+from tpm_gym.state import State
+
+__all__ = ["EnvSnapshot", "TPMEnv"]
+
+Observation = dict[str, NDArray[np.float32]]
+Action = NDArray[np.float32]
+
+_OBSERVATION_BOUND = 10.0
+_GOAL_BOUND = 2.0
+
+
+@dataclass(frozen=True)
+class EnvSnapshot:
+    """Everything that the next steps of an environment depend on."""
+
+    simulation: Snapshot
+    rng: dict[str, Any]
+    goal: NDArray[np.float64]
+
+
+class TPMEnv(gym.Env[Observation, Action]):
+    """A 3-translational parallel mechanism over a table.
+
+    ## Ids
+
+    ``TPM{Reach,PickAndPlace}{,Joints}{,Dense}-v0``: Cartesian or joint increments, sparse or dense
+    reward. Control at 25 Hz, episodes of 50 steps, truncation only.
+
+    ## Frames
+
+    World: z up, table top at z = 0, x and y as seen from above. The base hangs upside down, so
+    world = (x, -y, height - z) of the paper's frame; the workspace is a slab of negative world y.
+    Point P is the middle of the platform; the vacuum cup ends 40 mm below it.
+
+    ## Action
+
+    Box of [-1, 1]; values beyond are clipped.
+
+    | entries | meaning |
+    | --- | --- |
+    | 0 to 2, Cartesian | increment of the command for P along the paper's x, y, z: at most 30, 5, 30 mm |
+    | 0 to 2, joints | increment of theta_1, theta_2, theta_3: at most 0.08 rad, P no faster than above |
+    | 3 (PickAndPlace) | above 0: vacuum on |
+
+    Commands accumulate, are projected into the task region, and are followed along a B-spline.
+
+    ## Observation
+
+    A dictionary. ``achieved_goal`` and ``desired_goal`` are (3,) m in the world frame: point P
+    (Reach) or the centre of the puck (PickAndPlace). ``observation`` holds, each scaled to order
+    one (``env.unwrapped.task.decode`` gives back SI units):
+
+    | entry | size | meaning |
+    | --- | --- | --- |
+    | position | 3 | P by forward kinematics of the encoders |
+    | velocity | 3 | J(theta) theta_dot, from the encoders |
+    | command | 3 | commanded P minus position |
+    | object_position | 3 | centre of the puck, from a camera |
+    | object_offset | 3 | top of the puck minus lip of the cup |
+    | object_velocity | 3 | velocity of the puck, from a camera |
+    | object_tilt | 2 | x and y of the puck's axis |
+    | holding | 1 | +1 if the cup holds the puck (vacuum gauge), else -1 |
+
+    The object's entries exist in PickAndPlace only. The robot's come from the three encoders alone,
+    never from the simulator's platform.
+
+    ## Reward
+
+    ``goal`` term + ``singularity`` term (+ ``approach`` term in PickAndPlaceDense).
+
+    | term | value |
+    | --- | --- |
+    | goal, sparse | 0 if the distance to the goal is below 10 mm, else -1 |
+    | goal, dense | minus the distance in units of 0.1 m |
+    | singularity | -penalty_weight x penalty; the penalty is 0 where 1/cond(J) >= 0.08, 1 at a singularity |
+    | approach | minus half the distance from cup to puck in units of 0.1 m |
+
+    ## Start
+
+    The arm at rest at home, the puck upright on the table, the goal at least 30 mm away from where
+    the puck (or P) starts. Goals and objects are sampled where 1/cond(J) >= 0.08.
+    ``reset(options={"object": (x, y, z), "goal": (x, y, z)})`` chooses them instead.
+
+    ## Info
+
+    ``is_success`` (bool), ``closure_error`` (m), ``conditioning`` (1/cond(J)),
+    ``singularity_penalty`` (before weighting), ``reward_terms`` (name -> value; they sum to the
+    reward).
+
+    Args:
+        task: ``"reach"`` or ``"pick_and_place"``.
+        control: ``"cartesian"`` or ``"joints"``.
+        reward: ``"sparse"`` or ``"dense"``.
+        penalty_weight: Weight of the singularity penalty; 0 switches it off.
+        encoder_bias: (3,) rad, added to what the encoders report.
+        physics: Numerical settings of the engine.
+        render_mode: None, ``"rgb_array"`` or ``"human"``.
+        renderer: ``"tiny"`` (any machine) or ``"egl"`` (GPU).
+        width: Of rendered pictures, pixels.
+        height: Of rendered pictures, pixels.
+
+    Raises:
+        ConfigurationError: If an option is out of range.
+
+    ## Version history
+
+    * v0: first release.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": 25}
+
+    def __init__(
+        self,
+        task: str = "reach",
+        control: str = "cartesian",
+        reward: str = "sparse",
+        *,
+        penalty_weight: float = 1.0,
+        encoder_bias: ArrayLike = (0.0, 0.0, 0.0),
+        physics: Physics | None = None,
+        render_mode: str | None = None,
+        renderer: str = "tiny",
+        width: int = 640,
+        height: int = 480,
+    ) -> None:
+        """Check the options and start the simulation."""
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            valid = f"None, {', '.join(map(repr, self.metadata['render_modes']))}"
+            raise ConfigurationError("render_mode", render_mode, valid)
+        if not (np.isscalar(penalty_weight) and 0 <= penalty_weight < np.inf):
+            raise ConfigurationError("penalty_weight", penalty_weight, "a finite number >= 0")
+        self.render_mode = render_mode
+        self.penalty_weight = float(penalty_weight)
+        self.task = tasks.make(task, reward)
+        self.control = _control(control)
+        self._size = _picture_size(width, height)
+        self.observation_space = _observation_space(self.task.observation_size)
+        self.action_space = spaces.Box(-1.0, 1.0, (self.task.action_size,), np.float32)
+        self._home = kinematics.inverse(self.task.home)
+        self._state: State | None = None
+        self._goal = np.full(3, np.nan)
+        self._closed = False
+        self.simulation = Simulation(
+            self.task.scene,
+            physics=physics,
+            encoder_bias=encoder_bias,
+            gui=render_mode == "human",
+            renderer=renderer,
+        )
+
+    # -- the Gymnasium interface ----------------------------------------------------------------
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode.
+
+        Args:
+            seed: Seeds the environment's rng; equal seeds give equal episodes.
+            options: ``object`` and ``goal``, each (3,) m in the world frame, instead of sampled
+                ones.
+
+        Raises:
+            ResetOptionError: If an option is unknown or not three finite numbers.
+            UnreachableError: If the object or the goal is out of reach.
+            EpisodeError: If the environment is closed.
+        """
+        if self._closed:
+            raise EpisodeError("the environment is closed; make a new one")
+        super().reset(seed=seed)
+        options = _checked_options(options)
+        start, goal = options.get("object"), options.get("goal")
+        start = self.task.sample_object(self.np_random) if start is None else self.task.check_object(start)
+        goal = self.task.sample_goal(self.np_random, start) if goal is None else self.task.check_goal(goal)
+        self._goal = goal
+        self._state = self.simulation.reset(self._home, start, goal)
+        observation = self._observe(self._state)
+        info = self._info(self._state, observation)
+        if self.render_mode == "human":
+            self.render()
+        return observation, info
+
+    def step(
+        self, action: Action
+    ) -> tuple[Observation, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Run one control step of 40 ms.
+
+        Raises:
+            ActionError: If the action has the wrong shape or is not finite; nothing has moved then.
+            EpisodeError: If there is no episode: before reset, after close, after a lost loop.
+            ClosureError: If a loop of the mechanism opened.
+            AssemblyModeError: If the mechanism went through a parallel singularity.
+        """
+        values = self._checked_action(action)
+        state = self._require_state()
+        current = DEFAULT_MOUNT.to_paper(state.command)
+        command = self.control.command(values[:3], current)
+        vacuum = bool(values[3] > 0) if len(values) > 3 else False
+        self._state = None  # until the step has gone well
+        self._state = self.simulation.move(command, vacuum)
+        observation = self._observe(self._state)
+        info = self._info(self._state, observation)
+        reward = self.compute_reward(
+            observation["achieved_goal"], observation["desired_goal"], info
+        )
+        if self.render_mode == "human":
+            self.render()
+        return observation, float(reward), False, False, info
+
+    def compute_reward(
+        self,
+        achieved_goal: ArrayLike,
+        desired_goal: ArrayLike,
+        info: Mapping[str, Any] | Sequence[Mapping[str, Any]] | NDArray[Any],
+    ) -> Any:
+        """The reward of a transition, or of a batch of them, for any goal.
+
+        Terms that do not depend on the goal are taken from ``info``; where it is empty, as SB3's
+        HerReplayBuffer hands it over, they are left out, and what remains is the goal term.
+
+        Args:
+            achieved_goal: (..., 3) m.
+            desired_goal: (..., 3) m.
+            info: The step's info, or one for each transition of the batch.
+
+        Returns:
+            A float, or (...,) of them.
+        """
+        goal_term = self.task.goal_term(achieved_goal, desired_goal)
+        if isinstance(info, Mapping):
+            other: Any = self._goal_free(info)
+        else:
+            other = np.array([self._goal_free(entry) for entry in info]).reshape(goal_term.shape)
+        total = goal_term + other
+        return float(total) if np.ndim(total) == 0 else total
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """The scene as (height, width, 3) RGB; in ``human`` mode the window shows it already."""
+        if self._closed:
+            raise EpisodeError("the environment is closed; make a new one")
+        if self.render_mode == "rgb_array":
+            return self.simulation.render(*self._size)
+        return None
+
+    def close(self) -> None:
+        """Disconnect the simulation; harmless the second time."""
+        if not self._closed:
+            self._closed = True
+            self._state = None
+            self.simulation.close()
+
+    # -- beyond Gymnasium -----------------------------------------------------------------------
+
+    @property
+    def state(self) -> State:
+        """What the simulation reported last.
+
+        Raises:
+            EpisodeError: If there is no episode.
+        """
+        return self._require_state()
+
+    @property
+    def goal(self) -> NDArray[np.float64]:
+        """The episode's goal, (3,) m, world."""
+        return self._goal.copy()
+
+    def save_state(self) -> EnvSnapshot:
+        """Take down physics, rng, goal, commands and grasp.
+
+        Raises:
+            EpisodeError: If there is no episode.
+        """
+        self._require_state()
+        return EnvSnapshot(
+            self.simulation.save(), self.np_random.bit_generator.state, self._goal.copy()
+        )
+
+    def restore_state(self, snapshot: EnvSnapshot) -> Observation:
+        """Go back to a moment that :meth:`save_state` took down.
+
+        Returns:
+            The observation at that moment.
+
+        Raises:
+            EpisodeError: If the environment is closed.
+        """
+        if self._closed:
+            raise EpisodeError("the environment is closed; make a new one")
+        self.np_random.bit_generator.state = snapshot.rng
+        self._goal = snapshot.goal.copy()
+        self.simulation.show_goal(self._goal)
+        self._state = self.simulation.restore(snapshot.simulation)
+        return self._observe(self._state)
+
+    # -- inside ---------------------------------------------------------------------------------
+
+    def _require_state(self) -> State:
+        if self._closed:
+            raise EpisodeError("the environment is closed; make a new one")
+        if self._state is None:
+            raise EpisodeError("no episode is running; call reset() first")
+        return self._state
+
+    def _checked_action(self, action: Any) -> NDArray[np.float64]:
+        shape = self.action_space.shape
+        try:
+            values = np.array(action, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise ActionError("action", action, f"an array of numbers of shape {shape}") from error
+        if values.shape != shape:
+            raise ActionError("action", values.shape, f"of shape {shape}, by shape")
+        if not np.isfinite(values).all():
+            raise ActionError("action", values.tolist(), "finite")
+        return np.clip(values, -1.0, 1.0)
+
+    def _observe(self, state: State) -> Observation:
+        vector = np.clip(self.task.observe(state), -_OBSERVATION_BOUND, _OBSERVATION_BOUND)
+        achieved = np.clip(self.task.achieved(state), -_GOAL_BOUND, _GOAL_BOUND)
+        return {
+            "observation": vector.astype(np.float32),
+            "achieved_goal": achieved.astype(np.float32),
+            "desired_goal": self._goal.astype(np.float32),
+        }
+
+    def _info(self, state: State, observation: Observation) -> dict[str, Any]:
+        achieved, desired = observation["achieved_goal"], observation["desired_goal"]
+        penalty = float(rewards.singularity_penalty(state.conditioning))
+        terms = {
+            "goal": float(self.task.goal_term(achieved, desired)),
+            "singularity": -self.penalty_weight * penalty,
+        }
+        terms.update((name, float(v)) for name, v in self.task.state_terms(state).items())
+        return {
+            "is_success": bool(self.task.success(achieved, desired)),
+            "closure_error": float(state.closure_error),
+            "conditioning": float(state.conditioning),
+            "singularity_penalty": penalty,
+            "reward_terms": terms,
+        }
+
+    def _goal_free(self, info: Mapping[str, Any]) -> float:
+        """Sum of the terms in ``info`` that do not depend on the goal."""
+        shaped = sum(
+            value
+            for name, value in info.get("reward_terms", {}).items()
+            if name not in ("goal", "singularity")
+        )
+        return float(shaped - self.penalty_weight * info.get("singularity_penalty", 0.0))
+
+
+def _control(kind: str) -> control.Control:
+    return control.make(kind)
+
+
+def _picture_size(width: int, height: int) -> tuple[int, int]:
+    for name, value in (("width", width), ("height", height)):
+        if not (isinstance(value, int) and 16 <= value <= 4096):
+            raise ConfigurationError(name, value, "a whole number of pixels from 16 to 4096")
+    return width, height
+
+
+def _observation_space(size: int) -> spaces.Dict:
+    def box(bound: float, length: int) -> spaces.Box:
+        return spaces.Box(-bound, bound, (length,), np.float32)
+
+    return spaces.Dict(
+        {
+            "observation": box(_OBSERVATION_BOUND, size),
+            "achieved_goal": box(_GOAL_BOUND, 3),
+            "desired_goal": box(_GOAL_BOUND, 3),
+        }
+    )
+
+
+def _checked_options(options: Any) -> dict[str, Any]:
+    if options is None:
+        return {}
+    if not isinstance(options, Mapping):
+        raise ResetOptionError("options", options, "a dictionary with the keys 'object', 'goal'")
+    for key in options:
+        if key not in ("object", "goal"):
+            raise ResetOptionError(str(key), options[key], "the keys 'object' and 'goal'")
+    return dict(options)

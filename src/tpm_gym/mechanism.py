@@ -1,0 +1,494 @@
+"""The mechanism as data: links, joints, inertias and loop closures, from a Geometry.
+
+A physics engine for trees needs the loops cut. The spanning tree here follows the paper's
+numbering of links (Fig. 1):
+
+    base 0 - arm 2  - two rods 4                                        (branch I, the 4S rods)
+    base 0 - arm 5  - rod 6 - link 3' - link 7 - platform 1 - end link 10   (branch II and on)
+    base 0 - arm 12 - end link 9 - two rods 11                          (branch III)
+
+and four ball joints close it again: the far ends of rods 4 on link 3', the far ends of rods 11 on
+end link 10. A rod with a ball at both ends would spin idly about itself; rods 4 have a universal
+joint at the arm instead, which takes that idle freedom out. Rods 11 turn on the paper's revolutes
+R_e and R_f; R_g and R_h are closed as balls (cutting them as revolutes would add redundant rows),
+which leaves end link 10, a straight bar through both balls, free to roll about its own axis.
+
+All frames are parallel to the paper frame when all joints are at zero: arms and rods then point
+along +y (branch I) or +x (branches II, III). Units: metres, radians, kilograms.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tpm_gym.geometry import PAPER, Geometry
+from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode, passive_angles
+
+__all__ = [
+    "ACTUATED_JOINTS",
+    "CUP_LENGTH",
+    "CUP_RADIUS",
+    "DEFAULT_MOUNT",
+    "Closure",
+    "Joint",
+    "Link",
+    "Mechanism",
+    "Mount",
+    "Solid",
+    "build",
+    "joint_angles",
+]
+
+FloatArray = NDArray[np.float64]
+Vector = tuple[float, float, float]
+
+ACTUATED_JOINTS = ("R11", "R21", "R31")
+"""The motors, in the order of theta_1, theta_2, theta_3."""
+
+# Materials, kg/m^3.
+ALUMINIUM, STEEL, CARBON_FIBRE, SILICONE = 2700.0, 7850.0, 1600.0, 1150.0
+
+# Direct-drive torque motors of the class used in light delta robots: peak torque and speed.
+MOTOR_EFFORT = 100.0  # N m
+MOTOR_SPEED = 12.0  # rad/s
+# How far each arm may turn from pointing level outwards, towards the base and the platform.
+ARM_RAISED, ARM_LOWERED = np.deg2rad(75.0), np.deg2rad(115.0)
+
+CUP_LENGTH = 0.040
+"""From point P of the platform to the lip of the vacuum cup, m."""
+CUP_RADIUS = 0.008
+"""Radius of the lip of the vacuum cup, m."""
+
+
+@dataclass(frozen=True)
+class Mount:
+    """How the base hangs over the table: the one conversion between paper and world frame.
+
+    The base is mounted upside down, a half turn about x: world = (x, -y, height - z).
+
+    Attributes:
+        height: Height of the base plane above the table top (world z = 0), m.
+    """
+
+    height: float
+
+    def to_world(self, point: ArrayLike) -> FloatArray:
+        """Convert points (..., 3) m from the paper frame to the world frame."""
+        return np.asarray(point, dtype=np.float64) * _HALF_TURN + (0.0, 0.0, self.height)
+
+    def to_paper(self, point: ArrayLike) -> FloatArray:
+        """Convert points (..., 3) m from the world frame to the paper frame."""
+        return (np.asarray(point, dtype=np.float64) - (0.0, 0.0, self.height)) * _HALF_TURN
+
+    def rotate(self, vector: ArrayLike) -> FloatArray:
+        """Convert free vectors (..., 3), such as velocities; the half turn is its own inverse."""
+        return np.asarray(vector, dtype=np.float64) * _HALF_TURN
+
+    @property
+    def quaternion(self) -> tuple[float, float, float, float]:
+        """Orientation of the paper frame in the world, (x, y, z, w)."""
+        return (1.0, 0.0, 0.0, 0.0)
+
+
+_HALF_TURN = np.array([1.0, -1.0, -1.0])
+
+DEFAULT_MOUNT = Mount(height=0.97)
+"""The cup touches the table at z = 0.93 m of the paper frame, where the mechanism is at its best."""
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A homogeneous box or cylinder, possibly hollow, fixed to a link.
+
+    Attributes:
+        kind: ``"box"`` with full edge lengths, or ``"cylinder"`` along its own axis.
+        size: Box: edges (x, y, z). Cylinder: (radius, length, 0). In m.
+        centre: Position in the link's frame, m.
+        density: kg/m^3 of the material; zero for parts that are only drawn.
+        bore: Box: edges of the hollow (0 for solid faces). Cylinder: (inner radius, length, 0).
+        axis: Axis of a cylinder in the link's frame: ``"x"``, ``"y"`` or ``"z"``.
+        colour: Name of a colour in :mod:`tpm_gym.urdf`.
+        collides: Whether the engine should collide it.
+    """
+
+    kind: Literal["box", "cylinder"]
+    size: Vector
+    centre: Vector
+    density: float
+    bore: Vector = (0.0, 0.0, 0.0)
+    axis: Literal["x", "y", "z"] = "z"
+    colour: str = "grey"
+    collides: bool = False
+
+    @property
+    def mass(self) -> float:
+        """Mass in kg."""
+        return self._mass(self.size) - self._mass(self.bore)
+
+    @property
+    def inertia(self) -> FloatArray:
+        """(3,) kg m^2, principal moments about the centre, along the link's axes."""
+        return self._inertia(self.size) - self._inertia(self.bore)
+
+    def _mass(self, size: Vector) -> float:
+        if self.kind == "box":
+            return self.density * size[0] * size[1] * size[2]
+        return float(self.density * np.pi * size[0] ** 2 * size[1])
+
+    def _inertia(self, size: Vector) -> FloatArray:
+        mass = self._mass(size)
+        if self.kind == "box":
+            squares = np.square(size)
+            return mass / 12 * (squares.sum() - squares)
+        radius, length, _ = size
+        moments = np.full(3, mass * (3 * radius**2 + length**2) / 12)
+        moments["xyz".index(self.axis)] = mass * radius**2 / 2
+        return moments
+
+
+@dataclass(frozen=True)
+class Joint:
+    """How a link hangs on its parent.
+
+    Attributes:
+        name: Name of the joint; the paper's where it has one.
+        kind: URDF joint type.
+        parent: Name of the parent link.
+        origin: Position of the joint in the parent's frame, m.
+        axis: Axis in the joint's frame.
+        lower: Lower limit, rad (motors only; passive joints are bounded by the loops).
+        upper: Upper limit, rad.
+        effort: Torque limit, N m; zero for passive joints.
+        speed: Speed limit, rad/s; zero for passive joints.
+    """
+
+    name: str
+    kind: Literal["continuous", "revolute", "fixed"]
+    parent: str
+    origin: Vector
+    axis: Vector = (0.0, 0.0, 1.0)
+    lower: float = 0.0
+    upper: float = 0.0
+    effort: float = 0.0
+    speed: float = 0.0
+
+
+@dataclass(frozen=True)
+class Link:
+    """A rigid body: solids, and the joint that holds it (None for the base)."""
+
+    name: str
+    solids: tuple[Solid, ...]
+    joint: Joint | None = None
+
+    @property
+    def mass(self) -> float:
+        """Mass in kg."""
+        return sum(solid.mass for solid in self.solids)
+
+    @property
+    def centre_of_mass(self) -> FloatArray:
+        """(3,) m, in the link's frame."""
+        weighted = sum(solid.mass * np.asarray(solid.centre) for solid in self.solids)
+        return np.asarray(weighted) / self.mass
+
+    @property
+    def inertia(self) -> FloatArray:
+        """(3, 3) kg m^2 about the centre of mass, along the link's axes."""
+        total = np.zeros((3, 3))
+        for solid in self.solids:
+            arm = np.asarray(solid.centre) - self.centre_of_mass
+            steiner = solid.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+            total += np.diag(solid.inertia) + steiner
+        return total
+
+
+@dataclass(frozen=True)
+class Closure:
+    """A ball joint that closes a loop: two points that must coincide.
+
+    Attributes:
+        name: Name of the joint; the paper's where it has one.
+        link_a: Link on one side.
+        point_a: Point in the frame of ``link_a``, m.
+        link_b: Link on the other side.
+        point_b: Point in the frame of ``link_b``, m.
+    """
+
+    name: str
+    link_a: str
+    point_a: Vector
+    link_b: str
+    point_b: Vector
+
+
+@dataclass(frozen=True)
+class Mechanism:
+    """Everything an engine needs to build the mechanism.
+
+    Attributes:
+        geometry: The lengths it was built from.
+        links: Parents before children; the first is the base.
+        closures: The ball joints that close the loops.
+        platform: Name of the platform link.
+        point_p: Point P in the platform's frame, m.
+        cup: Centre of the cup's lip in the platform's frame, m.
+    """
+
+    geometry: Geometry
+    links: tuple[Link, ...]
+    closures: tuple[Closure, ...]
+    platform: str
+    point_p: Vector
+    cup: Vector
+    _index: dict[str, int] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        """Index the links by name."""
+        object.__setattr__(self, "_index", {link.name: i for i, link in enumerate(self.links)})
+
+    def link(self, name: str) -> Link:
+        """The link of that name.
+
+        Raises:
+            KeyError: If there is none.
+        """
+        return self.links[self._index[name]]
+
+
+def build(geometry: Geometry = PAPER) -> Mechanism:
+    """Build the mechanism for the given lengths.
+
+    Sections and materials do not scale with the lengths: they are those of a machine of the size
+    of the paper's case study.
+    """
+    g = geometry
+    links = (
+        _base(g),
+        *_branch_1(g),
+        *_branch_2(g),
+        *_branch_3(g),
+    )
+    closures = (
+        Closure("Sc", "rod_4a", (0.0, g.l4, 0.0), "link_3p", (3 * g.l5, 0.0, 0.0)),
+        Closure("Sd", "rod_4b", (0.0, g.l4, 0.0), "link_3p", (g.l5, 0.0, 0.0)),
+        Closure("Rg", "rod_11a", (g.l4, 0.0, 0.0), "end_link_10", (0.0, g.l5, 0.0)),
+        Closure("Rh", "rod_11b", (g.l4, 0.0, 0.0), "end_link_10", (0.0, -g.l5, 0.0)),
+    )
+    return Mechanism(
+        geometry=g,
+        links=links,
+        closures=closures,
+        platform="platform",
+        point_p=(g.l2, 0.0, g.l6),
+        cup=(g.l2, 0.0, g.l6 + CUP_LENGTH),
+    )
+
+
+def joint_angles(
+    theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
+) -> dict[str, float]:
+    """Angles of all joints of the spanning tree at which the loops close.
+
+    Args:
+        theta: (3,) rad, actuated angles.
+        branch: The assembly mode.
+        geometry: Link lengths.
+
+    Returns:
+        Joint name -> rad, for every joint of :func:`build` that moves.
+
+    Raises:
+        InputError: If theta has the wrong shape or is not finite.
+        UnreachableError: If the branch does not exist at theta.
+    """
+    passive = passive_angles(theta, branch, geometry)
+    theta_1, theta_2, theta_3 = np.asarray(theta, dtype=np.float64)
+    # Absolute directions become joint angles by subtracting the parent's direction.
+    angles = {
+        "R11": theta_1,
+        "Sa_swing": passive.rod4_swing - theta_1,
+        "Sa_tilt": passive.rod4_tilt,
+        "Sb_swing": passive.rod4_swing - theta_1,
+        "Sb_tilt": passive.rod4_tilt,
+        "R21": theta_2,
+        "R22": passive.rod6_swing - theta_2,
+        "R23": -passive.rod6_swing,
+        "R12": passive.beta,
+        "R13": -passive.beta,
+        "R33": passive.rod11_swing,  # end links 9 and 10 stay parallel
+        "R31": theta_3,
+        "R32": passive.rod11_swing - theta_3,
+        "Re": passive.rod11_tilt,
+        "Rf": passive.rod11_tilt,
+    }
+    return {name: float(angle) for name, angle in angles.items()}
+
+
+_ALONG: dict[str, int] = {"x": 0, "y": 1, "z": 2}
+
+
+def _vector(axis: str, value: float, centre: Vector = (0.0, 0.0, 0.0)) -> Vector:
+    """``centre`` displaced by ``value`` along ``axis``."""
+    moved = list(centre)
+    moved[_ALONG[axis]] += value
+    return (moved[0], moved[1], moved[2])
+
+
+def _tube(
+    axis: Literal["x", "y"], length: float, height: float, width: float, wall: float
+) -> Solid:
+    """A rectangular aluminium tube from the link's origin along ``axis``."""
+    outer = (length, width, height) if axis == "x" else (width, length, height)
+    inner = tuple(
+        edge if i == _ALONG[axis] else edge - 2 * wall for i, edge in enumerate(outer)
+    )
+    return Solid(
+        "box", outer, _vector(axis, length / 2), ALUMINIUM, bore=(inner[0], inner[1], inner[2]),
+        colour="orange",
+    )
+
+
+def _bar(
+    axis: Literal["x", "y", "z"],
+    half: float,
+    radius: float = 0.008,
+    centre: Vector = (0.0, 0.0, 0.0),
+    colour: str = "steel",
+    density: float = ALUMINIUM,
+) -> Solid:
+    """A round solid bar of half length ``half`` about ``centre``."""
+    return Solid("cylinder", (radius, 2 * half, 0.0), centre, density, axis=axis, colour=colour)
+
+
+def _rod(axis: Literal["x", "y"], length: float) -> tuple[Solid, ...]:
+    """A carbon-fibre tube, 16 mm by 1.5 mm, with a steel rod end at both ends."""
+    tube = Solid(
+        "cylinder", (0.008, length, 0.0), _vector(axis, length / 2), CARBON_FIBRE,
+        bore=(0.0065, length, 0.0), axis=axis, colour="carbon",
+    )
+    ends = tuple(
+        _bar(axis, 0.008, 0.009, _vector(axis, at), density=STEEL) for at in (0.008, length - 0.008)
+    )
+    return (tube, *ends)
+
+
+def _motor(name: str, axis: Vector, origin: Vector, level: float, sense: int) -> Joint:
+    """A motor whose arm points level outwards at ``level`` and lowers in the ``sense`` of theta."""
+    lower, upper = sorted((level - sense * ARM_RAISED, level + sense * ARM_LOWERED))
+    return Joint(
+        name, "revolute", "base", origin, axis, lower, upper, MOTOR_EFFORT, MOTOR_SPEED
+    )
+
+
+def _base(g: Geometry) -> Link:
+    """Base 0: a plate with a motor at each pivot. Its mass does not matter, it never moves."""
+    plate = Solid("cylinder", (g.l1 + 0.06, 0.02, 0.0), (0.0, 0.0, -0.07), ALUMINIUM, colour="white")
+    motors = (
+        _bar("x", 0.055, 0.042, (0.0, g.l1, 0.0), "dark"),
+        _bar("y", 0.055, 0.042, (-g.l1, 0.0, 0.0), "dark"),
+        _bar("y", 0.055, 0.042, (g.l1, 0.0, 0.0), "dark"),
+    )
+    brackets = tuple(
+        Solid("box", (0.08, 0.08, 0.05), (x, y, -0.04), ALUMINIUM, colour="white")
+        for x, y in ((0.0, g.l1), (-g.l1, 0.0), (g.l1, 0.0))
+    )
+    return Link("base", (plate, *brackets, *motors))
+
+
+def _arm(axis: Literal["x", "y"], across: Literal["x", "y"], g: Geometry) -> tuple[Solid, ...]:
+    """An actuated arm: hub with the motor's rotor, rectangular tube, elbow bar across."""
+    hub = _bar(across, 0.058, 0.022, colour="steel", density=STEEL)
+    return (hub, _tube(axis, g.l3, 0.045, 0.030, 0.003), _bar(across, 0.02, 0.015, _vector(axis, g.l3)))
+
+
+def _branch_1(g: Geometry) -> tuple[Link, ...]:
+    """Arm 2 with short link 3, and the two rods 4 of the 4S parallelogram."""
+    short_link = _bar("x", g.l5, 0.010, (0.0, g.l3, 0.0))
+    arm = Link(
+        "arm_2",
+        (*_arm("y", "x", g), short_link),
+        _motor("R11", (1.0, 0.0, 0.0), (0.0, g.l1, 0.0), level=0.0, sense=1),
+    )
+    links = [arm]
+    for suffix, ball, side in (("a", "Sa", 1), ("b", "Sb", -1)):
+        cross = Link(
+            f"cross_4{suffix}",
+            (_bar("z", 0.010, 0.009, density=STEEL),),
+            Joint(
+                f"{ball}_swing", "continuous", "arm_2", (side * g.l5, g.l3, 0.0), (1.0, 0.0, 0.0)
+            ),
+        )
+        rod = Link(
+            f"rod_4{suffix}",
+            _rod("y", g.l4),
+            Joint(f"{ball}_tilt", "continuous", cross.name, (0.0, 0.0, 0.0), (0.0, 0.0, -1.0)),
+        )
+        links += [cross, rod]
+    return tuple(links)
+
+
+def _branch_2(g: Geometry) -> tuple[Link, ...]:
+    """Arm 5, rod 6, link 3', link 7, platform 1 with the cup, end link 10."""
+    minus_y = (0.0, -1.0, 0.0)
+    link_3p = (
+        Solid("box", (3 * g.l5, 0.025, 0.018), (1.5 * g.l5, 0.0, 0.0), ALUMINIUM,
+              bore=(3 * g.l5, 0.019, 0.012), colour="blue"),
+        _bar("y", 0.016, 0.011, density=STEEL),
+    )
+    link_7 = (
+        Solid("box", (g.l7, 0.020, 0.008), (g.l7 / 2, 0.0, 0.0), ALUMINIUM, colour="yellow"),
+        _bar("z", 0.008, 0.011, density=STEEL),
+        _bar("z", 0.008, 0.011, (g.l7, 0.0, 0.0), density=STEEL),
+    )
+    return (
+        Link("arm_5", _arm("x", "y", g), _motor("R21", minus_y, (-g.l1, 0.0, 0.0), np.pi, -1)),
+        Link("rod_6", _rod("x", g.l4), Joint("R22", "continuous", "arm_5", (g.l3, 0.0, 0.0), minus_y)),
+        Link("link_3p", link_3p, Joint("R23", "continuous", "rod_6", (g.l4, 0.0, 0.0), minus_y)),
+        Link("link_7", link_7, Joint("R12", "continuous", "link_3p", (2 * g.l5, 0.0, g.l6))),
+        Link("platform", _platform(g), Joint("R13", "continuous", "link_7", (g.l7, 0.0, 0.0))),
+        Link(
+            "end_link_10",
+            (_bar("y", g.l5 + 0.01, 0.007),),
+            Joint("R33", "continuous", "platform", (2 * g.l2, 0.0, 0.0), minus_y),
+        ),
+    )
+
+
+def _platform(g: Geometry) -> tuple[Solid, ...]:
+    """Platform 1: a plate from F1 to D3, the stem of the cup, and the cup itself."""
+    point_p = (g.l2, 0.0, g.l6)
+    bellows, plate = 0.015, 0.008
+    stem = CUP_LENGTH - bellows
+    return (
+        Solid("box", (2 * g.l2 + 0.04, 0.045, plate), point_p, ALUMINIUM, colour="light"),
+        _bar("z", stem / 2, 0.005, _vector("z", stem / 2, point_p)),
+        Solid(
+            "cylinder", (CUP_RADIUS, bellows, 0.0), _vector("z", CUP_LENGTH - bellows / 2, point_p),
+            SILICONE, colour="red", collides=True,
+        ),
+    )
+
+
+def _branch_3(g: Geometry) -> tuple[Link, ...]:
+    """Arm 12, end link 9, and the two rods 11 of the second parallelogram."""
+    minus_y, plus_z = (0.0, -1.0, 0.0), (0.0, 0.0, 1.0)
+    arm = Link("arm_12", _arm("x", "y", g), _motor("R31", minus_y, (g.l1, 0.0, 0.0), 0.0, 1))
+    end_link = Link(
+        "end_link_9",
+        (_bar("y", g.l5 + 0.01, 0.008),),
+        Joint("R32", "continuous", "arm_12", (g.l3, 0.0, 0.0), minus_y),
+    )
+    rods = tuple(
+        Link(
+            f"rod_11{suffix}",
+            _rod("x", g.l4),
+            Joint(name, "continuous", "end_link_9", (0.0, side * g.l5, 0.0), plus_z),
+        )
+        for suffix, name, side in (("a", "Re", 1), ("b", "Rf", -1))
+    )
+    return (arm, end_link, *rods)

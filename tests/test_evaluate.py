@@ -1,0 +1,215 @@
+"""evaluate.py writes what it promises: a table, strict JSON and a video, without torch."""
+
+from __future__ import annotations
+
+import io
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as imageio
+import pytest
+from rich.console import Console
+
+import evaluate
+import provenance
+from errors import ConfigError, PolicyError, UnknownEnvError
+
+METRICS = (
+    "success_at_end",
+    "success_once",
+    "return",
+    "conditioning_min",
+    "conditioning_mean",
+    "closure_error_max",
+)
+SCRIPT = Path(evaluate.__file__)
+
+
+def quiet() -> Console:
+    return Console(file=io.StringIO(), width=120)
+
+
+def read_strict(path: Path) -> dict[str, Any]:
+    """Read JSON as a strict reader does: NaN and infinities are errors."""
+
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"{constant} is not JSON")
+
+    content = json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse)
+    assert isinstance(content, dict)
+    return content
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], str]:
+    """Return the JSON and the output of the command line, run on one policy."""
+    path = tmp_path_factory.mktemp("evaluate") / "deep" / "er" / "expert.json"
+    options = f"--policy expert --env TPMReach-v0 --episodes 4 --seed 7 --json {path}".split()
+    done = subprocess.run(
+        [sys.executable, str(SCRIPT), *options], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return read_strict(path), done.stdout
+
+
+def test_one_policy_has_its_metrics_at_the_top(written: tuple[dict[str, Any], str]) -> None:
+    content, _ = written
+    for name in METRICS:
+        estimate = content[name]
+        assert estimate["low"] <= estimate["mean"] <= estimate["high"], name
+    assert content["policy"] == "expert"
+    assert (content["env"], content["episodes"], content["seed"]) == ("TPMReach-v0", 4, 7)
+    assert content["wall_seconds"] > 0
+    assert content["closure_error_max"]["worst"] >= content["closure_error_max"]["mean"]
+
+
+def test_records_agree_with_the_metrics(written: tuple[dict[str, Any], str]) -> None:
+    content, _ = written
+    records = content["records"]
+    assert [record["seed"] for record in records] == [7, 8, 9, 10]
+    for name in METRICS:
+        mean = sum(record[name] for record in records) / 4
+        assert content[name]["mean"] == pytest.approx(mean), name
+    steps = sum(record["length"] for record in records)
+    assert content["steps_per_second"] == pytest.approx(steps / content["wall_seconds"])
+
+
+def test_json_says_how_to_repeat_it(written: tuple[dict[str, Any], str]) -> None:
+    content, _ = written
+    assert content["versions"]["python"] == provenance.versions()["python"]
+    assert {"numpy", "torch", "gymnasium", "pybullet", "stable-baselines3", "tpm_gym"} <= set(
+        content["versions"]
+    )
+    assert "git_commit" in content
+    assert content["command"].startswith("python ")
+    assert "--policy expert --env TPMReach-v0 --episodes 4 --seed 7" in content["command"]
+
+
+def test_no_absolute_path_is_written(written: tuple[dict[str, Any], str]) -> None:
+    content, _ = written
+    assert str(Path.home()) not in json.dumps(content)
+    assert str(SCRIPT.parent) not in json.dumps(content)
+
+
+def test_table_shows_means_and_intervals(written: tuple[dict[str, Any], str]) -> None:
+    _, output = written
+    assert "success at end" in output
+    assert "expert" in output
+    assert "[51.0, 100.0]" in output  # Wilson interval of 4 of 4
+
+
+def test_scripted_policies_do_not_load_torch(tmp_path: Path) -> None:
+    program = (
+        "import sys, evaluate\n"
+        "config = evaluate.Config(policy=('expert', 'random'), env='TPMReach-v0', episodes=1)\n"
+        "evaluate.evaluate(config)\n"
+        "loaded = {'torch', 'stable_baselines3'} & set(sys.modules)\n"
+        "sys.exit(f'loaded {loaded}' if loaded else 0)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        cwd=SCRIPT.parent,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_several_policies_share_a_table_and_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "both.json"
+    config = evaluate.Config(
+        policy=("random", "expert"), env="TPMReach-v0", episodes=2, json=path, seed=3
+    )
+    console = quiet()
+    results = evaluate.evaluate(config, console)
+    content = read_strict(path)
+    assert [entry["policy"] for entry in content["policies"]] == ["random", "expert"]
+    assert content["policies"][1]["return"]["mean"] == results[1].metrics["return"].mean
+    assert "return" not in content
+    assert content["seed"] == 3
+    header = console.file.getvalue().splitlines()[2]  # type: ignore[attr-defined]
+    assert "random" in header
+    assert "expert" in header
+
+
+def test_video_shows_the_first_episodes(tmp_path: Path) -> None:
+    path = tmp_path / "films" / "expert.mp4"
+    config = evaluate.Config(
+        policy=("expert",), env="TPMReach-v0", episodes=2, video=path, video_episodes=1
+    )
+    (result,) = evaluate.evaluate(config, quiet())
+    frames = imageio.imread(path, plugin="FFMPEG")  # (frames, height, width, 3)
+    assert len(frames) == result.records[0].length + 1
+    assert frames[0].std() > 5  # something is to be seen
+    assert (frames[0] != frames[-1]).any()  # and it moves
+    assert imageio.immeta(path, plugin="FFMPEG")["fps"] == 25
+    assert [entry.name for entry in path.parent.iterdir()] == ["expert.mp4"]
+
+
+@pytest.mark.parametrize(
+    ("policies", "names"),
+    [
+        (("expert",), ["v.mp4"]),
+        (("expert", "random"), ["v-expert.mp4", "v-random.mp4"]),
+        (("a/best.zip", "b/best.zip"), ["v-1-best.mp4", "v-2-best.mp4"]),
+    ],
+)
+def test_every_policy_gets_its_own_video(policies: tuple[str, ...], names: list[str]) -> None:
+    config = evaluate.Config(policy=policies, video=Path("films", "v.mp4"))
+    assert [path.name for path in evaluate._video_paths(config)] == names
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"env": "TPMReach-v0", "episodes": 0}, ConfigError, "at least 1"),
+        ({"env": "TPMReach-v0", "video_episodes": 0}, ConfigError, "at least 1"),
+        ({"env": "TPMReach-v0", "seed": -1}, ConfigError, "at least 0"),
+        ({}, ConfigError, "name one with --env"),
+        ({"env": "TPMRech-v0"}, UnknownEnvError, "TPMReach-v0"),
+        ({"env": "TPMReach-v0", "policy": ("expert", "gone.zip")}, PolicyError, "no file gone.zip"),
+    ],
+)
+def test_mistakes_are_named(options: dict[str, Any], error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        evaluate.evaluate(evaluate.Config(**{"policy": ("expert",), **options}), quiet())
+
+
+def test_command_line_errors_are_one_line() -> None:
+    done = subprocess.run(
+        [sys.executable, str(SCRIPT), "--policy", "expert", "--env", "Nope-v0"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: unknown environment 'Nope-v0'")
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_files_are_written_whole_or_not_at_all(tmp_path: Path) -> None:
+    path = tmp_path / "result.json"
+    provenance.write_json(path, {"value": 1})
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        provenance.write_json(path, {"value": float("nan")})
+
+    def fail(part: Path) -> None:
+        part.write_text("half")
+        raise OSError("disk full")
+
+    with pytest.raises(OSError, match="disk full"):
+        provenance.write_whole(path, fail)
+    assert read_strict(path) == {"value": 1}
+    assert [entry.name for entry in tmp_path.iterdir()] == ["result.json"]
+
+
+def test_command_keeps_no_folder_outside(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    inside, outside = tmp_path / "runs" / "a b", tmp_path.parent / "elsewhere" / "x.json"
+    words = ["train/train.py", "--run", str(inside), f"--json={outside}", "--seed", "3"]
+    expected = "python train/train.py --run 'runs/a b' --json=x.json --seed 3"
+    assert provenance.command_line(words) == expected

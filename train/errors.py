@@ -1,0 +1,124 @@
+"""The exceptions of the training scripts: one root, and leaves that carry what went wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+
+class TrainError(Exception):
+    """Root of every error a user of the training scripts can cause."""
+
+
+class RecipeError(TrainError):
+    """A recipe file cannot be read, or one of its entries is not valid.
+
+    Attributes:
+        path: The recipe file.
+        key: The offending entry, dotted for nested ones; empty for the file as a whole.
+    """
+
+    def __init__(self, path: Path, key: str, problem: str) -> None:
+        """Store the values and compose the message."""
+        self.path = path
+        self.key = key
+        where = f"{path}: {key}" if key else str(path)
+        super().__init__(f"{where}: {problem}")
+
+
+class ConfigError(TrainError):
+    """An option, or a combination of options, is not valid.
+
+    Attributes:
+        option: The option as it is written on the command line.
+        value: The value that was given.
+    """
+
+    def __init__(self, option: str, value: object, problem: str) -> None:
+        """Store the values and compose the message."""
+        self.option = option
+        self.value = value
+        super().__init__(f"{option} {value}: {problem}")
+
+
+class UnknownEnvError(TrainError):
+    """An environment id that tpm_gym does not register.
+
+    Attributes:
+        env_id: The id that was given.
+    """
+
+    def __init__(self, env_id: str, known: Iterable[str]) -> None:
+        """Store the values and compose the message."""
+        self.env_id = env_id
+        super().__init__(f"unknown environment {env_id!r}; tpm_gym registers {', '.join(known)}")
+
+
+class RunExistsError(TrainError):
+    """The run folder already holds something.
+
+    Attributes:
+        run: The folder.
+    """
+
+    def __init__(self, run: Path) -> None:
+        """Store the values and compose the message."""
+        self.run = run
+        super().__init__(
+            f"run folder {run} is not empty; choose another with --run, "
+            "or replace the earlier run with --overwrite"
+        )
+
+
+class NotARunError(TrainError):
+    """``--overwrite`` was asked to replace a folder that no training run wrote.
+
+    Attributes:
+        run: The folder.
+    """
+
+    def __init__(self, run: Path, marker: str) -> None:
+        """Store the values and compose the message."""
+        self.run = run
+        super().__init__(
+            f"--overwrite would delete {run}, which holds no {marker} and so is no earlier run; "
+            "choose another folder with --run"
+        )
+
+
+class PolicyError(TrainError):
+    """A policy cannot be found, loaded or used in the environment.
+
+    Attributes:
+        spec: The policy as it was named.
+    """
+
+    def __init__(self, spec: str, problem: str) -> None:
+        """Store the values and compose the message."""
+        self.spec = spec
+        super().__init__(f"policy {spec!r}: {problem}")
+
+
+class RolloutError(TrainError):
+    """An episode delivered a value that no statistic can be made of.
+
+    Attributes:
+        seed: Seed of the episode.
+        step: Step within the episode, from 0.
+        name: The quantity.
+        value: What was delivered.
+    """
+
+    def __init__(self, seed: int, step: int, name: str, value: object) -> None:
+        """Store the values and compose the message."""
+        self.seed = seed
+        self.step = step
+        self.name = name
+        self.value = value
+        super().__init__(
+            f"episode with seed {seed}, step {step}: {name} is {value!r}, expected a finite number"
+        )
+
+
+class ReplayBufferError(TrainError):
+    """The replay buffer is set up in a way that would corrupt the penalty in the reward."""

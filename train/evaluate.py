@@ -1,0 +1,288 @@
+"""Evaluate policies over seeded episodes: a table, and optionally JSON and a video.
+
+    python train/evaluate.py --policy runs/TPMReach-v0-sac-s0 expert random --episodes 100
+
+A policy is ``expert``, ``random``, a .zip file saved by train.py, or the folder of a run (its best
+policy). A saved policy is a pickle: only load files you trust.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import gymnasium as gym
+import tyro
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+import provenance
+from errors import ConfigError, TrainError, UnknownEnvError
+from policies import load_policy, trained_env
+from rollout import TEST_SEED, Episode, Estimate, GoalEnv, Policy, run_episodes, summarise
+
+# Label, key, factor and format of each row of the table.
+_ROWS = (
+    ("success at end", "success_at_end", 100.0, "{:.1f}", "%"),
+    ("success once", "success_once", 100.0, "{:.1f}", "%"),
+    ("return", "return", 1.0, "{:.2f}", ""),
+    ("conditioning, least", "conditioning_min", 1.0, "{:.3f}", ""),
+    ("conditioning, mean", "conditioning_mean", 1.0, "{:.3f}", ""),
+    ("closure error, largest", "closure_error_max", 1e3, "{:.4f}", " mm"),
+)
+
+
+@dataclass(frozen=True)
+class Config:
+    """Evaluate policies over seeded episodes."""
+
+    policy: Annotated[tuple[str, ...], tyro.conf.arg(metavar="POLICY ...")]
+    """Policies: expert, random, a .zip file saved by train.py, or the folder of a run."""
+
+    env: str | None = None
+    """Environment id. Default: the one the policy was trained on."""
+
+    episodes: int = 100
+    """Episodes per policy."""
+
+    seed: int = TEST_SEED
+    """Seed of the first episode; the following ones count up. The default is met neither in
+    training nor in the evaluations that select a policy."""
+
+    json: Path | None = None
+    """Write metrics, episodes and versions here."""
+
+    video: Path | None = None
+    """Write an MP4 of the first episodes here; several policies get a file each."""
+
+    video_episodes: int = 3
+    """Episodes in a video."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """The evaluation of one policy.
+
+    Attributes:
+        policy: The policy as it was named.
+        metrics: Estimates by name.
+        records: The episodes.
+        wall_seconds: Time the episodes took, s.
+    """
+
+    policy: str
+    metrics: dict[str, Estimate]
+    records: list[Episode]
+    wall_seconds: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the result as plain data, the metrics at its top level."""
+        steps = sum(record.length for record in self.records)
+        return {
+            "policy": self.policy,
+            **{name: estimate.as_dict() for name, estimate in self.metrics.items()},
+            "wall_seconds": self.wall_seconds,
+            "steps_per_second": steps / self.wall_seconds,
+            "records": [record.as_dict() for record in self.records],
+        }
+
+
+def evaluate(config: Config, console: Console | None = None) -> list[Result]:
+    """Evaluate the policies of a configuration and write what it asks for.
+
+    Args:
+        config: The configuration.
+        console: Where the table is printed; by default the standard output.
+
+    Returns:
+        One result per policy, in order.
+
+    Raises:
+        TrainError: An option is not valid, or a policy cannot be used.
+    """
+    console = console or Console()
+    _check(config)
+    env_id = _resolve_env(config)
+    env = _make_env(env_id)
+    try:
+        # All are loaded before the first one runs: a mistyped name shows at once.
+        policies = [(spec, load_policy(spec, env)) for spec in config.policy]
+        results = [_evaluate_one(env, *policy, config, console) for policy in policies]
+    finally:
+        env.close()
+    console.print(_table(env_id, config, results))
+    if config.json is not None:
+        provenance.write_json(config.json, _description(env_id, config, results))
+    if config.video is not None:
+        for path, spec in zip(_video_paths(config), config.policy, strict=True):
+            _write_video(path, env_id, spec, config)
+            console.print(f"video: {path}", markup=False)
+    return results
+
+
+def _check(config: Config) -> None:
+    """Refuse numbers that cannot work."""
+    for option, value in {
+        "--episodes": config.episodes,
+        "--video-episodes": config.video_episodes,
+    }.items():
+        if value < 1:
+            raise ConfigError(option, value, "must be at least 1")
+    if config.seed < 0:
+        raise ConfigError("--seed", config.seed, "must be at least 0")
+    if not config.policy:
+        raise ConfigError("--policy", "", "name at least one policy")
+
+
+def _resolve_env(config: Config) -> str:
+    """Return the environment id that was asked for, or that the policies were trained on."""
+    import tpm_gym
+
+    if config.env is None:
+        trained = {spec: trained_env(spec) for spec in config.policy}
+        ids = sorted({env_id for env_id in trained.values() if env_id is not None})
+        if len(ids) != 1:
+            found = f"policies were trained on {', '.join(ids)}" if ids else "no policy has one"
+            raise ConfigError("--env", "(not given)", f"{found}; name one with --env")
+        env_id = ids[0]
+    else:
+        env_id = config.env
+    if env_id not in tpm_gym.ENV_IDS:
+        raise UnknownEnvError(env_id, tpm_gym.ENV_IDS)
+    return env_id
+
+
+def _make_env(env_id: str, render_mode: str | None = None) -> GoalEnv:
+    """Make an environment; tpm_gym has been imported and has registered its ids."""
+    return gym.make(env_id, render_mode=render_mode)
+
+
+def _evaluate_one(
+    env: GoalEnv, spec: str, policy: Policy, config: Config, console: Console
+) -> Result:
+    """Run the episodes of one policy, with a progress bar on a terminal."""
+    ticks = iter(
+        track(
+            range(config.episodes),
+            description=spec,
+            console=console,
+            disable=not console.is_terminal,
+        )
+    )
+    start = time.perf_counter()
+    records = run_episodes(
+        env, policy, config.episodes, config.seed, on_episode=lambda: next(ticks, None)
+    )
+    wall_seconds = time.perf_counter() - start
+    next(ticks, None)  # exhausts the bar, which then leaves the terminal
+    return Result(spec, summarise(records), records, wall_seconds)
+
+
+def _table(env_id: str, config: Config, results: Sequence[Result]) -> Table:
+    """Lay the metrics out with a column per policy."""
+    last = config.seed + config.episodes - 1
+    table = Table(
+        title=f"{env_id}: {config.episodes} episodes, seeds {config.seed} to {last}",
+        caption="mean over episodes [95% interval]",
+    )
+    table.add_column("metric")
+    for result in results:
+        table.add_column(result.policy, justify="right")
+    for label, name, factor, form, unit in _ROWS:
+        cells = [_cell(result.metrics[name], factor, form, unit) for result in results]
+        table.add_row(label, *cells)
+        worst = [result.metrics[name].worst for result in results]
+        if any(value is not None for value in worst):
+            table.add_row(
+                "  worst of all steps",
+                *(form.format((value or 0.0) * factor) + unit for value in worst),
+                style="dim",
+            )
+    rates = [f"{result.as_dict()['steps_per_second']:.0f}" for result in results]
+    table.add_row("steps per second", *rates)
+    return table
+
+
+def _cell(estimate: Estimate, factor: float, form: str, unit: str) -> str:
+    """Format an estimate with its interval."""
+    mean, low, high = (
+        form.format(value * factor) for value in (estimate.mean, estimate.low, estimate.high)
+    )
+    return f"{mean}{unit} \\[{low}, {high}]"
+
+
+def _description(env_id: str, config: Config, results: Sequence[Result]) -> dict[str, Any]:
+    """Return what the JSON file records; a single policy has its metrics at the top level."""
+    if len(results) == 1:
+        content = results[0].as_dict()
+        records = {"records": content.pop("records")}  # last: they are long
+    else:
+        content = {"policies": [result.as_dict() for result in results]}
+        records = {}
+    return {
+        "env": env_id,
+        "episodes": config.episodes,
+        "seed": config.seed,
+        **content,
+        "versions": provenance.versions(),
+        "git_commit": provenance.git_commit(),
+        "machine": provenance.machine(),
+        "command": provenance.command_line(),
+        **records,
+    }
+
+
+def _video_paths(config: Config) -> list[Path]:
+    """Return one file per policy, with the policy's name in it where there are several."""
+    video = config.video
+    if video is None:
+        return []
+    if len(config.policy) == 1:
+        return [video]
+    names = [Path(spec).stem for spec in config.policy]
+    if len(set(names)) < len(names):
+        names = [f"{i + 1}-{name}" for i, name in enumerate(names)]
+    return [video.with_name(f"{video.stem}-{name}{video.suffix}") for name in names]
+
+
+def _write_video(path: Path, env_id: str, spec: str, config: Config) -> None:
+    """Run the first episodes once more, with rendering, which would have slowed the metrics."""
+    import imageio.v2 as imageio
+
+    env = _make_env(env_id, render_mode="rgb_array")
+
+    def write(part: Path) -> None:
+        fps = env.metadata["render_fps"]
+        # H.264 wants an even width and height, and no more than that.
+        writer: Any = imageio.get_writer(part, fps=fps, macro_block_size=2)
+        with writer as video:
+            run_episodes(
+                env,
+                load_policy(spec, env),
+                min(config.video_episodes, config.episodes),
+                config.seed,
+                on_frame=lambda: video.append_data(env.render()),
+            )
+
+    try:
+        provenance.write_whole(path, write)
+    finally:
+        env.close()
+
+
+def main() -> None:
+    """Run the command line."""
+    config = tyro.cli(Config, description=__doc__)
+    try:
+        evaluate(config)
+    except TrainError as error:
+        sys.exit(f"error: {error}")
+
+
+if __name__ == "__main__":
+    main()

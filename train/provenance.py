@@ -1,0 +1,146 @@
+"""What a result needs to be repeated: versions, commit, machine, command; and how it is written."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import shlex
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Final
+
+_PACKAGES: Final = (
+    "numpy",
+    "torch",
+    "gymnasium",
+    "pybullet",
+    "stable-baselines3",
+    "sb3-contrib",
+    "tpm_gym",
+)
+
+
+def versions() -> dict[str, str | None]:
+    """Return the versions of Python, tpm_gym and the packages below it; None where absent."""
+    found: dict[str, str | None] = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            found[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            found[package] = None
+    return found
+
+
+def git_commit() -> str | None:
+    """Return the commit of the checkout this file lies in, None outside one.
+
+    ``+modified`` is appended where tracked files differ from the commit.
+    """
+    commit = _git("rev-parse", "HEAD")
+    if commit is None:
+        return None
+    return f"{commit}+modified" if _git("status", "--porcelain", "--untracked-files=no") else commit
+
+
+def _git(*arguments: str) -> str | None:
+    """Return what a git command prints, None where it fails."""
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(Path(__file__).parent), *arguments],
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return done.stdout.strip()
+
+
+def machine() -> dict[str, Any]:
+    """Return what the speed of a run depends on, and nothing that names the machine."""
+    return {
+        "system": platform.system(),
+        "architecture": platform.machine(),
+        "processor": _processor(),
+        "cpu_count": os.cpu_count(),
+    }
+
+
+def _processor() -> str:
+    """Return the processor's name."""
+    try:
+        # platform.processor() is empty or only the architecture on most Linux systems.
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor()
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor()
+
+
+def command_line(arguments: Sequence[str] | None = None) -> str:
+    """Return a command that repeats this one, without folders outside the working directory.
+
+    Args:
+        arguments: The script and its arguments; by default those of this process.
+    """
+    words = [_portable(word) for word in (sys.argv if arguments is None else arguments)]
+    return shlex.join(["python", *words])
+
+
+def _portable(word: str) -> str:
+    """Make an absolute path relative to the working directory, or keep only its last part."""
+    option, equals, value = word.rpartition("=")
+    path = Path(value)
+    if not path.is_absolute():
+        return word
+    try:
+        return f"{option}{equals}{path.relative_to(Path.cwd())}"
+    except ValueError:
+        return f"{option}{equals}{path.name}"
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write strictly valid JSON in one piece, making the folders above it.
+
+    Args:
+        path: The file; it is replaced, or left as it was where writing fails.
+        content: Plain data.
+
+    Raises:
+        ValueError: ``content`` holds NaN or an infinity, which JSON cannot express.
+    """
+    text = json.dumps(content, indent=2, allow_nan=False) + "\n"
+    write_whole(path, lambda part: part.write_text(text, encoding="utf-8"))
+
+
+def write_whole(path: Path, write: Callable[[Path], object]) -> None:
+    """Write a file so that no reader ever sees half of it.
+
+    Args:
+        path: The file; folders above it are made.
+        write: Writes the content to the path it is given, which lies beside ``path`` and ends as
+            it does.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=path.suffix)
+    os.close(handle)
+    part = Path(name)
+    try:
+        write(part)
+        # mkstemp makes files private to the user; give it the mode any other new file would have.
+        part.chmod(0o666 & ~_umask())
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _umask() -> int:
+    """Return the file mode creation mask of the process."""
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
