@@ -11,10 +11,11 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
-from tpm_gym import control, kinematics, rewards, tasks
+from tpm_gym import kinematics, rewards, tasks
+from tpm_gym.control import make as make_control
 from tpm_gym.errors import ActionError, ConfigurationError, EpisodeError, ResetOptionError
 from tpm_gym.mechanism import DEFAULT_MOUNT
-from tpm_gym.simulation import Physics, Simulation, Snapshot
+from tpm_gym.simulation import Physics, Simulation, Snapshot, has_display
 from tpm_gym.state import State
 
 __all__ = ["EnvSnapshot", "TPMEnv"]
@@ -141,15 +142,19 @@ class TPMEnv(gym.Env[Observation, Action]):
         height: int = 480,
     ) -> None:
         """Check the options and start the simulation."""
-        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
-            valid = f"None, {', '.join(map(repr, self.metadata['render_modes']))}"
+        # Without a display PyBullet's window would end the whole process; so this environment
+        # offers only what the machine can show.
+        modes = [mode for mode in self.metadata["render_modes"] if mode != "human" or has_display()]
+        self.metadata = {**self.metadata, "render_modes": modes}  # type: ignore[misc]
+        if render_mode is not None and render_mode not in modes:
+            valid = f"None, {', '.join(map(repr, modes))} ('human' needs a display)"
             raise ConfigurationError("render_mode", render_mode, valid)
         if not (np.isscalar(penalty_weight) and 0 <= penalty_weight < np.inf):
             raise ConfigurationError("penalty_weight", penalty_weight, "a finite number >= 0")
         self.render_mode = render_mode
         self.penalty_weight = float(penalty_weight)
         self.task = tasks.make(task, reward)
-        self.control = _control(control)
+        self.control = make_control(control)
         self._size = _picture_size(width, height)
         self.observation_space = _observation_space(self.task.observation_size)
         self.action_space = spaces.Box(-1.0, 1.0, (self.task.action_size,), np.float32)
@@ -364,10 +369,6 @@ class TPMEnv(gym.Env[Observation, Action]):
             if name not in ("goal", "singularity")
         )
         return float(shaped - self.penalty_weight * info.get("singularity_penalty", 0.0))
-
-
-def _control(kind: str) -> control.Control:
-    return control.make(kind)
 
 
 def _picture_size(width: int, height: int) -> tuple[int, int]:

@@ -16,7 +16,16 @@ from tpm_gym.errors import SingularityError
 from tpm_gym.geometry import PAPER, Geometry
 from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode, forward, forward_all
 
-__all__ = ["Factors", "conditioning", "factors", "parallel", "serial", "velocity"]
+__all__ = [
+    "Evaluation",
+    "Factors",
+    "conditioning",
+    "evaluate",
+    "factors",
+    "parallel",
+    "serial",
+    "velocity",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -25,6 +34,7 @@ FloatArray = NDArray[np.float64]
 class _Configuration:
     """What all Jacobians are made of."""
 
+    position: FloatArray  # (..., 3) m
     rods: FloatArray  # (..., 3, 3) m, row i is B_iC_i
     serial: FloatArray  # (..., 3) m^2/rad, B_iC_i . dB_i/dtheta_i
     sin_beta: FloatArray  # (...,)
@@ -46,6 +56,21 @@ class Factors:
 
     parallel: FloatArray
     serial: FloatArray
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What :func:`evaluate` returns.
+
+    Attributes:
+        position: (..., 3) m, point P.
+        velocity: (..., 3, 3) m/rad, J.
+        conditioning: (...,) 1/cond(J).
+    """
+
+    position: FloatArray
+    velocity: FloatArray
+    conditioning: FloatArray
 
 
 def parallel(
@@ -124,15 +149,7 @@ def velocity(
         UnreachableError: If the branch does not exist at some theta.
         SingularityError: If theta is a parallel singularity, where J does not exist.
     """
-    c = _configuration(theta, branch, geometry)
-    scaled, determinant = _scaled_velocity(c, geometry)
-    # Relative to the size that each factor has away from its zero.
-    size = geometry.l7 * geometry.l4**3
-    if (np.abs(determinant) <= 1e-12 * size).any():
-        name, value = _smallest_parallel_factor(c)
-        raise SingularityError(name, value)
-    result: FloatArray = scaled / determinant[..., None, None]
-    return result
+    return _velocity(_configuration(theta, branch, geometry), geometry)
 
 
 def conditioning(
@@ -154,11 +171,25 @@ def conditioning(
     Raises:
         UnreachableError: If the branch does not exist at some theta.
     """
-    scaled, _ = _scaled_velocity(_configuration(theta, branch, geometry), geometry)
-    singular_values = np.linalg.svd(scaled, compute_uv=False)
-    largest = singular_values[..., 0]
-    result: FloatArray = singular_values[..., 2] / np.where(largest > 0, largest, 1.0)
-    return result
+    return _conditioning(_configuration(theta, branch, geometry), geometry)
+
+
+def evaluate(
+    theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
+) -> Evaluation:
+    """Position, J and conditioning at once, for the price of one solution.
+
+    Args:
+        theta: (..., 3) rad.
+        branch: The assembly mode.
+        geometry: Link lengths.
+
+    Raises:
+        UnreachableError: If the branch does not exist at some theta.
+        SingularityError: If theta is a parallel singularity.
+    """
+    c = _configuration(theta, branch, geometry)
+    return Evaluation(c.position, _velocity(c, geometry), _conditioning(c, geometry))
 
 
 def factors(
@@ -200,6 +231,7 @@ def _configuration(theta: ArrayLike, branch: AssemblyMode, geometry: Geometry) -
     # Arm 1 turns in the yz plane, arms 2 and 3 in the xz plane.
     in_plane = np.stack([rod1[1], rod2[0], rod3[0]], axis=-1)
     return _Configuration(
+        position=solutions.position[..., slot, :],
         rods=rods,
         serial=l3 * (rods[..., 2] * cos - in_plane * sin),
         sin_beta=y / geometry.l7,
@@ -207,6 +239,24 @@ def _configuration(theta: ArrayLike, branch: AssemblyMode, geometry: Geometry) -
         planar=rod1[0] * rod2[2] - rod1[2] * rod2[0],
         level3=geometry.l7 * np.cos(beta) - rod3[0],  # = xB3 - xC - 2 l2
     )
+
+
+def _velocity(c: _Configuration, geometry: Geometry) -> FloatArray:
+    scaled, determinant = _scaled_velocity(c, geometry)
+    # Relative to the size that the determinant has far from its zeros.
+    if (np.abs(determinant) <= 1e-12 * geometry.l7 * geometry.l4**3).any():
+        raise SingularityError(*_smallest_parallel_factor(c))
+    result: FloatArray = scaled / determinant[..., None, None]
+    return result
+
+
+def _conditioning(c: _Configuration, geometry: Geometry) -> FloatArray:
+    # det K cancels in the ratio of the singular values, so this exists at det K = 0 as well.
+    scaled, _ = _scaled_velocity(c, geometry)
+    singular_values = np.linalg.svd(scaled, compute_uv=False)
+    largest = singular_values[..., 0]
+    result: FloatArray = singular_values[..., 2] / np.where(largest > 0, largest, 1.0)
+    return result
 
 
 def _scaled_velocity(c: _Configuration, geometry: Geometry) -> tuple[FloatArray, FloatArray]:

@@ -7,18 +7,26 @@ starts with the loops closed to better than a micrometre.
 
 from __future__ import annotations
 
+import os
+import sys
 import tempfile
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pybullet
 from numpy.typing import ArrayLike, NDArray
-from pybullet_utils.bullet_client import BulletClient
 
 from tpm_gym import jacobian, kinematics, urdf
-from tpm_gym.errors import AssemblyModeError, ClosureError, ConfigurationError, UnreachableError
+from tpm_gym.errors import (
+    AssemblyModeError,
+    ClosureError,
+    ConfigurationError,
+    SingularityError,
+    UnreachableError,
+)
 from tpm_gym.geometry import PAPER, Geometry
 from tpm_gym.mechanism import (
     ACTUATED_JOINTS,
@@ -32,7 +40,7 @@ from tpm_gym.mechanism import (
 )
 from tpm_gym.state import Scene, State
 
-__all__ = ["Physics", "Simulation", "Snapshot"]
+__all__ = ["Physics", "Simulation", "Snapshot", "has_display"]
 
 FloatArray = NDArray[np.float64]
 
@@ -103,6 +111,30 @@ class Snapshot:
     grasp: tuple[tuple[float, ...], tuple[float, ...]] | None
 
 
+class _Client:
+    """A private physics client: pybullet's functions with its number filled in.
+
+    pybullet_utils' BulletClient looks every function up anew at every call, which costs as much as
+    the cheaper calls themselves, and prints a line on connecting.
+    """
+
+    def __init__(self, mode: int) -> None:
+        """Connect."""
+        self._number = pybullet.connect(mode)
+
+    def __getattr__(self, name: str) -> Any:
+        """The engine's function of that name, bound to this client and remembered."""
+        function = partial(getattr(pybullet, name), physicsClientId=self._number)
+        setattr(self, name, function)
+        return function
+
+    def close(self) -> None:
+        """Disconnect; harmless the second time."""
+        if self._number >= 0:
+            pybullet.disconnect(self._number)
+            self._number = -1
+
+
 class Simulation:
     """One robot over one table in one private physics client.
 
@@ -135,7 +167,7 @@ class Simulation:
         self.physics = physics or Physics()
         self.mechanism: Mechanism = build(geometry)
         self._bias = _bias(encoder_bias)
-        self._client = BulletClient(pybullet.GUI if gui else pybullet.DIRECT)
+        self._client = _Client(pybullet.GUI if gui else pybullet.DIRECT)
         try:
             self._renderer = _load_renderer(self._client, renderer)
             self._configure()
@@ -342,18 +374,17 @@ class Simulation:
         theta_dot = np.array([motor[1] for motor in motors])
         gap, platform, tilt = self._measure()
         try:
-            fk = kinematics.forward(theta, geometry=self.geometry)
-        except UnreachableError as error:
+            at = jacobian.evaluate(theta, geometry=self.geometry)
+        except (UnreachableError, SingularityError) as error:
             # Encoders that no assembly explains: the mechanism has left the one we know.
             raise AssemblyModeError(float("inf"), ASSEMBLY_LIMIT) from error
-        rate = jacobian.velocity(theta, geometry=self.geometry) @ theta_dot
         position, quaternion, velocity, spin = self._object_state()
         return State(
             theta=theta,
             theta_dot=theta_dot,
-            fk_position=self.mount.to_world(fk),
-            fk_velocity=self.mount.rotate(rate),
-            conditioning=float(jacobian.conditioning(theta, geometry=self.geometry)),
+            fk_position=self.mount.to_world(at.position),
+            fk_velocity=self.mount.rotate(at.velocity @ theta_dot),
+            conditioning=float(at.conditioning),
             platform_position=platform,
             platform_tilt=tilt,
             closure_error=gap,
@@ -392,10 +423,11 @@ class Simulation:
         # "not <=" so that a NaN fails too
         if not state.closure_error <= CLOSURE_LIMIT:
             raise ClosureError(float(state.closure_error), CLOSURE_LIMIT)
-        encoders = self.mount.to_world(
-            kinematics.forward(state.theta - self._bias, geometry=self.geometry)
-        )
-        apart = float(np.linalg.norm(state.platform_position - encoders))
+        true_fk = state.fk_position
+        if self._bias.any():
+            true_theta = state.theta - self._bias
+            true_fk = self.mount.to_world(kinematics.forward(true_theta, geometry=self.geometry))
+        apart = float(np.linalg.norm(state.platform_position - true_fk))
         if not apart <= ASSEMBLY_LIMIT:
             raise AssemblyModeError(apart, ASSEMBLY_LIMIT)
 
@@ -527,8 +559,12 @@ class Simulation:
 
     def close(self) -> None:
         """Disconnect the client; harmless if it is disconnected already."""
-        if self._client.isConnected():
-            self._client.disconnect()
+        self._client.close()
+
+
+def has_display() -> bool:
+    """Whether PyBullet can open a window here (on Linux it needs an X server)."""
+    return not sys.platform.startswith("linux") or bool(os.environ.get("DISPLAY"))
 
 
 def _bias(value: ArrayLike) -> FloatArray:
@@ -556,7 +592,7 @@ def _rotations(quaternions: FloatArray) -> FloatArray:
 
 
 def _add_box(
-    client: BulletClient,
+    client: _Client,
     half: tuple[float, float, float],
     centre: tuple[float, float, float],
     colour: tuple[float, float, float, float],
@@ -572,7 +608,7 @@ def _add_box(
     return body
 
 
-def _load_renderer(client: BulletClient, renderer: str) -> int:
+def _load_renderer(client: _Client, renderer: str) -> int:
     """The engine's number of the renderer; loads the EGL plugin if that was asked for."""
     if renderer == "tiny":
         return int(pybullet.ER_TINY_RENDERER)
