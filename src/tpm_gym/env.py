@@ -4,24 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, SupportsFloat
+from typing import Any, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
-from tpm_gym import kinematics, rewards, tasks
+from tpm_gym import checks, kinematics, rewards, tasks
 from tpm_gym.control import make as make_control
-from tpm_gym.errors import ActionError, ConfigurationError, EpisodeError, ResetOptionError
+from tpm_gym.errors import ConfigurationError, EpisodeError
 from tpm_gym.mechanism import DEFAULT_MOUNT
-from tpm_gym.simulation import Physics, Simulation, Snapshot, has_display
+from tpm_gym.physics import Physics
+from tpm_gym.simulation import Simulation, Snapshot, has_display
 from tpm_gym.state import State
 
 __all__ = ["EnvSnapshot", "TPMEnv"]
 
-Observation = dict[str, NDArray[np.float32]]
-Action = NDArray[np.float32]
+Observation = dict[str, Any]  # arrays of float32
+Action = NDArray[Any]
 
 _OBSERVATION_BOUND = 10.0
 _GOAL_BOUND = 2.0
@@ -56,8 +57,8 @@ class TPMEnv(gym.Env[Observation, Action]):
 
     | entries | meaning |
     | --- | --- |
-    | 0 to 2, Cartesian | increment of the command for P along the paper's x, y, z: at most 30, 5, 30 mm |
-    | 0 to 2, joints | increment of theta_1, theta_2, theta_3: at most 0.08 rad, P no faster than above |
+    | 0 to 2, Cartesian | increment of the command for P, paper's x, y, z: at most 30, 5, 30 mm |
+    | 0 to 2, joints | increment of theta_1 to theta_3: at most 0.08 rad, P at most as above |
     | 3 (PickAndPlace) | above 0: vacuum on |
 
     Commands accumulate, are projected into the task region, and are followed along a B-spline.
@@ -90,7 +91,7 @@ class TPMEnv(gym.Env[Observation, Action]):
     | --- | --- |
     | goal, sparse | 0 if the distance to the goal is below 10 mm, else -1 |
     | goal, dense | minus the distance in units of 0.1 m |
-    | singularity | -penalty_weight x penalty; the penalty is 0 where 1/cond(J) >= 0.08, 1 at a singularity |
+    | singularity | -penalty_weight x penalty: 0 where 1/cond(J) >= 0.08, 1 at a singularity |
     | approach | minus half the distance from cup to puck in units of 0.1 m |
 
     ## Start
@@ -125,7 +126,11 @@ class TPMEnv(gym.Env[Observation, Action]):
     * v0: first release.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": 25}
+    # Gymnasium declares this as an instance's, so it cannot be a ClassVar.
+    metadata: dict[str, Any] = {  # noqa: RUF012
+        "render_modes": ["human", "rgb_array"],
+        "render_fps": 25,
+    }
 
     def __init__(
         self,
@@ -145,19 +150,23 @@ class TPMEnv(gym.Env[Observation, Action]):
         # Without a display PyBullet's window would end the whole process; so this environment
         # offers only what the machine can show.
         modes = [mode for mode in self.metadata["render_modes"] if mode != "human" or has_display()]
-        self.metadata = {**self.metadata, "render_modes": modes}  # type: ignore[misc]
+        self.metadata = {**self.metadata, "render_modes": modes}
         if render_mode is not None and render_mode not in modes:
             valid = f"None, {', '.join(map(repr, modes))} ('human' needs a display)"
             raise ConfigurationError("render_mode", render_mode, valid)
-        if not (np.isscalar(penalty_weight) and 0 <= penalty_weight < np.inf):
-            raise ConfigurationError("penalty_weight", penalty_weight, "a finite number >= 0")
         self.render_mode = render_mode
-        self.penalty_weight = float(penalty_weight)
+        self.penalty_weight = checks.weight(penalty_weight)
         self.task = tasks.make(task, reward)
         self.control = make_control(control)
-        self._size = _picture_size(width, height)
-        self.observation_space = _observation_space(self.task.observation_size)
-        self.action_space = spaces.Box(-1.0, 1.0, (self.task.action_size,), np.float32)
+        self._size = checks.picture_size(width, height)
+        self.observation_space = spaces.Dict(
+            {
+                "observation": _box(_OBSERVATION_BOUND, self.task.observation_size),
+                "achieved_goal": _box(_GOAL_BOUND, 3),
+                "desired_goal": _box(_GOAL_BOUND, 3),
+            }
+        )
+        self.action_space = _box(1.0, self.task.action_size)
         self._home = kinematics.inverse(self.task.home)
         self._state: State | None = None
         self._goal = np.full(3, np.nan)
@@ -190,10 +199,18 @@ class TPMEnv(gym.Env[Observation, Action]):
         if self._closed:
             raise EpisodeError("the environment is closed; make a new one")
         super().reset(seed=seed)
-        options = _checked_options(options)
+        options = checks.reset_options(options)
         start, goal = options.get("object"), options.get("goal")
-        start = self.task.sample_object(self.np_random) if start is None else self.task.check_object(start)
-        goal = self.task.sample_goal(self.np_random, start) if goal is None else self.task.check_goal(goal)
+        start = (
+            self.task.sample_object(self.np_random)
+            if start is None
+            else self.task.check_object(start)
+        )
+        goal = (
+            self.task.sample_goal(self.np_random, start)
+            if goal is None
+            else self.task.check_goal(goal)
+        )
         self._goal = goal
         self._state = self.simulation.reset(self._home, start, goal)
         observation = self._observe(self._state)
@@ -202,9 +219,7 @@ class TPMEnv(gym.Env[Observation, Action]):
             self.render()
         return observation, info
 
-    def step(
-        self, action: Action
-    ) -> tuple[Observation, SupportsFloat, bool, bool, dict[str, Any]]:
+    def step(self, action: Action) -> tuple[Observation, SupportsFloat, bool, bool, dict[str, Any]]:
         """Run one control step of 40 ms.
 
         Raises:
@@ -213,7 +228,7 @@ class TPMEnv(gym.Env[Observation, Action]):
             ClosureError: If a loop of the mechanism opened.
             AssemblyModeError: If the mechanism went through a parallel singularity.
         """
-        values = self._checked_action(action)
+        values = checks.action(action, self.task.action_size)
         state = self._require_state()
         current = DEFAULT_MOUNT.to_paper(state.command)
         command = self.control.command(values[:3], current)
@@ -256,7 +271,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         total = goal_term + other
         return float(total) if np.ndim(total) == 0 else total
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """The scene as (height, width, 3) RGB; in ``human`` mode the window shows it already."""
         if self._closed:
             raise EpisodeError("the environment is closed; make a new one")
@@ -285,7 +300,7 @@ class TPMEnv(gym.Env[Observation, Action]):
     @property
     def goal(self) -> NDArray[np.float64]:
         """The episode's goal, (3,) m, world."""
-        return self._goal.copy()
+        return np.array(self._goal)
 
     def save_state(self) -> EnvSnapshot:
         """Take down physics, rng, goal, commands and grasp.
@@ -295,7 +310,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         """
         self._require_state()
         return EnvSnapshot(
-            self.simulation.save(), self.np_random.bit_generator.state, self._goal.copy()
+            self.simulation.save(), dict(self.np_random.bit_generator.state), self._goal.copy()
         )
 
     def restore_state(self, snapshot: EnvSnapshot) -> Observation:
@@ -323,18 +338,6 @@ class TPMEnv(gym.Env[Observation, Action]):
         if self._state is None:
             raise EpisodeError("no episode is running; call reset() first")
         return self._state
-
-    def _checked_action(self, action: Any) -> NDArray[np.float64]:
-        shape = self.action_space.shape
-        try:
-            values = np.array(action, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise ActionError("action", action, f"an array of numbers of shape {shape}") from error
-        if values.shape != shape:
-            raise ActionError("action", values.shape, f"of shape {shape}, by shape")
-        if not np.isfinite(values).all():
-            raise ActionError("action", values.tolist(), "finite")
-        return np.clip(values, -1.0, 1.0)
 
     def _observe(self, state: State) -> Observation:
         vector = np.clip(self.task.observe(state), -_OBSERVATION_BOUND, _OBSERVATION_BOUND)
@@ -371,32 +374,5 @@ class TPMEnv(gym.Env[Observation, Action]):
         return float(shaped - self.penalty_weight * info.get("singularity_penalty", 0.0))
 
 
-def _picture_size(width: int, height: int) -> tuple[int, int]:
-    for name, value in (("width", width), ("height", height)):
-        if not (isinstance(value, int) and 16 <= value <= 4096):
-            raise ConfigurationError(name, value, "a whole number of pixels from 16 to 4096")
-    return width, height
-
-
-def _observation_space(size: int) -> spaces.Dict:
-    def box(bound: float, length: int) -> spaces.Box:
-        return spaces.Box(-bound, bound, (length,), np.float32)
-
-    return spaces.Dict(
-        {
-            "observation": box(_OBSERVATION_BOUND, size),
-            "achieved_goal": box(_GOAL_BOUND, 3),
-            "desired_goal": box(_GOAL_BOUND, 3),
-        }
-    )
-
-
-def _checked_options(options: Any) -> dict[str, Any]:
-    if options is None:
-        return {}
-    if not isinstance(options, Mapping):
-        raise ResetOptionError("options", options, "a dictionary with the keys 'object', 'goal'")
-    for key in options:
-        if key not in ("object", "goal"):
-            raise ResetOptionError(str(key), options[key], "the keys 'object' and 'goal'")
-    return dict(options)
+def _box(bound: float, length: int) -> spaces.Box:
+    return spaces.Box(-bound, bound, (length,), np.float32)

@@ -144,7 +144,7 @@ class Expert:
     def _go(
         self, stops: list[FloatArray], vacuum: bool, while_holding: bool = False
     ) -> Iterator[tuple[FloatArray, bool]]:
-        """Straight lines through ``stops``, each from rest to rest; ends early if a puck is lost."""
+        """Straight lines through ``stops``, from rest to rest; ends early if a puck is lost."""
         for stop in stops:
             start = self._command
             for fraction in _trapezoid(start, stop):

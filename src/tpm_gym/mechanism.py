@@ -27,24 +27,20 @@ from numpy.typing import ArrayLike, NDArray
 
 from tpm_gym.geometry import PAPER, Geometry
 from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode, passive_angles
+from tpm_gym.parts import Closure, Joint, Link, Solid, Vector
 
 __all__ = [
     "ACTUATED_JOINTS",
     "CUP_LENGTH",
     "CUP_RADIUS",
     "DEFAULT_MOUNT",
-    "Closure",
-    "Joint",
-    "Link",
     "Mechanism",
     "Mount",
-    "Solid",
     "build",
     "joint_angles",
 ]
 
 FloatArray = NDArray[np.float64]
-Vector = tuple[float, float, float]
 
 ACTUATED_JOINTS = ("R11", "R21", "R31")
 """The motors, in the order of theta_1, theta_2, theta_3."""
@@ -78,15 +74,17 @@ class Mount:
 
     def to_world(self, point: ArrayLike) -> FloatArray:
         """Convert points (..., 3) m from the paper frame to the world frame."""
-        return np.asarray(point, dtype=np.float64) * _HALF_TURN + (0.0, 0.0, self.height)
+        world: FloatArray = self.rotate(point) + np.array([0.0, 0.0, self.height])
+        return world
 
     def to_paper(self, point: ArrayLike) -> FloatArray:
         """Convert points (..., 3) m from the world frame to the paper frame."""
-        return (np.asarray(point, dtype=np.float64) - (0.0, 0.0, self.height)) * _HALF_TURN
+        return self.rotate(np.asarray(point, dtype=np.float64) - np.array([0.0, 0.0, self.height]))
 
     def rotate(self, vector: ArrayLike) -> FloatArray:
         """Convert free vectors (..., 3), such as velocities; the half turn is its own inverse."""
-        return np.asarray(vector, dtype=np.float64) * _HALF_TURN
+        turned: FloatArray = np.multiply(vector, _HALF_TURN, dtype=np.float64)
+        return turned
 
     @property
     def quaternion(self) -> tuple[float, float, float, float]:
@@ -97,133 +95,7 @@ class Mount:
 _HALF_TURN = np.array([1.0, -1.0, -1.0])
 
 DEFAULT_MOUNT = Mount(height=0.97)
-"""The cup touches the table at z = 0.93 m of the paper frame, where the mechanism is at its best."""
-
-
-@dataclass(frozen=True)
-class Solid:
-    """A homogeneous box or cylinder, possibly hollow, fixed to a link.
-
-    Attributes:
-        kind: ``"box"`` with full edge lengths, or ``"cylinder"`` along its own axis.
-        size: Box: edges (x, y, z). Cylinder: (radius, length, 0). In m.
-        centre: Position in the link's frame, m.
-        density: kg/m^3 of the material; zero for parts that are only drawn.
-        bore: Box: edges of the hollow (0 for solid faces). Cylinder: (inner radius, length, 0).
-        axis: Axis of a cylinder in the link's frame: ``"x"``, ``"y"`` or ``"z"``.
-        colour: Name of a colour in :mod:`tpm_gym.urdf`.
-        collides: Whether the engine should collide it.
-    """
-
-    kind: Literal["box", "cylinder"]
-    size: Vector
-    centre: Vector
-    density: float
-    bore: Vector = (0.0, 0.0, 0.0)
-    axis: Literal["x", "y", "z"] = "z"
-    colour: str = "grey"
-    collides: bool = False
-
-    @property
-    def mass(self) -> float:
-        """Mass in kg."""
-        return self._mass(self.size) - self._mass(self.bore)
-
-    @property
-    def inertia(self) -> FloatArray:
-        """(3,) kg m^2, principal moments about the centre, along the link's axes."""
-        return self._inertia(self.size) - self._inertia(self.bore)
-
-    def _mass(self, size: Vector) -> float:
-        if self.kind == "box":
-            return self.density * size[0] * size[1] * size[2]
-        return float(self.density * np.pi * size[0] ** 2 * size[1])
-
-    def _inertia(self, size: Vector) -> FloatArray:
-        mass = self._mass(size)
-        if self.kind == "box":
-            squares = np.square(size)
-            return mass / 12 * (squares.sum() - squares)
-        radius, length, _ = size
-        moments = np.full(3, mass * (3 * radius**2 + length**2) / 12)
-        moments["xyz".index(self.axis)] = mass * radius**2 / 2
-        return moments
-
-
-@dataclass(frozen=True)
-class Joint:
-    """How a link hangs on its parent.
-
-    Attributes:
-        name: Name of the joint; the paper's where it has one.
-        kind: URDF joint type.
-        parent: Name of the parent link.
-        origin: Position of the joint in the parent's frame, m.
-        axis: Axis in the joint's frame.
-        lower: Lower limit, rad (motors only; passive joints are bounded by the loops).
-        upper: Upper limit, rad.
-        effort: Torque limit, N m; zero for passive joints.
-        speed: Speed limit, rad/s; zero for passive joints.
-    """
-
-    name: str
-    kind: Literal["continuous", "revolute", "fixed"]
-    parent: str
-    origin: Vector
-    axis: Vector = (0.0, 0.0, 1.0)
-    lower: float = 0.0
-    upper: float = 0.0
-    effort: float = 0.0
-    speed: float = 0.0
-
-
-@dataclass(frozen=True)
-class Link:
-    """A rigid body: solids, and the joint that holds it (None for the base)."""
-
-    name: str
-    solids: tuple[Solid, ...]
-    joint: Joint | None = None
-
-    @property
-    def mass(self) -> float:
-        """Mass in kg."""
-        return sum(solid.mass for solid in self.solids)
-
-    @property
-    def centre_of_mass(self) -> FloatArray:
-        """(3,) m, in the link's frame."""
-        weighted = sum(solid.mass * np.asarray(solid.centre) for solid in self.solids)
-        return np.asarray(weighted) / self.mass
-
-    @property
-    def inertia(self) -> FloatArray:
-        """(3, 3) kg m^2 about the centre of mass, along the link's axes."""
-        total = np.zeros((3, 3))
-        for solid in self.solids:
-            arm = np.asarray(solid.centre) - self.centre_of_mass
-            steiner = solid.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-            total += np.diag(solid.inertia) + steiner
-        return total
-
-
-@dataclass(frozen=True)
-class Closure:
-    """A ball joint that closes a loop: two points that must coincide.
-
-    Attributes:
-        name: Name of the joint; the paper's where it has one.
-        link_a: Link on one side.
-        point_a: Point in the frame of ``link_a``, m.
-        link_b: Link on the other side.
-        point_b: Point in the frame of ``link_b``, m.
-    """
-
-    name: str
-    link_a: str
-    point_a: Vector
-    link_b: str
-    point_b: Vector
+"""The cup touches the table at z = 0.93 m of the paper frame, well inside the reach."""
 
 
 @dataclass(frozen=True)
@@ -344,11 +216,13 @@ def _tube(
 ) -> Solid:
     """A rectangular aluminium tube from the link's origin along ``axis``."""
     outer = (length, width, height) if axis == "x" else (width, length, height)
-    inner = tuple(
-        edge if i == _ALONG[axis] else edge - 2 * wall for i, edge in enumerate(outer)
-    )
+    inner = tuple(edge if i == _ALONG[axis] else edge - 2 * wall for i, edge in enumerate(outer))
     return Solid(
-        "box", outer, _vector(axis, length / 2), ALUMINIUM, bore=(inner[0], inner[1], inner[2]),
+        "box",
+        outer,
+        _vector(axis, length / 2),
+        ALUMINIUM,
+        bore=(inner[0], inner[1], inner[2]),
         colour="orange",
     )
 
@@ -368,8 +242,13 @@ def _bar(
 def _rod(axis: Literal["x", "y"], length: float) -> tuple[Solid, ...]:
     """A carbon-fibre tube, 16 mm by 1.5 mm, with a steel rod end at both ends."""
     tube = Solid(
-        "cylinder", (0.008, length, 0.0), _vector(axis, length / 2), CARBON_FIBRE,
-        bore=(0.0065, length, 0.0), axis=axis, colour="carbon",
+        "cylinder",
+        (0.008, length, 0.0),
+        _vector(axis, length / 2),
+        CARBON_FIBRE,
+        bore=(0.0065, length, 0.0),
+        axis=axis,
+        colour="carbon",
     )
     ends = tuple(
         _bar(axis, 0.008, 0.009, _vector(axis, at), density=STEEL) for at in (0.008, length - 0.008)
@@ -380,14 +259,14 @@ def _rod(axis: Literal["x", "y"], length: float) -> tuple[Solid, ...]:
 def _motor(name: str, axis: Vector, origin: Vector, level: float, sense: int) -> Joint:
     """A motor whose arm points level outwards at ``level`` and lowers in the ``sense`` of theta."""
     lower, upper = sorted((level - sense * ARM_RAISED, level + sense * ARM_LOWERED))
-    return Joint(
-        name, "revolute", "base", origin, axis, lower, upper, MOTOR_EFFORT, MOTOR_SPEED
-    )
+    return Joint(name, "revolute", "base", origin, axis, lower, upper, MOTOR_EFFORT, MOTOR_SPEED)
 
 
 def _base(g: Geometry) -> Link:
     """Base 0: a plate with a motor at each pivot. Its mass does not matter, it never moves."""
-    plate = Solid("cylinder", (g.l1 + 0.06, 0.02, 0.0), (0.0, 0.0, -0.07), ALUMINIUM, colour="white")
+    plate = Solid(
+        "cylinder", (g.l1 + 0.06, 0.02, 0.0), (0.0, 0.0, -0.07), ALUMINIUM, colour="white"
+    )
     motors = (
         _bar("x", 0.055, 0.042, (0.0, g.l1, 0.0), "dark"),
         _bar("y", 0.055, 0.042, (-g.l1, 0.0, 0.0), "dark"),
@@ -403,7 +282,11 @@ def _base(g: Geometry) -> Link:
 def _arm(axis: Literal["x", "y"], across: Literal["x", "y"], g: Geometry) -> tuple[Solid, ...]:
     """An actuated arm: hub with the motor's rotor, rectangular tube, elbow bar across."""
     hub = _bar(across, 0.058, 0.022, colour="steel", density=STEEL)
-    return (hub, _tube(axis, g.l3, 0.045, 0.030, 0.003), _bar(across, 0.02, 0.015, _vector(axis, g.l3)))
+    return (
+        hub,
+        _tube(axis, g.l3, 0.045, 0.030, 0.003),
+        _bar(across, 0.02, 0.015, _vector(axis, g.l3)),
+    )
 
 
 def _branch_1(g: Geometry) -> tuple[Link, ...]:
@@ -436,8 +319,14 @@ def _branch_2(g: Geometry) -> tuple[Link, ...]:
     """Arm 5, rod 6, link 3', link 7, platform 1 with the cup, end link 10."""
     minus_y = (0.0, -1.0, 0.0)
     link_3p = (
-        Solid("box", (3 * g.l5, 0.025, 0.018), (1.5 * g.l5, 0.0, 0.0), ALUMINIUM,
-              bore=(3 * g.l5, 0.019, 0.012), colour="blue"),
+        Solid(
+            "box",
+            (3 * g.l5, 0.025, 0.018),
+            (1.5 * g.l5, 0.0, 0.0),
+            ALUMINIUM,
+            bore=(3 * g.l5, 0.019, 0.012),
+            colour="blue",
+        ),
         _bar("y", 0.016, 0.011, density=STEEL),
     )
     link_7 = (
@@ -447,7 +336,9 @@ def _branch_2(g: Geometry) -> tuple[Link, ...]:
     )
     return (
         Link("arm_5", _arm("x", "y", g), _motor("R21", minus_y, (-g.l1, 0.0, 0.0), np.pi, -1)),
-        Link("rod_6", _rod("x", g.l4), Joint("R22", "continuous", "arm_5", (g.l3, 0.0, 0.0), minus_y)),
+        Link(
+            "rod_6", _rod("x", g.l4), Joint("R22", "continuous", "arm_5", (g.l3, 0.0, 0.0), minus_y)
+        ),
         Link("link_3p", link_3p, Joint("R23", "continuous", "rod_6", (g.l4, 0.0, 0.0), minus_y)),
         Link("link_7", link_7, Joint("R12", "continuous", "link_3p", (2 * g.l5, 0.0, g.l6))),
         Link("platform", _platform(g), Joint("R13", "continuous", "link_7", (g.l7, 0.0, 0.0))),
@@ -468,8 +359,12 @@ def _platform(g: Geometry) -> tuple[Solid, ...]:
         Solid("box", (2 * g.l2 + 0.04, 0.045, plate), point_p, ALUMINIUM, colour="light"),
         _bar("z", stem / 2, 0.005, _vector("z", stem / 2, point_p)),
         Solid(
-            "cylinder", (CUP_RADIUS, bellows, 0.0), _vector("z", CUP_LENGTH - bellows / 2, point_p),
-            SILICONE, colour="red", collides=True,
+            "cylinder",
+            (CUP_RADIUS, bellows, 0.0),
+            _vector("z", CUP_LENGTH - bellows / 2, point_p),
+            SILICONE,
+            colour="red",
+            collides=True,
         ),
     )
 

@@ -135,8 +135,7 @@ class Task:
     def observe(self, state: State) -> FloatArray:
         """The observation vector (..., n), each entry of order one."""
         parts = [
-            (np.asarray(entry.source(state)) - entry.centre) / entry.scale
-            for entry in self.entries
+            (np.asarray(entry.source(state)) - entry.centre) / entry.scale for entry in self.entries
         ]
         return np.concatenate(parts, axis=-1)
 
@@ -164,7 +163,9 @@ class Task:
     def goal_term(self, achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
         """The part of the reward that depends on the goal, (...,)."""
         gap = rewards.distance(achieved, desired)
-        return rewards.sparse(gap, self.tolerance) if self.reward == "sparse" else rewards.dense(gap)
+        return (
+            rewards.sparse(gap, self.tolerance) if self.reward == "sparse" else rewards.dense(gap)
+        )
 
     def state_terms(self, state: State) -> dict[str, FloatArray]:
         """Parts of the reward that do not depend on the goal: name -> (...,)."""
@@ -254,11 +255,11 @@ class PickAndPlace(Task):
 
     def _on_table(self) -> FloatArray:
         """Point P when the cup touches a puck that stands on the table, world (x, y any)."""
-        return self._tool_offset() + (0.0, 0.0, self.puck.height / 2)
+        return np.add(self._tool_offset(), (0.0, 0.0, self.puck.height / 2))
 
     def _sample(self, rng: np.random.Generator, region: Region) -> FloatArray:
         point = workspace.sample(rng, region, rewards.SAFE_CONDITIONING)
-        return _MOUNT.to_world(point) - self._tool_offset()
+        return np.asarray(_MOUNT.to_world(point) - self._tool_offset())
 
 
 def make(name: str, reward: str) -> Task:
@@ -279,7 +280,7 @@ def _sample_apart(
     """A safe goal (world) whose distance from ``start`` is at least MIN_SEPARATION."""
     while True:
         point = workspace.sample(rng, region, rewards.SAFE_CONDITIONING)
-        goal = _MOUNT.to_world(point) - np.asarray(tool_offset)
+        goal: FloatArray = _MOUNT.to_world(point) - np.asarray(tool_offset)
         if not rewards.distance(goal, start) < MIN_SEPARATION:
             return goal
 
@@ -295,10 +296,15 @@ def _check_reach(name: str, value: ArrayLike, tool_offset: FloatArray) -> FloatA
     place = _MOUNT.to_paper(point + tool_offset)
     margin = TASK_REGION.margin(place)
     if margin < -1e-9:
-        corners = [_MOUNT.to_world(corner) - tool_offset for corner in (TASK_REGION.low, TASK_REGION.high)]
+        corners = [
+            _MOUNT.to_world(corner) - tool_offset for corner in (TASK_REGION.low, TASK_REGION.high)
+        ]
         low, high = np.min(corners, axis=0).round(4), np.max(corners, axis=0).round(4)
         raise UnreachableError(
-            tuple(point), "box", margin, f"{name} must lie between {low.tolist()} and {high.tolist()} m"
+            tuple(point),
+            "box",
+            margin,
+            f"{name} must lie between {low.tolist()} and {high.tolist()} m",
         )
     return point
 
@@ -314,6 +320,6 @@ def _top(state: State) -> FloatArray:
 
 
 def _axis(quaternion: FloatArray) -> FloatArray:
-    """z axis of a body, (..., 3), from its orientation (..., 4) as (x, y, z, w)."""
+    """Axis z of a body, (..., 3), from its orientation (..., 4) as (x, y, z, w)."""
     x, y, z, w = np.moveaxis(quaternion, -1, 0)
     return np.stack([2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)], axis=-1)

@@ -14,7 +14,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from xml.etree import ElementTree
 
-from tpm_gym.mechanism import ACTUATED_JOINTS, Link, Mechanism, Solid, build
+from tpm_gym.mechanism import ACTUATED_JOINTS, Mechanism, build
+from tpm_gym.parts import Link, Solid
 
 __all__ = ["COLOURS", "LOOPS_FILE", "URDF_FILE", "loops_text", "urdf_text", "write"]
 
@@ -44,9 +45,7 @@ _AXIS_RPY = {
 def urdf_text(mechanism: Mechanism) -> str:
     """The spanning tree as URDF, in the paper frame."""
     root = ElementTree.Element("robot", name="tpm")
-    root.append(
-        ElementTree.Comment(" Generated from tpm_gym.mechanism; do not edit (make urdf). ")
-    )
+    root.append(ElementTree.Comment(" Generated from tpm_gym.mechanism; do not edit (make urdf). "))
     for name, rgba in COLOURS.items():
         material = ElementTree.SubElement(root, "material", name=name)
         ElementTree.SubElement(material, "color", rgba=_numbers(rgba))
@@ -96,7 +95,14 @@ def _link_element(link: Link) -> ElementTree.Element:
     ElementTree.SubElement(inertial, "origin", xyz=_numbers(link.centre_of_mass), rpy="0 0 0")
     ElementTree.SubElement(inertial, "mass", value=_number(link.mass))
     moments = link.inertia
-    names = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
+    names = {
+        "ixx": (0, 0),
+        "ixy": (0, 1),
+        "ixz": (0, 2),
+        "iyy": (1, 1),
+        "iyz": (1, 2),
+        "izz": (2, 2),
+    }
     ElementTree.SubElement(
         inertial, "inertia", {name: _number(moments[at]) for name, at in names.items()}
     )

@@ -1,0 +1,98 @@
+"""The vacuum cup: it seals on contact, holds up to a force, and lets go.
+
+The client is handed in (see :mod:`tpm_gym.simulation`), so this module does not import the engine.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from tpm_gym.mechanism import CUP_RADIUS
+from tpm_gym.physics import PULL_OFF_FORCE, SEAL_GAP, SEAL_TILT, rotations
+from tpm_gym.robot import Robot
+from tpm_gym.state import Puck
+
+__all__ = ["Cup", "Pose"]
+
+Pose = tuple[tuple[float, ...], tuple[float, ...]]
+"""Position (m) and orientation (x, y, z, w)."""
+
+
+class Cup:
+    """The cup on a robot's platform, and the one object that it can hold.
+
+    Args:
+        client: The physics client.
+        robot: Whose platform carries the cup.
+        body: The object's number in the client.
+        puck: What the object is.
+    """
+
+    def __init__(self, client: Any, robot: Robot, body: int, puck: Puck) -> None:
+        """Start with nothing held."""
+        self._client, self._robot, self._body, self._puck = client, robot, body, puck
+        self._constraint: int | None = None
+        self.grip: Pose | None = None
+        """Pose of the held object in the platform's inertial frame, None if nothing is held."""
+
+    def suck(self) -> None:
+        """With the vacuum on: drop an object that was pulled off, take one that is touched."""
+        sealed = self._sealed()
+        if self.grip is not None and not sealed:
+            self.let_go()
+        elif self.grip is None and sealed:
+            self.take(self._relative_pose())
+
+    def take(self, grip: Pose) -> None:
+        """Fix the object to the platform at ``grip``."""
+        constraint = self._client.createConstraint(
+            self._robot.body,
+            self._robot.platform,
+            self._body,
+            -1,
+            self._client.JOINT_FIXED,
+            (0.0, 0.0, 0.0),
+            grip[0],
+            (0.0, 0.0, 0.0),
+            grip[1],
+        )
+        # Beyond this force the constraint yields, the lip lifts off, and the next check lets go.
+        self._client.changeConstraint(constraint, maxForce=PULL_OFF_FORCE)
+        self._collide(False)
+        self._constraint, self.grip = constraint, grip
+
+    def let_go(self) -> None:
+        """Release the object, if one is held."""
+        if self._constraint is not None:
+            self._client.removeConstraint(self._constraint)
+            self._collide(True)
+        self._constraint = self.grip = None
+
+    def _sealed(self) -> bool:
+        """Whether the whole lip lies on the top face of the puck."""
+        lip, axis = self._robot.cup()
+        position, quaternion = self._client.getBasePositionAndOrientation(self._body)
+        turn = rotations(np.array([quaternion]))[0]
+        local = turn.T @ (lip - np.array(position))
+        gap = float(local[2]) - self._puck.height / 2
+        covered = float(np.hypot(local[0], local[1])) <= self._puck.radius - CUP_RADIUS
+        aligned = float(-turn[:, 2] @ axis) >= np.cos(SEAL_TILT)
+        return abs(gap) <= SEAL_GAP and covered and aligned
+
+    def _relative_pose(self) -> Pose:
+        """Pose of the object in the platform's inertial frame, as it is now."""
+        state = self._client.getLinkState(
+            self._robot.body, self._robot.platform, computeForwardKinematics=True
+        )
+        inverse = self._client.invertTransform(state[0], state[1])
+        pose = self._client.getBasePositionAndOrientation(self._body)
+        relative: Pose = self._client.multiplyTransforms(*inverse, *pose)
+        return relative
+
+    def _collide(self, enable: bool) -> None:
+        # Contact and vacuum would fight over the same surface.
+        self._client.setCollisionFilterPair(
+            self._robot.body, self._body, self._robot.platform, -1, int(enable)
+        )

@@ -1,0 +1,84 @@
+"""Numerical settings of the engine, the vacuum's limits, and the path between two commands."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tpm_gym.errors import ConfigurationError
+
+__all__ = ["Physics", "rotations", "spline_weights"]
+
+FloatArray = NDArray[np.float64]
+
+GRAVITY = 9.81  # m/s^2
+MOTOR_GAIN = 1.0
+"""Share of the position error that a motor takes out in one time step, effort permitting."""
+PULL_OFF_FORCE = 12.0
+"""Largest force that the cup holds, N: 60 kPa of vacuum on the area of the lip."""
+SEAL_GAP = 0.002
+"""Largest gap between lip and object that the vacuum closes, m."""
+SEAL_TILT = np.deg2rad(10.0)
+"""Largest angle between the cup's axis and the object's that the lip follows, rad."""
+CLOSURE_LIMIT = 0.005
+"""A loop that is open by more than this is lost, m."""
+ASSEMBLY_LIMIT = 0.010
+"""Platform against forward kinematics: farther apart, the mechanism is assembled otherwise, m."""
+
+
+@dataclass(frozen=True)
+class Physics:
+    """Numerical settings of the engine.
+
+    Attributes:
+        time_step: s.
+        iterations: Iterations of the sequential-impulse solver a step.
+        erp: Share of a constraint's error that is taken out in one step, in (0, 1].
+        control_period: s between two commands; a whole number of time steps.
+
+    Raises:
+        ConfigurationError: If a value is out of range.
+    """
+
+    time_step: float = 1 / 500
+    iterations: int = 50
+    erp: float = 0.8
+    control_period: float = 1 / 25
+
+    def __post_init__(self) -> None:
+        """Reject settings that cannot work."""
+        if not 0 < self.time_step <= self.control_period:
+            valid = f"0 < time_step <= control_period = {self.control_period}"
+            raise ConfigurationError("time_step", self.time_step, valid)
+        ratio = self.control_period / self.time_step
+        if abs(ratio - round(ratio)) > 1e-6:
+            valid = f"a whole fraction of control_period = {self.control_period}"
+            raise ConfigurationError("time_step", self.time_step, valid)
+        if self.iterations < 1:
+            raise ConfigurationError("iterations", self.iterations, "1 or more")
+        if not 0 < self.erp <= 1:
+            raise ConfigurationError("erp", self.erp, "0 < erp <= 1")
+
+    @property
+    def substeps(self) -> int:
+        """Time steps in a control period."""
+        return round(self.control_period / self.time_step)
+
+
+def spline_weights(substeps: int) -> FloatArray:
+    """(substeps, 3) weights of the last three commands along the quadratic B-spline."""
+    s = np.arange(1, substeps + 1) / substeps
+    return np.stack([(1 - s) ** 2, 1 + 2 * s - 2 * s**2, s**2], axis=1) / 2
+
+
+def rotations(quaternions: FloatArray) -> FloatArray:
+    """Rotation matrices (n, 3, 3) of unit quaternions (n, 4), (x, y, z, w)."""
+    x, y, z, w = quaternions.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)
