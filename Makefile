@@ -1,0 +1,52 @@
+# Everything a developer or CI runs. `make help` lists the targets.
+PYTHON ?= python3
+VENV := .venv
+RUN := $(VENV)/bin/python
+INSTALLED := $(VENV)/.installed
+
+.PHONY: help demo test lint format test-fast test-slow urdf pictures clean
+.DEFAULT_GOAL := help
+
+help: ## list the targets
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
+
+$(INSTALLED): pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(RUN) -m pip install --upgrade pip
+	$(RUN) -m pip install -c constraints.txt -e ".[train,test]"
+	touch $@
+
+demo: $(INSTALLED) ## train Reach, evaluate it, let the expert pick and place; see runs/demo/
+	$(RUN) train/train.py --env TPMReach-v0 --algo sac --seed 0 --run runs/demo/reach --overwrite
+	$(RUN) train/evaluate.py --policy runs/demo/reach/best.zip expert random \
+		--env TPMReach-v0 --episodes 100 --json runs/demo/reach.json --video runs/demo/reach.mp4
+	$(RUN) train/evaluate.py --policy expert --env TPMPickAndPlace-v0 --episodes 20 \
+		--json runs/demo/pick_and_place.json --video runs/demo/pick_and_place.mp4 \
+		--picture runs/demo/pick_and_place.png
+	@echo; echo "runs/demo/ now holds:"; ls runs/demo runs/demo/reach
+
+test: lint test-fast ## what CI runs: lint, types, fast tests
+
+lint: $(INSTALLED)
+	$(RUN) -m ruff check .
+	$(RUN) -m ruff format --check .
+	$(RUN) -m mypy
+
+format: $(INSTALLED) ## rewrite the code in the house style
+	$(RUN) -m ruff check --fix .
+	$(RUN) -m ruff format .
+
+test-fast: $(INSTALLED)
+	$(RUN) -m pytest -q
+
+test-slow: $(INSTALLED) ## tests that take minutes: 1000 expert episodes, training to success
+	$(RUN) -m pytest -q -m slow
+
+urdf: $(INSTALLED) ## regenerate urdf/ from the mechanism
+	$(RUN) -m tpm_gym.urdf urdf
+
+pictures: $(INSTALLED) ## redraw docs/images/
+	$(RUN) docs/draw_pictures.py
+
+clean: ## remove the environment and everything generated
+	rm -rf $(VENV) runs dist build .pytest_cache .mypy_cache .ruff_cache .hypothesis
