@@ -36,6 +36,9 @@ class Cup:
         self._constraint: int | None = None
         self.grip: Pose | None = None
         """Pose of the held object in the platform's inertial frame, None if nothing is held."""
+        # The engine orders contacts otherwise once a pair has an entry of its own in the filter;
+        # with the entry from the start, the first episode equals all later ones to the last bit.
+        self._collide(True)
 
     def suck(self) -> None:
         """With the vacuum on: drop an object that was pulled off, take one that is touched."""
