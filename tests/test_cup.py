@@ -1,0 +1,130 @@
+import numpy as np
+import pytest
+
+from tpm_gym import kinematics
+from tpm_gym.mechanism import CUP_LENGTH
+from tpm_gym.simulation import Simulation
+from tpm_gym.state import Puck, Scene
+
+PLACE = np.array([-0.04, 0.028])  # x, y of the puck and of P, paper frame
+
+
+def level(height):
+    """Point P (paper frame) with the lip at ``height`` above the table."""
+    return np.array([*PLACE, 0.97 - height - CUP_LENGTH])
+
+
+def start(puck=None, offset=(0.0, 0.0), height=0.10):
+    puck = puck or Puck()
+    simulation = Simulation(Scene(puck=puck))
+    position = (PLACE[0] + offset[0], -PLACE[1] + offset[1], puck.height / 2)
+    simulation.reset(kinematics.inverse(level(height)), position)
+    return simulation
+
+
+def go(simulation, height, steps, vacuum):
+    for _ in range(steps):
+        state = simulation.move(level(height), vacuum)
+    return state
+
+
+def test_it_takes_what_it_touches_lifts_it_and_lets_go():
+    simulation = start(height=0.05)
+    assert not go(simulation, 0.04, 3, vacuum=True).holding  # 10 mm above: nothing to suck on
+    assert go(simulation, 0.03, 4, vacuum=True).holding
+    lifted = go(simulation, 0.06, 8, vacuum=True)
+    lifted = go(simulation, 0.09, 8, vacuum=True)
+    assert lifted.holding
+    assert lifted.object_position[2] == pytest.approx(0.075, abs=2e-3)
+    dropped = simulation.move(level(0.09), vacuum=False)
+    assert not dropped.holding
+    assert go(simulation, 0.09, 15, vacuum=False).object_position[2] == pytest.approx(
+        0.015, abs=1e-3
+    )
+    simulation.close()
+
+
+def test_without_vacuum_nothing_is_held():
+    simulation = start(height=0.05)
+    assert not go(simulation, 0.03, 4, vacuum=False).holding
+    assert go(simulation, 0.06, 6, vacuum=False).object_position[2] == pytest.approx(
+        0.015, abs=1e-3
+    )
+    simulation.close()
+
+
+@pytest.mark.parametrize(("offset", "seals"), [(0.0, True), (0.008, True), (0.014, False)])
+def test_the_whole_lip_must_lie_on_the_puck(offset, seals):
+    simulation = start(offset=(offset, 0.0), height=0.05)
+    assert go(simulation, 0.031, 4, vacuum=True).holding is seals
+    simulation.close()
+
+
+def test_the_puck_does_not_jump_when_it_is_taken():
+    simulation = start(offset=(0.006, 0.004), height=0.05)
+    before = go(simulation, 0.031, 4, vacuum=True)
+    after = go(simulation, 0.031, 3, vacuum=True)
+    assert after.holding
+    assert np.linalg.norm(after.object_position - before.object_position) < 1e-3
+    simulation.close()
+
+
+@pytest.mark.parametrize(("mass", "lifted"), [(0.05, True), (0.8, True), (2.0, False)])
+def test_the_pull_off_force_decides_what_can_be_lifted(mass, lifted):
+    # The cup holds 12 N: 1.22 kg at rest, less what acceleration takes.
+    simulation = start(Puck(mass=mass), height=0.05)
+    assert go(simulation, 0.03, 4, vacuum=True).holding
+    for height in np.arange(0.03, 0.07, 0.002):
+        state = simulation.move(level(height), vacuum=True)
+    assert state.holding is lifted
+    assert bool(state.object_position[2] > 0.04) is lifted
+    simulation.close()
+
+
+def test_a_held_puck_stays_put_at_full_speed():
+    simulation = start(height=0.05)
+    go(simulation, 0.03, 4, vacuum=True)
+    go(simulation, 0.06, 5, vacuum=True)
+    state = simulation.read()
+    grip = state.object_position - state.platform_position
+    point = level(0.06)
+    for step in (1, 1, 1, -1, -1, -1, 1, -1, 1, -1):
+        point = point + (0.03 * step, 0.0, -0.02 * step)
+        state = simulation.move(point, vacuum=True)
+        assert state.holding
+        assert np.linalg.norm(state.object_position - state.platform_position - grip) < 2e-3
+    assert state.closure_error < 0.5e-3
+    simulation.close()
+
+
+def test_pressing_on_the_puck_does_not_open_the_loops():
+    simulation = start(height=0.05)
+    for _ in range(10):
+        state = simulation.move(level(0.015), vacuum=False)  # 15 mm below its top
+    assert state.closure_error < 2e-3
+    simulation.close()
+
+
+def test_a_reset_while_holding_lets_go():
+    simulation = start(height=0.05)
+    assert go(simulation, 0.03, 4, vacuum=True).holding
+    state = simulation.reset(kinematics.inverse(level(0.1)), (0.0, -0.03, 0.015))
+    assert not state.holding
+    state = go(simulation, 0.1, 5, vacuum=True)
+    assert np.allclose(state.object_position, (0.0, -0.03, 0.015), atol=1e-3)
+    simulation.close()
+
+
+def test_a_snapshot_remembers_the_grasp():
+    simulation = start(height=0.05)
+    go(simulation, 0.03, 4, vacuum=True)
+    held = go(simulation, 0.06, 5, vacuum=True)
+    snapshot = simulation.save()
+    go(simulation, 0.06, 10, vacuum=False)
+    again = simulation.restore(snapshot)
+    assert again.holding
+    assert np.allclose(again.object_position, held.object_position, atol=1e-9)
+    state = go(simulation, 0.06, 5, vacuum=True)
+    assert state.holding
+    assert np.allclose(state.object_position, held.object_position, atol=1e-3)
+    simulation.close()

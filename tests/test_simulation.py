@@ -1,0 +1,221 @@
+import numpy as np
+import pytest
+
+from tpm_gym import jacobian, kinematics
+from tpm_gym.errors import (
+    AssemblyModeError,
+    ClosureError,
+    ConfigurationError,
+    InputError,
+    UnreachableError,
+)
+from tpm_gym.physics import Physics
+from tpm_gym.simulation import Simulation
+from tpm_gym.state import Puck, Scene
+from tpm_gym.workspace import TASK_REGION
+
+HOME = np.array([-0.04, 0.028, 0.80])
+
+
+@pytest.fixture
+def simulation():
+    simulation = Simulation(Scene())
+    yield simulation
+    simulation.close()
+
+
+@pytest.fixture
+def with_puck():
+    simulation = Simulation(Scene(puck=Puck()))
+    yield simulation
+    simulation.close()
+
+
+def random_commands(seed, count):
+    """Excursions at full speed over the whole region."""
+    rng = np.random.default_rng(seed)
+    command = HOME
+    for _ in range(count):
+        command = TASK_REGION.project(command + rng.choice([-1, 0, 1], 3) * (0.03, 0.005, 0.03))
+        yield command
+
+
+def follow(simulation, commands):
+    return [simulation.move(command) for command in commands]
+
+
+def test_a_reset_closes_all_loops_at_the_forward_kinematics(simulation):
+    rng = np.random.default_rng(0)
+    for point in rng.uniform(TASK_REGION.low, TASK_REGION.high, (50, 3)):
+        state = simulation.reset(kinematics.inverse(point))
+        assert state.closure_error < 1e-6
+        assert np.allclose(state.platform_position, simulation.mount.to_world(point), atol=1e-6)
+        assert np.allclose(state.fk_position, simulation.mount.to_world(point), atol=1e-9)
+        assert state.platform_tilt < 1e-5
+        assert np.array_equal(state.theta_dot, np.zeros(3))
+
+
+def test_loops_stay_closed_and_the_platform_stays_at_the_forward_kinematics(simulation):
+    simulation.reset(kinematics.inverse(HOME))
+    for command in random_commands(1, 400):
+        state = simulation.move(command)
+        assert state.closure_error < 0.3e-3
+        assert np.rad2deg(state.platform_tilt) < 0.1
+        apart = np.linalg.norm(state.platform_position - state.fk_position)
+        assert apart < (1e-3 if state.conditioning > 0.08 else 3e-3)
+
+
+def test_the_platform_comes_to_rest_at_the_command(simulation):
+    simulation.reset(kinematics.inverse(HOME))
+    target = np.array([0.05, 0.035, 0.72])
+    for _ in range(40):
+        state = simulation.move(HOME + np.clip(target - HOME, -0.2, 0.2))
+    assert np.allclose(state.platform_position, simulation.mount.to_world(target), atol=2e-4)
+    assert np.allclose(state.command, simulation.mount.to_world(target), atol=1e-12)
+    assert np.abs(state.theta_dot).max() < 1e-3
+
+
+def test_encoder_rates_and_platform_velocity_obey_the_jacobian(simulation):
+    simulation.reset(kinematics.inverse(HOME))
+    before = None
+    for step in range(12):
+        state = simulation.move(HOME + (0.01 * step, 0.0, -0.005 * step))
+        velocity = simulation.mount.rotate(jacobian.velocity(state.theta) @ state.theta_dot)
+        assert np.allclose(state.fk_velocity, velocity)
+        if before is not None and step > 4:
+            mean = (state.platform_position - before.platform_position) / 0.04
+            assert np.allclose(mean, [0.25, 0.0, 0.125], atol=5e-3)
+            assert np.allclose(state.fk_velocity, [0.25, 0.0, 0.125], atol=2e-2)
+        before = state
+
+
+def test_an_encoder_error_moves_the_forward_kinematics_and_not_the_platform():
+    bias = np.array([1e-3, -5e-4, 8e-4])
+    states = []
+    for encoder_bias in (np.zeros(3), bias):
+        simulation = Simulation(Scene(), encoder_bias=encoder_bias)
+        states.append(simulation.reset(kinematics.inverse(HOME)))
+        simulation.close()
+    honest, biased = states
+    assert np.array_equal(honest.platform_position, biased.platform_position)
+    expected = honest.fk_position + (1, -1, -1) * (jacobian.velocity(honest.theta) @ bias)
+    assert np.allclose(biased.fk_position, expected, atol=1e-4)
+    assert np.linalg.norm(biased.fk_position - honest.fk_position) > 5e-4
+
+
+def test_a_loop_that_opens_is_reported():
+    simulation = Simulation(Scene())
+    simulation.reset(kinematics.inverse(HOME))
+    client = simulation._client
+    client.removeConstraint(client.getConstraintUniqueId(0))
+    with pytest.raises(ClosureError) as caught:
+        follow(simulation, random_commands(2, 100))
+    assert caught.value.gap > caught.value.limit
+    simulation.close()
+
+
+def test_going_through_the_singularity_is_reported_and_a_reset_recovers(simulation):
+    simulation.reset(kinematics.inverse(HOME))
+    across = [(HOME[0], y, HOME[2]) for y in np.arange(0.028, -0.03, -0.002)]
+    with pytest.raises(AssemblyModeError) as caught:
+        follow(simulation, across)
+    assert caught.value.distance > caught.value.limit
+    state = simulation.reset(kinematics.inverse(HOME))
+    assert state.closure_error < 1e-6
+    assert simulation.move(HOME).closure_error < 1e-4
+
+
+def test_an_unreachable_command_raises_and_moves_nothing(simulation):
+    simulation.reset(kinematics.inverse(HOME))
+    before = simulation.read()
+    with pytest.raises(UnreachableError):
+        simulation.move((0.0, 0.2, 0.8))
+    with pytest.raises(InputError):
+        simulation.move((np.nan, 0.02, 0.8))
+    after = simulation.read()
+    assert np.array_equal(before.theta, after.theta)
+    assert np.array_equal(before.command, after.command)
+
+
+def test_an_unreachable_reset_raises(simulation):
+    with pytest.raises(UnreachableError):
+        simulation.reset((-1.5, 1.5, 1.5))
+
+
+def test_the_puck_falls_with_g_and_comes_to_rest_on_the_table(with_puck):
+    with_puck.reset(kinematics.inverse(HOME), (0.2, -0.02, 0.5))
+    heights = [with_puck.move(HOME).object_position[2] for _ in range(40)]
+    t = 0.04 * np.arange(1, 6)
+    # Semi-implicit Euler falls g t dt / 2 further than the parabola.
+    fallen = 9.81 * (t**2 + t * with_puck.physics.time_step) / 2
+    assert np.allclose(0.5 - np.array(heights[:5]), fallen, atol=1e-5)
+    assert heights[-1] == pytest.approx(0.015, abs=5e-4)
+
+
+def test_clients_do_not_see_each_other(simulation):
+    other = Simulation(Scene())
+    simulation.reset(kinematics.inverse(HOME))
+    other.reset(kinematics.inverse(HOME))
+    before = simulation.read()
+    for command in random_commands(3, 5):
+        other.move(command)
+    assert np.array_equal(simulation.read().theta, before.theta)
+    other.close()
+    assert simulation.move(HOME).closure_error < 1e-4
+
+
+def test_closing_twice_is_harmless_and_clients_are_given_back():
+    for _ in range(60):
+        simulation = Simulation(Scene())
+        simulation.close()
+        simulation.close()
+
+
+def test_a_snapshot_continues_the_motion(with_puck):
+    commands = list(random_commands(4, 30))
+    with_puck.reset(kinematics.inverse(HOME), (0.0, -0.03, 0.015))
+    for command in commands[:15]:
+        with_puck.move(command)
+    snapshot = with_puck.save()
+    expected = [with_puck.move(command) for command in commands[15:]]
+    with_puck.reset(kinematics.inverse(HOME), (0.05, -0.03, 0.015))
+    with_puck.restore(snapshot)
+    for command, state in zip(commands[15:], expected, strict=True):
+        again = with_puck.move(command)
+        assert np.allclose(again.theta, state.theta, atol=1e-6)
+        assert np.allclose(again.object_position, state.object_position, atol=1e-4)
+
+
+def test_pictures_show_the_scene_and_the_goal_marker(simulation):
+    simulation.reset(kinematics.inverse(HOME), goal=(0.0, -0.03, 0.2))
+    first = simulation.render(160, 120)
+    assert first.shape == (120, 160, 3)
+    assert first.dtype == np.uint8
+    assert first.std() > 20
+    simulation.show_goal((0.1, -0.03, 0.3))
+    second = simulation.render(160, 120)
+    changed = (first != second).any(axis=-1).mean()
+    assert 0.0 < changed < 0.05
+    # Equal states give equal pictures.
+    assert np.array_equal(second, simulation.render(160, 120))
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"time_step": 0.0}, {"time_step": 0.003}, {"iterations": 0}, {"erp": 0.0}, {"erp": 1.5}],
+)
+def test_physics_that_cannot_work_are_refused(settings):
+    with pytest.raises(ConfigurationError) as caught:
+        Physics(**settings)
+    assert caught.value.name == next(iter(settings))
+
+
+def test_more_solver_iterations_close_the_loops_better():
+    gaps = []
+    for iterations in (25, 50, 200):
+        simulation = Simulation(Scene(), physics=Physics(iterations=iterations))
+        simulation.reset(kinematics.inverse(HOME))
+        gaps.append(np.mean([simulation.move(c).closure_error for c in random_commands(5, 60)]))
+        simulation.close()
+    assert gaps[0] > 1.5 * gaps[1]
+    assert gaps[1] > 3 * gaps[2]
