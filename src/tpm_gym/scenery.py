@@ -135,7 +135,7 @@ class Scenery:
             viewMatrix=view,
             projectionMatrix=projection,
             lightDirection=(1.0, -1.2, 2.5),
-            shadow=1,
+            shadow=0,  # the software renderer blotches large faces with its shadow map
             renderer=renderer,
         )
         pixels = np.asarray(image[2], dtype=np.uint8).reshape(height, width, 4)

@@ -22,7 +22,7 @@ __all__ = ["COLOURS", "LOOPS_FILE", "URDF_FILE", "loops_text", "urdf_text", "wri
 URDF_FILE, LOOPS_FILE = "tpm.urdf", "tpm.loops.yaml"
 
 COLOURS = {
-    "white": (0.93, 0.94, 0.95, 1.0),
+    "white": (0.72, 0.76, 0.82, 1.0),
     "light": (0.80, 0.83, 0.87, 1.0),
     "grey": (0.55, 0.57, 0.60, 1.0),
     "steel": (0.62, 0.65, 0.70, 1.0),

@@ -1,0 +1,67 @@
+"""Draw the pictures of the README: the expert picking and placing, as a strip of frames.
+
+python docs/draw_pictures.py
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+import tpm_gym  # noqa: F401  # registers the ids
+from tpm_gym.expert import Expert
+
+IMAGES = Path(__file__).parent / "images"
+START, GOAL = (-0.16, -0.034, 0.015), (0.08, -0.030, 0.015)
+FRAMES = {0: "start", 13: "vacuum on: the cup seals", 24: "carrying", 40: "placed, vacuum off"}
+SIZE, SUPERSAMPLING = 380, 3
+CROP = (0.06, 0.0, 0.99, 0.94)  # left, top, right, bottom of the rendered picture
+
+
+def frames() -> dict[int, Image.Image]:
+    """Render the steps of an episode that FRAMES names."""
+    side = SIZE * SUPERSAMPLING
+    env = gym.make("TPMPickAndPlace-v0", render_mode="rgb_array", width=side, height=side)
+    observation, _ = env.reset(seed=0, options={"object": START, "goal": GOAL})
+    expert = Expert(env)
+    expert.reset(observation)
+    pictures = {}
+    for step in range(max(FRAMES) + 1):
+        if step in FRAMES:
+            picture = np.asarray(env.render())
+            pictures[step] = Image.fromarray(picture)
+        observation, *_ = env.step(expert.act(observation))
+    env.close()
+    return pictures
+
+
+def strip(pictures: dict[int, Image.Image]) -> Image.Image:
+    """Crop, shrink and caption the frames, and put them side by side."""
+    font = ImageFont.load_default(size=16)
+    width, height = int(SIZE * (CROP[2] - CROP[0])), int(SIZE * (CROP[3] - CROP[1]))
+    gap, caption = 8, 30
+    sheet = Image.new("RGB", (len(pictures) * (width + gap) - gap, height + caption), "white")
+    draw = ImageDraw.Draw(sheet)
+    for column, (step, picture) in enumerate(pictures.items()):
+        left, top, right, bottom = (edge * picture.width for edge in CROP)
+        cropped = picture.crop((int(left), int(top), int(right), int(bottom)))
+        x = column * (width + gap)
+        sheet.paste(cropped.resize((width, height), Image.Resampling.LANCZOS), (x, 0))
+        text = f"{0.04 * step:.2f} s: {FRAMES[step]}"
+        draw.text((x + width / 2, height + caption / 2), text, "black", font, anchor="mm")
+    return sheet
+
+
+def main() -> None:
+    """Write docs/images/pick_and_place.png."""
+    IMAGES.mkdir(exist_ok=True)
+    path = IMAGES / "pick_and_place.png"
+    strip(frames()).save(path, optimize=True)
+    print(path)
+
+
+if __name__ == "__main__":
+    main()
