@@ -69,6 +69,7 @@ def test_the_penalty_grows_towards_the_singularity_and_follows_the_weight():
         assert info["conditioning"] < 0.08
         assert info["singularity_penalty"] == float(singularity_penalty(info["conditioning"]))
         assert info["singularity_penalty"] > 0.1
+        assert sum(info["reward_terms"].values()) == pytest.approx(reward)
         rewards.append(reward)
         env.close()
     assert rewards[0] - rewards[1] == pytest.approx(info["singularity_penalty"])

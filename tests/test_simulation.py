@@ -152,6 +152,20 @@ def test_the_puck_falls_with_g_and_comes_to_rest_on_the_table(with_puck):
     assert heights[-1] == pytest.approx(0.015, abs=5e-4)
 
 
+@pytest.mark.parametrize("drift", [0.0, 0.002])
+def test_a_reset_forgets_old_contacts(with_puck, drift):
+    place = (HOME[0], -HOME[1], 0.015)
+    outcomes = []
+    for _ in range(2):
+        with_puck.reset(kinematics.inverse(HOME), place)
+        # Down onto the puck, perhaps pushing it sideways: contacts of all kinds are on record.
+        for step in range(12):
+            state = with_puck.move(HOME + (drift * step, 0.0, min(0.1, 0.03 * step)))
+        outcomes.append(np.concatenate([state.object_position, state.object_quaternion]))
+        follow(with_puck, [HOME] * 6)
+    assert np.array_equal(*outcomes)
+
+
 def test_clients_do_not_see_each_other(simulation):
     other = Simulation(Scene())
     simulation.reset(kinematics.inverse(HOME))

@@ -1,0 +1,59 @@
+"""What the README shows has to run, and its commands have to exist."""
+
+import re
+import subprocess
+import textwrap
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+
+import tpm_gym
+
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def blocks(language):
+    pattern = rf"^( *)```{language}\n(.*?)^ *```"
+    found = re.finditer(pattern, README, flags=re.MULTILINE | re.DOTALL)
+    return [textwrap.dedent(match.group(2)) for match in found]
+
+
+def test_the_python_blocks_run():
+    namespace = {}
+    for block in blocks("python"):
+        exec(block, namespace)
+    namespace["env"].close()
+    assert namespace["info"]["closure_error"] < 1e-3
+
+
+def test_the_numbers_in_the_kinematics_block_are_right():
+    block = next(block for block in blocks("python") if "kinematics.inverse" in block)
+    namespace = {}
+    exec(block, namespace)
+    theta, jacobian, kinematics = (namespace[n] for n in ("theta", "jacobian", "kinematics"))
+    printed = float(re.search(r"conditioning\(theta\)\s+# ([\d.]+)", block).group(1))
+    assert jacobian.conditioning(theta) == pytest.approx(printed, abs=5e-4)
+    assert np.allclose(kinematics.forward(theta), [-0.04, 0.028, 0.80])
+    assert kinematics.inverse_all([-0.04, 0.028, 0.80]).theta.shape == (16, 3)
+
+
+def test_every_id_in_the_readme_exists():
+    for env_id in re.findall(r"\bTPM\w+-v\d", README):
+        assert env_id in tpm_gym.ENV_IDS
+        assert env_id in gymnasium.registry
+
+
+def test_files_that_the_readme_links_to_exist():
+    for target in re.findall(r"\]\(([^)#]+)\)", README):
+        assert (ROOT / target).exists(), target
+
+
+def test_make_knows_the_commands():
+    targets = re.findall(r"^make ([\w-]+)", README, flags=re.MULTILINE)
+    assert targets == ["demo", "test"]
+    for target in targets:
+        command = ["make", "--dry-run", "--directory", str(ROOT), target]
+        subprocess.run(command, check=True, capture_output=True)
