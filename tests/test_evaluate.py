@@ -9,11 +9,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import imageio.v3 as imageio
+import numpy as np
 import pytest
 from rich.console import Console
 
 import evaluate
+import film
 import provenance
 from errors import ConfigError, PolicyError, UnknownEnvError
 
@@ -136,6 +139,8 @@ def test_several_policies_share_a_table_and_a_file(tmp_path: Path) -> None:
     assert "expert" in header
 
 
+# imageio-ffmpeg leaves a pipe to the collector where ffmpeg ends before its reader is closed.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_video_shows_the_first_episodes(tmp_path: Path) -> None:
     path = tmp_path / "films" / "expert.mp4"
     config = evaluate.Config(
@@ -159,8 +164,29 @@ def test_video_shows_the_first_episodes(tmp_path: Path) -> None:
     ],
 )
 def test_every_policy_gets_its_own_video(policies: tuple[str, ...], names: list[str]) -> None:
-    config = evaluate.Config(policy=policies, video=Path("films", "v.mp4"))
-    assert [path.name for path in evaluate._video_paths(config)] == names
+    paths = evaluate.paths_per_policy(Path("films", "v.mp4"), policies)
+    assert [path.name for path in paths] == names
+    assert all(path.parent == Path("films") for path in paths)
+
+
+def test_picture_shows_six_moments_of_the_first_episode(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "expert.png"
+    config = evaluate.Config(policy=("expert",), env="TPMReach-v0", episodes=1, picture=path)
+    evaluate.evaluate(config, quiet())
+    env = gym.make("TPMReach-v0", render_mode="rgb_array")
+    env.reset(seed=config.seed)
+    first = env.render()
+    env.close()
+    picture = imageio.imread(path)
+    height, width = first.shape[:2]
+    assert picture.shape == (2 * height, 3 * width, 3)
+    np.testing.assert_array_equal(picture[:height, :width], first)
+
+
+def test_contact_sheet_runs_from_the_first_frame_to_the_last() -> None:
+    frames = [np.full((1, 1, 3), value, np.uint8) for value in range(51)]
+    assert film.contact_sheet(frames)[..., 0].tolist() == [[0, 10, 20], [30, 40, 50]]
+    assert film.contact_sheet(frames[:1]).shape == (2, 3, 3)
 
 
 @pytest.mark.parametrize(

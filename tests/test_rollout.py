@@ -148,11 +148,10 @@ def test_same_seeds_same_records(reach: GoalEnv, spec: str) -> None:
 
 def test_expert_reaches_and_random_does_not(reach: GoalEnv) -> None:
     expert, chance = (
-        run_episodes(reach, load_policy(spec, reach), 10, TEST_SEED)
-        for spec in ("expert", "random")
+        run_episodes(reach, load_policy(spec, reach), 5, TEST_SEED) for spec in ("expert", "random")
     )
-    assert sum(record.success_at_end for record in expert) == 10
-    assert sum(record.success_at_end for record in chance) < 5
+    assert sum(record.success_at_end for record in expert) == 5
+    assert sum(record.success_at_end for record in chance) < 3
 
 
 def test_random_actions_fill_the_action_space(reach: GoalEnv) -> None:
@@ -195,9 +194,9 @@ def test_wilson_interval_holds_the_rate_at_both_ends() -> None:
 
 def test_bootstrap_interval_covers_the_true_mean() -> None:
     rng = np.random.default_rng(7)
-    estimates = [bootstrap(rng.exponential(2.0, 60).tolist()) for _ in range(60)]
+    estimates = [bootstrap(rng.exponential(2.0, 60).tolist()) for _ in range(200)]
     covered = np.mean([estimate.low <= 2.0 <= estimate.high for estimate in estimates])
-    assert 0.85 <= covered < 1
+    assert 0.88 <= covered <= 0.98
 
 
 def test_bootstrap_interval_has_the_width_of_the_normal_one() -> None:

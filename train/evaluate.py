@@ -1,4 +1,4 @@
-"""Evaluate policies over seeded episodes: a table, and optionally JSON and a video.
+"""Evaluate policies over seeded episodes: a table, and optionally JSON, a video and a picture.
 
     python train/evaluate.py --policy runs/TPMReach-v0-sac-s0 expert random --episodes 100
 
@@ -23,6 +23,7 @@ from rich.table import Table
 
 import provenance
 from errors import ConfigError, TrainError, UnknownEnvError
+from film import write_contact_sheet, write_video
 from policies import load_policy, trained_env
 from rollout import TEST_SEED, Episode, Estimate, GoalEnv, Policy, run_episodes, summarise
 
@@ -51,8 +52,7 @@ class Config:
     """Episodes per policy."""
 
     seed: int = TEST_SEED
-    """Seed of the first episode; the following ones count up. The default is met neither in
-    training nor in the evaluations that select a policy."""
+    """Seed of the first episode. The default is used neither in training nor to select policies."""
 
     json: Path | None = None
     """Write metrics, episodes and versions here."""
@@ -62,6 +62,9 @@ class Config:
 
     video_episodes: int = 3
     """Episodes in a video."""
+
+    picture: Path | None = None
+    """Write a PNG of six moments of the first episode here; several policies get a file each."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +108,8 @@ def evaluate(config: Config, console: Console | None = None) -> list[Result]:
     Raises:
         TrainError: An option is not valid, or a policy cannot be used.
     """
-    console = console or Console()
+    # A file has no margin at which a table would have to be folded.
+    console = console or Console(width=None if sys.stdout.isatty() else 200)
     _check(config)
     env_id = _resolve_env(config)
     env = _make_env(env_id)
@@ -118,10 +122,9 @@ def evaluate(config: Config, console: Console | None = None) -> list[Result]:
     console.print(_table(env_id, config, results))
     if config.json is not None:
         provenance.write_json(config.json, _description(env_id, config, results))
-    if config.video is not None:
-        for path, spec in zip(_video_paths(config), config.policy, strict=True):
-            _write_video(path, env_id, spec, config)
-            console.print(f"video: {path}", markup=False)
+        console.print(f"json: {config.json}", markup=False)
+    if config.video is not None or config.picture is not None:
+        _film(env_id, config, console)
     return results
 
 
@@ -190,9 +193,9 @@ def _table(env_id: str, config: Config, results: Sequence[Result]) -> Table:
         title=f"{env_id}: {config.episodes} episodes, seeds {config.seed} to {last}",
         caption="mean over episodes [95% interval]",
     )
-    table.add_column("metric")
+    table.add_column("metric", no_wrap=True)
     for result in results:
-        table.add_column(result.policy, justify="right")
+        table.add_column(result.policy, justify="right", overflow="fold")
     for label, name, factor, form, unit in _ROWS:
         cells = [_cell(result.metrics[name], factor, form, unit) for result in results]
         table.add_row(label, *cells)
@@ -237,40 +240,32 @@ def _description(env_id: str, config: Config, results: Sequence[Result]) -> dict
     }
 
 
-def _video_paths(config: Config) -> list[Path]:
+def paths_per_policy(path: Path, policies: Sequence[str]) -> list[Path]:
     """Return one file per policy, with the policy's name in it where there are several."""
-    video = config.video
-    if video is None:
-        return []
-    if len(config.policy) == 1:
-        return [video]
-    names = [Path(spec).stem for spec in config.policy]
+    if len(policies) == 1:
+        return [path]
+    names = [Path(spec).stem for spec in policies]
     if len(set(names)) < len(names):
         names = [f"{i + 1}-{name}" for i, name in enumerate(names)]
-    return [video.with_name(f"{video.stem}-{name}{video.suffix}") for name in names]
+    return [path.with_name(f"{path.stem}-{name}{path.suffix}") for name in names]
 
 
-def _write_video(path: Path, env_id: str, spec: str, config: Config) -> None:
+def _film(env_id: str, config: Config, console: Console) -> None:
     """Run the first episodes once more, with rendering, which would have slowed the metrics."""
-    import imageio.v2 as imageio
-
     env = _make_env(env_id, render_mode="rgb_array")
-
-    def write(part: Path) -> None:
-        fps = env.metadata["render_fps"]
-        # H.264 wants an even width and height, and no more than that.
-        writer: Any = imageio.get_writer(part, fps=fps, macro_block_size=2)
-        with writer as video:
-            run_episodes(
-                env,
-                load_policy(spec, env),
-                min(config.video_episodes, config.episodes),
-                config.seed,
-                on_frame=lambda: video.append_data(env.render()),
-            )
-
     try:
-        provenance.write_whole(path, write)
+        policies = [load_policy(spec, env) for spec in config.policy]
+        if config.video is not None:
+            episodes = min(config.video_episodes, config.episodes)
+            paths = paths_per_policy(config.video, config.policy)
+            for path, policy in zip(paths, policies, strict=True):
+                write_video(path, env, policy, episodes, config.seed)
+                console.print(f"video: {path}", markup=False)
+        if config.picture is not None:
+            paths = paths_per_policy(config.picture, config.policy)
+            for path, policy in zip(paths, policies, strict=True):
+                write_contact_sheet(path, env, policy, config.seed)
+                console.print(f"picture: {path}", markup=False)
     finally:
         env.close()
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-import yaml  # type: ignore[import-untyped]
+import yaml
 
 from errors import RecipeError
 
@@ -93,7 +93,13 @@ _OFF_POLICY: Final[_Rules] = {
         "goal_selection_strategy": _one_of("future", "final", "episode"),
     },
 }
-_Q_POLICY: Final[_Rules] = {"net_arch": _NET_ARCH, "n_critics": _COUNT, "log_std_init": _NUMBER}
+_POLICY: Final[_Rules] = {
+    "net_arch": _NET_ARCH,
+    "log_std_init": _NUMBER,
+    "features_extractor_class": _one_of("GoalGapExtractor"),
+    "features_extractor_kwargs": {"unit": _POSITIVE},
+}
+_Q_POLICY: Final[_Rules] = {**_POLICY, "n_critics": _COUNT}
 _RULES: Final[Mapping[str, _Rules]] = {
     "sac": {**_OFF_POLICY, "policy_kwargs": _Q_POLICY},
     "tqc": {
@@ -112,7 +118,7 @@ _RULES: Final[Mapping[str, _Rules]] = {
         "max_grad_norm": _POSITIVE,
         "normalize_advantage": _FLAG,
         "target_kl": _POSITIVE,
-        "policy_kwargs": {"net_arch": _NET_ARCH, "log_std_init": _NUMBER, "ortho_init": _FLAG},
+        "policy_kwargs": {**_POLICY, "ortho_init": _FLAG},
     },
 }
 _REQUIRED: Final = ("n_timesteps", "policy")

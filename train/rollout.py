@@ -30,6 +30,7 @@ GoalEnv: TypeAlias = gym.Env[Observation, Action]
 
 _Z95: Final = 1.959963984540054  # 97.5% quantile of the standard normal distribution
 _BOOTSTRAP_SAMPLES: Final = 2000
+_BOOTSTRAP_BLOCK: Final = 100
 _BOOTSTRAP_SEED: Final = 0  # fixed: the same records always give the same interval
 
 
@@ -222,10 +223,13 @@ def bootstrap(values: Sequence[float], worst: float | None = None) -> Estimate:
     """
     sample = np.asarray(values, dtype=np.float64)  # (n,)
     rng = np.random.default_rng(_BOOTSTRAP_SEED)
-    # One resample at a time: a matrix of all of them would not fit in memory for many episodes.
-    means = [
-        sample[rng.integers(0, sample.size, sample.size)].mean() for _ in range(_BOOTSTRAP_SAMPLES)
-    ]
+    # Not all resamples at once: with many episodes their matrix would not fit in memory.
+    means = np.concatenate(
+        [
+            sample[rng.integers(0, sample.size, (_BOOTSTRAP_BLOCK, sample.size))].mean(axis=1)
+            for _ in range(_BOOTSTRAP_SAMPLES // _BOOTSTRAP_BLOCK)
+        ]
+    )
     low, high = np.percentile(means, [2.5, 97.5])
     mean = float(sample.mean())
     # Equal values can differ from their mean by rounding; the interval must still hold the mean.

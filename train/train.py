@@ -44,8 +44,7 @@ class Config:
     """Environment steps, over all environments. Default: as the recipe says."""
 
     envs: int | None = None
-    """Parallel environments; more than one run in processes of their own. Default: as the recipe
-    says, else 1."""
+    """Parallel environments, in processes of their own if several. Default: as the recipe says."""
 
     recipe: Path | None = None
     """YAML file of hyperparameters by environment id. Default: train/recipes/<algo>.yml."""
@@ -272,6 +271,11 @@ def _make_model(plan: Plan, envs: Any) -> Any:
     from policies import algorithm_class
 
     arguments = dict(plan.recipe.arguments)
+    policy_kwargs = dict(arguments.get("policy_kwargs", {}))
+    if "features_extractor_class" in policy_kwargs:
+        from features import GoalGapExtractor
+
+        arguments["policy_kwargs"] = policy_kwargs | {"features_extractor_class": GoalGapExtractor}
     if plan.recipe.hindsight:
         from her import PenaltyHerReplayBuffer
 

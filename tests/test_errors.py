@@ -1,0 +1,125 @@
+"""Errors carry their values, say what is valid, and are caught as a caller would expect."""
+
+from __future__ import annotations
+
+import inspect
+import re
+
+import pytest
+
+from tpm_gym import errors
+from tpm_gym.errors import (
+    ActionError,
+    AssemblyModeError,
+    ClosureError,
+    ConfigurationError,
+    EpisodeError,
+    GeometryError,
+    InputError,
+    ResetOptionError,
+    SingularityError,
+    TPMError,
+    UnreachableError,
+)
+
+# One of each: the error, the built-in it stands for, its values, what its message must hold.
+CASES: list[tuple[TPMError, type[Exception], dict[str, object], list[str]]] = [
+    (
+        GeometryError("l4", -1.0, "it must be positive"),
+        ValueError,
+        {"name": "l4", "value": -1.0, "requirement": "it must be positive"},
+        ["l4", "-1.0", "it must be positive"],
+    ),
+    (
+        InputError("theta", (2,), "of shape (..., 3)"),
+        ValueError,
+        {"name": "theta", "value": (2,), "requirement": "of shape (..., 3)"},
+        ["theta", "(2,)", "of shape (..., 3)"],
+    ),
+    (
+        ActionError("action", "x", "finite"),
+        ValueError,
+        {"name": "action", "value": "x", "requirement": "finite"},
+        ["action", "'x'", "finite"],
+    ),
+    (
+        ConfigurationError("task", "fly", "'reach'"),
+        ValueError,
+        {"name": "task", "value": "fly", "valid": "'reach'"},
+        ["task", "'fly'", "'reach'"],
+    ),
+    (
+        ResetOptionError("goal", 3, "a point"),
+        ValueError,
+        {"name": "goal", "value": 3, "valid": "a point"},
+        ["goal", "3", "a point"],
+    ),
+    (EpisodeError("call reset() first"), RuntimeError, {}, ["call reset() first"]),
+    (
+        UnreachableError([0, 1, 2], "leg 3", -0.25, "go elsewhere"),
+        ValueError,
+        {"point": (0.0, 1.0, 2.0), "leg": "leg 3", "margin": -0.25, "unit": "m"},
+        ["(0, 1, 2)", "leg 3", "0.25 m", "go elsewhere"],
+    ),
+    (
+        UnreachableError([0, 1, 2], "loop 1", -0.5, "go elsewhere", "m^2"),
+        ValueError,
+        {"unit": "m^2", "margin": -0.5},
+        ["0.5 m^2"],
+    ),
+    (
+        SingularityError("sin(beta)", 1e-15),
+        ValueError,
+        {"factor": "sin(beta)", "value": 1e-15},
+        ["sin(beta)", "1e-15", "conditioning"],
+    ),
+    (
+        ClosureError(0.0123, 0.005),
+        RuntimeError,
+        {"gap": 0.0123, "limit": 0.005},
+        ["12.3 mm", "5 mm", "reset()"],
+    ),
+    (
+        AssemblyModeError(0.0345, 0.01),
+        RuntimeError,
+        {"distance": 0.0345, "limit": 0.01},
+        ["34.5 mm", "10 mm", "reset()"],
+    ),
+]
+LEAVES = [getattr(errors, name) for name in errors.__all__ if name != "TPMError"]
+
+
+@pytest.mark.parametrize(("error", "builtin", "values", "shown"), CASES)
+def test_errors_carry_their_values_and_show_them(
+    error: TPMError, builtin: type[Exception], values: dict[str, object], shown: list[str]
+) -> None:
+    assert isinstance(error, TPMError)
+    assert isinstance(error, builtin)
+    for name, value in values.items():
+        assert getattr(error, name) == value
+    for text in shown:
+        assert text in str(error)
+
+
+@pytest.mark.parametrize("leaf", LEAVES)
+def test_every_public_error_is_a_tpm_error_and_a_case_above(leaf: type[TPMError]) -> None:
+    assert issubclass(leaf, TPMError)
+    assert issubclass(leaf, (ValueError, RuntimeError))
+    assert any(type(case[0]) is leaf for case in CASES)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_documented_attributes_exist(case: tuple[TPMError, object, object, object]) -> None:
+    documentation = inspect.getdoc(type(case[0])) or ""
+    _, _, attributes = documentation.partition("Attributes:")
+    for name in re.findall(r"^ {4}(\w+):", attributes, flags=re.MULTILINE):
+        assert hasattr(case[0], name)
+
+
+def test_all_names_every_error() -> None:
+    defined = {
+        name
+        for name, value in vars(errors).items()
+        if inspect.isclass(value) and issubclass(value, TPMError)
+    }
+    assert defined == set(errors.__all__)

@@ -1,0 +1,252 @@
+"""The tree of links closes its loops, stands where the kinematics say, and can be a machine."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+import oracle
+from tpm_gym.errors import InputError, UnreachableError
+from tpm_gym.geometry import PAPER, Geometry
+from tpm_gym.kinematics import (
+    ASSEMBLY_MODES,
+    DEFAULT_ASSEMBLY,
+    AssemblyMode,
+    forward,
+    forward_all,
+    inverse,
+    inverse_all,
+)
+from tpm_gym.mechanism import (
+    ACTUATED_JOINTS,
+    CUP_LENGTH,
+    DEFAULT_MOUNT,
+    MOTOR_EFFORT,
+    MOTOR_SPEED,
+    Mechanism,
+    Mount,
+    build,
+    joint_angles,
+)
+from tpm_gym.physics import rotations
+from tpm_gym.workspace import TASK_REGION
+
+FloatArray = NDArray[np.float64]
+Frame = tuple[FloatArray, FloatArray]
+GAP = 1e-9
+# Link of the paper's Fig. 1 -> bodies; 3 is rigid with arm 2, 8 with platform 1.
+FIG_1 = {
+    "0": ["base"],
+    "1, 8": ["platform"],
+    "2, 3": ["arm_2"],
+    "3'": ["link_3p"],
+    "4": ["rod_4a", "rod_4b"],
+    "5": ["arm_5"],
+    "6": ["rod_6"],
+    "7": ["link_7"],
+    "9": ["end_link_9"],
+    "10": ["end_link_10"],
+    "11": ["rod_11a", "rod_11b"],
+    "12": ["arm_12"],
+}
+UNIVERSAL_CROSSES = ["cross_4a", "cross_4b"]
+
+
+def turn(axis: tuple[float, ...], angle: float) -> FloatArray:
+    """Rodrigues' rotation about a unit axis."""
+    x, y, z = axis
+    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.asarray(np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k)
+
+
+def walk(mechanism: Mechanism, angles: dict[str, float]) -> dict[str, Frame]:
+    """Position and rotation of every link, from the joints alone."""
+    frames = {mechanism.links[0].name: (np.zeros(3), np.eye(3))}
+    for link in mechanism.links[1:]:
+        assert link.joint is not None
+        position, rotation = frames[link.joint.parent]
+        assert np.linalg.norm(link.joint.axis) == pytest.approx(1)
+        frames[link.name] = (
+            position + rotation @ link.joint.origin,
+            rotation @ turn(link.joint.axis, angles[link.joint.name]),
+        )
+    return frames
+
+
+def place(frames: dict[str, Frame], link: str, point: tuple[float, ...]) -> FloatArray:
+    position, rotation = frames[link]
+    return np.asarray(position + rotation @ point)
+
+
+def assert_assembled(theta: FloatArray, branch: AssemblyMode, g: Geometry) -> None:
+    mechanism = build(g)
+    frames = walk(mechanism, joint_angles(theta, branch, g))
+    for closure in mechanism.closures:
+        a = place(frames, closure.link_a, closure.point_a)
+        b = place(frames, closure.link_b, closure.point_b)
+        assert np.linalg.norm(a - b) < GAP, closure.name
+    found = place(frames, mechanism.platform, mechanism.point_p)
+    np.testing.assert_allclose(found, forward(theta, branch, g), rtol=0, atol=GAP)
+    for level in (mechanism.platform, "link_3p"):
+        np.testing.assert_allclose(frames[level][1], np.eye(3), rtol=0, atol=GAP)
+    roll = [frames[link][1] for link in ("end_link_9", "end_link_10")]
+    np.testing.assert_allclose(*roll, rtol=0, atol=GAP)  # idle, but set parallel
+    solutions = forward_all(theta, g)
+    (x_c, z_c), beta = solutions.link3[branch.index], solutions.beta[branch.index]
+    p = oracle.points(theta, x_c, z_c, beta, g)
+    joints = {"arm_2": "A1", "arm_5": "A2", "arm_12": "A3", "rod_6": "B2", "link_3p": "C2"}
+    joints |= {"end_link_9": "B3", "link_7": "D1", "platform": "E1", "end_link_10": "C3"}
+    for link, point in joints.items():
+        np.testing.assert_allclose(frames[link][0], p[point], rtol=0, atol=GAP, err_msg=point)
+    half = np.array([g.l5, 0, 0])
+    for suffix, side in (("a", 1), ("b", -1)):
+        foot = frames[f"rod_4{suffix}"][0]
+        np.testing.assert_allclose(foot, p["B1"] + side * half, rtol=0, atol=GAP)
+    np.testing.assert_allclose(
+        place(frames, "rod_4a", (0, g.l4, 0)) - half, p["C1"], rtol=0, atol=GAP
+    )
+
+
+@settings(derandomize=True, max_examples=40, deadline=None)
+@given(oracle.geometries(), oracle.seeds())
+def test_joint_angles_close_every_loop_and_place_the_platform(g: Geometry, seed: int) -> None:
+    solutions = inverse_all(oracle.reachable_points(np.random.default_rng(seed), 1, g), g)
+    for theta in solutions.theta[solutions.valid][:4]:
+        for branch in ASSEMBLY_MODES:
+            # Where a factor vanishes, rounding of theta moves the platform more than GAP.
+            if forward_all(theta, g).valid[branch.index]:
+                assert_assembled(theta, branch, g)
+
+
+def test_joint_angles_close_every_loop_over_the_task_region() -> None:
+    rng = np.random.default_rng(0)
+    for point in rng.uniform(TASK_REGION.low, TASK_REGION.high, (40, 3)):
+        assert_assembled(inverse(point), DEFAULT_ASSEMBLY, PAPER)
+
+
+def test_joint_angles_name_every_joint_and_refuse_what_cannot_be_assembled() -> None:
+    joints = [link.joint.name for link in build().links if link.joint]
+    angles = joint_angles(inverse([0, 0.03, 0.75]))
+    assert set(angles) == set(joints)
+    assert len(joints) == len(set(joints))
+    assert all(type(angle) is float for angle in angles.values())
+    with pytest.raises(UnreachableError):
+        joint_angles([0.0, np.pi, -2.0])
+    with pytest.raises(InputError):
+        joint_angles([np.nan, 0.0, 0.0])
+
+
+def test_every_link_of_figure_1_is_there_and_nothing_else() -> None:
+    bodies = [name for names in FIG_1.values() for name in names] + UNIVERSAL_CROSSES
+    assert sorted(link.name for link in build().links) == sorted(bodies)
+
+
+def test_parents_come_before_children_and_closures_join_links_that_exist() -> None:
+    mechanism = build()
+    names = [link.name for link in mechanism.links]
+    assert mechanism.links[0].joint is None
+    for i, link in enumerate(mechanism.links[1:], start=1):
+        assert link.joint is not None
+        assert link.joint.parent in names[:i]
+        assert mechanism.link(link.name) is link
+    assert len({closure.name for closure in mechanism.closures}) == len(mechanism.closures) == 4
+    for closure in mechanism.closures:
+        assert {closure.link_a, closure.link_b} < set(names)
+        assert closure.link_a != closure.link_b
+    with pytest.raises(KeyError):
+        mechanism.link("arm_3")
+
+
+def test_the_tree_with_its_closures_has_three_degrees_of_freedom() -> None:
+    mechanism = build()
+    moving = sum(link.joint is not None for link in mechanism.links)
+    theta = inverse([-0.05, 0.03, 0.78])
+    rest = joint_angles(theta)
+
+    def gaps(values: FloatArray) -> FloatArray:
+        frames = walk(mechanism, dict(zip(rest, values, strict=True)))
+        sides = [
+            place(frames, c.link_a, c.point_a) - place(frames, c.link_b, c.point_b)
+            for c in mechanism.closures
+        ]
+        return np.concatenate(sides)
+
+    start, step = np.array(list(rest.values())), 1e-6
+    columns = [(gaps(start + step * e) - gaps(start - step * e)) / 2e-6 for e in np.eye(moving)]
+    rank = np.linalg.matrix_rank(np.stack(columns, axis=-1), tol=1e-6)
+    assert moving - rank == 3 + 1  # and end link 10, which rolls idly about its own axis
+
+
+@settings(derandomize=True, max_examples=20, deadline=None)
+@given(oracle.geometries())
+def test_moving_links_have_possible_inertias_along_their_axes(g: Geometry) -> None:
+    for link in build(g).links:
+        assert link.mass > 0
+        moments = np.linalg.eigvalsh(link.inertia)
+        assert (moments > 0).all()
+        assert moments[0] + moments[1] >= moments[2] * (1 - 1e-9)
+        if link.joint is not None:  # the URDF gives no rotation of the inertial frame
+            off_diagonal = link.inertia - np.diag(np.diag(link.inertia))
+            assert np.abs(off_diagonal).max() <= 1e-12
+
+
+def test_only_the_three_motors_drive_and_they_reach_the_task_region() -> None:
+    sides = [np.linspace(*ends, 9) for ends in zip(TASK_REGION.low, TASK_REGION.high, strict=True)]
+    theta = inverse(np.stack(np.meshgrid(*sides), axis=-1)).reshape(-1, 3)
+    joints = {link.joint.name: link.joint for link in build().links if link.joint}
+    for joint in joints.values():
+        if joint.name in ACTUATED_JOINTS:
+            angles = theta[:, ACTUATED_JOINTS.index(joint.name)]
+            assert joint.kind == "revolute"
+            assert joint.parent == "base"
+            assert joint.lower < angles.min() <= angles.max() < joint.upper
+            assert (joint.effort, joint.speed) == (MOTOR_EFFORT, MOTOR_SPEED)
+        else:
+            assert joint.kind == "continuous"
+            assert joint.effort == joint.speed == 0
+    assert set(ACTUATED_JOINTS) < set(joints)
+
+
+def test_the_cup_is_under_point_p_and_alone_collides() -> None:
+    mechanism = build()
+    np.testing.assert_allclose(np.subtract(mechanism.cup, mechanism.point_p), [0, 0, CUP_LENGTH])
+    colliding = [(link, s) for link in mechanism.links for s in link.solids if s.collides]
+    assert [link.name for link, _ in colliding] == [mechanism.platform]
+    cup = colliding[0][1]
+    assert cup.centre[2] + cup.size[1] / 2 == pytest.approx(mechanism.cup[2])
+
+
+coordinates = st.tuples(*[st.floats(-3, 3)] * 3)
+
+
+@settings(derandomize=True, max_examples=100)
+@given(st.floats(0.1, 2), coordinates, coordinates)
+def test_mounts_are_rigid_and_round_trip(
+    height: float, p: tuple[float, ...], q: tuple[float, ...]
+) -> None:
+    mount = Mount(height)
+    np.testing.assert_allclose(mount.to_paper(mount.to_world(p)), p, atol=1e-14)
+    np.testing.assert_allclose(mount.to_world(mount.to_paper(p)), p, atol=1e-14)
+    matrix = mount.rotate(np.eye(3)).T
+    assert np.linalg.det(matrix) == pytest.approx(1)
+    np.testing.assert_array_equal(matrix, rotations(np.array([mount.quaternion]))[0])
+    np.testing.assert_allclose(mount.to_world(p), matrix @ p + [0, 0, height], atol=1e-14)
+    moved = np.subtract(mount.to_world(p), mount.to_world(q))
+    np.testing.assert_allclose(moved, mount.rotate(np.subtract(p, q)), atol=1e-14)
+
+
+def test_the_mount_hangs_the_base_over_the_table() -> None:
+    mount = Mount(1.5)
+    np.testing.assert_array_equal(mount.to_world([0, 0, 0]), [0, 0, 1.5])
+    np.testing.assert_array_equal(mount.to_world([0.1, 0.2, 0.5]), [0.1, -0.2, 1.0])
+    axes = mount.rotate(np.eye(3))
+    np.testing.assert_array_equal(axes, [[1, 0, 0], [0, -1, 0], [0, 0, -1]])
+    assert mount.to_world(np.zeros((4, 2, 3))).shape == (4, 2, 3)
+    lips = DEFAULT_MOUNT.to_world([TASK_REGION.low, TASK_REGION.high])[:, 2] - CUP_LENGTH
+    assert all(a > 0 for a in lips)
+    assert all(a > b for a, b in pairwise(lips))

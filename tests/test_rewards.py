@@ -1,0 +1,84 @@
+"""The reward terms: exact at their ends, smooth between, the same for one state and for many."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tpm_gym.rewards import SAFE_CONDITIONING, dense, distance, singularity_penalty, sparse
+
+conditionings = st.floats(0, 1)
+safes = st.floats(0.01, 1)
+
+
+def test_penalty_is_zero_where_it_is_safe_and_one_at_a_singularity() -> None:
+    safe = np.linspace(SAFE_CONDITIONING, 1, 50)
+    np.testing.assert_array_equal(singularity_penalty(safe), 0)
+    assert singularity_penalty(0.0) == 1
+    assert singularity_penalty(SAFE_CONDITIONING / 2) == pytest.approx(0.5)
+    assert singularity_penalty(np.nextafter(SAFE_CONDITIONING, 0) - 1e-6) > 0
+
+
+@settings(derandomize=True, max_examples=200)
+@given(conditionings, conditionings, safes)
+def test_penalty_never_rises_with_the_conditioning(a: float, b: float, safe: float) -> None:
+    low, high = sorted((a, b))
+    worse, better = singularity_penalty(low, safe), singularity_penalty(high, safe)
+    assert 0 <= better <= worse <= 1
+
+
+@pytest.mark.parametrize("safe", [SAFE_CONDITIONING, 0.3])
+def test_penalty_has_no_kink_at_either_end(safe: float) -> None:
+    fine = 1e-5 * safe
+    c = np.arange(-50, 51) * fine
+    for end in (0.0, safe):
+        slopes = np.diff(singularity_penalty(end + c, safe)) / fine
+        # A kink would show as a slope of order 1/safe on one side.
+        assert np.abs(slopes).max() < 1e-2 / safe
+    inner = np.linspace(0.1, 0.9, 9) * safe
+    assert (np.diff(singularity_penalty(inner, safe)) < -0.05).all()
+
+
+def test_penalty_slope_is_continuous_everywhere() -> None:
+    c = np.linspace(-0.02, 0.15, 20_001)
+    slopes = np.diff(singularity_penalty(c)) / np.diff(c)
+    assert np.abs(np.diff(slopes)).max() < 0.02
+    assert np.abs(slopes).max() == pytest.approx(1.5 / SAFE_CONDITIONING, rel=1e-3)
+
+
+@pytest.mark.parametrize("shape", [(), (4,), (2, 3), (0,)])
+def test_terms_keep_leading_shapes(shape: tuple[int, ...]) -> None:
+    rng = np.random.default_rng(0)
+    achieved, desired = rng.normal(size=(2, *shape, 3))
+    gap = distance(achieved, desired)
+    conditioning = rng.uniform(0, 0.2, shape)
+    for found, single in (
+        (gap, lambda i: distance(achieved[i], desired[i])),
+        (sparse(gap, 1.0), lambda i: sparse(gap[i], 1.0)),
+        (dense(gap), lambda i: dense(gap[i])),
+        (singularity_penalty(conditioning), lambda i: singularity_penalty(conditioning[i])),
+    ):
+        assert np.shape(found) == shape
+        for index in np.ndindex(shape):
+            assert found[index] == pytest.approx(single(index), rel=1e-15)
+
+
+def test_distance_is_euclidean_and_broadcasts() -> None:
+    assert distance([1.0, 2.0, 2.0], [0.0, 0.0, 0.0]) == pytest.approx(3)
+    batch = np.random.default_rng(1).normal(size=(6, 3))
+    goal = np.array([0.1, 0.2, 0.3])
+    np.testing.assert_allclose(distance(batch, goal), np.linalg.norm(batch - goal, axis=1))
+    np.testing.assert_array_equal(distance(batch, goal), distance(goal, batch))
+
+
+def test_sparse_is_zero_strictly_within_the_tolerance_and_minus_one_elsewhere() -> None:
+    gaps = [0.0, 0.0099, 0.01, 0.0101, 3.0]
+    np.testing.assert_array_equal(sparse(gaps, 0.01), [0, 0, -1, -1, -1])
+    assert sparse(gaps, 0.01).dtype == np.float64
+
+
+def test_dense_is_minus_the_gap_in_units() -> None:
+    np.testing.assert_allclose(dense([0.0, 0.1, 0.25]), [0, -1, -2.5])
+    np.testing.assert_allclose(dense([0.0, 0.1, 0.25], unit=0.05), [0, -2, -5])
