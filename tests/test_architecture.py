@@ -15,6 +15,7 @@ ORDER = [
     "errors",
     "geometry",
     "branches",
+    "reach",
     "kinematics",
     "jacobian",
     "workspace",

@@ -109,11 +109,10 @@ def test_joint_actions_at_full_scale_are_slowed_down_without_changing_direction(
         action /= np.abs(action).max()
         full = forward_all(inverse(current) + action * JOINT_LIMIT)
         slot = DEFAULT_ASSEMBLY.index
-        if not full.valid[slot] or np.cos(full.beta[slot]) <= 0:
-            continue  # beyond a singularity
+        same_mode = full.valid[slot] and np.cos(full.beta[slot]) > 0
+        far = not (np.abs(full.position[slot] - current) <= 1.01 * STEP_LIMIT).all()
         command = JointControl().command(action, current)
-        too_far = (np.abs(full.position[slot] - current) > 1.01 * STEP_LIMIT).any()
-        if not too_far or TASK_REGION.margin(command) < 1e-6:
+        if (same_mode and not far) or TASK_REGION.margin(command) < 1e-6:
             continue
         turn = inverse(command) - inverse(current)
         cosine = turn @ action / np.linalg.norm(turn) / np.linalg.norm(action)

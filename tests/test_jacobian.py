@@ -141,19 +141,14 @@ def test_plane_y_0_is_a_parallel_singularity() -> None:
     rng = np.random.default_rng(4)
     low, high = np.array(TASK_REGION.low), np.array(TASK_REGION.high)
     low[1] = high[1] = 0.0
-    raised = 0
     for point in rng.uniform(low, high, (100, 3)):
         theta = inverse(point)
         assert jacobian.conditioning(theta) < 1e-6
-        if forward(theta)[1] > 0:
-            continue  # rounding put the platform beside the singularity
         for function in (jacobian.velocity, jacobian.evaluate):
             with pytest.raises(SingularityError) as caught:
                 function(theta)
             assert caught.value.factor == "sin(beta)"
-            assert abs(caught.value.value) < 1e-7
-        raised += 1
-    assert raised > 10
+            assert abs(caught.value.value) < 1e-6
 
 
 def test_one_singular_entry_makes_the_batch_singular() -> None:

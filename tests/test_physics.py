@@ -35,8 +35,9 @@ def test_substeps_fill_the_control_period(time_step: float, period: float, subst
 @pytest.mark.parametrize(
     ("name", "value"),
     [("time_step", value) for value in (0.0, -0.002, 0.05, 0.003, NAN, float("inf"))]
-    + [("iterations", value) for value in (0, -1)]
-    + [("erp", value) for value in (0.0, -0.1, 1.01, NAN)],
+    + [("time_step", "x"), ("control_period", float("inf")), ("control_period", None)]
+    + [("iterations", value) for value in (0, -1, 1.5, NAN, True, "50")]
+    + [("erp", value) for value in (0.0, -0.1, 1.01, NAN, True, [0.8])],
 )
 def test_settings_that_cannot_work_are_refused_by_name(name: str, value: Any) -> None:
     with pytest.raises(ConfigurationError) as caught:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tpm_gym.errors import InputError
+from tpm_gym.geometry import Geometry
 
 __all__ = [
     "ASSEMBLY_MODES",
@@ -109,14 +110,21 @@ class ForwardSolutions:
     Attributes:
         position: (..., 4, 3) m, point P in the paper frame; NaN where not real.
         beta: (..., 4) rad, passive angle of link 7 in (-pi, pi]; NaN where not real.
-        link3: (..., 4, 2) m, (xC, zC) of point C1 of link 3'; NaN where not real.
         valid: (..., 4) bool, which branches are real.
+        geometry: The lengths they were solved for.
     """
 
     position: FloatArray
     beta: FloatArray
-    link3: FloatArray
     valid: BoolArray
+    geometry: Geometry
+
+    @property
+    def link3(self) -> FloatArray:
+        """(..., 4, 2) m, (xC, zC) of point C1 of link 3'; NaN where not real."""
+        g = self.geometry
+        x_c = self.position[..., 0] - g.l2 - g.l7 * np.cos(self.beta)
+        return np.stack([x_c, self.position[..., 2] - 2 * g.l6], axis=-1)
 
 
 @dataclass(frozen=True)

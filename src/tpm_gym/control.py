@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tpm_gym.errors import ConfigurationError
-from tpm_gym.kinematics import DEFAULT_ASSEMBLY, forward_all, inverse
+from tpm_gym.kinematics import DEFAULT_ASSEMBLY, ForwardSolutions, forward_all, inverse
 from tpm_gym.workspace import TASK_REGION
 
 __all__ = ["JOINT_LIMIT", "STEP_LIMIT", "CartesianControl", "Control", "JointControl", "make"]
@@ -66,19 +66,28 @@ class JointControl:
         theta = inverse(start)
         step = np.asarray(action, dtype=np.float64) * JOINT_LIMIT
         point = start
-        fraction = 1.0
-        for _ in range(6):
-            solutions = forward_all(theta + fraction * step)
-            if not solutions.valid[DEFAULT_ASSEMBLY.index]:
-                fraction *= 0.5
-                continue
-            point = solutions.position[DEFAULT_ASSEMBLY.index]
-            excess = float((np.abs(point - start) / STEP_LIMIT).max())
-            if excess <= 1.0:
+        low, high = 0.0, 1.0
+        # The largest allowed fraction of the step, to 1/64 and then to 1/4096 of it.
+        for _ in range(2):
+            fractions = np.linspace(low, high, 65)[1:]
+            solutions = forward_all(theta + fractions[:, None] * step)
+            points = solutions.position[:, DEFAULT_ASSEMBLY.index]
+            allowed = self._allowed(solutions, start)
+            count = len(fractions) if allowed.all() else int(allowed.argmin())
+            if count:
+                point = points[count - 1]
+            if count == len(fractions):
                 break
-            fraction /= excess
-        limited = np.clip(point, start - STEP_LIMIT, start + STEP_LIMIT)
-        return TASK_REGION.project(limited)
+            low, high = (fractions[count - 1] if count else low), fractions[count]
+        return TASK_REGION.project(point)
+
+    def _allowed(self, solutions: ForwardSolutions, start: FloatArray) -> NDArray[np.bool_]:
+        """Whether postures are assembled as ``start`` is, with P no farther than STEP_LIMIT."""
+        slot = DEFAULT_ASSEMBLY.index
+        moved = np.abs(solutions.position[:, slot] - start) <= STEP_LIMIT
+        same_mode = np.abs(solutions.beta[:, slot]) < np.pi / 2  # cos(beta) > 0; NaN compares false
+        allowed: NDArray[np.bool_] = moved.all(axis=-1) & same_mode
+        return allowed
 
     def action(self, wanted: ArrayLike, current: ArrayLike) -> FloatArray:
         """The increment of the joints, scaled down as a whole where it is too large."""

@@ -26,7 +26,18 @@ __all__ = [
 
 
 class TPMError(Exception):
-    """Root of all errors raised by tpm_gym."""
+    """Root of all errors raised by tpm_gym. They survive pickling, as between worker processes."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Rebuild from the message and the attributes, not by calling ``__init__`` again."""
+        return _rebuild, (type(self), self.args, vars(self))
+
+
+def _rebuild(kind: type[TPMError], args: tuple[Any, ...], values: dict[str, Any]) -> TPMError:
+    error = kind.__new__(kind, *args)
+    error.args = args
+    vars(error).update(values)
+    return error
 
 
 class GeometryError(TPMError, ValueError):
@@ -92,19 +103,15 @@ class UnreachableError(TPMError, ValueError):
     Attributes:
         point: The offending point (m) or joint angles (rad).
         leg: What fails: ``"beta"``, ``"leg 1"`` ... or ``"box"`` for the task's region.
-        margin: By how much it fails, in the unit that ``unit`` names; negative.
-        unit: ``"m"`` for lengths, ``"m^2"`` for discriminants.
+        margin: By how much it fails, m; negative.
     """
 
-    def __init__(
-        self, point: Sequence[float], leg: str, margin: float, hint: str, unit: str = "m"
-    ) -> None:
+    def __init__(self, point: Sequence[float], leg: str, margin: float, hint: str) -> None:
         """Store the values and compose the message."""
         self.point, self.leg, self.margin = tuple(float(v) for v in point), leg, float(margin)
-        self.unit = unit
         shown = ", ".join(f"{v:.4g}" for v in self.point)
         super().__init__(
-            f"({shown}) cannot be reached: {leg} fails by {-self.margin:.4g} {unit}; {hint}"
+            f"({shown}) cannot be reached: {leg} fails by {-self.margin:.4g} m; {hint}"
         )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from numbers import Real
 
 from tpm_gym.errors import GeometryError
 
@@ -55,8 +56,10 @@ class Geometry:
 
     def _check_length(self, name: str) -> None:
         value = getattr(self, name)
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
+        if isinstance(value, bool) or not isinstance(value, Real):
             raise GeometryError(name, value, "it must be a number")
+        value = float(value)
+        object.__setattr__(self, name, value)
         if not math.isfinite(value):
             raise GeometryError(name, value, "it must be finite")
         if value < 0.0 or (value == 0.0 and name != "l6"):

@@ -29,6 +29,10 @@ __all__ = [
 
 FloatArray = NDArray[np.float64]
 
+# cos(beta) is known to about 1e-14, and where it is 1, sin(beta) is known to the square root of that
+# only: a factor below this (y below 50 nm) cannot be told from zero.
+_SINGULAR = 1e-6
+
 
 @dataclass(frozen=True)
 class _Configuration:
@@ -220,9 +224,10 @@ def _configuration(theta: ArrayLike, branch: AssemblyMode, geometry: Geometry) -
     if not solutions.valid[..., slot].all():
         forward(angles, branch, geometry)  # raises, and says why
     l1, l2, l3 = geometry.l1, geometry.l2, geometry.l3
-    x_c, z_c = solutions.link3[..., slot, 0], solutions.link3[..., slot, 1]
-    beta = solutions.beta[..., slot]
+    cos_beta = np.cos(solutions.beta[..., slot])
     x, y = solutions.position[..., slot, 0], solutions.position[..., slot, 1]
+    x_c = x - l2 - geometry.l7 * cos_beta
+    z_c = solutions.position[..., slot, 2] - 2 * geometry.l6
     cos, sin = np.cos(angles), np.sin(angles)
     rod1 = [x_c, -l1 - l3 * cos[..., 0], z_c - l3 * sin[..., 0]]
     rod2 = [x_c - 2 * geometry.l5 + l1 - l3 * cos[..., 1], 0 * x_c, z_c - l3 * sin[..., 1]]
@@ -235,17 +240,17 @@ def _configuration(theta: ArrayLike, branch: AssemblyMode, geometry: Geometry) -
         rods=rods,
         serial=l3 * (rods[..., 2] * cos - in_plane * sin),
         sin_beta=y / geometry.l7,
-        cos_beta=np.cos(beta),
+        cos_beta=cos_beta,
         planar=rod1[0] * rod2[2] - rod1[2] * rod2[0],
-        level3=geometry.l7 * np.cos(beta) - rod3[0],  # = xB3 - xC - 2 l2
+        level3=geometry.l7 * cos_beta - rod3[0],  # = xB3 - xC - 2 l2
     )
 
 
 def _velocity(c: _Configuration, geometry: Geometry) -> FloatArray:
     scaled, determinant = _scaled_velocity(c, geometry)
-    # Relative to the size that the determinant has far from its zeros.
-    if (np.abs(determinant) <= 1e-12 * geometry.l7 * geometry.l4**3).any():
-        raise SingularityError(*_smallest_parallel_factor(c))
+    name, value = _smallest_parallel_factor(c, geometry)
+    if abs(value) < _SINGULAR:
+        raise SingularityError(name, value)
     result: FloatArray = scaled / determinant[..., None, None]
     return result
 
@@ -286,13 +291,16 @@ def _scaled_velocity(c: _Configuration, geometry: Geometry) -> tuple[FloatArray,
     return scaled, k * c.planar
 
 
-def _smallest_parallel_factor(c: _Configuration) -> tuple[str, float]:
-    """Name and value of the parallel factor that is nearest to zero over the batch."""
+def _smallest_parallel_factor(c: _Configuration, geometry: Geometry) -> tuple[str, float]:
+    """Name and value (in units of l4) of the parallel factor nearest to zero over the batch."""
     values = {
         "sin(beta)": c.sin_beta,
-        "l1 + l3 cos(theta_3) - xC - 2 l2": c.level3,
-        "planar factor": c.planar,
+        "(l1 + l3 cos(theta_3) - xC - 2 l2) / l4": c.level3 / geometry.l4,
+        "planar factor / l4^2": c.planar / geometry.l4**2,
     }
-    smallest = {name: float(value.flat[np.abs(value).argmin()]) for name, value in values.items()}
+    smallest = {
+        name: float(value.flat[np.abs(value).argmin()]) if value.size else np.inf
+        for name, value in values.items()
+    }
     name = min(smallest, key=lambda key: abs(smallest[key]))
     return name, smallest[name]

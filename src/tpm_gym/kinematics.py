@@ -13,6 +13,8 @@ here too.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -27,8 +29,9 @@ from tpm_gym.branches import (
     PassiveAngles,
     WorkingMode,
 )
-from tpm_gym.errors import InputError, UnreachableError
+from tpm_gym.errors import InputError
 from tpm_gym.geometry import PAPER, Geometry
+from tpm_gym.reach import no_assembly, no_posture
 
 __all__ = [
     "ASSEMBLY_MODES",
@@ -53,6 +56,7 @@ BoolArray = NDArray[np.bool_]
 # Where two solutions merge, rounding alone can push a discriminant (here always scaled to order
 # one) below zero by a few units in the last place. Those are solutions, not misses.
 _ROUNDING = 64 * np.finfo(np.float64).eps
+_BLOCK = 8192  # rows solved at a time
 
 
 def forward_all(theta: ArrayLike, geometry: Geometry = PAPER) -> ForwardSolutions:
@@ -70,30 +74,19 @@ def forward_all(theta: ArrayLike, geometry: Geometry = PAPER) -> ForwardSolution
         InputError: If the last axis of theta does not have length 3.
     """
     theta = _points("theta", theta)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        y1, z1, x2, z2, x3, z3 = _elbows(theta, geometry)
-        x_c, z_c, real12 = _intersect_circles(y1, z1, x2 + 2 * geometry.l5, z2, geometry.l4)
-        # Leg 3, Eqs. (9) and (10) with z_C3 = z_C + l6.
-        u = x_c - x3[..., None] + 2 * geometry.l2
-        dz = z_c + geometry.l6 - z3[..., None]
-        cos_beta = (geometry.l4**2 - geometry.l7**2 - u**2 - dz**2) / (2 * u * geometry.l7)
-        valid = real12 & (np.abs(cos_beta) <= 1 + _ROUNDING)
-        sin_half = np.sqrt(np.maximum(0.0, 1 - cos_beta**2))
-        sign = np.array([mode.sin_beta for mode in ASSEMBLY_MODES], dtype=float)
-        beta = np.arctan2(sign * sin_half, cos_beta)
-        position = np.stack(
-            [
-                x_c + geometry.l7 * np.clip(cos_beta, -1, 1) + geometry.l2,
-                geometry.l7 * sign * sin_half,
-                z_c + 2 * geometry.l6,
-            ],
-            axis=-1,
-        )
-    beta[~valid] = np.nan
-    position[~valid] = np.nan
-    link3 = np.stack([x_c, z_c], axis=-1)
-    link3[~valid] = np.nan
-    return ForwardSolutions(position, beta, link3, valid)
+    flat = theta.reshape(-1, 3)
+    position, beta = np.empty((len(flat), 4, 3)), np.empty((len(flat), 4))
+    valid = np.empty((len(flat), 4), dtype=np.bool_)
+    with np.errstate(all="ignore"):
+        for rows in _blocks(len(flat)):
+            _forward_block(flat[rows].T, geometry, position[rows], beta[rows], valid[rows])
+    shape = theta.shape[:-1]
+    return ForwardSolutions(
+        position.reshape(*shape, 4, 3),
+        beta.reshape(*shape, 4),
+        valid.reshape(*shape, 4),
+        geometry,
+    )
 
 
 def inverse_all(position: ArrayLike, geometry: Geometry = PAPER) -> InverseSolutions:
@@ -111,26 +104,16 @@ def inverse_all(position: ArrayLike, geometry: Geometry = PAPER) -> InverseSolut
         InputError: If the last axis of position does not have length 3.
     """
     position = _points("position", position)
-    x, y, z = position[..., 0], position[..., 1], position[..., 2]
-    with np.errstate(invalid="ignore"):
-        cos_abs = np.sqrt(_clip_rounding(1 - (y / geometry.l7) ** 2))
-        per_leg = []
-        for cos_sign in (-1, 1):
-            x_c = x - geometry.l2 - geometry.l7 * cos_sign * cos_abs
-            z_c = z - 2 * geometry.l6
-            per_leg.append(_solve_legs(x_c, z_c, x, y, z, geometry))
+    flat = position.reshape(-1, 3)
+    theta, beta = np.empty((len(flat), 16, 3)), np.empty((len(flat), 16))
+    valid = np.empty((len(flat), 16), dtype=np.bool_)
+    with np.errstate(all="ignore"):
+        for rows in _blocks(len(flat)):
+            _inverse_block(flat[rows].T, geometry, theta[rows], beta[rows], valid[rows])
     shape = position.shape[:-1]
-    theta = np.empty((*shape, 16, 3))
-    beta = np.empty((*shape, 16))
-    for slot, mode in enumerate(WORKING_MODES):
-        legs = per_leg[(mode.cos_beta + 1) // 2]
-        for leg, bend in enumerate((mode.leg1, mode.leg2, mode.leg3)):
-            theta[..., slot, leg] = legs[leg][(bend + 1) // 2]
-        beta[..., slot] = np.arctan2(y / geometry.l7, mode.cos_beta * cos_abs)
-    valid = np.isfinite(theta).all(axis=-1) & np.isfinite(beta)
-    theta[~valid] = np.nan
-    beta[~valid] = np.nan
-    return InverseSolutions(theta, beta, valid)
+    return InverseSolutions(
+        theta.reshape(*shape, 16, 3), beta.reshape(*shape, 16), valid.reshape(*shape, 16)
+    )
 
 
 def forward(
@@ -155,7 +138,7 @@ def forward(
     slot = branch.index
     valid = solutions.valid[..., slot]
     if not valid.all():
-        raise _no_assembly(theta[~valid][0], branch, geometry)
+        raise no_assembly(theta[~valid][0], branch, geometry)
     return solutions.position[..., slot, :]
 
 
@@ -181,7 +164,7 @@ def inverse(
     slot = branch.index
     valid = solutions.valid[..., slot]
     if not valid.all():
-        raise _no_posture(position[~valid][0], branch, geometry)
+        raise no_posture(position[~valid][0], branch, geometry)
     return solutions.theta[..., slot, :]
 
 
@@ -204,94 +187,126 @@ def passive_angles(
     slot = branch.index
     valid = solutions.valid[..., slot]
     if not valid.all():
-        raise _no_assembly(theta[~valid][0], branch, geometry)
-    y1, z1, x2, z2, x3, z3 = _elbows(theta, geometry)
-    x_c, z_c = solutions.link3[..., slot, 0], solutions.link3[..., slot, 1]
+        raise no_assembly(theta[~valid][0], branch, geometry)
+    link3 = solutions.link3[..., slot, :]
+    x_c, z_c = link3[..., 0], link3[..., 1]
     x, y = solutions.position[..., slot, 0], solutions.position[..., slot, 1]
     l4, l6 = geometry.l4, geometry.l6
+    cos, sin = geometry.l3 * np.cos(theta), geometry.l3 * np.sin(theta)
+    y1, x2, x3 = geometry.l1 + cos[..., 0], cos[..., 1] - geometry.l1, cos[..., 2] + geometry.l1
     return PassiveAngles(
         beta=solutions.beta[..., slot],
-        rod4_swing=np.arctan2(z_c - z1, -y1),
+        rod4_swing=np.arctan2(z_c - sin[..., 0], -y1),
         rod4_tilt=np.arcsin(np.clip(x_c / l4, -1, 1)),
-        rod6_swing=np.arctan2(z_c - z2, x_c - 2 * geometry.l5 - x2),
-        rod11_swing=np.arctan2(z_c + l6 - z3, x + geometry.l2 - x3),
+        rod6_swing=np.arctan2(z_c - sin[..., 1], x_c - 2 * geometry.l5 - x2),
+        rod11_swing=np.arctan2(z_c + l6 - sin[..., 2], x + geometry.l2 - x3),
         rod11_tilt=np.arcsin(np.clip(y / l4, -1, 1)),
     )
 
 
-def _elbows(theta: FloatArray, geometry: Geometry) -> tuple[FloatArray, ...]:
-    """Coordinates yB1, zB1, xB2, zB2, xB3, zB3 of the arms' ends."""
-    reach, height = geometry.l3 * np.cos(theta), geometry.l3 * np.sin(theta)
-    return (
-        geometry.l1 + reach[..., 0],
-        height[..., 0],
-        -geometry.l1 + reach[..., 1],
-        height[..., 1],
-        geometry.l1 + reach[..., 2],
-        height[..., 2],
-    )
+def _blocks(count: int) -> Iterator[slice]:
+    """Row ranges small enough for all intermediate results to stay in the cache."""
+    for start in range(0, count, _BLOCK):
+        yield slice(start, start + _BLOCK)
 
 
-def _intersect_circles(
-    y1: FloatArray, z1: FloatArray, x2: FloatArray, z2: FloatArray, l4: float
-) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Point C1 in the plane y = 0, Eq. (6), one column per assembly mode.
-
-    C1 lies on the circle about (0, z1) with radius^2 = l4^2 - y1^2 and on the circle about
-    (x2, z2) with radius l4. Of the two intersections, the one on the left of the line from the
-    first to the second centre has a positive planar factor.
-    """
-    dx, dz = x2, z2 - z1
-    distance2 = dx**2 + dz**2
-    along = ((l4**2 - y1**2 - l4**2) / distance2 + 1) / 2
-    across2 = (l4**2 - y1**2) / distance2 - along**2
-    # Both terms can be large against their difference; scale the tolerance by them.
-    real = across2 >= -_ROUNDING * (1 + along**2)
-    across = np.sqrt(np.maximum(0.0, across2))[..., None] * [m.planar for m in ASSEMBLY_MODES]
-    x_c = along[..., None] * dx[..., None] - across * dz[..., None]
-    z_c = z1[..., None] + along[..., None] * dz[..., None] + across * dx[..., None]
-    return x_c, z_c, np.broadcast_to(real[..., None], x_c.shape)
-
-
-def _solve_legs(
-    x_c: FloatArray,
-    z_c: FloatArray,
-    x: FloatArray,
-    y: FloatArray,
-    z: FloatArray,
+def _forward_block(
+    theta: FloatArray,
     geometry: Geometry,
-) -> list[tuple[FloatArray, FloatArray]]:
-    """Both angles of each leg, ordered by the sign of its serial factor (-1, +1)."""
-    l1, l5, l6 = geometry.l1, geometry.l5, geometry.l6
-    zero = np.zeros_like(x_c)
-    # (C_i - A_i) as (in the arm's plane and level, in the arm's plane and vertical, out of plane)
-    leg1 = _solve_leg(zero - l1, z_c, x_c, geometry)
-    leg2 = _solve_leg(x_c - 2 * l5 + l1, z_c, zero, geometry)
-    leg3 = _solve_leg(x + geometry.l2 - l1, z - l6, y, geometry)
-    # Arm 2 points outwards at theta_2 = pi: keep the cut of the arctangent away from there.
-    return [leg1, (np.mod(leg2[0], 2 * np.pi), np.mod(leg2[1], 2 * np.pi)), leg3]
+    position: FloatArray,
+    beta: FloatArray,
+    valid: BoolArray,
+) -> None:
+    """Solve (3, n) angles into position (n, 4, 3), beta (n, 4) and valid (n, 4)."""
+    l1, l2, l3, l4, l5, l6, l7 = vars(geometry).values()
+    cos, sin = l3 * np.cos(theta), l3 * np.sin(theta)
+    # Eq. (6): C1 is on the circle about (0, z1) with radius^2 = l4^2 - y1^2 and on the circle about
+    # (dx, z1 + dz) with radius l4. Of the two intersections, the one on the left of the line from
+    # the first to the second centre has a positive planar factor.
+    y1_squared, z1 = np.square(cos[0] + l1), sin[0]
+    dx, dz = cos[1] + (2 * l5 - l1), sin[1] - z1
+    inverse_distance2 = 1 / (dx * dx + dz * dz)
+    along = 0.5 - 0.5 * y1_squared * inverse_distance2
+    across2 = (l4 * l4 - y1_squared) * inverse_distance2 - along * along
+    # Both terms can be large against their difference; scale the tolerance by them.
+    real = across2 >= -_ROUNDING * (1 + along * along)
+    across = np.sqrt(np.maximum(across2, 0.0))
+    x_foot, z_foot = along * dx, z1 + along * dz
+    for planar in (-1, 1):
+        x_c, z_c = x_foot - planar * across * dz, z_foot + planar * across * dx
+        # Eqs. (9) and (10), with z_C3 = z_C + l6
+        u, w = x_c - (cos[2] + (l1 - 2 * l2)), z_c - (sin[2] - l6)
+        cos_beta = (l4 * l4 - l7 * l7 - u * u - w * w) / (2 * l7 * u)
+        assembled = real & (np.abs(cos_beta) <= 1 + _ROUNDING)
+        cos_beta = np.clip(cos_beta, -1.0, 1.0)
+        if not assembled.all():
+            cos_beta[~assembled] = z_c[~assembled] = np.nan
+        angle, y = np.arccos(cos_beta), l7 * np.sqrt((1 - cos_beta) * (1 + cos_beta))
+        slot = planar + 1  # sin(beta) < 0 comes first
+        position[:, slot : slot + 2, 0] = (x_c + l7 * cos_beta + l2)[:, None]
+        position[:, slot, 1], position[:, slot + 1, 1] = -y, y
+        position[:, slot : slot + 2, 2] = (z_c + 2 * l6)[:, None]
+        beta[:, slot], beta[:, slot + 1] = -angle, angle
+        valid[:, slot : slot + 2] = assembled[:, None]
+
+
+def _inverse_block(
+    position: FloatArray,
+    geometry: Geometry,
+    theta: FloatArray,
+    beta: FloatArray,
+    valid: BoolArray,
+) -> None:
+    """Solve (3, n) points into theta (n, 16, 3), beta (n, 16) and valid (n, 16)."""
+    l1, l2, _, _, l5, l6, l7 = vars(geometry).values()
+    x, y, z = np.ascontiguousarray(position)
+    sin_beta = y / l7
+    cos_beta = np.sqrt(_clip_rounding((1 - sin_beta) * (1 + sin_beta)))
+    z_c = z - 2 * l6
+    # (C_i - A_i) as: level in the arm's plane, vertical in it, out of it (squared)
+    leg3 = _solve_leg(x + (l2 - l1), z - l6, y * y, geometry)
+    # Gathered by slots in the cache, then copied out once.
+    angles = np.empty((2, 2, 2, 2, 3, len(x)))  # signs of cos(beta), legs 1, 2, 3; leg
+    for index, sign in enumerate((-1, 1)):
+        x_c = x - l2 - sign * l7 * cos_beta
+        leg1 = _solve_leg(np.full_like(x, -l1), z_c, x_c * x_c, geometry)
+        leg2 = _solve_leg(x_c + (l1 - 2 * l5), z_c, np.zeros_like(x), geometry)
+        for bend in (0, 1):
+            angles[index, bend, :, :, 0] = leg1[bend]
+            # Arm 2 points outwards at theta_2 = pi: keep the cut of the arctangent away from there.
+            angles[index, :, bend, :, 1] = np.mod(leg2[bend], 2 * np.pi)
+            angles[index, :, :, bend, 2] = leg3[bend]
+        # One leg without a solution voids the branch. Both bends of a leg fail together.
+        real = np.isfinite(leg1[0] + leg2[0] + leg3[0])
+        angle = np.where(real, np.arctan2(sin_beta, sign * cos_beta), np.nan)
+        if not real.all():
+            angles[index][..., ~real] = np.nan
+        beta[:, 8 * index : 8 * index + 8] = angle[:, None]
+        valid[:, 8 * index : 8 * index + 8] = real[:, None]
+    theta[...] = angles.reshape(16, 3, -1).transpose(2, 0, 1)
 
 
 def _solve_leg(
-    a: FloatArray, b: FloatArray, out: FloatArray, geometry: Geometry
+    a: FloatArray, b: FloatArray, out2: FloatArray, geometry: Geometry
 ) -> tuple[FloatArray, FloatArray]:
     """Solve |C - A - l3 e(theta)| = l4, i.e. a cos + b sin = c; NaN where not real.
 
-    The serial factor BC . dB/dtheta is l3 (b cos - a sin), so its sign tells the two angles apart.
+    The serial factor BC . dB/dtheta is l3 (b cos - a sin), so its sign tells the two angles apart:
+    the first has it negative, the second positive.
     """
-    radius2 = a**2 + b**2
-    c = (radius2 + out**2 + geometry.l3**2 - geometry.l4**2) / (2 * geometry.l3)
-    s = np.sqrt(_clip_rounding((radius2 - c**2) / geometry.l4**2)) * geometry.l4
-    # theta = atan2(b, a) -+ atan2(s, c), in one arctangent each
-    return (
-        np.arctan2(b * c + a * s, a * c - b * s),
-        np.arctan2(b * c - a * s, a * c + b * s),
-    )
+    radius2 = a * a + b * b
+    c = (radius2 + out2 + (geometry.l3**2 - geometry.l4**2)) / (2 * geometry.l3)
+    s = np.sqrt(_clip_rounding((radius2 - c * c) / geometry.l4**2)) * geometry.l4
+    # theta = atan2(b, a) +- atan2(s, c), in one arctangent each
+    bc, ac, bs, as_ = b * c, a * c, b * s, a * s
+    return np.arctan2(bc + as_, ac - bs), np.arctan2(bc - as_, ac + bs)
 
 
 def _clip_rounding(value: FloatArray) -> FloatArray:
     """Zero where ``value`` is negative by rounding alone, NaN where it is truly negative."""
-    return np.where(value >= -_ROUNDING, np.maximum(value, 0.0), np.nan)
+    clipped = np.maximum(value, 0.0)
+    clipped[value < -_ROUNDING] = np.nan
+    return clipped
 
 
 def _points(name: str, value: ArrayLike) -> FloatArray:
@@ -310,48 +325,3 @@ def _finite_points(name: str, value: ArrayLike) -> FloatArray:
         bad = array[~np.isfinite(array).all(axis=-1)]
         raise InputError(name, bad.reshape(-1, 3)[0].tolist(), "finite")
     return array
-
-
-def _no_assembly(theta: FloatArray, branch: AssemblyMode, geometry: Geometry) -> UnreachableError:
-    """Say which loop cannot be assembled at ``theta``."""
-    y1, z1, x2, z2, x3, z3 = _elbows(theta, geometry)
-    x2 = x2 + 2 * geometry.l5
-    x_c, z_c, real = _intersect_circles(y1, z1, x2, z2, geometry.l4)
-    hint = f"choose joint angles within reach (branch {branch})"
-    if not real.any():
-        radius2 = geometry.l4**2 - y1**2
-        distance2 = x2**2 + (z2 - z1) ** 2
-        along = (radius2 - geometry.l4**2) / distance2 / 2 + 0.5
-        margin = float(radius2 - along**2 * distance2)
-        return UnreachableError(
-            theta.tolist(), "loop 1 (circles of B1C1, B2C2)", margin, hint, "m^2"
-        )
-    u = x_c[branch.index] - x3 + 2 * geometry.l2
-    dz = z_c[branch.index] + geometry.l6 - z3
-    needed = geometry.l4**2 - geometry.l7**2 - u**2 - dz**2
-    margin = float(abs(2 * u * geometry.l7) - abs(needed))
-    return UnreachableError(theta.tolist(), "loop 2 (beta, rod B3C3)", margin, hint, "m^2")
-
-
-def _no_posture(position: FloatArray, branch: WorkingMode, geometry: Geometry) -> UnreachableError:
-    """Say which part of the mechanism cannot reach ``position``, and by how much."""
-    x, y, z = position
-    hint = f"choose a point of the workspace (branch {branch}; see tpm_gym.workspace)"
-    if abs(y) > geometry.l7:
-        return UnreachableError(position.tolist(), "beta (|y| <= l7)", geometry.l7 - abs(y), hint)
-    x_c = x - geometry.l2 - branch.cos_beta * np.sqrt(geometry.l7**2 - y**2)
-    z_c = z - 2 * geometry.l6
-    worst = ("leg 1", np.inf)
-    legs = (
-        ("leg 1", (-geometry.l1, z_c, x_c)),
-        ("leg 2", (x_c - 2 * geometry.l5 + geometry.l1, z_c, 0.0)),
-        ("leg 3", (x + geometry.l2 - geometry.l1, z - geometry.l6, y)),
-    )
-    for name, (a, b, out) in legs:
-        in_plane = np.hypot(a, b)
-        # The rod's projection on the arm's plane has this length; arm and it form a triangle.
-        rod = np.sqrt(max(0.0, geometry.l4**2 - out**2))
-        margin = min(geometry.l3 + rod - in_plane, in_plane - abs(geometry.l3 - rod))
-        if margin < worst[1]:
-            worst = (name, margin)
-    return UnreachableError(position.tolist(), worst[0], worst[1], hint)

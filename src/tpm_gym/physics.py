@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from numbers import Integral, Real
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +51,12 @@ class Physics:
 
     def __post_init__(self) -> None:
         """Reject settings that cannot work."""
+        for name in ("time_step", "control_period", "erp"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
+                raise ConfigurationError(name, value, "a finite number")
+        if isinstance(self.iterations, bool) or not isinstance(self.iterations, Integral):
+            raise ConfigurationError("iterations", self.iterations, "a whole number, 1 or more")
         if not 0 < self.time_step <= self.control_period:
             valid = f"0 < time_step <= control_period = {self.control_period}"
             raise ConfigurationError("time_step", self.time_step, valid)

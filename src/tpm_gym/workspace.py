@@ -130,7 +130,7 @@ def sample(
     geometry: Geometry = PAPER,
     attempts: int = 1000,
 ) -> FloatArray:
-    """Draw one point (3,) m, uniform over the part of ``region`` that is conditioned well enough.
+    """Draw one point (3,) m, uniform over the part of ``region`` that is reachable and safe enough.
 
     Args:
         rng: Source of randomness.
@@ -144,7 +144,8 @@ def sample(
     """
     for _ in range(attempts):
         point = rng.uniform(region.low, region.high)
-        if conditioning_at(point, geometry=geometry) >= min_conditioning:
+        conditioning = conditioning_at(point, geometry=geometry)
+        if conditioning > 0 and conditioning >= min_conditioning:
             return point
     raise ConfigurationError(
         "min_conditioning", min_conditioning, f"a value that some point of {region} reaches"
