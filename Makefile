@@ -18,8 +18,9 @@ $(INSTALLED): pyproject.toml constraints.txt
 
 demo: $(INSTALLED) ## train Reach, evaluate it, let the expert pick and place; see runs/demo/
 	$(RUN) train/train.py --env TPMReach-v0 --algo sac --seed 0 --run runs/demo/reach --overwrite
+	cp runs/demo/reach/learning_curve.png runs/demo/learning_curve.png
 	$(RUN) train/evaluate.py --policy runs/demo/reach/best.zip expert random \
-		--env TPMReach-v0 --episodes 100 --json runs/demo/reach.json --video runs/demo/reach.mp4
+		--env TPMReach-v0 --episodes 100 --json runs/demo/reach.json
 	$(RUN) train/evaluate.py --policy expert --env TPMPickAndPlace-v0 --episodes 20 \
 		--json runs/demo/pick_and_place.json --video runs/demo/pick_and_place.mp4 \
 		--picture runs/demo/pick_and_place.png
