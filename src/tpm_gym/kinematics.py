@@ -13,6 +13,7 @@ here too.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -56,7 +57,18 @@ BoolArray = NDArray[np.bool_]
 # Where two solutions merge, rounding alone can push a discriminant (here always scaled to order
 # one) below zero by a few units in the last place. Those are solutions, not misses.
 _ROUNDING = 64 * np.finfo(np.float64).eps
-_BLOCK = 8192  # rows solved at a time
+_BLOCK = 4096  # rows solved at a time
+
+# Row of the 12 distinct angles (sign of cos(beta), leg, bend) that each slot and leg holds.
+_ROW_OF_SLOT = np.array(
+    [
+        [
+            3 * (mode.cos_beta + 1) + 2 * leg + (bend + 1) // 2
+            for leg, bend in enumerate((mode.leg1, mode.leg2, mode.leg3))
+        ]
+        for mode in WORKING_MODES
+    ]
+)
 
 
 def forward_all(theta: ArrayLike, geometry: Geometry = PAPER) -> ForwardSolutions:
@@ -134,6 +146,8 @@ def forward(
         UnreachableError: If the branch does not exist for some entry of theta.
     """
     theta = _finite_points("theta", theta)
+    if theta.ndim == 1:
+        return _forward_one(theta, branch, geometry)
     solutions = forward_all(theta, geometry)
     slot = branch.index
     valid = solutions.valid[..., slot]
@@ -250,6 +264,34 @@ def _forward_block(
         valid[:, slot : slot + 2] = assembled[:, None]
 
 
+def _forward_one(theta: FloatArray, branch: AssemblyMode, geometry: Geometry) -> FloatArray:
+    """:func:`_forward_block` for one row and one branch, in plain floats: numpy's calls cost more.
+
+    The formulas are explained there; a test holds the two together.
+    """
+    theta_1, theta_2, theta_3 = theta.tolist()
+    g, l3, l4 = geometry, geometry.l3, geometry.l4
+    y1, z1 = g.l1 + l3 * math.cos(theta_1), l3 * math.sin(theta_1)
+    dx, dz = l3 * math.cos(theta_2) + (2 * g.l5 - g.l1), l3 * math.sin(theta_2) - z1
+    distance2 = dx * dx + dz * dz
+    if distance2 == 0.0:
+        raise no_assembly(theta, branch, geometry)
+    along = 0.5 - 0.5 * y1 * y1 / distance2
+    across2 = (l4 * l4 - y1 * y1) / distance2 - along * along
+    if across2 < -_ROUNDING * (1 + along * along):
+        raise no_assembly(theta, branch, geometry)
+    across = branch.planar * math.sqrt(max(0.0, across2))
+    x_c, z_c = along * dx - across * dz, z1 + along * dz + across * dx
+    u = x_c - (l3 * math.cos(theta_3) + (g.l1 - 2 * g.l2))
+    w = z_c - (l3 * math.sin(theta_3) - g.l6)
+    numerator, denominator = l4 * l4 - g.l7 * g.l7 - u * u - w * w, 2 * g.l7 * u
+    if abs(numerator) > abs(denominator) * (1 + _ROUNDING) or denominator == 0.0:
+        raise no_assembly(theta, branch, geometry)
+    cos_beta = min(1.0, max(-1.0, numerator / denominator))
+    y = branch.sin_beta * g.l7 * math.sqrt((1 - cos_beta) * (1 + cos_beta))
+    return np.array([x_c + g.l7 * cos_beta + g.l2, y, z_c + 2 * g.l6])
+
+
 def _inverse_block(
     position: FloatArray,
     geometry: Geometry,
@@ -264,42 +306,52 @@ def _inverse_block(
     cos_beta = np.sqrt(_clip_rounding((1 - sin_beta) * (1 + sin_beta)))
     z_c = z - 2 * l6
     # (C_i - A_i) as: level in the arm's plane, vertical in it, out of it (squared)
-    leg3 = _solve_leg(x + (l2 - l1), z - l6, y * y, geometry)
-    # Gathered by slots in the cache, then copied out once.
-    angles = np.empty((2, 2, 2, 2, 3, len(x)))  # signs of cos(beta), legs 1, 2, 3; leg
+    angle1 = np.arctan2(z_c, -l1)
+    leg3 = _solve_leg(x + (l2 - l1), z - l6, y * y, None, geometry)
+    small_beta = np.arcsin(np.clip(sin_beta, -1.0, 1.0))
+    distinct = np.empty((12, len(x)))  # a row for each sign of cos(beta), leg and bend
     for index, sign in enumerate((-1, 1)):
         x_c = x - l2 - sign * l7 * cos_beta
-        leg1 = _solve_leg(np.full_like(x, -l1), z_c, x_c * x_c, geometry)
-        leg2 = _solve_leg(x_c + (l1 - 2 * l5), z_c, np.zeros_like(x), geometry)
+        leg1 = _solve_leg(np.full_like(x, -l1), z_c, x_c * x_c, angle1, geometry)
+        leg2 = _solve_leg(x_c + (l1 - 2 * l5), z_c, 0.0, None, geometry)
+        rows = distinct[6 * index : 6 * index + 6]
         for bend in (0, 1):
-            angles[index, bend, :, :, 0] = leg1[bend]
-            # Arm 2 points outwards at theta_2 = pi: keep the cut of the arctangent away from there.
-            angles[index, :, bend, :, 1] = np.mod(leg2[bend], 2 * np.pi)
-            angles[index, :, :, bend, 2] = leg3[bend]
-        # One leg without a solution voids the branch. Both bends of a leg fail together.
-        real = np.isfinite(leg1[0] + leg2[0] + leg3[0])
-        angle = np.where(real, np.arctan2(sin_beta, sign * cos_beta), np.nan)
+            rows[bend], rows[2 + bend], rows[4 + bend] = leg1[bend], leg2[bend], leg3[bend]
+        # One leg without a solution voids the branch; both bends of a leg fail together.
+        real = np.isfinite(rows[0] + rows[2] + rows[4])
+        angle = small_beta if sign > 0 else np.copysign(np.pi, y) - small_beta
         if not real.all():
-            angles[index][..., ~real] = np.nan
+            rows[:, ~real] = np.nan
+            angle = np.where(real, angle, np.nan)
         beta[:, 8 * index : 8 * index + 8] = angle[:, None]
         valid[:, 8 * index : 8 * index + 8] = real[:, None]
-    theta[...] = angles.reshape(16, 3, -1).transpose(2, 0, 1)
+    rows = distinct.reshape(2, 3, 2, -1)
+    # Arms 1 and 3 are cut where they point inwards, at theta = pi; arm 2 does so at theta = 0.
+    rows[:, ::2] -= 2 * np.pi * (rows[:, ::2] > np.pi)
+    rows[:, ::2] += 2 * np.pi * (rows[:, ::2] <= -np.pi)
+    rows[:, 1] += 2 * np.pi * (rows[:, 1] < 0)
+    np.take(np.ascontiguousarray(distinct.T), _ROW_OF_SLOT, axis=1, out=theta, mode="clip")
 
 
 def _solve_leg(
-    a: FloatArray, b: FloatArray, out2: FloatArray, geometry: Geometry
+    a: FloatArray,
+    b: FloatArray,
+    out2: FloatArray | float,
+    angle: FloatArray | None,
+    geometry: Geometry,
 ) -> tuple[FloatArray, FloatArray]:
     """Solve |C - A - l3 e(theta)| = l4, i.e. a cos + b sin = c; NaN where not real.
 
     The serial factor BC . dB/dtheta is l3 (b cos - a sin), so its sign tells the two angles apart:
-    the first has it negative, the second positive.
+    the first has it negative, the second positive. ``angle`` is atan2(b, a), if it is known.
     """
     radius2 = a * a + b * b
     c = (radius2 + out2 + (geometry.l3**2 - geometry.l4**2)) / (2 * geometry.l3)
-    s = np.sqrt(_clip_rounding((radius2 - c * c) / geometry.l4**2)) * geometry.l4
-    # theta = atan2(b, a) +- atan2(s, c), in one arctangent each
-    bc, ac, bs, as_ = b * c, a * c, b * s, a * s
-    return np.arctan2(bc + as_, ac - bs), np.arctan2(bc - as_, ac + bs)
+    ratio = c / np.sqrt(radius2)
+    ratio[np.abs(ratio) > 1 + _ROUNDING] = np.nan
+    apart = np.arccos(np.clip(ratio, -1.0, 1.0))
+    angle = np.arctan2(b, a) if angle is None else angle
+    return angle + apart, angle - apart
 
 
 def _clip_rounding(value: FloatArray) -> FloatArray:
