@@ -4,7 +4,7 @@ VENV := .venv
 RUN := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
 
-.PHONY: help demo test lint format test-fast test-slow urdf pictures clean
+.PHONY: help demo test lint format test-fast test-slow urdf pictures figures bench-kinematics clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -46,8 +46,14 @@ test-slow: $(INSTALLED) ## tests that take minutes: 1000 expert episodes, traini
 urdf: $(INSTALLED) ## regenerate urdf/ from the mechanism
 	$(RUN) -m tpm_gym.urdf urdf
 
-pictures: $(INSTALLED) ## redraw docs/images/
+pictures: $(INSTALLED) ## redraw the README's pictures
 	$(RUN) docs/draw_pictures.py
+
+figures: $(INSTALLED) ## redraw the paper's figures, and more, in docs/images/
+	$(RUN) docs/draw_figures.py
+
+bench-kinematics: $(INSTALLED) ## speed of the kinematics against a floor and a general solver
+	$(RUN) benchmarks/bench_kinematics.py
 
 clean: ## remove the environment and everything generated
 	rm -rf $(VENV) runs dist build .pytest_cache .mypy_cache .ruff_cache .hypothesis

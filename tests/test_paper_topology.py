@@ -68,22 +68,19 @@ def test_m_hsoc_1_printed_r1_perpendicular_to_bd_is_parallel_to_bd(
 ) -> None:
     """Link 3' turns about every axis in the parallelogram's plane, and not about its normal.
 
-    The normal is perpendicular to rod bd, so r(perpendicular to bd) is just what the rods forbid.
-    Read as the axis in the plane, it is ab again where the parallelogram is a rectangle.
+    The normal is perpendicular to rod bd, so r(perpendicular to bd) may be just what the rods
+    forbid. Read as the axis in the plane, it is ab again where the parallelogram is a rectangle.
     """
-    rectangle = [
-        x for x in (inverse([0.12, 0.03, 0.75]),) if abs(forward_all(x).link3[1, 0]) < 1e-9
-    ]
-    for structure in [*structures, *(describe(theta) for theta in rectangle)]:
+    rectangle = describe(inverse([PAPER.l2 + 0.8 * PAPER.l7, 0.6 * PAPER.l7, 0.75]))  # x_C1 = 0
+    for structure in [*structures, rectangle]:
         unit = structure.branches[0].units[1]
         short, rod = unit.rotations
-        normal = np.cross(short, rod)
         rotations = unit.poc(unit.point).rotations
-        assert rotations.dim == 2
-        np.testing.assert_allclose(
-            Subspace.span([short, rod]).projector, rotations.projector, atol=1e-9
-        )
-        assert (rotations & Subspace.span([normal])).dim == 0
+        ours = Subspace.span([short, rod])
+        np.testing.assert_allclose(ours.projector, rotations.projector, atol=1e-9)
+        assert (rotations & Subspace.span([np.cross(short, rod)])).dim == 0
+    in_plane = np.cross(np.cross(short, rod), rod)
+    assert Subspace.span([short, in_plane]).dim == 1 < rotations.dim == 2
 
 
 def test_m_hsoc_2_printed_t1_parallel_to_r32_holds_at_y_0_only(

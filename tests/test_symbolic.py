@@ -1,4 +1,4 @@
-"""sympy proves that our forms of the paper's equations follow from the closures, for any lengths."""
+"""sympy proves, for any lengths, that our forms of the equations follow from the closures."""
 
 from __future__ import annotations
 

@@ -373,7 +373,11 @@ def _points(name: str, value: ArrayLike) -> FloatArray:
 
 def _finite_points(name: str, value: ArrayLike) -> FloatArray:
     array = _points(name, value)
-    if not np.isfinite(array).all():
+    # For a single point, plain floats are several times faster than numpy's calls.
+    finite = (
+        all(map(math.isfinite, array.tolist())) if array.ndim == 1 else np.isfinite(array).all()
+    )
+    if not finite:
         bad = array[~np.isfinite(array).all(axis=-1)]
         raise InputError(name, bad.reshape(-1, 3)[0].tolist(), "finite")
     return array
