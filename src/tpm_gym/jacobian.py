@@ -29,8 +29,8 @@ __all__ = [
 
 FloatArray = NDArray[np.float64]
 
-# cos(beta) is known to about 1e-14, and where it is 1, sin(beta) is known to the square root of that
-# only: a factor below this (y below 50 nm) cannot be told from zero.
+# cos(beta) is known to about 1e-14; where it is 1, sin(beta) is known to the square root of that
+# only. A factor below this (y below 50 nm) cannot be told from zero.
 _SINGULAR = 1e-6
 
 
