@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, SupportsFloat
@@ -15,7 +16,7 @@ from tpm_gym import checks, kinematics, rewards, tasks
 from tpm_gym.control import make as make_control
 from tpm_gym.errors import ConfigurationError, EpisodeError
 from tpm_gym.mechanism import DEFAULT_MOUNT
-from tpm_gym.physics import Physics
+from tpm_gym.physics import CONTROL_PERIOD, Physics
 from tpm_gym.simulation import Simulation, Snapshot, has_display
 from tpm_gym.state import State
 
@@ -129,7 +130,7 @@ class TPMEnv(gym.Env[Observation, Action]):
     # Gymnasium declares this as an instance's, so it cannot be a ClassVar.
     metadata: dict[str, Any] = {  # noqa: RUF012
         "render_modes": ["human", "rgb_array"],
-        "render_fps": 25,
+        "render_fps": round(1 / CONTROL_PERIOD),
     }
 
     def __init__(
@@ -171,6 +172,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         self._state: State | None = None
         self._goal = np.full(3, np.nan)
         self._closed = False
+        self._shown = 0.0  # when the last frame was due, s of the performance counter
         self.simulation = Simulation(
             self.task.scene,
             physics=physics,
@@ -272,11 +274,18 @@ class TPMEnv(gym.Env[Observation, Action]):
         return float(total) if np.ndim(total) == 0 else total
 
     def render(self) -> NDArray[np.uint8] | None:
-        """The scene as (height, width, 3) RGB; in ``human`` mode the window shows it already."""
+        """The scene as (height, width, 3) RGB.
+
+        In ``human`` mode the window shows it already; then this waits until real time has caught up.
+        """
         if self._closed:
             raise EpisodeError("the environment is closed; make a new one")
         if self.render_mode == "rgb_array":
             return self.simulation.render(*self._size)
+        if self.render_mode == "human":
+            now = time.perf_counter()
+            self._shown = max(self._shown + CONTROL_PERIOD, now)
+            time.sleep(self._shown - now)
         return None
 
     def close(self) -> None:

@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 
 from tpm_gym.errors import ConfigurationError
 
-__all__ = ["Physics", "rotations", "spline_weights"]
+__all__ = ["CONTROL_PERIOD", "Physics", "rotations", "spline_weights"]
 
 FloatArray = NDArray[np.float64]
 
+CONTROL_PERIOD = 1 / 25
+"""Time between two commands, s."""
 GRAVITY = 9.81  # m/s^2
 MOTOR_GAIN = 1.0
 """Share of the position error that a motor takes out in one time step, effort permitting."""
@@ -47,7 +49,7 @@ class Physics:
     time_step: float = 1 / 500
     iterations: int = 50
     erp: float = 0.8
-    control_period: float = 1 / 25
+    control_period: float = CONTROL_PERIOD
 
     def __post_init__(self) -> None:
         """Reject settings that cannot work."""

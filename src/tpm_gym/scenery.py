@@ -27,6 +27,9 @@ _FLOOR_COLOUR: Colour = (0.70, 0.72, 0.75, 1.0)
 _MARKER_COLOUR: Colour = (0.1, 0.8, 0.2, 0.6)
 _PUCK_COLOUR: Colour = (0.83, 0.18, 0.33, 1.0)
 
+# The camera: what it looks at (m), from how far (m), and from where (degrees).
+_TARGET, _DISTANCE, _YAW, _PITCH = (-0.01, 0.0, 0.47), 1.85, 32.0, -13.0
+
 
 class Scenery:
     """Everything in the client that is not the robot.
@@ -115,14 +118,23 @@ class Scenery:
             return np.full(3, np.nan), np.full(4, np.nan), np.full(3, np.nan), np.full(3, np.nan)
         return np.array(pose[0]), np.array(pose[1]), np.array(velocity[0]), np.array(velocity[1])
 
+    def aim_window(self) -> None:
+        """Point the camera of the engine's window like that of :meth:`picture`."""
+        self._client.resetDebugVisualizerCamera(
+            cameraDistance=_DISTANCE,
+            cameraYaw=_YAW,
+            cameraPitch=_PITCH,
+            cameraTargetPosition=_TARGET,
+        )
+
     def picture(self, width: int, height: int, renderer: int) -> NDArray[np.uint8]:
         """The scene as (height, width, 3) RGB."""
         client = self._client
         view = client.computeViewMatrixFromYawPitchRoll(
-            cameraTargetPosition=(-0.01, 0.0, 0.47),
-            distance=1.85,
-            yaw=32.0,
-            pitch=-13.0,
+            cameraTargetPosition=_TARGET,
+            distance=_DISTANCE,
+            yaw=_YAW,
+            pitch=_PITCH,
             roll=0.0,
             upAxisIndex=2,
         )

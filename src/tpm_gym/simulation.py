@@ -118,6 +118,8 @@ class Simulation:
             self._configure()
             self._robot = Robot(self._client, self.mechanism, mount)
             self._scenery = Scenery(self._client, scene)
+            if gui:
+                self._scenery.aim_window()
             self._cup: Cup | None = None
             if scene.puck is not None and self._scenery.puck is not None:
                 self._cup = Cup(self._client, self._robot, self._scenery.puck, scene.puck)
@@ -138,7 +140,7 @@ class Simulation:
             erp=self.physics.erp,
             deterministicOverlappingPairs=1,
         )
-        client.configureDebugVisualizer(pybullet.COV_ENABLE_GUI, 0)
+        client.configureDebugVisualizer(pybullet.COV_ENABLE_GUI, 0)  # no side panels
 
     # -- running ----------------------------------------------------------------------------
 

@@ -16,6 +16,7 @@ from tpm_gym import rewards, workspace
 from tpm_gym.control import STEP_LIMIT
 from tpm_gym.errors import ConfigurationError, ResetOptionError, UnreachableError
 from tpm_gym.mechanism import CUP_LENGTH, DEFAULT_MOUNT
+from tpm_gym.physics import CONTROL_PERIOD
 from tpm_gym.state import Puck, Scene, State
 from tpm_gym.workspace import TASK_REGION, Region
 
@@ -32,7 +33,6 @@ GOAL_REGION = Region(low=(-0.20, 0.016, 0.70), high=(0.10, 0.042, 0.90))
 """Where point P has to go to reach a goal, paper frame; cut by the conditioning when sampled."""
 MIN_SEPARATION = 0.030
 """A goal is at least this far from where its episode starts, m: no success for free."""
-CONTROL_PERIOD = 1 / 25
 
 _MOUNT = DEFAULT_MOUNT
 _CENTRE = tuple(_MOUNT.to_world((np.array(TASK_REGION.low) + TASK_REGION.high) / 2).tolist())
