@@ -87,6 +87,18 @@ class Robot:
         self._end_link = np.array([index for index, _ in ends])
         self._end_point = np.array([point for _, point in ends])
 
+    def paint(self) -> None:
+        """Give each link the colour of its largest solid.
+
+        The engine's OpenGL pictures know one colour a link and take that of the last solid; the
+        software renderer needs no help.
+        """
+        for link in self._mechanism.links:
+            largest = max(link.solids, key=lambda solid: float(np.prod(np.abs(solid.size[:2]))))
+            self._client.changeVisualShape(
+                self.body, self._links.get(link.name, -1), rgbaColor=urdf.COLOURS[largest.colour]
+            )
+
     def place(self, angles: Mapping[str, float]) -> None:
         """Put every joint at its angle (rad), at rest."""
         for name, angle in angles.items():

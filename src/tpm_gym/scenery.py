@@ -121,7 +121,7 @@ class Scenery:
     def aim_window(self) -> None:
         """Point the camera of the engine's window like that of :meth:`picture`."""
         self._client.resetDebugVisualizerCamera(
-            cameraDistance=_DISTANCE,
+            cameraDistance=0.7 * _DISTANCE,  # the window's field of view is wider
             cameraYaw=_YAW,
             cameraPitch=_PITCH,
             cameraTargetPosition=_TARGET,

@@ -120,6 +120,8 @@ class Simulation:
             self._scenery = Scenery(self._client, scene)
             if gui:
                 self._scenery.aim_window()
+            if gui or renderer == "egl":
+                self._robot.paint()
             self._cup: Cup | None = None
             if scene.puck is not None and self._scenery.puck is not None:
                 self._cup = Cup(self._client, self._robot, self._scenery.puck, scene.puck)
