@@ -165,3 +165,15 @@ def test_the_datasheet_lists_the_entries_and_numbers_that_the_code_uses():
     assert singularity_penalty(0.08) == 0.0 < singularity_penalty(0.0799)
     assert f"below {1e3 * tasks.TOLERANCE:.0f} mm" in text
     assert f"at least {1e3 * tasks.MIN_SEPARATION:.0f} mm" in text
+
+
+@pytest.mark.parametrize("sideways", [(-1.0, -1.0), (1.0, 1.0), (1.0, -1.0), (0.0, 0.0)])
+def test_hammering_on_the_puck_at_full_speed_does_not_lose_the_mechanism(env, sideways):
+    for offset in (-0.016, 0.0, 0.016):
+        options = {"object": (-0.04 + offset, -0.028, 0.015), "goal": (0.05, -0.03, 0.1)}
+        env.reset(seed=0, options=options)
+        for vertical in (1, 1, 1, 1, -1, -1, 1, 1, 1, -1, 1, 1):
+            down = np.array([0.0, 0.0, vertical, 0.0])
+            env.step(down)
+            info = env.step(down + (*sideways, 0.0, 0.0))[4]
+            assert info["closure_error"] < 0.5e-3

@@ -10,7 +10,15 @@ from typing import Any
 import numpy as np
 
 from tpm_gym.mechanism import CUP_RADIUS
-from tpm_gym.physics import PULL_OFF_FORCE, SEAL_GAP, SEAL_TILT, rotations
+from tpm_gym.physics import (
+    CUP_DAMPING,
+    CUP_STIFFNESS,
+    PULL_OFF_FORCE,
+    SEAL_GAP,
+    SEAL_PRESS,
+    SEAL_TILT,
+    rotations,
+)
 from tpm_gym.robot import Robot
 from tpm_gym.state import Puck
 
@@ -36,6 +44,12 @@ class Cup:
         self._constraint: int | None = None
         self.grip: Pose | None = None
         """Pose of the held object in the platform's inertial frame, None if nothing is held."""
+        client.changeDynamics(
+            robot.body,
+            robot.platform,
+            contactStiffness=CUP_STIFFNESS,
+            contactDamping=CUP_DAMPING,
+        )
         # The engine orders contacts otherwise once a pair has an entry of its own in the filter;
         # with the entry from the start, the first episode equals all later ones to the last bit.
         self._collide(True)
@@ -82,7 +96,7 @@ class Cup:
         gap = float(local[2]) - self._puck.height / 2
         covered = float(np.hypot(local[0], local[1])) <= self._puck.radius - CUP_RADIUS
         aligned = float(-turn[:, 2] @ axis) >= np.cos(SEAL_TILT)
-        return abs(gap) <= SEAL_GAP and covered and aligned
+        return -SEAL_PRESS <= gap <= SEAL_GAP and covered and aligned
 
     def _relative_pose(self) -> Pose:
         """Pose of the object in the platform's inertial frame, as it is now."""

@@ -22,8 +22,13 @@ MOTOR_GAIN = 1.0
 """Share of the position error that a motor takes out in one time step, effort permitting."""
 PULL_OFF_FORCE = 12.0
 """Largest force that the cup holds, N: 60 kPa of vacuum on the area of the lip."""
+CUP_STIFFNESS, CUP_DAMPING = 3000.0, 30.0
+"""Of the cup's bellows in contact, N/m and N s/m: it gives way where a rigid tool would set the
+motors' full torque against the table."""
 SEAL_GAP = 0.002
 """Largest gap between lip and object that the vacuum closes, m."""
+SEAL_PRESS = 0.005
+"""How far the bellows may be pressed together and still seal, m."""
 SEAL_TILT = np.deg2rad(10.0)
 """Largest angle between the cup's axis and the object's that the lip follows, rad."""
 CLOSURE_LIMIT = 0.005

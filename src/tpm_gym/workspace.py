@@ -71,13 +71,14 @@ class Region:
         return float(np.minimum(array - self.low, np.asarray(self.high) - array).min())
 
 
-TASK_REGION = Region(low=(-0.24, 0.012, 0.66), high=(0.12, 0.046, 0.915))
+TASK_REGION = Region(low=(-0.24, 0.012, 0.66), high=(0.12, 0.046, 0.903))
 """Where the environments let point P go, for the paper's lengths.
 
 The slab 0 < y < l7, less a margin to the parallel singularity y = 0 and to the edge y = l7. Every
 point is reachable with the elbows out, in the default assembly mode (a test walks through it).
 Nearer to y = 0 than this, the motors' torque no longer suffices to hold y when a random policy
-reverses x or z at full speed: the platform is then thrown through the singularity.
+reverses x or z at full speed: the platform is then thrown through the singularity. Farther from the
+base than this, the cup of the default mount would be pressed into a puck by more than it yields.
 """
 
 
