@@ -8,7 +8,10 @@ from tpm_gym import jacobian, tasks
 from tpm_gym.env import TPMEnv
 from tpm_gym.errors import ClosureError, ConfigurationError, EpisodeError
 from tpm_gym.expert import Expert
+from tpm_gym.mechanism import DEFAULT_MOUNT
+from tpm_gym.physics import Physics
 from tpm_gym.rewards import singularity_penalty
+from tpm_gym.workspace import TASK_REGION
 
 
 @pytest.fixture
@@ -107,25 +110,52 @@ def test_a_lost_loop_voids_the_episode_and_a_reset_recovers(env):
     assert env.step(np.zeros(4))[4]["closure_error"] < 1e-4
 
 
-def test_a_saved_state_continues_with_the_same_goal_rng_and_grasp(env):
-    observation, _ = env.reset(seed=5)
+@pytest.mark.parametrize("stop", [2, 5, 6, 8, 12, 20, 30])
+def test_a_saved_state_continues_bit_equally(env, stop):
+    observation, _ = env.reset(seed=3)
     expert = Expert(env)
     expert.reset(observation)
     actions = []
     for step in range(40):
-        if step == 20:
+        if step == stop:
             snapshot = env.save_state()
+            held = env.state.holding
         actions.append(expert.act(observation))
         observation = env.step(actions[-1])[0]
     next_goal = env.reset()[0]["desired_goal"]
     env.reset(seed=6)
     restored = env.restore_state(snapshot)
-    assert env.state.holding
-    for action in actions[20:]:
+    assert env.state.holding is held
+    for action in actions[stop:]:
         restored = env.step(action)[0]
     for name, array in observation.items():
-        assert np.allclose(restored[name], array, atol=1e-3)
+        assert np.array_equal(restored[name], array)
     assert np.array_equal(env.reset()[0]["desired_goal"], next_goal)
+
+
+@pytest.mark.parametrize("bias", [0.002, -0.002, 0.005])
+def test_biased_encoders_never_end_an_episode(bias):
+    env = TPMEnv("reach", encoder_bias=(bias, -bias, bias))
+    rng = np.random.default_rng(0)
+    for seed in range(4):
+        env.reset(seed=seed)
+        for _ in range(50):
+            observation = env.step(rng.choice([-1.0, 0.0, 1.0], 3))[0]
+            assert env.observation_space.contains(observation)
+    env.close()
+
+
+def test_a_bias_with_which_nothing_can_be_assembled_is_refused_by_name():
+    env = TPMEnv("reach", encoder_bias=(0.5, 0.5, 0.5))
+    with pytest.raises(ConfigurationError, match="encoder_bias"):
+        env.reset(seed=0)
+    env.close()
+
+
+@pytest.mark.parametrize("physics", [5, {}, Physics(control_period=0.2)])
+def test_physics_that_do_not_fit_the_tasks_are_refused(physics):
+    with pytest.raises(ConfigurationError, match="physics"):
+        TPMEnv(physics=physics)
 
 
 def test_a_state_cannot_be_saved_outside_an_episode(env):
@@ -163,6 +193,13 @@ def test_the_datasheet_lists_the_entries_and_numbers_that_the_code_uses():
     assert list(tasks.STEP_LIMIT) == [0.03, 0.005, 0.03]
     assert "1/cond(J) >= 0.08" in text
     assert singularity_penalty(0.08) == 0.0 < singularity_penalty(0.0799)
+    low, high = np.array(TASK_REGION.low), np.array(TASK_REGION.high)
+    (x0, y0, z1), (x1, y1, z0) = DEFAULT_MOUNT.to_world(low), DEFAULT_MOUNT.to_world(high)
+    box = f"{x0:.4g} <= x <= {x1:.4g}, {y1:.4g} <= y <= {y0:.4g}, {z0:.4g} <= z <= {z1:.4g} m"
+    assert box in text
+    puck = tasks.PickAndPlace.puck
+    size = (2e3 * puck.radius, 1e3 * puck.height, 1e3 * puck.mass)
+    assert "({:.0f} mm wide, {:.0f} mm high, {:.0f} g)".format(*size) in text
     assert f"below {1e3 * tasks.TOLERANCE:.0f} mm" in text
     assert f"at least {1e3 * tasks.MIN_SEPARATION:.0f} mm" in text
 

@@ -239,3 +239,14 @@ def test_command_keeps_no_folder_outside(monkeypatch: pytest.MonkeyPatch, tmp_pa
     words = ["train/train.py", "--run", str(inside), f"--json={outside}", "--seed", "3"]
     expected = "python train/train.py --run 'runs/a b' --json=x.json --seed 3"
     assert provenance.command_line(words) == expected
+
+
+@pytest.mark.parametrize(("option", "name"), [("video", "film.xyz"), ("picture", "still")])
+def test_a_picture_of_an_unknown_kind_is_refused_before_the_episodes(
+    tmp_path: Path, option: str, name: str
+) -> None:
+    config = evaluate.Config(
+        policy=("random",), env="TPMReach-v0", episodes=1, **{option: tmp_path / name}
+    )
+    with pytest.raises(ConfigError, match=f"--{option}"):
+        evaluate.evaluate(config)

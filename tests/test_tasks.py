@@ -163,6 +163,8 @@ def test_an_object_below_the_table_is_refused():
     with pytest.raises(ResetOptionError):
         PickAndPlace().check_object((0.0, -0.03, 0.014))
     with pytest.raises(ResetOptionError):
+        PickAndPlace().check_goal((0.0, -0.03, 0.0135))
+    with pytest.raises(ResetOptionError):
         Reach().check_object((0.0, -0.03, 0.015))
 
 

@@ -382,3 +382,19 @@ def test_recipe_mistakes_name_file_key_and_choice(
         read_recipe(path, "sac", "TPMReach-v0")
     assert caught.value.key == key
     assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "device", ["abacus", "cuda" if not torch.cuda.is_available() else "cuda:99x"]
+)
+def test_a_missing_device_is_refused_before_an_earlier_run_is_deleted(
+    tmp_path: Path, device: str
+) -> None:
+    (tmp_path / "config.json").write_text("{}")
+    (tmp_path / "last.zip").write_text("precious")
+    config = train.Config(
+        env="TPMReach-v0", run=tmp_path, overwrite=True, device=device, steps=2000
+    )
+    with pytest.raises(ConfigError, match="--device"):
+        train.train(config)
+    assert (tmp_path / "last.zip").read_text() == "precious"

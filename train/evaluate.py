@@ -140,6 +140,10 @@ def _check(config: Config) -> None:
         raise ConfigError("--seed", config.seed, "must be at least 0")
     if not config.policy:
         raise ConfigError("--policy", "", "name at least one policy")
+    if config.video is not None and config.video.suffix != ".mp4":
+        raise ConfigError("--video", config.video, "must end in .mp4")
+    if config.picture is not None and config.picture.suffix != ".png":
+        raise ConfigError("--picture", config.picture, "must end in .png")
 
 
 def _resolve_env(config: Config) -> str:
@@ -272,10 +276,12 @@ def _film(env_id: str, config: Config, console: Console) -> None:
 
 def main() -> None:
     """Run the command line."""
+    from tpm_gym import TPMError
+
     config = tyro.cli(Config, description=__doc__)
     try:
         evaluate(config)
-    except TrainError as error:
+    except (TrainError, TPMError) as error:
         sys.exit(f"error: {error}")
 
 

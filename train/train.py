@@ -166,6 +166,19 @@ def _check(plan: Plan) -> None:
     if plan.eval_episodes > most:
         raise ConfigError("--eval-episodes", plan.eval_episodes, f"must be at most {most}")
     _check_hindsight(plan)
+    _check_device(plan.device)
+
+
+def _check_device(device: str) -> None:
+    """Refuse a device that PyTorch does not have here, before anything is deleted for the run."""
+    import torch
+
+    try:
+        kind = torch.device(device).type
+    except RuntimeError as error:
+        raise ConfigError("--device", device, "is no device of PyTorch; try cpu") from error
+    if kind == "cuda" and not torch.cuda.is_available():
+        raise ConfigError("--device", device, "PyTorch finds no GPU here; use cpu")
 
 
 def _check_hindsight(plan: Plan) -> None:
@@ -200,6 +213,9 @@ def train(config: Config, console: Console | None = None) -> bool:
     _prepare_folder(plan.run, config.overwrite)
     provenance.write_json(plan.run / CONFIG_FILE, _description(plan))
     console.print(f"{plan.title}, {plan.steps:,} steps, in {plan.run}", markup=False)
+    starts = int(plan.recipe.arguments.get("learning_starts", 0))
+    if plan.steps <= starts:
+        console.print(f"note: learning starts at step {starts:,}, so nothing will be learned")
     finished = _learn(plan, console)
     outcome = "finished" if finished else "stopped early, saved"
     console.print(f"{outcome}: {plan.run}", markup=False)
@@ -316,10 +332,12 @@ def make_env(env_id: str, in_worker: bool = False) -> GoalEnv:
 
 def main() -> None:
     """Run the command line."""
+    from tpm_gym import TPMError
+
     config = tyro.cli(Config, description=__doc__)
     try:
         finished = train(config)
-    except TrainError as error:
+    except (TrainError, TPMError) as error:
         sys.exit(f"error: {error}")
     if not finished:
         sys.exit(128 + signal.SIGINT)

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tpm_gym.errors import ActionError, ConfigurationError, ResetOptionError
+from tpm_gym.physics import CONTROL_PERIOD, Physics
 
-__all__ = ["action", "picture_size", "reset_options", "weight"]
+__all__ = ["action", "physics", "picture_size", "reset_options", "weight"]
 
 
 def action(value: Any, size: int) -> NDArray[np.float64]:
@@ -39,6 +40,21 @@ def weight(value: Any) -> float:
     if not isinstance(value, (int, float, np.number)) or not 0 <= float(value) < np.inf:
         raise ConfigurationError("penalty_weight", value, "a finite number >= 0")
     return float(value)
+
+
+def physics(value: Any) -> None:
+    """Settings of the engine that fit the 25 Hz of the environments, or None for the default.
+
+    Raises:
+        ConfigurationError: If it is anything else.
+    """
+    if value is None:
+        return
+    if not isinstance(value, Physics):
+        raise ConfigurationError("physics", value, "a tpm_gym.physics.Physics, or None")
+    if value.control_period != CONTROL_PERIOD:
+        valid = f"a control_period of {CONTROL_PERIOD} s, which the tasks are made for"
+        raise ConfigurationError("physics", value, valid)
 
 
 def picture_size(width: Any, height: Any) -> tuple[int, int]:

@@ -31,7 +31,7 @@ _GOAL_BOUND = 2.0
 
 @dataclass(frozen=True)
 class EnvSnapshot:
-    """Everything that the next steps of an environment depend on."""
+    """Everything that the next steps of an unwrapped environment depend on."""
 
     simulation: Snapshot
     rng: dict[str, Any]
@@ -62,13 +62,16 @@ class TPMEnv(gym.Env[Observation, Action]):
     | 0 to 2, joints | increment of theta_1 to theta_3: at most 0.08 rad, P at most as above |
     | 3 (PickAndPlace) | above 0: vacuum on |
 
-    Commands accumulate, are projected into the task region, and are followed along a B-spline.
+    Commands accumulate, are projected into the task region, and are followed along a B-spline. The
+    region is -0.24 <= x <= 0.12, -0.046 <= y <= -0.012, 0.067 <= z <= 0.31 m for P, world. Small
+    turns of the joints move P far along y, so with joint control the limit for P slows most random
+    actions down to a tenth, all three joints together.
 
     ## Observation
 
     A dictionary. ``achieved_goal`` and ``desired_goal`` are (3,) m in the world frame: point P
-    (Reach) or the centre of the puck (PickAndPlace). ``observation`` holds, each scaled to order
-    one (``env.unwrapped.task.decode`` gives back SI units):
+    (Reach) or the centre of the puck (PickAndPlace). ``observation``, 9 numbers (Reach) or 21,
+    holds what follows, each scaled to order one (``env.unwrapped.task.decode`` gives SI units):
 
     | entry | size | meaning |
     | --- | --- | --- |
@@ -95,11 +98,16 @@ class TPMEnv(gym.Env[Observation, Action]):
     | singularity | -penalty_weight x penalty: 0 where 1/cond(J) >= 0.08, 1 at a singularity |
     | approach | minus half the distance from cup to puck in units of 0.1 m |
 
+    Hindsight: ``compute_reward`` with an empty info, as SB3's HerReplayBuffer calls it, gives the
+    goal term alone. To keep the other terms use ``train/her.py``, or ``copy_info_dict=True``.
+
     ## Start
 
-    The arm at rest at home, the puck upright on the table, the goal at least 30 mm away from where
-    the puck (or P) starts. Goals and objects are sampled where 1/cond(J) >= 0.08.
-    ``reset(options={"object": (x, y, z), "goal": (x, y, z)})`` chooses them instead.
+    The arm at rest at home, the puck (36 mm wide, 30 mm high, 50 g) upright on the table, the goal
+    at least 30 mm away from where the puck (or P) starts. Goals and objects are sampled where
+    1/cond(J) >= 0.08.
+    ``reset(options={"object": (x, y, z), "goal": (x, y, z)})`` chooses them instead; a puck that
+    starts above the table falls.
 
     ## Info
 
@@ -112,7 +120,8 @@ class TPMEnv(gym.Env[Observation, Action]):
         control: ``"cartesian"`` or ``"joints"``.
         reward: ``"sparse"`` or ``"dense"``.
         penalty_weight: Weight of the singularity penalty; 0 switches it off.
-        encoder_bias: (3,) rad, added to what the encoders report.
+        encoder_bias: (3,) rad, added to what the encoders report; meant for some mrad. Where the
+            biased angles cannot be assembled, position and velocity keep their last values.
         physics: Numerical settings of the engine.
         render_mode: None, ``"rgb_array"`` or ``"human"``.
         renderer: ``"tiny"`` (any machine) or ``"egl"`` (GPU).
@@ -158,6 +167,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         self.render_mode = render_mode
         self.penalty_weight = checks.weight(penalty_weight)
         self.task = tasks.make(task, reward)
+        checks.physics(physics)
         self.control = make_control(control)
         self._size = checks.picture_size(width, height)
         self.observation_space = spaces.Dict(
@@ -276,7 +286,7 @@ class TPMEnv(gym.Env[Observation, Action]):
     def render(self) -> NDArray[np.uint8] | None:
         """The scene as (height, width, 3) RGB.
 
-        In ``human`` mode the window shows it already; then this waits until real time has caught up.
+        In ``human`` mode the window shows it already; this then waits until real time catches up.
         """
         if self._closed:
             raise EpisodeError("the environment is closed; make a new one")
@@ -313,6 +323,9 @@ class TPMEnv(gym.Env[Observation, Action]):
 
     def save_state(self) -> EnvSnapshot:
         """Take down physics, rng, goal, commands and grasp.
+
+        What follows, here or after :meth:`restore_state`, is equal to the last bit. Wrappers keep
+        their own counts: TimeLimit's steps are not part of it.
 
         Raises:
             EpisodeError: If there is no episode.

@@ -139,7 +139,8 @@ def forward(
         geometry: Link lengths.
 
     Returns:
-        (..., 3) m, point P in the paper frame.
+        (..., 3) m, point P in the paper frame. Both y and -y belong to the same angles: the default
+        branch gives y > 0, ``AssemblyMode(-1, -1)`` its mirror image.
 
     Raises:
         InputError: If theta has the wrong shape or is not finite.

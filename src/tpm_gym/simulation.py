@@ -109,7 +109,7 @@ class Simulation:
     ) -> None:
         """Connect, load and close the loops."""
         self.scene, self.geometry, self.mount = scene, geometry, mount
-        self.physics = physics or Physics()
+        self.physics = Physics() if physics is None else physics
         self.mechanism = build(geometry)
         self._bias = _bias(encoder_bias)
         self._client = _Client(pybullet.GUI if gui else pybullet.DIRECT)
@@ -129,6 +129,7 @@ class Simulation:
             self.close()
             raise
         self._commands = np.zeros((2, 3))  # the last two, paper frame, m
+        self._evaluation: jacobian.Evaluation | None = None  # the last one by the encoders
         self._spline = spline_weights(self.physics.substeps)
 
     # -- building ---------------------------------------------------------------------------
@@ -165,6 +166,7 @@ class Simulation:
         """
         angles = joint_angles(theta, geometry=self.geometry)
         self._let_go()
+        self._evaluation = None
         self._robot.place(angles)
         self._commands = np.tile(kinematics.forward(theta, geometry=self.geometry), (2, 1))
         if object_position is not None:
@@ -218,10 +220,7 @@ class Simulation:
         theta, theta_dot = self._robot.encoders()
         theta = theta + self._bias
         gap, platform, tilt = self._robot.truth()
-        try:
-            at = jacobian.evaluate(theta, geometry=self.geometry)
-        except (UnreachableError, SingularityError) as error:
-            raise AssemblyModeError(float("inf"), ASSEMBLY_LIMIT) from error
+        at = self._evaluate(theta)
         position, quaternion, velocity, spin = self._scenery.puck_state()
         return State(
             theta=theta,
@@ -240,14 +239,33 @@ class Simulation:
             object_angular_velocity=spin,
         )
 
+    def _evaluate(self, theta: FloatArray) -> jacobian.Evaluation:
+        """Position and Jacobian by the encoders; the last ones where the encoders make no sense.
+
+        That is what a controller can do whose biased encoders report angles at which no assembly
+        exists, as happens near the edges of the workspace.
+        """
+        try:
+            self._evaluation = jacobian.evaluate(theta, geometry=self.geometry)
+        except (UnreachableError, SingularityError) as error:
+            if not self._bias.any():
+                raise AssemblyModeError(float("inf"), ASSEMBLY_LIMIT) from error
+            if self._evaluation is None:
+                valid = "a bias with which the mechanism can be assembled at the start"
+                raise ConfigurationError("encoder_bias", self._bias.tolist(), valid) from error
+        return self._evaluation
+
     def _check(self, state: State) -> None:
         # "not <=" so that a NaN fails too
         if not state.closure_error <= CLOSURE_LIMIT:
             raise ClosureError(float(state.closure_error), CLOSURE_LIMIT)
         expected = state.fk_position
         if self._bias.any():
-            true_theta = state.theta - self._bias
-            expected = self.mount.to_world(kinematics.forward(true_theta, geometry=self.geometry))
+            try:
+                true_point = kinematics.forward(state.theta - self._bias, geometry=self.geometry)
+            except UnreachableError as error:
+                raise AssemblyModeError(float("inf"), ASSEMBLY_LIMIT) from error
+            expected = self.mount.to_world(true_point)
         apart = float(np.linalg.norm(state.platform_position - expected))
         if not apart <= ASSEMBLY_LIMIT:
             raise AssemblyModeError(apart, ASSEMBLY_LIMIT)
@@ -259,15 +277,22 @@ class Simulation:
     # -- state, pictures, end -----------------------------------------------------------------
 
     def save(self) -> Snapshot:
-        """Take down everything that the physics depend on."""
+        """Take down everything that the physics depend on, and go on from exactly that.
+
+        The engine keeps memories that cannot be read out, such as the impulses of old contacts. So
+        that what follows here and what follows a :meth:`restore` are equal to the last bit, they
+        are dropped here too.
+        """
         pose, velocity = self._scenery.puck_pose()
-        return Snapshot(
+        snapshot = Snapshot(
             joints=self._robot.joint_states(),
             commands=self._commands.copy(),
             object_pose=pose,
             object_velocity=velocity,
             grip=self._cup.grip if self._cup is not None else None,
         )
+        self.restore(snapshot)
+        return snapshot
 
     def restore(self, snapshot: Snapshot) -> State:
         """Go back to a moment that :meth:`save` took down, of this or an equal simulation."""
@@ -295,7 +320,10 @@ def has_display() -> bool:
 
 
 def _bias(value: ArrayLike) -> FloatArray:
-    bias = np.asarray(value, dtype=np.float64)
+    try:
+        bias = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ConfigurationError("encoder_bias", value, "three finite angles in rad") from error
     if bias.shape != (3,) or not np.isfinite(bias).all():
         raise ConfigurationError("encoder_bias", value, "three finite angles in rad")
     return bias

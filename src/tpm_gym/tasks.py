@@ -234,10 +234,16 @@ class PickAndPlace(Task):
 
     def check_object(self, position: ArrayLike) -> FloatArray:
         """A start of the puck that the user chose; see the base class."""
-        point = _check_reach("object", position, self._tool_offset())
+        return self._check_height("object", _check_reach("object", position, self._tool_offset()))
+
+    def check_goal(self, goal: ArrayLike) -> FloatArray:
+        """A goal for the puck that the user chose; see the base class."""
+        return self._check_height("goal", super().check_goal(goal))
+
+    def _check_height(self, name: str, point: FloatArray) -> FloatArray:
         if point[2] < self.puck.height / 2 - 1e-6:
             valid = f"z >= {self.puck.height / 2} m, half the puck's height above the table"
-            raise ResetOptionError("object", point.tolist(), valid)
+            raise ResetOptionError(name, point.tolist(), valid)
         return point
 
     def achieved(self, state: State) -> FloatArray:
