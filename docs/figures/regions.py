@@ -1,0 +1,115 @@
+"""The aspects: regions of the elbows-out mode that no singularity divides."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+
+from figures import style
+from figures.style import BLACK, BLUE, GREEN, MM, ORANGE, PURPLE
+from figures.zero_sets import Section, parallel_lines, reach_margin
+from tpm_gym.aspects import Aspect, aspects
+from tpm_gym.geometry import PAPER
+from tpm_gym.kinematics import ELBOWS_OUT
+from tpm_gym.singularity import factors_at
+from tpm_gym.workspace import TASK_REGION
+
+FloatArray = NDArray[np.float64]
+
+SHAPE = (200, 12, 260)
+# Signs of the second and third factor of Eq. (16) -> colour. No two regions of one half, as cut by
+# y = 0, have the same signs; where a grid sees two, they hang together by less than a cell.
+COLOURS = {(1, -1): BLUE, (-1, -1): ORANGE, (-1, 1): GREEN, (1, 1): PURPLE}
+
+_X, _Z = np.linspace(-0.92, 1.06, 397), np.linspace(-1.18, 1.22, 481)
+_Y = np.linspace(-PAPER.l7, PAPER.l7, 160)  # an even number: y = 0 itself is not sampled
+
+
+def aspects_figure() -> Figure:
+    """Sections of all aspects, with their volumes."""
+    found = aspects(ELBOWS_OUT, shape=SHAPE)
+    figure = Figure(figsize=(style.WIDTH, 4.9))
+    what = f"elbows-out mode ({style.mode_name(ELBOWS_OUT)})"
+    style.heading(figure, "Aspects: regions free of singularities", what, 0.978, 0.935)
+    for column, y in enumerate((0.005, 0.025, 0.048)):
+        axes = figure.add_axes((0.095 + 0.222 * column, 0.385, 0.2, 0.47))
+        _section(axes, Section("y", y))
+        axes.plot([-300, 300], [0, 0], color=BLACK, linewidth=1.8, solid_capstyle="butt")
+        axes.set_aspect("equal")
+        axes.set(xlim=(-880, 1020), ylim=(-1180, 1220))
+        if column:
+            axes.set_ylabel("")
+            axes.tick_params(labelleft=False)
+    for column, height in enumerate((0.75, 0.10)):
+        axes = figure.add_axes((0.095 + 0.335 * column, 0.1, 0.30, 0.155))
+        _section(axes, Section("z", height), _X, _Y)
+        axes.set(xlim=(-880, 1020), ylim=(-56, 56), yticks=[-50, 0, 50])
+        if column:
+            axes.set_ylabel("")
+            axes.tick_params(labelleft=False)
+    _legend(figure, found)
+    _smallest(figure.add_axes((0.825, 0.1, 0.165, 0.155)))
+    return figure
+
+
+def colour(signs: tuple[int, int], sin_beta: int) -> FloatArray:
+    """The colour of an aspect; that of its mirror image in y = 0, paler."""
+    strength = 0.85 if sin_beta > 0 else 0.40
+    mixed: FloatArray = 1 - strength * (1 - np.asarray(to_rgb(COLOURS[signs])))
+    return mixed
+
+
+def _signs(aspect: Aspect) -> tuple[int, int]:
+    return aspect.level3, aspect.assembly.planar
+
+
+def _section(axes: Axes, section: Section, x: FloatArray = _X, other: FloatArray = _Z) -> None:
+    """Colour the points (x, other) of a section by their signs, and draw the aspects' edges."""
+    points = section.points(np.stack(np.meshgrid(x, other), axis=-1))
+    parallel = factors_at(points, ELBOWS_OUT).parallel
+    image = np.ones(points.shape)
+    for signs in COLOURS:
+        same = np.all(np.sign(parallel[..., 1:]) == signs, axis=-1)
+        for half in (1, -1):
+            image[same & (np.sign(parallel[..., 0]) == half)] = colour(signs, half)
+    axes.pcolormesh(x * MM, other * MM, image)
+    margin = reach_margin(points, ELBOWS_OUT.cos_beta)
+    axes.contour(x * MM, other * MM, margin, [0], colors=[BLACK], linewidths=0.6)
+    for factor in (1, 2) if section.fixed == "y" else (0, 1, 2):
+        for line in parallel_lines(factor, ELBOWS_OUT, section, x, other):
+            axes.plot(*(line.T * MM), color=BLACK, linewidth=0.8)
+    vertical = "z" if section.fixed == "y" else "y"
+    style.section_axes(axes, f"{section.fixed} = {section.at * MM:.0f} mm", "x", vertical)
+    fixed = 1 if section.fixed == "y" else 2
+    if TASK_REGION.low[fixed] <= section.at <= TASK_REGION.high[fixed]:
+        style.outline_task_region(axes, vertical, inside=True)
+
+
+def _smallest(axes: Axes) -> None:
+    """The smallest aspect, too small to be seen in the other sections."""
+    x, z = np.linspace(-0.13, 0.33, 231), np.linspace(-0.470, -0.400, 141)
+    _section(axes, Section("y", 0.025), x, z)
+    axes.set(xlim=(x[0] * MM, x[-1] * MM), ylim=(z[0] * MM, z[-1] * MM), xticks=[0, 200])
+    axes.set_title("in detail, " + axes.get_title())
+    axes.set_ylabel("z (mm)", labelpad=0)
+
+
+def _legend(figure: Figure, found: tuple[Aspect, ...]) -> None:
+    handles = []
+    for sin_beta, half in ((1, "y > 0"), (-1, "y < 0")):
+        for signs in COLOURS:
+            volumes = [
+                aspect.cells.volume
+                for aspect in found
+                if aspect.assembly.sin_beta == sin_beta and _signs(aspect) == signs
+            ]
+            marks = ["+" if sign > 0 else "\N{MINUS SIGN}" for sign in signs]
+            text = "{}, {} {}: {:.1f} dm³".format(half, *marks, sum(volumes) * 1e3)
+            handles.append(Patch(color=colour(signs, sin_beta), label=text))
+    legend = figure.legend(handles=handles, loc="upper left", bbox_to_anchor=(0.765, 0.87))
+    legend.set_title("half, signs of factors\n2 and 3: volume")
+    legend.get_title().set_fontsize(7.5)
