@@ -189,6 +189,11 @@ def test_contact_sheet_runs_from_the_first_frame_to_the_last() -> None:
     assert film.contact_sheet(frames[:1]).shape == (2, 3, 3)
 
 
+def test_contact_sheet_ends_when_nothing_moves_any_more() -> None:
+    frames = [np.full((1, 1, 3), min(value, 10), np.uint8) for value in range(51)]
+    assert film.contact_sheet(frames)[..., 0].tolist() == [[0, 2, 4], [6, 8, 10]]
+
+
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [

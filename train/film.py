@@ -58,7 +58,7 @@ def write_contact_sheet(path: Path, env: GoalEnv, policy: Policy, seed: int) -> 
 
 
 def contact_sheet(frames: Sequence[Frame]) -> Frame:
-    """Return evenly spaced frames, the first and the last among them, side by side.
+    """Return evenly spaced frames, from the first until nothing moves any more, side by side.
 
     Args:
         frames: Frames of (height, width, 3), at least one.
@@ -66,10 +66,17 @@ def contact_sheet(frames: Sequence[Frame]) -> Frame:
     Returns:
         One picture of (2 * height, 3 * width, 3).
     """
-    moments = np.linspace(0, len(frames) - 1, _ROWS * _COLUMNS).round().astype(int)
+    moving = [i for i, frame in enumerate(frames) if _differs(frame, frames[-1])]
+    last = min(moving[-1] + 1, len(frames) - 1) if moving else len(frames) - 1
+    moments = np.linspace(0, last, _ROWS * _COLUMNS).round().astype(int)
     chosen = [frames[moment] for moment in moments]
     rows = [np.hstack(chosen[row * _COLUMNS : (row + 1) * _COLUMNS]) for row in range(_ROWS)]
     return np.vstack(rows)
+
+
+def _differs(frame: Frame, other: Frame) -> bool:
+    """Whether two frames differ by more than the last shiver of a robot at rest."""
+    return bool((frame != other).any(axis=-1).mean() > 1e-3)
 
 
 def _show(
