@@ -4,10 +4,10 @@ Importing this package registers the ids in :data:`ENV_IDS`; it imports neither 
 """
 
 from tpm_gym.errors import TPMError
-from tpm_gym.geometry import PAPER, Geometry
+from tpm_gym.geometry import PAPER, WIDE, Geometry
 from tpm_gym.registration import ENV_IDS, register
 
-__all__ = ["ENV_IDS", "PAPER", "Geometry", "TPMError", "__version__"]
+__all__ = ["ENV_IDS", "PAPER", "WIDE", "Geometry", "TPMError", "__version__"]
 
 __version__ = "0.1.0"
 
