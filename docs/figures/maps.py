@@ -21,7 +21,12 @@ from tpm_gym.workspace import TASK_REGION, conditioning_at
 FloatArray = NDArray[np.float64]
 
 HEIGHTS = (0.005, 0.012, 0.025, 0.040, 0.048)  # values of y, m
-PROBES = (((0.0, 0.75), BLUE, "-"), ((-0.24, 0.66), VERMILLION, "--"), ((0.12, 0.915), GREEN, ":"))
+_LOW, _HIGH = TASK_REGION.low, TASK_REGION.high
+PROBES = (
+    ((0.0, 0.75), BLUE, "-"),
+    ((_LOW[0], _LOW[2]), VERMILLION, "--"),
+    ((_HIGH[0], _HIGH[2]), GREEN, ":"),
+)
 
 _X, _Z = np.linspace(-0.78, 0.96, 436), np.linspace(0.42, 1.17, 188)
 _TICKS = (0.0, 0.02, 0.05, SAFE_CONDITIONING, 0.15, 0.25, 0.35, 0.5)
