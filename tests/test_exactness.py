@@ -259,22 +259,93 @@ def test_the_root_finder_finds_pairs_between_its_samples() -> None:
     np.testing.assert_allclose(np.cos(roots - 0.7), offset[rows], rtol=0, atol=1e-15)
 
 
-@pytest.mark.parametrize("off", [-1e-6, -1e-9, -1e-11, 1e-11, 1e-9, 1e-6])
-def test_branches_near_tangency_close_and_none_is_missed(off: float) -> None:
-    """Leg 2 within a relative ``off`` of stretched or folded: two postures about to merge."""
+OFFS = [-1e-6, -1e-9, -1e-11, 1e-11, 1e-9, 1e-6]
+
+
+@pytest.mark.parametrize("off", OFFS)
+def test_postures_about_to_merge_close_and_none_is_missed(off: float) -> None:
+    """Leg 2 within a relative ``off`` of being folded."""
     rng, g = np.random.default_rng(7), PAPER
     points = positions(rng, 400, g)
-    # leg 2 stretched or folded: put C1 next to the boundary of its annulus
-    radius = np.where(rng.random(400) < 0.5, g.l4 + g.l3, g.l4 - g.l3) * (1 + off)
-    beta, turn = np.arcsin(points[:, 1] / g.l7), rng.uniform(-np.pi, np.pi, 400)
+    radius, beta = (g.l4 - g.l3) * (1 + off), np.arcsin(points[:, 1] / g.l7)
+    turn = rng.uniform(-np.pi, np.pi, 400)
     x_c, z_c = 2 * g.l5 - g.l1 + radius * np.cos(turn), radius * np.sin(turn)
     points[:, 0], points[:, 2] = x_c + g.l2 + g.l7 * np.cos(beta), z_c + 2 * g.l6
     found = inverse_all(points, g)
+    right = found.valid[:, 8:].any(axis=-1)  # cos(beta) > 0, as the points were made
+    assert right.sum() > 100 if off > 0 else not right.any()
     row, slot = np.nonzero(found.valid)
-    gap = gaps(found.theta[row, slot], points[row], found.beta[row, slot], g)
-    assert gap.max() < CLOSED
+    assert gaps(found.theta[row, slot], points[row], found.beta[row, slot], g).max() < CLOSED
     numeric = numeric_inverse(points, g)
     assert [len(roots) for roots in numeric] == found.valid.sum(axis=-1).tolist()
+
+
+@pytest.mark.parametrize("off", OFFS)
+def test_circles_about_to_touch_close_and_no_assembly_is_missed(off: float) -> None:
+    """The circle of B1C1 within a relative ``off`` of touching that of B2C2 from inside."""
+    rng, g = np.random.default_rng(8), WIDE
+    theta = angles(rng, 400)
+    y1, z1 = g.l1 + g.l3 * np.cos(theta[:, 0]), g.l3 * np.sin(theta[:, 0])
+    touching = (g.l4 - np.sqrt(g.l4**2 - y1**2)) * (1 + off)
+
+    def apart(row: Rows, turn: FloatArray) -> FloatArray:
+        x2, z2 = -g.l1 + g.l3 * np.cos(turn) + 2 * g.l5, g.l3 * np.sin(turn)
+        return np.hypot(x2, z2 - z1[row]) - touching[row]
+
+    row, turn = circle_roots(apart, len(theta))
+    theta = np.stack([theta[row, 0], turn, theta[row, 2]], axis=-1)
+    found = forward_all(theta, g)
+    assert found.valid.any(axis=-1).sum() > 50 if off > 0 else not found.valid.any()
+    row, slot = np.nonzero(found.valid)
+    if len(row):
+        position, beta = found.position[row, slot], found.beta[row, slot]
+        assert gaps(theta[row], position, beta, g).max() < CLOSED
+    numeric = numeric_forward(theta, g)
+    assert [len(roots) for roots in numeric] == found.valid.sum(axis=-1).tolist()
+
+
+@pytest.mark.parametrize("angle", [1e-1, 1e-2, 1e-4, 1e-5, 1e-6, 1e-7])
+@pytest.mark.parametrize("folded", [False, True])
+def test_assemblies_about_to_merge_at_y_0_are_missed_by_rounding_alone(
+    angle: float, folded: bool
+) -> None:
+    """Link 7 within ``angle`` of beta = 0 or pi.
+
+    Known limit: cos(beta) is as exact as rounding of theta times 1 / |level3 planar|. Where that
+    exceeds 1 - |cos(beta)|, that is |beta| < 1e-6 or so, an assembly may be lost: forward_all's
+    tolerance does not grow so. From 1e-4 up none of these is.
+    """
+    g, points = PAPER, positions(np.random.default_rng(9), 1500, PAPER)
+    points[:, 1] = g.l7 * np.sin(angle)
+    posture = inverse_all(points)
+    valid = posture.valid.copy()
+    valid[:, slice(8, 16) if folded else slice(0, 8)] = False
+    theta, beta, target = posture.theta[valid], posture.beta[valid], points[np.nonzero(valid)[0]]
+    found = forward_all(theta)
+    errors = np.abs(found.position - target[:, None]).max(axis=-1)
+    missed = np.where(found.valid, errors, np.inf).min(axis=-1) > 1e-6
+    x_c, z_c = target[:, 0] - g.l2 - g.l7 * np.cos(beta), target[:, 2] - 2 * g.l6
+    parallel, _ = oracle.factors(theta, x_c, z_c, beta, g)
+    gain = np.abs(parallel[:, 1] * parallel[:, 2]) / g.l4**3
+    assert len(target) > 5_000
+    assert not missed[(1 - np.abs(np.cos(beta))) * gain > 1e-14].any()
+    if angle >= 1e-4:
+        assert not missed.any()
+    row, slot = np.nonzero(found.valid)
+    gap = gaps(theta[row], found.position[row, slot], found.beta[row, slot], g)
+    assert gap.max() < CLOSED
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_the_edge_in_y_belongs_to_the_workspace_and_nothing_beyond(sign: int) -> None:
+    points = oracle.vector(-0.05, sign * PAPER.l7 * np.array([1, 1 + 1e-15, 1 + 1e-11]), 0.78)
+    valid = inverse_all(points).valid
+    assert valid.all(axis=-1).tolist() == [True, True, False]
+    assert not valid[2].any()
+    found = inverse_all(points[:1])
+    row, slot = np.nonzero(found.valid)
+    gap = gaps(found.theta[row, slot], points[row], found.beta[row, slot], PAPER)
+    assert gap.max() < CLOSED
 
 
 @settings(derandomize=True, max_examples=40, deadline=None)

@@ -179,10 +179,13 @@ def test_clients_do_not_see_each_other(simulation):
 
 
 def test_closing_twice_is_harmless_and_clients_are_given_back():
+    numbers = set()
     for _ in range(60):
         simulation = Simulation(Scene())
+        numbers.add(simulation._client._number)
         simulation.close()
         simulation.close()
+    assert len(numbers) == 1
 
 
 def test_a_snapshot_continues_the_motion(with_puck):
