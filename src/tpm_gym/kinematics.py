@@ -246,13 +246,16 @@ def _forward_block(
     # Both terms can be large against their difference; scale the tolerance by them.
     real = across2 >= -_ROUNDING * (1 + along * along)
     across = np.sqrt(np.maximum(across2, 0.0))
+    # Rounding in C1 grows as the inverse of the planar factor, and in cos(beta) again as that of u;
+    # the cap keeps what the clipped cosine leaves of a gap in rod 11 below l4 / 1e12.
+    blur = np.minimum(1 + l4 * l4 * inverse_distance2 / across, 64) * (_ROUNDING * l4 * l4)
     x_foot, z_foot = along * dx, z1 + along * dz
     for planar in (-1, 1):
         x_c, z_c = x_foot - planar * across * dz, z_foot + planar * across * dx
         # Eqs. (9) and (10), with z_C3 = z_C + l6
         u, w = x_c - (cos[2] + (l1 - 2 * l2)), z_c - (sin[2] - l6)
         cos_beta = (l4 * l4 - l7 * l7 - u * u - w * w) / (2 * l7 * u)
-        assembled = real & (np.abs(cos_beta) <= 1 + _ROUNDING)
+        assembled = real & (np.abs(cos_beta) <= 1 + blur / np.abs(2 * l7 * u))
         cos_beta = np.clip(cos_beta, -1.0, 1.0)
         if not assembled.all():
             cos_beta[~assembled] = z_c[~assembled] = np.nan
@@ -286,7 +289,9 @@ def _forward_one(theta: FloatArray, branch: AssemblyMode, geometry: Geometry) ->
     u = x_c - (l3 * math.cos(theta_3) + (g.l1 - 2 * g.l2))
     w = z_c - (l3 * math.sin(theta_3) - g.l6)
     numerator, denominator = l4 * l4 - g.l7 * g.l7 - u * u - w * w, 2 * g.l7 * u
-    if abs(numerator) > abs(denominator) * (1 + _ROUNDING) or denominator == 0.0:
+    gain = 1 + l4 * l4 / (distance2 * abs(across)) if across else 64
+    blur = min(gain, 64) * _ROUNDING * l4 * l4
+    if abs(numerator) > abs(denominator) + blur or denominator == 0.0:
         raise no_assembly(theta, branch, geometry)
     cos_beta = min(1.0, max(-1.0, numerator / denominator))
     y = branch.sin_beta * g.l7 * math.sqrt((1 - cos_beta) * (1 + cos_beta))
