@@ -22,6 +22,7 @@ ORDER = [
     "workspace",
     "aspects",
     "parts",
+    "links",
     "mechanism",
     "urdf",
     "poc",

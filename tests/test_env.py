@@ -198,7 +198,7 @@ def test_the_datasheet_lists_the_entries_and_numbers_that_the_code_uses():
     box = f"{x0:.4g} <= x <= {x1:.4g}, {y1:.4g} <= y <= {y0:.4g}, {z0:.4g} <= z <= {z1:.4g} m"
     assert box in text
     puck = tasks.PickAndPlace.puck
-    size = (2e3 * puck.radius, 1e3 * puck.height, 1e3 * puck.mass)
+    size = (1e3 * puck.width, 1e3 * puck.height, 1e3 * puck.mass)
     assert "({:.0f} mm wide, {:.0f} mm high, {:.0f} g)".format(*size) in text
     assert f"below {1e3 * tasks.TOLERANCE:.0f} mm" in text
     assert f"at least {1e3 * tasks.MIN_SEPARATION:.0f} mm" in text

@@ -5,19 +5,15 @@ The client is handed in (see :mod:`tpm_gym.simulation`), so this module does not
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
-import numpy as np
-
-from tpm_gym.mechanism import CUP_RADIUS
+from tpm_gym.links import CUP_RADIUS
 from tpm_gym.physics import (
-    CUP_DAMPING,
-    CUP_STIFFNESS,
     PULL_OFF_FORCE,
     SEAL_GAP,
-    SEAL_PRESS,
     SEAL_TILT,
-    rotations,
+    rotate,
 )
 from tpm_gym.robot import Robot
 from tpm_gym.state import Puck
@@ -43,13 +39,7 @@ class Cup:
         self._client, self._robot, self._body, self._puck = client, robot, body, puck
         self._constraint: int | None = None
         self.grip: Pose | None = None
-        """Pose of the held object in the platform's inertial frame, None if nothing is held."""
-        client.changeDynamics(
-            robot.body,
-            robot.platform,
-            contactStiffness=CUP_STIFFNESS,
-            contactDamping=CUP_DAMPING,
-        )
+        """Pose of the held object in the tool's inertial frame, None if nothing is held."""
         # The engine orders contacts otherwise once a pair has an entry of its own in the filter;
         # with the entry from the start, the first episode equals all later ones to the last bit.
         self._collide(True)
@@ -63,10 +53,9 @@ class Cup:
             self.take(self._relative_pose())
 
     def take(self, grip: Pose) -> None:
-        """Fix the object to the platform at ``grip``."""
+        """Fix the object to the tool at ``grip``."""
         constraint = self._client.createConstraint(
-            self._robot.body,
-            self._robot.platform,
+            *self._robot.tool,
             self._body,
             -1,
             self._client.JOINT_FIXED,
@@ -90,19 +79,17 @@ class Cup:
     def _sealed(self) -> bool:
         """Whether the whole lip lies on the top face of the puck."""
         lip, axis = self._robot.cup()
-        position, quaternion = self._client.getBasePositionAndOrientation(self._body)
-        turn = rotations(np.array([quaternion]))[0]
-        local = turn.T @ (lip - np.array(position))
-        gap = float(local[2]) - self._puck.height / 2
-        covered = float(np.hypot(local[0], local[1])) <= self._puck.radius - CUP_RADIUS
-        aligned = float(-turn[:, 2] @ axis) >= np.cos(SEAL_TILT)
-        return -SEAL_PRESS <= gap <= SEAL_GAP and covered and aligned
+        (x, y, z), (qx, qy, qz, qw) = self._client.getBasePositionAndOrientation(self._body)
+        inverse = (-qx, -qy, -qz, qw)
+        local = rotate(inverse, (lip[0] - x, lip[1] - y, lip[2] - z))
+        gap = local[2] - self._puck.height / 2
+        covered = max(abs(local[0]), abs(local[1])) <= self._puck.width / 2 - CUP_RADIUS
+        aligned = -rotate(inverse, axis)[2] >= math.cos(SEAL_TILT)
+        return abs(gap) <= SEAL_GAP and covered and aligned
 
     def _relative_pose(self) -> Pose:
-        """Pose of the object in the platform's inertial frame, as it is now."""
-        state = self._client.getLinkState(
-            self._robot.body, self._robot.platform, computeForwardKinematics=True
-        )
+        """Pose of the object in the tool's inertial frame, as it is now."""
+        state = self._client.getLinkState(*self._robot.tool, computeForwardKinematics=True)
         inverse = self._client.invertTransform(state[0], state[1])
         pose = self._client.getBasePositionAndOrientation(self._body)
         relative: Pose = self._client.multiplyTransforms(*inverse, *pose)
@@ -111,5 +98,5 @@ class Cup:
     def _collide(self, enable: bool) -> None:
         # Contact and vacuum would fight over the same surface.
         self._client.setCollisionFilterPair(
-            self._robot.body, self._body, self._robot.platform, -1, int(enable)
+            self._robot.tool[0], self._body, self._robot.tool[1], -1, int(enable)
         )

@@ -77,14 +77,14 @@ class Joint:
         parent: Name of the parent link.
         origin: Position of the joint in the parent's frame, m.
         axis: Axis in the joint's frame.
-        lower: Lower limit, rad (motors only; passive joints are bounded by the loops).
-        upper: Upper limit, rad.
-        effort: Torque limit, N m; zero for passive joints.
-        speed: Speed limit, rad/s; zero for passive joints.
+        lower: Lower limit, rad or m (motors and slide; the others are bounded by the loops).
+        upper: Upper limit, rad or m.
+        effort: Limit of torque or force, N m or N; zero for passive joints.
+        speed: Speed limit, rad/s or m/s; zero for passive joints.
     """
 
     name: str
-    kind: Literal["continuous", "revolute", "fixed"]
+    kind: Literal["continuous", "revolute", "prismatic"]
     parent: str
     origin: Vector
     axis: Vector = (0.0, 0.0, 1.0)

@@ -10,25 +10,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tpm_gym.errors import ConfigurationError
+from tpm_gym.parts import Vector
 
-__all__ = ["CONTROL_PERIOD", "Physics", "rotations", "spline_weights"]
+__all__ = ["CONTROL_PERIOD", "Physics", "Quaternion", "rotate", "spline_weights", "transform"]
 
 FloatArray = NDArray[np.float64]
+Quaternion = tuple[float, float, float, float]
 
 CONTROL_PERIOD = 1 / 25
 """Time between two commands, s."""
 GRAVITY = 9.81  # m/s^2
+SOLVERS = ("direct", "iterative")
+REGULARISATION = 1e-9
+"""Added to the constraints' compliance (CFM): loops that close twice over stay solvable."""
 MOTOR_GAIN = 1.0
 """Share of the position error that a motor takes out in one time step, effort permitting."""
 PULL_OFF_FORCE = 12.0
 """Largest force that the cup holds, N: 60 kPa of vacuum on the area of the lip."""
-CUP_STIFFNESS, CUP_DAMPING = 3000.0, 30.0
-"""Of the cup's bellows in contact, N/m and N s/m: it gives way where a rigid tool would set the
-motors' full torque against the table."""
 SEAL_GAP = 0.002
-"""Largest gap between lip and object that the vacuum closes, m."""
-SEAL_PRESS = 0.005
-"""How far the bellows may be pressed together and still seal, m."""
+"""Largest distance between lip and object at which the vacuum seals, m."""
 SEAL_TILT = np.deg2rad(10.0)
 """Largest angle between the cup's axis and the object's that the lip follows, rad."""
 CLOSURE_LIMIT = 0.005
@@ -43,7 +43,9 @@ class Physics:
 
     Attributes:
         time_step: s.
-        iterations: Iterations of the sequential-impulse solver a step.
+        solver: ``"direct"`` solves the constraints of a step exactly (Dantzig's pivoting);
+            ``"iterative"`` is Bullet's default, sequential impulses.
+        iterations: Of the iterative solver, a step.
         erp: Share of a constraint's error that is taken out in one step, in (0, 1].
         control_period: s between two commands; a whole number of time steps.
 
@@ -51,7 +53,8 @@ class Physics:
         ConfigurationError: If a value is out of range.
     """
 
-    time_step: float = 1 / 500
+    time_step: float = 1 / 250
+    solver: str = "direct"
     iterations: int = 50
     erp: float = 0.8
     control_period: float = CONTROL_PERIOD
@@ -62,6 +65,8 @@ class Physics:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
                 raise ConfigurationError(name, value, "a finite number")
+        if self.solver not in SOLVERS:
+            raise ConfigurationError("solver", self.solver, " or ".join(map(repr, SOLVERS)))
         if isinstance(self.iterations, bool) or not isinstance(self.iterations, Integral):
             raise ConfigurationError("iterations", self.iterations, "a whole number, 1 or more")
         if not 0 < self.time_step <= self.control_period:
@@ -88,12 +93,20 @@ def spline_weights(substeps: int) -> FloatArray:
     return np.stack([(1 - s) ** 2, 1 + 2 * s - 2 * s**2, s**2], axis=1) / 2
 
 
-def rotations(quaternions: FloatArray) -> FloatArray:
-    """Rotation matrices (n, 3, 3) of unit quaternions (n, 4), (x, y, z, w)."""
-    x, y, z, w = quaternions.T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), -1, 0)
+def rotate(quaternion: Quaternion, vector: Vector) -> Vector:
+    """A vector turned by a unit quaternion (x, y, z, w); plain numbers, for speed."""
+    x, y, z, w = quaternion
+    a, b, c = vector
+    # v + w t + q x t, with t = 2 q x v
+    s, t, u = 2 * (y * c - z * b), 2 * (z * a - x * c), 2 * (x * b - y * a)
+    return (
+        a + w * s + y * u - z * t,
+        b + w * t + z * s - x * u,
+        c + w * u + x * t - y * s,
+    )
+
+
+def transform(origin: Vector, quaternion: Quaternion, point: Vector) -> Vector:
+    """A point of a frame in the frame's parent, m."""
+    a, b, c = rotate(quaternion, point)
+    return origin[0] + a, origin[1] + b, origin[2] + c

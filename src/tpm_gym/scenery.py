@@ -67,12 +67,9 @@ class Scenery:
 
     def _add_puck(self, puck: Puck) -> int:
         client = self._client
-        solid = client.createCollisionShape(
-            client.GEOM_CYLINDER, radius=puck.radius, height=puck.height
-        )
-        drawn = client.createVisualShape(
-            client.GEOM_CYLINDER, radius=puck.radius, length=puck.height, rgbaColor=_PUCK_COLOUR
-        )
+        half = (puck.width / 2, puck.width / 2, puck.height / 2)
+        solid = client.createCollisionShape(client.GEOM_BOX, halfExtents=half)
+        drawn = client.createVisualShape(client.GEOM_BOX, halfExtents=half, rgbaColor=_PUCK_COLOUR)
         body: int = client.createMultiBody(
             baseMass=puck.mass,
             baseCollisionShapeIndex=solid,
@@ -83,9 +80,6 @@ class Scenery:
             body,
             -1,
             lateralFriction=puck.friction,
-            # A flat face resists spinning and rolling a little; without, it never comes to rest.
-            spinningFriction=0.002,
-            rollingFriction=0.0005,
             linearDamping=0.0,
             angularDamping=0.0,
         )

@@ -7,9 +7,12 @@ starts with the loops closed to better than a micrometre.
 
 from __future__ import annotations
 
+import ctypes
 import importlib.util
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -29,7 +32,14 @@ from tpm_gym.errors import (
 )
 from tpm_gym.geometry import PAPER, Geometry
 from tpm_gym.mechanism import DEFAULT_MOUNT, Mount, build, joint_angles
-from tpm_gym.physics import ASSEMBLY_LIMIT, CLOSURE_LIMIT, GRAVITY, Physics, spline_weights
+from tpm_gym.physics import (
+    ASSEMBLY_LIMIT,
+    CLOSURE_LIMIT,
+    GRAVITY,
+    REGULARISATION,
+    Physics,
+    spline_weights,
+)
 from tpm_gym.robot import Robot
 from tpm_gym.scenery import AT_REST, UPRIGHT, Scenery
 from tpm_gym.state import Scene, State
@@ -142,7 +152,13 @@ class Simulation:
             numSolverIterations=self.physics.iterations,
             erp=self.physics.erp,
             deterministicOverlappingPairs=1,
+            globalCFM=REGULARISATION,
         )
+        if self.physics.solver == "direct":
+            with _silence():
+                client.setPhysicsEngineParameter(
+                    constraintSolverType=pybullet.CONSTRAINT_SOLVER_LCP_DANTZIG
+                )
         client.configureDebugVisualizer(pybullet.COV_ENABLE_GUI, 0)  # no side panels
 
     # -- running ----------------------------------------------------------------------------
@@ -217,8 +233,8 @@ class Simulation:
         Raises:
             AssemblyModeError: If no assembly in the default mode explains the encoders.
         """
-        theta, theta_dot = self._robot.encoders()
-        theta = theta + self._bias
+        angles, rates = self._robot.encoders()
+        theta, theta_dot = np.array(angles) + self._bias, np.array(rates)
         gap, platform, tilt = self._robot.truth()
         at = self._evaluate(theta)
         position, quaternion, velocity, spin = self._scenery.puck_state()
@@ -228,7 +244,7 @@ class Simulation:
             fk_position=self.mount.to_world(at.position),
             fk_velocity=self.mount.rotate(at.velocity @ theta_dot),
             conditioning=float(at.conditioning),
-            platform_position=platform,
+            platform_position=np.array(platform),
             platform_tilt=tilt,
             closure_error=gap,
             command=self.mount.to_world(self._commands[1]),
@@ -312,6 +328,26 @@ class Simulation:
     def close(self) -> None:
         """Disconnect the client; harmless the second time."""
         self._client.close()
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """Keep what the engine says (from C, on changing its solver) out of the user's output."""
+    if os.name != "posix":
+        yield
+        return
+    flush = ctypes.CDLL(None).fflush
+    sys.stdout.flush()
+    flush(None)
+    ours, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 1)
+        yield
+        flush(None)
+    finally:
+        os.dup2(ours, 1)
+        os.close(ours)
+        os.close(nowhere)
 
 
 def has_display() -> bool:

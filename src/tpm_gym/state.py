@@ -14,16 +14,19 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Puck:
-    """The object of the pick-and-place tasks: an upright cylinder.
+    """The object of the pick-and-place tasks: a square block.
+
+    Square, not round: between boxes the engine finds all four corners of a contact at once, while
+    a cylinder rests on one to three points and is pressed through the table where they miss.
 
     Attributes:
-        radius: m.
+        width: Edge of the square, m.
         height: m.
         mass: kg.
         friction: Coulomb coefficient against the table.
     """
 
-    radius: float = 0.018
+    width: float = 0.036
     height: float = 0.030
     mass: float = 0.050
     friction: float = 0.6

@@ -307,9 +307,12 @@ def _rank(values: FloatArray) -> int:
 
 
 def _moving_joints(mechanism: Mechanism) -> list[str]:
-    """Names of the joints of the tree that move, in the order of the links."""
+    """Names of the joints of the tree that turn, in the order of the links.
+
+    The cup's slide, the one prismatic joint, belongs to the tool and not to the mechanism.
+    """
     joints = (link.joint for link in mechanism.links)
-    return [joint.name for joint in joints if joint and joint.kind != "fixed"]
+    return [joint.name for joint in joints if joint and joint.kind != "prismatic"]
 
 
 def _frames(mechanism: Mechanism, angles: Mapping[str, float]) -> dict[str, Frame]:
@@ -321,7 +324,7 @@ def _frames(mechanism: Mechanism, angles: Mapping[str, float]) -> dict[str, Fram
             frames[link.name] = (np.eye(3), np.zeros(3))
             continue
         rotation = frames[joint.parent][0]
-        if joint.kind != "fixed":
+        if joint.kind != "prismatic":
             rotation = rotation @ _turn(joint.axis, angles[joint.name])
         frames[link.name] = (rotation, _place(frames, joint.parent, joint.origin))
     return frames
@@ -355,7 +358,7 @@ def _rates(
     joints = _moving_joints(mechanism)
     linear, angular = np.zeros((3, len(joints))), np.zeros((3, len(joints)))
     while (joint := mechanism.link(link).joint) is not None:
-        if joint.kind != "fixed":
+        if joint.kind != "prismatic":
             column, axis = joints.index(joint.name), _axis(mechanism, frames, link)
             angular[:, column] = axis
             linear[:, column] = np.cross(axis, point - frames[link][1])

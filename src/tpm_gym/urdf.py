@@ -137,7 +137,7 @@ def _joint_element(link: Link) -> ElementTree.Element:
     ElementTree.SubElement(element, "child", link=link.name)
     ElementTree.SubElement(element, "origin", xyz=_numbers(joint.origin), rpy="0 0 0")
     ElementTree.SubElement(element, "axis", xyz=_numbers(joint.axis))
-    if joint.kind == "revolute":
+    if joint.kind != "continuous":
         ElementTree.SubElement(
             element,
             "limit",
