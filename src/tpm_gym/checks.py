@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -26,9 +27,10 @@ def action(value: Any, size: int) -> NDArray[np.float64]:
         raise ActionError("action", value, f"an array of numbers of shape ({size},)") from error
     if values.shape != (size,):
         raise ActionError("action", values.shape, f"of shape ({size},), by shape")
-    if not np.isfinite(values).all():
+    if not math.isfinite(values.sum()):
         raise ActionError("action", values.tolist(), "finite")
-    return np.clip(values, -1.0, 1.0)
+    clipped: NDArray[np.float64] = np.minimum(np.maximum(values, -1.0), 1.0)
+    return clipped
 
 
 def weight(value: Any) -> float:

@@ -20,8 +20,8 @@ from tpm_gym.state import Puck
 
 __all__ = ["Cup", "Pose"]
 
-Pose = tuple[tuple[float, ...], tuple[float, ...]]
-"""Position (m) and orientation (x, y, z, w)."""
+Pose = tuple[Any, Any]
+"""Position (m) and orientation (x, y, z, w), or two velocities (m/s, rad/s); plain tuples."""
 
 
 class Cup:

@@ -9,24 +9,22 @@ from typing import Any, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
-from tpm_gym import checks, kinematics, rewards, tasks
+from tpm_gym import checks, kinematics, reports, tasks
 from tpm_gym.control import make as make_control
+from tpm_gym.engine import has_display
 from tpm_gym.errors import ConfigurationError, EpisodeError
 from tpm_gym.mechanism import DEFAULT_MOUNT
 from tpm_gym.physics import CONTROL_PERIOD, Physics
-from tpm_gym.simulation import Simulation, Snapshot, has_display
+from tpm_gym.randomisation import Randomisation
+from tpm_gym.reports import Observation
+from tpm_gym.simulation import Simulation, Snapshot
 from tpm_gym.state import State
 
 __all__ = ["EnvSnapshot", "TPMEnv"]
 
-Observation = dict[str, Any]  # arrays of float32
 Action = NDArray[Any]
-
-_OBSERVATION_BOUND = 10.0
-_GOAL_BOUND = 2.0
 
 
 @dataclass(frozen=True)
@@ -36,6 +34,7 @@ class EnvSnapshot:
     simulation: Snapshot
     rng: dict[str, Any]
     goal: NDArray[np.float64]
+    pending: tuple[NDArray[np.float64], ...]
 
 
 class TPMEnv(gym.Env[Observation, Action]):
@@ -64,8 +63,8 @@ class TPMEnv(gym.Env[Observation, Action]):
 
     Commands accumulate, are projected into the task region, and are followed along a B-spline. The
     region is -0.24 <= x <= 0.12, -0.046 <= y <= -0.012, 0.067 <= z <= 0.31 m for P, world. Small
-    turns of the joints move P far along y, so with joint control the limit for P slows most random
-    actions down to a tenth, all three joints together.
+    turns of the joints move P far along y, so the limit for P slows most random joint actions down
+    to a tenth, all three joints together.
 
     ## Observation
 
@@ -99,12 +98,12 @@ class TPMEnv(gym.Env[Observation, Action]):
     | approach | minus half the distance from cup to puck in units of 0.1 m |
 
     Hindsight: ``compute_reward`` with an empty info, as SB3's HerReplayBuffer calls it, gives the
-    goal term alone. To keep the other terms use ``train/her.py``, or ``copy_info_dict=True``.
+    goal term alone; ``train/her.py`` or ``copy_info_dict=True`` keep the other terms.
 
     ## Start
 
-    The arm at rest at home, the puck (36 mm wide, 30 mm high, 50 g) upright on the table, the goal
-    at least 30 mm away from where the puck (or P) starts. Goals and objects are sampled where
+    The arm at rest at home, the puck (square, 36 mm wide, 30 mm high, 50 g) flat on the table, the
+    goal at least 30 mm away from where the puck (or P) starts. Goals and objects are sampled where
     1/cond(J) >= 0.08.
     ``reset(options={"object": (x, y, z), "goal": (x, y, z)})`` chooses them instead; a puck that
     starts above the table falls.
@@ -112,16 +111,25 @@ class TPMEnv(gym.Env[Observation, Action]):
     ## Info
 
     ``is_success`` (bool), ``closure_error`` (m), ``conditioning`` (1/cond(J)),
-    ``singularity_penalty`` (before weighting), ``reward_terms`` (name -> value; they sum to the
-    reward).
+    ``singularity_penalty`` (before weighting), ``assembly_mode_changed`` and
+    ``working_mode_changed`` (bool), ``reward_terms`` (name -> value; they sum to the reward).
+
+    ## Singularities
+
+    Where the platform passes y = 0 (a parallel singularity) the assembly mode changes, and the
+    encoders no longer tell where it is; where it passes y = l7 (a serial one), the working mode. No
+    action leads there; should a disturbance do so, the step reports it in ``info``, the penalty is
+    1, the episode is truncated, and the next reset recovers.
 
     Args:
         task: ``"reach"`` or ``"pick_and_place"``.
         control: ``"cartesian"`` or ``"joints"``.
         reward: ``"sparse"`` or ``"dense"``.
         penalty_weight: Weight of the singularity penalty; 0 switches it off.
-        encoder_bias: (3,) rad, added to what the encoders report; meant for some mrad. Where the
-            biased angles cannot be assembled, position and velocity keep their last values.
+        randomisation: What differs from the nominal machine, drawn anew for each episode: a
+            :class:`~tpm_gym.randomisation.Randomisation` or a mapping of its attributes. Where
+            disturbed encoders report angles that cannot be assembled, position and velocity keep
+            their last values.
         physics: Numerical settings of the engine.
         render_mode: None, ``"rgb_array"`` or ``"human"``.
         renderer: ``"tiny"`` (any machine) or ``"egl"`` (GPU).
@@ -149,7 +157,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         reward: str = "sparse",
         *,
         penalty_weight: float = 1.0,
-        encoder_bias: ArrayLike = (0.0, 0.0, 0.0),
+        randomisation: Randomisation | Mapping[str, Any] | None = None,
         physics: Physics | None = None,
         render_mode: str | None = None,
         renderer: str = "tiny",
@@ -169,27 +177,18 @@ class TPMEnv(gym.Env[Observation, Action]):
         self.task = tasks.make(task, reward)
         checks.physics(physics)
         self.control = make_control(control)
+        self.randomisation = Randomisation.of(randomisation)
         self._size = checks.picture_size(width, height)
-        self.observation_space = spaces.Dict(
-            {
-                "observation": _box(_OBSERVATION_BOUND, self.task.observation_size),
-                "achieved_goal": _box(_GOAL_BOUND, 3),
-                "desired_goal": _box(_GOAL_BOUND, 3),
-            }
-        )
-        self.action_space = _box(1.0, self.task.action_size)
+        self.observation_space = reports.observation_space(self.task)
+        self.action_space = reports.box(1.0, self.task.action_size)
         self._home = kinematics.inverse(self.task.home)
         self._state: State | None = None
         self._goal = np.full(3, np.nan)
+        self._pending: tuple[NDArray[np.float64], ...] = ()  # actions that come late
         self._closed = False
         self._shown = 0.0  # when the last frame was due, s of the performance counter
-        self.simulation = Simulation(
-            self.task.scene,
-            physics=physics,
-            encoder_bias=encoder_bias,
-            gui=render_mode == "human",
-            renderer=renderer,
-        )
+        self._physics, self._renderer = physics, renderer
+        self.simulation = self._start()
 
     # -- the Gymnasium interface ----------------------------------------------------------------
 
@@ -208,25 +207,18 @@ class TPMEnv(gym.Env[Observation, Action]):
             UnreachableError: If the object or the goal is out of reach.
             EpisodeError: If the environment is closed.
         """
-        if self._closed:
-            raise EpisodeError("the environment is closed; make a new one")
+        self._require_open()
         super().reset(seed=seed)
         options = checks.reset_options(options)
-        start, goal = options.get("object"), options.get("goal")
-        start = (
-            self.task.sample_object(self.np_random)
-            if start is None
-            else self.task.check_object(start)
-        )
-        goal = (
-            self.task.sample_goal(self.np_random, start)
-            if goal is None
-            else self.task.check_goal(goal)
-        )
+        task, rng, start, goal = self.task, self.np_random, *map(options.get, ("object", "goal"))
+        start = task.sample_object(rng) if start is None else task.check_object(start)
+        goal = task.sample_goal(rng, start) if goal is None else task.check_goal(goal)
+        plant = self.randomisation.draw(rng, len(self.simulation.mechanism.links) - 1)
         self._goal = goal
-        self._state = self.simulation.reset(self._home, start, goal)
-        observation = self._observe(self._state)
-        info = self._info(self._state, observation)
+        self._pending = (np.zeros(task.action_size),) * self.randomisation.latency
+        self._state = None
+        self._state = self.simulation.reset(self._home, start, goal, plant, self._draw_noise())
+        observation, info = self._report(self._state)
         if self.render_mode == "human":
             self.render()
         return observation, info
@@ -238,23 +230,23 @@ class TPMEnv(gym.Env[Observation, Action]):
             ActionError: If the action has the wrong shape or is not finite; nothing has moved then.
             EpisodeError: If there is no episode: before reset, after close, after a lost loop.
             ClosureError: If a loop of the mechanism opened.
-            AssemblyModeError: If the mechanism went through a parallel singularity.
+            ModeChangeError: If the episode has been truncated because the mechanism passed a
+                singularity.
         """
         values = checks.action(action, self.task.action_size)
         state = self._require_state()
-        current = DEFAULT_MOUNT.to_paper(state.command)
-        command = self.control.command(values[:3], current)
-        vacuum = bool(values[3] > 0) if len(values) > 3 else False
+        queue = (*self._pending, values)
+        values, self._pending = queue[0], queue[1:]
+        command = self.control.command(values[:3], DEFAULT_MOUNT.to_paper(state.command))
+        vacuum = len(values) > 3 and bool(values[3] > 0)
         self._state = None  # until the step has gone well
-        self._state = self.simulation.move(command, vacuum)
-        observation = self._observe(self._state)
-        info = self._info(self._state, observation)
-        reward = self.compute_reward(
-            observation["achieved_goal"], observation["desired_goal"], info
-        )
+        self._state = state = self.simulation.move(command, vacuum, self._draw_noise())
+        observation, info = self._report(state)
+        reached, wanted = observation["achieved_goal"], observation["desired_goal"]
+        reward = self.compute_reward(reached, wanted, info)
         if self.render_mode == "human":
             self.render()
-        return observation, float(reward), False, False, info
+        return observation, float(reward), False, state.mode_change is not None, info
 
     def compute_reward(
         self,
@@ -277,9 +269,10 @@ class TPMEnv(gym.Env[Observation, Action]):
         """
         goal_term = self.task.goal_term(achieved_goal, desired_goal)
         if isinstance(info, Mapping):
-            other: Any = self._goal_free(info)
+            other: Any = reports.goal_free_reward(info, self.penalty_weight)
         else:
-            other = np.array([self._goal_free(entry) for entry in info]).reshape(goal_term.shape)
+            rest = [reports.goal_free_reward(entry, self.penalty_weight) for entry in info]
+            other = np.array(rest).reshape(goal_term.shape)
         total = goal_term + other
         return float(total) if np.ndim(total) == 0 else total
 
@@ -288,8 +281,7 @@ class TPMEnv(gym.Env[Observation, Action]):
 
         In ``human`` mode the window shows it already; this then waits until real time catches up.
         """
-        if self._closed:
-            raise EpisodeError("the environment is closed; make a new one")
+        self._require_open()
         if self.render_mode == "rgb_array":
             return self.simulation.render(*self._size)
         if self.render_mode == "human":
@@ -332,7 +324,10 @@ class TPMEnv(gym.Env[Observation, Action]):
         """
         self._require_state()
         return EnvSnapshot(
-            self.simulation.save(), dict(self.np_random.bit_generator.state), self._goal.copy()
+            self.simulation.save(),
+            dict(self.np_random.bit_generator.state),
+            self._goal.copy(),
+            self._pending,
         )
 
     def restore_state(self, snapshot: EnvSnapshot) -> Observation:
@@ -344,57 +339,64 @@ class TPMEnv(gym.Env[Observation, Action]):
         Raises:
             EpisodeError: If the environment is closed.
         """
-        if self._closed:
-            raise EpisodeError("the environment is closed; make a new one")
+        self._require_open()
         self.np_random.bit_generator.state = snapshot.rng
-        self._goal = snapshot.goal.copy()
+        self._goal, self._pending = snapshot.goal.copy(), snapshot.pending
         self.simulation.show_goal(self._goal)
         self._state = self.simulation.restore(snapshot.simulation)
-        return self._observe(self._state)
+        return reports.observation(self.task, self._state, self._goal)
 
     # -- inside ---------------------------------------------------------------------------------
 
-    def _require_state(self) -> State:
+    def _require_open(self) -> None:
         if self._closed:
             raise EpisodeError("the environment is closed; make a new one")
+
+    def _require_state(self) -> State:
+        self._require_open()
         if self._state is None:
             raise EpisodeError("no episode is running; call reset() first")
         return self._state
 
-    def _observe(self, state: State) -> Observation:
-        vector = np.clip(self.task.observe(state), -_OBSERVATION_BOUND, _OBSERVATION_BOUND)
-        achieved = np.clip(self.task.achieved(state), -_GOAL_BOUND, _GOAL_BOUND)
-        return {
-            "observation": vector.astype(np.float32),
-            "achieved_goal": achieved.astype(np.float32),
-            "desired_goal": self._goal.astype(np.float32),
-        }
+    def __getstate__(self) -> dict[str, Any]:
+        """What :func:`copy.deepcopy` and :mod:`pickle` take: all of it, in the midst of an episode.
 
-    def _info(self, state: State, observation: Observation) -> dict[str, Any]:
-        achieved, desired = observation["achieved_goal"], observation["desired_goal"]
-        penalty = float(rewards.singularity_penalty(state.conditioning))
-        terms = {
-            "goal": float(self.task.goal_term(achieved, desired)),
-            "singularity": -self.penalty_weight * penalty,
-        }
-        terms.update((name, float(v)) for name, v in self.task.state_terms(state).items())
-        return {
-            "is_success": bool(self.task.success(achieved, desired)),
-            "closure_error": float(state.closure_error),
-            "conditioning": float(state.conditioning),
-            "singularity_penalty": penalty,
-            "reward_terms": terms,
-        }
+        Raises:
+            ConfigurationError: With a window, of which PyBullet opens only one in a process.
+        """
+        if self.render_mode == "human":
+            valid = "None or 'rgb_array' for an environment that is copied or pickled"
+            raise ConfigurationError("render_mode", self.render_mode, valid)
+        running = self._state is not None
+        snapshot = self.simulation.save() if running else None
+        return {**vars(self), "simulation": snapshot, "_state": None}
 
-    def _goal_free(self, info: Mapping[str, Any]) -> float:
-        """Sum of the terms in ``info`` that do not depend on the goal."""
-        shaped = sum(
-            value
-            for name, value in info.get("reward_terms", {}).items()
-            if name not in ("goal", "singularity")
+    def __setstate__(self, values: dict[str, Any]) -> None:
+        """Start a simulation of its own, and take it to where the original was."""
+        vars(self).update(values)
+        snapshot: Snapshot | None = values["simulation"]
+        self.simulation = self._start()
+        if self._closed:
+            self.simulation.close()
+        elif snapshot is not None:
+            self.simulation.show_goal(self._goal)
+            self._state = self.simulation.restore(snapshot)
+
+    def _draw_noise(self) -> tuple[float, float, float]:
+        """Errors of one reading of the encoders, rad."""
+        if self.randomisation.encoder_noise == 0:
+            return (0.0, 0.0, 0.0)
+        a, b, c = self.np_random.normal(0.0, self.randomisation.encoder_noise, 3).tolist()
+        return a, b, c
+
+    def _report(self, state: State) -> tuple[Observation, dict[str, Any]]:
+        observation = reports.observation(self.task, state, self._goal)
+        return observation, reports.info(self.task, state, observation, self.penalty_weight)
+
+    def _start(self) -> Simulation:
+        return Simulation(
+            self.task.scene,
+            physics=self._physics,
+            gui=self.render_mode == "human",
+            renderer=self._renderer,
         )
-        return float(shaped - self.penalty_weight * info.get("singularity_penalty", 0.0))
-
-
-def _box(bound: float, length: int) -> spaces.Box:
-    return spaces.Box(-bound, bound, (length,), np.float32)

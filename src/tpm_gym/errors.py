@@ -12,12 +12,15 @@ from typing import Any
 
 __all__ = [
     "ActionError",
-    "AssemblyModeError",
     "ClosureError",
     "ConfigurationError",
     "EpisodeError",
     "GeometryError",
     "InputError",
+    "MissingPackageError",
+    "ModeChangeError",
+    "PolicyFileError",
+    "PolicyMismatchError",
     "ResetOptionError",
     "SingularityError",
     "TPMError",
@@ -149,19 +152,70 @@ class ClosureError(TPMError, RuntimeError):
         )
 
 
-class AssemblyModeError(TPMError, RuntimeError):
-    """The simulated mechanism left the assembly mode that the forward kinematics assume.
+class ModeChangeError(TPMError, RuntimeError):
+    """The simulated mechanism has passed a singularity in this episode, and was asked to go on.
 
     Attributes:
-        distance: Platform against forward kinematics, in metres.
-        limit: The distance that is tolerated, in metres.
+        mode: ``"assembly"``: it passed a parallel singularity, and the forward kinematics no longer
+            say where the platform is; ``"working"``: it passed a serial one, and the inverse
+            kinematics no longer say how to get where.
     """
 
-    def __init__(self, distance: float, limit: float) -> None:
-        """Store the values and compose the message."""
-        self.distance, self.limit = float(distance), float(limit)
+    def __init__(self, mode: str) -> None:
+        """Store the value and compose the message."""
+        self.mode = mode
+        kind = "parallel" if mode == "assembly" else "serial"
         super().__init__(
-            f"platform and forward kinematics are {1e3 * self.distance:.3g} mm apart, more than "
-            f"{1e3 * self.limit:.3g} mm: the mechanism passed a parallel singularity into another "
-            "assembly mode; call reset() to go on"
+            f"the mechanism passed a {kind} singularity into another {mode} mode; "
+            "call reset() to go on"
+        )
+
+
+class PolicyFileError(TPMError, ValueError):
+    """The files of a policy are missing, damaged, or not what they have to be; nothing was loaded.
+
+    Attributes:
+        path: The offending file.
+        reason: What is wrong with it.
+        remedy: What to do about it.
+    """
+
+    def __init__(self, path: str, reason: str, remedy: str) -> None:
+        """Store the values and compose the message."""
+        self.path, self.reason, self.remedy = path, reason, remedy
+        super().__init__(f"policy file {path}: {reason}; {remedy}")
+
+
+class PolicyMismatchError(TPMError, ValueError):
+    """A policy does not fit an environment.
+
+    Attributes:
+        kind: What differs: ``"observation space"`` or ``"action space"``.
+        trained: What the policy was trained with.
+        given: What the environment has.
+        env_id: The environment the policy was trained on, which would be valid.
+    """
+
+    def __init__(self, kind: str, trained: Any, given: Any, env_id: str) -> None:
+        """Store the values and compose the message."""
+        self.kind, self.trained, self.given, self.env_id = kind, trained, given, env_id
+        super().__init__(
+            f"the policy was trained with {kind} {trained}, the environment has {given}; "
+            f"use it in {env_id}"
+        )
+
+
+class MissingPackageError(TPMError, ImportError):
+    """An optional package is needed for this and is not installed.
+
+    Attributes:
+        package: The package.
+        extra: The extra of tpm-gym that installs it.
+    """
+
+    def __init__(self, package: str, extra: str) -> None:
+        """Store the values and compose the message."""
+        self.package, self.extra = package, extra
+        super().__init__(
+            f"this needs {package}, which cannot be imported; pip install 'tpm-gym[{extra}]'"
         )

@@ -12,9 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tpm_gym import single
 from tpm_gym.errors import SingularityError
 from tpm_gym.geometry import PAPER, Geometry
 from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode, forward, forward_all
+from tpm_gym.single import SINGULAR
 
 __all__ = [
     "Evaluation",
@@ -28,10 +30,6 @@ __all__ = [
 ]
 
 FloatArray = NDArray[np.float64]
-
-# cos(beta) is known to about 1e-14; where it is 1, sin(beta) is known to the square root of that
-# only. A factor below this (y below 50 nm) cannot be told from zero.
-_SINGULAR = 1e-6
 
 
 @dataclass(frozen=True)
@@ -192,6 +190,10 @@ def evaluate(
         UnreachableError: If the branch does not exist at some theta.
         SingularityError: If theta is a parallel singularity.
     """
+    angles = np.asarray(theta, dtype=np.float64)
+    if angles.shape == (3,):
+        assembly, rows, quality = single.evaluate(tuple(angles.tolist()), branch, geometry)
+        return Evaluation(np.array(assembly[:3]), np.array(rows), np.array(quality))
     c = _configuration(theta, branch, geometry)
     return Evaluation(c.position, _velocity(c, geometry), _conditioning(c, geometry))
 
@@ -249,7 +251,7 @@ def _configuration(theta: ArrayLike, branch: AssemblyMode, geometry: Geometry) -
 def _velocity(c: _Configuration, geometry: Geometry) -> FloatArray:
     scaled, determinant = _scaled_velocity(c, geometry)
     name, value = _smallest_parallel_factor(c, geometry)
-    if abs(value) < _SINGULAR:
+    if abs(value) < SINGULAR:
         raise SingularityError(name, value)
     result: FloatArray = scaled / determinant[..., None, None]
     return result

@@ -32,7 +32,9 @@ from tpm_gym.branches import (
 )
 from tpm_gym.errors import InputError
 from tpm_gym.geometry import PAPER, Geometry
+from tpm_gym.parts import Vector
 from tpm_gym.reach import no_assembly, no_posture
+from tpm_gym.single import ROUNDING, assemble, posture
 
 __all__ = [
     "ASSEMBLY_MODES",
@@ -54,9 +56,6 @@ __all__ = [
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-# Where two solutions merge, rounding alone can push a discriminant (here always scaled to order
-# one) below zero by a few units in the last place. Those are solutions, not misses.
-_ROUNDING = 64 * np.finfo(np.float64).eps
 _BLOCK = 4096  # rows solved at a time
 
 # Row of the 12 distinct angles (sign of cos(beta), leg, bend) that each slot and leg holds.
@@ -148,7 +147,7 @@ def forward(
     """
     theta = _finite_points("theta", theta)
     if theta.ndim == 1:
-        return _forward_one(theta, branch, geometry)
+        return np.array(assemble(_vector(theta), branch, geometry)[:3])
     solutions = forward_all(theta, geometry)
     slot = branch.index
     valid = solutions.valid[..., slot]
@@ -175,6 +174,8 @@ def inverse(
         UnreachableError: If the branch does not exist for some entry of position.
     """
     position = _finite_points("position", position)
+    if position.ndim == 1:
+        return np.array(posture(_vector(position), branch, geometry))
     solutions = inverse_all(position, geometry)
     slot = branch.index
     valid = solutions.valid[..., slot]
@@ -244,11 +245,11 @@ def _forward_block(
     along = 0.5 - 0.5 * y1_squared * inverse_distance2
     across2 = (l4 * l4 - y1_squared) * inverse_distance2 - along * along
     # Both terms can be large against their difference; scale the tolerance by them.
-    real = across2 >= -_ROUNDING * (1 + along * along)
+    real = across2 >= -ROUNDING * (1 + along * along)
     across = np.sqrt(np.maximum(across2, 0.0))
     # Rounding in C1 grows as the inverse of the planar factor, and in cos(beta) again as that of u;
     # the cap keeps what the clipped cosine leaves of a gap in rod 11 below l4 / 1e12.
-    blur = np.minimum(1 + l4 * l4 * inverse_distance2 / across, 64) * (_ROUNDING * l4 * l4)
+    blur = np.minimum(1 + l4 * l4 * inverse_distance2 / across, 64) * (ROUNDING * l4 * l4)
     x_foot, z_foot = along * dx, z1 + along * dz
     for planar in (-1, 1):
         x_c, z_c = x_foot - planar * across * dz, z_foot + planar * across * dx
@@ -266,36 +267,6 @@ def _forward_block(
         position[:, slot : slot + 2, 2] = (z_c + 2 * l6)[:, None]
         beta[:, slot], beta[:, slot + 1] = -angle, angle
         valid[:, slot : slot + 2] = assembled[:, None]
-
-
-def _forward_one(theta: FloatArray, branch: AssemblyMode, geometry: Geometry) -> FloatArray:
-    """:func:`_forward_block` for one row and one branch, in plain floats: numpy's calls cost more.
-
-    The formulas are explained there; a test holds the two together.
-    """
-    theta_1, theta_2, theta_3 = theta.tolist()
-    g, l3, l4 = geometry, geometry.l3, geometry.l4
-    y1, z1 = g.l1 + l3 * math.cos(theta_1), l3 * math.sin(theta_1)
-    dx, dz = l3 * math.cos(theta_2) + (2 * g.l5 - g.l1), l3 * math.sin(theta_2) - z1
-    distance2 = dx * dx + dz * dz
-    if distance2 == 0.0:
-        raise no_assembly(theta, branch, geometry)
-    along = 0.5 - 0.5 * y1 * y1 / distance2
-    across2 = (l4 * l4 - y1 * y1) / distance2 - along * along
-    if across2 < -_ROUNDING * (1 + along * along):
-        raise no_assembly(theta, branch, geometry)
-    across = branch.planar * math.sqrt(max(0.0, across2))
-    x_c, z_c = along * dx - across * dz, z1 + along * dz + across * dx
-    u = x_c - (l3 * math.cos(theta_3) + (g.l1 - 2 * g.l2))
-    w = z_c - (l3 * math.sin(theta_3) - g.l6)
-    numerator, denominator = l4 * l4 - g.l7 * g.l7 - u * u - w * w, 2 * g.l7 * u
-    gain = 1 + l4 * l4 / (distance2 * abs(across)) if across else 64
-    blur = min(gain, 64) * _ROUNDING * l4 * l4
-    if abs(numerator) > abs(denominator) + blur or denominator == 0.0:
-        raise no_assembly(theta, branch, geometry)
-    cos_beta = min(1.0, max(-1.0, numerator / denominator))
-    y = branch.sin_beta * g.l7 * math.sqrt((1 - cos_beta) * (1 + cos_beta))
-    return np.array([x_c + g.l7 * cos_beta + g.l2, y, z_c + 2 * g.l6])
 
 
 def _inverse_block(
@@ -354,7 +325,7 @@ def _solve_leg(
     radius2 = a * a + b * b
     c = (radius2 + out2 + (geometry.l3**2 - geometry.l4**2)) / (2 * geometry.l3)
     ratio = c / np.sqrt(radius2)
-    ratio[np.abs(ratio) > 1 + _ROUNDING] = np.nan
+    ratio[np.abs(ratio) > 1 + ROUNDING] = np.nan
     apart = np.arccos(np.clip(ratio, -1.0, 1.0))
     angle = np.arctan2(b, a) if angle is None else angle
     return angle + apart, angle - apart
@@ -363,8 +334,13 @@ def _solve_leg(
 def _clip_rounding(value: FloatArray) -> FloatArray:
     """Zero where ``value`` is negative by rounding alone, NaN where it is truly negative."""
     clipped = np.maximum(value, 0.0)
-    clipped[value < -_ROUNDING] = np.nan
+    clipped[value < -ROUNDING] = np.nan
     return clipped
+
+
+def _vector(array: FloatArray) -> Vector:
+    a, b, c = array.tolist()
+    return a, b, c
 
 
 def _points(name: str, value: ArrayLike) -> FloatArray:

@@ -72,6 +72,11 @@ class Mount:
         turned: FloatArray = np.multiply(vector, _HALF_TURN, dtype=np.float64)
         return turned
 
+    def swap(self, point: Vector) -> Vector:
+        """One point from either frame to the other, in plain floats: a half turn undoes itself."""
+        x, y, z = point
+        return x, -y, self.height - z
+
     @property
     def quaternion(self) -> tuple[float, float, float, float]:
         """Orientation of the paper frame in the world, (x, y, z, w)."""

@@ -20,7 +20,7 @@ least this; a sixth of the task region is below.
 
 def distance(achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
     """Euclidean distance of points (..., 3) m, as (...,) m."""
-    gap = np.asarray(achieved, dtype=np.float64) - np.asarray(desired, dtype=np.float64)
+    gap = np.subtract(achieved, desired, dtype=np.float64)
     result: FloatArray = np.sqrt((gap * gap).sum(axis=-1))
     return result
 
@@ -47,6 +47,7 @@ def singularity_penalty(conditioning: ArrayLike, safe: float = SAFE_CONDITIONING
     Returns:
         (...,) in [0, 1].
     """
-    depth = np.clip(1.0 - np.asarray(conditioning, dtype=np.float64) / safe, 0.0, 1.0)
+    depth = 1.0 - np.asarray(conditioning, dtype=np.float64) / safe
+    depth = np.minimum(np.maximum(depth, 0.0), 1.0)  # np.clip costs five times as much
     result: FloatArray = depth * depth * (3.0 - 2.0 * depth)
     return result

@@ -53,6 +53,8 @@ class Robot:
         self._links: dict[str, Address] = {}
         self.bodies = [self._load(leg, mount) for leg in mechanism.legs()]
         self._motors = [self._joints[name] for name in ACTUATED_JOINTS]
+        self._inertias = {link: self._inertia(link) for link in self._links.values()}
+        self._effort = [MOTOR_EFFORT] * 3
         self._platform = self._links[mechanism.platform]
         self.tool = self._links[mechanism.tool]
         client.setJointMotorControl2(
@@ -84,6 +86,11 @@ class Robot:
             )
             client.setJointMotorControl2(body, index, client.VELOCITY_CONTROL, force=0.0)
         return body
+
+    def _inertia(self, link: Address) -> tuple[float, Vector]:
+        """Mass and principal moments as loaded."""
+        info = self._client.getDynamicsInfo(*link)
+        return info[0], info[2]
 
     def _close_loops(self) -> None:
         """Close the loops; the engine wants pivots relative to the centres of mass."""
@@ -131,23 +138,35 @@ class Robot:
         for name, angle in angles.items():
             self._client.resetJointState(*self._joints[name], angle, 0.0)
 
-    def drive(self, theta: Sequence[float]) -> None:
-        """Let the motors go to ``theta`` (3) rad within the next time step, effort permitting."""
-        client = self._client
-        for (body, joint), angle in zip(self._motors, theta, strict=True):
-            client.setJointMotorControl2(
+    def alter(self, mass_factors: Sequence[float], motor_strength: Sequence[float]) -> None:
+        """Scale the masses of the moving links (empty: all nominal) and the motors' torques."""
+        factors = mass_factors or [1.0] * len(self._inertias)
+        for (link, (mass, moments)), factor in zip(self._inertias.items(), factors, strict=True):
+            self._client.changeDynamics(
+                *link,
+                mass=factor * mass,
+                localInertiaDiagonal=[factor * moment for moment in moments],
+            )
+        self._effort = [MOTOR_EFFORT * strength for strength in motor_strength]
+
+    def drive(self, theta: Vector) -> None:
+        """Let the motors go to ``theta`` rad within the next time step, effort permitting."""
+        turn, mode = self._client.setJointMotorControl2, self._client.POSITION_CONTROL
+        for (body, joint), angle, effort in zip(self._motors, theta, self._effort, strict=True):
+            turn(
                 body,
                 joint,
-                client.POSITION_CONTROL,
+                mode,
                 targetPosition=angle,
-                force=MOTOR_EFFORT,
+                force=effort,
                 positionGain=MOTOR_GAIN,
             )
 
-    def encoders(self) -> tuple[list[float], list[float]]:
-        """Angles (3) rad and rates (3) rad/s of the motors."""
-        states = [self._client.getJointState(*motor) for motor in self._motors]
-        return [state[0] for state in states], [state[1] for state in states]
+    def encoders(self) -> tuple[Vector, Vector]:
+        """True angles (rad) and rates (rad/s) of the motors."""
+        state, (first, second, third) = self._client.getJointState, self._motors
+        a, b, c = state(*first), state(*second), state(*third)
+        return (a[0], b[0], c[0]), (a[1], b[1], c[1])
 
     def joint_states(self) -> tuple[tuple[float, float], ...]:
         """Angle and rate of every joint, passive ones too."""

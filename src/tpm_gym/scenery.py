@@ -5,20 +5,24 @@ The client is handed in (see :mod:`tpm_gym.simulation`), so this module does not
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tpm_gym.cup import Pose
+from tpm_gym.parts import Vector
+from tpm_gym.physics import Quaternion
 from tpm_gym.state import Puck, Scene
 
 __all__ = ["AT_REST", "UPRIGHT", "Scenery"]
 
 FloatArray = NDArray[np.float64]
 Colour = tuple[float, float, float, float]
-Vector = tuple[float, float, float]
 
+_NOWHERE: Vector = (math.nan, math.nan, math.nan)
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 AT_REST: Pose = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
@@ -53,6 +57,7 @@ class Scenery:
             client.GEOM_SPHERE, radius=scene.marker_radius, rgbaColor=_MARKER_COLOUR
         )
         self._marker = client.createMultiBody(baseVisualShapeIndex=shape)
+        self._nominal = scene.puck
         self.puck: int | None = None if scene.puck is None else self._add_puck(scene.puck)
 
     def _add_box(self, half: Vector, centre: Vector, colour: Colour) -> int:
@@ -105,12 +110,29 @@ class Scenery:
         pose = self._client.getBasePositionAndOrientation(self.puck)
         return pose, self._client.getBaseVelocity(self.puck)
 
-    def puck_state(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    def puck_state(self) -> tuple[Vector, Quaternion, Vector, Vector]:
         """Position, orientation, velocity, angular velocity; NaN without a puck."""
         pose, velocity = self.puck_pose()
         if pose is None or velocity is None:
-            return np.full(3, np.nan), np.full(4, np.nan), np.full(3, np.nan), np.full(3, np.nan)
-        return np.array(pose[0]), np.array(pose[1]), np.array(velocity[0]), np.array(velocity[1])
+            return _NOWHERE, (*_NOWHERE, math.nan), _NOWHERE, _NOWHERE
+        return pose[0], pose[1], velocity[0], velocity[1]
+
+    def alter_puck(self, mass: float, friction: float) -> None:
+        """Make the puck ``mass`` times as heavy and ``friction`` times as rough as nominal."""
+        if self.puck is None or self._nominal is None:
+            return
+        puck = replace(
+            self._nominal,
+            mass=mass * self._nominal.mass,
+            friction=friction * self._nominal.friction,
+        )
+        self._client.changeDynamics(
+            self.puck,
+            -1,
+            mass=puck.mass,
+            localInertiaDiagonal=puck.inertia,
+            lateralFriction=puck.friction,
+        )
 
     def aim_window(self) -> None:
         """Point the camera of the engine's window like that of :meth:`picture`."""

@@ -1,104 +1,72 @@
-"""The mechanism in PyBullet: the only module that imports the engine.
+"""The mechanism in the physics engine: one robot over one table.
 
-The spanning tree is loaded from generated URDF; the loops are closed by point-to-point
-constraints. A reset sets every joint, passive ones too, to the closed-form angles, so an episode
-starts with the loops closed to better than a micrometre.
+The legs are loaded from generated URDF; the loops are closed by point-to-point constraints. A reset
+sets every joint, passive ones too, to the closed-form angles, so an episode starts with the loops
+closed to better than a micrometre.
 """
 
 from __future__ import annotations
 
-import ctypes
-import importlib.util
-import os
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+import math
 from dataclasses import dataclass
-from functools import partial
-from typing import Any
 
 import numpy as np
-import pybullet
 from numpy.typing import ArrayLike, NDArray
 
-from tpm_gym import jacobian, kinematics
+from tpm_gym import single
+from tpm_gym.branches import DEFAULT_ASSEMBLY, ELBOWS_OUT
 from tpm_gym.cup import Cup, Pose
+from tpm_gym.engine import Client
 from tpm_gym.errors import (
-    AssemblyModeError,
     ClosureError,
     ConfigurationError,
+    InputError,
+    ModeChangeError,
     SingularityError,
     UnreachableError,
 )
 from tpm_gym.geometry import PAPER, Geometry
 from tpm_gym.mechanism import DEFAULT_MOUNT, Mount, build, joint_angles
-from tpm_gym.physics import (
-    ASSEMBLY_LIMIT,
-    CLOSURE_LIMIT,
-    GRAVITY,
-    REGULARISATION,
-    Physics,
-    spline_weights,
-)
+from tpm_gym.parts import Vector
+from tpm_gym.physics import ASSEMBLY_LIMIT, CLOSURE_LIMIT, Physics, rotate, spline_weights
+from tpm_gym.randomisation import NOMINAL, Plant
 from tpm_gym.robot import Robot
 from tpm_gym.scenery import AT_REST, UPRIGHT, Scenery
 from tpm_gym.state import Scene, State
 
-__all__ = ["Simulation", "Snapshot", "has_display"]
+__all__ = ["Simulation", "Snapshot"]
 
-FloatArray = NDArray[np.float64]
+Reading = tuple[single.Assembly, tuple[Vector, Vector, Vector], float]
+"""What follows from the encoders: the assembly, the rows of J, the conditioning."""
+_ZERO: Vector = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Physics, commands and grasp of a :class:`Simulation` at one moment."""
+    """Everything that the next steps of a :class:`Simulation` depend on."""
 
+    plant: Plant
     joints: tuple[tuple[float, float], ...]
-    commands: FloatArray
+    commands: tuple[Vector, Vector]
+    noise: tuple[Vector, Vector]
+    reading: Reading | None
+    mode_change: str | None
     object_pose: Pose | None
     object_velocity: Pose | None
     grip: Pose | None
 
 
-class _Client:
-    """A private physics client: pybullet's functions with its number filled in.
-
-    pybullet_utils' BulletClient looks every function up anew at every call, which costs as much as
-    the cheaper calls themselves, and prints a line on connecting.
-    """
-
-    def __init__(self, mode: int) -> None:
-        """Connect."""
-        self._number = pybullet.connect(mode)
-        if self._number < 0:
-            raise ConfigurationError(
-                "render_mode", "human", "None or 'rgb_array': no window opened"
-            )
-
-    def __getattr__(self, name: str) -> Any:
-        """The engine's function of that name, bound to this client, or its constant."""
-        value = getattr(pybullet, name)
-        if callable(value):
-            value = partial(value, physicsClientId=self._number)
-        setattr(self, name, value)
-        return value
-
-    def close(self) -> None:
-        """Disconnect; harmless the second time."""
-        if self._number >= 0:
-            pybullet.disconnect(self._number)
-            self._number = -1
-
-
 class Simulation:
     """One robot over one table in one private physics client.
 
+    The lengths that control and encoders believe in are ``geometry``; the true ones are those of
+    the :class:`~tpm_gym.randomisation.Plant` of the episode.
+
     Args:
         scene: What stands on the table besides the robot.
-        geometry: Link lengths.
+        geometry: Nominal link lengths.
         mount: Where the base hangs.
         physics: Numerical settings.
-        encoder_bias: (3,) rad, added to what the three encoders report.
         gui: Whether to open PyBullet's window.
         renderer: ``"tiny"`` draws on the CPU anywhere; ``"egl"`` on a GPU, where the driver has it.
 
@@ -113,7 +81,6 @@ class Simulation:
         geometry: Geometry = PAPER,
         mount: Mount = DEFAULT_MOUNT,
         physics: Physics | None = None,
-        encoder_bias: ArrayLike = (0.0, 0.0, 0.0),
         gui: bool = False,
         renderer: str = "tiny",
     ) -> None:
@@ -121,45 +88,47 @@ class Simulation:
         self.scene, self.geometry, self.mount = scene, geometry, mount
         self.physics = Physics() if physics is None else physics
         self.mechanism = build(geometry)
-        self._bias = _bias(encoder_bias)
-        self._client = _Client(pybullet.GUI if gui else pybullet.DIRECT)
+        self._gui, self._painted = gui, gui or renderer == "egl"
+        self._client = Client(self.physics, gui, renderer)
         try:
-            self._renderer = _load_renderer(self._client, renderer)
-            self._configure()
-            self._robot = Robot(self._client, self.mechanism, mount)
-            self._scenery = Scenery(self._client, scene)
-            if gui:
-                self._scenery.aim_window()
-            if gui or renderer == "egl":
-                self._robot.paint()
-            self._cup: Cup | None = None
-            if scene.puck is not None and self._scenery.puck is not None:
-                self._cup = Cup(self._client, self._robot, self._scenery.puck, scene.puck)
+            self._load(NOMINAL)
         except BaseException:
             self.close()
             raise
-        self._commands = np.zeros((2, 3))  # the last two, paper frame, m
-        self._evaluation: jacobian.Evaluation | None = None  # the last one by the encoders
-        self._spline = spline_weights(self.physics.substeps)
+        self._commands = (_ZERO, _ZERO)  # the last two, paper frame, m
+        self._noise = (_ZERO, _ZERO)  # of the last two readings of the encoders, rad
+        self._reading: Reading | None = None  # the last one that made sense
+        self._mode_change: str | None = None
+        self._spline: list[list[float]] = spline_weights(self.physics.substeps).tolist()
 
     # -- building ---------------------------------------------------------------------------
 
-    def _configure(self) -> None:
-        client = self._client
-        client.setGravity(0.0, 0.0, -GRAVITY)
-        client.setTimeStep(self.physics.time_step)
-        client.setPhysicsEngineParameter(
-            numSolverIterations=self.physics.iterations,
-            erp=self.physics.erp,
-            deterministicOverlappingPairs=1,
-            globalCFM=REGULARISATION,
-        )
-        if self.physics.solver == "direct":
-            with _silence():
-                client.setPhysicsEngineParameter(
-                    constraintSolverType=pybullet.CONSTRAINT_SOLVER_LCP_DANTZIG
-                )
-        client.configureDebugVisualizer(pybullet.COV_ENABLE_GUI, 0)  # no side panels
+    def _load(self, plant: Plant) -> None:
+        """Fill the empty client with the robot of that plant and all that stands around it."""
+        self._true_geometry = plant.geometry(self.geometry)
+        self.mechanism = build(self._true_geometry)
+        self._robot = Robot(self._client, self.mechanism, self.mount)
+        self._scenery = Scenery(self._client, self.scene)
+        if self._gui:
+            self._scenery.aim_window()
+        if self._painted:
+            self._robot.paint()
+        self._cup: Cup | None = None
+        if self.scene.puck is not None and self._scenery.puck is not None:
+            self._cup = Cup(self._client, self._robot, self._scenery.puck, self.scene.puck)
+        self._plant = Plant(length_errors=plant.length_errors)
+
+    def _become(self, plant: Plant) -> None:
+        """Make the simulated machine that of ``plant``."""
+        if plant == self._plant:
+            return
+        if plant.geometry(self.geometry) != self._true_geometry:
+            self._client.resetSimulation()
+            self._client.configure(self.physics)
+            self._load(plant)
+        self._robot.alter(plant.link_masses, plant.motor_strength)
+        self._scenery.alter_puck(plant.puck_mass, plant.friction)
+        self._plant = plant
 
     # -- running ----------------------------------------------------------------------------
 
@@ -168,23 +137,32 @@ class Simulation:
         theta: ArrayLike,
         object_position: ArrayLike | None = None,
         goal: ArrayLike | None = None,
+        plant: Plant = NOMINAL,
+        noise: Vector = _ZERO,
     ) -> State:
         """Put everything at rest: the arms at ``theta``, the loops closed, the object upright.
 
         Args:
-            theta: (3,) rad.
+            theta: (3,) rad, by the encoders.
             object_position: (3,) m, world; centre of the object. Ignored without an object.
             goal: (3,) m, world; where the goal marker stands.
+            plant: The true machine.
+            noise: Of the first reading of the encoders, rad.
 
         Raises:
             InputError: If theta has the wrong shape or is not finite.
             UnreachableError: If the mechanism cannot be assembled at theta.
         """
-        angles = joint_angles(theta, geometry=self.geometry)
+        angles = _vector("theta", theta)
+        start = single.assemble(angles, DEFAULT_ASSEMBLY, self.geometry)
+        true_angles = joint_angles(
+            np.subtract(angles, plant.encoder_bias), geometry=plant.geometry(self.geometry)
+        )
         self._let_go()
-        self._evaluation = None
-        self._robot.place(angles)
-        self._commands = np.tile(kinematics.forward(theta, geometry=self.geometry), (2, 1))
+        self._become(plant)
+        self._robot.place(true_angles)
+        self._reading, self._mode_change, self._noise = None, None, (noise, noise)
+        self._commands = ((start.x, start.y, start.z),) * 2
         if object_position is not None:
             position = np.asarray(object_position, dtype=np.float64).tolist()
             self._scenery.place_puck((position, UPRIGHT), AT_REST)
@@ -196,7 +174,7 @@ class Simulation:
         """Move the goal marker to ``goal`` (3,) m, world."""
         self._scenery.move_marker(np.asarray(goal, dtype=np.float64).tolist())
 
-    def move(self, command: ArrayLike, vacuum: bool = False) -> State:
+    def move(self, command: ArrayLike, vacuum: bool = False, noise: Vector = _ZERO) -> State:
         """Command point P to ``command`` and run one control period.
 
         The motors follow a quadratic B-spline through the commands: it lags the commands by half a
@@ -207,84 +185,114 @@ class Simulation:
         Args:
             command: (3,) m, paper frame; inside the region (the caller projects).
             vacuum: Whether the cup sucks.
+            noise: Of the encoders' reading at the end, rad.
 
         Raises:
+            InputError: If the command has the wrong shape or is not finite.
             UnreachableError: If the command is out of reach; nothing has moved then.
+            ModeChangeError: If the mechanism has left its assembly or working mode before.
             ClosureError: If a loop opened.
-            AssemblyModeError: If the mechanism went through a parallel singularity.
         """
-        controls = np.vstack([self._commands, np.asarray(command, dtype=np.float64)])
-        references = kinematics.inverse(self._spline @ controls, geometry=self.geometry)
-        self._commands = controls[1:]
+        if self._mode_change is not None:
+            raise ModeChangeError(self._mode_change)
+        before, last = self._commands
+        new = _vector("command", command)
+        references = [
+            single.posture(_blend(weights, before, last, new), ELBOWS_OUT, self.geometry)
+            for weights in self._spline
+        ]
+        self._commands = (last, new)
         if not vacuum:
             self._let_go()
-        for theta in references.tolist():
-            self._robot.drive(theta)
-            self._client.stepSimulation()
+        b1, b2, b3 = self._plant.encoder_bias
+        drive, advance = self._robot.drive, self._client.stepSimulation
+        for theta_1, theta_2, theta_3 in references:
+            drive((theta_1 - b1, theta_2 - b2, theta_3 - b3))
+            advance()
         if vacuum and self._cup is not None:
             self._cup.suck()
-        state = self.read()
-        self._check(state)
-        return state
+        self._noise = (self._noise[1], noise)
+        return self.read()
+
+    # -- reading ----------------------------------------------------------------------------
 
     def read(self) -> State:
         """Read the encoders, what follows from them, and the truth.
 
         Raises:
-            AssemblyModeError: If no assembly in the default mode explains the encoders.
+            ClosureError: If a loop is open.
         """
-        angles, rates = self._robot.encoders()
-        theta, theta_dot = np.array(angles) + self._bias, np.array(rates)
+        true_theta, true_rates = self._robot.encoders()
         gap, platform, tilt = self._robot.truth()
-        at = self._evaluate(theta)
+        if not gap <= CLOSURE_LIMIT:  # so that a NaN fails too
+            raise ClosureError(gap, CLOSURE_LIMIT)
+        theta, rates = self._disturb(true_theta, true_rates)
+        (x, y, z, *_), rows, conditioning = self._evaluate(theta)
+        self._watch_mode(true_theta, platform)
         position, quaternion, velocity, spin = self._scenery.puck_state()
+        r1, r2, r3 = rates
         return State(
-            theta=theta,
-            theta_dot=theta_dot,
-            fk_position=self.mount.to_world(at.position),
-            fk_velocity=self.mount.rotate(at.velocity @ theta_dot),
-            conditioning=float(at.conditioning),
+            theta=np.array(theta),
+            theta_dot=np.array(rates),
+            fk_position=np.array(self.mount.swap((x, y, z))),
+            fk_velocity=self.mount.rotate([a * r1 + b * r2 + c * r3 for a, b, c in rows]),
+            conditioning=conditioning,
             platform_position=np.array(platform),
             platform_tilt=tilt,
             closure_error=gap,
-            command=self.mount.to_world(self._commands[1]),
+            mode_change=self._mode_change,
+            command=np.array(self.mount.swap(self._commands[1])),
             holding=self._cup is not None and self._cup.grip is not None,
-            object_position=position,
-            object_quaternion=quaternion,
-            object_velocity=velocity,
-            object_angular_velocity=spin,
+            object_position=np.array(position),
+            object_quaternion=np.array(quaternion),
+            object_axis=np.array(rotate(quaternion, (0.0, 0.0, 1.0))),
+            object_velocity=np.array(velocity),
+            object_angular_velocity=np.array(spin),
         )
 
-    def _evaluate(self, theta: FloatArray) -> jacobian.Evaluation:
-        """Position and Jacobian by the encoders; the last ones where the encoders make no sense.
+    def _disturb(self, theta: Vector, rates: Vector) -> tuple[Vector, Vector]:
+        """What the encoders report: with their bias and noise, and rates by differences."""
+        bias, (before, now) = self._plant.encoder_bias, self._noise
+        if bias == before == now == _ZERO:
+            return theta, rates
+        period = self.physics.control_period
+        return (
+            _vector("theta", np.array(theta) + bias + now),
+            _vector("theta_dot", rates + np.subtract(now, before) / period),
+        )
 
-        That is what a controller can do whose biased encoders report angles at which no assembly
+    def _evaluate(self, theta: Vector) -> Reading:
+        """What follows from the encoders; the last reading that made sense where this one does not.
+
+        That is what a controller can do whose disturbed encoders report angles at which no assembly
         exists, as happens near the edges of the workspace.
         """
         try:
-            self._evaluation = jacobian.evaluate(theta, geometry=self.geometry)
+            self._reading = single.evaluate(theta, DEFAULT_ASSEMBLY, self.geometry)
         except (UnreachableError, SingularityError) as error:
-            if not self._bias.any():
-                raise AssemblyModeError(float("inf"), ASSEMBLY_LIMIT) from error
-            if self._evaluation is None:
-                valid = "a bias with which the mechanism can be assembled at the start"
-                raise ConfigurationError("encoder_bias", self._bias.tolist(), valid) from error
-        return self._evaluation
+            if self._reading is None:
+                valid = "errors with which the mechanism can be assembled at the start"
+                raise ConfigurationError("randomisation", self._plant, valid) from error
+        return self._reading
 
-    def _check(self, state: State) -> None:
-        # "not <=" so that a NaN fails too
-        if not state.closure_error <= CLOSURE_LIMIT:
-            raise ClosureError(float(state.closure_error), CLOSURE_LIMIT)
-        expected = state.fk_position
-        if self._bias.any():
-            try:
-                true_point = kinematics.forward(state.theta - self._bias, geometry=self.geometry)
-            except UnreachableError as error:
-                raise AssemblyModeError(float("inf"), ASSEMBLY_LIMIT) from error
-            expected = self.mount.to_world(true_point)
-        apart = float(np.linalg.norm(state.platform_position - expected))
-        if not apart <= ASSEMBLY_LIMIT:
-            raise AssemblyModeError(apart, ASSEMBLY_LIMIT)
+    def _watch_mode(self, theta: Vector, platform: Vector) -> None:
+        """Note when the mechanism has passed a singularity.
+
+        Passing a parallel one changes the assembly mode, and the forward kinematics no longer say
+        where the platform is; passing a serial one changes the working mode, and the inverse
+        kinematics no longer say how to get where.
+        """
+        try:
+            true = single.assemble(theta, DEFAULT_ASSEMBLY, self._true_geometry)
+        except UnreachableError:
+            self._mode_change = "assembly"
+            return
+        y = self.mount.swap(platform)[1]
+        apart = math.dist(self.mount.swap((true.x, true.y, true.z)), platform)
+        if y * DEFAULT_ASSEMBLY.sin_beta <= 0 or not apart <= ASSEMBLY_LIMIT:
+            self._mode_change = "assembly"
+        elif true.cos_beta * ELBOWS_OUT.cos_beta <= 0:
+            self._mode_change = "working"
 
     def _let_go(self) -> None:
         if self._cup is not None:
@@ -301,8 +309,12 @@ class Simulation:
         """
         pose, velocity = self._scenery.puck_pose()
         snapshot = Snapshot(
+            plant=self._plant,
             joints=self._robot.joint_states(),
-            commands=self._commands.copy(),
+            commands=self._commands,
+            noise=self._noise,
+            reading=self._reading,
+            mode_change=self._mode_change,
             object_pose=pose,
             object_velocity=velocity,
             grip=self._cup.grip if self._cup is not None else None,
@@ -313,8 +325,10 @@ class Simulation:
     def restore(self, snapshot: Snapshot) -> State:
         """Go back to a moment that :meth:`save` took down, of this or an equal simulation."""
         self._let_go()
+        self._become(snapshot.plant)
         self._robot.set_joint_states(snapshot.joints)
-        self._commands = snapshot.commands.copy()
+        self._commands, self._noise = snapshot.commands, snapshot.noise
+        self._reading, self._mode_change = snapshot.reading, snapshot.mode_change
         if snapshot.object_pose is not None and snapshot.object_velocity is not None:
             self._scenery.place_puck(snapshot.object_pose, snapshot.object_velocity)
         if snapshot.grip is not None and self._cup is not None:
@@ -323,55 +337,32 @@ class Simulation:
 
     def render(self, width: int, height: int) -> NDArray[np.uint8]:
         """Draw the scene as (height, width, 3) RGB."""
-        return self._scenery.picture(width, height, self._renderer)
+        return self._scenery.picture(width, height, self._client.renderer)
 
     def close(self) -> None:
         """Disconnect the client; harmless the second time."""
         self._client.close()
 
 
-@contextmanager
-def _silence() -> Iterator[None]:
-    """Keep what the engine says (from C, on changing its solver) out of the user's output."""
-    if os.name != "posix":
-        yield
-        return
-    flush = ctypes.CDLL(None).fflush
-    sys.stdout.flush()
-    flush(None)
-    ours, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+def _vector(name: str, value: ArrayLike) -> Vector:
+    """Three finite floats."""
     try:
-        os.dup2(nowhere, 1)
-        yield
-        flush(None)
-    finally:
-        os.dup2(ours, 1)
-        os.close(ours)
-        os.close(nowhere)
-
-
-def has_display() -> bool:
-    """Whether PyBullet can open a window here (on Linux it needs an X server)."""
-    return not sys.platform.startswith("linux") or bool(os.environ.get("DISPLAY"))
-
-
-def _bias(value: ArrayLike) -> FloatArray:
-    try:
-        bias = np.asarray(value, dtype=np.float64)
+        array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise ConfigurationError("encoder_bias", value, "three finite angles in rad") from error
-    if bias.shape != (3,) or not np.isfinite(bias).all():
-        raise ConfigurationError("encoder_bias", value, "three finite angles in rad")
-    return bias
+        raise InputError(name, value, "three finite numbers") from error
+    if array.shape != (3,):
+        raise InputError(name, array.shape, "of shape (3,), by shape")
+    a, b, c = array.tolist()
+    if not math.isfinite(a + b + c):
+        raise InputError(name, [a, b, c], "finite")
+    return a, b, c
 
 
-def _load_renderer(client: _Client, renderer: str) -> int:
-    """The engine's number of the renderer; loads the EGL plugin if that was asked for."""
-    if renderer == "tiny":
-        return int(pybullet.ER_TINY_RENDERER)
-    if renderer != "egl":
-        raise ConfigurationError("renderer", renderer, "'tiny' or 'egl'")
-    spec = importlib.util.find_spec("eglRenderer")
-    if spec is None or client.loadPlugin(spec.origin, "_eglRendererPlugin") < 0:
-        raise ConfigurationError("renderer", renderer, "'tiny': this machine has no EGL renderer")
-    return int(pybullet.ER_BULLET_HARDWARE_OPENGL)
+def _blend(weights: list[float], a: Vector, b: Vector, c: Vector) -> Vector:
+    """A point of the spline through three commands."""
+    u, v, w = weights
+    return (
+        u * a[0] + v * b[0] + w * c[0],
+        u * a[1] + v * b[1] + w * c[1],
+        u * a[2] + v * b[2] + w * c[2],
+    )

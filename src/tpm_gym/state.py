@@ -31,6 +31,12 @@ class Puck:
     mass: float = 0.050
     friction: float = 0.6
 
+    @property
+    def inertia(self) -> tuple[float, float, float]:
+        """Principal moments about the centre, kg m^2."""
+        level = self.mass * (self.width**2 + self.height**2) / 12
+        return level, level, self.mass * self.width**2 / 6
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -59,10 +65,13 @@ class State:
             real robot does not know. Never part of an observation.
         platform_tilt: (...,) rad, rotation of the simulated platform, zero by design.
         closure_error: (...,) m, the largest gap of the simulated loops.
+        mode_change: None, or the mode that the mechanism has left in this episode by passing a
+            singularity: ``"assembly"`` or ``"working"``.
         command: (..., 3) m, world: where point P is commanded to go.
         holding: (...,) bool, whether the vacuum cup holds the object.
         object_position: (..., 3) m, world: centre of the object. NaN without an object, as below.
         object_quaternion: (..., 4), orientation of the object in the world, (x, y, z, w).
+        object_axis: (..., 3) unit vector, world: the object's own z axis.
         object_velocity: (..., 3) m/s, world.
         object_angular_velocity: (..., 3) rad/s, world.
     """
@@ -75,9 +84,11 @@ class State:
     platform_position: FloatArray
     platform_tilt: FloatArray | float
     closure_error: FloatArray | float
+    mode_change: str | None
     command: FloatArray
     holding: NDArray[np.bool_] | bool
     object_position: FloatArray
     object_quaternion: FloatArray
+    object_axis: FloatArray
     object_velocity: FloatArray
     object_angular_velocity: FloatArray

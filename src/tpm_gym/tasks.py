@@ -40,6 +40,7 @@ _EXTENT = tuple(((np.array(TASK_REGION.high) - TASK_REGION.low) / 2).tolist())
 _SPEED = tuple((STEP_LIMIT / CONTROL_PERIOD).tolist())
 _STEP = tuple(STEP_LIMIT.tolist())
 _ZERO = (0.0, 0.0, 0.0)
+_CUP = np.array([0.0, 0.0, CUP_LENGTH])
 
 
 @dataclass(frozen=True)
@@ -96,6 +97,8 @@ class Task:
         if reward not in ("sparse", "dense"):
             raise ConfigurationError("reward", reward, "'sparse' or 'dense'")
         self.reward = reward
+        self._centre = np.concatenate([entry.centre for entry in self.entries])
+        self._scale = np.concatenate([entry.scale for entry in self.entries])
 
     # -- sampling ---------------------------------------------------------------------------
 
@@ -134,10 +137,9 @@ class Task:
 
     def observe(self, state: State) -> FloatArray:
         """The observation vector (..., n), each entry of order one."""
-        parts = [
-            (np.asarray(entry.source(state)) - entry.centre) / entry.scale for entry in self.entries
-        ]
-        return np.concatenate(parts, axis=-1)
+        values = np.concatenate([entry.source(state) for entry in self.entries], axis=-1)
+        scaled: FloatArray = (values - self._centre) / self._scale
+        return scaled
 
     def decode(self, observation: ArrayLike) -> dict[str, FloatArray]:
         """The inverse of :meth:`observe`: name -> (..., k) in SI units."""
@@ -209,7 +211,7 @@ class PickAndPlace(Task):
         Entry("object_velocity", "m/s", "velocity of the puck, from a camera", _ZERO, _SPEED,
               lambda s: s.object_velocity),
         Entry("object_tilt", "-", "x and y of the puck's axis", (0.0, 0.0), (1.0, 1.0),
-              lambda s: _axis(s.object_quaternion)[..., :2]),
+              lambda s: s.object_axis[..., :2]),
         Entry("holding", "-", "+1 if the cup holds the puck (vacuum gauge), else -1",
               (0.5,), (0.5,), lambda s: np.asarray(s.holding, dtype=np.float64)[..., None]),
     )  # fmt: skip
@@ -316,16 +318,11 @@ def _check_reach(name: str, value: ArrayLike, tool_offset: FloatArray) -> FloatA
 
 
 def _lip(state: State) -> FloatArray:
-    """Centre of the cup's lip by forward kinematics, world."""
-    return state.fk_position - (0.0, 0.0, CUP_LENGTH)
+    """Centre of the cup's lip, pushed out, by forward kinematics, world."""
+    lip: FloatArray = state.fk_position - _CUP
+    return lip
 
 
 def _top(state: State) -> FloatArray:
     """Centre of the puck's top face, world."""
-    return state.object_position + _axis(state.object_quaternion) * (PickAndPlace.puck.height / 2)
-
-
-def _axis(quaternion: FloatArray) -> FloatArray:
-    """Axis z of a body, (..., 3), from its orientation (..., 4) as (x, y, z, w)."""
-    x, y, z, w = np.moveaxis(quaternion, -1, 0)
-    return np.stack([2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)], axis=-1)
+    return state.object_position + state.object_axis * (PickAndPlace.puck.height / 2)

@@ -63,7 +63,8 @@ class Region:
 
     def project(self, points: ArrayLike) -> FloatArray:
         """The points of the box that are nearest to points (..., 3)."""
-        return np.clip(np.asarray(points, dtype=np.float64), self.low, self.high)
+        inside: FloatArray = np.minimum(np.maximum(points, self.low), self.high)
+        return inside
 
     def margin(self, point: ArrayLike) -> float:
         """Signed distance of one point (3,) to the nearest face; negative outside, m."""
