@@ -4,7 +4,7 @@ VENV := .venv
 RUN := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
 
-.PHONY: help demo test lint format test-fast test-slow urdf pictures figures bench-kinematics clean
+.PHONY: help demo test lint format test-fast test-slow urdf pictures figures bench-kinematics bench-fidelity bench-speed soak clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -19,7 +19,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 demo: $(INSTALLED) ## train Reach, evaluate it, let the expert pick and place; see runs/demo/
 	$(RUN) train/train.py --env TPMReach-v0 --algo sac --seed 0 --run runs/demo/reach --overwrite
 	cp runs/demo/reach/learning_curve.png runs/demo/learning_curve.png
-	$(RUN) train/evaluate.py --policy runs/demo/reach/best.zip expert random \
+	$(RUN) train/evaluate.py --policy runs/demo/reach/best.json expert random \
 		--env TPMReach-v0 --episodes 100 --json runs/demo/reach.json
 	$(RUN) train/evaluate.py --policy expert --env TPMPickAndPlace-v0 --episodes 20 --seed 2000006 \
 		--json runs/demo/pick_and_place.json --video runs/demo/pick_and_place.mp4 \
@@ -54,6 +54,16 @@ figures: $(INSTALLED) ## redraw the paper's figures, and more, in docs/images/
 
 bench-kinematics: $(INSTALLED) ## speed of the kinematics against a floor and a general solver
 	$(RUN) benchmarks/bench_kinematics.py
+
+bench-fidelity: $(INSTALLED) ## loop gaps, FK error and tilt against cost; see docs/fidelity.md
+	$(RUN) benchmarks/bench_fidelity.py
+
+bench-speed: $(INSTALLED) ## steps per second beside panda-gym and Gymnasium-Robotics
+	$(RUN) -m pip install -c constraints.txt -e ".[bench]"
+	$(RUN) benchmarks/bench_speed.py
+
+soak: $(INSTALLED) ## a million steps over all ids: memory, loop gaps and speed over time
+	$(RUN) benchmarks/soak.py
 
 clean: ## remove the environment and everything generated
 	rm -rf $(VENV) runs dist build .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,8 +1,10 @@
+"""The vacuum cup takes, holds, lets go, and never presses harder than its spring."""
+
 import numpy as np
 import pytest
 
 from tpm_gym import kinematics
-from tpm_gym.mechanism import CUP_LENGTH
+from tpm_gym.links import CUP_LENGTH, CUP_PRELOAD, CUP_STROKE
 from tpm_gym.simulation import Simulation
 from tpm_gym.state import Puck, Scene
 
@@ -97,11 +99,94 @@ def test_a_held_puck_stays_put_at_full_speed():
     simulation.close()
 
 
-def test_pressing_on_the_puck_does_not_open_the_loops():
+class Recorder:
+    """What the cup does in every time step: force on the puck (N), slide (m), puck's height (m)."""
+
+    def __init__(self, simulation):
+        self._simulation, self._step = simulation, simulation._client.stepSimulation
+        self.rows = []
+        simulation._client.stepSimulation = self.step
+
+    def step(self):
+        self._step()
+        client, puck = self._simulation._client, self._simulation._scenery.puck
+        body, link = self._simulation._robot.tool
+        contacts = client.getContactPoints(bodyA=body, bodyB=puck, linkIndexA=link)
+        force = sum(contact[9] for contact in contacts)
+        slide = client.getJointState(body, link)[0]
+        height = client.getBasePositionAndOrientation(puck)[0][2]
+        self.rows.append((force, slide, height))
+
+
+@pytest.mark.parametrize("speed", [0.005, 0.03])  # m a control period; the second is full speed
+@pytest.mark.parametrize("offset", [(0.0, 0.0), (0.012, 0.012)])
+def test_the_cup_yields_to_the_puck_at_its_preload(speed, offset):
+    simulation = start(offset=offset, height=0.06)
+    record = Recorder(simulation)
+    for height in np.arange(0.06, 0.012, -speed):
+        simulation.move(level(height))
+    go(simulation, 0.012, 10, vacuum=False)  # 18 mm below the top of the puck
+    force, slide, height = np.transpose(record.rows)
+    cup = simulation.mechanism.link("cup")
+    resting = CUP_PRELOAD + cup.mass * 9.81
+    blow = cup.mass * speed / 0.04 / simulation.physics.time_step  # stopped in one time step
+    assert force.max() <= resting + blow + 0.1
+    assert force[-1] == pytest.approx(resting, rel=1e-3)
+    assert slide.min() == slide[-1] == pytest.approx(-0.018, abs=1e-4)
+    # The puck stays on the table: 0.16 mm into it at the blow, then as if nothing pressed.
+    assert (abs(height - 0.015) < 0.2e-3).all()
+    assert height[-1] == pytest.approx(0.015, abs=0.03e-3)
+    assert np.allclose(simulation.read().object_quaternion, (0, 0, 0, 1), atol=1e-3)
+    assert simulation.read().closure_error < 1e-6
+    simulation.close()
+
+
+def test_the_cup_comes_out_again():
     simulation = start(height=0.05)
-    for _ in range(10):
-        state = simulation.move(level(0.015), vacuum=False)  # 15 mm below its top
-    assert state.closure_error < 2e-3
+    record = Recorder(simulation)
+    go(simulation, 0.015, 8, vacuum=False)
+    assert record.rows[-1][1] == pytest.approx(-0.015, abs=1e-4)
+    state = go(simulation, 0.05, 10, vacuum=False)
+    force, slide, height = record.rows[-1]
+    assert force == 0
+    assert slide == pytest.approx(0, abs=1e-6)
+    assert height == pytest.approx(0.015, abs=0.03e-3)
+    assert np.linalg.norm(state.object_position[:2] - (PLACE[0], -PLACE[1])) < 1e-4
+    simulation.close()
+
+
+def test_the_cup_stays_out_in_free_motion_at_full_speed():
+    simulation = start(height=0.2)
+    record = Recorder(simulation)
+    for step in (1, 1, 1, 1, -1, -1, -1, -1, 1, -1, 1, -1, 1, 1, -1):
+        simulation.move(simulation.mount.to_paper(simulation.read().command) + (0, 0, 0.03 * step))
+    assert max(abs(slide) for _, slide, _ in record.rows) < 1e-6
+    simulation.close()
+
+
+def test_beyond_its_stroke_the_cup_stops_and_the_puck_holds():
+    simulation = start(height=0.05)
+    state = go(simulation, 0.006, 12, vacuum=False)  # 24 mm below the top, 4 mm beyond the stroke
+    slide = simulation._client.getJointState(*simulation._robot.tool)[0]
+    assert slide == pytest.approx(-CUP_STROKE, abs=1e-6)
+    assert state.object_position[2] == pytest.approx(0.015, abs=0.1e-3)
+    assert state.closure_error < 1e-5
+    simulation.close()
+
+
+def test_a_held_puck_pressed_on_the_table_stays_held_and_the_cup_yields():
+    simulation = start(height=0.05)
+    go(simulation, 0.03, 4, vacuum=True)
+    assert go(simulation, 0.06, 5, vacuum=True).holding
+    record = Recorder(simulation)
+    for height in np.arange(0.06, 0.012, -0.006):
+        assert simulation.move(level(height), vacuum=True).holding
+    state = go(simulation, 0.012, 5, vacuum=True)
+    assert state.holding
+    assert state.object_position[2] == pytest.approx(0.015, abs=0.1e-3)
+    assert record.rows[-1][1] == pytest.approx(-0.018, abs=1e-3)
+    lifted = [simulation.move(level(height), vacuum=True) for height in (0.02, 0.03, 0.04, 0.05)]
+    assert all(state.holding for state in lifted)
     simulation.close()
 
 

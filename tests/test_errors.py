@@ -13,12 +13,15 @@ import pytest
 from tpm_gym import errors
 from tpm_gym.errors import (
     ActionError,
-    AssemblyModeError,
     ClosureError,
     ConfigurationError,
     EpisodeError,
     GeometryError,
     InputError,
+    MissingPackageError,
+    ModeChangeError,
+    PolicyFileError,
+    PolicyMismatchError,
     ResetOptionError,
     SingularityError,
     TPMError,
@@ -77,10 +80,34 @@ CASES: list[tuple[TPMError, type[Exception], dict[str, object], list[str]]] = [
         ["12.3 mm", "5 mm", "reset()"],
     ),
     (
-        AssemblyModeError(0.0345, 0.01),
+        ModeChangeError("assembly"),
         RuntimeError,
-        {"distance": 0.0345, "limit": 0.01},
-        ["34.5 mm", "10 mm", "reset()"],
+        {"mode": "assembly"},
+        ["parallel singularity", "another assembly mode", "reset()"],
+    ),
+    (
+        ModeChangeError("working"),
+        RuntimeError,
+        {"mode": "working"},
+        ["serial singularity", "another working mode", "reset()"],
+    ),
+    (
+        PolicyFileError("best.json", "holds no JSON", "export it again"),
+        ValueError,
+        {"path": "best.json", "reason": "holds no JSON", "remedy": "export it again"},
+        ["best.json", "holds no JSON", "export it again"],
+    ),
+    (
+        PolicyMismatchError("action space", "Box(3)", "Box(4)", "TPMReach-v0"),
+        ValueError,
+        {"kind": "action space", "trained": "Box(3)", "given": "Box(4)", "env_id": "TPMReach-v0"},
+        ["action space", "Box(3)", "Box(4)", "TPMReach-v0"],
+    ),
+    (
+        MissingPackageError("torch", "policy"),
+        ImportError,
+        {"package": "torch", "extra": "policy"},
+        ["torch", "pip install 'tpm-gym[policy]'"],
     ),
 ]
 LEAVES = [getattr(errors, name) for name in errors.__all__ if name != "TPMError"]
@@ -101,7 +128,7 @@ def test_errors_carry_their_values_and_show_them(
 @pytest.mark.parametrize("leaf", LEAVES)
 def test_every_public_error_is_a_tpm_error_and_a_case_above(leaf: type[TPMError]) -> None:
     assert issubclass(leaf, TPMError)
-    assert issubclass(leaf, (ValueError, RuntimeError))
+    assert issubclass(leaf, (ValueError, RuntimeError, ImportError))
     assert any(type(case[0]) is leaf for case in CASES)
 
 
@@ -132,7 +159,10 @@ def test_all_names_every_error() -> None:
         errors.SingularityError("sin(beta)", 0.0),
         errors.UnreachableError((0.0, 1.0, 2.0), "leg 1", -0.1, "come closer"),
         errors.ClosureError(0.02, 0.005),
+        errors.ModeChangeError("working"),
         errors.EpisodeError("call reset() first"),
+        errors.PolicyFileError("best.json", "holds no JSON", "export it again"),
+        errors.MissingPackageError("torch", "policy"),
     ],
 )
 def test_errors_survive_the_way_between_processes(error: Any, copied: Any) -> None:

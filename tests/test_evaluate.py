@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -19,6 +20,7 @@ import evaluate
 import film
 import provenance
 from errors import ConfigError, PolicyError, UnknownEnvError
+from policies import load_policy
 
 METRICS = (
     "success_at_end",
@@ -208,6 +210,92 @@ def test_contact_sheet_ends_when_nothing_moves_any_more() -> None:
 def test_mistakes_are_named(options: dict[str, Any], error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         evaluate.evaluate(evaluate.Config(**{"policy": ("expert",), **options}), quiet())
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of a run: an untrained policy, as saved and as exported."""
+    from stable_baselines3 import PPO
+
+    import export
+
+    folder = tmp_path_factory.mktemp("runs") / "reach"
+    folder.mkdir()
+    env = gym.make("TPMReach-v0")
+    PPO("MultiInputPolicy", env, seed=0, device="cpu").save(folder / "best.zip")
+    env.close()
+    config = {"algo": "ppo", "env": "TPMReach-v0", "seed": 0, "recipe": {}}
+    (folder / "config.json").write_text(json.dumps(config))
+    export.export_run(folder)
+    return folder
+
+
+def returns(policy: Path | str, **options: Any) -> list[float]:
+    config = evaluate.Config(policy=(str(policy),), episodes=1, **options)
+    return [record.total_reward for record in evaluate.evaluate(config, quiet())[0].records]
+
+
+def test_an_exported_policy_goes_by_any_of_its_names(run: Path) -> None:
+    """Its environment is the one it was trained on; it acts as the archive does."""
+    trusted = returns(run / "best.zip", trust_pickle=True)
+    for name in ("best.json", "best.safetensors", "best", "."):
+        assert returns(run / name) == pytest.approx(trusted, abs=1e-3), name
+
+
+def test_an_archive_is_refused_unless_it_is_trusted(run: Path, tmp_path: Path) -> None:
+    for archive in (run / "best.zip", tmp_path):
+        (tmp_path / "best.zip").write_bytes((run / "best.zip").read_bytes())
+        (tmp_path / "config.json").write_bytes((run / "config.json").read_bytes())
+        with pytest.raises(PolicyError, match="--trust-pickle") as caught:
+            returns(archive)
+        assert "python train/export.py" in str(caught.value)
+    assert returns(tmp_path, trust_pickle=True)
+
+
+def test_without_trust_nothing_is_unpickled(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import torch
+
+    def refuse(*args: Any, **kwargs: Any) -> None:
+        raise AssertionError("unpickled")
+
+    for owner, name in ((pickle, "load"), (pickle, "loads"), (torch, "load")):
+        monkeypatch.setattr(owner, name, refuse)
+    assert returns(run / "best.json")
+    with pytest.raises(PolicyError, match="--trust-pickle"):
+        returns(run / "best.zip")
+
+
+def test_an_exported_policy_of_another_task_is_refused(run: Path) -> None:
+    with pytest.raises(PolicyError, match=r"was trained with observation space .*TPMReach-v0"):
+        returns(run / "best.json", env="TPMPickAndPlace-v0")
+
+
+def test_a_damaged_policy_is_one_line(run: Path, tmp_path: Path) -> None:
+    (tmp_path / "best.json").write_bytes((run / "best.json").read_bytes())
+    (tmp_path / "best.safetensors").write_bytes((run / "best.safetensors").read_bytes()[:-1])
+    words = [sys.executable, str(SCRIPT), "--policy", str(tmp_path / "best")]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    last = done.stderr.splitlines()[-1]  # the engine has introduced itself before
+    assert last.startswith("error: policy ")
+    assert "best.safetensors: is cut off" in last
+    env = gym.make("TPMReach-v0")
+    with pytest.raises(PolicyError, match="does not describe a policy"):
+        load_policy(str(run / "config.json"), env)
+    env.close()
+
+
+def test_an_exported_policy_needs_no_stable_baselines(run: Path) -> None:
+    program = (
+        "import sys\n"
+        "sys.modules['stable_baselines3'] = sys.modules['sb3_contrib'] = None\n"
+        "import evaluate\n"
+        f"evaluate.evaluate(evaluate.Config(policy=({str(run / 'best')!r},), episodes=1))\n"
+    )
+    words = [sys.executable, "-c", program]
+    done = subprocess.run(words, cwd=SCRIPT.parent, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 def test_command_line_errors_are_one_line() -> None:

@@ -22,22 +22,19 @@ from tpm_gym.kinematics import (
     inverse,
     inverse_all,
 )
+from tpm_gym.links import CUP_LENGTH, CUP_PRELOAD, CUP_STROKE, MOTOR_EFFORT, MOTOR_SPEED
 from tpm_gym.mechanism import (
     ACTUATED_JOINTS,
-    CUP_LENGTH,
     DEFAULT_MOUNT,
-    MOTOR_EFFORT,
-    MOTOR_SPEED,
-    Mechanism,
     Mount,
     build,
     joint_angles,
 )
-from tpm_gym.physics import rotations
+from tpm_gym.physics import PULL_OFF_FORCE, rotate
 from tpm_gym.workspace import TASK_REGION
+from walk import place, walk
 
 FloatArray = NDArray[np.float64]
-Frame = tuple[FloatArray, FloatArray]
 GAP = 1e-9
 # Link of the paper's Fig. 1 -> bodies; 3 is rigid with arm 2, 8 with platform 1.
 FIG_1 = {
@@ -55,32 +52,7 @@ FIG_1 = {
     "12": ["arm_12"],
 }
 UNIVERSAL_CROSSES = ["cross_4a", "cross_4b"]
-
-
-def turn(axis: tuple[float, ...], angle: float) -> FloatArray:
-    """Rodrigues' rotation about a unit axis."""
-    x, y, z = axis
-    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.asarray(np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k)
-
-
-def walk(mechanism: Mechanism, angles: dict[str, float]) -> dict[str, Frame]:
-    """Position and rotation of every link, from the joints alone."""
-    frames = {mechanism.links[0].name: (np.zeros(3), np.eye(3))}
-    for link in mechanism.links[1:]:
-        assert link.joint is not None
-        position, rotation = frames[link.joint.parent]
-        assert np.linalg.norm(link.joint.axis) == pytest.approx(1)
-        frames[link.name] = (
-            position + rotation @ link.joint.origin,
-            rotation @ turn(link.joint.axis, angles[link.joint.name]),
-        )
-    return frames
-
-
-def place(frames: dict[str, Frame], link: str, point: tuple[float, ...]) -> FloatArray:
-    position, rotation = frames[link]
-    return np.asarray(position + rotation @ point)
+TOOL = ["cup"]
 
 
 def assert_assembled(theta: FloatArray, branch: AssemblyMode, g: Geometry) -> None:
@@ -142,8 +114,8 @@ def test_joint_angles_name_every_joint_and_refuse_what_cannot_be_assembled() -> 
 
 
 def test_every_link_of_figure_1_is_there_and_nothing_else() -> None:
-    bodies = [name for names in FIG_1.values() for name in names] + UNIVERSAL_CROSSES
-    assert sorted(link.name for link in build().links) == sorted(bodies)
+    bodies = [name for names in FIG_1.values() for name in names]
+    assert sorted(link.name for link in build().links) == sorted(bodies + UNIVERSAL_CROSSES + TOOL)
 
 
 def test_parents_come_before_children_and_closures_join_links_that_exist() -> None:
@@ -179,7 +151,8 @@ def test_the_tree_with_its_closures_has_three_degrees_of_freedom() -> None:
     start, step = np.array(list(rest.values())), 1e-6
     columns = [(gaps(start + step * e) - gaps(start - step * e)) / 2e-6 for e in np.eye(moving)]
     rank = np.linalg.matrix_rank(np.stack(columns, axis=-1), tol=1e-6)
-    assert moving - rank == 3 + 1  # and end link 10, which rolls idly about its own axis
+    # And end link 10, which rolls idly about its own axis, and the cup, which slides.
+    assert moving - rank == 3 + 1 + 1
 
 
 @settings(derandomize=True, max_examples=20, deadline=None)
@@ -195,6 +168,23 @@ def test_moving_links_have_possible_inertias_along_their_axes(g: Geometry) -> No
             assert np.abs(off_diagonal).max() <= 1e-12
 
 
+def test_legs_part_the_links_and_every_closure_joins_two_of_them() -> None:
+    # What makes the direct solver exact: no closure has both ends in one multibody.
+    mechanism = build()
+    legs = mechanism.legs()
+    moving = [[link.name for link in leg.links[1:]] for leg in legs]
+    leg_of = {name: i for i, names in enumerate(moving) for name in names}
+    assert sum(len(names) for names in moving) == len(leg_of) == len(mechanism.links) - 1
+    for names, leg, motor in zip(moving, legs, ACTUATED_JOINTS, strict=True):
+        assert leg.links == (mechanism.links[0], *(mechanism.link(name) for name in names))
+        joints = [link.joint for link in leg.links[1:] if link.joint]
+        assert (joints[0].name, joints[0].parent) == (motor, "base")
+        for i, joint in enumerate(joints[1:], start=1):
+            assert joint.parent in names[:i]  # one tree, parents first
+    for closure in mechanism.closures:
+        assert leg_of[closure.link_a] != leg_of[closure.link_b], closure.name
+
+
 def test_only_the_three_motors_drive_and_they_reach_the_task_region() -> None:
     sides = [np.linspace(*ends, 9) for ends in zip(TASK_REGION.low, TASK_REGION.high, strict=True)]
     theta = inverse(np.stack(np.meshgrid(*sides), axis=-1)).reshape(-1, 3)
@@ -206,7 +196,7 @@ def test_only_the_three_motors_drive_and_they_reach_the_task_region() -> None:
             assert joint.parent == "base"
             assert joint.lower < angles.min() <= angles.max() < joint.upper
             assert (joint.effort, joint.speed) == (MOTOR_EFFORT, MOTOR_SPEED)
-        else:
+        elif joint.name != "cup_slide":
             assert joint.kind == "continuous"
             assert joint.effort == joint.speed == 0
     assert set(ACTUATED_JOINTS) < set(joints)
@@ -214,11 +204,30 @@ def test_only_the_three_motors_drive_and_they_reach_the_task_region() -> None:
 
 def test_the_cup_is_under_point_p_and_alone_collides() -> None:
     mechanism = build()
-    np.testing.assert_allclose(np.subtract(mechanism.cup, mechanism.point_p), [0, 0, CUP_LENGTH])
+    frames = walk(mechanism, joint_angles(inverse([-0.05, 0.03, 0.78])))
+    point_p = place(frames, mechanism.platform, mechanism.point_p)
+    lip = place(frames, mechanism.tool, mechanism.lip)
+    np.testing.assert_allclose(lip - point_p, [0, 0, CUP_LENGTH], atol=1e-9)
     colliding = [(link, s) for link in mechanism.links for s in link.solids if s.collides]
-    assert [link.name for link, _ in colliding] == [mechanism.platform]
+    assert [link.name for link, _ in colliding] == [mechanism.tool]
     cup = colliding[0][1]
-    assert cup.centre[2] + cup.size[1] / 2 == pytest.approx(mechanism.cup[2])
+    assert cup.centre[2] + cup.size[1] / 2 == pytest.approx(mechanism.lip[2])
+
+
+def test_the_cup_slides_back_into_the_platform_along_its_axis() -> None:
+    mechanism = build()
+    joint = mechanism.link(mechanism.tool).joint
+    assert joint is not None
+    assert (joint.kind, joint.parent) == ("prismatic", mechanism.platform)
+    assert joint.lower == -CUP_STROKE
+    assert 0 < joint.upper <= 0.001  # the stop must not fight the spring at rest
+    assert joint.effort == CUP_PRELOAD > PULL_OFF_FORCE  # what the vacuum holds stays up
+    rest = joint_angles(inverse([-0.05, 0.03, 0.78]))
+    out, back = (
+        place(walk(mechanism, rest | {"cup_slide": at}), mechanism.tool, mechanism.lip)
+        for at in (0.0, -CUP_STROKE)
+    )
+    np.testing.assert_allclose(back - out, [0, 0, -CUP_STROKE], atol=1e-9)
 
 
 coordinates = st.tuples(*[st.floats(-3, 3)] * 3)
@@ -227,14 +236,14 @@ coordinates = st.tuples(*[st.floats(-3, 3)] * 3)
 @settings(derandomize=True, max_examples=100)
 @given(st.floats(0.1, 2), coordinates, coordinates)
 def test_mounts_are_rigid_and_round_trip(
-    height: float, p: tuple[float, ...], q: tuple[float, ...]
+    height: float, p: tuple[float, float, float], q: tuple[float, float, float]
 ) -> None:
     mount = Mount(height)
     np.testing.assert_allclose(mount.to_paper(mount.to_world(p)), p, atol=1e-14)
     np.testing.assert_allclose(mount.to_world(mount.to_paper(p)), p, atol=1e-14)
     matrix = mount.rotate(np.eye(3)).T
     assert np.linalg.det(matrix) == pytest.approx(1)
-    np.testing.assert_array_equal(matrix, rotations(np.array([mount.quaternion]))[0])
+    np.testing.assert_allclose(mount.rotate(p), rotate(mount.quaternion, p), atol=1e-15)
     np.testing.assert_allclose(mount.to_world(p), matrix @ p + [0, 0, height], atol=1e-14)
     moved = np.subtract(mount.to_world(p), mount.to_world(q))
     np.testing.assert_allclose(moved, mount.rotate(np.subtract(p, q)), atol=1e-14)

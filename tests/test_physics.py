@@ -1,4 +1,4 @@
-"""Numerical settings, the path between commands, and rotations."""
+"""Numerical settings, the path between commands, rotations and rigid motions."""
 
 from __future__ import annotations
 
@@ -12,14 +12,16 @@ from hypothesis import strategies as st
 
 from tpm_gym import physics
 from tpm_gym.errors import ConfigurationError
-from tpm_gym.mechanism import CUP_RADIUS
-from tpm_gym.physics import Physics, rotations, spline_weights
+from tpm_gym.links import CUP_PRELOAD, CUP_RADIUS
+from tpm_gym.parts import Vector
+from tpm_gym.physics import Physics, Quaternion, rotate, spline_weights, transform
 
 NAN = float("nan")
 
 
-def test_defaults_are_500_hz_physics_under_25_hz_control() -> None:
-    assert Physics().substeps == 20
+def test_defaults_are_250_hz_physics_under_25_hz_control() -> None:
+    assert Physics().substeps == 10
+    assert Physics().solver == "direct"
     assert Physics().time_step * Physics().substeps == pytest.approx(Physics().control_period)
     with pytest.raises(FrozenInstanceError):
         Physics().erp = 0.5  # type: ignore[misc]
@@ -37,6 +39,7 @@ def test_substeps_fill_the_control_period(time_step: float, period: float, subst
     [("time_step", value) for value in (0.0, -0.002, 0.05, 0.003, NAN, float("inf"))]
     + [("time_step", "x"), ("control_period", float("inf")), ("control_period", None)]
     + [("iterations", value) for value in (0, -1, 1.5, NAN, True, "50")]
+    + [("solver", value) for value in ("dantzig", "Direct", "", None, 1)]
     + [("erp", value) for value in (0.0, -0.1, 1.01, NAN, True, [0.8])],
 )
 def test_settings_that_cannot_work_are_refused_by_name(name: str, value: Any) -> None:
@@ -54,10 +57,12 @@ def test_control_periods_that_time_steps_do_not_fill_are_refused(period: float) 
 
 def test_the_ends_of_the_ranges_are_allowed() -> None:
     assert Physics(iterations=1, erp=1.0).erp == 1.0
+    assert [Physics(solver=name).solver for name in physics.SOLVERS] == ["direct", "iterative"]
 
 
 def test_pull_off_force_is_60_kpa_on_the_lip() -> None:
     assert pytest.approx(60e3 * np.pi * CUP_RADIUS**2, rel=0.02) == physics.PULL_OFF_FORCE
+    assert physics.PULL_OFF_FORCE < CUP_PRELOAD  # or a heavy puck would pull the cup out
 
 
 def path(commands: np.ndarray, substeps: int) -> np.ndarray:
@@ -95,31 +100,45 @@ def test_spline_has_no_jump_in_velocity_and_bounded_acceleration() -> None:
         assert np.abs(np.diff(velocity)).max() <= largest / substeps * (1 + 1e-6)
 
 
+vectors = st.tuples(*[st.floats(-2, 2)] * 3)
 quaternions = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q) > 0.1)
 
 
-def unit(q: tuple[float, ...]) -> np.ndarray:
-    return np.array(q) / np.linalg.norm(q)
+def unit(q: Quaternion) -> Quaternion:
+    x, y, z, w = (np.array(q) / np.linalg.norm(q)).tolist()
+    return x, y, z, w
 
 
-def turned(q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Vector v turned by quaternion q = (x, y, z, w)."""
-    return v + 2 * np.cross(q[:3], np.cross(q[:3], v) + q[3] * v)
+def matrix(quaternion: Quaternion) -> np.ndarray:
+    """Rotation by the angle 2 atan2(|q|, w) about q (Rodrigues)."""
+    *vector, w = quaternion
+    length = np.linalg.norm(vector)
+    if length == 0.0:
+        return np.eye(3)
+    cross = np.cross(np.eye(3), np.array(vector) / length)  # row i is e_i x axis = -axis x e_i
+    angle = 2 * np.arctan2(length, w)
+    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross)
 
 
 @settings(derandomize=True, max_examples=100)
-@given(quaternions, st.tuples(*[st.floats(-2, 2)] * 3))
-def test_rotations_turn_vectors_as_quaternions_do(
-    q: tuple[float, ...], v: tuple[float, ...]
+@given(quaternions, vectors, vectors)
+def test_rotate_and_transform_are_rigid_motions_by_the_quaternion(
+    q: Quaternion, v: Vector, origin: Vector
 ) -> None:
-    matrix = rotations(unit(q)[None])[0]
-    np.testing.assert_allclose(matrix @ v, turned(unit(q), np.array(v)), atol=1e-12)
-    np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(matrix) == pytest.approx(1)
+    turned = rotate(unit(q), v)
+    np.testing.assert_allclose(turned, matrix(unit(q)) @ v, atol=1e-12)
+    assert all(type(value) is float for value in turned)
+    np.testing.assert_allclose(transform(origin, unit(q), v), np.add(origin, turned), atol=1e-15)
+    x, y, z, w = unit(q)
+    np.testing.assert_allclose(rotate((-x, -y, -z, w), turned), v, atol=1e-12)
 
 
-def test_rotations_of_known_quaternions() -> None:
+def test_rotate_by_known_quaternions() -> None:
     half = np.sqrt(0.5)
-    found = rotations(np.array([[0, 0, 0, 1], [1, 0, 0, 0], [0, 0, half, half]]))
-    expected = [np.eye(3), np.diag([1, -1, -1]), [[0, -1, 0], [1, 0, 0], [0, 0, 1]]]
-    np.testing.assert_allclose(found, expected, atol=1e-15)
+    known = {
+        (0.0, 0.0, 0.0, 1.0): (1.0, 2.0, 3.0),
+        (1.0, 0.0, 0.0, 0.0): (1.0, -2.0, -3.0),
+        (0.0, 0.0, half, half): (-2.0, 1.0, 3.0),
+    }
+    for quaternion, expected in known.items():
+        np.testing.assert_allclose(rotate(quaternion, (1.0, 2.0, 3.0)), expected, atol=1e-15)

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from tpm_gym.expert import Expert
+from tpm_gym.physics import GRAVITY
 
 IDS = ("TPMPickAndPlace-v0", "TPMPickAndPlaceJoints-v0")
 
@@ -48,17 +49,27 @@ HOSTILE = (
 def survives(env_id, policy, seeds):
     env = gym.make(env_id)
     expert = Expert(env)
+    simulation = env.unwrapped.simulation
+    time_step, period = simulation.physics.time_step, simulation.physics.control_period
     for seed in seeds:
         rng = np.random.default_rng(seed)
         observation, _ = env.reset(seed=seed)
         expert.reset(observation)
+        fall = pressed = 0.0
         for step in range(50):
             action = policy(rng, step, expert.act(observation))
             observation, _, _, _, info = env.step(action.astype(np.float32))
-            assert info["closure_error"] < 0.5e-3
-            # Neither pressed through the table nor thrown about.
-            height = env.unwrapped.state.object_position[2]
-            assert 0.013 < height < 0.4
+            assert info["closure_error"] < 0.1e-3
+            state = env.unwrapped.state
+            assert state.mode_change is None
+            # Neither thrown about nor pressed through the table. A landing is noticed one time
+            # step late, so it goes as deep as the puck falls in one; but nothing may keep it there.
+            assert state.object_position[2] < 0.4
+            depth = simulation.scene.puck.height / 2 - state.object_position[2]
+            assert depth < 1e-3 + time_step * (fall + GRAVITY * period)
+            fall = max(fall, -state.object_velocity[2])
+            pressed = pressed + period if depth > 1e-3 else 0.0
+            assert pressed < 0.15
     env.close()
 
 
@@ -70,7 +81,5 @@ def test_hostile_policies_do_not_lose_the_mechanism(policy):
 @pytest.mark.slow
 @pytest.mark.parametrize("env_id", IDS)
 @pytest.mark.parametrize("policy", HOSTILE)
-def test_hostile_policies_do_not_lose_the_mechanism_in_many_episodes(env_id, policy, request):
-    if policy is bang_bang_mostly_down and env_id == IDS[0]:
-        request.applymarker(pytest.mark.xfail(reason="a tilted puck is pressed into the table"))
+def test_hostile_policies_do_not_lose_the_mechanism_in_many_episodes(env_id, policy):
     survives(env_id, policy, range(100))

@@ -1,15 +1,20 @@
+"""The mechanism in the engine stays a mechanism, and the engine's quirks stay inside."""
+
 import numpy as np
 import pytest
 
+import tpm_gym.simulation
 from tpm_gym import jacobian, kinematics
 from tpm_gym.errors import (
-    AssemblyModeError,
     ClosureError,
     ConfigurationError,
     InputError,
+    ModeChangeError,
     UnreachableError,
 )
+from tpm_gym.mechanism import Mechanism, build
 from tpm_gym.physics import Physics
+from tpm_gym.randomisation import Plant
 from tpm_gym.simulation import Simulation
 from tpm_gym.state import Puck, Scene
 from tpm_gym.workspace import TASK_REGION
@@ -55,14 +60,17 @@ def test_a_reset_closes_all_loops_at_the_forward_kinematics(simulation):
         assert np.array_equal(state.theta_dot, np.zeros(3))
 
 
-def test_loops_stay_closed_and_the_platform_stays_at_the_forward_kinematics(simulation):
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_loops_stay_closed_and_the_platform_stays_at_the_forward_kinematics(simulation, seed):
+    # Largest of 16 000 such steps (seeds 0 to 39): 0.045 mm, 0.12 mm (0.085 mm where the
+    # conditioning is above 0.08), 1e-6 degrees.
     simulation.reset(kinematics.inverse(HOME))
-    for command in random_commands(1, 400):
+    for command in random_commands(seed, 400):
         state = simulation.move(command)
-        assert state.closure_error < 0.3e-3
-        assert np.rad2deg(state.platform_tilt) < 0.1
+        assert state.closure_error < 0.05e-3
+        assert np.rad2deg(state.platform_tilt) < 1e-5
         apart = np.linalg.norm(state.platform_position - state.fk_position)
-        assert apart < (1e-3 if state.conditioning > 0.08 else 3e-3)
+        assert apart < (0.1e-3 if state.conditioning > 0.08 else 0.15e-3)
 
 
 def test_the_platform_comes_to_rest_at_the_command(simulation):
@@ -89,18 +97,17 @@ def test_encoder_rates_and_platform_velocity_obey_the_jacobian(simulation):
         before = state
 
 
-def test_an_encoder_error_moves_the_forward_kinematics_and_not_the_platform():
+def test_an_encoder_error_moves_the_platform_and_not_the_forward_kinematics(simulation):
+    # The motors go where the encoders say, so the arms are off by as much.
     bias = np.array([1e-3, -5e-4, 8e-4])
-    states = []
-    for encoder_bias in (np.zeros(3), bias):
-        simulation = Simulation(Scene(), encoder_bias=encoder_bias)
-        states.append(simulation.reset(kinematics.inverse(HOME)))
-        simulation.close()
-    honest, biased = states
-    assert np.array_equal(honest.platform_position, biased.platform_position)
-    expected = honest.fk_position + (1, -1, -1) * (jacobian.velocity(honest.theta) @ bias)
-    assert np.allclose(biased.fk_position, expected, atol=1e-4)
-    assert np.linalg.norm(biased.fk_position - honest.fk_position) > 5e-4
+    honest = simulation.reset(kinematics.inverse(HOME))
+    biased = simulation.reset(kinematics.inverse(HOME), plant=Plant(encoder_bias=tuple(bias)))
+    off = simulation.mount.rotate(-jacobian.velocity(honest.theta) @ bias)
+    assert np.linalg.norm(off) > 5e-4
+    for state in (biased, *follow(simulation, [HOME] * 3)):
+        assert np.allclose(state.theta, honest.theta, atol=1e-8)
+        assert np.allclose(state.fk_position, honest.fk_position, atol=1e-8)
+        assert np.allclose(state.platform_position, honest.platform_position + off, atol=1e-4)
 
 
 def test_a_loop_that_opens_is_reported():
@@ -117,12 +124,29 @@ def test_a_loop_that_opens_is_reported():
 def test_going_through_the_singularity_is_reported_and_a_reset_recovers(simulation):
     simulation.reset(kinematics.inverse(HOME))
     across = [(HOME[0], y, HOME[2]) for y in np.arange(0.028, -0.03, -0.002)]
-    with pytest.raises(AssemblyModeError) as caught:
+    with pytest.raises(ModeChangeError) as caught:
         follow(simulation, across)
-    assert caught.value.distance > caught.value.limit
+    assert caught.value.mode == "assembly"
+    assert simulation.read().mode_change == "assembly"
     state = simulation.reset(kinematics.inverse(HOME))
+    assert state.mode_change is None
     assert state.closure_error < 1e-6
-    assert simulation.move(HOME).closure_error < 1e-4
+    assert simulation.move(HOME).closure_error < 1e-6
+
+
+def test_another_working_mode_is_reported(simulation):
+    folded = next(
+        mode
+        for mode in kinematics.WORKING_MODES
+        if (mode.leg1, mode.leg2, mode.leg3)
+        == (kinematics.ELBOWS_OUT.leg1, kinematics.ELBOWS_OUT.leg2, kinematics.ELBOWS_OUT.leg3)
+        and mode.cos_beta != kinematics.ELBOWS_OUT.cos_beta
+    )
+    state = simulation.reset(kinematics.inverse(HOME, folded))
+    assert np.allclose(state.platform_position, simulation.mount.to_world(HOME), atol=1e-6)
+    assert state.mode_change == "working"
+    with pytest.raises(ModeChangeError):
+        simulation.move(HOME)
 
 
 def test_an_unreachable_command_raises_and_moves_nothing(simulation):
@@ -175,12 +199,12 @@ def test_clients_do_not_see_each_other(simulation):
         other.move(command)
     assert np.array_equal(simulation.read().theta, before.theta)
     other.close()
-    assert simulation.move(HOME).closure_error < 1e-4
+    assert simulation.move(HOME).closure_error < 1e-6
 
 
 def test_closing_twice_is_harmless_and_clients_are_given_back():
     numbers = set()
-    for _ in range(60):
+    for _ in range(20):
         simulation = Simulation(Scene())
         numbers.add(simulation._client._number)
         simulation.close()
@@ -227,12 +251,51 @@ def test_physics_that_cannot_work_are_refused(settings):
     assert caught.value.name == next(iter(settings))
 
 
-def test_more_solver_iterations_close_the_loops_better():
-    gaps = []
-    for iterations in (25, 50, 200):
-        simulation = Simulation(Scene(), physics=Physics(iterations=iterations))
-        simulation.reset(kinematics.inverse(HOME))
-        gaps.append(np.mean([simulation.move(c).closure_error for c in random_commands(5, 60)]))
-        simulation.close()
-    assert gaps[0] > 1.5 * gaps[1]
-    assert gaps[1] > 3 * gaps[2]
+def errors(physics):
+    """Mean loop gap, and distance of the platform from its forward kinematics, at full speed."""
+    simulation = Simulation(Scene(), physics=physics)
+    simulation.reset(kinematics.inverse(HOME))
+    states = follow(simulation, random_commands(5, 60))
+    simulation.close()
+    apart = [np.linalg.norm(state.platform_position - state.fk_position) for state in states]
+    return np.mean([state.closure_error for state in states]), np.mean(apart)
+
+
+def test_the_direct_solver_closes_the_loops_better_than_iterations_do():
+    direct, iterative = errors(Physics()), errors(Physics(solver="iterative", iterations=50))
+    assert iterative[0] > 5 * direct[0]
+    assert iterative[1] > 10 * direct[1]
+
+
+def test_more_iterations_come_to_what_the_direct_solver_finds():
+    gaps = [errors(Physics(solver="iterative", iterations=n))[0] for n in (50, 100, 400)]
+    assert gaps[0] > 1.5 * gaps[1] > 3 * gaps[2]
+    direct = errors(Physics())
+    assert gaps[2] == pytest.approx(direct[0], rel=0.15)
+    # It does not iterate, nor fall back on the solver that does.
+    assert errors(Physics(iterations=1)) == direct
+
+
+def test_the_gap_falls_with_the_square_of_the_time_step():
+    gaps = [errors(Physics(time_step=step))[0] for step in (1 / 250, 1 / 500, 1 / 1000)]
+    assert np.allclose(np.divide(gaps[:-1], gaps[1:]), 4, rtol=0.2)
+
+
+class OneBody(Mechanism):
+    """The same links and closures as one spanning tree, as one would load them at first."""
+
+    def legs(self):
+        return (self,)
+
+
+def test_as_one_multibody_the_direct_solver_would_lose_the_loops(monkeypatch):
+    # Why Mechanism.legs exists. The iterative solver does not mind; if one day the direct one no
+    # longer minds either, the legs have lost their reason.
+    def one_body(geometry):
+        of = build(geometry)
+        return OneBody(of.geometry, of.links, of.closures, of.platform, of.point_p, of.tool, of.lip)
+
+    monkeypatch.setattr(tpm_gym.simulation, "build", one_body)
+    assert errors(Physics(solver="iterative"))[0] < 1e-3
+    with pytest.raises((ClosureError, ModeChangeError)):
+        errors(Physics(solver="direct"))

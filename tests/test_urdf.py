@@ -85,7 +85,7 @@ def test_joints_are_those_of_the_tree(mechanism: Mechanism) -> None:
         assert numbers(child(element, "origin").get("rpy")) == [0, 0, 0]
         assert numbers(child(element, "axis").get("xyz")) == list(joint.axis)
         limit = element.find("limit")
-        assert (limit is not None) == (joint.kind == "revolute")
+        assert (limit is not None) == (joint.kind in ("revolute", "prismatic"))
         if limit is not None:
             names = {"lower": "lower", "upper": "upper", "effort": "effort", "velocity": "speed"}
             for attribute, field in names.items():

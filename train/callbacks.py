@@ -1,9 +1,11 @@
-"""What happens besides learning while a policy trains: evaluation, progress, stopping."""
+"""What happens besides learning while a policy trains: evaluation, checkpoints, stopping."""
 
 from __future__ import annotations
 
+import io
 import json
 import signal
+import sys
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -23,19 +25,27 @@ from rich.progress import (
 )
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
+from checkpoint import CheckpointStore, Content
 from curves import draw_learning_curve
+from errors import CheckpointWriteError
 from policies import BEST_FILE, TrainedPolicy
 from provenance import write_whole
 from rollout import SELECTION_SEED, Estimate, GoalEnv, run_episodes, summarise
+from snapshot import EVALUATIONS_FILE, capture
 
-EVALUATIONS_FILE: Final = "evaluations.jsonl"
 CURVE_FILE: Final = "learning_curve.png"
+
+_SHORTEST_INTERVAL: Final = 30.0  # s between checkpoints
+_LARGEST_SHARE: Final = 0.02  # of the time may go into checkpoints
 
 
 def save_model(model: BaseAlgorithm, path: Path) -> None:
     """Save an algorithm so that an interruption cannot leave half a file."""
-    write_whole(path, model.save)
+    file = io.BytesIO()  # PyTorch, writing to a disk that is full, would hide the reason
+    model.save(file)
+    write_whole(path, lambda part: part.write_bytes(file.getvalue()))
 
 
 class PeriodicEvaluation(BaseCallback):
@@ -67,12 +77,22 @@ class PeriodicEvaluation(BaseCallback):
         self._evaluations: list[dict[str, Any]] = []
         self._best: tuple[float, float] | None = None
         self._total_steps = 0
-        self._started = 0.0
+
+    def state(self) -> dict[str, Any]:
+        """Return what a checkpoint has to keep, as plain data."""
+        return {"evaluations": self._evaluations, "best": self._best}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on after the evaluations that :meth:`state` returned."""
+        self._evaluations = list(state["evaluations"])
+        self._best = tuple(state["best"])
 
     def _on_training_start(self) -> None:
-        self._started = time.perf_counter()
         self._total_steps = self.locals["total_timesteps"]
-        self._evaluate()
+        if self._evaluations:  # resumed: the curve loses what is done again
+            draw_learning_curve(self._run / CURVE_FILE, self._title, self._evaluations)
+        else:
+            self._evaluate()
 
     def _on_step(self) -> bool:
         due = self.num_timesteps - self._evaluations[-1]["steps"] >= self._every
@@ -82,9 +102,7 @@ class PeriodicEvaluation(BaseCallback):
         return True
 
     def _on_training_end(self) -> None:
-        # Also reached after an early stop, and whoever stopped does not want to wait.
-        if self.num_timesteps >= self._total_steps:
-            self._evaluate()
+        self._evaluate()
 
     def _evaluate(self) -> None:
         """Evaluate, record, keep the policy where it is the best so far, and draw."""
@@ -106,7 +124,7 @@ class PeriodicEvaluation(BaseCallback):
             "steps": self.num_timesteps,
             "episodes": self._episodes,
             "first_seed": SELECTION_SEED,
-            "wall_seconds": round(time.perf_counter() - self._started, 3),
+            "wall_seconds": round(seconds_trained(self.model), 3),
         }
         line.update({name: estimate.as_dict() for name, estimate in metrics.items()})
         self._evaluations.append(line)
@@ -151,7 +169,9 @@ class ProgressBar(BaseCallback):
 
     def _on_training_start(self) -> None:
         self._progress.start()
-        self._task = self._progress.add_task("training", total=self.locals["total_timesteps"])
+        self._task = self._progress.add_task(
+            "training", total=self.locals["total_timesteps"], completed=self.num_timesteps
+        )
 
     def _on_step(self) -> bool:
         if self._task is not None:
@@ -163,33 +183,136 @@ class ProgressBar(BaseCallback):
         self._progress.stop()
 
 
-class StopOnSignal(BaseCallback):
-    """Ends training between two steps once the process is asked to stop.
+class SignalListener:
+    """Remembers that the process was asked to stop; a second signal ends it at once.
 
-    An exception in the middle of an update could leave a half-updated network to save. A second
-    signal interrupts at once.
+    An exception in the middle of an update could leave a half-updated network to save.
+
+    Attributes:
+        received: The signal, None before.
     """
 
     def __init__(self) -> None:
-        """Start out not stopped."""
-        super().__init__()
-        self.stopped = False
-
-    def _on_step(self) -> bool:
-        return not self.stopped
+        """Start out with no signal."""
+        self.received: signal.Signals | None = None
 
     @contextmanager
     def listening(self) -> Iterator[None]:
         """Take over SIGINT (Ctrl-C) and SIGTERM inside the context."""
         signals = (signal.SIGINT, signal.SIGTERM)
-        before = {number: signal.signal(number, self._stop) for number in signals}
+        before = {number: signal.signal(number, self._receive) for number in signals}
         try:
             yield
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
 
-    def _stop(self, number: int, frame: FrameType | None) -> None:
-        if self.stopped:
-            raise KeyboardInterrupt
-        self.stopped = True
+    def _receive(self, number: int, frame: FrameType | None) -> None:
+        if self.received is not None:
+            sys.exit(128 + number)
+        self.received = signal.Signals(number)
+
+
+class StopTrainingError(Exception):
+    """Leaves ``learn`` where the last checkpoint was taken; never seen by a user."""
+
+
+class Checkpointing(BaseCallback):
+    """Saves checkpoints between rollouts, and one when the process is asked to stop.
+
+    A checkpoint that cannot be written is reported and tried again when the next one is due;
+    training goes on meanwhile, and the checkpoints before stay.
+
+    A rollout of an on-policy algorithm is long, so a stop does not wait for its end: the state at
+    its beginning is kept in memory, saved, and the rollout is done again after resuming.
+
+    Args:
+        store: Where they are saved.
+        evaluation: Whose state is part of a checkpoint.
+        listener: Says when to stop.
+        every: Environment steps between checkpoints; None: half a minute, or longer where more
+            than a fiftieth of the time would go into checkpoints.
+        run: The run folder.
+        console: Where failures are reported.
+        seconds: Seconds that earlier processes have trained.
+    """
+
+    def __init__(
+        self,
+        store: CheckpointStore,
+        evaluation: PeriodicEvaluation,
+        listener: SignalListener,
+        every: int | None,
+        run: Path,
+        console: Console,
+        seconds: float,
+    ) -> None:
+        """Remember what to save, when and where."""
+        super().__init__()
+        self._store = store
+        self._evaluation = evaluation
+        self._listener = listener
+        self._every = every
+        self._run = run
+        self._console = console
+        self._seconds = seconds
+        self._held: Content | None = None
+        self._last_step: int | None = store.newest
+        self._next_time = time.perf_counter() + _SHORTEST_INTERVAL
+
+    def _on_training_start(self) -> None:
+        # Times and speeds in the logs count from the beginning of the run.
+        self.model.start_time = int(time.time_ns() - self._seconds * 1e9)
+        self.model._num_timesteps_at_start = 0
+
+    def _on_rollout_start(self) -> None:
+        started = time.perf_counter()
+        stop = self._listener.received is not None
+        on_policy = isinstance(self.model, OnPolicyAlgorithm)
+        due = self._is_due()
+        if on_policy or due or stop:
+            content = self._capture()
+            self._held = content if on_policy else None
+            if due or stop:
+                self._save(content, started)
+        if stop:
+            raise StopTrainingError
+
+    def _on_step(self) -> bool:
+        if self._listener.received is not None and self._held is not None:
+            self._save(self._held, time.perf_counter())
+            raise StopTrainingError
+        return True
+
+    def save_finished(self) -> None:
+        """Save the end of the training, after which there is nothing to resume."""
+        self._save(self._capture(finished=True), time.perf_counter())
+
+    def _is_due(self) -> bool:
+        if self._last_step is None:
+            return True  # so that there is always one
+        if self._every is not None:
+            return self.model.num_timesteps - self._last_step >= self._every
+        return time.perf_counter() >= self._next_time
+
+    def _capture(self, finished: bool = False) -> Content:
+        extra = {
+            "seconds": seconds_trained(self.model),
+            "evaluation": self._evaluation.state(),
+        }
+        return capture(self.model, self._run, extra, finished)
+
+    def _save(self, content: Content, started: float) -> None:
+        """Save what was captured from the time ``started`` on, or report why not."""
+        try:
+            self._store.save(content)
+        except CheckpointWriteError as error:
+            self._console.print(f"warning: {error}", markup=False, soft_wrap=True)
+        now = time.perf_counter()
+        self._next_time = now + max(_SHORTEST_INTERVAL, (now - started) / _LARGEST_SHARE)
+        self._last_step = content.step
+
+
+def seconds_trained(model: BaseAlgorithm) -> float:
+    """Return how long the run has been training, in this process and those before it."""
+    return (time.time_ns() - model.start_time) / 1e9

@@ -2,8 +2,9 @@
 
     python train/evaluate.py --policy runs/TPMReach-v0-sac-s0 expert random --episodes 100
 
-A policy is ``expert``, ``random``, a .zip file saved by train.py, or the folder of a run (its best
-policy). A saved policy is a pickle: only load files you trust.
+A policy is ``expert``, ``random``, an exported policy (``NAME.json`` with ``NAME.safetensors``
+beside it), or the folder of a run (its best policy). A .zip file of Stable-Baselines3 holds
+pickles, which can run any code: it is refused unless ``--trust-pickle`` is given.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ class Config:
     """Evaluate policies over seeded episodes."""
 
     policy: Annotated[tuple[str, ...], tyro.conf.arg(metavar="POLICY ...")]
-    """Policies: expert, random, a .zip file saved by train.py, or the folder of a run."""
+    """Policies: expert, random, an exported policy (.json), or the folder of a run."""
 
     env: str | None = None
     """Environment id. Default: the one the policy was trained on."""
@@ -65,6 +66,9 @@ class Config:
 
     picture: Path | None = None
     """Write a PNG of six moments of the first episode here; several policies get a file each."""
+
+    trust_pickle: bool = False
+    """Load .zip files as well, which can run any code that is in them."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +119,7 @@ def evaluate(config: Config, console: Console | None = None) -> list[Result]:
     env = _make_env(env_id)
     try:
         # All are loaded before the first one runs: a mistyped name shows at once.
-        policies = [(spec, load_policy(spec, env)) for spec in config.policy]
+        policies = list(zip(config.policy, _load(config, env), strict=True))
         results = [_evaluate_one(env, *policy, config, console) for policy in policies]
     finally:
         env.close()
@@ -167,6 +171,12 @@ def _resolve_env(config: Config) -> str:
 def _make_env(env_id: str, render_mode: str | None = None) -> GoalEnv:
     """Make an environment; tpm_gym has been imported and has registered its ids."""
     return gym.make(env_id, render_mode=render_mode)
+
+
+def _load(config: Config, env: GoalEnv) -> list[Policy]:
+    """Load the policies of a configuration."""
+    trust = config.trust_pickle
+    return [load_policy(spec, env, trust_pickle=trust) for spec in config.policy]
 
 
 def _evaluate_one(
@@ -258,7 +268,7 @@ def _film(env_id: str, config: Config, console: Console) -> None:
     """Run the first episodes once more, with rendering, which would have slowed the metrics."""
     env = _make_env(env_id, render_mode="rgb_array")
     try:
-        policies = [load_policy(spec, env) for spec in config.policy]
+        policies = _load(config, env)
         if config.video is not None:
             episodes = min(config.video_episodes, config.episodes)
             paths = paths_per_policy(config.video, config.policy)

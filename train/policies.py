@@ -1,4 +1,9 @@
-"""Policies by name: the scripted expert, uniform random actions, or a file that train.py saved."""
+"""Policies by name: the scripted expert, uniform random actions, or a trained policy on file.
+
+A trained policy comes in two forms. Exported, as ``NAME.json`` and ``NAME.safetensors``, it is
+plain data and loads safely. As an archive of Stable-Baselines3, ``NAME.zip``, it holds pickles,
+which can run any code when they are loaded: that takes ``trust_pickle``.
+"""
 
 from __future__ import annotations
 
@@ -19,6 +24,7 @@ if TYPE_CHECKING:
 CONFIG_FILE: Final = "config.json"
 BEST_FILE: Final = "best.zip"
 LAST_FILE: Final = "last.zip"
+EXPORTED: Final = (".json", ".safetensors")
 ALGORITHMS: Final = ("sac", "tqc", "ppo")
 SCRIPTED: Final = ("expert", "random")
 
@@ -97,18 +103,18 @@ class ExpertPolicy:
         return self.expert.act(observation)
 
 
-def load_policy(spec: str, env: GoalEnv) -> Policy:
+def load_policy(spec: str, env: GoalEnv, *, trust_pickle: bool = False) -> Policy:
     """Return the policy that ``spec`` names.
 
-    Only load files you trust: a saved policy is a pickle, and loading it can run code.
-
     Args:
-        spec: ``expert``, ``random``, a .zip file saved by train.py, or the folder of a run (its
-            best policy).
+        spec: ``expert``, ``random``, an exported policy (either of its files, or their common
+            name), a .zip file saved by train.py, or the folder of a run (its best policy).
         env: The environment the policy will act in.
+        trust_pickle: Whether a .zip file may be loaded, which can run any code that is in it.
 
     Raises:
-        PolicyError: There is no such policy, or it does not fit ``env``.
+        PolicyError: There is no such policy, its files are damaged, it does not fit ``env``, or it
+            is a .zip file and ``trust_pickle`` is not set.
     """
     if spec == "random":
         if not isinstance(env.action_space, gym.spaces.Box):
@@ -119,7 +125,10 @@ def load_policy(spec: str, env: GoalEnv) -> Policy:
 
         return ExpertPolicy(Expert(env))
     path = _policy_file(spec)
-    model = _load_model(spec, path)
+    if path.suffix in EXPORTED:
+        return TrainedPolicy(_load_exported(spec, path, env))
+    require_trust(spec, path, trust_pickle)
+    model = load_model(spec, path)
     _check_spaces(spec, model, env)
     return TrainedPolicy(model)
 
@@ -127,53 +136,116 @@ def load_policy(spec: str, env: GoalEnv) -> Policy:
 def trained_env(spec: str) -> str | None:
     """Return the id of the environment a policy was trained on, None for a scripted one.
 
+    Nothing is unpickled.
+
     Raises:
         PolicyError: There is no such policy, or its run folder does not say.
     """
     if spec in SCRIPTED:
         return None
-    return _from_config(spec, _policy_file(spec), "env")
+    path = _policy_file(spec)
+    if path.suffix not in EXPORTED:
+        return str(run_config(spec, path)["env"])
+    from tpm_gym import TPMError
+    from tpm_gym.policy_file import read_description
+
+    try:
+        return read_description(path).env_id
+    except TPMError as error:
+        raise PolicyError(spec, str(error)) from error
+
+
+def require_trust(spec: str, path: Path, trusted: bool) -> None:
+    """Refuse a .zip file that nobody has vouched for.
+
+    Raises:
+        PolicyError: It is not trusted.
+    """
+    if not trusted:
+        raise PolicyError(
+            spec,
+            f"{path} holds pickles, and loading it can run any code; if you trust where it comes "
+            "from, give --trust-pickle, or convert it once and share that instead: "
+            f"python train/export.py {path} {path.with_suffix('')} --trust-pickle",
+        )
 
 
 def _policy_file(spec: str) -> Path:
-    """Return the .zip file that ``spec`` names."""
+    """Return the file that ``spec`` names: one of an exported policy, or a .zip."""
     path = Path(spec)
-    candidates = [path / BEST_FILE, path / LAST_FILE] if path.is_dir() else [path]
+    if path.is_dir():
+        archives = [path / BEST_FILE, path / LAST_FILE]
+        candidates = [*(file.with_suffix(".json") for file in archives), *archives]
+    elif path.suffix in (".zip", *EXPORTED):
+        candidates = [path]
+    else:
+        candidates = [path.with_name(path.name + suffix) for suffix in EXPORTED]
     for candidate in candidates:
         if candidate.is_file():
             return candidate
     looked_for = " or ".join(str(candidate) for candidate in candidates)
     raise PolicyError(
         spec,
-        f"no file {looked_for}; expected {', '.join(SCRIPTED)}, a .zip saved by train.py, or the "
-        "folder of a run",
+        f"no file {looked_for}; expected {', '.join(SCRIPTED)}, an exported policy (.json), a .zip "
+        "saved by train.py, or the folder of a run",
     )
 
 
-def _from_config(spec: str, path: Path, key: str) -> str:
-    """Return an entry of the run's configuration, from beside or above the policy file."""
+def run_config(spec: str, path: Path) -> dict[str, Any]:
+    """Return the run's configuration, from beside or above a .zip file.
+
+    Raises:
+        PolicyError: There is none, or it lacks what train.py writes.
+    """
     folders = path.resolve().parents[:2]  # the run folder, or checkpoints/ inside it
     for folder in folders:
         file = folder / CONFIG_FILE
-        if file.is_file():
-            try:
-                return str(json.loads(file.read_text(encoding="utf-8"))[key])
-            except (ValueError, KeyError, TypeError) as error:
-                raise PolicyError(spec, f"{file} is damaged: no entry {key!r}") from error
+        if not file.is_file():
+            continue
+        try:
+            content = json.loads(file.read_text(encoding="utf-8"))
+        except (ValueError, RecursionError) as error:
+            raise PolicyError(spec, f"{file} is damaged: {error}") from error
+        for key in ("algo", "env", "seed", "recipe"):
+            if not isinstance(content, dict) or key not in content:
+                raise PolicyError(spec, f"{file} is damaged: no entry {key!r}")
+        return cast(dict[str, Any], content)
     raise PolicyError(
         spec, f"no {CONFIG_FILE} beside {path.name} or above it; keep the file in its run folder"
     )
 
 
-def _load_model(spec: str, path: Path) -> BaseAlgorithm:
-    """Load a saved algorithm for acting only."""
-    algorithm = _from_config(spec, path, "algo")
-    if algorithm not in ALGORITHMS:
-        raise PolicyError(spec, f"algorithm {algorithm!r} is none of {', '.join(ALGORITHMS)}")
+def _load_exported(spec: str, path: Path, env: GoalEnv) -> Predictor:
+    """Load an exported policy and make sure that it fits."""
+    from tpm_gym import TPMError
+    from tpm_gym.policy import load_policy as load_safely  # imports torch
+
+    _use_one_thread()
+    try:
+        policy = load_safely(path)
+        policy.check(env)
+    except TPMError as error:
+        raise PolicyError(spec, str(error)) from error
+    return policy
+
+
+def _use_one_thread() -> None:
+    """Set PyTorch up for these networks, too small to share; one thread repeats exactly."""
     import torch  # Imported here so that scripted policies do not pay for it.
 
-    # These networks are too small to share among threads, and one thread repeats exactly.
     torch.set_num_threads(1)
+
+
+def load_model(spec: str, path: Path) -> BaseAlgorithm:
+    """Unpickle a saved algorithm for acting only; see ``require_trust``.
+
+    Raises:
+        PolicyError: It cannot be loaded.
+    """
+    algorithm = run_config(spec, path)["algo"]
+    if algorithm not in ALGORITHMS:
+        raise PolicyError(spec, f"algorithm {algorithm!r} is none of {', '.join(ALGORITHMS)}")
+    _use_one_thread()
     # Acting stores nothing: no room is needed, nor a hindsight buffer, which would ask for an
     # environment.
     unused: dict[str, Any] = {

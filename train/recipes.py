@@ -1,7 +1,8 @@
 """Hyperparameters by environment id, read from YAML in the style of rl-baselines3-zoo, and checked.
 
 A recipe file has one mapping per environment id. Its entries are the arguments of the algorithm's
-constructor, plus ``n_timesteps``, ``n_envs`` and ``policy`` as in the zoo. Values are plain YAML:
+constructor, plus ``n_timesteps``, ``n_envs`` and ``policy`` as in the zoo, and ``demonstrations``:
+episodes of the expert that are in the replay buffer before training starts. Values are plain YAML:
 where the zoo evaluates a string such as ``"dict(net_arch=[64, 64])"`` as Python, a mapping is
 written here (the zoo reads it as well), and nothing is ever evaluated.
 """
@@ -87,6 +88,7 @@ _OFF_POLICY: Final[_Rules] = {
     "ent_coef": _Rule("auto, auto_<start>, or a number of at least 0", _is_ent_coef),
     "target_entropy": _Rule("auto or a number", lambda value: value == "auto" or _is_number(value)),
     "target_update_interval": _COUNT,
+    "demonstrations": {"episodes": _COUNT, "noise": _NOT_NEGATIVE},
     "replay_buffer_class": _one_of("HerReplayBuffer"),
     "replay_buffer_kwargs": {
         "n_sampled_goal": _COUNT,
@@ -129,10 +131,11 @@ class Recipe:
     """How one algorithm is trained on one environment.
 
     Attributes:
-        n_timesteps: Number of environment steps.
+        n_timesteps: Number of environment steps, those of the demonstrations included.
         n_envs: Number of parallel environments.
         policy: Name of the policy class.
         hindsight: Whether the replay buffer relabels goals.
+        demonstrations: Arguments of :class:`demonstrations.Demonstrations`; empty for none.
         arguments: The other arguments of the algorithm's constructor.
     """
 
@@ -140,6 +143,7 @@ class Recipe:
     n_envs: int
     policy: str
     hindsight: bool
+    demonstrations: Mapping[str, Any]
     arguments: Mapping[str, Any]
 
 
@@ -155,10 +159,7 @@ def read_recipe(path: Path, algorithm: str, env_id: str) -> Recipe:
         RecipeError: The file cannot be read, has no recipe for ``env_id``, or an entry anywhere in
             it is unknown or has a value it cannot have.
     """
-    recipes = _read_mapping(path)
-    for name, entries in recipes.items():
-        _check(path, name, entries, _RULES[algorithm])
-        _check_required(path, name, entries)
+    recipes = read_recipes(path, algorithm)
     if env_id not in recipes:
         raise RecipeError(path, "", f"no recipe for {env_id}; there are {_listed(recipes)}")
     arguments = dict(recipes[env_id])
@@ -167,8 +168,27 @@ def read_recipe(path: Path, algorithm: str, env_id: str) -> Recipe:
         n_envs=arguments.pop("n_envs", 1),
         policy=arguments.pop("policy"),
         hindsight=arguments.pop("replay_buffer_class", None) is not None,
+        demonstrations=arguments.pop("demonstrations", {}),
         arguments=arguments,
     )
+
+
+def read_recipes(path: Path, algorithm: str) -> dict[str, dict[str, Any]]:
+    """Read and check all recipes of a file: environment id -> entries.
+
+    Args:
+        path: The YAML file.
+        algorithm: ``sac``, ``tqc`` or ``ppo``.
+
+    Raises:
+        RecipeError: The file cannot be read, or an entry anywhere in it is unknown or has a value
+            it cannot have.
+    """
+    recipes = _read_mapping(path)
+    for name, entries in recipes.items():
+        _check(path, name, entries, _RULES[algorithm])
+        _check_required(path, name, entries)
+    return recipes
 
 
 def _read_mapping(path: Path) -> dict[str, Any]:

@@ -4,198 +4,54 @@
 
 The run folder holds ``config.json`` (the full configuration, versions and seeds), ``progress.csv``
 and TensorBoard events, ``evaluations.jsonl`` and ``learning_curve.png``, ``checkpoints/``,
-``best.zip`` (the policy with the best periodic evaluation) and ``last.zip``.
+``best.zip`` (the policy with the best periodic evaluation) and ``last.zip``, and both exported as
+safetensors. A run that was stopped or killed goes on from its last checkpoint with
+
+    python train/train.py --run runs/TPMReach-v0-sac-s0 --resume
+
+Ctrl-C saves a checkpoint and stops; a second one leaves at once.
 """
 
 from __future__ import annotations
 
+import errno
+import json
+import os
 import shutil
 import signal
 import sys
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final
 
 import gymnasium as gym
 import tyro
 from rich.console import Console
 
 import provenance
-from errors import ConfigError, NotARunError, RunExistsError, TrainError, UnknownEnvError
+from checkpoint import CheckpointStore, Content
+from errors import (
+    ConfigError,
+    NoCheckpointError,
+    NotARunError,
+    PolicyError,
+    RunBusyError,
+    RunExistsError,
+    RunWriteError,
+    TrainError,
+)
+from plan import Config, Plan, make_plan, resume_plan, run_folder
 from policies import CONFIG_FILE, LAST_FILE
-from recipes import RECIPES, Recipe, read_recipe
-from rollout import SELECTION_SEED, TEST_SEED, GoalEnv
+from rollout import SELECTION_SEED, GoalEnv
+
+CHECKPOINTS: Final = "checkpoints"
+
+_DISK_ERRORS: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
 
 
-@dataclass(frozen=True)
-class Config:
-    """Train a policy on a tpm_gym environment."""
-
-    algo: Literal["sac", "tqc", "ppo"] = "sac"
-    """Algorithm. SAC and TQC use hindsight replay on sparse rewards; PPO wants a Dense id."""
-
-    env: str = "TPMReach-v0"
-    """Environment id."""
-
-    seed: int = 0
-    """Seed of the networks, the exploration and the first training environment."""
-
-    steps: int | None = None
-    """Environment steps, over all environments. Default: as the recipe says."""
-
-    envs: int | None = None
-    """Parallel environments, in processes of their own if several. Default: as the recipe says."""
-
-    recipe: Path | None = None
-    """YAML file of hyperparameters by environment id. Default: train/recipes/<algo>.yml."""
-
-    run: Path | None = None
-    """Folder of the run. Default: runs/<env>-<algo>-s<seed>."""
-
-    eval_every: int | None = None
-    """Steps between evaluations on held-out seeds. Default: a tenth of the steps."""
-
-    eval_episodes: int = 20
-    """Episodes per evaluation."""
-
-    checkpoint_every: int | None = None
-    """Steps between checkpoints. Default: a fifth of the steps."""
-
-    threads: int = 1
-    """Threads of PyTorch. With one thread and one environment a seed repeats exactly."""
-
-    device: str = "cpu"
-    """Device of PyTorch. The networks are small; a GPU pays only with large batches."""
-
-    overwrite: bool = False
-    """Replace an earlier run in the same folder."""
-
-
-@dataclass(frozen=True)
-class Plan:
-    """A configuration with every default filled in and checked.
-
-    Attributes:
-        algo: Algorithm.
-        env: Environment id.
-        seed: Seed; environment i of the training starts from ``seed + i``.
-        steps: Environment steps.
-        envs: Parallel environments.
-        recipe_file: Where the recipe was read.
-        recipe: The hyperparameters.
-        run: The run folder.
-        eval_every: Steps between evaluations.
-        eval_episodes: Episodes per evaluation.
-        checkpoint_every: Steps between checkpoints.
-        threads: Threads of PyTorch.
-        device: Device of PyTorch.
-    """
-
-    algo: str
-    env: str
-    seed: int
-    steps: int
-    envs: int
-    recipe_file: Path
-    recipe: Recipe
-    run: Path
-    eval_every: int
-    eval_episodes: int
-    checkpoint_every: int
-    threads: int
-    device: str
-
-    @property
-    def title(self) -> str:
-        """One line that names the run."""
-        method = self.algo.upper() + (" + HER" if self.recipe.hindsight else "")
-        return f"{self.env}   {method}, seed {self.seed}"
-
-
-def make_plan(config: Config) -> Plan:
-    """Fill in the defaults of a configuration and check it.
-
-    Raises:
-        UnknownEnvError: tpm_gym does not register the environment.
-        ConfigError: An option, or a combination of options, is not valid.
-        RecipeError: The recipe is not valid.
-    """
-    import tpm_gym
-
-    if config.env not in tpm_gym.ENV_IDS:
-        raise UnknownEnvError(config.env, tpm_gym.ENV_IDS)
-    recipe_file = config.recipe or RECIPES / f"{config.algo}.yml"
-    recipe = read_recipe(recipe_file, config.algo, config.env)
-    steps = recipe.n_timesteps if config.steps is None else config.steps
-    plan = Plan(
-        algo=config.algo,
-        env=config.env,
-        seed=config.seed,
-        steps=steps,
-        envs=recipe.n_envs if config.envs is None else config.envs,
-        recipe_file=recipe_file,
-        recipe=recipe,
-        run=config.run or Path("runs", f"{config.env}-{config.algo}-s{config.seed}"),
-        eval_every=max(1, steps // 10) if config.eval_every is None else config.eval_every,
-        eval_episodes=config.eval_episodes,
-        checkpoint_every=(
-            max(1, steps // 5) if config.checkpoint_every is None else config.checkpoint_every
-        ),
-        threads=config.threads,
-        device=config.device,
-    )
-    _check(plan)
-    return plan
-
-
-def _check(plan: Plan) -> None:
-    """Refuse numbers that cannot work."""
-    names = ("steps", "envs", "eval_every", "eval_episodes", "checkpoint_every", "threads")
-    for name in names:
-        if getattr(plan, name) < 1:
-            option = "--" + name.replace("_", "-")
-            raise ConfigError(option, getattr(plan, name), "must be at least 1")
-    highest = SELECTION_SEED - plan.envs
-    if not 0 <= plan.seed <= highest:
-        raise ConfigError(
-            "--seed",
-            plan.seed,
-            f"must lie in 0 ... {highest}: seeds from {SELECTION_SEED} up are held out",
-        )
-    most = TEST_SEED - SELECTION_SEED
-    if plan.eval_episodes > most:
-        raise ConfigError("--eval-episodes", plan.eval_episodes, f"must be at most {most}")
-    _check_hindsight(plan)
-    _check_device(plan.device)
-
-
-def _check_device(device: str) -> None:
-    """Refuse a device that PyTorch does not have here, before anything is deleted for the run."""
-    import torch
-
-    try:
-        kind = torch.device(device).type
-    except RuntimeError as error:
-        raise ConfigError("--device", device, "is no device of PyTorch; try cpu") from error
-    if kind == "cuda" and not torch.cuda.is_available():
-        raise ConfigError("--device", device, "PyTorch finds no GPU here; use cpu")
-
-
-def _check_hindsight(plan: Plan) -> None:
-    """Refuse to learn before the first episode has ended: hindsight would have nothing to draw."""
-    horizon = gym.spec(plan.env).max_episode_steps or 0
-    needed = horizon * plan.envs
-    starts = int(plan.recipe.arguments.get("learning_starts", 100))
-    if plan.recipe.hindsight and starts < needed:
-        raise ConfigError(
-            "--recipe",
-            plan.recipe_file,
-            f"learning_starts: {starts} is before the first episode ends (step {needed} with "
-            f"{plan.envs} environments); raise it, or use fewer --envs",
-        )
-
-
-def train(config: Config, console: Console | None = None) -> bool:
+def train(config: Config, console: Console | None = None) -> signal.Signals | None:
     """Train as configured and leave the run folder.
 
     Args:
@@ -203,23 +59,89 @@ def train(config: Config, console: Console | None = None) -> bool:
         console: Where progress is shown; by default the standard output.
 
     Returns:
-        Whether training went to its end; False after Ctrl-C or SIGTERM, with everything saved.
+        None when training went to its end; the signal that stopped it (Ctrl-C or SIGTERM), with a
+        checkpoint saved.
 
     Raises:
-        TrainError: The configuration is not valid, or the run folder is taken.
+        TrainError: The configuration is not valid, the run folder is taken or cannot be written,
+            or there is no whole checkpoint to resume from.
     """
     console = console or Console()
+    if config.resume:
+        return _resume(config, console)
     plan = make_plan(config)
     _prepare_folder(plan.run, config.overwrite)
-    provenance.write_json(plan.run / CONFIG_FILE, _description(plan))
-    console.print(f"{plan.title}, {plan.steps:,} steps, in {plan.run}", markup=False)
-    starts = int(plan.recipe.arguments.get("learning_starts", 0))
-    if plan.steps <= starts:
-        console.print(f"note: learning starts at step {starts:,}, so nothing will be learned")
-    finished = _learn(plan, console)
-    outcome = "finished" if finished else "stopped early, saved"
-    console.print(f"{outcome}: {plan.run}", markup=False)
-    return finished
+    store = CheckpointStore(plan.run / CHECKPOINTS)
+    with _claimed(plan.run), _disk_errors_named(plan.run, store):
+        provenance.write_json(plan.run / CONFIG_FILE, _description(plan))
+        console.print(f"{plan.title}, {plan.steps:,} steps, in {plan.run}", markup=False)
+        starts = int(plan.recipe.arguments.get("learning_starts", 0))
+        if plan.steps <= starts:
+            console.print(f"note: learning starts at step {starts:,}, so nothing will be learned")
+        return _learn(plan, console, store, None)
+
+
+def _resume(config: Config, console: Console) -> signal.Signals | None:
+    """Go on from the last whole checkpoint of a run."""
+    from snapshot import restore_files
+
+    if config.overwrite:
+        raise ConfigError("--resume", "--overwrite", "exclude each other; choose one")
+    run = run_folder(config)
+    store = CheckpointStore(run / CHECKPOINTS)
+    if not run.is_dir():
+        raise NoCheckpointError(run / CHECKPOINTS)
+    with _claimed(run), _disk_errors_named(run, store):
+        content = store.load(lambda text: _say(console, f"warning: {text}"))
+        stored = json.loads(content.files[CONFIG_FILE])
+        plan = resume_plan(config, stored, content.step)
+        if content.finished and content.step >= plan.steps:
+            _say(console, f"nothing to do: {run} has finished its {content.step:,} steps")
+            return None
+        restore_files(run, content)
+        provenance.write_json(run / CONFIG_FILE, _description_resumed(plan, stored, content.step))
+        _say(console, f"{plan.title}, from step {content.step:,} to {plan.steps:,}, in {run}")
+        return _learn(plan, console, store, content)
+
+
+def _say(console: Console, text: str) -> None:
+    """Print a line as it is, however long."""
+    console.print(text, markup=False, soft_wrap=True)
+
+
+@contextmanager
+def _claimed(run: Path) -> Iterator[None]:
+    """Keep other processes out of a run; the system ends this however the process ends."""
+    if sys.platform == "win32":
+        yield
+        return
+    import fcntl
+
+    handle = os.open(run, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise RunBusyError(run) from error
+        except OSError:
+            pass  # a file system without locks
+        yield
+    finally:
+        os.close(handle)
+
+
+@contextmanager
+def _disk_errors_named(run: Path, store: CheckpointStore) -> Iterator[None]:
+    """Turn the errors of a full or broken disk into one that says how to go on.
+
+    Training without its logs would be of no use, so it ends; only a checkpoint may fail.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in _DISK_ERRORS:
+            raise
+        raise RunWriteError(run, error.strerror or str(error), store.newest) from error
 
 
 def _prepare_folder(run: Path, overwrite: bool) -> None:
@@ -230,6 +152,8 @@ def _prepare_folder(run: Path, overwrite: bool) -> None:
         # Deleting is for folders that this script has written, whatever --run was set to.
         if not (run / CONFIG_FILE).is_file():
             raise NotARunError(run, CONFIG_FILE)
+        with _claimed(run):
+            pass
         shutil.rmtree(run)
     run.mkdir(parents=True, exist_ok=True)
 
@@ -250,36 +174,115 @@ def _description(plan: Plan) -> dict[str, Any]:
     }
 
 
-def _learn(plan: Plan, console: Console) -> bool:
-    """Build everything, learn, and save; return whether training went to its end."""
-    import torch
-    from stable_baselines3.common.callbacks import CheckpointCallback
-    from stable_baselines3.common.logger import configure
+def _description_resumed(plan: Plan, stored: dict[str, Any], step: int) -> dict[str, Any]:
+    """Return what config.json records of a resumed run: its beginning, and every resumption."""
+    now = _description(plan)
+    changeable = ("steps", "eval_every", "checkpoint_every", "threads", "device")
+    about = ("versions", "git_commit", "machine", "command")
+    resumed = {"from_step": step, **{name: now[name] for name in about}}
+    return {
+        **stored,
+        **{name: now[name] for name in changeable},
+        "resumed": [*stored.get("resumed", []), resumed],
+    }
 
-    from callbacks import PeriodicEvaluation, ProgressBar, StopOnSignal, save_model
+
+def _learn(
+    plan: Plan, console: Console, store: CheckpointStore, content: Content | None
+) -> signal.Signals | None:
+    """Build everything, learn from the beginning or from a checkpoint, and save.
+
+    Returns:
+        The signal that stopped the training, None if it went to its end.
+    """
+    import torch
+
+    from callbacks import ProgressBar, SignalListener, StopTrainingError, save_model
+    from logs import make_logger
 
     torch.set_num_threads(plan.threads)
-    training_envs = _make_training_envs(plan)
-    evaluation_env = make_env(plan.env)
-    bar, stop = ProgressBar(console), StopOnSignal()
-    try:
+    bar, listener = ProgressBar(console), SignalListener()
+    with ExitStack() as stack:
+        training_envs = _make_training_envs(plan)
+        stack.callback(training_envs.close)
+        evaluation_env = make_env(plan.env)
+        stack.callback(evaluation_env.close)
+        stack.callback(bar.close)
         model = _make_model(plan, training_envs)
-        model.set_logger(configure(str(plan.run), ["csv", "tensorboard"]))
-        evaluation = PeriodicEvaluation(
-            evaluation_env, plan.eval_every, plan.eval_episodes, plan.run, plan.title, console
+        logger = make_logger(plan.run, None if content is None else content.step)
+        stack.callback(logger.close)
+        model.set_logger(logger)
+        evaluation, checkpointing = _make_callbacks(
+            plan, console, store, content, model, evaluation_env, listener
         )
-        # Counted in calls, each of which steps all environments once.
-        calls = max(1, plan.checkpoint_every // plan.envs)
-        checkpoints = CheckpointCallback(calls, str(plan.run / "checkpoints"), plan.algo)
-        with stop.listening():
-            model.learn(plan.steps, callback=[bar, evaluation, checkpoints, stop])
-            save_model(model, plan.run / LAST_FILE)
-        model.logger.close()
-    finally:
-        bar.close()
-        evaluation_env.close()
-        training_envs.close()
-    return not stop.stopped
+        callbacks = [checkpointing, bar, evaluation]  # the first sets the clock of the others
+        stack.enter_context(listener.listening())
+        try:
+            steps = plan.steps - model.num_timesteps
+            model.learn(steps, callback=callbacks, reset_num_timesteps=content is None)
+        except StopTrainingError:
+            pass
+        save_model(model, plan.run / LAST_FILE)
+        if listener.received is None:
+            _export(plan.run, console)
+            checkpointing.save_finished()
+    _report(plan, console, store, listener.received)
+    return listener.received
+
+
+def _make_callbacks(
+    plan: Plan,
+    console: Console,
+    store: CheckpointStore,
+    content: Content | None,
+    model: Any,
+    evaluation_env: GoalEnv,
+    listener: Any,
+) -> tuple[Any, Any]:
+    """Build evaluation and checkpointing; put everything back if there is a checkpoint."""
+    from callbacks import Checkpointing, PeriodicEvaluation
+    from snapshot import restore
+
+    evaluation = PeriodicEvaluation(
+        evaluation_env, plan.eval_every, plan.eval_episodes, plan.run, plan.title, console
+    )
+    seconds = 0.0
+    if content is not None:
+        extra, notes = restore(model, content)
+        evaluation.restore(extra["evaluation"])
+        seconds = extra["seconds"]
+        for note in notes:
+            _say(console, f"note: {note}; the run goes on, but not exactly as it would have")
+    checkpointing = Checkpointing(
+        store, evaluation, listener, plan.checkpoint_every, plan.run, console, seconds
+    )
+    return evaluation, checkpointing
+
+
+def _export(run: Path, console: Console) -> None:
+    """Export the policies of a run that has come to its end."""
+    from export import export_run
+
+    try:
+        export_run(run)
+    except PolicyError as error:
+        _say(console, f"warning: not exported: {error}")
+
+
+def _report(
+    plan: Plan, console: Console, store: CheckpointStore, received: signal.Signals | None
+) -> None:
+    """Say in one line how the training ended, and how it can go on."""
+    if received is None:
+        _say(console, f"finished: {plan.run}")
+    elif store.newest is None:
+        _say(console, f"stopped early by {received.name}, without a checkpoint: {plan.run}")
+    else:
+        _say(
+            console,
+            f"stopped early by {received.name}, saved at step {store.newest:,}; continue with: "
+            f"python train/train.py --run {plan.run} --resume",
+        )
 
 
 def _make_model(plan: Plan, envs: Any) -> Any:
@@ -305,11 +308,14 @@ def _make_training_envs(plan: Plan) -> Any:
     from stable_baselines3.common.env_util import make_vec_env
     from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
+    from snapshot import EpisodeRecorder
+
     several = plan.envs > 1
     return make_vec_env(
         make_env,
         n_envs=plan.envs,
         seed=plan.seed,
+        wrapper_class=EpisodeRecorder,
         env_kwargs={"env_id": plan.env, "in_worker": several},
         vec_env_cls=SubprocVecEnv if several else DummyVecEnv,
     )
@@ -320,13 +326,14 @@ def make_env(env_id: str, in_worker: bool = False) -> GoalEnv:
 
     Args:
         env_id: The registered id.
-        in_worker: Whether this runs in a process of its own, which has to outlive the Ctrl-C that
-            a terminal sends to all processes, until the main process has saved.
+        in_worker: Whether this runs in a process of its own, which has to outlive the signal that
+            a terminal or a batch system sends to all processes, until the main one has saved.
     """
     import tpm_gym  # noqa: F401  # registers the ids
 
     if in_worker:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)
     return gym.make(env_id)
 
 
@@ -336,11 +343,13 @@ def main() -> None:
 
     config = tyro.cli(Config, description=__doc__)
     try:
-        finished = train(config)
+        received = train(config)
     except (TrainError, TPMError) as error:
         sys.exit(f"error: {error}")
-    if not finished:
+    except KeyboardInterrupt:
         sys.exit(128 + signal.SIGINT)
+    if received is not None:
+        sys.exit(128 + received)
 
 
 if __name__ == "__main__":

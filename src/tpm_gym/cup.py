@@ -40,9 +40,6 @@ class Cup:
         self._constraint: int | None = None
         self.grip: Pose | None = None
         """Pose of the held object in the tool's inertial frame, None if nothing is held."""
-        # The engine orders contacts otherwise once a pair has an entry of its own in the filter;
-        # with the entry from the start, the first episode equals all later ones to the last bit.
-        self._collide(True)
 
     def suck(self) -> None:
         """With the vacuum on: drop an object that was pulled off, take one that is touched."""
@@ -66,14 +63,12 @@ class Cup:
         )
         # Beyond this force the constraint yields, the lip lifts off, and the next check lets go.
         self._client.changeConstraint(constraint, maxForce=PULL_OFF_FORCE)
-        self._collide(False)
         self._constraint, self.grip = constraint, grip
 
     def let_go(self) -> None:
         """Release the object, if one is held."""
         if self._constraint is not None:
             self._client.removeConstraint(self._constraint)
-            self._collide(True)
         self._constraint = self.grip = None
 
     def _sealed(self) -> bool:
@@ -94,9 +89,3 @@ class Cup:
         pose = self._client.getBasePositionAndOrientation(self._body)
         relative: Pose = self._client.multiplyTransforms(*inverse, *pose)
         return relative
-
-    def _collide(self, enable: bool) -> None:
-        # Contact and vacuum would fight over the same surface.
-        self._client.setCollisionFilterPair(
-            self._robot.tool[0], self._body, self._robot.tool[1], -1, int(enable)
-        )

@@ -116,10 +116,9 @@ class TPMEnv(gym.Env[Observation, Action]):
 
     ## Singularities
 
-    Where the platform passes y = 0 (a parallel singularity) the assembly mode changes, and the
-    encoders no longer tell where it is; where it passes y = l7 (a serial one), the working mode. No
-    action leads there; should a disturbance do so, the step reports it in ``info``, the penalty is
-    1, the episode is truncated, and the next reset recovers.
+    Where the platform passes y = 0, a parallel one, the assembly mode changes and the encoders no
+    longer tell where it is; past y = l7, a serial one, the working mode changes. No action leads
+    there; should a disturbance, ``info`` says so, the penalty is 1, and the episode is truncated.
 
     Args:
         task: ``"reach"`` or ``"pick_and_place"``.
@@ -242,11 +241,10 @@ class TPMEnv(gym.Env[Observation, Action]):
         self._state = None  # until the step has gone well
         self._state = state = self.simulation.move(command, vacuum, self._draw_noise())
         observation, info = self._report(state)
-        reached, wanted = observation["achieved_goal"], observation["desired_goal"]
-        reward = self.compute_reward(reached, wanted, info)
+        reward = reports.reward(info, self.penalty_weight)
         if self.render_mode == "human":
             self.render()
-        return observation, float(reward), False, state.mode_change is not None, info
+        return observation, reward, False, state.mode_change is not None, info
 
     def compute_reward(
         self,

@@ -26,7 +26,7 @@ REGULARISATION = 1e-9
 MOTOR_GAIN = 1.0
 """Share of the position error that a motor takes out in one time step, effort permitting."""
 PULL_OFF_FORCE = 12.0
-"""Largest force that the cup holds, N: 60 kPa of vacuum on the area of the lip."""
+"""Largest force that the cup holds along each axis, N: 60 kPa of vacuum on the area of the lip."""
 SEAL_GAP = 0.002
 """Largest distance between lip and object at which the vacuum seals, m."""
 SEAL_TILT = np.deg2rad(10.0)
@@ -45,7 +45,7 @@ class Physics:
         time_step: s.
         solver: ``"direct"`` solves the constraints of a step exactly (Dantzig's pivoting);
             ``"iterative"`` is Bullet's default, sequential impulses.
-        iterations: Of the iterative solver, a step.
+        iterations: Of the iterative solver, a step; with 25 the mechanism is lost now and then.
         erp: Share of a constraint's error that is taken out in one step, in (0, 1].
         control_period: s between two commands; a whole number of time steps.
 

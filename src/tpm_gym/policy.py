@@ -170,9 +170,7 @@ class Policy:
             arrays[name] = values.reshape(-1, math.prod(shape))
             leading.add(batch)
         if len(leading) > 1:
-            raise InputError(
-                "observation", sorted(leading), "one batch, of one size in all entries"
-            )
+            raise InputError("observation", sorted(leading), "of one batch size in all entries")
         tensors = {name: torch.tensor(values) for name, values in arrays.items()}
         return tensors, leading != {()}
 

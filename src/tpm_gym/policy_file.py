@@ -216,7 +216,8 @@ def read_weights(path: str | Path, description: Description) -> dict[str, NDArra
     try:
         tensors = dict(safetensors.deserialize(data))  # type: ignore[no-untyped-call]
     except safetensors.SafetensorError as error:
-        raise PolicyFileError(str(file), f"is no safetensors file ({error})", _DAMAGED) from error
+        reason = f"is no safetensors file: {shown(str(error))}"
+        raise PolicyFileError(str(file), reason, _DAMAGED) from error
     forms = {name: (tensor["dtype"], tuple(tensor["shape"])) for name, tensor in tensors.items()}
     wanted = {name: ("F32", shape) for name, shape in description.shapes.items()}
     if forms != wanted:
@@ -254,7 +255,8 @@ def _description(whole: Entry) -> Description:
         *("format", "version", "algorithm", "env", "seed", "steps", "recipe", "versions"),
         *("observation_space", "action_space", "network", "weights", "sha256"),
     )
-    versions = entries["versions"].members(".{1,100}", most=64)
+    recipe = entries["recipe"].members(r"\w{1,100}", most=64)
+    versions = entries["versions"].members(r"[\w.-]{1,100}", most=64)
     boxes = entries["observation_space"].members(r"\w{1,100}", most=16)
     observation: dict[str, spaces.Space[Any]] = {name: _box(e) for name, e in boxes.items()}
     weights = entries["weights"].record("bytes", "sha256")
@@ -264,9 +266,9 @@ def _description(whole: Entry) -> Description:
         algorithm=entries["algorithm"].choice("sac", "tqc", "ppo"),
         seed=None if seed.value is None else seed.integer(0, 2**63),
         steps=entries["steps"].integer(0, 2**63),
-        recipe={name: e.value for name, e in entries["recipe"].members(".{1,100}", 1000).items()},
+        recipe={name: entry.value for name, entry in recipe.items()},
         versions={
-            name: None if entry.value is None else entry.text(".{1,100}")
+            name: None if entry.value is None else entry.text("[ -~]{1,100}")
             for name, entry in versions.items()
         },
         observation_space=spaces.Dict(observation),

@@ -13,7 +13,15 @@ from tpm_gym import rewards
 from tpm_gym.state import State
 from tpm_gym.tasks import Task
 
-__all__ = ["Observation", "box", "goal_free_reward", "info", "observation", "observation_space"]
+__all__ = [
+    "Observation",
+    "box",
+    "goal_free_reward",
+    "info",
+    "observation",
+    "observation_space",
+    "reward",
+]
 
 Observation = dict[str, Any]  # arrays of float32
 
@@ -48,16 +56,16 @@ def observation(task: Task, state: State, goal: NDArray[np.float64]) -> Observat
 
 def info(task: Task, state: State, seen: Observation, penalty_weight: float) -> dict[str, Any]:
     """The info of a state whose observation is ``seen``."""
-    achieved, desired = seen["achieved_goal"], seen["desired_goal"]
+    gap = rewards.distance(seen["achieved_goal"], seen["desired_goal"])
     passed = state.mode_change is not None
     penalty = 1.0 if passed else float(rewards.singularity_penalty(state.conditioning))
     terms = {
-        "goal": float(task.goal_term(achieved, desired)),
+        "goal": float(task.goal_term_at(gap)),
         "singularity": -penalty_weight * penalty,
     }
     terms.update((name, float(value)) for name, value in task.state_terms(state).items())
     return {
-        "is_success": bool(task.success(achieved, desired)),
+        "is_success": bool(gap < task.tolerance),
         "closure_error": float(state.closure_error),
         "conditioning": float(state.conditioning),
         "singularity_penalty": penalty,
@@ -65,6 +73,12 @@ def info(task: Task, state: State, seen: Observation, penalty_weight: float) -> 
         "working_mode_changed": state.mode_change == "working",
         "reward_terms": terms,
     }
+
+
+def reward(info: Mapping[str, Any], penalty_weight: float) -> float:
+    """The reward of a step, from its info."""
+    total: float = info["reward_terms"]["goal"] + goal_free_reward(info, penalty_weight)
+    return total
 
 
 def goal_free_reward(info: Mapping[str, Any], penalty_weight: float) -> float:

@@ -116,6 +116,12 @@ class Robot:
             client.changeConstraint(constraint, maxForce=_CLOSURE_FORCE)
             end_a, end_b = ((self._links[name], point) for name, point in sides)
             self._pairs.append((end_a, end_b))
+        # One call of the engine a leg is cheaper than one a link.
+        self._watched: dict[int, list[int]] = {}
+        for body, link in sorted(
+            {self._platform, *(end[0] for pair in self._pairs for end in pair)}
+        ):
+            self._watched.setdefault(body, []).append(link)
 
     def paint(self) -> None:
         """Give each link the colour of its largest solid.
@@ -181,22 +187,19 @@ class Robot:
     def truth(self) -> tuple[float, Vector, float]:
         """Largest loop gap (m), platform position (m, world) and platform tilt (rad)."""
         frames: dict[Address, Frame] = {}
+        for body, links in self._watched.items():
+            states = self._client.getLinkStates(body, links, computeForwardKinematics=True)
+            for link, state in zip(links, states, strict=True):
+                frames[body, link] = state[4], state[5]
         squared = 0.0
-        for end_a, end_b in self._pairs:
-            a, b = self._point(frames, *end_a), self._point(frames, *end_b)
-            squared = max(squared, (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)
-        point = self._point(frames, self._platform, self._mechanism.point_p)
+        for (link_a, point_a), (link_b, point_b) in self._pairs:
+            x, y, z = transform(*frames[link_a], point_a)
+            u, v, w = transform(*frames[link_b], point_b)
+            squared = max(squared, (x - u) ** 2 + (y - v) ** 2 + (z - w) ** 2)
+        origin, turn = frames[self._platform]
         # The platform should stand as the base does: a half turn about x, quaternion (1, 0, 0, 0).
-        _, (_, y, z, w) = frames[self._platform]
-        tilt = 2 * math.asin(min(1.0, math.sqrt(y * y + z * z + w * w)))
-        return math.sqrt(squared), point, tilt
-
-    def _point(self, frames: dict[Address, Frame], link: Address, point: Vector) -> Vector:
-        """A link's point in the world; ``frames`` keeps what was already asked for."""
-        if link not in frames:
-            state = self._client.getLinkState(*link, computeForwardKinematics=True)
-            frames[link] = state[4], state[5]
-        return transform(*frames[link], point)
+        tilt = 2 * math.asin(min(1.0, math.hypot(*turn[1:])))
+        return math.sqrt(squared), transform(origin, turn, self._mechanism.point_p), tilt
 
     def cup(self) -> tuple[Vector, Vector]:
         """Centre of the cup's lip (m) and the cup's outward axis, world."""

@@ -187,7 +187,8 @@ def _conditioning(rows: tuple[Vector, Vector, Vector]) -> float:
     """Smallest over largest singular value, s3 / s1, of a matrix (3, 3).
 
     The cofactors have s1 s2 as their largest singular value, and |det| = s1 s2 s3; the smallest
-    one, as the root of the smallest eigenvalue of J J^T, would lose half of its digits.
+    one, as the root of the smallest eigenvalue of J J^T, would lose half of its digits. Where the
+    two largest nearly coincide, the result is good to 1e-9 only.
     """
     (a, b, c), (d, e, f), (g, h, i) = rows
     first = (e * i - f * h, f * g - d * i, d * h - e * g)

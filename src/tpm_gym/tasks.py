@@ -164,7 +164,10 @@ class Task:
 
     def goal_term(self, achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
         """The part of the reward that depends on the goal, (...,)."""
-        gap = rewards.distance(achieved, desired)
+        return self.goal_term_at(rewards.distance(achieved, desired))
+
+    def goal_term_at(self, gap: FloatArray) -> FloatArray:
+        """The same, for distances (...,) m from the goal."""
         return (
             rewards.sparse(gap, self.tolerance) if self.reward == "sparse" else rewards.dense(gap)
         )

@@ -79,7 +79,8 @@ The slab 0 < y < l7, less a margin to the parallel singularity y = 0 and to the 
 point is reachable with the elbows out, in the default assembly mode (a test walks through it).
 Nearer to y = 0 than this, the motors' torque no longer suffices to hold y when a random policy
 reverses x or z at full speed: the platform is then thrown through the singularity. Farther from the
-base than this, the cup of the default mount would be pressed into a puck by more than it yields.
+base than this, the cup of the default mount would be pushed back farther than its stroke by a puck
+that lies askew.
 """
 
 

@@ -1,0 +1,172 @@
+"""The default in the real environment, at every time step, for as long as one likes.
+
+Nothing is kept but histograms, so a million time steps take no more memory than a thousand.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from fidelity_lab import CONDITIONED, against_kinematics
+from machine import ROOT
+from numpy.typing import NDArray
+
+from tpm_gym.errors import ClosureError
+from tpm_gym.expert import Expert
+
+FloatArray = NDArray[np.float64]
+
+BUFFER = 5000  # time steps that wait for their kinematics
+JSON = ROOT / "runs" / "fidelity_long.json"
+
+
+class Histogram:
+    """Streamed samples of a positive quantity: exact mean and maximum, quantiles to 1 %.
+
+    Bins have equal widths in the logarithm, from 1e-12 to 1e3 in SI units.
+    """
+
+    LOW, HIGH, BINS = -12.0, 3.0, 3600  # 10 ** (15 / 3600) = 1.0096
+
+    def __init__(self) -> None:
+        """Empty."""
+        self._counts = np.zeros(self.BINS, dtype=np.int64)
+        self.count, self._sum, self.maximum = 0, 0.0, 0.0
+
+    def add(self, values: FloatArray) -> None:
+        """Take in (n,) values."""
+        if not len(values):
+            return
+        position = (np.log10(np.maximum(values, 1e-300)) - self.LOW) / (self.HIGH - self.LOW)
+        bins = np.clip(position * self.BINS, 0, self.BINS - 1).astype(np.int64)
+        self._counts += np.bincount(bins, minlength=self.BINS)
+        self.count += len(values)
+        self._sum += float(values.sum())
+        self.maximum = max(self.maximum, float(values.max()))
+
+    @property
+    def mean(self) -> float:
+        """Of all samples; NaN without any."""
+        return self._sum / self.count if self.count else float("nan")
+
+    def quantile(self, share: float) -> float:
+        """Upper edge of the bin that holds it, or the maximum where that is less."""
+        if not self.count:
+            return float("nan")
+        at = int(np.searchsorted(np.cumsum(self._counts), share * self.count))
+        edge = 10 ** (self.LOW + (at + 1) / self.BINS * (self.HIGH - self.LOW))
+        return min(edge, self.maximum)
+
+
+class Probe:
+    """Looks at the robot after every time step that an environment runs.
+
+    It puts itself in the place of the client's ``stepSimulation``, so the environment runs as it
+    always does.
+
+    Args:
+        env: TPMPickAndPlace-v0.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        """Hook in."""
+        inside: Any = env.unwrapped
+        self._robot, client = inside.simulation._robot, inside.simulation._client
+        self._step = client.stepSimulation
+        client.stepSimulation = self._measured_step
+        self._rows = np.empty((BUFFER, 8))
+        self._filled = self.steps = self.below = 0
+        self.gap, self.tilt = Histogram(), Histogram()
+        self.fk, self.fk_near = Histogram(), Histogram()
+
+    def _measured_step(self, *arguments: Any, **options: Any) -> Any:
+        result = self._step(*arguments, **options)
+        gap, position, tilt = self._robot.truth()
+        self._rows[self._filled] = (gap, tilt, *position, *self._robot.encoders()[0])
+        self._filled += 1
+        self.steps += 1
+        if self._filled == BUFFER:
+            self.flush()
+        return result
+
+    def flush(self) -> None:
+        """Sort what was measured into the histograms."""
+        rows, self._filled = self._rows[: self._filled], 0
+        apart, conditioning = against_kinematics(rows[:, 5:8], rows[:, 2:5])
+        good = conditioning > CONDITIONED
+        self.below += int((rows[:, 0] < 1e-4).sum())
+        self.gap.add(rows[:, 0])
+        self.tilt.add(rows[:, 1])
+        self.fk.add(apart[good])
+        self.fk_near.add(apart[~good])
+
+    def summary(self) -> dict[str, Any]:
+        """Mean, 99.9 % and maximum of each quantity, SI units."""
+        named = {"gap": self.gap, "fk": self.fk, "fk_near": self.fk_near, "tilt": self.tilt}
+        found: dict[str, Any] = {
+            name: {"samples": h.count, "mean": h.mean, "p999": h.quantile(0.999), "max": h.maximum}
+            for name, h in named.items()
+        }
+        return found | {"steps": self.steps, "share_gap_below_0.1_mm": self.below / self.steps}
+
+
+def follow(motion: str, steps: int, seed: int = 0) -> dict[str, Any]:
+    """Run TPMPickAndPlace-v0 for ``steps`` time steps; ``"random"`` or ``"expert"`` actions."""
+    env = gym.make("TPMPickAndPlace-v0")
+    env.action_space.seed(seed)
+    probe, expert = Probe(env), Expert(env)
+    start = time.perf_counter()
+    episode = successes = lost = mode_changes = 0
+    while probe.steps < steps:
+        observation, info = env.reset(seed=seed + episode)
+        expert.reset(observation)
+        episode, ended = episode + 1, False
+        while not ended:
+            random = motion == "random"
+            action = env.action_space.sample() if random else expert.act(observation)
+            try:
+                observation, _, _, ended, info = env.step(action)
+            except ClosureError as error:
+                lost, ended = lost + 1, True
+                print(f"{motion}: lost in episode {episode}: {error}")
+        mode_changes += info["assembly_mode_changed"] or info["working_mode_changed"]
+        successes += bool(info["is_success"])
+    probe.flush()
+    env.close()
+    return {
+        **probe.summary(),
+        "episodes": episode,
+        "successes": successes,
+        "lost": lost,
+        "mode_changes": int(mode_changes),
+        "seconds": time.perf_counter() - start,
+    }
+
+
+def run(steps: int, describe: Callable[[], dict[str, Any]], path: Path = JSON) -> None:
+    """Random actions and the expert; print and write what was found."""
+    description = describe()
+    results = {motion: follow(motion, steps) for motion in ("random", "expert")}
+    for motion, found in results.items():
+        gap, fk, near, tilt = (found[name] for name in ("gap", "fk", "fk_near", "tilt"))
+        print(
+            f"{motion}: {found['steps']:,} time steps, {found['episodes']} episodes "
+            f"({found['successes']} ended in success), loops lost {found['lost']} times, "
+            f"mode left {found['mode_changes']} times, {found['seconds']:.0f} s\n"
+            f"  gap: max {1e3 * gap['max']:.4f} mm, 99.9 % {1e3 * gap['p999']:.4f} mm, "
+            f"mean {1e3 * gap['mean']:.4f} mm, {100 * found['share_gap_below_0.1_mm']:.4f} % "
+            f"below 0.1 mm\n"
+            f"  FK where 1/cond(J) > {CONDITIONED}: max {1e3 * fk['max']:.4f} mm, "
+            f"99.9 % {1e3 * fk['p999']:.4f} mm ({fk['samples']:,} time steps)\n"
+            f"  FK elsewhere: max {1e3 * near['max']:.4f} mm ({near['samples']:,} time steps)\n"
+            f"  tilt: max {np.rad2deg(tilt['max']):.2e} degrees"
+        )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps({**description, "results": results}, indent=1) + "\n", "utf-8")
+    print(f"wrote {path.relative_to(ROOT)}")

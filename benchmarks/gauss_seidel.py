@@ -1,0 +1,120 @@
+"""How fast sequential impulses converge on the closures, and which solvers solve one step.
+
+    python benchmarks/gauss_seidel.py
+
+Sequential impulses are Gauss-Seidel on W lambda = b, with W = G M^-1 G^T, the coupling of all rows
+(three motors, the cup's spring, three rows for each ball); Bullet goes through the rows forwards
+and backwards by turns. The error shrinks by the largest eigenvalue of that double sweep, less the
+eigenvalue 1 of the one combination of closures that is redundant, which moves nothing. G and M are
+the engine's own; the order of the rows is ours.
+
+One step from rest then tells which solver solves W lambda = b: the rates that should be zero, the
+motors' and the closures', are compared with what the engine leaves of them.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import Any
+
+import numpy as np
+from fidelity_lab import Config, Rig
+from numpy.typing import NDArray
+
+from tpm_gym import kinematics
+from tpm_gym.mechanism import ACTUATED_JOINTS
+from tpm_gym.workspace import TASK_REGION
+
+FloatArray = NDArray[np.float64]
+
+HEIGHTS = (0.002, 0.005, 0.012, 0.020, 0.030, 0.046)
+"""y of point P, m; the task region starts at 12 mm."""
+
+
+def constraint_rows(rig: Rig) -> tuple[FloatArray, FloatArray]:
+    """G (rows, joints), and the mass matrix M (joints, joints), where the rig now stands.
+
+    Rows: the motors, the cup's slide, and x, y, z of each closure. The rig must be one multibody.
+    """
+    client, robot, mechanism = rig.client, rig.robot, rig.variant.mechanism
+    body = robot.bodies[0]
+    count = client.getNumJoints(body)
+    angles = [client.getJointState(body, i)[0] for i in range(count)]
+    rest = [0.0] * count
+    rows = [np.eye(count)[robot._joints[name][1]] for name in (*ACTUATED_JOINTS, "cup_slide")]
+
+    def jacobian_of(link: str, point: Any) -> FloatArray:
+        local = np.asarray(point) - mechanism.link(link).centre_of_mass
+        address = robot._links[link][1]
+        return np.array(
+            client.calculateJacobian(body, address, local.tolist(), angles, rest, rest)[0]
+        )
+
+    for c in mechanism.closures:
+        rows.extend(jacobian_of(c.link_a, c.point_a) - jacobian_of(c.link_b, c.point_b))
+    return np.array(rows), np.array(client.calculateMassMatrix(body, angles))
+
+
+def iterations_per_decade(coupling: FloatArray) -> float:
+    """Iterations in which symmetric Gauss-Seidel on ``coupling`` gains a decimal digit."""
+    scale = np.sqrt(np.diag(coupling))
+    unit = coupling / np.outer(scale, scale)
+    identity = np.eye(len(unit))
+    forwards = identity - np.linalg.solve(np.tril(unit), unit)
+    backwards = identity - np.linalg.solve(np.triu(unit), unit)
+    factors = np.sort(np.abs(np.linalg.eigvals(backwards @ forwards)))[::-1]
+    slowest = factors[factors < 1 - 1e-9][0]
+    return float(2 / -np.log10(slowest))
+
+
+def convergence() -> None:
+    """Iterations a decade over the task region, by y."""
+    rig = Rig(Config("", "", variant="one body"))
+    low, high = TASK_REGION.low, TASK_REGION.high
+    print("iterations of sequential impulses a decimal digit, over x and z of the task region")
+    for y in HEIGHTS:
+        counts = []
+        for x, z in product(np.linspace(low[0], high[0], 7), np.linspace(low[2], high[2], 5)):
+            rig.place(kinematics.inverse((x, y, z)))
+            rows, mass = constraint_rows(rig)
+            counts.append(iterations_per_decade(rows @ np.linalg.solve(mass, rows.T)))
+        print(f"  y = {1e3 * y:4.0f} mm: median {np.median(counts):4.0f}, most {max(counts):4.0f}")
+    rig.close()
+
+
+def left_over(config: Config, point: FloatArray) -> float:
+    """Largest rate (rad/s or m/s) of a motor or closure, of all that one step should have stopped.
+
+    The mechanism starts at rest at ``point``; its motors are told to stay.
+    """
+    theta = kinematics.inverse(point)
+    whole = Rig(Config("", "", variant="one body"))
+    whole.place(theta)
+    rows, _ = constraint_rows(whole)
+    names = {index: name for name, (_, index) in whole.robot._joints.items()}
+    whole.close()
+    rig = Rig(config)
+    rig.place(theta)
+    rig.drive(theta.tolist())
+    rig.step()
+    rates = np.array(
+        [rig.client.getJointState(*rig.robot._joints[names[i]])[1] for i in range(len(names))]
+    )
+    rig.close()
+    return float(np.abs(rows @ rates).max())
+
+
+def one_step() -> None:
+    """Who stops the motors and closures, in one multibody and in three."""
+    point = np.array((-0.04, 0.028, 0.80))
+    print("largest rate left of motors and closures after one step from rest (rad/s, m/s)")
+    for variant in ("one body", "three legs"):
+        for solver, iterations in (("direct", 50), ("lcp pgs", 3000), ("iterative", 3000)):
+            config = Config("", "", variant, solver, iterations=iterations, residual=0.0)
+            name = f"{variant}, {solver}" + ("" if solver == "direct" else f", {iterations} it.")
+            print(f"  {name:<28} {left_over(config, point):.1e}")
+
+
+if __name__ == "__main__":
+    convergence()
+    one_step()

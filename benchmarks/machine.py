@@ -1,0 +1,132 @@
+"""What the benchmarks share: a description of the machine, memory, quartiles, the figures' style.
+
+The scripts that train record versions and machine already, and the documentation's figures have
+their style; both are taken from there.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import platform
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+ROOT = Path(__file__).resolve().parents[1]
+for _folder in ("train", "docs"):  # scripts, no packages
+    if str(ROOT / _folder) not in sys.path:
+        sys.path.append(str(ROOT / _folder))
+
+import provenance  # noqa: E402
+
+__all__ = [
+    "describe",
+    "memory",
+    "open_files",
+    "processor_line",
+    "provenance",
+    "quartiles",
+    "silence",
+]
+
+_PACKAGES = ("panda-gym", "gymnasium-robotics", "mujoco")
+
+
+def describe(arguments: Sequence[str]) -> dict[str, Any]:
+    """What a speed depends on, and how to repeat it; no names of machines or folders.
+
+    Args:
+        arguments: The script and its arguments.
+    """
+    loads = os.getloadavg() if hasattr(os, "getloadavg") else None
+    return {
+        "command": provenance.command_line(arguments),
+        "commit": provenance.git_commit(),
+        "versions": provenance.versions() | {name: _version(name) for name in _PACKAGES},
+        "machine": provenance.machine(),
+        "load_before": None if loads is None else round(loads[0], 2),
+    }
+
+
+def _version(package: str) -> str | None:
+    """The version of an installed package, None where it is not installed."""
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def processor_line(description: dict[str, Any]) -> str:
+    """One line for tables and figures: processor, cores, Python, engine, load at the start."""
+    machine, versions = description["machine"], description["versions"]
+    load = description["load_before"]
+    busy = "" if load is None else f", load {load} at the start"
+    return (
+        f"{machine['processor'] or machine['architecture']}, {machine['cpu_count']} cores, "
+        f"Python {versions['python']}, pybullet {versions['pybullet']}{busy}"
+    )
+
+
+def memory() -> tuple[float, str]:
+    """Memory of this process in MB (1e6 bytes), and what it is.
+
+    Linux tells what is resident now. Elsewhere the standard library knows only the most that ever
+    was, which grows where the resident memory does, but never falls.
+
+    Raises:
+        SystemExit: On a system where the standard library knows neither.
+    """
+    try:
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+        return pages * os.sysconf("SC_PAGE_SIZE") / 1e6, "resident"
+    except OSError:
+        pass
+    try:
+        import resource
+    except ImportError:
+        sys.exit("the memory of a process is only known on Linux, macOS and BSD; run it there")
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak * (1 if platform.system() == "Darwin" else 1024) / 1e6, "peak"
+
+
+def open_files() -> int | None:
+    """Number of this process's open file descriptors; None where the system does not tell."""
+    try:
+        return len(os.listdir("/proc/self/fd"))
+    except OSError:
+        return None
+
+
+def quartiles(values: ArrayLike) -> tuple[float, float, float]:
+    """Lower quartile, median, upper quartile."""
+    low, middle, high = np.percentile(np.asarray(values, dtype=np.float64), [25, 50, 75])
+    return float(low), float(middle), float(high)
+
+
+def _flush() -> None:
+    """Write out what Python and the C library still hold back."""
+    sys.stdout.flush()
+    if os.name == "posix":
+        ctypes.CDLL(None).fflush(None)
+
+
+@contextmanager
+def silence() -> Iterator[None]:
+    """Send what is written to file descriptor 1, by C code too, to nowhere."""
+    _flush()
+    ours, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 1)
+        yield
+    finally:
+        _flush()
+        os.dup2(ours, 1)
+        os.close(ours)
+        os.close(nowhere)

@@ -1,0 +1,214 @@
+"""The engine's own work in an episode, recorded once and repeated without anything around it.
+
+What a control step asks of the engine is taken down as calls of pybullet: a target for each motor
+and one ``stepSimulation`` a time step, and the constraint of the vacuum cup when it takes or lets
+go. Repeated on another environment from the same start, the same calls do the same physics to the
+last bit, which :func:`replay` checks; its time is the floor of ``env.step``. Two floors:
+
+* physics: the ``stepSimulation`` calls alone;
+* with motors: these and the motor commands, which any controller in Python has to send as well.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pybullet
+from numpy.typing import NDArray
+
+__all__ = ["Floor", "Tape", "record", "recording", "replay"]
+
+STEP = "stepSimulation"
+MOTORS = ("setJointMotorControl2", "setJointMotorControlArray")
+GRASP = ("createConstraint", "changeConstraint", "removeConstraint", "setCollisionFilterPair")
+
+
+@dataclass
+class Call:
+    """One call of the engine, less the number of the client."""
+
+    name: str
+    arguments: tuple[Any, ...]
+    options: dict[str, Any]
+    result: Any
+
+
+@dataclass
+class Tape:
+    """What the engine was asked in a block of steps.
+
+    Attributes:
+        steps: The calls of each control step.
+        resets: Indices of the steps after which the environment was reset.
+        ends: Where each step left the motors and the object, to compare with.
+    """
+
+    steps: list[list[Call]] = field(default_factory=list)
+    resets: set[int] = field(default_factory=set)
+    ends: list[NDArray[np.float64]] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Floor:
+    """Seconds of a whole block: ``stepSimulation`` alone, and with the motor commands."""
+
+    physics: float
+    with_motors: float
+
+
+class Recorder:
+    """Functions of pybullet that take down how they are called.
+
+    A client binds the engine's functions when it first uses them, so a client that was first used
+    inside :func:`recording` must be used inside it only, and one to be timed must never be.
+    """
+
+    def __init__(self) -> None:
+        """Start with nothing taken down."""
+        self.calls: list[Call] = []
+
+    def wrap(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """The function, noting its calls."""
+
+        def noting(*arguments: Any, **options: Any) -> Any:
+            result = function(*arguments, **options)
+            kept = {key: value for key, value in options.items() if key != "physicsClientId"}
+            self.calls.append(Call(name, arguments, kept, result))
+            return result
+
+        return noting
+
+    def take(self) -> list[Call]:
+        """What was called since the last time."""
+        calls, self.calls = self.calls, []
+        return calls
+
+
+@contextmanager
+def recording(recorder: Recorder) -> Iterator[None]:
+    """Put the recorder's functions in the place of the engine's."""
+    real = {name: getattr(pybullet, name) for name in (STEP, *MOTORS, *GRASP)}
+    for name, function in real.items():
+        setattr(pybullet, name, recorder.wrap(name, function))
+    try:
+        yield
+    finally:
+        for name, function in real.items():
+            setattr(pybullet, name, function)
+
+
+def record(
+    env: gym.Env[Any, Any], recorder: Recorder, actions: NDArray[np.float32], seed: int
+) -> Tape:
+    """Run the block of ``actions`` (n, k) from ``reset(seed=seed)``; inside :func:`recording`.
+
+    Raises:
+        RuntimeError: If a step asked nothing of the engine, so that there is nothing to repeat.
+    """
+    tape = Tape()
+    env.reset(seed=seed)
+    for index, action in enumerate(actions):
+        recorder.take()
+        _, _, terminated, truncated, _ = env.step(action)
+        tape.steps.append(recorder.take())
+        tape.ends.append(_where(env))
+        if not any(call.name == STEP for call in tape.steps[-1]):
+            raise RuntimeError("a step of the environment called no pybullet.stepSimulation")
+        if terminated or truncated:
+            env.reset()
+            tape.resets.add(index)
+    return tape
+
+
+def replay(env: gym.Env[Any, Any], tape: Tape, seed: int) -> Floor:
+    """Repeat the engine's calls on an environment that was never recorded, timing them alone.
+
+    Raises:
+        RuntimeError: If a step ended elsewhere than when it was recorded: then the calls taken down
+            are not all that the step does to the engine, and their time is no floor.
+    """
+    player = _Player(env)
+    env.reset(seed=seed)
+    physics = with_motors = 0.0
+    for index, calls in enumerate(tape.steps):
+        places = [place for place, call in enumerate(calls) if call.name not in GRASP]
+        player.grasp(calls[: places[0]])
+        bound = [(player.bind(calls[place]), calls[place].name == STEP) for place in places]
+        begun = time.perf_counter()
+        for function, is_step in bound:
+            if is_step:
+                started = time.perf_counter()
+                function()
+                physics += time.perf_counter() - started
+            else:
+                function()
+        with_motors += time.perf_counter() - begun
+        player.grasp(calls[places[-1] + 1 :])
+        if not np.array_equal(_where(env, fresh=True), tape.ends[index], equal_nan=True):
+            raise RuntimeError(
+                f"the repeated physics differ from the recorded ones at step {index}"
+            )
+        if index in tape.resets:
+            player.let_go()
+            env.reset()
+    player.let_go()
+    return Floor(physics, with_motors)
+
+
+class _Player:
+    """Calls the engine in the name of an environment's client."""
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        """Take the number of the client."""
+        unwrapped: Any = env.unwrapped
+        self._number = unwrapped.simulation._client._number
+        self._constraints: dict[int, int] = {}  # number when recorded -> number here
+        self._pair: tuple[Any, ...] | None = None
+
+    def bind(self, call: Call) -> Callable[[], Any]:
+        """The call, ready to be made on this client."""
+        return partial(
+            getattr(pybullet, call.name),
+            *call.arguments,
+            **call.options,
+            physicsClientId=self._number,
+        )
+
+    def grasp(self, calls: list[Call]) -> None:
+        """Take or let go as recorded."""
+        for call in calls:
+            if call.name == "createConstraint":
+                self._constraints[call.result] = self.bind(call)()
+            elif call.name in ("changeConstraint", "removeConstraint"):
+                recorded, *others = call.arguments
+                if call.name == "removeConstraint":
+                    number = self._constraints.pop(recorded)
+                else:
+                    number = self._constraints[recorded]
+                self.bind(Call(call.name, (number, *others), call.options, None))()
+            else:
+                self._pair = call.arguments
+                self.bind(call)()
+
+    def let_go(self) -> None:
+        """Leave the environment without a grasp that it does not know of."""
+        for number in self._constraints.values():
+            pybullet.removeConstraint(number, physicsClientId=self._number)
+        if self._constraints and self._pair is not None:
+            *pair, _ = self._pair
+            pybullet.setCollisionFilterPair(*pair, 1, physicsClientId=self._number)
+        self._constraints.clear()
+
+
+def _where(env: gym.Env[Any, Any], fresh: bool = False) -> NDArray[np.float64]:
+    """Angles of the motors, P and the object as last reported, or as they are in the engine now."""
+    unwrapped: Any = env.unwrapped
+    state = unwrapped.simulation.read() if fresh else unwrapped.state
+    return np.concatenate([state.theta, state.platform_position, state.object_position])

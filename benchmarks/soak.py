@@ -1,0 +1,346 @@
+"""Run the environments for a million steps and watch memory, loop gaps and speed.
+
+    make soak
+
+All ids in turn get visits of one to three episodes each. A visit is drawn from (seed, number of the
+visit) alone: resets with and without seeds, with options, in the middle of an episode and at its
+end; uniform, bang-bang and expert actions; a moment saved, left and gone back to, which must repeat
+itself to the last bit; now and then a picture; now and then the environment is closed and a new one
+made. What raises is taken down and does not end the soak: ``--replay VISIT`` raises it again.
+
+The memory is compared with that of the first sample after the warm-up, by which every id has been
+opened and has drawn a picture (each new environment draws one, so that all are alike), and caches
+have filled. Garbage is collected before a sample is taken, outside the time that counts as speed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import gc
+import sys
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import machine
+import numpy as np
+from machine import provenance
+from numpy.typing import NDArray
+from soak_report import judge, print_verdict, save_plot
+
+from tpm_gym import ENV_IDS
+from tpm_gym.expert import Expert
+
+Env = gym.Env[Any, Any]
+Make = Callable[..., Env]
+Policy = Callable[[dict[str, Any]], NDArray[np.float32]]
+
+REOPEN, RENDER, SAVE, WHOLE = 0.1, 0.01, 0.1, 0.5
+"""Shares: of visits that reopen; of episodes that draw another picture, save and restore, are run
+to their end."""
+POLICIES = {"uniform": 0.7, "bang-bang": 0.15, "expert": 0.15}
+PICTURE = {"render_mode": "rgb_array", "renderer": "tiny", "width": 32, "height": 24}
+MOST_FAILURES = 100
+
+
+@dataclass
+class Window:
+    """What is added up between two samples; gaps in metres."""
+
+    steps: int = 0
+    gap_sum: float = 0.0
+    gap_max: float = 0.0
+    gaps: int = 0
+    begun: float = field(default_factory=time.perf_counter)
+
+
+class Soak:
+    """A pool of environments, one of each id, and what happened to it.
+
+    Args:
+        seed: Of all visits.
+        make: Makes an environment from an id; ``gymnasium.make``, or a test's.
+    """
+
+    def __init__(self, seed: int, make: Make = gym.make) -> None:
+        """Start with no environment open."""
+        self.seed, self._make = seed, make
+        self._pool: dict[str, Env] = {}
+        self.steps = self.visits = 0
+        self.events: Counter[str] = Counter()
+        self.failures: list[dict[str, Any]] = []
+        self.window = Window()
+        self._episode = self._step = 0  # within the visit, for the report of a failure
+        self.opened: set[str] = set()
+
+    # -- visits -------------------------------------------------------------------------------
+
+    def visit(self) -> None:
+        """The next visit; what it raises is taken down, and its environment thrown away."""
+        number, self.visits = self.visits, self.visits + 1
+        env_id = ENV_IDS[number % len(ENV_IDS)]
+        try:
+            self.run_visit(number)
+        except Exception as error:
+            # An endurance test outlives whatever happens, and fails at the end.
+            self._fail(env_id, number, error)
+            env = self._pool.pop(env_id, None)
+            with contextlib.suppress(Exception):
+                if env is not None:
+                    env.close()
+
+    def run_visit(self, number: int) -> None:
+        """Visit ``number``: a function of it and the seed alone."""
+        rng = np.random.default_rng([self.seed, number])
+        self._episode = self._step = 0
+        env_id = ENV_IDS[number % len(ENV_IDS)]
+        reopen = rng.random() < REOPEN
+        if reopen and env_id in self._pool:
+            self._pool.pop(env_id).close()
+            self.events["closes"] += 1
+        fresh = env_id not in self._pool
+        if fresh:
+            self._pool[env_id] = self._make(env_id, **PICTURE)
+            self.events["openings"] += 1
+            self.opened.add(env_id)
+        env = self._pool[env_id]
+        for episode in range(int(rng.integers(1, 4))):
+            self._episode, self._step = episode, 0
+            self._run_episode(env, rng, first=episode == 0, picture=fresh and episode == 0)
+
+    def _run_episode(
+        self, env: Env, rng: np.random.Generator, *, first: bool, picture: bool
+    ) -> None:
+        """One reset and the steps after it."""
+        observation = self._reset(env, rng, first)
+        policy = _policy(env, rng, observation)
+        length = 10_000 if rng.random() < WHOLE else int(rng.integers(1, 50))
+        save_at = int(rng.integers(0, 40)) if rng.random() < SAVE else -1
+        if rng.random() < RENDER or picture:
+            self._render(env)
+        for index in range(length):
+            self._step = index
+            if index == save_at and self._check_restore(env, rng):
+                break
+            observation, _, terminated, truncated, _ = self._advance(env, policy(observation))
+            if terminated or truncated:
+                break
+
+    def _reset(self, env: Env, rng: np.random.Generator, first: bool) -> dict[str, Any]:
+        """With a seed (always at the start of a visit), without, or with options."""
+        kind = "seeded" if first else str(rng.choice(["seeded", "plain", "options"]))
+        self.events[f"resets {kind}"] += 1
+        seed, options = None, None
+        if kind == "seeded":
+            seed = int(rng.integers(2**31))
+        elif kind == "options":
+            unwrapped: Any = env.unwrapped
+            start = unwrapped.task.sample_object(rng)
+            options = {"goal": unwrapped.task.sample_goal(rng, start)}
+            if start is not None:
+                options["object"] = start
+        observation: dict[str, Any] = env.reset(seed=seed, options=options)[0]
+        return observation
+
+    def _advance(self, env: Env, action: NDArray[np.float32]) -> tuple[Any, ...]:
+        """One step, counted even if it raises."""
+        self.steps += 1
+        self.window.steps += 1
+        result = env.step(action)
+        info = result[4]
+        gap = info["closure_error"]
+        if not np.isfinite(gap):
+            raise RuntimeError(f"closure_error is {gap}")
+        if info["assembly_mode_changed"] or info["working_mode_changed"]:
+            self.events["mode changes"] += 1
+        self.window.gap_sum += gap
+        self.window.gap_max = max(self.window.gap_max, gap)
+        self.window.gaps += 1
+        return result
+
+    def _render(self, env: Env) -> None:
+        """Draw a picture."""
+        picture: Any = env.render()
+        if picture is None or picture.shape != (PICTURE["height"], PICTURE["width"], 3):
+            raise RuntimeError("render() gave no picture of the size asked for")
+        self.events["pictures"] += 1
+
+    def _check_restore(self, env: Env, rng: np.random.Generator) -> bool:
+        """Save, go on, go back, go on again in the same way; whether that ended the episode.
+
+        The steps are the unwrapped environment's, whose episode the time limit does not end.
+        """
+        inner: Any = env.unwrapped
+        actions = _uniform(env, rng, 5)
+        snapshot = inner.save_state()
+        ways: list[list[NDArray[np.float32]]] = []
+        ended = False
+        for _ in range(2):
+            seen = []
+            for action in actions:
+                observation, _, _, ended, _ = self._advance(inner, action)
+                seen.append(np.concatenate([observation[name] for name in sorted(observation)]))
+                if ended:  # by a change of mode: there are no steps after that
+                    break
+            ways.append(seen)
+            if len(ways) == 1:
+                inner.restore_state(snapshot)
+        self.events["restores"] += 1
+        if not np.array_equal(ways[0], ways[1]):
+            raise RuntimeError("what follows a restored state differs from what followed it first")
+        return bool(ended)
+
+    def _fail(self, env_id: str, number: int, error: Exception) -> None:
+        """Take down an exception with all that is needed to see it again."""
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        self.failures.append(
+            {
+                "env_id": env_id,
+                "visit": number,
+                "seed": self.seed,
+                "total_steps": self.steps,
+                "episode": self._episode,
+                "step": self._step,
+                "error": f"{type(error).__name__}: {error}",
+                "where": f"{Path(last.filename).name}:{last.lineno} {last.name}",
+            }
+        )
+        print(f"visit {number}, {env_id}: {self.failures[-1]['error']}", file=sys.stderr)
+
+    # -- samples ------------------------------------------------------------------------------
+
+    def sample(self) -> dict[str, Any]:
+        """What the last window gave, and the process's memory after a garbage collection."""
+        window, seconds = self.window, time.perf_counter() - self.window.begun
+        gc.collect()
+        result = {
+            "steps": self.steps,
+            "visits": self.visits,
+            "all_opened": len(self.opened) == len(ENV_IDS),
+            "memory_mb": machine.memory()[0],
+            "open_files": machine.open_files(),
+            "closure_mean": window.gap_sum / window.gaps if window.gaps else None,
+            "closure_max": window.gap_max if window.gaps else None,
+            "steps_per_second": window.steps / seconds,
+        }
+        self.window = Window()
+        return result
+
+    def close(self) -> None:
+        """Close all that is open."""
+        while self._pool:
+            _, env = self._pool.popitem()
+            with contextlib.suppress(Exception):
+                env.close()
+
+
+def _uniform(env: Env, rng: np.random.Generator, count: int) -> NDArray[np.float32]:
+    """(count, n) uniform actions."""
+    shape = env.action_space.shape or (0,)
+    return rng.uniform(-1.0, 1.0, (count, *shape)).astype(np.float32)
+
+
+def _policy(env: Env, rng: np.random.Generator, observation: dict[str, Any]) -> Policy:
+    """What acts in an episode."""
+    kind = str(rng.choice(list(POLICIES), p=list(POLICIES.values())))
+    if kind == "expert":
+        expert = Expert(env)
+        expert.reset(observation)
+        return expert.act
+    if kind == "uniform":
+        return lambda _: _uniform(env, rng, 1)[0]
+    return lambda _: np.sign(_uniform(env, rng, 1)[0])
+
+
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
+    parser.add_argument("--steps", type=int, default=1_000_000)
+    parser.add_argument("--every", type=int, help="steps between samples; default: a 200th of all")
+    parser.add_argument("--warm-up", type=int, help="steps; default: a 20th of all")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--limit-mb", type=float, default=10.0, help="of growth after the warm-up")
+    parser.add_argument("--json", type=Path, help="written anew at each sample")
+    parser.add_argument("--plot", type=Path, help="where to draw the samples")
+    parser.add_argument("--replay", type=int, metavar="VISIT", help="run this visit alone")
+    options = parser.parse_args(arguments)
+    if options.every is None:
+        options.every = max(1, options.steps // 200)
+    if options.warm_up is None:
+        options.warm_up = options.steps // 20
+    if min(options.steps, options.every) < 1:
+        parser.error("--steps and --every must be 1 or more")
+    return options
+
+
+def main(arguments: Sequence[str] | None = None, make: Make = gym.make) -> int:
+    """Run the soak; the exit status is 0 only if it was finished and nothing was found."""
+    options = parse(arguments)
+    words = sys.argv if arguments is None else ["benchmarks/soak.py", *arguments]
+    soak = Soak(options.seed, make)
+    if options.replay is not None:
+        soak.run_visit(options.replay)
+        print(f"visit {options.replay} of seed {options.seed} raised nothing")
+        soak.close()
+        return 0
+    content: dict[str, Any] = machine.describe(words) | {
+        "seed": options.seed,
+        "steps": options.steps,
+        "warm_up": options.warm_up,
+        "limit_mb": options.limit_mb,
+        "memory_kind": machine.memory()[1],
+        "memory_before_mb": machine.memory()[0],
+        "finished": False,
+        "samples": [],
+        "failures": soak.failures,
+    }
+    with contextlib.suppress(KeyboardInterrupt):
+        _run(soak, options, content)
+    soak.close()
+    content["verdict"] = judge(content)
+    _write(options, content, soak)
+    print_verdict(content)
+    if options.plot and content["samples"]:
+        save_plot(content, options.plot)
+    return 0 if content["verdict"]["passed"] else 1
+
+
+def _run(soak: Soak, options: argparse.Namespace, content: dict[str, Any]) -> None:
+    """Visit until all steps are done, or too much has failed."""
+    due = options.every
+    while soak.steps < options.steps and len(soak.failures) < MOST_FAILURES:
+        soak.visit()
+        if soak.steps >= min(due, options.steps):
+            due = soak.steps - soak.steps % options.every + options.every
+            content["samples"].append(soak.sample())
+            _write(options, content, soak)
+            _progress(content["samples"][-1])
+    content["finished"] = soak.steps >= options.steps
+
+
+def _progress(sample: dict[str, Any]) -> None:
+    """One line a sample."""
+    gap = sample["closure_max"]
+    print(
+        f"{sample['steps']:>9} steps, {sample['memory_mb']:.1f} MB, largest gap "
+        f"{'-' if gap is None else f'{1e6 * gap:.1f} um'}, "
+        f"{sample['steps_per_second']:.0f} steps/s",
+        flush=True,
+    )
+
+
+def _write(options: argparse.Namespace, content: dict[str, Any], soak: Soak) -> None:
+    """Write all there is so far, so that an interrupted soak keeps its samples."""
+    content["events"] = dict(sorted(soak.events.items()))
+    if options.json:
+        provenance.write_json(options.json, content)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
