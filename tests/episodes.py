@@ -1,14 +1,17 @@
-"""Episodes to compare to the last bit."""
+"""Episodes to compare to the last bit. Fresh processes import this too, so it imports little."""
 
 from __future__ import annotations
 
 import hashlib
+import pickle
 from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
+import tpm_gym
 from tpm_gym.expert import Expert
 
 Step = tuple[dict[str, Any], float, dict[str, Any]]
@@ -25,6 +28,18 @@ EVERYTHING: dict[str, Any] = {
     "length_error": 2e-4,
 }
 """Every randomisation at once, as a configuration file would say it."""
+
+CASES: list[tuple[str, dict[str, Any]]] = [
+    *((env_id, {}) for env_id in tpm_gym.ENV_IDS),
+    ("TPMReachJoints-v0", EVERYTHING),
+    ("TPMPickAndPlace-v0", EVERYTHING),
+]
+"""Ids, and where their machines differ from the nominal one."""
+
+
+def make(env_id: str, machine: dict[str, Any], **options: Any) -> gym.Env[Any, Any]:
+    """An environment; also where tpm_gym has not been imported yet."""
+    return gym.make(f"tpm_gym:{env_id}", randomisation=machine, **options)
 
 
 def random_episode(env: gym.Env[Any, Any], seed: int, steps: int = 50) -> Iterator[Step]:
@@ -57,3 +72,35 @@ def fingerprint(steps: Iterable[Step]) -> str:
             digest.update(array.tobytes())
         digest.update(repr((reward, info)).encode())
     return digest.hexdigest()
+
+
+def bits(value: Any) -> Any:
+    """What two results are compared by."""
+    if isinstance(value, dict):
+        return {name: bits(entry) for name, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [bits(entry) for entry in value]
+    return value.tobytes() if isinstance(value, np.ndarray) else value
+
+
+def play(env: gym.Env[Any, Any], actions: Iterable[Any]) -> list[Any]:
+    """What each step returns, and the whole state behind it."""
+    return [(bits(env.step(action)), bits(vars(env.unwrapped.state))) for action in actions]
+
+
+def all_fingerprints() -> list[str]:
+    """Of an episode in each case."""
+    prints = []
+    for env_id, machine in CASES:
+        env = make(env_id, machine)
+        prints.append(fingerprint(expert_episode(env, 6, steps=30)))
+        env.close()
+    return prints
+
+
+def continued(path: str) -> str:
+    """How a pickled environment goes on."""
+    env = pickle.loads(Path(path).read_bytes())
+    steps = repr(play(env, [np.full(4, 0.3)] * 10))
+    env.close()
+    return steps

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
+import itertools
+import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -19,7 +22,7 @@ from tpm_gym.geometry import PAPER, Geometry
 from tpm_gym.links import MOTOR_EFFORT
 from tpm_gym.mechanism import ACTUATED_JOINTS, build, joint_angles
 from tpm_gym.physics import GRAVITY
-from tpm_gym.randomisation import NOMINAL, Plant, Randomisation
+from tpm_gym.randomisation import _FACTORS, _SIZES, NOMINAL, Plant, Randomisation
 from tpm_gym.simulation import Simulation
 from tpm_gym.state import Puck, Scene, State
 from tpm_gym.tasks import HOME
@@ -49,43 +52,47 @@ def rest(simulation: Simulation, plant: Plant, steps: int = 15) -> State:
 # -- options ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "limit"),
-    [
-        ("link_mass", 0.49, "0.5"),
-        ("link_mass", (0.5, 2.01), "2.0"),
-        ("link_mass", (1.2, 0.8), "(low, high)"),
-        ("link_mass", (1.0, 1.0, 1.0), "(low, high)"),
-        ("link_mass", "heavy", "a number"),
-        ("link_mass", None, "a number"),
-        ("puck_mass", 0.0, "0.1"),
-        ("puck_mass", (0.1, 11.0), "10.0"),
-        ("friction", (-1.0, 1.0), "0.1"),
-        ("friction", (0.5, np.nan), "3.0"),
-        ("motor_strength", True, "1.5"),
-        ("motor_strength", (0.5, np.inf), "1.5"),
-        ("encoder_noise", -1e-9, "0 to 0.005"),
-        ("encoder_noise", 0.0051, "0 to 0.005"),
-        ("encoder_noise", (0.0, 0.001), "a number"),
-        ("encoder_bias", 0.0051, "0 to 0.005"),
-        ("encoder_bias", np.nan, "0 to 0.005"),
-        ("length_error", 0.0021, "0 to 0.002"),
-        ("length_error", "0.001", "a number"),
-        ("latency", 2, "0 or 1"),
-        ("latency", 0.5, "0 or 1"),
-        ("latency", True, "0 or 1"),
-        ("latency", None, "0 or 1"),
-    ],
-)
+def out_of_range() -> Iterator[tuple[str, Any, str]]:
+    """Option, value, and what the error must say."""
+    for name, (low, high) in _FACTORS.items():
+        limits, pair = f"within {low} to {high}", "(low, high)"
+        for value in (0.99 * low, 1.01 * high, (0.99 * low, high), (low, 1.01 * high)):
+            yield name, value, limits
+        for value in (0.0, -1.0, np.nan, np.inf, (low, np.nan), True, None, "heavy"):
+            yield name, value, limits
+        for value in ((high, low), (1.0, 1.0, 1.0), (1.0,), {"low": 1.0}, ("1", "2")):
+            yield name, value, pair
+    for name, largest in _SIZES.items():
+        for value in (-1e-9, 1.01 * largest, np.nan, np.inf, True, None, "small", (0.0, largest)):
+            yield name, value, f"from 0 to {largest}"
+    for value in (2, -1, 0.5, True, None, "one", [1], np.nan):
+        yield "latency", value, "0 or 1"
+
+
+@pytest.mark.parametrize(("name", "value", "limit"), list(out_of_range()))
 def test_what_is_out_of_range_is_refused_by_name_value_and_limit(
     name: str, value: Any, limit: str
 ) -> None:
     with pytest.raises(ConfigurationError) as caught:
-        TPMEnv(randomisation={name: value})
+        Randomisation.of({name: value})
     assert caught.value.name == name
     assert repr(caught.value.value) == repr(value)
     assert limit in caught.value.valid
     assert limit in str(caught.value)
+
+
+def test_the_documentation_states_the_ranges() -> None:
+    text = inspect.getdoc(Randomisation) or ""
+    found = re.findall(r"^ {4}(\w+): (.*(?:\n {8}.*)*)", text, flags=re.MULTILINE)
+    entries = {name: " ".join(entry.split()) for name, entry in found}
+    for name, (low, high) in _FACTORS.items():
+        assert f"within {low:g} to {high:g}." in entries[name]
+    for name, largest in _SIZES.items():
+        assert re.search(rf"(at most|most) {largest:g}\.( |$)", entries[name])
+    puck = Puck()
+    assert f"({1e3 * puck.mass:g} g)" in entries["puck_mass"]
+    assert f"({puck.friction:g} on the table)" in entries["friction"]
+    assert f"({MOTOR_EFFORT:g} N m)" in entries["motor_strength"]
 
 
 @pytest.mark.parametrize("value", [0.1, "all", [("latency", 1)], {"encoder_jitter": 1}, {1: 2}])
@@ -125,18 +132,15 @@ def numbers(plant: Plant) -> FloatArray:
 
 
 def test_draws_fill_the_stated_ranges_and_are_independent() -> None:
-    wide = Randomisation(
-        link_mass=(0.5, 2.0),
-        puck_mass=(0.1, 10.0),
-        friction=(0.1, 3.0),
-        motor_strength=(0.5, 1.5),
-        encoder_bias=5e-3,
-        length_error=2e-3,
-    )
+    sizes = {name: _SIZES[name] for name in ("encoder_bias", "length_error")}
+    wide = Randomisation(**_FACTORS, **sizes)
     rng = np.random.default_rng(1)
     draws = np.array([numbers(wide.draw(rng, LINKS)) for _ in range(3000)])
-    factors = [(0.5, 2.0)] * LINKS + [(0.1, 10.0), (0.1, 3.0)] + [(0.5, 1.5)] * 3
-    low, high = np.array(factors + [(-5e-3, 5e-3)] * 3 + [(-2e-3, 2e-3)] * 7).T
+    counts = {"link_mass": LINKS, "puck_mass": 1, "friction": 1, "motor_strength": 3}
+    ranges = [_FACTORS[name] for name, count in counts.items() for _ in range(count)]
+    for size, count in zip(sizes.values(), (3, 7), strict=True):
+        ranges += [(-size, size)] * count
+    low, high = np.array(ranges).T
     unit = (draws - low) / (high - low)
     assert (unit >= 0).all()
     assert (unit <= 1).all()
@@ -468,6 +472,15 @@ def test_states_of_other_machines_can_be_restored() -> None:
     env.close()
 
 
+@pytest.mark.parametrize("bias", [0.0, _SIZES["encoder_bias"]])
+def test_the_arm_at_home_stands_on_its_own_side_at_every_corner_of_the_ranges(bias: float) -> None:
+    error = _SIZES["length_error"]
+    for signs in itertools.product((-1, 1), repeat=10):
+        theta = THETA - bias * np.array(signs[:3])
+        position = kinematics.forward(theta, geometry=lengths(error * np.array(signs[3:])))
+        assert position[1] > 0.005
+
+
 # -- all together ----------------------------------------------------------------------------------
 
 MODERATE: Mapping[str, Any] = {
@@ -491,19 +504,10 @@ def test_the_expert_succeeds_on_moderately_different_machines(env_id: str) -> No
 
 
 EXTREMES: list[dict[str, Any]] = [
-    {"link_mass": 0.5},
-    {"link_mass": 2.0},
-    {"link_mass": (0.5, 2.0)},
-    {"puck_mass": 0.1},
-    {"puck_mass": 10.0},
-    {"friction": 0.1},
-    {"friction": 3.0},
-    {"motor_strength": 0.5},
-    {"motor_strength": 1.5},
-    {"encoder_noise": 5e-3},
-    {"encoder_bias": 5e-3},
-    {"length_error": 2e-3},
-    {"latency": 1},
+    *({name: end} for name, ends in _FACTORS.items() for end in ends),
+    *({name: largest} for name, largest in _SIZES.items()),
+    {"link_mass": _FACTORS["link_mass"][1], "motor_strength": _FACTORS["motor_strength"][0]},
+    {**_FACTORS, **_SIZES, "latency": 1},
 ]
 
 
@@ -518,7 +522,7 @@ def hammer(option: dict[str, Any], seeds: range) -> int:
             observation, reward, _, truncated, info = env.step(action)
             assert env.observation_space.contains(observation)
             assert np.isfinite(reward)
-            assert info["closure_error"] < 0.5e-3
+            assert info["closure_error"] < 2e-3
             if truncated:
                 assert info["assembly_mode_changed"]
                 lost += 1
@@ -530,3 +534,9 @@ def hammer(option: dict[str, Any], seeds: range) -> int:
 @pytest.mark.parametrize("option", EXTREMES)
 def test_at_the_ends_of_the_ranges_nothing_is_lost_or_it_is_reported(option: Any) -> None:
     hammer(option, range(2))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("option", EXTREMES)
+def test_at_the_ends_of_the_ranges_nothing_is_lost_unreported_in_many_episodes(option: Any) -> None:
+    hammer(option, range(100, 200))

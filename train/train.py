@@ -20,6 +20,7 @@ import os
 import shutil
 import signal
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
@@ -136,12 +137,26 @@ def _disk_errors_named(run: Path, store: CheckpointStore) -> Iterator[None]:
 
     Training without its logs would be of no use, so it ends; only a checkpoint may fail.
     """
+    before = threading.excepthook
+
+    def hook(failed: threading.ExceptHookArgs) -> None:
+        # TensorBoard's thread fails as well, and its traceback would bury the error's one line.
+        if not _is_disk_error(failed.exc_value):
+            before(failed)
+
+    threading.excepthook = hook
     try:
         yield
     except OSError as error:
-        if error.errno not in _DISK_ERRORS:
+        if not _is_disk_error(error):
             raise
         raise RunWriteError(run, error.strerror or str(error), store.newest) from error
+    finally:
+        threading.excepthook = before
+
+
+def _is_disk_error(error: BaseException | None) -> bool:
+    return isinstance(error, OSError) and error.errno in _DISK_ERRORS
 
 
 def _prepare_folder(run: Path, overwrite: bool) -> None:

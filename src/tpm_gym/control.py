@@ -12,8 +12,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tpm_gym.errors import ConfigurationError
-from tpm_gym.kinematics import DEFAULT_ASSEMBLY, ForwardSolutions, forward_all, inverse
+from tpm_gym import jacobian, single
+from tpm_gym.errors import ConfigurationError, UnreachableError
+from tpm_gym.geometry import PAPER
+from tpm_gym.kinematics import DEFAULT_ASSEMBLY, inverse
 from tpm_gym.workspace import TASK_REGION
 
 __all__ = ["JOINT_LIMIT", "STEP_LIMIT", "CartesianControl", "Control", "JointControl", "make"]
@@ -26,6 +28,7 @@ STEP_LIMIT.setflags(write=False)
 
 JOINT_LIMIT = 0.08
 """Largest change of a joint's command in one control step, rad."""
+_BISECTIONS = 10  # the fraction of a step to a thousandth
 
 
 class Control(Protocol):
@@ -65,29 +68,32 @@ class JointControl:
         start = np.asarray(current, dtype=np.float64)
         theta = inverse(start)
         step = np.asarray(action, dtype=np.float64) * JOINT_LIMIT
-        point = start
-        low, high = 0.0, 1.0
-        # The largest allowed fraction of the step, to 1/64 and then to 1/4096 of it.
-        for _ in range(2):
-            fractions = np.linspace(low, high, 65)[1:]
-            solutions = forward_all(theta + fractions[:, None] * step)
-            points = solutions.position[:, DEFAULT_ASSEMBLY.index]
-            allowed = self._allowed(solutions, start)
-            count = len(fractions) if allowed.all() else int(allowed.argmin())
-            if count:
-                point = points[count - 1]
-            if count == len(fractions):
-                break
-            low, high = (fractions[count - 1] if count else low), fractions[count]
+        # By J, this fraction of the step uses the limit up; the exact one is near.
+        rate = np.abs(jacobian.evaluate(theta).velocity @ step)
+        linear = float((STEP_LIMIT / np.maximum(rate, 1e-12)).min())
+        low, high = 0.0, min(1.0, 2 * linear)
+        point = self._allowed(theta + high * step, start)
+        if point is None:
+            point = start
+            for _ in range(_BISECTIONS):
+                middle = (low + high) / 2
+                tried = self._allowed(theta + middle * step, start)
+                if tried is None:
+                    high = middle
+                else:
+                    low, point = middle, tried
         return TASK_REGION.project(point)
 
-    def _allowed(self, solutions: ForwardSolutions, start: FloatArray) -> NDArray[np.bool_]:
-        """Whether postures are assembled as ``start`` is, with P no farther than STEP_LIMIT."""
-        slot = DEFAULT_ASSEMBLY.index
-        moved = np.abs(solutions.position[:, slot] - start) <= STEP_LIMIT
-        same_mode = np.abs(solutions.beta[:, slot]) < np.pi / 2  # cos(beta) > 0; NaN compares false
-        allowed: NDArray[np.bool_] = moved.all(axis=-1) & same_mode
-        return allowed
+    def _allowed(self, theta: FloatArray, start: FloatArray) -> FloatArray | None:
+        """Point P at ``theta``, if it is assembled as at ``start`` and within STEP_LIMIT of it."""
+        a, b, c = theta.tolist()
+        try:
+            there = single.assemble((a, b, c), DEFAULT_ASSEMBLY, PAPER)
+        except UnreachableError:
+            return None
+        point = np.array(there[:3])
+        near = bool((np.abs(point - start) <= STEP_LIMIT).all())
+        return point if near and there.cos_beta > 0 else None
 
     def action(self, wanted: ArrayLike, current: ArrayLike) -> FloatArray:
         """The increment of the joints, scaled down as a whole where it is too large."""

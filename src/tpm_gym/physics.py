@@ -56,7 +56,7 @@ class Physics:
     time_step: float = 1 / 250
     solver: str = "direct"
     iterations: int = 50
-    erp: float = 0.8
+    erp: float = 1.0
     control_period: float = CONTROL_PERIOD
 
     def __post_init__(self) -> None:

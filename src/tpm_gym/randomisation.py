@@ -29,10 +29,11 @@ _FACTORS: dict[str, Range] = {
     "friction": (0.1, 3.0),
     "motor_strength": (0.5, 1.5),
 }
+# With bias and lengths off by all of this at once, the arm at home still stands on its own side.
 _SIZES: dict[str, float] = {
-    "encoder_noise": 5e-3,
-    "encoder_bias": 5e-3,
-    "length_error": 2e-3,
+    "encoder_noise": 1e-3,
+    "encoder_bias": 1e-3,
+    "length_error": 1e-3,
 }
 
 
@@ -81,13 +82,13 @@ class Randomisation:
         puck_mass: Factor of the puck's mass (50 g); within 0.1 to 10.
         friction: Factor of the puck's friction (0.6 on the table); within 0.1 to 3.
         motor_strength: Factor of each motor's largest torque (100 N m); within 0.5 to 1.5.
-        encoder_noise: Standard deviation of each reading of an encoder, rad; at most 0.005.
+        encoder_noise: Standard deviation of each reading of an encoder, rad; at most 0.001.
             The rates are differences of readings over a control period, and as noisy.
-        encoder_bias: Each encoder is off by up to this, rad; at most 0.005. Its motor goes where
+        encoder_bias: Each encoder is off by up to this, rad; at most 0.001. Its motor goes where
             the encoder says, so the arm is off too.
         latency: Control steps by which actions come late, 0 or 1.
-        length_error: Each of l1 to l7 is off by up to this, m; at most 0.002. The robot is then
-            built anew at each reset, which takes some 10 ms.
+        length_error: Each of l1 to l7 is off by up to this, m; at most 0.001. The robot is then
+            built anew at each reset, which takes several times as long.
 
     Raises:
         ConfigurationError: If a value is out of range.

@@ -1,9 +1,9 @@
 """The robot inside a physics client: three legs, loop closures, motors, encoders, and the truth.
 
 Each leg of the spanning tree is a multibody of its own, so that every loop closure joins two
-different multibodies. That is not a matter of taste: Bullet's direct solvers leave out half of the
-coupling between two rows whose both ends lie in one multibody, and lose the loops at once; between
-multibodies they are exact. It also shortens every row of the constraint solver.
+different multibodies. That is not a matter of taste: where both ends lie in one multibody, Bullet's
+direct solvers go wrong and lose the loops at once; between multibodies they are exact
+(docs/fidelity.md). It also shortens every row of the constraint solver.
 
 The client is handed in (see :mod:`tpm_gym.simulation`), so this module does not import the engine.
 """
@@ -17,8 +17,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tpm_gym import urdf
+from tpm_gym.errors import ConfigurationError
 from tpm_gym.links import CUP_PRELOAD, MOTOR_EFFORT
 from tpm_gym.mechanism import ACTUATED_JOINTS, Mechanism, Mount
 from tpm_gym.parts import Vector
@@ -99,10 +101,7 @@ class Robot:
         for closure in self._mechanism.closures:
             sides = ((closure.link_a, closure.point_a), (closure.link_b, closure.point_b))
             (body_a, link_a), (body_b, link_b) = (self._links[name] for name, _ in sides)
-            pivots = [
-                np.asarray(point) - self._mechanism.link(name).centre_of_mass
-                for name, point in sides
-            ]
+            pivots = [self._pivot(name, point) for name, point in sides]
             constraint = client.createConstraint(
                 body_a,
                 link_a,
@@ -122,6 +121,20 @@ class Robot:
             {self._platform, *(end[0] for pair in self._pairs for end in pair)}
         ):
             self._watched.setdefault(body, []).append(link)
+
+    def _pivot(self, name: str, point: Vector) -> NDArray[np.float64]:
+        """A link's point relative to its centre of mass, m.
+
+        Raises:
+            ConfigurationError: If the link has products of inertia: the engine would turn its
+                inertial frame onto the principal axes, and the loop would not close there.
+        """
+        link = self._mechanism.link(name)
+        if not np.allclose(link.inertia, np.diag(np.diag(link.inertia)), rtol=0.0, atol=1e-12):
+            valid = "links whose principal axes of inertia are the axes of their frame"
+            raise ConfigurationError("mechanism", name, valid)
+        relative: NDArray[np.float64] = np.asarray(point) - link.centre_of_mass
+        return relative
 
     def paint(self) -> None:
         """Give each link the colour of its largest solid.

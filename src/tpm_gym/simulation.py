@@ -88,7 +88,7 @@ class Simulation:
         self.scene, self.geometry, self.mount = scene, geometry, mount
         self.physics = Physics() if physics is None else physics
         self.mechanism = build(geometry)
-        self._gui, self._painted = gui, gui or renderer == "egl"
+        self._gui, self._renderer = gui, renderer
         self._client = Client(self.physics, gui, renderer)
         try:
             self._load(NOMINAL)
@@ -111,20 +111,28 @@ class Simulation:
         self._scenery = Scenery(self._client, self.scene)
         if self._gui:
             self._scenery.aim_window()
-        if self._painted:
+        if self._gui or self._renderer == "egl":
             self._robot.paint()
         self._cup: Cup | None = None
         if self.scene.puck is not None and self._scenery.puck is not None:
             self._cup = Cup(self._client, self._robot, self._scenery.puck, self.scene.puck)
         self._plant = Plant(length_errors=plant.length_errors)
 
+    def _empty(self) -> None:
+        """Take everything out of the client; a window stays, else a new client leaks least."""
+        if self._gui:
+            self._client.resetSimulation()
+            self._client.configure(self.physics)
+        else:
+            self._client.close()
+            self._client = Client(self.physics, renderer=self._renderer)
+
     def _become(self, plant: Plant) -> None:
         """Make the simulated machine that of ``plant``."""
         if plant == self._plant:
             return
         if plant.geometry(self.geometry) != self._true_geometry:
-            self._client.resetSimulation()
-            self._client.configure(self.physics)
+            self._empty()
             self._load(plant)
         self._robot.alter(plant.link_masses, plant.motor_strength)
         self._scenery.alter_puck(plant.puck_mass, plant.friction)
