@@ -131,7 +131,7 @@ LABELS: dict[str, dict[str, tuple[str, tuple[float, float], str]]] = {
         "1/1000 s": ("1/1000 s", (-6, -3), "right"),
         "erp 0.2": ("erp 0.2", (-6, -8), "right"),
         "erp 0.5": ("erp 0.5", (-6, -3), "right"),
-        "erp 1.0": ("erp 1", (-6, -6), "right"),
+        "erp 0.8": ("erp 0.8", (-6, -3), "right"),
         "1/250 s, 25 iterations": ("25 iterations, 1/250 s", (6, -2), "left"),
         "1/250 s, 400 iterations": ("400", (4, 3), "left"),
         "1/500 s, 100 iterations": ("1/500 s", (-5, -5), "right"),

@@ -37,7 +37,7 @@ def sweep() -> tuple[Config, ...]:
 
 def _direct() -> list[Config]:
     steps = [Config("direct", f"1/{rate} s", time_step=1 / rate) for rate in (125, 500, 1000)]
-    erps = [Config("direct", f"erp {erp}", erp=erp) for erp in (0.2, 0.5, 1.0)]
+    erps = [Config("direct", f"erp {erp}", erp=erp) for erp in (0.2, 0.5, 0.8)]
     cfms = [Config("direct", f"CFM {cfm:g}", cfm=cfm) for cfm in (0.0, 1e-6)]
     return [*steps, *erps, *cfms]
 

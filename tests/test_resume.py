@@ -637,49 +637,34 @@ def test_checkpoints_take_a_fiftieth_of_the_time_at_most(
 # -- real kills -----------------------------------------------------------------------------------
 
 
-def run_and_kill(arguments: list[str], after: float) -> int:
-    """Start train.py, kill -9 it some seconds after it has begun to train; return its status."""
+def kill_beyond(run: Path, step: int, arguments: list[str], delay: float = 0.0) -> int:
+    """Start train.py and kill -9 it once it has saved a step; return its exit status."""
     process = subprocess.Popen(
-        [sys.executable, str(SCRIPT), *arguments], stdout=subprocess.PIPE, text=True
+        [sys.executable, str(SCRIPT), "--run", str(run), *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
     )
     assert process.stdout is not None
-    process.stdout.readline()  # the plan: the run folder is there
-    try:
-        process.communicate(timeout=after)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.communicate()
+    process.stdout.readline()  # so that the imports are done
+    while process.poll() is None and newest(run) < step:
+        time.sleep(0.001)
+    time.sleep(delay)
+    process.kill()
+    process.communicate()
     return process.returncode
 
 
-def resume_until_done(run: Path, draw: random.Random, kills: int, most: float) -> int:
-    """Kill a run a number of times, then let it end; return how many kills hit it."""
-    hits = 0
-    arguments = ["--run", str(run), "--resume"]
-    for _ in range(kills):
-        hits += run_and_kill(arguments, draw.uniform(0.5, most)) == -signal.SIGKILL
-    subprocess.run([sys.executable, str(SCRIPT), *arguments], check=True, capture_output=True)
-    return hits
+def newest(run: Path) -> int:
+    names = [path.name for path in run.glob("checkpoints/*")]
+    return max((int(name) for name in names if name.isdigit()), default=-1)
 
 
 def test_kill_9_costs_nothing(uninterrupted: Callable[[str], Path], tmp_path: Path) -> None:
     config = make_config("sac", tmp_path)
     run = tmp_path / "run"
-    arguments = ["--recipe", str(config.recipe), "--run", str(run), "--eval-episodes", "1"]
-    arguments += ["--eval-every", "70", "--checkpoint-every", "1"]
-    process = subprocess.Popen(
-        [sys.executable, str(SCRIPT), *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    deadline = time.monotonic() + 120
-    while not list(run.glob("checkpoints/00000012?")) and process.poll() is None:
-        assert time.monotonic() < deadline
-        time.sleep(0.001)
-    process.kill()
-    process.communicate()
-    assert process.returncode == -signal.SIGKILL
+    arguments = ["--recipe", str(config.recipe), "--eval-episodes", "1", "--eval-every", "70"]
+    arguments += ["--checkpoint-every", "1"]
+    assert kill_beyond(run, 120, arguments) == -signal.SIGKILL
     assert CheckpointStore(run / "checkpoints").load(pytest.fail).step < 300
     assert train.train(Config(run=run, resume=True, checkpoint_every=1000), quiet()) is None
     assert_equal_runs(uninterrupted("sac"), run)
@@ -696,19 +681,18 @@ def success(run: Path, episodes: int) -> float:
 
 @pytest.mark.slow
 def test_ten_kills_at_random_moments_change_nothing(tmp_path: Path) -> None:
-    options = ["--eval-episodes", "5", "--checkpoint-every", "100"]
+    arguments = ["--eval-episodes", "5", "--checkpoint-every", "100"]
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    started = time.monotonic()
-    subprocess.run(
-        [sys.executable, str(SCRIPT), *options, "--run", str(whole)],
-        check=True,
-        capture_output=True,
-    )
-    each = (time.monotonic() - started) / 8  # of a tenth kill the run should not yet be done
+    command = [sys.executable, str(SCRIPT), "--run"]
+    subprocess.run([*command, str(whole), *arguments], check=True, capture_output=True)
     draw = random.Random(0)
-    hits = int(run_and_kill([*options, "--run", str(killed)], draw.uniform(0.5, each)) < 0)
-    hits += resume_until_done(killed, draw, 9, each)
-    assert hits == 10
+    for step in sorted(draw.sample(range(4500), 10)):  # of 5000
+        status = kill_beyond(killed, step, arguments, delay=draw.uniform(0.0, 1.0))
+        assert status == -signal.SIGKILL
+        arguments = ["--resume"]
+    subprocess.run([*command, str(killed), "--resume"], check=True, capture_output=True)
+    resumptions = json.loads((killed / "config.json").read_text())["resumed"]
+    assert len(resumptions) > 5  # those between the same two checkpoints count once
     assert_equal_runs(whole, killed)
     assert success(killed, 100) == success(whole, 100)
     assert success(killed, 100) > 0.9

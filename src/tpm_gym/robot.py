@@ -172,14 +172,8 @@ class Robot:
         """Let the motors go to ``theta`` rad within the next time step, effort permitting."""
         turn, mode = self._client.setJointMotorControl2, self._client.POSITION_CONTROL
         for (body, joint), angle, effort in zip(self._motors, theta, self._effort, strict=True):
-            turn(
-                body,
-                joint,
-                mode,
-                targetPosition=angle,
-                force=effort,
-                positionGain=MOTOR_GAIN,
-            )
+            # Target angle and rate, largest torque, gain; as keywords they cost half as much again.
+            turn(body, joint, mode, angle, 0.0, effort, MOTOR_GAIN)
 
     def encoders(self) -> tuple[Vector, Vector]:
         """True angles (rad) and rates (rad/s) of the motors."""

@@ -235,8 +235,9 @@ class Simulation:
         if not gap <= CLOSURE_LIMIT:  # so that a NaN fails too
             raise ClosureError(gap, CLOSURE_LIMIT)
         theta, rates = self._disturb(true_theta, true_rates)
-        (x, y, z, *_), rows, conditioning = self._evaluate(theta)
+        assembly, rows, conditioning = self._evaluate(theta)
         self._watch_mode(true_theta, platform)
+        x, y, z, *_ = assembly
         position, quaternion, velocity, spin = self._scenery.puck_state()
         r1, r2, r3 = rates
         return State(
