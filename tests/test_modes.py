@@ -157,7 +157,7 @@ def test_a_disturbance_through_the_plane_ends_the_episode_and_the_next_reset_rec
     release()
     with pytest.raises(ModeChangeError, match="reset"):
         env.step(idle)
-    with pytest.raises(EpisodeError, match="reset"):  # nor can one go on after that
+    with pytest.raises(ModeChangeError, match="reset"):  # nor can one go on after that
         env.step(idle)
     assert fingerprint(random_episode(env, 4)) == fingerprint(random_episode(fresh, 4))
     env.close()

@@ -508,9 +508,10 @@ MODERATE: Mapping[str, Any] = {
 }
 
 
-@pytest.mark.parametrize("env_id", ["TPMReach-v0", "TPMPickAndPlace-v0"])
-def test_the_expert_succeeds_on_moderately_different_machines(env_id: str) -> None:
-    env = gym.make(env_id, randomisation=MODERATE)
+@pytest.mark.parametrize("latency", [0, 1])
+@pytest.mark.parametrize("env_id", ["TPMReach-v0", "TPMPickAndPlace-v0", "TPMReachJoints-v0"])
+def test_the_expert_succeeds_on_moderately_different_machines(env_id: str, latency: int) -> None:
+    env = gym.make(env_id, randomisation={**MODERATE, "latency": latency})
     for seed in range(20):
         *_, (_, _, info) = expert_episode(env, seed)
         assert info["is_success"], seed

@@ -1,19 +1,15 @@
-"""A training that was killed or stopped ends, once resumed, as if nothing had happened."""
+"""A training that was killed ends, once resumed, as if nothing had happened."""
 
 from __future__ import annotations
 
-import csv
-import errno
-import io
 import json
 import os
 import random
-import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,212 +17,39 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch
-from rich.console import Console
 from stable_baselines3 import SAC
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import callbacks
 import train
-from callbacks import Checkpointing, SignalListener
 from checkpoint import CheckpointStore, Content
 from errors import (
-    CheckpointWriteError,
-    ConfigError,
-    NoCheckpointError,
     NoWholeCheckpointError,
-    ResumeConflictError,
-    RunBusyError,
-    RunWriteError,
 )
 from plan import Config
 from policies import load_policy
 from rollout import TEST_SEED, run_episodes
 from snapshot import EpisodeRecorder, restore
+from trainings import (
+    assert_equal_runs,
+    end_of,
+    evaluations,
+    kill_at,
+    make_config,
+    quiet,
+    resumed,
+    said,
+    table,
+    uninterrupted,
+)
 
 SCRIPT = Path(train.__file__)
-SAC_RECIPE = """
-{env}:
-  n_timesteps: 300
-  policy: MultiInputPolicy
-  buffer_size: 230
-  learning_starts: 100
-  train_freq: {train_freq}
-  batch_size: 16
-  gamma: 0.95
-  ent_coef: auto_0.1
-  replay_buffer_class: HerReplayBuffer
-  replay_buffer_kwargs: {{n_sampled_goal: 4, goal_selection_strategy: future}}
-  policy_kwargs: {{net_arch: [8], features_extractor_class: GoalGapExtractor}}
-"""
-PPO_RECIPE = """
-TPMReachDense-v0:
-  n_timesteps: 300
-  n_envs: {envs}
-  policy: MultiInputPolicy
-  n_steps: 40
-  batch_size: 20
-  n_epochs: 2
-  policy_kwargs: {{net_arch: [8]}}
-"""
-CASES = {
-    "sac": ("sac", "TPMReach-v0", SAC_RECIPE.format(env="TPMReach-v0", train_freq=2)),
-    "tqc": (
-        "tqc",
-        "TPMPickAndPlace-v0",
-        SAC_RECIPE.format(env="TPMPickAndPlace-v0", train_freq=3),
-    ),
-    "ppo": ("ppo", "TPMReachDense-v0", PPO_RECIPE.format(envs=1)),
-    "ppo in processes": ("ppo", "TPMReachDense-v0", PPO_RECIPE.format(envs=2)),
-}
-
-
-class Killed(BaseException):
-    """Ends a training without a chance to save anything."""
 
 
 @pytest.fixture(autouse=True)
 def _no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Drawing takes longer than all the rest of these trainings."""
     monkeypatch.setattr(callbacks, "draw_learning_curve", lambda *args: None)
-
-
-def quiet() -> Console:
-    return Console(file=io.StringIO(), width=200)
-
-
-def said(console: Console) -> str:
-    assert isinstance(console.file, io.StringIO)
-    return console.file.getvalue()
-
-
-def make_config(case: str, folder: Path) -> Config:
-    """A small training of which the second half learns."""
-    algo, env, text = CASES[case]
-    recipe = folder / f"{case}.yml"
-    recipe.write_text(text, encoding="utf-8")
-    return Config(
-        algo=algo,  # type: ignore[arg-type]
-        env=env,
-        recipe=recipe,
-        run=folder / "run",
-        eval_episodes=1,
-        eval_every=70,
-        checkpoint_every=50,
-    )
-
-
-@pytest.fixture(scope="module")
-def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """Runs by case that nothing has disturbed, not even a checkpoint."""
-    done: dict[str, Path] = {}
-
-    def run(case: str) -> Path:
-        if case not in done:
-            folder = tmp_path_factory.mktemp("uninterrupted")
-            config = replace(make_config(case, folder), checkpoint_every=10_000)
-            assert train.train(config, quiet()) is None
-            done[case] = folder / "run"
-        return done[case]
-
-    return run
-
-
-def interrupt_at(
-    monkeypatch: pytest.MonkeyPatch, step: int, interruption: Callable[[], object]
-) -> None:
-    """Let something happen in the middle of a step."""
-    before = Checkpointing._on_step
-
-    def on_step(self: Checkpointing) -> bool:
-        if self.num_timesteps >= step:
-            monkeypatch.setattr(Checkpointing, "_on_step", before)
-            interruption()
-        return before(self)
-
-    monkeypatch.setattr(Checkpointing, "_on_step", on_step)
-
-
-def kill_at(monkeypatch: pytest.MonkeyPatch, step: int, config: Config) -> None:
-    """Train, from a checkpoint if the configuration says so, up to a death at a step."""
-
-    def die() -> None:
-        raise Killed
-
-    interrupt_at(monkeypatch, step, die)
-    with pytest.raises(Killed):
-        train.train(config, quiet())
-
-
-def resumed(config: Config) -> Config:
-    return Config(run=config.run, resume=True)
-
-
-# -- comparing whole trainings --------------------------------------------------------------------
-
-
-def end_of(run: Path) -> Content:
-    """Return the last checkpoint of a run: everything that its next step would depend on."""
-    content = CheckpointStore(run / "checkpoints").load(pytest.fail)
-    assert content.finished
-    return content
-
-
-def without_times(value: Any) -> Any:
-    """Leave out what a clock has measured."""
-    clocks = ("t", "seconds", "wall_seconds")
-    if isinstance(value, dict):
-        return {
-            name: without_times(entry)
-            for name, entry in value.items()
-            if name not in clocks and not name.startswith("time/")
-        }
-    return [without_times(entry) for entry in value] if isinstance(value, list) else value
-
-
-def state_of(content: Content) -> Any:
-    return without_times(json.loads(content.files["state.json"]))
-
-
-def table(run: Path) -> list[dict[str, str]]:
-    """Return progress.csv without its clocks and without PPO's count of iterations a process."""
-    with (run / "progress.csv").open(encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    unequal = ("time/fps", "time/time_elapsed", "time/iterations")
-    return [{k: v for k, v in row.items() if k not in unequal} for row in rows]
-
-
-def evaluations(run: Path) -> Any:
-    lines = (run / "evaluations.jsonl").read_text(encoding="utf-8").splitlines()
-    return without_times([json.loads(line) for line in lines])
-
-
-def assert_equal_tensors(first: Any, second: Any) -> None:
-    assert type(first) is type(second)
-    if isinstance(first, torch.Tensor):
-        assert torch.equal(first, second)
-    elif isinstance(first, Mapping):
-        assert first.keys() == second.keys()
-        for name in first:
-            assert_equal_tensors(first[name], second[name])
-    elif isinstance(first, list | tuple):
-        for one, other in zip(first, second, strict=True):
-            assert_equal_tensors(one, other)
-    else:
-        assert first == second
-
-
-def assert_equal_runs(first: Path, second: Path) -> None:
-    """Compare two finished runs: networks, optimisers, buffer, generators, episodes and logs."""
-    one, other = end_of(first), end_of(second)
-    assert one.arrays.keys() == other.arrays.keys()
-    for name, array in one.arrays.items():
-        np.testing.assert_array_equal(array, other.arrays[name], err_msg=name)
-    tensors = [torch.load(io.BytesIO(end.files["torch.pt"])) for end in (one, other)]
-    assert_equal_tensors(*tensors)
-    assert state_of(one) == state_of(other)
-    assert table(first) == table(second)
-    assert evaluations(first) == evaluations(second)
 
 
 # -- killed ---------------------------------------------------------------------------------------
@@ -247,7 +70,6 @@ def assert_equal_runs(first: Path, second: Path) -> None:
 def test_a_killed_run_ends_as_if_nothing_had_happened(
     case: str,
     step: int,
-    uninterrupted: Callable[[str], Path],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -258,7 +80,7 @@ def test_a_killed_run_ends_as_if_nothing_had_happened(
 
 
 def test_a_run_killed_again_and_again_ends_the_same(
-    uninterrupted: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = make_config("sac", tmp_path)
     for step in (70, 40, 120, 170, 101, 260):  # some before the step that was reached already
@@ -288,7 +110,7 @@ def test_nothing_is_counted_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_logs_of_a_torn_write_are_put_right(
-    uninterrupted: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = make_config("sac", tmp_path)
     kill_at(monkeypatch, 240, config)
@@ -301,7 +123,7 @@ def test_logs_of_a_torn_write_are_put_right(
 
 
 def test_a_damaged_checkpoint_costs_only_time(
-    uninterrupted: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = make_config("sac", tmp_path)
     kill_at(monkeypatch, 240, config)
@@ -362,7 +184,6 @@ def fails(self: EpisodeRecorder, episode: dict[str, Any]) -> Any:
 @pytest.mark.parametrize("replay", [takes_another_course, fails])
 def test_an_episode_that_cannot_go_on_is_ended_and_not_joined_to_another(
     replay: Callable[..., Any],
-    uninterrupted: Callable[[str], Path],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -429,211 +250,6 @@ def train_logger(folder: Path) -> Any:
     return make_logger(folder / "log")
 
 
-# -- stopped --------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("case", "step", "number"),
-    [
-        ("sac", 1, signal.SIGINT),
-        ("sac", 187, signal.SIGINT),
-        ("tqc", 200, signal.SIGTERM),
-        ("ppo", 95, signal.SIGINT),
-    ],
-)
-def test_a_stopped_run_saves_and_goes_on(
-    case: str,
-    step: int,
-    number: signal.Signals,
-    uninterrupted: Callable[[str], Path],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    config = replace(make_config(case, tmp_path), checkpoint_every=10_000)
-    interrupt_at(monkeypatch, step, lambda: os.kill(os.getpid(), number))
-    handler, console = signal.getsignal(number), quiet()
-    assert train.train(config, console) == number
-    assert signal.getsignal(number) is handler
-    store = CheckpointStore(tmp_path / "run" / "checkpoints")
-    saved = store.load(pytest.fail).step
-    # PPO goes back to the beginning of its rollout of 40 steps, the others end theirs of 2 or 3.
-    assert saved == {"sac": step + 1, "tqc": 201, "ppo": 80}[case]
-    assert f"saved at step {saved}" in said(console)
-    assert f"--run {tmp_path / 'run'} --resume" in said(console)
-    assert (tmp_path / "run" / "last.zip").is_file()
-    assert train.train(resumed(config), quiet()) is None
-    assert_equal_runs(uninterrupted(case), tmp_path / "run")
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_second_signal_leaves_at_once(number: signal.Signals) -> None:
-    listener = SignalListener()
-    with listener.listening():
-        os.kill(os.getpid(), number)
-        assert listener.received == number
-        with pytest.raises(SystemExit) as caught:
-            signal.raise_signal(number)
-    assert caught.value.code == 128 + number
-
-
-# -- full disks -----------------------------------------------------------------------------------
-
-
-def test_training_goes_on_without_room_for_checkpoints(
-    uninterrupted: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    save = CheckpointStore.save
-
-    def full(self: CheckpointStore, content: Content) -> None:
-        if 150 <= content.step < 300:
-            raise CheckpointWriteError(Path("x"), "No space left on device", self.newest)
-        save(self, content)
-
-    monkeypatch.setattr(CheckpointStore, "save", full)
-    config, console = make_config("sac", tmp_path), quiet()
-    assert train.train(config, console) is None
-    warnings = [line for line in said(console).splitlines() if "warning:" in line]
-    assert len(warnings) == 3  # at 150, 200 and 250: it is tried again
-    assert all("No space left on device; that of step 100 stays" in line for line in warnings)
-    assert_equal_runs(uninterrupted("sac"), tmp_path / "run")
-
-
-def test_a_full_disk_ends_the_run_with_its_last_checkpoint_whole(
-    uninterrupted: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(*args: Any) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    config, console = make_config("sac", tmp_path), quiet()
-    interrupt_at(
-        monkeypatch, 205, lambda: monkeypatch.setattr(callbacks.PeriodicEvaluation, "_record", full)
-    )
-    with monkeypatch.context() as patched:
-        patched.setattr(
-            callbacks.PeriodicEvaluation, "_record", callbacks.PeriodicEvaluation._record
-        )
-        with pytest.raises(RunWriteError, match=r"from step 200 with --run .* --resume"):
-            train.train(config, console)
-    assert train.train(resumed(config), quiet()) is None
-    assert_equal_runs(uninterrupted("sac"), tmp_path / "run")
-
-
-# -- options --------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def half(tmp_path_factory: pytest.TempPathFactory) -> Config:
-    """A run that was killed half way; not to be changed."""
-    config = make_config("sac", tmp_path_factory.mktemp("half"))
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        kill_at(monkeypatch, 160, config)
-    return config
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"seed": 7}, "--seed is 7, but the run to be resumed has 0"),
-        ({"env": "TPMPickAndPlace-v0"}, "--env is TPMPickAndPlace-v0, .* has TPMReach-v0"),
-        ({"algo": "tqc"}, "--algo is tqc, .* has sac"),
-        ({"envs": 2}, "--envs is 2, .* has 1"),
-        ({"eval_episodes": 3}, "--eval-episodes is 3, .* has 1"),
-    ],
-)
-def test_options_that_contradict_the_run_are_refused(
-    half: Config, options: dict[str, Any], message: str
-) -> None:
-    with pytest.raises(ResumeConflictError, match=message):
-        train.train(replace(resumed(half), **options), quiet())
-
-
-def test_a_recipe_that_contradicts_the_run_is_refused(half: Config, tmp_path: Path) -> None:
-    assert half.recipe is not None
-    path = tmp_path / "other.yml"
-    path.write_text(half.recipe.read_text().replace("gamma: 0.95", "gamma: 0.9"))
-    with pytest.raises(ResumeConflictError, match=r"gamma is 0\.9, .* has 0\.95"):
-        train.train(replace(resumed(half), recipe=path), quiet())
-
-
-def test_fewer_steps_than_taken_and_overwriting_are_refused(half: Config) -> None:
-    with pytest.raises(ConfigError, match="--steps 140: the run has already taken 150"):
-        train.train(replace(resumed(half), steps=140), quiet())
-    with pytest.raises(ConfigError, match="exclude each other"):
-        train.train(replace(resumed(half), overwrite=True), quiet())
-    with pytest.raises(ConfigError, match="--eval-every 0"):
-        train.train(replace(resumed(half), eval_every=0), quiet())
-
-
-def test_options_that_agree_are_accepted(
-    half: Config, uninterrupted: Callable[[str], Path], tmp_path: Path
-) -> None:
-    assert half.run is not None
-    shutil.copytree(half.run, tmp_path / "run")
-    config = replace(half, run=tmp_path / "run", resume=True, checkpoint_every=1000)
-    assert train.train(config, quiet()) is None
-    assert_equal_runs(uninterrupted("sac"), tmp_path / "run")
-
-
-def test_a_finished_run_has_nothing_to_do_unless_it_is_to_take_more_steps(
-    uninterrupted: Callable[[str], Path], tmp_path: Path
-) -> None:
-    run = tmp_path / "run"
-    shutil.copytree(uninterrupted("sac"), run)
-    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
-    console = quiet()
-    assert train.train(Config(run=run, resume=True), console) is None
-    assert f"nothing to do: {run} has finished its 300 steps" in said(console)
-    assert before == {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
-    assert train.train(Config(run=run, resume=True, steps=360), quiet()) is None
-    assert [line["steps"] for line in evaluations(run)][-2:] == [300, 360]
-    assert json.loads((run / "config.json").read_text())["steps"] == 360
-
-
-def test_nothing_to_resume_is_an_error_that_says_so(tmp_path: Path) -> None:
-    for run in (tmp_path, tmp_path / "nowhere"):
-        with pytest.raises(NoCheckpointError, match="leave out --resume"):
-            train.train(Config(run=run, resume=True), quiet())
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="there are no such locks")
-def test_two_processes_cannot_train_in_one_folder(half: Config) -> None:
-    assert half.run is not None
-    with train._claimed(half.run), pytest.raises(RunBusyError, match="another process"):
-        train.train(resumed(half), quiet())
-    with train._claimed(half.run), pytest.raises(RunBusyError, match="another process"):
-        train.train(replace(half, overwrite=True), quiet())
-    assert (half.run / "config.json").is_file()
-
-
-def test_checkpoints_take_a_fiftieth_of_the_time_at_most(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """With a clock that only checkpoints (3 s) and rollouts of two steps (2 s) move."""
-    clock, saved = [0.0], []
-
-    class Clock:
-        perf_counter = staticmethod(lambda: clock[0])
-        time_ns = staticmethod(lambda: int(clock[0] * 1e9))
-
-    def save(self: CheckpointStore, content: Content) -> None:
-        clock[0] += 3.0
-        saved.append(content.step)
-
-    rollout_start = Checkpointing._on_rollout_start
-
-    def tick(self: Checkpointing) -> None:
-        clock[0] += 2.0
-        rollout_start(self)
-
-    monkeypatch.setattr(callbacks, "time", Clock)
-    monkeypatch.setattr(CheckpointStore, "save", save)
-    monkeypatch.setattr(Checkpointing, "_on_rollout_start", tick)
-    config = replace(make_config("sac", tmp_path), checkpoint_every=None, eval_every=1000)
-    train.train(replace(config, steps=330), quiet())
-    assert saved == [0, 150, 300, 330]  # the last is the end
-
-
 # -- real kills -----------------------------------------------------------------------------------
 
 
@@ -659,7 +275,7 @@ def newest(run: Path) -> int:
     return max((int(name) for name in names if name.isdigit()), default=-1)
 
 
-def test_kill_9_costs_nothing(uninterrupted: Callable[[str], Path], tmp_path: Path) -> None:
+def test_kill_9_costs_nothing(tmp_path: Path) -> None:
     config = make_config("sac", tmp_path)
     run = tmp_path / "run"
     arguments = ["--recipe", str(config.recipe), "--eval-episodes", "1", "--eval-every", "70"]

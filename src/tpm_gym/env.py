@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from tpm_gym import checks, kinematics, reports, tasks
 from tpm_gym.control import make as make_control
 from tpm_gym.engine import has_display
-from tpm_gym.errors import ConfigurationError, EpisodeError
+from tpm_gym.errors import ConfigurationError, EpisodeError, ModeChangeError
 from tpm_gym.mechanism import DEFAULT_MOUNT
 from tpm_gym.physics import CONTROL_PERIOD, Physics
 from tpm_gym.randomisation import Randomisation
@@ -97,8 +97,8 @@ class TPMEnv(gym.Env[Observation, Action]):
     | singularity | -penalty_weight x penalty: 0 where 1/cond(J) >= 0.08, 1 at a singularity |
     | approach | minus half the distance from cup to puck in units of 0.1 m |
 
-    Hindsight: ``compute_reward`` with an empty info, as SB3's HerReplayBuffer calls it, gives the
-    goal term alone; ``train/her.py`` or ``copy_info_dict=True`` keep the other terms.
+    With an empty info, as SB3's HerReplayBuffer calls it, ``compute_reward`` gives the goal term
+    alone; ``train/her.py`` or ``copy_info_dict=True`` keep the other terms.
 
     ## Start
 
@@ -113,12 +113,9 @@ class TPMEnv(gym.Env[Observation, Action]):
     ``is_success`` (bool), ``closure_error`` (m), ``conditioning`` (1/cond(J)),
     ``singularity_penalty`` (before weighting), ``assembly_mode_changed`` and
     ``working_mode_changed`` (bool), ``reward_terms`` (name -> value; they sum to the reward).
-
-    ## Singularities
-
     Where the platform passes y = 0, a parallel one, the assembly mode changes and the encoders no
-    longer tell where it is; past y = l7, a serial one, the working mode changes. No action leads
-    there; should a disturbance, ``info`` says so, the penalty is 1, and the episode is truncated.
+    longer tell where it is; past y = l7, a serial one, the working mode changes. No action of the
+    nominal robot leads there; if it happens, ``info`` says so, with a penalty of 1 and truncation.
 
     Args:
         task: ``"reach"`` or ``"pick_and_place"``.
@@ -164,8 +161,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         height: int = 480,
     ) -> None:
         """Check the options and start the simulation."""
-        # Without a display PyBullet's window would end the whole process; so this environment
-        # offers only what the machine can show.
+        # Without a display PyBullet's window would end the process; offer what can be shown.
         modes = [mode for mode in self.metadata["render_modes"] if mode != "human" or has_display()]
         self.metadata = {**self.metadata, "render_modes": modes}
         if render_mode is not None and render_mode not in modes:
@@ -229,8 +225,7 @@ class TPMEnv(gym.Env[Observation, Action]):
             ActionError: If the action has the wrong shape or is not finite; nothing has moved then.
             EpisodeError: If there is no episode: before reset, after close, after a lost loop.
             ClosureError: If a loop of the mechanism opened.
-            ModeChangeError: If the episode has been truncated because the mechanism passed a
-                singularity.
+            ModeChangeError: If the mechanism passed a singularity earlier in this episode.
         """
         values = checks.action(action, self.task.action_size)
         state = self._require_state()
@@ -239,12 +234,16 @@ class TPMEnv(gym.Env[Observation, Action]):
         command = self.control.command(values[:3], DEFAULT_MOUNT.to_paper(state.command))
         vacuum = len(values) > 3 and bool(values[3] > 0)
         self._state = None  # until the step has gone well
-        self._state = state = self.simulation.move(command, vacuum, self._draw_noise())
-        observation, info = self._report(state)
+        try:
+            self._state = self.simulation.move(command, vacuum, self._draw_noise())
+        except ModeChangeError:
+            self._state = state  # nothing has moved
+            raise
+        observation, info = self._report(self._state)
         reward = reports.reward(info, self.penalty_weight)
         if self.render_mode == "human":
             self.render()
-        return observation, reward, False, state.mode_change is not None, info
+        return observation, reward, False, self._state.mode_change is not None, info
 
     def compute_reward(
         self,
@@ -357,7 +356,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         return self._state
 
     def __getstate__(self) -> dict[str, Any]:
-        """What :func:`copy.deepcopy` and :mod:`pickle` take: all of it, in the midst of an episode.
+        """For :func:`copy.deepcopy` and :mod:`pickle`: all of it, in the midst of an episode.
 
         Raises:
             ConfigurationError: With a window, of which PyBullet opens only one in a process.

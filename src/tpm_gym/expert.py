@@ -44,16 +44,19 @@ class Expert:
     """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
-        """Take the task and the control from the environment; nothing else of it is used."""
+        """Take the task, the control and the latency from the environment; nothing else is used."""
         unwrapped: Any = env.unwrapped
         self._task: Task = unwrapped.task
         self._control = unwrapped.control
         self._size = self._task.action_size
         self._plan: Iterator[tuple[FloatArray, bool]] = iter(())
         self._seen: dict[str, FloatArray] = {}
+        self._latency: int = unwrapped.randomisation.latency
+        self._under_way: list[FloatArray] = []
 
     def reset(self, observation: dict[str, Any]) -> None:
         """Plan anew for the episode that starts with ``observation``."""
+        self._under_way = [np.zeros(3)] * self._latency
         self._look(observation)
         placing = isinstance(self._task, PickAndPlace)
         self._plan = self._pick_and_place(self._task.scene.puck) if placing else self._reach()
@@ -66,6 +69,8 @@ class Expert:
         action[:3] = self._control.action(TASK_REGION.project(wanted), self._command)
         if self._size > 3:
             action[3] = 1.0 if vacuum else -1.0
+        if self._latency:
+            self._under_way = [*self._under_way[1:], action[:3]]
         return action
 
     # -- what the expert knows ------------------------------------------------------------------
@@ -77,8 +82,11 @@ class Expert:
 
     @property
     def _command(self) -> FloatArray:
-        """Where point P is commanded to be, paper frame."""
-        return DEFAULT_MOUNT.to_paper(self._seen["position"] + self._seen["command"])
+        """Where point P is commanded to be once the actions under way have arrived, paper frame."""
+        command = DEFAULT_MOUNT.to_paper(self._seen["position"] + self._seen["command"])
+        for action in self._under_way:
+            command = self._control.command(action, command)
+        return command
 
     @property
     def _holding(self) -> bool:

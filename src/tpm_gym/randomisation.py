@@ -88,7 +88,11 @@ class Randomisation:
             the encoder says, so the arm is off too.
         latency: Control steps by which actions come late, 0 or 1.
         length_error: Each of l1 to l7 is off by up to this, m; at most 0.001. The robot is then
-            built anew at each reset, which takes several times as long.
+            built anew at each reset, which takes several times as long, and of which Bullet keeps
+            some 13 kB of memory.
+
+    Far from the nominal machine (links twice as heavy on motors half as strong, say) actions at
+    full speed can throw the platform through a singularity; that is reported as ever.
 
     Raises:
         ConfigurationError: If a value is out of range.

@@ -8,6 +8,7 @@ closed to better than a micrometre.
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +20,6 @@ from tpm_gym.cup import Cup, Pose
 from tpm_gym.engine import Client
 from tpm_gym.errors import (
     ClosureError,
-    ConfigurationError,
     InputError,
     ModeChangeError,
     SingularityError,
@@ -49,7 +49,7 @@ class Snapshot:
     joints: tuple[tuple[float, float], ...]
     commands: tuple[Vector, Vector]
     noise: tuple[Vector, Vector]
-    reading: Reading | None
+    reading: Reading
     mode_change: str | None
     object_pose: Pose | None
     object_velocity: Pose | None
@@ -97,7 +97,7 @@ class Simulation:
             raise
         self._commands = (_ZERO, _ZERO)  # the last two, paper frame, m
         self._noise = (_ZERO, _ZERO)  # of the last two readings of the encoders, rad
-        self._reading: Reading | None = None  # the last one that made sense
+        self._reading: Reading  # the last one that made sense
         self._mode_change: str | None = None
         self._spline: list[list[float]] = spline_weights(self.physics.substeps).tolist()
 
@@ -169,7 +169,9 @@ class Simulation:
         self._let_go()
         self._become(plant)
         self._robot.place(true_angles)
-        self._reading, self._mode_change, self._noise = None, None, (noise, noise)
+        # What is true of the nominal machine, in case the encoders' errors make no sense.
+        self._reading = single.evaluate(angles, DEFAULT_ASSEMBLY, self.geometry)
+        self._mode_change, self._noise = None, (noise, noise)
         self._commands = ((start.x, start.y, start.z),) * 2
         if object_position is not None:
             position = np.asarray(object_position, dtype=np.float64).tolist()
@@ -205,6 +207,7 @@ class Simulation:
             raise ModeChangeError(self._mode_change)
         before, last = self._commands
         new = _vector("command", command)
+        single.posture(new, ELBOWS_OUT, self.geometry)  # the spline may end before the command does
         references = [
             single.posture(_blend(weights, before, last, new), ELBOWS_OUT, self.geometry)
             for weights in self._spline
@@ -276,12 +279,8 @@ class Simulation:
         That is what a controller can do whose disturbed encoders report angles at which no assembly
         exists, as happens near the edges of the workspace.
         """
-        try:
+        with suppress(UnreachableError, SingularityError):
             self._reading = single.evaluate(theta, DEFAULT_ASSEMBLY, self.geometry)
-        except (UnreachableError, SingularityError) as error:
-            if self._reading is None:
-                valid = "errors with which the mechanism can be assembled at the start"
-                raise ConfigurationError("randomisation", self._plant, valid) from error
         return self._reading
 
     def _watch_mode(self, theta: Vector, platform: Vector) -> None:
