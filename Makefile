@@ -60,10 +60,10 @@ bench-fidelity: $(INSTALLED) ## loop gaps, FK error and tilt against cost; see d
 
 bench-speed: $(INSTALLED) ## steps per second beside panda-gym and Gymnasium-Robotics
 	$(RUN) -m pip install -c constraints.txt -e ".[bench]"
-	$(RUN) benchmarks/bench_speed.py
+	$(RUN) benchmarks/bench_speed.py --json runs/speed.json --plot docs/images/speed.png
 
-soak: $(INSTALLED) ## a million steps over all ids: memory, loop gaps and speed over time
-	$(RUN) benchmarks/soak.py
+soak: $(INSTALLED) ## a million steps over all ids: memory, loop gaps, speed; about half an hour
+	$(RUN) benchmarks/soak.py --json runs/soak.json --plot docs/images/soak.png
 
 clean: ## remove the environment and everything generated
 	rm -rf $(VENV) runs dist build .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -230,7 +230,8 @@ def _learn(
         evaluation, checkpointing = _make_callbacks(
             plan, console, store, content, model, evaluation_env, listener
         )
-        callbacks = [checkpointing, bar, evaluation]  # the first sets the clock of the others
+        # Checkpointing sets the clock of those after it.
+        callbacks = [*_demonstrations(plan), checkpointing, bar, evaluation]
         stack.enter_context(listener.listening())
         try:
             steps = plan.steps - model.num_timesteps
@@ -272,6 +273,15 @@ def _make_callbacks(
         store, evaluation, listener, plan.checkpoint_every, plan.run, console, seconds
     )
     return evaluation, checkpointing
+
+
+def _demonstrations(plan: Plan) -> list[Any]:
+    """What fills the replay buffer before training starts, if the recipe asks for it."""
+    if not plan.recipe.demonstrations:
+        return []
+    from demonstrations import Demonstrations
+
+    return [Demonstrations(**plan.recipe.demonstrations)]
 
 
 def _export(run: Path, console: Console) -> None:
