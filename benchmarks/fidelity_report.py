@@ -125,13 +125,13 @@ SERIES = tuple(
 """Rows that a thin line joins in the picture: more and more iterations."""
 LABELS: dict[str, dict[str, tuple[str, tuple[float, float], str]]] = {
     "gap": {
-        "default": ("default", (-7, -3), "right"),
-        "1/125 s": ("1/125 s", (-2, 6), "left"),
+        "default": ("default", (-5, -10), "right"),
+        "1/125 s": ("1/125 s", (0, -12), "center"),
         "1/500 s": ("1/500 s", (5, 4), "left"),
         "1/1000 s": ("1/1000 s", (-6, -3), "right"),
-        "erp 0.2": ("erp 0.2", (-6, -8), "right"),
+        "erp 0.2": ("erp 0.2", (-6, 1), "right"),
         "erp 0.5": ("erp 0.5", (-6, -3), "right"),
-        "erp 0.8": ("erp 0.8", (-6, -3), "right"),
+        "erp 0.8": ("erp 0.8", (-6, -2), "right"),
         "1/250 s, 25 iterations": ("25 iterations, 1/250 s", (6, -2), "left"),
         "1/250 s, 400 iterations": ("400", (4, 3), "left"),
         "1/500 s, 100 iterations": ("1/500 s", (-5, -5), "right"),
