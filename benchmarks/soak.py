@@ -10,14 +10,14 @@ made. What raises is taken down and does not end the soak: ``--replay VISIT`` ra
 
 The memory is compared with that of the first sample after the warm-up, by which every id has been
 opened and has drawn a picture (each new environment draws one, so that all are alike), and caches
-have filled. Garbage is collected before a sample is taken, outside the time that counts as speed.
+have filled. Before a sample is taken, garbage is collected and what the C library holds free is
+returned, outside the time that counts as speed.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
-import gc
 import sys
 import time
 import traceback
@@ -217,9 +217,9 @@ class Soak:
     # -- samples ------------------------------------------------------------------------------
 
     def sample(self) -> dict[str, Any]:
-        """What the last window gave, and the process's memory after a garbage collection."""
+        """What the last window gave, and the memory that the process has in use."""
         window, seconds = self.window, time.perf_counter() - self.window.begun
-        gc.collect()
+        machine.give_back_free_memory()
         result = {
             "steps": self.steps,
             "visits": self.visits,

@@ -137,6 +137,13 @@ def export_run(run: Path) -> list[Path]:
     return [_convert(archive, archive.with_suffix("")) for archive in archives]
 
 
+def remove_exports(run: Path) -> None:
+    """Delete what :func:`export_run` wrote: a run that goes on has other policies soon."""
+    for name in (BEST_FILE, LAST_FILE):
+        for suffix in (".json", ".safetensors"):
+            (run / name).with_suffix(suffix).unlink(missing_ok=True)
+
+
 def _convert(archive: Path, path: Path) -> Path:
     """Export a .zip file of a run."""
     name = str(archive)
@@ -190,7 +197,7 @@ def _network(
 def _features(name: str, extractor: nn.Module) -> dict[str, Any]:
     """Describe what the first layer sees."""
     if type(extractor) is GoalGapExtractor:
-        return {"kind": "goal_gap", "unit": float(extractor._unit)}
+        return {"kind": "goal_gap", "unit": extractor.unit}
     if type(extractor) is CombinedExtractor:
         return {"kind": "concatenate", "keys": list(extractor.extractors)}
     wanted = "CombinedExtractor or GoalGapExtractor"

@@ -26,9 +26,9 @@ class GoalGapExtractor(BaseFeaturesExtractor):
         shown = ("observation", "desired_goal")
         size = sum(spaces.flatdim(observation_space[name]) for name in shown)
         super().__init__(observation_space, size)
-        self._unit = unit
+        self.unit = float(unit)
 
     def forward(self, observations: dict[str, torch.Tensor]) -> torch.Tensor:
         """Return the features of a batch, (n, observation size + goal size)."""
         gap = observations["desired_goal"] - observations["achieved_goal"]  # (n, 3) m
-        return torch.cat([observations["observation"], gap / self._unit], dim=1)
+        return torch.cat([observations["observation"], gap / self.unit], dim=1)

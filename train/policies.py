@@ -197,7 +197,7 @@ def run_config(spec: str, path: Path) -> dict[str, Any]:
     Raises:
         PolicyError: There is none, or it lacks what train.py writes.
     """
-    folders = path.resolve().parents[:2]  # the run folder, or checkpoints/ inside it
+    folders = path.resolve().parents[:2]  # the run folder, or one inside it
     for folder in folders:
         file = folder / CONFIG_FILE
         if not file.is_file():

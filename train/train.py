@@ -84,6 +84,7 @@ def train(config: Config, console: Console | None = None) -> signal.Signals | No
 
 def _resume(config: Config, console: Console) -> signal.Signals | None:
     """Go on from the last whole checkpoint of a run."""
+    from export import remove_exports
     from snapshot import restore_files
 
     if config.overwrite:
@@ -100,6 +101,7 @@ def _resume(config: Config, console: Console) -> signal.Signals | None:
             _say(console, f"nothing to do: {run} has finished its {content.step:,} steps")
             return None
         restore_files(run, content)
+        remove_exports(run)
         provenance.write_json(run / CONFIG_FILE, _description_resumed(plan, stored, content.step))
         _say(console, f"{plan.title}, from step {content.step:,} to {plan.steps:,}, in {run}")
         return _learn(plan, console, store, content)
@@ -239,8 +241,8 @@ def _learn(
         except StopTrainingError:
             pass
         save_model(model, plan.run / LAST_FILE)
+        _export(plan.run, console)
         if listener.received is None:
-            _export(plan.run, console)
             checkpointing.save_finished()
     _report(plan, console, store, listener.received)
     return listener.received
@@ -285,7 +287,7 @@ def _demonstrations(plan: Plan) -> list[Any]:
 
 
 def _export(run: Path, console: Console) -> None:
-    """Export the policies of a run that has come to its end."""
+    """Export the policies of a run that has ended or was stopped."""
     from export import export_run
 
     try:
