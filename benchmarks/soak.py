@@ -43,8 +43,8 @@ Policy = Callable[[dict[str, Any]], NDArray[np.float32]]
 
 REOPEN, RENDER, SAVE, WHOLE = 0.02, 0.01, 0.1, 0.5
 """Shares: of visits that reopen; of episodes that draw another picture, save and restore, are run
-to their end. Of each environment that is closed, Bullet keeps some 20 kB (mostly scratch memory of its
-direct solver), so the memory grows with the number of openings and with nothing else."""
+to their end. Of each environment that is closed, Bullet keeps some 20 kB, mostly scratch memory of
+its direct solver, so the memory grows with the number of openings and with nothing else."""
 POLICIES = {"uniform": 0.7, "bang-bang": 0.15, "expert": 0.15}
 PICTURE = {"render_mode": "rgb_array", "renderer": "tiny", "width": 32, "height": 24}
 MOST_FAILURES = 100
