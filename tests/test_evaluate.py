@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import pickle
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -19,8 +21,10 @@ from rich.console import Console
 import evaluate
 import film
 import provenance
-from errors import ConfigError, PolicyError, UnknownEnvError
+import rollout
+from errors import ConfigError, PolicyError, RolloutError, UnknownEnvError
 from policies import load_policy
+from tpm_gym.errors import ConfigurationError
 
 METRICS = (
     "success_at_end",
@@ -29,8 +33,12 @@ METRICS = (
     "conditioning_min",
     "conditioning_mean",
     "closure_error_max",
+    "unsafe_share",
+    "fk_error_max",
 )
 SCRIPT = Path(evaluate.__file__)
+STRAYS = 3
+"""Seed of an episode in which random actions stray into the unsafe region."""
 
 
 def quiet() -> Console:
@@ -210,6 +218,123 @@ def test_contact_sheet_ends_when_nothing_moves_any_more() -> None:
 def test_mistakes_are_named(options: dict[str, Any], error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         evaluate.evaluate(evaluate.Config(**{"policy": ("expert",), **options}), quiet())
+
+
+def records_of(spec: str = "random", **options: Any) -> list[Any]:
+    """Return the records of a few episodes, by default the random policy's on Reach."""
+    config = evaluate.Config(policy=(spec,), **{"env": "TPMReach-v0", "episodes": 2} | options)
+    return evaluate.evaluate(config, quiet())[0].records
+
+
+def test_conditions_are_recorded_and_the_defaults_are_the_nominal_machine(
+    written: tuple[dict[str, Any], str], tmp_path: Path
+) -> None:
+    content, _ = written
+    assert (content["goals"], content["penalty_weight"]) == ("sampled", 1.0)
+    assert content["randomisation"] == {}
+    path = tmp_path / "other.json"
+    words = ["--policy", "random", "--env", "TPMReach-v0", "--episodes", "1", "--json", str(path)]
+    words += ["--randomisation", "encoder_noise=1e-4", "friction=0.5:1", "latency=1"]
+    words += ["--penalty-weight", "0.5", "--goals", "tempting"]
+    done = subprocess.run(
+        [sys.executable, str(SCRIPT), *words], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    content = read_strict(path)
+    assert content["randomisation"] == {
+        "encoder_noise": 1e-4,
+        "friction": [0.5, 1.0],
+        "latency": 1,
+    }
+    assert (content["goals"], content["penalty_weight"]) == ("tempting", 0.5)
+    assert "--randomisation encoder_noise=1e-4 friction=0.5:1" in content["command"]
+
+
+def test_the_environment_is_the_one_that_was_asked_for() -> None:
+    config = evaluate.Config(
+        policy=("random",), goals="tempting", penalty_weight=0.25, randomisation=("puck_mass=2",)
+    )
+    env: Any = evaluate._make_env("TPMPickAndPlace-v0", config)
+    assert env.unwrapped.penalty_weight == 0.25
+    assert env.unwrapped.randomisation.puck_mass == (2.0, 2.0)
+    plain = gym.make("TPMPickAndPlace-v0")
+    goals = [made.reset(seed=3)[0]["desired_goal"] for made in (env, plain)]
+    assert not np.array_equal(*goals)
+    env.close()
+    plain.close()
+
+
+def test_encoder_noise_shows_in_the_observed_position() -> None:
+    nominal, noisy = records_of(), records_of(randomisation=("encoder_noise=5e-4",))
+    assert max(record.fk_error_max for record in nominal) < 1e-3
+    assert all(
+        noise.fk_error_max > 2 * none.fk_error_max
+        for noise, none in zip(noisy, nominal, strict=True)
+    )
+
+
+def test_the_return_has_the_penalty_in_it_with_its_weight() -> None:
+    once, twice, free = (
+        records_of(penalty_weight=weight, seed=STRAYS, episodes=1)[0] for weight in (1.0, 2.0, 0.0)
+    )
+    assert once.unsafe_share == free.unsafe_share > 0
+    penalty = free.total_reward - once.total_reward
+    assert penalty > 0
+    assert free.total_reward - twice.total_reward == pytest.approx(2 * penalty)
+
+
+def test_per_step_figures_are_those_of_the_steps() -> None:
+    env: Any = gym.make("TPMReach-v0")
+    policy = load_policy("random", env)
+    observation, _ = env.reset(seed=STRAYS)
+    policy.reset(observation, STRAYS)
+    unsafe, gaps, done = [], [], False
+    while not done:
+        observation, _, _, done, info = env.step(policy.act(observation))
+        unsafe.append(info["conditioning"] < 0.08)
+        state = env.unwrapped.state
+        gaps.append(np.linalg.norm(state.fk_position - state.platform_position))
+    env.close()
+    (record,) = records_of(episodes=1, seed=STRAYS)
+    assert 0 < record.unsafe_share == np.mean(unsafe) < 1
+    assert record.fk_error_max == pytest.approx(max(gaps), rel=1e-12)
+
+
+def test_torques_are_condensed_where_the_environment_tells_them() -> None:
+    torques = [np.array([1.0, -2.0, 2.0]), np.array([0.0, 0.0, 6.0])]
+    point = np.zeros(3)
+    states = [
+        SimpleNamespace(torque=torque, fk_position=point, platform_position=point)
+        for torque in torques
+    ]
+    info = {"conditioning": 0.5, "closure_error": 0.0, "is_success": True}
+    record = rollout._record(0, [0.0, 0.0], [info, info], states)
+    assert record.torque_peak == 6.0
+    assert record.torque_rms == pytest.approx(math.sqrt((1 + 4 + 4 + 36) / 6))
+    metrics = rollout.summarise([record, record])
+    assert metrics["torque_peak"].worst == 6.0
+    states[1].torque = np.array([0.0, math.nan, 0.0])
+    with pytest.raises(RolloutError, match="step 1: torque is nan"):
+        rollout._record(0, [0.0, 0.0], [info, info], states)
+    unknown = rollout._record(0, [0.0, 0.0], [info, info], [None, None])
+    assert unknown.torque_peak is None
+    assert "torque_peak" not in unknown.as_dict()
+    assert "torque_peak" not in rollout.summarise([record, unknown])
+
+
+@pytest.mark.parametrize(
+    "entries", [("puck_mass",), ("puck_mass=heavy",), ("=1",), ("a=1:2:3",), ("a=1", "a=2")]
+)
+def test_a_randomisation_that_cannot_be_read_is_named(entries: tuple[str, ...]) -> None:
+    with pytest.raises(ConfigError, match="--randomisation"):
+        records_of(randomisation=entries)
+
+
+def test_a_randomisation_that_there_is_none_of_is_named() -> None:
+    with pytest.raises(ConfigurationError, match="puck_mass"):
+        records_of(randomisation=("puk_mass=2",))
+    with pytest.raises(ConfigurationError, match="penalty_weight"):
+        records_of(penalty_weight=-1.0)
 
 
 @pytest.fixture(scope="module")

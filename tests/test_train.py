@@ -31,11 +31,13 @@ from errors import (
     NotARunError,
     PolicyError,
     RecipeError,
+    ResumeConflictError,
     RunExistsError,
     TrainError,
     UnknownEnvError,
 )
 from features import GoalGapExtractor
+from plan import resume_plan
 from policies import load_policy
 from recipes import read_recipe
 from rollout import SELECTION_SEED, run_episodes
@@ -136,6 +138,58 @@ def test_config_records_the_whole_run(run: Path, small: Path) -> None:
     # Nothing about the machine it ran on beyond its kind.
     assert str(run.parent) not in text
     assert str(small.parent) not in text
+
+
+def test_penalty_weight_and_goals_reach_every_environment_and_survive_resuming(
+    small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[gym.Env[Any, Any]] = []
+    make = gym.make
+
+    def remember(*args: Any, **options: Any) -> Any:
+        made.append(make(*args, **options))
+        return made[-1]
+
+    monkeypatch.setattr(gym, "make", remember)
+    recipe = tmp_path / "demonstrated.yml"
+    text = small.read_text(encoding="utf-8") + "  demonstrations: {episodes: 1}\n"
+    recipe.write_text(text, encoding="utf-8")
+    folder = tmp_path / "run"
+    config = Config(
+        recipe=recipe, run=folder, steps=110, eval_episodes=1, penalty_weight=0.0, goals="tempting"
+    )
+    train.train(config, quiet())
+    content = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+    assert (content["penalty_weight"], content["goals"]) == (0.0, "tempting")
+    assert len(made) == 3  # training, evaluation, demonstrations
+    train.train(Config(run=folder, resume=True, steps=170), quiet())
+    assert len(made) == 5
+    for env in made:
+        inner: Any = env.unwrapped
+        assert inner.penalty_weight == 0.0
+        assert env.spec is not None
+        assert env.spec.id == "tempting/TPMReach-v0"
+    again = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+    assert (again["penalty_weight"], again["goals"]) == (0.0, "tempting")
+    for option, config in {
+        "--penalty-weight": Config(run=folder, resume=True, penalty_weight=1.0),
+        "--goals": Config(run=folder, resume=True, goals="sampled"),
+    }.items():
+        with pytest.raises(ResumeConflictError, match=option):
+            train.train(config, quiet())
+    # The exported policy is one for the id itself.
+    results = evaluate.evaluate(evaluate.Config(policy=(str(folder),), episodes=1), quiet())
+    assert results[0].records[0].length == 50
+
+
+def test_runs_from_before_these_options_go_on_with_their_defaults(run: Path) -> None:
+    stored = json.loads((run / "config.json").read_text(encoding="utf-8"))
+    assert (stored["penalty_weight"], stored["goals"]) == (1.0, "sampled")
+    del stored["penalty_weight"], stored["goals"]
+    plan = resume_plan(Config(run=run, penalty_weight=1.0), stored, 0)
+    assert (plan.penalty_weight, plan.goals) == (1.0, "sampled")
+    with pytest.raises(ResumeConflictError, match="--penalty-weight"):
+        resume_plan(Config(run=run, penalty_weight=0.0), stored, 0)
 
 
 def test_evaluations_are_before_during_and_after_training(run: Path) -> None:
@@ -289,6 +343,8 @@ def test_command_line_trains_ppo_in_parallel_and_stops_when_asked_to(
         ({"envs": 0}, ConfigError, "--envs 0"),
         ({"eval_every": 0}, ConfigError, "--eval-every 0"),
         ({"eval_episodes": 0}, ConfigError, "--eval-episodes 0"),
+        ({"penalty_weight": -0.1}, ConfigError, "--penalty-weight -0.1"),
+        ({"penalty_weight": float("nan")}, ConfigError, "--penalty-weight nan"),
         ({"seed": -1}, ConfigError, "held out"),
         ({"seed": SELECTION_SEED}, ConfigError, "held out"),
         ({"seed": SELECTION_SEED - 2, "envs": 3}, ConfigError, "held out"),

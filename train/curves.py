@@ -81,7 +81,7 @@ def _draw_success(
     axes.set_ylabel("successful episodes")
     episodes = evaluations[-1]["episodes"]
     axes.set_title(f"{episodes} held-out episodes per evaluation", fontsize=9.5, color=_INK)
-    axes.legend(frameon=False, fontsize=9, loc="lower right")
+    axes.legend(framealpha=0.9, edgecolor="none", fontsize=9, loc="lower right")
 
 
 def _draw_return(
@@ -101,7 +101,7 @@ def _draw_return(
     means = [estimate["mean"] for estimate in returns]
     axes.plot(steps, means, color=_BLUE, linewidth=2, marker="o", markersize=4, label="mean")
     axes.set_ylabel("return per episode")
-    axes.legend(frameon=False, fontsize=9, loc="lower right")
+    axes.legend(framealpha=0.9, edgecolor="none", fontsize=9, loc="lower right")
 
 
 def _style(axes: Axes) -> None:

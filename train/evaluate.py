@@ -14,7 +14,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import gymnasium as gym
 import tyro
@@ -27,6 +27,7 @@ from errors import ConfigError, TrainError, UnknownEnvError
 from film import write_contact_sheet, write_video
 from policies import load_policy, trained_env
 from rollout import TEST_SEED, Episode, Estimate, GoalEnv, Policy, run_episodes, summarise
+from tempting import env_id_for
 
 # Label, key, factor and format of each row of the table.
 _ROWS = (
@@ -35,7 +36,11 @@ _ROWS = (
     ("return", "return", 1.0, "{:.2f}", ""),
     ("conditioning, least", "conditioning_min", 1.0, "{:.3f}", ""),
     ("conditioning, mean", "conditioning_mean", 1.0, "{:.3f}", ""),
+    ("share of steps below safe", "unsafe_share", 100.0, "{:.1f}", "%"),
     ("closure error, largest", "closure_error_max", 1e3, "{:.4f}", " mm"),
+    ("observed P off, largest", "fk_error_max", 1e3, "{:.4f}", " mm"),
+    ("torque, RMS", "torque_rms", 1.0, "{:.1f}", " N m"),
+    ("torque, peak", "torque_peak", 1.0, "{:.1f}", " N m"),
 )
 
 
@@ -54,6 +59,16 @@ class Config:
 
     seed: int = TEST_SEED
     """Seed of the first episode. The default is used neither in training nor to select policies."""
+
+    goals: Literal["sampled", "tempting"] = "sampled"
+    """As the environment samples them, or goals that tempt towards the singularity."""
+
+    penalty_weight: float = 1.0
+    """Weight of the singularity penalty in the return."""
+
+    randomisation: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=VALUE ...")] = ()
+    """Where the machine differs from the nominal one: attributes of tpm_gym's Randomisation, each
+    a number, or LOW:HIGH to draw from, for example encoder_noise=1e-4 puck_mass=0.5:2."""
 
     json: Path | None = None
     """Write metrics, episodes and versions here."""
@@ -116,7 +131,7 @@ def evaluate(config: Config, console: Console | None = None) -> list[Result]:
     console = console or Console(width=None if sys.stdout.isatty() else 200)
     _check(config)
     env_id = _resolve_env(config)
-    env = _make_env(env_id)
+    env = _make_env(env_id, config)
     try:
         # All are loaded before the first one runs: a mistyped name shows at once.
         policies = list(zip(config.policy, _load(config, env), strict=True))
@@ -168,9 +183,37 @@ def _resolve_env(config: Config) -> str:
     return env_id
 
 
-def _make_env(env_id: str, render_mode: str | None = None) -> GoalEnv:
-    """Make an environment; tpm_gym has been imported and has registered its ids."""
-    return gym.make(env_id, render_mode=render_mode)
+def _make_env(env_id: str, config: Config, render_mode: str | None = None) -> GoalEnv:
+    """Make an environment as configured."""
+    return gym.make(
+        env_id_for(env_id, config.goals),
+        penalty_weight=config.penalty_weight,
+        randomisation=parse_randomisation(config.randomisation),
+        render_mode=render_mode,
+    )
+
+
+def parse_randomisation(entries: Sequence[str]) -> dict[str, Any]:
+    """Return what ``--randomisation`` says as a mapping; tpm_gym checks keys and values.
+
+    Args:
+        entries: Words such as ``puck_mass=2`` or ``friction=0.5:1``.
+
+    Raises:
+        ConfigError: A word has another form, or names something twice.
+    """
+    result: dict[str, Any] = {}
+    for entry in entries:
+        name, equals, text = entry.partition("=")
+        try:
+            numbers = [int(n) if n.isdecimal() else float(n) for n in text.split(":")]
+        except ValueError:
+            numbers = []
+        if not (name and equals and 1 <= len(numbers) <= 2) or name in result:
+            valid = "must be KEY=NUMBER or KEY=LOW:HIGH, each key once"
+            raise ConfigError("--randomisation", entry, valid)
+        result[name] = numbers[0] if len(numbers) == 1 else (numbers[0], numbers[1])
+    return result
 
 
 def _load(config: Config, env: GoalEnv) -> list[Policy]:
@@ -211,6 +254,8 @@ def _table(env_id: str, config: Config, results: Sequence[Result]) -> Table:
     for result in results:
         table.add_column(result.policy, justify="right", overflow="fold")
     for label, name, factor, form, unit in _ROWS:
+        if any(name not in result.metrics for result in results):
+            continue  # this version of the environments does not tell
         cells = [_cell(result.metrics[name], factor, form, unit) for result in results]
         table.add_row(label, *cells)
         worst = [result.metrics[name].worst for result in results]
@@ -245,6 +290,9 @@ def _description(env_id: str, config: Config, results: Sequence[Result]) -> dict
         "env": env_id,
         "episodes": config.episodes,
         "seed": config.seed,
+        "goals": config.goals,
+        "penalty_weight": config.penalty_weight,
+        "randomisation": parse_randomisation(config.randomisation),
         **content,
         "versions": provenance.versions(),
         "git_commit": provenance.git_commit(),
@@ -266,7 +314,7 @@ def paths_per_policy(path: Path, policies: Sequence[str]) -> list[Path]:
 
 def _film(env_id: str, config: Config, console: Console) -> None:
     """Run the first episodes once more, with rendering, which would have slowed the metrics."""
-    env = _make_env(env_id, render_mode="rgb_array")
+    env = _make_env(env_id, config, render_mode="rgb_array")
     try:
         policies = _load(config, env)
         if config.video is not None:

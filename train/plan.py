@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,6 +18,9 @@ _ALGO: Final = "sac"
 _ENV: Final = "TPMReach-v0"
 _SEED: Final = 0
 _EVAL_EPISODES: Final = 20
+_PENALTY_WEIGHT: Final = 1.0
+_GOALS: Final = "sampled"
+_FIXED: Final = ("algo", "env", "seed", "envs", "eval_episodes", "penalty_weight", "goals")
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,13 @@ class Config:
 
     run: Path | None = None
     """Folder of the run. Default: runs/<env>-<algo>-s<seed>."""
+
+    penalty_weight: float | None = None
+    """Weight of the singularity penalty in the reward; 0 switches it off. Default: 1."""
+
+    goals: Literal["sampled", "tempting"] | None = None
+    """As the environment samples them, or goals that tempt towards the singularity; in training and
+    in its evaluations. Default: sampled."""
 
     eval_every: int | None = None
     """Steps between evaluations on held-out seeds. Default: a tenth of the steps."""
@@ -89,6 +100,8 @@ class Plan:
         checkpoint_every: Steps between checkpoints; None: by time.
         threads: Threads of PyTorch.
         device: Device of PyTorch.
+        penalty_weight: Weight of the singularity penalty.
+        goals: ``sampled`` or ``tempting``.
     """
 
     algo: str
@@ -104,6 +117,8 @@ class Plan:
     checkpoint_every: int | None
     threads: int
     device: str
+    penalty_weight: float = _PENALTY_WEIGHT
+    goals: str = _GOALS
 
     @property
     def title(self) -> str:
@@ -148,6 +163,8 @@ def make_plan(config: Config) -> Plan:
         checkpoint_every=config.checkpoint_every,
         threads=_either(config.threads, 1),
         device=_either(config.device, "cpu"),
+        penalty_weight=_either(config.penalty_weight, _PENALTY_WEIGHT),
+        goals=_either(config.goals, _GOALS),
     )
     _check(plan)
     return plan
@@ -166,7 +183,9 @@ def resume_plan(config: Config, stored: Mapping[str, Any], reached: int) -> Plan
         ConfigError: An option is not valid.
         RecipeError: The recipe that was given is not valid.
     """
-    for name in ("algo", "env", "seed", "envs", "eval_episodes"):
+    # Runs of before these options had what is their default.
+    stored = {"penalty_weight": _PENALTY_WEIGHT, "goals": _GOALS, **stored}
+    for name in _FIXED:
         given = getattr(config, name)
         if given is not None and given != stored[name]:
             raise ResumeConflictError("--" + name.replace("_", "-"), given, stored[name])
@@ -189,6 +208,8 @@ def resume_plan(config: Config, stored: Mapping[str, Any], reached: int) -> Plan
         checkpoint_every=_either(config.checkpoint_every, stored["checkpoint_every"]),
         threads=_either(config.threads, stored["threads"]),
         device=_either(config.device, stored["device"]),
+        penalty_weight=stored["penalty_weight"],
+        goals=stored["goals"],
     )
     _check(plan)
     return plan
@@ -229,6 +250,9 @@ def _check(plan: Plan) -> None:
     most = TEST_SEED - SELECTION_SEED
     if plan.eval_episodes > most:
         raise ConfigError("--eval-episodes", plan.eval_episodes, f"must be at most {most}")
+    if not 0 <= plan.penalty_weight < math.inf:
+        valid = "must be a finite number, 0 or more"
+        raise ConfigError("--penalty-weight", plan.penalty_weight, valid)
     _check_hindsight(plan)
     _check_device(plan.device)
 

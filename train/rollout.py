@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from errors import RolloutError
+from tpm_gym.rewards import SAFE_CONDITIONING
 
 SELECTION_SEED: Final = 1_000_000
 TEST_SEED: Final = 2_000_000
@@ -57,6 +58,12 @@ class Episode:
         conditioning_mean: Mean 1/cond(J) over the steps.
         closure_error_max: Largest loop gap of all steps, m.
         length: Number of steps.
+        unsafe_share: Share of the steps with 1/cond(J) below ``SAFE_CONDITIONING``.
+        fk_error_max: Largest distance of the observed point P (forward kinematics of the encoders)
+            from that of the simulated platform, m; None where the environment does not tell.
+        torque_rms: Root mean square of the motors' torques at the ends of the steps, over steps and
+            motors, N m; None where the environment does not tell.
+        torque_peak: Largest of these torques, N m; None where the environment does not tell.
     """
 
     seed: int
@@ -67,12 +74,17 @@ class Episode:
     conditioning_mean: float
     closure_error_max: float
     length: int
+    unsafe_share: float = 0.0
+    fk_error_max: float | None = None
+    torque_rms: float | None = None
+    torque_peak: float | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the record as plain data, with ``total_reward`` under its name ``return``."""
+        """Return what is known as plain data, ``total_reward`` under its name ``return``."""
         return {
             "return" if name == "total_reward" else name: value
             for name, value in vars(self).items()
+            if value is not None
         }
 
 
@@ -120,7 +132,8 @@ def run_episodes(
         One record per episode, in order.
 
     Raises:
-        RolloutError: A reward, a conditioning or a closure error is not finite.
+        RolloutError: A reward, a conditioning, a closure error, a distance of forward kinematics
+            from the truth or a torque is not finite.
     """
     records = []
     for seed in range(first_seed, first_seed + episodes):
@@ -140,28 +153,43 @@ def _run_episode(
         on_frame()
     rewards: list[float] = []
     infos: list[Mapping[str, Any]] = []
+    states: list[Any] = []
+    inner: Any = env.unwrapped
     done = False
     while not done:
         observation, reward, terminated, truncated, info = env.step(policy.act(observation))
         done = terminated or truncated
         rewards.append(float(reward))
         infos.append(info)
+        states.append(getattr(inner, "state", None))
         if on_frame is not None:
             on_frame()
-    return _record(seed, rewards, infos)
+    return _record(seed, rewards, infos, states)
 
 
-def _record(seed: int, rewards: Sequence[float], infos: Sequence[Mapping[str, Any]]) -> Episode:
-    """Condense the steps of an episode."""
+def _record(
+    seed: int,
+    rewards: Sequence[float],
+    infos: Sequence[Mapping[str, Any]],
+    states: Sequence[Any],
+) -> Episode:
+    """Condense the steps of an episode; states are None where the environment has none."""
     conditioning = [float(info["conditioning"]) for info in infos]
     closure = [float(info["closure_error"]) for info in infos]
     successes = [bool(info["is_success"]) for info in infos]
-    named = {"reward": rewards, "conditioning": conditioning, "closure_error": closure}
+    fk_errors, torques = _fk_errors(states), _torques(states)
+    named = {
+        "reward": rewards,
+        "conditioning": conditioning,
+        "closure_error": closure,
+        "fk_error": fk_errors,
+        "torque": torques,
+    }
     for name, values in named.items():
         for step, value in enumerate(values):
             # A NaN would pass through min and max unseen, depending on where it stands.
             if not math.isfinite(value):
-                raise RolloutError(seed, step, name, value)
+                raise RolloutError(seed, step * len(rewards) // len(values), name, value)
     return Episode(
         seed=seed,
         success_at_end=successes[-1],
@@ -171,7 +199,28 @@ def _record(seed: int, rewards: Sequence[float], infos: Sequence[Mapping[str, An
         conditioning_mean=math.fsum(conditioning) / len(conditioning),
         closure_error_max=max(closure),
         length=len(rewards),
+        unsafe_share=sum(value < SAFE_CONDITIONING for value in conditioning) / len(conditioning),
+        fk_error_max=max(fk_errors, default=None),
+        torque_rms=math.hypot(*torques) / math.sqrt(len(torques)) if torques else None,
+        torque_peak=max(map(abs, torques), default=None),
     )
+
+
+def _fk_errors(states: Sequence[Any]) -> list[float]:
+    """Distances of the observed point P from the true one, m, a value a step; empty if unknown."""
+    if not hasattr(states[0], "platform_position"):
+        return []
+    gaps = np.array([state.fk_position - state.platform_position for state in states])
+    distances: list[float] = np.linalg.norm(gaps, axis=-1).tolist()
+    return distances
+
+
+def _torques(states: Sequence[Any]) -> list[float]:
+    """Torques of the motors, N m, three values a step; empty if unknown."""
+    if not hasattr(states[0], "torque"):
+        return []
+    values: list[float] = np.ravel([state.torque for state in states]).tolist()
+    return values
 
 
 def summarise(records: Sequence[Episode]) -> dict[str, Estimate]:
@@ -185,18 +234,26 @@ def summarise(records: Sequence[Episode]) -> dict[str, Estimate]:
 
     Returns:
         ``success_at_end``, ``success_once``, ``return``, ``conditioning_min`` (and the worst),
-        ``conditioning_mean`` and ``closure_error_max`` (m, and the worst), by name.
+        ``conditioning_mean``, ``closure_error_max`` (m, and the worst) and ``unsafe_share``, by
+        name; and, where every episode has it, ``fk_error_max`` (m), ``torque_rms`` and
+        ``torque_peak`` (N m), each with the worst.
     """
     lowest = [record.conditioning_min for record in records]
     largest = [record.closure_error_max for record in records]
-    return {
+    metrics = {
         "success_at_end": wilson([record.success_at_end for record in records]),
         "success_once": wilson([record.success_once for record in records]),
         "return": bootstrap([record.total_reward for record in records]),
         "conditioning_min": bootstrap(lowest, worst=min(lowest)),
         "conditioning_mean": bootstrap([record.conditioning_mean for record in records]),
         "closure_error_max": bootstrap(largest, worst=max(largest)),
+        "unsafe_share": bootstrap([record.unsafe_share for record in records]),
     }
+    for name in ("fk_error_max", "torque_rms", "torque_peak"):
+        values = [getattr(record, name) for record in records]
+        if None not in values:
+            metrics[name] = bootstrap(values, worst=max(values))
+    return metrics
 
 
 def wilson(outcomes: Sequence[bool]) -> Estimate:

@@ -222,7 +222,7 @@ def _learn(
     with ExitStack() as stack:
         training_envs = _make_training_envs(plan)
         stack.callback(training_envs.close)
-        evaluation_env = make_env(plan.env)
+        evaluation_env = make_env(**_env_options(plan))
         stack.callback(evaluation_env.close)
         stack.callback(bar.close)
         model = _make_model(plan, training_envs)
@@ -343,25 +343,34 @@ def _make_training_envs(plan: Plan) -> Any:
         n_envs=plan.envs,
         seed=plan.seed,
         wrapper_class=EpisodeRecorder,
-        env_kwargs={"env_id": plan.env, "in_worker": several},
+        env_kwargs={**_env_options(plan), "in_worker": several},
         vec_env_cls=SubprocVecEnv if several else DummyVecEnv,
     )
 
 
-def make_env(env_id: str, in_worker: bool = False) -> GoalEnv:
+def _env_options(plan: Plan) -> dict[str, Any]:
+    """Which environment a plan trains and evaluates in, as arguments of :func:`make_env`."""
+    return {"env_id": plan.env, "penalty_weight": plan.penalty_weight, "goals": plan.goals}
+
+
+def make_env(
+    env_id: str, in_worker: bool = False, penalty_weight: float = 1.0, goals: str = "sampled"
+) -> GoalEnv:
     """Make an environment of tpm_gym.
 
     Args:
         env_id: The registered id.
         in_worker: Whether this runs in a process of its own, which has to outlive the signal that
             a terminal or a batch system sends to all processes, until the main one has saved.
+        penalty_weight: Weight of the singularity penalty.
+        goals: ``sampled`` or ``tempting``.
     """
-    import tpm_gym  # noqa: F401  # registers the ids
+    from tempting import env_id_for  # registers the ids, tpm_gym's and its own
 
     if in_worker:
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_IGN)
-    return gym.make(env_id)
+    return gym.make(env_id_for(env_id, goals), penalty_weight=penalty_weight)
 
 
 def main() -> None:

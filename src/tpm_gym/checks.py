@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tpm_gym.errors import ActionError, ConfigurationError, ResetOptionError
+from tpm_gym.errors import ActionError, ConfigurationError, InputError, ResetOptionError
 from tpm_gym.physics import CONTROL_PERIOD, Physics
 
-__all__ = ["action", "physics", "picture_size", "reset_options", "weight"]
+__all__ = ["action", "physics", "picture_size", "reset_options", "snapshot", "weight"]
 
 
 def action(value: Any, size: int) -> NDArray[np.float64]:
@@ -66,9 +66,21 @@ def picture_size(width: Any, height: Any) -> tuple[int, int]:
         ConfigurationError: If one is not a whole number from 16 to 4096.
     """
     for name, value in (("width", width), ("height", height)):
-        if not (isinstance(value, int) and 16 <= value <= 4096):
+        if not (isinstance(value, (int, np.integer)) and 16 <= value <= 4096):
             raise ConfigurationError(name, value, "a whole number of pixels from 16 to 4096")
-    return width, height
+    return int(width), int(height)
+
+
+def snapshot(value: Any, kind: type[Any], own: tuple[Any, ...]) -> None:
+    """A snapshot that an environment of this task, randomisation and physics took.
+
+    Raises:
+        InputError: If it is anything else.
+    """
+    if not isinstance(value, kind):
+        raise InputError("snapshot", value, "what save_state() returned")
+    if value.kind != own:
+        raise InputError("snapshot", value.kind, f"of the same task and options, {own}")
 
 
 def reset_options(options: Any) -> dict[str, Any]:

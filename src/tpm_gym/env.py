@@ -35,6 +35,7 @@ class EnvSnapshot:
     rng: dict[str, Any]
     goal: NDArray[np.float64]
     pending: tuple[NDArray[np.float64], ...]
+    kind: tuple[str, Randomisation, Physics | None]
 
 
 class TPMEnv(gym.Env[Observation, Action]):
@@ -110,7 +111,7 @@ class TPMEnv(gym.Env[Observation, Action]):
 
     ## Info
 
-    ``is_success`` (bool), ``closure_error`` (m), ``conditioning`` (1/cond(J)),
+    ``is_success`` (bool), ``closure_error`` (m), ``conditioning`` (1/cond(J) by the encoders),
     ``singularity_penalty`` (before weighting), ``assembly_mode_changed`` and
     ``working_mode_changed`` (bool), ``reward_terms`` (name -> value; they sum to the reward).
     Where the platform passes y = 0, a parallel one, the assembly mode changes and the encoders no
@@ -183,6 +184,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         self._closed = False
         self._shown = 0.0  # when the last frame was due, s of the performance counter
         self._physics, self._renderer = physics, renderer
+        self._kind = (task, self.randomisation, physics)
         self.simulation = self._start()
 
     # -- the Gymnasium interface ----------------------------------------------------------------
@@ -274,10 +276,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         return float(total) if np.ndim(total) == 0 else total
 
     def render(self) -> NDArray[np.uint8] | None:
-        """The scene as (height, width, 3) RGB.
-
-        In ``human`` mode the window shows it already; this then waits until real time catches up.
-        """
+        """The scene as (height, width, 3) RGB; in ``human`` mode, wait for real time."""
         self._require_open()
         if self.render_mode == "rgb_array":
             return self.simulation.render(*self._size)
@@ -311,10 +310,9 @@ class TPMEnv(gym.Env[Observation, Action]):
         return np.array(self._goal)
 
     def save_state(self) -> EnvSnapshot:
-        """Take down physics, rng, goal, commands and grasp.
+        """Take down physics, rng, goal, commands and grasp; TimeLimit's count is not part of it.
 
-        What follows, here or after :meth:`restore_state`, is equal to the last bit. Wrappers keep
-        their own counts: TimeLimit's steps are not part of it.
+        What follows, here or after :meth:`restore_state`, is equal to the last bit.
 
         Raises:
             EpisodeError: If there is no episode.
@@ -325,6 +323,7 @@ class TPMEnv(gym.Env[Observation, Action]):
             dict(self.np_random.bit_generator.state),
             self._goal.copy(),
             self._pending,
+            self._kind,
         )
 
     def restore_state(self, snapshot: EnvSnapshot) -> Observation:
@@ -335,8 +334,10 @@ class TPMEnv(gym.Env[Observation, Action]):
 
         Raises:
             EpisodeError: If the environment is closed.
+            InputError: If the moment is none, or that of another kind of environment.
         """
         self._require_open()
+        checks.snapshot(snapshot, EnvSnapshot, self._kind)
         self.np_random.bit_generator.state = snapshot.rng
         self._goal, self._pending = snapshot.goal.copy(), snapshot.pending
         self.simulation.show_goal(self._goal)

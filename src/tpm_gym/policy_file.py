@@ -167,8 +167,9 @@ def read_description(path: str | Path) -> Description:
         PolicyFileError: The file is missing, damaged, or an entry cannot be.
     """
     file, _ = files(path)
+    text = _read(file, MAX_JSON)
     try:
-        content = parse(_read(file, MAX_JSON))
+        content = parse(text)
     except ValueError as error:
         raise PolicyFileError(str(file), f"is no valid JSON ({error})", _DAMAGED) from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:

@@ -112,7 +112,7 @@ def posture(point: Vector, branch: WorkingMode, geometry: Geometry) -> Vector:
         theta_1 = _solve_leg(-g.l1, z_c, x_c * x_c, branch.leg1, g)
         theta_2 = _solve_leg(x_c + g.l1 - 2 * g.l5, z_c, 0.0, branch.leg2, g)
         theta_3 = _solve_leg(x + g.l2 - g.l1, z - g.l6, y * y, branch.leg3, g)
-    except (ValueError, ZeroDivisionError):  # acos of more than 1, or a rod's end at the pivot
+    except (ValueError, ZeroDivisionError):  # out of reach, or a rod's end at the pivot
         raise no_posture(np.array(point), branch, geometry) from None
     return _cut(theta_1), theta_2 if theta_2 >= 0 else theta_2 + 2 * math.pi, _cut(theta_3)
 
@@ -122,9 +122,9 @@ def _solve_leg(a: float, b: float, out2: float, bend: int, geometry: Geometry) -
     l3, l4 = geometry.l3, geometry.l4
     radius2 = a * a + b * b
     ratio = (radius2 + out2 + (l3 * l3 - l4 * l4)) / (2 * l3 * math.sqrt(radius2))
-    if 1 < abs(ratio) <= 1 + ROUNDING:
-        ratio = math.copysign(1.0, ratio)
-    return math.atan2(b, a) - bend * math.acos(ratio)
+    if not abs(ratio) <= 1 + ROUNDING:  # so that a NaN, from lengths without end, fails too
+        raise ValueError("out of reach")
+    return math.atan2(b, a) - bend * math.acos(min(1.0, max(-1.0, ratio)))
 
 
 def _cut(angle: float) -> float:
