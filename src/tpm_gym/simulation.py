@@ -87,7 +87,6 @@ class Simulation:
         """Connect, load and close the loops."""
         self.scene, self.geometry, self.mount = scene, geometry, mount
         self.physics = Physics() if physics is None else physics
-        self.mechanism = build(geometry)
         self._gui, self._renderer = gui, renderer
         self._client = Client(self.physics, gui, renderer)
         try:
