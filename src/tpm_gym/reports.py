@@ -65,7 +65,7 @@ def info(task: Task, state: State, seen: Observation, penalty_weight: float) -> 
     }
     terms.update((name, float(value)) for name, value in task.state_terms(state).items())
     return {
-        "is_success": bool(gap < task.tolerance),
+        "is_success": bool(task.success_at(gap)),
         "closure_error": float(state.closure_error),
         "conditioning": float(state.conditioning),
         "singularity_penalty": penalty,

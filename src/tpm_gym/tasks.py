@@ -179,7 +179,11 @@ class Task:
 
     def success(self, achieved: ArrayLike, desired: ArrayLike) -> NDArray[np.bool_]:
         """Whether the goal is achieved, (...,)."""
-        result: NDArray[np.bool_] = rewards.distance(achieved, desired) < self.tolerance
+        return self.success_at(rewards.distance(achieved, desired))
+
+    def success_at(self, gap: FloatArray) -> NDArray[np.bool_]:
+        """The same, for distances (...,) m from the goal."""
+        result: NDArray[np.bool_] = gap < self.tolerance
         return result
 
 
