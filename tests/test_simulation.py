@@ -220,7 +220,8 @@ def test_a_snapshot_continues_the_motion(with_puck):
     snapshot = with_puck.save()
     expected = [with_puck.move(command) for command in commands[15:]]
     with_puck.reset(kinematics.inverse(HOME), (0.05, -0.03, 0.015))
-    with_puck.restore(snapshot)
+    assert np.array_equal(with_puck.restore(snapshot).torque, snapshot.torque)
+    assert any(snapshot.torque)
     for command, state in zip(commands[15:], expected, strict=True):
         again = with_puck.move(command)
         assert np.allclose(again.theta, state.theta, atol=1e-6)

@@ -19,6 +19,7 @@ def random_state(rng, shape=()):
     return State(
         theta=rng.normal(size=(*shape, 3)),
         theta_dot=rng.normal(size=(*shape, 3)),
+        torque=rng.normal(size=(*shape, 3)),
         fk_position=rng.normal(size=(*shape, 3)),
         fk_velocity=rng.normal(size=(*shape, 3)),
         conditioning=rng.random(shape),

@@ -181,6 +181,11 @@ class Robot:
         a, b, c = state(*first), state(*second), state(*third)
         return (a[0], b[0], c[0]), (a[1], b[1], c[1])
 
+    def torques(self) -> Vector:
+        """What the motors applied in the last time step, N m."""
+        state, (first, second, third) = self._client.getJointState, self._motors
+        return state(*first)[3], state(*second)[3], state(*third)[3]
+
     def joint_states(self) -> tuple[tuple[float, float], ...]:
         """Angle and rate of every joint, passive ones too."""
         states = (self._client.getJointState(*joint) for joint in self._joints.values())

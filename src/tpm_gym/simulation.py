@@ -47,6 +47,7 @@ class Snapshot:
 
     plant: Plant
     joints: tuple[tuple[float, float], ...]
+    torque: Vector
     commands: tuple[Vector, Vector]
     noise: tuple[Vector, Vector]
     reading: Reading
@@ -94,6 +95,7 @@ class Simulation:
         except BaseException:
             self.close()
             raise
+        self._torque = _ZERO  # of the motors in the last time step, N m
         self._commands = (_ZERO, _ZERO)  # the last two, paper frame, m
         self._noise = (_ZERO, _ZERO)  # of the last two readings of the encoders, rad
         self._reading: Reading  # the last one that made sense
@@ -168,6 +170,7 @@ class Simulation:
         self._let_go()
         self._become(plant)
         self._robot.place(true_angles)
+        self._torque = _ZERO
         # What is true of the nominal machine, in case the encoders' errors make no sense.
         self._reading = single.evaluate(angles, DEFAULT_ASSEMBLY, self.geometry)
         self._mode_change, self._noise = None, (noise, noise)
@@ -221,6 +224,7 @@ class Simulation:
             advance()
         if vacuum and self._cup is not None:
             self._cup.suck()
+        self._torque = self._robot.torques()
         self._noise = (self._noise[1], noise)
         return self.read()
 
@@ -245,6 +249,7 @@ class Simulation:
         return State(
             theta=np.array(theta),
             theta_dot=np.array(rates),
+            torque=np.array(self._torque),
             fk_position=np.array(self.mount.swap((x, y, z))),
             fk_velocity=self.mount.rotate([a * r1 + b * r2 + c * r3 for a, b, c in rows]),
             conditioning=conditioning,
@@ -318,6 +323,7 @@ class Simulation:
         snapshot = Snapshot(
             plant=self._plant,
             joints=self._robot.joint_states(),
+            torque=self._torque,
             commands=self._commands,
             noise=self._noise,
             reading=self._reading,
@@ -334,6 +340,7 @@ class Simulation:
         self._let_go()
         self._become(snapshot.plant)
         self._robot.set_joint_states(snapshot.joints)
+        self._torque = snapshot.torque
         self._commands, self._noise = snapshot.commands, snapshot.noise
         self._reading, self._mode_change = snapshot.reading, snapshot.mode_change
         if snapshot.object_pose is not None and snapshot.object_velocity is not None:

@@ -58,6 +58,7 @@ class State:
     Attributes:
         theta: (..., 3) rad, the three encoders (with their errors, if any are simulated).
         theta_dot: (..., 3) rad/s, the encoders' rates.
+        torque: (..., 3) N m, what the motors applied in the last time step; zero after a reset.
         fk_position: (..., 3) m, world: point P by forward kinematics of ``theta``.
         fk_velocity: (..., 3) m/s, world: J(theta) theta_dot.
         conditioning: (...,) 1/cond(J) at ``theta``, in [0, 1].
@@ -78,6 +79,7 @@ class State:
 
     theta: FloatArray
     theta_dot: FloatArray
+    torque: FloatArray
     fk_position: FloatArray
     fk_velocity: FloatArray
     conditioning: FloatArray | float
