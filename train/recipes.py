@@ -9,6 +9,7 @@ written here (the zoo reads it as well), and nothing is ever evaluated.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -56,6 +57,19 @@ def _is_ent_coef(value: object) -> bool:
     return _is_number(value) and float(value) >= 0  # type: ignore[arg-type]
 
 
+def _is_learning_rate(value: object) -> bool:
+    if isinstance(value, str):
+        return value.startswith("lin_") and _is_positive_text(value.removeprefix("lin_"))
+    return _is_number(value) and float(value) > 0  # type: ignore[arg-type]
+
+
+def _is_positive_text(text: str) -> bool:
+    try:
+        return 0 < float(text) < math.inf
+    except ValueError:
+        return False
+
+
 _COUNT = _Rule("a positive integer", lambda value: _is_int(value) and value > 0)
 _NATURAL = _Rule("an integer of at least 0", lambda value: _is_int(value) and value >= 0)
 _POSITIVE = _Rule("a positive number", lambda value: _is_number(value) and value > 0)
@@ -71,7 +85,9 @@ _COMMON: Final[_Rules] = {
     "n_timesteps": _COUNT,
     "n_envs": _COUNT,
     "policy": _one_of("MultiInputPolicy"),
-    "learning_rate": _POSITIVE,
+    "learning_rate": _Rule(
+        "a positive number, or lin_<start> to fall linearly to zero", _is_learning_rate
+    ),
     "gamma": _FRACTION,
     "batch_size": _COUNT,
 }

@@ -34,8 +34,8 @@ Written by `make results` from the records in [results](results); nothing here w
 {BOOTSTRAP_SEED}). A run without a test counts as 0.
 - **Time to {LEARNED:.0%}** is that of the first evaluation during training from which success stays
   at {LEARNED:.0%} or above to the end of training; those evaluations are short (20 episodes, so at
-  most one may fail), the same episodes each time. Minutes include them, but not the playing of
-  demonstrations; steps include those. For several seeds it is the median, "never" where that is a
+  most one may fail), the same episodes each time. Minutes include them; minutes and steps include
+  the playing of demonstrations. For several seeds it is the median, "never" where that is a
   run that never did.
 - **Smallest conditioning** is the least 1/cond(J) of all steps of all test episodes, **time below
   safe** the share of their steps with 1/cond(J) < 0.08.

@@ -233,7 +233,7 @@ def _learn(
             plan, console, store, content, model, evaluation_env, listener
         )
         # Checkpointing sets the clock of those after it.
-        callbacks = [*_demonstrations(plan), checkpointing, bar, evaluation]
+        callbacks = [checkpointing, *_demonstrations(plan), bar, evaluation]
         stack.enter_context(listener.listening())
         try:
             steps = plan.steps - model.num_timesteps
@@ -322,6 +322,11 @@ def _make_model(plan: Plan, envs: Any) -> Any:
         from features import GoalGapExtractor
 
         arguments["policy_kwargs"] = policy_kwargs | {"features_extractor_class": GoalGapExtractor}
+    rate = arguments.get("learning_rate")
+    if isinstance(rate, str):
+        from stable_baselines3.common.utils import LinearSchedule
+
+        arguments["learning_rate"] = LinearSchedule(float(rate.removeprefix("lin_")), 0.0, 1.0)
     if plan.recipe.hindsight:
         from her import PenaltyHerReplayBuffer
 

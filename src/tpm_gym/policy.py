@@ -157,11 +157,7 @@ class Policy:
         leading: set[tuple[int, ...]] = set()
         for name, box in boxes.items():
             shape = box.shape or ()
-            try:
-                with np.errstate(over="ignore"):  # becomes infinite, which is refused below
-                    values = np.asarray(observation[name], dtype=np.float32)
-            except (TypeError, ValueError) as error:
-                raise InputError(name, observation[name], "an array of numbers") from error
+            values = _as_float32(name, observation[name])
             batch = values.shape[: values.ndim - len(shape)]
             if values.shape != batch + shape or len(batch) > 1:
                 raise InputError(name, values.shape, f"of shape {shape} or (n, *{shape}), by shape")
@@ -171,7 +167,8 @@ class Policy:
             leading.add(batch)
         if len(leading) > 1:
             raise InputError("observation", sorted(leading), "of one batch size in all entries")
-        tensors = {name: torch.tensor(values) for name, values in arrays.items()}
+        # A copy: PyTorch warns of arrays that must not be written to.
+        tensors = {name: torch.from_numpy(values.copy()) for name, values in arrays.items()}
         return tensors, leading != {()}
 
     def _features(self, entries: Mapping[str, torch.Tensor]) -> torch.Tensor:
@@ -181,3 +178,14 @@ class Policy:
             return torch.cat([entries[key] for key in network.keys], dim=1)
         gap = entries["desired_goal"] - entries["achieved_goal"]
         return torch.cat([entries["observation"], gap / network.unit], dim=1)
+
+
+def _as_float32(name: str, value: Any) -> NDArray[np.float32]:
+    """An entry of an observation as an array; infinite where a number is too large."""
+    if isinstance(value, np.ndarray) and value.dtype == np.float32:
+        return value
+    try:
+        with np.errstate(over="ignore"):
+            return np.asarray(value, dtype=np.float32)
+    except (TypeError, ValueError) as error:
+        raise InputError(name, value, "an array of numbers") from error
