@@ -120,6 +120,19 @@ def test_learning_has_changed_the_policy(run: Path) -> None:
     assert equal(after, parameters(run))
 
 
+def test_a_learning_rate_falls_to_zero_if_asked_to(tmp_path: Path) -> None:
+    recipe = tmp_path / "falling.yml"
+    recipe.write_text(SMALL + "  learning_rate: lin_0.002\n", encoding="utf-8")
+    config = Config(recipe=recipe, run=tmp_path / "run", eval_episodes=1, eval_every=100)
+    train.train(config, quiet())
+    with (tmp_path / "run" / "progress.csv").open(encoding="utf-8") as file:
+        logged = [row["train/learning_rate"] for row in csv.DictReader(file)]
+    rates = [float(rate) for rate in logged if rate]
+    assert 0.0005 < rates[0] < 0.0015  # about half way
+    assert rates == sorted(rates, reverse=True)
+    assert 0 <= rates[-1] <= 0.002 * 2 / 400  # an update takes two steps
+
+
 def test_config_records_the_whole_run(run: Path, small: Path) -> None:
     text = (run / "config.json").read_text(encoding="utf-8")
     content = json.loads(text)
@@ -439,6 +452,9 @@ def test_networks_see_the_gap_to_the_goal() -> None:
         ),
         ("TPMReach-v0:", "- TPMReach-v0:", "", "one mapping per environment id"),
         ("gamma: 0.95", "gamma: [", "", "is not YAML"),
+        ("gamma: 0.95", "learning_rate: lin_0", "TPMReach-v0.learning_rate", "lin_<start>"),
+        ("gamma: 0.95", "learning_rate: lin_inf", "TPMReach-v0.learning_rate", "lin_<start>"),
+        ("gamma: 0.95", "learning_rate: exp_1", "TPMReach-v0.learning_rate", "lin_<start>"),
         ("gamma: 0.95", "gamma: !!python/object/apply:os.getcwd []", "", "is not YAML"),
     ],
 )

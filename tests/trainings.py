@@ -32,6 +32,7 @@ SAC_RECIPE = """
   learning_starts: 100
   train_freq: {train_freq}
   batch_size: 16
+  learning_rate: lin_0.0003
   gamma: 0.95
   ent_coef: auto_0.1
   replay_buffer_class: HerReplayBuffer
