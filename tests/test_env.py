@@ -155,7 +155,7 @@ def test_the_datasheet_lists_the_entries_and_numbers_that_the_code_uses():
     assert rows == entries
     assert "at most 30, 5, 30 mm" in text
     assert list(tasks.STEP_LIMIT) == [0.03, 0.005, 0.03]
-    assert "0 where 1/cond(J) = c >= 0.08, else 1 - (c / 0.08)^4" in text
+    assert "(1 - (c / 0.08)^4) where c = 1/cond(J) < 0.08, else 0" in text
     assert singularity_penalty(0.05) == pytest.approx(1 - (0.05 / 0.08) ** 4)
     assert singularity_penalty(0.08) == 0.0 < singularity_penalty(0.0799)
     low, high = np.array(TASK_REGION.low), np.array(TASK_REGION.high)

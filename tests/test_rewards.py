@@ -1,4 +1,4 @@
-"""The reward terms: exact at their ends, steep where it matters, the same for one state and for many."""
+"""The reward terms: exact at their ends, steep where it matters, the same alone or in a batch."""
 
 from __future__ import annotations
 

@@ -95,7 +95,7 @@ class TPMEnv(gym.Env[Observation, Action]):
     | --- | --- |
     | goal, sparse | 0 if the distance to the goal is below 10 mm, else -1 |
     | goal, dense | minus the distance in units of 0.1 m |
-    | singularity | -penalty_weight x penalty: 0 where 1/cond(J) = c >= 0.08, else 1 - (c / 0.08)^4 |
+    | singularity | -penalty_weight x (1 - (c / 0.08)^4) where c = 1/cond(J) < 0.08, else 0 |
     | approach | minus half the distance from cup to puck in units of 0.1 m |
 
     With an empty info, as SB3's HerReplayBuffer calls it, ``compute_reward`` gives the goal term
