@@ -4,7 +4,7 @@ VENV := .venv
 RUN := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
 
-.PHONY: help demo test lint format test-fast test-slow urdf pictures figures bench-kinematics bench-fidelity bench-speed soak clean
+.PHONY: help demo test lint format test-fast test-slow urdf pictures figures results bench-kinematics bench-fidelity bench-evaluate bench-speed soak clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -16,12 +16,12 @@ $(INSTALLED): pyproject.toml constraints.txt
 	$(RUN) -m pip install -c constraints.txt -e ".[train,test]"
 	touch $@
 
-demo: $(INSTALLED) ## train Reach, evaluate it, let the expert pick and place; see runs/demo/
+demo: $(INSTALLED) ## train Reach, evaluate it, film the published pick-and-place policy; see runs/demo/
 	$(RUN) train/train.py --env TPMReach-v0 --algo sac --seed 0 --run runs/demo/reach --overwrite
 	cp runs/demo/reach/learning_curve.png runs/demo/learning_curve.png
 	$(RUN) train/evaluate.py --policy runs/demo/reach/best.json expert random \
 		--env TPMReach-v0 --episodes 100 --json runs/demo/reach.json
-	$(RUN) train/evaluate.py --policy expert --env TPMPickAndPlace-v0 --episodes 20 --seed 2000006 \
+	$(RUN) train/evaluate.py --policy train/policies/TPMPickAndPlace-v0.json --episodes 20 --seed 2000006 \
 		--json runs/demo/pick_and_place.json --video runs/demo/pick_and_place.mp4 \
 		--picture runs/demo/pick_and_place.png
 	@echo; echo "runs/demo/ now holds:"; ls runs/demo runs/demo/reach
@@ -52,11 +52,17 @@ pictures: $(INSTALLED) ## redraw the README's pictures
 figures: $(INSTALLED) ## redraw the paper's figures, and more, in docs/images/
 	$(RUN) docs/draw_figures.py
 
+results: $(INSTALLED) ## rewrite docs/results.md and its figures from the records in docs/results/
+	$(RUN) train/results.py write
+
 bench-kinematics: $(INSTALLED) ## speed of the kinematics against a floor and a general solver
 	$(RUN) benchmarks/bench_kinematics.py
 
 bench-fidelity: $(INSTALLED) ## loop gaps, FK error and tilt against cost; see docs/fidelity.md
 	$(RUN) benchmarks/bench_fidelity.py
+
+bench-evaluate: $(INSTALLED) ## what evaluate.py costs beyond the stepping
+	$(RUN) benchmarks/bench_evaluate.py --json runs/evaluate.json
 
 bench-speed: $(INSTALLED) ## steps per second beside panda-gym and Gymnasium-Robotics
 	$(RUN) -m pip install -c constraints.txt -e ".[bench]"

@@ -1,4 +1,4 @@
-"""Draw the pictures of the README: the expert picking and placing, as a strip of frames.
+"""Draw the picture of the README: the published policy picking and placing, as a strip of frames.
 
 python docs/draw_pictures.py
 """
@@ -11,10 +11,11 @@ import gymnasium as gym
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-import tpm_gym  # noqa: F401  # registers the ids
-from tpm_gym.expert import Expert
+from tpm_gym import load_policy  # registers the ids as well
 
-IMAGES = Path(__file__).parent / "images"
+DOCS = Path(__file__).resolve().parent
+IMAGES = DOCS / "images"
+POLICY = DOCS.parent / "train" / "policies" / "TPMPickAndPlace-v0.json"
 START, GOAL = (-0.16, -0.034, 0.015), (0.08, -0.030, 0.015)
 FRAMES = {0: "start", 13: "vacuum on: the cup seals", 24: "carrying", 40: "placed, vacuum off"}
 SIZE, SUPERSAMPLING = 380, 3
@@ -26,14 +27,13 @@ def frames() -> dict[int, Image.Image]:
     side = SIZE * SUPERSAMPLING
     env = gym.make("TPMPickAndPlace-v0", render_mode="rgb_array", width=side, height=side)
     observation, _ = env.reset(seed=0, options={"object": START, "goal": GOAL})
-    expert = Expert(env)
-    expert.reset(observation)
+    policy = load_policy(POLICY)
     pictures = {}
     for step in range(max(FRAMES) + 1):
         if step in FRAMES:
             picture = np.asarray(env.render())
             pictures[step] = Image.fromarray(picture)
-        observation, *_ = env.step(expert.act(observation))
+        observation, *_ = env.step(policy.act(observation))
     env.close()
     return pictures
 

@@ -269,7 +269,7 @@ def test_the_learning_curve_is_the_median_with_a_band(real: dict[str, Any]) -> N
 
 def test_plans_have_every_recipe_and_seed(tmp_path: Path) -> None:
     planned = study.plan_runs(study.Config("results", folder=tmp_path))
-    assert len(planned) == (8 + 8 + 4) * 5
+    assert len(planned) == (6 + 4 + 2) * 5
     assert len({run.folder for run in planned}) == len(planned)
     penalty = study.plan_runs(study.Config("penalty", folder=tmp_path))
     assert len(penalty) == 3 * 2 * 5

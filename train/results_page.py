@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Sequence
+from statistics import median
 from typing import Any, Final
 
 from aggregate import (
@@ -91,7 +92,7 @@ def _training(records: Group, figures: Sequence[str]) -> list[str]:
     if not records:
         return []
     head = (
-        "id | method | steps | seeds | success, IQM | steps to 95% | minutes to 95% | "
+        "id | method | steps | seeds | success, IQM | median | steps to 95% | minutes to 95% | "
         "smallest conditioning | time below safe"
     )
     rows = [_training_row(group) for group in grouped(records)]
@@ -115,6 +116,7 @@ def _training_row(group: Group) -> str:
         f"{first['steps']:,}",
         str(len(group)),
         _iqm([success(record, NOMINAL) for record in group]),
+        f"{median(success(record, NOMINAL) for record in group):.1%}",
         _or_never(median_time([steps for steps, _ in times]), "{:,.0f}"),
         _or_never(median_time([minutes for _, minutes in times]), "{:.1f}"),
         _worst(group, NOMINAL, "conditioning_min", min, "{:.3f}"),
@@ -223,20 +225,28 @@ def _of(group: Group) -> set[str]:
 
 def _how(records: Sequence[Record]) -> list[str]:
     """Machines, versions and commands."""
-    told = {_machine(record) for record in records}
+    commits: dict[str, set[str]] = {}
+    for record in records:
+        commits.setdefault(_machine(record), set()).add(str(record["git_commit"])[:10])
+    listed = "\n".join(
+        f"- {machine}; commits {', '.join(sorted(of))}" for machine, of in sorted(commits.items())
+    )
     commands = []
-    for record in sorted(records, key=_order):
-        commands.append(str(record["command"]))
-        commands += [str(test["command"]) for test in record["tests"].values()]
-    listed = "\n".join(f"- {line}" for line in sorted(told))
-    return ["## How\n", listed, "\n```bash", *commands, "```\n"]
+    for first, *_ in grouped(records):
+        commands.append(str(first["command"]))
+        commands += [str(test["command"]) for test in first["tests"].values()]
+    text = (
+        "`train/study.py` ran these for every seed, two at a time; here those of the first seed. "
+        "Each record holds its own.\n"
+    )
+    return ["## How\n", listed + "\n", text, "```bash", *commands, "```\n"]
 
 
 def _machine(record: Record) -> str:
     machine = record["machine"] or {}
     kind = ", ".join(f"{machine.get(name)}" for name in ("system", "architecture", "processor"))
     used = ", ".join(f"{name} {value}" for name, value in (record["versions"] or {}).items())
-    return f"{kind}, {machine.get('cpu_count')} CPUs; {used}; commit {record['git_commit']}"
+    return f"{kind}, {machine.get('cpu_count')} CPUs; {used}"
 
 
 # -- cells ------------------------------------------------------------------------------------
