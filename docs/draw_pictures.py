@@ -16,10 +16,10 @@ from tpm_gym import load_policy  # registers the ids as well
 DOCS = Path(__file__).resolve().parent
 IMAGES = DOCS / "images"
 POLICY = DOCS.parent / "train" / "policies" / "TPMPickAndPlace-v0.json"
-START, GOAL = (-0.16, -0.034, 0.015), (0.08, -0.030, 0.015)
-FRAMES = {0: "start", 13: "vacuum on: the cup seals", 24: "carrying", 40: "placed, vacuum off"}
+START, GOAL = (-0.17, -0.034, 0.015), (0.05, -0.030, 0.015)
+FRAMES = {0: "start", 5: "vacuum on: the cup seals", 9: "carrying", 21: "placed, vacuum off"}
 SIZE, SUPERSAMPLING = 380, 3
-CROP = (0.06, 0.0, 0.99, 0.94)  # left, top, right, bottom of the rendered picture
+CROP = (0.05, 0.0, 1.0, 0.94)  # left, top, right, bottom of the rendered picture
 
 
 def frames() -> dict[int, Image.Image]:
