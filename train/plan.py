@@ -6,9 +6,10 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 import gymnasium as gym
+import tyro
 
 from errors import ConfigError, ResumeConflictError, UnknownEnvError
 from recipes import RECIPES, Recipe, read_recipe
@@ -23,56 +24,60 @@ _GOALS: Final = "sampled"
 _FIXED: Final = ("algo", "env", "seed", "envs", "eval_episodes", "penalty_weight", "goals")
 
 
+def _default(value: object, metavar: str) -> Any:
+    """How the help shows an option that is None where it was not given."""
+    return tyro.conf.arg(help_behavior_hint=f"(default: {value})", metavar=metavar)
+
+
 @dataclass(frozen=True)
 class Config:
     """Train a policy on a tpm_gym environment."""
 
-    algo: Literal["sac", "tqc", "ppo"] | None = None
-    """Algorithm. SAC and TQC use hindsight replay on sparse rewards; PPO wants a Dense id.
-    Default: sac."""
+    algo: Annotated[Literal["sac", "tqc", "ppo"] | None, _default(_ALGO, "{sac,tqc,ppo}")] = None
+    """Algorithm. SAC and TQC use hindsight replay on sparse rewards; PPO wants a Dense id."""
 
-    env: str | None = None
-    """Environment id. Default: TPMReach-v0."""
+    env: Annotated[str | None, _default(_ENV, "ID")] = None
+    """Environment id."""
 
-    seed: int | None = None
-    """Seed of the networks, the exploration and the first training environment. Default: 0."""
+    seed: Annotated[int | None, _default(_SEED, "INT")] = None
+    """Seed of the networks, the exploration and the first training environment."""
 
-    steps: int | None = None
-    """Environment steps, over all environments. Default: as the recipe says."""
+    steps: Annotated[int | None, _default("as the recipe says", "INT")] = None
+    """Environment steps, over all environments."""
 
-    envs: int | None = None
-    """Parallel environments, in processes of their own if several. Default: as the recipe says."""
+    envs: Annotated[int | None, _default("as the recipe says", "INT")] = None
+    """Parallel environments, in processes of their own if several."""
 
-    recipe: Path | None = None
-    """YAML file of hyperparameters by environment id. Default: train/recipes/<algo>.yml."""
+    recipe: Annotated[Path | None, _default("train/recipes/<algo>.yml", "PATH")] = None
+    """YAML file of hyperparameters by environment id."""
 
-    run: Path | None = None
-    """Folder of the run. Default: runs/<env>-<algo>-s<seed>."""
+    run: Annotated[Path | None, _default("runs/<env>-<algo>-s<seed>", "FOLDER")] = None
+    """Folder of the run."""
 
-    penalty_weight: float | None = None
-    """Weight of the singularity penalty in the reward; 0 switches it off. Default: 1."""
+    penalty_weight: Annotated[float | None, _default(_PENALTY_WEIGHT, "FLOAT")] = None
+    """Weight of the singularity penalty in the reward; 0 switches it off."""
 
-    goals: Literal["sampled", "tempting"] | None = None
+    goals: Annotated[
+        Literal["sampled", "tempting"] | None, _default(_GOALS, "{sampled,tempting}")
+    ] = None
     """As the environment samples them, or goals that tempt towards the singularity; in training and
-    in its evaluations. Default: sampled."""
+    in its evaluations."""
 
-    eval_every: int | None = None
-    """Steps between evaluations on held-out seeds. Default: a tenth of the steps."""
+    eval_every: Annotated[int | None, _default("a tenth of the steps", "INT")] = None
+    """Steps between evaluations on held-out seeds."""
 
-    eval_episodes: int | None = None
-    """Episodes per evaluation. Default: 20."""
+    eval_episodes: Annotated[int | None, _default(_EVAL_EPISODES, "INT")] = None
+    """Episodes per evaluation."""
 
-    checkpoint_every: int | None = None
-    """Steps between checkpoints. Default: every half minute, or less often where that would take
-    more than 2% of the time."""
+    checkpoint_every: Annotated[int | None, _default("by time", "INT")] = None
+    """Steps between checkpoints. By time means every half minute, or less often where that would
+    take more than 2% of the time."""
 
-    threads: int | None = None
-    """Threads of PyTorch. With one thread and one environment a seed repeats exactly.
-    Default: 1."""
+    threads: Annotated[int | None, _default("1", "INT")] = None
+    """Threads of PyTorch. With one thread and one environment a seed repeats exactly."""
 
-    device: str | None = None
-    """Device of PyTorch. The networks are small; a GPU pays only with large batches.
-    Default: cpu."""
+    device: Annotated[str | None, _default("cpu", "NAME")] = None
+    """Device of PyTorch. The networks are small; a GPU pays only with large batches."""
 
     overwrite: bool = False
     """Replace an earlier run in the same folder."""
