@@ -13,6 +13,11 @@ def test_actions_are_copied_and_clipped():
     assert np.array_equal(checks.action([0, 1, -1], 3), [0.0, 1.0, -1.0])
 
 
+def test_actions_of_any_finite_size_are_clipped():
+    largest = np.finfo(np.float64).max
+    assert np.array_equal(checks.action([largest, largest, -largest], 3), [1, 1, -1])
+
+
 def test_a_bad_action_is_named_with_what_would_be_valid():
     with pytest.raises(ActionError, match=r"shape \(3,\)") as caught:
         checks.action(np.zeros(4), 3)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -27,7 +26,7 @@ def action(value: Any, size: int) -> NDArray[np.float64]:
         raise ActionError("action", value, f"an array of numbers of shape ({size},)") from error
     if values.shape != (size,):
         raise ActionError("action", values.shape, f"of shape ({size},), by shape")
-    if not math.isfinite(values.sum()):
+    if not np.isfinite(values).all():
         raise ActionError("action", values.tolist(), "finite")
     clipped: NDArray[np.float64] = np.minimum(np.maximum(values, -1.0), 1.0)
     return clipped

@@ -367,7 +367,7 @@ def _vector(name: str, value: ArrayLike) -> Vector:
     if array.shape != (3,):
         raise InputError(name, array.shape, "of shape (3,), by shape")
     a, b, c = array.tolist()
-    if not math.isfinite(a + b + c):
+    if not (math.isfinite(a) and math.isfinite(b) and math.isfinite(c)):
         raise InputError(name, [a, b, c], "finite")
     return a, b, c
 
