@@ -51,3 +51,12 @@ def test_its_episodes_repeat(name: str) -> None:
         # Torch's arithmetic differs between machines: success may come a step sooner or later.
         assert found.total_reward == pytest.approx(published["return"], abs=2.0)
         assert found.conditioning_min == pytest.approx(published["conditioning_min"], abs=0.01)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_readme_tells_its_success_and_steps(name: str) -> None:
+    success = evaluation(name)["success_at_end"]
+    mean, low, high = (100 * success[key] for key in ("mean", "low", "high"))
+    steps = tpm_gym.load_policy(FOLDER / name).description.recipe["n_timesteps"]
+    row = f"| `{name}` | {mean:.1f}% [{low:.1f}, {high:.1f}] | {steps:,} steps"
+    assert row in (FOLDER.parents[1] / "README.md").read_text(encoding="utf-8")

@@ -353,3 +353,11 @@ def test_ctrl_c_stops_a_study_with_checkpoints_saved(tmp_path: Path) -> None:
     log = run.with_suffix(".log").read_text(encoding="utf-8")
     assert "stopped early by SIGTERM, saved at step" in log
     assert (run / "last.zip").is_file()
+
+
+def test_the_page_is_what_its_records_say() -> None:
+    records = [json.loads(path.read_text()) for path in sorted(results.RECORDS.glob("*.json"))]
+    page = results.ROOT / "docs" / "results.md"
+    drawn = (results_page.LEARNING_CURVES, results_page.PENALTY)
+    figures = [name for name in drawn if name in page.read_text()]
+    assert results_page.page(records, figures) == page.read_text(encoding="utf-8")

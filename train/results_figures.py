@@ -94,6 +94,7 @@ def learning_curves(records: Sequence[Record], style: Any) -> Figure:
             _draw_band(axes, group, colours[method(group[0])])
         axes.axhline(LEARNED, color=style.OUTLINE, linewidth=0.6, linestyle=(0, (3, 2)))
         axes.set_title(env_id)
+        axes.set_xlim(left=0)  # a curve that starts later does so because of demonstrations
         axes.set_xlabel("environment steps")
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         axes.set_ylim(-0.03, 1.03)
