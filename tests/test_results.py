@@ -229,6 +229,7 @@ def test_penalty_weights_and_machines_get_tables_of_their_own(real: dict[str, An
     penalty = text.split("## Does the penalty work?")[1].split("## Robustness")[0]
     assert rows(penalty, "| 0 |", "41.0% (40.0% to 42.0%)")
     assert rows(penalty, "| 1 |", "11.0% (10.0% to 12.0%)")
+    assert f"{real['env']}: 41.00% without the penalty, 11.000% with it: 4 times less." in penalty
     robustness = text.split("## Robustness")[1]
     assert rows(robustness, "encoder noise", '{"encoder_noise": 0.0001}', "97.0%")
     assert "tempting" not in text.split("## Does the penalty work?")[0].split("##")[1]

@@ -189,10 +189,27 @@ def _penalty(records: Group, figures: Sequence[str]) -> list[str]:
         "singularity (`--goals tempting`, see `train/tempting.py`): goals, and pucks, lie just "
         "within the safe threshold, and straight lines in the joint angles lead beyond it.\n"
     )
-    parts = [text, _table(head, rows)]
+    parts = [text, _table(head, rows), *_compared(records)]
     if PENALTY in figures:
         parts.append(f"![Success and time below safe by weight](images/{PENALTY})\n")
     return [*parts, *_failures(records, TEMPTING)]
+
+
+def _compared(records: Group) -> list[str]:
+    """One line an id: time below safe without the penalty and with it."""
+    lines = []
+    for env in sorted({record["env"] for record in records}):
+        shares = [
+            _values([r for r in records if r["env"] == env and r["penalty_weight"] == weight],
+                    TEMPTING, "unsafe_share", "mean")
+            for weight in (0.0, 1.0)
+        ]  # fmt: skip
+        if not all(shares):
+            continue
+        without, with_it = (sum(values) / len(values) for values in shares)
+        times = f"{without / with_it:,.0f} times less" if with_it > 0 else "never below"
+        lines.append(f"- {env}: {without:.2%} without the penalty, {with_it:.3%} with it: {times}.")
+    return ["Time below safe, mean over seeds:\n", "\n".join(lines) + "\n"] if lines else []
 
 
 def _robustness(records: Group) -> list[str]:
