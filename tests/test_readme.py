@@ -47,8 +47,18 @@ def test_every_id_in_the_readme_exists():
 
 
 def test_files_that_the_readme_links_to_exist():
-    for target in re.findall(r"\]\(([^)#]+)\)", README):
+    for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", README):
         assert (ROOT / target).exists(), target
+
+
+def test_what_the_penalty_does_is_as_measured():
+    results = (ROOT / "docs/results.md").read_text(encoding="utf-8")
+    measured = re.search(
+        r"^- TPMReachJoints-v0: ([\d.]+)% without .*?, ([\d.]+)% with", results, re.M
+    )
+    claimed = re.search(r"([\d.]+)% of\s+their time below .* without it and ([\d.]+)% with", README)
+    for one, other in zip(measured.groups(), claimed.groups(), strict=True):
+        assert float(one) == pytest.approx(float(other), abs=0.05)
 
 
 def test_make_knows_the_commands():

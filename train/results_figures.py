@@ -99,9 +99,24 @@ def learning_curves(records: Sequence[Record], style: Any) -> Figure:
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         axes.set_ylim(-0.03, 1.03)
         axes.yaxis.set_major_formatter(PercentFormatter(xmax=1))
-        axes.legend(loc="lower right", title="median, least and most")
     panels[0].set_ylabel("successful episodes")
+    _legend(figure, panels, title="median of the seeds, band from the least to the most successful")
     return figure
+
+
+def _legend(figure: Figure, panels: Sequence[Axes], title: str | None = None) -> None:
+    """One legend for all panels, below them."""
+    entries: dict[str, Any] = {}
+    for axes in panels:
+        handles, labels = axes.get_legend_handles_labels()
+        entries |= dict(zip(labels, handles, strict=True))
+    figure.legend(
+        entries.values(),
+        entries,
+        loc="outside lower center",
+        ncols=max(1, len(entries)),
+        title=title,
+    )
 
 
 def _draw_band(axes: Axes, group: Group, colour: str) -> None:
@@ -113,9 +128,7 @@ def _draw_band(axes: Axes, group: Group, colour: str) -> None:
     for row, curve in zip(rows, curves, strict=True):
         if curve["steps"]:
             row[np.searchsorted(steps, curve["steps"])] = curve["success_at_end"]
-    unfinished = sum(not record["finished"] for record in group)
-    label = f"{method(group[0])}, {len(group)} seed" + "s" * (len(group) > 1)
-    label += f", {unfinished} unfinished" if unfinished else ""
+    label = method(group[0])
     if steps:
         axes.fill_between(
             steps, np.nanmin(rows, axis=0), np.nanmax(rows, axis=0), color=colour, alpha=0.2, lw=0
@@ -159,8 +172,7 @@ def penalty(records: Sequence[Record], style: Any) -> Figure:
         axes.set_xlabel("penalty weight")
         axes.set_ylim(-0.03, 1.03)
         axes.yaxis.set_major_formatter(PercentFormatter(xmax=1))
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+    _legend(figure, panels)
     return figure
 
 
