@@ -228,9 +228,10 @@ def _robustness(records: Group) -> list[str]:
             for group in groups
         ]
         rows.append(" | ".join([name.replace("_", " "), ", ".join(sorted(changes)), *cells]))
+    counts = {test["episodes"] for record in records for test in record["tests"].values()}
     text = (
         "## Robustness\n\nThe policies above, trained on the nominal machine alone, on others "
-        "(success, IQM over seeds).\n"
+        f"(success, IQM over seeds; {' or '.join(map(str, sorted(counts)))} episodes a test).\n"
     )
     return [text, _table(" | ".join(["machine", "randomisation", *titles]), rows)]
 
