@@ -27,6 +27,7 @@ from tpm_gym.workspace import TASK_REGION
 HOME = np.array([-0.05, 0.03, 0.78])
 LENGTH_TOLERANCE = 1e-12
 POINT_TOLERANCE = 1e-9
+NEAREST = 1e-6  # product of the parallel factors, each in units of its size
 
 
 def postures(rng: np.random.Generator, count: int, g: Geometry) -> SimpleNamespace:
@@ -74,10 +75,13 @@ def assert_round_trip(s: SimpleNamespace, g: Geometry) -> None:
     )
     # Rounding grows as the inverse of the parallel factors: the nearer to a singularity, the less
     # the angles say about the point. Elsewhere it must not grow at all.
-    sizes = parallel / np.array([1.0, g.l4, g.l4**2])
-    assert (errors * np.minimum(1.0, np.abs(sizes).prod(axis=-1))).max() < 1e-13
+    sizes = np.abs(parallel / np.array([1.0, g.l4, g.l4**2])).prod(axis=-1)
+    assert (errors * np.minimum(1.0, sizes)).max() < 1e-13
     if g == PAPER:
-        assert errors.max() < POINT_TOLERANCE
+        # A point or two of 10,000 lie within rounding of a singularity: float64 angles tell no more.
+        far = sizes > NEAREST
+        assert far.mean() > 0.9999
+        assert errors[far].max() < POINT_TOLERANCE
 
 
 def assert_theta_found_again(s: SimpleNamespace, g: Geometry) -> None:
@@ -234,7 +238,8 @@ def test_named_branches_return_their_slots() -> None:
     found = inverse_all(HOME)
     for slot, mode in enumerate(WORKING_MODES):
         if found.valid[slot]:
-            np.testing.assert_array_equal(inverse(HOME, mode), found.theta[slot])
+            # numpy may round one number and many differently
+            np.testing.assert_allclose(inverse(HOME, mode), found.theta[slot], atol=1e-14)
     np.testing.assert_array_equal(inverse(HOME), inverse(HOME, ELBOWS_OUT))
     theta = inverse(HOME)
     for slot, mode in enumerate(ASSEMBLY_MODES):

@@ -39,7 +39,7 @@ from errors import (
 from features import GoalGapExtractor
 from plan import resume_plan
 from policies import load_policy
-from recipes import read_recipe
+from recipes import RECIPES, read_recipe, read_recipes
 from rollout import SELECTION_SEED, run_episodes
 from train import Config
 
@@ -376,35 +376,39 @@ def test_mistakes_are_named_before_anything_is_written(
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("algorithm", ["sac", "tqc"])
-@pytest.mark.parametrize("env_id", tpm_gym.ENV_IDS)
+SHIPPED = [
+    (algorithm, env_id)
+    for algorithm in ("sac", "tqc", "ppo")
+    for env_id in read_recipes(RECIPES / f"{algorithm}.yml", algorithm)
+]
+
+
+def test_every_id_has_a_shipped_recipe_and_every_sparse_one_two() -> None:
+    assert {env_id for _, env_id in SHIPPED} == set(tpm_gym.ENV_IDS)
+    sparse = {env_id for env_id in tpm_gym.ENV_IDS if "Dense" not in env_id}
+    for algorithm in ("sac", "tqc"):
+        assert sparse <= {env_id for of, env_id in SHIPPED if of == algorithm}
+
+
+@pytest.mark.parametrize(("algorithm", "env_id"), SHIPPED)
 def test_shipped_recipes_relabel_sparse_rewards(algorithm: str, env_id: str) -> None:
     plan = train.make_plan(Config(algo=algorithm, env=env_id))  # type: ignore[arg-type]
     assert plan.recipe.hindsight == ("Dense" not in env_id)
 
 
-@pytest.mark.parametrize("env_id", [name for name in tpm_gym.ENV_IDS if "Dense" in name])
-def test_shipped_ppo_recipes_fill_their_batches(env_id: str) -> None:
-    plan = train.make_plan(Config(algo="ppo", env=env_id))
-    arguments = plan.recipe.arguments
-    assert arguments["n_steps"] * plan.envs % arguments["batch_size"] == 0
-
-
-@pytest.mark.parametrize("algorithm", ["sac", "tqc", "ppo"])
-def test_shipped_recipes_are_arguments_of_the_algorithm(algorithm: str) -> None:
-    for env_id in tpm_gym.ENV_IDS:
-        if algorithm == "ppo" and "Dense" not in env_id:
-            continue
-        plan = train.make_plan(Config(algo=algorithm, env=env_id))  # type: ignore[arg-type]
-        recipe = plan.recipe
-        if "buffer_size" in recipe.arguments:  # a buffer of full size takes seconds to build
-            recipe = replace(recipe, arguments={**recipe.arguments, "buffer_size": 100})
-        envs = gym.make(env_id)
-        plan = replace(plan, recipe=recipe)
-        model = train._make_model(plan, envs)
-        assert model.gamma == recipe.arguments["gamma"]
-        assert model.policy_kwargs["net_arch"] == recipe.arguments["policy_kwargs"]["net_arch"]
-        envs.close()
+@pytest.mark.parametrize(("algorithm", "env_id"), SHIPPED)
+def test_shipped_recipes_are_arguments_of_the_algorithm(algorithm: str, env_id: str) -> None:
+    plan = train.make_plan(Config(algo=algorithm, env=env_id))  # type: ignore[arg-type]
+    recipe = plan.recipe
+    if algorithm == "ppo":
+        assert recipe.arguments["n_steps"] * plan.envs % recipe.arguments["batch_size"] == 0
+    else:  # a buffer of full size takes seconds to build
+        recipe = replace(recipe, arguments={**recipe.arguments, "buffer_size": 100})
+    envs = gym.make(env_id)
+    model = train._make_model(replace(plan, recipe=recipe), envs)
+    assert model.gamma == recipe.arguments["gamma"]
+    assert model.policy_kwargs["net_arch"] == recipe.arguments["policy_kwargs"]["net_arch"]
+    envs.close()
 
 
 def test_networks_see_the_gap_to_the_goal() -> None:

@@ -99,6 +99,7 @@ def _training(records: Group, figures: Sequence[str]) -> list[str]:
     parts = ["## Learning\n", _table(head, rows)]
     if LEARNING_CURVES in figures:
         parts.append(f"![Learning curves](images/{LEARNING_CURVES})\n")
+        parts.append("A curve that does not start at 0 starts after the demonstrations.\n")
     head = (
         "id | method | seed | success | steps to 95% | minutes to 95% | minutes in all | "
         "smallest conditioning | time below safe | observed P off"
