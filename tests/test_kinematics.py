@@ -78,7 +78,7 @@ def assert_round_trip(s: SimpleNamespace, g: Geometry) -> None:
     sizes = np.abs(parallel / np.array([1.0, g.l4, g.l4**2])).prod(axis=-1)
     assert (errors * np.minimum(1.0, sizes)).max() < 1e-13
     if g == PAPER:
-        # A point or two of 10,000 lie within rounding of a singularity: float64 angles tell no more.
+        # A few lie within rounding of a singularity: the angles tell no more in float64.
         far = sizes > NEAREST
         assert far.mean() > 0.9999
         assert errors[far].max() < POINT_TOLERANCE

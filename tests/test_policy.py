@@ -8,14 +8,17 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import safetensors.numpy
 from gymnasium import spaces
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 import tpm_gym
 from policies_on_file import DATA, WEIGHTS, Weights, described, observations, some_weights, write
@@ -26,6 +29,8 @@ from tpm_gym.errors import (
     PolicyMismatchError,
 )
 from tpm_gym.policy import Policy, load_policy
+
+PUBLISHED = Path(__file__).parents[1] / "train" / "policies"
 
 
 def reference(
@@ -162,6 +167,32 @@ def test_an_environment_of_another_kind_is_refused(policy: Policy) -> None:
         policy.check(other)
 
 
+def test_joint_increments_are_no_cartesian_ones() -> None:
+    """Their spaces are equal."""
+    policy = load_policy(PUBLISHED / "TPMPickAndPlaceJoints-v0.json")
+    for env_id in ("TPMPickAndPlaceJoints-v0", "TPMPickAndPlaceJointsDense-v0"):
+        with closing(gym.make(env_id)) as env:
+            policy.check(env)
+            policy.check(env.unwrapped)
+    with closing(gym.make("TPMPickAndPlace-v0")) as env:
+        with pytest.raises(PolicyMismatchError, match=r"control joints, .* cartesian") as caught:
+            policy.check(env)
+        assert caught.value.kind == "control"
+    vector = DummyVecEnv([lambda: gym.make("TPMPickAndPlaceDense-v0")])
+    with closing(vector), pytest.raises(PolicyMismatchError, match="TPMPickAndPlaceJoints-v0"):
+        policy.check(vector)
+
+
+def test_what_is_no_environment_is_refused(policy: Policy) -> None:
+    for thing in (None, "TPMReach-v0"):
+        with pytest.raises(InputError, match=r"an environment, such as gym.make\('TPMReach-v0'\)"):
+            policy.check(thing)
+
+
+def test_a_policy_names_itself(policy: Policy) -> None:
+    assert repr(policy) == "<Policy of TPMReach-v0, sac, seed 3>"
+
+
 def test_the_description_says_where_the_policy_comes_from(policy: Policy) -> None:
     about = policy.description
     assert (about.env_id, about.algorithm) == ("TPMReach-v0", "sac")
@@ -205,7 +236,7 @@ def test_what_is_no_policy_is_named(tmp_path: Path) -> None:
 
 def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "p.json")
-    with pytest.raises(PolicyFileError, match="no such file"):
+    with pytest.raises(PolicyFileError, match="is not a file"):
         load_policy(tmp_path / "p.json")
 
 

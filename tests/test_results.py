@@ -273,7 +273,7 @@ def test_plans_have_every_recipe_and_seed(tmp_path: Path) -> None:
     assert len(planned) == (6 + 4 + 2) * 5
     assert len({run.folder for run in planned}) == len(planned)
     penalty = study.plan_runs(study.Config("penalty", folder=tmp_path))
-    assert len(penalty) == 3 * 2 * 5
+    assert len(penalty) == 2 * 2 * 5
     assert all("--goals" in (run.options or ()) for run in penalty)
     with pytest.raises(ConfigError, match="--envs"):
         study.plan_runs(study.Config("results", envs=("Nope-v0",)))

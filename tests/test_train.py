@@ -348,6 +348,9 @@ def test_command_line_trains_ppo_in_parallel_and_stops_when_asked_to(
     assert json.loads((folder / "config.json").read_text())["training_seeds"] == [0, 1]
 
 
+PICK = {"env": "TPMPickAndPlace-v0", "recipe": RECIPES / "sac.yml"}
+
+
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
@@ -362,6 +365,8 @@ def test_command_line_trains_ppo_in_parallel_and_stops_when_asked_to(
         ({"seed": SELECTION_SEED}, ConfigError, "held out"),
         ({"seed": SELECTION_SEED - 2, "envs": 3}, ConfigError, "held out"),
         ({"envs": 5}, ConfigError, "before the first episode ends"),
+        ({**PICK, "steps": 20_000}, ConfigError, "more than the 20,000 of the recipe's demonst"),
+        ({**PICK, "steps": 20_050, "envs": 3}, ConfigError, "the 20,100 of"),
         ({"algo": "ppo"}, RecipeError, "no recipe for TPMReach-v0"),
         ({"recipe": Path("none.yml")}, RecipeError, "cannot be read"),
     ],
@@ -369,7 +374,7 @@ def test_command_line_trains_ppo_in_parallel_and_stops_when_asked_to(
 def test_mistakes_are_named_before_anything_is_written(
     options: dict[str, Any], error: type[TrainError], message: str, small: Path, tmp_path: Path
 ) -> None:
-    if "algo" not in options:
+    if not {"algo", "recipe"} & set(options):
         options = {"recipe": small, **options}
     with pytest.raises(error, match=message):
         train.train(Config(**{"run": tmp_path / "run", **options}), quiet())

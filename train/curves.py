@@ -28,7 +28,7 @@ def draw_learning_curve(path: Path, title: str, evaluations: Sequence[Mapping[st
         title: First line above the figure.
         evaluations: The lines of evaluations.jsonl, at least one.
     """
-    figure = Figure(figsize=(8.0, 6.4), dpi=150, layout="constrained")
+    figure = Figure(figsize=(9.0, 6.0), dpi=150, layout="constrained")
     FigureCanvasAgg(figure)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[3, 2])
     steps = [evaluation["steps"] for evaluation in evaluations]
@@ -80,8 +80,8 @@ def _draw_success(
     axes.yaxis.set_major_formatter(PercentFormatter(xmax=1))
     axes.set_ylabel("successful episodes")
     episodes = evaluations[-1]["episodes"]
-    axes.set_title(f"{episodes} held-out episodes per evaluation", fontsize=9.5, color=_INK)
-    axes.legend(framealpha=0.9, edgecolor="none", fontsize=9, loc="lower right")
+    axes.set_title(f"{episodes} episodes an evaluation, never trained on", fontsize=9.5, color=_INK)
+    _legend(axes)
 
 
 def _draw_return(
@@ -101,7 +101,12 @@ def _draw_return(
     means = [estimate["mean"] for estimate in returns]
     axes.plot(steps, means, color=_BLUE, linewidth=2, marker="o", markersize=4, label="mean")
     axes.set_ylabel("return per episode")
-    axes.legend(framealpha=0.9, edgecolor="none", fontsize=9, loc="lower right")
+    _legend(axes)
+
+
+def _legend(axes: Axes) -> None:
+    """A legend to the right, where it covers no data."""
+    axes.legend(frameon=False, fontsize=9, loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
 def _style(axes: Axes) -> None:

@@ -65,7 +65,7 @@ class RunExistsError(TrainError):
         """Store the values and compose the message."""
         self.run = run
         super().__init__(
-            f"run folder {run} is not empty; choose another with --run, continue the earlier run "
+            f"{run} is not an empty folder; choose another with --run, continue the earlier run "
             "with --resume, or replace it with --overwrite"
         )
 

@@ -68,7 +68,8 @@ class Config:
 
     randomisation: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=VALUE ...")] = ()
     """Where the machine differs from the nominal one: attributes of tpm_gym's Randomisation, each
-    a number, or LOW:HIGH to draw from, for example encoder_noise=1e-4 puck_mass=0.5:2."""
+    a number, or for factors LOW:HIGH to draw from, for example encoder_noise=1e-4 puck_mass=0.5:2.
+    Those about the puck change nothing where there is none."""
 
     json: Path | None = None
     """Write metrics, episodes and versions here."""

@@ -268,7 +268,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     config = tyro.cli(Config, description=__doc__, args=arguments)
     try:
         if not config.model.is_file():
-            raise ConfigError("MODEL", config.model, "there is no such file")
+            known = "is not a file" if config.model.exists() else "there is no such file"
+            raise ConfigError("MODEL", config.model, f"{known}; give best.zip or last.zip of a run")
         require_trust(str(config.model), config.model, config.trust_pickle)
         print(_convert(config.model, config.out))
     except (TrainError, TPMError) as error:

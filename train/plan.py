@@ -259,6 +259,7 @@ def _check(plan: Plan) -> None:
         valid = "must be a finite number, 0 or more"
         raise ConfigError("--penalty-weight", plan.penalty_weight, valid)
     _check_hindsight(plan)
+    _check_demonstrations(plan)
     _check_device(plan.device)
 
 
@@ -272,6 +273,19 @@ def _check_device(device: str) -> None:
         raise ConfigError("--device", device, "is no device of PyTorch; try cpu") from error
     if kind == "cuda" and not torch.cuda.is_available():
         raise ConfigError("--device", device, "PyTorch finds no GPU here; use cpu")
+
+
+def _check_demonstrations(plan: Plan) -> None:
+    """Refuse to end before the demonstrations do: they count as steps, and teach nothing alone."""
+    episodes = -(-int(plan.recipe.demonstrations.get("episodes", 0)) // plan.envs) * plan.envs
+    needed = episodes * (gym.spec(plan.env).max_episode_steps or 0)
+    if episodes and plan.steps <= needed:
+        raise ConfigError(
+            "--steps",
+            plan.steps,
+            f"must be more than the {needed:,} of the recipe's demonstrations; for a short trial "
+            "give a --recipe with fewer",
+        )
 
 
 def _check_hindsight(plan: Plan) -> None:

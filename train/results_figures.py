@@ -137,7 +137,7 @@ def _draw_band(axes: Axes, group: Group, colour: str) -> None:
 
 
 def penalty(records: Sequence[Record], style: Any) -> Figure:
-    """Draw success and time below safe by penalty weight: a dot a seed, a bar at the median.
+    """Draw success and time below safe by penalty weight: a dot a seed, a bar at the mean.
 
     Args:
         records: Runs on tempting goals, tested on them.
@@ -157,7 +157,7 @@ def penalty(records: Sequence[Record], style: Any) -> Figure:
                 values = [record["tests"][TEMPTING][name]["mean"] for record in group]
                 x = index + 0.16 * (2 * place - 1)
                 axes.plot([x] * len(values), values, "o", color=colour, alpha=0.6, markersize=4)
-                axes.hlines(np.median(values), x - 0.12, x + 0.12, color=colour, linewidth=1.6)
+                axes.hlines(np.mean(values), x - 0.12, x + 0.12, color=colour, linewidth=1.6)
             axes.plot([], [], "o", color=colour, label=label)
         axes.set_xlim(-0.5, len(groups) - 0.5)
         several = len({method(group[0]) for group in groups}) > 1
@@ -172,7 +172,7 @@ def penalty(records: Sequence[Record], style: Any) -> Figure:
         axes.set_xlabel("penalty weight")
         axes.set_ylim(-0.03, 1.03)
         axes.yaxis.set_major_formatter(PercentFormatter(xmax=1))
-    _legend(figure, panels)
+    _legend(figure, panels, title="a dot a seed, a bar at their mean")
     return figure
 
 

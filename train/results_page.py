@@ -38,10 +38,26 @@ Written by `make results` from the records in [results](results); nothing here w
   most one may fail), the same episodes each time. Minutes include them; minutes and steps include
   the playing of demonstrations. For several seeds it is the median, "never" where that is a
   run that never did.
-- **Smallest conditioning** is the least 1/cond(J) of all steps of all test episodes, **time below
-  safe** the share of their steps with 1/cond(J) < 0.08.
+- **Smallest conditioning** is the least 1/cond(J) of all steps of all test episodes (and seeds),
+  **time below safe** the share of their steps with 1/cond(J) < 0.08 (the mean of seeds).
 - **Observed P off** is the largest distance between the observed position of the platform (forward
-  kinematics of the encoders) and the simulated one.
+  kinematics of the encoders) and the simulated one, of all steps, episodes and seeds.
+"""
+
+
+_STUDY: Final = """\
+With `+modified`, files that git tracks differed from the commit. All of it again, two runs at a
+time on two cores:
+
+```bash
+python train/study.py --plan results
+python train/study.py --plan penalty
+python train/study.py --plan robustness --episodes 500
+python train/results.py collect
+make results
+```
+
+`study.py` runs these commands for every seed; here those of the first. Each record holds its own.
 """
 
 
@@ -246,7 +262,8 @@ def _how(records: Sequence[Record]) -> list[str]:
     """Machines, versions and commands."""
     commits: dict[str, set[str]] = {}
     for record in records:
-        commits.setdefault(_machine(record), set()).add(str(record["git_commit"])[:10])
+        used = [record, *record["tests"].values()]
+        commits.setdefault(_machine(record), set()).update(_commit(by["git_commit"]) for by in used)
     listed = "\n".join(
         f"- {machine}; commits {', '.join(sorted(of))}" for machine, of in sorted(commits.items())
     )
@@ -254,11 +271,13 @@ def _how(records: Sequence[Record]) -> list[str]:
     for first, *_ in grouped(records):
         commands.append(str(first["command"]))
         commands += [str(test["command"]) for test in first["tests"].values()]
-    text = (
-        "`train/study.py` ran these for every seed, two at a time; here those of the first seed. "
-        "Each record holds its own.\n"
-    )
-    return ["## How\n", listed + "\n", text, "```bash", *commands, "```\n"]
+    return ["## How\n", listed + "\n", _STUDY, "```bash", *commands, "```\n"]
+
+
+def _commit(name: str | None) -> str:
+    """A short commit; what was modified when it ran stays marked."""
+    commit, plus, modified = str(name).partition("+")
+    return commit[:10] + plus + modified
 
 
 def _machine(record: Record) -> str:

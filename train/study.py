@@ -39,7 +39,7 @@ from results import EVALUATIONS_FILE, TESTS
 from results_page import NOMINAL, TEMPTING
 
 _HERE: Final = Path(__file__).parent
-_PENALTY_IDS: Final = ("TPMReach-v0", "TPMReachJoints-v0", "TPMPickAndPlaceJoints-v0")
+_PENALTY_IDS: Final = ("TPMReach-v0", "TPMReachJoints-v0")
 _ROBUSTNESS_IDS: Final = ("TPMReach-v0", "TPMPickAndPlace-v0", "TPMPickAndPlaceJoints-v0")
 _WEIGHTS: Final = (0.0, 1.0)
 _MACHINES: Final = {
@@ -62,7 +62,7 @@ class Config:
     """What to run; robustness needs the runs of results."""
 
     envs: tuple[str, ...] = ()
-    """Environment ids. Default: all that have a recipe, or three of them for penalty and
+    """Environment ids. Default: all that have a recipe, two of them for penalty, three for
     robustness."""
 
     algos: tuple[str, ...] = ()
@@ -309,9 +309,10 @@ def _show(config: Config, runs: Sequence[Run]) -> None:
     for name, column in zip(("trainings", "tests"), zip(*times, strict=True), strict=True):
         known = [seconds for seconds in column if seconds is not None]
         hours = sum(known) / config.jobs / 3600
-        line = f"# {name}: {hours:.2f} h with {config.jobs} at once"
-        unknown = len(column) - len(known)
-        print(line + (f", and those of {unknown} runs, never timed" if unknown else ""))
+        parts = [f"{hours:.2f} h with {config.jobs} at once"] if known else []
+        if unknown := len(column) - len(known):
+            parts.append(f"{unknown} runs that nothing like has been timed here")
+        print(f"# {name}: {', and '.join(parts)}")
 
 
 def study(config: Config) -> int:

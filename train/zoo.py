@@ -10,8 +10,8 @@ as Python, it gets the classes themselves.
 
 from __future__ import annotations
 
+import argparse
 import sys
-from itertools import pairwise
 from typing import Any
 
 from features import GoalGapExtractor
@@ -47,10 +47,9 @@ def _translate(entries: dict[str, Any]) -> dict[str, Any]:
 
 def _algorithm(command_line: list[str]) -> str:
     """The value of ``--algo``; the zoo's own default without it."""
-    for flag, value in pairwise(command_line):
-        if flag == "--algo":
-            return value
-    return "ppo"
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--algo", default="ppo")
+    return str(parser.parse_known_args(command_line)[0].algo)
 
 
 hyperparams = hyperparameters(_algorithm(sys.argv))

@@ -190,7 +190,7 @@ class PolicyMismatchError(TPMError, ValueError):
     """A policy does not fit an environment.
 
     Attributes:
-        kind: What differs: ``"observation space"`` or ``"action space"``.
+        kind: What differs: ``"observation space"``, ``"action space"`` or ``"control"``.
         trained: What the policy was trained with.
         given: What the environment has.
         env_id: The environment the policy was trained on, which would be valid.

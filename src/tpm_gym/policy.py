@@ -10,7 +10,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from tpm_gym.errors import (
@@ -131,19 +133,32 @@ class Policy:
     def check(self, env: Any) -> None:
         """Make sure that the policy fits an environment.
 
-        Spaces alone are compared: they do not tell Cartesian from joint increments.
+        Spaces are compared, and between environments of tpm_gym whether actions are Cartesian or
+        joint increments, which spaces do not tell.
 
         Args:
             env: An environment of Gymnasium, wrapped or not, or a vector of Stable-Baselines3.
 
         Raises:
             PolicyMismatchError: It has other observations or actions.
+            InputError: It is no environment.
         """
+        wanted = self.description
+        if not hasattr(env, "observation_space") or not hasattr(env, "action_space"):
+            raise InputError("env", env, f"an environment, such as gym.make({wanted.env_id!r})")
         for kind in ("observation_space", "action_space"):
-            trained, given = getattr(self.description, kind), getattr(env, kind)
+            trained, given = getattr(wanted, kind), getattr(env, kind)
             if trained != given:
                 name = kind.replace("_", " ")
-                raise PolicyMismatchError(name, trained, given, self.description.env_id)
+                raise PolicyMismatchError(name, trained, given, wanted.env_id)
+        own, found = _control(gym.registry.get(wanted.env_id)), _control(_spec(env))
+        if own and found and own != found:
+            raise PolicyMismatchError("control", own, found, wanted.env_id)
+
+    def __repr__(self) -> str:
+        """Name the policy and its origin."""
+        about = self.description
+        return f"<Policy of {about.env_id}, {about.algorithm}, seed {about.seed}>"
 
     def _check_observation(
         self, observation: Mapping[str, Any]
@@ -189,3 +204,17 @@ def _as_float32(name: str, value: Any) -> NDArray[np.float32]:
             return np.asarray(value, dtype=np.float32)
     except (TypeError, ValueError) as error:
         raise InputError(name, value, "an array of numbers") from error
+
+
+def _spec(env: Any) -> EnvSpec | None:
+    """What an environment was made from, the first of a vector; None where it does not say."""
+    spec = getattr(getattr(env, "unwrapped", env), "spec", None)
+    if spec is None and hasattr(env, "get_attr"):
+        spec = env.get_attr("spec")[0]
+    found: EnvSpec | None = spec
+    return found
+
+
+def _control(spec: EnvSpec | None) -> str | None:
+    """How the actions of an environment of tpm_gym move the platform; None of others."""
+    return None if spec is None else spec.kwargs.get("control")

@@ -238,7 +238,8 @@ def _read(file: Path, limit: int) -> bytes:
     """Return the content of a file, after a look at its size."""
     try:
         if not file.is_file():  # a pipe, for one, would never end
-            raise PolicyFileError(str(file), "there is no such file", "check the name")
+            reason = "is not a file" if file.exists() else "there is no such file"
+            raise PolicyFileError(str(file), reason, "check the name")
         with file.open("rb") as stream:
             size = os.fstat(stream.fileno()).st_size
             if size > limit:
