@@ -46,8 +46,8 @@ Written by `make results` from the records in [results](results); nothing here w
 
 
 _STUDY: Final = """\
-With `+modified`, files that git tracks differed from the commit. Minutes are wall-clock, of two runs
-at a time on two cores, and of some runs too long: tests ran beside them. All of it again:
+With `+modified`, files that git tracks differed from the commit. Minutes are wall-clock, of two
+runs at a time on two cores, and of some runs too long: tests ran beside them. All of it again:
 
 ```bash
 python train/study.py --plan results
