@@ -229,7 +229,9 @@ def test_penalty_weights_and_machines_get_tables_of_their_own(real: dict[str, An
     penalty = text.split("## Does the penalty work?")[1].split("## Robustness")[0]
     assert rows(penalty, "| 0 |", "41.0% (40.0% to 42.0%)")
     assert rows(penalty, "| 1 |", "11.0% (10.0% to 12.0%)")
-    assert f"{real['env']}: 41.00% without the penalty, 11.000% with it: 4 times less." in penalty
+    assert (
+        f"{real['env']}, 120 steps: 41.00% without the penalty, 11.000% with it: 4 times less."
+    ) in penalty
     robustness = text.split("## Robustness")[1]
     assert rows(robustness, "encoder noise", '{"encoder_noise": 0.0001}', "97.0%")
     assert "tempting" not in text.split("## Does the penalty work?")[0].split("##")[1]
@@ -248,6 +250,10 @@ def test_the_penalty_figure_has_a_dot_a_seed(real: dict[str, Any], tmp_path: Pat
     figure = results_figures.penalty(records, style)
     dots = [line for line in figure.axes[0].lines if len(line.get_xdata()) == 3]
     assert len(dots) == 4  # two metrics at two weights
+    assert [label.get_text() for label in figure.axes[0].get_xticklabels()] == ["0", "1"]
+    longer = results_figures.penalty([*records, *(r | {"steps": 999} for r in records)], style)
+    labels = [label.get_text() for label in longer.axes[0].get_xticklabels()]
+    assert labels == ["0\n120\nsteps", "1\n120\nsteps", "0\n999\nsteps", "1\n999\nsteps"]
     (path,) = results_figures.draw(records, tmp_path)
     assert path.name == results_page.PENALTY
 
@@ -273,10 +279,15 @@ def test_plans_have_every_recipe_and_seed(tmp_path: Path) -> None:
     assert len(planned) == (6 + 4 + 2) * 5
     assert len({run.folder for run in planned}) == len(planned)
     penalty = study.plan_runs(study.Config("penalty", folder=tmp_path))
-    assert len(penalty) == 2 * 2 * 5
+    assert len(penalty) == 3 * 2 * 5
     assert all("--goals" in (run.options or ()) for run in penalty)
     with pytest.raises(ConfigError, match="--envs"):
         study.plan_runs(study.Config("results", envs=("Nope-v0",)))
+    longer = study.plan_runs(study.Config("penalty", folder=tmp_path, steps=70_000))
+    assert not {run.folder for run in longer} & {run.folder for run in penalty}
+    assert all("--steps 70000" in " ".join(study.commands(run, 1)[0]) for run in longer)
+    with pytest.raises(ConfigError, match="--steps 0"):
+        study.plan_runs(study.Config("results", steps=0))
     with pytest.raises(ConfigError, match="--seeds 0"):
         study.plan_runs(study.Config("results", seeds=0))
     with pytest.raises(ConfigError, match="run --plan results first"):

@@ -160,20 +160,24 @@ def penalty(records: Sequence[Record], style: Any) -> Figure:
                 axes.hlines(np.mean(values), x - 0.12, x + 0.12, color=colour, linewidth=1.6)
             axes.plot([], [], "o", color=colour, label=label)
         axes.set_xlim(-0.5, len(groups) - 0.5)
-        several = len({method(group[0]) for group in groups}) > 1
-        axes.set_xticks(
-            range(len(groups)),
-            [
-                f"{group[0]['penalty_weight']:g}" + (f"\n{method(group[0])}" if several else "")
-                for group in groups
-            ],
-        )
+        axes.set_xticks(range(len(groups)), _weights([group[0] for group in groups]))
         axes.set_title(env_id)
         axes.set_xlabel("penalty weight")
         axes.set_ylim(-0.03, 1.03)
         axes.yaxis.set_major_formatter(PercentFormatter(xmax=1))
     _legend(figure, panels, title="a dot a seed, a bar at their mean")
     return figure
+
+
+def _weights(records: Sequence[Record]) -> list[str]:
+    """Penalty weights as labels, with what else sets the runs apart."""
+    parts = [
+        [method(record) for record in records],
+        [f"{record['steps']:,}\nsteps" for record in records],
+    ]
+    telling = [part for part in parts if len(set(part)) > 1]
+    weights = [f"{record['penalty_weight']:g}" for record in records]
+    return ["\n".join(labels) for labels in zip(weights, *telling, strict=True)]
 
 
 def _colours(style: Any) -> list[str]:

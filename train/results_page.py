@@ -52,6 +52,7 @@ runs at a time on two cores, and of some runs too long: tests ran beside them. A
 ```bash
 python train/study.py --plan results
 python train/study.py --plan penalty
+python train/study.py --plan penalty --envs TPMPickAndPlaceJoints-v0 --steps 100000
 python train/study.py --plan robustness --episodes 500
 python train/results.py collect
 make results
@@ -166,7 +167,7 @@ def _failures(records: Group, test: str) -> list[str]:
     for record in sorted(records, key=_order):
         name = f"{record['env']}, {method(record)}, seed {record['seed']}"
         if record["goals"] == "tempting":
-            name += f", penalty weight {record['penalty_weight']:g}"
+            name += f", {record['steps']:,} steps, penalty weight {record['penalty_weight']:g}"
         if not record["finished"]:
             reached = (record["evaluations"]["steps"] or [0])[-1]
             lines.append(f"- {name}: stopped after {reached:,} of {record['steps']:,} steps.")
@@ -183,7 +184,7 @@ def _penalty(records: Group, figures: Sequence[str]) -> list[str]:
     if not records:
         return []
     head = (
-        "id | method | penalty weight | seeds | success, IQM | time below safe (seeds) | "
+        "id | method | steps | penalty weight | seeds | success, IQM | time below safe (seeds) | "
         "smallest conditioning | observed P off | torque, RMS | torque, peak"
     )
     rows = []
@@ -191,6 +192,7 @@ def _penalty(records: Group, figures: Sequence[str]) -> list[str]:
         cells = [
             group[0]["env"],
             method(group[0]),
+            f"{group[0]['steps']:,}",
             f"{group[0]['penalty_weight']:g}",
             str(len(group)),
             _iqm([success(record, TEMPTING) for record in group]),
@@ -213,11 +215,12 @@ def _penalty(records: Group, figures: Sequence[str]) -> list[str]:
 
 
 def _compared(records: Group) -> list[str]:
-    """One line an id: time below safe without the penalty and with it."""
+    """One line an id and its steps: time below safe without the penalty and with it."""
     lines = []
-    for env in sorted({record["env"] for record in records}):
+    for env, steps in sorted({(record["env"], record["steps"]) for record in records}):
+        alike = [r for r in records if (r["env"], r["steps"]) == (env, steps)]
         shares = [
-            _values([r for r in records if r["env"] == env and r["penalty_weight"] == weight],
+            _values([r for r in alike if r["penalty_weight"] == weight],
                     TEMPTING, "unsafe_share", "mean")
             for weight in (0.0, 1.0)
         ]  # fmt: skip
@@ -225,7 +228,10 @@ def _compared(records: Group) -> list[str]:
             continue
         without, with_it = (sum(values) / len(values) for values in shares)
         times = f"{without / with_it:,.0f} times less" if with_it > 0 else "never below"
-        lines.append(f"- {env}: {without:.2%} without the penalty, {with_it:.3%} with it: {times}.")
+        name = f"{env}, {steps:,} steps"
+        lines.append(
+            f"- {name}: {without:.2%} without the penalty, {with_it:.3%} with it: {times}."
+        )
     return ["Time below safe, mean over seeds:\n", "\n".join(lines) + "\n"] if lines else []
 
 

@@ -2,6 +2,7 @@
 
     python train/study.py --plan results --envs TPMReach-v0 --dry-run
     python train/study.py --plan penalty
+    python train/study.py --plan penalty --envs TPMPickAndPlaceJoints-v0 --steps 100000
 
 ``results``: every recipe on its ids, five seeds each, tested on 1000 held-out episodes.
 ``penalty``: the same recipes with the singularity penalty off and on, on goals that tempt towards
@@ -39,7 +40,7 @@ from results import EVALUATIONS_FILE, TESTS
 from results_page import NOMINAL, TEMPTING
 
 _HERE: Final = Path(__file__).parent
-_PENALTY_IDS: Final = ("TPMReach-v0", "TPMReachJoints-v0")
+_PENALTY_IDS: Final = ("TPMReach-v0", "TPMReachJoints-v0", "TPMPickAndPlaceJoints-v0")
 _ROBUSTNESS_IDS: Final = ("TPMReach-v0", "TPMPickAndPlace-v0", "TPMPickAndPlaceJoints-v0")
 _WEIGHTS: Final = (0.0, 1.0)
 _MACHINES: Final = {
@@ -62,8 +63,12 @@ class Config:
     """What to run; robustness needs the runs of results."""
 
     envs: tuple[str, ...] = ()
-    """Environment ids. Default: all that have a recipe, two of them for penalty, three for
+    """Environment ids. Default: all that have a recipe, three of them for penalty and for
     robustness."""
+
+    steps: int | None = None
+    """Steps of each training; other than the recipe's, in folders of their own. Default: the
+    recipe's."""
 
     algos: tuple[str, ...] = ()
     """Algorithms. Default: sac, tqc and ppo for results, else sac."""
@@ -110,11 +115,12 @@ def plan_runs(config: Config) -> list[Run]:
         ConfigError: No run is left of the plan, or a number cannot work.
     """
     for option, value in {
+        "--steps": config.steps,
         "--seeds": config.seeds,
         "--episodes": config.episodes,
         "--jobs": config.jobs,
     }.items():
-        if value < 1:
+        if value is not None and value < 1:
             raise ConfigError(option, value, "must be at least 1")
     usual = ("sac", "tqc", "ppo") if config.plan == "results" else ("sac",)
     runs = [
@@ -142,6 +148,10 @@ def _ids(config: Config, algo: str) -> list[str]:
 def _runs_of(config: Config, env: str, algo: str, seed: int) -> list[Run]:
     """The runs of one id, algorithm and seed."""
     name = f"{env}-{algo}"
+    options = ["--seed", str(seed)]
+    if config.steps is not None:
+        name += f"-{config.steps}steps"
+        options += ["--steps", str(config.steps)]
     if config.plan == "penalty":
         goals = ("--goals", "tempting")
         return [
@@ -149,14 +159,14 @@ def _runs_of(config: Config, env: str, algo: str, seed: int) -> list[Run]:
                 config.folder / f"{name}-tempting-w{weight:g}-s{seed}",
                 env,
                 algo,
-                ("--seed", str(seed), *goals, "--penalty-weight", f"{weight:g}"),
+                (*options, *goals, "--penalty-weight", f"{weight:g}"),
                 ((TEMPTING, goals),),
             )
             for weight in _WEIGHTS
         ]
     folder = config.folder / f"{name}-s{seed}"
     if config.plan == "results":
-        return [Run(folder, env, algo, ("--seed", str(seed)), ((NOMINAL, ()),))]
+        return [Run(folder, env, algo, tuple(options), ((NOMINAL, ()),))]
     machines = {
         machine: ("--randomisation", entry)
         for machine, entry in _MACHINES.items()
@@ -228,21 +238,22 @@ def estimate(run: Run, config: Config) -> tuple[float | None, float | None]:
         Seconds for the training and for the tests; None where nothing of its kind has been timed.
     """
     left = commands(run, config.episodes)
-    training = 0.0 if _is_finished(run.folder) else _time_to_train(run, config.folder)
+    training = 0.0 if _is_finished(run.folder) else _time_to_train(run, config)
     tests = sum("train/evaluate.py" in command for command in left)
     pace = _seconds_an_episode(run.env, config.folder)
     testing = tests * config.episodes * pace if pace is not None else None
     return training if run.options is not None else 0.0, testing if tests else 0.0
 
 
-def _time_to_train(run: Run, folder: Path) -> float | None:
+def _time_to_train(run: Run, config: Config) -> float | None:
     """Seconds from where a training is to its end, at the median pace of all of its kind."""
-    found = [_progress(other) for other in folder.glob(f"{run.env}-{run.algo}-*")]
+    found = [_progress(other) for other in config.folder.glob(f"{run.env}-{run.algo}-*")]
     paces = [progress[1] / progress[0] for progress in found if progress and progress[0] > 0]
     if not paces:
         return None
     own = _progress(run.folder)
-    steps = make_plan(TrainConfig(algo=run.algo, env=run.env)).steps  # type: ignore[arg-type]
+    training = TrainConfig(algo=run.algo, env=run.env, steps=config.steps)  # type: ignore[arg-type]
+    steps = make_plan(training).steps
     return statistics.median(paces) * (steps - (own[0] if own else 0))
 
 
