@@ -25,6 +25,7 @@ from rich.table import Table
 import provenance
 from errors import ConfigError, TrainError, UnknownEnvError
 from film import write_contact_sheet, write_video
+from options import default
 from policies import load_policy, trained_env
 from rollout import TEST_SEED, Episode, Estimate, GoalEnv, Policy, run_episodes, summarise
 from tempting import env_id_for
@@ -51,8 +52,8 @@ class Config:
     policy: Annotated[tuple[str, ...], tyro.conf.arg(metavar="POLICY ...")]
     """Policies: expert, random, an exported policy (.json), or the folder of a run."""
 
-    env: str | None = None
-    """Environment id. Default: the one the policy was trained on."""
+    env: Annotated[str | None, default("the one the policy was trained on", "ID")] = None
+    """Environment id."""
 
     episodes: int = 100
     """Episodes per policy."""
@@ -66,21 +67,21 @@ class Config:
     penalty_weight: float = 1.0
     """Weight of the singularity penalty in the return."""
 
-    randomisation: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=VALUE ...")] = ()
+    randomisation: Annotated[tuple[str, ...], default("nowhere", "KEY=VALUE ...")] = ()
     """Where the machine differs from the nominal one: attributes of tpm_gym's Randomisation, each
     a number, or for factors LOW:HIGH to draw from, for example encoder_noise=1e-4 puck_mass=0.5:2.
     Those about the puck change nothing where there is none."""
 
-    json: Path | None = None
+    json: Annotated[Path | None, default("not written", "PATH")] = None
     """Write metrics, episodes and versions here."""
 
-    video: Path | None = None
+    video: Annotated[Path | None, default("not written", "PATH")] = None
     """Write an MP4 of the first episodes here; several policies get a file each."""
 
     video_episodes: int = 3
     """Episodes in a video."""
 
-    picture: Path | None = None
+    picture: Annotated[Path | None, default("not written", "PATH")] = None
     """Write a PNG of six moments of the first episode here; several policies get a file each."""
 
     trust_pickle: bool = False

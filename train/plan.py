@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import gymnasium as gym
-import tyro
 
 from errors import ConfigError, ResumeConflictError, UnknownEnvError
+from options import default
 from recipes import RECIPES, Recipe, read_recipe
 from rollout import SELECTION_SEED, TEST_SEED
 
@@ -24,59 +24,54 @@ _GOALS: Final = "sampled"
 _FIXED: Final = ("algo", "env", "seed", "envs", "eval_episodes", "penalty_weight", "goals")
 
 
-def _default(value: object, metavar: str) -> Any:
-    """How the help shows an option that is None where it was not given."""
-    return tyro.conf.arg(help_behavior_hint=f"(default: {value})", metavar=metavar)
-
-
 @dataclass(frozen=True)
 class Config:
     """Train a policy on a tpm_gym environment."""
 
-    algo: Annotated[Literal["sac", "tqc", "ppo"] | None, _default(_ALGO, "{sac,tqc,ppo}")] = None
+    algo: Annotated[Literal["sac", "tqc", "ppo"] | None, default(_ALGO, "{sac,tqc,ppo}")] = None
     """Algorithm. SAC and TQC use hindsight replay on sparse rewards; PPO wants a Dense id."""
 
-    env: Annotated[str | None, _default(_ENV, "ID")] = None
+    env: Annotated[str | None, default(_ENV, "ID")] = None
     """Environment id."""
 
-    seed: Annotated[int | None, _default(_SEED, "INT")] = None
+    seed: Annotated[int | None, default(_SEED, "INT")] = None
     """Seed of the networks, the exploration and the first training environment."""
 
-    steps: Annotated[int | None, _default("as the recipe says", "INT")] = None
+    steps: Annotated[int | None, default("as the recipe says", "INT")] = None
     """Environment steps, over all environments."""
 
-    envs: Annotated[int | None, _default("as the recipe says", "INT")] = None
+    envs: Annotated[int | None, default("as the recipe says", "INT")] = None
     """Parallel environments, in processes of their own if several."""
 
-    recipe: Annotated[Path | None, _default("train/recipes/<algo>.yml", "PATH")] = None
+    recipe: Annotated[Path | None, default("train/recipes/<algo>.yml", "PATH")] = None
     """YAML file of hyperparameters by environment id."""
 
-    run: Annotated[Path | None, _default("runs/<env>-<algo>-s<seed>", "FOLDER")] = None
+    run: Annotated[Path | None, default("runs/<env>-<algo>-s<seed>", "FOLDER")] = None
     """Folder of the run."""
 
-    penalty_weight: Annotated[float | None, _default(_PENALTY_WEIGHT, "FLOAT")] = None
+    penalty_weight: Annotated[float | None, default(_PENALTY_WEIGHT, "FLOAT")] = None
     """Weight of the singularity penalty in the reward; 0 switches it off."""
 
     goals: Annotated[
-        Literal["sampled", "tempting"] | None, _default(_GOALS, "{sampled,tempting}")
+        Literal["sampled", "tempting"] | None, default(_GOALS, "{sampled,tempting}")
     ] = None
     """As the environment samples them, or goals that tempt towards the singularity; in training and
     in its evaluations."""
 
-    eval_every: Annotated[int | None, _default("a tenth of the steps", "INT")] = None
+    eval_every: Annotated[int | None, default("a tenth of the steps", "INT")] = None
     """Steps between evaluations on held-out seeds."""
 
-    eval_episodes: Annotated[int | None, _default(_EVAL_EPISODES, "INT")] = None
+    eval_episodes: Annotated[int | None, default(_EVAL_EPISODES, "INT")] = None
     """Episodes per evaluation."""
 
-    checkpoint_every: Annotated[int | None, _default("by time", "INT")] = None
+    checkpoint_every: Annotated[int | None, default("by time", "INT")] = None
     """Steps between checkpoints. By time means every half minute, or less often where that would
     take more than 2% of the time."""
 
-    threads: Annotated[int | None, _default("1", "INT")] = None
+    threads: Annotated[int | None, default("1", "INT")] = None
     """Threads of PyTorch. With one thread and one environment a seed repeats exactly."""
 
-    device: Annotated[str | None, _default("cpu", "NAME")] = None
+    device: Annotated[str | None, default("cpu", "NAME")] = None
     """Device of PyTorch. The networks are small; a GPU pays only with large batches."""
 
     overwrite: bool = False

@@ -27,11 +27,12 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 import tyro
 
 from errors import ConfigError, TrainError
+from options import default
 from plan import Config as TrainConfig
 from plan import make_plan
 from policies import CONFIG_FILE
@@ -62,16 +63,15 @@ class Config:
     plan: Literal["results", "penalty", "robustness"]
     """What to run; robustness needs the runs of results."""
 
-    envs: tuple[str, ...] = ()
-    """Environment ids. Default: all that have a recipe, three of them for penalty and for
-    robustness."""
+    envs: Annotated[tuple[str, ...], default("all for results, else three", "ID ...")] = ()
+    """Environment ids."""
 
-    steps: int | None = None
-    """Steps of each training; other than the recipe's, in folders of their own. Default: the
-    recipe's."""
+    steps: Annotated[int | None, default("as the recipes say", "INT")] = None
+    """Steps of each training. Runs of other lengths than their recipes' have folders of their own,
+    which robustness, too, looks for."""
 
-    algos: tuple[str, ...] = ()
-    """Algorithms. Default: sac, tqc and ppo for results, else sac."""
+    algos: Annotated[tuple[str, ...], default("all for results, else sac", "NAME ...")] = ()
+    """Algorithms: sac, tqc, ppo."""
 
     seeds: int = 5
     """Seeds, from 0 up."""
