@@ -347,11 +347,12 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "reach"
     folder.mkdir()
     env = gym.make("TPMReach-v0")
-    PPO("MultiInputPolicy", env, seed=0, device="cpu").save(folder / "best.zip")
+    model = PPO("MultiInputPolicy", env, seed=0, device="cpu")
     env.close()
+    model.save(folder / "best.zip")
+    export.save(model, folder / "best", env_id="TPMReach-v0", seed=0, recipe={})
     config = {"algo": "ppo", "env": "TPMReach-v0", "seed": 0, "recipe": {}}
     (folder / "config.json").write_text(json.dumps(config))
-    export.export_run(folder)
     return folder
 
 

@@ -172,7 +172,12 @@ def test_a_run_that_broke_off_is_collected_too(runs: Path, tmp_path: Path) -> No
     assert [path.name for path in paths] == ["early.json", "late.json"]
     for path in paths:
         assert json.loads(path.read_text())["finished"] is False
-    (tmp_path / "runs" / "late" / "evaluations.jsonl").write_text("{")
+    late = tmp_path / "runs" / "late" / "evaluations.jsonl"
+    late.write_text('{"steps": 60, "wall_seconds": 1.0}\n{"steps": 70, "wa')
+    results.collect(results.Collect(tmp_path / "runs", tmp_path / "records"))
+    record = json.loads((tmp_path / "records" / "late.json").read_text())
+    assert record["evaluations"]["steps"] == [60]  # the disk was full
+    late.write_text("{\n")
     with pytest.raises(ConfigError, match=r"late.evaluations\.jsonl: is damaged"):
         results.collect(results.Collect(tmp_path / "runs", tmp_path / "records"))
 
@@ -230,7 +235,8 @@ def test_penalty_weights_and_machines_get_tables_of_their_own(real: dict[str, An
     assert rows(penalty, "| 0 |", "41.0% (40.0% to 42.0%)")
     assert rows(penalty, "| 1 |", "11.0% (10.0% to 12.0%)")
     assert (
-        f"{real['env']}, 120 steps: 41.00% without the penalty, 11.000% with it: 4 times less."
+        f"{real['env']}, SAC + HER, 120 steps: 41.00% without the penalty, 11.000% with it: "
+        "4 times less."
     ) in penalty
     robustness = text.split("## Robustness")[1]
     assert rows(robustness, "encoder noise", '{"encoder_noise": 0.0001}', "97.0%")
@@ -304,11 +310,11 @@ def test_what_is_done_is_skipped_and_what_was_stopped_goes_on(tmp_path: Path) ->
     assert first[:2] == ["python", "train/train.py"]
     assert "--resume" not in first
     assert test[test.index("--episodes") + 1] == "7"
-    (run.folder / "checkpoints" / "000000050").mkdir(parents=True)
+    run.folder.mkdir()
     (run.folder / "config.json").write_text('{"steps": 100}')
     assert study.commands(run, 7)[0][2:] == ["--run", str(run.folder), "--resume"]
     evaluations = run.folder / "evaluations.jsonl"
-    evaluations.write_text('{"steps": 50, "wall_seconds": 10.0}\n')
+    evaluations.write_text('{"steps": 50, "wall_seconds": 10.0}\n{"steps": 60, "wa')
     assert len(study.commands(run, 7)) == 2
     # 5000 steps as the recipe says, 50 of them done at five a second.
     assert study.estimate(run, config) == (pytest.approx((5000 - 50) / 5), None)
@@ -319,8 +325,11 @@ def test_what_is_done_is_skipped_and_what_was_stopped_goes_on(tmp_path: Path) ->
     (run.folder / "tests").mkdir()
     timed = '{"wall_seconds": 30.0, "episodes": 10}'
     (run.folder / "tests" / "encoder_noise.json").write_text(timed)
+    (run.folder / "tests" / ".half.json").write_text('{"wall_sec')
     assert study.estimate(run, config) == (0.0, pytest.approx(7 * 3.0))
     (run.folder / "tests" / "nominal.json").write_text(timed)
+    assert len(study.commands(run, 7)) == 1  # a test of other than 7 episodes
+    (run.folder / "tests" / "nominal.json").write_text(timed.replace("10}", "7}"))
     assert study.commands(run, 7) == []
     assert study.estimate(run, config) == (0.0, 0.0)
 

@@ -31,6 +31,7 @@ from policies import load_policy
 from rollout import TEST_SEED, run_episodes
 from snapshot import EpisodeRecorder, restore
 from trainings import (
+    Killed,
     assert_equal_runs,
     end_of,
     evaluations,
@@ -94,6 +95,25 @@ def test_a_run_killed_again_and_again_ends_the_same(
     assert steps[-1] == 250
 
 
+def test_a_run_killed_before_its_first_checkpoint_begins_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = make_config("sac", tmp_path)
+
+    def die(*args: object) -> None:
+        raise Killed
+
+    with monkeypatch.context() as patched:
+        patched.setattr(CheckpointStore, "_check_space", die)
+        with pytest.raises(Killed):
+            train.train(config, quiet())
+    (tmp_path / "run" / "checkpoints" / "000000000.tmp").mkdir(parents=True)
+    console = quiet()
+    assert train.train(resumed(config), console) is None
+    assert "from step 0 to 300" in said(console)
+    assert_equal_runs(uninterrupted("sac"), tmp_path / "run")
+
+
 def test_nothing_is_counted_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = replace(make_config("sac", tmp_path), checkpoint_every=200)
     kill_at(monkeypatch, 290, config)
@@ -115,11 +135,13 @@ def test_logs_of_a_torn_write_are_put_right(
     config = make_config("sac", tmp_path)
     kill_at(monkeypatch, 240, config)
     run = tmp_path / "run"
-    for name in ("progress.csv", "evaluations.jsonl", "best.zip", "config.json"):
+    torn = ("progress.csv", "evaluations.jsonl", "best.zip", "best.json", "config.json")
+    for name in torn:
         os.truncate(run / name, (run / name).stat().st_size // 2)
     train.train(resumed(config), quiet())
     assert_equal_runs(uninterrupted("sac"), run)
-    assert (run / "best.zip").read_bytes() == end_of(run).files["best.zip"]
+    for name in ("best.zip", "best.json", "best.safetensors"):
+        assert (run / name).read_bytes() == end_of(run).files[name]
 
 
 def test_a_damaged_checkpoint_costs_only_time(
@@ -199,6 +221,8 @@ def test_an_episode_that_cannot_go_on_is_ended_and_not_joined_to_another(
     last = 129  # of the third episode, 100 to 129 is what there was
     assert end.arrays["buffer/ep_length"][last, 0] == 30
     assert end.arrays["buffer/timeouts"][last, 0] == 1
+    goals = end.arrays["buffer/observations/desired_goal"][:, 0]
+    assert not np.array_equal(goals[last + 1], goals[0])  # not the first episode over again
 
 
 def test_resuming_does_not_act_at_random_again(

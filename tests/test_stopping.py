@@ -26,6 +26,7 @@ from errors import (
     RunBusyError,
     RunWriteError,
 )
+from folder import claimed
 from plan import Config
 from trainings import (
     assert_equal_runs,
@@ -78,6 +79,23 @@ def test_a_stopped_run_saves_and_goes_on(
     assert f"--run {tmp_path / 'run'} --resume" in said(console)
     assert (tmp_path / "run" / "last.zip").is_file()
     assert train.train(resumed(config), quiet()) is None
+    assert_equal_runs(uninterrupted(case), tmp_path / "run")
+
+
+@pytest.mark.parametrize("case", ["sac", "ppo"])
+def test_a_signal_after_the_last_step_stops_nothing(
+    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ends = callbacks.PeriodicEvaluation._on_training_end
+
+    def interrupted(self: callbacks.PeriodicEvaluation) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        ends(self)
+
+    monkeypatch.setattr(callbacks.PeriodicEvaluation, "_on_training_end", interrupted)
+    console = quiet()
+    assert train.train(make_config(case, tmp_path), console) is None
+    assert f"finished: {tmp_path / 'run'}" in said(console)
     assert_equal_runs(uninterrupted(case), tmp_path / "run")
 
 
@@ -191,6 +209,8 @@ def test_options_that_agree_are_accepted(half: Config, tmp_path: Path) -> None:
 def test_a_finished_run_has_nothing_to_do_unless_it_is_to_take_more_steps(tmp_path: Path) -> None:
     run = tmp_path / "run"
     shutil.copytree(uninterrupted("sac"), run)
+    (run / "tests").mkdir()
+    (run / "tests" / "nominal.json").write_text("{}")
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
     console = quiet()
     assert train.train(Config(run=run, resume=True), console) is None
@@ -199,6 +219,7 @@ def test_a_finished_run_has_nothing_to_do_unless_it_is_to_take_more_steps(tmp_pa
     assert train.train(Config(run=run, resume=True, steps=360), quiet()) is None
     assert [line["steps"] for line in evaluations(run)][-2:] == [300, 360]
     assert json.loads((run / "config.json").read_text())["steps"] == 360
+    assert not (run / "tests").exists()  # they were of the policy of step 300
 
 
 def test_nothing_to_resume_is_an_error_that_says_so(tmp_path: Path) -> None:
@@ -211,9 +232,9 @@ def test_nothing_to_resume_is_an_error_that_says_so(tmp_path: Path) -> None:
 @pytest.mark.skipif(sys.platform == "win32", reason="there are no such locks")
 def test_two_processes_cannot_train_in_one_folder(half: Config) -> None:
     assert half.run is not None
-    with train._claimed(half.run), pytest.raises(RunBusyError, match="another process"):
+    with claimed(half.run), pytest.raises(RunBusyError, match="another process"):
         train.train(resumed(half), quiet())
-    with train._claimed(half.run), pytest.raises(RunBusyError, match="another process"):
+    with claimed(half.run), pytest.raises(RunBusyError, match="another process"):
         train.train(replace(half, overwrite=True), quiet())
     assert (half.run / "config.json").is_file()
 

@@ -38,7 +38,7 @@ from errors import (
 )
 from features import GoalGapExtractor
 from plan import resume_plan
-from policies import load_policy
+from policies import load_model, load_policy
 from recipes import RECIPES, read_recipe, read_recipes
 from rollout import SELECTION_SEED, run_episodes
 from train import Config
@@ -274,6 +274,55 @@ def test_run_folder_is_not_overwritten_unasked(run: Path, small: Path, tmp_path:
     with pytest.raises(NotARunError, match=r"config\.json"):
         train.train(replace(config, run=tmp_path, overwrite=True), quiet())
     assert (tmp_path / "thesis.tex").is_file()
+
+
+def test_both_policies_are_exported_and_nothing_is_unpickled_for_it(run: Path) -> None:
+    for name in ("best", "last"):
+        exported = tpm_gym.load_policy(run / name)
+        saved = load_model(name, run / f"{name}.zip")
+        batch = {
+            key: np.stack([box.sample() for _ in range(8)])
+            for key, box in saved.observation_space.items()
+        }
+        expected, _ = saved.predict(batch, deterministic=True)
+        np.testing.assert_allclose(exported.act(batch), expected, atol=1e-6)
+        config = json.loads((run / "config.json").read_text())
+        assert exported.description.recipe == config["recipe"]
+        assert exported.description.steps == saved.num_timesteps
+
+
+def test_resuming_runs_no_pickle(small: Path, tmp_path: Path) -> None:
+    """In a process of its own, from a checkpoint whose best.zip would stop it."""
+    config = Config(recipe=small, run=tmp_path / "run", steps=150, eval_episodes=1)
+    train.train(config, quiet())
+    script = (
+        "import sys, train; from pathlib import Path; from stable_baselines3 import SAC\n"
+        "from plan import Config; SAC.load = lambda *a, **k: sys.exit('unpickled')\n"
+        f"train.train(Config(run=Path({str(tmp_path / 'run')!r}), resume=True, steps=200))\n"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True, cwd=SCRIPT.parent)
+
+
+def test_what_was_killed_half_way_through_deleting_can_be_replaced(
+    small: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / ".half.json").write_text("{", encoding="utf-8")  # killed in the first moment
+    config = Config(recipe=small, run=folder, steps=60, eval_every=60, eval_episodes=1)
+    train.train(config, quiet())
+
+    def dies(path: Path) -> None:
+        if path.name == "config.json":
+            raise KeyboardInterrupt
+        path.rename(tmp_path / "deleted")
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(Path, "unlink", dies)
+        with pytest.raises(KeyboardInterrupt):
+            train.train(replace(config, overwrite=True), quiet())
+    assert [path.name for path in folder.iterdir()] == ["config.json"]
+    train.train(replace(config, overwrite=True), quiet())
 
 
 def test_overwrite_leaves_nothing_of_the_earlier_run(small: Path, tmp_path: Path) -> None:

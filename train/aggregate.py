@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from statistics import median
 from typing import Final
 
 import numpy as np
@@ -89,5 +90,5 @@ def median_time(times: Sequence[float | None]) -> float | None:
     Returns:
         The median; None where it falls on a run that never got there.
     """
-    value = float(np.sort([math.inf if time is None else time for time in times])[len(times) // 2])
+    value = median(math.inf if time is None else time for time in times)
     return value if math.isfinite(value) else None

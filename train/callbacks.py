@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import io
 import json
 import signal
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -30,22 +29,14 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from checkpoint import CheckpointStore, Content
 from curves import draw_learning_curve
 from errors import CheckpointWriteError
-from policies import BEST_FILE, TrainedPolicy
-from provenance import write_whole
+from policies import EVALUATIONS_FILE, TrainedPolicy
 from rollout import SELECTION_SEED, Estimate, GoalEnv, run_episodes, summarise
-from snapshot import EVALUATIONS_FILE, capture
+from snapshot import capture
 
 CURVE_FILE: Final = "learning_curve.png"
 
 _SHORTEST_INTERVAL: Final = 30.0  # s between checkpoints
 _LARGEST_SHARE: Final = 0.02  # of the time may go into checkpoints
-
-
-def save_model(model: BaseAlgorithm, path: Path) -> None:
-    """Save an algorithm so that an interruption cannot leave half a file."""
-    file = io.BytesIO()  # PyTorch, writing to a disk that is full, would hide the reason
-    model.save(file)
-    write_whole(path, lambda part: part.write_bytes(file.getvalue()))
 
 
 class PeriodicEvaluation(BaseCallback):
@@ -61,10 +52,18 @@ class PeriodicEvaluation(BaseCallback):
         run: The run folder.
         title: Title of the learning curve.
         console: Where one line per evaluation is printed.
+        keep: Called with the model whenever it is the best so far.
     """
 
     def __init__(
-        self, env: GoalEnv, every: int, episodes: int, run: Path, title: str, console: Console
+        self,
+        env: GoalEnv,
+        every: int,
+        episodes: int,
+        run: Path,
+        title: str,
+        console: Console,
+        keep: Callable[[BaseAlgorithm], object],
     ) -> None:
         """Remember what to evaluate and where to put it."""
         super().__init__()
@@ -74,6 +73,7 @@ class PeriodicEvaluation(BaseCallback):
         self._run = run
         self._title = title
         self._console = console
+        self._keep = keep
         self._evaluations: list[dict[str, Any]] = []
         self._best: tuple[float, float] | None = None
         self._total_steps = 0
@@ -114,7 +114,7 @@ class PeriodicEvaluation(BaseCallback):
         best = self._best is None or quality > self._best
         if best:
             self._best = quality
-            save_model(self.model, self._run / BEST_FILE)
+            self._keep(self.model)
         self._print(metrics, best)
         draw_learning_curve(self._run / CURVE_FILE, self._title, self._evaluations)
 

@@ -11,6 +11,7 @@ code when they are loaded: only give --trust-pickle for files you trust.
 from __future__ import annotations
 
 import copy
+import io
 import json
 import sys
 import tempfile
@@ -34,8 +35,6 @@ from errors import ConfigError, PolicyError, TrainError
 from features import GoalGapExtractor
 from policies import (
     ALGORITHMS,
-    BEST_FILE,
-    LAST_FILE,
     algorithm_class,
     load_model,
     require_trust,
@@ -119,29 +118,22 @@ def save(
     return _write(name, path, content, data, model)
 
 
-def export_run(run: Path) -> list[Path]:
-    """Export the best and the last policy of a run, into its folder.
-
-    This unpickles them: only for runs of your own.
+def save_archive(model: BaseAlgorithm, path: Path) -> None:
+    """Save a model as Stable-Baselines3 does, but so that an interruption leaves no half a file.
 
     Args:
-        run: The run folder.
-
-    Returns:
-        The JSON files.
-
-    Raises:
-        PolicyError: The folder has no configuration, or a policy cannot be loaded or exported.
+        model: Any algorithm.
+        path: The .zip file.
     """
-    archives = [run / name for name in (BEST_FILE, LAST_FILE) if (run / name).is_file()]
-    return [_convert(archive, archive.with_suffix("")) for archive in archives]
+    file = io.BytesIO()  # PyTorch, writing to a disk that is full, would hide the reason
+    model.save(file)
+    provenance.write_whole(path, lambda part: part.write_bytes(file.getvalue()))
 
 
-def remove_exports(run: Path) -> None:
-    """Delete what :func:`export_run` wrote: a run that goes on has other policies soon."""
-    for name in (BEST_FILE, LAST_FILE):
-        for suffix in (".json", ".safetensors"):
-            (run / name).with_suffix(suffix).unlink(missing_ok=True)
+def remove(path: Path) -> None:
+    """Delete what :func:`save` wrote as ``path``, if it did."""
+    for file in files(path):
+        file.unlink(missing_ok=True)
 
 
 def _convert(archive: Path, path: Path) -> Path:

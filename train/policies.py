@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
 CONFIG_FILE: Final = "config.json"
+EVALUATIONS_FILE: Final = "evaluations.jsonl"
+TESTS: Final = "tests"
 BEST_FILE: Final = "best.zip"
 LAST_FILE: Final = "last.zip"
 EXPORTED: Final = (".json", ".safetensors")

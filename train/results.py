@@ -21,12 +21,10 @@ import tyro
 
 import provenance
 from errors import ConfigError, TrainError
-from policies import CONFIG_FILE
+from policies import CONFIG_FILE, EVALUATIONS_FILE, TESTS
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 RECORDS: Final = ROOT / "docs" / "results"
-EVALUATIONS_FILE: Final = "evaluations.jsonl"
-TESTS: Final = "tests"
 
 _KEPT: Final = (
     "env",
@@ -44,6 +42,7 @@ _KEPT: Final = (
     "machine",
     "command",
 )
+_WHOLE: Final = "[!.]*.json"  # not what a process that was killed has left half written
 _CURVES: Final = ("success_at_end", "return", "unsafe_share")
 _NOT_KEPT: Final = ("records", "versions", "machine", "policy", "env")
 
@@ -111,7 +110,8 @@ def condense(run: Path) -> Record:
     for name in _CURVES:
         if evaluations and all(name in evaluation for evaluation in evaluations):
             curves[name] = [round(evaluation[name]["mean"], 6) for evaluation in evaluations]
-    tests = {path.stem: _condense_test(_read(path)) for path in sorted(run.glob(f"{TESTS}/*.json"))}
+    files = sorted(run.glob(f"{TESTS}/{_WHOLE}"))
+    tests = {path.stem: _condense_test(_read(path)) for path in files}
     return {
         "run": run.name,
         **{name: config.get(name) for name in _KEPT},
@@ -130,6 +130,21 @@ def _condense_test(content: Mapping[str, Any]) -> Record:
     return {name: value for name, value in content.items() if name not in _NOT_KEPT}
 
 
+def read_whole_lines(path: Path) -> list[Record]:
+    """Return the records in a file of JSON lines, without one that a kill or full disk has cut.
+
+    Args:
+        path: The file; there need not be one.
+
+    Raises:
+        ValueError: A line is whole and no JSON.
+    """
+    if not path.is_file():
+        return []
+    whole = [line for line in path.read_text(encoding="utf-8").splitlines(True) if line[-1] == "\n"]
+    return [json.loads(line) for line in whole]
+
+
 def _read(path: Path) -> Record:
     """Read a JSON file that holds a mapping."""
     try:
@@ -143,11 +158,8 @@ def _read(path: Path) -> Record:
 
 def _read_lines(path: Path) -> list[Record]:
     """Read a file of JSON lines; none where a run ended before its first."""
-    if not path.is_file():
-        return []
-    lines = path.read_text(encoding="utf-8").splitlines()
     try:
-        return [json.loads(line) for line in lines]
+        return read_whole_lines(path)
     except ValueError as error:
         raise ConfigError("--runs", path, f"is damaged: {error}") from error
 
@@ -167,7 +179,7 @@ def write(config: Write) -> list[Path]:
     from results_figures import draw
     from results_page import page
 
-    paths = sorted(config.records.glob("*.json"))
+    paths = sorted(config.records.glob(_WHOLE))
     if not paths:
         raise ConfigError("--records", config.records, "holds no records; collect them first")
     records = [_read(path) for path in paths]

@@ -25,7 +25,7 @@ NONE: Final = "\N{EM DASH}"
 
 _INTRO: Final = f"""# Results
 
-Written by `make results` from the records in [results](results); nothing here was typed by hand.
+Written by `make results` from the records in [results](results); no result here was typed by hand.
 
 - **Success** is that of the last step of an episode. Each run is tested with the policy that did
   best in the evaluations during training, on held-out seeds that neither training nor those
@@ -215,10 +215,10 @@ def _penalty(records: Group, figures: Sequence[str]) -> list[str]:
 
 
 def _compared(records: Group) -> list[str]:
-    """One line an id and its steps: time below safe without the penalty and with it."""
+    """One line an id, method and its steps: time below safe without the penalty and with it."""
     lines = []
-    for env, steps in sorted({(record["env"], record["steps"]) for record in records}):
-        alike = [r for r in records if (r["env"], r["steps"]) == (env, steps)]
+    for kind in sorted({_kind(record) for record in records}):
+        alike = [record for record in records if _kind(record) == kind]
         shares = [
             _values([r for r in alike if r["penalty_weight"] == weight],
                     TEMPTING, "unsafe_share", "mean")
@@ -228,11 +228,15 @@ def _compared(records: Group) -> list[str]:
             continue
         without, with_it = (sum(values) / len(values) for values in shares)
         times = f"{without / with_it:,.0f} times less" if with_it > 0 else "never below"
-        name = f"{env}, {steps:,} steps"
+        name = f"{kind[0]}, {kind[1]}, {kind[2]:,} steps"
         lines.append(
             f"- {name}: {without:.2%} without the penalty, {with_it:.3%} with it: {times}."
         )
     return ["Time below safe, mean over seeds:\n", "\n".join(lines) + "\n"] if lines else []
+
+
+def _kind(record: Record) -> tuple[str, str, int]:
+    return record["env"], method(record), record["steps"]
 
 
 def _robustness(records: Group) -> list[str]:

@@ -15,6 +15,7 @@ from __future__ import annotations
 import io
 import json
 import random
+import shutil
 import warnings
 from collections import deque
 from collections.abc import Mapping
@@ -33,13 +34,18 @@ from stable_baselines3.her import HerReplayBuffer
 
 from checkpoint import Content
 from logs import PROGRESS_FILE
-from policies import BEST_FILE, CONFIG_FILE
+from policies import BEST_FILE, CONFIG_FILE, EVALUATIONS_FILE, EXPORTED, LAST_FILE, TESTS
 from provenance import versions, write_whole
 from rollout import Action, GoalEnv, Observation
 from tpm_gym import TPMError
 
-EVALUATIONS_FILE: Final = "evaluations.jsonl"
-RUN_FILES: Final = (CONFIG_FILE, PROGRESS_FILE, EVALUATIONS_FILE, BEST_FILE)
+RUN_FILES: Final = (
+    CONFIG_FILE,
+    PROGRESS_FILE,
+    EVALUATIONS_FILE,
+    BEST_FILE,
+    *(Path(BEST_FILE).with_suffix(suffix).name for suffix in EXPORTED),
+)
 """Files of the run folder that belong to a checkpoint: what is in them later is done again."""
 
 _STATE, _TENSORS = "state.json", "torch.pt"
@@ -141,7 +147,13 @@ def capture(
 
 
 def restore_files(run: Path, content: Content) -> None:
-    """Cut the files of a run back to the moment of a checkpoint."""
+    """Cut the files of a run back to the moment of a checkpoint.
+
+    Tests, and what was exported at the end, are deleted: the policy will soon be another.
+    """
+    shutil.rmtree(run / TESTS, ignore_errors=True)
+    for suffix in EXPORTED:
+        (run / LAST_FILE).with_suffix(suffix).unlink(missing_ok=True)
     for name in RUN_FILES:
         if name in content.files:
             data = content.files[name]
@@ -294,6 +306,7 @@ def _restore_episodes(
 
 def _start_afresh(model: BaseAlgorithm, envs: VecEnv) -> None:
     """Start new episodes, and end those in the replay buffer where they were interrupted."""
+    envs._reset_seeds()  # of the run's first reset, which would begin its first episodes again
     model._last_obs = envs.reset()  # type: ignore[assignment]
     model._last_episode_starts = np.ones(envs.num_envs, dtype=bool)
     buffer = getattr(model, "replay_buffer", None)

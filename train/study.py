@@ -35,9 +35,9 @@ from errors import ConfigError, TrainError
 from options import default
 from plan import Config as TrainConfig
 from plan import make_plan
-from policies import CONFIG_FILE
+from policies import CONFIG_FILE, EVALUATIONS_FILE, TESTS
 from recipes import RECIPES, read_recipes
-from results import EVALUATIONS_FILE, TESTS
+from results import read_whole_lines
 from results_page import NOMINAL, TEMPTING
 
 _HERE: Final = Path(__file__).parent
@@ -189,19 +189,21 @@ def commands(run: Run, episodes: int) -> list[list[str]]:
     where = ["--run", str(run.folder)]
     if run.options is not None and not _is_finished(run.folder):
         script = ["python", "train/train.py"]
-        if any(run.folder.glob("checkpoints/*")):
+        if (run.folder / CONFIG_FILE).is_file():
             left.append([*script, *where, "--resume"])
         else:
-            # A folder without a checkpoint is one that was stopped in its first moments.
-            again = ["--overwrite"] if (run.folder / CONFIG_FILE).is_file() else []
-            options = ["--env", run.env, "--algo", run.algo, *run.options]
-            left.append([*script, *options, *where, *again])
+            left.append([*script, "--env", run.env, "--algo", run.algo, *run.options, *where])
     for name, changes in run.tests:
         file = run.folder / TESTS / f"{name}.json"
-        if left or not file.is_file():
+        if left or not _is_tested(file, episodes):
             test = ["python", "train/evaluate.py", "--policy", str(run.folder), "--env", run.env]
             left.append([*test, "--episodes", str(episodes), *changes, "--json", str(file)])
     return left
+
+
+def _is_tested(file: Path, episodes: int) -> bool:
+    """Whether a test has been, with as many episodes; train.py deletes those of other policies."""
+    return file.is_file() and json.loads(file.read_bytes())["episodes"] == episodes
 
 
 def _is_finished(folder: Path) -> bool:
@@ -217,14 +219,11 @@ def _is_finished(folder: Path) -> bool:
 
 def _progress(folder: Path) -> tuple[int, float, int] | None:
     """Steps and seconds at the last evaluation of a run, and its steps in all; None before it."""
-    file = folder / EVALUATIONS_FILE
-    if not file.is_file() or not (folder / CONFIG_FILE).is_file():
+    lines = read_whole_lines(folder / EVALUATIONS_FILE)
+    if not lines or not (folder / CONFIG_FILE).is_file():
         return None
-    lines = file.read_text(encoding="utf-8").splitlines()
-    if not lines:
-        return None
-    last, config = (json.loads(text) for text in (lines[-1], (folder / CONFIG_FILE).read_text()))
-    return int(last["steps"]), float(last["wall_seconds"]), int(config["steps"])
+    config = json.loads((folder / CONFIG_FILE).read_bytes())
+    return int(lines[-1]["steps"]), float(lines[-1]["wall_seconds"]), int(config["steps"])
 
 
 def estimate(run: Run, config: Config) -> tuple[float | None, float | None]:
@@ -259,8 +258,8 @@ def _time_to_train(run: Run, config: Config) -> float | None:
 
 def _seconds_an_episode(env: str, folder: Path) -> float | None:
     """Median over the tests that there are."""
-    texts = (path.read_text() for path in folder.glob(f"{env}-*/{TESTS}/*.json"))
-    found = [json.loads(text) for text in texts]
+    files = folder.glob(f"{env}-*/{TESTS}/[!.]*.json")
+    found = [json.loads(path.read_bytes()) for path in files]
     return statistics.median(f["wall_seconds"] / f["episodes"] for f in found) if found else None
 
 

@@ -14,16 +14,12 @@ Ctrl-C saves a checkpoint and stops; a second one leaves at once.
 
 from __future__ import annotations
 
-import errno
 import json
-import os
-import shutil
 import signal
 import sys
-import threading
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -33,23 +29,13 @@ from rich.console import Console
 
 import provenance
 from checkpoint import CheckpointStore, Content
-from errors import (
-    ConfigError,
-    NoCheckpointError,
-    NotARunError,
-    PolicyError,
-    RunBusyError,
-    RunExistsError,
-    RunWriteError,
-    TrainError,
-)
+from errors import ConfigError, NoCheckpointError, PolicyError, TrainError
+from folder import claimed, clear, disk_errors_named, prepare
 from plan import Config, Plan, make_plan, resume_plan, run_folder
-from policies import CONFIG_FILE, LAST_FILE
+from policies import BEST_FILE, CONFIG_FILE, LAST_FILE
 from rollout import SELECTION_SEED, GoalEnv
 
 CHECKPOINTS: Final = "checkpoints"
-
-_DISK_ERRORS: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
 
 
 def train(config: Config, console: Console | None = None) -> signal.Signals | None:
@@ -71,9 +57,9 @@ def train(config: Config, console: Console | None = None) -> signal.Signals | No
     if config.resume:
         return _resume(config, console)
     plan = make_plan(config)
-    _prepare_folder(plan.run, config.overwrite)
+    prepare(plan.run, config.overwrite)
     store = CheckpointStore(plan.run / CHECKPOINTS)
-    with _claimed(plan.run), _disk_errors_named(plan.run, store):
+    with claimed(plan.run), disk_errors_named(plan.run, store):
         provenance.write_json(plan.run / CONFIG_FILE, _description(plan))
         console.print(f"{plan.title}, {plan.steps:,} steps, in {plan.run}", markup=False)
         starts = int(plan.recipe.arguments.get("learning_starts", 0))
@@ -84,7 +70,6 @@ def train(config: Config, console: Console | None = None) -> signal.Signals | No
 
 def _resume(config: Config, console: Console) -> signal.Signals | None:
     """Go on from the last whole checkpoint of a run."""
-    from export import remove_exports
     from snapshot import restore_files
 
     if config.overwrite:
@@ -93,86 +78,41 @@ def _resume(config: Config, console: Console) -> signal.Signals | None:
     store = CheckpointStore(run / CHECKPOINTS)
     if not run.is_dir():
         raise NoCheckpointError(run / CHECKPOINTS)
-    with _claimed(run), _disk_errors_named(run, store):
-        content = store.load(lambda text: _say(console, f"warning: {text}"))
-        stored = json.loads(content.files[CONFIG_FILE])
-        plan = resume_plan(config, stored, content.step)
-        if content.finished and content.step >= plan.steps:
-            _say(console, f"nothing to do: {run} has finished its {content.step:,} steps")
+    with claimed(run), disk_errors_named(run, store):
+        content, stored = _load(run, store, console)
+        step = content.step if content else 0
+        plan = resume_plan(config, stored, step)
+        if content and content.finished and step >= plan.steps:
+            _say(console, f"nothing to do: {run} has finished its {step:,} steps")
             return None
-        restore_files(run, content)
-        remove_exports(run)
-        provenance.write_json(run / CONFIG_FILE, _description_resumed(plan, stored, content.step))
-        _say(console, f"{plan.title}, from step {content.step:,} to {plan.steps:,}, in {run}")
+        if content:
+            restore_files(run, content)
+        else:
+            clear(run, but=CONFIG_FILE)
+        provenance.write_json(run / CONFIG_FILE, _description_resumed(plan, stored, step))
+        _say(console, f"{plan.title}, from step {step:,} to {plan.steps:,}, in {run}")
         return _learn(plan, console, store, content)
+
+
+def _load(
+    run: Path, store: CheckpointStore, console: Console
+) -> tuple[Content | None, dict[str, Any]]:
+    """Return the last whole checkpoint and the configuration of a run.
+
+    A run that was killed before its first checkpoint has none, and begins again.
+    """
+    try:
+        content = store.load(lambda text: _say(console, f"warning: {text}"))
+    except NoCheckpointError:
+        if not (run / CONFIG_FILE).is_file():
+            raise
+        return None, json.loads((run / CONFIG_FILE).read_bytes())
+    return content, json.loads(content.files[CONFIG_FILE])
 
 
 def _say(console: Console, text: str) -> None:
     """Print a line as it is, however long."""
     console.print(text, markup=False, soft_wrap=True)
-
-
-@contextmanager
-def _claimed(run: Path) -> Iterator[None]:
-    """Keep other processes out of a run; the system ends this however the process ends."""
-    if sys.platform == "win32":
-        yield
-        return
-    import fcntl
-
-    handle = os.open(run, os.O_RDONLY)
-    try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise RunBusyError(run) from error
-        except OSError:
-            pass  # a file system without locks
-        yield
-    finally:
-        os.close(handle)
-
-
-@contextmanager
-def _disk_errors_named(run: Path, store: CheckpointStore) -> Iterator[None]:
-    """Turn the errors of a full or broken disk into one that says how to go on.
-
-    Training without its logs would be of no use, so it ends; only a checkpoint may fail.
-    """
-    before = threading.excepthook
-
-    def hook(failed: threading.ExceptHookArgs) -> None:
-        # TensorBoard's thread fails as well, and its traceback would bury the error's one line.
-        if not _is_disk_error(failed.exc_value):
-            before(failed)
-
-    threading.excepthook = hook
-    try:
-        yield
-    except OSError as error:
-        if not _is_disk_error(error):
-            raise
-        raise RunWriteError(run, error.strerror or str(error), store.newest) from error
-    finally:
-        threading.excepthook = before
-
-
-def _is_disk_error(error: BaseException | None) -> bool:
-    return isinstance(error, OSError) and error.errno in _DISK_ERRORS
-
-
-def _prepare_folder(run: Path, overwrite: bool) -> None:
-    """Make the run folder, empty."""
-    if run.exists() and (not run.is_dir() or any(run.iterdir())):
-        if not overwrite:
-            raise RunExistsError(run)
-        # Deleting is for folders that this script has written, whatever --run was set to.
-        if not (run / CONFIG_FILE).is_file():
-            raise NotARunError(run, CONFIG_FILE)
-        with _claimed(run):
-            pass
-        shutil.rmtree(run)
-    run.mkdir(parents=True, exist_ok=True)
 
 
 def _description(plan: Plan) -> dict[str, Any]:
@@ -210,11 +150,12 @@ def _learn(
     """Build everything, learn from the beginning or from a checkpoint, and save.
 
     Returns:
-        The signal that stopped the training, None if it went to its end.
+        The signal that stopped the training, None if it went to its end; one that came too late
+        to stop it does not count.
     """
     import torch
 
-    from callbacks import ProgressBar, SignalListener, StopTrainingError, save_model
+    from callbacks import ProgressBar, SignalListener, StopTrainingError
     from logs import make_logger
 
     torch.set_num_threads(plan.threads)
@@ -235,17 +176,17 @@ def _learn(
         # Checkpointing sets the clock of those after it.
         callbacks = [checkpointing, *_demonstrations(plan), bar, evaluation]
         stack.enter_context(listener.listening())
+        stopped_by = None
         try:
             steps = plan.steps - model.num_timesteps
             model.learn(steps, callback=callbacks, reset_num_timesteps=content is None)
         except StopTrainingError:
-            pass
-        save_model(model, plan.run / LAST_FILE)
-        _export(plan.run, console)
-        if listener.received is None:
+            stopped_by = listener.received
+        _keep(plan, console, LAST_FILE, model)
+        if stopped_by is None:
             checkpointing.save_finished()
-    _report(plan, console, store, listener.received)
-    return listener.received
+    _report(plan, console, store, stopped_by)
+    return stopped_by
 
 
 def _make_callbacks(
@@ -262,7 +203,13 @@ def _make_callbacks(
     from snapshot import restore
 
     evaluation = PeriodicEvaluation(
-        evaluation_env, plan.eval_every, plan.eval_episodes, plan.run, plan.title, console
+        evaluation_env,
+        plan.eval_every,
+        plan.eval_episodes,
+        plan.run,
+        plan.title,
+        console,
+        partial(_keep, plan, console, BEST_FILE),
     )
     seconds = 0.0
     if content is not None:
@@ -286,13 +233,17 @@ def _demonstrations(plan: Plan) -> list[Any]:
     return [Demonstrations(**plan.recipe.demonstrations)]
 
 
-def _export(run: Path, console: Console) -> None:
-    """Export the policies of a run that has ended or was stopped."""
-    from export import export_run
+def _keep(plan: Plan, console: Console, name: str, model: Any) -> None:
+    """Save a policy in the run folder, and export it."""
+    from export import remove, save, save_archive
 
+    archive = plan.run / name
+    path = archive.with_suffix("")
+    save_archive(model, archive)
     try:
-        export_run(run)
+        save(model, path, env_id=plan.env, seed=plan.seed, recipe=asdict(plan.recipe))
     except PolicyError as error:
+        remove(path)
         _say(console, f"warning: not exported: {error}")
 
 
