@@ -227,6 +227,11 @@ def test_nothing_to_resume_is_an_error_that_says_so(tmp_path: Path) -> None:
         with pytest.raises(NoCheckpointError, match="leave out --resume"):
             train.train(Config(run=run, resume=True), quiet())
     assert list(tmp_path.iterdir()) == []
+    for text in ('{"model_type": "bert"}', "{", "[]"):  # another program's
+        (tmp_path / "config.json").write_text(text)
+        with pytest.raises(NoCheckpointError):
+            train.train(Config(run=tmp_path, resume=True), quiet())
+        assert (tmp_path / "config.json").read_text() == text
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there are no such locks")

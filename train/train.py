@@ -99,15 +99,27 @@ def _load(
 ) -> tuple[Content | None, dict[str, Any]]:
     """Return the last whole checkpoint and the configuration of a run.
 
-    A run that was killed before its first checkpoint has none, and begins again.
+    A run that was killed before its first checkpoint has none, and begins again; what lies in the
+    folder of another program is left alone.
     """
     try:
         content = store.load(lambda text: _say(console, f"warning: {text}"))
     except NoCheckpointError:
-        if not (run / CONFIG_FILE).is_file():
+        stored = _described(run)
+        if stored is None:
             raise
-        return None, json.loads((run / CONFIG_FILE).read_bytes())
+        return None, stored
     return content, json.loads(content.files[CONFIG_FILE])
+
+
+def _described(run: Path) -> dict[str, Any] | None:
+    """Return the configuration in a folder, None where train.py wrote none."""
+    try:
+        stored = json.loads((run / CONFIG_FILE).read_bytes())
+    except (OSError, ValueError):
+        return None
+    ours = isinstance(stored, dict) and {"algo", "env", "training_seeds"} <= stored.keys()
+    return stored if ours else None
 
 
 def _say(console: Console, text: str) -> None:
