@@ -273,6 +273,9 @@ def test_run_folder_is_not_overwritten_unasked(run: Path, small: Path, tmp_path:
     (tmp_path / "thesis.tex").write_text("years of work", encoding="utf-8")
     with pytest.raises(NotARunError, match=r"config\.json"):
         train.train(replace(config, run=tmp_path, overwrite=True), quiet())
+    (tmp_path / "config.json").write_text('{"model_type": "bert"}', encoding="utf-8")
+    with pytest.raises(NotARunError, match=r"config\.json of train\.py"):
+        train.train(replace(config, run=tmp_path, overwrite=True), quiet())
     assert (tmp_path / "thesis.tex").is_file()
 
 

@@ -81,8 +81,8 @@ class NotARunError(TrainError):
         """Store the values and compose the message."""
         self.run = run
         super().__init__(
-            f"--overwrite would delete {run}, which holds no {marker} and so is no earlier run; "
-            "choose another folder with --run"
+            f"--overwrite would delete {run}, which holds no {marker} of train.py and so is no "
+            "earlier run; choose another folder with --run"
         )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import shutil
 import sys
@@ -10,7 +11,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from checkpoint import CheckpointStore
 from errors import NotARunError, RunBusyError, RunExistsError, RunWriteError
@@ -36,11 +37,26 @@ def prepare(run: Path, overwrite: bool) -> None:
         if not overwrite:
             raise RunExistsError(run)
         # Deleting is for folders that train.py has written, whatever --run was set to.
-        if not (run / CONFIG_FILE).is_file():
+        if description(run) is None:
             raise NotARunError(run, CONFIG_FILE)
         with claimed(run):
             clear(run)
     run.mkdir(parents=True, exist_ok=True)
+
+
+def description(run: Path) -> dict[str, Any] | None:
+    """Return the configuration in the folder of a run; None where train.py wrote none.
+
+    Args:
+        run: The folder.
+    """
+    try:
+        stored = json.loads((run / CONFIG_FILE).read_bytes())
+    except (OSError, ValueError):
+        return None
+    # Other programs, too, have a config.json.
+    ours = isinstance(stored, dict) and {"algo", "env", "training_seeds"} <= stored.keys()
+    return stored if ours else None
 
 
 def clear(run: Path, but: str | None = None) -> None:

@@ -30,7 +30,7 @@ from rich.console import Console
 import provenance
 from checkpoint import CheckpointStore, Content
 from errors import ConfigError, NoCheckpointError, PolicyError, TrainError
-from folder import claimed, clear, disk_errors_named, prepare
+from folder import claimed, clear, description, disk_errors_named, prepare
 from plan import Config, Plan, make_plan, resume_plan, run_folder
 from policies import BEST_FILE, CONFIG_FILE, LAST_FILE
 from rollout import SELECTION_SEED, GoalEnv
@@ -105,21 +105,11 @@ def _load(
     try:
         content = store.load(lambda text: _say(console, f"warning: {text}"))
     except NoCheckpointError:
-        stored = _described(run)
+        stored = description(run)
         if stored is None:
             raise
         return None, stored
     return content, json.loads(content.files[CONFIG_FILE])
-
-
-def _described(run: Path) -> dict[str, Any] | None:
-    """Return the configuration in a folder, None where train.py wrote none."""
-    try:
-        stored = json.loads((run / CONFIG_FILE).read_bytes())
-    except (OSError, ValueError):
-        return None
-    ours = isinstance(stored, dict) and {"algo", "env", "training_seeds"} <= stored.keys()
-    return stored if ours else None
 
 
 def _say(console: Console, text: str) -> None:
