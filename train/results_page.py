@@ -113,7 +113,8 @@ def _training(records: Group, figures: Sequence[str]) -> list[str]:
         "smallest conditioning | time below safe"
     )
     rows = [_training_row(group) for group in grouped(records)]
-    parts = ["## Learning\n", _table(head, rows)]
+    tested = f"Each seed is tested on {_episodes(records, [NOMINAL])} held-out episodes.\n"
+    parts = ["## Learning\n", tested, _table(head, rows)]
     if LEARNING_CURVES in figures:
         parts.append(f"![Learning curves](images/{LEARNING_CURVES})\n")
         parts.append("A curve that does not start at 0 starts after the demonstrations.\n")
@@ -206,7 +207,8 @@ def _penalty(records: Group, figures: Sequence[str]) -> list[str]:
     text = (
         "## Does the penalty work?\n\nTrained and tested on goals that tempt towards the "
         "singularity (`--goals tempting`, see `train/tempting.py`): goals, and pucks, lie just "
-        "within the safe threshold, and straight lines in the joint angles lead beyond it.\n"
+        "within the safe threshold, and straight lines in the joint angles lead beyond it. "
+        f"{_episodes(records, [TEMPTING])} held-out episodes a seed.\n"
     )
     parts = [text, _table(head, rows), *_compared(records)]
     if PENALTY in figures:
@@ -255,12 +257,18 @@ def _robustness(records: Group) -> list[str]:
             for group in groups
         ]
         rows.append(" | ".join([name.replace("_", " "), ", ".join(sorted(changes)), *cells]))
-    counts = {test["episodes"] for record in records for test in record["tests"].values()}
     text = (
         "## Robustness\n\nThe policies above, trained on the nominal machine alone, on others "
-        f"(success, IQM over seeds; {' or '.join(map(str, sorted(counts)))} episodes a test).\n"
+        f"(success, IQM over seeds; {_episodes(records, names)} episodes a seed, "
+        f"{_episodes(records, [NOMINAL])} on the nominal one).\n"
     )
     return [text, _table(" | ".join(["machine", "randomisation", *titles]), rows)]
+
+
+def _episodes(records: Group, names: Sequence[str]) -> str:
+    """How many episodes the tests of these names had."""
+    tests = [record["tests"].get(name) for record in records for name in names]
+    return " or ".join(map(str, sorted({test["episodes"] for test in tests if test}))) or "no"
 
 
 def _of(group: Group) -> set[str]:
