@@ -273,9 +273,6 @@ def test_run_folder_is_not_overwritten_unasked(run: Path, small: Path, tmp_path:
     (tmp_path / "thesis.tex").write_text("years of work", encoding="utf-8")
     with pytest.raises(NotARunError, match=r"config\.json"):
         train.train(replace(config, run=tmp_path, overwrite=True), quiet())
-    (tmp_path / "config.json").write_text('{"model_type": "bert"}', encoding="utf-8")
-    with pytest.raises(NotARunError, match=r"config\.json of train\.py"):
-        train.train(replace(config, run=tmp_path, overwrite=True), quiet())
     assert (tmp_path / "thesis.tex").is_file()
 
 
@@ -304,28 +301,6 @@ def test_resuming_runs_no_pickle(small: Path, tmp_path: Path) -> None:
         f"train.train(Config(run=Path({str(tmp_path / 'run')!r}), resume=True, steps=200))\n"
     )
     subprocess.run([sys.executable, "-c", script], check=True, cwd=SCRIPT.parent)
-
-
-def test_what_was_killed_half_way_through_deleting_can_be_replaced(
-    small: Path, tmp_path: Path
-) -> None:
-    folder = tmp_path / "run"
-    folder.mkdir()
-    (folder / ".half.json").write_text("{", encoding="utf-8")  # killed in the first moment
-    config = Config(recipe=small, run=folder, steps=60, eval_every=60, eval_episodes=1)
-    train.train(config, quiet())
-
-    def dies(path: Path) -> None:
-        if path.name == "config.json":
-            raise KeyboardInterrupt
-        path.rename(tmp_path / "deleted")
-
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(Path, "unlink", dies)
-        with pytest.raises(KeyboardInterrupt):
-            train.train(replace(config, overwrite=True), quiet())
-    assert [path.name for path in folder.iterdir()] == ["config.json"]
-    train.train(replace(config, overwrite=True), quiet())
 
 
 def test_overwrite_leaves_nothing_of_the_earlier_run(small: Path, tmp_path: Path) -> None:
