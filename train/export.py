@@ -235,14 +235,18 @@ def _write(
 
 def _verify(name: str, model: BaseAlgorithm, written: Path) -> None:
     """Compare the actions of the written policy with those of the model."""
-    # A copy on the CPU: a GPU rounds differently, and the model stays as it is.
-    policy: Any = copy.deepcopy(model.policy).to("cpu")
     rng = np.random.default_rng(0)
     boxes: Any = model.observation_space
     batch = {
         key: rng.uniform(box.low, box.high, (_TRIALS, *box.shape)).astype(box.dtype)
         for key, box in boxes.items()
     }
+    # PPO's last update has left its graph in the distribution, and graphs cannot be copied.
+    training = model.policy.training
+    model.policy.predict(batch, deterministic=True)
+    model.policy.set_training_mode(training)
+    # A copy on the CPU: a GPU rounds differently, and the model stays as it is.
+    policy: Any = copy.deepcopy(model.policy).to("cpu")
     try:
         actions = load_policy(written).act(batch)
     except TPMError as error:
