@@ -25,6 +25,8 @@ from policies import CONFIG_FILE, EVALUATIONS_FILE, TESTS
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 RECORDS: Final = ROOT / "docs" / "results"
+WHOLE: Final = "[!.]*.json"
+"""JSON files, without the hidden halves that a process leaves which was killed while it wrote."""
 
 _KEPT: Final = (
     "env",
@@ -42,7 +44,6 @@ _KEPT: Final = (
     "machine",
     "command",
 )
-_WHOLE: Final = "[!.]*.json"  # not what a process that was killed has left half written
 _CURVES: Final = ("success_at_end", "return", "unsafe_share")
 _NOT_KEPT: Final = ("records", "versions", "machine", "policy", "env")
 
@@ -110,7 +111,7 @@ def condense(run: Path) -> Record:
     for name in _CURVES:
         if evaluations and all(name in evaluation for evaluation in evaluations):
             curves[name] = [round(evaluation[name]["mean"], 6) for evaluation in evaluations]
-    files = sorted(run.glob(f"{TESTS}/{_WHOLE}"))
+    files = sorted(run.glob(f"{TESTS}/{WHOLE}"))
     tests = {path.stem: _condense_test(_read(path)) for path in files}
     return {
         "run": run.name,
@@ -179,7 +180,7 @@ def write(config: Write) -> list[Path]:
     from results_figures import draw
     from results_page import page
 
-    paths = sorted(config.records.glob(_WHOLE))
+    paths = sorted(config.records.glob(WHOLE))
     if not paths:
         raise ConfigError("--records", config.records, "holds no records; collect them first")
     records = [_read(path) for path in paths]

@@ -33,6 +33,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her import HerReplayBuffer
 
 from checkpoint import Content
+from export import remove
 from logs import PROGRESS_FILE
 from policies import BEST_FILE, CONFIG_FILE, EVALUATIONS_FILE, EXPORTED, LAST_FILE, TESTS
 from provenance import versions, write_whole
@@ -152,8 +153,7 @@ def restore_files(run: Path, content: Content) -> None:
     Tests, and what was exported at the end, are deleted: the policy will soon be another.
     """
     shutil.rmtree(run / TESTS, ignore_errors=True)
-    for suffix in EXPORTED:
-        (run / LAST_FILE).with_suffix(suffix).unlink(missing_ok=True)
+    remove((run / LAST_FILE).with_suffix(""))
     for name in RUN_FILES:
         if name in content.files:
             data = content.files[name]

@@ -37,7 +37,7 @@ from plan import Config as TrainConfig
 from plan import make_plan
 from policies import CONFIG_FILE, EVALUATIONS_FILE, TESTS
 from recipes import RECIPES, read_recipes
-from results import read_whole_lines
+from results import WHOLE, read_whole_lines
 from results_page import NOMINAL, TEMPTING
 
 _HERE: Final = Path(__file__).parent
@@ -258,7 +258,7 @@ def _time_to_train(run: Run, config: Config) -> float | None:
 
 def _seconds_an_episode(env: str, folder: Path) -> float | None:
     """Median over the tests that there are."""
-    files = folder.glob(f"{env}-*/{TESTS}/[!.]*.json")
+    files = folder.glob(f"{env}-*/{TESTS}/{WHOLE}")
     found = [json.loads(path.read_bytes()) for path in files]
     return statistics.median(f["wall_seconds"] / f["episodes"] for f in found) if found else None
 
