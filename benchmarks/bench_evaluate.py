@@ -21,8 +21,8 @@ from typing import Any
 import gymnasium as gym
 from machine import ROOT, describe, processor_line, quartiles  # first: it finds the scripts
 
-from policies import load_policy, trained_env
-from rollout import TEST_SEED
+from tpm_gym.learning.policies import load_policy, trained_env
+from tpm_gym.learning.rollout import TEST_SEED
 
 Episode = list[Any]
 """The actions of an episode."""

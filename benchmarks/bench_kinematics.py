@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import root
 
-from tpm_gym.geometry import PAPER
 from tpm_gym.kinematics import forward, forward_all, inverse, inverse_all
+from tpm_gym.kinematics.geometry import PAPER
 
 FloatArray = NDArray[np.float64]
 

@@ -1,6 +1,6 @@
 """A mechanism in a physics client, motions to follow, and what to measure on the way.
 
-The production classes load the mechanism and close its loops (:class:`tpm_gym.robot.Robot`); only
+The production classes load the mechanism and close its loops (:class:`tpm_gym.simulation.bullet.robot.Robot`); only
 the engine's settings and the motors vary here.
 """
 
@@ -20,13 +20,14 @@ from machine import silence
 from numpy.typing import NDArray
 
 import tpm_gym  # noqa: F401  (registers the environments)
-from tpm_gym import jacobian, kinematics
-from tpm_gym.control import CartesianControl
-from tpm_gym.engine import Client
-from tpm_gym.expert import Expert
-from tpm_gym.links import MOTOR_EFFORT
-from tpm_gym.mechanism import DEFAULT_MOUNT
-from tpm_gym.physics import (
+from tpm_gym import kinematics
+from tpm_gym.kinematics import jacobian
+from tpm_gym.kinematics.workspace import TASK_REGION
+from tpm_gym.mechanism.links import MOTOR_EFFORT
+from tpm_gym.mechanism.tree import DEFAULT_MOUNT
+from tpm_gym.simulation.bullet.client import Client
+from tpm_gym.simulation.bullet.robot import Robot
+from tpm_gym.simulation.physics import (
     ASSEMBLY_LIMIT,
     CLOSURE_LIMIT,
     CONTROL_PERIOD,
@@ -35,8 +36,8 @@ from tpm_gym.physics import (
     Physics,
     spline_weights,
 )
-from tpm_gym.robot import Robot
-from tpm_gym.workspace import TASK_REGION
+from tpm_gym.tasks.control import CartesianControl
+from tpm_gym.tasks.expert import Expert
 
 FloatArray = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from machine import ROOT
 from numpy.typing import NDArray
 
 from tpm_gym.errors import ClosureError
-from tpm_gym.expert import Expert
+from tpm_gym.tasks.expert import Expert
 
 FloatArray = NDArray[np.float64]
 

@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 from fidelity_sweep import QUANTITIES, Result, pareto
-from figures import style
-from figures.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import NullLocator
+
+from tpm_gym.learning import figure_style as style
+from tpm_gym.learning.figure_style import BLACK, BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION
 
 ROOT = Path(__file__).resolve().parents[1]
 JSON = ROOT / "runs" / "fidelity.json"

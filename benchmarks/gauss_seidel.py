@@ -22,8 +22,8 @@ from fidelity_lab import Config, Rig
 from numpy.typing import NDArray
 
 from tpm_gym import kinematics
-from tpm_gym.mechanism import ACTUATED_JOINTS
-from tpm_gym.workspace import TASK_REGION
+from tpm_gym.kinematics.workspace import TASK_REGION
+from tpm_gym.mechanism.tree import ACTUATED_JOINTS
 
 FloatArray = NDArray[np.float64]
 

@@ -20,13 +20,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from tpm_gym.learning import provenance
+
 ROOT = Path(__file__).resolve().parents[1]
-for _folder in ("train", "docs"):  # scripts, no packages
-    if str(ROOT / _folder) not in sys.path:
-        sys.path.append(str(ROOT / _folder))
-
-import provenance  # noqa: E402
-
 __all__ = [
     "describe",
     "give_back_free_memory",

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from soak_report import judge, print_verdict, save_plot
 
 from tpm_gym import ENV_IDS
-from tpm_gym.expert import Expert
+from tpm_gym.tasks.expert import Expert
 
 Env = gym.Env[Any, Any]
 Make = Callable[..., Env]

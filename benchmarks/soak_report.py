@@ -8,9 +8,10 @@ from typing import Any
 
 import machine
 import numpy as np
-from figures import style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+
+from tpm_gym.learning import figure_style as style
 
 __all__ = ["judge", "print_verdict", "save_plot"]
 

@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import machine
-from figures import style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+
+from tpm_gym.learning import figure_style as style
 
 __all__ = ["TARGETS", "print_report", "save_plot"]
 

@@ -3,7 +3,7 @@
 All variants are the same machine, link for link: only the spanning tree and the joints at the ends
 of the rods differ. Each comes with the closed-form angles at which its loops close.
 
-The links' solids are those of :func:`tpm_gym.mechanism.build`, so lengths, masses and inertias stay
+The links' solids are those of :func:`tpm_gym.mechanism.tree.build`, so lengths, masses and inertias stay
 in one place.
 """
 
@@ -15,8 +15,8 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tpm_gym.mechanism import Mechanism, build, joint_angles
-from tpm_gym.parts import Closure, Joint, Link, Solid, Vector
+from tpm_gym.mechanism.bodies import Closure, Joint, Link, Solid, Vector
+from tpm_gym.mechanism.tree import Mechanism, build, joint_angles
 
 FloatArray = NDArray[np.float64]
 Angles = dict[str, float]
@@ -123,7 +123,7 @@ def spherical_parallelogram() -> Variant:
 
     The end links become parts of arm 12 and of the platform. On the platform the bar is moved to
     the middle: at its own place it would give the platform a product of inertia, and then the
-    engine turns the frame in which :class:`tpm_gym.robot.Robot` gives it the closures' pivots.
+    engine turns the frame in which :class:`tpm_gym.simulation.bullet.robot.Robot` gives it the closures' pivots.
     """
     mechanism = build()
     g = mechanism.geometry

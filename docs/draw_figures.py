@@ -9,8 +9,10 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from figures import maps, postures, regions, singularities, style
+from figures import maps, postures, regions, singularities
 from matplotlib.figure import Figure
+
+from tpm_gym.learning import figure_style as style
 
 IMAGES = Path(__file__).parent / "images"
 FIGURES: dict[str, Callable[[], Figure]] = {

@@ -10,13 +10,13 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from figures import style
-from figures.style import BLACK, BLUE, GREEN, MM, OUTLINE, VERMILLION
 from figures.zero_sets import Section, reach_margin
-from tpm_gym.geometry import PAPER
 from tpm_gym.kinematics import ELBOWS_OUT
-from tpm_gym.rewards import SAFE_CONDITIONING
-from tpm_gym.workspace import TASK_REGION, conditioning_at
+from tpm_gym.kinematics.geometry import PAPER
+from tpm_gym.kinematics.workspace import TASK_REGION, conditioning_at
+from tpm_gym.learning import figure_style as style
+from tpm_gym.learning.figure_style import BLACK, BLUE, GREEN, MM, OUTLINE, VERMILLION
+from tpm_gym.tasks.rewards import SAFE_CONDITIONING
 
 FloatArray = NDArray[np.float64]
 

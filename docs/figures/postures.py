@@ -8,10 +8,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
-from figures import style
 from figures.skeleton import skeleton
-from figures.style import BLACK, BLUE, GREEN, MM, ORANGE, PURPLE, VERMILLION
 from tpm_gym.kinematics import ELBOWS_OUT, WorkingMode
+from tpm_gym.learning import figure_style as style
+from tpm_gym.learning.figure_style import BLACK, BLUE, GREEN, MM, ORANGE, PURPLE, VERMILLION
 
 FloatArray = NDArray[np.float64]
 

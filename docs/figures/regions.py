@@ -9,14 +9,14 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from figures import style
-from figures.style import BLACK, BLUE, GREEN, MM, ORANGE, PURPLE
 from figures.zero_sets import Section, parallel_lines, reach_margin
-from tpm_gym.aspects import Aspect, aspects
-from tpm_gym.geometry import PAPER
+from tpm_gym.analysis.aspects import Aspect, aspects
+from tpm_gym.analysis.singularity import factors_at
 from tpm_gym.kinematics import ELBOWS_OUT
-from tpm_gym.singularity import factors_at
-from tpm_gym.workspace import TASK_REGION
+from tpm_gym.kinematics.geometry import PAPER
+from tpm_gym.kinematics.workspace import TASK_REGION
+from tpm_gym.learning import figure_style as style
+from tpm_gym.learning.figure_style import BLACK, BLUE, GREEN, MM, ORANGE, PURPLE
 
 FloatArray = NDArray[np.float64]
 

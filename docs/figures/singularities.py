@@ -13,8 +13,7 @@ from matplotlib.patches import Patch
 from mpl_toolkits.mplot3d import Axes3D
 from numpy.typing import NDArray
 
-from figures import style, surfaces
-from figures.style import BLACK, BLUE, GREEN, MM, ORANGE, OUTLINE, PURPLE, REACHED, VERMILLION
+from figures import surfaces
 from figures.surfaces import Surface
 from figures.zero_sets import (
     Section,
@@ -23,10 +22,22 @@ from figures.zero_sets import (
     serial_lines,
     serial_squares,
 )
-from tpm_gym.geometry import PAPER
+from tpm_gym.analysis.singularity import factors_at
 from tpm_gym.kinematics import ELBOWS_OUT, WORKING_MODES
-from tpm_gym.singularity import factors_at
-from tpm_gym.workspace import TASK_REGION
+from tpm_gym.kinematics.geometry import PAPER
+from tpm_gym.kinematics.workspace import TASK_REGION
+from tpm_gym.learning import figure_style as style
+from tpm_gym.learning.figure_style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    MM,
+    ORANGE,
+    OUTLINE,
+    PURPLE,
+    REACHED,
+    VERMILLION,
+)
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

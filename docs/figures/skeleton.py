@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tpm_gym.geometry import PAPER, Geometry
 from tpm_gym.kinematics import WorkingMode, inverse_all
+from tpm_gym.kinematics.geometry import PAPER, Geometry
 
 FloatArray = NDArray[np.float64]
 

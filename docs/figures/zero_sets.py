@@ -15,9 +15,9 @@ import contourpy
 import numpy as np
 from numpy.typing import NDArray
 
-from tpm_gym.geometry import PAPER, Geometry
+from tpm_gym.analysis.singularity import factors_at
 from tpm_gym.kinematics import WorkingMode
-from tpm_gym.singularity import factors_at
+from tpm_gym.kinematics.geometry import PAPER, Geometry
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

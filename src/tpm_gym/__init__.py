@@ -8,12 +8,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tpm_gym.envs.registration import ENV_IDS, register
 from tpm_gym.errors import TPMError
-from tpm_gym.geometry import PAPER, WIDE, Geometry
-from tpm_gym.registration import ENV_IDS, register
+from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
 
 if TYPE_CHECKING:
-    from tpm_gym.policy import Policy
+    from tpm_gym.policy.policy import Policy
 
 __all__ = ["ENV_IDS", "PAPER", "WIDE", "Geometry", "TPMError", "__version__", "load_policy"]
 
@@ -21,8 +21,8 @@ __version__ = "0.1.0"
 
 
 def load_policy(path: str | Path) -> Policy:
-    """Load a trained policy; the same as :func:`tpm_gym.policy.load_policy`, and needs PyTorch."""
-    from tpm_gym import policy  # here, so that PyTorch is not imported before it is needed
+    """Load a trained policy; the same as :func:`tpm_gym.policy.policy.load_policy`, and needs PyTorch."""
+    from tpm_gym.policy import policy  # here, so that PyTorch is not imported before it is needed
 
     return policy.load_policy(path)
 

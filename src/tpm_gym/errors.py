@@ -131,7 +131,7 @@ class SingularityError(TPMError, ValueError):
         self.factor, self.value = factor, float(value)
         super().__init__(
             f"singular configuration: {factor} = {self.value:.3g}; stay where the conditioning is "
-            "above zero (tpm_gym.jacobian.conditioning)"
+            "above zero (tpm_gym.kinematics.jacobian.conditioning)"
         )
 
 

@@ -1,0 +1,1 @@
+"""Singularities, aspects and topology; no environment imports this."""

@@ -1,0 +1,366 @@
+"""Topology of the mechanism, and its mobility from the rank of its loop closures.
+
+Two counts of the degrees of freedom that share nothing but the joints' axes, in the paper frame:
+
+* :func:`analyse` follows the paper's section "Topological analysis": POC sets and Eqs. (1) to (5),
+  see :mod:`tpm_gym.analysis.poc`, on branches I, II, III and the pair R12, R13;
+* :func:`mobility` knows none of that theory: it takes the rank of the closure Jacobian of the
+  spanning tree and point closures that the simulator loads, with every rod and ball of the
+  parallelograms in it.
+
+Both are taken at one configuration, and agree at singularities too. If z_C1 = z_B1, both find 4:
+the parallelogram of branch I then contains the direction y, and link 3' can turn about it. That
+constraint singularity is not among the factors of Eqs. (16) and (17), which take for granted that
+link 3' only translates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import permutations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tpm_gym.analysis.poc import (
+    Chain,
+    Loop,
+    POCSet,
+    Subspace,
+    Unit,
+    coupling_degrees,
+    degrees_of_freedom,
+    independent_equations,
+    parallel,
+    parallelogram_4r,
+    parallelogram_4s,
+    revolute,
+    serial,
+)
+from tpm_gym.errors import SingularityError
+from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode
+from tpm_gym.kinematics.geometry import PAPER, Geometry
+from tpm_gym.mechanism.bodies import Vector
+from tpm_gym.mechanism.tree import ACTUATED_JOINTS, Mechanism, build, joint_angles
+
+__all__ = [
+    "Mobility",
+    "Structure",
+    "Topology",
+    "analyse",
+    "closure_jacobian",
+    "describe",
+    "mobility",
+]
+
+FloatArray = NDArray[np.float64]
+Frame = tuple[FloatArray, FloatArray]
+
+# Singular values up to the first fraction of the largest are zeros, from the second on they are
+# not, and in between the rank is in doubt. Rounding leaves zeros of some 1e-16.
+_ZERO, _NOT_ZERO = 1e-11, 1e-7
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """The mechanism as the paper's topology section sees it, at one configuration.
+
+    Attributes:
+        branches: I, II (base to link 3') and III (base to platform 1).
+        wrist: R12 and R13, from link 3' to platform 1.
+        link_3p: (3,) m, base point C1 of link 3'.
+        platform: (3,) m, base point E1 of platform 1: on the axis of R13, so that R12, R13
+            contribute no dependent element.
+    """
+
+    branches: tuple[Chain, Chain, Chain]
+    wrist: Chain
+    link_3p: FloatArray
+    platform: FloatArray
+
+    @property
+    def chains(self) -> tuple[Chain, Chain, Chain]:
+        """The three chains from the base to link 3': I, II, and III with the wrist reversed."""
+        first, second, third = self.branches
+        return first, second, Chain("III, wrist", (*third.units, *self.wrist.units[::-1]))
+
+
+def describe(
+    theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
+) -> Structure:
+    """Axes and rods of :func:`tpm_gym.mechanism.tree.build`, named as in the paper.
+
+    Args:
+        theta: (3,) rad, actuated angles.
+        branch: The assembly mode.
+        geometry: Link lengths.
+
+    Raises:
+        InputError: If theta has the wrong shape or is not finite.
+        UnreachableError: If the branch does not exist at theta.
+    """
+    mechanism = build(geometry)
+    frames = _frames(mechanism, joint_angles(theta, branch, geometry))
+    joints = {link.joint.name: link for link in mechanism.links if link.joint}
+    ends = {c.name: _place(frames, c.link_b, c.point_b) for c in mechanism.closures}
+
+    def turning(*names: str) -> tuple[Unit, ...]:
+        return tuple(
+            revolute(name, _axis(mechanism, frames, link), frames[link][1], name in ACTUATED_JOINTS)
+            for name, link in ((name, joints[name].name) for name in names)
+        )
+
+    def sides(near: str, far: str, other: str) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Short link, rod, and middle of the far short link of a parallelogram."""
+        foot = frames[joints[near].name][1]
+        return ends[far] - ends[other], ends[far] - foot, (ends[far] + ends[other]) / 2
+
+    four_s = parallelogram_4s("Pa(4S)", *sides("Sa_swing", "Sc", "Sd"))
+    four_r = parallelogram_4r("Pa(4R)", *sides("Re", "Rg", "Rh"))
+    return Structure(
+        branches=(
+            Chain("I", (*turning("R11"), four_s)),
+            Chain("II", turning("R21", "R22", "R23")),
+            Chain("III", (*turning("R31", "R32"), four_r, *turning("R33"))),
+        ),
+        wrist=Chain("wrist", turning("R12", "R13")),
+        link_3p=four_s.point,
+        platform=frames[joints["R13"].name][1],
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Topology:
+    """What :func:`analyse` finds.
+
+    Attributes:
+        sub_mechanism: M_Pa(1-2) of the first Eq. (4): POC set of link 3' under branches I and II.
+        hsoc_1: POC set of the platform under those and R12, R13.
+        hsoc_2: POC set of the platform under branch III.
+        platform: POC set of the platform, the intersection of both.
+        decompositions: The independent loops, for every order in which the three chains can be
+            taken; the paper's (I and II, then III) comes first.
+    """
+
+    sub_mechanism: POCSet
+    hsoc_1: POCSet
+    hsoc_2: POCSet
+    platform: POCSet
+    decompositions: tuple[tuple[Loop, ...], ...]
+
+    @property
+    def loops(self) -> tuple[Loop, ...]:
+        """The paper's two loops."""
+        return self.decompositions[0]
+
+    @property
+    def coupling(self) -> tuple[float, ...]:
+        """Eq. (5): kappa of each Assur kinematic chain.
+
+        Raises:
+            InputError: At a constraint singularity, where there are more freedoms than motors and
+                the constraint degrees do not add up to zero.
+        """
+        return coupling_degrees([[x.constraint for x in loops] for loops in self.decompositions])
+
+    def dof(self, loops: int = 2) -> int:
+        """F of Eq. (3a), counting the first ``loops`` of the paper's loops."""
+        counted = self.loops[:loops]
+        return degrees_of_freedom(
+            [loop.freedoms for loop in counted], [loop.equations for loop in counted]
+        )
+
+
+def analyse(structure: Structure) -> Topology:
+    """Apply Eqs. (1) to (5) to the structure at its configuration.
+
+    Args:
+        structure: From :func:`describe`.
+    """
+    held = [(chain, chain.poc(structure.link_3p)) for chain in structure.chains]
+    sub_mechanism = parallel([poc for _, poc in held[:2]])
+    # Where link 3' does not turn, its POC set is the same about any point.
+    hsoc_1 = serial([sub_mechanism, structure.wrist.poc(structure.platform)])
+    hsoc_2 = structure.branches[2].poc(structure.platform)
+    return Topology(
+        sub_mechanism=sub_mechanism,
+        hsoc_1=hsoc_1,
+        hsoc_2=hsoc_2,
+        platform=parallel([hsoc_1, hsoc_2]),
+        decompositions=tuple(_loops(order) for order in permutations(held)),
+    )
+
+
+def _loops(order: tuple[tuple[Chain, POCSet], ...]) -> tuple[Loop, ...]:
+    """The loops that form as the chains are mounted in this order, the first by two of them."""
+    chains, sets = zip(*order, strict=True)
+    loops = []
+    for j in range(1, len(order)):
+        added = chains[: j + 1] if j == 1 else chains[j : j + 1]
+        loops.append(
+            Loop(
+                chains=tuple(chain.name for chain in added),
+                freedoms=sum(chain.freedoms for chain in added),
+                actuated=sum(chain.actuated for chain in added),
+                equations=independent_equations(sets[:j], sets[j]),
+            )
+        )
+    return tuple(loops)
+
+
+@dataclass(frozen=True, eq=False)
+class Mobility:
+    """What :func:`mobility` finds.
+
+    Attributes:
+        dof: Freedoms that move the platform or a motor.
+        idle: Freedoms that move neither: end link 10 rolling about its own axis, R33.
+        rank: Rank of the closure Jacobian.
+        redundant: Number of its rows that depend on others.
+        smallest: Smallest singular value of the closure Jacobian that is not zero, as a fraction of
+            the largest: how far the rank is from being in doubt.
+        platform: POC set of the platform: all directions in which the loops let it move.
+    """
+
+    dof: int
+    idle: int
+    rank: int
+    redundant: int
+    smallest: float
+    platform: POCSet
+
+
+def mobility(
+    theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
+) -> Mobility:
+    """Count freedoms by the numerical rank of the closure Jacobian, at one configuration.
+
+    Singular values up to 1e-11 of the largest count as zeros.
+
+    Args:
+        theta: (3,) rad, actuated angles.
+        branch: The assembly mode.
+        geometry: Link lengths.
+
+    Raises:
+        InputError: If theta has the wrong shape or is not finite.
+        UnreachableError: If the branch does not exist at theta.
+        SingularityError: If the rank is in doubt, since a singular value is between 1e-11 and 1e-7
+            of the largest: very near to a constraint singularity, but not on it.
+    """
+    mechanism = build(geometry)
+    angles = joint_angles(theta, branch, geometry)
+    jacobian = closure_jacobian(mechanism, angles)
+    _, values, right = np.linalg.svd(jacobian)
+    rank = _rank(values)
+    free = right[rank:].T  # columns: joint rates that keep the loops closed
+    frames = _frames(mechanism, angles)
+    point = _place(frames, mechanism.platform, mechanism.point_p)
+    joints = _moving_joints(mechanism)
+    linear, angular = _rates(mechanism, frames, mechanism.platform, point)
+    motors = np.eye(len(joints))[[joints.index(name) for name in ACTUATED_JOINTS]]
+    seen = np.linalg.svd(np.concatenate([linear, angular, motors]) @ free, compute_uv=False)
+    dof = _rank(seen)
+    return Mobility(
+        dof=dof,
+        idle=free.shape[1] - dof,
+        rank=rank,
+        redundant=len(jacobian) - rank,
+        smallest=float(values[rank - 1] / values[0]),
+        platform=POCSet(Subspace.span((linear @ free).T), Subspace.span((angular @ free).T)),
+    )
+
+
+def closure_jacobian(mechanism: Mechanism, angles: Mapping[str, float]) -> FloatArray:
+    """Derivative of the gaps of all closures by the joint angles of the spanning tree.
+
+    Args:
+        mechanism: Tree and closures.
+        angles: Joint name -> rad, for every joint that moves.
+
+    Returns:
+        (3 closures, joints) m/rad, in the paper frame: rows in the order of
+        ``mechanism.closures`` (x, y, z of ``point_a`` - ``point_b``), columns in the order of
+        ``mechanism.links``.
+    """
+    frames = _frames(mechanism, angles)
+    rows = []
+    for closure in mechanism.closures:
+        side_a, side_b = (
+            _rates(mechanism, frames, link, _place(frames, link, point))[0]
+            for link, point in (
+                (closure.link_a, closure.point_a),
+                (closure.link_b, closure.point_b),
+            )
+        )
+        rows.append(side_a - side_b)
+    return np.concatenate(rows)
+
+
+def _rank(values: FloatArray) -> int:
+    """Numerical rank from singular values in descending order; SingularityError if in doubt."""
+    rank = int((values > _ZERO * values[0]).sum())
+    if values[rank - 1] < _NOT_ZERO * values[0]:
+        raise SingularityError("a singular value of the loop closures", values[rank - 1])
+    return rank
+
+
+def _moving_joints(mechanism: Mechanism) -> list[str]:
+    """Names of the joints of the tree that turn, in the order of the links.
+
+    The cup's slide, the one prismatic joint, belongs to the tool and not to the mechanism.
+    """
+    joints = (link.joint for link in mechanism.links)
+    return [joint.name for joint in joints if joint and joint.kind != "prismatic"]
+
+
+def _frames(mechanism: Mechanism, angles: Mapping[str, float]) -> dict[str, Frame]:
+    """Rotation (3, 3) and origin (3,) m of every link."""
+    frames: dict[str, Frame] = {}
+    for link in mechanism.links:
+        joint = link.joint
+        if joint is None:
+            frames[link.name] = (np.eye(3), np.zeros(3))
+            continue
+        rotation = frames[joint.parent][0]
+        if joint.kind != "prismatic":
+            rotation = rotation @ _turn(joint.axis, angles[joint.name])
+        frames[link.name] = (rotation, _place(frames, joint.parent, joint.origin))
+    return frames
+
+
+def _turn(axis: Vector, angle: float) -> FloatArray:
+    """Rotation matrix about a unit axis (Rodrigues)."""
+    cross = np.cross(np.eye(3), axis)
+    turned: FloatArray = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    return turned
+
+
+def _place(frames: Mapping[str, Frame], link: str, point: Vector) -> FloatArray:
+    """A point of a link in the paper frame, (3,) m."""
+    rotation, origin = frames[link]
+    placed: FloatArray = origin + rotation @ np.asarray(point)
+    return placed
+
+
+def _axis(mechanism: Mechanism, frames: Mapping[str, Frame], link: str) -> FloatArray:
+    """Axis of the joint that holds a link, in the paper frame; a joint does not turn its axis."""
+    joint = mechanism.link(link).joint
+    axis: FloatArray = frames[link][0] @ np.asarray(joint.axis if joint else (0.0, 0.0, 0.0))
+    return axis
+
+
+def _rates(
+    mechanism: Mechanism, frames: Mapping[str, Frame], link: str, point: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Velocity of a point of a link (3, n) m/rad, and its angular velocity (3, n), per joint."""
+    joints = _moving_joints(mechanism)
+    linear, angular = np.zeros((3, len(joints))), np.zeros((3, len(joints)))
+    while (joint := mechanism.link(link).joint) is not None:
+        if joint.kind != "prismatic":
+            column, axis = joints.index(joint.name), _axis(mechanism, frames, link)
+            angular[:, column] = axis
+            linear[:, column] = np.cross(axis, point - frames[link][1])
+        link = joint.parent
+    return linear, angular

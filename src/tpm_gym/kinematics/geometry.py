@@ -1,0 +1,80 @@
+"""The seven lengths that define the mechanism, validated."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from numbers import Real
+
+from tpm_gym.errors import GeometryError
+
+__all__ = ["PAPER", "WIDE", "Geometry"]
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Link lengths of the mechanism in metres, named as in the paper ("Establishment of ...").
+
+    Attributes:
+        l1: Half side of the base: distance from O to each actuated pivot A_i.
+        l2: Half side of the platform: F1 to P and P to D3.
+        l3: Actuated arms A_iB_i (links 2, 5 and 12).
+        l4: Rods B_iC_i (link 6 and the long links of both parallelograms).
+        l5: Half the short links of both parallelograms.
+        l6: Vertical offsets C_1D_1, E_1F_1 and C_3D_3. May be zero.
+        l7: Link 7, D_1E_1; the workspace reaches y = -l7 to l7.
+
+    Raises:
+        GeometryError: If a length is zero, negative or not finite, or if the combination
+            degenerates (see ``__post_init__``).
+    """
+
+    l1: float
+    l2: float
+    l3: float
+    l4: float
+    l5: float
+    l6: float
+    l7: float
+
+    def __post_init__(self) -> None:
+        """Reject lengths that make no mechanism."""
+        for field in fields(self):
+            self._check_length(field.name)
+        if math.isclose(self.l3, self.l1, rel_tol=1e-9):
+            raise GeometryError("l3", self.l3, f"the paper requires l3 != l1 = {self.l1} m")
+        if self.l3 > self.l1 and math.isclose(self.l5, self.l1, rel_tol=1e-9):
+            # At cos(theta_1) = -l1/l3 and cos(theta_2) = (l1 - 2 l5)/l3 = -l1/l3 the two circles
+            # of Eq. (6) would be one circle: Eq. (7) reads 0 = 0, sub-chain I-II moves freely.
+            raise GeometryError("l5", self.l5, f"it must differ from l1 = {self.l1} m")
+        if self.l4 <= self.l1 - self.l3:
+            raise GeometryError(
+                "l4",
+                self.l4,
+                f"it must exceed l1 - l3 = {self.l1 - self.l3} m, or rod 4 never reaches y = 0",
+            )
+
+    def _check_length(self, name: str) -> None:
+        value = getattr(self, name)
+        if isinstance(value, bool) or not isinstance(value, Real):
+            raise GeometryError(name, value, "it must be a number")
+        value = float(value)
+        object.__setattr__(self, name, value)
+        if not math.isfinite(value):
+            raise GeometryError(name, value, "it must be finite")
+        if value < 0.0 or (value == 0.0 and name != "l6"):
+            raise GeometryError(name, value, "it must be positive")
+
+
+PAPER = Geometry(l1=0.300, l2=0.070, l3=0.350, l4=0.800, l5=0.100, l6=0.010, l7=0.050)
+"""The paper's case study (section "Case study"), there in millimetres."""
+
+WIDE = Geometry(l1=0.300, l2=0.070, l3=0.350, l4=0.800, l5=0.100, l6=0.010, l7=0.600)
+"""The paper's lengths but for l7, for a workspace of practical depth in y.
+
+Of l7 = 0.1, 0.2 ... 0.9 m it is the one with the largest axis-aligned box, elbows out, in which the
+conditioning is at least 0.1 (:func:`tpm_gym.analysis.aspects.largest_box`; a slow test recomputes it on two
+grids): about 45 litres and 0.3 m deep in y, against 3 litres and 0.02 m of PAPER. A longer link 7
+deepens the box, but beyond this it costs more in height than it gains. The maximum is flat: 0.65 m
+is as good within the grids' few per cent.
+"""

@@ -1,0 +1,168 @@
+"""Solution branches of the kinematics: their names, and what holds the solutions.
+
+Branches are named by signs that change only at a singularity:
+
+* an :class:`AssemblyMode` (forward kinematics, 4 of them) by the signs of the two factors of the
+  parallel Jacobian's determinant that the branches differ in;
+* a :class:`WorkingMode` (inverse kinematics, 16 of them) by the signs of the four factors of the
+  serial Jacobian's determinant.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tpm_gym.errors import InputError
+from tpm_gym.kinematics.geometry import Geometry
+
+__all__ = [
+    "ASSEMBLY_MODES",
+    "DEFAULT_ASSEMBLY",
+    "ELBOWS_OUT",
+    "WORKING_MODES",
+    "AssemblyMode",
+    "ForwardSolutions",
+    "InverseSolutions",
+    "PassiveAngles",
+    "WorkingMode",
+]
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class AssemblyMode:
+    """One of the 4 branches of the forward kinematics.
+
+    Attributes:
+        planar: Sign of the planar factor xC (zC - zB2) - (zC - zB1)(xC - 2 l5 - xB2) of Eq. (16):
+            on which side of the line through the two circle centres link 3' is assembled.
+        sin_beta: Sign of sin(beta), so of y: in which half the platform is assembled.
+    """
+
+    planar: int
+    sin_beta: int
+
+    def __post_init__(self) -> None:
+        """Reject anything but signs."""
+        _check_signs("AssemblyMode", self.planar, self.sin_beta)
+
+    @property
+    def index(self) -> int:
+        """Slot of this branch in the results of :func:`forward_all`."""
+        return (self.planar + 1) + (self.sin_beta + 1) // 2
+
+
+@dataclass(frozen=True)
+class WorkingMode:
+    """One of the 16 branches of the inverse kinematics.
+
+    Attributes:
+        cos_beta: Sign of cos(beta): to which side of link 3' link 7 points.
+        leg1: Sign of B1C1 . dB1/dtheta_1, a factor of Eq. (17): which way the elbow is bent.
+        leg2: The same for leg 2.
+        leg3: The same for leg 3.
+    """
+
+    cos_beta: int
+    leg1: int
+    leg2: int
+    leg3: int
+
+    def __post_init__(self) -> None:
+        """Reject anything but signs."""
+        _check_signs("WorkingMode", self.cos_beta, self.leg1, self.leg2, self.leg3)
+
+    @property
+    def index(self) -> int:
+        """Slot of this branch in the results of :func:`inverse_all`."""
+        bits = (self.cos_beta, self.leg1, self.leg2, self.leg3)
+        return sum((sign + 1) // 2 << shift for sign, shift in zip(bits, (3, 2, 1, 0), strict=True))
+
+
+def _check_signs(name: str, *signs: int) -> None:
+    if any(sign not in (-1, 1) for sign in signs):
+        raise InputError(name, signs, "made of signs, each +1 or -1")
+
+
+ASSEMBLY_MODES = tuple(AssemblyMode(*signs) for signs in product((-1, 1), repeat=2))
+"""All forward branches, in the order of the slots of :func:`forward_all`."""
+
+WORKING_MODES = tuple(WorkingMode(*signs) for signs in product((-1, 1), repeat=4))
+"""All inverse branches, in the order of the slots of :func:`inverse_all`."""
+
+DEFAULT_ASSEMBLY = AssemblyMode(planar=-1, sin_beta=1)
+"""The assembly mode of the environments: platform on the far side of the base, y > 0."""
+
+ELBOWS_OUT = WorkingMode(cos_beta=1, leg1=1, leg2=-1, leg3=1)
+"""The working mode of the environments: arms bent away from the centre, as a delta robot's."""
+
+
+@dataclass(frozen=True)
+class ForwardSolutions:
+    """All solutions of the forward kinematics, one slot per :data:`ASSEMBLY_MODES` entry.
+
+    Attributes:
+        position: (..., 4, 3) m, point P in the paper frame; NaN where not real.
+        beta: (..., 4) rad, passive angle of link 7 in (-pi, pi]; NaN where not real.
+        valid: (..., 4) bool, which branches are real.
+        geometry: The lengths they were solved for.
+    """
+
+    position: FloatArray
+    beta: FloatArray
+    valid: BoolArray
+    geometry: Geometry
+
+    @property
+    def link3(self) -> FloatArray:
+        """(..., 4, 2) m, (xC, zC) of point C1 of link 3'; NaN where not real."""
+        g = self.geometry
+        x_c = self.position[..., 0] - g.l2 - g.l7 * np.cos(self.beta)
+        return np.stack([x_c, self.position[..., 2] - 2 * g.l6], axis=-1)
+
+
+@dataclass(frozen=True)
+class InverseSolutions:
+    """All solutions of the inverse kinematics, one slot per :data:`WORKING_MODES` entry.
+
+    Attributes:
+        theta: (..., 16, 3) rad, NaN where not real. theta_1 and theta_3 are in (-pi, pi], theta_2
+            is in [0, 2 pi): each is cut where the arm points level towards the centre, so that
+            no posture of practical use lies on a cut.
+        beta: (..., 16) rad, in (-pi, pi]; NaN where not real.
+        valid: (..., 16) bool, which branches are real.
+    """
+
+    theta: FloatArray
+    beta: FloatArray
+    valid: BoolArray
+
+
+@dataclass(frozen=True)
+class PassiveAngles:
+    """Absolute directions of the passive links, each of shape (...,), in rad.
+
+    A "swing" is an angle in the plane in which the leg's arm turns, measured like the arm's own
+    theta; a "tilt" is the elevation out of that plane.
+
+    Attributes:
+        beta: Link 7, from +x towards +y.
+        rod4_swing: Rods of the 4S parallelogram (B1C1), in the yz plane, from +y towards +z.
+        rod4_tilt: The same rods, out of the yz plane towards +x.
+        rod6_swing: Rod 6 (B2C2), in the xz plane, from +x towards +z.
+        rod11_swing: Rods of the second parallelogram (B3C3), in the xz plane, from +x towards +z.
+        rod11_tilt: The same rods, out of the xz plane towards +y.
+    """
+
+    beta: FloatArray
+    rod4_swing: FloatArray
+    rod4_tilt: FloatArray
+    rod6_swing: FloatArray
+    rod11_swing: FloatArray
+    rod11_tilt: FloatArray

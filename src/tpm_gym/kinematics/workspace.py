@@ -1,0 +1,155 @@
+"""Where the mechanism can go: reachability, margins, regions, and samplers that take an rng.
+
+Everything here is in the paper frame, in metres, on one working mode.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tpm_gym.errors import ConfigurationError
+from tpm_gym.kinematics import jacobian
+from tpm_gym.kinematics.geometry import PAPER, Geometry
+from tpm_gym.kinematics.position import (
+    DEFAULT_ASSEMBLY,
+    ELBOWS_OUT,
+    AssemblyMode,
+    WorkingMode,
+    forward_all,
+    inverse_all,
+)
+
+__all__ = [
+    "TASK_REGION",
+    "Region",
+    "assembly_of",
+    "conditioning_at",
+    "reachable",
+    "sample",
+]
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Region:
+    """An axis-aligned box in the paper frame.
+
+    Attributes:
+        low: Smallest x, y, z, m.
+        high: Largest x, y, z, m.
+
+    Raises:
+        ConfigurationError: If low exceeds high on an axis.
+    """
+
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+
+    def __post_init__(self) -> None:
+        """Reject empty boxes."""
+        if not np.all(np.asarray(self.low) <= np.asarray(self.high)):
+            raise ConfigurationError("low", self.low, f"at most high = {self.high} on every axis")
+
+    def contains(self, points: ArrayLike) -> BoolArray:
+        """Whether points (..., 3) are inside, as (...,)."""
+        array = np.asarray(points, dtype=np.float64)
+        inside: BoolArray = np.all((array >= self.low) & (array <= self.high), axis=-1)
+        return inside
+
+    def project(self, points: ArrayLike) -> FloatArray:
+        """The points of the box that are nearest to points (..., 3)."""
+        inside: FloatArray = np.minimum(np.maximum(points, self.low), self.high)
+        return inside
+
+    def margin(self, point: ArrayLike) -> float:
+        """Signed distance of one point (3,) to the nearest face; negative outside, m."""
+        array = np.asarray(point, dtype=np.float64)
+        return float(np.minimum(array - self.low, np.asarray(self.high) - array).min())
+
+
+TASK_REGION = Region(low=(-0.24, 0.012, 0.66), high=(0.12, 0.046, 0.903))
+"""Where the environments let point P go, for the paper's lengths.
+
+The slab 0 < y < l7, less a margin to the parallel singularity y = 0 and to the edge y = l7. Every
+point is reachable with the elbows out, in the default assembly mode (a test walks through it).
+Nearer to y = 0 than this, the motors' torque no longer suffices to hold y when a random policy
+reverses x or z at full speed: the platform is then thrown through the singularity. Farther from the
+base than this, the cup of the default mount would be pushed back farther than its stroke by a puck
+that lies askew.
+"""
+
+
+def reachable(
+    position: ArrayLike, branch: WorkingMode = ELBOWS_OUT, geometry: Geometry = PAPER
+) -> BoolArray:
+    """Whether points (..., 3) m have a posture on ``branch``, as (...,)."""
+    valid: BoolArray = inverse_all(position, geometry).valid[..., branch.index]
+    return valid
+
+
+def assembly_of(
+    position: ArrayLike, branch: WorkingMode = ELBOWS_OUT, geometry: Geometry = PAPER
+) -> NDArray[np.int64]:
+    """Slot in ASSEMBLY_MODES that the posture of ``branch`` at points (..., 3) belongs to.
+
+    Returns:
+        (...,) slot, or -1 where the point is not reachable on ``branch``.
+    """
+    points = np.asarray(position, dtype=np.float64)
+    solutions = inverse_all(points, geometry)
+    valid = solutions.valid[..., branch.index]
+    theta = np.where(valid[..., None], solutions.theta[..., branch.index, :], 0.0)
+    candidates = forward_all(theta, geometry).position
+    gaps = np.linalg.norm(candidates - points[..., None, :], axis=-1)
+    nearest = np.where(np.isnan(gaps), np.inf, gaps).argmin(axis=-1)
+    return np.where(valid, nearest, -1)
+
+
+def conditioning_at(
+    position: ArrayLike,
+    branch: WorkingMode = ELBOWS_OUT,
+    assembly: AssemblyMode = DEFAULT_ASSEMBLY,
+    geometry: Geometry = PAPER,
+) -> FloatArray:
+    """Conditioning 1/cond(J) at points (..., 3) m; 0 where not reachable on both branches."""
+    points = np.asarray(position, dtype=np.float64)
+    usable = assembly_of(points, branch, geometry) == assembly.index
+    result = np.zeros(points.shape[:-1])
+    if usable.any():
+        theta = inverse_all(points[usable], geometry).theta[..., branch.index, :]
+        result[usable] = jacobian.conditioning(theta, assembly, geometry)
+    return result
+
+
+def sample(
+    rng: np.random.Generator,
+    region: Region,
+    min_conditioning: float = 0.0,
+    geometry: Geometry = PAPER,
+    attempts: int = 1000,
+) -> FloatArray:
+    """Draw one point (3,) m, uniform over the part of ``region`` that is reachable and safe enough.
+
+    Args:
+        rng: Source of randomness.
+        region: The box to draw from.
+        min_conditioning: Smallest conditioning accepted.
+        geometry: Link lengths.
+        attempts: Draws before giving up.
+
+    Raises:
+        ConfigurationError: If no draw was accepted.
+    """
+    for _ in range(attempts):
+        point = rng.uniform(region.low, region.high)
+        conditioning = conditioning_at(point, geometry=geometry)
+        if conditioning > 0 and conditioning >= min_conditioning:
+            return point
+    raise ConfigurationError(
+        "min_conditioning", min_conditioning, f"a value that some point of {region} reaches"
+    )

@@ -1,0 +1,1 @@
+"""Training, resuming, evaluation and export with Stable-Baselines3."""

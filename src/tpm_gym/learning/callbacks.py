@@ -1,0 +1,318 @@
+"""What happens besides learning while a policy trains: evaluation, checkpoints, stopping."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any, Final
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+
+from tpm_gym.learning.checkpoint import CheckpointStore, Content
+from tpm_gym.learning.errors import CheckpointWriteError
+from tpm_gym.learning.learning_curve import draw_learning_curve
+from tpm_gym.learning.policies import EVALUATIONS_FILE, TrainedPolicy
+from tpm_gym.learning.rollout import SELECTION_SEED, Estimate, GoalEnv, run_episodes, summarise
+from tpm_gym.learning.training_state import capture
+
+CURVE_FILE: Final = "learning_curve.png"
+
+_SHORTEST_INTERVAL: Final = 30.0  # s between checkpoints
+_LARGEST_SHARE: Final = 0.02  # of the time may go into checkpoints
+
+
+class PeriodicEvaluation(BaseCallback):
+    """Evaluates the policy on held-out seeds before, during and after training.
+
+    Every evaluation uses the same episodes, so the points of a learning curve differ by the policy
+    alone. Each is appended to evaluations.jsonl and drawn; the best policy so far is kept.
+
+    Args:
+        env: An environment of its own, so that training is not disturbed.
+        every: Environment steps between evaluations.
+        episodes: Episodes per evaluation, from ``SELECTION_SEED`` up.
+        run: The run folder.
+        title: Title of the learning curve.
+        console: Where one line per evaluation is printed.
+        keep: Called with the model whenever it is the best so far.
+    """
+
+    def __init__(
+        self,
+        env: GoalEnv,
+        every: int,
+        episodes: int,
+        run: Path,
+        title: str,
+        console: Console,
+        keep: Callable[[BaseAlgorithm], object],
+    ) -> None:
+        """Remember what to evaluate and where to put it."""
+        super().__init__()
+        self._env = env
+        self._every = every
+        self._episodes = episodes
+        self._run = run
+        self._title = title
+        self._console = console
+        self._keep = keep
+        self._evaluations: list[dict[str, Any]] = []
+        self._best: tuple[float, float] | None = None
+        self._total_steps = 0
+
+    def state(self) -> dict[str, Any]:
+        """Return what a checkpoint has to keep, as plain data."""
+        return {"evaluations": self._evaluations, "best": self._best}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on after the evaluations that :meth:`state` returned."""
+        self._evaluations = list(state["evaluations"])
+        self._best = tuple(state["best"])
+
+    def _on_training_start(self) -> None:
+        self._total_steps = self.locals["total_timesteps"]
+        if self._evaluations:  # resumed: the curve loses what is done again
+            draw_learning_curve(self._run / CURVE_FILE, self._title, self._evaluations)
+        else:
+            self._evaluate()
+
+    def _on_step(self) -> bool:
+        due = self.num_timesteps - self._evaluations[-1]["steps"] >= self._every
+        # The last evaluation waits for the last update, to be that of the policy which is saved.
+        if due and self.num_timesteps < self._total_steps:
+            self._evaluate()
+        return True
+
+    def _on_training_end(self) -> None:
+        self._evaluate()
+
+    def _evaluate(self) -> None:
+        """Evaluate, record, keep the policy where it is the best so far, and draw."""
+        policy = TrainedPolicy(self.model)
+        records = run_episodes(self._env, policy, self._episodes, SELECTION_SEED)
+        metrics = summarise(records)
+        self._record(metrics)
+        quality = (metrics["success_at_end"].mean, metrics["return"].mean)
+        best = self._best is None or quality > self._best
+        if best:
+            self._best = quality
+            self._keep(self.model)
+        self._print(metrics, best)
+        draw_learning_curve(self._run / CURVE_FILE, self._title, self._evaluations)
+
+    def _record(self, metrics: Mapping[str, Estimate]) -> None:
+        """Append the metrics to evaluations.jsonl, progress.csv and TensorBoard."""
+        line: dict[str, Any] = {
+            "steps": self.num_timesteps,
+            "episodes": self._episodes,
+            "first_seed": SELECTION_SEED,
+            "wall_seconds": round(seconds_trained(self.model), 3),
+        }
+        line.update({name: estimate.as_dict() for name, estimate in metrics.items()})
+        self._evaluations.append(line)
+        with (self._run / EVALUATIONS_FILE).open("a", encoding="utf-8") as file:
+            file.write(json.dumps(line, allow_nan=False) + "\n")
+        for name, estimate in metrics.items():
+            self.logger.record(f"eval/{name}", estimate.mean)
+        self.logger.dump(self.num_timesteps)
+
+    def _print(self, metrics: Mapping[str, Estimate], best: bool) -> None:
+        """Print one line."""
+        success = metrics["success_at_end"]
+        self._console.print(
+            f"{self.num_timesteps:>9,} steps   success {success.mean:6.1%} "
+            f"[{success.low:.1%}, {success.high:.1%}]   return {metrics['return'].mean:7.2f}"
+            f"{'   best' if best else ''}",
+            markup=False,
+        )
+
+
+class ProgressBar(BaseCallback):
+    """Shows a progress bar on a terminal, and nothing anywhere else.
+
+    Args:
+        console: Where it is shown; lines printed there appear above the bar.
+    """
+
+    def __init__(self, console: Console) -> None:
+        """Lay out the bar without showing it."""
+        super().__init__()
+        self._progress = Progress(
+            TextColumn("training"),
+            BarColumn(bar_width=None),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+            console=console,
+            disable=not console.is_terminal,
+        )
+        self._task: TaskID | None = None
+
+    def _on_training_start(self) -> None:
+        self._progress.start()
+        self._task = self._progress.add_task(
+            "training", total=self.locals["total_timesteps"], completed=self.num_timesteps
+        )
+
+    def _on_step(self) -> bool:
+        if self._task is not None:
+            self._progress.update(self._task, completed=self.num_timesteps)
+        return True
+
+    def close(self) -> None:
+        """Leave the terminal as it was; safe to call at any time."""
+        self._progress.stop()
+
+
+class SignalListener:
+    """Remembers that the process was asked to stop; a second signal ends it at once.
+
+    An exception in the middle of an update could leave a half-updated network to save.
+
+    Attributes:
+        received: The signal, None before.
+    """
+
+    def __init__(self) -> None:
+        """Start out with no signal."""
+        self.received: signal.Signals | None = None
+
+    @contextmanager
+    def listening(self) -> Iterator[None]:
+        """Take over SIGINT (Ctrl-C) and SIGTERM inside the context."""
+        signals = (signal.SIGINT, signal.SIGTERM)
+        before = {number: signal.signal(number, self._receive) for number in signals}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+    def _receive(self, number: int, frame: FrameType | None) -> None:
+        if self.received is not None:
+            sys.exit(128 + number)
+        self.received = signal.Signals(number)
+
+
+class StopTrainingError(Exception):
+    """Leaves ``learn`` where the last checkpoint was taken; never seen by a user."""
+
+
+class Checkpointing(BaseCallback):
+    """Saves checkpoints between rollouts, and one when the process is asked to stop.
+
+    A checkpoint that cannot be written is reported and tried again when the next one is due;
+    training goes on meanwhile, and the checkpoints before stay.
+
+    A rollout of an on-policy algorithm is long, so a stop does not wait for its end: the state at
+    its beginning is kept in memory, saved, and the rollout is done again after resuming.
+
+    Args:
+        store: Where they are saved.
+        evaluation: Whose state is part of a checkpoint.
+        listener: Says when to stop.
+        every: Environment steps between checkpoints; None: half a minute, or longer where more
+            than a fiftieth of the time would go into checkpoints.
+        run: The run folder.
+        console: Where failures are reported.
+        seconds: Seconds that earlier processes have trained.
+    """
+
+    def __init__(
+        self,
+        store: CheckpointStore,
+        evaluation: PeriodicEvaluation,
+        listener: SignalListener,
+        every: int | None,
+        run: Path,
+        console: Console,
+        seconds: float,
+    ) -> None:
+        """Remember what to save, when and where."""
+        super().__init__()
+        self._store = store
+        self._evaluation = evaluation
+        self._listener = listener
+        self._every = every
+        self._run = run
+        self._console = console
+        self._seconds = seconds
+        self._held: Content | None = None
+        self._last_step: int | None = store.newest
+        self._next_time = time.perf_counter() + _SHORTEST_INTERVAL
+
+    def _on_training_start(self) -> None:
+        # Times and speeds in the logs count from the beginning of the run.
+        self.model.start_time = int(time.time_ns() - self._seconds * 1e9)
+        self.model._num_timesteps_at_start = 0
+
+    def _on_rollout_start(self) -> None:
+        started = time.perf_counter()
+        stop = self._listener.received is not None
+        on_policy = isinstance(self.model, OnPolicyAlgorithm)
+        due = self._is_due()
+        if on_policy or due or stop:
+            content = self._capture()
+            self._held = content if on_policy else None
+            if due or stop:
+                self._save(content, started)
+        if stop:
+            raise StopTrainingError
+
+    def _on_step(self) -> bool:
+        if self._listener.received is not None and self._held is not None:
+            self._save(self._held, time.perf_counter())
+            raise StopTrainingError
+        return True
+
+    def save_finished(self) -> None:
+        """Save the end of the training, after which there is nothing to resume."""
+        self._save(self._capture(finished=True), time.perf_counter())
+
+    def _is_due(self) -> bool:
+        if self._last_step is None:
+            return True  # so that there is always one
+        if self._every is not None:
+            return self.model.num_timesteps - self._last_step >= self._every
+        return time.perf_counter() >= self._next_time
+
+    def _capture(self, finished: bool = False) -> Content:
+        extra = {
+            "seconds": seconds_trained(self.model),
+            "evaluation": self._evaluation.state(),
+        }
+        return capture(self.model, self._run, extra, finished)
+
+    def _save(self, content: Content, started: float) -> None:
+        """Save what was captured from the time ``started`` on, or report why not."""
+        try:
+            self._store.save(content)
+        except CheckpointWriteError as error:
+            self._console.print(f"warning: {error}", markup=False, soft_wrap=True)
+        now = time.perf_counter()
+        self._next_time = now + max(_SHORTEST_INTERVAL, (now - started) / _LARGEST_SHARE)
+        self._last_step = content.step
+
+
+def seconds_trained(model: BaseAlgorithm) -> float:
+    """Return how long the run has been training, in this process and those before it."""
+    return (time.time_ns() - model.start_time) / 1e9

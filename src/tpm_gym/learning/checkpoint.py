@@ -1,0 +1,271 @@
+"""Checkpoints on disk: each is whole or not there, and says so itself if it has been damaged.
+
+A checkpoint is a folder ``checkpoints/<step>/``. It is written as ``<step>.tmp``, flushed to the
+disk and then renamed, so that a process killed at any moment leaves the ones before untouched.
+``manifest.json`` holds the size and the SHA-256 of every file, and one of itself. Nothing in it is
+a pickle that would be loaded: the files are JSON, NumPy arrays, and tensors that
+``torch.load(weights_only=True)`` reads; all of them are checked before they are parsed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import re
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, BinaryIO, Final, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tpm_gym.learning.errors import (
+    CheckpointDamagedError,
+    CheckpointWriteError,
+    NoCheckpointError,
+    NoWholeCheckpointError,
+)
+
+FORMAT: Final = 1
+KEPT: Final = 2  # checkpoints; the second is there for when the first turns out to be damaged
+MANIFEST: Final = "manifest.json"
+ARRAYS: Final = "arrays.npz"
+
+_NAME: Final = re.compile(r"\d{9,}")
+_OURS: Final = re.compile(r"\d{9,}(\.tmp|\.old)?")
+_SPARE: Final = 1 << 20  # bytes that have to stay free besides, for logs and headers
+
+
+@dataclass(frozen=True)
+class Content:
+    """What a checkpoint holds.
+
+    Attributes:
+        step: Environment steps up to this moment.
+        finished: Whether the run had come to its end.
+        files: Small files, by name.
+        arrays: Large arrays, by name. They may be views into memory that training writes to.
+    """
+
+    step: int
+    finished: bool
+    files: Mapping[str, bytes]
+    arrays: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+
+    @property
+    def size(self) -> int:
+        """Bytes on the disk, to a few kilobytes."""
+        arrays = sum(array.nbytes for array in self.arrays.values())
+        return arrays + sum(len(data) for data in self.files.values())
+
+
+class CheckpointStore:
+    """The checkpoints of one run.
+
+    Args:
+        folder: Where they are; made when the first is saved.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Touch nothing yet."""
+        self._folder = folder
+        self._whole: list[int] = []  # steps of those to be kept, oldest first
+
+    @property
+    def newest(self) -> int | None:
+        """Step of the newest whole checkpoint that was saved or loaded; None before."""
+        return self._whole[-1] if self._whole else None
+
+    def save(self, content: Content) -> None:
+        """Write a checkpoint, then delete all but the last two.
+
+        Raises:
+            CheckpointWriteError: The disk is full, or cannot be written for another reason. What
+                was written of the new checkpoint is removed; the ones before are as they were.
+        """
+        if content.step == self.newest and not content.finished:
+            return
+        target = self._path(content.step)
+        part = target.with_suffix(".tmp")
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            _remove(part)  # left by a process that was killed
+            self._check_space(content)
+            part.mkdir()
+            _fill(part, content)
+            if target.exists():
+                _remove(target.with_suffix(".old"))
+                target.rename(target.with_suffix(".old"))
+            part.rename(target)
+            _flush_folder(self._folder)
+        except BaseException as error:
+            _remove(part)
+            if isinstance(error, OSError):
+                self._refuse(target, error.strerror or str(error), error)
+            raise
+        earlier = [step for step in self._whole if step != content.step]
+        self._whole = [*earlier, content.step][-KEPT:]
+        self._tidy()
+
+    def load(self, warn: Callable[[str], object]) -> Content:
+        """Read the newest checkpoint that is whole.
+
+        Args:
+            warn: Called with a sentence for every newer one that is damaged.
+
+        Raises:
+            NoCheckpointError: There is none.
+            NoWholeCheckpointError: There are some, but all are damaged.
+        """
+        steps = self._steps()
+        if not steps:
+            raise NoCheckpointError(self._folder)
+        problems = []
+        for step in reversed(steps):
+            try:
+                content = _read(self._path(step))
+            except CheckpointDamagedError as error:
+                problems.append(str(error))
+                continue
+            for problem in problems:
+                warn(f"{problem}; using the checkpoint before, of step {step:,}")
+            # The damaged ones are deleted once there is a new one to take their place.
+            self._whole = [earlier for earlier in steps if earlier <= step][-KEPT:]
+            return content
+        raise NoWholeCheckpointError(self._folder, problems)
+
+    def _path(self, step: int) -> Path:
+        return self._folder / f"{step:09d}"
+
+    def _steps(self) -> list[int]:
+        """Steps of all checkpoints in the folder, whole or damaged, oldest first."""
+        if not self._folder.is_dir():
+            return []
+        names = (entry.name for entry in self._folder.iterdir())
+        return sorted(int(name) for name in names if _NAME.fullmatch(name))
+
+    def _check_space(self, content: Content) -> None:
+        """Refuse to begin what will not fit."""
+        needed, free = content.size + _SPARE, shutil.disk_usage(self._folder).free
+        if free < needed:
+            problem = f"{needed / 1e6:,.1f} MB are needed, {free / 1e6:,.1f} MB are free"
+            self._refuse(self._path(content.step), problem)
+
+    def _refuse(self, target: Path, problem: str, cause: OSError | None = None) -> NoReturn:
+        raise CheckpointWriteError(target, problem, self.newest) from cause
+
+    def _tidy(self) -> None:
+        """Delete what earlier processes and earlier checkpoints left, but nothing of the user's."""
+        kept = {self._path(step).name for step in self._whole}
+        for entry in self._folder.iterdir():
+            if _OURS.fullmatch(entry.name) and entry.name not in kept:
+                _remove(entry)
+
+
+def _fill(folder: Path, content: Content) -> None:
+    """Write all files of a checkpoint, the manifest last, and wait until the disk has them."""
+    for name, data in content.files.items():
+        _write(folder / name, partial(_put, data))
+    # Not compressed: that would take ten times as long and save little of random motion.
+    arrays: dict[str, Any] = dict(content.arrays)
+    _write(folder / ARRAYS, lambda file: np.savez(file, allow_pickle=False, **arrays))
+    names = [*content.files, ARRAYS]
+    manifest = {
+        "format": FORMAT,
+        "step": content.step,
+        "finished": content.finished,
+        "files": {name: _fingerprint((folder / name).read_bytes()) for name in names},
+    }
+    manifest["sha256"] = _digest(_canonical(manifest))
+    text = json.dumps(manifest, indent=2) + "\n"
+    _write(folder / MANIFEST, partial(_put, text.encode()))
+    _flush_folder(folder)
+
+
+def _read(folder: Path) -> Content:
+    """Read a checkpoint after checking every byte of it.
+
+    Raises:
+        CheckpointDamagedError: A file is missing or is not what was written.
+    """
+    manifest = _read_manifest(folder / MANIFEST)
+    files = {}
+    for name, expected in manifest["files"].items():
+        data = _read_bytes(folder / name)
+        if len(data) != expected["size"]:
+            problem = f"has {len(data):,} bytes instead of {expected['size']:,}"
+            raise CheckpointDamagedError(folder / name, problem)
+        if _fingerprint(data) != expected:
+            raise CheckpointDamagedError(folder / name, "differs from what was written (SHA-256)")
+        files[name] = data
+    with np.load(io.BytesIO(files.pop(ARRAYS)), allow_pickle=False) as loaded:
+        arrays = {name: loaded[name] for name in loaded.files}
+    return Content(manifest["step"], manifest["finished"], files, arrays)
+
+
+def _read_manifest(path: Path) -> dict[str, Any]:
+    """Read a manifest and check it against its own digest."""
+    try:
+        manifest = json.loads(_read_bytes(path))
+        digest = manifest.pop("sha256")
+    except (ValueError, AttributeError, KeyError, TypeError) as error:
+        raise CheckpointDamagedError(path, "is not a manifest") from error
+    if digest != _digest(_canonical(manifest)):
+        raise CheckpointDamagedError(path, "differs from what was written (SHA-256)")
+    if manifest["format"] != FORMAT:
+        problem = f"has format {manifest['format']}, this version of train.py reads {FORMAT}"
+        raise CheckpointDamagedError(path, problem)
+    return dict(manifest)
+
+
+def _read_bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise CheckpointDamagedError(path, f"cannot be read: {error.strerror}") from error
+
+
+def _write(path: Path, write: Callable[[BinaryIO], object]) -> None:
+    """Write a new file and wait until the disk has it."""
+    with path.open("xb") as file:
+        write(file)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _put(data: bytes, file: BinaryIO) -> None:
+    file.write(data)
+
+
+def _flush_folder(folder: Path) -> None:
+    """Wait until the disk has the names in a folder; Windows has no such call."""
+    if os.name != "posix":
+        return
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _remove(folder: Path) -> None:
+    """Delete a folder as far as possible; what stays is deleted after the next checkpoint."""
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def _fingerprint(data: bytes) -> dict[str, Any]:
+    return {"size": len(data), "sha256": _digest(data)}
+
+
+def _digest(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+def _canonical(manifest: Mapping[str, Any]) -> bytes:
+    """The text that the manifest's own digest is taken of."""
+    return json.dumps(manifest, sort_keys=True).encode()

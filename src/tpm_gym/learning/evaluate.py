@@ -1,0 +1,357 @@
+"""Evaluate policies over seeded episodes: a table, and optionally JSON, a video and a picture.
+
+    python train/evaluate.py --policy runs/TPMReach-v0-sac-s0 expert random --episodes 100
+
+A policy is ``expert``, ``random``, an exported policy (``NAME.json`` with ``NAME.safetensors``
+beside it), or the folder of a run (its best policy). A .zip file of Stable-Baselines3 holds
+pickles, which can run any code: it is refused unless ``--trust-pickle`` is given.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import gymnasium as gym
+import tyro
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from tpm_gym.learning import provenance
+from tpm_gym.learning.errors import ConfigError, TrainError, UnknownEnvError
+from tpm_gym.learning.film import write_contact_sheet, write_video
+from tpm_gym.learning.options import default
+from tpm_gym.learning.policies import load_policy, trained_env
+from tpm_gym.learning.rollout import (
+    TEST_SEED,
+    Episode,
+    Estimate,
+    GoalEnv,
+    Policy,
+    run_episodes,
+    summarise,
+)
+from tpm_gym.learning.tempting import env_id_for
+
+# Label, key, factor and format of each row of the table.
+_ROWS = (
+    ("success at end", "success_at_end", 100.0, "{:.1f}", "%"),
+    ("success once", "success_once", 100.0, "{:.1f}", "%"),
+    ("return", "return", 1.0, "{:.2f}", ""),
+    ("conditioning, least", "conditioning_min", 1.0, "{:.3f}", ""),
+    ("conditioning, mean", "conditioning_mean", 1.0, "{:.3f}", ""),
+    ("share of steps below safe", "unsafe_share", 100.0, "{:.1f}", "%"),
+    ("closure error, largest", "closure_error_max", 1e3, "{:.4f}", " mm"),
+    ("observed P off, largest", "fk_error_max", 1e3, "{:.4f}", " mm"),
+    ("torque, RMS", "torque_rms", 1.0, "{:.1f}", " N m"),
+    ("torque, peak", "torque_peak", 1.0, "{:.1f}", " N m"),
+)
+
+
+@dataclass(frozen=True)
+class Config:
+    """Evaluate policies over seeded episodes."""
+
+    policy: Annotated[tuple[str, ...], tyro.conf.arg(metavar="POLICY ...")]
+    """Policies: expert, random, an exported policy (.json), or the folder of a run."""
+
+    env: Annotated[str | None, default("the one the policy was trained on", "ID")] = None
+    """Environment id."""
+
+    episodes: int = 100
+    """Episodes per policy."""
+
+    seed: int = TEST_SEED
+    """Seed of the first episode. The default is used neither in training nor to select policies."""
+
+    goals: Literal["sampled", "tempting"] = "sampled"
+    """As the environment samples them, or goals that tempt towards the singularity."""
+
+    penalty_weight: float = 1.0
+    """Weight of the singularity penalty in the return."""
+
+    randomisation: Annotated[tuple[str, ...], default("nowhere", "KEY=VALUE ...")] = ()
+    """Where the machine differs from the nominal one: attributes of tpm_gym's Randomisation, each
+    a number, or for factors LOW:HIGH to draw from, for example encoder_noise=1e-4 puck_mass=0.5:2.
+    Those about the puck change nothing where there is none."""
+
+    json: Annotated[Path | None, default("not written", "PATH")] = None
+    """Write metrics, episodes and versions here."""
+
+    video: Annotated[Path | None, default("not written", "PATH")] = None
+    """Write an MP4 of the first episodes here; several policies get a file each."""
+
+    video_episodes: int = 3
+    """Episodes in a video."""
+
+    picture: Annotated[Path | None, default("not written", "PATH")] = None
+    """Write a PNG of six moments of the first episode here; several policies get a file each."""
+
+    trust_pickle: bool = False
+    """Load .zip files as well, which can run any code that is in them."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """The evaluation of one policy.
+
+    Attributes:
+        policy: The policy as it was named.
+        metrics: Estimates by name.
+        records: The episodes.
+        wall_seconds: Time the episodes took, s.
+    """
+
+    policy: str
+    metrics: dict[str, Estimate]
+    records: list[Episode]
+    wall_seconds: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the result as plain data, the metrics at its top level."""
+        steps = sum(record.length for record in self.records)
+        return {
+            "policy": self.policy,
+            **{name: estimate.as_dict() for name, estimate in self.metrics.items()},
+            "wall_seconds": self.wall_seconds,
+            "steps_per_second": steps / self.wall_seconds,
+            "records": [record.as_dict() for record in self.records],
+        }
+
+
+def evaluate(config: Config, console: Console | None = None) -> list[Result]:
+    """Evaluate the policies of a configuration and write what it asks for.
+
+    Args:
+        config: The configuration.
+        console: Where the table is printed; by default the standard output.
+
+    Returns:
+        One result per policy, in order.
+
+    Raises:
+        TrainError: An option is not valid, or a policy cannot be used.
+    """
+    # A file has no margin at which a table would have to be folded.
+    console = console or Console(width=None if sys.stdout.isatty() else 200)
+    _check(config)
+    env_id = _resolve_env(config)
+    env = _make_env(env_id, config)
+    try:
+        # All are loaded before the first one runs: a mistyped name shows at once.
+        policies = list(zip(config.policy, _load(config, env), strict=True))
+        results = [_evaluate_one(env, *policy, config, console) for policy in policies]
+    finally:
+        env.close()
+    console.print(_table(env_id, config, results))
+    if config.json is not None:
+        provenance.write_json(config.json, _description(env_id, config, results))
+        console.print(f"json: {config.json}", markup=False)
+    if config.video is not None or config.picture is not None:
+        _film(env_id, config, console)
+    return results
+
+
+def _check(config: Config) -> None:
+    """Refuse numbers that cannot work."""
+    for option, value in {
+        "--episodes": config.episodes,
+        "--video-episodes": config.video_episodes,
+    }.items():
+        if value < 1:
+            raise ConfigError(option, value, "must be at least 1")
+    if config.seed < 0:
+        raise ConfigError("--seed", config.seed, "must be at least 0")
+    if not config.policy:
+        raise ConfigError("--policy", "", "name at least one policy")
+    if config.video is not None and config.video.suffix != ".mp4":
+        raise ConfigError("--video", config.video, "must end in .mp4")
+    if config.picture is not None and config.picture.suffix != ".png":
+        raise ConfigError("--picture", config.picture, "must end in .png")
+
+
+def _resolve_env(config: Config) -> str:
+    """Return the environment id that was asked for, or that the policies were trained on."""
+    import tpm_gym
+
+    if config.env is None:
+        trained = {spec: trained_env(spec) for spec in config.policy}
+        ids = sorted({env_id for env_id in trained.values() if env_id is not None})
+        if len(ids) != 1:
+            found = f"policies were trained on {', '.join(ids)}" if ids else "no policy has one"
+            raise ConfigError("--env", "(not given)", f"{found}; name one with --env")
+        env_id = ids[0]
+    else:
+        env_id = config.env
+    if env_id not in tpm_gym.ENV_IDS:
+        raise UnknownEnvError(env_id, tpm_gym.ENV_IDS)
+    return env_id
+
+
+def _make_env(env_id: str, config: Config, render_mode: str | None = None) -> GoalEnv:
+    """Make an environment as configured."""
+    return gym.make(
+        env_id_for(env_id, config.goals),
+        penalty_weight=config.penalty_weight,
+        randomisation=parse_randomisation(config.randomisation),
+        render_mode=render_mode,
+    )
+
+
+def parse_randomisation(entries: Sequence[str]) -> dict[str, Any]:
+    """Return what ``--randomisation`` says as a mapping; tpm_gym checks keys and values.
+
+    Args:
+        entries: Words such as ``puck_mass=2`` or ``friction=0.5:1``.
+
+    Raises:
+        ConfigError: A word has another form, or names something twice.
+    """
+    result: dict[str, Any] = {}
+    for entry in entries:
+        name, equals, text = entry.partition("=")
+        try:
+            numbers = [int(n) if n.isdecimal() else float(n) for n in text.split(":")]
+        except ValueError:
+            numbers = []
+        if not (name and equals and 1 <= len(numbers) <= 2) or name in result:
+            valid = "must be KEY=NUMBER or KEY=LOW:HIGH, each key once"
+            raise ConfigError("--randomisation", entry, valid)
+        result[name] = numbers[0] if len(numbers) == 1 else (numbers[0], numbers[1])
+    return result
+
+
+def _load(config: Config, env: GoalEnv) -> list[Policy]:
+    """Load the policies of a configuration."""
+    trust = config.trust_pickle
+    return [load_policy(spec, env, trust_pickle=trust) for spec in config.policy]
+
+
+def _evaluate_one(
+    env: GoalEnv, spec: str, policy: Policy, config: Config, console: Console
+) -> Result:
+    """Run the episodes of one policy, with a progress bar on a terminal."""
+    ticks = iter(
+        track(
+            range(config.episodes),
+            description=spec,
+            console=console,
+            disable=not console.is_terminal,
+        )
+    )
+    start = time.perf_counter()
+    records = run_episodes(
+        env, policy, config.episodes, config.seed, on_episode=lambda: next(ticks, None)
+    )
+    wall_seconds = time.perf_counter() - start
+    next(ticks, None)  # exhausts the bar, which then leaves the terminal
+    return Result(spec, summarise(records), records, wall_seconds)
+
+
+def _table(env_id: str, config: Config, results: Sequence[Result]) -> Table:
+    """Lay the metrics out with a column per policy."""
+    last = config.seed + config.episodes - 1
+    table = Table(
+        title=f"{env_id}: {config.episodes} episodes, seeds {config.seed} to {last}",
+        caption="mean over episodes [95% interval]",
+    )
+    table.add_column("metric", no_wrap=True)
+    for result in results:
+        table.add_column(result.policy, justify="right", overflow="fold")
+    for label, name, factor, form, unit in _ROWS:
+        if any(name not in result.metrics for result in results):
+            continue  # this version of the environments does not tell
+        cells = [_cell(result.metrics[name], factor, form, unit) for result in results]
+        table.add_row(label, *cells)
+        worst = [result.metrics[name].worst for result in results]
+        if any(value is not None for value in worst):
+            table.add_row(
+                "  worst of all steps",
+                *(form.format((value or 0.0) * factor) + unit for value in worst),
+                style="dim",
+            )
+    rates = [f"{result.as_dict()['steps_per_second']:.0f}" for result in results]
+    table.add_row("steps per second", *rates)
+    return table
+
+
+def _cell(estimate: Estimate, factor: float, form: str, unit: str) -> str:
+    """Format an estimate with its interval."""
+    mean, low, high = (
+        form.format(value * factor) for value in (estimate.mean, estimate.low, estimate.high)
+    )
+    return f"{mean}{unit} \\[{low}, {high}]"
+
+
+def _description(env_id: str, config: Config, results: Sequence[Result]) -> dict[str, Any]:
+    """Return what the JSON file records; a single policy has its metrics at the top level."""
+    if len(results) == 1:
+        content = results[0].as_dict()
+        records = {"records": content.pop("records")}  # last: they are long
+    else:
+        content = {"policies": [result.as_dict() for result in results]}
+        records = {}
+    return {
+        "env": env_id,
+        "episodes": config.episodes,
+        "seed": config.seed,
+        "goals": config.goals,
+        "penalty_weight": config.penalty_weight,
+        "randomisation": parse_randomisation(config.randomisation),
+        **content,
+        "versions": provenance.versions(),
+        "git_commit": provenance.git_commit(),
+        "machine": provenance.machine(),
+        "command": provenance.command_line(),
+        **records,
+    }
+
+
+def paths_per_policy(path: Path, policies: Sequence[str]) -> list[Path]:
+    """Return one file per policy, with the policy's name in it where there are several."""
+    if len(policies) == 1:
+        return [path]
+    names = [Path(spec).stem for spec in policies]
+    if len(set(names)) < len(names):
+        names = [f"{i + 1}-{name}" for i, name in enumerate(names)]
+    return [path.with_name(f"{path.stem}-{name}{path.suffix}") for name in names]
+
+
+def _film(env_id: str, config: Config, console: Console) -> None:
+    """Run the first episodes once more, with rendering, which would have slowed the metrics."""
+    env = _make_env(env_id, config, render_mode="rgb_array")
+    try:
+        policies = _load(config, env)
+        if config.video is not None:
+            episodes = min(config.video_episodes, config.episodes)
+            paths = paths_per_policy(config.video, config.policy)
+            for path, policy in zip(paths, policies, strict=True):
+                write_video(path, env, policy, episodes, config.seed)
+                console.print(f"video: {path}", markup=False)
+        if config.picture is not None:
+            paths = paths_per_policy(config.picture, config.policy)
+            for path, policy in zip(paths, policies, strict=True):
+                write_contact_sheet(path, env, policy, config.seed)
+                console.print(f"picture: {path}", markup=False)
+    finally:
+        env.close()
+
+
+def main() -> None:
+    """Run the command line."""
+    from tpm_gym import TPMError
+
+    config = tyro.cli(Config, description=__doc__)
+    try:
+        evaluate(config)
+    except (TrainError, TPMError) as error:
+        sys.exit(f"error: {error}")
+
+
+if __name__ == "__main__":
+    main()

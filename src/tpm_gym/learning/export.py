@@ -1,0 +1,276 @@
+"""Export a trained policy as safetensors and JSON, which load without trust.
+
+    python train/export.py runs/TPMReach-v0-sac-s0/best.zip best --trust-pickle
+
+writes ``best.json`` (network, spaces, environment, recipe, versions, SHA-256) and
+``best.safetensors`` (the weights of the actor), for ``tpm_gym.load_policy`` and ``evaluate.py``.
+The .zip file is one that train.py saved, in its run folder; it holds pickles, which can run any
+code when they are loaded: only give --trust-pickle for files you trust.
+"""
+
+from __future__ import annotations
+
+import copy
+import io
+import json
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import tyro
+from gymnasium import spaces
+from numpy.typing import NDArray
+from safetensors.numpy import save as safetensors_bytes
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.torch_layers import CombinedExtractor
+from torch import nn
+
+from tpm_gym import TPMError, load_policy
+from tpm_gym.learning import provenance
+from tpm_gym.learning.errors import ConfigError, PolicyError, TrainError
+from tpm_gym.learning.features import GoalGapExtractor
+from tpm_gym.learning.policies import (
+    ALGORITHMS,
+    algorithm_class,
+    load_model,
+    require_trust,
+    run_config,
+)
+from tpm_gym.policy.files import FORMAT, VERSION, digest, files
+
+TOLERANCE: Final = 1e-6
+"""How far an exported action may be from the original; of half its range where that is over 1."""
+_TRIALS: Final = 64
+_ACTIVATIONS: Final = {nn.ReLU: "relu", nn.Tanh: "tanh"}
+
+
+@dataclass(frozen=True)
+class Config:
+    """Export a trained policy as safetensors and JSON."""
+
+    model: tyro.conf.Positional[Path]
+    """A .zip file that train.py saved, in its run folder."""
+
+    out: tyro.conf.Positional[Path]
+    """What the two new files have in common; earlier ones are replaced."""
+
+    trust_pickle: bool = False
+    """Load the .zip file, which can run any code that is in it."""
+
+
+def save(
+    model: BaseAlgorithm,
+    path: Path,
+    *,
+    env_id: str,
+    seed: int | None,
+    recipe: Mapping[str, Any],
+    versions: Mapping[str, str | None] | None = None,
+) -> Path:
+    """Write the policy of a model as ``path``.safetensors and ``path``.json.
+
+    The files are loaded again and their actions compared with the model's before they take their
+    names, so that what cannot be expressed is refused rather than changed.
+
+    Args:
+        model: SAC, TQC or PPO with a MultiInputPolicy.
+        path: What the files have in common; folders above are made, earlier files replaced.
+        env_id: Id of the environment it was trained on.
+        seed: Seed of the training; None where it is not known.
+        recipe: The hyperparameters, as plain data.
+        versions: Versions it was trained with; by default those installed.
+
+    Returns:
+        The JSON file.
+
+    Raises:
+        PolicyError: The policy has something that the files cannot hold.
+        ConfigError: ``path`` ends in .zip.
+    """
+    if path.suffix == ".zip":
+        raise ConfigError("OUT", path, "is a name for a .json and a .safetensors, not for a .zip")
+    name = str(path)
+    algorithm = next((a for a in ALGORITHMS if type(model) is algorithm_class(a)), None)
+    if algorithm is None:
+        raise PolicyError(name, f"{type(model).__name__} is none of {', '.join(ALGORITHMS)}")
+    network, weights = _network(name, model, algorithm)
+    data = safetensors_bytes(weights)
+    content: dict[str, Any] = {
+        "format": FORMAT,
+        "version": VERSION,
+        "env": env_id,
+        "algorithm": algorithm,
+        "seed": seed,
+        "steps": model.num_timesteps,
+        "recipe": dict(recipe),
+        "versions": dict(provenance.versions() if versions is None else versions),
+        "network": network,
+        "action_space": _box(name, "actions", model.action_space),
+        "observation_space": _boxes(name, model.observation_space),
+        "weights": {"bytes": len(data), "sha256": sha256(data).hexdigest()},
+    }
+    content["sha256"] = digest(content)
+    return _write(name, path, content, data, model)
+
+
+def save_archive(model: BaseAlgorithm, path: Path) -> None:
+    """Save a model as Stable-Baselines3 does, but so that an interruption leaves no half a file.
+
+    Args:
+        model: Any algorithm.
+        path: The .zip file.
+    """
+    file = io.BytesIO()  # PyTorch, writing to a disk that is full, would hide the reason
+    model.save(file)
+    provenance.write_whole(path, lambda part: part.write_bytes(file.getvalue()))
+
+
+def remove(path: Path) -> None:
+    """Delete what :func:`save` wrote as ``path``, if it did."""
+    for file in files(path):
+        file.unlink(missing_ok=True)
+
+
+def _convert(archive: Path, path: Path) -> Path:
+    """Export a .zip file of a run."""
+    name = str(archive)
+    config = run_config(name, archive)
+    return save(
+        load_model(name, archive),
+        path,
+        env_id=config["env"],
+        seed=config["seed"],
+        recipe=config["recipe"],
+        versions=config.get("versions"),
+    )
+
+
+def _network(
+    name: str, model: BaseAlgorithm, algorithm: str
+) -> tuple[dict[str, Any], dict[str, NDArray[np.float32]]]:
+    """Return the description and the weights of what computes the mean action."""
+    if getattr(model, "use_sde", False):
+        raise PolicyError(name, "state-dependent exploration (use_sde) cannot be exported")
+    if model.get_vec_normalize_env() is not None:
+        raise PolicyError(name, "normalised observations (VecNormalize) cannot be exported")
+    policy: Any = model.policy
+    if algorithm == "ppo":
+        extractor, hidden = policy.pi_features_extractor, policy.mlp_extractor.policy_net
+        last, output = policy.action_net, "clip"
+    else:
+        extractor, hidden = policy.actor.features_extractor, policy.actor.latent_pi
+        last, output = policy.actor.mu, "tanh"
+    modules = [*hidden, last]  # linear, activation, linear, ..., linear
+    linear, between = modules[::2], modules[1::2]
+    kinds = {_ACTIVATIONS.get(type(module)) for module in between} or {"relu"}
+    if any(type(m) is not nn.Linear or m.bias is None for m in linear) or len(kinds - {None}) != 1:
+        raise PolicyError(name, f"only linear layers with ReLU or Tanh can be exported: {modules}")
+    weights: dict[str, NDArray[np.float32]] = {}
+    for i, module in enumerate(linear):
+        for part in ("weight", "bias"):
+            values = getattr(module, part).detach().cpu().numpy().astype(np.float32)
+            if not np.isfinite(values).all():
+                raise PolicyError(name, "its weights are not finite: the training diverged")
+            weights[f"layers.{i}.{part}"] = values
+    description = {
+        "features": _features(name, extractor),
+        "hidden": [module.out_features for module in linear[:-1]],
+        "activation": next(iter(kinds - {None})),
+        "output": output,
+    }
+    return description, weights
+
+
+def _features(name: str, extractor: nn.Module) -> dict[str, Any]:
+    """Describe what the first layer sees."""
+    if type(extractor) is GoalGapExtractor:
+        return {"kind": "goal_gap", "unit": extractor.unit}
+    if type(extractor) is CombinedExtractor:
+        return {"kind": "concatenate", "keys": list(extractor.extractors)}
+    wanted = "CombinedExtractor or GoalGapExtractor"
+    raise PolicyError(name, f"features of {type(extractor).__name__}, not of {wanted}")
+
+
+def _boxes(name: str, space: spaces.Space[Any]) -> dict[str, Any]:
+    """Describe a dictionary of spaces."""
+    if not isinstance(space, spaces.Dict):
+        raise PolicyError(name, f"observations in {space}, not in a Dict")
+    return {key: _box(name, key, box) for key, box in space.items()}
+
+
+def _box(name: str, what: str, space: spaces.Space[Any]) -> dict[str, Any]:
+    """Describe a space of arrays."""
+    if not isinstance(space, spaces.Box) or not space.is_bounded() or space.dtype.kind != "f":
+        raise PolicyError(name, f"{what} in {space}, not in a bounded Box of floats")
+    return {
+        "shape": list(space.shape),
+        "dtype": space.dtype.name,
+        "low": space.low.ravel().tolist(),
+        "high": space.high.ravel().tolist(),
+    }
+
+
+def _write(
+    name: str, path: Path, content: Mapping[str, Any], data: bytes, model: BaseAlgorithm
+) -> Path:
+    """Write both files, make sure that they are the policy, and give them their names."""
+    json_file, weights_file = files(path)
+    json_file.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=json_file.parent, prefix=".export-") as folder:
+        new_json, new_weights = files(Path(folder, "policy"))
+        text = json.dumps(content, indent=1, allow_nan=False) + "\n"
+        new_json.write_text(text, encoding="ascii")
+        new_weights.write_bytes(data)
+        _verify(name, model, new_json)
+        # In between, the sums tell a reader that the files do not belong together.
+        new_weights.replace(weights_file)
+        new_json.replace(json_file)
+    return json_file
+
+
+def _verify(name: str, model: BaseAlgorithm, written: Path) -> None:
+    """Compare the actions of the written policy with those of the model."""
+    rng = np.random.default_rng(0)
+    boxes: Any = model.observation_space
+    batch = {
+        key: rng.uniform(box.low, box.high, (_TRIALS, *box.shape)).astype(box.dtype)
+        for key, box in boxes.items()
+    }
+    # PPO's last update has left its graph in the distribution, and graphs cannot be copied.
+    training = model.policy.training
+    model.policy.predict(batch, deterministic=True)
+    model.policy.set_training_mode(training)
+    # A copy on the CPU: a GPU rounds differently, and the model stays as it is.
+    policy: Any = copy.deepcopy(model.policy).to("cpu")
+    try:
+        actions = load_policy(written).act(batch)
+    except TPMError as error:
+        raise PolicyError(name, f"cannot be exported: {error}") from error
+    space: Any = model.action_space
+    expected, _ = policy.predict(batch, deterministic=True)
+    scale = np.maximum(1.0, (space.high - space.low) / 2)
+    off = float(np.max(np.abs(actions - expected) / scale))
+    if not off <= TOLERANCE:
+        raise PolicyError(name, f"cannot be exported: its actions would be off by {off:.2g}")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line."""
+    config = tyro.cli(Config, description=__doc__, args=arguments)
+    try:
+        if not config.model.is_file():
+            known = "is not a file" if config.model.exists() else "there is no such file"
+            raise ConfigError("MODEL", config.model, f"{known}; give best.zip or last.zip of a run")
+        require_trust(str(config.model), config.model, config.trust_pickle)
+        print(_convert(config.model, config.out))
+    except (TrainError, TPMError) as error:
+        sys.exit(f"error: {error}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,90 @@
+"""Pictures of a policy at work: a video of episodes, a contact sheet of one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tpm_gym.learning.provenance import write_whole
+from tpm_gym.learning.rollout import GoalEnv, Policy, run_episodes
+
+Frame = NDArray[np.uint8]
+
+_ROWS: Final = 2
+_COLUMNS: Final = 3
+
+
+def write_video(path: Path, env: GoalEnv, policy: Policy, episodes: int, first_seed: int) -> None:
+    """Write an MP4 of some episodes, at the speed of the robot.
+
+    Args:
+        path: The file; written in one piece.
+        env: An environment that renders ``rgb_array``.
+        policy: What acts.
+        episodes: Number of episodes.
+        first_seed: Seed of the first one; the following count up.
+    """
+    import imageio.v2 as imageio
+
+    def write(part: Path) -> None:
+        fps = env.metadata["render_fps"]
+        # H.264 wants an even width and height, and no more than that.
+        writer: Any = imageio.get_writer(part, fps=fps, macro_block_size=2)
+        with writer as video:
+            _show(env, policy, episodes, first_seed, video.append_data)
+
+    write_whole(path, write)
+
+
+def write_contact_sheet(path: Path, env: GoalEnv, policy: Policy, seed: int) -> None:
+    """Write a PNG of one episode: six moments from first to last, row by row.
+
+    Args:
+        path: The file; written in one piece.
+        env: An environment that renders ``rgb_array``.
+        policy: What acts.
+        seed: Seed of the episode.
+    """
+    import imageio.v3 as imageio
+
+    frames: list[Frame] = []
+    _show(env, policy, 1, seed, frames.append)
+    sheet = contact_sheet(frames)
+    write_whole(path, lambda part: imageio.imwrite(part, sheet))
+
+
+def contact_sheet(frames: Sequence[Frame]) -> Frame:
+    """Return evenly spaced frames, from the first until nothing moves any more, side by side.
+
+    Args:
+        frames: Frames of (height, width, 3), at least one.
+
+    Returns:
+        One picture of (2 * height, 3 * width, 3).
+    """
+    moving = [i for i, frame in enumerate(frames) if _differs(frame, frames[-1])]
+    last = min(moving[-1] + 1, len(frames) - 1) if moving else len(frames) - 1
+    moments = np.linspace(0, last, _ROWS * _COLUMNS).round().astype(int)
+    chosen = [frames[moment] for moment in moments]
+    rows = [np.hstack(chosen[row * _COLUMNS : (row + 1) * _COLUMNS]) for row in range(_ROWS)]
+    return np.vstack(rows)
+
+
+def _differs(frame: Frame, other: Frame) -> bool:
+    """Whether two frames differ by more than a robot's last millimetres."""
+    return bool((frame != other).any(axis=-1).mean() > 1e-2)
+
+
+def _show(
+    env: GoalEnv,
+    policy: Policy,
+    episodes: int,
+    first_seed: int,
+    receive: Callable[[Any], object],
+) -> None:
+    """Run episodes and hand over what the environment renders."""
+    run_episodes(env, policy, episodes, first_seed, on_frame=lambda: receive(env.render()))

@@ -1,0 +1,94 @@
+"""Hindsight replay that keeps a goal-independent penalty in relabelled rewards."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.type_aliases import DictReplayBufferSamples
+from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.her import HerReplayBuffer
+
+from tpm_gym.learning.errors import ReplayBufferError
+
+
+class PenaltyHerReplayBuffer(HerReplayBuffer):
+    """Hindsight experience replay for a reward of the form ``R(achieved, goal) - penalty``.
+
+    Stable-Baselines3 relabels with ``compute_reward(achieved, new_goal, {})``: an empty info, from
+    which no environment can tell how close to a singularity the robot was, so the penalty would
+    vanish from four samples out of five. The penalty does not depend on the goal, hence with the
+    stored reward r, the next achieved goal ag', the old goal g and the new goal g',
+
+        r' = r - R(ag', g) + R(ag', g')
+
+    is the reward the environment would have paid for g'. Only the task term R is evaluated, for the
+    whole batch at once, and no info dictionary is stored. (``copy_info_dict=True`` would keep the
+    penalty as well, at the price of a deep copy of every info of every batch.)
+
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        """Build the buffer with the arguments of ``stable_baselines3.HerReplayBuffer``.
+
+        Args:
+            args: Positional arguments of the parent.
+            kwargs: Keyword arguments of the parent.
+
+        Raises:
+            ReplayBufferError: ``copy_info_dict`` is on: the penalty would be counted twice.
+        """
+        super().__init__(*args, **kwargs)
+        if self.copy_info_dict:
+            raise ReplayBufferError(
+                "copy_info_dict=True: the stored infos already carry the penalty and it would be "
+                "counted twice; leave copy_info_dict off, or use HerReplayBuffer"
+            )
+
+    def _get_virtual_samples(
+        self,
+        batch_indices: NDArray[np.int64],
+        env_indices: NDArray[np.int64],
+        env: VecNormalize | None = None,
+    ) -> DictReplayBufferSamples:
+        """Relabel as the parent does, then put the goal-independent part of the reward back.
+
+        Args:
+            batch_indices: Row of each transition in the buffer, (n,).
+            env_indices: Environment of each transition, (n,).
+            env: The ``VecNormalize`` around the training environment, if there is one.
+
+        Returns:
+            The n transitions with new goals and their rewards.
+
+        Raises:
+            ReplayBufferError: ``env`` normalises rewards.
+        """
+        if env is not None and env.norm_reward:
+            # The parent has normalised R(ag', g') by then; a sum with raw rewards has no meaning.
+            raise ReplayBufferError(
+                "VecNormalize has norm_reward=True: relabelled rewards cannot be corrected after "
+                "normalisation; wrap the environment with VecNormalize(..., norm_reward=False)"
+            )
+        samples = super()._get_virtual_samples(batch_indices, env_indices, env)
+        kept = self._goal_independent_reward(batch_indices, env_indices)  # (n,)
+        rewards = samples.rewards + self.to_torch(kept.reshape(-1, 1))  # (n, 1)
+        return samples._replace(rewards=rewards)
+
+    def _goal_independent_reward(
+        self, batch_indices: NDArray[np.int64], env_indices: NDArray[np.int64]
+    ) -> NDArray[np.float32]:
+        """Return r - R(ag', g) of stored transitions: minus the weighted penalty, (n,)."""
+        if self.env is None:
+            raise ReplayBufferError(
+                "the buffer has no environment to compute rewards with; call set_env() after "
+                "loading it"
+            )
+        achieved = self.next_observations["achieved_goal"][batch_indices, env_indices]  # (n, 3) m
+        desired = self.next_observations["desired_goal"][batch_indices, env_indices]  # (n, 3) m
+        infos: list[dict[str, Any]] = [{} for _ in range(len(batch_indices))]
+        # One environment answers for all: they are identical (the parent does the same).
+        task = self.env.env_method("compute_reward", achieved, desired, infos, indices=[0])[0]
+        stored = self.rewards[batch_indices, env_indices]  # (n,)
+        return np.asarray(stored - task, dtype=np.float32)

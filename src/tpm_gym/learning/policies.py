@@ -1,0 +1,285 @@
+"""Policies by name: the scripted expert, uniform random actions, or a trained policy on file.
+
+A trained policy comes in two forms. Exported, as ``NAME.json`` and ``NAME.safetensors``, it is
+plain data and loads safely. As an archive of Stable-Baselines3, ``NAME.zip``, it holds pickles,
+which can run any code when they are loaded: that takes ``trust_pickle``.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Protocol, cast
+
+import gymnasium as gym
+import numpy as np
+
+from tpm_gym.learning.errors import PolicyError
+from tpm_gym.learning.rollout import Action, GoalEnv, Observation, Policy
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
+
+CONFIG_FILE: Final = "config.json"
+EVALUATIONS_FILE: Final = "evaluations.jsonl"
+TESTS: Final = "tests"
+BEST_FILE: Final = "best.zip"
+LAST_FILE: Final = "last.zip"
+EXPORTED: Final = (".json", ".safetensors")
+ALGORITHMS: Final = ("sac", "tqc", "ppo")
+SCRIPTED: Final = ("expert", "random")
+
+
+class Predictor(Protocol):
+    """The part of a Stable-Baselines3 algorithm that acts."""
+
+    def predict(self, observation: Any, *, deterministic: bool = False) -> tuple[Any, Any]:
+        """Return the action, and the state of a recurrent policy."""
+
+
+class _Expert(Protocol):
+    """The part of ``tpm_gym.tasks.expert.Expert`` that acts."""
+
+    def reset(self, obs: Observation) -> None: ...
+
+    def act(self, obs: Observation) -> Action: ...
+
+
+@dataclass(frozen=True)
+class TrainedPolicy:
+    """Acts with the mean action of a trained algorithm.
+
+    Attributes:
+        model: The Stable-Baselines3 algorithm.
+    """
+
+    model: Predictor
+
+    def reset(self, observation: Observation, seed: int) -> None:
+        """Do nothing: the policy has no memory."""
+
+    def act(self, observation: Observation) -> Action:
+        """Return the deterministic action for ``observation``."""
+        action, _ = self.model.predict(observation, deterministic=True)
+        return cast(Action, action)
+
+
+class RandomPolicy:
+    """Draws actions uniformly, from a generator seeded anew in every episode.
+
+    Args:
+        space: The action space.
+    """
+
+    def __init__(self, space: gym.spaces.Box) -> None:
+        """Remember the space; the generator is seeded by ``reset``."""
+        self._space = space
+        self._rng = np.random.default_rng()
+
+    def reset(self, observation: Observation, seed: int) -> None:
+        """Seed the generator with the seed of the episode."""
+        self._rng = np.random.default_rng(seed)
+
+    def act(self, observation: Observation) -> Action:
+        """Return an action that does not depend on ``observation``."""
+        return self._rng.uniform(self._space.low, self._space.high).astype(self._space.dtype)
+
+
+@dataclass(frozen=True)
+class ExpertPolicy:
+    """Acts with the scripted controller of tpm_gym.
+
+    Attributes:
+        expert: The controller.
+    """
+
+    expert: _Expert
+
+    def reset(self, observation: Observation, seed: int) -> None:
+        """Plan the motion of the episode; the controller is deterministic."""
+        self.expert.reset(observation)
+
+    def act(self, observation: Observation) -> Action:
+        """Return the action of the controller."""
+        return self.expert.act(observation)
+
+
+def load_policy(spec: str, env: GoalEnv, *, trust_pickle: bool = False) -> Policy:
+    """Return the policy that ``spec`` names.
+
+    Args:
+        spec: ``expert``, ``random``, an exported policy (either of its files, or their common
+            name), a .zip file saved by train.py, or the folder of a run (its best policy).
+        env: The environment the policy will act in.
+        trust_pickle: Whether a .zip file may be loaded, which can run any code that is in it.
+
+    Raises:
+        PolicyError: There is no such policy, its files are damaged, it does not fit ``env``, or it
+            is a .zip file and ``trust_pickle`` is not set.
+    """
+    if spec == "random":
+        if not isinstance(env.action_space, gym.spaces.Box):
+            raise PolicyError(spec, f"needs a Box action space, not {env.action_space}")
+        return RandomPolicy(env.action_space)
+    if spec == "expert":
+        from tpm_gym.tasks.expert import Expert
+
+        return ExpertPolicy(Expert(env))
+    path = _policy_file(spec)
+    if path.suffix in EXPORTED:
+        return TrainedPolicy(_load_exported(spec, path, env))
+    require_trust(spec, path, trust_pickle)
+    model = load_model(spec, path)
+    _check_spaces(spec, model, env)
+    return TrainedPolicy(model)
+
+
+def trained_env(spec: str) -> str | None:
+    """Return the id of the environment a policy was trained on, None for a scripted one.
+
+    Nothing is unpickled.
+
+    Raises:
+        PolicyError: There is no such policy, or its run folder does not say.
+    """
+    if spec in SCRIPTED:
+        return None
+    path = _policy_file(spec)
+    if path.suffix not in EXPORTED:
+        return str(run_config(spec, path)["env"])
+    from tpm_gym import TPMError
+    from tpm_gym.policy.files import read_description
+
+    try:
+        return read_description(path).env_id
+    except TPMError as error:
+        raise PolicyError(spec, str(error)) from error
+
+
+def require_trust(spec: str, path: Path, trusted: bool) -> None:
+    """Refuse a .zip file that nobody has vouched for.
+
+    Raises:
+        PolicyError: It is not trusted.
+    """
+    if not trusted:
+        raise PolicyError(
+            spec,
+            f"{path} holds pickles, and loading it can run any code; if you trust where it comes "
+            "from, give --trust-pickle, or convert it once and share that instead: "
+            f"python train/export.py {path} {path.with_suffix('')} --trust-pickle",
+        )
+
+
+def _policy_file(spec: str) -> Path:
+    """Return the file that ``spec`` names: one of an exported policy, or a .zip."""
+    path = Path(spec)
+    if path.is_dir():
+        archives = [path / BEST_FILE, path / LAST_FILE]
+        candidates = [*(file.with_suffix(".json") for file in archives), *archives]
+    elif path.suffix in (".zip", *EXPORTED):
+        candidates = [path]
+    else:
+        candidates = [path.with_name(path.name + suffix) for suffix in EXPORTED]
+    for candidate in candidates:
+        if candidate.is_file():
+            return candidate
+    looked_for = " or ".join(str(candidate) for candidate in candidates)
+    raise PolicyError(
+        spec,
+        f"no file {looked_for}; expected {', '.join(SCRIPTED)}, an exported policy (.json), a .zip "
+        "saved by train.py, or the folder of a run",
+    )
+
+
+def run_config(spec: str, path: Path) -> dict[str, Any]:
+    """Return the run's configuration, from beside or above a .zip file.
+
+    Raises:
+        PolicyError: There is none, or it lacks what train.py writes.
+    """
+    folders = path.resolve().parents[:2]  # the run folder, or one inside it
+    for folder in folders:
+        file = folder / CONFIG_FILE
+        if not file.is_file():
+            continue
+        try:
+            content = json.loads(file.read_text(encoding="utf-8"))
+        except (ValueError, RecursionError) as error:
+            raise PolicyError(spec, f"{file} is damaged: {error}") from error
+        for key in ("algo", "env", "seed", "recipe"):
+            if not isinstance(content, dict) or key not in content:
+                raise PolicyError(spec, f"{file} is damaged: no entry {key!r}")
+        return cast(dict[str, Any], content)
+    raise PolicyError(
+        spec, f"no {CONFIG_FILE} beside {path.name} or above it; keep the file in its run folder"
+    )
+
+
+def _load_exported(spec: str, path: Path, env: GoalEnv) -> Predictor:
+    """Load an exported policy and make sure that it fits."""
+    from tpm_gym import TPMError
+    from tpm_gym.policy.policy import load_policy as load_safely  # imports torch
+
+    _use_one_thread()
+    try:
+        policy = load_safely(path)
+        policy.check(env)
+    except TPMError as error:
+        raise PolicyError(spec, str(error)) from error
+    return policy
+
+
+def _use_one_thread() -> None:
+    """Set PyTorch up for these networks, too small to share; one thread repeats exactly."""
+    import torch  # Imported here so that scripted policies do not pay for it.
+
+    torch.set_num_threads(1)
+
+
+def load_model(spec: str, path: Path) -> BaseAlgorithm:
+    """Unpickle a saved algorithm for acting only; see ``require_trust``.
+
+    Raises:
+        PolicyError: It cannot be loaded.
+    """
+    algorithm = run_config(spec, path)["algo"]
+    if algorithm not in ALGORITHMS:
+        raise PolicyError(spec, f"algorithm {algorithm!r} is none of {', '.join(ALGORITHMS)}")
+    _use_one_thread()
+    # Acting stores nothing: no room is needed, nor a hindsight buffer, which would ask for an
+    # environment.
+    unused: dict[str, Any] = {
+        "replay_buffer_class": None,
+        "replay_buffer_kwargs": {},
+        "buffer_size": 1,
+    }
+    try:
+        return algorithm_class(algorithm).load(path, device="cpu", custom_objects=unused)
+    except Exception as error:  # A damaged archive or pickle can raise anything at all.
+        raise PolicyError(spec, f"cannot be loaded as {algorithm}: {error}") from error
+
+
+def algorithm_class(name: str) -> type[BaseAlgorithm]:
+    """Return the Stable-Baselines3 class of an algorithm in ``ALGORITHMS``."""
+    if name == "tqc":
+        from sb3_contrib import TQC
+
+        return TQC
+    from stable_baselines3 import PPO, SAC
+
+    return SAC if name == "sac" else PPO
+
+
+def _check_spaces(spec: str, model: BaseAlgorithm, env: GoalEnv) -> None:
+    """Refuse a policy that was trained with other observations or actions."""
+    pairs = {
+        "observation": (model.observation_space, env.observation_space),
+        "action": (model.action_space, env.action_space),
+    }
+    for kind, (trained, given) in pairs.items():
+        if trained != given:
+            raise PolicyError(
+                spec, f"was trained with {kind} space {trained}, the environment has {given}"
+            )

@@ -1,0 +1,175 @@
+"""The figures of docs/results.md, in the style of the other figures in docs/."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter, PercentFormatter
+
+from tpm_gym.learning import figure_style
+from tpm_gym.learning.aggregate import LEARNED
+from tpm_gym.learning.provenance import write_whole
+from tpm_gym.learning.report_page import (
+    LEARNING_CURVES,
+    PENALTY,
+    TEMPTING,
+    Group,
+    Record,
+    grouped,
+    method,
+)
+
+_COLUMNS = 3
+
+
+def draw(records: Sequence[Record], folder: Path) -> list[Path]:
+    """Draw what there are records for.
+
+    Args:
+        records: What ``results.condense`` gave, one a run.
+        folder: Where the figures go.
+
+    Returns:
+        The figures.
+    """
+    plain = [r for r in records if r["goals"] == "sampled" and r["penalty_weight"] == 1.0]
+    tempted = [r for r in records if r["goals"] == "tempting" and TEMPTING in r["tests"]]
+    style = figure_style
+    written = []
+    with style.style():
+        if any(record["evaluations"]["steps"] for record in plain):
+            written.append(_save(style, learning_curves(plain, style), folder / LEARNING_CURVES))
+        if tempted:
+            written.append(_save(style, penalty(tempted, style), folder / PENALTY))
+    return written
+
+
+def _save(style: Any, figure: Figure, path: Path) -> Path:
+    write_whole(path, partial(style.save, figure))
+    return path
+
+
+def _panels(style: Any, count: int, title: str, height: float) -> tuple[Figure, list[Axes]]:
+    """A figure with some panels, row by row."""
+    columns = min(_COLUMNS, count)
+    rows = -(-count // columns)
+    figure = Figure(figsize=(style.WIDTH, height * rows + 0.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(title, weight="bold")
+    panels = figure.subplots(rows, columns, squeeze=False).ravel().tolist()
+    for unused in panels[count:]:
+        unused.set_visible(False)
+    return figure, panels[:count]
+
+
+def learning_curves(records: Sequence[Record], style: Any) -> Figure:
+    """Draw success against steps: a panel an id, a median and a band over seeds each method.
+
+    Args:
+        records: The runs.
+        style: The house style.
+    """
+    ids = sorted({record["env"] for record in records})
+    names = sorted({method(record) for record in records})
+    colours = dict(zip(names, _colours(style), strict=False))
+    figure, panels = _panels(style, len(ids), "Success in the evaluations during training", 2.1)
+    for env_id, axes in zip(ids, panels, strict=True):
+        for group in grouped(record for record in records if record["env"] == env_id):
+            _draw_band(axes, group, colours[method(group[0])])
+        axes.axhline(LEARNED, color=style.OUTLINE, linewidth=0.6, linestyle=(0, (3, 2)))
+        axes.set_title(env_id)
+        axes.set_xlim(left=0)  # a curve that starts later does so because of demonstrations
+        axes.set_xlabel("environment steps")
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes.set_ylim(-0.03, 1.03)
+        axes.yaxis.set_major_formatter(PercentFormatter(xmax=1))
+    panels[0].set_ylabel("successful episodes")
+    _legend(figure, panels, title="median of the seeds, band from the least to the most successful")
+    return figure
+
+
+def _legend(figure: Figure, panels: Sequence[Axes], title: str | None = None) -> None:
+    """One legend for all panels, below them."""
+    entries: dict[str, Any] = {}
+    for axes in panels:
+        handles, labels = axes.get_legend_handles_labels()
+        entries |= dict(zip(labels, handles, strict=True))
+    figure.legend(
+        entries.values(),
+        entries,
+        loc="outside lower center",
+        ncols=max(1, len(entries)),
+        title=title,
+    )
+
+
+def _draw_band(axes: Axes, group: Group, colour: str) -> None:
+    """Median over seeds, and the band from the least to the most successful one."""
+    curves = [record["evaluations"] for record in group]
+    steps = sorted({step for curve in curves for step in curve["steps"]})
+    # A run that ended early is in the band as far as it went.
+    rows = np.full((len(curves), len(steps)), np.nan)  # (seeds, evaluations)
+    for row, curve in zip(rows, curves, strict=True):
+        if curve["steps"]:
+            row[np.searchsorted(steps, curve["steps"])] = curve["success_at_end"]
+    label = method(group[0])
+    if steps:
+        axes.fill_between(
+            steps, np.nanmin(rows, axis=0), np.nanmax(rows, axis=0), color=colour, alpha=0.2, lw=0
+        )
+        axes.plot(steps, np.nanmedian(rows, axis=0), color=colour, label=label, linewidth=1.4)
+
+
+def penalty(records: Sequence[Record], style: Any) -> Figure:
+    """Draw success and time below safe by penalty weight: a dot a seed, a bar at the mean.
+
+    Args:
+        records: Runs on tempting goals, tested on them.
+        style: The house style.
+    """
+    ids = sorted({record["env"] for record in records})
+    title = "Goals that tempt towards the singularity, by penalty weight"
+    figure, panels = _panels(style, len(ids), title, 2.4)
+    metrics = {
+        "success_at_end": ("success", style.BLUE),
+        "unsafe_share": ("time below safe", style.VERMILLION),
+    }
+    for env_id, axes in zip(ids, panels, strict=True):
+        groups = grouped(record for record in records if record["env"] == env_id)
+        for place, (name, (label, colour)) in enumerate(metrics.items()):
+            for index, group in enumerate(groups):
+                values = [record["tests"][TEMPTING][name]["mean"] for record in group]
+                x = index + 0.16 * (2 * place - 1)
+                axes.plot([x] * len(values), values, "o", color=colour, alpha=0.6, markersize=4)
+                axes.hlines(np.mean(values), x - 0.12, x + 0.12, color=colour, linewidth=1.6)
+            axes.plot([], [], "o", color=colour, label=label)
+        axes.set_xlim(-0.5, len(groups) - 0.5)
+        axes.set_xticks(range(len(groups)), _weights([group[0] for group in groups]))
+        axes.set_title(env_id)
+        axes.set_xlabel("penalty weight")
+        axes.set_ylim(-0.03, 1.03)
+        axes.yaxis.set_major_formatter(PercentFormatter(xmax=1))
+    _legend(figure, panels, title="a dot a seed, a bar at their mean")
+    return figure
+
+
+def _weights(records: Sequence[Record]) -> list[str]:
+    """Penalty weights as labels, with what else sets the runs apart."""
+    parts = [
+        [method(record) for record in records],
+        [f"{record['steps']:,}\nsteps" for record in records],
+    ]
+    telling = [part for part in parts if len(set(part)) > 1]
+    weights = [f"{record['penalty_weight']:g}" for record in records]
+    return ["\n".join(labels) for labels in zip(weights, *telling, strict=True)]
+
+
+def _colours(style: Any) -> list[str]:
+    return [style.BLUE, style.VERMILLION, style.GREEN, style.PURPLE, style.ORANGE, style.SKY]

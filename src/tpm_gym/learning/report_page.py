@@ -1,0 +1,367 @@
+"""The text of docs/results.md, from the records that results.py has collected."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Sequence
+from statistics import median
+from typing import Any, Final
+
+from tpm_gym.learning.aggregate import (
+    BOOTSTRAP_SAMPLES,
+    BOOTSTRAP_SEED,
+    LEARNED,
+    interquartile_mean_interval,
+    median_time,
+    settled,
+)
+
+Record = dict[str, Any]
+Group = list[Record]
+
+NOMINAL, TEMPTING = "nominal", "tempting"
+LEARNING_CURVES, PENALTY = "results_learning_curves.png", "results_penalty.png"
+NONE: Final = "\N{EM DASH}"
+
+_INTRO: Final = f"""# Results
+
+Written by `make results` from the records in [results](results); no result here was typed by hand.
+
+- **Success** is that of the last step of an episode. Each run is tested with the policy that did
+  best in the evaluations during training, on held-out seeds that neither training nor those
+  evaluations have seen; its interval is Wilson's, at 95%.
+- **IQM** is the interquartile mean over seeds (of five, the mean of the middle three), with a 95%
+  stratified bootstrap interval ({BOOTSTRAP_SAMPLES:,} resamples of the seeds, seed \
+{BOOTSTRAP_SEED}). A run without a test counts as 0.
+- **Time to {LEARNED:.0%}** is that of the first evaluation during training from which success stays
+  at {LEARNED:.0%} or above to the end of training; those evaluations are short (20 episodes, so at
+  most one may fail), the same episodes each time. Minutes include them; minutes and steps include
+  the playing of demonstrations. For several seeds it is the median, "never" where that is a
+  run that never did.
+- **Smallest conditioning** is the least 1/cond(J) of all steps of all test episodes (and seeds),
+  **time below safe** the share of their steps with 1/cond(J) < 0.08 (the mean of seeds).
+- **Observed P off** is the largest distance between the observed position of the platform (forward
+  kinematics of the encoders) and the simulated one, of all steps, episodes and seeds.
+"""
+
+
+_STUDY: Final = """\
+With `+modified`, files that git tracks differed from the commit. Minutes are wall-clock, of two
+runs at a time on two cores, and of some runs too long: tests ran beside them. All of it again:
+
+```bash
+python train/study.py --plan results
+python train/study.py --plan penalty
+python train/study.py --plan penalty --envs TPMPickAndPlaceJoints-v0 --steps 100000
+python train/study.py --plan robustness --episodes 500
+python train/results.py collect
+make results
+```
+
+`study.py` runs these commands for every seed; here those of the first. Each record holds its own.
+"""
+
+
+def page(records: Sequence[Record], figures: Sequence[str]) -> str:
+    """Return the page as Markdown.
+
+    Args:
+        records: What ``results.condense`` gave, one a run.
+        figures: Names of the figures in images/.
+    """
+    plain = [r for r in records if r["goals"] == "sampled" and r["penalty_weight"] == 1.0]
+    tempted = [r for r in records if r["goals"] == "tempting"]
+    parts = [_INTRO, *_training(plain, figures), *_penalty(tempted, figures), *_robustness(plain)]
+    return "\n".join([*parts, *_how(records)])
+
+
+def grouped(records: Iterable[Record]) -> list[Group]:
+    """Put runs together that differ by their seed alone, seeds in order."""
+    groups: dict[str, Group] = {}
+    for record in sorted(records, key=_order):
+        names = ("env", "algo", "recipe", "steps", "envs", "goals", "penalty_weight")
+        key = json.dumps([record[name] for name in names], sort_keys=True)
+        groups.setdefault(key, []).append(record)
+    return list(groups.values())
+
+
+def method(record: Record) -> str:
+    """Name the algorithm of a run, and its recipe where that is not the usual one."""
+    name = str(record["algo"]).upper() + (" + HER" if record["recipe"]["hindsight"] else "")
+    usual = record["recipe_file"] == f"{record['algo']}.yml"
+    return name if usual else f"{name} ({record['recipe_file']})"
+
+
+def success(record: Record, test: str) -> float:
+    """Success rate of a run in a test; 0 where it has none."""
+    return float(record["tests"].get(test, {}).get("success_at_end", {}).get("mean", 0.0))
+
+
+def _order(record: Record) -> tuple[Any, ...]:
+    return record["env"], record["algo"], record["steps"], record["penalty_weight"], record["seed"]
+
+
+# -- sections ---------------------------------------------------------------------------------
+
+
+def _training(records: Group, figures: Sequence[str]) -> list[str]:
+    """How well, and how fast, the recipes learn."""
+    if not records:
+        return []
+    head = (
+        "id | method | steps | seeds | success, IQM | median | steps to 95% | minutes to 95% | "
+        "smallest conditioning | time below safe"
+    )
+    rows = [_training_row(group) for group in grouped(records)]
+    tested = f"Each seed is tested on {_episodes(records, [NOMINAL])} held-out episodes.\n"
+    parts = ["## Learning\n", tested, _table(head, rows)]
+    if LEARNING_CURVES in figures:
+        parts.append(f"![Learning curves](images/{LEARNING_CURVES})\n")
+        parts.append("A curve that does not start at 0 starts after the demonstrations.\n")
+    head = (
+        "id | method | seed | success | steps to 95% | minutes to 95% | minutes in all | "
+        "smallest conditioning | time below safe | observed P off"
+    )
+    runs = [_run_row(record) for group in grouped(records) for record in group]
+    return [*parts, "### Every run\n", _table(head, runs), *_failures(records, NOMINAL)]
+
+
+def _training_row(group: Group) -> str:
+    times = [_time_to_learn(record) for record in group]
+    first = group[0]
+    cells = [
+        first["env"],
+        method(first),
+        f"{first['steps']:,}",
+        str(len(group)),
+        _iqm([success(record, NOMINAL) for record in group]),
+        f"{median(success(record, NOMINAL) for record in group):.1%}",
+        _or_never(median_time([steps for steps, _ in times]), "{:,.0f}"),
+        _or_never(median_time([minutes for _, minutes in times]), "{:.1f}"),
+        _worst(group, NOMINAL, "conditioning_min", min, "{:.3f}"),
+        _mean(group, NOMINAL, "unsafe_share", "{:.1%}"),
+    ]
+    return " | ".join(cells)
+
+
+def _run_row(record: Record) -> str:
+    steps, minutes = _time_to_learn(record)
+    walls = record["evaluations"]["wall_seconds"]
+    cells = [
+        record["env"],
+        method(record),
+        str(record["seed"]),
+        _tested(record, NOMINAL),
+        _or_never(steps, "{:,.0f}"),
+        _or_never(minutes, "{:.1f}"),
+        f"{walls[-1] / 60:.1f}" if walls else NONE,
+        _worst([record], NOMINAL, "conditioning_min", min, "{:.3f}"),
+        _mean([record], NOMINAL, "unsafe_share", "{:.1%}"),
+        _worst([record], NOMINAL, "fk_error_max", max, "{:.3f} mm", 1e3),
+    ]
+    return " | ".join(cells)
+
+
+def _failures(records: Group, test: str) -> list[str]:
+    """Name every run that did not do what it should."""
+    lines = []
+    for record in sorted(records, key=_order):
+        name = f"{record['env']}, {method(record)}, seed {record['seed']}"
+        if record["goals"] == "tempting":
+            name += f", {record['steps']:,} steps, penalty weight {record['penalty_weight']:g}"
+        if not record["finished"]:
+            reached = (record["evaluations"]["steps"] or [0])[-1]
+            lines.append(f"- {name}: stopped after {reached:,} of {record['steps']:,} steps.")
+        elif test not in record["tests"]:
+            lines.append(f"- {name}: not tested.")
+        elif success(record, test) < LEARNED:
+            lines.append(f"- {name}: success {_tested(record, test)}, below {LEARNED:.0%}.")
+    body = "\n".join(lines) if lines else f"None: every run has {LEARNED:.0%} or more."
+    return ["### Failures\n", body + "\n"]
+
+
+def _penalty(records: Group, figures: Sequence[str]) -> list[str]:
+    """Whether the singularity penalty does what it is for."""
+    if not records:
+        return []
+    head = (
+        "id | method | steps | penalty weight | seeds | success, IQM | time below safe (seeds) | "
+        "smallest conditioning | observed P off | torque, RMS | torque, peak"
+    )
+    rows = []
+    for group in grouped(records):
+        cells = [
+            group[0]["env"],
+            method(group[0]),
+            f"{group[0]['steps']:,}",
+            f"{group[0]['penalty_weight']:g}",
+            str(len(group)),
+            _iqm([success(record, TEMPTING) for record in group]),
+            _mean(group, TEMPTING, "unsafe_share", "{:.1%}", spread=True),
+            _worst(group, TEMPTING, "conditioning_min", min, "{:.3f}"),
+            _worst(group, TEMPTING, "fk_error_max", max, "{:.3f} mm", 1e3),
+            _mean(group, TEMPTING, "torque_rms", "{:.1f} N m"),
+            _worst(group, TEMPTING, "torque_peak", max, "{:.0f} N m"),
+        ]
+        rows.append(" | ".join(cells))
+    text = (
+        "## Does the penalty work?\n\nTrained and tested on goals that tempt towards the "
+        "singularity (`--goals tempting`, see `train/tempting.py`): goals, and pucks, lie just "
+        "within the safe threshold, and straight lines in the joint angles lead beyond it. "
+        f"{_episodes(records, [TEMPTING])} held-out episodes a seed.\n"
+    )
+    parts = [text, _table(head, rows), *_compared(records)]
+    if PENALTY in figures:
+        parts.append(f"![Success and time below safe by weight](images/{PENALTY})\n")
+    return [*parts, *_failures(records, TEMPTING)]
+
+
+def _compared(records: Group) -> list[str]:
+    """One line an id, method and its steps: time below safe without the penalty and with it."""
+    lines = []
+    for kind in sorted({_kind(record) for record in records}):
+        alike = [record for record in records if _kind(record) == kind]
+        shares = [
+            _values([r for r in alike if r["penalty_weight"] == weight],
+                    TEMPTING, "unsafe_share", "mean")
+            for weight in (0.0, 1.0)
+        ]  # fmt: skip
+        if not all(shares):
+            continue
+        without, with_it = (sum(values) / len(values) for values in shares)
+        times = f"{without / with_it:,.0f} times less" if with_it > 0 else "never below"
+        name = f"{kind[0]}, {kind[1]}, {kind[2]:,} steps"
+        lines.append(
+            f"- {name}: {without:.2%} without the penalty, {with_it:.3%} with it: {times}."
+        )
+    return ["Time below safe, mean over seeds:\n", "\n".join(lines) + "\n"] if lines else []
+
+
+def _kind(record: Record) -> tuple[str, str, int]:
+    return record["env"], method(record), record["steps"]
+
+
+def _robustness(records: Group) -> list[str]:
+    """How the policies do on machines that they have never seen."""
+    names = sorted({name for record in records for name in record["tests"]} - {NOMINAL})
+    groups = [group for group in grouped(records) if any(set(names) & set(_of(group)))]
+    if not names or not groups:
+        return []
+    titles = [f"{group[0]['env']}, {method(group[0])}" for group in groups]
+    rows = []
+    for name in [NOMINAL, *names]:
+        tests = [record["tests"][name] for record in records if name in record["tests"]]
+        changes = {json.dumps(test["randomisation"]) for test in tests}
+        cells = [
+            _iqm([success(record, name) for record in group]) if name in _of(group) else NONE
+            for group in groups
+        ]
+        rows.append(" | ".join([name.replace("_", " "), ", ".join(sorted(changes)), *cells]))
+    text = (
+        "## Robustness\n\nThe policies above, trained on the nominal machine alone, on others "
+        f"(success, IQM over seeds; {_episodes(records, names)} episodes a seed, "
+        f"{_episodes(records, [NOMINAL])} on the nominal one).\n"
+    )
+    return [text, _table(" | ".join(["machine", "randomisation", *titles]), rows)]
+
+
+def _episodes(records: Group, names: Sequence[str]) -> str:
+    """How many episodes the tests of these names had."""
+    tests = [record["tests"].get(name) for record in records for name in names]
+    return " or ".join(map(str, sorted({test["episodes"] for test in tests if test}))) or "no"
+
+
+def _of(group: Group) -> set[str]:
+    """Names of the tests that a run of a group has."""
+    return {name for record in group for name in record["tests"]}
+
+
+def _how(records: Sequence[Record]) -> list[str]:
+    """Machines, versions and commands."""
+    commits: dict[str, set[str]] = {}
+    for record in records:
+        used = [record, *record["tests"].values()]
+        commits.setdefault(_machine(record), set()).update(_commit(by["git_commit"]) for by in used)
+    listed = "\n".join(
+        f"- {machine}; commits {', '.join(sorted(of))}" for machine, of in sorted(commits.items())
+    )
+    commands = []
+    for first, *_ in grouped(records):
+        commands.append(str(first["command"]))
+        commands += [str(test["command"]) for test in first["tests"].values()]
+    return ["## How\n", listed + "\n", _STUDY, "```bash", *commands, "```\n"]
+
+
+def _commit(name: str | None) -> str:
+    """A short commit; what was modified when it ran stays marked."""
+    commit, plus, modified = str(name).partition("+")
+    return commit[:10] + plus + modified
+
+
+def _machine(record: Record) -> str:
+    machine = record["machine"] or {}
+    kind = ", ".join(f"{machine.get(name)}" for name in ("system", "architecture", "processor"))
+    used = ", ".join(f"{name} {value}" for name, value in (record["versions"] or {}).items())
+    return f"{kind}, {machine.get('cpu_count')} CPUs; {used}"
+
+
+# -- cells ------------------------------------------------------------------------------------
+
+
+def _table(head: str, rows: Sequence[str]) -> str:
+    count = head.count("|") + 1
+    lines = [head, " | ".join(["---"] * count), *rows]
+    return "\n".join(f"| {line} |" for line in lines) + "\n"
+
+
+def _iqm(scores: Sequence[float]) -> str:
+    found = interquartile_mean_interval([scores])
+    return f"{found.mean:.1%} [{found.low * 100:.1f}, {found.high * 100:.1f}]"
+
+
+def _tested(record: Record, test: str) -> str:
+    """Success with its interval; a run without a test says so."""
+    if test not in record["tests"]:
+        return "not finished" if not record["finished"] else "not tested"
+    found = record["tests"][test]["success_at_end"]
+    return f"{found['mean']:.1%} [{found['low'] * 100:.1f}, {found['high'] * 100:.1f}]"
+
+
+def _time_to_learn(record: Record) -> tuple[float | None, float | None]:
+    """Steps and minutes until success stays; None where it does not, or training ended early."""
+    curves = record["evaluations"]
+    index = settled(curves.get("success_at_end", [])) if record["finished"] else None
+    if index is None:
+        return None, None
+    return float(curves["steps"][index]), curves["wall_seconds"][index] / 60
+
+
+def _or_never(value: float | None, form: str) -> str:
+    return "never" if value is None else form.format(value)
+
+
+def _values(group: Group, test: str, metric: str, key: str) -> list[float]:
+    """A metric of all runs of a group that have it."""
+    found = [record["tests"].get(test, {}).get(metric, {}).get(key) for record in group]
+    return [float(value) for value in found if value is not None]
+
+
+def _worst(
+    group: Group,
+    test: str,
+    metric: str,
+    pick: Callable[[list[float]], float],
+    form: str,
+    factor: float = 1.0,
+) -> str:
+    values = _values(group, test, metric, "worst")
+    return form.format(pick(values) * factor) if values else NONE
+
+
+def _mean(group: Group, test: str, metric: str, form: str, spread: bool = False) -> str:
+    values = _values(group, test, metric, "mean")
+    if not values:
+        return NONE
+    text = form.format(sum(values) / len(values))
+    ends = f" ({form.format(min(values))} to {form.format(max(values))})"
+    return text + (ends if spread else "")

@@ -1,0 +1,293 @@
+"""Run a policy over seeded episodes and summarise what happened, with 95% intervals.
+
+Seeds fall into three ranges that never meet, so no figure is taken on episodes that a policy has
+trained on or was selected by:
+
+- below ``SELECTION_SEED``: training;
+- from ``SELECTION_SEED``: the periodic evaluations during training, which select ``best.zip``;
+- from ``TEST_SEED``: ``evaluate.py``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Protocol, TypeAlias
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from tpm_gym.learning.errors import RolloutError
+from tpm_gym.tasks.rewards import SAFE_CONDITIONING
+
+SELECTION_SEED: Final = 1_000_000
+TEST_SEED: Final = 2_000_000
+
+Observation: TypeAlias = dict[str, NDArray[Any]]
+Action: TypeAlias = NDArray[Any]
+GoalEnv: TypeAlias = gym.Env[Observation, Action]
+
+_Z95: Final = 1.959963984540054  # 97.5% quantile of the standard normal distribution
+_BOOTSTRAP_SAMPLES: Final = 2000
+_BOOTSTRAP_BLOCK: Final = 100
+_BOOTSTRAP_SEED: Final = 0  # fixed: the same records always give the same interval
+
+
+class Policy(Protocol):
+    """What acts in an episode."""
+
+    def reset(self, observation: Observation, seed: int) -> None:
+        """Prepare for an episode that starts with ``observation`` and was reset with ``seed``."""
+
+    def act(self, observation: Observation) -> Action:
+        """Return the action for ``observation``."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """What one episode came to.
+
+    Attributes:
+        seed: Seed the environment was reset with.
+        success_at_end: Whether the last step was a success.
+        success_once: Whether any step was a success.
+        total_reward: Undiscounted sum of rewards, the return.
+        conditioning_min: Smallest 1/cond(J) of all steps, in [0, 1].
+        conditioning_mean: Mean 1/cond(J) over the steps.
+        closure_error_max: Largest loop gap of all steps, m.
+        length: Number of steps.
+        unsafe_share: Share of the steps with 1/cond(J) below ``SAFE_CONDITIONING``.
+        fk_error_max: Largest distance of the observed point P (forward kinematics of the encoders)
+            from that of the simulated platform, m; None where the environment does not tell.
+        torque_rms: Root mean square of the motors' torques at the ends of the steps, over steps and
+            motors, N m; None where the environment does not tell.
+        torque_peak: Largest of these torques, N m; None where the environment does not tell.
+    """
+
+    seed: int
+    success_at_end: bool
+    success_once: bool
+    total_reward: float
+    conditioning_min: float
+    conditioning_mean: float
+    closure_error_max: float
+    length: int
+    unsafe_share: float = 0.0
+    fk_error_max: float | None = None
+    torque_rms: float | None = None
+    torque_peak: float | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what is known as plain data, ``total_reward`` under its name ``return``."""
+        return {
+            "return" if name == "total_reward" else name: value
+            for name, value in vars(self).items()
+            if value is not None
+        }
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A mean over episodes with its 95% interval.
+
+    Attributes:
+        mean: Sample mean.
+        low: Lower end of the interval.
+        high: Upper end of the interval.
+        worst: The worst value of any step of any episode, where the metric has one.
+    """
+
+    mean: float
+    low: float
+    high: float
+    worst: float | None = None
+
+    def as_dict(self) -> dict[str, float]:
+        """Return the estimate as plain data, without ``worst`` where there is none."""
+        return {name: value for name, value in vars(self).items() if value is not None}
+
+
+def run_episodes(
+    env: GoalEnv,
+    policy: Policy,
+    episodes: int,
+    first_seed: int,
+    *,
+    on_frame: Callable[[], object] | None = None,
+    on_episode: Callable[[], object] | None = None,
+) -> list[Episode]:
+    """Run a policy for a number of episodes; the same arguments give the same records.
+
+    Args:
+        env: The environment; left open.
+        policy: What acts.
+        episodes: Number of episodes.
+        first_seed: Seed of the first episode; episode i is reset with ``first_seed + i``.
+        on_frame: Called after every reset and every step, for example to record a video.
+        on_episode: Called after every episode, for example to move a progress bar.
+
+    Returns:
+        One record per episode, in order.
+
+    Raises:
+        RolloutError: A reward, a conditioning, a closure error, a distance of forward kinematics
+            from the truth or a torque is not finite.
+    """
+    records = []
+    for seed in range(first_seed, first_seed + episodes):
+        records.append(_run_episode(env, policy, seed, on_frame))
+        if on_episode is not None:
+            on_episode()
+    return records
+
+
+def _run_episode(
+    env: GoalEnv, policy: Policy, seed: int, on_frame: Callable[[], object] | None
+) -> Episode:
+    """Run one episode to its end."""
+    observation, _ = env.reset(seed=seed)
+    policy.reset(observation, seed)
+    if on_frame is not None:
+        on_frame()
+    rewards: list[float] = []
+    infos: list[Mapping[str, Any]] = []
+    states: list[Any] = []
+    inner: Any = env.unwrapped
+    done = False
+    while not done:
+        observation, reward, terminated, truncated, info = env.step(policy.act(observation))
+        done = terminated or truncated
+        rewards.append(float(reward))
+        infos.append(info)
+        states.append(getattr(inner, "state", None))
+        if on_frame is not None:
+            on_frame()
+    return _record(seed, rewards, infos, states)
+
+
+def _record(
+    seed: int,
+    rewards: Sequence[float],
+    infos: Sequence[Mapping[str, Any]],
+    states: Sequence[Any],
+) -> Episode:
+    """Condense the steps of an episode; states are None where the environment has none."""
+    conditioning = [float(info["conditioning"]) for info in infos]
+    closure = [float(info["closure_error"]) for info in infos]
+    successes = [bool(info["is_success"]) for info in infos]
+    fk_errors, torques = _fk_errors(states), _torques(states)
+    named = {
+        "reward": rewards,
+        "conditioning": conditioning,
+        "closure_error": closure,
+        "fk_error": fk_errors,
+        "torque": torques,
+    }
+    for name, values in named.items():
+        for step, value in enumerate(values):
+            # A NaN would pass through min and max unseen, depending on where it stands.
+            if not math.isfinite(value):
+                raise RolloutError(seed, step * len(rewards) // len(values), name, value)
+    return Episode(
+        seed=seed,
+        success_at_end=successes[-1],
+        success_once=any(successes),
+        total_reward=math.fsum(rewards),
+        conditioning_min=min(conditioning),
+        conditioning_mean=math.fsum(conditioning) / len(conditioning),
+        closure_error_max=max(closure),
+        length=len(rewards),
+        unsafe_share=sum(value < SAFE_CONDITIONING for value in conditioning) / len(conditioning),
+        fk_error_max=max(fk_errors, default=None),
+        torque_rms=math.hypot(*torques) / math.sqrt(len(torques)) if torques else None,
+        torque_peak=max(map(abs, torques), default=None),
+    )
+
+
+def _fk_errors(states: Sequence[Any]) -> list[float]:
+    """Distances of the observed point P from the true one, m, a value a step; empty if unknown."""
+    if not hasattr(states[0], "platform_position"):
+        return []
+    gaps = np.array([state.fk_position - state.platform_position for state in states])
+    distances: list[float] = np.linalg.norm(gaps, axis=-1).tolist()
+    return distances
+
+
+def _torques(states: Sequence[Any]) -> list[float]:
+    """Torques of the motors, N m, three values a step; empty if unknown."""
+    if not hasattr(states[0], "torque"):
+        return []
+    values: list[float] = np.ravel([state.torque for state in states]).tolist()
+    return values
+
+
+def summarise(records: Sequence[Episode]) -> dict[str, Estimate]:
+    """Return the metrics of an evaluation, each with its 95% interval over episodes.
+
+    Success rates have Wilson intervals, which stay honest at 0 and 1; the others have percentile
+    bootstrap intervals.
+
+    Args:
+        records: The episodes, at least one.
+
+    Returns:
+        ``success_at_end``, ``success_once``, ``return``, ``conditioning_min`` (and the worst),
+        ``conditioning_mean``, ``closure_error_max`` (m, and the worst) and ``unsafe_share``, by
+        name; and, where every episode has it, ``fk_error_max`` (m), ``torque_rms`` and
+        ``torque_peak`` (N m), each with the worst.
+    """
+    lowest = [record.conditioning_min for record in records]
+    largest = [record.closure_error_max for record in records]
+    metrics = {
+        "success_at_end": wilson([record.success_at_end for record in records]),
+        "success_once": wilson([record.success_once for record in records]),
+        "return": bootstrap([record.total_reward for record in records]),
+        "conditioning_min": bootstrap(lowest, worst=min(lowest)),
+        "conditioning_mean": bootstrap([record.conditioning_mean for record in records]),
+        "closure_error_max": bootstrap(largest, worst=max(largest)),
+        "unsafe_share": bootstrap([record.unsafe_share for record in records]),
+    }
+    for name in ("fk_error_max", "torque_rms", "torque_peak"):
+        values = [getattr(record, name) for record in records]
+        if None not in values:
+            metrics[name] = bootstrap(values, worst=max(values))
+    return metrics
+
+
+def wilson(outcomes: Sequence[bool]) -> Estimate:
+    """Return a success rate with its 95% Wilson score interval (Wilson 1927).
+
+    Args:
+        outcomes: One outcome per episode, at least one.
+    """
+    n = len(outcomes)
+    rate = sum(outcomes) / n
+    spread = _Z95**2 / n
+    centre = (rate + spread / 2) / (1 + spread)
+    half = _Z95 / (1 + spread) * math.sqrt(rate * (1 - rate) / n + spread / (4 * n))
+    # At rates of 0 and 1 one end equals the rate but for rounding, which must not exclude the rate.
+    return Estimate(rate, max(0.0, min(rate, centre - half)), min(1.0, max(rate, centre + half)))
+
+
+def bootstrap(values: Sequence[float], worst: float | None = None) -> Estimate:
+    """Return a mean with its 95% percentile bootstrap interval (Efron 1979).
+
+    Args:
+        values: One value per episode, at least one.
+        worst: Passed on to the estimate.
+    """
+    sample = np.asarray(values, dtype=np.float64)  # (n,)
+    rng = np.random.default_rng(_BOOTSTRAP_SEED)
+    # Not all resamples at once: with many episodes their matrix would not fit in memory.
+    means = np.concatenate(
+        [
+            sample[rng.integers(0, sample.size, (_BOOTSTRAP_BLOCK, sample.size))].mean(axis=1)
+            for _ in range(_BOOTSTRAP_SAMPLES // _BOOTSTRAP_BLOCK)
+        ]
+    )
+    low, high = np.percentile(means, [2.5, 97.5])
+    mean = float(sample.mean())
+    # Equal values can differ from their mean by rounding; the interval must still hold the mean.
+    return Estimate(mean, min(mean, float(low)), max(mean, float(high)), worst)

@@ -1,0 +1,363 @@
+"""Taking down a training between two rollouts, and putting it back, to the last bit.
+
+Between two rollouts everything that the next steps depend on is at rest: the last transition is
+stored and the update it led to is done. A training that is put back there does what it would have
+done, with environments in this process or in others, on one thread of one kind of machine.
+
+Three things make a resumed hindsight training look untrained if they are missing: the count of
+steps (from zero, Stable-Baselines3 acts at random for another ``learning_starts`` steps), the
+optimisers, and the episode under way (its first half, joined to another episode in the replay
+buffer, teaches goals that were never reached). All three are restored here.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import random
+import shutil
+import warnings
+from collections import deque
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import gymnasium as gym
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import DictReplayBuffer
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.her import HerReplayBuffer
+
+from tpm_gym import TPMError
+from tpm_gym.learning.checkpoint import Content
+from tpm_gym.learning.export import remove
+from tpm_gym.learning.logger import PROGRESS_FILE
+from tpm_gym.learning.policies import (
+    BEST_FILE,
+    CONFIG_FILE,
+    EVALUATIONS_FILE,
+    EXPORTED,
+    LAST_FILE,
+    TESTS,
+)
+from tpm_gym.learning.provenance import versions, write_whole
+from tpm_gym.learning.rollout import Action, GoalEnv, Observation
+
+RUN_FILES: Final = (
+    CONFIG_FILE,
+    PROGRESS_FILE,
+    EVALUATIONS_FILE,
+    BEST_FILE,
+    *(Path(BEST_FILE).with_suffix(suffix).name for suffix in EXPORTED),
+)
+"""Files of the run folder that belong to a checkpoint: what is in them later is done again."""
+
+_STATE, _TENSORS = "state.json", "torch.pt"
+_COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining")
+_PER_KEY = ("observations", "next_observations")
+_PER_ROW = ("actions", "rewards", "dones", "timeouts", "ep_start", "ep_length")
+
+
+class EpisodeRecorder(gym.Wrapper[Observation, Action, Observation, Action]):
+    """Remembers how the episode under way began and what was done in it.
+
+    The engine keeps memories that cannot be read out, so a snapshot of its state would change what
+    follows, and checkpoints would change the training. Repeating the at most 50 steps of an episode
+    changes nothing, is exact, takes a tenth of a second, and brings the wrappers below along: their
+    counts of steps and sums of rewards.
+
+    Args:
+        env: The environment with all its other wrappers.
+    """
+
+    def __init__(self, env: GoalEnv) -> None:
+        """Start with no episode."""
+        super().__init__(env)
+        self._seed: int | None = None
+        self._rng: dict[str, Any] = {}
+        self._actions: list[Action] = []
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode; training never uses ``options``, and they are not recorded."""
+        self._seed, self._actions = seed, []
+        self._rng = dict(self.unwrapped.np_random.bit_generator.state)
+        return self.env.reset(seed=seed, options=options)
+
+    def step(self, action: Action) -> tuple[Observation, Any, bool, bool, dict[str, Any]]:
+        """Run one control step."""
+        self._actions.append(np.array(action))
+        return self.env.step(action)
+
+    def episode(self) -> dict[str, Any]:
+        """Return the episode under way as plain data."""
+        dtype = str(self._actions[0].dtype) if self._actions else ""
+        actions = [action.tolist() for action in self._actions]
+        return {"seed": self._seed, "rng": self._rng, "dtype": dtype, "actions": actions}
+
+    def replay(self, episode: Mapping[str, Any]) -> Observation | None:
+        """Repeat an episode that :meth:`episode` returned, up to where it was.
+
+        Returns:
+            The last observation; None where the episode could not be repeated, as may happen with
+            another version of the physics.
+        """
+        self.unwrapped.np_random.bit_generator.state = episode["rng"]
+        try:
+            observation, _ = self.reset(seed=episode["seed"])
+            for action in episode["actions"]:
+                observation, *_ = self.step(np.array(action, dtype=episode["dtype"]))
+        except TPMError:
+            return None
+        return observation
+
+
+def capture(
+    model: BaseAlgorithm, run: Path, extra: Mapping[str, Any], finished: bool = False
+) -> Content:
+    """Take down a training between two rollouts.
+
+    Args:
+        model: The algorithm; its environments are wrapped in :class:`EpisodeRecorder`.
+        run: The run folder.
+        extra: Plain data to be kept with it.
+        finished: Whether the training has come to its end.
+
+    Returns:
+        The content of a checkpoint. Its arrays are views of the replay buffer, the rest is copied.
+    """
+    envs, observations = model.env, model._last_obs
+    assert envs is not None
+    assert isinstance(observations, dict)
+    state = {
+        "counters": {name: getattr(model, name) for name in _COUNTERS},
+        "statistics": [list(model.ep_info_buffer or ()), list(model.ep_success_buffer or ())],
+        "log": _pending_log(model),
+        "rng": _rng_state(model),
+        "episodes": envs.env_method("episode"),
+        "versions": versions(),
+        "extra": dict(extra),
+    }
+    files = {
+        _STATE: json.dumps(state, default=lambda scalar: scalar.item()).encode(),
+        _TENSORS: _tensors(model),
+    }
+    files |= {name: (run / name).read_bytes() for name in RUN_FILES if (run / name).is_file()}
+    arrays = {f"last/{name}": np.array(value) for name, value in observations.items()}
+    arrays["episode_starts"] = np.array(model._last_episode_starts)
+    arrays |= {f"buffer/{name}": array for name, array in _buffer_arrays(model).items()}
+    return Content(model.num_timesteps, finished, files, arrays)
+
+
+def restore_files(run: Path, content: Content) -> None:
+    """Cut the files of a run back to the moment of a checkpoint.
+
+    Tests, and what was exported at the end, are deleted: the policy will soon be another.
+    """
+    shutil.rmtree(run / TESTS, ignore_errors=True)
+    remove((run / LAST_FILE).with_suffix(""))
+    for name in RUN_FILES:
+        if name in content.files:
+            data = content.files[name]
+            write_whole(run / name, partial(Path.write_bytes, data=data))
+        else:
+            (run / name).unlink(missing_ok=True)
+
+
+def restore(model: BaseAlgorithm, content: Content) -> tuple[dict[str, Any], list[str]]:
+    """Put a training back to the moment of a checkpoint; ``learn`` then goes on from there.
+
+    Args:
+        model: An algorithm just built with the same arguments, with a logger.
+        content: What :func:`capture` returned.
+
+    Returns:
+        The plain data that was kept with it, and sentences about what keeps the continuation from
+        being exact; none if it is.
+    """
+    state = json.loads(content.files[_STATE])
+    for name, value in state["counters"].items():
+        setattr(model, name, value)
+    size = model._stats_window_size
+    model.ep_info_buffer, model.ep_success_buffer = (
+        deque(entries, maxlen=size) for entries in state["statistics"]
+    )
+    _restore_buffer(model, content.arrays)
+    notes = _version_notes(state["versions"]) + _restore_episodes(model, state, content.arrays)
+    _restore_log(model, state["log"])
+    tensors = _restore_tensors(model, content.files[_TENSORS])
+    _restore_rng(model, state["rng"], tensors)  # last: what is above may draw
+    return state["extra"], notes
+
+
+# -- networks and optimisers ------------------------------------------------------------------
+
+
+def _tensors(model: BaseAlgorithm) -> bytes:
+    """Return networks, optimisers and PyTorch's generators as a file."""
+    _, names = model._get_torch_save_params()
+    content = {
+        "parameters": model.get_parameters(),
+        "variables": {name: getattr(model, name).detach() for name in names},
+        "rng": torch.get_rng_state(),
+        "cuda_rng": torch.cuda.get_rng_state_all() if model.device.type == "cuda" else [],
+    }
+    file = io.BytesIO()
+    torch.save(content, file)
+    return file.getvalue()
+
+
+def _restore_tensors(model: BaseAlgorithm, data: bytes) -> dict[str, Any]:
+    """Put networks and optimisers back; return the content of the file."""
+    content: dict[str, Any] = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    model.set_parameters(content["parameters"], exact_match=True)
+    with torch.no_grad():
+        for name, value in content["variables"].items():
+            getattr(model, name).copy_(value)  # in place: the optimiser holds this very tensor
+    return content
+
+
+# -- random numbers ---------------------------------------------------------------------------
+
+
+def _rng_state(model: BaseAlgorithm) -> dict[str, Any]:
+    """Return the states of the generators outside PyTorch; environments have theirs."""
+    numpy_state: Any = np.random.get_state(legacy=False)  # noqa: NPY002  # what SB3 draws from
+    key = numpy_state["state"]["key"].tolist()
+    return {
+        "python": random.getstate(),
+        "numpy": {**numpy_state, "state": {**numpy_state["state"], "key": key}},
+        "actions": model.action_space.np_random.bit_generator.state,
+    }
+
+
+def _restore_rng(model: BaseAlgorithm, state: Mapping[str, Any], tensors: dict[str, Any]) -> None:
+    """Put the generators back."""
+    version, internal, gauss = state["python"]
+    random.setstate((version, tuple(internal), gauss))
+    key = np.array(state["numpy"]["state"]["key"], dtype=np.uint32)
+    inner = {**state["numpy"]["state"], "key": key}
+    np.random.set_state({**state["numpy"], "state": inner})  # noqa: NPY002
+    model.action_space.np_random.bit_generator.state = state["actions"]
+    torch.set_rng_state(tensors["rng"])
+    if model.device.type == "cuda" and len(tensors["cuda_rng"]) == torch.cuda.device_count():
+        torch.cuda.set_rng_state_all(tensors["cuda_rng"])
+
+
+# -- replay buffer ----------------------------------------------------------------------------
+
+
+def _buffer_arrays(model: BaseAlgorithm) -> dict[str, NDArray[Any]]:
+    """Return views of the filled part of the replay buffer; nothing without one."""
+    buffer = getattr(model, "replay_buffer", None)
+    if not isinstance(buffer, DictReplayBuffer):
+        return {}
+    size = buffer.size()
+    arrays = {"place": np.array([buffer.pos, buffer.full])}
+    for group in _PER_KEY:
+        arrays |= {f"{group}/{key}": rows[:size] for key, rows in getattr(buffer, group).items()}
+    arrays |= {name: getattr(buffer, name)[:size] for name in _PER_ROW if hasattr(buffer, name)}
+    if isinstance(buffer, HerReplayBuffer):
+        arrays["current_ep_start"] = buffer._current_ep_start.copy()
+    return arrays
+
+
+def _restore_buffer(model: BaseAlgorithm, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Fill an empty replay buffer as it was, the bookkeeping of its episodes included."""
+    buffer = getattr(model, "replay_buffer", None)
+    if not isinstance(buffer, DictReplayBuffer):
+        return
+    position, full = arrays["buffer/place"].tolist()
+    buffer.pos, buffer.full = position, bool(full)
+    size = buffer.size()
+    for group in _PER_KEY:
+        for key, rows in getattr(buffer, group).items():
+            rows[:size] = arrays[f"buffer/{group}/{key}"]
+    for name in _PER_ROW:
+        if hasattr(buffer, name):
+            getattr(buffer, name)[:size] = arrays[f"buffer/{name}"]
+    if isinstance(buffer, HerReplayBuffer):
+        buffer._current_ep_start[:] = arrays["buffer/current_ep_start"]
+
+
+# -- environments -----------------------------------------------------------------------------
+
+
+def _restore_episodes(
+    model: BaseAlgorithm, state: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
+) -> list[str]:
+    """Repeat the episodes under way; where that is not exact, end them and start others."""
+    envs = model.env
+    assert envs is not None
+    names = [name for name in arrays if name.startswith("last/")]
+    last = {name.removeprefix("last/"): arrays[name] for name in names}
+    exact = True
+    for index, episode in enumerate(state["episodes"]):
+        (observation,) = envs.env_method("replay", episode, indices=[index])
+        exact = exact and observation is not None
+        if observation is not None:
+            exact = exact and all(
+                np.array_equal(observation[key], rows[index]) for key, rows in last.items()
+            )
+    if exact:
+        model._last_obs, model._last_episode_starts = last, arrays["episode_starts"]
+        return []
+    _start_afresh(model, envs)
+    return ["the episodes under way could not be repeated exactly, so new ones begin"]
+
+
+def _start_afresh(model: BaseAlgorithm, envs: VecEnv) -> None:
+    """Start new episodes, and end those in the replay buffer where they were interrupted."""
+    envs._reset_seeds()  # of the run's first reset, which would begin its first episodes again
+    model._last_obs = envs.reset()  # type: ignore[assignment]
+    model._last_episode_starts = np.ones(envs.num_envs, dtype=bool)
+    buffer = getattr(model, "replay_buffer", None)
+    if isinstance(buffer, HerReplayBuffer):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # it warns of what is wanted here
+            buffer.truncate_last_trajectory()
+
+
+def _version_notes(before: Mapping[str, str | None]) -> list[str]:
+    """Say which versions have changed since."""
+    now = versions()
+    changed = [
+        f"{name} {before.get(name)} -> {now[name]}" for name in now if before.get(name) != now[name]
+    ]
+    return [f"versions have changed ({', '.join(changed)})"] if changed else []
+
+
+# -- log --------------------------------------------------------------------------------------
+
+
+def _pending_log(model: BaseAlgorithm) -> dict[str, Any]:
+    """Return what has been recorded and not yet been written to the log."""
+    logger = model.logger
+    # With their types: a float32 is printed with fewer digits.
+    types = {
+        name: value.dtype.str
+        for name, value in logger.name_to_value.items()
+        if isinstance(value, np.generic)
+    }
+    return {
+        "values": dict(logger.name_to_value),
+        "types": types,
+        "counts": dict(logger.name_to_count),
+        "excluded": dict(logger.name_to_excluded),
+    }
+
+
+def _restore_log(model: BaseAlgorithm, state: Mapping[str, Any]) -> None:
+    """Put back what was recorded and not yet written."""
+    logger = model.logger
+    logger.name_to_value.update(state["values"])
+    for name, dtype in state["types"].items():
+        logger.name_to_value[name] = np.dtype(dtype).type(state["values"][name])
+    logger.name_to_count.update(state["counts"])
+    excluded = {name: tuple(formats) for name, formats in state["excluded"].items()}
+    logger.name_to_excluded.update(excluded)

@@ -1,0 +1,56 @@
+"""Our recipes for rl-baselines3-zoo.
+
+    PYTHONPATH=train python -m rl_zoo3.train --algo sac --env TPMReach-v0 \
+        --gym-packages tpm_gym --conf-file train/zoo.py
+
+The zoo executes this file and takes the name ``hyperparams`` from it. One file of ours is for one
+algorithm, so the algorithm is read off the zoo's command line. Where the zoo would evaluate strings
+as Python, it gets the classes themselves.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import Any
+
+from tpm_gym.learning.features import GoalGapExtractor
+from tpm_gym.learning.hindsight import PenaltyHerReplayBuffer
+from tpm_gym.learning.recipes import read_recipes
+from tpm_gym.resources import RECIPES
+
+
+def hyperparameters(algorithm: str) -> dict[str, dict[str, Any]]:
+    """The recipes of one algorithm, by environment id, as rl-baselines3-zoo wants them.
+
+    Raises:
+        RecipeError: An entry of the file is not valid.
+    """
+    recipes = read_recipes(RECIPES / f"{algorithm}.yml", algorithm)
+    return {env_id: _translate(entries) for env_id, entries in recipes.items()}
+
+
+def _translate(entries: dict[str, Any]) -> dict[str, Any]:
+    """One recipe: classes for their names, a callback for the demonstrations."""
+    translated = dict(entries)
+    if "demonstrations" in translated:
+        arguments = translated.pop("demonstrations")
+        translated["callback"] = [{"demonstrations.Demonstrations": dict(arguments)}]
+    if "replay_buffer_class" in translated:
+        translated["replay_buffer_class"] = PenaltyHerReplayBuffer
+    policy = dict(translated.get("policy_kwargs", {}))
+    if "features_extractor_class" in policy:
+        policy["features_extractor_class"] = GoalGapExtractor
+    if policy:
+        translated["policy_kwargs"] = policy
+    return translated
+
+
+def _algorithm(command_line: list[str]) -> str:
+    """The value of ``--algo``; the zoo's own default without it."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--algo", default="ppo")
+    return str(parser.parse_known_args(command_line)[0].algo)
+
+
+hyperparams = hyperparameters(_algorithm(sys.argv))

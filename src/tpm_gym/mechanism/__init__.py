@@ -1,0 +1,1 @@
+"""The robot as data: bodies, joints, closures, and the files other tools read."""

@@ -1,0 +1,143 @@
+"""What mechanisms are made of: solids, joints, links and loop closures, with mass properties.
+
+Units: metres, radians, kilograms.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Closure", "Joint", "Link", "Solid", "Vector"]
+
+FloatArray = NDArray[np.float64]
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A homogeneous box or cylinder, possibly hollow, fixed to a link.
+
+    Attributes:
+        kind: ``"box"`` with full edge lengths, or ``"cylinder"`` along its own axis.
+        size: Box: edges (x, y, z). Cylinder: (radius, length, 0). In m.
+        centre: Position in the link's frame, m.
+        density: kg/m^3 of the material; zero for parts that are only drawn.
+        bore: Box: edges of the hollow (0 for solid faces). Cylinder: (inner radius, length, 0).
+        axis: Axis of a cylinder in the link's frame: ``"x"``, ``"y"`` or ``"z"``.
+        colour: Name of a colour in :mod:`tpm_gym.mechanism.urdf`.
+        collides: Whether the engine should collide it.
+    """
+
+    kind: Literal["box", "cylinder"]
+    size: Vector
+    centre: Vector
+    density: float
+    bore: Vector = (0.0, 0.0, 0.0)
+    axis: Literal["x", "y", "z"] = "z"
+    colour: str = "grey"
+    collides: bool = False
+
+    @property
+    def mass(self) -> float:
+        """Mass in kg."""
+        return self._mass(self.size) - self._mass(self.bore)
+
+    @property
+    def inertia(self) -> FloatArray:
+        """(3,) kg m^2, principal moments about the centre, along the link's axes."""
+        return self._inertia(self.size) - self._inertia(self.bore)
+
+    def _mass(self, size: Vector) -> float:
+        if self.kind == "box":
+            return self.density * size[0] * size[1] * size[2]
+        return float(self.density * np.pi * size[0] ** 2 * size[1])
+
+    def _inertia(self, size: Vector) -> FloatArray:
+        mass = self._mass(size)
+        if self.kind == "box":
+            squares: FloatArray = np.square(size)
+            return np.asarray(mass / 12 * (squares.sum() - squares))
+        radius, length, _ = size
+        moments = np.full(3, mass * (3 * radius**2 + length**2) / 12)
+        moments["xyz".index(self.axis)] = mass * radius**2 / 2
+        return moments
+
+
+@dataclass(frozen=True)
+class Joint:
+    """How a link hangs on its parent.
+
+    Attributes:
+        name: Name of the joint; the paper's where it has one.
+        kind: URDF joint type.
+        parent: Name of the parent link.
+        origin: Position of the joint in the parent's frame, m.
+        axis: Axis in the joint's frame.
+        lower: Lower limit, rad or m (motors and slide; the others are bounded by the loops).
+        upper: Upper limit, rad or m.
+        effort: Limit of torque or force, N m or N; zero for passive joints.
+        speed: Speed limit, rad/s or m/s; zero for passive joints.
+    """
+
+    name: str
+    kind: Literal["continuous", "revolute", "prismatic"]
+    parent: str
+    origin: Vector
+    axis: Vector = (0.0, 0.0, 1.0)
+    lower: float = 0.0
+    upper: float = 0.0
+    effort: float = 0.0
+    speed: float = 0.0
+
+
+@dataclass(frozen=True)
+class Link:
+    """A rigid body: solids, and the joint that holds it (None for the base)."""
+
+    name: str
+    solids: tuple[Solid, ...]
+    joint: Joint | None = None
+
+    @property
+    def mass(self) -> float:
+        """Mass in kg."""
+        return sum(solid.mass for solid in self.solids)
+
+    @property
+    def centre_of_mass(self) -> FloatArray:
+        """(3,) m, in the link's frame."""
+        weighted = sum(solid.mass * np.asarray(solid.centre) for solid in self.solids)
+        return np.asarray(weighted) / self.mass
+
+    @property
+    def inertia(self) -> FloatArray:
+        """(3, 3) kg m^2 about the centre of mass, along the link's axes."""
+        total = np.zeros((3, 3))
+        for solid in self.solids:
+            arm = np.asarray(solid.centre) - self.centre_of_mass
+            steiner = solid.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+            total += np.diag(solid.inertia) + steiner
+        return total
+
+
+@dataclass(frozen=True)
+class Closure:
+    """A ball joint that closes a loop: two points that must coincide.
+
+    Attributes:
+        name: Name of the joint; the paper's where it has one.
+        link_a: Link on one side.
+        point_a: Point in the frame of ``link_a``, m.
+        link_b: Link on the other side.
+        point_b: Point in the frame of ``link_b``, m.
+    """
+
+    name: str
+    link_a: str
+    point_a: Vector
+    link_b: str
+    point_b: Vector

@@ -1,0 +1,1 @@
+"""Trained policies without pickle; :mod:`tpm_gym.policy.policy` needs PyTorch."""

@@ -1,0 +1,220 @@
+"""Trained policies at work: loaded from safetensors and JSON, run by PyTorch alone.
+
+Loading needs neither Stable-Baselines3 nor trust: see :mod:`tpm_gym.policy.files`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.envs.registration import EnvSpec
+from numpy.typing import NDArray
+
+from tpm_gym.errors import (
+    ConfigurationError,
+    InputError,
+    MissingPackageError,
+    PolicyMismatchError,
+)
+from tpm_gym.policy.files import Description, read_description, read_weights
+
+try:
+    import torch
+except ImportError as error:
+    raise MissingPackageError("torch", "policy") from error
+
+__all__ = ["Policy", "load_policy"]
+
+_ACTIVATIONS = {"relu": torch.relu, "tanh": torch.tanh}
+
+
+def load_policy(path: str | Path) -> Policy:
+    """Load a policy that train/export.py wrote. Nothing in its files is executed or unpickled.
+
+    Args:
+        path: ``NAME.json``, ``NAME.safetensors`` or ``NAME``; both files have to be there.
+
+    Raises:
+        PolicyFileError: A file is missing, damaged, too large or not what it has to be, or the
+            path names an archive of Stable-Baselines3, which only unpickling could read.
+        MissingPackageError: safetensors is not installed.
+    """
+    description = read_description(path)
+    return Policy(description, read_weights(path, description))
+
+
+class Policy:
+    """The mean action of a trained policy.
+
+    Args:
+        description: What the policy is.
+        weights: Weights by name, of the shapes of ``description.shapes``.
+
+    Attributes:
+        description: What the policy is: environment, algorithm, recipe, spaces, versions, network.
+    """
+
+    def __init__(
+        self, description: Description, weights: Mapping[str, NDArray[np.float32]]
+    ) -> None:
+        """Build the network."""
+        self.description = description
+        tensors = {name: torch.from_numpy(values) for name, values in weights.items()}
+        self._layers = [
+            (tensors[f"layers.{i}.weight"], tensors[f"layers.{i}.bias"])
+            for i in range(len(description.network.hidden) + 1)
+        ]
+
+    def act(self, observation: Mapping[str, Any]) -> NDArray[Any]:
+        """The action for an observation, or the actions for a batch of them.
+
+        Args:
+            observation: Arrays of the shapes of the observation space, or all with one more axis
+                in front for a batch of n.
+
+        Returns:
+            The action, in the shape, dtype and bounds of the action space; (n, ...) for a batch.
+
+        Raises:
+            InputError: An entry is missing, unknown, of the wrong shape or not finite.
+        """
+        entries, batched = self._check_observation(observation)
+        network = self.description.network
+        with torch.inference_mode():
+            x = self._features(entries)
+            for weight, bias in self._layers[:-1]:
+                x = torch.nn.functional.linear(x, weight, bias)
+                x = _ACTIVATIONS[network.activation](x)
+            x = torch.nn.functional.linear(x, *self._layers[-1])
+            if network.output == "tanh":
+                x = torch.tanh(x)
+        space = self.description.action_space
+        actions: NDArray[Any] = x.numpy().reshape(-1, *space.shape)
+        if network.output == "tanh":
+            actions = space.low + 0.5 * (actions + 1.0) * (space.high - space.low)
+        else:
+            actions = np.clip(actions, space.low, space.high)
+        found = actions.astype(space.dtype)
+        return found if batched else np.asarray(found[0])
+
+    def predict(
+        self,
+        observation: Mapping[str, Any],
+        state: None = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> tuple[NDArray[Any], None]:
+        """The same as ``act`` for callers that expect the interface of Stable-Baselines3.
+
+        Args:
+            observation: As for ``act``.
+            state: Ignored: the policy has no memory.
+            episode_start: Ignored.
+            deterministic: Must be true; only the mean action is on file.
+
+        Returns:
+            The action or actions, and None.
+
+        Raises:
+            ConfigurationError: A random action was asked for.
+            InputError: As for ``act``.
+        """
+        if not deterministic:
+            raise ConfigurationError(
+                "deterministic", deterministic, "True; an exported policy has no random actions"
+            )
+        return self.act(observation), None
+
+    def check(self, env: Any) -> None:
+        """Make sure that the policy fits an environment.
+
+        Spaces are compared, and between environments of tpm_gym whether actions are Cartesian or
+        joint increments, which spaces do not tell.
+
+        Args:
+            env: An environment of Gymnasium, wrapped or not, or a vector of Stable-Baselines3.
+
+        Raises:
+            PolicyMismatchError: It has other observations or actions.
+            InputError: It is no environment.
+        """
+        wanted = self.description
+        if not hasattr(env, "observation_space") or not hasattr(env, "action_space"):
+            raise InputError("env", env, f"an environment, such as gym.make({wanted.env_id!r})")
+        for kind in ("observation_space", "action_space"):
+            trained, given = getattr(wanted, kind), getattr(env, kind)
+            if trained != given:
+                name = kind.replace("_", " ")
+                raise PolicyMismatchError(name, trained, given, wanted.env_id)
+        own, found = _control(gym.registry.get(wanted.env_id)), _control(_spec(env))
+        if own and found and own != found:
+            raise PolicyMismatchError("control", own, found, wanted.env_id)
+
+    def __repr__(self) -> str:
+        """Name the policy and its origin."""
+        about = self.description
+        return f"<Policy of {about.env_id}, {about.algorithm}, seed {about.seed}>"
+
+    def _check_observation(
+        self, observation: Mapping[str, Any]
+    ) -> tuple[dict[str, torch.Tensor], bool]:
+        """The entries as float32 (n, size), and whether they came as a batch."""
+        boxes = self.description.observation_space
+        if not isinstance(observation, Mapping) or set(observation) != set(boxes):
+            given = sorted(observation) if isinstance(observation, Mapping) else type(observation)
+            raise InputError("observation", given, f"a mapping with the keys {', '.join(boxes)}")
+        arrays: dict[str, NDArray[np.float32]] = {}
+        leading: set[tuple[int, ...]] = set()
+        for name, box in boxes.items():
+            shape = box.shape or ()
+            values = _as_float32(name, observation[name])
+            batch = values.shape[: values.ndim - len(shape)]
+            if values.shape != batch + shape or len(batch) > 1:
+                raise InputError(name, values.shape, f"of shape {shape} or (n, *{shape}), by shape")
+            if not np.isfinite(values).all():
+                raise InputError(name, values[~np.isfinite(values)][0], "finite")
+            arrays[name] = values.reshape(-1, math.prod(shape))
+            leading.add(batch)
+        if len(leading) > 1:
+            raise InputError("observation", sorted(leading), "of one batch size in all entries")
+        # A copy: PyTorch warns of arrays that must not be written to.
+        tensors = {name: torch.from_numpy(values.copy()) for name, values in arrays.items()}
+        return tensors, leading != {()}
+
+    def _features(self, entries: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        """What the first layer sees, (n, size)."""
+        network = self.description.network
+        if network.features == "concatenate":
+            return torch.cat([entries[key] for key in network.keys], dim=1)
+        gap = entries["desired_goal"] - entries["achieved_goal"]
+        return torch.cat([entries["observation"], gap / network.unit], dim=1)
+
+
+def _as_float32(name: str, value: Any) -> NDArray[np.float32]:
+    """An entry of an observation as an array; infinite where a number is too large."""
+    if isinstance(value, np.ndarray) and value.dtype == np.float32:
+        return value
+    try:
+        with np.errstate(over="ignore"):
+            return np.asarray(value, dtype=np.float32)
+    except (TypeError, ValueError) as error:
+        raise InputError(name, value, "an array of numbers") from error
+
+
+def _spec(env: Any) -> EnvSpec | None:
+    """What an environment was made from, the first of a vector; None where it does not say."""
+    spec = getattr(getattr(env, "unwrapped", env), "spec", None)
+    if spec is None and hasattr(env, "get_attr"):
+        spec = env.get_attr("spec")[0]
+    found: EnvSpec | None = spec
+    return found
+
+
+def _control(spec: EnvSpec | None) -> str | None:
+    """How the actions of an environment of tpm_gym move the platform; None of others."""
+    return None if spec is None else spec.kwargs.get("control")

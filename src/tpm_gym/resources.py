@@ -1,0 +1,24 @@
+"""Where the files are that come with the package: robot descriptions, recipes, trained policies.
+
+The wheel carries them in ``tpm_gym/data``; in a checkout they are where people look for them.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+__all__ = ["POLICIES", "RECIPES", "URDF"]
+
+_PACKAGED: Final = Path(__file__).parent / "data"
+_CHECKOUT: Final = Path(__file__).parents[2]
+
+
+def _folder(name: str, in_checkout: str) -> Path:
+    packaged = _PACKAGED / name
+    return packaged if packaged.is_dir() else _CHECKOUT / in_checkout
+
+
+URDF: Final = _folder("urdf", "urdf")
+RECIPES: Final = _folder("recipes", "train/recipes")
+POLICIES: Final = _folder("policies", "train/policies")

@@ -1,0 +1,1 @@
+"""What moves the robot: state, randomisation, the simulation and its engines."""

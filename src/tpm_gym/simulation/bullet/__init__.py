@@ -1,0 +1,1 @@
+"""PyBullet as an engine; the only package that imports it."""

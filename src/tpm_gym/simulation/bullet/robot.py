@@ -1,0 +1,220 @@
+"""The robot inside a physics client: three legs, loop closures, motors, encoders, and the truth.
+
+Each leg of the spanning tree is a multibody of its own, so that every loop closure joins two
+different multibodies. That is not a matter of taste: where both ends lie in one multibody, Bullet's
+direct solvers go wrong and lose the loops at once; between multibodies they are exact
+(docs/fidelity.md). It also shortens every row of the constraint solver.
+
+The client is handed in (see :mod:`tpm_gym.simulation.simulation`), so this module does not import the engine.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tpm_gym.errors import ConfigurationError
+from tpm_gym.mechanism import urdf
+from tpm_gym.mechanism.bodies import Vector
+from tpm_gym.mechanism.links import CUP_PRELOAD, MOTOR_EFFORT
+from tpm_gym.mechanism.tree import ACTUATED_JOINTS, Mechanism, Mount
+from tpm_gym.simulation.physics import MOTOR_GAIN, Quaternion, rotate, transform
+
+__all__ = ["Robot"]
+
+Frame = tuple[Vector, Quaternion]
+"""Origin (m) and orientation (x, y, z, w) of a link in the world."""
+
+
+Address = tuple[int, int]
+"""A body in the client, and one of its links (or the joint above it)."""
+
+_CLOSURE_FORCE = 1e6  # N; the loops never yield
+_SPRING_GAIN = 0.2  # share of its way back that the cup's spring takes in one time step
+
+
+class Robot:
+    """The mechanism as one multibody a leg, with closed loops.
+
+    Args:
+        client: The physics client.
+        mechanism: What to load.
+        mount: Where the base hangs.
+    """
+
+    def __init__(self, client: Any, mechanism: Mechanism, mount: Mount) -> None:
+        """Load the legs, take out what the engine adds on its own, close the loops."""
+        self._client, self._mechanism = client, mechanism
+        self._joints: dict[str, Address] = {}
+        self._links: dict[str, Address] = {}
+        self.bodies = [self._load(leg, mount) for leg in mechanism.legs()]
+        self._motors = [self._joints[name] for name in ACTUATED_JOINTS]
+        self._inertias = {link: self._inertia(link) for link in self._links.values()}
+        self._effort = [MOTOR_EFFORT] * 3
+        self._platform = self._links[mechanism.platform]
+        self.tool = self._links[mechanism.tool]
+        client.setJointMotorControl2(
+            *self.tool,
+            client.POSITION_CONTROL,
+            targetPosition=0.0,
+            force=CUP_PRELOAD,
+            positionGain=_SPRING_GAIN,
+        )
+        self._close_loops()
+
+    def _load(self, leg: Mechanism, mount: Mount) -> int:
+        client = self._client
+        with tempfile.TemporaryDirectory() as folder:
+            path, _ = urdf.write(Path(folder), leg)
+            body: int = client.loadURDF(
+                str(path),
+                basePosition=mount.to_world((0.0, 0.0, 0.0)).tolist(),
+                baseOrientation=mount.quaternion,
+                useFixedBase=True,
+                flags=client.URDF_USE_INERTIA_FROM_FILE | client.URDF_USE_IMPLICIT_CYLINDER,
+            )
+        for index in range(client.getNumJoints(body)):
+            info = client.getJointInfo(body, index)
+            self._joints[info[1].decode()] = self._links[info[12].decode()] = (body, index)
+            # PyBullet adds damping to everything and a motor to every joint; we want neither.
+            client.changeDynamics(
+                body, index, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0
+            )
+            client.setJointMotorControl2(body, index, client.VELOCITY_CONTROL, force=0.0)
+        return body
+
+    def _inertia(self, link: Address) -> tuple[float, Vector]:
+        """Mass and principal moments as loaded."""
+        info = self._client.getDynamicsInfo(*link)
+        return info[0], info[2]
+
+    def _close_loops(self) -> None:
+        """Close the loops; the engine wants pivots relative to the centres of mass."""
+        client = self._client
+        self._pairs: list[tuple[tuple[Address, Vector], tuple[Address, Vector]]] = []
+        for closure in self._mechanism.closures:
+            sides = ((closure.link_a, closure.point_a), (closure.link_b, closure.point_b))
+            (body_a, link_a), (body_b, link_b) = (self._links[name] for name, _ in sides)
+            pivots = [self._pivot(name, point) for name, point in sides]
+            constraint = client.createConstraint(
+                body_a,
+                link_a,
+                body_b,
+                link_b,
+                client.JOINT_POINT2POINT,
+                (0.0, 0.0, 0.0),
+                pivots[0].tolist(),
+                pivots[1].tolist(),
+            )
+            client.changeConstraint(constraint, maxForce=_CLOSURE_FORCE)
+            end_a, end_b = ((self._links[name], point) for name, point in sides)
+            self._pairs.append((end_a, end_b))
+        # One call of the engine a leg is cheaper than one a link.
+        self._watched: dict[int, list[int]] = {}
+        for body, link in sorted(
+            {self._platform, *(end[0] for pair in self._pairs for end in pair)}
+        ):
+            self._watched.setdefault(body, []).append(link)
+
+    def _pivot(self, name: str, point: Vector) -> NDArray[np.float64]:
+        """A link's point relative to its centre of mass, m.
+
+        Raises:
+            ConfigurationError: If the link has products of inertia: the engine would turn its
+                inertial frame onto the principal axes, and the loop would not close there.
+        """
+        link = self._mechanism.link(name)
+        if not np.allclose(link.inertia, np.diag(np.diag(link.inertia)), rtol=0.0, atol=1e-12):
+            valid = "links whose principal axes of inertia are the axes of their frame"
+            raise ConfigurationError("mechanism", name, valid)
+        relative: NDArray[np.float64] = np.asarray(point) - link.centre_of_mass
+        return relative
+
+    def paint(self) -> None:
+        """Give each link the colour of its largest solid.
+
+        The engine's OpenGL pictures know one colour a link and take that of the last solid; the
+        software renderer needs no help.
+        """
+        for link in self._mechanism.links:
+            largest = max(link.solids, key=lambda solid: float(np.prod(np.abs(solid.size[:2]))))
+            places = (
+                [(body, -1) for body in self.bodies]
+                if link.joint is None
+                else [self._links[link.name]]
+            )
+            for place in places:
+                self._client.changeVisualShape(*place, rgbaColor=urdf.COLOURS[largest.colour])
+
+    def place(self, angles: Mapping[str, float]) -> None:
+        """Put every joint at its angle (rad), at rest."""
+        for name, angle in angles.items():
+            self._client.resetJointState(*self._joints[name], angle, 0.0)
+
+    def alter(self, mass_factors: Sequence[float], motor_strength: Sequence[float]) -> None:
+        """Scale the masses of the moving links (empty: all nominal) and the motors' torques."""
+        factors = mass_factors or [1.0] * len(self._inertias)
+        for (link, (mass, moments)), factor in zip(self._inertias.items(), factors, strict=True):
+            self._client.changeDynamics(
+                *link,
+                mass=factor * mass,
+                localInertiaDiagonal=[factor * moment for moment in moments],
+            )
+        self._effort = [MOTOR_EFFORT * strength for strength in motor_strength]
+
+    def drive(self, theta: Vector) -> None:
+        """Let the motors go to ``theta`` rad within the next time step, effort permitting."""
+        turn, mode = self._client.setJointMotorControl2, self._client.POSITION_CONTROL
+        for (body, joint), angle, effort in zip(self._motors, theta, self._effort, strict=True):
+            # Target angle and rate, largest torque, gain; as keywords they cost half as much again.
+            turn(body, joint, mode, angle, 0.0, effort, MOTOR_GAIN)
+
+    def encoders(self) -> tuple[Vector, Vector]:
+        """True angles (rad) and rates (rad/s) of the motors."""
+        state, (first, second, third) = self._client.getJointState, self._motors
+        a, b, c = state(*first), state(*second), state(*third)
+        return (a[0], b[0], c[0]), (a[1], b[1], c[1])
+
+    def torques(self) -> Vector:
+        """What the motors applied in the last time step, N m."""
+        state, (first, second, third) = self._client.getJointState, self._motors
+        return state(*first)[3], state(*second)[3], state(*third)[3]
+
+    def joint_states(self) -> tuple[tuple[float, float], ...]:
+        """Angle and rate of every joint, passive ones too."""
+        states = (self._client.getJointState(*joint) for joint in self._joints.values())
+        return tuple((state[0], state[1]) for state in states)
+
+    def set_joint_states(self, states: tuple[tuple[float, float], ...]) -> None:
+        """Put every joint at an angle and rate that :meth:`joint_states` gave."""
+        for joint, (angle, rate) in zip(self._joints.values(), states, strict=True):
+            self._client.resetJointState(*joint, angle, rate)
+
+    def truth(self) -> tuple[float, Vector, float]:
+        """Largest loop gap (m), platform position (m, world) and platform tilt (rad)."""
+        frames: dict[Address, Frame] = {}
+        for body, links in self._watched.items():
+            states = self._client.getLinkStates(body, links, computeForwardKinematics=True)
+            for link, state in zip(links, states, strict=True):
+                frames[body, link] = state[4], state[5]
+        squared = 0.0
+        for (link_a, point_a), (link_b, point_b) in self._pairs:
+            x, y, z = transform(*frames[link_a], point_a)
+            u, v, w = transform(*frames[link_b], point_b)
+            squared = max(squared, (x - u) ** 2 + (y - v) ** 2 + (z - w) ** 2)
+        origin, turn = frames[self._platform]
+        # The platform should stand as the base does: a half turn about x, quaternion (1, 0, 0, 0).
+        tilt = 2 * math.asin(min(1.0, math.hypot(*turn[1:])))
+        return math.sqrt(squared), transform(origin, turn, self._mechanism.point_p), tilt
+
+    def cup(self) -> tuple[Vector, Vector]:
+        """Centre of the cup's lip (m) and the cup's outward axis, world."""
+        state = self._client.getLinkState(*self.tool, computeForwardKinematics=True)
+        origin, turn = state[4], state[5]
+        return transform(origin, turn, self._mechanism.lip), rotate(turn, (0.0, 0.0, 1.0))

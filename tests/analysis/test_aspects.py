@@ -1,0 +1,307 @@
+"""Reachable sets, aspects and boxes are what brute force on the oracle's factors says they are."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import asdict, replace
+from itertools import product
+
+import numpy as np
+import oracle
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+from numpy.typing import NDArray
+
+import tpm_gym
+from tpm_gym.analysis import aspects, singularity
+from tpm_gym.analysis.aspects import Aspect, Cells
+from tpm_gym.errors import ConfigurationError
+from tpm_gym.kinematics import ELBOWS_OUT, WORKING_MODES, WorkingMode, inverse_all, workspace
+from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
+
+FloatArray = NDArray[np.float64]
+COARSE, FINE = (32, 8, 48), (64, 16, 96)
+modes = st.sampled_from(WORKING_MODES)
+
+
+def signs(points: FloatArray, mode: WorkingMode, g: Geometry) -> FloatArray:
+    """Signs (..., 3) of the parallel factors by the oracle; NaN where not reachable."""
+    found = inverse_all(points, g)
+    theta, beta = found.theta[..., mode.index, :], found.beta[..., mode.index]
+    x_c = points[..., 0] - g.l2 - g.l7 * np.cos(beta)
+    parallel, _ = oracle.factors(theta, x_c, points[..., 2] - 2 * g.l6, beta, g)
+    return np.sign(parallel)
+
+
+def of(aspect: Aspect) -> list[int]:
+    """The signs that an aspect claims, as ``signs`` has them."""
+    return [aspect.assembly.sin_beta, aspect.level3, aspect.assembly.planar]
+
+
+def all_centres(cells: Cells) -> FloatArray:
+    return replace(cells, mask=np.ones_like(cells.mask)).centres()
+
+
+@settings(derandomize=True, max_examples=20, deadline=None)
+@given(oracle.geometries(), oracle.seeds(), modes)
+def test_the_grid_covers_the_reachable_set(g: Geometry, seed: int, mode: WorkingMode) -> None:
+    cells = aspects.reachable_set(mode, g, (24, 6, 24)).cells
+    reachable = workspace.reachable(all_centres(cells), mode, g)
+    np.testing.assert_array_equal(cells.mask.ravel(), reachable)
+    np.testing.assert_array_equal(workspace.reachable(cells.centres(), mode, g), True)
+    points = oracle.reachable_points(np.random.default_rng(seed), 300, g)
+    points = points[workspace.reachable(points, mode, g)]
+    high = np.asarray(cells.low) + np.asarray(cells.spacing) * cells.mask.shape
+    assert ((points >= cells.low) & (points <= high + 1e-12)).all()
+    np.testing.assert_array_equal(cells.mask, cells.mask[:, ::-1])
+
+
+@pytest.mark.parametrize("mode", [ELBOWS_OUT, WORKING_MODES[0]])
+def test_volumes_are_those_of_monte_carlo_within_the_stated_error(mode: WorkingMode) -> None:
+    coarse, fine = (aspects.reachable_set(mode, shape=shape).cells for shape in (COARSE, FINE))
+    rng = np.random.default_rng(1)
+    low, high = [-1.6, -PAPER.l7, -1.3], [1.6, PAPER.l7, 1.3]
+    draws = rng.uniform(low, high, (400_000, 3))
+    inside = workspace.reachable(draws, mode)
+    box = np.prod(np.subtract(high, low))
+    volume, noise = box * inside.mean(), box * inside.std() / np.sqrt(len(draws))
+    for cells in (coarse, fine):
+        assert abs(cells.volume - volume) < cells.volume_error + 3 * noise
+    # and the statement is neither lax nor beyond first order
+    assert coarse.volume_error < 0.12 * coarse.volume
+    assert 1.7 < coarse.volume_error / fine.volume_error < 2.3
+
+
+def test_volumes_of_aspects_converge() -> None:
+    coarse, fine = (aspects.aspects(shape=shape) for shape in (COARSE, FINE))
+    for one, other in zip(coarse[:6], fine[:6], strict=True):
+        assert of(one) == of(other)
+        assert abs(one.cells.volume - other.cells.volume) < one.cells.volume_error
+        assert other.cells.volume_error < 0.75 * one.cells.volume_error
+    assert coarse[0].cells.volume == pytest.approx(fine[0].cells.volume, rel=0.01)
+
+
+def test_volume_error_counts_no_flat_faces() -> None:
+    mask = np.zeros((6, 4, 6), dtype=bool)
+    mask[1:5, 2:, 1:5] = True  # against y = 0 and y = l7; 12 of 16 columns are on the rim
+    cells = Cells((0, 0, 0), (1, 1, 1), mask)
+    assert cells.volume == 32
+    assert cells.volume_error == 0.5 * 2 * 16  # 16 cells outside touch the rim, a layer
+    assert len(cells.centres()) == 32
+    assert cells.centres()[0].tolist() == [1.5, 2.5, 1.5]
+
+
+@settings(derandomize=True, max_examples=20, deadline=None)
+@given(oracle.geometries(), modes)
+def test_aspects_part_the_reachable_set_by_signs(g: Geometry, mode: WorkingMode) -> None:
+    shape = (24, 6, 24)
+    found = aspects.aspects(mode, g, shape, min_cells=1)
+    reachable = aspects.reachable_set(mode, g, shape).cells
+    np.testing.assert_array_equal(sum(a.cells.mask.astype(int) for a in found), reachable.mask)
+    volumes = [a.cells.volume for a in found]
+    assert volumes == sorted(volumes, reverse=True)
+    for aspect in found:
+        assert (signs(aspect.cells.centres(), mode, g) == of(aspect)).all()
+        assert (aspect.branch, aspect.geometry) == (mode, g)
+    # y -> -y turns every aspect into another
+    masks = {(*of(a), a.cells.mask.tobytes()) for a in found}
+    mirrored = {
+        (-of(a)[0], *of(a)[1:], np.ascontiguousarray(a.cells.mask[:, ::-1]).tobytes())
+        for a in found
+    }
+    assert masks == mirrored
+    kept = aspects.aspects(mode, g, shape, min_cells=5)
+    assert len(kept) == sum(a.cells.mask.sum() >= 5 for a in found)
+
+
+@settings(derandomize=True, max_examples=15, deadline=None)
+@given(oracle.geometries(), modes, st.sampled_from([0.5, 4.0]))
+def test_sets_scale_with_the_lengths(g: Geometry, mode: WorkingMode, factor: float) -> None:
+    bigger = Geometry(**{name: factor * length for name, length in asdict(g).items()})
+    shape = (16, 4, 16)
+    pairs = zip(aspects.aspects(mode, g, shape), aspects.aspects(mode, bigger, shape), strict=True)
+    for one, other in pairs:
+        np.testing.assert_array_equal(one.cells.mask, other.cells.mask)
+        assert of(one) == of(other)
+        assert other.cells.volume == pytest.approx(factor**3 * one.cells.volume)
+        try:
+            box = aspects.largest_box(one, 0.02)
+        except ConfigurationError:
+            continue
+        scaled = aspects.largest_box(other, 0.02)
+        np.testing.assert_allclose(scaled.region.low, np.multiply(factor, box.region.low))
+        np.testing.assert_allclose(scaled.region.high, np.multiply(factor, box.region.high))
+        assert scaled.conditioning == pytest.approx(box.conditioning)
+
+
+def flood_fill(codes: NDArray[np.int64]) -> list[frozenset[tuple[int, ...]]]:
+    """Connected sets of equal codes, one cell at a time."""
+    waiting, found = set(np.ndindex(codes.shape)), []
+    while waiting:
+        seed = waiting.pop()
+        members, queue = {seed}, deque([seed])
+        while queue:
+            cell = queue.popleft()
+            for axis, step in product(range(3), (-1, 1)):
+                other = tuple(c + step * (axis == a) for a, c in enumerate(cell))
+                if other in waiting and codes[other] == codes[cell]:
+                    waiting.remove(other)
+                    members.add(other)
+                    queue.append(other)
+        found.append(frozenset(members))
+    return found
+
+
+shapes = st.tuples(*[st.integers(1, 6)] * 3)
+
+
+@settings(derandomize=True, max_examples=150, deadline=None)
+@given(arrays.arrays(np.int64, shapes, elements=st.integers(-1, 1)))
+def test_components_are_those_of_a_flood_fill(codes: NDArray[np.int64]) -> None:
+    labels = aspects._components(codes)
+    members = [
+        frozenset(tuple(c) for c in np.argwhere(labels == name).tolist())
+        for name in np.unique(labels)
+    ]
+    assert set(members) == set(flood_fill(codes))
+
+
+def best_by_trying(mask: NDArray[np.bool_]) -> int:
+    best = 0
+    ranges = [[(a, b) for a in range(n) for b in range(a + 1, n)] for n in mask.shape]
+    for (a, b), (c, d), (e, f) in product(*ranges):
+        if mask[a : b + 1, c : d + 1, e : f + 1].all():
+            best = max(best, (b - a) * (d - c) * (f - e))
+    return best
+
+
+@settings(derandomize=True, max_examples=200, deadline=None)
+@given(shapes, oracle.seeds(), st.floats(0.4, 1.0))
+def test_largest_block_is_that_of_trying_all(
+    shape: tuple[int, int, int], seed: int, density: float
+) -> None:
+    mask = np.random.default_rng(seed).random(shape) < density
+    found, best = aspects._largest_block(mask), best_by_trying(mask)
+    if found is None:
+        assert best == 0
+        return
+    first, last = found
+    assert np.prod(np.subtract(last, first)) == best
+    assert mask[tuple(slice(a, b + 1) for a, b in zip(first, last, strict=True))].all()
+
+
+@pytest.mark.parametrize("threshold", [0.0, 0.05, 0.1])
+def test_boxes_are_in_the_aspect_and_conditioned_well(threshold: float) -> None:
+    aspect = aspects.aspects(shape=FINE)[1]
+    box = aspects.largest_box(aspect, threshold)
+    sides = [np.linspace(*ends, 14) for ends in zip(box.region.low, box.region.high, strict=True)]
+    points = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 3)
+    assert (signs(points, aspect.branch, PAPER) == of(aspect)).all()
+    values = workspace.conditioning_at(points, aspect.branch, aspect.assembly)
+    assert values.min() > 0.97 * threshold  # between the nodes, too
+    assert values.min() == pytest.approx(box.conditioning, rel=0.03)
+    assert box.conditioning >= threshold
+    assert box.volume == pytest.approx(np.prod(np.subtract(box.region.high, box.region.low)))
+    centres = aspect.cells.centres()
+    for corner in (box.region.low, box.region.high):
+        assert np.abs(centres - corner).max(axis=-1).min() < 1e-12
+    if threshold:
+        assert box.volume < aspects.largest_box(aspect, threshold / 2).volume
+
+
+@pytest.mark.parametrize("rank", [0, 3, 5])
+def test_samples_are_uniform_over_the_aspect_itself(rank: int) -> None:
+    aspect, count = aspects.aspects(shape=COARSE)[rank], 20_000
+    points = aspects.sample(np.random.default_rng(2), aspect, count)
+    assert points.shape == (count, 3)
+    assert (signs(points, ELBOWS_OUT, PAPER) == of(aspect)).all()
+    # Planes through faces of a far finer grid part the samples as they part its cells
+    fine = aspects.aspects(shape=(96, 24, 144))[rank]
+    assert of(fine) == of(aspect)
+    centres = fine.cells.centres()
+    edges = fine.cells.spacing
+    middle = fine.cells.low + np.round((centres.mean(axis=0) - fine.cells.low) / edges) * edges
+    for axis in range(3):
+        share = (centres[:, axis] < middle[axis]).mean()
+        assert abs((points[:, axis] < middle[axis]).mean() - share) < 0.02
+    # Cells whose centres are outside take part, others are not filled to the brim
+    corner = np.floor((points - aspect.cells.low) / aspect.cells.spacing).astype(int)
+    own = aspect.cells.mask[tuple(corner.T)]
+    assert 0.5 < own.mean() < 0.999
+
+
+def test_samples_depend_on_the_rng_alone_and_are_not_singular() -> None:
+    aspect = aspects.aspects(shape=COARSE)[0]
+    first, second = (aspects.sample(np.random.default_rng(3), aspect, 50) for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+    assert len(np.unique(first, axis=0)) == 50
+    found = singularity.nearest_singularity(first, aspect.branch, aspect.assembly)
+    assert found.valid.all()
+    assert (found.distance > 0).all()
+    assert aspects.sample(np.random.default_rng(3), aspect, 0).shape == (0, 3)
+
+
+@pytest.mark.parametrize(
+    "shape", [(8, 8), (8, 7, 8), (1, 8, 8), (8, 8, 0), (8.5, 8, 8), (8, -2, 8), (8, 8, 8, 8)]
+)
+def test_grids_that_are_none_are_refused(shape: tuple[int, int, int]) -> None:
+    for function in (aspects.reachable_set, aspects.aspects):
+        with pytest.raises(ConfigurationError) as caught:
+            function(ELBOWS_OUT, PAPER, shape)
+        assert caught.value.name == "shape"
+        assert caught.value.value == shape
+
+
+def test_bad_arguments_are_refused() -> None:
+    aspect = aspects.aspects(shape=COARSE)[0]
+    for threshold in (-0.1, 1.1, float("nan"), 0.9):  # no box is as good as the last
+        with pytest.raises(ConfigurationError) as caught:
+            aspects.largest_box(aspect, threshold)
+        assert caught.value.name == "threshold"
+    rng = np.random.default_rng(4)
+    with pytest.raises(ConfigurationError, match="count"):
+        aspects.sample(rng, aspect, -1)
+    empty = replace(aspect, cells=replace(aspect.cells, mask=np.zeros(COARSE, dtype=bool)))
+    with pytest.raises(ConfigurationError, match="aspect"):
+        aspects.sample(rng, empty, 1)
+    with pytest.raises(ConfigurationError, match="min_cells"):
+        aspects.aspects(min_cells=0)
+
+
+def test_mechanisms_that_reach_nothing_have_no_aspects() -> None:
+    g = Geometry(l1=0.3, l2=1.5, l3=0.2, l4=0.15, l5=0.02, l6=0.0, l7=0.05)
+    assert aspects.aspects(geometry=g, shape=COARSE) == ()
+    assert aspects.reachable_set(geometry=g, shape=COARSE).cells.volume == 0
+    assert aspects.reachable_set(geometry=g, shape=COARSE).cells.volume_error == 0
+
+
+def largest(g: Geometry, shape: tuple[int, int, int]) -> aspects.Box:
+    """The largest box with conditioning 0.1, y > 0 (y < 0 mirrors it), over all aspects."""
+    boxes = []
+    for aspect in aspects.aspects(geometry=g, shape=shape):
+        if aspect.assembly.sin_beta > 0:
+            try:
+                boxes.append(aspects.largest_box(aspect, 0.1))
+            except ConfigurationError:
+                continue
+    return max(boxes, key=lambda box: box.volume)
+
+
+def test_wide_is_the_paper_s_mechanism_with_a_deeper_workspace() -> None:
+    assert tpm_gym.WIDE is WIDE
+    assert replace(WIDE, l7=PAPER.l7) == PAPER
+    narrow, wide = (largest(g, (32, 24, 48)) for g in (PAPER, WIDE))
+    depth = np.subtract(wide.region.high, wide.region.low)[1]
+    assert depth > 0.25
+    assert wide.volume > 10 * narrow.volume
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shape", [(64, 32, 80), (96, 64, 120)])
+def test_wide_meets_its_criterion(shape: tuple[int, int, int]) -> None:
+    lengths = np.arange(1, 10) / 10
+    volumes = [largest(replace(PAPER, l7=l7), shape).volume for l7 in lengths]
+    assert lengths[np.argmax(volumes)] == WIDE.l7
+    assert 0.04 < max(volumes) < 0.05

@@ -1,0 +1,53 @@
+"""docs/paper.md covers every equation, and what it names (functions, tests, sections) exists."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from functools import reduce
+
+import pytest
+from paths import ROOT
+
+TEXT = (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
+TESTS = sorted(set(re.findall(r"`(test_\w+\.py)::(\w+)`", TEXT)))
+FUNCTIONS = sorted(set(re.findall(r"`((?:poc|topology|kinematics|jacobian)\.[\w.]+)`", TEXT)))
+SLIPS = ["test_paper.py", "test_paper_topology.py"]
+
+
+def names_of_tests(file: str) -> set[str]:
+    source = (ROOT / "tests" / file).read_text(encoding="utf-8")
+    return set(re.findall(r"^def (test_\w+)", source, flags=re.MULTILINE))
+
+
+def anchor(heading: str) -> str:
+    """As GitHub makes them."""
+    return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
+
+
+def test_every_equation_has_its_row() -> None:
+    rows = re.findall(r"^\| \((\d+)", TEXT, flags=re.MULTILINE)
+    assert {int(number) for number in rows} == set(range(1, 18))
+
+
+@pytest.mark.parametrize(("file", "name"), TESTS)
+def test_named_tests_exist(file: str, name: str) -> None:
+    assert name in names_of_tests(file)
+
+
+@pytest.mark.parametrize("file", SLIPS)
+def test_every_test_of_a_slip_is_in_the_table(file: str) -> None:
+    assert names_of_tests(file) <= {name for named, name in TESTS if named == file}
+
+
+@pytest.mark.parametrize("path", FUNCTIONS)
+def test_named_functions_exist(path: str) -> None:
+    module, *names = path.split(".")
+    assert callable(reduce(getattr, names, importlib.import_module(f"tpm_gym.{module}")))
+
+
+def test_links_lead_to_sections() -> None:
+    sections = {anchor(h) for h in re.findall(r"^#+ (.+)$", TEXT, flags=re.MULTILINE)}
+    links = set(re.findall(r"\]\(#([^)]+)\)", TEXT))
+    assert links
+    assert links <= sections

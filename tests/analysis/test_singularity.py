@@ -1,0 +1,306 @@
+"""Singularities are what the oracle's factors say, and as far away as brute force finds them."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import numpy as np
+import oracle
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from tpm_gym.analysis import singularity
+from tpm_gym.analysis.singularity import FACTORS, SingularityType, nearest_singularity
+from tpm_gym.errors import ConfigurationError, InputError, UnreachableError
+from tpm_gym.kinematics import (
+    ASSEMBLY_MODES,
+    ELBOWS_OUT,
+    WORKING_MODES,
+    AssemblyMode,
+    WorkingMode,
+    inverse,
+    inverse_all,
+    jacobian,
+    workspace,
+)
+from tpm_gym.kinematics.geometry import PAPER, Geometry
+
+FloatArray = NDArray[np.float64]
+HOME = np.array([-0.05, 0.03, 0.78])
+SIDES = [AssemblyMode(planar, 1) for planar in (-1, 1)]
+
+
+def scaled(g: Geometry, factor: float) -> Geometry:
+    return Geometry(**{name: factor * length for name, length in asdict(g).items()})
+
+
+def oracle_factors(points: FloatArray, mode: WorkingMode, g: Geometry) -> FloatArray:
+    """(..., 7) dimensionless factors by the oracle; NaN where not reachable."""
+    found = inverse_all(points, g)
+    theta, beta = found.theta[..., mode.index, :], found.beta[..., mode.index]
+    x_c = points[..., 0] - g.l2 - g.l7 * np.cos(beta)
+    parallel, serial = oracle.factors(theta, x_c, points[..., 2] - 2 * g.l6, beta, g)
+    sizes = np.array([1, g.l4, g.l4**2, 1, g.l3 * g.l4, g.l3 * g.l4, g.l3 * g.l4])
+    return np.concatenate([parallel, serial], axis=-1) / sizes
+
+
+def rays(count: int, seed: int) -> FloatArray:
+    draws = np.random.default_rng(seed).normal(size=(count, 3))
+    return draws / np.linalg.norm(draws, axis=-1, keepdims=True)
+
+
+def ball_is_clear(
+    point: FloatArray, radius: float, mode: WorkingMode, g: Geometry, count: int
+) -> bool:
+    """Whether no sign changes within 0.999 of the radius; brute force along rays, by the oracle."""
+    steps = np.append(np.linspace(0.05, 0.95, 19), [0.99, 0.999])
+    ball = point + radius * steps[:, None, None] * rays(count, 1)
+    clear = np.sign(oracle_factors(ball, mode, g)) == np.sign(oracle_factors(point, mode, g))
+    return bool(clear.all())
+
+
+def assert_feet_are_singular(
+    points: FloatArray, found: singularity.NearestSingularity, mode: WorkingMode, g: Geometry
+) -> None:
+    reach = np.linalg.norm(found.point - points, axis=-1)
+    np.testing.assert_allclose(reach, found.distance, rtol=0, atol=1e-12)
+    # A foot is on the boundary up to rounding; from just inside, its factor has to be zero.
+    # Legs' factors rise as the square root of the distance.
+    beside = found.point + 1e-11 * (points - found.point)
+    values = np.abs(oracle_factors(beside, mode, g))[np.arange(len(points)), found.factor]
+    assert values.max() < 2e-5
+
+
+@settings(derandomize=True, max_examples=40, deadline=None)
+@given(oracle.geometries(), oracle.seeds(), st.sampled_from(WORKING_MODES))
+def test_factors_at_points_are_the_oracle_s(g: Geometry, seed: int, mode: WorkingMode) -> None:
+    points = oracle.reachable_points(np.random.default_rng(seed), 100, g)
+    found = singularity.factors_at(points, mode, g)
+    values = singularity.dimensionless(found, g)
+    np.testing.assert_allclose(values, oracle_factors(points, mode, g), rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(np.isfinite(values).all(-1), workspace.reachable(points, mode, g))
+    bigger = singularity.factors_at(3 * points, mode, scaled(g, 3))
+    np.testing.assert_allclose(singularity.dimensionless(bigger, scaled(g, 3)), values, atol=1e-6)
+    mirrored = singularity.factors_at(points * [1, -1, 1], mode, g)
+    np.testing.assert_allclose(mirrored.parallel, found.parallel * [-1, 1, 1], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(mirrored.serial, found.serial, rtol=0, atol=1e-12)
+
+
+@settings(derandomize=True, max_examples=30, deadline=None)
+@given(oracle.geometries(), oracle.seeds(), st.sampled_from(WORKING_MODES))
+def test_generic_points_are_regular_and_their_mode_is_their_signs(
+    g: Geometry, seed: int, mode: WorkingMode
+) -> None:
+    points = oracle.reachable_points(np.random.default_rng(seed), 100, g)
+    points = points[workspace.reachable(points, mode, g)]
+    found = singularity.classify_at(points, mode, g, tolerance=1e-9)
+    assert (found.kind == SingularityType.NONE).all()
+    assert not found.vanishing.any()
+    signs = [mode.cos_beta, mode.leg1, mode.leg2, mode.leg3]
+    assert (np.sign(found.factors[:, 3:]) == signs).all()
+
+
+@pytest.mark.parametrize("mode", WORKING_MODES)
+def test_both_ways_of_naming_a_configuration_agree(mode: WorkingMode) -> None:
+    points = oracle.reachable_points(np.random.default_rng(3), 400, PAPER)
+    slots = workspace.assembly_of(points, mode)
+    for assembly in ASSEMBLY_MODES:
+        here = points[slots == assembly.index]
+        theta = inverse(here, mode)
+        for tolerance in (1e-6, 0.05, 0.3):
+            at = singularity.classify_at(here, mode, tolerance=tolerance)
+            by = singularity.classify(theta, assembly, tolerance=tolerance)
+            assert at.tolerance == tolerance
+            close = np.abs(np.abs(at.factors) - tolerance).min(axis=-1) < 1e-6
+            np.testing.assert_array_equal(at.kind[~close], by.kind[~close])
+            np.testing.assert_array_equal(at.vanishing[~close], by.vanishing[~close])
+            assert (at.constraint == by.constraint).all()
+            np.testing.assert_array_equal(at.vanishing, np.abs(at.factors) <= tolerance)
+
+
+def vanishing(found: singularity.Classification) -> list[str]:
+    return [name for name, zero in zip(FACTORS, found.vanishing, strict=True) if zero]
+
+
+def edge_of_leg3(x: float, y: float, g: Geometry = PAPER) -> FloatArray:
+    """The lowest point above (x, y) that leg 3 reaches: folded."""
+    level = np.sqrt(g.l4**2 - y**2) - g.l3
+    return np.array([x, y, g.l6 + np.sqrt(level**2 - (x + g.l2 - g.l1) ** 2)])
+
+
+def test_the_four_kinds() -> None:
+    plane, edge = HOME * [1, 0, 1], np.array([HOME[0], PAPER.l7, HOME[2]])
+    folded = edge_of_leg3(0.2, 0.03)
+    cases = [
+        (HOME, SingularityType.NONE, []),
+        (plane, SingularityType.PARALLEL, ["sin_beta"]),
+        (edge, SingularityType.SERIAL, ["cos_beta"]),
+        (edge * [1, -1, 1], SingularityType.SERIAL, ["cos_beta"]),
+        (folded, SingularityType.SERIAL, ["leg3"]),
+        (edge_of_leg3(0.2, 0.0), SingularityType.BOTH, ["sin_beta", "leg3"]),
+    ]
+    for point, kind, names in cases:
+        found = singularity.classify_at(point)
+        assert found.kind == kind, point
+        assert vanishing(found) == names
+        assert found.kind.shape == ()
+        assert not found.constraint
+    together = singularity.classify_at(np.array([point for point, _, _ in cases]))
+    assert together.kind.tolist() == [int(kind) for _, kind, _ in cases]
+    assert SingularityType.BOTH == SingularityType.SERIAL | SingularityType.PARALLEL
+
+
+def test_constraint_singularities_are_flagged_apart() -> None:
+    """Where z_C1 = z_B1 rod 1 lies level; no factor is small there."""
+    l1, l2, l3, l4, _, l6, l7 = asdict(PAPER).values()
+    cos1, beta = 0.6, 0.6
+    x_c, z_c = np.sqrt(l4**2 - (l1 + cos1 * l3) ** 2), l3 * np.sqrt(1 - cos1**2)
+    point = np.array([x_c + l7 * np.cos(beta) + l2, l7 * np.sin(beta), z_c + 2 * l6])
+    kinds = []
+    for mode in WORKING_MODES:
+        if mode.cos_beta == 1 and workspace.reachable(point, mode):
+            found = singularity.classify_at(point, mode)
+            assert found.kind == SingularityType.NONE
+            slot = int(workspace.assembly_of(point, mode))
+            theta = inverse(point, mode)
+            again = singularity.classify(theta, ASSEMBLY_MODES[slot])
+            assert found.constraint == again.constraint == (abs(np.cos(theta[0]) - cos1) < 1e-9)
+            kinds.append(bool(found.constraint))
+    assert set(kinds) == {True, False}
+
+
+@pytest.mark.parametrize("mode", [ELBOWS_OUT, WORKING_MODES[0], WORKING_MODES[14]])
+@pytest.mark.parametrize("assembly", SIDES)
+def test_distance_is_that_of_brute_force(mode: WorkingMode, assembly: AssemblyMode) -> None:
+    compare(mode, assembly, PAPER, points=40, count=1000)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", WORKING_MODES)
+@pytest.mark.parametrize("assembly", SIDES)
+def test_distance_is_that_of_20000_rays(mode: WorkingMode, assembly: AssemblyMode) -> None:
+    compare(mode, assembly, PAPER, points=40, count=20_000)
+
+
+def compare(
+    mode: WorkingMode, assembly: AssemblyMode, g: Geometry, points: int, count: int, seed: int = 4
+) -> None:
+    some = oracle.reachable_points(np.random.default_rng(seed), 6000, g)
+    near = np.abs(some[:, 1] - np.where(some[:, 1] > 0, 0.5, -0.5) * g.l7) < 0.3 * g.l7
+    some = some[near]  # elsewhere the planes are the answer, and they are exact
+    found = nearest_singularity(some[:200], mode, assembly, g)
+    expected = workspace.assembly_of(some[:200], mode, g) == assembly.index
+    np.testing.assert_array_equal(found.valid, expected)
+    curved = ~np.isin(found.factor, (0, 3, -1))
+    order = np.argsort(~curved, kind="stable")[:points]  # the curved surfaces first
+    order = order[found.valid[order]]
+    if not len(order):
+        return
+    part = nearest_singularity(some[order], mode, assembly, g)
+    assert_feet_are_singular(some[order], part, mode, g)
+    for index in order:
+        assert ball_is_clear(some[index], float(found.distance[index]), mode, g, count)
+
+
+@settings(derandomize=True, max_examples=4, deadline=None)
+@given(oracle.geometries(), oracle.seeds(), st.sampled_from(WORKING_MODES))
+def test_distance_for_any_geometry(g: Geometry, seed: int, mode: WorkingMode) -> None:
+    for assembly in SIDES:
+        compare(mode, assembly, g, points=5, count=200, seed=seed)
+
+
+@pytest.mark.slow
+@settings(derandomize=True, max_examples=60, deadline=None)
+@given(oracle.geometries(), oracle.seeds(), st.sampled_from(WORKING_MODES))
+def test_distance_for_many_geometries(g: Geometry, seed: int, mode: WorkingMode) -> None:
+    for assembly in SIDES:
+        compare(mode, assembly, g, points=20, count=2000, seed=seed)
+
+
+@settings(derandomize=True, max_examples=4, deadline=None)
+@given(oracle.geometries(), oracle.seeds(), st.floats(0.1, 10))
+def test_distance_scales_and_is_symmetric_in_y(g: Geometry, seed: int, factor: float) -> None:
+    points = oracle.reachable_points(np.random.default_rng(seed), 12, g)
+    for assembly in SIDES:
+        found = nearest_singularity(points, ELBOWS_OUT, assembly, g)
+        other = AssemblyMode(assembly.planar, -assembly.sin_beta)
+        mirrored = nearest_singularity(points * [1, -1, 1], ELBOWS_OUT, other, g)
+        np.testing.assert_array_equal(found.distance, mirrored.distance)
+        np.testing.assert_array_equal(found.point, mirrored.point * [1, -1, 1])
+        bigger = nearest_singularity(factor * points, ELBOWS_OUT, assembly, scaled(g, factor))
+        np.testing.assert_array_equal(found.valid, bigger.valid)
+        np.testing.assert_allclose(factor * found.distance, bigger.distance, rtol=1e-4)
+
+
+def test_distance_to_the_planes_is_exact_in_the_middle_of_the_workspace() -> None:
+    y = np.linspace(0, PAPER.l7, 11)
+    found = nearest_singularity(oracle.vector(-0.05, y, 0.78))
+    np.testing.assert_array_equal(found.distance, np.minimum(y, PAPER.l7 - y))
+    assert set(found.factor.tolist()) == {0, 3}
+    np.testing.assert_array_equal(found.point[:5], oracle.vector(-0.05, 0 * y[:5], 0.78))
+
+
+def test_every_surface_is_met_somewhere() -> None:
+    points = oracle.reachable_points(np.random.default_rng(5), 6000, PAPER)
+    found = nearest_singularity(points[:2500], ELBOWS_OUT, SIDES[0])
+    assert set(found.factor[found.valid].tolist()) == set(range(7))
+    assert set(found.factor[~found.valid].tolist()) == {-1}
+    assert np.isnan(found.distance[~found.valid]).all()
+    assert np.isnan(found.point[~found.valid]).all()
+    # so far from any singularity, the conditioning is not zero
+    clear = points[:2500][found.valid & (found.distance > 0.02)]
+    assert workspace.conditioning_at(clear, ELBOWS_OUT, SIDES[0]).min() > 1e-4
+
+
+@pytest.mark.parametrize("shape", [(), (4,), (2, 3), (0,)])
+def test_leading_shapes(shape: tuple[int, ...]) -> None:
+    points = np.broadcast_to(HOME, (*shape, 3))
+    found = nearest_singularity(points)
+    assert found.distance.shape == found.factor.shape == found.valid.shape == shape
+    assert found.point.shape == (*shape, 3)
+    assert found.valid.all()
+    kinds = singularity.classify_at(points)
+    assert kinds.kind.shape == kinds.constraint.shape == shape
+    assert kinds.vanishing.shape == kinds.factors.shape == (*shape, 7)
+
+
+def test_points_that_are_none_are_masked_in_batches() -> None:
+    points = np.array([HOME, [np.nan, 0, 0], [np.inf, 0, 1], [1e200, 0.01, 1e200], [0, 0.06, 0.78]])
+    found = nearest_singularity(points)
+    assert found.valid.tolist() == [True, False, False, False, False]
+    assert not nearest_singularity(HOME * [1, -1, 1]).valid
+    for values in vars(singularity.factors_at(points)).values():
+        assert np.isfinite(values[0]).all()
+        assert np.isnan(values[1:]).all()
+
+
+def test_bad_input_is_refused() -> None:
+    theta = inverse(HOME)
+    for wrong in ([0.0, 0.0], 1.0):
+        with pytest.raises(InputError):
+            singularity.classify_at(wrong)
+        with pytest.raises(InputError):
+            singularity.classify(wrong)
+        with pytest.raises(InputError):
+            nearest_singularity(wrong)
+    with pytest.raises(InputError):
+        singularity.classify([theta, [np.nan, 0, 0]])
+    with pytest.raises(UnreachableError):
+        singularity.classify_at([HOME, [0, 0.03, 5]])
+    with pytest.raises(UnreachableError):
+        singularity.classify([theta, [0.0, np.pi, -2.0]])
+    for tolerance in (0.0, -1e-6, 1.0, float("nan")):
+        with pytest.raises(ConfigurationError) as caught:
+            singularity.classify(theta, tolerance=tolerance)
+        assert caught.value.name == "tolerance"
+        with pytest.raises(ConfigurationError):
+            singularity.classify_at(HOME, tolerance=tolerance)
+
+
+def test_factors_at_points_are_those_of_the_joint_angles() -> None:
+    points = oracle.vector(np.linspace(-0.2, 0.1, 9), 0.03, 0.8)
+    by_angle, by_point = jacobian.factors(inverse(points)), singularity.factors_at(points)
+    np.testing.assert_allclose(by_angle.parallel, by_point.parallel, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(by_angle.serial, by_point.serial, rtol=0, atol=1e-12)

@@ -1,0 +1,328 @@
+"""Eqs. 1 to 5 give the paper's numbers, screw theory and the rank of the loops agree with them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import oracle
+import pytest
+from hypothesis import given, settings
+from numpy.typing import NDArray
+from walk import place, walk
+
+from tpm_gym.analysis.poc import (
+    Chain,
+    POCSet,
+    Subspace,
+    degrees_of_freedom,
+)
+from tpm_gym.analysis.topology import Structure, analyse, closure_jacobian, describe, mobility
+from tpm_gym.errors import InputError, SingularityError, UnreachableError
+from tpm_gym.kinematics import (
+    ASSEMBLY_MODES,
+    AssemblyMode,
+    forward_all,
+    inverse,
+    inverse_all,
+    jacobian,
+)
+from tpm_gym.kinematics.geometry import PAPER, Geometry
+from tpm_gym.kinematics.workspace import TASK_REGION
+from tpm_gym.mechanism.tree import build, joint_angles
+
+FloatArray = NDArray[np.float64]
+X, Y, Z = np.eye(3)
+
+
+def same(a: Subspace, b: Subspace) -> bool:
+    return bool(np.allclose(a.projector, b.projector, rtol=0, atol=1e-9))
+
+
+def configurations(
+    seed: int, count: int, g: Geometry = PAPER, clear: float = 1e-2
+) -> list[tuple[FloatArray, AssemblyMode]]:
+    """Random angles with an assembly mode, away from every singularity by ``clear`` (scaled)."""
+    rng = np.random.default_rng(seed)
+    solutions = inverse_all(oracle.reachable_points(rng, count, g), g)
+    theta = rng.permutation(solutions.theta[solutions.valid])
+    found = []
+    for branch in ASSEMBLY_MODES:
+        angles = theta[forward_all(theta, g).valid[:, branch.index]]
+        factors = jacobian.factors(angles, branch, g)
+        size = np.concatenate(
+            [
+                np.abs(factors.parallel) / [1, g.l4, g.l4**2],
+                np.abs(factors.serial) / ([1] + [g.l3 * g.l4] * 3),
+                np.abs(rise(angles, branch, g))[:, None] / g.l4,
+            ],
+            axis=1,
+        )
+        found += [(t, branch) for t in angles[(size > clear).all(axis=1)][: count // 4]]
+    return found
+
+
+def rise(theta: FloatArray, branch: AssemblyMode, g: Geometry) -> FloatArray:
+    """z_C1 - z_B1, which vanishes at the constraint singularity."""
+    z_c = forward_all(theta, g).link3[..., branch.index, 1]
+    return np.asarray(z_c - g.l3 * np.sin(theta[..., 0]))
+
+
+# The mechanism
+
+
+def assert_paper_topology(structure: Structure) -> None:
+    first, second, third = (chain.poc(structure.link_3p) for chain in structure.chains)
+    assert (str(first), str(second), str(third)) == ("t^3 r^2", "t^2 r^1", "t^3 r^2")
+    found = analyse(structure)
+    in_plane, everything = Subspace.span([X, Z]), Subspace.span(np.eye(3))
+    assert str(found.sub_mechanism) == "t^2 r^0"
+    assert same(found.sub_mechanism.translations, in_plane)
+    for hsoc, axis in ((found.hsoc_1, Z), (found.hsoc_2, Y)):
+        assert same(hsoc.translations, everything)
+        assert same(hsoc.rotations, Subspace.span([axis]))
+    assert str(found.platform) == "t^3 r^0"
+    assert [loop.equations for loop in found.loops] == [6, 5]
+    assert [loop.freedoms for loop in found.loops] == [8, 6]
+    assert [loop.actuated for loop in found.loops] == [2, 1]
+    assert [loop.constraint for loop in found.loops] == [0, 0]
+    assert (found.dof(1), found.dof()) == (2, 3)
+    assert found.coupling == (0, 0)
+
+
+def test_topology_is_the_paper_s_at_random_configurations() -> None:
+    sample = configurations(1, 60)
+    assert len(sample) > 40
+    for theta, branch in sample:
+        assert_paper_topology(describe(theta, branch))
+
+
+@settings(derandomize=True, max_examples=15, deadline=None)
+@given(oracle.geometries(), oracle.seeds())
+def test_topology_and_mobility_do_not_depend_on_lengths(g: Geometry, seed: int) -> None:
+    for theta, branch in configurations(seed, 8, g):
+        assert_paper_topology(describe(theta, branch, g))
+        found = mobility(theta, branch, g)
+        assert (found.dof, found.idle, str(found.platform)) == (3, 1, "t^3 r^0")
+
+
+def test_structure_has_the_paper_s_joints() -> None:
+    structure = describe(inverse([-0.04, 0.028, 0.8]))
+    names = [[unit.name for unit in chain.units] for chain in structure.branches]
+    assert names[0] == ["R11", "Pa(4S)"]
+    assert names[1] == ["R21", "R22", "R23"]
+    assert sorted(names[2]) == ["Pa(4R)", "R31", "R32", "R33"]
+    assert [unit.name for unit in structure.wrist.units] == ["R12", "R13"]
+    axes = {"R11": X, "R12": Z, "R13": Z} | {f"R{b}{i}": Y for b in (2, 3) for i in (1, 2, 3)}
+    units = [unit for chain in structure.chains for unit in chain.units]
+    assert {unit.name for unit in units if unit.actuated} == {"R11", "R21", "R31"}
+    for unit in units:
+        if unit.name in axes:
+            assert same(Subspace.span(unit.rotations), Subspace.span([axes[unit.name]]))
+
+
+def test_number_of_loops_is_m_minus_n_plus_1() -> None:
+    structure = describe(inverse([-0.04, 0.028, 0.8]))
+    m = sum(chain.freedoms for chain in structure.chains)  # joints of one freedom each
+    n = 2 + sum(chain.freedoms - 1 for chain in structure.chains)  # base, link 3', links between
+    assert (m, n, m - n + 1) == (14, 13, 2)
+    assert len(analyse(structure).loops) == m - n + 1
+
+
+def test_every_decomposition_has_the_same_freedoms_and_the_paper_s_couples_least() -> None:
+    for theta, branch in configurations(2, 12):
+        found = analyse(describe(theta, branch))
+        assert len(found.decompositions) == 6
+        totals = []
+        for loops in found.decompositions:
+            freedoms, equations = (
+                [loop.freedoms for loop in loops],
+                [loop.equations for loop in loops],
+            )
+            assert degrees_of_freedom(freedoms, equations) == 3
+            assert sum(loop.constraint for loop in loops) == 0
+            totals.append(sum(abs(loop.constraint) for loop in loops) / 2)
+        assert sorted(totals) == [0, 0, 2, 2, 3, 3]
+        assert totals[0] == 0
+
+
+# Screw theory: twists (velocity of the base point, angular velocity), no columns taken apart
+
+
+def twists(chain: Chain, base_point: FloatArray) -> FloatArray:
+    rows = []
+    for unit in chain.units:
+        rows += [np.concatenate([t, np.zeros(3)]) for t in unit.translations]
+        rows += [np.concatenate([np.cross(s, base_point - unit.point), s]) for s in unit.rotations]
+    return np.array(rows)
+
+
+def projector(rows: FloatArray) -> FloatArray:
+    _, values, right = np.linalg.svd(rows)
+    basis = right[: int((values > 1e-9).sum())]
+    return np.asarray(basis.T @ basis)
+
+
+def common(*projectors: FloatArray) -> FloatArray:
+    eye = np.eye(6)
+    return np.asarray(eye - projector(np.concatenate([eye - p for p in projectors])))
+
+
+def as_projector(poc: POCSet) -> FloatArray:
+    result = np.zeros((6, 6))
+    result[:3, :3], result[3:, 3:] = poc.translations.projector, poc.rotations.projector
+    return result
+
+
+def test_screw_theory_finds_the_same_sets() -> None:
+    for theta, branch in configurations(3, 40, clear=0.03):
+        structure = describe(theta, branch)
+        found = analyse(structure)
+        spaces = [projector(twists(chain, structure.link_3p)) for chain in structure.chains]
+        for chain, space in zip(structure.chains, spaces, strict=True):
+            np.testing.assert_allclose(space, as_projector(chain.poc(structure.link_3p)), atol=1e-9)
+        sub = common(*spaces[:2])
+        np.testing.assert_allclose(sub, as_projector(found.sub_mechanism), atol=1e-8)
+        # xi is the dimension of the sum of the twist spaces
+        sums = [
+            np.trace(projector(np.concatenate(pair))) for pair in (spaces[:2], (sub, spaces[2]))
+        ]
+        assert np.round(sums).tolist() == [loop.equations for loop in found.loops]
+        wrist = twists(structure.wrist, structure.platform)
+        hsoc_1 = projector(np.concatenate([sub, wrist]))
+        hsoc_2 = projector(twists(structure.branches[2], structure.platform))
+        np.testing.assert_allclose(hsoc_1, as_projector(found.hsoc_1), atol=1e-8)
+        np.testing.assert_allclose(hsoc_2, as_projector(found.hsoc_2), atol=1e-8)
+        np.testing.assert_allclose(common(hsoc_1, hsoc_2), as_projector(found.platform), atol=1e-8)
+
+
+# Mobility from the loops that the simulator closes
+
+
+def gaps(angles: dict[str, float]) -> FloatArray:
+    mechanism = build()
+    frames = walk(mechanism, angles)
+    return np.concatenate(
+        [
+            place(frames, c.link_a, c.point_a) - place(frames, c.link_b, c.point_b)
+            for c in mechanism.closures
+        ]
+    )
+
+
+def joints_of_the_mechanism() -> list[str]:
+    """All but the cup's slide, which belongs to the tool."""
+    joints = [link.joint.name for link in build().links if link.joint]
+    return [name for name in joints if name != "cup_slide"]
+
+
+def test_closure_jacobian_is_the_derivative_of_the_gaps() -> None:
+    step = 1e-5
+    for theta, branch in configurations(4, 8):
+        angles = joint_angles(theta, branch)
+        found = closure_jacobian(build(), angles)
+        names = joints_of_the_mechanism()
+        assert found.shape == (12, len(names))
+        assert len(names) == len(angles) - 1
+        for column, name in enumerate(names):
+            up, down = angles | {name: angles[name] + step}, angles | {name: angles[name] - step}
+            slope = (gaps(up) - gaps(down)) / (2 * step)
+            np.testing.assert_allclose(found[:, column], slope, atol=1e-9, err_msg=name)
+
+
+def test_mobility_by_rank_agrees_with_the_poc_count() -> None:
+    sample = configurations(5, 120)
+    assert len(sample) > 80
+    for theta, branch in sample:
+        found = mobility(theta, branch)
+        assert (found.dof, found.idle) == (3, 1)
+        assert (found.rank, found.redundant) == (11, 1)
+        assert found.smallest > 1e-5
+        assert str(found.platform) == "t^3 r^0"
+        assert found.dof == analyse(describe(theta, branch)).dof()
+
+
+def test_the_idle_freedom_is_end_link_10_about_its_own_axis() -> None:
+    for theta, branch in configurations(6, 8):
+        angles = joint_angles(theta, branch)
+        rolled = angles | {"R33": angles["R33"] + 1.0}
+        np.testing.assert_allclose(gaps(rolled), gaps(angles), atol=1e-12)
+        still = np.linalg.norm(closure_jacobian(build(), angles), axis=0) < 1e-12
+        names = joints_of_the_mechanism()
+        assert [name for name, idle in zip(names, still, strict=True) if idle] == ["R33"]
+
+
+def on_constraint_singularity(
+    theta_1: float, side: int, offset: float = 0.0
+) -> list[tuple[FloatArray, AssemblyMode]]:
+    """Configurations with z_C1 = z_B1 + offset."""
+    g = PAPER
+    y_b, z_b = g.l1 + g.l3 * np.cos(theta_1), g.l3 * np.sin(theta_1)
+    x_c = side * np.sqrt(g.l4**2 - y_b**2 - offset**2)
+    point = [x_c + 0.8 * g.l7 + g.l2, 0.6 * g.l7, z_b + offset + 2 * g.l6]
+    solutions = inverse_all(point)
+    found = []
+    for theta in solutions.theta[solutions.valid]:
+        forward = forward_all(theta)
+        for branch in ASSEMBLY_MODES:
+            near = np.abs(forward.position[branch.index] - point).max() < 1e-9
+            if near and abs(theta[0] - theta_1) < 1e-9:
+                found.append((theta, branch))
+    return found
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize("theta_1", [0.7, 0.9273, 1.2])
+def test_both_counts_find_the_constraint_singularity(theta_1: float, side: int) -> None:
+    sample = on_constraint_singularity(theta_1, side)
+    assert sample
+    for theta, branch in sample:
+        found, topology = mobility(theta, branch), analyse(describe(theta, branch))
+        assert (found.dof, found.idle, found.rank) == (4, 1, 10)
+        assert str(topology.sub_mechanism) == "t^2 r^1"
+        assert topology.dof() == 4
+        with pytest.raises(InputError):
+            _ = topology.coupling
+
+
+def test_the_task_region_keeps_clear_of_the_constraint_singularity() -> None:
+    sides = [np.linspace(*ends, 9) for ends in zip(TASK_REGION.low, TASK_REGION.high, strict=True)]
+    points = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 3)
+    z_c = points[:, 2] - 2 * PAPER.l6
+    assert (z_c - PAPER.l3 * np.sin(inverse(points)[:, 0])).min() > PAPER.l3
+
+
+def test_doubtful_rank_raises() -> None:
+    raised = 0
+    for theta, branch in on_constraint_singularity(0.9273, 1, offset=1e-9):
+        with pytest.raises(SingularityError):
+            mobility(theta, branch)
+        raised += 1
+    assert raised
+    for theta, branch in on_constraint_singularity(0.9273, 1, offset=1e-4):
+        assert mobility(theta, branch).dof == 3
+
+
+@pytest.mark.parametrize("y", [-PAPER.l7, PAPER.l7])
+def test_at_the_edge_in_y_both_counts_lose_the_translation_but_no_freedom(y: float) -> None:
+    theta, branch = inverse([-0.04, y, 0.8]), AssemblyMode(-1, int(np.sign(y)))
+    found, topology = mobility(theta, branch), analyse(describe(theta, branch))
+    assert found.dof == topology.dof() == 3
+    for poc in (found.platform, topology.platform):
+        assert same(poc.translations, Subspace.span([X, Z]))
+        assert poc.rotations.dim == 0
+
+
+def test_a_locked_joint_takes_a_freedom() -> None:
+    structure = describe(inverse([-0.04, 0.028, 0.8]))
+    first, second, third = structure.branches
+    locked = replace(structure, branches=(first, replace(second, units=second.units[1:]), third))
+    assert analyse(locked).dof() == 2
+
+
+def test_unreachable_and_malformed_angles_raise() -> None:
+    for function in (describe, mobility):
+        with pytest.raises(UnreachableError):
+            function([0.0, 0.0, np.pi])
+        with pytest.raises(InputError):
+            function([0.0, np.nan, 0.0])

@@ -1,0 +1,400 @@
+"""The benchmarks run, and find what they are there to find: failures, growth, drift."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from types import BuiltinFunctionType
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pybullet
+import pytest
+from paths import ROOT
+
+from tpm_gym import ENV_IDS
+from tpm_gym.tasks.expert import Expert
+
+BENCHMARKS = ROOT / "benchmarks"
+
+import bench_speed  # noqa: E402
+import raw_physics  # noqa: E402
+import soak  # noqa: E402
+import soak_report  # noqa: E402
+from raw_physics import STEP, Recorder, record, recording, replay  # noqa: E402
+
+PICK = "TPMPickAndPlace-v0"
+
+
+def read_strict(path: Path) -> dict[str, Any]:
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"{constant} is not JSON")
+
+    return json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse)
+
+
+def is_png(path: Path) -> bool:
+    return path.read_bytes().startswith(b"\x89PNG")
+
+
+def expert_actions(seed: int, steps: int) -> np.ndarray:
+    """What the expert does in the first episode; it takes the puck."""
+    env = gym.make(PICK)
+    observation, _ = env.reset(seed=seed)
+    expert = Expert(env)
+    expert.reset(observation)
+    actions = []
+    for _ in range(steps):
+        actions.append(expert.act(observation))
+        observation, *_ = env.step(actions[-1])
+    env.close()
+    return np.array(actions)
+
+
+@pytest.fixture(scope="module")
+def taped():
+    """A tape of two episodes, in the first of which the puck is taken, and its actions."""
+    actions = np.concatenate([expert_actions(0, 50), np.zeros((10, 4), np.float32)])
+    recorder = Recorder()
+    with recording(recorder):
+        env = gym.make(PICK)
+        tape = record(env, recorder, actions, seed=0)
+    env.close()
+    assert isinstance(pybullet.stepSimulation, BuiltinFunctionType)  # the engine's own again
+    return tape, actions
+
+
+def test_a_tape_holds_the_time_steps_the_grasp_and_the_reset(taped):
+    tape, actions = taped
+    names = [[call.name for call in calls] for calls in tape.steps]
+    assert len(names) == len(actions) == 60
+    assert all(step.count(STEP) == 10 for step in names)
+    assert any("createConstraint" in step for step in names)
+    assert tape.resets == {49}
+
+
+def test_the_same_calls_do_the_same_physics_and_leave_nothing_behind(taped):
+    tape, actions = taped
+    grasp = next(i for i, calls in enumerate(tape.steps) if calls[-1].name in raw_physics.GRASP)
+    holding = raw_physics.Tape(tape.steps[: grasp + 3], set(), tape.ends)
+    env = gym.make(PICK)
+    for block in (holding, tape):  # replay itself compares every step with the tape
+        floor = replay(env, block, seed=0)
+        assert 0 < floor.physics < floor.with_motors
+    env.reset(seed=0)
+    for action, end in zip(actions[:50], tape.ends, strict=False):
+        env.step(action)
+        np.testing.assert_array_equal(raw_physics._where(env), end)
+    env.close()
+
+
+def test_calls_that_are_missing_from_the_tape_are_noticed(taped):
+    tape, _ = taped
+    broken = raw_physics.Tape(list(tape.steps), tape.resets, tape.ends)
+    broken.steps[3] = [call for call in broken.steps[3] if call.name == STEP][:-1]
+    env = gym.make(PICK)
+    with pytest.raises(RuntimeError, match="differ from the recorded ones at step 3"):
+        replay(env, broken, seed=0)
+    env.close()
+
+
+# -- speed ----------------------------------------------------------------------------------------
+
+
+def test_bench_speed_from_the_command_line(tmp_path):
+    numbers, plot = tmp_path / "deep" / "speed.json", tmp_path / "speed.png"
+    command = f"""--contestants TPMReach-v0 {PICK} --rounds 2 --steps 60 --scaling-steps 10
+        --json {numbers} --plot {plot}""".split()
+    done = subprocess.run(
+        [sys.executable, str(BENCHMARKS / "bench_speed.py"), *command],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    content = read_strict(numbers)
+    assert list(content["contestants"]) == ["TPMReach-v0", PICK]
+    for entry in content["contestants"].values():
+        assert len(entry["rounds"]) == 2
+        for name in (
+            "steps_per_second",
+            "reset_milliseconds",
+            "step_over_physics",
+            "step_over_with_motors",
+        ):
+            low, middle, high = entry[name]
+            assert 0 < low <= middle <= high
+        assert "ratio_to_baseline" not in entry  # panda-gym was not asked for
+    scaling = content["scaling"]
+    assert scaling["env_id"] == PICK
+    for name in ("one_process", "two_processes", "two_over_one", "async_over_sync"):
+        assert min(scaling[name]) > 0
+    for key in ("command", "commit", "versions", "machine", "load_before", "unavailable"):
+        assert key in content
+    assert str(tmp_path) not in numbers.read_text(encoding="utf-8")
+    assert f"not measured: {PICK} over PandaPickAndPlace-v3" in done.stdout
+    assert is_png(plot)
+
+
+def test_a_peer_that_cannot_run_is_a_line_in_the_table(monkeypatch, capsys):
+    def broken(name):
+        print("chatter of a peer")
+        raise ModuleNotFoundError(f"No module named {name!r}")
+
+    monkeypatch.setattr(bench_speed, "import_module", broken)
+    content = bench_speed.main(
+        ["--contestants", "PandaReach-v3", "TPMReach-v0", "--rounds", "1", "--steps", "5"]
+        + ["--scaling-steps", "0"]
+    )
+    assert content["unavailable"] == {
+        "PandaReach-v3": "ModuleNotFoundError: No module named 'panda_gym'"
+    }
+    assert list(content["contestants"]) == ["TPMReach-v0"]
+    assert "PandaReach-v3" in capsys.readouterr().out
+
+
+def test_an_environment_of_ours_that_cannot_run_ends_the_benchmark(monkeypatch):
+    monkeypatch.setattr(bench_speed.gym, "make", lambda env_id: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        bench_speed.main(["--contestants", "TPMReach-v0", "--rounds", "1", "--steps", "5"])
+
+
+def test_ratios_are_taken_within_a_round():
+    def contestant(env_id, seconds):
+        return bench_speed.Contestant(env_id, None, seconds, [0.0] * 3, [0] * 3)
+
+    ours = contestant(PICK, [1.0, 2.0, 4.0])
+    panda = contestant(bench_speed.BASELINE, [4.0, 2.0, 12.0])
+    found = bench_speed.summary([ours, panda], steps=100)
+    # Of 4, 1 and 3; the medians' ratio is 2.
+    assert found[PICK]["ratio_to_baseline"] == (2.0, 3.0, 3.5)
+    assert found[PICK]["steps_per_second"] == (37.5, 50.0, 75.0)
+    assert found[bench_speed.BASELINE]["ratio_to_baseline"] == (1.0, 1.0, 1.0)
+
+
+def test_profile_names_where_the_time_goes(capsys):
+    bench_speed.main(["--profile", "--steps", "1"])
+    assert "(move)" in capsys.readouterr().out
+
+
+def test_silence_takes_what_c_writes_too():
+    script = """
+import ctypes, sys
+sys.path.insert(0, sys.argv[1])
+import machine
+c = ctypes.CDLL(None)
+with machine.silence():
+    print("python"); c.puts(b"c")
+print("after"); c.puts(b"c after")
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script, str(BENCHMARKS)], capture_output=True, text=True, check=True
+    )
+    assert sorted(done.stdout.split("\n")) == ["", "after", "c after"]
+
+
+# -- endurance ------------------------------------------------------------------------------------
+
+
+SHORT = ["--steps", "1200", "--every", "100", "--warm-up", "300"]
+
+
+def test_soak_goes_through_everything_and_passes(tmp_path, capsys, monkeypatch):
+    for share in ("REOPEN", "RENDER", "SAVE"):
+        monkeypatch.setattr(soak, share, 0.6)  # so that a short one sees all of it
+    numbers, plot = tmp_path / "soak.json", tmp_path / "soak.png"
+    options = ["--steps", "2000", "--json", str(numbers), "--plot", str(plot)]
+    status = soak.main([*SHORT, *options])
+    output = capsys.readouterr().out
+    assert status == 0, output
+    content = read_strict(numbers)
+    assert content["finished"]
+    assert content["failures"] == []
+    assert content["samples"][-1]["steps"] >= 2000
+    verdict = content["verdict"]
+    assert verdict["passed"]
+    assert verdict["memory"]["baseline_steps"] >= 300
+    assert 0 < verdict["closure_drift"]["mean"] < verdict["closure_drift"]["largest"] < 1e-3
+    for event in ("openings", "closes", "pictures", "resets options", "resets plain", "restores"):
+        assert content["events"][event] > 0, event
+    assert content["events"]["openings"] >= len(ENV_IDS)
+    assert is_png(plot)
+    assert "0 exceptions" in output
+    assert output.rstrip().endswith("PASSED")
+
+
+class Raising(gym.Wrapper):
+    """Raises at its 30th step."""
+
+    taken = 0
+
+    def step(self, action):
+        self.taken += 1
+        if self.taken == 30:
+            raise ValueError("injected")
+        return super().step(action)
+
+
+def test_a_step_that_raises_is_reported_outlived_and_can_be_repeated(tmp_path, capsys):
+    def make(env_id, **options):
+        env = gym.make(env_id, **options)
+        return Raising(env) if env_id == "TPMReachJoints-v0" else env
+
+    numbers = tmp_path / "soak.json"
+    status = soak.main([*SHORT, "--json", str(numbers)], make=make)
+    output = capsys.readouterr().out
+    assert status == 1
+    content = read_strict(numbers)
+    assert content["finished"]  # it went on
+    assert not content["verdict"]["nothing_raised"]
+    first = content["failures"][0]
+    assert first["env_id"] == "TPMReachJoints-v0"
+    assert ENV_IDS[first["visit"] % len(ENV_IDS)] == first["env_id"]
+    assert first["error"] == "ValueError: injected"
+    assert {"seed", "total_steps", "episode", "step"} <= first.keys()
+    assert f"--seed 0 --replay {first['visit']}" in output
+    assert output.rstrip().endswith("FAILED")
+
+
+def test_replay_raises_what_the_visit_raised():
+    def make(env_id, **options):
+        env = gym.make(env_id, **options)
+        env.reset = None  # whatever the visit does first
+        return env
+
+    with pytest.raises(TypeError):
+        soak.main(["--replay", "3"], make=make)
+    assert soak.main(["--replay", "3"]) == 0
+
+
+def test_a_soak_that_only_fails_ends(capsys):
+    def make(env_id, **options):
+        raise RuntimeError("no environment")
+
+    assert soak.main(SHORT, make=make) == 1
+    output = capsys.readouterr()
+    assert f"{soak.MOST_FAILURES} exceptions" in output.out
+    assert "NOT FINISHED" in output.out
+
+
+class Growing(gym.Wrapper):
+    """Keeps 200 kB a step."""
+
+    kept: list[np.ndarray] = []  # noqa: RUF012
+
+    def step(self, action):
+        self.kept.append(np.ones(25_000))
+        return super().step(action)
+
+
+def test_memory_that_grows_is_found(tmp_path):
+    numbers = tmp_path / "soak.json"
+    try:
+        status = soak.main(
+            [*SHORT, "--json", str(numbers)],
+            make=lambda env_id, **options: Growing(gym.make(env_id, **options)),
+        )
+    finally:
+        Growing.kept.clear()
+    verdict = read_strict(numbers)["verdict"]
+    assert status == 1
+    assert not verdict["memory_within_limit"]
+    assert verdict["memory"]["growth_mb"] > 30
+    assert verdict["nothing_raised"]
+
+
+def test_an_interrupted_soak_keeps_its_samples_and_does_not_pass(tmp_path, monkeypatch):
+    run_visit = soak.Soak.run_visit
+
+    def interrupted(self, number):
+        if self.steps > 500:
+            raise KeyboardInterrupt
+        run_visit(self, number)
+
+    monkeypatch.setattr(soak.Soak, "run_visit", interrupted)
+    numbers = tmp_path / "soak.json"
+    assert soak.main([*SHORT, "--json", str(numbers)]) == 1
+    content = read_strict(numbers)
+    assert len(content["samples"]) >= 4
+    assert not content["finished"]
+
+
+def test_a_restored_state_that_goes_on_otherwise_is_found():
+    class Forgetful:
+        """Restores nothing."""
+
+        def __init__(self, env):
+            self._env = env
+
+        def __getattr__(self, name):
+            return getattr(self._env, name)
+
+        def restore_state(self, snapshot):
+            pass
+
+    env = gym.make("TPMReach-v0")
+    env.reset(seed=0)
+    endurance = soak.Soak(0)
+    assert not endurance._check_restore(env, np.random.default_rng(0))
+    wrapped = type("Wrapped", (), {"unwrapped": Forgetful(env.unwrapped)})()
+    wrapped.action_space = env.action_space
+    with pytest.raises(RuntimeError, match="restored state differs"):
+        endurance._check_restore(wrapped, np.random.default_rng(0))
+    env.close()
+
+
+def samples(slope: float, noise: float) -> dict[str, Any]:
+    """A finished soak of a million steps whose gaps start at 10 um and grow by ``slope`` m."""
+    rng = np.random.default_rng(0)
+    steps = np.arange(5_000, 1_000_001, 5_000)
+    gaps = 1e-5 + slope * steps / 1e6 + noise * rng.standard_normal(len(steps))
+    return {
+        "finished": True, "failures": [], "warm_up": 50_000, "limit_mb": 10.0,
+        "samples": [
+            {"steps": int(s), "memory_mb": 100.0, "all_opened": True, "closure_mean": float(g),
+             "closure_max": float(2 * g), "steps_per_second": 500.0}
+            for s, g in zip(steps, gaps, strict=True)
+        ],
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("slope", "drifts"), [(0.0, False), (2e-6, True), (-2e-6, False), (5e-8, False)]
+)
+def test_drift_is_a_slope_beyond_its_error_and_beyond_a_percent(slope, drifts):
+    verdict = soak_report.judge(samples(slope, noise=1e-8))
+    drift = verdict["closure_drift"]
+    assert drift["found"] == drifts
+    assert verdict["passed"] == (not drifts)
+    assert abs(drift["slope"] - slope) < 4 * drift["standard_error"]
+    # Least squares of 191 points with 10 nm of noise, spread evenly over 0.95 million steps.
+    assert drift["standard_error"] == pytest.approx(1e-8 / (0.95 * np.sqrt(191 / 12)), rel=0.2)
+
+
+def test_a_slope_within_its_error_is_no_drift():
+    drift = soak_report.judge(samples(6e-6, noise=1e-5))["closure_drift"]
+    assert 0.01 * drift["mean"] < drift["slope"] < 3 * drift["standard_error"]
+    assert not drift["found"]
+
+
+def test_the_baseline_waits_for_the_warm_up_and_for_all_environments():
+    content = samples(0.0, 1e-8)
+    for sample in content["samples"]:
+        sample["all_opened"] = sample["steps"] > 70_000
+        sample["memory_mb"] = 50.0 if sample["steps"] < 75_000 else 100.0
+    verdict = soak_report.judge(content)
+    assert verdict["memory"]["baseline_steps"] == 75_000
+    assert verdict["memory_within_limit"]
+    content["samples"][-1]["memory_mb"] = 110.5
+    assert not soak_report.judge(content)["passed"]
+
+
+def test_too_few_samples_do_not_pass():
+    content = samples(0.0, 1e-8)
+    del content["samples"][11:]
+    verdict = soak_report.judge(content)
+    assert verdict["closure_drift"] is None
+    assert not verdict["passed"]

@@ -1,0 +1,224 @@
+"""The data behind the figures of docs/: zero sets, surfaces, skeletons, volumes; one is drawn."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from paths import ROOT
+
+from tpm_gym.analysis.aspects import aspects
+from tpm_gym.analysis.singularity import factors_at
+from tpm_gym.kinematics import ASSEMBLY_MODES, ELBOWS_OUT, WORKING_MODES, inverse_all, jacobian
+from tpm_gym.kinematics.geometry import PAPER, Geometry
+from tpm_gym.kinematics.workspace import TASK_REGION, assembly_of, reachable
+
+DOCS = ROOT / "docs"
+
+import draw_figures  # noqa: E402
+from figures import maps, postures, regions, surfaces  # noqa: E402
+from figures.skeleton import skeleton  # noqa: E402
+from figures.zero_sets import (  # noqa: E402
+    Section,
+    clip,
+    parallel_lines,
+    reach_margin,
+    serial_lines,
+    serial_squares,
+    zero_lines,
+)
+
+X, Z = np.linspace(-0.92, 1.06, 100), np.linspace(-1.18, 1.22, 121)
+OTHER = Geometry(l1=0.25, l2=0.06, l3=0.30, l4=0.65, l5=0.08, l6=0.02, l7=0.12)
+
+
+def random_points(count: int, geometry: Geometry = PAPER) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    reach = geometry.l3 + geometry.l4
+    return rng.uniform((-reach, -geometry.l7, -reach), (reach, geometry.l7, reach), (count, 3))
+
+
+@pytest.mark.parametrize("geometry", [PAPER, OTHER])
+@pytest.mark.parametrize("mode", [ELBOWS_OUT, WORKING_MODES[3]])
+def test_serial_squares_are_the_squares_of_the_factors_and_tell_what_is_reached(geometry, mode):
+    points = random_points(20_000, geometry)
+    squares = serial_squares(points, mode.cos_beta, geometry)
+    valid = reachable(points, mode, geometry)
+    assert 0.2 < valid.mean() < 0.9
+    np.testing.assert_array_equal(valid, np.all(squares >= 0, axis=-1))
+    np.testing.assert_array_equal(valid, reach_margin(points, mode.cos_beta, geometry) >= 0)
+    serial = factors_at(points[valid], mode, geometry).serial
+    np.testing.assert_allclose(squares[valid], serial**2, atol=1e-14)
+
+
+@pytest.mark.parametrize("index", [1, 2])
+@pytest.mark.parametrize("y", [1e-5, 0.025, 0.048])
+def test_parallel_lines_are_zeros_with_a_change_of_sign(index, y):
+    section = Section("y", y)
+    lines = parallel_lines(index, ELBOWS_OUT, section, X, Z)
+    assert sum(len(line) for line in lines) > 50
+    points = section.points(np.concatenate(lines))
+    # Near the edge of the reach a factor changes like a square root: hence the tolerance.
+    assert np.abs(factors_at(points, ELBOWS_OUT).parallel[..., index]).max() < 1e-10
+    matrices = np.array([parallel_jacobian(point) for point in points[:: len(points) // 20]])
+    values = np.linalg.svd(matrices, compute_uv=False)
+    assert (values[:, 2] / values[:, 0]).max() < 1e-9
+
+
+def parallel_jacobian(point: np.ndarray) -> np.ndarray:
+    """A of the point, from the rods of the drawn skeleton and not from the factors."""
+    s = skeleton(point, ELBOWS_OUT)
+    rods, (cos, sin, _) = s.c - s.b, (s.e1 - s.d1) / PAPER.l7
+    return np.array(
+        [
+            [cos * rods[0, 0], sin * rods[0, 0], cos * rods[0, 2]],
+            [cos * rods[1, 0], sin * rods[1, 0], cos * rods[1, 2]],
+            rods[2],
+        ]
+    )
+
+
+def test_plane_y_0_is_found_in_sections_of_constant_z():
+    y = np.linspace(-0.0529, 0.0529, 60)
+    section = Section("z", 0.75)
+    lines = parallel_lines(0, ELBOWS_OUT, section, X, y)
+    points = section.points(np.concatenate(lines))
+    assert np.abs(points[:, 1]).max() < 1e-12
+    assert np.ptp(points[:, 0]) > 1.2  # from rim to rim
+
+
+def test_no_parallel_line_enters_the_task_region():
+    for y in np.linspace(TASK_REGION.low[1], TASK_REGION.high[1], 3):
+        section = Section("y", y)
+        for index in (1, 2):
+            for line in parallel_lines(index, ELBOWS_OUT, section, X, Z):
+                assert not TASK_REGION.contains(section.points(line)).any()
+
+
+@pytest.mark.parametrize("index", [1, 2, 3])
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_serial_lines_are_the_edge_of_the_reach(index, sign):
+    section = Section("y", 0.025)
+    mode = next(m for m in WORKING_MODES if m.cos_beta == sign)
+    line = np.concatenate(serial_lines(index, sign, section, X, Z))
+    points = section.points(line)
+    assert np.abs(serial_squares(points, sign)[:, index]).max() < 1e-14
+    # A step to one side of the edge is reached, a step to the other is not.
+    steps = 2e-5 * np.array([(np.cos(a), 0, np.sin(a)) for a in np.linspace(0, 2 * np.pi, 16)])
+    around = reachable(points[:, None] + steps, mode)
+    ends = np.abs(reach_margin(points, sign)) > 1e-12  # where another leg's edge begins
+    assert (around.any(axis=1) & ~around.all(axis=1))[~ends].all()
+
+
+def test_zero_lines_of_a_circle_are_exact_and_clip_cuts_them():
+    nodes = np.linspace(-1.5, 1.5, 40)
+    lines = zero_lines(lambda p: 1 - (p**2).sum(axis=-1), nodes, nodes)
+    radius = np.hypot(*np.concatenate(lines).T)
+    np.testing.assert_allclose(radius, 1.0, atol=1e-14)
+    pieces = clip(lines, lambda p: p[..., 0] > 0.3)
+    assert pieces
+    assert all((piece[:, 0] > 0.3).all() for piece in pieces)
+    assert zero_lines(lambda p: 1 + p[..., 0] ** 2, nodes, nodes) == []
+
+
+def test_swept_surfaces_stay_singular():
+    """The curves of factors 2 and 3 at one y, swept at constant (xC, zC), are zeros at every y."""
+    y0, y = 0.025, surfaces.levels(9)[1:-1]
+    y = y[np.abs(y) > 1e-9]
+    for index in (1, 2):
+        line = np.concatenate(parallel_lines(index, ELBOWS_OUT, Section("y", y0), X, Z))
+        mesh = surfaces.sweep(line, y0, y, ELBOWS_OUT.cos_beta)
+        values = factors_at(mesh, ELBOWS_OUT).parallel[..., index]
+        assert np.isfinite(values).mean() > 0.9
+        assert np.nanmax(np.abs(values)) < 1e-10
+    for index in (1, 2, 3):
+        lines = serial_lines(index, 1, Section("y", 0.0), X, Z, clipped=False)
+        line = np.concatenate(lines)
+        mesh = surfaces.sweep_leg3(line, 0.0, y) if index == 3 else surfaces.sweep(line, 0.0, y, 1)
+        assert np.abs(serial_squares(mesh, 1)[..., index]).max() < 1e-12
+
+
+def test_platform_runs_free_on_the_second_factor():
+    """Where it vanishes, the same motor angles hold for every beta, as the caption says."""
+    y = np.linspace(0.005, 0.045, 9)
+    line = np.concatenate(parallel_lines(1, ELBOWS_OUT, Section("y", 0.025), X, Z))
+    mesh = surfaces.sweep(line[len(line) // 4 :: 40], 0.025, y, 1)
+    theta = inverse_all(mesh).theta[..., ELBOWS_OUT.index, :]
+    assert np.isfinite(theta).all()
+    assert np.ptp(theta, axis=0).max() < 1e-9
+
+
+@pytest.mark.parametrize("geometry", [PAPER, OTHER])
+def test_drawn_links_have_the_lengths_of_the_geometry(geometry):
+    middle = postures.POINT if geometry is PAPER else np.array([0.0, 0.06, 0.6])
+    assert inverse_all(middle, geometry).valid.all()
+    for mode in WORKING_MODES:
+        links = skeleton(middle, mode, geometry).links()
+        for name, (start, end, length) in links.items():
+            assert np.linalg.norm(end - start) == pytest.approx(length, abs=1e-14), name
+    assert set(postures.STROKES) <= set(links)
+
+
+def test_postures_are_distinct_in_the_drawing():
+    drawn = []
+    for mode in WORKING_MODES:
+        s = skeleton(postures.POINT, mode)
+        drawn.append(postures.project(np.concatenate([s.b, s.c])).ravel())
+    gaps = np.linalg.norm(np.array(drawn)[:, None] - np.array(drawn), axis=-1)
+    assert gaps[~np.eye(16, dtype=bool)].min() > 0.05  # m, of 1.2
+
+
+def test_projection_keeps_scale():
+    """Three orthogonal unit vectors have squared lengths that sum to 2 in a parallel projection."""
+    assert (postures.project(np.eye(3)) ** 2).sum() == pytest.approx(2.0)
+
+
+def test_factors_agree_with_those_of_joint_angles():
+    """The figures take factors from points; the library's from joint angles say the same."""
+    points = random_points(300)
+    points = points[reachable(points) & (np.abs(points[:, 1]) > 2e-3)]
+    slots = assembly_of(points)
+    theta = inverse_all(points).theta[:, ELBOWS_OUT.index]
+    for slot, assembly in enumerate(ASSEMBLY_MODES):
+        ours = factors_at(points[slots == slot], ELBOWS_OUT)
+        theirs = jacobian.factors(theta[slots == slot], assembly)
+        np.testing.assert_allclose(ours.parallel, theirs.parallel, atol=1e-8)
+        np.testing.assert_allclose(ours.serial, theirs.serial, atol=1e-8)
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_volume_agrees_with_random_points(sign):
+    mode = next(m for m in WORKING_MODES if m.cos_beta == sign)
+    low, high = np.array([-1.2, -PAPER.l7, -1.3]), np.array([1.2, PAPER.l7, 1.3])
+    points = np.random.default_rng(1).uniform(low, high, (40_000, 3))
+    share = reachable(points, mode).mean()
+    box = np.prod(high - low)
+    sigma = box * np.sqrt(share * (1 - share) / len(points))
+    volume = maps.volume(sign, step=0.01, slices=16)
+    assert volume == pytest.approx(share * box, abs=4 * sigma)
+    assert volume == pytest.approx(maps.volume(sign, step=0.02, slices=8), rel=5e-3)
+
+
+def test_signs_tell_the_aspects_of_a_half_apart():
+    """The figure of the aspects colours by signs: each pair of signs is one aspect in each half."""
+    found = aspects(ELBOWS_OUT, shape=(128, 8, 192))
+    for sin_beta in (-1, 1):
+        half = [a for a in found if a.assembly.sin_beta == sin_beta]
+        assert {(a.level3, a.assembly.planar) for a in half} == set(regions.COLOURS)
+        # Cells may cut the thinnest off; what they cut off is a crumb.
+        assert all(a.cells.volume < 5e-5 for a in half[4:])
+
+
+def test_a_figure_is_drawn_twice_with_the_same_bytes(tmp_path):
+    first = draw_figures.draw("postures", tmp_path).read_bytes()
+    assert first.startswith(b"\x89PNG")
+    assert b"matplotlib" not in first
+    assert draw_figures.draw("postures", tmp_path).read_bytes() == first
+
+
+def test_unknown_name_is_refused_and_every_figure_has_a_caption():
+    with pytest.raises(SystemExit, match="no figure nonsense"):
+        draw_figures.main(["nonsense"])
+    text = (DOCS / "figures.md").read_text(encoding="utf-8")
+    for name in draw_figures.FIGURES:
+        assert f"(images/{name}.png)" in text
+        assert f"draw_figures.py {name}`" in text

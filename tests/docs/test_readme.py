@@ -1,0 +1,83 @@
+"""What the README shows has to run, and its commands have to exist."""
+
+import re
+import subprocess
+import textwrap
+
+import gymnasium
+import numpy as np
+import pytest
+from paths import ROOT
+
+import tpm_gym
+
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def blocks(language):
+    pattern = rf"^( *)```{language}\n(.*?)^ *```"
+    found = re.finditer(pattern, README, flags=re.MULTILINE | re.DOTALL)
+    return [textwrap.dedent(match.group(2)) for match in found]
+
+
+def test_the_python_blocks_run():
+    namespace = {}
+    for block in blocks("python"):
+        exec(block, namespace)
+    namespace["env"].close()
+    assert namespace["info"]["closure_error"] < 1e-3
+
+
+def test_the_numbers_in_the_kinematics_block_are_right():
+    block = next(block for block in blocks("python") if "kinematics.inverse" in block)
+    namespace = {}
+    exec(block, namespace)
+    theta, jacobian, kinematics = (namespace[n] for n in ("theta", "jacobian", "kinematics"))
+    printed = float(re.search(r"conditioning\(theta\)\s+# ([\d.]+)", block).group(1))
+    assert jacobian.conditioning(theta) == pytest.approx(printed, abs=5e-4)
+    assert np.allclose(kinematics.forward(theta), [-0.04, 0.028, 0.80])
+    assert kinematics.inverse_all([-0.04, 0.028, 0.80]).theta.shape == (16, 3)
+
+
+def test_every_id_in_the_readme_exists():
+    for env_id in re.findall(r"\bTPM\w+-v\d", README):
+        assert env_id in tpm_gym.ENV_IDS
+        assert env_id in gymnasium.registry
+
+
+def test_files_that_the_readme_links_to_exist():
+    for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", README):
+        assert (ROOT / target).exists(), target
+
+
+def test_what_the_penalty_does_is_as_measured():
+    results = (ROOT / "docs/results.md").read_text(encoding="utf-8")
+    kinds = ("TPMReachJoints-v0, .* 10,000", "TPMPickAndPlaceJoints-v0, .* 100,000")
+    measured = [
+        share
+        for kind in kinds
+        for share in re.search(
+            rf"^- {kind} steps: ([\d.]+)% without .*?, ([\d.]+)% with", results, re.M
+        ).groups()
+    ]
+    claimed = re.search(
+        r"([\d.]+)%\s+of\s+their\s+time\s+below\s.*?\swithout\s+it\s+and\s+([\d.]+)%\s+with\s.*?"
+        r"([\d.]+)%\s+and\s+([\d.]+)%\s+in\s+pick-and-place",
+        README,
+        re.S,
+    )
+    for one, other in zip(measured, claimed.groups(), strict=True):
+        assert float(one) == pytest.approx(float(other), abs=0.05)
+    # "as successful as without": interquartile means within half a point of each other
+    for kind in ("TPMReachJoints-v0 .* 10,000", "TPMPickAndPlaceJoints-v0 .* 100,000"):
+        rows = re.findall(rf"^\| {kind} \| [01] \| 5 \| ([\d.]+)%", results, re.M)
+        without, with_it = map(float, rows)
+        assert with_it >= without - 0.5
+
+
+def test_make_knows_the_commands():
+    targets = re.findall(r"^make ([\w-]+)", README, flags=re.MULTILINE)
+    assert targets == ["demo", "test"]
+    for target in targets:
+        command = ["make", "--dry-run", "--directory", str(ROOT), target]
+        subprocess.run(command, check=True, capture_output=True)

@@ -1,0 +1,354 @@
+"""The same seed gives the same bits: again, later, elsewhere, side by side, copied or restored."""
+
+from __future__ import annotations
+
+import copy
+import os
+import pickle
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pybullet
+import pytest
+from episodes import (
+    CASES,
+    EVERYTHING,
+    all_fingerprints,
+    bits,
+    continued,
+    expert_episode,
+    fingerprint,
+    make,
+    play,
+    random_episode,
+)
+from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
+from paths import SUPPORT
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
+
+from tpm_gym.envs.env import TPMEnv
+from tpm_gym.errors import ConfigurationError, EpisodeError, ModeChangeError
+from tpm_gym.tasks.expert import Expert
+
+MACHINES: list[dict[str, Any]] = [{}, EVERYTHING]
+Outcome = tuple[Any, ...]
+
+
+@pytest.fixture(params=CASES, ids=lambda case: case[0] + ("-random" if case[1] else ""))
+def env(request: pytest.FixtureRequest) -> Iterator[gym.Env[Any, Any]]:
+    env = make(*request.param)
+    yield env
+    env.close()
+
+
+# -- again, later, elsewhere -----------------------------------------------------------------------
+
+
+def test_first_and_hundredth_episode_are_equal(env: gym.Env[Any, Any]) -> None:
+    episode = random_episode if "Dense" in str(env.spec) else expert_episode
+    first = fingerprint(episode(env, 5))
+    rebuilt = env.unwrapped.randomisation.length_error > 0  # slow, and little to remember
+    for seed in range(18 if rebuilt else 98):
+        for _ in random_episode(env, 100 + seed, steps=1 + seed % 4):
+            pass
+    assert fingerprint(episode(env, 5)) == first
+
+
+def test_fresh_processes_give_the_same_and_go_on_with_what_was_pickled(tmp_path: Path) -> None:
+    env = make("TPMPickAndPlace-v0", EVERYTHING)
+    for _ in expert_episode(env, 8, steps=20):
+        pass
+    path = tmp_path / "env.pickle"
+    path.write_bytes(pickle.dumps(env))
+    code = (
+        "import sys; sys.path.insert(0, sys.argv[1]);"
+        "from episodes import all_fingerprints, continued;"
+        "print(*all_fingerprints(), continued(sys.argv[2]), sep='\\n')"
+    )
+    command = [sys.executable, "-c", code, str(SUPPORT), str(path)]
+    fresh = [
+        subprocess.Popen(
+            command,
+            stdout=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "PYTHONHASHSEED": seed},
+        )
+        for seed in ("0", "4711")
+    ]
+    expected = [*all_fingerprints(), continued(str(path))]
+    for process in fresh:
+        printed = process.communicate()[0].splitlines()
+        assert process.returncode == 0
+        assert printed[-len(expected) :] == expected
+    env.close()
+
+
+# -- saved and restored ----------------------------------------------------------------------------
+
+
+def touching(env: gym.Env[Any, Any]) -> bool:
+    """Whether the cup touches the puck."""
+    simulation = env.unwrapped.simulation
+    body = simulation._robot.tool[0]
+    return bool(simulation._client.getContactPoints(body, simulation._scenery.puck))
+
+
+@pytest.mark.parametrize("machine", MACHINES)
+@pytest.mark.parametrize("env_id", ["TPMPickAndPlace-v0", "TPMPickAndPlaceJointsDense-v0"])
+def test_saved_states_go_on_equally_on_their_way_in_contact_and_holding(
+    env_id: str, machine: dict[str, Any]
+) -> None:
+    env = make(env_id, machine, max_episode_steps=1000)
+    bare = env.unwrapped
+    # The expert comes down without vacuum first: a contact, then a grasp.
+    observation, _ = env.reset(seed=3, options={"object": (-0.05, -0.03, 0.015)})
+    expert = Expert(env)
+    expert.reset(observation)
+    moments, actions, expected = {}, [], []
+    for step in range(40):
+        held, touched = bare.state.holding, touching(env)
+        moments[step] = (bare.save_state(), "held" if held else "touched" if touched else "free")
+        action = expert.act(observation)
+        if step < 14:
+            action[3] = -1.0
+        actions.append(action)
+        observation = env.step(action)[0]
+        expected.append((bits(observation), bits(vars(bare.state))))
+    assert {kind for _, kind in moments.values()} == {"free", "touched", "held"}
+    for stop in (30, 0, 8, 12, 13, 16, 22, 39):
+        snapshot = moments[stop][0]
+        bare.reset(seed=stop)  # somebody else's episode, on another machine
+        bare.step(np.ones(4))
+        bare.restore_state(snapshot)
+        for step in range(stop, min(stop + 12, 40)):
+            observation = env.step(actions[step])[0]
+            assert (bits(observation), bits(vars(bare.state))) == expected[step]
+            bare.save_state()  # as was done the first time
+    env.close()
+
+
+def test_a_snapshot_serves_another_environment_and_brings_rng_and_goal(
+    env: gym.Env[Any, Any],
+) -> None:
+    for _ in random_episode(env, 1, steps=8):
+        pass
+    snapshot = env.unwrapped.save_state()
+    actions = list(np.random.default_rng(2).uniform(-1, 1, (10, *env.action_space.shape)))
+    expected = play(env, actions), bits(env.reset()[0])
+    other = copy.deepcopy(env)  # equally wrapped
+    other.reset(seed=99)
+    for _ in range(8):  # the wrapper counts for itself
+        other.step(actions[0])
+    seen = other.unwrapped.restore_state(pickle.loads(pickle.dumps(snapshot)))
+    assert other.observation_space.contains(seen)
+    assert (play(other, actions), bits(other.reset()[0])) == expected
+    other.close()
+
+
+# -- side by side ----------------------------------------------------------------------------------
+
+STEPS, EPISODE = 14, 5
+ROWS = 2
+
+
+def vector_actions(env_id: str) -> Any:
+    size = 4 if "Pick" in env_id else 3
+    actions = np.random.default_rng(9).uniform(-1, 1, (STEPS, ROWS, size))
+    return actions.astype(np.float32)
+
+
+def factories(env_id: str, machine: dict[str, Any]) -> list[Callable[[], gym.Env[Any, Any]]]:
+    return [partial(make, env_id, machine, max_episode_steps=EPISODE)] * ROWS
+
+
+def gymnasium_rows(env_id: str, machine: dict[str, Any]) -> list[list[Outcome]]:
+    """What the single environments give, each reset on the step after its end."""
+    rows = []
+    for index, factory in enumerate(factories(env_id, machine)):
+        env, done = factory(), False
+        row: list[Outcome] = [(bits(env.reset(seed=40 + index)[0]),)]
+        for action in vector_actions(env_id)[:, index]:
+            if done:
+                observation, done = env.reset()[0], False
+                row.append((bits(observation), 0.0, False))
+                continue
+            observation, reward, terminated, done, _ = env.step(action)
+            assert not terminated
+            row.append((bits(observation), reward, done))
+        rows.append(row)
+        env.close()
+    return rows
+
+
+@pytest.mark.parametrize(
+    ("vectorise", "env_id", "machine"),
+    [
+        (SyncVectorEnv, "TPMReachJoints-v0", {}),
+        (SyncVectorEnv, "TPMPickAndPlaceDense-v0", EVERYTHING),
+        (partial(AsyncVectorEnv, context="spawn"), "TPMPickAndPlaceDense-v0", EVERYTHING),
+    ],
+    ids=["sync", "sync-random", "async-random"],
+)
+def test_gymnasiums_vectors_give_the_rows_of_single_environments(
+    vectorise: Any, env_id: str, machine: dict[str, Any]
+) -> None:
+    envs = vectorise(factories(env_id, machine))
+    observations = envs.reset(seed=[40, 41])[0]
+    found: list[list[Outcome]] = [
+        [({name: batch[row].tobytes() for name, batch in observations.items()},)]
+        for row in range(ROWS)
+    ]
+    for actions in vector_actions(env_id):
+        observations, rewards, _, truncations, _ = envs.step(actions)
+        for row in range(ROWS):
+            seen = {name: batch[row].tobytes() for name, batch in observations.items()}
+            found[row].append((seen, rewards[row], truncations[row]))
+    envs.close()
+    assert found == gymnasium_rows(env_id, machine)
+
+
+def sb3_rows(env_id: str, machine: dict[str, Any]) -> list[list[Outcome]]:
+    """What the single environments give, each reset in the step of its end."""
+    rows = []
+    for index, factory in enumerate(factories(env_id, machine)):
+        env = factory()
+        row: list[Outcome] = [(bits(env.reset(seed=40 + index)[0]),)]
+        for action in vector_actions(env_id)[:, index]:
+            observation, reward, _, done, info = env.step(action)
+            last = bits(observation) if done else None
+            if done:
+                observation = env.reset()[0]
+            row.append((bits(observation), np.float32(reward), done, last, info["conditioning"]))
+        rows.append(row)
+        env.close()
+    return rows
+
+
+@pytest.mark.parametrize(
+    "vectorise", [DummyVecEnv, partial(SubprocVecEnv, start_method="spawn")], ids=["dummy", "sub"]
+)
+def test_sb3s_vectors_give_the_rows_of_single_environments(
+    vectorise: Callable[..., VecEnv],
+) -> None:
+    env_id = "TPMPickAndPlace-v0"
+    envs = vectorise(factories(env_id, EVERYTHING))
+    envs.seed(40)
+    observations: Any = envs.reset()
+    found: list[list[Outcome]] = [
+        [({name: batch[row].tobytes() for name, batch in observations.items()},)]
+        for row in range(ROWS)
+    ]
+    for actions in vector_actions(env_id):
+        observations, rewards, dones, infos = envs.step(actions)
+        for row, info in enumerate(infos):
+            seen = {name: batch[row].tobytes() for name, batch in observations.items()}
+            last = bits(info["terminal_observation"]) if dones[row] else None
+            found[row].append((seen, rewards[row], bool(dones[row]), last, info["conditioning"]))
+    envs.close()
+    assert found == sb3_rows(env_id, EVERYTHING)
+
+
+# -- copied ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_copy_goes_on_equally_and_on_its_own(env: gym.Env[Any, Any], copied: Any) -> None:
+    for _ in expert_episode(env, 4, steps=15):
+        pass
+    other = copied(env)
+    assert type(other) is type(env)
+    actions = list(np.random.default_rng(5).uniform(-1, 1, (36, *env.action_space.shape)))
+    ours = play(env, actions[:35])  # to the end: the count of the wrapper goes along
+    assert ours[-1][0][3] is True
+    ahead = env.reset()[0]
+    assert play(other, actions[:35]) == ours
+    assert bits(other.reset()[0]) == bits(ahead)
+    # One of them closed, the other one runs on.
+    env.close()
+    other.step(actions[0])
+    other.close()
+
+
+def test_a_copy_holds_what_the_original_holds() -> None:
+    env = make("TPMPickAndPlace-v0", {})
+    for _ in expert_episode(env, 3, steps=20):
+        pass
+    other = copy.deepcopy(env)
+    assert env.unwrapped.state.holding is other.unwrapped.state.holding is True
+    lift = [np.array([0.0, 0.0, -1.0, 1.0])] * 5
+    assert play(env, lift) == play(other, lift)
+    assert other.unwrapped.state.object_position[2] > 0.05
+    env.close()
+    other.close()
+
+
+def test_a_copy_made_before_the_first_reset_or_after_an_episode_starts_equally() -> None:
+    env = TPMEnv("pick_and_place", randomisation=EVERYTHING)
+    early = copy.deepcopy(env)
+    with pytest.raises(EpisodeError, match="reset"):
+        early.step(np.zeros(4))
+    expected = fingerprint(random_episode(env, 2, steps=10))
+    assert fingerprint(random_episode(early, 2, steps=10)) == expected
+    env.simulation.move = None  # an episode that failed
+    with pytest.raises(TypeError):
+        env.step(np.zeros(4))
+    late = copy.deepcopy(env)
+    with pytest.raises(EpisodeError, match="reset"):
+        late.step(np.zeros(4))
+    assert fingerprint(random_episode(late, 2, steps=10)) == expected
+    for one in (env, early, late):
+        one.close()
+
+
+def test_a_copy_of_a_closed_environment_is_closed() -> None:
+    env = TPMEnv("reach")
+    env.reset(seed=0)
+    env.close()
+    for other in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
+        with pytest.raises(EpisodeError, match="closed"):
+            other.reset()
+        with pytest.raises(pybullet.error):  # and holds no client
+            other.simulation.read()
+
+
+def test_a_copy_of_a_truncated_environment_has_to_be_reset_too() -> None:
+    env = TPMEnv("reach")
+    env.reset(seed=0)
+    for y in (0.018, 0.008, -0.002, -0.012):
+        env._state = env.simulation.move((-0.04, y, 0.80))
+    other = copy.deepcopy(env)
+    assert other.state.mode_change == "assembly"
+    for one in (env, other):
+        with pytest.raises(ModeChangeError):
+            one.step(np.zeros(3))
+        one.close()
+
+
+def test_an_environment_with_a_window_refuses_to_be_copied() -> None:
+    env = TPMEnv("reach")
+    env.reset(seed=0)
+    env.render_mode = "human"  # as if it had one
+    for copied in (pickle.dumps, copy.deepcopy, copy.copy):
+        with pytest.raises(ConfigurationError, match="copied or pickled") as caught:
+            copied(env)
+        assert caught.value.name == "render_mode"
+    env.close()
+
+
+def test_saving_and_copying_leave_the_original_as_it_would_be_after_a_restore() -> None:
+    env = TPMEnv("pick_and_place")
+    actions = [np.full(4, 0.2)] * 5
+    for _ in expert_episode(env, 3, steps=12):
+        pass
+    snapshot = env.save_state()
+    expected = play(env, actions)
+    env.restore_state(snapshot)
+    copy.deepcopy(env).close()
+    assert play(env, actions) == expected
+    env.close()

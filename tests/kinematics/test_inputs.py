@@ -1,0 +1,198 @@
+"""What the kinematics say about inputs that have no solution, or are no input at all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import oracle
+import pytest
+from numpy.typing import NDArray
+
+from tpm_gym.errors import InputError, UnreachableError
+from tpm_gym.kinematics import (
+    ASSEMBLY_MODES,
+    ELBOWS_OUT,
+    WORKING_MODES,
+    forward,
+    forward_all,
+    inverse,
+    inverse_all,
+    passive_angles,
+)
+from tpm_gym.kinematics.geometry import PAPER, Geometry
+
+HOME = np.array([-0.05, 0.03, 0.78])
+SINGLE_BRANCH = (forward, inverse, passive_angles)
+NOT_FINITE = [
+    [value if axis == i else 0.3 for i in range(3)]
+    for axis in range(3)
+    for value in (np.nan, np.inf, -np.inf)
+]
+FAR = [[0, 0.02, 5], [9, 0, 0], [-9, 0.04, 0.7], [0, 0.0501, 0.75], [0, -3, 0.75], [1e6, 1e6, -1e6]]
+# Arm 1 lowered, arm 2 raised: the circles of the first loop miss each other.
+APART = [0.0, np.pi, -2.0], [np.pi / 2, -np.pi / 2 + 0.2, 0.5]
+
+
+@pytest.mark.parametrize("function", [forward_all, inverse_all])
+@pytest.mark.parametrize("values", NOT_FINITE)
+def test_values_that_are_not_finite_give_invalid_branches(
+    function: Callable[..., Any], values: list[float]
+) -> None:
+    with np.errstate(invalid="raise", divide="raise", over="raise"):
+        solutions = function([values, HOME, values])
+    assert not solutions.valid[[0, 2]].any()
+    assert np.isnan(solutions.beta[[0, 2]]).all()
+    assert solutions.valid[1].any() == function(HOME).valid.any()
+
+
+@pytest.mark.parametrize("point", FAR)
+def test_points_out_of_reach_give_invalid_branches(point: list[float]) -> None:
+    with np.errstate(invalid="raise", divide="raise", over="raise"):
+        solutions = inverse_all(point)
+    assert not solutions.valid.any()
+    assert np.isnan(solutions.theta).all()
+    assert np.isnan(solutions.beta).all()
+
+
+def test_forward_branches_are_real_together_or_not_at_all() -> None:
+    angles = np.random.default_rng(0).uniform(-np.pi, np.pi, (5000, 3))
+    solutions = forward_all(angles)
+    assert not solutions.valid.all()
+    by_planar = {-1: [], 1: []}
+    for slot, mode in enumerate(ASSEMBLY_MODES):
+        by_planar[mode.planar].append(solutions.valid[:, slot])
+    for pair in by_planar.values():
+        np.testing.assert_array_equal(*pair)
+    for values in (solutions.position, solutions.beta[..., None], solutions.link3):
+        np.testing.assert_array_equal(np.isfinite(values).all(axis=-1), solutions.valid)
+
+
+@pytest.mark.parametrize("function", SINGLE_BRANCH)
+@pytest.mark.parametrize("values", NOT_FINITE)
+def test_single_branch_calls_reject_values_that_are_not_finite(
+    function: Callable[..., Any], values: list[float]
+) -> None:
+    with pytest.raises(InputError, match="finite") as caught:
+        function([HOME, values])
+    assert caught.value.name in {"theta", "position"}
+    np.testing.assert_array_equal(caught.value.value, values)
+
+
+@pytest.mark.parametrize("function", [*SINGLE_BRANCH, forward_all, inverse_all])
+@pytest.mark.parametrize("bad", [1.0, [], [0.0, 0.0], np.zeros((3, 2)), ["a", "b", "c"], [[1], 2]])
+def test_wrong_shapes_and_types_are_input_errors(function: Callable[..., Any], bad: Any) -> None:
+    with pytest.raises(InputError, match="shape"):
+        function(bad)
+
+
+@pytest.mark.parametrize("y", [0.0501, -0.06, 1.0])
+def test_points_beyond_link_7_blame_beta_and_say_by_how_much(y: float) -> None:
+    point = [0.0, y, 0.75]
+    with pytest.raises(UnreachableError) as caught:
+        inverse([HOME, point])
+    assert caught.value.leg.startswith("beta")
+    assert caught.value.margin == pytest.approx(PAPER.l7 - abs(y))
+    assert caught.value.margin < 0
+    assert caught.value.point == tuple(point)
+
+
+def rod_range(point: NDArray[np.float64], leg: int, cos_sign: int) -> tuple[float, float]:
+    """Shortest and longest B_iC_i over a full turn of the arm, C_i where the point puts it."""
+    g = PAPER
+    beta = np.arctan2(point[1], cos_sign * np.sqrt(g.l7**2 - point[1] ** 2))
+    turn = np.linspace(0, 2 * np.pi, 20_001)
+    theta = np.stack([turn] * 3, axis=-1)
+    x_c = np.full(turn.shape, point[0] - g.l2 - g.l7 * np.cos(beta))
+    p = oracle.points(theta, x_c, point[2] - 2 * g.l6, beta, g)
+    lengths = np.linalg.norm(oracle.rods(p)[:, leg - 1], axis=-1)
+    return float(lengths.min()), float(lengths.max())
+
+
+def test_the_leg_that_is_blamed_cannot_reach() -> None:
+    rng = np.random.default_rng(1)
+    blamed = set()
+    for point in rng.uniform([-0.9, -0.049, -1.3], [0.9, 0.049, 1.3], (150, 3)):
+        mode = WORKING_MODES[rng.integers(16)]
+        if inverse_all(point).valid[mode.index]:
+            continue
+        with pytest.raises(UnreachableError) as caught:
+            inverse(point, mode)
+        assert caught.value.margin < 0
+        leg = int(caught.value.leg.removeprefix("leg "))
+        shortest, longest = rod_range(point, leg, mode.cos_beta)
+        assert not shortest <= PAPER.l4 <= longest
+        blamed.add(leg)
+    assert blamed == {1, 2, 3}
+
+
+def test_margin_of_a_planar_leg_is_the_missing_length() -> None:
+    # C2 is 300 mm under A2, nearer than leg 2 can fold: |l3 - l4| = 450 mm.
+    x_c, z_c = 2 * PAPER.l5 - PAPER.l1, 0.3
+    point = [x_c + PAPER.l2 + PAPER.l7, 0.0, z_c + 2 * PAPER.l6]
+    with pytest.raises(UnreachableError) as caught:
+        inverse(point, ELBOWS_OUT)
+    assert caught.value.leg == "leg 2"
+    assert caught.value.margin == pytest.approx(-0.15)
+
+
+@pytest.mark.parametrize("theta", APART)
+def test_loops_that_cannot_be_assembled_are_named(theta: list[float]) -> None:
+    assert not forward_all(theta).valid.any()
+    home = inverse(HOME)
+    for mode in ASSEMBLY_MODES:
+        batch = [home, theta] if forward_all(home).valid[mode.index] else [theta]
+        for function in (forward, passive_angles):
+            with pytest.raises(UnreachableError, match=r"loop \d") as caught:
+                function(batch, mode)
+            assert caught.value.margin < 0
+            assert caught.value.point == tuple(theta)
+
+
+def test_the_loop_that_is_blamed_is_the_one_that_fails() -> None:
+    angles = np.random.default_rng(2).uniform(-np.pi, np.pi, (120, 3))
+    blamed = set()
+    for theta in angles:
+        for mode in ASSEMBLY_MODES[::2]:
+            if forward_all(theta).valid[mode.index]:
+                continue
+            with pytest.raises(UnreachableError) as caught:
+                forward(theta, mode)
+            assert caught.value.margin < 0
+            loop = int(caught.value.leg.removeprefix("loop ")[0])
+            # Loop 1 fails where the circles of B1C1 and B2C2 in the plane y = 0 do not meet.
+            p = oracle.points(theta, 0.0, 0.0, 0.0, PAPER)
+            radius = np.sqrt(PAPER.l4**2 - p["B1"][1] ** 2)
+            apart = np.hypot(p["B2"][0] + 2 * PAPER.l5, p["B2"][2] - p["B1"][2])
+            meet = abs(PAPER.l4 - radius) <= apart <= PAPER.l4 + radius
+            assert loop == (2 if meet else 1)
+            blamed.add(loop)
+    assert blamed == {1, 2}
+
+
+def test_the_edge_of_the_workspace_in_y_is_reached_exactly() -> None:
+    for y in (PAPER.l7, -PAPER.l7):
+        solutions = inverse_all([-0.05, y, 0.78])
+        assert solutions.valid.any()
+        found = forward_all(solutions.theta[solutions.valid]).position
+        gaps = np.linalg.norm(found - [-0.05, y, 0.78], axis=-1)
+        assert np.nanmin(gaps, axis=-1).max() < 1e-9
+
+
+def test_concentric_circles_are_named_without_a_warning() -> None:
+    # 2 l5 = l1: at theta_2 = 90 degrees the centres of both circles of Eq. (6) lie above O.
+    geometry, theta = Geometry(0.3, 0.07, 0.35, 0.8, 0.15, 0.01, 0.05), [np.pi / 2, np.pi / 2, 0.0]
+    assert not forward_all(theta, geometry).valid.any()
+    with pytest.raises(UnreachableError, match="loop 1"):
+        forward(theta, geometry=geometry)
+
+
+@pytest.mark.parametrize("far", [1e160, 1e200, 1e300])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_points_at_the_end_of_the_number_range_are_unreachable(far: float, axis: int) -> None:
+    point = [0.0, 0.02, 0.8]
+    point[axis] = far
+    assert not inverse_all(point).valid.any()
+    with pytest.raises(UnreachableError):
+        inverse(point)

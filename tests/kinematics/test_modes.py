@@ -1,0 +1,88 @@
+"""Names of the branches: signs only, one slot each, the environments' own the useful ones."""
+
+from __future__ import annotations
+
+from dataclasses import FrozenInstanceError, fields
+from typing import Any
+
+import numpy as np
+import oracle
+import pytest
+
+from tpm_gym import kinematics
+from tpm_gym.errors import InputError
+from tpm_gym.kinematics import modes as branches
+from tpm_gym.kinematics.geometry import PAPER
+from tpm_gym.kinematics.modes import (
+    ASSEMBLY_MODES,
+    DEFAULT_ASSEMBLY,
+    ELBOWS_OUT,
+    WORKING_MODES,
+    AssemblyMode,
+    WorkingMode,
+)
+
+CENTRE = np.array([-0.06, 0.03, 0.78])
+
+
+@pytest.mark.parametrize(("modes", "count"), [(ASSEMBLY_MODES, 4), (WORKING_MODES, 16)])
+def test_every_combination_of_signs_has_the_slot_of_its_index(
+    modes: tuple[Any, ...], count: int
+) -> None:
+    assert len(set(modes)) == len(modes) == count
+    assert [mode.index for mode in modes] == list(range(count))
+    for mode in modes:
+        assert all(getattr(mode, field.name) in (-1, 1) for field in fields(mode))
+
+
+@pytest.mark.parametrize("bad", [0, 2, -2, 0.5, float("nan"), "+", None])
+def test_anything_but_signs_is_refused(bad: Any) -> None:
+    for position in range(2):
+        signs = [1, 1]
+        signs[position] = bad
+        with pytest.raises(InputError) as caught:
+            AssemblyMode(*signs)
+        assert caught.value.name == "AssemblyMode"
+    for position in range(4):
+        signs = [1, -1, 1, -1]
+        signs[position] = bad
+        with pytest.raises(InputError) as caught:
+            WorkingMode(*signs)
+        assert caught.value.name == "WorkingMode"
+
+
+def test_modes_are_frozen() -> None:
+    with pytest.raises(FrozenInstanceError):
+        DEFAULT_ASSEMBLY.planar = 1  # type: ignore[misc]
+    with pytest.raises(FrozenInstanceError):
+        ELBOWS_OUT.leg1 = -1  # type: ignore[misc]
+
+
+def elbow_distances(mode: WorkingMode) -> np.ndarray:
+    """Distance of each elbow B_i from the z axis, less that of its pivot A_i."""
+    theta = kinematics.inverse(CENTRE, mode)
+    p = oracle.points(theta, 0.0, 0.0, 0.0, PAPER)
+    distance = {name: np.linalg.norm(point[:2]) for name, point in p.items()}
+    return np.array([distance[f"B{i}"] - distance[f"A{i}"] for i in (1, 2, 3)])
+
+
+def test_elbows_out_bends_every_arm_away_from_the_centre_and_the_others_do_not() -> None:
+    assert (elbow_distances(ELBOWS_OUT) > 0).all()
+    assert ELBOWS_OUT.cos_beta == 1
+    valid = kinematics.inverse_all(CENTRE).valid
+    others = [mode for mode in WORKING_MODES if mode.cos_beta == 1 and valid[mode.index]]
+    assert len(others) == 8
+    for mode in others:
+        assert (elbow_distances(mode) > 0).all() == (mode == ELBOWS_OUT)
+
+
+def test_the_default_assembly_holds_the_platform_beyond_the_elbows_at_positive_y() -> None:
+    theta = kinematics.inverse(CENTRE)
+    np.testing.assert_allclose(kinematics.forward(theta, DEFAULT_ASSEMBLY), CENTRE, atol=1e-12)
+    heights = PAPER.l3 * np.sin(theta)
+    assert (CENTRE[2] > heights).all()
+
+
+def test_kinematics_offers_the_names_of_branches() -> None:
+    for name in branches.__all__:
+        assert getattr(kinematics, name) is getattr(branches, name)

@@ -1,0 +1,263 @@
+"""Forward and inverse kinematics close the loops and invert each other, on every branch."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import oracle
+import pytest
+from hypothesis import given, settings
+
+from tpm_gym.errors import UnreachableError
+from tpm_gym.kinematics import (
+    ASSEMBLY_MODES,
+    DEFAULT_ASSEMBLY,
+    ELBOWS_OUT,
+    WORKING_MODES,
+    forward,
+    forward_all,
+    inverse,
+    inverse_all,
+    passive_angles,
+)
+from tpm_gym.kinematics.geometry import PAPER, Geometry
+from tpm_gym.kinematics.workspace import TASK_REGION
+
+HOME = np.array([-0.05, 0.03, 0.78])
+LENGTH_TOLERANCE = 1e-12
+POINT_TOLERANCE = 1e-9
+NEAREST = 1e-6  # product of the parallel factors, each in units of its size
+
+
+def postures(rng: np.random.Generator, count: int, g: Geometry) -> SimpleNamespace:
+    """Every posture of ``count`` random reachable points, one row each."""
+    targets = oracle.reachable_points(rng, count, g)
+    solutions = inverse_all(targets, g)
+    row, slot = np.nonzero(solutions.valid)
+    theta, beta, target = solutions.theta[row, slot], solutions.beta[row, slot], targets[row]
+    x_c, z_c = target[:, 0] - g.l2 - g.l7 * np.cos(beta), target[:, 2] - 2 * g.l6
+    return SimpleNamespace(theta=theta, beta=beta, target=target, slot=slot, x_c=x_c, z_c=z_c)
+
+
+def assemblies(rng: np.random.Generator, count: int, g: Geometry) -> SimpleNamespace:
+    """Every assembly of ``count`` random joint angles, one row each."""
+    angles = rng.uniform([-np.pi, 0, -np.pi], [np.pi, 2 * np.pi, np.pi], (count, 3))
+    solutions = forward_all(angles, g)
+    row, slot = np.nonzero(solutions.valid)
+    x_c, z_c = solutions.link3[row, slot].T
+    beta, position = solutions.beta[row, slot], solutions.position[row, slot]
+    return SimpleNamespace(
+        theta=angles[row], beta=beta, position=position, slot=slot, x_c=x_c, z_c=z_c
+    )
+
+
+def assert_closed(s: SimpleNamespace, g: Geometry, position: np.ndarray) -> None:
+    p = oracle.points(s.theta, s.x_c, s.z_c, s.beta, g)
+    lengths = np.linalg.norm(oracle.rods(p), axis=-1)
+    assert np.abs(lengths - g.l4).max() < LENGTH_TOLERANCE
+    link7 = np.linalg.norm(p["P"] - [g.l2, 0, g.l6] - p["D1"], axis=-1)
+    assert np.abs(link7 - g.l7).max() < LENGTH_TOLERANCE
+    assert np.abs(p["P"] - position).max() < LENGTH_TOLERANCE
+
+
+def assert_round_trip(s: SimpleNamespace, g: Geometry) -> None:
+    """The assembly mode that the oracle's factors name leads back to the point."""
+    parallel, _ = oracle.factors(s.theta, s.x_c, s.z_c, s.beta, g)
+    slot = oracle.assembly_slots(parallel)
+    solutions = forward_all(s.theta, g)
+    row = np.arange(len(slot))
+    assert solutions.valid[row, slot].all()
+    link3 = np.stack([s.x_c, s.z_c], axis=-1)
+    errors = np.hypot(
+        np.linalg.norm(solutions.position[row, slot] - s.target, axis=-1),
+        np.linalg.norm(solutions.link3[row, slot] - link3, axis=-1),
+    )
+    # Rounding grows as the inverse of the parallel factors: the nearer to a singularity, the less
+    # the angles say about the point. Elsewhere it must not grow at all.
+    sizes = np.abs(parallel / np.array([1.0, g.l4, g.l4**2])).prod(axis=-1)
+    assert (errors * np.minimum(1.0, sizes)).max() < 1e-13
+    if g == PAPER:
+        # A few lie within rounding of a singularity: the angles tell no more in float64.
+        far = sizes > NEAREST
+        assert far.mean() > 0.9999
+        assert errors[far].max() < POINT_TOLERANCE
+
+
+def assert_theta_found_again(s: SimpleNamespace, g: Geometry) -> None:
+    """The working mode that the oracle's factors name holds the angles."""
+    _, serial = oracle.factors(s.theta, s.x_c, s.z_c, s.beta, g)
+    slots = {(m.cos_beta, m.leg1, m.leg2, m.leg3): i for i, m in enumerate(WORKING_MODES)}
+    slot = np.array([slots[tuple(signs)] for signs in np.sign(serial).astype(int).tolist()])
+    solutions = inverse_all(s.position, g)
+    row = np.arange(len(slot))
+    assert solutions.valid[row, slot].all()
+    # An angle is as exact as its leg is far from its singularity; the tip's travel always is.
+    turn = np.abs(np.exp(1j * solutions.theta[row, slot]) - np.exp(1j * s.theta))
+    assert (turn * np.abs(serial[:, 1:]) / g.l3).max() < POINT_TOLERANCE
+    assert np.median(turn) < 1e-14
+
+
+def test_inverse_then_forward_returns_to_10000_points_on_every_branch() -> None:
+    found = postures(np.random.default_rng(1), 10_000, PAPER)
+    assert set(found.slot) == set(range(16))
+    assert_round_trip(found, PAPER)
+
+
+def test_every_inverse_branch_closes_every_rod() -> None:
+    found = postures(np.random.default_rng(2), 10_000, PAPER)
+    assert_closed(found, PAPER, found.target)
+
+
+def test_every_forward_branch_closes_every_rod() -> None:
+    found = assemblies(np.random.default_rng(3), 20_000, PAPER)
+    assert set(found.slot) == set(range(4))
+    assert_closed(found, PAPER, found.position)
+
+
+def test_forward_then_inverse_contains_theta_in_the_slot_its_factors_name() -> None:
+    assert_theta_found_again(assemblies(np.random.default_rng(4), 10_000, PAPER), PAPER)
+
+
+@settings(derandomize=True, max_examples=40, deadline=None)
+@given(oracle.geometries(), oracle.seeds())
+def test_any_geometry_closes_inverts_and_keeps_its_labels(g: Geometry, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    by_point, by_angle = postures(rng, 100, g), assemblies(rng, 200, g)
+    assert_closed(by_point, g, by_point.target)
+    assert_closed(by_angle, g, by_angle.position)
+    assert_round_trip(by_point, g)
+    assert_theta_found_again(by_angle, g)
+
+
+def test_labels_of_assembly_modes_are_the_signs_of_the_parallel_factors() -> None:
+    s = assemblies(np.random.default_rng(5), 20_000, PAPER)
+    parallel, _ = oracle.factors(s.theta, s.x_c, s.z_c, s.beta, PAPER)
+    labels = np.array([(mode.planar, mode.sin_beta) for mode in ASSEMBLY_MODES])[s.slot]
+    np.testing.assert_array_equal(np.sign(parallel[:, [2, 0]]), labels)
+
+
+def test_labels_of_working_modes_are_the_signs_of_the_serial_factors() -> None:
+    s = postures(np.random.default_rng(6), 10_000, PAPER)
+    _, serial = oracle.factors(s.theta, s.x_c, s.z_c, s.beta, PAPER)
+    labels = np.array([(m.cos_beta, m.leg1, m.leg2, m.leg3) for m in WORKING_MODES])[s.slot]
+    np.testing.assert_array_equal(np.sign(serial), labels)
+
+
+def test_slots_move_continuously_along_a_path_of_theta() -> None:
+    t = np.linspace(0.0, 2 * np.pi, 2001)
+    swing = 0.04 * np.stack([np.sin(t), np.sin(2 * t), np.cos(3 * t)], axis=-1)
+    solutions = forward_all(np.array([-2.108, 1.853, -2.051]) + swing)
+    assert solutions.valid.all()
+    # Slots that swapped would jump by decimetres, or by 2 |y| > 80 mm.
+    assert np.linalg.norm(np.diff(solutions.position, axis=0), axis=-1).max() < 1e-3
+    assert np.abs(solutions.position[..., 1]).min() > 0.04
+
+
+def test_inverse_angles_are_continuous_over_the_task_region() -> None:
+    t = np.linspace(0.0, 1.0, 2001)[:, None]
+    for low, high in (
+        (TASK_REGION.low, TASK_REGION.high),
+        ((-0.24, 0.046, 0.66), (0.12, 0.012, 0.915)),
+    ):
+        steps = np.diff(inverse(np.array(low) * (1 - t) + np.array(high) * t), axis=0)
+        assert np.abs(steps).max() < 0.005
+
+
+def test_angles_are_returned_in_the_ranges_that_are_promised() -> None:
+    found = postures(np.random.default_rng(7), 5_000, PAPER)
+    theta1, theta2, theta3 = found.theta.T
+    assert (theta2 >= 0).all()
+    assert (theta2 < 2 * np.pi).all()
+    for angle in (theta1, theta3, found.beta):
+        assert (angle > -np.pi).all()
+        assert (angle <= np.pi).all()
+
+
+@pytest.mark.parametrize("shape", [(), (5,), (2, 3), (0,)])
+def test_leading_shapes_broadcast_and_agree_with_single_calls(shape: tuple[int, ...]) -> None:
+    targets = np.random.default_rng(8).uniform(TASK_REGION.low, TASK_REGION.high, (*shape, 3))
+    theta = inverse(targets)
+    assert theta.shape == (*shape, 3)
+    assert inverse_all(targets).theta.shape == (*shape, 16, 3)
+    assert inverse_all(targets).beta.shape == inverse_all(targets).valid.shape == (*shape, 16)
+    solutions = forward_all(theta)
+    assert solutions.position.shape == (*shape, 4, 3)
+    assert solutions.link3.shape == (*shape, 4, 2)
+    assert solutions.beta.shape == solutions.valid.shape == (*shape, 4)
+    assert forward(theta).shape == (*shape, 3)
+    assert passive_angles(theta).rod4_tilt.shape == shape
+    for index in np.ndindex(shape):
+        # Single calls run in plain floats: the same formulas, rounded otherwise.
+        np.testing.assert_allclose(theta[index], inverse(targets[index]), atol=1e-14)
+        np.testing.assert_allclose(forward(theta)[index], forward(theta[index]), atol=1e-13)
+
+
+def test_mirrored_points_have_mirrored_solutions() -> None:
+    targets = oracle.reachable_points(np.random.default_rng(9), 2000, PAPER)
+    mirror = np.array([1, -1, 1])
+    there, back = inverse_all(targets), inverse_all(targets * mirror)
+    np.testing.assert_array_equal(there.valid, back.valid)
+    np.testing.assert_array_equal(there.theta, back.theta)
+    np.testing.assert_array_equal(there.beta, -back.beta)
+    solutions = forward_all(there.theta[there.valid])
+    for slot, mode in enumerate(ASSEMBLY_MODES):
+        twin = next(
+            i
+            for i, other in enumerate(ASSEMBLY_MODES)
+            if (other.planar, other.sin_beta) == (mode.planar, -mode.sin_beta)
+        )
+        mirrored = solutions.position[:, twin] * mirror
+        np.testing.assert_array_equal(solutions.position[:, slot], mirrored)
+
+
+def test_passive_angles_point_along_the_links() -> None:
+    rng = np.random.default_rng(10)
+    for slot, mode in enumerate(ASSEMBLY_MODES):
+        s = assemblies(rng, 4000, PAPER)
+        keep = s.slot == slot
+        theta, x_c, z_c, beta = s.theta[keep], s.x_c[keep], s.z_c[keep], s.beta[keep]
+        p = oracle.points(theta, x_c, z_c, beta, PAPER)
+        found = passive_angles(theta, mode)
+
+        def tilted(swing: np.ndarray, tilt: np.ndarray) -> tuple[np.ndarray, ...]:
+            return np.cos(tilt) * np.cos(swing), np.cos(tilt) * np.sin(swing), np.sin(tilt)
+
+        level, up, out = tilted(found.rod4_swing, found.rod4_tilt)
+        rod4 = oracle.vector(out, level, up)
+        rod6 = oracle.vector(np.cos(found.rod6_swing), 0, np.sin(found.rod6_swing))
+        level, up, out = tilted(found.rod11_swing, found.rod11_tilt)
+        rod11 = oracle.vector(level, out, up)
+        directions = np.stack([rod4, rod6, rod11], axis=-2)
+        assert np.abs(PAPER.l4 * directions - oracle.rods(p)).max() < 1e-11
+        link7 = PAPER.l7 * oracle.vector(np.cos(found.beta), np.sin(found.beta), 0)
+        assert np.abs(link7 - (p["E1"] - p["D1"])).max() < 1e-11
+
+
+def test_named_branches_return_their_slots() -> None:
+    found = inverse_all(HOME)
+    for slot, mode in enumerate(WORKING_MODES):
+        if found.valid[slot]:
+            # numpy may round one number and many differently
+            np.testing.assert_allclose(inverse(HOME, mode), found.theta[slot], atol=1e-14)
+    np.testing.assert_array_equal(inverse(HOME), inverse(HOME, ELBOWS_OUT))
+    theta = inverse(HOME)
+    for slot, mode in enumerate(ASSEMBLY_MODES):
+        if forward_all(theta).valid[slot]:
+            expected = forward_all(theta).position[slot]
+            np.testing.assert_allclose(forward(theta, mode), expected, atol=1e-14)
+    np.testing.assert_array_equal(forward(theta), forward(theta, DEFAULT_ASSEMBLY))
+
+
+def test_single_calls_agree_with_the_batch_on_what_can_be_assembled() -> None:
+    rng = np.random.default_rng(11)
+    for theta in rng.uniform(-np.pi, np.pi, (3000, 3)):
+        solutions = forward_all(theta)
+        for slot, mode in enumerate(ASSEMBLY_MODES):
+            if solutions.valid[slot]:
+                found = forward(theta, mode)
+                # y goes with the square root of what rounding leaves of 1 - cos(beta)
+                np.testing.assert_allclose(found, solutions.position[slot], atol=1e-9)
+            else:
+                with pytest.raises(UnreachableError):
+                    forward(theta, mode)

@@ -1,0 +1,169 @@
+"""The task's region can be reached everywhere, and samplers stay where they should."""
+
+from __future__ import annotations
+
+import numpy as np
+import oracle
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from tpm_gym.errors import ConfigurationError
+from tpm_gym.kinematics import (
+    ASSEMBLY_MODES,
+    DEFAULT_ASSEMBLY,
+    ELBOWS_OUT,
+    WORKING_MODES,
+    AssemblyMode,
+    inverse,
+    inverse_all,
+    jacobian,
+    workspace,
+)
+from tpm_gym.kinematics.geometry import PAPER
+from tpm_gym.kinematics.workspace import TASK_REGION, Region
+
+FloatArray = NDArray[np.float64]
+BOX = Region(low=(-1.0, 0.0, 2.0), high=(1.0, 0.5, 2.0))
+coordinates = st.floats(-3, 3)
+triples = st.tuples(coordinates, coordinates, coordinates)
+
+
+def grid(region: Region, counts: tuple[int, int, int]) -> FloatArray:
+    """A grid over the box, faces included."""
+    sides = [np.linspace(*ends) for ends in zip(region.low, region.high, counts, strict=True)]
+    return np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1)
+
+
+def test_task_region_is_wholly_reachable_with_the_elbows_out_in_the_default_assembly() -> None:
+    points = grid(TASK_REGION, (37, 18, 27))
+    assert workspace.reachable(points).all()
+    assert (workspace.assembly_of(points) == DEFAULT_ASSEMBLY.index).all()
+    # and is not so only at the nodes: the angles hardly change from node to node
+    theta = inverse(points)
+    assert max(np.abs(np.diff(theta, axis=axis)).max() for axis in range(3)) < 0.05
+
+
+def test_task_region_lies_between_the_singularities_in_y() -> None:
+    assert 0 < TASK_REGION.low[1] < TASK_REGION.high[1] < PAPER.l7
+    assert workspace.conditioning_at(grid(TASK_REGION, (19, 9, 14))).min() > 0.03
+
+
+def test_reachable_is_the_validity_of_the_slot() -> None:
+    points = np.random.default_rng(0).uniform([-1, -0.06, -1.3], [1, 0.06, 1.3], (500, 3))
+    points[7] = np.nan
+    for mode in WORKING_MODES:
+        expected = inverse_all(points).valid[:, mode.index]
+        np.testing.assert_array_equal(workspace.reachable(points, mode), expected)
+        np.testing.assert_array_equal(workspace.assembly_of(points, mode) >= 0, expected)
+
+
+def test_assembly_of_names_the_signs_of_the_parallel_factors() -> None:
+    points = oracle.reachable_points(np.random.default_rng(1), 2000, PAPER)
+    seen = set()
+    for mode in WORKING_MODES:
+        here = points[workspace.reachable(points, mode)]
+        found = inverse_all(here)
+        theta, beta = found.theta[:, mode.index], found.beta[:, mode.index]
+        x_c = here[:, 0] - PAPER.l2 - PAPER.l7 * np.cos(beta)
+        parallel, _ = oracle.factors(theta, x_c, here[:, 2] - 2 * PAPER.l6, beta, PAPER)
+        slots = workspace.assembly_of(here, mode)
+        np.testing.assert_array_equal(slots, oracle.assembly_slots(parallel))
+        seen |= set(slots.tolist())
+    assert seen == set(range(len(ASSEMBLY_MODES)))
+
+
+def test_conditioning_at_points_is_that_of_their_posture() -> None:
+    points = grid(TASK_REGION, (7, 5, 6))
+    expected = jacobian.conditioning(inverse(points))
+    np.testing.assert_allclose(workspace.conditioning_at(points), expected, rtol=1e-12)
+    single = workspace.conditioning_at(points[1, 2, 3])
+    assert single.shape == ()
+    assert single == pytest.approx(expected[1, 2, 3])
+
+
+def test_conditioning_is_zero_where_a_branch_does_not_exist() -> None:
+    points = np.array([[0, 0.03, 5], [0, 0.06, 0.75], [np.nan, 0, 0], [0, -0.03, 0.75]])
+    np.testing.assert_array_equal(workspace.conditioning_at(points), 0)
+    assert workspace.conditioning_at(points[0]) == 0
+    # y < 0 is the other half of the assembly modes, where it is as good as at y > 0.
+    other = AssemblyMode(DEFAULT_ASSEMBLY.planar, -1)
+    mirrored = workspace.conditioning_at([0, -0.03, 0.75], ELBOWS_OUT, other)
+    assert mirrored == pytest.approx(workspace.conditioning_at([0, 0.03, 0.75]))
+    assert mirrored > 0.1
+
+
+@settings(derandomize=True, max_examples=200)
+@given(triples, triples)
+def test_projection_is_inside_idempotent_and_nearest(
+    point: tuple[float, ...], other: tuple[float, ...]
+) -> None:
+    for region in (TASK_REGION, BOX):
+        projected = region.project(point)
+        assert region.contains(projected)
+        np.testing.assert_array_equal(region.project(projected), projected)
+        distance = np.linalg.norm(projected - point)
+        competitor = np.clip(other, region.low, region.high)
+        assert distance <= np.linalg.norm(competitor - point) + 1e-12
+        assert region.contains(point) == (distance == 0)
+
+
+@settings(derandomize=True, max_examples=200)
+@given(triples)
+def test_margin_is_negative_outside_and_the_distance_to_the_faces_inside(
+    point: tuple[float, ...],
+) -> None:
+    for region in (TASK_REGION, Region(low=(-2, -2, -2), high=(2, 1, 2.5))):
+        margin = region.margin(point)
+        assert (margin >= 0) == bool(region.contains(point))
+        gaps = [
+            abs(p - face)
+            for p, *faces in zip(point, region.low, region.high, strict=True)
+            for face in faces
+        ]
+        assert abs(margin) in gaps
+        if margin >= 0:
+            assert margin == min(gaps)
+
+
+def test_regions_accept_batches() -> None:
+    points = np.random.default_rng(2).uniform(-2, 2, (4, 5, 3))
+    assert BOX.contains(points).shape == (4, 5)
+    assert BOX.project(points).shape == (4, 5, 3)
+
+
+@pytest.mark.parametrize("low", [(0.1, 0, 0), (0, 0.1, 0), (0, 0, 0.1), (float("nan"), 0, 0)])
+def test_empty_regions_are_refused(low: tuple[float, float, float]) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        Region(low=low, high=(0.0, 0.0, 0.0))
+    assert caught.value.name == "low"
+
+
+@pytest.mark.parametrize("least", [0.0, 0.08, 0.15])
+def test_samples_are_inside_conditioned_well_and_cover_the_region(least: float) -> None:
+    rng = np.random.default_rng(3)
+    points = np.array([workspace.sample(rng, TASK_REGION, least) for _ in range(200)])
+    assert TASK_REGION.contains(points).all()
+    assert (workspace.conditioning_at(points) >= least).all()
+    extent = np.array(TASK_REGION.high) - TASK_REGION.low
+    assert (np.ptp(points, axis=0)[[0, 2]] > 0.6 * extent[[0, 2]]).all()
+
+
+def test_samples_depend_on_the_rng_alone() -> None:
+    first, second = (
+        [workspace.sample(rng, TASK_REGION, 0.1) for _ in range(10)]
+        for rng in (np.random.default_rng(4), np.random.default_rng(4))
+    )
+    np.testing.assert_array_equal(first, second)
+    assert len(np.unique(first, axis=0)) == 10
+
+
+def test_conditions_that_no_point_meets_are_refused() -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        workspace.sample(np.random.default_rng(5), TASK_REGION, 0.9, attempts=20)
+    assert caught.value.name == "min_conditioning"
+    assert caught.value.value == 0.9
+    beyond = Region(low=(0, 0.03, 5), high=(0.1, 0.04, 6))
+    with pytest.raises(ConfigurationError):
+        workspace.sample(np.random.default_rng(5), beyond, 1e-6, attempts=20)

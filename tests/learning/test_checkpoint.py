@@ -1,0 +1,332 @@
+"""A whole checkpoint is left by a death at any moment, and damage anywhere is noticed."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import resource
+import shutil
+import sys
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tpm_gym.learning import checkpoint
+from tpm_gym.learning.checkpoint import CheckpointStore, Content
+from tpm_gym.learning.errors import CheckpointWriteError, NoCheckpointError, NoWholeCheckpointError
+
+FILES = ("manifest.json", "state.json", "weights.pt", "arrays.npz")
+KILLED = 9
+
+
+def content(step: int, finished: bool = False) -> Content:
+    """Content that is different in every byte for every step."""
+    rng = np.random.default_rng(step)
+    return Content(
+        step,
+        finished,
+        {"state.json": json.dumps({"step": step}).encode(), "weights.pt": rng.bytes(5000)},
+        {"buffer/rows": rng.normal(size=(700, 3)), "buffer/place": np.array([step, 0])},
+    )
+
+
+def assert_equal(first: Content, second: Content) -> None:
+    assert (first.step, first.finished) == (second.step, second.finished)
+    assert first.files == second.files
+    assert first.arrays.keys() == second.arrays.keys()
+    for name, array in first.arrays.items():
+        assert array.dtype == second.arrays[name].dtype
+        np.testing.assert_array_equal(array, second.arrays[name])
+
+
+def no_warning(text: str) -> None:
+    raise AssertionError(text)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder with whole checkpoints of steps 1 and 2."""
+    store = CheckpointStore(tmp_path / "checkpoints")
+    for step in (1, 2):
+        store.save(content(step))
+    return tmp_path / "checkpoints"
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(entry.name for entry in folder.iterdir())
+
+
+def test_what_is_loaded_is_what_was_saved(folder: Path) -> None:
+    store = CheckpointStore(folder)
+    assert_equal(store.load(no_warning), content(2))
+    assert store.newest == 2
+    store.save(content(2, finished=True))
+    assert CheckpointStore(folder).load(no_warning).finished
+
+
+def test_the_last_two_are_kept_and_nothing_else_is_touched(folder: Path) -> None:
+    (folder / "notes.txt").write_text("mine")
+    (folder / "000000001.old").mkdir()
+    store = CheckpointStore(folder)
+    store.load(no_warning)
+    for step in (3, 40):
+        store.save(content(step))
+    assert names(folder) == ["000000003", "000000040", "notes.txt"]
+
+
+def test_checkpoints_are_ordered_by_number(folder: Path) -> None:
+    store = CheckpointStore(folder)
+    for step in (999_999_999, 1_000_000_000):
+        store.save(content(step))
+    assert CheckpointStore(folder).load(no_warning).step == 1_000_000_000
+
+
+def truncate(path: Path) -> None:
+    os.truncate(path, path.stat().st_size // 2)
+
+
+def empty(path: Path) -> None:
+    os.truncate(path, 0)
+
+
+def grow(path: Path) -> None:
+    with path.open("ab") as file:
+        file.write(b"\0")
+
+
+def flip(path: Path) -> None:
+    """Flip one bit in the middle."""
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 4
+    path.write_bytes(data)
+
+
+def zero(path: Path) -> None:
+    """What a file system may leave of a file whose content had not reached the disk."""
+    path.write_bytes(bytes(path.stat().st_size))
+
+
+@pytest.mark.parametrize("damage", [truncate, empty, grow, flip, zero, Path.unlink])
+@pytest.mark.parametrize("name", FILES)
+def test_any_damage_to_any_file_is_named_and_the_one_before_is_used(
+    folder: Path, name: str, damage: Callable[[Path], object]
+) -> None:
+    damaged = folder / "000000002" / name
+    damage(damaged)
+    warned: list[str] = []
+    store = CheckpointStore(folder)
+    assert_equal(store.load(warned.append), content(1))
+    assert len(warned) == 1
+    assert str(damaged) in warned[0]
+    assert "step 1" in warned[0]
+
+
+def test_every_bit_of_the_manifest_counts(folder: Path) -> None:
+    path = folder / "000000002" / "manifest.json"
+    whole = path.read_bytes()
+    for place in range(len(whole)):
+        data = bytearray(whole)
+        data[place] ^= 1
+        path.write_bytes(data)
+        try:
+            loaded = CheckpointStore(folder).load(lambda text: None)
+        except Exception as error:  # any other kind is what this looks for
+            raise AssertionError(f"bit flip in byte {place}") from error
+        # White space between entries means nothing; everything else is noticed.
+        assert_equal(loaded, content(1 if not chr(whole[place]).isspace() else loaded.step))
+
+
+def test_another_format_is_named(folder: Path) -> None:
+    path = folder / "000000002" / "manifest.json"
+    manifest = json.loads(path.read_text())
+    del manifest["sha256"]
+    manifest["format"] = 99
+    manifest["sha256"] = checkpoint._digest(checkpoint._canonical(manifest))
+    path.write_text(json.dumps(manifest))
+    warned: list[str] = []
+    assert CheckpointStore(folder).load(warned.append).step == 1
+    assert "has format 99" in warned[0]
+
+
+def test_no_checkpoint_at_all_says_what_to_do(folder: Path, tmp_path: Path) -> None:
+    for where in (tmp_path / "nowhere", tmp_path):
+        with pytest.raises(NoCheckpointError, match="--overwrite"):
+            CheckpointStore(where).load(no_warning)
+    flip(folder / "000000001" / "weights.pt")
+    truncate(folder / "000000002" / "arrays.npz")
+    with pytest.raises(NoWholeCheckpointError, match="--overwrite") as caught:
+        CheckpointStore(folder).load(no_warning)
+    assert [path in str(caught.value) for path in ("weights.pt", "arrays.npz")] == [True, True]
+    assert len(caught.value.problems) == 2
+
+
+def test_pickles_are_neither_written_nor_read(folder: Path) -> None:
+    with pytest.raises(ValueError, match="allow_pickle"):
+        CheckpointStore(folder).save(Content(3, False, {}, {"bad": np.array([object()])}))
+    assert names(folder) == ["000000001", "000000002"]
+
+
+def test_a_damaged_checkpoint_gives_way_to_the_next(folder: Path) -> None:
+    store = CheckpointStore(folder)
+    store.save(content(30))
+    store.save(content(40))
+    flip(folder / "000000040" / "weights.pt")
+    store = CheckpointStore(folder)
+    assert store.load(lambda text: None).step == 30
+    assert "000000040" in names(folder)
+    store.save(content(35))
+    assert names(folder) == ["000000030", "000000035"]
+    flip(folder / "000000035" / "weights.pt")
+    store = CheckpointStore(folder)
+    store.load(lambda text: None)
+    store.save(content(35))  # done again, it ends at the same step
+    assert names(folder) == ["000000030", "000000035"]
+    assert_equal(CheckpointStore(folder).load(no_warning), content(35))
+
+
+# -- dying ------------------------------------------------------------------------------------
+
+
+def in_child(action: Callable[[], object]) -> int:
+    """Run something in a process of its own; return its exit status."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # other threads: of no interest here
+        child = os.fork()
+    if child == 0:
+        status = 1
+        try:
+            action()
+            status = 0
+        finally:
+            os._exit(status)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+class Dying:
+    """Ends the process at the n-th operation on files, before it takes place."""
+
+    EVENTS = ("open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.scandir", "os.chmod")
+
+    def __init__(self, operation: int) -> None:
+        self.left = operation
+        flush = os.fsync
+
+        def fsync(handle: int) -> None:
+            self.count()
+            flush(handle)
+
+        os.fsync = fsync
+        sys.addaudithook(lambda event, args: self.count() if event in self.EVENTS else None)
+
+    def count(self) -> None:
+        self.left -= 1
+        if self.left < 0:
+            os._exit(KILLED)
+
+
+def save_and_die(folder: Path, operation: int) -> None:
+    store = CheckpointStore(folder)
+    store.load(no_warning)
+    Dying(operation)
+    store.save(content(3))
+
+
+def test_a_death_at_any_file_operation_leaves_a_whole_checkpoint(
+    folder: Path, tmp_path: Path
+) -> None:
+    seen = set()
+    for operation in range(1000):
+        copy = tmp_path / f"copy{operation}"
+        shutil.copytree(folder, copy)
+        status = in_child(lambda copy=copy, operation=operation: save_and_die(copy, operation))
+        assert status in (0, KILLED)
+        store = CheckpointStore(copy)
+        loaded = store.load(no_warning)
+        assert_equal(loaded, content(loaded.step))
+        seen.add(loaded.step)
+        store.save(content(4))
+        assert names(copy) == [f"{loaded.step:09d}", "000000004"]
+        shutil.rmtree(copy)
+        if status == 0:
+            break
+    assert operation > 15, "hardly any operation was seen"
+    assert seen == {2, 3}
+
+
+# -- disks that are full ------------------------------------------------------------------------
+
+
+def save_with_limit(folder: Path, limit: int) -> None:
+    """Save where no file can grow beyond a limit: a write that really fails half way."""
+    store = CheckpointStore(folder)
+    store.load(no_warning)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+    with pytest.raises(CheckpointWriteError, match="that of step 2 stays"):
+        store.save(content(3))
+
+
+@pytest.mark.parametrize("limit", [0, 10, 100, 4096, 6000, 12_000])
+def test_a_write_that_fails_half_way_leaves_the_others_whole(folder: Path, limit: int) -> None:
+    assert in_child(lambda: save_with_limit(folder, limit)) == 0
+    assert names(folder) == ["000000001", "000000002"]
+    assert_equal(CheckpointStore(folder).load(no_warning), content(2))
+
+
+def test_a_full_disk_is_named_and_the_partial_checkpoint_removed(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = CheckpointStore(folder)
+    store.load(no_warning)
+    flush, failing = os.fsync, True
+    for moment in range(100):
+        left = [moment]
+
+        def full(handle: int, left: list[int] = left) -> None:
+            left[0] -= 1
+            if left[0] < 0:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            flush(handle)
+
+        monkeypatch.setattr(os, "fsync", full)
+        try:
+            store.save(content(3))
+        except CheckpointWriteError as error:
+            message = str(error)
+            assert "No space left on device" in message
+            assert "that of step 2 stays" in message
+            if "000000003" not in names(folder):  # else only the last flush has failed
+                assert names(folder) == ["000000001", "000000002"]
+        else:
+            failing = False
+            break
+    assert not failing
+    assert moment >= 6
+    assert_equal(CheckpointStore(folder).load(no_warning), content(3))
+
+
+def test_what_will_not_fit_is_not_begun(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = CheckpointStore(folder)
+    store.load(no_warning)
+    usage: Any = shutil.disk_usage(folder)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=1_000_000))
+    with pytest.raises(CheckpointWriteError, match=r"1\.1 MB are needed, 1\.0 MB are free"):
+        store.save(content(3))
+    assert names(folder) == ["000000001", "000000002"]
+    monkeypatch.undo()
+    store.save(content(3))
+    assert names(folder) == ["000000002", "000000003"]
+
+
+def test_an_interrupted_save_cleans_up(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(handle: int) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "fsync", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        CheckpointStore(folder).save(content(3))
+    assert names(folder) == ["000000001", "000000002"]

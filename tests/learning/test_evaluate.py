@@ -1,0 +1,468 @@
+"""evaluate.py writes what it promises: a table, strict JSON and a video, without torch."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import gymnasium as gym
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+from rich.console import Console
+
+from tpm_gym.errors import ConfigurationError
+from tpm_gym.learning import evaluate, film, provenance, rollout
+from tpm_gym.learning.errors import ConfigError, PolicyError, RolloutError, UnknownEnvError
+from tpm_gym.learning.policies import load_policy
+
+METRICS = (
+    "success_at_end",
+    "success_once",
+    "return",
+    "conditioning_min",
+    "conditioning_mean",
+    "closure_error_max",
+    "unsafe_share",
+    "fk_error_max",
+)
+SCRIPT = Path(evaluate.__file__)
+STRAYS = 3
+"""Seed of an episode in which random actions stray into the unsafe region."""
+
+
+def quiet() -> Console:
+    return Console(file=io.StringIO(), width=120)
+
+
+def read_strict(path: Path) -> dict[str, Any]:
+    """Read JSON as a strict reader does: NaN and infinities are errors."""
+
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"{constant} is not JSON")
+
+    content = json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse)
+    assert isinstance(content, dict)
+    return content
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], str]:
+    """Return the JSON and the output of the command line, run on one policy."""
+    path = tmp_path_factory.mktemp("evaluate") / "deep" / "er" / "expert.json"
+    options = f"--policy expert --env TPMReach-v0 --episodes 4 --seed 7 --json {path}".split()
+    done = subprocess.run(
+        [sys.executable, str(SCRIPT), *options], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return read_strict(path), done.stdout
+
+
+def test_one_policy_has_its_metrics_at_the_top(written: tuple[dict[str, Any], str]) -> None:
+    content, _ = written
+    for name in METRICS:
+        estimate = content[name]
+        assert estimate["low"] <= estimate["mean"] <= estimate["high"], name
+    assert content["policy"] == "expert"
+    assert (content["env"], content["episodes"], content["seed"]) == ("TPMReach-v0", 4, 7)
+    assert content["wall_seconds"] > 0
+    assert content["closure_error_max"]["worst"] >= content["closure_error_max"]["mean"]
+
+
+def test_records_agree_with_the_metrics(written: tuple[dict[str, Any], str]) -> None:
+    content, _ = written
+    records = content["records"]
+    assert [record["seed"] for record in records] == [7, 8, 9, 10]
+    for name in METRICS:
+        mean = sum(record[name] for record in records) / 4
+        assert content[name]["mean"] == pytest.approx(mean), name
+    steps = sum(record["length"] for record in records)
+    assert content["steps_per_second"] == pytest.approx(steps / content["wall_seconds"])
+
+
+def test_json_says_how_to_repeat_it(written: tuple[dict[str, Any], str]) -> None:
+    content, _ = written
+    assert content["versions"]["python"] == provenance.versions()["python"]
+    assert {"numpy", "torch", "gymnasium", "pybullet", "stable-baselines3", "tpm_gym"} <= set(
+        content["versions"]
+    )
+    assert "git_commit" in content
+    assert content["command"].startswith("python ")
+    assert "--policy expert --env TPMReach-v0 --episodes 4 --seed 7" in content["command"]
+
+
+def test_no_absolute_path_is_written(written: tuple[dict[str, Any], str]) -> None:
+    content, _ = written
+    assert str(Path.home()) not in json.dumps(content)
+    assert str(SCRIPT.parent) not in json.dumps(content)
+
+
+def test_table_shows_means_and_intervals(written: tuple[dict[str, Any], str]) -> None:
+    _, output = written
+    assert "success at end" in output
+    assert "expert" in output
+    assert "[51.0, 100.0]" in output  # Wilson interval of 4 of 4
+
+
+def test_scripted_policies_do_not_load_torch(tmp_path: Path) -> None:
+    program = (
+        "import sys, evaluate\n"
+        "config = evaluate.Config(policy=('expert', 'random'), env='TPMReach-v0', episodes=1)\n"
+        "evaluate.evaluate(config)\n"
+        "loaded = {'torch', 'stable_baselines3'} & set(sys.modules)\n"
+        "sys.exit(f'loaded {loaded}' if loaded else 0)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        cwd=SCRIPT.parent,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_several_policies_share_a_table_and_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "both.json"
+    config = evaluate.Config(
+        policy=("random", "expert"), env="TPMReach-v0", episodes=2, json=path, seed=3
+    )
+    console = quiet()
+    results = evaluate.evaluate(config, console)
+    content = read_strict(path)
+    assert [entry["policy"] for entry in content["policies"]] == ["random", "expert"]
+    assert content["policies"][1]["return"]["mean"] == results[1].metrics["return"].mean
+    assert "return" not in content
+    assert content["seed"] == 3
+    header = console.file.getvalue().splitlines()[2]  # type: ignore[attr-defined]
+    assert "random" in header
+    assert "expert" in header
+
+
+# imageio-ffmpeg leaves a pipe to the collector where ffmpeg ends before its reader is closed.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_video_shows_the_first_episodes(tmp_path: Path) -> None:
+    path = tmp_path / "films" / "expert.mp4"
+    config = evaluate.Config(
+        policy=("expert",), env="TPMReach-v0", episodes=2, video=path, video_episodes=1
+    )
+    (result,) = evaluate.evaluate(config, quiet())
+    frames = imageio.imread(path, plugin="FFMPEG")  # (frames, height, width, 3)
+    assert len(frames) == result.records[0].length + 1
+    assert frames[0].std() > 5  # something is to be seen
+    assert (frames[0] != frames[-1]).any()  # and it moves
+    assert imageio.immeta(path, plugin="FFMPEG")["fps"] == 25
+    assert [entry.name for entry in path.parent.iterdir()] == ["expert.mp4"]
+
+
+@pytest.mark.parametrize(
+    ("policies", "names"),
+    [
+        (("expert",), ["v.mp4"]),
+        (("expert", "random"), ["v-expert.mp4", "v-random.mp4"]),
+        (("a/best.zip", "b/best.zip"), ["v-1-best.mp4", "v-2-best.mp4"]),
+    ],
+)
+def test_every_policy_gets_its_own_video(policies: tuple[str, ...], names: list[str]) -> None:
+    paths = evaluate.paths_per_policy(Path("films", "v.mp4"), policies)
+    assert [path.name for path in paths] == names
+    assert all(path.parent == Path("films") for path in paths)
+
+
+def test_picture_shows_six_moments_of_the_first_episode(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "expert.png"
+    config = evaluate.Config(policy=("expert",), env="TPMReach-v0", episodes=1, picture=path)
+    evaluate.evaluate(config, quiet())
+    env = gym.make("TPMReach-v0", render_mode="rgb_array")
+    env.reset(seed=config.seed)
+    first = env.render()
+    env.close()
+    picture = imageio.imread(path)
+    height, width = first.shape[:2]
+    assert picture.shape == (2 * height, 3 * width, 3)
+    np.testing.assert_array_equal(picture[:height, :width], first)
+
+
+def test_contact_sheet_runs_from_the_first_frame_to_the_last() -> None:
+    frames = [np.full((1, 1, 3), value, np.uint8) for value in range(51)]
+    assert film.contact_sheet(frames)[..., 0].tolist() == [[0, 10, 20], [30, 40, 50]]
+    assert film.contact_sheet(frames[:1]).shape == (2, 3, 3)
+
+
+def test_contact_sheet_ends_when_nothing_moves_any_more() -> None:
+    frames = [np.full((1, 1, 3), min(value, 10), np.uint8) for value in range(51)]
+    assert film.contact_sheet(frames)[..., 0].tolist() == [[0, 2, 4], [6, 8, 10]]
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"env": "TPMReach-v0", "episodes": 0}, ConfigError, "at least 1"),
+        ({"env": "TPMReach-v0", "video_episodes": 0}, ConfigError, "at least 1"),
+        ({"env": "TPMReach-v0", "seed": -1}, ConfigError, "at least 0"),
+        ({}, ConfigError, "name one with --env"),
+        ({"env": "TPMRech-v0"}, UnknownEnvError, "TPMReach-v0"),
+        ({"env": "TPMReach-v0", "policy": ("expert", "gone.zip")}, PolicyError, "no file gone.zip"),
+    ],
+)
+def test_mistakes_are_named(options: dict[str, Any], error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        evaluate.evaluate(evaluate.Config(**{"policy": ("expert",), **options}), quiet())
+
+
+def records_of(spec: str = "random", **options: Any) -> list[Any]:
+    """Return the records of a few episodes, by default the random policy's on Reach."""
+    config = evaluate.Config(policy=(spec,), **{"env": "TPMReach-v0", "episodes": 2} | options)
+    return evaluate.evaluate(config, quiet())[0].records
+
+
+def test_conditions_are_recorded_and_the_defaults_are_the_nominal_machine(
+    written: tuple[dict[str, Any], str], tmp_path: Path
+) -> None:
+    content, _ = written
+    assert (content["goals"], content["penalty_weight"]) == ("sampled", 1.0)
+    assert content["randomisation"] == {}
+    path = tmp_path / "other.json"
+    words = ["--policy", "random", "--env", "TPMReach-v0", "--episodes", "1", "--json", str(path)]
+    words += ["--randomisation", "encoder_noise=1e-4", "friction=0.5:1", "latency=1"]
+    words += ["--penalty-weight", "0.5", "--goals", "tempting"]
+    done = subprocess.run(
+        [sys.executable, str(SCRIPT), *words], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    content = read_strict(path)
+    assert content["randomisation"] == {
+        "encoder_noise": 1e-4,
+        "friction": [0.5, 1.0],
+        "latency": 1,
+    }
+    assert (content["goals"], content["penalty_weight"]) == ("tempting", 0.5)
+    assert "--randomisation encoder_noise=1e-4 friction=0.5:1" in content["command"]
+
+
+def test_the_environment_is_the_one_that_was_asked_for() -> None:
+    config = evaluate.Config(
+        policy=("random",), goals="tempting", penalty_weight=0.25, randomisation=("puck_mass=2",)
+    )
+    env: Any = evaluate._make_env("TPMPickAndPlace-v0", config)
+    assert env.unwrapped.penalty_weight == 0.25
+    assert env.unwrapped.randomisation.puck_mass == (2.0, 2.0)
+    plain = gym.make("TPMPickAndPlace-v0")
+    goals = [made.reset(seed=3)[0]["desired_goal"] for made in (env, plain)]
+    assert not np.array_equal(*goals)
+    env.close()
+    plain.close()
+
+
+def test_encoder_noise_shows_in_the_observed_position() -> None:
+    nominal, noisy = records_of(), records_of(randomisation=("encoder_noise=5e-4",))
+    assert max(record.fk_error_max for record in nominal) < 1e-3
+    assert all(
+        noise.fk_error_max > 2 * none.fk_error_max
+        for noise, none in zip(noisy, nominal, strict=True)
+    )
+
+
+def test_the_return_has_the_penalty_in_it_with_its_weight() -> None:
+    once, twice, free = (
+        records_of(penalty_weight=weight, seed=STRAYS, episodes=1)[0] for weight in (1.0, 2.0, 0.0)
+    )
+    assert once.unsafe_share == free.unsafe_share > 0
+    penalty = free.total_reward - once.total_reward
+    assert penalty > 0
+    assert free.total_reward - twice.total_reward == pytest.approx(2 * penalty)
+
+
+def test_per_step_figures_are_those_of_the_steps() -> None:
+    env: Any = gym.make("TPMReach-v0")
+    policy = load_policy("random", env)
+    observation, _ = env.reset(seed=STRAYS)
+    policy.reset(observation, STRAYS)
+    unsafe, gaps, done = [], [], False
+    while not done:
+        observation, _, _, done, info = env.step(policy.act(observation))
+        unsafe.append(info["conditioning"] < 0.08)
+        state = env.unwrapped.state
+        gaps.append(np.linalg.norm(state.fk_position - state.platform_position))
+    env.close()
+    (record,) = records_of(episodes=1, seed=STRAYS)
+    assert 0 < record.unsafe_share == np.mean(unsafe) < 1
+    assert record.fk_error_max == pytest.approx(max(gaps), rel=1e-12)
+
+
+def test_torques_are_condensed_where_the_environment_tells_them() -> None:
+    torques = [np.array([1.0, -2.0, 2.0]), np.array([0.0, 0.0, 6.0])]
+    point = np.zeros(3)
+    states = [
+        SimpleNamespace(torque=torque, fk_position=point, platform_position=point)
+        for torque in torques
+    ]
+    info = {"conditioning": 0.5, "closure_error": 0.0, "is_success": True}
+    record = rollout._record(0, [0.0, 0.0], [info, info], states)
+    assert record.torque_peak == 6.0
+    assert record.torque_rms == pytest.approx(math.sqrt((1 + 4 + 4 + 36) / 6))
+    metrics = rollout.summarise([record, record])
+    assert metrics["torque_peak"].worst == 6.0
+    states[1].torque = np.array([0.0, math.nan, 0.0])
+    with pytest.raises(RolloutError, match="step 1: torque is nan"):
+        rollout._record(0, [0.0, 0.0], [info, info], states)
+    unknown = rollout._record(0, [0.0, 0.0], [info, info], [None, None])
+    assert unknown.torque_peak is None
+    assert "torque_peak" not in unknown.as_dict()
+    assert "torque_peak" not in rollout.summarise([record, unknown])
+
+
+@pytest.mark.parametrize(
+    "entries", [("puck_mass",), ("puck_mass=heavy",), ("=1",), ("a=1:2:3",), ("a=1", "a=2")]
+)
+def test_a_randomisation_that_cannot_be_read_is_named(entries: tuple[str, ...]) -> None:
+    with pytest.raises(ConfigError, match="--randomisation"):
+        records_of(randomisation=entries)
+
+
+def test_a_randomisation_that_there_is_none_of_is_named() -> None:
+    with pytest.raises(ConfigurationError, match="puck_mass"):
+        records_of(randomisation=("puk_mass=2",))
+    with pytest.raises(ConfigurationError, match="penalty_weight"):
+        records_of(penalty_weight=-1.0)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of a run: an untrained policy, as saved and as exported."""
+    from stable_baselines3 import PPO
+
+    from tpm_gym.learning import export
+
+    folder = tmp_path_factory.mktemp("runs") / "reach"
+    folder.mkdir()
+    env = gym.make("TPMReach-v0")
+    model = PPO("MultiInputPolicy", env, seed=0, device="cpu")
+    env.close()
+    model.save(folder / "best.zip")
+    export.save(model, folder / "best", env_id="TPMReach-v0", seed=0, recipe={})
+    config = {"algo": "ppo", "env": "TPMReach-v0", "seed": 0, "recipe": {}}
+    (folder / "config.json").write_text(json.dumps(config))
+    return folder
+
+
+def returns(policy: Path | str, **options: Any) -> list[float]:
+    config = evaluate.Config(policy=(str(policy),), episodes=1, **options)
+    return [record.total_reward for record in evaluate.evaluate(config, quiet())[0].records]
+
+
+def test_an_exported_policy_goes_by_any_of_its_names(run: Path) -> None:
+    """Its environment is the one it was trained on; it acts as the archive does."""
+    trusted = returns(run / "best.zip", trust_pickle=True)
+    for name in ("best.json", "best.safetensors", "best", "."):
+        assert returns(run / name) == pytest.approx(trusted, abs=1e-3), name
+
+
+def test_an_archive_is_refused_unless_it_is_trusted(run: Path, tmp_path: Path) -> None:
+    for archive in (run / "best.zip", tmp_path):
+        (tmp_path / "best.zip").write_bytes((run / "best.zip").read_bytes())
+        (tmp_path / "config.json").write_bytes((run / "config.json").read_bytes())
+        with pytest.raises(PolicyError, match="--trust-pickle") as caught:
+            returns(archive)
+        assert "python train/export.py" in str(caught.value)
+    assert returns(tmp_path, trust_pickle=True)
+
+
+def test_without_trust_nothing_is_unpickled(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import torch
+
+    def refuse(*args: Any, **kwargs: Any) -> None:
+        raise AssertionError("unpickled")
+
+    for owner, name in ((pickle, "load"), (pickle, "loads"), (torch, "load")):
+        monkeypatch.setattr(owner, name, refuse)
+    assert returns(run / "best.json")
+    with pytest.raises(PolicyError, match="--trust-pickle"):
+        returns(run / "best.zip")
+
+
+def test_an_exported_policy_of_another_task_is_refused(run: Path) -> None:
+    with pytest.raises(PolicyError, match=r"was trained with observation space .*TPMReach-v0"):
+        returns(run / "best.json", env="TPMPickAndPlace-v0")
+
+
+def test_a_damaged_policy_is_one_line(run: Path, tmp_path: Path) -> None:
+    (tmp_path / "best.json").write_bytes((run / "best.json").read_bytes())
+    (tmp_path / "best.safetensors").write_bytes((run / "best.safetensors").read_bytes()[:-1])
+    words = [sys.executable, str(SCRIPT), "--policy", str(tmp_path / "best")]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    last = done.stderr.splitlines()[-1]  # the engine has introduced itself before
+    assert last.startswith("error: policy ")
+    assert "best.safetensors: is cut off" in last
+    env = gym.make("TPMReach-v0")
+    with pytest.raises(PolicyError, match="does not describe a policy"):
+        load_policy(str(run / "config.json"), env)
+    env.close()
+
+
+def test_an_exported_policy_needs_no_stable_baselines(run: Path) -> None:
+    program = (
+        "import sys\n"
+        "sys.modules['stable_baselines3'] = sys.modules['sb3_contrib'] = None\n"
+        "import evaluate\n"
+        f"evaluate.evaluate(evaluate.Config(policy=({str(run / 'best')!r},), episodes=1))\n"
+    )
+    words = [sys.executable, "-c", program]
+    done = subprocess.run(words, cwd=SCRIPT.parent, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_command_line_errors_are_one_line() -> None:
+    done = subprocess.run(
+        [sys.executable, str(SCRIPT), "--policy", "expert", "--env", "Nope-v0"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: unknown environment 'Nope-v0'")
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_files_are_written_whole_or_not_at_all(tmp_path: Path) -> None:
+    path = tmp_path / "result.json"
+    provenance.write_json(path, {"value": 1})
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        provenance.write_json(path, {"value": float("nan")})
+
+    def fail(part: Path) -> None:
+        part.write_text("half")
+        raise OSError("disk full")
+
+    with pytest.raises(OSError, match="disk full"):
+        provenance.write_whole(path, fail)
+    assert read_strict(path) == {"value": 1}
+    assert [entry.name for entry in tmp_path.iterdir()] == ["result.json"]
+
+
+def test_command_keeps_no_folder_outside(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    inside, outside = tmp_path / "runs" / "a b", tmp_path.parent / "elsewhere" / "x.json"
+    words = ["train/train.py", "--run", str(inside), f"--json={outside}", "--seed", "3"]
+    expected = "python train/train.py --run 'runs/a b' --json=x.json --seed 3"
+    assert provenance.command_line(words) == expected
+
+
+@pytest.mark.parametrize(("option", "name"), [("video", "film.xyz"), ("picture", "still")])
+def test_a_picture_of_an_unknown_kind_is_refused_before_the_episodes(
+    tmp_path: Path, option: str, name: str
+) -> None:
+    config = evaluate.Config(
+        policy=("random",), env="TPMReach-v0", episodes=1, **{option: tmp_path / name}
+    )
+    with pytest.raises(ConfigError, match=f"--{option}"):
+        evaluate.evaluate(config)

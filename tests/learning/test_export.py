@@ -1,0 +1,360 @@
+"""An exported policy acts as the model does, and what cannot be exported is refused."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from sb3_contrib import TQC
+from stable_baselines3 import DDPG, PPO, SAC
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.torch_layers import CombinedExtractor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+import tpm_gym
+from tpm_gym.learning import export
+from tpm_gym.learning.errors import ConfigError, PolicyError
+from tpm_gym.learning.features import GoalGapExtractor
+from tpm_gym.policy.files import read_description
+
+RECIPE = {"n_timesteps": 5000, "arguments": {"gamma": 0.95, "policy_kwargs": {"net_arch": [8]}}}
+GOAL_GAP = {
+    "features_extractor_class": GoalGapExtractor,
+    "features_extractor_kwargs": {"unit": 0.07},
+}
+
+
+class Blank(gym.Env[dict[str, Any], Any]):
+    """Has the spaces of a task and nothing behind them, so that no engine is needed here."""
+
+    def __init__(self, action_space: spaces.Box | None = None, **boxes: spaces.Space[Any]) -> None:
+        goal = spaces.Box(-2.0, 2.0, (3,), np.float32)
+        found = {
+            "observation": spaces.Box(-10.0, 10.0, (9,), np.float32),
+            "achieved_goal": goal,
+            "desired_goal": goal,
+        }
+        self.observation_space = spaces.Dict({**found, **boxes})
+        self.action_space = action_space or spaces.Box(-1.0, 1.0, (4,), np.float32)
+        self._steps = 0
+
+    def reset(self, **kwargs: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+        self._steps = 0
+        return self.observation_space.sample(), {}
+
+    def step(self, action: Any) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        self._steps += 1
+        return self.observation_space.sample(), 0.0, False, self._steps == 5, {}
+
+
+def make(kind: type[BaseAlgorithm], env: gym.Env[Any, Any], **policy_kwargs: Any) -> Any:
+    """Make a model whose weights, biases included, are far from zero."""
+    options: dict[str, Any] = {} if kind is PPO else {"buffer_size": 10}
+    made: Any = kind(
+        "MultiInputPolicy", env, seed=0, device="cpu", policy_kwargs=policy_kwargs, **options
+    )
+    generator = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        for parameter in made.policy.parameters():
+            parameter += 0.2 * torch.randn(parameter.shape, generator=generator)
+    return made
+
+
+def save(made: BaseAlgorithm, path: Path) -> Path:
+    return export.save(made, path, env_id="TPMPickAndPlace-v0", seed=5, recipe=RECIPE)
+
+
+def observations(env: gym.Env[Any, Any], n: int) -> dict[str, Any]:
+    """Return goals that lie near each other, and observations over their whole range."""
+    rng = np.random.default_rng(3)
+    boxes: Any = env.observation_space
+    found = {
+        key: rng.uniform(0.3 * box.low, 0.3 * box.high, (n, *box.shape)).astype(np.float32)
+        for key, box in boxes.items()
+    }
+    found["desired_goal"] = found["achieved_goal"] + rng.normal(0, 0.05, (n, 3)).astype(np.float32)
+    return found
+
+
+EVEN = spaces.Box(-1.0, 1.0, (4,), np.float32)
+UNEVEN = spaces.Box(np.array([-0.2, 0.0], "f"), np.array([0.1, 5.0], "f"))
+
+
+@pytest.mark.parametrize("kind", [SAC, TQC, PPO])
+@pytest.mark.parametrize(
+    ("policy_kwargs", "boxes", "action_space"),
+    [
+        ({"net_arch": [64, 64], **GOAL_GAP}, {}, EVEN),
+        ({"net_arch": [32, 16]}, {}, EVEN),
+        ({"net_arch": [16], "activation_fn": torch.nn.Tanh}, {}, UNEVEN),
+        ({"net_arch": [], **GOAL_GAP}, {}, UNEVEN),
+        (
+            {"net_arch": [8, 8, 8, 8], "activation_fn": torch.nn.ReLU},
+            {"an_image": spaces.Box(0.0, 1.0, (2, 3), np.float32)},
+            EVEN,
+        ),
+        ({"net_arch": {"pi": [7], "qf": [5], "vf": [6]}}, {}, EVEN),
+    ],
+    ids=["gap", "joined", "tanh", "linear", "table", "uneven"],
+)
+def test_actions_are_those_of_the_model(
+    tmp_path: Path,
+    kind: type[BaseAlgorithm],
+    policy_kwargs: dict[str, Any],
+    boxes: dict[str, Any],
+    action_space: spaces.Box,
+) -> None:
+    env = Blank(action_space, **boxes)
+    made = make(kind, env, **policy_kwargs)
+    loaded = tpm_gym.load_policy(save(made, tmp_path / "p"))
+    loaded.check(env)
+    batch = observations(env, 1000)
+    expected, _ = made.predict(batch, deterministic=True)
+    actions, _ = loaded.predict(batch, deterministic=True)
+    assert (actions.shape, actions.dtype) == (expected.shape, expected.dtype)
+    np.testing.assert_allclose(actions, expected, rtol=0, atol=1e-6)
+    assert expected.std(axis=0).min() > 0.01  # the comparison is not one of constants
+    for i in range(1000):
+        one = {key: values[i] for key, values in batch.items()}
+        wanted, _ = made.predict(one, deterministic=True)
+        action = loaded.act(one)
+        assert action.shape == wanted.shape
+        np.testing.assert_allclose(action, wanted, rtol=0, atol=1e-6)
+
+
+@pytest.fixture
+def model() -> Any:
+    return make(SAC, Blank(), net_arch=[8], **GOAL_GAP)
+
+
+def test_the_description_is_that_of_the_model(tmp_path: Path, model: Any) -> None:
+    model.num_timesteps = 1234
+    path = save(model, tmp_path / "new" / "v1.5")
+    assert path == tmp_path / "new" / "v1.5.json"
+    assert sorted(file.name for file in path.parent.iterdir()) == ["v1.5.json", "v1.5.safetensors"]
+    about = read_description(path)
+    assert (about.env_id, about.algorithm) == ("TPMPickAndPlace-v0", "sac")
+    assert (about.seed, about.steps, about.recipe) == (5, 1234, RECIPE)
+    assert about.versions["torch"] == torch.__version__
+    assert about.observation_space == model.observation_space
+    assert about.action_space == model.action_space
+    assert (about.network.features, about.network.unit) == ("goal_gap", 0.07)
+    text = path.read_text()
+    assert str(tmp_path) not in text
+    assert str(Path.home()) not in text
+
+
+def test_only_the_actor_is_written(tmp_path: Path, model: Any) -> None:
+    about = read_description(save(model, tmp_path / "p"))
+    assert about.shapes == {
+        "layers.0.weight": (8, 12),
+        "layers.0.bias": (8,),
+        "layers.1.weight": (4, 8),
+        "layers.1.bias": (4,),
+    }
+
+
+def test_the_same_model_gives_the_same_files(tmp_path: Path, model: Any) -> None:
+    for name in ("a", "b"):
+        save(model, tmp_path / name)
+    for suffix in (".json", ".safetensors"):
+        first, second = ((tmp_path / f"{name}{suffix}").read_bytes() for name in ("a", "b"))
+        assert first == second
+
+
+def test_exporting_leaves_the_model_as_it_was(tmp_path: Path, model: Any) -> None:
+    model.policy.set_training_mode(True)
+    weights = {name: value.clone() for name, value in model.policy.state_dict().items()}
+    random = torch.get_rng_state()
+    save(model, tmp_path / "p")
+    assert model.policy.training
+    assert torch.equal(torch.get_rng_state(), random)
+    for name, value in model.policy.state_dict().items():
+        assert torch.equal(value, weights[name])
+
+
+def test_a_model_fresh_from_an_update_is_exported(tmp_path: Path) -> None:
+    model = make(PPO, Blank(), net_arch=[4])
+    batch, _ = model.policy.obs_to_tensor(observations(Blank(), 3))
+    actions, _, _ = model.policy(batch)
+    model.policy.evaluate_actions(batch, actions)
+    save(model, tmp_path / "fresh")
+    assert tpm_gym.load_policy(tmp_path / "fresh").description.algorithm == "ppo"
+
+
+def test_stable_baselines_evaluates_an_exported_policy(tmp_path: Path, model: Any) -> None:
+    loaded: Any = tpm_gym.load_policy(save(model, tmp_path / "p"))
+    mean, _ = evaluate_policy(loaded, DummyVecEnv([Blank]), n_eval_episodes=2, warn=False)
+    assert mean == 0.0
+
+
+class Halved(CombinedExtractor):
+    """Looks like the extractor it derives from, and is another."""
+
+    def forward(self, observations: Any) -> torch.Tensor:
+        return 0.5 * super().forward(observations)
+
+
+def endless() -> Blank:
+    return Blank(observation=spaces.Box(-np.inf, np.inf, (9,), np.float32))
+
+
+def counted() -> Blank:
+    return Blank(observation=spaces.Box(0, 9, (9,), np.int64))
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: make(SAC, Blank(), features_extractor_class=Halved), "features of Halved"),
+        (lambda: make(SAC, Blank(), activation_fn=torch.nn.ELU), "ReLU or Tanh"),
+        (lambda: make(PPO, Blank(), activation_fn=torch.nn.Sigmoid), "ReLU or Tanh"),
+        (lambda: SAC("MultiInputPolicy", Blank(), use_sde=True, buffer_size=10), "use_sde"),
+        (lambda: PPO("MultiInputPolicy", Blank(), use_sde=True), "use_sde"),
+        (lambda: make(DDPG, Blank()), "DDPG is none of sac, tqc, ppo"),
+        (lambda: make(SAC, endless()), "observation in .*inf.* bounded"),
+        (lambda: make(SAC, counted()), "bounded Box of floats"),
+        (
+            lambda: PPO("MultiInputPolicy", VecNormalize(DummyVecEnv([Blank]))),
+            "VecNormalize",
+        ),
+        (lambda: make(SAC, Blank(), net_arch=[4097]), "from 1 to 4096"),
+    ],
+)
+def test_what_the_files_cannot_hold_is_refused(tmp_path: Path, build: Any, message: str) -> None:
+    with pytest.raises(PolicyError, match=message):
+        save(build(), tmp_path / "p")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_diverged_policy_is_refused(tmp_path: Path, model: Any) -> None:
+    with torch.no_grad():
+        model.policy.actor.mu.bias[0] = float("nan")
+    with pytest.raises(PolicyError, match="training diverged"):
+        save(model, tmp_path / "p")
+
+
+def test_actions_that_differ_are_noticed_and_earlier_files_kept(
+    tmp_path: Path, model: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = save(model, tmp_path / "p")
+    before = path.read_bytes()
+    network = export._network
+
+    def slightly_wrong(*arguments: Any) -> Any:
+        description, weights = network(*arguments)
+        weights["layers.1.bias"][2] += 1e-4
+        return description, weights
+
+    monkeypatch.setattr(export, "_network", slightly_wrong)
+    with pytest.raises(PolicyError, match="actions would be off by"):
+        save(model, path)
+    assert path.read_bytes() == before
+    tpm_gym.load_policy(path)
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+# -- files of train.py -----------------------------------------------------------------------------
+
+
+@pytest.fixture
+def run(tmp_path: Path, model: Any) -> Path:
+    """A folder as train.py leaves it, as far as matters here."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    for name in ("best.zip", "last.zip"):
+        model.save(folder / name)
+    config = {
+        "algo": "sac",
+        "env": "TPMPickAndPlace-v0",
+        "seed": 5,
+        "recipe": RECIPE,
+        "versions": {"torch": "2.0.0", "tpm_gym": None},
+    }
+    (folder / "config.json").write_text(json.dumps(config))
+    return folder
+
+
+def test_what_is_converted_says_what_the_run_says(run: Path, model: Any) -> None:
+    export.main([str(run / "last.zip"), str(run / "last"), "--trust-pickle"])
+    batch = observations(Blank(), 10)
+    loaded = tpm_gym.load_policy(run / "last")
+    expected, _ = model.predict(batch, deterministic=True)
+    np.testing.assert_allclose(loaded.act(batch), expected, atol=1e-6)
+    assert loaded.description.seed == 5
+    assert loaded.description.versions == {"torch": "2.0.0", "tpm_gym": None}
+
+
+def test_the_command_line_converts_what_is_trusted(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    export.main([str(run / "best.zip"), str(run / "shared.json"), "--trust-pickle"])
+    assert capsys.readouterr().out == f"{run / 'shared.json'}\n"
+    assert tpm_gym.load_policy(run / "shared").description.recipe == RECIPE
+
+
+def test_the_command_line_does_not_touch_what_is_not_trusted(run: Path) -> None:
+    """In a process of its own, with a file that would leave a trace if it were unpickled."""
+    trace = run / "trace"
+    (run / "best.zip").write_bytes(pickle.dumps(Trace(str(trace))))
+    done = subprocess.run(
+        [sys.executable, export.__file__, str(run / "best.zip"), str(run / "out")],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: ")
+    assert "--trust-pickle" in done.stderr
+    assert not trace.exists()
+    assert not (run / "out.json").exists()
+
+
+class Trace:
+    """Writes a file when it is unpickled."""
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+
+    def __reduce__(self) -> Any:
+        return open, (self.path, "w")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["none.zip", "out"], "no such file"),
+        (["best.zip", "out.zip"], "not for a .zip"),
+        (["broken.zip", "out"], "cannot be loaded as sac"),
+        (["elsewhere/best.zip", "out"], "no config.json"),
+    ],
+)
+def test_mistakes_on_the_command_line_are_one_line(
+    run: Path, words: list[str], message: str
+) -> None:
+    (run / "broken.zip").write_bytes(b"PK")
+    away = run.parent / "a" / "b" / "elsewhere"
+    away.mkdir(parents=True)
+    (away / "best.zip").write_bytes((run / "best.zip").read_bytes())
+    model = away / "best.zip" if "elsewhere" in words[0] else run / words[0]
+    with pytest.raises(SystemExit, match=message) as caught:
+        export.main([str(model), str(run / words[1]), "--trust-pickle"])
+    assert "\n" not in str(caught.value)
+
+
+def test_a_damaged_configuration_is_named(run: Path) -> None:
+    (run / "config.json").write_text('{"algo": "sac"}')
+    with pytest.raises(SystemExit, match=r"config\.json is damaged: no entry 'env'"):
+        export.main([str(run / "best.zip"), str(run / "best"), "--trust-pickle"])
+    with pytest.raises(ConfigError, match=r"not for a \.zip"):
+        save(make(PPO, Blank(), net_arch=[4]), run / "best.zip")

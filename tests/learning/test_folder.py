@@ -1,0 +1,113 @@
+"""The folder of a run: what may be deleted, and in which order."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from tpm_gym.learning.checkpoint import CheckpointStore
+from tpm_gym.learning.errors import NotARunError, RunBusyError, RunExistsError, RunWriteError
+from tpm_gym.learning.run_folder import claimed, clear, description, disk_errors_named, prepare
+
+OURS = {"algo": "sac", "env": "TPMReach-v0", "training_seeds": [0, 0]}
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    """A run with files and folders."""
+    folder = tmp_path / "run"
+    (folder / "checkpoints" / "000000050").mkdir(parents=True)
+    (folder / "config.json").write_text(json.dumps(OURS))
+    (folder / "best.zip").write_text("")
+    (folder / "zzz").write_text("")
+    return folder
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(entry.name for entry in folder.iterdir())
+
+
+def test_a_run_is_replaced_only_if_asked_to(run: Path) -> None:
+    before = names(run)
+    with pytest.raises(RunExistsError, match="--overwrite"):
+        prepare(run, overwrite=False)
+    assert names(run) == before
+    prepare(run, overwrite=True)
+    assert names(run) == []
+
+
+@pytest.mark.parametrize("config", [None, '{"model_type": "bert"}', "{", "[]", '"text"'])
+def test_what_another_program_wrote_is_never_deleted(config: str | None, tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("years of work")
+    if config is not None:
+        (tmp_path / "config.json").write_text(config)
+    before = names(tmp_path)
+    assert description(tmp_path) is None
+    with pytest.raises(NotARunError, match=r"config\.json of train\.py"):
+        prepare(tmp_path, overwrite=True)
+    assert names(tmp_path) == before
+
+
+def test_a_file_is_no_folder(tmp_path: Path) -> None:
+    (tmp_path / "run").write_text("")
+    with pytest.raises(RunExistsError):
+        prepare(tmp_path / "run", overwrite=False)
+
+
+def test_what_a_first_moment_left_is_no_run(tmp_path: Path) -> None:
+    (tmp_path / ".half.json").write_text("{")
+    prepare(tmp_path, overwrite=False)
+    prepare(tmp_path / "new" / "run", overwrite=False)
+    assert (tmp_path / "new" / "run").is_dir()
+
+
+def test_a_death_while_deleting_leaves_a_run_that_can_be_deleted(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Killed(BaseException):
+        pass
+
+    def unlink(path: Path) -> None:
+        if path.name == "config.json":
+            raise Killed
+        os.unlink(path)  # the method is this function
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "unlink", unlink)
+        with pytest.raises(Killed):
+            prepare(run, overwrite=True)
+    assert names(run) == ["config.json"]
+    prepare(run, overwrite=True)
+    assert names(run) == []
+
+
+def test_clearing_keeps_what_it_is_told_to_and_follows_no_links(run: Path, tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "kept").write_text("")
+    (run / "link").symlink_to(tmp_path / "elsewhere")
+    clear(run, but="config.json")
+    assert names(run) == ["config.json"]
+    assert names(tmp_path / "elsewhere") == ["kept"]
+    assert description(run) == OURS
+
+
+@pytest.mark.skipif(os.name == "nt", reason="there are no such locks")
+def test_a_run_in_use_is_not_deleted(run: Path) -> None:
+    before = names(run)
+    with claimed(run), pytest.raises(RunBusyError, match="another process"):
+        prepare(run, overwrite=True)
+    assert names(run) == before
+    with claimed(run):
+        pass
+
+
+def test_only_errors_of_the_disk_are_renamed(run: Path) -> None:
+    store = CheckpointStore(run / "checkpoints")
+    with pytest.raises(RunWriteError, match="No space left"), disk_errors_named(run, store):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    with pytest.raises(FileNotFoundError), disk_errors_named(run, store):
+        raise FileNotFoundError(errno.ENOENT, "gone")

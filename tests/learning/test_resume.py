@@ -1,0 +1,337 @@
+"""A training that was killed ends, once resumed, as if nothing had happened."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3 import SAC
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from trainings import (
+    Killed,
+    assert_equal_runs,
+    end_of,
+    evaluations,
+    kill_at,
+    make_config,
+    quiet,
+    resumed,
+    said,
+    table,
+    uninterrupted,
+)
+
+from tpm_gym.learning import callbacks, train
+from tpm_gym.learning.checkpoint import CheckpointStore, Content
+from tpm_gym.learning.configuration import Config
+from tpm_gym.learning.errors import (
+    NoWholeCheckpointError,
+)
+from tpm_gym.learning.policies import load_policy
+from tpm_gym.learning.rollout import TEST_SEED, run_episodes
+from tpm_gym.learning.training_state import EpisodeRecorder, restore
+
+SCRIPT = Path(train.__file__)
+
+
+@pytest.fixture(autouse=True)
+def _no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drawing takes longer than all the rest of these trainings."""
+    monkeypatch.setattr(callbacks, "draw_learning_curve", lambda *args: None)
+
+
+# -- killed ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("case", "step"),
+    [
+        *[("sac", step) for step in (51, 149, 233)],
+        *[pytest.param("sac", step, marks=pytest.mark.slow) for step in (1, 50, 99, 201, 299)],
+        ("tqc", 271),
+        *[pytest.param("tqc", step, marks=pytest.mark.slow) for step in (60, 161)],
+        ("ppo", 241),
+        *[pytest.param("ppo", step, marks=pytest.mark.slow) for step in (39, 95)],
+        ("ppo in processes", 201),
+    ],
+)
+def test_a_killed_run_ends_as_if_nothing_had_happened(
+    case: str,
+    step: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    config = make_config(case, tmp_path)
+    kill_at(monkeypatch, step, config)
+    assert train.train(resumed(config), quiet()) is None
+    assert_equal_runs(uninterrupted(case), tmp_path / "run")
+
+
+def test_a_run_killed_again_and_again_ends_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = make_config("sac", tmp_path)
+    for step in (70, 40, 120, 170, 101, 260):  # some before the step that was reached already
+        kill_at(monkeypatch, step, config)
+        config = resumed(config)
+    assert train.train(config, quiet()) is None
+    assert_equal_runs(uninterrupted("sac"), tmp_path / "run")
+    resumptions = json.loads((tmp_path / "run" / "config.json").read_text())["resumed"]
+    steps = [resumption["from_step"] for resumption in resumptions]
+    assert steps == sorted(steps)
+    assert steps[-1] == 250
+
+
+def test_a_run_killed_before_its_first_checkpoint_begins_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = make_config("sac", tmp_path)
+
+    def die(*args: object) -> None:
+        raise Killed
+
+    with monkeypatch.context() as patched:
+        patched.setattr(CheckpointStore, "_check_space", die)
+        with pytest.raises(Killed):
+            train.train(config, quiet())
+    (tmp_path / "run" / "checkpoints" / "000000000.tmp").mkdir(parents=True)
+    console = quiet()
+    assert train.train(resumed(config), console) is None
+    assert "from step 0 to 300" in said(console)
+    assert_equal_runs(uninterrupted("sac"), tmp_path / "run")
+
+
+def test_nothing_is_counted_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = replace(make_config("sac", tmp_path), checkpoint_every=200)
+    kill_at(monkeypatch, 290, config)
+    run = tmp_path / "run"
+    assert [line["steps"] for line in evaluations(run)] == [0, 70, 140, 210, 280]
+    train.train(resumed(config), quiet())
+    steps = [int(row["time/total_timesteps"]) for row in table(run) if row["time/total_timesteps"]]
+    assert steps == [200]  # logged every four episodes
+    assert [line["steps"] for line in evaluations(run)] == [0, 70, 140, 210, 280, 300]
+    events = EventAccumulator(str(run))
+    events.Reload()
+    logged = [event.step for event in events.Scalars("eval/success_at_end")]
+    assert logged == [0, 70, 140, 210, 280, 300]
+
+
+def test_logs_of_a_torn_write_are_put_right(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = make_config("sac", tmp_path)
+    kill_at(monkeypatch, 240, config)
+    run = tmp_path / "run"
+    torn = ("progress.csv", "evaluations.jsonl", "best.zip", "best.json", "config.json")
+    for name in torn:
+        os.truncate(run / name, (run / name).stat().st_size // 2)
+    train.train(resumed(config), quiet())
+    assert_equal_runs(uninterrupted("sac"), run)
+    for name in ("best.zip", "best.json", "best.safetensors"):
+        assert (run / name).read_bytes() == end_of(run).files[name]
+
+
+def test_a_damaged_checkpoint_costs_only_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = make_config("sac", tmp_path)
+    kill_at(monkeypatch, 240, config)
+    damaged = tmp_path / "run" / "checkpoints" / "000000200" / "arrays.npz"
+    os.truncate(damaged, damaged.stat().st_size - 1)
+    console = quiet()
+    train.train(resumed(config), console)
+    assert f"warning: damaged checkpoint: {damaged}" in said(console)
+    assert "from step 150 to 300" in said(console)
+    assert_equal_runs(uninterrupted("sac"), tmp_path / "run")
+
+
+def test_all_checkpoints_damaged_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = make_config("sac", tmp_path)
+    kill_at(monkeypatch, 120, config)
+    for path in (tmp_path / "run" / "checkpoints").glob("*/torch.pt"):
+        path.write_bytes(b"")
+    with pytest.raises(NoWholeCheckpointError, match=r"torch\.pt"):
+        train.train(resumed(config), quiet())
+
+
+# -- hindsight over the seam -----------------------------------------------------------------------
+
+
+def assert_whole_episodes(content: Content) -> None:
+    """Every episode that can be sampled has one goal, follows on itself, and has 50 steps at most.
+
+    An episode that goes on as another one after resuming is what makes hindsight teach goals that
+    were never reached.
+    """
+    rows = {name.removeprefix("buffer/"): array for name, array in content.arrays.items()}
+    length, start = rows["ep_length"][:, 0], rows["ep_start"][:, 0]
+    size = len(length)
+    assert length.max() <= 50
+    for first in {int(value) for value in start[length > 0]}:
+        places = (first + np.arange(int(length[first]))) % size
+        goals = rows["observations/desired_goal"][places, 0]
+        assert (goals == goals[0]).all()
+        after = rows["next_observations/observation"][places[:-1], 0]
+        np.testing.assert_array_equal(after, rows["observations/observation"][places[1:], 0])
+
+
+REPLAY = EpisodeRecorder.replay
+
+
+def takes_another_course(self: EpisodeRecorder, episode: dict[str, Any]) -> Any:
+    """Replay as another version of the physics might."""
+    actions = [[-value for value in action] for action in episode["actions"]]
+    return REPLAY(self, {**episode, "actions": actions})
+
+
+def fails(self: EpisodeRecorder, episode: dict[str, Any]) -> Any:
+    return None
+
+
+@pytest.mark.parametrize("replay", [takes_another_course, fails])
+def test_an_episode_that_cannot_go_on_is_ended_and_not_joined_to_another(
+    replay: Callable[..., Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert_whole_episodes(end_of(uninterrupted("sac")))
+    config = replace(make_config("sac", tmp_path), checkpoint_every=130)
+    kill_at(monkeypatch, 140, config)
+    monkeypatch.setattr(EpisodeRecorder, "replay", replay)
+    config, console = replace(resumed(config), steps=220), quiet()
+    train.train(config, console)
+    assert "could not be repeated exactly, so new ones begin" in said(console)
+    end = end_of(tmp_path / "run")
+    assert_whole_episodes(end)
+    last = 129  # of the third episode, 100 to 129 is what there was
+    assert end.arrays["buffer/ep_length"][last, 0] == 30
+    assert end.arrays["buffer/timeouts"][last, 0] == 1
+    goals = end.arrays["buffer/observations/desired_goal"][:, 0]
+    assert not np.array_equal(goals[last + 1], goals[0])  # not the first episode over again
+
+
+def test_resuming_does_not_act_at_random_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = make_config("sac", tmp_path)
+    kill_at(monkeypatch, 180, config)
+    random_actions = []
+    sample = gym.spaces.Box.sample
+
+    def counted(self: gym.spaces.Box, *args: Any, **kwargs: Any) -> Any:
+        random_actions.append(1)
+        return sample(self, *args, **kwargs)
+
+    monkeypatch.setattr(gym.spaces.Box, "sample", counted)
+    train.train(resumed(config), quiet())
+    assert not random_actions
+
+
+def test_saving_changes_nothing_and_the_optimiser_moves_what_was_restored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An optimiser that holds other tensors than the networks would train nothing."""
+    config = make_config("sac", tmp_path)
+    kill_at(monkeypatch, 260, config)
+    content = CheckpointStore(tmp_path / "run" / "checkpoints").load(pytest.fail)
+    plan = train.make_plan(replace(config, run=tmp_path / "other"))
+    envs = train._make_training_envs(plan)
+    model = train._make_model(plan, envs)
+    model.set_logger(train_logger(tmp_path))
+    restore(model, content)
+    assert isinstance(model, SAC)
+    before = {name: value.clone() for name, value in model.policy.state_dict().items()}
+    entropy = model.log_ent_coef.item()
+    model.train(3, 16)
+    moved = [
+        name for name, value in model.policy.state_dict().items() if (value != before[name]).any()
+    ]
+    assert len(moved) == len(before)
+    assert model.log_ent_coef.item() != entropy
+    model.logger.close()
+    envs.close()
+
+
+def train_logger(folder: Path) -> Any:
+    from tpm_gym.learning.logger import make_logger
+
+    (folder / "log").mkdir()
+    return make_logger(folder / "log")
+
+
+# -- real kills -----------------------------------------------------------------------------------
+
+
+def kill_beyond(run: Path, step: int, arguments: list[str], delay: float = 0.0) -> int:
+    """Start train.py and kill -9 it once it has saved a step; return its exit status."""
+    process = subprocess.Popen(
+        [sys.executable, str(SCRIPT), "--run", str(run), *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+    )
+    assert process.stdout is not None
+    process.stdout.readline()  # so that the imports are done
+    while process.poll() is None and newest(run) < step:
+        time.sleep(0.001)
+    time.sleep(delay)
+    process.kill()
+    process.communicate()
+    return process.returncode
+
+
+def newest(run: Path) -> int:
+    names = [path.name for path in run.glob("checkpoints/*")]
+    return max((int(name) for name in names if name.isdigit()), default=-1)
+
+
+def test_kill_9_costs_nothing(tmp_path: Path) -> None:
+    config = make_config("sac", tmp_path)
+    run = tmp_path / "run"
+    arguments = ["--recipe", str(config.recipe), "--eval-episodes", "1", "--eval-every", "70"]
+    arguments += ["--checkpoint-every", "1"]
+    assert kill_beyond(run, 120, arguments) == -signal.SIGKILL
+    assert CheckpointStore(run / "checkpoints").load(pytest.fail).step < 300
+    assert train.train(Config(run=run, resume=True, checkpoint_every=1000), quiet()) is None
+    assert_equal_runs(uninterrupted("sac"), run)
+
+
+def success(run: Path, episodes: int) -> float:
+    """Return the success rate of the last policy on the seeds that evaluate.py uses."""
+    env = gym.make("TPMReach-v0")
+    policy = load_policy(str(run / "last.zip"), env, trust_pickle=True)
+    records = run_episodes(env, policy, episodes, TEST_SEED)
+    env.close()
+    return sum(record.success_at_end for record in records) / episodes
+
+
+@pytest.mark.slow
+def test_ten_kills_at_random_moments_change_nothing(tmp_path: Path) -> None:
+    arguments = ["--eval-episodes", "5", "--checkpoint-every", "100"]
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    command = [sys.executable, str(SCRIPT), "--run"]
+    subprocess.run([*command, str(whole), *arguments], check=True, capture_output=True)
+    draw = random.Random(0)
+    for step in sorted(draw.sample(range(4500), 10)):  # of 5000
+        status = kill_beyond(killed, step, arguments, delay=draw.uniform(0.0, 1.0))
+        assert status == -signal.SIGKILL
+        arguments = ["--resume"]
+    subprocess.run([*command, str(killed), "--resume"], check=True, capture_output=True)
+    resumptions = json.loads((killed / "config.json").read_text())["resumed"]
+    assert len(resumptions) > 5  # those between the same two checkpoints count once
+    assert_equal_runs(whole, killed)
+    assert success(killed, 100) == success(whole, 100)
+    assert success(killed, 100) > 0.9

@@ -1,0 +1,258 @@
+"""Episodes repeat exactly, records say what happened, and intervals cover what they promise."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import tpm_gym  # noqa: F401  # registers the ids
+from tpm_gym.learning.errors import PolicyError, RolloutError
+from tpm_gym.learning.policies import load_policy, trained_env
+from tpm_gym.learning.rollout import (
+    SELECTION_SEED,
+    TEST_SEED,
+    Episode,
+    Estimate,
+    GoalEnv,
+    bootstrap,
+    run_episodes,
+    summarise,
+    wilson,
+)
+
+
+class ScriptedEnv(gym.Env[dict[str, NDArray[Any]], NDArray[Any]]):
+    """Delivers the steps it was given, in every episode."""
+
+    def __init__(self, steps: list[dict[str, Any]]) -> None:
+        self.steps = steps
+        self.seeds: list[int | None] = []
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        self.seeds.append(seed)
+        self.index = 0
+        return {}, {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        info = dict(self.steps[self.index])
+        self.index += 1
+        return {}, info.pop("reward"), False, self.index == len(self.steps), info
+
+
+class Idle:
+    """Acts, and remembers the seeds it was reset with."""
+
+    def __init__(self) -> None:
+        self.seeds: list[int] = []
+
+    def reset(self, observation: Any, seed: int) -> None:
+        self.seeds.append(seed)
+
+    def act(self, observation: Any) -> NDArray[Any]:
+        return np.zeros(3)
+
+
+def scripted_step(
+    reward: float = -1.0, success: bool = False, conditioning: float = 0.5, gap: float = 1e-5
+) -> dict[str, Any]:
+    return {
+        "reward": reward,
+        "is_success": success,
+        "conditioning": conditioning,
+        "closure_error": gap,
+    }
+
+
+@pytest.fixture(scope="module")
+def reach() -> Iterator[GoalEnv]:
+    env = gym.make("TPMReach-v0")
+    yield env
+    env.close()
+
+
+def test_record_says_what_happened() -> None:
+    env = ScriptedEnv(
+        [
+            scripted_step(-1.0, False, 0.5, 1e-5),
+            scripted_step(-0.5, True, 0.1, 7e-5),
+            scripted_step(-0.25, False, 0.3, 2e-5),
+        ]
+    )
+    (record,) = run_episodes(env, Idle(), 1, first_seed=5)
+    assert record == Episode(
+        seed=5,
+        success_at_end=False,
+        success_once=True,
+        total_reward=-1.75,
+        conditioning_min=0.1,
+        conditioning_mean=pytest.approx(0.3),
+        closure_error_max=7e-5,
+        length=3,
+    )
+    assert record.as_dict()["return"] == -1.75
+
+
+def test_success_at_end_is_that_of_the_last_step() -> None:
+    env = ScriptedEnv([scripted_step(), scripted_step(success=True)])
+    (record,) = run_episodes(env, Idle(), 1, first_seed=0)
+    assert record.success_at_end
+    assert record.success_once
+
+
+def test_seeds_count_up_for_environment_and_policy() -> None:
+    env, policy = ScriptedEnv([scripted_step()]), Idle()
+    records = run_episodes(env, policy, 3, first_seed=40)
+    assert [record.seed for record in records] == env.seeds == policy.seeds == [40, 41, 42]
+
+
+def test_hooks_see_every_frame_and_episode() -> None:
+    frames, episodes = [], []
+    env = ScriptedEnv([scripted_step()] * 4)
+    run_episodes(
+        env,
+        Idle(),
+        2,
+        0,
+        on_frame=lambda: frames.append(env.index),
+        on_episode=lambda: episodes.append(len(frames)),
+    )
+    assert frames == [0, 1, 2, 3, 4] * 2
+    assert episodes == [5, 10]
+
+
+@pytest.mark.parametrize("name", ["reward", "conditioning", "closure_error"])
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_values_that_are_not_finite_raise(name: str, value: float) -> None:
+    env = ScriptedEnv([scripted_step(), scripted_step() | {name: value}])
+    with pytest.raises(RolloutError, match="seed 3, step 1") as caught:
+        run_episodes(env, Idle(), 1, first_seed=3)
+    assert caught.value.name == name
+
+
+@pytest.mark.parametrize("spec", ["random", "expert"])
+def test_same_seeds_same_records(reach: GoalEnv, spec: str) -> None:
+    policy = load_policy(spec, reach)
+    records = run_episodes(reach, policy, 4, first_seed=100)
+    assert run_episodes(reach, load_policy(spec, reach), 4, first_seed=100) == records
+    # An episode depends on its own seed alone, not on those run before it.
+    assert run_episodes(reach, policy, 2, first_seed=102) == records[2:]
+    assert len({record.total_reward for record in records}) > 1 or spec == "random"
+
+
+def test_expert_reaches_and_random_does_not(reach: GoalEnv) -> None:
+    expert, chance = (
+        run_episodes(reach, load_policy(spec, reach), 5, TEST_SEED) for spec in ("expert", "random")
+    )
+    assert sum(record.success_at_end for record in expert) == 5
+    assert sum(record.success_at_end for record in chance) < 3
+
+
+def test_random_actions_fill_the_action_space(reach: GoalEnv) -> None:
+    policy = load_policy("random", reach)
+    policy.reset({}, seed=0)
+    actions = np.array([policy.act({}) for _ in range(2000)])  # (2000, 3)
+    assert reach.action_space.contains(policy.act({}))
+    np.testing.assert_allclose(actions.mean(axis=0), 0.0, atol=0.06)
+    np.testing.assert_allclose(actions.var(axis=0), 1 / 3, rtol=0.08)
+
+
+@pytest.mark.parametrize(
+    ("successes", "trials", "low", "high"),
+    # Newcombe 1998, Table I, method 3 (Wilson score without continuity correction).
+    [
+        (81, 263, 0.2553, 0.3662),
+        (15, 148, 0.0624, 0.1605),
+        (0, 20, 0.0, 0.1611),
+        (1, 29, 0.0061, 0.1718),
+    ],
+)
+def test_wilson_interval_matches_published_values(
+    successes: int, trials: int, low: float, high: float
+) -> None:
+    estimate = wilson([i < successes for i in range(trials)])
+    assert estimate.mean == successes / trials
+    assert (estimate.low, estimate.high) == (
+        pytest.approx(low, abs=6e-5),
+        pytest.approx(high, abs=6e-5),
+    )
+
+
+def test_wilson_interval_holds_the_rate_at_both_ends() -> None:
+    for trials in range(1, 200):
+        for outcome in (False, True):
+            estimate = wilson([outcome] * trials)
+            assert 0 <= estimate.low <= estimate.mean <= estimate.high <= 1
+            assert estimate.low < estimate.high
+
+
+def test_bootstrap_interval_covers_the_true_mean() -> None:
+    rng = np.random.default_rng(7)
+    estimates = [bootstrap(rng.exponential(2.0, 60).tolist()) for _ in range(200)]
+    covered = np.mean([estimate.low <= 2.0 <= estimate.high for estimate in estimates])
+    assert 0.88 <= covered <= 0.98
+
+
+def test_bootstrap_interval_has_the_width_of_the_normal_one() -> None:
+    sample = np.random.default_rng(1).normal(3.0, 1.5, 400)
+    estimate = bootstrap(sample.tolist())
+    half = 1.96 * sample.std() / math.sqrt(sample.size)
+    assert estimate.low == pytest.approx(sample.mean() - half, abs=0.15 * half)
+    assert estimate.high == pytest.approx(sample.mean() + half, abs=0.15 * half)
+
+
+def test_bootstrap_of_equal_values_is_that_value() -> None:
+    assert bootstrap([0.1] * 7) == Estimate(
+        pytest.approx(0.1), pytest.approx(0.1), pytest.approx(0.1)
+    )
+
+
+def test_summary_keeps_the_worst_of_all_episodes() -> None:
+    steps = [scripted_step(gap=3e-5, conditioning=0.4), scripted_step(gap=9e-5, conditioning=0.2)]
+    records = run_episodes(ScriptedEnv(steps[:1]), Idle(), 3, 0)
+    records += run_episodes(ScriptedEnv(steps), Idle(), 1, 3)
+    metrics = summarise(records)
+    assert metrics["closure_error_max"].worst == 9e-5
+    assert metrics["closure_error_max"].mean == pytest.approx((3 * 3e-5 + 9e-5) / 4)
+    assert metrics["conditioning_min"].worst == 0.2
+    assert metrics["conditioning_min"].mean == pytest.approx(0.35)
+    assert metrics["conditioning_mean"].mean == pytest.approx((3 * 0.4 + 0.3) / 4)
+    assert metrics["return"].mean == pytest.approx(-1.25)
+    assert metrics["success_at_end"].worst is None
+
+
+def test_held_out_ranges_do_not_meet() -> None:
+    assert 0 < SELECTION_SEED < TEST_SEED
+
+
+def test_unknown_policies_say_what_there_is(reach: GoalEnv, tmp_path: Path) -> None:
+    with pytest.raises(PolicyError, match=r"expert, random, an exported policy"):
+        load_policy("exprt", reach)
+    with pytest.raises(PolicyError, match=r"best\.zip or .*last\.zip"):
+        load_policy(str(tmp_path), reach)
+
+
+def test_policy_without_its_run_is_refused(reach: GoalEnv, tmp_path: Path) -> None:
+    stray = tmp_path / "a" / "b" / "stray.zip"
+    stray.parent.mkdir(parents=True)
+    stray.write_bytes(b"")
+    with pytest.raises(PolicyError, match="trust-pickle"):
+        load_policy(str(stray), reach)
+    with pytest.raises(PolicyError, match=r"config\.json"):
+        load_policy(str(stray), reach, trust_pickle=True)
+    (stray.parent / "config.json").write_text('{"algo": "sac"}')
+    with pytest.raises(PolicyError, match=r"damaged|cannot be loaded as sac"):
+        load_policy(str(stray), reach, trust_pickle=True)
+    with pytest.raises(PolicyError, match="damaged"):
+        trained_env(str(stray))
+
+
+def test_scripted_policies_were_trained_nowhere() -> None:
+    assert trained_env("expert") is None
+    assert trained_env("random") is None

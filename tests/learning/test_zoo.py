@@ -1,0 +1,67 @@
+"""rl-baselines3-zoo trains with our recipes."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+import tpm_gym
+from tpm_gym.learning.features import GoalGapExtractor
+from tpm_gym.learning.hindsight import PenaltyHerReplayBuffer
+from tpm_gym.learning.zoo import _algorithm, hyperparameters
+from tpm_gym.resources import RECIPES
+
+TRAIN = RECIPES.parent
+
+
+@pytest.mark.parametrize("algorithm", ["sac", "tqc", "ppo"])
+def test_every_recipe_is_handed_over_with_classes_for_their_names(algorithm: str) -> None:
+    recipes = yaml.safe_load((RECIPES / f"{algorithm}.yml").read_text(encoding="utf-8"))
+    translated = hyperparameters(algorithm)
+    assert set(translated) == set(recipes) <= set(tpm_gym.ENV_IDS)
+    for env_id, entries in translated.items():
+        source = recipes[env_id]
+        assert entries["n_timesteps"] == source["n_timesteps"]
+        assert "demonstrations" not in entries
+        assert ("callback" in entries) == ("demonstrations" in source)
+        if "replay_buffer_class" in source:
+            assert entries["replay_buffer_class"] is PenaltyHerReplayBuffer
+        if "features_extractor_class" in source.get("policy_kwargs", {}):
+            assert entries["policy_kwargs"]["features_extractor_class"] is GoalGapExtractor
+
+
+@pytest.mark.parametrize("words", [["--algo", "tqc"], ["--algo=tqc"]])
+def test_the_algorithm_is_that_of_the_command_line(words: list[str]) -> None:
+    assert _algorithm(["train.py", "--env", "TPMReach-v0", *words, "-n", "200"]) == "tqc"
+    assert _algorithm(["train.py"]) == "ppo"
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "env_id", "steps"),
+    [("sac", "TPMReach-v0", 1020), ("ppo", "TPMReachDense-v0", 1)],
+)
+def test_the_zoo_runs_them(algorithm: str, env_id: str, steps: int, tmp_path: Path) -> None:
+    pytest.importorskip("rl_zoo3")
+    options = {
+        "--algo": algorithm,
+        "--env": env_id,
+        "--gym-packages": "tpm_gym",
+        "--conf-file": str(TRAIN / "zoo.py"),
+        "--n-timesteps": str(steps),
+        "--eval-freq": "-1",
+        "--log-folder": str(tmp_path / "logs"),
+        "--num-threads": "1",
+    }
+    command = [sys.executable, "-m", "rl_zoo3.train"]
+    command += [word for pair in options.items() for word in pair]
+    environment = {**os.environ, "PYTHONPATH": str(TRAIN)}
+    done = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert list((tmp_path / "logs" / algorithm).glob(f"{env_id}_1/*.zip"))

@@ -1,0 +1,261 @@
+"""The tree of links closes its loops, stands where the kinematics say, and can be a machine."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import oracle
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from walk import place, walk
+
+from tpm_gym.errors import InputError, UnreachableError
+from tpm_gym.kinematics import (
+    ASSEMBLY_MODES,
+    DEFAULT_ASSEMBLY,
+    AssemblyMode,
+    forward,
+    forward_all,
+    inverse,
+    inverse_all,
+)
+from tpm_gym.kinematics.geometry import PAPER, Geometry
+from tpm_gym.kinematics.workspace import TASK_REGION
+from tpm_gym.mechanism.links import CUP_LENGTH, CUP_PRELOAD, CUP_STROKE, MOTOR_EFFORT, MOTOR_SPEED
+from tpm_gym.mechanism.tree import (
+    ACTUATED_JOINTS,
+    DEFAULT_MOUNT,
+    Mount,
+    build,
+    joint_angles,
+)
+from tpm_gym.simulation.physics import PULL_OFF_FORCE, rotate
+
+FloatArray = NDArray[np.float64]
+GAP = 1e-9
+# Link of the paper's Fig. 1 -> bodies; 3 is rigid with arm 2, 8 with platform 1.
+FIG_1 = {
+    "0": ["base"],
+    "1, 8": ["platform"],
+    "2, 3": ["arm_2"],
+    "3'": ["link_3p"],
+    "4": ["rod_4a", "rod_4b"],
+    "5": ["arm_5"],
+    "6": ["rod_6"],
+    "7": ["link_7"],
+    "9": ["end_link_9"],
+    "10": ["end_link_10"],
+    "11": ["rod_11a", "rod_11b"],
+    "12": ["arm_12"],
+}
+UNIVERSAL_CROSSES = ["cross_4a", "cross_4b"]
+TOOL = ["cup"]
+
+
+def assert_assembled(theta: FloatArray, branch: AssemblyMode, g: Geometry) -> None:
+    mechanism = build(g)
+    frames = walk(mechanism, joint_angles(theta, branch, g))
+    for closure in mechanism.closures:
+        a = place(frames, closure.link_a, closure.point_a)
+        b = place(frames, closure.link_b, closure.point_b)
+        assert np.linalg.norm(a - b) < GAP, closure.name
+    found = place(frames, mechanism.platform, mechanism.point_p)
+    np.testing.assert_allclose(found, forward(theta, branch, g), rtol=0, atol=GAP)
+    for level in (mechanism.platform, "link_3p"):
+        np.testing.assert_allclose(frames[level][1], np.eye(3), rtol=0, atol=GAP)
+    roll = [frames[link][1] for link in ("end_link_9", "end_link_10")]
+    np.testing.assert_allclose(*roll, rtol=0, atol=GAP)  # idle, but set parallel
+    solutions = forward_all(theta, g)
+    (x_c, z_c), beta = solutions.link3[branch.index], solutions.beta[branch.index]
+    p = oracle.points(theta, x_c, z_c, beta, g)
+    joints = {"arm_2": "A1", "arm_5": "A2", "arm_12": "A3", "rod_6": "B2", "link_3p": "C2"}
+    joints |= {"end_link_9": "B3", "link_7": "D1", "platform": "E1", "end_link_10": "C3"}
+    for link, point in joints.items():
+        np.testing.assert_allclose(frames[link][0], p[point], rtol=0, atol=GAP, err_msg=point)
+    half = np.array([g.l5, 0, 0])
+    for suffix, side in (("a", 1), ("b", -1)):
+        foot = frames[f"rod_4{suffix}"][0]
+        np.testing.assert_allclose(foot, p["B1"] + side * half, rtol=0, atol=GAP)
+    np.testing.assert_allclose(
+        place(frames, "rod_4a", (0, g.l4, 0)) - half, p["C1"], rtol=0, atol=GAP
+    )
+
+
+@settings(derandomize=True, max_examples=40, deadline=None)
+@given(oracle.geometries(), oracle.seeds())
+def test_joint_angles_close_every_loop_and_place_the_platform(g: Geometry, seed: int) -> None:
+    solutions = inverse_all(oracle.reachable_points(np.random.default_rng(seed), 1, g), g)
+    for theta in solutions.theta[solutions.valid][:4]:
+        for branch in ASSEMBLY_MODES:
+            # Where a factor vanishes, rounding of theta moves the platform more than GAP.
+            if forward_all(theta, g).valid[branch.index]:
+                assert_assembled(theta, branch, g)
+
+
+def test_joint_angles_close_every_loop_over_the_task_region() -> None:
+    rng = np.random.default_rng(0)
+    for point in rng.uniform(TASK_REGION.low, TASK_REGION.high, (40, 3)):
+        assert_assembled(inverse(point), DEFAULT_ASSEMBLY, PAPER)
+
+
+def test_joint_angles_name_every_joint_and_refuse_what_cannot_be_assembled() -> None:
+    joints = [link.joint.name for link in build().links if link.joint]
+    angles = joint_angles(inverse([0, 0.03, 0.75]))
+    assert set(angles) == set(joints)
+    assert len(joints) == len(set(joints))
+    assert all(type(angle) is float for angle in angles.values())
+    with pytest.raises(UnreachableError):
+        joint_angles([0.0, np.pi, -2.0])
+    with pytest.raises(InputError):
+        joint_angles([np.nan, 0.0, 0.0])
+
+
+def test_every_link_of_figure_1_is_there_and_nothing_else() -> None:
+    bodies = [name for names in FIG_1.values() for name in names]
+    assert sorted(link.name for link in build().links) == sorted(bodies + UNIVERSAL_CROSSES + TOOL)
+
+
+def test_parents_come_before_children_and_closures_join_links_that_exist() -> None:
+    mechanism = build()
+    names = [link.name for link in mechanism.links]
+    assert mechanism.links[0].joint is None
+    for i, link in enumerate(mechanism.links[1:], start=1):
+        assert link.joint is not None
+        assert link.joint.parent in names[:i]
+        assert mechanism.link(link.name) is link
+    assert len({closure.name for closure in mechanism.closures}) == len(mechanism.closures) == 4
+    for closure in mechanism.closures:
+        assert {closure.link_a, closure.link_b} < set(names)
+        assert closure.link_a != closure.link_b
+    with pytest.raises(KeyError):
+        mechanism.link("arm_3")
+
+
+def test_the_tree_with_its_closures_has_three_degrees_of_freedom() -> None:
+    mechanism = build()
+    moving = sum(link.joint is not None for link in mechanism.links)
+    theta = inverse([-0.05, 0.03, 0.78])
+    rest = joint_angles(theta)
+
+    def gaps(values: FloatArray) -> FloatArray:
+        frames = walk(mechanism, dict(zip(rest, values, strict=True)))
+        sides = [
+            place(frames, c.link_a, c.point_a) - place(frames, c.link_b, c.point_b)
+            for c in mechanism.closures
+        ]
+        return np.concatenate(sides)
+
+    start, step = np.array(list(rest.values())), 1e-6
+    columns = [(gaps(start + step * e) - gaps(start - step * e)) / 2e-6 for e in np.eye(moving)]
+    rank = np.linalg.matrix_rank(np.stack(columns, axis=-1), tol=1e-6)
+    # And end link 10, which rolls idly about its own axis, and the cup, which slides.
+    assert moving - rank == 3 + 1 + 1
+
+
+@settings(derandomize=True, max_examples=20, deadline=None)
+@given(oracle.geometries())
+def test_moving_links_have_possible_inertias_along_their_axes(g: Geometry) -> None:
+    for link in build(g).links:
+        assert link.mass > 0
+        moments = np.linalg.eigvalsh(link.inertia)
+        assert (moments > 0).all()
+        assert moments[0] + moments[1] >= moments[2] * (1 - 1e-9)
+        if link.joint is not None:  # the URDF gives no rotation of the inertial frame
+            off_diagonal = link.inertia - np.diag(np.diag(link.inertia))
+            assert np.abs(off_diagonal).max() <= 1e-12
+
+
+def test_legs_part_the_links_and_every_closure_joins_two_of_them() -> None:
+    # What makes the direct solver exact: no closure has both ends in one multibody.
+    mechanism = build()
+    legs = mechanism.legs()
+    moving = [[link.name for link in leg.links[1:]] for leg in legs]
+    leg_of = {name: i for i, names in enumerate(moving) for name in names}
+    assert sum(len(names) for names in moving) == len(leg_of) == len(mechanism.links) - 1
+    for names, leg, motor in zip(moving, legs, ACTUATED_JOINTS, strict=True):
+        assert leg.links == (mechanism.links[0], *(mechanism.link(name) for name in names))
+        joints = [link.joint for link in leg.links[1:] if link.joint]
+        assert (joints[0].name, joints[0].parent) == (motor, "base")
+        for i, joint in enumerate(joints[1:], start=1):
+            assert joint.parent in names[:i]  # one tree, parents first
+    for closure in mechanism.closures:
+        assert leg_of[closure.link_a] != leg_of[closure.link_b], closure.name
+
+
+def test_only_the_three_motors_drive_and_they_reach_the_task_region() -> None:
+    sides = [np.linspace(*ends, 9) for ends in zip(TASK_REGION.low, TASK_REGION.high, strict=True)]
+    theta = inverse(np.stack(np.meshgrid(*sides), axis=-1)).reshape(-1, 3)
+    joints = {link.joint.name: link.joint for link in build().links if link.joint}
+    for joint in joints.values():
+        if joint.name in ACTUATED_JOINTS:
+            angles = theta[:, ACTUATED_JOINTS.index(joint.name)]
+            assert joint.kind == "revolute"
+            assert joint.parent == "base"
+            assert joint.lower < angles.min() <= angles.max() < joint.upper
+            assert (joint.effort, joint.speed) == (MOTOR_EFFORT, MOTOR_SPEED)
+        elif joint.name != "cup_slide":
+            assert joint.kind == "continuous"
+            assert joint.effort == joint.speed == 0
+    assert set(ACTUATED_JOINTS) < set(joints)
+
+
+def test_the_cup_is_under_point_p_and_alone_collides() -> None:
+    mechanism = build()
+    frames = walk(mechanism, joint_angles(inverse([-0.05, 0.03, 0.78])))
+    point_p = place(frames, mechanism.platform, mechanism.point_p)
+    lip = place(frames, mechanism.tool, mechanism.lip)
+    np.testing.assert_allclose(lip - point_p, [0, 0, CUP_LENGTH], atol=1e-9)
+    colliding = [(link, s) for link in mechanism.links for s in link.solids if s.collides]
+    assert [link.name for link, _ in colliding] == [mechanism.tool]
+    cup = colliding[0][1]
+    assert cup.centre[2] + cup.size[1] / 2 == pytest.approx(mechanism.lip[2])
+
+
+def test_the_cup_slides_back_into_the_platform_along_its_axis() -> None:
+    mechanism = build()
+    joint = mechanism.link(mechanism.tool).joint
+    assert joint is not None
+    assert (joint.kind, joint.parent) == ("prismatic", mechanism.platform)
+    assert joint.lower == -CUP_STROKE
+    assert 0 < joint.upper <= 0.001  # the stop must not fight the spring at rest
+    assert joint.effort == CUP_PRELOAD > PULL_OFF_FORCE  # what the vacuum holds stays up
+    rest = joint_angles(inverse([-0.05, 0.03, 0.78]))
+    out, back = (
+        place(walk(mechanism, rest | {"cup_slide": at}), mechanism.tool, mechanism.lip)
+        for at in (0.0, -CUP_STROKE)
+    )
+    np.testing.assert_allclose(back - out, [0, 0, -CUP_STROKE], atol=1e-9)
+
+
+coordinates = st.tuples(*[st.floats(-3, 3)] * 3)
+
+
+@settings(derandomize=True, max_examples=100)
+@given(st.floats(0.1, 2), coordinates, coordinates)
+def test_mounts_are_rigid_and_round_trip(
+    height: float, p: tuple[float, float, float], q: tuple[float, float, float]
+) -> None:
+    mount = Mount(height)
+    np.testing.assert_allclose(mount.to_paper(mount.to_world(p)), p, atol=1e-14)
+    np.testing.assert_allclose(mount.to_world(mount.to_paper(p)), p, atol=1e-14)
+    matrix = mount.rotate(np.eye(3)).T
+    assert np.linalg.det(matrix) == pytest.approx(1)
+    np.testing.assert_allclose(mount.rotate(p), rotate(mount.quaternion, p), atol=1e-15)
+    np.testing.assert_allclose(mount.to_world(p), matrix @ p + [0, 0, height], atol=1e-14)
+    moved = np.subtract(mount.to_world(p), mount.to_world(q))
+    np.testing.assert_allclose(moved, mount.rotate(np.subtract(p, q)), atol=1e-14)
+
+
+def test_the_mount_hangs_the_base_over_the_table() -> None:
+    mount = Mount(1.5)
+    np.testing.assert_array_equal(mount.to_world([0, 0, 0]), [0, 0, 1.5])
+    np.testing.assert_array_equal(mount.to_world([0.1, 0.2, 0.5]), [0.1, -0.2, 1.0])
+    axes = mount.rotate(np.eye(3))
+    np.testing.assert_array_equal(axes, [[1, 0, 0], [0, -1, 0], [0, 0, -1]])
+    assert mount.to_world(np.zeros((4, 2, 3))).shape == (4, 2, 3)
+    lips = DEFAULT_MOUNT.to_world([TASK_REGION.low, TASK_REGION.high])[:, 2] - CUP_LENGTH
+    assert all(a > 0 for a in lips)
+    assert all(a > b for a, b in pairwise(lips))

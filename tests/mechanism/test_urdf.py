@@ -1,0 +1,166 @@
+"""The files in urdf/ are what the mechanism's data give, number by number."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import yaml
+
+from tpm_gym.kinematics.geometry import PAPER, Geometry
+from tpm_gym.mechanism.tree import ACTUATED_JOINTS, Mechanism, build
+from tpm_gym.mechanism.urdf import COLOURS, LOOPS_FILE, URDF_FILE, loops_text, urdf_text, write
+from tpm_gym.resources import URDF as FOLDER
+
+OTHER = Geometry(l1=0.31, l2=0.06, l3=0.4, l4=0.9, l5=0.12, l6=0.0, l7=0.08)
+DIGITS = {"rel": 1e-8, "abs": 1e-14}
+
+
+def numbers(text: str | None) -> list[float]:
+    assert text is not None
+    return [float(word) for word in text.split()]
+
+
+def child(element: ElementTree.Element, path: str) -> ElementTree.Element:
+    found = element.find(path)
+    assert found is not None, path
+    return found
+
+
+def parsed(mechanism: Mechanism) -> ElementTree.Element:
+    return ElementTree.fromstring(urdf_text(mechanism))
+
+
+@pytest.fixture(params=[PAPER, OTHER], ids=["paper", "other"])
+def mechanism(request: pytest.FixtureRequest) -> Mechanism:
+    return build(request.param)
+
+
+def test_regenerating_gives_the_shipped_files_byte_for_byte(tmp_path: Path) -> None:
+    for path in write(tmp_path / "new"):
+        assert path.read_bytes() == (FOLDER / path.name).read_bytes()
+    assert {path.name for path in FOLDER.iterdir()} >= {URDF_FILE, LOOPS_FILE}
+
+
+def test_other_lengths_give_other_files(tmp_path: Path) -> None:
+    urdf, loops = write(tmp_path, build(OTHER))
+    assert urdf.read_bytes() != (FOLDER / URDF_FILE).read_bytes()
+    assert loops.read_bytes() != (FOLDER / LOOPS_FILE).read_bytes()
+    assert urdf.read_text() == urdf_text(build(OTHER))
+
+
+def test_inertials_are_those_of_the_links(mechanism: Mechanism) -> None:
+    root = parsed(mechanism)
+    names = [element.get("name") for element in root.findall("link")]
+    assert names == [link.name for link in mechanism.links]
+    for element, link in zip(root.findall("link"), mechanism.links, strict=True):
+        inertial = child(element, "inertial")
+        origin = child(inertial, "origin")
+        assert numbers(origin.get("xyz")) == pytest.approx(link.centre_of_mass.tolist(), **DIGITS)
+        assert numbers(origin.get("rpy")) == [0, 0, 0]
+        assert numbers(child(inertial, "mass").get("value")) == pytest.approx([link.mass], **DIGITS)
+        inertia = child(inertial, "inertia")
+        for i, a in enumerate("xyz"):
+            for j, b in enumerate("xyz"[i:], start=i):
+                found = numbers(inertia.get(f"i{a}{b}"))
+                assert found == pytest.approx([link.inertia[i, j]], **DIGITS)
+
+
+def test_joints_are_those_of_the_tree(mechanism: Mechanism) -> None:
+    elements = {e.get("name"): e for e in parsed(mechanism).findall("joint")}
+    held = [link for link in mechanism.links if link.joint]
+    assert len(elements) == len(held)
+    for link in held:
+        joint = link.joint
+        assert joint is not None
+        element = elements[joint.name]
+        assert element.get("type") == joint.kind
+        assert child(element, "parent").get("link") == joint.parent
+        assert child(element, "child").get("link") == link.name
+        assert numbers(child(element, "origin").get("xyz")) == pytest.approx(joint.origin, **DIGITS)
+        assert numbers(child(element, "origin").get("rpy")) == [0, 0, 0]
+        assert numbers(child(element, "axis").get("xyz")) == list(joint.axis)
+        limit = element.find("limit")
+        assert (limit is not None) == (joint.kind in ("revolute", "prismatic"))
+        if limit is not None:
+            names = {"lower": "lower", "upper": "upper", "effort": "effort", "velocity": "speed"}
+            for attribute, field in names.items():
+                expected = [getattr(joint, field)]
+                assert numbers(limit.get(attribute)) == pytest.approx(expected, **DIGITS)
+
+
+def cylinder_axis(rpy: Sequence[float]) -> np.ndarray:
+    """Where roll, pitch, yaw turn the z axis."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
+    return np.array([cy * sp * cr + sy * sr, sy * sp * cr - cy * sr, cp * cr])
+
+
+def assert_same_solid(element: ElementTree.Element, solid: Any) -> None:
+    origin = child(element, "origin")
+    assert numbers(origin.get("xyz")) == pytest.approx(solid.centre, **DIGITS)
+    rpy = numbers(origin.get("rpy"))
+    if solid.kind == "box":
+        assert rpy == [0, 0, 0]
+        size = numbers(child(element, "geometry/box").get("size"))
+        assert size == pytest.approx(solid.size, **DIGITS)
+    else:
+        along = np.abs(cylinder_axis(rpy))
+        np.testing.assert_allclose(along, np.eye(3)["xyz".index(solid.axis)], atol=1e-8)
+        shape = child(element, "geometry/cylinder")
+        found = numbers(shape.get("radius")) + numbers(shape.get("length"))
+        assert found == pytest.approx(solid.size[:2], **DIGITS)
+
+
+def test_solids_are_drawn_as_they_are_and_collide_where_they_should(mechanism: Mechanism) -> None:
+    materials = set()
+    for element, link in zip(parsed(mechanism).findall("link"), mechanism.links, strict=True):
+        for visual, solid in zip(element.findall("visual"), link.solids, strict=True):
+            assert_same_solid(visual, solid)
+            material = child(visual, "material").get("name")
+            assert material == solid.colour
+            materials.add(material)
+        colliding = [solid for solid in link.solids if solid.collides]
+        for collision, solid in zip(element.findall("collision"), colliding, strict=True):
+            assert_same_solid(collision, solid)
+    assert materials <= set(COLOURS)
+
+
+def test_materials_are_the_colours(mechanism: Mechanism) -> None:
+    found = {
+        material.get("name"): tuple(numbers(child(material, "color").get("rgba")))
+        for material in parsed(mechanism).findall("material")
+    }
+    assert found == COLOURS
+
+
+def test_loops_file_names_motors_and_closures(mechanism: Mechanism) -> None:
+    content = yaml.safe_load(loops_text(mechanism))
+    assert set(content) == {"name_mot", "closed_loop"}
+    assert content["name_mot"] == list(ACTUATED_JOINTS)
+    for entry, closure in zip(content["closed_loop"], mechanism.closures, strict=True):
+        assert entry["name"] == closure.name
+        assert entry["type"] == "3d"
+        assert entry["links"] == [closure.link_a, closure.link_b]
+        for found, expected in zip(
+            entry["points"], [closure.point_a, closure.point_b], strict=True
+        ):
+            assert found == pytest.approx(expected, **DIGITS)
+
+
+def test_shipped_files_agree_with_each_other() -> None:
+    root = ElementTree.parse(FOLDER / URDF_FILE).getroot()
+    loops = yaml.safe_load((FOLDER / LOOPS_FILE).read_text())
+    links = {element.get("name") for element in root.findall("link")}
+    revolute = [e.get("name") for e in root.findall("joint") if e.get("type") == "revolute"]
+    assert revolute == loops["name_mot"]
+    assert all(set(entry["links"]) <= links for entry in loops["closed_loop"])
+
+
+def test_no_number_is_a_negative_zero(mechanism: Mechanism) -> None:
+    words = urdf_text(mechanism).replace('"', " ").split()
+    assert "-0" not in words
+    assert "-0" not in loops_text(mechanism).replace(",", " ").replace("[", " ").split()

@@ -1,0 +1,294 @@
+"""A loaded policy acts as its layers say, names what does not fit, and needs PyTorch alone."""
+
+from __future__ import annotations
+
+import copy
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import safetensors.numpy
+from gymnasium import spaces
+from policies_on_file import DATA, WEIGHTS, Weights, described, observations, some_weights, write
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+import tpm_gym
+from tpm_gym.errors import (
+    ConfigurationError,
+    InputError,
+    PolicyFileError,
+    PolicyMismatchError,
+)
+from tpm_gym.policy.policy import Policy, load_policy
+from tpm_gym.resources import POLICIES as PUBLISHED
+
+
+def reference(
+    observation: dict[str, Any], weights: Weights, activation: Callable[[Any], Any]
+) -> np.ndarray[Any, Any]:
+    """The same network, in double precision and numpy, before its output is bounded."""
+    gap = (observation["desired_goal"] - observation["achieved_goal"]) / 0.05
+    x = np.concatenate([observation["observation"], gap], axis=1)
+    layers = len(weights) // 2
+    for i in range(layers):
+        x = x @ weights[f"layers.{i}.weight"].T.astype(float) + weights[f"layers.{i}.bias"]
+        x = activation(x) if i < layers - 1 else x
+    return np.asarray(x)
+
+
+@pytest.fixture
+def policy(tmp_path: Path) -> Policy:
+    return load_policy(write(tmp_path))
+
+
+# -- acting ----------------------------------------------------------------------------------------
+
+
+def test_the_action_is_what_the_layers_say(policy: Policy) -> None:
+    batch = observations(50)
+    expected = np.tanh(reference(batch, WEIGHTS, lambda x: np.maximum(x, 0)))
+    np.testing.assert_allclose(policy.act(batch), expected, atol=1e-5)
+
+
+def test_tanh_layers_and_an_action_cut_off_at_uneven_bounds(tmp_path: Path) -> None:
+    content = described(DATA)
+    content["network"] |= {"activation": "tanh", "output": "clip"}
+    content["action_space"] |= {"low": [-0.1, 0.0], "high": [0.2, 3.0]}
+    batch = observations(50)
+    expected = np.clip(reference(batch, WEIGHTS, np.tanh), [-0.1, 0.0], [0.2, 3.0])
+    actions = load_policy(write(tmp_path, content)).act(batch)
+    np.testing.assert_allclose(actions, expected, atol=1e-5)
+    assert (actions == np.float32(0.2)).any()  # bounds are met
+    assert (actions == 0.0).any()
+
+
+def test_a_tanh_output_fills_uneven_bounds(tmp_path: Path) -> None:
+    content = described(DATA)
+    content["action_space"] |= {"low": [-1.0, 2.0], "high": [3.0, 10.0], "dtype": "float64"}
+    batch = observations(50)
+    squashed = np.tanh(reference(batch, WEIGHTS, lambda x: np.maximum(x, 0)))
+    actions = load_policy(write(tmp_path, content)).act(batch)
+    np.testing.assert_allclose(actions, [1, 6] + squashed * [2, 4], atol=1e-4)
+    assert actions.dtype == np.float64
+
+
+def test_joined_entries_come_in_the_order_on_file(tmp_path: Path) -> None:
+    weights = some_weights((10, 2))
+    data = safetensors.numpy.save(weights)
+    batch = observations(9)
+    for keys in (
+        ["observation", "achieved_goal", "desired_goal"],
+        ["desired_goal", "observation", "achieved_goal"],
+    ):
+        content = described(data)
+        content["network"] |= {"features": {"kind": "concatenate", "keys": keys}, "hidden": []}
+        x = np.concatenate([batch[key] for key in keys], axis=1)
+        expected = np.tanh(x @ weights["layers.0.weight"].T + weights["layers.0.bias"])
+        actions = load_policy(write(tmp_path, content, data)).act(batch)
+        np.testing.assert_allclose(actions, expected, atol=1e-5)
+
+
+def test_one_observation_is_a_batch_of_one(policy: Policy) -> None:
+    batch = observations(5)
+    actions = policy.act(batch)
+    assert (actions.shape, actions.dtype) == ((5, 2), np.float32)
+    for i in range(5):
+        one = policy.act({key: values[i] for key, values in batch.items()})
+        assert one.shape == (2,)
+        np.testing.assert_allclose(one, actions[i], atol=1e-6)
+    assert policy.act({key: values[:0] for key, values in batch.items()}).shape == (0, 2)
+
+
+def test_predict_has_the_interface_of_stable_baselines(policy: Policy) -> None:
+    batch = observations(3)
+    action, state = policy.predict(batch, None, np.ones(3, bool), deterministic=True)
+    np.testing.assert_array_equal(action, policy.act(batch))
+    assert state is None
+    with pytest.raises(ConfigurationError, match="no random actions"):
+        policy.predict(batch, deterministic=False)
+
+
+def test_the_observation_is_left_as_it_was_and_the_action_is_the_callers(policy: Policy) -> None:
+    batch = {key: values.astype(np.float32) for key, values in observations(3).items()}
+    before = copy.deepcopy(batch)
+    first = policy.act(batch)
+    kept = first.copy()
+    first[:] = 9.0
+    np.testing.assert_array_equal(policy.act(batch), kept)
+    for key, values in before.items():
+        np.testing.assert_array_equal(batch[key], values)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"observation": np.zeros(5)}, r"observation must be of shape \(4,\)"),
+        ({"observation": np.zeros((2, 2, 4))}, "observation must be of shape"),
+        ({"observation": 1.0}, "observation must be of shape"),
+        ({"observation": np.zeros((3, 4))}, "of one batch size in all"),
+        ({"observation": ["a", "b", "c", "d"]}, "an array of numbers"),
+        ({"observation": [0, 0, np.nan, 0]}, "observation must be finite, got .*nan"),
+        ({"desired_goal": [1e300, 0, 0]}, "desired_goal must be finite"),
+        ({"extra": np.zeros(3)}, "keys achieved_goal, desired_goal, observation"),
+    ],
+)
+def test_observations_that_do_not_fit_are_named(
+    policy: Policy, changes: dict[str, Any], message: str
+) -> None:
+    one: dict[str, Any] = {key: values[0] for key, values in observations(1).items()}
+    with pytest.raises(InputError, match=message):
+        policy.act(one | changes)
+    with pytest.raises(InputError, match="a mapping"):
+        policy.act(np.zeros(4))  # type: ignore[arg-type]
+
+
+def test_an_environment_of_another_kind_is_refused(policy: Policy) -> None:
+    fits = SimpleNamespace(
+        observation_space=policy.description.observation_space,
+        action_space=spaces.Box(-1.0, 1.0, (2,)),
+    )
+    policy.check(fits)
+    other = SimpleNamespace(**vars(fits) | {"action_space": spaces.Box(-1.0, 1.0, (4,))})
+    with pytest.raises(PolicyMismatchError, match=r"with action space .*\(2,\).*\(4,\)") as caught:
+        policy.check(other)
+    assert (caught.value.env_id, caught.value.given) == ("TPMReach-v0", other.action_space)
+    other = SimpleNamespace(**vars(fits) | {"observation_space": spaces.Dict()})
+    with pytest.raises(PolicyMismatchError, match="observation space"):
+        policy.check(other)
+
+
+def test_joint_increments_are_no_cartesian_ones() -> None:
+    """Their spaces are equal."""
+    policy = load_policy(PUBLISHED / "TPMPickAndPlaceJoints-v0.json")
+    for env_id in ("TPMPickAndPlaceJoints-v0", "TPMPickAndPlaceJointsDense-v0"):
+        with closing(gym.make(env_id)) as env:
+            policy.check(env)
+            policy.check(env.unwrapped)
+    with closing(gym.make("TPMPickAndPlace-v0")) as env:
+        with pytest.raises(PolicyMismatchError, match=r"control joints, .* cartesian") as caught:
+            policy.check(env)
+        assert caught.value.kind == "control"
+    vector = DummyVecEnv([lambda: gym.make("TPMPickAndPlaceDense-v0")])
+    with closing(vector), pytest.raises(PolicyMismatchError, match="TPMPickAndPlaceJoints-v0"):
+        policy.check(vector)
+
+
+def test_what_is_no_environment_is_refused(policy: Policy) -> None:
+    for thing in (None, "TPMReach-v0"):
+        with pytest.raises(InputError, match=r"an environment, such as gym.make\('TPMReach-v0'\)"):
+            policy.check(thing)
+
+
+def test_a_policy_names_itself(policy: Policy) -> None:
+    assert repr(policy) == "<Policy of TPMReach-v0, sac, seed 3>"
+
+
+def test_the_description_says_where_the_policy_comes_from(policy: Policy) -> None:
+    about = policy.description
+    assert (about.env_id, about.algorithm) == ("TPMReach-v0", "sac")
+    assert (about.seed, about.steps) == (3, 5000)
+    assert about.recipe["arguments"]["gamma"] == 0.95
+    assert about.versions == {"python": "3.11.7", "torch": None}
+    assert about.network.unit == 0.05
+    assert about.network.hidden == (5, 4)
+
+
+# -- names -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["v1.2.json", "v1.2.safetensors", "v1.2"])
+def test_a_policy_is_named_by_either_file_or_by_both(tmp_path: Path, name: str) -> None:
+    path = write(tmp_path)
+    path.rename(tmp_path / "v1.2.json")
+    path.with_suffix(".safetensors").rename(tmp_path / "v1.2.safetensors")
+    assert tpm_gym.load_policy(tmp_path / name).description.seed == 3
+    assert tpm_gym.load_policy(str(tmp_path / name)).description.seed == 3
+
+
+def test_what_is_no_policy_is_named(tmp_path: Path) -> None:
+    path = write(tmp_path)
+    for name, message in {
+        "none": "no such file",
+        "best.zip": "holds pickles.*export.py.*--trust-pickle",
+        ".": "is a folder",
+    }.items():
+        with pytest.raises(PolicyFileError, match=message):
+            load_policy(tmp_path / name)
+    (tmp_path / "other.json").write_text('{"algo": "sac"}')
+    with pytest.raises(PolicyFileError, match="does not describe a policy"):
+        load_policy(tmp_path / "other.json")
+    path.with_suffix(".safetensors").unlink()
+    with pytest.raises(PolicyFileError, match=r"p\.safetensors: there is no such file") as caught:
+        load_policy(path)
+    assert caught.value.path == str(tmp_path / "p.safetensors")
+    assert caught.value.remedy
+
+
+def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "p.json")
+    with pytest.raises(PolicyFileError, match="is not a file"):
+        load_policy(tmp_path / "p.json")
+
+
+# -- what loading needs, and what it leaves alone --------------------------------------------------
+
+
+def run_without(packages: list[str], code: str) -> str:
+    """Run Python code where some packages cannot be imported; return what it prints."""
+    block = f"import sys; sys.modules.update(dict.fromkeys({packages}))\n"
+    done = subprocess.run(
+        [sys.executable, "-c", block + code], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def test_loading_needs_no_stable_baselines_and_no_engine(tmp_path: Path) -> None:
+    path = write(tmp_path)
+    one = {key: values[0].tolist() for key, values in observations(1).items()}
+    code = f"import tpm_gym\nprint(tpm_gym.load_policy({str(path)!r}).act({one}).tolist())"
+    printed = run_without(["stable_baselines3", "sb3_contrib", "pybullet", "matplotlib"], code)
+    np.testing.assert_allclose(json.loads(printed), load_policy(path).act(one), atol=1e-6)
+
+
+@pytest.mark.parametrize("package", ["torch", "safetensors"])
+def test_a_missing_package_is_named_with_its_remedy(tmp_path: Path, package: str) -> None:
+    path = write(tmp_path)
+    code = (
+        "import tpm_gym\n"
+        f"try: tpm_gym.load_policy({str(path)!r})\n"
+        "except ImportError as error:\n"
+        "    assert isinstance(error, tpm_gym.TPMError)\n"
+        "    print(error)"
+    )
+    printed = run_without([package], code)
+    assert package in printed
+    assert "pip install 'tpm-gym[policy]'" in printed
+
+
+def test_nothing_is_unpickled_or_evaluated(tmp_path: Path) -> None:
+    """In a process of its own, where every way to run what a file says raises."""
+    path = write(tmp_path)
+    code = (
+        "import builtins, pickle, _pickle, marshal\n"
+        "import numpy, safetensors, torch, tpm_gym.policy.policy\n"
+        "def refuse(*args, **kwargs): raise SystemExit('unpickled or evaluated')\n"
+        "class Refused:\n"
+        "    __init__ = refuse\n"
+        "for module in (pickle, _pickle, marshal):\n"
+        "    module.load = module.loads = refuse\n"
+        "pickle.Unpickler = pickle._Unpickler = _pickle.Unpickler = Refused\n"
+        "torch.load = torch.jit.load = numpy.load = refuse\n"
+        "builtins.eval = builtins.exec = builtins.compile = refuse\n"
+        f"print(tpm_gym.policy.policy.load_policy({str(path)!r}).description.seed)"
+    )
+    assert run_without([], code) == "3"

@@ -1,0 +1,268 @@
+"""Near the singularities, and through them on purpose: detected, reported, never trained on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from episodes import fingerprint, random_episode
+from numpy.typing import NDArray
+
+from tpm_gym import kinematics
+from tpm_gym.envs.env import TPMEnv
+from tpm_gym.errors import ClosureError, EpisodeError, ModeChangeError, UnreachableError
+from tpm_gym.kinematics.geometry import PAPER
+from tpm_gym.simulation.simulation import Simulation
+from tpm_gym.simulation.state import Scene, State
+from tpm_gym.tasks.task import HOME
+
+FloatArray = NDArray[np.float64]
+IDLE = np.zeros(3)
+
+
+@pytest.fixture
+def simulation() -> Iterator[Simulation]:
+    simulation = Simulation(Scene())
+    yield simulation
+    simulation.close()
+
+
+@pytest.fixture
+def env() -> Iterator[TPMEnv]:
+    env = TPMEnv("reach")
+    yield env
+    env.close()
+
+
+def true_y(state: State) -> float:
+    """Of the simulated platform, paper frame, m."""
+    return -float(state.platform_position[1])
+
+
+def apart(state: State) -> float:
+    """Forward kinematics against the truth, m."""
+    return float(np.linalg.norm(state.fk_position - state.platform_position))
+
+
+def push(env: TPMEnv, force: tuple[float, float, float]) -> Callable[[], None]:
+    """Let a force (N, world) act on the platform from now on; returns what ends it."""
+    client, platform = env.simulation._client, env.simulation._robot._platform
+    advance = client.stepSimulation
+
+    def pushed() -> None:
+        centre = client.getLinkState(*platform, computeForwardKinematics=True)[0]
+        client.applyExternalForce(*platform, force, centre, client.WORLD_FRAME)
+        advance()
+
+    def release() -> None:
+        client.stepSimulation = advance
+
+    client.stepSimulation = pushed
+    return release
+
+
+# -- y = 0: the parallel singularity ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("step", [0.0005, 0.002, 0.005, 0.010])
+@pytest.mark.parametrize("x", [-0.20, -0.04, 0.10])
+def test_commands_through_the_plane_are_followed_until_the_step_that_reports_it(
+    simulation: Simulation, x: float, step: float
+) -> None:
+    # Far more than any action may ask for: 0.25 m/s along y.
+    start = min(0.028, 20 * step)
+    state = simulation.reset(kinematics.inverse((x, start, 0.80)))
+    for y in np.arange(start, -0.03, -step):
+        if state.mode_change is not None:
+            break
+        assert true_y(state) > 0
+        assert apart(state) < 0.5e-3  # 0.2 mm seen
+        assert state.closure_error < 0.1e-3
+        state = simulation.move((x, y, 0.80))
+    # Reported at the very step, when forward kinematics are still off by the last step only.
+    assert state.mode_change == "assembly"
+    assert true_y(state) <= 0
+    assert state.fk_position[1] < 0  # what the encoders believe: still on the other side
+    with pytest.raises(ModeChangeError) as caught:
+        simulation.move((x, 0.028, 0.80))
+    assert caught.value.mode == "assembly"
+
+
+def test_the_conditioning_falls_to_zero_on_the_way_to_the_plane(simulation: Simulation) -> None:
+    simulation.reset(kinematics.inverse(HOME))
+    states = [simulation.move((HOME[0], y, HOME[2])) for y in np.arange(0.028, 0.001, -0.001)]
+    # After the first steps, in proportion to y.
+    ratios = np.array([state.conditioning / true_y(state) for state in states[15:]])
+    assert states[-1].conditioning < 0.012
+    assert np.ptp(ratios) < 0.1 * ratios.mean()
+
+
+def test_once_reported_the_change_stays_reported_and_a_reset_forgets_it(
+    simulation: Simulation,
+) -> None:
+    simulation.reset(kinematics.inverse(HOME))
+    for y in (0.018, 0.008, -0.002, -0.012):
+        simulation.move((HOME[0], y, HOME[2]))
+    snapshot = simulation.save()
+    assert simulation.read().mode_change == snapshot.mode_change == "assembly"
+    state = simulation.reset(kinematics.inverse(HOME))
+    assert state.mode_change is None
+    assert apart(state) < 1e-6
+    assert simulation.move(HOME).mode_change is None
+    assert simulation.restore(snapshot).mode_change == "assembly"
+    with pytest.raises(ModeChangeError):
+        simulation.move(HOME)
+
+
+class Across:
+    """A control whose commands leave the region, as a broken one would."""
+
+    def command(self, action: Any, current: FloatArray) -> FloatArray:
+        return np.asarray(current) - (0.0, 0.005, 0.0)
+
+
+def disturbed(env: TPMEnv, how: str) -> Callable[[], None]:
+    """Something that takes the platform through a singularity; returns what ends it."""
+    if how == "commands":
+        healthy, env.control = env.control, Across()
+        return lambda: setattr(env, "control", healthy)
+    return push(env, {"soft push": (0.0, 120.0, 0.0), "hard push": (0.0, 800.0, 0.0)}[how])
+
+
+@pytest.mark.parametrize("how", ["commands", "soft push", "hard push"])
+@pytest.mark.parametrize("task", ["reach", "pick_and_place"])
+def test_a_disturbance_through_the_plane_ends_the_episode_and_the_next_reset_recovers(
+    task: str, how: str
+) -> None:
+    env, fresh = TPMEnv(task), TPMEnv(task)
+    idle = np.zeros(env.task.action_size)
+    env.reset(seed=3)
+    release = disturbed(env, how)
+    for _ in range(50):
+        observation, reward, terminated, truncated, info = env.step(idle)
+        assert env.observation_space.contains(observation)
+        assert not terminated
+        assert info["assembly_mode_changed"] is truncated is (true_y(env.state) <= 0)
+        assert info["working_mode_changed"] is False
+        if truncated:
+            break
+        assert apart(env.state) < 2e-3
+        assert info["singularity_penalty"] < 1
+    assert truncated
+    assert info["singularity_penalty"] == 1
+    assert info["reward_terms"]["singularity"] == -1
+    assert reward == pytest.approx(sum(info["reward_terms"].values()))
+    release()
+    with pytest.raises(ModeChangeError, match="reset"):
+        env.step(idle)
+    with pytest.raises(ModeChangeError, match="reset"):  # nor can one go on after that
+        env.step(idle)
+    assert fingerprint(random_episode(env, 4)) == fingerprint(random_episode(fresh, 4))
+    env.close()
+    fresh.close()
+
+
+def test_an_episode_that_was_left_can_be_reset_at_once(env: TPMEnv) -> None:
+    expected = fingerprint(random_episode(env, 5))
+    env.reset(seed=3)
+    release = push(env, (0.0, 800.0, 0.0))
+    assert env.step(IDLE)[3]
+    release()
+    assert fingerprint(random_episode(env, 5)) == expected
+
+
+# -- y = l7: the serial singularity ----------------------------------------------------------------
+
+
+def test_commands_towards_the_edge_are_followed_and_beyond_it_refused(
+    simulation: Simulation,
+) -> None:
+    simulation.reset(kinematics.inverse(HOME))
+    ways = [0.030, 0.035, 0.040, 0.045, 0.048, 0.049, 0.0495, *[0.0499] * 5]
+    states = [simulation.move((HOME[0], y, HOME[2])) for y in ways]
+    assert {state.mode_change for state in states} == {None}
+    # Seen: gaps to 0.011 mm, forward kinematics to 0.005 mm; conditioning from 0.30 at 46.5 mm
+    # down to 0.071 at 49.9 mm.
+    assert max(state.closure_error for state in states) < 0.03e-3
+    assert max(apart(state) for state in states) < 0.02e-3
+    assert true_y(states[-1]) == pytest.approx(0.0499, abs=1e-6)
+    assert states[-1].conditioning == pytest.approx(0.071, abs=0.001)
+    assert max(state.conditioning for state in states) == pytest.approx(0.30, abs=0.01)
+    before = simulation.read()
+    for beyond in (1e-3, 0.1):
+        with pytest.raises(UnreachableError) as caught:
+            simulation.move((HOME[0], PAPER.l7 + beyond, HOME[2]))
+        assert caught.value.leg.startswith("beta")
+        assert caught.value.margin < 0
+    after = simulation.read()
+    assert np.array_equal(before.theta, after.theta)
+    assert np.array_equal(before.command, after.command)
+    assert simulation.move((HOME[0], 0.0499, HOME[2])).mode_change is None
+
+
+@pytest.mark.parametrize("force", [500.0, 1000.0])
+def test_a_platform_pushed_over_the_edge_is_a_change_of_the_working_mode(
+    env: TPMEnv, force: float
+) -> None:
+    fresh = fingerprint(random_episode(env, 6))
+    home, env._home = env._home, kinematics.inverse((-0.04, 0.045, 0.80))
+    env.reset(seed=0)
+    release = push(env, (0.0, -force, 0.0))
+    for _ in range(50):
+        _, _, terminated, truncated, info = env.step(IDLE)
+        assert not terminated
+        assert apart(env.state) < 1e-3  # link 7 is past its turning point, P still known
+        if truncated:
+            break
+    assert (info["working_mode_changed"], info["assembly_mode_changed"]) == (True, False)
+    assert info["singularity_penalty"] == 1
+    release()
+    with pytest.raises(ModeChangeError, match="serial") as caught:
+        env.step(IDLE)
+    assert caught.value.mode == "working"
+    env._home = home
+    assert fingerprint(random_episode(env, 6)) == fresh
+
+
+# -- forces that no machine would stand ------------------------------------------------------------
+
+
+def test_a_loop_torn_open_is_a_typed_error_and_the_next_reset_recovers(env: TPMEnv) -> None:
+    fresh = fingerprint(random_episode(env, 7))
+    env.reset(seed=0)
+    release = push(env, (0.0, 0.0, -3000.0))
+    with pytest.raises(ClosureError, match="reset") as caught:
+        env.step(IDLE)
+    assert caught.value.gap > caught.value.limit == 0.005
+    release()
+    with pytest.raises(EpisodeError, match="reset"):
+        env.step(IDLE)
+    assert fingerprint(random_episode(env, 7)) == fresh
+
+
+def test_no_push_goes_unnoticed(env: TPMEnv) -> None:
+    """Hard or soft, from any side: until something is reported, P is where the encoders say."""
+    rng = np.random.default_rng(0)
+    outcomes = set()
+    for _ in range(60):
+        direction = rng.normal(size=3)
+        force = 10 ** rng.uniform(1.5, 4.5) * direction / np.linalg.norm(direction)
+        env.reset(seed=0)
+        release = push(env, tuple(force.tolist()))
+        outcome = "held"
+        for _ in range(5):
+            try:
+                _, _, _, truncated, info = env.step(rng.uniform(-1, 1, 3))
+            except ClosureError:
+                outcome = "torn"
+                break
+            if truncated:
+                outcome = "assembly" if info["assembly_mode_changed"] else "working"
+                break
+            assert apart(env.state) < 10e-3
+            assert 0 < true_y(env.state) < PAPER.l7 + 1e-4
+        release()
+        outcomes.add(outcome)
+    assert {"held", "torn", "assembly"} <= outcomes

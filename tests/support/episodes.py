@@ -1,0 +1,106 @@
+"""Episodes to compare to the last bit. Fresh processes import this too, so it imports little."""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+import tpm_gym
+from tpm_gym.tasks.expert import Expert
+
+Step = tuple[dict[str, Any], float, dict[str, Any]]
+"""Observation, reward and info."""
+
+EVERYTHING: dict[str, Any] = {
+    "link_mass": (0.8, 1.25),
+    "puck_mass": (0.5, 2.0),
+    "friction": (0.5, 1.5),
+    "motor_strength": (0.9, 1.1),
+    "encoder_noise": 1e-4,
+    "encoder_bias": 2e-4,
+    "latency": 1,
+    "length_error": 2e-4,
+}
+"""Every randomisation at once, as a configuration file would say it."""
+
+CASES: list[tuple[str, dict[str, Any]]] = [
+    *((env_id, {}) for env_id in tpm_gym.ENV_IDS),
+    ("TPMReachJoints-v0", EVERYTHING),
+    ("TPMPickAndPlace-v0", EVERYTHING),
+]
+"""Ids, and where their machines differ from the nominal one."""
+
+
+def make(env_id: str, machine: dict[str, Any], **options: Any) -> gym.Env[Any, Any]:
+    """An environment; also where tpm_gym has not been imported yet."""
+    return gym.make(f"tpm_gym:{env_id}", randomisation=machine, **options)
+
+
+def random_episode(env: gym.Env[Any, Any], seed: int, steps: int = 50) -> Iterator[Step]:
+    """Whole excursions, not jitter; the actions come from the seed too."""
+    rng = np.random.default_rng(seed)
+    observation, info = env.reset(seed=seed)
+    yield observation, 0.0, info
+    for _ in range(steps):
+        action = rng.choice([-1.0, 0.0, 1.0], env.action_space.shape)
+        observation, reward, _, _, info = env.step(action.astype(np.float32))
+        yield observation, float(reward), info
+
+
+def expert_episode(env: gym.Env[Any, Any], seed: int, steps: int = 50) -> Iterator[Step]:
+    """The scripted controller's: it touches, holds and lets go."""
+    observation, info = env.reset(seed=seed)
+    expert = Expert(env)
+    expert.reset(observation)
+    yield observation, 0.0, info
+    for _ in range(steps):
+        observation, reward, _, _, info = env.step(expert.act(observation))
+        yield observation, float(reward), info
+
+
+def fingerprint(steps: Iterable[Step]) -> str:
+    """A hash of every bit of an episode."""
+    digest = hashlib.sha256()
+    for observation, reward, info in steps:
+        for array in observation.values():
+            digest.update(array.tobytes())
+        digest.update(repr((reward, info)).encode())
+    return digest.hexdigest()
+
+
+def bits(value: Any) -> Any:
+    """What two results are compared by."""
+    if isinstance(value, dict):
+        return {name: bits(entry) for name, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [bits(entry) for entry in value]
+    return value.tobytes() if isinstance(value, np.ndarray) else value
+
+
+def play(env: gym.Env[Any, Any], actions: Iterable[Any]) -> list[Any]:
+    """What each step returns, and the whole state behind it."""
+    return [(bits(env.step(action)), bits(vars(env.unwrapped.state))) for action in actions]
+
+
+def all_fingerprints() -> list[str]:
+    """Of an episode in each case."""
+    prints = []
+    for env_id, machine in CASES:
+        env = make(env_id, machine)
+        prints.append(fingerprint(expert_episode(env, 6, steps=30)))
+        env.close()
+    return prints
+
+
+def continued(path: str) -> str:
+    """How a pickled environment goes on."""
+    env = pickle.loads(Path(path).read_bytes())
+    steps = repr(play(env, [np.full(4, 0.3)] * 10))
+    env.close()
+    return steps

@@ -1,0 +1,43 @@
+"""The tree of links, walked joint by joint: where everything is, from the joints alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tpm_gym.mechanism.tree import Mechanism
+
+FloatArray = NDArray[np.float64]
+Frame = tuple[FloatArray, FloatArray]
+
+
+def turn(axis: tuple[float, ...], angle: float) -> FloatArray:
+    """Rodrigues' rotation about a unit axis."""
+    x, y, z = axis
+    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.asarray(np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k)
+
+
+def walk(mechanism: Mechanism, joints: Mapping[str, float]) -> dict[str, Frame]:
+    """Position (m) and rotation of every link in the paper frame, joints in rad or m."""
+    frames = {mechanism.links[0].name: (np.zeros(3), np.eye(3))}
+    for link in mechanism.links[1:]:
+        joint = link.joint
+        assert joint is not None
+        assert np.linalg.norm(joint.axis) == pytest.approx(1)
+        position, rotation = frames[joint.parent]
+        value = joints[joint.name]
+        slides = joint.kind == "prismatic"
+        origin = np.array(joint.origin) + slides * value * np.array(joint.axis)
+        turned = rotation if slides else rotation @ turn(joint.axis, value)
+        frames[link.name] = (position + rotation @ origin, turned)
+    return frames
+
+
+def place(frames: Mapping[str, Frame], link: str, point: tuple[float, ...]) -> FloatArray:
+    """A point of a link in the paper frame, m."""
+    position, rotation = frames[link]
+    return np.asarray(position + rotation @ point)

@@ -1,0 +1,82 @@
+"""The reward terms: exact at their ends, steep where it matters, the same alone or in a batch."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tpm_gym.tasks.rewards import SAFE_CONDITIONING, dense, distance, singularity_penalty, sparse
+
+conditionings = st.floats(0, 1)
+safes = st.floats(0.01, 1)
+
+
+def test_penalty_is_zero_where_it_is_safe_and_one_at_a_singularity() -> None:
+    safe = np.linspace(SAFE_CONDITIONING, 1, 50)
+    np.testing.assert_array_equal(singularity_penalty(safe), 0)
+    assert singularity_penalty(0.0) == 1
+    assert singularity_penalty(SAFE_CONDITIONING / 2) == pytest.approx(15 / 16)
+    assert singularity_penalty(np.nextafter(SAFE_CONDITIONING, 0) - 1e-6) > 0
+
+
+@settings(derandomize=True, max_examples=200)
+@given(conditionings, conditionings, safes)
+def test_penalty_never_rises_with_the_conditioning(a: float, b: float, safe: float) -> None:
+    low, high = sorted((a, b))
+    worse, better = singularity_penalty(low, safe), singularity_penalty(high, safe)
+    assert 0 <= better <= worse <= 1
+
+
+@pytest.mark.parametrize("safe", [SAFE_CONDITIONING, 0.3])
+def test_penalty_is_steepest_at_the_threshold(safe: float) -> None:
+    # Flat there, crossing it would cost nothing, and policies would not care.
+    c = np.linspace(0, safe, 1001)
+    slopes = -np.diff(singularity_penalty(c, safe)) / np.diff(c)
+    assert (np.diff(slopes) > -1e-9).all()
+    assert slopes[-1] == pytest.approx(4 / safe, rel=2e-3)
+    assert slopes[0] == pytest.approx(0, abs=1e-6 / safe)
+    assert singularity_penalty(0.9 * safe, safe) > 0.3
+
+
+def test_penalty_is_continuous() -> None:
+    c = np.linspace(-0.02, 0.15, 20_001)
+    largest = np.abs(np.diff(singularity_penalty(c))).max()
+    assert largest <= 1.001 * (c[1] - c[0]) * 4 / SAFE_CONDITIONING
+
+
+@pytest.mark.parametrize("shape", [(), (4,), (2, 3), (0,)])
+def test_terms_keep_leading_shapes(shape: tuple[int, ...]) -> None:
+    rng = np.random.default_rng(0)
+    achieved, desired = rng.normal(size=(2, *shape, 3))
+    gap = distance(achieved, desired)
+    conditioning = rng.uniform(0, 0.2, shape)
+    for found, single in (
+        (gap, lambda i: distance(achieved[i], desired[i])),
+        (sparse(gap, 1.0), lambda i: sparse(gap[i], 1.0)),
+        (dense(gap), lambda i: dense(gap[i])),
+        (singularity_penalty(conditioning), lambda i: singularity_penalty(conditioning[i])),
+    ):
+        assert np.shape(found) == shape
+        for index in np.ndindex(shape):
+            assert found[index] == pytest.approx(single(index), rel=1e-15)
+
+
+def test_distance_is_euclidean_and_broadcasts() -> None:
+    assert distance([1.0, 2.0, 2.0], [0.0, 0.0, 0.0]) == pytest.approx(3)
+    batch = np.random.default_rng(1).normal(size=(6, 3))
+    goal = np.array([0.1, 0.2, 0.3])
+    np.testing.assert_allclose(distance(batch, goal), np.linalg.norm(batch - goal, axis=1))
+    np.testing.assert_array_equal(distance(batch, goal), distance(goal, batch))
+
+
+def test_sparse_is_zero_strictly_within_the_tolerance_and_minus_one_elsewhere() -> None:
+    gaps = [0.0, 0.0099, 0.01, 0.0101, 3.0]
+    np.testing.assert_array_equal(sparse(gaps, 0.01), [0, 0, -1, -1, -1])
+    assert sparse(gaps, 0.01).dtype == np.float64
+
+
+def test_dense_is_minus_the_gap_in_units() -> None:
+    np.testing.assert_allclose(dense([0.0, 0.1, 0.25]), [0, -1, -2.5])
+    np.testing.assert_allclose(dense([0.0, 0.1, 0.25], unit=0.05), [0, -2, -5])
