@@ -21,7 +21,7 @@ from tpm_gym.errors import (
     SingularityError,
     UnreachableError,
 )
-from tpm_gym.kinematics import single
+from tpm_gym.kinematics import equations
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.kinematics.modes import DEFAULT_ASSEMBLY, ELBOWS_OUT
 from tpm_gym.mechanism.bodies import Vector
@@ -42,7 +42,7 @@ from tpm_gym.simulation.state import Scene, State
 
 __all__ = ["Simulation", "Snapshot"]
 
-Reading = tuple[single.Assembly, tuple[Vector, Vector, Vector], float]
+Reading = tuple[equations.Assembly, tuple[Vector, Vector, Vector], float]
 """What follows from the encoders: the assembly, the rows of J, the conditioning."""
 _ZERO: Vector = (0.0, 0.0, 0.0)
 
@@ -169,7 +169,7 @@ class Simulation:
             UnreachableError: If the mechanism cannot be assembled at theta.
         """
         angles = _vector("theta", theta)
-        start = single.assemble(angles, DEFAULT_ASSEMBLY, self.geometry)
+        start = equations.assemble(angles, DEFAULT_ASSEMBLY, self.geometry)
         true_angles = joint_angles(
             np.subtract(angles, plant.encoder_bias), geometry=plant.geometry(self.geometry)
         )
@@ -178,7 +178,7 @@ class Simulation:
         self._robot.place(true_angles)
         self._torque = _ZERO
         # What is true of the nominal machine, in case the encoders' errors make no sense.
-        self._reading = single.evaluate(angles, DEFAULT_ASSEMBLY, self.geometry)
+        self._reading = equations.evaluate(angles, DEFAULT_ASSEMBLY, self.geometry)
         self._mode_change, self._noise = None, (noise, noise)
         self._commands = ((start.x, start.y, start.z),) * 2
         if object_position is not None:
@@ -215,9 +215,10 @@ class Simulation:
             raise ModeChangeError(self._mode_change)
         before, last = self._commands
         new = _vector("command", command)
-        single.posture(new, ELBOWS_OUT, self.geometry)  # the spline may end before the command does
+        # the spline may end before the command does
+        equations.posture(new, ELBOWS_OUT, self.geometry)
         references = [
-            single.posture(_blend(weights, before, last, new), ELBOWS_OUT, self.geometry)
+            equations.posture(_blend(weights, before, last, new), ELBOWS_OUT, self.geometry)
             for weights in self._spline
         ]
         self._commands = (last, new)
@@ -290,7 +291,7 @@ class Simulation:
         exists, as happens near the edges of the workspace.
         """
         with suppress(UnreachableError, SingularityError):
-            self._reading = single.evaluate(theta, DEFAULT_ASSEMBLY, self.geometry)
+            self._reading = equations.evaluate(theta, DEFAULT_ASSEMBLY, self.geometry)
         return self._reading
 
     def _watch_mode(self, theta: Vector, platform: Vector) -> None:
@@ -301,7 +302,7 @@ class Simulation:
         kinematics no longer say how to get where.
         """
         try:
-            true = single.assemble(theta, DEFAULT_ASSEMBLY, self._true_geometry)
+            true = equations.assemble(theta, DEFAULT_ASSEMBLY, self._true_geometry)
         except UnreachableError:
             self._mode_change = "assembly"
             return

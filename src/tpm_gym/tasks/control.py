@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tpm_gym.errors import ConfigurationError, UnreachableError
-from tpm_gym.kinematics import DEFAULT_ASSEMBLY, inverse, jacobian, single
+from tpm_gym.kinematics import DEFAULT_ASSEMBLY, equations, inverse, jacobian
 from tpm_gym.kinematics.geometry import PAPER
 from tpm_gym.kinematics.workspace import TASK_REGION
 
@@ -87,7 +87,7 @@ class JointControl:
         """Point P at ``theta``, if it is assembled as at ``start`` and within STEP_LIMIT of it."""
         a, b, c = theta.tolist()
         try:
-            there = single.assemble((a, b, c), DEFAULT_ASSEMBLY, PAPER)
+            there = equations.assemble((a, b, c), DEFAULT_ASSEMBLY, PAPER)
         except UnreachableError:
             return None
         point = np.array(there[:3])
