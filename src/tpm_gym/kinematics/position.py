@@ -19,6 +19,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tpm_gym.arrays import Vector
 from tpm_gym.errors import InputError
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.kinematics.modes import (
@@ -34,7 +35,6 @@ from tpm_gym.kinematics.modes import (
 )
 from tpm_gym.kinematics.single import ROUNDING, assemble, posture
 from tpm_gym.kinematics.unreachable import no_assembly, no_posture
-from tpm_gym.mechanism.bodies import Vector
 
 __all__ = [
     "ASSEMBLY_MODES",

@@ -13,11 +13,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tpm_gym.arrays import Vector
 from tpm_gym.errors import SingularityError
 from tpm_gym.kinematics.geometry import Geometry
 from tpm_gym.kinematics.modes import AssemblyMode, WorkingMode
 from tpm_gym.kinematics.unreachable import no_assembly, no_posture
-from tpm_gym.mechanism.bodies import Vector
 
 __all__ = ["ROUNDING", "SINGULAR", "Assembly", "assemble", "evaluate", "posture"]
 
