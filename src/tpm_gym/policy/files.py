@@ -39,7 +39,7 @@ __all__ = [
     "read_weights",
 ]
 
-FORMAT: Final = "tpm_gym.policy.policy"
+FORMAT: Final = "tpm_gym.policy"
 VERSION: Final = 1
 
 MAX_JSON: Final = 1 << 20
