@@ -149,7 +149,8 @@ def test_the_description_is_that_of_the_model(tmp_path: Path, model: Any) -> Non
     assert str(about.versions["torch"]).split("+")[0] == torch.__version__.split("+")[0]
     assert about.observation_space == model.observation_space
     assert about.action_space == model.action_space
-    assert (about.network.features, about.network.unit) == ("goal_gap", 0.07)
+    features = about.network.features
+    assert (features.kind, features.unit) == ("goal_gap", 0.07)
     text = path.read_text()
     assert str(tmp_path) not in text
     assert str(Path.home()) not in text
