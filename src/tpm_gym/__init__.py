@@ -13,7 +13,7 @@ from tpm_gym.errors import TPMError
 from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
 
 if TYPE_CHECKING:
-    from tpm_gym.policy.policy import Policy
+    from tpm_gym.policy import Policy
 
 __all__ = ["ENV_IDS", "PAPER", "WIDE", "Geometry", "TPMError", "__version__", "load_policy"]
 
@@ -21,8 +21,8 @@ __version__ = "0.1.0"
 
 
 def load_policy(path: str | Path) -> Policy:
-    """Load a trained policy; the same as :func:`tpm_gym.policy.policy.load_policy`, and needs PyTorch."""
-    from tpm_gym.policy import policy  # here, so that PyTorch is not imported before it is needed
+    """The same as :func:`tpm_gym.policy.load_policy`, which imports PyTorch."""
+    from tpm_gym import policy
 
     return policy.load_policy(path)
 

@@ -97,13 +97,10 @@ class Box(_Entries):
 
 
 class Features(_Entries):
-    """What the first layer sees.
+    """What the first layer sees: all entries of the observation, or the gap to the goal.
 
-    Attributes:
-        kind: ``"concatenate"``, all entries of the observation, or ``"goal_gap"``, ``observation``
-            and (``desired_goal`` - ``achieved_goal``) / unit.
-        keys: The entries in the order in which they are joined.
-        unit: The gap to the goal that becomes 1, m.
+    Entries are joined in the order of ``keys``; or ``observation`` is with (``desired_goal`` -
+    ``achieved_goal``) / ``unit``, m.
     """
 
     kind: Literal["concatenate", "goal_gap"]
@@ -121,11 +118,8 @@ class Features(_Entries):
 class Network(_Entries):
     """The layers from an observation to the mean action.
 
-    Attributes:
-        hidden: Units of the hidden layers.
-        activation: What follows each hidden layer.
-        output: What follows the last layer: ``"tanh"``, then stretched to the action space, or
-            ``"clip"``, cut off at its bounds.
+    The activation follows each hidden layer. What leaves the last one goes through tanh and is
+    stretched to the action space, or is clipped to it.
     """
 
     features: Features
@@ -144,12 +138,8 @@ class Weights(_Entries):
 class Description(_Entries):
     """Everything about a policy but its weights.
 
-    Attributes:
-        env_id: The environment it was trained on.
-        seed: Seed of the training; None where it is not known.
-        steps: Environment steps it was trained for.
-        recipe: The hyperparameters.
-        versions: Versions it was trained with, by package; None where one was absent.
+    ``steps`` counts those of the environment it was trained in; ``seed`` is None where it is not
+    known, and so are the ``versions`` of packages that were absent.
     """
 
     format: Literal["tpm_gym.policy"]
@@ -205,10 +195,7 @@ class Description(_Entries):
 
 
 def files(path: str | Path) -> tuple[Path, Path]:
-    """The JSON file and the file of weights that a path names.
-
-    Args:
-        path: Either of the two, or what they have in common.
+    """The JSON file and the file of weights; ``path`` is either, or what they have in common.
 
     Raises:
         InputError: It is no path.

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
+from tpm_gym.arrays import numbers
 from tpm_gym.errors import ConfigurationError, InputError, MissingPackageError, PolicyMismatchError
 from tpm_gym.policy.files import Description, files, published, read_description, read_weights
 from tpm_gym.resources import POLICIES
@@ -35,15 +35,15 @@ def load_policy(path: str | Path) -> Policy:
     """Load a policy that train/export.py wrote. Nothing in its files is executed or unpickled.
 
     Args:
-        path: ``NAME.json``, ``NAME.safetensors`` or ``NAME``, where both files have to be. Only
-            where neither is there, and ``path`` is a str, it may also be the id of an environment
-            with a published policy, such as ``"TPMPickAndPlace-v0"``.
+        path: ``NAME.json``, ``NAME.safetensors`` or ``NAME``, where both files have to be. Where
+            neither is there, also the id of an environment with a published policy, a str such as
+            ``"TPMPickAndPlace-v0"``.
 
     Raises:
         InputError: It is neither a str nor a Path, or empty.
         PolicyFileError: A file is missing, damaged, too large or not what it has to be, or the
             path names an archive of Stable-Baselines3, which only unpickling could read.
-        MissingPackageError: A package that loading needs is not installed.
+        MissingPackageError: PyTorch, safetensors or pydantic is not installed.
     """
     pair = files(path)
     if path in published() and not any(map(os.path.exists, pair)):
@@ -95,10 +95,10 @@ class Policy:
                 x = torch.nn.functional.linear(x, weight, bias)
                 x = _ACTIVATIONS[network.activation](x)
             x = torch.nn.functional.linear(x, *self._layers[-1])
-            if not torch.isfinite(x).all():
-                largest = max(float(values.abs().max()) for values in entries.values())
-                raise InputError("observation", largest, "near its space; the network overflows")
             actions: NDArray[Any] = (torch.tanh(x) if network.output == "tanh" else x).numpy()
+        if not np.isfinite(x.numpy()).all():
+            largest = max(float(values.abs().max()) for values in entries.values())
+            raise InputError("observation", largest, "near its space; the network overflows")
         actions = actions.reshape(-1, *space.shape)
         if network.output == "tanh":
             actions = space.low + 0.5 * (actions + 1.0) * (space.high - space.low)
@@ -176,32 +176,20 @@ class Policy:
         leading: set[tuple[int, ...]] = set()
         for name, box in boxes.items():
             shape = box.shape or ()
-            values = _float32(name, observation[name])
+            values = numbers(name, observation[name])
             batch = values.shape[: values.ndim - len(shape)]
             if values.shape != batch + shape or len(batch) > 1:
                 raise InputError(name, values.shape, f"of shape {shape} or (n, *{shape}), by shape")
-            if not np.isfinite(values).all():
-                raise InputError(name, values[~np.isfinite(values)][0], "finite")
-            # A copy: PyTorch warns of arrays that must not be written to.
-            entries[name] = torch.from_numpy(values.reshape(-1, math.prod(shape)).copy())
+            with np.errstate(over="ignore"):
+                flat = values.reshape(-1, math.prod(shape)).astype(np.float32)
+            if not np.isfinite(flat).all():
+                odd = float(values.flat[np.isfinite(flat).argmin()])
+                raise InputError(name, odd, "finite in float32")
+            entries[name] = torch.from_numpy(flat)
             leading.add(batch)
         if len(leading) > 1:
             raise InputError("observation", sorted(leading), "of one batch size in all entries")
         return entries, leading != {()}
-
-
-def _float32(name: str, value: Any) -> NDArray[np.float32]:
-    """An entry of an observation as an array; infinite where a number is too large."""
-    if type(value) is np.ndarray and value.dtype == np.float32:
-        return value
-    if not isinstance(value, np.ma.MaskedArray):
-        # Not ragged lists, integers beyond floats, tensors that require gradients
-        with suppress(TypeError, ValueError, OverflowError, RuntimeError):
-            array = np.asarray(value)
-            if array.dtype.kind in "biuf":
-                with np.errstate(over="ignore"):
-                    return array.astype(np.float32)
-    raise InputError(name, type(value), "an array of real numbers")
 
 
 def _spec(env: Any) -> EnvSpec | None:
