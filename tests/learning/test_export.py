@@ -230,7 +230,7 @@ def counted() -> Blank:
             lambda: PPO("MultiInputPolicy", VecNormalize(DummyVecEnv([Blank]))),
             "VecNormalize",
         ),
-        (lambda: make(SAC, Blank(), net_arch=[4097]), "from 1 to 4096"),
+        (lambda: make(SAC, Blank(), net_arch=[4097]), "equal to 4096"),
     ],
 )
 def test_what_the_files_cannot_hold_is_refused(tmp_path: Path, build: Any, message: str) -> None:
