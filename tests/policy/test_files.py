@@ -73,22 +73,14 @@ def test_any_byte_of_the_weights_counts(intact: Policy, place: int, mask: int) -
 
 
 @settings(max_examples=200, deadline=None)
-@given(cut=st.integers(0, len(TEXT) - 1))
-def test_a_json_cut_off_anywhere_is_refused(intact: Policy, cut: int) -> None:
-    assert not still_loads(intact, TEXT[:cut], DATA)
-
-
-@settings(max_examples=100, deadline=None)
-@given(cut=st.integers(0, len(DATA) - 1))
-def test_weights_cut_off_anywhere_are_refused(intact: Policy, cut: int) -> None:
-    assert not still_loads(intact, TEXT, DATA[:cut])
-
-
-@settings(max_examples=50, deadline=None)
-@given(more=st.binary(min_size=1, max_size=100))
-def test_nothing_may_follow(intact: Policy, more: bytes) -> None:
+@given(part=st.floats(0, 1, exclude_max=True), more=st.binary(min_size=1, max_size=100))
+def test_files_cut_off_anywhere_or_followed_by_anything_are_refused(
+    intact: Policy, part: float, more: bytes
+) -> None:
+    assert not still_loads(intact, TEXT[: int(part * len(TEXT))], DATA)
+    assert not still_loads(intact, TEXT, DATA[: int(part * len(DATA))])
     assert not still_loads(intact, TEXT, DATA + more)
-    still_loads(intact, TEXT + more, DATA)
+    still_loads(intact, TEXT + more, DATA)  # it may be blanks
 
 
 def test_cut_off_and_swapped_weights_are_told_apart(tmp_path: Path) -> None:
