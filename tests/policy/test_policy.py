@@ -177,11 +177,12 @@ def test_observations_that_do_not_fit_are_named(
 
 
 @pytest.mark.parametrize("activation", ["relu", "tanh"])
-@pytest.mark.parametrize("factor", [1e15, 3e37])
+@pytest.mark.parametrize("factors", [(1e15, 1e15, 1e15), (3e37, 3e37, 3e37), (3e37, 1e-38, 1e-38)])
 def test_finite_weights_that_overflow_are_refused(
-    tmp_path: Path, activation: str, factor: float
+    tmp_path: Path, activation: str, factors: tuple[float, ...]
 ) -> None:
-    data = safetensors.numpy.save({name: factor * values for name, values in WEIGHTS.items()})
+    weights = {name: values * factors[int(name[7])] for name, values in WEIGHTS.items()}
+    data = safetensors.numpy.save({n: v.astype(np.float32) for n, v in weights.items()})
     content = described(data)
     content["network"]["activation"] = activation
     with pytest.raises(PolicyFileError, match=r"could reach .*e\+") as caught:

@@ -287,15 +287,15 @@ def read_weights(path: str | Path, description: Description) -> dict[str, NDArra
 def _largest(description: Description, weights: Mapping[str, NDArray[np.float32]]) -> float:
     """What no sum in the network exceeds for observations of the space: all terms add up."""
     boxes = description.observations.values()
-    largest = max(np.abs([box.low, box.high]).max() for box in boxes)
-    # An entry, or the gap between two
-    reach = np.full(weights["layers.0.weight"].shape[1], 2 * largest)
-    reach /= min(description.network.features.unit, 1.0)
+    entry = max(np.abs([box.low, box.high]).max() for box in boxes)
+    largest = 2 * entry / min(description.network.features.unit, 1.0)  # or of a gap of two entries
+    reach = np.full(weights["layers.0.weight"].shape[1], largest)
     with np.errstate(over="ignore", invalid="ignore"):
         for i in range(len(weights) // 2):
             reach = np.abs(weights[f"layers.{i}.weight"]) @ reach
             reach += np.abs(weights[f"layers.{i}.bias"])
-    return float(reach.max())
+            largest = np.maximum(largest, reach.max())  # NaN, once there, stays
+    return float(largest)
 
 
 def published() -> list[str]:
