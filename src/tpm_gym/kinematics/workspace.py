@@ -5,7 +5,9 @@ Everything here is in the paper frame, in metres, on one working mode.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -58,6 +60,10 @@ class Region:
         """The points of the box that are nearest to points (..., 3)."""
         inside: FloatArray = np.minimum(np.maximum(points, self.low), self.high)
         return inside
+
+    def corners(self) -> Iterator[tuple[float, float, float]]:
+        """The eight corners, m."""
+        return product(*zip(self.low, self.high, strict=True))  # type: ignore[return-value]
 
     def margin(self, point: ArrayLike) -> float:
         """Signed distance of one point (3,) to the nearest face; negative outside, m."""

@@ -4,27 +4,28 @@ Each leg of the spanning tree is a multibody of its own, so that every loop clos
 different multibodies. That is not a matter of taste: where both ends lie in one multibody, Bullet's
 direct solvers go wrong and lose the loops at once; between multibodies they are exact
 (docs/fidelity.md). It also shortens every row of the constraint solver.
-
-The client is handed in (see :mod:`tpm_gym.simulation.simulation`), so this module does not import the engine.
 """
 
 from __future__ import annotations
 
 import math
+import os
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tpm_gym.arrays import Quaternion, Vector, rotate, transform
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism import urdf
-from tpm_gym.mechanism.bodies import Vector
-from tpm_gym.mechanism.links import CUP_PRELOAD, MOTOR_EFFORT
-from tpm_gym.mechanism.tree import ACTUATED_JOINTS, Mechanism, Mount
-from tpm_gym.simulation.physics import MOTOR_GAIN, Quaternion, rotate, transform
+from tpm_gym.mechanism.bodies import Mechanism
+from tpm_gym.mechanism.mount import Mount
+from tpm_gym.simulation.bullet.client import Client
+from tpm_gym.simulation.bullet.physics import MOTOR_GAIN
+from tpm_gym.simulation.engine import Motors, Truth
 
 __all__ = ["Robot"]
 
@@ -48,32 +49,35 @@ class Robot:
         mount: Where the base hangs.
     """
 
-    def __init__(self, client: Any, mechanism: Mechanism, mount: Mount) -> None:
+    def __init__(self, client: Client, mechanism: Mechanism, mount: Mount) -> None:
         """Load the legs, take out what the engine adds on its own, close the loops."""
         self._client, self._mechanism = client, mechanism
         self._joints: dict[str, Address] = {}
         self._links: dict[str, Address] = {}
         self.bodies = [self._load(leg, mount) for leg in mechanism.legs()]
-        self._motors = [self._joints[name] for name in ACTUATED_JOINTS]
+        self._motors = [self._joints[name] for name in mechanism.actuated]
         self._inertias = {link: self._inertia(link) for link in self._links.values()}
-        self._effort = [MOTOR_EFFORT] * 3
+        joints = {link.joint.name: link.joint for link in mechanism.links if link.joint}
+        self._nominal_effort = [joints[name].effort for name in mechanism.actuated]
+        self._effort = self._nominal_effort
         self._platform = self._links[mechanism.platform]
+        slide = mechanism.link(mechanism.tool).joint
+        assert slide is not None
         self.tool = self._links[mechanism.tool]
         client.setJointMotorControl2(
             *self.tool,
             client.POSITION_CONTROL,
             targetPosition=0.0,
-            force=CUP_PRELOAD,
+            force=slide.effort,
             positionGain=_SPRING_GAIN,
         )
         self._close_loops()
 
     def _load(self, leg: Mechanism, mount: Mount) -> int:
         client = self._client
-        with tempfile.TemporaryDirectory() as folder:
-            path, _ = urdf.write(Path(folder), leg)
+        with _on_disk(urdf.urdf_text(leg)) as path:
             body: int = client.loadURDF(
-                str(path),
+                path,
                 basePosition=mount.to_world((0.0, 0.0, 0.0)).tolist(),
                 baseOrientation=mount.quaternion,
                 useFixedBase=True,
@@ -166,7 +170,8 @@ class Robot:
                 mass=factor * mass,
                 localInertiaDiagonal=[factor * moment for moment in moments],
             )
-        self._effort = [MOTOR_EFFORT * strength for strength in motor_strength]
+        pairs = zip(self._nominal_effort, motor_strength, strict=True)
+        self._effort = [effort * strength for effort, strength in pairs]
 
     def drive(self, theta: Vector) -> None:
         """Let the motors go to ``theta`` rad within the next time step, effort permitting."""
@@ -175,16 +180,11 @@ class Robot:
             # Target angle and rate, largest torque, gain; as keywords they cost half as much again.
             turn(body, joint, mode, angle, 0.0, effort, MOTOR_GAIN)
 
-    def encoders(self) -> tuple[Vector, Vector]:
-        """True angles (rad) and rates (rad/s) of the motors."""
+    def motors(self) -> Motors:
+        """True angles (rad), rates (rad/s) and last torques (N m) of the motors."""
         state, (first, second, third) = self._client.getJointState, self._motors
         a, b, c = state(*first), state(*second), state(*third)
-        return (a[0], b[0], c[0]), (a[1], b[1], c[1])
-
-    def torques(self) -> Vector:
-        """What the motors applied in the last time step, N m."""
-        state, (first, second, third) = self._client.getJointState, self._motors
-        return state(*first)[3], state(*second)[3], state(*third)[3]
+        return Motors((a[0], b[0], c[0]), (a[1], b[1], c[1]), (a[3], b[3], c[3]))
 
     def joint_states(self) -> tuple[tuple[float, float], ...]:
         """Angle and rate of every joint, passive ones too."""
@@ -196,7 +196,7 @@ class Robot:
         for joint, (angle, rate) in zip(self._joints.values(), states, strict=True):
             self._client.resetJointState(*joint, angle, rate)
 
-    def truth(self) -> tuple[float, Vector, float]:
+    def truth(self) -> Truth:
         """Largest loop gap (m), platform position (m, world) and platform tilt (rad)."""
         frames: dict[Address, Frame] = {}
         for body, links in self._watched.items():
@@ -211,10 +211,27 @@ class Robot:
         origin, turn = frames[self._platform]
         # The platform should stand as the base does: a half turn about x, quaternion (1, 0, 0, 0).
         tilt = 2 * math.asin(min(1.0, math.hypot(*turn[1:])))
-        return math.sqrt(squared), transform(origin, turn, self._mechanism.point_p), tilt
+        return Truth(math.sqrt(squared), transform(origin, turn, self._mechanism.point_p), tilt)
 
     def cup(self) -> tuple[Vector, Vector]:
         """Centre of the cup's lip (m) and the cup's outward axis, world."""
         state = self._client.getLinkState(*self.tool, computeForwardKinematics=True)
         origin, turn = state[4], state[5]
         return transform(origin, turn, self._mechanism.lip), rotate(turn, (0.0, 0.0, 1.0))
+
+
+@contextmanager
+def _on_disk(text: str) -> Iterator[str]:
+    """The path of a file with this text: the engine reads robots from files alone.
+
+    Raises:
+        ConfigurationError: If no temporary file can be written.
+    """
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, "robot.urdf")
+            path.write_text(text, encoding="utf-8")
+            yield str(path)
+    except OSError as error:
+        valid = f"a folder that can be written to, for the engine's robot file ({error})"
+        raise ConfigurationError("TMPDIR", os.environ.get("TMPDIR"), valid) from error
