@@ -7,8 +7,8 @@ import oracle
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.kinematics import (
     ASSEMBLY_MODES,
@@ -24,7 +24,6 @@ from tpm_gym.kinematics import (
 from tpm_gym.kinematics.geometry import PAPER
 from tpm_gym.kinematics.workspace import TASK_REGION, Region
 
-FloatArray = NDArray[np.float64]
 BOX = Region(low=(-1.0, 0.0, 2.0), high=(1.0, 0.5, 2.0))
 coordinates = st.floats(-3, 3)
 triples = st.tuples(coordinates, coordinates, coordinates)

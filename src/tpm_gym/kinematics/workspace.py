@@ -117,17 +117,8 @@ def sample(
 ) -> FloatArray:
     """Draw one point (3,) m, uniform over the part of ``region`` that is reachable and safe enough.
 
-    Args:
-        rng: Source of randomness.
-        region: The box to draw from.
-        min_conditioning: Smallest conditioning accepted.
-        geometry: Lengths of the mechanism.
-        attempts: Draws before giving up.
-        branch: The working mode.
-        assembly: The assembly mode that the posture must belong to.
-
     Raises:
-        ConfigurationError: If no draw was accepted.
+        ConfigurationError: If ``attempts`` draws were not accepted.
     """
     for _ in range(attempts):
         point = rng.uniform(region.low, region.high)
