@@ -200,7 +200,7 @@ class Machine(ABC):
         return self
 
     def occupied(self, position: ArrayLike) -> list[tuple[FloatArray, FloatArray]]:
-        """Boxes (low, high corner, m, world) around platform and tool with P at ``position``."""
+        """Boxes around platform and tool with P at ``position``: low and high corners, m, world."""
         platform = np.asarray(position, dtype=np.float64) - self.mechanism.point_p
         boxes = []
         for name in (self.mechanism.platform, self.mechanism.tool):
