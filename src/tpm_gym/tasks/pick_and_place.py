@@ -40,7 +40,7 @@ class PickAndPlace(Task):
         """See the base class."""
         machine, offset = self.machine, self.hanging(self.puck)
         to_p, from_p = machine.mount.to_paper, machine.mount.to_world
-        table = sampling.level(machine.goal_region, self._level())
+        table = self.on_table(self.puck)
         if self.goals == "tempting":
             pair = sampling.tempting(rng, machine, table, self._draw_region)
             ends = {
@@ -59,15 +59,11 @@ class PickAndPlace(Task):
 
     def _draw_region(self, rng: np.random.Generator) -> Region:
         """Where P goes with the puck: half on the table, half in the air."""
-        low, high = self.machine.goal_region.low, self.machine.goal_region.high
+        table = self.on_table(self.puck)
         if rng.random() < 0.5:
-            return sampling.level(self.machine.goal_region, self._level())
-        return Region(low, (high[0], high[1], self._level() - sampling.APART))
-
-    def _level(self) -> float:
-        """Height of P, machine's frame, when the cup touches a puck that stands on the table."""
-        touching = self.hanging(self.puck) + (0.0, 0.0, self.puck.height / 2)
-        return float(self.machine.mount.to_paper(touching)[2])
+            return table
+        x, y, level = table.high
+        return Region(self.machine.goal_region.low, (x, y, level - sampling.APART))
 
     def observed(self) -> tuple[Entry, ...]:
         """The robot, then the puck."""

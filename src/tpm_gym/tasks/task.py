@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from tpm_gym.arrays import BoolArray, FloatArray, finite
 from tpm_gym.errors import ConfigurationError, ResetOptionError, UnreachableError
+from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.state import CONTROL_PERIOD, Block, Scene, State
@@ -172,7 +173,7 @@ class Task(ABC):
 
     def goal_term(self, achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
         """The one term that depends on the goal, (...,)."""
-        gap = rewards.distance(achieved, desired)
+        gap = self.gap(achieved, desired)
         return (
             rewards.sparse(gap, self.tolerance) if self.reward == "sparse" else rewards.dense(gap)
         )
@@ -184,8 +185,12 @@ class Task(ABC):
 
     def success(self, achieved: ArrayLike, desired: ArrayLike) -> BoolArray:
         """Whether the goal is achieved, (...,)."""
-        result: BoolArray = rewards.distance(achieved, desired) < self.tolerance
+        result: BoolArray = self.gap(achieved, desired) < self.tolerance
         return result
+
+    def gap(self, achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
+        """How far from the goal, (...,) m: what reward and success are made of."""
+        return rewards.distance(achieved, desired)
 
     # -- start of an episode ----------------------------------------------------------------------
 
@@ -249,6 +254,13 @@ class Task(ABC):
     def hanging(self, block: Block) -> FloatArray:
         """From the centre of a block in the cup to point P, (3,) m."""
         return np.array([0.0, 0.0, block.height / 2 + CUP.length])
+
+    def on_table(self, block: Block) -> Region:
+        """Goals for point P, machine's frame, with a block in the cup that stands on the table."""
+        low, high = self.machine.goal_region.low, self.machine.goal_region.high
+        touching = self.hanging(block) + (0.0, 0.0, block.height / 2)
+        level = float(self.machine.mount.to_paper(touching)[2])
+        return Region((*low[:2], level), (*high[:2], level))
 
     def _check_reach(self, name: str, point: FloatArray, block: Block | None) -> None:
         low, high = self.reach_of(block)
