@@ -8,7 +8,6 @@ import numpy as np
 
 from tpm_gym.arrays import FloatArray
 from tpm_gym.kinematics.workspace import Region
-from tpm_gym.mechanism.cup import CUP
 from tpm_gym.simulation.state import Block, Scene, State
 from tpm_gym.tasks import rewards, sampling
 from tpm_gym.tasks.expert import Expert, Move
@@ -18,8 +17,6 @@ __all__ = ["PickAndPlace"]
 
 CLEARANCE = 0.030
 """Height over the puck, or over its place, at which the expert arrives and leaves, m."""
-SEAL_STEPS = 4
-"""Control steps for which the expert waits for the cup to seal before it tries again."""
 
 
 class PickAndPlace(Task):
@@ -86,7 +83,7 @@ class PickAndPlace(Task):
         to_paper = expert.machine.mount.to_paper
         up = np.array([0.0, 0.0, -CLEARANCE])  # paper z points down
         while True:
-            yield from self._pick(expert, up)
+            yield from expert.pick(self.puck, CLEARANCE)
             if not expert.holding():
                 continue
             # Where the cup sits on the puck is where it took it, not the puck's middle.
@@ -102,15 +99,6 @@ class PickAndPlace(Task):
                 break
         yield from self._finish(expert, place, place + up, release=on_table)
 
-    def _pick(self, expert: Expert, up: FloatArray) -> Iterator[Move]:
-        """Come down on the puck and wait for the seal."""
-        yield from expert.go([self._above(expert) + up], vacuum=False)
-        yield from expert.go([self._above(expert)], vacuum=True)
-        for _ in range(SEAL_STEPS):
-            if expert.holding():
-                return
-            yield Move(self._above(expert), True)
-
     def _finish(
         self, expert: Expert, place: FloatArray, above: FloatArray, release: bool
     ) -> Iterator[Move]:
@@ -123,8 +111,3 @@ class PickAndPlace(Task):
             place = above
         while True:
             yield Move(place, not release)
-
-    def _above(self, expert: Expert) -> FloatArray:
-        """Point P, machine's frame, when the cup touches the puck where it stands now."""
-        top = expert.seen["object_position"] + (0.0, 0.0, self.puck.height / 2 + CUP.length)
-        return expert.machine.mount.to_paper(top)

@@ -12,6 +12,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import cycle
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -68,7 +69,8 @@ class Task(ABC):
     Attributes:
         scene: What the simulation must hold.
         vacuum: Whether actions have a fourth entry, which switches the vacuum.
-        goal_size: Length of a goal; three for each point that has to be somewhere.
+        goal_size: Length of a goal; three for each point that has to be somewhere: those of the
+            scene's objects in its order, or P.
         tolerance: Distance below which a goal is achieved, m.
         samplings: What ``goals`` may be.
         entries: What the observation vector consists of, in order.
@@ -100,7 +102,7 @@ class Task(ABC):
             raise ConfigurationError("penalty_weight", penalty_weight, "a finite number >= 0")
         self.machine, self.reward, self.goals = machine, reward, goals
         self.penalty_weight = float(penalty_weight)
-        self._places = [self.reach_of(block) for block in self.scene.objects]
+        self._places = [self._place_of(block) for block in self.scene.objects]
         self._observe_as()
 
     def _observe_as(self) -> None:
@@ -221,8 +223,8 @@ class Task(ABC):
     def check_goal(self, goal: ArrayLike) -> FloatArray:
         """A goal that the user chose, as (goal_size,) m; see :meth:`start` for what it raises."""
         points = _numbers("goal", goal, (self.goal_size,))
-        block = self.scene.objects[0] if self.scene.objects else None
-        for point in points.reshape(-1, 3):
+        blocks = self.scene.objects or (None,)
+        for point, block in zip(points.reshape(-1, 3), cycle(blocks), strict=False):
             self._check_reach("goal", point, block)
         return points
 
@@ -249,6 +251,15 @@ class Task(ABC):
             offset = self.hanging(block)
             low, high = low - offset, high - offset
             low[2] = max(low[2], block.height / 2)  # on the table
+        return low, high
+
+    def _place_of(self, block: Block) -> tuple[FloatArray, FloatArray]:
+        """The same, for a block that has to be in reach where it stands on the table."""
+        low, high = self.reach_of(block)
+        if low[2] > block.height / 2 + 1e-9:
+            least = f"at least {low[2] + block.height / 2:.4g} m high"
+            valid = f"blocks {least}: the cup of {self.machine.name!r} comes no lower"
+            raise ConfigurationError("scene", block.name, valid)
         return low, high
 
     def hanging(self, block: Block) -> FloatArray:
