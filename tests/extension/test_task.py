@@ -8,7 +8,7 @@ from unittest.mock import patch
 import gymnasium as gym
 import numpy as np
 import pytest
-from episodes import expert_episode, fingerprint, play, random_episode
+from episodes import bits, expert_episode, fingerprint, play, random_episode
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
@@ -84,9 +84,9 @@ def test_its_terms_sum_to_the_reward_alone_and_in_batches(env):
 
 def test_the_worse_placed_block_decides(env):
     task, place = env.unwrapped.task, np.array([0.0, -0.03, 0.015, 0.0, -0.03, 0.048])
-    for block in (0, 3):
-        near, far = (place + size * np.eye(6)[block] for size in (0.009, 0.011))
-        assert [bool(task.success(at, place)) for at in (near, far)] == [True, False]
+    both, red, blue = np.array([[1, 0, 0, 0, 1, 0], [1, 0, 0, 0, 0, 0], [0, 0, 0, 0, 1, 0]])
+    offsets = [0.009 * both, 0.011 * red, 0.011 * blue]
+    assert [bool(task.success(place + off, place)) for off in offsets] == [True, False, False]
 
 
 def test_users_place_the_blocks_by_name(env):
@@ -110,11 +110,11 @@ def test_the_blocks_are_drawn_in_their_colours(env):
 
 def test_snapshots_and_copies_go_on_to_the_bit(env):
     actions = np.random.default_rng(3).uniform(-1, 1, (20, 4))
-    env.reset(seed=2)
+    observation, _ = env.reset(seed=2)
     copy = pickle.loads(pickle.dumps(env.unwrapped))
     snapshot = env.unwrapped.save_state()
     first = play(env, actions)
-    env.unwrapped.restore_state(snapshot)
+    assert bits(env.unwrapped.restore_state(snapshot)) == bits(observation)
     assert play(env, actions) == first == play(copy, actions)
     copy.close()
 
