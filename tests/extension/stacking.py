@@ -73,8 +73,6 @@ class Stack(Task):
             yield from expert.go([expert.command + up, place + up, place], vacuum=True)
             yield from [Move(place, True), Move(place, True), Move(place, False)]
             yield from expert.go([place + up], vacuum=False)
-        while True:
-            yield Move(place + up, False)
 
 
 IDS = tpm_gym.register_task("Stack", Stack, max_episode_steps=100)

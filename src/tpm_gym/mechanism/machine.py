@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tpm_gym.arrays import FloatArray, Vector
-from tpm_gym.errors import ConfigurationError, SingularityError, TPMError, UnreachableError
+from tpm_gym.errors import ConfigurationError, SingularityError, UnreachableError
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism.bodies import Mechanism
 from tpm_gym.mechanism.mount import Mount
@@ -222,7 +222,7 @@ def register_machine(name: str, machine: Machine | Callable[[], Machine]) -> Non
     Raises:
         ConfigurationError: If the name is taken by another machine.
     """
-    if _MACHINES.get(name, machine) is not machine:
+    if _MACHINES.get(name, machine) != machine:
         raise ConfigurationError("machine", name, f"a name other than {', '.join(_MACHINES)}")
     _MACHINES[name] = machine
 
@@ -233,11 +233,9 @@ def find_machine(machine: Any) -> Machine:
     Raises:
         ConfigurationError: If there is none of that name, or it is no machine.
     """
-    found = _MACHINES.get(machine, machine) if isinstance(machine, str) else machine
-    try:
-        found = found() if callable(found) and not isinstance(found, Machine) else found
-    except TPMError:
-        raise
+    found = _MACHINES.get(machine) if isinstance(machine, str) else machine
+    if isinstance(machine, str) and callable(found):
+        found = found()
     if not isinstance(found, Machine):
         names = ", ".join(map(repr, _MACHINES))
         raise ConfigurationError("machine", machine, f"{names}, or a tpm_gym.Machine")

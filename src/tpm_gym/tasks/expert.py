@@ -70,26 +70,30 @@ class Expert:
         self.seen: dict[str, FloatArray] = {}
         self.goal: FloatArray = np.full(self._task.goal_size, np.nan)
         self._plan: Iterator[Move] | None = None
+        self._move: Move | None = None
         self._episode: int | None = None
-        self._under_way: list[FloatArray] = []
+        self._under_way: list[NDArray[Any]] = []  # actions that come late
 
     def reset(self, observation: dict[str, Any]) -> None:
         """Plan anew for the episode that starts with ``observation``."""
         self._episode = self._env.episode
         self._under_way = [np.zeros(3)] * self._latency
         self._look(observation)
-        self._plan = self._task.plan(self)
+        self._plan, self._move = self._task.plan(self), None
 
     def act(self, observation: dict[str, Any]) -> NDArray[np.float32]:
         """The next action, shape and range of the environment's action space.
 
         Raises:
-            EpisodeError: If the expert was not reset for this episode of its environment.
+            EpisodeError: If the expert was not reset for this episode of its environment, or its
+                plan has no moves.
         """
         if self._plan is None or self._episode != self._env.episode:
             raise EpisodeError("the expert has no plan for this episode; call its reset() first")
         self._look(observation)
-        move = next(self._plan)
+        self._move = move = next(self._plan, self._move)
+        if move is None:
+            raise EpisodeError(f"the plan of {type(self._task).__name__} has no moves")
         action = np.zeros(self._task.action_size, dtype=np.float32)
         action[:3] = self._control.action(self.machine.region.project(move.point), self.command)
         if self._task.vacuum:

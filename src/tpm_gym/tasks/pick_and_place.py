@@ -40,19 +40,16 @@ class PickAndPlace(Task):
         table = self.on_table(self.puck)
         if self.goals == "tempting":
             pair = sampling.tempting(rng, machine, table, self._draw_region)
-            ends = {
-                name: from_p(p) - offset for name, p in zip(("object", "goal"), pair, strict=True)
-            }
-            return {**ends, **chosen}
-        start = chosen.get("object")
-        if start is None:
-            start = from_p(machine.sample(rng, table)) - offset
-        goal = chosen.get("goal")
-        if goal is None:
-            region = self._draw_region(rng)
-            point = sampling.apart_from(to_p(start + offset), rng, machine, region)
-            goal = from_p(point) - offset
-        return {"object": start, "goal": goal}
+            first, last = (from_p(point) - offset for point in pair)
+            return {"object": first, "goal": last, **chosen}
+        start = (
+            chosen["object"] if "object" in chosen else from_p(machine.sample(rng, table)) - offset
+        )
+        if "goal" in chosen:
+            return {"object": start, **chosen}
+        region = self._draw_region(rng)
+        goal = sampling.apart_from(to_p(start + offset), rng, machine, region)
+        return {"object": start, "goal": from_p(goal) - offset}
 
     def _draw_region(self, rng: np.random.Generator) -> Region:
         """Where P goes with the puck: half on the table, half in the air."""
@@ -109,5 +106,4 @@ class PickAndPlace(Task):
             yield Move(place, False)
             yield from expert.go([above], vacuum=False)
             place = above
-        while True:
-            yield Move(place, not release)
+        yield Move(place, not release)

@@ -32,8 +32,8 @@ APART: Final = 0.030
 BAND: Final = 0.004
 """How far above the threshold the conditioning of a tempting end may be: less than 1 mm of y."""
 
-_ATTEMPTS: Final = 1000
 _BATCH: Final = 256
+_ATTEMPTS: Final = 100
 _FRACTIONS: Final = np.linspace(0.0, 1.0, 33)
 
 
@@ -71,7 +71,7 @@ def tempting(
         goal: Draws the region of the goal.
 
     Raises:
-        ConfigurationError: If no draw was, as on a machine without singularities.
+        ConfigurationError: If none was drawn: not every machine has some.
     """
     for _ in range(_ATTEMPTS):
         goals = _at_the_threshold(rng, machine, goal(rng))  # (n, 3)
@@ -84,7 +84,7 @@ def tempting(
             apart = rewards.distance(first, last) >= APART
             if apart and (line_in_joints(machine, first, last) < machine.safe_conditioning).any():
                 return first, last
-    valid = f"'sampled': no draw led past a singularity of the machine {machine.name!r}"
+    valid = f"'sampled': on {machine.name!r} no careless way was found that passes the singularity"
     raise ConfigurationError("goals", "tempting", valid)
 
 
