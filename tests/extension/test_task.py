@@ -143,12 +143,14 @@ def test_sac_trains_on_it(env):
 
 def test_a_block_that_the_cup_cannot_come_down_to_is_refused(stacking):
     class Coin(stacking.Stack):
-        scene = Scene(objects=(Block("coin", height=0.020), stacking.Stack.blue))
+        scene = Scene((Block("coin", height=0.020), stacking.Stack.blue), markers=2)
 
     with pytest.raises(ConfigurationError, match=r"'coin'.*at least 0\.027 m high"):
         Coin(PAPER_TPM)
     with pytest.raises(ConfigurationError, match="objects of different names"):
-        tpm_gym.TPMEnv(type("Twins", (stacking.Stack,), {"scene": Scene((Block(), Block()))}))
+        tpm_gym.TPMEnv(
+            type("Twins", (stacking.Stack,), {"scene": Scene((Block(), Block()), markers=2)})
+        )
 
 
 def test_where_there_is_no_room_sampling_says_so(stacking):
