@@ -91,8 +91,8 @@ class Machine(ABC):
                 raise ConfigurationError(name, point, f"inside the region, {self.region}")
         if not (min(self.step_limit) > 0 and self.joint_limit > 0):
             raise ConfigurationError("step_limit", self.step_limit, "positive, as joint_limit")
-        if not 0 <= self.safe_conditioning <= 1:
-            raise ConfigurationError("safe_conditioning", self.safe_conditioning, "from 0 to 1")
+        if not 0 < self.safe_conditioning <= 1:  # the penalty is in units of it
+            raise ConfigurationError("safe_conditioning", self.safe_conditioning, "in (0, 1]")
         for corner in self.region.corners():
             self.evaluate(self.inverse(corner))
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import EpisodeError, InputError
 from tpm_gym.mechanism.machine import Machine
+from tpm_gym.simulation.state import Block
 from tpm_gym.tasks.control import Control
 from tpm_gym.tasks.task import Task
 
@@ -25,6 +26,8 @@ __all__ = ["Expert", "Move"]
 
 RAMP = 3
 """Control steps from rest to full speed."""
+SEAL_STEPS = 4
+"""Control steps for which it waits for the cup to seal before it gives up."""
 
 
 class Move(NamedTuple):
@@ -129,6 +132,20 @@ class Expert:
                 if while_holding is not None and not self.holding(while_holding):
                     return
                 yield Move(start + fraction * (stop - start), vacuum)
+
+    def pick(self, block: Block, clearance: float) -> Iterator[Move]:
+        """Come down on a block from ``clearance`` (m) above it, and wait for the seal."""
+        yield from self.go([self._above(block, clearance)], vacuum=False)
+        yield from self.go([self._above(block)], vacuum=True)
+        for _ in range(SEAL_STEPS):
+            if self.holding(block.name):
+                return
+            yield Move(self._above(block), True)
+
+    def _above(self, block: Block, clearance: float = 0.0) -> FloatArray:
+        """Point P, machine's frame, with the lip over the top of a block where it stands now."""
+        place = self.seen[f"{block.name}_position"] + self._task.hanging(block)
+        return self.machine.mount.to_paper(place + (0.0, 0.0, clearance))
 
     def _look(self, observation: dict[str, Any]) -> None:
         self.seen = self._task.decode(observation["observation"])

@@ -25,7 +25,7 @@ from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.tasks import rewards
 
-__all__ = ["APART", "BAND", "apart_from", "level", "line_in_joints", "line_in_space", "tempting"]
+__all__ = ["APART", "BAND", "apart_from", "line_in_joints", "line_in_space", "tempting"]
 
 APART: Final = 0.030
 """A goal is at least this far from where its episode starts, m: no success for free."""
@@ -38,26 +38,22 @@ _FRACTIONS: Final = np.linspace(0.0, 1.0, 33)
 
 
 def apart_from(
-    start: ArrayLike, rng: np.random.Generator, machine: Machine, region: Region
+    others: ArrayLike,
+    rng: np.random.Generator,
+    machine: Machine,
+    region: Region,
+    apart: float = APART,
 ) -> FloatArray:
-    """A safe point (3,) of ``region`` at least :data:`APART` from ``start`` (3,).
+    """A safe point (3,) of ``region`` at least ``apart`` (m) from all ``others`` (..., 3).
 
     Raises:
-        ConfigurationError: If none was drawn.
+        ConfigurationError: If no draw was.
     """
     for _ in range(_ATTEMPTS):
         point = machine.sample(rng, region)
-        if rewards.distance(point, start) >= APART:
+        if (rewards.distance(point, others) >= apart).all():
             return point
-    raise ConfigurationError(
-        "goal_region", region, f"a larger one, goals lie {APART} m from starts"
-    )
-
-
-def level(region: Region, z: float) -> Region:
-    """The part of a region at one height."""
-    low, high = region.low, region.high
-    return Region((low[0], low[1], z), (high[0], high[1], z))
+    raise ConfigurationError("apart", apart, f"a distance that leaves room in {region}")
 
 
 def tempting(

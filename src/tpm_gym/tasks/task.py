@@ -12,6 +12,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import cycle
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -19,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from tpm_gym.arrays import BoolArray, FloatArray, finite
 from tpm_gym.errors import ConfigurationError, ResetOptionError, UnreachableError
+from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.state import CONTROL_PERIOD, Block, Scene, State
@@ -67,7 +69,8 @@ class Task(ABC):
     Attributes:
         scene: What the simulation must hold.
         vacuum: Whether actions have a fourth entry, which switches the vacuum.
-        goal_size: Length of a goal; three for each point that has to be somewhere.
+        goal_size: Length of a goal; three for each point that has to be somewhere: those of the
+            scene's objects in its order, or P.
         tolerance: Distance below which a goal is achieved, m.
         samplings: What ``goals`` may be.
         entries: What the observation vector consists of, in order.
@@ -103,7 +106,7 @@ class Task(ABC):
         if shown != self.scene.markers:
             raise ConfigurationError("markers", self.scene.markers, f"{shown}, as a goal shows")
         self.machine, self.reward, self.goals = machine, reward, goals
-        self._within = [self.reach_of(block) for block in self.scene.objects]
+        self._within = [self._place_of(block) for block in self.scene.objects]
         self._set_entries()
 
     def _set_entries(self) -> None:
@@ -178,7 +181,7 @@ class Task(ABC):
 
     def goal_term(self, achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
         """The one term that depends on the goal, (...,)."""
-        gap = rewards.distance(achieved, desired)
+        gap = self.gap(achieved, desired)
         return (
             rewards.sparse(gap, self.tolerance) if self.reward == "sparse" else rewards.dense(gap)
         )
@@ -190,8 +193,12 @@ class Task(ABC):
 
     def success(self, achieved: ArrayLike, desired: ArrayLike) -> BoolArray:
         """Whether the goal is achieved, (...,)."""
-        result: BoolArray = rewards.distance(achieved, desired) < self.tolerance
+        result: BoolArray = self.gap(achieved, desired) < self.tolerance
         return result
+
+    def gap(self, achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
+        """How far from the goal, (...,) m: what reward and success are made of."""
+        return rewards.distance(achieved, desired)
 
     # -- start of an episode ----------------------------------------------------------------------
 
@@ -222,8 +229,8 @@ class Task(ABC):
     def check_goal(self, goal: ArrayLike) -> FloatArray:
         """A goal that the user chose, as (goal_size,) m; see :meth:`start` for what it raises."""
         points = _numbers("goal", goal, (self.goal_size,))
-        block = self.scene.objects[0] if self.scene.objects else None
-        for point in points.reshape(-1, 3):
+        blocks = self.scene.objects or (None,)
+        for point, block in zip(points.reshape(-1, 3), cycle(blocks), strict=False):
             self._check_reach("goal", point, block)
         return points
 
@@ -244,9 +251,25 @@ class Task(ABC):
             low[2] = max(low[2], block.height / 2)  # on the table
         return low, high
 
+    def _place_of(self, block: Block) -> tuple[FloatArray, FloatArray]:
+        """The same, for a block that has to be in reach where it stands on the table."""
+        low, high = self.reach_of(block)
+        if low[2] > block.height / 2 + 1e-9:
+            least = f"at least {low[2] + block.height / 2:.4g} m high"
+            valid = f"blocks {least}: the cup of {self.machine.name!r} comes no lower"
+            raise ConfigurationError("scene", block.name, valid)
+        return low, high
+
     def hanging(self, block: Block) -> FloatArray:
         """From the centre of a block in the cup to point P, (3,) m."""
         return np.array([0.0, 0.0, block.height / 2 + CUP.length])
+
+    def on_table(self, block: Block) -> Region:
+        """Goals for point P, machine's frame, with a block in the cup that stands on the table."""
+        low, high = self.machine.goal_region.low, self.machine.goal_region.high
+        touching = self.hanging(block) + (0.0, 0.0, block.height / 2)
+        level = float(self.machine.mount.to_paper(touching)[2])
+        return Region((*low[:2], level), (*high[:2], level))
 
     def _check_reach(self, name: str, point: FloatArray, block: Block | None) -> None:
         low, high = self.reach_of(block)
