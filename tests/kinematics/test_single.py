@@ -11,9 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from tpm_gym.errors import SingularityError, TPMError, UnreachableError
-from tpm_gym.kinematics import forward, forward_all, inverse, inverse_all, jacobian, equations as single
+from tpm_gym.kinematics import equations as single
+from tpm_gym.kinematics import forward, forward_all, inverse, inverse_all, jacobian
 from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
-from tpm_gym.kinematics.namespaces import PLAIN
 from tpm_gym.kinematics.modes import (
     ASSEMBLY_MODES,
     DEFAULT_ASSEMBLY,
@@ -22,6 +22,7 @@ from tpm_gym.kinematics.modes import (
     AssemblyMode,
     WorkingMode,
 )
+from tpm_gym.kinematics.namespaces import PLAIN
 
 FloatArray = NDArray[np.float64]
 GEOMETRIES = [PAPER, WIDE, Geometry(l1=0.31, l2=0.06, l3=0.36, l4=0.79, l5=0.11, l6=0.02, l7=0.07)]
