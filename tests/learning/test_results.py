@@ -20,7 +20,7 @@ import scipy.stats
 from rich.console import Console
 from trainings import SAC_RECIPE
 
-from tpm_gym.learning import evaluate, study, train
+from tpm_gym.learning import evaluate, figure_style, study, train
 from tpm_gym.learning import report as results
 from tpm_gym.learning import report_page as results_page
 from tpm_gym.learning.aggregate import (
@@ -255,7 +255,7 @@ def test_the_penalty_figure_has_a_dot_a_seed(real: dict[str, Any], tmp_path: Pat
         for seed in range(3)
         for weight in (0.0, 1.0)
     ]
-    style = results_figures._house_style()
+    style = figure_style
     figure = results_figures.penalty(records, style)
     dots = [line for line in figure.axes[0].lines if len(line.get_xdata()) == 3]
     assert len(dots) == 4  # two metrics at two weights
@@ -271,7 +271,7 @@ def test_the_learning_curve_is_the_median_with_a_band(real: dict[str, Any]) -> N
     from tpm_gym.learning import report_figures as results_figures
 
     records = [changed(real, seed, rate) for seed, rate in enumerate([0.2, 0.9, 1.0])]
-    figure = results_figures.learning_curves(records, results_figures._house_style())
+    figure = results_figures.learning_curves(records, figure_style)
     curve = figure.axes[0].lines[0]
     assert list(curve.get_xdata()) == [0, 60, 120]
     assert list(curve.get_ydata()) == [0.0, 0.9, 0.9]

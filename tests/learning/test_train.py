@@ -296,11 +296,12 @@ def test_resuming_runs_no_pickle(small: Path, tmp_path: Path) -> None:
     config = Config(recipe=small, run=tmp_path / "run", steps=150, eval_episodes=1)
     train.train(config, quiet())
     script = (
-        "import sys, train; from pathlib import Path; from stable_baselines3 import SAC\n"
-        "from plan import Config; SAC.load = lambda *a, **k: sys.exit('unpickled')\n"
+        "import sys; from pathlib import Path; from stable_baselines3 import SAC\n"
+        "from tpm_gym.learning import train; from tpm_gym.learning.configuration import Config\n"
+        "SAC.load = lambda *a, **k: sys.exit('unpickled')\n"
         f"train.train(Config(run=Path({str(tmp_path / 'run')!r}), resume=True, steps=200))\n"
     )
-    done = subprocess.run([sys.executable, "-c", script], check=False, cwd=SCRIPT.parent)
+    done = subprocess.run([sys.executable, "-c", script], check=False)
     assert done.returncode == 0
     assert tpm_gym.load_policy(tmp_path / "run" / "last").description.steps == 200
 

@@ -23,7 +23,7 @@ from tpm_gym.learning import provenance
 from tpm_gym.learning.errors import ConfigError, TrainError
 from tpm_gym.learning.policies import CONFIG_FILE, EVALUATIONS_FILE, TESTS
 
-ROOT: Final = Path(__file__).resolve().parents[1]
+ROOT: Final = Path(__file__).resolve().parents[3]
 RECORDS: Final = ROOT / "docs" / "results"
 WHOLE: Final = "[!.]*.json"
 """JSON files, without the hidden halves that a process leaves which was killed while it wrote."""

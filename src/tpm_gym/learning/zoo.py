@@ -1,9 +1,9 @@
 """Our recipes for rl-baselines3-zoo.
 
-    PYTHONPATH=train python -m rl_zoo3.train --algo sac --env TPMReach-v0 \
-        --gym-packages tpm_gym --conf-file train/zoo.py
+    python -m rl_zoo3.train --algo sac --env TPMReach-v0 \
+        --gym-packages tpm_gym --conf-file tpm_gym.learning.zoo
 
-The zoo executes this file and takes the name ``hyperparams`` from it. One file of ours is for one
+The zoo imports this module and takes the name ``hyperparams`` from it. One file of ours is for one
 algorithm, so the algorithm is read off the zoo's command line. Where the zoo would evaluate strings
 as Python, it gets the classes themselves.
 """
@@ -35,7 +35,9 @@ def _translate(entries: dict[str, Any]) -> dict[str, Any]:
     translated = dict(entries)
     if "demonstrations" in translated:
         arguments = translated.pop("demonstrations")
-        translated["callback"] = [{"demonstrations.Demonstrations": dict(arguments)}]
+        translated["callback"] = [
+            {"tpm_gym.learning.demonstrations.Demonstrations": dict(arguments)}
+        ]
     if "replay_buffer_class" in translated:
         translated["replay_buffer_class"] = PenaltyHerReplayBuffer
     policy = dict(translated.get("policy_kwargs", {}))
