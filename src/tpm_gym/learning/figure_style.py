@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -32,7 +33,7 @@ REACHED, OUTLINE = "#EBEBEB", "#8C8C8C"  # the reachable set, and its edge
 
 LENGTHS = "lengths of the paper's case study"
 
-_SETTINGS = {
+_SETTINGS: dict[Any, Any] = {
     "font.size": 8.0,
     "axes.titlesize": 8.0,
     "axes.labelsize": 8.0,
