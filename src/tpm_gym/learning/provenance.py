@@ -101,9 +101,11 @@ def command_line(arguments: Sequence[str] | None = None) -> str:
         arguments: The script and its arguments; by default those of this process.
     """
     program, *words = sys.argv if arguments is None else arguments
-    name = Path(program).name
-    # ``python -m tpm_gym.learning`` is the same command, and shows only its file's name.
-    first = ["tpm-gym"] if name in ("tpm-gym", "__main__.py") else ["python", _portable(program)]
+    # ``python -m tpm_gym.learning`` is the same command.
+    ours = Path(program).name == "tpm-gym" or Path(program) == Path(__file__).with_name(
+        "__main__.py"
+    )
+    first = ["tpm-gym"] if ours else ["python", _portable(program)]
     return shlex.join([*first, *map(_portable, words)])
 
 
