@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import signal
 from typing import Any
 
@@ -28,10 +29,13 @@ def check_env_id(env_id: str) -> EnvSpec:
         ConfigError: The module cannot be imported, or the id is not registered, or is that of an
             environment without goal, conditioning and loops to evaluate.
     """
+    module, _, name = env_id.rpartition(":")
     try:
-        spec = gym.spec(env_id)
+        if module:
+            importlib.import_module(module)
+        spec = gym.spec(name)
     except (gym.error.Error, ImportError) as error:
-        ids = [name for name, spec in gym.registry.items() if spec.entry_point == _ENTRY_POINT]
+        ids = [name for name, known in gym.registry.items() if known.entry_point == _ENTRY_POINT]
         there = f"there are {', '.join(ids)}, and module:id for those that a module registers"
         raise ConfigError(f"unknown environment {env_id!r} ({error}); {there}") from error
     if not _is_ours(spec):
