@@ -38,7 +38,7 @@ __all__ = [
     "Triple",
     "arms",
     "assemble",
-    "assembly",
+    "assembly_at",
     "conditioning",
     "determinant",
     "evaluate",
@@ -101,14 +101,11 @@ def arms(theta: Triple, g: Geometry, ns: Namespace) -> tuple[Triple, Triple]:
     """The arms A_iB_i in their planes: l3 cos(theta_i), and l3 sin(theta_i)."""
     one, two, three = theta
     cos, sin, l3 = ns.cos, ns.sin, g.l3
-    return (l3 * cos(one), l3 * cos(two), l3 * cos(three)), (
-        l3 * sin(one),
-        l3 * sin(two),
-        l3 * sin(three),
-    )
+    level = l3 * cos(one), l3 * cos(two), l3 * cos(three)
+    return level, (l3 * sin(one), l3 * sin(two), l3 * sin(three))
 
 
-def assembly(
+def assembly_at(
     cos: Triple, sin: Triple, planar: Numbers, side: Numbers, g: Geometry, ns: Namespace
 ) -> tuple[Assembly, Numbers, tuple[Numbers, Numbers, Numbers, Numbers]]:
     """Forward kinematics (Eqs. 6 to 11, corrected) for the signs of planar factor and sin(beta).
@@ -188,9 +185,8 @@ def _fold(
     l3, l4 = g.l3, g.l4
     radius2 = a * a + b * b
     ratio = (radius2 + out * out + (l3 * l3 - l4 * l4)) / (2 * l3 * ns.sqrt(radius2))
-    return ns.arccos(ns.clip(ratio)), abs(
-        ratio
-    ) <= 1 + ROUNDING  # NaN, from lengths without end, fails
+    reaches = abs(ratio) <= 1 + ROUNDING  # not where it is NaN, from lengths without end
+    return ns.arccos(ns.clip(ratio)), reaches
 
 
 def rods(cos: Triple, sin: Triple, found: Assembly, g: Geometry) -> tuple[Triple, Triple, Triple]:
@@ -306,7 +302,7 @@ def _assembled(
     theta: Vector, cos: Triple, sin: Triple, branch: AssemblyMode, geometry: Geometry
 ) -> Assembly:
     try:
-        found, real, _ = assembly(cos, sin, branch.planar, branch.sin_beta, geometry, PLAIN)
+        found, real, _ = assembly_at(cos, sin, branch.planar, branch.sin_beta, geometry, PLAIN)
     except ZeroDivisionError:  # concentric circles, or link 7 beside B3
         real = False
     if not real:
@@ -367,7 +363,7 @@ def no_assembly(theta: Vector, branch: AssemblyMode, geometry: Geometry) -> Unre
     """Why a branch cannot be assembled at theta (3) rad."""
     with np.errstate(all="ignore"):
         cos, sin = arms(tuple(map(np.float64, theta)), geometry, NUMPY)
-        _, _, lengths = assembly(cos, sin, branch.planar, branch.sin_beta, geometry, NUMPY)
+        _, _, lengths = assembly_at(cos, sin, branch.planar, branch.sin_beta, geometry, NUMPY)
     y1, distance2, level, vertical = map(float, lengths)
     return margins.no_assembly(
         theta, branch, geometry, (y1, math.sqrt(distance2)), (level, vertical)

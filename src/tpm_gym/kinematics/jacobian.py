@@ -233,7 +233,7 @@ def _from_angles(
 
     def text(angles: equations.Triple, ns: Namespace) -> list[Numbers]:
         cos, sin = equations.arms(angles, g, ns)
-        found, real, _ = equations.assembly(cos, sin, branch.planar, branch.sin_beta, g, ns)
+        found, real, _ = equations.assembly_at(cos, sin, branch.planar, branch.sin_beta, g, ns)
         missing = ns.where(real, 0.0, 1.0)
         return [missing, *columns(_configuration(cos, sin, found, g, ns))]
 
@@ -295,7 +295,7 @@ def _require_regular(values: FloatArray, geometry: Geometry) -> None:
     for name, value in named.items():
         flat = value.reshape(-1)
         if len(flat):
-            smallest = float(flat[abs(flat).argmin()])
+            smallest = flat[abs(flat).argmin()].item()
             nearest.append((abs(smallest), smallest, name))
     if nearest and min(nearest)[0] < equations.SINGULAR:
         _, smallest, name = min(nearest)

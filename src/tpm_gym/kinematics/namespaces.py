@@ -118,7 +118,10 @@ NUMPY = Namespace(
 
 @cache
 def _torch() -> Namespace:
-    """For tensors. Where a derivative is infinite it is 0, or other branches would become NaN."""
+    """For tensors.
+
+    Where a derivative is infinite it is 0, or those of other branches would become NaN.
+    """
     import torch  # here, since whoever has no tensor may have no torch
 
     def like(x: Any, other: Any) -> Any:
@@ -130,7 +133,10 @@ def _torch() -> Namespace:
 
     def arccos(x: Any) -> Any:
         end = abs(x) >= 1
-        return torch.where(end, torch.where(x > 0, 0.0, math.pi), torch.where(end, 0.0, x).arccos())
+        return torch.where(end, like(math.pi, x) * (x < 0), torch.where(end, 0.0, x).arccos())
+
+    def wrap(x: Any) -> Any:
+        return torch.where(x > math.pi, x - _TURN, torch.where(x <= -math.pi, x + _TURN, x))
 
     return Namespace(
         cos=torch.cos,
@@ -144,7 +150,7 @@ def _torch() -> Namespace:
         arcsin=lambda x: math.pi / 2 - arccos(x),
         maximum=lambda x, least: torch.clip(x, min=least),
         where=torch.where,
-        wrap=lambda x: x + _TURN * (x <= -math.pi) - _TURN * (x > math.pi),
+        wrap=wrap,
         nonzero=lambda x: torch.where(x == 0, 1.0, x),
         cube=lambda x: x * x * x,
         signs=lambda other, shape: like([-1.0, 1.0], other).reshape(shape),

@@ -182,7 +182,7 @@ def _assembled(theta: FloatArray, branch: AssemblyMode, geometry: Geometry) -> F
 def _assemblies(theta: equations.Triple, g: Geometry, ns: Namespace) -> list[Any]:
     """Both planar signs; the other half is the mirror image."""
     cos, sin = equations.arms(theta, g, ns)
-    found, real, _ = equations.assembly(cos, sin, ns.signs(theta[0], (2, 1)), 1.0, g, ns)
+    found, real, _ = equations.assembly_at(cos, sin, ns.signs(theta[0], (2, 1)), 1.0, g, ns)
     x, y, z, cos_beta = (
         ns.where(real, values, math.nan) for values in (found.x, found.y, found.z, found.cos_beta)
     )
@@ -197,6 +197,6 @@ def _postures(point: equations.Triple, g: Geometry, ns: Namespace) -> list[Any]:
         point, (sides, bends, bends, bends), g, ns
     )
     acute = ns.arcsin(sin_beta)
-    obtuse = ns.where(point[1] < 0, -math.pi, math.pi) - acute
+    obtuse = ns.where(point[1] < 0, -math.pi - acute, math.pi - acute)
     angles = [row for leg in theta for both in ns.where(real, leg, math.nan) for row in both]
     return [*angles, ns.where(real[0], obtuse, math.nan), ns.where(real[1], acute, math.nan)]
