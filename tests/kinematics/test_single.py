@@ -11,7 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from tpm_gym.errors import SingularityError, TPMError, UnreachableError
-from tpm_gym.kinematics import forward, forward_all, inverse, inverse_all, jacobian, single
+from tpm_gym.kinematics import equations as single
+from tpm_gym.kinematics import forward, forward_all, inverse, inverse_all, jacobian
 from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
 from tpm_gym.kinematics.modes import (
     ASSEMBLY_MODES,
@@ -21,6 +22,7 @@ from tpm_gym.kinematics.modes import (
     AssemblyMode,
     WorkingMode,
 )
+from tpm_gym.kinematics.namespaces import PLAIN
 
 FloatArray = NDArray[np.float64]
 GEOMETRIES = [PAPER, WIDE, Geometry(l1=0.31, l2=0.06, l3=0.36, l4=0.79, l5=0.11, l6=0.02, l7=0.07)]
@@ -174,7 +176,7 @@ def error(matrix: FloatArray) -> float:
     """Of the conditioning, against numpy's singular values."""
     values = np.linalg.svd(matrix, compute_uv=False)
     expected = values[2] / values[0] if values[0] else 0.0
-    found = single._conditioning(matrix.tolist())
+    found = single.conditioning(matrix.tolist(), PLAIN)
     assert 0 <= found <= 1 + 1e-12
     return float(abs(found - expected))
 
@@ -202,4 +204,4 @@ def test_the_conditioning_keeps_its_digits_where_it_is_small() -> None:
     rng = np.random.default_rng(2)
     for smallest in (1e-4, 1e-8, 1e-11):
         matrix = with_singular_values(rng, [1.0, 0.3, smallest])
-        assert single._conditioning(matrix.tolist()) == pytest.approx(smallest, rel=1e-3)
+        assert single.conditioning(matrix.tolist(), PLAIN) == pytest.approx(smallest, rel=1e-3)

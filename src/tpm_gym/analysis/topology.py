@@ -38,10 +38,10 @@ from tpm_gym.analysis.poc import (
     revolute,
     serial,
 )
+from tpm_gym.arrays import Vector
 from tpm_gym.errors import SingularityError
 from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode
 from tpm_gym.kinematics.geometry import PAPER, Geometry
-from tpm_gym.arrays import Vector
 from tpm_gym.mechanism.bodies import Mechanism
 from tpm_gym.mechanism.tree import ACTUATED_JOINTS, build, joint_angles
 

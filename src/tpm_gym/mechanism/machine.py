@@ -20,7 +20,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tpm_gym.arrays import FloatArray, Vector
+from tpm_gym.arrays import FloatArray, Vector, vector
 from tpm_gym.errors import ConfigurationError, SingularityError, UnreachableError
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism.bodies import Mechanism
@@ -66,7 +66,8 @@ class Machine(ABC):
         table: Half edges of the table along x and y, m; its top is the world's z = 0.
 
     Raises:
-        ConfigurationError: If a value cannot be, or home or the goals lie outside the region.
+        ConfigurationError: If a value cannot be, home or the goals lie outside the region, or the
+            region reaches beyond a singularity.
         UnreachableError: If a corner of the region cannot be reached.
     """
 
@@ -83,18 +84,26 @@ class Machine(ABC):
     def __post_init__(self) -> None:
         """Reject machines on which no episode could run."""
         for name, point in (
-            ("home", self.home),
+            ("home", vector("home", self.home, ConfigurationError)),
             ("goal_region", self.goal_region.low),
             ("goal_region", self.goal_region.high),
         ):
             if not self.region.contains(point):
                 raise ConfigurationError(name, point, f"inside the region, {self.region}")
-        if not (min(self.step_limit) > 0 and self.joint_limit > 0):
-            raise ConfigurationError("step_limit", self.step_limit, "positive, as joint_limit")
+        limits = {
+            "step_limit": vector("step_limit", self.step_limit, ConfigurationError),
+            "joint_limit": (self.joint_limit,),
+            "table": self.table,
+        }
+        for name, values in limits.items():
+            if not min(values) > 0:
+                raise ConfigurationError(name, getattr(self, name), "positive")
         if not 0 < self.safe_conditioning <= 1:  # the penalty is in units of it
             raise ConfigurationError("safe_conditioning", self.safe_conditioning, "in (0, 1]")
         for corner in self.region.corners():
-            self.evaluate(self.inverse(corner))
+            if (mode := self.mode_left(self.inverse(corner), corner)) is not None:
+                valid = f"in one {mode} mode; {corner} is beyond a singularity"
+                raise ConfigurationError("region", self.region, valid)
 
     # -- kinematics -------------------------------------------------------------------------
 
@@ -200,7 +209,7 @@ class Machine(ABC):
         return self
 
     def occupied(self, position: ArrayLike) -> list[tuple[FloatArray, FloatArray]]:
-        """Boxes (low, high corner, m, world) around platform and tool with P at ``position``."""
+        """Boxes around platform and tool with P at ``position``: low and high corners, m, world."""
         platform = np.asarray(position, dtype=np.float64) - self.mechanism.point_p
         boxes = []
         for name in (self.mechanism.platform, self.mechanism.tool):

@@ -283,8 +283,8 @@ class Task(ABC):
         if not chosen:
             return
         taken = [(block.name, _box(start[block.name], block)) for block in self.scene.objects]
-        home = self.machine.mount.to_world(self.machine.home)
-        robot = [("the robot at home", box) for box in self.machine.occupied(home)]
+        boxes = self.machine.occupied(self.machine.home)
+        robot = [("the robot at home", box) for box in boxes]
         for name, (low, high) in taken:
             for other, (least, most) in robot + taken:
                 if name in chosen and other != name and (low < most).all() and (high > least).all():
