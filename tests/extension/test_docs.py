@@ -1,5 +1,6 @@
-"""The code of docs/extending.md runs."""
+"""The code of docs/extending.md runs, and what it and CONTRIBUTING.md point at is there."""
 
+import pkgutil
 import re
 from unittest.mock import patch
 
@@ -8,6 +9,7 @@ import pytest
 from episodes import expert_episode
 from paths import ROOT
 
+import tpm_gym
 from tpm_gym.tasks.registry import TASKS
 
 PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
@@ -33,6 +35,19 @@ def test_the_table_counts_lines_as_they_are():
         assert int(lines) == pytest.approx(found, abs=5), name
 
 
-def test_the_links_lead_somewhere():
-    for path in re.findall(r"\]\((?!http)([^)#]+)", PAGE):
-        assert (ROOT / "docs" / path).is_file(), path
+@pytest.mark.parametrize("page", ["docs/extending.md", "CONTRIBUTING.md"])
+def test_links_lead_to_files_and_headings(page):
+    text = (ROOT / page).read_text(encoding="utf-8")
+    for path, heading in re.findall(r"\]\((?!http)([^)#]+)#?([^)]*)", text):
+        place = (ROOT / page).parent / path
+        assert place.exists(), path
+        if heading:
+            titles = re.findall(r"^## (.*)$", place.read_text(encoding="utf-8"), re.MULTILINE)
+            assert heading in [title.lower().replace(" ", "-") for title in titles]
+
+
+def test_the_table_of_rooms_has_all_rooms():
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    rooms = re.findall(r"`(\w+)`", " ".join(re.findall(r"^\| (`.*?) \|", text, re.MULTILINE)))
+    there = {module.name for module in pkgutil.iter_modules(tpm_gym.__path__)}
+    assert set(rooms) == there
