@@ -3,10 +3,9 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from conformance import CHECKS
 from episodes import expert_episode, random_episode
 from gantry import GANTRY
-from gymnasium.utils.env_checker import check_env as gymnasium_check_env
-from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 import tpm_gym
 from tpm_gym.errors import ConfigurationError
@@ -21,9 +20,10 @@ def env(request):
     env.close()
 
 
-def test_the_tasks_conform_on_it(env):
-    gymnasium_check_env(env.unwrapped)
-    sb3_check_env(env.unwrapped)
+@pytest.mark.parametrize("env_id", ["TPMReachJoints-v0", "TPMPickAndPlace-v0"])
+@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
+def test_the_tasks_conform_on_it(check, env_id):
+    check(lambda: gym.make(env_id, machine="gantry"))
 
 
 def test_the_expert_solves_the_tasks_on_it(env):

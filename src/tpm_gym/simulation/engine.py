@@ -142,9 +142,16 @@ def register_engine(name: str, engine: str | Factory) -> None:
     Raises:
         ConfigurationError: If the name is taken by another engine.
     """
-    if _ENGINES.get(name, engine) != engine:
+    if _path(_ENGINES.get(name, engine)) != _path(engine):
         raise ConfigurationError("engine", name, f"a name other than {', '.join(_ENGINES)}")
     _ENGINES[name] = engine
+
+
+def _path(engine: str | Factory) -> str:
+    """Where it is defined: there the same one may be registered as itself."""
+    if isinstance(engine, str):
+        return engine
+    return f"{engine.__module__}:{getattr(engine, '__qualname__', engine)}"
 
 
 def make_engine(
