@@ -14,17 +14,15 @@ from numpy.typing import NDArray
 
 import tpm_gym  # noqa: F401  # registers the ids
 from tpm_gym.learning.errors import PolicyError, RolloutError
+from tpm_gym.learning.estimates import Estimate, bootstrap, wilson
 from tpm_gym.learning.policies import load_policy, trained_env
 from tpm_gym.learning.rollout import (
     SELECTION_SEED,
     TEST_SEED,
     Episode,
-    Estimate,
     GoalEnv,
-    bootstrap,
     run_episodes,
     summarise,
-    wilson,
 )
 
 
@@ -131,9 +129,8 @@ def test_hooks_see_every_frame_and_episode() -> None:
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_values_that_are_not_finite_raise(name: str, value: float) -> None:
     env = ScriptedEnv([scripted_step(), scripted_step() | {name: value}])
-    with pytest.raises(RolloutError, match="seed 3, step 1") as caught:
+    with pytest.raises(RolloutError, match=f"seed 3, step 1: {name} is {value}"):
         run_episodes(env, Idle(), 1, first_seed=3)
-    assert caught.value.name == name
 
 
 @pytest.mark.parametrize("spec", ["random", "expert"])

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
+import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, is_dataclass
 from typing import Any, SupportsFloat
 
 import gymnasium as gym
@@ -19,7 +21,6 @@ from tpm_gym.errors import (
     EpisodeError,
     InputError,
     ModeChangeError,
-    TPMError,
 )
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.display import has_display
@@ -49,6 +50,15 @@ class EnvSnapshot:
     goal: FloatArray
     pending: tuple[FloatArray, ...]
     kind: tuple[Any, ...]
+    digest: str
+
+    def is_intact(self) -> bool:
+        """Whether nothing has been changed since it was taken, by the digest."""
+        own = (self.simulation, self.rng, self.goal, self.pending, self.kind)
+        try:
+            return bool(self.digest == _digest(own))
+        except Exception:  # of the repr of whatever somebody put in
+            return False
 
 
 class TPMEnv(gym.Env[Observation, Action]):
@@ -202,7 +212,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         self.machine = self.task.machine
         self.control = make_control(control, self.machine)
         self.randomisation = settings_of(Randomisation, "randomisation", randomisation)
-        self._size = _picture_size(width), _picture_size(height)
+        self._size = _pixels("width", width), _pixels("height", height)
         self.observation_space = spaces.Dict(
             {
                 "observation": _box(_OBSERVATION_BOUND, self.task.observation_size),
@@ -219,7 +229,11 @@ class TPMEnv(gym.Env[Observation, Action]):
         self._closed = False
         self._shown = 0.0  # when the last frame was due, s of the performance counter
         self._engine, self._physics, self._renderer = engine, physics, renderer
-        self._kind = (type(self.task), self.machine, engine, self.randomisation, physics)
+        # As a dictionary, which is what a spec that went through JSON has.
+        numerics = physics
+        if is_dataclass(physics) and not isinstance(physics, type):
+            numerics = asdict(physics)
+        self._kind = (type(self.task), self.machine, engine, self.randomisation, numerics)
         self.simulation = self._start()
 
     def _start(self) -> Simulation:
@@ -285,8 +299,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         """
         values = finite("action", action, (self.task.action_size,), ActionError)
         state = self._require_state()
-        queue = (*self._pending, np.minimum(np.maximum(values, -1.0), 1.0))
-        values, self._pending = queue[0], queue[1:]
+        values, *pending = (*self._pending, np.minimum(np.maximum(values, -1.0), 1.0))
         command = self.control.command(values[:3], self.machine.mount.to_paper(state.command))
         vacuum = self.task.vacuum and bool(values[3] > 0)
         self._state = None  # until the step has gone well
@@ -295,6 +308,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         except ModeChangeError:
             self._state = state  # nothing has moved
             raise
+        self._pending = tuple(pending)
         observation, info = self._report(self._state)
         reward = info["reward_terms"]["goal"] + _goal_free(info)
         if self.render_mode == "human":
@@ -371,13 +385,9 @@ class TPMEnv(gym.Env[Observation, Action]):
             EpisodeError: If there is no episode.
         """
         self._require_state()
-        return EnvSnapshot(
-            self.simulation.save(),
-            dict(self.np_random.bit_generator.state),
-            self._goal.copy(),
-            self._pending,
-            self._kind,
-        )
+        rng = dict(self.np_random.bit_generator.state)
+        moment = (self.simulation.save(), rng, self.goal, self._pending, self._kind)
+        return EnvSnapshot(*moment, _digest(moment))
 
     def restore_state(self, snapshot: EnvSnapshot) -> Observation:
         """Go back to a moment that :meth:`save_state` took down.
@@ -387,33 +397,21 @@ class TPMEnv(gym.Env[Observation, Action]):
 
         Raises:
             EpisodeError: If the environment is closed.
-            InputError: If the moment is none, that of another kind of environment, or was tampered
-                with; goal and rng are then as they were, and a new episode has to be started.
+            InputError: If the moment is none, was changed, or is that of another kind of
+                environment; nothing has happened then.
         """
         self._require_open()
-        if not isinstance(snapshot, EnvSnapshot):
-            raise InputError("snapshot", snapshot, "what save_state() returned")
+        if not isinstance(snapshot, EnvSnapshot) or not snapshot.is_intact():
+            raise InputError("snapshot", type(snapshot), "what save_state() returned, unchanged")
         if snapshot.kind != self._kind:
-            raise InputError(
-                "snapshot", snapshot.kind, f"of the same task and options, {self._kind}"
-            )
-        self._state = None
-        try:
-            rng = type(self.np_random.bit_generator)()
-            rng.state = snapshot.rng
-            goal = finite("goal", snapshot.goal, self._goal.shape).copy()
-            state = self.simulation.restore(snapshot.simulation)
-            observation = self._observe(state, goal)
-        except TPMError:
-            raise
-        except Exception as error:  # whatever values of any kind can lead to
-            raise InputError(
-                "snapshot", repr(error), "what save_state() returned, intact"
-            ) from error
+            valid = f"of the same task and options, {self._kind}"
+            raise InputError("snapshot", snapshot.kind, valid)
         self.np_random.bit_generator.state = snapshot.rng
-        self._goal, self._pending, self._state = goal, snapshot.pending, state
+        self._goal, self._pending = snapshot.goal.copy(), snapshot.pending
+        self._state = None
         self._show_goal()
-        return observation
+        self._state = self.simulation.restore(snapshot.simulation)
+        return self._observe(self._state, self._goal)
 
     # -- inside ---------------------------------------------------------------------------------
 
@@ -499,8 +497,13 @@ def _clip(values: FloatArray, bound: float) -> NDArray[np.float32]:
     return clipped
 
 
-def _picture_size(value: Any) -> int:
-    """Width or height of a picture in pixels."""
+def _pixels(name: str, value: Any) -> int:
     if isinstance(value, (int, np.integer)) and 16 <= value <= 4096:
         return int(value)
-    raise ConfigurationError("width or height", value, "a whole number of pixels from 16 to 4096")
+    raise ConfigurationError(name, value, "a whole number of pixels from 16 to 4096")
+
+
+def _digest(values: tuple[Any, ...]) -> str:
+    """A hash of plain data; of its repr, which unlike a pickle tells values, not identities."""
+    with np.printoptions(threshold=sys.maxsize, floatmode="unique"):
+        return hashlib.sha256(repr(values).encode()).hexdigest()

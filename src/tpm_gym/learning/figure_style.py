@@ -32,7 +32,7 @@ REACHED, OUTLINE = "#EBEBEB", "#8C8C8C"  # the reachable set, and its edge
 
 LENGTHS = "lengths of the paper's case study"
 
-_SETTINGS = {
+_SETTINGS: dict[Any, Any] = {
     "font.size": 8.0,
     "axes.titlesize": 8.0,
     "axes.labelsize": 8.0,

@@ -19,13 +19,13 @@ _COLUMNS: Final = 3
 
 
 def write_video(path: Path, env: GoalEnv, policy: Policy, episodes: int, first_seed: int) -> None:
-    """Write an MP4 of some episodes, at the speed of the robot.
+    """Write an MP4 of some episodes in one piece, at the speed of the robot.
 
     Args:
-        path: The file; written in one piece.
+        path: The file.
         env: An environment that renders ``rgb_array``.
         policy: What acts.
-        episodes: Number of episodes.
+        episodes: How many.
         first_seed: Seed of the first one; the following count up.
     """
     import imageio.v2 as imageio
@@ -43,11 +43,7 @@ def write_video(path: Path, env: GoalEnv, policy: Policy, episodes: int, first_s
 def write_contact_sheet(path: Path, env: GoalEnv, policy: Policy, seed: int) -> None:
     """Write a PNG of one episode: six moments from first to last, row by row.
 
-    Args:
-        path: The file; written in one piece.
-        env: An environment that renders ``rgb_array``.
-        policy: What acts.
-        seed: Seed of the episode.
+    ``env`` renders ``rgb_array``.
     """
     import imageio.v3 as imageio
 

@@ -15,19 +15,16 @@ from typing import TYPE_CHECKING, Any, Final, Protocol, cast
 import gymnasium as gym
 import numpy as np
 
+from tpm_gym import TPMError
+from tpm_gym.learning.algorithms import ALGORITHMS, NAMES
 from tpm_gym.learning.errors import PolicyError
+from tpm_gym.learning.recipes import with_classes
 from tpm_gym.learning.rollout import Action, GoalEnv, Observation, Policy
+from tpm_gym.learning.run_folder import BEST_FILE, CONFIG_FILE, EXPORTED, LAST_FILE
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
-CONFIG_FILE: Final = "config.json"
-EVALUATIONS_FILE: Final = "evaluations.jsonl"
-TESTS: Final = "tests"
-BEST_FILE: Final = "best.zip"
-LAST_FILE: Final = "last.zip"
-EXPORTED: Final = (".json", ".safetensors")
-ALGORITHMS: Final = ("sac", "tqc", "ppo")
 SCRIPTED: Final = ("expert", "random")
 
 
@@ -48,11 +45,7 @@ class _Expert(Protocol):
 
 @dataclass(frozen=True)
 class TrainedPolicy:
-    """Acts with the mean action of a trained algorithm.
-
-    Attributes:
-        model: The Stable-Baselines3 algorithm.
-    """
+    """Acts with the mean action of a trained algorithm."""
 
     model: Predictor
 
@@ -66,11 +59,7 @@ class TrainedPolicy:
 
 
 class RandomPolicy:
-    """Draws actions uniformly, from a generator seeded anew in every episode.
-
-    Args:
-        space: The action space.
-    """
+    """Draws actions uniformly, from a generator seeded anew in every episode."""
 
     def __init__(self, space: gym.spaces.Box) -> None:
         """Remember the space; the generator is seeded by ``reset``."""
@@ -88,11 +77,7 @@ class RandomPolicy:
 
 @dataclass(frozen=True)
 class ExpertPolicy:
-    """Acts with the scripted controller of tpm_gym.
-
-    Attributes:
-        expert: The controller.
-    """
+    """Acts with the scripted controller of tpm_gym."""
 
     expert: _Expert
 
@@ -110,7 +95,7 @@ def load_policy(spec: str, env: GoalEnv, *, trust_pickle: bool = False) -> Polic
 
     Args:
         spec: ``expert``, ``random``, an exported policy (either of its files, or their common
-            name), a .zip file saved by train.py, or the folder of a run (its best policy).
+            name), a .zip file of a training, or the folder of a run (its best policy).
         env: The environment the policy will act in.
         trust_pickle: Whether a .zip file may be loaded, which can run any code that is in it.
 
@@ -120,7 +105,7 @@ def load_policy(spec: str, env: GoalEnv, *, trust_pickle: bool = False) -> Polic
     """
     if spec == "random":
         if not isinstance(env.action_space, gym.spaces.Box):
-            raise PolicyError(spec, f"needs a Box action space, not {env.action_space}")
+            raise refused(spec, f"needs a Box action space, not {env.action_space}")
         return RandomPolicy(env.action_space)
     if spec == "expert":
         from tpm_gym.tasks.expert import Expert
@@ -148,13 +133,17 @@ def trained_env(spec: str) -> str | None:
     path = _policy_file(spec)
     if path.suffix not in EXPORTED:
         return str(run_config(spec, path)["env"])
-    from tpm_gym import TPMError
     from tpm_gym.policy.files import read_description
 
     try:
         return read_description(path).env_id
     except TPMError as error:
-        raise PolicyError(spec, str(error)) from error
+        raise refused(spec, str(error)) from error
+
+
+def refused(spec: object, problem: str) -> PolicyError:
+    """Return the error about a policy that was named as ``spec``."""
+    return PolicyError(f"policy {str(spec)!r}: {problem}")
 
 
 def require_trust(spec: str, path: Path, trusted: bool) -> None:
@@ -164,11 +153,11 @@ def require_trust(spec: str, path: Path, trusted: bool) -> None:
         PolicyError: It is not trusted.
     """
     if not trusted:
-        raise PolicyError(
+        raise refused(
             spec,
             f"{path} holds pickles, and loading it can run any code; if you trust where it comes "
             "from, give --trust-pickle, or convert it once and share that instead: "
-            f"python train/export.py {path} {path.with_suffix('')} --trust-pickle",
+            f"tpm-gym export {path} {path.with_suffix('')} --trust-pickle",
         )
 
 
@@ -186,10 +175,10 @@ def _policy_file(spec: str) -> Path:
         if candidate.is_file():
             return candidate
     looked_for = " or ".join(str(candidate) for candidate in candidates)
-    raise PolicyError(
+    raise refused(
         spec,
         f"no file {looked_for}; expected {', '.join(SCRIPTED)}, an exported policy (.json), a .zip "
-        "saved by train.py, or the folder of a run",
+        "of a training, or the folder of a run",
     )
 
 
@@ -197,7 +186,7 @@ def run_config(spec: str, path: Path) -> dict[str, Any]:
     """Return the run's configuration, from beside or above a .zip file.
 
     Raises:
-        PolicyError: There is none, or it lacks what train.py writes.
+        PolicyError: There is none, or it lacks what a training writes.
     """
     folders = path.resolve().parents[:2]  # the run folder, or one inside it
     for folder in folders:
@@ -207,19 +196,18 @@ def run_config(spec: str, path: Path) -> dict[str, Any]:
         try:
             content = json.loads(file.read_text(encoding="utf-8"))
         except (ValueError, RecursionError) as error:
-            raise PolicyError(spec, f"{file} is damaged: {error}") from error
+            raise refused(spec, f"{file} is damaged: {error}") from error
         for key in ("algo", "env", "seed", "recipe"):
             if not isinstance(content, dict) or key not in content:
-                raise PolicyError(spec, f"{file} is damaged: no entry {key!r}")
+                raise refused(spec, f"{file} is damaged: no entry {key!r}")
         return cast(dict[str, Any], content)
-    raise PolicyError(
+    raise refused(
         spec, f"no {CONFIG_FILE} beside {path.name} or above it; keep the file in its run folder"
     )
 
 
 def _load_exported(spec: str, path: Path, env: GoalEnv) -> Predictor:
     """Load an exported policy and make sure that it fits."""
-    from tpm_gym import TPMError
     from tpm_gym.policy.policy import load_policy as load_safely  # imports torch
 
     _use_one_thread()
@@ -227,7 +215,7 @@ def _load_exported(spec: str, path: Path, env: GoalEnv) -> Predictor:
         policy = load_safely(path)
         policy.check(env)
     except TPMError as error:
-        raise PolicyError(spec, str(error)) from error
+        raise refused(spec, str(error)) from error
     return policy
 
 
@@ -244,32 +232,27 @@ def load_model(spec: str, path: Path) -> BaseAlgorithm:
     Raises:
         PolicyError: It cannot be loaded.
     """
-    algorithm = run_config(spec, path)["algo"]
+    config = run_config(spec, path)
+    algorithm = config["algo"]
     if algorithm not in ALGORITHMS:
-        raise PolicyError(spec, f"algorithm {algorithm!r} is none of {', '.join(ALGORITHMS)}")
+        raise refused(spec, f"algorithm {algorithm!r} is none of {NAMES}")
     _use_one_thread()
     # Acting stores nothing: no room is needed, nor a hindsight buffer, which would ask for an
     # environment.
-    unused: dict[str, Any] = {
+    replaced: dict[str, Any] = {
         "replay_buffer_class": None,
         "replay_buffer_kwargs": {},
         "buffer_size": 1,
     }
     try:
-        return algorithm_class(algorithm).load(path, device="cpu", custom_objects=unused)
+        arguments = config["recipe"].get("arguments", {})
+        if "features_extractor_class" in arguments.get("policy_kwargs", {}):
+            # The archive's pickle names the module that this class was in, and it may have moved.
+            replaced["policy_kwargs"] = with_classes(arguments)["policy_kwargs"]
+        kind = ALGORITHMS[algorithm].load_class()
+        return kind.load(path, device="cpu", custom_objects=replaced)
     except Exception as error:  # A damaged archive or pickle can raise anything at all.
-        raise PolicyError(spec, f"cannot be loaded as {algorithm}: {error}") from error
-
-
-def algorithm_class(name: str) -> type[BaseAlgorithm]:
-    """Return the Stable-Baselines3 class of an algorithm in ``ALGORITHMS``."""
-    if name == "tqc":
-        from sb3_contrib import TQC
-
-        return TQC
-    from stable_baselines3 import PPO, SAC
-
-    return SAC if name == "sac" else PPO
+        raise refused(spec, f"cannot be loaded as {algorithm}: {error}") from error
 
 
 def _check_spaces(spec: str, model: BaseAlgorithm, env: GoalEnv) -> None:
@@ -280,6 +263,6 @@ def _check_spaces(spec: str, model: BaseAlgorithm, env: GoalEnv) -> None:
     }
     for kind, (trained, given) in pairs.items():
         if trained != given:
-            raise PolicyError(
+            raise refused(
                 spec, f"was trained with {kind} space {trained}, the environment has {given}"
             )

@@ -1,11 +1,11 @@
-"""Run a policy over seeded episodes and summarise what happened, with 95% intervals.
+"""Run a policy over seeded episodes, and condense what happened.
 
 Seeds fall into three ranges that never meet, so no figure is taken on episodes that a policy has
 trained on or was selected by:
 
 - below ``SELECTION_SEED``: training;
 - from ``SELECTION_SEED``: the periodic evaluations during training, which select ``best.zip``;
-- from ``TEST_SEED``: ``evaluate.py``.
+- from ``TEST_SEED``: ``tpm-gym evaluate``.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tpm_gym.learning.errors import RolloutError
+from tpm_gym.learning.estimates import Estimate, bootstrap, wilson
 from tpm_gym.tasks.rewards import SAFE_CONDITIONING
 
 SELECTION_SEED: Final = 1_000_000
@@ -28,11 +29,6 @@ TEST_SEED: Final = 2_000_000
 Observation: TypeAlias = dict[str, NDArray[Any]]
 Action: TypeAlias = NDArray[Any]
 GoalEnv: TypeAlias = gym.Env[Observation, Action]
-
-_Z95: Final = 1.959963984540054  # 97.5% quantile of the standard normal distribution
-_BOOTSTRAP_SAMPLES: Final = 2000
-_BOOTSTRAP_BLOCK: Final = 100
-_BOOTSTRAP_SEED: Final = 0  # fixed: the same records always give the same interval
 
 
 class Policy(Protocol):
@@ -88,27 +84,6 @@ class Episode:
         }
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """A mean over episodes with its 95% interval.
-
-    Attributes:
-        mean: Sample mean.
-        low: Lower end of the interval.
-        high: Upper end of the interval.
-        worst: The worst value of any step of any episode, where the metric has one.
-    """
-
-    mean: float
-    low: float
-    high: float
-    worst: float | None = None
-
-    def as_dict(self) -> dict[str, float]:
-        """Return the estimate as plain data, without ``worst`` where there is none."""
-        return {name: value for name, value in vars(self).items() if value is not None}
-
-
 def run_episodes(
     env: GoalEnv,
     policy: Policy,
@@ -121,10 +96,10 @@ def run_episodes(
     """Run a policy for a number of episodes; the same arguments give the same records.
 
     Args:
-        env: The environment; left open.
+        env: Left open.
         policy: What acts.
-        episodes: Number of episodes.
-        first_seed: Seed of the first episode; episode i is reset with ``first_seed + i``.
+        episodes: How many.
+        first_seed: Episode i is reset with ``first_seed + i``.
         on_frame: Called after every reset and every step, for example to record a video.
         on_episode: Called after every episode, for example to move a progress bar.
 
@@ -189,7 +164,8 @@ def _record(
         for step, value in enumerate(values):
             # A NaN would pass through min and max unseen, depending on where it stands.
             if not math.isfinite(value):
-                raise RolloutError(seed, step * len(rewards) // len(values), name, value)
+                where = f"episode with seed {seed}, step {step * len(rewards) // len(values)}"
+                raise RolloutError(f"{where}: {name} is {value!r}, expected a finite number")
     return Episode(
         seed=seed,
         success_at_end=successes[-1],
@@ -254,40 +230,3 @@ def summarise(records: Sequence[Episode]) -> dict[str, Estimate]:
         if None not in values:
             metrics[name] = bootstrap(values, worst=max(values))
     return metrics
-
-
-def wilson(outcomes: Sequence[bool]) -> Estimate:
-    """Return a success rate with its 95% Wilson score interval (Wilson 1927).
-
-    Args:
-        outcomes: One outcome per episode, at least one.
-    """
-    n = len(outcomes)
-    rate = sum(outcomes) / n
-    spread = _Z95**2 / n
-    centre = (rate + spread / 2) / (1 + spread)
-    half = _Z95 / (1 + spread) * math.sqrt(rate * (1 - rate) / n + spread / (4 * n))
-    # At rates of 0 and 1 one end equals the rate but for rounding, which must not exclude the rate.
-    return Estimate(rate, max(0.0, min(rate, centre - half)), min(1.0, max(rate, centre + half)))
-
-
-def bootstrap(values: Sequence[float], worst: float | None = None) -> Estimate:
-    """Return a mean with its 95% percentile bootstrap interval (Efron 1979).
-
-    Args:
-        values: One value per episode, at least one.
-        worst: Passed on to the estimate.
-    """
-    sample = np.asarray(values, dtype=np.float64)  # (n,)
-    rng = np.random.default_rng(_BOOTSTRAP_SEED)
-    # Not all resamples at once: with many episodes their matrix would not fit in memory.
-    means = np.concatenate(
-        [
-            sample[rng.integers(0, sample.size, (_BOOTSTRAP_BLOCK, sample.size))].mean(axis=1)
-            for _ in range(_BOOTSTRAP_SAMPLES // _BOOTSTRAP_BLOCK)
-        ]
-    )
-    low, high = np.percentile(means, [2.5, 97.5])
-    mean = float(sample.mean())
-    # Equal values can differ from their mean by rounding; the interval must still hold the mean.
-    return Estimate(mean, min(mean, float(low)), max(mean, float(high)), worst)

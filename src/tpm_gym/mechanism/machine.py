@@ -20,8 +20,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tpm_gym.arrays import FloatArray, Vector
-from tpm_gym.errors import ConfigurationError, SingularityError, TPMError, UnreachableError
+from tpm_gym.arrays import FloatArray, Vector, vector
+from tpm_gym.errors import ConfigurationError, SingularityError, UnreachableError
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism.bodies import Mechanism
 from tpm_gym.mechanism.mount import Mount
@@ -66,7 +66,8 @@ class Machine(ABC):
         table: Half edges of the table along x and y, m; its top is the world's z = 0.
 
     Raises:
-        ConfigurationError: If a value cannot be, or home or the goals lie outside the region.
+        ConfigurationError: If a value cannot be, home or the goals lie outside the region, or the
+            region reaches beyond a singularity.
         UnreachableError: If a corner of the region cannot be reached.
     """
 
@@ -83,18 +84,26 @@ class Machine(ABC):
     def __post_init__(self) -> None:
         """Reject machines on which no episode could run."""
         for name, point in (
-            ("home", self.home),
+            ("home", vector("home", self.home, ConfigurationError)),
             ("goal_region", self.goal_region.low),
             ("goal_region", self.goal_region.high),
         ):
             if not self.region.contains(point):
                 raise ConfigurationError(name, point, f"inside the region, {self.region}")
-        if not (min(self.step_limit) > 0 and self.joint_limit > 0):
-            raise ConfigurationError("step_limit", self.step_limit, "positive, as joint_limit")
-        if not 0 <= self.safe_conditioning <= 1:
-            raise ConfigurationError("safe_conditioning", self.safe_conditioning, "from 0 to 1")
+        limits = {
+            "step_limit": vector("step_limit", self.step_limit, ConfigurationError),
+            "joint_limit": (self.joint_limit,),
+            "table": self.table,
+        }
+        for name, values in limits.items():
+            if not min(values) > 0:
+                raise ConfigurationError(name, getattr(self, name), "positive")
+        if not 0 < self.safe_conditioning <= 1:  # the penalty is in units of it
+            raise ConfigurationError("safe_conditioning", self.safe_conditioning, "in (0, 1]")
         for corner in self.region.corners():
-            self.evaluate(self.inverse(corner))
+            if (mode := self.mode_left(self.inverse(corner), corner)) is not None:
+                valid = f"in one {mode} mode; {corner} is beyond a singularity"
+                raise ConfigurationError("region", self.region, valid)
 
     # -- kinematics -------------------------------------------------------------------------
 
@@ -200,7 +209,7 @@ class Machine(ABC):
         return self
 
     def occupied(self, position: ArrayLike) -> list[tuple[FloatArray, FloatArray]]:
-        """Boxes (low, high corner, m, world) around platform and tool with P at ``position``."""
+        """Boxes around platform and tool with P at ``position``: low and high corners, m, world."""
         platform = np.asarray(position, dtype=np.float64) - self.mechanism.point_p
         boxes = []
         for name in (self.mechanism.platform, self.mechanism.tool):
@@ -222,7 +231,7 @@ def register_machine(name: str, machine: Machine | Callable[[], Machine]) -> Non
     Raises:
         ConfigurationError: If the name is taken by another machine.
     """
-    if _MACHINES.get(name, machine) is not machine:
+    if _MACHINES.get(name, machine) != machine:
         raise ConfigurationError("machine", name, f"a name other than {', '.join(_MACHINES)}")
     _MACHINES[name] = machine
 
@@ -233,11 +242,9 @@ def find_machine(machine: Any) -> Machine:
     Raises:
         ConfigurationError: If there is none of that name, or it is no machine.
     """
-    found = _MACHINES.get(machine, machine) if isinstance(machine, str) else machine
-    try:
-        found = found() if callable(found) and not isinstance(found, Machine) else found
-    except TPMError:
-        raise
+    found = _MACHINES.get(machine) if isinstance(machine, str) else machine
+    if isinstance(machine, str) and callable(found):
+        found = found()
     if not isinstance(found, Machine):
         names = ", ".join(map(repr, _MACHINES))
         raise ConfigurationError("machine", machine, f"{names}, or a tpm_gym.Machine")

@@ -45,9 +45,7 @@ _AXIS_RPY = {
 def urdf_text(mechanism: Mechanism) -> str:
     """The spanning tree as URDF, in the paper frame."""
     root = ElementTree.Element("robot", name="tpm")
-    root.append(
-        ElementTree.Comment(" Generated from tpm_gym.mechanism; do not edit (make urdf). ")
-    )
+    root.append(ElementTree.Comment(" Generated from tpm_gym.mechanism; do not edit (make urdf). "))
     for name, rgba in COLOURS.items():
         material = ElementTree.SubElement(root, "material", name=name)
         ElementTree.SubElement(material, "color", rgba=_numbers(rgba))

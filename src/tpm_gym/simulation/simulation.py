@@ -34,6 +34,14 @@ CLOSURE_LIMIT = 0.005
 """A loop that is open by more than this is lost, m."""
 
 _ZERO: Vector = (0.0, 0.0, 0.0)
+_OF_OBJECTS = {
+    "object_position": slice(0, 3),
+    "object_quaternion": slice(3, 7),
+    "object_axis": slice(7, 10),
+    "object_velocity": slice(10, 13),
+    "object_angular_velocity": slice(13, 16),
+}
+"""Columns in which an object's entries of a State are read."""
 
 
 @dataclass(frozen=True)
@@ -239,19 +247,12 @@ class Simulation:
 
     def _read_objects(self) -> dict[str, FloatArray]:
         """The entries of a State about the scene's objects."""
-        read = self.engine.objects()
-        quaternions = [pose.quaternion for pose, _ in read]
-        columns = {
-            "object_position": ([pose.position for pose, _ in read], 3),
-            "object_quaternion": (quaternions, 4),
-            "object_axis": ([rotate(turn, (0.0, 0.0, 1.0)) for turn in quaternions], 3),
-            "object_velocity": ([twist.velocity for _, twist in read], 3),
-            "object_angular_velocity": ([twist.angular_velocity for _, twist in read], 3),
-        }
-        return {
-            name: np.array(rows, dtype=np.float64) if rows else np.empty((0, width))
-            for name, (rows, width) in columns.items()
-        }
+        rows = [
+            (*position, *turn, *rotate(turn, (0.0, 0.0, 1.0)), *velocity, *angular_velocity)
+            for (position, turn), (velocity, angular_velocity) in self.engine.objects()
+        ]
+        table = np.array(rows, dtype=np.float64).reshape(-1, 16)
+        return {name: table[:, columns] for name, columns in _OF_OBJECTS.items()}
 
     def _disturb(self, theta: Vector, rates: Vector) -> tuple[Vector, Vector]:
         """What the encoders report: with their bias and noise, and rates by differences."""

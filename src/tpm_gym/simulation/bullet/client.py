@@ -38,7 +38,8 @@ class Client:
         renderer: ``"tiny"`` (None too) draws on the CPU anywhere; ``"egl"`` on a GPU.
 
     Attributes:
-        renderer: The engine's number of the renderer.
+        number: The engine's of this client.
+        renderer: The engine's of the renderer.
 
     Raises:
         ConfigurationError: If no window opened, or EGL was asked for and is not there.
@@ -46,9 +47,9 @@ class Client:
 
     def __init__(self, physics: Physics, gui: bool = False, renderer: str | None = None) -> None:
         """Connect and configure."""
-        self._number = _connect(gui)
+        self.number = _connect(gui)
         # An environment that is dropped without close() would keep its 28 MB until the end.
-        self._disconnect = weakref.finalize(self, _disconnect, self._number)
+        self._disconnect = weakref.finalize(self, _disconnect, self.number)
         try:
             self.renderer = self._load_renderer(renderer)
             self.configure(physics)
@@ -60,7 +61,7 @@ class Client:
         """The engine's function of that name, bound to this client, or its constant."""
         value = getattr(pybullet, name)
         if callable(value):
-            value = partial(value, physicsClientId=self._number)
+            value = partial(value, physicsClientId=self.number)
         setattr(self, name, value)
         return value
 

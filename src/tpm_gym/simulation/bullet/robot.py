@@ -47,23 +47,28 @@ class Robot:
         client: The physics client.
         mechanism: What to load.
         mount: Where the base hangs.
+
+    Attributes:
+        bodies: Numbers of the legs in the client.
+        joints: Where each joint is, by name.
+        links: Where each link but the base is, by name.
+        tool: Where the link with the vacuum cup is.
     """
 
     def __init__(self, client: Client, mechanism: Mechanism, mount: Mount) -> None:
         """Load the legs, take out what the engine adds on its own, close the loops."""
         self._client, self._mechanism = client, mechanism
-        self._joints: dict[str, Address] = {}
-        self._links: dict[str, Address] = {}
+        self.joints: dict[str, Address] = {}
+        self.links: dict[str, Address] = {}
         self.bodies = [self._load(leg, mount) for leg in mechanism.legs()]
-        self._motors = [self._joints[name] for name in mechanism.actuated]
-        self._inertias = {link: self._inertia(link) for link in self._links.values()}
+        self._motors = [self.joints[name] for name in mechanism.actuated]
+        self._inertias = {link: self._inertia(link) for link in self.links.values()}
         joints = {link.joint.name: link.joint for link in mechanism.links if link.joint}
         self._nominal_effort = [joints[name].effort for name in mechanism.actuated]
         self._effort = self._nominal_effort
-        self._platform = self._links[mechanism.platform]
         slide = mechanism.link(mechanism.tool).joint
         assert slide is not None
-        self.tool = self._links[mechanism.tool]
+        self.tool = self.links[mechanism.tool]
         client.setJointMotorControl2(
             *self.tool,
             client.POSITION_CONTROL,
@@ -85,7 +90,7 @@ class Robot:
             )
         for index in range(client.getNumJoints(body)):
             info = client.getJointInfo(body, index)
-            self._joints[info[1].decode()] = self._links[info[12].decode()] = (body, index)
+            self.joints[info[1].decode()] = self.links[info[12].decode()] = (body, index)
             # PyBullet adds damping to everything and a motor to every joint; we want neither.
             client.changeDynamics(
                 body, index, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0
@@ -101,30 +106,29 @@ class Robot:
     def _close_loops(self) -> None:
         """Close the loops; the engine wants pivots relative to the centres of mass."""
         client = self._client
-        self._pairs: list[tuple[tuple[Address, Vector], tuple[Address, Vector]]] = []
+        watched = {self.links[self._mechanism.platform]}
         for closure in self._mechanism.closures:
             sides = ((closure.link_a, closure.point_a), (closure.link_b, closure.point_b))
-            (body_a, link_a), (body_b, link_b) = (self._links[name] for name, _ in sides)
+            link_a, link_b = (self.links[name] for name, _ in sides)
             pivots = [self._pivot(name, point) for name, point in sides]
             constraint = client.createConstraint(
-                body_a,
-                link_a,
-                body_b,
-                link_b,
+                *link_a,
+                *link_b,
                 client.JOINT_POINT2POINT,
                 (0.0, 0.0, 0.0),
                 pivots[0].tolist(),
                 pivots[1].tolist(),
             )
             client.changeConstraint(constraint, maxForce=_CLOSURE_FORCE)
-            end_a, end_b = ((self._links[name], point) for name, point in sides)
-            self._pairs.append((end_a, end_b))
+            watched |= {link_a, link_b}
         # One call of the engine a leg is cheaper than one a link.
-        self._watched: dict[int, list[int]] = {}
-        for body, link in sorted(
-            {self._platform, *(end[0] for pair in self._pairs for end in pair)}
-        ):
-            self._watched.setdefault(body, []).append(link)
+        order = sorted(watched)
+        self._watched = {body: [link for of, link in order if of == body] for body, _ in order}
+        at = {name: order.index(link) for name, link in self.links.items() if link in watched}
+        self._platform = at[self._mechanism.platform]
+        self._pairs = [
+            (at[c.link_a], c.point_a, at[c.link_b], c.point_b) for c in self._mechanism.closures
+        ]
 
     def _pivot(self, name: str, point: Vector) -> NDArray[np.float64]:
         """A link's point relative to its centre of mass, m.
@@ -151,7 +155,7 @@ class Robot:
             places = (
                 [(body, -1) for body in self.bodies]
                 if link.joint is None
-                else [self._links[link.name]]
+                else [self.links[link.name]]
             )
             for place in places:
                 self._client.changeVisualShape(*place, rgbaColor=urdf.COLOURS[largest.colour])
@@ -159,7 +163,7 @@ class Robot:
     def place(self, angles: Mapping[str, float]) -> None:
         """Put every joint at its angle (rad), at rest."""
         for name, angle in angles.items():
-            self._client.resetJointState(*self._joints[name], angle, 0.0)
+            self._client.resetJointState(*self.joints[name], angle, 0.0)
 
     def alter(self, mass_factors: Sequence[float], motor_strength: Sequence[float]) -> None:
         """Scale the masses of the moving links (empty: all nominal) and the motors' torques."""
@@ -188,25 +192,26 @@ class Robot:
 
     def joint_states(self) -> tuple[tuple[float, float], ...]:
         """Angle and rate of every joint, passive ones too."""
-        states = (self._client.getJointState(*joint) for joint in self._joints.values())
+        states = (self._client.getJointState(*joint) for joint in self.joints.values())
         return tuple((state[0], state[1]) for state in states)
 
     def set_joint_states(self, states: tuple[tuple[float, float], ...]) -> None:
         """Put every joint at an angle and rate that :meth:`joint_states` gave."""
-        for joint, (angle, rate) in zip(self._joints.values(), states, strict=True):
+        for joint, (angle, rate) in zip(self.joints.values(), states, strict=True):
             self._client.resetJointState(*joint, angle, rate)
 
     def truth(self) -> Truth:
         """Largest loop gap (m), platform position (m, world) and platform tilt (rad)."""
-        frames: dict[Address, Frame] = {}
-        for body, links in self._watched.items():
-            states = self._client.getLinkStates(body, links, computeForwardKinematics=True)
-            for link, state in zip(links, states, strict=True):
-                frames[body, link] = state[4], state[5]
+        read = self._client.getLinkStates
+        frames: list[Frame] = [
+            state[4:6]
+            for body, links in self._watched.items()
+            for state in read(body, links, computeForwardKinematics=True)
+        ]
         squared = 0.0
-        for (link_a, point_a), (link_b, point_b) in self._pairs:
-            x, y, z = transform(*frames[link_a], point_a)
-            u, v, w = transform(*frames[link_b], point_b)
+        for at_a, point_a, at_b, point_b in self._pairs:
+            x, y, z = transform(*frames[at_a], point_a)
+            u, v, w = transform(*frames[at_b], point_b)
             squared = max(squared, (x - u) ** 2 + (y - v) ** 2 + (z - w) ** 2)
         origin, turn = frames[self._platform]
         # The platform should stand as the base does: a half turn about x, quaternion (1, 0, 0, 0).

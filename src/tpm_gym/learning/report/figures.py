@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
 from tpm_gym.learning import figure_style
-from tpm_gym.learning.aggregate import LEARNED
+from tpm_gym.learning.estimates import LEARNED
 from tpm_gym.learning.provenance import write_whole
-from tpm_gym.learning.report_page import (
+from tpm_gym.learning.report.page import (
     LEARNING_CURVES,
     PENALTY,
     TEMPTING,
@@ -33,7 +33,7 @@ def draw(records: Sequence[Record], folder: Path) -> list[Path]:
     """Draw what there are records for.
 
     Args:
-        records: What ``results.condense`` gave, one a run.
+        records: What ``records.condense`` gave, one a run.
         folder: Where the figures go.
 
     Returns:
