@@ -64,6 +64,7 @@ def scripted_step(
         "reward": reward,
         "is_success": success,
         "conditioning": conditioning,
+        "singularity_penalty": max(0.0, 1 - (conditioning / 0.08) ** 4),
         "closure_error": gap,
     }
 

@@ -182,7 +182,7 @@ def test_penalty_weight_and_goals_reach_every_environment_and_survive_resuming(
     assert len(made) == 5
     for env in made:
         inner: Any = env.unwrapped
-        assert inner.penalty_weight == 0.0
+        assert inner.task.penalty_weight == 0.0
         assert inner.task.goals == "tempting"
     again = json.loads((folder / "config.json").read_text(encoding="utf-8"))
     assert (again["penalty_weight"], again["goals"]) == (0.0, "tempting")

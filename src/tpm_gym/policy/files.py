@@ -145,7 +145,7 @@ class Description(_Entries):
     format: Literal["tpm_gym.policy"]
     version: int = Field(ge=VERSION, le=VERSION)  # a Literal would take true for 1
     env_id: str = Field(alias="env", pattern="^[A-Za-z0-9_.:/-]{1,100}$")
-    algorithm: Literal["sac", "tqc", "ppo"]
+    algorithm: _Key
     seed: _Count | None
     steps: _Count
     recipe: Annotated[dict[_Key, Any], Field(max_length=64)]
