@@ -23,7 +23,6 @@ from tpm_gym.learning import (
     EvaluationConfig,
     TrainingConfig,
     evaluate,
-    figure_style,
     study,
     train,
 )
@@ -239,12 +238,11 @@ def test_the_penalty_figure_has_a_dot_a_seed(real: dict[str, Any], tmp_path: Pat
         for seed in range(3)
         for weight in (0.0, 1.0)
     ]
-    style = figure_style
-    figure = penalty(records, style)
+    figure = penalty(records)
     dots = [line for line in figure.axes[0].lines if len(line.get_xdata()) == 3]
     assert len(dots) == 4  # two metrics at two weights
     assert [label.get_text() for label in figure.axes[0].get_xticklabels()] == ["0", "1"]
-    longer = penalty([*records, *(r | {"steps": 999} for r in records)], style)
+    longer = penalty([*records, *(r | {"steps": 999} for r in records)])
     labels = [label.get_text() for label in longer.axes[0].get_xticklabels()]
     assert labels == ["0\n120\nsteps", "1\n120\nsteps", "0\n999\nsteps", "1\n999\nsteps"]
     (path,) = draw(records, tmp_path)
@@ -253,7 +251,7 @@ def test_the_penalty_figure_has_a_dot_a_seed(real: dict[str, Any], tmp_path: Pat
 
 def test_the_learning_curve_is_the_median_with_a_band(real: dict[str, Any]) -> None:
     records = [changed(real, seed, rate) for seed, rate in enumerate([0.2, 0.9, 1.0])]
-    figure = learning_curves(records, figure_style)
+    figure = learning_curves(records)
     curve = figure.axes[0].lines[0]
     assert list(curve.get_xdata()) == [0, 60, 120]
     assert list(curve.get_ydata()) == [0.0, 0.9, 0.9]
