@@ -38,7 +38,6 @@ class PeriodicEvaluation(BaseCallback):
     alone. Each is appended to evaluations.jsonl and drawn; the best policy so far is kept.
 
     Args:
-        config: The completed configuration.
         env: An environment of its own, so that training is not disturbed.
         console: Where one line per evaluation is printed.
         keep: Called with the model whenever it is the best so far.
@@ -200,11 +199,7 @@ class Checkpointing(BaseCallback):
     The first is saved before anything else is done, so that no policy is ever without one.
 
     Args:
-        config: The completed configuration.
-        store: Where they are saved.
         evaluation: Whose state is part of a checkpoint.
-        listener: Says when to stop.
-        console: Where failures are reported.
         seconds: Seconds that earlier processes have trained.
     """
 

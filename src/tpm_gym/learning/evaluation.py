@@ -113,7 +113,6 @@ def evaluate(config: EvaluationConfig, console: Console | None = None) -> list[R
     """Evaluate the policies of a configuration and write what it asks for.
 
     Args:
-        config: The configuration.
         console: Where the table is printed; by default the standard output.
 
     Returns:

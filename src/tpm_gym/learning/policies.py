@@ -96,7 +96,6 @@ def load_policy(spec: str, env: GoalEnv, *, trust_pickle: bool = False) -> Polic
     Args:
         spec: ``expert``, ``random``, an exported policy (either of its files, or their common
             name), a .zip file of a training, or the folder of a run (its best policy).
-        env: The environment the policy will act in.
         trust_pickle: Whether a .zip file may be loaded, which can run any code that is in it.
 
     Raises:

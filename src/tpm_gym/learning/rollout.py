@@ -96,8 +96,6 @@ def run_episodes(
 
     Args:
         env: Left open.
-        policy: What acts.
-        episodes: How many.
         first_seed: Episode i is reset with ``first_seed + i``.
         on_frame: Called after every reset and every step, for example to record a video.
         on_episode: Called after every episode, for example to move a progress bar.
@@ -194,9 +192,6 @@ def summarise(records: Sequence[Episode]) -> dict[str, Estimate]:
 
     Success rates have Wilson intervals, which stay honest at 0 and 1; the others have percentile
     bootstrap intervals, and those that are the extreme of an episode the worst of all episodes.
-
-    Args:
-        records: The episodes, at least one.
     """
     values = {
         name: [record.as_dict()[name] for record in records]

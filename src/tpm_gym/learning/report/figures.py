@@ -44,10 +44,6 @@ _COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
 def draw(records: Sequence[Record], folder: Path) -> list[Path]:
     """Draw what there are records for.
 
-    Args:
-        records: What ``records.condense`` gave, one a run.
-        folder: Where the figures go.
-
     Returns:
         The figures.
     """
@@ -81,12 +77,7 @@ def _panels(count: int, title: str, height: float) -> tuple[Figure, list[Axes]]:
 
 
 def learning_curves(records: Sequence[Record]) -> Figure:
-    """Draw success against steps: a panel an id, a median and a band over seeds each method.
-
-    Args:
-        records: The runs.
-        style: The house
-    """
+    """Draw success against steps: a panel an id, a median and a band over seeds each method."""
     ids = sorted({record["env"] for record in records})
     names = sorted({method(record) for record in records})
     colours = dict(zip(names, _COLOURS, strict=False))
@@ -139,12 +130,7 @@ def _draw_band(axes: Axes, group: Group, colour: str) -> None:
 
 
 def penalty(records: Sequence[Record]) -> Figure:
-    """Draw success and time below safe by penalty weight: a dot a seed, a bar at the mean.
-
-    Args:
-        records: Runs on tempting goals, tested on them.
-        style: The house
-    """
+    """Draw success and time below safe by penalty weight: a dot a seed, a bar at the mean."""
     ids = sorted({record["env"] for record in records})
     title = "Goals that tempt towards the singularity, by penalty weight"
     figure, panels = _panels(len(ids), title, 2.4)

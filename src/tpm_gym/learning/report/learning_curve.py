@@ -18,13 +18,7 @@ Evaluations = Sequence[Mapping[str, Any]]
 
 
 def draw_learning_curve(path: Path, title: str, evaluations: Evaluations) -> None:
-    """Draw the periodic evaluations of a run.
-
-    Args:
-        path: The PNG file; replaced in one piece.
-        title: First line above the figure.
-        evaluations: The lines of evaluations.jsonl, at least one.
-    """
+    """Draw the periodic evaluations of a run."""
     with style():
         figure = Figure(figsize=(7.2, 4.8), layout="constrained")
         FigureCanvasAgg(figure)

@@ -66,12 +66,7 @@ it was then: `train/train.py` is `tpm-gym train`, `train/evaluate.py` is `tpm-gy
 
 
 def page(records: Sequence[Record], figures: Sequence[str]) -> str:
-    """Return the page as Markdown.
-
-    Args:
-        records: What ``records.condense`` gave, one a run.
-        figures: Names of the figures in images/.
-    """
+    """Return the page as Markdown."""
     plain = [r for r in records if r["goals"] == "sampled" and r["penalty_weight"] == 1.0]
     tempted = [r for r in records if r["goals"] == "tempting"]
     parts = [_INTRO, *_training(plain, figures), *_penalty(tempted, figures), *_robustness(plain)]
