@@ -32,6 +32,7 @@ lint: $(INSTALLED)
 	$(RUN) -m ruff check .
 	$(RUN) -m ruff format --check .
 	$(RUN) -m mypy
+	$(VENV)/bin/lint-imports --no-logo
 
 format: $(INSTALLED) ## rewrite the code in the house style
 	$(RUN) -m ruff check --fix .

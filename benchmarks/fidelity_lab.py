@@ -18,15 +18,7 @@ import pybullet
 import variants
 from machine import silence
 from numpy.typing import NDArray
-
-import tpm_gym  # noqa: F401  (registers the environments)
-from tpm_gym import kinematics
-from tpm_gym.kinematics import jacobian
-from tpm_gym.kinematics.workspace import TASK_REGION
 from tpm_gym.mechanism.links import MOTOR_EFFORT
-from tpm_gym.mechanism.tree import DEFAULT_MOUNT
-from tpm_gym.simulation.bullet.client import Client
-from tpm_gym.simulation.bullet.robot import Robot
 from tpm_gym.simulation.physics import (
     ASSEMBLY_LIMIT,
     CLOSURE_LIMIT,
@@ -36,6 +28,14 @@ from tpm_gym.simulation.physics import (
     Physics,
     spline_weights,
 )
+
+import tpm_gym  # noqa: F401  (registers the environments)
+from tpm_gym import kinematics
+from tpm_gym.kinematics import jacobian
+from tpm_gym.kinematics.workspace import TASK_REGION
+from tpm_gym.mechanism.tree import DEFAULT_MOUNT
+from tpm_gym.simulation.bullet.client import Client
+from tpm_gym.simulation.bullet.robot import Robot
 from tpm_gym.tasks.control import CartesianControl
 from tpm_gym.tasks.expert import Expert
 

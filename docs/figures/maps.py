@@ -13,15 +13,16 @@ from numpy.typing import NDArray
 from figures.zero_sets import Section, reach_margin
 from tpm_gym.kinematics import ELBOWS_OUT
 from tpm_gym.kinematics.geometry import PAPER
-from tpm_gym.kinematics.workspace import TASK_REGION, conditioning_at
+from tpm_gym.kinematics.workspace import conditioning_at
 from tpm_gym.learning import figure_style as style
 from tpm_gym.learning.figure_style import BLACK, BLUE, GREEN, MM, OUTLINE, VERMILLION
-from tpm_gym.tasks.rewards import SAFE_CONDITIONING
+from tpm_gym.mechanism import PAPER_TPM
 
 FloatArray = NDArray[np.float64]
 
 HEIGHTS = (0.005, 0.012, 0.025, 0.040, 0.048)  # values of y, m
-_LOW, _HIGH = TASK_REGION.low, TASK_REGION.high
+_SAFE = PAPER_TPM.safe_conditioning
+_LOW, _HIGH = PAPER_TPM.region.low, PAPER_TPM.region.high
 PROBES = (
     ((0.0, 0.75), BLUE, "-"),
     ((_LOW[0], _LOW[2]), VERMILLION, "--"),
@@ -29,7 +30,7 @@ PROBES = (
 )
 
 _X, _Z = np.linspace(-0.78, 0.96, 436), np.linspace(0.42, 1.17, 188)
-_TICKS = (0.0, 0.02, 0.05, SAFE_CONDITIONING, 0.15, 0.25, 0.35, 0.5)
+_TICKS = (0.0, 0.02, 0.05, _SAFE, 0.15, 0.25, 0.35, 0.5)
 
 
 def conditioning_figure() -> Figure:
@@ -48,11 +49,11 @@ def conditioning_figure() -> Figure:
         image = axes.pcolormesh(
             _X * MM, _Z * MM, np.ma.masked_equal(value, 0.0), cmap="viridis", norm=norm
         )
-        axes.contour(_X * MM, _Z * MM, value, [SAFE_CONDITIONING], colors="white", linewidths=1.4)
+        axes.contour(_X * MM, _Z * MM, value, [_SAFE], colors="white", linewidths=1.4)
         axes.contour(
             _X * MM, _Z * MM, reach_margin(points, 1), [0], colors=[OUTLINE], linewidths=0.6
         )
-        inside = TASK_REGION.low[1] <= y <= TASK_REGION.high[1]
+        inside = PAPER_TPM.region.low[1] <= y <= PAPER_TPM.region.high[1]
         style.outline_task_region(axes, "z", inside)
         largest = float(value.max())
         style.section_axes(axes, f"y = {y * MM:.0f} mm, largest {largest:.3f}")
@@ -62,7 +63,7 @@ def conditioning_figure() -> Figure:
             axes.tick_params(labelleft=False)
     bar = figure.add_axes((0.912, 0.40, 0.018, 0.495))
     figure.colorbar(image, cax=bar, ticks=_TICKS, format="%g", label="1/cond(J)")
-    bar.axhline(SAFE_CONDITIONING, color="white", linewidth=1.4)
+    bar.axhline(_SAFE, color="white", linewidth=1.4)
     _along_y(figure.add_axes((0.55, 0.115, 0.385, 0.20)))
     _conditioning_legend(figure)
     return figure
@@ -75,8 +76,8 @@ def _along_y(axes: Axes) -> None:
         points = np.stack([np.full_like(y, x), y, np.full_like(y, z)], axis=-1)
         label = f"x = {x * MM:.0f}, z = {z * MM:.0f} mm".replace("-", "\N{MINUS SIGN}")
         axes.plot(y * MM, conditioning_at(points), dash, color=colour, label=label)
-    axes.axhline(SAFE_CONDITIONING, color="0.5", linewidth=0.8)
-    axes.axvspan(TASK_REGION.low[1] * MM, TASK_REGION.high[1] * MM, color="0.92")
+    axes.axhline(_SAFE, color="0.5", linewidth=0.8)
+    axes.axvspan(PAPER_TPM.region.low[1] * MM, PAPER_TPM.region.high[1] * MM, color="0.92")
     axes.set(xlim=(0, PAPER.l7 * MM), ylim=(0, None), xlabel="y (mm)", ylabel="1/cond(J)")
     axes.set_title("along y; shaded: the task region")
     axes.legend(loc="upper left", fontsize=6.5)
@@ -93,7 +94,13 @@ def _conditioning_legend(figure: Figure) -> None:
             linestyle=(0, (3, 2)),
             label="the same, not in this section",
         ),
-        Line2D([], [], color="white", linewidth=1.4, label=f"{SAFE_CONDITIONING}, the safe limit"),
+        Line2D(
+            [],
+            [],
+            color="white",
+            linewidth=1.4,
+            label=f"{_SAFE}, the safe limit",
+        ),
         Line2D([], [], color=OUTLINE, linewidth=0.8, label="edge of the reachable set"),
     ]
     legend = figure.legend(

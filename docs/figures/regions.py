@@ -14,9 +14,9 @@ from tpm_gym.analysis.aspects import Aspect, aspects
 from tpm_gym.analysis.singularity import factors_at
 from tpm_gym.kinematics import ELBOWS_OUT
 from tpm_gym.kinematics.geometry import PAPER
-from tpm_gym.kinematics.workspace import TASK_REGION
 from tpm_gym.learning import figure_style as style
 from tpm_gym.learning.figure_style import BLACK, BLUE, GREEN, MM, ORANGE, PURPLE
+from tpm_gym.mechanism import PAPER_TPM
 
 FloatArray = NDArray[np.float64]
 
@@ -85,7 +85,7 @@ def _section(axes: Axes, section: Section, x: FloatArray = _X, other: FloatArray
     vertical = "z" if section.fixed == "y" else "y"
     style.section_axes(axes, f"{section.fixed} = {section.at * MM:.0f} mm", "x", vertical)
     fixed = 1 if section.fixed == "y" else 2
-    if TASK_REGION.low[fixed] <= section.at <= TASK_REGION.high[fixed]:
+    if PAPER_TPM.region.low[fixed] <= section.at <= PAPER_TPM.region.high[fixed]:
         style.outline_task_region(axes, vertical, inside=True)
 
 

@@ -25,7 +25,6 @@ from figures.zero_sets import (
 from tpm_gym.analysis.singularity import factors_at
 from tpm_gym.kinematics import ELBOWS_OUT, WORKING_MODES
 from tpm_gym.kinematics.geometry import PAPER
-from tpm_gym.kinematics.workspace import TASK_REGION
 from tpm_gym.learning import figure_style as style
 from tpm_gym.learning.figure_style import (
     BLACK,
@@ -38,6 +37,7 @@ from tpm_gym.learning.figure_style import (
     REACHED,
     VERMILLION,
 )
+from tpm_gym.mechanism import PAPER_TPM
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -234,7 +234,7 @@ def _finish_section(
     vertical = "z" if section.fixed == "y" else "y"
     style.section_axes(axes, title, "x", vertical)
     row = 1 if section.fixed == "y" else 2
-    low, high = TASK_REGION.low[row], TASK_REGION.high[row]
+    low, high = PAPER_TPM.region.low[row], PAPER_TPM.region.high[row]
     if ours and low <= section.at <= high:
         style.outline_task_region(axes, vertical, inside=True)
     axes.set_xlim(_LIMITS_X)

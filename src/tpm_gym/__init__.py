@@ -1,30 +1,54 @@
 """Gymnasium environments of an asymmetric 3-translational parallel mechanism.
 
-Importing this package registers the ids in :data:`ENV_IDS`; it imports neither pybullet nor torch.
+Importing this package registers the ids in ``ENV_IDS``; it imports no engine and no torch.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from tpm_gym.envs.registration import ENV_IDS, register
+from tpm_gym.envs.env import TPMEnv
+from tpm_gym.envs.registration import env_ids, register_task
 from tpm_gym.errors import TPMError
 from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
+from tpm_gym.mechanism.machine import Machine, register_machine
+from tpm_gym.mechanism.tpm import TPM
+from tpm_gym.simulation.engine import register_engine
 
 if TYPE_CHECKING:
-    from tpm_gym.policy.policy import Policy
+    from tpm_gym.policy import Policy
 
-__all__ = ["ENV_IDS", "PAPER", "WIDE", "Geometry", "TPMError", "__version__", "load_policy"]
+    ENV_IDS: tuple[str, ...]
+
+__all__ = [
+    "ENV_IDS",
+    "PAPER",
+    "TPM",
+    "WIDE",
+    "Geometry",
+    "Machine",
+    "TPMEnv",
+    "TPMError",
+    "__version__",
+    "load_policy",
+    "register_engine",
+    "register_machine",
+    "register_task",
+]
 
 __version__ = "0.1.0"
 
 
 def load_policy(path: str | Path) -> Policy:
-    """Load a trained policy; the same as :func:`tpm_gym.policy.policy.load_policy`, and needs PyTorch."""
-    from tpm_gym.policy import policy  # here, so that PyTorch is not imported before it is needed
+    """The same as :func:`tpm_gym.policy.load_policy`, which imports PyTorch."""
+    from tpm_gym import policy
 
     return policy.load_policy(path)
 
 
-register()
+def __getattr__(name: str) -> Any:
+    """``ENV_IDS``: all ids that are registered by now, in order."""
+    if name == "ENV_IDS":
+        return env_ids()
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -236,7 +236,7 @@ def test_the_environment_is_the_one_that_was_asked_for() -> None:
         policy=("random",), goals="tempting", penalty_weight=0.25, randomisation=("puck_mass=2",)
     )
     env: Any = evaluation._make_env("TPMPickAndPlace-v0", config)
-    assert env.unwrapped.penalty_weight == 0.25
+    assert env.unwrapped.task.penalty_weight == 0.25
     assert env.unwrapped.randomisation.puck_mass == (2.0, 2.0)
     plain = gym.make("TPMPickAndPlace-v0")
     goals = [made.reset(seed=3)[0]["desired_goal"] for made in (env, plain)]

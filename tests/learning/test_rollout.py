@@ -70,6 +70,7 @@ def scripted_step(
         "reward": reward,
         "is_success": success,
         "conditioning": conditioning,
+        "singularity_penalty": max(0.0, 1 - (conditioning / 0.08) ** 4),
         "closure_error": gap,
         "fk_error": 2 * gap,
         "torque": np.array([1.0, -2.0, 2.0]),

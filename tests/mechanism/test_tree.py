@@ -2,39 +2,27 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 import oracle
 import pytest
 from hypothesis import given, settings
-from hypothesis import strategies as st
-from numpy.typing import NDArray
-from walk import place, walk
+from machines import anywhere, each_machine
+from walk import gaps, place, walk
 
+from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import InputError, UnreachableError
-from tpm_gym.kinematics import (
-    ASSEMBLY_MODES,
-    DEFAULT_ASSEMBLY,
-    AssemblyMode,
-    forward,
-    forward_all,
-    inverse,
-    inverse_all,
-)
-from tpm_gym.kinematics.geometry import PAPER, Geometry
-from tpm_gym.kinematics.workspace import TASK_REGION
-from tpm_gym.mechanism.links import CUP_LENGTH, CUP_PRELOAD, CUP_STROKE, MOTOR_EFFORT, MOTOR_SPEED
+from tpm_gym.kinematics import ASSEMBLY_MODES, AssemblyMode, forward, forward_all, inverse_all
+from tpm_gym.kinematics.geometry import Geometry
+from tpm_gym.mechanism import PAPER_TPM, TPM
+from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.tree import (
     ACTUATED_JOINTS,
-    DEFAULT_MOUNT,
-    Mount,
+    MOTOR_EFFORT,
+    MOTOR_SPEED,
     build,
     joint_angles,
 )
-from tpm_gym.simulation.physics import PULL_OFF_FORCE, rotate
 
-FloatArray = NDArray[np.float64]
 GAP = 1e-9
 # Link of the paper's Fig. 1 -> bodies; 3 is rigid with arm 2, 8 with platform 1.
 FIG_1 = {
@@ -57,11 +45,9 @@ TOOL = ["cup"]
 
 def assert_assembled(theta: FloatArray, branch: AssemblyMode, g: Geometry) -> None:
     mechanism = build(g)
-    frames = walk(mechanism, joint_angles(theta, branch, g))
-    for closure in mechanism.closures:
-        a = place(frames, closure.link_a, closure.point_a)
-        b = place(frames, closure.link_b, closure.point_b)
-        assert np.linalg.norm(a - b) < GAP, closure.name
+    joints = joint_angles(theta, branch, g)
+    assert np.linalg.norm(gaps(mechanism, joints), axis=-1).max() < GAP
+    frames = walk(mechanism, joints)
     found = place(frames, mechanism.platform, mechanism.point_p)
     np.testing.assert_allclose(found, forward(theta, branch, g), rtol=0, atol=GAP)
     for level in (mechanism.platform, "link_3p"):
@@ -71,9 +57,9 @@ def assert_assembled(theta: FloatArray, branch: AssemblyMode, g: Geometry) -> No
     solutions = forward_all(theta, g)
     (x_c, z_c), beta = solutions.link3[branch.index], solutions.beta[branch.index]
     p = oracle.points(theta, x_c, z_c, beta, g)
-    joints = {"arm_2": "A1", "arm_5": "A2", "arm_12": "A3", "rod_6": "B2", "link_3p": "C2"}
-    joints |= {"end_link_9": "B3", "link_7": "D1", "platform": "E1", "end_link_10": "C3"}
-    for link, point in joints.items():
+    origins = {"arm_2": "A1", "arm_5": "A2", "arm_12": "A3", "rod_6": "B2", "link_3p": "C2"}
+    origins |= {"end_link_9": "B3", "link_7": "D1", "platform": "E1", "end_link_10": "C3"}
+    for link, point in origins.items():
         np.testing.assert_allclose(frames[link][0], p[point], rtol=0, atol=GAP, err_msg=point)
     half = np.array([g.l5, 0, 0])
     for suffix, side in (("a", 1), ("b", -1)):
@@ -95,15 +81,19 @@ def test_joint_angles_close_every_loop_and_place_the_platform(g: Geometry, seed:
                 assert_assembled(theta, branch, g)
 
 
-def test_joint_angles_close_every_loop_over_the_task_region() -> None:
-    rng = np.random.default_rng(0)
-    for point in rng.uniform(TASK_REGION.low, TASK_REGION.high, (40, 3)):
-        assert_assembled(inverse(point), DEFAULT_ASSEMBLY, PAPER)
+@each_machine
+def test_joint_angles_close_every_loop_over_the_region(machine: TPM) -> None:
+    for point in anywhere(machine, 40):
+        theta = np.array(machine.inverse(point))
+        assert machine.joint_positions(tuple(theta)) == joint_angles(
+            theta, machine.assembly_mode, machine.geometry
+        )
+        assert_assembled(theta, machine.assembly_mode, machine.geometry)
 
 
 def test_joint_angles_name_every_joint_and_refuse_what_cannot_be_assembled() -> None:
     joints = [link.joint.name for link in build().links if link.joint]
-    angles = joint_angles(inverse([0, 0.03, 0.75]))
+    angles = joint_angles(PAPER_TPM.inverse((0, 0.03, 0.75)))
     assert set(angles) == set(joints)
     assert len(joints) == len(set(joints))
     assert all(type(angle) is float for angle in angles.values())
@@ -134,25 +124,19 @@ def test_parents_come_before_children_and_closures_join_links_that_exist() -> No
         mechanism.link("arm_3")
 
 
-def test_the_tree_with_its_closures_has_three_degrees_of_freedom() -> None:
-    mechanism = build()
-    moving = sum(link.joint is not None for link in mechanism.links)
-    theta = inverse([-0.05, 0.03, 0.78])
-    rest = joint_angles(theta)
+@each_machine
+def test_the_tree_with_its_closures_has_three_degrees_of_freedom(machine: TPM) -> None:
+    rest = machine.joint_positions(machine.inverse(machine.home))
 
-    def gaps(values: FloatArray) -> FloatArray:
-        frames = walk(mechanism, dict(zip(rest, values, strict=True)))
-        sides = [
-            place(frames, c.link_a, c.point_a) - place(frames, c.link_b, c.point_b)
-            for c in mechanism.closures
-        ]
-        return np.concatenate(sides)
+    def opened(values: FloatArray) -> FloatArray:
+        return gaps(machine.mechanism, dict(zip(rest, values, strict=True))).ravel()
 
     start, step = np.array(list(rest.values())), 1e-6
-    columns = [(gaps(start + step * e) - gaps(start - step * e)) / 2e-6 for e in np.eye(moving)]
+    moved = step * np.eye(len(start))
+    columns = [(opened(start + by) - opened(start - by)) / (2 * step) for by in moved]
     rank = np.linalg.matrix_rank(np.stack(columns, axis=-1), tol=1e-6)
     # And end link 10, which rolls idly about its own axis, and the cup, which slides.
-    assert moving - rank == 3 + 1 + 1
+    assert len(start) - rank == 3 + 1 + 1
 
 
 @settings(derandomize=True, max_examples=20, deadline=None)
@@ -185,77 +169,41 @@ def test_legs_part_the_links_and_every_closure_joins_two_of_them() -> None:
         assert leg_of[closure.link_a] != leg_of[closure.link_b], closure.name
 
 
-def test_only_the_three_motors_drive_and_they_reach_the_task_region() -> None:
-    sides = [np.linspace(*ends, 9) for ends in zip(TASK_REGION.low, TASK_REGION.high, strict=True)]
-    theta = inverse(np.stack(np.meshgrid(*sides), axis=-1)).reshape(-1, 3)
-    joints = {link.joint.name: link.joint for link in build().links if link.joint}
-    for joint in joints.values():
-        if joint.name in ACTUATED_JOINTS:
-            angles = theta[:, ACTUATED_JOINTS.index(joint.name)]
-            assert joint.kind == "revolute"
-            assert joint.parent == "base"
-            assert joint.lower < angles.min() <= angles.max() < joint.upper
-            assert (joint.effort, joint.speed) == (MOTOR_EFFORT, MOTOR_SPEED)
-        elif joint.name != "cup_slide":
-            assert joint.kind == "continuous"
-            assert joint.effort == joint.speed == 0
-    assert set(ACTUATED_JOINTS) < set(joints)
+@each_machine
+def test_only_the_three_motors_drive_and_none_meets_its_stops_in_the_region(machine: TPM) -> None:
+    region = machine.region
+    sides = [np.linspace(*ends, 9) for ends in zip(region.low, region.high, strict=True)]
+    grid = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 3).tolist()
+    theta = np.array([machine.inverse((x, y, z)) for x, y, z in grid])
+    joints = {link.joint.name: link.joint for link in machine.mechanism.links if link.joint}
+    assert machine.mechanism.actuated == ACTUATED_JOINTS
+    for angles, joint in zip(theta.T, (joints.pop(name) for name in ACTUATED_JOINTS), strict=True):
+        assert (joint.kind, joint.parent) == ("revolute", "base")
+        assert joint.lower < angles.min() <= angles.max() < joint.upper
+        assert (joint.effort, joint.speed) == (MOTOR_EFFORT, MOTOR_SPEED)
+    del joints["cup_slide"]
+    assert {(joint.kind, joint.effort, joint.speed) for joint in joints.values()} == {
+        ("continuous", 0, 0)
+    }
 
 
-def test_the_cup_is_under_point_p_and_alone_collides() -> None:
-    mechanism = build()
-    frames = walk(mechanism, joint_angles(inverse([-0.05, 0.03, 0.78])))
-    point_p = place(frames, mechanism.platform, mechanism.point_p)
-    lip = place(frames, mechanism.tool, mechanism.lip)
-    np.testing.assert_allclose(lip - point_p, [0, 0, CUP_LENGTH], atol=1e-9)
-    colliding = [(link, s) for link in mechanism.links for s in link.solids if s.collides]
-    assert [link.name for link, _ in colliding] == [mechanism.tool]
-    cup = colliding[0][1]
-    assert cup.centre[2] + cup.size[1] / 2 == pytest.approx(mechanism.lip[2])
-
-
-def test_the_cup_slides_back_into_the_platform_along_its_axis() -> None:
-    mechanism = build()
+@each_machine
+def test_the_cup_is_under_point_p_slides_back_along_its_axis_and_alone_collides(
+    machine: TPM,
+) -> None:
+    mechanism = machine.mechanism
+    rest = machine.joint_positions(machine.inverse(machine.home))
     joint = mechanism.link(mechanism.tool).joint
     assert joint is not None
     assert (joint.kind, joint.parent) == ("prismatic", mechanism.platform)
-    assert joint.lower == -CUP_STROKE
+    assert joint.lower == -CUP.stroke
     assert 0 < joint.upper <= 0.001  # the stop must not fight the spring at rest
-    assert joint.effort == CUP_PRELOAD > PULL_OFF_FORCE  # what the vacuum holds stays up
-    rest = joint_angles(inverse([-0.05, 0.03, 0.78]))
-    out, back = (
-        place(walk(mechanism, rest | {"cup_slide": at}), mechanism.tool, mechanism.lip)
-        for at in (0.0, -CUP_STROKE)
-    )
-    np.testing.assert_allclose(back - out, [0, 0, -CUP_STROKE], atol=1e-9)
-
-
-coordinates = st.tuples(*[st.floats(-3, 3)] * 3)
-
-
-@settings(derandomize=True, max_examples=100)
-@given(st.floats(0.1, 2), coordinates, coordinates)
-def test_mounts_are_rigid_and_round_trip(
-    height: float, p: tuple[float, float, float], q: tuple[float, float, float]
-) -> None:
-    mount = Mount(height)
-    np.testing.assert_allclose(mount.to_paper(mount.to_world(p)), p, atol=1e-14)
-    np.testing.assert_allclose(mount.to_world(mount.to_paper(p)), p, atol=1e-14)
-    matrix = mount.rotate(np.eye(3)).T
-    assert np.linalg.det(matrix) == pytest.approx(1)
-    np.testing.assert_allclose(mount.rotate(p), rotate(mount.quaternion, p), atol=1e-15)
-    np.testing.assert_allclose(mount.to_world(p), matrix @ p + [0, 0, height], atol=1e-14)
-    moved = np.subtract(mount.to_world(p), mount.to_world(q))
-    np.testing.assert_allclose(moved, mount.rotate(np.subtract(p, q)), atol=1e-14)
-
-
-def test_the_mount_hangs_the_base_over_the_table() -> None:
-    mount = Mount(1.5)
-    np.testing.assert_array_equal(mount.to_world([0, 0, 0]), [0, 0, 1.5])
-    np.testing.assert_array_equal(mount.to_world([0.1, 0.2, 0.5]), [0.1, -0.2, 1.0])
-    axes = mount.rotate(np.eye(3))
-    np.testing.assert_array_equal(axes, [[1, 0, 0], [0, -1, 0], [0, 0, -1]])
-    assert mount.to_world(np.zeros((4, 2, 3))).shape == (4, 2, 3)
-    lips = DEFAULT_MOUNT.to_world([TASK_REGION.low, TASK_REGION.high])[:, 2] - CUP_LENGTH
-    assert all(a > 0 for a in lips)
-    assert all(a > b for a, b in pairwise(lips))
+    assert joint.effort == CUP.preload
+    point_p = place(walk(mechanism, rest), mechanism.platform, mechanism.point_p)
+    for slide in (0.0, -CUP.stroke):
+        lip = place(walk(mechanism, rest | {"cup_slide": slide}), mechanism.tool, mechanism.lip)
+        np.testing.assert_allclose(lip - point_p, [0, 0, CUP.length + slide], atol=1e-9)
+    colliding = [(link, s) for link in mechanism.links for s in link.solids if s.collides]
+    assert [link.name for link, _ in colliding] == [mechanism.tool]
+    bellows = colliding[0][1]
+    assert bellows.centre[2] + bellows.size[1] / 2 == pytest.approx(mechanism.lip[2])

@@ -3,30 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
+import inside_bullet
 import numpy as np
 import pytest
 from episodes import fingerprint, random_episode
-from numpy.typing import NDArray
 
-from tpm_gym import kinematics
+from tpm_gym.arrays import FloatArray, Vector
 from tpm_gym.envs.env import TPMEnv
 from tpm_gym.errors import ClosureError, EpisodeError, ModeChangeError, UnreachableError
 from tpm_gym.kinematics.geometry import PAPER
-from tpm_gym.simulation.simulation import Simulation
-from tpm_gym.simulation.state import Scene, State
-from tpm_gym.tasks.task import HOME
+from tpm_gym.mechanism import PAPER_TPM
+from tpm_gym.simulation import Simulation, State
 
-FloatArray = NDArray[np.float64]
+HOME = PAPER_TPM.home
+THETA = PAPER_TPM.inverse(HOME)
 IDLE = np.zeros(3)
-
-
-@pytest.fixture
-def simulation() -> Iterator[Simulation]:
-    simulation = Simulation(Scene())
-    yield simulation
-    simulation.close()
 
 
 @pytest.fixture
@@ -37,7 +31,7 @@ def env() -> Iterator[TPMEnv]:
 
 
 def true_y(state: State) -> float:
-    """Of the simulated platform, paper frame, m."""
+    """Of the simulated platform, machine's frame, m."""
     return -float(state.platform_position[1])
 
 
@@ -46,21 +40,10 @@ def apart(state: State) -> float:
     return float(np.linalg.norm(state.fk_position - state.platform_position))
 
 
-def push(env: TPMEnv, force: tuple[float, float, float]) -> Callable[[], None]:
-    """Let a force (N, world) act on the platform from now on; returns what ends it."""
-    client, platform = env.simulation._client, env.simulation._robot._platform
-    advance = client.stepSimulation
-
-    def pushed() -> None:
-        centre = client.getLinkState(*platform, computeForwardKinematics=True)[0]
-        client.applyExternalForce(*platform, force, centre, client.WORLD_FRAME)
-        advance()
-
-    def release() -> None:
-        client.stepSimulation = advance
-
-    client.stepSimulation = pushed
-    return release
+def push(env: TPMEnv, force: Vector) -> Callable[[], None]:
+    """Let a force (N, machine's frame) act on the platform from now on; returns what ends it."""
+    simulation = env.simulation
+    return inside_bullet.around_each_step(simulation, lambda: inside_bullet.push(simulation, force))
 
 
 # -- y = 0: the parallel singularity ---------------------------------------------------------------
@@ -73,16 +56,16 @@ def test_commands_through_the_plane_are_followed_until_the_step_that_reports_it(
 ) -> None:
     # Far more than any action may ask for: 0.25 m/s along y.
     start = min(0.028, 20 * step)
-    state = simulation.reset(kinematics.inverse((x, start, 0.80)))
+    state = simulation.reset(PAPER_TPM.inverse((x, start, 0.80)))
     for y in np.arange(start, -0.03, -step):
-        if state.mode_change is not None:
+        if state.passed_singularity:
             break
         assert true_y(state) > 0
         assert apart(state) < 0.5e-3  # 0.2 mm seen
         assert state.closure_error < 0.1e-3
         state = simulation.move((x, y, 0.80))
     # Reported at the very step, when forward kinematics are still off by the last step only.
-    assert state.mode_change == "assembly"
+    assert (state.assembly_mode_changed, state.working_mode_changed) == (True, False)
     assert true_y(state) <= 0
     assert state.fk_position[1] < 0  # what the encoders believe: still on the other side
     with pytest.raises(ModeChangeError) as caught:
@@ -91,7 +74,7 @@ def test_commands_through_the_plane_are_followed_until_the_step_that_reports_it(
 
 
 def test_the_conditioning_falls_to_zero_on_the_way_to_the_plane(simulation: Simulation) -> None:
-    simulation.reset(kinematics.inverse(HOME))
+    simulation.reset(THETA)
     states = [simulation.move((HOME[0], y, HOME[2])) for y in np.arange(0.028, 0.001, -0.001)]
     # After the first steps, in proportion to y.
     ratios = np.array([state.conditioning / true_y(state) for state in states[15:]])
@@ -102,16 +85,16 @@ def test_the_conditioning_falls_to_zero_on_the_way_to_the_plane(simulation: Simu
 def test_once_reported_the_change_stays_reported_and_a_reset_forgets_it(
     simulation: Simulation,
 ) -> None:
-    simulation.reset(kinematics.inverse(HOME))
+    simulation.reset(THETA)
     for y in (0.018, 0.008, -0.002, -0.012):
         simulation.move((HOME[0], y, HOME[2]))
     snapshot = simulation.save()
-    assert simulation.read().mode_change == snapshot.mode_change == "assembly"
-    state = simulation.reset(kinematics.inverse(HOME))
-    assert state.mode_change is None
+    assert simulation.read().assembly_mode_changed
+    state = simulation.reset(THETA)
+    assert not state.passed_singularity
     assert apart(state) < 1e-6
-    assert simulation.move(HOME).mode_change is None
-    assert simulation.restore(snapshot).mode_change == "assembly"
+    assert not simulation.move(HOME).passed_singularity
+    assert simulation.restore(snapshot).assembly_mode_changed
     with pytest.raises(ModeChangeError):
         simulation.move(HOME)
 
@@ -128,7 +111,7 @@ def disturbed(env: TPMEnv, how: str) -> Callable[[], None]:
     if how == "commands":
         healthy, env.control = env.control, Across()
         return lambda: setattr(env, "control", healthy)
-    return push(env, {"soft push": (0.0, 120.0, 0.0), "hard push": (0.0, 800.0, 0.0)}[how])
+    return push(env, {"soft push": (0.0, -120.0, 0.0), "hard push": (0.0, -800.0, 0.0)}[how])
 
 
 @pytest.mark.parametrize("how", ["commands", "soft push", "hard push"])
@@ -167,7 +150,7 @@ def test_a_disturbance_through_the_plane_ends_the_episode_and_the_next_reset_rec
 def test_an_episode_that_was_left_can_be_reset_at_once(env: TPMEnv) -> None:
     expected = fingerprint(random_episode(env, 5))
     env.reset(seed=3)
-    release = push(env, (0.0, 800.0, 0.0))
+    release = push(env, (0.0, -800.0, 0.0))
     assert env.step(IDLE)[3]
     release()
     assert fingerprint(random_episode(env, 5)) == expected
@@ -179,10 +162,10 @@ def test_an_episode_that_was_left_can_be_reset_at_once(env: TPMEnv) -> None:
 def test_commands_towards_the_edge_are_followed_and_beyond_it_refused(
     simulation: Simulation,
 ) -> None:
-    simulation.reset(kinematics.inverse(HOME))
+    simulation.reset(THETA)
     ways = [0.030, 0.035, 0.040, 0.045, 0.048, 0.049, 0.0495, *[0.0499] * 5]
     states = [simulation.move((HOME[0], y, HOME[2])) for y in ways]
-    assert {state.mode_change for state in states} == {None}
+    assert not any(state.passed_singularity for state in states)
     # Seen: gaps to 0.011 mm, forward kinematics to 0.005 mm; conditioning from 0.30 at 46.5 mm
     # down to 0.071 at 49.9 mm.
     assert max(state.closure_error for state in states) < 0.03e-3
@@ -199,17 +182,15 @@ def test_commands_towards_the_edge_are_followed_and_beyond_it_refused(
     after = simulation.read()
     assert np.array_equal(before.theta, after.theta)
     assert np.array_equal(before.command, after.command)
-    assert simulation.move((HOME[0], 0.0499, HOME[2])).mode_change is None
+    assert not simulation.move((HOME[0], 0.0499, HOME[2])).passed_singularity
 
 
 @pytest.mark.parametrize("force", [500.0, 1000.0])
-def test_a_platform_pushed_over_the_edge_is_a_change_of_the_working_mode(
-    env: TPMEnv, force: float
-) -> None:
+def test_a_platform_pushed_over_the_edge_is_a_change_of_the_working_mode(force: float) -> None:
+    env = TPMEnv("reach", machine=replace(PAPER_TPM, home=(-0.04, 0.045, 0.80)))
     fresh = fingerprint(random_episode(env, 6))
-    home, env._home = env._home, kinematics.inverse((-0.04, 0.045, 0.80))
     env.reset(seed=0)
-    release = push(env, (0.0, -force, 0.0))
+    release = push(env, (0.0, force, 0.0))
     for _ in range(50):
         _, _, terminated, truncated, info = env.step(IDLE)
         assert not terminated
@@ -222,7 +203,6 @@ def test_a_platform_pushed_over_the_edge_is_a_change_of_the_working_mode(
     with pytest.raises(ModeChangeError, match="serial") as caught:
         env.step(IDLE)
     assert caught.value.mode == "working"
-    env._home = home
     assert fingerprint(random_episode(env, 6)) == fresh
 
 
@@ -232,7 +212,7 @@ def test_a_platform_pushed_over_the_edge_is_a_change_of_the_working_mode(
 def test_a_loop_torn_open_is_a_typed_error_and_the_next_reset_recovers(env: TPMEnv) -> None:
     fresh = fingerprint(random_episode(env, 7))
     env.reset(seed=0)
-    release = push(env, (0.0, 0.0, -3000.0))
+    release = push(env, (0.0, 0.0, 3000.0))
     with pytest.raises(ClosureError, match="reset") as caught:
         env.step(IDLE)
     assert caught.value.gap > caught.value.limit == 0.005

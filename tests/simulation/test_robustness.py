@@ -4,8 +4,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from tpm_gym.simulation.physics import GRAVITY
-from tpm_gym.tasks.expert import Expert
+from tpm_gym.simulation.bullet.client import GRAVITY
+from tpm_gym.simulation.state import CONTROL_PERIOD
+from tpm_gym.tasks import Expert
 
 IDS = ("TPMPickAndPlace-v0", "TPMPickAndPlaceJoints-v0")
 
@@ -50,7 +51,7 @@ def survives(env_id, policy, seeds):
     env = gym.make(env_id)
     expert = Expert(env)
     simulation = env.unwrapped.simulation
-    time_step, period = simulation.physics.time_step, simulation.physics.control_period
+    (puck,), time_step = simulation.scene.objects, simulation.engine.physics.time_step
     for seed in seeds:
         rng = np.random.default_rng(seed)
         observation, _ = env.reset(seed=seed)
@@ -61,14 +62,15 @@ def survives(env_id, policy, seeds):
             observation, _, _, _, info = env.step(action.astype(np.float32))
             assert info["closure_error"] < 0.1e-3
             state = env.unwrapped.state
-            assert state.mode_change is None
+            assert not state.passed_singularity
             # Neither thrown about nor pressed through the table. A landing is noticed one time
             # step late, so it goes as deep as the puck falls in one; but nothing may keep it there.
-            assert state.object_position[2] < 0.4
-            depth = simulation.scene.puck.height / 2 - state.object_position[2]
-            assert depth < 1e-3 + time_step * (fall + GRAVITY * period)
-            fall = max(fall, -state.object_velocity[2])
-            pressed = pressed + period if depth > 1e-3 else 0.0
+            height = state.object_position[0, 2]
+            assert height < 0.4
+            depth = puck.height / 2 - height
+            assert depth < 1e-3 + time_step * (fall + GRAVITY * CONTROL_PERIOD)
+            fall = max(fall, -state.object_velocity[0, 2])
+            pressed = pressed + CONTROL_PERIOD if depth > 1e-3 else 0.0
             assert pressed < 0.15
     env.close()
 

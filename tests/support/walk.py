@@ -6,11 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from tpm_gym.mechanism.tree import Mechanism
+from tpm_gym.arrays import FloatArray
+from tpm_gym.mechanism.bodies import Mechanism
 
-FloatArray = NDArray[np.float64]
 Frame = tuple[FloatArray, FloatArray]
 
 
@@ -22,7 +21,7 @@ def turn(axis: tuple[float, ...], angle: float) -> FloatArray:
 
 
 def walk(mechanism: Mechanism, joints: Mapping[str, float]) -> dict[str, Frame]:
-    """Position (m) and rotation of every link in the paper frame, joints in rad or m."""
+    """Position (m) and rotation of every link in the machine's frame, joints in rad or m."""
     frames = {mechanism.links[0].name: (np.zeros(3), np.eye(3))}
     for link in mechanism.links[1:]:
         joint = link.joint
@@ -38,6 +37,17 @@ def walk(mechanism: Mechanism, joints: Mapping[str, float]) -> dict[str, Frame]:
 
 
 def place(frames: Mapping[str, Frame], link: str, point: tuple[float, ...]) -> FloatArray:
-    """A point of a link in the paper frame, m."""
+    """A point of a link in the machine's frame, m."""
     position, rotation = frames[link]
     return np.asarray(position + rotation @ point)
+
+
+def gaps(mechanism: Mechanism, joints: Mapping[str, float]) -> FloatArray:
+    """From one side of each closure to the other, (closures, 3) m."""
+    frames = walk(mechanism, joints)
+    return np.array(
+        [
+            place(frames, c.link_a, c.point_a) - place(frames, c.link_b, c.point_b)
+            for c in mechanism.closures
+        ]
+    )

@@ -38,11 +38,12 @@ from tpm_gym.analysis.poc import (
     revolute,
     serial,
 )
+from tpm_gym.arrays import Vector
 from tpm_gym.errors import SingularityError
 from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode
 from tpm_gym.kinematics.geometry import PAPER, Geometry
-from tpm_gym.mechanism.bodies import Vector
-from tpm_gym.mechanism.tree import ACTUATED_JOINTS, Mechanism, build, joint_angles
+from tpm_gym.mechanism.bodies import Mechanism
+from tpm_gym.mechanism.tree import ACTUATED_JOINTS, build, joint_angles
 
 __all__ = [
     "Mobility",

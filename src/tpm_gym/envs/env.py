@@ -2,31 +2,43 @@
 
 from __future__ import annotations
 
+import hashlib
+import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, is_dataclass
 from typing import Any, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
-from tpm_gym import kinematics
-from tpm_gym.envs import checks, reports
-from tpm_gym.envs.reports import Observation
-from tpm_gym.errors import ConfigurationError, EpisodeError, ModeChangeError
-from tpm_gym.mechanism.tree import DEFAULT_MOUNT
-from tpm_gym.simulation.bullet.client import has_display
-from tpm_gym.simulation.physics import CONTROL_PERIOD, Physics
+from tpm_gym.arrays import FloatArray, Vector, finite
+from tpm_gym.errors import (
+    ActionError,
+    ConfigurationError,
+    EpisodeError,
+    InputError,
+    ModeChangeError,
+)
+from tpm_gym.mechanism.machine import Machine
+from tpm_gym.simulation.display import has_display
 from tpm_gym.simulation.randomisation import Randomisation
+from tpm_gym.simulation.settings import settings_of
 from tpm_gym.simulation.simulation import Simulation, Snapshot
-from tpm_gym.simulation.state import State
-from tpm_gym.tasks import task as tasks
-from tpm_gym.tasks.control import make as make_control
+from tpm_gym.simulation.state import CONTROL_PERIOD, State
+from tpm_gym.tasks.control import make_control
+from tpm_gym.tasks.registry import make_task
+from tpm_gym.tasks.task import Task
 
 __all__ = ["EnvSnapshot", "TPMEnv"]
 
 Action = NDArray[Any]
+Observation = dict[str, Any]  # arrays of float32
+
+_OBSERVATION_BOUND = 10.0
+_GOAL_BOUND = 2.0
 
 
 @dataclass(frozen=True)
@@ -35,9 +47,18 @@ class EnvSnapshot:
 
     simulation: Snapshot
     rng: dict[str, Any]
-    goal: NDArray[np.float64]
-    pending: tuple[NDArray[np.float64], ...]
-    kind: tuple[str, Randomisation, Physics | None]
+    goal: FloatArray
+    pending: tuple[FloatArray, ...]
+    kind: tuple[Any, ...]
+    digest: str
+
+    def is_intact(self) -> bool:
+        """Whether nothing has been changed since it was taken, by the digest."""
+        own = (self.simulation, self.rng, self.goal, self.pending, self.kind)
+        try:
+            return bool(self.digest == _digest(own))
+        except Exception:  # of the repr of whatever somebody put in
+            return False
 
 
 class TPMEnv(gym.Env[Observation, Action]):
@@ -46,7 +67,8 @@ class TPMEnv(gym.Env[Observation, Action]):
     ## Ids
 
     ``TPM{Reach,PickAndPlace}{,Joints}{,Dense}-v0``: Cartesian or joint increments, sparse or dense
-    reward. Control at 25 Hz, episodes of 50 steps, truncation only.
+    reward. Control at 25 Hz, episodes of 50 steps, truncation only. Numbers below are those of the
+    paper's machine.
 
     ## Frames
 
@@ -80,11 +102,11 @@ class TPMEnv(gym.Env[Observation, Action]):
     | position | 3 | P by forward kinematics of the encoders |
     | velocity | 3 | J(theta) theta_dot, from the encoders |
     | command | 3 | commanded P minus position |
-    | object_position | 3 | centre of the puck, from a camera |
-    | object_offset | 3 | top of the puck minus lip of the cup |
-    | object_velocity | 3 | velocity of the puck, from a camera |
-    | object_tilt | 2 | x and y of the puck's axis |
-    | holding | 1 | +1 if the cup holds the puck (vacuum gauge), else -1 |
+    | object_position | 3 | centre of the object, from a camera |
+    | object_offset | 3 | top of the object minus lip of the cup |
+    | object_velocity | 3 | velocity of the object, from a camera |
+    | object_tilt | 2 | x and y of the object's axis |
+    | object_held | 1 | +1 if the cup holds the object (vacuum gauge), else -1 |
 
     The object's entries exist in PickAndPlace only. The robot's come from the three encoders alone,
     never from the simulator's platform.
@@ -101,7 +123,7 @@ class TPMEnv(gym.Env[Observation, Action]):
     | approach | minus half the distance from cup to puck in units of 0.1 m |
 
     With an empty info, as SB3's HerReplayBuffer calls it, ``compute_reward`` gives the goal term
-    alone; ``train/her.py`` or ``copy_info_dict=True`` keep the other terms.
+    alone; ``tpm_gym.learning.PenaltyHerReplayBuffer`` or ``copy_info_dict=True`` keep the others.
 
     ## Start
 
@@ -109,38 +131,48 @@ class TPMEnv(gym.Env[Observation, Action]):
     goal at least 30 mm away from where the puck (or P) starts. Goals and objects are sampled where
     1/cond(J) >= 0.08.
     ``reset(options={"object": (x, y, z), "goal": (x, y, z)})`` chooses them instead; a puck that
-    starts above the table falls.
+    starts above the table falls. With ``goals="tempting"`` both lie next to the singularity.
 
     ## Info
 
     ``is_success`` (bool), ``closure_error`` (m), ``conditioning`` (1/cond(J) by the encoders),
     ``singularity_penalty`` (before weighting), ``assembly_mode_changed`` and
-    ``working_mode_changed`` (bool), ``reward_terms`` (name -> value; they sum to the reward).
+    ``working_mode_changed`` (bool), ``object_lost`` (bool, whether an object lies where the robot
+    cannot pick it up, off the table for one), ``reward_terms`` (name -> value; they sum to the
+    reward). That of a reset tells with ``randomisation`` what differs in the episode.
     Where the platform passes y = 0, a parallel one, the assembly mode changes and the encoders no
     longer tell where it is; past y = l7, a serial one, the working mode changes. No action of the
     nominal robot leads there; if it happens, ``info`` says so, with a penalty of 1 and truncation.
 
     Args:
-        task: ``"reach"`` or ``"pick_and_place"``.
+        task: Name of a task (``"reach"``, ``"pick_and_place"``, or one that
+            :func:`tpm_gym.register_task` knows), a :class:`~tpm_gym.tasks.Task` class, or a task; a
+            task that is made already has its own machine, reward, goals and penalty weight.
         control: ``"cartesian"`` or ``"joints"``.
         reward: ``"sparse"`` or ``"dense"``.
+        engine: Name of what moves the robot: ``"pybullet"``, or one that
+            :func:`tpm_gym.register_engine` knows.
+        machine: ``"paper"``, ``"wide"``, or a :class:`~tpm_gym.mechanism.Machine`.
+        goals: ``"sampled"``, or ``"tempting"``: next to the singularity.
         penalty_weight: Weight of the singularity penalty; 0 switches it off.
         randomisation: What differs from the nominal machine, drawn anew for each episode: a
-            :class:`~tpm_gym.simulation.randomisation.Randomisation` or a mapping of its attributes. Where
+            :class:`~tpm_gym.simulation.Randomisation` or a mapping of its attributes. Where
             disturbed encoders report angles that cannot be assembled, position and velocity keep
             their last values.
-        physics: Numerical settings of the engine.
+        physics: Numerical settings of the engine, or a mapping of them.
         render_mode: None, ``"rgb_array"`` or ``"human"``.
-        renderer: ``"tiny"`` (any machine) or ``"egl"`` (GPU).
+        renderer: What draws pictures; for PyBullet ``"tiny"`` (any machine) or ``"egl"`` (GPU).
         width: Of rendered pictures, pixels.
         height: Of rendered pictures, pixels.
 
     Raises:
         ConfigurationError: If an option is out of range.
 
+    An environment keeps some 29 MB, 28 of them PyBullet's client, until it is closed or dropped.
+
     ## Version history
 
-    * v0: first release.
+    * v0: not released yet; observations and physics still change.
     """
 
     # Gymnasium declares this as an instance's, so it cannot be a ClassVar.
@@ -151,43 +183,73 @@ class TPMEnv(gym.Env[Observation, Action]):
 
     def __init__(
         self,
-        task: str = "reach",
+        task: str | type[Task] | Task = "reach",
         control: str = "cartesian",
-        reward: str = "sparse",
+        reward: str | None = None,
         *,
-        penalty_weight: float = 1.0,
+        engine: str = "pybullet",
+        machine: str | Machine | None = None,
+        goals: str | None = None,
+        penalty_weight: float | None = None,
         randomisation: Randomisation | Mapping[str, Any] | None = None,
-        physics: Physics | None = None,
+        physics: Any = None,
         render_mode: str | None = None,
-        renderer: str = "tiny",
+        renderer: str | None = None,
         width: int = 640,
         height: int = 480,
     ) -> None:
         """Check the options and start the simulation."""
-        # Without a display PyBullet's window would end the process; offer what can be shown.
+        # Without a display an engine's window would end the process; offer what can be shown.
         modes = [mode for mode in self.metadata["render_modes"] if mode != "human" or has_display()]
         self.metadata = {**self.metadata, "render_modes": modes}
         if render_mode is not None and render_mode not in modes:
             valid = f"None, {', '.join(map(repr, modes))} ('human' needs a display)"
             raise ConfigurationError("render_mode", render_mode, valid)
         self.render_mode = render_mode
-        self.penalty_weight = checks.weight(penalty_weight)
-        self.task = tasks.make(task, reward)
-        checks.physics(physics)
-        self.control = make_control(control)
-        self.randomisation = Randomisation.of(randomisation)
-        self._size = checks.picture_size(width, height)
-        self.observation_space = reports.observation_space(self.task)
-        self.action_space = reports.box(1.0, self.task.action_size)
-        self._home = kinematics.inverse(self.task.home)
+        self.task = make_task(
+            task, machine=machine, reward=reward, goals=goals, penalty_weight=penalty_weight
+        )
+        self.machine = self.task.machine
+        self.control = make_control(control, self.machine)
+        self.randomisation = settings_of(Randomisation, "randomisation", randomisation)
+        self._size = _pixels("width", width), _pixels("height", height)
+        self.observation_space = spaces.Dict(
+            {
+                "observation": _box(_OBSERVATION_BOUND, self.task.observation_size),
+                "achieved_goal": _box(_GOAL_BOUND, self.task.goal_size),
+                "desired_goal": _box(_GOAL_BOUND, self.task.goal_size),
+            }
+        )
+        self.action_space = _box(1.0, self.task.action_size)
+        self.episode = 0  # how many have been started
+        self._home = self.machine.inverse(self.machine.home)
         self._state: State | None = None
-        self._goal = np.full(3, np.nan)
-        self._pending: tuple[NDArray[np.float64], ...] = ()  # actions that come late
+        self._goal = np.full(self.task.goal_size, np.nan)
+        self._pending: tuple[FloatArray, ...] = ()  # actions that come late
         self._closed = False
         self._shown = 0.0  # when the last frame was due, s of the performance counter
-        self._physics, self._renderer = physics, renderer
-        self._kind = (task, self.randomisation, physics)
+        self._engine, self._physics, self._renderer = engine, physics, renderer
+        # As a dictionary, which is what a spec that went through JSON has.
+        numerics = physics
+        if is_dataclass(physics) and not isinstance(physics, type):
+            numerics = asdict(physics)
+        self._kind = (type(self.task), self.machine, engine, self.randomisation, numerics)
         self.simulation = self._start()
+
+    def _start(self) -> Simulation:
+        simulation = Simulation(
+            self.task.scene,
+            machine=self.machine,
+            engine=self._engine,
+            physics=self._physics,
+            gui=self.render_mode == "human",
+            renderer=self._renderer,
+        )
+        if simulation.engine.control_period != CONTROL_PERIOD:
+            simulation.close()
+            valid = f"a control_period of {CONTROL_PERIOD} s, which the tasks are made for"
+            raise ConfigurationError("physics", self._physics, valid)
+        return simulation
 
     # -- the Gymnasium interface ----------------------------------------------------------------
 
@@ -198,26 +260,30 @@ class TPMEnv(gym.Env[Observation, Action]):
 
         Args:
             seed: Seeds the environment's rng; equal seeds give equal episodes.
-            options: ``object`` and ``goal``, each (3,) m in the world frame, instead of sampled
-                ones.
+            options: Where objects (by name) start and the ``goal`` is, m, world frame, instead of
+                sampled ones.
 
         Raises:
-            ResetOptionError: If an option is unknown or not three finite numbers.
-            UnreachableError: If the object or the goal is out of reach.
+            ResetOptionError: If an option is unknown, not so many finite numbers, or would put an
+                object into another or into the robot.
+            UnreachableError: If an object or the goal is out of reach.
             EpisodeError: If the environment is closed.
         """
         self._require_open()
         super().reset(seed=seed)
-        options = checks.reset_options(options)
-        task, rng, start, goal = self.task, self.np_random, *map(options.get, ("object", "goal"))
-        start = task.sample_object(rng) if start is None else task.check_object(start)
-        goal = task.sample_goal(rng, start) if goal is None else task.check_goal(goal)
-        plant = self.randomisation.draw(rng, len(self.simulation.mechanism.links) - 1)
-        self._goal = goal
-        self._pending = (np.zeros(task.action_size),) * self.randomisation.latency
+        rng = self.np_random
+        start = self.task.start(rng, options)
+        plant = self.randomisation.draw(rng, self.machine)
+        self._goal = start.pop("goal")
+        self._pending = (np.zeros(self.task.action_size),) * self.randomisation.latency
         self._state = None
-        self._state = self.simulation.reset(self._home, start, goal, plant, self._draw_noise())
+        self.episode += 1
+        self._show_goal()
+        self._state = self.simulation.reset(self._home, start, plant, self._draw_noise())
         observation, info = self._report(self._state)
+        if self.randomisation != Randomisation():
+            latency = {"latency": self.randomisation.latency}
+            info["randomisation"] = {**plant.as_dict(), **latency}
         if self.render_mode == "human":
             self.render()
         return observation, info
@@ -231,23 +297,23 @@ class TPMEnv(gym.Env[Observation, Action]):
             ClosureError: If a loop of the mechanism opened.
             ModeChangeError: If the mechanism passed a singularity earlier in this episode.
         """
-        values = checks.action(action, self.task.action_size)
+        values = finite("action", action, (self.task.action_size,), ActionError)
         state = self._require_state()
-        queue = (*self._pending, values)
-        values, self._pending = queue[0], queue[1:]
-        command = self.control.command(values[:3], DEFAULT_MOUNT.to_paper(state.command))
-        vacuum = len(values) > 3 and bool(values[3] > 0)
+        values, *pending = (*self._pending, np.minimum(np.maximum(values, -1.0), 1.0))
+        command = self.control.command(values[:3], self.machine.mount.to_paper(state.command))
+        vacuum = self.task.vacuum and bool(values[3] > 0)
         self._state = None  # until the step has gone well
         try:
             self._state = self.simulation.move(command, vacuum, self._draw_noise())
         except ModeChangeError:
             self._state = state  # nothing has moved
             raise
+        self._pending = tuple(pending)
         observation, info = self._report(self._state)
-        reward = reports.reward(info, self.penalty_weight)
+        reward = info["reward_terms"]["goal"] + _goal_free(info)
         if self.render_mode == "human":
             self.render()
-        return observation, reward, False, self._state.mode_change is not None, info
+        return observation, reward, False, bool(self._state.passed_singularity), info
 
     def compute_reward(
         self,
@@ -261,8 +327,8 @@ class TPMEnv(gym.Env[Observation, Action]):
         HerReplayBuffer hands it over, they are left out, and what remains is the goal term.
 
         Args:
-            achieved_goal: (..., 3) m.
-            desired_goal: (..., 3) m.
+            achieved_goal: (..., goal size) m.
+            desired_goal: (..., goal size) m.
             info: The step's info, or one for each transition of the batch.
 
         Returns:
@@ -270,10 +336,9 @@ class TPMEnv(gym.Env[Observation, Action]):
         """
         goal_term = self.task.goal_term(achieved_goal, desired_goal)
         if isinstance(info, Mapping):
-            other: Any = reports.goal_free_reward(info, self.penalty_weight)
+            other: Any = _goal_free(info)
         else:
-            rest = [reports.goal_free_reward(entry, self.penalty_weight) for entry in info]
-            other = np.array(rest).reshape(goal_term.shape)
+            other = np.array([_goal_free(entry) for entry in info]).reshape(goal_term.shape)
         total = goal_term + other
         return float(total) if np.ndim(total) == 0 else total
 
@@ -289,7 +354,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         return None
 
     def close(self) -> None:
-        """Disconnect the simulation; harmless the second time."""
+        """Close the simulation; harmless the second time."""
         if not self._closed:
             self._closed = True
             self._state = None
@@ -307,8 +372,8 @@ class TPMEnv(gym.Env[Observation, Action]):
         return self._require_state()
 
     @property
-    def goal(self) -> NDArray[np.float64]:
-        """The episode's goal, (3,) m, world."""
+    def goal(self) -> FloatArray:
+        """The episode's goal, (goal size,) m, world."""
         return np.array(self._goal)
 
     def save_state(self) -> EnvSnapshot:
@@ -320,13 +385,9 @@ class TPMEnv(gym.Env[Observation, Action]):
             EpisodeError: If there is no episode.
         """
         self._require_state()
-        return EnvSnapshot(
-            self.simulation.save(),
-            dict(self.np_random.bit_generator.state),
-            self._goal.copy(),
-            self._pending,
-            self._kind,
-        )
+        rng = dict(self.np_random.bit_generator.state)
+        moment = (self.simulation.save(), rng, self.goal, self._pending, self._kind)
+        return EnvSnapshot(*moment, _digest(moment))
 
     def restore_state(self, snapshot: EnvSnapshot) -> Observation:
         """Go back to a moment that :meth:`save_state` took down.
@@ -336,15 +397,21 @@ class TPMEnv(gym.Env[Observation, Action]):
 
         Raises:
             EpisodeError: If the environment is closed.
-            InputError: If the moment is none, or that of another kind of environment.
+            InputError: If the moment is none, was changed, or is that of another kind of
+                environment; nothing has happened then.
         """
         self._require_open()
-        checks.snapshot(snapshot, EnvSnapshot, self._kind)
+        if not isinstance(snapshot, EnvSnapshot) or not snapshot.is_intact():
+            raise InputError("snapshot", type(snapshot), "what save_state() returned, unchanged")
+        if snapshot.kind != self._kind:
+            valid = f"of the same task and options, {self._kind}"
+            raise InputError("snapshot", snapshot.kind, valid)
         self.np_random.bit_generator.state = snapshot.rng
         self._goal, self._pending = snapshot.goal.copy(), snapshot.pending
-        self.simulation.show_goal(self._goal)
+        self._state = None
+        self._show_goal()
         self._state = self.simulation.restore(snapshot.simulation)
-        return reports.observation(self.task, self._state, self._goal)
+        return self._observe(self._state, self._goal)
 
     # -- inside ---------------------------------------------------------------------------------
 
@@ -379,24 +446,64 @@ class TPMEnv(gym.Env[Observation, Action]):
         if self._closed:
             self.simulation.close()
         elif snapshot is not None:
-            self.simulation.show_goal(self._goal)
+            self._show_goal()
             self._state = self.simulation.restore(snapshot)
 
-    def _draw_noise(self) -> tuple[float, float, float]:
+    def _show_goal(self) -> None:
+        self.simulation.show_goal(self.task.markers(self._goal))
+
+    def _draw_noise(self) -> Vector:
         """Errors of one reading of the encoders, rad."""
         if self.randomisation.encoder_noise == 0:
             return (0.0, 0.0, 0.0)
         a, b, c = self.np_random.normal(0.0, self.randomisation.encoder_noise, 3).tolist()
         return a, b, c
 
-    def _report(self, state: State) -> tuple[Observation, dict[str, Any]]:
-        observation = reports.observation(self.task, state, self._goal)
-        return observation, reports.info(self.task, state, observation, self.penalty_weight)
+    def _observe(self, state: State, goal: FloatArray) -> Observation:
+        return {
+            "observation": _clip(self.task.observe(state), _OBSERVATION_BOUND),
+            "achieved_goal": _clip(self.task.achieved(state), _GOAL_BOUND),
+            "desired_goal": goal.astype(np.float32),
+        }
 
-    def _start(self) -> Simulation:
-        return Simulation(
-            self.task.scene,
-            physics=self._physics,
-            gui=self.render_mode == "human",
-            renderer=self._renderer,
-        )
+    def _report(self, state: State) -> tuple[Observation, dict[str, Any]]:
+        task, observation = self.task, self._observe(state, self._goal)
+        achieved, desired = observation["achieved_goal"], observation["desired_goal"]
+        terms = task.reward_terms(state, achieved, desired)
+        return observation, {
+            "is_success": bool(task.success(achieved, desired)),
+            "closure_error": float(state.closure_error),
+            "conditioning": float(state.conditioning),
+            "singularity_penalty": float(task.penalty(state)),
+            "assembly_mode_changed": bool(state.assembly_mode_changed),
+            "working_mode_changed": bool(state.working_mode_changed),
+            "object_lost": bool(task.lost(state)),
+            "reward_terms": {name: float(value) for name, value in terms.items()},
+        }
+
+
+def _goal_free(info: Mapping[str, Any]) -> float:
+    """Sum of the reward's terms in ``info`` that do not depend on the goal; 0 for an empty one."""
+    terms = info.get("reward_terms", {})
+    return float(sum(value for name, value in terms.items() if name != "goal"))
+
+
+def _box(bound: float, length: int) -> spaces.Box:
+    return spaces.Box(-bound, bound, (length,), np.float32)
+
+
+def _clip(values: FloatArray, bound: float) -> NDArray[np.float32]:
+    clipped: NDArray[np.float32] = np.minimum(np.maximum(values, -bound), bound).astype(np.float32)
+    return clipped
+
+
+def _pixels(name: str, value: Any) -> int:
+    if isinstance(value, (int, np.integer)) and 16 <= value <= 4096:
+        return int(value)
+    raise ConfigurationError(name, value, "a whole number of pixels from 16 to 4096")
+
+
+def _digest(values: tuple[Any, ...]) -> str:
+    """A hash of plain data; of its repr, which unlike a pickle tells values, not identities."""
+    with np.printoptions(threshold=sys.maxsize, floatmode="unique"):
+        return hashlib.sha256(repr(values).encode()).hexdigest()

@@ -1,35 +1,79 @@
-"""The ids, and nothing that would import an engine."""
+"""The ids that Gymnasium knows."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import gymnasium as gym
 
-__all__ = ["ENV_IDS", "MAX_EPISODE_STEPS", "register"]
+from tpm_gym.errors import ConfigurationError
+from tpm_gym.tasks.pick_and_place import PickAndPlace
+from tpm_gym.tasks.reach import Reach
+from tpm_gym.tasks.registry import TASKS, option_name
+from tpm_gym.tasks.task import Task
 
+__all__ = ["ENTRY_POINT", "MAX_EPISODE_STEPS", "env_ids", "register_task"]
+
+ENTRY_POINT = "tpm_gym.envs.env:TPMEnv"
 MAX_EPISODE_STEPS = 50
 
-_TABLE = {
-    f"TPM{task_name}{control_suffix}{reward_suffix}-v0": {
-        "task": task,
-        "control": control,
-        "reward": reward,
+
+def register_task(
+    name: str, task: type[Task], *, version: int = 0, max_episode_steps: int = MAX_EPISODE_STEPS
+) -> tuple[str, ...]:
+    """Register a task's ids: ``TPM<name>{,Joints}{,Dense}-v<version>``; harmless the second time.
+
+    ``TPMEnv(task=...)`` and the command line then know it too, as ``name`` in snake case. In worker
+    processes that are spawned rather than forked, ids are found as ``"module:id"``, where importing
+    the module registers them.
+
+    Args:
+        name: In CamelCase, e.g. ``"PickAndPlace"``.
+        task: The class; one that was defined anew, as in a notebook, replaces its forerunner.
+        version: At the end of the ids.
+        max_episode_steps: After so many, episodes are truncated.
+
+    Returns:
+        The four ids.
+
+    Raises:
+        ConfigurationError: If the name is none, or it or an id is taken; nothing is registered
+            then.
+    """
+    option = option_name(name)
+    if not (isinstance(task, type) and issubclass(task, Task)):
+        raise ConfigurationError("task", task, "a class derived from tpm_gym.tasks.Task")
+    if _path(TASKS.get(option, task)) != _path(task):
+        raise ConfigurationError("name", name, f"another name; {TASKS[option]} has this one")
+    variants: dict[str, dict[str, Any]] = {
+        f"TPM{name}{joints}{dense}-v{version}": {
+            "entry_point": ENTRY_POINT,
+            "max_episode_steps": max_episode_steps,
+            "kwargs": {"task": option, "control": control, "reward": reward},
+        }
+        for control, joints in (("cartesian", ""), ("joints", "Joints"))
+        for reward, dense in (("sparse", ""), ("dense", "Dense"))
     }
-    for task_name, task in (("Reach", "reach"), ("PickAndPlace", "pick_and_place"))
-    for control_suffix, control in (("", "cartesian"), ("Joints", "joints"))
-    for reward_suffix, reward in (("", "sparse"), ("Dense", "dense"))
-}
-
-ENV_IDS: tuple[str, ...] = tuple(_TABLE)
-"""All ids that tpm_gym registers."""
-
-
-def register() -> None:
-    """Register every id with Gymnasium; harmless the second time."""
-    for env_id, kwargs in _TABLE.items():
+    for env_id, spec in variants.items():
+        other = gym.registry.get(env_id)
+        if other is not None and any(getattr(other, key) != spec[key] for key in spec):
+            valid = f"another name or version: {env_id} is there already, and is not this"
+            raise ConfigurationError("name", name, valid)
+    TASKS[option] = task
+    for env_id, spec in variants.items():
         if env_id not in gym.registry:
-            gym.register(
-                id=env_id,
-                entry_point="tpm_gym.envs.env:TPMEnv",
-                max_episode_steps=MAX_EPISODE_STEPS,
-                kwargs=dict(kwargs),
-            )
+            gym.register(env_id, **spec)
+    return tuple(variants)
+
+
+def env_ids() -> tuple[str, ...]:
+    """All ids whose environments are of tpm_gym, those of a user's tasks too."""
+    return tuple(env_id for env_id, spec in gym.registry.items() if spec.entry_point == ENTRY_POINT)
+
+
+def _path(task: type[Task]) -> tuple[str, str]:
+    return task.__module__, task.__qualname__
+
+
+register_task("Reach", Reach)
+register_task("PickAndPlace", PickAndPlace)

@@ -5,22 +5,20 @@ Everything here is in the paper frame, in metres, on one working mode.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector
 from tpm_gym.errors import ConfigurationError
-from tpm_gym.kinematics import jacobian
 from tpm_gym.kinematics.geometry import PAPER, Geometry
-from tpm_gym.kinematics.position import (
-    DEFAULT_ASSEMBLY,
-    ELBOWS_OUT,
-    AssemblyMode,
-    WorkingMode,
-    forward_all,
-    inverse_all,
-)
+from tpm_gym.kinematics.jacobian import conditioning_at, factors_at
+from tpm_gym.kinematics.modes import DEFAULT_ASSEMBLY, ELBOWS_OUT, AssemblyMode, WorkingMode
+from tpm_gym.kinematics.namespaces import namespace_of
+from tpm_gym.kinematics.position import inverse_all
 
 __all__ = [
     "TASK_REGION",
@@ -30,9 +28,6 @@ __all__ = [
     "reachable",
     "sample",
 ]
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -47,8 +42,8 @@ class Region:
         ConfigurationError: If low exceeds high on an axis.
     """
 
-    low: tuple[float, float, float]
-    high: tuple[float, float, float]
+    low: Vector
+    high: Vector
 
     def __post_init__(self) -> None:
         """Reject empty boxes."""
@@ -65,6 +60,10 @@ class Region:
         """The points of the box that are nearest to points (..., 3)."""
         inside: FloatArray = np.minimum(np.maximum(points, self.low), self.high)
         return inside
+
+    def corners(self) -> Iterator[tuple[float, float, float]]:
+        """The eight corners, m."""
+        return product(*zip(self.low, self.high, strict=True))  # type: ignore[return-value]
 
     def margin(self, point: ArrayLike) -> float:
         """Signed distance of one point (3,) to the nearest face; negative outside, m."""
@@ -94,36 +93,17 @@ def reachable(
 
 def assembly_of(
     position: ArrayLike, branch: WorkingMode = ELBOWS_OUT, geometry: Geometry = PAPER
-) -> NDArray[np.int64]:
+) -> IntArray:
     """Slot in ASSEMBLY_MODES that the posture of ``branch`` at points (..., 3) belongs to.
 
     Returns:
         (...,) slot, or -1 where the point is not reachable on ``branch``.
     """
-    points = np.asarray(position, dtype=np.float64)
-    solutions = inverse_all(points, geometry)
-    valid = solutions.valid[..., branch.index]
-    theta = np.where(valid[..., None], solutions.theta[..., branch.index, :], 0.0)
-    candidates = forward_all(theta, geometry).position
-    gaps = np.linalg.norm(candidates - points[..., None, :], axis=-1)
-    nearest = np.where(np.isnan(gaps), np.inf, gaps).argmin(axis=-1)
-    return np.where(valid, nearest, -1)
-
-
-def conditioning_at(
-    position: ArrayLike,
-    branch: WorkingMode = ELBOWS_OUT,
-    assembly: AssemblyMode = DEFAULT_ASSEMBLY,
-    geometry: Geometry = PAPER,
-) -> FloatArray:
-    """Conditioning 1/cond(J) at points (..., 3) m; 0 where not reachable on both branches."""
-    points = np.asarray(position, dtype=np.float64)
-    usable = assembly_of(points, branch, geometry) == assembly.index
-    result = np.zeros(points.shape[:-1])
-    if usable.any():
-        theta = inverse_all(points[usable], geometry).theta[..., branch.index, :]
-        result[usable] = jacobian.conditioning(theta, assembly, geometry)
-    return result
+    parallel = factors_at(position, branch, geometry).parallel
+    sin_beta, planar = parallel[..., 0], parallel[..., 2]
+    slots = 2 * (planar > 0) + 1 * (sin_beta > 0)
+    found: IntArray = namespace_of(parallel).where(planar == planar, slots, -1)
+    return found
 
 
 def sample(
@@ -132,6 +112,8 @@ def sample(
     min_conditioning: float = 0.0,
     geometry: Geometry = PAPER,
     attempts: int = 1000,
+    branch: WorkingMode = ELBOWS_OUT,
+    assembly: AssemblyMode = DEFAULT_ASSEMBLY,
 ) -> FloatArray:
     """Draw one point (3,) m, uniform over the part of ``region`` that is reachable and safe enough.
 
@@ -139,15 +121,17 @@ def sample(
         rng: Source of randomness.
         region: The box to draw from.
         min_conditioning: Smallest conditioning accepted.
-        geometry: Link lengths.
+        geometry: Lengths of the mechanism.
         attempts: Draws before giving up.
+        branch: The working mode.
+        assembly: The assembly mode that the posture must belong to.
 
     Raises:
         ConfigurationError: If no draw was accepted.
     """
     for _ in range(attempts):
         point = rng.uniform(region.low, region.high)
-        conditioning = conditioning_at(point, geometry=geometry)
+        conditioning = conditioning_at(point, branch, assembly, geometry)
         if conditioning > 0 and conditioning >= min_conditioning:
             return point
     raise ConfigurationError(

@@ -18,7 +18,7 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from tpm_gym.kinematics import WorkingMode
-from tpm_gym.kinematics.workspace import TASK_REGION
+from tpm_gym.mechanism import PAPER_TPM
 
 FloatArray = NDArray[np.float64]
 
@@ -82,7 +82,9 @@ def section_axes(axes: Axes, title: str, horizontal: str = "x", vertical: str = 
 def outline_task_region(axes: Axes, vertical: str, inside: bool, colour: str = BLACK) -> None:
     """Outline the environments' region in an x-z or x-y section; dashed where that misses it."""
     row = {"y": 1, "z": 2}[vertical]
-    low, high = (np.asarray(corner) * MM for corner in (TASK_REGION.low, TASK_REGION.high))
+    low, high = (
+        np.asarray(corner) * MM for corner in (PAPER_TPM.region.low, PAPER_TPM.region.high)
+    )
     axes.add_patch(
         Rectangle(
             (low[0], low[row]),

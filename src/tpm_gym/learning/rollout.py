@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from tpm_gym.learning.errors import RolloutError
 from tpm_gym.learning.estimates import Estimate, bootstrap, wilson
-from tpm_gym.tasks.rewards import SAFE_CONDITIONING
 
 SELECTION_SEED: Final = 1_000_000
 TEST_SEED: Final = 2_000_000
@@ -54,7 +53,8 @@ class Episode:
         conditioning_mean: Mean 1/cond(J) over the steps.
         closure_error_max: Largest loop gap of all steps, m.
         length: Number of steps.
-        unsafe_share: Share of the steps with 1/cond(J) below ``SAFE_CONDITIONING``.
+        unsafe_share: Share of the steps with a singularity penalty, so below the machine's
+            safe conditioning.
         fk_error_max: Largest distance of the observed point P (forward kinematics of the encoders)
             from that of the simulated platform, m.
         torque_rms: Root mean square of the motors' torques at the ends of the steps, over steps and
@@ -171,7 +171,7 @@ def _record(
         conditioning_mean=math.fsum(conditioning) / len(conditioning),
         closure_error_max=max(closure),
         length=len(rewards),
-        unsafe_share=sum(value < SAFE_CONDITIONING for value in conditioning) / len(conditioning),
+        unsafe_share=sum(info["singularity_penalty"] > 0 for info in infos) / len(infos),
         fk_error_max=max(fk_errors),
         torque_rms=math.hypot(*torques) / math.sqrt(len(torques)),
         torque_peak=max(map(abs, torques)),

@@ -1,1 +1,15 @@
-"""The robot as data: bodies, joints, closures, and the files other tools read."""
+"""The robot as data: bodies and joints, machines, mount and cup, and files other tools read."""
+
+from tpm_gym.mechanism.machine import Machine, find_machine, register_machine
+from tpm_gym.mechanism.mount import Mount
+from tpm_gym.mechanism.tpm import PAPER_TPM, TPM, WIDE_TPM
+
+__all__ = [
+    "PAPER_TPM",
+    "TPM",
+    "WIDE_TPM",
+    "Machine",
+    "Mount",
+    "find_machine",
+    "register_machine",
+]

@@ -1,20 +1,18 @@
-"""What mechanisms are made of: solids, joints, links and loop closures, with mass properties.
+"""What mechanisms are made of: solids, joints, links, loop closures, and the tree of them all.
 
 Units: metres, radians, kilograms.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-__all__ = ["Closure", "Joint", "Link", "Solid", "Vector"]
+from tpm_gym.arrays import FloatArray, Vector
 
-FloatArray = NDArray[np.float64]
-Vector = tuple[float, float, float]
+__all__ = ["Closure", "Joint", "Link", "Mechanism", "Solid"]
 
 
 @dataclass(frozen=True)
@@ -50,6 +48,16 @@ class Solid:
     def inertia(self) -> FloatArray:
         """(3,) kg m^2, principal moments about the centre, along the link's axes."""
         return self._inertia(self.size) - self._inertia(self.bore)
+
+    @property
+    def half_extent(self) -> FloatArray:
+        """(3,) m, half edges of the box around the solid, along the link's axes."""
+        if self.kind == "box":
+            return np.asarray(self.size) / 2
+        radius, length, _ = self.size
+        half = np.full(3, radius)
+        half["xyz".index(self.axis)] = length / 2
+        return half
 
     def _mass(self, size: Vector) -> float:
         if self.kind == "box":
@@ -141,3 +149,53 @@ class Closure:
     point_a: Vector
     link_b: str
     point_b: Vector
+
+
+@dataclass(frozen=True)
+class Mechanism:
+    """Everything an engine needs to build the mechanism.
+
+    Attributes:
+        links: Parents before children; the first is the base.
+        closures: The ball joints that close the loops.
+        platform: Name of the platform link.
+        point_p: Point P in the platform's frame, m.
+        tool: Name of the link that slides in the platform, with the vacuum cup.
+        lip: Centre of the cup's lip in the tool's frame, m.
+        actuated: Names of the motors' joints, in the order of theta_1, theta_2, theta_3.
+    """
+
+    links: tuple[Link, ...]
+    closures: tuple[Closure, ...]
+    platform: str
+    point_p: Vector
+    tool: str
+    lip: Vector
+    actuated: tuple[str, ...]
+    _index: dict[str, int] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        """Index the links by name."""
+        object.__setattr__(self, "_index", {link.name: i for i, link in enumerate(self.links)})
+
+    def link(self, name: str) -> Link:
+        """The link of that name.
+
+        Raises:
+            KeyError: If there is none.
+        """
+        return self.links[self._index[name]]
+
+    def legs(self) -> tuple[Mechanism, ...]:
+        """The spanning tree taken apart at the base: one tree for each arm and what hangs on it."""
+        arm: dict[str, str] = {}
+        for link in self.links[1:]:
+            joint = link.joint
+            assert joint is not None
+            arm[link.name] = arm.get(joint.parent, link.name)
+        return tuple(
+            replace(
+                self, links=(self.links[0], *(k for k in self.links[1:] if arm[k.name] == name))
+            )
+            for name in dict.fromkeys(arm.values())
+        )

@@ -19,124 +19,206 @@ along +y (branch I) or +x (branches II, III). Units: metres, radians, kilograms.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tpm_gym.arrays import Vector
 from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode, passive_angles
 from tpm_gym.kinematics.geometry import PAPER, Geometry
-from tpm_gym.mechanism.bodies import Closure, Link, Vector
-from tpm_gym.mechanism.links import CUP_LENGTH, CUP_RADIUS, base, branch_1, branch_2, branch_3
+from tpm_gym.mechanism.bodies import Closure, Joint, Link, Mechanism, Solid
+from tpm_gym.mechanism.cup import CUP
 
-__all__ = [
-    "ACTUATED_JOINTS",
-    "CUP_LENGTH",
-    "CUP_RADIUS",
-    "DEFAULT_MOUNT",
-    "Mechanism",
-    "Mount",
-    "build",
-    "joint_angles",
-]
-
-FloatArray = NDArray[np.float64]
+__all__ = ["ACTUATED_JOINTS", "build", "joint_angles"]
 
 ACTUATED_JOINTS = ("R11", "R21", "R31")
 """The motors, in the order of theta_1, theta_2, theta_3."""
 
+# Materials, kg/m^3.
+ALUMINIUM, STEEL, CARBON_FIBRE = 2700.0, 7850.0, 1600.0
 
-@dataclass(frozen=True)
-class Mount:
-    """How the base hangs over the table: the one conversion between paper and world frame.
+# Direct-drive torque motors of the class used in light delta robots: peak torque and speed.
+MOTOR_EFFORT = 100.0  # N m
+MOTOR_SPEED = 12.0  # rad/s
+# How far each arm may turn from pointing level outwards, towards the base and the platform.
+ARM_RAISED, ARM_LOWERED = np.deg2rad(75.0), np.deg2rad(115.0)
 
-    The base is mounted upside down, a half turn about x: world = (x, -y, height - z).
-
-    Attributes:
-        height: Height of the base plane above the table top (world z = 0), m.
-    """
-
-    height: float
-
-    def to_world(self, point: ArrayLike) -> FloatArray:
-        """Convert points (..., 3) m from the paper frame to the world frame."""
-        world: FloatArray = self.rotate(point) + np.array([0.0, 0.0, self.height])
-        return world
-
-    def to_paper(self, point: ArrayLike) -> FloatArray:
-        """Convert points (..., 3) m from the world frame to the paper frame."""
-        return self.rotate(np.asarray(point, dtype=np.float64) - np.array([0.0, 0.0, self.height]))
-
-    def rotate(self, vector: ArrayLike) -> FloatArray:
-        """Convert free vectors (..., 3), such as velocities; the half turn is its own inverse."""
-        turned: FloatArray = np.multiply(vector, _HALF_TURN, dtype=np.float64)
-        return turned
-
-    def swap(self, point: Vector) -> Vector:
-        """One point from either frame to the other, in plain floats: a half turn undoes itself."""
-        x, y, z = point
-        return x, -y, self.height - z
-
-    @property
-    def quaternion(self) -> tuple[float, float, float, float]:
-        """Orientation of the paper frame in the world, (x, y, z, w)."""
-        return (1.0, 0.0, 0.0, 0.0)
+_ALONG: dict[str, int] = {"x": 0, "y": 1, "z": 2}
 
 
-_HALF_TURN = np.array([1.0, -1.0, -1.0])
+def _vector(axis: str, value: float, centre: Vector = (0.0, 0.0, 0.0)) -> Vector:
+    """``centre`` displaced by ``value`` along ``axis``."""
+    moved = list(centre)
+    moved[_ALONG[axis]] += value
+    return (moved[0], moved[1], moved[2])
 
-DEFAULT_MOUNT = Mount(height=0.97)
-"""The cup touches the table at z = 0.93 m of the paper frame, well inside the reach."""
+
+def _tube(
+    axis: Literal["x", "y"], length: float, height: float, width: float, wall: float
+) -> Solid:
+    """A rectangular aluminium tube from the link's origin along ``axis``."""
+    outer = (length, width, height) if axis == "x" else (width, length, height)
+    inner = tuple(edge if i == _ALONG[axis] else edge - 2 * wall for i, edge in enumerate(outer))
+    return Solid(
+        "box",
+        outer,
+        _vector(axis, length / 2),
+        ALUMINIUM,
+        bore=(inner[0], inner[1], inner[2]),
+        colour="orange",
+    )
 
 
-@dataclass(frozen=True)
-class Mechanism:
-    """Everything an engine needs to build the mechanism.
+def _bar(
+    axis: Literal["x", "y", "z"],
+    half: float,
+    radius: float = 0.008,
+    centre: Vector = (0.0, 0.0, 0.0),
+    colour: str = "steel",
+    density: float = ALUMINIUM,
+) -> Solid:
+    """A round solid bar of half length ``half`` about ``centre``."""
+    return Solid("cylinder", (radius, 2 * half, 0.0), centre, density, axis=axis, colour=colour)
 
-    Attributes:
-        geometry: The lengths it was built from.
-        links: Parents before children; the first is the base.
-        closures: The ball joints that close the loops.
-        platform: Name of the platform link.
-        point_p: Point P in the platform's frame, m.
-        tool: Name of the link that slides in the platform, with the vacuum cup.
-        lip: Centre of the cup's lip in the tool's frame, m.
-    """
 
-    geometry: Geometry
-    links: tuple[Link, ...]
-    closures: tuple[Closure, ...]
-    platform: str
-    point_p: Vector
-    tool: str
-    lip: Vector
-    _index: dict[str, int] = field(init=False, repr=False, compare=False)
+def _rod(axis: Literal["x", "y"], length: float) -> tuple[Solid, ...]:
+    """A carbon-fibre tube, 16 mm by 1.5 mm, with a steel rod end at both ends."""
+    tube = Solid(
+        "cylinder",
+        (0.008, length, 0.0),
+        _vector(axis, length / 2),
+        CARBON_FIBRE,
+        bore=(0.0065, length, 0.0),
+        axis=axis,
+        colour="carbon",
+    )
+    ends = tuple(
+        _bar(axis, 0.008, 0.009, _vector(axis, at), density=STEEL) for at in (0.008, length - 0.008)
+    )
+    return (tube, *ends)
 
-    def __post_init__(self) -> None:
-        """Index the links by name."""
-        object.__setattr__(self, "_index", {link.name: i for i, link in enumerate(self.links)})
 
-    def link(self, name: str) -> Link:
-        """The link of that name.
+def _motor(name: str, axis: Vector, origin: Vector, level: float, sense: int) -> Joint:
+    """A motor whose arm points level outwards at ``level`` and lowers in the ``sense`` of theta."""
+    lower, upper = sorted((level - sense * ARM_RAISED, level + sense * ARM_LOWERED))
+    return Joint(name, "revolute", "base", origin, axis, lower, upper, MOTOR_EFFORT, MOTOR_SPEED)
 
-        Raises:
-            KeyError: If there is none.
-        """
-        return self.links[self._index[name]]
 
-    def legs(self) -> tuple[Mechanism, ...]:
-        """The spanning tree taken apart at the base: one tree for each arm and what hangs on it."""
-        arm: dict[str, str] = {}
-        for link in self.links[1:]:
-            joint = link.joint
-            assert joint is not None
-            arm[link.name] = arm.get(joint.parent, link.name)
-        return tuple(
-            replace(
-                self, links=(self.links[0], *(k for k in self.links[1:] if arm[k.name] == name))
-            )
-            for name in dict.fromkeys(arm.values())
+def _base(g: Geometry) -> Link:
+    """Base 0: a plate with a motor at each pivot. Its mass does not matter, it never moves."""
+    plate = Solid(
+        "cylinder", (g.l1 + 0.06, 0.02, 0.0), (0.0, 0.0, -0.07), ALUMINIUM, colour="white"
+    )
+    motors = (
+        _bar("x", 0.055, 0.042, (0.0, g.l1, 0.0), "dark"),
+        _bar("y", 0.055, 0.042, (-g.l1, 0.0, 0.0), "dark"),
+        _bar("y", 0.055, 0.042, (g.l1, 0.0, 0.0), "dark"),
+    )
+    brackets = tuple(
+        Solid("box", (0.08, 0.08, 0.05), (x, y, -0.04), ALUMINIUM, colour="white")
+        for x, y in ((0.0, g.l1), (-g.l1, 0.0), (g.l1, 0.0))
+    )
+    return Link("base", (plate, *brackets, *motors))
+
+
+def _arm(axis: Literal["x", "y"], across: Literal["x", "y"], g: Geometry) -> tuple[Solid, ...]:
+    """An actuated arm: hub with the motor's rotor, rectangular tube, elbow bar across."""
+    hub = _bar(across, 0.058, 0.022, colour="steel", density=STEEL)
+    return (
+        hub,
+        _tube(axis, g.l3, 0.045, 0.030, 0.003),
+        _bar(across, 0.02, 0.015, _vector(axis, g.l3)),
+    )
+
+
+def _branch_1(g: Geometry) -> tuple[Link, ...]:
+    """Arm 2 with short link 3, and the two rods 4 of the 4S parallelogram."""
+    short_link = _bar("x", g.l5, 0.010, (0.0, g.l3, 0.0))
+    arm = Link(
+        "arm_2",
+        (*_arm("y", "x", g), short_link),
+        _motor("R11", (1.0, 0.0, 0.0), (0.0, g.l1, 0.0), level=0.0, sense=1),
+    )
+    links = [arm]
+    for suffix, ball, side in (("a", "Sa", 1), ("b", "Sb", -1)):
+        cross = Link(
+            f"cross_4{suffix}",
+            (_bar("z", 0.010, 0.009, density=STEEL),),
+            Joint(
+                f"{ball}_swing", "continuous", "arm_2", (side * g.l5, g.l3, 0.0), (1.0, 0.0, 0.0)
+            ),
         )
+        rod = Link(
+            f"rod_4{suffix}",
+            _rod("y", g.l4),
+            Joint(f"{ball}_tilt", "continuous", cross.name, (0.0, 0.0, 0.0), (0.0, 0.0, -1.0)),
+        )
+        links += [cross, rod]
+    return tuple(links)
+
+
+def _branch_2(g: Geometry) -> tuple[Link, ...]:
+    """Arm 5, rod 6, link 3', link 7, platform 1, the cup that slides in it, end link 10."""
+    minus_y = (0.0, -1.0, 0.0)
+    link_3p = (
+        Solid(
+            "box",
+            (3 * g.l5, 0.025, 0.018),
+            (1.5 * g.l5, 0.0, 0.0),
+            ALUMINIUM,
+            bore=(3 * g.l5, 0.019, 0.012),
+            colour="blue",
+        ),
+        _bar("y", 0.016, 0.011, density=STEEL),
+    )
+    link_7 = (
+        Solid("box", (g.l7, 0.020, 0.008), (g.l7 / 2, 0.0, 0.0), ALUMINIUM, colour="yellow"),
+        _bar("z", 0.008, 0.011, density=STEEL),
+        _bar("z", 0.008, 0.011, (g.l7, 0.0, 0.0), density=STEEL),
+    )
+    return (
+        Link("arm_5", _arm("x", "y", g), _motor("R21", minus_y, (-g.l1, 0.0, 0.0), np.pi, -1)),
+        Link(
+            "rod_6", _rod("x", g.l4), Joint("R22", "continuous", "arm_5", (g.l3, 0.0, 0.0), minus_y)
+        ),
+        Link("link_3p", link_3p, Joint("R23", "continuous", "rod_6", (g.l4, 0.0, 0.0), minus_y)),
+        Link("link_7", link_7, Joint("R12", "continuous", "link_3p", (2 * g.l5, 0.0, g.l6))),
+        Link("platform", _platform(g), Joint("R13", "continuous", "link_7", (g.l7, 0.0, 0.0))),
+        CUP.link("platform", (g.l2, 0.0, g.l6)),
+        Link(
+            "end_link_10",
+            (_bar("y", g.l5 + 0.01, 0.007),),
+            Joint("R33", "continuous", "platform", (2 * g.l2, 0.0, 0.0), minus_y),
+        ),
+    )
+
+
+def _platform(g: Geometry) -> tuple[Solid, ...]:
+    """Platform 1: a plate from F1 to D3 and the stem in which the cup slides."""
+    point_p = (g.l2, 0.0, g.l6)
+    plate = Solid("box", (2 * g.l2 + 0.04, 0.045, 0.008), point_p, ALUMINIUM, colour="light")
+    return plate, CUP.stem(point_p)
+
+
+def _branch_3(g: Geometry) -> tuple[Link, ...]:
+    """Arm 12, end link 9, and the two rods 11 of the second parallelogram."""
+    minus_y, plus_z = (0.0, -1.0, 0.0), (0.0, 0.0, 1.0)
+    arm = Link("arm_12", _arm("x", "y", g), _motor("R31", minus_y, (g.l1, 0.0, 0.0), 0.0, 1))
+    end_link = Link(
+        "end_link_9",
+        (_bar("y", g.l5 + 0.01, 0.008),),
+        Joint("R32", "continuous", "arm_12", (g.l3, 0.0, 0.0), minus_y),
+    )
+    rods = tuple(
+        Link(
+            f"rod_11{suffix}",
+            _rod("x", g.l4),
+            Joint(name, "continuous", "end_link_9", (0.0, side * g.l5, 0.0), plus_z),
+        )
+        for suffix, name, side in (("a", "Re", 1), ("b", "Rf", -1))
+    )
+    return (arm, end_link, *rods)
 
 
 def build(geometry: Geometry = PAPER) -> Mechanism:
@@ -147,10 +229,10 @@ def build(geometry: Geometry = PAPER) -> Mechanism:
     """
     g = geometry
     links = (
-        base(g),
-        *branch_1(g),
-        *branch_2(g),
-        *branch_3(g),
+        _base(g),
+        *_branch_1(g),
+        *_branch_2(g),
+        *_branch_3(g),
     )
     closures = (
         Closure("Sc", "rod_4a", (0.0, g.l4, 0.0), "link_3p", (3 * g.l5, 0.0, 0.0)),
@@ -159,13 +241,13 @@ def build(geometry: Geometry = PAPER) -> Mechanism:
         Closure("Rh", "rod_11b", (g.l4, 0.0, 0.0), "end_link_10", (0.0, -g.l5, 0.0)),
     )
     return Mechanism(
-        geometry=g,
         links=links,
         closures=closures,
         platform="platform",
         point_p=(g.l2, 0.0, g.l6),
         tool="cup",
-        lip=(0.0, 0.0, CUP_LENGTH),
+        lip=CUP.lip,
+        actuated=ACTUATED_JOINTS,
     )
 
 

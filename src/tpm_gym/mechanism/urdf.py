@@ -14,8 +14,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from xml.etree import ElementTree
 
-from tpm_gym.mechanism.bodies import Link, Solid
-from tpm_gym.mechanism.tree import ACTUATED_JOINTS, Mechanism, build
+from tpm_gym.mechanism.bodies import Link, Mechanism, Solid
+from tpm_gym.mechanism.tree import build
 
 __all__ = ["COLOURS", "LOOPS_FILE", "URDF_FILE", "loops_text", "urdf_text", "write"]
 
@@ -45,9 +45,7 @@ _AXIS_RPY = {
 def urdf_text(mechanism: Mechanism) -> str:
     """The spanning tree as URDF, in the paper frame."""
     root = ElementTree.Element("robot", name="tpm")
-    root.append(
-        ElementTree.Comment(" Generated from tpm_gym.mechanism.tree; do not edit (make urdf). ")
-    )
+    root.append(ElementTree.Comment(" Generated from tpm_gym.mechanism; do not edit (make urdf). "))
     for name, rgba in COLOURS.items():
         material = ElementTree.SubElement(root, "material", name=name)
         ElementTree.SubElement(material, "color", rgba=_numbers(rgba))
@@ -62,8 +60,8 @@ def urdf_text(mechanism: Mechanism) -> str:
 
 def loops_text(mechanism: Mechanism) -> str:
     """The loop closures and the motors as YAML."""
-    lines = ["# Generated from tpm_gym.mechanism.tree; do not edit (make urdf).", "name_mot:"]
-    lines += [f"  - {name}" for name in ACTUATED_JOINTS]
+    lines = ["# Generated from tpm_gym.mechanism; do not edit (make urdf).", "name_mot:"]
+    lines += [f"  - {name}" for name in mechanism.actuated]
     lines.append("closed_loop:")
     for closure in mechanism.closures:
         lines += [

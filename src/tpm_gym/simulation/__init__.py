@@ -1,1 +1,18 @@
 """What moves the robot: state, randomisation, the simulation and its engines."""
+
+from tpm_gym.simulation.engine import Engine, register_engine
+from tpm_gym.simulation.randomisation import Plant, Randomisation
+from tpm_gym.simulation.simulation import Simulation, Snapshot
+from tpm_gym.simulation.state import Block, Scene, State
+
+__all__ = [
+    "Block",
+    "Engine",
+    "Plant",
+    "Randomisation",
+    "Scene",
+    "Simulation",
+    "Snapshot",
+    "State",
+    "register_engine",
+]

@@ -8,15 +8,14 @@ expert keep believing in the nominal machine, as on a real robot.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
+from tpm_gym.arrays import Vector
 from tpm_gym.errors import ConfigurationError
-from tpm_gym.kinematics.geometry import Geometry
-from tpm_gym.mechanism.bodies import Vector
+from tpm_gym.mechanism.machine import Machine
 
 __all__ = ["NOMINAL", "Plant", "Randomisation"]
 
@@ -43,12 +42,12 @@ class Plant:
 
     Attributes:
         link_masses: Factors of mass and inertia, one for each moving link in the order of
-            :func:`tpm_gym.mechanism.tree.build`; empty if all are one.
-        puck_mass: Factor of the puck's mass.
-        friction: Factor of the friction between puck and table, and puck and cup.
+            the machine's mechanism; empty if all are one.
+        puck_mass: Factor of the objects' mass.
+        friction: Factor of the friction between objects and table, and objects and cup.
         motor_strength: Factors of the three motors' largest torque.
         encoder_bias: What the encoders report minus what is true, rad.
-        length_errors: True minus nominal lengths l1 to l7, m; empty if all are zero.
+        length_errors: True minus nominal lengths (l1 to l7), m; empty if all are zero.
     """
 
     link_masses: tuple[float, ...] = ()
@@ -58,12 +57,16 @@ class Plant:
     encoder_bias: Vector = (0.0, 0.0, 0.0)
     length_errors: tuple[float, ...] = ()
 
-    def geometry(self, nominal: Geometry) -> Geometry:
-        """The true lengths."""
+    def of(self, nominal: Machine) -> Machine:
+        """The true machine."""
         if not self.length_errors:
             return nominal
-        lengths = zip(vars(nominal).values(), self.length_errors, strict=True)
-        return Geometry(*(length + error for length, error in lengths))
+        lengths = zip(nominal.lengths, self.length_errors, strict=True)
+        return nominal.with_lengths(tuple(length + error for length, error in lengths))
+
+    def as_dict(self) -> dict[str, Any]:
+        """As plain data, for ``info``."""
+        return asdict(self)
 
 
 NOMINAL = Plant()
@@ -79,8 +82,8 @@ class Randomisation:
     Attributes:
         link_mass: Factor of each moving link's mass and inertia, drawn for each link;
             within 0.5 to 2.
-        puck_mass: Factor of the puck's mass (50 g); within 0.1 to 10.
-        friction: Factor of the puck's friction (0.6 on the table); within 0.1 to 3.
+        puck_mass: Factor of the objects' mass (50 g); within 0.1 to 10.
+        friction: Factor of the objects' friction (0.6 on the table); within 0.1 to 3.
         motor_strength: Factor of each motor's largest torque (100 N m); within 0.5 to 1.5.
         encoder_noise: Standard deviation of each reading of an encoder, rad; at most 0.001.
             The rates are differences of readings over a control period, and as noisy.
@@ -120,41 +123,19 @@ class Randomisation:
             raise ConfigurationError("latency", self.latency, "0 or 1 control steps")
         object.__setattr__(self, "latency", int(self.latency))
 
-    @classmethod
-    def of(cls, value: Any) -> Randomisation:
-        """From None, a Randomisation, or a mapping of its attributes (as YAML files have it).
-
-        Raises:
-            ConfigurationError: If it is anything else, or a value is out of range.
-        """
-        if value is None:
-            return cls()
-        if isinstance(value, cls):
-            return value
-        names = [field.name for field in fields(cls)]
-        if not isinstance(value, Mapping) or not set(value) <= set(names):
-            valid = f"None, a Randomisation, or a mapping with keys among {', '.join(names)}"
-            raise ConfigurationError("randomisation", value, valid)
-        return cls(**value)
-
-    def draw(self, rng: np.random.Generator, links: int) -> Plant:
-        """The machine of one episode.
-
-        Args:
-            rng: Source of randomness; not touched where there is nothing to draw.
-            links: How many links move.
-        """
+    def draw(self, rng: np.random.Generator, machine: Machine) -> Plant:
+        """How the machine of one episode differs; ``rng`` is not touched where nothing does."""
         if self == _NOTHING:
             return NOMINAL
         motors = self._factors(rng, "motor_strength", 3)
         biases = _deviations(rng, self.encoder_bias, 3) or (0.0, 0.0, 0.0)
         return Plant(
-            link_masses=self._factors(rng, "link_mass", links),
+            link_masses=self._factors(rng, "link_mass", len(machine.mechanism.links) - 1),
             puck_mass=self._factors(rng, "puck_mass", 1)[0],
             friction=self._factors(rng, "friction", 1)[0],
             motor_strength=(motors[0], motors[1], motors[2]),
             encoder_bias=(biases[0], biases[1], biases[2]),
-            length_errors=_deviations(rng, self.length_error, 7),
+            length_errors=_deviations(rng, self.length_error, len(machine.lengths)),
         )
 
     def _factors(self, rng: np.random.Generator, name: str, count: int) -> tuple[float, ...]:

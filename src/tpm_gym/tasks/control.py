@@ -1,8 +1,8 @@
 """From an action to the next command for point P, and back.
 
-Both kinds of control end in a Cartesian command inside :data:`~tpm_gym.kinematics.workspace.TASK_REGION`, at
-most :data:`STEP_LIMIT` away from the last one, so that the simulation never sees a target that it
-cannot follow. Everything is in the paper frame.
+Both kinds of control end in a Cartesian command inside the machine's region, at most its step limit
+away from the last one, so that the simulation never sees a target that it cannot follow. Everything
+is in the machine's frame.
 """
 
 from __future__ import annotations
@@ -10,23 +10,14 @@ from __future__ import annotations
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tpm_gym.arrays import FloatArray, Vector
 from tpm_gym.errors import ConfigurationError, UnreachableError
-from tpm_gym.kinematics import DEFAULT_ASSEMBLY, inverse, jacobian, single
-from tpm_gym.kinematics.geometry import PAPER
-from tpm_gym.kinematics.workspace import TASK_REGION
+from tpm_gym.mechanism.machine import Machine
 
-__all__ = ["JOINT_LIMIT", "STEP_LIMIT", "CartesianControl", "Control", "JointControl", "make"]
+__all__ = ["CartesianControl", "Control", "JointControl", "make_control"]
 
-FloatArray = NDArray[np.float64]
-
-STEP_LIMIT = np.array([0.030, 0.005, 0.030])
-"""Largest change of the command for P along x, y, z in one control step, m."""
-STEP_LIMIT.setflags(write=False)
-
-JOINT_LIMIT = 0.08
-"""Largest change of a joint's command in one control step, rad."""
 _BISECTIONS = 10  # the fraction of a step to a thousandth
 
 
@@ -41,35 +32,44 @@ class Control(Protocol):
 
 
 class CartesianControl:
-    """Actions are increments of point P along x, y, z, in units of STEP_LIMIT."""
+    """Actions are increments of point P along x, y, z, in units of the machine's step limit."""
+
+    def __init__(self, machine: Machine) -> None:
+        """For one machine."""
+        self._region, self._step = machine.region, np.array(machine.step_limit)
 
     def command(self, action: ArrayLike, current: ArrayLike) -> FloatArray:
         """The current command plus the increment, projected into the region."""
-        return TASK_REGION.project(np.asarray(current) + np.asarray(action) * STEP_LIMIT)
+        return self._region.project(np.asarray(current) + np.asarray(action) * self._step)
 
     def action(self, wanted: ArrayLike, current: ArrayLike) -> FloatArray:
         """The increment that is wanted, clipped axis by axis."""
-        step: FloatArray = (np.asarray(wanted) - np.asarray(current)) / STEP_LIMIT
+        step: FloatArray = (np.asarray(wanted) - np.asarray(current)) / self._step
         return np.clip(step, -1.0, 1.0)
 
 
 class JointControl:
-    """Actions are increments of the three actuated angles, in units of JOINT_LIMIT.
+    """Actions are increments of the three joints, in units of the machine's joint limit.
 
-    Where the increment would move P faster than STEP_LIMIT allows (along y it often would: the
-    platform is quick there, and near the singularity very quick) or into a posture that cannot be
-    assembled, all three joints are slowed down together; what then still leaves the region is
+    Where the increment would move P faster than the step limit allows (along y the TPM often would:
+    the platform is quick there, and near the singularity very quick) or into a posture that cannot
+    be assembled, all three joints are slowed down together; what then still leaves the region is
     projected into it.
     """
+
+    def __init__(self, machine: Machine) -> None:
+        """For one machine."""
+        self._machine, self._step = machine, np.array(machine.step_limit)
 
     def command(self, action: ArrayLike, current: ArrayLike) -> FloatArray:
         """Point P after the (slowed down) increment of the joints, projected into the region."""
         start = np.asarray(current, dtype=np.float64)
-        theta = inverse(start)
-        step = np.asarray(action, dtype=np.float64) * JOINT_LIMIT
+        joints = self._machine.inverse(_vector(start))
+        theta = np.array(joints)
+        step = np.asarray(action, dtype=np.float64) * self._machine.joint_limit
         # By J, this fraction of the step uses the limit up; the exact one is near.
-        rate = np.abs(jacobian.evaluate(theta).velocity @ step)
-        linear = float((STEP_LIMIT / np.maximum(rate, 1e-12)).min())
+        rate = np.abs(np.array(self._machine.evaluate(joints).jacobian) @ step)
+        linear = float((self._step / np.maximum(rate, 1e-12)).min())
         low, high = 0.0, min(1.0, 2 * linear)
         point = self._allowed(theta + high * step, start)
         if point is None:
@@ -81,32 +81,37 @@ class JointControl:
                     high = middle
                 else:
                     low, point = middle, tried
-        return TASK_REGION.project(point)
+        return self._machine.region.project(point)
 
     def _allowed(self, theta: FloatArray, start: FloatArray) -> FloatArray | None:
-        """Point P at ``theta``, if it is assembled as at ``start`` and within STEP_LIMIT of it."""
-        a, b, c = theta.tolist()
+        """Point P at ``theta``, if it is in the machine's modes and a step from ``start``."""
         try:
-            there = single.assemble((a, b, c), DEFAULT_ASSEMBLY, PAPER)
+            point = np.array(self._machine.forward(_vector(theta)))
         except UnreachableError:
             return None
-        point = np.array(there[:3])
-        near = bool((np.abs(point - start) <= STEP_LIMIT).all())
-        return point if near and there.cos_beta > 0 else None
+        return point if (np.abs(point - start) <= self._step).all() else None
 
     def action(self, wanted: ArrayLike, current: ArrayLike) -> FloatArray:
         """The increment of the joints, scaled down as a whole where it is too large."""
-        step: FloatArray = (inverse(wanted) - inverse(current)) / JOINT_LIMIT
+        inverse = self._machine.inverse
+        there, here = (inverse(_vector(np.asarray(p))) for p in (wanted, current))
+        step: FloatArray = np.subtract(there, here) / self._machine.joint_limit
         return step / max(1.0, float(np.abs(step).max()))
 
 
-def make(kind: str) -> Control:
+def make_control(kind: str, machine: Machine) -> Control:
     """The control of that name.
 
     Raises:
         ConfigurationError: If there is none.
     """
-    kinds: dict[str, type[Control]] = {"cartesian": CartesianControl, "joints": JointControl}
-    if kind not in kinds:
-        raise ConfigurationError("control", kind, ", ".join(map(repr, kinds)))
-    return kinds[kind]()
+    if kind == "cartesian":
+        return CartesianControl(machine)
+    if kind == "joints":
+        return JointControl(machine)
+    raise ConfigurationError("control", kind, "'cartesian' or 'joints'")
+
+
+def _vector(array: FloatArray) -> Vector:
+    a, b, c = array.tolist()
+    return a, b, c

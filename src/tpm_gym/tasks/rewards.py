@@ -3,19 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-__all__ = ["SAFE_CONDITIONING", "dense", "distance", "singularity_penalty", "sparse"]
+from tpm_gym.arrays import FloatArray
 
-FloatArray = NDArray[np.float64]
-
-SAFE_CONDITIONING = 0.08
-"""Conditioning 1/cond(J) from which on the mechanism counts as safe from singularities.
-
-There, a joint error of 1 mrad moves the platform by 3 mm at most; as y goes to zero, the one grows
-without bound and the other falls with y. Goals and objects are sampled where the conditioning is at
-least this; a sixth of the task region is below.
-"""
+__all__ = ["dense", "distance", "singularity_penalty", "sparse"]
 
 
 def distance(achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
@@ -35,7 +27,7 @@ def dense(gap: ArrayLike, unit: float = 0.1) -> FloatArray:
     return -np.asarray(gap, dtype=np.float64) / unit
 
 
-def singularity_penalty(conditioning: ArrayLike, safe: float = SAFE_CONDITIONING) -> FloatArray:
+def singularity_penalty(conditioning: ArrayLike, safe: float) -> FloatArray:
     """Nearness to a singularity: 1 - (conditioning / safe)^4, and 0 where conditioning >= safe.
 
     1 at a singularity, smooth down to the threshold, and steepest there, so that crossing it has a

@@ -1,47 +1,39 @@
-"""Tasks: what is sampled, observed, rewarded and called a success.
+"""What a task is: the scene, what is sampled, observed, rewarded, called a success; its expert.
 
-A task sees only :class:`~tpm_gym.simulation.state.State`; every function of a state accepts any leading batch
-shape. Goals, positions and velocities are in the world frame, in metres and seconds.
+A task sees only :class:`~tpm_gym.simulation.state.State`; every function of a state accepts any
+leading batch shape. Goals, positions and velocities are in the world frame, in metres and seconds.
+
+A new one is one file: derive from :class:`Task`, write :meth:`~Task.sample`, :meth:`~Task.achieved`
+and, for an expert, :meth:`~Task.plan`; then :func:`tpm_gym.register_task`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import cycle
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tpm_gym.arrays import BoolArray, FloatArray, finite
 from tpm_gym.errors import ConfigurationError, ResetOptionError, UnreachableError
-from tpm_gym.kinematics import workspace
-from tpm_gym.kinematics.workspace import TASK_REGION, Region
-from tpm_gym.mechanism.tree import CUP_LENGTH, DEFAULT_MOUNT
-from tpm_gym.simulation.physics import CONTROL_PERIOD
-from tpm_gym.simulation.state import Puck, Scene, State
+from tpm_gym.kinematics.workspace import Region
+from tpm_gym.mechanism.cup import CUP
+from tpm_gym.mechanism.machine import Machine
+from tpm_gym.simulation.state import CONTROL_PERIOD, Block, Scene, State
 from tpm_gym.tasks import rewards
-from tpm_gym.tasks.control import STEP_LIMIT
 
-__all__ = ["HOME", "TOLERANCE", "Entry", "PickAndPlace", "Reach", "Task", "make"]
+if TYPE_CHECKING:
+    from tpm_gym.tasks.expert import Expert, Move
 
-FloatArray = NDArray[np.float64]
-Vector = tuple[float, ...]
+__all__ = ["Entry", "Task"]
 
-TOLERANCE = 0.010
-"""Success is a distance below this, m."""
-HOME = (-0.04, 0.028, 0.80)
-"""Where point P is at the start of an episode, paper frame, m."""
-GOAL_REGION = Region(low=(-0.20, 0.016, 0.70), high=(0.10, 0.042, 0.90))
-"""Where point P has to go to reach a goal, paper frame; cut by the conditioning when sampled."""
-MIN_SEPARATION = 0.030
-"""A goal is at least this far from where its episode starts, m: no success for free."""
+Values = tuple[float, ...]
 
-_MOUNT = DEFAULT_MOUNT
-_CENTRE = tuple(_MOUNT.to_world((np.array(TASK_REGION.low) + TASK_REGION.high) / 2).tolist())
-_EXTENT = tuple(((np.array(TASK_REGION.high) - TASK_REGION.low) / 2).tolist())
-_SPEED = tuple((STEP_LIMIT / CONTROL_PERIOD).tolist())
-_STEP = tuple(STEP_LIMIT.tolist())
 _ZERO = (0.0, 0.0, 0.0)
-_CUP = np.array([0.0, 0.0, CUP_LENGTH])
 
 
 @dataclass(frozen=True)
@@ -60,81 +52,299 @@ class Entry:
     name: str
     unit: str
     meaning: str
-    centre: Vector
-    scale: Vector
+    centre: Values
+    scale: Values
     source: Callable[[State], ArrayLike]
 
 
-_ROBOT_ENTRIES = (
-    Entry("position", "m", "P by forward kinematics of the encoders", _CENTRE, _EXTENT,
-          lambda s: s.fk_position),
-    Entry("velocity", "m/s", "J(theta) theta_dot, from the encoders", _ZERO, _SPEED,
-          lambda s: s.fk_velocity),
-    Entry("command", "m", "commanded P minus position", _ZERO, _STEP,
-          lambda s: s.command - s.fk_position),
-)  # fmt: skip
-
-
-class Task:
-    """Base of all tasks: the robot's own observation, rewards and success by distance.
+class Task(ABC):
+    """Base of all tasks: the robot's own observation, the reward, success by distance.
 
     Args:
+        machine: What the task is done with.
         reward: ``"sparse"`` (-1 until success, then 0) or ``"dense"`` (minus the distance).
+        goals: How goals and starts are sampled: one of :attr:`samplings`.
+        penalty_weight: Weight of the singularity penalty; 0 switches it off.
 
     Attributes:
         scene: What the simulation must hold.
-        entries: What the observation vector consists of, in order.
+        vacuum: Whether actions have a fourth entry, which switches the vacuum.
+        goal_size: Length of a goal; three for each point that has to be somewhere: those of the
+            scene's objects in its order, or P.
         tolerance: Distance below which a goal is achieved, m.
+        samplings: What ``goals`` may be.
+        entries: What the observation vector consists of, in order.
+
+    Raises:
+        ConfigurationError: If an option is none of those.
     """
 
-    scene: Scene = Scene()
-    entries: tuple[Entry, ...] = _ROBOT_ENTRIES
-    tolerance: float = TOLERANCE
-    action_size: int = 3
-    home: tuple[float, float, float] = HOME
+    scene: ClassVar[Scene] = Scene()
+    vacuum: ClassVar[bool] = False
+    goal_size: ClassVar[int] = 3
+    tolerance: ClassVar[float] = 0.010
+    samplings: ClassVar[tuple[str, ...]] = ("sampled",)
 
-    def __init__(self, reward: str = "sparse") -> None:
-        """Choose the reward."""
+    def __init__(
+        self,
+        machine: Machine,
+        reward: str = "sparse",
+        goals: str = "sampled",
+        penalty_weight: float = 1.0,
+    ) -> None:
+        """Check the options."""
         if reward not in ("sparse", "dense"):
             raise ConfigurationError("reward", reward, "'sparse' or 'dense'")
-        self.reward = reward
+        if goals not in self.samplings:
+            raise ConfigurationError("goals", goals, " or ".join(map(repr, self.samplings)))
+        self.penalty_weight = float(
+            finite("penalty_weight", penalty_weight, (), ConfigurationError)
+        )
+        if self.penalty_weight < 0:
+            raise ConfigurationError("penalty_weight", penalty_weight, "0 or more")
+        shown = len(self.markers(np.zeros(self.goal_size)))
+        if shown != self.scene.markers:
+            raise ConfigurationError("markers", self.scene.markers, f"{shown}, as a goal shows")
+        self.machine, self.reward, self.goals = machine, reward, goals
+        self._within = [self._place_of(block) for block in self.scene.objects]
+        self._set_entries()
+
+    def _set_entries(self) -> None:
+        self.entries = self.observed()
         self._centre = np.concatenate([entry.centre for entry in self.entries])
         self._scale = np.concatenate([entry.scale for entry in self.entries])
 
-    # -- sampling ---------------------------------------------------------------------------
+    def __getstate__(self) -> dict[str, Any]:
+        """Entries hold functions, which cannot be pickled; they follow from the rest."""
+        return {name: value for name, value in vars(self).items() if name != "entries"}
 
-    def sample_object(self, rng: np.random.Generator) -> FloatArray | None:
-        """Where the object starts, (3,) m; None without an object."""
-        del rng
-        return None
+    def __setstate__(self, values: dict[str, Any]) -> None:
+        """Take all but the entries from another task, and make those anew."""
+        vars(self).update(values)
+        self._set_entries()
 
-    def sample_goal(self, rng: np.random.Generator, start: ArrayLike | None) -> FloatArray:
-        """A goal (3,) m for an episode whose object starts at ``start``."""
-        raise NotImplementedError
+    # -- to be written for each task ------------------------------------------------------------
+
+    @abstractmethod
+    def sample(
+        self, rng: np.random.Generator, chosen: Mapping[str, FloatArray]
+    ) -> dict[str, FloatArray]:
+        """Where an episode starts and what it aims at.
+
+        Args:
+            rng: Source of randomness.
+            chosen: What the user has chosen of it, within reach; to be taken as it is. What is
+                sampled beside it keeps clear of it.
+
+        Returns:
+            Centre (3,) m of each of the scene's objects by name, and ``"goal"`` (goal_size,) m.
+        """
+
+    @abstractmethod
+    def achieved(self, state: State) -> FloatArray:
+        """What is compared with the goal, (..., goal_size) m."""
+
+    def plan(self, expert: Expert) -> Iterator[Move]:
+        """The moves of the scripted controller, from what ``expert`` sees; the last one is kept.
+
+        Raises:
+            ConfigurationError: If the task has none.
+        """
+        raise ConfigurationError("expert", type(self).__name__, "a task that has a plan")
+
+    def shaping(self, state: State) -> dict[str, FloatArray]:
+        """Weighted terms of the reward that do not depend on the goal: name -> (...,)."""
+        del state
+        return {}
+
+    def observed(self) -> tuple[Entry, ...]:
+        """What the observation vector consists of; the robot's own entries come first."""
+        return self.robot_entries()
+
+    # -- reward: here and nowhere else ------------------------------------------------------------
+
+    def reward_terms(
+        self, state: State, achieved: ArrayLike, desired: ArrayLike
+    ) -> dict[str, FloatArray]:
+        """The terms of the reward, weighted: name -> (...,); their sum is the reward.
+
+        Args:
+            state: The state that was reached.
+            achieved: (..., goal_size) m, as in the observation.
+            desired: (..., goal_size) m.
+        """
+        return {
+            "goal": self.goal_term(achieved, desired),
+            "singularity": -self.penalty_weight * self.penalty(state),
+            **self.shaping(state),
+        }
+
+    def goal_term(self, achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
+        """The one term that depends on the goal, (...,)."""
+        gap = self.gap(achieved, desired)
+        return (
+            rewards.sparse(gap, self.tolerance) if self.reward == "sparse" else rewards.dense(gap)
+        )
+
+    def penalty(self, state: State) -> FloatArray:
+        """Nearness to a singularity before weighting, (...,) in [0, 1]; 1 where one was passed."""
+        near = rewards.singularity_penalty(state.conditioning, self.machine.safe_conditioning)
+        return np.maximum(near, state.passed_singularity)
+
+    def success(self, achieved: ArrayLike, desired: ArrayLike) -> BoolArray:
+        """Whether the goal is achieved, (...,)."""
+        result: BoolArray = self.gap(achieved, desired) < self.tolerance
+        return result
+
+    def gap(self, achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
+        """How far from the goal, (...,) m: what reward and success are made of."""
+        return rewards.distance(achieved, desired)
+
+    # -- start of an episode ----------------------------------------------------------------------
+
+    def start(self, rng: np.random.Generator, options: Any) -> dict[str, FloatArray]:
+        """What :meth:`sample` gives, with what ``reset(options=...)`` asks for.
+
+        Raises:
+            ResetOptionError: If an option is unknown, or not so many finite numbers, or an object
+                would start inside another or inside the robot.
+            UnreachableError: If the robot cannot get to an object or the goal.
+        """
+        blocks = {block.name: block for block in self.scene.objects}
+        valid = f"a dictionary with keys among {', '.join(map(repr, (*blocks, 'goal')))}"
+        if not isinstance(options, Mapping) and options is not None:
+            raise ResetOptionError("options", options, valid)
+        chosen: dict[str, FloatArray] = {}
+        for name, value in (options or {}).items():
+            if name == "goal":
+                chosen[name] = self.check_goal(value)
+            elif name in blocks:
+                chosen[name] = self.check_object(blocks[name], value)
+            else:
+                raise ResetOptionError(str(name), value, valid)
+        start = self.sample(rng, chosen)
+        self._check_free(start, chosen.keys() & blocks.keys())
+        return start
 
     def check_goal(self, goal: ArrayLike) -> FloatArray:
-        """A goal that the user chose, as (3,) m.
+        """A goal that the user chose, as (goal_size,) m; see :meth:`start` for what it raises."""
+        points = _numbers("goal", goal, (self.goal_size,))
+        blocks = self.scene.objects or (None,)
+        for point, block in zip(points.reshape(-1, 3), cycle(blocks), strict=False):
+            self._check_reach("goal", point, block)
+        return points
 
-        Raises:
-            ResetOptionError: If it is not three finite numbers.
-            UnreachableError: If the robot cannot get there.
-        """
-        return _check_reach("goal", goal, self._tool_offset())
+    def check_object(self, block: Block, position: ArrayLike) -> FloatArray:
+        """A start of an object that the user chose, as (3,) m; see :meth:`start`."""
+        point = _numbers(block.name, position, (3,))
+        self._check_reach(block.name, point, block)
+        return point
 
-    def check_object(self, position: ArrayLike) -> FloatArray:
-        """A start of the object that the user chose, as (3,) m.
+    def reach_of(self, block: Block | None) -> tuple[FloatArray, FloatArray]:
+        """Lowest and highest place (3,) m for point P, or for the centre of a block in the cup."""
+        region, mount = self.machine.region, self.machine.mount
+        corners = np.stack([mount.to_world(corner) for corner in (region.low, region.high)])
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        if block is not None:
+            offset = self.hanging(block)
+            low, high = low - offset, high - offset
+            low[2] = max(low[2], block.height / 2)  # on the table
+        return low, high
 
-        Raises:
-            ResetOptionError: If the task has no object, or it is not three finite numbers.
-            UnreachableError: If the robot cannot get there.
-        """
-        raise ResetOptionError("object", position, f"nothing: {type(self).__name__} has no object")
+    def _place_of(self, block: Block) -> tuple[FloatArray, FloatArray]:
+        """The same, for a block that has to be in reach where it stands on the table."""
+        low, high = self.reach_of(block)
+        if low[2] > block.height / 2 + 1e-9:
+            least = f"at least {low[2] + block.height / 2:.4g} m high"
+            valid = f"blocks {least}: the cup of {self.machine.name!r} comes no lower"
+            raise ConfigurationError("scene", block.name, valid)
+        return low, high
 
-    def _tool_offset(self) -> FloatArray:
-        """From what has to be at the goal to point P, world, m."""
-        return np.zeros(3)
+    def hanging(self, block: Block) -> FloatArray:
+        """From the centre of a block in the cup to point P, (3,) m."""
+        return np.array([0.0, 0.0, block.height / 2 + CUP.length])
 
-    # -- observation ------------------------------------------------------------------------
+    def on_table(self, block: Block) -> Region:
+        """Goals for point P, machine's frame, with a block in the cup that stands on the table."""
+        low, high = self.machine.goal_region.low, self.machine.goal_region.high
+        touching = self.hanging(block) + (0.0, 0.0, block.height / 2)
+        level = float(self.machine.mount.to_paper(touching)[2])
+        return Region((*low[:2], level), (*high[:2], level))
+
+    def _check_reach(self, name: str, point: FloatArray, block: Block | None) -> None:
+        low, high = self.reach_of(block)
+        margin = float(np.minimum(point - low, high - point).min())
+        if margin < -1e-6:
+            hint = f"{name} must lie in {_range(low, high)}"
+            raise UnreachableError(point.tolist(), "box", margin, hint)
+
+    def _check_free(self, start: Mapping[str, FloatArray], chosen: Collection[str]) -> None:
+        """Refuse objects that would start inside the robot at home, or inside another object."""
+        if not chosen:
+            return
+        taken = [(block.name, _box(start[block.name], block)) for block in self.scene.objects]
+        boxes = self.machine.occupied(self.machine.home)
+        robot = [("the robot at home", box) for box in boxes]
+        for name, (low, high) in taken:
+            for other, (least, most) in robot + taken:
+                if name in chosen and other != name and (low < most).all() and (high > least).all():
+                    valid = f"clear of {other}, {_range(least, most)}"
+                    raise ResetOptionError(name, start[name].tolist(), valid)
+
+    # -- observation ------------------------------------------------------------------------------
+
+    def robot_entries(self) -> tuple[Entry, ...]:
+        """What encoders and forward kinematics tell."""
+        centre, extent, speed, step = self._scales()
+        return (
+            Entry("position", "m", "P by forward kinematics of the encoders", centre, extent,
+                  lambda s: s.fk_position),
+            Entry("velocity", "m/s", "J(theta) theta_dot, from the encoders", _ZERO, speed,
+                  lambda s: s.fk_velocity),
+            Entry("command", "m", "commanded P minus position", _ZERO, step,
+                  lambda s: s.command - s.fk_position),
+        )  # fmt: skip
+
+    def object_entries(self, index: int = 0) -> tuple[Entry, ...]:
+        """What a camera and the vacuum gauge tell of one of the scene's objects."""
+        centre, extent, speed, _ = self._scales()
+        name = self.scene.objects[index].name
+        near = tuple(min(0.1, max(0.02, half)) for half in extent)
+        return (
+            Entry(f"{name}_position", "m", f"centre of the {name}, from a camera", centre, extent,
+                  lambda s: s.object_position[..., index, :]),
+            Entry(f"{name}_offset", "m", f"top of the {name} minus lip of the cup", _ZERO, near,
+                  lambda s: self.top(s, index) - self.lip(s)),
+            Entry(f"{name}_velocity", "m/s", f"velocity of the {name}, from a camera", _ZERO, speed,
+                  lambda s: s.object_velocity[..., index, :]),
+            Entry(f"{name}_tilt", "-", f"x and y of the {name}'s axis", (0.0, 0.0), (1.0, 1.0),
+                  lambda s: s.object_axis[..., index, :2]),
+            Entry(f"{name}_held", "-", f"+1 if the cup holds the {name} (vacuum gauge), else -1",
+                  (0.5,), (0.5,),
+                  lambda s: np.asarray(s.held == index, dtype=np.float64)[..., None]),
+        )  # fmt: skip
+
+    def _scales(self) -> tuple[Values, Values, Values, Values]:
+        """Centre and extent of the region (m, world), full speed (m/s), largest step (m)."""
+        region, mount, step = self.machine.region, self.machine.mount, self.machine.step_limit
+        low, high = np.array(region.low), np.array(region.high)
+        columns = (
+            mount.to_world((low + high) / 2),
+            (high - low) / 2,
+            np.divide(step, CONTROL_PERIOD),
+        )
+        centre, extent, speed = (tuple(column.tolist()) for column in columns)
+        return centre, extent, speed, step
+
+    def lip(self, state: State) -> FloatArray:
+        """Centre of the cup's lip, pushed out, by forward kinematics, (..., 3) m."""
+        lip: FloatArray = state.fk_position - np.array(CUP.lip)
+        return lip
+
+    def top(self, state: State, index: int = 0) -> FloatArray:
+        """Centre of an object's top face, (..., 3) m."""
+        half = self.scene.objects[index].height / 2
+        return state.object_position[..., index, :] + state.object_axis[..., index, :] * half
 
     def observe(self, state: State) -> FloatArray:
         """The observation vector (..., n), each entry of order one."""
@@ -155,182 +365,40 @@ class Task:
     @property
     def observation_size(self) -> int:
         """Length of the observation vector."""
-        return sum(len(entry.scale) for entry in self.entries)
+        return len(self._scale)
 
-    def achieved(self, state: State) -> FloatArray:
-        """What is compared with the goal, (..., 3) m."""
-        raise NotImplementedError
+    @property
+    def action_size(self) -> int:
+        """Length of an action."""
+        return 4 if self.vacuum else 3
 
-    # -- reward -----------------------------------------------------------------------------
+    def markers(self, goal: FloatArray) -> FloatArray:
+        """The points (k, 3) m that show a goal (goal_size,)."""
+        return goal.reshape(-1, 3)
 
-    def goal_term(self, achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
-        """The part of the reward that depends on the goal, (...,)."""
-        return self.goal_term_at(rewards.distance(achieved, desired))
-
-    def goal_term_at(self, gap: FloatArray) -> FloatArray:
-        """The same, for distances (...,) m from the goal."""
-        return (
-            rewards.sparse(gap, self.tolerance) if self.reward == "sparse" else rewards.dense(gap)
-        )
-
-    def state_terms(self, state: State) -> dict[str, FloatArray]:
-        """Parts of the reward that do not depend on the goal: name -> (...,)."""
-        del state
-        return {}
-
-    def success(self, achieved: ArrayLike, desired: ArrayLike) -> NDArray[np.bool_]:
-        """Whether the goal is achieved, (...,)."""
-        return self.success_at(rewards.distance(achieved, desired))
-
-    def success_at(self, gap: FloatArray) -> NDArray[np.bool_]:
-        """The same, for distances (...,) m from the goal."""
-        result: NDArray[np.bool_] = gap < self.tolerance
-        return result
+    def lost(self, state: State) -> BoolArray:
+        """Whether an object is off the table or where the robot cannot get to, (...,)."""
+        lost: BoolArray = np.zeros(np.shape(state.held), dtype=np.bool_)
+        for index, block in enumerate(self.scene.objects):
+            low, high = self._within[index]
+            slack = block.width / 2  # the cup may take it off its middle
+            place = state.object_position[..., index, :]
+            level = place[..., :2]
+            beyond = ((level < low[:2] - slack) | (level > high[:2] + slack)).any(axis=-1)
+            lost |= beyond | (place[..., 2] < 0)
+        return lost
 
 
-class Reach(Task):
-    """Bring point P of the platform to a point in the workspace."""
-
-    def sample_goal(self, rng: np.random.Generator, start: ArrayLike | None) -> FloatArray:
-        """Uniform over the well-conditioned part of the goal region, away from home."""
-        del start
-        return _sample_apart(rng, GOAL_REGION, _ZERO, _MOUNT.to_world(self.home))
-
-    def achieved(self, state: State) -> FloatArray:
-        """Point P by forward kinematics of the encoders."""
-        return state.fk_position
+def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
+    """A copy, so that the user's array stays the user's."""
+    return np.array(finite(name, value, shape, ResetOptionError))
 
 
-class PickAndPlace(Task):
-    """Pick up a puck with the vacuum cup and bring its centre to the goal.
-
-    Half of the goals lie on the table, half in the air.
-    """
-
-    puck = Puck()
-    scene = Scene(puck=puck)
-    action_size = 4
-    entries = (
-        *_ROBOT_ENTRIES,
-        Entry("object_position", "m", "centre of the puck, from a camera", _CENTRE, _EXTENT,
-              lambda s: s.object_position),
-        Entry("object_offset", "m", "top of the puck minus lip of the cup",
-              _ZERO, (0.1, 0.02, 0.1), lambda s: _top(s) - _lip(s)),
-        Entry("object_velocity", "m/s", "velocity of the puck, from a camera", _ZERO, _SPEED,
-              lambda s: s.object_velocity),
-        Entry("object_tilt", "-", "x and y of the puck's axis", (0.0, 0.0), (1.0, 1.0),
-              lambda s: s.object_axis[..., :2]),
-        Entry("holding", "-", "+1 if the cup holds the puck (vacuum gauge), else -1",
-              (0.5,), (0.5,), lambda s: np.asarray(s.holding, dtype=np.float64)[..., None]),
-    )  # fmt: skip
-
-    def sample_object(self, rng: np.random.Generator) -> FloatArray:
-        """Uniform over the well-conditioned part of the table, standing."""
-        low, high = GOAL_REGION.low, GOAL_REGION.high
-        level = float(_MOUNT.to_paper(self._on_table())[2])
-        flat = Region((low[0], low[1], level), (high[0], high[1], level))
-        return self._sample(rng, flat)
-
-    def sample_goal(self, rng: np.random.Generator, start: ArrayLike | None) -> FloatArray:
-        """Half on the table, half in the air, away from where the puck starts."""
-        low, high = GOAL_REGION.low, GOAL_REGION.high
-        level = float(_MOUNT.to_paper(self._on_table())[2])
-        if rng.random() < 0.5:
-            region = Region((low[0], low[1], level), (high[0], high[1], level))
-        else:
-            region = Region(low, (high[0], high[1], level - MIN_SEPARATION))
-        far = (np.inf, np.inf, np.inf) if start is None else start
-        return _sample_apart(rng, region, self._tool_offset(), far)
-
-    def check_object(self, position: ArrayLike) -> FloatArray:
-        """A start of the puck that the user chose; see the base class."""
-        return self._check_height("object", _check_reach("object", position, self._tool_offset()))
-
-    def check_goal(self, goal: ArrayLike) -> FloatArray:
-        """A goal for the puck that the user chose; see the base class."""
-        return self._check_height("goal", super().check_goal(goal))
-
-    def _check_height(self, name: str, point: FloatArray) -> FloatArray:
-        if point[2] < self.puck.height / 2 - 1e-6:
-            valid = f"z >= {self.puck.height / 2} m, half the puck's height above the table"
-            raise ResetOptionError(name, point.tolist(), valid)
-        return point
-
-    def achieved(self, state: State) -> FloatArray:
-        """Centre of the puck."""
-        return state.object_position
-
-    def state_terms(self, state: State) -> dict[str, FloatArray]:
-        """Dense only: minus the distance from the cup to the puck, half as dear as the goal."""
-        if self.reward == "sparse":
-            return {}
-        return {"approach": 0.5 * rewards.dense(rewards.distance(_lip(state), _top(state)))}
-
-    def _tool_offset(self) -> FloatArray:
-        return np.array([0.0, 0.0, self.puck.height / 2 + CUP_LENGTH])
-
-    def _on_table(self) -> FloatArray:
-        """Point P when the cup touches a puck that stands on the table, world (x, y any)."""
-        return np.add(self._tool_offset(), (0.0, 0.0, self.puck.height / 2))
-
-    def _sample(self, rng: np.random.Generator, region: Region) -> FloatArray:
-        point = workspace.sample(rng, region, rewards.SAFE_CONDITIONING)
-        return np.asarray(_MOUNT.to_world(point) - self._tool_offset())
+def _range(low: FloatArray, high: FloatArray) -> str:
+    return f"{low.round(4).tolist()} to {high.round(4).tolist()} m"
 
 
-def make(name: str, reward: str) -> Task:
-    """The task of that name.
-
-    Raises:
-        ConfigurationError: If there is none, or the reward is unknown.
-    """
-    tasks = {"reach": Reach, "pick_and_place": PickAndPlace}
-    if name not in tasks:
-        raise ConfigurationError("task", name, ", ".join(map(repr, tasks)))
-    return tasks[name](reward)
-
-
-def _sample_apart(
-    rng: np.random.Generator, region: Region, tool_offset: ArrayLike, start: ArrayLike
-) -> FloatArray:
-    """A safe goal (world) whose distance from ``start`` is at least MIN_SEPARATION."""
-    while True:
-        point = workspace.sample(rng, region, rewards.SAFE_CONDITIONING)
-        goal: FloatArray = _MOUNT.to_world(point) - np.asarray(tool_offset)
-        if not rewards.distance(goal, start) < MIN_SEPARATION:
-            return goal
-
-
-def _check_reach(name: str, value: ArrayLike, tool_offset: FloatArray) -> FloatArray:
-    """Three finite numbers (world) at which point P would be inside the task region."""
-    try:
-        point = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ResetOptionError(name, value, "three finite numbers in m, world frame") from error
-    if point.shape != (3,) or not np.isfinite(point).all():
-        raise ResetOptionError(name, value, "three finite numbers in m, world frame")
-    place = _MOUNT.to_paper(point + tool_offset)
-    margin = TASK_REGION.margin(place)
-    if margin < -1e-9:
-        corners = [
-            _MOUNT.to_world(corner) - tool_offset for corner in (TASK_REGION.low, TASK_REGION.high)
-        ]
-        low, high = np.min(corners, axis=0).round(4), np.max(corners, axis=0).round(4)
-        raise UnreachableError(
-            tuple(point),
-            "box",
-            margin,
-            f"{name} must lie between {low.tolist()} and {high.tolist()} m",
-        )
-    return point
-
-
-def _lip(state: State) -> FloatArray:
-    """Centre of the cup's lip, pushed out, by forward kinematics, world."""
-    lip: FloatArray = state.fk_position - _CUP
-    return lip
-
-
-def _top(state: State) -> FloatArray:
-    """Centre of the puck's top face, world."""
-    return state.object_position + state.object_axis * (PickAndPlace.puck.height / 2)
+def _box(point: FloatArray, block: Block) -> tuple[FloatArray, FloatArray]:
+    """Corners of an upright block, m; a micrometre smaller, so that touching is not overlapping."""
+    half = np.array([block.width, block.width, block.height]) / 2 - 1e-6
+    return point - half, point + half

@@ -1,4 +1,4 @@
-"""The physics engine: the only module that imports PyBullet."""
+"""PyBullet's functions, bound to one private physics client."""
 
 from __future__ import annotations
 
@@ -6,17 +6,24 @@ import ctypes
 import importlib.util
 import os
 import sys
+import threading
+import weakref
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from typing import Any
 
 import pybullet
 
 from tpm_gym.errors import ConfigurationError
-from tpm_gym.simulation.physics import GRAVITY, REGULARISATION, Physics
+from tpm_gym.simulation.bullet.physics import REGULARISATION, Physics
+from tpm_gym.simulation.display import has_display
 
-__all__ = ["Client", "has_display"]
+__all__ = ["Client"]
+
+GRAVITY = 9.81  # m/s^2
+
+_stdout_lock = threading.Lock()
 
 
 class Client:
@@ -28,22 +35,21 @@ class Client:
     Args:
         physics: Numerical settings.
         gui: Whether to open PyBullet's window.
-        renderer: ``"tiny"`` or ``"egl"``.
+        renderer: ``"tiny"`` (None too) draws on the CPU anywhere; ``"egl"`` on a GPU.
 
     Attributes:
-        renderer: The engine's number of the renderer.
+        number: The engine's of this client.
+        renderer: The engine's of the renderer.
 
     Raises:
         ConfigurationError: If no window opened, or EGL was asked for and is not there.
     """
 
-    def __init__(self, physics: Physics, gui: bool = False, renderer: str = "tiny") -> None:
+    def __init__(self, physics: Physics, gui: bool = False, renderer: str | None = None) -> None:
         """Connect and configure."""
-        self._number = pybullet.connect(pybullet.GUI if gui else pybullet.DIRECT)
-        if self._number < 0:
-            raise ConfigurationError(
-                "render_mode", "human", "None or 'rgb_array': no window opened"
-            )
+        self.number = _connect(gui)
+        # An environment that is dropped without close() would keep its 28 MB until the end.
+        self._disconnect = weakref.finalize(self, _disconnect, self.number)
         try:
             self.renderer = self._load_renderer(renderer)
             self.configure(physics)
@@ -55,7 +61,7 @@ class Client:
         """The engine's function of that name, bound to this client, or its constant."""
         value = getattr(pybullet, name)
         if callable(value):
-            value = partial(value, physicsClientId=self._number)
+            value = partial(value, physicsClientId=self.number)
         setattr(self, name, value)
         return value
 
@@ -78,13 +84,11 @@ class Client:
 
     def close(self) -> None:
         """Disconnect; harmless the second time."""
-        if self._number >= 0:
-            pybullet.disconnect(self._number)
-            self._number = -1
+        self._disconnect()
 
-    def _load_renderer(self, renderer: str) -> int:
+    def _load_renderer(self, renderer: str | None) -> int:
         """The engine's number of the renderer; loads the EGL plugin if that was asked for."""
-        if renderer == "tiny":
+        if renderer in (None, "tiny"):
             return int(pybullet.ER_TINY_RENDERER)
         if renderer != "egl":
             raise ConfigurationError("renderer", renderer, "'tiny' or 'egl'")
@@ -95,26 +99,54 @@ class Client:
         return int(pybullet.ER_BULLET_HARDWARE_OPENGL)
 
 
-def has_display() -> bool:
-    """Whether PyBullet can open a window here (on Linux it needs an X server)."""
-    return not sys.platform.startswith("linux") or bool(os.environ.get("DISPLAY"))
+def _connect(gui: bool) -> int:
+    """A new client of PyBullet.
+
+    Raises:
+        ConfigurationError: If a window was asked for and none opened.
+    """
+    if not gui:
+        return int(pybullet.connect(pybullet.DIRECT))
+    try:
+        number = int(pybullet.connect(pybullet.GUI)) if has_display() else -1
+    except pybullet.error:
+        number = -1
+    if number < 0:
+        valid = "None or 'rgb_array': no window opened (it takes a display, one in a process)"
+        raise ConfigurationError("render_mode", "human", valid)
+    return number
+
+
+def _disconnect(number: int) -> None:
+    # The engine may have gone first, as when the interpreter ends or after a fork.
+    with suppress(pybullet.error):
+        pybullet.disconnect(number)
 
 
 @contextmanager
 def _silence() -> Iterator[None]:
-    """Keep what the engine says (from C, on changing its solver) out of the user's output."""
-    if os.name != "posix":
+    """Keep what the engine says (from C, on changing its solver) out of the user's output.
+
+    For a moment the whole process writes nowhere, so one thread does this at a time.
+    """
+    with _stdout_lock, ExitStack() as stack:
+        if os.name == "posix" and (ours := _duplicate(1)) is not None:
+            flush = ctypes.CDLL(None).fflush
+            with suppress(AttributeError, ValueError, OSError):  # stdout may be None, or closed
+                sys.stdout.flush()
+            flush(None)
+            stack.callback(os.close, ours)
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            stack.callback(os.close, nowhere)
+            stack.callback(os.dup2, ours, 1)
+            os.dup2(nowhere, 1)
+            stack.callback(flush, None)
         yield
-        return
-    flush = ctypes.CDLL(None).fflush
-    sys.stdout.flush()
-    flush(None)
-    ours, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+
+
+def _duplicate(descriptor: int) -> int | None:
+    """A copy of a file descriptor; None where it is closed, so that nothing can be said there."""
     try:
-        os.dup2(nowhere, 1)
-        yield
-        flush(None)
-    finally:
-        os.dup2(ours, 1)
-        os.close(ours)
-        os.close(nowhere)
+        return os.dup(descriptor)
+    except OSError:
+        return None

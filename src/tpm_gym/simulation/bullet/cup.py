@@ -1,68 +1,74 @@
-"""The vacuum cup: it seals on contact, holds up to a force, and lets go.
-
-The client is handed in (see :mod:`tpm_gym.simulation.simulation`), so this module does not import the engine.
-"""
+"""The vacuum cup in PyBullet: it seals on contact, holds up to a force, and lets go."""
 
 from __future__ import annotations
 
-import math
-from typing import Any
+from collections.abc import Sequence
+from typing import NamedTuple
 
-from tpm_gym.mechanism.links import CUP_RADIUS
+from tpm_gym.arrays import Vector
+from tpm_gym.mechanism.cup import CUP, sealed
+from tpm_gym.simulation.bullet.client import Client
 from tpm_gym.simulation.bullet.robot import Robot
-from tpm_gym.simulation.physics import (
-    PULL_OFF_FORCE,
-    SEAL_GAP,
-    SEAL_TILT,
-    rotate,
-)
-from tpm_gym.simulation.state import Puck
+from tpm_gym.simulation.engine import Pose
+from tpm_gym.simulation.state import Block
 
-__all__ = ["Cup", "Pose"]
+__all__ = ["Cup", "Grip"]
 
-Pose = tuple[Any, Any]
-"""Position (m) and orientation (x, y, z, w), or two velocities (m/s, rad/s); plain tuples."""
+
+class Grip(NamedTuple):
+    """Which object is held, and its pose in the tool's inertial frame."""
+
+    which: int
+    pose: Pose
 
 
 class Cup:
-    """The cup on a robot's platform, and the one object that it can hold.
+    """The cup on a robot's platform, and the objects of which it can hold one.
 
     Args:
         client: The physics client.
         robot: Whose platform carries the cup.
-        body: The object's number in the client.
-        puck: What the object is.
+        bodies: The objects' numbers in the client.
+        blocks: What they are.
     """
 
-    def __init__(self, client: Any, robot: Robot, body: int, puck: Puck) -> None:
+    def __init__(
+        self, client: Client, robot: Robot, bodies: Sequence[int], blocks: Sequence[Block]
+    ) -> None:
         """Start with nothing held."""
-        self._client, self._robot, self._body, self._puck = client, robot, body, puck
+        self._client, self._robot = client, robot
+        self._bodies, self._blocks = bodies, blocks
         self._constraint: int | None = None
-        self.grip: Pose | None = None
-        """Pose of the held object in the tool's inertial frame, None if nothing is held."""
+        self.grip: Grip | None = None
 
     def suck(self) -> None:
         """With the vacuum on: drop an object that was pulled off, take one that is touched."""
-        sealed = self._sealed()
-        if self.grip is not None and not sealed:
-            self.let_go()
-        elif self.grip is None and sealed:
-            self.take(self._relative_pose())
+        if not self._bodies:
+            return
+        lip, axis = self._robot.cup()
+        if self.grip is not None:
+            if not self._seals(self.grip.which, lip, axis):
+                self.let_go()
+            return
+        for index in range(len(self._bodies)):
+            if self._seals(index, lip, axis):
+                self.take(Grip(index, self._relative_pose(index)))
+                return
 
-    def take(self, grip: Pose) -> None:
-        """Fix the object to the tool at ``grip``."""
+    def take(self, grip: Grip) -> None:
+        """Fix an object to the tool."""
         constraint = self._client.createConstraint(
             *self._robot.tool,
-            self._body,
+            self._bodies[grip.which],
             -1,
             self._client.JOINT_FIXED,
             (0.0, 0.0, 0.0),
-            grip[0],
+            grip.pose.position,
             (0.0, 0.0, 0.0),
-            grip[1],
+            grip.pose.quaternion,
         )
         # Beyond this force the constraint yields, the lip lifts off, and the next check lets go.
-        self._client.changeConstraint(constraint, maxForce=PULL_OFF_FORCE)
+        self._client.changeConstraint(constraint, maxForce=CUP.pull_off)
         self._constraint, self.grip = constraint, grip
 
     def let_go(self) -> None:
@@ -71,21 +77,14 @@ class Cup:
             self._client.removeConstraint(self._constraint)
         self._constraint = self.grip = None
 
-    def _sealed(self) -> bool:
-        """Whether the whole lip lies on the top face of the puck."""
-        lip, axis = self._robot.cup()
-        (x, y, z), (qx, qy, qz, qw) = self._client.getBasePositionAndOrientation(self._body)
-        inverse = (-qx, -qy, -qz, qw)
-        local = rotate(inverse, (lip[0] - x, lip[1] - y, lip[2] - z))
-        gap = local[2] - self._puck.height / 2
-        covered = max(abs(local[0]), abs(local[1])) <= self._puck.width / 2 - CUP_RADIUS
-        aligned = -rotate(inverse, axis)[2] >= math.cos(SEAL_TILT)
-        return abs(gap) <= SEAL_GAP and covered and aligned
+    def _seals(self, index: int, lip: Vector, axis: Vector) -> bool:
+        block = self._blocks[index]
+        pose = Pose(*self._client.getBasePositionAndOrientation(self._bodies[index]))
+        return sealed(lip, axis, pose.position, pose.quaternion, (block.width, block.height))
 
-    def _relative_pose(self) -> Pose:
-        """Pose of the object in the tool's inertial frame, as it is now."""
+    def _relative_pose(self, index: int) -> Pose:
+        """Pose of an object in the tool's inertial frame, as it is now."""
         state = self._client.getLinkState(*self._robot.tool, computeForwardKinematics=True)
         inverse = self._client.invertTransform(state[0], state[1])
-        pose = self._client.getBasePositionAndOrientation(self._body)
-        relative: Pose = self._client.multiplyTransforms(*inverse, *pose)
-        return relative
+        pose = self._client.getBasePositionAndOrientation(self._bodies[index])
+        return Pose(*self._client.multiplyTransforms(*inverse, *pose))

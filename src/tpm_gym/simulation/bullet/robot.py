@@ -4,27 +4,28 @@ Each leg of the spanning tree is a multibody of its own, so that every loop clos
 different multibodies. That is not a matter of taste: where both ends lie in one multibody, Bullet's
 direct solvers go wrong and lose the loops at once; between multibodies they are exact
 (docs/fidelity.md). It also shortens every row of the constraint solver.
-
-The client is handed in (see :mod:`tpm_gym.simulation.simulation`), so this module does not import the engine.
 """
 
 from __future__ import annotations
 
 import math
+import os
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tpm_gym.arrays import Quaternion, Vector, rotate, transform
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism import urdf
-from tpm_gym.mechanism.bodies import Vector
-from tpm_gym.mechanism.links import CUP_PRELOAD, MOTOR_EFFORT
-from tpm_gym.mechanism.tree import ACTUATED_JOINTS, Mechanism, Mount
-from tpm_gym.simulation.physics import MOTOR_GAIN, Quaternion, rotate, transform
+from tpm_gym.mechanism.bodies import Mechanism
+from tpm_gym.mechanism.mount import Mount
+from tpm_gym.simulation.bullet.client import Client
+from tpm_gym.simulation.bullet.physics import MOTOR_GAIN
+from tpm_gym.simulation.engine import Motors, Truth
 
 __all__ = ["Robot"]
 
@@ -46,34 +47,42 @@ class Robot:
         client: The physics client.
         mechanism: What to load.
         mount: Where the base hangs.
+
+    Attributes:
+        bodies: Numbers of the legs in the client.
+        joints: Where each joint is, by name.
+        links: Where each link but the base is, by name.
+        tool: Where the link with the vacuum cup is.
     """
 
-    def __init__(self, client: Any, mechanism: Mechanism, mount: Mount) -> None:
+    def __init__(self, client: Client, mechanism: Mechanism, mount: Mount) -> None:
         """Load the legs, take out what the engine adds on its own, close the loops."""
         self._client, self._mechanism = client, mechanism
-        self._joints: dict[str, Address] = {}
-        self._links: dict[str, Address] = {}
+        self.joints: dict[str, Address] = {}
+        self.links: dict[str, Address] = {}
         self.bodies = [self._load(leg, mount) for leg in mechanism.legs()]
-        self._motors = [self._joints[name] for name in ACTUATED_JOINTS]
-        self._inertias = {link: self._inertia(link) for link in self._links.values()}
-        self._effort = [MOTOR_EFFORT] * 3
-        self._platform = self._links[mechanism.platform]
-        self.tool = self._links[mechanism.tool]
+        self._motors = [self.joints[name] for name in mechanism.actuated]
+        self._inertias = {link: self._inertia(link) for link in self.links.values()}
+        joints = {link.joint.name: link.joint for link in mechanism.links if link.joint}
+        self._nominal_effort = [joints[name].effort for name in mechanism.actuated]
+        self._effort = self._nominal_effort
+        slide = mechanism.link(mechanism.tool).joint
+        assert slide is not None
+        self.tool = self.links[mechanism.tool]
         client.setJointMotorControl2(
             *self.tool,
             client.POSITION_CONTROL,
             targetPosition=0.0,
-            force=CUP_PRELOAD,
+            force=slide.effort,
             positionGain=_SPRING_GAIN,
         )
         self._close_loops()
 
     def _load(self, leg: Mechanism, mount: Mount) -> int:
         client = self._client
-        with tempfile.TemporaryDirectory() as folder:
-            path, _ = urdf.write(Path(folder), leg)
+        with _on_disk(urdf.urdf_text(leg)) as path:
             body: int = client.loadURDF(
-                str(path),
+                path,
                 basePosition=mount.to_world((0.0, 0.0, 0.0)).tolist(),
                 baseOrientation=mount.quaternion,
                 useFixedBase=True,
@@ -81,7 +90,7 @@ class Robot:
             )
         for index in range(client.getNumJoints(body)):
             info = client.getJointInfo(body, index)
-            self._joints[info[1].decode()] = self._links[info[12].decode()] = (body, index)
+            self.joints[info[1].decode()] = self.links[info[12].decode()] = (body, index)
             # PyBullet adds damping to everything and a motor to every joint; we want neither.
             client.changeDynamics(
                 body, index, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0
@@ -97,30 +106,29 @@ class Robot:
     def _close_loops(self) -> None:
         """Close the loops; the engine wants pivots relative to the centres of mass."""
         client = self._client
-        self._pairs: list[tuple[tuple[Address, Vector], tuple[Address, Vector]]] = []
+        watched = {self.links[self._mechanism.platform]}
         for closure in self._mechanism.closures:
             sides = ((closure.link_a, closure.point_a), (closure.link_b, closure.point_b))
-            (body_a, link_a), (body_b, link_b) = (self._links[name] for name, _ in sides)
+            link_a, link_b = (self.links[name] for name, _ in sides)
             pivots = [self._pivot(name, point) for name, point in sides]
             constraint = client.createConstraint(
-                body_a,
-                link_a,
-                body_b,
-                link_b,
+                *link_a,
+                *link_b,
                 client.JOINT_POINT2POINT,
                 (0.0, 0.0, 0.0),
                 pivots[0].tolist(),
                 pivots[1].tolist(),
             )
             client.changeConstraint(constraint, maxForce=_CLOSURE_FORCE)
-            end_a, end_b = ((self._links[name], point) for name, point in sides)
-            self._pairs.append((end_a, end_b))
+            watched |= {link_a, link_b}
         # One call of the engine a leg is cheaper than one a link.
-        self._watched: dict[int, list[int]] = {}
-        for body, link in sorted(
-            {self._platform, *(end[0] for pair in self._pairs for end in pair)}
-        ):
-            self._watched.setdefault(body, []).append(link)
+        order = sorted(watched)
+        self._watched = {body: [link for of, link in order if of == body] for body, _ in order}
+        at = {name: order.index(link) for name, link in self.links.items() if link in watched}
+        self._platform = at[self._mechanism.platform]
+        self._pairs = [
+            (at[c.link_a], c.point_a, at[c.link_b], c.point_b) for c in self._mechanism.closures
+        ]
 
     def _pivot(self, name: str, point: Vector) -> NDArray[np.float64]:
         """A link's point relative to its centre of mass, m.
@@ -147,7 +155,7 @@ class Robot:
             places = (
                 [(body, -1) for body in self.bodies]
                 if link.joint is None
-                else [self._links[link.name]]
+                else [self.links[link.name]]
             )
             for place in places:
                 self._client.changeVisualShape(*place, rgbaColor=urdf.COLOURS[largest.colour])
@@ -155,7 +163,7 @@ class Robot:
     def place(self, angles: Mapping[str, float]) -> None:
         """Put every joint at its angle (rad), at rest."""
         for name, angle in angles.items():
-            self._client.resetJointState(*self._joints[name], angle, 0.0)
+            self._client.resetJointState(*self.joints[name], angle, 0.0)
 
     def alter(self, mass_factors: Sequence[float], motor_strength: Sequence[float]) -> None:
         """Scale the masses of the moving links (empty: all nominal) and the motors' torques."""
@@ -166,7 +174,8 @@ class Robot:
                 mass=factor * mass,
                 localInertiaDiagonal=[factor * moment for moment in moments],
             )
-        self._effort = [MOTOR_EFFORT * strength for strength in motor_strength]
+        pairs = zip(self._nominal_effort, motor_strength, strict=True)
+        self._effort = [effort * strength for effort, strength in pairs]
 
     def drive(self, theta: Vector) -> None:
         """Let the motors go to ``theta`` rad within the next time step, effort permitting."""
@@ -175,46 +184,59 @@ class Robot:
             # Target angle and rate, largest torque, gain; as keywords they cost half as much again.
             turn(body, joint, mode, angle, 0.0, effort, MOTOR_GAIN)
 
-    def encoders(self) -> tuple[Vector, Vector]:
-        """True angles (rad) and rates (rad/s) of the motors."""
+    def motors(self) -> Motors:
+        """True angles (rad), rates (rad/s) and last torques (N m) of the motors."""
         state, (first, second, third) = self._client.getJointState, self._motors
         a, b, c = state(*first), state(*second), state(*third)
-        return (a[0], b[0], c[0]), (a[1], b[1], c[1])
-
-    def torques(self) -> Vector:
-        """What the motors applied in the last time step, N m."""
-        state, (first, second, third) = self._client.getJointState, self._motors
-        return state(*first)[3], state(*second)[3], state(*third)[3]
+        return Motors((a[0], b[0], c[0]), (a[1], b[1], c[1]), (a[3], b[3], c[3]))
 
     def joint_states(self) -> tuple[tuple[float, float], ...]:
         """Angle and rate of every joint, passive ones too."""
-        states = (self._client.getJointState(*joint) for joint in self._joints.values())
+        states = (self._client.getJointState(*joint) for joint in self.joints.values())
         return tuple((state[0], state[1]) for state in states)
 
     def set_joint_states(self, states: tuple[tuple[float, float], ...]) -> None:
         """Put every joint at an angle and rate that :meth:`joint_states` gave."""
-        for joint, (angle, rate) in zip(self._joints.values(), states, strict=True):
+        for joint, (angle, rate) in zip(self.joints.values(), states, strict=True):
             self._client.resetJointState(*joint, angle, rate)
 
-    def truth(self) -> tuple[float, Vector, float]:
+    def truth(self) -> Truth:
         """Largest loop gap (m), platform position (m, world) and platform tilt (rad)."""
-        frames: dict[Address, Frame] = {}
-        for body, links in self._watched.items():
-            states = self._client.getLinkStates(body, links, computeForwardKinematics=True)
-            for link, state in zip(links, states, strict=True):
-                frames[body, link] = state[4], state[5]
+        read = self._client.getLinkStates
+        frames: list[Frame] = [
+            state[4:6]
+            for body, links in self._watched.items()
+            for state in read(body, links, computeForwardKinematics=True)
+        ]
         squared = 0.0
-        for (link_a, point_a), (link_b, point_b) in self._pairs:
-            x, y, z = transform(*frames[link_a], point_a)
-            u, v, w = transform(*frames[link_b], point_b)
+        for at_a, point_a, at_b, point_b in self._pairs:
+            x, y, z = transform(*frames[at_a], point_a)
+            u, v, w = transform(*frames[at_b], point_b)
             squared = max(squared, (x - u) ** 2 + (y - v) ** 2 + (z - w) ** 2)
         origin, turn = frames[self._platform]
         # The platform should stand as the base does: a half turn about x, quaternion (1, 0, 0, 0).
         tilt = 2 * math.asin(min(1.0, math.hypot(*turn[1:])))
-        return math.sqrt(squared), transform(origin, turn, self._mechanism.point_p), tilt
+        return Truth(math.sqrt(squared), transform(origin, turn, self._mechanism.point_p), tilt)
 
     def cup(self) -> tuple[Vector, Vector]:
         """Centre of the cup's lip (m) and the cup's outward axis, world."""
         state = self._client.getLinkState(*self.tool, computeForwardKinematics=True)
         origin, turn = state[4], state[5]
         return transform(origin, turn, self._mechanism.lip), rotate(turn, (0.0, 0.0, 1.0))
+
+
+@contextmanager
+def _on_disk(text: str) -> Iterator[str]:
+    """The path of a file with this text: the engine reads robots from files alone.
+
+    Raises:
+        ConfigurationError: If no temporary file can be written.
+    """
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, "robot.urdf")
+            path.write_text(text, encoding="utf-8")
+            yield str(path)
+    except OSError as error:
+        valid = f"a folder that can be written to, for the engine's robot file ({error})"
+        raise ConfigurationError("TMPDIR", os.environ.get("TMPDIR"), valid) from error

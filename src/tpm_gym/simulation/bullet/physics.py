@@ -1,4 +1,4 @@
-"""Numerical settings of the engine, the vacuum's limits, and the path between two commands."""
+"""Numerical settings of PyBullet."""
 
 from __future__ import annotations
 
@@ -6,35 +6,16 @@ import math
 from dataclasses import dataclass
 from numbers import Integral, Real
 
-import numpy as np
-from numpy.typing import NDArray
-
 from tpm_gym.errors import ConfigurationError
-from tpm_gym.mechanism.bodies import Vector
+from tpm_gym.simulation.state import CONTROL_PERIOD
 
-__all__ = ["CONTROL_PERIOD", "Physics", "Quaternion", "rotate", "spline_weights", "transform"]
+__all__ = ["Physics"]
 
-FloatArray = NDArray[np.float64]
-Quaternion = tuple[float, float, float, float]
-
-CONTROL_PERIOD = 1 / 25
-"""Time between two commands, s."""
-GRAVITY = 9.81  # m/s^2
 SOLVERS = ("direct", "iterative")
 REGULARISATION = 1e-9
 """Added to the constraints' compliance (CFM): loops that close twice over stay solvable."""
 MOTOR_GAIN = 1.0
 """Share of the position error that a motor takes out in one time step, effort permitting."""
-PULL_OFF_FORCE = 12.0
-"""Largest force that the cup holds along each axis, N: 60 kPa of vacuum on the area of the lip."""
-SEAL_GAP = 0.002
-"""Largest distance between lip and object at which the vacuum seals, m."""
-SEAL_TILT = np.deg2rad(10.0)
-"""Largest angle between the cup's axis and the object's that the lip follows, rad."""
-CLOSURE_LIMIT = 0.005
-"""A loop that is open by more than this is lost, m."""
-ASSEMBLY_LIMIT = 0.010
-"""Platform against forward kinematics: farther apart, the mechanism is assembled otherwise, m."""
 
 
 @dataclass(frozen=True)
@@ -85,28 +66,3 @@ class Physics:
     def substeps(self) -> int:
         """Time steps in a control period."""
         return round(self.control_period / self.time_step)
-
-
-def spline_weights(substeps: int) -> FloatArray:
-    """(substeps, 3) weights of the last three commands along the quadratic B-spline."""
-    s = np.arange(1, substeps + 1) / substeps
-    return np.stack([(1 - s) ** 2, 1 + 2 * s - 2 * s**2, s**2], axis=1) / 2
-
-
-def rotate(quaternion: Quaternion, vector: Vector) -> Vector:
-    """A vector turned by a unit quaternion (x, y, z, w); plain numbers, for speed."""
-    x, y, z, w = quaternion
-    a, b, c = vector
-    # v + w t + q x t, with t = 2 q x v
-    s, t, u = 2 * (y * c - z * b), 2 * (z * a - x * c), 2 * (x * b - y * a)
-    return (
-        a + w * s + y * u - z * t,
-        b + w * t + z * s - x * u,
-        c + w * u + x * t - y * s,
-    )
-
-
-def transform(origin: Vector, quaternion: Quaternion, point: Vector) -> Vector:
-    """A point of a frame in the frame's parent, m."""
-    a, b, c = rotate(quaternion, point)
-    return origin[0] + a, origin[1] + b, origin[2] + c

@@ -1,0 +1,164 @@
+"""Types of arrays, the one check of what users hand over as numbers, and rotations of vectors."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from numbers import Real
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tpm_gym.errors import InputError, TPMError
+
+__all__ = [
+    "BoolArray",
+    "FloatArray",
+    "IntArray",
+    "Quaternion",
+    "Vector",
+    "finite",
+    "finite_points",
+    "is_tensor",
+    "numbers",
+    "points",
+    "rotate",
+    "transform",
+    "vector",
+]
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+"""x, y, z, w."""
+
+_Error = Callable[[str, Any, str], TPMError]
+_LONGEST = 200  # characters of a value that a message repeats
+
+
+def numbers(name: str, value: ArrayLike, error: _Error = InputError) -> FloatArray:
+    """Real numbers of any shape, finite or not; not copied where they are such an array already.
+
+    Strings, dates, complex numbers and whatever else numpy would bend into floats are refused, and
+    so are masked arrays, whose mask would be ignored.
+
+    Raises:
+        TPMError: The ``error``, made of name, value and what would be valid.
+    """
+    if type(value) is np.ndarray and value.dtype.char in "df":  # the common case, fast
+        return value if value.dtype.char == "d" else value.astype(np.float64)
+    if not _holds_masked(value):
+        # Not ragged lists, integers beyond the range of floats, tensors that require gradients
+        with suppress(TypeError, ValueError, OverflowError, RuntimeError):
+            array = np.asarray(value)
+            if array.dtype.char == "d":
+                return array
+            items = array.flat if array.dtype.kind == "O" else ()
+            if array.dtype.kind in "biufO" and all(isinstance(v, Real) for v in items):
+                with np.errstate(over="ignore"):
+                    return array.astype(np.float64)
+    raise error(name, _brief(value), "real numbers in an array of regular shape")
+
+
+def finite(
+    name: str, value: ArrayLike, shape: tuple[int, ...], error: _Error = InputError
+) -> FloatArray:
+    """Finite numbers of exactly this shape.
+
+    Raises:
+        TPMError: The ``error``, made of name, value and what would be valid.
+    """
+    array = numbers(name, value, error)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise error(name, _brief(value), f"finite numbers of shape {shape}")
+    return array
+
+
+def vector(name: str, value: ArrayLike, error: _Error = InputError) -> Vector:
+    """Three finite numbers, as plain floats.
+
+    Raises:
+        TPMError: The ``error``, made of name, value and what would be valid.
+    """
+    array = numbers(name, value, error)
+    if array.shape == (3,):
+        a, b, c = array.tolist()
+        if math.isfinite(a) and math.isfinite(b) and math.isfinite(c):
+            return a, b, c
+    raise error(name, _brief(value), "three finite numbers, of shape (3,)")
+
+
+def points(name: str, value: ArrayLike) -> FloatArray:
+    """Points (..., 3), finite or not; a torch tensor stays one, on its device, in float64.
+
+    Raises:
+        InputError: If they are no real numbers or the last axis does not have length 3.
+    """
+    array: Any
+    if is_tensor(value):
+        array = value
+        if array.is_complex():
+            raise InputError(name, _brief(value), "real numbers of shape (..., 3)")
+        array = array.double()
+    else:
+        array = numbers(name, value)
+    if array.ndim == 0 or array.shape[-1] != 3:
+        raise InputError(name, tuple(array.shape), "an array of shape (..., 3), by shape")
+    return array  # type: ignore[no-any-return]
+
+
+def finite_points(name: str, value: ArrayLike) -> FloatArray:
+    """Points (..., 3) as :func:`points` returns them, all finite.
+
+    Raises:
+        InputError: If they are no real numbers, not all finite, or not of that shape.
+    """
+    array = points(name, value)
+    wrong = ~(abs(array) < math.inf).all(-1)
+    if wrong.any():
+        raise InputError(name, array[wrong].reshape(-1, 3)[0].tolist(), "finite")
+    return array
+
+
+def is_tensor(value: object) -> bool:
+    """Whether this is a tensor of torch, which is not imported to find out."""
+    return isinstance(value, getattr(sys.modules.get("torch"), "Tensor", ()))
+
+
+def rotate(quaternion: Quaternion, vector: Vector) -> Vector:
+    """A vector turned by a unit quaternion; plain numbers, for speed."""
+    x, y, z, w = quaternion
+    a, b, c = vector
+    # v + w t + q x t, with t = 2 q x v
+    s, t, u = 2 * (y * c - z * b), 2 * (z * a - x * c), 2 * (x * b - y * a)
+    return (
+        a + w * s + y * u - z * t,
+        b + w * t + z * s - x * u,
+        c + w * u + x * t - y * s,
+    )
+
+
+def transform(origin: Vector, quaternion: Quaternion, point: Vector) -> Vector:
+    """A point of a frame in the frame's parent, m."""
+    a, b, c = rotate(quaternion, point)
+    return origin[0] + a, origin[1] + b, origin[2] + c
+
+
+def _holds_masked(value: Any) -> bool:
+    """Whether this is a masked array, or a sequence with one in it."""
+    items = {type(item) for item in value} if isinstance(value, (list, tuple)) else {type(value)}
+    return any(issubclass(kind, np.ma.MaskedArray) for kind in items)
+
+
+def _brief(value: Any) -> Any:
+    """What a message can repeat of a value: itself, or the beginning of a long one."""
+    try:
+        text = repr(value)
+    except Exception as error:  # integers beyond 4300 digits, and whatever else users write
+        return f"{type(value).__name__} ({error})"
+    return value if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."

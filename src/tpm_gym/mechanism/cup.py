@@ -1,0 +1,112 @@
+"""The vacuum cup below the platform: its size, its spring, and what it can hold.
+
+Engines simulate it; :func:`sealed` says, for all of them, when it can hold an object.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from tpm_gym.arrays import Quaternion, Vector, rotate
+from tpm_gym.mechanism.bodies import Joint, Link, Solid
+
+__all__ = ["CUP", "VacuumCup", "sealed"]
+
+_SILICONE, _STEEL, _ALUMINIUM = 1150.0, 7850.0, 2700.0  # kg/m^3
+_BELLOWS = 0.015  # length of the cup's bellows, m
+
+
+@dataclass(frozen=True)
+class VacuumCup:
+    """A cup on a spring-loaded plunger, a level compensator.
+
+    Attributes:
+        length: From point P of the platform to the lip, m.
+        radius: Radius of the lip, m.
+        stroke: How far the cup slides back into its stem when it meets something, m.
+        preload: Force with which the spring keeps the cup out, N: more than the vacuum can hold.
+        pull_off: Largest force that the cup holds along each axis, N: 60 kPa of vacuum on the area
+            of the lip.
+        seal_gap: Largest distance between lip and object at which the vacuum seals, m.
+        seal_tilt: Largest angle between the cup's axis and the object's that the lip follows, rad.
+    """
+
+    length: float = 0.040
+    radius: float = 0.008
+    stroke: float = 0.020
+    preload: float = 15.0
+    pull_off: float = 12.0
+    seal_gap: float = 0.002
+    seal_tilt: float = math.radians(10.0)
+
+    @property
+    def lip(self) -> Vector:
+        """Centre of the lip in the cup's frame, m."""
+        return (0.0, 0.0, self.length)
+
+    def stem(self, point_p: Vector) -> Solid:
+        """The tube below point P (m, in the platform's frame) in which the cup slides."""
+        x, y, z = point_p
+        half = (self.length - _BELLOWS) / 2
+        size = (0.005, 2 * half, 0.0)
+        return Solid("cylinder", size, (x, y, z + half), _ALUMINIUM, colour="steel")
+
+    def link(self, platform: str, point_p: Vector) -> Link:
+        """The cup as a link that slides in the platform of that name."""
+        bellows = Solid(
+            "cylinder",
+            (self.radius, _BELLOWS, 0.0),
+            (0.0, 0.0, self.length - _BELLOWS / 2),
+            _SILICONE,
+            colour="red",
+            collides=True,
+        )
+        plunger = Solid(
+            "cylinder", (0.003, 0.04, 0.0), (0.0, 0.0, self.length - 0.02), _STEEL, colour="steel"
+        )
+        # The stop lies a millimetre beyond the rest position, or the engine would let them fight.
+        slide = Joint(
+            "cup_slide",
+            "prismatic",
+            platform,
+            point_p,
+            lower=-self.stroke,
+            upper=0.001,
+            effort=self.preload,
+            speed=1.0,
+        )
+        return Link("cup", (bellows, plunger), slide)
+
+
+CUP = VacuumCup()
+"""The cup of all machines here."""
+
+
+def sealed(
+    lip: Vector,
+    axis: Vector,
+    position: Vector,
+    quaternion: Quaternion,
+    size: tuple[float, float],
+    cup: VacuumCup = CUP,
+) -> bool:
+    """Whether the whole lip lies on the top face of a square block.
+
+    Args:
+        lip: Centre of the lip, m, world.
+        axis: Outward axis of the cup, world.
+        position: Centre of the block, m, world.
+        quaternion: Its orientation (x, y, z, w).
+        size: Its width and height, m.
+        cup: The cup.
+    """
+    qx, qy, qz, qw = quaternion
+    inverse = (-qx, -qy, -qz, qw)
+    x, y, z = position
+    local = rotate(inverse, (lip[0] - x, lip[1] - y, lip[2] - z))
+    width, height = size
+    gap = local[2] - height / 2
+    covered = max(abs(local[0]), abs(local[1])) <= width / 2 - cup.radius
+    aligned = -rotate(inverse, axis)[2] >= math.cos(cup.seal_tilt)
+    return abs(gap) <= cup.seal_gap and covered and aligned

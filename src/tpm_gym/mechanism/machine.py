@@ -1,0 +1,251 @@
+"""What an environment is built for: a translational robot with closed-form kinematics, as a value.
+
+A :class:`Machine` is asked only what any such robot can answer, so that another one (a Delta, a
+gantry) stands under the same tasks: forward and inverse kinematics, the Jacobian, whether it is
+still in its modes, where it may go, and the bodies to load.
+
+Everything is in the machine's own frame, which its :class:`~tpm_gym.mechanism.mount.Mount` places
+in the world; for the TPM that is the paper's. Joint positions theta are in rad (m for a slide).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from tpm_gym.arrays import FloatArray, Vector, vector
+from tpm_gym.errors import ConfigurationError, SingularityError, UnreachableError
+from tpm_gym.kinematics.workspace import Region
+from tpm_gym.mechanism.bodies import Mechanism
+from tpm_gym.mechanism.mount import Mount
+
+__all__ = ["Machine", "Mode", "Reading", "find_machine", "register_machine"]
+
+Mode = Literal["assembly", "working"]
+Rows = tuple[Vector, Vector, Vector]
+
+_ATTEMPTS = 1000
+
+
+class Reading(NamedTuple):
+    """What follows from joint positions.
+
+    Attributes:
+        position: Point P, m.
+        jacobian: Rows of J with v = J theta_dot, m/rad.
+        conditioning: 1/cond(J), in [0, 1].
+    """
+
+    position: Vector
+    jacobian: Rows
+    conditioning: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Machine(ABC):
+    """A translational robot with three motors over a table.
+
+    Attributes:
+        name: What the machine is called in messages.
+        mount: Where its frame is in the world.
+        region: Where the environments let point P go.
+        goal_region: Where point P has to go to reach a goal, or an object on the table; cut by
+            ``safe_conditioning`` when sampled.
+        home: Where point P is at the start of an episode, m.
+        step_limit: Largest change of the command for P along x, y, z in one control step, m.
+        joint_limit: Largest change of a joint's command in one control step, rad.
+        safe_conditioning: Conditioning 1/cond(J) from which on the machine counts as safe from
+            singularities; the penalty of the reward begins below it.
+        table: Half edges of the table along x and y, m; its top is the world's z = 0.
+
+    Raises:
+        ConfigurationError: If a value cannot be, home or the goals lie outside the region, or the
+            region reaches beyond a singularity.
+        UnreachableError: If a corner of the region cannot be reached.
+    """
+
+    name: str
+    mount: Mount
+    region: Region
+    goal_region: Region
+    home: Vector
+    step_limit: Vector = (0.030, 0.030, 0.030)
+    joint_limit: float = 0.08
+    safe_conditioning: float = 0.08
+    table: tuple[float, float] = (0.45, 0.30)
+
+    def __post_init__(self) -> None:
+        """Reject machines on which no episode could run."""
+        for name, point in (
+            ("home", vector("home", self.home, ConfigurationError)),
+            ("goal_region", self.goal_region.low),
+            ("goal_region", self.goal_region.high),
+        ):
+            if not self.region.contains(point):
+                raise ConfigurationError(name, point, f"inside the region, {self.region}")
+        limits = {
+            "step_limit": vector("step_limit", self.step_limit, ConfigurationError),
+            "joint_limit": (self.joint_limit,),
+            "table": self.table,
+        }
+        for name, values in limits.items():
+            if not min(values) > 0:
+                raise ConfigurationError(name, getattr(self, name), "positive")
+        if not 0 < self.safe_conditioning <= 1:  # the penalty is in units of it
+            raise ConfigurationError("safe_conditioning", self.safe_conditioning, "in (0, 1]")
+        for corner in self.region.corners():
+            if (mode := self.mode_left(self.inverse(corner), corner)) is not None:
+                valid = f"in one {mode} mode; {corner} is beyond a singularity"
+                raise ConfigurationError("region", self.region, valid)
+
+    # -- kinematics -------------------------------------------------------------------------
+
+    @abstractmethod
+    def inverse(self, point: Vector) -> Vector:
+        """Joint positions at which P is at ``point``, on the machine's working mode.
+
+        Raises:
+            UnreachableError: If there are none.
+        """
+
+    @abstractmethod
+    def evaluate(self, theta: Vector) -> Reading:
+        """Point P, J and conditioning at ``theta``, on the machine's assembly mode.
+
+        Raises:
+            UnreachableError: If the machine cannot be assembled there.
+            SingularityError: If theta is a parallel singularity.
+        """
+
+    def forward(self, theta: Vector) -> Vector:
+        """Point P at ``theta``, in the machine's modes.
+
+        Raises:
+            UnreachableError: If the machine cannot be assembled there, or only in other modes.
+        """
+        position = self.evaluate(theta).position
+        if (mode := self.mode_left(theta, position)) is not None:
+            hint = "choose joint positions in the machine's modes"
+            raise UnreachableError(theta, f"{mode} mode", 0.0, hint)
+        return position
+
+    def mode_left(self, theta: Vector, position: Vector) -> Mode | None:
+        """The mode that a machine has left whose joints are at ``theta`` and P at ``position``.
+
+        ``"assembly"`` where it passed a parallel singularity, so that the forward kinematics no
+        longer say where P is; ``"working"`` where it passed a serial one, and the inverse
+        kinematics no longer say how to get where. A machine without singularities leaves none.
+        """
+        del theta, position
+        return None
+
+    # -- regions ----------------------------------------------------------------------------
+
+    def conditioning_at(self, points: ArrayLike) -> FloatArray:
+        """Conditioning 1/cond(J) at points (..., 3) m, as (...,); 0 where P cannot be."""
+        array = np.asarray(points, dtype=np.float64)
+        values = np.zeros(array.shape[:-1])
+        for index in np.ndindex(values.shape):
+            with suppress(UnreachableError, SingularityError):
+                x, y, z = array[index].tolist()
+                values[index] = self.evaluate(self.inverse((x, y, z))).conditioning
+        return values
+
+    def conditioning(self, theta: ArrayLike) -> FloatArray:
+        """Conditioning 1/cond(J) at joint positions (..., 3); 0 where it cannot be assembled."""
+        array = np.asarray(theta, dtype=np.float64)
+        values = np.zeros(array.shape[:-1])
+        for index in np.ndindex(values.shape):
+            with suppress(UnreachableError, SingularityError):
+                a, b, c = array[index].tolist()
+                values[index] = self.evaluate((a, b, c)).conditioning
+        return values
+
+    def sample(self, rng: np.random.Generator, region: Region) -> FloatArray:
+        """Draw a point (3,) m, uniform over the part of ``region`` that is safe.
+
+        Raises:
+            ConfigurationError: If no draw was safe.
+        """
+        for _ in range(_ATTEMPTS):
+            point = rng.uniform(region.low, region.high)
+            conditioning = float(self.conditioning_at(point))
+            if conditioning > 0 and conditioning >= self.safe_conditioning:
+                return point
+        valid = f"a value that some point of {region} reaches"
+        raise ConfigurationError("safe_conditioning", self.safe_conditioning, valid)
+
+    # -- bodies -----------------------------------------------------------------------------
+
+    @cached_property
+    @abstractmethod
+    def mechanism(self) -> Mechanism:
+        """Links, joints and closures, for an engine to load."""
+
+    @abstractmethod
+    def joint_positions(self, theta: Vector) -> dict[str, float]:
+        """Positions of all joints of :attr:`mechanism` at which its loops close, rad or m.
+
+        Raises:
+            UnreachableError: If it cannot be assembled at theta.
+        """
+
+    @property
+    def lengths(self) -> tuple[float, ...]:
+        """The lengths, m, in which a machine that was built may differ from its drawing."""
+        return ()
+
+    def with_lengths(self, lengths: tuple[float, ...]) -> Machine:
+        """The machine with other lengths (m, in the order of :attr:`lengths`)."""
+        if lengths:
+            raise ConfigurationError("length_error", lengths, f"0: {self.name} has no lengths")
+        return self
+
+    def occupied(self, position: ArrayLike) -> list[tuple[FloatArray, FloatArray]]:
+        """Boxes around platform and tool with P at ``position``: low and high corners, m, world."""
+        platform = np.asarray(position, dtype=np.float64) - self.mechanism.point_p
+        boxes = []
+        for name in (self.mechanism.platform, self.mechanism.tool):
+            link = self.mechanism.link(name)
+            slides = link.joint is not None and link.joint.parent == self.mechanism.platform
+            origin = platform + link.joint.origin if link.joint and slides else platform
+            for solid in link.solids:
+                centre = self.mount.to_world(origin + np.asarray(solid.centre))
+                boxes.append((centre - solid.half_extent, centre + solid.half_extent))
+        return boxes
+
+
+_MACHINES: dict[str, Machine | Callable[[], Machine]] = {}
+
+
+def register_machine(name: str, machine: Machine | Callable[[], Machine]) -> None:
+    """Let environments be made with ``machine=name``; a callable is called when first asked for.
+
+    Raises:
+        ConfigurationError: If the name is taken by another machine.
+    """
+    if _MACHINES.get(name, machine) != machine:
+        raise ConfigurationError("machine", name, f"a name other than {', '.join(_MACHINES)}")
+    _MACHINES[name] = machine
+
+
+def find_machine(machine: Any) -> Machine:
+    """A machine by its name, or the machine itself.
+
+    Raises:
+        ConfigurationError: If there is none of that name, or it is no machine.
+    """
+    found = _MACHINES.get(machine) if isinstance(machine, str) else machine
+    if isinstance(machine, str) and callable(found):
+        found = found()
+    if not isinstance(found, Machine):
+        names = ", ".join(map(repr, _MACHINES))
+        raise ConfigurationError("machine", machine, f"{names}, or a tpm_gym.Machine")
+    return found

@@ -1,0 +1,54 @@
+"""How a robot hangs over the table: the one conversion between its own frame and the world."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from tpm_gym.arrays import FloatArray, Vector
+
+__all__ = ["Mount"]
+
+_HALF_TURN = np.array([1.0, -1.0, -1.0])
+
+
+@dataclass(frozen=True)
+class Mount:
+    """How the base hangs over the table: the one conversion between paper and world frame.
+
+    The base is mounted upside down, a half turn about x: world = (x, -y, height - z).
+
+    Attributes:
+        height: Height of the base plane above the table top (world z = 0), m.
+    """
+
+    height: float
+
+    def to_world(self, point: ArrayLike) -> FloatArray:
+        """Convert points (..., 3) m from the paper frame to the world frame."""
+        world: FloatArray = self.rotate(point) + np.array([0.0, 0.0, self.height])
+        return world
+
+    def to_paper(self, point: ArrayLike) -> FloatArray:
+        """Convert points (..., 3) m from the world frame to the paper frame."""
+        return self.rotate(np.asarray(point, dtype=np.float64) - np.array([0.0, 0.0, self.height]))
+
+    def rotate(self, vector: ArrayLike) -> FloatArray:
+        """Convert free vectors (..., 3), such as velocities; the half turn is its own inverse."""
+        turned: FloatArray = np.multiply(vector, _HALF_TURN, dtype=np.float64)
+        return turned
+
+    def swap(self, point: Vector) -> Vector:
+        """One point from either frame to the other, in plain floats: a half turn undoes itself."""
+        x, y, z = point
+        return x, -y, self.height - z
+
+    @property
+    def quaternion(self) -> tuple[float, float, float, float]:
+        """Orientation of the paper frame in the world, (x, y, z, w)."""
+        return (1.0, 0.0, 0.0, 0.0)
+
+
+_HALF_TURN = np.array([1.0, -1.0, -1.0])

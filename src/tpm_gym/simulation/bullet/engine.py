@@ -1,0 +1,143 @@
+"""PyBullet behind the seam of :class:`tpm_gym.simulation.engine.Engine`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tpm_gym.arrays import Vector
+from tpm_gym.mechanism.machine import Machine
+from tpm_gym.simulation.bullet.client import Client
+from tpm_gym.simulation.bullet.cup import Cup, Grip
+from tpm_gym.simulation.bullet.physics import Physics
+from tpm_gym.simulation.bullet.robot import Robot
+from tpm_gym.simulation.bullet.scenery import Scenery
+from tpm_gym.simulation.engine import Engine, Motors, Pose, Truth, Twist
+from tpm_gym.simulation.randomisation import Plant
+from tpm_gym.simulation.settings import settings_of
+from tpm_gym.simulation.state import Scene
+
+__all__ = ["BulletEngine"]
+
+
+@dataclass(frozen=True)
+class _Moment:
+    joints: tuple[tuple[float, float], ...]  # rad and rad/s, passive ones too
+    objects: list[tuple[Pose, Twist]]
+    grip: Grip | None
+
+
+class BulletEngine:
+    """See :class:`~tpm_gym.simulation.engine.Engine`.
+
+    Args:
+        gui: Whether to open PyBullet's window.
+        renderer: ``"tiny"`` (None too) draws on the CPU anywhere; ``"egl"`` on a GPU, where the
+            driver has it.
+        physics: A :class:`Physics` or a mapping of its attributes.
+
+    Raises:
+        ConfigurationError: If an option is out of range, no window opened, or EGL is not there.
+    """
+
+    def __init__(
+        self, *, gui: bool = False, renderer: str | None = None, physics: Any = None
+    ) -> None:
+        """Connect."""
+        self.physics = settings_of(Physics, "physics", physics)
+        self.substeps, self.control_period = self.physics.substeps, self.physics.control_period
+        self._gui, self._renderer = gui, renderer
+        self.client = Client(self.physics, gui, renderer)
+        self._loaded = False
+
+    def load(self, machine: Machine, scene: Scene) -> None:
+        """See the protocol."""
+        if self._loaded:
+            self._empty()
+        self._loaded = True
+        self.robot = Robot(self.client, machine.mechanism, machine.mount)
+        self._scenery = Scenery(self.client, scene, machine.table)
+        if self._gui:
+            self._scenery.aim_window()
+        if self._gui or self._renderer == "egl":
+            self.robot.paint()
+        self.bodies = self._scenery.bodies
+        self._cup = Cup(self.client, self.robot, self.bodies, scene.objects)
+
+    def _empty(self) -> None:
+        """Take everything out of the client; a window stays, else a new client leaks least."""
+        if self._gui:
+            self.client.resetSimulation()
+            self.client.configure(self.physics)
+        else:
+            self.client.close()
+            self.client = Client(self.physics, renderer=self._renderer)
+
+    def alter(self, plant: Plant) -> None:
+        """See the protocol."""
+        self.robot.alter(plant.link_masses, plant.motor_strength)
+        self._scenery.alter(plant.puck_mass, plant.friction)
+
+    def place(self, joints: Mapping[str, float], objects: Sequence[Pose]) -> None:
+        """See the protocol."""
+        self._cup.let_go()
+        self.robot.place(joints)
+        self._scenery.place([(pose, Twist()) for pose in objects])
+
+    def show_goal(self, markers: Sequence[Vector]) -> None:
+        """See the protocol."""
+        self._scenery.move_markers(markers)
+
+    def advance(self, references: Sequence[Vector], vacuum: bool) -> None:
+        """See the protocol."""
+        if not vacuum:
+            self._cup.let_go()
+        drive, step = self.robot.drive, self.client.stepSimulation
+        for theta in references:
+            drive(theta)
+            step()
+        if vacuum:
+            self._cup.suck()
+
+    def motors(self) -> Motors:
+        """See the protocol."""
+        return self.robot.motors()
+
+    def truth(self) -> Truth:
+        """See the protocol."""
+        return self.robot.truth()
+
+    def objects(self) -> list[tuple[Pose, Twist]]:
+        """See the protocol."""
+        return self._scenery.read()
+
+    def held(self) -> int:
+        """See the protocol."""
+        return -1 if self._cup.grip is None else self._cup.grip.which
+
+    def save(self) -> Any:
+        """See the protocol."""
+        return _Moment(self.robot.joint_states(), self.objects(), self._cup.grip)
+
+    def restore(self, snapshot: Any) -> None:
+        """See the protocol."""
+        self._cup.let_go()
+        self.robot.set_joint_states(snapshot.joints)
+        self._scenery.place(snapshot.objects)
+        if snapshot.grip is not None:
+            self._cup.take(snapshot.grip)
+
+    def picture(self, width: int, height: int) -> NDArray[np.uint8]:
+        """See the protocol."""
+        return self._scenery.picture(width, height, self.client.renderer)
+
+    def close(self) -> None:
+        """See the protocol."""
+        self.client.close()
+
+
+_: type[Engine] = BulletEngine  # so that mypy compares them

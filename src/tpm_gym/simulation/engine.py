@@ -1,0 +1,190 @@
+"""What an engine is asked to do, and the engines by name.
+
+An engine knows a machine, a scene and a drive; never a goal, a reward or gymnasium. What is the
+same for all of them (references, encoders' errors, modes, the State) is in
+:mod:`tpm_gym.simulation.simulation`.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tpm_gym.arrays import Quaternion, Vector
+from tpm_gym.errors import ConfigurationError
+from tpm_gym.mechanism.machine import Machine
+from tpm_gym.simulation.randomisation import Plant
+from tpm_gym.simulation.state import Scene
+
+__all__ = [
+    "Engine",
+    "Motors",
+    "Pose",
+    "Truth",
+    "Twist",
+    "make_engine",
+    "register_engine",
+]
+
+UPRIGHT: Quaternion = (0.0, 0.0, 0.0, 1.0)
+
+
+class Pose(NamedTuple):
+    """Position (m) and orientation (x, y, z, w)."""
+
+    position: Vector
+    quaternion: Quaternion = UPRIGHT
+
+
+class Twist(NamedTuple):
+    """Velocity (m/s) and angular velocity (rad/s)."""
+
+    velocity: Vector = (0.0, 0.0, 0.0)
+    angular_velocity: Vector = (0.0, 0.0, 0.0)
+
+
+class Motors(NamedTuple):
+    """True positions (rad, m for a slide) and rates of the motors, and what they last applied."""
+
+    theta: Vector
+    theta_dot: Vector
+    torque: Vector
+
+
+class Truth(NamedTuple):
+    """What a real robot does not know: largest loop gap (m), point P (m, world), tilt (rad)."""
+
+    gap: float
+    position: Vector
+    tilt: float
+
+
+class Engine(Protocol):
+    """One machine over one table. World frame, SI units, plain floats.
+
+    ``load`` comes first, then ``place``; what an engine cannot do it refuses with a
+    :class:`~tpm_gym.errors.ConfigurationError` that names it.
+
+    Attributes:
+        substeps: Time steps in a control period.
+        control_period: s.
+    """
+
+    substeps: int
+    control_period: float
+
+    def load(self, machine: Machine, scene: Scene) -> None:
+        """Hold this machine and scene, and nothing else; loops closed, nothing altered."""
+
+    def alter(self, plant: Plant) -> None:
+        """Make the machine that of ``plant``, but for its lengths, which ``load`` has seen to."""
+
+    def place(self, joints: Mapping[str, float], objects: Sequence[Pose]) -> None:
+        """Let go, then put all joints (rad, m) and objects where they are wanted, at rest."""
+
+    def show_goal(self, markers: Sequence[Vector]) -> None:
+        """Move the goal markers."""
+
+    def advance(self, references: Sequence[Vector], vacuum: bool) -> None:
+        """Run a control period: drive the motors to one reference (rad, m) in each time step."""
+
+    def motors(self) -> Motors:
+        """Read the motors."""
+
+    def truth(self) -> Truth:
+        """Read what only a simulation knows."""
+
+    def objects(self) -> list[tuple[Pose, Twist]]:
+        """Read the scene's objects, in its order."""
+
+    def held(self) -> int:
+        """Index of the object that the cup holds; -1 for none."""
+
+    def save(self) -> Any:
+        """Take down everything that the next steps depend on, as plain data.
+
+        What an engine cannot read out (old contacts' impulses) is not part of it, and ``restore``
+        drops it.
+        """
+
+    def restore(self, snapshot: Any) -> None:
+        """Go back to what ``save`` returned, for the same machine and scene, altered alike."""
+
+    def picture(self, width: int, height: int) -> NDArray[np.uint8]:
+        """Draw the scene as (height, width, 3) RGB."""
+
+    def close(self) -> None:
+        """Give everything back; harmless the second time."""
+
+
+Factory = Callable[..., Engine]
+
+
+_ENGINES: dict[str, str | Factory] = {
+    "pybullet": "tpm_gym.simulation.bullet.engine:BulletEngine",
+}
+
+
+def register_engine(name: str, engine: str | Factory) -> None:
+    """Let environments be made with ``engine=name``.
+
+    Args:
+        name: The name.
+        engine: What makes the engine, from those of the keywords ``gui`` (to open a window),
+            ``renderer`` (other than its own) and ``physics`` (its numerical settings) that it can
+            serve; or ``"module:attribute"`` of that, imported when first asked for.
+
+    Raises:
+        ConfigurationError: If the name is taken by another engine.
+    """
+    if _path(_ENGINES.get(name, engine)) != _path(engine):
+        raise ConfigurationError("engine", name, f"a name other than {', '.join(_ENGINES)}")
+    _ENGINES[name] = engine
+
+
+def _path(engine: str | Factory) -> str:
+    """Where it is defined: there the same one may be registered as itself."""
+    if isinstance(engine, str):
+        return engine
+    return f"{engine.__module__}:{getattr(engine, '__qualname__', engine)}"
+
+
+def make_engine(
+    name: str, *, gui: bool = False, renderer: str | None = None, physics: Any = None
+) -> Engine:
+    """The engine of that name.
+
+    Raises:
+        ConfigurationError: If there is none, or it cannot do what is asked for.
+    """
+    if not isinstance(name, str) or name not in _ENGINES:
+        raise ConfigurationError("engine", name, ", ".join(map(repr, _ENGINES)))
+    factory = _ENGINES[name]
+    if isinstance(factory, str):
+        module, _, attribute = factory.partition(":")
+        factory = getattr(importlib.import_module(module), attribute)
+    options: dict[str, Any] = {"gui": gui or None, "renderer": renderer, "physics": physics}
+    asked = {option: value for option, value in options.items() if value is not None}
+    known = inspect.signature(factory).parameters
+    if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in known.values()):
+        for option in asked.keys() - known.keys():
+            valid = f"left out: the engine {name!r} has no such option"
+            raise ConfigurationError(option, asked[option], valid)
+    engine: Engine = factory(**asked)
+    if lacking := [part for part in _PARTS if not _has(engine, part)]:
+        raise ConfigurationError("engine", name, f"an engine that has {', '.join(lacking)}")
+    return engine
+
+
+_PARTS = [name for name in (*Engine.__annotations__, *vars(Engine)) if not name.startswith("_")]
+
+
+def _has(engine: Engine, part: str) -> bool:
+    """Whether it has that part of the protocol, and of its own: the protocol's do nothing."""
+    own = getattr(engine, part, None)
+    return own is not None and getattr(own, "__func__", None) is not vars(Engine).get(part, own)

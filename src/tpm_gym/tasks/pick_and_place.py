@@ -1,0 +1,109 @@
+"""Pick and place: pick up a puck with the vacuum cup and bring it to the goal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from tpm_gym.arrays import FloatArray
+from tpm_gym.kinematics.workspace import Region
+from tpm_gym.simulation.state import Block, Scene, State
+from tpm_gym.tasks import rewards, sampling
+from tpm_gym.tasks.expert import Expert, Move
+from tpm_gym.tasks.task import Entry, Task
+
+__all__ = ["PickAndPlace"]
+
+CLEARANCE = 0.030
+"""Height over the puck, or over its place, at which the expert arrives and leaves, m."""
+
+
+class PickAndPlace(Task):
+    """Pick up a puck with the vacuum cup and bring its centre to the goal.
+
+    Half of the goals lie on the table, half in the air, away from where the puck starts; both where
+    the machine is safe.
+    """
+
+    puck = Block()
+    scene = Scene(objects=(puck,))
+    vacuum = True
+    samplings = ("sampled", "tempting")
+
+    def sample(
+        self, rng: np.random.Generator, chosen: Mapping[str, FloatArray]
+    ) -> dict[str, FloatArray]:
+        """See the base class."""
+        machine, offset = self.machine, self.hanging(self.puck)
+        to_p, from_p = machine.mount.to_paper, machine.mount.to_world
+        table = self.on_table(self.puck)
+        if self.goals == "tempting":
+            pair = sampling.tempting(rng, machine, table, self._draw_region)
+            first, last = (from_p(point) - offset for point in pair)
+            return {"object": first, "goal": last, **chosen}
+        start = (
+            chosen["object"] if "object" in chosen else from_p(machine.sample(rng, table)) - offset
+        )
+        if "goal" in chosen:
+            return {"object": start, **chosen}
+        region = self._draw_region(rng)
+        goal = sampling.apart_from(to_p(start + offset), rng, machine, region)
+        return {"object": start, "goal": from_p(goal) - offset}
+
+    def _draw_region(self, rng: np.random.Generator) -> Region:
+        """Where P goes with the puck: half on the table, half in the air."""
+        table = self.on_table(self.puck)
+        if rng.random() < 0.5:
+            return table
+        x, y, level = table.high
+        return Region(self.machine.goal_region.low, (x, y, level - sampling.APART))
+
+    def observed(self) -> tuple[Entry, ...]:
+        """The robot, then the puck."""
+        return (*self.robot_entries(), *self.object_entries())
+
+    def achieved(self, state: State) -> FloatArray:
+        """Centre of the puck."""
+        return state.object_position[..., 0, :]
+
+    def shaping(self, state: State) -> dict[str, FloatArray]:
+        """Dense only: minus the distance from the cup to the puck, half as dear as the goal."""
+        if self.reward == "sparse":
+            return {}
+        return {"approach": 0.5 * rewards.dense(rewards.distance(self.lip(state), self.top(state)))}
+
+    # -- the expert -------------------------------------------------------------------------------
+
+    def plan(self, expert: Expert) -> Iterator[Move]:
+        """Come down on the puck, carry it, let go on the table or hold it in the air."""
+        to_paper = expert.machine.mount.to_paper
+        up = np.array([0.0, 0.0, -CLEARANCE])  # paper z points down
+        while True:
+            yield from expert.pick(self.puck, CLEARANCE)
+            if not expert.holding():
+                continue
+            # Where the cup sits on the puck is where it took it, not the puck's middle.
+            grip = expert.seen["position"] - expert.seen["object_position"]
+            place = to_paper(expert.goal + grip)
+            on_table = bool(expert.goal[2] < self.puck.height / 2 + 0.005)
+            stops = [expert.command + up, place + up, place] if on_table else [place]
+            if not on_table:
+                # Off the table first, then straight on.
+                stops.insert(0, expert.command + up / 2)
+            yield from expert.go(stops, vacuum=True, while_holding=self.puck.name)
+            if expert.holding():
+                break
+        yield from self._finish(expert, place, place + up, release=on_table)
+
+    def _finish(
+        self, expert: Expert, place: FloatArray, above: FloatArray, release: bool
+    ) -> Iterator[Move]:
+        """Let go and move away, or hold the puck in the air."""
+        for _ in range(2):  # the platform lags its command
+            yield Move(place, True)
+        if release:
+            yield Move(place, False)
+            yield from expert.go([above], vacuum=False)
+            place = above
+        yield Move(place, not release)

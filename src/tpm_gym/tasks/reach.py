@@ -1,0 +1,47 @@
+"""Reach: bring the platform to a point."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from tpm_gym.arrays import FloatArray
+from tpm_gym.simulation.state import State
+from tpm_gym.tasks import sampling
+from tpm_gym.tasks.expert import Expert, Move
+from tpm_gym.tasks.task import Task
+
+__all__ = ["Reach"]
+
+
+class Reach(Task):
+    """Bring point P of the platform to a point in the workspace.
+
+    Goals are uniform over the safe part of the machine's goal region, away from home.
+    """
+
+    samplings = ("sampled", "tempting")
+
+    def sample(
+        self, rng: np.random.Generator, chosen: Mapping[str, FloatArray]
+    ) -> dict[str, FloatArray]:
+        """See the base class."""
+        machine, region = self.machine, self.machine.goal_region
+        if "goal" in chosen:
+            return dict(chosen)
+        if self.goals == "tempting":
+            _, goal = sampling.tempting(rng, machine, machine.home, lambda _: region)
+        else:
+            goal = sampling.apart_from(machine.home, rng, machine, region)
+        return {"goal": machine.mount.to_world(goal)}
+
+    def achieved(self, state: State) -> FloatArray:
+        """Point P by forward kinematics of the encoders."""
+        return state.fk_position
+
+    def plan(self, expert: Expert) -> Iterator[Move]:
+        """Straight to the goal."""
+        goal = expert.machine.mount.to_paper(expert.goal)
+        yield from expert.go([goal], vacuum=False)
+        yield Move(goal, False)

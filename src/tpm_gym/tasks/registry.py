@@ -1,0 +1,50 @@
+"""Tasks by the names that options give them."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from tpm_gym.errors import ConfigurationError
+from tpm_gym.mechanism.machine import Machine, find_machine
+from tpm_gym.tasks.task import Task
+
+__all__ = ["TASKS", "make_task", "option_name"]
+
+TASKS: dict[str, type[Task]] = {}
+"""Classes of the registered tasks by name; :func:`tpm_gym.register_task` fills it."""
+
+
+def option_name(name: str) -> str:
+    """``"PickAndPlace"`` as options write it: ``"pick_and_place"``.
+
+    Raises:
+        ConfigurationError: If it is no name in CamelCase.
+    """
+    if not isinstance(name, str) or not re.fullmatch(r"([A-Z][a-z0-9]*)+", name, re.ASCII):
+        raise ConfigurationError("name", name, "a name in CamelCase, such as 'PickAndPlace'")
+    return "_".join(re.findall(r"[A-Z][a-z0-9]*", name)).lower()
+
+
+def make_task(task: Any, machine: str | Machine | None = None, **options: Any) -> Task:
+    """A task from its name or class, or the task itself.
+
+    Args:
+        task: Name, class or task.
+        machine: None for the paper's.
+        options: Of :class:`Task`; those that are None keep their defaults.
+
+    Raises:
+        ConfigurationError: If there is no such task, an option is out of range, or options are
+            given with a task that is made already.
+    """
+    options = {"machine": machine, **options}
+    given = {name: value for name, value in options.items() if value is not None}
+    if isinstance(task, Task):
+        for name, value in given.items():
+            raise ConfigurationError(name, value, "left out: a task that is made has its own")
+        return task
+    kind = TASKS.get(task) if isinstance(task, str) else task
+    if not (isinstance(kind, type) and issubclass(kind, Task)):
+        raise ConfigurationError("task", task, f"{', '.join(map(repr, TASKS))}, or a Task")
+    return kind(find_machine(given.pop("machine", "paper")), **given)
