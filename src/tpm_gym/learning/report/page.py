@@ -40,8 +40,8 @@ Written by `make results` from the records in [results](results); no result here
   the playing of demonstrations. For several seeds it is the median, "never" where that is a
   run that never did.
 - **Smallest conditioning** is the least 1/cond(J) of all steps of all test episodes (and seeds),
-  **time below safe** the share of their steps with 1/cond(J) < {PAPER_TPM.safe_conditioning} (the mean of
-  seeds).
+  **time below safe** the share of their steps with 1/cond(J) < \
+{PAPER_TPM.safe_conditioning} (the mean of seeds).
 - **Observed P off** is the largest distance between the observed position of the platform (forward
   kinematics of the encoders) and the simulated one, of all steps, episodes and seeds.
 """
