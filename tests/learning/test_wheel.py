@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 import time
@@ -73,9 +74,9 @@ def test_a_training_is_killed_resumed_and_evaluated_beside_the_expert(
 
 def test_the_published_policies_come_along(installed: Path, tmp_path: Path) -> None:
     program = (
-        "import gymnasium as gym, tpm_gym; from tpm_gym.resources import POLICIES\n"
+        "import gymnasium as gym, tpm_gym\n"
         "assert 'site-packages' in tpm_gym.__file__\n"
-        "policy = tpm_gym.load_policy(POLICIES / 'TPMPickAndPlace-v0.json')\n"
+        "policy = tpm_gym.load_policy('TPMPickAndPlace-v0')\n"
         "env = gym.make('TPMPickAndPlace-v0'); observation, _ = env.reset(seed=0); done = False\n"
         "while not done:\n"
         "    observation, _, _, done, info = env.step(policy.act(observation))\n"
@@ -85,7 +86,8 @@ def test_the_published_policies_come_along(installed: Path, tmp_path: Path) -> N
 
 
 def test_the_readmes_lines_learn_reach(installed: Path, tmp_path: Path) -> None:
-    script = ROOT / "tests" / "data" / "learn_reach.py"
-    last = run(tmp_path, installed / "python", script).splitlines()[-1]
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    (script,) = (block for block in blocks if "import recipe" in block)
+    last = run(tmp_path, installed / "python", "-c", script).splitlines()[-1]
     assert last.endswith(" of 100")
     assert int(last.split()[0]) >= 95
