@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -41,6 +42,11 @@ class ScriptedEnv(gym.Env[dict[str, NDArray[Any]], NDArray[Any]]):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         info = dict(self.steps[self.index])
         self.index += 1
+        truth = np.zeros(3)
+        observed = truth + [0.0, 0.0, info.pop("fk_error")]
+        self.state = SimpleNamespace(
+            fk_position=observed, platform_position=truth, torque=info.pop("torque")
+        )
         return {}, info.pop("reward"), False, self.index == len(self.steps), info
 
 
@@ -66,6 +72,8 @@ def scripted_step(
         "conditioning": conditioning,
         "singularity_penalty": max(0.0, 1 - (conditioning / 0.08) ** 4),
         "closure_error": gap,
+        "fk_error": 2 * gap,
+        "torque": np.array([1.0, -2.0, 2.0]),
     }
 
 
@@ -80,8 +88,8 @@ def test_record_says_what_happened() -> None:
     env = ScriptedEnv(
         [
             scripted_step(-1.0, False, 0.5, 1e-5),
-            scripted_step(-0.5, True, 0.1, 7e-5),
-            scripted_step(-0.25, False, 0.3, 2e-5),
+            scripted_step(-0.5, True, 0.07, 7e-5),
+            scripted_step(-0.25, False, 0.3, 2e-5) | {"torque": np.array([0.0, 0.0, -6.0])},
         ]
     )
     (record,) = run_episodes(env, Idle(), 1, first_seed=5)
@@ -90,10 +98,14 @@ def test_record_says_what_happened() -> None:
         success_at_end=False,
         success_once=True,
         total_reward=-1.75,
-        conditioning_min=0.1,
-        conditioning_mean=pytest.approx(0.3),
+        conditioning_min=0.07,
+        conditioning_mean=pytest.approx(0.29),
         closure_error_max=7e-5,
         length=3,
+        unsafe_share=pytest.approx(1 / 3),
+        fk_error_max=pytest.approx(1.4e-4),
+        torque_rms=pytest.approx(math.sqrt((2 * (1 + 4 + 4) + 36) / 9)),
+        torque_peak=6.0,
     )
     assert record.as_dict()["return"] == -1.75
 
@@ -126,10 +138,11 @@ def test_hooks_see_every_frame_and_episode() -> None:
     assert episodes == [5, 10]
 
 
-@pytest.mark.parametrize("name", ["reward", "conditioning", "closure_error"])
+@pytest.mark.parametrize("name", ["reward", "conditioning", "closure_error", "fk_error", "torque"])
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_values_that_are_not_finite_raise(name: str, value: float) -> None:
-    env = ScriptedEnv([scripted_step(), scripted_step() | {name: value}])
+    wrong = np.array([0.0, value, 0.0]) if name == "torque" else value
+    env = ScriptedEnv([scripted_step(), scripted_step() | {name: wrong}])
     with pytest.raises(RolloutError, match=f"seed 3, step 1: {name} is {value}"):
         run_episodes(env, Idle(), 1, first_seed=3)
 
@@ -222,6 +235,7 @@ def test_summary_keeps_the_worst_of_all_episodes() -> None:
     assert metrics["conditioning_min"].mean == pytest.approx(0.35)
     assert metrics["conditioning_mean"].mean == pytest.approx((3 * 0.4 + 0.3) / 4)
     assert metrics["return"].mean == pytest.approx(-1.25)
+    assert metrics["torque_peak"].worst == 2.0
     assert metrics["success_at_end"].worst is None
 
 

@@ -209,7 +209,7 @@ def files(path: str | Path) -> tuple[Path, Path]:
         raise PolicyFileError(
             str(path),
             "is an archive of Stable-Baselines3, which holds pickles: loading it can run any code",
-            "if you trust it, convert it once: python train/export.py MODEL.zip OUT --trust-pickle",
+            "if you trust it, convert it once: tpm-gym export MODEL.zip OUT --trust-pickle",
         )
     if os.path.isdir(path):  # path.is_dir() raises where a name is too long
         raise PolicyFileError(str(path), "is a folder", "name a policy in it, as in FOLDER/best")
