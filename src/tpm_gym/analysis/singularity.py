@@ -119,15 +119,11 @@ def classify(
     geometry: Geometry = PAPER,
     tolerance: float = 1e-6,
 ) -> Classification:
-    """Tell what kind of singularity joint angles are in (section "Singularity analysis").
+    """Tell what kind of singularity theta (..., 3) rad is in (section "Singularity analysis").
 
-    Args:
-        theta: (..., 3) rad.
-        branch: The assembly mode.
-        geometry: Link lengths.
-        tolerance: A factor made dimensionless counts as zero up to this. From joint angles, a
-            factor that merges two branches is known to the square root of rounding only, so less
-            than 1e-7 makes no sense here.
+    A factor made dimensionless counts as zero up to ``tolerance``. From joint angles, a factor that
+    merges two branches is known to the square root of rounding only, so less than 1e-7 makes no
+    sense here.
 
     Raises:
         InputError: If theta has the wrong shape or is not finite.
@@ -143,14 +139,10 @@ def classify_at(
     geometry: Geometry = PAPER,
     tolerance: float = 1e-6,
 ) -> Classification:
-    """Tell what kind of singularity points are in, on one working mode.
+    """Tell what kind of singularity points (..., 3) m are in, on one working mode.
 
-    Args:
-        position: (..., 3) m, point P.
-        branch: The working mode.
-        geometry: Link lengths.
-        tolerance: A factor made dimensionless counts as zero up to this. A leg's factor grows as
-            the square root of the distance to its boundary: 1e-6 is reached 1e-12 m from it.
+    A factor made dimensionless counts as zero up to ``tolerance``. A leg's factor grows as the
+    square root of the distance to its boundary: 1e-6 is reached 1e-12 m from it.
 
     Raises:
         InputError: If position has the wrong shape or is not finite.
@@ -167,7 +159,7 @@ def nearest_singularity(
     assembly: AssemblyMode = DEFAULT_ASSEMBLY,
     geometry: Geometry = PAPER,
 ) -> NearestSingularity:
-    """Distance from points to the nearest singular point, in Cartesian space, on one working mode.
+    """Distance from points (..., 3) m to the nearest singular point, in Cartesian space.
 
     That is the radius of the largest ball about the point in which P can move without meeting a
     singularity. The planes y = 0 (sin(beta) = 0) and |y| = l7 (cos(beta) = 0) are exact, and so is
@@ -179,12 +171,6 @@ def nearest_singularity(
     What is returned is a true distance to a true singular point, so never too small; it is too
     large only where a surface that bends sharply, or a sliver beyond two close surfaces, escapes
     the rays. A test compares with thousands of rays a point. It takes a few milliseconds a point.
-
-    Args:
-        position: (..., 3) m, point P.
-        branch: The working mode.
-        assembly: The assembly mode that the posture must belong to.
-        geometry: Link lengths.
 
     Returns:
         Distances and where they end; not valid where not finite, or not on both branches.

@@ -250,12 +250,8 @@ def conditioning(
 
     The cofactors have s1 s2 as their largest singular value, and |det| = s1 s2 s3; the smallest
     one, as the root of the smallest eigenvalue of J J^T, would lose half of its digits. Where the
-    two largest nearly coincide, the result is good to 1e-9 only.
-
-    Args:
-        rows: The matrix.
-        ns: What it is made of.
-        det: |det|, if it is known better than the rows tell it.
+    two largest nearly coincide, the result is good to 1e-9 only. ``det`` is |det|, where it is
+    known better than the rows tell it.
     """
     (a, b, c), (d, e, f), (g, h, i) = rows
     first = (e * i - f * h, f * g - d * i, d * h - e * g)
@@ -284,12 +280,7 @@ def _largest_singular_value(rows: tuple[Triple, Triple, Triple], ns: Namespace) 
 
 
 def assemble(theta: Vector, branch: AssemblyMode, geometry: Geometry) -> Assembly:
-    """Forward kinematics on one branch (Eqs. 6 to 11, corrected).
-
-    Args:
-        theta: (3) rad.
-        branch: The assembly mode.
-        geometry: Link lengths.
+    """Forward kinematics on one branch (Eqs. 6 to 11, corrected), at theta (3) rad.
 
     Raises:
         UnreachableError: If the branch does not exist at theta.
@@ -311,12 +302,7 @@ def _assembled(
 
 
 def posture(point: Vector, branch: WorkingMode, geometry: Geometry) -> Vector:
-    """Inverse kinematics on one branch (Eqs. 12 to 15, corrected).
-
-    Args:
-        point: (3) m, point P.
-        branch: The working mode.
-        geometry: Link lengths.
+    """Inverse kinematics on one branch (Eqs. 12 to 15, corrected), for point P (3) m.
 
     Returns:
         (3) rad; theta_1 and theta_3 in (-pi, pi], theta_2 in [0, 2 pi).
@@ -337,12 +323,7 @@ def posture(point: Vector, branch: WorkingMode, geometry: Geometry) -> Vector:
 def evaluate(
     theta: Vector, branch: AssemblyMode, geometry: Geometry
 ) -> tuple[Assembly, tuple[Vector, Vector, Vector], float]:
-    """The assembly, the rows of the velocity Jacobian J (m/rad) and the conditioning 1/cond(J).
-
-    Args:
-        theta: (3) rad.
-        branch: The assembly mode.
-        geometry: Link lengths.
+    """The assembly, the rows of J (m/rad) and the conditioning 1/cond(J), at theta (3) rad.
 
     Raises:
         UnreachableError: If the branch does not exist at theta.

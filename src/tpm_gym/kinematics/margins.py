@@ -26,13 +26,8 @@ def no_assembly(
 ) -> UnreachableError:
     """The error for joint angles at which ``branch`` cannot be assembled.
 
-    Args:
-        theta: rad.
-        branch: The assembly mode.
-        geometry: Link lengths.
-        circles: y of B1 and the distance of the centres of the two circles of Eq. (6), m.
-        link7: From B3 to C3 without link 7: level and vertical, m; of no matter where the circles
-            do not meet.
+    ``circles`` are y of B1 and the distance of the centres of the circles of Eq. (6), m; ``link7``
+    is level and vertical from B3 to where C3 would be without link 7, m, if the circles meet.
     """
     g = geometry
     y1, distance = circles
@@ -57,11 +52,7 @@ def no_posture(
 ) -> UnreachableError:
     """The error for a point that has no posture on ``branch``.
 
-    Args:
-        point: m.
-        branch: The working mode.
-        geometry: Link lengths.
-        legs: C_i - A_i of each leg, m: level and vertical in the arm's plane, and out of it.
+    ``legs`` are C_i - A_i, m: level and vertical in the arm's plane, and out of it.
     """
     hint = f"choose a point of the workspace (branch {branch}; see tpm_gym.kinematics.workspace)"
     beyond = geometry.l7 - abs(point[1])

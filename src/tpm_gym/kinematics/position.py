@@ -48,11 +48,7 @@ _ANGLE_BETA = np.array([12 + (mode.cos_beta + 1) // 2 for mode in WORKING_MODES]
 
 
 def forward_all(theta: ArrayLike, geometry: Geometry = PAPER) -> ForwardSolutions:
-    """Solve the forward kinematics on all 4 branches.
-
-    Args:
-        theta: (..., 3) rad, actuated angles theta_1, theta_2, theta_3.
-        geometry: Lengths of the mechanism.
+    """Solve the forward kinematics on all 4 branches, at actuated angles theta (..., 3) rad.
 
     Returns:
         All solutions; a branch keeps its slot as theta moves, and holds NaN where it is not real.
@@ -67,11 +63,7 @@ def forward_all(theta: ArrayLike, geometry: Geometry = PAPER) -> ForwardSolution
 
 
 def inverse_all(position: ArrayLike, geometry: Geometry = PAPER) -> InverseSolutions:
-    """Solve the inverse kinematics on all 16 branches.
-
-    Args:
-        position: (..., 3) m, point P in the paper frame.
-        geometry: Lengths of the mechanism.
+    """Solve the inverse kinematics on all 16 branches, for point P at position (..., 3) m.
 
     Returns:
         All solutions, NaN where a branch is not real. Entries of position that are not finite give
@@ -88,15 +80,10 @@ def inverse_all(position: ArrayLike, geometry: Geometry = PAPER) -> InverseSolut
 def forward(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> FloatArray:
-    """Platform position on one named branch of the forward kinematics.
-
-    Args:
-        theta: (..., 3) rad, actuated angles.
-        branch: The assembly mode.
-        geometry: Lengths of the mechanism.
+    """Platform position at theta (..., 3) rad, on one named branch of the forward kinematics.
 
     Returns:
-        (..., 3) m, point P in the paper frame. Both y and -y belong to the same angles: the default
+        (..., 3) m, point P. Both y and -y belong to the same angles: the default
         branch gives y > 0, ``AssemblyMode(-1, -1)`` its mirror image.
 
     Raises:
@@ -112,12 +99,7 @@ def forward(
 def inverse(
     position: ArrayLike, branch: WorkingMode = ELBOWS_OUT, geometry: Geometry = PAPER
 ) -> FloatArray:
-    """Actuated angles on one named branch of the inverse kinematics.
-
-    Args:
-        position: (..., 3) m, point P in the paper frame.
-        branch: The working mode.
-        geometry: Lengths of the mechanism.
+    """Actuated angles for P at position (..., 3) m, on one named branch of the inverse kinematics.
 
     Returns:
         (..., 3) rad; theta_1 and theta_3 in (-pi, pi], theta_2 in [0, 2 pi).
@@ -140,12 +122,7 @@ def inverse(
 def passive_angles(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> PassiveAngles:
-    """Directions of all passive links, in closed form, on one branch of the forward kinematics.
-
-    Args:
-        theta: (..., 3) rad, actuated angles.
-        branch: The assembly mode.
-        geometry: Lengths of the mechanism.
+    """Directions of all passive links at theta (..., 3) rad, in closed form, on one branch.
 
     Raises:
         InputError: If theta has the wrong shape or is not finite.

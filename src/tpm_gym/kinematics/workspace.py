@@ -1,4 +1,4 @@
-"""Where the mechanism can go: reachability, margins, regions, and samplers that take an rng.
+"""Where the mechanism can go: regions, reachability, assembly modes and conditioning of points.
 
 Everything here is in the paper frame, in metres, on one working mode.
 """
@@ -16,7 +16,7 @@ from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.kinematics.jacobian import conditioning_at, factors_at
-from tpm_gym.kinematics.modes import DEFAULT_ASSEMBLY, ELBOWS_OUT, AssemblyMode, WorkingMode
+from tpm_gym.kinematics.modes import ELBOWS_OUT, WorkingMode
 from tpm_gym.kinematics.namespaces import namespace_of
 from tpm_gym.kinematics.position import inverse_all
 
@@ -26,7 +26,6 @@ __all__ = [
     "assembly_of",
     "conditioning_at",
     "reachable",
-    "sample",
 ]
 
 
@@ -104,36 +103,3 @@ def assembly_of(
     slots = 2 * (planar > 0) + 1 * (sin_beta > 0)
     found: IntArray = namespace_of(parallel).where(planar == planar, slots, -1)
     return found
-
-
-def sample(
-    rng: np.random.Generator,
-    region: Region,
-    min_conditioning: float = 0.0,
-    geometry: Geometry = PAPER,
-    attempts: int = 1000,
-    branch: WorkingMode = ELBOWS_OUT,
-    assembly: AssemblyMode = DEFAULT_ASSEMBLY,
-) -> FloatArray:
-    """Draw one point (3,) m, uniform over the part of ``region`` that is reachable and safe enough.
-
-    Args:
-        rng: Source of randomness.
-        region: The box to draw from.
-        min_conditioning: Smallest conditioning accepted.
-        geometry: Lengths of the mechanism.
-        attempts: Draws before giving up.
-        branch: The working mode.
-        assembly: The assembly mode that the posture must belong to.
-
-    Raises:
-        ConfigurationError: If no draw was accepted.
-    """
-    for _ in range(attempts):
-        point = rng.uniform(region.low, region.high)
-        conditioning = conditioning_at(point, branch, assembly, geometry)
-        if conditioning > 0 and conditioning >= min_conditioning:
-            return point
-    raise ConfigurationError(
-        "min_conditioning", min_conditioning, f"a value that some point of {region} reaches"
-    )
