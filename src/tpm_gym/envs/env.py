@@ -298,7 +298,7 @@ class TPMEnv(gym.Env[Observation, Action]):
             ModeChangeError: If the mechanism passed a singularity earlier in this episode.
         """
         values = finite("action", action, (self.task.action_size,), ActionError)
-        state = self._require_state()
+        state = self.state
         values, *pending = (*self._pending, np.minimum(np.maximum(values, -1.0), 1.0))
         command = self.control.command(values[:3], self.machine.mount.to_paper(state.command))
         vacuum = self.task.vacuum and bool(values[3] > 0)
@@ -369,7 +369,10 @@ class TPMEnv(gym.Env[Observation, Action]):
         Raises:
             EpisodeError: If there is no episode.
         """
-        return self._require_state()
+        self._require_open()
+        if self._state is None:
+            raise EpisodeError("no episode is running; call reset() first")
+        return self._state
 
     @property
     def goal(self) -> FloatArray:
@@ -384,7 +387,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         Raises:
             EpisodeError: If there is no episode.
         """
-        self._require_state()
+        _ = self.state  # there has to be an episode
         rng = dict(self.np_random.bit_generator.state)
         moment = (self.simulation.save(), rng, self.goal, self._pending, self._kind)
         return EnvSnapshot(*moment, _digest(moment))
@@ -418,12 +421,6 @@ class TPMEnv(gym.Env[Observation, Action]):
     def _require_open(self) -> None:
         if self._closed:
             raise EpisodeError("the environment is closed; make a new one")
-
-    def _require_state(self) -> State:
-        self._require_open()
-        if self._state is None:
-            raise EpisodeError("no episode is running; call reset() first")
-        return self._state
 
     def __getstate__(self) -> dict[str, Any]:
         """For :func:`copy.deepcopy` and :mod:`pickle`: all of it, in the midst of an episode.
