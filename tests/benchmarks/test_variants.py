@@ -13,12 +13,12 @@ import pytest
 from fidelity_lab import Config, Rig, gravity_torques, measure, random_motion
 from fidelity_long import Histogram
 from fidelity_sweep import pareto, sweep
+from tpm_gym.simulation.physics import CLOSURE_LIMIT
 from variants import Variant, all_variants, gaps, link_frames
 
 from tpm_gym.kinematics import inverse
 from tpm_gym.kinematics.workspace import TASK_REGION
 from tpm_gym.mechanism.tree import ACTUATED_JOINTS, build
-from tpm_gym.simulation.physics import CLOSURE_LIMIT
 
 VARIANTS = all_variants()
 GAP = 1e-9  # m
