@@ -16,6 +16,8 @@ from tpm_gym.kinematics import (
     ASSEMBLY_MODES,
     ELBOWS_OUT,
     WORKING_MODES,
+    AssemblyMode,
+    equations,
     forward,
     forward_all,
     inverse,
@@ -23,6 +25,7 @@ from tpm_gym.kinematics import (
     passive_angles,
 )
 from tpm_gym.kinematics.geometry import PAPER, Geometry
+from tpm_gym.kinematics.namespaces import NUMPY
 
 HOME = np.array([-0.05, 0.03, 0.78])
 SINGLE_BRANCH = (forward, inverse, passive_angles)
@@ -163,7 +166,20 @@ def test_loops_that_cannot_be_assembled_are_named(theta: list[float]) -> None:
             assert caught.value.point == tuple(theta)
 
 
-def test_the_loop_that_is_blamed_is_the_one_that_fails() -> None:
+def margin_of_loop_2(theta: FloatArray, mode: AssemblyMode) -> float:
+    """How far l4 is from the range of |B3C3| over a full turn of link 7."""
+    with np.errstate(invalid="ignore"):
+        cos, sin = equations.arms(theta, PAPER, NUMPY)
+        found, _, _ = equations.assembly_at(cos, sin, mode.planar, mode.sin_beta, PAPER, NUMPY)
+    turn = np.linspace(0, 2 * np.pi, 20_001)
+    p = oracle.points(np.broadcast_to(theta, (20_001, 3)), found.x_c, found.z_c, turn, PAPER)
+    rods = np.linalg.norm(oracle.rods(p), axis=-1)
+    np.testing.assert_allclose(rods[:, :2], PAPER.l4)  # loop 1 is closed
+    lengths = rods[:, 2]
+    return float(min(lengths.max() - PAPER.l4, PAPER.l4 - lengths.min()))
+
+
+def test_the_loop_that_is_blamed_is_the_one_that_fails_and_by_so_much() -> None:
     angles = np.random.default_rng(2).uniform(-np.pi, np.pi, (120, 3))
     blamed = set()
     for theta in angles:
@@ -180,6 +196,9 @@ def test_the_loop_that_is_blamed_is_the_one_that_fails() -> None:
             apart = np.hypot(p["B2"][0] + 2 * PAPER.l5, p["B2"][2] - p["B1"][2])
             meet = abs(PAPER.l4 - radius) <= apart <= PAPER.l4 + radius
             assert loop == (2 if meet else 1)
+            margin = min(PAPER.l4 + radius - apart, apart - PAPER.l4 + radius)
+            margin = margin_of_loop_2(theta, mode) if meet else margin
+            assert caught.value.margin == pytest.approx(margin, abs=1e-7)
             blamed.add(loop)
     assert blamed == {1, 2}
 

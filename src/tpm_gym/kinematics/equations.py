@@ -40,7 +40,6 @@ __all__ = [
     "assemble",
     "assembly_at",
     "conditioning",
-    "determinant",
     "evaluate",
     "factors",
     "no_assembly",
@@ -237,30 +236,20 @@ def velocity(bars: tuple[Triple, Triple, Triple], values: Factors) -> tuple[Trip
     )
 
 
-def determinant(values: Factors) -> Numbers:
-    """|det J| = |det B / det A|, exact to rounding where the rows of J, grown large, cancel."""
-    sin_beta, level3, planar, cos_beta, leg1, leg2, leg3, _ = values
-    return abs(cos_beta * leg1 * leg2 * leg3 / (sin_beta * level3 * planar))
-
-
-def conditioning(
-    rows: tuple[Triple, Triple, Triple], ns: Namespace, det: Numbers | None = None
-) -> Numbers:
+def conditioning(rows: tuple[Triple, Triple, Triple], ns: Namespace) -> Numbers:
     """Smallest over largest singular value, s3 / s1, of a matrix (3, 3).
 
     The cofactors have s1 s2 as their largest singular value, and |det| = s1 s2 s3; the smallest
     one, as the root of the smallest eigenvalue of J J^T, would lose half of its digits. Where the
-    two largest nearly coincide, the result is good to 1e-9 only. ``det`` is |det|, where it is
-    known better than the rows tell it.
+    two largest nearly coincide, the result is good to 1e-9 only.
     """
     (a, b, c), (d, e, f), (g, h, i) = rows
     first = (e * i - f * h, f * g - d * i, d * h - e * g)
     second = (h * c - i * b, i * a - g * c, g * b - h * a)
     third = (b * f - c * e, c * d - a * f, a * e - b * d)
-    if det is None:
-        det = abs(a * first[0] + b * first[1] + c * first[2])
+    determinant = a * first[0] + b * first[1] + c * first[2]
     scale = _largest_singular_value(rows, ns) * _largest_singular_value((first, second, third), ns)
-    return ns.clip(det / ns.nonzero(scale))
+    return ns.clip(abs(determinant) / ns.nonzero(scale))
 
 
 def _largest_singular_value(rows: tuple[Triple, Triple, Triple], ns: Namespace) -> Numbers:

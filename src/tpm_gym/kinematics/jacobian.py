@@ -283,8 +283,7 @@ def _velocity(c: _Configuration) -> list[Numbers]:
 
 def _conditioning(c: _Configuration) -> Numbers:
     """0 where J does not exist: beside what grows there without bound, the rest is nothing."""
-    rows, determinant = equations.velocity(c.rods, c.factors), equations.determinant(c.factors)
-    found = equations.conditioning(rows, c.ns, determinant)
+    found = equations.conditioning(equations.velocity(c.rods, c.factors), c.ns)
     return c.ns.where(found <= 1.0, found, 0.0)
 
 
