@@ -3,12 +3,12 @@ import re
 import gymnasium as gym
 import numpy as np
 import pytest
+from tpm_gym.simulation.physics import Physics
 
 from tpm_gym.envs.env import TPMEnv
 from tpm_gym.errors import ClosureError, ConfigurationError, EpisodeError
 from tpm_gym.kinematics.workspace import TASK_REGION
 from tpm_gym.mechanism.tree import DEFAULT_MOUNT
-from tpm_gym.simulation.physics import Physics
 from tpm_gym.tasks import task as tasks
 from tpm_gym.tasks.expert import Expert
 from tpm_gym.tasks.rewards import singularity_penalty
