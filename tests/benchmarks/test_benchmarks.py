@@ -173,7 +173,7 @@ def test_ratios_are_taken_within_a_round():
 
 def test_profile_names_where_the_time_goes(capsys):
     bench_speed.main(["--profile", "--steps", "1"])
-    assert "(move)" in capsys.readouterr().out
+    assert "(advance)" in capsys.readouterr().out
 
 
 # -- endurance ------------------------------------------------------------------------------------
