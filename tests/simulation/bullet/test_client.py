@@ -24,8 +24,8 @@ from tpm_gym.simulation.display import has_display
 posix = pytest.mark.skipif(os.name != "posix", reason="descriptors and X11")
 
 
-def in_a_process(script: str, **variables: str) -> str:
-    """What a script with an environment says on stderr."""
+def in_a_process(script: str, **variables: str) -> tuple[str, str]:
+    """What a script says on stdout and stderr."""
     begin = "import os, sys\nimport gymnasium as gym\nimport tpm_gym\n"
     done = subprocess.run(
         [sys.executable, "-c", begin + script],
@@ -36,7 +36,8 @@ def in_a_process(script: str, **variables: str) -> str:
         check=False,
     )
     lines = done.stderr.splitlines()
-    return "\n".join(line for line in lines if not line.startswith("pybullet build time"))
+    told = [line for line in lines if not line.startswith("pybullet build time")]
+    return done.stdout, "\n".join(told)
 
 
 @pytest.fixture
@@ -147,7 +148,7 @@ def test_what_is_dropped_is_given_back() -> None:
 @pytest.mark.slow  # 20 s
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs Linux")
 def test_200_environments_and_copies_dropped_without_close_leave_no_memory() -> None:
-    grown = in_a_process("""
+    _, grown = in_a_process("""
 import copy, ctypes, gc
 def memory():
     gc.collect()
@@ -212,12 +213,28 @@ def test_where_no_file_can_be_written_the_error_says_so(
 )
 def test_environments_are_made_where_there_is_no_standard_output(gone: str) -> None:
     made = f"{gone}\nenv = gym.make('TPMReach-v0')\nenv.reset(seed=0)\nsys.stderr.write('made')"
-    assert "made" in in_a_process(made)
+    assert "made" in in_a_process(made)[1]
+
+
+@posix
+def test_silence_takes_what_c_writes_too_and_may_be_nested() -> None:
+    said, _ = in_a_process("""
+import ctypes
+from tpm_gym.simulation.bullet.client import silence
+c = ctypes.CDLL(None)
+with silence():
+    with silence():
+        print("python")
+    c.puts(b"c")
+print("after")
+c.puts(b"c after")
+""")
+    assert sorted(said.splitlines()) == ["after", "c after"]
 
 
 @posix
 def test_threads_that_make_environments_leave_standard_output_as_it_was() -> None:
-    said = in_a_process("""
+    _, said = in_a_process("""
 import time
 from threading import Thread
 import pybullet
@@ -256,7 +273,7 @@ REFUSED = "ConfigurationError render_mode;"
 @posix
 @pytest.mark.parametrize("display", [":987", "localhost:987", "nonsense", ""])
 def test_a_display_that_does_not_answer_is_a_typed_error(display: str) -> None:
-    assert in_a_process(OPEN, DISPLAY=display) == REFUSED
+    assert in_a_process(OPEN, DISPLAY=display)[1] == REFUSED
 
 
 SCREENS = [
@@ -280,7 +297,7 @@ def screen(request: pytest.FixtureRequest) -> Iterator[str]:
 def test_a_second_window_is_a_typed_error_and_the_first_goes_on(
     screen: str, request: pytest.FixtureRequest
 ) -> None:
-    said = in_a_process(
+    _, said = in_a_process(
         OPEN
         + """
 second = window()
