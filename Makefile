@@ -48,7 +48,7 @@ test-wheel: $(INSTALLED) ## the wheel in an empty environment: train, kill, resu
 	$(RUN) -m pytest -q -m slow tests/learning/test_wheel.py
 
 urdf: $(INSTALLED) ## regenerate urdf/ from the mechanism
-	$(RUN) -m tpm_gym.urdf urdf
+	$(RUN) -m tpm_gym.mechanism.urdf urdf
 
 pictures: $(INSTALLED) ## redraw the README's pictures
 	$(RUN) docs/draw_pictures.py
