@@ -4,7 +4,7 @@ VENV := .venv
 RUN := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
 
-.PHONY: help demo test lint format test-fast test-slow urdf pictures figures results bench-kinematics bench-fidelity bench-evaluate bench-speed soak clean
+.PHONY: help demo test lint format test-fast test-slow test-wheel urdf pictures figures results bench-kinematics bench-fidelity bench-evaluate bench-speed soak clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -44,8 +44,11 @@ test-fast: $(INSTALLED)
 test-slow: $(INSTALLED) ## tests that take minutes: 1000 expert episodes, training to success
 	$(RUN) -m pytest -q -m slow
 
+test-wheel: $(INSTALLED) ## the wheel in an empty environment: train, kill, resume, evaluate
+	$(RUN) -m pytest -q -m slow tests/learning/test_wheel.py
+
 urdf: $(INSTALLED) ## regenerate urdf/ from the mechanism
-	$(RUN) -m tpm_gym.urdf urdf
+	$(RUN) -m tpm_gym.mechanism.urdf urdf
 
 pictures: $(INSTALLED) ## redraw the README's pictures
 	$(RUN) docs/draw_pictures.py

@@ -38,6 +38,7 @@ from raw_physics import Floor, Recorder, Tape, record, recording, replay
 from speed_report import print_report, save_plot
 
 from tpm_gym import ENV_IDS
+from tpm_gym.simulation.bullet.client import silence
 
 BASELINE = "PandaPickAndPlace-v3"
 PEERS = {
@@ -109,7 +110,7 @@ def open_contestants(env_ids: Sequence[str]) -> tuple[list[Contestant], dict[str
     made, missing = [], {}
     for env_id in env_ids:
         try:
-            with machine.silence(), warnings.catch_warnings():
+            with silence(), warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 if env_id in PEERS:
                     gym.register_envs(import_module(PEERS[env_id]))
@@ -140,7 +141,7 @@ def _check_rate(env_id: str, env: gym.Env[Any, Any]) -> None:
     """Raise where an environment's control step is not 40 ms, so that steps are not comparable."""
     unwrapped: Any = env.unwrapped
     if env_id in ENV_IDS:
-        period = unwrapped.simulation.physics.control_period
+        period = unwrapped.simulation.engine.control_period
     elif PEERS[env_id] == "panda_gym":
         period = unwrapped.sim.dt
     else:
@@ -269,7 +270,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
     try:
         race(contestants, options.rounds, options.steps, options.seed)
     finally:
-        with machine.silence():
+        with silence():
             for contestant in contestants:
                 contestant.close()
     content["contestants"] = summary(contestants, options.steps)

@@ -1,7 +1,8 @@
 """A mechanism in a physics client, motions to follow, and what to measure on the way.
 
-The production classes load the mechanism and close its loops (:class:`tpm_gym.simulation.bullet.robot.Robot`); only
-the engine's settings and the motors vary here.
+The production classes load the mechanism and close its loops
+(:class:`tpm_gym.simulation.bullet.robot.Robot`); only the engine's settings and the motors vary
+here.
 """
 
 from __future__ import annotations
@@ -16,36 +17,26 @@ import gymnasium as gym
 import numpy as np
 import pybullet
 import variants
-from machine import silence
-from numpy.typing import NDArray
-from tpm_gym.mechanism.links import MOTOR_EFFORT
-from tpm_gym.simulation.physics import (
-    ASSEMBLY_LIMIT,
-    CLOSURE_LIMIT,
-    CONTROL_PERIOD,
-    GRAVITY,
-    REGULARISATION,
-    Physics,
-    spline_weights,
-)
 
 import tpm_gym  # noqa: F401  (registers the environments)
 from tpm_gym import kinematics
+from tpm_gym.arrays import FloatArray
 from tpm_gym.kinematics import jacobian
-from tpm_gym.kinematics.workspace import TASK_REGION
-from tpm_gym.mechanism.tree import DEFAULT_MOUNT
-from tpm_gym.simulation.bullet.client import Client
+from tpm_gym.mechanism import PAPER_TPM
+from tpm_gym.mechanism.tpm import ASSEMBLY_LIMIT
+from tpm_gym.mechanism.tree import MOTOR_EFFORT
+from tpm_gym.simulation.bullet.client import GRAVITY, Client, silence
+from tpm_gym.simulation.bullet.physics import REGULARISATION, Physics
 from tpm_gym.simulation.bullet.robot import Robot
+from tpm_gym.simulation.simulation import CLOSURE_LIMIT, spline_weights
+from tpm_gym.simulation.state import CONTROL_PERIOD
+from tpm_gym.tasks import Expert
 from tpm_gym.tasks.control import CartesianControl
-from tpm_gym.tasks.expert import Expert
-
-FloatArray = NDArray[np.float64]
 
 DEFAULT = Physics()
 CONDITIONED = 0.05
 """1/cond(J) above which forward kinematics is held to its strict limit."""
-HOME = np.array((-0.04, 0.028, 0.80))
-"""Where random and scripted motions start, paper frame, m."""
+HOME, REGION, MOUNT = np.array(PAPER_TPM.home), PAPER_TPM.region, PAPER_TPM.mount
 
 
 # -- settings ----------------------------------------------------------------------------------
@@ -121,9 +112,10 @@ class Rig:
         for setting, value in config.beyond.items():
             with silence():  # the engine prints the name of its solver
                 self.client.setPhysicsEngineParameter(**{setting: value})
-        self.robot = Robot(self.client, self.variant.mechanism, DEFAULT_MOUNT)
+        self.robot = Robot(self.client, self.variant.mechanism, MOUNT)
+        self.motors = [self.robot.joints[name] for name in self.variant.mechanism.actuated]
         if config.motor == "torque":
-            for motor in self.robot._motors:
+            for motor in self.motors:
                 self.client.setJointMotorControl2(*motor, self.client.VELOCITY_CONTROL, force=0.0)
 
     def place(self, theta: FloatArray) -> None:
@@ -139,9 +131,9 @@ class Rig:
         if self.config.motor == "servo":
             self.robot.drive(target[:3])
             return
-        angles, rates = self.robot.encoders()
+        angles, rates, _ = self.robot.motors()
         client, (stiffness, damping) = self.client, self.config.gains
-        for i, motor in enumerate(self.robot._motors):
+        for i, motor in enumerate(self.motors):
             torque = (
                 stiffness * (target[i] - angles[i])
                 + damping * (target[3 + i] - rates[i])
@@ -189,7 +181,7 @@ class Motion:
             padded = np.vstack([commands[:1], commands[:1], commands[1:]])
             splines = [weights @ padded[k : k + 3] for k in range(len(padded) - 2)]
             yield np.vstack([commands[:1], *splines])
-        low, high = np.asarray(TASK_REGION.low), np.asarray(TASK_REGION.high)
+        low, high = np.asarray(REGION.low), np.asarray(REGION.high)
         for frequencies in self.sweeps:
             t = np.arange(round(self.seconds / time_step) + 1)[:, None] * time_step
             swing = np.cos(2 * np.pi * t * np.asarray(frequencies))  # at rest at t = 0
@@ -224,10 +216,10 @@ def expert_motion(episodes: int, seed: int = 0) -> Motion:
     for episode in range(episodes):
         observation, _ = env.reset(seed=seed + episode)
         expert.reset(observation)
-        commands, done = [DEFAULT_MOUNT.to_paper(inside.state.command)], False
+        commands, done = [MOUNT.to_paper(inside.state.command)], False
         while not done:
             observation, _, terminated, truncated, _ = env.step(expert.act(observation))
-            commands.append(DEFAULT_MOUNT.to_paper(inside.state.command))
+            commands.append(MOUNT.to_paper(inside.state.command))
             done = terminated or truncated
         recorded.append(np.array(commands))
     env.close()
@@ -236,7 +228,7 @@ def expert_motion(episodes: int, seed: int = 0) -> Motion:
 
 def _walk(actions: FloatArray) -> FloatArray:
     """Commands that Cartesian actions (n, 3) lead to from HOME, (n + 1, 3) m."""
-    control, commands = CartesianControl(), [HOME]
+    control, commands = CartesianControl(PAPER_TPM), [HOME]
     for action in actions:
         commands.append(control.command(action, commands[-1]))
     return np.array(commands)
@@ -321,7 +313,7 @@ def measure(rig: Rig, motion: Motion) -> Errors:
             rig.drive(target)
             rig.step()
             gap, position, tilt = rig.robot.truth()
-            rows.append((gap, tilt, *position, *rig.robot.encoders()[0]))
+            rows.append((gap, tilt, *position, *rig.robot.motors().theta))
             wanted.append(point)
             if not gap <= CLOSURE_LIMIT:  # a NaN ends it too
                 return _evaluate(np.array(rows), np.array(wanted))
@@ -332,7 +324,7 @@ def _evaluate(rows: FloatArray, wanted: FloatArray) -> Errors:
     """Errors of (n, 8) rows of gap, tilt, platform (world) and encoders, up to where it is lost."""
     gap, tilt, position, theta = rows[:, 0], rows[:, 1], rows[:, 2:5], rows[:, 5:8]
     apart, conditioning = against_kinematics(theta, position)
-    tracking = np.linalg.norm(DEFAULT_MOUNT.to_paper(position) - wanted, axis=-1)
+    tracking = np.linalg.norm(MOUNT.to_paper(position) - wanted, axis=-1)
     bad = np.flatnonzero(~((gap <= CLOSURE_LIMIT) & (apart <= ASSEMBLY_LIMIT)))
     lost = int(bad[0]) + 1 if len(bad) else None
     keep = slice(None if lost is None else lost - 1)
@@ -349,7 +341,7 @@ def against_kinematics(theta: FloatArray, position: FloatArray) -> tuple[FloatAr
     solutions = kinematics.forward_all(np.where(finite[:, None], theta, 0.0))
     slot = kinematics.DEFAULT_ASSEMBLY.index
     valid = finite & solutions.valid[:, slot]
-    expected = DEFAULT_MOUNT.to_world(solutions.position[valid, slot])
+    expected = MOUNT.to_world(solutions.position[valid, slot])
     apart[valid] = np.linalg.norm(position[valid] - expected, axis=-1)
     conditioning[valid] = jacobian.conditioning(theta[valid])
     return apart, conditioning

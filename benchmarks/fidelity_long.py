@@ -15,12 +15,10 @@ import gymnasium as gym
 import numpy as np
 from fidelity_lab import CONDITIONED, against_kinematics
 from machine import ROOT
-from numpy.typing import NDArray
 
+from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import ClosureError
-from tpm_gym.tasks.expert import Expert
-
-FloatArray = NDArray[np.float64]
+from tpm_gym.tasks import Expert
 
 BUFFER = 5000  # time steps that wait for their kinematics
 JSON = ROOT / "runs" / "fidelity_long.json"
@@ -77,7 +75,7 @@ class Probe:
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         """Hook in."""
         inside: Any = env.unwrapped
-        self._robot, client = inside.simulation._robot, inside.simulation._client
+        self._robot, client = inside.simulation.engine.robot, inside.simulation.engine.client
         self._step = client.stepSimulation
         client.stepSimulation = self._measured_step
         self._rows = np.empty((BUFFER, 8))
@@ -88,7 +86,7 @@ class Probe:
     def _measured_step(self, *arguments: Any, **options: Any) -> Any:
         result = self._step(*arguments, **options)
         gap, position, tilt = self._robot.truth()
-        self._rows[self._filled] = (gap, tilt, *position, *self._robot.encoders()[0])
+        self._rows[self._filled] = (gap, tilt, *position, *self._robot.motors().theta)
         self._filled += 1
         self.steps += 1
         if self._filled == BUFFER:

@@ -10,9 +10,8 @@ import numpy as np
 from fidelity_lab import CONDITIONED, Config, Errors, Motion, Rig, measure, references
 from fidelity_lab import seconds_per_step as timed
 from machine import quartiles
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from tpm_gym.arrays import FloatArray
 
 QUANTITIES = ("gap", "fk", "fk_near", "tilt", "tracking")
 """Loop gap (m); platform against forward kinematics where 1/cond(J) exceeds CONDITIONED, and where

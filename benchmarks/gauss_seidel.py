@@ -19,13 +19,9 @@ from typing import Any
 
 import numpy as np
 from fidelity_lab import Config, Rig
-from numpy.typing import NDArray
 
-from tpm_gym import kinematics
-from tpm_gym.kinematics.workspace import TASK_REGION
-from tpm_gym.mechanism.tree import ACTUATED_JOINTS
-
-FloatArray = NDArray[np.float64]
+from tpm_gym.arrays import FloatArray, Vector
+from tpm_gym.mechanism import PAPER_TPM
 
 HEIGHTS = (0.002, 0.005, 0.012, 0.020, 0.030, 0.046)
 """y of point P, m; the task region starts at 12 mm."""
@@ -41,11 +37,11 @@ def constraint_rows(rig: Rig) -> tuple[FloatArray, FloatArray]:
     count = client.getNumJoints(body)
     angles = [client.getJointState(body, i)[0] for i in range(count)]
     rest = [0.0] * count
-    rows = [np.eye(count)[robot._joints[name][1]] for name in (*ACTUATED_JOINTS, "cup_slide")]
+    rows = [np.eye(count)[robot.joints[name][1]] for name in (*mechanism.actuated, "cup_slide")]
 
     def jacobian_of(link: str, point: Any) -> FloatArray:
         local = np.asarray(point) - mechanism.link(link).centre_of_mass
-        address = robot._links[link][1]
+        address = robot.links[link][1]
         return np.array(
             client.calculateJacobian(body, address, local.tolist(), angles, rest, rest)[0]
         )
@@ -70,35 +66,35 @@ def iterations_per_decade(coupling: FloatArray) -> float:
 def convergence() -> None:
     """Iterations a decade over the task region, by y."""
     rig = Rig(Config("", "", variant="one body"))
-    low, high = TASK_REGION.low, TASK_REGION.high
+    low, high = PAPER_TPM.region.low, PAPER_TPM.region.high
     print("iterations of sequential impulses a decimal digit, over x and z of the task region")
     for y in HEIGHTS:
         counts = []
         for x, z in product(np.linspace(low[0], high[0], 7), np.linspace(low[2], high[2], 5)):
-            rig.place(kinematics.inverse((x, y, z)))
+            rig.place(PAPER_TPM.inverse((x, y, z)))
             rows, mass = constraint_rows(rig)
             counts.append(iterations_per_decade(rows @ np.linalg.solve(mass, rows.T)))
         print(f"  y = {1e3 * y:4.0f} mm: median {np.median(counts):4.0f}, most {max(counts):4.0f}")
     rig.close()
 
 
-def left_over(config: Config, point: FloatArray) -> float:
+def left_over(config: Config, point: Vector) -> float:
     """Largest rate (rad/s or m/s) of a motor or closure, of all that one step should have stopped.
 
     The mechanism starts at rest at ``point``; its motors are told to stay.
     """
-    theta = kinematics.inverse(point)
+    theta = PAPER_TPM.inverse(point)
     whole = Rig(Config("", "", variant="one body"))
     whole.place(theta)
     rows, _ = constraint_rows(whole)
-    names = {index: name for name, (_, index) in whole.robot._joints.items()}
+    names = {index: name for name, (_, index) in whole.robot.joints.items()}
     whole.close()
     rig = Rig(config)
     rig.place(theta)
-    rig.drive(theta.tolist())
+    rig.drive(list(theta))
     rig.step()
     rates = np.array(
-        [rig.client.getJointState(*rig.robot._joints[names[i]])[1] for i in range(len(names))]
+        [rig.client.getJointState(*rig.robot.joints[names[i]])[1] for i in range(len(names))]
     )
     rig.close()
     return float(np.abs(rows @ rates).max())
@@ -106,7 +102,7 @@ def left_over(config: Config, point: FloatArray) -> float:
 
 def one_step() -> None:
     """Who stops the motors and closures, in one multibody and in three."""
-    point = np.array((-0.04, 0.028, 0.80))
+    point = PAPER_TPM.home
     print("largest rate left of motors and closures after one step from rest (rad/s, m/s)")
     for variant in ("one body", "three legs"):
         for solver, iterations in (("direct", 50), ("lcp pgs", 3000), ("iterative", 3000)):

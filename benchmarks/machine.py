@@ -11,8 +11,7 @@ import gc
 import os
 import platform
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -31,7 +30,6 @@ __all__ = [
     "processor_line",
     "provenance",
     "quartiles",
-    "silence",
 ]
 
 _PACKAGES = ("panda-gym", "gymnasium-robotics", "mujoco")
@@ -118,25 +116,3 @@ def quartiles(values: ArrayLike) -> tuple[float, float, float]:
     """Lower quartile, median, upper quartile."""
     low, middle, high = np.percentile(np.asarray(values, dtype=np.float64), [25, 50, 75])
     return float(low), float(middle), float(high)
-
-
-def _flush() -> None:
-    """Write out what Python and the C library still hold back."""
-    sys.stdout.flush()
-    if os.name == "posix":
-        ctypes.CDLL(None).fflush(None)
-
-
-@contextmanager
-def silence() -> Iterator[None]:
-    """Send what is written to file descriptor 1, by C code too, to nowhere."""
-    _flush()
-    ours, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(nowhere, 1)
-        yield
-    finally:
-        _flush()
-        os.dup2(ours, 1)
-        os.close(ours)
-        os.close(nowhere)

@@ -23,6 +23,8 @@ import numpy as np
 import pybullet
 from numpy.typing import NDArray
 
+from tpm_gym.arrays import FloatArray
+
 __all__ = ["Floor", "Tape", "record", "recording", "replay"]
 
 STEP = "stepSimulation"
@@ -52,7 +54,7 @@ class Tape:
 
     steps: list[list[Call]] = field(default_factory=list)
     resets: set[int] = field(default_factory=set)
-    ends: list[NDArray[np.float64]] = field(default_factory=list)
+    ends: list[FloatArray] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -168,7 +170,7 @@ class _Player:
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         """Take the number of the client."""
         unwrapped: Any = env.unwrapped
-        self._number = unwrapped.simulation._client._number
+        self._number = unwrapped.simulation.engine.client.number
         self._constraints: dict[int, int] = {}  # number when recorded -> number here
         self._pair: tuple[Any, ...] | None = None
 
@@ -207,8 +209,8 @@ class _Player:
         self._constraints.clear()
 
 
-def _where(env: gym.Env[Any, Any], fresh: bool = False) -> NDArray[np.float64]:
-    """Angles of the motors, P and the object as last reported, or as they are in the engine now."""
+def _where(env: gym.Env[Any, Any], fresh: bool = False) -> FloatArray:
+    """Angles of the motors, P and the objects as last reported, or as the engine has them now."""
     unwrapped: Any = env.unwrapped
     state = unwrapped.simulation.read() if fresh else unwrapped.state
-    return np.concatenate([state.theta, state.platform_position, state.object_position])
+    return np.concatenate([state.theta, state.platform_position, *state.object_position])

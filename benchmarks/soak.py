@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from soak_report import judge, print_verdict, save_plot
 
 from tpm_gym import ENV_IDS
-from tpm_gym.tasks.expert import Expert
+from tpm_gym.tasks import Expert
 
 Env = gym.Env[Any, Any]
 Make = Callable[..., Env]
@@ -142,10 +142,7 @@ class Soak:
             seed = int(rng.integers(2**31))
         elif kind == "options":
             unwrapped: Any = env.unwrapped
-            start = unwrapped.task.sample_object(rng)
-            options = {"goal": unwrapped.task.sample_goal(rng, start)}
-            if start is not None:
-                options["object"] = start
+            options = unwrapped.task.sample(rng, {})
         observation: dict[str, Any] = env.reset(seed=seed, options=options)[0]
         return observation
 

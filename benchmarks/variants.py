@@ -3,8 +3,8 @@
 All variants are the same machine, link for link: only the spanning tree and the joints at the ends
 of the rods differ. Each comes with the closed-form angles at which its loops close.
 
-The links' solids are those of :func:`tpm_gym.mechanism.tree.build`, so lengths, masses and inertias stay
-in one place.
+The links' solids are those of :func:`tpm_gym.mechanism.tree.build`, so lengths, masses and inertias
+stay in one place.
 """
 
 from __future__ import annotations
@@ -13,12 +13,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from tpm_gym.mechanism.bodies import Closure, Joint, Link, Solid, Vector
-from tpm_gym.mechanism.tree import Mechanism, build, joint_angles
+from tpm_gym.arrays import FloatArray, Vector
+from tpm_gym.kinematics.geometry import PAPER
+from tpm_gym.mechanism.bodies import Closure, Joint, Link, Mechanism, Solid
+from tpm_gym.mechanism.tree import build, joint_angles
 
-FloatArray = NDArray[np.float64]
 Angles = dict[str, float]
 
 X, MINUS_Y, Z, MINUS_Z = (1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)
@@ -94,7 +95,7 @@ def spherical_rods() -> Variant:
 def rods_4_cut_at_arm() -> Variant:
     """Rods 4 hang on link 3' by universal joints; the balls are at the arm."""
     mechanism = build()
-    g = mechanism.geometry
+    g = PAPER
     links, closures = _without(mechanism, "cross_4", "rod_4"), list(mechanism.closures[2:])
     for suffix, side in SIDES:
         at = ((2 + side) * g.l5, 0.0, 0.0)
@@ -123,10 +124,10 @@ def spherical_parallelogram() -> Variant:
 
     The end links become parts of arm 12 and of the platform. On the platform the bar is moved to
     the middle: at its own place it would give the platform a product of inertia, and then the
-    engine turns the frame in which :class:`tpm_gym.simulation.bullet.robot.Robot` gives it the closures' pivots.
+    engine turns the frame in which it is given the closures' pivots.
     """
     mechanism = build()
-    g = mechanism.geometry
+    g = PAPER
     links = _without(mechanism, "end_link", "rod_11")
     bars = {
         "arm_12": ("end_link_9", (g.l3, 0.0, 0.0)),
@@ -159,7 +160,7 @@ def spherical_parallelogram() -> Variant:
 def rods_11_cut_at_arm() -> Variant:
     """Rods 11 hang on end link 10 by revolutes; the balls are at end link 9."""
     mechanism = build()
-    g = mechanism.geometry
+    g = PAPER
     links, closures = _without(mechanism, "rod_11"), list(mechanism.closures[:2])
     for suffix, side in SIDES:
         rod = _backwards(mechanism.link(f"rod_11{suffix}"), (g.l4, 0.0, 0.0))

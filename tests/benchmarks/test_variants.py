@@ -13,12 +13,13 @@ import pytest
 from fidelity_lab import Config, Rig, gravity_torques, measure, random_motion
 from fidelity_long import Histogram
 from fidelity_sweep import pareto, sweep
+from machines import anywhere
 from variants import Variant, all_variants, gaps, link_frames
 
 from tpm_gym.kinematics import inverse
-from tpm_gym.kinematics.workspace import TASK_REGION
-from tpm_gym.mechanism.tree import ACTUATED_JOINTS, build
-from tpm_gym.simulation.physics import CLOSURE_LIMIT
+from tpm_gym.mechanism import PAPER_TPM
+from tpm_gym.mechanism.tree import build
+from tpm_gym.simulation.simulation import CLOSURE_LIMIT
 
 VARIANTS = all_variants()
 GAP = 1e-9  # m
@@ -26,8 +27,7 @@ each = pytest.mark.parametrize("variant", VARIANTS, ids=lambda v: v.name)
 
 
 def postures(count: int) -> np.ndarray:
-    rng = np.random.default_rng(0)
-    return inverse(rng.uniform(TASK_REGION.low, TASK_REGION.high, (count, 3)))
+    return np.array([PAPER_TPM.inverse(point) for point in anywhere(PAPER_TPM, count)])
 
 
 @each
@@ -47,7 +47,7 @@ def test_moving_any_passive_joint_opens_a_loop_unless_it_is_idle(variant: Varian
     if variant.name == "rods 11 cut at arm":
         idle |= {"R32"}  # the same for end link 9
     angles = variant.angles(postures(1)[0])
-    for name in set(angles) - set(ACTUATED_JOINTS):
+    for name in set(angles) - set(variant.mechanism.actuated):
         moved = gaps(variant.mechanism, {**angles, name: angles[name] + 0.01}).max()
         assert (moved < GAP) == (name in idle), name
 
@@ -186,7 +186,7 @@ def test_gravity_torques_hold_the_mechanism_in_the_engine() -> None:
         rig.place(theta)
         rig.drive([*theta, 0.0, 0.0, 0.0, *(share * torques)])  # gains are zero
         rig.step()
-        speeds.append(np.abs(rig.robot.encoders()[1]).max())
+        speeds.append(np.abs(rig.robot.motors().theta_dot).max())
         rig.close()
     assert speeds[0] < 1e-3 * speeds[1]
 
@@ -194,7 +194,7 @@ def test_gravity_torques_hold_the_mechanism_in_the_engine() -> None:
 def test_motions_start_at_rest_and_stay_in_the_region() -> None:
     for motion in (random_motion(30), fidelity_lab.fast_motion(40)):
         for points in motion.points(1 / 250):
-            np.testing.assert_allclose(points, TASK_REGION.project(points), rtol=0, atol=1e-9)
+            np.testing.assert_allclose(points, PAPER_TPM.region.project(points), rtol=0, atol=1e-9)
             first, second = np.linalg.norm(np.diff(points[:3], axis=0), axis=1)
             assert first < second + 1e-12
 

@@ -67,17 +67,17 @@ def test_fresh_processes_give_the_same_and_go_on_with_what_was_pickled(tmp_path:
     path = tmp_path / "env.pickle"
     path.write_bytes(pickle.dumps(env))
     code = (
-        "import sys; sys.path.insert(0, sys.argv[1]);"
-        "from episodes import all_fingerprints, continued;"
-        "print(*all_fingerprints(), continued(sys.argv[2]), sep='\\n')"
+        "import sys; from episodes import all_fingerprints, continued;"
+        "print(*all_fingerprints(), continued(sys.argv[1]), sep='\\n')"
     )
-    command = [sys.executable, "-c", code, str(SUPPORT), str(path)]
+    command = [sys.executable, "-c", code, str(path)]
+    places = os.pathsep.join([str(SUPPORT), os.environ.get("PYTHONPATH", "")])
     fresh = [
         subprocess.Popen(
             command,
             stdout=subprocess.PIPE,
             text=True,
-            env={**os.environ, "PYTHONHASHSEED": seed},
+            env={**os.environ, "PYTHONHASHSEED": seed, "PYTHONPATH": places},
         )
         for seed in ("0", "4711")
     ]

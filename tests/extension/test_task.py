@@ -134,6 +134,6 @@ def test_where_there_is_no_room_sampling_says_so(stacking):
                 return super().sample(rng, chosen)
 
     env = tpm_gym.TPMEnv(Crowd)
-    with pytest.raises(ConfigurationError, match="leaves room"):
+    with pytest.raises(ConfigurationError, match="a larger one: what is drawn lies"):
         env.reset(seed=0)
     env.close()

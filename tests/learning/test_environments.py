@@ -82,7 +82,7 @@ def test_a_class_that_derives_from_ours_is_accepted_however_it_is_registered() -
     try:
         env = make_env(check_env_id("Mine-v0"), penalty_weight=0.5)
         assert isinstance(env.unwrapped, Mine)
-        assert env.unwrapped.penalty_weight == 0.5
+        assert env.unwrapped.task.penalty_weight == 0.5
         env.close()
     finally:
         del gym.registry["Mine-v0"]

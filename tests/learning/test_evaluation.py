@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-import math
 import pickle
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -18,8 +16,8 @@ import pytest
 from trainings import quiet
 
 from tpm_gym.errors import ConfigurationError
-from tpm_gym.learning import EvaluationConfig, evaluate, evaluation, film, provenance, rollout
-from tpm_gym.learning.errors import ConfigError, PolicyError, RolloutError
+from tpm_gym.learning import EvaluationConfig, evaluate, evaluation, film, provenance
+from tpm_gym.learning.errors import ConfigError, PolicyError
 from tpm_gym.learning.policies import load_policy
 
 METRICS = (
@@ -238,7 +236,7 @@ def test_the_environment_is_the_one_that_was_asked_for() -> None:
         policy=("random",), goals="tempting", penalty_weight=0.25, randomisation=("puck_mass=2",)
     )
     env: Any = evaluation._make_env("TPMPickAndPlace-v0", config)
-    assert env.unwrapped.penalty_weight == 0.25
+    assert env.unwrapped.task.penalty_weight == 0.25
     assert env.unwrapped.randomisation.puck_mass == (2.0, 2.0)
     plain = gym.make("TPMPickAndPlace-v0")
     goals = [made.reset(seed=3)[0]["desired_goal"] for made in (env, plain)]
@@ -281,28 +279,6 @@ def test_per_step_figures_are_those_of_the_steps() -> None:
     (record,) = records_of(episodes=1, seed=STRAYS)
     assert 0 < record.unsafe_share == np.mean(unsafe) < 1
     assert record.fk_error_max == pytest.approx(max(gaps), rel=1e-12)
-
-
-def test_torques_are_condensed_where_the_environment_tells_them() -> None:
-    torques = [np.array([1.0, -2.0, 2.0]), np.array([0.0, 0.0, 6.0])]
-    point = np.zeros(3)
-    states = [
-        SimpleNamespace(torque=torque, fk_position=point, platform_position=point)
-        for torque in torques
-    ]
-    info = {"conditioning": 0.5, "closure_error": 0.0, "is_success": True}
-    record = rollout._record(0, [0.0, 0.0], [info, info], states)
-    assert record.torque_peak == 6.0
-    assert record.torque_rms == pytest.approx(math.sqrt((1 + 4 + 4 + 36) / 6))
-    metrics = rollout.summarise([record, record])
-    assert metrics["torque_peak"].worst == 6.0
-    states[1].torque = np.array([0.0, math.nan, 0.0])
-    with pytest.raises(RolloutError, match="step 1: torque is nan"):
-        rollout._record(0, [0.0, 0.0], [info, info], states)
-    unknown = rollout._record(0, [0.0, 0.0], [info, info], [None, None])
-    assert unknown.torque_peak is None
-    assert "torque_peak" not in unknown.as_dict()
-    assert "torque_peak" not in rollout.summarise([record, unknown])
 
 
 @pytest.mark.parametrize(

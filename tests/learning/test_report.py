@@ -23,7 +23,6 @@ from tpm_gym.learning import (
     EvaluationConfig,
     TrainingConfig,
     evaluate,
-    figure_style,
     study,
     train,
 )
@@ -239,12 +238,11 @@ def test_the_penalty_figure_has_a_dot_a_seed(real: dict[str, Any], tmp_path: Pat
         for seed in range(3)
         for weight in (0.0, 1.0)
     ]
-    style = figure_style
-    figure = penalty(records, style)
+    figure = penalty(records)
     dots = [line for line in figure.axes[0].lines if len(line.get_xdata()) == 3]
     assert len(dots) == 4  # two metrics at two weights
     assert [label.get_text() for label in figure.axes[0].get_xticklabels()] == ["0", "1"]
-    longer = penalty([*records, *(r | {"steps": 999} for r in records)], style)
+    longer = penalty([*records, *(r | {"steps": 999} for r in records)])
     labels = [label.get_text() for label in longer.axes[0].get_xticklabels()]
     assert labels == ["0\n120\nsteps", "1\n120\nsteps", "0\n999\nsteps", "1\n999\nsteps"]
     (path,) = draw(records, tmp_path)
@@ -253,7 +251,7 @@ def test_the_penalty_figure_has_a_dot_a_seed(real: dict[str, Any], tmp_path: Pat
 
 def test_the_learning_curve_is_the_median_with_a_band(real: dict[str, Any]) -> None:
     records = [changed(real, seed, rate) for seed, rate in enumerate([0.2, 0.9, 1.0])]
-    figure = learning_curves(records, figure_style)
+    figure = learning_curves(records)
     curve = figure.axes[0].lines[0]
     assert list(curve.get_xdata()) == [0, 60, 120]
     assert list(curve.get_ydata()) == [0.0, 0.9, 0.9]
@@ -285,36 +283,33 @@ def test_plans_have_every_recipe_and_seed(tmp_path: Path) -> None:
         study.study(study.StudyConfig("robustness", folder=tmp_path))
 
 
-def test_what_is_done_is_skipped_and_what_was_stopped_goes_on(tmp_path: Path) -> None:
-    config = study.StudyConfig(
-        "results", envs=("TPMReach-v0",), algos=("sac",), seeds=1, episodes=7, folder=tmp_path
-    )
-    (run,) = study.plan_runs(config)
-    assert study.estimate(run, config) == (None, None)
-    first, test = study.commands(run, 7)
-    assert first[:2] == ["tpm-gym", "train"]
-    assert test[test.index("--episodes") + 1] == "7"
-    run.folder.mkdir()
-    (run.folder / "config.json").write_text('{"steps": 100}')
-    assert study.commands(run, 7)[0] == ["tpm-gym", "resume", str(run.folder)]
-    evaluations = run.folder / "evaluations.jsonl"
-    evaluations.write_text('{"steps": 50, "wall_seconds": 10.0}\n{"steps": 60, "wa')
-    assert len(study.commands(run, 7)) == 2
-    # 5000 steps as the recipe says, 50 of them done at five a second.
-    assert study.estimate(run, config) == (pytest.approx((5000 - 50) / 5), None)
-    evaluations.write_text('{"steps": 100, "wall_seconds": 20.0}\n')
-    (run.folder / "last.zip").write_text("")
-    assert [command[1] for command in study.commands(run, 7)] == ["evaluate"]
-    (run.folder / "tests").mkdir()
-    timed = '{"wall_seconds": 30.0, "episodes": 10}'
-    (run.folder / "tests" / "encoder_noise.json").write_text(timed)
-    (run.folder / "tests" / ".half.json").write_text('{"wall_sec')
-    assert study.estimate(run, config) == (0.0, pytest.approx(7 * 3.0))
-    (run.folder / "tests" / "nominal.json").write_text(timed)
-    assert len(study.commands(run, 7)) == 1  # a test of other than 7 episodes
-    (run.folder / "tests" / "nominal.json").write_text(timed.replace("10}", "7}"))
-    assert study.commands(run, 7) == []
-    assert study.estimate(run, config) == (0.0, 0.0)
+def test_what_is_done_is_skipped_and_what_was_stopped_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--envs", "TPMReach-v0", "--algos", "sac", "--seeds", "1", "--episodes", "7"]
+    words = ["study", "--plan", "results", *words, "--folder", str(tmp_path), "--dry-run"]
+
+    def left() -> list[str]:
+        main(words)
+        return capsys.readouterr().out.split("\n")[:-1]
+
+    run = tmp_path / "TPMReach-v0-sac-s0"
+    test = f"tpm-gym evaluate --policy {run} --env TPMReach-v0 --episodes 7"
+    test += f" --json {run / 'tests' / 'nominal.json'}"
+    first = f"tpm-gym train --env TPMReach-v0 --algo sac --seed 0 --run {run}"
+    assert left() == [first, test]
+    run.mkdir()
+    (run / "config.json").write_text('{"steps": 100}')
+    (run / "evaluations.jsonl").write_text('{"steps": 60}\n{"steps": 100, "wa')
+    assert left() == [f"tpm-gym resume {run}", test]
+    (run / "evaluations.jsonl").write_text('{"steps": 100}\n')
+    (run / "last.zip").write_text("")
+    assert left() == [test]
+    (run / "tests").mkdir()
+    (run / "tests" / "nominal.json").write_text('{"episodes": 10}')
+    assert left() == [test]
+    (run / "tests" / "nominal.json").write_text('{"episodes": 7}')
+    assert left() == [""]
 
 
 def test_a_run_is_trained_and_tested_and_one_that_fails_is_told(tmp_path: Path) -> None:

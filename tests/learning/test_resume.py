@@ -305,7 +305,7 @@ def test_kill_9_costs_nothing(tmp_path: Path) -> None:
 
 
 def success(run: Path, episodes: int) -> float:
-    """Return the success rate of the last policy on the seeds that evaluate.py uses."""
+    """Return the success rate of the last policy on the seeds of evaluations."""
     env = gym.make("TPMReach-v0")
     policy = load_policy(str(run / "last.zip"), env, trust_pickle=True)
     records = run_episodes(env, policy, episodes, TEST_SEED)

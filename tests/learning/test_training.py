@@ -35,7 +35,7 @@ from tpm_gym.learning import (
 )
 from tpm_gym.learning.algorithms import ALGORITHMS
 from tpm_gym.learning.configuration import complete, resumed
-from tpm_gym.learning.errors import ConfigError, PolicyError, RunError
+from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.policies import load_model, load_policy
 from tpm_gym.learning.recipes import read_recipe, read_recipes, recipe_file
 from tpm_gym.learning.rollout import SELECTION_SEED, run_episodes
@@ -182,9 +182,8 @@ def test_penalty_weight_and_goals_reach_every_environment_and_survive_resuming(
     assert len(made) == 5
     for env in made:
         inner: Any = env.unwrapped
-        assert inner.penalty_weight == 0.0
-        assert env.spec is not None
-        assert env.spec.id == "tempting/TPMReach-v0"
+        assert inner.task.penalty_weight == 0.0
+        assert inner.task.goals == "tempting"
     again = json.loads((folder / "config.json").read_text(encoding="utf-8"))
     assert (again["penalty_weight"], again["goals"]) == (0.0, "tempting")
     # The exported policy is one for the id itself.
@@ -240,34 +239,9 @@ def test_logs_hold_training_and_evaluation(run: Path) -> None:
 
 def test_learning_curve_is_a_picture(run: Path) -> None:
     picture = imageio.imread(run / "learning_curve.png")
-    assert picture.shape[:2] == (900, 1350)
+    assert picture.shape[:2] == (768, 1152)
     colours = np.unique(picture[::7, ::7].reshape(-1, picture.shape[2]), axis=0)
     assert len(colours) > 50
-
-
-@pytest.mark.parametrize("name", [".", "best.zip", "last.zip", "best.json", "last.json"])
-def test_evaluate_takes_any_policy_of_a_run(run: Path, name: str) -> None:
-    trust = name.endswith(".zip")
-    config = EvaluationConfig(policy=(str(run / name),), episodes=1, trust_pickle=trust)
-    results = evaluate(config, quiet())
-    assert results[0].records[0].length == 50
-
-
-def test_policy_of_another_task_is_refused(run: Path) -> None:
-    config = EvaluationConfig(policy=(str(run),), env="TPMPickAndPlace-v0", episodes=1)
-    with pytest.raises(PolicyError, match="was trained with"):
-        evaluate(config, quiet())
-
-
-def test_run_folder_is_not_overwritten_unasked(run: Path, small: Path, tmp_path: Path) -> None:
-    config = TrainingConfig(recipe_file=small, run=run)
-    with pytest.raises(RunError, match="--overwrite"):
-        train(config, quiet())
-    assert (run / "last.zip").is_file()
-    (tmp_path / "thesis.tex").write_text("years of work", encoding="utf-8")
-    with pytest.raises(RunError, match=r"config\.json"):
-        train(replace(config, run=tmp_path, overwrite=True), quiet())
-    assert (tmp_path / "thesis.tex").is_file()
 
 
 def test_both_policies_are_exported_and_nothing_is_unpickled_for_it(run: Path) -> None:

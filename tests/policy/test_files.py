@@ -143,7 +143,7 @@ def put(path: str, value: Any) -> dict[str, Any]:
         ("network.hidden", [5, 4, 3000], ALL + "weights.bytes must be from"),
         ("network.activation", "exec", "'relu' or 'tanh'"),
         ("network.output", ["tanh"], "'tanh' or 'clip'"),
-        ("algorithm", "dqn", "'sac', 'tqc' or 'ppo'"),
+        ("algorithm", "d q n", "pattern"),
         ("env", "TPMReach-v0\n\x1b[31m", "pattern"),
         ("env", "TPMReach-v0\n", "pattern"),
         ("env", "x" * 10000, "pattern"),

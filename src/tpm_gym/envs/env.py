@@ -131,30 +131,37 @@ class TPMEnv(gym.Env[Observation, Action]):
     goal at least 30 mm away from where the puck (or P) starts. Goals and objects are sampled where
     1/cond(J) >= 0.08.
     ``reset(options={"object": (x, y, z), "goal": (x, y, z)})`` chooses them instead; a puck that
-    starts above the table falls. With ``goals="tempting"`` both lie next to the singularity.
+    starts above the table falls.
 
     ## Info
 
-    ``is_success`` (bool), ``closure_error`` (m), ``conditioning`` (1/cond(J) by the encoders),
-    ``singularity_penalty`` (before weighting), ``assembly_mode_changed`` and
-    ``working_mode_changed`` (bool), ``object_lost`` (bool, whether an object lies where the robot
-    cannot pick it up, off the table for one), ``reward_terms`` (name -> value; they sum to the
-    reward). That of a reset tells with ``randomisation`` what differs in the episode.
-    Where the platform passes y = 0, a parallel one, the assembly mode changes and the encoders no
-    longer tell where it is; past y = l7, a serial one, the working mode changes. No action of the
-    nominal robot leads there; if it happens, ``info`` says so, with a penalty of 1 and truncation.
+    | key | meaning |
+    | --- | --- |
+    | ``is_success`` | whether the goal is achieved |
+    | ``closure_error`` | largest gap of the simulated loops, m |
+    | ``conditioning`` | 1/cond(J) by the encoders |
+    | ``singularity_penalty`` | before weighting, 0 to 1 |
+    | ``assembly_mode_changed`` | whether the platform passed y = 0, a parallel singularity |
+    | ``working_mode_changed`` | whether it passed y = l7, a serial one |
+    | ``object_lost`` | whether an object is off the table or where the robot cannot get to |
+    | ``reward_terms`` | the terms above by name; they sum to the reward |
+    | ``randomisation`` | in a reset's, with that option: what differs in the episode |
+
+    Past a parallel singularity the encoders no longer tell where the platform is. No action of the
+    nominal robot leads past one; if it happens, the penalty is 1 and the episode truncated.
 
     Args:
         task: Name of a task (``"reach"``, ``"pick_and_place"``, or one that
             :func:`tpm_gym.register_task` knows), a :class:`~tpm_gym.tasks.Task` class, or a task; a
-            task that is made already has its own machine, reward, goals and penalty weight.
+            task that is made has its own machine, reward, goals and penalty weight, and takes none.
         control: ``"cartesian"`` or ``"joints"``.
-        reward: ``"sparse"`` or ``"dense"``.
-        engine: Name of what moves the robot: ``"pybullet"``, or one that
-            :func:`tpm_gym.register_engine` knows.
-        machine: ``"paper"``, ``"wide"``, or a :class:`~tpm_gym.mechanism.Machine`.
-        goals: ``"sampled"``, or ``"tempting"``: next to the singularity.
-        penalty_weight: Weight of the singularity penalty; 0 switches it off.
+        reward: ``"sparse"`` (None too) or ``"dense"``.
+        engine: ``"pybullet"``, or a name that :func:`tpm_gym.register_engine` knows.
+        machine: ``"paper"`` (None too), ``"wide"``, a name that :func:`tpm_gym.register_machine`
+            knows, or a :class:`~tpm_gym.Machine`.
+        goals: ``"sampled"`` (None too), or ``"tempting"``: the goal, and where the puck starts, lie
+            next to the singularity, which not every machine has near its goals.
+        penalty_weight: Weight of the singularity penalty, None for 1; 0 switches it off.
         randomisation: What differs from the nominal machine, drawn anew for each episode: a
             :class:`~tpm_gym.simulation.Randomisation` or a mapping of its attributes. Where
             disturbed encoders report angles that cannot be assembled, position and velocity keep
@@ -298,7 +305,7 @@ class TPMEnv(gym.Env[Observation, Action]):
             ModeChangeError: If the mechanism passed a singularity earlier in this episode.
         """
         values = finite("action", action, (self.task.action_size,), ActionError)
-        state = self._require_state()
+        state = self.state
         values, *pending = (*self._pending, np.minimum(np.maximum(values, -1.0), 1.0))
         command = self.control.command(values[:3], self.machine.mount.to_paper(state.command))
         vacuum = self.task.vacuum and bool(values[3] > 0)
@@ -369,7 +376,10 @@ class TPMEnv(gym.Env[Observation, Action]):
         Raises:
             EpisodeError: If there is no episode.
         """
-        return self._require_state()
+        self._require_open()
+        if self._state is None:
+            raise EpisodeError("no episode is running; call reset() first")
+        return self._state
 
     @property
     def goal(self) -> FloatArray:
@@ -384,7 +394,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         Raises:
             EpisodeError: If there is no episode.
         """
-        self._require_state()
+        _ = self.state  # there has to be an episode
         rng = dict(self.np_random.bit_generator.state)
         moment = (self.simulation.save(), rng, self.goal, self._pending, self._kind)
         return EnvSnapshot(*moment, _digest(moment))
@@ -418,12 +428,6 @@ class TPMEnv(gym.Env[Observation, Action]):
     def _require_open(self) -> None:
         if self._closed:
             raise EpisodeError("the environment is closed; make a new one")
-
-    def _require_state(self) -> State:
-        self._require_open()
-        if self._state is None:
-            raise EpisodeError("no episode is running; call reset() first")
-        return self._state
 
     def __getstate__(self) -> dict[str, Any]:
         """For :func:`copy.deepcopy` and :mod:`pickle`: all of it, in the midst of an episode.

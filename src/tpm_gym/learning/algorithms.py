@@ -1,15 +1,16 @@
 """The algorithms: all that the code knows about one is its row in the table, and its recipes.
 
-A row with the entries that its recipes may have, and ``train/recipes/<name>.yml``, is what it takes
-to train, resume, evaluate, export and study with another algorithm of Stable-Baselines3.
+A row and ``train/recipes/<name>.yml`` are what it takes to train, resume, evaluate, export and
+study with another algorithm of Stable-Baselines3; an argument that none had before is an entry.
 """
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+import inspect
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from pydantic import Field, ValidationError, WrapValidator
 from typing_extensions import Required, TypedDict
@@ -30,104 +31,70 @@ def _says(description: str) -> WrapValidator:
     return WrapValidator(check)
 
 
+_keys: Any = TypedDict  # made from tables, which no type checker follows
+
+_COUNT: Final[Any] = Annotated[int, Field(gt=0)]
+_NATURAL: Final[Any] = Annotated[int, Field(ge=0)]
+_POSITIVE: Final[Any] = Annotated[float, Field(gt=0)]
+_NOT_NEGATIVE: Final[Any] = Annotated[float, Field(ge=0)]
+_FRACTION: Final[Any] = Annotated[float, Field(gt=0, le=1)]
 _NUMBER: Final = r"(\d*\.\d*[1-9]\d*|\d*[1-9]\d*\.?\d*)(e-?\d+)?"  # positive, as text
 
-_Count: TypeAlias = Annotated[int, Field(gt=0)]
-_Positive: TypeAlias = Annotated[float, Field(gt=0)]
-_NotNegative: TypeAlias = Annotated[float, Field(ge=0)]
-_Fraction: TypeAlias = Annotated[float, Field(gt=0, le=1)]
-_Layers: TypeAlias = list[_Count]
-_NetArch: TypeAlias = Annotated[
-    _Layers | dict[Literal["pi", "qf", "vf"], _Layers],
-    _says("a list of positive integers, or one for each of pi, qf, vf"),
+_POLICY_ENTRIES: Final[Mapping[str, Any]] = {
+    "net_arch": Annotated[
+        list[_COUNT] | dict[Literal["pi", "qf", "vf"], list[_COUNT]],
+        _says("a list of positive integers, or one for each of pi, qf, vf"),
+    ],
+    "log_std_init": float,
+    "ortho_init": bool,
+    "n_critics": _COUNT,
+    "n_quantiles": _COUNT,
+    "features_extractor_class": Literal["GoalGapExtractor"],
+    "features_extractor_kwargs": _keys("Extractor", {"unit": _POSITIVE}, total=False),
+}
+_ENTRIES: Final[Mapping[str, Any]] = {
+    "learning_rate": Annotated[
+        _POSITIVE | Annotated[str, Field(pattern=f"^lin_{_NUMBER}$")],
+        _says("a positive number, or lin_<start> to fall linearly to zero"),
+    ],
+    "gamma": _FRACTION,
+    "batch_size": _COUNT,
+    "buffer_size": _COUNT,
+    "learning_starts": _NATURAL,
+    "tau": _FRACTION,
+    "train_freq": _COUNT,
+    "gradient_steps": Annotated[
+        _COUNT | Literal[-1], _says("a positive integer, or -1 for as many as steps were taken")
+    ],
+    "ent_coef": _NOT_NEGATIVE,
+    "target_entropy": Annotated[float | Literal["auto"], _says("auto or a number")],
+    "target_update_interval": _COUNT,
+    "top_quantiles_to_drop_per_net": _NATURAL,
+    "n_steps": _COUNT,
+    "n_epochs": _COUNT,
+    "gae_lambda": _FRACTION,
+    "clip_range": _POSITIVE,
+    "vf_coef": _NOT_NEGATIVE,
+    "max_grad_norm": _POSITIVE,
+    "normalize_advantage": bool,
+    "target_kl": _POSITIVE,
+    "replay_buffer_class": Literal["HerReplayBuffer"],
+    "replay_buffer_kwargs": _keys(
+        "Hindsight",
+        {
+            "n_sampled_goal": _COUNT,
+            "goal_selection_strategy": Literal["future", "final", "episode"],
+        },
+        total=False,
+    ),
+}
+_LEARNED_ENTROPY: Final[Any] = Annotated[
+    _NOT_NEGATIVE | Annotated[str, Field(pattern=f"^auto(_{_NUMBER})?$")],
+    _says("auto, auto_<start>, or a number of at least 0"),
 ]
-_LearningRate: TypeAlias = Annotated[
-    _Positive | Annotated[str, Field(pattern=f"^lin_{_NUMBER}$")],
-    _says("a positive number, or lin_<start> to fall linearly to zero"),
-]
-
-
-class _Policy(TypedDict, total=False):
-    net_arch: _NetArch
-    log_std_init: float
-    features_extractor_class: Literal["GoalGapExtractor"]
-    features_extractor_kwargs: _Unit
-
-
-class _Unit(TypedDict, total=False):
-    unit: _Positive
-
-
-class _Critics(_Policy, total=False):
-    n_critics: _Count
-
-
-class _Quantiles(_Critics, total=False):
-    n_quantiles: _Count
-
-
-class _ActorCritic(_Policy, total=False):
-    ortho_init: bool
-
-
-class _Hindsight(TypedDict, total=False):
-    n_sampled_goal: _Count
-    goal_selection_strategy: Literal["future", "final", "episode"]
-
-
-class _Demonstrations(TypedDict, total=False):
-    episodes: Required[_Count]
-    noise: _NotNegative
-
-
-class _Common(TypedDict, total=False):
-    n_timesteps: Required[_Count]
-    n_envs: _Count
-    policy: Required[Literal["MultiInputPolicy"]]
-    learning_rate: _LearningRate
-    gamma: _Fraction
-    batch_size: _Count
-
-
-class _OffPolicy(_Common, total=False):
-    buffer_size: _Count
-    learning_starts: Annotated[int, Field(ge=0)]
-    tau: _Fraction
-    train_freq: _Count
-    gradient_steps: Annotated[
-        _Count | Literal[-1], _says("a positive integer, or -1 for as many as steps were taken")
-    ]
-    ent_coef: Annotated[
-        _NotNegative | Annotated[str, Field(pattern=f"^auto(_{_NUMBER})?$")],
-        _says("auto, auto_<start>, or a number of at least 0"),
-    ]
-    target_entropy: Annotated[float | Literal["auto"], _says("auto or a number")]
-    target_update_interval: _Count
-    demonstrations: _Demonstrations
-    replay_buffer_class: Literal["HerReplayBuffer"]
-    replay_buffer_kwargs: _Hindsight
-
-
-class _SAC(_OffPolicy, total=False):
-    policy_kwargs: _Critics
-
-
-class _TQC(_OffPolicy, total=False):
-    top_quantiles_to_drop_per_net: Annotated[int, Field(ge=0)]
-    policy_kwargs: _Quantiles
-
-
-class _PPO(_Common, total=False):
-    n_steps: _Count
-    n_epochs: _Count
-    gae_lambda: _Fraction
-    clip_range: _Positive
-    ent_coef: _NotNegative
-    vf_coef: _NotNegative
-    max_grad_norm: _Positive
-    normalize_advantage: bool
-    target_kl: _Positive
-    policy_kwargs: _ActorCritic
+_DEMONSTRATIONS: Final[Any] = _keys(
+    "Demonstrations", {"episodes": Required[_COUNT], "noise": _NOT_NEGATIVE}, total=False
+)
 
 
 @dataclass(frozen=True)
@@ -157,12 +124,10 @@ class Algorithm:
 
     Attributes:
         path: Its class, as ``module:name``.
-        entries: The entries of its recipes.
         actor: What an export takes.
     """
 
     path: str
-    entries: type[Any]
     actor: Actor
 
     def load_class(self) -> type[BaseAlgorithm]:
@@ -171,10 +136,29 @@ class Algorithm:
         found: type[BaseAlgorithm] = getattr(importlib.import_module(module), name)
         return found
 
+    def entries(self) -> Any:
+        """Return the type of a recipe: of the entries above, those that the constructors take."""
+        kind: Any = self.load_class()
+        arguments = inspect.signature(kind).parameters
+        policy = inspect.signature(kind.policy_aliases["MultiInputPolicy"]).parameters
+        found = {name: entry for name, entry in _ENTRIES.items() if name in arguments}
+        if "ent_coef" in found and isinstance(arguments["ent_coef"].default, str):
+            found["ent_coef"] = _LEARNED_ENTROPY
+        if "replay_buffer_class" in arguments:
+            found["demonstrations"] = _DEMONSTRATIONS
+        inner = {name: entry for name, entry in _POLICY_ENTRIES.items() if name in policy}
+        found |= {
+            "n_timesteps": Required[_COUNT],
+            "n_envs": _COUNT,
+            "policy": Required[Literal["MultiInputPolicy"]],
+            "policy_kwargs": _keys("Policy", inner, total=False),
+        }
+        return _keys("Recipe", found, total=False)
+
 
 ALGORITHMS: Final[dict[str, Algorithm]] = {
-    "sac": Algorithm("stable_baselines3:SAC", _SAC, _SQUASHED),
-    "tqc": Algorithm("sb3_contrib:TQC", _TQC, _SQUASHED),
-    "ppo": Algorithm("stable_baselines3:PPO", _PPO, _CLIPPED),
+    "sac": Algorithm("stable_baselines3:SAC", _SQUASHED),
+    "tqc": Algorithm("sb3_contrib:TQC", _SQUASHED),
+    "ppo": Algorithm("stable_baselines3:PPO", _CLIPPED),
 }
 NAMES: Final = ", ".join(ALGORITHMS)

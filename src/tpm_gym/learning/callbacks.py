@@ -12,15 +12,7 @@ from types import FrameType
 from typing import Any, Final
 
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import MofNCompleteColumn, Progress
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
@@ -46,7 +38,6 @@ class PeriodicEvaluation(BaseCallback):
     alone. Each is appended to evaluations.jsonl and drawn; the best policy so far is kept.
 
     Args:
-        config: The completed configuration.
         env: An environment of its own, so that training is not disturbed.
         console: Where one line per evaluation is printed.
         keep: Called with the model whenever it is the best so far.
@@ -139,36 +130,22 @@ class PeriodicEvaluation(BaseCallback):
 
 
 class ProgressBar(BaseCallback):
-    """Shows a progress bar on a terminal, and nothing anywhere else.
-
-    Args:
-        console: Where it is shown; lines printed there appear above the bar.
-    """
+    """Shows a progress bar on a terminal, and nothing anywhere else."""
 
     def __init__(self, console: Console) -> None:
         """Lay out the bar without showing it."""
         super().__init__()
-        self._progress = Progress(
-            TextColumn("training"),
-            BarColumn(bar_width=None),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TextColumn("left"),
-            TimeRemainingColumn(),
-            console=console,
-            disable=not console.is_terminal,
-        )
-        self._task: TaskID | None = None
+        columns = (*Progress.get_default_columns(), MofNCompleteColumn())
+        self._progress = Progress(*columns, console=console, disable=not console.is_terminal)
+        self._task = self._progress.add_task("training", start=False)
 
     def _on_training_start(self) -> None:
         self._progress.start()
-        self._task = self._progress.add_task(
-            "training", total=self.locals["total_timesteps"], completed=self.num_timesteps
-        )
+        self._progress.start_task(self._task)
+        self._progress.update(self._task, total=self.locals["total_timesteps"])
 
     def _on_step(self) -> bool:
-        if self._task is not None:
-            self._progress.update(self._task, completed=self.num_timesteps)
+        self._progress.update(self._task, completed=self.num_timesteps)
         return True
 
     def close(self) -> None:
@@ -222,11 +199,7 @@ class Checkpointing(BaseCallback):
     The first is saved before anything else is done, so that no policy is ever without one.
 
     Args:
-        config: The completed configuration.
-        store: Where they are saved.
         evaluation: Whose state is part of a checkpoint.
-        listener: Says when to stop.
-        console: Where failures are reported.
         seconds: Seconds that earlier processes have trained.
     """
 

@@ -24,7 +24,6 @@ def unset(kind: Any, shown: str, metavar: str, name: str | None = None) -> Any:
     """Describe an option of a type that is ``UNSET`` where it is not given.
 
     Args:
-        kind: Its type.
         shown: What the help says that the default is.
         metavar: What the help calls the value.
         name: Its name on the command line, where that differs from the field's.
@@ -155,7 +154,6 @@ def resumed(config: ResumeConfig, stored: Mapping[str, Any], reached: int) -> Tr
     """Return the configuration of a run, with what is to change in it.
 
     Args:
-        config: What is to change.
         stored: The run's config.json.
         reached: Steps that the run has taken.
 

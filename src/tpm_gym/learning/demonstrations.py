@@ -38,7 +38,6 @@ class Demonstrations(BaseCallback):
         Args:
             episodes: How many; with n environments, rounded up to a multiple of n.
             noise: Standard deviation, in units of the largest action.
-            verbose: Passed on to stable-baselines3.
         """
         super().__init__(verbose)
         self.episodes, self.noise = episodes, noise

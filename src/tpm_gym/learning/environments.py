@@ -9,11 +9,10 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 
-import tpm_gym  # noqa: F401  # registers its ids
+from tpm_gym.envs.env import TPMEnv
+from tpm_gym.envs.registration import ENTRY_POINT, env_ids
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.rollout import GoalEnv
-
-_ENTRY_POINT = "tpm_gym.envs.env:TPMEnv"
 
 
 def check_env_id(env_id: str) -> EnvSpec:
@@ -35,8 +34,7 @@ def check_env_id(env_id: str) -> EnvSpec:
             importlib.import_module(module)
         spec = gym.spec(name)
     except (gym.error.Error, ImportError) as error:
-        ids = [name for name, known in gym.registry.items() if known.entry_point == _ENTRY_POINT]
-        there = f"there are {', '.join(ids)}, and module:id for those that a module registers"
+        there = f"there are {', '.join(env_ids())}, and module:id for those that a module registers"
         raise ConfigError(f"unknown environment {env_id!r} ({error}); {there}") from error
     if not _is_ours(spec):
         raise ConfigError(f"{env_id} is no environment of tpm_gym; it makes {spec.entry_point}")
@@ -47,34 +45,25 @@ def _is_ours(spec: EnvSpec) -> bool:
     """Whether an id makes a ``TPMEnv``, or what derives from it."""
     entry: Any = spec.entry_point
     if isinstance(entry, str):
-        if entry == _ENTRY_POINT:
+        if entry == ENTRY_POINT:
             return True
         try:
             entry = load_env_creator(entry)
         except (ImportError, AttributeError):
             return False
-    from tpm_gym.envs.env import TPMEnv
-
     return isinstance(entry, type) and issubclass(entry, TPMEnv)
 
 
-def make_env(
-    env: str | EnvSpec, *, goals: str = "sampled", in_worker: bool = False, **options: Any
-) -> GoalEnv:
+def make_env(env: str | EnvSpec, *, in_worker: bool = False, **options: Any) -> GoalEnv:
     """Make an environment.
 
     Args:
         env: An id, or what Gymnasium has registered, which another process may not have.
-        goals: ``sampled`` or ``tempting``.
         in_worker: Whether this runs in a process of its own, which has to outlive the signal that
             a terminal or a batch system sends to all processes, until the main one has saved.
-        options: Arguments of the environment, such as ``penalty_weight``.
+        options: Arguments of the environment, such as ``goals`` and ``penalty_weight``.
     """
-    from tpm_gym.learning.tempting import env_id_for  # registers its ids
-
     if in_worker:
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_IGN)
-    if goals != "sampled":
-        env = env_id_for(env if isinstance(env, str) else env.id, goals)
     return gym.make(env, **options)

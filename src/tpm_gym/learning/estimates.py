@@ -48,11 +48,7 @@ class Estimate:
 
 
 def wilson(outcomes: Sequence[bool]) -> Estimate:
-    """Return a success rate with its 95% Wilson score interval (Wilson 1927).
-
-    Args:
-        outcomes: One outcome per episode, at least one.
-    """
+    """Return a success rate with its 95% Wilson score interval (Wilson 1927)."""
     n = len(outcomes)
     rate = sum(outcomes) / n
     spread = _Z95**2 / n
@@ -63,12 +59,7 @@ def wilson(outcomes: Sequence[bool]) -> Estimate:
 
 
 def bootstrap(values: Sequence[float], worst: float | None = None) -> Estimate:
-    """Return a mean with its 95% percentile bootstrap interval (Efron 1979).
-
-    Args:
-        values: One value per episode, at least one.
-        worst: Passed on to the estimate.
-    """
+    """Return a mean with its 95% percentile bootstrap interval (Efron 1979)."""
     sample = np.asarray(values, dtype=np.float64)  # (n,)
     rng = np.random.default_rng(BOOTSTRAP_SEED)
     # Not all resamples at once: with many episodes their matrix would not fit in memory.
@@ -89,10 +80,6 @@ def interquartile_mean(scores: Sequence[float], samples: int = BOOTSTRAP_SAMPLES
 
     The mean is that without the lowest and highest quarter, rounded down to whole scores: of five
     scores, that of the middle three.
-
-    Args:
-        scores: One score a run, at least one.
-        samples: Number of resamples.
     """
     values = np.asarray(scores, dtype=np.float64)  # (n,)
     rng = np.random.default_rng(BOOTSTRAP_SEED)
@@ -113,10 +100,6 @@ def _trimmed_means(rows: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def settled(successes: Sequence[float], rate: float = LEARNED) -> int | None:
     """Index of the first evaluation from which success stays at ``rate`` or above to the end.
-
-    Args:
-        successes: Success rates of the evaluations during training, in order.
-        rate: The rate to be kept.
 
     Returns:
         The index; None where the last evaluation is below, or there is none.

@@ -113,7 +113,6 @@ def evaluate(config: EvaluationConfig, console: Console | None = None) -> list[R
     """Evaluate the policies of a configuration and write what it asks for.
 
     Args:
-        config: The configuration.
         console: Where the table is printed; by default the standard output.
 
     Returns:
@@ -245,8 +244,6 @@ def _table(env_id: str, config: EvaluationConfig, results: Sequence[Result]) -> 
     for result in results:
         table.add_column(result.policy, justify="right", overflow="fold")
     for label, name, factor, form, unit in _ROWS:
-        if any(name not in result.metrics for result in results):
-            continue  # this version of the environments does not tell
         cells = [_cell(result.metrics[name], factor, form, unit) for result in results]
         table.add_row(label, *cells)
         worst = [result.metrics[name].worst for result in results]

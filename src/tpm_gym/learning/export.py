@@ -54,9 +54,7 @@ def save(
     Args:
         model: SAC, TQC or PPO with a MultiInputPolicy.
         path: What the files have in common; folders above are made, earlier files replaced.
-        env_id: Id of the environment it was trained on.
         seed: Seed of the training; None where it is not known.
-        recipe: The hyperparameters, as plain data.
         versions: Versions it was trained with; by default those installed.
 
     Returns:
@@ -94,12 +92,7 @@ def save(
 
 
 def save_archive(model: BaseAlgorithm, path: Path) -> None:
-    """Save a model as Stable-Baselines3 does, but so that an interruption leaves no half a file.
-
-    Args:
-        model: Any algorithm.
-        path: The .zip file.
-    """
+    """Save a model as Stable-Baselines3 does, but so that an interruption leaves no half a file."""
     file = io.BytesIO()  # PyTorch, writing to a disk that is full, would hide the reason
     model.save(file)
     provenance.write_whole(path, lambda part: part.write_bytes(file.getvalue()))

@@ -32,10 +32,6 @@ class PenaltyHerReplayBuffer(HerReplayBuffer):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         """Build the buffer with the arguments of ``stable_baselines3.HerReplayBuffer``.
 
-        Args:
-            args: Positional arguments of the parent.
-            kwargs: Keyword arguments of the parent.
-
         Raises:
             ConfigError: ``copy_info_dict`` is on: the penalty would be counted twice.
         """

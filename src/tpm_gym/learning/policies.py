@@ -12,15 +12,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol, cast
 
-import gymnasium as gym
 import numpy as np
 
+import tpm_gym
 from tpm_gym import TPMError
 from tpm_gym.learning.algorithms import ALGORITHMS, NAMES
 from tpm_gym.learning.errors import PolicyError
 from tpm_gym.learning.recipes import with_classes
 from tpm_gym.learning.rollout import Action, GoalEnv, Observation, Policy
 from tpm_gym.learning.run_folder import BEST_FILE, CONFIG_FILE, EXPORTED, LAST_FILE
+from tpm_gym.resources import POLICIES
+from tpm_gym.tasks.expert import Expert
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -33,14 +35,6 @@ class Predictor(Protocol):
 
     def predict(self, observation: Any, *, deterministic: bool = False) -> tuple[Any, Any]:
         """Return the action, and the state of a recurrent policy."""
-
-
-class _Expert(Protocol):
-    """The part of ``tpm_gym.tasks.expert.Expert`` that acts."""
-
-    def reset(self, obs: Observation) -> None: ...
-
-    def act(self, obs: Observation) -> Action: ...
 
 
 @dataclass(frozen=True)
@@ -61,7 +55,7 @@ class TrainedPolicy:
 class RandomPolicy:
     """Draws actions uniformly, from a generator seeded anew in every episode."""
 
-    def __init__(self, space: gym.spaces.Box) -> None:
+    def __init__(self, space: Any) -> None:
         """Remember the space; the generator is seeded by ``reset``."""
         self._space = space
         self._rng = np.random.default_rng()
@@ -72,17 +66,18 @@ class RandomPolicy:
 
     def act(self, observation: Observation) -> Action:
         """Return an action that does not depend on ``observation``."""
-        return self._rng.uniform(self._space.low, self._space.high).astype(self._space.dtype)
+        drawn: Action = self._rng.uniform(self._space.low, self._space.high)
+        return drawn.astype(self._space.dtype)
 
 
 @dataclass(frozen=True)
 class ExpertPolicy:
-    """Acts with the scripted controller of tpm_gym."""
+    """Acts with the scripted controller, which is deterministic."""
 
-    expert: _Expert
+    expert: Expert
 
     def reset(self, observation: Observation, seed: int) -> None:
-        """Plan the motion of the episode; the controller is deterministic."""
+        """Plan the motion of the episode."""
         self.expert.reset(observation)
 
     def act(self, observation: Observation) -> Action:
@@ -95,8 +90,8 @@ def load_policy(spec: str, env: GoalEnv, *, trust_pickle: bool = False) -> Polic
 
     Args:
         spec: ``expert``, ``random``, an exported policy (either of its files, or their common
-            name), a .zip file of a training, or the folder of a run (its best policy).
-        env: The environment the policy will act in.
+            name), the id of a published one, a .zip file of a training, or the folder of a run (its
+            best policy).
         trust_pickle: Whether a .zip file may be loaded, which can run any code that is in it.
 
     Raises:
@@ -104,20 +99,22 @@ def load_policy(spec: str, env: GoalEnv, *, trust_pickle: bool = False) -> Polic
             is a .zip file and ``trust_pickle`` is not set.
     """
     if spec == "random":
-        if not isinstance(env.action_space, gym.spaces.Box):
-            raise refused(spec, f"needs a Box action space, not {env.action_space}")
         return RandomPolicy(env.action_space)
     if spec == "expert":
-        from tpm_gym.tasks.expert import Expert
-
         return ExpertPolicy(Expert(env))
     path = _policy_file(spec)
-    if path.suffix in EXPORTED:
-        return TrainedPolicy(_load_exported(spec, path, env))
-    require_trust(spec, path, trust_pickle)
-    model = load_model(spec, path)
-    _check_spaces(spec, model, env)
-    return TrainedPolicy(model)
+    if path.suffix not in EXPORTED:
+        require_trust(spec, path, trust_pickle)
+        model = load_model(spec, path)
+        _check_spaces(spec, model, env)
+        return TrainedPolicy(model)
+    _use_one_thread()
+    try:
+        policy = tpm_gym.load_policy(path)
+        policy.check(env)
+    except TPMError as error:
+        raise refused(spec, str(error)) from error
+    return TrainedPolicy(policy)
 
 
 def trained_env(spec: str) -> str | None:
@@ -142,7 +139,7 @@ def trained_env(spec: str) -> str | None:
 
 
 def refused(spec: object, problem: str) -> PolicyError:
-    """Return the error about a policy that was named as ``spec``."""
+    """Return an error about a policy."""
     return PolicyError(f"policy {str(spec)!r}: {problem}")
 
 
@@ -165,21 +162,20 @@ def _policy_file(spec: str) -> Path:
     """Return the file that ``spec`` names: one of an exported policy, or a .zip."""
     path = Path(spec)
     if path.is_dir():
-        archives = [path / BEST_FILE, path / LAST_FILE]
-        candidates = [*(file.with_suffix(".json") for file in archives), *archives]
+        saved = [path / BEST_FILE, path / LAST_FILE]
+        candidates = [*(file.with_suffix(".json") for file in saved), *saved]
     elif path.suffix in (".zip", *EXPORTED):
         candidates = [path]
     else:
-        candidates = [path.with_name(path.name + suffix) for suffix in EXPORTED]
+        files = [Path(spec + suffix) for suffix in EXPORTED]
+        candidates = [*files, POLICIES / f"{spec}.json"]
     for candidate in candidates:
         if candidate.is_file():
             return candidate
     looked_for = " or ".join(str(candidate) for candidate in candidates)
-    raise refused(
-        spec,
-        f"no file {looked_for}; expected {', '.join(SCRIPTED)}, an exported policy (.json), a .zip "
-        "of a training, or the folder of a run",
-    )
+    known = f"{', '.join(SCRIPTED)}, an exported policy (.json), the id of a published one"
+    archives = "a .zip of a training, or the folder of a run"
+    raise refused(spec, f"no file {looked_for}; expected {known}, {archives}")
 
 
 def run_config(spec: str, path: Path) -> dict[str, Any]:
@@ -204,19 +200,6 @@ def run_config(spec: str, path: Path) -> dict[str, Any]:
     raise refused(
         spec, f"no {CONFIG_FILE} beside {path.name} or above it; keep the file in its run folder"
     )
-
-
-def _load_exported(spec: str, path: Path, env: GoalEnv) -> Predictor:
-    """Load an exported policy and make sure that it fits."""
-    from tpm_gym.policy.policy import load_policy as load_safely  # imports torch
-
-    _use_one_thread()
-    try:
-        policy = load_safely(path)
-        policy.check(env)
-    except TPMError as error:
-        raise refused(spec, str(error)) from error
-    return policy
 
 
 def _use_one_thread() -> None:
@@ -257,12 +240,8 @@ def load_model(spec: str, path: Path) -> BaseAlgorithm:
 
 def _check_spaces(spec: str, model: BaseAlgorithm, env: GoalEnv) -> None:
     """Refuse a policy that was trained with other observations or actions."""
-    pairs = {
-        "observation": (model.observation_space, env.observation_space),
-        "action": (model.action_space, env.action_space),
-    }
-    for kind, (trained, given) in pairs.items():
+    for kind in ("observation", "action"):
+        trained, given = (getattr(owner, f"{kind}_space") for owner in (model, env))
         if trained != given:
-            raise refused(
-                spec, f"was trained with {kind} space {trained}, the environment has {given}"
-            )
+            problem = f"was trained with {kind} space {trained}, the environment has {given}"
+            raise refused(spec, problem)

@@ -95,11 +95,7 @@ def _processor() -> str:
 
 
 def command_line(arguments: Sequence[str] | None = None) -> str:
-    """Return a command that repeats this one, without folders outside the working directory.
-
-    Args:
-        arguments: The script and its arguments; by default those of this process.
-    """
+    """Return a command that repeats this one, without folders outside the working directory."""
     program, *words = sys.argv if arguments is None else arguments
     # ``python -m tpm_gym.learning`` is the same command.
     ours = Path(program).name == "tpm-gym" or Path(program) == Path(__file__).with_name(
@@ -126,7 +122,6 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
     Args:
         path: The file; it is replaced, or left as it was where writing fails.
-        content: Plain data.
 
     Raises:
         ValueError: ``content`` holds NaN or an infinity, which JSON cannot express.

@@ -123,7 +123,7 @@ def read_recipes(path: Path, algorithm: str) -> dict[str, dict[str, Any]]:
             it cannot have.
     """
     recipes = _read_mapping(path)
-    kind: Any = dict[str, ALGORITHMS[algorithm].entries]  # type: ignore[misc]
+    kind: Any = dict[str, ALGORITHMS[algorithm].entries()]  # type: ignore[misc]
     strict = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
     try:
         TypeAdapter(kind, config=strict).validate_python(recipes)

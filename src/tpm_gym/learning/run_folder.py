@@ -54,7 +54,6 @@ def prepare(run: Path, overwrite: bool) -> None:
     """Make the folder of a new run, without anything of an earlier one.
 
     Args:
-        run: The folder.
         overwrite: Whether an earlier run in it is to be deleted; other files there stay.
 
     Raises:

@@ -14,11 +14,9 @@ import json
 import os
 import shlex
 import signal
-import statistics
 import subprocess
 import sys
 import threading
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -31,9 +29,9 @@ from tpm_gym.learning.algorithms import ALGORITHMS
 from tpm_gym.learning.configuration import UNSET, unset
 from tpm_gym.learning.environments import check_env_id
 from tpm_gym.learning.errors import ConfigError, LearningError
-from tpm_gym.learning.recipes import read_recipe, read_recipes, recipe_file
+from tpm_gym.learning.recipes import read_recipes, recipe_file
 from tpm_gym.learning.report.page import NOMINAL, TEMPTING
-from tpm_gym.learning.run_folder import CONFIG_FILE, TESTS, WHOLE, evaluations, is_finished
+from tpm_gym.learning.run_folder import CONFIG_FILE, TESTS, is_finished
 
 _PENALTY_IDS: Final = ("TPMReach-v0", "TPMReachJoints-v0", "TPMPickAndPlaceJoints-v0")
 _ROBUSTNESS_IDS: Final = ("TPMReach-v0", "TPMPickAndPlace-v0", "TPMPickAndPlaceJoints-v0")
@@ -84,7 +82,7 @@ class StudyConfig:
     """Runs at once; each uses one CPU core."""
 
     dry_run: bool = False
-    """Print the commands that are left to run, and an estimate of their time, and run none."""
+    """Print the commands that are left to run, and run none."""
 
 
 @dataclass(frozen=True)
@@ -171,12 +169,7 @@ def _runs_of(config: StudyConfig, env: str, algo: str, seed: int) -> list[Run]:
 
 
 def commands(run: Run, episodes: int) -> list[list[str]]:
-    """Return the commands that are left to run, in order; none where all is done.
-
-    Args:
-        run: The run.
-        episodes: Episodes of each test.
-    """
+    """Return the commands that are left, tests of so many episodes; none where all is done."""
     left = []
     folder = str(run.folder)
     if run.options is not None and not is_finished(run.folder):
@@ -198,59 +191,11 @@ def _is_tested(file: Path, episodes: int) -> bool:
     return file.is_file() and json.loads(file.read_bytes())["episodes"] == episodes
 
 
-def _progress(folder: Path) -> tuple[int, float] | None:
-    """Steps and seconds at the last evaluation of a run; None before it."""
-    found = evaluations(folder)
-    return (int(found[-1]["steps"]), float(found[-1]["wall_seconds"])) if found else None
-
-
-def estimate(run: Run, config: StudyConfig) -> tuple[float | None, float | None]:
-    """Return the seconds that the training of a run and its tests will still take.
-
-    Args:
-        run: The run.
-        config: The plan; other runs in its folder hold the times to estimate from.
-
-    Returns:
-        Seconds for the training and for the tests; None where nothing of its kind has been timed.
-    """
-    left = commands(run, config.episodes)
-    training = 0.0 if is_finished(run.folder) else _time_to_train(run, config)
-    tests = sum("evaluate" in command for command in left)
-    pace = _seconds_an_episode(run.env, config.folder)
-    testing = tests * config.episodes * pace if pace is not None else None
-    return training if run.options is not None else 0.0, testing if tests else 0.0
-
-
-def _time_to_train(run: Run, config: StudyConfig) -> float | None:
-    """Seconds from where a training is to its end, at the median pace of all of its kind."""
-    found = [_progress(other) for other in config.folder.glob(f"{run.env}-{run.algo}-*")]
-    paces = [progress[1] / progress[0] for progress in found if progress and progress[0] > 0]
-    if not paces:
-        return None
-    own = _progress(run.folder)
-    steps = config.steps
-    if steps is UNSET:
-        steps = read_recipe(recipe_file(run.algo), run.algo, run.env).n_timesteps
-    return statistics.median(paces) * (steps - (own[0] if own else 0))
-
-
-def _seconds_an_episode(env: str, folder: Path) -> float | None:
-    """Median over the tests that there are."""
-    files = folder.glob(f"{env}-*/{TESTS}/{WHOLE}")
-    found = [json.loads(path.read_bytes()) for path in files]
-    return statistics.median(f["wall_seconds"] / f["episodes"] for f in found) if found else None
-
-
 # -- running --------------------------------------------------------------------------------------
 
 
 def execute(run: Run, episodes: int) -> bool:
-    """Run what is left of a run, with the output in files beside its folder.
-
-    Args:
-        run: The run.
-        episodes: Episodes of each test.
+    """Run what is left of a run, with the output in a file beside its folder.
 
     Returns:
         Whether all went well.
@@ -288,21 +233,6 @@ def _stop(*_: Any) -> None:
         process.terminate()
 
 
-def _show(config: StudyConfig, runs: Sequence[Run]) -> None:
-    """Print what is left to do, and for how long."""
-    for run in runs:
-        for command in commands(run, config.episodes):
-            print(shlex.join(command))
-    times = [estimate(run, config) for run in runs]
-    for name, column in zip(("trainings", "tests"), zip(*times, strict=True), strict=True):
-        known = [seconds for seconds in column if seconds is not None]
-        hours = sum(known) / config.jobs / 3600
-        parts = [f"{hours:.2f} h with {config.jobs} at once"] if known else []
-        if unknown := len(column) - len(known):
-            parts.append(f"{unknown} runs that nothing like has been timed here")
-        print(f"# {name}: {', and '.join(parts)}")
-
-
 def study(config: StudyConfig) -> None:
     """Run a plan, or show it.
 
@@ -312,7 +242,8 @@ def study(config: StudyConfig) -> None:
     """
     runs = plan_runs(config)
     if config.dry_run:
-        _show(config, runs)
+        left = [command for run in runs for command in commands(run, config.episodes)]
+        print(*map(shlex.join, left), sep="\n")
         return
     for run in runs:
         if run.options is None and not is_finished(run.folder):

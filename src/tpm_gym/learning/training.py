@@ -90,7 +90,6 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
     is, unless it is to take more steps.
 
     Args:
-        config: The run, and what is to change in it.
         console: Where progress is shown; by default the standard output.
 
     Returns:

@@ -51,9 +51,6 @@ class EpisodeRecorder(gym.Wrapper[Observation, Action, Observation, Action]):
     follows, and checkpoints would change the training. Repeating the at most 50 steps of an episode
     changes nothing, is exact, takes a tenth of a second, and brings the wrappers below along: their
     counts of steps and sums of rewards.
-
-    Args:
-        env: The environment with all its other wrappers.
     """
 
     def __init__(self, env: GoalEnv) -> None:
@@ -106,9 +103,6 @@ def capture(
 
     Args:
         model: The algorithm; its environments are wrapped in :class:`EpisodeRecorder`.
-        run: The run folder.
-        extra: Plain data to be kept with it.
-        finished: Whether the training has come to its end.
 
     Returns:
         The content of a checkpoint. Its arrays are views of the replay buffer, the rest is copied.

@@ -22,11 +22,10 @@ from tpm_gym.mechanism.bodies import Mechanism
 from tpm_gym.mechanism.machine import Machine, Mode, Reading, register_machine
 from tpm_gym.mechanism.mount import Mount
 
-__all__ = ["PAPER_TPM", "TPM", "WIDE_TPM"]
+__all__ = ["ASSEMBLY_LIMIT", "PAPER_TPM", "TPM", "WIDE_TPM"]
 
-_OTHER_ASSEMBLY = (
-    0.010  # m; farther from where forward kinematics have P, it is assembled otherwise
-)
+ASSEMBLY_LIMIT = 0.010
+"""Platform against forward kinematics: farther apart, the mechanism is assembled otherwise, m."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +66,7 @@ class TPM(Machine):
         except UnreachableError:
             return "assembly"
         mirrored = position[1] * self.assembly_mode.sin_beta <= 0
-        if mirrored or not math.dist(there[:3], position) <= _OTHER_ASSEMBLY:
+        if mirrored or not math.dist(there[:3], position) <= ASSEMBLY_LIMIT:
             return "assembly"
         return "working" if there.cos_beta * self.working_mode.cos_beta <= 0 else None
 

@@ -145,7 +145,7 @@ class Description(_Entries):
     format: Literal["tpm_gym.policy"]
     version: int = Field(ge=VERSION, le=VERSION)  # a Literal would take true for 1
     env_id: str = Field(alias="env", pattern="^[A-Za-z0-9_.:/-]{1,100}$")
-    algorithm: Literal["sac", "tqc", "ppo"]
+    algorithm: _Key
     seed: _Count | None
     steps: _Count
     recipe: Annotated[dict[_Key, Any], Field(max_length=64)]
@@ -209,7 +209,7 @@ def files(path: str | Path) -> tuple[Path, Path]:
         raise PolicyFileError(
             str(path),
             "is an archive of Stable-Baselines3, which holds pickles: loading it can run any code",
-            "if you trust it, convert it once: python train/export.py MODEL.zip OUT --trust-pickle",
+            "if you trust it, convert it once: tpm-gym export MODEL.zip OUT --trust-pickle",
         )
     if os.path.isdir(path):  # path.is_dir() raises where a name is too long
         raise PolicyFileError(str(path), "is a folder", "name a policy in it, as in FOLDER/best")

@@ -32,7 +32,7 @@ _ACTIVATIONS = {"relu": torch.relu, "tanh": torch.tanh}
 
 
 def load_policy(path: str | Path) -> Policy:
-    """Load a policy that train/export.py wrote. Nothing in its files is executed or unpickled.
+    """Load an exported policy. Nothing in its files is executed or unpickled.
 
     Args:
         path: ``NAME.json``, ``NAME.safetensors`` or ``NAME``, where both files have to be. Where

@@ -106,7 +106,7 @@ class Engine(Protocol):
         """Index of the object that the cup holds; -1 for none."""
 
     def save(self) -> Any:
-        """Take down everything that the next steps depend on, as plain data.
+        """Take down everything that the next steps depend on, as plain data, all in its repr.
 
         What an engine cannot read out (old contacts' impulses) is not part of it, and ``restore``
         drops it.

@@ -53,7 +53,8 @@ def apart_from(
         point = machine.sample(rng, region)
         if (rewards.distance(point, others) >= apart).all():
             return point
-    raise ConfigurationError("apart", apart, f"a distance that leaves room in {region}")
+    valid = f"a larger one: what is drawn lies {apart} m from the start, or from other objects"
+    raise ConfigurationError("goal_region", region, valid)
 
 
 def tempting(

@@ -210,35 +210,35 @@ class Task(ABC):
                 would start inside another or inside the robot.
             UnreachableError: If the robot cannot get to an object or the goal.
         """
-        blocks = {block.name: block for block in self.scene.objects}
-        valid = f"a dictionary with keys among {', '.join(map(repr, (*blocks, 'goal')))}"
+        objects = self.scene.objects
+        known: dict[str, tuple[int, tuple[Block | None, ...]]] = {
+            "goal": (self.goal_size, objects or (None,)),
+            **{block.name: (3, (block,)) for block in objects},
+        }
+        valid = f"a dictionary with keys among {', '.join(map(repr, known))}"
         if not isinstance(options, Mapping) and options is not None:
             raise ResetOptionError("options", options, valid)
         chosen: dict[str, FloatArray] = {}
         for name, value in (options or {}).items():
-            if name == "goal":
-                chosen[name] = self.check_goal(value)
-            elif name in blocks:
-                chosen[name] = self.check_object(blocks[name], value)
-            else:
+            if name not in known:
                 raise ResetOptionError(str(name), value, valid)
+            chosen[name] = self._within_reach(name, value, *known[name])
         start = self.sample(rng, chosen)
-        self._check_free(start, chosen.keys() & blocks.keys())
+        self._check_free(start, chosen.keys() - {"goal"})
         return start
 
-    def check_goal(self, goal: ArrayLike) -> FloatArray:
-        """A goal that the user chose, as (goal_size,) m; see :meth:`start` for what it raises."""
-        points = _numbers("goal", goal, (self.goal_size,))
-        blocks = self.scene.objects or (None,)
+    def _within_reach(
+        self, name: str, value: Any, size: int, blocks: tuple[Block | None, ...]
+    ) -> FloatArray:
+        """Points (size,) m that the user chose, of P or of blocks' centres in turn; a copy."""
+        points = np.array(finite(name, value, (size,), ResetOptionError))
         for point, block in zip(points.reshape(-1, 3), cycle(blocks), strict=False):
-            self._check_reach("goal", point, block)
+            low, high = self.reach_of(block)
+            margin = float(np.minimum(point - low, high - point).min())
+            if margin < -1e-6:
+                hint = f"{name} must lie in {_range(low, high)}"
+                raise UnreachableError(point.tolist(), "box", margin, hint)
         return points
-
-    def check_object(self, block: Block, position: ArrayLike) -> FloatArray:
-        """A start of an object that the user chose, as (3,) m; see :meth:`start`."""
-        point = _numbers(block.name, position, (3,))
-        self._check_reach(block.name, point, block)
-        return point
 
     def reach_of(self, block: Block | None) -> tuple[FloatArray, FloatArray]:
         """Lowest and highest place (3,) m for point P, or for the centre of a block in the cup."""
@@ -270,13 +270,6 @@ class Task(ABC):
         touching = self.hanging(block) + (0.0, 0.0, block.height / 2)
         level = float(self.machine.mount.to_paper(touching)[2])
         return Region((*low[:2], level), (*high[:2], level))
-
-    def _check_reach(self, name: str, point: FloatArray, block: Block | None) -> None:
-        low, high = self.reach_of(block)
-        margin = float(np.minimum(point - low, high - point).min())
-        if margin < -1e-6:
-            hint = f"{name} must lie in {_range(low, high)}"
-            raise UnreachableError(point.tolist(), "box", margin, hint)
 
     def _check_free(self, start: Mapping[str, FloatArray], chosen: Collection[str]) -> None:
         """Refuse objects that would start inside the robot at home, or inside another object."""
@@ -387,11 +380,6 @@ class Task(ABC):
             beyond = ((level < low[:2] - slack) | (level > high[:2] + slack)).any(axis=-1)
             lost |= beyond | (place[..., 2] < 0)
         return lost
-
-
-def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
-    """A copy, so that the user's array stays the user's."""
-    return np.array(finite(name, value, shape, ResetOptionError))
 
 
 def _range(low: FloatArray, high: FloatArray) -> str:

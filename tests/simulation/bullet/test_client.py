@@ -1,16 +1,43 @@
-"""The client of the physics engine: private, quiet, given back."""
+"""The client of the physics engine: private, quiet, given back; and what it makes of windows."""
 
 from __future__ import annotations
 
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pybullet
 import pytest
 
 from tpm_gym.errors import ConfigurationError
-from tpm_gym.simulation.bullet.client import Client, has_display
-from tpm_gym.simulation.physics import GRAVITY, REGULARISATION, Physics
+from tpm_gym.simulation import Scene, Simulation
+from tpm_gym.simulation.bullet import client as client_module
+from tpm_gym.simulation.bullet.client import GRAVITY, Client
+from tpm_gym.simulation.bullet.physics import REGULARISATION, Physics
+from tpm_gym.simulation.display import has_display
+
+posix = pytest.mark.skipif(os.name != "posix", reason="descriptors and X11")
+
+
+def in_a_process(script: str, **variables: str) -> tuple[str, str]:
+    """What a script says on stdout and stderr."""
+    begin = "import os, sys\nimport gymnasium as gym\nimport tpm_gym\n"
+    done = subprocess.run(
+        [sys.executable, "-c", begin + script],
+        env={**os.environ, **variables},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    lines = done.stderr.splitlines()
+    told = [line for line in lines if not line.startswith("pybullet build time")]
+    return done.stdout, "\n".join(told)
 
 
 @pytest.fixture
@@ -30,7 +57,7 @@ def drop(client: Client) -> int:
 
 def test_functions_act_on_this_client_alone_and_constants_pass_through(client: Client) -> None:
     other = Client(Physics())
-    assert other._number != client._number
+    assert other.number != client.number
     ball = drop(client)
     assert (client.getNumBodies(), other.getNumBodies()) == (1, 0)
     other.stepSimulation()
@@ -93,24 +120,66 @@ def test_nothing_is_printed(capfd: pytest.CaptureFixture[str]) -> None:
     assert capfd.readouterr() == ("before after\n", "")
 
 
-def test_closing_twice_is_harmless_and_closed_means_closed(client: Client) -> None:
+def test_closed_means_closed_and_twice_is_harmless(client: Client) -> None:
+    numbers = {client.number}
     client.stepSimulation()
+    for _ in range(20):
+        client.close()
+        client.close()
+        with pytest.raises(pybullet.error):
+            client.stepSimulation()
+        client = Client(Physics())
+        numbers.add(client.number)
     client.close()
-    client.close()
-    with pytest.raises(pybullet.error):
-        client.stepSimulation()
+    assert len(numbers) == 1  # given back each time
 
 
-@pytest.mark.parametrize("renderer", ["raytracer", "", None])
+def test_what_is_dropped_is_given_back() -> None:
+    free = Client(Physics()).number
+    kept = Client(Physics())
+    assert kept.number == free
+    first = Simulation(Scene())
+    number = first.engine.client.number
+    del first
+    assert Simulation(Scene()).engine.client.number == number
+    kept.stepSimulation()
+
+
+@pytest.mark.slow  # 20 s
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs Linux")
+def test_200_environments_and_copies_dropped_without_close_leave_no_memory() -> None:
+    _, grown = in_a_process("""
+import copy, ctypes, gc
+def memory():
+    gc.collect()
+    getattr(ctypes.CDLL(None), "malloc_trim", print)(0)
+    return int(open("/proc/self/statm").read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+def drop(count):
+    for _ in range(count):
+        env = gym.make("TPMPickAndPlace-v0")
+        env.reset(seed=0)
+        copy.deepcopy(env).step(env.action_space.sample())
+drop(3)
+before = memory()
+for dropped in range(0, 100, 10):
+    drop(10)
+    if memory() > before + 20:
+        break
+sys.stderr.write(f"{memory() - before}")
+""")
+    assert float(grown) < 20  # MB
+
+
+@pytest.mark.parametrize("renderer", ["raytracer", "", 1])
 def test_an_unknown_renderer_is_refused_and_the_client_given_back(renderer: Any) -> None:
     first = Client(Physics())
-    free = first._number
+    free = first.number
     first.close()
     with pytest.raises(ConfigurationError, match="'tiny' or 'egl'") as caught:
         Client(Physics(), renderer=renderer)
     assert (caught.value.name, caught.value.value) == ("renderer", renderer)
     again = Client(Physics())
-    assert again._number == free
+    assert again.number == free
     again.close()
 
 
@@ -120,23 +189,150 @@ def test_egl_that_is_not_there_is_refused(monkeypatch: pytest.MonkeyPatch) -> No
         Client(Physics(), renderer="egl")
 
 
-def test_a_window_that_does_not_open_is_a_typed_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pybullet, "connect", lambda mode: -1)
+def test_where_no_file_can_be_written_the_error_says_so(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    free = Client(Physics()).number
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "missing"))
+    with pytest.raises(ConfigurationError, match="folder that can be written to") as caught:
+        Simulation(Scene())
+    assert caught.value.name == "TMPDIR"
+    assert Client(Physics()).number == free
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    Simulation(Scene())
+    assert not list(tmp_path.iterdir())  # nothing is left there
+
+
+# -- standard output -------------------------------------------------------------------------------
+
+
+@posix
+@pytest.mark.parametrize(
+    "gone",
+    ["sys.stdout = None", "sys.stdout.close()", "os.close(1)", "os.close(1); sys.stdout = None"],
+)
+def test_environments_are_made_where_there_is_no_standard_output(gone: str) -> None:
+    made = f"{gone}\nenv = gym.make('TPMReach-v0')\nenv.reset(seed=0)\nsys.stderr.write('made')"
+    assert "made" in in_a_process(made)[1]
+
+
+@posix
+def test_silence_takes_what_c_writes_too_and_may_be_nested() -> None:
+    said, _ = in_a_process("""
+import ctypes
+from tpm_gym.simulation.bullet.client import silence
+c = ctypes.CDLL(None)
+with silence():
+    with silence():
+        print("python")
+    c.puts(b"c")
+print("after")
+c.puts(b"c after")
+""")
+    assert sorted(said.splitlines()) == ["after", "c after"]
+
+
+@posix
+def test_threads_that_make_environments_leave_standard_output_as_it_was() -> None:
+    _, said = in_a_process("""
+import time
+from threading import Thread
+import pybullet
+quick = pybullet.setPhysicsEngineParameter
+def slow(**settings):
+    if "constraintSolverType" in settings:
+        time.sleep(0.3)  # where it is silent, so that the threads meet there
+    quick(**settings)
+pybullet.setPhysicsEngineParameter = slow
+before = os.fstat(1)
+threads = [Thread(target=gym.make, args=("TPMReach-v0",)) for _ in range(6)]
+for thread in threads:
+    thread.start()
+for thread in threads:
+    thread.join()
+sys.stderr.write(str(os.path.samestat(os.fstat(1), before)))
+""")
+    assert said == "True"
+
+
+# -- windows ---------------------------------------------------------------------------------------
+
+OPEN = """
+def window():
+    try:
+        env = gym.make("TPMReach-v0", render_mode="human")
+        sys.stderr.write("opened;")
+        return env
+    except tpm_gym.TPMError as error:
+        sys.stderr.write(f"{type(error).__name__} {error.name};")
+first = window()
+"""
+REFUSED = "ConfigurationError render_mode;"
+
+
+@posix
+@pytest.mark.parametrize("display", [":987", "localhost:987", "nonsense", ""])
+def test_a_display_that_does_not_answer_is_a_typed_error(display: str) -> None:
+    assert in_a_process(OPEN, DISPLAY=display)[1] == REFUSED
+
+
+SCREENS = [
+    pytest.param((), id="GLX", marks=pytest.mark.slow),  # 20 s, drawn in software
+    pytest.param(("-extension", "GLX"), id="no GLX"),
+]
+
+
+@pytest.fixture(params=SCREENS)
+def screen(request: pytest.FixtureRequest) -> Iterator[str]:
+    """DISPLAY of an X server that draws into memory."""
+    if shutil.which("Xvfb") is None:
+        pytest.skip("needs Xvfb")
+    command = ["Xvfb", "-displayfd", "1", "-screen", "0", "320x240x24", *request.param]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as server:
+        assert server.stdout is not None
+        yield f":{server.stdout.readline().decode().strip()}"
+        server.terminate()
+
+
+def test_a_second_window_is_a_typed_error_and_the_first_goes_on(
+    screen: str, request: pytest.FixtureRequest
+) -> None:
+    _, said = in_a_process(
+        OPEN
+        + """
+second = window()
+if first:
+    first.reset(seed=0)
+    first.step(first.action_space.sample())
+    first.close()
+    window()
+""",
+        DISPLAY=screen,
+    )
+    without_glx = "no GLX" in request.node.name
+    assert said == (2 * REFUSED if without_glx else f"opened;{REFUSED}opened;")
+
+
+@pytest.mark.parametrize("how", ["refuses", "raises"])
+def test_a_window_that_does_not_open_is_a_typed_error(
+    monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    def connect(mode: int) -> int:
+        if how == "raises":
+            raise pybullet.error("Only one local in-process GUI connection allowed.")
+        return -1
+
+    monkeypatch.setattr(client_module, "has_display", lambda: True)
+    monkeypatch.setattr(pybullet, "connect", connect)
     with pytest.raises(ConfigurationError, match="no window") as caught:
         Client(Physics(), gui=True)
     assert caught.value.name == "render_mode"
 
 
-@pytest.mark.parametrize(
-    ("platform", "display", "expected"),
-    [("linux", None, False), ("linux", "", False), ("linux", ":0", True), ("darwin", None, True)],
-)
-def test_linux_needs_a_display(
-    monkeypatch: pytest.MonkeyPatch, platform: str, display: str | None, expected: bool
+@pytest.mark.parametrize(("platform", "expected"), [("linux", False), ("darwin", True)])
+def test_only_linux_needs_a_display(
+    monkeypatch: pytest.MonkeyPatch, platform: str, expected: bool
 ) -> None:
     monkeypatch.setattr("sys.platform", platform)
-    if display is None:
-        monkeypatch.delenv("DISPLAY", raising=False)
-    else:
-        monkeypatch.setenv("DISPLAY", display)
+    monkeypatch.delenv("DISPLAY", raising=False)
     assert has_display() is expected

@@ -175,6 +175,18 @@ def test_a_held_puck_pressed_on_the_table_stays_held_and_the_cup_yields():
     assert all(state.held == 0 for state in lifted)
 
 
+def test_of_two_it_takes_the_one_that_it_touches():
+    blocks = (Block("near"), Block("there"))
+    simulation = Simulation(Scene(objects=blocks))
+    there = (PLACE[0], -PLACE[1], 0.015)
+    near = (PLACE[0] + 0.05, -PLACE[1], 0.015)
+    simulation.reset(PAPER_TPM.inverse(level(0.05)), {"near": near, "there": there})
+    go(simulation, 0.03, 4, vacuum=True)
+    state = go(simulation, 0.06, 8, vacuum=True)
+    assert state.held == 1
+    assert state.object_position[:, 2] == pytest.approx([0.015, 0.045], abs=2e-3)
+
+
 def test_a_reset_while_holding_lets_go():
     simulation = start(height=0.05)
     assert go(simulation, 0.03, 4, vacuum=True).held == 0

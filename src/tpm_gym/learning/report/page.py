@@ -15,7 +15,7 @@ from tpm_gym.learning.estimates import (
     median_time,
     settled,
 )
-from tpm_gym.tasks.rewards import SAFE_CONDITIONING
+from tpm_gym.mechanism import PAPER_TPM
 
 Record = dict[str, Any]
 Group = list[Record]
@@ -40,8 +40,8 @@ Written by `make results` from the records in [results](results); no result here
   the playing of demonstrations. For several seeds it is the median, "never" where that is a
   run that never did.
 - **Smallest conditioning** is the least 1/cond(J) of all steps of all test episodes (and seeds),
-  **time below safe** the share of their steps with 1/cond(J) < {SAFE_CONDITIONING} (the mean of
-  seeds).
+  **time below safe** the share of their steps with 1/cond(J) < \
+{PAPER_TPM.safe_conditioning} (the mean of seeds).
 - **Observed P off** is the largest distance between the observed position of the platform (forward
   kinematics of the encoders) and the simulated one, of all steps, episodes and seeds.
 """
@@ -66,12 +66,7 @@ it was then: `train/train.py` is `tpm-gym train`, `train/evaluate.py` is `tpm-gy
 
 
 def page(records: Sequence[Record], figures: Sequence[str]) -> str:
-    """Return the page as Markdown.
-
-    Args:
-        records: What ``records.condense`` gave, one a run.
-        figures: Names of the figures in images/.
-    """
+    """Return the page as Markdown."""
     plain = [r for r in records if r["goals"] == "sampled" and r["penalty_weight"] == 1.0]
     tempted = [r for r in records if r["goals"] == "tempting"]
     parts = [_INTRO, *_training(plain, figures), *_penalty(tempted, figures), *_robustness(plain)]

@@ -19,11 +19,11 @@ from tpm_gym.errors import ConfigurationError
 from tpm_gym.simulation.bullet.physics import REGULARISATION, Physics
 from tpm_gym.simulation.display import has_display
 
-__all__ = ["Client"]
+__all__ = ["GRAVITY", "Client", "silence"]
 
 GRAVITY = 9.81  # m/s^2
 
-_stdout_lock = threading.Lock()
+_stdout_lock = threading.RLock()
 
 
 class Client:
@@ -76,7 +76,7 @@ class Client:
             deterministicOverlappingPairs=1,
         )
         if physics.solver == "direct":
-            with _silence():
+            with silence():  # it says so from C
                 self.setPhysicsEngineParameter(
                     constraintSolverType=pybullet.CONSTRAINT_SOLVER_LCP_DANTZIG
                 )
@@ -124,24 +124,28 @@ def _disconnect(number: int) -> None:
 
 
 @contextmanager
-def _silence() -> Iterator[None]:
-    """Keep what the engine says (from C, on changing its solver) out of the user's output.
+def silence() -> Iterator[None]:
+    """Keep what is said, from C too, out of the user's output.
 
     For a moment the whole process writes nowhere, so one thread does this at a time.
     """
     with _stdout_lock, ExitStack() as stack:
         if os.name == "posix" and (ours := _duplicate(1)) is not None:
-            flush = ctypes.CDLL(None).fflush
-            with suppress(AttributeError, ValueError, OSError):  # stdout may be None, or closed
-                sys.stdout.flush()
-            flush(None)
+            _flush()
             stack.callback(os.close, ours)
             nowhere = os.open(os.devnull, os.O_WRONLY)
             stack.callback(os.close, nowhere)
             stack.callback(os.dup2, ours, 1)
             os.dup2(nowhere, 1)
-            stack.callback(flush, None)
+            stack.callback(_flush)
         yield
+
+
+def _flush() -> None:
+    """Write out what Python and the C library still hold back."""
+    with suppress(AttributeError, ValueError, OSError):  # stdout may be None, or closed
+        sys.stdout.flush()
+    ctypes.CDLL(None).fflush(None)
 
 
 def _duplicate(descriptor: int) -> int | None:
