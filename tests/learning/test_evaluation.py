@@ -367,7 +367,7 @@ def test_a_damaged_policy_is_one_line(run: Path, tmp_path: Path) -> None:
     assert last.startswith("error: policy ")
     assert re.search(r"damaged: \d+ of \d+ bytes", last)
     env = gym.make("TPMReach-v0")
-    with pytest.raises(PolicyError, match="does not describe a policy"):
+    with pytest.raises(PolicyError, match="describes no policy"):
         load_policy(str(run / "config.json"), env)
     env.close()
 
