@@ -4,7 +4,7 @@ VENV := .venv
 RUN := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
 
-.PHONY: help demo test lint format test-fast test-slow urdf pictures figures results bench-kinematics bench-fidelity bench-evaluate bench-speed soak clean
+.PHONY: help demo test lint format test-fast test-slow test-wheel urdf pictures figures results bench-kinematics bench-fidelity bench-evaluate bench-speed soak clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -17,11 +17,11 @@ $(INSTALLED): pyproject.toml constraints.txt
 	touch $@
 
 demo: $(INSTALLED) ## train Reach, evaluate it, film the published pick-and-place policy; see runs/demo/
-	$(RUN) train/train.py --env TPMReach-v0 --algo sac --seed 0 --run runs/demo/reach --overwrite
+	$(VENV)/bin/tpm-gym train --env TPMReach-v0 --algo sac --seed 0 --run runs/demo/reach --overwrite
 	cp runs/demo/reach/learning_curve.png runs/demo/learning_curve.png
-	$(RUN) train/evaluate.py --policy runs/demo/reach/best.json expert random \
+	$(VENV)/bin/tpm-gym evaluate --policy runs/demo/reach/best.json expert random \
 		--env TPMReach-v0 --episodes 100 --json runs/demo/reach.json
-	$(RUN) train/evaluate.py --policy train/policies/TPMPickAndPlace-v0.json --episodes 20 --seed 2000006 \
+	$(VENV)/bin/tpm-gym evaluate --policy train/policies/TPMPickAndPlace-v0.json --episodes 20 --seed 2000006 \
 		--json runs/demo/pick_and_place.json --video runs/demo/pick_and_place.mp4 \
 		--picture runs/demo/pick_and_place.png
 	@echo; echo "runs/demo/ now holds:"; ls runs/demo runs/demo/reach
@@ -32,6 +32,7 @@ lint: $(INSTALLED)
 	$(RUN) -m ruff check .
 	$(RUN) -m ruff format --check .
 	$(RUN) -m mypy
+	$(VENV)/bin/lint-imports --no-logo
 
 format: $(INSTALLED) ## rewrite the code in the house style
 	$(RUN) -m ruff check --fix .
@@ -43,6 +44,9 @@ test-fast: $(INSTALLED)
 test-slow: $(INSTALLED) ## tests that take minutes: 1000 expert episodes, training to success
 	$(RUN) -m pytest -q -m slow
 
+test-wheel: $(INSTALLED) ## the wheel in an empty environment: train, kill, resume, evaluate
+	$(RUN) -m pytest -q -m slow tests/learning/test_wheel.py
+
 urdf: $(INSTALLED) ## regenerate urdf/ from the mechanism
 	$(RUN) -m tpm_gym.urdf urdf
 
@@ -53,7 +57,7 @@ figures: $(INSTALLED) ## redraw the paper's figures, and more, in docs/images/
 	$(RUN) docs/draw_figures.py
 
 results: $(INSTALLED) ## rewrite docs/results.md and its figures from the records in docs/results/
-	$(RUN) train/results.py write
+	$(VENV)/bin/tpm-gym report write
 
 bench-kinematics: $(INSTALLED) ## speed of the kinematics against a floor and a general solver
 	$(RUN) benchmarks/bench_kinematics.py
@@ -61,7 +65,7 @@ bench-kinematics: $(INSTALLED) ## speed of the kinematics against a floor and a 
 bench-fidelity: $(INSTALLED) ## loop gaps, FK error and tilt against cost; see docs/fidelity.md
 	$(RUN) benchmarks/bench_fidelity.py
 
-bench-evaluate: $(INSTALLED) ## what evaluate.py costs beyond the stepping
+bench-evaluate: $(INSTALLED) ## what tpm-gym evaluate costs beyond the stepping
 	$(RUN) benchmarks/bench_evaluate.py --json runs/evaluate.json
 
 bench-speed: $(INSTALLED) ## steps per second beside panda-gym and Gymnasium-Robotics

@@ -1,8 +1,8 @@
-"""How much evaluate.py costs beyond the environment it steps.
+"""How much tpm-gym evaluate costs beyond the environment it steps.
 
     make bench-evaluate
 
-Each round runs the command ``train/evaluate.py`` on a policy, start-up, statistics and JSON
+Each round runs the command ``tpm-gym evaluate`` on a policy, start-up, statistics and JSON
 included, and then steps the bare environment through the same episodes: the same resets, and the
 actions of the policy, played from a record. The ratio is taken within a round.
 """
@@ -19,10 +19,11 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-from machine import ROOT, describe, processor_line, quartiles  # first: it finds the scripts
+from machine import describe, processor_line, quartiles
 
 from tpm_gym.learning.policies import load_policy, trained_env
 from tpm_gym.learning.rollout import TEST_SEED
+from tpm_gym.resources import POLICIES
 
 Episode = list[Any]
 """The actions of an episode."""
@@ -61,9 +62,9 @@ def bare(env_id: str, tape: list[Episode]) -> float:
 
 
 def evaluated(env_id: str, policy_name: str, episodes: int) -> float:
-    """Seconds of the command evaluate.py."""
+    """Seconds of the command tpm-gym evaluate."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, str(ROOT / "train" / "evaluate.py"), "--policy", policy_name]
+        command = [sys.executable, "-m", "tpm_gym.learning", "evaluate", "--policy", policy_name]
         command += ["--env", env_id, "--episodes", str(episodes)]
         command += ["--json", str(Path(folder, "evaluation.json"))]
         started = time.perf_counter()
@@ -74,7 +75,7 @@ def evaluated(env_id: str, policy_name: str, episodes: int) -> float:
 def main(arguments: list[str] | None = None) -> dict[str, Any]:
     """Measure, print, and return what was measured."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    published = ROOT / "train" / "policies" / "TPMPickAndPlace-v0.json"
+    published = POLICIES / "TPMPickAndPlace-v0.json"
     parser.add_argument("--policy", default=str(published), help="an exported policy")
     parser.add_argument("--episodes", type=int, default=1000, help="episodes a round")
     parser.add_argument("--rounds", type=int, default=3, help="rounds")
@@ -93,7 +94,7 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     content |= {"env": env_id, "episodes": options.episodes, "rounds": rows, "ratio": ratio}
     print(processor_line(content))
     for row in rows:
-        print(f"evaluate.py {row['evaluate_s']:6.1f} s   bare {row['bare_s']:6.1f} s")
+        print(f"tpm-gym evaluate {row['evaluate_s']:6.1f} s   bare {row['bare_s']:6.1f} s")
     low, median, high = ratio
     print(f"{env_id}, {options.episodes} episodes: {median:.2f} [{low:.2f}, {high:.2f}]")
     if options.json is not None:

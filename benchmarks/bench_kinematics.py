@@ -4,7 +4,8 @@
 
 The floor of the batched functions is numpy's sine and cosine of as many angles as the inputs hold:
 no method that evaluates the mechanism's trigonometry in numpy can be faster. The peer of the single
-call is scipy.optimize.root on the three closure equations, started 20 mm beside the solution.
+call is scipy.optimize.root on the three closure equations, started 20 mm beside the solution; that
+of the conditioning, from angles, is numpy's SVD alone, of Jacobians that are given.
 """
 
 from __future__ import annotations
@@ -17,13 +18,20 @@ import tracemalloc
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import root
 
-from tpm_gym.kinematics import forward, forward_all, inverse, inverse_all
+from tpm_gym.arrays import FloatArray
+from tpm_gym.kinematics import (
+    DEFAULT_ASSEMBLY,
+    ELBOWS_OUT,
+    equations,
+    forward,
+    forward_all,
+    inverse,
+    inverse_all,
+    jacobian,
+)
 from tpm_gym.kinematics.geometry import PAPER
-
-FloatArray = NDArray[np.float64]
 
 ROWS, REPEATS, CALLS = 1_000_000, 7, 300
 TARGETS = {"forward_all": 4.0, "inverse_all": 10.0}
@@ -99,6 +107,45 @@ def batched() -> None:
         report(name, ratios[name], detail)
 
 
+def conditioning() -> None:
+    """Of a batch of joint angles, against numpy's SVD of their Jacobians, alternating."""
+    rng = np.random.default_rng(2)
+    theta = inverse(rng.uniform((-0.2, 0.015, 0.7), (0.1, 0.042, 0.9), (ROWS // 10, 3)))
+    matrices, ratios, times = jacobian.velocity(theta), [], []
+    for _ in range(REPEATS):
+        peer = seconds(lambda: np.linalg.svd(matrices, compute_uv=False))
+        times.append(seconds(lambda: jacobian.conditioning(theta)))
+        ratios.append(peer / times[-1])
+    detail = "times faster than numpy's SVD (target: at least 5)"
+    report(
+        "conditioning",
+        ratios,
+        f"{detail}; {1e9 * statistics.median(times) / len(theta):.0f} ns a row",
+    )
+
+
+def one_call() -> None:
+    """What one configuration costs at every time step, and through the public functions."""
+    point = (-0.04, 0.028, 0.80)
+    theta = equations.posture(point, ELBOWS_OUT, PAPER)
+    array, angles = np.array(point), np.array(theta)
+    calls: dict[str, Callable[[], object]] = {
+        "posture": lambda: equations.posture(point, ELBOWS_OUT, PAPER),
+        "assemble": lambda: equations.assemble(theta, DEFAULT_ASSEMBLY, PAPER),
+        "evaluate": lambda: equations.evaluate(theta, DEFAULT_ASSEMBLY, PAPER),
+        "inverse": lambda: inverse(array),
+        "forward": lambda: forward(angles),
+        "jacobian.evaluate": lambda: jacobian.evaluate(angles),
+    }
+    for name, call in calls.items():
+        each = [
+            1e6 * seconds(lambda call=call: [call() for _ in range(2000)]) / 2000 for _ in range(15)
+        ]
+        print(
+            f"{name:<18} {statistics.median(each):6.2f}  [{min(each):.2f}, {max(each):.2f}]  us a call"
+        )
+
+
 def single() -> None:
     """One forward call against scipy.optimize.root, alternating."""
     rng = np.random.default_rng(1)
@@ -128,7 +175,9 @@ def main() -> None:
     print(f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}, "
           f"numpy {np.__version__}; median and range of {REPEATS} runs")  # fmt: skip
     batched()
+    conditioning()
     single()
+    one_call()
 
 
 if __name__ == "__main__":

@@ -28,145 +28,71 @@ from tpm_gym.errors import (
     UnreachableError,
 )
 
-# One of each: the error, the built-in it stands for, its values, what its message must hold.
-CASES: list[tuple[TPMError, type[Exception], dict[str, object], list[str]]] = [
+# One of each: what it is made of, the built-in it stands for, and what its message must hold.
+CASES: list[tuple[type[TPMError], tuple[Any, ...], type[Exception], str]] = [
+    (GeometryError, ("l4", -1.0, "it must be positive"), ValueError, "l4 = -1.0 m, but it must"),
+    (InputError, ("theta", (2,), "of shape (..., 3)"), ValueError, "of shape (..., 3), got (2,)"),
+    (ActionError, ("action", "x", "finite"), ValueError, "action must be finite, got 'x'"),
     (
-        GeometryError("l4", -1.0, "it must be positive"),
+        ConfigurationError,
+        ("task", "fly", "'reach'"),
         ValueError,
-        {"name": "l4", "value": -1.0, "requirement": "it must be positive"},
-        ["l4", "-1.0", "it must be positive"],
+        "'fly' is not possible; valid: 'r",
     ),
+    (ResetOptionError, ("goal", 3, "a point"), ValueError, "goal = 3 is not possible; valid: a p"),
+    (EpisodeError, ("call reset() first",), RuntimeError, "call reset() first"),
     (
-        InputError("theta", (2,), "of shape (..., 3)"),
+        UnreachableError,
+        ((0.0, 1.0, 2.0), "leg 3", -0.25, "go elsewhere"),
         ValueError,
-        {"name": "theta", "value": (2,), "requirement": "of shape (..., 3)"},
-        ["theta", "(2,)", "of shape (..., 3)"],
+        "(0, 1, 2) cannot be reached: leg 3 fails by 0.25 m; go elsewhere",
     ),
+    (SingularityError, ("sin(beta)", 1e-15), ValueError, "sin(beta) = 1e-15; stay where"),
+    (ClosureError, (0.0123, 0.005), RuntimeError, "open by 0.0123 m, more than 0.005 m; call"),
+    (ModeChangeError, ("assembly",), RuntimeError, "a singularity into another assembly mode"),
+    (ModeChangeError, ("working",), RuntimeError, "a singularity into another working mode"),
     (
-        ActionError("action", "x", "finite"),
+        PolicyFileError,
+        ("best.json", "holds no JSON", "export it again"),
         ValueError,
-        {"name": "action", "value": "x", "requirement": "finite"},
-        ["action", "'x'", "finite"],
+        "best.json: holds no JSON; export it again",
     ),
     (
-        ConfigurationError("task", "fly", "'reach'"),
+        PolicyMismatchError,
+        ("action space", "Box(3)", "Box(4)", "TPMReach-v0"),
         ValueError,
-        {"name": "task", "value": "fly", "valid": "'reach'"},
-        ["task", "'fly'", "'reach'"],
+        "action space Box(3), the environment has Box(4); use it in TPMReach-v0",
     ),
     (
-        ResetOptionError("goal", 3, "a point"),
-        ValueError,
-        {"name": "goal", "value": 3, "valid": "a point"},
-        ["goal", "3", "a point"],
-    ),
-    (EpisodeError("call reset() first"), RuntimeError, {}, ["call reset() first"]),
-    (
-        UnreachableError([0, 1, 2], "leg 3", -0.25, "go elsewhere"),
-        ValueError,
-        {"point": (0.0, 1.0, 2.0), "leg": "leg 3", "margin": -0.25},
-        ["(0, 1, 2)", "leg 3", "0.25 m", "go elsewhere"],
-    ),
-    (
-        SingularityError("sin(beta)", 1e-15),
-        ValueError,
-        {"factor": "sin(beta)", "value": 1e-15},
-        ["sin(beta)", "1e-15", "conditioning"],
-    ),
-    (
-        ClosureError(0.0123, 0.005),
-        RuntimeError,
-        {"gap": 0.0123, "limit": 0.005},
-        ["12.3 mm", "5 mm", "reset()"],
-    ),
-    (
-        ModeChangeError("assembly"),
-        RuntimeError,
-        {"mode": "assembly"},
-        ["parallel singularity", "another assembly mode", "reset()"],
-    ),
-    (
-        ModeChangeError("working"),
-        RuntimeError,
-        {"mode": "working"},
-        ["serial singularity", "another working mode", "reset()"],
-    ),
-    (
-        PolicyFileError("best.json", "holds no JSON", "export it again"),
-        ValueError,
-        {"path": "best.json", "reason": "holds no JSON", "remedy": "export it again"},
-        ["best.json", "holds no JSON", "export it again"],
-    ),
-    (
-        PolicyMismatchError("action space", "Box(3)", "Box(4)", "TPMReach-v0"),
-        ValueError,
-        {"kind": "action space", "trained": "Box(3)", "given": "Box(4)", "env_id": "TPMReach-v0"},
-        ["action space", "Box(3)", "Box(4)", "TPMReach-v0"],
-    ),
-    (
-        MissingPackageError("torch", "policy"),
+        MissingPackageError,
+        ("torch", "policy"),
         ImportError,
-        {"package": "torch", "extra": "policy"},
-        ["torch", "pip install 'tpm-gym[policy]'"],
+        "be imported; pip install 'tpm-gym[policy]'",
     ),
 ]
-LEAVES = [getattr(errors, name) for name in errors.__all__ if name != "TPMError"]
 
 
-@pytest.mark.parametrize(("error", "builtin", "values", "shown"), CASES)
-def test_errors_carry_their_values_and_show_them(
-    error: TPMError, builtin: type[Exception], values: dict[str, object], shown: list[str]
+@pytest.mark.parametrize(("kind", "values", "builtin", "shown"), CASES)
+def test_errors_carry_their_values_show_them_and_survive_the_way_between_processes(
+    kind: type[TPMError], values: tuple[Any, ...], builtin: type[Exception], shown: str
 ) -> None:
+    error = kind(*values)
     assert isinstance(error, TPMError)
     assert isinstance(error, builtin)
-    for name, value in values.items():
-        assert getattr(error, name) == value
-    for text in shown:
-        assert text in str(error)
+    assert shown in str(error)
+    _, _, documented = (inspect.getdoc(kind) or "").partition("Attributes:")
+    for name in re.findall(r"^ {4}(\w+):", documented, flags=re.MULTILINE):
+        assert getattr(error, name) == inspect.signature(kind).bind(*values).arguments[name]
+    for again in (copy.copy(error), copy.deepcopy(error), pickle.loads(pickle.dumps(error))):
+        assert type(again) is kind
+        assert (str(again), vars(again)) == (str(error), vars(error))
 
 
-@pytest.mark.parametrize("leaf", LEAVES)
-def test_every_public_error_is_a_tpm_error_and_a_case_above(leaf: type[TPMError]) -> None:
-    assert issubclass(leaf, TPMError)
-    assert issubclass(leaf, (ValueError, RuntimeError, ImportError))
-    assert any(type(case[0]) is leaf for case in CASES)
-
-
-@pytest.mark.parametrize("case", CASES)
-def test_documented_attributes_exist(case: tuple[TPMError, object, object, object]) -> None:
-    documentation = inspect.getdoc(type(case[0])) or ""
-    _, _, attributes = documentation.partition("Attributes:")
-    for name in re.findall(r"^ {4}(\w+):", attributes, flags=re.MULTILINE):
-        assert hasattr(case[0], name)
-
-
-def test_all_names_every_error() -> None:
+def test_every_error_is_a_case_above_and_public() -> None:
+    assert {kind.__name__ for kind, *_ in CASES} | {"TPMError"} == set(errors.__all__)
     defined = {
         name
         for name, value in vars(errors).items()
         if inspect.isclass(value) and issubclass(value, TPMError)
     }
     assert defined == set(errors.__all__)
-
-
-@pytest.mark.parametrize(
-    "copied", [copy.copy, copy.deepcopy, lambda e: pickle.loads(pickle.dumps(e))]
-)
-@pytest.mark.parametrize(
-    "error",
-    [
-        errors.GeometryError("l1", 1.0, "it must be positive"),
-        errors.SingularityError("sin(beta)", 0.0),
-        errors.UnreachableError((0.0, 1.0, 2.0), "leg 1", -0.1, "come closer"),
-        errors.ClosureError(0.02, 0.005),
-        errors.ModeChangeError("working"),
-        errors.EpisodeError("call reset() first"),
-        errors.PolicyFileError("best.json", "holds no JSON", "export it again"),
-        errors.MissingPackageError("torch", "policy"),
-    ],
-)
-def test_errors_survive_the_way_between_processes(error: Any, copied: Any) -> None:
-    again = copied(error)
-    assert type(again) is type(error)
-    assert str(again) == str(error)
-    assert vars(again) == vars(error)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from tpm_gym.learning.evaluate import main
+import sys
+
+from tpm_gym.learning.command_line import main
 
 if __name__ == "__main__":
-    main()
+    main(["evaluate", *sys.argv[1:]])

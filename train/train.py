@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from tpm_gym.learning.train import main
+import sys
+
+from tpm_gym.learning.command_line import main
 
 if __name__ == "__main__":
-    main()
+    main(["train", *sys.argv[1:]])

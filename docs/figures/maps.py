@@ -10,18 +10,20 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+from figures.sections import MM, heading, mode_name, outline_task_region, section_axes
 from figures.zero_sets import Section, reach_margin
 from tpm_gym.kinematics import ELBOWS_OUT
 from tpm_gym.kinematics.geometry import PAPER
-from tpm_gym.kinematics.workspace import TASK_REGION, conditioning_at
+from tpm_gym.kinematics.workspace import conditioning_at
 from tpm_gym.learning import figure_style as style
-from tpm_gym.learning.figure_style import BLACK, BLUE, GREEN, MM, OUTLINE, VERMILLION
-from tpm_gym.tasks.rewards import SAFE_CONDITIONING
+from tpm_gym.learning.figure_style import BLACK, BLUE, GREEN, OUTLINE, VERMILLION
+from tpm_gym.mechanism import PAPER_TPM
 
 FloatArray = NDArray[np.float64]
 
 HEIGHTS = (0.005, 0.012, 0.025, 0.040, 0.048)  # values of y, m
-_LOW, _HIGH = TASK_REGION.low, TASK_REGION.high
+_SAFE = PAPER_TPM.safe_conditioning
+_LOW, _HIGH = PAPER_TPM.region.low, PAPER_TPM.region.high
 PROBES = (
     ((0.0, 0.75), BLUE, "-"),
     ((_LOW[0], _LOW[2]), VERMILLION, "--"),
@@ -29,15 +31,13 @@ PROBES = (
 )
 
 _X, _Z = np.linspace(-0.78, 0.96, 436), np.linspace(0.42, 1.17, 188)
-_TICKS = (0.0, 0.02, 0.05, SAFE_CONDITIONING, 0.15, 0.25, 0.35, 0.5)
+_TICKS = (0.0, 0.02, 0.05, _SAFE, 0.15, 0.25, 0.35, 0.5)
 
 
 def conditioning_figure() -> Figure:
     """1/cond(J) in x-z sections, and along y."""
     figure = Figure(figsize=(style.WIDTH, 6.6))
-    style.heading(
-        figure, "Conditioning 1/cond(J)", f"elbows-out mode ({style.mode_name(ELBOWS_OUT)})"
-    )
+    heading(figure, "Conditioning 1/cond(J)", f"elbows-out mode ({mode_name(ELBOWS_OUT)})")
     grid_x, grid_z = np.meshgrid(_X, _Z)
     norm = PowerNorm(0.5, vmin=0.0, vmax=_TICKS[-1], clip=True)  # room for the small values
     for number, y in enumerate(HEIGHTS):
@@ -48,21 +48,21 @@ def conditioning_figure() -> Figure:
         image = axes.pcolormesh(
             _X * MM, _Z * MM, np.ma.masked_equal(value, 0.0), cmap="viridis", norm=norm
         )
-        axes.contour(_X * MM, _Z * MM, value, [SAFE_CONDITIONING], colors="white", linewidths=1.4)
+        axes.contour(_X * MM, _Z * MM, value, [_SAFE], colors="white", linewidths=1.4)
         axes.contour(
             _X * MM, _Z * MM, reach_margin(points, 1), [0], colors=[OUTLINE], linewidths=0.6
         )
-        inside = TASK_REGION.low[1] <= y <= TASK_REGION.high[1]
-        style.outline_task_region(axes, "z", inside)
+        inside = PAPER_TPM.region.low[1] <= y <= PAPER_TPM.region.high[1]
+        outline_task_region(axes, "z", inside)
         largest = float(value.max())
-        style.section_axes(axes, f"y = {y * MM:.0f} mm, largest {largest:.3f}")
+        section_axes(axes, f"y = {y * MM:.0f} mm, largest {largest:.3f}")
         axes.set_aspect("equal")
         if column:
             axes.set_ylabel("")
             axes.tick_params(labelleft=False)
     bar = figure.add_axes((0.912, 0.40, 0.018, 0.495))
     figure.colorbar(image, cax=bar, ticks=_TICKS, format="%g", label="1/cond(J)")
-    bar.axhline(SAFE_CONDITIONING, color="white", linewidth=1.4)
+    bar.axhline(_SAFE, color="white", linewidth=1.4)
     _along_y(figure.add_axes((0.55, 0.115, 0.385, 0.20)))
     _conditioning_legend(figure)
     return figure
@@ -75,8 +75,8 @@ def _along_y(axes: Axes) -> None:
         points = np.stack([np.full_like(y, x), y, np.full_like(y, z)], axis=-1)
         label = f"x = {x * MM:.0f}, z = {z * MM:.0f} mm".replace("-", "\N{MINUS SIGN}")
         axes.plot(y * MM, conditioning_at(points), dash, color=colour, label=label)
-    axes.axhline(SAFE_CONDITIONING, color="0.5", linewidth=0.8)
-    axes.axvspan(TASK_REGION.low[1] * MM, TASK_REGION.high[1] * MM, color="0.92")
+    axes.axhline(_SAFE, color="0.5", linewidth=0.8)
+    axes.axvspan(PAPER_TPM.region.low[1] * MM, PAPER_TPM.region.high[1] * MM, color="0.92")
     axes.set(xlim=(0, PAPER.l7 * MM), ylim=(0, None), xlabel="y (mm)", ylabel="1/cond(J)")
     axes.set_title("along y; shaded: the task region")
     axes.legend(loc="upper left", fontsize=6.5)
@@ -93,7 +93,13 @@ def _conditioning_legend(figure: Figure) -> None:
             linestyle=(0, (3, 2)),
             label="the same, not in this section",
         ),
-        Line2D([], [], color="white", linewidth=1.4, label=f"{SAFE_CONDITIONING}, the safe limit"),
+        Line2D(
+            [],
+            [],
+            color="white",
+            linewidth=1.4,
+            label=f"{_SAFE}, the safe limit",
+        ),
         Line2D([], [], color=OUTLINE, linewidth=0.8, label="edge of the reachable set"),
     ]
     legend = figure.legend(
@@ -121,13 +127,13 @@ def volume(cos_beta_sign: int, step: float = 0.005, slices: int = 32) -> float:
 def workspace_figure() -> Figure:
     """The two reachable sets, in sections and by volume."""
     figure = Figure(figsize=(style.WIDTH, 4.75))
-    style.heading(figure, "Reachable set of point P", "all 16 working modes", 0.975, 0.93)
+    heading(figure, "Reachable set of point P", "all 16 working modes", 0.975, 0.93)
     x, z = np.linspace(-0.95, 1.06, 403), np.linspace(-1.18, 1.22, 481)
     sections = [Section("y", y) for y in (0.0, 0.030, 0.050)] + [Section("z", 0.750)]
     for column, section in enumerate(sections[:3]):
         axes = figure.add_axes((0.095 + 0.233 * column, 0.385, 0.21, 0.47))
         _compare(axes, section, x, z)
-        style.section_axes(axes, f"y = ±{section.at * MM:.0f} mm" if section.at else "y = 0")
+        section_axes(axes, f"y = ±{section.at * MM:.0f} mm" if section.at else "y = 0")
         axes.plot([-300, 300], [0, 0], color=BLACK, linewidth=1.8, solid_capstyle="butt")
         axes.set_aspect("equal")
         if column:
@@ -136,7 +142,7 @@ def workspace_figure() -> Figure:
     axes = figure.add_axes((0.095, 0.1, 0.676, 0.155))
     y = np.linspace(-PAPER.l7, PAPER.l7, 201)
     _compare(axes, sections[3], x, y)
-    style.section_axes(axes, "z = 750 mm (y stretched)", "x", "y")
+    section_axes(axes, "z = 750 mm (y stretched)", "x", "y")
     figure.legend(handles=_workspace_handles(), loc="upper left", bbox_to_anchor=(0.785, 0.865))
     note = "8 modes each: how\nthe legs are bent\nmakes no difference\nto where P can be"
     figure.text(0.795, 0.63, note, va="top", fontsize=7.5)

@@ -8,10 +8,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
+from figures.sections import MM, heading
 from figures.skeleton import skeleton
 from tpm_gym.kinematics import ELBOWS_OUT, WorkingMode
 from tpm_gym.learning import figure_style as style
-from tpm_gym.learning.figure_style import BLACK, BLUE, GREEN, MM, ORANGE, PURPLE, VERMILLION
+from tpm_gym.learning.figure_style import BLACK, BLUE, GREEN, ORANGE, PURPLE, VERMILLION
 
 FloatArray = NDArray[np.float64]
 
@@ -56,7 +57,7 @@ def postures_figure() -> Figure:
     figure = Figure(figsize=(style.WIDTH, 8.5))
     x, y, z = (f"{value * MM:.0f}".replace("-", "\N{MINUS SIGN}") for value in POINT)
     what = f"P at x = {x}, y = {y}, z = {z} mm; z points down"
-    style.heading(figure, "The 16 inverse postures of one point", what, 0.988, 0.963)
+    heading(figure, "The 16 inverse postures of one point", what, 0.988, 0.963)
     for group, cos_beta in enumerate((1, -1)):
         bottom = 0.503 - 0.45 * group
         plan = figure.add_axes((0.30, bottom + 0.375, 0.55, 0.05))

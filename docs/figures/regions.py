@@ -9,14 +9,15 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+from figures.sections import MM, heading, mode_name, outline_task_region, section_axes
 from figures.zero_sets import Section, parallel_lines, reach_margin
 from tpm_gym.analysis.aspects import Aspect, aspects
 from tpm_gym.analysis.singularity import factors_at
 from tpm_gym.kinematics import ELBOWS_OUT
 from tpm_gym.kinematics.geometry import PAPER
-from tpm_gym.kinematics.workspace import TASK_REGION
 from tpm_gym.learning import figure_style as style
-from tpm_gym.learning.figure_style import BLACK, BLUE, GREEN, MM, ORANGE, PURPLE
+from tpm_gym.learning.figure_style import BLACK, BLUE, GREEN, ORANGE, PURPLE
+from tpm_gym.mechanism import PAPER_TPM
 
 FloatArray = NDArray[np.float64]
 
@@ -33,8 +34,8 @@ def aspects_figure() -> Figure:
     """Sections of all aspects, with their volumes."""
     found = aspects(ELBOWS_OUT, shape=SHAPE)
     figure = Figure(figsize=(style.WIDTH, 4.9))
-    what = f"elbows-out mode ({style.mode_name(ELBOWS_OUT)})"
-    style.heading(figure, "Aspects: regions free of singularities", what, 0.978, 0.935)
+    what = f"elbows-out mode ({mode_name(ELBOWS_OUT)})"
+    heading(figure, "Aspects: regions free of singularities", what, 0.978, 0.935)
     for column, y in enumerate((0.005, 0.025, 0.048)):
         axes = figure.add_axes((0.095 + 0.222 * column, 0.385, 0.2, 0.47))
         _section(axes, Section("y", y))
@@ -83,10 +84,10 @@ def _section(axes: Axes, section: Section, x: FloatArray = _X, other: FloatArray
         for line in parallel_lines(factor, ELBOWS_OUT, section, x, other):
             axes.plot(*(line.T * MM), color=BLACK, linewidth=0.8)
     vertical = "z" if section.fixed == "y" else "y"
-    style.section_axes(axes, f"{section.fixed} = {section.at * MM:.0f} mm", "x", vertical)
+    section_axes(axes, f"{section.fixed} = {section.at * MM:.0f} mm", "x", vertical)
     fixed = 1 if section.fixed == "y" else 2
-    if TASK_REGION.low[fixed] <= section.at <= TASK_REGION.high[fixed]:
-        style.outline_task_region(axes, vertical, inside=True)
+    if PAPER_TPM.region.low[fixed] <= section.at <= PAPER_TPM.region.high[fixed]:
+        outline_task_region(axes, vertical, inside=True)
 
 
 def _smallest(axes: Axes) -> None:

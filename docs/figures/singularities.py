@@ -14,6 +14,7 @@ from mpl_toolkits.mplot3d import Axes3D
 from numpy.typing import NDArray
 
 from figures import surfaces
+from figures.sections import MM, heading, mode_name, outline_task_region, section_axes
 from figures.surfaces import Surface
 from figures.zero_sets import (
     Section,
@@ -25,19 +26,18 @@ from figures.zero_sets import (
 from tpm_gym.analysis.singularity import factors_at
 from tpm_gym.kinematics import ELBOWS_OUT, WORKING_MODES
 from tpm_gym.kinematics.geometry import PAPER
-from tpm_gym.kinematics.workspace import TASK_REGION
 from tpm_gym.learning import figure_style as style
 from tpm_gym.learning.figure_style import (
     BLACK,
     BLUE,
     GREEN,
-    MM,
     ORANGE,
     OUTLINE,
     PURPLE,
     REACHED,
     VERMILLION,
 )
+from tpm_gym.mechanism import PAPER_TPM
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -182,8 +182,8 @@ def _draw_serial(space: Axes3D) -> None:
 def _layout(title: str) -> tuple[Figure, Axes3D, list[Axes], list[Axes]]:
     """Space on top, four x-z sections below it, three x-y sections at the bottom."""
     figure = Figure(figsize=(style.WIDTH, 8.7))
-    what = f"elbows-out working mode ({style.mode_name(ELBOWS_OUT)})"
-    style.heading(figure, title, what, 0.982, 0.957)
+    what = f"elbows-out working mode ({mode_name(ELBOWS_OUT)})"
+    heading(figure, title, what, 0.982, 0.957)
     space = figure.add_axes((0.0, 0.55, 0.58, 0.39), projection="3d")
     surfaces.frame(space, _LIMITS_X, _LIMITS_Z)
     sections: list[Axes] = []
@@ -232,11 +232,11 @@ def _finish_section(
 ) -> None:
     """Axes of a section; the task region only where it is cut, and on the environments' mode."""
     vertical = "z" if section.fixed == "y" else "y"
-    style.section_axes(axes, title, "x", vertical)
+    section_axes(axes, title, "x", vertical)
     row = 1 if section.fixed == "y" else 2
-    low, high = TASK_REGION.low[row], TASK_REGION.high[row]
+    low, high = PAPER_TPM.region.low[row], PAPER_TPM.region.high[row]
     if ours and low <= section.at <= high:
-        style.outline_task_region(axes, vertical, inside=True)
+        outline_task_region(axes, vertical, inside=True)
     axes.set_xlim(_LIMITS_X)
     axes.set_xticks([-500, 0, 500, 1000])
     if section.fixed == "y":

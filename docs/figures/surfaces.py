@@ -16,9 +16,9 @@ from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from numpy.typing import NDArray
 
+from figures.sections import MM
 from figures.zero_sets import reach_margin
 from tpm_gym.kinematics.geometry import PAPER
-from tpm_gym.learning.figure_style import MM
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

@@ -17,7 +17,7 @@ from tpm_gym.mechanism.tpm import TPM
 from tpm_gym.simulation.engine import register_engine
 
 if TYPE_CHECKING:
-    from tpm_gym.policy.policy import Policy
+    from tpm_gym.policy import Policy
 
     ENV_IDS: tuple[str, ...]
 
@@ -41,8 +41,8 @@ __version__ = "0.1.0"
 
 
 def load_policy(path: str | Path) -> Policy:
-    """Load a trained policy; the same as :func:`tpm_gym.policy.policy.load_policy`."""
-    from tpm_gym.policy import policy  # here, so that PyTorch is not imported before it is needed
+    """The same as :func:`tpm_gym.policy.load_policy`, which imports PyTorch."""
+    from tpm_gym import policy
 
     return policy.load_policy(path)
 

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 import tpm_gym
 from tpm_gym.analysis import aspects, singularity
 from tpm_gym.analysis.aspects import Aspect, Cells
+from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.kinematics import ELBOWS_OUT, WORKING_MODES, WorkingMode, inverse_all, workspace
 from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
 
-FloatArray = NDArray[np.float64]
 COARSE, FINE = (32, 8, 48), (64, 16, 96)
 modes = st.sampled_from(WORKING_MODES)
 

@@ -12,9 +12,9 @@ from types import SimpleNamespace
 import numpy as np
 import oracle
 import pytest
-from numpy.typing import NDArray
 
 from tpm_gym.analysis.topology import mobility
+from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import GeometryError
 from tpm_gym.kinematics import (
     DEFAULT_ASSEMBLY,
@@ -28,7 +28,6 @@ from tpm_gym.kinematics import (
 )
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 
-FloatArray = NDArray[np.float64]
 l1, l2, l3, l4, l5, l6, l7 = vars(PAPER).values()
 CLOSED = 1e-12  # m^2; and open, below, is at least 1e-4 m^2 on half of the sample
 OPEN = 1e-4

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from tpm_gym.analysis.poc import (
     Chain,
@@ -23,9 +22,9 @@ from tpm_gym.analysis.poc import (
     revolute,
     serial,
 )
+from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import InputError
 
-FloatArray = NDArray[np.float64]
 X, Y, Z = np.eye(3)
 
 # Few directions, so that subspaces often share some.

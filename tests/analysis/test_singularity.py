@@ -9,10 +9,10 @@ import oracle
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from tpm_gym.analysis import singularity
 from tpm_gym.analysis.singularity import FACTORS, SingularityType, nearest_singularity
+from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import ConfigurationError, InputError, UnreachableError
 from tpm_gym.kinematics import (
     ASSEMBLY_MODES,
@@ -27,7 +27,6 @@ from tpm_gym.kinematics import (
 )
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 
-FloatArray = NDArray[np.float64]
 HOME = np.array([-0.05, 0.03, 0.78])
 SIDES = [AssemblyMode(planar, 1) for planar in (-1, 1)]
 

@@ -8,7 +8,6 @@ import numpy as np
 import oracle
 import pytest
 from hypothesis import given, settings
-from numpy.typing import NDArray
 from walk import place, walk
 
 from tpm_gym.analysis.poc import (
@@ -18,6 +17,7 @@ from tpm_gym.analysis.poc import (
     degrees_of_freedom,
 )
 from tpm_gym.analysis.topology import Structure, analyse, closure_jacobian, describe, mobility
+from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import InputError, SingularityError, UnreachableError
 from tpm_gym.kinematics import (
     ASSEMBLY_MODES,
@@ -31,7 +31,6 @@ from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.kinematics.workspace import TASK_REGION
 from tpm_gym.mechanism.tree import build, joint_angles
 
-FloatArray = NDArray[np.float64]
 X, Y, Z = np.eye(3)
 
 

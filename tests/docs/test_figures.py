@@ -10,7 +10,8 @@ from tpm_gym.analysis.aspects import aspects
 from tpm_gym.analysis.singularity import factors_at
 from tpm_gym.kinematics import ASSEMBLY_MODES, ELBOWS_OUT, WORKING_MODES, inverse_all, jacobian
 from tpm_gym.kinematics.geometry import PAPER, Geometry
-from tpm_gym.kinematics.workspace import TASK_REGION, assembly_of, reachable
+from tpm_gym.kinematics.workspace import assembly_of, reachable
+from tpm_gym.mechanism import PAPER_TPM
 
 DOCS = ROOT / "docs"
 
@@ -87,11 +88,11 @@ def test_plane_y_0_is_found_in_sections_of_constant_z():
 
 
 def test_no_parallel_line_enters_the_task_region():
-    for y in np.linspace(TASK_REGION.low[1], TASK_REGION.high[1], 3):
+    for y in np.linspace(PAPER_TPM.region.low[1], PAPER_TPM.region.high[1], 3):
         section = Section("y", y)
         for index in (1, 2):
             for line in parallel_lines(index, ELBOWS_OUT, section, X, Z):
-                assert not TASK_REGION.contains(section.points(line)).any()
+                assert not PAPER_TPM.region.contains(section.points(line)).any()
 
 
 @pytest.mark.parametrize("index", [1, 2, 3])

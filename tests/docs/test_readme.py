@@ -22,8 +22,8 @@ def blocks(language):
 
 def test_the_python_blocks_run():
     namespace = {}
-    for block in blocks("python"):
-        exec(block, namespace)
+    for block in blocks("python"):  # what is learned in 5,000 steps, test-wheel sees
+        exec(block.replace("5_000", "100").replace("2_000_100", "2_000_001"), namespace)
     namespace["env"].close()
     assert namespace["info"]["closure_error"] < 1e-3
 

@@ -1,143 +1,127 @@
+"""What the environment does with its options, its episodes and its snapshots; its datasheet."""
+
+from __future__ import annotations
+
+import copy
+import inspect
 import re
+from collections.abc import Iterator
+from dataclasses import is_dataclass, replace
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from tpm_gym.simulation.physics import Physics
+from episodes import EVERYTHING, bits, expert_episode, play
+from gymnasium.envs.registration import EnvSpec
 
-from tpm_gym.envs.env import TPMEnv
-from tpm_gym.errors import ClosureError, ConfigurationError, EpisodeError
-from tpm_gym.kinematics.workspace import TASK_REGION
-from tpm_gym.mechanism.tree import DEFAULT_MOUNT
-from tpm_gym.tasks import task as tasks
-from tpm_gym.tasks.expert import Expert
+from tpm_gym import TPMEnv
+from tpm_gym.errors import ClosureError, ConfigurationError, EpisodeError, InputError
+from tpm_gym.mechanism.machine import Machine
+from tpm_gym.mechanism.tpm import PAPER_TPM, WIDE_TPM
+from tpm_gym.simulation.bullet.physics import Physics
+from tpm_gym.tasks import Expert, PickAndPlace, Reach, Task
 from tpm_gym.tasks.rewards import singularity_penalty
+from tpm_gym.tasks.sampling import APART
+
+PUCK = PickAndPlace.puck
 
 
 @pytest.fixture
-def env():
-    env = TPMEnv("pick_and_place")
-    yield env
-    env.close()
+def env() -> Iterator[TPMEnv]:
+    made = TPMEnv("pick_and_place")
+    yield made
+    made.close()
 
 
-def test_options_place_the_object_and_the_goal(env):
-    goal, place = (0.02, -0.03, 0.1), (-0.05, -0.025, 0.015)
-    observation, _ = env.reset(seed=0, options={"object": place, "goal": goal})
-    assert np.allclose(observation["desired_goal"], goal)
-    assert np.allclose(observation["achieved_goal"], place)
-    assert np.allclose(env.state.object_position, place)
-    assert np.allclose(env.goal, goal)
+# -- options ---------------------------------------------------------------------------------------
 
 
-def test_observations_come_from_forward_kinematics_while_moving(env):
-    env.reset(seed=2)
-    for _ in range(10):
-        observation = env.step(np.array([1.0, -1.0, 0.5, 0.0]))[0]
-        decoded = env.task.decode(observation["observation"])
-        assert np.allclose(decoded["position"], env.state.fk_position, atol=1e-6)
-        assert np.allclose(decoded["velocity"], env.state.fk_velocity, atol=1e-5)
+@pytest.mark.parametrize(
+    "options",
+    [
+        *({"penalty_weight": value} for value in (-1.0, np.nan, "much", 10**400, [1.0])),
+        {"randomisation": 0.1},
+        {"randomisation": {"encoder_jitter": 0.1}},
+        *(
+            {"physics": value}
+            for value in (5, {"gravity": 0}, Physics, Physics(control_period=0.2))
+        ),
+        {"renderer": "raytracer"},
+        *({"width": value} for value in (0, 15, 5000, 64.0, "64")),
+        {"height": 2.5},
+        {"render_mode": "ascii"},
+        {"control": "torque"},
+        {"reward": "none"},
+        {"goals": "hard"},
+        {"task": "juggle"},
+        *({"engine": value} for value in ("havok", None, 3)),
+        *({"machine": value} for value in ("delta", 3, object, Machine, {"name": "paper"})),
+    ],
+    ids=lambda options: str(options)[:50],
+)
+def test_bad_options_are_refused_by_name(options: dict[str, Any]) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        TPMEnv(**options)
+    name = next(iter(options))
+    assert caught.value.name == name
+    assert repr(options[name])[:20] in repr(caught.value.value)
 
 
-def drive_to_the_singular_side(env):
-    """Step towards small y until the command stops; the last step's results."""
-    env.reset(seed=3)
-    for _ in range(12):
-        result = env.step(np.array([0.5, -1.0, 0.0]))
-    return result
+def test_unknown_options_raise_a_type_error() -> None:
+    with pytest.raises(TypeError, match="colour"):
+        gym.make("TPMReach-v0", colour="red")
 
 
-def test_the_penalty_grows_towards_the_singularity_and_follows_the_weight():
-    rewards = []
-    for weight in (0.0, 1.0, 2.0):
-        env = TPMEnv("reach", penalty_weight=weight)
-        _, reward, _, _, info = drive_to_the_singular_side(env)
-        assert info["conditioning"] < 0.08
-        assert info["singularity_penalty"] == float(singularity_penalty(info["conditioning"]))
-        assert info["singularity_penalty"] > 0.1
-        assert sum(info["reward_terms"].values()) == pytest.approx(reward)
-        rewards.append(reward)
-        env.close()
-    assert rewards[0] - rewards[1] == pytest.approx(info["singularity_penalty"])
-    assert rewards[0] - rewards[2] == pytest.approx(2 * info["singularity_penalty"])
-
-
-def test_hindsight_keeps_the_penalty_by_the_difference_of_goal_terms():
-    env = TPMEnv("reach")
-    observation, reward, _, _, info = drive_to_the_singular_side(env)
-    achieved, goal, other = observation["achieved_goal"], observation["desired_goal"], np.zeros(3)
-    for new_goal in (achieved, other):
-        relabelled = (
-            reward
-            - env.compute_reward(achieved, goal, {})
-            + env.compute_reward(achieved, new_goal, {})
-        )
-        assert relabelled == pytest.approx(env.compute_reward(achieved, new_goal, info))
-    env.close()
-
-
-def test_a_lost_loop_voids_the_episode_and_a_reset_recovers(env):
-    env.reset(seed=4)
-    healthy = env.simulation.move
-
-    def broken(*arguments):
-        raise ClosureError(0.02, 0.005)
-
-    env.simulation.move = broken
-    with pytest.raises(ClosureError, match="reset"):
-        env.step(np.zeros(4))
-    with pytest.raises(EpisodeError, match="reset"):
-        env.step(np.zeros(4))
-    env.simulation.move = healthy
-    env.reset(seed=4)
-    assert env.step(np.zeros(4))[4]["closure_error"] < 1e-4
-
-
-@pytest.mark.parametrize("stop", [2, 5, 6, 8, 12, 20, 30])
-def test_a_saved_state_continues_bit_equally(env, stop):
-    observation, _ = env.reset(seed=3)
-    expert = Expert(env)
-    expert.reset(observation)
-    actions = []
-    for step in range(40):
-        if step == stop:
-            snapshot = env.save_state()
-            held = env.state.holding
-        actions.append(expert.act(observation))
-        observation = env.step(actions[-1])[0]
-    next_goal = env.reset()[0]["desired_goal"]
-    env.reset(seed=6)
-    restored = env.restore_state(snapshot)
-    assert env.state.holding is held
-    for action in actions[stop:]:
-        restored = env.step(action)[0]
-    for name, array in observation.items():
-        assert np.array_equal(restored[name], array)
-    assert np.array_equal(env.reset()[0]["desired_goal"], next_goal)
-
-
-@pytest.mark.parametrize("physics", [5, {}, Physics(control_period=0.2)])
-def test_physics_that_do_not_fit_the_tasks_are_refused(physics):
-    with pytest.raises(ConfigurationError, match="physics"):
-        TPMEnv(physics=physics)
-
-
-def test_a_state_cannot_be_saved_outside_an_episode(env):
-    with pytest.raises(EpisodeError):
-        env.save_state()
-
-
-def test_rgb_array_gives_pictures_of_the_asked_size():
-    env = gym.make("TPMPickAndPlace-v0", render_mode="rgb_array", width=96, height=64)
+@pytest.mark.parametrize("machine", ["wide", WIDE_TPM, replace(PAPER_TPM, name="mine")], ids=str)
+def test_machines_are_taken_by_name_or_value(machine: Any) -> None:
+    env = gym.make("TPMReach-v0", machine=machine, engine="pybullet")
+    inner: Any = env.unwrapped
+    assert inner.machine == (WIDE_TPM if machine == "wide" else machine)
     env.reset(seed=0)
-    picture = env.render()
-    assert picture.shape == (64, 96, 3)
-    assert picture.dtype == np.uint8
-    assert picture.std() > 10
+    home = inner.machine.mount.to_world(inner.machine.home)
+    np.testing.assert_allclose(inner.state.platform_position, home, atol=1e-4)
     env.close()
 
 
-def test_human_mode_without_a_display_is_refused_instead_of_ending_the_process(monkeypatch):
+def test_tasks_are_taken_by_name_class_or_value() -> None:
+    made = PickAndPlace(WIDE_TPM, "dense", penalty_weight=3.0)
+    for task, machine in (
+        ("pick_and_place", PAPER_TPM),
+        (PickAndPlace, PAPER_TPM),
+        (made, WIDE_TPM),
+    ):
+        env = TPMEnv(task)
+        assert type(env.task) is PickAndPlace
+        assert (env.task is made) == (task is made)
+        assert env.machine is env.task.machine is machine
+        env.close()
+    with pytest.raises(ConfigurationError, match="has its own"):
+        TPMEnv(made, reward="sparse")
+
+
+class Scaled(Reach):
+    """A task with a value of its own."""
+
+    def __init__(self, machine: Machine, tolerance: float, **options: Any) -> None:
+        super().__init__(machine, **options)
+        self.tolerance = tolerance  # type: ignore[misc]
+
+
+def test_a_task_of_ones_own_goes_along_with_copies() -> None:
+    env = TPMEnv(Scaled(PAPER_TPM, 0.05))
+    env.reset(seed=0)
+    other = copy.deepcopy(env)
+    assert other.task.tolerance == 0.05
+    assert other.task is not env.task
+    assert play(other, [np.full(3, 0.3)] * 5) == play(env, [np.full(3, 0.3)] * 5)
+    for one in (env, other):
+        one.close()
+
+
+def test_human_mode_without_a_display_is_refused_instead_of_ending_the_process(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr("sys.platform", "linux")
     monkeypatch.delenv("DISPLAY", raising=False)
     with pytest.raises(ConfigurationError, match="display"):
@@ -148,29 +132,142 @@ def test_human_mode_without_a_display_is_refused_instead_of_ending_the_process(m
     env.close()
 
 
-def test_the_datasheet_lists_the_entries_and_numbers_that_the_code_uses():
-    text = TPMEnv.__doc__
-    rows = re.findall(r"^    \| (\w+) \| (\d) \| (.+) \|$", text, flags=re.MULTILINE)
-    entries = [(e.name, str(len(e.scale)), e.meaning) for e in tasks.PickAndPlace.entries]
-    assert rows == entries
-    assert "at most 30, 5, 30 mm" in text
-    assert list(tasks.STEP_LIMIT) == [0.03, 0.005, 0.03]
-    assert "(1 - (c / 0.08)^4) where c = 1/cond(J) < 0.08, else 0" in text
-    assert singularity_penalty(0.05) == pytest.approx(1 - (0.05 / 0.08) ** 4)
-    assert singularity_penalty(0.08) == 0.0 < singularity_penalty(0.0799)
-    low, high = np.array(TASK_REGION.low), np.array(TASK_REGION.high)
-    (x0, y0, z1), (x1, y1, z0) = DEFAULT_MOUNT.to_world(low), DEFAULT_MOUNT.to_world(high)
-    box = f"{x0:.4g} <= x <= {x1:.4g}, {y1:.4g} <= y <= {y0:.4g}, {z0:.4g} <= z <= {z1:.4g} m"
-    assert box in text
-    puck = tasks.PickAndPlace.puck
-    size = (1e3 * puck.width, 1e3 * puck.height, 1e3 * puck.mass)
-    assert "(square, {:.0f} mm wide, {:.0f} mm high, {:.0f} g)".format(*size) in text
-    assert f"below {1e3 * tasks.TOLERANCE:.0f} mm" in text
-    assert f"at least {1e3 * tasks.MIN_SEPARATION:.0f} mm" in text
+def test_rgb_array_gives_pictures_of_the_asked_size() -> None:
+    env = gym.make("TPMPickAndPlace-v0", render_mode="rgb_array", width=96, height=64)
+    env.reset(seed=0)
+    picture: Any = env.render()
+    assert picture.shape == (64, 96, 3)
+    assert picture.dtype == np.uint8
+    assert picture.std() > 10
+    env.close()
+
+
+PHYSICS = Physics(time_step=1 / 500, erp=0.9)
+
+
+@pytest.mark.parametrize("physics", [PHYSICS, {"time_step": 1 / 500, "erp": 0.9}], ids=repr)
+def test_a_spec_with_physics_and_randomisation_survives_json(physics: Any) -> None:
+    env = gym.make("TPMReach-v0", physics=physics, randomisation=EVERYTHING, machine="wide")
+    spec: Any = env.spec
+    again = gym.make(EnvSpec.from_json(spec.to_json()))
+    inner, other = env.unwrapped, again.unwrapped
+    assert inner.simulation.engine.physics == other.simulation.engine.physics == PHYSICS
+    assert (inner.randomisation, inner.machine) == (other.randomisation, other.machine)
+    actions = [np.full(3, 0.5)] * 5
+    inner.reset(seed=1)
+    snapshot = inner.save_state()
+    again.reset()
+    other.restore_state(snapshot)
+    assert play(again.unwrapped, actions) == play(env.unwrapped, actions)
+    env.close()
+    again.close()
+
+
+# -- episodes --------------------------------------------------------------------------------------
+
+
+def test_options_place_the_object_and_the_goal(env: TPMEnv) -> None:
+    goal, place = (0.02, -0.03, 0.1), (-0.05, -0.025, 0.015)
+    observation, _ = env.reset(seed=0, options={"object": place, "goal": goal})
+    for found, wanted in (
+        (observation["desired_goal"], goal),
+        (env.goal, goal),
+        (observation["achieved_goal"], place),
+        (env.state.object_position[0], place),
+    ):
+        np.testing.assert_allclose(found, wanted, atol=1e-6)
+
+
+def test_observations_come_from_forward_kinematics_while_moving(env: TPMEnv) -> None:
+    env.reset(seed=2)
+    for _ in range(10):
+        observation = env.step(np.array([1.0, -1.0, 0.5, 0.0]))[0]
+        decoded = env.task.decode(observation["observation"])
+        assert np.allclose(decoded["position"], env.state.fk_position, atol=1e-6)
+        assert np.allclose(decoded["velocity"], env.state.fk_velocity, atol=1e-5)
+
+
+class Far(Reach):
+    """Its observations lie beyond the space."""
+
+    size = 1.0
+
+    def achieved(self, state: Any) -> Any:
+        return state.fk_position + (0.0, self.size, -self.size)
+
+    def observe(self, state: Any) -> Any:
+        return super().observe(state) + np.eye(9)[4] * self.size - np.eye(9)[7] * self.size
+
+
+@pytest.mark.parametrize("size", [1e2, 1e5, 1e30])
+def test_observations_are_clipped_into_their_space_and_else_exact(size: float) -> None:
+    env = TPMEnv(Far)
+    env.task.size = size  # type: ignore[attr-defined]
+    seen, _ = env.reset(seed=0)
+    assert env.observation_space.contains(seen)
+    exact = env.task.observe(env.state)
+    inside = np.abs(exact) < 10
+    assert inside.sum() == 7
+    np.testing.assert_array_equal(seen["observation"][inside], exact[inside].astype(np.float32))
+    np.testing.assert_array_equal(seen["observation"][~inside], [10, -10])
+    np.testing.assert_array_equal(seen["achieved_goal"][1:], [2, -2])
+    env.close()
+
+
+def drive_to_the_singular_side(env: TPMEnv) -> Any:
+    """Step towards small y until the command stops; the last step's results."""
+    env.reset(seed=3)
+    for _ in range(12):
+        result = env.step(np.array([0.5, -1.0, 0.0]))
+    return result
+
+
+def test_the_penalty_grows_towards_the_singularity_and_follows_the_weight() -> None:
+    rewards = []
+    for weight in (0.0, 1.0, 2.0):
+        env = TPMEnv("reach", penalty_weight=weight)
+        _, reward, _, _, info = drive_to_the_singular_side(env)
+        assert info["conditioning"] < 0.08
+        assert info["singularity_penalty"] == singularity_penalty(info["conditioning"], 0.08)
+        assert info["singularity_penalty"] > 0.1
+        assert info["reward_terms"]["singularity"] == -weight * info["singularity_penalty"]
+        rewards.append(reward)
+        env.close()
+    assert rewards[0] - rewards[1] == pytest.approx(info["singularity_penalty"])
+    assert rewards[0] - rewards[2] == pytest.approx(2 * info["singularity_penalty"])
+
+
+def test_hindsight_keeps_the_penalty_by_the_difference_of_goal_terms() -> None:
+    env = TPMEnv("reach")
+    observation, reward, _, _, info = drive_to_the_singular_side(env)
+    achieved, goal = observation["achieved_goal"], observation["desired_goal"]
+    for new_goal in (achieved, np.zeros(3)):
+        old, new = (env.compute_reward(achieved, g, {}) for g in (goal, new_goal))
+        assert reward - old + new == pytest.approx(env.compute_reward(achieved, new_goal, info))
+    env.close()
+
+
+def test_a_lost_loop_voids_the_episode_and_a_reset_recovers(
+    env: TPMEnv, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: Any) -> None:
+        raise ClosureError(0.02, 0.005)
+
+    env.reset(seed=4)
+    with monkeypatch.context() as patch:
+        patch.setattr(env.simulation, "move", broken)
+        with pytest.raises(ClosureError, match="reset"):
+            env.step(np.zeros(4))
+    with pytest.raises(EpisodeError, match="reset"):
+        env.step(np.zeros(4))
+    env.reset(seed=4)
+    assert env.step(np.zeros(4))[4]["closure_error"] < 1e-4
 
 
 @pytest.mark.parametrize("sideways", [(-1.0, -1.0), (1.0, 1.0), (1.0, -1.0), (0.0, 0.0)])
-def test_hammering_on_the_puck_at_full_speed_does_not_lose_the_mechanism(env, sideways):
+def test_hammering_on_the_puck_at_full_speed_does_not_lose_the_mechanism(
+    env: TPMEnv, sideways: tuple[float, float]
+) -> None:
     for offset in (-0.016, 0.0, 0.016):
         options = {"object": (-0.04 + offset, -0.028, 0.015), "goal": (0.05, -0.03, 0.1)}
         env.reset(seed=0, options=options)
@@ -179,3 +276,158 @@ def test_hammering_on_the_puck_at_full_speed_does_not_lose_the_mechanism(env, si
             env.step(down)
             info = env.step(down + (*sideways, 0.0, 0.0))[4]
             assert info["closure_error"] < 0.15e-3
+
+
+def test_a_puck_that_is_thrown_is_lost(env: TPMEnv) -> None:
+    """The expert lifts it, swings at full speed and lets go; it slides on, out of reach."""
+    observation, info = env.reset(
+        seed=0, options={"object": (-0.18, -0.03, 0.015), "goal": (0.1, -0.03, 0.25)}
+    )
+    expert = Expert(env)
+    expert.reset(observation)
+    told = [info["object_lost"]]
+    for _ in range(50):
+        action = expert.act(observation)
+        if env.state.object_position[0, 0] > 0.03:
+            action[:] = (1.0, 0.0, 0.0, -1.0)
+        observation, _, _, _, info = env.step(action)
+        told.append(info["object_lost"])
+    assert env.state.object_position[0, 0] > 0.12 + PUCK.width / 2
+    assert told == sorted(told)
+    assert told[0] is False
+    assert told[-1] is True
+
+
+@pytest.mark.parametrize("x", [0.2, 0.6], ids=["on the table", "beside it"])
+def test_a_puck_that_is_pushed_off_is_lost(env: TPMEnv, x: float) -> None:
+    env.reset(seed=0)
+    body, client = env.simulation.engine.bodies[0], env.simulation.engine.client
+    client.resetBasePositionAndOrientation(body, (x, -0.03, 0.016), (0, 0, 0, 1))
+    for _ in range(10):
+        info = env.step(np.zeros(4))[4]
+        assert info["object_lost"] is True
+    assert env.reset(seed=0)[1]["object_lost"] is False
+
+
+def test_info_tells_the_machine_that_was_drawn() -> None:
+    env = TPMEnv("pick_and_place", randomisation=EVERYTHING)
+    first, second, again = (env.reset(seed=seed)[1]["randomisation"] for seed in (1, 2, 1))
+    assert first == again != second
+    plant = env.simulation.plant
+    assert first == {**vars(plant), "latency": 1}
+    assert first["puck_mass"] != 1
+    assert len(first["link_masses"]) == len(env.machine.mechanism.links) - 1
+    assert "randomisation" not in env.step(np.zeros(4))[4]
+    env.close()
+    nominal = TPMEnv()
+    assert "randomisation" not in nominal.reset(seed=0)[1]
+    nominal.close()
+
+
+# -- snapshots -------------------------------------------------------------------------------------
+
+GARBAGE: list[Any] = [None, "x", np.nan, -1, (), (1.0,), np.full(3, np.nan), object(), 10**5000]
+
+
+def tampered(value: Any) -> Iterator[Any]:
+    """Garbage instead of a value, and the value with an entry, at any depth, tampered with."""
+    yield from (garbage for garbage in GARBAGE if garbage is not value)
+    if is_dataclass(value):
+        for name in vars(value).keys() - {"kind"}:
+            yield from (replace(value, **{name: new}) for new in tampered(getattr(value, name)))
+    elif isinstance(value, dict):
+        for name in value:
+            yield from ({**value, name: new} for new in tampered(value[name]))
+    elif isinstance(value, (tuple, list)):
+        yield [*value, value]
+        build = getattr(value, "_make", type(value))  # also of named ones
+        for i, entry in enumerate(value):
+            yield from (build([*value[:i], new, *value[i + 1 :]]) for new in tampered(entry))
+
+
+def test_a_changed_snapshot_raises_and_touches_nothing() -> None:
+    env = TPMEnv("pick_and_place", randomisation={"latency": 1, "link_mass": (0.9, 1.1)})
+    for _ in expert_episode(env, 3, steps=20):
+        pass
+    assert env.state.held == 0
+    snapshot = env.save_state()
+    env.reset(seed=5)
+    before = bits(vars(env.state)), env.goal.tolist(), env.np_random.bit_generator.state
+    count = 0
+    for wrong in tampered(snapshot):
+        with pytest.raises(InputError, match="snapshot"):
+            env.restore_state(wrong)
+        after = bits(vars(env.state)), env.goal.tolist(), env.np_random.bit_generator.state
+        assert after == before
+        count += 1
+    assert count > 1500
+    env.step(np.zeros(4))
+    env.restore_state(snapshot)
+    assert env.state.held == 0
+    env.close()
+
+
+@pytest.mark.parametrize("wrong", [None, 0, "state", (), object(), 10**5000], ids=type)
+def test_what_is_no_snapshot_is_refused(env: TPMEnv, wrong: Any) -> None:
+    env.reset(seed=0)
+    with pytest.raises(InputError, match="save_state"):
+        env.restore_state(wrong)
+    env.step(np.zeros(4))
+
+
+def test_a_snapshot_of_another_kind_of_environment_is_refused(env: TPMEnv) -> None:
+    env.reset(seed=0)
+    others: list[dict[str, Any]] = [
+        {"task": "reach"},
+        {"machine": "wide"},
+        {"randomisation": {"latency": 1}},
+        {"physics": PHYSICS},
+    ]
+    for options in others:
+        other = TPMEnv(**{"task": "pick_and_place", **options})
+        other.reset(seed=0)
+        with pytest.raises(InputError, match="of the same task and options"):
+            env.restore_state(other.save_state())
+        other.close()
+    env.step(np.zeros(4))
+
+
+# -- the datasheet ---------------------------------------------------------------------------------
+
+
+def test_the_datasheet_lists_the_entries_and_numbers_that_the_code_uses() -> None:
+    text = inspect.getdoc(TPMEnv) or ""
+    task, machine = PickAndPlace(PAPER_TPM), PAPER_TPM
+    rows = re.findall(r"^\| (\w+) \| (\d) \| (.+) \|$", text, flags=re.MULTILINE)
+    assert rows == [(e.name, str(len(e.scale)), e.meaning) for e in task.entries]
+    sizes = {kind: kind(PAPER_TPM).observation_size for kind in (Reach, PickAndPlace)}
+    assert f"{sizes[Reach]} numbers (Reach) or {sizes[PickAndPlace]}" in text
+    steps = ", ".join(f"{1e3 * step:g}" for step in machine.step_limit)
+    assert f"at most {steps} mm" in text
+    assert f"at most {machine.joint_limit} rad" in text
+    safe = machine.safe_conditioning
+    assert f"(1 - (c / {safe})^4) where c = 1/cond(J) < {safe}, else 0" in text
+    assert f"1/cond(J) >= {safe}" in text
+    assert singularity_penalty(0.05, safe) == pytest.approx(1 - (0.05 / safe) ** 4)
+    (x0, y0, z1), (x1, y1, z0) = (
+        machine.mount.to_world(end) for end in vars(machine.region).values()
+    )
+    box = f"{x0:.4g} <= x <= {x1:.4g}, {y1:.4g} <= y <= {y0:.4g}, {z0:.4g} <= z <= {z1:.4g} m"
+    assert box in text
+    size = (1e3 * PUCK.width, 1e3 * PUCK.height, 1e3 * PUCK.mass)
+    assert "(square, {:.0f} mm wide, {:.0f} mm high, {:.0f} g)".format(*size) in text
+    assert f"below {1e3 * Task.tolerance:.0f} mm" in text
+    assert f"at least {1e3 * APART:.0f} mm" in text
+
+
+def test_the_datasheet_lists_all_of_info_and_every_option() -> None:
+    text = inspect.getdoc(TPMEnv) or ""
+    env = TPMEnv(randomisation=EVERYTHING)
+    info = text[text.index("## Info") : text.index("Args:")]
+    assert re.findall(r"^\| ``(\w+)`` \|", info, re.M) == list(env.reset(seed=0)[1])
+    env.close()
+    options = list(inspect.signature(TPMEnv).parameters)
+    assert (
+        re.findall(r"^    (\w+): ", text[text.index("Args:") : text.index("Raises:")], re.M)
+        == options
+    )

@@ -1,36 +1,125 @@
+"""Ids mean what they say; users add their own; importing the package imports little."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from typing import Any
+
 import gymnasium as gym
 import pytest
 
 import tpm_gym
-from tpm_gym.envs.registration import MAX_EPISODE_STEPS, register
+from tpm_gym import TPMEnv, register_task
+from tpm_gym.envs import registration
+from tpm_gym.envs.registration import MAX_EPISODE_STEPS
+from tpm_gym.errors import ConfigurationError
+from tpm_gym.tasks import PickAndPlace, Reach
+from tpm_gym.tasks.registry import TASKS
 
 
-def test_all_eight_ids_are_registered_under_their_documented_names():
-    expected = {
+@pytest.fixture
+def registries() -> Iterator[None]:
+    """What a test registers is forgotten after it."""
+    ids, tasks = dict(gym.registry), dict(TASKS)
+    yield
+    for registry, before in ((gym.registry, ids), (TASKS, tasks)):
+        registry.clear()
+        registry.update(before)
+
+
+class Lift(PickAndPlace):
+    """A user's."""
+
+
+def test_all_eight_ids_are_registered_under_their_documented_names() -> None:
+    assert set(tpm_gym.ENV_IDS) == {
         f"TPM{task}{control}{reward}-v0"
         for task in ("Reach", "PickAndPlace")
         for control in ("", "Joints")
         for reward in ("", "Dense")
     }
-    assert set(tpm_gym.ENV_IDS) == expected
-    assert expected <= set(gym.registry)
+    assert set(tpm_gym.ENV_IDS) <= set(gym.registry)
 
 
 @pytest.mark.parametrize("env_id", tpm_gym.ENV_IDS)
-def test_an_id_means_what_it_says(env_id):
+def test_an_id_means_what_it_says(env_id: str) -> None:
     env = gym.make(env_id)
-    task = env.unwrapped.task
-    assert type(task).__name__ == ("PickAndPlace" if "Pick" in env_id else "Reach")
-    assert task.reward == ("dense" if "Dense" in env_id else "sparse")
+    inner: Any = env.unwrapped
+    assert type(inner.task) is (PickAndPlace if "Pick" in env_id else Reach)
+    assert inner.task.reward == ("dense" if "Dense" in env_id else "sparse")
     control = "JointControl" if "Joints" in env_id else "CartesianControl"
-    assert type(env.unwrapped.control).__name__ == control
+    assert type(inner.control).__name__ == control
     assert env.action_space.shape == ((4,) if "Pick" in env_id else (3,))
     assert env.spec.max_episode_steps == MAX_EPISODE_STEPS == 50
     assert env.metadata["render_fps"] == 25
     env.close()
 
 
-def test_registering_twice_is_harmless():
-    before = dict(gym.registry)
-    register()
-    assert gym.registry == before
+@pytest.mark.usefixtures("registries")
+def test_a_users_task_gets_four_ids_and_a_name() -> None:
+    ids = register_task("Lift", Lift, version=3, max_episode_steps=7)
+    assert ids == ("TPMLift-v3", "TPMLiftDense-v3", "TPMLiftJoints-v3", "TPMLiftJointsDense-v3")
+    assert tpm_gym.ENV_IDS[-4:] == ids
+    assert len(tpm_gym.ENV_IDS) == 12
+    env = gym.make(ids[-1], machine="wide")
+    assert type(env.unwrapped.task) is Lift
+    assert env.spec.max_episode_steps == 7
+    env.close()
+    TPMEnv("lift").close()
+
+
+@pytest.mark.usefixtures("registries")
+def test_registering_twice_is_harmless_and_a_class_defined_anew_replaces_its_forerunner() -> None:
+    for name, task in (("Reach", Reach), ("PickAndPlace", PickAndPlace), ("Lift", Lift)):
+        register_task(name, task)
+        before = dict(gym.registry)
+        register_task(name, task)
+        assert gym.registry == before
+    anew = type("Lift", (Reach,), {"__module__": Lift.__module__})
+    register_task("Lift", anew)
+    env = gym.make("TPMLift-v0")
+    assert type(env.unwrapped.task) is anew
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("name", "task", "options", "blamed"),
+    [
+        ("Reach", Lift, {}, "name"),
+        ("Reach", Reach, {"max_episode_steps": 100}, "name"),  # the ids' are 50
+        ("ReachJoints", Lift, {}, "name"),  # its id is that of Reach with joints
+        ("PickAndPlaceDense", Lift, {}, "name"),
+        *((name, Lift, {}, "name") for name in ("lift", "", "Lift up", "Lift-v0", None, 3)),
+        ("Lift", Lift(tpm_gym.mechanism.tpm.PAPER_TPM), {}, "task"),
+        ("Lift", dict, {}, "task"),
+    ],
+    ids=str,
+)
+@pytest.mark.usefixtures("registries")
+def test_what_cannot_be_registered_is_refused_and_leaves_nothing(
+    name: Any, task: Any, options: dict[str, Any], blamed: str
+) -> None:
+    ids, tasks = dict(gym.registry), dict(TASKS)
+    with pytest.raises(ConfigurationError) as caught:
+        register_task(name, task, **options)
+    assert caught.value.name == blamed
+    assert (gym.registry, TASKS) == (ids, tasks)
+
+
+def test_other_ids_are_not_taken_for_ours(registries: None) -> None:
+    gym.register("Elsewhere-v0", entry_point="elsewhere:Env")
+    assert "Elsewhere-v0" not in registration.env_ids()
+    with pytest.raises(AttributeError, match="ENV_IDX"):
+        _ = tpm_gym.ENV_IDX
+
+
+def test_importing_the_package_imports_no_engine_and_nothing_of_learning() -> None:
+    heavy = "pybullet", "mujoco", "torch", "matplotlib", "yaml", "stable_baselines3", "scipy"
+    code = (
+        "import sys, tpm_gym; tpm_gym.ENV_IDS; from tpm_gym.tasks import Expert;"
+        f"print(sorted(set({heavy}) & set(sys.modules)))"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (result.stdout.strip(), result.stderr) == ("[]", "")

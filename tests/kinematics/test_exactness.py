@@ -17,10 +17,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from tpm_gym.arrays import FloatArray
 from tpm_gym.kinematics import ASSEMBLY_MODES, forward_all, inverse_all, jacobian
 from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
 
-FloatArray = NDArray[np.float64]
 Rows = NDArray[np.int64]
 CLOSED = 1e-12
 BLOCK = 20_000

@@ -9,11 +9,8 @@ import oracle
 import pytest
 from hypothesis import given, settings
 
-from tpm_gym.errors import UnreachableError
 from tpm_gym.kinematics import (
     ASSEMBLY_MODES,
-    DEFAULT_ASSEMBLY,
-    ELBOWS_OUT,
     WORKING_MODES,
     forward,
     forward_all,
@@ -193,24 +190,6 @@ def test_leading_shapes_broadcast_and_agree_with_single_calls(shape: tuple[int, 
         np.testing.assert_allclose(forward(theta)[index], forward(theta[index]), atol=1e-13)
 
 
-def test_mirrored_points_have_mirrored_solutions() -> None:
-    targets = oracle.reachable_points(np.random.default_rng(9), 2000, PAPER)
-    mirror = np.array([1, -1, 1])
-    there, back = inverse_all(targets), inverse_all(targets * mirror)
-    np.testing.assert_array_equal(there.valid, back.valid)
-    np.testing.assert_array_equal(there.theta, back.theta)
-    np.testing.assert_array_equal(there.beta, -back.beta)
-    solutions = forward_all(there.theta[there.valid])
-    for slot, mode in enumerate(ASSEMBLY_MODES):
-        twin = next(
-            i
-            for i, other in enumerate(ASSEMBLY_MODES)
-            if (other.planar, other.sin_beta) == (mode.planar, -mode.sin_beta)
-        )
-        mirrored = solutions.position[:, twin] * mirror
-        np.testing.assert_array_equal(solutions.position[:, slot], mirrored)
-
-
 def test_passive_angles_point_along_the_links() -> None:
     rng = np.random.default_rng(10)
     for slot, mode in enumerate(ASSEMBLY_MODES):
@@ -232,32 +211,3 @@ def test_passive_angles_point_along_the_links() -> None:
         assert np.abs(PAPER.l4 * directions - oracle.rods(p)).max() < 1e-11
         link7 = PAPER.l7 * oracle.vector(np.cos(found.beta), np.sin(found.beta), 0)
         assert np.abs(link7 - (p["E1"] - p["D1"])).max() < 1e-11
-
-
-def test_named_branches_return_their_slots() -> None:
-    found = inverse_all(HOME)
-    for slot, mode in enumerate(WORKING_MODES):
-        if found.valid[slot]:
-            # numpy may round one number and many differently
-            np.testing.assert_allclose(inverse(HOME, mode), found.theta[slot], atol=1e-14)
-    np.testing.assert_array_equal(inverse(HOME), inverse(HOME, ELBOWS_OUT))
-    theta = inverse(HOME)
-    for slot, mode in enumerate(ASSEMBLY_MODES):
-        if forward_all(theta).valid[slot]:
-            expected = forward_all(theta).position[slot]
-            np.testing.assert_allclose(forward(theta, mode), expected, atol=1e-14)
-    np.testing.assert_array_equal(forward(theta), forward(theta, DEFAULT_ASSEMBLY))
-
-
-def test_single_calls_agree_with_the_batch_on_what_can_be_assembled() -> None:
-    rng = np.random.default_rng(11)
-    for theta in rng.uniform(-np.pi, np.pi, (3000, 3)):
-        solutions = forward_all(theta)
-        for slot, mode in enumerate(ASSEMBLY_MODES):
-            if solutions.valid[slot]:
-                found = forward(theta, mode)
-                # y goes with the square root of what rounding leaves of 1 - cos(beta)
-                np.testing.assert_allclose(found, solutions.position[slot], atol=1e-9)
-            else:
-                with pytest.raises(UnreachableError):
-                    forward(theta, mode)

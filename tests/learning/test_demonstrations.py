@@ -11,8 +11,7 @@ import torch
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
 
-from tpm_gym.learning.demonstrations import Demonstrations
-from tpm_gym.learning.hindsight import PenaltyHerReplayBuffer
+from tpm_gym.learning import Demonstrations, PenaltyHerReplayBuffer
 
 HORIZON = 50
 

@@ -7,6 +7,7 @@ import pickle
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import gymnasium as gym
@@ -22,9 +23,10 @@ from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import tpm_gym
-from tpm_gym.learning import export
+from tpm_gym.learning import GoalGapExtractor, PenaltyHerReplayBuffer, export
+from tpm_gym.learning.command_line import main
 from tpm_gym.learning.errors import ConfigError, PolicyError
-from tpm_gym.learning.features import GoalGapExtractor
+from tpm_gym.learning.policies import load_model
 from tpm_gym.policy.files import read_description
 
 RECIPE = {"n_timesteps": 5000, "arguments": {"gamma": 0.95, "policy_kwargs": {"net_arch": [8]}}}
@@ -145,10 +147,12 @@ def test_the_description_is_that_of_the_model(tmp_path: Path, model: Any) -> Non
     about = read_description(path)
     assert (about.env_id, about.algorithm) == ("TPMPickAndPlace-v0", "sac")
     assert (about.seed, about.steps, about.recipe) == (5, 1234, RECIPE)
-    assert about.versions["torch"] == torch.__version__
+    # PyPI's package leaves out the local part, such as +cu130, that the module tells.
+    assert str(about.versions["torch"]).split("+")[0] == torch.__version__.split("+")[0]
     assert about.observation_space == model.observation_space
     assert about.action_space == model.action_space
-    assert (about.network.features, about.network.unit) == ("goal_gap", 0.07)
+    features = about.network.features
+    assert (features.kind, features.unit) == ("goal_gap", 0.07)
     text = path.read_text()
     assert str(tmp_path) not in text
     assert str(Path.home()) not in text
@@ -228,7 +232,7 @@ def counted() -> Blank:
             lambda: PPO("MultiInputPolicy", VecNormalize(DummyVecEnv([Blank]))),
             "VecNormalize",
         ),
-        (lambda: make(SAC, Blank(), net_arch=[4097]), "from 1 to 4096"),
+        (lambda: make(SAC, Blank(), net_arch=[4097]), "equal to 4096"),
     ],
 )
 def test_what_the_files_cannot_hold_is_refused(tmp_path: Path, build: Any, message: str) -> None:
@@ -264,12 +268,12 @@ def test_actions_that_differ_are_noticed_and_earlier_files_kept(
     assert len(list(tmp_path.iterdir())) == 2
 
 
-# -- files of train.py -----------------------------------------------------------------------------
+# -- files of a training -------------------------------------------------------------------------
 
 
 @pytest.fixture
 def run(tmp_path: Path, model: Any) -> Path:
-    """A folder as train.py leaves it, as far as matters here."""
+    """A folder as a training leaves it, as far as matters here."""
     folder = tmp_path / "run"
     folder.mkdir()
     for name in ("best.zip", "last.zip"):
@@ -286,7 +290,7 @@ def run(tmp_path: Path, model: Any) -> Path:
 
 
 def test_what_is_converted_says_what_the_run_says(run: Path, model: Any) -> None:
-    export.main([str(run / "last.zip"), str(run / "last"), "--trust-pickle"])
+    main(["export", str(run / "last.zip"), str(run / "last"), "--trust-pickle"])
     batch = observations(Blank(), 10)
     loaded = tpm_gym.load_policy(run / "last")
     expected, _ = model.predict(batch, deterministic=True)
@@ -298,7 +302,7 @@ def test_what_is_converted_says_what_the_run_says(run: Path, model: Any) -> None
 def test_the_command_line_converts_what_is_trusted(
     run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    export.main([str(run / "best.zip"), str(run / "shared.json"), "--trust-pickle"])
+    main(["export", str(run / "best.zip"), str(run / "shared.json"), "--trust-pickle"])
     assert capsys.readouterr().out == f"{run / 'shared.json'}\n"
     assert tpm_gym.load_policy(run / "shared").description.recipe == RECIPE
 
@@ -308,7 +312,7 @@ def test_the_command_line_does_not_touch_what_is_not_trusted(run: Path) -> None:
     trace = run / "trace"
     (run / "best.zip").write_bytes(pickle.dumps(Trace(str(trace))))
     done = subprocess.run(
-        [sys.executable, export.__file__, str(run / "best.zip"), str(run / "out")],
+        [sys.executable, "-m", "tpm_gym.learning", "export", run / "best.zip", run / "out"],
         capture_output=True,
         text=True,
         check=False,
@@ -348,13 +352,50 @@ def test_mistakes_on_the_command_line_are_one_line(
     (away / "best.zip").write_bytes((run / "best.zip").read_bytes())
     model = away / "best.zip" if "elsewhere" in words[0] else run / words[0]
     with pytest.raises(SystemExit, match=message) as caught:
-        export.main([str(model), str(run / words[1]), "--trust-pickle"])
+        main(["export", str(model), str(run / words[1]), "--trust-pickle"])
     assert "\n" not in str(caught.value)
 
 
 def test_a_damaged_configuration_is_named(run: Path) -> None:
     (run / "config.json").write_text('{"algo": "sac"}')
     with pytest.raises(SystemExit, match=r"config\.json is damaged: no entry 'env'"):
-        export.main([str(run / "best.zip"), str(run / "best"), "--trust-pickle"])
+        main(["export", str(run / "best.zip"), str(run / "best"), "--trust-pickle"])
     with pytest.raises(ConfigError, match=r"not for a \.zip"):
         save(make(PPO, Blank(), net_arch=[4]), run / "best.zip")
+
+
+def test_archives_load_that_name_a_module_which_has_moved(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Runs of before the package had the extractor and the buffer in modules of their own."""
+    names = {"features": GoalGapExtractor, "her": PenaltyHerReplayBuffer}
+    for name, kind in names.items():
+        module: Any = ModuleType(name)
+        setattr(module, kind.__name__, kind)
+        monkeypatch.setitem(sys.modules, name, module)
+        monkeypatch.setattr(kind, "__module__", name)
+    env: Any = Blank()
+    old = SAC(
+        "MultiInputPolicy",
+        env,
+        seed=0,
+        buffer_size=10,
+        replay_buffer_class=PenaltyHerReplayBuffer,
+        policy_kwargs={"net_arch": [8], **GOAL_GAP},
+    )
+    old.save(run / "last.zip")
+    monkeypatch.undo()
+    policy_kwargs = {
+        "net_arch": [8],
+        "features_extractor_class": "GoalGapExtractor",
+        "features_extractor_kwargs": {"unit": 0.07},
+    }
+    config = json.loads((run / "config.json").read_text())
+    recipe = {"arguments": {"policy_kwargs": policy_kwargs}}
+    (run / "config.json").write_text(json.dumps(config | {"recipe": recipe}))
+    batch = observations(env, 10)
+    expected, _ = old.predict(batch, deterministic=True)
+    actions, _ = load_model("last", run / "last.zip").predict(batch, deterministic=True)
+    np.testing.assert_array_equal(actions, expected)
+    main(["export", str(run / "last.zip"), str(run / "last"), "--trust-pickle"])
+    np.testing.assert_allclose(tpm_gym.load_policy(run / "last").act(batch), expected, atol=1e-6)

@@ -27,23 +27,21 @@ from trainings import (
     kill_at,
     make_config,
     quiet,
-    resumed,
     said,
     table,
     uninterrupted,
 )
 
-from tpm_gym.learning import callbacks, train
+from tpm_gym.learning import ResumeConfig, TrainingConfig, callbacks, resume, train
 from tpm_gym.learning.checkpoint import CheckpointStore, Content
-from tpm_gym.learning.configuration import Config
-from tpm_gym.learning.errors import (
-    NoWholeCheckpointError,
-)
+from tpm_gym.learning.configuration import complete
+from tpm_gym.learning.errors import CheckpointError
 from tpm_gym.learning.policies import load_policy
 from tpm_gym.learning.rollout import TEST_SEED, run_episodes
+from tpm_gym.learning.training import make_model, make_training_envs
 from tpm_gym.learning.training_state import EpisodeRecorder, restore
 
-SCRIPT = Path(train.__file__)
+COMMAND = [sys.executable, "-m", "tpm_gym.learning"]
 
 
 @pytest.fixture(autouse=True)
@@ -75,18 +73,18 @@ def test_a_killed_run_ends_as_if_nothing_had_happened(
 ) -> None:
     config = make_config(case, tmp_path)
     kill_at(monkeypatch, step, config)
-    assert train.train(resumed(config), quiet()) is None
+    assert resume(ResumeConfig(config.run), quiet()) is None
     assert_equal_runs(uninterrupted(case), tmp_path / "run")
 
 
 def test_a_run_killed_again_and_again_ends_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = make_config("sac", tmp_path)
+    config: TrainingConfig | ResumeConfig = make_config("sac", tmp_path)
     for step in (70, 40, 120, 170, 101, 260):  # some before the step that was reached already
         kill_at(monkeypatch, step, config)
-        config = resumed(config)
-    assert train.train(config, quiet()) is None
+        config = ResumeConfig(config.run)
+    assert resume(config, quiet()) is None
     assert_equal_runs(uninterrupted("sac"), tmp_path / "run")
     resumptions = json.loads((tmp_path / "run" / "config.json").read_text())["resumed"]
     steps = [resumption["from_step"] for resumption in resumptions]
@@ -105,10 +103,10 @@ def test_a_run_killed_before_its_first_checkpoint_begins_again(
     with monkeypatch.context() as patched:
         patched.setattr(CheckpointStore, "_check_space", die)
         with pytest.raises(Killed):
-            train.train(config, quiet())
+            train(config, quiet())
     (tmp_path / "run" / "checkpoints" / "000000000.tmp").mkdir(parents=True)
     console = quiet()
-    assert train.train(resumed(config), console) is None
+    assert resume(ResumeConfig(config.run), console) is None
     assert "from step 0 to 300" in said(console)
     assert_equal_runs(uninterrupted("sac"), tmp_path / "run")
 
@@ -118,7 +116,7 @@ def test_nothing_is_counted_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     kill_at(monkeypatch, 290, config)
     run = tmp_path / "run"
     assert [line["steps"] for line in evaluations(run)] == [0, 70, 140, 210, 280]
-    train.train(resumed(config), quiet())
+    resume(ResumeConfig(config.run), quiet())
     steps = [int(row["time/total_timesteps"]) for row in table(run) if row["time/total_timesteps"]]
     assert steps == [200]  # logged every four episodes
     assert [line["steps"] for line in evaluations(run)] == [0, 70, 140, 210, 280, 300]
@@ -137,7 +135,7 @@ def test_logs_of_a_torn_write_are_put_right(
     torn = ("progress.csv", "evaluations.jsonl", "best.zip", "best.json", "config.json")
     for name in torn:
         os.truncate(run / name, (run / name).stat().st_size // 2)
-    train.train(resumed(config), quiet())
+    resume(ResumeConfig(config.run), quiet())
     assert_equal_runs(uninterrupted("sac"), run)
     for name in ("best.zip", "best.json", "best.safetensors"):
         assert (run / name).read_bytes() == end_of(run).files[name]
@@ -151,7 +149,7 @@ def test_a_damaged_checkpoint_costs_only_time(
     damaged = tmp_path / "run" / "checkpoints" / "000000200" / "arrays.npz"
     os.truncate(damaged, damaged.stat().st_size - 1)
     console = quiet()
-    train.train(resumed(config), console)
+    resume(ResumeConfig(config.run), console)
     assert f"warning: damaged checkpoint: {damaged}" in said(console)
     assert "from step 150 to 300" in said(console)
     assert_equal_runs(uninterrupted("sac"), tmp_path / "run")
@@ -164,8 +162,8 @@ def test_all_checkpoints_damaged_is_an_error(
     kill_at(monkeypatch, 120, config)
     for path in (tmp_path / "run" / "checkpoints").glob("*/torch.pt"):
         path.write_bytes(b"")
-    with pytest.raises(NoWholeCheckpointError, match=r"torch\.pt"):
-        train.train(resumed(config), quiet())
+    with pytest.raises(CheckpointError, match=r"torch\.pt"):
+        resume(ResumeConfig(config.run), quiet())
 
 
 # -- hindsight over the seam -----------------------------------------------------------------------
@@ -212,8 +210,8 @@ def test_an_episode_that_cannot_go_on_is_ended_and_not_joined_to_another(
     config = replace(make_config("sac", tmp_path), checkpoint_every=130)
     kill_at(monkeypatch, 140, config)
     monkeypatch.setattr(EpisodeRecorder, "replay", replay)
-    config, console = replace(resumed(config), steps=220), quiet()
-    train.train(config, console)
+    console = quiet()
+    resume(ResumeConfig(config.run, steps=220), console)
     assert "could not be repeated exactly, so new ones begin" in said(console)
     end = end_of(tmp_path / "run")
     assert_whole_episodes(end)
@@ -237,7 +235,7 @@ def test_resuming_does_not_act_at_random_again(
         return sample(self, *args, **kwargs)
 
     monkeypatch.setattr(gym.spaces.Box, "sample", counted)
-    train.train(resumed(config), quiet())
+    resume(ResumeConfig(config.run), quiet())
     assert not random_actions
 
 
@@ -248,9 +246,10 @@ def test_saving_changes_nothing_and_the_optimiser_moves_what_was_restored(
     config = make_config("sac", tmp_path)
     kill_at(monkeypatch, 260, config)
     content = CheckpointStore(tmp_path / "run" / "checkpoints").load(pytest.fail)
-    plan = train.make_plan(replace(config, run=tmp_path / "other"))
-    envs = train._make_training_envs(plan)
-    model = train._make_model(plan, envs)
+    assert content is not None
+    completed = complete(config)
+    envs = make_training_envs(completed)
+    model = make_model(completed, envs)
     model.set_logger(train_logger(tmp_path))
     restore(model, content)
     assert isinstance(model, SAC)
@@ -276,13 +275,9 @@ def train_logger(folder: Path) -> Any:
 # -- real kills -----------------------------------------------------------------------------------
 
 
-def kill_beyond(run: Path, step: int, arguments: list[str], delay: float = 0.0) -> int:
-    """Start train.py and kill -9 it once it has saved a step; return its exit status."""
-    process = subprocess.Popen(
-        [sys.executable, str(SCRIPT), "--run", str(run), *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-    )
+def kill_beyond(run: Path, step: int, words: list[str], delay: float = 0.0) -> int:
+    """Start a command and kill -9 it once it has saved a step; return its exit status."""
+    process = subprocess.Popen([*COMMAND, *words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
     assert process.stdout is not None
     process.stdout.readline()  # so that the imports are done
     while process.poll() is None and newest(run) < step:
@@ -301,16 +296,16 @@ def newest(run: Path) -> int:
 def test_kill_9_costs_nothing(tmp_path: Path) -> None:
     config = make_config("sac", tmp_path)
     run = tmp_path / "run"
-    arguments = ["--recipe", str(config.recipe), "--eval-episodes", "1", "--eval-every", "70"]
-    arguments += ["--checkpoint-every", "1"]
-    assert kill_beyond(run, 120, arguments) == -signal.SIGKILL
-    assert CheckpointStore(run / "checkpoints").load(pytest.fail).step < 300
-    assert train.train(Config(run=run, resume=True, checkpoint_every=1000), quiet()) is None
+    words = ["train", "--run", str(run), "--recipe", str(config.recipe_file)]
+    words += ["--eval-episodes", "1", "--eval-every", "70", "--checkpoint-every", "1"]
+    assert kill_beyond(run, 120, words) == -signal.SIGKILL
+    assert newest(run) < 300
+    assert resume(ResumeConfig(run, checkpoint_every=1000), quiet()) is None
     assert_equal_runs(uninterrupted("sac"), run)
 
 
 def success(run: Path, episodes: int) -> float:
-    """Return the success rate of the last policy on the seeds that evaluate.py uses."""
+    """Return the success rate of the last policy on the seeds of evaluations."""
     env = gym.make("TPMReach-v0")
     policy = load_policy(str(run / "last.zip"), env, trust_pickle=True)
     records = run_episodes(env, policy, episodes, TEST_SEED)
@@ -320,16 +315,16 @@ def success(run: Path, episodes: int) -> float:
 
 @pytest.mark.slow
 def test_ten_kills_at_random_moments_change_nothing(tmp_path: Path) -> None:
-    arguments = ["--eval-episodes", "5", "--checkpoint-every", "100"]
+    words = ["train", "--eval-episodes", "5", "--checkpoint-every", "100", "--run"]
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    command = [sys.executable, str(SCRIPT), "--run"]
-    subprocess.run([*command, str(whole), *arguments], check=True, capture_output=True)
+    subprocess.run([*COMMAND, *words, str(whole)], check=True, capture_output=True)
+    words.append(str(killed))
     draw = random.Random(0)
     for step in sorted(draw.sample(range(4500), 10)):  # of 5000
-        status = kill_beyond(killed, step, arguments, delay=draw.uniform(0.0, 1.0))
+        status = kill_beyond(killed, step, words, delay=draw.uniform(0.0, 1.0))
         assert status == -signal.SIGKILL
-        arguments = ["--resume"]
-    subprocess.run([*command, str(killed), "--resume"], check=True, capture_output=True)
+        words = ["resume", str(killed)]
+    subprocess.run([*COMMAND, *words], check=True, capture_output=True)
     resumptions = json.loads((killed / "config.json").read_text())["resumed"]
     assert len(resumptions) > 5  # those between the same two checkpoints count once
     assert_equal_runs(whole, killed)

@@ -5,26 +5,26 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
+import scipy.stats
 from numpy.typing import NDArray
 
 import tpm_gym  # noqa: F401  # registers the ids
 from tpm_gym.learning.errors import PolicyError, RolloutError
+from tpm_gym.learning.estimates import Estimate, bootstrap, wilson
 from tpm_gym.learning.policies import load_policy, trained_env
 from tpm_gym.learning.rollout import (
     SELECTION_SEED,
     TEST_SEED,
     Episode,
-    Estimate,
     GoalEnv,
-    bootstrap,
     run_episodes,
     summarise,
-    wilson,
 )
 
 
@@ -43,6 +43,11 @@ class ScriptedEnv(gym.Env[dict[str, NDArray[Any]], NDArray[Any]]):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         info = dict(self.steps[self.index])
         self.index += 1
+        truth = np.zeros(3)
+        observed = truth + [0.0, 0.0, info.pop("fk_error")]
+        self.state = SimpleNamespace(
+            fk_position=observed, platform_position=truth, torque=info.pop("torque")
+        )
         return {}, info.pop("reward"), False, self.index == len(self.steps), info
 
 
@@ -66,7 +71,10 @@ def scripted_step(
         "reward": reward,
         "is_success": success,
         "conditioning": conditioning,
+        "singularity_penalty": max(0.0, 1 - (conditioning / 0.08) ** 4),
         "closure_error": gap,
+        "fk_error": 2 * gap,
+        "torque": np.array([1.0, -2.0, 2.0]),
     }
 
 
@@ -81,8 +89,8 @@ def test_record_says_what_happened() -> None:
     env = ScriptedEnv(
         [
             scripted_step(-1.0, False, 0.5, 1e-5),
-            scripted_step(-0.5, True, 0.1, 7e-5),
-            scripted_step(-0.25, False, 0.3, 2e-5),
+            scripted_step(-0.5, True, 0.07, 7e-5),
+            scripted_step(-0.25, False, 0.3, 2e-5) | {"torque": np.array([0.0, 0.0, -6.0])},
         ]
     )
     (record,) = run_episodes(env, Idle(), 1, first_seed=5)
@@ -91,10 +99,14 @@ def test_record_says_what_happened() -> None:
         success_at_end=False,
         success_once=True,
         total_reward=-1.75,
-        conditioning_min=0.1,
-        conditioning_mean=pytest.approx(0.3),
+        conditioning_min=0.07,
+        conditioning_mean=pytest.approx(0.29),
         closure_error_max=7e-5,
         length=3,
+        unsafe_share=pytest.approx(1 / 3),
+        fk_error_max=pytest.approx(1.4e-4),
+        torque_rms=pytest.approx(math.sqrt((2 * (1 + 4 + 4) + 36) / 9)),
+        torque_peak=6.0,
     )
     assert record.as_dict()["return"] == -1.75
 
@@ -127,13 +139,13 @@ def test_hooks_see_every_frame_and_episode() -> None:
     assert episodes == [5, 10]
 
 
-@pytest.mark.parametrize("name", ["reward", "conditioning", "closure_error"])
+@pytest.mark.parametrize("name", ["reward", "conditioning", "closure_error", "fk_error", "torque"])
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_values_that_are_not_finite_raise(name: str, value: float) -> None:
-    env = ScriptedEnv([scripted_step(), scripted_step() | {name: value}])
-    with pytest.raises(RolloutError, match="seed 3, step 1") as caught:
+    wrong = np.array([0.0, value, 0.0]) if name == "torque" else value
+    env = ScriptedEnv([scripted_step(), scripted_step() | {name: wrong}])
+    with pytest.raises(RolloutError, match=f"seed 3, step 1: {name} is {value}"):
         run_episodes(env, Idle(), 1, first_seed=3)
-    assert caught.value.name == name
 
 
 @pytest.mark.parametrize("spec", ["random", "expert"])
@@ -163,25 +175,12 @@ def test_random_actions_fill_the_action_space(reach: GoalEnv) -> None:
     np.testing.assert_allclose(actions.var(axis=0), 1 / 3, rtol=0.08)
 
 
-@pytest.mark.parametrize(
-    ("successes", "trials", "low", "high"),
-    # Newcombe 1998, Table I, method 3 (Wilson score without continuity correction).
-    [
-        (81, 263, 0.2553, 0.3662),
-        (15, 148, 0.0624, 0.1605),
-        (0, 20, 0.0, 0.1611),
-        (1, 29, 0.0061, 0.1718),
-    ],
-)
-def test_wilson_interval_matches_published_values(
-    successes: int, trials: int, low: float, high: float
-) -> None:
+@pytest.mark.parametrize(("successes", "trials"), [(81, 263), (15, 148), (0, 20), (29, 29), (1, 1)])
+def test_wilson_interval_is_that_of_scipy(successes: int, trials: int) -> None:
     estimate = wilson([i < successes for i in range(trials)])
+    theirs = scipy.stats.binomtest(successes, trials).proportion_ci(method="wilson")
     assert estimate.mean == successes / trials
-    assert (estimate.low, estimate.high) == (
-        pytest.approx(low, abs=6e-5),
-        pytest.approx(high, abs=6e-5),
-    )
+    assert (estimate.low, estimate.high) == pytest.approx((theirs.low, theirs.high), abs=1e-15)
 
 
 def test_wilson_interval_holds_the_rate_at_both_ends() -> None:
@@ -224,6 +223,7 @@ def test_summary_keeps_the_worst_of_all_episodes() -> None:
     assert metrics["conditioning_min"].mean == pytest.approx(0.35)
     assert metrics["conditioning_mean"].mean == pytest.approx((3 * 0.4 + 0.3) / 4)
     assert metrics["return"].mean == pytest.approx(-1.25)
+    assert metrics["torque_peak"].worst == 2.0
     assert metrics["success_at_end"].worst is None
 
 

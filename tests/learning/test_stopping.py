@@ -20,23 +20,14 @@ from trainings import (
     kill_at,
     make_config,
     quiet,
-    resumed,
     said,
     uninterrupted,
 )
 
-from tpm_gym.learning import callbacks, train
+from tpm_gym.learning import ResumeConfig, TrainingConfig, callbacks, resume, train
 from tpm_gym.learning.callbacks import Checkpointing, SignalListener
 from tpm_gym.learning.checkpoint import CheckpointStore, Content
-from tpm_gym.learning.configuration import Config
-from tpm_gym.learning.errors import (
-    CheckpointWriteError,
-    ConfigError,
-    NoCheckpointError,
-    ResumeConflictError,
-    RunBusyError,
-    RunWriteError,
-)
+from tpm_gym.learning.errors import ConfigError, RunError
 from tpm_gym.learning.run_folder import claimed
 
 
@@ -68,16 +59,18 @@ def test_a_stopped_run_saves_and_goes_on(
     config = replace(make_config(case, tmp_path), checkpoint_every=10_000)
     interrupt_at(monkeypatch, step, lambda: os.kill(os.getpid(), number))
     handler, console = signal.getsignal(number), quiet()
-    assert train.train(config, console) == number
+    assert train(config, console) == number
     assert signal.getsignal(number) is handler
     store = CheckpointStore(tmp_path / "run" / "checkpoints")
-    saved = store.load(pytest.fail).step
+    content = store.load(pytest.fail)
+    assert content is not None
+    saved = content.step
     # PPO goes back to the beginning of its rollout of 40 steps, the others end theirs of 2 or 3.
     assert saved == {"sac": step + 1, "tqc": 201, "ppo": 80}[case]
     assert f"saved at step {saved}" in said(console)
-    assert f"--run {tmp_path / 'run'} --resume" in said(console)
+    assert f"tpm-gym resume {tmp_path / 'run'}" in said(console)
     assert (tmp_path / "run" / "last.zip").is_file()
-    assert train.train(resumed(config), quiet()) is None
+    assert resume(ResumeConfig(config.run), quiet()) is None
     assert_equal_runs(uninterrupted(case), tmp_path / "run")
 
 
@@ -93,7 +86,7 @@ def test_a_signal_after_the_last_step_stops_nothing(
 
     monkeypatch.setattr(callbacks.PeriodicEvaluation, "_on_training_end", interrupted)
     console = quiet()
-    assert train.train(make_config(case, tmp_path), console) is None
+    assert train(make_config(case, tmp_path), console) is None
     assert f"finished: {tmp_path / 'run'}" in said(console)
     assert_equal_runs(uninterrupted(case), tmp_path / "run")
 
@@ -119,12 +112,12 @@ def test_training_goes_on_without_room_for_checkpoints(
 
     def full(self: CheckpointStore, content: Content) -> None:
         if 150 <= content.step < 300:
-            raise CheckpointWriteError(Path("x"), "No space left on device", self.newest)
+            self._refuse(Path("x"), "No space left on device")
         save(self, content)
 
     monkeypatch.setattr(CheckpointStore, "save", full)
     config, console = make_config("sac", tmp_path), quiet()
-    assert train.train(config, console) is None
+    assert train(config, console) is None
     warnings = [line for line in said(console).splitlines() if "warning:" in line]
     assert len(warnings) == 3  # at 150, 200 and 250: it is tried again
     assert all("No space left on device; that of step 100 stays" in line for line in warnings)
@@ -145,101 +138,131 @@ def test_a_full_disk_ends_the_run_with_its_last_checkpoint_whole(
         patched.setattr(
             callbacks.PeriodicEvaluation, "_record", callbacks.PeriodicEvaluation._record
         )
-        with pytest.raises(RunWriteError, match=r"from step 200 with --run .* --resume"):
-            train.train(config, console)
-    assert train.train(resumed(config), quiet()) is None
+        with pytest.raises(RunError, match=r"from step 200 with: tpm-gym resume .*run"):
+            train(config, console)
+    assert resume(ResumeConfig(config.run), quiet()) is None
     assert_equal_runs(uninterrupted("sac"), tmp_path / "run")
 
 
-# -- options --------------------------------------------------------------------------------------
+# -- what a resumption may change, and what it may not delete --------------------------------------
 
 
-@pytest.fixture(scope="module")
-def half(tmp_path_factory: pytest.TempPathFactory) -> Config:
-    """A run that was killed half way; not to be changed."""
-    config = make_config("sac", tmp_path_factory.mktemp("half"))
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        kill_at(monkeypatch, 160, config)
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture
+def half(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> TrainingConfig:
+    """A run that was killed half way."""
+    config = make_config("sac", tmp_path)
+    kill_at(monkeypatch, 160, config)
     return config
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"seed": 7}, "--seed is 7, but the run to be resumed has 0"),
-        ({"env": "TPMPickAndPlace-v0"}, "--env is TPMPickAndPlace-v0, .* has TPMReach-v0"),
-        ({"algo": "tqc"}, "--algo is tqc, .* has sac"),
-        ({"envs": 2}, "--envs is 2, .* has 1"),
-        ({"eval_episodes": 3}, "--eval-episodes is 3, .* has 1"),
-    ],
-)
-def test_options_that_contradict_the_run_are_refused(
-    half: Config, options: dict[str, Any], message: str
-) -> None:
-    with pytest.raises(ResumeConflictError, match=message):
-        train.train(replace(resumed(half), **options), quiet())
-
-
-def test_a_recipe_that_contradicts_the_run_is_refused(half: Config, tmp_path: Path) -> None:
-    assert half.recipe is not None
-    path = tmp_path / "other.yml"
-    path.write_text(half.recipe.read_text().replace("gamma: 0.95", "gamma: 0.9"))
-    with pytest.raises(ResumeConflictError, match=r"gamma is 0\.9, .* has 0\.95"):
-        train.train(replace(resumed(half), recipe=path), quiet())
-
-
-def test_fewer_steps_than_taken_and_overwriting_are_refused(half: Config) -> None:
-    with pytest.raises(ConfigError, match="--steps 140: the run has already taken 150"):
-        train.train(replace(resumed(half), steps=140), quiet())
-    with pytest.raises(ConfigError, match="exclude each other"):
-        train.train(replace(resumed(half), overwrite=True), quiet())
-    with pytest.raises(ConfigError, match="--eval-every 0"):
-        train.train(replace(resumed(half), eval_every=0), quiet())
-
-
-def test_options_that_agree_are_accepted(half: Config, tmp_path: Path) -> None:
-    assert half.run is not None
-    shutil.copytree(half.run, tmp_path / "run")
-    config = replace(half, run=tmp_path / "run", resume=True, checkpoint_every=1000)
-    assert train.train(config, quiet()) is None
-    assert_equal_runs(uninterrupted("sac"), tmp_path / "run")
-
-
-def test_a_finished_run_has_nothing_to_do_unless_it_is_to_take_more_steps(tmp_path: Path) -> None:
+@pytest.fixture
+def finished(tmp_path: Path) -> Path:
+    """A run that went to its end, with a test of its policy."""
     run = tmp_path / "run"
     shutil.copytree(uninterrupted("sac"), run)
     (run / "tests").mkdir()
-    (run / "tests" / "nominal.json").write_text("{}")
-    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
-    console = quiet()
-    assert train.train(Config(run=run, resume=True), console) is None
-    assert f"nothing to do: {run} has finished its 300 steps" in said(console)
-    assert before == {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
-    assert train.train(Config(run=run, resume=True, steps=360), quiet()) is None
-    assert [line["steps"] for line in evaluations(run)][-2:] == [300, 360]
-    assert json.loads((run / "config.json").read_text())["steps"] == 360
-    assert not (run / "tests").exists()  # they were of the policy of step 300
+    test = {"env": "TPMReach-v0", "episodes": 1, "command": "tpm-gym evaluate"}
+    (run / "tests" / "nominal.json").write_text(json.dumps(test))
+    return run
+
+
+def test_fewer_steps_than_taken_and_numbers_that_cannot_work_are_refused(
+    half: TrainingConfig,
+) -> None:
+    before = contents(half.run)
+    with pytest.raises(ConfigError, match="--steps 140: the run has already taken 150"):
+        resume(ResumeConfig(half.run, steps=140), quiet())
+    with pytest.raises(ConfigError, match="--eval-every 0"):
+        resume(ResumeConfig(half.run, eval_every=0), quiet())
+    assert contents(half.run) == before
+
+
+def test_a_finished_run_has_nothing_to_do_unless_it_is_to_take_more_steps(finished: Path) -> None:
+    before, console = contents(finished), quiet()
+    assert resume(ResumeConfig(finished), console) is None
+    assert f"nothing to do: {finished} has finished its 300 steps" in said(console)
+    assert before == contents(finished)
+    assert resume(ResumeConfig(finished, steps=360), quiet()) is None
+    assert [line["steps"] for line in evaluations(finished)][-2:] == [300, 360]
+    assert json.loads((finished / "config.json").read_text())["steps"] == 360
+    assert not (finished / "tests").exists()  # they were of the policy of step 300
+
+
+def test_a_finished_run_is_finished_without_its_checkpoints(finished: Path) -> None:
+    shutil.rmtree(finished / "checkpoints")
+    before, console = contents(finished), quiet()
+    assert resume(ResumeConfig(finished), console) is None
+    assert "nothing to do" in said(console)
+    with pytest.raises(RunError, match="holds a policy, but no checkpoint"):
+        resume(ResumeConfig(finished, steps=360), quiet())
+    assert contents(finished) == before
+
+
+@pytest.mark.parametrize("policy", ["best.zip", "last.zip", "best.json", "last.safetensors"])
+def test_a_policy_is_never_replaced_by_beginning_again(half: TrainingConfig, policy: str) -> None:
+    shutil.rmtree(half.run / "checkpoints")
+    for path in (*half.run.glob("best.*"), *half.run.glob("last.*")):
+        path.unlink()
+    (half.run / policy).write_text("precious")
+    before = contents(half.run)
+    with pytest.raises(RunError, match="holds a policy, but no checkpoint"):
+        resume(ResumeConfig(half.run), quiet())
+    assert contents(half.run) == before
+
+
+def test_a_run_whose_checkpoints_could_not_be_written_keeps_its_policies(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = replace(make_config("sac", tmp_path), steps=120)
+    usage: Any = shutil.disk_usage(tmp_path)
+    with monkeypatch.context() as patched:
+        patched.setattr(shutil, "disk_usage", lambda path: usage._replace(free=0))
+        console = quiet()
+        assert train(config, console) is None
+    assert "cannot write checkpoint" in said(console)
+    before = contents(config.run)
+    assert resume(ResumeConfig(config.run), quiet()) is None
+    assert contents(config.run) == before
+
+
+def test_what_others_put_into_a_run_stays(half: TrainingConfig) -> None:
+    strangers = ["notes.md", "tests/mine.json", "tests/plot.pdf", "checkpoints/copy/weights.pt"]
+    for name in strangers:
+        path = half.run / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("{}")
+    assert resume(ResumeConfig(half.run), quiet()) is None
+    assert train(replace(half, overwrite=True, steps=60), quiet()) is None
+    assert all((half.run / name).read_text() == "{}" for name in strangers)
+    (half.run / "checkpoints").rename(half.run / "elsewhere")
+    for path in (*half.run.glob("best.*"), *half.run.glob("last.*")):
+        path.unlink()
+    assert resume(ResumeConfig(half.run), quiet()) is None  # begins again
+    assert (half.run / "notes.md").is_file()
 
 
 def test_nothing_to_resume_is_an_error_that_says_so(tmp_path: Path) -> None:
     for run in (tmp_path, tmp_path / "nowhere"):
-        with pytest.raises(NoCheckpointError, match="leave out --resume"):
-            train.train(Config(run=run, resume=True), quiet())
+        with pytest.raises(RunError, match="tpm-gym train"):
+            resume(ResumeConfig(run), quiet())
     assert list(tmp_path.iterdir()) == []
     for text in ('{"model_type": "bert"}', "{", "[]"):  # another program's
         (tmp_path / "config.json").write_text(text)
-        with pytest.raises(NoCheckpointError):
-            train.train(Config(run=tmp_path, resume=True), quiet())
+        with pytest.raises(RunError, match="holds no run"):
+            resume(ResumeConfig(tmp_path), quiet())
         assert (tmp_path / "config.json").read_text() == text
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there are no such locks")
-def test_two_processes_cannot_train_in_one_folder(half: Config) -> None:
-    assert half.run is not None
-    with claimed(half.run), pytest.raises(RunBusyError, match="another process"):
-        train.train(resumed(half), quiet())
-    with claimed(half.run), pytest.raises(RunBusyError, match="another process"):
-        train.train(replace(half, overwrite=True), quiet())
+def test_two_processes_cannot_train_in_one_folder(half: TrainingConfig) -> None:
+    with claimed(half.run), pytest.raises(RunError, match="another process"):
+        resume(ResumeConfig(half.run), quiet())
+    with claimed(half.run), pytest.raises(RunError, match="another process"):
+        train(replace(half, overwrite=True), quiet())
     assert (half.run / "config.json").is_file()
 
 
@@ -267,5 +290,5 @@ def test_checkpoints_take_a_fiftieth_of_the_time_at_most(
     monkeypatch.setattr(CheckpointStore, "save", save)
     monkeypatch.setattr(Checkpointing, "_on_rollout_start", tick)
     config = replace(make_config("sac", tmp_path), checkpoint_every=None, eval_every=1000)
-    train.train(replace(config, steps=330), quiet())
-    assert saved == [0, 150, 300, 330]  # the last is the end
+    train(replace(config, steps=330), quiet())
+    assert saved == [0, 148, 298, 330]  # the last is the end

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -15,8 +14,6 @@ from tpm_gym.learning.features import GoalGapExtractor
 from tpm_gym.learning.hindsight import PenaltyHerReplayBuffer
 from tpm_gym.learning.zoo import _algorithm, hyperparameters
 from tpm_gym.resources import RECIPES
-
-TRAIN = RECIPES.parent
 
 
 @pytest.mark.parametrize("algorithm", ["sac", "tqc", "ppo"])
@@ -51,7 +48,7 @@ def test_the_zoo_runs_them(algorithm: str, env_id: str, steps: int, tmp_path: Pa
         "--algo": algorithm,
         "--env": env_id,
         "--gym-packages": "tpm_gym",
-        "--conf-file": str(TRAIN / "zoo.py"),
+        "--conf-file": "tpm_gym.learning.zoo",
         "--n-timesteps": str(steps),
         "--eval-freq": "-1",
         "--log-folder": str(tmp_path / "logs"),
@@ -59,9 +56,6 @@ def test_the_zoo_runs_them(algorithm: str, env_id: str, steps: int, tmp_path: Pa
     }
     command = [sys.executable, "-m", "rl_zoo3.train"]
     command += [word for pair in options.items() for word in pair]
-    environment = {**os.environ, "PYTHONPATH": str(TRAIN)}
-    done = subprocess.run(
-        command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
-    )
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert list((tmp_path / "logs" / algorithm).glob(f"{env_id}_1/*.zip"))

@@ -93,7 +93,7 @@ def test_boxes_hold_platform_and_cup_and_no_more(machine: TPM, place: int) -> No
     point = anywhere(machine, 2)[place]
     mechanism = machine.mechanism
     frames = walk(mechanism, machine.joint_positions(machine.inverse(point)))
-    boxes = iter(machine.occupied(machine.mount.to_world(point)))
+    boxes = iter(machine.occupied(point))
     for name in (mechanism.platform, mechanism.tool):
         origin, rotation = frames[name]
         for solid in mechanism.link(name).solids:

@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -17,18 +18,30 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import safetensors.numpy
+import torch
 from gymnasium import spaces
-from policies_on_file import DATA, WEIGHTS, Weights, described, observations, some_weights, write
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from policies_on_file import (
+    DATA,
+    WEIGHTS,
+    Weights,
+    described,
+    observations,
+    some_weights,
+    write,
+)
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 import tpm_gym
+import tpm_gym.policy
 from tpm_gym.errors import (
     ConfigurationError,
     InputError,
     PolicyFileError,
     PolicyMismatchError,
 )
-from tpm_gym.policy.policy import Policy, load_policy
+from tpm_gym.policy import Policy, load_policy
 from tpm_gym.resources import POLICIES as PUBLISHED
 
 
@@ -131,12 +144,21 @@ def test_the_observation_is_left_as_it_was_and_the_action_is_the_callers(policy:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
+        ({"observation": [10**400, 0, 0, 0]}, "observation must be"),
+        ({"observation": [10**5000, 0, 0, 0]}, "observation must be"),
+        ({"observation": torch.zeros(4, requires_grad=True)}, "observation must be real numbers"),
+        ({"observation": np.ma.array(np.zeros(4), mask=[1, 0, 0, 0])}, "must be real numbers"),
+        ({"observation": np.zeros(4, complex)}, "observation must be real numbers"),
+        ({"observation": np.zeros(4, "datetime64[s]")}, "observation must be real numbers"),
+        ({"observation": np.array(["1", "2", "3", "4"])}, "observation must be real numbers"),
+        ({"observation": [[1, 2], [3]]}, "observation must be real numbers"),
+        ({"observation": None}, "observation must be"),
         ({"observation": np.zeros(5)}, r"observation must be of shape \(4,\)"),
         ({"observation": np.zeros((2, 2, 4))}, "observation must be of shape"),
         ({"observation": 1.0}, "observation must be of shape"),
         ({"observation": np.zeros((3, 4))}, "of one batch size in all"),
-        ({"observation": ["a", "b", "c", "d"]}, "an array of numbers"),
-        ({"observation": [0, 0, np.nan, 0]}, "observation must be finite, got .*nan"),
+        ({"observation": ["a", "b", "c", "d"]}, "observation must be real numbers"),
+        ({"observation": [0, 0, np.nan, 0]}, "observation must be finite in float32, got nan"),
         ({"desired_goal": [1e300, 0, 0]}, "desired_goal must be finite"),
         ({"extra": np.zeros(3)}, "keys achieved_goal, desired_goal, observation"),
     ],
@@ -149,6 +171,65 @@ def test_observations_that_do_not_fit_are_named(
         policy.act(one | changes)
     with pytest.raises(InputError, match="a mapping"):
         policy.act(np.zeros(4))  # type: ignore[arg-type]
+
+
+# -- numbers that float32 cannot hold --------------------------------------------------------------
+
+
+@pytest.mark.parametrize("activation", ["relu", "tanh"])
+@pytest.mark.parametrize("factors", [(1e15, 1e15, 1e15), (3e37, 3e37, 3e37), (3e37, 1e-38, 1e-38)])
+def test_finite_weights_that_overflow_are_refused(
+    tmp_path: Path, activation: str, factors: tuple[float, ...]
+) -> None:
+    weights = {name: values * factors[int(name[7])] for name, values in WEIGHTS.items()}
+    data = safetensors.numpy.save({n: v.astype(np.float32) for n, v in weights.items()})
+    content = described(data)
+    content["network"]["activation"] = activation
+    with pytest.raises(PolicyFileError, match=r"could reach .*e\+") as caught:
+        load_policy(write(tmp_path, content, data))
+    assert caught.value.path == str(tmp_path / "p.safetensors")
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    scale=st.floats(0, 38),
+    output=st.sampled_from(["tanh", "clip"]),
+    activation=st.sampled_from(["relu", "tanh"]),
+    seed=st.integers(0, 100),
+)
+def test_every_action_in_the_observation_space_is_finite(
+    scale: float, output: str, activation: str, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    weights = {
+        name: rng.choice([-1, 1], values.shape) * np.float32(10 ** rng.uniform(-scale, scale))
+        for name, values in WEIGHTS.items()
+    }
+    data = safetensors.numpy.save({n: v.astype(np.float32) for n, v in weights.items()})
+    content = described(data)
+    content["network"] |= {"output": output, "activation": activation}
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            policy = load_policy(write(Path(folder), content, data))
+        except PolicyFileError:
+            return
+    boxes = policy.description.observation_space
+    for sign in (-1, 1):
+        corner = {
+            key: sign * rng.choice([-1, 1], box.shape) * box.high for key, box in boxes.items()
+        }
+        assert np.isfinite(policy.act(corner)).all()
+
+
+def test_what_overflows_far_outside_the_observation_space_is_named(policy: Policy) -> None:
+    far = {key: np.full(values[0].shape, 3e38) for key, values in observations(1).items()}
+    for sign in (-1, 1):
+        one = far | {"achieved_goal": sign * far["achieved_goal"]}
+        with pytest.raises(InputError, match="observation must be near its space"):
+            policy.act(one)
+
+
+# -- environments ----------------------------------------------------------------------------------
 
 
 def test_an_environment_of_another_kind_is_refused(policy: Policy) -> None:
@@ -198,7 +279,7 @@ def test_the_description_says_where_the_policy_comes_from(policy: Policy) -> Non
     assert (about.seed, about.steps) == (3, 5000)
     assert about.recipe["arguments"]["gamma"] == 0.95
     assert about.versions == {"python": "3.11.7", "torch": None}
-    assert about.network.unit == 0.05
+    assert about.network.features.unit == 0.05
     assert about.network.hidden == (5, 4)
 
 
@@ -224,7 +305,7 @@ def test_what_is_no_policy_is_named(tmp_path: Path) -> None:
         with pytest.raises(PolicyFileError, match=message):
             load_policy(tmp_path / name)
     (tmp_path / "other.json").write_text('{"algo": "sac"}')
-    with pytest.raises(PolicyFileError, match="does not describe a policy"):
+    with pytest.raises(PolicyFileError, match="describes no policy: entry 'format'"):
         load_policy(tmp_path / "other.json")
     path.with_suffix(".safetensors").unlink()
     with pytest.raises(PolicyFileError, match=r"p\.safetensors: there is no such file") as caught:
@@ -233,9 +314,39 @@ def test_what_is_no_policy_is_named(tmp_path: Path) -> None:
     assert caught.value.remedy
 
 
+@pytest.mark.parametrize("name", [3, b"best.json", None, "", ["best"]])
+def test_what_is_no_name_is_refused(name: Any) -> None:
+    with pytest.raises(InputError, match="path must be the str or Path of a policy, as in 'runs"):
+        tpm_gym.load_policy(name)
+
+
+@pytest.mark.parametrize("name", ["x" * 5000, "x" * 5000 + ".json", "x" * 250, "a/\0", "\0"])
+def test_names_that_no_file_can_have_are_refused(tmp_path: Path, name: str) -> None:
+    for path in (name, Path(name), tmp_path / name):
+        with pytest.raises(PolicyFileError, match=r"no such file|name too long"):
+            tpm_gym.load_policy(path)
+
+
+def test_a_published_policy_is_named_by_its_environment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for path in PUBLISHED.glob("*.safetensors"):
+        found, wanted = tpm_gym.load_policy(path.stem), tpm_gym.load_policy(path)
+        assert found.description == wanted.description
+    for wrong in ("TPMReach-v9", "TPMReach-v0.json", "./TPMReach-v0", Path("TPMReach-v0")):
+        with pytest.raises(PolicyFileError, match=r"no such file; .*: TPMPickAndPlace-v0, .*Reach"):
+            tpm_gym.load_policy(wrong)
+    write(tmp_path).rename(tmp_path / "TPMReach-v0.json")  # files come first, though one is lost
+    with pytest.raises(PolicyFileError, match=r"TPMReach-v0.safetensors: there is no such file"):
+        tpm_gym.load_policy("TPMReach-v0")
+    (tmp_path / "p.safetensors").rename(tmp_path / "TPMReach-v0.safetensors")
+    assert tpm_gym.load_policy("TPMReach-v0").description.seed == 3
+
+
 def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "p.json")
-    with pytest.raises(PolicyFileError, match="is not a file"):
+    with pytest.raises(PolicyFileError, match="no such file"):
         load_policy(tmp_path / "p.json")
 
 
@@ -260,7 +371,14 @@ def test_loading_needs_no_stable_baselines_and_no_engine(tmp_path: Path) -> None
     np.testing.assert_allclose(json.loads(printed), load_policy(path).act(one), atol=1e-6)
 
 
-@pytest.mark.parametrize("package", ["torch", "safetensors"])
+def test_the_package_imports_pytorch_only_when_asked() -> None:
+    code = "import tpm_gym.policy, sys; print('torch' in sys.modules, tpm_gym.policy.Policy)"
+    assert run_without([], code) == "False <class 'tpm_gym.policy.policy.Policy'>"
+    with pytest.raises(AttributeError, match=r"'tpm_gym.policy' has no attribute 'Polcy'"):
+        tpm_gym.policy.Polcy  # noqa: B018
+
+
+@pytest.mark.parametrize("package", ["torch", "safetensors", "pydantic"])
 def test_a_missing_package_is_named_with_its_remedy(tmp_path: Path, package: str) -> None:
     path = write(tmp_path)
     code = (

@@ -7,19 +7,20 @@ from typing import Any
 
 import gymnasium as gym
 import pytest
+from paths import ROOT
 
 import tpm_gym
 from tpm_gym.learning import policies
 from tpm_gym.learning.rollout import TEST_SEED, run_episodes
-from tpm_gym.resources import POLICIES as FOLDER
+from tpm_gym.resources import POLICIES
 
-NAMES = sorted(path.stem for path in FOLDER.glob("*.safetensors"))
+NAMES = sorted(path.stem for path in POLICIES.glob("*.safetensors"))
 PROMISED = {"TPMReach-v0": 1.0, "TPMPickAndPlace-v0": 0.99, "TPMPickAndPlaceJoints-v0": 0.95}
 """Least success rate of 1000 held-out episodes."""
 
 
 def evaluation(name: str) -> dict[str, Any]:
-    content: dict[str, Any] = json.loads((FOLDER / f"{name}.evaluation.json").read_text())
+    content: dict[str, Any] = json.loads((POLICIES / f"{name}.evaluation.json").read_text())
     return content
 
 
@@ -30,7 +31,7 @@ def test_all_that_are_promised_are_there() -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_the_evaluation_is_of_this_policy_on_held_out_episodes(name: str) -> None:
     content = evaluation(name)
-    assert content["env"] == name == tpm_gym.load_policy(FOLDER / name).description.env_id
+    assert content["env"] == name == tpm_gym.load_policy(POLICIES / name).description.env_id
     assert content["policy"] == f"train/policies/{name}.json"
     assert content["episodes"] == len(content["records"]) >= 1000
     assert content["seed"] >= TEST_SEED
@@ -40,7 +41,7 @@ def test_the_evaluation_is_of_this_policy_on_held_out_episodes(name: str) -> Non
 @pytest.mark.parametrize("name", NAMES)
 def test_its_episodes_repeat(name: str) -> None:
     env = gym.make(name)
-    policy = policies.load_policy(str(FOLDER / f"{name}.json"), env)
+    policy = policies.load_policy(str(POLICIES / f"{name}.json"), env)
     content = evaluation(name)
     records = run_episodes(env, policy, 5, content["seed"])
     env.close()
@@ -56,6 +57,6 @@ def test_its_episodes_repeat(name: str) -> None:
 def test_the_readme_tells_its_success_and_steps(name: str) -> None:
     success = evaluation(name)["success_at_end"]
     mean, low, high = (100 * success[key] for key in ("mean", "low", "high"))
-    steps = tpm_gym.load_policy(FOLDER / name).description.recipe["n_timesteps"]
+    steps = tpm_gym.load_policy(POLICIES / name).description.recipe["n_timesteps"]
     row = f"| `{name}` | {mean:.1f}% [{low:.1f}, {high:.1f}] | {steps:,} steps"
-    assert row in (FOLDER.parents[1] / "README.md").read_text(encoding="utf-8")
+    assert row in (ROOT / "README.md").read_text(encoding="utf-8")

@@ -34,12 +34,12 @@ CASES: list[tuple[str, dict[str, Any]]] = [
     ("TPMReachJoints-v0", EVERYTHING),
     ("TPMPickAndPlace-v0", EVERYTHING),
 ]
-"""Ids, and where their machines differ from the nominal one."""
+"""Ids, and how far their plants may stray."""
 
 
-def make(env_id: str, machine: dict[str, Any], **options: Any) -> gym.Env[Any, Any]:
+def make(env_id: str, randomisation: dict[str, Any], **options: Any) -> gym.Env[Any, Any]:
     """An environment; also where tpm_gym has not been imported yet."""
-    return gym.make(f"tpm_gym:{env_id}", randomisation=machine, **options)
+    return gym.make(f"tpm_gym:{env_id}", randomisation=randomisation, **options)
 
 
 def random_episode(env: gym.Env[Any, Any], seed: int, steps: int = 50) -> Iterator[Step]:
@@ -91,8 +91,8 @@ def play(env: gym.Env[Any, Any], actions: Iterable[Any]) -> list[Any]:
 def all_fingerprints() -> list[str]:
     """Of an episode in each case."""
     prints = []
-    for env_id, machine in CASES:
-        env = make(env_id, machine)
+    for case in CASES:
+        env = make(*case)
         prints.append(fingerprint(expert_episode(env, 6, steps=30)))
         env.close()
     return prints

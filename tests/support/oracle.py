@@ -11,10 +11,9 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from tpm_gym.arrays import FloatArray
 from tpm_gym.kinematics import ASSEMBLY_MODES, inverse_all
 from tpm_gym.kinematics.geometry import Geometry
-
-FloatArray = NDArray[np.float64]
 
 
 class Lengths(Protocol):

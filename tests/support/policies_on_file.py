@@ -25,7 +25,7 @@ def box(size: int, bound: float, dtype: str = "float32") -> dict[str, Any]:
 def described(data: bytes, **changes: Any) -> dict[str, Any]:
     """Return what a JSON file holds, before it is sealed with its own sum."""
     content: dict[str, Any] = {
-        "format": "tpm_gym.policy.policy",
+        "format": "tpm_gym.policy",
         "version": 1,
         "env": "TPMReach-v0",
         "algorithm": "sac",

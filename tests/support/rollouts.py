@@ -2,7 +2,7 @@
 
     python tests/support/rollouts.py tests/data/rollouts.json
 
-Recorded at 93a7656, before the package was taken apart into rooms; the refactoring had to keep them.
+Recorded before the package was taken apart into rooms, which had to keep them.
 """
 
 from __future__ import annotations

@@ -1,32 +1,37 @@
-"""States with any numbers in them."""
+"""States with any numbers in them: tasks are pure functions of them."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 
 from tpm_gym.simulation.state import State
 
 
-def random_state(rng, shape=()):
-    """A state with any numbers in it; tasks are pure functions."""
-    quaternion = rng.normal(size=(*shape, 4))
-    axis = rng.normal(size=(*shape, 3))
-    return State(
-        theta=rng.normal(size=(*shape, 3)),
-        theta_dot=rng.normal(size=(*shape, 3)),
-        torque=rng.normal(size=(*shape, 3)),
-        fk_position=rng.normal(size=(*shape, 3)),
-        fk_velocity=rng.normal(size=(*shape, 3)),
-        conditioning=rng.random(shape),
-        platform_position=rng.normal(size=(*shape, 3)),
-        platform_tilt=rng.random(shape),
-        closure_error=rng.random(shape),
-        mode_change=None,
-        command=rng.normal(size=(*shape, 3)),
-        holding=rng.random(shape) > 0.5,
-        object_position=rng.normal(size=(*shape, 3)),
-        object_quaternion=quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True),
-        object_axis=axis / np.linalg.norm(axis, axis=-1, keepdims=True),
-        object_velocity=rng.normal(size=(*shape, 3)),
-        object_angular_velocity=rng.normal(size=(*shape, 3)),
-    )
+def random_state(
+    rng: np.random.Generator, shape: tuple[int, ...] = (), objects: int = 1, **values: Any
+) -> State:
+    """A state with leading axes ``shape``; ``values`` are taken as they are."""
+
+    def normal(*size: int) -> Any:
+        return rng.normal(size=(*shape, *size))
+
+    def unit(*size: int) -> Any:
+        vectors = normal(*size)
+        return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+    drawn = {
+        **{name: normal(3) for name in ("theta", "theta_dot", "torque", "command")},
+        **{name: normal(3) for name in ("fk_position", "fk_velocity", "platform_position")},
+        **{name: rng.random(shape) for name in ("conditioning", "platform_tilt", "closure_error")},
+        "assembly_mode_changed": np.zeros(shape, dtype=bool),
+        "working_mode_changed": np.zeros(shape, dtype=bool),
+        "held": rng.integers(-1, objects, shape),
+        "object_position": normal(objects, 3),
+        "object_quaternion": unit(objects, 4),
+        "object_axis": unit(objects, 3),
+        "object_velocity": normal(objects, 3),
+        "object_angular_velocity": normal(objects, 3),
+    }
+    return State(**{**drawn, **values})

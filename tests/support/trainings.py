@@ -17,10 +17,9 @@ import pytest
 import torch
 from rich.console import Console
 
-from tpm_gym.learning import train
+from tpm_gym.learning import ResumeConfig, TrainingConfig, resume, train
 from tpm_gym.learning.callbacks import Checkpointing
 from tpm_gym.learning.checkpoint import CheckpointStore, Content
-from tpm_gym.learning.configuration import Config
 
 _FOLDERS = tempfile.TemporaryDirectory()
 
@@ -74,16 +73,16 @@ def said(console: Console) -> str:
     return console.file.getvalue()
 
 
-def make_config(case: str, folder: Path) -> Config:
+def make_config(case: str, folder: Path) -> TrainingConfig:
     """A small training of which the second half learns."""
     algo, env, text = CASES[case]
     folder.mkdir(exist_ok=True)
     recipe = folder / f"{case}.yml"
     recipe.write_text(text, encoding="utf-8")
-    return Config(
-        algo=algo,  # type: ignore[arg-type]
+    return TrainingConfig(
+        algo=algo,
         env=env,
-        recipe=recipe,
+        recipe_file=recipe,
         run=folder / "run",
         eval_episodes=1,
         eval_every=70,
@@ -95,8 +94,7 @@ def make_config(case: str, folder: Path) -> Config:
 def uninterrupted(case: str) -> Path:
     """Return a run that nothing has disturbed, not even a checkpoint; not to be changed."""
     config = replace(make_config(case, Path(_FOLDERS.name, case)), checkpoint_every=10_000)
-    assert train.train(config, quiet()) is None
-    assert config.run is not None
+    assert train(config, quiet()) is None
     return config.run
 
 
@@ -115,19 +113,18 @@ def interrupt_at(
     monkeypatch.setattr(Checkpointing, "_on_step", on_step)
 
 
-def kill_at(monkeypatch: pytest.MonkeyPatch, step: int, config: Config) -> None:
-    """Train, from a checkpoint if the configuration says so, up to a death at a step."""
+def kill_at(
+    monkeypatch: pytest.MonkeyPatch, step: int, config: TrainingConfig | ResumeConfig
+) -> None:
+    """Train, or resume, up to a death at a step."""
 
     def die() -> None:
         raise Killed
 
     interrupt_at(monkeypatch, step, die)
+    run: Callable[..., object] = resume if isinstance(config, ResumeConfig) else train
     with pytest.raises(Killed):
-        train.train(config, quiet())
-
-
-def resumed(config: Config) -> Config:
-    return Config(run=config.run, resume=True)
+        run(config, quiet())
 
 
 # -- comparing whole trainings --------------------------------------------------------------------
@@ -136,6 +133,7 @@ def resumed(config: Config) -> Config:
 def end_of(run: Path) -> Content:
     """Return the last checkpoint of a run: everything that its next step would depend on."""
     content = CheckpointStore(run / "checkpoints").load(pytest.fail)
+    assert content is not None
     assert content.finished
     return content
 

@@ -1,21 +1,44 @@
+"""The scripted controller solves every task on every machine, and says when it cannot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
 import gymnasium as gym
 import numpy as np
 import pytest
 
 import tpm_gym
-from tpm_gym.tasks.control import STEP_LIMIT
-from tpm_gym.tasks.expert import Expert, _trapezoid
-from tpm_gym.tasks.rewards import SAFE_CONDITIONING
+from tpm_gym import TPMEnv
+from tpm_gym.errors import ConfigurationError, EpisodeError, InputError
+from tpm_gym.tasks import Expert, Move, PickAndPlace, Reach
+
+SPARSE = [env_id for env_id in tpm_gym.ENV_IDS if "Dense" not in env_id]
+MACHINES = ["paper", "wide"]
 
 
-def episode(env, expert, seed, disturb=None, options=None):
-    """Infos of an episode, and the largest closure error."""
+@pytest.fixture
+def env() -> Iterator[Any]:
+    made = gym.make("TPMPickAndPlace-v0")
+    yield made
+    made.close()
+
+
+def episode(
+    env: Any,
+    expert: Expert,
+    seed: int,
+    disturb: Callable[[int], None] | None = None,
+    options: dict[str, Any] | None = None,
+) -> list[dict[str, Any]]:
+    """Infos of an episode."""
     observation, info = env.reset(seed=seed, options=options)
     expert.reset(observation)
-    infos = []
+    infos = [info]
     for step in range(50):
         if disturb is not None:
-            disturb(env.unwrapped, step)
+            disturb(step)
         action = expert.act(observation)
         assert env.action_space.contains(action)
         observation, _, _, _, info = env.step(action)
@@ -23,70 +46,142 @@ def episode(env, expert, seed, disturb=None, options=None):
     return infos
 
 
-@pytest.mark.parametrize("env_id", [i for i in tpm_gym.ENV_IDS if "Dense" not in i])
-def test_it_solves_every_task_and_keeps_clear_of_the_singularity(env_id):
-    env = gym.make(env_id)
-    expert = Expert(env)
-    for seed in range(12):
+def assert_solved(env_id: str, machine: str, episodes: int, wanted: int) -> None:
+    """Success, with the loops closed, clear of the singularity, nothing lost."""
+    env = gym.make(env_id, machine=machine)
+    safe, successes, expert = env.unwrapped.machine.safe_conditioning, 0, Expert(env)
+    for seed in range(episodes):
         infos = episode(env, expert, seed)
-        assert infos[-1]["is_success"]
+        successes += infos[-1]["is_success"]
         assert max(info["closure_error"] for info in infos) < 0.5e-3
-        assert min(info["conditioning"] for info in infos) > 0.95 * SAFE_CONDITIONING
+        assert min(info["conditioning"] for info in infos) > 0.95 * safe
+        assert not any(info["object_lost"] for info in infos)
     env.close()
+    assert successes >= wanted
 
 
-def test_on_the_table_it_lets_go_and_in_the_air_it_holds():
-    env = gym.make("TPMPickAndPlace-v0")
-    expert = Expert(env)
-    for height, holds in ((0.015, False), (0.1, True)):
-        options = {"object": (-0.12, -0.03, 0.015), "goal": (0.0, -0.03, height)}
-        assert episode(env, expert, 0, options=options)[-1]["is_success"]
-        assert env.unwrapped.state.holding is holds
-    env.close()
-
-
-def test_it_tries_again_when_the_puck_is_lost():
-    env = gym.make("TPMPickAndPlace-v0")
-    expert = Expert(env)
-    lost = []
-
-    def knock_off(unwrapped, step):
-        if unwrapped.state.holding and not lost:
-            lost.append(step)
-            unwrapped.simulation._cup.let_go()
-
-    options = {"object": (-0.1, -0.03, 0.015), "goal": (0.0, -0.03, 0.1)}
-    infos = episode(env, expert, 0, knock_off, options)
-    assert lost
-    assert infos[-1]["is_success"]
-    env.close()
-
-
-def test_the_longest_paths_fit_into_an_episode():
-    env = gym.make("TPMPickAndPlace-v0")
-    expert = Expert(env)
-    options = {"object": (-0.2, -0.04, 0.015), "goal": (0.1, -0.027, 0.015)}
-    assert episode(env, expert, 0, options=options)[-1]["is_success"]
-    env.close()
-
-
-def test_trapezoids_start_and_stop_gently_and_respect_the_step_limit():
-    rng = np.random.default_rng(0)
-    for stop in rng.uniform(-0.3, 0.3, (100, 3)) * (1, 0.1, 1):
-        fractions = _trapezoid(np.zeros(3), stop)
-        steps = np.diff(fractions, prepend=0.0)
-        assert fractions[-1] == pytest.approx(1.0)
-        assert (steps > 0).all()
-        assert np.allclose(steps, steps[::-1])
-        assert (np.abs(steps[:, None] * stop) <= STEP_LIMIT * (1 + 1e-9)).all()
-        assert steps[0] == pytest.approx(steps.min())
+@pytest.mark.parametrize("machine", MACHINES)
+@pytest.mark.parametrize("env_id", SPARSE)
+def test_it_solves_every_task_and_keeps_clear_of_the_singularity(env_id: str, machine: str) -> None:
+    assert_solved(env_id, machine, 12, 12)
 
 
 @pytest.mark.slow
-def test_990_of_1000_episodes_succeed_with_the_loops_closed():
-    env = gym.make("TPMPickAndPlace-v0")
+@pytest.mark.parametrize("machine", MACHINES)
+@pytest.mark.parametrize("env_id", SPARSE)
+def test_990_of_1000_episodes_succeed_with_the_loops_closed(env_id: str, machine: str) -> None:
+    assert_solved(env_id, machine, 1000, 990)
+
+
+def test_on_the_table_it_lets_go_and_in_the_air_it_holds(env: Any) -> None:
     expert = Expert(env)
-    results = [episode(env, expert, seed) for seed in range(1000)]
-    assert sum(infos[-1]["is_success"] for infos in results) >= 990
-    assert max(info["closure_error"] for infos in results for info in infos) < 0.5e-3
+    for height, held in ((0.015, -1), (0.1, 0)):
+        options = {"object": (-0.12, -0.03, 0.015), "goal": (0.0, -0.03, height)}
+        assert episode(env, expert, 0, options=options)[-1]["is_success"]
+        assert env.unwrapped.state.held == held
+
+
+def test_it_tries_again_when_the_puck_is_lost(env: Any) -> None:
+    lost: list[int] = []
+
+    def knock_off(step: int) -> None:
+        if env.unwrapped.state.held == 0 and not lost:
+            lost.append(step)
+            env.unwrapped.simulation.engine.advance([], vacuum=False)
+
+    options = {"object": (-0.1, -0.03, 0.015), "goal": (0.0, -0.03, 0.1)}
+    infos = episode(env, Expert(env), 0, knock_off, options)
+    assert lost
+    assert infos[-1]["is_success"]
+
+
+def test_the_longest_paths_fit_into_an_episode(env: Any) -> None:
+    options = {"object": (-0.2, -0.04, 0.015), "goal": (0.1, -0.027, 0.015)}
+    assert episode(env, Expert(env), 0, options=options)[-1]["is_success"]
+
+
+def test_its_commands_start_and_stop_gently_and_respect_the_step_limit() -> None:
+    env = gym.make("TPMReach-v0")
+    expert, machine = Expert(env), env.unwrapped.machine
+    rng = np.random.default_rng(0)
+    for goal in rng.uniform(machine.goal_region.low, machine.goal_region.high, (100, 3)):
+        expert.reset(env.reset(seed=0)[0])
+        start = expert.command
+        points = np.array([start, *(move.point for move in expert.go([goal], vacuum=False))])
+        steps = np.diff(points, axis=0)
+        shares = np.linalg.norm(steps, axis=1)
+        np.testing.assert_allclose(points[-1], goal, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(steps, steps[::-1], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(np.cross(steps, goal - start), 0, atol=1e-12)
+        assert (np.abs(steps) <= np.array(machine.step_limit) * (1 + 1e-9)).all()
+        assert shares[0] == pytest.approx(shares.min())
+        assert shares[0] <= 0.5 * shares.max() + 1e-12
     env.close()
+
+
+# -- when it cannot --------------------------------------------------------------------------------
+
+
+def test_environments_of_others_are_refused() -> None:
+    for wrong in (gym.make("CartPole-v1"), None, "TPMReach-v0", object()):
+        with pytest.raises(InputError, match="an environment of tpm_gym"):
+            Expert(wrong)  # type: ignore[arg-type]
+
+
+def test_it_has_to_be_reset_for_each_episode(env: Any) -> None:
+    expert = Expert(env)
+    observation, _ = env.reset(seed=0)
+    with pytest.raises(EpisodeError, match="reset"):
+        list(map(expert.act, [observation]))
+    expert.reset(observation)
+    expert.act(observation)
+    observation, _ = env.reset(seed=1)
+    with pytest.raises(EpisodeError, match="reset"):
+        expert.act(observation)
+    expert.reset(observation)
+    assert env.action_space.contains(expert.act(observation))
+    # A reset that was refused ended nothing.
+    with pytest.raises(ConfigurationError):
+        env.unwrapped.reset(options={"gaol": 1})
+    expert.act(observation)
+
+
+class Twice(Reach):
+    """Its plan ends."""
+
+    def plan(self, expert: Expert) -> Iterator[Move]:
+        for _ in range(2):
+            yield Move(np.array(expert.machine.home) + (0.01, 0.0, 0.0), False)
+
+
+class Never(Reach):
+    """Its plan has no moves."""
+
+    def plan(self, expert: Expert) -> Iterator[Move]:
+        return iter(())
+
+
+class Unplanned(PickAndPlace):
+    """It leaves the plan to the base class."""
+
+    plan = tpm_gym.tasks.Task.plan
+
+
+def test_the_last_move_of_a_plan_is_kept_and_plans_without_one_are_told() -> None:
+    for kind in (Twice, Never, Unplanned):
+        env = TPMEnv(kind)
+        expert = Expert(env)
+        observation, _ = env.reset(seed=0)
+        if kind is Unplanned:
+            with pytest.raises(ConfigurationError, match="Unplanned"):
+                expert.reset(observation)
+        else:
+            expert.reset(observation)
+        if kind is Never:
+            with pytest.raises(EpisodeError, match="Never has no moves"):
+                expert.act(observation)
+        if kind is Twice:
+            for _ in range(6):
+                observation = env.step(expert.act(observation))[0]
+            assert expert.command == pytest.approx(np.array(env.machine.home) + (0.01, 0, 0))
+        env.close()

@@ -7,18 +7,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tpm_gym.tasks.rewards import SAFE_CONDITIONING, dense, distance, singularity_penalty, sparse
+from tpm_gym.tasks.rewards import dense, distance, singularity_penalty, sparse
 
+SAFE = 0.08
 conditionings = st.floats(0, 1)
 safes = st.floats(0.01, 1)
 
 
 def test_penalty_is_zero_where_it_is_safe_and_one_at_a_singularity() -> None:
-    safe = np.linspace(SAFE_CONDITIONING, 1, 50)
-    np.testing.assert_array_equal(singularity_penalty(safe), 0)
-    assert singularity_penalty(0.0) == 1
-    assert singularity_penalty(SAFE_CONDITIONING / 2) == pytest.approx(15 / 16)
-    assert singularity_penalty(np.nextafter(SAFE_CONDITIONING, 0) - 1e-6) > 0
+    safe = np.linspace(SAFE, 1, 50)
+    np.testing.assert_array_equal(singularity_penalty(safe, SAFE), 0)
+    assert singularity_penalty(0.0, SAFE) == 1
+    assert singularity_penalty(SAFE / 2, SAFE) == pytest.approx(15 / 16)
+    assert singularity_penalty(np.nextafter(SAFE, 0) - 1e-6, SAFE) > 0
 
 
 @settings(derandomize=True, max_examples=200)
@@ -29,7 +30,7 @@ def test_penalty_never_rises_with_the_conditioning(a: float, b: float, safe: flo
     assert 0 <= better <= worse <= 1
 
 
-@pytest.mark.parametrize("safe", [SAFE_CONDITIONING, 0.3])
+@pytest.mark.parametrize("safe", [SAFE, 0.3])
 def test_penalty_is_steepest_at_the_threshold(safe: float) -> None:
     # Flat there, crossing it would cost nothing, and policies would not care.
     c = np.linspace(0, safe, 1001)
@@ -42,8 +43,8 @@ def test_penalty_is_steepest_at_the_threshold(safe: float) -> None:
 
 def test_penalty_is_continuous() -> None:
     c = np.linspace(-0.02, 0.15, 20_001)
-    largest = np.abs(np.diff(singularity_penalty(c))).max()
-    assert largest <= 1.001 * (c[1] - c[0]) * 4 / SAFE_CONDITIONING
+    largest = np.abs(np.diff(singularity_penalty(c, SAFE))).max()
+    assert largest <= 1.001 * (c[1] - c[0]) * 4 / SAFE
 
 
 @pytest.mark.parametrize("shape", [(), (4,), (2, 3), (0,)])
@@ -56,7 +57,10 @@ def test_terms_keep_leading_shapes(shape: tuple[int, ...]) -> None:
         (gap, lambda i: distance(achieved[i], desired[i])),
         (sparse(gap, 1.0), lambda i: sparse(gap[i], 1.0)),
         (dense(gap), lambda i: dense(gap[i])),
-        (singularity_penalty(conditioning), lambda i: singularity_penalty(conditioning[i])),
+        (
+            singularity_penalty(conditioning, SAFE),
+            lambda i: singularity_penalty(conditioning[i], SAFE),
+        ),
     ):
         assert np.shape(found) == shape
         for index in np.ndindex(shape):

@@ -1,167 +1,306 @@
+"""Tasks are functions of a state, over any leading axes, that say what they need of a user."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 from states import random_state
 
 from tpm_gym.errors import ConfigurationError, ResetOptionError, UnreachableError
-from tpm_gym.kinematics import workspace
-from tpm_gym.kinematics.workspace import TASK_REGION
-from tpm_gym.mechanism.tree import CUP_LENGTH, DEFAULT_MOUNT
-from tpm_gym.simulation.state import State
-from tpm_gym.tasks import task as tasks
-from tpm_gym.tasks.rewards import SAFE_CONDITIONING
-from tpm_gym.tasks.task import MIN_SEPARATION, PickAndPlace, Reach
+from tpm_gym.mechanism.cup import CUP
+from tpm_gym.mechanism.tpm import PAPER_TPM, WIDE_TPM
+from tpm_gym.simulation.state import Block, Scene, State
+from tpm_gym.tasks import PickAndPlace, Reach, Task
+from tpm_gym.tasks.registry import make_task
 
 PUCK = PickAndPlace.puck
+HANGING = np.array([0.0, 0.0, CUP.length + PUCK.height / 2])  # P above the centre of a held puck
 
 
-def pick(state, index):
-    values = {
-        name: np.asarray(value)[index] for name, value in vars(state).items() if value is not None
-    }
-    return State(mode_change=None, **values)
+class TwoBlocks(PickAndPlace):
+    """The second block beside the first, and a goal for both."""
+
+    scene = Scene(objects=(Block(), Block(name="other", width=0.02)), markers=2)
+    goal_size = 6
+
+    def observed(self) -> Any:
+        return (*super().observed(), *self.object_entries(1))
+
+    def sample(self, rng: Any, chosen: Any) -> Any:
+        start = {"object": np.array([0.0, -0.03, 0.015]), "other": np.array([0.05, -0.03, 0.015])}
+        return {**start, "goal": np.tile([-0.05, -0.03, 0.1], 2), **chosen}
+
+    def achieved(self, state: State) -> Any:
+        return np.concatenate([state.object_position[..., i, :] for i in (0, 1)], axis=-1)
 
 
-@pytest.fixture(params=["reach", "pick_and_place"])
-def task(request):
-    return tasks.make(request.param, "dense")
+@pytest.fixture(params=[Reach, PickAndPlace, TwoBlocks])
+def task(request: pytest.FixtureRequest) -> Task:
+    made: Task = request.param(PAPER_TPM, "dense")
+    return made
 
 
-def test_every_function_of_a_state_accepts_a_batch(task):
-    rng = np.random.default_rng(0)
-    batch = random_state(rng, (4, 2))
-    desired = rng.normal(size=(4, 2, 3))
-    observed, achieved = task.observe(batch), task.achieved(batch)
-    reward, success = task.goal_term(achieved, desired), task.success(achieved, desired)
-    terms = task.state_terms(batch)
-    assert observed.shape == (4, 2, task.observation_size)
+def states(task: Task, seed: int = 0, shape: tuple[int, ...] = (), **values: Any) -> State:
+    return random_state(np.random.default_rng(seed), shape, len(task.scene.objects), **values)
+
+
+def test_every_function_of_a_state_accepts_a_batch(task: Task) -> None:
+    passed = np.zeros((4, 2), dtype=bool)
+    passed[1, 1] = True
+    batch = states(task, shape=(4, 2), working_mode_changed=passed)
+    desired = np.random.default_rng(1).normal(size=(4, 2, task.goal_size))
+
+    def results(state: State, goal: Any) -> dict[str, Any]:
+        achieved = task.achieved(state)
+        return {
+            "observed": task.observe(state),
+            "achieved": achieved,
+            "success": task.success(achieved, goal),
+            "goal term": task.goal_term(achieved, goal),
+            "penalty": task.penalty(state),
+            "lost": task.lost(state),
+            **task.reward_terms(state, achieved, goal),
+        }
+
+    batched = results(batch, desired)
+    assert batched["observed"].shape == (4, 2, task.observation_size)
     for index in np.ndindex(4, 2):
-        one = pick(batch, index)
-        assert np.array_equal(task.observe(one), observed[index])
-        assert np.array_equal(task.achieved(one), achieved[index])
-        assert task.goal_term(task.achieved(one), desired[index]) == reward[index]
-        assert task.success(task.achieved(one), desired[index]) == success[index]
-        for name, value in task.state_terms(one).items():
-            assert value == terms[name][index]
+        one = State(**{name: np.asarray(value)[index] for name, value in vars(batch).items()})
+        for name, value in results(one, desired[index]).items():
+            np.testing.assert_array_equal(value, batched[name][index])
 
 
-def test_decode_is_the_inverse_of_observe(task):
-    state = random_state(np.random.default_rng(1), (5,))
+def test_decode_is_the_inverse_of_observe(task: Task) -> None:
+    state = states(task, 1, (5,))
     decoded = task.decode(task.observe(state))
-    assert np.allclose(decoded["position"], state.fk_position)
-    assert np.allclose(decoded["velocity"], state.fk_velocity)
-    assert np.allclose(decoded["command"], state.command - state.fk_position)
-    if isinstance(task, PickAndPlace):
-        assert np.allclose(decoded["object_position"], state.object_position)
-        assert np.allclose(decoded["object_velocity"], state.object_velocity)
-        assert np.allclose(decoded["holding"][:, 0], state.holding)
+    expected = {
+        "position": state.fk_position,
+        "velocity": state.fk_velocity,
+        "command": state.command - state.fk_position,
+    }
+    for index, block in enumerate(task.scene.objects):
+        expected[f"{block.name}_position"] = state.object_position[:, index]
+        expected[f"{block.name}_velocity"] = state.object_velocity[:, index]
+        expected[f"{block.name}_tilt"] = state.object_axis[:, index, :2]
+        expected[f"{block.name}_held"] = np.equal(state.held, index)[:, None]
+    for name, value in expected.items():
+        np.testing.assert_allclose(decoded[name], value, atol=1e-12)
+    assert set(decoded) == {entry.name for entry in task.entries}
 
 
-def test_the_observation_never_reads_the_platform_of_the_simulator(task):
-    rng = np.random.default_rng(2)
-    state = random_state(rng)
-    values = dict(vars(state), platform_position=rng.normal(size=3), platform_tilt=9.0)
-    assert np.array_equal(task.observe(State(**values)), task.observe(state))
-    assert np.array_equal(task.achieved(State(**values)), task.achieved(state))
+def test_the_observation_never_reads_the_platform_of_the_simulator(task: Task) -> None:
+    state = states(task, 2)
+    other = replace(state, platform_position=np.ones(3), platform_tilt=9.0)
+    np.testing.assert_array_equal(task.observe(other), task.observe(state))
+    np.testing.assert_array_equal(task.achieved(other), task.achieved(state))
 
 
-def test_the_offset_to_the_puck_vanishes_when_the_cup_touches_it():
-    task = PickAndPlace()
-    values = vars(random_state(np.random.default_rng(3)))
-    values["object_axis"] = np.array([0.0, 0.0, 1.0])
-    values["object_position"] = values["fk_position"] - (0, 0, CUP_LENGTH + PUCK.height / 2)
-    decoded = task.decode(task.observe(State(**values)))
-    assert np.allclose(decoded["object_offset"], 0.0, atol=1e-12)
-    assert np.allclose(decoded["object_tilt"], 0.0)
+def test_the_offset_to_the_puck_vanishes_when_the_cup_touches_it() -> None:
+    task = PickAndPlace(PAPER_TPM)
+    upright = np.array([[0.0, 0.0, 1.0]])
+    state = states(task, 3, object_axis=upright)
+    state = replace(state, object_position=(state.fk_position - HANGING)[None])
+    decoded = task.decode(task.observe(state))
+    np.testing.assert_allclose(decoded["object_offset"], 0.0, atol=1e-12)
+    np.testing.assert_allclose(decoded["object_tilt"], 0.0, atol=1e-12)
 
 
-def test_a_toppled_puck_shows_in_the_tilt():
-    values = vars(random_state(np.random.default_rng(4)))
-    values["object_axis"] = np.array([1.0, 0.0, 0.0])
-    decoded = PickAndPlace().decode(PickAndPlace().observe(State(**values)))
-    assert np.allclose(decoded["object_tilt"], [1.0, 0.0])
+# -- reward ----------------------------------------------------------------------------------------
 
 
-def safe(points):
-    """Whether P at points (world) is in the region and well conditioned."""
-    place = DEFAULT_MOUNT.to_paper(points)
-    conditioned = workspace.conditioning_at(place) >= SAFE_CONDITIONING
-    return TASK_REGION.contains(place) & conditioned
+def test_the_reward_has_the_documented_terms() -> None:
+    gap, near = np.array([0.03, 0.0, 0.04]), 1 - 0.5**4
+    for kind, reward, names in (
+        (Reach, "sparse", {"goal": -1.0, "singularity": -2 * near}),
+        (Reach, "dense", {"goal": -0.5, "singularity": -2 * near}),
+        (PickAndPlace, "sparse", {"goal": -1.0, "singularity": -2 * near}),
+        (PickAndPlace, "dense", {"goal": -0.5, "singularity": -2 * near, "approach": -0.15}),
+    ):
+        task = kind(PAPER_TPM, reward, penalty_weight=2)
+        upright = np.array([[0.0, 0.0, 1.0]] * len(task.scene.objects)).reshape(-1, 3)
+        state = states(task, conditioning=0.04, object_axis=upright)
+        below = state.fk_position - HANGING - (0.0, 0.0, 0.03)
+        state = replace(state, object_position=below[None])
+        assert task.reward_terms(state, np.zeros(3), gap) == pytest.approx(names)
 
 
-def test_reach_goals_are_safe_apart_from_home_and_spread():
-    task, rng = Reach(), np.random.default_rng(5)
-    goals = np.array([task.sample_goal(rng, None) for _ in range(400)])
-    assert safe(goals).all()
-    home = DEFAULT_MOUNT.to_world(task.home)
-    assert np.linalg.norm(goals - home, axis=1).min() >= MIN_SEPARATION
-    assert (np.ptp(goals, axis=0) > (0.25, 0.02, 0.18)).all()
+@pytest.mark.parametrize("mode", ["assembly", "working"])
+@pytest.mark.parametrize("conditioning", [0.0, 0.05, 0.3])
+def test_a_mode_change_costs_the_whole_penalty(mode: str, conditioning: float) -> None:
+    task = Reach(PAPER_TPM)
+    state = states(task, conditioning=conditioning, **{f"{mode}_mode_changed": np.True_})
+    assert task.penalty(state) == 1
+    assert task.reward_terms(state, np.zeros(3), np.zeros(3))["singularity"] == -1
 
 
-def test_pick_and_place_samples_are_safe_and_half_on_the_table():
-    task, rng = PickAndPlace(), np.random.default_rng(6)
-    starts = np.array([task.sample_object(rng) for _ in range(400)])
-    goals = np.array([task.sample_goal(rng, start) for start in starts])
-    above = (0.0, 0.0, PUCK.height / 2 + CUP_LENGTH)
-    assert safe(starts + above).all()
-    assert safe(goals + above).all()
-    assert np.allclose(starts[:, 2], PUCK.height / 2)
-    assert np.linalg.norm(goals - starts, axis=1).min() >= MIN_SEPARATION
-    on_table = np.isclose(goals[:, 2], PUCK.height / 2)
-    assert 0.4 < on_table.mean() < 0.6
-    assert goals[~on_table, 2].min() > PUCK.height / 2 + 0.02
-
-
-def test_sampling_repeats_with_the_rng(task):
-    def draw():
-        rng = np.random.default_rng(7)
-        start = task.sample_object(rng)
-        return task.sample_goal(rng, start)
-
-    assert np.array_equal(draw(), draw())
-
-
-@pytest.mark.parametrize("value", ["here", (0.0, 1.0), (0.0, np.nan, 0.0), None, [[1, 2, 3]]])
-def test_what_is_no_point_is_refused(task, value):
-    with pytest.raises(ResetOptionError):
-        task.check_goal(value)
-
-
-def test_what_is_out_of_reach_is_refused_with_the_margin_and_the_limits(task):
-    inside = task.sample_goal(np.random.default_rng(8), (0.0, 0.0, 0.0))
-    assert np.array_equal(task.check_goal(inside), inside)
-    with pytest.raises(UnreachableError, match="must lie between") as caught:
-        task.check_goal(inside + (0.0, 0.2, 0.0))
-    assert caught.value.margin < 0
-    assert caught.value.leg == "box"
-
-
-def test_the_checked_goal_is_a_copy(task):
-    goal = task.sample_goal(np.random.default_rng(9), None)
-    checked = task.check_goal(goal)
-    goal[:] = 0.0
-    assert not np.array_equal(checked, goal)
-
-
-def test_an_object_below_the_table_is_refused():
-    with pytest.raises(ResetOptionError):
-        PickAndPlace().check_object((0.0, -0.03, 0.014))
-    with pytest.raises(ResetOptionError):
-        PickAndPlace().check_goal((0.0, -0.03, 0.0135))
-    with pytest.raises(ResetOptionError):
-        Reach().check_object((0.0, -0.03, 0.015))
-
-
-def test_sparse_rewards_follow_success():
-    task = PickAndPlace("sparse")
-    goal = np.zeros(3)
+def test_sparse_rewards_follow_success() -> None:
+    task = PickAndPlace(PAPER_TPM)
     for gap, reward in ((0.0099, 0.0), (0.0101, -1.0)):
-        assert task.goal_term((gap, 0.0, 0.0), goal) == reward
-        assert task.success((gap, 0.0, 0.0), goal) == (reward == 0.0)
-    assert task.state_terms(random_state(np.random.default_rng(10))) == {}
+        assert task.goal_term((gap, 0.0, 0.0), np.zeros(3)) == reward
+        assert task.success((gap, 0.0, 0.0), np.zeros(3)) == (reward == 0.0)
 
 
-def test_unknown_tasks_and_rewards_are_refused():
-    with pytest.raises(ConfigurationError):
-        tasks.make("juggle", "sparse")
-    with pytest.raises(ConfigurationError):
-        tasks.make("reach", "none")
+def test_the_penalty_begins_where_the_machine_says() -> None:
+    state = states(Reach(PAPER_TPM), conditioning=0.2)
+    assert Reach(PAPER_TPM).penalty(state) == 0
+    assert Reach(replace(PAPER_TPM, safe_conditioning=0.4)).penalty(state) == 1 - 0.5**4
+
+
+@pytest.mark.parametrize(
+    ("place", "lost"),
+    [
+        ((0.0, -0.03, 0.015), False),
+        ((0.0, -0.03, 0.3), False),  # held, or falling
+        ((0.13, -0.03, 0.015), False),  # the cup takes it off its middle
+        ((0.2, -0.03, 0.015), True),
+        ((0.0, 0.03, 0.015), True),
+        ((0.0, -0.03, -0.5), True),
+    ],
+)
+def test_an_object_is_lost_off_the_table_and_out_of_reach(place: Any, lost: bool) -> None:
+    task = TwoBlocks(PAPER_TPM)
+    near = (0.0, -0.03, 0.015)
+    for places in ((near, place), (place, near)):
+        assert task.lost(states(task, object_position=np.array(places))) == lost
+    assert not Reach(PAPER_TPM).lost(states(Reach(PAPER_TPM)))
+
+
+# -- starts ----------------------------------------------------------------------------------------
+
+
+def test_starts_repeat_with_the_rng_and_take_what_is_chosen(task: Task) -> None:
+    first, again = (task.start(np.random.default_rng(7), None) for _ in range(2))
+    assert set(first) == {"goal", *(block.name for block in task.scene.objects)}
+    for name, place in first.items():
+        np.testing.assert_array_equal(again[name], place)
+        given = place.tolist()
+        chosen = task.start(np.random.default_rng(8), {name: given})
+        np.testing.assert_array_equal(chosen[name], place)
+    goal = first["goal"].copy()
+    kept = task.start(np.random.default_rng(7), {"goal": goal})["goal"]
+    goal[:] = 0.0
+    np.testing.assert_array_equal(kept, first["goal"])
+
+
+@pytest.mark.parametrize(
+    "value",
+    ["here", (0.0, 1.0), (0.0, np.nan, 0.0), None, [[1, 2, 3]], (10**400, 0, 0), (1j, 0, 0)],
+    ids=repr,
+)
+def test_what_is_no_point_is_refused(task: Task, value: Any) -> None:
+    for name in ("goal", *(block.name for block in task.scene.objects)):
+        with pytest.raises(ResetOptionError) as caught:
+            task.start(np.random.default_rng(0), {name: value})
+        assert caught.value.name == name
+
+
+@pytest.mark.parametrize("options", [{"gaol": (0, 0, 0)}, [("goal", (0, 0, 0))], {3: 4}, "goal"])
+def test_unknown_options_are_refused_with_the_known_ones(task: Task, options: Any) -> None:
+    with pytest.raises(ResetOptionError, match="'goal'") as caught:
+        task.start(np.random.default_rng(0), options)
+    assert all(block.name in str(caught.value) for block in task.scene.objects)
+    with pytest.raises(ResetOptionError):  # Reach has no object
+        Reach(PAPER_TPM).start(np.random.default_rng(0), {"object": (0.0, -0.03, 0.015)})
+
+
+@pytest.mark.parametrize("name", ["goal", "object"])
+def test_what_is_out_of_reach_is_refused_with_the_range_that_is_enforced(name: str) -> None:
+    task = PickAndPlace(PAPER_TPM)
+    for place in ((0.0, -0.03, 0.0135), (0.0, -0.03, -0.3), (0.0, 0.2, 0.015), (1.0, -0.03, 0.1)):
+        with pytest.raises(UnreachableError) as caught:
+            task.start(np.random.default_rng(0), {name: place})
+        assert caught.value.leg == "box"
+        assert caught.value.margin < 0
+        low, high = task.reach_of(PUCK)
+        assert f"{name} must lie in {low.round(4).tolist()}" in str(caught.value)
+        assert low[2] == 0.015
+    for place in (low, high):
+        chosen = task.start(np.random.default_rng(0), {name: place})
+        np.testing.assert_array_equal(chosen[name], place)
+
+
+@pytest.mark.parametrize("machine", [PAPER_TPM, WIDE_TPM], ids=lambda machine: machine.name)
+def test_an_object_does_not_start_inside_the_robot(machine: Any) -> None:
+    task = PickAndPlace(machine)
+    home = machine.mount.to_world(machine.home)
+    touching = home - HANGING
+    for place in (home, touching + (0, 0, 0.001), touching + (0.02, 0.0, 0.02)):
+        with pytest.raises(ResetOptionError, match="clear of the robot at home") as caught:
+            task.start(np.random.default_rng(0), {"object": place, "goal": touching})
+        assert caught.value.name == "object"
+    for place in (touching, home + (0.12, 0.0, 0.0)):
+        task.start(np.random.default_rng(0), {"object": place})
+
+
+def test_an_object_does_not_start_inside_another() -> None:
+    task, rng = TwoBlocks(PAPER_TPM), np.random.default_rng(0)
+    task.start(rng, {"object": (0.022, -0.03, 0.015)})  # they touch
+    for name, place in (("object", (0.023, -0.03, 0.02)), ("other", (0.01, -0.04, 0.04))):
+        with pytest.raises(ResetOptionError, match="clear of") as caught:
+            task.start(rng, {name: place})
+        assert caught.value.name == name
+
+
+# -- made by name, copied --------------------------------------------------------------------------
+
+
+def test_tasks_are_made_by_name_or_class_or_taken_as_they_are() -> None:
+    by_name = make_task("pick_and_place", machine="wide", reward="dense", penalty_weight=2)
+    assert (type(by_name), by_name.machine, by_name.reward) == (PickAndPlace, WIDE_TPM, "dense")
+    assert by_name.penalty_weight == 2.0
+    by_class = make_task(TwoBlocks, goals="tempting")
+    assert (type(by_class), by_class.machine, by_class.goals) == (TwoBlocks, PAPER_TPM, "tempting")
+    assert make_task(by_class) is by_class
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"machine": "wide"},
+        {"machine": PAPER_TPM},
+        {"reward": "dense"},
+        {"goals": "sampled"},
+        {"penalty_weight": 0},
+    ],
+    ids=repr,
+)
+def test_a_task_that_is_made_takes_no_options(options: dict[str, Any]) -> None:
+    with pytest.raises(ConfigurationError, match="has its own") as caught:
+        make_task(Reach(PAPER_TPM), **options)
+    assert caught.value.name in options
+
+
+@pytest.mark.parametrize("task", ["juggle", None, 3, dict, object(), ["reach"]], ids=repr)
+def test_what_is_no_task_is_refused(task: Any) -> None:
+    with pytest.raises(ConfigurationError, match="'reach', 'pick_and_place'") as caught:
+        make_task(task)
+    assert caught.value.name == "task"
+
+
+def test_weights_of_any_number_type_are_taken() -> None:
+    for weight in (2, 2.0, np.float32(2), np.int64(2), np.array(2.0)):
+        assert Reach(PAPER_TPM, penalty_weight=weight).penalty_weight == 2.0
+
+
+def test_markers_that_do_not_fit_the_goal_are_refused_when_the_task_is_made() -> None:
+    class Unmarked(TwoBlocks):
+        scene = Scene(objects=TwoBlocks.scene.objects)
+
+    with pytest.raises(ConfigurationError, match="2, as a goal shows") as caught:
+        Unmarked(PAPER_TPM)
+    assert caught.value.name == "markers"
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda task: pickle.loads(pickle.dumps(task))])
+def test_copies_observe_and_reward_alike(task: Task, copied: Any) -> None:
+    other, state = copied(task), states(task, 5)
+    np.testing.assert_array_equal(other.observe(state), task.observe(state))
+    goal = np.zeros(task.goal_size)
+    found = [one.reward_terms(state, one.achieved(state), goal) for one in (task, other)]
+    assert found[0] == found[1]
+    assert other.machine == task.machine

@@ -15,9 +15,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tpm_gym.analysis.singularity import factors_at
+from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.kinematics.modes import ELBOWS_OUT, AssemblyMode, WorkingMode
@@ -35,9 +35,6 @@ __all__ = [
     "sample",
 ]
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.int64]
 Shape = tuple[int, int, int]
 
 DEFAULT_SHAPE: Shape = (64, 16, 96)
@@ -55,8 +52,8 @@ class Cells:
             cells ny / 2 - 1 and ny / 2.
     """
 
-    low: tuple[float, float, float]
-    spacing: tuple[float, float, float]
+    low: Vector
+    spacing: Vector
     mask: BoolArray
 
     @property
@@ -94,8 +91,6 @@ class ReachableSet:
     """Where point P can be on one working mode.
 
     Attributes:
-        branch: The working mode.
-        geometry: Link lengths.
         cells: The set.
     """
 
@@ -112,7 +107,6 @@ class Aspect:
         branch: The working mode; names the signs of the serial factors.
         assembly: The assembly mode; names the signs of sin(beta) and the planar factor.
         level3: Sign of the remaining factor, l1 + l3 c3 - xC - 2 l2.
-        geometry: Link lengths.
         cells: The region.
     """
 
@@ -143,10 +137,7 @@ def reachable_set(
 ) -> ReachableSet:
     """The points that have a posture on ``branch``, as cells of a grid over all that rods reach.
 
-    Args:
-        branch: The working mode.
-        geometry: Link lengths.
-        shape: Cells along x, y, z; at least 2 each, along y an even number.
+    ``shape`` counts cells along x, y, z: at least 2 each, along y an even number.
 
     Raises:
         ConfigurationError: If the shape is not possible.
@@ -165,13 +156,8 @@ def aspects(
 
     Cells belong together if they share a face and all factors have the same signs at their centres.
     So regions joined by a neck narrower than a cell come out as several, and a wall of singular
-    points thinner than a cell may be overlooked: compare two grids.
-
-    Args:
-        branch: The working mode.
-        geometry: Link lengths.
-        shape: Cells along x, y, z; at least 2 each, along y an even number.
-        min_cells: Regions of fewer cells are dropped: crumbs along curved boundaries.
+    points thinner than a cell may be overlooked: compare two grids. Regions of fewer than
+    ``min_cells`` cells are dropped: crumbs along curved boundaries.
 
     Raises:
         ConfigurationError: If the shape is not possible, or min_cells is not positive.
@@ -206,11 +192,6 @@ def sample(rng: np.random.Generator, aspect: Aspect, count: int) -> FloatArray:
     a cell from the aspect's cells is missing, and that another region with the same signs less than
     a cell away would be let in.
 
-    Args:
-        rng: Source of randomness.
-        aspect: Where to draw.
-        count: How many points; may be 0.
-
     Raises:
         ConfigurationError: If count is negative, or if the aspect has no cells.
     """
@@ -237,10 +218,6 @@ def largest_box(aspect: Aspect, threshold: float) -> Box:
     the aspect and have 1/cond(J) >= threshold, is larger. The box ends at the outermost nodes, so
     every face was looked at; between the nodes the conditioning is not known, but it varies little
     from node to node.
-
-    Args:
-        aspect: Where to search.
-        threshold: Smallest conditioning allowed, between 0 and 1.
 
     Raises:
         ConfigurationError: If the threshold is not between 0 and 1, or if no box of at least two
@@ -270,7 +247,7 @@ def largest_box(aspect: Aspect, threshold: float) -> Box:
 
 def _codes(
     branch: WorkingMode, geometry: Geometry, shape: Shape
-) -> tuple[tuple[float, float, float], tuple[float, float, float], IntArray]:
+) -> tuple[Vector, Vector, IntArray]:
     """Corner and spacing of the grid, and the signs at the centres of its cells."""
     if len(shape) != 3 or any(int(n) != n or n < 2 for n in shape) or shape[1] % 2:
         raise ConfigurationError("shape", shape, "three integers from 2 up, that along y even")

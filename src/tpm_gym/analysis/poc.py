@@ -25,8 +25,9 @@ from dataclasses import dataclass
 from functools import reduce
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tpm_gym.arrays import FloatArray, finite_points, numbers
 from tpm_gym.errors import InputError
 
 __all__ = [
@@ -45,8 +46,6 @@ __all__ = [
     "revolute",
     "serial",
 ]
-
-FloatArray = NDArray[np.float64]
 
 # Directions closer than this (sine of the angle) count as one, and vectors shorter than this as
 # none: far above rounding, far below anything away from a singularity.
@@ -70,12 +69,10 @@ class Subspace:
         Raises:
             InputError: If the shape is wrong or an entry is not finite.
         """
-        rows = np.asarray(vectors, dtype=np.float64)
-        rows = rows.reshape(0, 3) if rows.size == 0 else rows
-        if rows.ndim != 2 or rows.shape[1] != 3:
+        rows = numbers("vectors", vectors)
+        rows = finite_points("vectors", rows if rows.size else rows.reshape(0, 3))
+        if rows.ndim != 2:
             raise InputError("vectors", rows.shape, "an array of shape (n, 3), by shape")
-        if not np.isfinite(rows).all():
-            raise InputError("vectors", rows.tolist(), "finite")
         lengths = np.linalg.norm(rows, axis=1)
         rows = rows[lengths > _SAME] / lengths[lengths > _SAME, None]
         _, values, right = np.linalg.svd(rows)
@@ -175,13 +172,9 @@ def parallelogram_4s(name: str, short: FloatArray, rod: FloatArray, point: Float
     """A parallelogram of four spherical pairs, P^(4S) P^(4S) R^(4S) R^(4S) of the paper.
 
     Its rods, which spin idly about themselves, keep one distance each: the far short link loses
-    the translation along the rods and the rotation about the normal of the parallelogram.
-
-    Args:
-        name: The paper's name.
-        short: (3,) direction of the short links.
-        rod: (3,) direction of the rods.
-        point: (3,) m, middle of the far short link.
+    the translation along the rods and the rotation about the normal of the parallelogram. ``short``
+    and ``rod`` (3,) are directions of short links and rods, ``point`` (3,) m is the middle of the
+    far short link.
     """
     normal = np.cross(short, rod)
     translations = np.stack([normal, np.cross(rod, normal)])
@@ -192,13 +185,7 @@ def parallelogram_4r(name: str, short: FloatArray, rod: FloatArray, point: Float
     """A parallelogram of four revolutes, P^(4R): a translation in its plane, across the rods.
 
     The paper writes t^1(|| R32), the direction of its short links; that is where the rods are
-    perpendicular to them.
-
-    Args:
-        name: The paper's name.
-        short: (3,) direction of the short links.
-        rod: (3,) direction of the rods.
-        point: (3,) m, middle of the far short link.
+    perpendicular to them. The arguments are those of :func:`parallelogram_4s`.
     """
     normal = np.cross(short, rod)
     return Unit(name, point, np.cross(rod, normal)[None], np.empty((0, 3)))

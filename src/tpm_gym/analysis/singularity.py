@@ -15,12 +15,13 @@ from dataclasses import dataclass
 from enum import IntFlag
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tpm_gym.arrays import BoolArray, FloatArray, IntArray
 from tpm_gym.errors import ConfigurationError
-from tpm_gym.kinematics import forward, inverse, inverse_all
+from tpm_gym.kinematics import inverse
 from tpm_gym.kinematics.geometry import PAPER, Geometry
-from tpm_gym.kinematics.jacobian import Factors, factors
+from tpm_gym.kinematics.jacobian import Factors, factors, factors_at
 from tpm_gym.kinematics.modes import DEFAULT_ASSEMBLY, ELBOWS_OUT, AssemblyMode, WorkingMode
 
 __all__ = [
@@ -34,10 +35,6 @@ __all__ = [
     "factors_at",
     "nearest_singularity",
 ]
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.int64]
 
 FACTORS = ("sin_beta", "level3", "planar", "cos_beta", "leg1", "leg2", "leg3")
 """Names of the factors, in the order of every axis of length 7 here: 3 parallel, then 4 serial.
@@ -116,70 +113,24 @@ def dimensionless(values: Factors, geometry: Geometry = PAPER) -> FloatArray:
     return scaled
 
 
-def factors_at(
-    position: ArrayLike, branch: WorkingMode = ELBOWS_OUT, geometry: Geometry = PAPER
-) -> Factors:
-    """The factors of Eqs. (16) and (17), corrected, at points instead of joint angles.
-
-    Unlike :func:`tpm_gym.kinematics.jacobian.factors` it does not pass through the forward kinematics, so it
-    keeps its accuracy at the parallel singularities.
-
-    Args:
-        position: (..., 3) m, point P.
-        branch: The working mode.
-        geometry: Link lengths.
-
-    Returns:
-        Factors (m, m^2, m^2/rad as there); NaN where the point is not reachable on ``branch``.
-
-    Raises:
-        InputError: If the last axis of position does not have length 3.
-    """
-    solutions = inverse_all(position, geometry)
-    theta = solutions.theta[..., branch.index, :]
-    x, y, z = np.moveaxis(np.asarray(position, dtype=np.float64), -1, 0)
-    l1, l2, l3, _, l5, l6, l7 = vars(geometry).values()
-    with np.errstate(all="ignore"):  # points that are infinite, or so far that their squares are
-        sin_beta = np.where(solutions.valid[..., branch.index], y / l7, np.nan)
-        cos_beta = branch.cos_beta * np.sqrt(np.maximum((1 - sin_beta) * (1 + sin_beta), 0.0))
-        x_c, z_c = x - l2 - l7 * cos_beta, z - 2 * l6
-        c1, c2, c3 = np.moveaxis(l3 * np.cos(theta), -1, 0)
-        s1, s2, s3 = np.moveaxis(l3 * np.sin(theta), -1, 0)
-        y1, z1 = -l1 - c1, z_c - s1
-        x2, z2 = x_c - 2 * l5 + l1 - c2, z_c - s2
-        x3, z3 = x + l2 - l1 - c3, z_c + l6 - s3
-        return Factors(
-            parallel=np.stack([sin_beta, l1 + c3 - x_c - 2 * l2, x_c * z2 - z1 * x2], axis=-1),
-            serial=np.stack(
-                [cos_beta, z1 * c1 - y1 * s1, z2 * c2 - x2 * s2, z3 * c3 - x3 * s3], axis=-1
-            ),
-        )
-
-
 def classify(
     theta: ArrayLike,
     branch: AssemblyMode = DEFAULT_ASSEMBLY,
     geometry: Geometry = PAPER,
     tolerance: float = 1e-6,
 ) -> Classification:
-    """Tell what kind of singularity joint angles are in (section "Singularity analysis").
+    """Tell what kind of singularity theta (..., 3) rad is in (section "Singularity analysis").
 
-    Args:
-        theta: (..., 3) rad.
-        branch: The assembly mode.
-        geometry: Link lengths.
-        tolerance: A factor made dimensionless counts as zero up to this. From joint angles, a
-            factor that merges two branches is known to the square root of rounding only, so less
-            than 1e-7 makes no sense here.
+    A factor made dimensionless counts as zero up to ``tolerance``. From joint angles, a factor that
+    merges two branches is known to the square root of rounding only, so less than 1e-7 makes no
+    sense here.
 
     Raises:
         InputError: If theta has the wrong shape or is not finite.
         UnreachableError: If the branch does not exist at some theta.
         ConfigurationError: If the tolerance is not between 0 and 1.
     """
-    height = forward(theta, branch, geometry)[..., 2] - 2 * geometry.l6
-    elevation = height - geometry.l3 * np.sin(np.asarray(theta, dtype=np.float64)[..., 0])
-    return _classify(factors(theta, branch, geometry), elevation, geometry, tolerance)
+    return _classify(factors(theta, branch, geometry), geometry, tolerance)
 
 
 def classify_at(
@@ -188,24 +139,18 @@ def classify_at(
     geometry: Geometry = PAPER,
     tolerance: float = 1e-6,
 ) -> Classification:
-    """Tell what kind of singularity points are in, on one working mode.
+    """Tell what kind of singularity points (..., 3) m are in, on one working mode.
 
-    Args:
-        position: (..., 3) m, point P.
-        branch: The working mode.
-        geometry: Link lengths.
-        tolerance: A factor made dimensionless counts as zero up to this. A leg's factor grows as
-            the square root of the distance to its boundary: 1e-6 is reached 1e-12 m from it.
+    A factor made dimensionless counts as zero up to ``tolerance``. A leg's factor grows as the
+    square root of the distance to its boundary: 1e-6 is reached 1e-12 m from it.
 
     Raises:
         InputError: If position has the wrong shape or is not finite.
         UnreachableError: If some point is not reachable on ``branch``.
         ConfigurationError: If the tolerance is not between 0 and 1.
     """
-    theta = inverse(position, branch, geometry)
-    height = np.asarray(position, dtype=np.float64)[..., 2] - 2 * geometry.l6
-    elevation = height - geometry.l3 * np.sin(theta[..., 0])
-    return _classify(factors_at(position, branch, geometry), elevation, geometry, tolerance)
+    inverse(position, branch, geometry)  # raises where it is not reachable, and says why
+    return _classify(factors_at(position, branch, geometry), geometry, tolerance)
 
 
 def nearest_singularity(
@@ -214,7 +159,7 @@ def nearest_singularity(
     assembly: AssemblyMode = DEFAULT_ASSEMBLY,
     geometry: Geometry = PAPER,
 ) -> NearestSingularity:
-    """Distance from points to the nearest singular point, in Cartesian space, on one working mode.
+    """Distance from points (..., 3) m to the nearest singular point, in Cartesian space.
 
     That is the radius of the largest ball about the point in which P can move without meeting a
     singularity. The planes y = 0 (sin(beta) = 0) and |y| = l7 (cos(beta) = 0) are exact, and so is
@@ -226,12 +171,6 @@ def nearest_singularity(
     What is returned is a true distance to a true singular point, so never too small; it is too
     large only where a surface that bends sharply, or a sliver beyond two close surfaces, escapes
     the rays. A test compares with thousands of rays a point. It takes a few milliseconds a point.
-
-    Args:
-        position: (..., 3) m, point P.
-        branch: The working mode.
-        assembly: The assembly mode that the posture must belong to.
-        geometry: Link lengths.
 
     Returns:
         Distances and where they end; not valid where not finite, or not on both branches.
@@ -258,16 +197,14 @@ def nearest_singularity(
     )
 
 
-def _classify(
-    values: Factors, elevation: FloatArray, geometry: Geometry, tolerance: float
-) -> Classification:
+def _classify(values: Factors, geometry: Geometry, tolerance: float) -> Classification:
     if not 0 < tolerance < 1:
         raise ConfigurationError("tolerance", tolerance, "a number between 0 and 1")
     scaled = dimensionless(values, geometry)
     vanishing = np.abs(scaled) <= tolerance
     parallel, serial = vanishing[..., :3].any(axis=-1), vanishing[..., 3:].any(axis=-1)
     kind = SingularityType.PARALLEL.value * parallel + SingularityType.SERIAL.value * serial
-    constraint = np.abs(elevation) <= tolerance * geometry.l4
+    constraint = np.abs(values.constraint) <= tolerance * geometry.l4
     return Classification(np.asarray(kind), vanishing, scaled, np.asarray(constraint), tolerance)
 
 

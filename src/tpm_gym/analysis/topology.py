@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from itertools import permutations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from tpm_gym.analysis.poc import (
     Chain,
@@ -38,10 +38,10 @@ from tpm_gym.analysis.poc import (
     revolute,
     serial,
 )
+from tpm_gym.arrays import FloatArray, Vector
 from tpm_gym.errors import SingularityError
 from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode
 from tpm_gym.kinematics.geometry import PAPER, Geometry
-from tpm_gym.arrays import Vector
 from tpm_gym.mechanism.bodies import Mechanism
 from tpm_gym.mechanism.tree import ACTUATED_JOINTS, build, joint_angles
 
@@ -55,7 +55,6 @@ __all__ = [
     "mobility",
 ]
 
-FloatArray = NDArray[np.float64]
 Frame = tuple[FloatArray, FloatArray]
 
 # Singular values up to the first fraction of the largest are zeros, from the second on they are
@@ -90,12 +89,7 @@ class Structure:
 def describe(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> Structure:
-    """Axes and rods of :func:`tpm_gym.mechanism.tree.build`, named as in the paper.
-
-    Args:
-        theta: (3,) rad, actuated angles.
-        branch: The assembly mode.
-        geometry: Link lengths.
+    """Axes and rods of :mod:`tpm_gym.mechanism.tree` at theta (3,) rad, named as in the paper.
 
     Raises:
         InputError: If theta has the wrong shape or is not finite.
@@ -174,11 +168,7 @@ class Topology:
 
 
 def analyse(structure: Structure) -> Topology:
-    """Apply Eqs. (1) to (5) to the structure at its configuration.
-
-    Args:
-        structure: From :func:`describe`.
-    """
+    """Apply Eqs. (1) to (5) to the structure at its configuration."""
     held = [(chain, chain.poc(structure.link_3p)) for chain in structure.chains]
     sub_mechanism = parallel([poc for _, poc in held[:2]])
     # Where link 3' does not turn, its POC set is the same about any point.
@@ -235,14 +225,9 @@ class Mobility:
 def mobility(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> Mobility:
-    """Count freedoms by the numerical rank of the closure Jacobian, at one configuration.
+    """Count freedoms by the numerical rank of the closure Jacobian, at theta (3,) rad.
 
     Singular values up to 1e-11 of the largest count as zeros.
-
-    Args:
-        theta: (3,) rad, actuated angles.
-        branch: The assembly mode.
-        geometry: Link lengths.
 
     Raises:
         InputError: If theta has the wrong shape or is not finite.

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
+import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, is_dataclass
 from typing import Any, SupportsFloat
 
 import gymnasium as gym
@@ -19,7 +21,6 @@ from tpm_gym.errors import (
     EpisodeError,
     InputError,
     ModeChangeError,
-    TPMError,
 )
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.display import has_display
@@ -49,6 +50,15 @@ class EnvSnapshot:
     goal: FloatArray
     pending: tuple[FloatArray, ...]
     kind: tuple[Any, ...]
+    digest: str
+
+    def is_intact(self) -> bool:
+        """Whether nothing has been changed since it was taken, by the digest."""
+        own = (self.simulation, self.rng, self.goal, self.pending, self.kind)
+        try:
+            return bool(self.digest == _digest(own))
+        except Exception:  # of the repr of whatever somebody put in
+            return False
 
 
 class TPMEnv(gym.Env[Observation, Action]):
@@ -121,30 +131,37 @@ class TPMEnv(gym.Env[Observation, Action]):
     goal at least 30 mm away from where the puck (or P) starts. Goals and objects are sampled where
     1/cond(J) >= 0.08.
     ``reset(options={"object": (x, y, z), "goal": (x, y, z)})`` chooses them instead; a puck that
-    starts above the table falls. With ``goals="tempting"`` both lie next to the singularity.
+    starts above the table falls.
 
     ## Info
 
-    ``is_success`` (bool), ``closure_error`` (m), ``conditioning`` (1/cond(J) by the encoders),
-    ``singularity_penalty`` (before weighting), ``assembly_mode_changed`` and
-    ``working_mode_changed`` (bool), ``object_lost`` (bool, whether an object lies where the robot
-    cannot pick it up, off the table for one), ``reward_terms`` (name -> value; they sum to the
-    reward). That of a reset tells with ``randomisation`` what differs in the episode.
-    Where the platform passes y = 0, a parallel one, the assembly mode changes and the encoders no
-    longer tell where it is; past y = l7, a serial one, the working mode changes. No action of the
-    nominal robot leads there; if it happens, ``info`` says so, with a penalty of 1 and truncation.
+    | key | meaning |
+    | --- | --- |
+    | ``is_success`` | whether the goal is achieved |
+    | ``closure_error`` | largest gap of the simulated loops, m |
+    | ``conditioning`` | 1/cond(J) by the encoders |
+    | ``singularity_penalty`` | before weighting, 0 to 1 |
+    | ``assembly_mode_changed`` | whether the platform passed y = 0, a parallel singularity |
+    | ``working_mode_changed`` | whether it passed y = l7, a serial one |
+    | ``object_lost`` | whether an object is off the table or where the robot cannot get to |
+    | ``reward_terms`` | the terms above by name; they sum to the reward |
+    | ``randomisation`` | in a reset's, with that option: what differs in the episode |
+
+    Past a parallel singularity the encoders no longer tell where the platform is. No action of the
+    nominal robot leads past one; if it happens, the penalty is 1 and the episode truncated.
 
     Args:
         task: Name of a task (``"reach"``, ``"pick_and_place"``, or one that
             :func:`tpm_gym.register_task` knows), a :class:`~tpm_gym.tasks.Task` class, or a task; a
-            task that is made already has its own machine, reward, goals and penalty weight.
+            task that is made has its own machine, reward, goals and penalty weight, and takes none.
         control: ``"cartesian"`` or ``"joints"``.
-        reward: ``"sparse"`` or ``"dense"``.
-        engine: Name of what moves the robot: ``"pybullet"``, or one that
-            :func:`tpm_gym.register_engine` knows.
-        machine: ``"paper"``, ``"wide"``, or a :class:`~tpm_gym.mechanism.Machine`.
-        goals: ``"sampled"``, or ``"tempting"``: next to the singularity.
-        penalty_weight: Weight of the singularity penalty; 0 switches it off.
+        reward: ``"sparse"`` (None too) or ``"dense"``.
+        engine: ``"pybullet"``, or a name that :func:`tpm_gym.register_engine` knows.
+        machine: ``"paper"`` (None too), ``"wide"``, a name that :func:`tpm_gym.register_machine`
+            knows, or a :class:`~tpm_gym.Machine`.
+        goals: ``"sampled"`` (None too), or ``"tempting"``: the goal, and where the puck starts, lie
+            next to the singularity, which not every machine has near its goals.
+        penalty_weight: Weight of the singularity penalty, None for 1; 0 switches it off.
         randomisation: What differs from the nominal machine, drawn anew for each episode: a
             :class:`~tpm_gym.simulation.Randomisation` or a mapping of its attributes. Where
             disturbed encoders report angles that cannot be assembled, position and velocity keep
@@ -202,7 +219,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         self.machine = self.task.machine
         self.control = make_control(control, self.machine)
         self.randomisation = settings_of(Randomisation, "randomisation", randomisation)
-        self._size = _picture_size(width), _picture_size(height)
+        self._size = _pixels("width", width), _pixels("height", height)
         self.observation_space = spaces.Dict(
             {
                 "observation": _box(_OBSERVATION_BOUND, self.task.observation_size),
@@ -219,7 +236,11 @@ class TPMEnv(gym.Env[Observation, Action]):
         self._closed = False
         self._shown = 0.0  # when the last frame was due, s of the performance counter
         self._engine, self._physics, self._renderer = engine, physics, renderer
-        self._kind = (type(self.task), self.machine, engine, self.randomisation, physics)
+        # As a dictionary, which is what a spec that went through JSON has.
+        numerics = physics
+        if is_dataclass(physics) and not isinstance(physics, type):
+            numerics = asdict(physics)
+        self._kind = (type(self.task), self.machine, engine, self.randomisation, numerics)
         self.simulation = self._start()
 
     def _start(self) -> Simulation:
@@ -284,9 +305,8 @@ class TPMEnv(gym.Env[Observation, Action]):
             ModeChangeError: If the mechanism passed a singularity earlier in this episode.
         """
         values = finite("action", action, (self.task.action_size,), ActionError)
-        state = self._require_state()
-        queue = (*self._pending, np.minimum(np.maximum(values, -1.0), 1.0))
-        values, self._pending = queue[0], queue[1:]
+        state = self.state
+        values, *pending = (*self._pending, np.minimum(np.maximum(values, -1.0), 1.0))
         command = self.control.command(values[:3], self.machine.mount.to_paper(state.command))
         vacuum = self.task.vacuum and bool(values[3] > 0)
         self._state = None  # until the step has gone well
@@ -295,6 +315,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         except ModeChangeError:
             self._state = state  # nothing has moved
             raise
+        self._pending = tuple(pending)
         observation, info = self._report(self._state)
         reward = info["reward_terms"]["goal"] + _goal_free(info)
         if self.render_mode == "human":
@@ -355,7 +376,10 @@ class TPMEnv(gym.Env[Observation, Action]):
         Raises:
             EpisodeError: If there is no episode.
         """
-        return self._require_state()
+        self._require_open()
+        if self._state is None:
+            raise EpisodeError("no episode is running; call reset() first")
+        return self._state
 
     @property
     def goal(self) -> FloatArray:
@@ -370,14 +394,10 @@ class TPMEnv(gym.Env[Observation, Action]):
         Raises:
             EpisodeError: If there is no episode.
         """
-        self._require_state()
-        return EnvSnapshot(
-            self.simulation.save(),
-            dict(self.np_random.bit_generator.state),
-            self._goal.copy(),
-            self._pending,
-            self._kind,
-        )
+        _ = self.state  # there has to be an episode
+        rng = dict(self.np_random.bit_generator.state)
+        moment = (self.simulation.save(), rng, self.goal, self._pending, self._kind)
+        return EnvSnapshot(*moment, _digest(moment))
 
     def restore_state(self, snapshot: EnvSnapshot) -> Observation:
         """Go back to a moment that :meth:`save_state` took down.
@@ -387,45 +407,27 @@ class TPMEnv(gym.Env[Observation, Action]):
 
         Raises:
             EpisodeError: If the environment is closed.
-            InputError: If the moment is none, that of another kind of environment, or was tampered
-                with; goal and rng are then as they were, and a new episode has to be started.
+            InputError: If the moment is none, was changed, or is that of another kind of
+                environment; nothing has happened then.
         """
         self._require_open()
-        if not isinstance(snapshot, EnvSnapshot):
-            raise InputError("snapshot", snapshot, "what save_state() returned")
+        if not isinstance(snapshot, EnvSnapshot) or not snapshot.is_intact():
+            raise InputError("snapshot", type(snapshot), "what save_state() returned, unchanged")
         if snapshot.kind != self._kind:
-            raise InputError(
-                "snapshot", snapshot.kind, f"of the same task and options, {self._kind}"
-            )
-        self._state = None
-        try:
-            rng = type(self.np_random.bit_generator)()
-            rng.state = snapshot.rng
-            goal = finite("goal", snapshot.goal, self._goal.shape).copy()
-            state = self.simulation.restore(snapshot.simulation)
-            observation = self._observe(state, goal)
-        except TPMError:
-            raise
-        except Exception as error:  # whatever values of any kind can lead to
-            raise InputError(
-                "snapshot", repr(error), "what save_state() returned, intact"
-            ) from error
+            valid = f"of the same task and options, {self._kind}"
+            raise InputError("snapshot", snapshot.kind, valid)
         self.np_random.bit_generator.state = snapshot.rng
-        self._goal, self._pending, self._state = goal, snapshot.pending, state
+        self._goal, self._pending = snapshot.goal.copy(), snapshot.pending
+        self._state = None
         self._show_goal()
-        return observation
+        self._state = self.simulation.restore(snapshot.simulation)
+        return self._observe(self._state, self._goal)
 
     # -- inside ---------------------------------------------------------------------------------
 
     def _require_open(self) -> None:
         if self._closed:
             raise EpisodeError("the environment is closed; make a new one")
-
-    def _require_state(self) -> State:
-        self._require_open()
-        if self._state is None:
-            raise EpisodeError("no episode is running; call reset() first")
-        return self._state
 
     def __getstate__(self) -> dict[str, Any]:
         """For :func:`copy.deepcopy` and :mod:`pickle`: all of it, in the midst of an episode.
@@ -499,8 +501,13 @@ def _clip(values: FloatArray, bound: float) -> NDArray[np.float32]:
     return clipped
 
 
-def _picture_size(value: Any) -> int:
-    """Width or height of a picture in pixels."""
+def _pixels(name: str, value: Any) -> int:
     if isinstance(value, (int, np.integer)) and 16 <= value <= 4096:
         return int(value)
-    raise ConfigurationError("width or height", value, "a whole number of pixels from 16 to 4096")
+    raise ConfigurationError(name, value, "a whole number of pixels from 16 to 4096")
+
+
+def _digest(values: tuple[Any, ...]) -> str:
+    """A hash of plain data; of its repr, which unlike a pickle tells values, not identities."""
+    with np.printoptions(threshold=sys.maxsize, floatmode="unique"):
+        return hashlib.sha256(repr(values).encode()).hexdigest()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import gymnasium as gym
 
 from tpm_gym.errors import ConfigurationError
@@ -27,7 +29,7 @@ def register_task(
 
     Args:
         name: In CamelCase, e.g. ``"PickAndPlace"``.
-        task: The class.
+        task: The class; one that was defined anew, as in a notebook, replaces its forerunner.
         version: At the end of the ids.
         max_episode_steps: After so many, episodes are truncated.
 
@@ -35,32 +37,42 @@ def register_task(
         The four ids.
 
     Raises:
-        ConfigurationError: If the name is none, or taken by another task.
+        ConfigurationError: If the name is none, or it or an id is taken; nothing is registered
+            then.
     """
     option = option_name(name)
     if not (isinstance(task, type) and issubclass(task, Task)):
         raise ConfigurationError("task", task, "a class derived from tpm_gym.tasks.Task")
-    if TASKS.get(option, task) is not task:
+    if _path(TASKS.get(option, task)) != _path(task):
         raise ConfigurationError("name", name, f"another name; {TASKS[option]} has this one")
+    variants: dict[str, dict[str, Any]] = {
+        f"TPM{name}{joints}{dense}-v{version}": {
+            "entry_point": ENTRY_POINT,
+            "max_episode_steps": max_episode_steps,
+            "kwargs": {"task": option, "control": control, "reward": reward},
+        }
+        for control, joints in (("cartesian", ""), ("joints", "Joints"))
+        for reward, dense in (("sparse", ""), ("dense", "Dense"))
+    }
+    for env_id, spec in variants.items():
+        other = gym.registry.get(env_id)
+        if other is not None and any(getattr(other, key) != spec[key] for key in spec):
+            valid = f"another name or version: {env_id} is there already, and is not this"
+            raise ConfigurationError("name", name, valid)
     TASKS[option] = task
-    ids = []
-    for control, joints in (("cartesian", ""), ("joints", "Joints")):
-        for reward, dense in (("sparse", ""), ("dense", "Dense")):
-            env_id = f"TPM{name}{joints}{dense}-v{version}"
-            ids.append(env_id)
-            if env_id not in gym.registry:
-                gym.register(
-                    id=env_id,
-                    entry_point=ENTRY_POINT,
-                    max_episode_steps=max_episode_steps,
-                    kwargs={"task": option, "control": control, "reward": reward},
-                )
-    return tuple(ids)
+    for env_id, spec in variants.items():
+        if env_id not in gym.registry:
+            gym.register(env_id, **spec)
+    return tuple(variants)
 
 
 def env_ids() -> tuple[str, ...]:
     """All ids whose environments are of tpm_gym, those of a user's tasks too."""
     return tuple(env_id for env_id, spec in gym.registry.items() if spec.entry_point == ENTRY_POINT)
+
+
+def _path(task: type[Task]) -> tuple[str, str]:
+    return task.__module__, task.__qualname__
 
 
 register_task("Reach", Reach)

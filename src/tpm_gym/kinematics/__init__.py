@@ -1,6 +1,6 @@
 """Closed-form kinematics of the mechanism; see :mod:`tpm_gym.kinematics.position`."""
 
-from tpm_gym.kinematics.position import (
+from tpm_gym.kinematics.modes import (
     ASSEMBLY_MODES,
     DEFAULT_ASSEMBLY,
     ELBOWS_OUT,
@@ -10,6 +10,8 @@ from tpm_gym.kinematics.position import (
     InverseSolutions,
     PassiveAngles,
     WorkingMode,
+)
+from tpm_gym.kinematics.position import (
     forward,
     forward_all,
     inverse,

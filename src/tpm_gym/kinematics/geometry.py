@@ -73,8 +73,8 @@ WIDE = Geometry(l1=0.300, l2=0.070, l3=0.350, l4=0.800, l5=0.100, l6=0.010, l7=0
 """The paper's lengths but for l7, for a workspace of practical depth in y.
 
 Of l7 = 0.1, 0.2 ... 0.9 m it is the one with the largest axis-aligned box, elbows out, in which the
-conditioning is at least 0.1 (:func:`tpm_gym.analysis.aspects.largest_box`; a slow test recomputes it on two
-grids): about 45 litres and 0.3 m deep in y, against 3 litres and 0.02 m of PAPER. A longer link 7
-deepens the box, but beyond this it costs more in height than it gains. The maximum is flat: 0.65 m
-is as good within the grids' few per cent.
+conditioning is at least 0.1 (:func:`tpm_gym.analysis.aspects.largest_box`; a slow test recomputes
+it on two grids): about 45 litres and 0.3 m deep in y, against 3 litres and 0.02 m of PAPER. A
+longer link 7 deepens the box, but beyond this it costs more in height than it gains. The maximum is
+flat: 0.65 m is as good within the grids' few per cent.
 """

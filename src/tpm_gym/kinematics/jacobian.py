@@ -2,47 +2,46 @@
 
 With f_i = |B_iC_i|^2 - l4^2 = 0 and the platform velocity v, differentiation gives
 A v = B theta_dot (section "Singularity analysis"). Configurations are given by the actuated angles
-and the assembly mode, so every function here takes ``theta`` (..., 3) in rad.
+``theta`` (..., 3) in rad and the assembly mode, or by points ``position`` (..., 3) in m and the
+working mode. Torch tensors give tensors, as in :mod:`tpm_gym.kinematics.position`.
+
+From angles, all functions raise InputError if theta has the wrong shape or is not finite, and
+UnreachableError if the branch does not exist at some theta.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tpm_gym.arrays import FloatArray, finite_points, is_tensor, points, vector
 from tpm_gym.errors import SingularityError
-from tpm_gym.kinematics import single
+from tpm_gym.kinematics import equations, margins
 from tpm_gym.kinematics.geometry import PAPER, Geometry
-from tpm_gym.kinematics.position import DEFAULT_ASSEMBLY, AssemblyMode, forward, forward_all
-from tpm_gym.kinematics.single import SINGULAR
+from tpm_gym.kinematics.modes import DEFAULT_ASSEMBLY, ELBOWS_OUT, AssemblyMode, WorkingMode
+from tpm_gym.kinematics.namespaces import Namespace, Numbers, by_rows
 
 __all__ = [
     "Evaluation",
     "Factors",
     "conditioning",
+    "conditioning_at",
     "evaluate",
     "factors",
+    "factors_at",
     "parallel",
     "serial",
     "velocity",
 ]
 
-FloatArray = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class _Configuration:
-    """What all Jacobians are made of."""
-
-    position: FloatArray  # (..., 3) m
-    rods: FloatArray  # (..., 3, 3) m, row i is B_iC_i
-    serial: FloatArray  # (..., 3) m^2/rad, B_iC_i . dB_i/dtheta_i
-    sin_beta: FloatArray  # (...,)
-    cos_beta: FloatArray  # (...,)
-    planar: FloatArray  # (...,) m^2, third factor of Eq. (16)
-    level3: FloatArray  # (...,) m, second factor of Eq. (16)
+_MATRIX = np.arange(9).reshape(3, 3)
+_DIAGONAL = np.array([[0, 3, 3], [3, 1, 3], [3, 3, 2]])  # of three columns and one of zeros
+_COLUMN = np.array(0)
+_PARALLEL, _SERIAL, _CONSTRAINT = np.arange(3), np.arange(3, 7), np.array(7)
 
 
 @dataclass(frozen=True)
@@ -54,10 +53,12 @@ class Factors:
             Eq. (16), corrected.
         serial: (..., 4): cos(beta); B_iC_i . dB_i/dtheta_i (m^2/rad) for i = 1, 2, 3, as in
             Eq. (17), corrected.
+        constraint: (...,) m, z_C1 - z_B1: zero at a constraint singularity, a factor of neither.
     """
 
     parallel: FloatArray
     serial: FloatArray
+    constraint: FloatArray
 
 
 @dataclass(frozen=True)
@@ -75,105 +76,104 @@ class Evaluation:
     conditioning: FloatArray
 
 
+@dataclass(frozen=True)
+class _Configuration:
+    """What all Jacobians are made of, as components."""
+
+    position: equations.Triple
+    rods: tuple[equations.Triple, equations.Triple, equations.Triple]
+    factors: equations.Factors
+    ns: Namespace
+
+
+_Columns = Callable[[_Configuration], list[Numbers]]
+
+
 def parallel(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> FloatArray:
-    """Parallel Jacobian A of A v = B theta_dot.
+    """Parallel Jacobian A of A v = B theta_dot, (..., 3, 3) m.
 
     Eliminating the passive angle beta through y = l7 sin(beta) gives dxC = dx + tan(beta) dy. Rows
     1 and 2 are multiplied by cos(beta), which keeps A finite at y = +-l7; so
     det A = -cos(beta) times the product of the factors of Eq. (16).
-
-    Args:
-        theta: (..., 3) rad.
-        branch: The assembly mode.
-        geometry: Link lengths.
-
-    Returns:
-        (..., 3, 3) m.
-
-    Raises:
-        UnreachableError: If the branch does not exist at some theta.
     """
-    c = _configuration(theta, branch, geometry)
-    a = np.empty_like(c.rods)
-    for leg in (0, 1):
+
+    def columns(c: _Configuration) -> list[Numbers]:
+        (r1x, _, r1z), (r2x, _, r2z), r3 = c.rods
+        cos, sin = c.factors.cos_beta, c.factors.sin_beta
         # C1 and C2 move with (dx + tan(beta) dy, 0, dz)
-        a[..., leg, 0] = c.cos_beta * c.rods[..., leg, 0]
-        a[..., leg, 1] = c.sin_beta * c.rods[..., leg, 0]
-        a[..., leg, 2] = c.cos_beta * c.rods[..., leg, 2]
-    a[..., 2, :] = c.rods[..., 2, :]
-    return a
+        return [cos * r1x, sin * r1x, cos * r1z, cos * r2x, sin * r2x, cos * r2z, *r3]
+
+    return _from_angles(columns, theta, branch, geometry, _MATRIX)[0]
 
 
 def serial(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> FloatArray:
-    """Serial Jacobian B of A v = B theta_dot, with the row scaling of :func:`parallel`.
+    """Serial Jacobian B of A v = B theta_dot, (..., 3, 3) m^2/rad, diagonal.
 
-    So det B = cos(beta) times the product of the factors of Eq. (17).
-
-    Args:
-        theta: (..., 3) rad.
-        branch: The assembly mode.
-        geometry: Link lengths.
-
-    Returns:
-        (..., 3, 3) m^2/rad, diagonal.
-
-    Raises:
-        UnreachableError: If the branch does not exist at some theta.
+    With the row scaling of :func:`parallel`; so det B = cos(beta) times the product of the factors
+    of Eq. (17).
     """
-    c = _configuration(theta, branch, geometry)
-    b = np.zeros_like(c.rods)
-    b[..., 0, 0] = c.cos_beta * c.serial[..., 0]
-    b[..., 1, 1] = c.cos_beta * c.serial[..., 1]
-    b[..., 2, 2] = c.serial[..., 2]
-    return b
+
+    def columns(c: _Configuration) -> list[Numbers]:
+        f = c.factors
+        return [f.cos_beta * f.leg1, f.cos_beta * f.leg2, f.leg3, 0 * f.leg3]
+
+    return _from_angles(columns, theta, branch, geometry, _DIAGONAL)[0]
 
 
 def velocity(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> FloatArray:
-    """Velocity Jacobian J with v = J theta_dot; J = A^-1 B wherever A can be inverted.
+    """Velocity Jacobian J with v = J theta_dot, (..., 3, 3) m/rad.
 
-    J exists at the serial singularities too (where cos(beta) = 0 makes both A and B singular).
-
-    Args:
-        theta: (..., 3) rad.
-        branch: The assembly mode.
-        geometry: Link lengths.
-
-    Returns:
-        (..., 3, 3) m/rad.
+    J = A^-1 B wherever A can be inverted. It exists at the serial singularities too (where
+    cos(beta) = 0 makes both A and B singular).
 
     Raises:
-        UnreachableError: If the branch does not exist at some theta.
         SingularityError: If theta is a parallel singularity, where J does not exist.
     """
-    return _velocity(_configuration(theta, branch, geometry), geometry)
+
+    def columns(c: _Configuration) -> list[Numbers]:
+        return [*c.factors[:3], *_velocity(c)]
+
+    layouts = _PARALLEL, _MATRIX + 3
+    singular, found = _from_angles(columns, theta, branch, geometry, *layouts)
+    _require_regular(singular, geometry)
+    return found
 
 
 def conditioning(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> FloatArray:
-    """Inverse condition number 1/cond(J) in [0, 1]: 0 at a singularity, 1 where J is isotropic.
+    """Inverse condition number 1/cond(J), (...,) in [0, 1].
 
-    It exists at singularities too, where it is 0 up to rounding. The three inputs share one unit
-    and so do the three outputs, so the number is meaningful without any scaling.
+    It is 0 at a singularity up to rounding, where it exists too, and 1 where J is isotropic. The
+    three inputs share one unit and so do the three outputs, so it is meaningful without scaling.
+    """
+    return _from_angles(lambda c: [_conditioning(c)], theta, branch, geometry, _COLUMN)[0]
 
-    Args:
-        theta: (..., 3) rad.
-        branch: The assembly mode.
-        geometry: Link lengths.
 
-    Returns:
-        (...,) in [0, 1].
+def conditioning_at(
+    position: ArrayLike,
+    branch: WorkingMode = ELBOWS_OUT,
+    assembly: AssemblyMode = DEFAULT_ASSEMBLY,
+    geometry: Geometry = PAPER,
+) -> FloatArray:
+    """1/cond(J) at points, (...,); 0 where they are not reachable on both branches.
 
     Raises:
-        UnreachableError: If the branch does not exist at some theta.
+        InputError: If the last axis of position does not have length 3.
     """
-    return _conditioning(_configuration(theta, branch, geometry), geometry)
+
+    def columns(c: _Configuration) -> list[Numbers]:
+        planar, side = (2.0 * (f > 0) - 1.0 for f in (c.factors.planar, c.factors.sin_beta))
+        here = (planar == assembly.planar) & (side == assembly.sin_beta)
+        return [c.ns.where(here, _conditioning(c), 0.0)]
+
+    return _from_points(columns, position, branch, geometry, 0.0, _COLUMN)[0]
 
 
 def evaluate(
@@ -181,128 +181,121 @@ def evaluate(
 ) -> Evaluation:
     """Position, J and conditioning at once, for the price of one solution.
 
-    Args:
-        theta: (..., 3) rad.
-        branch: The assembly mode.
-        geometry: Link lengths.
-
     Raises:
-        UnreachableError: If the branch does not exist at some theta.
         SingularityError: If theta is a parallel singularity.
     """
-    angles = np.asarray(theta, dtype=np.float64)
-    if angles.shape == (3,):
-        assembly, rows, quality = single.evaluate(tuple(angles.tolist()), branch, geometry)
-        return Evaluation(np.array(assembly[:3]), np.array(rows), np.array(quality))
-    c = _configuration(theta, branch, geometry)
-    return Evaluation(c.position, _velocity(c, geometry), _conditioning(c, geometry))
+    angles = points("theta", theta)
+    if angles.ndim == 1 and not is_tensor(angles):
+        one = equations.evaluate(vector("theta", angles), branch, geometry)
+        return Evaluation(np.array(one[0][:3]), np.array(one[1]), np.array(one[2]))
+
+    def columns(c: _Configuration) -> list[Numbers]:
+        return [_conditioning(c), *c.factors[:3], *c.position, *_velocity(c)]
+
+    layouts = _COLUMN, _PARALLEL + 1, np.arange(4, 7), _MATRIX + 7
+    quality, singular, position, rows = _from_angles(columns, angles, branch, geometry, *layouts)
+    _require_regular(singular, geometry)
+    return Evaluation(position, rows, quality)
 
 
 def factors(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> Factors:
-    """Closed-form factors of det A and det B (Eqs. 16 and 17, corrected).
+    """Closed-form factors of det A and det B (Eqs. 16 and 17, corrected)."""
+    layouts = _PARALLEL, _SERIAL, _CONSTRAINT
+    return Factors(*_from_angles(lambda c: [*c.factors], theta, branch, geometry, *layouts))
 
-    Args:
-        theta: (..., 3) rad.
-        branch: The assembly mode.
-        geometry: Link lengths.
+
+def factors_at(
+    position: ArrayLike, branch: WorkingMode = ELBOWS_OUT, geometry: Geometry = PAPER
+) -> Factors:
+    """The factors at points instead of joint angles; NaN where not reachable on ``branch``.
+
+    Unlike :func:`factors` it does not pass through the forward kinematics, so it keeps its accuracy
+    at the parallel singularities.
 
     Raises:
-        UnreachableError: If the branch does not exist at some theta.
+        InputError: If the last axis of position does not have length 3.
     """
-    c = _configuration(theta, branch, geometry)
-    return Factors(
-        parallel=np.stack([c.sin_beta, c.level3, c.planar], axis=-1),
-        serial=np.concatenate([c.cos_beta[..., None], c.serial], axis=-1),
-    )
+    layouts = _PARALLEL, _SERIAL, _CONSTRAINT
+    columns = _from_points(lambda c: [*c.factors], position, branch, geometry, math.nan, *layouts)
+    return Factors(*columns)
 
 
-def _configuration(theta: ArrayLike, branch: AssemblyMode, geometry: Geometry) -> _Configuration:
-    """Solve the forward kinematics and collect the rods."""
-    angles = np.asarray(theta, dtype=np.float64)
-    solutions = forward_all(angles, geometry)
-    slot = branch.index
-    if not solutions.valid[..., slot].all():
-        forward(angles, branch, geometry)  # raises, and says why
-    l1, l2, l3 = geometry.l1, geometry.l2, geometry.l3
-    cos_beta = np.cos(solutions.beta[..., slot])
-    x, y = solutions.position[..., slot, 0], solutions.position[..., slot, 1]
-    x_c = x - l2 - geometry.l7 * cos_beta
-    z_c = solutions.position[..., slot, 2] - 2 * geometry.l6
-    cos, sin = np.cos(angles), np.sin(angles)
-    rod1 = [x_c, -l1 - l3 * cos[..., 0], z_c - l3 * sin[..., 0]]
-    rod2 = [x_c - 2 * geometry.l5 + l1 - l3 * cos[..., 1], 0 * x_c, z_c - l3 * sin[..., 1]]
-    rod3 = [x + l2 - l1 - l3 * cos[..., 2], y, z_c + geometry.l6 - l3 * sin[..., 2]]
-    rods = np.stack([np.stack(rod, axis=-1) for rod in (rod1, rod2, rod3)], axis=-2)
-    # Arm 1 turns in the yz plane, arms 2 and 3 in the xz plane.
-    in_plane = np.stack([rod1[1], rod2[0], rod3[0]], axis=-1)
-    return _Configuration(
-        position=solutions.position[..., slot, :],
-        rods=rods,
-        serial=l3 * (rods[..., 2] * cos - in_plane * sin),
-        sin_beta=y / geometry.l7,
-        cos_beta=cos_beta,
-        planar=rod1[0] * rod2[2] - rod1[2] * rod2[0],
-        level3=geometry.l7 * cos_beta - rod3[0],  # = xB3 - xC - 2 l2
-    )
+def _from_angles(
+    columns: _Columns,
+    theta: ArrayLike,
+    branch: AssemblyMode,
+    g: Geometry,
+    *layouts: NDArray[np.intp],
+) -> list[FloatArray]:
+    """What is computed of configurations at joint angles, which have to exist; see by_rows."""
+
+    def text(angles: equations.Triple, ns: Namespace) -> list[Numbers]:
+        cos, sin = equations.arms(angles, g, ns)
+        found, real, _ = equations.assembly_at(cos, sin, branch.planar, branch.sin_beta, g, ns)
+        missing = ns.where(real, 0.0, 1.0)
+        return [missing, *columns(_configuration(cos, sin, found, g, ns))]
+
+    angles = finite_points("theta", theta)
+    missing, *results = by_rows(text, angles, _COLUMN, *(layout + 1 for layout in layouts))
+    if missing.any():
+        a, b, c = angles[missing != 0][0].tolist()
+        raise equations.no_assembly((a, b, c), branch, g)
+    return results
 
 
-def _velocity(c: _Configuration, geometry: Geometry) -> FloatArray:
-    scaled, determinant = _scaled_velocity(c, geometry)
-    name, value = _smallest_parallel_factor(c, geometry)
-    if abs(value) < SINGULAR:
-        raise SingularityError(name, value)
-    result: FloatArray = scaled / determinant[..., None, None]
-    return result
+def _from_points(
+    columns: _Columns,
+    position: ArrayLike,
+    branch: WorkingMode,
+    g: Geometry,
+    missing: float,
+    *layouts: NDArray[np.intp],
+) -> list[FloatArray]:
+    """What is computed of configurations at points; ``missing`` where there is none."""
+    signs = branch.cos_beta, branch.leg1, branch.leg2, branch.leg3
+
+    def text(point: equations.Triple, ns: Namespace) -> list[Numbers]:
+        theta, real, link7, _ = equations.posture_at(point, signs, g, ns)
+        cos, sin = equations.arms(theta, g, ns)
+        found = _configuration(cos, sin, equations.Assembly(*point, *link7), g, ns)
+        return [ns.where(real, column, missing) for column in columns(found)]
+
+    return by_rows(text, points("position", position), *layouts)
 
 
-def _conditioning(c: _Configuration, geometry: Geometry) -> FloatArray:
-    # det K cancels in the ratio of the singular values, so this exists at det K = 0 as well.
-    scaled, _ = _scaled_velocity(c, geometry)
-    singular_values = np.linalg.svd(scaled, compute_uv=False)
-    largest = singular_values[..., 0]
-    result: FloatArray = singular_values[..., 2] / np.where(largest > 0, largest, 1.0)
-    return result
+def _configuration(
+    cos: equations.Triple,
+    sin: equations.Triple,
+    found: equations.Assembly,
+    g: Geometry,
+    ns: Namespace,
+) -> _Configuration:
+    bars = equations.rods(cos, sin, found, g)
+    return _Configuration(found[:3], bars, equations.factors(cos, sin, found, bars, g), ns)
 
 
-def _scaled_velocity(c: _Configuration, geometry: Geometry) -> tuple[FloatArray, FloatArray]:
-    """(det K) J and det K, where K is the parallel Jacobian in the variables (xC, zC, beta).
-
-    K = [[r1x, r1z, 0], [r2x, r2z, 0], [r3x, r3z, k]] with k = l7 sin(beta) level3, so that
-    det K = k planar; neither it nor (det K) J contains a division.
-    """
-    k = geometry.l7 * c.sin_beta * c.level3
-    r1, r2, r3 = c.rods[..., 0, :], c.rods[..., 1, :], c.rods[..., 2, :]
-    b1, b2, b3 = c.serial[..., 0], c.serial[..., 1], c.serial[..., 2]
-    zero = np.zeros_like(k)
-    # planar times the rates of xC and zC per unit of theta_dot, and det K times that of beta
-    x_rate = np.stack([r2[..., 2] * b1, -r1[..., 2] * b2, zero], axis=-1)
-    z_rate = np.stack([-r2[..., 0] * b1, r1[..., 0] * b2, zero], axis=-1)
-    beta_rate = -r3[..., 0, None] * x_rate - r3[..., 2, None] * z_rate
-    beta_rate[..., 2] += c.planar * b3
-    beta_rate *= geometry.l7
-    scaled = np.stack(
-        [
-            k[..., None] * x_rate - c.sin_beta[..., None] * beta_rate,
-            c.cos_beta[..., None] * beta_rate,
-            k[..., None] * z_rate,
-        ],
-        axis=-2,
-    )
-    return scaled, k * c.planar
+def _velocity(c: _Configuration) -> list[Numbers]:
+    first, second, (z1, z2, _) = equations.velocity(c.rods, c.factors)
+    return [*first, *second, z1, z2, 0 * z1]
 
 
-def _smallest_parallel_factor(c: _Configuration, geometry: Geometry) -> tuple[str, float]:
-    """Name and value (in units of l4) of the parallel factor nearest to zero over the batch."""
-    values = {
-        "sin(beta)": c.sin_beta,
-        "(l1 + l3 cos(theta_3) - xC - 2 l2) / l4": c.level3 / geometry.l4,
-        "planar factor / l4^2": c.planar / geometry.l4**2,
-    }
-    smallest = {
-        name: float(value.flat[np.abs(value).argmin()]) if value.size else np.inf
-        for name, value in values.items()
-    }
-    name = min(smallest, key=lambda key: abs(smallest[key]))
-    return name, smallest[name]
+def _conditioning(c: _Configuration) -> Numbers:
+    """0 where J does not exist: beside what grows there without bound, the rest is nothing."""
+    found = equations.conditioning(equations.velocity(c.rods, c.factors), c.ns)
+    return c.ns.where(found <= 1.0, found, 0.0)
+
+
+def _require_regular(values: FloatArray, geometry: Geometry) -> None:
+    """Raise if a factor of det A (..., 3) is zero somewhere, for the one that is nearest to it."""
+    nearest = []
+    named = margins.parallel_factors((values[..., 0], values[..., 1], values[..., 2]), geometry)
+    for name, value in named.items():
+        flat = value.reshape(-1)
+        if len(flat):
+            smallest = flat[abs(flat).argmin()].item()
+            nearest.append((abs(smallest), smallest, name))
+    if nearest and min(nearest)[0] < equations.SINGULAR:
+        _, smallest, name = min(nearest)
+        raise SingularityError(name, smallest)

@@ -13,11 +13,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import product
 
-import numpy as np
-from numpy.typing import NDArray
-
+from tpm_gym.arrays import BoolArray, FloatArray
 from tpm_gym.errors import InputError
 from tpm_gym.kinematics.geometry import Geometry
+from tpm_gym.kinematics.namespaces import namespace_of
 
 __all__ = [
     "ASSEMBLY_MODES",
@@ -30,9 +29,6 @@ __all__ = [
     "PassiveAngles",
     "WorkingMode",
 ]
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -123,8 +119,10 @@ class ForwardSolutions:
     def link3(self) -> FloatArray:
         """(..., 4, 2) m, (xC, zC) of point C1 of link 3'; NaN where not real."""
         g = self.geometry
-        x_c = self.position[..., 0] - g.l2 - g.l7 * np.cos(self.beta)
-        return np.stack([x_c, self.position[..., 2] - 2 * g.l6], axis=-1)
+        ns = namespace_of(self.beta)
+        x_c = self.position[..., 0] - g.l2 - g.l7 * ns.cos(self.beta)
+        found: FloatArray = ns.stack([x_c, self.position[..., 2] - 2 * g.l6])
+        return found
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Where the mechanism can go: reachability, margins, regions, and samplers that take an rng.
+"""Where the mechanism can go: regions, reachability, assembly modes and conditioning of points.
 
 Everything here is in the paper frame, in metres, on one working mode.
 """
@@ -10,19 +10,15 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector
 from tpm_gym.errors import ConfigurationError
-from tpm_gym.kinematics import jacobian
 from tpm_gym.kinematics.geometry import PAPER, Geometry
-from tpm_gym.kinematics.position import (
-    DEFAULT_ASSEMBLY,
-    ELBOWS_OUT,
-    AssemblyMode,
-    WorkingMode,
-    forward_all,
-    inverse_all,
-)
+from tpm_gym.kinematics.jacobian import conditioning_at, factors_at
+from tpm_gym.kinematics.modes import ELBOWS_OUT, WorkingMode
+from tpm_gym.kinematics.namespaces import namespace_of
+from tpm_gym.kinematics.position import inverse_all
 
 __all__ = [
     "TASK_REGION",
@@ -30,11 +26,7 @@ __all__ = [
     "assembly_of",
     "conditioning_at",
     "reachable",
-    "sample",
 ]
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -49,8 +41,8 @@ class Region:
         ConfigurationError: If low exceeds high on an axis.
     """
 
-    low: tuple[float, float, float]
-    high: tuple[float, float, float]
+    low: Vector
+    high: Vector
 
     def __post_init__(self) -> None:
         """Reject empty boxes."""
@@ -100,62 +92,14 @@ def reachable(
 
 def assembly_of(
     position: ArrayLike, branch: WorkingMode = ELBOWS_OUT, geometry: Geometry = PAPER
-) -> NDArray[np.int64]:
+) -> IntArray:
     """Slot in ASSEMBLY_MODES that the posture of ``branch`` at points (..., 3) belongs to.
 
     Returns:
         (...,) slot, or -1 where the point is not reachable on ``branch``.
     """
-    points = np.asarray(position, dtype=np.float64)
-    solutions = inverse_all(points, geometry)
-    valid = solutions.valid[..., branch.index]
-    theta = np.where(valid[..., None], solutions.theta[..., branch.index, :], 0.0)
-    candidates = forward_all(theta, geometry).position
-    gaps = np.linalg.norm(candidates - points[..., None, :], axis=-1)
-    nearest = np.where(np.isnan(gaps), np.inf, gaps).argmin(axis=-1)
-    return np.where(valid, nearest, -1)
-
-
-def conditioning_at(
-    position: ArrayLike,
-    branch: WorkingMode = ELBOWS_OUT,
-    assembly: AssemblyMode = DEFAULT_ASSEMBLY,
-    geometry: Geometry = PAPER,
-) -> FloatArray:
-    """Conditioning 1/cond(J) at points (..., 3) m; 0 where not reachable on both branches."""
-    points = np.asarray(position, dtype=np.float64)
-    usable = assembly_of(points, branch, geometry) == assembly.index
-    result = np.zeros(points.shape[:-1])
-    if usable.any():
-        theta = inverse_all(points[usable], geometry).theta[..., branch.index, :]
-        result[usable] = jacobian.conditioning(theta, assembly, geometry)
-    return result
-
-
-def sample(
-    rng: np.random.Generator,
-    region: Region,
-    min_conditioning: float = 0.0,
-    geometry: Geometry = PAPER,
-    attempts: int = 1000,
-) -> FloatArray:
-    """Draw one point (3,) m, uniform over the part of ``region`` that is reachable and safe enough.
-
-    Args:
-        rng: Source of randomness.
-        region: The box to draw from.
-        min_conditioning: Smallest conditioning accepted.
-        geometry: Link lengths.
-        attempts: Draws before giving up.
-
-    Raises:
-        ConfigurationError: If no draw was accepted.
-    """
-    for _ in range(attempts):
-        point = rng.uniform(region.low, region.high)
-        conditioning = conditioning_at(point, geometry=geometry)
-        if conditioning > 0 and conditioning >= min_conditioning:
-            return point
-    raise ConfigurationError(
-        "min_conditioning", min_conditioning, f"a value that some point of {region} reaches"
-    )
+    parallel = factors_at(position, branch, geometry).parallel
+    sin_beta, planar = parallel[..., 0], parallel[..., 2]
+    slots = 2 * (planar > 0) + 1 * (sin_beta > 0)
+    found: IntArray = namespace_of(parallel).where(planar == planar, slots, -1)
+    return found

@@ -1,1 +1,65 @@
-"""Training, resuming, evaluation and export with Stable-Baselines3."""
+"""What it takes to learn the tasks: hindsight, features, demonstrations, recipes, training.
+
+Needs the extra ``train``. Importing this package imports neither PyTorch nor Stable-Baselines3; a
+name is imported when it is first used.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from tpm_gym.learning.configuration import ResumeConfig, TrainingConfig
+    from tpm_gym.learning.demonstrations import Demonstrations
+    from tpm_gym.learning.errors import LearningError
+    from tpm_gym.learning.evaluation import EvaluationConfig, evaluate
+    from tpm_gym.learning.features import GoalGapExtractor
+    from tpm_gym.learning.hindsight import PenaltyHerReplayBuffer
+    from tpm_gym.learning.recipes import recipe
+    from tpm_gym.learning.training import resume, train
+
+__all__ = [
+    "Demonstrations",
+    "EvaluationConfig",
+    "GoalGapExtractor",
+    "LearningError",
+    "PenaltyHerReplayBuffer",
+    "ResumeConfig",
+    "TrainingConfig",
+    "evaluate",
+    "recipe",
+    "resume",
+    "train",
+]
+
+_MODULES = {
+    "Demonstrations": "demonstrations",
+    "EvaluationConfig": "evaluation",
+    "GoalGapExtractor": "features",
+    "LearningError": "errors",
+    "PenaltyHerReplayBuffer": "hindsight",
+    "ResumeConfig": "configuration",
+    "TrainingConfig": "configuration",
+    "evaluate": "evaluation",
+    "recipe": "recipes",
+    "resume": "training",
+    "train": "training",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name from the module that has it (PEP 562).
+
+    Raises:
+        MissingPackageError: A package of the extra ``train`` is not installed.
+    """
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    try:
+        module = importlib.import_module(f"{__name__}.{_MODULES[name]}")
+    except ModuleNotFoundError as error:
+        from tpm_gym.errors import MissingPackageError
+
+        raise MissingPackageError(error.name or "a package", "train") from error
+    return getattr(module, name)

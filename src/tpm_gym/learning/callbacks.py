@@ -8,32 +8,24 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path
 from types import FrameType
 from typing import Any, Final
 
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import MofNCompleteColumn, Progress
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from tpm_gym.learning.checkpoint import CheckpointStore, Content
-from tpm_gym.learning.errors import CheckpointWriteError
-from tpm_gym.learning.learning_curve import draw_learning_curve
-from tpm_gym.learning.policies import EVALUATIONS_FILE, TrainedPolicy
-from tpm_gym.learning.rollout import SELECTION_SEED, Estimate, GoalEnv, run_episodes, summarise
+from tpm_gym.learning.configuration import TrainingConfig
+from tpm_gym.learning.errors import CheckpointError
+from tpm_gym.learning.estimates import Estimate
+from tpm_gym.learning.policies import TrainedPolicy
+from tpm_gym.learning.report.learning_curve import draw_learning_curve
+from tpm_gym.learning.rollout import SELECTION_SEED, GoalEnv, run_episodes, summarise
+from tpm_gym.learning.run_folder import CURVE_FILE, EVALUATIONS_FILE
 from tpm_gym.learning.training_state import capture
-
-CURVE_FILE: Final = "learning_curve.png"
 
 _SHORTEST_INTERVAL: Final = 30.0  # s between checkpoints
 _LARGEST_SHARE: Final = 0.02  # of the time may go into checkpoints
@@ -47,33 +39,21 @@ class PeriodicEvaluation(BaseCallback):
 
     Args:
         env: An environment of its own, so that training is not disturbed.
-        every: Environment steps between evaluations.
-        episodes: Episodes per evaluation, from ``SELECTION_SEED`` up.
-        run: The run folder.
-        title: Title of the learning curve.
         console: Where one line per evaluation is printed.
         keep: Called with the model whenever it is the best so far.
     """
 
     def __init__(
         self,
+        config: TrainingConfig,
         env: GoalEnv,
-        every: int,
-        episodes: int,
-        run: Path,
-        title: str,
         console: Console,
         keep: Callable[[BaseAlgorithm], object],
     ) -> None:
         """Remember what to evaluate and where to put it."""
         super().__init__()
-        self._env = env
-        self._every = every
-        self._episodes = episodes
-        self._run = run
-        self._title = title
-        self._console = console
-        self._keep = keep
+        self._config, self._env = config, env
+        self._console, self._keep = console, keep
         self._evaluations: list[dict[str, Any]] = []
         self._best: tuple[float, float] | None = None
         self._total_steps = 0
@@ -85,17 +65,17 @@ class PeriodicEvaluation(BaseCallback):
     def restore(self, state: Mapping[str, Any]) -> None:
         """Go on after the evaluations that :meth:`state` returned."""
         self._evaluations = list(state["evaluations"])
-        self._best = tuple(state["best"])
+        self._best = tuple(state["best"]) if state["best"] else None
 
     def _on_training_start(self) -> None:
         self._total_steps = self.locals["total_timesteps"]
         if self._evaluations:  # resumed: the curve loses what is done again
-            draw_learning_curve(self._run / CURVE_FILE, self._title, self._evaluations)
+            self._draw()
         else:
             self._evaluate()
 
     def _on_step(self) -> bool:
-        due = self.num_timesteps - self._evaluations[-1]["steps"] >= self._every
+        due = self.num_timesteps - self._evaluations[-1]["steps"] >= self._config.eval_every
         # The last evaluation waits for the last update, to be that of the policy which is saved.
         if due and self.num_timesteps < self._total_steps:
             self._evaluate()
@@ -107,7 +87,7 @@ class PeriodicEvaluation(BaseCallback):
     def _evaluate(self) -> None:
         """Evaluate, record, keep the policy where it is the best so far, and draw."""
         policy = TrainedPolicy(self.model)
-        records = run_episodes(self._env, policy, self._episodes, SELECTION_SEED)
+        records = run_episodes(self._env, policy, self._config.eval_episodes, SELECTION_SEED)
         metrics = summarise(records)
         self._record(metrics)
         quality = (metrics["success_at_end"].mean, metrics["return"].mean)
@@ -116,19 +96,23 @@ class PeriodicEvaluation(BaseCallback):
             self._best = quality
             self._keep(self.model)
         self._print(metrics, best)
-        draw_learning_curve(self._run / CURVE_FILE, self._title, self._evaluations)
+        self._draw()
+
+    def _draw(self) -> None:
+        path = self._config.run / CURVE_FILE
+        draw_learning_curve(path, self._config.title, self._evaluations)
 
     def _record(self, metrics: Mapping[str, Estimate]) -> None:
         """Append the metrics to evaluations.jsonl, progress.csv and TensorBoard."""
         line: dict[str, Any] = {
             "steps": self.num_timesteps,
-            "episodes": self._episodes,
+            "episodes": self._config.eval_episodes,
             "first_seed": SELECTION_SEED,
             "wall_seconds": round(seconds_trained(self.model), 3),
         }
         line.update({name: estimate.as_dict() for name, estimate in metrics.items()})
         self._evaluations.append(line)
-        with (self._run / EVALUATIONS_FILE).open("a", encoding="utf-8") as file:
+        with (self._config.run / EVALUATIONS_FILE).open("a", encoding="utf-8") as file:
             file.write(json.dumps(line, allow_nan=False) + "\n")
         for name, estimate in metrics.items():
             self.logger.record(f"eval/{name}", estimate.mean)
@@ -146,36 +130,22 @@ class PeriodicEvaluation(BaseCallback):
 
 
 class ProgressBar(BaseCallback):
-    """Shows a progress bar on a terminal, and nothing anywhere else.
-
-    Args:
-        console: Where it is shown; lines printed there appear above the bar.
-    """
+    """Shows a progress bar on a terminal, and nothing anywhere else."""
 
     def __init__(self, console: Console) -> None:
         """Lay out the bar without showing it."""
         super().__init__()
-        self._progress = Progress(
-            TextColumn("training"),
-            BarColumn(bar_width=None),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TextColumn("left"),
-            TimeRemainingColumn(),
-            console=console,
-            disable=not console.is_terminal,
-        )
-        self._task: TaskID | None = None
+        columns = (*Progress.get_default_columns(), MofNCompleteColumn())
+        self._progress = Progress(*columns, console=console, disable=not console.is_terminal)
+        self._task = self._progress.add_task("training", start=False)
 
     def _on_training_start(self) -> None:
         self._progress.start()
-        self._task = self._progress.add_task(
-            "training", total=self.locals["total_timesteps"], completed=self.num_timesteps
-        )
+        self._progress.start_task(self._task)
+        self._progress.update(self._task, total=self.locals["total_timesteps"])
 
     def _on_step(self) -> bool:
-        if self._task is not None:
-            self._progress.update(self._task, completed=self.num_timesteps)
+        self._progress.update(self._task, completed=self.num_timesteps)
         return True
 
     def close(self) -> None:
@@ -226,36 +196,26 @@ class Checkpointing(BaseCallback):
     A rollout of an on-policy algorithm is long, so a stop does not wait for its end: the state at
     its beginning is kept in memory, saved, and the rollout is done again after resuming.
 
+    The first is saved before anything else is done, so that no policy is ever without one.
+
     Args:
-        store: Where they are saved.
         evaluation: Whose state is part of a checkpoint.
-        listener: Says when to stop.
-        every: Environment steps between checkpoints; None: half a minute, or longer where more
-            than a fiftieth of the time would go into checkpoints.
-        run: The run folder.
-        console: Where failures are reported.
         seconds: Seconds that earlier processes have trained.
     """
 
     def __init__(
         self,
+        config: TrainingConfig,
         store: CheckpointStore,
         evaluation: PeriodicEvaluation,
         listener: SignalListener,
-        every: int | None,
-        run: Path,
         console: Console,
         seconds: float,
     ) -> None:
         """Remember what to save, when and where."""
         super().__init__()
-        self._store = store
-        self._evaluation = evaluation
-        self._listener = listener
-        self._every = every
-        self._run = run
-        self._console = console
-        self._seconds = seconds
+        self._config, self._store, self._evaluation = config, store, evaluation
+        self._listener, self._console, self._seconds = listener, console, seconds
         self._held: Content | None = None
         self._last_step: int | None = store.newest
         self._next_time = time.perf_counter() + _SHORTEST_INTERVAL
@@ -264,6 +224,8 @@ class Checkpointing(BaseCallback):
         # Times and speeds in the logs count from the beginning of the run.
         self.model.start_time = int(time.time_ns() - self._seconds * 1e9)
         self.model._num_timesteps_at_start = 0
+        if self._last_step is None:
+            self._save(self._capture(), time.perf_counter())
 
     def _on_rollout_start(self) -> None:
         started = time.perf_counter()
@@ -289,10 +251,9 @@ class Checkpointing(BaseCallback):
         self._save(self._capture(finished=True), time.perf_counter())
 
     def _is_due(self) -> bool:
-        if self._last_step is None:
-            return True  # so that there is always one
-        if self._every is not None:
-            return self.model.num_timesteps - self._last_step >= self._every
+        if self._config.checkpoint_every is not None:
+            taken = self.model.num_timesteps - (self._last_step or 0)
+            return taken >= self._config.checkpoint_every
         return time.perf_counter() >= self._next_time
 
     def _capture(self, finished: bool = False) -> Content:
@@ -300,13 +261,13 @@ class Checkpointing(BaseCallback):
             "seconds": seconds_trained(self.model),
             "evaluation": self._evaluation.state(),
         }
-        return capture(self.model, self._run, extra, finished)
+        return capture(self.model, self._config.run, extra, finished)
 
     def _save(self, content: Content, started: float) -> None:
         """Save what was captured from the time ``started`` on, or report why not."""
         try:
             self._store.save(content)
-        except CheckpointWriteError as error:
+        except CheckpointError as error:
             self._console.print(f"warning: {error}", markup=False, soft_wrap=True)
         now = time.perf_counter()
         self._next_time = now + max(_SHORTEST_INTERVAL, (now - started) / _LARGEST_SHARE)

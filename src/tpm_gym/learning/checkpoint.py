@@ -16,6 +16,7 @@ import os
 import re
 import shutil
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -24,12 +25,7 @@ from typing import Any, BinaryIO, Final, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from tpm_gym.learning.errors import (
-    CheckpointDamagedError,
-    CheckpointWriteError,
-    NoCheckpointError,
-    NoWholeCheckpointError,
-)
+from tpm_gym.learning.errors import CheckpointError
 
 FORMAT: Final = 1
 KEPT: Final = 2  # checkpoints; the second is there for when the first turns out to be damaged
@@ -65,11 +61,7 @@ class Content:
 
 
 class CheckpointStore:
-    """The checkpoints of one run.
-
-    Args:
-        folder: Where they are; made when the first is saved.
-    """
+    """The checkpoints of one run, in a folder that is made when the first is saved."""
 
     def __init__(self, folder: Path) -> None:
         """Touch nothing yet."""
@@ -85,7 +77,7 @@ class CheckpointStore:
         """Write a checkpoint, then delete all but the last two.
 
         Raises:
-            CheckpointWriteError: The disk is full, or cannot be written for another reason. What
+            CheckpointError: The disk is full, or cannot be written for another reason. What
                 was written of the new checkpoint is removed; the ones before are as they were.
         """
         if content.step == self.newest and not content.finished:
@@ -112,24 +104,24 @@ class CheckpointStore:
         self._whole = [*earlier, content.step][-KEPT:]
         self._tidy()
 
-    def load(self, warn: Callable[[str], object]) -> Content:
+    def load(self, warn: Callable[[str], object]) -> Content | None:
         """Read the newest checkpoint that is whole.
 
         Args:
             warn: Called with a sentence for every newer one that is damaged.
 
+        Returns:
+            Its content; None where there are no checkpoints.
+
         Raises:
-            NoCheckpointError: There is none.
-            NoWholeCheckpointError: There are some, but all are damaged.
+            CheckpointError: There are some, but all are damaged.
         """
         steps = self._steps()
-        if not steps:
-            raise NoCheckpointError(self._folder)
         problems = []
         for step in reversed(steps):
             try:
                 content = _read(self._path(step))
-            except CheckpointDamagedError as error:
+            except CheckpointError as error:
                 problems.append(str(error))
                 continue
             for problem in problems:
@@ -137,7 +129,19 @@ class CheckpointStore:
             # The damaged ones are deleted once there is a new one to take their place.
             self._whole = [earlier for earlier in steps if earlier <= step][-KEPT:]
             return content
-        raise NoWholeCheckpointError(self._folder, problems)
+        if not problems:
+            return None
+        listed = "".join(f"\n  {problem}" for problem in problems)
+        anew = "start the run anew with --overwrite"
+        raise CheckpointError(f"no checkpoint in {self._folder} is whole; {anew}:{listed}")
+
+    def clear(self) -> None:
+        """Delete all checkpoints, but nothing else that is in their folder."""
+        self._whole = []
+        if self._folder.is_dir():
+            self._tidy()
+            with suppress(OSError):  # something else is in it
+                self._folder.rmdir()
 
     def _path(self, step: int) -> Path:
         return self._folder / f"{step:09d}"
@@ -157,7 +161,8 @@ class CheckpointStore:
             self._refuse(self._path(content.step), problem)
 
     def _refuse(self, target: Path, problem: str, cause: OSError | None = None) -> NoReturn:
-        raise CheckpointWriteError(target, problem, self.newest) from cause
+        kept = "there is none yet" if self.newest is None else f"that of step {self.newest:,} stays"
+        raise CheckpointError(f"cannot write checkpoint {target}: {problem}; {kept}") from cause
 
     def _tidy(self) -> None:
         """Delete what earlier processes and earlier checkpoints left, but nothing of the user's."""
@@ -191,17 +196,18 @@ def _read(folder: Path) -> Content:
     """Read a checkpoint after checking every byte of it.
 
     Raises:
-        CheckpointDamagedError: A file is missing or is not what was written.
+        CheckpointError: A file is missing or is not what was written.
     """
     manifest = _read_manifest(folder / MANIFEST)
     files = {}
     for name, expected in manifest["files"].items():
         data = _read_bytes(folder / name)
         if len(data) != expected["size"]:
-            problem = f"has {len(data):,} bytes instead of {expected['size']:,}"
-            raise CheckpointDamagedError(folder / name, problem)
+            raise _damaged(
+                folder / name, f"has {len(data):,} bytes instead of {expected['size']:,}"
+            )
         if _fingerprint(data) != expected:
-            raise CheckpointDamagedError(folder / name, "differs from what was written (SHA-256)")
+            raise _damaged(folder / name, "differs from what was written (SHA-256)")
         files[name] = data
     with np.load(io.BytesIO(files.pop(ARRAYS)), allow_pickle=False) as loaded:
         arrays = {name: loaded[name] for name in loaded.files}
@@ -214,20 +220,24 @@ def _read_manifest(path: Path) -> dict[str, Any]:
         manifest = json.loads(_read_bytes(path))
         digest = manifest.pop("sha256")
     except (ValueError, AttributeError, KeyError, TypeError) as error:
-        raise CheckpointDamagedError(path, "is not a manifest") from error
+        raise _damaged(path, "is not a manifest") from error
     if digest != _digest(_canonical(manifest)):
-        raise CheckpointDamagedError(path, "differs from what was written (SHA-256)")
+        raise _damaged(path, "differs from what was written (SHA-256)")
     if manifest["format"] != FORMAT:
-        problem = f"has format {manifest['format']}, this version of train.py reads {FORMAT}"
-        raise CheckpointDamagedError(path, problem)
+        problem = f"has format {manifest['format']}, this version of tpm_gym reads {FORMAT}"
+        raise _damaged(path, problem)
     return dict(manifest)
+
+
+def _damaged(path: Path, problem: str) -> CheckpointError:
+    return CheckpointError(f"damaged checkpoint: {path} {problem}")
 
 
 def _read_bytes(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise CheckpointDamagedError(path, f"cannot be read: {error.strerror}") from error
+        raise _damaged(path, f"cannot be read: {error.strerror}") from error
 
 
 def _write(path: Path, write: Callable[[BinaryIO], object]) -> None:

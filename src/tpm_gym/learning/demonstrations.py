@@ -11,15 +11,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from tpm_gym.learning.environments import make_env
+from tpm_gym.learning.rollout import GoalEnv, Observation
 from tpm_gym.tasks.expert import Expert
-
-Observation = dict[str, NDArray[Any]]
 
 
 class Demonstrations(BaseCallback):
@@ -39,7 +38,6 @@ class Demonstrations(BaseCallback):
         Args:
             episodes: How many; with n environments, rounded up to a multiple of n.
             noise: Standard deviation, in units of the largest action.
-            verbose: Passed on to stable-baselines3.
         """
         super().__init__(verbose)
         self.episodes, self.noise = episodes, noise
@@ -52,7 +50,7 @@ class Demonstrations(BaseCallback):
         if model.num_timesteps > 0:
             return  # a run that goes on has them already
         specs = self.training_env.get_attr("spec")
-        envs = [gym.make(spec.id, **spec.kwargs) for spec in specs]
+        envs = [make_env(spec.id, **spec.kwargs) for spec in specs]
         rng = np.random.default_rng(model.seed)
         outcomes: list[bool] = []
         for episode in range(0, self.episodes, len(envs)):
@@ -66,7 +64,7 @@ class Demonstrations(BaseCallback):
     def _play(
         self,
         model: OffPolicyAlgorithm,
-        envs: Sequence[gym.Env[Observation, NDArray[Any]]],
+        envs: Sequence[GoalEnv],
         noise: NDArray[Any],
         rng: np.random.Generator,
     ) -> list[bool]:

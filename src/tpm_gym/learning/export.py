@@ -1,11 +1,7 @@
 """Export a trained policy as safetensors and JSON, which load without trust.
 
-    python train/export.py runs/TPMReach-v0-sac-s0/best.zip best --trust-pickle
-
-writes ``best.json`` (network, spaces, environment, recipe, versions, SHA-256) and
-``best.safetensors`` (the weights of the actor), for ``tpm_gym.load_policy`` and ``evaluate.py``.
-The .zip file is one that train.py saved, in its run folder; it holds pickles, which can run any
-code when they are loaded: only give --trust-pickle for files you trust.
+``NAME.json`` holds network, spaces, environment, recipe, versions and SHA-256,
+``NAME.safetensors`` the weights of the actor, for ``tpm_gym.load_policy`` and ``tpm-gym evaluate``.
 """
 
 from __future__ import annotations
@@ -13,16 +9,13 @@ from __future__ import annotations
 import copy
 import io
 import json
-import sys
 import tempfile
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import tyro
 from gymnasium import spaces
 from numpy.typing import NDArray
 from safetensors.numpy import save as safetensors_bytes
@@ -32,35 +25,16 @@ from torch import nn
 
 from tpm_gym import TPMError, load_policy
 from tpm_gym.learning import provenance
-from tpm_gym.learning.errors import ConfigError, PolicyError, TrainError
+from tpm_gym.learning.algorithms import ALGORITHMS, NAMES, Actor
+from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.features import GoalGapExtractor
-from tpm_gym.learning.policies import (
-    ALGORITHMS,
-    algorithm_class,
-    load_model,
-    require_trust,
-    run_config,
-)
+from tpm_gym.learning.policies import load_model, refused, require_trust, run_config
 from tpm_gym.policy.files import FORMAT, VERSION, digest, files
 
 TOLERANCE: Final = 1e-6
 """How far an exported action may be from the original; of half its range where that is over 1."""
 _TRIALS: Final = 64
 _ACTIVATIONS: Final = {nn.ReLU: "relu", nn.Tanh: "tanh"}
-
-
-@dataclass(frozen=True)
-class Config:
-    """Export a trained policy as safetensors and JSON."""
-
-    model: tyro.conf.Positional[Path]
-    """A .zip file that train.py saved, in its run folder."""
-
-    out: tyro.conf.Positional[Path]
-    """What the two new files have in common; earlier ones are replaced."""
-
-    trust_pickle: bool = False
-    """Load the .zip file, which can run any code that is in it."""
 
 
 def save(
@@ -80,9 +54,7 @@ def save(
     Args:
         model: SAC, TQC or PPO with a MultiInputPolicy.
         path: What the files have in common; folders above are made, earlier files replaced.
-        env_id: Id of the environment it was trained on.
         seed: Seed of the training; None where it is not known.
-        recipe: The hyperparameters, as plain data.
         versions: Versions it was trained with; by default those installed.
 
     Returns:
@@ -93,12 +65,13 @@ def save(
         ConfigError: ``path`` ends in .zip.
     """
     if path.suffix == ".zip":
-        raise ConfigError("OUT", path, "is a name for a .json and a .safetensors, not for a .zip")
+        raise ConfigError(f"OUT {path}: is a name for a .json and a .safetensors, not for a .zip")
     name = str(path)
-    algorithm = next((a for a in ALGORITHMS if type(model) is algorithm_class(a)), None)
+    known = (a for a, row in ALGORITHMS.items() if type(model) is row.load_class())
+    algorithm = next(known, None)
     if algorithm is None:
-        raise PolicyError(name, f"{type(model).__name__} is none of {', '.join(ALGORITHMS)}")
-    network, weights = _network(name, model, algorithm)
+        raise refused(name, f"{type(model).__name__} is none of {NAMES}")
+    network, weights = _network(name, model, ALGORITHMS[algorithm].actor)
     data = safetensors_bytes(weights)
     content: dict[str, Any] = {
         "format": FORMAT,
@@ -119,12 +92,7 @@ def save(
 
 
 def save_archive(model: BaseAlgorithm, path: Path) -> None:
-    """Save a model as Stable-Baselines3 does, but so that an interruption leaves no half a file.
-
-    Args:
-        model: Any algorithm.
-        path: The .zip file.
-    """
+    """Save a model as Stable-Baselines3 does, but so that an interruption leaves no half a file."""
     file = io.BytesIO()  # PyTorch, writing to a disk that is full, would hide the reason
     model.save(file)
     provenance.write_whole(path, lambda part: part.write_bytes(file.getvalue()))
@@ -136,9 +104,26 @@ def remove(path: Path) -> None:
         file.unlink(missing_ok=True)
 
 
-def _convert(archive: Path, path: Path) -> Path:
-    """Export a .zip file of a run."""
+def convert(archive: Path, path: Path, *, trust_pickle: bool) -> Path:
+    """Export a .zip file of a run.
+
+    Args:
+        archive: ``best.zip`` or ``last.zip``, in its run folder.
+        path: As for :func:`save`.
+        trust_pickle: Whether the archive may be loaded, which can run any code that is in it.
+
+    Returns:
+        The JSON file.
+
+    Raises:
+        PolicyError: It is not trusted, or cannot be loaded or exported.
+        ConfigError: There is no such file, or ``path`` ends in .zip.
+    """
+    if not archive.is_file():
+        known = "is not a file" if archive.exists() else "there is no such file"
+        raise ConfigError(f"MODEL {archive}: {known}; give best.zip or last.zip of a run")
     name = str(archive)
+    require_trust(name, archive, trust_pickle)
     config = run_config(name, archive)
     return save(
         load_model(name, archive),
@@ -151,37 +136,32 @@ def _convert(archive: Path, path: Path) -> Path:
 
 
 def _network(
-    name: str, model: BaseAlgorithm, algorithm: str
+    name: str, model: BaseAlgorithm, actor: Actor
 ) -> tuple[dict[str, Any], dict[str, NDArray[np.float32]]]:
     """Return the description and the weights of what computes the mean action."""
     if getattr(model, "use_sde", False):
-        raise PolicyError(name, "state-dependent exploration (use_sde) cannot be exported")
+        raise refused(name, "state-dependent exploration (use_sde) cannot be exported")
     if model.get_vec_normalize_env() is not None:
-        raise PolicyError(name, "normalised observations (VecNormalize) cannot be exported")
-    policy: Any = model.policy
-    if algorithm == "ppo":
-        extractor, hidden = policy.pi_features_extractor, policy.mlp_extractor.policy_net
-        last, output = policy.action_net, "clip"
-    else:
-        extractor, hidden = policy.actor.features_extractor, policy.actor.latent_pi
-        last, output = policy.actor.mu, "tanh"
-    modules = [*hidden, last]  # linear, activation, linear, ..., linear
+        raise refused(name, "normalised observations (VecNormalize) cannot be exported")
+    part = model.policy.get_submodule
+    hidden: Any = part(actor.hidden)
+    modules = [*hidden, part(actor.last)]  # linear, activation, linear, ..., linear
     linear, between = modules[::2], modules[1::2]
     kinds = {_ACTIVATIONS.get(type(module)) for module in between} or {"relu"}
     if any(type(m) is not nn.Linear or m.bias is None for m in linear) or len(kinds - {None}) != 1:
-        raise PolicyError(name, f"only linear layers with ReLU or Tanh can be exported: {modules}")
+        raise refused(name, f"only linear layers with ReLU or Tanh can be exported: {modules}")
     weights: dict[str, NDArray[np.float32]] = {}
     for i, module in enumerate(linear):
-        for part in ("weight", "bias"):
-            values = getattr(module, part).detach().cpu().numpy().astype(np.float32)
+        for tensor in ("weight", "bias"):
+            values = getattr(module, tensor).detach().cpu().numpy().astype(np.float32)
             if not np.isfinite(values).all():
-                raise PolicyError(name, "its weights are not finite: the training diverged")
-            weights[f"layers.{i}.{part}"] = values
+                raise refused(name, "its weights are not finite: the training diverged")
+            weights[f"layers.{i}.{tensor}"] = values
     description = {
-        "features": _features(name, extractor),
+        "features": _features(name, part(actor.features)),
         "hidden": [module.out_features for module in linear[:-1]],
         "activation": next(iter(kinds - {None})),
-        "output": output,
+        "output": actor.output,
     }
     return description, weights
 
@@ -193,20 +173,20 @@ def _features(name: str, extractor: nn.Module) -> dict[str, Any]:
     if type(extractor) is CombinedExtractor:
         return {"kind": "concatenate", "keys": list(extractor.extractors)}
     wanted = "CombinedExtractor or GoalGapExtractor"
-    raise PolicyError(name, f"features of {type(extractor).__name__}, not of {wanted}")
+    raise refused(name, f"features of {type(extractor).__name__}, not of {wanted}")
 
 
 def _boxes(name: str, space: spaces.Space[Any]) -> dict[str, Any]:
     """Describe a dictionary of spaces."""
     if not isinstance(space, spaces.Dict):
-        raise PolicyError(name, f"observations in {space}, not in a Dict")
+        raise refused(name, f"observations in {space}, not in a Dict")
     return {key: _box(name, key, box) for key, box in space.items()}
 
 
 def _box(name: str, what: str, space: spaces.Space[Any]) -> dict[str, Any]:
     """Describe a space of arrays."""
     if not isinstance(space, spaces.Box) or not space.is_bounded() or space.dtype.kind != "f":
-        raise PolicyError(name, f"{what} in {space}, not in a bounded Box of floats")
+        raise refused(name, f"{what} in {space}, not in a bounded Box of floats")
     return {
         "shape": list(space.shape),
         "dtype": space.dtype.name,
@@ -250,27 +230,10 @@ def _verify(name: str, model: BaseAlgorithm, written: Path) -> None:
     try:
         actions = load_policy(written).act(batch)
     except TPMError as error:
-        raise PolicyError(name, f"cannot be exported: {error}") from error
+        raise refused(name, f"cannot be exported: {error}") from error
     space: Any = model.action_space
     expected, _ = policy.predict(batch, deterministic=True)
     scale = np.maximum(1.0, (space.high - space.low) / 2)
     off = float(np.max(np.abs(actions - expected) / scale))
     if not off <= TOLERANCE:
-        raise PolicyError(name, f"cannot be exported: its actions would be off by {off:.2g}")
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command line."""
-    config = tyro.cli(Config, description=__doc__, args=arguments)
-    try:
-        if not config.model.is_file():
-            known = "is not a file" if config.model.exists() else "there is no such file"
-            raise ConfigError("MODEL", config.model, f"{known}; give best.zip or last.zip of a run")
-        require_trust(str(config.model), config.model, config.trust_pickle)
-        print(_convert(config.model, config.out))
-    except (TrainError, TPMError) as error:
-        sys.exit(f"error: {error}")
-
-
-if __name__ == "__main__":
-    main()
+        raise refused(name, f"cannot be exported: its actions would be off by {off:.2g}")

@@ -1,27 +1,15 @@
-"""What all figures share: palette, fonts, names of modes, and saving with the same bytes each time.
-
-All drawings are in millimetres, the unit of the paper's case study; all data are in metres.
-"""
+"""What all figures share: palette, fonts, and saving with the same bytes each time."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import matplotlib
-import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
-from numpy.typing import NDArray
 
-from tpm_gym.kinematics import WorkingMode
-from tpm_gym.kinematics.workspace import TASK_REGION
-
-FloatArray = NDArray[np.float64]
-
-MM = 1e3
 DPI = 160
 WIDTH = 7.2  # inches: a paper's page, both columns
 
@@ -30,9 +18,7 @@ BLUE, VERMILLION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 ORANGE, SKY, BLACK = "#E69F00", "#56B4E9", "#000000"
 REACHED, OUTLINE = "#EBEBEB", "#8C8C8C"  # the reachable set, and its edge
 
-LENGTHS = "lengths of the paper's case study"
-
-_SETTINGS = {
+_SETTINGS: dict[Any, Any] = {
     "font.size": 8.0,
     "axes.titlesize": 8.0,
     "axes.labelsize": 8.0,
@@ -62,41 +48,3 @@ def style() -> Iterator[None]:
 def save(figure: Figure, path: Path) -> None:
     """Write a PNG without the entries (program, date) that would change its bytes."""
     figure.savefig(path, dpi=DPI, metadata={"Software": None})
-
-
-def mode_name(mode: WorkingMode) -> str:
-    """The four signs of a working mode, in words."""
-    signs = (mode.cos_beta, mode.leg1, mode.leg2, mode.leg3)
-    marks = ["+" if sign > 0 else "\N{MINUS SIGN}" for sign in signs]
-    return "cos β {}, legs {} {} {}".format(*marks)
-
-
-def section_axes(axes: Axes, title: str, horizontal: str = "x", vertical: str = "z") -> None:
-    """Title and units of a section through the workspace."""
-    axes.set_title(title)
-    axes.set_xlabel(f"{horizontal} (mm)")
-    axes.set_ylabel(f"{vertical} (mm)")
-
-
-def outline_task_region(axes: Axes, vertical: str, inside: bool, colour: str = BLACK) -> None:
-    """Outline the environments' region in an x-z or x-y section; dashed where that misses it."""
-    row = {"y": 1, "z": 2}[vertical]
-    low, high = (np.asarray(corner) * MM for corner in (TASK_REGION.low, TASK_REGION.high))
-    axes.add_patch(
-        Rectangle(
-            (low[0], low[row]),
-            high[0] - low[0],
-            high[row] - low[row],
-            fill=False,
-            edgecolor=colour,
-            linewidth=1.0,
-            linestyle="-" if inside else (0, (3, 2)),
-            zorder=5,
-        )
-    )
-
-
-def heading(figure: Figure, title: str, what: str, top: float = 0.985, below: float = 0.95) -> None:
-    """Title, and below it the lengths and the working mode; heights in parts of the figure."""
-    figure.text(0.5, top, title, ha="center", va="top", fontsize=11, weight="bold")
-    figure.text(0.5, below, f"{LENGTHS}; {what}", ha="center", va="top", fontsize=8.5)

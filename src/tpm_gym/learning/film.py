@@ -19,15 +19,7 @@ _COLUMNS: Final = 3
 
 
 def write_video(path: Path, env: GoalEnv, policy: Policy, episodes: int, first_seed: int) -> None:
-    """Write an MP4 of some episodes, at the speed of the robot.
-
-    Args:
-        path: The file; written in one piece.
-        env: An environment that renders ``rgb_array``.
-        policy: What acts.
-        episodes: Number of episodes.
-        first_seed: Seed of the first one; the following count up.
-    """
+    """Write an MP4 of some episodes in one piece, at the speed of the robot."""
     import imageio.v2 as imageio
 
     def write(part: Path) -> None:
@@ -43,11 +35,7 @@ def write_video(path: Path, env: GoalEnv, policy: Policy, episodes: int, first_s
 def write_contact_sheet(path: Path, env: GoalEnv, policy: Policy, seed: int) -> None:
     """Write a PNG of one episode: six moments from first to last, row by row.
 
-    Args:
-        path: The file; written in one piece.
-        env: An environment that renders ``rgb_array``.
-        policy: What acts.
-        seed: Seed of the episode.
+    ``env`` renders ``rgb_array``.
     """
     import imageio.v3 as imageio
 
@@ -59,9 +47,6 @@ def write_contact_sheet(path: Path, env: GoalEnv, policy: Policy, seed: int) -> 
 
 def contact_sheet(frames: Sequence[Frame]) -> Frame:
     """Return evenly spaced frames, from the first until nothing moves any more, side by side.
-
-    Args:
-        frames: Frames of (height, width, 3), at least one.
 
     Returns:
         One picture of (2 * height, 3 * width, 3).

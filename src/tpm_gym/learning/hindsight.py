@@ -10,7 +10,7 @@ from stable_baselines3.common.type_aliases import DictReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.her import HerReplayBuffer
 
-from tpm_gym.learning.errors import ReplayBufferError
+from tpm_gym.learning.errors import ConfigError
 
 
 class PenaltyHerReplayBuffer(HerReplayBuffer):
@@ -32,16 +32,12 @@ class PenaltyHerReplayBuffer(HerReplayBuffer):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         """Build the buffer with the arguments of ``stable_baselines3.HerReplayBuffer``.
 
-        Args:
-            args: Positional arguments of the parent.
-            kwargs: Keyword arguments of the parent.
-
         Raises:
-            ReplayBufferError: ``copy_info_dict`` is on: the penalty would be counted twice.
+            ConfigError: ``copy_info_dict`` is on: the penalty would be counted twice.
         """
         super().__init__(*args, **kwargs)
         if self.copy_info_dict:
-            raise ReplayBufferError(
+            raise ConfigError(
                 "copy_info_dict=True: the stored infos already carry the penalty and it would be "
                 "counted twice; leave copy_info_dict off, or use HerReplayBuffer"
             )
@@ -63,11 +59,11 @@ class PenaltyHerReplayBuffer(HerReplayBuffer):
             The n transitions with new goals and their rewards.
 
         Raises:
-            ReplayBufferError: ``env`` normalises rewards.
+            ConfigError: ``env`` normalises rewards.
         """
         if env is not None and env.norm_reward:
             # The parent has normalised R(ag', g') by then; a sum with raw rewards has no meaning.
-            raise ReplayBufferError(
+            raise ConfigError(
                 "VecNormalize has norm_reward=True: relabelled rewards cannot be corrected after "
                 "normalisation; wrap the environment with VecNormalize(..., norm_reward=False)"
             )
@@ -81,7 +77,7 @@ class PenaltyHerReplayBuffer(HerReplayBuffer):
     ) -> NDArray[np.float32]:
         """Return r - R(ag', g) of stored transitions: minus the weighted penalty, (n,)."""
         if self.env is None:
-            raise ReplayBufferError(
+            raise ConfigError(
                 "the buffer has no environment to compute rewards with; call set_env() after "
                 "loading it"
             )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from stable_baselines3.common.logger import CSVOutputFormat, Logger, TensorBoardOutputFormat
 from tensorboard.compat.proto.event_pb2 import (  # type: ignore[import-untyped]
@@ -11,7 +11,7 @@ from tensorboard.compat.proto.event_pb2 import (  # type: ignore[import-untyped]
     SessionLog,
 )
 
-PROGRESS_FILE: Final = "progress.csv"
+from tpm_gym.learning.run_folder import PROGRESS_FILE
 
 
 def make_logger(run: Path, resumed_at: int | None = None) -> Logger:

@@ -12,22 +12,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol, cast
 
-import gymnasium as gym
 import numpy as np
 
+import tpm_gym
+from tpm_gym import TPMError
+from tpm_gym.learning.algorithms import ALGORITHMS, NAMES
 from tpm_gym.learning.errors import PolicyError
+from tpm_gym.learning.recipes import with_classes
 from tpm_gym.learning.rollout import Action, GoalEnv, Observation, Policy
+from tpm_gym.learning.run_folder import BEST_FILE, CONFIG_FILE, EXPORTED, LAST_FILE
+from tpm_gym.resources import POLICIES
+from tpm_gym.tasks.expert import Expert
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
-CONFIG_FILE: Final = "config.json"
-EVALUATIONS_FILE: Final = "evaluations.jsonl"
-TESTS: Final = "tests"
-BEST_FILE: Final = "best.zip"
-LAST_FILE: Final = "last.zip"
-EXPORTED: Final = (".json", ".safetensors")
-ALGORITHMS: Final = ("sac", "tqc", "ppo")
 SCRIPTED: Final = ("expert", "random")
 
 
@@ -38,21 +37,9 @@ class Predictor(Protocol):
         """Return the action, and the state of a recurrent policy."""
 
 
-class _Expert(Protocol):
-    """The part of ``tpm_gym.tasks.expert.Expert`` that acts."""
-
-    def reset(self, obs: Observation) -> None: ...
-
-    def act(self, obs: Observation) -> Action: ...
-
-
 @dataclass(frozen=True)
 class TrainedPolicy:
-    """Acts with the mean action of a trained algorithm.
-
-    Attributes:
-        model: The Stable-Baselines3 algorithm.
-    """
+    """Acts with the mean action of a trained algorithm."""
 
     model: Predictor
 
@@ -66,13 +53,9 @@ class TrainedPolicy:
 
 
 class RandomPolicy:
-    """Draws actions uniformly, from a generator seeded anew in every episode.
+    """Draws actions uniformly, from a generator seeded anew in every episode."""
 
-    Args:
-        space: The action space.
-    """
-
-    def __init__(self, space: gym.spaces.Box) -> None:
+    def __init__(self, space: Any) -> None:
         """Remember the space; the generator is seeded by ``reset``."""
         self._space = space
         self._rng = np.random.default_rng()
@@ -83,21 +66,18 @@ class RandomPolicy:
 
     def act(self, observation: Observation) -> Action:
         """Return an action that does not depend on ``observation``."""
-        return self._rng.uniform(self._space.low, self._space.high).astype(self._space.dtype)
+        drawn: Action = self._rng.uniform(self._space.low, self._space.high)
+        return drawn.astype(self._space.dtype)
 
 
 @dataclass(frozen=True)
 class ExpertPolicy:
-    """Acts with the scripted controller of tpm_gym.
+    """Acts with the scripted controller, which is deterministic."""
 
-    Attributes:
-        expert: The controller.
-    """
-
-    expert: _Expert
+    expert: Expert
 
     def reset(self, observation: Observation, seed: int) -> None:
-        """Plan the motion of the episode; the controller is deterministic."""
+        """Plan the motion of the episode."""
         self.expert.reset(observation)
 
     def act(self, observation: Observation) -> Action:
@@ -110,8 +90,8 @@ def load_policy(spec: str, env: GoalEnv, *, trust_pickle: bool = False) -> Polic
 
     Args:
         spec: ``expert``, ``random``, an exported policy (either of its files, or their common
-            name), a .zip file saved by train.py, or the folder of a run (its best policy).
-        env: The environment the policy will act in.
+            name), the id of a published one, a .zip file of a training, or the folder of a run (its
+            best policy).
         trust_pickle: Whether a .zip file may be loaded, which can run any code that is in it.
 
     Raises:
@@ -119,20 +99,22 @@ def load_policy(spec: str, env: GoalEnv, *, trust_pickle: bool = False) -> Polic
             is a .zip file and ``trust_pickle`` is not set.
     """
     if spec == "random":
-        if not isinstance(env.action_space, gym.spaces.Box):
-            raise PolicyError(spec, f"needs a Box action space, not {env.action_space}")
         return RandomPolicy(env.action_space)
     if spec == "expert":
-        from tpm_gym.tasks.expert import Expert
-
         return ExpertPolicy(Expert(env))
     path = _policy_file(spec)
-    if path.suffix in EXPORTED:
-        return TrainedPolicy(_load_exported(spec, path, env))
-    require_trust(spec, path, trust_pickle)
-    model = load_model(spec, path)
-    _check_spaces(spec, model, env)
-    return TrainedPolicy(model)
+    if path.suffix not in EXPORTED:
+        require_trust(spec, path, trust_pickle)
+        model = load_model(spec, path)
+        _check_spaces(spec, model, env)
+        return TrainedPolicy(model)
+    _use_one_thread()
+    try:
+        policy = tpm_gym.load_policy(path)
+        policy.check(env)
+    except TPMError as error:
+        raise refused(spec, str(error)) from error
+    return TrainedPolicy(policy)
 
 
 def trained_env(spec: str) -> str | None:
@@ -148,13 +130,17 @@ def trained_env(spec: str) -> str | None:
     path = _policy_file(spec)
     if path.suffix not in EXPORTED:
         return str(run_config(spec, path)["env"])
-    from tpm_gym import TPMError
     from tpm_gym.policy.files import read_description
 
     try:
         return read_description(path).env_id
     except TPMError as error:
-        raise PolicyError(spec, str(error)) from error
+        raise refused(spec, str(error)) from error
+
+
+def refused(spec: object, problem: str) -> PolicyError:
+    """Return an error about a policy."""
+    return PolicyError(f"policy {str(spec)!r}: {problem}")
 
 
 def require_trust(spec: str, path: Path, trusted: bool) -> None:
@@ -164,11 +150,11 @@ def require_trust(spec: str, path: Path, trusted: bool) -> None:
         PolicyError: It is not trusted.
     """
     if not trusted:
-        raise PolicyError(
+        raise refused(
             spec,
             f"{path} holds pickles, and loading it can run any code; if you trust where it comes "
             "from, give --trust-pickle, or convert it once and share that instead: "
-            f"python train/export.py {path} {path.with_suffix('')} --trust-pickle",
+            f"tpm-gym export {path} {path.with_suffix('')} --trust-pickle",
         )
 
 
@@ -176,28 +162,27 @@ def _policy_file(spec: str) -> Path:
     """Return the file that ``spec`` names: one of an exported policy, or a .zip."""
     path = Path(spec)
     if path.is_dir():
-        archives = [path / BEST_FILE, path / LAST_FILE]
-        candidates = [*(file.with_suffix(".json") for file in archives), *archives]
+        saved = [path / BEST_FILE, path / LAST_FILE]
+        candidates = [*(file.with_suffix(".json") for file in saved), *saved]
     elif path.suffix in (".zip", *EXPORTED):
         candidates = [path]
     else:
-        candidates = [path.with_name(path.name + suffix) for suffix in EXPORTED]
+        files = [Path(spec + suffix) for suffix in EXPORTED]
+        candidates = [*files, POLICIES / f"{spec}.json"]
     for candidate in candidates:
         if candidate.is_file():
             return candidate
     looked_for = " or ".join(str(candidate) for candidate in candidates)
-    raise PolicyError(
-        spec,
-        f"no file {looked_for}; expected {', '.join(SCRIPTED)}, an exported policy (.json), a .zip "
-        "saved by train.py, or the folder of a run",
-    )
+    known = f"{', '.join(SCRIPTED)}, an exported policy (.json), the id of a published one"
+    archives = "a .zip of a training, or the folder of a run"
+    raise refused(spec, f"no file {looked_for}; expected {known}, {archives}")
 
 
 def run_config(spec: str, path: Path) -> dict[str, Any]:
     """Return the run's configuration, from beside or above a .zip file.
 
     Raises:
-        PolicyError: There is none, or it lacks what train.py writes.
+        PolicyError: There is none, or it lacks what a training writes.
     """
     folders = path.resolve().parents[:2]  # the run folder, or one inside it
     for folder in folders:
@@ -207,28 +192,14 @@ def run_config(spec: str, path: Path) -> dict[str, Any]:
         try:
             content = json.loads(file.read_text(encoding="utf-8"))
         except (ValueError, RecursionError) as error:
-            raise PolicyError(spec, f"{file} is damaged: {error}") from error
+            raise refused(spec, f"{file} is damaged: {error}") from error
         for key in ("algo", "env", "seed", "recipe"):
             if not isinstance(content, dict) or key not in content:
-                raise PolicyError(spec, f"{file} is damaged: no entry {key!r}")
+                raise refused(spec, f"{file} is damaged: no entry {key!r}")
         return cast(dict[str, Any], content)
-    raise PolicyError(
+    raise refused(
         spec, f"no {CONFIG_FILE} beside {path.name} or above it; keep the file in its run folder"
     )
-
-
-def _load_exported(spec: str, path: Path, env: GoalEnv) -> Predictor:
-    """Load an exported policy and make sure that it fits."""
-    from tpm_gym import TPMError
-    from tpm_gym.policy.policy import load_policy as load_safely  # imports torch
-
-    _use_one_thread()
-    try:
-        policy = load_safely(path)
-        policy.check(env)
-    except TPMError as error:
-        raise PolicyError(spec, str(error)) from error
-    return policy
 
 
 def _use_one_thread() -> None:
@@ -244,42 +215,33 @@ def load_model(spec: str, path: Path) -> BaseAlgorithm:
     Raises:
         PolicyError: It cannot be loaded.
     """
-    algorithm = run_config(spec, path)["algo"]
+    config = run_config(spec, path)
+    algorithm = config["algo"]
     if algorithm not in ALGORITHMS:
-        raise PolicyError(spec, f"algorithm {algorithm!r} is none of {', '.join(ALGORITHMS)}")
+        raise refused(spec, f"algorithm {algorithm!r} is none of {NAMES}")
     _use_one_thread()
     # Acting stores nothing: no room is needed, nor a hindsight buffer, which would ask for an
     # environment.
-    unused: dict[str, Any] = {
+    replaced: dict[str, Any] = {
         "replay_buffer_class": None,
         "replay_buffer_kwargs": {},
         "buffer_size": 1,
     }
     try:
-        return algorithm_class(algorithm).load(path, device="cpu", custom_objects=unused)
+        arguments = config["recipe"].get("arguments", {})
+        if "features_extractor_class" in arguments.get("policy_kwargs", {}):
+            # The archive's pickle names the module that this class was in, and it may have moved.
+            replaced["policy_kwargs"] = with_classes(arguments)["policy_kwargs"]
+        kind = ALGORITHMS[algorithm].load_class()
+        return kind.load(path, device="cpu", custom_objects=replaced)
     except Exception as error:  # A damaged archive or pickle can raise anything at all.
-        raise PolicyError(spec, f"cannot be loaded as {algorithm}: {error}") from error
-
-
-def algorithm_class(name: str) -> type[BaseAlgorithm]:
-    """Return the Stable-Baselines3 class of an algorithm in ``ALGORITHMS``."""
-    if name == "tqc":
-        from sb3_contrib import TQC
-
-        return TQC
-    from stable_baselines3 import PPO, SAC
-
-    return SAC if name == "sac" else PPO
+        raise refused(spec, f"cannot be loaded as {algorithm}: {error}") from error
 
 
 def _check_spaces(spec: str, model: BaseAlgorithm, env: GoalEnv) -> None:
     """Refuse a policy that was trained with other observations or actions."""
-    pairs = {
-        "observation": (model.observation_space, env.observation_space),
-        "action": (model.action_space, env.action_space),
-    }
-    for kind, (trained, given) in pairs.items():
+    for kind in ("observation", "action"):
+        trained, given = (getattr(owner, f"{kind}_space") for owner in (model, env))
         if trained != given:
-            raise PolicyError(
-                spec, f"was trained with {kind} space {trained}, the environment has {given}"
-            )
+            problem = f"was trained with {kind} space {trained}, the environment has {given}"
+            raise refused(spec, problem)

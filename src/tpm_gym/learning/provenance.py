@@ -25,6 +25,16 @@ _PACKAGES: Final = (
 )
 
 
+def origin() -> dict[str, Any]:
+    """Return versions, commit, machine and command as plain data, by these names."""
+    return {
+        "versions": versions(),
+        "git_commit": git_commit(),
+        "machine": machine(),
+        "command": command_line(),
+    }
+
+
 def versions() -> dict[str, str | None]:
     """Return the versions of Python, tpm_gym and the packages below it; None where absent."""
     return {"python": platform.python_version()} | {name: _version(name) for name in _PACKAGES}
@@ -85,13 +95,14 @@ def _processor() -> str:
 
 
 def command_line(arguments: Sequence[str] | None = None) -> str:
-    """Return a command that repeats this one, without folders outside the working directory.
-
-    Args:
-        arguments: The script and its arguments; by default those of this process.
-    """
-    words = [_portable(word) for word in (sys.argv if arguments is None else arguments)]
-    return shlex.join(["python", *words])
+    """Return a command that repeats this one, without folders outside the working directory."""
+    program, *words = sys.argv if arguments is None else arguments
+    # ``python -m tpm_gym.learning`` is the same command.
+    ours = Path(program).name == "tpm-gym" or Path(program) == Path(__file__).with_name(
+        "__main__.py"
+    )
+    first = ["tpm-gym"] if ours else ["python", _portable(program)]
+    return shlex.join([*first, *map(_portable, words)])
 
 
 def _portable(word: str) -> str:
@@ -111,7 +122,6 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
     Args:
         path: The file; it is replaced, or left as it was where writing fails.
-        content: Plain data.
 
     Raises:
         ValueError: ``content`` holds NaN or an infinity, which JSON cannot express.

@@ -9,147 +9,29 @@ written here (the zoo reads it as well), and nothing is ever evaluated.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, get_args, get_type_hints
 
 import yaml
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from tpm_gym.learning.errors import RecipeError
-
-
-class _Rule(NamedTuple):
-    """What an entry has to be."""
-
-    description: str
-    accepts: Callable[[Any], bool]
-
-
-def _is_int(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool)
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _one_of(*choices: str) -> _Rule:
-    return _Rule(f"one of {', '.join(choices)}", lambda value: value in choices)
-
-
-def _is_layers(value: object) -> bool:
-    return isinstance(value, list) and all(_is_int(width) and width > 0 for width in value)
-
-
-def _is_net_arch(value: object) -> bool:
-    if isinstance(value, dict):
-        return set(value) <= {"pi", "qf", "vf"} and all(map(_is_layers, value.values()))
-    return _is_layers(value)
-
-
-def _is_ent_coef(value: object) -> bool:
-    if isinstance(value, str):
-        return value == "auto" or value.startswith("auto_")
-    return _is_number(value) and float(value) >= 0  # type: ignore[arg-type]
-
-
-def _is_learning_rate(value: object) -> bool:
-    if isinstance(value, str):
-        return value.startswith("lin_") and _is_positive_text(value.removeprefix("lin_"))
-    return _is_number(value) and float(value) > 0  # type: ignore[arg-type]
-
-
-def _is_positive_text(text: str) -> bool:
-    try:
-        return 0 < float(text) < math.inf
-    except ValueError:
-        return False
-
-
-_COUNT = _Rule("a positive integer", lambda value: _is_int(value) and value > 0)
-_NATURAL = _Rule("an integer of at least 0", lambda value: _is_int(value) and value >= 0)
-_POSITIVE = _Rule("a positive number", lambda value: _is_number(value) and value > 0)
-_NOT_NEGATIVE = _Rule("a number of at least 0", lambda value: _is_number(value) and value >= 0)
-_NUMBER = _Rule("a number", _is_number)
-_FRACTION = _Rule("a number in (0, 1]", lambda value: _is_number(value) and 0 < value <= 1)
-_FLAG = _Rule("true or false", lambda value: isinstance(value, bool))
-
-_Rules = Mapping[str, "_Rule | _Rules"]
-
-_NET_ARCH = _Rule("a list of positive integers, or one for each of pi, qf, vf", _is_net_arch)
-_COMMON: Final[_Rules] = {
-    "n_timesteps": _COUNT,
-    "n_envs": _COUNT,
-    "policy": _one_of("MultiInputPolicy"),
-    "learning_rate": _Rule(
-        "a positive number, or lin_<start> to fall linearly to zero", _is_learning_rate
-    ),
-    "gamma": _FRACTION,
-    "batch_size": _COUNT,
-}
-_OFF_POLICY: Final[_Rules] = {
-    **_COMMON,
-    "buffer_size": _COUNT,
-    "learning_starts": _NATURAL,
-    "tau": _FRACTION,
-    "train_freq": _COUNT,
-    "gradient_steps": _Rule(
-        "a positive integer, or -1 for as many as steps were taken",
-        lambda value: _is_int(value) and (value > 0 or value == -1),
-    ),
-    "ent_coef": _Rule("auto, auto_<start>, or a number of at least 0", _is_ent_coef),
-    "target_entropy": _Rule("auto or a number", lambda value: value == "auto" or _is_number(value)),
-    "target_update_interval": _COUNT,
-    "demonstrations": {"episodes": _COUNT, "noise": _NOT_NEGATIVE},
-    "replay_buffer_class": _one_of("HerReplayBuffer"),
-    "replay_buffer_kwargs": {
-        "n_sampled_goal": _COUNT,
-        "goal_selection_strategy": _one_of("future", "final", "episode"),
-    },
-}
-_POLICY: Final[_Rules] = {
-    "net_arch": _NET_ARCH,
-    "log_std_init": _NUMBER,
-    "features_extractor_class": _one_of("GoalGapExtractor"),
-    "features_extractor_kwargs": {"unit": _POSITIVE},
-}
-_Q_POLICY: Final[_Rules] = {**_POLICY, "n_critics": _COUNT}
-_RULES: Final[Mapping[str, _Rules]] = {
-    "sac": {**_OFF_POLICY, "policy_kwargs": _Q_POLICY},
-    "tqc": {
-        **_OFF_POLICY,
-        "top_quantiles_to_drop_per_net": _NATURAL,
-        "policy_kwargs": {**_Q_POLICY, "n_quantiles": _COUNT},
-    },
-    "ppo": {
-        **_COMMON,
-        "n_steps": _COUNT,
-        "n_epochs": _COUNT,
-        "gae_lambda": _FRACTION,
-        "clip_range": _POSITIVE,
-        "ent_coef": _NOT_NEGATIVE,
-        "vf_coef": _NOT_NEGATIVE,
-        "max_grad_norm": _POSITIVE,
-        "normalize_advantage": _FLAG,
-        "target_kl": _POSITIVE,
-        "policy_kwargs": {**_POLICY, "ortho_init": _FLAG},
-    },
-}
-_REQUIRED: Final = ("n_timesteps", "policy")
+from tpm_gym.learning.algorithms import ALGORITHMS, NAMES
+from tpm_gym.learning.errors import ConfigError
+from tpm_gym.resources import RECIPES
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """How one algorithm is trained on one environment.
+    """How one algorithm is trained on one environment, as plain data.
 
     Attributes:
         n_timesteps: Number of environment steps, those of the demonstrations included.
         n_envs: Number of parallel environments.
         policy: Name of the policy class.
         hindsight: Whether the replay buffer relabels goals.
-        demonstrations: Arguments of :class:`demonstrations.Demonstrations`; empty for none.
+        demonstrations: Arguments of :class:`~tpm_gym.learning.Demonstrations`; empty for none.
         arguments: The other arguments of the algorithm's constructor.
     """
 
@@ -160,23 +42,69 @@ class Recipe:
     demonstrations: Mapping[str, Any]
     arguments: Mapping[str, Any]
 
+    def keywords(self) -> dict[str, Any]:
+        """Return the keyword arguments of the algorithm's constructor, with classes for names."""
+        entries = {"policy": self.policy, **self.arguments}
+        if self.hindsight:
+            entries["replay_buffer_class"] = "HerReplayBuffer"
+        rate = entries.get("learning_rate")
+        if isinstance(rate, str):
+            from stable_baselines3.common.utils import LinearSchedule
 
-def read_recipe(path: Path, algorithm: str, env_id: str) -> Recipe:
-    """Read the recipe of an environment, after checking the whole file.
+            entries["learning_rate"] = LinearSchedule(float(rate.removeprefix("lin_")), 0.0, 1.0)
+        return with_classes(entries)
 
-    Args:
-        path: The YAML file.
-        algorithm: ``sac``, ``tqc`` or ``ppo``.
-        env_id: The environment's id.
+
+def recipe(env_id: str, algorithm: str = "sac") -> dict[str, Any]:
+    """Return the shipped recipe of an environment as keyword arguments for Stable-Baselines3.
+
+    For example ``SAC(env=env, **recipe("TPMReach-v0"))``. What is no argument of the constructor is
+    left out: the number of steps and of environments, and the demonstrations.
 
     Raises:
-        RecipeError: The file cannot be read, has no recipe for ``env_id``, or an entry anywhere in
+        ConfigError: There is none for this environment and algorithm.
+    """
+    return read_recipe(recipe_file(algorithm), algorithm, env_id).keywords()
+
+
+def recipe_file(algorithm: str) -> Path:
+    """Return the shipped recipes of an algorithm.
+
+    Raises:
+        ConfigError: There is no such algorithm.
+    """
+    if algorithm not in ALGORITHMS:
+        raise ConfigError(f"algorithm {algorithm!r} is none of {NAMES}")
+    return RECIPES / f"{algorithm}.yml"
+
+
+def with_classes(entries: Mapping[str, Any]) -> dict[str, Any]:
+    """Return entries of a recipe with our classes in place of their names."""
+    found = dict(entries)
+    if "replay_buffer_class" in found:
+        from tpm_gym.learning.hindsight import PenaltyHerReplayBuffer
+
+        found["replay_buffer_class"] = PenaltyHerReplayBuffer
+    if "features_extractor_class" in found.get("policy_kwargs", {}):
+        from tpm_gym.learning.features import GoalGapExtractor
+
+        extractor = {"features_extractor_class": GoalGapExtractor}
+        found["policy_kwargs"] = {**found["policy_kwargs"], **extractor}
+    return found
+
+
+def read_recipe(path: Path, algorithm: str, env_id: str) -> Recipe:
+    """Read the recipe of an environment, ``id`` or ``module:id``, after checking the whole file.
+
+    Raises:
+        ConfigError: The file cannot be read, has no recipe for ``env_id``, or an entry anywhere in
             it is unknown or has a value it cannot have.
     """
     recipes = read_recipes(path, algorithm)
-    if env_id not in recipes:
-        raise RecipeError(path, "", f"no recipe for {env_id}; there are {_listed(recipes)}")
-    arguments = dict(recipes[env_id])
+    name = env_id.rpartition(":")[2]
+    if name not in recipes:
+        raise ConfigError(f"{path}: no recipe for {name}; there are {_listed(recipes)}")
+    arguments = dict(recipes[name])
     return Recipe(
         n_timesteps=arguments.pop("n_timesteps"),
         n_envs=arguments.pop("n_envs", 1),
@@ -190,18 +118,21 @@ def read_recipe(path: Path, algorithm: str, env_id: str) -> Recipe:
 def read_recipes(path: Path, algorithm: str) -> dict[str, dict[str, Any]]:
     """Read and check all recipes of a file: environment id -> entries.
 
-    Args:
-        path: The YAML file.
-        algorithm: ``sac``, ``tqc`` or ``ppo``.
-
     Raises:
-        RecipeError: The file cannot be read, or an entry anywhere in it is unknown or has a value
+        ConfigError: The file cannot be read, or an entry anywhere in it is unknown or has a value
             it cannot have.
     """
     recipes = _read_mapping(path)
-    for name, entries in recipes.items():
-        _check(path, name, entries, _RULES[algorithm])
-        _check_required(path, name, entries)
+    kind: Any = dict[str, ALGORITHMS[algorithm].entries()]  # type: ignore[misc]
+    strict = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
+    try:
+        TypeAdapter(kind, config=strict).validate_python(recipes)
+    except ValidationError as error:
+        raise ConfigError(f"{path}: {_explained(error, kind)}") from error
+    for env_id, entries in recipes.items():
+        if "replay_buffer_kwargs" in entries and "replay_buffer_class" not in entries:
+            where = f"{path}: {env_id}.replay_buffer_kwargs"
+            raise ConfigError(f"{where}: no effect without replay_buffer_class: HerReplayBuffer")
     return recipes
 
 
@@ -210,39 +141,28 @@ def _read_mapping(path: Path) -> dict[str, Any]:
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise RecipeError(path, "", f"cannot be read: {error.strerror}") from error
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise RecipeError(path, "", f"is not YAML: {error}") from error
+        raise ConfigError(f"{path}: is not YAML: {error}") from error
     if not isinstance(content, dict):
-        raise RecipeError(path, "", "must hold one mapping per environment id")
+        raise ConfigError(f"{path}: must hold one mapping per environment id")
     return content
 
 
-def _check(path: Path, key: str, value: object, rule: _Rule | _Rules) -> None:
-    """Check one entry, and those below it."""
-    if isinstance(rule, _Rule):
-        if not rule.accepts(value):
-            raise RecipeError(path, key, f"must be {rule.description}, not {value!r}{_hint(value)}")
-        return
-    if not isinstance(value, dict):
-        raise RecipeError(path, key, f"must be a mapping, not {value!r}; keys: {_listed(rule)}")
-    for name, entry in value.items():
-        if name not in rule:
-            raise RecipeError(path, f"{key}.{name}", f"unknown key; valid keys: {_listed(rule)}")
-        _check(path, f"{key}.{name}", entry, rule[name])
-
-
-def _check_required(path: Path, key: str, entries: Mapping[str, Any]) -> None:
-    """Check what a recipe cannot do without."""
-    for name in _REQUIRED:
-        if name not in entries:
-            raise RecipeError(path, f"{key}.{name}", "is missing")
-    if "replay_buffer_kwargs" in entries and "replay_buffer_class" not in entries:
-        raise RecipeError(
-            path,
-            f"{key}.replay_buffer_kwargs",
-            "has no effect without replay_buffer_class: HerReplayBuffer",
-        )
+def _explained(error: ValidationError, kind: Any) -> str:
+    """Name the first entry that is not valid, and what would be."""
+    first = error.errors()[0]
+    names = [str(name) for name in first["loc"]]
+    entry = ".".join(names)
+    if first["type"] == "extra_forbidden":
+        valid: Any = get_args(kind)[1]
+        for name in names[1:-1]:
+            valid = get_type_hints(valid)[name]
+        return f"{entry}: unknown key; valid keys: {_listed(get_type_hints(valid))}"
+    if first["type"] == "missing":
+        return f"{entry}: is missing"
+    needed = first["msg"].removeprefix("Value error, ").replace("Input should", "must", 1)
+    return f"{entry}: {needed}, not {first['input']!r}{_hint(first['input'])}"
 
 
 def _hint(value: object) -> str:
@@ -254,5 +174,5 @@ def _hint(value: object) -> str:
     return "" if number is None else f" (YAML takes {value} for text; write {number!r})"
 
 
-def _listed(names: Iterable[str]) -> str:
+def _listed(names: Iterable[object]) -> str:
     return ", ".join(sorted(map(str, names)))

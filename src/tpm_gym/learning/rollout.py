@@ -1,11 +1,11 @@
-"""Run a policy over seeded episodes and summarise what happened, with 95% intervals.
+"""Run a policy over seeded episodes, and condense what happened.
 
 Seeds fall into three ranges that never meet, so no figure is taken on episodes that a policy has
 trained on or was selected by:
 
 - below ``SELECTION_SEED``: training;
 - from ``SELECTION_SEED``: the periodic evaluations during training, which select ``best.zip``;
-- from ``TEST_SEED``: ``evaluate.py``.
+- from ``TEST_SEED``: ``tpm-gym evaluate``.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tpm_gym.learning.errors import RolloutError
-from tpm_gym.tasks.rewards import SAFE_CONDITIONING
+from tpm_gym.learning.estimates import Estimate, bootstrap, wilson
 
 SELECTION_SEED: Final = 1_000_000
 TEST_SEED: Final = 2_000_000
@@ -28,11 +28,6 @@ TEST_SEED: Final = 2_000_000
 Observation: TypeAlias = dict[str, NDArray[Any]]
 Action: TypeAlias = NDArray[Any]
 GoalEnv: TypeAlias = gym.Env[Observation, Action]
-
-_Z95: Final = 1.959963984540054  # 97.5% quantile of the standard normal distribution
-_BOOTSTRAP_SAMPLES: Final = 2000
-_BOOTSTRAP_BLOCK: Final = 100
-_BOOTSTRAP_SEED: Final = 0  # fixed: the same records always give the same interval
 
 
 class Policy(Protocol):
@@ -58,12 +53,13 @@ class Episode:
         conditioning_mean: Mean 1/cond(J) over the steps.
         closure_error_max: Largest loop gap of all steps, m.
         length: Number of steps.
-        unsafe_share: Share of the steps with 1/cond(J) below ``SAFE_CONDITIONING``.
+        unsafe_share: Share of the steps with a singularity penalty, so below the machine's
+            safe conditioning.
         fk_error_max: Largest distance of the observed point P (forward kinematics of the encoders)
-            from that of the simulated platform, m; None where the environment does not tell.
+            from that of the simulated platform, m.
         torque_rms: Root mean square of the motors' torques at the ends of the steps, over steps and
-            motors, N m; None where the environment does not tell.
-        torque_peak: Largest of these torques, N m; None where the environment does not tell.
+            motors, N m.
+        torque_peak: Largest of these torques, N m.
     """
 
     seed: int
@@ -74,39 +70,17 @@ class Episode:
     conditioning_mean: float
     closure_error_max: float
     length: int
-    unsafe_share: float = 0.0
-    fk_error_max: float | None = None
-    torque_rms: float | None = None
-    torque_peak: float | None = None
+    unsafe_share: float
+    fk_error_max: float
+    torque_rms: float
+    torque_peak: float
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what is known as plain data, ``total_reward`` under its name ``return``."""
+        """Return the episode as plain data, ``total_reward`` under its name ``return``."""
         return {
             "return" if name == "total_reward" else name: value
             for name, value in vars(self).items()
-            if value is not None
         }
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A mean over episodes with its 95% interval.
-
-    Attributes:
-        mean: Sample mean.
-        low: Lower end of the interval.
-        high: Upper end of the interval.
-        worst: The worst value of any step of any episode, where the metric has one.
-    """
-
-    mean: float
-    low: float
-    high: float
-    worst: float | None = None
-
-    def as_dict(self) -> dict[str, float]:
-        """Return the estimate as plain data, without ``worst`` where there is none."""
-        return {name: value for name, value in vars(self).items() if value is not None}
 
 
 def run_episodes(
@@ -121,10 +95,8 @@ def run_episodes(
     """Run a policy for a number of episodes; the same arguments give the same records.
 
     Args:
-        env: The environment; left open.
-        policy: What acts.
-        episodes: Number of episodes.
-        first_seed: Seed of the first episode; episode i is reset with ``first_seed + i``.
+        env: Left open.
+        first_seed: Episode i is reset with ``first_seed + i``.
         on_frame: Called after every reset and every step, for example to record a video.
         on_episode: Called after every episode, for example to move a progress bar.
 
@@ -161,23 +133,22 @@ def _run_episode(
         done = terminated or truncated
         rewards.append(float(reward))
         infos.append(info)
-        states.append(getattr(inner, "state", None))
+        states.append(inner.state)
         if on_frame is not None:
             on_frame()
     return _record(seed, rewards, infos, states)
 
 
 def _record(
-    seed: int,
-    rewards: Sequence[float],
-    infos: Sequence[Mapping[str, Any]],
-    states: Sequence[Any],
+    seed: int, rewards: list[float], infos: Sequence[Mapping[str, Any]], states: Sequence[Any]
 ) -> Episode:
-    """Condense the steps of an episode; states are None where the environment has none."""
+    """Condense the steps of an episode."""
     conditioning = [float(info["conditioning"]) for info in infos]
     closure = [float(info["closure_error"]) for info in infos]
     successes = [bool(info["is_success"]) for info in infos]
-    fk_errors, torques = _fk_errors(states), _torques(states)
+    gaps = np.array([state.fk_position - state.platform_position for state in states])  # (n, 3) m
+    fk_errors: list[float] = np.linalg.norm(gaps, axis=-1).tolist()
+    torques: list[float] = np.ravel([state.torque for state in states]).tolist()  # (3 n,) N m
     named = {
         "reward": rewards,
         "conditioning": conditioning,
@@ -189,7 +160,8 @@ def _record(
         for step, value in enumerate(values):
             # A NaN would pass through min and max unseen, depending on where it stands.
             if not math.isfinite(value):
-                raise RolloutError(seed, step * len(rewards) // len(values), name, value)
+                where = f"episode with seed {seed}, step {step * len(rewards) // len(values)}"
+                raise RolloutError(f"{where}: {name} is {value!r}, expected a finite number")
     return Episode(
         seed=seed,
         success_at_end=successes[-1],
@@ -199,95 +171,36 @@ def _record(
         conditioning_mean=math.fsum(conditioning) / len(conditioning),
         closure_error_max=max(closure),
         length=len(rewards),
-        unsafe_share=sum(value < SAFE_CONDITIONING for value in conditioning) / len(conditioning),
-        fk_error_max=max(fk_errors, default=None),
-        torque_rms=math.hypot(*torques) / math.sqrt(len(torques)) if torques else None,
-        torque_peak=max(map(abs, torques), default=None),
+        unsafe_share=sum(info["singularity_penalty"] > 0 for info in infos) / len(infos),
+        fk_error_max=max(fk_errors),
+        torque_rms=math.hypot(*torques) / math.sqrt(len(torques)),
+        torque_peak=max(map(abs, torques)),
     )
 
 
-def _fk_errors(states: Sequence[Any]) -> list[float]:
-    """Distances of the observed point P from the true one, m, a value a step; empty if unknown."""
-    if not hasattr(states[0], "platform_position"):
-        return []
-    gaps = np.array([state.fk_position - state.platform_position for state in states])
-    distances: list[float] = np.linalg.norm(gaps, axis=-1).tolist()
-    return distances
-
-
-def _torques(states: Sequence[Any]) -> list[float]:
-    """Torques of the motors, N m, three values a step; empty if unknown."""
-    if not hasattr(states[0], "torque"):
-        return []
-    values: list[float] = np.ravel([state.torque for state in states]).tolist()
-    return values
+_WORST: Final = {
+    "conditioning_min": min,
+    "closure_error_max": max,
+    "fk_error_max": max,
+    "torque_rms": max,
+    "torque_peak": max,
+}
 
 
 def summarise(records: Sequence[Episode]) -> dict[str, Estimate]:
-    """Return the metrics of an evaluation, each with its 95% interval over episodes.
+    """Return the metrics of an evaluation by name, each with its 95% interval over episodes.
 
     Success rates have Wilson intervals, which stay honest at 0 and 1; the others have percentile
-    bootstrap intervals.
-
-    Args:
-        records: The episodes, at least one.
-
-    Returns:
-        ``success_at_end``, ``success_once``, ``return``, ``conditioning_min`` (and the worst),
-        ``conditioning_mean``, ``closure_error_max`` (m, and the worst) and ``unsafe_share``, by
-        name; and, where every episode has it, ``fk_error_max`` (m), ``torque_rms`` and
-        ``torque_peak`` (N m), each with the worst.
+    bootstrap intervals, and those that are the extreme of an episode the worst of all episodes.
     """
-    lowest = [record.conditioning_min for record in records]
-    largest = [record.closure_error_max for record in records]
-    metrics = {
-        "success_at_end": wilson([record.success_at_end for record in records]),
-        "success_once": wilson([record.success_once for record in records]),
-        "return": bootstrap([record.total_reward for record in records]),
-        "conditioning_min": bootstrap(lowest, worst=min(lowest)),
-        "conditioning_mean": bootstrap([record.conditioning_mean for record in records]),
-        "closure_error_max": bootstrap(largest, worst=max(largest)),
-        "unsafe_share": bootstrap([record.unsafe_share for record in records]),
+    values = {
+        name: [record.as_dict()[name] for record in records]
+        for name in records[0].as_dict()
+        if name not in ("seed", "length")
     }
-    for name in ("fk_error_max", "torque_rms", "torque_peak"):
-        values = [getattr(record, name) for record in records]
-        if None not in values:
-            metrics[name] = bootstrap(values, worst=max(values))
-    return metrics
-
-
-def wilson(outcomes: Sequence[bool]) -> Estimate:
-    """Return a success rate with its 95% Wilson score interval (Wilson 1927).
-
-    Args:
-        outcomes: One outcome per episode, at least one.
-    """
-    n = len(outcomes)
-    rate = sum(outcomes) / n
-    spread = _Z95**2 / n
-    centre = (rate + spread / 2) / (1 + spread)
-    half = _Z95 / (1 + spread) * math.sqrt(rate * (1 - rate) / n + spread / (4 * n))
-    # At rates of 0 and 1 one end equals the rate but for rounding, which must not exclude the rate.
-    return Estimate(rate, max(0.0, min(rate, centre - half)), min(1.0, max(rate, centre + half)))
-
-
-def bootstrap(values: Sequence[float], worst: float | None = None) -> Estimate:
-    """Return a mean with its 95% percentile bootstrap interval (Efron 1979).
-
-    Args:
-        values: One value per episode, at least one.
-        worst: Passed on to the estimate.
-    """
-    sample = np.asarray(values, dtype=np.float64)  # (n,)
-    rng = np.random.default_rng(_BOOTSTRAP_SEED)
-    # Not all resamples at once: with many episodes their matrix would not fit in memory.
-    means = np.concatenate(
-        [
-            sample[rng.integers(0, sample.size, (_BOOTSTRAP_BLOCK, sample.size))].mean(axis=1)
-            for _ in range(_BOOTSTRAP_SAMPLES // _BOOTSTRAP_BLOCK)
-        ]
-    )
-    low, high = np.percentile(means, [2.5, 97.5])
-    mean = float(sample.mean())
-    # Equal values can differ from their mean by rounding; the interval must still hold the mean.
-    return Estimate(mean, min(mean, float(low)), max(mean, float(high)), worst)
+    return {
+        name: wilson(column)
+        if name.startswith("success")
+        else bootstrap(column, worst=_WORST[name](column) if name in _WORST else None)
+        for name, column in values.items()
+    }

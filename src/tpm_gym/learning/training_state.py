@@ -15,13 +15,12 @@ from __future__ import annotations
 import io
 import json
 import random
-import shutil
 import warnings
 from collections import deque
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -35,26 +34,9 @@ from stable_baselines3.her import HerReplayBuffer
 from tpm_gym import TPMError
 from tpm_gym.learning.checkpoint import Content
 from tpm_gym.learning.export import remove
-from tpm_gym.learning.logger import PROGRESS_FILE
-from tpm_gym.learning.policies import (
-    BEST_FILE,
-    CONFIG_FILE,
-    EVALUATIONS_FILE,
-    EXPORTED,
-    LAST_FILE,
-    TESTS,
-)
 from tpm_gym.learning.provenance import versions, write_whole
 from tpm_gym.learning.rollout import Action, GoalEnv, Observation
-
-RUN_FILES: Final = (
-    CONFIG_FILE,
-    PROGRESS_FILE,
-    EVALUATIONS_FILE,
-    BEST_FILE,
-    *(Path(BEST_FILE).with_suffix(suffix).name for suffix in EXPORTED),
-)
-"""Files of the run folder that belong to a checkpoint: what is in them later is done again."""
+from tpm_gym.learning.run_folder import LAST_FILE, RESTORED, clear_tests
 
 _STATE, _TENSORS = "state.json", "torch.pt"
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining")
@@ -69,9 +51,6 @@ class EpisodeRecorder(gym.Wrapper[Observation, Action, Observation, Action]):
     follows, and checkpoints would change the training. Repeating the at most 50 steps of an episode
     changes nothing, is exact, takes a tenth of a second, and brings the wrappers below along: their
     counts of steps and sums of rewards.
-
-    Args:
-        env: The environment with all its other wrappers.
     """
 
     def __init__(self, env: GoalEnv) -> None:
@@ -124,9 +103,6 @@ def capture(
 
     Args:
         model: The algorithm; its environments are wrapped in :class:`EpisodeRecorder`.
-        run: The run folder.
-        extra: Plain data to be kept with it.
-        finished: Whether the training has come to its end.
 
     Returns:
         The content of a checkpoint. Its arrays are views of the replay buffer, the rest is copied.
@@ -147,7 +123,7 @@ def capture(
         _STATE: json.dumps(state, default=lambda scalar: scalar.item()).encode(),
         _TENSORS: _tensors(model),
     }
-    files |= {name: (run / name).read_bytes() for name in RUN_FILES if (run / name).is_file()}
+    files |= {name: (run / name).read_bytes() for name in RESTORED if (run / name).is_file()}
     arrays = {f"last/{name}": np.array(value) for name, value in observations.items()}
     arrays["episode_starts"] = np.array(model._last_episode_starts)
     arrays |= {f"buffer/{name}": array for name, array in _buffer_arrays(model).items()}
@@ -159,9 +135,9 @@ def restore_files(run: Path, content: Content) -> None:
 
     Tests, and what was exported at the end, are deleted: the policy will soon be another.
     """
-    shutil.rmtree(run / TESTS, ignore_errors=True)
+    clear_tests(run)
     remove((run / LAST_FILE).with_suffix(""))
-    for name in RUN_FILES:
+    for name in RESTORED:
         if name in content.files:
             data = content.files[name]
             write_whole(run / name, partial(Path.write_bytes, data=data))

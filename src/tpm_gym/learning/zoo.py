@@ -1,9 +1,9 @@
 """Our recipes for rl-baselines3-zoo.
 
-    PYTHONPATH=train python -m rl_zoo3.train --algo sac --env TPMReach-v0 \
-        --gym-packages tpm_gym --conf-file train/zoo.py
+    python -m rl_zoo3.train --algo sac --env TPMReach-v0 \
+        --gym-packages tpm_gym --conf-file tpm_gym.learning.zoo
 
-The zoo executes this file and takes the name ``hyperparams`` from it. One file of ours is for one
+The zoo imports this module and takes the name ``hyperparams`` from it. One file of ours is for one
 algorithm, so the algorithm is read off the zoo's command line. Where the zoo would evaluate strings
 as Python, it gets the classes themselves.
 """
@@ -14,35 +14,26 @@ import argparse
 import sys
 from typing import Any
 
-from tpm_gym.learning.features import GoalGapExtractor
-from tpm_gym.learning.hindsight import PenaltyHerReplayBuffer
-from tpm_gym.learning.recipes import read_recipes
-from tpm_gym.resources import RECIPES
+from tpm_gym.learning.recipes import read_recipes, recipe_file, with_classes
 
 
 def hyperparameters(algorithm: str) -> dict[str, dict[str, Any]]:
     """The recipes of one algorithm, by environment id, as rl-baselines3-zoo wants them.
 
     Raises:
-        RecipeError: An entry of the file is not valid.
+        ConfigError: An entry of the file is not valid.
     """
-    recipes = read_recipes(RECIPES / f"{algorithm}.yml", algorithm)
+    recipes = read_recipes(recipe_file(algorithm), algorithm)
     return {env_id: _translate(entries) for env_id, entries in recipes.items()}
 
 
 def _translate(entries: dict[str, Any]) -> dict[str, Any]:
     """One recipe: classes for their names, a callback for the demonstrations."""
-    translated = dict(entries)
+    translated = with_classes(entries)
     if "demonstrations" in translated:
         arguments = translated.pop("demonstrations")
-        translated["callback"] = [{"demonstrations.Demonstrations": dict(arguments)}]
-    if "replay_buffer_class" in translated:
-        translated["replay_buffer_class"] = PenaltyHerReplayBuffer
-    policy = dict(translated.get("policy_kwargs", {}))
-    if "features_extractor_class" in policy:
-        policy["features_extractor_class"] = GoalGapExtractor
-    if policy:
-        translated["policy_kwargs"] = policy
+        callback = "tpm_gym.learning.demonstrations.Demonstrations"
+        translated["callback"] = [{callback: dict(arguments)}]
     return translated
 
 

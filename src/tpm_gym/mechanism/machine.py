@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tpm_gym.arrays import FloatArray, Vector, vector
-from tpm_gym.errors import ConfigurationError, SingularityError, TPMError, UnreachableError
+from tpm_gym.errors import ConfigurationError, SingularityError, UnreachableError
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism.bodies import Mechanism
 from tpm_gym.mechanism.mount import Mount
@@ -98,8 +98,8 @@ class Machine(ABC):
         for name, values in limits.items():
             if not min(values) > 0:
                 raise ConfigurationError(name, getattr(self, name), "positive")
-        if not 0 <= self.safe_conditioning <= 1:
-            raise ConfigurationError("safe_conditioning", self.safe_conditioning, "from 0 to 1")
+        if not 0 < self.safe_conditioning <= 1:  # the penalty is in units of it
+            raise ConfigurationError("safe_conditioning", self.safe_conditioning, "in (0, 1]")
         for corner in self.region.corners():
             if (mode := self.mode_left(self.inverse(corner), corner)) is not None:
                 valid = f"in one {mode} mode; {corner} is beyond a singularity"
@@ -209,8 +209,8 @@ class Machine(ABC):
         return self
 
     def occupied(self, position: ArrayLike) -> list[tuple[FloatArray, FloatArray]]:
-        """Boxes (low, high corner) around platform and tool with P at ``position``; m, world."""
-        platform = self.mount.to_paper(position) - self.mechanism.point_p
+        """Boxes around platform and tool with P at ``position``: low and high corners, m, world."""
+        platform = np.asarray(position, dtype=np.float64) - self.mechanism.point_p
         boxes = []
         for name in (self.mechanism.platform, self.mechanism.tool):
             link = self.mechanism.link(name)
@@ -231,7 +231,7 @@ def register_machine(name: str, machine: Machine | Callable[[], Machine]) -> Non
     Raises:
         ConfigurationError: If the name is taken by another machine.
     """
-    if _MACHINES.get(name, machine) is not machine:
+    if _MACHINES.get(name, machine) != machine:
         raise ConfigurationError("machine", name, f"a name other than {', '.join(_MACHINES)}")
     _MACHINES[name] = machine
 
@@ -242,11 +242,9 @@ def find_machine(machine: Any) -> Machine:
     Raises:
         ConfigurationError: If there is none of that name, or it is no machine.
     """
-    found = _MACHINES.get(machine, machine) if isinstance(machine, str) else machine
-    try:
-        found = found() if callable(found) and not isinstance(found, Machine) else found
-    except TPMError:
-        raise
+    found = _MACHINES.get(machine) if isinstance(machine, str) else machine
+    if isinstance(machine, str) and callable(found):
+        found = found()
     if not isinstance(found, Machine):
         names = ", ".join(map(repr, _MACHINES))
         raise ConfigurationError("machine", machine, f"{names}, or a tpm_gym.Machine")

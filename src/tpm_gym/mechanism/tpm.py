@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike
 from tpm_gym.arrays import FloatArray, Vector
 from tpm_gym.errors import UnreachableError
 from tpm_gym.kinematics import jacobian, workspace
+from tpm_gym.kinematics.equations import assemble, evaluate, posture
 from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
 from tpm_gym.kinematics.modes import DEFAULT_ASSEMBLY, ELBOWS_OUT, AssemblyMode, WorkingMode
 from tpm_gym.kinematics.position import forward_all
-from tpm_gym.kinematics.single import assemble, evaluate, posture
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism import tree
 from tpm_gym.mechanism.bodies import Mechanism

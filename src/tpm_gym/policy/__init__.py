@@ -1,1 +1,21 @@
-"""Trained policies without pickle; :mod:`tpm_gym.policy.policy` needs PyTorch."""
+"""Trained policies without pickle: :func:`load_policy` and :class:`Policy`.
+
+PyTorch is imported when either is first asked for, not with this package.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from tpm_gym.policy.policy import Policy, load_policy
+
+__all__ = ["Policy", "load_policy"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from tpm_gym.policy import policy
+
+    return getattr(policy, name)

@@ -15,26 +15,33 @@ import hashlib
 import itertools
 import json
 import math
+import operator
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from tpm_gym.errors import MissingPackageError, PolicyFileError
-from tpm_gym.policy.strict_json import Entry, EntryError, parse, shown
+from tpm_gym.errors import InputError, MissingPackageError, PolicyFileError
+from tpm_gym.resources import POLICIES
+
+try:
+    import safetensors
+    from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError, model_validator
+except ImportError as error:
+    raise MissingPackageError(str(error.name), "policy") from error
 
 __all__ = [
     "FORMAT",
     "VERSION",
     "Description",
-    "Network",
     "digest",
     "files",
+    "published",
     "read_description",
     "read_weights",
 ]
@@ -42,109 +49,169 @@ __all__ = [
 FORMAT: Final = "tpm_gym.policy"
 VERSION: Final = 1
 
-MAX_JSON: Final = 1 << 20
-"""Size of the JSON file at most, bytes."""
-MAX_WEIGHTS: Final = 64 << 20
-"""Size of the weights at most, bytes."""
-MAX_HEADER: Final = 16 << 10
-"""What the safetensors file may hold besides the weights at most, bytes."""
-MAX_LAYERS: Final = 20
-MAX_UNITS: Final = 4096
-"""Hidden layers, and units of each, or entries of an observation or action, at most."""
-
-_DAMAGED: Final = "get an intact copy of both files, or export the policy again"
-_LARGEST: Final = 1e30  # far from where float32 overflows
+# At most, in bytes: the JSON file, that of the weights, and what stands before them in it
+MAX_JSON, MAX_WEIGHTS, MAX_HEADER = 1 << 20, 64 << 20, 16 << 10
+MAX_DEPTH: Final = 16  # of objects and lists inside each other
+MAX_UNITS: Final = 4096  # of a layer, or entries of an observation or action
+MAX_VALUE: Final = 1e38  # of a unit in the observation space; float32 overflows at 3.4e38
 _GOAL_KEYS: Final = ("observation", "achieved_goal", "desired_goal")
+_Key = Annotated[str, Field(pattern="^[A-Za-z0-9_]{1,100}$")]
+_Package = Annotated[str, Field(pattern="^[A-Za-z0-9_.-]{1,100}$")]
+_Version = Annotated[str, Field(pattern="^[ -~]{1,100}$")]
+_Count = Annotated[int, Field(ge=0, le=2**63)]
+_Size = Annotated[int, Field(ge=1, le=MAX_UNITS)]
+_Bound = Annotated[float, Field(ge=-1e30, le=1e30)]
+_Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+# Not strict where JSON has lists and these are tuples
+_Bounds = Annotated[tuple[_Bound, ...], Strict(False), Field(max_length=MAX_UNITS)]
 
 
-@dataclass(frozen=True)
-class Network:
+class _Entries(BaseModel):
+    """An object with exactly these keys, and values of exactly these types: true is no integer."""
+
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Box(_Entries):
+    """A bounded space of arrays; ``low`` and ``high`` are flat, by rows."""
+
+    shape: Annotated[tuple[_Size, ...], Strict(False), Field(max_length=4)]
+    dtype: Literal["float32", "float64"]
+    low: _Bounds
+    high: _Bounds
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Box:
+        if not len(self.low) == len(self.high) == math.prod(self.shape):
+            raise ValueError("low and high must be of the size that shape has")
+        if any(map(operator.gt, self.low, self.high)):
+            raise ValueError("low must be nowhere above high")
+        return self
+
+    @property
+    def space(self) -> spaces.Box[Any]:
+        """The same for Gymnasium."""
+        dtype = np.dtype(self.dtype).type
+        low, high = (np.array(flat, dtype).reshape(self.shape) for flat in (self.low, self.high))
+        return spaces.Box(low, high, dtype=dtype)
+
+
+class Features(_Entries):
+    """What the first layer sees: all entries of the observation, or the gap to the goal.
+
+    Entries are joined in the order of ``keys``; or ``observation`` is with (``desired_goal`` -
+    ``achieved_goal``) / ``unit``, m.
+    """
+
+    kind: Literal["concatenate", "goal_gap"]
+    keys: Annotated[tuple[_Key, ...], Strict(False), Field(max_length=16)] = _GOAL_KEYS
+    unit: Annotated[float, Field(ge=1e-6, le=1e6)] = 1.0
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Features:
+        wanted = "keys" if self.kind == "concatenate" else "unit"
+        if self.model_fields_set != {"kind", wanted}:
+            raise ValueError(f"must hold kind and {wanted} where kind is {self.kind!r}")
+        return self
+
+
+class Network(_Entries):
     """The layers from an observation to the mean action.
 
-    Attributes:
-        features: What the first layer sees: ``"concatenate"``, all entries of the observation, or
-            ``"goal_gap"``, ``observation`` and (``desired_goal`` - ``achieved_goal``) / unit.
-        keys: The entries in the order in which they are joined.
-        unit: The gap to the goal that becomes 1, m; 1 where no gap is taken.
-        hidden: Units of the hidden layers.
-        activation: What follows each hidden layer: ``"relu"`` or ``"tanh"``.
-        output: What follows the last layer: ``"tanh"``, then stretched to the action space, or
-            ``"clip"``, cut off at its bounds.
+    The activation follows each hidden layer. What leaves the last one goes through tanh and is
+    stretched to the action space, or is clipped to it.
     """
 
-    features: str
-    keys: tuple[str, ...]
-    unit: float
-    hidden: tuple[int, ...]
-    activation: str
-    output: str
+    features: Features
+    hidden: Annotated[tuple[_Size, ...], Strict(False), Field(max_length=20)]
+    activation: Literal["relu", "tanh"]
+    output: Literal["tanh", "clip"]
 
 
-@dataclass(frozen=True)
-class Description:
+class Weights(_Entries):
+    """What the file of weights has to be."""
+
+    bytes: Annotated[int, Field(ge=0, le=MAX_WEIGHTS)]
+    sha256: _Sha256
+
+
+class Description(_Entries):
     """Everything about a policy but its weights.
 
-    Attributes:
-        env_id: The environment it was trained on.
-        algorithm: ``"sac"``, ``"tqc"`` or ``"ppo"``.
-        seed: Seed of the training; None where it is not known.
-        steps: Environment steps it was trained for.
-        recipe: The hyperparameters.
-        versions: Versions it was trained with, by package; None where one was absent.
-        observation_space: The observations it takes.
-        action_space: The actions it gives.
-        network: Its network.
-        weights_size: Size of the file of weights, bytes.
-        weights_sha256: SHA-256 of the file of weights.
+    ``steps`` counts those of the environment it was trained in; ``seed`` is None where it is not
+    known, and so are the ``versions`` of packages that were absent.
     """
 
-    env_id: str
-    algorithm: str
-    seed: int | None
-    steps: int
-    recipe: Mapping[str, Any]
-    versions: Mapping[str, str | None]
-    observation_space: spaces.Dict
-    action_space: spaces.Box[Any]
+    format: Literal["tpm_gym.policy"]
+    version: int = Field(ge=VERSION, le=VERSION)  # a Literal would take true for 1
+    env_id: str = Field(alias="env", pattern="^[A-Za-z0-9_.:/-]{1,100}$")
+    algorithm: _Key
+    seed: _Count | None
+    steps: _Count
+    recipe: Annotated[dict[_Key, Any], Field(max_length=64)]
+    versions: Annotated[dict[_Package, _Version | None], Field(max_length=64)]
     network: Network
-    weights_size: int
-    weights_sha256: str
+    observations: Annotated[
+        dict[_Key, Box], Field(min_length=1, max_length=16, alias="observation_space")
+    ]
+    actions: Box = Field(alias="action_space")
+    weights: Weights
+    sha256: _Sha256
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Description:
+        boxes, features = self.observations, self.network.features
+        if sorted(features.keys) != sorted(boxes):
+            raise ValueError(f"observation_space must hold exactly {_shown(features.keys)}")
+        if features.kind == "goal_gap" and len({boxes[key].shape for key in _GOAL_KEYS[1:]}) > 1:
+            raise ValueError("the goals in observation_space must be of one shape")
+        needed = 4 * sum(math.prod(shape) for shape in self.shapes.values())
+        if not needed <= self.weights.bytes <= needed + MAX_HEADER:
+            raise ValueError(f"weights.bytes must be from {needed} to {needed + MAX_HEADER}")
+        return self
+
+    @cached_property
+    def observation_space(self) -> spaces.Dict:
+        """The observations it takes."""
+        return spaces.Dict({key: box.space for key, box in self.observations.items()})
+
+    @cached_property
+    def action_space(self) -> spaces.Box[Any]:
+        """The actions it gives."""
+        return self.actions.space
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Shapes of the weights by name; each layer maps x to weight x + bias."""
-        boxes = self.observation_space
-        inputs = sum(
-            math.prod(boxes[key].shape or ())
-            for key in self.network.keys
-            # The achieved goal only shows in the gap, which has the size of the desired goal.
-            if not (self.network.features == "goal_gap" and key == "achieved_goal")
-        )
-        sizes = [inputs, *self.network.hidden, math.prod(self.action_space.shape)]
+        gap = self.network.features.kind == "goal_gap"
+        # The achieved goal only shows in the gap, which has the size of the desired goal.
+        seen = (key for key in self.observations if not (gap and key == "achieved_goal"))
+        inputs = sum(len(self.observations[key].low) for key in seen)
+        sizes = [inputs, *self.network.hidden, len(self.actions.low)]
         found: dict[str, tuple[int, ...]] = {}
         for i, (before, after) in enumerate(itertools.pairwise(sizes)):
-            found[f"layers.{i}.weight"] = (after, before)
-            found[f"layers.{i}.bias"] = (after,)
+            found |= {f"layers.{i}.weight": (after, before), f"layers.{i}.bias": (after,)}
         return found
 
 
 def files(path: str | Path) -> tuple[Path, Path]:
-    """The JSON file and the file of weights that a path names.
-
-    Args:
-        path: Either of the two, or what they have in common.
+    """The JSON file and the file of weights; ``path`` is either, or what they have in common.
 
     Raises:
+        InputError: It is no path.
         PolicyFileError: It names a folder, or an archive of Stable-Baselines3.
     """
+    if not isinstance(path, str | Path) or not str(path):
+        given = path if path == "" else type(path)
+        raise InputError("path", given, "the str or Path of a policy, as in 'runs/reach/best.json'")
     path = Path(path)
     if path.suffix == ".zip":
         raise PolicyFileError(
             str(path),
             "is an archive of Stable-Baselines3, which holds pickles: loading it can run any code",
-            "if you trust it, convert it once: python train/export.py MODEL.zip OUT --trust-pickle",
+            "if you trust it, convert it once: tpm-gym export MODEL.zip OUT --trust-pickle",
         )
-    if path.is_dir():
+    if os.path.isdir(path):  # path.is_dir() raises where a name is too long
         raise PolicyFileError(str(path), "is a folder", "name a policy in it, as in FOLDER/best")
     stem = path.with_suffix("") if path.suffix in (".json", ".safetensors") else path
     return Path(f"{stem}.json"), Path(f"{stem}.safetensors")
@@ -158,174 +225,124 @@ def digest(content: Mapping[str, Any]) -> str:
 
 
 def read_description(path: str | Path) -> Description:
-    """Read and check the JSON file of a policy.
-
-    Args:
-        path: Either of the policy's files, or what they have in common.
+    """Read and check the JSON file of a policy, named as for :func:`files`.
 
     Raises:
         PolicyFileError: The file is missing, damaged, or an entry cannot be.
     """
     file, _ = files(path)
-    text = _read(file, MAX_JSON)
+    data = _read(file, MAX_JSON)
     try:
-        content = parse(text)
-    except ValueError as error:
-        raise PolicyFileError(str(file), f"is no valid JSON ({error})", _DAMAGED) from error
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        remedy = "name the .json that train/export.py wrote"
-        raise PolicyFileError(str(file), f"does not describe a policy ({FORMAT!r})", remedy)
-    version = content.get("version")
-    if type(version) is not int or version != VERSION:
-        reason = f"has format version {shown(version)}, this tpm_gym reads version {VERSION}"
-        raise PolicyFileError(str(file), reason, "use the tpm_gym that wrote it, or a newer one")
-    if content.get("sha256") != digest(content):
-        reason = "its SHA-256 does not match its entries: it was damaged, or edited by hand"
-        raise PolicyFileError(str(file), reason, _DAMAGED)
-    try:
-        return _description(Entry("", content))
-    except EntryError as error:
-        raise PolicyFileError(str(file), str(error), _DAMAGED) from error
+        content = json.loads(data.decode("utf-8"), object_pairs_hook=_unique, parse_int=_short)
+        if _depth(content) > MAX_DEPTH:
+            raise ValueError("nested too deeply")
+        description = Description.model_validate(content)
+        intact = description.sha256 == digest(content)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        place = _shown(".".join(map(str, first["loc"])) or "(all)")
+        value = "" if isinstance(first["input"], dict) else f", not {_shown(first['input'])}"
+        reason = f"describes no policy: entry {place}: {first['msg']}{value}"
+        raise _damaged(file, reason) from error
+    except (ValueError, RecursionError) as error:
+        raise _damaged(file, f"is no valid JSON ({error})") from error
+    if not intact:
+        raise _damaged(file, "its SHA-256 does not match its entries: damaged, or edited by hand")
+    return description
 
 
 def read_weights(path: str | Path, description: Description) -> dict[str, NDArray[np.float32]]:
-    """Read and check the weights of a policy.
-
-    Args:
-        path: Either of the policy's files, or what they have in common.
-        description: What its JSON file says.
+    """Read and check the weights of a policy, named as for :func:`files`.
 
     Returns:
-        The weights by name, as ``description.shapes`` has them; all finite.
+        The weights by name, as ``description.shapes`` have them; so small that no observation of
+        the observation space makes the network overflow.
 
     Raises:
         PolicyFileError: The file is missing, damaged, or does not fit the description.
-        MissingPackageError: safetensors is not installed.
     """
-    try:
-        import safetensors
-    except ImportError as error:
-        raise MissingPackageError("safetensors", "policy") from error
     _, file = files(path)
-    data = _read(file, description.weights_size)
-    if len(data) < description.weights_size:
-        reason = f"is cut off: {len(data)} bytes of {description.weights_size}"
-        raise PolicyFileError(str(file), reason, _DAMAGED)
-    if hashlib.sha256(data).hexdigest() != description.weights_sha256:
-        reason = "its SHA-256 is not the one in the JSON file: damaged, or of another policy"
-        raise PolicyFileError(str(file), reason, _DAMAGED)
+    data = _read(file, description.weights.bytes)
+    if hashlib.sha256(data).hexdigest() != description.weights.sha256:
+        said = f"of another policy, or damaged: {len(data)} of {description.weights.bytes} bytes"
+        raise _damaged(file, f"its SHA-256 is not that in the JSON file; it is {said}")
     try:
         tensors = dict(safetensors.deserialize(data))  # type: ignore[no-untyped-call]
     except safetensors.SafetensorError as error:
-        reason = f"is no safetensors file: {shown(str(error))}"
-        raise PolicyFileError(str(file), reason, _DAMAGED) from error
+        raise _damaged(file, f"is no safetensors file: {_shown(str(error))}") from error
     forms = {name: (tensor["dtype"], tuple(tensor["shape"])) for name, tensor in tensors.items()}
     wanted = {name: ("F32", shape) for name, shape in description.shapes.items()}
-    if forms != wanted:
-        odd = sorted(name for name in {*forms, *wanted} if forms.get(name) != wanted.get(name))[0]
-        reason = f"tensor {shown(odd)} is {shown(forms.get(odd))}, not {shown(wanted.get(odd))}"
-        raise PolicyFileError(str(file), reason, _DAMAGED)
-    weights = {}
-    for name, tensor in tensors.items():
-        values = np.frombuffer(tensor["data"], dtype="<f4").reshape(wanted[name][1])
-        if not np.isfinite(values).all():
-            raise PolicyFileError(str(file), f"tensor {name!r} is not finite", _DAMAGED)
-        weights[name] = values.astype(np.float32)
+    for name in sorted({*forms, *wanted}):
+        if (form := forms.get(name)) != (fit := wanted.get(name)):
+            raise _damaged(file, f"tensor {_shown(name)} is {_shown(form)}, not {_shown(fit)}")
+    weights = {
+        name: np.frombuffer(tensors[name]["data"], "<f4").reshape(shape).astype(np.float32)
+        for name, shape in description.shapes.items()
+    }
+    if not (largest := _largest(description, weights)) <= MAX_VALUE:  # also where it is NaN
+        raise _damaged(file, f"is not finite, or overflows: its network could reach {largest:.2g}")
     return weights
+
+
+def _largest(description: Description, weights: Mapping[str, NDArray[np.float32]]) -> float:
+    """What no sum in the network exceeds for observations of the space: all terms add up."""
+    boxes = description.observations.values()
+    entry = max(np.abs([box.low, box.high]).max() for box in boxes)
+    largest = 2 * entry / min(description.network.features.unit, 1.0)  # or of a gap of two entries
+    reach = np.full(weights["layers.0.weight"].shape[1], largest)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for i in range(len(weights) // 2):
+            reach = np.abs(weights[f"layers.{i}.weight"]) @ reach
+            reach += np.abs(weights[f"layers.{i}.bias"])
+            largest = np.maximum(largest, reach.max())  # NaN, once there, stays
+    return float(largest)
+
+
+def published() -> list[str]:
+    """The ids of the environments with a published policy."""
+    return sorted(file.stem for file in POLICIES.glob("*.safetensors"))
+
+
+def _damaged(file: Path, reason: str) -> PolicyFileError:
+    remedy = "get an intact copy of both files, export the policy again, or update tpm_gym"
+    return PolicyFileError(str(file), reason, remedy)
 
 
 def _read(file: Path, limit: int) -> bytes:
     """Return the content of a file, after a look at its size."""
     try:
         if not file.is_file():  # a pipe, for one, would never end
-            reason = "is not a file" if file.exists() else "there is no such file"
-            raise PolicyFileError(str(file), reason, "check the name")
+            remedy = f"name a file, or a published policy: {', '.join(published())}"
+            raise PolicyFileError(str(file), "there is no such file", remedy)
         with file.open("rb") as stream:
-            size = os.fstat(stream.fileno()).st_size
-            if size > limit:
-                reason = f"is too large: {size} bytes, at most {limit} can belong to the policy"
-                raise PolicyFileError(str(file), reason, _DAMAGED)
+            if (size := os.fstat(stream.fileno()).st_size) > limit:
+                raise _damaged(file, f"is too large: {size} bytes, at most {limit} can be valid")
             return stream.read(size)
     except OSError as error:
         reason = f"cannot be read: {error.strerror}"
-        raise PolicyFileError(str(file), reason, "check its permissions") from error
+        raise PolicyFileError(str(file), reason, "check its name and permissions") from error
 
 
-def _description(whole: Entry) -> Description:
-    """Check every entry of the JSON file."""
-    entries = whole.record(
-        *("format", "version", "algorithm", "env", "seed", "steps", "recipe", "versions"),
-        *("observation_space", "action_space", "network", "weights", "sha256"),
-    )
-    recipe = entries["recipe"].members(r"\w{1,100}", most=64)
-    versions = entries["versions"].members(r"[\w.-]{1,100}", most=64)
-    boxes = entries["observation_space"].members(r"\w{1,100}", most=16)
-    observation: dict[str, spaces.Space[Any]] = {name: _box(e) for name, e in boxes.items()}
-    weights = entries["weights"].record("bytes", "sha256")
-    seed = entries["seed"]
-    description = Description(
-        env_id=entries["env"].text(r"[\w.:/-]{1,100}"),
-        algorithm=entries["algorithm"].choice("sac", "tqc", "ppo"),
-        seed=None if seed.value is None else seed.integer(0, 2**63),
-        steps=entries["steps"].integer(0, 2**63),
-        recipe={name: entry.value for name, entry in recipe.items()},
-        versions={
-            name: None if entry.value is None else entry.text("[ -~]{1,100}")
-            for name, entry in versions.items()
-        },
-        observation_space=spaces.Dict(observation),
-        action_space=_box(entries["action_space"]),
-        network=_network(entries["network"], observation),
-        weights_size=weights["bytes"].integer(0, MAX_WEIGHTS + MAX_HEADER),
-        weights_sha256=weights["sha256"].text("[0-9a-f]{64}"),
-    )
-    needed = 4 * sum(math.prod(shape) for shape in description.shapes.values())
-    if needed > MAX_WEIGHTS:
-        raise entries["network"].wrong(f"a network of at most {MAX_WEIGHTS} bytes")
-    weights["bytes"].integer(needed, needed + MAX_HEADER)
-    return description
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        raise ValueError("a key stands twice in one object")
+    return found
 
 
-def _network(entry: Entry, observation: Mapping[str, spaces.Space[Any]]) -> Network:
-    """Check the network against the observations it sees."""
-    entries = entry.record("features", "hidden", "activation", "output")
-    features = entries["features"]
-    kind = features.members(r"\w*", most=8).get("kind", features).choice("concatenate", "goal_gap")
-    if kind == "concatenate":
-        joined = features.record("kind", "keys")["keys"]
-        keys, unit = tuple(key.text(r"\w{1,100}") for key in joined.items(16)), 1.0
-        if sorted(keys) != sorted(observation):
-            raise joined.wrong(f"all keys of the observation, {', '.join(observation)}")
-    else:
-        keys = _GOAL_KEYS
-        unit = features.record("kind", "unit")["unit"].number(1e-6, 1e6)
-        goals = [observation[key].shape for key in keys[1:] if key in observation]
-        if set(keys) != set(observation) or goals[0] != goals[1]:
-            raise features.wrong(f"of a kind that suits the observation {shown(observation)}")
-    return Network(
-        features=kind,
-        keys=keys,
-        unit=unit,
-        hidden=tuple(e.integer(1, MAX_UNITS) for e in entries["hidden"].items(MAX_LAYERS)),
-        activation=entries["activation"].choice("relu", "tanh"),
-        output=entries["output"].choice("tanh", "clip"),
-    )
+def _short(digits: str) -> int:
+    if len(digits) > 20:  # the time to convert them grows with the square
+        raise ValueError(f"{_shown(digits)} is too large")
+    return int(digits)
 
 
-def _box(entry: Entry) -> spaces.Box[Any]:
-    """Check a space of arrays."""
-    entries = entry.record("shape", "dtype", "low", "high")
-    shape = tuple(e.integer(1, MAX_UNITS) for e in entries["shape"].items(4))
-    size = math.prod(shape)
-    if size > MAX_UNITS:
-        raise entries["shape"].wrong(f"of at most {MAX_UNITS} entries in all")
-    dtype = np.dtype(entries["dtype"].choice("float32", "float64")).type
-    bounds: dict[str, NDArray[Any]] = {}
-    for name in ("low", "high"):
-        values = [e.number(-_LARGEST, _LARGEST) for e in entries[name].items(size)]
-        if len(values) != size:
-            raise entries[name].wrong(f"a list of {size} numbers")
-        bounds[name] = np.array(values, dtype).reshape(shape)
-    if (bounds["low"] > bounds["high"]).any():
-        raise entries["low"].wrong("nowhere above high")
-    return spaces.Box(bounds["low"], bounds["high"], dtype=dtype)
+def _depth(value: Any) -> int:
+    if not isinstance(value, dict | list):
+        return 0
+    return 1 + max(map(_depth, value.values() if isinstance(value, dict) else value), default=0)
+
+
+def _shown(value: object) -> str:
+    """A value as a message can hold it: short, and without control characters."""
+    text = ascii(value)
+    return text if len(text) <= 60 else f"{text[:60]}..."

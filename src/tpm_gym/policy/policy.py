@@ -6,6 +6,7 @@ Loading needs neither Stable-Baselines3 nor trust: see :mod:`tpm_gym.policy.file
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,13 +16,10 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
-from tpm_gym.errors import (
-    ConfigurationError,
-    InputError,
-    MissingPackageError,
-    PolicyMismatchError,
-)
-from tpm_gym.policy.files import Description, read_description, read_weights
+from tpm_gym.arrays import numbers
+from tpm_gym.errors import ConfigurationError, InputError, MissingPackageError, PolicyMismatchError
+from tpm_gym.policy.files import Description, files, published, read_description, read_weights
+from tpm_gym.resources import POLICIES
 
 try:
     import torch
@@ -34,26 +32,31 @@ _ACTIVATIONS = {"relu": torch.relu, "tanh": torch.tanh}
 
 
 def load_policy(path: str | Path) -> Policy:
-    """Load a policy that train/export.py wrote. Nothing in its files is executed or unpickled.
+    """Load an exported policy. Nothing in its files is executed or unpickled.
 
     Args:
-        path: ``NAME.json``, ``NAME.safetensors`` or ``NAME``; both files have to be there.
+        path: ``NAME.json``, ``NAME.safetensors`` or ``NAME``, where both files have to be. Where
+            neither is there, also the id of an environment with a published policy, a str such as
+            ``"TPMPickAndPlace-v0"``.
 
     Raises:
+        InputError: It is neither a str nor a Path, or empty.
         PolicyFileError: A file is missing, damaged, too large or not what it has to be, or the
             path names an archive of Stable-Baselines3, which only unpickling could read.
-        MissingPackageError: safetensors is not installed.
+        MissingPackageError: PyTorch, safetensors or pydantic is not installed.
     """
-    description = read_description(path)
-    return Policy(description, read_weights(path, description))
+    pair = files(path)
+    if path in published() and not any(map(os.path.exists, pair)):
+        pair = files(POLICIES / path)
+    description = read_description(pair[0])
+    return Policy(description, read_weights(pair[1], description))
 
 
 class Policy:
     """The mean action of a trained policy.
 
     Args:
-        description: What the policy is.
-        weights: Weights by name, of the shapes of ``description.shapes``.
+        weights: By name, of the shapes of ``description.shapes``.
 
     Attributes:
         description: What the policy is: environment, algorithm, recipe, spaces, versions, network.
@@ -81,20 +84,22 @@ class Policy:
             The action, in the shape, dtype and bounds of the action space; (n, ...) for a batch.
 
         Raises:
-            InputError: An entry is missing, unknown, of the wrong shape or not finite.
+            InputError: An entry is missing, unknown, of the wrong shape or not of finite real
+                numbers, or so far outside the observation space that the network overflows.
         """
         entries, batched = self._check_observation(observation)
-        network = self.description.network
+        network, space = self.description.network, self.description.action_space
         with torch.inference_mode():
             x = self._features(entries)
             for weight, bias in self._layers[:-1]:
                 x = torch.nn.functional.linear(x, weight, bias)
                 x = _ACTIVATIONS[network.activation](x)
             x = torch.nn.functional.linear(x, *self._layers[-1])
-            if network.output == "tanh":
-                x = torch.tanh(x)
-        space = self.description.action_space
-        actions: NDArray[Any] = x.numpy().reshape(-1, *space.shape)
+            actions: NDArray[Any] = (torch.tanh(x) if network.output == "tanh" else x).numpy()
+        if not np.isfinite(x.numpy()).all():
+            largest = max(float(values.abs().max()) for values in entries.values())
+            raise InputError("observation", largest, "near its space; the network overflows")
+        actions = actions.reshape(-1, *space.shape)
         if network.output == "tanh":
             actions = space.low + 0.5 * (actions + 1.0) * (space.high - space.low)
         else:
@@ -109,19 +114,10 @@ class Policy:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[Any], None]:
-        """The same as ``act`` for callers that expect the interface of Stable-Baselines3.
-
-        Args:
-            observation: As for ``act``.
-            state: Ignored: the policy has no memory.
-            episode_start: Ignored.
-            deterministic: Must be true; only the mean action is on file.
-
-        Returns:
-            The action or actions, and None.
+        """The same as ``act`` with the interface of Stable-Baselines3; there is no state.
 
         Raises:
-            ConfigurationError: A random action was asked for.
+            ConfigurationError: A random action was asked for; only the mean action is on file.
             InputError: As for ``act``.
         """
         if not deterministic:
@@ -160,59 +156,46 @@ class Policy:
         about = self.description
         return f"<Policy of {about.env_id}, {about.algorithm}, seed {about.seed}>"
 
+    def _features(self, entries: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        """What the first layer sees, (n, size)."""
+        features = self.description.network.features
+        if features.kind == "concatenate":
+            return torch.cat([entries[key] for key in features.keys], dim=1)
+        gap = entries["desired_goal"] - entries["achieved_goal"]
+        return torch.cat([entries["observation"], gap / features.unit], dim=1)
+
     def _check_observation(
         self, observation: Mapping[str, Any]
     ) -> tuple[dict[str, torch.Tensor], bool]:
-        """The entries as float32 (n, size), and whether they came as a batch."""
+        """The entries as (n, size), and whether they came as a batch."""
         boxes = self.description.observation_space
         if not isinstance(observation, Mapping) or set(observation) != set(boxes):
-            given = sorted(observation) if isinstance(observation, Mapping) else type(observation)
+            given = list(observation) if isinstance(observation, Mapping) else type(observation)
             raise InputError("observation", given, f"a mapping with the keys {', '.join(boxes)}")
-        arrays: dict[str, NDArray[np.float32]] = {}
+        entries: dict[str, torch.Tensor] = {}
         leading: set[tuple[int, ...]] = set()
         for name, box in boxes.items():
             shape = box.shape or ()
-            values = _as_float32(name, observation[name])
+            values = numbers(name, observation[name])
             batch = values.shape[: values.ndim - len(shape)]
             if values.shape != batch + shape or len(batch) > 1:
                 raise InputError(name, values.shape, f"of shape {shape} or (n, *{shape}), by shape")
-            if not np.isfinite(values).all():
-                raise InputError(name, values[~np.isfinite(values)][0], "finite")
-            arrays[name] = values.reshape(-1, math.prod(shape))
+            with np.errstate(over="ignore"):
+                flat = values.reshape(-1, math.prod(shape)).astype(np.float32)
+            if not np.isfinite(flat).all():
+                odd = float(values.flat[np.isfinite(flat).argmin()])
+                raise InputError(name, odd, "finite in float32")
+            entries[name] = torch.from_numpy(flat)
             leading.add(batch)
         if len(leading) > 1:
             raise InputError("observation", sorted(leading), "of one batch size in all entries")
-        # A copy: PyTorch warns of arrays that must not be written to.
-        tensors = {name: torch.from_numpy(values.copy()) for name, values in arrays.items()}
-        return tensors, leading != {()}
-
-    def _features(self, entries: Mapping[str, torch.Tensor]) -> torch.Tensor:
-        """What the first layer sees, (n, size)."""
-        network = self.description.network
-        if network.features == "concatenate":
-            return torch.cat([entries[key] for key in network.keys], dim=1)
-        gap = entries["desired_goal"] - entries["achieved_goal"]
-        return torch.cat([entries["observation"], gap / network.unit], dim=1)
-
-
-def _as_float32(name: str, value: Any) -> NDArray[np.float32]:
-    """An entry of an observation as an array; infinite where a number is too large."""
-    if isinstance(value, np.ndarray) and value.dtype == np.float32:
-        return value
-    try:
-        with np.errstate(over="ignore"):
-            return np.asarray(value, dtype=np.float32)
-    except (TypeError, ValueError) as error:
-        raise InputError(name, value, "an array of numbers") from error
+        return entries, leading != {()}
 
 
 def _spec(env: Any) -> EnvSpec | None:
     """What an environment was made from, the first of a vector; None where it does not say."""
-    spec = getattr(getattr(env, "unwrapped", env), "spec", None)
-    if spec is None and hasattr(env, "get_attr"):
-        spec = env.get_attr("spec")[0]
-    found: EnvSpec | None = spec
-    return found
+    spec: EnvSpec | None = getattr(getattr(env, "unwrapped", env), "spec", None)
+    return env.get_attr("spec")[0] if spec is None and hasattr(env, "get_attr") else spec
 
 
 def _control(spec: EnvSpec | None) -> str | None:

@@ -8,6 +8,7 @@ same for all of them (references, encoders' errors, modes, the State) is in
 from __future__ import annotations
 
 import importlib
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
@@ -105,7 +106,7 @@ class Engine(Protocol):
         """Index of the object that the cup holds; -1 for none."""
 
     def save(self) -> Any:
-        """Take down everything that the next steps depend on, as plain data.
+        """Take down everything that the next steps depend on, as plain data, all in its repr.
 
         What an engine cannot read out (old contacts' impulses) is not part of it, and ``restore``
         drops it.
@@ -123,6 +124,7 @@ class Engine(Protocol):
 
 Factory = Callable[..., Engine]
 
+
 _ENGINES: dict[str, str | Factory] = {
     "pybullet": "tpm_gym.simulation.bullet.engine:BulletEngine",
 }
@@ -133,16 +135,23 @@ def register_engine(name: str, engine: str | Factory) -> None:
 
     Args:
         name: The name.
-        engine: What makes the engine from the keywords ``gui`` (whether to open a window),
-            ``renderer`` (None for the engine's own) and ``physics`` (None, or its numerical
-            settings); or ``"module:attribute"``, imported when first asked for.
+        engine: What makes the engine, from those of the keywords ``gui`` (to open a window),
+            ``renderer`` (other than its own) and ``physics`` (its numerical settings) that it can
+            serve; or ``"module:attribute"`` of that, imported when first asked for.
 
     Raises:
         ConfigurationError: If the name is taken by another engine.
     """
-    if _ENGINES.get(name, engine) != engine:
+    if _path(_ENGINES.get(name, engine)) != _path(engine):
         raise ConfigurationError("engine", name, f"a name other than {', '.join(_ENGINES)}")
     _ENGINES[name] = engine
+
+
+def _path(engine: str | Factory) -> str:
+    """Where it is defined: there the same one may be registered as itself."""
+    if isinstance(engine, str):
+        return engine
+    return f"{engine.__module__}:{getattr(engine, '__qualname__', engine)}"
 
 
 def make_engine(
@@ -159,5 +168,23 @@ def make_engine(
     if isinstance(factory, str):
         module, _, attribute = factory.partition(":")
         factory = getattr(importlib.import_module(module), attribute)
-    engine: Engine = factory(gui=gui, renderer=renderer, physics=physics)
+    options: dict[str, Any] = {"gui": gui or None, "renderer": renderer, "physics": physics}
+    asked = {option: value for option, value in options.items() if value is not None}
+    known = inspect.signature(factory).parameters
+    if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in known.values()):
+        for option in asked.keys() - known.keys():
+            valid = f"left out: the engine {name!r} has no such option"
+            raise ConfigurationError(option, asked[option], valid)
+    engine: Engine = factory(**asked)
+    if lacking := [part for part in _PARTS if not _has(engine, part)]:
+        raise ConfigurationError("engine", name, f"an engine that has {', '.join(lacking)}")
     return engine
+
+
+_PARTS = [name for name in (*Engine.__annotations__, *vars(Engine)) if not name.startswith("_")]
+
+
+def _has(engine: Engine, part: str) -> bool:
+    """Whether it has that part of the protocol, and of its own: the protocol's do nothing."""
+    own = getattr(engine, part, None)
+    return own is not None and getattr(own, "__func__", None) is not vars(Engine).get(part, own)

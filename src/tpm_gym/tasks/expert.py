@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import EpisodeError, InputError
 from tpm_gym.mechanism.machine import Machine
+from tpm_gym.simulation.state import Block
 from tpm_gym.tasks.control import Control
 from tpm_gym.tasks.task import Task
 
@@ -25,6 +26,8 @@ __all__ = ["Expert", "Move"]
 
 RAMP = 3
 """Control steps from rest to full speed."""
+SEAL_STEPS = 4
+"""Control steps for which it waits for the cup to seal before it gives up."""
 
 
 class Move(NamedTuple):
@@ -67,26 +70,30 @@ class Expert:
         self.seen: dict[str, FloatArray] = {}
         self.goal: FloatArray = np.full(self._task.goal_size, np.nan)
         self._plan: Iterator[Move] | None = None
+        self._move: Move | None = None
         self._episode: int | None = None
-        self._under_way: list[FloatArray] = []
+        self._under_way: list[NDArray[Any]] = []  # actions that come late
 
     def reset(self, observation: dict[str, Any]) -> None:
         """Plan anew for the episode that starts with ``observation``."""
         self._episode = self._env.episode
         self._under_way = [np.zeros(3)] * self._latency
         self._look(observation)
-        self._plan = self._task.plan(self)
+        self._plan, self._move = self._task.plan(self), None
 
     def act(self, observation: dict[str, Any]) -> NDArray[np.float32]:
         """The next action, shape and range of the environment's action space.
 
         Raises:
-            EpisodeError: If the expert was not reset for this episode of its environment.
+            EpisodeError: If the expert was not reset for this episode of its environment, or its
+                plan has no moves.
         """
         if self._plan is None or self._episode != self._env.episode:
             raise EpisodeError("the expert has no plan for this episode; call its reset() first")
         self._look(observation)
-        move = next(self._plan)
+        self._move = move = next(self._plan, self._move)
+        if move is None:
+            raise EpisodeError(f"the plan of {type(self._task).__name__} has no moves")
         action = np.zeros(self._task.action_size, dtype=np.float32)
         action[:3] = self._control.action(self.machine.region.project(move.point), self.command)
         if self._task.vacuum:
@@ -125,6 +132,20 @@ class Expert:
                 if while_holding is not None and not self.holding(while_holding):
                     return
                 yield Move(start + fraction * (stop - start), vacuum)
+
+    def pick(self, block: Block, clearance: float) -> Iterator[Move]:
+        """Come down on a block from ``clearance`` (m) above it, and wait for the seal."""
+        yield from self.go([self._above(block, clearance)], vacuum=False)
+        yield from self.go([self._above(block)], vacuum=True)
+        for _ in range(SEAL_STEPS):
+            if self.holding(block.name):
+                return
+            yield Move(self._above(block), True)
+
+    def _above(self, block: Block, clearance: float = 0.0) -> FloatArray:
+        """Point P, machine's frame, with the lip over the top of a block where it stands now."""
+        place = self.seen[f"{block.name}_position"] + self._task.hanging(block)
+        return self.machine.mount.to_paper(place + (0.0, 0.0, clearance))
 
     def _look(self, observation: dict[str, Any]) -> None:
         self.seen = self._task.decode(observation["observation"])

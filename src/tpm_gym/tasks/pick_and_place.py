@@ -8,7 +8,6 @@ import numpy as np
 
 from tpm_gym.arrays import FloatArray
 from tpm_gym.kinematics.workspace import Region
-from tpm_gym.mechanism.cup import CUP
 from tpm_gym.simulation.state import Block, Scene, State
 from tpm_gym.tasks import rewards, sampling
 from tpm_gym.tasks.expert import Expert, Move
@@ -18,8 +17,6 @@ __all__ = ["PickAndPlace"]
 
 CLEARANCE = 0.030
 """Height over the puck, or over its place, at which the expert arrives and leaves, m."""
-SEAL_STEPS = 4
-"""Control steps for which the expert waits for the cup to seal before it tries again."""
 
 
 class PickAndPlace(Task):
@@ -40,34 +37,27 @@ class PickAndPlace(Task):
         """See the base class."""
         machine, offset = self.machine, self.hanging(self.puck)
         to_p, from_p = machine.mount.to_paper, machine.mount.to_world
-        table = sampling.level(machine.goal_region, self._level())
+        table = self.on_table(self.puck)
         if self.goals == "tempting":
             pair = sampling.tempting(rng, machine, table, self._draw_region)
-            ends = {
-                name: from_p(p) - offset for name, p in zip(("object", "goal"), pair, strict=True)
-            }
-            return {**ends, **chosen}
-        start = chosen.get("object")
-        if start is None:
-            start = from_p(machine.sample(rng, table)) - offset
-        goal = chosen.get("goal")
-        if goal is None:
-            region = self._draw_region(rng)
-            point = sampling.apart_from(to_p(start + offset), rng, machine, region)
-            goal = from_p(point) - offset
-        return {"object": start, "goal": goal}
+            first, last = (from_p(point) - offset for point in pair)
+            return {"object": first, "goal": last, **chosen}
+        start = (
+            chosen["object"] if "object" in chosen else from_p(machine.sample(rng, table)) - offset
+        )
+        if "goal" in chosen:
+            return {"object": start, **chosen}
+        region = self._draw_region(rng)
+        goal = sampling.apart_from(to_p(start + offset), rng, machine, region)
+        return {"object": start, "goal": from_p(goal) - offset}
 
     def _draw_region(self, rng: np.random.Generator) -> Region:
         """Where P goes with the puck: half on the table, half in the air."""
-        low, high = self.machine.goal_region.low, self.machine.goal_region.high
+        table = self.on_table(self.puck)
         if rng.random() < 0.5:
-            return sampling.level(self.machine.goal_region, self._level())
-        return Region(low, (high[0], high[1], self._level() - sampling.APART))
-
-    def _level(self) -> float:
-        """Height of P, machine's frame, when the cup touches a puck that stands on the table."""
-        touching = self.hanging(self.puck) + (0.0, 0.0, self.puck.height / 2)
-        return float(self.machine.mount.to_paper(touching)[2])
+            return table
+        x, y, level = table.high
+        return Region(self.machine.goal_region.low, (x, y, level - sampling.APART))
 
     def observed(self) -> tuple[Entry, ...]:
         """The robot, then the puck."""
@@ -90,7 +80,7 @@ class PickAndPlace(Task):
         to_paper = expert.machine.mount.to_paper
         up = np.array([0.0, 0.0, -CLEARANCE])  # paper z points down
         while True:
-            yield from self._pick(expert, up)
+            yield from expert.pick(self.puck, CLEARANCE)
             if not expert.holding():
                 continue
             # Where the cup sits on the puck is where it took it, not the puck's middle.
@@ -106,15 +96,6 @@ class PickAndPlace(Task):
                 break
         yield from self._finish(expert, place, place + up, release=on_table)
 
-    def _pick(self, expert: Expert, up: FloatArray) -> Iterator[Move]:
-        """Come down on the puck and wait for the seal."""
-        yield from expert.go([self._above(expert) + up], vacuum=False)
-        yield from expert.go([self._above(expert)], vacuum=True)
-        for _ in range(SEAL_STEPS):
-            if expert.holding():
-                return
-            yield Move(self._above(expert), True)
-
     def _finish(
         self, expert: Expert, place: FloatArray, above: FloatArray, release: bool
     ) -> Iterator[Move]:
@@ -125,10 +106,4 @@ class PickAndPlace(Task):
             yield Move(place, False)
             yield from expert.go([above], vacuum=False)
             place = above
-        while True:
-            yield Move(place, not release)
-
-    def _above(self, expert: Expert) -> FloatArray:
-        """Point P, machine's frame, when the cup touches the puck where it stands now."""
-        top = expert.seen["object_position"] + (0.0, 0.0, self.puck.height / 2 + CUP.length)
-        return expert.machine.mount.to_paper(top)
+        yield Move(place, not release)

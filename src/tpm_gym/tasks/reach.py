@@ -44,5 +44,4 @@ class Reach(Task):
         """Straight to the goal."""
         goal = expert.machine.mount.to_paper(expert.goal)
         yield from expert.go([goal], vacuum=False)
-        while True:
-            yield Move(goal, False)
+        yield Move(goal, False)

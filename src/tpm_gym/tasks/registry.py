@@ -38,13 +38,13 @@ def make_task(task: Any, machine: str | Machine | None = None, **options: Any) -
         ConfigurationError: If there is no such task, an option is out of range, or options are
             given with a task that is made already.
     """
+    options = {"machine": machine, **options}
     given = {name: value for name, value in options.items() if value is not None}
     if isinstance(task, Task):
-        if given or machine is not None:
-            odd = ", ".join(["machine"] * (machine is not None) + list(given))
-            raise ConfigurationError(odd, "given", "left out: a task that is made has its own")
+        for name, value in given.items():
+            raise ConfigurationError(name, value, "left out: a task that is made has its own")
         return task
     kind = TASKS.get(task) if isinstance(task, str) else task
     if not (isinstance(kind, type) and issubclass(kind, Task)):
         raise ConfigurationError("task", task, f"{', '.join(map(repr, TASKS))}, or a Task")
-    return kind(find_machine("paper" if machine is None else machine), **given)
+    return kind(find_machine(given.pop("machine", "paper")), **given)

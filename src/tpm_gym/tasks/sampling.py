@@ -20,11 +20,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tpm_gym.arrays import FloatArray, Vector
+from tpm_gym.errors import ConfigurationError
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.tasks import rewards
 
-__all__ = ["APART", "BAND", "apart_from", "level", "line_in_joints", "line_in_space", "tempting"]
+__all__ = ["APART", "BAND", "apart_from", "line_in_joints", "line_in_space", "tempting"]
 
 APART: Final = 0.030
 """A goal is at least this far from where its episode starts, m: no success for free."""
@@ -32,23 +33,28 @@ BAND: Final = 0.004
 """How far above the threshold the conditioning of a tempting end may be: less than 1 mm of y."""
 
 _BATCH: Final = 256
+_ATTEMPTS: Final = 100
 _FRACTIONS: Final = np.linspace(0.0, 1.0, 33)
 
 
 def apart_from(
-    start: ArrayLike, rng: np.random.Generator, machine: Machine, region: Region
+    others: ArrayLike,
+    rng: np.random.Generator,
+    machine: Machine,
+    region: Region,
+    apart: float = APART,
 ) -> FloatArray:
-    """A safe point (3,) of ``region`` at least :data:`APART` from ``start`` (3,)."""
-    while True:
+    """A safe point (3,) of ``region`` at least ``apart`` (m) from all ``others`` (..., 3).
+
+    Raises:
+        ConfigurationError: If no draw was.
+    """
+    for _ in range(_ATTEMPTS):
         point = machine.sample(rng, region)
-        if not rewards.distance(point, start) < APART:
+        if (rewards.distance(point, others) >= apart).all():
             return point
-
-
-def level(region: Region, z: float) -> Region:
-    """The part of a region at one height."""
-    low, high = region.low, region.high
-    return Region((low[0], low[1], z), (high[0], high[1], z))
+    valid = f"a larger one: what is drawn lies {apart} m from the start, or from other objects"
+    raise ConfigurationError("goal_region", region, valid)
 
 
 def tempting(
@@ -64,8 +70,11 @@ def tempting(
         machine: The machine.
         start: Where the start lies, or the start itself.
         goal: Draws the region of the goal.
+
+    Raises:
+        ConfigurationError: If none was drawn: not every machine has some.
     """
-    while True:
+    for _ in range(_ATTEMPTS):
         goals = _at_the_threshold(rng, machine, goal(rng))  # (n, 3)
         starts = (
             _at_the_threshold(rng, machine, start)
@@ -76,6 +85,8 @@ def tempting(
             apart = rewards.distance(first, last) >= APART
             if apart and (line_in_joints(machine, first, last) < machine.safe_conditioning).any():
                 return first, last
+    valid = f"'sampled': on {machine.name!r} no careless way was found that passes the singularity"
+    raise ConfigurationError("goals", "tempting", valid)
 
 
 def line_in_space(machine: Machine, start: ArrayLike, end: ArrayLike) -> FloatArray:

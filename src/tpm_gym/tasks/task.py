@@ -10,8 +10,9 @@ and, for an expert, :meth:`~Task.plan`; then :func:`tpm_gym.register_task`.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import cycle
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -19,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from tpm_gym.arrays import BoolArray, FloatArray, finite
 from tpm_gym.errors import ConfigurationError, ResetOptionError, UnreachableError
+from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.state import CONTROL_PERIOD, Block, Scene, State
@@ -67,7 +69,8 @@ class Task(ABC):
     Attributes:
         scene: What the simulation must hold.
         vacuum: Whether actions have a fourth entry, which switches the vacuum.
-        goal_size: Length of a goal; three for each point that has to be somewhere.
+        goal_size: Length of a goal; three for each point that has to be somewhere: those of the
+            scene's objects in its order, or P.
         tolerance: Distance below which a goal is achieved, m.
         samplings: What ``goals`` may be.
         entries: What the observation vector consists of, in order.
@@ -94,15 +97,19 @@ class Task(ABC):
             raise ConfigurationError("reward", reward, "'sparse' or 'dense'")
         if goals not in self.samplings:
             raise ConfigurationError("goals", goals, " or ".join(map(repr, self.samplings)))
-        number = isinstance(penalty_weight, (int, float, np.number))
-        if not number or not 0 <= float(penalty_weight) < np.inf:
-            raise ConfigurationError("penalty_weight", penalty_weight, "a finite number >= 0")
+        self.penalty_weight = float(
+            finite("penalty_weight", penalty_weight, (), ConfigurationError)
+        )
+        if self.penalty_weight < 0:
+            raise ConfigurationError("penalty_weight", penalty_weight, "0 or more")
+        shown = len(self.markers(np.zeros(self.goal_size)))
+        if shown != self.scene.markers:
+            raise ConfigurationError("markers", self.scene.markers, f"{shown}, as a goal shows")
         self.machine, self.reward, self.goals = machine, reward, goals
-        self.penalty_weight = float(penalty_weight)
-        self._places = [self.reach_of(block) for block in self.scene.objects]
-        self._observe_as()
+        self._within = [self._place_of(block) for block in self.scene.objects]
+        self._set_entries()
 
-    def _observe_as(self) -> None:
+    def _set_entries(self) -> None:
         self.entries = self.observed()
         self._centre = np.concatenate([entry.centre for entry in self.entries])
         self._scale = np.concatenate([entry.scale for entry in self.entries])
@@ -112,8 +119,9 @@ class Task(ABC):
         return {name: value for name, value in vars(self).items() if name != "entries"}
 
     def __setstate__(self, values: dict[str, Any]) -> None:
+        """Take all but the entries from another task, and make those anew."""
         vars(self).update(values)
-        self._observe_as()
+        self._set_entries()
 
     # -- to be written for each task ------------------------------------------------------------
 
@@ -125,7 +133,8 @@ class Task(ABC):
 
         Args:
             rng: Source of randomness.
-            chosen: What the user has chosen of it, checked; to be taken as it is.
+            chosen: What the user has chosen of it, within reach; to be taken as it is. What is
+                sampled beside it keeps clear of it.
 
         Returns:
             Centre (3,) m of each of the scene's objects by name, and ``"goal"`` (goal_size,) m.
@@ -136,7 +145,7 @@ class Task(ABC):
         """What is compared with the goal, (..., goal_size) m."""
 
     def plan(self, expert: Expert) -> Iterator[Move]:
-        """The moves of the scripted controller, from what ``expert`` sees.
+        """The moves of the scripted controller, from what ``expert`` sees; the last one is kept.
 
         Raises:
             ConfigurationError: If the task has none.
@@ -172,7 +181,7 @@ class Task(ABC):
 
     def goal_term(self, achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
         """The one term that depends on the goal, (...,)."""
-        gap = rewards.distance(achieved, desired)
+        gap = self.gap(achieved, desired)
         return (
             rewards.sparse(gap, self.tolerance) if self.reward == "sparse" else rewards.dense(gap)
         )
@@ -184,8 +193,12 @@ class Task(ABC):
 
     def success(self, achieved: ArrayLike, desired: ArrayLike) -> BoolArray:
         """Whether the goal is achieved, (...,)."""
-        result: BoolArray = rewards.distance(achieved, desired) < self.tolerance
+        result: BoolArray = self.gap(achieved, desired) < self.tolerance
         return result
+
+    def gap(self, achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
+        """How far from the goal, (...,) m: what reward and success are made of."""
+        return rewards.distance(achieved, desired)
 
     # -- start of an episode ----------------------------------------------------------------------
 
@@ -194,46 +207,38 @@ class Task(ABC):
 
         Raises:
             ResetOptionError: If an option is unknown, or not so many finite numbers, or an object
-                would start inside another, or inside the platform or its cup.
+                would start inside another or inside the robot.
             UnreachableError: If the robot cannot get to an object or the goal.
         """
-        blocks = {block.name: block for block in self.scene.objects}
-        valid = f"a dictionary with keys among {', '.join(map(repr, (*blocks, 'goal')))}"
+        objects = self.scene.objects
+        known: dict[str, tuple[int, tuple[Block | None, ...]]] = {
+            "goal": (self.goal_size, objects or (None,)),
+            **{block.name: (3, (block,)) for block in objects},
+        }
+        valid = f"a dictionary with keys among {', '.join(map(repr, known))}"
         if not isinstance(options, Mapping) and options is not None:
             raise ResetOptionError("options", options, valid)
         chosen: dict[str, FloatArray] = {}
         for name, value in (options or {}).items():
-            if name == "goal":
-                chosen[name] = self.check_goal(value)
-            elif name in blocks:
-                chosen[name] = self.check_object(blocks[name], value)
-            else:
+            if name not in known:
                 raise ResetOptionError(str(name), value, valid)
+            chosen[name] = self._within_reach(name, value, *known[name])
         start = self.sample(rng, chosen)
-        self._check_apart(start, chosen)
+        self._check_free(start, chosen.keys() - {"goal"})
         return start
 
-    def check_goal(self, goal: ArrayLike) -> FloatArray:
-        """A goal that the user chose, as (goal_size,) m; see :meth:`start` for what it raises."""
-        points = _numbers("goal", goal, (self.goal_size,))
-        block = self.scene.objects[0] if self.scene.objects else None
-        for point in points.reshape(-1, 3):
-            self._check_reach("goal", point, block)
+    def _within_reach(
+        self, name: str, value: Any, size: int, blocks: tuple[Block | None, ...]
+    ) -> FloatArray:
+        """Points (size,) m that the user chose, of P or of blocks' centres in turn; a copy."""
+        points = np.array(finite(name, value, (size,), ResetOptionError))
+        for point, block in zip(points.reshape(-1, 3), cycle(blocks), strict=False):
+            low, high = self.reach_of(block)
+            margin = float(np.minimum(point - low, high - point).min())
+            if margin < -1e-6:
+                hint = f"{name} must lie in {_range(low, high)}"
+                raise UnreachableError(point.tolist(), "box", margin, hint)
         return points
-
-    def check_object(self, block: Block, position: ArrayLike) -> FloatArray:
-        """A start of an object that the user chose, as (3,) m; see :meth:`start`."""
-        point = _numbers(block.name, position, (3,))
-        self._check_reach(block.name, point, block)
-        low, high = _box(point, block)
-        for place, (least, most) in enumerate(
-            self.machine.occupied(self.machine.mount.to_world(self.machine.home))
-        ):
-            if (low < most).all() and (high > least).all():
-                part = "platform" if place == 0 else "vacuum cup"
-                valid = f"clear of the {part} at home, {least.round(4)} to {most.round(4)} m"
-                raise ResetOptionError(block.name, point.tolist(), valid)
-        return point
 
     def reach_of(self, block: Block | None) -> tuple[FloatArray, FloatArray]:
         """Lowest and highest place (3,) m for point P, or for the centre of a block in the cup."""
@@ -246,24 +251,37 @@ class Task(ABC):
             low[2] = max(low[2], block.height / 2)  # on the table
         return low, high
 
+    def _place_of(self, block: Block) -> tuple[FloatArray, FloatArray]:
+        """The same, for a block that has to be in reach where it stands on the table."""
+        low, high = self.reach_of(block)
+        if low[2] > block.height / 2 + 1e-9:
+            least = f"at least {low[2] + block.height / 2:.4g} m high"
+            valid = f"blocks {least}: the cup of {self.machine.name!r} comes no lower"
+            raise ConfigurationError("scene", block.name, valid)
+        return low, high
+
     def hanging(self, block: Block) -> FloatArray:
         """From the centre of a block in the cup to point P, (3,) m."""
         return np.array([0.0, 0.0, block.height / 2 + CUP.length])
 
-    def _check_reach(self, name: str, point: FloatArray, block: Block | None) -> None:
-        low, high = self.reach_of(block)
-        margin = float(np.minimum(point - low, high - point).min())
-        if margin < -1e-6:
-            hint = f"{name} must lie between {low.round(4).tolist()} and {high.round(4).tolist()} m"
-            raise UnreachableError(point.tolist(), "box", margin, hint)
+    def on_table(self, block: Block) -> Region:
+        """Goals for point P, machine's frame, with a block in the cup that stands on the table."""
+        low, high = self.machine.goal_region.low, self.machine.goal_region.high
+        touching = self.hanging(block) + (0.0, 0.0, block.height / 2)
+        level = float(self.machine.mount.to_paper(touching)[2])
+        return Region((*low[:2], level), (*high[:2], level))
 
-    def _check_apart(self, start: Mapping[str, FloatArray], chosen: Mapping[str, Any]) -> None:
-        boxes = {block.name: _box(start[block.name], block) for block in self.scene.objects}
-        for name in chosen.keys() & boxes.keys():
-            for other in boxes.keys() - {name}:
-                (low, high), (least, most) = boxes[name], boxes[other]
-                if (low < most).all() and (high > least).all():
-                    valid = f"clear of {other!r} at {start[other].round(4).tolist()} m"
+    def _check_free(self, start: Mapping[str, FloatArray], chosen: Collection[str]) -> None:
+        """Refuse objects that would start inside the robot at home, or inside another object."""
+        if not chosen:
+            return
+        taken = [(block.name, _box(start[block.name], block)) for block in self.scene.objects]
+        boxes = self.machine.occupied(self.machine.home)
+        robot = [("the robot at home", box) for box in boxes]
+        for name, (low, high) in taken:
+            for other, (least, most) in robot + taken:
+                if name in chosen and other != name and (low < most).all() and (high > least).all():
+                    valid = f"clear of {other}, {_range(least, most)}"
                     raise ResetOptionError(name, start[name].tolist(), valid)
 
     # -- observation ------------------------------------------------------------------------------
@@ -301,12 +319,14 @@ class Task(ABC):
 
     def _scales(self) -> tuple[Values, Values, Values, Values]:
         """Centre and extent of the region (m, world), full speed (m/s), largest step (m)."""
-        machine = self.machine
-        low, high = np.array(machine.region.low), np.array(machine.region.high)
-        step = np.array(machine.step_limit)
-        centre = machine.mount.to_world((low + high) / 2)
-        columns = (centre, (high - low) / 2, step / CONTROL_PERIOD, step)
-        centre, extent, speed, step = (tuple(column.tolist()) for column in columns)
+        region, mount, step = self.machine.region, self.machine.mount, self.machine.step_limit
+        low, high = np.array(region.low), np.array(region.high)
+        columns = (
+            mount.to_world((low + high) / 2),
+            (high - low) / 2,
+            np.divide(step, CONTROL_PERIOD),
+        )
+        centre, extent, speed = (tuple(column.tolist()) for column in columns)
         return centre, extent, speed, step
 
     def lip(self, state: State) -> FloatArray:
@@ -350,21 +370,20 @@ class Task(ABC):
         return goal.reshape(-1, 3)
 
     def lost(self, state: State) -> BoolArray:
-        """Whether an object lies where the robot cannot pick it up, (...,): off the table, say."""
+        """Whether an object is off the table or where the robot cannot get to, (...,)."""
         lost: BoolArray = np.zeros(np.shape(state.held), dtype=np.bool_)
-        for index, (low, high) in enumerate(self._places):
-            # The cup may take it off its middle.
-            slack = self.scene.objects[index].width / 2
+        for index, block in enumerate(self.scene.objects):
+            low, high = self._within[index]
+            slack = block.width / 2  # the cup may take it off its middle
             place = state.object_position[..., index, :]
             level = place[..., :2]
             beyond = ((level < low[:2] - slack) | (level > high[:2] + slack)).any(axis=-1)
-            lost = lost | beyond | (place[..., 2] < 0)
+            lost |= beyond | (place[..., 2] < 0)
         return lost
 
 
-def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
-    """A copy, so that the user's array stays the user's."""
-    return finite(name, value, shape, ResetOptionError).copy()
+def _range(low: FloatArray, high: FloatArray) -> str:
+    return f"{low.round(4).tolist()} to {high.round(4).tolist()} m"
 
 
 def _box(point: FloatArray, block: Block) -> tuple[FloatArray, FloatArray]:

@@ -16,7 +16,7 @@ from tpm_gym.simulation.bullet.cup import Cup, Grip
 from tpm_gym.simulation.bullet.physics import Physics
 from tpm_gym.simulation.bullet.robot import Robot
 from tpm_gym.simulation.bullet.scenery import Scenery
-from tpm_gym.simulation.engine import Motors, Pose, Truth, Twist
+from tpm_gym.simulation.engine import Engine, Motors, Pose, Truth, Twist
 from tpm_gym.simulation.randomisation import Plant
 from tpm_gym.simulation.settings import settings_of
 from tpm_gym.simulation.state import Scene
@@ -138,3 +138,6 @@ class BulletEngine:
     def close(self) -> None:
         """See the protocol."""
         self.client.close()
+
+
+_: type[Engine] = BulletEngine  # so that mypy compares them

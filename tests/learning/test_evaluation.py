@@ -1,26 +1,23 @@
-"""evaluate.py writes what it promises: a table, strict JSON and a video, without torch."""
+"""An evaluation writes what it promises: a table, strict JSON and a video, without torch."""
 
 from __future__ import annotations
 
-import io
 import json
-import math
 import pickle
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
 import imageio.v3 as imageio
 import numpy as np
 import pytest
-from rich.console import Console
+from trainings import quiet
 
 from tpm_gym.errors import ConfigurationError
-from tpm_gym.learning import evaluate, film, provenance, rollout
-from tpm_gym.learning.errors import ConfigError, PolicyError, RolloutError, UnknownEnvError
+from tpm_gym.learning import EvaluationConfig, evaluate, evaluation, film, provenance
+from tpm_gym.learning.errors import ConfigError, PolicyError
 from tpm_gym.learning.policies import load_policy
 
 METRICS = (
@@ -33,13 +30,9 @@ METRICS = (
     "unsafe_share",
     "fk_error_max",
 )
-SCRIPT = Path(evaluate.__file__)
+COMMAND = [sys.executable, "-m", "tpm_gym.learning", "evaluate"]
 STRAYS = 3
 """Seed of an episode in which random actions stray into the unsafe region."""
-
-
-def quiet() -> Console:
-    return Console(file=io.StringIO(), width=120)
 
 
 def read_strict(path: Path) -> dict[str, Any]:
@@ -58,9 +51,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], s
     """Return the JSON and the output of the command line, run on one policy."""
     path = tmp_path_factory.mktemp("evaluate") / "deep" / "er" / "expert.json"
     options = f"--policy expert --env TPMReach-v0 --episodes 4 --seed 7 --json {path}".split()
-    done = subprocess.run(
-        [sys.executable, str(SCRIPT), *options], capture_output=True, text=True, check=False
-    )
+    done = subprocess.run([*COMMAND, *options], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return read_strict(path), done.stdout
 
@@ -94,14 +85,14 @@ def test_json_says_how_to_repeat_it(written: tuple[dict[str, Any], str]) -> None
         content["versions"]
     )
     assert "git_commit" in content
-    assert content["command"].startswith("python ")
+    assert content["command"].startswith("tpm-gym evaluate ")
     assert "--policy expert --env TPMReach-v0 --episodes 4 --seed 7" in content["command"]
 
 
 def test_no_absolute_path_is_written(written: tuple[dict[str, Any], str]) -> None:
     content, _ = written
     assert str(Path.home()) not in json.dumps(content)
-    assert str(SCRIPT.parent) not in json.dumps(content)
+    assert str(Path(evaluation.__file__).parent) not in json.dumps(content)
 
 
 def test_table_shows_means_and_intervals(written: tuple[dict[str, Any], str]) -> None:
@@ -113,29 +104,24 @@ def test_table_shows_means_and_intervals(written: tuple[dict[str, Any], str]) ->
 
 def test_scripted_policies_do_not_load_torch(tmp_path: Path) -> None:
     program = (
-        "import sys, evaluate\n"
-        "config = evaluate.Config(policy=('expert', 'random'), env='TPMReach-v0', episodes=1)\n"
-        "evaluate.evaluate(config)\n"
+        "import sys; from tpm_gym.learning import EvaluationConfig, evaluate\n"
+        "config = EvaluationConfig(policy=('expert', 'random'), env='TPMReach-v0', episodes=1)\n"
+        "evaluate(config)\n"
         "loaded = {'torch', 'stable_baselines3'} & set(sys.modules)\n"
         "sys.exit(f'loaded {loaded}' if loaded else 0)\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program],
-        cwd=SCRIPT.parent,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    words = [sys.executable, "-c", program]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 
 
 def test_several_policies_share_a_table_and_a_file(tmp_path: Path) -> None:
     path = tmp_path / "both.json"
-    config = evaluate.Config(
+    config = EvaluationConfig(
         policy=("random", "expert"), env="TPMReach-v0", episodes=2, json=path, seed=3
     )
     console = quiet()
-    results = evaluate.evaluate(config, console)
+    results = evaluate(config, console)
     content = read_strict(path)
     assert [entry["policy"] for entry in content["policies"]] == ["random", "expert"]
     assert content["policies"][1]["return"]["mean"] == results[1].metrics["return"].mean
@@ -150,10 +136,10 @@ def test_several_policies_share_a_table_and_a_file(tmp_path: Path) -> None:
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_video_shows_the_first_episodes(tmp_path: Path) -> None:
     path = tmp_path / "films" / "expert.mp4"
-    config = evaluate.Config(
+    config = EvaluationConfig(
         policy=("expert",), env="TPMReach-v0", episodes=2, video=path, video_episodes=1
     )
-    (result,) = evaluate.evaluate(config, quiet())
+    (result,) = evaluate(config, quiet())
     frames = imageio.imread(path, plugin="FFMPEG")  # (frames, height, width, 3)
     assert len(frames) == result.records[0].length + 1
     assert frames[0].std() > 5  # something is to be seen
@@ -171,15 +157,15 @@ def test_video_shows_the_first_episodes(tmp_path: Path) -> None:
     ],
 )
 def test_every_policy_gets_its_own_video(policies: tuple[str, ...], names: list[str]) -> None:
-    paths = evaluate.paths_per_policy(Path("films", "v.mp4"), policies)
+    paths = evaluation.paths_per_policy(Path("films", "v.mp4"), policies)
     assert [path.name for path in paths] == names
     assert all(path.parent == Path("films") for path in paths)
 
 
 def test_picture_shows_six_moments_of_the_first_episode(tmp_path: Path) -> None:
     path = tmp_path / "new" / "expert.png"
-    config = evaluate.Config(policy=("expert",), env="TPMReach-v0", episodes=1, picture=path)
-    evaluate.evaluate(config, quiet())
+    config = EvaluationConfig(policy=("expert",), env="TPMReach-v0", episodes=1, picture=path)
+    evaluate(config, quiet())
     env = gym.make("TPMReach-v0", render_mode="rgb_array")
     env.reset(seed=config.seed)
     first = env.render()
@@ -208,19 +194,19 @@ def test_contact_sheet_ends_when_nothing_moves_any_more() -> None:
         ({"env": "TPMReach-v0", "video_episodes": 0}, ConfigError, "at least 1"),
         ({"env": "TPMReach-v0", "seed": -1}, ConfigError, "at least 0"),
         ({}, ConfigError, "name one with --env"),
-        ({"env": "TPMRech-v0"}, UnknownEnvError, "TPMReach-v0"),
+        ({"env": "TPMRech-v0"}, ConfigError, "TPMReach-v0"),
         ({"env": "TPMReach-v0", "policy": ("expert", "gone.zip")}, PolicyError, "no file gone.zip"),
     ],
 )
 def test_mistakes_are_named(options: dict[str, Any], error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
-        evaluate.evaluate(evaluate.Config(**{"policy": ("expert",), **options}), quiet())
+        evaluate(EvaluationConfig(**{"policy": ("expert",), **options}), quiet())
 
 
 def records_of(spec: str = "random", **options: Any) -> list[Any]:
     """Return the records of a few episodes, by default the random policy's on Reach."""
-    config = evaluate.Config(policy=(spec,), **{"env": "TPMReach-v0", "episodes": 2} | options)
-    return evaluate.evaluate(config, quiet())[0].records
+    config = EvaluationConfig(policy=(spec,), **{"env": "TPMReach-v0", "episodes": 2} | options)
+    return evaluate(config, quiet())[0].records
 
 
 def test_conditions_are_recorded_and_the_defaults_are_the_nominal_machine(
@@ -233,9 +219,7 @@ def test_conditions_are_recorded_and_the_defaults_are_the_nominal_machine(
     words = ["--policy", "random", "--env", "TPMReach-v0", "--episodes", "1", "--json", str(path)]
     words += ["--randomisation", "encoder_noise=1e-4", "friction=0.5:1", "latency=1"]
     words += ["--penalty-weight", "0.5", "--goals", "tempting"]
-    done = subprocess.run(
-        [sys.executable, str(SCRIPT), *words], capture_output=True, text=True, check=False
-    )
+    done = subprocess.run([*COMMAND, *words], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     content = read_strict(path)
     assert content["randomisation"] == {
@@ -248,11 +232,11 @@ def test_conditions_are_recorded_and_the_defaults_are_the_nominal_machine(
 
 
 def test_the_environment_is_the_one_that_was_asked_for() -> None:
-    config = evaluate.Config(
+    config = EvaluationConfig(
         policy=("random",), goals="tempting", penalty_weight=0.25, randomisation=("puck_mass=2",)
     )
-    env: Any = evaluate._make_env("TPMPickAndPlace-v0", config)
-    assert env.unwrapped.penalty_weight == 0.25
+    env: Any = evaluation._make_env("TPMPickAndPlace-v0", config)
+    assert env.unwrapped.task.penalty_weight == 0.25
     assert env.unwrapped.randomisation.puck_mass == (2.0, 2.0)
     plain = gym.make("TPMPickAndPlace-v0")
     goals = [made.reset(seed=3)[0]["desired_goal"] for made in (env, plain)]
@@ -297,28 +281,6 @@ def test_per_step_figures_are_those_of_the_steps() -> None:
     assert record.fk_error_max == pytest.approx(max(gaps), rel=1e-12)
 
 
-def test_torques_are_condensed_where_the_environment_tells_them() -> None:
-    torques = [np.array([1.0, -2.0, 2.0]), np.array([0.0, 0.0, 6.0])]
-    point = np.zeros(3)
-    states = [
-        SimpleNamespace(torque=torque, fk_position=point, platform_position=point)
-        for torque in torques
-    ]
-    info = {"conditioning": 0.5, "closure_error": 0.0, "is_success": True}
-    record = rollout._record(0, [0.0, 0.0], [info, info], states)
-    assert record.torque_peak == 6.0
-    assert record.torque_rms == pytest.approx(math.sqrt((1 + 4 + 4 + 36) / 6))
-    metrics = rollout.summarise([record, record])
-    assert metrics["torque_peak"].worst == 6.0
-    states[1].torque = np.array([0.0, math.nan, 0.0])
-    with pytest.raises(RolloutError, match="step 1: torque is nan"):
-        rollout._record(0, [0.0, 0.0], [info, info], states)
-    unknown = rollout._record(0, [0.0, 0.0], [info, info], [None, None])
-    assert unknown.torque_peak is None
-    assert "torque_peak" not in unknown.as_dict()
-    assert "torque_peak" not in rollout.summarise([record, unknown])
-
-
 @pytest.mark.parametrize(
     "entries", [("puck_mass",), ("puck_mass=heavy",), ("=1",), ("a=1:2:3",), ("a=1", "a=2")]
 )
@@ -354,8 +316,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def returns(policy: Path | str, **options: Any) -> list[float]:
-    config = evaluate.Config(policy=(str(policy),), episodes=1, **options)
-    return [record.total_reward for record in evaluate.evaluate(config, quiet())[0].records]
+    config = EvaluationConfig(policy=(str(policy),), episodes=1, **options)
+    return [record.total_reward for record in evaluate(config, quiet())[0].records]
 
 
 def test_an_exported_policy_goes_by_any_of_its_names(run: Path) -> None:
@@ -371,7 +333,7 @@ def test_an_archive_is_refused_unless_it_is_trusted(run: Path, tmp_path: Path) -
         (tmp_path / "config.json").write_bytes((run / "config.json").read_bytes())
         with pytest.raises(PolicyError, match="--trust-pickle") as caught:
             returns(archive)
-        assert "python train/export.py" in str(caught.value)
+        assert "tpm-gym export" in str(caught.value)
     assert returns(tmp_path, trust_pickle=True)
 
 
@@ -396,7 +358,7 @@ def test_an_exported_policy_of_another_task_is_refused(run: Path) -> None:
 def test_a_damaged_policy_is_one_line(run: Path, tmp_path: Path) -> None:
     (tmp_path / "best.json").write_bytes((run / "best.json").read_bytes())
     (tmp_path / "best.safetensors").write_bytes((run / "best.safetensors").read_bytes()[:-1])
-    words = [sys.executable, str(SCRIPT), "--policy", str(tmp_path / "best")]
+    words = [*COMMAND, "--policy", str(tmp_path / "best")]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
@@ -413,17 +375,17 @@ def test_an_exported_policy_needs_no_stable_baselines(run: Path) -> None:
     program = (
         "import sys\n"
         "sys.modules['stable_baselines3'] = sys.modules['sb3_contrib'] = None\n"
-        "import evaluate\n"
-        f"evaluate.evaluate(evaluate.Config(policy=({str(run / 'best')!r},), episodes=1))\n"
+        "from tpm_gym.learning import EvaluationConfig, evaluate\n"
+        f"evaluate(EvaluationConfig(policy=({str(run / 'best')!r},), episodes=1))\n"
     )
     words = [sys.executable, "-c", program]
-    done = subprocess.run(words, cwd=SCRIPT.parent, capture_output=True, text=True, check=False)
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 
 
 def test_command_line_errors_are_one_line() -> None:
     done = subprocess.run(
-        [sys.executable, str(SCRIPT), "--policy", "expert", "--env", "Nope-v0"],
+        [*COMMAND, "--policy", "expert", "--env", "Nope-v0"],
         capture_output=True,
         text=True,
         check=False,
@@ -451,6 +413,8 @@ def test_files_are_written_whole_or_not_at_all(tmp_path: Path) -> None:
 
 def test_command_keeps_no_folder_outside(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
+    installed = str(tmp_path.parent / "bin" / "tpm-gym")
+    assert provenance.command_line([installed, "resume", "x"]) == "tpm-gym resume x"
     inside, outside = tmp_path / "runs" / "a b", tmp_path.parent / "elsewhere" / "x.json"
     words = ["train/train.py", "--run", str(inside), f"--json={outside}", "--seed", "3"]
     expected = "python train/train.py --run 'runs/a b' --json=x.json --seed 3"
@@ -461,8 +425,8 @@ def test_command_keeps_no_folder_outside(monkeypatch: pytest.MonkeyPatch, tmp_pa
 def test_a_picture_of_an_unknown_kind_is_refused_before_the_episodes(
     tmp_path: Path, option: str, name: str
 ) -> None:
-    config = evaluate.Config(
+    config = EvaluationConfig(
         policy=("random",), env="TPMReach-v0", episodes=1, **{option: tmp_path / name}
     )
     with pytest.raises(ConfigError, match=f"--{option}"):
-        evaluate.evaluate(config)
+        evaluate(config)

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import pytest
 
+from tpm_gym.learning import TrainingConfig, train
 from tpm_gym.learning.checkpoint import CheckpointStore
-from tpm_gym.learning.errors import NotARunError, RunBusyError, RunExistsError, RunWriteError
-from tpm_gym.learning.run_folder import claimed, clear, description, disk_errors_named, prepare
+from tpm_gym.learning.errors import RunError
+from tpm_gym.learning.run_folder import claimed, description, disk_errors_named, prepare
 
 OURS = {"algo": "sac", "env": "TPMReach-v0", "training_seeds": [0, 0]}
 
@@ -21,9 +22,11 @@ def run(tmp_path: Path) -> Path:
     """A run with files and folders."""
     folder = tmp_path / "run"
     (folder / "checkpoints" / "000000050").mkdir(parents=True)
+    (folder / "tests").mkdir()
+    (folder / "tests" / "nominal.json").write_text('{"env": 1, "episodes": 1, "command": ""}')
     (folder / "config.json").write_text(json.dumps(OURS))
-    (folder / "best.zip").write_text("")
-    (folder / "zzz").write_text("")
+    for name in ("best.zip", "last.safetensors", "progress.csv", "events.out.tfevents.1.host"):
+        (folder / name).write_text("")
     return folder
 
 
@@ -33,7 +36,7 @@ def names(folder: Path) -> list[str]:
 
 def test_a_run_is_replaced_only_if_asked_to(run: Path) -> None:
     before = names(run)
-    with pytest.raises(RunExistsError, match="--overwrite"):
+    with pytest.raises(RunError, match="--overwrite"):
         prepare(run, overwrite=False)
     assert names(run) == before
     prepare(run, overwrite=True)
@@ -47,14 +50,14 @@ def test_what_another_program_wrote_is_never_deleted(config: str | None, tmp_pat
         (tmp_path / "config.json").write_text(config)
     before = names(tmp_path)
     assert description(tmp_path) is None
-    with pytest.raises(NotARunError, match=r"config\.json of train\.py"):
+    with pytest.raises(RunError, match=r"config\.json of a training"):
         prepare(tmp_path, overwrite=True)
     assert names(tmp_path) == before
 
 
 def test_a_file_is_no_folder(tmp_path: Path) -> None:
     (tmp_path / "run").write_text("")
-    with pytest.raises(RunExistsError):
+    with pytest.raises(RunError):
         prepare(tmp_path / "run", overwrite=False)
 
 
@@ -71,10 +74,12 @@ def test_a_death_while_deleting_leaves_a_run_that_can_be_deleted(
     class Killed(BaseException):
         pass
 
-    def unlink(path: Path) -> None:
+    delete = Path.unlink
+
+    def unlink(path: Path, missing_ok: bool = False) -> None:
         if path.name == "config.json":
             raise Killed
-        os.unlink(path)  # the method is this function
+        delete(path, missing_ok)
 
     with monkeypatch.context() as patched:
         patched.setattr(Path, "unlink", unlink)
@@ -85,29 +90,45 @@ def test_a_death_while_deleting_leaves_a_run_that_can_be_deleted(
     assert names(run) == []
 
 
-def test_clearing_keeps_what_it_is_told_to_and_follows_no_links(run: Path, tmp_path: Path) -> None:
+def test_only_what_a_run_writes_is_deleted_and_no_link_is_followed(
+    run: Path, tmp_path: Path
+) -> None:
     (tmp_path / "elsewhere").mkdir()
-    (tmp_path / "elsewhere" / "kept").write_text("")
+    (tmp_path / "elsewhere" / "best.zip").write_text("")
     (run / "link").symlink_to(tmp_path / "elsewhere")
-    clear(run, but="config.json")
-    assert names(run) == ["config.json"]
-    assert names(tmp_path / "elsewhere") == ["kept"]
-    assert description(run) == OURS
+    (run / "tests" / "mine.json").write_text("{}")
+    prepare(run, overwrite=True)
+    assert names(run) == ["link", "tests"]
+    assert names(run / "tests") == ["mine.json"]
+    assert names(tmp_path / "elsewhere") == ["best.zip"]
 
 
 @pytest.mark.skipif(os.name == "nt", reason="there are no such locks")
 def test_a_run_in_use_is_not_deleted(run: Path) -> None:
     before = names(run)
-    with claimed(run), pytest.raises(RunBusyError, match="another process"):
+    with claimed(run), pytest.raises(RunError, match="another process"):
         prepare(run, overwrite=True)
     assert names(run) == before
     with claimed(run):
         pass
 
 
+@pytest.mark.parametrize("number", [errno.EROFS, errno.EACCES, errno.ENOSPC])
+def test_a_folder_that_cannot_be_made_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    def refuse(*args: object, **options: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    with pytest.raises(RunError, match=f"{os.strerror(number)}; choose another --run") as caught:
+        train(TrainingConfig(run=tmp_path / "run"))
+    assert "\n" not in str(caught.value)
+
+
 def test_only_errors_of_the_disk_are_renamed(run: Path) -> None:
     store = CheckpointStore(run / "checkpoints")
-    with pytest.raises(RunWriteError, match="No space left"), disk_errors_named(run, store):
+    with pytest.raises(RunError, match="No space left"), disk_errors_named(run, store):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     with pytest.raises(FileNotFoundError), disk_errors_named(run, store):
         raise FileNotFoundError(errno.ENOENT, "gone")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import itertools
 import json
 import os
@@ -17,48 +16,56 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 import scipy.stats
-from rich.console import Console
-from trainings import SAC_RECIPE
+from paths import ROOT
+from trainings import SAC_RECIPE, quiet
 
-from tpm_gym.learning import evaluate, study, train
-from tpm_gym.learning import report as results
-from tpm_gym.learning import report_page as results_page
-from tpm_gym.learning.aggregate import (
-    interquartile_mean,
-    interquartile_mean_interval,
-    median_time,
-    settled,
+from tpm_gym.learning import (
+    EvaluationConfig,
+    TrainingConfig,
+    evaluate,
+    study,
+    train,
 )
-from tpm_gym.learning.configuration import Config
+from tpm_gym.learning.command_line import main
 from tpm_gym.learning.errors import ConfigError
+from tpm_gym.learning.estimates import interquartile_mean, median_time, settled
+from tpm_gym.learning.report.figures import draw, learning_curves, penalty
+from tpm_gym.learning.report.page import LEARNING_CURVES, PENALTY
+from tpm_gym.learning.report.page import page as page_of
+from tpm_gym.learning.report.records import (
+    PAGE,
+    RECORDS,
+    Collect,
+    Write,
+    collect,
+    condense,
+    write,
+)
+from tpm_gym.learning.run_folder import TESTS
 
 # -- statistics -------------------------------------------------------------------------------
-
-
-def test_interquartile_mean_by_hand() -> None:
-    assert interquartile_mean([0.9, 0.0, 1.0, 0.8, 0.7]) == pytest.approx((0.7 + 0.8 + 0.9) / 3)
-    assert interquartile_mean([4.0, 1.0, 2.0, 100.0]) == pytest.approx(3.0)
-    assert interquartile_mean([1.0, 2.0, 6.0]) == pytest.approx(3.0)
 
 
 @pytest.mark.parametrize("count", range(1, 14))
 def test_interquartile_mean_is_that_of_scipy(count: int) -> None:
     scores = np.random.default_rng(count).random(count)
-    assert interquartile_mean(scores.tolist()) == pytest.approx(scipy.stats.trim_mean(scores, 0.25))
+    found = interquartile_mean(scores.tolist()).mean
+    assert found == pytest.approx(scipy.stats.trim_mean(scores, 0.25))
 
 
 def test_interval_of_three_scores_is_that_of_all_resamples() -> None:
     """Of three scores nothing is trimmed, and all 27 resamples can be listed."""
     scores = [0.0, 0.3, 0.9]
     means = sorted(sum(drawn) / 3 for drawn in itertools.product(scores, repeat=3))
-    found = interquartile_mean_interval([scores], samples=200_000)
+    found = interquartile_mean(scores, samples=200_000)
     # One resample in 27 (3.7%) is all of the lowest, so that is the 2.5% quantile; likewise above.
     assert (found.mean, found.low, found.high) == pytest.approx((0.4, means[0], means[-1]))
+    assert interquartile_mean(scores) == interquartile_mean(scores)
 
 
 def test_interval_is_that_of_scipy() -> None:
     scores = np.random.default_rng(3).random(12)
-    found = interquartile_mean_interval([scores.tolist()], samples=20_000)
+    found = interquartile_mean(scores.tolist(), samples=20_000)
 
     def statistic(sample: Any, axis: int) -> Any:
         return scipy.stats.trim_mean(sample, 0.25, axis=axis)
@@ -67,17 +74,6 @@ def test_interval_is_that_of_scipy() -> None:
         (scores,), statistic, n_resamples=20_000, method="percentile", rng=0
     ).confidence_interval
     assert (found.low, found.high) == pytest.approx((theirs.low, theirs.high), abs=0.01)
-
-
-def test_resampling_is_stratified() -> None:
-    """Between strata nothing is exchanged: where each has equal scores there is no doubt."""
-    stratified = interquartile_mean_interval([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
-    assert (stratified.mean, stratified.low, stratified.high) == (0.5, 0.5, 0.5)
-    pooled = interquartile_mean_interval([[0.0, 0.0, 0.0, 1.0, 1.0, 1.0]])
-    assert pooled.high - pooled.low > 0.5
-    assert interquartile_mean_interval([[0.1, 0.7, 0.4]]) == interquartile_mean_interval(
-        [[0.1, 0.7, 0.4]]
-    )
 
 
 @pytest.mark.parametrize(
@@ -102,10 +98,6 @@ def test_a_run_that_never_learned_is_later_than_any_other() -> None:
 # -- from runs to the page ----------------------------------------------------------------------
 
 
-def quiet() -> Console:
-    return Console(file=io.StringIO(), width=120)
-
-
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A tiny real run, tested in three ways."""
@@ -113,18 +105,18 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     recipe = folder / "sac.yml"
     recipe.write_text(SAC_RECIPE.format(env="TPMReach-v0", train_freq=20), encoding="utf-8")
     run = folder / "TPMReach-v0-sac-s0"
-    config = Config(recipe=recipe, run=run, steps=120, eval_every=60, eval_episodes=2)
-    assert train.train(config, quiet()) is None
+    config = TrainingConfig(recipe_file=recipe, run=run, steps=120, eval_every=60, eval_episodes=2)
+    assert train(config, quiet()) is None
     for name, changes in {"nominal": (), "encoder_noise": ("encoder_noise=1e-4",)}.items():
-        path = run / results.TESTS / f"{name}.json"
-        test = evaluate.Config(policy=(str(run),), episodes=2, json=path, randomisation=changes)
-        evaluate.evaluate(test, quiet())
+        path = run / TESTS / f"{name}.json"
+        test = EvaluationConfig(policy=(str(run),), episodes=2, json=path, randomisation=changes)
+        evaluate(test, quiet())
     return folder
 
 
 @pytest.fixture(scope="module")
 def real(runs: Path) -> dict[str, Any]:
-    return results.condense(runs / "TPMReach-v0-sac-s0")
+    return condense(runs / "TPMReach-v0-sac-s0")
 
 
 def changed(record: dict[str, Any], seed: int, rate: float | None, **changes: Any) -> Any:
@@ -171,47 +163,40 @@ def test_a_run_that_broke_off_is_collected_too(runs: Path, tmp_path: Path) -> No
         (tmp_path / "runs" / name / "config.json").write_text(json.dumps(config))
         (tmp_path / "runs" / name / "evaluations.jsonl").write_text(lines)
     (tmp_path / "runs" / "early" / "evaluations.jsonl").unlink()
-    paths = results.collect(results.Collect(tmp_path / "runs", tmp_path / "records"))
+    paths = collect(Collect(tmp_path / "runs", tmp_path / "records"))
     assert [path.name for path in paths] == ["early.json", "late.json"]
     for path in paths:
         assert json.loads(path.read_text())["finished"] is False
     late = tmp_path / "runs" / "late" / "evaluations.jsonl"
     late.write_text('{"steps": 60, "wall_seconds": 1.0}\n{"steps": 70, "wa')
-    results.collect(results.Collect(tmp_path / "runs", tmp_path / "records"))
+    collect(Collect(tmp_path / "runs", tmp_path / "records"))
     record = json.loads((tmp_path / "records" / "late.json").read_text())
     assert record["evaluations"]["steps"] == [60]  # the disk was full
     late.write_text("{\n")
-    with pytest.raises(ConfigError, match=r"late.evaluations\.jsonl: is damaged"):
-        results.collect(results.Collect(tmp_path / "runs", tmp_path / "records"))
+    with pytest.raises(ConfigError, match="late: its evaluations are damaged"):
+        collect(Collect(tmp_path / "runs", tmp_path / "records"))
 
 
 def test_the_command_line_goes_from_runs_to_page(runs: Path, tmp_path: Path) -> None:
-    script = str(Path(results.__file__))
     records, page = tmp_path / "results", tmp_path / "results.md"
-    for words in (
-        ["collect", "--runs", str(runs), "--to", str(records)],
-        ["write", "--records", str(records), "--page", str(page)],
-    ):
-        done = subprocess.run(
-            [sys.executable, script, *words], capture_output=True, text=True, check=False
-        )
-        assert done.returncode == 0, done.stderr
+    main(["report", "collect", "--runs", str(runs), "--to", str(records)])
+    main(["report", "write", "--records", str(records), "--page", str(page)])
     assert sorted(path.name for path in records.iterdir()) == ["TPMReach-v0-sac-s0.json"]
     assert rows(page.read_text(), "TPMReach-v0", "SAC + HER")
-    picture = imageio.imread(tmp_path / "images" / results_page.LEARNING_CURVES)
+    picture = imageio.imread(tmp_path / "images" / LEARNING_CURVES)
     assert len(np.unique(picture[::3, ::3].reshape(-1, picture.shape[2]), axis=0)) > 10
     again = [page.read_bytes(), picture.tobytes()]
-    results.write(results.Write(records, page))
-    figure = tmp_path / "images" / results_page.LEARNING_CURVES
+    write(Write(records, page))
+    figure = tmp_path / "images" / LEARNING_CURVES
     assert [page.read_bytes(), imageio.imread(figure).tobytes()] == again
 
 
 def test_failures_are_counted_and_named(real: dict[str, Any]) -> None:
     rates = [1.0, 0.99, 0.98, 0.2, None]
     records = [changed(real, seed, rate) for seed, rate in enumerate(rates)]
-    text = results_page.page(records, [])
+    text = page_of(records, [])
     (row,) = rows(text, "| 5 |", "[")
-    expected = interquartile_mean_interval([[1.0, 0.99, 0.98, 0.2, 0.0]])
+    expected = interquartile_mean([1.0, 0.99, 0.98, 0.2, 0.0])
     assert f"{expected.mean:.1%} [{expected.low * 100:.1f}, {expected.high * 100:.1f}]" in row
     assert "| 60 |" in row  # steps: 60, 60, 60, never, never
     assert len(rows(text, "not finished")) == 1
@@ -220,7 +205,7 @@ def test_failures_are_counted_and_named(real: dict[str, Any]) -> None:
     assert "seed 4: stopped after 120 of 120 steps" in failures
     assert "seed 2" not in failures
     most = [changed(real, seed, rate) for seed, rate in enumerate([1.0, 0.5, 0.4, 0.2, None])]
-    (row,) = rows(results_page.page(most, []), "| 5 |", "[")
+    (row,) = rows(page_of(most, []), "| 5 |", "[")
     assert row.count("never") == 2
 
 
@@ -233,45 +218,40 @@ def test_penalty_weights_and_machines_get_tables_of_their_own(real: dict[str, An
         records.append(
             changed(real, seed, 1.0, goals="tempting", penalty_weight=weight, tests=tests)
         )
-    text = results_page.page(records, [])
-    penalty = text.split("## Does the penalty work?")[1].split("## Robustness")[0]
-    assert rows(penalty, "| 0 |", "41.0% (40.0% to 42.0%)")
-    assert rows(penalty, "| 1 |", "11.0% (10.0% to 12.0%)")
+    text = page_of(records, [])
+    table = text.split("## Does the penalty work?")[1].split("## Robustness")[0]
+    assert rows(table, "| 0 |", "41.0% (40.0% to 42.0%)")
+    assert rows(table, "| 1 |", "11.0% (10.0% to 12.0%)")
     assert (
         f"{real['env']}, SAC + HER, 120 steps: 41.00% without the penalty, 11.000% with it: "
         "4 times less."
-    ) in penalty
+    ) in table
     robustness = text.split("## Robustness")[1]
     assert rows(robustness, "encoder noise", '{"encoder_noise": 0.0001}', "97.0%")
     assert "tempting" not in text.split("## Does the penalty work?")[0].split("##")[1]
 
 
 def test_the_penalty_figure_has_a_dot_a_seed(real: dict[str, Any], tmp_path: Path) -> None:
-    from tpm_gym.learning import report_figures as results_figures
-
     test = {"tempting": real["tests"]["nominal"]}
     records = [
         changed(real, seed, 1.0, goals="tempting", penalty_weight=weight, tests=test)
         for seed in range(3)
         for weight in (0.0, 1.0)
     ]
-    style = results_figures._house_style()
-    figure = results_figures.penalty(records, style)
+    figure = penalty(records)
     dots = [line for line in figure.axes[0].lines if len(line.get_xdata()) == 3]
     assert len(dots) == 4  # two metrics at two weights
     assert [label.get_text() for label in figure.axes[0].get_xticklabels()] == ["0", "1"]
-    longer = results_figures.penalty([*records, *(r | {"steps": 999} for r in records)], style)
+    longer = penalty([*records, *(r | {"steps": 999} for r in records)])
     labels = [label.get_text() for label in longer.axes[0].get_xticklabels()]
     assert labels == ["0\n120\nsteps", "1\n120\nsteps", "0\n999\nsteps", "1\n999\nsteps"]
-    (path,) = results_figures.draw(records, tmp_path)
-    assert path.name == results_page.PENALTY
+    (path,) = draw(records, tmp_path)
+    assert path.name == PENALTY
 
 
 def test_the_learning_curve_is_the_median_with_a_band(real: dict[str, Any]) -> None:
-    from tpm_gym.learning import report_figures as results_figures
-
     records = [changed(real, seed, rate) for seed, rate in enumerate([0.2, 0.9, 1.0])]
-    figure = results_figures.learning_curves(records, results_figures._house_style())
+    figure = learning_curves(records)
     curve = figure.axes[0].lines[0]
     assert list(curve.get_xdata()) == [0, 60, 120]
     assert list(curve.get_ydata()) == [0.0, 0.9, 0.9]
@@ -284,57 +264,52 @@ def test_the_learning_curve_is_the_median_with_a_band(real: dict[str, Any]) -> N
 
 
 def test_plans_have_every_recipe_and_seed(tmp_path: Path) -> None:
-    planned = study.plan_runs(study.Config("results", folder=tmp_path))
+    planned = study.plan_runs(study.StudyConfig("results", folder=tmp_path))
     assert len(planned) == (6 + 4 + 2) * 5
     assert len({run.folder for run in planned}) == len(planned)
-    penalty = study.plan_runs(study.Config("penalty", folder=tmp_path))
-    assert len(penalty) == 3 * 2 * 5
-    assert all("--goals" in (run.options or ()) for run in penalty)
+    weighted = study.plan_runs(study.StudyConfig("penalty", folder=tmp_path))
+    assert len(weighted) == 3 * 2 * 5
+    assert all("--goals" in (run.options or ()) for run in weighted)
     with pytest.raises(ConfigError, match="--envs"):
-        study.plan_runs(study.Config("results", envs=("Nope-v0",)))
-    longer = study.plan_runs(study.Config("penalty", folder=tmp_path, steps=70_000))
-    assert not {run.folder for run in longer} & {run.folder for run in penalty}
+        study.plan_runs(study.StudyConfig("results", envs=("Nope-v0",)))
+    longer = study.plan_runs(study.StudyConfig("penalty", folder=tmp_path, steps=70_000))
+    assert not {run.folder for run in longer} & {run.folder for run in weighted}
     assert all("--steps 70000" in " ".join(study.commands(run, 1)[0]) for run in longer)
     with pytest.raises(ConfigError, match="--steps 0"):
-        study.plan_runs(study.Config("results", steps=0))
+        study.plan_runs(study.StudyConfig("results", steps=0))
     with pytest.raises(ConfigError, match="--seeds 0"):
-        study.plan_runs(study.Config("results", seeds=0))
+        study.plan_runs(study.StudyConfig("results", seeds=0))
     with pytest.raises(ConfigError, match="run --plan results first"):
-        study.study(study.Config("robustness", folder=tmp_path))
+        study.study(study.StudyConfig("robustness", folder=tmp_path))
 
 
-def test_what_is_done_is_skipped_and_what_was_stopped_goes_on(tmp_path: Path) -> None:
-    config = study.Config(
-        "results", envs=("TPMReach-v0",), algos=("sac",), seeds=1, episodes=7, folder=tmp_path
-    )
-    (run,) = study.plan_runs(config)
-    assert study.estimate(run, config) == (None, None)
-    first, test = study.commands(run, 7)
-    assert first[:2] == ["python", "train/train.py"]
-    assert "--resume" not in first
-    assert test[test.index("--episodes") + 1] == "7"
-    run.folder.mkdir()
-    (run.folder / "config.json").write_text('{"steps": 100}')
-    assert study.commands(run, 7)[0][2:] == ["--run", str(run.folder), "--resume"]
-    evaluations = run.folder / "evaluations.jsonl"
-    evaluations.write_text('{"steps": 50, "wall_seconds": 10.0}\n{"steps": 60, "wa')
-    assert len(study.commands(run, 7)) == 2
-    # 5000 steps as the recipe says, 50 of them done at five a second.
-    assert study.estimate(run, config) == (pytest.approx((5000 - 50) / 5), None)
-    evaluations.write_text('{"steps": 100, "wall_seconds": 20.0}\n')
-    for name in ("best.json", "last.json"):
-        (run.folder / name).write_text("{}")
-    assert [command[1] for command in study.commands(run, 7)] == ["train/evaluate.py"]
-    (run.folder / "tests").mkdir()
-    timed = '{"wall_seconds": 30.0, "episodes": 10}'
-    (run.folder / "tests" / "encoder_noise.json").write_text(timed)
-    (run.folder / "tests" / ".half.json").write_text('{"wall_sec')
-    assert study.estimate(run, config) == (0.0, pytest.approx(7 * 3.0))
-    (run.folder / "tests" / "nominal.json").write_text(timed)
-    assert len(study.commands(run, 7)) == 1  # a test of other than 7 episodes
-    (run.folder / "tests" / "nominal.json").write_text(timed.replace("10}", "7}"))
-    assert study.commands(run, 7) == []
-    assert study.estimate(run, config) == (0.0, 0.0)
+def test_what_is_done_is_skipped_and_what_was_stopped_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--envs", "TPMReach-v0", "--algos", "sac", "--seeds", "1", "--episodes", "7"]
+    words = ["study", "--plan", "results", *words, "--folder", str(tmp_path), "--dry-run"]
+
+    def left() -> list[str]:
+        main(words)
+        return capsys.readouterr().out.split("\n")[:-1]
+
+    run = tmp_path / "TPMReach-v0-sac-s0"
+    test = f"tpm-gym evaluate --policy {run} --env TPMReach-v0 --episodes 7"
+    test += f" --json {run / 'tests' / 'nominal.json'}"
+    first = f"tpm-gym train --env TPMReach-v0 --algo sac --seed 0 --run {run}"
+    assert left() == [first, test]
+    run.mkdir()
+    (run / "config.json").write_text('{"steps": 100}')
+    (run / "evaluations.jsonl").write_text('{"steps": 60}\n{"steps": 100, "wa')
+    assert left() == [f"tpm-gym resume {run}", test]
+    (run / "evaluations.jsonl").write_text('{"steps": 100}\n')
+    (run / "last.zip").write_text("")
+    assert left() == [test]
+    (run / "tests").mkdir()
+    (run / "tests" / "nominal.json").write_text('{"episodes": 10}')
+    assert left() == [test]
+    (run / "tests" / "nominal.json").write_text('{"episodes": 7}')
+    assert left() == [""]
 
 
 def test_a_run_is_trained_and_tested_and_one_that_fails_is_told(tmp_path: Path) -> None:
@@ -346,7 +321,7 @@ def test_a_run_is_trained_and_tested_and_one_that_fails_is_told(tmp_path: Path) 
         tmp_path / "runs" / "a", "TPMReach-v0", "sac", (*options, *goals), (("tempting", goals),)
     )
     assert study.execute(run, 1), (tmp_path / "runs" / "a.log").read_text()
-    record = results.condense(run.folder)
+    record = condense(run.folder)
     assert record["finished"]
     assert record["goals"] == record["tests"]["tempting"]["goals"] == "tempting"
     assert study.commands(run, 1) == []
@@ -359,7 +334,7 @@ def test_ctrl_c_stops_a_study_with_checkpoints_saved(tmp_path: Path) -> None:
     """As a terminal sends it: to the whole process group; a second signal would kill trainings."""
     words = ["--plan", "results", "--envs", "TPMReach-v0", "--algos", "sac", "--seeds", "1"]
     process = subprocess.Popen(
-        [sys.executable, str(Path(study.__file__)), *words, "--folder", str(tmp_path)],
+        [sys.executable, "-m", "tpm_gym.learning", "study", *words, "--folder", str(tmp_path)],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -373,15 +348,13 @@ def test_ctrl_c_stops_a_study_with_checkpoints_saved(tmp_path: Path) -> None:
     os.killpg(process.pid, signal.SIGINT)
     output, _ = process.communicate(timeout=60)
     assert process.returncode == 1, output
-    assert "stopped: python train/train.py --env TPMReach-v0" in output
+    assert "stopped: tpm-gym train --env TPMReach-v0" in output
     log = run.with_suffix(".log").read_text(encoding="utf-8")
     assert "stopped early by SIGTERM, saved at step" in log
     assert (run / "last.zip").is_file()
 
 
 def test_the_page_is_what_its_records_say() -> None:
-    records = [json.loads(path.read_text()) for path in sorted(results.RECORDS.glob("*.json"))]
-    page = results.ROOT / "docs" / "results.md"
-    drawn = (results_page.LEARNING_CURVES, results_page.PENALTY)
-    figures = [name for name in drawn if name in page.read_text()]
-    assert results_page.page(records, figures) == page.read_text(encoding="utf-8")
+    records = [json.loads(path.read_text()) for path in sorted((ROOT / RECORDS).glob("*.json"))]
+    text = (ROOT / PAGE).read_text(encoding="utf-8")
+    assert page_of(records, [name for name in (LEARNING_CURVES, PENALTY) if name in text]) == text

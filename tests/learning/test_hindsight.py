@@ -16,8 +16,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 from stable_baselines3.her import HerReplayBuffer
 
 import tpm_gym  # noqa: F401  # registers the ids
-from tpm_gym.learning.errors import ReplayBufferError
-from tpm_gym.learning.hindsight import PenaltyHerReplayBuffer
+from tpm_gym.learning import PenaltyHerReplayBuffer
+from tpm_gym.learning.errors import ConfigError
 
 HORIZON = 10
 
@@ -167,10 +167,10 @@ def test_observations_may_be_normalised() -> None:
 
 def test_normalised_rewards_are_refused() -> None:
     envs = VecNormalize(DummyVecEnv([PenaltyEnv]), norm_reward=True)
-    with pytest.raises(ReplayBufferError, match="norm_reward=False"):
+    with pytest.raises(ConfigError, match="norm_reward=False"):
         filled(PenaltyHerReplayBuffer, envs)
 
 
 def test_copied_infos_are_refused() -> None:
-    with pytest.raises(ReplayBufferError, match="counted twice"):
+    with pytest.raises(ConfigError, match="counted twice"):
         filled(PenaltyHerReplayBuffer, DummyVecEnv([PenaltyEnv]), copy_info_dict=True)

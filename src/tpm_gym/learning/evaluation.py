@@ -1,11 +1,4 @@
-"""Evaluate policies over seeded episodes: a table, and optionally JSON, a video and a picture.
-
-    python train/evaluate.py --policy runs/TPMReach-v0-sac-s0 expert random --episodes 100
-
-A policy is ``expert``, ``random``, an exported policy (``NAME.json`` with ``NAME.safetensors``
-beside it), or the folder of a run (its best policy). A .zip file of Stable-Baselines3 holds
-pickles, which can run any code: it is refused unless ``--trust-pickle`` is given.
-"""
+"""Evaluate policies over seeded episodes: a table, and optionally JSON, a video and a picture."""
 
 from __future__ import annotations
 
@@ -16,27 +9,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import gymnasium as gym
 import tyro
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
 from tpm_gym.learning import provenance
-from tpm_gym.learning.errors import ConfigError, TrainError, UnknownEnvError
+from tpm_gym.learning.configuration import UNSET, unset
+from tpm_gym.learning.environments import check_env_id, make_env
+from tpm_gym.learning.errors import ConfigError
+from tpm_gym.learning.estimates import Estimate
 from tpm_gym.learning.film import write_contact_sheet, write_video
-from tpm_gym.learning.options import default
 from tpm_gym.learning.policies import load_policy, trained_env
-from tpm_gym.learning.rollout import (
-    TEST_SEED,
-    Episode,
-    Estimate,
-    GoalEnv,
-    Policy,
-    run_episodes,
-    summarise,
-)
-from tpm_gym.learning.tempting import env_id_for
+from tpm_gym.learning.rollout import TEST_SEED, Episode, GoalEnv, Policy, run_episodes, summarise
 
 # Label, key, factor and format of each row of the table.
 _ROWS = (
@@ -54,14 +39,18 @@ _ROWS = (
 
 
 @dataclass(frozen=True)
-class Config:
-    """Evaluate policies over seeded episodes."""
+class EvaluationConfig:
+    """Evaluate policies over seeded episodes: a table, and optionally JSON, a video and a picture.
+
+    A .zip file of Stable-Baselines3 holds pickles, which can run any code: it is refused unless
+    --trust-pickle is given.
+    """
 
     policy: Annotated[tuple[str, ...], tyro.conf.arg(metavar="POLICY ...")]
-    """Policies: expert, random, an exported policy (.json), or the folder of a run."""
+    """Policies: expert, random, an exported policy (.json), or the folder of a run (its best)."""
 
-    env: Annotated[str | None, default("the one the policy was trained on", "ID")] = None
-    """Environment id."""
+    env: Annotated[str, unset(str, "the one the policy was trained on", "ID")] = UNSET
+    """Environment id, or module:id for one that a module of yours registers."""
 
     episodes: int = 100
     """Episodes per policy."""
@@ -75,21 +64,24 @@ class Config:
     penalty_weight: float = 1.0
     """Weight of the singularity penalty in the return."""
 
-    randomisation: Annotated[tuple[str, ...], default("nowhere", "KEY=VALUE ...")] = ()
+    randomisation: Annotated[
+        tuple[str, ...],
+        tyro.conf.arg(help_behavior_hint="(default: nowhere)", metavar="KEY=VALUE ..."),
+    ] = ()
     """Where the machine differs from the nominal one: attributes of tpm_gym's Randomisation, each
     a number, or for factors LOW:HIGH to draw from, for example encoder_noise=1e-4 puck_mass=0.5:2.
     Those about the puck change nothing where there is none."""
 
-    json: Annotated[Path | None, default("not written", "PATH")] = None
+    json: Annotated[Path | None, unset(Path, "not written", "PATH")] = None
     """Write metrics, episodes and versions here."""
 
-    video: Annotated[Path | None, default("not written", "PATH")] = None
+    video: Annotated[Path | None, unset(Path, "not written", "PATH")] = None
     """Write an MP4 of the first episodes here; several policies get a file each."""
 
     video_episodes: int = 3
     """Episodes in a video."""
 
-    picture: Annotated[Path | None, default("not written", "PATH")] = None
+    picture: Annotated[Path | None, unset(Path, "not written", "PATH")] = None
     """Write a PNG of six moments of the first episode here; several policies get a file each."""
 
     trust_pickle: bool = False
@@ -98,14 +90,7 @@ class Config:
 
 @dataclass(frozen=True)
 class Result:
-    """The evaluation of one policy.
-
-    Attributes:
-        policy: The policy as it was named.
-        metrics: Estimates by name.
-        records: The episodes.
-        wall_seconds: Time the episodes took, s.
-    """
+    """The evaluation of one policy, as it was named; the episodes took ``wall_seconds``."""
 
     policy: str
     metrics: dict[str, Estimate]
@@ -124,18 +109,18 @@ class Result:
         }
 
 
-def evaluate(config: Config, console: Console | None = None) -> list[Result]:
+def evaluate(config: EvaluationConfig, console: Console | None = None) -> list[Result]:
     """Evaluate the policies of a configuration and write what it asks for.
 
     Args:
-        config: The configuration.
         console: Where the table is printed; by default the standard output.
 
     Returns:
         One result per policy, in order.
 
     Raises:
-        TrainError: An option is not valid, or a policy cannot be used.
+        LearningError: An option is not valid, or a policy cannot be used.
+        ConfigurationError: The environment has no such randomisation or penalty weight.
     """
     # A file has no margin at which a table would have to be folded.
     console = console or Console(width=None if sys.stdout.isatty() else 200)
@@ -157,46 +142,41 @@ def evaluate(config: Config, console: Console | None = None) -> list[Result]:
     return results
 
 
-def _check(config: Config) -> None:
-    """Refuse numbers that cannot work."""
-    for option, value in {
-        "--episodes": config.episodes,
-        "--video-episodes": config.video_episodes,
-    }.items():
-        if value < 1:
-            raise ConfigError(option, value, "must be at least 1")
-    if config.seed < 0:
-        raise ConfigError("--seed", config.seed, "must be at least 0")
+def _check(config: EvaluationConfig) -> None:
+    """Refuse what cannot work."""
+    least = {"episodes": 1, "video_episodes": 1, "seed": 0}
+    for name, value in least.items():
+        given = getattr(config, name)
+        if given < value:
+            raise ConfigError(f"--{name.replace('_', '-')} {given}: must be at least {value}")
     if not config.policy:
-        raise ConfigError("--policy", "", "name at least one policy")
-    if config.video is not None and config.video.suffix != ".mp4":
-        raise ConfigError("--video", config.video, "must end in .mp4")
-    if config.picture is not None and config.picture.suffix != ".png":
-        raise ConfigError("--picture", config.picture, "must end in .png")
+        raise ConfigError("--policy: name at least one policy")
+    for option, path, suffix in (
+        ("--video", config.video, ".mp4"),
+        ("--picture", config.picture, ".png"),
+    ):
+        if path is not None and path.suffix != suffix:
+            raise ConfigError(f"{option} {path}: must end in {suffix}")
 
 
-def _resolve_env(config: Config) -> str:
+def _resolve_env(config: EvaluationConfig) -> str:
     """Return the environment id that was asked for, or that the policies were trained on."""
-    import tpm_gym
-
-    if config.env is None:
-        trained = {spec: trained_env(spec) for spec in config.policy}
-        ids = sorted({env_id for env_id in trained.values() if env_id is not None})
+    env_id = config.env
+    if env_id is UNSET:
+        ids = sorted({found for spec in config.policy if (found := trained_env(spec)) is not None})
         if len(ids) != 1:
             found = f"policies were trained on {', '.join(ids)}" if ids else "no policy has one"
-            raise ConfigError("--env", "(not given)", f"{found}; name one with --env")
+            raise ConfigError(f"--env (not given): {found}; name one with --env")
         env_id = ids[0]
-    else:
-        env_id = config.env
-    if env_id not in tpm_gym.ENV_IDS:
-        raise UnknownEnvError(env_id, tpm_gym.ENV_IDS)
+    check_env_id(env_id)
     return env_id
 
 
-def _make_env(env_id: str, config: Config, render_mode: str | None = None) -> GoalEnv:
+def _make_env(env_id: str, config: EvaluationConfig, render_mode: str | None = None) -> GoalEnv:
     """Make an environment as configured."""
-    return gym.make(
-        env_id_for(env_id, config.goals),
+    return make_env(
+        env_id,
+        goals=config.goals,
         penalty_weight=config.penalty_weight,
         randomisation=parse_randomisation(config.randomisation),
         render_mode=render_mode,
@@ -221,19 +201,19 @@ def parse_randomisation(entries: Sequence[str]) -> dict[str, Any]:
             numbers = []
         if not (name and equals and 1 <= len(numbers) <= 2) or name in result:
             valid = "must be KEY=NUMBER or KEY=LOW:HIGH, each key once"
-            raise ConfigError("--randomisation", entry, valid)
+            raise ConfigError(f"--randomisation {entry}: {valid}")
         result[name] = numbers[0] if len(numbers) == 1 else (numbers[0], numbers[1])
     return result
 
 
-def _load(config: Config, env: GoalEnv) -> list[Policy]:
+def _load(config: EvaluationConfig, env: GoalEnv) -> list[Policy]:
     """Load the policies of a configuration."""
     trust = config.trust_pickle
     return [load_policy(spec, env, trust_pickle=trust) for spec in config.policy]
 
 
 def _evaluate_one(
-    env: GoalEnv, spec: str, policy: Policy, config: Config, console: Console
+    env: GoalEnv, spec: str, policy: Policy, config: EvaluationConfig, console: Console
 ) -> Result:
     """Run the episodes of one policy, with a progress bar on a terminal."""
     ticks = iter(
@@ -253,7 +233,7 @@ def _evaluate_one(
     return Result(spec, summarise(records), records, wall_seconds)
 
 
-def _table(env_id: str, config: Config, results: Sequence[Result]) -> Table:
+def _table(env_id: str, config: EvaluationConfig, results: Sequence[Result]) -> Table:
     """Lay the metrics out with a column per policy."""
     last = config.seed + config.episodes - 1
     table = Table(
@@ -264,8 +244,6 @@ def _table(env_id: str, config: Config, results: Sequence[Result]) -> Table:
     for result in results:
         table.add_column(result.policy, justify="right", overflow="fold")
     for label, name, factor, form, unit in _ROWS:
-        if any(name not in result.metrics for result in results):
-            continue  # this version of the environments does not tell
         cells = [_cell(result.metrics[name], factor, form, unit) for result in results]
         table.add_row(label, *cells)
         worst = [result.metrics[name].worst for result in results]
@@ -288,7 +266,9 @@ def _cell(estimate: Estimate, factor: float, form: str, unit: str) -> str:
     return f"{mean}{unit} \\[{low}, {high}]"
 
 
-def _description(env_id: str, config: Config, results: Sequence[Result]) -> dict[str, Any]:
+def _description(
+    env_id: str, config: EvaluationConfig, results: Sequence[Result]
+) -> dict[str, Any]:
     """Return what the JSON file records; a single policy has its metrics at the top level."""
     if len(results) == 1:
         content = results[0].as_dict()
@@ -304,10 +284,7 @@ def _description(env_id: str, config: Config, results: Sequence[Result]) -> dict
         "penalty_weight": config.penalty_weight,
         "randomisation": parse_randomisation(config.randomisation),
         **content,
-        "versions": provenance.versions(),
-        "git_commit": provenance.git_commit(),
-        "machine": provenance.machine(),
-        "command": provenance.command_line(),
+        **provenance.origin(),
         **records,
     }
 
@@ -322,36 +299,19 @@ def paths_per_policy(path: Path, policies: Sequence[str]) -> list[Path]:
     return [path.with_name(f"{path.stem}-{name}{path.suffix}") for name in names]
 
 
-def _film(env_id: str, config: Config, console: Console) -> None:
+def _film(env_id: str, config: EvaluationConfig, console: Console) -> None:
     """Run the first episodes once more, with rendering, which would have slowed the metrics."""
     env = _make_env(env_id, config, render_mode="rgb_array")
     try:
-        policies = _load(config, env)
-        if config.video is not None:
-            episodes = min(config.video_episodes, config.episodes)
-            paths = paths_per_policy(config.video, config.policy)
-            for path, policy in zip(paths, policies, strict=True):
+        for i, policy in enumerate(_load(config, env)):
+            if config.video is not None:
+                path = paths_per_policy(config.video, config.policy)[i]
+                episodes = min(config.video_episodes, config.episodes)
                 write_video(path, env, policy, episodes, config.seed)
                 console.print(f"video: {path}", markup=False)
-        if config.picture is not None:
-            paths = paths_per_policy(config.picture, config.policy)
-            for path, policy in zip(paths, policies, strict=True):
+            if config.picture is not None:
+                path = paths_per_policy(config.picture, config.policy)[i]
                 write_contact_sheet(path, env, policy, config.seed)
                 console.print(f"picture: {path}", markup=False)
     finally:
         env.close()
-
-
-def main() -> None:
-    """Run the command line."""
-    from tpm_gym import TPMError
-
-    config = tyro.cli(Config, description=__doc__)
-    try:
-        evaluate(config)
-    except (TrainError, TPMError) as error:
-        sys.exit(f"error: {error}")
-
-
-if __name__ == "__main__":
-    main()

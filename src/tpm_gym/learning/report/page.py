@@ -1,4 +1,4 @@
-"""The text of docs/results.md, from the records that results.py has collected."""
+"""The text of docs/results.md, from the records of runs."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ from collections.abc import Callable, Iterable, Sequence
 from statistics import median
 from typing import Any, Final
 
-from tpm_gym.learning.aggregate import (
+from tpm_gym.learning.estimates import (
     BOOTSTRAP_SAMPLES,
     BOOTSTRAP_SEED,
     LEARNED,
-    interquartile_mean_interval,
+    interquartile_mean,
     median_time,
     settled,
 )
+from tpm_gym.mechanism import PAPER_TPM
 
 Record = dict[str, Any]
 Group = list[Record]
@@ -31,15 +32,16 @@ Written by `make results` from the records in [results](results); no result here
   best in the evaluations during training, on held-out seeds that neither training nor those
   evaluations have seen; its interval is Wilson's, at 95%.
 - **IQM** is the interquartile mean over seeds (of five, the mean of the middle three), with a 95%
-  stratified bootstrap interval ({BOOTSTRAP_SAMPLES:,} resamples of the seeds, seed \
-{BOOTSTRAP_SEED}). A run without a test counts as 0.
+  bootstrap interval ({BOOTSTRAP_SAMPLES:,} resamples of the seeds, seed {BOOTSTRAP_SEED}). A run
+  without a test counts as 0.
 - **Time to {LEARNED:.0%}** is that of the first evaluation during training from which success stays
   at {LEARNED:.0%} or above to the end of training; those evaluations are short (20 episodes, so at
   most one may fail), the same episodes each time. Minutes include them; minutes and steps include
   the playing of demonstrations. For several seeds it is the median, "never" where that is a
   run that never did.
 - **Smallest conditioning** is the least 1/cond(J) of all steps of all test episodes (and seeds),
-  **time below safe** the share of their steps with 1/cond(J) < 0.08 (the mean of seeds).
+  **time below safe** the share of their steps with 1/cond(J) < \
+{PAPER_TPM.safe_conditioning} (the mean of seeds).
 - **Observed P off** is the largest distance between the observed position of the platform (forward
   kinematics of the encoders) and the simulated one, of all steps, episodes and seeds.
 """
@@ -50,25 +52,21 @@ With `+modified`, files that git tracks differed from the commit. Minutes are wa
 runs at a time on two cores, and of some runs too long: tests ran beside them. All of it again:
 
 ```bash
-python train/study.py --plan results
-python train/study.py --plan penalty
-python train/study.py --plan penalty --envs TPMPickAndPlaceJoints-v0 --steps 100000
-python train/study.py --plan robustness --episodes 500
-python train/results.py collect
+tpm-gym study --plan results
+tpm-gym study --plan penalty
+tpm-gym study --plan penalty --envs TPMPickAndPlaceJoints-v0 --steps 100000
+tpm-gym study --plan robustness --episodes 500
+tpm-gym report collect
 make results
 ```
 
-`study.py` runs these commands for every seed; here those of the first. Each record holds its own.
+A study runs these commands for every seed; here those of the first. Each record holds its own, as
+it was then: `train/train.py` is `tpm-gym train`, `train/evaluate.py` is `tpm-gym evaluate`.
 """
 
 
 def page(records: Sequence[Record], figures: Sequence[str]) -> str:
-    """Return the page as Markdown.
-
-    Args:
-        records: What ``results.condense`` gave, one a run.
-        figures: Names of the figures in images/.
-    """
+    """Return the page as Markdown."""
     plain = [r for r in records if r["goals"] == "sampled" and r["penalty_weight"] == 1.0]
     tempted = [r for r in records if r["goals"] == "tempting"]
     parts = [_INTRO, *_training(plain, figures), *_penalty(tempted, figures), *_robustness(plain)]
@@ -206,8 +204,8 @@ def _penalty(records: Group, figures: Sequence[str]) -> list[str]:
         rows.append(" | ".join(cells))
     text = (
         "## Does the penalty work?\n\nTrained and tested on goals that tempt towards the "
-        "singularity (`--goals tempting`, see `train/tempting.py`): goals, and pucks, lie just "
-        "within the safe threshold, and straight lines in the joint angles lead beyond it. "
+        "singularity (`--goals tempting`): goals, and pucks, lie just within the safe threshold, "
+        "and straight lines in the joint angles lead beyond it. "
         f"{_episodes(records, [TEMPTING])} held-out episodes a seed.\n"
     )
     parts = [text, _table(head, rows), *_compared(records)]
@@ -315,7 +313,7 @@ def _table(head: str, rows: Sequence[str]) -> str:
 
 
 def _iqm(scores: Sequence[float]) -> str:
-    found = interquartile_mean_interval([scores])
+    found = interquartile_mean(scores)
     return f"{found.mean:.1%} [{found.low * 100:.1f}, {found.high * 100:.1f}]"
 
 

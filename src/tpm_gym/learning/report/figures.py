@@ -13,10 +13,21 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
-from tpm_gym.learning import figure_style
-from tpm_gym.learning.aggregate import LEARNED
+from tpm_gym.learning.estimates import LEARNED
+from tpm_gym.learning.figure_style import (
+    BLUE,
+    GREEN,
+    ORANGE,
+    OUTLINE,
+    PURPLE,
+    SKY,
+    VERMILLION,
+    WIDTH,
+    save,
+    style,
+)
 from tpm_gym.learning.provenance import write_whole
-from tpm_gym.learning.report_page import (
+from tpm_gym.learning.report.page import (
     LEARNING_CURVES,
     PENALTY,
     TEMPTING,
@@ -27,40 +38,36 @@ from tpm_gym.learning.report_page import (
 )
 
 _COLUMNS = 3
+_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
 
 
 def draw(records: Sequence[Record], folder: Path) -> list[Path]:
     """Draw what there are records for.
-
-    Args:
-        records: What ``results.condense`` gave, one a run.
-        folder: Where the figures go.
 
     Returns:
         The figures.
     """
     plain = [r for r in records if r["goals"] == "sampled" and r["penalty_weight"] == 1.0]
     tempted = [r for r in records if r["goals"] == "tempting" and TEMPTING in r["tests"]]
-    style = figure_style
     written = []
-    with style.style():
+    with style():
         if any(record["evaluations"]["steps"] for record in plain):
-            written.append(_save(style, learning_curves(plain, style), folder / LEARNING_CURVES))
+            written.append(_save(learning_curves(plain), folder / LEARNING_CURVES))
         if tempted:
-            written.append(_save(style, penalty(tempted, style), folder / PENALTY))
+            written.append(_save(penalty(tempted), folder / PENALTY))
     return written
 
 
-def _save(style: Any, figure: Figure, path: Path) -> Path:
-    write_whole(path, partial(style.save, figure))
+def _save(figure: Figure, path: Path) -> Path:
+    write_whole(path, partial(save, figure))
     return path
 
 
-def _panels(style: Any, count: int, title: str, height: float) -> tuple[Figure, list[Axes]]:
+def _panels(count: int, title: str, height: float) -> tuple[Figure, list[Axes]]:
     """A figure with some panels, row by row."""
     columns = min(_COLUMNS, count)
     rows = -(-count // columns)
-    figure = Figure(figsize=(style.WIDTH, height * rows + 0.5), layout="constrained")
+    figure = Figure(figsize=(WIDTH, height * rows + 0.5), layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(title, weight="bold")
     panels = figure.subplots(rows, columns, squeeze=False).ravel().tolist()
@@ -69,21 +76,16 @@ def _panels(style: Any, count: int, title: str, height: float) -> tuple[Figure, 
     return figure, panels[:count]
 
 
-def learning_curves(records: Sequence[Record], style: Any) -> Figure:
-    """Draw success against steps: a panel an id, a median and a band over seeds each method.
-
-    Args:
-        records: The runs.
-        style: The house style.
-    """
+def learning_curves(records: Sequence[Record]) -> Figure:
+    """Draw success against steps: a panel an id, a median and a band over seeds each method."""
     ids = sorted({record["env"] for record in records})
     names = sorted({method(record) for record in records})
-    colours = dict(zip(names, _colours(style), strict=False))
-    figure, panels = _panels(style, len(ids), "Success in the evaluations during training", 2.1)
+    colours = dict(zip(names, _COLOURS, strict=False))
+    figure, panels = _panels(len(ids), "Success in the evaluations during training", 2.1)
     for env_id, axes in zip(ids, panels, strict=True):
         for group in grouped(record for record in records if record["env"] == env_id):
             _draw_band(axes, group, colours[method(group[0])])
-        axes.axhline(LEARNED, color=style.OUTLINE, linewidth=0.6, linestyle=(0, (3, 2)))
+        axes.axhline(LEARNED, color=OUTLINE, linewidth=0.6, linestyle=(0, (3, 2)))
         axes.set_title(env_id)
         axes.set_xlim(left=0)  # a curve that starts later does so because of demonstrations
         axes.set_xlabel("environment steps")
@@ -127,19 +129,14 @@ def _draw_band(axes: Axes, group: Group, colour: str) -> None:
         axes.plot(steps, np.nanmedian(rows, axis=0), color=colour, label=label, linewidth=1.4)
 
 
-def penalty(records: Sequence[Record], style: Any) -> Figure:
-    """Draw success and time below safe by penalty weight: a dot a seed, a bar at the mean.
-
-    Args:
-        records: Runs on tempting goals, tested on them.
-        style: The house style.
-    """
+def penalty(records: Sequence[Record]) -> Figure:
+    """Draw success and time below safe by penalty weight: a dot a seed, a bar at the mean."""
     ids = sorted({record["env"] for record in records})
     title = "Goals that tempt towards the singularity, by penalty weight"
-    figure, panels = _panels(style, len(ids), title, 2.4)
+    figure, panels = _panels(len(ids), title, 2.4)
     metrics = {
-        "success_at_end": ("success", style.BLUE),
-        "unsafe_share": ("time below safe", style.VERMILLION),
+        "success_at_end": ("success", BLUE),
+        "unsafe_share": ("time below safe", VERMILLION),
     }
     for env_id, axes in zip(ids, panels, strict=True):
         groups = grouped(record for record in records if record["env"] == env_id)
@@ -169,7 +166,3 @@ def _weights(records: Sequence[Record]) -> list[str]:
     telling = [part for part in parts if len(set(part)) > 1]
     weights = [f"{record['penalty_weight']:g}" for record in records]
     return ["\n".join(labels) for labels in zip(weights, *telling, strict=True)]
-
-
-def _colours(style: Any) -> list[str]:
-    return [style.BLUE, style.VERMILLION, style.GREEN, style.PURPLE, style.ORANGE, style.SKY]

@@ -1,0 +1,348 @@
+"""The equations of the mechanism, in closed form, written once.
+
+The paper's frame O-xyz: origin in the middle of the base, base plane z = 0, z from the base towards
+the platform; metres and radians. The mechanism has two loops of coupling degree zero, so both
+problems reduce to intersecting circles. We solve those intersections as vectors and as
+``a cos + b sin = c``, not with the paper's half-angle forms (Eqs. 13 and 15), which break where
+``g_i = 0`` or ``theta_i = pi``.
+
+The functions of the first part compute with whatever their namespace ``ns`` does, see
+:mod:`tpm_gym.kinematics.namespaces`. Components (x, y, z or theta_1 to theta_3) are separate
+floats, arrays or tensors (...,), and signs of branches may be arrays that broadcast with them. They
+check nothing and raise nothing: beside a solution they return whether it is real, and the lengths
+from which :mod:`tpm_gym.kinematics.margins` explains why it is not.
+
+The second part is the first in plain floats, for one configuration at every time step, with errors:
+:func:`assemble`, :func:`posture` and :func:`evaluate`. Three finite floats are expected.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from typing import NamedTuple
+
+import numpy as np
+
+from tpm_gym.arrays import Vector
+from tpm_gym.errors import SingularityError, UnreachableError
+from tpm_gym.kinematics import margins
+from tpm_gym.kinematics.geometry import Geometry
+from tpm_gym.kinematics.modes import AssemblyMode, WorkingMode
+from tpm_gym.kinematics.namespaces import NUMPY, PLAIN, Namespace, Numbers
+
+__all__ = [
+    "SINGULAR",
+    "Assembly",
+    "Factors",
+    "Triple",
+    "arms",
+    "assemble",
+    "assembly_at",
+    "conditioning",
+    "evaluate",
+    "factors",
+    "no_assembly",
+    "no_posture",
+    "posture",
+    "posture_at",
+    "rods",
+    "velocity",
+]
+
+ROUNDING = 64 * sys.float_info.epsilon
+"""Where two solutions merge, rounding alone can push a discriminant (always scaled to order one)
+below zero by a few units in the last place. Those are solutions, not misses."""
+SINGULAR = 1e-6
+"""A factor of det A below this cannot be told from zero: cos(beta) is known to about 1e-14, and
+where it is 1, sin(beta) to the square root of that only (y to 50 nm)."""
+
+Triple = tuple[Numbers, Numbers, Numbers]
+
+
+class Assembly(NamedTuple):
+    """The mechanism assembled at three actuated angles: P and C1 in m, and link 7's direction."""
+
+    x: Numbers
+    y: Numbers
+    z: Numbers
+    x_c: Numbers
+    z_c: Numbers
+    cos_beta: Numbers
+    sin_beta: Numbers
+
+
+class Factors(NamedTuple):
+    """The factors of det A (Eq. 16, corrected), of det B (Eq. 17, corrected), and one of neither.
+
+    Attributes:
+        level3: l1 + l3 c3 - xC - 2 l2, m.
+        planar: Zero where B1C1 and B2C2, projected on y = 0, line up, m^2.
+        leg1: B_1C_1 . dB_1/dtheta_1, m^2/rad: zero where the leg is stretched or folded.
+        elevation: z_C1 - z_B1, m: where it is zero, the rods of the 4S parallelogram no longer keep
+            link 3' from turning about y, a constraint singularity.
+    """
+
+    sin_beta: Numbers
+    level3: Numbers
+    planar: Numbers
+    cos_beta: Numbers
+    leg1: Numbers
+    leg2: Numbers
+    leg3: Numbers
+    elevation: Numbers
+
+
+# -- over any namespace ----------------------------------------------------------------------------
+
+
+def arms(theta: Triple, g: Geometry, ns: Namespace) -> tuple[Triple, Triple]:
+    """The arms A_iB_i in their planes: l3 cos(theta_i), and l3 sin(theta_i)."""
+    one, two, three = theta
+    cos, sin, l3 = ns.cos, ns.sin, g.l3
+    level = l3 * cos(one), l3 * cos(two), l3 * cos(three)
+    return level, (l3 * sin(one), l3 * sin(two), l3 * sin(three))
+
+
+def assembly_at(
+    cos: Triple, sin: Triple, planar: Numbers, side: Numbers, g: Geometry, ns: Namespace
+) -> tuple[Assembly, Numbers, tuple[Numbers, Numbers, Numbers, Numbers]]:
+    """Forward kinematics (Eqs. 6 to 11, corrected) for the signs of planar factor and sin(beta).
+
+    Eq. (6): C1 is on the circle about (0, z1) with radius^2 = l4^2 - y1^2 and on the circle about
+    (dx, z1 + dz) with radius l4. Of the two intersections, the one on the left of the line from the
+    first to the second centre has a positive planar factor.
+
+    Returns:
+        The assembly; whether it is real; and, for the margins, y1, the circles' distance^2, and
+        level and vertical from B3 to where C3 would be without link 7, m.
+    """
+    l4, l7 = g.l4, g.l7
+    y1, z1 = g.l1 + cos[0], sin[0]
+    dx, dz = cos[1] + (2 * g.l5 - g.l1), sin[1] - z1
+    distance2 = dx * dx + dz * dz
+    along = 0.5 - ns.over(0.5 * y1 * y1, distance2)
+    across2 = ns.over(l4 * l4 - y1 * y1, distance2) - along * along
+    # Both terms can be large against their difference; scale the tolerance by them.
+    meet = across2 >= -ROUNDING * (1 + along * along)
+    root = ns.root(across2)
+    across = planar * root
+    x_c, z_c = along * dx - across * dz, z1 + along * dz + across * dx
+    # Eqs. (9) and (10), with z_C3 = z_C + l6
+    u, w = x_c - (cos[2] + (g.l1 - 2 * g.l2)), z_c - (sin[2] - g.l6)
+    numerator, denominator = l4 * l4 - l7 * l7 - u * u - w * w, 2 * l7 * u
+    # Rounding in C1 grows as the inverse of the planar factor, and in cos(beta) again as that of u;
+    # the cap, 64, keeps what the clipped cosine leaves of a gap in rod 11 below l4 / 1e12.
+    blur = (1 + l4 * l4 / ns.maximum(distance2 * root, l4 * l4 / 63)) * (ROUNDING * l4 * l4)
+    real = meet & (abs(numerator) <= abs(denominator) + blur)
+    cos_beta = ns.clip(numerator / denominator)
+    sin_beta = side * ns.root((1 - cos_beta) * (1 + cos_beta))
+    x, y, z = x_c + l7 * cos_beta + g.l2, l7 * sin_beta, z_c + 2 * g.l6  # Eq. (11)
+    return Assembly(x, y, z, x_c, z_c, cos_beta, sin_beta), real, (y1, distance2, u, w)
+
+
+def posture_at(
+    point: Triple, signs: tuple[Numbers, Numbers, Numbers, Numbers], g: Geometry, ns: Namespace
+) -> tuple[
+    Triple, Numbers, tuple[Numbers, Numbers, Numbers, Numbers], tuple[Triple, Triple, Triple]
+]:
+    """Inverse kinematics (Eqs. 12 to 15, corrected) for the signs of a working mode, in its order.
+
+    Returns:
+        theta_1 and theta_3 in (-pi, pi], theta_2 in [0, 2 pi): arms 1 and 3 point inwards at pi,
+        arm 2 at 0. Whether they are real. xC, zC, cos(beta) and sin(beta). For the margins,
+        C_i - A_i of each leg, m: level and vertical in the arm's plane, and out of it.
+    """
+    x, y, z = point
+    side, bend1, bend2, bend3 = signs
+    l1 = g.l1
+    sin_beta = y / g.l7
+    squared = (1 - sin_beta) * (1 + sin_beta)
+    cos_beta = side * ns.root(squared)
+    x_c, z_c = x - g.l2 - g.l7 * cos_beta, z - 2 * g.l6
+    a1, a2, a3, b3 = -l1, x_c + l1 - 2 * g.l5, x + g.l2 - l1, z - g.l6
+    fold1, real1 = _fold(a1, z_c, x_c, g, ns)
+    fold2, real2 = _fold(a2, z_c, 0.0, g, ns)
+    fold3, real3 = _fold(a3, b3, y, g, ns)
+    # The serial factor BC . dB/dtheta is l3 (b cos - a sin), so its sign tells two angles apart.
+    arctan2 = ns.arctan2
+    theta_2 = arctan2(z_c, a2) - bend2 * fold2
+    theta = (
+        ns.wrap(arctan2(z_c, a1) - bend1 * fold1),
+        ns.where(theta_2 < 0, theta_2 + 2 * math.pi, theta_2),
+        ns.wrap(arctan2(b3, a3) - bend3 * fold3),
+    )
+    real = (squared >= -ROUNDING) & real1 & real2 & real3
+    legs = (a1, z_c, x_c), (a2, z_c, 0.0), (a3, b3, y)
+    return theta, real, (x_c, z_c, cos_beta, sin_beta), legs
+
+
+def _fold(
+    a: Numbers, b: Numbers, out: Numbers, g: Geometry, ns: Namespace
+) -> tuple[Numbers, Numbers]:
+    """The arm's angle to its leg's span, of |C - A - l3 e(theta)| = l4; whether the leg reaches."""
+    l3, l4 = g.l3, g.l4
+    radius2 = a * a + b * b
+    ratio = (radius2 + out * out + (l3 * l3 - l4 * l4)) / (2 * l3 * ns.sqrt(radius2))
+    reaches = abs(ratio) <= 1 + ROUNDING  # not where it is NaN, from lengths without end
+    return ns.arccos(ns.clip(ratio)), reaches
+
+
+def rods(cos: Triple, sin: Triple, found: Assembly, g: Geometry) -> tuple[Triple, Triple, Triple]:
+    """The vectors B_iC_i, m."""
+    x, y, _, x_c, z_c, _, _ = found
+    return (
+        (x_c, -g.l1 - cos[0], z_c - sin[0]),
+        (x_c - 2 * g.l5 + g.l1 - cos[1], 0.0, z_c - sin[1]),
+        (x + g.l2 - g.l1 - cos[2], y, z_c + g.l6 - sin[2]),
+    )
+
+
+def factors(
+    cos: Triple, sin: Triple, found: Assembly, bars: tuple[Triple, Triple, Triple], g: Geometry
+) -> Factors:
+    """What vanishes where the configuration is singular, from its arms and rods."""
+    (r1x, r1y, r1z), (r2x, _, r2z), (r3x, _, r3z) = bars
+    # Arm 1 turns in the yz plane, arms 2 and 3 in the xz plane.
+    return Factors(
+        found.sin_beta,
+        g.l7 * found.cos_beta - r3x,
+        r1x * r2z - r1z * r2x,
+        found.cos_beta,
+        r1z * cos[0] - r1y * sin[0],
+        r2z * cos[1] - r2x * sin[1],
+        r3z * cos[2] - r3x * sin[2],
+        r1z,
+    )
+
+
+def velocity(bars: tuple[Triple, Triple, Triple], values: Factors) -> tuple[Triple, Triple, Triple]:
+    """Rows of the velocity Jacobian J, v = J theta_dot, m/rad.
+
+    The closures are solved for the rates of xC, zC and l7 beta, whose matrix has the determinant
+    l7 sin(beta) level3 planar; J exists at the serial singularities too.
+    """
+    sin_beta, level3, planar, cos_beta, leg1, leg2, leg3, _ = values
+    (r1x, _, r1z), (r2x, _, r2z), (r3x, _, r3z) = bars
+    # For a unit rate of motors 1 and 2; motor 3 moves link 7 alone.
+    x1, x2 = r2z * leg1 / planar, -r1z * leg2 / planar
+    z1, z2 = -r2x * leg1 / planar, r1x * leg2 / planar
+    k = sin_beta * level3
+    turn1, turn2, turn3 = -(r3x * x1 + r3z * z1) / k, -(r3x * x2 + r3z * z2) / k, leg3 / k
+    return (
+        (x1 - sin_beta * turn1, x2 - sin_beta * turn2, -sin_beta * turn3),
+        (cos_beta * turn1, cos_beta * turn2, cos_beta * turn3),
+        (z1, z2, 0.0),
+    )
+
+
+def conditioning(rows: tuple[Triple, Triple, Triple], ns: Namespace) -> Numbers:
+    """Smallest over largest singular value, s3 / s1, of a matrix (3, 3).
+
+    The cofactors have s1 s2 as their largest singular value, and |det| = s1 s2 s3; the smallest
+    one, as the root of the smallest eigenvalue of J J^T, would lose half of its digits. Where the
+    two largest nearly coincide, the result is good to 1e-9 only.
+    """
+    (a, b, c), (d, e, f), (g, h, i) = rows
+    first = (e * i - f * h, f * g - d * i, d * h - e * g)
+    second = (h * c - i * b, i * a - g * c, g * b - h * a)
+    third = (b * f - c * e, c * d - a * f, a * e - b * d)
+    determinant = a * first[0] + b * first[1] + c * first[2]
+    scale = _largest_singular_value(rows, ns) * _largest_singular_value((first, second, third), ns)
+    return ns.clip(abs(determinant) / ns.nonzero(scale))
+
+
+def _largest_singular_value(rows: tuple[Triple, Triple, Triple], ns: Namespace) -> Numbers:
+    """From the trigonometric roots of the characteristic polynomial of M M^T."""
+    (a, b, c), (d, e, f), (g, h, i) = rows
+    xx, yy, zz = a * a + b * b + c * c, d * d + e * e + f * f, g * g + h * h + i * i
+    xy, xz, yz = a * d + b * e + c * f, a * g + b * h + c * i, d * g + e * h + f * i
+    mean = (xx + yy + zz) / 3
+    p, q, r = xx - mean, yy - mean, zz - mean
+    spread = ns.root((p * p + q * q + r * r + 2 * (xy * xy + xz * xz + yz * yz)) / 6)
+    half = p * (q * r - yz * yz) - xy * (xy * r - yz * xz) + xz * (xy * yz - q * xz)
+    turn = ns.arccos(ns.clip(half / ns.nonzero(ns.cube(spread)) / 2)) / 3
+    return ns.sqrt(mean + 2 * spread * ns.cos(turn))
+
+
+# -- one configuration in plain floats, with errors ------------------------------------------------
+
+
+def assemble(theta: Vector, branch: AssemblyMode, geometry: Geometry) -> Assembly:
+    """Forward kinematics on one branch (Eqs. 6 to 11, corrected), at theta (3) rad.
+
+    Raises:
+        UnreachableError: If the branch does not exist at theta.
+    """
+    cos, sin = arms(theta, geometry, PLAIN)
+    return _assembled(theta, cos, sin, branch, geometry)
+
+
+def _assembled(
+    theta: Vector, cos: Triple, sin: Triple, branch: AssemblyMode, geometry: Geometry
+) -> Assembly:
+    try:
+        found, real, _ = assembly_at(cos, sin, branch.planar, branch.sin_beta, geometry, PLAIN)
+    except ZeroDivisionError:  # concentric circles, or link 7 beside B3
+        real = False
+    if not real:
+        raise no_assembly(theta, branch, geometry)
+    return found
+
+
+def posture(point: Vector, branch: WorkingMode, geometry: Geometry) -> Vector:
+    """Inverse kinematics on one branch (Eqs. 12 to 15, corrected), for point P (3) m.
+
+    Returns:
+        (3) rad; theta_1 and theta_3 in (-pi, pi], theta_2 in [0, 2 pi).
+
+    Raises:
+        UnreachableError: If the branch does not exist at the point.
+    """
+    signs = branch.cos_beta, branch.leg1, branch.leg2, branch.leg3
+    try:
+        theta, real, _, _ = posture_at(point, signs, geometry, PLAIN)
+    except ZeroDivisionError:  # a rod's end at the pivot
+        real = False
+    if not real:
+        raise no_posture(point, branch, geometry)
+    return theta
+
+
+def evaluate(
+    theta: Vector, branch: AssemblyMode, geometry: Geometry
+) -> tuple[Assembly, tuple[Vector, Vector, Vector], float]:
+    """The assembly, the rows of J (m/rad) and the conditioning 1/cond(J), at theta (3) rad.
+
+    Raises:
+        UnreachableError: If the branch does not exist at theta.
+        SingularityError: If theta is a parallel singularity.
+    """
+    cos, sin = arms(theta, geometry, PLAIN)
+    found = _assembled(theta, cos, sin, branch, geometry)
+    bars = rods(cos, sin, found, geometry)
+    values = factors(cos, sin, found, bars, geometry)
+    for name, value in margins.parallel_factors(values[:3], geometry).items():
+        if abs(value) < SINGULAR:
+            raise SingularityError(name, value)
+    rows = velocity(bars, values)
+    return found, rows, conditioning(rows, PLAIN)
+
+
+def no_assembly(theta: Vector, branch: AssemblyMode, geometry: Geometry) -> UnreachableError:
+    """Why a branch cannot be assembled at theta (3) rad."""
+    with np.errstate(all="ignore"):
+        cos, sin = arms(tuple(map(np.float64, theta)), geometry, NUMPY)
+        _, _, lengths = assembly_at(cos, sin, branch.planar, branch.sin_beta, geometry, NUMPY)
+    y1, distance2, level, vertical = map(float, lengths)
+    return margins.no_assembly(
+        theta, branch, geometry, (y1, math.sqrt(distance2)), (level, vertical)
+    )
+
+
+def no_posture(point: Vector, branch: WorkingMode, geometry: Geometry) -> UnreachableError:
+    """Why a point (3) m has no posture on a branch."""
+    signs = branch.cos_beta, branch.leg1, branch.leg2, branch.leg3
+    with np.errstate(all="ignore"):
+        _, _, _, legs = posture_at(tuple(map(np.float64, point)), signs, geometry, NUMPY)
+    return margins.no_posture(point, branch, geometry, legs)

@@ -1,0 +1,189 @@
+"""What the equations are computed with: plain floats, numpy arrays, or torch tensors.
+
+:mod:`tpm_gym.kinematics.equations` stands once, over a :class:`Namespace`: for one configuration at
+every time step, where numpy's calls cost ten times what they compute; for batches; and for
+gradients and GPUs.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tpm_gym.arrays import FloatArray, is_tensor
+
+__all__ = ["NUMPY", "PLAIN", "Namespace", "Numbers", "by_rows", "namespace_of"]
+
+Numbers = Any
+"""A float, an array (...,) or a tensor (...,): what a namespace computes with."""
+_One = Callable[[Any], Any]
+_TURN = 2 * math.pi
+_BLOCK = 2048  # rows of arrays computed at a time, so that what is between stays in the cache
+
+
+@dataclass(frozen=True)
+class Namespace:
+    """Functions of one kind of numbers, elementwise.
+
+    Attributes:
+        over: The quotient. In numpy by way of the reciprocal, so that results, and with them the
+            postures in which simulations begin, keep the last bits they have always had.
+        root: The square root; 0 for negative numbers.
+        clip: The nearest number in [-1, 1].
+        arcsin: Of the clipped number.
+        wrap: An angle within a turn of it, in (-pi, pi].
+        nonzero: 1 in place of 0.
+        signs: Of a shape, as numbers like those that are given: -1 and 1.
+        stack: Components (...,), joined along a new last axis.
+    """
+
+    cos: _One
+    sin: _One
+    arctan2: Callable[[Any, Any], Any]
+    over: Callable[[Any, Any], Any]
+    sqrt: _One
+    root: _One
+    clip: _One
+    arccos: _One
+    arcsin: _One
+    maximum: Callable[[Any, float], Any]
+    where: Callable[[Any, Any, Any], Any]
+    wrap: _One
+    nonzero: _One
+    cube: _One
+    signs: Callable[[Any, tuple[int, ...]], Any]
+    stack: Callable[[Sequence[Any]], Any]
+
+
+def namespace_of(value: object) -> Namespace:
+    """The namespace for arrays like this one."""
+    return _torch() if is_tensor(value) else NUMPY
+
+
+def _clip(x: float) -> float:
+    return -1.0 if x < -1.0 else 1.0 if x > 1.0 else x
+
+
+def _wrap(angle: float) -> float:
+    if angle > math.pi:
+        return angle - _TURN
+    return angle + _TURN if angle <= -math.pi else angle
+
+
+PLAIN = Namespace(
+    cos=math.cos,
+    sin=math.sin,
+    arctan2=math.atan2,
+    over=operator.truediv,
+    sqrt=math.sqrt,
+    root=lambda x: math.sqrt(x) if x > 0.0 else 0.0,
+    clip=_clip,
+    arccos=math.acos,
+    arcsin=lambda x: math.asin(_clip(x)),
+    maximum=lambda x, least: x if x > least else least,
+    where=lambda condition, one, other: one if condition else other,
+    wrap=_wrap,
+    nonzero=lambda x: x or 1.0,
+    cube=lambda x: x**3,
+    signs=lambda like, shape: (-1, 1),
+    stack=tuple,
+)
+
+NUMPY = Namespace(
+    cos=np.cos,
+    sin=np.sin,
+    arctan2=np.arctan2,
+    over=lambda a, b: a * (1 / b),
+    sqrt=np.sqrt,
+    root=lambda x: np.sqrt(np.maximum(x, 0.0)),
+    clip=lambda x: np.minimum(np.maximum(x, -1.0), 1.0),
+    arccos=np.arccos,
+    arcsin=lambda x: np.arcsin(np.clip(x, -1.0, 1.0)),
+    maximum=np.maximum,
+    where=np.where,
+    wrap=lambda x: x + _TURN * (x <= -math.pi) - _TURN * (x > math.pi),
+    nonzero=lambda x: np.where(x == 0, 1.0, x),
+    cube=lambda x: x * x * x,  # its power of 3 costs 20 times as much
+    signs=lambda like, shape: np.array([-1.0, 1.0]).reshape(shape),
+    stack=lambda columns: np.stack(columns, axis=-1),
+)
+
+
+@cache
+def _torch() -> Namespace:
+    """For tensors.
+
+    Where a derivative is infinite it is 0, or those of other branches would become NaN.
+    """
+    import torch  # here, since whoever has no tensor may have no torch
+
+    def like(x: Any, other: Any) -> Any:
+        return torch.as_tensor(x, dtype=other.dtype, device=other.device)
+
+    def root(x: Any) -> Any:
+        none = x <= 0
+        return torch.where(none, 0.0, torch.where(none, 1.0, x).sqrt())
+
+    def arccos(x: Any) -> Any:
+        end = abs(x) >= 1
+        return torch.where(end, like(math.pi, x) * (x < 0), torch.where(end, 0.0, x).arccos())
+
+    def wrap(x: Any) -> Any:
+        return torch.where(x > math.pi, x - _TURN, torch.where(x <= -math.pi, x + _TURN, x))
+
+    return Namespace(
+        cos=torch.cos,
+        sin=torch.sin,
+        arctan2=lambda y, x: torch.arctan2(y, like(x, y)),
+        over=operator.truediv,
+        sqrt=torch.sqrt,
+        root=root,
+        clip=lambda x: torch.clip(x, -1.0, 1.0),
+        arccos=arccos,
+        arcsin=lambda x: math.pi / 2 - arccos(x),
+        maximum=lambda x, least: torch.clip(x, min=least),
+        where=torch.where,
+        wrap=wrap,
+        nonzero=lambda x: torch.where(x == 0, 1.0, x),
+        cube=lambda x: x * x * x,
+        signs=lambda other, shape: like([-1.0, 1.0], other).reshape(shape),
+        stack=lambda columns: torch.stack(list(columns), -1),
+    )
+
+
+def by_rows(
+    text: Callable[[tuple[Numbers, Numbers, Numbers], Namespace], Sequence[Numbers]],
+    points: FloatArray,
+    *layouts: NDArray[np.intp],
+) -> list[FloatArray]:
+    """Compute columns (n,) for points (..., 3), and lay them out.
+
+    Args:
+        text: From components (n,) to columns (n,).
+        points: An array, or a tensor.
+        layouts: Numbers of columns, in the shape of a result.
+
+    Returns:
+        For each layout, (..., *layout.shape).
+    """
+    ns, shape = namespace_of(points), points.shape[:-1]
+    flat = points.reshape(-1, 3)
+    if ns is not NUMPY:
+        table = ns.stack(text((flat[:, 0], flat[:, 1], flat[:, 2]), ns))
+        return [table[:, layout].reshape((*shape, *layout.shape)) for layout in layouts]
+    results = [np.empty((len(flat), *layout.shape)) for layout in layouts]
+    with np.errstate(all="ignore"):
+        for start in range(0, len(flat), _BLOCK):
+            rows = slice(start, start + _BLOCK)
+            x, y, z = np.ascontiguousarray(flat[rows].T)
+            table = np.ascontiguousarray(np.array(text((x, y, z), ns)).T)
+            for result, layout in zip(results, layouts, strict=True):
+                np.take(table, layout, axis=1, out=result[rows], mode="clip")
+    return [result.reshape((*shape, *result.shape[1:])) for result in results]

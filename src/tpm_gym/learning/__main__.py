@@ -1,0 +1,20 @@
+"""``python -m tpm_gym.learning`` is the command ``tpm-gym``."""
+
+from __future__ import annotations
+
+import sys
+
+
+def main() -> None:
+    """Run the command line, or say what it needs to be installed."""
+    try:
+        from tpm_gym.learning import command_line
+    except ModuleNotFoundError as error:
+        from tpm_gym.errors import MissingPackageError
+
+        sys.exit(f"error: {MissingPackageError(str(error.name), 'train')}")
+    command_line.main()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,164 @@
+"""The algorithms: all that the code knows about one is its row in the table, and its recipes.
+
+A row and ``train/recipes/<name>.yml`` are what it takes to train, resume, evaluate, export and
+study with another algorithm of Stable-Baselines3; an argument that none had before is an entry.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+
+from pydantic import Field, ValidationError, WrapValidator
+from typing_extensions import Required, TypedDict
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
+
+
+def _says(description: str) -> WrapValidator:
+    """Say what an entry has to be, where its types would say it in several messages."""
+
+    def check(value: Any, validate: Callable[[Any], Any]) -> Any:
+        try:
+            return validate(value)
+        except ValidationError as error:
+            raise ValueError(f"must be {description}") from error
+
+    return WrapValidator(check)
+
+
+_keys: Any = TypedDict  # made from tables, which no type checker follows
+
+_COUNT: Final[Any] = Annotated[int, Field(gt=0)]
+_NATURAL: Final[Any] = Annotated[int, Field(ge=0)]
+_POSITIVE: Final[Any] = Annotated[float, Field(gt=0)]
+_NOT_NEGATIVE: Final[Any] = Annotated[float, Field(ge=0)]
+_FRACTION: Final[Any] = Annotated[float, Field(gt=0, le=1)]
+_NUMBER: Final = r"(\d*\.\d*[1-9]\d*|\d*[1-9]\d*\.?\d*)(e-?\d+)?"  # positive, as text
+
+_POLICY_ENTRIES: Final[Mapping[str, Any]] = {
+    "net_arch": Annotated[
+        list[_COUNT] | dict[Literal["pi", "qf", "vf"], list[_COUNT]],
+        _says("a list of positive integers, or one for each of pi, qf, vf"),
+    ],
+    "log_std_init": float,
+    "ortho_init": bool,
+    "n_critics": _COUNT,
+    "n_quantiles": _COUNT,
+    "features_extractor_class": Literal["GoalGapExtractor"],
+    "features_extractor_kwargs": _keys("Extractor", {"unit": _POSITIVE}, total=False),
+}
+_ENTRIES: Final[Mapping[str, Any]] = {
+    "learning_rate": Annotated[
+        _POSITIVE | Annotated[str, Field(pattern=f"^lin_{_NUMBER}$")],
+        _says("a positive number, or lin_<start> to fall linearly to zero"),
+    ],
+    "gamma": _FRACTION,
+    "batch_size": _COUNT,
+    "buffer_size": _COUNT,
+    "learning_starts": _NATURAL,
+    "tau": _FRACTION,
+    "train_freq": _COUNT,
+    "gradient_steps": Annotated[
+        _COUNT | Literal[-1], _says("a positive integer, or -1 for as many as steps were taken")
+    ],
+    "ent_coef": _NOT_NEGATIVE,
+    "target_entropy": Annotated[float | Literal["auto"], _says("auto or a number")],
+    "target_update_interval": _COUNT,
+    "top_quantiles_to_drop_per_net": _NATURAL,
+    "n_steps": _COUNT,
+    "n_epochs": _COUNT,
+    "gae_lambda": _FRACTION,
+    "clip_range": _POSITIVE,
+    "vf_coef": _NOT_NEGATIVE,
+    "max_grad_norm": _POSITIVE,
+    "normalize_advantage": bool,
+    "target_kl": _POSITIVE,
+    "replay_buffer_class": Literal["HerReplayBuffer"],
+    "replay_buffer_kwargs": _keys(
+        "Hindsight",
+        {
+            "n_sampled_goal": _COUNT,
+            "goal_selection_strategy": Literal["future", "final", "episode"],
+        },
+        total=False,
+    ),
+}
+_LEARNED_ENTROPY: Final[Any] = Annotated[
+    _NOT_NEGATIVE | Annotated[str, Field(pattern=f"^auto(_{_NUMBER})?$")],
+    _says("auto, auto_<start>, or a number of at least 0"),
+]
+_DEMONSTRATIONS: Final[Any] = _keys(
+    "Demonstrations", {"episodes": Required[_COUNT], "noise": _NOT_NEGATIVE}, total=False
+)
+
+
+@dataclass(frozen=True)
+class Actor:
+    """Where a policy computes its mean action, as an export takes it.
+
+    Attributes:
+        features: Attribute of the policy, dotted: the features extractor.
+        hidden: The layers between; a sequence of modules.
+        last: The last layer.
+        output: What is done with its output: ``tanh`` or ``clip``.
+    """
+
+    features: str
+    hidden: str
+    last: str
+    output: str
+
+
+_SQUASHED: Final = Actor("actor.features_extractor", "actor.latent_pi", "actor.mu", "tanh")
+_CLIPPED: Final = Actor("pi_features_extractor", "mlp_extractor.policy_net", "action_net", "clip")
+
+
+@dataclass(frozen=True)
+class Algorithm:
+    """One algorithm.
+
+    Attributes:
+        path: Its class, as ``module:name``.
+        actor: What an export takes.
+    """
+
+    path: str
+    actor: Actor
+
+    def load_class(self) -> type[BaseAlgorithm]:
+        """Return the class; this imports PyTorch."""
+        module, _, name = self.path.partition(":")
+        found: type[BaseAlgorithm] = getattr(importlib.import_module(module), name)
+        return found
+
+    def entries(self) -> Any:
+        """Return the type of a recipe: of the entries above, those that the constructors take."""
+        kind: Any = self.load_class()
+        arguments = inspect.signature(kind).parameters
+        policy = inspect.signature(kind.policy_aliases["MultiInputPolicy"]).parameters
+        found = {name: entry for name, entry in _ENTRIES.items() if name in arguments}
+        if "ent_coef" in found and isinstance(arguments["ent_coef"].default, str):
+            found["ent_coef"] = _LEARNED_ENTROPY
+        if "replay_buffer_class" in arguments:
+            found["demonstrations"] = _DEMONSTRATIONS
+        inner = {name: entry for name, entry in _POLICY_ENTRIES.items() if name in policy}
+        found |= {
+            "n_timesteps": Required[_COUNT],
+            "n_envs": _COUNT,
+            "policy": Required[Literal["MultiInputPolicy"]],
+            "policy_kwargs": _keys("Policy", inner, total=False),
+        }
+        return _keys("Recipe", found, total=False)
+
+
+ALGORITHMS: Final[dict[str, Algorithm]] = {
+    "sac": Algorithm("stable_baselines3:SAC", _SQUASHED),
+    "tqc": Algorithm("sb3_contrib:TQC", _SQUASHED),
+    "ppo": Algorithm("stable_baselines3:PPO", _CLIPPED),
+}
+NAMES: Final = ", ".join(ALGORITHMS)

@@ -1,0 +1,101 @@
+"""The command ``tpm-gym``."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from tyro.conf import OmitSubcommandPrefixes, Positional, subcommand
+
+from tpm_gym import TPMError
+from tpm_gym.learning.configuration import ResumeConfig, TrainingConfig
+from tpm_gym.learning.evaluation import EvaluationConfig
+from tpm_gym.learning.report.records import Collect, Write
+from tpm_gym.learning.study import StudyConfig
+
+
+@dataclass(frozen=True)
+class ExportConfig:
+    """Export a trained policy as safetensors and JSON, which load without trust."""
+
+    model: Positional[Path]
+    """A .zip file of a training, in its run folder."""
+
+    out: Positional[Path]
+    """What the two new files have in common; earlier ones are replaced."""
+
+    trust_pickle: bool = False
+    """Load the .zip file, which can run any code that is in it."""
+
+
+@dataclass(frozen=True)
+class ReportConfig:
+    """Condense runs into records, or write the page of results from them."""
+
+    action: OmitSubcommandPrefixes[
+        Annotated[Collect, subcommand("collect")] | Annotated[Write, subcommand("write")]
+    ]
+
+
+Command = (
+    Annotated[TrainingConfig, subcommand("train")]
+    | Annotated[ResumeConfig, subcommand("resume")]
+    | Annotated[EvaluationConfig, subcommand("evaluate")]
+    | Annotated[ExportConfig, subcommand("export")]
+    | Annotated[StudyConfig, subcommand("study")]
+    | Annotated[ReportConfig, subcommand("report")]
+)
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Run a command line, by default that of the process, and exit with its status.
+
+    A command that a signal has stopped exits with 128 and its number, as shells do.
+    """
+    about = "Train policies on the environments of tpm_gym, and evaluate them."
+    command: Any = tyro.cli(Command, prog="tpm-gym", description=about, args=words)
+    try:
+        stopped_by = _run(command)
+    except TPMError as error:
+        sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        stopped_by = signal.SIGINT
+    if stopped_by is not None:
+        sys.exit(128 + stopped_by)
+
+
+def _run(command: Any) -> signal.Signals | None:
+    """Run a command, importing what it needs; return the signal that stopped it, if one did."""
+    match command:
+        case TrainingConfig():
+            from tpm_gym.learning.training import train
+
+            return train(command)
+        case ResumeConfig():
+            from tpm_gym.learning.training import resume
+
+            return resume(command)
+        case EvaluationConfig():
+            from tpm_gym.learning.evaluation import evaluate
+
+            evaluate(command)
+        case ExportConfig():
+            from tpm_gym.learning.export import convert
+
+            print(convert(command.model, command.out, trust_pickle=command.trust_pickle))
+        case StudyConfig():
+            from tpm_gym.learning.study import study
+
+            study(command)
+        case ReportConfig():
+            from tpm_gym.learning.report.records import collect, write
+
+            action = command.action
+            written = collect(action) if isinstance(action, Collect) else write(action)
+            print(*written, sep="\n")
+    return None

@@ -1,0 +1,1 @@
+"""From runs to docs/results.md: what is kept of each run, the page and its figures."""

@@ -1,0 +1,294 @@
+"""Train a policy with Stable-Baselines3 and leave everything about the run in one folder.
+
+The run folder holds ``config.json`` (the full configuration, versions and seeds), ``progress.csv``
+and TensorBoard events, ``evaluations.jsonl`` and ``learning_curve.png``, ``checkpoints/``,
+``best.zip`` (the policy with the best periodic evaluation) and ``last.zip``, and both exported as
+safetensors. A run that was stopped or killed goes on from its last checkpoint. Ctrl-C saves a
+checkpoint and stops; a second one leaves at once.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+from contextlib import ExitStack
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+
+from tpm_gym.learning import provenance
+from tpm_gym.learning.algorithms import ALGORITHMS
+from tpm_gym.learning.checkpoint import CheckpointStore, Content
+from tpm_gym.learning.configuration import (
+    UNSET,
+    ResumeConfig,
+    TrainingConfig,
+    complete,
+    resumed,
+)
+from tpm_gym.learning.environments import check_env_id, make_env
+from tpm_gym.learning.errors import PolicyError, RunError
+from tpm_gym.learning.rollout import SELECTION_SEED
+from tpm_gym.learning.run_folder import (
+    BEST_FILE,
+    CHECKPOINTS,
+    CONFIG_FILE,
+    LAST_FILE,
+    claimed,
+    clear,
+    description,
+    disk_errors_named,
+    holds_policy,
+    is_finished,
+    prepare,
+)
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
+    from stable_baselines3.common.callbacks import BaseCallback
+    from stable_baselines3.common.vec_env import VecEnv
+
+    from tpm_gym.learning.callbacks import PeriodicEvaluation
+
+_CHANGEABLE = ("steps", "eval_every", "checkpoint_every", "threads", "device")
+
+
+def train(config: TrainingConfig, console: Console | None = None) -> signal.Signals | None:
+    """Train as configured and leave the run folder.
+
+    Args:
+        config: The configuration; what is not set in it is worked out.
+        console: Where progress is shown; by default the standard output.
+
+    Returns:
+        None when training went to its end; the signal that stopped it (Ctrl-C or SIGTERM), with a
+        checkpoint saved.
+
+    Raises:
+        LearningError: The configuration is not valid, or the run folder is taken or not writable.
+    """
+    console = console or Console()
+    config = complete(config)
+    prepare(config.run, config.overwrite)
+    store = CheckpointStore(config.run / CHECKPOINTS)
+    with disk_errors_named(config.run, store), claimed(config.run):
+        provenance.write_json(config.run / CONFIG_FILE, _description(config))
+        console.print(f"{config.title}, {config.steps:,} steps, in {config.run}", markup=False)
+        starts = int(config.recipe.arguments.get("learning_starts", 0))
+        if config.steps <= starts:
+            console.print(f"note: learning starts at step {starts:,}, so nothing will be learned")
+        return _learn(config, console, store, None)
+
+
+def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signals | None:
+    """Go on with a run from its last whole checkpoint.
+
+    One that was killed before its first checkpoint begins again; one that is finished stays as it
+    is, unless it is to take more steps.
+
+    Args:
+        console: Where progress is shown; by default the standard output.
+
+    Returns:
+        As for :func:`train`.
+
+    Raises:
+        LearningError: There is no such run, no whole checkpoint to resume it from although there is
+            a policy that beginning again would replace, or a change is not valid.
+    """
+    from tpm_gym.learning.training_state import restore_files
+
+    console = console or Console()
+    run = config.run
+    store = CheckpointStore(run / CHECKPOINTS)
+    if not run.is_dir():
+        raise RunError(f"there is no folder {run}; start a run with tpm-gym train")
+    with disk_errors_named(run, store), claimed(run):
+        stored = description(run)
+        if stored is not None and is_finished(run) and config.steps in (UNSET, stored["steps"]):
+            _say(console, f"nothing to do: {run} has finished its {stored['steps']:,} steps")
+            return None
+        content = store.load(lambda text: _say(console, f"warning: {text}"))
+        if content:
+            stored = json.loads(content.files[CONFIG_FILE])
+        elif stored is None:
+            raise RunError(f"{run} holds no run of tpm_gym; start one with tpm-gym train")
+        elif holds_policy(run):
+            raise RunError(
+                f"{run} holds a policy, but no checkpoint to go on from, and beginning again would "
+                "replace it; train into another --run, or here with tpm-gym train --overwrite"
+            )
+        step = content.step if content else 0
+        changed = resumed(config, stored, step)
+        if content:
+            restore_files(run, content)
+        else:
+            clear(run)
+        provenance.write_json(run / CONFIG_FILE, _description_resumed(changed, stored, step))
+        _say(console, f"{changed.title}, from step {step:,} to {changed.steps:,}, in {run}")
+        return _learn(changed, console, store, content)
+
+
+def _say(console: Console, text: str) -> None:
+    """Print a line as it is, however long."""
+    console.print(text, markup=False, soft_wrap=True)
+
+
+def _description(config: TrainingConfig) -> dict[str, Any]:
+    """Return what config.json records."""
+    return {
+        **config.record(),
+        "training_seeds": [config.seed, config.seed + config.envs - 1],
+        "evaluation_seeds": [SELECTION_SEED, SELECTION_SEED + config.eval_episodes - 1],
+        **provenance.origin(),
+    }
+
+
+def _description_resumed(
+    config: TrainingConfig, stored: dict[str, Any], step: int
+) -> dict[str, Any]:
+    """Return what config.json records of a resumed run: its beginning, and every resumption."""
+    resumption = {"from_step": step, **provenance.origin()}
+    return {
+        **stored,
+        **{name: getattr(config, name) for name in _CHANGEABLE},
+        "resumed": [*stored.get("resumed", []), resumption],
+    }
+
+
+def _learn(
+    config: TrainingConfig, console: Console, store: CheckpointStore, content: Content | None
+) -> signal.Signals | None:
+    """Build everything, learn from the beginning or from a checkpoint, and save.
+
+    Returns:
+        The signal that stopped the training, None if it went to its end; one that came too late
+        to stop it does not count.
+    """
+    import torch
+
+    from tpm_gym.learning.callbacks import (
+        Checkpointing,
+        PeriodicEvaluation,
+        ProgressBar,
+        SignalListener,
+        StopTrainingError,
+    )
+    from tpm_gym.learning.logger import make_logger
+
+    torch.set_num_threads(config.threads)
+    bar, listener = ProgressBar(console), SignalListener()
+    with ExitStack() as stack:
+        training_envs = make_training_envs(config)
+        stack.callback(training_envs.close)
+        evaluation_env = make_env(**_env_options(config))
+        stack.callback(evaluation_env.close)
+        stack.callback(bar.close)
+        model = make_model(config, training_envs)
+        logger = make_logger(config.run, None if content is None else content.step)
+        stack.callback(logger.close)
+        model.set_logger(logger)
+        keep = partial(_keep, config, console, BEST_FILE)
+        evaluation = PeriodicEvaluation(config, evaluation_env, console, keep)
+        seconds = _restore(model, evaluation, content, console) if content else 0.0
+        checkpointing = Checkpointing(config, store, evaluation, listener, console, seconds)
+        # Checkpointing sets the clock of those after it.
+        callbacks = [checkpointing, *_demonstrations(config), bar, evaluation]
+        stack.enter_context(listener.listening())
+        stopped_by = None
+        try:
+            steps = config.steps - model.num_timesteps
+            model.learn(steps, callback=callbacks, reset_num_timesteps=content is None)
+        except StopTrainingError:
+            stopped_by = listener.received
+        _keep(config, console, LAST_FILE, model)
+        if stopped_by is None:
+            checkpointing.save_finished()
+    _report(config.run, console, store, stopped_by)
+    return stopped_by
+
+
+def _restore(
+    model: BaseAlgorithm, evaluation: PeriodicEvaluation, content: Content, console: Console
+) -> float:
+    """Put everything back to a checkpoint; return the seconds that the run had trained."""
+    from tpm_gym.learning.training_state import restore
+
+    extra, notes = restore(model, content)
+    evaluation.restore(extra["evaluation"])
+    for note in notes:
+        _say(console, f"note: {note}; the run goes on, but not exactly as it would have")
+    return float(extra["seconds"])
+
+
+def _demonstrations(config: TrainingConfig) -> list[BaseCallback]:
+    """What fills the replay buffer before training starts, if the recipe asks for it."""
+    if not config.recipe.demonstrations:
+        return []
+    from tpm_gym.learning.demonstrations import Demonstrations
+
+    return [Demonstrations(**config.recipe.demonstrations)]
+
+
+def _keep(config: TrainingConfig, console: Console, name: str, model: BaseAlgorithm) -> None:
+    """Export a policy to the run folder and save it; what is saved is complete."""
+    from tpm_gym.learning.export import remove, save, save_archive
+
+    archive = config.run / name
+    path = archive.with_suffix("")
+    try:
+        save(model, path, env_id=config.env, seed=config.seed, recipe=asdict(config.recipe))
+    except PolicyError as error:
+        remove(path)
+        _say(console, f"warning: not exported: {error}")
+    save_archive(model, archive)
+
+
+def _report(
+    run: Path, console: Console, store: CheckpointStore, received: signal.Signals | None
+) -> None:
+    """Say in one line how the training ended, and how it can go on."""
+    if received is None:
+        _say(console, f"finished: {run}")
+    elif store.newest is None:
+        _say(console, f"stopped early by {received.name}, without a checkpoint: {run}")
+    else:
+        where = f"saved at step {store.newest:,}; continue with: tpm-gym resume {run}"
+        _say(console, f"stopped early by {received.name}, {where}")
+
+
+def make_model(config: TrainingConfig, envs: VecEnv) -> BaseAlgorithm:
+    """Build the algorithm of a completed configuration."""
+    kind: Any = ALGORITHMS[config.algo].load_class()
+    model: BaseAlgorithm = kind(
+        env=envs, seed=config.seed, device=config.device, **config.recipe.keywords()
+    )
+    return model
+
+
+def make_training_envs(config: TrainingConfig) -> VecEnv:
+    """Build the training environments, in processes of their own where there are several."""
+    from stable_baselines3.common.env_util import make_vec_env
+    from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+
+    from tpm_gym.learning.training_state import EpisodeRecorder
+
+    several = config.envs > 1
+    return make_vec_env(
+        make_env,
+        n_envs=config.envs,
+        seed=config.seed,
+        wrapper_class=EpisodeRecorder,
+        env_kwargs={**_env_options(config), "in_worker": several},
+        vec_env_cls=SubprocVecEnv if several else DummyVecEnv,
+    )
+
+
+def _env_options(config: TrainingConfig) -> dict[str, Any]:
+    """Which environment is trained and evaluated in, as arguments of :func:`make_env`."""
+    # Not the id: a process of its own may not have it registered.
+    spec = check_env_id(config.env)
+    return {"env": spec, "penalty_weight": config.penalty_weight, "goals": config.goals}

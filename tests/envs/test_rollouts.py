@@ -1,0 +1,40 @@
+"""Rollouts are those of the first version: to the bit, or near where a processor rounds otherwise.
+
+Their records are made by ``python tests/support/rollouts.py tests/data/rollouts.json``.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+from paths import ROOT
+from rollouts import cases, play
+
+from tpm_gym.tasks import Expert
+
+RECORDED = json.loads((ROOT / "tests" / "data" / "rollouts.json").read_text(encoding="utf-8"))
+FAST = {
+    ("TPMReach-v0", "random"),
+    ("TPMReachJoints-v0", "expert"),
+    ("TPMPickAndPlaceDense-v0", "expert"),
+    ("TPMPickAndPlaceJoints-v0", "published"),
+}
+
+
+def test_every_case_is_recorded_and_no_other() -> None:
+    assert set(RECORDED) == {f"{env_id} {name}" for env_id, name in cases()}
+    assert set(cases()) >= FAST
+
+
+def marked(case: tuple[str, str]) -> Any:
+    return pytest.param(*case, marks=[] if case in FAST else [pytest.mark.slow])
+
+
+@pytest.mark.parametrize(("env_id", "name"), [marked(case) for case in cases()])
+def test_rollouts_are_those_of_the_first_version(env_id: str, name: str) -> None:
+    found, recorded = play(env_id, name, Expert), RECORDED[f"{env_id} {name}"]
+    if found["sha256"] != recorded["sha256"]:
+        for key in ("returns", "gaps"):
+            assert found[key] == pytest.approx(recorded[key], rel=0, abs=1e-9)

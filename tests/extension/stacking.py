@@ -1,0 +1,78 @@
+"""Stack: a task with two objects, in one file outside the package."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+import tpm_gym
+from tpm_gym.arrays import FloatArray
+from tpm_gym.simulation import Block, Scene, State
+from tpm_gym.tasks import Entry, Expert, Move, Task, rewards, sampling
+
+CLEARANCE = 0.045  # m; a block that is carried passes over one that stands
+APART = 0.060  # m between the middles of what stands on the table
+
+
+class Stack(Task):
+    """Put the red block on the goal, and the blue one on top of it."""
+
+    red = Block("red", colour=(0.8, 0.1, 0.1, 1.0))
+    blue = Block("blue", height=0.036, mass=0.060, colour=(0.1, 0.2, 0.8, 1.0))
+    scene = Scene(objects=(red, blue), markers=2)
+    vacuum = True
+    goal_size = 6
+    tower = np.array([0.0, 0.0, (red.height + blue.height) / 2])
+
+    def sample(
+        self, rng: np.random.Generator, chosen: Mapping[str, FloatArray]
+    ) -> dict[str, FloatArray]:
+        """Blocks and goal stand on the table, apart from each other."""
+        mount, start = self.machine.mount, dict(chosen)
+        for name, block in (("red", self.red), ("blue", self.blue), ("goal", self.red)):
+            if name not in chosen:
+                others = [place[:3] + self.hanging(block) for place in start.values()]
+                taken = mount.to_paper(np.reshape(others, (-1, 3)))
+                table = self.on_table(block)
+                point = sampling.apart_from(taken, rng, self.machine, table, APART)
+                place = mount.to_world(point) - self.hanging(block)
+                start[name] = np.r_[place, place + self.tower] if name == "goal" else place
+        return start
+
+    def achieved(self, state: State) -> FloatArray:
+        """Middles of the two blocks."""
+        return state.object_position.reshape(*state.object_position.shape[:-2], 6)
+
+    def gap(self, achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
+        """That of the block that is farther from its place."""
+        ends = (np.reshape(goal, (*np.shape(goal)[:-1], 2, 3)) for goal in (achieved, desired))
+        largest: FloatArray = rewards.distance(*ends).max(axis=-1)
+        return largest
+
+    def shaping(self, state: State) -> dict[str, FloatArray]:
+        """Dense only: tilted blocks are dear, and so is an empty cup."""
+        if self.reward == "sparse":
+            return {}
+        tilt = np.linalg.norm(state.object_axis[..., :2], axis=-1).max(axis=-1)
+        return {"tilt": -tilt, "empty": -0.1 * (np.asarray(state.held) < 0)}
+
+    def observed(self) -> tuple[Entry, ...]:
+        """The robot, then each block."""
+        return (*self.robot_entries(), *self.object_entries(0), *self.object_entries(1))
+
+    def plan(self, expert: Expert) -> Iterator[Move]:
+        """Red to its place, blue on top of it, and up."""
+        up = np.array([0.0, 0.0, -CLEARANCE])  # z points down in the machine's frame
+        for block, goal in zip(self.scene.objects, expert.goal.reshape(2, 3), strict=True):
+            while not expert.holding(block.name):
+                yield from expert.pick(block, CLEARANCE)
+            grip = expert.seen["position"] - expert.seen[f"{block.name}_position"]
+            place = self.machine.mount.to_paper(goal + grip)
+            yield from expert.go([expert.command + up, place + up, place], vacuum=True)
+            yield from [Move(place, True), Move(place, True), Move(place, False)]
+            yield from expert.go([place + up], vacuum=False)
+
+
+IDS = tpm_gym.register_task("Stack", Stack, max_episode_steps=100)

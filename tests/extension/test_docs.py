@@ -1,0 +1,53 @@
+"""The code of docs/extending.md runs, and what it and CONTRIBUTING.md point at is there."""
+
+import pkgutil
+import re
+from unittest.mock import patch
+
+import gymnasium as gym
+import pytest
+from episodes import expert_episode
+from paths import ROOT
+
+import tpm_gym
+from tpm_gym.tasks.registry import TASKS
+
+PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+
+
+@pytest.mark.parametrize("code", BLOCKS, ids=["task", "machine", "engine"])
+def test_a_block_makes_an_environment_that_its_expert_solves(code):
+    with patch.dict(gym.registry), patch.dict(TASKS):
+        names = {"__name__": "extending"}
+        exec(code, names)
+        env = names["env"]
+        for seed in range(3):
+            *_, (_, reward, info) = expert_episode(env, seed)
+            assert info["is_success"]
+            assert sum(info["reward_terms"].values()) == pytest.approx(reward)
+        env.close()
+
+
+def test_the_table_counts_lines_as_they_are():
+    for name, lines in re.findall(r"`(\w+\.py)`, (\d+) lines", PAGE):
+        found = len((ROOT / "tests" / "extension" / name).read_text("utf-8").splitlines())
+        assert int(lines) == pytest.approx(found, abs=5), name
+
+
+@pytest.mark.parametrize("page", ["docs/extending.md", "CONTRIBUTING.md"])
+def test_links_lead_to_files_and_headings(page):
+    text = (ROOT / page).read_text(encoding="utf-8")
+    for path, heading in re.findall(r"\]\((?!http)([^)#]+)#?([^)]*)", text):
+        place = (ROOT / page).parent / path
+        assert place.exists(), path
+        if heading:
+            titles = re.findall(r"^## (.*)$", place.read_text(encoding="utf-8"), re.MULTILINE)
+            assert heading in [title.lower().replace(" ", "-") for title in titles]
+
+
+def test_the_table_of_rooms_has_all_rooms():
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    rooms = re.findall(r"`(\w+)`", " ".join(re.findall(r"^\| (`.*?) \|", text, re.MULTILINE)))
+    there = {module.name for module in pkgutil.iter_modules(tpm_gym.__path__)}
+    assert set(rooms) == there

@@ -1,0 +1,85 @@
+"""An engine that was written outside the package, and engines that are refused."""
+
+import gymnasium as gym
+import pytest
+from conformance import CHECKS
+from episodes import expert_episode
+from kinematic import KinematicEngine
+
+import tpm_gym
+from tpm_gym.errors import ConfigurationError
+from tpm_gym.simulation import Engine
+
+
+@pytest.fixture(params=["TPMReach-v0", "TPMPickAndPlaceJoints-v0"])
+def env(request):
+    env = gym.make(request.param, engine="kinematic")
+    yield env
+    env.close()
+
+
+@pytest.mark.parametrize("env_id", ["TPMReach-v0", "TPMPickAndPlaceJoints-v0"])
+@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
+def test_the_tasks_conform_on_it(check, env_id):
+    check(lambda: gym.make(env_id, engine="kinematic"))
+
+
+def test_the_expert_solves_the_tasks_on_it(env):
+    episodes = [list(expert_episode(env, seed)) for seed in range(20)]
+    assert [episode[-1][2]["is_success"] for episode in episodes] == [True] * 20
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("physics", {"time_step": 0.01}), ("renderer", "egl"), ("gui", True)],
+)
+def test_an_option_that_it_does_not_take_is_refused_by_name(option, value):
+    with pytest.raises(ConfigurationError, match=f"^{option} = .*'kinematic' has no such option"):
+        tpm_gym.simulation.Simulation(
+            tpm_gym.tasks.Reach.scene, engine="kinematic", **{option: value}
+        )
+
+
+def test_what_it_cannot_randomise_it_refuses_by_name():
+    env = tpm_gym.TPMEnv(engine="kinematic", randomisation={"link_mass": (0.9, 1.1)})
+    with pytest.raises(ConfigurationError, match="randomisation"):
+        env.reset(seed=0)
+    env.close()
+
+
+class Derived(Engine):
+    """Of the protocol, whose methods do nothing, and of no others."""
+
+    substeps, control_period = 1, 0.04
+
+
+@pytest.mark.parametrize(
+    ("engine", "lacking"),
+    [
+        (type("NoSave", (KinematicEngine,), {"save": None}), ["save"]),
+        (type("NoPeriod", (KinematicEngine,), {"control_period": None}), ["control_period"]),
+        (Derived, ["load", "advance", "close"]),
+    ],
+)
+def test_an_engine_that_lacks_a_part_is_refused_by_name(engine, lacking):
+    name = engine.__name__
+    tpm_gym.register_engine(name, engine)
+    with pytest.raises(ConfigurationError, match=f"engine = '{name}'") as caught:
+        tpm_gym.TPMEnv(engine=name)
+    for part in lacking:
+        assert part in caught.value.valid
+    assert "substeps" not in caught.value.valid
+
+
+def test_an_engine_of_another_period_is_refused():
+    tpm_gym.register_engine("slow", type("Slow", (KinematicEngine,), {"control_period": 0.1}))
+    with pytest.raises(ConfigurationError, match="control_period"):
+        tpm_gym.TPMEnv(engine="slow")
+
+
+def test_names_are_taken_once():
+    tpm_gym.register_engine("kinematic", KinematicEngine)
+    with pytest.raises(ConfigurationError, match="a name other than"):
+        tpm_gym.register_engine("pybullet", KinematicEngine)
+    with pytest.raises(ConfigurationError, match="'pybullet'"):
+        tpm_gym.TPMEnv(engine="mujoco2000")

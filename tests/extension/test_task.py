@@ -1,0 +1,139 @@
+"""A task that was written outside the package, with two objects."""
+
+import importlib
+import sys
+from unittest.mock import patch
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from conformance import CHECKS
+from episodes import expert_episode
+from stable_baselines3 import SAC, HerReplayBuffer
+
+import tpm_gym
+from tpm_gym.errors import ConfigurationError, ResetOptionError, UnreachableError
+from tpm_gym.mechanism import PAPER_TPM
+from tpm_gym.simulation import Block, Scene
+from tpm_gym.tasks.registry import TASKS
+
+IDS = ("TPMStack-v0", "TPMStackDense-v0", "TPMStackJoints-v0", "TPMStackJointsDense-v0")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def stacking():
+    """The task's file; what it registers is gone afterwards, for other tests count the ids."""
+    with patch.dict(gym.registry), patch.dict(TASKS):
+        sys.modules.pop("stacking", None)
+        yield importlib.import_module("stacking")
+
+
+@pytest.fixture
+def env():
+    env = gym.make("TPMStackDense-v0", render_mode="rgb_array")
+    yield env
+    env.close()
+
+
+def test_it_gets_ids_like_the_tasks_of_the_package(stacking):
+    assert stacking.IDS == IDS
+    assert set(IDS) <= set(tpm_gym.ENV_IDS)
+    with pytest.raises(ConfigurationError, match="another name"):
+        tpm_gym.register_task("Reach", stacking.Stack)
+
+
+@pytest.mark.parametrize("env_id", ["TPMStack-v0", "TPMStackJointsDense-v0"])
+@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
+def test_it_conforms(check, env_id):
+    check(lambda: gym.make(env_id))
+
+
+@pytest.mark.parametrize(
+    ("env_id", "machine"),
+    [("TPMStack-v0", "paper"), ("TPMStackJoints-v0", "paper"), ("TPMStack-v0", "wide")],
+)
+def test_its_expert_stacks(env_id, machine):
+    env = gym.make(env_id, machine=machine)
+    solved = 0
+    for seed in range(20):
+        *_, (observation, _, info) = expert_episode(env, seed, steps=100)
+        red, blue = np.split(observation["achieved_goal"], 2)
+        assert np.allclose(blue - red, [0.0, 0.0, 0.033], atol=0.004) or not info["is_success"]
+        solved += info["is_success"]
+    env.close()
+    assert solved == 20
+
+
+def test_its_own_terms_are_part_of_the_reward(env):
+    env.reset(seed=0)
+    _, reward, _, _, info = env.step(np.ones(4))
+    assert set(info["reward_terms"]) == {"goal", "singularity", "tilt", "empty"}
+    assert info["reward_terms"]["empty"] == -0.1
+    assert sum(info["reward_terms"].values()) == pytest.approx(reward)
+
+
+def test_the_worse_placed_block_decides(env):
+    task, place = env.unwrapped.task, np.array([0.0, -0.03, 0.015, 0.0, -0.03, 0.048])
+    both, red, blue = np.array([[1, 0, 0, 0, 1, 0], [1, 0, 0, 0, 0, 0], [0, 0, 0, 0, 1, 0]])
+    offsets = [0.009 * both, 0.011 * red, 0.011 * blue]
+    assert [bool(task.success(place + off, place)) for off in offsets] == [True, False, False]
+
+
+def test_users_place_the_blocks_by_name(env):
+    red, blue = (0.05, -0.03, 0.015), (-0.05, -0.03, 0.018)
+    env.reset(options={"red": red, "blue": blue})
+    assert np.allclose(env.unwrapped.state.object_position, [red, blue], atol=1e-6)
+    with pytest.raises(ResetOptionError, match="clear of blue"):
+        env.reset(options={"red": red, "blue": (0.06, -0.03, 0.018)})
+    with pytest.raises(ResetOptionError, match=r"'red', 'blue', 'goal'"):
+        env.reset(options={"object": red})
+    with pytest.raises(UnreachableError):  # each place for its own block
+        env.reset(options={"goal": (0.0, -0.03, 0.015, 0.0, -0.03, 0.015)})
+
+
+def test_the_blocks_are_drawn_in_their_colours(env):
+    env.reset(seed=0, options={"red": (0.05, -0.03, 0.015), "blue": (-0.05, -0.03, 0.018)})
+    r, g, b = env.render().astype(int).transpose(2, 0, 1)
+    assert ((r > 2 * b) & (r > 2 * g)).sum() > 100
+    assert ((b > 2 * r) & (b > 2 * g)).sum() > 100
+
+
+def test_sac_trains_on_it(env):
+    model = SAC(
+        "MultiInputPolicy",
+        env,
+        learning_starts=100,
+        batch_size=64,
+        policy_kwargs={"net_arch": [32, 32]},
+        replay_buffer_class=HerReplayBuffer,
+        replay_buffer_kwargs={"copy_info_dict": True},
+        seed=0,
+    )
+    before = model.policy.state_dict()["actor.mu.weight"].clone()
+    model.learn(200)
+    assert model.num_timesteps == 200
+    assert not before.equal(model.policy.state_dict()["actor.mu.weight"])
+
+
+def test_a_block_that_the_cup_cannot_come_down_to_is_refused(stacking):
+    class Coin(stacking.Stack):
+        scene = Scene((Block("coin", height=0.020), stacking.Stack.blue), markers=2)
+
+    with pytest.raises(ConfigurationError, match=r"'coin'.*at least 0\.027 m high"):
+        Coin(PAPER_TPM)
+    with pytest.raises(ConfigurationError, match="objects of different names"):
+        tpm_gym.TPMEnv(
+            type("Twins", (stacking.Stack,), {"scene": Scene((Block(), Block()), markers=2)})
+        )
+
+
+def test_where_there_is_no_room_sampling_says_so(stacking):
+    class Crowd(stacking.Stack):
+        def sample(self, rng, chosen):
+            with patch.object(stacking, "APART", 0.5):
+                return super().sample(rng, chosen)
+
+    env = tpm_gym.TPMEnv(Crowd)
+    with pytest.raises(ConfigurationError, match="a larger one: what is drawn lies"):
+        env.reset(seed=0)
+    env.close()

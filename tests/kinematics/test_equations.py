@@ -1,0 +1,300 @@
+"""The one text gives the same in plain floats, arrays and tensors, and tensors differentiate it."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch.autograd import gradcheck
+
+from tpm_gym.arrays import FloatArray
+from tpm_gym.errors import SingularityError, UnreachableError
+from tpm_gym.kinematics import (
+    ASSEMBLY_MODES,
+    DEFAULT_ASSEMBLY,
+    WORKING_MODES,
+    AssemblyMode,
+    WorkingMode,
+    equations,
+    forward,
+    forward_all,
+    inverse,
+    inverse_all,
+    jacobian,
+    passive_angles,
+    workspace,
+)
+from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
+from tpm_gym.kinematics.namespaces import NUMPY, PLAIN
+
+GEOMETRIES = [PAPER, WIDE, Geometry(l1=0.31, l2=0.06, l3=0.36, l4=0.79, l5=0.11, l6=0.02, l7=0.07)]
+LOW, HIGH = (-0.24, 0.012, 0.66), (0.12, 0.046, 0.90)
+
+
+def angles(seed: int, count: int) -> FloatArray:
+    return np.random.default_rng(seed).uniform(-math.pi, math.pi, (count, 3))
+
+
+def places(seed: int, count: int, g: Geometry) -> FloatArray:
+    reach = np.array([0.6, 1.1 * g.l7, 1.2])
+    return np.random.default_rng(seed).uniform(-reach, reach, (count, 3))
+
+
+def assert_same(tensors: Any, arrays: Any, names: tuple[str, ...], atol: float) -> None:
+    np.testing.assert_array_equal(tensors.valid, arrays.valid)
+    for name in names:
+        found, expected = getattr(tensors, name), getattr(arrays, name)
+        assert found.dtype == torch.float64
+        np.testing.assert_allclose(found, expected, rtol=0, atol=atol)  # NaN equals NaN
+
+
+# -- the same everywhere ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("g", GEOMETRIES)
+@pytest.mark.parametrize("branch", ASSEMBLY_MODES)
+def test_single_angles_give_what_batches_give(branch: AssemblyMode, g: Geometry) -> None:
+    thetas, slot = angles(branch.index, 600), branch.index
+    solutions = forward_all(thetas, g)
+    valid = solutions.valid[:, slot]
+    assert 20 < valid.sum() < 580
+    for theta in thetas[~valid]:
+        with pytest.raises(UnreachableError) as caught:
+            forward(theta, branch, g)
+        assert caught.value.point == tuple(theta)
+    batch, beta = jacobian.evaluate(thetas[valid], branch, g), solutions.beta[valid, slot]
+    np.testing.assert_array_equal(batch.position, solutions.position[valid, slot])
+    expected = np.column_stack(
+        [batch.position, solutions.link3[valid, slot], np.cos(beta), np.sin(beta)]
+    )
+    for index, theta in enumerate(thetas[valid]):
+        found, matrix = jacobian.evaluate(theta, branch, g), batch.velocity[index]
+        np.testing.assert_array_equal(found.position, forward(theta, branch, g))
+        assembly = equations.assemble(theta.tolist(), branch, g)
+        np.testing.assert_allclose(assembly, expected[index], rtol=0, atol=1e-10)
+        np.testing.assert_allclose(found.position, batch.position[index], rtol=0, atol=1e-12)
+        scale = 1e-9 * np.abs(matrix).max()
+        np.testing.assert_allclose(found.velocity, matrix, rtol=1e-9, atol=scale)
+        assert found.conditioning == pytest.approx(batch.conditioning[index], rel=1e-9, abs=1e-12)
+
+
+@pytest.mark.parametrize("g", GEOMETRIES)
+@pytest.mark.parametrize("branch", WORKING_MODES)
+def test_single_points_give_what_batches_give(branch: WorkingMode, g: Geometry) -> None:
+    points, slot = places(branch.index, 200, g), branch.index
+    solutions = inverse_all(points, g)
+    valid = solutions.valid[:, slot]
+    assert 20 < valid.sum() < 180
+    for point in points[~valid]:
+        with pytest.raises(UnreachableError) as caught:
+            inverse(point, branch, g)
+        assert caught.value.point == tuple(point)
+    found = [inverse(point, branch, g) for point in points[valid]]
+    np.testing.assert_allclose(found, solutions.theta[valid, slot], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("g", GEOMETRIES)
+def test_tensors_give_what_arrays_give(g: Geometry) -> None:
+    thetas, points = angles(1, 5000), places(2, 5000, g)
+    names = ("position", "beta", "link3")
+    assert_same(forward_all(torch.tensor(thetas), g), forward_all(thetas, g), names, 1e-12)
+    names = ("theta", "beta")
+    assert_same(inverse_all(torch.tensor(points), g), inverse_all(points, g), names, 1e-12)
+    thetas = thetas[forward_all(thetas, g).valid[:, DEFAULT_ASSEMBLY.index]]
+    for function in (forward, jacobian.parallel, jacobian.serial, jacobian.conditioning):
+        found = function(torch.tensor(thetas), geometry=g)
+        np.testing.assert_allclose(found, function(thetas, geometry=g), rtol=0, atol=1e-11)
+    for function in (jacobian.evaluate, jacobian.factors, passive_angles):
+        found, expected = function(torch.tensor(thetas), geometry=g), function(thetas, geometry=g)
+        for name, value in vars(expected).items():
+            np.testing.assert_allclose(getattr(found, name), value, rtol=1e-9, atol=1e-11)
+    at_points = (workspace.reachable, workspace.assembly_of, workspace.conditioning_at)
+    for function in at_points:
+        found = function(torch.tensor(points), geometry=g)
+        np.testing.assert_allclose(found, function(points, geometry=g), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("shape", [(3,), (0, 3), (2, 5, 3)])
+def test_tensors_stay_on_their_device_in_every_shape(shape: tuple[int, ...]) -> None:
+    # "meta" holds no numbers, and refuses to compute with tensors of another device.
+    somewhere = torch.zeros(shape, dtype=torch.float32, device="meta")
+    found = [*vars(inverse_all(somewhere)).values(), *vars(forward_all(somewhere)).values()]
+    tensors = [value for value in found if isinstance(value, torch.Tensor)]
+    assert len(tensors) == 6
+    assert {value.device.type for value in tensors} == {"meta"}
+    assert {value.shape[: len(shape) - 1] for value in tensors} == {shape[:-1]}
+    assert {value.dtype for value in tensors} == {torch.float64, torch.bool}
+
+
+def test_torch_is_not_imported_by_who_has_no_tensor() -> None:
+    code = (
+        "import sys; from tpm_gym.kinematics import forward_all, inverse; "
+        "forward_all(inverse([[0, 0.03, 0.8]])); sys.exit('torch' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+# -- derivatives -----------------------------------------------------------------------------------
+
+
+def regular(count: int, branch: AssemblyMode, clear: float = 0.1) -> torch.Tensor:
+    """Joint angles on a branch, with every parallel factor clear of zero (scaled)."""
+    thetas = angles(3, 200 * count)
+    thetas = thetas[forward_all(thetas).valid[:, branch.index]]
+    scaled = jacobian.factors(thetas, branch).parallel / [1.0, PAPER.l4, PAPER.l4**2]
+    thetas = thetas[(np.abs(scaled) > clear).all(axis=-1)][:count]
+    assert len(thetas) == count
+    return torch.tensor(thetas, requires_grad=True)
+
+
+@pytest.mark.parametrize("branch", ASSEMBLY_MODES)
+@pytest.mark.parametrize(
+    "function",
+    [forward, jacobian.parallel, jacobian.serial, jacobian.velocity, jacobian.conditioning]
+    + [jacobian.factors, jacobian.evaluate, passive_angles],
+)
+def test_derivatives_are_those_of_finite_differences(
+    function: Callable[..., Any], branch: AssemblyMode
+) -> None:
+    def values(theta: torch.Tensor) -> Any:
+        found = function(theta, branch)
+        return found if isinstance(found, torch.Tensor) else tuple(vars(found).values())
+
+    assert gradcheck(values, (regular(3, branch, clear=0.3),))
+
+
+@pytest.mark.parametrize("branch", [mode for mode in WORKING_MODES if mode.cos_beta > 0])
+def test_derivatives_at_points_are_those_of_finite_differences(branch: WorkingMode) -> None:
+    points = np.random.default_rng(4).uniform(LOW, HIGH, (3, 3))
+    tensor = torch.tensor(points, requires_grad=True)
+    slot = int(workspace.assembly_of(points[0], branch))
+    assert gradcheck(lambda p: inverse(p, branch), (tensor,))
+    assert gradcheck(
+        lambda p: workspace.conditioning_at(p, branch, ASSEMBLY_MODES[slot]), (tensor,)
+    )
+
+
+def test_branches_that_do_not_exist_leave_the_derivatives_of_the_others_finite() -> None:
+    points, thetas = places(5, 3000, PAPER), angles(6, 3000)
+    for function, given in ((inverse_all, points), (forward_all, thetas)):
+        tensor = torch.tensor(given, requires_grad=True)
+        found = function(tensor)
+        assert 0 < found.valid.double().mean() < 0.9
+        values = [v for v in vars(found).values() if getattr(v, "requires_grad", False)]
+        sum(value[found.valid].sum() for value in values).backward()
+        assert torch.isfinite(tensor.grad).all()
+        assert (tensor.grad != 0).any(dim=-1).equal(found.valid.any(dim=-1))
+
+
+# -- singularities ---------------------------------------------------------------------------------
+
+
+def exists(theta: FloatArray) -> bool:
+    return bool(forward_all(theta).valid[DEFAULT_ASSEMBLY.index])
+
+
+def test_where_an_assembly_ends_it_meets_another_and_the_factor_is_named() -> None:
+    factors = set()
+    for inside, outside in zip(angles(7, 300), angles(8, 300), strict=True):
+        if not exists(inside) or exists(outside):
+            continue
+        for _ in range(60):
+            middle = (inside + outside) / 2
+            inside, outside = (middle, outside) if exists(middle) else (inside, middle)
+        with pytest.raises((SingularityError, UnreachableError)) as caught:  # rounding decides
+            equations.evaluate(inside.tolist(), DEFAULT_ASSEMBLY, PAPER)
+        with pytest.raises((SingularityError, UnreachableError)):
+            jacobian.velocity(inside[None])
+        factors.add(getattr(caught.value, "factor", None))
+    assert "sin(beta)" in factors
+
+
+# -- conditioning ----------------------------------------------------------------------------------
+
+
+def with_singular_values(rng: np.random.Generator, values: list[float]) -> FloatArray:
+    left, _, right = np.linalg.svd(rng.normal(size=(3, 3)))
+    return np.asarray(left @ np.diag(values) @ right)
+
+
+def error(matrices: FloatArray) -> float:
+    """The largest of the conditioning in floats and arrays, against numpy's singular values."""
+    matrices = matrices.reshape(-1, 3, 3)
+    values = np.linalg.svd(matrices, compute_uv=False)
+    expected = values[:, 2] / np.where(values[:, 0] > 0, values[:, 0], 1.0)
+    batch = equations.conditioning(np.moveaxis(matrices, 0, -1), NUMPY)
+    single = [equations.conditioning(matrix, PLAIN) for matrix in matrices.tolist()]
+    for found in (batch, np.array(single)):
+        assert ((found >= 0) & (found <= 1)).all()
+    return float(np.abs([batch - expected, single - expected]).max())
+
+
+def test_the_conditioning_is_that_of_the_singular_values() -> None:
+    rng = np.random.default_rng(1)
+    assert error(rng.normal(size=(500, 3, 3))) < 1e-12
+    for exact in ([1, 1, 1], [1, 1, 0], [1, 0, 0], [1, 1, 1e-9], [1, 1e-9, 1e-9], [0, 0, 0]):
+        assert error(np.diag(exact)) < 1e-15
+    for _ in range(500):
+        size, middle, small = 10 ** rng.uniform((-3, -3, -6), (3, -0.05, 0))
+        assert (
+            error(with_singular_values(rng, [size, size * middle, size * middle * small])) < 1e-12
+        )
+
+
+def test_where_the_two_largest_singular_values_coincide_some_digits_are_lost() -> None:
+    rng = np.random.default_rng(4)
+    for _ in range(300):
+        near, small = 1 - 10 ** rng.uniform(-16, -3), 10 ** rng.uniform(-6, 0)
+        assert error(with_singular_values(rng, [1.0, near, near * small])) < 1e-8
+
+
+def test_the_conditioning_keeps_its_digits_where_it_is_small() -> None:
+    # The root of the smallest eigenvalue of J J^T would have none left below 1e-8.
+    rng = np.random.default_rng(2)
+    for smallest in (1e-4, 1e-8, 1e-11):
+        matrix = with_singular_values(rng, [1.0, 0.3, smallest]).tolist()
+        assert equations.conditioning(matrix, PLAIN) == pytest.approx(smallest, rel=1e-3)
+
+
+@pytest.mark.parametrize("g", GEOMETRIES)
+def test_the_conditioning_of_the_mechanism_is_that_of_its_singular_values_everywhere(
+    g: Geometry,
+) -> None:
+    thetas = angles(9, 20_000)
+    for branch in ASSEMBLY_MODES:
+        real = thetas[forward_all(thetas, g).valid[:, branch.index]]
+        values = np.linalg.svd(jacobian.velocity(real, branch, g), compute_uv=False)
+        found = jacobian.conditioning(real, branch, g)
+        np.testing.assert_allclose(found, values[:, 2] / values[:, 0], rtol=1e-8, atol=1e-12)
+
+
+def test_the_conditioning_falls_to_zero_with_y() -> None:
+    points = np.random.default_rng(10).uniform(LOW, HIGH, (200, 3))
+    for y in 10.0 ** -np.arange(3, 20):
+        found = workspace.conditioning_at(points * [1, 0, 1] + [0, y, 0])
+        assert (found > 0).all()
+        assert (found < 20 * y).all()
+
+
+@pytest.mark.parametrize("factor", [1, 2])
+def test_the_conditioning_is_zero_where_level3_or_the_planar_factor_is(factor: int) -> None:
+    def sign(points: FloatArray) -> FloatArray:
+        return np.sign(jacobian.factors_at(points).parallel[:, factor])
+
+    one = places(11, 60_000, PAPER)
+    other = one + np.random.default_rng(12).normal(0.0, 0.03, one.shape) * [1, 0, 1]
+    across = sign(one) * sign(other) < 0
+    one, other = one[across], other[across]
+    assert len(one) > 20
+    for _ in range(60):
+        middle = (one + other) / 2
+        same = (sign(middle) == sign(one))[:, None]
+        one, other = np.where(same, middle, one), np.where(same, other, middle)
+    for mode in ASSEMBLY_MODES:
+        assert workspace.conditioning_at(one, assembly=mode).max() < 1e-9

@@ -1,0 +1,88 @@
+"""What a user registers with Gymnasium is trained, resumed and evaluated like our own ids."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import pytest
+from trainings import SAC_RECIPE
+
+from tpm_gym.learning.environments import check_env_id, make_env
+from tpm_gym.learning.errors import ConfigError
+
+MODULE = """
+import gymnasium as gym
+
+gym.register(
+    id="MyReach-v0",
+    entry_point="tpm_gym.envs.env:TPMEnv",
+    max_episode_steps=20,
+    kwargs={"task": "reach", "control": "joints"},
+)
+"""
+
+
+def run(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "tpm_gym.learning", *words],
+        cwd=folder,  # from which Python imports
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_an_id_of_a_users_module_is_trained_in_workers_resumed_and_evaluated(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "my_tasks.py").write_text(MODULE)
+    (tmp_path / "sac.yml").write_text(SAC_RECIPE.format(env="MyReach-v0", train_freq=5))
+    words = ["--env", "my_tasks:MyReach-v0", "--recipe", "sac.yml", "--envs", "2"]
+    words += ["--steps", "120", "--eval-episodes", "1"]
+    done = run(tmp_path, "train", *words)
+    assert done.returncode == 0, done.stderr
+    folder = Path("runs", "MyReach-v0-sac-s0")
+    done = run(tmp_path, "resume", str(folder), "--steps", "160")
+    assert done.returncode == 0, done.stderr
+    words = ["--policy", str(folder), "expert", "--episodes", "1", "--json", "out.json"]
+    done = run(tmp_path, "evaluate", *words)
+    assert done.returncode == 0, done.stderr
+    content = json.loads((tmp_path / "out.json").read_text())
+    assert content["env"] == "my_tasks:MyReach-v0"
+    assert [policy["records"][0]["length"] for policy in content["policies"]] == [20, 20]
+
+
+@pytest.mark.parametrize(
+    ("env_id", "message"),
+    [
+        ("TPMRech-v0", "unknown environment 'TPMRech-v0'.*TPMReach-v0.*module:id"),
+        ("no_such_module:MyReach-v0", "unknown environment .*no_such_module"),
+        ("CartPole-v1", "CartPole-v1 is no environment of tpm_gym"),
+        ("not an id", "unknown environment"),
+    ],
+)
+def test_what_is_no_environment_of_ours_is_refused(env_id: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        check_env_id(env_id)
+
+
+def test_a_class_that_derives_from_ours_is_accepted_however_it_is_registered() -> None:
+    from tpm_gym.envs.env import TPMEnv
+
+    class Mine(TPMEnv):
+        pass
+
+    gym.register(id="Mine-v0", entry_point=Mine, max_episode_steps=5, kwargs={"task": "reach"})
+    try:
+        env = make_env(check_env_id("Mine-v0"), penalty_weight=0.5)
+        assert isinstance(env.unwrapped, Mine)
+        assert env.unwrapped.task.penalty_weight == 0.5
+        env.close()
+    finally:
+        del gym.registry["Mine-v0"]

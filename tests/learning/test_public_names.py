@@ -1,0 +1,69 @@
+"""The package's names are there without the cost of what is behind them."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from tpm_gym import TPMError, learning
+from tpm_gym.learning import errors
+from tpm_gym.learning.command_line import main
+
+
+def python(program: str) -> None:
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_every_name_is_there_and_unknown_ones_are_not() -> None:
+    for name in learning.__all__:
+        assert getattr(learning, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        learning.nonsense  # noqa: B018
+
+
+def test_neither_the_package_nor_the_help_imports_torch() -> None:
+    heavy = "{'torch', 'stable_baselines3', 'matplotlib', 'pybullet'} & set(sys.modules)"
+    python(f"import sys, tpm_gym.learning; sys.exit(str({heavy}) if {heavy} else 0)")
+    python(f"import sys, tpm_gym.learning.command_line; sys.exit(str({heavy}) if {heavy} else 0)")
+
+
+def test_what_is_not_installed_is_named_with_the_extra_that_installs_it() -> None:
+    python(
+        "import sys; sys.modules['stable_baselines3'] = None\n"
+        "import tpm_gym.learning, tpm_gym.errors\n"
+        "try: tpm_gym.learning.PenaltyHerReplayBuffer\n"
+        "except tpm_gym.errors.MissingPackageError as error: assert '[train]' in str(error)\n"
+        "else: sys.exit('imported')\n"
+    )
+
+
+@pytest.mark.parametrize(
+    "command", ["train", "resume", "evaluate", "export", "study", "report collect", "report write"]
+)
+def test_every_command_has_its_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main([*command.split(), "--help"])
+    assert caught.value.code == 0
+    assert f"usage: tpm-gym {command}" in capsys.readouterr().out
+
+
+def test_one_root_catches_every_error() -> None:
+    kinds = [kind for kind in vars(errors).values() if isinstance(kind, type)]
+    assert len(kinds) > 5
+    assert all(issubclass(kind, TPMError) for kind in kinds)
+
+
+def test_a_recipe_is_ready_for_stable_baselines() -> None:
+    keywords = learning.recipe("TPMPickAndPlace-v0", "tqc")
+    assert keywords["replay_buffer_class"] is learning.PenaltyHerReplayBuffer
+    extractor = keywords["policy_kwargs"]["features_extractor_class"]
+    assert extractor is learning.GoalGapExtractor
+    assert keywords["learning_rate"](0.5) == pytest.approx(0.0005)
+    assert not {"demonstrations", "n_timesteps", "n_envs"} & set(keywords)
+    with pytest.raises(errors.ConfigError, match="no recipe for TPMReach-v0"):
+        learning.recipe("TPMReach-v0", "ppo")
+    with pytest.raises(errors.ConfigError, match="none of sac, tqc, ppo"):
+        learning.recipe("TPMReach-v0", "dqn")

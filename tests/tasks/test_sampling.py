@@ -1,0 +1,185 @@
+"""Sampled ends are safe, apart and spread; tempting ones lie at the threshold and lure beyond."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import tpm_gym
+from tpm_gym.arrays import FloatArray
+from tpm_gym.errors import ConfigurationError
+from tpm_gym.kinematics.workspace import Region
+from tpm_gym.mechanism.cup import CUP
+from tpm_gym.mechanism.machine import Machine
+from tpm_gym.mechanism.tpm import PAPER_TPM, WIDE_TPM
+from tpm_gym.tasks import Expert, PickAndPlace, Reach, Task
+from tpm_gym.tasks.rewards import distance
+from tpm_gym.tasks.sampling import APART, BAND, line_in_joints, line_in_space
+
+SAFE = PAPER_TPM.safe_conditioning
+PUCK = PickAndPlace.puck
+ON_TABLE = PUCK.height / 2
+KINDS = [Reach, PickAndPlace]
+
+
+@cache
+def ends(
+    kind: type[Task], machine: Machine = PAPER_TPM, goals: str = "tempting", count: int = 100
+) -> tuple[FloatArray, FloatArray]:
+    """Starts and goals of point P, machine's frame, each (count, 3); legal ones."""
+    task, starts, aims = kind(machine, goals=goals), [], []
+    raised = (0.0, 0.0, CUP.length + PUCK.height / 2 if task.scene.objects else 0.0)
+    for seed in range(count):
+        drawn = task.start(np.random.default_rng(seed), None)
+        kind(machine).start(np.random.default_rng(seed), drawn)  # what is drawn may be chosen
+        home = task.machine.mount.to_world(task.machine.home)
+        starts.append(drawn.get("object", home - raised) + raised)
+        aims.append(drawn["goal"] + raised)
+    to_paper = task.machine.mount.to_paper
+    return to_paper(np.array(starts)), to_paper(np.array(aims))
+
+
+@pytest.mark.parametrize("machine", [PAPER_TPM, WIDE_TPM], ids=lambda machine: machine.name)
+@pytest.mark.parametrize("kind", KINDS)
+def test_sampled_ends_are_safe_apart_and_spread(kind: type[Task], machine: Machine) -> None:
+    starts, goals = ends(kind, machine, "sampled", 200)
+    for points in (starts, goals):
+        assert machine.region.contains(points).all()
+        assert (machine.conditioning_at(points) >= machine.safe_conditioning).all()
+    assert distance(starts, goals).min() >= APART - 1e-12
+    edges = np.subtract(machine.goal_region.high, machine.goal_region.low)
+    assert (np.ptp(goals, axis=0) > 0.8 * edges).all()
+    if kind is PickAndPlace:  # half on the table, half in the air
+        np.testing.assert_allclose(starts[:, 2], starts[0, 2], rtol=0, atol=1e-12)
+        height = machine.mount.to_world(goals)[:, 2] - CUP.length - PUCK.height
+        on_table = np.isclose(height, 0.0)
+        assert 0.4 < on_table.mean() < 0.6
+        assert height[~on_table].min() > 0.02
+        assert (np.ptp(starts[:, :2], axis=0) > 0.8 * edges[:2]).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_tempting_ends_are_safe_and_the_goal_only_just(kind: type[Task]) -> None:
+    starts, goals = ends(kind)
+    conditioning = PAPER_TPM.conditioning_at(goals if kind is Reach else np.stack([starts, goals]))
+    assert (conditioning >= SAFE - 1e-12).all()
+    assert (conditioning < SAFE + BAND).all()
+    assert (PAPER_TPM.conditioning_at(starts) >= SAFE - 1e-12).all()
+    assert (distance(starts, goals) >= APART - 1e-12).all()
+    assert np.ptp(goals[:, 0]) > 0.1
+    if kind is PickAndPlace:
+        assert 0.3 < np.isclose(goals[:, 2], starts[:, 2]).mean() < 0.7
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_line_in_joints_leads_beyond_the_threshold_and_that_in_space_along_it(
+    kind: type[Task],
+) -> None:
+    starts, goals = ends(kind)
+    unsafe = line_in_joints(PAPER_TPM, starts, goals) < SAFE  # (33, n)
+    assert unsafe.any(axis=0).all()
+    # With a puck both ends are at the threshold, and most of the way lies beyond.
+    assert unsafe.mean() > (0.6 if kind is PickAndPlace else 0.1)
+    in_space = line_in_space(PAPER_TPM, starts, goals)
+    assert (in_space >= SAFE - 1e-9).all()
+    assert (in_space.min(axis=0) < SAFE + BAND).all()
+
+
+def test_straight_lines_in_space_between_safe_points_stay_safe() -> None:
+    """So with Cartesian actions no pair of safe ends could tempt but by where it ends."""
+    region = PAPER_TPM.region
+    points = np.random.default_rng(0).uniform(region.low, region.high, (4000, 3))
+    safe = points[PAPER_TPM.conditioning_at(points) >= SAFE]
+    half = len(safe) // 2
+    assert half > 1000
+    assert (line_in_space(PAPER_TPM, safe[:half], safe[half : 2 * half]) >= SAFE).all()
+
+
+def test_lines_start_and_end_where_they_should() -> None:
+    pair = np.array([PAPER_TPM.home, [0.05, 0.025, 0.85]])
+    for line in (line_in_space(PAPER_TPM, *pair), line_in_joints(PAPER_TPM, *pair)):
+        np.testing.assert_allclose(line[[0, -1]], PAPER_TPM.conditioning_at(pair), rtol=1e-9)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_nearly_half_of_what_reaches_a_tempting_goal_is_unsafe(kind: type[Task]) -> None:
+    _, goals = ends(kind)
+    rng = np.random.default_rng(1)
+    offsets = rng.normal(size=(200, 3))
+    radii = kind.tolerance * rng.random(200) ** (1 / 3)
+    offsets *= (radii / np.linalg.norm(offsets, axis=1))[:, None]
+    near = PAPER_TPM.region.project(goals[:, None] + offsets)
+    share = (PAPER_TPM.conditioning_at(near) < SAFE).mean(axis=1)
+    assert share.min() > 0.35
+    assert share.max() < 0.6
+
+
+def test_machines_on_which_nothing_can_be_drawn_are_told_instead_of_searched_for_ever() -> None:
+    rng = np.random.default_rng(0)
+    with pytest.raises(ConfigurationError, match="'sampled': on 'wide'") as caught:
+        Reach(WIDE_TPM, goals="tempting").start(rng, None)
+    assert caught.value.name == "goals"
+    home = PAPER_TPM.home
+    with pytest.raises(ConfigurationError) as caught:
+        Reach(replace(PAPER_TPM, goal_region=Region(home, home))).start(rng, None)
+    assert caught.value.name == "goal_region"
+    with pytest.raises(ConfigurationError) as caught:
+        Reach(replace(PAPER_TPM, safe_conditioning=0.9)).start(rng, None)
+    assert caught.value.name == "safe_conditioning"
+
+
+# -- in environments -------------------------------------------------------------------------------
+
+
+@contextmanager
+def tempting(env_id: str) -> Iterator[Any]:
+    env = gym.make(env_id, goals="tempting")
+    yield env
+    env.close()
+
+
+@pytest.mark.parametrize("env_id", tpm_gym.ENV_IDS)
+def test_every_id_can_tempt_and_repeats_with_its_seed(env_id: str) -> None:
+    with tempting(env_id) as env, tempting(env_id) as other:
+        first, again = env.reset(seed=5)[0], other.reset(seed=5)[0]
+        state = env.unwrapped.np_random.bit_generator.state
+        following, sixth = env.reset()[0], other.reset(seed=6)[0]
+        for key in first:
+            np.testing.assert_array_equal(first[key], again[key])
+        assert not np.array_equal(first["desired_goal"], following["desired_goal"])
+        assert not np.array_equal(first["desired_goal"], sixth["desired_goal"])
+        # An episode without a seed repeats from the generator's state, as resuming does.
+        env.unwrapped.np_random.bit_generator.state = state
+        np.testing.assert_array_equal(env.reset()[0]["desired_goal"], following["desired_goal"])
+        goal = np.array([0.0, -0.03, 0.2])
+        chosen, _ = env.reset(seed=5, options={"goal": goal})
+        np.testing.assert_allclose(chosen["desired_goal"], goal, atol=1e-7)
+
+
+def test_one_who_moves_the_joints_straight_to_the_goal_gets_into_the_unsafe_region() -> None:
+    """And the expert, who goes straight in space, hardly does, and succeeds."""
+    lowest: dict[bool, list[float]] = {False: [], True: []}
+    with tempting("TPMReachJoints-v0") as env:
+        inner, expert = env.unwrapped, Expert(env)
+        to_paper = inner.machine.mount.to_paper
+        for careful, found in lowest.items():
+            for seed in range(4):
+                observation, info = env.reset(seed=2_000_000 + seed)
+                expert.reset(observation)
+                goal, met = to_paper(inner.goal), []
+                for _ in range(50):
+                    straight = inner.control.action(goal, to_paper(inner.state.command))
+                    action = expert.act(observation) if careful else straight.astype(np.float32)
+                    observation, *_, info = env.step(action)
+                    met.append(info["conditioning"])
+                found.append(min(met))
+                assert info["is_success"] or not careful
+    assert np.mean(lowest[False]) < SAFE - 0.002
+    assert min(lowest[True]) > SAFE - 0.002
