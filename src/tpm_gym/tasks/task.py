@@ -104,7 +104,7 @@ class Task(ABC):
         if shown != self.scene.markers:
             raise ConfigurationError("markers", self.scene.markers, f"{shown}, as a goal shows")
         self.machine, self.reward, self.goals = machine, reward, goals
-        self._within = [self._place_of(block) for block in self.scene.objects]
+        self._within = self._not_lost()
         self._set_entries()
 
     def _set_entries(self) -> None:
@@ -363,16 +363,21 @@ class Task(ABC):
         """The points (k, 3) m that show a goal (goal_size,)."""
         return goal.reshape(-1, 3)
 
+    def _not_lost(self) -> tuple[FloatArray, FloatArray]:
+        """Between what corners (n, 3) m the objects are not lost."""
+        low, high = np.empty((2, len(self.scene.objects), 3))
+        for index, block in enumerate(self.scene.objects):
+            least, most = self._place_of(block)
+            slack = block.width / 2  # the cup may take it off its middle
+            low[index, :2], high[index, :2] = least[:2] - slack, most[:2] + slack
+        low[:, 2], high[:, 2] = 0.0, np.inf
+        return low, high
+
     def lost(self, state: State) -> BoolArray:
         """Whether an object is off the table or where the robot cannot get to, (...,)."""
-        lost: BoolArray = np.zeros(np.shape(state.held), dtype=np.bool_)
-        for index, block in enumerate(self.scene.objects):
-            low, high = self._within[index]
-            slack = block.width / 2  # the cup may take it off its middle
-            place = state.object_position[..., index, :]
-            level = place[..., :2]
-            beyond = ((level < low[:2] - slack) | (level > high[:2] + slack)).any(axis=-1)
-            lost |= beyond | (place[..., 2] < 0)
+        low, high = self._within
+        beyond = (state.object_position < low) | (state.object_position > high)
+        lost: BoolArray = np.logical_or.reduce(beyond, axis=(-2, -1))
         return lost
 
 
