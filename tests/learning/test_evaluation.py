@@ -364,7 +364,7 @@ def test_a_damaged_policy_is_one_line(run: Path, tmp_path: Path) -> None:
     assert "Traceback" not in done.stderr
     last = done.stderr.splitlines()[-1]  # the engine has introduced itself before
     assert last.startswith("error: policy ")
-    assert "best.safetensors: is cut off" in last
+    assert "or damaged" in last
     env = gym.make("TPMReach-v0")
     with pytest.raises(PolicyError, match="does not describe a policy"):
         load_policy(str(run / "config.json"), env)
