@@ -94,15 +94,15 @@ def test_another_working_mode_is_reported(simulation):
 
 def test_what_cannot_be_followed_raises_and_moves_nothing(simulation):
     before = simulation.reset(THETA)
-    with pytest.raises(UnreachableError):
-        simulation.move((0.0, 0.2, 0.8))
-    for command in ((np.nan, 0.02, 0.8), (0.0, 0.02)):
-        with pytest.raises(InputError):
-            simulation.move(command)
-    with pytest.raises(UnreachableError):
-        simulation.reset((-1.5, 1.5, 1.5))
-    with pytest.raises(InputError):
-        simulation.reset((np.nan, 1.5, 1.5))
+    for call, value, error in (
+        (simulation.move, (0.0, 0.2, 0.8), UnreachableError),
+        (simulation.move, (np.nan, 0.02, 0.8), InputError),
+        (simulation.move, (0.0, 0.02), InputError),
+        (simulation.reset, (-1.5, 1.5, 1.5), UnreachableError),
+        (simulation.reset, (np.nan, 1.5, 1.5), InputError),
+    ):
+        with pytest.raises(error):
+            call(value)
     after = simulation.read()
     assert np.array_equal(before.theta, after.theta)
     assert np.array_equal(before.command, after.command)

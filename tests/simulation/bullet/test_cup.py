@@ -24,6 +24,13 @@ def start(puck=None, offset=(0.0, 0.0), height=0.10):
     return simulation
 
 
+def start_holding():
+    """The puck is in the cup and still on the table."""
+    simulation = start(height=0.05)
+    assert go(simulation, 0.03, 4, vacuum=True).held == 0
+    return simulation
+
+
 def go(simulation, height, steps, vacuum):
     for _ in range(steps):
         state = simulation.move(level(height), vacuum)
@@ -68,10 +75,8 @@ def test_the_puck_does_not_jump_when_it_is_taken():
 
 
 def test_a_held_puck_stays_put_at_full_speed():
-    simulation = start(height=0.05)
-    go(simulation, 0.03, 4, vacuum=True)
-    go(simulation, 0.06, 5, vacuum=True)
-    state = simulation.read()
+    simulation = start_holding()
+    state = go(simulation, 0.06, 5, vacuum=True)
     grip = state.object_position - state.platform_position
     point = level(0.06)
     for step in (1, 1, 1, -1, -1, -1, 1, -1, 1, -1):
@@ -150,8 +155,7 @@ def test_beyond_its_stroke_the_cup_stops_and_the_puck_holds():
 
 
 def test_a_held_puck_pressed_on_the_table_stays_held_and_the_cup_yields():
-    simulation = start(height=0.05)
-    go(simulation, 0.03, 4, vacuum=True)
+    simulation = start_holding()
     assert go(simulation, 0.06, 5, vacuum=True).held == 0
     rows = record(simulation)
     for height in np.arange(0.06, 0.012, -0.006):
@@ -165,8 +169,7 @@ def test_a_held_puck_pressed_on_the_table_stays_held_and_the_cup_yields():
 
 
 def test_a_reset_while_holding_lets_go():
-    simulation = start(height=0.05)
-    assert go(simulation, 0.03, 4, vacuum=True).held == 0
+    simulation = start_holding()
     state = simulation.reset(PAPER_TPM.inverse(level(0.1)), {"object": (0.0, -0.03, 0.015)})
     assert state.held == -1
     state = go(simulation, 0.1, 5, vacuum=True)
