@@ -75,7 +75,7 @@ def test_users_place_the_blocks_by_name(env):
     assert np.allclose(env.unwrapped.state.object_position, [red, blue], atol=1e-6)
     with pytest.raises(ResetOptionError, match="clear of blue"):
         env.reset(options={"red": red, "blue": (0.06, -0.03, 0.018)})
-    with pytest.raises(ResetOptionError, match=r"'goal', 'red', 'blue'"):
+    with pytest.raises(ResetOptionError, match=r"'red', 'blue', 'goal'"):
         env.reset(options={"object": red})
     with pytest.raises(UnreachableError):  # each place for its own block
         env.reset(options={"goal": (0.0, -0.03, 0.015, 0.0, -0.03, 0.015)})
