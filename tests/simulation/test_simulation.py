@@ -1,6 +1,6 @@
 """The mechanism in the engine stays a mechanism, and the engine's quirks stay inside."""
 
-from dataclasses import fields, replace
+from dataclasses import fields
 from itertools import pairwise
 
 import numpy as np
@@ -8,7 +8,7 @@ import pytest
 from machines import anywhere, each_machine, excursions
 
 from tpm_gym.errors import ClosureError, InputError, ModeChangeError, UnreachableError
-from tpm_gym.kinematics import ELBOWS_OUT, inverse, jacobian
+from tpm_gym.kinematics import jacobian
 from tpm_gym.mechanism import PAPER_TPM, TPM
 from tpm_gym.mechanism.bodies import Mechanism
 from tpm_gym.simulation import Block, Scene, Simulation
@@ -82,24 +82,6 @@ def test_encoder_rates_and_platform_velocity_obey_the_jacobian(simulation):
         mean = (state.platform_position - before.platform_position) / 0.04
         np.testing.assert_allclose(mean, [0.25, 0.0, 0.125], atol=5e-3)
         np.testing.assert_allclose(state.fk_velocity, [0.25, 0.0, 0.125], atol=2e-2)
-
-
-def test_a_loop_that_opens_is_reported(simulation):
-    simulation.reset(THETA)
-    client = simulation.engine.client
-    client.removeConstraint(client.getConstraintUniqueId(0))
-    with pytest.raises(ClosureError) as caught:
-        follow(simulation, excursions(PAPER_TPM, 100, seed=2))
-    assert caught.value.gap > caught.value.limit
-
-
-def test_another_working_mode_is_reported(simulation):
-    folded = replace(ELBOWS_OUT, cos_beta=-ELBOWS_OUT.cos_beta)
-    state = simulation.reset(inverse(HOME, folded))
-    np.testing.assert_allclose(state.platform_position, PAPER_TPM.mount.to_world(HOME), atol=1e-6)
-    assert (state.working_mode_changed, state.assembly_mode_changed) == (True, False)
-    with pytest.raises(ModeChangeError):
-        simulation.move(HOME)
 
 
 def test_what_cannot_be_followed_raises_and_moves_nothing(simulation):
@@ -192,16 +174,6 @@ def test_a_reset_forgets_old_contacts(with_puck, drift):
         outcomes.append(np.hstack([state.object_position, state.object_quaternion]))
         follow(with_puck, [HOME] * 6)
     assert np.array_equal(*outcomes)
-
-
-def test_clients_do_not_see_each_other(simulation):
-    other = Simulation(Scene())
-    before = simulation.reset(THETA)
-    other.reset(THETA)
-    follow(other, excursions(PAPER_TPM, 5, seed=3))
-    assert np.array_equal(simulation.read().theta, before.theta)
-    other.close()
-    assert simulation.move(HOME).closure_error < 1e-6
 
 
 def test_a_snapshot_continues_the_motion(with_puck):

@@ -45,20 +45,6 @@ def test_it_takes_what_it_touches_lifts_it_and_lets_go():
     )
 
 
-def test_without_vacuum_nothing_is_held():
-    simulation = start(height=0.05)
-    assert go(simulation, 0.03, 4, vacuum=False).held == -1
-    assert go(simulation, 0.06, 6, vacuum=False).object_position[0, 2] == pytest.approx(
-        0.015, abs=1e-3
-    )
-
-
-@pytest.mark.parametrize(("offset", "seals"), [(0.0, True), (0.008, True), (0.014, False)])
-def test_the_whole_lip_must_lie_on_the_puck(offset, seals):
-    simulation = start(offset=(offset, 0.0), height=0.05)
-    assert (go(simulation, 0.031, 4, vacuum=True).held == 0) is seals
-
-
 def test_the_puck_does_not_jump_when_it_is_taken():
     simulation = start(offset=(0.006, 0.004), height=0.05)
     before = go(simulation, 0.031, 4, vacuum=True)
@@ -67,15 +53,10 @@ def test_the_puck_does_not_jump_when_it_is_taken():
     assert np.linalg.norm(after.object_position - before.object_position) < 1e-3
 
 
-@pytest.mark.parametrize(("mass", "lifted"), [(0.05, True), (0.8, True), (2.0, False)])
-def test_the_pull_off_force_decides_what_can_be_lifted(mass, lifted):
-    # The cup holds 12 N: 1.22 kg at rest, less what acceleration takes.
-    simulation = start(Block(mass=mass), height=0.05)
-    assert go(simulation, 0.03, 4, vacuum=True).held == 0
-    for height in np.arange(0.03, 0.07, 0.002):
-        state = simulation.move(level(height), vacuum=True)
-    assert (state.held == 0) is lifted
-    assert bool(state.object_position[0, 2] > 0.04) is lifted
+@pytest.mark.parametrize(("offset", "seals"), [(0.0, True), (0.008, True), (0.014, False)])
+def test_the_whole_lip_must_lie_on_the_puck(offset, seals):
+    simulation = start(offset=(offset, 0.0), height=0.05)
+    assert (go(simulation, 0.031, 4, vacuum=True).held == 0) is seals
 
 
 def test_a_held_puck_stays_put_at_full_speed():
@@ -136,6 +117,7 @@ def test_the_cup_comes_out_again():
     go(simulation, 0.015, 8, vacuum=False)
     assert rows[-1][1] == pytest.approx(-0.015, abs=1e-4)
     state = go(simulation, 0.05, 10, vacuum=False)
+    assert state.held == -1  # without vacuum
     force, slide, height = rows[-1]
     assert force == 0
     assert slide == pytest.approx(0, abs=1e-6)
