@@ -52,20 +52,6 @@ def test_it_takes_what_it_touches_lifts_it_and_lets_go():
     )
 
 
-def test_without_vacuum_nothing_is_held():
-    simulation = start(height=0.05)
-    assert go(simulation, 0.03, 4, vacuum=False).held == -1
-    assert go(simulation, 0.06, 6, vacuum=False).object_position[0, 2] == pytest.approx(
-        0.015, abs=1e-3
-    )
-
-
-@pytest.mark.parametrize(("offset", "seals"), [(0.0, True), (0.008, True), (0.014, False)])
-def test_the_whole_lip_must_lie_on_the_puck(offset, seals):
-    simulation = start(offset=(offset, 0.0), height=0.05)
-    assert (go(simulation, 0.031, 4, vacuum=True).held == 0) is seals
-
-
 def test_the_puck_does_not_jump_when_it_is_taken():
     simulation = start(offset=(0.006, 0.004), height=0.05)
     before = go(simulation, 0.031, 4, vacuum=True)
@@ -130,6 +116,7 @@ def test_the_cup_comes_out_again():
     go(simulation, 0.015, 8, vacuum=False)
     assert rows[-1][1] == pytest.approx(-0.015, abs=1e-4)
     state = go(simulation, 0.05, 10, vacuum=False)
+    assert state.held == -1  # without vacuum
     force, slide, height = rows[-1]
     assert force == 0
     assert slide == pytest.approx(0, abs=1e-6)
