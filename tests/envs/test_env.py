@@ -43,10 +43,7 @@ def env() -> Iterator[TPMEnv]:
         *({"penalty_weight": value} for value in (-1.0, np.nan, "much", 10**400, [1.0])),
         {"randomisation": 0.1},
         {"randomisation": {"encoder_jitter": 0.1}},
-        *(
-            {"physics": value}
-            for value in (5, {"gravity": 0}, Physics, Physics(control_period=0.2))
-        ),
+        *({"physics": value} for value in (5, {"gravity": 0}, Physics)),
         {"renderer": "raytracer"},
         *({"width": value} for value in (0, 15, 5000, 64.0, "64")),
         {"height": 2.5},

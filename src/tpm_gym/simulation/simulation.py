@@ -26,7 +26,7 @@ from tpm_gym.mechanism.machine import Machine, Mode, Reading
 from tpm_gym.mechanism.tpm import PAPER_TPM
 from tpm_gym.simulation.engine import Engine, Pose, make_engine
 from tpm_gym.simulation.randomisation import NOMINAL, Plant
-from tpm_gym.simulation.state import Scene, State
+from tpm_gym.simulation.state import CONTROL_PERIOD, Scene, State
 
 __all__ = ["Simulation", "Snapshot"]
 
@@ -263,10 +263,9 @@ class Simulation:
         bias, (before, now) = self.plant.encoder_bias, self._noise
         if bias == before == now == _ZERO:
             return theta, rates
-        period = self.engine.control_period
         return (
             vector("theta", np.array(theta) + bias + now),
-            vector("theta_dot", rates + np.subtract(now, before) / period),
+            vector("theta_dot", rates + np.subtract(now, before) / CONTROL_PERIOD),
         )
 
     def _evaluate(self, theta: Vector) -> Reading:
