@@ -205,7 +205,6 @@ def _read(folder: Path) -> Content:
 
 
 def _read_manifest(path: Path) -> dict[str, Any]:
-    """Read a manifest and check it against its own digest."""
     try:
         manifest = json.loads(_read_bytes(path))
         digest = manifest.pop("sha256")

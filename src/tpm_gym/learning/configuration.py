@@ -184,7 +184,6 @@ def check_least(config: Any, least: int, *names: str) -> None:
 
 
 def _check(config: TrainingConfig) -> None:
-    """Refuse what cannot work."""
     counts = ("steps", "envs", "eval_every", "eval_episodes", "checkpoint_every", "threads")
     check_least(config, 1, *counts)
     highest = SELECTION_SEED - config.envs

@@ -135,7 +135,6 @@ def evaluate(config: EvaluationConfig, console: Console | None = None) -> list[R
 
 
 def _check(config: EvaluationConfig) -> None:
-    """Refuse what cannot work."""
     check_least(config, 1, "episodes", "video_episodes")
     check_least(config, 0, "seed")
     if not config.policy:

@@ -154,7 +154,6 @@ def require_trust(spec: str, path: Path, trusted: bool) -> None:
 
 
 def _policy_file(spec: str) -> Path:
-    """Return the file that ``spec`` names: one of an exported policy, or a .zip."""
     path = Path(spec)
     if path.is_dir():
         saved = [path / BEST_FILE, path / LAST_FILE]

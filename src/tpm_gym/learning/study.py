@@ -116,14 +116,12 @@ def plan_runs(config: StudyConfig) -> list[Run]:
 
 
 def _ids(config: StudyConfig, algo: str) -> list[str]:
-    """Ids that the plan has for an algorithm."""
     usual = {"results": (), "penalty": _PENALTY_IDS, "robustness": _ROBUSTNESS_IDS}
     wanted = config.envs or usual[config.plan]
     return [env for env in read_recipes(recipe_file(algo), algo) if not wanted or env in wanted]
 
 
 def _runs_of(config: StudyConfig, env: str, algo: str, seed: int) -> list[Run]:
-    """The runs of one id, algorithm and seed."""
     name = f"{env}-{algo}"
     options = ["--seed", str(seed)]
     if config.steps is not UNSET:

@@ -218,7 +218,6 @@ def _draw_success(axes: Axes, evaluations: Sequence[Mapping[str, Any]]) -> None:
 def _draw_interval(
     axes: Axes, evaluations: Sequence[Mapping[str, Any]], name: str, interval: str, mean: str
 ) -> None:
-    """Draw a metric with the band of its intervals."""
     steps = [evaluation["steps"] for evaluation in evaluations]
     low, means, high = (
         [evaluation[name][part] for evaluation in evaluations] for part in ("low", "mean", "high")
