@@ -39,6 +39,7 @@ from speed_report import print_report, save_plot
 
 from tpm_gym import ENV_IDS
 from tpm_gym.simulation.bullet.client import silence
+from tpm_gym.simulation.state import CONTROL_PERIOD
 
 BASELINE = "PandaPickAndPlace-v3"
 PEERS = {
@@ -141,7 +142,7 @@ def _check_rate(env_id: str, env: gym.Env[Any, Any]) -> None:
     """Raise where an environment's control step is not 40 ms, so that steps are not comparable."""
     unwrapped: Any = env.unwrapped
     if env_id in ENV_IDS:
-        period = unwrapped.simulation.engine.control_period
+        period = CONTROL_PERIOD
     elif PEERS[env_id] == "panda_gym":
         period = unwrapped.sim.dt
     else:

@@ -81,6 +81,8 @@ class Recorder:
 
         def noting(*arguments: Any, **options: Any) -> Any:
             result = function(*arguments, **options)
+            if name == MOTORS[0]:
+                arguments = arguments[:9]  # the tenth is the client's number
             kept = {key: value for key, value in options.items() if key != "physicsClientId"}
             self.calls.append(Call(name, arguments, kept, result))
             return result

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import asdict, replace
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -19,7 +19,7 @@ from tpm_gym.analysis import aspects, singularity
 from tpm_gym.analysis.aspects import Aspect, Cells
 from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import ConfigurationError
-from tpm_gym.kinematics import ELBOWS_OUT, WORKING_MODES, WorkingMode, inverse_all, workspace
+from tpm_gym.kinematics import ELBOWS_OUT, WORKING_MODES, WorkingMode, workspace
 from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
 
 COARSE, FINE = (32, 8, 48), (64, 16, 96)
@@ -28,11 +28,7 @@ modes = st.sampled_from(WORKING_MODES)
 
 def signs(points: FloatArray, mode: WorkingMode, g: Geometry) -> FloatArray:
     """Signs (..., 3) of the parallel factors by the oracle; NaN where not reachable."""
-    found = inverse_all(points, g)
-    theta, beta = found.theta[..., mode.index, :], found.beta[..., mode.index]
-    x_c = points[..., 0] - g.l2 - g.l7 * np.cos(beta)
-    parallel, _ = oracle.factors(theta, x_c, points[..., 2] - 2 * g.l6, beta, g)
-    return np.sign(parallel)
+    return np.sign(oracle.factors_at(points, mode, g)[0])
 
 
 def of(aspect: Aspect) -> list[int]:
@@ -119,10 +115,10 @@ def test_aspects_part_the_reachable_set_by_signs(g: Geometry, mode: WorkingMode)
 @settings(derandomize=True, max_examples=15, deadline=None)
 @given(oracle.geometries(), modes, st.sampled_from([0.5, 4.0]))
 def test_sets_scale_with_the_lengths(g: Geometry, mode: WorkingMode, factor: float) -> None:
-    bigger = Geometry(**{name: factor * length for name, length in asdict(g).items()})
-    shape = (16, 4, 16)
-    pairs = zip(aspects.aspects(mode, g, shape), aspects.aspects(mode, bigger, shape), strict=True)
-    for one, other in pairs:
+    both = (
+        aspects.aspects(mode, lengths, (16, 4, 16)) for lengths in (g, oracle.scaled(g, factor))
+    )
+    for one, other in zip(*both, strict=True):
         np.testing.assert_array_equal(one.cells.mask, other.cells.mask)
         assert of(one) == of(other)
         assert other.cells.volume == pytest.approx(factor**3 * one.cells.volume)
@@ -196,8 +192,7 @@ def test_largest_block_is_that_of_trying_all(
 def test_boxes_are_in_the_aspect_and_conditioned_well(threshold: float) -> None:
     aspect = aspects.aspects(shape=FINE)[1]
     box = aspects.largest_box(aspect, threshold)
-    sides = [np.linspace(*ends, 14) for ends in zip(box.region.low, box.region.high, strict=True)]
-    points = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 3)
+    points = oracle.grid(box.region.low, box.region.high, (14, 14, 14))
     assert (signs(points, aspect.branch, PAPER) == of(aspect)).all()
     values = workspace.conditioning_at(points, aspect.branch, aspect.assembly)
     assert values.min() > 0.97 * threshold  # between the nodes, too
@@ -272,9 +267,9 @@ def test_bad_arguments_are_refused() -> None:
 
 def test_mechanisms_that_reach_nothing_have_no_aspects() -> None:
     g = Geometry(l1=0.3, l2=1.5, l3=0.2, l4=0.15, l5=0.02, l6=0.0, l7=0.05)
+    cells = aspects.reachable_set(geometry=g, shape=COARSE).cells
     assert aspects.aspects(geometry=g, shape=COARSE) == ()
-    assert aspects.reachable_set(geometry=g, shape=COARSE).cells.volume == 0
-    assert aspects.reachable_set(geometry=g, shape=COARSE).cells.volume_error == 0
+    assert cells.volume == cells.volume_error == 0
 
 
 def largest(g: Geometry, shape: tuple[int, int, int]) -> aspects.Box:

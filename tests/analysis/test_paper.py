@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import oracle
@@ -54,8 +55,7 @@ def sample() -> Sample:
     solutions = inverse_all(points)
     number = np.nonzero(solutions.valid)[0]
     theta, beta = solutions.theta[solutions.valid], solutions.beta[solutions.valid]
-    x_c = points[number, 0] - l2 - l7 * np.cos(beta)
-    z_c = points[number, 2] - 2 * l6
+    x_c, z_c = oracle.link3(points[number], beta, PAPER)
     p = oracle.points(theta, x_c, z_c, beta, PAPER)
     assert np.abs(gap(p["B1"], p["C1"])).max() < CLOSED
     return Sample(theta, x_c, z_c, beta, p)
@@ -166,17 +166,19 @@ def leg_gaps(sample: Sample, leg: int, angles: FloatArray) -> FloatArray:
     return gap(arms, sample.p[f"C{leg}"])
 
 
-def assert_leg(sample: Sample, leg: int, printed: FloatArray, ours: FloatArray) -> None:
+def assert_leg(
+    sample: Sample, leg: int, printed: FloatArray, ours: FloatArray, among: Any = slice(None)
+) -> None:
     """Our angles close the leg and contain the true one; the printed ones do not."""
     turned = np.abs(np.exp(1j * ours) - np.exp(1j * sample.theta[:, leg - 1])).min(axis=0)
     # Half angles lose digits near g = 0 and near a double root, so judge where they do not.
     good = np.isfinite(ours).all(axis=0) & (np.abs(np.cos(ours / 2)).min(axis=0) > 1e-2)
     good &= np.abs(np.sin((ours[0] - ours[1]) / 2)) > 1e-2
-    assert good.mean() > 0.8
+    assert good[among].mean() > 0.8
     assert_closed(leg_gaps(sample, leg, ours)[:, good], 1e-10)
     assert turned[good].max() < 1e-9
     wrong = np.abs(leg_gaps(sample, leg, printed))
-    assert (~(wrong < OPEN)).mean() > 0.95  # open, or not even real
+    assert (~(wrong < OPEN))[:, among].mean() > 0.95  # open, or not even real
 
 
 def test_eq_13_leg_1_printed_swaps_g_and_h(sample: Sample) -> None:
@@ -200,17 +202,7 @@ def test_eq_13_leg_2_printed_has_x_c1_squared_for_x_c2_squared(sample: Sample) -
 
     apart = np.abs(x1**2 - x2**2) > 1e-2  # they agree where x_C1 = l5
     assert apart.mean() > 0.8
-    part = Sample(
-        sample.theta[apart],
-        sample.x_c[apart],
-        sample.z_c[apart],
-        sample.beta[apart],
-        {
-            name: point[..., :] if point.ndim == 1 else point[apart]
-            for name, point in sample.p.items()
-        },
-    )
-    assert_leg(part, 2, angles(x1**2)[:, apart], angles(x2**2)[:, apart])
+    assert_leg(sample, 2, angles(x1**2), angles(x2**2), among=apart)
 
 
 def test_eq_15_printed_lacks_the_x_c3_terms(sample: Sample) -> None:
@@ -357,9 +349,7 @@ def test_conclusion_decoupling_is_partial() -> None:
 def test_singularities_lack_the_constraint_singularity_z_c1_equal_z_b1() -> None:
     """There link 3' can turn about y, while every factor of Eqs. (16) and (17) is far from 0."""
     theta_1 = np.arccos(0.6)
-    x_c, z_c = np.sqrt(l4**2 - (l1 + 0.6 * l3) ** 2), l3 * np.sin(theta_1)
-    point = [x_c + 0.8 * l7 + l2, 0.6 * l7, z_c + 2 * l6]
-    theta, branch = inverse(point), AssemblyMode(planar=1, sin_beta=1)
+    point, branch = oracle.level_rod_4(theta_1, np.arcsin(0.6)), AssemblyMode(1, 1)
     theta = inverse_all(point).theta
     theta = theta[np.abs(theta[:, 0] - theta_1) < 1e-9]
     slot = branch.index

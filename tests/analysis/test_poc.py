@@ -14,7 +14,6 @@ from tpm_gym.analysis.poc import (
     Unit,
     constraint_degree,
     coupling_degrees,
-    degrees_of_freedom,
     independent_equations,
     parallel,
     parallelogram_4r,
@@ -185,11 +184,6 @@ def test_coupling_degree_is_half_the_least_sum(
 def test_coupling_degree_needs_balanced_constraint_degrees(decompositions: list[list[int]]) -> None:
     with pytest.raises(InputError):
         coupling_degrees(decompositions)
-
-
-def test_degrees_of_freedom_is_a_difference_of_sums() -> None:
-    assert degrees_of_freedom([8, 6], [6, 5]) == 3
-    assert degrees_of_freedom([8], [6]) == 2
 
 
 def test_constraint_degree_is_the_paper_s_arithmetic() -> None:

@@ -8,14 +8,10 @@ import numpy as np
 import oracle
 import pytest
 from hypothesis import given, settings
-from walk import place, walk
+from walk import gaps
 
-from tpm_gym.analysis.poc import (
-    Chain,
-    POCSet,
-    Subspace,
-    degrees_of_freedom,
-)
+from tpm_gym.analysis.poc import Chain, POCSet, Subspace, degrees_of_freedom
+from tpm_gym.analysis.singularity import dimensionless
 from tpm_gym.analysis.topology import Structure, analyse, closure_jacobian, describe, mobility
 from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import InputError, SingularityError, UnreachableError
@@ -28,7 +24,7 @@ from tpm_gym.kinematics import (
     jacobian,
 )
 from tpm_gym.kinematics.geometry import PAPER, Geometry
-from tpm_gym.kinematics.workspace import TASK_REGION
+from tpm_gym.mechanism import PAPER_TPM
 from tpm_gym.mechanism.tree import build, joint_angles
 
 X, Y, Z = np.eye(3)
@@ -49,22 +45,10 @@ def configurations(
     for branch in ASSEMBLY_MODES:
         angles = theta[forward_all(theta, g).valid[:, branch.index]]
         factors = jacobian.factors(angles, branch, g)
-        size = np.concatenate(
-            [
-                np.abs(factors.parallel) / [1, g.l4, g.l4**2],
-                np.abs(factors.serial) / ([1] + [g.l3 * g.l4] * 3),
-                np.abs(rise(angles, branch, g))[:, None] / g.l4,
-            ],
-            axis=1,
-        )
+        level = factors.constraint[:, None] / g.l4
+        size = np.abs(np.concatenate([dimensionless(factors, g), level], axis=1))
         found += [(t, branch) for t in angles[(size > clear).all(axis=1)][: count // 4]]
     return found
-
-
-def rise(theta: FloatArray, branch: AssemblyMode, g: Geometry) -> FloatArray:
-    """z_C1 - z_B1, which vanishes at the constraint singularity."""
-    z_c = forward_all(theta, g).link3[..., branch.index, 1]
-    return np.asarray(z_c - g.l3 * np.sin(theta[..., 0]))
 
 
 # The mechanism
@@ -134,11 +118,8 @@ def test_every_decomposition_has_the_same_freedoms_and_the_paper_s_couples_least
         assert len(found.decompositions) == 6
         totals = []
         for loops in found.decompositions:
-            freedoms, equations = (
-                [loop.freedoms for loop in loops],
-                [loop.equations for loop in loops],
-            )
-            assert degrees_of_freedom(freedoms, equations) == 3
+            counts = [(loop.freedoms, loop.equations) for loop in loops]
+            assert degrees_of_freedom(*zip(*counts, strict=True)) == 3
             assert sum(loop.constraint for loop in loops) == 0
             totals.append(sum(abs(loop.constraint) for loop in loops) / 2)
         assert sorted(totals) == [0, 0, 2, 2, 3, 3]
@@ -198,17 +179,6 @@ def test_screw_theory_finds_the_same_sets() -> None:
 # Mobility from the loops that the simulator closes
 
 
-def gaps(angles: dict[str, float]) -> FloatArray:
-    mechanism = build()
-    frames = walk(mechanism, angles)
-    return np.concatenate(
-        [
-            place(frames, c.link_a, c.point_a) - place(frames, c.link_b, c.point_b)
-            for c in mechanism.closures
-        ]
-    )
-
-
 def joints_of_the_mechanism() -> list[str]:
     """All but the cup's slide, which belongs to the tool."""
     joints = [link.joint.name for link in build().links if link.joint]
@@ -225,7 +195,7 @@ def test_closure_jacobian_is_the_derivative_of_the_gaps() -> None:
         assert len(names) == len(angles) - 1
         for column, name in enumerate(names):
             up, down = angles | {name: angles[name] + step}, angles | {name: angles[name] - step}
-            slope = (gaps(up) - gaps(down)) / (2 * step)
+            slope = (gaps(build(), up) - gaps(build(), down)).ravel() / (2 * step)
             np.testing.assert_allclose(found[:, column], slope, atol=1e-9, err_msg=name)
 
 
@@ -245,7 +215,7 @@ def test_the_idle_freedom_is_end_link_10_about_its_own_axis() -> None:
     for theta, branch in configurations(6, 8):
         angles = joint_angles(theta, branch)
         rolled = angles | {"R33": angles["R33"] + 1.0}
-        np.testing.assert_allclose(gaps(rolled), gaps(angles), atol=1e-12)
+        np.testing.assert_allclose(gaps(build(), rolled), gaps(build(), angles), atol=1e-12)
         still = np.linalg.norm(closure_jacobian(build(), angles), axis=0) < 1e-12
         names = joints_of_the_mechanism()
         assert [name for name, idle in zip(names, still, strict=True) if idle] == ["R33"]
@@ -255,10 +225,7 @@ def on_constraint_singularity(
     theta_1: float, side: int, offset: float = 0.0
 ) -> list[tuple[FloatArray, AssemblyMode]]:
     """Configurations with z_C1 = z_B1 + offset."""
-    g = PAPER
-    y_b, z_b = g.l1 + g.l3 * np.cos(theta_1), g.l3 * np.sin(theta_1)
-    x_c = side * np.sqrt(g.l4**2 - y_b**2 - offset**2)
-    point = [x_c + 0.8 * g.l7 + g.l2, 0.6 * g.l7, z_b + offset + 2 * g.l6]
+    point = oracle.level_rod_4(theta_1, np.arcsin(0.6), side, offset)
     solutions = inverse_all(point)
     found = []
     for theta in solutions.theta[solutions.valid]:
@@ -285,10 +252,9 @@ def test_both_counts_find_the_constraint_singularity(theta_1: float, side: int) 
 
 
 def test_the_task_region_keeps_clear_of_the_constraint_singularity() -> None:
-    sides = [np.linspace(*ends, 9) for ends in zip(TASK_REGION.low, TASK_REGION.high, strict=True)]
-    points = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 3)
-    z_c = points[:, 2] - 2 * PAPER.l6
-    assert (z_c - PAPER.l3 * np.sin(inverse(points)[:, 0])).min() > PAPER.l3
+    points = oracle.grid(PAPER_TPM.region.low, PAPER_TPM.region.high, (9, 9, 9))
+    z_c = points[..., 2] - 2 * PAPER.l6
+    assert (z_c - PAPER.l3 * np.sin(inverse(points)[..., 0])).min() > PAPER.l3
 
 
 def test_doubtful_rank_raises() -> None:

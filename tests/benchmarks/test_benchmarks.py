@@ -182,15 +182,19 @@ def test_profile_names_where_the_time_goes(capsys):
 SHORT = ["--steps", "1200", "--every", "100", "--warm-up", "300"]
 
 
+def soaked(folder: Path, *options: str, **hooks: Any) -> tuple[int, dict[str, Any]]:
+    """Status and file of a short soak."""
+    numbers = folder / "soak.json"
+    return soak.main([*SHORT, "--json", str(numbers), *options], **hooks), read_strict(numbers)
+
+
 def test_soak_goes_through_everything_and_passes(tmp_path, capsys, monkeypatch):
     for share in ("REOPEN", "RENDER", "SAVE"):
         monkeypatch.setattr(soak, share, 0.6)  # so that a short one sees all of it
-    numbers, plot = tmp_path / "soak.json", tmp_path / "soak.png"
-    options = ["--steps", "2000", "--json", str(numbers), "--plot", str(plot)]
-    status = soak.main([*SHORT, *options])
+    plot = tmp_path / "soak.png"
+    status, content = soaked(tmp_path, "--steps", "2000", "--plot", str(plot))
     output = capsys.readouterr().out
     assert status == 0, output
-    content = read_strict(numbers)
     assert content["finished"]
     assert content["failures"] == []
     assert content["samples"][-1]["steps"] >= 2000
@@ -223,11 +227,9 @@ def test_a_step_that_raises_is_reported_outlived_and_can_be_repeated(tmp_path, c
         env = gym.make(env_id, **options)
         return Raising(env) if env_id == "TPMReachJoints-v0" else env
 
-    numbers = tmp_path / "soak.json"
-    status = soak.main([*SHORT, "--json", str(numbers)], make=make)
+    status, content = soaked(tmp_path, make=make)
     output = capsys.readouterr().out
     assert status == 1
-    content = read_strict(numbers)
     assert content["finished"]  # it went on
     assert not content["verdict"]["nothing_raised"]
     first = content["failures"][0]
@@ -271,15 +273,13 @@ class Growing(gym.Wrapper):
 
 
 def test_memory_that_grows_is_found(tmp_path):
-    numbers = tmp_path / "soak.json"
     try:
-        status = soak.main(
-            [*SHORT, "--json", str(numbers)],
-            make=lambda env_id, **options: Growing(gym.make(env_id, **options)),
+        status, content = soaked(
+            tmp_path, make=lambda env_id, **options: Growing(gym.make(env_id, **options))
         )
     finally:
         Growing.kept.clear()
-    verdict = read_strict(numbers)["verdict"]
+    verdict = content["verdict"]
     assert status == 1
     assert not verdict["memory_within_limit"]
     assert verdict["memory"]["growth_mb"] > 30
@@ -295,9 +295,8 @@ def test_an_interrupted_soak_keeps_its_samples_and_does_not_pass(tmp_path, monke
         run_visit(self, number)
 
     monkeypatch.setattr(soak.Soak, "run_visit", interrupted)
-    numbers = tmp_path / "soak.json"
-    assert soak.main([*SHORT, "--json", str(numbers)]) == 1
-    content = read_strict(numbers)
+    status, content = soaked(tmp_path)
+    assert status == 1
     assert len(content["samples"]) >= 4
     assert not content["finished"]
 

@@ -15,6 +15,7 @@ import tpm_gym
 ENGINES = ["pybullet"]
 CASES: list[tuple[str, dict[str, Any]]] = [
     *((env_id, {"machine": name}) for name in ("paper", "wide") for env_id in tpm_gym.ENV_IDS),
+    ("TPMReach-v0", {"goals": "tempting"}),
     ("TPMPickAndPlaceJoints-v0", {"goals": "tempting"}),
     ("TPMReachJoints-v0", {"randomisation": EVERYTHING}),
     ("TPMPickAndPlace-v0", {"randomisation": EVERYTHING}),

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Iterator
 from typing import Any
 
@@ -113,13 +111,3 @@ def test_other_ids_are_not_taken_for_ours(registries: None) -> None:
     assert "Elsewhere-v0" not in registration.env_ids()
     with pytest.raises(AttributeError, match="ENV_IDX"):
         _ = tpm_gym.ENV_IDX
-
-
-def test_importing_the_package_imports_no_engine_and_nothing_of_learning() -> None:
-    heavy = "pybullet", "mujoco", "torch", "matplotlib", "yaml", "stable_baselines3", "scipy"
-    code = (
-        "import sys, tpm_gym; tpm_gym.ENV_IDS; from tpm_gym.tasks import Expert;"
-        f"print(sorted(set({heavy}) & set(sys.modules)))"
-    )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert (result.stdout.strip(), result.stderr) == ("[]", "")

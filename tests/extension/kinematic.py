@@ -23,7 +23,7 @@ DOWN = (0.0, 0.0, -1.0)
 class KinematicEngine:
     """Takes neither physics nor a window, so it names neither in its constructor."""
 
-    substeps, control_period = 1, CONTROL_PERIOD
+    substeps = 1
 
     def load(self, machine: Machine, scene: Scene) -> None:
         self._machine, self._blocks = machine, scene.objects
@@ -42,7 +42,7 @@ class KinematicEngine:
 
     def advance(self, references: Sequence[Vector], vacuum: bool) -> None:
         before, (theta,) = self._position(), references
-        a, b, c = np.subtract(theta, self._theta) / self.control_period
+        a, b, c = np.subtract(theta, self._theta) / CONTROL_PERIOD
         self._theta, self._rates = theta, (a, b, c)
         now = self._position()
         if self._held >= 0:

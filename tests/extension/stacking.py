@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 import tpm_gym
 from tpm_gym.arrays import FloatArray
 from tpm_gym.simulation import Block, Scene, State
-from tpm_gym.tasks import Entry, Expert, Move, Task, rewards, sampling
+from tpm_gym.tasks import Entry, Motion, Move, Task, hanging, rewards, sampling
 
 CLEARANCE = 0.045  # m; a block that is carried passes over one that stands
 APART = 0.060  # m between the middles of what stands on the table
@@ -33,11 +33,11 @@ class Stack(Task):
         mount, start = self.machine.mount, dict(chosen)
         for name, block in (("red", self.red), ("blue", self.blue), ("goal", self.red)):
             if name not in chosen:
-                others = [place[:3] + self.hanging(block) for place in start.values()]
+                others = [place[:3] + hanging(block) for place in start.values()]
                 taken = mount.to_paper(np.reshape(others, (-1, 3)))
                 table = self.on_table(block)
                 point = sampling.apart_from(taken, rng, self.machine, table, APART)
-                place = mount.to_world(point) - self.hanging(block)
+                place = mount.to_world(point) - hanging(block)
                 start[name] = np.r_[place, place + self.tower] if name == "goal" else place
         return start
 
@@ -62,17 +62,17 @@ class Stack(Task):
         """The robot, then each block."""
         return (*self.robot_entries(), *self.object_entries(0), *self.object_entries(1))
 
-    def plan(self, expert: Expert) -> Iterator[Move]:
+    def plan(self, motion: Motion) -> Iterator[Move]:
         """Red to its place, blue on top of it, and up."""
         up = np.array([0.0, 0.0, -CLEARANCE])  # z points down in the machine's frame
-        for block, goal in zip(self.scene.objects, expert.goal.reshape(2, 3), strict=True):
-            while not expert.holding(block.name):
-                yield from expert.pick(block, CLEARANCE)
-            grip = expert.seen["position"] - expert.seen[f"{block.name}_position"]
+        for block, goal in zip(self.scene.objects, motion.goal.reshape(2, 3), strict=True):
+            while not motion.holding(block.name):
+                yield from motion.pick(block, CLEARANCE)
+            grip = motion.seen["position"] - motion.seen[f"{block.name}_position"]
             place = self.machine.mount.to_paper(goal + grip)
-            yield from expert.go([expert.command + up, place + up, place], vacuum=True)
+            yield from motion.go([motion.command + up, place + up, place], vacuum=True)
             yield from [Move(place, True), Move(place, True), Move(place, False)]
-            yield from expert.go([place + up], vacuum=False)
+            yield from motion.go([place + up], vacuum=False)
 
 
 IDS = tpm_gym.register_task("Stack", Stack, max_episode_steps=100)

@@ -50,14 +50,14 @@ def test_what_it_cannot_randomise_it_refuses_by_name():
 class Derived(Engine):
     """Of the protocol, whose methods do nothing, and of no others."""
 
-    substeps, control_period = 1, 0.04
+    substeps = 1
 
 
 @pytest.mark.parametrize(
     ("engine", "lacking"),
     [
         (type("NoSave", (KinematicEngine,), {"save": None}), ["save"]),
-        (type("NoPeriod", (KinematicEngine,), {"control_period": None}), ["control_period"]),
+        (type("NoSteps", (KinematicEngine,), {"substeps": None}), ["substeps"]),
         (Derived, ["load", "advance", "close"]),
     ],
 )
@@ -68,13 +68,7 @@ def test_an_engine_that_lacks_a_part_is_refused_by_name(engine, lacking):
         tpm_gym.TPMEnv(engine=name)
     for part in lacking:
         assert part in caught.value.valid
-    assert "substeps" not in caught.value.valid
-
-
-def test_an_engine_of_another_period_is_refused():
-    tpm_gym.register_engine("slow", type("Slow", (KinematicEngine,), {"control_period": 0.1}))
-    with pytest.raises(ConfigurationError, match="control_period"):
-        tpm_gym.TPMEnv(engine="slow")
+    assert ("substeps" in caught.value.valid) == ("substeps" in lacking)
 
 
 def test_names_are_taken_once():

@@ -8,7 +8,7 @@ into every extremum that comes near zero for a pair of roots between two samples
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 import oracle
@@ -18,10 +18,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from tpm_gym.arrays import FloatArray
-from tpm_gym.kinematics import ASSEMBLY_MODES, forward_all, inverse_all, jacobian
+from tpm_gym.kinematics import ASSEMBLY_MODES, ForwardSolutions, forward_all, inverse_all, jacobian
 from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
 
 Rows = NDArray[np.int64]
+Solve = Callable[..., Any]
 CLOSED = 1e-12
 BLOCK = 20_000
 SAMPLES = 180
@@ -38,57 +39,62 @@ def positions(rng: np.random.Generator, count: int, g: Geometry) -> FloatArray:
     return rng.uniform(low, high, (count, 3))
 
 
-def gaps(theta: FloatArray, position: FloatArray, beta: FloatArray, g: Geometry) -> FloatArray:
-    """The largest opening of any loop, m, of configurations (n, ...)."""
-    x_c = position[:, 0] - g.l2 - g.l7 * np.cos(beta)
-    z_c = position[:, 2] - 2 * g.l6
-    p = oracle.points(theta, x_c, z_c, beta, g)
+def draw(solve: Solve, rng: np.random.Generator, count: int, g: Geometry) -> FloatArray:
+    return angles(rng, count) if solve is forward_all else positions(rng, count, g)
+
+
+def gaps(found: Any, given: FloatArray, g: Geometry) -> FloatArray:
+    """The largest opening of any loop, m, of each branch (n,) found for the inputs given."""
+    row, slot = np.nonzero(found.valid)
+    if isinstance(found, ForwardSolutions):
+        theta, position = given[row], found.position[row, slot]
+    else:
+        theta, position = found.theta[row, slot], given[row]
+    beta = found.beta[row, slot]
+    p = oracle.points(theta, *oracle.link3(position, beta, g), beta, g)
     rods = np.abs(np.linalg.norm(oracle.rods(p), axis=-1) - g.l4).max(axis=-1)
     worst: FloatArray = np.maximum(rods, np.linalg.norm(p["P"] - position, axis=-1))
     assert np.isfinite(worst).all()
     return worst
 
 
-def worst_forward(count: int, g: Geometry, seed: int) -> tuple[float, int]:
-    """The largest gap over all branches of random angles, and the number of branches."""
-    rng, worst, branches = np.random.default_rng(seed), 0.0, 0
+def worst(solve: Solve, count: int, g: Geometry, seed: int) -> tuple[float, int]:
+    """The largest gap over all branches of random inputs, and the number of branches."""
+    rng, largest, branches = np.random.default_rng(seed), 0.0, 0
     for _ in range(0, count, BLOCK):
-        theta = angles(rng, min(BLOCK, count))
-        found = forward_all(theta, g)
-        row, slot = np.nonzero(found.valid)
-        gap = gaps(theta[row], found.position[row, slot], found.beta[row, slot], g)
-        worst, branches = max(worst, float(gap.max())), branches + len(row)
-    return worst, branches
+        given = draw(solve, rng, min(BLOCK, count), g)
+        gap = gaps(solve(given, g), given, g)
+        largest, branches = max(largest, float(gap.max())), branches + len(gap)
+    return largest, branches
 
 
-def worst_inverse(count: int, g: Geometry, seed: int) -> tuple[float, int]:
-    """The same for random points."""
-    rng, worst, branches = np.random.default_rng(seed), 0.0, 0
-    for _ in range(0, count, BLOCK):
-        points = positions(rng, min(BLOCK, count), g)
-        found = inverse_all(points, g)
-        row, slot = np.nonzero(found.valid)
-        gap = gaps(found.theta[row, slot], points[row], found.beta[row, slot], g)
-        worst, branches = max(worst, float(gap.max())), branches + len(row)
-    return worst, branches
+both_ways = pytest.mark.parametrize("solve", [forward_all, inverse_all])
+both_lengths = pytest.mark.parametrize("g", [PAPER, WIDE])
 
 
-@pytest.mark.parametrize("g", [PAPER, WIDE])
-@pytest.mark.parametrize("worst", [worst_forward, worst_inverse])
-def test_10000_inputs_close(worst: Callable[..., tuple[float, int]], g: Geometry) -> None:
-    gap, branches = worst(10_000, g, seed=1)
+@both_lengths
+@both_ways
+def test_10000_inputs_close(solve: Solve, g: Geometry) -> None:
+    gap, branches = worst(solve, 10_000, g, seed=1)
     assert gap < CLOSED
     assert branches > 2_000
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("g", [PAPER, WIDE])
-@pytest.mark.parametrize("worst", [worst_forward, worst_inverse])
-def test_a_million_inputs_close(worst: Callable[..., tuple[float, int]], g: Geometry) -> None:
-    gap, branches = worst(1_000_000, g, seed=2)
-    print(f"{worst.__name__} {g.l7}: largest gap {gap:.2e} m over {branches} branches")
+@both_lengths
+@both_ways
+def test_a_million_inputs_close(solve: Solve, g: Geometry) -> None:
+    gap, branches = worst(solve, 1_000_000, g, seed=2)
+    print(f"{solve.__name__} {g.l7}: largest gap {gap:.2e} m over {branches} branches")
     assert gap < CLOSED
     assert branches > 200_000
+
+
+@settings(derandomize=True, max_examples=40, deadline=None)
+@given(oracle.geometries(), oracle.seeds())
+def test_any_geometry_closes(g: Geometry, seed: int) -> None:
+    assert worst(forward_all, 500, g, seed)[0] < CLOSED
+    assert worst(inverse_all, 500, g, seed)[0] < CLOSED
 
 
 Equation = Callable[[Rows, FloatArray], FloatArray]
@@ -194,32 +200,27 @@ def unmatched(numeric: list[FloatArray], ours: list[FloatArray]) -> tuple[int, i
     return other, compared, worst
 
 
-def check_forward(count: int, g: Geometry, seed: int) -> int:
-    theta = angles(np.random.default_rng(seed), count)
-    other, compared, worst = 0, 0, 0.0
-    for some in np.split(theta, range(500, count, 500)):
-        found = forward_all(some, g)
+def both(solve: Solve, some: FloatArray, g: Geometry) -> tuple[list[FloatArray], list[FloatArray]]:
+    """The solutions of each input by the root finder, and ours."""
+    found = solve(some, g)
+    if solve is forward_all:
         ours = [p[valid] for p, valid in zip(found.position, found.valid, strict=True)]
-        result = unmatched(numeric_forward(some, g), ours)
+        return numeric_forward(some, g), ours
+    all_angles = np.concatenate([found.beta[..., None], found.theta], axis=-1)
+    ours = [unit(rows[valid]) for rows, valid in zip(all_angles, found.valid, strict=True)]
+    return [unit(roots) for roots in numeric_inverse(some, g)], ours
+
+
+def check(solve: Solve, count: int, g: Geometry, seed: int) -> int:
+    given = draw(solve, np.random.default_rng(seed), count, g)
+    other, compared, worst = 0, 0, 0.0
+    for some in np.split(given, range(500, count, 500)):
+        result = unmatched(*both(solve, some, g))
         other, compared, worst = other + result[0], compared + result[1], max(worst, result[2])
-    print(f"forward, l7 {g.l7}: {other} of {count} differ; {compared} roots, {worst:.1e} m apart")
+    name = solve.__name__
+    print(f"{name}, l7 {g.l7}: {other} of {count} differ; {compared} roots, {worst:.1e} apart")
     assert other == 0
     # Near tangency, a root is known to the square root of rounding.
-    assert worst < 1e-6
-    return compared
-
-
-def check_inverse(count: int, g: Geometry, seed: int) -> int:
-    points = positions(np.random.default_rng(seed), count, g)
-    other, compared, worst = 0, 0, 0.0
-    for some in np.split(points, range(500, count, 500)):
-        found = inverse_all(some, g)
-        both = np.concatenate([found.beta[..., None], found.theta], axis=-1)
-        ours = [unit(rows[valid]) for rows, valid in zip(both, found.valid, strict=True)]
-        result = unmatched([unit(roots) for roots in numeric_inverse(some, g)], ours)
-        other, compared, worst = other + result[0], compared + result[1], max(worst, result[2])
-    print(f"inverse, l7 {g.l7}: {other} of {count} differ; {compared} roots, {worst:.1e} apart")
-    assert other == 0
     assert worst < 1e-6
     return compared
 
@@ -229,26 +230,24 @@ def unit(angle: FloatArray) -> FloatArray:
     return np.concatenate([np.cos(angle), np.sin(angle)], axis=-1)
 
 
-@pytest.mark.parametrize("g", [PAPER, WIDE])
+@both_lengths
 def test_no_branch_is_missed_on_200_inputs(g: Geometry) -> None:
-    assert check_forward(200, g, seed=3) > 40
-    assert check_inverse(200, g, seed=4) > 800
+    assert check(forward_all, 200, g, seed=3) > 40
+    assert check(inverse_all, 200, g, seed=4) > 800
 
 
 @pytest.mark.slow
 def test_no_branch_is_missed_on_10000_inputs() -> None:
     for g in (PAPER, WIDE):
-        assert check_forward(10_000, g, seed=5) > 2_000
-        assert check_inverse(10_000, g, seed=6) > 40_000
+        assert check(forward_all, 10_000, g, seed=5) > 2_000
+        assert check(inverse_all, 10_000, g, seed=6) > 40_000
 
 
 @settings(derandomize=True, max_examples=10, deadline=None)
 @given(oracle.geometries(), oracle.seeds())
 def test_no_branch_is_missed_for_any_geometry(g: Geometry, seed: int) -> None:
-    check_forward(40, g, seed)
-    check_inverse(40, g, seed)
-    for worst in (worst_forward, worst_inverse):
-        assert worst(500, g, seed)[0] < CLOSED
+    check(forward_all, 40, g, seed)
+    check(inverse_all, 40, g, seed)
 
 
 def test_the_root_finder_finds_pairs_between_its_samples() -> None:
@@ -273,8 +272,7 @@ def test_postures_about_to_merge_close_and_none_is_missed(off: float) -> None:
     found = inverse_all(points, g)
     right = found.valid[:, 8:].any(axis=-1)  # cos(beta) > 0, as the points were made
     assert right.sum() > 100 if off > 0 else not right.any()
-    row, slot = np.nonzero(found.valid)
-    assert gaps(found.theta[row, slot], points[row], found.beta[row, slot], g).max() < CLOSED
+    assert gaps(found, points, g).max() < CLOSED
     numeric = numeric_inverse(points, g)
     assert [len(roots) for roots in numeric] == found.valid.sum(axis=-1).tolist()
 
@@ -295,10 +293,7 @@ def test_circles_about_to_touch_close_and_no_assembly_is_missed(off: float) -> N
     theta = np.stack([theta[row, 0], turn, theta[row, 2]], axis=-1)
     found = forward_all(theta, g)
     assert found.valid.any(axis=-1).sum() > 50 if off > 0 else not found.valid.any()
-    row, slot = np.nonzero(found.valid)
-    if len(row):
-        position, beta = found.position[row, slot], found.beta[row, slot]
-        assert gaps(theta[row], position, beta, g).max() < CLOSED
+    assert gaps(found, theta, g).max(initial=0.0) < CLOSED
     numeric = numeric_forward(theta, g)
     assert [len(roots) for roots in numeric] == found.valid.sum(axis=-1).tolist()
 
@@ -320,27 +315,22 @@ def test_assemblies_about_to_merge_at_y_0_are_not_missed(angle: float, folded: b
     # y goes with the square root of rounding there, which grows as 1 / |level3 planar|: within a
     # hair of those factors' zeros a point may be found farther off, but hardly ever.
     assert missed.mean() < 1e-3
-    row, slot = np.nonzero(found.valid)
-    gap = gaps(theta[row], found.position[row, slot], found.beta[row, slot], g)
-    assert gap.max() < CLOSED
+    assert gaps(found, theta, g).max() < CLOSED
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_the_edge_in_y_belongs_to_the_workspace_and_nothing_beyond(sign: int) -> None:
     points = oracle.vector(-0.05, sign * PAPER.l7 * np.array([1, 1 + 1e-15, 1 + 1e-11]), 0.78)
-    valid = inverse_all(points).valid
-    assert valid.all(axis=-1).tolist() == [True, True, False]
-    assert not valid[2].any()
-    found = inverse_all(points[:1])
-    row, slot = np.nonzero(found.valid)
-    gap = gaps(found.theta[row, slot], points[row], found.beta[row, slot], PAPER)
-    assert gap.max() < CLOSED
+    found = inverse_all(points)
+    assert found.valid.all(axis=-1).tolist() == [True, True, False]
+    assert not found.valid[2].any()
+    assert gaps(found, points, PAPER).max() < CLOSED
 
 
 @settings(derandomize=True, max_examples=40, deadline=None)
 @given(oracle.geometries(), oracle.seeds(), st.floats(0.05, 20))
 def test_lengths_scale_positions_alone(g: Geometry, seed: int, factor: float) -> None:
-    bigger = Geometry(**{name: factor * length for name, length in asdict(g).items()})
+    bigger = oracle.scaled(g, factor)
     rng = np.random.default_rng(seed)
     points = oracle.reachable_points(rng, 50, g)
     one, other = inverse_all(points, g), inverse_all(factor * points, bigger)

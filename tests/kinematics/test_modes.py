@@ -37,25 +37,20 @@ def test_every_combination_of_signs_has_the_slot_of_its_index(
 
 @pytest.mark.parametrize("bad", [0, 2, -2, 0.5, float("nan"), "+", None])
 def test_anything_but_signs_is_refused(bad: Any) -> None:
-    for position in range(2):
-        signs = [1, 1]
-        signs[position] = bad
-        with pytest.raises(InputError) as caught:
-            AssemblyMode(*signs)
-        assert caught.value.name == "AssemblyMode"
-    for position in range(4):
-        signs = [1, -1, 1, -1]
-        signs[position] = bad
-        with pytest.raises(InputError) as caught:
-            WorkingMode(*signs)
-        assert caught.value.name == "WorkingMode"
+    for kind, good in ((AssemblyMode, [1, 1]), (WorkingMode, [1, -1, 1, -1])):
+        for position in range(len(good)):
+            signs: list[Any] = [*good]
+            signs[position] = bad
+            with pytest.raises(InputError) as caught:
+                kind(*signs)
+            assert caught.value.name == kind.__name__
 
 
-def test_modes_are_frozen() -> None:
-    with pytest.raises(FrozenInstanceError):
-        DEFAULT_ASSEMBLY.planar = 1  # type: ignore[misc]
-    with pytest.raises(FrozenInstanceError):
-        ELBOWS_OUT.leg1 = -1  # type: ignore[misc]
+@pytest.mark.parametrize("mode", [DEFAULT_ASSEMBLY, ELBOWS_OUT])
+def test_modes_are_frozen(mode: AssemblyMode | WorkingMode) -> None:
+    for field in fields(mode):
+        with pytest.raises(FrozenInstanceError):
+            setattr(mode, field.name, 1)
 
 
 def elbow_distances(mode: WorkingMode) -> np.ndarray:

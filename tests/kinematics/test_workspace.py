@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.kinematics import (
     ASSEMBLY_MODES,
@@ -22,21 +21,17 @@ from tpm_gym.kinematics import (
     workspace,
 )
 from tpm_gym.kinematics.geometry import PAPER
-from tpm_gym.kinematics.workspace import TASK_REGION, Region
+from tpm_gym.kinematics.workspace import Region
+from tpm_gym.mechanism import PAPER_TPM
 
+TASK_REGION = PAPER_TPM.region
 BOX = Region(low=(-1.0, 0.0, 2.0), high=(1.0, 0.5, 2.0))
 coordinates = st.floats(-3, 3)
 triples = st.tuples(coordinates, coordinates, coordinates)
 
 
-def grid(region: Region, counts: tuple[int, int, int]) -> FloatArray:
-    """A grid over the box, faces included."""
-    sides = [np.linspace(*ends) for ends in zip(region.low, region.high, counts, strict=True)]
-    return np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1)
-
-
 def test_task_region_is_wholly_reachable_with_the_elbows_out_in_the_default_assembly() -> None:
-    points = grid(TASK_REGION, (37, 18, 27))
+    points = oracle.grid(TASK_REGION.low, TASK_REGION.high, (37, 18, 27))
     assert workspace.reachable(points).all()
     assert (workspace.assembly_of(points) == DEFAULT_ASSEMBLY.index).all()
     # and is not so only at the nodes: the angles hardly change from node to node
@@ -46,7 +41,10 @@ def test_task_region_is_wholly_reachable_with_the_elbows_out_in_the_default_asse
 
 def test_task_region_lies_between_the_singularities_in_y() -> None:
     assert 0 < TASK_REGION.low[1] < TASK_REGION.high[1] < PAPER.l7
-    assert workspace.conditioning_at(grid(TASK_REGION, (19, 9, 14))).min() > 0.03
+    assert (
+        workspace.conditioning_at(oracle.grid(TASK_REGION.low, TASK_REGION.high, (19, 9, 14))).min()
+        > 0.03
+    )
 
 
 def test_reachable_is_the_validity_of_the_slot() -> None:
@@ -63,10 +61,7 @@ def test_assembly_of_names_the_signs_of_the_parallel_factors() -> None:
     seen = set()
     for mode in WORKING_MODES:
         here = points[workspace.reachable(points, mode)]
-        found = inverse_all(here)
-        theta, beta = found.theta[:, mode.index], found.beta[:, mode.index]
-        x_c = here[:, 0] - PAPER.l2 - PAPER.l7 * np.cos(beta)
-        parallel, _ = oracle.factors(theta, x_c, here[:, 2] - 2 * PAPER.l6, beta, PAPER)
+        parallel, _ = oracle.factors_at(here, mode, PAPER)
         slots = workspace.assembly_of(here, mode)
         np.testing.assert_array_equal(slots, oracle.assembly_slots(parallel))
         seen |= set(slots.tolist())
@@ -74,7 +69,7 @@ def test_assembly_of_names_the_signs_of_the_parallel_factors() -> None:
 
 
 def test_conditioning_at_points_is_that_of_their_posture() -> None:
-    points = grid(TASK_REGION, (7, 5, 6))
+    points = oracle.grid(TASK_REGION.low, TASK_REGION.high, (7, 5, 6))
     expected = jacobian.conditioning(inverse(points))
     np.testing.assert_allclose(workspace.conditioning_at(points), expected, rtol=1e-12)
     single = workspace.conditioning_at(points[1, 2, 3])

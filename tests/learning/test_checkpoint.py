@@ -86,38 +86,34 @@ def test_checkpoints_are_ordered_by_number(folder: Path) -> None:
     assert CheckpointStore(folder).load(no_warning).step == 1_000_000_000
 
 
-def truncate(path: Path) -> None:
-    os.truncate(path, path.stat().st_size // 2)
+DAMAGES: dict[str, Callable[[bytes], bytes]] = {
+    "truncated": lambda data: data[: len(data) // 2],
+    "empty": lambda data: b"",
+    "grown": lambda data: data + b"\0",
+    "flipped": lambda data: flipped(data, len(data) // 2, 4),
+    # What a file system may leave of a file whose content had not reached the disk
+    "zeros": lambda data: bytes(len(data)),
+}
 
 
-def empty(path: Path) -> None:
-    os.truncate(path, 0)
+def flipped(data: bytes, place: int, bits: int) -> bytes:
+    return data[:place] + bytes([data[place] ^ bits]) + data[place + 1 :]
 
 
-def grow(path: Path) -> None:
-    with path.open("ab") as file:
-        file.write(b"\0")
+def damage(path: Path, kind: str = "flipped") -> None:
+    path.write_bytes(DAMAGES[kind](path.read_bytes()))
 
 
-def flip(path: Path) -> None:
-    """Flip one bit in the middle."""
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 4
-    path.write_bytes(data)
-
-
-def zero(path: Path) -> None:
-    """What a file system may leave of a file whose content had not reached the disk."""
-    path.write_bytes(bytes(path.stat().st_size))
-
-
-@pytest.mark.parametrize("damage", [truncate, empty, grow, flip, zero, Path.unlink])
+@pytest.mark.parametrize("kind", [*DAMAGES, "gone"])
 @pytest.mark.parametrize("name", FILES)
 def test_any_damage_to_any_file_is_named_and_the_one_before_is_used(
-    folder: Path, name: str, damage: Callable[[Path], object]
+    folder: Path, name: str, kind: str
 ) -> None:
     damaged = folder / "000000002" / name
-    damage(damaged)
+    if kind == "gone":
+        damaged.unlink()
+    else:
+        damage(damaged, kind)
     warned: list[str] = []
     store = CheckpointStore(folder)
     assert_equal(store.load(warned.append), content(1))
@@ -130,9 +126,7 @@ def test_every_bit_of_the_manifest_counts(folder: Path) -> None:
     path = folder / "000000002" / "manifest.json"
     whole = path.read_bytes()
     for place in range(len(whole)):
-        data = bytearray(whole)
-        data[place] ^= 1
-        path.write_bytes(data)
+        path.write_bytes(flipped(whole, place, 1))
         try:
             loaded = CheckpointStore(folder).load(lambda text: None)
         except Exception as error:  # any other kind is what this looks for
@@ -156,8 +150,8 @@ def test_another_format_is_named(folder: Path) -> None:
 def test_no_whole_checkpoint_says_what_to_do(folder: Path, tmp_path: Path) -> None:
     for where in (tmp_path / "nowhere", tmp_path):
         assert CheckpointStore(where).load(no_warning) is None
-    flip(folder / "000000001" / "weights.pt")
-    truncate(folder / "000000002" / "arrays.npz")
+    damage(folder / "000000001" / "weights.pt")
+    damage(folder / "000000002" / "arrays.npz", "truncated")
     with pytest.raises(CheckpointError, match="--overwrite") as caught:
         CheckpointStore(folder).load(no_warning)
     assert [path in str(caught.value) for path in ("weights.pt", "arrays.npz")] == [True, True]
@@ -173,13 +167,13 @@ def test_a_damaged_checkpoint_gives_way_to_the_next(folder: Path) -> None:
     store = CheckpointStore(folder)
     store.save(content(30))
     store.save(content(40))
-    flip(folder / "000000040" / "weights.pt")
+    damage(folder / "000000040" / "weights.pt")
     store = CheckpointStore(folder)
     assert store.load(lambda text: None).step == 30
     assert "000000040" in names(folder)
     store.save(content(35))
     assert names(folder) == ["000000030", "000000035"]
-    flip(folder / "000000035" / "weights.pt")
+    damage(folder / "000000035" / "weights.pt")
     store = CheckpointStore(folder)
     store.load(lambda text: None)
     store.save(content(35))  # done again, it ends at the same step

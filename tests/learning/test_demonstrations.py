@@ -7,18 +7,12 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
 
 from tpm_gym.learning import Demonstrations, PenaltyHerReplayBuffer
 
 HORIZON = 50
-
-
-@pytest.fixture(autouse=True)
-def _one_thread() -> None:
-    torch.set_num_threads(1)
 
 
 def filled(envs: int = 1, **options: Any) -> tuple[SAC, Demonstrations]:

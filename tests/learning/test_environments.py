@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import gymnasium as gym
 import pytest
-from trainings import SAC_RECIPE
+from trainings import SAC_RECIPE, tpm_gym_command
 
 from tpm_gym.learning.environments import check_env_id, make_env
 from tpm_gym.learning.errors import ConfigError
@@ -27,15 +25,10 @@ gym.register(
 """
 
 
-def run(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "tpm_gym.learning", *words],
-        cwd=folder,  # from which Python imports
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+def run(folder: Path, *words: str) -> None:
+    """Run a command in a folder, from which Python imports."""
+    done = tpm_gym_command(*words, cwd=folder, env={**os.environ, "OMP_NUM_THREADS": "1"})
+    assert done.returncode == 0, done.stderr
 
 
 def test_an_id_of_a_users_module_is_trained_in_workers_resumed_and_evaluated(
@@ -45,14 +38,10 @@ def test_an_id_of_a_users_module_is_trained_in_workers_resumed_and_evaluated(
     (tmp_path / "sac.yml").write_text(SAC_RECIPE.format(env="MyReach-v0", train_freq=5))
     words = ["--env", "my_tasks:MyReach-v0", "--recipe", "sac.yml", "--envs", "2"]
     words += ["--steps", "120", "--eval-episodes", "1"]
-    done = run(tmp_path, "train", *words)
-    assert done.returncode == 0, done.stderr
-    folder = Path("runs", "MyReach-v0-sac-s0")
-    done = run(tmp_path, "resume", str(folder), "--steps", "160")
-    assert done.returncode == 0, done.stderr
-    words = ["--policy", str(folder), "expert", "--episodes", "1", "--json", "out.json"]
-    done = run(tmp_path, "evaluate", *words)
-    assert done.returncode == 0, done.stderr
+    run(tmp_path, "train", *words)
+    folder = "runs/MyReach-v0-sac-s0"
+    run(tmp_path, "resume", folder, "--steps", "160")
+    run(tmp_path, "evaluate", "--policy", folder, "expert", "--episodes", "1", "--json", "out.json")
     content = json.loads((tmp_path / "out.json").read_text())
     assert content["env"] == "my_tasks:MyReach-v0"
     assert [policy["records"][0]["length"] for policy in content["policies"]] == [20, 20]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import pickle
-import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -21,6 +20,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from trainings import tpm_gym_command
 
 import tpm_gym
 from tpm_gym.learning import GoalGapExtractor, PenaltyHerReplayBuffer, export
@@ -153,19 +153,16 @@ def test_the_description_is_that_of_the_model(tmp_path: Path, model: Any) -> Non
     assert about.action_space == model.action_space
     features = about.network.features
     assert (features.kind, features.unit) == ("goal_gap", 0.07)
-    text = path.read_text()
-    assert str(tmp_path) not in text
-    assert str(Path.home()) not in text
-
-
-def test_only_the_actor_is_written(tmp_path: Path, model: Any) -> None:
-    about = read_description(save(model, tmp_path / "p"))
+    # Nothing but the actor is in it.
     assert about.shapes == {
         "layers.0.weight": (8, 12),
         "layers.0.bias": (8,),
         "layers.1.weight": (4, 8),
         "layers.1.bias": (4,),
     }
+    text = path.read_text()
+    assert str(tmp_path) not in text
+    assert str(Path.home()) not in text
 
 
 def test_the_same_model_gives_the_same_files(tmp_path: Path, model: Any) -> None:
@@ -289,34 +286,25 @@ def run(tmp_path: Path, model: Any) -> Path:
     return folder
 
 
-def test_what_is_converted_says_what_the_run_says(run: Path, model: Any) -> None:
-    main(["export", str(run / "last.zip"), str(run / "last"), "--trust-pickle"])
+def test_what_is_converted_says_what_the_run_says(
+    run: Path, model: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    main(["export", str(run / "last.zip"), str(run / "last.json"), "--trust-pickle"])
+    assert capsys.readouterr().out == f"{run / 'last.json'}\n"
     batch = observations(Blank(), 10)
     loaded = tpm_gym.load_policy(run / "last")
     expected, _ = model.predict(batch, deterministic=True)
     np.testing.assert_allclose(loaded.act(batch), expected, atol=1e-6)
-    assert loaded.description.seed == 5
-    assert loaded.description.versions == {"torch": "2.0.0", "tpm_gym": None}
-
-
-def test_the_command_line_converts_what_is_trusted(
-    run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    main(["export", str(run / "best.zip"), str(run / "shared.json"), "--trust-pickle"])
-    assert capsys.readouterr().out == f"{run / 'shared.json'}\n"
-    assert tpm_gym.load_policy(run / "shared").description.recipe == RECIPE
+    about = loaded.description
+    assert (about.seed, about.recipe) == (5, RECIPE)
+    assert about.versions == {"torch": "2.0.0", "tpm_gym": None}
 
 
 def test_the_command_line_does_not_touch_what_is_not_trusted(run: Path) -> None:
     """In a process of its own, with a file that would leave a trace if it were unpickled."""
     trace = run / "trace"
     (run / "best.zip").write_bytes(pickle.dumps(Trace(str(trace))))
-    done = subprocess.run(
-        [sys.executable, "-m", "tpm_gym.learning", "export", run / "best.zip", run / "out"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = tpm_gym_command("export", run / "best.zip", run / "out")
     assert done.returncode == 1
     assert done.stderr.startswith("error: ")
     assert "--trust-pickle" in done.stderr

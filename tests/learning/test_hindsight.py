@@ -7,7 +7,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3 import SAC
@@ -20,12 +19,6 @@ from tpm_gym.learning import PenaltyHerReplayBuffer
 from tpm_gym.learning.errors import ConfigError
 
 HORIZON = 10
-
-
-@pytest.fixture(autouse=True)
-def _one_thread() -> None:
-    """Networks this small only wait for each other on several threads."""
-    torch.set_num_threads(1)
 
 
 class PenaltyEnv(gym.Env[dict[str, NDArray[Any]], NDArray[Any]]):

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import pytest
+from trainings import python
 
 from tpm_gym import TPMError, learning
 from tpm_gym.learning import errors
 from tpm_gym.learning.command_line import main
 
 
-def python(program: str) -> None:
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+def succeeds(program: str) -> None:
+    done = python("-c", program)
     assert done.returncode == 0, done.stderr
 
 
@@ -26,12 +24,12 @@ def test_every_name_is_there_and_unknown_ones_are_not() -> None:
 
 def test_neither_the_package_nor_the_help_imports_torch() -> None:
     heavy = "{'torch', 'stable_baselines3', 'matplotlib', 'pybullet'} & set(sys.modules)"
-    python(f"import sys, tpm_gym.learning; sys.exit(str({heavy}) if {heavy} else 0)")
-    python(f"import sys, tpm_gym.learning.command_line; sys.exit(str({heavy}) if {heavy} else 0)")
+    for module in ("tpm_gym.learning", "tpm_gym.learning.command_line"):
+        succeeds(f"import sys, {module}; sys.exit(str({heavy}) if {heavy} else 0)")
 
 
 def test_what_is_not_installed_is_named_with_the_extra_that_installs_it() -> None:
-    python(
+    succeeds(
         "import sys; sys.modules['stable_baselines3'] = None\n"
         "import tpm_gym.learning, tpm_gym.errors\n"
         "try: tpm_gym.learning.PenaltyHerReplayBuffer\n"

@@ -10,7 +10,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,10 +31,11 @@ from trainings import (
     uninterrupted,
 )
 
-from tpm_gym.learning import ResumeConfig, TrainingConfig, callbacks, resume, train
+from tpm_gym.learning import ResumeConfig, TrainingConfig, resume, train
 from tpm_gym.learning.checkpoint import CheckpointStore, Content
 from tpm_gym.learning.configuration import complete
 from tpm_gym.learning.errors import CheckpointError
+from tpm_gym.learning.logger import make_logger
 from tpm_gym.learning.policies import load_policy
 from tpm_gym.learning.rollout import TEST_SEED, run_episodes
 from tpm_gym.learning.training import make_model, make_training_envs
@@ -44,10 +44,9 @@ from tpm_gym.learning.training_state import EpisodeRecorder, restore
 COMMAND = [sys.executable, "-m", "tpm_gym.learning"]
 
 
-@pytest.fixture(autouse=True)
-def _no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Drawing takes longer than all the rest of these trainings."""
-    monkeypatch.setattr(callbacks, "draw_learning_curve", lambda *args: None)
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
+Kill = Callable[..., TrainingConfig]
 
 
 # -- killed ---------------------------------------------------------------------------------------
@@ -65,16 +64,10 @@ def _no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
         ("ppo in processes", 201),
     ],
 )
-def test_a_killed_run_ends_as_if_nothing_had_happened(
-    case: str,
-    step: int,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    config = make_config(case, tmp_path)
-    kill_at(monkeypatch, step, config)
-    assert resume(ResumeConfig(config.run), quiet()) is None
-    assert_equal_runs(uninterrupted(case), tmp_path / "run")
+def test_a_killed_run_ends_as_if_nothing_had_happened(case: str, step: int, killed: Kill) -> None:
+    run = killed(step, case).run
+    assert resume(ResumeConfig(run), quiet()) is None
+    assert_equal_runs(uninterrupted(case), run)
 
 
 def test_a_run_killed_again_and_again_ends_the_same(
@@ -111,12 +104,10 @@ def test_a_run_killed_before_its_first_checkpoint_begins_again(
     assert_equal_runs(uninterrupted("sac"), tmp_path / "run")
 
 
-def test_nothing_is_counted_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    config = replace(make_config("sac", tmp_path), checkpoint_every=200)
-    kill_at(monkeypatch, 290, config)
-    run = tmp_path / "run"
+def test_nothing_is_counted_twice(killed: Kill) -> None:
+    run = killed(290, checkpoint_every=200).run
     assert [line["steps"] for line in evaluations(run)] == [0, 70, 140, 210, 280]
-    resume(ResumeConfig(config.run), quiet())
+    resume(ResumeConfig(run), quiet())
     steps = [int(row["time/total_timesteps"]) for row in table(run) if row["time/total_timesteps"]]
     assert steps == [200]  # logged every four episodes
     assert [line["steps"] for line in evaluations(run)] == [0, 70, 140, 210, 280, 300]
@@ -126,44 +117,33 @@ def test_nothing_is_counted_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert logged == [0, 70, 140, 210, 280, 300]
 
 
-def test_logs_of_a_torn_write_are_put_right(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config = make_config("sac", tmp_path)
-    kill_at(monkeypatch, 240, config)
-    run = tmp_path / "run"
+def test_logs_of_a_torn_write_are_put_right(killed: Kill) -> None:
+    run = killed(240).run
     torn = ("progress.csv", "evaluations.jsonl", "best.zip", "best.json", "config.json")
     for name in torn:
         os.truncate(run / name, (run / name).stat().st_size // 2)
-    resume(ResumeConfig(config.run), quiet())
+    resume(ResumeConfig(run), quiet())
     assert_equal_runs(uninterrupted("sac"), run)
     for name in ("best.zip", "best.json", "best.safetensors"):
         assert (run / name).read_bytes() == end_of(run).files[name]
 
 
-def test_a_damaged_checkpoint_costs_only_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config = make_config("sac", tmp_path)
-    kill_at(monkeypatch, 240, config)
-    damaged = tmp_path / "run" / "checkpoints" / "000000200" / "arrays.npz"
+def test_a_damaged_checkpoint_costs_only_time(killed: Kill) -> None:
+    run, console = killed(240).run, quiet()
+    damaged = run / "checkpoints" / "000000200" / "arrays.npz"
     os.truncate(damaged, damaged.stat().st_size - 1)
-    console = quiet()
-    resume(ResumeConfig(config.run), console)
+    resume(ResumeConfig(run), console)
     assert f"warning: damaged checkpoint: {damaged}" in said(console)
     assert "from step 150 to 300" in said(console)
-    assert_equal_runs(uninterrupted("sac"), tmp_path / "run")
+    assert_equal_runs(uninterrupted("sac"), run)
 
 
-def test_all_checkpoints_damaged_is_an_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config = make_config("sac", tmp_path)
-    kill_at(monkeypatch, 120, config)
-    for path in (tmp_path / "run" / "checkpoints").glob("*/torch.pt"):
+def test_all_checkpoints_damaged_is_an_error(killed: Kill) -> None:
+    run = killed(120).run
+    for path in (run / "checkpoints").glob("*/torch.pt"):
         path.write_bytes(b"")
     with pytest.raises(CheckpointError, match=r"torch\.pt"):
-        resume(ResumeConfig(config.run), quiet())
+        resume(ResumeConfig(run), quiet())
 
 
 # -- hindsight over the seam -----------------------------------------------------------------------
@@ -202,18 +182,14 @@ def fails(self: EpisodeRecorder, episode: dict[str, Any]) -> Any:
 
 @pytest.mark.parametrize("replay", [takes_another_course, fails])
 def test_an_episode_that_cannot_go_on_is_ended_and_not_joined_to_another(
-    replay: Callable[..., Any],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    replay: Callable[..., Any], killed: Kill, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert_whole_episodes(end_of(uninterrupted("sac")))
-    config = replace(make_config("sac", tmp_path), checkpoint_every=130)
-    kill_at(monkeypatch, 140, config)
+    run, console = killed(140, checkpoint_every=130).run, quiet()
     monkeypatch.setattr(EpisodeRecorder, "replay", replay)
-    console = quiet()
-    resume(ResumeConfig(config.run, steps=220), console)
+    resume(ResumeConfig(run, steps=220), console)
     assert "could not be repeated exactly, so new ones begin" in said(console)
-    end = end_of(tmp_path / "run")
+    end = end_of(run)
     assert_whole_episodes(end)
     last = 129  # of the third episode, 100 to 129 is what there was
     assert end.arrays["buffer/ep_length"][last, 0] == 30
@@ -223,10 +199,9 @@ def test_an_episode_that_cannot_go_on_is_ended_and_not_joined_to_another(
 
 
 def test_resuming_does_not_act_at_random_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    killed: Kill, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = make_config("sac", tmp_path)
-    kill_at(monkeypatch, 180, config)
+    run = killed(180).run
     random_actions = []
     sample = gym.spaces.Box.sample
 
@@ -235,22 +210,21 @@ def test_resuming_does_not_act_at_random_again(
         return sample(self, *args, **kwargs)
 
     monkeypatch.setattr(gym.spaces.Box, "sample", counted)
-    resume(ResumeConfig(config.run), quiet())
+    resume(ResumeConfig(run), quiet())
     assert not random_actions
 
 
 def test_saving_changes_nothing_and_the_optimiser_moves_what_was_restored(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, killed: Kill
 ) -> None:
     """An optimiser that holds other tensors than the networks would train nothing."""
-    config = make_config("sac", tmp_path)
-    kill_at(monkeypatch, 260, config)
-    content = CheckpointStore(tmp_path / "run" / "checkpoints").load(pytest.fail)
+    config = complete(killed(260))
+    content = CheckpointStore(config.run / "checkpoints").load(pytest.fail)
     assert content is not None
-    completed = complete(config)
-    envs = make_training_envs(completed)
-    model = make_model(completed, envs)
-    model.set_logger(train_logger(tmp_path))
+    envs = make_training_envs(config)
+    model = make_model(config, envs)
+    (tmp_path / "log").mkdir()
+    model.set_logger(make_logger(tmp_path / "log"))
     restore(model, content)
     assert isinstance(model, SAC)
     before = {name: value.clone() for name, value in model.policy.state_dict().items()}
@@ -263,13 +237,6 @@ def test_saving_changes_nothing_and_the_optimiser_moves_what_was_restored(
     assert model.log_ent_coef.item() != entropy
     model.logger.close()
     envs.close()
-
-
-def train_logger(folder: Path) -> Any:
-    from tpm_gym.learning.logger import make_logger
-
-    (folder / "log").mkdir()
-    return make_logger(folder / "log")
 
 
 # -- real kills -----------------------------------------------------------------------------------

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 import tpm_gym  # noqa: F401  # registers the ids
 from tpm_gym.learning.errors import PolicyError, RolloutError
-from tpm_gym.learning.estimates import Estimate, bootstrap, wilson
+from tpm_gym.learning.estimates import Estimate, bootstrap, interquartile_mean, wilson
 from tpm_gym.learning.policies import load_policy, trained_env
 from tpm_gym.learning.rollout import (
     SELECTION_SEED,
@@ -109,11 +110,7 @@ def test_record_says_what_happened() -> None:
         torque_peak=6.0,
     )
     assert record.as_dict()["return"] == -1.75
-
-
-def test_success_at_end_is_that_of_the_last_step() -> None:
-    env = ScriptedEnv([scripted_step(), scripted_step(success=True)])
-    (record,) = run_episodes(env, Idle(), 1, first_seed=0)
+    (record,) = run_episodes(ScriptedEnv([scripted_step(success=True)]), Idle(), 1, first_seed=0)
     assert record.success_at_end
     assert record.success_once
 
@@ -191,19 +188,26 @@ def test_wilson_interval_holds_the_rate_at_both_ends() -> None:
             assert estimate.low < estimate.high
 
 
-def test_bootstrap_interval_covers_the_true_mean() -> None:
-    rng = np.random.default_rng(7)
-    estimates = [bootstrap(rng.exponential(2.0, 60).tolist()) for _ in range(200)]
-    covered = np.mean([estimate.low <= 2.0 <= estimate.high for estimate in estimates])
-    assert 0.88 <= covered <= 0.98
-
-
-def test_bootstrap_interval_has_the_width_of_the_normal_one() -> None:
-    sample = np.random.default_rng(1).normal(3.0, 1.5, 400)
-    estimate = bootstrap(sample.tolist())
-    half = 1.96 * sample.std() / math.sqrt(sample.size)
-    assert estimate.low == pytest.approx(sample.mean() - half, abs=0.15 * half)
-    assert estimate.high == pytest.approx(sample.mean() + half, abs=0.15 * half)
+@pytest.mark.parametrize(
+    ("ours", "theirs"),
+    [
+        (bootstrap, np.mean),
+        (
+            partial(interquartile_mean, samples=20_000),
+            partial(scipy.stats.trim_mean, proportiontocut=0.25),
+        ),
+    ],
+)
+def test_bootstrap_intervals_are_those_of_scipy(
+    ours: Callable[[Sequence[float]], Estimate], theirs: Callable[..., Any]
+) -> None:
+    scores = np.random.default_rng(3).random(12)
+    found = ours(scores.tolist())
+    expected = scipy.stats.bootstrap(
+        (scores,), theirs, n_resamples=20_000, method="percentile", rng=0
+    ).confidence_interval
+    assert (found.low, found.high) == pytest.approx((expected.low, expected.high), abs=0.01)
+    assert found.mean == pytest.approx(theirs(scores))
 
 
 def test_bootstrap_of_equal_values_is_that_value() -> None:

@@ -8,6 +8,7 @@ import os
 import shutil
 import signal
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,24 +18,20 @@ from trainings import (
     assert_equal_runs,
     evaluations,
     interrupt_at,
-    kill_at,
     make_config,
     quiet,
     said,
     uninterrupted,
 )
 
+import tpm_gym
 from tpm_gym.learning import ResumeConfig, TrainingConfig, callbacks, resume, train
 from tpm_gym.learning.callbacks import Checkpointing, SignalListener
 from tpm_gym.learning.checkpoint import CheckpointStore, Content
 from tpm_gym.learning.errors import ConfigError, RunError
 from tpm_gym.learning.run_folder import claimed
 
-
-@pytest.fixture(autouse=True)
-def _no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Drawing takes longer than all the rest of these trainings."""
-    monkeypatch.setattr(callbacks, "draw_learning_curve", lambda *args: None)
+pytestmark = pytest.mark.usefixtures("no_pictures")
 
 
 # -- stopped --------------------------------------------------------------------------------------
@@ -70,6 +67,8 @@ def test_a_stopped_run_saves_and_goes_on(
     assert f"saved at step {saved}" in said(console)
     assert f"tpm-gym resume {tmp_path / 'run'}" in said(console)
     assert (tmp_path / "run" / "last.zip").is_file()
+    taken = tpm_gym.load_policy(tmp_path / "run" / "last").description.steps
+    assert taken == (step if case == "ppo" else saved)
     assert resume(ResumeConfig(config.run), quiet()) is None
     assert_equal_runs(uninterrupted(case), tmp_path / "run")
 
@@ -152,11 +151,9 @@ def contents(folder: Path) -> dict[Path, bytes]:
 
 
 @pytest.fixture
-def half(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> TrainingConfig:
+def half(killed: Callable[..., TrainingConfig]) -> TrainingConfig:
     """A run that was killed half way."""
-    config = make_config("sac", tmp_path)
-    kill_at(monkeypatch, 160, config)
-    return config
+    return killed(160)
 
 
 @pytest.fixture

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import yaml
+from trainings import python
 
 import tpm_gym
 from tpm_gym.learning.features import GoalGapExtractor
@@ -44,18 +43,9 @@ def test_the_algorithm_is_that_of_the_command_line(words: list[str]) -> None:
 )
 def test_the_zoo_runs_them(algorithm: str, env_id: str, steps: int, tmp_path: Path) -> None:
     pytest.importorskip("rl_zoo3")
-    options = {
-        "--algo": algorithm,
-        "--env": env_id,
-        "--gym-packages": "tpm_gym",
-        "--conf-file": "tpm_gym.learning.zoo",
-        "--n-timesteps": str(steps),
-        "--eval-freq": "-1",
-        "--log-folder": str(tmp_path / "logs"),
-        "--num-threads": "1",
-    }
-    command = [sys.executable, "-m", "rl_zoo3.train"]
-    command += [word for pair in options.items() for word in pair]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    words = ["--algo", algorithm, "--env", env_id, "--n-timesteps", str(steps)]
+    words += ["--gym-packages", "tpm_gym", "--conf-file", "tpm_gym.learning.zoo"]
+    words += ["--eval-freq", "-1", "--log-folder", str(tmp_path / "logs"), "--num-threads", "1"]
+    done = python("-m", "rl_zoo3.train", *words, cwd=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     assert list((tmp_path / "logs" / algorithm).glob(f"{env_id}_1/*.zip"))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from machines import anywhere, each_machine
+from machines import anywhere, each_machine, within
 from walk import walk
 
 import tpm_gym
@@ -23,19 +23,12 @@ from tpm_gym.mechanism import PAPER_TPM, TPM, WIDE_TPM, Machine, find_machine, r
 share = st.floats(0.0, 1.0)
 
 
-def within(machine: Machine, shares: Vector) -> Vector:
-    region = machine.region
-    low, high = np.array(region.low), np.array(region.high)
-    x, y, z = region.project(low + shares * (high - low)).tolist()
-    return x, y, z
-
-
 @each_machine
 @settings(derandomize=True, max_examples=100)
 @given(st.tuples(share, share, share))
 def test_kinematics_agree_all_over_the_region(machine: TPM, shares: Vector) -> None:
     point = within(machine, shares)
-    theta = machine.inverse(point)
+    theta = machine.inverse(tuple(point.tolist()))
     position, rows, conditioning = machine.evaluate(theta)
     np.testing.assert_allclose(position, point, rtol=0, atol=1e-9)
     assert machine.forward(theta) == position

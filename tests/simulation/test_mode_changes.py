@@ -200,7 +200,7 @@ def test_a_platform_pushed_over_the_edge_is_a_change_of_the_working_mode(force: 
     assert (info["working_mode_changed"], info["assembly_mode_changed"]) == (True, False)
     assert info["singularity_penalty"] == 1
     release()
-    with pytest.raises(ModeChangeError, match="serial") as caught:
+    with pytest.raises(ModeChangeError, match="working") as caught:
         env.step(IDLE)
     assert caught.value.mode == "working"
     assert fingerprint(random_episode(env, 6)) == fresh

@@ -8,27 +8,12 @@ from tpm_gym.simulation.bullet.client import GRAVITY
 from tpm_gym.simulation.state import CONTROL_PERIOD
 from tpm_gym.tasks import Expert
 
-IDS = ("TPMPickAndPlace-v0", "TPMPickAndPlaceJoints-v0")
+DOWN = np.array([0.0, 0.0, 1.0, -1.0])
+SUCKING = np.array([0.0, 0.0, 0.0, 2.0])
 
 
-def straight_down(rng, step, action):
-    return np.array([0.0, 0.0, 1.0, -1.0])
-
-
-def grasped_then_down(rng, step, action):
-    return action if step < 14 else np.array([0.0, 0.0, 1.0, 1.0])
-
-
-def dropped_then_down(rng, step, action):
-    return action if step < 14 else np.array([0.0, 0.0, 1.0, -1.0])
-
-
-def grasped_then_shoved_into_the_table(rng, step, action):
-    return action if step < 12 else np.append(rng.uniform(-1, 1, 2), (1.0, rng.uniform(-1, 1)))
-
-
-def noisy_expert(rng, step, action):
-    return np.clip(action + rng.normal(0.0, 0.5, 4), -1, 1)
+def shoved_into_the_table(rng):
+    return np.append(rng.uniform(-1, 1, 2), (1.0, rng.uniform(-1, 1)))
 
 
 def bang_bang_mostly_down(rng, step, action):
@@ -37,17 +22,28 @@ def bang_bang_mostly_down(rng, step, action):
     return action
 
 
-HOSTILE = (
-    straight_down,
-    grasped_then_down,
-    dropped_then_down,
-    grasped_then_shoved_into_the_table,
-    noisy_expert,
-    bang_bang_mostly_down,
+HOSTILE = {
+    "straight down": lambda rng, step, action: DOWN,
+    "grasped, then down": lambda rng, step, action: action if step < 14 else DOWN + SUCKING,
+    "dropped, then down": lambda rng, step, action: action if step < 14 else DOWN,
+    "grasped, then shoved into the table": lambda rng, step, action: (
+        action if step < 12 else shoved_into_the_table(rng)
+    ),
+    "noisy expert": lambda rng, step, action: np.clip(action + rng.normal(0.0, 0.5, 4), -1, 1),
+    "bang-bang, mostly down": bang_bang_mostly_down,
+}
+
+
+@pytest.mark.parametrize("policy", HOSTILE.values(), ids=HOSTILE)
+@pytest.mark.parametrize(
+    ("env_id", "seeds"),
+    [
+        ("TPMPickAndPlace-v0", range(1, 3)),
+        pytest.param("TPMPickAndPlace-v0", range(100), marks=pytest.mark.slow),
+        pytest.param("TPMPickAndPlaceJoints-v0", range(100), marks=pytest.mark.slow),
+    ],
 )
-
-
-def survives(env_id, policy, seeds):
+def test_hostile_policies_do_not_lose_the_mechanism(env_id, policy, seeds):
     env = gym.make(env_id)
     expert = Expert(env)
     simulation = env.unwrapped.simulation
@@ -73,15 +69,3 @@ def survives(env_id, policy, seeds):
             pressed = pressed + CONTROL_PERIOD if depth > 1e-3 else 0.0
             assert pressed < 0.15
     env.close()
-
-
-@pytest.mark.parametrize("policy", HOSTILE)
-def test_hostile_policies_do_not_lose_the_mechanism(policy):
-    survives("TPMPickAndPlace-v0", policy, range(1, 3))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("env_id", IDS)
-@pytest.mark.parametrize("policy", HOSTILE)
-def test_hostile_policies_do_not_lose_the_mechanism_in_many_episodes(env_id, policy):
-    survives(env_id, policy, range(100))

@@ -1,16 +1,15 @@
 """The mechanism in the engine stays a mechanism, and the engine's quirks stay inside."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 from machines import anywhere, each_machine, excursions
 
-from tpm_gym.errors import ClosureError, InputError, ModeChangeError, UnreachableError
+from tpm_gym.errors import InputError, ModeChangeError, UnreachableError
 from tpm_gym.kinematics import ELBOWS_OUT, inverse, jacobian
-from tpm_gym.mechanism import PAPER_TPM, TPM
-from tpm_gym.mechanism.bodies import Mechanism
+from tpm_gym.mechanism import PAPER_TPM
 from tpm_gym.simulation import Block, Scene, Simulation
 from tpm_gym.simulation.simulation import spline_weights
 
@@ -84,15 +83,6 @@ def test_encoder_rates_and_platform_velocity_obey_the_jacobian(simulation):
         np.testing.assert_allclose(state.fk_velocity, [0.25, 0.0, 0.125], atol=2e-2)
 
 
-def test_a_loop_that_opens_is_reported(simulation):
-    simulation.reset(THETA)
-    client = simulation.engine.client
-    client.removeConstraint(client.getConstraintUniqueId(0))
-    with pytest.raises(ClosureError) as caught:
-        follow(simulation, excursions(PAPER_TPM, 100, seed=2))
-    assert caught.value.gap > caught.value.limit
-
-
 def test_another_working_mode_is_reported(simulation):
     folded = replace(ELBOWS_OUT, cos_beta=-ELBOWS_OUT.cos_beta)
     state = simulation.reset(inverse(HOME, folded))
@@ -104,15 +94,15 @@ def test_another_working_mode_is_reported(simulation):
 
 def test_what_cannot_be_followed_raises_and_moves_nothing(simulation):
     before = simulation.reset(THETA)
-    with pytest.raises(UnreachableError):
-        simulation.move((0.0, 0.2, 0.8))
-    for command in ((np.nan, 0.02, 0.8), (0.0, 0.02)):
-        with pytest.raises(InputError):
-            simulation.move(command)
-    with pytest.raises(UnreachableError):
-        simulation.reset((-1.5, 1.5, 1.5))
-    with pytest.raises(InputError):
-        simulation.reset((np.nan, 1.5, 1.5))
+    for call, value, error in (
+        (simulation.move, (0.0, 0.2, 0.8), UnreachableError),
+        (simulation.move, (np.nan, 0.02, 0.8), InputError),
+        (simulation.move, (0.0, 0.02), InputError),
+        (simulation.reset, (-1.5, 1.5, 1.5), UnreachableError),
+        (simulation.reset, (np.nan, 1.5, 1.5), InputError),
+    ):
+        with pytest.raises(error):
+            call(value)
     after = simulation.read()
     assert np.array_equal(before.theta, after.theta)
     assert np.array_equal(before.command, after.command)
@@ -194,30 +184,6 @@ def test_a_reset_forgets_old_contacts(with_puck, drift):
     assert np.array_equal(*outcomes)
 
 
-def test_clients_do_not_see_each_other(simulation):
-    other = Simulation(Scene())
-    before = simulation.reset(THETA)
-    other.reset(THETA)
-    follow(other, excursions(PAPER_TPM, 5, seed=3))
-    assert np.array_equal(simulation.read().theta, before.theta)
-    other.close()
-    assert simulation.move(HOME).closure_error < 1e-6
-
-
-def test_a_snapshot_continues_the_motion(with_puck):
-    commands = list(excursions(PAPER_TPM, 30, seed=4))
-    with_puck.reset(THETA, ON_TABLE)
-    follow(with_puck, commands[:15])
-    snapshot = with_puck.save()
-    expected = follow(with_puck, commands[15:])
-    with_puck.reset(THETA, {"object": (0.05, -0.03, 0.015)})
-    assert np.array_equal(with_puck.restore(snapshot).torque, snapshot.torque)
-    assert any(snapshot.torque)
-    for again, state in zip(follow(with_puck, commands[15:]), expected, strict=True):
-        for name, value in vars(state).items():
-            np.testing.assert_array_equal(getattr(again, name), value, err_msg=name)
-
-
 def test_pictures_show_the_scene_and_the_goal_marker(simulation):
     simulation.reset(THETA)
     simulation.show_goal(np.array([(0.0, -0.03, 0.2)]))
@@ -258,28 +224,3 @@ def test_the_direct_solver_finds_what_iterations_tend_to():
 def test_the_gap_falls_with_the_square_of_the_time_step(machine):
     gaps = [errors(machine, time_step=step)[0] for step in (1 / 250, 1 / 500, 1 / 1000)]
     np.testing.assert_allclose(np.divide(gaps[:-1], gaps[1:]), 4, rtol=0.2)
-
-
-class OneBody(Mechanism):
-    """The same links and closures as one spanning tree, as one would load them at first."""
-
-    def legs(self):
-        return (self,)
-
-
-class OneBodyTPM(TPM):
-    """Loaded as one multibody."""
-
-    @property
-    def mechanism(self):
-        of = super().mechanism
-        return OneBody(of.links, of.closures, of.platform, of.point_p, of.tool, of.lip, of.actuated)
-
-
-def test_as_one_multibody_the_direct_solver_would_lose_the_loops():
-    # Why Mechanism.legs exists. The iterative solver does not mind; if one day the direct one no
-    # longer minds either, the legs have lost their reason.
-    machine = OneBodyTPM(**{of.name: getattr(PAPER_TPM, of.name) for of in fields(PAPER_TPM)})
-    assert errors(machine, solver="iterative")[0] < 1e-3
-    with pytest.raises((ClosureError, ModeChangeError)):
-        errors(machine, solver="direct")

@@ -203,7 +203,7 @@ def what_is_saved_copied_or_pickled_goes_on_equally_to_the_next_episode(make: Ma
             for _ in random_episode(other, 4, steps=15):
                 pass
         restored.unwrapped.reset(seed=99)
-        moment = env.unwrapped.save_state()
+        moment, now = env.unwrapped.save_state(), bits(vars(env.unwrapped.state))
         copies = [copy.deepcopy(env), pickle.loads(pickle.dumps(env))]
         rng = np.random.default_rng(2)
         actions = rng.uniform(-1, 1, (env.spec.max_episode_steps - 15, *env.action_space.shape))
@@ -211,6 +211,7 @@ def what_is_saved_copied_or_pickled_goes_on_equally_to_the_next_episode(make: Ma
         assert expected[0][-1][0][3] is True  # truncated
         seen = restored.unwrapped.restore_state(pickle.loads(pickle.dumps(moment)))
         assert restored.observation_space.contains(seen)
+        assert bits(vars(restored.unwrapped.state)) == now
         for other in (*copies, restored):
             assert (play(other, actions), bits(other.reset()[0])) == expected
             other.close()

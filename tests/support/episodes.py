@@ -53,9 +53,11 @@ def random_episode(env: gym.Env[Any, Any], seed: int, steps: int = 50) -> Iterat
         yield observation, float(reward), info
 
 
-def expert_episode(env: gym.Env[Any, Any], seed: int, steps: int = 50) -> Iterator[Step]:
+def expert_episode(
+    env: gym.Env[Any, Any], seed: int, steps: int = 50, options: dict[str, Any] | None = None
+) -> Iterator[Step]:
     """The scripted controller's: it touches, holds and lets go."""
-    observation, info = env.reset(seed=seed)
+    observation, info = env.reset(seed=seed, options=options)
     expert = Expert(env)
     expert.reset(observation)
     yield observation, 0.0, info

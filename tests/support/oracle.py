@@ -5,15 +5,16 @@ Nothing here calls the package's formulas, so a slip in them cannot hide.
 
 from __future__ import annotations
 
+from dataclasses import astuple
 from typing import Any, Protocol
 
 import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tpm_gym.arrays import FloatArray
-from tpm_gym.kinematics import ASSEMBLY_MODES, inverse_all
-from tpm_gym.kinematics.geometry import Geometry
+from tpm_gym.arrays import FloatArray, Vector
+from tpm_gym.kinematics import ASSEMBLY_MODES, WorkingMode, inverse_all
+from tpm_gym.kinematics.geometry import PAPER, Geometry
 
 
 class Lengths(Protocol):
@@ -26,6 +27,17 @@ class Lengths(Protocol):
     l5: float
     l6: float
     l7: float
+
+
+def scaled(g: Geometry, factor: float) -> Geometry:
+    """All lengths times a factor."""
+    return Geometry(*(factor * length for length in astuple(g)))
+
+
+def grid(low: Vector, high: Vector, counts: tuple[int, int, int]) -> FloatArray:
+    """Points (nx, ny, nz, 3) all over a box, faces included."""
+    sides = [np.linspace(*ends) for ends in zip(low, high, counts, strict=True)]
+    return np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1)
 
 
 def vector(x: Any, y: Any, z: Any) -> FloatArray:
@@ -85,6 +97,30 @@ def factors(theta: Any, x_c: Any, z_c: Any, beta: Any, g: Lengths) -> tuple[Floa
     )
     legs = (bc * rates).sum(axis=-1)
     return parallel, np.concatenate([np.cos(beta)[..., None], legs], axis=-1)
+
+
+def link3(position: FloatArray, beta: Any, g: Lengths) -> tuple[FloatArray, FloatArray]:
+    """xC and zC of link 3' for P (..., 3) and beta (...,)."""
+    return position[..., 0] - g.l2 - g.l7 * np.cos(beta), position[..., 2] - 2 * g.l6
+
+
+def factors_at(
+    position: FloatArray, mode: WorkingMode, g: Geometry
+) -> tuple[FloatArray, FloatArray]:
+    """The same at points (..., 3) on a working mode; NaN where not reachable."""
+    found = inverse_all(position, g)
+    theta, beta = found.theta[..., mode.index, :], found.beta[..., mode.index]
+    return factors(theta, *link3(position, beta, g), beta, g)
+
+
+def level_rod_4(
+    theta_1: float, beta: float, side: int = 1, offset: float = 0.0, g: Geometry = PAPER
+) -> FloatArray:
+    """P (3,) with z_C1 = z_B1 + offset: at 0, a constraint singularity."""
+    y_b, z_b = g.l1 + g.l3 * np.cos(theta_1), g.l3 * np.sin(theta_1)
+    x_c = side * np.sqrt(g.l4**2 - y_b**2 - offset**2)
+    x, y = x_c + g.l7 * np.cos(beta) + g.l2, g.l7 * np.sin(beta)
+    return np.array([x, y, z_b + offset + 2 * g.l6])
 
 
 def assembly_slots(parallel: FloatArray) -> NDArray[np.int64]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -11,15 +9,16 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from episodes import expert_episode
+from machines import each_machine
 
-import tpm_gym
 from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.tpm import PAPER_TPM, WIDE_TPM
-from tpm_gym.tasks import Expert, PickAndPlace, Reach, Task
+from tpm_gym.tasks import PickAndPlace, Reach, Task
 from tpm_gym.tasks.rewards import distance
 from tpm_gym.tasks.sampling import APART, BAND, line_in_joints, line_in_space
 
@@ -46,7 +45,7 @@ def ends(
     return to_paper(np.array(starts)), to_paper(np.array(aims))
 
 
-@pytest.mark.parametrize("machine", [PAPER_TPM, WIDE_TPM], ids=lambda machine: machine.name)
+@each_machine
 @pytest.mark.parametrize("kind", KINDS)
 def test_sampled_ends_are_safe_apart_and_spread(kind: type[Task], machine: Machine) -> None:
     starts, goals = ends(kind, machine, "sampled", 200)
@@ -135,51 +134,21 @@ def test_machines_on_which_nothing_can_be_drawn_are_told_instead_of_searched_for
     assert caught.value.name == "safe_conditioning"
 
 
-# -- in environments -------------------------------------------------------------------------------
-
-
-@contextmanager
-def tempting(env_id: str) -> Iterator[Any]:
-    env = gym.make(env_id, goals="tempting")
-    yield env
-    env.close()
-
-
-@pytest.mark.parametrize("env_id", tpm_gym.ENV_IDS)
-def test_every_id_can_tempt_and_repeats_with_its_seed(env_id: str) -> None:
-    with tempting(env_id) as env, tempting(env_id) as other:
-        first, again = env.reset(seed=5)[0], other.reset(seed=5)[0]
-        state = env.unwrapped.np_random.bit_generator.state
-        following, sixth = env.reset()[0], other.reset(seed=6)[0]
-        for key in first:
-            np.testing.assert_array_equal(first[key], again[key])
-        assert not np.array_equal(first["desired_goal"], following["desired_goal"])
-        assert not np.array_equal(first["desired_goal"], sixth["desired_goal"])
-        # An episode without a seed repeats from the generator's state, as resuming does.
-        env.unwrapped.np_random.bit_generator.state = state
-        np.testing.assert_array_equal(env.reset()[0]["desired_goal"], following["desired_goal"])
-        goal = np.array([0.0, -0.03, 0.2])
-        chosen, _ = env.reset(seed=5, options={"goal": goal})
-        np.testing.assert_allclose(chosen["desired_goal"], goal, atol=1e-7)
-
-
 def test_one_who_moves_the_joints_straight_to_the_goal_gets_into_the_unsafe_region() -> None:
     """And the expert, who goes straight in space, hardly does, and succeeds."""
-    lowest: dict[bool, list[float]] = {False: [], True: []}
-    with tempting("TPMReachJoints-v0") as env:
-        inner, expert = env.unwrapped, Expert(env)
-        to_paper = inner.machine.mount.to_paper
-        for careful, found in lowest.items():
-            for seed in range(4):
-                observation, info = env.reset(seed=2_000_000 + seed)
-                expert.reset(observation)
-                goal, met = to_paper(inner.goal), []
-                for _ in range(50):
-                    straight = inner.control.action(goal, to_paper(inner.state.command))
-                    action = expert.act(observation) if careful else straight.astype(np.float32)
-                    observation, *_, info = env.step(action)
-                    met.append(info["conditioning"])
-                found.append(min(met))
-                assert info["is_success"] or not careful
-    assert np.mean(lowest[False]) < SAFE - 0.002
-    assert min(lowest[True]) > SAFE - 0.002
+    env: Any = gym.make("TPMReachJoints-v0", goals="tempting")
+    inner, careless, careful = env.unwrapped, [], []
+    to_paper = inner.machine.mount.to_paper
+    for seed in range(2_000_000, 2_000_004):
+        _, *steps = expert_episode(env, seed)
+        careful.append(min(info["conditioning"] for *_, info in steps))
+        assert steps[-1][2]["is_success"]
+        env.reset(seed=seed)
+        met = []
+        for _ in range(50):
+            action = inner.control.action(to_paper(inner.goal), to_paper(inner.state.command))
+            met.append(env.step(action.astype(np.float32))[4]["conditioning"])
+        careless.append(min(met))
+    env.close()
+    assert np.mean(careless) < SAFE - 0.002
+    assert min(careful) > SAFE - 0.002

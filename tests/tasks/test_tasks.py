@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import copy
-import pickle
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from machines import each_machine
 from states import random_state
 
 from tpm_gym.errors import ConfigurationError, ResetOptionError, UnreachableError
@@ -182,6 +181,10 @@ def test_starts_repeat_with_the_rng_and_take_what_is_chosen(task: Task) -> None:
         chosen = task.start(np.random.default_rng(8), {name: given})
         np.testing.assert_array_equal(chosen[name], place)
     goal = first["goal"].copy()
+    task.goals = "tempting"
+    tempted = task.start(np.random.default_rng(8), {"goal": goal})["goal"]
+    np.testing.assert_array_equal(tempted, goal)
+    task.goals = "sampled"
     kept = task.start(np.random.default_rng(7), {"goal": goal})["goal"]
     goal[:] = 0.0
     np.testing.assert_array_equal(kept, first["goal"])
@@ -224,7 +227,7 @@ def test_what_is_out_of_reach_is_refused_with_the_range_that_is_enforced(name: s
         np.testing.assert_array_equal(chosen[name], place)
 
 
-@pytest.mark.parametrize("machine", [PAPER_TPM, WIDE_TPM], ids=lambda machine: machine.name)
+@each_machine
 def test_an_object_does_not_start_inside_the_robot(machine: Any) -> None:
     task = PickAndPlace(machine)
     home = machine.mount.to_world(machine.home)
@@ -294,13 +297,3 @@ def test_markers_that_do_not_fit_the_goal_are_refused_when_the_task_is_made() ->
     with pytest.raises(ConfigurationError, match="2, as a goal shows") as caught:
         Unmarked(PAPER_TPM)
     assert caught.value.name == "markers"
-
-
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda task: pickle.loads(pickle.dumps(task))])
-def test_copies_observe_and_reward_alike(task: Task, copied: Any) -> None:
-    other, state = copied(task), states(task, 5)
-    np.testing.assert_array_equal(other.observe(state), task.observe(state))
-    goal = np.zeros(task.goal_size)
-    found = [one.reward_terms(state, one.achieved(state), goal) for one in (task, other)]
-    assert found[0] == found[1]
-    assert other.machine == task.machine

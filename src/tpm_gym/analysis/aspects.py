@@ -39,6 +39,7 @@ Shape = tuple[int, int, int]
 
 DEFAULT_SHAPE: Shape = (64, 16, 96)
 """Cells along x, y, z; for the paper's lengths about 27 x 6 x 24 mm each."""
+_BITS = (1, 2, 4)
 
 
 @dataclass(frozen=True)
@@ -69,16 +70,10 @@ class Cells:
         judged too full and too empty cancel. The planes y = 0 and |y| = l7 are faces of cells and
         add nothing.
         """
-        half = self.mask.shape[1] // 2
-        padded = np.pad(self.mask, ((1, 1), (0, 0), (1, 1)))
-        edge = np.zeros_like(padded)
-        for part, found in ((padded[:, :half], edge[:, :half]), (padded[:, half:], edge[:, half:])):
-            for first, second in _neighbours(part.shape):
-                differ = part[first] != part[second]
-                found[first] |= differ
-                found[second] |= differ
-        sides = max(int((edge & padded).sum()), int((edge & ~padded).sum()))
-        return 0.5 * math.prod(self.spacing) * sides
+        halves = np.array_split(np.pad(self.mask, ((1, 1), (0, 0), (1, 1))), 2, axis=1)
+        inside = sum((half & _grown(~half, corners=False)).sum() for half in halves)
+        outside = sum((~half & _grown(half, corners=False)).sum() for half in halves)
+        return 0.5 * math.prod(self.spacing) * int(max(inside, outside))
 
     def centres(self) -> FloatArray:
         """Centres of the cells of the set, (count, 3) m."""
@@ -88,11 +83,7 @@ class Cells:
 
 @dataclass(frozen=True)
 class ReachableSet:
-    """Where point P can be on one working mode.
-
-    Attributes:
-        cells: The set.
-    """
+    """Where point P can be on one working mode."""
 
     branch: WorkingMode
     geometry: Geometry
@@ -104,10 +95,9 @@ class Aspect:
     """A connected region of one working mode without singularities.
 
     Attributes:
-        branch: The working mode; names the signs of the serial factors.
-        assembly: The assembly mode; names the signs of sin(beta) and the planar factor.
+        branch: Names the signs of the serial factors.
+        assembly: Names the signs of sin(beta) and the planar factor.
         level3: Sign of the remaining factor, l1 + l3 c3 - xC - 2 l2.
-        cells: The region.
     """
 
     branch: WorkingMode
@@ -171,7 +161,7 @@ def aspects(
     for index in np.argsort(-counts, kind="stable"):
         code = int(codes.flat[first[index]])
         if code >= 0 and counts[index] >= min_cells:
-            sin_beta, level3, planar = (1 if code & bit else -1 for bit in (1, 2, 4))
+            sin_beta, level3, planar = (1 if code & bit else -1 for bit in _BITS)
             found.append(
                 Aspect(
                     branch=branch,
@@ -201,7 +191,8 @@ def sample(rng: np.random.Generator, aspect: Aspect, count: int) -> FloatArray:
     if not cells.mask.any():
         raise ConfigurationError("aspect", "without cells", "an aspect that aspects() returned")
     candidates = np.argwhere(_grown(cells.mask))
-    code = _code_of(aspect)
+    signs = aspect.assembly.sin_beta, aspect.level3, aspect.assembly.planar
+    code = sum(bit for sign, bit in zip(signs, _BITS, strict=True) if sign > 0)
     points = np.empty((0, 3))
     while len(points) < count:
         corner = candidates[rng.integers(len(candidates), size=count)]
@@ -266,15 +257,10 @@ def _codes(
 
 
 def _signs(points: FloatArray, branch: WorkingMode, geometry: Geometry) -> IntArray:
-    """Signs of sin(beta), level3 and planar as bits 1, 2, 4; -1 where not reachable."""
+    """Signs of sin(beta), level3 and planar as bits; -1 where not reachable."""
     parallel = factors_at(points, branch, geometry).parallel
-    bits = ((parallel > 0) * np.array([1, 2, 4])).sum(axis=-1)
+    bits = ((parallel > 0) * np.array(_BITS)).sum(axis=-1)
     return np.where(np.isnan(parallel[..., 0]), -1, bits)
-
-
-def _code_of(aspect: Aspect) -> int:
-    signs = (aspect.assembly.sin_beta, aspect.level3, aspect.assembly.planar)
-    return sum(bit for sign, bit in zip(signs, (1, 2, 4), strict=True) if sign > 0)
 
 
 def _neighbours(shape: tuple[int, ...]) -> list[tuple[tuple[slice, ...], tuple[slice, ...]]]:
@@ -308,14 +294,13 @@ def _components(codes: IntArray) -> IntArray:
             parent = parent[parent]
 
 
-def _grown(mask: BoolArray) -> BoolArray:
-    """The cells of a set and all that touch them, be it at a corner."""
+def _grown(mask: BoolArray, corners: bool = True) -> BoolArray:
+    """The cells of a set and all that touch them: at a face, or be it at a corner."""
     grown: BoolArray = mask.copy()
     for before, after in _neighbours(mask.shape):
-        wider = grown.copy()
-        wider[before] |= grown[after]
-        wider[after] |= grown[before]
-        grown = wider
+        reached = grown.copy() if corners else mask
+        grown[before] |= reached[after]
+        grown[after] |= reached[before]
     return grown
 
 

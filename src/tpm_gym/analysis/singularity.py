@@ -7,6 +7,10 @@ det A, the serial ones those of det B. Everything is in the paper frame, in metr
 A constraint singularity is no factor of either determinant: where z_C1 = z_B1, the rods of the 4S
 parallelogram no longer keep link 3' from turning about y. It is reported apart, and
 :func:`nearest_singularity` does not count it.
+
+All functions raise InputError for what is no array (..., 3) of numbers. Those that
+classify raise it also for entries that are not finite, UnreachableError if some entry does not
+exist on the branch, and ConfigurationError if the tolerance is not between 0 and 1.
 """
 
 from __future__ import annotations
@@ -19,7 +23,7 @@ from numpy.typing import ArrayLike
 
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray
 from tpm_gym.errors import ConfigurationError
-from tpm_gym.kinematics import inverse
+from tpm_gym.kinematics import equations, inverse
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.kinematics.jacobian import Factors, factors, factors_at
 from tpm_gym.kinematics.modes import DEFAULT_ASSEMBLY, ELBOWS_OUT, AssemblyMode, WorkingMode
@@ -36,12 +40,8 @@ __all__ = [
     "nearest_singularity",
 ]
 
-FACTORS = ("sin_beta", "level3", "planar", "cos_beta", "leg1", "leg2", "leg3")
-"""Names of the factors, in the order of every axis of length 7 here: 3 parallel, then 4 serial.
-
-``level3`` is l1 + l3 c3 - xC - 2 l2; ``planar`` is zero where B1C1 and B2C2, projected on y = 0,
-line up; ``leg1`` to ``leg3`` are B_iC_i . dB_i/dtheta_i, zero where a leg is stretched or folded.
-"""
+FACTORS = equations.Factors._fields[:7]
+"""Names of the factors, in the order of every axis of length 7 here: 3 parallel, then 4 serial."""
 
 _LEVEL3, _PLANAR, _LEG1, _LEG3 = 1, 2, 4, 6
 # What the search for the nearest singularity is made of; see nearest_singularity.
@@ -100,12 +100,9 @@ class NearestSingularity:
 
 
 def dimensionless(values: Factors, geometry: Geometry = PAPER) -> FloatArray:
-    """The factors over their natural sizes, so that one tolerance suits all and none has a unit.
+    """The factors (..., 7) over their natural sizes, so that one tolerance suits all.
 
     level3 over l4, planar over l4^2, legs over l3 l4; sin(beta) and cos(beta) as they are.
-
-    Returns:
-        (..., 7) in the order of :data:`FACTORS`.
     """
     l3, l4 = geometry.l3, geometry.l4
     sizes = np.array([1.0, l4, l4**2, 1.0, l3 * l4, l3 * l4, l3 * l4])
@@ -124,11 +121,6 @@ def classify(
     A factor made dimensionless counts as zero up to ``tolerance``. From joint angles, a factor that
     merges two branches is known to the square root of rounding only, so less than 1e-7 makes no
     sense here.
-
-    Raises:
-        InputError: If theta has the wrong shape or is not finite.
-        UnreachableError: If the branch does not exist at some theta.
-        ConfigurationError: If the tolerance is not between 0 and 1.
     """
     return _classify(factors(theta, branch, geometry), geometry, tolerance)
 
@@ -143,11 +135,6 @@ def classify_at(
 
     A factor made dimensionless counts as zero up to ``tolerance``. A leg's factor grows as the
     square root of the distance to its boundary: 1e-6 is reached 1e-12 m from it.
-
-    Raises:
-        InputError: If position has the wrong shape or is not finite.
-        UnreachableError: If some point is not reachable on ``branch``.
-        ConfigurationError: If the tolerance is not between 0 and 1.
     """
     inverse(position, branch, geometry)  # raises where it is not reachable, and says why
     return _classify(factors_at(position, branch, geometry), geometry, tolerance)
@@ -171,19 +158,13 @@ def nearest_singularity(
     What is returned is a true distance to a true singular point, so never too small; it is too
     large only where a surface that bends sharply, or a sliver beyond two close surfaces, escapes
     the rays. A test compares with thousands of rays a point. It takes a few milliseconds a point.
-
-    Returns:
-        Distances and where they end; not valid where not finite, or not on both branches.
-
-    Raises:
-        InputError: If the last axis of position does not have length 3.
+    Points that are not finite, or not on both branches, are not valid.
     """
     points = np.array(position, dtype=np.float64)
     values = dimensionless(factors_at(points, branch, geometry), geometry)
     with np.errstate(invalid="ignore"):
-        valid = (values[..., _PLANAR] * assembly.planar >= 0) & (
-            points[..., 1] * assembly.sin_beta >= 0
-        )
+        valid = values[..., _PLANAR] * assembly.planar >= 0
+        valid &= points[..., 1] * assembly.sin_beta >= 0
     shape = valid.shape
     distance, feet = np.full(valid.size, np.nan), np.full((valid.size, 3), np.nan)
     factor, rows, flat = np.full(valid.size, -1), np.flatnonzero(valid), points.reshape(-1, 3)

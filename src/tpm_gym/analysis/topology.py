@@ -12,6 +12,9 @@ Both are taken at one configuration, and agree at singularities too. If z_C1 = z
 the parallelogram of branch I then contains the direction y, and link 3' can turn about it. That
 constraint singularity is not among the factors of Eqs. (16) and (17), which take for granted that
 link 3' only translates.
+
+Functions of joint angles raise InputError for what is not three finite numbers, and
+UnreachableError if the branch does not exist there.
 """
 
 from __future__ import annotations
@@ -89,12 +92,7 @@ class Structure:
 def describe(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> Structure:
-    """Axes and rods of :mod:`tpm_gym.mechanism.tree` at theta (3,) rad, named as in the paper.
-
-    Raises:
-        InputError: If theta has the wrong shape or is not finite.
-        UnreachableError: If the branch does not exist at theta.
-    """
+    """Axes and rods of :mod:`tpm_gym.mechanism.tree` at theta (3,) rad, named as in the paper."""
     mechanism = build(geometry)
     frames = _frames(mechanism, joint_angles(theta, branch, geometry))
     joints = {link.joint.name: link for link in mechanism.links if link.joint}
@@ -162,9 +160,7 @@ class Topology:
     def dof(self, loops: int = 2) -> int:
         """F of Eq. (3a), counting the first ``loops`` of the paper's loops."""
         counted = self.loops[:loops]
-        return degrees_of_freedom(
-            [loop.freedoms for loop in counted], [loop.equations for loop in counted]
-        )
+        return degrees_of_freedom([x.freedoms for x in counted], [x.equations for x in counted])
 
 
 def analyse(structure: Structure) -> Topology:
@@ -230,8 +226,6 @@ def mobility(
     Singular values up to 1e-11 of the largest count as zeros.
 
     Raises:
-        InputError: If theta has the wrong shape or is not finite.
-        UnreachableError: If the branch does not exist at theta.
         SingularityError: If the rank is in doubt, since a singular value is between 1e-11 and 1e-7
             of the largest: very near to a constraint singularity, but not on it.
     """
@@ -261,27 +255,18 @@ def mobility(
 def closure_jacobian(mechanism: Mechanism, angles: Mapping[str, float]) -> FloatArray:
     """Derivative of the gaps of all closures by the joint angles of the spanning tree.
 
-    Args:
-        mechanism: Tree and closures.
-        angles: Joint name -> rad, for every joint that moves.
-
-    Returns:
-        (3 closures, joints) m/rad, in the paper frame: rows in the order of
-        ``mechanism.closures`` (x, y, z of ``point_a`` - ``point_b``), columns in the order of
-        ``mechanism.links``.
+    (3 closures, joints) m/rad, in the paper frame: rows in the order of ``mechanism.closures``
+    (x, y, z of ``point_a`` - ``point_b``), columns in the order of ``mechanism.links``. ``angles``
+    holds every joint that turns, by name, in rad.
     """
     frames = _frames(mechanism, angles)
-    rows = []
-    for closure in mechanism.closures:
-        side_a, side_b = (
-            _rates(mechanism, frames, link, _place(frames, link, point))[0]
-            for link, point in (
-                (closure.link_a, closure.point_a),
-                (closure.link_b, closure.point_b),
-            )
-        )
-        rows.append(side_a - side_b)
-    return np.concatenate(rows)
+
+    def velocity(link: str, point: Vector) -> FloatArray:
+        return _rates(mechanism, frames, link, _place(frames, link, point))[0]
+
+    return np.concatenate(
+        [velocity(c.link_a, c.point_a) - velocity(c.link_b, c.point_b) for c in mechanism.closures]
+    )
 
 
 def _rank(values: FloatArray) -> int:

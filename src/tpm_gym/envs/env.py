@@ -244,7 +244,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         self.simulation = self._start()
 
     def _start(self) -> Simulation:
-        simulation = Simulation(
+        return Simulation(
             self.task.scene,
             machine=self.machine,
             engine=self._engine,
@@ -252,11 +252,6 @@ class TPMEnv(gym.Env[Observation, Action]):
             gui=self.render_mode == "human",
             renderer=self._renderer,
         )
-        if simulation.engine.control_period != CONTROL_PERIOD:
-            simulation.close()
-            valid = f"a control_period of {CONTROL_PERIOD} s, which the tasks are made for"
-            raise ConfigurationError("physics", self._physics, valid)
-        return simulation
 
     # -- the Gymnasium interface ----------------------------------------------------------------
 

@@ -10,7 +10,7 @@ The functions of the first part compute with whatever their namespace ``ns`` doe
 :mod:`tpm_gym.kinematics.namespaces`. Components (x, y, z or theta_1 to theta_3) are separate
 floats, arrays or tensors (...,), and signs of branches may be arrays that broadcast with them. They
 check nothing and raise nothing: beside a solution they return whether it is real, and the lengths
-from which :mod:`tpm_gym.kinematics.margins` explains why it is not.
+from which the errors of the last part explain why it is not.
 
 The second part is the first in plain floats, for one configuration at every time step, with errors:
 :func:`assemble`, :func:`posture` and :func:`evaluate`. Three finite floats are expected.
@@ -20,13 +20,12 @@ from __future__ import annotations
 
 import math
 import sys
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from tpm_gym.arrays import Vector
 from tpm_gym.errors import SingularityError, UnreachableError
-from tpm_gym.kinematics import margins
 from tpm_gym.kinematics.geometry import Geometry
 from tpm_gym.kinematics.modes import AssemblyMode, WorkingMode
 from tpm_gym.kinematics.namespaces import NUMPY, PLAIN, Namespace, Numbers
@@ -44,6 +43,7 @@ __all__ = [
     "factors",
     "no_assembly",
     "no_posture",
+    "parallel_factors",
     "posture",
     "posture_at",
     "rods",
@@ -146,7 +146,7 @@ def posture_at(
 ) -> tuple[
     Triple, Numbers, tuple[Numbers, Numbers, Numbers, Numbers], tuple[Triple, Triple, Triple]
 ]:
-    """Inverse kinematics (Eqs. 12 to 15, corrected) for the signs of a working mode, in its order.
+    """Inverse kinematics (Eqs. 12 to 15, corrected) for the signs of a working mode.
 
     Returns:
         theta_1 and theta_3 in (-pi, pi], theta_2 in [0, 2 pi): arms 1 and 3 point inwards at pi,
@@ -274,20 +274,20 @@ def assemble(theta: Vector, branch: AssemblyMode, geometry: Geometry) -> Assembl
     Raises:
         UnreachableError: If the branch does not exist at theta.
     """
-    cos, sin = arms(theta, geometry, PLAIN)
-    return _assembled(theta, cos, sin, branch, geometry)
+    return _assembled(theta, branch, geometry)[2]
 
 
 def _assembled(
-    theta: Vector, cos: Triple, sin: Triple, branch: AssemblyMode, geometry: Geometry
-) -> Assembly:
+    theta: Vector, branch: AssemblyMode, geometry: Geometry
+) -> tuple[Triple, Triple, Assembly]:
+    cos, sin = arms(theta, geometry, PLAIN)
     try:
         found, real, _ = assembly_at(cos, sin, branch.planar, branch.sin_beta, geometry, PLAIN)
     except ZeroDivisionError:  # concentric circles, or link 7 beside B3
         real = False
     if not real:
         raise no_assembly(theta, branch, geometry)
-    return found
+    return cos, sin, found
 
 
 def posture(point: Vector, branch: WorkingMode, geometry: Geometry) -> Vector:
@@ -299,9 +299,8 @@ def posture(point: Vector, branch: WorkingMode, geometry: Geometry) -> Vector:
     Raises:
         UnreachableError: If the branch does not exist at the point.
     """
-    signs = branch.cos_beta, branch.leg1, branch.leg2, branch.leg3
     try:
-        theta, real, _, _ = posture_at(point, signs, geometry, PLAIN)
+        theta, real, _, _ = posture_at(point, branch.signs, geometry, PLAIN)
     except ZeroDivisionError:  # a rod's end at the pivot
         real = False
     if not real:
@@ -318,31 +317,62 @@ def evaluate(
         UnreachableError: If the branch does not exist at theta.
         SingularityError: If theta is a parallel singularity.
     """
-    cos, sin = arms(theta, geometry, PLAIN)
-    found = _assembled(theta, cos, sin, branch, geometry)
+    cos, sin, found = _assembled(theta, branch, geometry)
     bars = rods(cos, sin, found, geometry)
     values = factors(cos, sin, found, bars, geometry)
-    for name, value in margins.parallel_factors(values[:3], geometry).items():
+    for name, value in parallel_factors(values[:3], geometry).items():
         if abs(value) < SINGULAR:
             raise SingularityError(name, value)
     rows = velocity(bars, values)
     return found, rows, conditioning(rows, PLAIN)
 
 
-def no_assembly(theta: Vector, branch: AssemblyMode, geometry: Geometry) -> UnreachableError:
-    """Why a branch cannot be assembled at theta (3) rad."""
+# -- why there is no configuration, or no velocity -------------------------------------------------
+
+
+def no_assembly(theta: Vector, branch: AssemblyMode, g: Geometry) -> UnreachableError:
+    """Which loop keeps a branch from being assembled at theta (3) rad, and by how much."""
     with np.errstate(all="ignore"):
-        cos, sin = arms(tuple(map(np.float64, theta)), geometry, NUMPY)
-        _, _, lengths = assembly_at(cos, sin, branch.planar, branch.sin_beta, geometry, NUMPY)
+        cos, sin = arms(tuple(map(np.float64, theta)), g, NUMPY)
+        _, _, lengths = assembly_at(cos, sin, branch.planar, branch.sin_beta, g, NUMPY)
     y1, distance2, level, vertical = map(float, lengths)
-    return margins.no_assembly(
-        theta, branch, geometry, (y1, math.sqrt(distance2)), (level, vertical)
-    )
+    hint = f"choose joint angles within reach (branch {branch})"
+    if abs(y1) >= g.l4:
+        return UnreachableError(theta, "loop 1 (rod B1C1 to y = 0)", g.l4 - abs(y1), hint)
+    radius, distance = math.sqrt(g.l4**2 - y1**2), math.sqrt(distance2)
+    margin = min(radius + g.l4 - distance, distance - (g.l4 - radius))
+    if margin < 0 or distance == 0:
+        return UnreachableError(theta, "loop 1 (circles of B1C1 and B2C2)", margin, hint)
+    nearest, farthest = (math.hypot(abs(level) + side * g.l7, vertical) for side in (-1, 1))
+    margin = min(farthest - g.l4, g.l4 - nearest)
+    return UnreachableError(theta, "loop 2 (rod B3C3 to link 7)", margin, hint)
 
 
-def no_posture(point: Vector, branch: WorkingMode, geometry: Geometry) -> UnreachableError:
-    """Why a point (3) m has no posture on a branch."""
-    signs = branch.cos_beta, branch.leg1, branch.leg2, branch.leg3
+def no_posture(point: Vector, branch: WorkingMode, g: Geometry) -> UnreachableError:
+    """Which part keeps a point (3) m from having a posture on a branch, and by how much."""
+    hint = f"choose a point of the workspace (branch {branch}; see tpm_gym.kinematics.workspace)"
+    beyond = g.l7 - abs(point[1])
+    if beyond < 0:
+        return UnreachableError(point, "beta (|y| <= l7)", beyond, hint)
     with np.errstate(all="ignore"):
-        _, _, _, legs = posture_at(tuple(map(np.float64, point)), signs, geometry, NUMPY)
-    return margins.no_posture(point, branch, geometry, legs)
+        _, _, _, legs = posture_at(tuple(map(np.float64, point)), branch.signs, g, NUMPY)
+    margin, leg = min((_leg_margin(*leg, g), i) for i, leg in enumerate(legs, 1))
+    return UnreachableError(point, f"leg {leg}", margin, hint)
+
+
+def _leg_margin(level: float, vertical: float, out: float, g: Geometry) -> float:
+    """How far the triangle of arm, rod (projected on the arm's plane) and pivot is from failing."""
+    if abs(out) >= g.l4:
+        return g.l4 - abs(out)
+    in_plane, rod = math.hypot(level, vertical), math.sqrt(g.l4**2 - out**2)
+    return min(g.l3 + rod - in_plane, in_plane - abs(g.l3 - rod))
+
+
+def parallel_factors(values: tuple[Any, Any, Any], geometry: Geometry) -> dict[str, Any]:
+    """Names of the factors of det A, as errors have them -> values in units of l4."""
+    sin_beta, level3, planar = values
+    return {
+        "sin(beta)": sin_beta,
+        "(l1 + l3 cos(theta_3) - xC - 2 l2) / l4": level3 / geometry.l4,
+        "planar factor / l4^2": planar / geometry.l4**2,
+    }

@@ -5,8 +5,8 @@ A v = B theta_dot (section "Singularity analysis"). Configurations are given by 
 ``theta`` (..., 3) in rad and the assembly mode, or by points ``position`` (..., 3) in m and the
 working mode. Torch tensors give tensors, as in :mod:`tpm_gym.kinematics.position`.
 
-From angles, all functions raise InputError if theta has the wrong shape or is not finite, and
-UnreachableError if the branch does not exist at some theta.
+All functions raise InputError for what is no array (..., 3) of numbers; from angles, they raise it
+also if theta is not finite, and UnreachableError if the branch does not exist at some theta.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tpm_gym.arrays import FloatArray, finite_points, is_tensor, points, vector
 from tpm_gym.errors import SingularityError
-from tpm_gym.kinematics import equations, margins
+from tpm_gym.kinematics import equations
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.kinematics.modes import DEFAULT_ASSEMBLY, ELBOWS_OUT, AssemblyMode, WorkingMode
 from tpm_gym.kinematics.namespaces import Namespace, Numbers, by_rows
@@ -162,11 +162,7 @@ def conditioning_at(
     assembly: AssemblyMode = DEFAULT_ASSEMBLY,
     geometry: Geometry = PAPER,
 ) -> FloatArray:
-    """1/cond(J) at points, (...,); 0 where they are not reachable on both branches.
-
-    Raises:
-        InputError: If the last axis of position does not have length 3.
-    """
+    """1/cond(J) at points, (...,); 0 where they are not reachable on both branches."""
 
     def columns(c: _Configuration) -> list[Numbers]:
         planar, side = (2.0 * (f > 0) - 1.0 for f in (c.factors.planar, c.factors.sin_beta))
@@ -213,9 +209,6 @@ def factors_at(
 
     Unlike :func:`factors` it does not pass through the forward kinematics, so it keeps its accuracy
     at the parallel singularities.
-
-    Raises:
-        InputError: If the last axis of position does not have length 3.
     """
     layouts = _PARALLEL, _SERIAL, _CONSTRAINT
     columns = _from_points(lambda c: [*c.factors], position, branch, geometry, math.nan, *layouts)
@@ -254,10 +247,9 @@ def _from_points(
     *layouts: NDArray[np.intp],
 ) -> list[FloatArray]:
     """What is computed of configurations at points; ``missing`` where there is none."""
-    signs = branch.cos_beta, branch.leg1, branch.leg2, branch.leg3
 
     def text(point: equations.Triple, ns: Namespace) -> list[Numbers]:
-        theta, real, link7, _ = equations.posture_at(point, signs, g, ns)
+        theta, real, link7, _ = equations.posture_at(point, branch.signs, g, ns)
         cos, sin = equations.arms(theta, g, ns)
         found = _configuration(cos, sin, equations.Assembly(*point, *link7), g, ns)
         return [ns.where(real, column, missing) for column in columns(found)]
@@ -290,7 +282,7 @@ def _conditioning(c: _Configuration) -> Numbers:
 def _require_regular(values: FloatArray, geometry: Geometry) -> None:
     """Raise if a factor of det A (..., 3) is zero somewhere, for the one that is nearest to it."""
     nearest = []
-    named = margins.parallel_factors((values[..., 0], values[..., 1], values[..., 2]), geometry)
+    named = equations.parallel_factors((values[..., 0], values[..., 1], values[..., 2]), geometry)
     for name, value in named.items():
         flat = value.reshape(-1)
         if len(flat):

@@ -31,8 +31,27 @@ __all__ = [
 ]
 
 
+class _Mode:
+    """A branch, named by its signs."""
+
+    @property
+    def signs(self) -> tuple[int, ...]:
+        """Its signs, in their order."""
+        raise NotImplementedError
+
+    def __post_init__(self) -> None:
+        """Reject anything but signs."""
+        if any(sign not in (-1, 1) for sign in self.signs):
+            raise InputError(type(self).__name__, self.signs, "made of signs, each +1 or -1")
+
+    @property
+    def index(self) -> int:
+        """Slot of this branch in the solutions on all branches."""
+        return sum((sign + 1) // 2 << shift for shift, sign in enumerate(self.signs[::-1]))
+
+
 @dataclass(frozen=True)
-class AssemblyMode:
+class AssemblyMode(_Mode):
     """One of the 4 branches of the forward kinematics.
 
     Attributes:
@@ -44,18 +63,14 @@ class AssemblyMode:
     planar: int
     sin_beta: int
 
-    def __post_init__(self) -> None:
-        """Reject anything but signs."""
-        _check_signs("AssemblyMode", self.planar, self.sin_beta)
-
     @property
-    def index(self) -> int:
-        """Slot of this branch in the results of :func:`forward_all`."""
-        return (self.planar + 1) + (self.sin_beta + 1) // 2
+    def signs(self) -> tuple[int, int]:
+        """planar, sin_beta."""
+        return self.planar, self.sin_beta
 
 
 @dataclass(frozen=True)
-class WorkingMode:
+class WorkingMode(_Mode):
     """One of the 16 branches of the inverse kinematics.
 
     Attributes:
@@ -70,20 +85,10 @@ class WorkingMode:
     leg2: int
     leg3: int
 
-    def __post_init__(self) -> None:
-        """Reject anything but signs."""
-        _check_signs("WorkingMode", self.cos_beta, self.leg1, self.leg2, self.leg3)
-
     @property
-    def index(self) -> int:
-        """Slot of this branch in the results of :func:`inverse_all`."""
-        bits = (self.cos_beta, self.leg1, self.leg2, self.leg3)
-        return sum((sign + 1) // 2 << shift for sign, shift in zip(bits, (3, 2, 1, 0), strict=True))
-
-
-def _check_signs(name: str, *signs: int) -> None:
-    if any(sign not in (-1, 1) for sign in signs):
-        raise InputError(name, signs, "made of signs, each +1 or -1")
+    def signs(self) -> tuple[int, int, int, int]:
+        """cos_beta, leg1, leg2, leg3."""
+        return self.cos_beta, self.leg1, self.leg2, self.leg3
 
 
 ASSEMBLY_MODES = tuple(AssemblyMode(*signs) for signs in product((-1, 1), repeat=2))

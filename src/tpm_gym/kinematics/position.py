@@ -3,6 +3,10 @@
 In the paper's frame, m and rad; branches are named, ordered and returned as
 :mod:`tpm_gym.kinematics.modes` has it. Torch tensors give tensors, on their device and in float64,
 that can be differentiated; where branches merge, the derivative is 0 instead of infinite.
+
+All functions raise InputError for what is no array (..., 3) of numbers. Entries that are not finite
+give invalid branches where all are solved; those on one named branch raise InputError for them, and
+UnreachableError if the branch does not exist for some entry.
 """
 
 from __future__ import annotations
@@ -39,9 +43,8 @@ _BETA = _PLANAR + 8 + _MIRRORED
 # Which columns of _postures: for each leg, for each bend, both signs of cos(beta); then beta
 _ANGLES = np.array(
     [
-        [4 * leg + (bend + 1) + (mode.cos_beta + 1) // 2 for leg, bend in enumerate(bends)]
+        [4 * leg + (bend + 1) + (mode.cos_beta + 1) // 2 for leg, bend in enumerate(mode.signs[1:])]
         for mode in WORKING_MODES
-        for bends in [(mode.leg1, mode.leg2, mode.leg3)]
     ]
 )
 _ANGLE_BETA = np.array([12 + (mode.cos_beta + 1) // 2 for mode in WORKING_MODES])
@@ -50,12 +53,7 @@ _ANGLE_BETA = np.array([12 + (mode.cos_beta + 1) // 2 for mode in WORKING_MODES]
 def forward_all(theta: ArrayLike, geometry: Geometry = PAPER) -> ForwardSolutions:
     """Solve the forward kinematics on all 4 branches, at actuated angles theta (..., 3) rad.
 
-    Returns:
-        All solutions; a branch keeps its slot as theta moves, and holds NaN where it is not real.
-        Entries of theta that are not finite give invalid branches.
-
-    Raises:
-        InputError: If theta holds anything but numbers or its last axis does not have length 3.
+    A branch keeps its slot as theta moves, and holds NaN where it is not real.
     """
     angles = points("theta", theta)
     position, beta = by_rows(lambda t, ns: _assemblies(t, geometry, ns), angles, _POSITION, _BETA)
@@ -63,15 +61,7 @@ def forward_all(theta: ArrayLike, geometry: Geometry = PAPER) -> ForwardSolution
 
 
 def inverse_all(position: ArrayLike, geometry: Geometry = PAPER) -> InverseSolutions:
-    """Solve the inverse kinematics on all 16 branches, for point P at position (..., 3) m.
-
-    Returns:
-        All solutions, NaN where a branch is not real. Entries of position that are not finite give
-        invalid branches.
-
-    Raises:
-        InputError: If position holds anything but numbers or its last axis does not have length 3.
-    """
+    """Solve the inverse kinematics on all 16 branches, for point P at position (..., 3) m."""
     places = points("position", position)
     theta, beta = by_rows(lambda p, ns: _postures(p, geometry, ns), places, _ANGLES, _ANGLE_BETA)
     return InverseSolutions(theta, beta, beta == beta)
@@ -80,15 +70,10 @@ def inverse_all(position: ArrayLike, geometry: Geometry = PAPER) -> InverseSolut
 def forward(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> FloatArray:
-    """Platform position at theta (..., 3) rad, on one named branch of the forward kinematics.
+    """Position of P (..., 3) m at theta (..., 3) rad, on one named branch.
 
-    Returns:
-        (..., 3) m, point P. Both y and -y belong to the same angles: the default
-        branch gives y > 0, ``AssemblyMode(-1, -1)`` its mirror image.
-
-    Raises:
-        InputError: If theta has the wrong shape or is not finite.
-        UnreachableError: If the branch does not exist for some entry of theta.
+    Both y and -y belong to the same angles: the default branch gives y > 0,
+    ``AssemblyMode(-1, -1)`` its mirror image.
     """
     angles = points("theta", theta)
     if angles.ndim == 1 and not is_tensor(angles):
@@ -99,14 +84,9 @@ def forward(
 def inverse(
     position: ArrayLike, branch: WorkingMode = ELBOWS_OUT, geometry: Geometry = PAPER
 ) -> FloatArray:
-    """Actuated angles for P at position (..., 3) m, on one named branch of the inverse kinematics.
+    """Actuated angles (..., 3) rad for P at position (..., 3) m, on one named branch.
 
-    Returns:
-        (..., 3) rad; theta_1 and theta_3 in (-pi, pi], theta_2 in [0, 2 pi).
-
-    Raises:
-        InputError: If position has the wrong shape or is not finite.
-        UnreachableError: If the branch does not exist for some entry of position.
+    theta_1 and theta_3 are in (-pi, pi], theta_2 in [0, 2 pi).
     """
     places = points("position", position)
     if places.ndim == 1 and not is_tensor(places):
@@ -122,12 +102,7 @@ def inverse(
 def passive_angles(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> PassiveAngles:
-    """Directions of all passive links at theta (..., 3) rad, in closed form, on one branch.
-
-    Raises:
-        InputError: If theta has the wrong shape or is not finite.
-        UnreachableError: If the branch does not exist for some entry of theta.
-    """
+    """Directions of all passive links at theta (..., 3) rad, on one named branch."""
     angles = points("theta", theta)
     solutions, slot = _assembled(angles, branch, geometry), branch.index
     ns, beta, l4 = namespace_of(angles), solutions.beta[..., slot], geometry.l4

@@ -20,13 +20,7 @@ from tpm_gym.kinematics.modes import ELBOWS_OUT, WorkingMode
 from tpm_gym.kinematics.namespaces import namespace_of
 from tpm_gym.kinematics.position import inverse_all
 
-__all__ = [
-    "TASK_REGION",
-    "Region",
-    "assembly_of",
-    "conditioning_at",
-    "reachable",
-]
+__all__ = ["Region", "assembly_of", "conditioning_at", "reachable"]
 
 
 @dataclass(frozen=True)
@@ -68,18 +62,6 @@ class Region:
         """Signed distance of one point (3,) to the nearest face; negative outside, m."""
         array = np.asarray(point, dtype=np.float64)
         return float(np.minimum(array - self.low, np.asarray(self.high) - array).min())
-
-
-TASK_REGION = Region(low=(-0.24, 0.012, 0.66), high=(0.12, 0.046, 0.903))
-"""Where the environments let point P go, for the paper's lengths.
-
-The slab 0 < y < l7, less a margin to the parallel singularity y = 0 and to the edge y = l7. Every
-point is reachable with the elbows out, in the default assembly mode (a test walks through it).
-Nearer to y = 0 than this, the motors' torque no longer suffices to hold y when a random policy
-reverses x or z at full speed: the platform is then thrown through the singularity. Farther from the
-base than this, the cup of the default mount would be pushed back farther than its stroke by a puck
-that lies askew.
-"""
 
 
 def reachable(

@@ -10,28 +10,17 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from tpm_gym.learning.configuration import ResumeConfig, TrainingConfig
-    from tpm_gym.learning.demonstrations import Demonstrations
-    from tpm_gym.learning.errors import LearningError
-    from tpm_gym.learning.evaluation import EvaluationConfig, evaluate
-    from tpm_gym.learning.features import GoalGapExtractor
-    from tpm_gym.learning.hindsight import PenaltyHerReplayBuffer
-    from tpm_gym.learning.recipes import recipe
-    from tpm_gym.learning.training import resume, train
-
-__all__ = [
-    "Demonstrations",
-    "EvaluationConfig",
-    "GoalGapExtractor",
-    "LearningError",
-    "PenaltyHerReplayBuffer",
-    "ResumeConfig",
-    "TrainingConfig",
-    "evaluate",
-    "recipe",
-    "resume",
-    "train",
-]
+    from tpm_gym.learning.configuration import ResumeConfig as ResumeConfig
+    from tpm_gym.learning.configuration import TrainingConfig as TrainingConfig
+    from tpm_gym.learning.demonstrations import Demonstrations as Demonstrations
+    from tpm_gym.learning.errors import LearningError as LearningError
+    from tpm_gym.learning.evaluation import EvaluationConfig as EvaluationConfig
+    from tpm_gym.learning.evaluation import evaluate as evaluate
+    from tpm_gym.learning.features import GoalGapExtractor as GoalGapExtractor
+    from tpm_gym.learning.hindsight import PenaltyHerReplayBuffer as PenaltyHerReplayBuffer
+    from tpm_gym.learning.recipes import recipe as recipe
+    from tpm_gym.learning.training import resume as resume
+    from tpm_gym.learning.training import train as train
 
 _MODULES = {
     "Demonstrations": "demonstrations",
@@ -46,6 +35,7 @@ _MODULES = {
     "resume": "training",
     "train": "training",
 }
+__all__ = list(_MODULES)
 
 
 def __getattr__(name: str) -> Any:

@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from types import FrameType
 from typing import Any, Final
 
@@ -22,7 +23,7 @@ from tpm_gym.learning.configuration import TrainingConfig
 from tpm_gym.learning.errors import CheckpointError
 from tpm_gym.learning.estimates import Estimate
 from tpm_gym.learning.policies import TrainedPolicy
-from tpm_gym.learning.report.learning_curve import draw_learning_curve
+from tpm_gym.learning.report.figures import draw_learning_curve
 from tpm_gym.learning.rollout import SELECTION_SEED, GoalEnv, run_episodes, summarise
 from tpm_gym.learning.run_folder import CURVE_FILE, EVALUATIONS_FILE
 from tpm_gym.learning.training_state import capture
@@ -85,7 +86,6 @@ class PeriodicEvaluation(BaseCallback):
         self._evaluate()
 
     def _evaluate(self) -> None:
-        """Evaluate, record, keep the policy where it is the best so far, and draw."""
         policy = TrainedPolicy(self.model)
         records = run_episodes(self._env, policy, self._config.eval_episodes, SELECTION_SEED)
         metrics = summarise(records)
@@ -99,8 +99,8 @@ class PeriodicEvaluation(BaseCallback):
         self._draw()
 
     def _draw(self) -> None:
-        path = self._config.run / CURVE_FILE
-        draw_learning_curve(path, self._config.title, self._evaluations)
+        config = self._config
+        draw_learning_curve(config.run / CURVE_FILE, config.title, self._evaluations)
 
     def _record(self, metrics: Mapping[str, Estimate]) -> None:
         """Append the metrics to evaluations.jsonl, progress.csv and TensorBoard."""
@@ -119,7 +119,6 @@ class PeriodicEvaluation(BaseCallback):
         self.logger.dump(self.num_timesteps)
 
     def _print(self, metrics: Mapping[str, Estimate], best: bool) -> None:
-        """Print one line."""
         success = metrics["success_at_end"]
         self._console.print(
             f"{self.num_timesteps:>9,} steps   success {success.mean:6.1%} "
@@ -153,18 +152,14 @@ class ProgressBar(BaseCallback):
         self._progress.stop()
 
 
+@dataclass
 class SignalListener:
     """Remembers that the process was asked to stop; a second signal ends it at once.
 
     An exception in the middle of an update could leave a half-updated network to save.
-
-    Attributes:
-        received: The signal, None before.
     """
 
-    def __init__(self) -> None:
-        """Start out with no signal."""
-        self.received: signal.Signals | None = None
+    received: signal.Signals | None = None
 
     @contextmanager
     def listening(self) -> Iterator[None]:
@@ -257,10 +252,7 @@ class Checkpointing(BaseCallback):
         return time.perf_counter() >= self._next_time
 
     def _capture(self, finished: bool = False) -> Content:
-        extra = {
-            "seconds": seconds_trained(self.model),
-            "evaluation": self._evaluation.state(),
-        }
+        extra = {"seconds": seconds_trained(self.model), "evaluation": self._evaluation.state()}
         return capture(self.model, self._config.run, extra, finished)
 
     def _save(self, content: Content, started: float) -> None:

@@ -23,15 +23,15 @@ UNSET: Final[Any] = None
 def unset(kind: Any, shown: str, metavar: str, name: str | None = None) -> Any:
     """Describe an option of a type that is ``UNSET`` where it is not given.
 
-    Args:
-        shown: What the help says that the default is.
-        metavar: What the help calls the value.
-        name: Its name on the command line, where that differs from the field's.
+    ``shown`` is what the help says that the default is, ``name`` what the command line calls it.
     """
+    return shown_default(shown, metavar, constructor=kind | None, name=name)
+
+
+def shown_default(shown: str, metavar: str, **options: Any) -> Any:
+    """Describe an option whose default has to be put into words."""
     hint = f"(default: {shown})"
-    return tyro.conf.arg(
-        constructor=kind | None, help_behavior_hint=hint, metavar=metavar, name=name
-    )
+    return tyro.conf.arg(help_behavior_hint=hint, metavar=metavar, **options)
 
 
 @dataclass(frozen=True)
@@ -171,13 +171,21 @@ def resumed(config: ResumeConfig, stored: Mapping[str, Any], reached: int) -> Tr
     return found
 
 
-def _check(config: TrainingConfig) -> None:
-    """Refuse what cannot work."""
-    names = ("steps", "envs", "eval_every", "eval_episodes", "checkpoint_every", "threads")
+def check_least(config: Any, least: int, *names: str) -> None:
+    """Refuse an option that is given and less than it may be.
+
+    Raises:
+        ConfigError: There is one.
+    """
     for name in names:
         value = getattr(config, name)
-        if value is not None and value < 1:
-            raise ConfigError(f"--{name.replace('_', '-')} {value}: must be at least 1")
+        if value is not UNSET and value < least:
+            raise ConfigError(f"--{name.replace('_', '-')} {value}: must be at least {least}")
+
+
+def _check(config: TrainingConfig) -> None:
+    counts = ("steps", "envs", "eval_every", "eval_episodes", "checkpoint_every", "threads")
+    check_least(config, 1, *counts)
     highest = SELECTION_SEED - config.envs
     if not 0 <= config.seed <= highest:
         held_out = f"seeds from {SELECTION_SEED} up are held out"

@@ -21,9 +21,6 @@ def check_env_id(env_id: str) -> EnvSpec:
     Args:
         env_id: A registered id, or ``module:id``, for which the module is imported first.
 
-    Returns:
-        What Gymnasium has registered.
-
     Raises:
         ConfigError: The module cannot be imported, or the id is not registered, or is that of an
             environment without goal, conditioning and loops to evaluate.
@@ -55,13 +52,12 @@ def _is_ours(spec: EnvSpec) -> bool:
 
 
 def make_env(env: str | EnvSpec, *, in_worker: bool = False, **options: Any) -> GoalEnv:
-    """Make an environment.
+    """Make an environment, with arguments such as ``goals`` and ``penalty_weight``.
 
     Args:
         env: An id, or what Gymnasium has registered, which another process may not have.
         in_worker: Whether this runs in a process of its own, which has to outlive the signal that
             a terminal or a batch system sends to all processes, until the main one has saved.
-        options: Arguments of the environment, such as ``goals`` and ``penalty_weight``.
     """
     if in_worker:
         for number in (signal.SIGINT, signal.SIGTERM):

@@ -8,10 +8,10 @@ et al. 2021, "Deep reinforcement learning at the edge of the statistical precipi
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from statistics import median
-from typing import Final
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,24 +23,20 @@ LEARNED: Final = 0.95
 
 _Z95: Final = 1.959963984540054  # 97.5% quantile of the standard normal distribution
 _EPISODE_SAMPLES: Final = 2000
-_EPISODE_BLOCK: Final = 100
+_BLOCK: Final = 100
+
+Array: TypeAlias = NDArray[Any]
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean over episodes with its 95% interval.
-
-    Attributes:
-        mean: Sample mean.
-        low: Lower end of the interval.
-        high: Upper end of the interval.
-        worst: The worst value of any step of any episode, where the metric has one.
-    """
+    """A mean over episodes with its 95% interval."""
 
     mean: float
     low: float
     high: float
     worst: float | None = None
+    """The worst value of any step of any episode, where the metric has one."""
 
     def as_dict(self) -> dict[str, float]:
         """Return the estimate as plain data, without ``worst`` where there is none."""
@@ -60,19 +56,7 @@ def wilson(outcomes: Sequence[bool]) -> Estimate:
 
 def bootstrap(values: Sequence[float], worst: float | None = None) -> Estimate:
     """Return a mean with its 95% percentile bootstrap interval (Efron 1979)."""
-    sample = np.asarray(values, dtype=np.float64)  # (n,)
-    rng = np.random.default_rng(BOOTSTRAP_SEED)
-    # Not all resamples at once: with many episodes their matrix would not fit in memory.
-    means = np.concatenate(
-        [
-            sample[rng.integers(0, sample.size, (_EPISODE_BLOCK, sample.size))].mean(axis=1)
-            for _ in range(_EPISODE_SAMPLES // _EPISODE_BLOCK)
-        ]
-    )
-    low, high = np.percentile(means, [2.5, 97.5])
-    mean = float(sample.mean())
-    # Equal values can differ from their mean by rounding; the interval must still hold the mean.
-    return Estimate(mean, min(mean, float(low)), max(mean, float(high)), worst)
+    return _resampled(values, lambda rows: rows.mean(axis=1), _EPISODE_SAMPLES, worst)
 
 
 def interquartile_mean(scores: Sequence[float], samples: int = BOOTSTRAP_SAMPLES) -> Estimate:
@@ -81,28 +65,40 @@ def interquartile_mean(scores: Sequence[float], samples: int = BOOTSTRAP_SAMPLES
     The mean is that without the lowest and highest quarter, rounded down to whole scores: of five
     scores, that of the middle three.
     """
-    values = np.asarray(scores, dtype=np.float64)  # (n,)
+
+    def trimmed(rows: Array) -> Array:
+        count = rows.shape[1]
+        cut = count // 4
+        means: Array = np.sort(rows, axis=1)[:, cut : count - cut].mean(axis=1)
+        return means
+
+    return _resampled(scores, trimmed, samples)
+
+
+def _resampled(
+    values: Sequence[float],
+    statistic: Callable[[Array], Array],
+    samples: int,
+    worst: float | None = None,
+) -> Estimate:
+    """Estimate a statistic, (m, n) -> (m,), with its 95% percentile bootstrap interval."""
+    sample = np.asarray(values, dtype=np.float64)  # (n,)
     rng = np.random.default_rng(BOOTSTRAP_SEED)
-    drawn = values[rng.integers(0, values.size, (samples, values.size))]  # (samples, n)
-    low, high = np.percentile(_trimmed_means(drawn), [2.5, 97.5])
-    mean = float(_trimmed_means(values[None])[0])
-    # Equal scores can differ from their mean by rounding; the interval must still hold the mean.
-    return Estimate(mean, min(mean, float(low)), max(mean, float(high)))
-
-
-def _trimmed_means(rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Interquartile means of the rows of (m, n), as (m,)."""
-    count = rows.shape[1]
-    cut = count // 4
-    means: NDArray[np.float64] = np.sort(rows, axis=1)[:, cut : count - cut].mean(axis=1)
-    return means
+    # Not all resamples at once: with many values their matrix would not fit in memory.
+    blocks = [
+        statistic(sample[rng.integers(0, sample.size, (_BLOCK, sample.size))])
+        for _ in range(samples // _BLOCK)
+    ]
+    low, high = np.percentile(np.concatenate(blocks), [2.5, 97.5])
+    mean = float(statistic(sample[None])[0])
+    # Equal values can differ from their mean by rounding; the interval must still hold the mean.
+    return Estimate(mean, min(mean, float(low)), max(mean, float(high)), worst)
 
 
 def settled(successes: Sequence[float], rate: float = LEARNED) -> int | None:
     """Index of the first evaluation from which success stays at ``rate`` or above to the end.
 
-    Returns:
-        The index; None where the last evaluation is below, or there is none.
+    None where the last evaluation is below, or there is none.
     """
     found = None
     for index in reversed(range(len(successes))):
@@ -113,10 +109,6 @@ def settled(successes: Sequence[float], rate: float = LEARNED) -> int | None:
 
 
 def median_time(times: Sequence[float | None]) -> float | None:
-    """Median over runs, where None is a run that never got there: later than any other.
-
-    Returns:
-        The median; None where it falls on a run that never got there.
-    """
+    """Median over runs, where None is a run that never got there: later than any other."""
     value = median(math.inf if time is None else time for time in times)
     return value if math.isfinite(value) else None

@@ -5,17 +5,18 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
-from rich.progress import track
+from rich.progress import Progress
 from rich.table import Table
 
 from tpm_gym.learning import provenance
-from tpm_gym.learning.configuration import UNSET, unset
+from tpm_gym.learning.configuration import UNSET, check_least, shown_default, unset
 from tpm_gym.learning.environments import check_env_id, make_env
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.estimates import Estimate
@@ -64,10 +65,7 @@ class EvaluationConfig:
     penalty_weight: float = 1.0
     """Weight of the singularity penalty in the return."""
 
-    randomisation: Annotated[
-        tuple[str, ...],
-        tyro.conf.arg(help_behavior_hint="(default: nowhere)", metavar="KEY=VALUE ..."),
-    ] = ()
+    randomisation: Annotated[tuple[str, ...], shown_default("nowhere", "KEY=VALUE ...")] = ()
     """Where the machine differs from the nominal one: attributes of tpm_gym's Randomisation, each
     a number, or for factors LOW:HIGH to draw from, for example encoder_noise=1e-4 puck_mass=0.5:2.
     Those about the puck change nothing where there is none."""
@@ -110,13 +108,10 @@ class Result:
 
 
 def evaluate(config: EvaluationConfig, console: Console | None = None) -> list[Result]:
-    """Evaluate the policies of a configuration and write what it asks for.
+    """Evaluate the policies of a configuration, in order, and write what it asks for.
 
     Args:
         console: Where the table is printed; by default the standard output.
-
-    Returns:
-        One result per policy, in order.
 
     Raises:
         LearningError: An option is not valid, or a policy cannot be used.
@@ -126,13 +121,10 @@ def evaluate(config: EvaluationConfig, console: Console | None = None) -> list[R
     console = console or Console(width=None if sys.stdout.isatty() else 200)
     _check(config)
     env_id = _resolve_env(config)
-    env = _make_env(env_id, config)
-    try:
+    with closing(_make_env(env_id, config)) as env:
         # All are loaded before the first one runs: a mistyped name shows at once.
         policies = list(zip(config.policy, _load(config, env), strict=True))
         results = [_evaluate_one(env, *policy, config, console) for policy in policies]
-    finally:
-        env.close()
     console.print(_table(env_id, config, results))
     if config.json is not None:
         provenance.write_json(config.json, _description(env_id, config, results))
@@ -143,20 +135,14 @@ def evaluate(config: EvaluationConfig, console: Console | None = None) -> list[R
 
 
 def _check(config: EvaluationConfig) -> None:
-    """Refuse what cannot work."""
-    least = {"episodes": 1, "video_episodes": 1, "seed": 0}
-    for name, value in least.items():
-        given = getattr(config, name)
-        if given < value:
-            raise ConfigError(f"--{name.replace('_', '-')} {given}: must be at least {value}")
+    check_least(config, 1, "episodes", "video_episodes")
+    check_least(config, 0, "seed")
     if not config.policy:
         raise ConfigError("--policy: name at least one policy")
-    for option, path, suffix in (
-        ("--video", config.video, ".mp4"),
-        ("--picture", config.picture, ".png"),
-    ):
+    for option, suffix in (("video", ".mp4"), ("picture", ".png")):
+        path = getattr(config, option)
         if path is not None and path.suffix != suffix:
-            raise ConfigError(f"{option} {path}: must end in {suffix}")
+            raise ConfigError(f"--{option} {path}: must end in {suffix}")
 
 
 def _resolve_env(config: EvaluationConfig) -> str:
@@ -173,7 +159,6 @@ def _resolve_env(config: EvaluationConfig) -> str:
 
 
 def _make_env(env_id: str, config: EvaluationConfig, render_mode: str | None = None) -> GoalEnv:
-    """Make an environment as configured."""
     return make_env(
         env_id,
         goals=config.goals,
@@ -184,10 +169,7 @@ def _make_env(env_id: str, config: EvaluationConfig, render_mode: str | None = N
 
 
 def parse_randomisation(entries: Sequence[str]) -> dict[str, Any]:
-    """Return what ``--randomisation`` says as a mapping; tpm_gym checks keys and values.
-
-    Args:
-        entries: Words such as ``puck_mass=2`` or ``friction=0.5:1``.
+    """Return words such as ``friction=0.5:1`` as a mapping; tpm_gym checks keys and values.
 
     Raises:
         ConfigError: A word has another form, or names something twice.
@@ -207,7 +189,6 @@ def parse_randomisation(entries: Sequence[str]) -> dict[str, Any]:
 
 
 def _load(config: EvaluationConfig, env: GoalEnv) -> list[Policy]:
-    """Load the policies of a configuration."""
     trust = config.trust_pickle
     return [load_policy(spec, env, trust_pickle=trust) for spec in config.policy]
 
@@ -216,20 +197,14 @@ def _evaluate_one(
     env: GoalEnv, spec: str, policy: Policy, config: EvaluationConfig, console: Console
 ) -> Result:
     """Run the episodes of one policy, with a progress bar on a terminal."""
-    ticks = iter(
-        track(
-            range(config.episodes),
-            description=spec,
-            console=console,
-            disable=not console.is_terminal,
-        )
-    )
+    hidden = not console.is_terminal
     start = time.perf_counter()
-    records = run_episodes(
-        env, policy, config.episodes, config.seed, on_episode=lambda: next(ticks, None)
-    )
-    wall_seconds = time.perf_counter() - start
-    next(ticks, None)  # exhausts the bar, which then leaves the terminal
+    with Progress(console=console, disable=hidden) as bar:
+        task = bar.add_task(spec, total=config.episodes)
+        records = run_episodes(
+            env, policy, config.episodes, config.seed, on_episode=lambda: bar.advance(task)
+        )
+        wall_seconds = time.perf_counter() - start
     return Result(spec, summarise(records), records, wall_seconds)
 
 
@@ -259,7 +234,6 @@ def _table(env_id: str, config: EvaluationConfig, results: Sequence[Result]) -> 
 
 
 def _cell(estimate: Estimate, factor: float, form: str, unit: str) -> str:
-    """Format an estimate with its interval."""
     mean, low, high = (
         form.format(value * factor) for value in (estimate.mean, estimate.low, estimate.high)
     )
@@ -301,8 +275,7 @@ def paths_per_policy(path: Path, policies: Sequence[str]) -> list[Path]:
 
 def _film(env_id: str, config: EvaluationConfig, console: Console) -> None:
     """Run the first episodes once more, with rendering, which would have slowed the metrics."""
-    env = _make_env(env_id, config, render_mode="rgb_array")
-    try:
+    with closing(_make_env(env_id, config, render_mode="rgb_array")) as env:
         for i, policy in enumerate(_load(config, env)):
             if config.video is not None:
                 path = paths_per_policy(config.video, config.policy)[i]
@@ -313,5 +286,3 @@ def _film(env_id: str, config: EvaluationConfig, console: Console) -> None:
                 path = paths_per_policy(config.picture, config.policy)[i]
                 write_contact_sheet(path, env, policy, config.seed)
                 console.print(f"picture: {path}", markup=False)
-    finally:
-        env.close()

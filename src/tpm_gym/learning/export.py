@@ -46,7 +46,7 @@ def save(
     recipe: Mapping[str, Any],
     versions: Mapping[str, str | None] | None = None,
 ) -> Path:
-    """Write the policy of a model as ``path``.safetensors and ``path``.json.
+    """Write the policy of a model as ``path``.safetensors and ``path``.json; return the latter.
 
     The files are loaded again and their actions compared with the model's before they take their
     names, so that what cannot be expressed is refused rather than changed.
@@ -54,11 +54,7 @@ def save(
     Args:
         model: SAC, TQC or PPO with a MultiInputPolicy.
         path: What the files have in common; folders above are made, earlier files replaced.
-        seed: Seed of the training; None where it is not known.
         versions: Versions it was trained with; by default those installed.
-
-    Returns:
-        The JSON file.
 
     Raises:
         PolicyError: The policy has something that the files cannot hold.
@@ -105,15 +101,7 @@ def remove(path: Path) -> None:
 
 
 def convert(archive: Path, path: Path, *, trust_pickle: bool) -> Path:
-    """Export a .zip file of a run.
-
-    Args:
-        archive: ``best.zip`` or ``last.zip``, in its run folder.
-        path: As for :func:`save`.
-        trust_pickle: Whether the archive may be loaded, which can run any code that is in it.
-
-    Returns:
-        The JSON file.
+    """Export ``best.zip`` or ``last.zip`` of a run as :func:`save` does; return the JSON file.
 
     Raises:
         PolicyError: It is not trusted, or cannot be loaded or exported.
@@ -177,14 +165,12 @@ def _features(name: str, extractor: nn.Module) -> dict[str, Any]:
 
 
 def _boxes(name: str, space: spaces.Space[Any]) -> dict[str, Any]:
-    """Describe a dictionary of spaces."""
     if not isinstance(space, spaces.Dict):
         raise refused(name, f"observations in {space}, not in a Dict")
     return {key: _box(name, key, box) for key, box in space.items()}
 
 
 def _box(name: str, what: str, space: spaces.Space[Any]) -> dict[str, Any]:
-    """Describe a space of arrays."""
     if not isinstance(space, spaces.Box) or not space.is_bounded() or space.dtype.kind != "f":
         raise refused(name, f"{what} in {space}, not in a bounded Box of floats")
     return {

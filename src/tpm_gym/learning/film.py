@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -27,7 +27,8 @@ def write_video(path: Path, env: GoalEnv, policy: Policy, episodes: int, first_s
         # H.264 wants an even width and height, and no more than that.
         writer: Any = imageio.get_writer(part, fps=fps, macro_block_size=2)
         with writer as video:
-            _show(env, policy, episodes, first_seed, video.append_data)
+            add: Any = video.append_data
+            run_episodes(env, policy, episodes, first_seed, on_frame=lambda: add(env.render()))
 
     write_whole(path, write)
 
@@ -39,17 +40,16 @@ def write_contact_sheet(path: Path, env: GoalEnv, policy: Policy, seed: int) -> 
     """
     import imageio.v3 as imageio
 
-    frames: list[Frame] = []
-    _show(env, policy, 1, seed, frames.append)
+    frames: list[Any] = []
+    run_episodes(env, policy, 1, seed, on_frame=lambda: frames.append(env.render()))
     sheet = contact_sheet(frames)
     write_whole(path, lambda part: imageio.imwrite(part, sheet))
 
 
 def contact_sheet(frames: Sequence[Frame]) -> Frame:
-    """Return evenly spaced frames, from the first until nothing moves any more, side by side.
+    """Return evenly spaced frames, from the first until nothing moves any more, as one picture.
 
-    Returns:
-        One picture of (2 * height, 3 * width, 3).
+    It has the shape (2 * height, 3 * width, 3).
     """
     moving = [i for i, frame in enumerate(frames) if _differs(frame, frames[-1])]
     last = min(moving[-1] + 1, len(frames) - 1) if moving else len(frames) - 1
@@ -62,14 +62,3 @@ def contact_sheet(frames: Sequence[Frame]) -> Frame:
 def _differs(frame: Frame, other: Frame) -> bool:
     """Whether two frames differ by more than a robot's last millimetres."""
     return bool((frame != other).any(axis=-1).mean() > 1e-2)
-
-
-def _show(
-    env: GoalEnv,
-    policy: Policy,
-    episodes: int,
-    first_seed: int,
-    receive: Callable[[Any], object],
-) -> None:
-    """Run episodes and hand over what the environment renders."""
-    run_episodes(env, policy, episodes, first_seed, on_frame=lambda: receive(env.render()))

@@ -26,7 +26,6 @@ class PenaltyHerReplayBuffer(HerReplayBuffer):
     is the reward the environment would have paid for g'. Only the task term R is evaluated, for the
     whole batch at once, and no info dictionary is stored. (``copy_info_dict=True`` would keep the
     penalty as well, at the price of a deep copy of every info of every batch.)
-
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -48,19 +47,7 @@ class PenaltyHerReplayBuffer(HerReplayBuffer):
         env_indices: NDArray[np.int64],
         env: VecNormalize | None = None,
     ) -> DictReplayBufferSamples:
-        """Relabel as the parent does, then put the goal-independent part of the reward back.
-
-        Args:
-            batch_indices: Row of each transition in the buffer, (n,).
-            env_indices: Environment of each transition, (n,).
-            env: The ``VecNormalize`` around the training environment, if there is one.
-
-        Returns:
-            The n transitions with new goals and their rewards.
-
-        Raises:
-            ConfigError: ``env`` normalises rewards.
-        """
+        """Relabel as the parent does, then put the goal-independent part of the reward back."""
         if env is not None and env.norm_reward:
             # The parent has normalised R(ag', g') by then; a sum with raw rewards has no meaning.
             raise ConfigError(

@@ -15,12 +15,7 @@ from tpm_gym.learning.run_folder import PROGRESS_FILE
 
 
 def make_logger(run: Path, resumed_at: int | None = None) -> Logger:
-    """Open the log of a run.
-
-    Args:
-        run: The run folder. A resumed run's progress.csv has been cut back already.
-        resumed_at: Step at which the run goes on; None where it begins.
-    """
+    """Open the log of a run, which may go on at a step; its progress.csv has been cut back then."""
     path = run / PROGRESS_FILE
     before = "" if resumed_at is None or not path.is_file() else path.read_text(encoding="utf-8")
     table = CSVOutputFormat(str(path))  # empties the file

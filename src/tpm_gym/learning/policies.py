@@ -8,7 +8,7 @@ which can run any code when they are loaded: that takes ``trust_pickle``.
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol, cast
 
@@ -52,22 +52,21 @@ class TrainedPolicy:
         return cast(Action, action)
 
 
+@dataclass
 class RandomPolicy:
     """Draws actions uniformly, from a generator seeded anew in every episode."""
 
-    def __init__(self, space: Any) -> None:
-        """Remember the space; the generator is seeded by ``reset``."""
-        self._space = space
-        self._rng = np.random.default_rng()
+    space: Any
+    rng: np.random.Generator = field(default_factory=np.random.default_rng)
 
     def reset(self, observation: Observation, seed: int) -> None:
         """Seed the generator with the seed of the episode."""
-        self._rng = np.random.default_rng(seed)
+        self.rng = np.random.default_rng(seed)
 
     def act(self, observation: Observation) -> Action:
         """Return an action that does not depend on ``observation``."""
-        drawn: Action = self._rng.uniform(self._space.low, self._space.high)
-        return drawn.astype(self._space.dtype)
+        drawn: Action = self.rng.uniform(self.space.low, self.space.high)
+        return drawn.astype(self.space.dtype)
 
 
 @dataclass(frozen=True)
@@ -138,17 +137,13 @@ def trained_env(spec: str) -> str | None:
         raise refused(spec, str(error)) from error
 
 
-def refused(spec: object, problem: str) -> PolicyError:
+def refused(spec: str, problem: str) -> PolicyError:
     """Return an error about a policy."""
-    return PolicyError(f"policy {str(spec)!r}: {problem}")
+    return PolicyError(f"policy {spec!r}: {problem}")
 
 
 def require_trust(spec: str, path: Path, trusted: bool) -> None:
-    """Refuse a .zip file that nobody has vouched for.
-
-    Raises:
-        PolicyError: It is not trusted.
-    """
+    """Refuse, with a PolicyError, a .zip file that nobody has vouched for."""
     if not trusted:
         raise refused(
             spec,
@@ -159,7 +154,6 @@ def require_trust(spec: str, path: Path, trusted: bool) -> None:
 
 
 def _policy_file(spec: str) -> Path:
-    """Return the file that ``spec`` names: one of an exported policy, or a .zip."""
     path = Path(spec)
     if path.is_dir():
         saved = [path / BEST_FILE, path / LAST_FILE]
@@ -210,11 +204,7 @@ def _use_one_thread() -> None:
 
 
 def load_model(spec: str, path: Path) -> BaseAlgorithm:
-    """Unpickle a saved algorithm for acting only; see ``require_trust``.
-
-    Raises:
-        PolicyError: It cannot be loaded.
-    """
+    """Unpickle a saved algorithm for acting only; see ``require_trust``."""
     config = run_config(spec, path)
     algorithm = config["algo"]
     if algorithm not in ALGORITHMS:
@@ -222,11 +212,8 @@ def load_model(spec: str, path: Path) -> BaseAlgorithm:
     _use_one_thread()
     # Acting stores nothing: no room is needed, nor a hindsight buffer, which would ask for an
     # environment.
-    replaced: dict[str, Any] = {
-        "replay_buffer_class": None,
-        "replay_buffer_kwargs": {},
-        "buffer_size": 1,
-    }
+    replaced: dict[str, Any]
+    replaced = {"replay_buffer_class": None, "replay_buffer_kwargs": {}, "buffer_size": 1}
     try:
         arguments = config["recipe"].get("arguments", {})
         if "features_extractor_class" in arguments.get("policy_kwargs", {}):

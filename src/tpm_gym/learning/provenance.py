@@ -8,7 +8,7 @@ import platform
 import shlex
 import subprocess
 import sys
-import tempfile
+import uuid
 from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
@@ -41,7 +41,6 @@ def versions() -> dict[str, str | None]:
 
 
 def _version(package: str) -> str | None:
-    """Return the version of an installed package, None where it is not installed."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
@@ -84,7 +83,6 @@ def machine() -> dict[str, Any]:
 
 
 def _processor() -> str:
-    """Return the processor's name."""
     try:
         # platform.processor() is empty or only the architecture on most Linux systems.
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
@@ -118,10 +116,7 @@ def _portable(word: str) -> str:
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write strictly valid JSON in one piece, making the folders above it.
-
-    Args:
-        path: The file; it is replaced, or left as it was where writing fails.
+    """Write strictly valid JSON as :func:`write_whole` does.
 
     Raises:
         ValueError: ``content`` holds NaN or an infinity, which JSON cannot express.
@@ -133,26 +128,12 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     """Write a file so that no reader ever sees half of it.
 
-    Args:
-        path: The file; folders above it are made.
-        write: Writes the content to the path it is given, which lies beside ``path`` and ends as
-            it does.
+    Folders above it are made. ``write`` is given a path beside ``path`` that ends as it does.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=path.suffix)
-    os.close(handle)
-    part = Path(name)
+    part = path.with_name(f".{uuid.uuid4().hex}{path.suffix}")
     try:
         write(part)
-        # mkstemp makes files private to the user; give it the mode any other new file would have.
-        part.chmod(0o666 & ~_umask())
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
-
-
-def _umask() -> int:
-    """Return the file mode creation mask of the process."""
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

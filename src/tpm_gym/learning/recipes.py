@@ -28,8 +28,6 @@ class Recipe:
 
     Attributes:
         n_timesteps: Number of environment steps, those of the demonstrations included.
-        n_envs: Number of parallel environments.
-        policy: Name of the policy class.
         hindsight: Whether the replay buffer relabels goals.
         demonstrations: Arguments of :class:`~tpm_gym.learning.Demonstrations`; empty for none.
         arguments: The other arguments of the algorithm's constructor.
@@ -68,11 +66,7 @@ def recipe(env_id: str, algorithm: str = "sac") -> dict[str, Any]:
 
 
 def recipe_file(algorithm: str) -> Path:
-    """Return the shipped recipes of an algorithm.
-
-    Raises:
-        ConfigError: There is no such algorithm.
-    """
+    """Return the shipped recipes of an algorithm, if there is such an algorithm."""
     if algorithm not in ALGORITHMS:
         raise ConfigError(f"algorithm {algorithm!r} is none of {NAMES}")
     return RECIPES / f"{algorithm}.yml"
@@ -137,7 +131,6 @@ def read_recipes(path: Path, algorithm: str) -> dict[str, dict[str, Any]]:
 
 
 def _read_mapping(path: Path) -> dict[str, Any]:
-    """Read a YAML file that holds a mapping."""
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:

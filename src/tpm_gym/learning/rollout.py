@@ -45,14 +45,11 @@ class Episode:
     """What one episode came to.
 
     Attributes:
-        seed: Seed the environment was reset with.
         success_at_end: Whether the last step was a success.
-        success_once: Whether any step was a success.
         total_reward: Undiscounted sum of rewards, the return.
         conditioning_min: Smallest 1/cond(J) of all steps, in [0, 1].
         conditioning_mean: Mean 1/cond(J) over the steps.
         closure_error_max: Largest loop gap of all steps, m.
-        length: Number of steps.
         unsafe_share: Share of the steps with a singularity penalty, so below the machine's
             safe conditioning.
         fk_error_max: Largest distance of the observed point P (forward kinematics of the encoders)
@@ -100,9 +97,6 @@ def run_episodes(
         on_frame: Called after every reset and every step, for example to record a video.
         on_episode: Called after every episode, for example to move a progress bar.
 
-    Returns:
-        One record per episode, in order.
-
     Raises:
         RolloutError: A reward, a conditioning, a closure error, a distance of forward kinematics
             from the truth or a torque is not finite.
@@ -118,7 +112,6 @@ def run_episodes(
 def _run_episode(
     env: GoalEnv, policy: Policy, seed: int, on_frame: Callable[[], object] | None
 ) -> Episode:
-    """Run one episode to its end."""
     observation, _ = env.reset(seed=seed)
     policy.reset(observation, seed)
     if on_frame is not None:
@@ -142,7 +135,6 @@ def _run_episode(
 def _record(
     seed: int, rewards: list[float], infos: Sequence[Mapping[str, Any]], states: Sequence[Any]
 ) -> Episode:
-    """Condense the steps of an episode."""
     conditioning = [float(info["conditioning"]) for info in infos]
     closure = [float(info["closure_error"]) for info in infos]
     successes = [bool(info["is_success"]) for info in infos]
@@ -178,7 +170,7 @@ def _record(
     )
 
 
-_WORST: Final = {
+WORST: Final = {
     "conditioning_min": min,
     "closure_error_max": max,
     "fk_error_max": max,
@@ -201,6 +193,6 @@ def summarise(records: Sequence[Episode]) -> dict[str, Estimate]:
     return {
         name: wilson(column)
         if name.startswith("success")
-        else bootstrap(column, worst=_WORST[name](column) if name in _WORST else None)
+        else bootstrap(column, worst=WORST[name](column) if name in WORST else None)
         for name, column in values.items()
     }

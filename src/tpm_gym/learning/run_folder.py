@@ -51,10 +51,7 @@ _DISK_ERRORS: Final = (
 
 
 def prepare(run: Path, overwrite: bool) -> None:
-    """Make the folder of a new run, without anything of an earlier one.
-
-    Args:
-        overwrite: Whether an earlier run in it is to be deleted; other files there stay.
+    """Make the folder of a new run; with ``overwrite``, delete an earlier run, but no other files.
 
     Raises:
         RunError: There is something in it, what is to be deleted is no run, another process trains

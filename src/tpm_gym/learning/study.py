@@ -23,10 +23,8 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
-import tyro
-
 from tpm_gym.learning.algorithms import ALGORITHMS
-from tpm_gym.learning.configuration import UNSET, unset
+from tpm_gym.learning.configuration import UNSET, check_least, shown_default, unset
 from tpm_gym.learning.environments import check_env_id
 from tpm_gym.learning.errors import ConfigError, LearningError
 from tpm_gym.learning.recipes import read_recipes, recipe_file
@@ -48,10 +46,6 @@ _stopping = threading.Event()
 _running: set[subprocess.Popen[bytes]] = set()
 
 
-def _shown(default: str, metavar: str) -> Any:
-    return tyro.conf.arg(help_behavior_hint=f"(default: {default})", metavar=metavar)
-
-
 @dataclass(frozen=True)
 class StudyConfig:
     """Run the trainings and tests of docs/results.md; what is done already is left out."""
@@ -59,14 +53,14 @@ class StudyConfig:
     plan: Literal["results", "penalty", "robustness"]
     """What to run; robustness needs the runs of results."""
 
-    envs: Annotated[tuple[str, ...], _shown("all for results, else three", "ID ...")] = ()
+    envs: Annotated[tuple[str, ...], shown_default("all for results, else three", "ID ...")] = ()
     """Environment ids."""
 
     steps: Annotated[int, unset(int, "as the recipes say", "INT")] = UNSET
     """Steps of each training. Runs of other lengths than their recipes' have folders of their own,
     which robustness, too, looks for."""
 
-    algos: Annotated[tuple[str, ...], _shown("all for results, else sac", "NAME ...")] = ()
+    algos: Annotated[tuple[str, ...], shown_default("all for results, else sac", "NAME ...")] = ()
     """Algorithms."""
 
     seeds: int = 5
@@ -90,10 +84,7 @@ class Run:
     """A training and its tests.
 
     Attributes:
-        folder: The run folder.
-        env: Environment id.
-        algo: Algorithm.
-        options: Options of the training besides those; None: the run is only tested.
+        options: Options of the training besides the others; None: the run is only tested.
         tests: Name of each test and options of its evaluation.
     """
 
@@ -110,10 +101,7 @@ def plan_runs(config: StudyConfig) -> list[Run]:
     Raises:
         ConfigError: No run is left of the plan, or a number cannot work.
     """
-    for name in ("steps", "seeds", "episodes", "jobs"):
-        value = getattr(config, name)
-        if value is not UNSET and value < 1:
-            raise ConfigError(f"--{name} {value}: must be at least 1")
+    check_least(config, 1, "steps", "seeds", "episodes", "jobs")
     usual = tuple(ALGORITHMS) if config.plan == "results" else ("sac",)
     runs = [
         run
@@ -128,14 +116,12 @@ def plan_runs(config: StudyConfig) -> list[Run]:
 
 
 def _ids(config: StudyConfig, algo: str) -> list[str]:
-    """Ids that the plan has for an algorithm."""
     usual = {"results": (), "penalty": _PENALTY_IDS, "robustness": _ROBUSTNESS_IDS}
     wanted = config.envs or usual[config.plan]
     return [env for env in read_recipes(recipe_file(algo), algo) if not wanted or env in wanted]
 
 
 def _runs_of(config: StudyConfig, env: str, algo: str, seed: int) -> list[Run]:
-    """The runs of one id, algorithm and seed."""
     name = f"{env}-{algo}"
     options = ["--seed", str(seed)]
     if config.steps is not UNSET:
@@ -195,11 +181,7 @@ def _is_tested(file: Path, episodes: int) -> bool:
 
 
 def execute(run: Run, episodes: int) -> bool:
-    """Run what is left of a run, with the output in a file beside its folder.
-
-    Returns:
-        Whether all went well.
-    """
+    """Run what is left, with the output in a file beside the run; return whether all went well."""
     log = run.folder.with_suffix(".log")
     log.parent.mkdir(parents=True, exist_ok=True)
     for command in commands(run, episodes):

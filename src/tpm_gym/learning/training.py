@@ -57,11 +57,7 @@ _CHANGEABLE = ("steps", "eval_every", "checkpoint_every", "threads", "device")
 
 
 def train(config: TrainingConfig, console: Console | None = None) -> signal.Signals | None:
-    """Train as configured and leave the run folder.
-
-    Args:
-        config: The configuration; what is not set in it is worked out.
-        console: Where progress is shown; by default the standard output.
+    """Train as configured and leave the run folder; progress is shown on ``console``.
 
     Returns:
         None when training went to its end; the signal that stopped it (Ctrl-C or SIGTERM), with a
@@ -87,13 +83,7 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
     """Go on with a run from its last whole checkpoint.
 
     One that was killed before its first checkpoint begins again; one that is finished stays as it
-    is, unless it is to take more steps.
-
-    Args:
-        console: Where progress is shown; by default the standard output.
-
-    Returns:
-        As for :func:`train`.
+    is, unless it is to take more steps. What is returned is as for :func:`train`.
 
     Raises:
         LearningError: There is no such run, no whole checkpoint to resume it from although there is
@@ -133,12 +123,10 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
 
 
 def _say(console: Console, text: str) -> None:
-    """Print a line as it is, however long."""
     console.print(text, markup=False, soft_wrap=True)
 
 
 def _description(config: TrainingConfig) -> dict[str, Any]:
-    """Return what config.json records."""
     return {
         **config.record(),
         "training_seeds": [config.seed, config.seed + config.envs - 1],
@@ -150,7 +138,6 @@ def _description(config: TrainingConfig) -> dict[str, Any]:
 def _description_resumed(
     config: TrainingConfig, stored: dict[str, Any], step: int
 ) -> dict[str, Any]:
-    """Return what config.json records of a resumed run: its beginning, and every resumption."""
     resumption = {"from_step": step, **provenance.origin()}
     return {
         **stored,
@@ -164,9 +151,7 @@ def _learn(
 ) -> signal.Signals | None:
     """Build everything, learn from the beginning or from a checkpoint, and save.
 
-    Returns:
-        The signal that stopped the training, None if it went to its end; one that came too late
-        to stop it does not count.
+    A signal that came too late to stop the training is not returned.
     """
     import torch
 

@@ -76,15 +76,12 @@ class EpisodeRecorder(gym.Wrapper[Observation, Action, Observation, Action]):
     def episode(self) -> dict[str, Any]:
         """Return the episode under way as plain data."""
         dtype = str(self._actions[0].dtype) if self._actions else ""
-        actions = [action.tolist() for action in self._actions]
-        return {"seed": self._seed, "rng": self._rng, "dtype": dtype, "actions": actions}
+        return {"seed": self._seed, "rng": self._rng, "dtype": dtype, "actions": self._actions}
 
     def replay(self, episode: Mapping[str, Any]) -> Observation | None:
-        """Repeat an episode that :meth:`episode` returned, up to where it was.
+        """Repeat an episode that :meth:`episode` returned; return its last observation.
 
-        Returns:
-            The last observation; None where the episode could not be repeated, as may happen with
-            another version of the physics.
+        None where it could not be repeated, as may happen with another version of the physics.
         """
         self.unwrapped.np_random.bit_generator.state = episode["rng"]
         try:
@@ -99,13 +96,9 @@ class EpisodeRecorder(gym.Wrapper[Observation, Action, Observation, Action]):
 def capture(
     model: BaseAlgorithm, run: Path, extra: Mapping[str, Any], finished: bool = False
 ) -> Content:
-    """Take down a training between two rollouts.
+    """Take down a training, in environments of :class:`EpisodeRecorder`, between two rollouts.
 
-    Args:
-        model: The algorithm; its environments are wrapped in :class:`EpisodeRecorder`.
-
-    Returns:
-        The content of a checkpoint. Its arrays are views of the replay buffer, the rest is copied.
+    The arrays are views of the replay buffer, the rest is copied.
     """
     envs, observations = model.env, model._last_obs
     assert envs is not None
@@ -120,7 +113,7 @@ def capture(
         "extra": dict(extra),
     }
     files = {
-        _STATE: json.dumps(state, default=lambda scalar: scalar.item()).encode(),
+        _STATE: json.dumps(state, default=lambda array: array.tolist()).encode(),
         _TENSORS: _tensors(model),
     }
     files |= {name: (run / name).read_bytes() for name in RESTORED if (run / name).is_file()}
@@ -150,7 +143,6 @@ def restore(model: BaseAlgorithm, content: Content) -> tuple[dict[str, Any], lis
 
     Args:
         model: An algorithm just built with the same arguments, with a logger.
-        content: What :func:`capture` returned.
 
     Returns:
         The plain data that was kept with it, and sentences about what keeps the continuation from
@@ -203,22 +195,17 @@ def _restore_tensors(model: BaseAlgorithm, data: bytes) -> dict[str, Any]:
 
 def _rng_state(model: BaseAlgorithm) -> dict[str, Any]:
     """Return the states of the generators outside PyTorch; environments have theirs."""
-    numpy_state: Any = np.random.get_state(legacy=False)  # noqa: NPY002  # what SB3 draws from
-    key = numpy_state["state"]["key"].tolist()
     return {
         "python": random.getstate(),
-        "numpy": {**numpy_state, "state": {**numpy_state["state"], "key": key}},
+        "numpy": np.random.get_state(legacy=False),  # noqa: NPY002  # what SB3 draws from
         "actions": model.action_space.np_random.bit_generator.state,
     }
 
 
 def _restore_rng(model: BaseAlgorithm, state: Mapping[str, Any], tensors: dict[str, Any]) -> None:
-    """Put the generators back."""
     version, internal, gauss = state["python"]
     random.setstate((version, tuple(internal), gauss))
-    key = np.array(state["numpy"]["state"]["key"], dtype=np.uint32)
-    inner = {**state["numpy"]["state"], "key": key}
-    np.random.set_state({**state["numpy"], "state": inner})  # noqa: NPY002
+    np.random.set_state(state["numpy"])  # noqa: NPY002
     model.action_space.np_random.bit_generator.state = state["actions"]
     torch.set_rng_state(tensors["rng"])
     if model.device.type == "cuda" and len(tensors["cuda_rng"]) == torch.cuda.device_count():
@@ -329,7 +316,6 @@ def _pending_log(model: BaseAlgorithm) -> dict[str, Any]:
 
 
 def _restore_log(model: BaseAlgorithm, state: Mapping[str, Any]) -> None:
-    """Put back what was recorded and not yet written."""
     logger = model.logger
     logger.name_to_value.update(state["values"])
     for name, dtype in state["types"].items():

@@ -18,11 +18,7 @@ from tpm_gym.learning.recipes import read_recipes, recipe_file, with_classes
 
 
 def hyperparameters(algorithm: str) -> dict[str, dict[str, Any]]:
-    """The recipes of one algorithm, by environment id, as rl-baselines3-zoo wants them.
-
-    Raises:
-        ConfigError: An entry of the file is not valid.
-    """
+    """The recipes of one algorithm, by environment id, as rl-baselines3-zoo wants them."""
     recipes = read_recipes(recipe_file(algorithm), algorithm)
     return {env_id: _translate(entries) for env_id, entries in recipes.items()}
 

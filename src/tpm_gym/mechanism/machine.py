@@ -150,23 +150,11 @@ class Machine(ABC):
 
     def conditioning_at(self, points: ArrayLike) -> FloatArray:
         """Conditioning 1/cond(J) at points (..., 3) m, as (...,); 0 where P cannot be."""
-        array = np.asarray(points, dtype=np.float64)
-        values = np.zeros(array.shape[:-1])
-        for index in np.ndindex(values.shape):
-            with suppress(UnreachableError, SingularityError):
-                x, y, z = array[index].tolist()
-                values[index] = self.evaluate(self.inverse((x, y, z))).conditioning
-        return values
+        return _each(lambda point: self.evaluate(self.inverse(point)).conditioning, points)
 
     def conditioning(self, theta: ArrayLike) -> FloatArray:
         """Conditioning 1/cond(J) at joint positions (..., 3); 0 where it cannot be assembled."""
-        array = np.asarray(theta, dtype=np.float64)
-        values = np.zeros(array.shape[:-1])
-        for index in np.ndindex(values.shape):
-            with suppress(UnreachableError, SingularityError):
-                a, b, c = array[index].tolist()
-                values[index] = self.evaluate((a, b, c)).conditioning
-        return values
+        return _each(lambda one: self.evaluate(one).conditioning, theta)
 
     def sample(self, rng: np.random.Generator, region: Region) -> FloatArray:
         """Draw a point (3,) m, uniform over the part of ``region`` that is safe.
@@ -220,6 +208,17 @@ class Machine(ABC):
                 centre = self.mount.to_world(origin + np.asarray(solid.centre))
                 boxes.append((centre - solid.half_extent, centre + solid.half_extent))
         return boxes
+
+
+def _each(function: Callable[[Vector], float], vectors: ArrayLike) -> FloatArray:
+    """A function of vectors (..., 3), one by one, as (...,); 0 where there is no solution."""
+    array = np.asarray(vectors, dtype=np.float64)
+    values = np.zeros(array.shape[:-1])
+    for index in np.ndindex(values.shape):
+        with suppress(UnreachableError, SingularityError):
+            a, b, c = array[index].tolist()
+            values[index] = function((a, b, c))
+    return values
 
 
 _MACHINES: dict[str, Machine | Callable[[], Machine]] = {}

@@ -72,11 +72,9 @@ class Engine(Protocol):
 
     Attributes:
         substeps: Time steps in a control period.
-        control_period: s.
     """
 
     substeps: int
-    control_period: float
 
     def load(self, machine: Machine, scene: Scene) -> None:
         """Hold this machine and scene, and nothing else; loops closed, nothing altered."""

@@ -6,7 +6,7 @@ closed and modes kept, and the :class:`~tpm_gym.simulation.state.State` that tel
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -26,7 +26,7 @@ from tpm_gym.mechanism.machine import Machine, Mode, Reading
 from tpm_gym.mechanism.tpm import PAPER_TPM
 from tpm_gym.simulation.engine import Engine, Pose, make_engine
 from tpm_gym.simulation.randomisation import NOMINAL, Plant
-from tpm_gym.simulation.state import Scene, State
+from tpm_gym.simulation.state import CONTROL_PERIOD, Scene, State
 
 __all__ = ["Simulation", "Snapshot"]
 
@@ -196,10 +196,14 @@ class Simulation:
         new = vector("command", command)
         inverse, bias = self.machine.inverse, self.plant.encoder_bias
         inverse(new)  # the spline may end before the command does
-        references = [inverse(_blend(weights, before, last, new)) for weights in self._spline]
+        (a, b, c), (d, e, f), (x, y, z) = before, last, new
+        references = [
+            inverse((u * a + v * d + w * x, u * b + v * e + w * y, u * c + v * f + w * z))
+            for u, v, w in self._spline
+        ]
         if bias != _ZERO:
             b1, b2, b3 = bias
-            references = [(a - b1, b - b2, c - b3) for a, b, c in references]
+            references = [(one - b1, two - b2, three - b3) for one, two, three in references]
         self._commands = (last, new)
         self.engine.advance(references, vacuum)
         self._noise = (self._noise[1], noise)
@@ -259,10 +263,9 @@ class Simulation:
         bias, (before, now) = self.plant.encoder_bias, self._noise
         if bias == before == now == _ZERO:
             return theta, rates
-        period = self.engine.control_period
         return (
             vector("theta", np.array(theta) + bias + now),
-            vector("theta_dot", rates + np.subtract(now, before) / period),
+            vector("theta_dot", rates + np.subtract(now, before) / CONTROL_PERIOD),
         )
 
     def _evaluate(self, theta: Vector) -> Reading:
@@ -318,13 +321,3 @@ def spline_weights(substeps: int) -> FloatArray:
     """(substeps, 3) weights of the last three commands along the quadratic B-spline."""
     s = np.arange(1, substeps + 1) / substeps
     return np.stack([(1 - s) ** 2, 1 + 2 * s - 2 * s**2, s**2], axis=1) / 2
-
-
-def _blend(weights: Sequence[float], a: Vector, b: Vector, c: Vector) -> Vector:
-    """A point of the spline through three commands."""
-    u, v, w = weights
-    return (
-        u * a[0] + v * b[0] + w * c[0],
-        u * a[1] + v * b[1] + w * c[1],
-        u * a[2] + v * b[2] + w * c[2],
-    )

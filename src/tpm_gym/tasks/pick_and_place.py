@@ -10,7 +10,7 @@ from tpm_gym.arrays import FloatArray
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.simulation.state import Block, Scene, State
 from tpm_gym.tasks import rewards, sampling
-from tpm_gym.tasks.expert import Expert, Move
+from tpm_gym.tasks.motion import Motion, Move, hanging
 from tpm_gym.tasks.task import Entry, Task
 
 __all__ = ["PickAndPlace"]
@@ -35,7 +35,7 @@ class PickAndPlace(Task):
         self, rng: np.random.Generator, chosen: Mapping[str, FloatArray]
     ) -> dict[str, FloatArray]:
         """See the base class."""
-        machine, offset = self.machine, self.hanging(self.puck)
+        machine, offset = self.machine, hanging(self.puck)
         to_p, from_p = machine.mount.to_paper, machine.mount.to_world
         table = self.on_table(self.puck)
         if self.goals == "tempting":
@@ -75,35 +75,35 @@ class PickAndPlace(Task):
 
     # -- the expert -------------------------------------------------------------------------------
 
-    def plan(self, expert: Expert) -> Iterator[Move]:
+    def plan(self, motion: Motion) -> Iterator[Move]:
         """Come down on the puck, carry it, let go on the table or hold it in the air."""
-        to_paper = expert.machine.mount.to_paper
+        to_paper = motion.machine.mount.to_paper
         up = np.array([0.0, 0.0, -CLEARANCE])  # paper z points down
         while True:
-            yield from expert.pick(self.puck, CLEARANCE)
-            if not expert.holding():
+            yield from motion.pick(self.puck, CLEARANCE)
+            if not motion.holding():
                 continue
             # Where the cup sits on the puck is where it took it, not the puck's middle.
-            grip = expert.seen["position"] - expert.seen["object_position"]
-            place = to_paper(expert.goal + grip)
-            on_table = bool(expert.goal[2] < self.puck.height / 2 + 0.005)
-            stops = [expert.command + up, place + up, place] if on_table else [place]
+            grip = motion.seen["position"] - motion.seen["object_position"]
+            place = to_paper(motion.goal + grip)
+            on_table = bool(motion.goal[2] < self.puck.height / 2 + 0.005)
+            stops = [motion.command + up, place + up, place] if on_table else [place]
             if not on_table:
                 # Off the table first, then straight on.
-                stops.insert(0, expert.command + up / 2)
-            yield from expert.go(stops, vacuum=True, while_holding=self.puck.name)
-            if expert.holding():
+                stops.insert(0, motion.command + up / 2)
+            yield from motion.go(stops, vacuum=True, while_holding=self.puck.name)
+            if motion.holding():
                 break
-        yield from self._finish(expert, place, place + up, release=on_table)
+        yield from self._finish(motion, place, place + up, release=on_table)
 
     def _finish(
-        self, expert: Expert, place: FloatArray, above: FloatArray, release: bool
+        self, motion: Motion, place: FloatArray, above: FloatArray, release: bool
     ) -> Iterator[Move]:
         """Let go and move away, or hold the puck in the air."""
         for _ in range(2):  # the platform lags its command
             yield Move(place, True)
         if release:
             yield Move(place, False)
-            yield from expert.go([above], vacuum=False)
+            yield from motion.go([above], vacuum=False)
             place = above
         yield Move(place, not release)

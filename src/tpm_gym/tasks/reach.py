@@ -9,7 +9,7 @@ import numpy as np
 from tpm_gym.arrays import FloatArray
 from tpm_gym.simulation.state import State
 from tpm_gym.tasks import sampling
-from tpm_gym.tasks.expert import Expert, Move
+from tpm_gym.tasks.motion import Motion, Move
 from tpm_gym.tasks.task import Task
 
 __all__ = ["Reach"]
@@ -40,8 +40,8 @@ class Reach(Task):
         """Point P by forward kinematics of the encoders."""
         return state.fk_position
 
-    def plan(self, expert: Expert) -> Iterator[Move]:
+    def plan(self, motion: Motion) -> Iterator[Move]:
         """Straight to the goal."""
-        goal = expert.machine.mount.to_paper(expert.goal)
-        yield from expert.go([goal], vacuum=False)
+        goal = motion.machine.mount.to_paper(motion.goal)
+        yield from motion.go([goal], vacuum=False)
         yield Move(goal, False)

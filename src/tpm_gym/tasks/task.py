@@ -13,7 +13,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import cycle
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,9 +25,7 @@ from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.state import CONTROL_PERIOD, Block, Scene, State
 from tpm_gym.tasks import rewards
-
-if TYPE_CHECKING:
-    from tpm_gym.tasks.expert import Expert, Move
+from tpm_gym.tasks.motion import Motion, Move, hanging
 
 __all__ = ["Entry", "Task"]
 
@@ -106,7 +104,7 @@ class Task(ABC):
         if shown != self.scene.markers:
             raise ConfigurationError("markers", self.scene.markers, f"{shown}, as a goal shows")
         self.machine, self.reward, self.goals = machine, reward, goals
-        self._within = [self._place_of(block) for block in self.scene.objects]
+        self._within = self._not_lost()
         self._set_entries()
 
     def _set_entries(self) -> None:
@@ -144,8 +142,8 @@ class Task(ABC):
     def achieved(self, state: State) -> FloatArray:
         """What is compared with the goal, (..., goal_size) m."""
 
-    def plan(self, expert: Expert) -> Iterator[Move]:
-        """The moves of the scripted controller, from what ``expert`` sees; the last one is kept.
+    def plan(self, motion: Motion) -> Iterator[Move]:
+        """The moves of the scripted controller, from what it sees; the last one is kept.
 
         Raises:
             ConfigurationError: If the task has none.
@@ -212,8 +210,8 @@ class Task(ABC):
         """
         objects = self.scene.objects
         known: dict[str, tuple[int, tuple[Block | None, ...]]] = {
-            "goal": (self.goal_size, objects or (None,)),
             **{block.name: (3, (block,)) for block in objects},
+            "goal": (self.goal_size, objects or (None,)),
         }
         valid = f"a dictionary with keys among {', '.join(map(repr, known))}"
         if not isinstance(options, Mapping) and options is not None:
@@ -246,7 +244,7 @@ class Task(ABC):
         corners = np.stack([mount.to_world(corner) for corner in (region.low, region.high)])
         low, high = corners.min(axis=0), corners.max(axis=0)
         if block is not None:
-            offset = self.hanging(block)
+            offset = hanging(block)
             low, high = low - offset, high - offset
             low[2] = max(low[2], block.height / 2)  # on the table
         return low, high
@@ -260,14 +258,10 @@ class Task(ABC):
             raise ConfigurationError("scene", block.name, valid)
         return low, high
 
-    def hanging(self, block: Block) -> FloatArray:
-        """From the centre of a block in the cup to point P, (3,) m."""
-        return np.array([0.0, 0.0, block.height / 2 + CUP.length])
-
     def on_table(self, block: Block) -> Region:
         """Goals for point P, machine's frame, with a block in the cup that stands on the table."""
         low, high = self.machine.goal_region.low, self.machine.goal_region.high
-        touching = self.hanging(block) + (0.0, 0.0, block.height / 2)
+        touching = hanging(block) + (0.0, 0.0, block.height / 2)
         level = float(self.machine.mount.to_paper(touching)[2])
         return Region((*low[:2], level), (*high[:2], level))
 
@@ -369,16 +363,21 @@ class Task(ABC):
         """The points (k, 3) m that show a goal (goal_size,)."""
         return goal.reshape(-1, 3)
 
+    def _not_lost(self) -> tuple[FloatArray, FloatArray]:
+        """Between what corners (n, 3) m the objects are not lost."""
+        low, high = np.empty((2, len(self.scene.objects), 3))
+        for index, block in enumerate(self.scene.objects):
+            least, most = self._place_of(block)
+            slack = block.width / 2  # the cup may take it off its middle
+            low[index, :2], high[index, :2] = least[:2] - slack, most[:2] + slack
+        low[:, 2], high[:, 2] = 0.0, np.inf
+        return low, high
+
     def lost(self, state: State) -> BoolArray:
         """Whether an object is off the table or where the robot cannot get to, (...,)."""
-        lost: BoolArray = np.zeros(np.shape(state.held), dtype=np.bool_)
-        for index, block in enumerate(self.scene.objects):
-            low, high = self._within[index]
-            slack = block.width / 2  # the cup may take it off its middle
-            place = state.object_position[..., index, :]
-            level = place[..., :2]
-            beyond = ((level < low[:2] - slack) | (level > high[:2] + slack)).any(axis=-1)
-            lost |= beyond | (place[..., 2] < 0)
+        low, high = self._within
+        beyond = (state.object_position < low) | (state.object_position > high)
+        lost: BoolArray = np.logical_or.reduce(beyond, axis=(-2, -1))
         return lost
 
 

@@ -1,15 +1,14 @@
-"""The figures of docs/results.md, in the style of the other figures in docs/."""
+"""The learning curve of a run, and the figures of docs/results.md."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
@@ -42,11 +41,7 @@ _COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
 
 
 def draw(records: Sequence[Record], folder: Path) -> list[Path]:
-    """Draw what there are records for.
-
-    Returns:
-        The figures.
-    """
+    """Draw what there are records for; return the files."""
     plain = [r for r in records if r["goals"] == "sampled" and r["penalty_weight"] == 1.0]
     tempted = [r for r in records if r["goals"] == "tempting" and TEMPTING in r["tests"]]
     written = []
@@ -63,13 +58,22 @@ def _save(figure: Figure, path: Path) -> Path:
     return path
 
 
+def _figure(height: float, title: str) -> Figure:
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    figure.suptitle(title, weight="bold")
+    return figure
+
+
+def _count_steps(axes: Axes) -> None:
+    axes.set_xlabel("environment steps")
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+
+
 def _panels(count: int, title: str, height: float) -> tuple[Figure, list[Axes]]:
     """A figure with some panels, row by row."""
     columns = min(_COLUMNS, count)
     rows = -(-count // columns)
-    figure = Figure(figsize=(WIDTH, height * rows + 0.5), layout="constrained")
-    FigureCanvasAgg(figure)
-    figure.suptitle(title, weight="bold")
+    figure = _figure(height * rows + 0.5, title)
     panels = figure.subplots(rows, columns, squeeze=False).ravel().tolist()
     for unused in panels[count:]:
         unused.set_visible(False)
@@ -88,8 +92,7 @@ def learning_curves(records: Sequence[Record]) -> Figure:
         axes.axhline(LEARNED, color=OUTLINE, linewidth=0.6, linestyle=(0, (3, 2)))
         axes.set_title(env_id)
         axes.set_xlim(left=0)  # a curve that starts later does so because of demonstrations
-        axes.set_xlabel("environment steps")
-        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        _count_steps(axes)
         axes.set_ylim(-0.03, 1.03)
         axes.yaxis.set_major_formatter(PercentFormatter(xmax=1))
     panels[0].set_ylabel("successful episodes")
@@ -166,3 +169,58 @@ def _weights(records: Sequence[Record]) -> list[str]:
     telling = [part for part in parts if len(set(part)) > 1]
     weights = [f"{record['penalty_weight']:g}" for record in records]
     return ["\n".join(labels) for labels in zip(weights, *telling, strict=True)]
+
+
+# -- of one run -------------------------------------------------------------------------------
+
+
+def draw_learning_curve(path: Path, title: str, evaluations: Sequence[Mapping[str, Any]]) -> None:
+    """Draw the periodic evaluations of a run."""
+    with style():
+        figure = _figure(4.8, title)
+        upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[3, 2])
+        _draw_success(upper, evaluations)
+        _draw_interval(lower, evaluations, "return", "95% interval (bootstrap)", "mean")
+        lower.set_ylabel("return per episode")
+        for axes in (upper, lower):
+            axes.grid(linewidth=0.4)
+            # To the right, where it covers no data.
+            axes.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
+        figure.align_ylabels([upper, lower])
+        _count_steps(lower)
+        _save(figure, path)
+
+
+def _draw_success(axes: Axes, evaluations: Sequence[Mapping[str, Any]]) -> None:
+    """Draw the success rates with the Wilson band of the one that counts."""
+    steps = [evaluation["steps"] for evaluation in evaluations]
+    once = [evaluation["success_once"]["mean"] for evaluation in evaluations]
+    axes.plot(steps, once, color=GREEN, linewidth=1.2, linestyle=(0, (4, 2)), label="success once")
+    _draw_interval(axes, evaluations, "success_at_end", "95% interval (Wilson)", "success at end")
+    means = [evaluation["success_at_end"]["mean"] for evaluation in evaluations]
+    best = max(range(len(means)), key=lambda i: (means[i], evaluations[i]["return"]["mean"]))
+    label = f"best.zip ({means[best]:.0%})"
+    axes.plot(
+        *(steps[best], means[best], "*"),
+        color=ORANGE,
+        markersize=12,
+        markeredgecolor="white",
+        zorder=3,
+        clip_on=False,
+        label=label,
+    )
+    axes.set_ylim(-0.02, 1.04)
+    axes.yaxis.set_major_formatter(PercentFormatter(xmax=1))
+    axes.set_ylabel("successful episodes")
+    axes.set_title(f"{evaluations[-1]['episodes']} episodes an evaluation, never trained on")
+
+
+def _draw_interval(
+    axes: Axes, evaluations: Sequence[Mapping[str, Any]], name: str, interval: str, mean: str
+) -> None:
+    steps = [evaluation["steps"] for evaluation in evaluations]
+    low, means, high = (
+        [evaluation[name][part] for evaluation in evaluations] for part in ("low", "mean", "high")
+    )
+    axes.fill_between(steps, low, high, color=BLUE, alpha=0.16, linewidth=0, label=interval)
+    axes.plot(steps, means, color=BLUE, linewidth=1.6, marker="o", markersize=3, label=mean)

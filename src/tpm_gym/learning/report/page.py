@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Sequence
-from statistics import median
+from collections.abc import Iterable, Sequence
+from statistics import fmean, median
 from typing import Any, Final
 
 from tpm_gym.learning.estimates import (
@@ -15,6 +15,7 @@ from tpm_gym.learning.estimates import (
     median_time,
     settled,
 )
+from tpm_gym.learning.rollout import WORST
 from tpm_gym.mechanism import PAPER_TPM
 
 Record = dict[str, Any]
@@ -136,7 +137,7 @@ def _training_row(group: Group) -> str:
         f"{median(success(record, NOMINAL) for record in group):.1%}",
         _or_never(median_time([steps for steps, _ in times]), "{:,.0f}"),
         _or_never(median_time([minutes for _, minutes in times]), "{:.1f}"),
-        _worst(group, NOMINAL, "conditioning_min", min, "{:.3f}"),
+        _worst(group, NOMINAL, "conditioning_min", "{:.3f}"),
         _mean(group, NOMINAL, "unsafe_share", "{:.1%}"),
     ]
     return " | ".join(cells)
@@ -153,15 +154,14 @@ def _run_row(record: Record) -> str:
         _or_never(steps, "{:,.0f}"),
         _or_never(minutes, "{:.1f}"),
         f"{walls[-1] / 60:.1f}" if walls else NONE,
-        _worst([record], NOMINAL, "conditioning_min", min, "{:.3f}"),
+        _worst([record], NOMINAL, "conditioning_min", "{:.3f}"),
         _mean([record], NOMINAL, "unsafe_share", "{:.1%}"),
-        _worst([record], NOMINAL, "fk_error_max", max, "{:.3f} mm", 1e3),
+        _worst([record], NOMINAL, "fk_error_max", "{:.3f} mm", 1e3),
     ]
     return " | ".join(cells)
 
 
 def _failures(records: Group, test: str) -> list[str]:
-    """Name every run that did not do what it should."""
     lines = []
     for record in sorted(records, key=_order):
         name = f"{record['env']}, {method(record)}, seed {record['seed']}"
@@ -196,10 +196,10 @@ def _penalty(records: Group, figures: Sequence[str]) -> list[str]:
             str(len(group)),
             _iqm([success(record, TEMPTING) for record in group]),
             _mean(group, TEMPTING, "unsafe_share", "{:.1%}", spread=True),
-            _worst(group, TEMPTING, "conditioning_min", min, "{:.3f}"),
-            _worst(group, TEMPTING, "fk_error_max", max, "{:.3f} mm", 1e3),
+            _worst(group, TEMPTING, "conditioning_min", "{:.3f}"),
+            _worst(group, TEMPTING, "fk_error_max", "{:.3f} mm", 1e3),
             _mean(group, TEMPTING, "torque_rms", "{:.1f} N m"),
-            _worst(group, TEMPTING, "torque_peak", max, "{:.0f} N m"),
+            _worst(group, TEMPTING, "torque_peak", "{:.0f} N m"),
         ]
         rows.append(" | ".join(cells))
     text = (
@@ -216,27 +216,22 @@ def _penalty(records: Group, figures: Sequence[str]) -> list[str]:
 
 def _compared(records: Group) -> list[str]:
     """One line an id, method and its steps: time below safe without the penalty and with it."""
+    shares: dict[tuple[str, str, int], dict[float, list[float]]] = {}
+    for record in records:
+        by_weight = shares.setdefault((record["env"], method(record), record["steps"]), {})
+        values = by_weight.setdefault(record["penalty_weight"], [])
+        values += _values([record], TEMPTING, "unsafe_share", "mean")
     lines = []
-    for kind in sorted({_kind(record) for record in records}):
-        alike = [record for record in records if _kind(record) == kind]
-        shares = [
-            _values([r for r in alike if r["penalty_weight"] == weight],
-                    TEMPTING, "unsafe_share", "mean")
-            for weight in (0.0, 1.0)
-        ]  # fmt: skip
-        if not all(shares):
+    for (env, name, steps), by_weight in sorted(shares.items()):
+        if not (by_weight.get(0.0) and by_weight.get(1.0)):
             continue
-        without, with_it = (sum(values) / len(values) for values in shares)
+        without, with_it = (fmean(by_weight[weight]) for weight in (0.0, 1.0))
         times = f"{without / with_it:,.0f} times less" if with_it > 0 else "never below"
-        name = f"{kind[0]}, {kind[1]}, {kind[2]:,} steps"
         lines.append(
-            f"- {name}: {without:.2%} without the penalty, {with_it:.3%} with it: {times}."
+            f"- {env}, {name}, {steps:,} steps: {without:.2%} without the penalty, {with_it:.3%} "
+            f"with it: {times}."
         )
     return ["Time below safe, mean over seeds:\n", "\n".join(lines) + "\n"] if lines else []
-
-
-def _kind(record: Record) -> tuple[str, str, int]:
-    return record["env"], method(record), record["steps"]
 
 
 def _robustness(records: Group) -> list[str]:
@@ -270,12 +265,10 @@ def _episodes(records: Group, names: Sequence[str]) -> str:
 
 
 def _of(group: Group) -> set[str]:
-    """Names of the tests that a run of a group has."""
     return {name for record in group for name in record["tests"]}
 
 
 def _how(records: Sequence[Record]) -> list[str]:
-    """Machines, versions and commands."""
     commits: dict[str, set[str]] = {}
     for record in records:
         used = [record, *record["tests"].values()]
@@ -339,21 +332,13 @@ def _or_never(value: float | None, form: str) -> str:
 
 
 def _values(group: Group, test: str, metric: str, key: str) -> list[float]:
-    """A metric of all runs of a group that have it."""
     found = [record["tests"].get(test, {}).get(metric, {}).get(key) for record in group]
     return [float(value) for value in found if value is not None]
 
 
-def _worst(
-    group: Group,
-    test: str,
-    metric: str,
-    pick: Callable[[list[float]], float],
-    form: str,
-    factor: float = 1.0,
-) -> str:
+def _worst(group: Group, test: str, metric: str, form: str, factor: float = 1.0) -> str:
     values = _values(group, test, metric, "worst")
-    return form.format(pick(values) * factor) if values else NONE
+    return form.format(WORST[metric](values) * factor) if values else NONE
 
 
 def _mean(group: Group, test: str, metric: str, form: str, spread: bool = False) -> str:

@@ -8,7 +8,6 @@ can do it. Runs that did not finish are kept.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -98,7 +97,11 @@ def condense(run: Path) -> Record:
         if found and all(name in evaluation for evaluation in found):
             curves[name] = [round(evaluation[name]["mean"], 6) for evaluation in found]
     files = sorted(run.glob(f"{TESTS}/{WHOLE}"))
-    tests = {path.stem: _condense_test(_read(path)) for path in files}
+    # Without the episodes, and what the run says already
+    tests = {
+        path.stem: {name: value for name, value in _read(path).items() if name not in _NOT_KEPT}
+        for path in files
+    }
     return {
         "run": run.name,
         **{name: config.get(name) for name in _KEPT},
@@ -112,13 +115,7 @@ def condense(run: Path) -> Record:
     }
 
 
-def _condense_test(content: Mapping[str, Any]) -> Record:
-    """Leave out the episodes, and what the run says already."""
-    return {name: value for name, value in content.items() if name not in _NOT_KEPT}
-
-
 def _read(path: Path) -> Record:
-    """Read a JSON file that holds a mapping."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

@@ -49,7 +49,7 @@ class BulletEngine:
     ) -> None:
         """Connect."""
         self.physics = settings_of(Physics, "physics", physics)
-        self.substeps, self.control_period = self.physics.substeps, self.physics.control_period
+        self.substeps = self.physics.substeps
         self._gui, self._renderer = gui, renderer
         self.client = Client(self.physics, gui, renderer)
         self._loaded = False

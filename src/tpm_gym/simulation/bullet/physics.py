@@ -23,12 +23,11 @@ class Physics:
     """Numerical settings of the engine.
 
     Attributes:
-        time_step: s.
+        time_step: s; a whole fraction of the control period.
         solver: ``"direct"`` solves the constraints of a step exactly (Dantzig's pivoting);
             ``"iterative"`` is Bullet's default, sequential impulses.
         iterations: Of the iterative solver, a step; with 25 the mechanism is lost now and then.
         erp: Share of a constraint's error that is taken out in one step, in (0, 1].
-        control_period: s between two commands; a whole number of time steps.
 
     Raises:
         ConfigurationError: If a value is out of range.
@@ -38,31 +37,26 @@ class Physics:
     solver: str = "direct"
     iterations: int = 50
     erp: float = 1.0
-    control_period: float = CONTROL_PERIOD
 
     def __post_init__(self) -> None:
         """Reject settings that cannot work."""
-        for name in ("time_step", "control_period", "erp"):
+        for name in ("time_step", "erp"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
                 raise ConfigurationError(name, value, "a finite number")
-        if self.solver not in SOLVERS:
-            raise ConfigurationError("solver", self.solver, " or ".join(map(repr, SOLVERS)))
-        if isinstance(self.iterations, bool) or not isinstance(self.iterations, Integral):
-            raise ConfigurationError("iterations", self.iterations, "a whole number, 1 or more")
-        if not 0 < self.time_step <= self.control_period:
-            valid = f"0 < time_step <= control_period = {self.control_period}"
-            raise ConfigurationError("time_step", self.time_step, valid)
-        ratio = self.control_period / self.time_step
-        if abs(ratio - round(ratio)) > 1e-6:
-            valid = f"a whole fraction of control_period = {self.control_period}"
-            raise ConfigurationError("time_step", self.time_step, valid)
-        if self.iterations < 1:
-            raise ConfigurationError("iterations", self.iterations, "1 or more")
-        if not 0 < self.erp <= 1:
-            raise ConfigurationError("erp", self.erp, "0 < erp <= 1")
+        whole = isinstance(self.iterations, Integral) and not isinstance(self.iterations, bool)
+        steps = CONTROL_PERIOD / self.time_step if self.time_step > 0 else 0.0
+        for name, fits, valid in (
+            ("time_step", round(steps) >= 1 and abs(steps - round(steps)) < 1e-6,
+             f"a whole fraction of the control period, {CONTROL_PERIOD} s"),
+            ("solver", self.solver in SOLVERS, " or ".join(map(repr, SOLVERS))),
+            ("iterations", whole and self.iterations >= 1, "a whole number, 1 or more"),
+            ("erp", 0 < self.erp <= 1, "0 < erp <= 1"),
+        ):  # fmt: skip
+            if not fits:
+                raise ConfigurationError(name, getattr(self, name), valid)
 
     @property
     def substeps(self) -> int:
         """Time steps in a control period."""
-        return round(self.control_period / self.time_step)
+        return round(CONTROL_PERIOD / self.time_step)

@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+import pybullet
 from numpy.typing import NDArray
 
 from tpm_gym.arrays import Quaternion, Vector, rotate, transform
@@ -179,10 +180,12 @@ class Robot:
 
     def drive(self, theta: Vector) -> None:
         """Let the motors go to ``theta`` rad within the next time step, effort permitting."""
-        turn, mode = self._client.setJointMotorControl2, self._client.POSITION_CONTROL
+        # Target angle and rate, largest torque, gains, rate limit (none), client; as keywords they
+        # cost half as much again.
+        turn, mode = pybullet.setJointMotorControl2, pybullet.POSITION_CONTROL
+        number = self._client.number
         for (body, joint), angle, effort in zip(self._motors, theta, self._effort, strict=True):
-            # Target angle and rate, largest torque, gain; as keywords they cost half as much again.
-            turn(body, joint, mode, angle, 0.0, effort, MOTOR_GAIN)
+            turn(body, joint, mode, angle, 0.0, effort, MOTOR_GAIN, 1.0, -1.0, number)
 
     def motors(self) -> Motors:
         """True angles (rad), rates (rad/s) and last torques (N m) of the motors."""

@@ -1,0 +1,106 @@
+"""What the plans of tasks are made of: what is seen, and ways for point P."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tpm_gym.arrays import FloatArray
+from tpm_gym.mechanism.cup import CUP
+from tpm_gym.mechanism.machine import Machine
+from tpm_gym.simulation.state import Block
+from tpm_gym.tasks.control import Control
+
+__all__ = ["Motion", "Move", "hanging"]
+
+RAMP = 3
+"""Control steps from rest to full speed."""
+SEAL_STEPS = 4
+"""Control steps for which to wait for the cup to seal before giving up."""
+
+
+def hanging(block: Block) -> FloatArray:
+    """From the centre of a block in the cup to point P, (3,) m."""
+    return np.array([0.0, 0.0, block.height / 2 + CUP.length])
+
+
+class Move(NamedTuple):
+    """A command for point P (3,) m, in the machine's frame, and whether the vacuum is on."""
+
+    point: FloatArray
+    vacuum: bool
+
+
+class Motion:
+    """What a plan sees, and the ways it can take, with trapezoidal speed.
+
+    Attributes:
+        machine: The machine that moves.
+        seen: The observation in SI units, by entry, world frame.
+        goal: The goal, m, world frame.
+    """
+
+    def __init__(self, machine: Machine, control: Control) -> None:
+        """Start with nothing seen."""
+        self.machine, self._control = machine, control
+        self.seen: dict[str, FloatArray] = {}
+        self.goal: FloatArray = np.empty(0)
+        self._under_way: list[NDArray[Any]] = []  # actions that come late
+
+    @property
+    def command(self) -> FloatArray:
+        """Where P is commanded to be once the actions under way have arrived, machine's frame."""
+        command = self.machine.mount.to_paper(self.seen["position"] + self.seen["command"])
+        for action in self._under_way:
+            command = self._control.command(action, command)
+        return command
+
+    def holding(self, name: str = "object") -> bool:
+        """Whether the cup holds the object of that name."""
+        return bool(self.seen[f"{name}_held"][0] > 0.5)
+
+    def go(
+        self, stops: list[FloatArray], vacuum: bool, while_holding: str | None = None
+    ) -> Iterator[Move]:
+        """Straight lines through ``stops`` (machine's frame), from rest to rest.
+
+        Args:
+            stops: Points (3,) m.
+            vacuum: Whether the vacuum is on.
+            while_holding: Name of an object; where the cup loses it the way ends early.
+        """
+        for stop in stops:
+            start = self.command
+            for fraction in self._trapezoid(start, stop):
+                if while_holding is not None and not self.holding(while_holding):
+                    return
+                yield Move(start + fraction * (stop - start), vacuum)
+
+    def pick(self, block: Block, clearance: float) -> Iterator[Move]:
+        """Come down on a block from ``clearance`` (m) above it, and wait for the seal."""
+        yield from self.go([self._above(block, clearance)], vacuum=False)
+        yield from self.go([self._above(block)], vacuum=True)
+        for _ in range(SEAL_STEPS):
+            if self.holding(block.name):
+                return
+            yield Move(self._above(block), True)
+
+    def _above(self, block: Block, clearance: float = 0.0) -> FloatArray:
+        """Point P, machine's frame, with the lip over the top of a block where it stands now."""
+        place = self.seen[f"{block.name}_position"] + hanging(block)
+        return self.machine.mount.to_paper(place + (0.0, 0.0, clearance))
+
+    def _trapezoid(self, start: FloatArray, stop: FloatArray) -> FloatArray:
+        """Fractions of the way at the control steps from ``start`` to ``stop``.
+
+        Speed rises over RAMP steps, holds, and falls; no axis exceeds the machine's step limit.
+        """
+        steps = float((np.abs(stop - start) / self.machine.step_limit).max())
+        count = int(np.ceil(steps)) + RAMP - 1
+        ramp = np.minimum(np.arange(1, count + 1), np.arange(count, 0, -1))
+        speed = np.minimum(ramp, RAMP).astype(np.float64)
+        result: FloatArray = np.cumsum(speed) / speed.sum()
+        return result
