@@ -99,14 +99,13 @@ def points(name: str, value: ArrayLike) -> FloatArray:
     Raises:
         InputError: If they are no real numbers or the last axis does not have length 3.
     """
-    array: Any
-    if is_tensor(value):
-        array = value
-        if array.is_complex():
-            raise InputError(name, _brief(value), "real numbers of shape (..., 3)")
-        array = array.double()
-    else:
+    array: Any = value
+    if type(value) is np.ndarray or not is_tensor(value):
         array = numbers(name, value)
+    elif array.is_complex():
+        raise InputError(name, _brief(value), "real numbers of shape (..., 3)")
+    else:
+        array = array.double()
     if array.ndim == 0 or array.shape[-1] != 3:
         raise InputError(name, tuple(array.shape), "an array of shape (..., 3), by shape")
     return array  # type: ignore[no-any-return]

@@ -249,7 +249,7 @@ def conditioning(rows: tuple[Triple, Triple, Triple], ns: Namespace) -> Numbers:
     third = (b * f - c * e, c * d - a * f, a * e - b * d)
     determinant = a * first[0] + b * first[1] + c * first[2]
     scale = _largest_singular_value(rows, ns) * _largest_singular_value((first, second, third), ns)
-    return ns.clip(abs(determinant) / ns.nonzero(scale))
+    return ns.clip(abs(determinant) / ns.maximum(scale, sys.float_info.min))
 
 
 def _largest_singular_value(rows: tuple[Triple, Triple, Triple], ns: Namespace) -> Numbers:
@@ -259,9 +259,10 @@ def _largest_singular_value(rows: tuple[Triple, Triple, Triple], ns: Namespace) 
     xy, xz, yz = a * d + b * e + c * f, a * g + b * h + c * i, d * g + e * h + f * i
     mean = (xx + yy + zz) / 3
     p, q, r = xx - mean, yy - mean, zz - mean
-    spread = ns.root((p * p + q * q + r * r + 2 * (xy * xy + xz * xz + yz * yz)) / 6)
-    half = p * (q * r - yz * yz) - xy * (xy * r - yz * xz) + xz * (xy * yz - q * xz)
-    turn = ns.arccos(ns.clip(half / ns.nonzero(ns.cube(spread)) / 2)) / 3
+    yz2 = yz * yz
+    spread = ns.root((p * p + q * q + r * r + 2 * (xy * xy + xz * xz + yz2)) / 6)
+    half = p * (q * r - yz2) - xy * (xy * r - yz * xz) + xz * (xy * yz - q * xz)
+    turn = ns.arccos(ns.clip(half / ns.maximum(ns.cube(spread), sys.float_info.min) / 2)) / 3
     return ns.sqrt(mean + 2 * spread * ns.cos(turn))
 
 

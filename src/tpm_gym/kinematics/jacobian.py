@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tpm_gym.arrays import FloatArray, finite_points, is_tensor, points, vector
+from tpm_gym.arrays import FloatArray, finite_points, points, vector
 from tpm_gym.errors import SingularityError
 from tpm_gym.kinematics import equations
 from tpm_gym.kinematics.geometry import PAPER, Geometry
@@ -181,7 +181,7 @@ def evaluate(
         SingularityError: If theta is a parallel singularity.
     """
     angles = points("theta", theta)
-    if angles.ndim == 1 and not is_tensor(angles):
+    if angles.ndim == 1 and isinstance(angles, np.ndarray):
         one = equations.evaluate(vector("theta", angles), branch, geometry)
         return Evaluation(np.array(one[0][:3]), np.array(one[1]), np.array(one[2]))
 
