@@ -30,6 +30,7 @@ from tpm_gym.learning.errors import ConfigError, LearningError
 from tpm_gym.learning.recipes import read_recipes, recipe_file
 from tpm_gym.learning.report.page import NOMINAL, TEMPTING
 from tpm_gym.learning.run_folder import CONFIG_FILE, TESTS, is_finished
+from tpm_gym.tasks.registry import TASKS
 
 _PENALTY_IDS: Final = ("TPMReach-v0", "TPMReachJoints-v0", "TPMPickAndPlaceJoints-v0")
 _ROBUSTNESS_IDS: Final = ("TPMReach-v0", "TPMPickAndPlace-v0", "TPMPickAndPlaceJoints-v0")
@@ -142,7 +143,7 @@ def _runs_of(config: StudyConfig, env: str, algo: str, seed: int) -> list[Run]:
     folder = config.folder / f"{name}-s{seed}"
     if config.plan == "results":
         return [Run(folder, env, algo, tuple(options), ((NOMINAL, ()),))]
-    puck = check_env_id(env).kwargs["task"] != "reach"
+    puck = bool(TASKS[check_env_id(env).kwargs["task"]].scene.objects)
     machines = {
         machine: ("--randomisation", entry)
         for machine, entry in _MACHINES.items()
