@@ -170,13 +170,7 @@ def test_distance_is_that_of_brute_force(
 
 
 def compare(
-    mode: WorkingMode,
-    assembly: AssemblyMode,
-    g: Geometry,
-    points: int,
-    count: int,
-    seed: int = 4,
-    missed: int = 0,
+    mode: WorkingMode, assembly: AssemblyMode, g: Geometry, points: int, count: int, seed: int = 4
 ) -> None:
     some = oracle.reachable_points(np.random.default_rng(seed), 6000, g)
     near = np.abs(some[:, 1] - np.where(some[:, 1] > 0, 0.5, -0.5) * g.l7) < 0.3 * g.l7
@@ -191,8 +185,8 @@ def compare(
         return
     part = nearest_singularity(some[order], mode, assembly, g)
     assert_feet_are_singular(some[order], part, mode, g)
-    balls = [(some[index], float(found.distance[index])) for index in order]
-    assert sum(not ball_is_clear(*ball, mode, g, count) for ball in balls) <= missed
+    for index in order:
+        assert ball_is_clear(some[index], float(found.distance[index]), mode, g, count)
 
 
 @settings(derandomize=True, max_examples=4, deadline=None)
@@ -207,8 +201,7 @@ def test_distance_for_any_geometry(g: Geometry, seed: int, mode: WorkingMode) ->
 @given(oracle.geometries(), oracle.seeds(), st.sampled_from(WORKING_MODES))
 def test_distance_for_many_geometries(g: Geometry, seed: int, mode: WorkingMode) -> None:
     for assembly in SIDES:
-        # Of odd proportions, a surface that bends sharply escapes the rays now and then.
-        compare(mode, assembly, g, points=20, count=2000, seed=seed, missed=1)
+        compare(mode, assembly, g, points=20, count=2000, seed=seed)
 
 
 @settings(derandomize=True, max_examples=4, deadline=None)
