@@ -93,7 +93,6 @@ def test_registering_twice_is_harmless_and_a_class_defined_anew_replaces_its_for
         ("Lift", Lift(tpm_gym.mechanism.tpm.PAPER_TPM), {}, "task"),
         ("Lift", dict, {}, "task"),
     ],
-    ids=str,
 )
 @pytest.mark.usefixtures("registries")
 def test_what_cannot_be_registered_is_refused_and_leaves_nothing(

@@ -278,7 +278,7 @@ def test_a_task_that_is_made_takes_no_options(options: dict[str, Any]) -> None:
     assert caught.value.name in options
 
 
-@pytest.mark.parametrize("task", ["juggle", None, 3, dict, object(), ["reach"]], ids=repr)
+@pytest.mark.parametrize("task", ["juggle", None, 3, dict, ["reach"]], ids=repr)
 def test_what_is_no_task_is_refused(task: Any) -> None:
     with pytest.raises(ConfigurationError, match="'reach', 'pick_and_place'") as caught:
         make_task(task)
