@@ -14,22 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from tpm_gym.errors import InputError, TPMError
 
-__all__ = [
-    "BoolArray",
-    "FloatArray",
-    "IntArray",
-    "Quaternion",
-    "Vector",
-    "finite",
-    "finite_points",
-    "is_tensor",
-    "numbers",
-    "points",
-    "rotate",
-    "transform",
-    "vector",
-]
-
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]

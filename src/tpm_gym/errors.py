@@ -11,23 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-__all__ = [
-    "ActionError",
-    "ClosureError",
-    "ConfigurationError",
-    "EpisodeError",
-    "GeometryError",
-    "InputError",
-    "MissingPackageError",
-    "ModeChangeError",
-    "PolicyFileError",
-    "PolicyMismatchError",
-    "ResetOptionError",
-    "SingularityError",
-    "TPMError",
-    "UnreachableError",
-]
-
 
 class TPMError(Exception):
     """Root of all errors raised by tpm_gym. They survive pickling, as between worker processes.

@@ -23,18 +23,6 @@ from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.kinematics.modes import ELBOWS_OUT, AssemblyMode, WorkingMode
 from tpm_gym.kinematics.workspace import Region, conditioning_at
 
-__all__ = [
-    "DEFAULT_SHAPE",
-    "Aspect",
-    "Box",
-    "Cells",
-    "ReachableSet",
-    "aspects",
-    "largest_box",
-    "reachable_set",
-    "sample",
-]
-
 Shape = tuple[int, int, int]
 
 DEFAULT_SHAPE: Shape = (64, 16, 96)

@@ -48,16 +48,6 @@ from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.mechanism.bodies import Mechanism
 from tpm_gym.mechanism.tree import ACTUATED_JOINTS, build, joint_angles
 
-__all__ = [
-    "Mobility",
-    "Structure",
-    "Topology",
-    "analyse",
-    "closure_jacobian",
-    "describe",
-    "mobility",
-]
-
 Frame = tuple[FloatArray, FloatArray]
 
 # Singular values up to the first fraction of the largest are zeros, from the second on they are

@@ -30,26 +30,6 @@ from tpm_gym.kinematics.geometry import Geometry
 from tpm_gym.kinematics.modes import AssemblyMode, WorkingMode
 from tpm_gym.kinematics.namespaces import NUMPY, PLAIN, Namespace, Numbers
 
-__all__ = [
-    "SINGULAR",
-    "Assembly",
-    "Factors",
-    "Triple",
-    "arms",
-    "assemble",
-    "assembly_at",
-    "conditioning",
-    "evaluate",
-    "factors",
-    "no_assembly",
-    "no_posture",
-    "parallel_factors",
-    "posture",
-    "posture_at",
-    "rods",
-    "velocity",
-]
-
 ROUNDING = 64 * sys.float_info.epsilon
 """Where two solutions merge, rounding alone can push a discriminant (always scaled to order one)
 below zero by a few units in the last place. Those are solutions, not misses."""

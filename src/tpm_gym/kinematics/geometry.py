@@ -8,8 +8,6 @@ from numbers import Real
 
 from tpm_gym.errors import GeometryError
 
-__all__ = ["PAPER", "WIDE", "Geometry"]
-
 
 @dataclass(frozen=True)
 class Geometry:

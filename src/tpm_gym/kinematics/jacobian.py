@@ -25,19 +25,6 @@ from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.kinematics.modes import DEFAULT_ASSEMBLY, ELBOWS_OUT, AssemblyMode, WorkingMode
 from tpm_gym.kinematics.namespaces import Namespace, Numbers, by_rows
 
-__all__ = [
-    "Evaluation",
-    "Factors",
-    "conditioning",
-    "conditioning_at",
-    "evaluate",
-    "factors",
-    "factors_at",
-    "parallel",
-    "serial",
-    "velocity",
-]
-
 _MATRIX = np.arange(9).reshape(3, 3)
 _DIAGONAL = np.array([[0, 3, 3], [3, 1, 3], [3, 3, 2]])  # of three columns and one of zeros
 _COLUMN = np.array(0)

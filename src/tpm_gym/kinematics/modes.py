@@ -18,18 +18,6 @@ from tpm_gym.errors import InputError
 from tpm_gym.kinematics.geometry import Geometry
 from tpm_gym.kinematics.namespaces import namespace_of
 
-__all__ = [
-    "ASSEMBLY_MODES",
-    "DEFAULT_ASSEMBLY",
-    "ELBOWS_OUT",
-    "WORKING_MODES",
-    "AssemblyMode",
-    "ForwardSolutions",
-    "InverseSolutions",
-    "PassiveAngles",
-    "WorkingMode",
-]
-
 
 class _Mode:
     """A branch, named by its signs."""

@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 
 from tpm_gym.arrays import FloatArray, is_tensor
 
-__all__ = ["NUMPY", "PLAIN", "Namespace", "Numbers", "by_rows", "namespace_of"]
-
 Numbers = Any
 """A float, an array (...,) or a tensor (...,): what a namespace computes with."""
 _One = Callable[[Any], Any]

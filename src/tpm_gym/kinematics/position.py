@@ -33,8 +33,6 @@ from tpm_gym.kinematics.modes import (
 )
 from tpm_gym.kinematics.namespaces import Namespace, by_rows, namespace_of
 
-__all__ = ["forward", "forward_all", "inverse", "inverse_all", "passive_angles"]
-
 # Which columns of _assemblies a slot holds: x, y, -y, z, beta, -beta, of both planar signs each
 _PLANAR = np.array([(mode.planar + 1) // 2 for mode in ASSEMBLY_MODES])
 _MIRRORED = np.array([2 * (mode.sin_beta < 0) for mode in ASSEMBLY_MODES])
