@@ -95,17 +95,14 @@ def _resampled(
     return Estimate(mean, min(mean, float(low)), max(mean, float(high)), worst)
 
 
-def settled(successes: Sequence[float], rate: float = LEARNED) -> int | None:
-    """Index of the first evaluation from which success stays at ``rate`` or above to the end.
+def settled(successes: Sequence[float]) -> int | None:
+    """Index of the first evaluation from which success stays at ``LEARNED`` or above to the end.
 
     None where the last evaluation is below, or there is none.
     """
-    found = None
-    for index in reversed(range(len(successes))):
-        if successes[index] < rate - 1e-9:
-            break
-        found = index
-    return found
+    below = [index for index, success in enumerate(successes) if success < LEARNED - 1e-9]
+    first = below[-1] + 1 if below else 0
+    return first if first < len(successes) else None
 
 
 def median_time(times: Sequence[float | None]) -> float | None:
