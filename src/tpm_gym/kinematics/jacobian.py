@@ -28,7 +28,8 @@ from tpm_gym.kinematics.namespaces import Namespace, Numbers, by_rows
 _MATRIX = np.arange(9).reshape(3, 3)
 _DIAGONAL = np.array([[0, 3, 3], [3, 1, 3], [3, 3, 2]])  # of three columns and one of zeros
 _COLUMN = np.array(0)
-_PARALLEL, _SERIAL, _CONSTRAINT = np.arange(3), np.arange(3, 7), np.array(7)
+_PARALLEL = np.arange(3)
+_FACTORS = _PARALLEL, np.arange(3, 7), np.array(7)
 
 
 @dataclass(frozen=True)
@@ -185,8 +186,7 @@ def factors(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> Factors:
     """Closed-form factors of det A and det B (Eqs. 16 and 17, corrected)."""
-    layouts = _PARALLEL, _SERIAL, _CONSTRAINT
-    return Factors(*_from_angles(lambda c: [*c.factors], theta, branch, geometry, *layouts))
+    return Factors(*_from_angles(lambda c: [*c.factors], theta, branch, geometry, *_FACTORS))
 
 
 def factors_at(
@@ -197,8 +197,7 @@ def factors_at(
     Unlike :func:`factors` it does not pass through the forward kinematics, so it keeps its accuracy
     at the parallel singularities.
     """
-    layouts = _PARALLEL, _SERIAL, _CONSTRAINT
-    columns = _from_points(lambda c: [*c.factors], position, branch, geometry, math.nan, *layouts)
+    columns = _from_points(lambda c: [*c.factors], position, branch, geometry, math.nan, *_FACTORS)
     return Factors(*columns)
 
 

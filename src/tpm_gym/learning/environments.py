@@ -10,7 +10,7 @@ import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 
 from tpm_gym.envs.env import TPMEnv
-from tpm_gym.envs.registration import ENTRY_POINT, env_ids
+from tpm_gym.envs.registration import env_ids
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.rollout import GoalEnv
 
@@ -42,8 +42,6 @@ def _is_ours(spec: EnvSpec) -> bool:
     """Whether an id makes a ``TPMEnv``, or what derives from it."""
     entry: Any = spec.entry_point
     if isinstance(entry, str):
-        if entry == ENTRY_POINT:
-            return True
         try:
             entry = load_env_creator(entry)
         except (ImportError, AttributeError):

@@ -150,6 +150,7 @@ def _learn(
         SignalListener,
         StopTrainingError,
     )
+    from tpm_gym.learning.demonstrations import Demonstrations
     from tpm_gym.learning.logger import make_logger
 
     torch.set_num_threads(config.threads)
@@ -169,7 +170,9 @@ def _learn(
         seconds = _restore(model, evaluation, content, console) if content else 0.0
         checkpointing = Checkpointing(config, store, evaluation, listener, console, seconds)
         # Checkpointing sets the clock of those after it.
-        callbacks = [checkpointing, *_demonstrations(config), bar, evaluation]
+        callbacks: list[BaseCallback] = [checkpointing, bar, evaluation]
+        if config.recipe.demonstrations:
+            callbacks.insert(1, Demonstrations(**config.recipe.demonstrations))
         stack.enter_context(listener.listening())
         stopped_by = None
         try:
@@ -195,15 +198,6 @@ def _restore(
     for note in notes:
         _say(console, f"note: {note}; the run goes on, but not exactly as it would have")
     return float(extra["seconds"])
-
-
-def _demonstrations(config: TrainingConfig) -> list[BaseCallback]:
-    """What fills the replay buffer before training starts, if the recipe asks for it."""
-    if not config.recipe.demonstrations:
-        return []
-    from tpm_gym.learning.demonstrations import Demonstrations
-
-    return [Demonstrations(**config.recipe.demonstrations)]
 
 
 def _keep(config: TrainingConfig, console: Console, name: str, model: BaseAlgorithm) -> None:
