@@ -3,8 +3,6 @@
 A check that takes an ``error`` raises it, made of name, value and what would be valid.
 """
 
-from __future__ import annotations
-
 import math
 import sys
 from collections.abc import Callable

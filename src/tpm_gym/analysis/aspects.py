@@ -9,8 +9,6 @@ Aspects are those of the factors of Eqs. (16) and (17); the constraint singulari
 :mod:`tpm_gym.analysis.singularity` does not divide them.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

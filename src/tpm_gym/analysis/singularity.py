@@ -13,8 +13,6 @@ classify raise it also for entries that are not finite, UnreachableError if some
 exist on the branch, and ConfigurationError if the tolerance is not between 0 and 1.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import IntFlag
 

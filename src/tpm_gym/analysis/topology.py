@@ -17,8 +17,6 @@ Functions of joint angles raise InputError for what is not three finite numbers,
 UnreachableError if the branch does not exist there.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import permutations

@@ -16,8 +16,6 @@ The second part is the first in plain floats, for one configuration at every tim
 :func:`assemble`, :func:`posture` and :func:`evaluate`. Three finite floats are expected.
 """
 
-from __future__ import annotations
-
 import math
 import sys
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """The seven lengths that define the mechanism, validated."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, fields
 from numbers import Real

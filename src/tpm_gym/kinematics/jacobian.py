@@ -9,8 +9,6 @@ All functions raise InputError for what is no array (..., 3) of numbers; from an
 also if theta is not finite, and UnreachableError if the branch does not exist at some theta.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

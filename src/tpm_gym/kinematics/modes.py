@@ -8,8 +8,6 @@ Branches are named by signs that change only at a singularity:
   serial Jacobian's determinant.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import product
 

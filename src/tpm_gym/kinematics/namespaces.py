@@ -5,8 +5,6 @@ every time step, where numpy's calls cost ten times what they compute; for batch
 gradients and GPUs.
 """
 
-from __future__ import annotations
-
 import math
 import operator
 from collections.abc import Callable, Sequence

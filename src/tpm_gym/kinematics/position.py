@@ -9,8 +9,6 @@ give invalid branches where all are solved; those on one named branch raise Inpu
 UnreachableError if the branch does not exist for some entry.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

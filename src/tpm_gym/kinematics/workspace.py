@@ -3,8 +3,6 @@
 Everything here is in the paper frame, in metres, on one working mode.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product

@@ -1,7 +1,5 @@
 """What happens besides learning while a policy trains: evaluation, checkpoints, stopping."""
 
-from __future__ import annotations
-
 import json
 import signal
 import sys

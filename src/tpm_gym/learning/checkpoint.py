@@ -7,8 +7,6 @@ a pickle that would be loaded: the files are JSON, NumPy arrays, and tensors tha
 ``torch.load(weights_only=True)`` reads; all of them are checked before they are parsed.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

@@ -1,7 +1,5 @@
 """The command ``tpm-gym``."""
 
-from __future__ import annotations
-
 import signal
 import sys
 from collections.abc import Sequence

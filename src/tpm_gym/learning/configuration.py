@@ -1,7 +1,5 @@
 """What a training run is to do: the options of the command line, completed and checked."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace

@@ -1,7 +1,5 @@
 """The one place where training, evaluation, demonstrations and films get their environments."""
 
-from __future__ import annotations
-
 import importlib
 import signal
 from typing import Any

@@ -5,8 +5,6 @@ unluckiest quarter out, and its interval says how much another set of seeds migh
 et al. 2021, "Deep reinforcement learning at the edge of the statistical precipice").
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -8,8 +8,6 @@ It can be stopped with Ctrl-C at any time and started again: trainings go on fro
 checkpoint. A training that fails is reported, and the others go on.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shlex

@@ -10,8 +10,6 @@ optimisers, and the episode under way (its first half, joined to another episode
 buffer, teaches goals that were never reached). All three are restored here.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import random

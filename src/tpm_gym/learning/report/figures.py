@@ -1,7 +1,5 @@
 """The learning curve of a run, and the figures of docs/results.md."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path

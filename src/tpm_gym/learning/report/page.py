@@ -1,7 +1,5 @@
 """The text of docs/results.md, from the records of runs."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Sequence
 from statistics import fmean, median

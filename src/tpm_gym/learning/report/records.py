@@ -5,8 +5,6 @@ in ``tests/``, which a study has written there). ``write`` needs the records alo
 can do it. Runs that did not finish are kept.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path
