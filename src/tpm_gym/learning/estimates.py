@@ -9,10 +9,11 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from statistics import median
-from typing import Any, Final, TypeAlias
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+
+from tpm_gym.arrays import FloatArray
 
 BOOTSTRAP_SAMPLES: Final = 5000
 BOOTSTRAP_SEED: Final = 0  # fixed: the same values always give the same interval
@@ -22,8 +23,6 @@ LEARNED: Final = 0.95
 _Z95: Final = 1.959963984540054  # 97.5% quantile of the standard normal distribution
 _EPISODE_SAMPLES: Final = 2000
 _BLOCK: Final = 100
-
-Array: TypeAlias = NDArray[Any]
 
 
 @dataclass(frozen=True)
@@ -64,10 +63,10 @@ def interquartile_mean(scores: Sequence[float], samples: int = BOOTSTRAP_SAMPLES
     scores, that of the middle three.
     """
 
-    def trimmed(rows: Array) -> Array:
+    def trimmed(rows: FloatArray) -> FloatArray:
         count = rows.shape[1]
         cut = count // 4
-        means: Array = np.sort(rows, axis=1)[:, cut : count - cut].mean(axis=1)
+        means: FloatArray = np.sort(rows, axis=1)[:, cut : count - cut].mean(axis=1)
         return means
 
     return _resampled(scores, trimmed, samples)
@@ -75,7 +74,7 @@ def interquartile_mean(scores: Sequence[float], samples: int = BOOTSTRAP_SAMPLES
 
 def _resampled(
     values: Sequence[float],
-    statistic: Callable[[Array], Array],
+    statistic: Callable[[FloatArray], FloatArray],
     samples: int,
     worst: float | None = None,
 ) -> Estimate:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import signal
 from contextlib import ExitStack
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,8 +40,6 @@ if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
     from tpm_gym.learning.callbacks import PeriodicEvaluation
-
-_CHANGEABLE = ("steps", "eval_every", "checkpoint_every", "threads", "device")
 
 
 def train(config: TrainingConfig, console: Console | None = None) -> signal.Signals | None:
@@ -127,9 +125,10 @@ def _description_resumed(
     config: TrainingConfig, stored: dict[str, Any], step: int
 ) -> dict[str, Any]:
     resumption = {"from_step": step, **provenance.origin()}
+    changeable = [field.name for field in fields(ResumeConfig) if field.name != "run"]
     return {
         **stored,
-        **{name: getattr(config, name) for name in _CHANGEABLE},
+        **{name: getattr(config, name) for name in changeable},
         "resumed": [*stored.get("resumed", []), resumption],
     }
 
@@ -229,11 +228,8 @@ def _report(
 
 def make_model(config: TrainingConfig, envs: VecEnv) -> BaseAlgorithm:
     """Build the algorithm of a completed configuration."""
-    kind: Any = ALGORITHMS[config.algo].load_class()
-    model: BaseAlgorithm = kind(
-        env=envs, seed=config.seed, device=config.device, **config.recipe.keywords()
-    )
-    return model
+    kind = ALGORITHMS[config.algo].load_class()
+    return kind(env=envs, seed=config.seed, device=config.device, **config.recipe.keywords())
 
 
 def make_training_envs(config: TrainingConfig) -> VecEnv:
