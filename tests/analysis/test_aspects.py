@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 import oracle
 import pytest
-from hypothesis import given, settings
+from examples import examples
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from numpy.typing import NDArray
@@ -40,8 +40,7 @@ def all_centres(cells: Cells) -> FloatArray:
     return replace(cells, mask=np.ones_like(cells.mask)).centres()
 
 
-@settings(derandomize=True, max_examples=20, deadline=None)
-@given(oracle.geometries(), oracle.seeds(), modes)
+@examples(20, oracle.geometries(), oracle.seeds(), modes)
 def test_the_grid_covers_the_reachable_set(g: Geometry, seed: int, mode: WorkingMode) -> None:
     cells = aspects.reachable_set(mode, g, (24, 6, 24)).cells
     reachable = workspace.reachable(all_centres(cells), mode, g)
@@ -89,8 +88,7 @@ def test_volume_error_counts_no_flat_faces() -> None:
     assert cells.centres()[0].tolist() == [1.5, 2.5, 1.5]
 
 
-@settings(derandomize=True, max_examples=20, deadline=None)
-@given(oracle.geometries(), modes)
+@examples(20, oracle.geometries(), modes)
 def test_aspects_part_the_reachable_set_by_signs(g: Geometry, mode: WorkingMode) -> None:
     shape = (24, 6, 24)
     found = aspects.aspects(mode, g, shape, min_cells=1)
@@ -112,8 +110,7 @@ def test_aspects_part_the_reachable_set_by_signs(g: Geometry, mode: WorkingMode)
     assert len(kept) == sum(a.cells.mask.sum() >= 5 for a in found)
 
 
-@settings(derandomize=True, max_examples=15, deadline=None)
-@given(oracle.geometries(), modes, st.sampled_from([0.5, 4.0]))
+@examples(15, oracle.geometries(), modes, st.sampled_from([0.5, 4.0]))
 def test_sets_scale_with_the_lengths(g: Geometry, mode: WorkingMode, factor: float) -> None:
     both = (
         aspects.aspects(mode, lengths, (16, 4, 16)) for lengths in (g, oracle.scaled(g, factor))
@@ -153,8 +150,7 @@ def flood_fill(codes: NDArray[np.int64]) -> list[frozenset[tuple[int, ...]]]:
 shapes = st.tuples(*[st.integers(1, 6)] * 3)
 
 
-@settings(derandomize=True, max_examples=150, deadline=None)
-@given(arrays.arrays(np.int64, shapes, elements=st.integers(-1, 1)))
+@examples(150, arrays.arrays(np.int64, shapes, elements=st.integers(-1, 1)))
 def test_components_are_those_of_a_flood_fill(codes: NDArray[np.int64]) -> None:
     labels = aspects._components(codes)
     members = [
@@ -173,8 +169,7 @@ def best_by_trying(mask: NDArray[np.bool_]) -> int:
     return best
 
 
-@settings(derandomize=True, max_examples=200, deadline=None)
-@given(shapes, oracle.seeds(), st.floats(0.4, 1.0))
+@examples(200, shapes, oracle.seeds(), st.floats(0.4, 1.0))
 def test_largest_block_is_that_of_trying_all(
     shape: tuple[int, int, int], seed: int, density: float
 ) -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import oracle
 import pytest
-from hypothesis import given, settings
+from examples import examples
 from walk import gaps
 
 from tpm_gym.analysis.poc import Chain, POCSet, Subspace, degrees_of_freedom
@@ -80,8 +80,7 @@ def test_topology_is_the_paper_s_at_random_configurations() -> None:
         assert_paper_topology(describe(theta, branch))
 
 
-@settings(derandomize=True, max_examples=15, deadline=None)
-@given(oracle.geometries(), oracle.seeds())
+@examples(15, oracle.geometries(), oracle.seeds())
 def test_topology_and_mobility_do_not_depend_on_lengths(g: Geometry, seed: int) -> None:
     for theta, branch in configurations(seed, 8, g):
         assert_paper_topology(describe(theta, branch, g))

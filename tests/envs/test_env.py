@@ -28,10 +28,8 @@ PUCK = PickAndPlace.puck
 
 
 @pytest.fixture
-def env() -> Iterator[TPMEnv]:
-    made = TPMEnv("pick_and_place")
-    yield made
-    made.close()
+def env() -> TPMEnv:
+    return TPMEnv("pick_and_place")
 
 
 # -- options ---------------------------------------------------------------------------------------
@@ -78,7 +76,6 @@ def test_machines_are_taken_by_name_or_value(machine: Any) -> None:
     env.reset(seed=0)
     home = inner.machine.mount.to_world(inner.machine.home)
     np.testing.assert_allclose(inner.state.platform_position, home, atol=1e-4)
-    env.close()
 
 
 class Scaled(Reach):
@@ -98,8 +95,6 @@ def test_a_task_of_ones_own_goes_along_with_copies() -> None:
     assert other.task.tolerance == 0.05
     assert other.task is not env.task
     assert play(other, [np.full(3, 0.3)] * 5) == play(env, [np.full(3, 0.3)] * 5)
-    for one in (env, other):
-        one.close()
     with pytest.raises(ConfigurationError, match="has its own"):
         TPMEnv(task, reward="sparse")
 
@@ -114,7 +109,6 @@ def test_human_mode_without_a_display_is_refused_instead_of_ending_the_process(
     env = TPMEnv()
     assert env.metadata["render_modes"] == ["rgb_array"]
     assert TPMEnv.metadata["render_modes"] == ["human", "rgb_array"]
-    env.close()
 
 
 def test_rgb_array_gives_pictures_of_the_asked_size() -> None:
@@ -124,7 +118,6 @@ def test_rgb_array_gives_pictures_of_the_asked_size() -> None:
     assert picture.shape == (64, 96, 3)
     assert picture.dtype == np.uint8
     assert picture.std() > 10
-    env.close()
 
 
 PHYSICS = Physics(time_step=1 / 500, erp=0.9)
@@ -144,8 +137,6 @@ def test_a_spec_with_physics_and_randomisation_survives_json(physics: Any) -> No
     again.reset()
     other.restore_state(snapshot)
     assert play(again.unwrapped, actions) == play(env.unwrapped, actions)
-    env.close()
-    again.close()
 
 
 # -- episodes --------------------------------------------------------------------------------------
@@ -188,7 +179,6 @@ def test_observations_are_clipped_into_their_space_and_else_exact(size: float) -
     np.testing.assert_array_equal(seen["observation"][inside], exact[inside].astype(np.float32))
     np.testing.assert_array_equal(seen["observation"][~inside], [10, -10])
     np.testing.assert_array_equal(seen["achieved_goal"][1:], [2, -2])
-    env.close()
 
 
 def drive_to_the_singular_side(env: TPMEnv) -> Any:
@@ -209,7 +199,6 @@ def test_the_penalty_grows_towards_the_singularity_and_follows_the_weight() -> N
         assert info["singularity_penalty"] > 0.1
         assert info["reward_terms"]["singularity"] == -weight * info["singularity_penalty"]
         rewards.append(reward)
-        env.close()
     assert rewards[0] - rewards[1] == pytest.approx(info["singularity_penalty"])
     assert rewards[0] - rewards[2] == pytest.approx(2 * info["singularity_penalty"])
 
@@ -221,7 +210,6 @@ def test_hindsight_keeps_the_penalty_by_the_difference_of_goal_terms() -> None:
     for new_goal in (achieved, np.zeros(3)):
         old, new = (env.compute_reward(achieved, g, {}) for g in (goal, new_goal))
         assert reward - old + new == pytest.approx(env.compute_reward(achieved, new_goal, info))
-    env.close()
 
 
 @pytest.mark.parametrize("sideways", [(-1.0, -1.0), (1.0, 1.0), (1.0, -1.0), (0.0, 0.0)])
@@ -280,10 +268,8 @@ def test_info_tells_the_machine_that_was_drawn() -> None:
     assert first["puck_mass"] != 1
     assert len(first["link_masses"]) == len(env.machine.mechanism.links) - 1
     assert "randomisation" not in env.step(np.zeros(4))[4]
-    env.close()
     nominal = TPMEnv()
     assert "randomisation" not in nominal.reset(seed=0)[1]
-    nominal.close()
 
 
 # -- snapshots -------------------------------------------------------------------------------------
@@ -326,7 +312,6 @@ def test_a_changed_snapshot_raises_and_touches_nothing() -> None:
     env.step(np.zeros(4))
     env.restore_state(snapshot)
     assert env.state.held == 0
-    env.close()
 
 
 def test_a_snapshot_of_another_kind_of_environment_is_refused(env: TPMEnv) -> None:
@@ -342,7 +327,6 @@ def test_a_snapshot_of_another_kind_of_environment_is_refused(env: TPMEnv) -> No
         other.reset(seed=0)
         with pytest.raises(InputError, match="of the same task and options"):
             env.restore_state(other.save_state())
-        other.close()
     env.step(np.zeros(4))
 
 
@@ -379,7 +363,6 @@ def test_the_datasheet_lists_all_of_info_and_every_option() -> None:
     env = TPMEnv(randomisation=EVERYTHING)
     info = text[text.index("## Info") : text.index("Args:")]
     assert re.findall(r"^\| ``(\w+)`` \|", info, re.M) == list(env.reset(seed=0)[1])
-    env.close()
     options = list(inspect.signature(TPMEnv).parameters)
     assert (
         re.findall(r"^    (\w+): ", text[text.index("Args:") : text.index("Raises:")], re.M)

@@ -52,7 +52,6 @@ def test_an_id_means_what_it_says(env_id: str) -> None:
     assert env.action_space.shape == ((4,) if "Pick" in env_id else (3,))
     assert env.spec.max_episode_steps == MAX_EPISODE_STEPS == 50
     assert env.metadata["render_fps"] == 25
-    env.close()
 
 
 @pytest.mark.usefixtures("registries")
@@ -64,8 +63,7 @@ def test_a_users_task_gets_four_ids_and_a_name() -> None:
     env = gym.make(ids[-1], machine="wide")
     assert type(env.unwrapped.task) is Lift
     assert env.spec.max_episode_steps == 7
-    env.close()
-    TPMEnv("lift").close()
+    TPMEnv("lift")
 
 
 @pytest.mark.usefixtures("registries")
@@ -79,7 +77,6 @@ def test_registering_twice_is_harmless_and_a_class_defined_anew_replaces_its_for
     register_task("Lift", anew)
     env = gym.make("TPMLift-v0")
     assert type(env.unwrapped.task) is anew
-    env.close()
 
 
 @pytest.mark.parametrize(

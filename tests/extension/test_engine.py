@@ -13,9 +13,7 @@ from tpm_gym.simulation import Engine
 
 @pytest.fixture(params=["TPMReach-v0", "TPMPickAndPlaceJoints-v0"])
 def env(request):
-    env = gym.make(request.param, engine="kinematic")
-    yield env
-    env.close()
+    return gym.make(request.param, engine="kinematic")
 
 
 @pytest.mark.parametrize("env_id", ["TPMReach-v0", "TPMPickAndPlaceJoints-v0"])
@@ -44,7 +42,6 @@ def test_what_it_cannot_randomise_it_refuses_by_name():
     env = tpm_gym.TPMEnv(engine="kinematic", randomisation={"link_mass": (0.9, 1.1)})
     with pytest.raises(ConfigurationError, match="randomisation"):
         env.reset(seed=0)
-    env.close()
 
 
 class Derived(Engine):

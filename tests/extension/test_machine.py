@@ -15,9 +15,7 @@ IDS = ("TPMReach-v0", "TPMReachJoints-v0", "TPMPickAndPlace-v0", "TPMPickAndPlac
 
 @pytest.fixture(params=IDS)
 def env(request):
-    env = gym.make(request.param, machine="gantry")
-    yield env
-    env.close()
+    return gym.make(request.param, machine="gantry")
 
 
 @pytest.mark.parametrize("env_id", ["TPMReachJoints-v0", "TPMPickAndPlace-v0"])
@@ -47,11 +45,9 @@ def test_where_nothing_tempts_tempting_goals_are_refused(task):
     env = tpm_gym.TPMEnv(task, machine="gantry", goals="tempting")
     with pytest.raises(ConfigurationError, match="no careless way was found"):
         env.reset(seed=0)
-    env.close()
 
 
 def test_its_lengths_cannot_be_off(env):
     randomised = tpm_gym.TPMEnv(machine="gantry", randomisation={"length_error": 1e-3})
     _, info = randomised.reset(seed=0)
     assert info["randomisation"]["length_errors"] == ()
-    randomised.close()

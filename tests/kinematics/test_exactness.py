@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import oracle
 import pytest
-from hypothesis import given, settings
+from examples import examples
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -90,8 +90,7 @@ def test_a_million_inputs_close(solve: Solve, g: Geometry) -> None:
     assert branches > 200_000
 
 
-@settings(derandomize=True, max_examples=40, deadline=None)
-@given(oracle.geometries(), oracle.seeds())
+@examples(40, oracle.geometries(), oracle.seeds())
 def test_any_geometry_closes(g: Geometry, seed: int) -> None:
     assert worst(forward_all, 500, g, seed)[0] < CLOSED
     assert worst(inverse_all, 500, g, seed)[0] < CLOSED
@@ -243,8 +242,7 @@ def test_no_branch_is_missed_on_10000_inputs() -> None:
         assert check(inverse_all, 10_000, g, seed=6) > 40_000
 
 
-@settings(derandomize=True, max_examples=10, deadline=None)
-@given(oracle.geometries(), oracle.seeds())
+@examples(10, oracle.geometries(), oracle.seeds())
 def test_no_branch_is_missed_for_any_geometry(g: Geometry, seed: int) -> None:
     check(forward_all, 40, g, seed)
     check(inverse_all, 40, g, seed)
@@ -327,8 +325,7 @@ def test_the_edge_in_y_belongs_to_the_workspace_and_nothing_beyond(sign: int) ->
     assert gaps(found, points, PAPER).max() < CLOSED
 
 
-@settings(derandomize=True, max_examples=40, deadline=None)
-@given(oracle.geometries(), oracle.seeds(), st.floats(0.05, 20))
+@examples(40, oracle.geometries(), oracle.seeds(), st.floats(0.05, 20))
 def test_lengths_scale_positions_alone(g: Geometry, seed: int, factor: float) -> None:
     bigger = oracle.scaled(g, factor)
     rng = np.random.default_rng(seed)
@@ -347,8 +344,7 @@ def test_lengths_scale_positions_alone(g: Geometry, seed: int, factor: float) ->
         np.testing.assert_allclose(*values, rtol=0, atol=1e-7)
 
 
-@settings(derandomize=True, max_examples=40, deadline=None)
-@given(oracle.geometries(), oracle.seeds())
+@examples(40, oracle.geometries(), oracle.seeds())
 def test_the_mechanism_is_symmetric_in_y(g: Geometry, seed: int) -> None:
     rng = np.random.default_rng(seed)
     points = oracle.reachable_points(rng, 50, g)

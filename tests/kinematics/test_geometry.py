@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import oracle
 import pytest
-from hypothesis import given, settings
+from examples import examples
 
 from tpm_gym.errors import GeometryError
 from tpm_gym.kinematics import forward_all
@@ -91,8 +91,7 @@ def test_too_short_rods_never_meet_the_plane_of_link_3() -> None:
     assert np.abs(b1[:, 1]).min() > g.l4
 
 
-@settings(derandomize=True, max_examples=50, deadline=None)
-@given(oracle.geometries(), oracle.seeds())
+@examples(50, oracle.geometries(), oracle.seeds())
 def test_accepted_lengths_can_be_assembled(g: Geometry, seed: int) -> None:
     angles = np.random.default_rng(seed).uniform(-np.pi, np.pi, (2000, 3))
     assert forward_all(angles, g).valid.any()

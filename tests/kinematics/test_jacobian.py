@@ -6,7 +6,8 @@ import numpy as np
 import oracle
 import pytest
 import torch
-from hypothesis import example, given, settings
+from examples import examples
+from hypothesis import example
 from torch.autograd.functional import jacobian as derivatives
 
 from tpm_gym.arrays import FloatArray
@@ -46,8 +47,7 @@ def assert_derivative(theta: FloatArray, branch: AssemblyMode, g: Geometry) -> N
     assert (errors / size).max() < 1e-9
 
 
-@settings(derandomize=True, max_examples=25, deadline=None)
-@given(oracle.geometries(), oracle.seeds())
+@examples(25, oracle.geometries(), oracle.seeds())
 @example(PAPER, 1)
 def test_velocity_jacobian_is_the_derivative_of_the_forward_kinematics(
     g: Geometry, seed: int
@@ -59,8 +59,7 @@ def test_velocity_jacobian_is_the_derivative_of_the_forward_kinematics(
             assert_derivative(theta, branch, g)
 
 
-@settings(derandomize=True, max_examples=25, deadline=None)
-@given(oracle.geometries(), oracle.seeds())
+@examples(25, oracle.geometries(), oracle.seeds())
 def test_determinants_are_the_products_of_the_factors(g: Geometry, seed: int) -> None:
     for branch in ASSEMBLY_MODES:
         theta = joint_angles(seed, branch, g, 40, clear=0.0)

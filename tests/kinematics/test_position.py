@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import oracle
 import pytest
-from hypothesis import given, settings
+from examples import examples
 
 from tpm_gym.kinematics import (
     ASSEMBLY_MODES,
@@ -94,8 +94,7 @@ def test_forward_then_inverse_contains_theta_in_the_slot_its_factors_name() -> N
     assert_theta_found_again(assemblies(np.random.default_rng(4), 10_000, PAPER), PAPER)
 
 
-@settings(derandomize=True, max_examples=40, deadline=None)
-@given(oracle.geometries(), oracle.seeds())
+@examples(40, oracle.geometries(), oracle.seeds())
 def test_any_geometry_inverts_and_keeps_its_labels(g: Geometry, seed: int) -> None:
     rng = np.random.default_rng(seed)
     assert_round_trip(postures(rng, 100, g), g)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
 from hypothesis import strategies as st
 from machines import anywhere, each_machine, within
 from walk import walk
@@ -24,8 +24,7 @@ share = st.floats(0.0, 1.0)
 
 
 @each_machine
-@settings(derandomize=True, max_examples=100)
-@given(st.tuples(share, share, share))
+@examples(100, st.tuples(share, share, share))
 def test_kinematics_agree_all_over_the_region(machine: TPM, shares: Vector) -> None:
     point = within(machine, shares)
     theta = machine.inverse(tuple(point.tolist()))

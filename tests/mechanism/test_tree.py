@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import oracle
 import pytest
-from hypothesis import given, settings
+from examples import examples
 from machines import anywhere, each_machine
 from walk import gaps, place, walk
 
@@ -70,8 +70,7 @@ def assert_assembled(theta: FloatArray, branch: AssemblyMode, g: Geometry) -> No
     )
 
 
-@settings(derandomize=True, max_examples=40, deadline=None)
-@given(oracle.geometries(), oracle.seeds())
+@examples(40, oracle.geometries(), oracle.seeds())
 def test_joint_angles_close_every_loop_and_place_the_platform(g: Geometry, seed: int) -> None:
     solutions = inverse_all(oracle.reachable_points(np.random.default_rng(seed), 1, g), g)
     for theta in solutions.theta[solutions.valid][:4]:
@@ -139,8 +138,7 @@ def test_the_tree_with_its_closures_has_three_degrees_of_freedom(machine: TPM) -
     assert len(start) - rank == 3 + 1 + 1
 
 
-@settings(derandomize=True, max_examples=20, deadline=None)
-@given(oracle.geometries())
+@examples(20, oracle.geometries())
 def test_moving_links_have_possible_inertias_along_their_axes(g: Geometry) -> None:
     for link in build(g).links:
         assert link.mass > 0

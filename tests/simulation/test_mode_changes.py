@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -24,10 +24,8 @@ IDLE = np.zeros(3)
 
 
 @pytest.fixture
-def env() -> Iterator[TPMEnv]:
-    env = TPMEnv("reach")
-    yield env
-    env.close()
+def env() -> TPMEnv:
+    return TPMEnv("reach")
 
 
 def true_y(state: State) -> float:
@@ -143,8 +141,6 @@ def test_a_disturbance_through_the_plane_ends_the_episode_and_the_next_reset_rec
     with pytest.raises(ModeChangeError, match="reset"):  # nor can one go on after that
         env.step(idle)
     assert fingerprint(random_episode(env, 4)) == fingerprint(random_episode(fresh, 4))
-    env.close()
-    fresh.close()
 
 
 def test_an_episode_that_was_left_can_be_reset_at_once(env: TPMEnv) -> None:

@@ -161,7 +161,6 @@ def test_a_machine_without_deviations_is_the_nominal_one_to_the_last_bit(task: s
     for option in (None, {}, {"link_mass": (1.0, 1.0), "encoder_noise": 0}, Randomisation()):
         env = TPMEnv(task, randomisation=option)
         prints.append(fingerprint(random_episode(env, 0)) + fingerprint(random_episode(env, 1)))
-        env.close()
     assert len(set(prints)) == 1
 
 
@@ -259,8 +258,6 @@ def test_noise_is_in_what_the_encoders_say_and_not_in_the_truth() -> None:
     assert np.abs(lagged).max() < 5 / np.sqrt(len(errors))
     assert np.abs(np.corrcoef(errors.T) - np.eye(3)).max() < 5 / np.sqrt(len(errors))
     np.testing.assert_allclose(np.std(said, axis=0), size * gains, rtol=0.3)
-    env.close()
-    quiet.close()
 
 
 def test_a_bias_moves_the_platform_by_minus_j_bias_and_the_encoders_do_not_know(
@@ -322,8 +319,6 @@ def test_an_action_comes_one_step_late_the_vacuum_too() -> None:
     for vacuum in (1.0, -1.0, 1.0, 1.0):
         late.step(np.array([0.0, 0.0, 0.0, vacuum]))
     assert moves[1] == [False, True, False, True]
-    prompt.close()
-    late.close()
 
 
 # -- lengths ---------------------------------------------------------------------------------------
@@ -381,7 +376,6 @@ def test_with_other_lengths_the_loops_stay_closed_at_full_speed_and_every_reset_
         seen.add(env.simulation.plant.length_errors)
         assert true != PAPER
     assert len(seen) == 4
-    env.close()
 
 
 def test_a_robot_built_anew_stands_in_the_same_world(simulation: Simulation) -> None:
@@ -408,7 +402,6 @@ def test_a_hundred_robots_later_the_memory_is_what_it_was() -> None:
         env.reset(seed=seed)
     assert memory()[0] - before < 10
     assert env.simulation.engine.client.getNumBodies() == 7
-    env.close()
 
 
 @pytest.mark.parametrize("bias", [0.0, _SIZES["encoder_bias"]])
@@ -440,7 +433,6 @@ def test_the_expert_succeeds_on_moderately_different_machines(env_id: str, laten
     for seed in range(20):
         *_, (_, _, info) = expert_episode(env, seed)
         assert info["is_success"], seed
-    env.close()
 
 
 EXTREMES: list[dict[str, Any]] = [
@@ -471,4 +463,3 @@ def test_at_the_ends_of_the_ranges_nothing_is_lost_or_it_is_reported(
             if truncated:
                 assert info["assembly_mode_changed"] != info["working_mode_changed"]
                 break
-    env.close()

@@ -68,4 +68,3 @@ def test_hostile_policies_do_not_lose_the_mechanism(env_id, policy, seeds):
             fall = max(fall, -state.object_velocity[0, 2])
             pressed = pressed + CONTROL_PERIOD if depth > 1e-3 else 0.0
             assert pressed < 0.15
-    env.close()

@@ -19,10 +19,8 @@ SPARSE = [env_id for env_id in tpm_gym.ENV_IDS if "Dense" not in env_id]
 
 
 @pytest.fixture
-def env() -> Iterator[Any]:
-    made = gym.make("TPMPickAndPlace-v0")
-    yield made
-    made.close()
+def env() -> Any:
+    return gym.make("TPMPickAndPlace-v0")
 
 
 def solved(env: Any, **options: Any) -> bool:
@@ -48,7 +46,6 @@ def test_it_solves_every_task_and_keeps_clear_of_the_singularity(
         assert max(info["closure_error"] for info in infos) < 0.5e-3
         clear += min(info["conditioning"] for info in infos) > 0.95 * safe
         assert not any(info["object_lost"] for info in infos)
-    env.close()
     assert successes >= wanted
     assert clear >= wanted
 
@@ -91,7 +88,6 @@ def test_its_commands_start_and_stop_gently_and_respect_the_step_limit() -> None
         assert (np.abs(steps) <= np.array(machine.step_limit) * (1 + 1e-9)).all()
         assert shares[0] == pytest.approx(shares.min())
         assert shares[0] <= 0.5 * shares.max() + 1e-12
-    env.close()
 
 
 # -- when it cannot --------------------------------------------------------------------------------
@@ -159,4 +155,3 @@ def test_the_last_move_of_a_plan_is_kept_and_plans_without_one_are_told() -> Non
             for _ in range(6):
                 observation = env.step(expert.act(observation))[0]
             assert expert.command == pytest.approx(np.array(env.machine.home) + (0.01, 0, 0))
-        env.close()

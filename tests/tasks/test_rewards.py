@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
 from hypothesis import strategies as st
 
 from tpm_gym.tasks.rewards import dense, distance, singularity_penalty, sparse
@@ -22,8 +22,7 @@ def test_penalty_is_zero_where_it_is_safe_and_one_at_a_singularity() -> None:
     assert singularity_penalty(np.nextafter(SAFE, 0) - 1e-6, SAFE) > 0
 
 
-@settings(derandomize=True, max_examples=200)
-@given(conditionings, conditionings, safes)
+@examples(200, conditionings, conditionings, safes)
 def test_penalty_never_rises_with_the_conditioning(a: float, b: float, safe: float) -> None:
     low, high = sorted((a, b))
     worse, better = singularity_penalty(low, safe), singularity_penalty(high, safe)
