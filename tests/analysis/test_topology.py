@@ -39,11 +39,9 @@ def configurations(
 ) -> list[tuple[FloatArray, AssemblyMode]]:
     """Random angles with an assembly mode, away from every singularity by ``clear`` (scaled)."""
     rng = np.random.default_rng(seed)
-    solutions = inverse_all(oracle.reachable_points(rng, count, g), g)
-    theta = rng.permutation(solutions.theta[solutions.valid])
     found = []
     for branch in ASSEMBLY_MODES:
-        angles = theta[forward_all(theta, g).valid[:, branch.index]]
+        angles = rng.permutation(oracle.angles_on(branch, rng, count, g))
         factors = jacobian.factors(angles, branch, g)
         level = factors.constraint[:, None] / g.l4
         size = np.abs(np.concatenate([dimensionless(factors, g), level], axis=1))

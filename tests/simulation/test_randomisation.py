@@ -336,17 +336,11 @@ def test_with_other_lengths_the_truth_is_elsewhere_by_what_first_order_predicts(
     plant = Plant(length_errors=ERRORS)
     started = simulation.reset(THETA, ON_TABLE, plant=plant)
     settled = rest(simulation, plant)
-    steps = 1e-6 * np.eye(7)
-    per_length = np.array(
-        [
-            (
-                kinematics.forward(THETA, geometry=lengths(step))
-                - kinematics.forward(THETA, geometry=lengths(-step))
-            )
-            / 2e-6
-            for step in steps
-        ]
-    )
+
+    def moved(errors: FloatArray) -> FloatArray:
+        return kinematics.forward(THETA, geometry=lengths(errors))
+
+    per_length = [(moved(step) - moved(-step)) / 2e-6 for step in 1e-6 * np.eye(7)]
     predicted = np.array(ERRORS) @ per_length
     assert started.closure_error < 1e-6
     assert settled.closure_error < 0.05e-3

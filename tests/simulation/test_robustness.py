@@ -22,7 +22,15 @@ def bang_bang_mostly_down(rng, step, action):
     return action
 
 
+def hammering(rng, step, action):
+    if step < 12:  # until it is over the puck
+        return action
+    vertical = (1, 1, 1, 1, -1, -1, 1, 1, 1, -1, 1, 1)[step // 2 % 12]
+    return np.append(rng.choice([-1, 0, 1], 2) * (step % 2), (vertical, 0.0))
+
+
 HOSTILE = {
+    "hammering on the puck": hammering,
     "straight down": lambda rng, step, action: DOWN,
     "grasped, then down": lambda rng, step, action: action if step < 14 else DOWN + SUCKING,
     "dropped, then down": lambda rng, step, action: action if step < 14 else DOWN,
