@@ -1,30 +1,11 @@
 """An engine that was written outside the package, and engines that are refused."""
 
-import gymnasium as gym
 import pytest
-from conformance import CHECKS
-from episodes import expert_episode
 from kinematic import KinematicEngine
 
 import tpm_gym
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.simulation import Engine
-
-
-@pytest.fixture(params=["TPMReach-v0", "TPMPickAndPlaceJoints-v0"])
-def env(request):
-    return gym.make(request.param, engine="kinematic")
-
-
-@pytest.mark.parametrize("env_id", ["TPMReach-v0", "TPMPickAndPlaceJoints-v0"])
-@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
-def test_the_tasks_conform_on_it(check, env_id):
-    check(lambda: gym.make(env_id, engine="kinematic"))
-
-
-def test_the_expert_solves_the_tasks_on_it(env):
-    episodes = [list(expert_episode(env, seed)) for seed in range(20)]
-    assert [episode[-1][2]["is_success"] for episode in episodes] == [True] * 20
 
 
 @pytest.mark.parametrize(
