@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from typing import Any
+from unittest.mock import patch
 
 import gymnasium as gym
 import pytest
@@ -20,11 +21,8 @@ from tpm_gym.tasks.registry import TASKS
 @pytest.fixture
 def registries() -> Iterator[None]:
     """What a test registers is forgotten after it."""
-    ids, tasks = dict(gym.registry), dict(TASKS)
-    yield
-    for registry, before in ((gym.registry, ids), (TASKS, tasks)):
-        registry.clear()
-        registry.update(before)
+    with patch.dict(gym.registry), patch.dict(TASKS):
+        yield
 
 
 class Lift(PickAndPlace):

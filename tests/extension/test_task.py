@@ -68,7 +68,11 @@ def test_the_worse_placed_block_decides(env):
 
 def test_users_place_the_blocks_by_name(env):
     red, blue = (0.05, -0.03, 0.015), (-0.05, -0.03, 0.018)
-    env.reset(options={"red": red, "blue": blue})
+    goal = (0.0, -0.03, 0.015, 0.0, -0.03, 0.048)
+    observation, _ = env.reset(options={"red": red, "blue": blue, "goal": goal})
+    assert np.allclose(observation["desired_goal"], goal, atol=1e-6)
+    assert np.allclose(env.unwrapped.goal, goal, atol=1e-6)
+    assert np.allclose(observation["achieved_goal"], [*red, *blue], atol=1e-6)
     assert np.allclose(env.unwrapped.state.object_position, [red, blue], atol=1e-6)
     with pytest.raises(ResetOptionError, match="clear of blue"):
         env.reset(options={"red": red, "blue": (0.06, -0.03, 0.018)})

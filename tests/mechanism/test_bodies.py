@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from examples import examples
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from tpm_gym.arrays import FloatArray
 from tpm_gym.mechanism.bodies import Link, Solid
 
-FloatArray = NDArray[np.float64]
 AXES = ("x", "y", "z")
 lengths = st.floats(0.005, 0.5)
 shares = st.one_of(st.just(0.0), st.floats(0.1, 0.95))

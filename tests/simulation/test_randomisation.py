@@ -5,14 +5,14 @@ from __future__ import annotations
 import inspect
 import itertools
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import yaml
-from episodes import expert_episode, fingerprint, random_episode
+from episodes import EVERYTHING, expert_episode, fingerprint, random_episode
 from machine import memory
 
 from tpm_gym import kinematics
@@ -409,15 +409,7 @@ def test_the_arm_at_home_stands_on_its_own_side_at_every_corner_of_the_ranges(bi
 
 # -- all together ----------------------------------------------------------------------------------
 
-MODERATE: Mapping[str, Any] = {
-    "link_mass": (0.8, 1.25),
-    "puck_mass": (0.5, 2.0),
-    "friction": (0.5, 1.5),
-    "motor_strength": (0.8, 1.2),
-    "encoder_noise": 1e-4,
-    "encoder_bias": 2e-4,
-    "length_error": 5e-4,
-}
+MODERATE = {**EVERYTHING, "motor_strength": (0.8, 1.2), "length_error": 5e-4}
 
 
 @pytest.mark.parametrize("latency", [0, 1])

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from examples import examples
-from hypothesis import strategies as st
 
 from tpm_gym.tasks.rewards import dense, distance, singularity_penalty, sparse
 
 SAFE = 0.08
-conditionings = st.floats(0, 1)
-safes = st.floats(0.01, 1)
 
 
 def test_penalty_is_zero_where_it_is_safe_and_one_at_a_singularity() -> None:
@@ -22,18 +18,12 @@ def test_penalty_is_zero_where_it_is_safe_and_one_at_a_singularity() -> None:
     assert singularity_penalty(np.nextafter(SAFE, 0) - 1e-6, SAFE) > 0
 
 
-@examples(200, conditionings, conditionings, safes)
-def test_penalty_never_rises_with_the_conditioning(a: float, b: float, safe: float) -> None:
-    low, high = sorted((a, b))
-    worse, better = singularity_penalty(low, safe), singularity_penalty(high, safe)
-    assert 0 <= better <= worse <= 1
-
-
-@pytest.mark.parametrize("safe", [SAFE, 0.3])
-def test_penalty_is_steepest_at_the_threshold(safe: float) -> None:
+@pytest.mark.parametrize("safe", [0.01, SAFE, 0.3, 1.0])
+def test_penalty_falls_with_the_conditioning_steepest_at_the_threshold(safe: float) -> None:
     # Flat there, crossing it would cost nothing, and policies would not care.
     c = np.linspace(0, safe, 1001)
     slopes = -np.diff(singularity_penalty(c, safe)) / np.diff(c)
+    assert (slopes >= 0).all()
     assert (np.diff(slopes) > -1e-9).all()
     assert slopes[-1] == pytest.approx(4 / safe, rel=2e-3)
     assert slopes[0] == pytest.approx(0, abs=1e-6 / safe)
