@@ -15,7 +15,7 @@ from episodes import expert_episode
 import tpm_gym
 from tpm_gym import TPMEnv
 from tpm_gym.errors import ConfigurationError, EpisodeError, InputError
-from tpm_gym.tasks import Expert, Move, PickAndPlace, Reach
+from tpm_gym.tasks import Expert, Move, Reach
 
 PLACES = [{"machine": name} for name in ("paper", "wide", "gantry")] + [{"engine": "kinematic"}]
 SPARSE = [env_id for env_id in tpm_gym.ENV_IDS if "Dense" not in env_id]
@@ -120,41 +120,31 @@ def test_it_has_to_be_reset_for_each_episode(env: Any) -> None:
     expert.act(observation)
 
 
-class Twice(Reach):
+class Planned(Reach):
     """Its plan ends."""
 
+    moves = 2
+
     def plan(self, expert: Expert) -> Iterator[Move]:
-        for _ in range(2):
+        for _ in range(self.moves):
             yield Move(np.array(expert.machine.home) + (0.01, 0.0, 0.0), False)
 
 
-class Never(Reach):
-    """Its plan has no moves."""
-
-    def plan(self, expert: Expert) -> Iterator[Move]:
-        return iter(())
-
-
-class Unplanned(PickAndPlace):
-    """It leaves the plan to the base class."""
-
-    plan = tpm_gym.tasks.Task.plan
+def started(kind: type[Reach]) -> tuple[TPMEnv, Expert, Any]:
+    env = TPMEnv(kind)
+    return env, Expert(env), env.reset(seed=0)[0]
 
 
 def test_the_last_move_of_a_plan_is_kept_and_plans_without_one_are_told() -> None:
-    for kind in (Twice, Never, Unplanned):
-        env = TPMEnv(kind)
-        expert = Expert(env)
-        observation, _ = env.reset(seed=0)
-        if kind is Unplanned:
-            with pytest.raises(ConfigurationError, match="Unplanned"):
-                expert.reset(observation)
-        else:
-            expert.reset(observation)
-        if kind is Never:
-            with pytest.raises(EpisodeError, match="Never has no moves"):
-                expert.act(observation)
-        if kind is Twice:
-            for _ in range(6):
-                observation = env.step(expert.act(observation))[0]
-            assert expert.command == pytest.approx(np.array(env.machine.home) + (0.01, 0, 0))
+    env, expert, observation = started(Planned)
+    expert.reset(observation)
+    for _ in range(6):
+        observation = env.step(expert.act(observation))[0]
+    assert expert.command == pytest.approx(np.array(env.machine.home) + (0.01, 0, 0))
+    _, expert, observation = started(type("Never", (Planned,), {"moves": 0}))
+    expert.reset(observation)
+    with pytest.raises(EpisodeError, match="Never has no moves"):
+        expert.act(observation)
+    _, expert, observation = started(type("Unplanned", (Reach,), {"plan": tpm_gym.tasks.Task.plan}))
+    with pytest.raises(ConfigurationError, match="Unplanned"):
+        expert.reset(observation)
