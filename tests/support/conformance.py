@@ -113,7 +113,7 @@ def compute_reward_is_vectorised_and_keeps_what_info_holds(make: Make) -> None:
     assert np.array_equal(compute(achieved, desired, empty), goal_terms)
     # Relabelled with what was achieved, every goal term is at its best, and the others stay.
     assert np.array_equal(compute(achieved, achieved, empty), np.zeros(len(steps)))
-    others = [reward - goal for (_, reward, _), goal in zip(steps, goal_terms, strict=True)]
+    others = [sum(info["reward_terms"].values()) - info["reward_terms"]["goal"] for info in infos]
     assert np.allclose(compute(achieved, achieved, infos), others, rtol=0, atol=1e-12)
 
 
