@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 from pathlib import Path
 from types import BuiltinFunctionType
 from typing import Any
@@ -17,19 +14,13 @@ import pytest
 import raw_physics
 import soak
 import soak_report
-from paths import ROOT
+from paths import ROOT, read_strict
+from processes import PYTHON, printed_by
 from raw_physics import STEP, Recorder, record, recording, replay
 
 from tpm_gym.tasks import Expert
 
 PICK = "TPMPickAndPlace-v0"
-
-
-def read_strict(path: Path) -> dict[str, Any]:
-    def refuse(constant: str) -> None:
-        raise AssertionError(f"{constant} is not JSON")
-
-    return json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse)
 
 
 def is_png(path: Path) -> bool:
@@ -104,13 +95,7 @@ def test_bench_speed_from_the_command_line(tmp_path):
     numbers, plot = tmp_path / "deep" / "speed.json", tmp_path / "speed.png"
     command = f"""--contestants TPMReach-v0 {PICK} --rounds 2 --steps 60 --scaling-steps 10
         --json {numbers} --plot {plot}""".split()
-    done = subprocess.run(
-        [sys.executable, str(ROOT / "benchmarks" / "bench_speed.py"), *command],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    output = printed_by(PYTHON, ROOT / "benchmarks" / "bench_speed.py", *command)
     content = read_strict(numbers)
     assert list(content["contestants"]) == ["TPMReach-v0", PICK]
     for entry in content["contestants"].values():
@@ -131,7 +116,7 @@ def test_bench_speed_from_the_command_line(tmp_path):
     for key in ("command", "commit", "versions", "machine", "load_before", "unavailable"):
         assert key in content
     assert str(tmp_path) not in numbers.read_text(encoding="utf-8")
-    assert f"not measured: {PICK} over PandaPickAndPlace-v3" in done.stdout
+    assert f"not measured: {PICK} over PandaPickAndPlace-v3" in output
     assert is_png(plot)
 
 
@@ -301,27 +286,14 @@ def test_an_interrupted_soak_keeps_its_samples_and_does_not_pass(tmp_path, monke
     assert not content["finished"]
 
 
-def test_a_restored_state_that_goes_on_otherwise_is_found():
-    class Forgetful:
-        """Restores nothing."""
-
-        def __init__(self, env):
-            self._env = env
-
-        def __getattr__(self, name):
-            return getattr(self._env, name)
-
-        def restore_state(self, snapshot):
-            pass
-
+def test_a_restored_state_that_goes_on_otherwise_is_found(monkeypatch):
     env = gym.make("TPMReach-v0")
     env.reset(seed=0)
     endurance = soak.Soak(0)
     assert not endurance._check_restore(env, np.random.default_rng(0))
-    wrapped = type("Wrapped", (), {"unwrapped": Forgetful(env.unwrapped)})()
-    wrapped.action_space = env.action_space
+    monkeypatch.setattr(env.unwrapped, "restore_state", lambda snapshot: None)
     with pytest.raises(RuntimeError, match="restored state differs"):
-        endurance._check_restore(wrapped, np.random.default_rng(0))
+        endurance._check_restore(env, np.random.default_rng(0))
     env.close()
 
 

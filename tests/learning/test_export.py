@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from processes import TPM_GYM, error_of
 from sb3_contrib import TQC
 from stable_baselines3 import DDPG, PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
-from trainings import tpm_gym_command
 
 import tpm_gym
 from tpm_gym.learning import GoalGapExtractor, PenaltyHerReplayBuffer, export
@@ -304,10 +304,9 @@ def test_the_command_line_does_not_touch_what_is_not_trusted(run: Path) -> None:
     """In a process of its own, with a file that would leave a trace if it were unpickled."""
     trace = run / "trace"
     (run / "best.zip").write_bytes(pickle.dumps(Trace(str(trace))))
-    done = tpm_gym_command("export", run / "best.zip", run / "out")
-    assert done.returncode == 1
-    assert done.stderr.startswith("error: ")
-    assert "--trust-pickle" in done.stderr
+    error = error_of(*TPM_GYM, "export", run / "best.zip", run / "out")
+    assert error.startswith("error: ")
+    assert "--trust-pickle" in error
     assert not trace.exists()
     assert not (run / "out.json").exists()
 

@@ -6,12 +6,7 @@ import csv
 import functools
 import io
 import json
-import os
-import signal
-import subprocess
-import sys
 import tempfile
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -76,37 +71,6 @@ def quiet() -> Console:
 def said(console: Console) -> str:
     assert isinstance(console.file, io.StringIO)
     return console.file.getvalue()
-
-
-def python(*words: str | Path, **options: Any) -> subprocess.CompletedProcess[str]:
-    """Run Python in a process of its own, to its end."""
-    return subprocess.run(
-        [sys.executable, *words], capture_output=True, text=True, check=False, **options
-    )
-
-
-def tpm_gym_command(*words: str | Path, **options: Any) -> subprocess.CompletedProcess[str]:
-    return python("-m", "tpm_gym.learning", *words, **options)
-
-
-def signalled(
-    words: list[str], ready: Callable[[], object], number: signal.Signals
-) -> tuple[int, str]:
-    """Signal Python and its children, as a terminal does, once it is ready; status and output."""
-    process = subprocess.Popen(
-        [sys.executable, *words],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        start_new_session=True,
-    )
-    deadline = time.monotonic() + 120
-    while not ready() and process.poll() is None:
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
-    os.killpg(process.pid, number)
-    output, _ = process.communicate(timeout=60)
-    return process.returncode, output
 
 
 def make_config(case: str, folder: Path) -> TrainingConfig:
