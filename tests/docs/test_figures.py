@@ -59,22 +59,6 @@ def test_parallel_lines_are_zeros_with_a_change_of_sign(index, y):
     points = section.points(np.concatenate(lines))
     # Near the edge of the reach a factor changes like a square root: hence the tolerance.
     assert np.abs(factors_at(points, ELBOWS_OUT).parallel[..., index]).max() < 1e-10
-    matrices = np.array([parallel_jacobian(point) for point in points[:: len(points) // 20]])
-    values = np.linalg.svd(matrices, compute_uv=False)
-    assert (values[:, 2] / values[:, 0]).max() < 1e-9
-
-
-def parallel_jacobian(point: np.ndarray) -> np.ndarray:
-    """A of the point, from the rods of the drawn skeleton and not from the factors."""
-    s = skeleton(point, ELBOWS_OUT)
-    rods, (cos, sin, _) = s.c - s.b, (s.e1 - s.d1) / PAPER.l7
-    return np.array(
-        [
-            [cos * rods[0, 0], sin * rods[0, 0], cos * rods[0, 2]],
-            [cos * rods[1, 0], sin * rods[1, 0], cos * rods[1, 2]],
-            rods[2],
-        ]
-    )
 
 
 def test_plane_y_0_is_found_in_sections_of_constant_z():

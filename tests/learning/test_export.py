@@ -184,15 +184,6 @@ def test_exporting_leaves_the_model_as_it_was(tmp_path: Path, model: Any) -> Non
         assert torch.equal(value, weights[name])
 
 
-def test_a_model_fresh_from_an_update_is_exported(tmp_path: Path) -> None:
-    model = make(PPO, Blank(), net_arch=[4])
-    batch, _ = model.policy.obs_to_tensor(observations(Blank(), 3))
-    actions, _, _ = model.policy(batch)
-    model.policy.evaluate_actions(batch, actions)
-    save(model, tmp_path / "fresh")
-    assert tpm_gym.load_policy(tmp_path / "fresh").description.algorithm == "ppo"
-
-
 def test_stable_baselines_evaluates_an_exported_policy(tmp_path: Path, model: Any) -> None:
     loaded: Any = tpm_gym.load_policy(save(model, tmp_path / "p"))
     mean, _ = evaluate_policy(loaded, DummyVecEnv([Blank]), n_eval_episodes=2, warn=False)

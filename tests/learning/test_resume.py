@@ -32,7 +32,6 @@ from trainings import (
 from tpm_gym.learning import ResumeConfig, TrainingConfig, resume, train
 from tpm_gym.learning.checkpoint import CheckpointStore, Content
 from tpm_gym.learning.configuration import complete
-from tpm_gym.learning.errors import CheckpointError
 from tpm_gym.learning.logger import make_logger
 from tpm_gym.learning.training import make_model, make_training_envs
 from tpm_gym.learning.training_state import EpisodeRecorder, restore
@@ -129,14 +128,6 @@ def test_a_damaged_checkpoint_costs_only_time(killed: Kill) -> None:
     assert f"warning: damaged checkpoint: {damaged}" in said(console)
     assert "from step 150 to 300" in said(console)
     assert_equal_runs(uninterrupted("sac"), run)
-
-
-def test_all_checkpoints_damaged_is_an_error(killed: Kill) -> None:
-    run = killed(120).run
-    for path in (run / "checkpoints").glob("*/torch.pt"):
-        path.write_bytes(b"")
-    with pytest.raises(CheckpointError, match=r"torch\.pt"):
-        resume(ResumeConfig(run), quiet())
 
 
 # -- hindsight over the seam -----------------------------------------------------------------------

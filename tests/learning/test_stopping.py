@@ -211,21 +211,6 @@ def test_a_policy_is_never_replaced_by_beginning_again(half: TrainingConfig, pol
     assert contents(half.run) == before
 
 
-def test_a_run_whose_checkpoints_could_not_be_written_keeps_its_policies(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config = replace(make_config("sac", tmp_path), steps=120)
-    usage: Any = shutil.disk_usage(tmp_path)
-    with monkeypatch.context() as patched:
-        patched.setattr(shutil, "disk_usage", lambda path: usage._replace(free=0))
-        console = quiet()
-        assert train(config, console) is None
-    assert "cannot write checkpoint" in said(console)
-    before = contents(config.run)
-    assert resume(ResumeConfig(config.run), quiet()) is None
-    assert contents(config.run) == before
-
-
 def test_nothing_to_resume_is_an_error_that_says_so(tmp_path: Path) -> None:
     for run in (tmp_path, tmp_path / "nowhere"):
         with pytest.raises(RunError, match="tpm-gym train"):

@@ -7,7 +7,7 @@ import functools
 import io
 import json
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -167,21 +167,6 @@ def evaluations(run: Path) -> Any:
     return without_times([json.loads(line) for line in lines])
 
 
-def assert_equal_tensors(first: Any, second: Any) -> None:
-    assert type(first) is type(second)
-    if isinstance(first, torch.Tensor):
-        assert torch.equal(first, second)
-    elif isinstance(first, Mapping):
-        assert first.keys() == second.keys()
-        for name in first:
-            assert_equal_tensors(first[name], second[name])
-    elif isinstance(first, list | tuple):
-        for one, other in zip(first, second, strict=True):
-            assert_equal_tensors(one, other)
-    else:
-        assert first == second
-
-
 def assert_equal_runs(first: Path, second: Path) -> None:
     """Compare two finished runs: networks, optimisers, buffer, generators, episodes and logs."""
     one, other = end_of(first), end_of(second)
@@ -189,7 +174,7 @@ def assert_equal_runs(first: Path, second: Path) -> None:
     for name, array in one.arrays.items():
         np.testing.assert_array_equal(array, other.arrays[name], err_msg=name)
     tensors = [torch.load(io.BytesIO(end.files["torch.pt"])) for end in (one, other)]
-    assert_equal_tensors(*tensors)
+    torch.testing.assert_close(*tensors, rtol=0, atol=0)
     assert state_of(one) == state_of(other)
     assert table(first) == table(second)
     assert evaluations(first) == evaluations(second)
