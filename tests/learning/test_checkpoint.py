@@ -275,7 +275,7 @@ def test_a_write_that_fails_half_way_leaves_the_others_whole(folder: Path, limit
     ("problem", "raised", "message"),
     [
         (OSError(errno.ENOSPC, "full"), CheckpointError, "full; that of step 2 stays"),
-        (KeyboardInterrupt(), KeyboardInterrupt, ""),
+        (KeyboardInterrupt(), KeyboardInterrupt, None),
     ],
 )
 def test_a_flush_that_fails_is_named_and_the_partial_checkpoint_removed(
@@ -283,7 +283,7 @@ def test_a_flush_that_fails_is_named_and_the_partial_checkpoint_removed(
     monkeypatch: pytest.MonkeyPatch,
     problem: BaseException,
     raised: type[BaseException],
-    message: str,
+    message: str | None,
     moment: int,
 ) -> None:
     store = CheckpointStore(folder)
