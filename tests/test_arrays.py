@@ -1,7 +1,5 @@
 """Numbers are taken as users write them, and whatever is none is refused by a typed error."""
 
-from __future__ import annotations
-
 from datetime import date, datetime, timedelta
 from typing import Any
 

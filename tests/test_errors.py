@@ -1,7 +1,5 @@
 """Errors carry their values, say what is valid, and are caught as a caller would expect."""
 
-from __future__ import annotations
-
 import copy
 import inspect
 import pickle

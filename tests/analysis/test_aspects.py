@@ -1,7 +1,5 @@
 """Reachable sets, aspects and boxes are what brute force on the oracle's factors says they are."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import product
 

@@ -4,8 +4,6 @@ docs/paper.md lists them in words. The printed forms exist nowhere but here; tho
 on topology are in test_paper_topology.py.
 """
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """docs/paper.md covers every equation, and what it names (functions, tests, sections) exists."""
 
-from __future__ import annotations
-
 import importlib
 import re
 from functools import reduce

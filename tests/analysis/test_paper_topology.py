@@ -3,8 +3,6 @@
 Named after the equations; docs/paper.md lists them in words.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import oracle
 import pytest

@@ -1,7 +1,5 @@
 """POC sets are pairs of subspaces, and Eqs. 1 to 5 combine them as the paper says."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from examples import examples

@@ -1,7 +1,5 @@
 """Singularities are what the oracle's factors say, and as far away as brute force finds them."""
 
-from __future__ import annotations
-
 import numpy as np
 import oracle
 import pytest

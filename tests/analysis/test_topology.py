@@ -1,7 +1,5 @@
 """Eqs. 1 to 5 give the paper's numbers, screw theory and the rank of the loops agree with them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

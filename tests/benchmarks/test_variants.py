@@ -4,8 +4,6 @@ And the reason why the default is cut at the base too: Bullet's direct solver ho
 multibodies, and loses them within one.
 """
 
-from __future__ import annotations
-
 import fidelity_lab
 import gauss_seidel
 import numpy as np

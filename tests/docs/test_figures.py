@@ -1,7 +1,5 @@
 """The data behind the figures of docs/: zero sets, surfaces, skeletons, volumes; one is drawn."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from paths import ROOT

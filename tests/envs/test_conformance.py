@@ -1,7 +1,5 @@
 """Every id keeps what tpm_gym promises, on every machine, in every engine."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The same seed gives the same bits: again, later, elsewhere, side by side, copied or restored."""
 
-from __future__ import annotations
-
 import copy
 import os
 import pickle

@@ -1,7 +1,5 @@
 """What the environment does with its options, its episodes and its snapshots; its datasheet."""
 
-from __future__ import annotations
-
 import copy
 import inspect
 import re

@@ -1,7 +1,5 @@
 """Ids mean what they say; users add their own; importing the package imports little."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 from unittest.mock import patch

@@ -3,8 +3,6 @@
 Their records are made by ``python tests/support/rollouts.py tests/data/rollouts.json``.
 """
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

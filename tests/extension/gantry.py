@@ -1,7 +1,5 @@
 """A gantry: three slides at right angles, in one file outside the package."""
 
-from __future__ import annotations
-
 from functools import cached_property
 
 from tpm_gym import register_machine

@@ -1,7 +1,5 @@
 """An engine without physics, in one file outside the package: joints jump, blocks stay put."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Stack: a task with two objects, in one file outside the package."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 
 import numpy as np

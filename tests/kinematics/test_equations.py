@@ -1,7 +1,5 @@
 """The one text gives the same in plain floats, arrays and tensors, and tensors differentiate it."""
 
-from __future__ import annotations
-
 import math
 import subprocess
 import sys

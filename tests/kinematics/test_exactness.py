@@ -5,8 +5,6 @@ from the table of points, densely over each unknown angle, bisects every change 
 into every extremum that comes near zero for a pair of roots between two samples.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
@@ -71,7 +69,6 @@ both_lengths = pytest.mark.parametrize("g", [PAPER, WIDE])
 @pytest.mark.parametrize("count", [10_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
 def test_random_inputs_close(count: int, solve: Solve, g: Geometry) -> None:
     gap, branches = worst(solve, count, g, seed=1)
-    print(f"{solve.__name__} {g.l7}: largest gap {gap:.2e} m over {branches} branches")
     assert gap < CLOSED
     assert branches > 0.2 * count
 

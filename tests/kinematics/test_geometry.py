@@ -1,7 +1,5 @@
 """Lengths that make no mechanism are refused, and those that are refused indeed make none."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, replace
 from itertools import product
 from types import SimpleNamespace

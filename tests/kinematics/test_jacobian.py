@@ -1,7 +1,5 @@
 """The Jacobians are the derivatives of the kinematics, and their factors are the singularities."""
 
-from __future__ import annotations
-
 import numpy as np
 import oracle
 import pytest

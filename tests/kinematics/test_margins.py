@@ -1,7 +1,5 @@
 """What has no solution is told by validity in batches, and explained by the part that fails."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

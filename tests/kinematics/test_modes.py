@@ -1,7 +1,5 @@
 """Names of the branches: signs only, one slot each, the environments' own the useful ones."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 from typing import Any
 

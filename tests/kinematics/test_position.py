@@ -1,7 +1,5 @@
 """Forward and inverse kinematics invert each other, on every branch, under the promised labels."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """sympy proves, for any lengths, that our forms of the equations follow from the closures."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The task's region can be reached everywhere, and is singular nowhere."""
 
-from __future__ import annotations
-
 import numpy as np
 import oracle
 import pytest

@@ -1,7 +1,5 @@
 """A whole checkpoint is left by a death at any moment, and damage anywhere is noticed."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

@@ -1,7 +1,5 @@
 """Demonstrations are whole episodes of the expert, as a replay buffer would have recorded them."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium as gym

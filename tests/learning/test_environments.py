@@ -1,7 +1,5 @@
 """What a user registers with Gymnasium is trained, resumed and evaluated like our own ids."""
 
-from __future__ import annotations
-
 import json
 import sys
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """An evaluation writes what it promises: a table, strict JSON and a video, without torch."""
 
-from __future__ import annotations
-
 import json
 import pickle
 from pathlib import Path

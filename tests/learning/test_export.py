@@ -1,7 +1,5 @@
 """An exported policy acts as the model does, and what cannot be exported is refused."""
 
-from __future__ import annotations
-
 import json
 import pickle
 import sys

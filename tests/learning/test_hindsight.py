@@ -1,7 +1,5 @@
 """The penalty survives hindsight: relabelled rewards are what the environment would have paid."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

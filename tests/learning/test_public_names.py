@@ -1,7 +1,5 @@
 """The package's names are there without the cost of what is behind them."""
 
-from __future__ import annotations
-
 import pytest
 from processes import PYTHON, printed_by
 

@@ -1,7 +1,5 @@
 """The page of results says what the runs did: statistics by hand, and failures are kept."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import signal

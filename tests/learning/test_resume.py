@@ -1,7 +1,5 @@
 """A training that was killed ends, once resumed, as if nothing had happened."""
 
-from __future__ import annotations
-
 import json
 import os
 import random

@@ -1,7 +1,5 @@
 """Episodes repeat exactly, records say what happened, and intervals cover what they promise."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial

@@ -1,7 +1,5 @@
 """The folder of a run: what may be deleted, and in which order."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

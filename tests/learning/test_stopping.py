@@ -1,7 +1,5 @@
 """A training stops when asked to, outlives a full disk, and refuses to go on as another one."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

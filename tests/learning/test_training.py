@@ -1,7 +1,5 @@
 """Training repeats exactly, refuses what cannot work, and leaves a complete run folder."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

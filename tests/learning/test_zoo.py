@@ -1,7 +1,5 @@
 """rl-baselines3-zoo trains with our recipes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Masses and inertias equal a numerical integration over the solids that are drawn."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

@@ -1,7 +1,5 @@
 """When the cup seals: the whole lip on the block's top, near it, and not askew."""
 
-from __future__ import annotations
-
 import math
 from itertools import product
 

@@ -1,7 +1,5 @@
 """A machine is one value: its kinematics agree, its limits are checked, and it is found by name."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

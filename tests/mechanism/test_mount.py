@@ -1,7 +1,5 @@
 """The mount is a rigid motion, there and back, that hangs the base over the table."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from examples import examples

@@ -1,7 +1,5 @@
 """The tree of links closes its loops, stands where the kinematics say, and can be a machine."""
 
-from __future__ import annotations
-
 import numpy as np
 import oracle
 import pytest

@@ -1,7 +1,5 @@
 """The files in urdf/ are what the mechanism's data give, number by number."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A policy on file loads without trust: damage and ill will are named, and nothing grows."""
 
-from __future__ import annotations
-
 import json
 import tempfile
 from collections.abc import Sequence

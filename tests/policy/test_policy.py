@@ -1,7 +1,5 @@
 """A loaded policy acts as its layers say, names what does not fit, and needs PyTorch alone."""
 
-from __future__ import annotations
-
 import copy
 import json
 import os

@@ -1,7 +1,5 @@
 """The published policies load without trust, fit, and repeat their evaluations."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

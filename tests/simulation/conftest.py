@@ -1,7 +1,5 @@
 """The simulation that most tests here look at."""
 
-from __future__ import annotations
-
 import pytest
 
 from tpm_gym.simulation import Block, Scene, Simulation

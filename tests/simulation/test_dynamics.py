@@ -4,8 +4,6 @@ Theory is the mechanism's data (masses, inertias, frames) moved along the closed
 kinematics, differentiated by central differences. What was measured is in the comments.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Near the singularities, and through them on purpose: detected, reported, never trained on."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -9,6 +7,7 @@ import inside_bullet
 import numpy as np
 import pytest
 from episodes import fingerprint, random_episode
+from states import apart
 
 from tpm_gym.arrays import Vector
 from tpm_gym.envs.env import TPMEnv
@@ -30,11 +29,6 @@ def env() -> TPMEnv:
 def true_y(state: State) -> float:
     """Of the simulated platform, machine's frame, m."""
     return -float(state.platform_position[1])
-
-
-def apart(state: State) -> float:
-    """Forward kinematics against the truth, m."""
-    return float(np.linalg.norm(state.fk_position - state.platform_position))
 
 
 def push(env: TPMEnv, force: Vector) -> Callable[[], None]:

@@ -1,7 +1,5 @@
 """Each quantity of a randomised machine has its physical effect, unknown to the controller."""
 
-from __future__ import annotations
-
 import inspect
 import itertools
 import re

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from machines import anywhere, each_machine, excursions
+from states import apart
 
 from tpm_gym.errors import InputError, ModeChangeError, UnreachableError
 from tpm_gym.kinematics import ELBOWS_OUT, inverse, jacobian
@@ -19,10 +20,6 @@ ON_TABLE = {"object": (0.0, -0.03, 0.015)}
 
 def follow(simulation, commands):
     return [simulation.move(command) for command in commands]
-
-
-def apart(state):
-    return np.linalg.norm(state.platform_position - state.fk_position)
 
 
 # -- the mechanism ---------------------------------------------------------------------------------

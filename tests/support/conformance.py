@@ -7,8 +7,6 @@ Each check takes a callable that makes an environment, as ``partial(gym.make, en
         check(lambda: gym.make("TPMMine-v0"))
 """
 
-from __future__ import annotations
-
 import copy
 import json
 import pickle

@@ -1,7 +1,5 @@
 """Episodes to compare to the last bit. Fresh processes import this too, so it imports little."""
 
-from __future__ import annotations
-
 import hashlib
 import pickle
 from collections.abc import Iterable, Iterator

@@ -1,7 +1,5 @@
 """Properties of whatever hypothesis draws: the same draws in every process, however slow."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Hands inside PyBullet: forces, and eyes on every time step."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The machines that properties are shown for, and places and motions all over their regions."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from operator import attrgetter
 

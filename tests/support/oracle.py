@@ -3,8 +3,6 @@
 Nothing here calls the package's formulas, so a slip in them cannot hide.
 """
 
-from __future__ import annotations
-
 from dataclasses import astuple
 from types import SimpleNamespace
 from typing import Any, Protocol

@@ -1,7 +1,5 @@
 """Places in the checkout, and how files are read."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Policies written to files for tests, by the letter of the format and without the exporter."""
 
-from __future__ import annotations
-
 import itertools
 import json
 from hashlib import sha256

@@ -1,7 +1,5 @@
 """Commands in processes of their own: run to the end, or signalled on the way."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -5,8 +5,6 @@
 Recorded before the package was taken apart into rooms, which had to keep them.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import struct

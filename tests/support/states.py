@@ -1,12 +1,15 @@
 """States with any numbers in them: tasks are pure functions of them."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
 
 from tpm_gym.simulation.state import State
+
+
+def apart(state: State) -> float:
+    """Forward kinematics against the truth, m."""
+    return float(np.linalg.norm(state.fk_position - state.platform_position))
 
 
 def random_state(

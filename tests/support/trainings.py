@@ -1,7 +1,5 @@
 """Small trainings to be killed and stopped, and the comparison of what they end in."""
 
-from __future__ import annotations
-
 import csv
 import functools
 import io

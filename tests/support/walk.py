@@ -1,7 +1,5 @@
 """The tree of links, walked joint by joint: where everything is, from the joints alone."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Whatever the action, the next command is one that the simulation can follow."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from examples import examples

@@ -1,7 +1,5 @@
 """The scripted controller solves every task on every machine, and says when it cannot."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

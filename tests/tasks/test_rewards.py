@@ -1,7 +1,5 @@
 """The reward terms: exact at their ends, steep where it matters, the same alone or in a batch."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Sampled ends are safe, apart and spread; tempting ones lie at the threshold and lure beyond."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from typing import Any

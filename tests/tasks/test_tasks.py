@@ -1,7 +1,5 @@
 """Tasks are functions of a state, over any leading axes, that say what they need of a user."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The client of the physics engine: private, quiet, given back; and what it makes of windows."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Numerical settings: what they are, and what is refused."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest
