@@ -145,6 +145,10 @@ def test_links_and_factors_that_are_not_the_mechanisms_are_refused() -> None:
         inertia_of(replace(mechanism, links=(*mechanism.links, other)), PAPER)
     with pytest.raises(ConfigurationError, match=f"{LINKS} moving links"):
         Dynamics(link_masses=(1.0, 2.0)).gravity(HOME)
+    with pytest.raises(ConfigurationError, match="payload"):
+        Dynamics(payload=-0.1)
+    with pytest.raises(ConfigurationError, match="link_masses"):
+        Dynamics(link_masses=(0.0,) * LINKS)
 
 
 # Mechanics
