@@ -15,7 +15,7 @@ import numpy as np
 import oracle
 import pytest
 import torch
-from hypothesis import given, settings
+from examples import examples
 from machines import anywhere, each_machine
 from motion import IDLE, Bodies
 
@@ -75,8 +75,7 @@ def test_inertia_and_weight_are_those_of_the_bodies_in_every_assembly_mode(g: Ge
     assert branches == set(ASSEMBLY_MODES)
 
 
-@settings(derandomize=True, max_examples=25, deadline=None)
-@given(oracle.geometries(), oracle.seeds())
+@examples(25, oracle.geometries(), oracle.seeds())
 def test_inertia_and_weight_are_those_of_the_bodies_for_any_lengths(g: Geometry, seed: int) -> None:
     branches_with_those_of_the_bodies(g, seed)
 

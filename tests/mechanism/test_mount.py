@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
 from hypothesis import strategies as st
 from machines import each_machine
 
@@ -15,8 +15,7 @@ from tpm_gym.mechanism.cup import CUP
 coordinates = st.tuples(*[st.floats(-3, 3)] * 3)
 
 
-@settings(derandomize=True, max_examples=100)
-@given(st.floats(0.1, 2), coordinates, coordinates)
+@examples(100, st.floats(0.1, 2), coordinates, coordinates)
 def test_mounts_are_rigid_and_round_trip(height: float, p: Vector, q: Vector) -> None:
     mount = Mount(height)
     np.testing.assert_allclose(mount.to_paper(mount.to_world(p)), p, atol=1e-14)

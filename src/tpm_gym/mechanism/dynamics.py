@@ -49,20 +49,6 @@ from tpm_gym.mechanism import tree
 from tpm_gym.mechanism.inertia import Inertia, Swing, inertia_of
 from tpm_gym.mechanism.mount import GRAVITY
 
-__all__ = [
-    "Accelerations",
-    "Dynamics",
-    "Energy",
-    "Pose",
-    "Velocities",
-    "accelerations",
-    "carried",
-    "energies",
-    "pose_at",
-    "torques",
-    "velocities",
-]
-
 _VECTOR = np.arange(3)
 _MATRIX = np.arange(9).reshape(3, 3)
 _SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])

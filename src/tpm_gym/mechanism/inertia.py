@@ -23,8 +23,6 @@ from tpm_gym.kinematics.geometry import Geometry
 from tpm_gym.kinematics.namespaces import Numbers
 from tpm_gym.mechanism.bodies import Link, Mechanism
 
-__all__ = ["Inertia", "Swing", "inertia_of"]
-
 X, Y, Z = range(3)
 _ROUNDING = 1e-9  # of a centre of mass, m; of two equal moments, relative
 

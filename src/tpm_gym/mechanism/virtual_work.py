@@ -18,8 +18,6 @@ import numpy as np
 from tpm_gym.arrays import FloatArray, Vector
 from tpm_gym.mechanism.bodies import Joint, Mechanism
 
-__all__ = ["torque"]
-
 _STEP = 1e-5  # rad or m
 _TIME = 1e-5  # s
 
