@@ -21,9 +21,9 @@ from tpm_gym.envs.env import TPMEnv
 from tpm_gym.errors import ConfigurationError, TPMError
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.mechanism import PAPER_TPM
+from tpm_gym.mechanism.mount import GRAVITY
 from tpm_gym.mechanism.tree import MOTOR_EFFORT
 from tpm_gym.simulation import Block, Plant, Randomisation, Simulation, State
-from tpm_gym.simulation.bullet.client import GRAVITY
 from tpm_gym.simulation.randomisation import _FACTORS, _SIZES, NOMINAL
 from tpm_gym.simulation.settings import settings_of
 
