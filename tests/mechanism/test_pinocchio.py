@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from tpm_gym.arrays import FloatArray
 from tpm_gym.kinematics import ASSEMBLY_MODES, inverse, workspace
 from tpm_gym.kinematics.geometry import PAPER
+from tpm_gym.mechanism.dynamics import Dynamics
 from tpm_gym.mechanism.tree import joint_angles
 from tpm_gym.mechanism.urdf import LOOPS_FILE, URDF_FILE
 from tpm_gym.resources import URDF as FOLDER
@@ -94,6 +95,14 @@ class Files:
         turn[self.driven] = theta - posture[at]
         return np.asarray(pin.integrate(self.model, posture, turn))
 
+    def mass_matrix(self, posture: FloatArray) -> FloatArray:
+        """(3, 3) kg m^2, as the motors feel it."""
+        upper = np.triu(pin.crba(self.model, self.data, posture))
+        masses = upper + np.triu(upper, 1).T
+        rates = np.zeros((self.model.nv, 3))
+        rates[self.driven], rates[self.passive] = np.eye(3), self.follow(self.loops(posture)[1])
+        return np.asarray(rates.T @ masses @ rates)
+
     def torque(self, posture: FloatArray) -> FloatArray:
         """(3,) N m, of the motors at rest, by virtual work."""
         weight = pin.computeGeneralizedGravity(self.model, self.data, posture)
@@ -142,12 +151,12 @@ def test_the_files_close_at_our_joint_angles_all_over_the_workspace(files: Files
         assert files.open_by(files.posture(angles)) < CLOSED
 
 
-def test_what_the_motors_hold_is_what_the_files_weigh(
+def test_what_the_motors_hold_and_move_is_what_the_files_weigh(
     files: Files, found: list[tuple[FloatArray, FloatArray]]
 ) -> None:
-    from tpm_gym.mechanism.dynamics import Dynamics
-
     dynamics = Dynamics()
     for point, posture in found:
-        expected = dynamics.gravity_torque(inverse(point))
-        np.testing.assert_allclose(files.torque(posture), expected, rtol=0, atol=1e-6)
+        theta = inverse(point)
+        held, moved = dynamics.gravity(theta), dynamics.mass_matrix(theta)
+        np.testing.assert_allclose(files.torque(posture), held, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(files.mass_matrix(posture), moved, rtol=1e-6, atol=1e-6)
