@@ -18,6 +18,7 @@ __all__ = [
     "EpisodeError",
     "GeometryError",
     "InputError",
+    "JointLimitError",
     "MissingPackageError",
     "ModeChangeError",
     "PolicyFileError",
@@ -102,6 +103,21 @@ class UnreachableError(TPMError, ValueError):
         """The message."""
         shown = ", ".join(f"{value:.4g}" for value in self.point)
         return f"({shown}) cannot be reached: {self.leg} fails by {-self.margin:.4g} m; {self.hint}"
+
+
+@dataclass(eq=False)
+class JointLimitError(TPMError, ValueError):
+    """A posture lies beyond a stop of a motor."""
+
+    template: ClassVar[str] = (
+        "joint {joint} cannot be at {position:.6g} {unit}: its stops are at {lower:.6g} and "
+        "{upper:.6g} {unit}; choose a posture between them"
+    )
+    joint: str
+    position: float
+    lower: float
+    upper: float
+    unit: str  # "rad", or "m" for a slide
 
 
 @dataclass(eq=False)
