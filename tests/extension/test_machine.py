@@ -42,6 +42,14 @@ def test_it_goes_where_its_kinematics_say_whatever_is_asked(env):
         assert GANTRY.region.margin(GANTRY.mount.to_paper(state.fk_position)) > -1e-6
 
 
+def test_torques_follow_from_its_bodies():
+    bridge, trolley, ram, cup = (link.mass for link in GANTRY.mechanism.links[1:])
+    moved = np.array([bridge + trolley + ram + cup, trolley + ram + cup, ram + cup])
+    change = np.array([3.0, -2.0, 5.0])
+    torque = GANTRY.torque(GANTRY.home, (0.3, 0.2, 0.1), tuple(change))
+    np.testing.assert_allclose(torque, moved * (change - (0, 0, 9.81)), rtol=1e-5)
+
+
 @pytest.mark.parametrize("task", ["reach", "pick_and_place"])
 def test_where_nothing_tempts_tempting_goals_are_refused(task):
     env = tpm_gym.TPMEnv(task, machine="gantry", goals="tempting")

@@ -36,6 +36,7 @@ def test_the_mount_hangs_the_base_upside_down() -> None:
     np.testing.assert_array_equal(mount.to_world([0, 0, 0]), [0, 0, 1.5])
     np.testing.assert_array_equal(mount.to_world([0.1, 0.2, 0.5]), [0.1, -0.2, 1.0])
     np.testing.assert_array_equal(mount.rotate(np.eye(3)), np.diag([1, -1, -1]))
+    assert mount.free_fall == (0.0, 0.0, 9.81)
     assert mount.to_world(np.zeros((4, 2, 3))).shape == (4, 2, 3)
 
 

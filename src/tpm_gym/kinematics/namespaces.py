@@ -141,7 +141,7 @@ def _torch() -> Namespace:
 
     def join(points: Sequence[Any]) -> Any:
         tensor = next(point for point in points if is_tensor(point))
-        shape = torch.broadcast_shapes(*(point.shape for point in points))
+        shape = np.broadcast_shapes(*(tuple(point.shape) for point in points))
         return torch.cat([like(point, tensor).expand(shape) for point in points], -1)
 
     return Namespace(

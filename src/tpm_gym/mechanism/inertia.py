@@ -145,7 +145,7 @@ class _Bodies:
         self._known: set[str] = set()
 
     def require_all_known(self) -> None:
-        left = [name for name in self._links if name not in self._known]
+        left = [name for name, k in self._links.items() if k.mass and name not in self._known]
         if left:
             raise ConfigurationError("mechanism", left, "the links of mechanism.tree.build alone")
 

@@ -20,7 +20,7 @@ from tpm_gym.mechanism.bodies import Joint, Mechanism
 __all__ = ["torque"]
 
 _STEP = 1e-5  # rad or m
-_TIME = 1e-4  # s
+_TIME = 1e-5  # s
 
 
 def torque(
