@@ -39,6 +39,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tpm_gym.arrays import FloatArray, Vector, finite_points, is_tensor
+from tpm_gym.errors import ConfigurationError
 from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode, equations
 from tpm_gym.kinematics.equations import Triple
 from tpm_gym.kinematics.geometry import PAPER, Geometry
