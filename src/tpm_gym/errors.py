@@ -86,6 +86,21 @@ class UnreachableError(TPMError, ValueError):
 
 
 @dataclass(eq=False)
+class JointLimitError(TPMError, ValueError):
+    """A posture lies beyond a stop of a motor."""
+
+    template: ClassVar[str] = (
+        "joint {joint} cannot be at {position:.6g} {unit}: its stops are at {lower:.6g} and "
+        "{upper:.6g} {unit}; choose a posture between them"
+    )
+    joint: str
+    position: float
+    lower: float
+    upper: float
+    unit: str  # "rad", or "m" for a slide
+
+
+@dataclass(eq=False)
 class SingularityError(TPMError, ValueError):
     """A quantity that does not exist at a singularity was asked for there."""
 

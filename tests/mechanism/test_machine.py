@@ -1,6 +1,8 @@
 """A machine is one value: its kinematics agree, its limits are checked, and it is found by name."""
 
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -16,8 +18,16 @@ from tpm_gym.errors import ConfigurationError, SingularityError, TPMError, Unrea
 from tpm_gym.kinematics import inverse
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.kinematics.workspace import Region
-from tpm_gym.mechanism import PAPER_TPM, TPM, WIDE_TPM, Machine, find_machine, register_machine
-from tpm_gym.mechanism.tree import joint_angles
+from tpm_gym.mechanism import (
+    PAPER_TPM,
+    TPM,
+    WIDE_TPM,
+    Machine,
+    find_machine,
+    register_machine,
+    tree,
+)
+from tpm_gym.mechanism.bodies import Mechanism
 
 share = st.floats(0.0, 1.0)
 
@@ -37,7 +47,7 @@ def test_kinematics_agree_all_over_the_region(machine: TPM, shares: Vector) -> N
     np.testing.assert_allclose(rows, jacobian, rtol=1e-5, atol=1e-5)
     assert conditioning == pytest.approx(1 / np.linalg.cond(rows), rel=1e-9)
     positions = machine.joint_positions(theta)
-    assert positions == joint_angles(theta, machine.assembly_mode, machine.geometry)
+    assert positions == tree.joint_angles(theta, machine.assembly_mode, machine.geometry)
     assert tuple(positions[name] for name in machine.mechanism.actuated) == theta
 
 
@@ -151,6 +161,49 @@ def test_a_region_out_of_reach_is_refused_with_what_fails_where(high: Vector, le
         replace(PAPER_TPM, region=Region(LOW, high))
     assert caught.value.point[1:] in {(high[1], z) for z in (LOW[2], high[2])} | {(LOW[1], high[2])}
     assert caught.value.margin < 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stopped(TPM):
+    """With another stop for the lifted arm 5."""
+
+    stop: float
+
+    @cached_property
+    def mechanism(self) -> Mechanism:
+        whole = tree.build(self.geometry)
+        links = [
+            replace(link, joint=replace(link.joint, upper=self.stop))
+            if link.joint and link.joint.name == "R21"
+            else link
+            for link in whole.links
+        ]
+        return replace(whole, links=tuple(links))
+
+
+def test_a_region_or_home_beyond_a_stop_is_refused_and_the_stop_is_named() -> None:
+    region = WIDE_TPM.region
+    farthest = max(WIDE_TPM.inverse(corner)[1] for corner in region.corners())
+    grid = [
+        tuple(within(WIDE_TPM, shares).tolist()) for shares in product((0, 0.25, 0.5, 1), repeat=3)
+    ]
+    inside = max(grid, key=lambda point: WIDE_TPM.inverse(point)[1])
+    assert WIDE_TPM.inverse(inside)[1] > farthest + 1e-3  # the corners are not all
+    values = {field.name: getattr(WIDE_TPM, field.name) for field in fields(WIDE_TPM)}
+    Stopped(**values, stop=farthest)
+    for name, stop, home in (
+        ("region", farthest - 1e-6, WIDE_TPM.home),
+        ("home", farthest, inside),
+    ):
+        with pytest.raises(ConfigurationError, match="R21 cannot be at") as caught:
+            Stopped(**{**values, "home": home}, stop=stop)
+        assert caught.value.name == name
+
+
+@each_machine
+def test_the_whole_region_is_between_the_stops(machine: TPM) -> None:
+    for shares in product(np.linspace(0, 1, 9), repeat=3):
+        machine.require_within_stops(machine.inverse(tuple(within(machine, shares).tolist())))
 
 
 def test_where_there_is_no_posture_the_errors_say_so() -> None:

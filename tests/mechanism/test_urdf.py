@@ -43,7 +43,7 @@ def test_regenerating_gives_the_shipped_files_byte_for_byte(tmp_path: Path) -> N
         assert path.read_bytes() == (FOLDER / path.name).read_bytes()
     assert {path.name for path in FOLDER.iterdir()} >= {URDF_FILE, LOOPS_FILE}
     texts = [path.read_text() for path in write(tmp_path, build(OTHER))]
-    assert texts == [urdf_text(build(OTHER)), loops_text(build(OTHER))]
+    assert texts == [urdf_text(build(OTHER), closure_frames=True), loops_text(build(OTHER))]
 
 
 def test_inertials_are_those_of_the_links(mechanism: Mechanism) -> None:
@@ -130,21 +130,33 @@ def test_materials_are_the_colours(mechanism: Mechanism) -> None:
     assert found == COLOURS
 
 
-def test_loops_file_names_motors_and_closures(mechanism: Mechanism) -> None:
+def test_loops_file_names_the_motors_and_pairs_massless_frames_at_the_closures(
+    mechanism: Mechanism,
+) -> None:
     content = yaml.safe_load(loops_text(mechanism))
-    assert set(content) == {"name_mot", "closed_loop"}
+    assert set(content) == {"closed_loop", "type", "name_mot"}
     assert content["name_mot"] == list(ACTUATED_JOINTS)
-    for entry, closure in zip(content["closed_loop"], mechanism.closures, strict=True):
-        assert entry["name"] == closure.name
-        assert entry["type"] == "3d"
-        assert entry["links"] == [closure.link_a, closure.link_b]
-        for found, expected in zip(
-            entry["points"], [closure.point_a, closure.point_b], strict=True
-        ):
-            assert found == pytest.approx(expected, **DIGITS)
+    assert content["type"] == ["3d"] * len(mechanism.closures)
+    root = ElementTree.fromstring(urdf_text(mechanism, closure_frames=True))
+    links = {element.get("name"): element for element in root.findall("link")}
+    held = {child(element, "child").get("link"): element for element in root.findall("joint")}
+    for pair, closure in zip(content["closed_loop"], mechanism.closures, strict=True):
+        sides = ((closure.link_a, closure.point_a), (closure.link_b, closure.point_b))
+        for name, (link, point) in zip(pair, sides, strict=True):
+            joint, inertial = held[name], child(links.pop(name), "inertial")
+            assert joint.get("type") == "fixed"
+            assert child(joint, "parent").get("link") == link
+            origin = child(joint, "origin")
+            assert numbers(origin.get("xyz")) == pytest.approx(point, **DIGITS)
+            assert numbers(origin.get("rpy")) == [0, 0, 0]
+            assert child(inertial, "mass").get("value") == "0"
+            assert set(child(inertial, "inertia").attrib.values()) == {"0"}
+    # Nothing else is added, and nothing is for the engine, which closes the loops by itself.
+    assert list(links) == [link.name for link in mechanism.links]
+    assert set(held) - {name for pair in content["closed_loop"] for name in pair} == {
+        element.get("link") for element in parsed(mechanism).findall("joint/child")
+    }
 
 
 def test_no_number_is_a_negative_zero(mechanism: Mechanism) -> None:
-    words = urdf_text(mechanism).replace('"', " ").split()
-    assert "-0" not in words
-    assert "-0" not in loops_text(mechanism).replace(",", " ").replace("[", " ").split()
+    assert "-0" not in urdf_text(mechanism, closure_frames=True).replace('"', " ").split()

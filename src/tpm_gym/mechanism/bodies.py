@@ -101,6 +101,11 @@ class Joint:
     effort: float = 0.0
     speed: float = 0.0
 
+    @property
+    def unit(self) -> Literal["rad", "m"]:
+        """What its position is in."""
+        return "m" if self.kind == "prismatic" else "rad"
+
 
 @dataclass(frozen=True)
 class Link:
@@ -185,6 +190,12 @@ class Mechanism:
             KeyError: If there is none.
         """
         return self.links[self._index[name]]
+
+    @property
+    def motors(self) -> tuple[Joint, ...]:
+        """The motors' joints, in the order of :attr:`actuated`."""
+        joints = {link.joint.name: link.joint for link in self.links if link.joint}
+        return tuple(joints[name] for name in self.actuated)
 
     def legs(self) -> tuple[Mechanism, ...]:
         """The spanning tree taken apart at the base: one tree for each arm and what hangs on it."""

@@ -21,7 +21,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tpm_gym.arrays import FloatArray, Vector, vector
-from tpm_gym.errors import ConfigurationError, SingularityError, UnreachableError
+from tpm_gym.errors import (
+    ConfigurationError,
+    JointLimitError,
+    SingularityError,
+    UnreachableError,
+)
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism import virtual_work
 from tpm_gym.mechanism.bodies import Mechanism
@@ -68,7 +73,7 @@ class Machine(ABC):
 
     Raises:
         ConfigurationError: If a value cannot be, home or the goals lie outside the region, or the
-            region reaches beyond a singularity.
+            region reaches beyond a singularity or a motor's stop.
         UnreachableError: If a corner of the region cannot be reached.
     """
 
@@ -102,9 +107,20 @@ class Machine(ABC):
         if not 0 < self.safe_conditioning <= 1:  # the penalty is in units of it
             raise ConfigurationError("safe_conditioning", self.safe_conditioning, "in (0, 1]")
         for corner in self.region.corners():
-            if (mode := self.mode_left(self.inverse(corner), corner)) is not None:
-                valid = f"in one {mode} mode; {corner} is beyond a singularity"
-                raise ConfigurationError("region", self.region, valid)
+            self._require_usable("region", corner)
+        self._require_usable("home", self.home)
+
+    def _require_usable(self, name: str, point: Vector) -> None:
+        """Refuse the option of that name if P cannot be worked with at ``point``."""
+        theta = self.inverse(point)
+        if (mode := self.mode_left(theta, point)) is not None:
+            valid = f"in one {mode} mode; {point} is beyond a singularity"
+            raise ConfigurationError(name, getattr(self, name), valid)
+        try:
+            self.require_within_stops(theta)
+        except JointLimitError as error:
+            valid = f"where every motor is between its stops; at {point}, {error}"
+            raise ConfigurationError(name, getattr(self, name), valid) from error
 
     # -- kinematics -------------------------------------------------------------------------
 
@@ -146,6 +162,18 @@ class Machine(ABC):
         """
         del theta, position
         return None
+
+    def require_within_stops(self, theta: Vector) -> None:
+        """Refuse joint positions beyond a motor's stop.
+
+        Raises:
+            JointLimitError: If there is one.
+        """
+        for motor, position in zip(self.mechanism.motors, theta, strict=True):
+            endless = motor.kind == "continuous"
+            if not (endless or motor.lower <= position <= motor.upper):
+                limits = motor.lower, motor.upper
+                raise JointLimitError(motor.name, position, *limits, motor.unit)
 
     # -- regions ----------------------------------------------------------------------------
 

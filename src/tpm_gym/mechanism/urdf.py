@@ -1,8 +1,12 @@
 """URDF text of a Mechanism, and the file of loop closures beside it.
 
-URDF knows trees only. The closures are written in the manner of the extended-URDF convention
-(a list ``closed_loop`` of frame pairs, ``type: 3d`` for ball joints, and ``name_mot`` for the
-motors), so that other tools can close the loops too.
+URDF knows trees only. The written one has a massless link at either end of each closure, and the
+file beside it pairs them in the extended-URDF convention of Gepetto's example-parallel-robots:
+``closed_loop`` lists pairs of frames, ``type`` says for each what coincides (``3d``: the origins, a
+ball joint), ``name_mot`` names the motors' joints. So Pinocchio closes the loops from the two files
+alone (its ``completeRobotLoader(folder, "tpm.urdf", "tpm.loops.yaml")`` reads them). Gravity is not
+in them: the base is the paper's, which hangs upside down over a table, so that things fall along
++z.
 
 Run ``python -m tpm_gym.mechanism.urdf FOLDER`` to write both files.
 """
@@ -13,7 +17,9 @@ import argparse
 from collections.abc import Iterable
 from pathlib import Path
 from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 
+from tpm_gym.arrays import Vector
 from tpm_gym.mechanism.bodies import Link, Mechanism, Solid
 from tpm_gym.mechanism.tree import build
 
@@ -41,10 +47,23 @@ _AXIS_RPY = {
     "z": (0.0, 0.0, 0.0),
 }
 
+_MOMENTS = {
+    "ixx": (0, 0),
+    "ixy": (0, 1),
+    "ixz": (0, 2),
+    "iyy": (1, 1),
+    "iyz": (1, 2),
+    "izz": (2, 2),
+}
 
-def urdf_text(mechanism: Mechanism) -> str:
-    """The spanning tree as URDF, in the paper frame."""
-    root = ElementTree.Element("robot", name="tpm")
+
+def urdf_text(mechanism: Mechanism, closure_frames: bool = False) -> str:
+    """The spanning tree as URDF, in the paper frame.
+
+    Args:
+        closure_frames: Whether to add the frames that :func:`loops_text` pairs.
+    """
+    root = Element("robot", name="tpm")
     root.append(ElementTree.Comment(" Generated from tpm_gym.mechanism; do not edit (make urdf). "))
     for name, rgba in COLOURS.items():
         material = ElementTree.SubElement(root, "material", name=name)
@@ -54,24 +73,21 @@ def urdf_text(mechanism: Mechanism) -> str:
     for link in mechanism.links:
         if link.joint is not None:
             root.append(_joint_element(link))
+    if closure_frames:
+        for name, parent, point in _closure_frames(mechanism):
+            root.extend(_frame_elements(name, parent, point))
     ElementTree.indent(root)
     return '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
 def loops_text(mechanism: Mechanism) -> str:
-    """The loop closures and the motors as YAML."""
-    lines = ["# Generated from tpm_gym.mechanism; do not edit (make urdf).", "name_mot:"]
-    lines += [f"  - {name}" for name in mechanism.actuated]
-    lines.append("closed_loop:")
-    for closure in mechanism.closures:
-        lines += [
-            f"  - name: {closure.name}",
-            "    type: 3d",
-            f"    links: [{closure.link_a}, {closure.link_b}]",
-            "    points:  # m, in the frames of the two links",
-            f"      - [{_numbers(closure.point_a, ', ')}]",
-            f"      - [{_numbers(closure.point_b, ', ')}]",
-        ]
+    """The loop closures and the motors as YAML, for the URDF with its closure frames."""
+    names = [name for name, _, _ in _closure_frames(mechanism)]
+    pairs = zip(names[::2], names[1::2], strict=True)
+    lines = ["# Generated from tpm_gym.mechanism; do not edit (make urdf).", "closed_loop:"]
+    lines += [f"  - [{a}, {b}]" for a, b in pairs]
+    lines.append(f"type: [{', '.join(['3d'] * len(mechanism.closures))}]")
+    lines.append(f"name_mot: [{', '.join(mechanism.actuated)}]")
     return "\n".join(lines) + "\n"
 
 
@@ -84,27 +100,44 @@ def write(folder: Path, mechanism: Mechanism | None = None) -> tuple[Path, Path]
     mechanism = mechanism or build()
     folder.mkdir(parents=True, exist_ok=True)
     urdf, loops = folder / URDF_FILE, folder / LOOPS_FILE
-    urdf.write_text(urdf_text(mechanism), encoding="utf-8", newline="\n")
+    urdf.write_text(urdf_text(mechanism, closure_frames=True), encoding="utf-8", newline="\n")
     loops.write_text(loops_text(mechanism), encoding="utf-8", newline="\n")
     return urdf, loops
 
 
-def _link_element(link: Link) -> ElementTree.Element:
-    element = ElementTree.Element("link", name=link.name)
+def _closure_frames(mechanism: Mechanism) -> list[tuple[str, str, Vector]]:
+    """Both sides of each closure in turn: name, link that it is on, place in that link's frame."""
+    return [
+        (f"closedloop_{closure.name}_{side}", link, point)
+        for closure in mechanism.closures
+        for side, link, point in (
+            ("A", closure.link_a, closure.point_a),
+            ("B", closure.link_b, closure.point_b),
+        )
+    ]
+
+
+def _frame_elements(name: str, parent: str, point: Vector) -> tuple[Element, Element]:
+    """A massless link at ``point`` (m) of another, and the joint that fixes it there."""
+    link = Element("link", name=name)
+    inertial = ElementTree.SubElement(link, "inertial")  # without it, some loaders assume 1 kg
+    ElementTree.SubElement(inertial, "mass", value="0")
+    ElementTree.SubElement(inertial, "inertia", dict.fromkeys(_MOMENTS, "0"))
+    joint = Element("joint", name=f"{name}_frame", type="fixed")
+    ElementTree.SubElement(joint, "parent", link=parent)
+    ElementTree.SubElement(joint, "child", link=name)
+    ElementTree.SubElement(joint, "origin", xyz=_numbers(point), rpy="0 0 0")
+    return link, joint
+
+
+def _link_element(link: Link) -> Element:
+    element = Element("link", name=link.name)
     inertial = ElementTree.SubElement(element, "inertial")
     ElementTree.SubElement(inertial, "origin", xyz=_numbers(link.centre_of_mass), rpy="0 0 0")
     ElementTree.SubElement(inertial, "mass", value=_number(link.mass))
     moments = link.inertia
-    names = {
-        "ixx": (0, 0),
-        "ixy": (0, 1),
-        "ixz": (0, 2),
-        "iyy": (1, 1),
-        "iyz": (1, 2),
-        "izz": (2, 2),
-    }
     ElementTree.SubElement(
-        inertial, "inertia", {name: _number(moments[at]) for name, at in names.items()}
+        inertial, "inertia", {name: _number(moments[at]) for name, at in _MOMENTS.items()}
     )
     for solid in link.solids:
         element.append(_solid_element("visual", solid))
@@ -113,8 +146,8 @@ def _link_element(link: Link) -> ElementTree.Element:
     return element
 
 
-def _solid_element(tag: str, solid: Solid) -> ElementTree.Element:
-    element = ElementTree.Element(tag)
+def _solid_element(tag: str, solid: Solid) -> Element:
+    element = Element(tag)
     rpy = _AXIS_RPY[solid.axis] if solid.kind == "cylinder" else (0.0, 0.0, 0.0)
     ElementTree.SubElement(element, "origin", xyz=_numbers(solid.centre), rpy=_numbers(rpy))
     shape = ElementTree.SubElement(element, "geometry")
@@ -128,11 +161,11 @@ def _solid_element(tag: str, solid: Solid) -> ElementTree.Element:
     return element
 
 
-def _joint_element(link: Link) -> ElementTree.Element:
+def _joint_element(link: Link) -> Element:
     joint = link.joint
     if joint is None:
         raise TypeError(f"the base {link.name!r} has no joint")
-    element = ElementTree.Element("joint", name=joint.name, type=joint.kind)
+    element = Element("joint", name=joint.name, type=joint.kind)
     ElementTree.SubElement(element, "parent", link=joint.parent)
     ElementTree.SubElement(element, "child", link=link.name)
     ElementTree.SubElement(element, "origin", xyz=_numbers(joint.origin), rpy="0 0 0")
@@ -154,8 +187,8 @@ def _number(value: float) -> str:
     return f"{float(value) + 0.0:.9g}" if abs(value) > 1e-15 else "0"
 
 
-def _numbers(values: Iterable[float], separator: str = " ") -> str:
-    return separator.join(_number(value) for value in values)
+def _numbers(values: Iterable[float]) -> str:
+    return " ".join(_number(value) for value in values)
 
 
 def main() -> None:

@@ -144,11 +144,13 @@ class Simulation:
         Raises:
             InputError: If theta or a position is not three finite numbers.
             UnreachableError: If the mechanism cannot be assembled at theta.
+            JointLimitError: If a motor is beyond a stop there; nothing has moved then.
         """
         angles = vector("theta", theta)
         reading = self.machine.evaluate(angles)
         a, b, c = (angle - bias for angle, bias in zip(angles, plant.encoder_bias, strict=True))
         true_machine = self._true(plant)
+        true_machine.require_within_stops((a, b, c))
         joints = true_machine.joint_positions((a, b, c))
         placed = self._poses(objects or {})
         self._become(plant, true_machine)

@@ -1,0 +1,153 @@
+"""Pinocchio closes the loops, and holds the robot up, from the two files in urdf/ alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import yaml
+from numpy.typing import ArrayLike
+
+from tpm_gym.arrays import FloatArray
+from tpm_gym.kinematics import ASSEMBLY_MODES, inverse, workspace
+from tpm_gym.kinematics.geometry import PAPER
+from tpm_gym.mechanism.dynamics import Dynamics
+from tpm_gym.mechanism.mount import GRAVITY
+from tpm_gym.mechanism.tree import joint_angles
+from tpm_gym.mechanism.urdf import LOOPS_FILE, URDF_FILE
+from tpm_gym.resources import URDF as FOLDER
+
+pin = pytest.importorskip(
+    "pinocchio", reason="Pinocchio (pip install pin) has no wheels for Windows"
+)
+
+LOW, HIGH = (-0.24, 0.012, 0.66), (0.12, 0.046, 0.903)  # m; points P of the paper's cell
+START = (-0.04, 0.028, 0.80)
+ABOUT = {  # the passive joints at START to ten degrees, all else at 0
+    "Sa_swing": 90, "Sa_tilt": -10, "Sb_swing": 90, "Sb_tilt": -10, "R22": -110, "R23": -70,
+    "R12": 30, "R13": -30, "R33": 130, "R32": 100,
+}  # fmt: skip
+CLOSED = 1e-12  # m
+
+
+class Files:
+    """The robot that the two files describe, with gravity as where it hangs upside down."""
+
+    def __init__(self) -> None:
+        loops = yaml.safe_load((FOLDER / LOOPS_FILE).read_text(encoding="utf-8"))
+        assert loops["type"] == ["3d"] * len(loops["closed_loop"])
+        self.model = pin.buildModelFromUrdf(str(FOLDER / URDF_FILE))
+        self.model.gravity.linear = np.array([0.0, 0.0, GRAVITY])
+        self.data = self.model.createData()
+        self.motors = loops["name_mot"]
+        self.pairs = [
+            [self.model.getFrameId(name) for name in pair] for pair in loops["closed_loop"]
+        ]
+        self.driven = [self.column(name) for name in self.motors]
+        self.passive = np.delete(np.arange(self.model.nv), self.driven)
+
+    def column(self, joint: str) -> int:
+        assert self.model.existJointName(joint)
+        return int(self.model.joints[self.model.getJointId(joint)].idx_v)
+
+    def posture(self, angles: dict[str, float]) -> FloatArray:
+        turn = np.zeros(self.model.nv)
+        for name, angle in angles.items():
+            turn[self.column(name)] = angle
+        return np.asarray(pin.integrate(self.model, pin.neutral(self.model), turn))
+
+    def loops(self, posture: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Gaps (12,) m, and what the joints' rates do to them, (12, nv)."""
+        pin.computeJointJacobians(self.model, self.data, posture)
+        pin.updateFramePlacements(self.model, self.data)
+        gaps, rows = [], []
+        for pair in self.pairs:
+            a, b = (self.data.oMf[frame].translation for frame in pair)
+            along_a, along_b = (
+                pin.getFrameJacobian(self.model, self.data, frame, pin.LOCAL_WORLD_ALIGNED)[:3]
+                for frame in pair
+            )
+            gaps.append(a - b)
+            rows.append(along_a - along_b)
+        return np.concatenate(gaps), np.vstack(rows)
+
+    def open_by(self, posture: FloatArray) -> float:
+        """The widest gap, m."""
+        return float(np.linalg.norm(self.loops(posture)[0].reshape(-1, 3), axis=1).max())
+
+    def follow(self, rows: FloatArray) -> FloatArray:
+        """Rates of the passive joints for rates of the motors, (passive, 3); least where idle."""
+        return -np.linalg.pinv(rows[:, self.passive], rcond=1e-9) @ rows[:, self.driven]
+
+    def close(self, posture: FloatArray) -> FloatArray:
+        """Newton's method on the passive joints."""
+        for _ in range(30):
+            gaps, rows = self.loops(posture)
+            if np.abs(gaps).max() < CLOSED / 10:
+                break
+            turn = np.zeros(self.model.nv)
+            turn[self.passive] = -np.linalg.pinv(rows[:, self.passive], rcond=1e-9) @ gaps
+            posture = pin.integrate(self.model, posture, turn)
+        return posture
+
+    def turn_to(self, posture: FloatArray, theta: ArrayLike) -> FloatArray:
+        """The same but for the motors, at ``theta`` (3,) rad; loops open."""
+        turn = np.zeros(self.model.nv)
+        at = [self.model.joints[self.model.getJointId(name)].idx_q for name in self.motors]
+        turn[self.driven] = theta - posture[at]
+        return np.asarray(pin.integrate(self.model, posture, turn))
+
+    def torque(self, posture: FloatArray) -> FloatArray:
+        """(3,) N m, of the motors at rest, by virtual work."""
+        weight = pin.computeGeneralizedGravity(self.model, self.data, posture)
+        rates = self.follow(self.loops(posture)[1])
+        return np.asarray(weight[self.driven] + rates.T @ weight[self.passive])
+
+
+@pytest.fixture(scope="module")
+def files() -> Files:
+    return Files()
+
+
+@pytest.fixture(scope="module")
+def found(files: Files) -> list[tuple[FloatArray, FloatArray]]:
+    """Random points P with the posture that Pinocchio finds, on a straight way from START."""
+    rough = {name: float(np.deg2rad(angle)) for name, angle in ABOUT.items()}
+    start = files.close(files.turn_to(files.posture(rough), inverse(START)))
+    pairs = []
+    for point in np.random.default_rng(0).uniform(LOW, HIGH, (300, 3)):
+        posture = start
+        for between in np.linspace(START, point, 9)[1:]:
+            posture = files.close(files.turn_to(posture, inverse(between)))
+        pairs.append((point, posture))
+    return pairs
+
+
+def test_the_files_close_where_the_closed_form_has_the_platform(
+    files: Files, found: list[tuple[FloatArray, FloatArray]]
+) -> None:
+    platform = files.model.getFrameId("platform")
+    for point, posture in found:
+        assert files.open_by(posture) < CLOSED
+        placed = files.data.oMf[platform]
+        np.testing.assert_allclose(placed.act(np.array([PAPER.l2, 0, PAPER.l6])), point, atol=1e-10)
+        np.testing.assert_allclose(placed.rotation, np.eye(3), atol=1e-10)
+
+
+def test_the_files_close_at_our_joint_angles_all_over_the_workspace(files: Files) -> None:
+    cloud = np.random.default_rng(1).uniform((-0.5, -0.05, 0.1), (0.5, 0.05, 1.1), (2000, 3))
+    points = cloud[workspace.reachable(cloud)][:300]
+    assert len(points) == 300
+    modes = workspace.assembly_of(points)
+    assert len(set(modes.tolist())) > 1
+    for point, mode in zip(points, modes, strict=True):
+        angles = joint_angles(inverse(point), ASSEMBLY_MODES[mode])
+        assert files.open_by(files.posture(angles)) < CLOSED
+
+
+def test_what_the_motors_hold_is_what_the_files_weigh(
+    files: Files, found: list[tuple[FloatArray, FloatArray]]
+) -> None:
+    dynamics = Dynamics()
+    for point, posture in found:
+        held = dynamics.gravity(inverse(point))
+        np.testing.assert_allclose(files.torque(posture), held, rtol=0, atol=1e-6)
