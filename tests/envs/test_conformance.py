@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import gantry  # noqa: F401  registers a machine
 import gymnasium as gym
+import kinematic  # noqa: F401  registers an engine
 import pytest
 from conformance import CHECKS, Make
 from episodes import EVERYTHING, OF_SERVOS
@@ -21,6 +23,10 @@ CASES: list[tuple[str, dict[str, Any]]] = [
     ("TPMPickAndPlace-v0", {"randomisation": EVERYTHING}),
     ("TPMReach-v0", {"drive": "servo"}),
     ("TPMPickAndPlaceJoints-v0", {"drive": "servo", "randomisation": EVERYTHING | OF_SERVOS}),
+    ("TPMReachJoints-v0", {"machine": "gantry"}),
+    ("TPMPickAndPlace-v0", {"machine": "gantry"}),
+    ("TPMReach-v0", {"engine": "kinematic"}),
+    ("TPMPickAndPlaceJoints-v0", {"engine": "kinematic"}),
 ]
 
 
@@ -30,4 +36,4 @@ CASES: list[tuple[str, dict[str, Any]]] = [
 def test_it_keeps_what_is_promised(
     check: Callable[[Make], None], env_id: str, options: dict[str, Any], engine: str
 ) -> None:
-    check(lambda: gym.make(env_id, engine=engine, **options))
+    check(lambda: gym.make(env_id, **{"engine": engine, **options}))
