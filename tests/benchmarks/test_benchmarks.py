@@ -4,6 +4,7 @@ from pathlib import Path
 from types import BuiltinFunctionType
 from typing import Any
 
+import bench_drives
 import bench_speed
 import gymnasium as gym
 import numpy as np
@@ -16,6 +17,7 @@ from paths import ROOT, read_strict
 from processes import PYTHON, printed_by
 from raw_physics import STEP, Recorder, record, recording, replay
 
+from tpm_gym.simulation import Servo
 from tpm_gym.tasks import Expert
 
 PICK = "TPMPickAndPlace-v0"
@@ -336,3 +338,17 @@ def test_too_few_samples_do_not_pass():
     verdict = soak_report.judge(content)
     assert verdict["closure_drift"] is None
     assert not verdict["passed"]
+
+
+def test_bench_drives_compares_all_drives():
+    names = [name for name, _ in bench_drives.drives()]
+    assert len(names) == len(set(names)) == 16
+    found = [
+        bench_drives.play("TPMReach-v0", "pybullet", drive, scripted=True, episodes=1)
+        for drive in (None, Servo())
+    ]
+    assert [row.successes for row in found] == [1, 1]
+    assert [row.singular for row in found] == [0, 0]
+    assert max(found[0].errors) < 1e-8 < 1e-6 < max(found[1].errors) < 1e-3
+    assert 3 < max(found[0].torques) < 12
+    assert bench_drives.line("one", found[1]).startswith("| one | 1 | 0 | 0.0")
