@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tpm_gym.arrays import Vector
+from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.bullet.client import Client
 from tpm_gym.simulation.bullet.cup import Cup, Grip
@@ -20,6 +21,7 @@ from tpm_gym.simulation.engine import Engine, Motors, Pose, Truth, Twist
 from tpm_gym.simulation.randomisation import Plant
 from tpm_gym.simulation.settings import settings_of
 from tpm_gym.simulation.state import Scene
+from tpm_gym.simulation.vacuum import EMPTY, Hold
 
 __all__ = ["BulletEngine"]
 
@@ -115,9 +117,10 @@ class BulletEngine:
         """See the protocol."""
         return self._scenery.read()
 
-    def held(self) -> int:
+    def hold(self) -> Hold:
         """See the protocol."""
-        return -1 if self._cup.grip is None else self._cup.grip.which
+        grip = self._cup.grip
+        return EMPTY if grip is None else Hold(grip.which, CUP.vacuum)
 
     def save(self) -> Any:
         """See the protocol."""
