@@ -13,6 +13,7 @@ from tpm_gym.arrays import Vector
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.bullet.client import Client
 from tpm_gym.simulation.bullet.cup import Cup, Grip
+from tpm_gym.simulation.bullet.friction import Friction
 from tpm_gym.simulation.bullet.physics import Physics
 from tpm_gym.simulation.bullet.robot import Robot
 from tpm_gym.simulation.bullet.scenery import Scenery
@@ -69,6 +70,10 @@ class BulletEngine:
         self.bodies = self._scenery.bodies
         self._cup = Cup(self.client, self.robot, self.bodies, scene.objects, self.physics.time_step)
 
+        self._friction = Friction(
+            self.client, self.robot, self.bodies, self._scenery.tables, scene.objects
+        )
+
     def _empty(self) -> None:
         """Take everything out of the client; a window stays, else a new client leaks least."""
         if self._gui:
@@ -82,12 +87,14 @@ class BulletEngine:
         """See the protocol."""
         self.robot.alter(plant.link_masses, plant.motor_strength)
         self._scenery.alter(plant.puck_mass, plant.friction)
+        self._friction.alter(plant.friction)
 
     def place(self, joints: Mapping[str, float], objects: Sequence[Pose]) -> None:
         """See the protocol."""
         self._cup.take(Grip())
         self.robot.place(joints)
         self._scenery.place([(pose, Twist()) for pose in objects])
+        self._friction.reset()
 
     def show_goal(self, markers: Sequence[Vector]) -> None:
         """See the protocol."""
@@ -96,8 +103,10 @@ class BulletEngine:
     def advance(self, references: Sequence[Vector], vacuum: bool) -> None:
         """See the protocol."""
         drive, step, suck = self.robot.drive, self.client.stepSimulation, self._cup.suck
-        self._cup.look(vacuum)
+        near = self._cup.look()
+        self._friction.look(near)
         for theta in references:
+            self._friction.turn(self._cup.grip.hold.which)
             drive(theta)
             step()
             suck(vacuum)
@@ -127,6 +136,7 @@ class BulletEngine:
         self._cup.take(Grip())
         self.robot.set_joint_states(snapshot.joints)
         self._scenery.place(snapshot.objects)
+        self._friction.reset()
         self._cup.take(snapshot.grip)
 
     def picture(self, width: int, height: int) -> NDArray[np.uint8]:
