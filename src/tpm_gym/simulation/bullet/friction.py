@@ -66,9 +66,8 @@ class Friction:
         blocks: Sequence[Block],
     ) -> None:
         """Start with nothing scaled."""
-        self._bodies = list(
-            zip(bodies, [_Face(table, -1) for table in tables], blocks, strict=True)
-        )
+        faces = [_Face(table, -1) for table in tables[: len(bodies)]]  # one, without objects
+        self._bodies = list(zip(bodies, faces, blocks, strict=True))
         self._cup = _Face(*robot.tool)
         number = client.number
         self._client, self._factor = client, 1.0
