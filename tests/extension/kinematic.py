@@ -11,9 +11,10 @@ from tpm_gym.arrays import Vector
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.cup import CUP, sealed
 from tpm_gym.simulation import Plant, Scene
-from tpm_gym.simulation.engine import Motors, Pose, Reference, Truth, Twist
+from tpm_gym.simulation.engine import Hold, Motors, Pose, Reference, Truth, Twist
 from tpm_gym.simulation.randomisation import NOMINAL
 from tpm_gym.simulation.state import CONTROL_PERIOD
+from tpm_gym.simulation.vacuum import EMPTY, Load, hold_after
 
 DOWN = (0.0, 0.0, -1.0)
 
@@ -32,7 +33,7 @@ class KinematicEngine:
 
     def place(self, joints: Mapping[str, float], objects: Sequence[Pose]) -> None:
         a, b, c = (joints[name] for name in self._machine.mechanism.actuated)
-        self._theta, self._rates, self._held = (a, b, c), (0.0, 0.0, 0.0), -1
+        self._theta, self._rates, self._hold = (a, b, c), (0.0, 0.0, 0.0), EMPTY
         self._poses = list(objects)
 
     def show_goal(self, markers: Sequence[Vector]) -> None:
@@ -43,9 +44,10 @@ class KinematicEngine:
         a, b, c = np.subtract(theta, self._theta) / CONTROL_PERIOD
         self._theta, self._rates = theta, (a, b, c)
         now = self._position()
-        if self._held >= 0:
-            x, y, z = np.add(self._poses[self._held].position, np.subtract(now, before))
-            self._poses[self._held] = Pose((x, y, z))
+        held = self._hold.which
+        if held >= 0:
+            x, y, z = np.add(self._poses[held].position, np.subtract(now, before))
+            self._poses[held] = Pose((x, y, z))
         x, y, z = now
         lip = (x, y, z - CUP.length)
         touched = [
@@ -53,7 +55,8 @@ class KinematicEngine:
             for index, (block, pose) in enumerate(zip(self._blocks, self._poses, strict=True))
             if sealed(lip, DOWN, *pose, (block.width, block.height))
         ]
-        self._held = touched[0] if vacuum and touched else -1
+        first = touched[0] if touched else -1
+        self._hold = hold_after(self._hold, CONTROL_PERIOD, vacuum, Load(), first)
 
     def motors(self) -> Motors:
         return Motors(self._theta, self._rates, (0.0, 0.0, 0.0))
@@ -64,14 +67,14 @@ class KinematicEngine:
     def objects(self) -> list[tuple[Pose, Twist]]:
         return [(pose, Twist()) for pose in self._poses]
 
-    def held(self) -> int:
-        return self._held
+    def hold(self) -> Hold:
+        return self._hold
 
     def save(self) -> Any:
-        return self._theta, self._rates, self._held, tuple(self._poses)
+        return self._theta, self._rates, self._hold, tuple(self._poses)
 
     def restore(self, snapshot: Any) -> None:
-        self._theta, self._rates, self._held, poses = snapshot
+        self._theta, self._rates, self._hold, poses = snapshot
         self._poses = list(poses)
 
     def picture(self, width: int, height: int) -> NDArray[np.uint8]:

@@ -25,6 +25,7 @@ from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 from tpm_gym.errors import ActionError, EpisodeError, ResetOptionError, UnreachableError
+from tpm_gym.mechanism.cup import CUP
 from tpm_gym.tasks import Expert
 
 Make = Callable[[], gym.Env[Any, Any]]
@@ -32,6 +33,7 @@ Make = Callable[[], gym.Env[Any, Any]]
 INFO = {
     "is_success": bool,
     "closure_error": float,
+    "vacuum": float,
     "conditioning": float,
     "singularity_penalty": float,
     "assembly_mode_changed": bool,
@@ -58,6 +60,7 @@ def observations_are_in_the_space_and_of_order_one_and_info_is_plain(make: Make)
             assert {name: type(value) for name, value in info.items()} == INFO
             assert all(type(term) is float for term in info["reward_terms"].values())
             assert 0.0 <= info["conditioning"] <= 1.0
+            assert 0.0 <= info["vacuum"] <= CUP.vacuum
             assert 0.0 <= info["singularity_penalty"] <= 1.0
             assert not info["assembly_mode_changed"] | info["working_mode_changed"]
             if index:

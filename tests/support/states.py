@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from tpm_gym.mechanism.cup import CUP
 from tpm_gym.simulation.state import State
 
 
@@ -31,6 +32,7 @@ def random_state(
         "assembly_mode_changed": np.zeros(shape, dtype=bool),
         "working_mode_changed": np.zeros(shape, dtype=bool),
         "held": rng.integers(-1, objects, shape),
+        "vacuum": rng.uniform(0.0, CUP.vacuum, shape),
         "object_position": normal(objects, 3),
         "object_quaternion": unit(objects, 4),
         "object_axis": unit(objects, 3),

@@ -84,7 +84,8 @@ def test_decode_is_the_inverse_of_observe(task: Task) -> None:
         expected[f"{block.name}_position"] = state.object_position[:, index]
         expected[f"{block.name}_velocity"] = state.object_velocity[:, index]
         expected[f"{block.name}_tilt"] = state.object_axis[:, index, :2]
-        expected[f"{block.name}_held"] = np.equal(state.held, index)[:, None]
+        share = np.where(state.held == index, state.vacuum / CUP.vacuum, 0.0)
+        expected[f"{block.name}_held"] = share[:, None]
     for name, value in expected.items():
         np.testing.assert_allclose(decoded[name], value, atol=1e-12)
     assert set(decoded) == {entry.name for entry in task.entries}

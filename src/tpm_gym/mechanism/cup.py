@@ -26,8 +26,14 @@ class VacuumCup:
         radius: Radius of the lip, m.
         stroke: How far the cup slides back into its stem when it meets something, m.
         preload: Force with which the spring keeps the cup out, N: more than the vacuum can hold.
-        pull_off: Largest force that the cup holds along each axis, N: 60 kPa of vacuum on the area
-            of the lip.
+        vacuum: How far below the ambient's the ejector gets the pressure in the cup, Pa.
+        area: On which the vacuum acts, m^2: what lies within the lip.
+        evacuation_time: Time constant with which the vacuum builds up once the cup is sealed, s.
+            An ejector of 5 l/min empties a cup and hose of 1.6 cm^3 so.
+        venting_time: The same when air comes in, through the valve or below the lip, s.
+        least_vacuum: At which the lip comes off when the vacuum is off, Pa.
+        friction: Of the open lip, times an object's is the Coulomb coefficient between them.
+        seal_friction: Coulomb coefficient of the sealed lip: silicone sucked onto something smooth.
         seal_gap: Largest distance between lip and object at which the vacuum seals, m.
         seal_tilt: Largest angle between the cup's axis and the object's that the lip follows, rad.
     """
@@ -36,9 +42,20 @@ class VacuumCup:
     radius: float = 0.008
     stroke: float = 0.020
     preload: float = 15.0
-    pull_off: float = 12.0
+    vacuum: float = 60e3
+    area: float = 200e-6
+    evacuation_time: float = 0.020
+    venting_time: float = 0.010
+    least_vacuum: float = 3e3
+    friction: float = 0.5
+    seal_friction: float = 1.0
     seal_gap: float = 0.002
     seal_tilt: float = math.radians(10.0)
+
+    @property
+    def pull_off(self) -> float:
+        """Largest force that the whole vacuum holds, in any direction but up, N."""
+        return self.vacuum * self.area
 
     @property
     def lip(self) -> Vector:

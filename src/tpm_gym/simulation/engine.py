@@ -21,9 +21,11 @@ from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.drives import Reference, Servo
 from tpm_gym.simulation.randomisation import Plant
 from tpm_gym.simulation.state import Scene
+from tpm_gym.simulation.vacuum import Hold
 
 __all__ = [
     "Engine",
+    "Hold",
     "Motors",
     "Pose",
     "Reference",
@@ -102,8 +104,8 @@ class Engine(Protocol):
     def objects(self) -> list[tuple[Pose, Twist]]:
         """Read the scene's objects, in its order."""
 
-    def held(self) -> int:
-        """Index of the object that the cup holds; -1 for none."""
+    def hold(self) -> Hold:
+        """What the cup holds, and how well; by :mod:`tpm_gym.simulation.vacuum` each time step."""
 
     def save(self) -> Any:
         """Take down everything that the next steps depend on, as plain data, all in its repr.

@@ -251,7 +251,7 @@ class Simulation:
             self._torque = torque
         theta, rates = self._disturb(true_theta, true_rates)
         position, rows, conditioning = self._evaluate(theta)
-        mount = self.machine.mount
+        mount, hold = self.machine.mount, self.engine.hold()
         if self._mode_left is None:
             self._mode_left = self._true_machine.mode_left(true_theta, mount.swap(platform))
         r1, r2, r3 = rates
@@ -268,7 +268,8 @@ class Simulation:
             assembly_mode_changed=self._mode_left == "assembly",
             working_mode_changed=self._mode_left == "working",
             command=np.array(mount.swap(self._commands[1])),
-            held=self.engine.held(),
+            held=hold.which,
+            vacuum=hold.vacuum,
             **self._read_objects(),
         )
 

@@ -77,6 +77,7 @@ class State:
         working_mode_changed: (...,) the same for a serial one.
         command: (..., 3) m, world: where point P is commanded to go.
         held: (...,) index of the object that the vacuum cup holds; -1 for none.
+        vacuum: (...,) Pa, how far the pressure in the cup is below the ambient's.
         object_position: (..., n, 3) m, world: centres of the scene's objects.
         object_quaternion: (..., n, 4), their orientations in the world, (x, y, z, w).
         object_axis: (..., n, 3) unit vectors, world: the objects' own z axes.
@@ -97,6 +98,7 @@ class State:
     working_mode_changed: BoolArray | bool
     command: FloatArray
     held: IntArray | int
+    vacuum: FloatArray | float
     object_position: FloatArray
     object_quaternion: FloatArray
     object_axis: FloatArray

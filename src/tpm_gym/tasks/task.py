@@ -306,9 +306,9 @@ class Task(ABC):
                   lambda s: s.object_velocity[..., index, :]),
             Entry(f"{name}_tilt", "-", f"x and y of the {name}'s axis", (0.0, 0.0), (1.0, 1.0),
                   lambda s: s.object_axis[..., index, :2]),
-            Entry(f"{name}_held", "-", f"+1 if the cup holds the {name} (vacuum gauge), else -1",
+            Entry(f"{name}_held", "-", f"share of the vacuum that holds the {name}, by a gauge",
                   (0.5,), (0.5,),
-                  lambda s: np.asarray(s.held == index, dtype=np.float64)[..., None]),
+                  lambda s: ((s.held == index) * np.divide(s.vacuum, CUP.vacuum))[..., None]),
         )  # fmt: skip
 
     def _scales(self) -> tuple[Values, Values, Values, Values]:

@@ -13,6 +13,7 @@ from tpm_gym.arrays import Vector
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.bullet.client import Client
 from tpm_gym.simulation.bullet.cup import Cup, Grip
+from tpm_gym.simulation.bullet.friction import Friction
 from tpm_gym.simulation.bullet.physics import Physics
 from tpm_gym.simulation.bullet.robot import Robot
 from tpm_gym.simulation.bullet.scenery import Scenery
@@ -21,6 +22,7 @@ from tpm_gym.simulation.engine import Engine, Motors, Pose, Truth, Twist
 from tpm_gym.simulation.randomisation import Plant
 from tpm_gym.simulation.settings import settings_of
 from tpm_gym.simulation.state import Scene
+from tpm_gym.simulation.vacuum import Hold
 
 __all__ = ["BulletEngine"]
 
@@ -30,7 +32,7 @@ class _Moment:
     joints: tuple[tuple[float, float], ...]  # rad and rad/s, passive ones too
     drives: Memory | None
     objects: list[tuple[Pose, Twist]]
-    grip: Grip | None
+    grip: Grip
 
 
 class BulletEngine:
@@ -78,7 +80,11 @@ class BulletEngine:
         if self._gui or self._renderer == "egl":
             self.robot.paint()
         self.bodies = self._scenery.bodies
-        self._cup = Cup(self.client, self.robot, self.bodies, scene.objects)
+        self._cup = Cup(self.client, self.robot, self.bodies, scene.objects, self.physics.time_step)
+
+        self._friction = Friction(
+            self.client, self.robot, self.bodies, self._scenery.tables, scene.objects
+        )
 
     def _empty(self) -> None:
         """Take everything out of the client; a window stays, else a new client leaks least."""
@@ -96,14 +102,16 @@ class BulletEngine:
             self._servos.alter(plant)
             self.robot.rub(plant.joint_friction)
         self._scenery.alter(plant.puck_mass, plant.friction)
+        self._friction.alter(plant.friction)
 
     def place(self, joints: Mapping[str, float], objects: Sequence[Pose]) -> None:
         """See the protocol."""
-        self._cup.let_go()
+        self._cup.take(Grip())
         self.robot.place(joints)
         if self._servos is not None:
             self._servos.rest(self.robot.motors().theta)
         self._scenery.place([(pose, Twist()) for pose in objects])
+        self._friction.reset()
 
     def show_goal(self, markers: Sequence[Vector]) -> None:
         """See the protocol."""
@@ -111,20 +119,20 @@ class BulletEngine:
 
     def advance(self, references: Sequence[Reference], vacuum: bool) -> None:
         """See the protocol."""
-        if not vacuum:
-            self._cup.let_go()
         robot, servos, step = self.robot, self._servos, self.client.stepSimulation
+        cup, friction = self._cup, self._friction
+        friction.look(cup.look())
         if servos is not None and references:
             servos.begin(references[0].theta)
         for reference in references:
+            friction.turn(cup.grip.hold.which)
             if servos is None:
                 robot.drive(reference.theta)
             else:
                 theta, theta_dot, _ = robot.motors()
                 robot.apply(servos.torque(reference, theta, theta_dot))
             step()
-        if vacuum:
-            self._cup.suck()
+            cup.suck(vacuum)
 
     def motors(self) -> Motors:
         """See the protocol."""
@@ -142,9 +150,9 @@ class BulletEngine:
         """See the protocol."""
         return self._scenery.read()
 
-    def held(self) -> int:
+    def hold(self) -> Hold:
         """See the protocol."""
-        return -1 if self._cup.grip is None else self._cup.grip.which
+        return self._cup.grip.hold
 
     def save(self) -> Any:
         """See the protocol."""
@@ -157,13 +165,13 @@ class BulletEngine:
 
     def restore(self, snapshot: Any) -> None:
         """See the protocol."""
-        self._cup.let_go()
+        self._cup.take(Grip())
         self.robot.set_joint_states(snapshot.joints)
         if self._servos is not None:
             self._servos.memory = snapshot.drives
         self._scenery.place(snapshot.objects)
-        if snapshot.grip is not None:
-            self._cup.take(snapshot.grip)
+        self._friction.reset()
+        self._cup.take(snapshot.grip)
 
     def picture(self, width: int, height: int) -> NDArray[np.uint8]:
         """See the protocol."""
