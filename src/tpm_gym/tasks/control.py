@@ -19,6 +19,7 @@ from tpm_gym.mechanism.machine import Machine
 __all__ = ["CartesianControl", "Control", "JointControl", "make_control"]
 
 _BISECTIONS = 10  # the fraction of a step to a thousandth
+_PARTS = 8  # of a way, in which joints turn nearly evenly
 
 
 class Control(Protocol):
@@ -29,6 +30,9 @@ class Control(Protocol):
 
     def action(self, wanted: ArrayLike, current: ArrayLike) -> FloatArray:
         """The action (3,) in [-1, 1] that moves the command from current towards wanted."""
+
+    def steps(self, wanted: ArrayLike, current: ArrayLike) -> float:
+        """Control steps that a straight way at constant speed takes, if no limit is exceeded."""
 
 
 class CartesianControl:
@@ -46,6 +50,10 @@ class CartesianControl:
         """The increment that is wanted, clipped axis by axis."""
         step: FloatArray = (np.asarray(wanted) - np.asarray(current)) / self._step
         return np.clip(step, -1.0, 1.0)
+
+    def steps(self, wanted: ArrayLike, current: ArrayLike) -> float:
+        """By the axis that has farthest to go."""
+        return float((np.abs(np.subtract(wanted, current)) / self._step).max())
 
 
 class JointControl:
@@ -97,6 +105,14 @@ class JointControl:
         there, here = (inverse(_vector(np.asarray(p))) for p in (wanted, current))
         step: FloatArray = np.subtract(there, here) / self._machine.joint_limit
         return step / max(1.0, float(np.abs(step).max()))
+
+    def steps(self, wanted: ArrayLike, current: ArrayLike) -> float:
+        """By the axis, or the joint where it turns fastest, that has farthest to go."""
+        inverse, parts = self._machine.inverse, np.linspace(0.0, 1.0, _PARTS + 1)[:, None]
+        way = np.asarray(current) + parts * np.subtract(wanted, current)
+        turns = np.diff([inverse(_vector(point)) for point in way], axis=0) * _PARTS
+        joints = float(np.abs(turns).max()) / self._machine.joint_limit
+        return max(joints, float((np.abs(way[-1] - way[0]) / self._step).max()))
 
 
 def make_control(kind: str, machine: Machine) -> Control:

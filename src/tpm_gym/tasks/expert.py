@@ -4,8 +4,6 @@ It sees the same observation as a policy does, follows the task's plan of comman
 trapezoidal speed, and turns each of them into an action of the environment's control, through the
 inverse kinematics where that is joints. Between two points of the safe region its plan stays in the
 safe region: y, which the conditioning follows, is changed along with x and z, never beyond both.
-Where the plan asks more of the joints than their limit, the way cuts the corner: 6 of 1000 episodes
-of TPMPickAndPlaceJoints-v0 get to conditionings of 0.055 to 0.076.
 """
 
 from __future__ import annotations

@@ -18,6 +18,8 @@ __all__ = ["Motion", "Move", "hanging"]
 
 RAMP = 3
 """Control steps from rest to full speed."""
+ROUNDING = 1e-5
+"""Of a control step; more than the 1e-6 by which single precision is off."""
 SEAL_STEPS = 4
 """Control steps for which to wait for the cup to seal before giving up."""
 
@@ -96,10 +98,11 @@ class Motion:
     def _trapezoid(self, start: FloatArray, stop: FloatArray) -> FloatArray:
         """Fractions of the way at the control steps from ``start`` to ``stop``.
 
-        Speed rises over RAMP steps, holds, and falls; no axis exceeds the machine's step limit.
+        Speed rises over RAMP steps, holds, and falls; neither P nor a joint that is controlled
+        exceeds its limit. What observation rounds off (float32) takes no step more.
         """
-        steps = float((np.abs(stop - start) / self.machine.step_limit).max())
-        count = int(np.ceil(steps)) + RAMP - 1
+        steps = self._control.steps(stop, start)
+        count = int(np.ceil(steps - ROUNDING)) + RAMP - 1
         ramp = np.minimum(np.arange(1, count + 1), np.arange(count, 0, -1))
         speed = np.minimum(ramp, RAMP).astype(np.float64)
         result: FloatArray = np.cumsum(speed) / speed.sum()
