@@ -1,0 +1,149 @@
+"""Two engines and theory on the same commands, and policies over engines and drives.
+
+    make bench-engines
+    python benchmarks/bench_engines.py --quick
+
+Agreement: five motions, their actions recorded once and repeated blindly in every engine. Largest
+loop gap, largest distance of the platform from the forward kinematics of the encoders, torques
+against those of the other engine and of the closed form, and where the puck ends. Energy: what is
+missing after a fall of 0.2 s with the motors off. Cost: control steps of TPMPickAndPlace-v0 under
+random actions, in blocks that take turns.
+
+Matrix: success of the expert, of a noisy one, of the published policies and of weak ones, in every
+engine with every drive. The weak ones are trainings of ``WEAK_STEPS`` steps; they are done here
+first where runs/engines does not hold them.
+
+Everything goes to docs/records/engines.json, and from there into docs/fidelity.md and
+docs/images/engines.png.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import closing
+from typing import Any
+
+import engine_report
+import gymnasium as gym
+import machine
+import numpy as np
+from engine_agreement import PICK, Trace, energy_lost, follow, motions
+from engine_matrix import IDS, cells, run_all
+
+ENGINES = ("pybullet", "mujoco")
+WEAK_STEPS = 20_000
+ROUNDS, BLOCK = 20, 100
+"""Rounds of timing, and control steps in a block."""
+
+
+def agreement(engines: Sequence[str], episodes: int) -> list[dict[str, Any]]:
+    """A row for each motion and engine."""
+    rows = []
+    for motion in motions(episodes):
+        print(f"following: {motion.name}", file=sys.stderr)
+        traces = {engine: follow(motion, engine) for engine in engines}
+        reference = traces[engines[0]]
+        rows += [
+            {"motion": motion.name, "engine": engine, **_compare(trace, reference)}
+            for engine, trace in traces.items()
+        ]
+    return rows
+
+
+def _compare(trace: Trace, reference: Trace) -> dict[str, Any]:
+    """A motion in one engine, against the first engine and theory."""
+    rms = float(np.sqrt((trace.torque**2).mean()))
+    apart = np.linalg.norm(trace.puck - reference.puck, axis=-1)
+    return {
+        "gap_max": float(trace.gap.max()),
+        "apart_max": float(trace.apart.max()),
+        "torque_rms": rms,
+        "torque_peak": float(np.abs(trace.torque).max()),
+        "off_engine": _off(trace.torque, reference.torque),
+        "off_theory": _off(trace.torque, trace.theory) if trace.theory.size else None,
+        "puck_median": float(np.median(apart)) if apart.size else None,
+        "puck_max": float(apart.max()) if apart.size else None,
+    }
+
+
+def _off(torque: Any, other: Any) -> float:
+    """Relative root mean square of a difference of torques."""
+    return float(np.sqrt(((torque - other) ** 2).mean() / (other**2).mean()))
+
+
+def costs(engines: Sequence[str], rounds: int) -> dict[str, list[float]]:
+    """Seconds a control step in each round, engine by engine in turn."""
+    spent: dict[str, list[float]] = {engine: [] for engine in engines}
+    envs = {engine: gym.make(PICK, engine=engine) for engine in engines}
+    rng = np.random.default_rng(0)
+    for number in range(rounds):
+        actions = rng.uniform(-1.0, 1.0, (BLOCK, 4)).astype(np.float32)
+        for engine in engines if number % 2 else reversed(engines):
+            with_resets = envs[engine]
+            start = time.perf_counter()
+            for k, action in enumerate(actions):
+                if k % 50 == 0:
+                    with_resets.reset(seed=number)
+                with_resets.step(action)
+            spent[engine].append((time.perf_counter() - start) / BLOCK)
+    for env in envs.values():
+        with closing(env):
+            pass
+    return spent
+
+
+def weak_policies(steps: int) -> dict[str, str]:
+    """Folders of runs that were stopped early, trained now where they are not there."""
+    found = {}
+    for env_id in IDS:
+        run = machine.ROOT / "runs" / "engines" / f"{env_id}-{steps}"
+        found[env_id] = str(run / "last.json")
+        if not (run / "last.json").exists():
+            print(f"training {env_id} for {steps} steps", file=sys.stderr)
+            command = [sys.executable, "-m", "tpm_gym.learning", "train", "--env", env_id]
+            command += ["--steps", str(steps), "--run", str(run), "--overwrite"]
+            subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    return found
+
+
+def matrix(engines: Sequence[str], episodes: int, jobs: int, steps: int) -> list[dict[str, Any]]:
+    """All cells, said as they come."""
+    todo = list(cells(engines, episodes, weak_policies(steps)))
+    done = []
+    for record in run_all(todo, jobs):
+        success = record["metrics"]["success_at_end"]["mean"]
+        shown = ("env_id", "policy", "engine", "drive")
+        print(*(record[key] for key in shown), f"{100 * success:.1f}%", file=sys.stderr)
+        done.append(record)
+    return done
+
+
+def main() -> None:
+    """Parse the options and run."""
+    parser = argparse.ArgumentParser(description="Engines and theory on the same commands.")
+    parser.add_argument("--quick", action="store_true", help="some minutes; writes no files")
+    parser.add_argument("--jobs", type=int, default=1, help="processes for the matrix")
+    parser.add_argument("--redraw", action="store_true", help="picture and page from the records")
+    options = parser.parse_args()
+    if not options.redraw:
+        quick = options.quick
+        record = {
+            "machine": machine.describe(sys.argv),
+            "agreement": agreement(ENGINES, 3 if quick else 20),
+            "energy_lost": {engine: energy_lost(engine) for engine in ENGINES},
+            "cost": costs(ENGINES, 4 if quick else ROUNDS),
+            "matrix": matrix(ENGINES, 10 if quick else 1000, options.jobs, WEAK_STEPS),
+        }
+        engine_report.print_tables(record)
+        if quick:
+            return
+        engine_report.write(record)
+    engine_report.publish()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,198 @@
+"""Tables and picture of what bench_engines.py measured, in docs/fidelity.md."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from machine import ROOT, processor_line, quartiles
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from tpm_gym.learning import figure_style as style
+from tpm_gym.learning.figure_style import BLUE, ORANGE, PURPLE, SKY, VERMILLION
+
+RECORD = ROOT / "docs" / "records" / "engines.json"
+PICTURE = ROOT / "docs" / "images" / "engines.png"
+PAGE = ROOT / "docs" / "fidelity.md"
+BEGIN, END = "<!-- engines: begin -->", "<!-- engines: end -->"
+
+MM = 1e3
+COLUMNS = {
+    "gap, largest (mm)": lambda row: f"{MM * row['gap_max']:.4f}",
+    "P off FK, largest (mm)": lambda row: f"{MM * row['apart_max']:.3f}",
+    "torque, RMS (N m)": lambda row: f"{row['torque_rms']:.3f}",
+    "peak (N m)": lambda row: f"{row['torque_peak']:.1f}",
+    "off PyBullet's": lambda row: f"{100 * row['off_engine']:.2f}%",
+    "off theory": lambda row: _share(row["off_theory"]),
+    "puck apart, median (mm)": lambda row: _length(row["puck_median"]),
+    "largest (mm)": lambda row: _length(row["puck_max"]),
+}
+COLOURS = {
+    ("pybullet", "ideal"): BLUE,
+    ("pybullet", "servo"): SKY,
+    ("mujoco", "ideal"): VERMILLION,
+    ("mujoco", "servo"): ORANGE,
+}
+
+
+def _share(value: float | None) -> str:
+    return "-" if value is None else f"{100 * value:.2f}%"
+
+
+def _length(value: float | None) -> str:
+    return "-" if value is None else f"{MM * value:.2f}"
+
+
+def write(record: dict[str, Any]) -> None:
+    """Keep the record."""
+    RECORD.parent.mkdir(parents=True, exist_ok=True)
+    RECORD.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+
+
+def publish() -> None:
+    """Fill the page and draw the picture from the record."""
+    record = json.loads(RECORD.read_text(encoding="utf-8"))
+    before, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
+    _, after = rest.split(END)
+    text = "\n".join([BEGIN, *lines(record), END])
+    PAGE.write_text(before + text + after, encoding="utf-8")
+    draw(record)
+    for path in (PICTURE, PAGE):
+        print("wrote", path.relative_to(ROOT))
+
+
+def print_tables(record: dict[str, Any]) -> None:
+    """The same tables on the screen."""
+    print("\n".join(lines(record)))
+
+
+def lines(record: dict[str, Any]) -> Iterator[str]:
+    """Both tables as Markdown, and what the machine was."""
+    yield f"`make bench-engines` on {processor_line(record['machine'])}."
+    yield ""
+    yield from _table(
+        ["motion", "engine", *COLUMNS],
+        [
+            [row["motion"], row["engine"], *(form(row) for form in COLUMNS.values())]
+            for row in record["agreement"]
+        ],
+    )
+    yield ""
+    yield _costs(record)
+    yield ""
+    heads = list(dict.fromkeys((row["engine"], row["drive"]) for row in record["matrix"]))
+    yield from _table(
+        ["id", "policy", *(f"{engine}, {drive}" for engine, drive in heads)],
+        [
+            [env_id, policy, *(_success(cells[head]) for head in heads)]
+            for (env_id, policy), cells in _by_policy(record).items()
+        ],
+    )
+
+
+def _table(head: list[str], rows: list[list[str]]) -> Iterator[str]:
+    yield "| " + " | ".join(head) + " |"
+    yield "|---" * len(head) + "|"
+    for row in rows:
+        yield "| " + " | ".join(row) + " |"
+
+
+def _costs(record: dict[str, Any]) -> str:
+    """One sentence on cost and energy."""
+    cost = {engine: np.array(seconds) for engine, seconds in record["cost"].items()}
+    first, *others = cost
+    times = ", ".join(
+        f"{engine} {1e3 * np.median(seconds):.3f} ms" for engine, seconds in cost.items()
+    )
+    ratios = []
+    for engine in others:
+        low, middle, high = quartiles(cost[first] / cost[engine])
+        ratios.append(f"{engine} {middle:.2f} [{low:.2f}, {high:.2f}] times as fast as {first}")
+    lost = ", ".join(f"{name} {100 * share:.1f}%" for name, share in record["energy_lost"].items())
+    return (
+        f"A control step of `TPMPickAndPlace-v0` under random actions: {times}; {'; '.join(ratios)} "
+        f"(median and quartiles of rounds that take turns). Energy that a fall of 0.2 s with the "
+        f"motors off loses: {lost}."
+    )
+
+
+def _by_policy(record: dict[str, Any]) -> dict[tuple[str, str], dict[tuple[str, str], Any]]:
+    """Cells of the matrix by id and policy, then by engine and drive."""
+    found: dict[tuple[str, str], dict[tuple[str, str], Any]] = {}
+    for cell in record["matrix"]:
+        row = found.setdefault((cell["env_id"], _name(cell)), {})
+        row[cell["engine"], cell["drive"]] = cell["metrics"]["success_at_end"]
+    return found
+
+
+def _name(cell: dict[str, Any]) -> str:
+    """The policy as a reader knows it."""
+    if cell["policy"] == cell["env_id"]:
+        return "published"
+    return "stopped early" if cell["policy"].endswith(".json") else cell["policy"]
+
+
+def _success(estimate: dict[str, float]) -> str:
+    low, mean, high = (100 * estimate[key] for key in ("low", "mean", "high"))
+    return f"{mean:.1f}% [{low:.1f}, {high:.1f}]"
+
+
+# -- picture -----------------------------------------------------------------------------------
+
+
+def draw(record: dict[str, Any]) -> None:
+    """Torques off each other and off theory; success of each policy over engines and drives."""
+    with style.style():
+        figure = Figure(figsize=(style.WIDTH, 3.4))
+        left, *right = figure.subplots(1, 3, width_ratios=(1.1, 1, 1))
+        _agreement(left, record)
+        ids = list(dict.fromkeys(cell["env_id"] for cell in record["matrix"]))
+        for axes, env_id in zip(right, ids, strict=True):
+            _matrix(axes, record, env_id)
+        handles, labels = right[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="lower right", ncols=4, bbox_to_anchor=(0.99, 0.0))
+        figure.subplots_adjust(left=0.17, right=0.985, top=0.9, bottom=0.2, wspace=0.55)
+        style.save(figure, PICTURE)
+
+
+def _agreement(axes: Axes, record: dict[str, Any]) -> None:
+    rows = record["agreement"]
+    names = list(dict.fromkeys(row["motion"] for row in rows))
+    marks = (
+        ("PyBullet off theory", "o", BLUE, "pybullet", "off_theory"),
+        ("MuJoCo off theory", "s", VERMILLION, "mujoco", "off_theory"),
+        ("MuJoCo off PyBullet", "D", PURPLE, "mujoco", "off_engine"),
+    )
+    for label, marker, colour, engine, key in marks:
+        found = {row["motion"]: row[key] for row in rows if row["engine"] == engine}
+        shown = [(found[name], at) for at, name in enumerate(names) if found.get(name)]
+        x, y = zip(*shown, strict=True)
+        axes.plot(
+            100 * np.array(x), y, marker, color=colour, label=label, markersize=5, mec="white"
+        )
+    axes.set_yticks(range(len(names)), names)
+    axes.set_ylim(len(names) - 0.4, -0.6)
+    axes.set(xscale="log", xlabel="relative RMS of the torques apart (%)")
+    axes.set_title("Torques", loc="left")
+    axes.grid(axis="x", color="0.92", linewidth=0.6)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.1, -0.13), frameon=False)
+
+
+def _matrix(axes: Axes, record: dict[str, Any], env_id: str) -> None:
+    rows = {policy: row for (of, policy), row in _by_policy(record).items() if of == env_id}
+    height = 0.8 / len(COLOURS)
+    for k, (head, colour) in enumerate(COLOURS.items()):
+        values = np.array(
+            [[row[head][q] for q in ("low", "mean", "high")] for row in rows.values()]
+        )
+        at = np.arange(len(rows)) + (k - (len(COLOURS) - 1) / 2) * height
+        axes.barh(at, 100 * values[:, 1], 0.9 * height, color=colour, label=", ".join(head))
+        spread = 100 * np.abs(values[:, [0, 2]].T - values[:, 1])
+        axes.errorbar(100 * values[:, 1], at, xerr=spread, fmt="none", ecolor="0.3", lw=0.6)
+    axes.set_yticks(range(len(rows)), list(rows))
+    axes.set_ylim(len(rows) - 0.4, -0.6)
+    axes.set(xlim=(0, 103), xlabel="success at end (%)")
+    axes.set_title(env_id, loc="left")
