@@ -4,7 +4,7 @@ VENV := .venv
 RUN := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
 
-.PHONY: help demo test lint format test-fast test-slow test-wheel urdf pictures figures results bench-kinematics bench-fidelity bench-evaluate bench-speed soak clean
+.PHONY: help demo test lint format test-fast test-slow test-wheel urdf pictures figures results bench-kinematics bench-engines bench-fidelity bench-evaluate bench-speed soak clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -68,12 +68,16 @@ bench-fidelity: $(INSTALLED) ## loop gaps, FK error and tilt against cost; see d
 bench-evaluate: $(INSTALLED) ## what tpm-gym evaluate costs beyond the stepping
 	$(RUN) benchmarks/bench_evaluate.py --json runs/evaluate.json
 
+bench-engines: $(INSTALLED) ## both engines and theory on the same commands; policies over engines and drives
+	$(RUN) benchmarks/bench_engines.py --jobs 2
+
 bench-speed: $(INSTALLED) ## steps per second beside panda-gym and Gymnasium-Robotics
 	$(RUN) -m pip install -c constraints.txt -e ".[bench]"
 	$(RUN) benchmarks/bench_speed.py --json runs/speed.json --plot docs/images/speed.png
 
-soak: $(INSTALLED) ## a million steps over all ids: memory, loop gaps, speed; about half an hour
+soak: $(INSTALLED) ## a million steps over all ids in each engine: memory, loop gaps, speed; an hour
 	$(RUN) benchmarks/soak.py --json runs/soak.json --plot docs/images/soak.png
+	$(RUN) benchmarks/soak.py --engine mujoco --json runs/soak_mujoco.json --plot runs/soak_mujoco.png
 
 clean: ## remove the environment and everything generated
 	rm -rf $(VENV) runs dist build .pytest_cache .mypy_cache .ruff_cache .hypothesis

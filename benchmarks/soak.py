@@ -1,6 +1,7 @@
 """Run the environments for a million steps and watch memory, loop gaps and speed.
 
     make soak
+    python benchmarks/soak.py --engine mujoco
 
 All ids in turn get visits of one to three episodes each. A visit is drawn from (seed, number of the
 visit) alone: resets with and without seeds, with options, in the middle of an episode and at its
@@ -46,7 +47,7 @@ REOPEN, RENDER, SAVE, WHOLE = 0.02, 0.01, 0.1, 0.5
 to their end. Of each environment that is closed, Bullet keeps some 20 kB, mostly scratch memory of
 its direct solver, so the memory grows with the number of openings and with nothing else."""
 POLICIES = {"uniform": 0.7, "bang-bang": 0.15, "expert": 0.15}
-PICTURE = {"render_mode": "rgb_array", "renderer": "tiny", "width": 32, "height": 24}
+PICTURE = {"render_mode": "rgb_array", "width": 32, "height": 24}
 MOST_FAILURES = 100
 
 
@@ -66,12 +67,13 @@ class Soak:
 
     Args:
         seed: Of all visits.
+        engine: Of all environments.
         make: Makes an environment from an id; ``gymnasium.make``, or a test's.
     """
 
-    def __init__(self, seed: int, make: Make = gym.make) -> None:
+    def __init__(self, seed: int, engine: str = "pybullet", make: Make = gym.make) -> None:
         """Start with no environment open."""
-        self.seed, self._make = seed, make
+        self.seed, self.engine, self._make = seed, engine, make
         self._pool: dict[str, Env] = {}
         self.steps = self.visits = 0
         self.events: Counter[str] = Counter()
@@ -107,7 +109,7 @@ class Soak:
             self.events["closes"] += 1
         fresh = env_id not in self._pool
         if fresh:
-            self._pool[env_id] = self._make(env_id, **PICTURE)
+            self._pool[env_id] = self._make(env_id, engine=self.engine, **PICTURE)
             self.events["openings"] += 1
             self.opened.add(env_id)
         env = self._pool[env_id]
@@ -263,6 +265,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--every", type=int, help="steps between samples; default: a 200th of all")
     parser.add_argument("--warm-up", type=int, help="steps; default: a 20th of all")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--engine", default="pybullet")
     parser.add_argument("--limit-mb", type=float, default=10.0, help="of growth after the warm-up")
     parser.add_argument("--json", type=Path, help="written anew at each sample")
     parser.add_argument("--plot", type=Path, help="where to draw the samples")
@@ -281,7 +284,7 @@ def main(arguments: Sequence[str] | None = None, make: Make = gym.make) -> int:
     """Run the soak; the exit status is 0 only if it was finished and nothing was found."""
     options = parse(arguments)
     words = sys.argv if arguments is None else ["benchmarks/soak.py", *arguments]
-    soak = Soak(options.seed, make)
+    soak = Soak(options.seed, options.engine, make)
     if options.replay is not None:
         soak.run_visit(options.replay)
         print(f"visit {options.replay} of seed {options.seed} raised nothing")
@@ -289,6 +292,7 @@ def main(arguments: Sequence[str] | None = None, make: Make = gym.make) -> int:
         return 0
     content: dict[str, Any] = machine.describe(words) | {
         "seed": options.seed,
+        "engine": options.engine,
         "steps": options.steps,
         "warm_up": options.warm_up,
         "limit_mb": options.limit_mb,
