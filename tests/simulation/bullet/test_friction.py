@@ -100,7 +100,7 @@ def test_what_slides_is_braked_by_mu_n_against_its_way(degrees):
 @pytest.mark.parametrize("factor", [0.5, 1.0])
 @pytest.mark.parametrize("degrees", DIRECTIONS)
 def test_what_rests_breaks_away_at_mu_n(degrees, factor):
-    # Measured: 20 um away at 1.008 to 1.020 of mu N, which the growing load needs to get there (box:
+    # Measured: 20 um away at 1.008 to 1.020 of mu N, as the load needs to get there (box:
     # up to 1.43). Near the limit it moves by 10 um when the solver changes which corners bear what.
     simulation = start(LOW, places=[UNDER], plant=Plant(friction=factor))
     client, (puck,), load = simulation.engine.client, simulation.engine.bodies, [0.0]
