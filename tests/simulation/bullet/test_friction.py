@@ -100,7 +100,7 @@ def test_what_slides_is_braked_by_mu_n_against_its_way(degrees):
 @pytest.mark.parametrize("factor", [0.5, 1.0])
 @pytest.mark.parametrize("degrees", DIRECTIONS)
 def test_what_rests_breaks_away_at_mu_n(degrees, factor):
-    # Measured: 40 um away at 1.02 to 1.03 of mu N, which the growing load needs to get there, and at
+    # Measured: 40 um away at 1.02 to 1.03 of mu N, which the growing load needs to get there; at
     # 0.93 and 0.95 along 202.5 degrees, when the corners' loads change (box: up to 1.43).
     simulation = start(LOW, places=[UNDER], plant=Plant(friction=factor))
     client, (puck,), load = simulation.engine.client, simulation.engine.bodies, [0.0]
