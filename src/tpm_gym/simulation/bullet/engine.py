@@ -113,18 +113,22 @@ class BulletEngine:
         """See the protocol."""
         if not vacuum:
             self._cup.let_go()
-        robot, servos, step = self.robot, self._servos, self.client.stepSimulation
-        if servos is not None and references:
-            servos.begin(references[0].theta)
+        if self._servos is not None and references:
+            self._servos.begin(references[0].theta)
+        step = self.client.stepSimulation
         for reference in references:
-            if servos is None:
-                robot.drive(reference.theta)
-            else:
-                theta, theta_dot, _ = robot.motors()
-                robot.apply(servos.torque(reference, theta, theta_dot))
+            self._drive(reference)
             step()
         if vacuum:
             self._cup.suck()
+
+    def _drive(self, reference: Reference) -> None:
+        """Let the motors follow a reference in the next time step."""
+        if self._servos is None:
+            self.robot.drive(reference.theta)
+            return
+        theta, theta_dot, _ = self.robot.motors()
+        self.robot.apply(self._servos.torque(reference, theta, theta_dot))
 
     def motors(self) -> Motors:
         """See the protocol."""
