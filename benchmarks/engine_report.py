@@ -115,7 +115,7 @@ def _costs(record: dict[str, Any]) -> str:
     return (
         f"A control step of `TPMPickAndPlace-v0` under random actions: {times}; "
         f"{'; '.join(ratios)} (median and quartiles of rounds that take turns). Energy that a fall "
-        f"of 0.2 s with the motors off loses: {lost}."
+        f"of 0.16 s with the motors off loses: {lost}."
     )
 
 
