@@ -23,8 +23,8 @@ from tpm_gym import kinematics
 from tpm_gym.arrays import FloatArray
 from tpm_gym.kinematics import jacobian
 from tpm_gym.mechanism import PAPER_TPM
+from tpm_gym.mechanism.motor import TORQUE_MOTOR
 from tpm_gym.mechanism.tpm import ASSEMBLY_LIMIT
-from tpm_gym.mechanism.tree import MOTOR_EFFORT
 from tpm_gym.simulation.bullet.client import GRAVITY, Client, silence
 from tpm_gym.simulation.bullet.physics import REGULARISATION, Physics
 from tpm_gym.simulation.bullet.robot import Robot
@@ -142,7 +142,7 @@ class Rig:
             client.setJointMotorControl2(
                 *motor,
                 client.TORQUE_CONTROL,
-                force=min(MOTOR_EFFORT, max(-MOTOR_EFFORT, torque)),
+                force=min(TORQUE_MOTOR.peak_torque, max(-TORQUE_MOTOR.peak_torque, torque)),
             )
 
     def step(self) -> None:

@@ -15,10 +15,9 @@ from tpm_gym.kinematics import ASSEMBLY_MODES, AssemblyMode, forward, forward_al
 from tpm_gym.kinematics.geometry import Geometry
 from tpm_gym.mechanism import PAPER_TPM, TPM
 from tpm_gym.mechanism.cup import CUP
+from tpm_gym.mechanism.motor import TORQUE_MOTOR
 from tpm_gym.mechanism.tree import (
     ACTUATED_JOINTS,
-    MOTOR_EFFORT,
-    MOTOR_SPEED,
     build,
     joint_angles,
 )
@@ -180,7 +179,11 @@ def test_only_the_three_motors_drive_and_none_meets_its_stops_in_the_region(mach
     for angles, joint in zip(theta.T, (joints.pop(name) for name in ACTUATED_JOINTS), strict=True):
         assert (joint.kind, joint.parent) == ("revolute", "base")
         assert joint.lower < angles.min() <= angles.max() < joint.upper
-        assert (joint.effort, joint.speed) == (MOTOR_EFFORT, MOTOR_SPEED)
+        assert joint.effort == TORQUE_MOTOR.peak_torque
+        assert (joint.corner, joint.speed) == (
+            TORQUE_MOTOR.corner_speed,
+            TORQUE_MOTOR.no_load_speed,
+        )
     del joints["cup_slide"]
     assert {(joint.kind, joint.effort, joint.speed) for joint in joints.values()} == {
         ("continuous", 0, 0)

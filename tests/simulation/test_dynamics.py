@@ -19,7 +19,7 @@ from walk import place, walk
 from tpm_gym.arrays import FloatArray, Vector
 from tpm_gym.mechanism import PAPER_TPM, Machine
 from tpm_gym.mechanism.cup import CUP
-from tpm_gym.mechanism.tree import MOTOR_EFFORT
+from tpm_gym.mechanism.motor import TORQUE_MOTOR
 from tpm_gym.simulation import Block, Plant, Scene, Simulation
 
 G = 9.81
@@ -274,7 +274,7 @@ def test_a_held_puck_comes_off_at_the_pull_off_force(mass: float) -> None:
 def test_a_motor_holds_its_effort_and_no_more(
     simulation: Simulation, motor: int, sign: int, strength: Vector
 ) -> None:
-    effort = MOTOR_EFFORT * np.array(strength)
+    effort = TORQUE_MOTOR.peak_torque * np.array(strength)
     j, load, force = jacobian(PAPER_TPM, THETA), weights(PAPER_TPM, THETA), np.zeros(3)
     around_each_step(simulation, before=lambda: push(simulation, force))
     moved = []
@@ -301,4 +301,4 @@ def test_no_command_draws_more_than_the_motors_have(simulation: Simulation) -> N
     simulation.reset(THETA)
     for jump in (-0.1, 0.1, -0.1, 0.1):  # m in a control period, three times what actions reach
         simulation.move(np.add(HOME, (0, 0, jump)))
-    np.testing.assert_allclose(np.max(drawn, axis=0), MOTOR_EFFORT, rtol=1e-9)
+    np.testing.assert_allclose(np.max(drawn, axis=0), TORQUE_MOTOR.peak_torque, rtol=1e-9)

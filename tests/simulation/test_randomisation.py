@@ -21,7 +21,7 @@ from tpm_gym.envs.env import TPMEnv
 from tpm_gym.errors import ConfigurationError, TPMError
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.mechanism import PAPER_TPM
-from tpm_gym.mechanism.tree import MOTOR_EFFORT
+from tpm_gym.mechanism.motor import TORQUE_MOTOR
 from tpm_gym.simulation import Block, Plant, Randomisation, Simulation, State
 from tpm_gym.simulation.bullet.client import GRAVITY
 from tpm_gym.simulation.randomisation import _FACTORS, _SIZES, NOMINAL
@@ -96,7 +96,7 @@ def test_the_documentation_states_the_ranges() -> None:
     puck = Block()
     assert f"({1e3 * puck.mass:g} g)" in entries["puck_mass"]
     assert f"({puck.friction:g} on the table)" in entries["friction"]
-    assert f"({MOTOR_EFFORT:g} N m)" in entries["motor_strength"]
+    assert f"({TORQUE_MOTOR.peak_torque:g} N m)" in entries["motor_strength"]
 
 
 @pytest.mark.parametrize("value", [0.1, "all", [("latency", 1)], {"encoder_jitter": 1}, {1: 2}])

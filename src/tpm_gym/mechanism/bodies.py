@@ -88,7 +88,9 @@ class Joint:
         lower: Lower limit, rad or m (motors and slide; the others are bounded by the loops).
         upper: Upper limit, rad or m.
         effort: Limit of torque or force, N m or N; zero for passive joints.
-        speed: Speed limit, rad/s or m/s; zero for passive joints.
+        speed: Where the motor has no effort left, rad/s or m/s; zero for passive joints.
+        corner: Up to which speed the motor has its full effort, which from there on falls in a
+            straight line.
     """
 
     name: str
@@ -100,6 +102,7 @@ class Joint:
     upper: float = 0.0
     effort: float = 0.0
     speed: float = 0.0
+    corner: float = 0.0
 
 
 @dataclass(frozen=True)

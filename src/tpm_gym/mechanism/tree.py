@@ -29,6 +29,7 @@ from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode, passive_angles
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.mechanism.bodies import Closure, Joint, Link, Mechanism, Solid
 from tpm_gym.mechanism.cup import CUP
+from tpm_gym.mechanism.motor import TORQUE_MOTOR
 
 __all__ = ["ACTUATED_JOINTS", "build", "joint_angles"]
 
@@ -38,9 +39,6 @@ ACTUATED_JOINTS = ("R11", "R21", "R31")
 # Materials, kg/m^3.
 ALUMINIUM, STEEL, CARBON_FIBRE = 2700.0, 7850.0, 1600.0
 
-# Direct-drive torque motors of the class used in light delta robots: peak torque and speed.
-MOTOR_EFFORT = 100.0  # N m
-MOTOR_SPEED = 12.0  # rad/s
 # How far each arm may turn from pointing level outwards, towards the base and the platform.
 ARM_RAISED, ARM_LOWERED = np.deg2rad(75.0), np.deg2rad(115.0)
 
@@ -102,31 +100,45 @@ def _rod(axis: Literal["x", "y"], length: float) -> tuple[Solid, ...]:
 def _motor(name: str, axis: Vector, origin: Vector, level: float, sense: int) -> Joint:
     """A motor whose arm points level outwards at ``level`` and lowers in the ``sense`` of theta."""
     lower, upper = sorted((level - sense * ARM_RAISED, level + sense * ARM_LOWERED))
-    return Joint(name, "revolute", "base", origin, axis, lower, upper, MOTOR_EFFORT, MOTOR_SPEED)
+    return Joint(
+        name,
+        "revolute",
+        "base",
+        origin,
+        axis,
+        lower,
+        upper,
+        effort=TORQUE_MOTOR.peak_torque,
+        speed=TORQUE_MOTOR.no_load_speed,
+        corner=TORQUE_MOTOR.corner_speed,
+    )
 
 
 def _base(g: Geometry) -> Link:
     """Base 0: a plate with a motor at each pivot. Its mass does not matter, it never moves."""
-    plate = Solid(
-        "cylinder", (g.l1 + 0.06, 0.02, 0.0), (0.0, 0.0, -0.07), ALUMINIUM, colour="white"
+    # So far up that the motors fit below it, and so small that it ends where the arms turn.
+    plate = Solid("cylinder", (g.l1, 0.02, 0.0), (0.0, 0.0, -0.105), ALUMINIUM, colour="white")
+    pivots: tuple[tuple[Literal["x", "y"], Vector], ...] = (
+        ("x", (0.0, g.l1, 0.0)),
+        ("y", (-g.l1, 0.0, 0.0)),
+        ("y", (g.l1, 0.0, 0.0)),
     )
-    motors = (
-        _bar("x", 0.055, 0.042, (0.0, g.l1, 0.0), "dark"),
-        _bar("y", 0.055, 0.042, (-g.l1, 0.0, 0.0), "dark"),
-        _bar("y", 0.055, 0.042, (g.l1, 0.0, 0.0), "dark"),
-    )
-    brackets = tuple(
-        Solid("box", (0.08, 0.08, 0.05), (x, y, -0.04), ALUMINIUM, colour="white")
-        for x, y in ((0.0, g.l1), (-g.l1, 0.0), (g.l1, 0.0))
-    )
-    return Link("base", (plate, *brackets, *motors))
+    motors = [solid for axis, at in pivots for solid in TORQUE_MOTOR.stator(axis, at)]
+    saddles = [
+        Solid("box", (0.06, 0.12, 0.09) if axis == "x" else (0.12, 0.06, 0.09),
+              _vector("z", -0.06, middle), ALUMINIUM, colour="white")
+        for axis, at in pivots
+        for middle in TORQUE_MOTOR.halves(axis, at)
+    ]  # fmt: skip
+    return Link("base", (plate, *saddles, *motors))
 
 
 def _arm(axis: Literal["x", "y"], across: Literal["x", "y"], g: Geometry) -> tuple[Solid, ...]:
-    """An actuated arm: hub with the motor's rotor, rectangular tube, elbow bar across."""
-    hub = _bar(across, 0.058, 0.022, colour="steel", density=STEEL)
+    """An actuated arm: the motor's shaft and rotor, rectangular tube, elbow bar across."""
+    shaft = _bar(across, TORQUE_MOTOR.reach, 0.022, density=STEEL)
     return (
-        hub,
+        shaft,
+        *TORQUE_MOTOR.rotor(across),
         _tube(axis, g.l3, 0.045, 0.030, 0.003),
         _bar(across, 0.02, 0.015, _vector(axis, g.l3)),
     )

@@ -1,0 +1,68 @@
+"""The motor's torque, size, inertia and speed belong together, and it is in the mechanism."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from machines import each_machine
+
+from tpm_gym.mechanism import TPM
+from tpm_gym.mechanism.motor import TORQUE_MOTOR
+from tpm_gym.mechanism.tree import ACTUATED_JOINTS
+
+
+def test_the_torque_is_what_the_air_gap_of_a_torque_motor_gives() -> None:
+    # Textbooks and makers: 30 to 60 kPa at the peak, 10 to 20 kPa for ever in still air.
+    gap = 2 * math.pi * TORQUE_MOTOR.gap_radius**2 * TORQUE_MOTOR.length
+    assert 30e3 <= TORQUE_MOTOR.peak_torque / gap <= 60e3
+    assert TORQUE_MOTOR.shear_stress == pytest.approx(TORQUE_MOTOR.peak_torque / gap)
+    assert 10e3 <= TORQUE_MOTOR.continuous_torque / gap <= 20e3
+
+
+def test_the_continuous_torque_loses_what_the_housing_gives_off_in_still_air() -> None:
+    lost = (TORQUE_MOTOR.continuous_torque / TORQUE_MOTOR.motor_constant) ** 2
+    radius, length = TORQUE_MOTOR.stator_radius, TORQUE_MOTOR.reach - TORQUE_MOTOR.clearance
+    area = 2 * (2 * math.pi * radius * length + 2 * math.pi * radius**2)
+    assert lost / (10.0 * area) < 80.0  # K above the room, at 10 W/(m^2 K)
+
+
+def test_the_rotor_fits_into_the_housing_round_the_shaft() -> None:
+    for rotor, stator in zip(
+        TORQUE_MOTOR.rotor("x"), TORQUE_MOTOR.stator("x", (0, 0, 0)), strict=True
+    ):
+        assert rotor.centre == stator.centre
+        assert (rotor.half_extent < stator.half_extent).all()
+        assert rotor.half_extent[1] == TORQUE_MOTOR.gap_radius
+
+
+@each_machine
+def test_the_rotor_is_part_of_every_arm(machine: TPM) -> None:
+    for link in machine.mechanism.links:
+        if link.joint is None or link.joint.name not in ACTUATED_JOINTS:
+            continue
+        along = np.flatnonzero(link.joint.axis)[0]
+        rings = [solid for solid in link.solids if solid.size[0] == TORQUE_MOTOR.gap_radius]
+        assert sum(ring.inertia[along] for ring in rings) == pytest.approx(
+            TORQUE_MOTOR.rotor_inertia, rel=1e-12
+        )
+        for ring in rings:  # about the pivot, where the link's origin is
+            assert np.flatnonzero(ring.centre).tolist() == [along]
+
+
+@each_machine
+def test_the_arm_turns_between_the_halves_of_its_motor(machine: TPM) -> None:
+    for link in machine.mechanism.links:
+        if link.joint is not None and link.joint.name in ACTUATED_JOINTS:
+            along = np.flatnonzero(link.joint.axis)[0]
+            (tube,) = (solid for solid in link.solids if solid.kind == "box")
+            assert tube.half_extent[along] < TORQUE_MOTOR.clearance
+
+
+def test_the_line_is_that_of_a_winding() -> None:
+    # At the corner the voltage of the no-load speed is just used up: by speed and by resistance.
+    constant, speed = TORQUE_MOTOR.motor_constant, TORQUE_MOTOR.no_load_speed
+    at_corner = constant**2 * (speed - TORQUE_MOTOR.corner_speed)
+    assert at_corner == pytest.approx(TORQUE_MOTOR.peak_torque)
+    assert 0 < TORQUE_MOTOR.corner_speed < speed
