@@ -1,0 +1,134 @@
+"""The robot inside MuJoCo: motors, the cup's spring, encoders, and the truth.
+
+Motors that go exactly where they are told, as far as their effort lasts, are no servos but
+constraints: a rate to have at the end of the time step, with a limit of force. MuJoCo knows such a
+constraint, dry friction, whose rate is zero. The rows of friction are therefore given another rate
+where MuJoCo's own first half of a time step has set them up and before its second half solves them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import mujoco
+import numpy as np
+
+from tpm_gym.arrays import Quaternion, Vector, rotate, transform
+from tpm_gym.mechanism.machine import Machine
+from tpm_gym.mechanism.mjcf import STIFF, site_names
+from tpm_gym.simulation.engine import Motors, Truth
+
+__all__ = ["Robot"]
+
+_SPRING_GAIN = 0.2  # share of its way back that the cup's spring takes in one time step
+
+
+class Robot:
+    """The mechanism in a model.
+
+    Args:
+        model: The model.
+        data: Its state.
+        machine: What was compiled into it.
+
+    Attributes:
+        tool_body: Number of the link with the vacuum cup.
+    """
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, machine: Machine) -> None:
+        """Look up where everything is."""
+        self._model, self._data = model, data
+        mechanism = machine.mechanism
+        self._point_p, self._lip = mechanism.point_p, mechanism.lip
+        joints = [link.joint for link in mechanism.links if link.joint]
+        self._at = {joint.name: model.joint(joint.name).qposadr.item() for joint in joints}
+        self._dof = {joint.name: model.joint(joint.name).dofadr.item() for joint in joints}
+        self._platform = model.body(mechanism.platform).id
+        self.tool_body = model.body(mechanism.tool).id
+        moving = [model.body(link.name).id for link in mechanism.links[1:]]
+        self._inertias = {
+            body: (model.body_mass[body].item(), model.body_inertia[body].copy()) for body in moving
+        }
+        slide = mechanism.link(mechanism.tool).joint
+        assert slide is not None
+        self._driven = (*mechanism.actuated, slide.name)
+        efforts = {joint.name: joint.effort for joint in joints}
+        self._efforts = [efforts[name] for name in self._driven]
+        pairs = [site_names(closure.name) for closure in mechanism.closures]
+        self._sides = [[model.site(pair[side]).id for pair in pairs] for side in (0, 1)]
+        for name in self._driven:
+            model.dof_solimp[self._dof[name]] = [float(number) for number in STIFF.split()]
+        self._torque: Vector = (0.0, 0.0, 0.0)
+        self.alter((), (1.0, 1.0, 1.0))
+
+    def alter(self, mass_factors: Sequence[float], motor_strength: Sequence[float]) -> None:
+        """Scale the masses of the moving links (empty: all nominal) and the motors' torques."""
+        model = self._model
+        factors = mass_factors or [1.0] * len(self._inertias)
+        for (body, (mass, moments)), factor in zip(self._inertias.items(), factors, strict=True):
+            model.body_mass[body] = factor * mass
+            model.body_inertia[body] = factor * moments
+        strengths = zip(self._driven, self._efforts, (*motor_strength, 1.0), strict=True)
+        for name, effort, strength in strengths:
+            model.dof_frictionloss[self._dof[name]] = strength * effort
+        rough = np.flatnonzero(model.dof_frictionloss).tolist()  # each has a row, in this order
+        step = model.opt.timestep
+        self._rows = [
+            (rough.index(self._dof[name]), self._at[name], self._dof[name], gain / step)
+            for name, gain in zip(self._driven, (1.0, 1.0, 1.0, _SPRING_GAIN), strict=True)
+        ]
+        self._rate = 1 / step
+
+    def place(self, joints: Mapping[str, float]) -> None:
+        """Put every joint at its position (rad, m)."""
+        for name, position in joints.items():
+            self._data.qpos[self._at[name]] = position
+
+    def drive(self, theta: Vector) -> None:
+        """Let the motors go to ``theta`` within this time step, effort permitting.
+
+        To be called between the two halves of a time step.
+        """
+        data, rate = self._data, self._rate
+        wanted, first = data.efc_aref, data.ne
+        position, speed = data.qpos.item, data.qvel.item
+        for (row, at, dof, gain), target in zip(self._rows, (*theta, 0.0), strict=True):
+            wanted[first + row] = ((target - position(at)) * gain - speed(dof)) * rate
+
+    def note_torque(self) -> None:
+        """Note what the motors apply; to be called after the second half of a time step."""
+        forces, first = self._data.efc_force, self._data.ne
+        a, b, c = (forces.item(first + row) for row, *_ in self._rows[:3])
+        self._torque = (a, b, c)
+
+    def motors(self) -> Motors:
+        """True positions (rad, m), rates and noted torques (N m, N) of the motors."""
+        position, speed = self._data.qpos.item, self._data.qvel.item
+        (_, a, i, _), (_, b, j, _), (_, c, k, _), _ = self._rows
+        theta = position(a), position(b), position(c)
+        return Motors(theta, (speed(i), speed(j), speed(k)), self._torque)
+
+    def truth(self) -> Truth:
+        """Largest loop gap (m), platform position (m, world) and platform tilt (rad)."""
+        data, (side, other) = self._data, self._sides
+        gaps = data.site_xpos[side] - data.site_xpos[other]
+        origin, turn = self._frame(self._platform)
+        # The platform should stand as the base does: a half turn about x, quaternion (1, 0, 0, 0).
+        tilt = 2 * math.asin(min(1.0, math.hypot(*turn[1:])))
+        gap = math.sqrt((gaps * gaps).sum(axis=1).max(initial=0.0))
+        return Truth(gap, transform(origin, turn, self._point_p), tilt)
+
+    def cup(self) -> tuple[Vector, Vector]:
+        """Centre of the cup's lip (m) and the cup's outward axis, world."""
+        origin, turn = self._frame(self.tool_body)
+        return transform(origin, turn, self._lip), rotate(turn, (0.0, 0.0, 1.0))
+
+    def tool(self) -> tuple[Vector, Quaternion]:
+        """Origin (m) and orientation of the link with the cup, world."""
+        return self._frame(self.tool_body)
+
+    def _frame(self, body: int) -> tuple[Vector, Quaternion]:
+        x, y, z = self._data.xpos[body].tolist()
+        qw, qx, qy, qz = self._data.xquat[body].tolist()
+        return (x, y, z), (qx, qy, qz, qw)
