@@ -117,6 +117,7 @@ def mjcf_text(machine: Machine) -> str:
     tool = mechanism.link(mechanism.tool).joint
     for joint in world.iter("joint"):
         if tool is not None and joint.get("name") == tool.name:
+            joint.set("range", numbers((tool.lower, 0.0)))  # the spring keeps it on this stop
             joint.set("stiffness", numbers([_SPRING]))
             joint.set("springref", numbers([CUP.preload / _SPRING]))
     root.append(_actuators(mechanism))

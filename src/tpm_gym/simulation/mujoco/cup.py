@@ -19,6 +19,7 @@ from tpm_gym.simulation.vacuum import EMPTY, Hold, Load, hold_after
 
 __all__ = ["Cup", "Grip"]
 
+_NO_LOAD = Load()
 _APART = -1.0
 """Margin (m) at which a pair is never in contact."""
 
@@ -73,7 +74,7 @@ class Cup:
     def load(self) -> Load:
         """What the seal bore; to be called after the second half of a time step."""
         if self.grip.hold.which < 0:
-            return Load()
+            return _NO_LOAD
         row = self._row
         x, y, z = self._data.efc_force[row : row + 3].tolist()
         _, (a, b, c) = self._robot.cup()
@@ -84,6 +85,8 @@ class Cup:
     def breathe(self, on: bool, load: Load) -> bool:
         """Let air in or out for a time step; whether an object was taken or dropped."""
         before, pose = self.grip
+        if not on and before == EMPTY:
+            return False
         touched = self._touched() if on and before.which < 0 else -1
         hold = hold_after(before, self._model.opt.timestep, on, load, touched)
         if hold.which == before.which:
@@ -107,11 +110,11 @@ class Cup:
 
     def _touched(self) -> int:
         """Index of the first object on whose face the lip lies; -1 for none."""
-        near = self._robot.tool()[0]
+        height = self._robot.tool_height()
         for index, (block, reach) in enumerate(zip(self._blocks, self._reach, strict=True)):
-            pose = self._scenery.pose(index)
-            if math.dist(near, pose.position) <= reach:
+            if height - self._scenery.height(index) <= reach:  # else there is no need to look
                 lip, axis = self._robot.cup()
+                pose = self._scenery.pose(index)
                 if sealed(lip, axis, *pose, (block.width, block.height)):
                     return index
         return -1

@@ -91,10 +91,12 @@ class MujocoEngine:
         """See the protocol."""
         model, data, robot, cup = self.model, self.data, self.robot, self._cup
         first_half, second_half = mujoco.mj_step1, mujoco.mj_step2
+        last = references[-1]
         for theta in references:
             robot.drive(theta)
             second_half(model, data)
-            robot.note_torque()
+            if theta is last:
+                robot.note_torque()
             load = cup.load()
             first_half(model, data)
             if cup.breathe(vacuum, load):

@@ -23,7 +23,7 @@ from tpm_gym.simulation.state import Block, Scene
 
 __all__ = ["compiled", "grip_name", "marker_name", "object_name"]
 
-_RECOVERY = 0.25
+_RECOVERY = 0.1
 """Share of a penetration that a contact takes out in one time step: what bounces least."""
 _MARGIN = 1e-6  # m; so that what is put down exactly on the table is in contact at once
 

@@ -27,7 +27,7 @@ class Physics:
 
     time_step: float = 1 / 200
     iterations: int = 50
-    tolerance: float = 1e-15
+    tolerance: float = 1e-10
 
     def __post_init__(self) -> None:
         """Reject settings that cannot work."""

@@ -59,6 +59,7 @@ class Robot:
         self._sides = [[model.site(pair[side]).id for pair in pairs] for side in (0, 1)]
         for name in self._driven:
             model.dof_solimp[self._dof[name]] = [float(number) for number in STIFF.split()]
+        self._position, self._speed, self._height = data.qpos.item, data.qvel.item, data.xpos.item
         self._torque: Vector = (0.0, 0.0, 0.0)
         self.alter((), (1.0, 1.0, 1.0))
 
@@ -90,21 +91,20 @@ class Robot:
 
         To be called between the two halves of a time step.
         """
-        data, rate = self._data, self._rate
+        data, rate, position, speed = self._data, self._rate, self._position, self._speed
         wanted, first = data.efc_aref, data.ne
-        position, speed = data.qpos.item, data.qvel.item
         for (row, at, dof, gain), target in zip(self._rows, (*theta, 0.0), strict=True):
             wanted[first + row] = ((target - position(at)) * gain - speed(dof)) * rate
 
     def note_torque(self) -> None:
         """Note what the motors apply; to be called after the second half of a time step."""
-        forces, first = self._data.efc_force, self._data.ne
-        a, b, c = (forces.item(first + row) for row, *_ in self._rows[:3])
-        self._torque = (a, b, c)
+        force, first = self._data.efc_force.item, self._data.ne
+        (a, *_), (b, *_), (c, *_), _ = self._rows
+        self._torque = force(first + a), force(first + b), force(first + c)
 
     def motors(self) -> Motors:
         """True positions (rad, m), rates and noted torques (N m, N) of the motors."""
-        position, speed = self._data.qpos.item, self._data.qvel.item
+        position, speed = self._position, self._speed
         (_, a, i, _), (_, b, j, _), (_, c, k, _), _ = self._rows
         theta = position(a), position(b), position(c)
         return Motors(theta, (speed(i), speed(j), speed(k)), self._torque)
@@ -123,6 +123,10 @@ class Robot:
         """Centre of the cup's lip (m) and the cup's outward axis, world."""
         origin, turn = self._frame(self.tool_body)
         return transform(origin, turn, self._lip), rotate(turn, (0.0, 0.0, 1.0))
+
+    def tool_height(self) -> float:
+        """Of the origin of the link with the cup above the table, m."""
+        return self._height(self.tool_body, 2)
 
     def tool(self) -> tuple[Vector, Quaternion]:
         """Origin (m) and orientation of the link with the cup, world."""

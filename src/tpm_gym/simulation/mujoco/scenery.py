@@ -28,6 +28,7 @@ class Scenery:
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, scene: Scene) -> None:
         """Look up where everything is."""
         self._model, self._data, self._blocks = model, data, scene.objects
+        self._position = data.qpos.item
         names = [object_name(index) for index in range(len(scene.objects))]
         joints = [model.joint(name) for name in names]
         self._at = [joint.qposadr.item() for joint in joints]
@@ -56,6 +57,10 @@ class Scenery:
         return [
             (self.pose(index), self._twist(index, dof)) for index, dof in enumerate(self._dof)
         ]
+
+    def height(self, index: int) -> float:
+        """Of an object's centre above the table, m."""
+        return self._position(self._at[index] + 2)
 
     def pose(self, index: int) -> Pose:
         """Pose of an object."""
