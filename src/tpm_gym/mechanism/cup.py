@@ -32,7 +32,8 @@ class VacuumCup:
             An ejector of 5 l/min empties a cup and hose of 1.6 cm^3 so.
         venting_time: The same when air comes in, through the valve or below the lip, s.
         least_vacuum: At which the lip comes off when the vacuum is off, Pa.
-        friction: Coulomb coefficient of the lip's silicone on what is smooth and dry.
+        friction: Of the open lip, times an object's is the Coulomb coefficient between them.
+        seal_friction: Coulomb coefficient of the sealed lip: silicone sucked onto something smooth.
         seal_gap: Largest distance between lip and object at which the vacuum seals, m.
         seal_tilt: Largest angle between the cup's axis and the object's that the lip follows, rad.
     """
@@ -47,6 +48,7 @@ class VacuumCup:
     venting_time: float = 0.010
     least_vacuum: float = 3e3
     friction: float = 0.5
+    seal_friction: float = 1.0
     seal_gap: float = 0.002
     seal_tilt: float = math.radians(10.0)
 

@@ -57,7 +57,7 @@ def holds(vacuum: float, load: Load, cup: VacuumCup = CUP) -> bool:
     """
     pull, shear = load
     if pull < 0:
-        pull, shear = 0.0, max(0.0, shear + cup.friction * pull)
+        pull, shear = 0.0, max(0.0, shear + cup.seal_friction * pull)
     return math.hypot(pull, shear) <= cup.area * vacuum
 
 

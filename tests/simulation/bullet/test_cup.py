@@ -150,14 +150,132 @@ def test_a_held_puck_pressed_on_the_table_stays_held_and_the_cup_yields():
     state = go(simulation, 0.012, 5, vacuum=True)
     assert state.held == 0
     assert state.object_position[0, 2] == pytest.approx(0.015, abs=0.1e-3)
-    assert rows[-1][1] == pytest.approx(-0.018, abs=1e-3)
+    assert -0.020 < rows[-1][1] <= -0.018  # and what was between lip and puck when it sealed
     lifted = [simulation.move(level(height), vacuum=True) for height in (0.02, 0.03, 0.04, 0.05)]
     assert all(state.held == 0 for state in lifted)
+
+
+def pressed_at_full_speed(**of_puck):
+    """Sealed while the cup came down at full speed and went on for 18 mm."""
+    simulation = start(Block(**of_puck), height=0.09)
+    for height in (0.06, 0.03, 0.012):
+        state = simulation.move(level(height), vacuum=True)
+    state = go(simulation, 0.012, 4, vacuum=True)
+    assert state.held == 0
+    assert state.vacuum == pytest.approx(CUP.vacuum, rel=1e-2)
+    return simulation
+
+
+def weld(simulation):
+    """Force of the weld on the puck, N, world."""
+    return np.array(simulation.engine.client.getConstraintState(simulation.engine._cup._weld)[:3])
+
+
+def between(simulation):
+    """Force with which cup and puck push each other apart, N, and how deep they overlap, m."""
+    client, (puck,) = simulation.engine.client, simulation.engine.bodies
+    body, link = simulation.engine.robot.tool
+    force = sum(contact[9] for contact in client.getContactPoints(body, puck, link, -1))
+    near = client.getClosestPoints(body, puck, 0.01, link, -1)
+    return force, max(-point[8] for point in near)
+
+
+def test_weld_and_contact_do_not_fight():
+    simulation = pressed_at_full_speed()
+    for height in (0.03, 0.03, 0.045, 0.06, 0.06, 0.06, 0.06, 0.06):  # off the table, and at rest
+        assert go(simulation, height, 1, vacuum=True).held == 0
+        assert between(simulation)[0] == 0
+    np.testing.assert_allclose(weld(simulation), (0, 0, -0.05 * 9.81), atol=1e-3)
+    assert between(simulation)[1] < 0.02e-3
+
+
+def test_what_is_let_go_does_not_pop():
+    simulation = pressed_at_full_speed()
+    before = go(simulation, 0.031, 3, vacuum=True).object_position
+    rows = record(simulation)
+    after = go(simulation, 0.031, 3, vacuum=False)
+    assert after.held == -1
+    assert np.linalg.norm(after.object_position - before) < 0.05e-3
+    assert max(height for _, _, height in rows) < 0.01505
+
+
+def test_in_the_air_it_falls_from_rest():
+    simulation = pressed_at_full_speed()
+    go(simulation, 0.06, 3, vacuum=True)
+    go(simulation, 0.09, 8, vacuum=True)
+    step, speeds = simulation.engine.physics.time_step, []
+    around_each_step(simulation, after=lambda: speeds.append(simulation.engine.objects()[0][1]))
+    go(simulation, 0.09, 2, vacuum=False)
+    z = np.array([twist.velocity[2] for twist in speeds])
+    begun = int(np.argmax(z < -1e-3))
+    # The vacuum lasts 30 ms: 7 whole time steps; it is let go at the end of the eighth.
+    assert begun == 8
+    np.testing.assert_allclose(
+        z[begun:], -9.81 * step * np.arange(1, len(z) - begun + 1), atol=1e-3
+    )
+
+
+@pytest.mark.parametrize("direction", [(0, 0, -1), (1, 0, 0), (0, -1, 0), (1, 1, 0), (1, 0, -1)])
+@pytest.mark.parametrize("mass", [0.05, 0.3, 1.0])
+def test_a_held_puck_comes_off_at_the_pull_off_force(direction, mass):
+    # Measured: weight and pull together are 12.000 to 12.002 N when it is let go.
+    simulation = start(Block(mass=mass), height=0.05)
+    go(simulation, 0.03, 8, vacuum=True)
+    for height in np.arange(0.03, 0.06, 0.003):
+        assert go(simulation, height, 1, vacuum=True).held == 0
+    go(simulation, 0.06, 3, vacuum=True)
+    client, (body,), load = simulation.engine.client, simulation.engine.bodies, [11.5]
+    along = np.array(direction) / np.linalg.norm(direction)
+
+    def pull():
+        if simulation.engine.hold().which == 0:
+            load[0] += 0.002  # N a time step
+            force = load[0] * along + (0, 0, mass * 9.81)
+            position, _ = client.getBasePositionAndOrientation(body)
+            client.applyExternalForce(body, -1, force, position, client.WORLD_FRAME)
+
+    around_each_step(simulation, before=pull)
+    while simulation.move(level(0.06), vacuum=True).held == 0 and load[0] < 20:
+        pass
+    assert load[0] == pytest.approx(12.0, abs=0.01)
+
+
+@pytest.mark.parametrize(("mass", "kept"), [(0.2, True), (0.3, False)])
+def test_who_pulls_too_hard_loses_the_puck(mass, kept):
+    # Down at full speed and up again: 37.5 m/s^2 and the weight are 9.5 N, and 14.2 N.
+    simulation = pressed_at_full_speed(mass=mass)
+    for height in np.arange(0.012, 0.25, 0.012):
+        assert simulation.move(level(height), vacuum=True).held == 0
+    for height in (0.22, 0.19, 0.16, 0.19, 0.22):
+        state = simulation.move(level(height), vacuum=True)
+    assert (state.held == 0) is kept
+    assert (state.vacuum > 0.99 * CUP.vacuum) is kept
+    state = go(simulation, 0.22, 8, vacuum=True)
+    assert state.object_position[0, 2] == pytest.approx(0.205 if kept else 0.015, abs=2e-3)
+    assert state.vacuum > 0.99 * CUP.vacuum if kept else state.vacuum < 1
+
+
+@pytest.mark.parametrize("steps", [1, 3, 5])
+def test_a_moment_of_any_pressure_is_gone_back_to_exactly(steps):
+    simulation = start(height=0.0315)
+    moments = []
+    for index, vacuum in enumerate((True, True, False, True, True, True)):
+        if index == steps:
+            moments.append(simulation.save())
+        state = simulation.move(level(0.03), vacuum)
+    assert 0 < state.vacuum < CUP.vacuum
+    again = simulation.restore(moments[0])
+    assert again.vacuum > 0
+    for vacuum in (True, True, False, True, True, True)[steps:]:
+        again = simulation.move(level(0.03), vacuum)
+    for name, value in vars(state).items():
+        np.testing.assert_array_equal(getattr(again, name), value, err_msg=name)
 
 
 def test_a_reset_while_holding_lets_go():
     simulation = start_holding()
     state = simulation.reset(PAPER_TPM.inverse(level(0.1)), {"object": (0.0, -0.03, 0.015)})
     assert state.held == -1
+    assert state.vacuum == 0
     state = go(simulation, 0.1, 5, vacuum=True)
     assert np.allclose(state.object_position, (0.0, -0.03, 0.015), atol=1e-3)

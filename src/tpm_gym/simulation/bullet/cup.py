@@ -1,90 +1,135 @@
-"""The vacuum cup in PyBullet: it seals on contact, holds up to a force, and lets go."""
+"""The vacuum cup in PyBullet: a rigid joint to what it holds, judged after every time step."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 from tpm_gym.arrays import Vector
-from tpm_gym.mechanism.cup import CUP, sealed
+from tpm_gym.mechanism.cup import sealed
 from tpm_gym.simulation.bullet.client import Client
 from tpm_gym.simulation.bullet.robot import Robot
 from tpm_gym.simulation.engine import Pose
 from tpm_gym.simulation.state import Block
+from tpm_gym.simulation.vacuum import EMPTY, Hold, Load, hold_after
 
 __all__ = ["Cup", "Grip"]
 
+_WELD_FORCE = 1e4  # N; the weld itself never yields
+_REACH = 0.1  # m; what is farther from the lip does not get there in a control period
+_NOTHING = Load()
+
 
 class Grip(NamedTuple):
-    """Which object is held, and its pose in the tool's inertial frame."""
+    """What is held and how well, and its pose in the tool's inertial frame; None for nothing."""
 
-    which: int
-    pose: Pose
+    hold: Hold = EMPTY
+    pose: Pose | None = None
 
 
 class Cup:
     """The cup on a robot's platform, and the objects of which it can hold one.
+
+    While an object is held it does not collide with the cup: the weld keeps it where the lip lies
+    on its top face, and contact would fight with it.
 
     Args:
         client: The physics client.
         robot: Whose platform carries the cup.
         bodies: The objects' numbers in the client.
         blocks: What they are.
+        time_step: s.
+
+    Attributes:
+        grip: What it holds.
     """
 
     def __init__(
-        self, client: Client, robot: Robot, bodies: Sequence[int], blocks: Sequence[Block]
+        self,
+        client: Client,
+        robot: Robot,
+        bodies: Sequence[int],
+        blocks: Sequence[Block],
+        time_step: float,
     ) -> None:
         """Start with nothing held."""
-        self._client, self._robot = client, robot
+        self._client, self._robot, self._time_step = client, robot, time_step
         self._bodies, self._blocks = bodies, blocks
-        self._constraint: int | None = None
-        self.grip: Grip | None = None
+        self._weld = -1
+        self._near: list[int] = []
+        self.grip = Grip()
 
-    def suck(self) -> None:
-        """With the vacuum on: drop an object that was pulled off, take one that is touched."""
-        if not self._bodies:
+    def look(self, on: bool) -> None:
+        """Before a control period: which objects the cup may come to."""
+        self._near = []
+        if on and self._bodies:
+            lip, _ = self._robot.cup()
+            place = self._client.getBasePositionAndOrientation
+            for index, (body, block) in enumerate(zip(self._bodies, self._blocks, strict=True)):
+                size = math.hypot(block.width, block.width, block.height) / 2
+                if math.dist(place(body)[0], lip) < _REACH + size:
+                    self._near.append(index)
+
+    def suck(self, on: bool) -> None:
+        """After a time step: let the air in or out, hold on or drop, take what is touched."""
+        hold, pose = self.grip
+        if hold.which < 0 and not hold.vacuum and not self._near:
             return
-        lip, axis = self._robot.cup()
-        if self.grip is not None:
-            if not self._seals(self.grip.which, lip, axis):
-                self.let_go()
-            return
-        for index in range(len(self._bodies)):
-            if self._seals(index, lip, axis):
-                self.take(Grip(index, self._relative_pose(index)))
-                return
+        load = _NOTHING if pose is None else self._load()
+        touched = self._touched() if on and pose is None else -1
+        new = hold_after(hold, self._time_step, on, load, touched)
+        if new.which == hold.which:
+            self.grip = Grip(new, pose)
+        else:
+            self.take(Grip(new, None if new.which < 0 else self._seat(new.which)))
 
     def take(self, grip: Grip) -> None:
-        """Fix an object to the tool."""
-        constraint = self._client.createConstraint(
-            *self._robot.tool,
-            self._bodies[grip.which],
-            -1,
-            self._client.JOINT_FIXED,
-            (0.0, 0.0, 0.0),
-            grip.pose.position,
-            (0.0, 0.0, 0.0),
-            grip.pose.quaternion,
-        )
-        # Beyond this force the constraint yields, the lip lifts off, and the next check lets go.
-        self._client.changeConstraint(constraint, maxForce=CUP.pull_off)
-        self._constraint, self.grip = constraint, grip
+        """Let go, and hold what ``grip`` says."""
+        client, tool = self._client, self._robot.tool
+        if self.grip.pose is not None:
+            client.removeConstraint(self._weld)
+            self._collide(self.grip.hold.which, True)
+        self.grip = grip
+        if grip.pose is not None:
+            which, zero = grip.hold.which, (0.0, 0.0, 0.0)
+            ends = (*tool, self._bodies[which], -1, client.JOINT_FIXED, zero)
+            position, turn = grip.pose
+            self._weld = client.createConstraint(*ends, position, zero, turn)
+            client.changeConstraint(self._weld, maxForce=_WELD_FORCE)
+            self._collide(which, False)
 
-    def let_go(self) -> None:
-        """Release the object, if one is held."""
-        if self._constraint is not None:
-            self._client.removeConstraint(self._constraint)
-        self._constraint = self.grip = None
+    def _collide(self, which: int, on: bool) -> None:
+        body, link = self._robot.tool
+        self._client.setCollisionFilterPair(body, self._bodies[which], link, -1, int(on))
 
-    def _seals(self, index: int, lip: Vector, axis: Vector) -> bool:
-        block = self._blocks[index]
-        pose = Pose(*self._client.getBasePositionAndOrientation(self._bodies[index]))
-        return sealed(lip, axis, pose.position, pose.quaternion, (block.width, block.height))
+    def _load(self) -> Load:
+        """What the weld did to the object in the last time step.
 
-    def _relative_pose(self, index: int) -> Pose:
-        """Pose of an object in the tool's inertial frame, as it is now."""
-        state = self._client.getLinkState(*self._robot.tool, computeForwardKinematics=True)
-        inverse = self._client.invertTransform(state[0], state[1])
-        pose = self._client.getBasePositionAndOrientation(self._bodies[index])
-        return Pose(*self._client.multiplyTransforms(*inverse, *pose))
+        The engine gives its force along the axes of the world, and the cup's axis never leaves the
+        vertical.
+        """
+        x, y, z, *_ = self._client.getConstraintState(self._weld)
+        return Load(-z, math.hypot(x, y))
+
+    def _touched(self) -> int:
+        """The first of the objects nearby that the lip lies on; -1 for none."""
+        lip, axis = self._robot.cup()
+        for index in self._near:
+            block = self._blocks[index]
+            pose = self._client.getBasePositionAndOrientation(self._bodies[index])
+            if sealed(lip, axis, pose[0], pose[1], (block.width, block.height)):
+                return index
+        return -1
+
+    def _seat(self, index: int) -> Pose:
+        """Where an object sits in the tool's inertial frame: as it is, but not inside the cup."""
+        client, (body, link) = self._client, self._robot.tool
+        state = client.getLinkState(body, link, computeForwardKinematics=True)
+        inverse = client.invertTransform(state[0], state[1])
+        pose = client.getBasePositionAndOrientation(self._bodies[index])
+        (x, y, z), turn = client.multiplyTransforms(*inverse, *pose)
+        points = client.getClosestPoints(body, self._bodies[index], 0.0, link, -1)
+        depth = -min((point[8] for point in points), default=0.0)
+        seat: Vector = (x, y, z + depth)
+        return Pose(seat, turn)

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tpm_gym.arrays import Vector
-from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.bullet.client import Client
 from tpm_gym.simulation.bullet.cup import Cup, Grip
@@ -21,7 +20,7 @@ from tpm_gym.simulation.engine import Engine, Motors, Pose, Truth, Twist
 from tpm_gym.simulation.randomisation import Plant
 from tpm_gym.simulation.settings import settings_of
 from tpm_gym.simulation.state import Scene
-from tpm_gym.simulation.vacuum import EMPTY, Hold
+from tpm_gym.simulation.vacuum import Hold
 
 __all__ = ["BulletEngine"]
 
@@ -30,7 +29,7 @@ __all__ = ["BulletEngine"]
 class _Moment:
     joints: tuple[tuple[float, float], ...]  # rad and rad/s, passive ones too
     objects: list[tuple[Pose, Twist]]
-    grip: Grip | None
+    grip: Grip
 
 
 class BulletEngine:
@@ -68,7 +67,7 @@ class BulletEngine:
         if self._gui or self._renderer == "egl":
             self.robot.paint()
         self.bodies = self._scenery.bodies
-        self._cup = Cup(self.client, self.robot, self.bodies, scene.objects)
+        self._cup = Cup(self.client, self.robot, self.bodies, scene.objects, self.physics.time_step)
 
     def _empty(self) -> None:
         """Take everything out of the client; a window stays, else a new client leaks least."""
@@ -86,7 +85,7 @@ class BulletEngine:
 
     def place(self, joints: Mapping[str, float], objects: Sequence[Pose]) -> None:
         """See the protocol."""
-        self._cup.let_go()
+        self._cup.take(Grip())
         self.robot.place(joints)
         self._scenery.place([(pose, Twist()) for pose in objects])
 
@@ -96,14 +95,12 @@ class BulletEngine:
 
     def advance(self, references: Sequence[Vector], vacuum: bool) -> None:
         """See the protocol."""
-        if not vacuum:
-            self._cup.let_go()
-        drive, step = self.robot.drive, self.client.stepSimulation
+        drive, step, suck = self.robot.drive, self.client.stepSimulation, self._cup.suck
+        self._cup.look(vacuum)
         for theta in references:
             drive(theta)
             step()
-        if vacuum:
-            self._cup.suck()
+            suck(vacuum)
 
     def motors(self) -> Motors:
         """See the protocol."""
@@ -119,8 +116,7 @@ class BulletEngine:
 
     def hold(self) -> Hold:
         """See the protocol."""
-        grip = self._cup.grip
-        return EMPTY if grip is None else Hold(grip.which, CUP.vacuum)
+        return self._cup.grip.hold
 
     def save(self) -> Any:
         """See the protocol."""
@@ -128,11 +124,10 @@ class BulletEngine:
 
     def restore(self, snapshot: Any) -> None:
         """See the protocol."""
-        self._cup.let_go()
+        self._cup.take(Grip())
         self.robot.set_joint_states(snapshot.joints)
         self._scenery.place(snapshot.objects)
-        if snapshot.grip is not None:
-            self._cup.take(snapshot.grip)
+        self._cup.take(snapshot.grip)
 
     def picture(self, width: int, height: int) -> NDArray[np.uint8]:
         """See the protocol."""

@@ -23,6 +23,7 @@ from tpm_gym.arrays import Quaternion, Vector, rotate, transform
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism import urdf
 from tpm_gym.mechanism.bodies import Mechanism
+from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.mount import Mount
 from tpm_gym.simulation.bullet.client import Client
 from tpm_gym.simulation.bullet.physics import MOTOR_GAIN
@@ -70,6 +71,7 @@ class Robot:
         slide = mechanism.link(mechanism.tool).joint
         assert slide is not None
         self.tool = self.links[mechanism.tool]
+        client.changeDynamics(*self.tool, lateralFriction=CUP.friction)
         client.setJointMotorControl2(
             *self.tool,
             client.POSITION_CONTROL,
