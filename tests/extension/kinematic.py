@@ -13,7 +13,7 @@ from tpm_gym.arrays import Vector
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.cup import CUP, sealed
 from tpm_gym.simulation import Plant, Scene
-from tpm_gym.simulation.engine import Hold, Motors, Pose, Truth, Twist
+from tpm_gym.simulation.engine import Hold, Motors, Pose, Reference, Truth, Twist
 from tpm_gym.simulation.randomisation import NOMINAL
 from tpm_gym.simulation.state import CONTROL_PERIOD
 from tpm_gym.simulation.vacuum import EMPTY, Load, hold_after
@@ -41,8 +41,8 @@ class KinematicEngine:
     def show_goal(self, markers: Sequence[Vector]) -> None:
         pass
 
-    def advance(self, references: Sequence[Vector], vacuum: bool) -> None:
-        before, (theta,) = self._position(), references
+    def advance(self, references: Sequence[Reference], vacuum: bool) -> None:
+        before, theta = self._position(), references[-1].theta
         a, b, c = np.subtract(theta, self._theta) / CONTROL_PERIOD
         self._theta, self._rates = theta, (a, b, c)
         now = self._position()

@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from tpm_gym.simulation.bullet.client import GRAVITY
+from tpm_gym.mechanism.mount import GRAVITY
 from tpm_gym.simulation.state import CONTROL_PERIOD
 from tpm_gym.tasks import Expert
 

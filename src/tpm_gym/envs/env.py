@@ -24,6 +24,7 @@ from tpm_gym.errors import (
 )
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.display import has_display
+from tpm_gym.simulation.drives import Servo, drive_of, require_servo
 from tpm_gym.simulation.randomisation import Randomisation
 from tpm_gym.simulation.settings import settings_of
 from tpm_gym.simulation.simulation import Simulation, Snapshot
@@ -163,6 +164,10 @@ class TPMEnv(gym.Env[Observation, Action]):
         goals: ``"sampled"`` (None too), or ``"tempting"``: the goal, and where the puck starts, lie
             next to the singularity, which not every machine has near its goals.
         penalty_weight: Weight of the singularity penalty, None for 1; 0 switches it off.
+        drive: How the motors follow their references. ``"ideal"`` (None too): exactly, with up to
+            100 N m. ``"servo"``, a :class:`~tpm_gym.simulation.Servo` or a mapping of its
+            attributes: as torque motors with servo drives do, that have stiffness, damping, a
+            feed-forward, and less torque the faster they turn.
         randomisation: What differs from the nominal machine, drawn anew for each episode: a
             :class:`~tpm_gym.simulation.Randomisation` or a mapping of its attributes. Where
             disturbed encoders report angles that cannot be assembled, position and velocity keep
@@ -199,6 +204,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         machine: str | Machine | None = None,
         goals: str | None = None,
         penalty_weight: float | None = None,
+        drive: str | Servo | Mapping[str, Any] | None = None,
         randomisation: Randomisation | Mapping[str, Any] | None = None,
         physics: Any = None,
         render_mode: str | None = None,
@@ -220,6 +226,10 @@ class TPMEnv(gym.Env[Observation, Action]):
         self.machine = self.task.machine
         self.control = make_control(control, self.machine)
         self.randomisation = settings_of(Randomisation, "randomisation", randomisation)
+        self.drive = drive_of(drive)
+        require_servo(
+            self.drive, self.randomisation.servo_stiffness, self.randomisation.joint_friction
+        )
         self._size = _pixels("width", width), _pixels("height", height)
         self.observation_space = spaces.Dict(
             {
@@ -241,7 +251,14 @@ class TPMEnv(gym.Env[Observation, Action]):
         numerics = physics
         if is_dataclass(physics) and not isinstance(physics, type):
             numerics = asdict(physics)
-        self._kind = (type(self.task), self.machine, engine, self.randomisation, numerics)
+        self._kind = (
+            type(self.task),
+            self.machine,
+            engine,
+            self.drive,
+            self.randomisation,
+            numerics,
+        )
         self.simulation = self._start()
 
     def _start(self) -> Simulation:
@@ -250,6 +267,7 @@ class TPMEnv(gym.Env[Observation, Action]):
             machine=self.machine,
             engine=self._engine,
             physics=self._physics,
+            drive=self.drive,
             gui=self.render_mode == "human",
             renderer=self._renderer,
         )

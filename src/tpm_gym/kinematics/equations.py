@@ -46,6 +46,7 @@ __all__ = [
     "parallel_factors",
     "posture",
     "posture_at",
+    "require_regular",
     "rods",
     "velocity",
 ]
@@ -321,11 +322,16 @@ def evaluate(
     cos, sin, found = _assembled(theta, branch, geometry)
     bars = rods(cos, sin, found, geometry)
     values = factors(cos, sin, found, bars, geometry)
+    require_regular(values, geometry)
+    rows = velocity(bars, values)
+    return found, rows, conditioning(rows, PLAIN)
+
+
+def require_regular(values: Factors, geometry: Geometry) -> None:
+    """Raise SingularityError if a factor of det A is zero."""
     for name, value in parallel_factors(values[:3], geometry).items():
         if abs(value) < SINGULAR:
             raise SingularityError(name, value)
-    rows = velocity(bars, values)
-    return found, rows, conditioning(rows, PLAIN)
 
 
 # -- why there is no configuration, or no velocity -------------------------------------------------

@@ -34,6 +34,7 @@ __all__ = [
     "factors",
     "factors_at",
     "parallel",
+    "require_regular",
     "serial",
     "velocity",
 ]
@@ -141,7 +142,7 @@ def velocity(
 
     layouts = _PARALLEL, _MATRIX + 3
     singular, found = _from_angles(columns, theta, branch, geometry, *layouts)
-    _require_regular(singular, geometry)
+    require_regular(singular, geometry)
     return found
 
 
@@ -190,7 +191,7 @@ def evaluate(
 
     layouts = _COLUMN, _PARALLEL + 1, np.arange(4, 7), _MATRIX + 7
     quality, singular, position, rows = _from_angles(columns, angles, branch, geometry, *layouts)
-    _require_regular(singular, geometry)
+    require_regular(singular, geometry)
     return Evaluation(position, rows, quality)
 
 
@@ -279,7 +280,7 @@ def _conditioning(c: _Configuration) -> Numbers:
     return c.ns.where(found <= 1.0, found, 0.0)
 
 
-def _require_regular(values: FloatArray, geometry: Geometry) -> None:
+def require_regular(values: FloatArray, geometry: Geometry) -> None:
     """Raise if a factor of det A (..., 3) is zero somewhere, for the one that is nearest to it."""
     nearest = []
     named = equations.parallel_factors((values[..., 0], values[..., 1], values[..., 2]), geometry)

@@ -7,6 +7,7 @@ gradients and GPUs.
 
 from __future__ import annotations
 
+import itertools
 import math
 import operator
 from collections.abc import Callable, Sequence
@@ -41,6 +42,7 @@ class Namespace:
         wrap: An angle within a turn of it, in (-pi, pi].
         signs: Of a shape, as numbers like those that are given: -1 and 1.
         stack: Components (...,), joined along a new last axis.
+        join: Points (..., 3), broadcast with each other, joined along their last axis.
     """
 
     cos: _One
@@ -58,6 +60,7 @@ class Namespace:
     cube: _One
     signs: Callable[[Any, tuple[int, ...]], Any]
     stack: Callable[[Sequence[Any]], Any]
+    join: Callable[[Sequence[Any]], Any]
 
 
 def namespace_of(value: object) -> Namespace:
@@ -91,6 +94,7 @@ PLAIN = Namespace(
     cube=lambda x: x**3,
     signs=lambda like, shape: (-1, 1),
     stack=tuple,
+    join=lambda points: tuple(itertools.chain(*points)),
 )
 
 NUMPY = Namespace(
@@ -109,6 +113,7 @@ NUMPY = Namespace(
     cube=lambda x: x * x * x,  # its power of 3 costs 20 times as much
     signs=lambda like, shape: np.array([-1.0, 1.0]).reshape(shape),
     stack=lambda columns: np.stack(columns, axis=-1),
+    join=lambda points: np.concatenate(np.broadcast_arrays(*points), axis=-1),
 )
 
 
@@ -134,6 +139,11 @@ def _torch() -> Namespace:
     def wrap(x: Any) -> Any:
         return torch.where(x > math.pi, x - _TURN, torch.where(x <= -math.pi, x + _TURN, x))
 
+    def join(points: Sequence[Any]) -> Any:
+        tensor = next(point for point in points if is_tensor(point))
+        shape = torch.broadcast_shapes(*(point.shape for point in points))
+        return torch.cat([like(point, tensor).expand(shape) for point in points], -1)
+
     return Namespace(
         cos=torch.cos,
         sin=torch.sin,
@@ -150,18 +160,19 @@ def _torch() -> Namespace:
         cube=lambda x: x * x * x,
         signs=lambda other, shape: like([-1.0, 1.0], other).reshape(shape),
         stack=lambda columns: torch.stack(list(columns), -1),
+        join=join,
     )
 
 
 def by_rows(
-    text: Callable[[tuple[Numbers, Numbers, Numbers], Namespace], Sequence[Numbers]],
+    text: Callable[[Any, Namespace], Sequence[Numbers]],
     points: FloatArray,
     *layouts: NDArray[np.intp],
 ) -> list[FloatArray]:
-    """Compute columns (n,) for points (..., 3), and lay them out.
+    """Compute columns (n,) for points (..., k), and lay them out.
 
     Args:
-        text: From components (n,) to columns (n,).
+        text: From a tuple of the components (n,) to columns (n,).
         points: An array, or a tensor.
         layouts: Numbers of columns, in the shape of a result.
 
@@ -169,16 +180,15 @@ def by_rows(
         For each layout, (..., *layout.shape).
     """
     ns, shape = namespace_of(points), points.shape[:-1]
-    flat = points.reshape(-1, 3)
+    flat = points.reshape(-1, points.shape[-1])
     if ns is not NUMPY:
-        table = ns.stack(text((flat[:, 0], flat[:, 1], flat[:, 2]), ns))
+        table = ns.stack(text(tuple(flat.T), ns))
         return [table[:, layout].reshape((*shape, *layout.shape)) for layout in layouts]
     results = [np.empty((len(flat), *layout.shape)) for layout in layouts]
     with np.errstate(all="ignore"):
         for start in range(0, len(flat), _BLOCK):
             rows = slice(start, start + _BLOCK)
-            x, y, z = np.ascontiguousarray(flat[rows].T)
-            columns = text((x, y, z), ns)
+            columns = text(tuple(np.ascontiguousarray(flat[rows].T)), ns)
             for result, layout in zip(results, layouts, strict=True):
                 _lay_out(columns, layout, result[rows])
     return [result.reshape((*shape, *result.shape[1:])) for result in results]

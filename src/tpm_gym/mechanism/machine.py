@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike
 from tpm_gym.arrays import FloatArray, Vector, vector
 from tpm_gym.errors import ConfigurationError, SingularityError, UnreachableError
 from tpm_gym.kinematics.workspace import Region
+from tpm_gym.mechanism import virtual_work
 from tpm_gym.mechanism.bodies import Mechanism
 from tpm_gym.mechanism.mount import Mount
 
@@ -184,6 +185,20 @@ class Machine(ABC):
         Raises:
             UnreachableError: If it cannot be assembled at theta.
         """
+
+    def torque(self, theta: Vector, theta_dot: Vector, theta_ddot: Vector) -> Vector:
+        """Torques of the motors for a motion of the empty machine, N m (N for a slide).
+
+        From the bodies, by differences, which takes milliseconds; a machine with a closed form
+        overrides it.
+
+        Raises:
+            UnreachableError: If it cannot be assembled at theta.
+            SingularityError: If theta is a parallel singularity.
+        """
+        fall = self.mount.free_fall
+        motion = theta, theta_dot, theta_ddot
+        return virtual_work.torque(self.mechanism, self.joint_positions, fall, *motion)
 
     @property
     def lengths(self) -> tuple[float, ...]:

@@ -136,9 +136,7 @@ def write(folder: Path, machine: Machine = PAPER_TPM) -> Path:
 
 def numbers(values: Iterable[float]) -> str:
     """Nine significant digits: a nanometre in a metre; never ``-0``."""
-    return " ".join(
-        f"{float(value) + 0.0:.9g}" if abs(value) > 1e-15 else "0" for value in values
-    )
+    return " ".join(f"{float(value) + 0.0:.9g}" if abs(value) > 1e-15 else "0" for value in values)
 
 
 def _body(world: Element, bodies: dict[str, Element], link: Link, mount: Mount) -> Element:

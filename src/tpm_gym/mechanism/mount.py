@@ -9,7 +9,10 @@ from numpy.typing import ArrayLike
 
 from tpm_gym.arrays import FloatArray, Vector
 
-__all__ = ["Mount"]
+__all__ = ["GRAVITY", "Mount"]
+
+GRAVITY = 9.81
+"""m/s^2, along the world's -z."""
 
 _HALF_TURN = np.array([1.0, -1.0, -1.0])
 
@@ -44,6 +47,12 @@ class Mount:
         """One point from either frame to the other, in plain floats: a half turn undoes itself."""
         x, y, z = point
         return x, -y, self.height - z
+
+    @property
+    def free_fall(self) -> Vector:
+        """Acceleration of gravity in the paper frame, m/s^2."""
+        x, y, z = self.rotate((0.0, 0.0, -GRAVITY)).tolist()
+        return x, y, z
 
     @property
     def quaternion(self) -> tuple[float, float, float, float]:

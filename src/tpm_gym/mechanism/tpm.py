@@ -19,6 +19,7 @@ from tpm_gym.kinematics.position import forward_all
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism import tree
 from tpm_gym.mechanism.bodies import Mechanism
+from tpm_gym.mechanism.dynamics import Dynamics, torques
 from tpm_gym.mechanism.machine import Machine, Mode, Reading, register_machine
 from tpm_gym.mechanism.mount import Mount
 
@@ -94,6 +95,19 @@ class TPM(Machine):
     def joint_positions(self, theta: Vector) -> dict[str, float]:
         """See :class:`Machine`."""
         return tree.joint_angles(theta, self.assembly_mode, self.geometry)
+
+    @cached_property
+    def dynamics(self) -> Dynamics:
+        """Torques, mass matrix and so on, as designed and with nothing in the cup."""
+        return Dynamics(
+            geometry=self.geometry, branch=self.assembly_mode, free_fall=self.mount.free_fall
+        )
+
+    def torque(self, theta: Vector, theta_dot: Vector, theta_ddot: Vector) -> Vector:
+        """See :class:`Machine`."""
+        dynamics = self.dynamics
+        pose = dynamics.pose(theta)
+        return torques(pose, theta_dot, theta_ddot, dynamics.free_fall, dynamics.inertia)
 
     @property
     def lengths(self) -> tuple[float, ...]:

@@ -1,5 +1,6 @@
 """What moves the robot: state, randomisation, the simulation and its engines."""
 
+from tpm_gym.simulation.drives import Servo
 from tpm_gym.simulation.engine import Engine, register_engine
 from tpm_gym.simulation.randomisation import Plant, Randomisation
 from tpm_gym.simulation.simulation import Simulation, Snapshot
@@ -11,6 +12,7 @@ __all__ = [
     "Plant",
     "Randomisation",
     "Scene",
+    "Servo",
     "Simulation",
     "Snapshot",
     "State",

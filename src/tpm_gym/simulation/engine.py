@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from tpm_gym.arrays import Quaternion, Vector
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.machine import Machine
+from tpm_gym.simulation.drives import Reference, Servo
 from tpm_gym.simulation.randomisation import Plant
 from tpm_gym.simulation.state import Scene
 from tpm_gym.simulation.vacuum import Hold
@@ -27,6 +28,7 @@ __all__ = [
     "Hold",
     "Motors",
     "Pose",
+    "Reference",
     "Truth",
     "Twist",
     "make_engine",
@@ -90,8 +92,8 @@ class Engine(Protocol):
     def show_goal(self, markers: Sequence[Vector]) -> None:
         """Move the goal markers."""
 
-    def advance(self, references: Sequence[Vector], vacuum: bool) -> None:
-        """Run a control period: drive the motors to one reference (rad, m) in each time step."""
+    def advance(self, references: Sequence[Reference], vacuum: bool) -> None:
+        """Run a control period: drive the motors to one reference in each time step."""
 
     def motors(self) -> Motors:
         """Read the motors."""
@@ -137,8 +139,9 @@ def register_engine(name: str, engine: str | Factory) -> None:
     Args:
         name: The name.
         engine: What makes the engine, from those of the keywords ``gui`` (to open a window),
-            ``renderer`` (other than its own) and ``physics`` (its numerical settings) that it can
-            serve; or ``"module:attribute"`` of that, imported when first asked for.
+            ``renderer`` (other than its own), ``physics`` (its numerical settings) and ``drive`` (a
+            :class:`~tpm_gym.simulation.drives.Servo` on each motor, instead of ideal drives) that
+            it can serve; or ``"module:attribute"`` of that, imported when first asked for.
 
     Raises:
         ConfigurationError: If the name is taken by another engine.
@@ -156,7 +159,12 @@ def _path(engine: str | Factory) -> str:
 
 
 def make_engine(
-    name: str, *, gui: bool = False, renderer: str | None = None, physics: Any = None
+    name: str,
+    *,
+    gui: bool = False,
+    renderer: str | None = None,
+    physics: Any = None,
+    drive: Servo | None = None,
 ) -> Engine:
     """The engine of that name.
 
@@ -169,7 +177,12 @@ def make_engine(
     if isinstance(factory, str):
         module, _, attribute = factory.partition(":")
         factory = getattr(importlib.import_module(module), attribute)
-    options: dict[str, Any] = {"gui": gui or None, "renderer": renderer, "physics": physics}
+    options: dict[str, Any] = {
+        "gui": gui or None,
+        "renderer": renderer,
+        "physics": physics,
+        "drive": drive,
+    }
     asked = {option: value for option, value in options.items() if value is not None}
     known = inspect.signature(factory).parameters
     if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in known.values()):

@@ -8,7 +8,7 @@ expert keep believing in the nominal machine, as on a real robot.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,11 +22,13 @@ __all__ = ["NOMINAL", "Plant", "Randomisation"]
 Range = tuple[float, float]
 
 # What may be asked for: far enough for any machine of this kind, near enough to stay one.
-_FACTORS: dict[str, Range] = {
+_RANGES: dict[str, Range] = {
     "link_mass": (0.5, 2.0),
     "puck_mass": (0.1, 10.0),
     "friction": (0.1, 3.0),
     "motor_strength": (0.5, 1.5),
+    "servo_stiffness": (0.25, 4.0),
+    "joint_friction": (0.0, 5.0),
 }
 # With bias and lengths off by all of this at once, the arm at home still stands on its own side.
 _SIZES: dict[str, float] = {
@@ -46,6 +48,8 @@ class Plant:
         puck_mass: Factor of the objects' mass.
         friction: Factor of the friction between objects and table, and objects and cup.
         motor_strength: Factors of the three motors' largest torque.
+        servo_stiffness: Factors of the three servo drives' stiffness.
+        joint_friction: Coulomb friction on the three motors' axes, N m.
         encoder_bias: What the encoders report minus what is true, rad.
         length_errors: True minus nominal lengths (l1 to l7), m; empty if all are zero.
     """
@@ -54,6 +58,8 @@ class Plant:
     puck_mass: float = 1.0
     friction: float = 1.0
     motor_strength: Vector = (1.0, 1.0, 1.0)
+    servo_stiffness: Vector = (1.0, 1.0, 1.0)
+    joint_friction: Vector = (0.0, 0.0, 0.0)
     encoder_bias: Vector = (0.0, 0.0, 0.0)
     length_errors: tuple[float, ...] = ()
 
@@ -77,7 +83,7 @@ NOMINAL = Plant()
 class Randomisation:
     """How far the machine may stray from the nominal one. Each episode draws uniformly.
 
-    Factors are given as (low, high), or as one number that is then fixed.
+    Ranges are given as (low, high), or as one number that is then fixed.
 
     Attributes:
         link_mass: Factor of each moving link's mass and inertia, drawn for each link;
@@ -85,6 +91,10 @@ class Randomisation:
         puck_mass: Factor of the objects' mass (50 g); within 0.1 to 10.
         friction: Factor of the objects' friction (0.6 on the table); within 0.1 to 3.
         motor_strength: Factor of each motor's largest torque (100 N m); within 0.5 to 1.5.
+        servo_stiffness: Factor of each drive's stiffness, its damping left as it is; within 0.25 to
+            4. With ``drive="servo"`` only.
+        joint_friction: Coulomb friction on each motor's axis, N m; within 0 to 5. With
+            ``drive="servo"`` only.
         encoder_noise: Standard deviation of each reading of an encoder, rad; at most 0.001.
             The rates are differences of readings over a control period, and as noisy.
         encoder_bias: Each encoder is off by up to this, rad; at most 0.001. Its motor goes where
@@ -106,14 +116,16 @@ class Randomisation:
     puck_mass: Range | float = (1.0, 1.0)
     friction: Range | float = (1.0, 1.0)
     motor_strength: Range | float = (1.0, 1.0)
+    servo_stiffness: Range | float = (1.0, 1.0)
+    joint_friction: Range | float = (0.0, 0.0)
     encoder_noise: float = 0.0
     encoder_bias: float = 0.0
     latency: int = 0
     length_error: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the values; make pairs of single factors."""
-        for name, (low, high) in _FACTORS.items():
+        """Check the values; make pairs of single numbers."""
+        for name, (low, high) in _RANGES.items():
             object.__setattr__(self, name, _pair(name, getattr(self, name), low, high))
         for name, largest in _SIZES.items():
             value = getattr(self, name)
@@ -127,24 +139,28 @@ class Randomisation:
         """How the machine of one episode differs; ``rng`` is not touched where nothing does."""
         if self == _NOTHING:
             return NOMINAL
-        motors = self._factors(rng, "motor_strength", 3)
+        one, two, three = self._numbers(rng, "motor_strength", 3)
         biases = _deviations(rng, self.encoder_bias, 3) or (0.0, 0.0, 0.0)
-        return Plant(
-            link_masses=self._factors(rng, "link_mass", len(machine.mechanism.links) - 1),
-            puck_mass=self._factors(rng, "puck_mass", 1)[0],
-            friction=self._factors(rng, "friction", 1)[0],
-            motor_strength=(motors[0], motors[1], motors[2]),
+        # What there was first is drawn first, so that seeds keep their meaning.
+        plant = Plant(
+            link_masses=self._numbers(rng, "link_mass", len(machine.mechanism.links) - 1),
+            puck_mass=self._numbers(rng, "puck_mass", 1)[0],
+            friction=self._numbers(rng, "friction", 1)[0],
+            motor_strength=(one, two, three),
             encoder_bias=(biases[0], biases[1], biases[2]),
             length_errors=_deviations(rng, self.length_error, len(machine.lengths)),
         )
+        a, b, c = self._numbers(rng, "servo_stiffness", 3)
+        d, e, f = self._numbers(rng, "joint_friction", 3)
+        return replace(plant, servo_stiffness=(a, b, c), joint_friction=(d, e, f))
 
-    def _factors(self, rng: np.random.Generator, name: str, count: int) -> tuple[float, ...]:
+    def _numbers(self, rng: np.random.Generator, name: str, count: int) -> tuple[float, ...]:
         low, high = getattr(self, name)
         return tuple(rng.uniform(low, high, count).tolist()) if high > low else (low,) * count
 
 
 def _pair(name: str, value: Any, low: float, high: float) -> Range:
-    """A factor, or a pair of them, as a pair within the limits."""
+    """A number, or a pair of them, as a pair within the limits."""
     pair = (value, value) if _is_number(value) else value
     sized = isinstance(pair, (tuple, list, np.ndarray)) and len(pair) == 2
     if sized and all(map(_is_number, pair)):

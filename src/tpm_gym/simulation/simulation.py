@@ -24,6 +24,7 @@ from tpm_gym.errors import (
 )
 from tpm_gym.mechanism.machine import Machine, Mode, Reading
 from tpm_gym.mechanism.tpm import PAPER_TPM
+from tpm_gym.simulation.drives import Reference, Servo, references, require_servo
 from tpm_gym.simulation.engine import Engine, Pose, make_engine
 from tpm_gym.simulation.randomisation import NOMINAL, Plant
 from tpm_gym.simulation.state import CONTROL_PERIOD, Scene, State
@@ -68,6 +69,7 @@ class Simulation:
         machine: The nominal machine.
         engine: Name of the engine.
         physics: The engine's numerical settings; None for its own.
+        drive: The motors' servo drives; None for ideal ones.
         gui: Whether to open a window.
         renderer: What draws pictures; None for the engine's own choice.
 
@@ -82,6 +84,7 @@ class Simulation:
         machine: Machine = PAPER_TPM,
         engine: str = "pybullet",
         physics: Any = None,
+        drive: Servo | None = None,
         gui: bool = False,
         renderer: str | None = None,
     ) -> None:
@@ -90,7 +93,10 @@ class Simulation:
         if len(set(names)) < len(names) or "goal" in names:
             raise ConfigurationError("scene", names, "objects of different names, none 'goal'")
         self.scene, self.machine = scene, machine
-        self.engine: Engine = make_engine(engine, gui=gui, renderer=renderer, physics=physics)
+        self.drive = drive
+        self.engine: Engine = make_engine(
+            engine, gui=gui, renderer=renderer, physics=physics, drive=drive
+        )
         try:
             self._load(machine, NOMINAL.length_errors)
         except BaseException:
@@ -142,9 +148,11 @@ class Simulation:
             noise: Of the first reading of the encoders, rad.
 
         Raises:
+            ConfigurationError: If the plant differs in what only a servo drive has.
             InputError: If theta or a position is not three finite numbers.
             UnreachableError: If the mechanism cannot be assembled at theta.
         """
+        require_servo(self.drive, plant.servo_stiffness, plant.joint_friction)
         angles = vector("theta", theta)
         reading = self.machine.evaluate(angles)
         a, b, c = (angle - bias for angle, bias in zip(angles, plant.encoder_bias, strict=True))
@@ -194,20 +202,33 @@ class Simulation:
             raise ModeChangeError(self._mode_left)
         before, last = self._commands
         new = vector("command", command)
+        self.machine.inverse(new)  # the spline may end before the command does
+        followed = self._references(before, last, new)
+        self._commands = (last, new)
+        self.engine.advance(followed, vacuum)
+        self._noise = (self._noise[1], noise)
+        return self.read(moved=True)
+
+    def _references(self, before: Vector, last: Vector, new: Vector) -> list[Reference]:
+        """Where the motors shall be along the spline through three commands (m)."""
         inverse, bias = self.machine.inverse, self.plant.encoder_bias
-        inverse(new)  # the spline may end before the command does
         (a, b, c), (d, e, f), (x, y, z) = before, last, new
-        references = [
+        path = [
             inverse((u * a + v * d + w * x, u * b + v * e + w * y, u * c + v * f + w * z))
             for u, v, w in self._spline
         ]
+        if self.drive is None:
+            found = [Reference(theta) for theta in path]
+        else:
+            start = inverse(((a + d) / 2, (b + e) / 2, (c + f) / 2))
+            found = references(self.machine, self.drive, start, path, CONTROL_PERIOD / len(path))
         if bias != _ZERO:
             b1, b2, b3 = bias
-            references = [(one - b1, two - b2, three - b3) for one, two, three in references]
-        self._commands = (last, new)
-        self.engine.advance(references, vacuum)
-        self._noise = (self._noise[1], noise)
-        return self.read(moved=True)
+            found = [
+                Reference((one - b1, two - b2, three - b3), rates, torque)
+                for (one, two, three), rates, torque in found
+            ]
+        return found
 
     # -- reading ----------------------------------------------------------------------------
 

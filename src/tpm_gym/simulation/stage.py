@@ -6,12 +6,9 @@ from typing import Final, NamedTuple
 
 from tpm_gym.arrays import Vector
 
-__all__ = ["CAMERA", "FLOOR", "GRAVITY", "LIGHT", "MARKER_COLOUR", "TABLE", "Camera", "Slab"]
+__all__ = ["CAMERA", "FLOOR", "FLOOR_EDGE", "LIGHT", "MARKER_COLOUR", "TABLE", "Camera", "Slab"]
 
 Colour = tuple[float, float, float, float]
-
-GRAVITY: Final = 9.81
-"""m/s^2, downwards."""
 
 
 class Slab(NamedTuple):

@@ -15,9 +15,10 @@ import pybullet
 import pytest
 
 from tpm_gym.errors import ConfigurationError
+from tpm_gym.mechanism.mount import GRAVITY
 from tpm_gym.simulation import Scene, Simulation
 from tpm_gym.simulation.bullet import client as client_module
-from tpm_gym.simulation.bullet.client import GRAVITY, Client
+from tpm_gym.simulation.bullet.client import Client
 from tpm_gym.simulation.bullet.physics import REGULARISATION, Physics
 from tpm_gym.simulation.display import has_display
 

@@ -16,12 +16,11 @@ from typing import Any
 import pybullet
 
 from tpm_gym.errors import ConfigurationError
+from tpm_gym.mechanism.mount import GRAVITY
 from tpm_gym.simulation.bullet.physics import REGULARISATION, Physics
 from tpm_gym.simulation.display import has_display
 
-__all__ = ["GRAVITY", "Client", "silence"]
-
-GRAVITY = 9.81  # m/s^2
+__all__ = ["Client", "silence"]
 
 _stdout_lock = threading.RLock()
 

@@ -16,6 +16,7 @@ from tpm_gym.simulation.bullet.cup import Cup, Grip
 from tpm_gym.simulation.bullet.physics import Physics
 from tpm_gym.simulation.bullet.robot import Robot
 from tpm_gym.simulation.bullet.scenery import Scenery
+from tpm_gym.simulation.drives import Memory, Reference, Servo, Servos
 from tpm_gym.simulation.engine import Engine, Motors, Pose, Truth, Twist
 from tpm_gym.simulation.randomisation import Plant
 from tpm_gym.simulation.settings import settings_of
@@ -28,6 +29,7 @@ __all__ = ["BulletEngine"]
 @dataclass(frozen=True)
 class _Moment:
     joints: tuple[tuple[float, float], ...]  # rad and rad/s, passive ones too
+    drives: Memory | None
     objects: list[tuple[Pose, Twist]]
     grip: Grip
 
@@ -40,18 +42,26 @@ class BulletEngine:
         renderer: ``"tiny"`` (None too) draws on the CPU anywhere; ``"egl"`` on a GPU, where the
             driver has it.
         physics: A :class:`Physics` or a mapping of its attributes.
+        drive: The motors' servo drives; None for ideal ones, of which Bullet's solver finds the
+            torques.
 
     Raises:
         ConfigurationError: If an option is out of range, no window opened, or EGL is not there.
     """
 
     def __init__(
-        self, *, gui: bool = False, renderer: str | None = None, physics: Any = None
+        self,
+        *,
+        gui: bool = False,
+        renderer: str | None = None,
+        physics: Any = None,
+        drive: Servo | None = None,
     ) -> None:
         """Connect."""
         self.physics = settings_of(Physics, "physics", physics)
         self.substeps = self.physics.substeps
-        self._gui, self._renderer = gui, renderer
+        self._gui, self._renderer, self._servo = gui, renderer, drive
+        self._servos: Servos | None = None
         self.client = Client(self.physics, gui, renderer)
         self._loaded = False
 
@@ -61,6 +71,8 @@ class BulletEngine:
             self._empty()
         self._loaded = True
         self.robot = Robot(self.client, machine.mechanism, machine.mount)
+        if self._servo is not None:
+            self._servos = Servos(self._servo, machine, self.physics.time_step)
         self._scenery = Scenery(self.client, scene, machine.table)
         if self._gui:
             self._scenery.aim_window()
@@ -81,30 +93,46 @@ class BulletEngine:
     def alter(self, plant: Plant) -> None:
         """See the protocol."""
         self.robot.alter(plant.link_masses, plant.motor_strength)
+        if self._servos is not None:
+            self._servos.alter(plant)
+            self.robot.rub(plant.joint_friction)
         self._scenery.alter(plant.puck_mass, plant.friction)
 
     def place(self, joints: Mapping[str, float], objects: Sequence[Pose]) -> None:
         """See the protocol."""
         self._cup.take(Grip())
         self.robot.place(joints)
+        if self._servos is not None:
+            self._servos.rest(self.robot.motors().theta)
         self._scenery.place([(pose, Twist()) for pose in objects])
 
     def show_goal(self, markers: Sequence[Vector]) -> None:
         """See the protocol."""
         self._scenery.move_markers(markers)
 
-    def advance(self, references: Sequence[Vector], vacuum: bool) -> None:
+    def advance(self, references: Sequence[Reference], vacuum: bool) -> None:
         """See the protocol."""
-        drive, step, suck = self.robot.drive, self.client.stepSimulation, self._cup.suck
-        self._cup.look(vacuum)
-        for theta in references:
-            drive(theta)
+        robot, servos, cup = self.robot, self._servos, self._cup
+        step = self.client.stepSimulation
+        cup.look(vacuum)
+        if servos is not None and references:
+            servos.begin(references[0].theta)
+        for reference in references:
+            if servos is None:
+                robot.drive(reference.theta)
+            else:
+                theta, theta_dot, _ = robot.motors()
+                robot.apply(servos.torque(reference, theta, theta_dot))
             step()
-            suck(vacuum)
+            cup.suck(vacuum)
 
     def motors(self) -> Motors:
         """See the protocol."""
-        return self.robot.motors()
+        motors = self.robot.motors()
+        # The engine reports what its own motors apply, here friction.
+        return (
+            motors if self._servos is None else motors._replace(torque=self._servos.memory.torque)
+        )
 
     def truth(self) -> Truth:
         """See the protocol."""
@@ -120,12 +148,19 @@ class BulletEngine:
 
     def save(self) -> Any:
         """See the protocol."""
-        return _Moment(self.robot.joint_states(), self.objects(), self._cup.grip)
+        return _Moment(
+            self.robot.joint_states(),
+            None if self._servos is None else self._servos.memory,
+            self.objects(),
+            self._cup.grip,
+        )
 
     def restore(self, snapshot: Any) -> None:
         """See the protocol."""
         self._cup.take(Grip())
         self.robot.set_joint_states(snapshot.joints)
+        if self._servos is not None:
+            self._servos.memory = snapshot.drives
         self._scenery.place(snapshot.objects)
         self._cup.take(snapshot.grip)
 

@@ -189,6 +189,18 @@ class Robot:
         for (body, joint), angle, effort in zip(self._motors, theta, self._effort, strict=True):
             turn(body, joint, mode, angle, 0.0, effort, MOTOR_GAIN, 1.0, -1.0, number)
 
+    def apply(self, torque: Vector) -> None:
+        """Let the motors apply ``torque`` N m in the next time step."""
+        turn, mode = self._client.setJointMotorControl2, pybullet.TORQUE_CONTROL
+        for motor, one in zip(self._motors, torque, strict=True):
+            turn(*motor, mode, force=one)
+
+    def rub(self, friction: Vector) -> None:
+        """Let the motors' axes resist any motion with ``friction`` N m."""
+        turn, mode = self._client.setJointMotorControl2, pybullet.VELOCITY_CONTROL
+        for motor, one in zip(self._motors, friction, strict=True):
+            turn(*motor, mode, targetVelocity=0.0, force=one)
+
     def motors(self) -> Motors:
         """True angles (rad), rates (rad/s) and last torques (N m) of the motors."""
         state, (first, second, third) = self._client.getJointState, self._motors

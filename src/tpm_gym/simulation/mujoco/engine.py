@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from tpm_gym.arrays import Vector
 from tpm_gym.mechanism.machine import Machine
+from tpm_gym.simulation.drives import Memory, Reference, Servo, Servos
 from tpm_gym.simulation.engine import Engine, Motors, Pose, Truth, Twist
 from tpm_gym.simulation.mujoco.cup import Cup, Grip
 from tpm_gym.simulation.mujoco.model import compiled
@@ -37,6 +38,7 @@ _STATE = int(
 @dataclass(frozen=True)
 class _Moment:
     numbers: tuple[float, ...]
+    drives: Memory | None
     grip: Grip
 
 
@@ -50,28 +52,39 @@ class MujocoEngine:
         renderer: ``"egl"``, ``"osmesa"`` or ``"glfw"``; None for that of the environment variable
             ``MUJOCO_GL``, or else the first that works.
         physics: A :class:`Physics` or a mapping of its attributes.
+        drive: The motors' servo drives; None for ideal ones.
 
     Raises:
         ConfigurationError: If an option is out of range.
     """
 
-    def __init__(self, *, renderer: str | None = None, physics: Any = None) -> None:
+    def __init__(
+        self, *, renderer: str | None = None, physics: Any = None, drive: Servo | None = None
+    ) -> None:
         """Check the options."""
         self.physics = settings_of(Physics, "physics", physics)
         self.substeps = self.physics.substeps
         self._pictures = Pictures(renderer)
+        self._servo = drive
+        self._servos: Servos | None = None
 
     def load(self, machine: Machine, scene: Scene) -> None:
         """See the protocol."""
         self.model = compiled(machine, scene, self.physics)
         self.data = mujoco.MjData(self.model)
         self.robot = Robot(self.model, self.data, machine)
+        if self._servo is not None:
+            self._servos = Servos(self._servo, machine, self.physics.time_step)
         self._scenery = Scenery(self.model, self.data, scene)
         self._cup = Cup(self.model, self.data, self.robot, self._scenery, scene.objects)
 
     def alter(self, plant: Plant) -> None:
         """See the protocol."""
-        self.robot.alter(plant.link_masses, plant.motor_strength)
+        servos, friction = self._servos, None
+        if servos is not None:
+            servos.alter(plant)
+            friction = plant.joint_friction
+        self.robot.alter(plant.link_masses, plant.motor_strength, friction)
         self._scenery.alter(plant.puck_mass, plant.friction)
         mujoco.mj_setConst(self.model, self.data)
 
@@ -80,6 +93,8 @@ class MujocoEngine:
         mujoco.mj_resetData(self.model, self.data)
         self._cup.set(Grip())
         self.robot.place(joints)
+        if self._servos is not None:
+            self._servos.rest(self.robot.motors().theta)
         self._scenery.place(objects)
         mujoco.mj_step1(self.model, self.data)
 
@@ -87,15 +102,21 @@ class MujocoEngine:
         """See the protocol."""
         self._scenery.move_markers(markers)
 
-    def advance(self, references: Sequence[Vector], vacuum: bool) -> None:
+    def advance(self, references: Sequence[Reference], vacuum: bool) -> None:
         """See the protocol."""
         model, data, robot, cup = self.model, self.data, self.robot, self._cup
-        first_half, second_half = mujoco.mj_step1, mujoco.mj_step2
+        first_half, second_half, servos = mujoco.mj_step1, mujoco.mj_step2, self._servos
+        if servos is not None:
+            servos.begin(references[0].theta)
         last = references[-1]
-        for theta in references:
-            robot.drive(theta)
+        for reference in references:
+            if servos is None:
+                robot.drive(reference.theta)
+            else:
+                theta, theta_dot, _ = robot.motors()
+                robot.apply(servos.torque(reference, theta, theta_dot))
             second_half(model, data)
-            if theta is last:
+            if servos is None and reference is last:
                 robot.note_torque()
             load = cup.load()
             first_half(model, data)
@@ -122,12 +143,15 @@ class MujocoEngine:
         """See the protocol."""
         numbers = np.empty(mujoco.mj_stateSize(self.model, _STATE))
         mujoco.mj_getState(self.model, self.data, numbers, _STATE)
-        return _Moment(tuple(numbers.tolist()), self._cup.grip)
+        memory = None if self._servos is None else self._servos.memory
+        return _Moment(tuple(numbers.tolist()), memory, self._cup.grip)
 
     def restore(self, snapshot: Any) -> None:
         """See the protocol."""
         mujoco.mj_setState(self.model, self.data, np.array(snapshot.numbers), _STATE)
         self._cup.set(snapshot.grip)
+        if self._servos is not None:
+            self._servos.memory = snapshot.drives
         mujoco.mj_step1(self.model, self.data)
 
     def picture(self, width: int, height: int) -> NDArray[np.uint8]:

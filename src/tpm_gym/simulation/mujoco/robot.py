@@ -52,52 +52,80 @@ class Robot:
         }
         slide = mechanism.link(mechanism.tool).joint
         assert slide is not None
-        self._driven = (*mechanism.actuated, slide.name)
+        self._motors = [(self._at[name], self._dof[name]) for name in mechanism.actuated]
         efforts = {joint.name: joint.effort for joint in joints}
-        self._efforts = [efforts[name] for name in self._driven]
+        self._efforts = [efforts[name] for name in mechanism.actuated]
+        self._slide = self._at[slide.name], self._dof[slide.name]
+        self._spring = slide.effort
         pairs = [site_names(closure.name) for closure in mechanism.closures]
         self._sides = [[model.site(pair[side]).id for pair in pairs] for side in (0, 1)]
-        for name in self._driven:
-            model.dof_solimp[self._dof[name]] = [float(number) for number in STIFF.split()]
+        # Friction is as stiff as it can be, and stops in one time step.
+        step = model.opt.timestep
+        model.dof_solimp[:] = [float(number) for number in STIFF.split()]
+        model.dof_solref[:] = -1 / step**2, -1 / step
         self._position, self._speed, self._height = data.qpos.item, data.qvel.item, data.xpos.item
         self._torque: Vector = (0.0, 0.0, 0.0)
         self.alter((), (1.0, 1.0, 1.0))
 
-    def alter(self, mass_factors: Sequence[float], motor_strength: Sequence[float]) -> None:
-        """Scale the masses of the moving links (empty: all nominal) and the motors' torques."""
-        model = self._model
+    def alter(
+        self,
+        mass_factors: Sequence[float],
+        motor_strength: Vector,
+        joint_friction: Vector | None = None,
+    ) -> None:
+        """Scale the masses of the moving links and the torques of the motors.
+
+        Args:
+            mass_factors: One for each moving link; empty: all nominal.
+            motor_strength: Factors of the ideal motors' torques.
+            joint_friction: Of motors that are not ideal, N m; None for ideal ones.
+        """
+        model, rate = self._model, 1 / self._model.opt.timestep
         factors = mass_factors or [1.0] * len(self._inertias)
         for (body, (mass, moments)), factor in zip(self._inertias.items(), factors, strict=True):
             model.body_mass[body] = factor * mass
             model.body_inertia[body] = factor * moments
-        strengths = zip(self._driven, self._efforts, (*motor_strength, 1.0), strict=True)
-        for name, effort, strength in strengths:
-            model.dof_frictionloss[self._dof[name]] = strength * effort
-        rough = np.flatnonzero(model.dof_frictionloss).tolist()  # each has a row, in this order
-        step = model.opt.timestep
-        self._rows = [
-            (rough.index(self._dof[name]), self._at[name], self._dof[name], gain / step)
-            for name, gain in zip(self._driven, (1.0, 1.0, 1.0, _SPRING_GAIN), strict=True)
+        limits = [
+            one * strength for one, strength in zip(self._efforts, motor_strength, strict=True)
         ]
-        self._rate = 1 / step
+        losses = zip(self._motors, joint_friction or limits, strict=True)
+        driven = [] if joint_friction else [(*motor, rate) for motor in self._motors]
+        driven.append((*self._slide, _SPRING_GAIN * rate))
+        for (_, dof), loss in (*losses, (self._slide, self._spring)):
+            model.dof_frictionloss[dof] = loss
+        rough = np.flatnonzero(model.dof_frictionloss).tolist()  # each has a row, in this order
+        self._rows = [(rough.index(dof), at, dof, gain) for at, dof, gain in driven]
+        self._rate = rate
 
     def place(self, joints: Mapping[str, float]) -> None:
         """Put every joint at its position (rad, m)."""
         for name, position in joints.items():
             self._data.qpos[self._at[name]] = position
+        self._torque = (0.0, 0.0, 0.0)
 
     def drive(self, theta: Vector) -> None:
-        """Let the motors go to ``theta`` within this time step, effort permitting.
+        """Let ideal motors go to ``theta`` within this time step, effort permitting.
 
-        To be called between the two halves of a time step.
+        This and :meth:`apply` are to be called between the two halves of a time step.
         """
+        self._pull((*theta, 0.0))
+
+    def apply(self, torque: Vector) -> None:
+        """Let the motors apply ``torque`` N m in this time step."""
+        self._torque = torque
+        for (_, dof), one in zip(self._motors, torque, strict=True):
+            self._data.qfrc_applied[dof] = one
+        self._pull((0.0,))
+
+    def _pull(self, targets: Sequence[float]) -> None:
+        """Let what friction drives go to ``targets``, the last of which is the slide's."""
         data, rate, position, speed = self._data, self._rate, self._position, self._speed
         wanted, first = data.efc_aref, data.ne
-        for (row, at, dof, gain), target in zip(self._rows, (*theta, 0.0), strict=True):
+        for (row, at, dof, gain), target in zip(self._rows, targets, strict=True):
             wanted[first + row] = ((target - position(at)) * gain - speed(dof)) * rate
 
     def note_torque(self) -> None:
-        """Note what the motors apply; to be called after the second half of a time step."""
+        """Note what ideal motors apply; to be called after the second half of a time step."""
         force, first = self._data.efc_force.item, self._data.ne
         (a, *_), (b, *_), (c, *_), _ = self._rows
         self._torque = force(first + a), force(first + b), force(first + c)
@@ -105,7 +133,7 @@ class Robot:
     def motors(self) -> Motors:
         """True positions (rad, m), rates and noted torques (N m, N) of the motors."""
         position, speed = self._position, self._speed
-        (_, a, i, _), (_, b, j, _), (_, c, k, _), _ = self._rows
+        (a, i), (b, j), (c, k) = self._motors
         theta = position(a), position(b), position(c)
         return Motors(theta, (speed(i), speed(j), speed(k)), self._torque)
 

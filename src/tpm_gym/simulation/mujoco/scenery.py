@@ -54,9 +54,7 @@ class Scenery:
 
     def read(self) -> list[tuple[Pose, Twist]]:
         """Poses and velocities of the objects."""
-        return [
-            (self.pose(index), self._twist(index, dof)) for index, dof in enumerate(self._dof)
-        ]
+        return [(self.pose(index), self._twist(index, dof)) for index, dof in enumerate(self._dof)]
 
     def height(self, index: int) -> float:
         """Of an object's centre above the table, m."""

@@ -1,0 +1,399 @@
+"""The dynamics of the mechanism in closed form: no solver, no iteration.
+
+    torque = M(theta) theta_ddot + C(theta, theta_dot) theta_dot + g(theta)
+
+Coupling degree zero means that every point is a formula, and so are its velocity and acceleration:
+the closures |B_iC_i| = l4, differentiated twice, give those of C1, then that of P, from those of
+B_i, each by one division (:func:`_resolve`). Bodies enter by sixteen constants of their motion
+(:mod:`tpm_gym.mechanism.inertia`):
+
+* the arms turn about the motors' axes;
+* rods are bars between B_i and C_i, two coupled points each; rod 6 stays in its plane. Rods 4 and
+  11 hang on universal joints, by which they turn about their own axes as they swing: part of the
+  swing's inertia, with what swings with them, the crosses and end link 9;
+* link 3' translates in the plane y = 0, as C1 does;
+* link 7 turns about z, a bar between C1 and P but for constant offsets;
+* platform, cup (its slide at rest), payload and end link 10 translate as P does. End link 10 can
+  roll about its own axis, on which both its balls lie. Nothing acts about that axis, so a roll
+  stays what it is and takes no torque: it is left out.
+
+Forces of inertia and weight at B_i, C1 and P go the way back: the forces in the rods that carry
+them, one division each (:func:`_gather`), and by those to the motors. The mass matrix is the torque
+of unit accelerations, linear in them; C is the torque's part that is quadratic in the rates,
+polarised, which makes it that of Christoffel's symbols, so that M' - 2C is skew.
+
+Everything is in SI units and the machine's (the paper's) frame, in which gravity points along +z:
+the base hangs upside down. The functions with a Pose compute with whatever their namespace does, as
+:mod:`tpm_gym.kinematics.equations`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tpm_gym.arrays import FloatArray, Vector, finite_points, is_tensor
+from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode, equations
+from tpm_gym.kinematics.equations import Triple
+from tpm_gym.kinematics.geometry import PAPER, Geometry
+from tpm_gym.kinematics.jacobian import require_regular
+from tpm_gym.kinematics.namespaces import PLAIN, Namespace, Numbers, by_rows, namespace_of
+from tpm_gym.mechanism import tree
+from tpm_gym.mechanism.inertia import Inertia, Swing, inertia_of
+from tpm_gym.mechanism.mount import GRAVITY
+
+__all__ = ["Dynamics", "Energy", "Pose", "energies", "pose_at", "torques"]
+
+_VECTOR = np.arange(3)
+_MATRIX = np.arange(9).reshape(3, 3)
+_SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+_CHECKS = 4  # columns before the results: whether it is not assembled, and the factors of det A
+_REST = (0.0, 0.0, 0.0)
+_UNITS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+class Energy(NamedTuple):
+    """Energies, each of shape (...,), J; the potential one up to a constant of the machine."""
+
+    kinetic: FloatArray
+    potential: FloatArray
+
+
+class Pose(NamedTuple):
+    """A configuration, as the dynamics need it.
+
+    Attributes:
+        cos: l3 cos(theta_i), m.
+        sin: l3 sin(theta_i), m.
+        found: The assembly.
+        rods: B_iC_i, m.
+        factors: Those of the Jacobians' determinants.
+        k: sin(beta) times level3: the determinant of loop 2, m.
+        lengths: The geometry.
+    """
+
+    cos: Triple
+    sin: Triple
+    found: equations.Assembly
+    rods: tuple[Triple, Triple, Triple]
+    factors: equations.Factors
+    k: Numbers
+    lengths: Geometry
+
+
+# -- over any namespace ----------------------------------------------------------------------------
+
+
+def pose_at(
+    theta: Triple, branch: AssemblyMode, g: Geometry, ns: Namespace
+) -> tuple[Pose, Numbers]:
+    """The configuration at joint angles, and whether it is real."""
+    cos, sin = equations.arms(theta, g, ns)
+    found, real, _ = equations.assembly_at(cos, sin, branch.planar, branch.sin_beta, g, ns)
+    rods = equations.rods(cos, sin, found, g)
+    factors = equations.factors(cos, sin, found, rods, g)
+    return Pose(cos, sin, found, rods, factors, factors.sin_beta * factors.level3, g), real
+
+
+def torques(pose: Pose, rates: Triple, changes: Triple, gravity: Triple, m: Inertia) -> Triple:
+    """The motors' torques for rates (rad/s) and their changes (rad/s^2), in a gravity (m/s^2).
+
+    Weight is what inertia would be if all points accelerated by -gravity beside what they do.
+    """
+    (c1, c2, c3), (s1, s2, s3), (r1, _, r3) = pose.cos, pose.sin, pose.rods
+    v = _velocities(pose, rates)
+    (b1y, b1z), (b2x, b2z), (b3x, b3z), (cx, cz), (px, py, pz) = _accelerations(
+        pose, rates, changes, v
+    )
+    f1x, f1y, f1z = _swing(r1, v.rod1, (-b1y, cz - b1z), m.swing1)
+    f3y, f3x, f3z = _swing(
+        (r3[1], r3[0], r3[2]), (v.rod3[1], v.rod3[0], v.rod3[2]), (px - b3x, pz - b3z), m.swing3
+    )
+    gx, gy, gz = gravity
+    cx, cz, px, py, pz = cx - gx, cz - gz, px - gx, py - gy, pz - gz
+    (k1, k2, k3), (w1, w2, w3), (j1, j2, j3) = m.couples, m.weights, m.motors
+    one, two, three = _gather(
+        pose,
+        (
+            m.link3 * cx - k1 * gx + k2 * (b2x - gx) + m.link7 * px + f1x,
+            m.link3 * cz + k1 * (b1z - gz) + k2 * (b2z - gz) + m.link7 * pz + f1z,
+        ),
+        (
+            m.platform * px + k3 * (b3x - gx) + m.link7 * cx + f3x,
+            m.platform * py - (k3 + m.link7) * gy + f3y,
+            m.platform * pz + k3 * (b3z - gz) + m.link7 * cz + f3z,
+        ),
+    )
+    return (
+        one + j1 * changes[0] + s1 * ((k1 + w1) * gy + f1y) + c1 * (k1 * cz - w1 * gz - f1z),
+        two + j2 * changes[1] - s2 * (k2 * cx - w2 * gx) + c2 * (k2 * cz - w2 * gz),
+        three + j3 * changes[2] - s3 * (k3 * px - w3 * gx - f3x) + c3 * (k3 * pz - w3 * gz - f3z),
+    )
+
+
+def energies(pose: Pose, rates: Triple, gravity: Triple, m: Inertia) -> tuple[Numbers, Numbers]:
+    """Kinetic and potential energy, J; the latter up to a constant."""
+    (c1, c2, c3), (s1, s2, s3), found = pose.cos, pose.sin, pose.found
+    (r1x, r1y, r1z), _, (r3x, r3y, r3z) = pose.rods
+    (u1, u2, u3), (k1, k2, k3), (j1, j2, j3) = rates, m.couples, m.motors
+    v = _velocities(pose, rates)
+    (cx, cz), (px, py, pz) = v.link3, v.platform
+    swing1 = (r1y * v.rod1[2] - r1z * v.rod1[1]) / (r1y * r1y + r1z * r1z)
+    swing3 = (r3x * v.rod3[2] - r3z * v.rod3[0]) / (r3x * r3x + r3z * r3z)
+    squares = (
+        j1 * u1 * u1 + j2 * u2 * u2 + j3 * u3 * u3
+        + m.link3 * (cx * cx + cz * cz) + m.platform * (px * px + py * py + pz * pz)
+        + (m.swing1.fixed + m.swing1.spin * r1x * r1x) * swing1 * swing1
+        + (m.swing3.fixed + m.swing3.spin * r3y * r3y) * swing3 * swing3
+    )  # fmt: skip
+    products = (
+        k1 * u1 * c1 * cz + k2 * u2 * (c2 * cz - s2 * cx) + k3 * u3 * (c3 * pz - s3 * px)
+        + m.link7 * (cx * px + cz * pz)
+    )  # fmt: skip
+    gx, gy, gz = gravity
+    w1, w2, w3 = (weight + couple for weight, couple in zip(m.weights, m.couples, strict=True))
+    at_c, at_p = m.link3 + k1 + k2 + m.link7, m.platform + k3 + m.link7
+    potential = -(
+        gx * (w2 * c2 + w3 * c3 + at_c * found.x_c + at_p * found.x)
+        + gy * (w1 * c1 + at_p * found.y)
+        + gz * (w1 * s1 + w2 * s2 + w3 * s3 + at_c * found.z_c + at_p * found.z)
+    )
+    return squares / 2 + products, potential
+
+
+class _Velocities(NamedTuple):
+    link3: tuple[Numbers, Numbers]  # of C1, along x and z
+    platform: Triple
+    turn: Numbers  # l7 times the rate of beta
+    rod1: Triple  # of C1 relative to B1
+    rod2: tuple[Numbers, Numbers]  # along x and z
+    rod3: Triple
+
+
+def _velocities(pose: Pose, rates: Triple) -> _Velocities:
+    """First derivatives of the closures, m/s."""
+    (c1, c2, c3), (s1, s2, s3), (u1, u2, u3), f = pose.cos, pose.sin, rates, pose.factors
+    x, z, turn = _resolve(pose, f.leg1 * u1, f.leg2 * u2, f.leg3 * u3)
+    px, py = x - f.sin_beta * turn, f.cos_beta * turn
+    return _Velocities(
+        (x, z),
+        (px, py, z),
+        turn,
+        (x, s1 * u1, z - c1 * u1),
+        (x + s2 * u2, z - c2 * u2),
+        (px + s3 * u3, py, z - c3 * u3),
+    )
+
+
+def _accelerations(
+    pose: Pose, rates: Triple, changes: Triple, v: _Velocities
+) -> tuple[Any, Any, Any, Any, Triple]:
+    """Second derivatives, m/s^2: of B1 (y, z), B2 and B3 and C1 (x, z), and P."""
+    (c1, c2, c3), (s1, s2, s3), f = pose.cos, pose.sin, pose.factors
+    (_, r1y, r1z), (r2x, _, r2z), (r3x, r3y, r3z) = pose.rods
+    (u1, u2, u3), (a1, a2, a3) = rates, changes
+    (d1x, d1y, d1z), (d2x, d2z), (d3x, d3y, d3z) = v.rod1, v.rod2, v.rod3
+    b1y, b1z = -s1 * a1 - c1 * u1 * u1, c1 * a1 - s1 * u1 * u1
+    b2x, b2z = -s2 * a2 - c2 * u2 * u2, c2 * a2 - s2 * u2 * u2
+    b3x, b3z = -s3 * a3 - c3 * u3 * u3, c3 * a3 - s3 * u3 * u3
+    inwards = v.turn * v.turn / pose.lengths.l7
+    ex, ey = inwards * f.cos_beta, inwards * f.sin_beta
+    x, z, turn = _resolve(
+        pose,
+        r1y * b1y + r1z * b1z - d1x * d1x - d1y * d1y - d1z * d1z,
+        r2x * b2x + r2z * b2z - d2x * d2x - d2z * d2z,
+        r3x * (b3x + ex) + r3y * ey + r3z * b3z - d3x * d3x - d3y * d3y - d3z * d3z,
+    )
+    platform = (x - f.sin_beta * turn - ex, f.cos_beta * turn - ey, z)
+    return (b1y, b1z), (b2x, b2z), (b3x, b3z), (x, z), platform
+
+
+def _resolve(pose: Pose, h1: Numbers, h2: Numbers, h3: Numbers) -> Triple:
+    """What C1 does along x and z, and P beside it along link 7's turn, of r_i . (what C_i does)."""
+    (r1x, _, r1z), (r2x, _, r2z), (r3x, _, r3z) = pose.rods
+    planar = pose.factors.planar
+    x, z = (r2z * h1 - r1z * h2) / planar, (r1x * h2 - r2x * h1) / planar
+    return x, z, (h3 - r3x * x - r3z * z) / pose.k
+
+
+def _gather(pose: Pose, at_c: tuple[Numbers, Numbers], at_p: Triple) -> Triple:
+    """Torques that carry forces (N) at C1 (x, z) and at P: the transpose of what rates do."""
+    (r1x, _, r1z), (r2x, _, r2z), (r3x, _, r3z) = pose.rods
+    (cx, cz), (px, py, pz), f = at_c, at_p, pose.factors
+    rod3 = (f.cos_beta * py - f.sin_beta * px) / pose.k  # its force, over l4
+    x, z = cx + px - rod3 * r3x, cz + pz - rod3 * r3z
+    rod1, rod2 = (x * r2z - z * r2x) / f.planar, (z * r1x - x * r1z) / f.planar
+    return f.leg1 * rod1, f.leg2 * rod2, f.leg3 * rod3
+
+
+def _swing(rod: Triple, rates: Triple, changes: tuple[Numbers, Numbers], m: Swing) -> Triple:
+    """Force at C, and against it at B, for the swing of a leg with its rod along (out, level, z).
+
+    The swing is the angle of (level, z): Lagrange's equation of (fixed + spin out^2) rate^2 / 2.
+    """
+    (out, level, z), (out_rate, level_rate, z_rate), (level_change, z_change) = rod, rates, changes
+    square = level * level + z * z
+    rate = (level * z_rate - z * level_rate) / square
+    change = level * z_change - z * level_change - 2 * rate * (level * level_rate + z * z_rate)
+    moment = (m.fixed + m.spin * out * out) * change / square + 2 * m.spin * out * out_rate * rate
+    return -m.spin * out * rate * rate, -z * moment / square, level * moment / square
+
+
+# -- points and batches ----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dynamics:
+    """The dynamics of one mechanism, for points and batches.
+
+    Joint angles, rates and so on are arrays (..., 3) that broadcast with each other; torch tensors
+    among them give tensors, in float64, that can be differentiated.
+
+    All methods raise InputError for what is no array (..., 3) of finite numbers, UnreachableError
+    if the branch does not exist at some theta, and SingularityError if one is a parallel
+    singularity, where torques have no bound.
+
+    Attributes:
+        geometry: Link lengths.
+        branch: The assembly mode.
+        link_masses: Factors of mass and inertia, one for each moving link in the order of the
+            mechanism's; empty if all are one.
+        payload: What the cup carries, kg.
+        free_fall: Acceleration of gravity in the machine's frame, m/s^2.
+
+    Raises:
+        ConfigurationError: If there is another number of factors.
+    """
+
+    geometry: Geometry = PAPER
+    branch: AssemblyMode = DEFAULT_ASSEMBLY
+    link_masses: tuple[float, ...] = ()
+    payload: float = 0.0
+    free_fall: Vector = (0.0, 0.0, GRAVITY)
+
+    @cached_property
+    def inertia(self) -> Inertia:
+        """The constants."""
+        mechanism = tree.build(self.geometry)
+        return inertia_of(mechanism, self.geometry, self.link_masses, self.payload)
+
+    def pose(self, theta: Vector) -> Pose:
+        """The configuration at three joint angles, in plain floats, for :func:`torques`."""
+        try:
+            pose, real = pose_at(theta, self.branch, self.geometry, PLAIN)
+        except ZeroDivisionError:  # concentric circles, or link 7 beside B3
+            real = False
+        if not real:
+            raise equations.no_assembly(theta, self.branch, self.geometry)
+        equations.require_regular(pose.factors, self.geometry)
+        return pose
+
+    def torque(self, theta: ArrayLike, theta_dot: ArrayLike, theta_ddot: ArrayLike) -> FloatArray:
+        """The motors' torques (..., 3) N m for a motion: M theta_ddot + C theta_dot + g."""
+        return self._rows(self._torques, (theta, theta_dot, theta_ddot), _VECTOR)[0]
+
+    def gravity(self, theta: ArrayLike) -> FloatArray:
+        """The torques (..., 3) N m that carry the machine at rest."""
+        return self._rows(lambda pose: self._torques(pose, _REST, _REST), (theta,), _VECTOR)[0]
+
+    def mass_matrix(self, theta: ArrayLike) -> FloatArray:
+        """The inertia that the motors feel, (..., 3, 3) kg m^2: symmetric and positive."""
+        return self._rows(self._masses, (theta,), _SYMMETRIC)[0]
+
+    def coriolis(self, theta: ArrayLike, theta_dot: ArrayLike) -> FloatArray:
+        """C (..., 3, 3) kg m^2/s, of Christoffel's symbols: M' - 2 C is skew."""
+
+        def columns(pose: Pose, rates: Triple) -> list[Numbers]:
+            # What is quadratic in the rates, q(u), has q(u + e) - q(u - e) = 4 C(u) e
+            pairs = [
+                [torques(pose, moved, _REST, _REST, self.inertia) for moved in _both(rates, unit)]
+                for unit in _UNITS
+            ]
+            return [(up[row] - down[row]) / 4 for row in range(3) for up, down in pairs]
+
+        return self._rows(columns, (theta, theta_dot), _MATRIX)[0]
+
+    def forward(self, theta: ArrayLike, theta_dot: ArrayLike, torque: ArrayLike) -> FloatArray:
+        """The accelerations (..., 3) rad/s^2 under the motors' torques (..., 3) N m."""
+
+        def columns(pose: Pose, rates: Triple, given: Triple) -> Triple:
+            one, two, three = self._torques(pose, rates, _REST)
+            rest = given[0] - one, given[1] - two, given[2] - three
+            return _solve(self._masses(pose), rest)
+
+        return self._rows(columns, (theta, theta_dot, torque), _VECTOR)[0]
+
+    def energy(self, theta: ArrayLike, theta_dot: ArrayLike) -> Energy:
+        """Kinetic and potential energy."""
+
+        def columns(pose: Pose, rates: Triple) -> tuple[Numbers, Numbers]:
+            return energies(pose, rates, self.free_fall, self.inertia)
+
+        return Energy(*self._rows(columns, (theta, theta_dot), np.array(0), np.array(1)))
+
+    def _torques(self, pose: Pose, rates: Triple, changes: Triple) -> Triple:
+        return torques(pose, rates, changes, self.free_fall, self.inertia)
+
+    def _masses(self, pose: Pose) -> tuple[Numbers, ...]:
+        """The upper triangle of M, by rows: torques of unit accelerations at rest, weightless."""
+        one, two, three = (torques(pose, _REST, unit, _REST, self.inertia) for unit in _UNITS)
+        return (*one, *two[1:], three[2])
+
+    def _rows(
+        self,
+        text: Callable[..., Sequence[Numbers]],
+        states: tuple[ArrayLike, ...],
+        *layouts: NDArray[np.intp],
+    ) -> list[FloatArray]:
+        """What is computed of a pose and triples of numbers, for each row of the states."""
+
+        def columns(numbers: tuple[Numbers, ...], ns: Namespace) -> list[Numbers]:
+            theta, *rest = (numbers[i : i + 3] for i in range(0, len(numbers), 3))
+            pose, real = pose_at(theta, self.branch, self.geometry, ns)
+            missing = ns.where(real, 0.0, 1.0)
+            return [missing, *pose.factors[:3], *text(pose, *rest)]
+
+        table = _side_by_side(states)
+        if table.ndim == 1 and isinstance(table, np.ndarray):
+            (a, b, c), *rest = table.reshape(-1, 3).tolist()
+            found = np.array(text(self.pose((a, b, c)), *rest))
+            return [found[layout] for layout in layouts]
+        shifted = (layout + 4 for layout in layouts)
+        missing, factors, *results = by_rows(columns, table, np.array(0), _VECTOR + 1, *shifted)
+        if missing.any():
+            a, b, c = table[..., :3][missing != 0][0].tolist()
+            raise equations.no_assembly((a, b, c), self.branch, self.geometry)
+        require_regular(factors, self.geometry)
+        return results
+
+
+def _side_by_side(states: tuple[ArrayLike, ...]) -> FloatArray:
+    """Arrays (..., 3), broadcast with each other, in one (..., 3 n)."""
+    names = ("theta", "theta_dot", "the third")
+    arrays = [finite_points(name, state) for name, state in zip(names, states, strict=False)]
+    like = next((array for array in arrays if is_tensor(array)), arrays[0])
+    table: FloatArray = namespace_of(like).join(arrays)
+    return table
+
+
+def _both(rates: Triple, unit: Vector) -> tuple[Triple, Triple]:
+    (u, v, w), (a, b, c) = rates, unit
+    return (u + a, v + b, w + c), (u - a, v - b, w - c)
+
+
+def _solve(matrix: tuple[Numbers, ...], right: Triple) -> Triple:
+    """Of a symmetric positive matrix, by its upper triangle: L D L^T."""
+    (a, b, c, d, e, f), (p, q, r) = matrix, right
+    below, last = b / a, c / a
+    second, rest = d - below * b, e - last * b
+    cross = rest / second
+    q = q - below * p
+    r = r - last * p - cross * q
+    z = r / (f - last * c - cross * rest)
+    y = q / second - cross * z
+    return p / a - below * y - last * z, y, z

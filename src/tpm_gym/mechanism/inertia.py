@@ -1,0 +1,198 @@
+"""What the closed-form dynamics need to know of the bodies: sixteen constants, from their data.
+
+A rigid bar from B to C moves as two coupled points do: with its mass m, its centre at the share s
+of its length l, and its moment of inertia I across it,
+
+    T = (a |vB|^2 + 2 b vB . vC + c |vC|^2) / 2,
+    a = m (1 - s)^2 + I / l^2,  b = m s (1 - s) - I / l^2,  c = m s^2 + I / l^2.
+
+Arms (whose near end is fixed), rods and link 7 are such bars; what only translates is a mass at the
+point with which it moves. Left is what turns about itself: the crosses and end link 9 swing with
+their rods, and the rods 4 and 11 on them turn about their own axes too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from tpm_gym.errors import ConfigurationError
+from tpm_gym.kinematics.geometry import Geometry
+from tpm_gym.kinematics.namespaces import Numbers
+from tpm_gym.mechanism.bodies import Link, Mechanism
+
+__all__ = ["Inertia", "Swing", "inertia_of"]
+
+X, Y, Z = range(3)
+_ROUNDING = 1e-9  # of a centre of mass, m; of two equal moments, relative
+
+
+class Swing(NamedTuple):
+    """What turns with a leg's swing, beside its rods' masses: T = (fixed + spin out^2) rate^2 / 2.
+
+    Attributes:
+        fixed: Moment of inertia about the axis of the swing, kg m^2.
+        spin: That of the rods about their own axes, over l4^2, kg; out is the component of BC along
+            the swing's axis, m.
+    """
+
+    fixed: Numbers
+    spin: Numbers
+
+
+class Inertia(NamedTuple):
+    """The constants of the dynamics, numbers or arrays of one for each row.
+
+    Attributes:
+        motors: For each leg, what moves with its motor alone, kg m^2: arm and near ends of rods.
+        weights: For each leg, kg: its mass where B_i is, less ``couples``.
+        couples: For each leg, kg: b of the bars B_iC_i.
+        link3: Mass at C1, kg.
+        link7: b of link 7, kg.
+        platform: Mass at P, kg.
+        swing1: Of leg 1, about the axis x.
+        swing3: Of leg 3, about the axis y.
+    """
+
+    motors: tuple[Numbers, Numbers, Numbers]
+    weights: tuple[Numbers, Numbers, Numbers]
+    couples: tuple[Numbers, Numbers, Numbers]
+    link3: Numbers
+    link7: Numbers
+    platform: Numbers
+    swing1: Swing
+    swing3: Swing
+
+
+class _Bar(NamedTuple):
+    near: Numbers
+    couple: Numbers
+    far: Numbers
+
+    def __add__(self, other: _Bar) -> _Bar:  # type: ignore[override]
+        """Two bars between the same points."""
+        return _Bar(*(one + two for one, two in zip(self, other, strict=True)))
+
+
+def inertia_of(
+    mechanism: Mechanism,
+    geometry: Geometry,
+    link_masses: Sequence[Numbers] = (),
+    payload: Numbers = 0.0,
+) -> Inertia:
+    """The constants of the mechanism of :func:`tpm_gym.mechanism.tree.build`.
+
+    Args:
+        mechanism: Its bodies.
+        geometry: Its lengths.
+        link_masses: Factors of mass and inertia, one for each link but the base, each a number or
+            an array; empty if all are one.
+        payload: What the cup carries, kg.
+
+    Raises:
+        ConfigurationError: If there is another number of factors, or a body is not where or what
+            the formulas take it for: a bar of which the centre is off its axis, a rod that is not
+            round, a link of another name.
+    """
+    bodies = _Bodies(mechanism, link_masses)
+    l3, l4, l7 = geometry.l3, geometry.l4, geometry.l7
+    arms = [
+        bodies.bar("arm_2", Y, X, l3),
+        bodies.bar("arm_5", X, Y, l3),
+        bodies.bar("arm_12", X, Y, l3),
+    ]
+    rods = [
+        bodies.round_bar("rod_4a", Y, l4) + bodies.round_bar("rod_4b", Y, l4),
+        bodies.bar("rod_6", X, Y, l4),
+        bodies.round_bar("rod_11a", X, l4) + bodies.round_bar("rod_11b", X, l4),
+    ]
+    link7 = bodies.bar("link_7", X, Z, l7)
+    crosses = [bodies.shaft(f"cross_4{suffix}", X) for suffix in "ab"]
+    end9, end10 = bodies.shaft("end_link_9", Y), bodies.shaft("end_link_10", Y)
+    elbows = [crosses[0][0] + crosses[1][0], 0.0, end9[0]]
+    translating = bodies.mass("platform") + bodies.mass("cup") + end10[0]
+    spin4, spin11 = (
+        sum(bodies.moment(f"{rod}{suffix}", along) for suffix in "ab") / l4**2
+        for rod, along in (("rod_4", Y), ("rod_11", X))
+    )
+    legs = list(zip(arms, rods, elbows, strict=True))
+    found = Inertia(
+        motors=_three([(arm.far + rod.near + elbow) * l3**2 for arm, rod, elbow in legs]),
+        weights=_three([arm.couple + arm.far + rod.near + elbow for arm, rod, elbow in legs]),
+        couples=_three([rod.couple for rod in rods]),
+        link3=bodies.mass("link_3p") + rods[0].far + rods[1].far + link7.near,
+        link7=link7.couple,
+        platform=translating + rods[2].far + link7.far + payload,
+        swing1=Swing(crosses[0][1] + crosses[1][1], spin4),
+        swing3=Swing(end9[1], spin11),
+    )
+    bodies.require_all_known()
+    return found
+
+
+class _Bodies:
+    """The links, with their factors; remembers which were asked for."""
+
+    def __init__(self, mechanism: Mechanism, factors: Sequence[Numbers]) -> None:
+        moving = mechanism.links[1:]
+        if len(factors) not in (0, len(moving)):
+            valid = f"one factor for each of the {len(moving)} moving links, or none"
+            raise ConfigurationError("link_masses", tuple(factors), valid)
+        self._links = {link.name: link for link in moving}
+        self._factors = dict(zip(self._links, factors or [1.0] * len(moving), strict=True))
+        self._known: set[str] = set()
+
+    def require_all_known(self) -> None:
+        left = [name for name in self._links if name not in self._known]
+        if left:
+            raise ConfigurationError("mechanism", left, "the links of mechanism.tree.build alone")
+
+    def mass(self, name: str) -> Numbers:
+        return self._factors[name] * self._link(name).mass
+
+    def moment(self, name: str, axis: int) -> Numbers:
+        """About the axis through the centre of mass, kg m^2."""
+        return self._factors[name] * float(self._link(name).inertia[axis, axis])
+
+    def shaft(self, name: str, axis: int) -> tuple[Numbers, Numbers]:
+        """Mass, and moment about its own axis, of a body with its centre on it."""
+        self._require_on_axis(name, [k for k in (X, Y, Z) if k != axis])
+        return self.mass(name), self.moment(name, axis)
+
+    def bar(self, name: str, along: int, about: int, length: float) -> _Bar:
+        """A body on a line of its frame, which turns in a plane, about an axis across that line."""
+        self._require_on_axis(name, [k for k in (X, Y, Z) if k not in (along, about)])
+        share = float(self._link(name).centre_of_mass[along]) / length
+        mass, turning = self.mass(name), self.moment(name, about) / length**2
+        return _Bar(
+            mass * (1 - share) ** 2 + turning,
+            mass * share * (1 - share) - turning,
+            mass * share**2 + turning,
+        )
+
+    def round_bar(self, name: str, along: int, length: float) -> _Bar:
+        """A bar that turns in space, so that it must be round."""
+        one, other = (k for k in (X, Y, Z) if k != along)
+        self._require_on_axis(name, [one, other])
+        moments = self._link(name).inertia
+        expected = np.diag([moments[k, k] if k == along else moments[one, one] for k in (X, Y, Z)])
+        if not np.allclose(moments, expected, rtol=_ROUNDING, atol=_ROUNDING * moments[one, one]):
+            raise ConfigurationError("mechanism", name, "a rod with equal moments across its axis")
+        return self.bar(name, along, one, length)
+
+    def _require_on_axis(self, name: str, axes: list[int]) -> None:
+        centre = self._link(name).centre_of_mass
+        if np.abs(centre[axes]).max() > _ROUNDING:
+            valid = f"a link with its centre of mass, now {centre.tolist()} m, on its axis"
+            raise ConfigurationError("mechanism", name, valid)
+
+    def _link(self, name: str) -> Link:
+        self._known.add(name)
+        return self._links[name]
+
+
+def _three(values: list[Numbers]) -> tuple[Numbers, Numbers, Numbers]:
+    one, two, three = values
+    return one, two, three

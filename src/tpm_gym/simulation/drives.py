@@ -1,0 +1,290 @@
+"""Drives: how motors follow their references.
+
+The ideal drive (``None`` here) is each engine's own: it is where it shall be at the end of a time
+step, its motor's effort permitting. A :class:`Servo` is what a real axis has: stiffness, damping, a
+feed-forward, and a motor with a torque-speed line.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, fields
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tpm_gym.arrays import FloatArray, Vector
+from tpm_gym.errors import ConfigurationError, SingularityError, UnreachableError
+from tpm_gym.mechanism.bodies import Joint
+from tpm_gym.mechanism.machine import Machine
+from tpm_gym.simulation.randomisation import NOMINAL, Plant
+from tpm_gym.simulation.settings import settings_of
+
+__all__ = [
+    "Memory",
+    "Reference",
+    "Servo",
+    "Servos",
+    "drive_of",
+    "limited",
+    "references",
+    "require_servo",
+]
+
+FEEDFORWARDS = ("none", "gravity", "computed")
+
+_ZERO: Vector = (0.0, 0.0, 0.0)
+_UNITS: tuple[Vector, ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+class Reference(NamedTuple):
+    """Where the motors shall be at the end of a time step.
+
+    Attributes:
+        theta: rad (m for a slide).
+        theta_dot: rad/s; zero for the ideal drive, which needs none.
+        torque: Fed forward in the time step, N m; zero for the ideal drive.
+    """
+
+    theta: Vector
+    theta_dot: Vector = _ZERO
+    torque: Vector = _ZERO
+
+
+@dataclass(frozen=True)
+class Servo:
+    """A servo drive on each motor's axis.
+
+    The torque is stiffness x (reference - angle) + damping x (its rate - rate) + feed-forward, and
+    not more than the motor has at its speed. The defaults are a direct drive with a bandwidth f of
+    40 Hz and a damping ratio of 0.7 on I = 0.1 kg m^2, which each motor feels at the home of the
+    paper's machine: I (2 pi f)^2 and 2 x 0.7 x I (2 pi f).
+
+    Attributes:
+        stiffness: N m/rad.
+        damping: N m s/rad.
+        feedforward: What the drives know of the nominal machine: ``"none"``, ``"gravity"`` (the
+            torques that carry it at rest), or ``"computed"`` (those of the whole motion).
+
+    Raises:
+        ConfigurationError: If a value is out of range.
+    """
+
+    stiffness: float = 6300.0
+    damping: float = 35.0
+    feedforward: str = "computed"
+
+    def __post_init__(self) -> None:
+        """Reject what is no servo."""
+        for name in ("stiffness", "damping"):
+            value = getattr(self, name)
+            number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
+            if not number or not math.isfinite(value) or not value > 0:
+                raise ConfigurationError(name, value, "a positive number")
+        if self.feedforward not in FEEDFORWARDS:
+            valid = ", ".join(map(repr, FEEDFORWARDS))
+            raise ConfigurationError("feedforward", self.feedforward, valid)
+
+
+def drive_of(value: Any) -> Servo | None:
+    """The drive that a user names: ``"ideal"`` or None, ``"servo"``, a Servo or a mapping.
+
+    Raises:
+        ConfigurationError: If it is none of these, or a value is out of range.
+    """
+    if value is None or value == "ideal":
+        return None
+    if value == "servo":
+        return Servo()
+    if isinstance(value, (Servo, Mapping)):
+        return settings_of(Servo, "drive", value)
+    names = ", ".join(field.name for field in fields(Servo))
+    valid = f"'ideal', 'servo', a Servo, or a mapping with keys among {names}"
+    raise ConfigurationError("drive", value, valid)
+
+
+def require_servo(
+    drive: Servo | None,
+    servo_stiffness: Sequence[float] | float,
+    joint_friction: Sequence[float] | float,
+) -> None:
+    """Refuse what only a servo has, where the drive is ideal.
+
+    Raises:
+        ConfigurationError: If a factor of the stiffness is not 1, or there is friction.
+    """
+    if drive is not None:
+        return
+    asked = (("servo_stiffness", servo_stiffness, 1), ("joint_friction", joint_friction, 0))
+    for name, values, neutral in asked:
+        if np.any(np.not_equal(values, neutral)):
+            valid = f"{neutral}, or drive='servo': ideal drives have neither"
+            raise ConfigurationError(name, values, valid)
+
+
+def limited(torque: float, rate: float, effort: float, motor: Joint) -> float:
+    """What a motor gives of a torque.
+
+    Up to its corner speed that is ``effort`` at most; driving faster it falls in a straight line to
+    nothing at the no-load speed, while braking, the voltage helps.
+
+    Args:
+        torque: Wanted, N m.
+        rate: rad/s.
+        effort: The largest torque, N m.
+        motor: Its corner and no-load speeds.
+    """
+    share = (motor.speed - abs(rate)) / (motor.speed - motor.corner)
+    driving = effort * min(1.0, max(0.0, share))
+    high, low = (driving, -effort) if rate > 0 else (effort, -driving)
+    return min(high, max(low, torque))
+
+
+def references(
+    machine: Machine, servo: Servo, start: Vector, path: Sequence[Vector], time_step: float
+) -> list[Reference]:
+    """Angles with their rates, and the torques fed forward.
+
+    Args:
+        machine: The nominal one.
+        servo: Whose feed-forward it is.
+        start: Angles at the beginning, rad.
+        path: Angles at the end of each time step, rad.
+        time_step: s.
+    """
+    points = [start, *path]
+    rates = [_slope(now, before, time_step) for before, now in pairwise(points)]
+    if servo.feedforward == "none":
+        return [Reference(*one) for one in zip(path, rates, strict=True)]
+    if servo.feedforward == "gravity":
+        torques = [machine.torque(theta, _ZERO, _ZERO) for theta in points[:-1]]
+    else:
+        changes = [_slope(now, before, time_step) for before, now in pairwise(rates)] or [_ZERO]
+        # Across a border of control periods the acceleration jumps: to that of the new one.
+        torques = [
+            machine.torque(*motion)
+            for motion in zip(points[:-1], rates, [changes[0], *changes], strict=False)
+        ]
+    return [Reference(*one) for one in zip(path, rates, torques, strict=True)]
+
+
+def _slope(now: Vector, before: Vector, time: float) -> Vector:
+    a, b, c = now
+    d, e, f = before
+    return (a - d) / time, (b - e) / time, (c - f) / time
+
+
+class Memory(NamedTuple):
+    """What servo drives remember of the last time step.
+
+    Attributes:
+        torque: What the motors applied, N m.
+        theta_dot: Their rates at its beginning, rad/s.
+    """
+
+    torque: Vector
+    theta_dot: Vector
+
+
+class Servos:
+    """The three drives of a machine, in an engine of fixed time steps.
+
+    A real amplifier closes its loops some ten thousand times a second, an engine a few hundred
+    times. Computed from the angles at the beginning of each time step, the law would then explode
+    at the stiffness of a real axis. It is taken at the end of the time step instead (backward
+    Euler), which is stable at any stiffness. To foresee that end, the acceleration follows from
+    the machine's inertia M and from the load, which is what the last time step's torque was more
+    than M times its acceleration. So the static stiffness is the stated one against any force, and
+    motion is that of a spring and a damper that Euler's backward method integrates: it damps
+    ``stiffness`` x ``time_step`` more than the stated damping.
+
+    Args:
+        servo: The law.
+        machine: The one that is driven; its ``torque`` gives M.
+        time_step: s.
+
+    Attributes:
+        memory: What the next time step depends on besides the motors' angles and rates.
+
+    Raises:
+        ConfigurationError: If a motor of the machine has no torque-speed line.
+    """
+
+    def __init__(self, servo: Servo, machine: Machine, time_step: float) -> None:
+        """Be the nominal drives, the machine at rest at home."""
+        self._servo, self._machine, self._step = servo, machine, time_step
+        joints = {link.joint.name: link.joint for link in machine.mechanism.links if link.joint}
+        self._motors = [joints[name] for name in machine.mechanism.actuated]
+        for motor in self._motors:
+            if not 0 <= motor.corner < motor.speed:
+                valid = f"motors whose corner speed is below their speed, unlike {motor}"
+                raise ConfigurationError("drive", servo, valid)
+        self._home = machine.inverse(machine.home)
+        self.alter(NOMINAL)
+        self.rest(self._home)
+
+    def alter(self, plant: Plant) -> None:
+        """Become the drives of ``plant``."""
+        strengths = zip(self._motors, plant.motor_strength, strict=True)
+        self._effort = [motor.effort * strength for motor, strength in strengths]
+        a, b, c = (self._servo.stiffness * factor for factor in plant.servo_stiffness)
+        self._stiffness = (a, b, c)
+        # Too large an inertia would be unstable; with each link's own factor M is between these.
+        self._lightest = min(plant.link_masses, default=1.0)
+
+    def rest(self, theta: Vector) -> None:
+        """Start at rest at ``theta`` rad, with what carries the machine there."""
+        with suppress(UnreachableError, SingularityError):
+            self.memory = Memory(self._machine.torque(theta, _ZERO, _ZERO), _ZERO)
+
+    def begin(self, theta: Vector) -> None:
+        """Take up the inertia at ``theta`` rad, for a control period."""
+        try:
+            mass = self._inertia(theta)
+        except (UnreachableError, SingularityError):  # not this machine, if its lengths are off
+            mass = self._inertia(self._home)
+        stiffness, damping, step = np.array(self._stiffness), self._servo.damping, self._step
+        inverse = np.linalg.inv(mass + np.diag(step * (step * stiffness + damping)))
+        self._mass: list[list[float]] = mass.tolist()
+        self._inverse: list[list[float]] = inverse.tolist()
+
+    def _inertia(self, theta: Vector) -> FloatArray:
+        """(3, 3) kg m^2, at least as light as the true machine."""
+        torque = self._machine.torque
+        moving = np.array([torque(theta, _ZERO, unit) for unit in _UNITS])
+        mass: FloatArray = self._lightest * (moving - torque(theta, _ZERO, _ZERO))
+        return (mass + mass.T) / 2
+
+    def torque(self, reference: Reference, theta: Vector, theta_dot: Vector) -> Vector:
+        """What the motors apply in a time step, N m, from angles and rates at its beginning."""
+        step, damping = self._step, self._servo.damping
+        before, rates = self.memory
+        load = _minus(before, _times(self._mass, _slope(theta_dot, rates, step)))
+        motion = zip(
+            self._stiffness, reference.theta, reference.theta_dot, theta, theta_dot, strict=True
+        )
+        a, b, c = (
+            stiffness * (wanted - angle - step * rate) + damping * (wanted_rate - rate)
+            for stiffness, wanted, wanted_rate, angle, rate in motion
+        )
+        d, e, f = _minus(reference.torque, load)
+        x, y, z = _times(self._mass, _times(self._inverse, (a + d, b + e, c + f)))
+        u, v, w = load
+        wanted_torques = (u + x, v + y, w + z)
+        one, two, three = map(limited, wanted_torques, theta_dot, self._effort, self._motors)
+        self.memory = Memory((one, two, three), theta_dot)
+        return self.memory.torque
+
+
+def _minus(left: Vector, right: Vector) -> Vector:
+    (a, b, c), (d, e, f) = left, right
+    return a - d, b - e, c - f
+
+
+def _times(matrix: list[list[float]], column: Vector) -> Vector:
+    (a, b, c), (d, e, f), (g, h, i) = matrix
+    x, y, z = column
+    return a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z
