@@ -144,8 +144,9 @@ def _body(world: Element, bodies: dict[str, Element], link: Link, mount: Mount) 
     joint = link.joint
     if joint is None:
         x, y, z, w = mount.quaternion
-        place = {"pos": numbers(mount.to_world((0.0, 0.0, 0.0))), "quat": numbers((w, x, y, z))}
-        body = SubElement(world, "body", name=link.name, **place)
+        origin = numbers(mount.to_world((0.0, 0.0, 0.0)))
+        turn = numbers((w, x, y, z))
+        body = SubElement(world, "body", name=link.name, pos=origin, quat=turn)
     else:
         body = SubElement(bodies[joint.parent], "body", name=link.name, pos=numbers(joint.origin))
         inertia = link.inertia

@@ -1,8 +1,8 @@
 """MuJoCo as an engine; the only package that imports it."""
 
+from tpm_gym.errors import MissingPackageError
+
 try:
     import mujoco as mujoco
 except ModuleNotFoundError as error:
-    from tpm_gym.errors import MissingPackageError
-
     raise MissingPackageError("mujoco", "mujoco") from error

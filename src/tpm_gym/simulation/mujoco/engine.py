@@ -72,7 +72,7 @@ class MujocoEngine:
         """See the protocol."""
         self.model = compiled(machine, scene, self.physics)
         self.data = mujoco.MjData(self.model)
-        self.robot = Robot(self.model, self.data, machine)
+        self.robot = Robot(self.model, self.data, machine, ideal=self._servo is None)
         if self._servo is not None:
             self._servos = Servos(self._servo, machine, self.physics.time_step)
         self._scenery = Scenery(self.model, self.data, scene)
@@ -80,11 +80,9 @@ class MujocoEngine:
 
     def alter(self, plant: Plant) -> None:
         """See the protocol."""
-        servos, friction = self._servos, None
-        if servos is not None:
-            servos.alter(plant)
-            friction = plant.joint_friction
-        self.robot.alter(plant.link_masses, plant.motor_strength, friction)
+        self.robot.alter(plant)
+        if self._servos is not None:
+            self._servos.alter(plant)
         self._scenery.alter(plant.puck_mass, plant.friction)
         mujoco.mj_setConst(self.model, self.data)
 

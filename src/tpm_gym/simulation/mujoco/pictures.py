@@ -6,7 +6,6 @@ import atexit
 import importlib
 import os
 import weakref
-from contextlib import suppress
 from typing import Any
 
 import mujoco

@@ -18,6 +18,7 @@ from tpm_gym.arrays import Quaternion, Vector, rotate, transform
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.mjcf import STIFF, site_names
 from tpm_gym.simulation.engine import Motors, Truth
+from tpm_gym.simulation.randomisation import NOMINAL, Plant
 
 __all__ = ["Robot"]
 
@@ -31,14 +32,17 @@ class Robot:
         model: The model.
         data: Its state.
         machine: What was compiled into it.
+        ideal: Whether the motors go where they are told; else they apply the torques they are told.
 
     Attributes:
         tool_body: Number of the link with the vacuum cup.
     """
 
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, machine: Machine) -> None:
+    def __init__(
+        self, model: mujoco.MjModel, data: mujoco.MjData, machine: Machine, ideal: bool
+    ) -> None:
         """Look up where everything is."""
-        self._model, self._data = model, data
+        self._model, self._data, self._ideal = model, data, ideal
         mechanism = machine.mechanism
         self._point_p, self._lip = mechanism.point_p, mechanism.lip
         joints = [link.joint for link in mechanism.links if link.joint]
@@ -65,34 +69,23 @@ class Robot:
         model.dof_solref[:] = -1 / step**2, -1 / step
         self._position, self._speed, self._height = data.qpos.item, data.qvel.item, data.xpos.item
         self._torque: Vector = (0.0, 0.0, 0.0)
-        self.alter((), (1.0, 1.0, 1.0))
+        self.alter(NOMINAL)
 
-    def alter(
-        self,
-        mass_factors: Sequence[float],
-        motor_strength: Vector,
-        joint_friction: Vector | None = None,
-    ) -> None:
-        """Scale the masses of the moving links and the torques of the motors.
-
-        Args:
-            mass_factors: One for each moving link; empty: all nominal.
-            motor_strength: Factors of the ideal motors' torques.
-            joint_friction: Of motors that are not ideal, N m; None for ideal ones.
-        """
+    def alter(self, plant: Plant) -> None:
+        """Make masses, motors and friction those of ``plant``."""
         model, rate = self._model, 1 / self._model.opt.timestep
-        factors = mass_factors or [1.0] * len(self._inertias)
+        factors = plant.link_masses or [1.0] * len(self._inertias)
         for (body, (mass, moments)), factor in zip(self._inertias.items(), factors, strict=True):
             model.body_mass[body] = factor * mass
             model.body_inertia[body] = factor * moments
-        limits = [
-            one * strength for one, strength in zip(self._efforts, motor_strength, strict=True)
-        ]
-        losses = zip(self._motors, joint_friction or limits, strict=True)
-        driven = [] if joint_friction else [(*motor, rate) for motor in self._motors]
-        driven.append((*self._slide, _SPRING_GAIN * rate))
-        for (_, dof), loss in (*losses, (self._slide, self._spring)):
+        limits = [a * b for a, b in zip(self._efforts, plant.motor_strength, strict=True)]
+        losses = limits if self._ideal else plant.joint_friction
+        for (_, dof), loss in zip(
+            (*self._motors, self._slide), (*losses, self._spring), strict=True
+        ):
             model.dof_frictionloss[dof] = loss
+        driven = [(*motor, rate) for motor in self._motors] if self._ideal else []
+        driven.append((*self._slide, _SPRING_GAIN * rate))
         rough = np.flatnonzero(model.dof_frictionloss).tolist()  # each has a row, in this order
         self._rows = [(rough.index(dof), at, dof, gain) for at, dof, gain in driven]
         self._rate = rate
@@ -154,7 +147,8 @@ class Robot:
 
     def tool_height(self) -> float:
         """Of the origin of the link with the cup above the table, m."""
-        return self._height(self.tool_body, 2)
+        height: float = self._height(self.tool_body, 2)
+        return height
 
     def tool(self) -> tuple[Vector, Quaternion]:
         """Origin (m) and orientation of the link with the cup, world."""

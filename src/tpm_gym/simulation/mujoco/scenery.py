@@ -58,7 +58,8 @@ class Scenery:
 
     def height(self, index: int) -> float:
         """Of an object's centre above the table, m."""
-        return self._position(self._at[index] + 2)
+        height: float = self._position(self._at[index] + 2)
+        return height
 
     def pose(self, index: int) -> Pose:
         """Pose of an object."""
