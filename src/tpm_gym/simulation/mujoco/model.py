@@ -27,6 +27,8 @@ _RECOVERY = 0.1
 """Share of a penetration that a contact takes out in one time step: what bounces least."""
 _MARGIN = 1e-6  # m; so that what is put down exactly on the table is in contact at once
 
+_OUT_OF_SIGHT = "0 0 -9"  # where markers are before they are shown; at 0 0 0 they could not move
+
 
 def compiled(machine: Machine, scene: Scene, physics: Physics) -> mujoco.MjModel:
     """The model; equality constraints are the closures in their order, then a grip an object."""
@@ -79,9 +81,19 @@ def marker_name(index: int) -> str:
 
 
 def _light(root: Element, world: Element) -> None:
-    """One light, no shadows, a white sky."""
-    away = numbers(-part for part in LIGHT)
-    SubElement(world, "light", directional="true", castshadow="false", pos=numbers(LIGHT), dir=away)
+    """As bright as in the other engine's pictures: no shadows, a white sky."""
+    visual = SubElement(root, "visual")
+    SubElement(visual, "headlight", ambient=".45 .45 .45", diffuse=".2 .2 .2", specular="0 0 0")
+    SubElement(
+        world,
+        "light",
+        directional="true",
+        castshadow="false",
+        pos=numbers(LIGHT),
+        dir=numbers(-part for part in LIGHT),
+        diffuse=".5 .5 .5",
+        specular=".1 .1 .1",
+    )
     asset = root.find("asset")
     assert asset is not None
     SubElement(
@@ -115,7 +127,9 @@ def _surroundings(world: Element, machine: Machine, scene: Scene) -> None:
     for index in range(scene.markers):
         size = numbers([scene.marker_radius])
         rgba = numbers(MARKER_COLOUR)
-        SubElement(world, "site", name=marker_name(index), type="sphere", size=size, rgba=rgba)
+        site = SubElement(world, "site", name=marker_name(index), type="sphere", size=size)
+        site.set("rgba", rgba)
+        site.set("pos", _OUT_OF_SIGHT)
 
 
 def _object(world: Element, index: int, block: Block) -> None:

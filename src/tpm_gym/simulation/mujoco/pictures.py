@@ -65,7 +65,7 @@ class Pictures:
         mujoco.mjr_render(place, scene, self._context)
         pixels = np.empty((height, width, 3), np.uint8)
         mujoco.mjr_readPixels(pixels, None, place, self._context)
-        return pixels[::-1].copy()  # OpenGL begins below
+        return np.ascontiguousarray(pixels[::-1])  # OpenGL begins below
 
     def close(self) -> None:
         """Give the way to OpenGL back; harmless the second time."""
