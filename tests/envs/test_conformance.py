@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 import pytest
 from conformance import CHECKS, Make
-from episodes import EVERYTHING
+from episodes import EVERYTHING, OF_SERVOS
 
 import tpm_gym
 
@@ -19,6 +19,8 @@ CASES: list[tuple[str, dict[str, Any]]] = [
     ("TPMPickAndPlaceJoints-v0", {"goals": "tempting"}),
     ("TPMReachJoints-v0", {"randomisation": EVERYTHING}),
     ("TPMPickAndPlace-v0", {"randomisation": EVERYTHING}),
+    ("TPMReach-v0", {"drive": "servo"}),
+    ("TPMPickAndPlaceJoints-v0", {"drive": "servo", "randomisation": EVERYTHING | OF_SERVOS}),
 ]
 
 

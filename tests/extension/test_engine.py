@@ -8,7 +8,7 @@ from kinematic import KinematicEngine
 
 import tpm_gym
 from tpm_gym.errors import ConfigurationError
-from tpm_gym.simulation import Engine
+from tpm_gym.simulation import Engine, Servo
 
 
 @pytest.fixture(params=["TPMReach-v0", "TPMPickAndPlaceJoints-v0"])
@@ -31,7 +31,7 @@ def test_the_expert_solves_the_tasks_on_it(env):
 
 @pytest.mark.parametrize(
     ("option", "value"),
-    [("physics", {"time_step": 0.01}), ("renderer", "egl"), ("gui", True)],
+    [("physics", {"time_step": 0.01}), ("renderer", "egl"), ("gui", True), ("drive", Servo())],
 )
 def test_an_option_that_it_does_not_take_is_refused_by_name(option, value):
     with pytest.raises(ConfigurationError, match=f"^{option} = .*'kinematic' has no such option"):

@@ -27,7 +27,10 @@ EVERYTHING: dict[str, Any] = {
     "latency": 1,
     "length_error": 2e-4,
 }
-"""Every randomisation at once, as a configuration file would say it."""
+"""Every randomisation of any drive at once, as a configuration file would say it."""
+
+OF_SERVOS: dict[str, Any] = {"servo_stiffness": (0.5, 2.0), "joint_friction": (0.0, 0.5)}
+"""Those of servo drives."""
 
 CASES: list[tuple[str, dict[str, Any]]] = [
     *((env_id, {}) for env_id in tpm_gym.ENV_IDS),

@@ -106,7 +106,7 @@ class Motor:
 
 
 TORQUE_MOTOR = Motor(
-    # Experts take 10 N m at most and random actions 36, so motors at half their strength, the least
+    # Experts take 10 N m at most and full reversals 43, so motors at half their strength, the least
     # that may be drawn, still follow. 44 kPa of shear stress, and 18 for ever.
     peak_torque=100.0,
     continuous_torque=40.0,  # 100 W, which 0.14 m^2 of housing give off 70 K above the room

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, fields
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -59,9 +58,10 @@ class Servo:
     """A servo drive on each motor's axis.
 
     The torque is stiffness x (reference - angle) + damping x (its rate - rate) + feed-forward, and
-    not more than the motor has at its speed. The defaults are a direct drive with a bandwidth f of
-    40 Hz and a damping ratio of 0.7 on I = 0.1 kg m^2, which each motor feels at the home of the
-    paper's machine: I (2 pi f)^2 and 2 x 0.7 x I (2 pi f).
+    not more than the motor has at its speed. The defaults are a good direct drive's: a bandwidth f
+    of 40 Hz, critically damped, on I = 0.12 kg m^2, the lightest motion that the paper's machine
+    has, I (2 pi f)^2 and 2 I (2 pi f), rounded. Motions along y, next to the singularity, are up to
+    150 times as heavy, and that much slower and less damped.
 
     Attributes:
         stiffness: N m/rad.
@@ -73,8 +73,8 @@ class Servo:
         ConfigurationError: If a value is out of range.
     """
 
-    stiffness: float = 6300.0
-    damping: float = 35.0
+    stiffness: float = 7500.0
+    damping: float = 60.0
     feedforward: str = "computed"
 
     def __post_init__(self) -> None:
@@ -146,7 +146,10 @@ def limited(torque: float, rate: float, effort: float, motor: Joint) -> float:
 def references(
     machine: Machine, servo: Servo, start: Vector, path: Sequence[Vector], time_step: float
 ) -> list[Reference]:
-    """Angles with their rates, and the torques fed forward.
+    """Angles with their rates, and the torques fed forward in each time step.
+
+    The torques are those of the first and the last time step, and in between a straight line: in a
+    control period, they differ little from it.
 
     Args:
         machine: The nominal one.
@@ -159,16 +162,21 @@ def references(
     rates = [_slope(now, before, time_step) for before, now in pairwise(points)]
     if servo.feedforward == "none":
         return [Reference(*one) for one in zip(path, rates, strict=True)]
-    if servo.feedforward == "gravity":
-        torques = [machine.torque(theta, _ZERO, _ZERO) for theta in points[:-1]]
-    else:
-        changes = [_slope(now, before, time_step) for before, now in pairwise(rates)] or [_ZERO]
-        # Across a border of control periods the acceleration jumps: to that of the new one.
-        torques = [
-            machine.torque(*motion)
-            for motion in zip(points[:-1], rates, [changes[0], *changes], strict=False)
-        ]
-    return [Reference(*one) for one in zip(path, rates, torques, strict=True)]
+    moving = servo.feedforward == "computed"
+    # Across a border of control periods the acceleration jumps: to that of the new one.
+    changes = [_slope(now, before, time_step) for before, now in pairwise(rates)] or [_ZERO]
+    first, last = (
+        machine.torque(theta, *(motion if moving else (_ZERO, _ZERO)))
+        for theta, *motion in (
+            (points[0], rates[0], changes[0]),
+            (points[-2], rates[-1], changes[-1]),
+        )
+    )
+    between = np.linspace(first, last, len(path)).tolist()
+    return [
+        Reference(theta, rate, (a, b, c))
+        for theta, rate, (a, b, c) in zip(path, rates, between, strict=True)
+    ]
 
 
 def _slope(now: Vector, before: Vector, time: float) -> Vector:
@@ -237,8 +245,7 @@ class Servos:
 
     def rest(self, theta: Vector) -> None:
         """Start at rest at ``theta`` rad, with what carries the machine there."""
-        with suppress(UnreachableError, SingularityError):
-            self.memory = Memory(self._machine.torque(theta, _ZERO, _ZERO), _ZERO)
+        self.memory = Memory(self._machine.torque(theta, _ZERO, _ZERO), _ZERO)
 
     def begin(self, theta: Vector) -> None:
         """Take up the inertia at ``theta`` rad, for a control period."""
@@ -254,9 +261,9 @@ class Servos:
     def _inertia(self, theta: Vector) -> FloatArray:
         """(3, 3) kg m^2, at least as light as the true machine."""
         torque = self._machine.torque
-        moving = np.array([torque(theta, _ZERO, unit) for unit in _UNITS])
-        mass: FloatArray = self._lightest * (moving - torque(theta, _ZERO, _ZERO))
-        return (mass + mass.T) / 2
+        weight = torque(theta, _ZERO, _ZERO)
+        columns = [_minus(torque(theta, _ZERO, unit), weight) for unit in _UNITS]
+        return self._lightest * np.array(columns)
 
     def torque(self, reference: Reference, theta: Vector, theta_dot: Vector) -> Vector:
         """What the motors apply in a time step, N m, from angles and rates at its beginning."""

@@ -191,9 +191,10 @@ class Robot:
 
     def apply(self, torque: Vector) -> None:
         """Let the motors apply ``torque`` N m in the next time step."""
-        turn, mode = self._client.setJointMotorControl2, pybullet.TORQUE_CONTROL
-        for motor, one in zip(self._motors, torque, strict=True):
-            turn(*motor, mode, force=one)
+        turn, mode = pybullet.setJointMotorControl2, pybullet.TORQUE_CONTROL
+        number = self._client.number
+        for (body, joint), one in zip(self._motors, torque, strict=True):
+            turn(body, joint, mode, 0.0, 0.0, one, 0.0, 0.0, -1.0, number)
 
     def rub(self, friction: Vector) -> None:
         """Let the motors' axes resist any motion with ``friction`` N m."""

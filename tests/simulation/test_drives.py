@@ -1,0 +1,352 @@
+"""Servo drives: stated stiffness, honest time steps, limits that bite, and what they carry."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import asdict, replace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from episodes import expert_episode, random_episode
+from gymnasium.envs.registration import EnvSpec
+from inside_bullet import around_each_step, push
+from machines import each_machine
+
+from tpm_gym import TPMEnv
+from tpm_gym.arrays import FloatArray, Vector
+from tpm_gym.errors import ConfigurationError, InputError
+from tpm_gym.mechanism import PAPER_TPM, TPM, Machine, tree
+from tpm_gym.mechanism.bodies import Joint
+from tpm_gym.mechanism.motor import TORQUE_MOTOR
+from tpm_gym.simulation import Plant, Scene, Servo, Simulation
+from tpm_gym.simulation.drives import Reference, drive_of, limited
+from tpm_gym.simulation.state import CONTROL_PERIOD
+
+HOME = PAPER_TPM.home
+THETA = PAPER_TPM.inverse(HOME)
+REST = (0.0, 0.0, 0.0)
+HELD = Servo(feedforward="gravity")
+MOTOR = Joint("R11", "revolute", "base", REST, effort=100.0, speed=25.0, corner=15.0)
+
+
+def simulation_of(servo: Servo | None, machine: Machine = PAPER_TPM, **physics: Any) -> Simulation:
+    return Simulation(Scene(), machine=machine, drive=servo, physics=physics)
+
+
+def gravity(theta: Vector = THETA) -> FloatArray:
+    return np.array(PAPER_TPM.torque(theta, REST, REST))
+
+
+def mass_matrix(theta: Vector = THETA) -> FloatArray:
+    return np.array([PAPER_TPM.torque(theta, REST, unit) for unit in np.eye(3)]) - gravity(theta)
+
+
+def watched(simulation: Simulation) -> list[tuple[Any, Vector]]:
+    """Of every time step from now on: motors at its end, and their rates at its beginning."""
+    seen: list[tuple[Any, Vector]] = []
+    before: list[Vector] = []
+    motors = simulation.engine.motors
+    around_each_step(
+        simulation,
+        before=lambda: before.append(motors().theta_dot),
+        after=lambda: seen.append((motors(), before[-1])),
+    )
+    return seen
+
+
+# -- options ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("value", "name"),
+    [
+        ("stiff", "drive"),
+        (7500.0, "drive"),
+        ({"gain": 1.0}, "drive"),
+        ({"stiffness": 0.0}, "stiffness"),
+        ({"stiffness": "high"}, "stiffness"),
+        ({"damping": -1.0}, "damping"),
+        ({"damping": float("nan")}, "damping"),
+        ({"feedforward": "full"}, "feedforward"),
+        ({"feedforward": ["none"]}, "feedforward"),
+    ],
+)
+def test_what_is_no_drive_is_refused_by_name(value: Any, name: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        TPMEnv(drive=value)
+    assert caught.value.name == name
+
+
+def test_a_drive_has_many_names() -> None:
+    for value, drive in (
+        (None, None),
+        ("ideal", None),
+        ("servo", Servo()),
+        (HELD, HELD),
+        ({"feedforward": "gravity"}, HELD),
+    ):
+        assert drive_of(value) == drive
+    with closing(TPMEnv(drive=asdict(HELD))) as env:
+        assert env.drive == env.simulation.drive == HELD
+
+
+@pytest.mark.parametrize(("name", "value"), [("servo_stiffness", 0.5), ("joint_friction", (0, 1))])
+def test_ideal_drives_refuse_what_only_servos_have_and_say_so(name: str, value: Any) -> None:
+    with pytest.raises(ConfigurationError, match="drive='servo'") as caught:
+        TPMEnv(randomisation={name: value})
+    assert caught.value.name == name
+    with closing(simulation_of(None)) as simulation:
+        plant = Plant(**{name: (0.5, 0.5, 0.5)})
+        with pytest.raises(ConfigurationError, match="drive='servo'") as caught:
+            simulation.reset(THETA, plant=plant)
+        assert caught.value.name == name
+        assert simulation.reset(THETA).theta == pytest.approx(THETA)  # and is as it was
+
+
+def test_info_tells_the_drives_of_an_episode() -> None:
+    options = {"servo_stiffness": (0.5, 2.0), "joint_friction": (0.1, 0.4)}
+    with closing(TPMEnv(drive="servo", randomisation=options)) as env:
+        plants = [env.reset(seed=seed)[1]["randomisation"] for seed in (1, 2, 1)]
+    assert plants[0] == plants[2] != plants[1]
+    for name, (low, high) in options.items():
+        drawn = np.array([plant[name] for plant in plants])
+        assert drawn.shape == (3, 3)
+        assert ((low <= drawn) & (drawn <= high)).all()
+        assert len(np.unique(drawn[0])) == 3  # each motor has its own
+
+
+def test_a_spec_that_went_through_json_has_the_same_drive_and_takes_its_snapshots() -> None:
+    with closing(gym.make("TPMReach-v0", drive=HELD)) as env:
+        assert env.spec is not None
+        spec = EnvSpec.from_json(json.dumps(json.loads(env.spec.to_json())))
+        env.reset(seed=0)
+        snapshot: Any = env.unwrapped.save_state()  # type: ignore[attr-defined]
+    with closing(gym.make(spec)) as same, closing(TPMEnv(drive="servo")) as other:
+        same.reset(seed=1)
+        same.unwrapped.restore_state(snapshot)  # type: ignore[attr-defined]
+        with pytest.raises(InputError, match="same task and options"):
+            other.restore_state(snapshot)
+
+
+# -- the law ---------------------------------------------------------------------------------------
+
+
+@each_machine
+@pytest.mark.parametrize("force", [(20.0, 0.0, 0.0), (0.0, 3.0, 0.0), (-5.0, 2.0, 15.0)])
+def test_any_load_turns_a_motor_by_torque_over_stiffness(machine: TPM, force: Vector) -> None:
+    # Also a load that is in no model, and after time steps in which the law cannot know it.
+    simulation, home = simulation_of(HELD, machine), machine.inverse(machine.home)
+    simulation.reset(home)
+    around_each_step(simulation, before=lambda: push(simulation, force))
+    for _ in range(25):
+        state = simulation.move(machine.home)
+    rows = np.array(machine.evaluate(tuple(state.theta.tolist())).jacobian)
+    turned = HELD.stiffness * (state.theta - home)
+    np.testing.assert_allclose(turned, rows.T @ force, rtol=0.02, atol=0.01)
+
+
+@pytest.mark.parametrize("feedforward", ["none", "gravity", "computed"])
+def test_what_is_fed_forward_need_not_turn_the_motors(feedforward: str) -> None:
+    servo = Servo(feedforward=feedforward)
+    simulation = simulation_of(servo)
+    simulation.reset(THETA)
+    for _ in range(25):
+        state = simulation.move(HOME)
+    sagged = gravity() if feedforward == "none" else np.zeros(3)
+    np.testing.assert_allclose(servo.stiffness * (THETA - state.theta), sagged, atol=0.03)
+    np.testing.assert_allclose(state.torque, gravity(), atol=0.03)
+
+
+def step_response(servo: Servo, substeps: int) -> tuple[FloatArray, FloatArray]:
+    """Angles (control periods * substeps, 3) after the references jump by a little; what theory
+    says: Euler's backward method on M x'' + D x' + K x = 0."""
+    step, jump = CONTROL_PERIOD / substeps, np.array((2e-4, -1e-4, 1e-4))
+    simulation = simulation_of(servo, time_step=step)
+    simulation.reset(THETA)
+    for _ in range(10):
+        start = np.array(simulation.move(HOME).theta)
+    seen, a, b, c = watched(simulation), *(start + jump).tolist()
+    hold = tuple(gravity().tolist())
+    for _ in range(3):
+        simulation.engine.advance([Reference((a, b, c), REST, hold)] * substeps, False)
+    found = np.array([motors.theta for motors, _ in seen]) - start
+    mass, x, v, expected = mass_matrix(), -jump, np.zeros(3), []
+    stiff, damping = servo.stiffness * np.eye(3), servo.damping * np.eye(3)
+    for _ in seen:
+        v = np.linalg.solve(mass + step * damping + step**2 * stiff, mass @ v - step * stiff @ x)
+        x = x + step * v
+        expected.append(x + jump)
+    return found, np.array(expected)
+
+
+@pytest.mark.parametrize("substeps", [10, 40])
+@pytest.mark.parametrize("servo", [HELD, Servo(30_000.0, 60.0, "gravity")])
+def test_motion_is_that_of_springs_and_dampers_integrated_by_eulers_backward_method(
+    servo: Servo, substeps: int
+) -> None:
+    found, expected = step_response(servo, substeps)
+    assert np.abs(expected).max() > 1.5e-4
+    np.testing.assert_allclose(found, expected, atol=2e-6)  # 0.02 of the smallest jump
+
+
+@pytest.mark.parametrize("masses", [0.5, 1.0, 2.0])
+@pytest.mark.parametrize("stiffness", [1e3, 1e5, 1e7])
+def test_it_is_stable_at_any_stiffness_and_mass(stiffness: float, masses: float) -> None:
+    simulation = simulation_of(Servo(stiffness, 60.0))
+    plant = Plant(link_masses=(masses,) * (len(PAPER_TPM.mechanism.links) - 1))
+    simulation.reset(THETA, plant=plant)
+    for share in (0.2, 0.4, 0.6, 0.8, *[1.0] * 25):
+        command = (HOME[0] + 0.05 * share, HOME[1] + 0.01 * share, HOME[2] + 0.05 * share)
+        state = simulation.move(command)
+    np.testing.assert_allclose(state.theta_dot, 0, atol=2e-3)
+    # What is fed forward is the nominal machine's, and off by its weight at most.
+    np.testing.assert_allclose(state.theta, PAPER_TPM.inverse(command), atol=10 / stiffness)
+
+
+def test_springs_and_dampers_give_nothing_that_was_not_put_in() -> None:
+    servo, dynamics = Servo(feedforward="none"), PAPER_TPM.dynamics
+    simulation = simulation_of(servo)
+    simulation.reset(THETA)
+    seen = watched(simulation)
+    reference = Reference(PAPER_TPM.inverse((HOME[0] + 0.02, HOME[1], HOME[2] + 0.02)))
+    for _ in range(6):
+        simulation.engine.advance([reference] * 10, False)
+    motions = [(np.array(motors.theta), np.array(motors.theta_dot)) for motors, _ in seen]
+    energies = [sum(dynamics.energy(*motion)) for motion in motions]
+    sprung = [servo.stiffness * np.sum((theta - reference.theta) ** 2) / 2 for theta, _ in motions]
+    total = np.array(energies) + sprung
+    assert total[0] - total[-1] > 0.1  # J
+    assert np.diff(total).max() < 1e-3 * (total[0] - total[-1])
+
+
+# -- limits ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+@pytest.mark.parametrize(
+    ("speed", "share"),
+    [(0.0, 1.0), (15.0, 1.0), (20.0, 0.5), (24.0, 0.1), (25.0, 0.0), (40.0, 0.0),
+     (-5.0, 1.0), (-20.0, 1.0), (-40.0, 1.0)],
+)  # fmt: skip
+def test_torque_falls_from_the_corner_to_the_no_load_speed_and_brakes_in_full(
+    speed: float, share: float, sign: int
+) -> None:
+    for effort in (100.0, 50.0):  # a weak motor's line starts lower
+        given = limited(sign * 1e3, sign * speed, effort, MOTOR)
+        assert given == pytest.approx(sign * share * effort)
+        assert limited(sign * 0.01, sign * speed, effort, MOTOR) == min(0.01, share * effort) * sign
+
+
+def over_the_line(seen: list[tuple[Any, Vector]], motor: Any, strength: float) -> list[float]:
+    """By how much torque each motor was beyond its line in each time step, N m."""
+    line = Joint(
+        "R11", "revolute", "base", REST, speed=motor.no_load_speed, corner=motor.corner_speed
+    )
+    effort = strength * motor.peak_torque
+    return [
+        abs(torque - limited(torque, rate, effort, line))
+        for motors, rates in seen
+        for torque, rate in zip(motors.torque, rates, strict=True)
+    ]
+
+
+@pytest.mark.parametrize(("drive", "beyond"), [(None, True), (Servo(), False)])
+def test_a_slow_motor_keeps_to_its_line(
+    drive: Servo | None, beyond: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # At 1 rad/s the corner, at 2 no torque is left; actions go up to 3 rad/s.
+    slow = replace(TORQUE_MOTOR, no_load_speed=2.0, motor_constant=10.0)
+    monkeypatch.setattr(tree, "TORQUE_MOTOR", slow)
+    machine = replace(PAPER_TPM, name="slow")
+    simulation = simulation_of(drive, machine)
+    simulation.reset(THETA)
+    seen = watched(simulation)
+    for shift in (0.03, 0.06, 0.09, 0.12, 0.12, 0.12):  # m, upwards, well away from y = 0
+        simulation.move((HOME[0], HOME[1] + 0.01, HOME[2] - shift))
+    over = over_the_line(seen, slow, 1.0)
+    assert (max(over) > 1.0) == beyond
+    assert beyond or max(over) < 1e-9
+
+
+def test_a_weak_motor_gives_its_share_and_no_more() -> None:
+    simulation = simulation_of(Servo(1e5, 200.0, "none"))
+    simulation.reset(THETA, plant=Plant(motor_strength=(0.5, 0.5, 0.5)))
+    seen = watched(simulation)
+    for shift in (0.1, -0.05):  # m, three times what actions reach
+        simulation.move(np.add(HOME, (0, 0.01, shift)))
+    applied = np.abs([motors.torque for motors, _ in seen]).max()
+    assert applied == pytest.approx(0.5 * TORQUE_MOTOR.peak_torque)
+
+
+# -- friction, stiffness ---------------------------------------------------------------------------
+
+
+def test_friction_holds_up_to_its_torque_and_slows_by_it() -> None:
+    friction, way = 2.0, [(HOME[0] + 0.004 * k, HOME[1], HOME[2]) for k in range(12)]
+    torques = []
+    for plant in (Plant(), Plant(joint_friction=(friction,) * 3)):
+        simulation = simulation_of(Servo())
+        simulation.reset(THETA, plant=plant)
+        states = [simulation.move(command) for command in way]
+        torques.append(states[-1].torque)
+    np.testing.assert_allclose(
+        torques[1] - torques[0], friction * np.sign(states[-1].theta_dot), rtol=0.03
+    )
+    simulation.reset(THETA, plant=plant)
+    held = [simulation.move((HOME[0], HOME[1], HOME[2] + 5e-5)) for _ in range(12)][-1]
+    wanted = np.array(PAPER_TPM.inverse((HOME[0], HOME[1], HOME[2] + 5e-5)))
+    assert np.abs(Servo().stiffness * (wanted - THETA)).max() < friction
+    np.testing.assert_allclose(held.theta, THETA, atol=1e-6)  # it sticks
+
+
+def test_stiffness_is_each_drives_own() -> None:
+    factors = np.array((0.5, 1.0, 4.0))
+    simulation = simulation_of(Servo(feedforward="none"))
+    simulation.reset(THETA, plant=Plant(servo_stiffness=tuple(factors.tolist())))
+    for _ in range(25):
+        state = simulation.move(HOME)
+    np.testing.assert_allclose(
+        7500.0 * factors * (THETA - state.theta), gravity(), rtol=0.02, atol=0.01
+    )
+
+
+# -- in the environment ----------------------------------------------------------------------------
+
+
+def played(drive: Any, scripted: bool) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Tracking errors (rad) and torques (N m) of all time steps of a few episodes."""
+    with closing(TPMEnv("reach", drive=drive)) as env:
+        env.reset(seed=0)
+        engine: Any = env.simulation.engine
+        advance, wanted = engine.advance, []
+
+        def noted(references: list[Reference], vacuum: bool) -> None:
+            wanted.extend(reference.theta for reference in references)
+            advance(references, vacuum)
+
+        engine.advance = noted
+        seen = watched(env.simulation)
+        for seed in range(5):
+            play = expert_episode if scripted else random_episode
+            *_, (_, _, info) = play(env, seed)
+            assert info["is_success"] or not scripted
+            assert not info["assembly_mode_changed"]
+        yield (
+            np.abs(np.subtract([motors.theta for motors, _ in seen], wanted)),
+            np.abs([motors.torque for motors, _ in seen]),
+        )
+
+
+@pytest.mark.parametrize("scripted", [True, False], ids=["expert", "random"])
+def test_tracking_and_effort(scripted: bool) -> None:
+    # Of 40 episodes: 0.15 mrad and 10 N m (expert), 0.7 mrad and 43 N m (random).
+    ((exact, ideal),) = played("ideal", scripted)
+    ((errors, effort),) = played("servo", scripted)
+    assert exact.max() < 1e-8
+    assert 1e-5 < errors.max() < (3e-4 if scripted else 1.5e-3)
+    largest = 0.12 if scripted else 0.5  # of the peak: half is what the weakest motors have
+    assert max(ideal.max(), effort.max()) < largest * TORQUE_MOTOR.peak_torque
