@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import gantry  # noqa: F401  registers a machine
 import gymnasium as gym
 import pytest
 from conformance import CHECKS, Make
@@ -19,6 +20,10 @@ CASES: list[tuple[str, dict[str, Any]]] = [
     ("TPMPickAndPlaceJoints-v0", {"goals": "tempting"}),
     ("TPMReachJoints-v0", {"randomisation": EVERYTHING}),
     ("TPMPickAndPlace-v0", {"randomisation": EVERYTHING}),
+    ("TPMReachJoints-v0", {"engine": "mujoco"}),
+    ("TPMPickAndPlace-v0", {"engine": "mujoco", "randomisation": EVERYTHING}),
+    ("TPMPickAndPlaceJointsDense-v0", {"engine": "mujoco", "machine": "wide", "drive": "servo"}),
+    ("TPMPickAndPlace-v0", {"engine": "mujoco", "machine": "gantry"}),
     ("TPMReach-v0", {"drive": "servo"}),
     ("TPMPickAndPlaceJoints-v0", {"drive": "servo", "randomisation": EVERYTHING | OF_SERVOS}),
 ]
@@ -30,4 +35,4 @@ CASES: list[tuple[str, dict[str, Any]]] = [
 def test_it_keeps_what_is_promised(
     check: Callable[[Make], None], env_id: str, options: dict[str, Any], engine: str
 ) -> None:
-    check(lambda: gym.make(env_id, engine=engine, **options))
+    check(lambda: gym.make(env_id, **{"engine": engine, **options}))
