@@ -103,6 +103,7 @@ class MujocoEngine:
     def advance(self, references: Sequence[Reference], vacuum: bool) -> None:
         """See the protocol."""
         model, data, robot, cup = self.model, self.data, self.robot, self._cup
+        scenery = self._scenery
         first_half, second_half, servos = mujoco.mj_step1, mujoco.mj_step2, self._servos
         if servos is not None:
             servos.begin(references[0].theta)
@@ -113,6 +114,7 @@ class MujocoEngine:
             else:
                 theta, theta_dot, _ = robot.motors()
                 robot.apply(servos.torque(reference, theta, theta_dot))
+            scenery.keep_sliding()
             second_half(model, data)
             if servos is None and reference is last:
                 robot.note_torque()

@@ -25,7 +25,7 @@ class Physics:
         ConfigurationError: If a value is out of range.
     """
 
-    time_step: float = 1 / 200
+    time_step: float = 1 / 250
     iterations: int = 50
     tolerance: float = 1e-10
 

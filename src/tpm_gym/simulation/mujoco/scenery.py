@@ -15,6 +15,8 @@ from tpm_gym.simulation.state import Scene
 
 __all__ = ["Scenery"]
 
+_STILL = 1e-4  # m/s
+
 
 class Scenery:
     """Everything in the model that moves and is not the robot.
@@ -28,7 +30,8 @@ class Scenery:
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, scene: Scene) -> None:
         """Look up where everything is."""
         self._model, self._data, self._blocks = model, data, scene.objects
-        self._position = data.qpos.item
+        self._position, self._speed = data.qpos.item, data.qvel.item
+        self._resting = 4 * len(scene.objects)  # contacts of objects that lie flat
         names = [object_name(index) for index in range(len(scene.objects))]
         joints = [model.joint(name) for name in names]
         self._at = [joint.qposadr.item() for joint in joints]
@@ -41,6 +44,30 @@ class Scenery:
         ]
         self._friction = model.pair_friction.copy()
         self._markers = [model.site(marker_name(index)).id for index in range(scene.markers)]
+
+    def keep_sliding(self) -> None:
+        """Let what slides slide, and not take off.
+
+        The engine's contacts are convex: where two bodies slide along each other it drives them
+        apart, at the coefficient of friction times the speed of the slip, and they would hop. The
+        normal's share of what is wanted is lowered by that much. To be called between the two
+        halves of a time step.
+        """
+        data = self._data
+        if not data.ncon or (data.ncon <= self._resting and not self._moves()):
+            return
+        contacts = data.nefc - 3 * data.ncon  # three rows each, at the end
+        _, x, y = data.efc_vel[contacts:].reshape(-1, 3).T
+        wanted = data.efc_aref[contacts::3]
+        wanted -= data.contact.friction[:, 0] * np.hypot(x, y) / self._model.opt.timestep
+
+    def _moves(self) -> bool:
+        """Whether an object is faster than solver noise."""
+        speed = self._speed
+        return any(
+            abs(speed(dof)) + abs(speed(dof + 1)) + abs(speed(dof + 2)) > _STILL
+            for dof in self._dof
+        )
 
     def move_markers(self, positions: Sequence[Vector]) -> None:
         """Show the goal at these points, m, world."""

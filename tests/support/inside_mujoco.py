@@ -1,0 +1,78 @@
+"""Hands inside MuJoCo: forces, and eyes on every time step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+from unittest.mock import patch
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike
+
+from tpm_gym.arrays import FloatArray
+from tpm_gym.simulation import Simulation
+from tpm_gym.simulation.mujoco.model import object_name
+
+
+def nothing() -> None:
+    """What happens by default."""
+
+
+@contextmanager
+def around_each_step(
+    simulation: Simulation,
+    before: Callable[[], None] = nothing,
+    after: Callable[[], None] = nothing,
+) -> Iterator[None]:
+    """Let something happen around every time step: before it, and after it is complete."""
+    engine: Any = simulation.engine
+    second_half, breathe = mujoco.mj_step2, engine._cup.breathe
+
+    def step2(model: Any, data: Any) -> None:
+        before()
+        second_half(model, data)
+
+    def breathed(*state: Any) -> Any:
+        after()
+        return breathe(*state)
+
+    with patch.object(mujoco, "mj_step2", step2), patch.object(engine._cup, "breathe", breathed):
+        yield
+
+
+def throw(simulation: Simulation, velocity: ArrayLike) -> None:
+    """Let the first object have a velocity, m/s."""
+    engine: Any = simulation.engine
+    engine.data.joint(object_name(0)).qvel[:3] = velocity
+    mujoco.mj_step1(engine.model, engine.data)  # what depends on it
+
+
+def push(simulation: Simulation, body: str, force: ArrayLike, offset: ArrayLike = 0.0) -> None:
+    """Let a force (N, world) act from now on, ``offset`` m from the body's centre of mass."""
+    engine: Any = simulation.engine
+    force = np.asarray(force, dtype=np.float64)
+    torque = np.cross(np.broadcast_to(np.asarray(offset, dtype=np.float64), 3), force)
+    engine.data.xfrc_applied[engine.model.body(body).id] = (*force, *torque)
+
+
+def at_point_p(simulation: Simulation) -> FloatArray:
+    """Where point P is from the platform's centre of mass, m, world."""
+    engine: Any = simulation.engine
+    body = engine.model.body(simulation.machine.mechanism.platform).id
+    offset: FloatArray = np.subtract(engine.truth().position, engine.data.xipos[body])
+    return offset
+
+
+def pressure(simulation: Simulation) -> float:
+    """Force with which the contacts between the cup and the first object push them apart, N."""
+    engine: Any = simulation.engine
+    model, data = engine.model, engine.data
+    bodies = {model.body(simulation.machine.mechanism.tool).id, model.body(object_name(0)).id}
+    total, force = 0.0, np.empty(6)
+    for index, contact in enumerate(data.contact):
+        if {model.geom_bodyid[contact.geom1], model.geom_bodyid[contact.geom2]} == bodies:
+            mujoco.mj_contactForce(model, data, index, force)
+            total += force[0]
+    return total
