@@ -24,15 +24,17 @@ def nothing() -> None:
 def around_each_step(
     simulation: Simulation,
     before: Callable[[], None] = nothing,
+    solved: Callable[[], None] = nothing,
     after: Callable[[], None] = nothing,
 ) -> Iterator[None]:
-    """Let something happen around every time step: before it, and after it is complete."""
+    """Let something happen in every time step: before, once its forces are known, and after it."""
     engine: Any = simulation.engine
     second_half, breathe = mujoco.mj_step2, engine._cup.breathe
 
     def step2(model: Any, data: Any) -> None:
         before()
         second_half(model, data)
+        solved()
 
     def breathed(*state: Any) -> Any:
         after()
@@ -66,7 +68,10 @@ def at_point_p(simulation: Simulation) -> FloatArray:
 
 
 def pressure(simulation: Simulation) -> float:
-    """Force with which the contacts between the cup and the first object push them apart, N."""
+    """Force with which the contacts between the cup and the first object push them apart, N.
+
+    Known where a time step is ``solved``.
+    """
     engine: Any = simulation.engine
     model, data = engine.model, engine.data
     bodies = {model.body(simulation.machine.mechanism.tool).id, model.body(object_name(0)).id}
