@@ -21,6 +21,7 @@ from tpm_gym.arrays import Vector
 from tpm_gym.errors import ConfigurationError, MissingPackageError
 from tpm_gym.mechanism import PAPER_TPM
 from tpm_gym.simulation import Block, Plant, Scene, Simulation
+from tpm_gym.simulation.engine import Reference
 from tpm_gym.simulation.mujoco.model import object_name
 
 HOME = PAPER_TPM.home
@@ -76,21 +77,17 @@ def test_the_ideal_drive_is_where_it_shall_be_at_the_end_of_every_time_step(
     simulation: Simulation,
 ) -> None:
     simulation.reset(THETA)
-    rate, theta = np.array((0.5, -0.3, 0.4)), np.array(THETA)  # rad/s
-    step = simulation.engine.physics.time_step
-    for share in np.minimum(1, np.arange(60) / 40):
-        theta = theta + share * step * rate
-        simulation.engine.advance([reference(theta)], False)
+    step = simulation.engine.physics.time_step  # type: ignore[attr-defined]
+    before = THETA
+    for share in (1 - np.cos(np.linspace(0, np.pi, 100))) / 2:
+        point = np.add(HOME, share * np.array((-0.10, 0.010, 0.05)))
+        theta = PAPER_TPM.inverse(tuple(point))
+        simulation.engine.advance([Reference(theta)], False)
         motors = simulation.engine.motors()
         np.testing.assert_allclose(motors.theta, theta, atol=2e-6)
-    np.testing.assert_allclose(motors.theta_dot, rate, rtol=1e-3)
-
-
-def reference(theta: Any) -> Any:
-    from tpm_gym.simulation.engine import Reference
-
-    a, b, c = theta
-    return Reference((float(a), float(b), float(c)))
+        rates = np.subtract(theta, before) / step
+        np.testing.assert_allclose(motors.theta_dot, rates, atol=1e-3)
+        before = theta
 
 
 def test_torques_at_rest_are_those_of_the_closed_form(simulation: Simulation) -> None:
