@@ -39,7 +39,7 @@ format: $(INSTALLED) ## rewrite the code in the house style
 	$(RUN) -m ruff format .
 
 test-fast: $(INSTALLED)
-	$(RUN) -m pytest -q
+	$(RUN) -m pytest -q -n logical --maxprocesses 8 --dist worksteal
 
 test-slow: $(INSTALLED) ## tests that take minutes: 1000 expert episodes, training to success
 	$(RUN) -m pytest -q -m slow

@@ -1,10 +1,16 @@
 """Rooms import only what lies below them, and importing the package is cheap."""
 
+import importlib
+import pkgutil
+import re
 import subprocess
 import sys
+from dataclasses import is_dataclass
 
 from importlinter.cli import lint_imports
 from paths import ROOT
+
+import tpm_gym
 
 
 def test_the_contracts_on_imports_hold(capsys):
@@ -21,3 +27,11 @@ def test_importing_the_package_imports_neither_an_engine_nor_what_learning_needs
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert (done.stdout.strip(), done.stderr) == ("set()", "")
+
+
+def test_every_dataclass_but_errors_and_listeners_is_frozen():
+    for module in pkgutil.walk_packages(tpm_gym.__path__, "tpm_gym."):
+        if not re.search("__main__|learning", module.name):
+            for kind in vars(importlib.import_module(module.name)).values():
+                if is_dataclass(kind) and getattr(kind, "__module__", "") == module.name:
+                    assert kind.__dataclass_params__.frozen or issubclass(kind, Exception), kind

@@ -88,11 +88,10 @@ def test_errors_carry_their_values_show_them_and_survive_the_way_between_process
         assert (str(again), vars(again)) == (str(error), vars(error))
 
 
-def test_every_error_is_a_case_above_and_public() -> None:
-    assert {kind.__name__ for kind, *_ in CASES} | {"TPMError"} == set(errors.__all__)
+def test_every_error_is_a_case_above() -> None:
     defined = {
         name
         for name, value in vars(errors).items()
         if inspect.isclass(value) and issubclass(value, TPMError)
     }
-    assert defined == set(errors.__all__)
+    assert defined == {kind.__name__ for kind, *_ in CASES} | {"TPMError"}

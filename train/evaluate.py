@@ -1,7 +1,5 @@
 """The same as ``tpm-gym evaluate``."""
 
-from __future__ import annotations
-
 import sys
 
 from tpm_gym.learning.command_line import main

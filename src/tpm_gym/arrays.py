@@ -1,6 +1,7 @@
-"""Types of arrays, the one check of what users hand over as numbers, and rotations of vectors."""
+"""Types of arrays, the one check of what users hand over as numbers, and rotations of vectors.
 
-from __future__ import annotations
+A check that takes an ``error`` raises it, made of name, value and what would be valid.
+"""
 
 import math
 import sys
@@ -13,22 +14,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tpm_gym.errors import InputError, TPMError
-
-__all__ = [
-    "BoolArray",
-    "FloatArray",
-    "IntArray",
-    "Quaternion",
-    "Vector",
-    "finite",
-    "finite_points",
-    "is_tensor",
-    "numbers",
-    "points",
-    "rotate",
-    "transform",
-    "vector",
-]
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -46,9 +31,6 @@ def numbers(name: str, value: ArrayLike, error: _Error = InputError) -> FloatArr
 
     Strings, dates, complex numbers and whatever else numpy would bend into floats are refused, and
     so are masked arrays, whose mask would be ignored.
-
-    Raises:
-        TPMError: The ``error``, made of name, value and what would be valid.
     """
     if type(value) is np.ndarray and value.dtype.char in "df":  # the common case, fast
         return value if value.dtype.char == "d" else value.astype(np.float64)
@@ -68,11 +50,7 @@ def numbers(name: str, value: ArrayLike, error: _Error = InputError) -> FloatArr
 def finite(
     name: str, value: ArrayLike, shape: tuple[int, ...], error: _Error = InputError
 ) -> FloatArray:
-    """Finite numbers of exactly this shape.
-
-    Raises:
-        TPMError: The ``error``, made of name, value and what would be valid.
-    """
+    """Finite numbers of exactly this shape."""
     array = numbers(name, value, error)
     if array.shape != shape or not np.isfinite(array).all():
         raise error(name, _brief(value), f"finite numbers of shape {shape}")
@@ -80,11 +58,7 @@ def finite(
 
 
 def vector(name: str, value: ArrayLike, error: _Error = InputError) -> Vector:
-    """Three finite numbers, as plain floats.
-
-    Raises:
-        TPMError: The ``error``, made of name, value and what would be valid.
-    """
+    """Three finite numbers, as plain floats."""
     array = numbers(name, value, error)
     if array.shape == (3,):
         a, b, c = array.tolist()

@@ -5,28 +5,9 @@ exception that a caller would expect, and carries the offending values as attrib
 program can react without parsing the message.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
-
-__all__ = [
-    "ActionError",
-    "ClosureError",
-    "ConfigurationError",
-    "EpisodeError",
-    "GeometryError",
-    "InputError",
-    "MissingPackageError",
-    "ModeChangeError",
-    "PolicyFileError",
-    "PolicyMismatchError",
-    "ResetOptionError",
-    "SingularityError",
-    "TPMError",
-    "UnreachableError",
-]
 
 
 class TPMError(Exception):

@@ -3,12 +3,8 @@
 The wheel carries them in ``tpm_gym/data``; in a checkout they are where people look for them.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Final
-
-__all__ = ["POLICIES", "RECIPES", "URDF"]
 
 _PACKAGED: Final = Path(__file__).parent / "data"
 _CHECKOUT: Final = Path(__file__).parents[2]

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import replace
 from itertools import product
 
 import numpy as np
 import oracle
 import pytest
-from hypothesis import given, settings
+from examples import examples
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from numpy.typing import NDArray
+from scipy import ndimage
 
 import tpm_gym
 from tpm_gym.analysis import aspects, singularity
@@ -40,8 +40,7 @@ def all_centres(cells: Cells) -> FloatArray:
     return replace(cells, mask=np.ones_like(cells.mask)).centres()
 
 
-@settings(derandomize=True, max_examples=20, deadline=None)
-@given(oracle.geometries(), oracle.seeds(), modes)
+@examples(20, oracle.geometries(), oracle.seeds(), modes)
 def test_the_grid_covers_the_reachable_set(g: Geometry, seed: int, mode: WorkingMode) -> None:
     cells = aspects.reachable_set(mode, g, (24, 6, 24)).cells
     reachable = workspace.reachable(all_centres(cells), mode, g)
@@ -89,8 +88,7 @@ def test_volume_error_counts_no_flat_faces() -> None:
     assert cells.centres()[0].tolist() == [1.5, 2.5, 1.5]
 
 
-@settings(derandomize=True, max_examples=20, deadline=None)
-@given(oracle.geometries(), modes)
+@examples(20, oracle.geometries(), modes)
 def test_aspects_part_the_reachable_set_by_signs(g: Geometry, mode: WorkingMode) -> None:
     shape = (24, 6, 24)
     found = aspects.aspects(mode, g, shape, min_cells=1)
@@ -112,8 +110,7 @@ def test_aspects_part_the_reachable_set_by_signs(g: Geometry, mode: WorkingMode)
     assert len(kept) == sum(a.cells.mask.sum() >= 5 for a in found)
 
 
-@settings(derandomize=True, max_examples=15, deadline=None)
-@given(oracle.geometries(), modes, st.sampled_from([0.5, 4.0]))
+@examples(15, oracle.geometries(), modes, st.sampled_from([0.5, 4.0]))
 def test_sets_scale_with_the_lengths(g: Geometry, mode: WorkingMode, factor: float) -> None:
     both = (
         aspects.aspects(mode, lengths, (16, 4, 16)) for lengths in (g, oracle.scaled(g, factor))
@@ -132,36 +129,19 @@ def test_sets_scale_with_the_lengths(g: Geometry, mode: WorkingMode, factor: flo
         assert scaled.conditioning == pytest.approx(box.conditioning)
 
 
-def flood_fill(codes: NDArray[np.int64]) -> list[frozenset[tuple[int, ...]]]:
-    """Connected sets of equal codes, one cell at a time."""
-    waiting, found = set(np.ndindex(codes.shape)), []
-    while waiting:
-        seed = waiting.pop()
-        members, queue = {seed}, deque([seed])
-        while queue:
-            cell = queue.popleft()
-            for axis, step in product(range(3), (-1, 1)):
-                other = tuple(c + step * (axis == a) for a, c in enumerate(cell))
-                if other in waiting and codes[other] == codes[cell]:
-                    waiting.remove(other)
-                    members.add(other)
-                    queue.append(other)
-        found.append(frozenset(members))
-    return found
-
-
 shapes = st.tuples(*[st.integers(1, 6)] * 3)
 
 
-@settings(derandomize=True, max_examples=150, deadline=None)
-@given(arrays.arrays(np.int64, shapes, elements=st.integers(-1, 1)))
-def test_components_are_those_of_a_flood_fill(codes: NDArray[np.int64]) -> None:
-    labels = aspects._components(codes)
-    members = [
-        frozenset(tuple(c) for c in np.argwhere(labels == name).tolist())
-        for name in np.unique(labels)
-    ]
-    assert set(members) == set(flood_fill(codes))
+@examples(150, arrays.arrays(np.int64, shapes, elements=st.integers(-1, 1)))
+def test_components_are_those_that_scipy_labels(codes: NDArray[np.int64]) -> None:
+    labels, total = aspects._components(codes), 0
+    for code in np.unique(codes):
+        here = codes == code
+        expected, count = ndimage.label(here)
+        pairs = set(zip(labels[here].tolist(), expected[here].tolist(), strict=True))
+        assert len(pairs) == len({label for label, _ in pairs}) == count
+        total += count
+    assert len(np.unique(labels)) == total
 
 
 def best_by_trying(mask: NDArray[np.bool_]) -> int:
@@ -173,8 +153,7 @@ def best_by_trying(mask: NDArray[np.bool_]) -> int:
     return best
 
 
-@settings(derandomize=True, max_examples=200, deadline=None)
-@given(shapes, oracle.seeds(), st.floats(0.4, 1.0))
+@examples(200, shapes, oracle.seeds(), st.floats(0.4, 1.0))
 def test_largest_block_is_that_of_trying_all(
     shape: tuple[int, int, int], seed: int, density: float
 ) -> None:

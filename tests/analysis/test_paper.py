@@ -6,7 +6,6 @@ on topology are in test_paper_topology.py.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
@@ -34,31 +33,19 @@ CLOSED = 1e-12  # m^2; and open, below, is at least 1e-4 m^2 on half of the samp
 OPEN = 1e-4
 
 
-@dataclass(frozen=True)
-class Sample:
-    """Random postures: angles, link 3', and all points by the oracle."""
+class Sample(SimpleNamespace):
+    """Random postures, as the oracle has them."""
 
-    theta: FloatArray  # (n, 3)
-    x_c: FloatArray  # (n,)
-    z_c: FloatArray
-    beta: FloatArray
-    p: dict[str, FloatArray]
-
-    def __getitem__(self, name: str) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """x, y, z of a point, each (n,)."""
-        return tuple(self.p[name].T)  # type: ignore[return-value]
+    def __getitem__(self, name: str) -> FloatArray:
+        """x, y, z of a point, (3, n)."""
+        return np.asarray(self.p[name].T)
 
 
 @pytest.fixture(scope="module")
 def sample() -> Sample:
-    points = oracle.reachable_points(np.random.default_rng(0), 300, PAPER)
-    solutions = inverse_all(points)
-    number = np.nonzero(solutions.valid)[0]
-    theta, beta = solutions.theta[solutions.valid], solutions.beta[solutions.valid]
-    x_c, z_c = oracle.link3(points[number], beta, PAPER)
-    p = oracle.points(theta, x_c, z_c, beta, PAPER)
-    assert np.abs(gap(p["B1"], p["C1"])).max() < CLOSED
-    return Sample(theta, x_c, z_c, beta, p)
+    found = oracle.reachable_postures(np.random.default_rng(0), 300, PAPER)
+    assert np.abs(gap(found.p["B1"], found.p["C1"])).max() < CLOSED
+    return Sample(**vars(found))
 
 
 def gap(b: FloatArray, c: FloatArray) -> FloatArray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
 from hypothesis import strategies as st
 
 from tpm_gym.analysis.poc import (
@@ -44,8 +44,7 @@ def holds(whole: Subspace, part: Subspace) -> bool:
 # Subspaces and POC sets
 
 
-@settings(derandomize=True, max_examples=200)
-@given(subspaces, subspaces)
+@examples(200, subspaces, subspaces)
 def test_union_and_intersection_are_those_of_subspaces(a: Subspace, b: Subspace) -> None:
     union, common = a | b, a & b
     assert union.dim + common.dim == a.dim + b.dim
@@ -60,8 +59,7 @@ def test_union_and_intersection_are_those_of_subspaces(a: Subspace, b: Subspace)
     assert same(a.complement.complement, a)
 
 
-@settings(derandomize=True, max_examples=100)
-@given(vectors, st.floats(1e-3, 1e3))
+@examples(100, vectors, st.floats(1e-3, 1e3))
 def test_span_is_the_rank_whatever_the_lengths(rows: list[tuple[int, ...]], scale: float) -> None:
     subspace = Subspace.span(rows)
     assert subspace.dim == (np.linalg.matrix_rank(np.array(rows)) if rows else 0)
@@ -75,8 +73,7 @@ def test_span_rejects_what_is_no_list_of_vectors(bad: list[list[float]]) -> None
         Subspace.span(bad)
 
 
-@settings(derandomize=True, max_examples=100)
-@given(poc_sets, poc_sets)
+@examples(100, poc_sets, poc_sets)
 def test_poc_sets_combine_by_column(a: POCSet, b: POCSet) -> None:
     for found, rule in ((serial([a, b]), Subspace.__or__), (parallel([a, b]), Subspace.__and__)):
         assert same(found.translations, rule(a.translations, b.translations))
@@ -95,8 +92,7 @@ def test_equations_1_and_2_need_a_set() -> None:
 # What joints contribute
 
 
-@settings(derandomize=True, max_examples=100)
-@given(directions, directions, directions)
+@examples(100, directions, directions, directions)
 def test_revolutes_translate_perpendicularly_to_axis_and_arm(
     axis: tuple[float, ...], point: tuple[float, ...], base: tuple[float, ...]
 ) -> None:
@@ -112,8 +108,7 @@ def test_revolutes_translate_perpendicularly_to_axis_and_arm(
         assert poc.translations.dim == 1
 
 
-@settings(derandomize=True, max_examples=100)
-@given(directions, st.integers(0, 2**32 - 1))
+@examples(100, directions, st.integers(0, 2**32 - 1))
 def test_three_parallel_revolutes_give_t2_r1(axis: tuple[float, ...], seed: int) -> None:
     points = np.random.default_rng(seed).normal(size=(3, 3))
     chain = Chain("3R", tuple(revolute("R", np.array(axis), p) for p in points))
@@ -129,8 +124,7 @@ def far_link_freedoms(short: FloatArray, rod: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.svd(np.array(rows))[2][2:])
 
 
-@settings(derandomize=True, max_examples=100)
-@given(directions, directions)
+@examples(100, directions, directions)
 def test_4s_parallelogram_has_the_freedoms_that_its_rods_leave(
     short: tuple[float, ...], rod: tuple[float, ...]
 ) -> None:
@@ -147,8 +141,7 @@ def test_4s_parallelogram_has_the_freedoms_that_its_rods_leave(
     np.testing.assert_allclose(exact[:3, 3:], 0, atol=1e-9)
 
 
-@settings(derandomize=True, max_examples=100)
-@given(directions, directions)
+@examples(100, directions, directions)
 def test_4r_parallelogram_translates_along_the_tangent(
     short: tuple[float, ...], rod: tuple[float, ...]
 ) -> None:

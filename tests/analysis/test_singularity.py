@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import oracle
 import pytest
-from hypothesis import given, settings
+from examples import examples
 from hypothesis import strategies as st
 
 from tpm_gym.analysis import singularity
@@ -60,8 +60,7 @@ def assert_feet_are_singular(
     assert values.max() < 2e-5
 
 
-@settings(derandomize=True, max_examples=40, deadline=None)
-@given(oracle.geometries(), oracle.seeds(), st.sampled_from(WORKING_MODES))
+@examples(40, oracle.geometries(), oracle.seeds(), st.sampled_from(WORKING_MODES))
 def test_factors_at_points_are_the_oracle_s(g: Geometry, seed: int, mode: WorkingMode) -> None:
     points = oracle.reachable_points(np.random.default_rng(seed), 100, g)
     found = singularity.factors_at(points, mode, g)
@@ -77,8 +76,7 @@ def test_factors_at_points_are_the_oracle_s(g: Geometry, seed: int, mode: Workin
     np.testing.assert_allclose(mirrored.serial, found.serial, rtol=0, atol=1e-12)
 
 
-@settings(derandomize=True, max_examples=30, deadline=None)
-@given(oracle.geometries(), oracle.seeds(), st.sampled_from(WORKING_MODES))
+@examples(30, oracle.geometries(), oracle.seeds(), st.sampled_from(WORKING_MODES))
 def test_generic_points_are_regular_and_their_mode_is_their_signs(
     g: Geometry, seed: int, mode: WorkingMode
 ) -> None:
@@ -189,23 +187,20 @@ def compare(
         assert ball_is_clear(some[index], float(found.distance[index]), mode, g, count)
 
 
-@settings(derandomize=True, max_examples=4, deadline=None)
-@given(oracle.geometries(), oracle.seeds(), st.sampled_from(WORKING_MODES))
+@examples(4, oracle.geometries(), oracle.seeds(), st.sampled_from(WORKING_MODES))
 def test_distance_for_any_geometry(g: Geometry, seed: int, mode: WorkingMode) -> None:
     for assembly in SIDES:
         compare(mode, assembly, g, points=5, count=200, seed=seed)
 
 
 @pytest.mark.slow
-@settings(derandomize=True, max_examples=60, deadline=None)
-@given(oracle.geometries(), oracle.seeds(), st.sampled_from(WORKING_MODES))
+@examples(60, oracle.geometries(), oracle.seeds(), st.sampled_from(WORKING_MODES))
 def test_distance_for_many_geometries(g: Geometry, seed: int, mode: WorkingMode) -> None:
     for assembly in SIDES:
         compare(mode, assembly, g, points=20, count=2000, seed=seed)
 
 
-@settings(derandomize=True, max_examples=4, deadline=None)
-@given(oracle.geometries(), oracle.seeds(), st.floats(0.1, 10))
+@examples(4, oracle.geometries(), oracle.seeds(), st.floats(0.1, 10))
 def test_distance_scales_and_is_symmetric_in_y(g: Geometry, seed: int, factor: float) -> None:
     points = oracle.reachable_points(np.random.default_rng(seed), 12, g)
     for assembly in SIDES:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 from pathlib import Path
 from types import BuiltinFunctionType
 from typing import Any
 
+import bench_drives
 import bench_speed
 import gymnasium as gym
 import numpy as np
@@ -17,19 +15,14 @@ import pytest
 import raw_physics
 import soak
 import soak_report
-from paths import ROOT
+from paths import ROOT, read_strict
+from processes import PYTHON, printed_by
 from raw_physics import STEP, Recorder, record, recording, replay
 
+from tpm_gym.simulation import Servo
 from tpm_gym.tasks import Expert
 
 PICK = "TPMPickAndPlace-v0"
-
-
-def read_strict(path: Path) -> dict[str, Any]:
-    def refuse(constant: str) -> None:
-        raise AssertionError(f"{constant} is not JSON")
-
-    return json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse)
 
 
 def is_png(path: Path) -> bool:
@@ -104,13 +97,7 @@ def test_bench_speed_from_the_command_line(tmp_path):
     numbers, plot = tmp_path / "deep" / "speed.json", tmp_path / "speed.png"
     command = f"""--contestants TPMReach-v0 {PICK} --rounds 2 --steps 60 --scaling-steps 10
         --json {numbers} --plot {plot}""".split()
-    done = subprocess.run(
-        [sys.executable, str(ROOT / "benchmarks" / "bench_speed.py"), *command],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    output = printed_by(PYTHON, ROOT / "benchmarks" / "bench_speed.py", *command)
     content = read_strict(numbers)
     assert list(content["contestants"]) == ["TPMReach-v0", PICK]
     for entry in content["contestants"].values():
@@ -131,7 +118,7 @@ def test_bench_speed_from_the_command_line(tmp_path):
     for key in ("command", "commit", "versions", "machine", "load_before", "unavailable"):
         assert key in content
     assert str(tmp_path) not in numbers.read_text(encoding="utf-8")
-    assert f"not measured: {PICK} over PandaPickAndPlace-v3" in done.stdout
+    assert f"not measured: {PICK} over PandaPickAndPlace-v3" in output
     assert is_png(plot)
 
 
@@ -301,27 +288,14 @@ def test_an_interrupted_soak_keeps_its_samples_and_does_not_pass(tmp_path, monke
     assert not content["finished"]
 
 
-def test_a_restored_state_that_goes_on_otherwise_is_found():
-    class Forgetful:
-        """Restores nothing."""
-
-        def __init__(self, env):
-            self._env = env
-
-        def __getattr__(self, name):
-            return getattr(self._env, name)
-
-        def restore_state(self, snapshot):
-            pass
-
+def test_a_restored_state_that_goes_on_otherwise_is_found(monkeypatch):
     env = gym.make("TPMReach-v0")
     env.reset(seed=0)
     endurance = soak.Soak(0)
     assert not endurance._check_restore(env, np.random.default_rng(0))
-    wrapped = type("Wrapped", (), {"unwrapped": Forgetful(env.unwrapped)})()
-    wrapped.action_space = env.action_space
+    monkeypatch.setattr(env.unwrapped, "restore_state", lambda snapshot: None)
     with pytest.raises(RuntimeError, match="restored state differs"):
-        endurance._check_restore(wrapped, np.random.default_rng(0))
+        endurance._check_restore(env, np.random.default_rng(0))
     env.close()
 
 
@@ -341,22 +315,23 @@ def samples(slope: float, noise: float) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    ("slope", "drifts"), [(0.0, False), (2e-6, True), (-2e-6, False), (5e-8, False)]
+    ("slope", "noise", "drifts"),
+    [
+        (0.0, 1e-8, False),
+        (2e-6, 1e-8, True),
+        (-2e-6, 1e-8, False),
+        (5e-8, 1e-8, False),  # half a percent
+        (6e-6, 1e-5, False),  # within three standard errors
+    ],
 )
-def test_drift_is_a_slope_beyond_its_error_and_beyond_a_percent(slope, drifts):
-    verdict = soak_report.judge(samples(slope, noise=1e-8))
+def test_drift_is_a_slope_beyond_its_error_and_beyond_a_percent(slope, noise, drifts):
+    verdict = soak_report.judge(samples(slope, noise))
     drift = verdict["closure_drift"]
     assert drift["found"] == drifts
     assert verdict["passed"] == (not drifts)
     assert abs(drift["slope"] - slope) < 4 * drift["standard_error"]
-    # Least squares of 191 points with 10 nm of noise, spread evenly over 0.95 million steps.
-    assert drift["standard_error"] == pytest.approx(1e-8 / (0.95 * np.sqrt(191 / 12)), rel=0.2)
-
-
-def test_a_slope_within_its_error_is_no_drift():
-    drift = soak_report.judge(samples(6e-6, noise=1e-5))["closure_drift"]
-    assert 0.01 * drift["mean"] < drift["slope"] < 3 * drift["standard_error"]
-    assert not drift["found"]
+    # Least squares of 191 points spread evenly over 0.95 million steps.
+    assert drift["standard_error"] == pytest.approx(noise / (0.95 * np.sqrt(191 / 12)), rel=0.2)
 
 
 def test_the_baseline_waits_for_the_warm_up_and_for_all_environments():
@@ -377,3 +352,17 @@ def test_too_few_samples_do_not_pass():
     verdict = soak_report.judge(content)
     assert verdict["closure_drift"] is None
     assert not verdict["passed"]
+
+
+def test_bench_drives_compares_all_drives():
+    names = [name for name, _ in bench_drives.drives()]
+    assert len(names) == len(set(names)) == 16
+    found = [
+        bench_drives.play("TPMReach-v0", "pybullet", drive, scripted=True, episodes=1)
+        for drive in (None, Servo())
+    ]
+    assert [row.successes for row in found] == [1, 1]
+    assert [row.singular for row in found] == [0, 0]
+    assert max(found[0].errors) < 1e-8 < 1e-6 < max(found[1].errors) < 1e-3
+    assert 3 < max(found[0].torques) < 12
+    assert bench_drives.line("one", found[1]).startswith("| one | 1 | 0 | 0.0")

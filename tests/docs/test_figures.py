@@ -8,10 +8,9 @@ from paths import ROOT
 
 from tpm_gym.analysis.aspects import aspects
 from tpm_gym.analysis.singularity import factors_at
-from tpm_gym.kinematics import ASSEMBLY_MODES, ELBOWS_OUT, WORKING_MODES, inverse_all, jacobian
+from tpm_gym.kinematics import ELBOWS_OUT, WORKING_MODES, inverse_all
 from tpm_gym.kinematics.geometry import PAPER, Geometry
-from tpm_gym.kinematics.workspace import assembly_of, reachable
-from tpm_gym.mechanism import PAPER_TPM
+from tpm_gym.kinematics.workspace import reachable
 
 DOCS = ROOT / "docs"
 
@@ -60,22 +59,6 @@ def test_parallel_lines_are_zeros_with_a_change_of_sign(index, y):
     points = section.points(np.concatenate(lines))
     # Near the edge of the reach a factor changes like a square root: hence the tolerance.
     assert np.abs(factors_at(points, ELBOWS_OUT).parallel[..., index]).max() < 1e-10
-    matrices = np.array([parallel_jacobian(point) for point in points[:: len(points) // 20]])
-    values = np.linalg.svd(matrices, compute_uv=False)
-    assert (values[:, 2] / values[:, 0]).max() < 1e-9
-
-
-def parallel_jacobian(point: np.ndarray) -> np.ndarray:
-    """A of the point, from the rods of the drawn skeleton and not from the factors."""
-    s = skeleton(point, ELBOWS_OUT)
-    rods, (cos, sin, _) = s.c - s.b, (s.e1 - s.d1) / PAPER.l7
-    return np.array(
-        [
-            [cos * rods[0, 0], sin * rods[0, 0], cos * rods[0, 2]],
-            [cos * rods[1, 0], sin * rods[1, 0], cos * rods[1, 2]],
-            rods[2],
-        ]
-    )
 
 
 def test_plane_y_0_is_found_in_sections_of_constant_z():
@@ -85,14 +68,6 @@ def test_plane_y_0_is_found_in_sections_of_constant_z():
     points = section.points(np.concatenate(lines))
     assert np.abs(points[:, 1]).max() < 1e-12
     assert np.ptp(points[:, 0]) > 1.2  # from rim to rim
-
-
-def test_no_parallel_line_enters_the_task_region():
-    for y in np.linspace(PAPER_TPM.region.low[1], PAPER_TPM.region.high[1], 3):
-        section = Section("y", y)
-        for index in (1, 2):
-            for line in parallel_lines(index, ELBOWS_OUT, section, X, Z):
-                assert not PAPER_TPM.region.contains(section.points(line)).any()
 
 
 @pytest.mark.parametrize("index", [1, 2, 3])
@@ -171,19 +146,6 @@ def test_postures_are_distinct_in_the_drawing():
 def test_projection_keeps_scale():
     """Three orthogonal unit vectors have squared lengths that sum to 2 in a parallel projection."""
     assert (postures.project(np.eye(3)) ** 2).sum() == pytest.approx(2.0)
-
-
-def test_factors_agree_with_those_of_joint_angles():
-    """The figures take factors from points; the library's from joint angles say the same."""
-    points = random_points(300)
-    points = points[reachable(points) & (np.abs(points[:, 1]) > 2e-3)]
-    slots = assembly_of(points)
-    theta = inverse_all(points).theta[:, ELBOWS_OUT.index]
-    for slot, assembly in enumerate(ASSEMBLY_MODES):
-        ours = factors_at(points[slots == slot], ELBOWS_OUT)
-        theirs = jacobian.factors(theta[slots == slot], assembly)
-        np.testing.assert_allclose(ours.parallel, theirs.parallel, atol=1e-8)
-        np.testing.assert_allclose(ours.serial, theirs.serial, atol=1e-8)
 
 
 @pytest.mark.parametrize("sign", [-1, 1])

@@ -7,6 +7,7 @@ from typing import Any
 
 import gantry  # noqa: F401  registers a machine
 import gymnasium as gym
+import kinematic  # noqa: F401  registers an engine
 import pytest
 from conformance import CHECKS, Make
 from episodes import EVERYTHING, OF_SERVOS
@@ -26,6 +27,10 @@ CASES: list[tuple[str, dict[str, Any]]] = [
     ("TPMPickAndPlace-v0", {"engine": "mujoco", "machine": "gantry"}),
     ("TPMReach-v0", {"drive": "servo"}),
     ("TPMPickAndPlaceJoints-v0", {"drive": "servo", "randomisation": EVERYTHING | OF_SERVOS}),
+    ("TPMReachJoints-v0", {"machine": "gantry"}),
+    ("TPMPickAndPlace-v0", {"machine": "gantry"}),
+    ("TPMReach-v0", {"engine": "kinematic"}),
+    ("TPMPickAndPlaceJoints-v0", {"engine": "kinematic"}),
 ]
 
 

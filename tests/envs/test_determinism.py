@@ -138,103 +138,72 @@ def test_saved_states_go_on_equally_on_their_way_in_contact_and_holding(
 
 STEPS, EPISODE = 14, 5
 ROWS = 2
+VECTORS: dict[str, tuple[Any, str, dict[str, Any]]] = {
+    "sync": (SyncVectorEnv, "TPMReachJoints-v0", {}),
+    "sync-random": (SyncVectorEnv, "TPMPickAndPlaceDense-v0", EVERYTHING),
+    "async-random": (
+        partial(AsyncVectorEnv, context="spawn"),
+        "TPMPickAndPlaceDense-v0",
+        EVERYTHING,
+    ),
+    "dummy": (DummyVecEnv, "TPMPickAndPlace-v0", EVERYTHING),
+    "sub": (partial(SubprocVecEnv, start_method="spawn"), "TPMPickAndPlace-v0", EVERYTHING),
+}
 
 
-def vector_actions(env_id: str) -> Any:
-    size = 4 if "Pick" in env_id else 3
-    actions = np.random.default_rng(9).uniform(-1, 1, (STEPS, ROWS, size))
-    return actions.astype(np.float32)
-
-
-def factories(env_id: str, randomisation: dict[str, Any]) -> list[Callable[[], gym.Env[Any, Any]]]:
-    return [partial(make, env_id, randomisation, max_episode_steps=EPISODE)] * ROWS
-
-
-def gymnasium_rows(env_id: str, randomisation: dict[str, Any]) -> list[list[Outcome]]:
-    """What the single environments give, each reset on the step after its end."""
-    rows = []
-    for index, factory in enumerate(factories(env_id, randomisation)):
+def single_rows(
+    factory: Callable[[], Any], actions: np.ndarray, of_sb3: bool
+) -> Iterator[list[Outcome]]:
+    """What single environments give; Stable-Baselines3 resets in the step of an episode's end."""
+    for index in range(ROWS):
         env, done = factory(), False
-        row: list[Outcome] = [(bits(env.reset(seed=40 + index)[0]),)]
-        for action in vector_actions(env_id)[:, index]:
-            if done:
-                observation, done = env.reset()[0], False
-                row.append((bits(observation), 0.0, False))
-                continue
-            observation, reward, terminated, done, _ = env.step(action)
-            assert not terminated
-            row.append((bits(observation), reward, done))
-        rows.append(row)
-        env.close()
-    return rows
+        observation, info = env.reset(seed=40 + index)
+        row: list[Outcome] = [(bits(observation),)]
+        for action in actions[:, index]:
+            if done and not of_sb3:
+                (observation, info), reward, done = env.reset(), 0.0, False
+            else:
+                observation, reward, terminated, done, info = env.step(action)
+                assert not terminated
+            last = bits(observation) if of_sb3 and done else None
+            if of_sb3 and done:
+                observation = env.reset()[0]
+            reward = np.float32(reward) if of_sb3 else reward
+            row.append((bits(observation), reward, done, last, info["conditioning"]))
+        yield row
 
 
 @pytest.mark.parametrize(
-    ("vectorise", "env_id", "randomisation"),
-    [
-        (SyncVectorEnv, "TPMReachJoints-v0", {}),
-        (SyncVectorEnv, "TPMPickAndPlaceDense-v0", EVERYTHING),
-        (partial(AsyncVectorEnv, context="spawn"), "TPMPickAndPlaceDense-v0", EVERYTHING),
-    ],
-    ids=["sync", "sync-random", "async-random"],
+    ("vectorise", "env_id", "randomisation"), VECTORS.values(), ids=VECTORS.keys()
 )
-def test_gymnasiums_vectors_give_the_rows_of_single_environments(
+def test_vectors_give_the_rows_of_single_environments(
     vectorise: Any, env_id: str, randomisation: dict[str, Any]
 ) -> None:
-    envs = vectorise(factories(env_id, randomisation))
-    observations = envs.reset(seed=[40, 41])[0]
-    found: list[list[Outcome]] = [
-        [({name: batch[row].tobytes() for name, batch in observations.items()},)]
-        for row in range(ROWS)
-    ]
-    for actions in vector_actions(env_id):
-        observations, rewards, _, truncations, _ = envs.step(actions)
+    factory = partial(make, env_id, randomisation, max_episode_steps=EPISODE)
+    envs = vectorise([factory] * ROWS)
+    of_sb3 = isinstance(envs, VecEnv)
+    if of_sb3:
+        envs.seed(40)
+    observations = envs.reset() if of_sb3 else envs.reset(seed=40)[0]
+    size = envs.action_space.shape[-1]
+    actions = np.random.default_rng(9).uniform(-1, 1, (STEPS, ROWS, size)).astype(np.float32)
+
+    def seen(row: int) -> dict[str, bytes]:
+        return {name: batch[row].tobytes() for name, batch in observations.items()}
+
+    found: list[list[Outcome]] = [[(seen(row),)] for row in range(ROWS)]
+    for action in actions:
+        if of_sb3:
+            observations, rewards, dones, infos = envs.step(action)
+            told = [info["conditioning"] for info in infos]
+            last = [bits(info.get("terminal_observation")) for info in infos]
+        else:
+            observations, rewards, _, dones, infos = envs.step(action)
+            told, last = infos["conditioning"], [None] * ROWS
         for row in range(ROWS):
-            seen = {name: batch[row].tobytes() for name, batch in observations.items()}
-            found[row].append((seen, rewards[row], truncations[row]))
+            found[row].append((seen(row), rewards[row], bool(dones[row]), last[row], told[row]))
     envs.close()
-    assert found == gymnasium_rows(env_id, randomisation)
-
-
-def sb3_rows(env_id: str, randomisation: dict[str, Any]) -> list[list[Outcome]]:
-    """What the single environments give, each reset in the step of its end."""
-    rows = []
-    for index, factory in enumerate(factories(env_id, randomisation)):
-        env = factory()
-        row: list[Outcome] = [(bits(env.reset(seed=40 + index)[0]),)]
-        for action in vector_actions(env_id)[:, index]:
-            observation, reward, _, done, info = env.step(action)
-            last = bits(observation) if done else None
-            if done:
-                observation = env.reset()[0]
-            row.append((bits(observation), np.float32(reward), done, last, info["conditioning"]))
-        rows.append(row)
-        env.close()
-    return rows
-
-
-@pytest.mark.parametrize(
-    "vectorise", [DummyVecEnv, partial(SubprocVecEnv, start_method="spawn")], ids=["dummy", "sub"]
-)
-def test_sb3s_vectors_give_the_rows_of_single_environments(
-    vectorise: Callable[..., VecEnv],
-) -> None:
-    env_id = "TPMPickAndPlace-v0"
-    envs = vectorise(factories(env_id, EVERYTHING))
-    envs.seed(40)
-    observations: Any = envs.reset()
-    found: list[list[Outcome]] = [
-        [({name: batch[row].tobytes() for name, batch in observations.items()},)]
-        for row in range(ROWS)
-    ]
-    for actions in vector_actions(env_id):
-        observations, rewards, dones, infos = envs.step(actions)
-        for row, info in enumerate(infos):
-            seen = {name: batch[row].tobytes() for name, batch in observations.items()}
-            last = bits(info["terminal_observation"]) if dones[row] else None
-            found[row].append((seen, rewards[row], bool(dones[row]), last, info["conditioning"]))
-    envs.close()
-    assert found == sb3_rows(env_id, EVERYTHING)
+    assert found == list(single_rows(factory, actions, of_sb3))
 
 
 # -- copied ----------------------------------------------------------------------------------------

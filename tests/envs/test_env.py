@@ -20,7 +20,7 @@ from tpm_gym.errors import ConfigurationError, InputError
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.tpm import PAPER_TPM, WIDE_TPM
 from tpm_gym.simulation.bullet.physics import Physics
-from tpm_gym.tasks import Expert, PickAndPlace, Reach, Task
+from tpm_gym.tasks import PickAndPlace, Reach, Task
 from tpm_gym.tasks.rewards import singularity_penalty
 from tpm_gym.tasks.sampling import APART
 
@@ -28,10 +28,8 @@ PUCK = PickAndPlace.puck
 
 
 @pytest.fixture
-def env() -> Iterator[TPMEnv]:
-    made = TPMEnv("pick_and_place")
-    yield made
-    made.close()
+def env() -> TPMEnv:
+    return TPMEnv("pick_and_place")
 
 
 # -- options ---------------------------------------------------------------------------------------
@@ -41,8 +39,6 @@ def env() -> Iterator[TPMEnv]:
     "options",
     [
         *({"penalty_weight": value} for value in (-1.0, np.nan, "much", 10**400, [1.0])),
-        {"randomisation": 0.1},
-        {"randomisation": {"encoder_jitter": 0.1}},
         *({"physics": value} for value in (5, {"gravity": 0}, Physics)),
         {"renderer": "raytracer"},
         *({"width": value} for value in (0, 15, 5000, 64.0, "64")),
@@ -78,7 +74,6 @@ def test_machines_are_taken_by_name_or_value(machine: Any) -> None:
     env.reset(seed=0)
     home = inner.machine.mount.to_world(inner.machine.home)
     np.testing.assert_allclose(inner.state.platform_position, home, atol=1e-4)
-    env.close()
 
 
 class Scaled(Reach):
@@ -98,10 +93,6 @@ def test_a_task_of_ones_own_goes_along_with_copies() -> None:
     assert other.task.tolerance == 0.05
     assert other.task is not env.task
     assert play(other, [np.full(3, 0.3)] * 5) == play(env, [np.full(3, 0.3)] * 5)
-    for one in (env, other):
-        one.close()
-    with pytest.raises(ConfigurationError, match="has its own"):
-        TPMEnv(task, reward="sparse")
 
 
 def test_human_mode_without_a_display_is_refused_instead_of_ending_the_process(
@@ -114,7 +105,6 @@ def test_human_mode_without_a_display_is_refused_instead_of_ending_the_process(
     env = TPMEnv()
     assert env.metadata["render_modes"] == ["rgb_array"]
     assert TPMEnv.metadata["render_modes"] == ["human", "rgb_array"]
-    env.close()
 
 
 def test_rgb_array_gives_pictures_of_the_asked_size() -> None:
@@ -124,7 +114,6 @@ def test_rgb_array_gives_pictures_of_the_asked_size() -> None:
     assert picture.shape == (64, 96, 3)
     assert picture.dtype == np.uint8
     assert picture.std() > 10
-    env.close()
 
 
 PHYSICS = Physics(time_step=1 / 500, erp=0.9)
@@ -144,23 +133,9 @@ def test_a_spec_with_physics_and_randomisation_survives_json(physics: Any) -> No
     again.reset()
     other.restore_state(snapshot)
     assert play(again.unwrapped, actions) == play(env.unwrapped, actions)
-    env.close()
-    again.close()
 
 
 # -- episodes --------------------------------------------------------------------------------------
-
-
-def test_options_place_the_object_and_the_goal(env: TPMEnv) -> None:
-    goal, place = (0.02, -0.03, 0.1), (-0.05, -0.025, 0.015)
-    observation, _ = env.reset(seed=0, options={"object": place, "goal": goal})
-    for found, wanted in (
-        (observation["desired_goal"], goal),
-        (env.goal, goal),
-        (observation["achieved_goal"], place),
-        (env.state.object_position[0], place),
-    ):
-        np.testing.assert_allclose(found, wanted, atol=1e-6)
 
 
 class Far(Reach):
@@ -188,74 +163,22 @@ def test_observations_are_clipped_into_their_space_and_else_exact(size: float) -
     np.testing.assert_array_equal(seen["observation"][inside], exact[inside].astype(np.float32))
     np.testing.assert_array_equal(seen["observation"][~inside], [10, -10])
     np.testing.assert_array_equal(seen["achieved_goal"][1:], [2, -2])
-    env.close()
-
-
-def drive_to_the_singular_side(env: TPMEnv) -> Any:
-    """Step towards small y until the command stops; the last step's results."""
-    env.reset(seed=3)
-    for _ in range(12):
-        result = env.step(np.array([0.5, -1.0, 0.0]))
-    return result
 
 
 def test_the_penalty_grows_towards_the_singularity_and_follows_the_weight() -> None:
     rewards = []
     for weight in (0.0, 1.0, 2.0):
         env = TPMEnv("reach", penalty_weight=weight)
-        _, reward, _, _, info = drive_to_the_singular_side(env)
+        env.reset(seed=3)
+        for _ in range(12):  # towards small y until the command stops
+            _, reward, _, _, info = env.step(np.array([0.5, -1.0, 0.0]))
         assert info["conditioning"] < 0.08
         assert info["singularity_penalty"] == singularity_penalty(info["conditioning"], 0.08)
         assert info["singularity_penalty"] > 0.1
         assert info["reward_terms"]["singularity"] == -weight * info["singularity_penalty"]
         rewards.append(reward)
-        env.close()
     assert rewards[0] - rewards[1] == pytest.approx(info["singularity_penalty"])
     assert rewards[0] - rewards[2] == pytest.approx(2 * info["singularity_penalty"])
-
-
-def test_hindsight_keeps_the_penalty_by_the_difference_of_goal_terms() -> None:
-    env = TPMEnv("reach")
-    observation, reward, _, _, info = drive_to_the_singular_side(env)
-    achieved, goal = observation["achieved_goal"], observation["desired_goal"]
-    for new_goal in (achieved, np.zeros(3)):
-        old, new = (env.compute_reward(achieved, g, {}) for g in (goal, new_goal))
-        assert reward - old + new == pytest.approx(env.compute_reward(achieved, new_goal, info))
-    env.close()
-
-
-@pytest.mark.parametrize("sideways", [(-1.0, -1.0), (1.0, 1.0), (1.0, -1.0), (0.0, 0.0)])
-def test_hammering_on_the_puck_at_full_speed_does_not_lose_the_mechanism(
-    env: TPMEnv, sideways: tuple[float, float]
-) -> None:
-    for offset in (-0.016, 0.0, 0.016):
-        options = {"object": (-0.04 + offset, -0.028, 0.015), "goal": (0.05, -0.03, 0.1)}
-        env.reset(seed=0, options=options)
-        for vertical in (1, 1, 1, 1, -1, -1, 1, 1, 1, -1, 1, 1):
-            down = np.array([0.0, 0.0, vertical, 0.0])
-            env.step(down)
-            info = env.step(down + (*sideways, 0.0, 0.0))[4]
-            assert info["closure_error"] < 0.15e-3
-
-
-def test_a_puck_that_is_thrown_is_lost(env: TPMEnv) -> None:
-    """The expert lifts it, swings at full speed and lets go; it slides on, out of reach."""
-    observation, info = env.reset(
-        seed=0, options={"object": (-0.18, -0.03, 0.015), "goal": (0.1, -0.03, 0.25)}
-    )
-    expert = Expert(env)
-    expert.reset(observation)
-    told = [info["object_lost"]]
-    for _ in range(50):
-        action = expert.act(observation)
-        if env.state.object_position[0, 0] > 0.03:
-            action[:] = (1.0, 0.0, 0.0, -1.0)
-        observation, _, _, _, info = env.step(action)
-        told.append(info["object_lost"])
-    assert env.state.object_position[0, 0] > 0.12 + PUCK.width / 2
-    assert told == sorted(told)
-    assert told[0] is False
-    assert told[-1] is True
 
 
 @pytest.mark.parametrize("x", [0.2, 0.6], ids=["on the table", "beside it"])
@@ -280,10 +203,8 @@ def test_info_tells_the_machine_that_was_drawn() -> None:
     assert first["puck_mass"] != 1
     assert len(first["link_masses"]) == len(env.machine.mechanism.links) - 1
     assert "randomisation" not in env.step(np.zeros(4))[4]
-    env.close()
     nominal = TPMEnv()
     assert "randomisation" not in nominal.reset(seed=0)[1]
-    nominal.close()
 
 
 # -- snapshots -------------------------------------------------------------------------------------
@@ -326,7 +247,6 @@ def test_a_changed_snapshot_raises_and_touches_nothing() -> None:
     env.step(np.zeros(4))
     env.restore_state(snapshot)
     assert env.state.held == 0
-    env.close()
 
 
 def test_a_snapshot_of_another_kind_of_environment_is_refused(env: TPMEnv) -> None:
@@ -342,7 +262,6 @@ def test_a_snapshot_of_another_kind_of_environment_is_refused(env: TPMEnv) -> No
         other.reset(seed=0)
         with pytest.raises(InputError, match="of the same task and options"):
             env.restore_state(other.save_state())
-        other.close()
     env.step(np.zeros(4))
 
 
@@ -379,7 +298,6 @@ def test_the_datasheet_lists_all_of_info_and_every_option() -> None:
     env = TPMEnv(randomisation=EVERYTHING)
     info = text[text.index("## Info") : text.index("Args:")]
     assert re.findall(r"^\| ``(\w+)`` \|", info, re.M) == list(env.reset(seed=0)[1])
-    env.close()
     options = list(inspect.signature(TPMEnv).parameters)
     assert (
         re.findall(r"^    (\w+): ", text[text.index("Args:") : text.index("Raises:")], re.M)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from typing import Any
+from unittest.mock import patch
 
 import gymnasium as gym
 import pytest
@@ -20,11 +21,8 @@ from tpm_gym.tasks.registry import TASKS
 @pytest.fixture
 def registries() -> Iterator[None]:
     """What a test registers is forgotten after it."""
-    ids, tasks = dict(gym.registry), dict(TASKS)
-    yield
-    for registry, before in ((gym.registry, ids), (TASKS, tasks)):
-        registry.clear()
-        registry.update(before)
+    with patch.dict(gym.registry), patch.dict(TASKS):
+        yield
 
 
 class Lift(PickAndPlace):
@@ -52,7 +50,6 @@ def test_an_id_means_what_it_says(env_id: str) -> None:
     assert env.action_space.shape == ((4,) if "Pick" in env_id else (3,))
     assert env.spec.max_episode_steps == MAX_EPISODE_STEPS == 50
     assert env.metadata["render_fps"] == 25
-    env.close()
 
 
 @pytest.mark.usefixtures("registries")
@@ -64,8 +61,7 @@ def test_a_users_task_gets_four_ids_and_a_name() -> None:
     env = gym.make(ids[-1], machine="wide")
     assert type(env.unwrapped.task) is Lift
     assert env.spec.max_episode_steps == 7
-    env.close()
-    TPMEnv("lift").close()
+    TPMEnv("lift")
 
 
 @pytest.mark.usefixtures("registries")
@@ -79,7 +75,6 @@ def test_registering_twice_is_harmless_and_a_class_defined_anew_replaces_its_for
     register_task("Lift", anew)
     env = gym.make("TPMLift-v0")
     assert type(env.unwrapped.task) is anew
-    env.close()
 
 
 @pytest.mark.parametrize(
@@ -93,7 +88,6 @@ def test_registering_twice_is_harmless_and_a_class_defined_anew_replaces_its_for
         ("Lift", Lift(tpm_gym.mechanism.tpm.PAPER_TPM), {}, "task"),
         ("Lift", dict, {}, "task"),
     ],
-    ids=str,
 )
 @pytest.mark.usefixtures("registries")
 def test_what_cannot_be_registered_is_refused_and_leaves_nothing(

@@ -26,7 +26,6 @@ def test_a_block_makes_an_environment_that_its_expert_solves(code):
             *_, (_, reward, info) = expert_episode(env, seed)
             assert info["is_success"]
             assert sum(info["reward_terms"].values()) == pytest.approx(reward)
-        env.close()
 
 
 def test_the_table_counts_lines_as_they_are():

@@ -1,32 +1,11 @@
 """An engine that was written outside the package, and engines that are refused."""
 
-import gymnasium as gym
 import pytest
-from conformance import CHECKS
-from episodes import expert_episode
 from kinematic import KinematicEngine
 
 import tpm_gym
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.simulation import Engine, Servo
-
-
-@pytest.fixture(params=["TPMReach-v0", "TPMPickAndPlaceJoints-v0"])
-def env(request):
-    env = gym.make(request.param, engine="kinematic")
-    yield env
-    env.close()
-
-
-@pytest.mark.parametrize("env_id", ["TPMReach-v0", "TPMPickAndPlaceJoints-v0"])
-@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
-def test_the_tasks_conform_on_it(check, env_id):
-    check(lambda: gym.make(env_id, engine="kinematic"))
-
-
-def test_the_expert_solves_the_tasks_on_it(env):
-    episodes = [list(expert_episode(env, seed)) for seed in range(20)]
-    assert [episode[-1][2]["is_success"] for episode in episodes] == [True] * 20
 
 
 @pytest.mark.parametrize(
@@ -44,7 +23,6 @@ def test_what_it_cannot_randomise_it_refuses_by_name():
     env = tpm_gym.TPMEnv(engine="kinematic", randomisation={"link_mass": (0.9, 1.1)})
     with pytest.raises(ConfigurationError, match="randomisation"):
         env.reset(seed=0)
-    env.close()
 
 
 class Derived(Engine):

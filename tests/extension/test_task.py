@@ -28,9 +28,7 @@ def stacking():
 
 @pytest.fixture
 def env():
-    env = gym.make("TPMStackDense-v0", render_mode="rgb_array")
-    yield env
-    env.close()
+    return gym.make("TPMStackDense-v0", render_mode="rgb_array")
 
 
 @pytest.mark.parametrize("env_id", ["TPMStack-v0", "TPMStackJointsDense-v0"])
@@ -51,7 +49,6 @@ def test_its_expert_stacks(env_id, machine):
         red, blue = np.split(observation["achieved_goal"], 2)
         assert np.allclose(blue - red, [0.0, 0.0, 0.033], atol=0.004) or not info["is_success"]
         solved += info["is_success"]
-    env.close()
     assert solved == 20
 
 
@@ -71,7 +68,11 @@ def test_the_worse_placed_block_decides(env):
 
 def test_users_place_the_blocks_by_name(env):
     red, blue = (0.05, -0.03, 0.015), (-0.05, -0.03, 0.018)
-    env.reset(options={"red": red, "blue": blue})
+    goal = (0.0, -0.03, 0.015, 0.0, -0.03, 0.048)
+    observation, _ = env.reset(options={"red": red, "blue": blue, "goal": goal})
+    assert np.allclose(observation["desired_goal"], goal, atol=1e-6)
+    assert np.allclose(env.unwrapped.goal, goal, atol=1e-6)
+    assert np.allclose(observation["achieved_goal"], [*red, *blue], atol=1e-6)
     assert np.allclose(env.unwrapped.state.object_position, [red, blue], atol=1e-6)
     with pytest.raises(ResetOptionError, match="clear of blue"):
         env.reset(options={"red": red, "blue": (0.06, -0.03, 0.018)})
@@ -126,4 +127,3 @@ def test_where_there_is_no_room_sampling_says_so(stacking):
     env = tpm_gym.TPMEnv(Crowd)
     with pytest.raises(ConfigurationError, match="a larger one: what is drawn lies"):
         env.reset(seed=0)
-    env.close()

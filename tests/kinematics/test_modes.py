@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import FrozenInstanceError, fields
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -46,13 +46,6 @@ def test_anything_but_signs_is_refused(bad: Any) -> None:
             assert caught.value.name == kind.__name__
 
 
-@pytest.mark.parametrize("mode", [DEFAULT_ASSEMBLY, ELBOWS_OUT])
-def test_modes_are_frozen(mode: AssemblyMode | WorkingMode) -> None:
-    for field in fields(mode):
-        with pytest.raises(FrozenInstanceError):
-            setattr(mode, field.name, 1)
-
-
 def elbow_distances(mode: WorkingMode) -> np.ndarray:
     """Distance of each elbow B_i from the z axis, less that of its pivot A_i."""
     theta = kinematics.inverse(CENTRE, mode)
@@ -79,5 +72,7 @@ def test_the_default_assembly_holds_the_platform_beyond_the_elbows_at_positive_y
 
 
 def test_kinematics_offers_the_names_of_branches() -> None:
-    for name in branches.__all__:
-        assert getattr(kinematics, name) is getattr(branches, name)
+    for name, value in vars(branches).items():
+        made_there = getattr(value, "__module__", "") == branches.__name__
+        if (made_there or name.endswith("_MODES")) and not name.startswith("_"):
+            assert getattr(kinematics, name) is value

@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 import oracle
 import pytest
+from examples import examples
+from hypothesis import example
 
-from tpm_gym.kinematics import ASSEMBLY_MODES, forward_all, inverse_all, jacobian
-from tpm_gym.kinematics.geometry import PAPER
+from tpm_gym.kinematics import ASSEMBLY_MODES, forward_all, jacobian
+from tpm_gym.kinematics.geometry import PAPER, Geometry
 
 sp = pytest.importorskip("sympy")
 
@@ -144,34 +146,33 @@ def test_determinants_of_a_and_b_are_products_of_the_factors() -> None:
     assert_zero(b.det() - cos * product(SERIAL))
 
 
-def test_the_code_returns_these_factors_a_and_b() -> None:
-    arguments = (*THETA, x_c, z_c, beta)
-    values = dict(zip(LENGTHS, vars(PAPER).values(), strict=True))
-    symbolic = {
-        name: sp.lambdify(arguments, [f.subs(values) for f in factors], "numpy")
-        for name, factors in (("parallel", PARALLEL), ("serial", SERIAL))
-    }
-    solutions = inverse_all(oracle.reachable_points(np.random.default_rng(0), 300, PAPER))
-    angles = solutions.theta[solutions.valid]
+SYMBOLIC = {
+    name: sp.lambdify((*LENGTHS, *THETA, x_c, z_c, beta), factors, "numpy")
+    for name, factors in (("parallel", PARALLEL), ("serial", SERIAL))
+}
+
+
+@examples(25, oracle.geometries(), oracle.seeds())
+@example(PAPER, 1)
+def test_the_code_returns_these_factors_a_and_b(g: Geometry, seed: int) -> None:
     for branch in ASSEMBLY_MODES:
-        forward = forward_all(angles)
-        real = forward.valid[:, branch.index]
-        theta = angles[real]
-        x, z = forward.link3[real, branch.index].T
-        turned = forward.beta[real, branch.index]
-        assert len(theta) > 100
-        found = jacobian.factors(theta, branch)
+        theta = oracle.angles_on(branch, np.random.default_rng(seed), 100, g)
+        assert len(theta) > 100 or g != PAPER
+        forward = forward_all(theta, g)
+        x, z = forward.link3[:, branch.index].T
+        turned = forward.beta[:, branch.index]
         expected = {
-            name: np.stack(np.broadcast_arrays(*f(*theta.T, x, z, turned)), axis=-1)
-            for name, f in symbolic.items()
+            name: np.stack(np.broadcast_arrays(*f(*vars(g).values(), *theta.T, x, z, turned)), -1)
+            for name, f in SYMBOLIC.items()
         }
-        np.testing.assert_allclose(found.parallel, expected["parallel"], rtol=0, atol=1e-13)
-        np.testing.assert_allclose(found.serial, expected["serial"], rtol=0, atol=1e-13)
-        cos = np.cos(turned)
-        det_a = np.linalg.det(jacobian.parallel(theta, branch))
-        det_b = np.linalg.det(jacobian.serial(theta, branch))
-        np.testing.assert_allclose(det_a, -cos * expected["parallel"].prod(axis=-1), atol=1e-14)
-        np.testing.assert_allclose(det_b, cos * expected["serial"].prod(axis=-1), atol=1e-14)
+        found = jacobian.factors(theta, branch, g)
+        np.testing.assert_allclose(found.parallel, expected["parallel"], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(found.serial, expected["serial"], rtol=0, atol=1e-12)
+        det_a = np.linalg.det(jacobian.parallel(theta, branch, g))
+        det_b = np.linalg.det(jacobian.serial(theta, branch, g))
+        products = [expected[name].prod(axis=-1) for name in ("parallel", "serial")]
+        np.testing.assert_allclose(det_a, -np.cos(turned) * products[0], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(det_b, np.cos(turned) * products[1], rtol=0, atol=1e-12)
 
 
 def test_text_under_eq_7_what_keeps_a1_b1_c1_from_vanishing_together_is_l5() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import oracle
 import pytest
-from hypothesis import given, settings
+from examples import examples
 from hypothesis import strategies as st
 
 from tpm_gym.errors import ConfigurationError
@@ -88,8 +88,7 @@ def test_conditioning_is_zero_where_a_branch_does_not_exist() -> None:
     assert mirrored > 0.1
 
 
-@settings(derandomize=True, max_examples=200)
-@given(triples, triples)
+@examples(200, triples, triples)
 def test_projection_is_inside_idempotent_and_nearest(
     point: tuple[float, ...], other: tuple[float, ...]
 ) -> None:
@@ -103,8 +102,7 @@ def test_projection_is_inside_idempotent_and_nearest(
         assert region.contains(point) == (distance == 0)
 
 
-@settings(derandomize=True, max_examples=200)
-@given(triples)
+@examples(200, triples)
 def test_margin_is_negative_outside_and_the_distance_to_the_faces_inside(
     point: tuple[float, ...],
 ) -> None:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
-import os
+import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import gymnasium as gym
 import pytest
-from trainings import SAC_RECIPE, tpm_gym_command
+from trainings import SAC_RECIPE
 
+from tpm_gym.learning.command_line import main
 from tpm_gym.learning.environments import check_env_id, make_env
 from tpm_gym.learning.errors import ConfigError
 
@@ -25,23 +27,32 @@ gym.register(
 """
 
 
-def run(folder: Path, *words: str) -> None:
-    """Run a command in a folder, from which Python imports."""
-    done = tpm_gym_command(*words, cwd=folder, env={**os.environ, "OMP_NUM_THREADS": "1"})
-    assert done.returncode == 0, done.stderr
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Runs a command in a folder from which Python imports, and which it has not imported yet."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def run_anew(*words: str) -> None:
+        sys.modules.pop("my_tasks", None)
+        gym.registry.pop("MyReach-v0", None)
+        main(words)
+
+    return run_anew
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_an_id_of_a_users_module_is_trained_in_workers_resumed_and_evaluated(
-    tmp_path: Path,
+    tmp_path: Path, run: Callable[..., None]
 ) -> None:
     (tmp_path / "my_tasks.py").write_text(MODULE)
     (tmp_path / "sac.yml").write_text(SAC_RECIPE.format(env="MyReach-v0", train_freq=5))
     words = ["--env", "my_tasks:MyReach-v0", "--recipe", "sac.yml", "--envs", "2"]
     words += ["--steps", "120", "--eval-episodes", "1"]
-    run(tmp_path, "train", *words)
+    run("train", *words)
     folder = "runs/MyReach-v0-sac-s0"
-    run(tmp_path, "resume", folder, "--steps", "160")
-    run(tmp_path, "evaluate", "--policy", folder, "expert", "--episodes", "1", "--json", "out.json")
+    run("resume", folder, "--steps", "160")
+    run("evaluate", "--policy", folder, "expert", "--episodes", "1", "--json", "out.json")
     content = json.loads((tmp_path / "out.json").read_text())
     assert content["env"] == "my_tasks:MyReach-v0"
     assert [policy["records"][0]["length"] for policy in content["policies"]] == [20, 20]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import pickle
-import re
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +11,13 @@ import gymnasium as gym
 import imageio.v3 as imageio
 import numpy as np
 import pytest
-from trainings import python, quiet, tpm_gym_command
+from paths import read_strict
+from processes import PYTHON, TPM_GYM, error_of, printed_by
+from trainings import quiet, said
 
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.learning import EvaluationConfig, evaluate, evaluation, film, provenance
 from tpm_gym.learning.errors import ConfigError, PolicyError
-from tpm_gym.learning.policies import load_policy
 
 METRICS = (
     "success_at_end",
@@ -29,19 +29,6 @@ METRICS = (
     "unsafe_share",
     "fk_error_max",
 )
-STRAYS = 3
-"""Seed of an episode in which random actions stray into the unsafe region."""
-
-
-def read_strict(path: Path) -> dict[str, Any]:
-    """Read JSON as a strict reader does: NaN and infinities are errors."""
-
-    def refuse(constant: str) -> None:
-        raise AssertionError(f"{constant} is not JSON")
-
-    content = json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse)
-    assert isinstance(content, dict)
-    return content
 
 
 @pytest.fixture(scope="module")
@@ -49,9 +36,8 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], s
     """Return the JSON and the output of the command line, run on one policy."""
     path = tmp_path_factory.mktemp("evaluate") / "deep" / "er" / "expert.json"
     options = f"--policy expert --env TPMReach-v0 --episodes 4 --seed 7 --json {path}".split()
-    done = tpm_gym_command("evaluate", *options)
-    assert done.returncode == 0, done.stderr
-    return read_strict(path), done.stdout
+    output = printed_by(*TPM_GYM, "evaluate", *options)
+    return read_strict(path), output
 
 
 def test_one_policy_has_its_metrics_at_the_top(written: tuple[dict[str, Any], str]) -> None:
@@ -93,18 +79,6 @@ def test_table_shows_means_and_intervals(written: tuple[dict[str, Any], str]) ->
         assert shown in output
 
 
-def test_scripted_policies_do_not_load_torch(tmp_path: Path) -> None:
-    program = (
-        "import sys; from tpm_gym.learning import EvaluationConfig, evaluate\n"
-        "config = EvaluationConfig(policy=('expert', 'random'), env='TPMReach-v0', episodes=1)\n"
-        "evaluate(config)\n"
-        "loaded = {'torch', 'stable_baselines3'} & set(sys.modules)\n"
-        "sys.exit(f'loaded {loaded}' if loaded else 0)\n"
-    )
-    done = python("-c", program)
-    assert done.returncode == 0, done.stderr
-
-
 def test_several_policies_share_a_table_and_a_file(tmp_path: Path) -> None:
     path = tmp_path / "both.json"
     config = EvaluationConfig(
@@ -117,7 +91,7 @@ def test_several_policies_share_a_table_and_a_file(tmp_path: Path) -> None:
     assert content["policies"][1]["return"]["mean"] == results[1].metrics["return"].mean
     assert "return" not in content
     assert content["seed"] == 3
-    header = console.file.getvalue().splitlines()[2]  # type: ignore[attr-defined]
+    header = said(console).splitlines()[2]
     assert "random" in header
     assert "expert" in header
 
@@ -202,12 +176,6 @@ def test_mistakes_are_named(options: dict[str, Any], error: type[Exception], mes
         evaluate(EvaluationConfig(**{**usual, **options}), quiet())
 
 
-def records_of(spec: str = "random", **options: Any) -> list[Any]:
-    """Return the records of a few episodes, by default the random policy's on Reach."""
-    config = EvaluationConfig(policy=(spec,), **{"env": "TPMReach-v0", "episodes": 2} | options)
-    return evaluate(config, quiet())[0].records
-
-
 def test_conditions_are_recorded_and_the_defaults_are_the_nominal_machine(
     written: tuple[dict[str, Any], str], tmp_path: Path
 ) -> None:
@@ -218,8 +186,7 @@ def test_conditions_are_recorded_and_the_defaults_are_the_nominal_machine(
     words = ["--policy", "random", "--env", "TPMReach-v0", "--episodes", "1", "--json", str(path)]
     words += ["--randomisation", "encoder_noise=1e-4", "friction=0.5:1", "latency=1"]
     words += ["--penalty-weight", "0.5", "--goals", "tempting"]
-    done = tpm_gym_command("evaluate", *words)
-    assert done.returncode == 0, done.stderr
+    printed_by(*TPM_GYM, "evaluate", *words)
     content = read_strict(path)
     assert content["randomisation"] == {
         "encoder_noise": 1e-4,
@@ -242,42 +209,6 @@ def test_the_environment_is_the_one_that_was_asked_for() -> None:
     assert not np.array_equal(*goals)
     env.close()
     plain.close()
-
-
-def test_encoder_noise_shows_in_the_observed_position() -> None:
-    nominal, noisy = records_of(), records_of(randomisation=("encoder_noise=5e-4",))
-    assert max(record.fk_error_max for record in nominal) < 1e-3
-    assert all(
-        noise.fk_error_max > 2 * none.fk_error_max
-        for noise, none in zip(noisy, nominal, strict=True)
-    )
-
-
-def test_the_return_has_the_penalty_in_it_with_its_weight() -> None:
-    once, twice, free = (
-        records_of(penalty_weight=weight, seed=STRAYS, episodes=1)[0] for weight in (1.0, 2.0, 0.0)
-    )
-    assert once.unsafe_share == free.unsafe_share > 0
-    penalty = free.total_reward - once.total_reward
-    assert penalty > 0
-    assert free.total_reward - twice.total_reward == pytest.approx(2 * penalty)
-
-
-def test_per_step_figures_are_those_of_the_steps() -> None:
-    env: Any = gym.make("TPMReach-v0")
-    policy = load_policy("random", env)
-    observation, _ = env.reset(seed=STRAYS)
-    policy.reset(observation, STRAYS)
-    unsafe, gaps, done = [], [], False
-    while not done:
-        observation, _, _, done, info = env.step(policy.act(observation))
-        unsafe.append(info["conditioning"] < 0.08)
-        state = env.unwrapped.state
-        gaps.append(np.linalg.norm(state.fk_position - state.platform_position))
-    env.close()
-    (record,) = records_of(episodes=1, seed=STRAYS)
-    assert 0 < record.unsafe_share == np.mean(unsafe) < 1
-    assert record.fk_error_max == pytest.approx(max(gaps), rel=1e-12)
 
 
 @pytest.fixture(scope="module")
@@ -331,42 +262,32 @@ def test_an_archive_is_not_unpickled_unless_it_is_trusted(
     assert returns(tmp_path, trust_pickle=True)
 
 
-def test_an_exported_policy_of_another_task_is_refused(run: Path) -> None:
+def test_an_exported_policy_that_is_of_another_task_or_damaged_is_refused(
+    run: Path, tmp_path: Path
+) -> None:
     with pytest.raises(PolicyError, match=r"was trained with observation space .*TPMReach-v0"):
         returns(run / "best.json", env="TPMPickAndPlace-v0")
-
-
-def test_a_damaged_policy_is_one_line(run: Path, tmp_path: Path) -> None:
     (tmp_path / "best.json").write_bytes((run / "best.json").read_bytes())
-    (tmp_path / "best.safetensors").write_bytes((run / "best.safetensors").read_bytes()[:-1])
-    done = tpm_gym_command("evaluate", "--policy", tmp_path / "best")
-    assert done.returncode == 1
-    assert "Traceback" not in done.stderr
-    last = done.stderr.splitlines()[-1]  # the engine has introduced itself before
-    assert last.startswith("error: policy ")
-    assert re.search(r"damaged: \d+ of \d+ bytes", last)
-    env = gym.make("TPMReach-v0")
-    with pytest.raises(PolicyError, match="describes no policy"):
-        load_policy(str(run / "config.json"), env)
-    env.close()
+    (tmp_path / "best.safetensors").write_bytes(b"")
+    with pytest.raises(PolicyError, match=r"damaged: 0 of \d+ bytes"):
+        returns(tmp_path)
 
 
-def test_an_exported_policy_needs_no_stable_baselines(run: Path) -> None:
+def test_scripted_policies_load_no_torch_and_exported_ones_no_stable_baselines(run: Path) -> None:
     program = (
-        "import sys\n"
-        "sys.modules['stable_baselines3'] = sys.modules['sb3_contrib'] = None\n"
+        "import sys; sys.modules['stable_baselines3'] = sys.modules['sb3_contrib'] = None\n"
         "from tpm_gym.learning import EvaluationConfig, evaluate\n"
+        "evaluate(EvaluationConfig(policy=('expert', 'random'), env='TPMReach-v0', episodes=1))\n"
+        "assert 'torch' not in sys.modules\n"
         f"evaluate(EvaluationConfig(policy=({str(run / 'best')!r},), episodes=1))\n"
     )
-    done = python("-c", program)
-    assert done.returncode == 0, done.stderr
+    printed_by(PYTHON, "-c", program)
 
 
 def test_command_line_errors_are_one_line() -> None:
-    done = tpm_gym_command("evaluate", "--policy", "expert", "--env", "Nope-v0")
-    assert done.returncode == 1
-    assert done.stderr.startswith("error: unknown environment 'Nope-v0'")
-    assert len(done.stderr.splitlines()) == 1
+    error = error_of(*TPM_GYM, "evaluate", "--policy", "expert", "--env", "Nope-v0")
+    assert error.startswith("error: unknown environment 'Nope-v0'")
+    assert len(error.splitlines()) == 1
 
 
 def test_files_are_written_whole_or_not_at_all(tmp_path: Path) -> None:

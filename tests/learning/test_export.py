@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from processes import TPM_GYM, error_of
 from sb3_contrib import TQC
 from stable_baselines3 import DDPG, PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
-from trainings import tpm_gym_command
 
 import tpm_gym
 from tpm_gym.learning import GoalGapExtractor, PenaltyHerReplayBuffer, export
@@ -184,15 +184,6 @@ def test_exporting_leaves_the_model_as_it_was(tmp_path: Path, model: Any) -> Non
         assert torch.equal(value, weights[name])
 
 
-def test_a_model_fresh_from_an_update_is_exported(tmp_path: Path) -> None:
-    model = make(PPO, Blank(), net_arch=[4])
-    batch, _ = model.policy.obs_to_tensor(observations(Blank(), 3))
-    actions, _, _ = model.policy(batch)
-    model.policy.evaluate_actions(batch, actions)
-    save(model, tmp_path / "fresh")
-    assert tpm_gym.load_policy(tmp_path / "fresh").description.algorithm == "ppo"
-
-
 def test_stable_baselines_evaluates_an_exported_policy(tmp_path: Path, model: Any) -> None:
     loaded: Any = tpm_gym.load_policy(save(model, tmp_path / "p"))
     mean, _ = evaluate_policy(loaded, DummyVecEnv([Blank]), n_eval_episodes=2, warn=False)
@@ -304,10 +295,9 @@ def test_the_command_line_does_not_touch_what_is_not_trusted(run: Path) -> None:
     """In a process of its own, with a file that would leave a trace if it were unpickled."""
     trace = run / "trace"
     (run / "best.zip").write_bytes(pickle.dumps(Trace(str(trace))))
-    done = tpm_gym_command("export", run / "best.zip", run / "out")
-    assert done.returncode == 1
-    assert done.stderr.startswith("error: ")
-    assert "--trust-pickle" in done.stderr
+    error = error_of(*TPM_GYM, "export", run / "best.zip", run / "out")
+    assert error.startswith("error: ")
+    assert "--trust-pickle" in error
     assert not trace.exists()
     assert not (run / "out.json").exists()
 

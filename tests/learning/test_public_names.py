@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 import pytest
-from trainings import python
+from processes import PYTHON, printed_by
 
 from tpm_gym import TPMError, learning
 from tpm_gym.learning import errors
 from tpm_gym.learning.command_line import main
-
-
-def succeeds(program: str) -> None:
-    done = python("-c", program)
-    assert done.returncode == 0, done.stderr
 
 
 def test_every_name_is_there_and_unknown_ones_are_not() -> None:
@@ -25,16 +20,18 @@ def test_every_name_is_there_and_unknown_ones_are_not() -> None:
 def test_neither_the_package_nor_the_help_imports_torch() -> None:
     heavy = "{'torch', 'stable_baselines3', 'matplotlib', 'pybullet'} & set(sys.modules)"
     for module in ("tpm_gym.learning", "tpm_gym.learning.command_line"):
-        succeeds(f"import sys, {module}; sys.exit(str({heavy}) if {heavy} else 0)")
+        printed_by(PYTHON, "-c", f"import sys, {module}; sys.exit(str({heavy}) if {heavy} else 0)")
 
 
 def test_what_is_not_installed_is_named_with_the_extra_that_installs_it() -> None:
-    succeeds(
+    printed_by(
+        PYTHON,
+        "-c",
         "import sys; sys.modules['stable_baselines3'] = None\n"
         "import tpm_gym.learning, tpm_gym.errors\n"
         "try: tpm_gym.learning.PenaltyHerReplayBuffer\n"
         "except tpm_gym.errors.MissingPackageError as error: assert '[train]' in str(error)\n"
-        "else: sys.exit('imported')\n"
+        "else: sys.exit('imported')\n",
     )
 
 

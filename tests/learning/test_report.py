@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 import scipy.stats
 from paths import ROOT
-from trainings import SAC_RECIPE, quiet, signalled
+from processes import TPM_GYM, signalled
+from trainings import SAC_RECIPE
 
-from tpm_gym.learning import EvaluationConfig, TrainingConfig, evaluate, study, train
+from tpm_gym.learning import study
 from tpm_gym.learning.command_line import main
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.estimates import interquartile_mean, median_time, settled
@@ -31,7 +32,6 @@ from tpm_gym.learning.report.records import (
     condense,
     write,
 )
-from tpm_gym.learning.run_folder import TESTS
 
 # -- statistics -------------------------------------------------------------------------------
 
@@ -41,16 +41,6 @@ def test_interquartile_mean_is_that_of_scipy(count: int) -> None:
     scores = np.random.default_rng(count).random(count)
     found = interquartile_mean(scores.tolist()).mean
     assert found == pytest.approx(scipy.stats.trim_mean(scores, 0.25))
-
-
-def test_interval_of_three_scores_is_that_of_all_resamples() -> None:
-    """Of three scores nothing is trimmed, and all 27 resamples can be listed."""
-    scores = [0.0, 0.3, 0.9]
-    means = sorted(sum(drawn) / 3 for drawn in itertools.product(scores, repeat=3))
-    found = interquartile_mean(scores, samples=200_000)
-    # One resample in 27 (3.7%) is all of the lowest, so that is the 2.5% quantile; likewise above.
-    assert (found.mean, found.low, found.high) == pytest.approx((0.4, means[0], means[-1]))
-    assert interquartile_mean(scores) == interquartile_mean(scores)
 
 
 @pytest.mark.parametrize(
@@ -77,17 +67,15 @@ def test_a_run_that_never_learned_is_later_than_any_other() -> None:
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A tiny real run, tested in three ways."""
+    """A tiny real run, trained and tested as a study does."""
     folder = tmp_path_factory.mktemp("study")
     recipe = folder / "sac.yml"
     recipe.write_text(SAC_RECIPE.format(env="TPMReach-v0", train_freq=20), encoding="utf-8")
-    run = folder / "TPMReach-v0-sac-s0"
-    config = TrainingConfig(recipe_file=recipe, run=run, steps=120, eval_every=60, eval_episodes=2)
-    assert train(config, quiet()) is None
-    for name, changes in {"nominal": (), "encoder_noise": ("encoder_noise=1e-4",)}.items():
-        path = run / TESTS / f"{name}.json"
-        test = EvaluationConfig(policy=(str(run),), episodes=2, json=path, randomisation=changes)
-        evaluate(test, quiet())
+    words = ("--recipe", str(recipe), "--steps", "120", "--eval-every", "60", "--eval-episodes")
+    tests = (("nominal", ()), ("encoder_noise", ("--randomisation", "encoder_noise=1e-4")))
+    run = study.Run(folder / "TPMReach-v0-sac-s0", "TPMReach-v0", "sac", (*words, "2"), tests)
+    assert study.execute(run, 2), run.folder.with_suffix(".log").read_text()
+    assert study.commands(run, 2) == []
     return folder
 
 
@@ -297,19 +285,7 @@ def test_what_is_done_is_skipped_and_what_was_stopped_goes_on(
     assert left() == [""]
 
 
-def test_a_run_is_trained_and_tested_and_one_that_fails_is_told(tmp_path: Path) -> None:
-    recipe = tmp_path / "small.yml"
-    recipe.write_text(SAC_RECIPE.format(env="TPMReach-v0", train_freq=20), encoding="utf-8")
-    options = ("--steps", "120", "--recipe", str(recipe), "--eval-episodes", "1")
-    goals = ("--goals", "tempting")
-    run = study.Run(
-        tmp_path / "runs" / "a", "TPMReach-v0", "sac", (*options, *goals), (("tempting", goals),)
-    )
-    assert study.execute(run, 1), (tmp_path / "runs" / "a.log").read_text()
-    record = condense(run.folder)
-    assert record["finished"]
-    assert record["goals"] == record["tests"]["tempting"]["goals"] == "tempting"
-    assert study.commands(run, 1) == []
+def test_a_training_that_fails_is_told(tmp_path: Path) -> None:
     failing = study.Run(tmp_path / "runs" / "b", "TPMReach-v0", "sac", ("--steps", "0"), ())
     assert not study.execute(failing, 1)
     assert "--steps 0" in (tmp_path / "runs" / "b.log").read_text()
@@ -318,7 +294,7 @@ def test_a_run_is_trained_and_tested_and_one_that_fails_is_told(tmp_path: Path) 
 def test_ctrl_c_stops_a_study_with_checkpoints_saved(tmp_path: Path) -> None:
     """As a terminal sends it: to the whole process group; a second signal would kill trainings."""
     words = ["--plan", "results", "--envs", "TPMReach-v0", "--algos", "sac", "--seeds", "1"]
-    words = ["-m", "tpm_gym.learning", "study", *words, "--folder", str(tmp_path)]
+    words = [*TPM_GYM, "study", *words, "--folder", str(tmp_path)]
     run = tmp_path / "TPMReach-v0-sac-s0"
     status, output = signalled(words, lambda: list(run.glob("checkpoints/0*")), signal.SIGINT)
     assert status == 1, output

@@ -155,14 +155,6 @@ def test_same_seeds_same_records(reach: GoalEnv, spec: str) -> None:
     assert len({record.total_reward for record in records}) > 1 or spec == "random"
 
 
-def test_expert_reaches_and_random_does_not(reach: GoalEnv) -> None:
-    expert, chance = (
-        run_episodes(reach, load_policy(spec, reach), 5, TEST_SEED) for spec in ("expert", "random")
-    )
-    assert sum(record.success_at_end for record in expert) == 5
-    assert sum(record.success_at_end for record in chance) < 3
-
-
 def test_random_actions_fill_the_action_space(reach: GoalEnv) -> None:
     policy = load_policy("random", reach)
     policy.reset({}, seed=0)
@@ -240,23 +232,7 @@ def test_unknown_policies_say_what_there_is(reach: GoalEnv, tmp_path: Path) -> N
         load_policy("exprt", reach)
     with pytest.raises(PolicyError, match=r"best\.zip or .*last\.zip"):
         load_policy(str(tmp_path), reach)
-
-
-def test_policy_without_its_run_is_refused(reach: GoalEnv, tmp_path: Path) -> None:
-    stray = tmp_path / "a" / "b" / "stray.zip"
-    stray.parent.mkdir(parents=True)
-    stray.write_bytes(b"")
-    with pytest.raises(PolicyError, match="trust-pickle"):
-        load_policy(str(stray), reach)
-    with pytest.raises(PolicyError, match=r"config\.json"):
-        load_policy(str(stray), reach, trust_pickle=True)
-    (stray.parent / "config.json").write_text('{"algo": "sac"}')
-    with pytest.raises(PolicyError, match=r"damaged|cannot be loaded as sac"):
-        load_policy(str(stray), reach, trust_pickle=True)
+    (tmp_path / "config.json").write_text('{"algo": "sac"}')
+    (tmp_path / "best.zip").touch()
     with pytest.raises(PolicyError, match="damaged"):
-        trained_env(str(stray))
-
-
-def test_scripted_policies_were_trained_nowhere() -> None:
-    assert trained_env("expert") is None
-    assert trained_env("random") is None
+        trained_env(str(tmp_path))

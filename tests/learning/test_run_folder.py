@@ -8,11 +8,12 @@ import os
 from pathlib import Path
 
 import pytest
+from trainings import Killed
 
 from tpm_gym.learning import TrainingConfig, train
 from tpm_gym.learning.checkpoint import CheckpointStore
 from tpm_gym.learning.errors import RunError
-from tpm_gym.learning.run_folder import claimed, description, disk_errors_named, prepare
+from tpm_gym.learning.run_folder import description, disk_errors_named, prepare
 
 OURS = {"algo": "sac", "env": "TPMReach-v0", "training_seeds": [0, 0]}
 
@@ -71,9 +72,6 @@ def test_what_a_first_moment_left_is_no_run(tmp_path: Path) -> None:
 def test_a_death_while_deleting_leaves_a_run_that_can_be_deleted(
     run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class Killed(BaseException):
-        pass
-
     delete = Path.unlink
 
     def unlink(path: Path, missing_ok: bool = False) -> None:
@@ -96,21 +94,14 @@ def test_only_what_a_run_writes_is_deleted_and_no_link_is_followed(
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "elsewhere" / "best.zip").write_text("")
     (run / "link").symlink_to(tmp_path / "elsewhere")
-    (run / "tests" / "mine.json").write_text("{}")
+    strangers = ["notes.md", "tests/mine.json", "tests/plot.pdf", "checkpoints/copy/weights.pt"]
+    for name in strangers:
+        (run / name).parent.mkdir(exist_ok=True)
+        (run / name).write_text("{}")
     prepare(run, overwrite=True)
-    assert names(run) == ["link", "tests"]
-    assert names(run / "tests") == ["mine.json"]
+    assert {str(path.relative_to(run)) for path in run.rglob("*.*")} == set(strangers)
+    assert names(run) == ["checkpoints", "link", "notes.md", "tests"]
     assert names(tmp_path / "elsewhere") == ["best.zip"]
-
-
-@pytest.mark.skipif(os.name == "nt", reason="there are no such locks")
-def test_a_run_in_use_is_not_deleted(run: Path) -> None:
-    before = names(run)
-    with claimed(run), pytest.raises(RunError, match="another process"):
-        prepare(run, overwrite=True)
-    assert names(run) == before
-    with claimed(run):
-        pass
 
 
 @pytest.mark.parametrize("number", [errno.EROFS, errno.EACCES, errno.ENOSPC])

@@ -14,14 +14,13 @@ import numpy as np
 import pytest
 import torch
 from paths import ROOT
+from processes import PYTHON, signalled
 from stable_baselines3 import SAC
 from trainings import (
     CASES,
     evaluations,
     make_config,
-    python,
     quiet,
-    signalled,
     table,
     uninterrupted,
 )
@@ -29,7 +28,6 @@ from trainings import (
 import tpm_gym
 from tpm_gym.learning import (
     EvaluationConfig,
-    GoalGapExtractor,
     ResumeConfig,
     TrainingConfig,
     evaluate,
@@ -144,14 +142,6 @@ def test_runs_from_before_these_options_go_on_with_their_defaults(run: Path) -> 
     assert (config.penalty_weight, config.goals) == (1.0, "sampled")
 
 
-def test_evaluations_are_before_during_and_after_training(run: Path) -> None:
-    assert [evaluation["steps"] for evaluation in evaluations(run)] == [0, 70, 140, 210, 280, 300]
-    for evaluation in evaluations(run):
-        assert evaluation["first_seed"] == SELECTION_SEED
-        success = evaluation["success_at_end"]
-        assert 0 <= success["low"] <= success["mean"] <= success["high"] <= 1
-
-
 def test_best_policy_is_the_one_evaluated_best(run: Path) -> None:
     scores = [
         (entry["success_at_end"]["mean"], entry["return"]["mean"]) for entry in evaluations(run)
@@ -191,20 +181,6 @@ def test_both_policies_are_exported_and_nothing_is_unpickled_for_it(run: Path) -
         assert exported.description.steps == saved.num_timesteps
 
 
-def test_resuming_runs_no_pickle(tmp_path: Path) -> None:
-    """In a process of its own, which unpickling a policy would end."""
-    train(replace(make_config("sac", tmp_path), steps=150), quiet())
-    script = (
-        "import sys; from pathlib import Path; from stable_baselines3 import SAC\n"
-        "from tpm_gym.learning import ResumeConfig, resume\n"
-        "SAC.load = lambda *a, **k: sys.exit('unpickled')\n"
-        f"resume(ResumeConfig(Path({str(tmp_path / 'run')!r}), steps=200))\n"
-    )
-    done = python("-c", script)
-    assert done.returncode == 0, done.stderr
-    assert tpm_gym.load_policy(tmp_path / "run" / "last").description.steps == 200
-
-
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_command_line_trains_ppo_in_parallel_and_stops_when_asked_to(
     tmp_path: Path, number: signal.Signals, status: int
@@ -214,9 +190,9 @@ def test_command_line_trains_ppo_in_parallel_and_stops_when_asked_to(
     folder = config.run
     words = ["--algo", "ppo", "--env", config.env, "--steps", "1000000", "--run", str(folder)]
     words += ["--recipe", str(config.recipe_file), "--checkpoint-every", "240"]
-    script = str(ROOT / "train" / "train.py")
     saved = folder / "checkpoints" / "000000240"
-    returned, output = signalled([script, *words, "--eval-episodes", "1"], saved.is_dir, number)
+    command = [PYTHON, ROOT / "train" / "train.py", *words, "--eval-episodes", "1"]
+    returned, output = signalled(command, saved.is_dir, number)
     assert returned == status, output
     assert "Traceback" not in output
     assert f"stopped early by {number.name}, saved at step" in output
@@ -286,19 +262,6 @@ def test_shipped_recipes_are_arguments_of_the_algorithm_and_relabel_sparse_rewar
     assert model.gamma == recipe.arguments["gamma"]
     assert model.policy_kwargs["net_arch"] == recipe.arguments["policy_kwargs"]["net_arch"]
     envs.close()
-
-
-def test_networks_see_the_gap_to_the_goal() -> None:
-    env = gym.make("TPMPickAndPlace-v0")
-    extractor = GoalGapExtractor(env.observation_space, unit=0.05)  # type: ignore[arg-type]
-    observation, _ = env.reset(seed=0)
-    batch = {name: torch.as_tensor(value)[None] for name, value in observation.items()}
-    batch["desired_goal"] = batch["achieved_goal"] + torch.tensor([[0.05, -0.01, 0.1]])
-    features = extractor(batch)
-    assert features.shape == (1, extractor.features_dim)
-    np.testing.assert_array_equal(features[0, :-3], observation["observation"])
-    np.testing.assert_allclose(features[0, -3:], [1.0, -0.2, 2.0], atol=1e-5)
-    env.close()
 
 
 @pytest.mark.parametrize(

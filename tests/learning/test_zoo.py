@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from trainings import python
+from processes import PYTHON, printed_by
 
 import tpm_gym
 from tpm_gym.learning.features import GoalGapExtractor
@@ -46,6 +46,5 @@ def test_the_zoo_runs_them(algorithm: str, env_id: str, steps: int, tmp_path: Pa
     words = ["--algo", algorithm, "--env", env_id, "--n-timesteps", str(steps)]
     words += ["--gym-packages", "tpm_gym", "--conf-file", "tpm_gym.learning.zoo"]
     words += ["--eval-freq", "-1", "--log-folder", str(tmp_path / "logs"), "--num-threads", "1"]
-    done = python("-m", "rl_zoo3.train", *words, cwd=tmp_path)
-    assert done.returncode == 0, done.stdout + done.stderr
+    printed_by(PYTHON, "-m", "rl_zoo3.train", *words, cwd=tmp_path)
     assert list((tmp_path / "logs" / algorithm).glob(f"{env_id}_1/*.zip"))

@@ -6,13 +6,12 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from tpm_gym.arrays import FloatArray
 from tpm_gym.mechanism.bodies import Link, Solid
 
-FloatArray = NDArray[np.float64]
 AXES = ("x", "y", "z")
 lengths = st.floats(0.005, 0.5)
 shares = st.one_of(st.just(0.0), st.floats(0.1, 0.95))
@@ -83,8 +82,7 @@ def cylinders(draw: st.DrawFn) -> Solid:
     )
 
 
-@settings(derandomize=True, max_examples=150)
-@given(st.one_of(boxes(), cylinders()))
+@examples(150, st.one_of(boxes(), cylinders()))
 def test_mass_and_inertia_of_solids_equal_an_integration(solid: Solid) -> None:
     at, mass = cloud(solid)
     assert solid.mass == pytest.approx(mass.sum(), rel=1e-9)
@@ -92,8 +90,7 @@ def test_mass_and_inertia_of_solids_equal_an_integration(solid: Solid) -> None:
     np.testing.assert_allclose(np.diag(solid.inertia), tensor, rtol=1e-9, atol=1e-9 * tensor.max())
 
 
-@settings(derandomize=True, max_examples=60)
-@given(st.lists(st.one_of(boxes(), cylinders()), min_size=1, max_size=4))
+@examples(60, st.lists(st.one_of(boxes(), cylinders()), min_size=1, max_size=4))
 def test_mass_properties_of_links_equal_an_integration(solids: list[Solid]) -> None:
     link = Link("link", tuple(solids))
     clouds = [cloud(solid) for solid in solids]

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
 from hypothesis import strategies as st
 from machines import anywhere, each_machine, within
 from walk import walk
@@ -19,13 +19,13 @@ from tpm_gym.kinematics import inverse
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism import PAPER_TPM, TPM, WIDE_TPM, Machine, find_machine, register_machine
+from tpm_gym.mechanism.tree import joint_angles
 
 share = st.floats(0.0, 1.0)
 
 
 @each_machine
-@settings(derandomize=True, max_examples=100)
-@given(st.tuples(share, share, share))
+@examples(100, st.tuples(share, share, share))
 def test_kinematics_agree_all_over_the_region(machine: TPM, shares: Vector) -> None:
     point = within(machine, shares)
     theta = machine.inverse(tuple(point.tolist()))
@@ -39,6 +39,7 @@ def test_kinematics_agree_all_over_the_region(machine: TPM, shares: Vector) -> N
     np.testing.assert_allclose(rows, jacobian, rtol=1e-5, atol=1e-5)
     assert conditioning == pytest.approx(1 / np.linalg.cond(rows), rel=1e-9)
     positions = machine.joint_positions(theta)
+    assert positions == joint_angles(theta, machine.assembly_mode, machine.geometry)
     assert tuple(positions[name] for name in machine.mechanism.actuated) == theta
 
 

@@ -25,7 +25,7 @@ def test_the_continuous_torque_loses_what_the_housing_gives_off_in_still_air() -
     lost = (TORQUE_MOTOR.continuous_torque / TORQUE_MOTOR.motor_constant) ** 2
     radius, length = TORQUE_MOTOR.stator_radius, TORQUE_MOTOR.reach - TORQUE_MOTOR.clearance
     area = 2 * (2 * math.pi * radius * length + 2 * math.pi * radius**2)
-    assert lost / (10.0 * area) < 80.0  # K above the room, at 10 W/(m^2 K)
+    assert lost / (10.0 * area) < 65.0  # K above the room, at 10 W/(m^2 K)
 
 
 def test_the_rotor_fits_into_the_housing_round_the_shaft() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
 from hypothesis import strategies as st
 from machines import each_machine
 
@@ -15,8 +15,7 @@ from tpm_gym.mechanism.cup import CUP
 coordinates = st.tuples(*[st.floats(-3, 3)] * 3)
 
 
-@settings(derandomize=True, max_examples=100)
-@given(st.floats(0.1, 2), coordinates, coordinates)
+@examples(100, st.floats(0.1, 2), coordinates, coordinates)
 def test_mounts_are_rigid_and_round_trip(height: float, p: Vector, q: Vector) -> None:
     mount = Mount(height)
     np.testing.assert_allclose(mount.to_paper(mount.to_world(p)), p, atol=1e-14)
@@ -36,6 +35,7 @@ def test_the_mount_hangs_the_base_upside_down() -> None:
     np.testing.assert_array_equal(mount.to_world([0, 0, 0]), [0, 0, 1.5])
     np.testing.assert_array_equal(mount.to_world([0.1, 0.2, 0.5]), [0.1, -0.2, 1.0])
     np.testing.assert_array_equal(mount.rotate(np.eye(3)), np.diag([1, -1, -1]))
+    assert mount.free_fall == (0.0, 0.0, 9.81)
     assert mount.to_world(np.zeros((4, 2, 3))).shape == (4, 2, 3)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -106,10 +107,10 @@ def test_a_file_of_a_terabyte_is_refused_before_it_is_read(tmp_path: Path, name:
 ALL, SPACE = r"entry '\(all\)': .*", "entry 'observation_space.[a-z_]*': .*"
 
 
-def put(path: str, value: Any) -> dict[str, Any]:
-    """Return the JSON with one entry replaced or added, dotted path."""
+def put(path: Sequence[Any], value: Any) -> dict[str, Any]:
+    """Return the JSON with one entry replaced or added."""
     content = described(DATA)
-    *parents, last = path.split(".")
+    *parents, last = path
     place: Any = content
     for key in parents:
         place = place[key]
@@ -181,7 +182,7 @@ def test_entries_that_cannot_be_are_named(
 ) -> None:
     wanted = message if message.startswith("entry") else f"entry '{path}.*': .*{message}"
     with pytest.raises(PolicyFileError, match=wanted) as caught:
-        load_policy(write(tmp_path, put(path, value)))
+        load_policy(write(tmp_path, put(path.split("."), value)))
     assert caught.value.path == str(tmp_path / "p.json")
     assert str(caught.value).isprintable()
     assert len(caught.value.reason) < 300
@@ -259,10 +260,6 @@ def test_tensors_are_exactly_those_of_the_network(
 ) -> None:
     data = safetensors.numpy.save(tensors)
     content = described(data)
-    content["weights"]["bytes"] = len(data)
-    needed = 4 * sum(values.size for values in WEIGHTS.values())
-    if len(data) < needed:
-        pytest.fail("the case would be refused for its size")
     with pytest.raises(PolicyFileError, match=message):
         load_policy(write(tmp_path, content, data))
 
@@ -327,9 +324,4 @@ def places(value: Any, before: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
 def test_json_of_an_ill_willed_author_is_refused_or_a_policy(
     place: tuple[Any, ...], value: Any
 ) -> None:
-    content = described(DATA)
-    inner: Any = content
-    for key in place[:-1]:
-        inner = inner[key]
-    inner[place[-1]] = value
-    assert_refused_or_a_policy(content, DATA)
+    assert_refused_or_a_policy(put(place, value), DATA)

@@ -22,7 +22,15 @@ def bang_bang_mostly_down(rng, step, action):
     return action
 
 
+def hammering(rng, step, action):
+    if step < 12:  # until it is over the puck
+        return action
+    vertical = (1, 1, 1, 1, -1, -1, 1, 1, 1, -1, 1, 1)[step // 2 % 12]
+    return np.append(rng.choice([-1, 0, 1], 2) * (step % 2), (vertical, 0.0))
+
+
 HOSTILE = {
+    "hammering on the puck": hammering,
     "straight down": lambda rng, step, action: DOWN,
     "grasped, then down": lambda rng, step, action: action if step < 14 else DOWN + SUCKING,
     "dropped, then down": lambda rng, step, action: action if step < 14 else DOWN,
@@ -68,4 +76,3 @@ def test_hostile_policies_do_not_lose_the_mechanism(env_id, policy, seeds):
             fall = max(fall, -state.object_velocity[0, 2])
             pressed = pressed + CONTROL_PERIOD if depth > 1e-3 else 0.0
             assert pressed < 0.15
-    env.close()

@@ -1,7 +1,6 @@
 """The mechanism in the engine stays a mechanism, and the engine's quirks stay inside."""
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -77,9 +76,7 @@ def test_encoder_rates_and_platform_velocity_obey_the_jacobian(simulation):
     for state in states:
         velocity = PAPER_TPM.mount.rotate(jacobian.velocity(state.theta) @ state.theta_dot)
         np.testing.assert_allclose(state.fk_velocity, velocity, rtol=1e-9, atol=1e-12)
-    for before, state in pairwise(states[4:]):
-        mean = (state.platform_position - before.platform_position) / 0.04
-        np.testing.assert_allclose(mean, [0.25, 0.0, 0.125], atol=5e-3)
+    for state in states[5:]:
         np.testing.assert_allclose(state.fk_velocity, [0.25, 0.0, 0.125], atol=2e-2)
 
 

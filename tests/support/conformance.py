@@ -26,7 +26,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
-from tpm_gym.errors import ActionError, EpisodeError, TPMError
+from tpm_gym.errors import ActionError, EpisodeError, ResetOptionError, UnreachableError
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.tasks import Expert
 
@@ -114,8 +114,10 @@ def compute_reward_is_vectorised_and_keeps_what_info_holds(make: Make) -> None:
     goal_terms = [info["reward_terms"]["goal"] for info in infos]
     empty: list[dict[str, Any]] = [{}] * len(steps)
     assert np.array_equal(compute(achieved, desired, empty), goal_terms)
-    # Relabelled with what was achieved, every goal term is at its best.
+    # Relabelled with what was achieved, every goal term is at its best, and the others stay.
     assert np.array_equal(compute(achieved, achieved, empty), np.zeros(len(steps)))
+    others = [sum(info["reward_terms"].values()) - info["reward_terms"]["goal"] for info in infos]
+    assert np.allclose(compute(achieved, achieved, infos), others, rtol=0, atol=1e-12)
 
 
 def bad_actions(size: int) -> Iterator[Any]:
@@ -171,8 +173,10 @@ def bad_reset_options_raise_and_leave_the_episode_as_it_was(make: Make) -> None:
         env.step(np.ones(env.action_space.shape))
         state, goal = bits(vars(bare.state)), bare.goal
         for options in bad:
-            with pytest.raises(TPMError):
+            with pytest.raises((ResetOptionError, UnreachableError)) as caught:
                 bare.reset(options=options)
+            if isinstance(caught.value, ResetOptionError) and isinstance(options, dict):
+                assert caught.value.name in options
             assert bits(vars(bare.state)) == state
             assert np.array_equal(bare.goal, goal)
         env.step(np.ones(env.action_space.shape))

@@ -6,6 +6,7 @@ Nothing here calls the package's formulas, so a slip in them cannot hide.
 from __future__ import annotations
 
 from dataclasses import astuple
+from types import SimpleNamespace
 from typing import Any, Protocol
 
 import numpy as np
@@ -13,7 +14,15 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from tpm_gym.arrays import FloatArray, Vector
-from tpm_gym.kinematics import ASSEMBLY_MODES, WorkingMode, inverse_all
+from tpm_gym.kinematics import (
+    ASSEMBLY_MODES,
+    AssemblyMode,
+    ForwardSolutions,
+    WorkingMode,
+    forward_all,
+    inverse_all,
+    jacobian,
+)
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 
 
@@ -143,6 +152,39 @@ def reachable_points(rng: np.random.Generator, count: int, g: Geometry) -> Float
         if len(found) >= count:
             return found[:count]
     raise AssertionError(f"hardly any point can be reached with {g}")
+
+
+def postures(found: Any, given: FloatArray, g: Geometry) -> SimpleNamespace:
+    """Every branch found for the angles or points given (n, 3), one row each, and its points."""
+    row, slot = np.nonzero(found.valid)
+    if isinstance(found, ForwardSolutions):
+        theta, position = given[row], found.position[row, slot]
+    else:
+        theta, position = found.theta[row, slot], given[row]
+    beta = found.beta[row, slot]
+    x_c, z_c = link3(position, beta, g)
+    rows = {"theta": theta, "position": position, "beta": beta, "x_c": x_c, "z_c": z_c}
+    return SimpleNamespace(**rows, slot=slot, p=points(theta, x_c, z_c, beta, g))
+
+
+def reachable_postures(rng: np.random.Generator, count: int, g: Geometry) -> SimpleNamespace:
+    """Every posture of ``count`` random points."""
+    some = reachable_points(rng, count, g)
+    return postures(inverse_all(some, g), some, g)
+
+
+def angles_on(
+    branch: AssemblyMode, rng: np.random.Generator, count: int, g: Geometry, clear: float = 0.0
+) -> FloatArray:
+    """Angles (n, 3) of those postures on an assembly mode, every parallel factor clear of zero.
+
+    ``clear`` is in units of the factors' sizes.
+    """
+    theta = reachable_postures(rng, count, g).theta
+    theta = theta[forward_all(theta, g).valid[:, branch.index]]
+    scaled = jacobian.factors(theta, branch, g).parallel / [1.0, g.l4, g.l4**2]
+    on: FloatArray = theta[(np.abs(scaled) > clear).all(axis=-1)]
+    return on
 
 
 def geometries() -> st.SearchStrategy[Geometry]:

@@ -40,22 +40,20 @@ def play(env_id: str, name: str, make_expert: Callable[[Any], Any]) -> dict[str,
     """Play a case; its digest, and the return and the last distance to the goal of each episode."""
     digest, returns, gaps = hashlib.sha256(), [], []
     env = gym.make(env_id)
-    expert = make_expert(env) if name == "expert" else None
-    policy = tpm_gym.load_policy(POLICIES / f"{env_id}.json") if name == "published" else None
+    if name == "expert":
+        player = make_expert(env)
+    elif name == "published":
+        player = tpm_gym.load_policy(POLICIES / f"{env_id}.json")
     for seed in range(FIRST_SEED, FIRST_SEED + EPISODES):
         observation, info = env.reset(seed=seed)
         rng = np.random.default_rng(seed)
-        if expert is not None:
-            expert.reset(observation)
+        if name == "expert":
+            player.reset(observation)
         total, done = 0.0, False
         while not done:
             _update(digest, observation, info)
-            if expert is not None:
-                action = expert.act(observation)
-            elif policy is not None:
-                action = policy.act(observation)
-            else:
-                action = rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
+            random = rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
+            action = random if name == "random" else player.act(observation)
             observation, reward, terminated, truncated, info = env.step(action)
             digest.update(struct.pack("d??", float(reward), terminated, truncated))
             total, done = total + float(reward), terminated or truncated
@@ -63,7 +61,6 @@ def play(env_id: str, name: str, make_expert: Callable[[Any], Any]) -> dict[str,
         returns.append(total)
         gap = observation["achieved_goal"] - observation["desired_goal"]
         gaps.append(float(np.linalg.norm(gap.astype(np.float64))))
-    env.close()
     return {"sha256": digest.hexdigest(), "returns": returns, "gaps": gaps}
 
 

@@ -6,13 +6,8 @@ import csv
 import functools
 import io
 import json
-import os
-import signal
-import subprocess
-import sys
 import tempfile
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -76,37 +71,6 @@ def quiet() -> Console:
 def said(console: Console) -> str:
     assert isinstance(console.file, io.StringIO)
     return console.file.getvalue()
-
-
-def python(*words: str | Path, **options: Any) -> subprocess.CompletedProcess[str]:
-    """Run Python in a process of its own, to its end."""
-    return subprocess.run(
-        [sys.executable, *words], capture_output=True, text=True, check=False, **options
-    )
-
-
-def tpm_gym_command(*words: str | Path, **options: Any) -> subprocess.CompletedProcess[str]:
-    return python("-m", "tpm_gym.learning", *words, **options)
-
-
-def signalled(
-    words: list[str], ready: Callable[[], object], number: signal.Signals
-) -> tuple[int, str]:
-    """Signal Python and its children, as a terminal does, once it is ready; status and output."""
-    process = subprocess.Popen(
-        [sys.executable, *words],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        start_new_session=True,
-    )
-    deadline = time.monotonic() + 120
-    while not ready() and process.poll() is None:
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
-    os.killpg(process.pid, number)
-    output, _ = process.communicate(timeout=60)
-    return process.returncode, output
 
 
 def make_config(case: str, folder: Path) -> TrainingConfig:
@@ -203,21 +167,6 @@ def evaluations(run: Path) -> Any:
     return without_times([json.loads(line) for line in lines])
 
 
-def assert_equal_tensors(first: Any, second: Any) -> None:
-    assert type(first) is type(second)
-    if isinstance(first, torch.Tensor):
-        assert torch.equal(first, second)
-    elif isinstance(first, Mapping):
-        assert first.keys() == second.keys()
-        for name in first:
-            assert_equal_tensors(first[name], second[name])
-    elif isinstance(first, list | tuple):
-        for one, other in zip(first, second, strict=True):
-            assert_equal_tensors(one, other)
-    else:
-        assert first == second
-
-
 def assert_equal_runs(first: Path, second: Path) -> None:
     """Compare two finished runs: networks, optimisers, buffer, generators, episodes and logs."""
     one, other = end_of(first), end_of(second)
@@ -225,7 +174,7 @@ def assert_equal_runs(first: Path, second: Path) -> None:
     for name, array in one.arrays.items():
         np.testing.assert_array_equal(array, other.arrays[name], err_msg=name)
     tensors = [torch.load(io.BytesIO(end.files["torch.pt"])) for end in (one, other)]
-    assert_equal_tensors(*tensors)
+    torch.testing.assert_close(*tensors, rtol=0, atol=0)
     assert state_of(one) == state_of(other)
     assert table(first) == table(second)
     assert evaluations(first) == evaluations(second)

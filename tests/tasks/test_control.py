@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from examples import examples
 from hypothesis import strategies as st
 from machines import each_machine, within
 
@@ -32,8 +32,7 @@ def turn(machine: Machine, start: FloatArray, end: FloatArray) -> FloatArray:
 
 
 @pytest.mark.parametrize(("kind", "machine"), CONTROLS)
-@settings(derandomize=True, max_examples=300, deadline=None)
-@given(action=actions, share=shares)
+@examples(300, action=actions, share=shares)
 def test_commands_stay_in_the_region_and_within_the_step_limit(
     kind: Control, machine: Machine, action: Triple, share: Triple
 ) -> None:
@@ -48,8 +47,7 @@ def test_commands_stay_in_the_region_and_within_the_step_limit(
 
 
 @pytest.mark.parametrize(("kind", "machine"), CONTROLS)
-@settings(derandomize=True, max_examples=200, deadline=None)
-@given(share=shares, way=actions, far=shares)
+@examples(200, share=shares, way=actions, far=shares)
 def test_actions_are_in_the_unit_box_and_reach_every_wanted_point_nearby(
     kind: Control, machine: Machine, share: Triple, way: Triple, far: Triple
 ) -> None:
@@ -70,8 +68,7 @@ def test_actions_are_in_the_unit_box_and_reach_every_wanted_point_nearby(
 
 
 @each_machine
-@settings(derandomize=True, max_examples=200, deadline=None)
-@given(action=actions, share=shares)
+@examples(200, action=actions, share=shares)
 def test_cartesian_actions_are_fractions_of_the_step_limit(
     machine: Machine, action: Triple, share: Triple
 ) -> None:

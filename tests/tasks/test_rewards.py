@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from tpm_gym.tasks.rewards import dense, distance, singularity_penalty, sparse
 
 SAFE = 0.08
-conditionings = st.floats(0, 1)
-safes = st.floats(0.01, 1)
 
 
 def test_penalty_is_zero_where_it_is_safe_and_one_at_a_singularity() -> None:
@@ -22,37 +18,16 @@ def test_penalty_is_zero_where_it_is_safe_and_one_at_a_singularity() -> None:
     assert singularity_penalty(np.nextafter(SAFE, 0) - 1e-6, SAFE) > 0
 
 
-@settings(derandomize=True, max_examples=200)
-@given(conditionings, conditionings, safes)
-def test_penalty_never_rises_with_the_conditioning(a: float, b: float, safe: float) -> None:
-    low, high = sorted((a, b))
-    worse, better = singularity_penalty(low, safe), singularity_penalty(high, safe)
-    assert 0 <= better <= worse <= 1
-
-
-@pytest.mark.parametrize("safe", [SAFE, 0.3])
-def test_penalty_is_steepest_at_the_threshold(safe: float) -> None:
+@pytest.mark.parametrize("safe", [0.01, SAFE, 0.3, 1.0])
+def test_penalty_falls_with_the_conditioning_steepest_at_the_threshold(safe: float) -> None:
     # Flat there, crossing it would cost nothing, and policies would not care.
     c = np.linspace(0, safe, 1001)
     slopes = -np.diff(singularity_penalty(c, safe)) / np.diff(c)
+    assert (slopes >= 0).all()
     assert (np.diff(slopes) > -1e-9).all()
     assert slopes[-1] == pytest.approx(4 / safe, rel=2e-3)
     assert slopes[0] == pytest.approx(0, abs=1e-6 / safe)
     assert singularity_penalty(0.9 * safe, safe) > 0.3
-
-
-def test_penalty_is_continuous() -> None:
-    c = np.linspace(-0.02, 0.15, 20_001)
-    largest = np.abs(np.diff(singularity_penalty(c, SAFE))).max()
-    assert largest <= 1.001 * (c[1] - c[0]) * 4 / SAFE
-
-
-@pytest.mark.parametrize("shape", [(), (4,), (2, 3), (0,)])
-def test_terms_keep_leading_shapes(shape: tuple[int, ...]) -> None:
-    achieved, desired = np.random.default_rng(0).normal(size=(2, *shape, 3))
-    gap = distance(achieved, desired)
-    for found in (gap, sparse(gap, 1.0), dense(gap), singularity_penalty(gap, SAFE)):
-        assert np.shape(found) == shape
 
 
 def test_distance_is_euclidean_and_broadcasts() -> None:

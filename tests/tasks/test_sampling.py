@@ -149,6 +149,5 @@ def test_one_who_moves_the_joints_straight_to_the_goal_gets_into_the_unsafe_regi
             action = inner.control.action(to_paper(inner.goal), to_paper(inner.state.command))
             met.append(env.step(action.astype(np.float32))[4]["conditioning"])
         careless.append(min(met))
-    env.close()
     assert np.mean(careless) < SAFE - 0.002
     assert min(careful) > SAFE - 0.002

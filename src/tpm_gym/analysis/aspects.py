@@ -9,8 +9,6 @@ Aspects are those of the factors of Eqs. (16) and (17); the constraint singulari
 :mod:`tpm_gym.analysis.singularity` does not divide them.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -22,18 +20,6 @@ from tpm_gym.errors import ConfigurationError
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.kinematics.modes import ELBOWS_OUT, AssemblyMode, WorkingMode
 from tpm_gym.kinematics.workspace import Region, conditioning_at
-
-__all__ = [
-    "DEFAULT_SHAPE",
-    "Aspect",
-    "Box",
-    "Cells",
-    "ReachableSet",
-    "aspects",
-    "largest_box",
-    "reachable_set",
-    "sample",
-]
 
 Shape = tuple[int, int, int]
 

@@ -30,23 +30,6 @@ from numpy.typing import ArrayLike
 from tpm_gym.arrays import FloatArray, finite_points, numbers
 from tpm_gym.errors import InputError
 
-__all__ = [
-    "Chain",
-    "Loop",
-    "POCSet",
-    "Subspace",
-    "Unit",
-    "constraint_degree",
-    "coupling_degrees",
-    "degrees_of_freedom",
-    "independent_equations",
-    "parallel",
-    "parallelogram_4r",
-    "parallelogram_4s",
-    "revolute",
-    "serial",
-]
-
 # Directions closer than this (sine of the angle) count as one, and vectors shorter than this as
 # none: far above rounding, far below anything away from a singularity.
 _SAME = 1e-9

@@ -13,8 +13,6 @@ classify raise it also for entries that are not finite, UnreachableError if some
 exist on the branch, and ConfigurationError if the tolerance is not between 0 and 1.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import IntFlag
 
@@ -25,20 +23,9 @@ from tpm_gym.arrays import BoolArray, FloatArray, IntArray
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.kinematics import equations, inverse
 from tpm_gym.kinematics.geometry import PAPER, Geometry
-from tpm_gym.kinematics.jacobian import Factors, factors, factors_at
+from tpm_gym.kinematics.jacobian import Factors, factors
+from tpm_gym.kinematics.jacobian import factors_at as factors_at
 from tpm_gym.kinematics.modes import DEFAULT_ASSEMBLY, ELBOWS_OUT, AssemblyMode, WorkingMode
-
-__all__ = [
-    "FACTORS",
-    "Classification",
-    "NearestSingularity",
-    "SingularityType",
-    "classify",
-    "classify_at",
-    "dimensionless",
-    "factors_at",
-    "nearest_singularity",
-]
 
 FACTORS = equations.Factors._fields[:7]
 """Names of the factors, in the order of every axis of length 7 here: 3 parallel, then 4 serial."""

@@ -17,8 +17,6 @@ Functions of joint angles raise InputError for what is not three finite numbers,
 UnreachableError if the branch does not exist there.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import permutations
@@ -47,16 +45,6 @@ from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.mechanism.bodies import Mechanism
 from tpm_gym.mechanism.tree import ACTUATED_JOINTS, build, joint_angles
-
-__all__ = [
-    "Mobility",
-    "Structure",
-    "Topology",
-    "analyse",
-    "closure_jacobian",
-    "describe",
-    "mobility",
-]
 
 Frame = tuple[FloatArray, FloatArray]
 

@@ -16,8 +16,6 @@ The second part is the first in plain floats, for one configuration at every tim
 :func:`assemble`, :func:`posture` and :func:`evaluate`. Three finite floats are expected.
 """
 
-from __future__ import annotations
-
 import math
 import sys
 from typing import Any, NamedTuple
@@ -29,27 +27,6 @@ from tpm_gym.errors import SingularityError, UnreachableError
 from tpm_gym.kinematics.geometry import Geometry
 from tpm_gym.kinematics.modes import AssemblyMode, WorkingMode
 from tpm_gym.kinematics.namespaces import NUMPY, PLAIN, Namespace, Numbers
-
-__all__ = [
-    "SINGULAR",
-    "Assembly",
-    "Factors",
-    "Triple",
-    "arms",
-    "assemble",
-    "assembly_at",
-    "conditioning",
-    "evaluate",
-    "factors",
-    "no_assembly",
-    "no_posture",
-    "parallel_factors",
-    "posture",
-    "posture_at",
-    "require_regular",
-    "rods",
-    "velocity",
-]
 
 ROUNDING = 64 * sys.float_info.epsilon
 """Where two solutions merge, rounding alone can push a discriminant (always scaled to order one)

@@ -1,14 +1,10 @@
 """The seven lengths that define the mechanism, validated."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, fields
 from numbers import Real
 
 from tpm_gym.errors import GeometryError
-
-__all__ = ["PAPER", "WIDE", "Geometry"]
 
 
 @dataclass(frozen=True)

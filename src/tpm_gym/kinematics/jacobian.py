@@ -9,8 +9,6 @@ All functions raise InputError for what is no array (..., 3) of numbers; from an
 also if theta is not finite, and UnreachableError if the branch does not exist at some theta.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,24 +23,11 @@ from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.kinematics.modes import DEFAULT_ASSEMBLY, ELBOWS_OUT, AssemblyMode, WorkingMode
 from tpm_gym.kinematics.namespaces import Namespace, Numbers, by_rows
 
-__all__ = [
-    "Evaluation",
-    "Factors",
-    "conditioning",
-    "conditioning_at",
-    "evaluate",
-    "factors",
-    "factors_at",
-    "parallel",
-    "require_regular",
-    "serial",
-    "velocity",
-]
-
 _MATRIX = np.arange(9).reshape(3, 3)
 _DIAGONAL = np.array([[0, 3, 3], [3, 1, 3], [3, 3, 2]])  # of three columns and one of zeros
 _COLUMN = np.array(0)
-_PARALLEL, _SERIAL, _CONSTRAINT = np.arange(3), np.arange(3, 7), np.array(7)
+_PARALLEL = np.arange(3)
+_FACTORS = _PARALLEL, np.arange(3, 7), np.array(7)
 
 
 @dataclass(frozen=True)
@@ -199,8 +184,7 @@ def factors(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> Factors:
     """Closed-form factors of det A and det B (Eqs. 16 and 17, corrected)."""
-    layouts = _PARALLEL, _SERIAL, _CONSTRAINT
-    return Factors(*_from_angles(lambda c: [*c.factors], theta, branch, geometry, *layouts))
+    return Factors(*_from_angles(lambda c: [*c.factors], theta, branch, geometry, *_FACTORS))
 
 
 def factors_at(
@@ -211,8 +195,7 @@ def factors_at(
     Unlike :func:`factors` it does not pass through the forward kinematics, so it keeps its accuracy
     at the parallel singularities.
     """
-    layouts = _PARALLEL, _SERIAL, _CONSTRAINT
-    columns = _from_points(lambda c: [*c.factors], position, branch, geometry, math.nan, *layouts)
+    columns = _from_points(lambda c: [*c.factors], position, branch, geometry, math.nan, *_FACTORS)
     return Factors(*columns)
 
 

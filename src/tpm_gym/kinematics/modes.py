@@ -8,8 +8,6 @@ Branches are named by signs that change only at a singularity:
   serial Jacobian's determinant.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import product
 
@@ -17,18 +15,6 @@ from tpm_gym.arrays import BoolArray, FloatArray
 from tpm_gym.errors import InputError
 from tpm_gym.kinematics.geometry import Geometry
 from tpm_gym.kinematics.namespaces import namespace_of
-
-__all__ = [
-    "ASSEMBLY_MODES",
-    "DEFAULT_ASSEMBLY",
-    "ELBOWS_OUT",
-    "WORKING_MODES",
-    "AssemblyMode",
-    "ForwardSolutions",
-    "InverseSolutions",
-    "PassiveAngles",
-    "WorkingMode",
-]
 
 
 class _Mode:

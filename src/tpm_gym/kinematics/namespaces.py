@@ -5,8 +5,6 @@ every time step, where numpy's calls cost ten times what they compute; for batch
 gradients and GPUs.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 import operator
@@ -19,8 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tpm_gym.arrays import FloatArray, is_tensor
-
-__all__ = ["NUMPY", "PLAIN", "Namespace", "Numbers", "by_rows", "namespace_of"]
 
 Numbers = Any
 """A float, an array (...,) or a tensor (...,): what a namespace computes with."""
@@ -141,7 +137,7 @@ def _torch() -> Namespace:
 
     def join(points: Sequence[Any]) -> Any:
         tensor = next(point for point in points if is_tensor(point))
-        shape = torch.broadcast_shapes(*(point.shape for point in points))
+        shape = np.broadcast_shapes(*(tuple(point.shape) for point in points))
         return torch.cat([like(point, tensor).expand(shape) for point in points], -1)
 
     return Namespace(

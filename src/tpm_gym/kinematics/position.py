@@ -9,8 +9,6 @@ give invalid branches where all are solved; those on one named branch raise Inpu
 UnreachableError if the branch does not exist for some entry.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
@@ -32,8 +30,6 @@ from tpm_gym.kinematics.modes import (
     WorkingMode,
 )
 from tpm_gym.kinematics.namespaces import Namespace, by_rows, namespace_of
-
-__all__ = ["forward", "forward_all", "inverse", "inverse_all", "passive_angles"]
 
 # Which columns of _assemblies a slot holds: x, y, -y, z, beta, -beta, of both planar signs each
 _PLANAR = np.array([(mode.planar + 1) // 2 for mode in ASSEMBLY_MODES])

@@ -3,8 +3,6 @@
 Everything here is in the paper frame, in metres, on one working mode.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
@@ -15,12 +13,11 @@ from numpy.typing import ArrayLike
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.kinematics.geometry import PAPER, Geometry
-from tpm_gym.kinematics.jacobian import conditioning_at, factors_at
+from tpm_gym.kinematics.jacobian import conditioning_at as conditioning_at
+from tpm_gym.kinematics.jacobian import factors_at
 from tpm_gym.kinematics.modes import ELBOWS_OUT, WorkingMode
 from tpm_gym.kinematics.namespaces import namespace_of
 from tpm_gym.kinematics.position import inverse_all
-
-__all__ = ["Region", "assembly_of", "conditioning_at", "reachable"]
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,6 @@ Needs the extra ``train``. Importing this package imports neither PyTorch nor St
 name is imported when it is first used.
 """
 
-from __future__ import annotations
-
 import importlib
 from typing import TYPE_CHECKING, Any
 

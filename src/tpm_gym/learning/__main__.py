@@ -1,7 +1,5 @@
 """``python -m tpm_gym.learning`` is the command ``tpm-gym``."""
 
-from __future__ import annotations
-
 import sys
 
 

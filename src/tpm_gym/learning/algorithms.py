@@ -6,8 +6,8 @@ study with another algorithm of Stable-Baselines3; an argument that none had bef
 
 from __future__ import annotations
 
-import importlib
 import inspect
+import pkgutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
@@ -132,8 +132,7 @@ class Algorithm:
 
     def load_class(self) -> type[BaseAlgorithm]:
         """Return the class; this imports PyTorch."""
-        module, _, name = self.path.partition(":")
-        found: type[BaseAlgorithm] = getattr(importlib.import_module(module), name)
+        found: type[BaseAlgorithm] = pkgutil.resolve_name(self.path)
         return found
 
     def entries(self) -> Any:

@@ -1,7 +1,5 @@
 """What happens besides learning while a policy trains: evaluation, checkpoints, stopping."""
 
-from __future__ import annotations
-
 import json
 import signal
 import sys
@@ -57,7 +55,6 @@ class PeriodicEvaluation(BaseCallback):
         self._console, self._keep = console, keep
         self._evaluations: list[dict[str, Any]] = []
         self._best: tuple[float, float] | None = None
-        self._total_steps = 0
 
     def state(self) -> dict[str, Any]:
         """Return what a checkpoint has to keep, as plain data."""
@@ -69,7 +66,6 @@ class PeriodicEvaluation(BaseCallback):
         self._best = tuple(state["best"]) if state["best"] else None
 
     def _on_training_start(self) -> None:
-        self._total_steps = self.locals["total_timesteps"]
         if self._evaluations:  # resumed: the curve loses what is done again
             self._draw()
         else:
@@ -78,7 +74,7 @@ class PeriodicEvaluation(BaseCallback):
     def _on_step(self) -> bool:
         due = self.num_timesteps - self._evaluations[-1]["steps"] >= self._config.eval_every
         # The last evaluation waits for the last update, to be that of the policy which is saved.
-        if due and self.num_timesteps < self._total_steps:
+        if due and self.num_timesteps < self._config.steps:
             self._evaluate()
         return True
 

@@ -7,8 +7,6 @@ a pickle that would be loaded: the files are JSON, NumPy arrays, and tensors tha
 ``torch.load(weights_only=True)`` reads; all of them are checked before they are parsed.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json
@@ -55,13 +53,12 @@ class Content:
         return arrays + sum(len(data) for data in self.files.values())
 
 
+@dataclass
 class CheckpointStore:
     """The checkpoints of one run, in a folder that is made when the first is saved."""
 
-    def __init__(self, folder: Path) -> None:
-        """Touch nothing yet."""
-        self._folder = folder
-        self._whole: list[int] = []  # steps of those to be kept, oldest first
+    folder: Path
+    _whole: list[int] = field(default_factory=list, init=False)  # steps kept, oldest first
 
     @property
     def newest(self) -> int | None:
@@ -80,7 +77,7 @@ class CheckpointStore:
         target = self._path(content.step)
         part = target.with_suffix(".tmp")
         try:
-            self._folder.mkdir(parents=True, exist_ok=True)
+            self.folder.mkdir(parents=True, exist_ok=True)
             _remove(part)  # left by a process that was killed
             self._check_space(content)
             part.mkdir()
@@ -89,7 +86,7 @@ class CheckpointStore:
                 _remove(target.with_suffix(".old"))
                 target.rename(target.with_suffix(".old"))
             part.rename(target)
-            _flush_folder(self._folder)
+            _flush_folder(self.folder)
         except BaseException as error:
             _remove(part)
             if isinstance(error, OSError):
@@ -128,28 +125,28 @@ class CheckpointStore:
             return None
         listed = "".join(f"\n  {problem}" for problem in problems)
         anew = "start the run anew with --overwrite"
-        raise CheckpointError(f"no checkpoint in {self._folder} is whole; {anew}:{listed}")
+        raise CheckpointError(f"no checkpoint in {self.folder} is whole; {anew}:{listed}")
 
     def clear(self) -> None:
         """Delete all checkpoints, but nothing else that is in their folder."""
         self._whole = []
-        if self._folder.is_dir():
+        if self.folder.is_dir():
             self._tidy()
             with suppress(OSError):  # something else is in it
-                self._folder.rmdir()
+                self.folder.rmdir()
 
     def _path(self, step: int) -> Path:
-        return self._folder / f"{step:09d}"
+        return self.folder / f"{step:09d}"
 
     def _steps(self) -> list[int]:
         """Steps of all checkpoints in the folder, whole or damaged, oldest first."""
-        if not self._folder.is_dir():
+        if not self.folder.is_dir():
             return []
-        names = (entry.name for entry in self._folder.iterdir())
+        names = (entry.name for entry in self.folder.iterdir())
         return sorted(int(name) for name in names if _NAME.fullmatch(name))
 
     def _check_space(self, content: Content) -> None:
-        needed, free = content.size + _SPARE, shutil.disk_usage(self._folder).free
+        needed, free = content.size + _SPARE, shutil.disk_usage(self.folder).free
         if free < needed:
             problem = f"{needed / 1e6:,.1f} MB are needed, {free / 1e6:,.1f} MB are free"
             self._refuse(self._path(content.step), problem)
@@ -161,7 +158,7 @@ class CheckpointStore:
     def _tidy(self) -> None:
         """Delete what earlier processes and earlier checkpoints left, but nothing of the user's."""
         kept = {self._path(step).name for step in self._whole}
-        for entry in self._folder.iterdir():
+        for entry in self.folder.iterdir():
             if _OURS.fullmatch(entry.name) and entry.name not in kept:
                 _remove(entry)
 

@@ -1,7 +1,5 @@
 """The command ``tpm-gym``."""
 
-from __future__ import annotations
-
 import signal
 import sys
 from collections.abc import Sequence
@@ -14,9 +12,10 @@ from tyro.conf import OmitSubcommandPrefixes, Positional, subcommand
 
 from tpm_gym import TPMError
 from tpm_gym.learning.configuration import ResumeConfig, TrainingConfig
-from tpm_gym.learning.evaluation import EvaluationConfig
-from tpm_gym.learning.report.records import Collect, Write
-from tpm_gym.learning.study import StudyConfig
+from tpm_gym.learning.evaluation import EvaluationConfig, evaluate
+from tpm_gym.learning.report.records import Collect, Write, collect, write
+from tpm_gym.learning.study import StudyConfig, study
+from tpm_gym.learning.training import resume, train
 
 
 @dataclass(frozen=True)
@@ -70,32 +69,22 @@ def main(words: Sequence[str] | None = None) -> None:
 
 
 def _run(command: Any) -> signal.Signals | None:
-    """Run a command, importing what it needs; return the signal that stopped it, if one did."""
+    """Run a command; return the signal that stopped it, if one did."""
     match command:
         case TrainingConfig():
-            from tpm_gym.learning.training import train
-
             return train(command)
         case ResumeConfig():
-            from tpm_gym.learning.training import resume
-
             return resume(command)
         case EvaluationConfig():
-            from tpm_gym.learning.evaluation import evaluate
-
             evaluate(command)
+        case StudyConfig():
+            study(command)
+        case ReportConfig(Collect() as action):
+            print(*collect(action), sep="\n")
+        case ReportConfig(Write() as action):
+            print(*write(action), sep="\n")
         case ExportConfig():
-            from tpm_gym.learning.export import convert
+            from tpm_gym.learning.export import convert  # here, since it imports PyTorch
 
             print(convert(command.model, command.out, trust_pickle=command.trust_pickle))
-        case StudyConfig():
-            from tpm_gym.learning.study import study
-
-            study(command)
-        case ReportConfig():
-            from tpm_gym.learning.report.records import collect, write
-
-            action = command.action
-            written = collect(action) if isinstance(action, Collect) else write(action)
-            print(*written, sep="\n")
     return None

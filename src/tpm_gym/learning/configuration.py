@@ -1,7 +1,5 @@
 """What a training run is to do: the options of the command line, completed and checked."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
@@ -172,11 +170,7 @@ def resumed(config: ResumeConfig, stored: Mapping[str, Any], reached: int) -> Tr
 
 
 def check_least(config: Any, least: int, *names: str) -> None:
-    """Refuse an option that is given and less than it may be.
-
-    Raises:
-        ConfigError: There is one.
-    """
+    """Refuse, with a ConfigError, an option that is given and less than it may be."""
     for name in names:
         value = getattr(config, name)
         if value is not UNSET and value < least:

@@ -6,8 +6,6 @@ They are stored as whole episodes, so that hindsight can relabel them like any o
 steps of the environment, so that no learning curve hides them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The one place where training, evaluation, demonstrations and films get their environments."""
 
-from __future__ import annotations
-
 import importlib
 import signal
 from typing import Any
@@ -10,7 +8,7 @@ import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 
 from tpm_gym.envs.env import TPMEnv
-from tpm_gym.envs.registration import ENTRY_POINT, env_ids
+from tpm_gym.envs.registration import env_ids
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.rollout import GoalEnv
 
@@ -42,8 +40,6 @@ def _is_ours(spec: EnvSpec) -> bool:
     """Whether an id makes a ``TPMEnv``, or what derives from it."""
     entry: Any = spec.entry_point
     if isinstance(entry, str):
-        if entry == ENTRY_POINT:
-            return True
         try:
             entry = load_env_creator(entry)
         except (ImportError, AttributeError):

@@ -1,7 +1,5 @@
 """The errors of training and evaluation; all derive from :class:`tpm_gym.errors.TPMError`."""
 
-from __future__ import annotations
-
 from tpm_gym.errors import TPMError
 
 

@@ -5,16 +5,15 @@ unluckiest quarter out, and its interval says how much another set of seeds migh
 et al. 2021, "Deep reinforcement learning at the edge of the statistical precipice").
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from statistics import median
-from typing import Any, Final, TypeAlias
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+
+from tpm_gym.arrays import FloatArray
 
 BOOTSTRAP_SAMPLES: Final = 5000
 BOOTSTRAP_SEED: Final = 0  # fixed: the same values always give the same interval
@@ -24,8 +23,6 @@ LEARNED: Final = 0.95
 _Z95: Final = 1.959963984540054  # 97.5% quantile of the standard normal distribution
 _EPISODE_SAMPLES: Final = 2000
 _BLOCK: Final = 100
-
-Array: TypeAlias = NDArray[Any]
 
 
 @dataclass(frozen=True)
@@ -66,10 +63,10 @@ def interquartile_mean(scores: Sequence[float], samples: int = BOOTSTRAP_SAMPLES
     scores, that of the middle three.
     """
 
-    def trimmed(rows: Array) -> Array:
+    def trimmed(rows: FloatArray) -> FloatArray:
         count = rows.shape[1]
         cut = count // 4
-        means: Array = np.sort(rows, axis=1)[:, cut : count - cut].mean(axis=1)
+        means: FloatArray = np.sort(rows, axis=1)[:, cut : count - cut].mean(axis=1)
         return means
 
     return _resampled(scores, trimmed, samples)
@@ -77,7 +74,7 @@ def interquartile_mean(scores: Sequence[float], samples: int = BOOTSTRAP_SAMPLES
 
 def _resampled(
     values: Sequence[float],
-    statistic: Callable[[Array], Array],
+    statistic: Callable[[FloatArray], FloatArray],
     samples: int,
     worst: float | None = None,
 ) -> Estimate:
@@ -95,17 +92,14 @@ def _resampled(
     return Estimate(mean, min(mean, float(low)), max(mean, float(high)), worst)
 
 
-def settled(successes: Sequence[float], rate: float = LEARNED) -> int | None:
-    """Index of the first evaluation from which success stays at ``rate`` or above to the end.
+def settled(successes: Sequence[float]) -> int | None:
+    """Index of the first evaluation from which success stays at ``LEARNED`` or above to the end.
 
     None where the last evaluation is below, or there is none.
     """
-    found = None
-    for index in reversed(range(len(successes))):
-        if successes[index] < rate - 1e-9:
-            break
-        found = index
-    return found
+    below = [index for index, success in enumerate(successes) if success < LEARNED - 1e-9]
+    first = below[-1] + 1 if below else 0
+    return first if first < len(successes) else None
 
 
 def median_time(times: Sequence[float | None]) -> float | None:

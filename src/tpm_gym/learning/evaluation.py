@@ -1,7 +1,5 @@
 """Evaluate policies over seeded episodes: a table, and optionally JSON, a video and a picture."""
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Sequence

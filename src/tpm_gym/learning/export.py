@@ -4,8 +4,6 @@
 ``NAME.safetensors`` the weights of the actor, for ``tpm_gym.load_policy`` and ``tpm-gym evaluate``.
 """
 
-from __future__ import annotations
-
 import copy
 import io
 import json

@@ -1,7 +1,5 @@
 """What the networks see of a goal."""
 
-from __future__ import annotations
-
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor

@@ -1,7 +1,5 @@
 """What all figures share: palette, fonts, and saving with the same bytes each time."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Pictures of a policy at work: a video of episodes, a contact sheet of one."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final

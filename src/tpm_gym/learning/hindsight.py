@@ -1,7 +1,5 @@
 """Hindsight replay that keeps a goal-independent penalty in relabelled rewards."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

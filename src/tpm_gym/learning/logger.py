@@ -1,7 +1,5 @@
 """The log of a run, as CSV and TensorBoard events, which a resumed run continues."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 
@@ -27,21 +27,16 @@ from tpm_gym.tasks.expert import Expert
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
+    from tpm_gym.policy import Policy as ExportedPolicy
+
 SCRIPTED: Final = ("expert", "random")
-
-
-class Predictor(Protocol):
-    """The part of a Stable-Baselines3 algorithm that acts."""
-
-    def predict(self, observation: Any, *, deterministic: bool = False) -> tuple[Any, Any]:
-        """Return the action, and the state of a recurrent policy."""
 
 
 @dataclass(frozen=True)
 class TrainedPolicy:
     """Acts with the mean action of a trained algorithm."""
 
-    model: Predictor
+    model: BaseAlgorithm | ExportedPolicy
 
     def reset(self, observation: Observation, seed: int) -> None:
         """Do nothing: the policy has no memory."""
@@ -49,7 +44,7 @@ class TrainedPolicy:
     def act(self, observation: Observation) -> Action:
         """Return the deterministic action for ``observation``."""
         action, _ = self.model.predict(observation, deterministic=True)
-        return cast(Action, action)
+        return action
 
 
 @dataclass

@@ -1,7 +1,5 @@
 """What a result needs to be repeated: versions, commit, machine, command; and how it is written."""
 
-from __future__ import annotations
-
 import json
 import os
 import platform

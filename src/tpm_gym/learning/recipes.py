@@ -7,8 +7,6 @@ where the zoo evaluates a string such as ``"dict(net_arch=[64, 64])"`` as Python
 written here (the zoo reads it as well), and nothing is ever evaluated.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path

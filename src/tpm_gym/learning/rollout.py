@@ -8,8 +8,6 @@ trained on or was selected by:
 - from ``TEST_SEED``: ``tpm-gym evaluate``.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 Nothing is ever deleted but files that a run writes, by name, and no policy unless it is asked for.
 """
 
-from __future__ import annotations
-
 import errno
 import json
 import os

@@ -8,8 +8,6 @@ It can be stopped with Ctrl-C at any time and started again: trainings go on fro
 checkpoint. A training that fails is reported, and the others go on.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shlex
@@ -35,13 +33,8 @@ from tpm_gym.tasks.registry import TASKS
 _PENALTY_IDS: Final = ("TPMReach-v0", "TPMReachJoints-v0", "TPMPickAndPlaceJoints-v0")
 _ROBUSTNESS_IDS: Final = ("TPMReach-v0", "TPMPickAndPlace-v0", "TPMPickAndPlaceJoints-v0")
 _WEIGHTS: Final = (0.0, 1.0)
-_MACHINES: Final = {
-    "encoder_noise": "encoder_noise=1e-4",
-    "length_error": "length_error=5e-4",
-    "puck_mass": "puck_mass=2",
-    "friction": "friction=0.5",
-}
-_NEEDS_PUCK: Final = ("puck_mass", "friction")
+_MACHINES: Final = ("encoder_noise=1e-4", "length_error=5e-4")
+_MACHINES_WITH_PUCK: Final = (*_MACHINES, "puck_mass=2", "friction=0.5")
 
 _stopping = threading.Event()
 _running: set[subprocess.Popen[bytes]] = set()
@@ -144,12 +137,9 @@ def _runs_of(config: StudyConfig, env: str, algo: str, seed: int) -> list[Run]:
     if config.plan == "results":
         return [Run(folder, env, algo, tuple(options), ((NOMINAL, ()),))]
     puck = bool(TASKS[check_env_id(env).kwargs["task"]].scene.objects)
-    machines = {
-        machine: ("--randomisation", entry)
-        for machine, entry in _MACHINES.items()
-        if puck or machine not in _NEEDS_PUCK
-    }
-    return [Run(folder, env, algo, None, tuple(machines.items()))]
+    machines = _MACHINES_WITH_PUCK if puck else _MACHINES
+    tests = tuple((entry.split("=")[0], ("--randomisation", entry)) for entry in machines)
+    return [Run(folder, env, algo, None, tests)]
 
 
 # -- what is left to do ---------------------------------------------------------------------------

@@ -12,14 +12,14 @@ from __future__ import annotations
 import json
 import signal
 from contextlib import ExitStack
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from tpm_gym.learning import provenance
+from tpm_gym.learning import provenance, run_folder
 from tpm_gym.learning.algorithms import ALGORITHMS
 from tpm_gym.learning.checkpoint import CheckpointStore, Content
 from tpm_gym.learning.configuration import (
@@ -32,19 +32,7 @@ from tpm_gym.learning.configuration import (
 from tpm_gym.learning.environments import check_env_id, make_env
 from tpm_gym.learning.errors import PolicyError, RunError
 from tpm_gym.learning.rollout import SELECTION_SEED
-from tpm_gym.learning.run_folder import (
-    BEST_FILE,
-    CHECKPOINTS,
-    CONFIG_FILE,
-    LAST_FILE,
-    claimed,
-    clear,
-    description,
-    disk_errors_named,
-    holds_policy,
-    is_finished,
-    prepare,
-)
+from tpm_gym.learning.run_folder import CHECKPOINTS, CONFIG_FILE, is_finished
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -52,8 +40,6 @@ if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
     from tpm_gym.learning.callbacks import PeriodicEvaluation
-
-_CHANGEABLE = ("steps", "eval_every", "checkpoint_every", "threads", "device")
 
 
 def train(config: TrainingConfig, console: Console | None = None) -> signal.Signals | None:
@@ -68,9 +54,9 @@ def train(config: TrainingConfig, console: Console | None = None) -> signal.Sign
     """
     console = console or Console()
     config = complete(config)
-    prepare(config.run, config.overwrite)
+    run_folder.prepare(config.run, config.overwrite)
     store = CheckpointStore(config.run / CHECKPOINTS)
-    with disk_errors_named(config.run, store), claimed(config.run):
+    with run_folder.disk_errors_named(config.run, store), run_folder.claimed(config.run):
         provenance.write_json(config.run / CONFIG_FILE, _description(config))
         console.print(f"{config.title}, {config.steps:,} steps, in {config.run}", markup=False)
         starts = int(config.recipe.arguments.get("learning_starts", 0))
@@ -96,8 +82,8 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
     store = CheckpointStore(run / CHECKPOINTS)
     if not run.is_dir():
         raise RunError(f"there is no folder {run}; start a run with tpm-gym train")
-    with disk_errors_named(run, store), claimed(run):
-        stored = description(run)
+    with run_folder.disk_errors_named(run, store), run_folder.claimed(run):
+        stored = run_folder.description(run)
         if stored is not None and is_finished(run) and config.steps in (UNSET, stored["steps"]):
             _say(console, f"nothing to do: {run} has finished its {stored['steps']:,} steps")
             return None
@@ -106,7 +92,7 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
             stored = json.loads(content.files[CONFIG_FILE])
         elif stored is None:
             raise RunError(f"{run} holds no run of tpm_gym; start one with tpm-gym train")
-        elif holds_policy(run):
+        elif run_folder.holds_policy(run):
             raise RunError(
                 f"{run} holds a policy, but no checkpoint to go on from, and beginning again would "
                 "replace it; train into another --run, or here with tpm-gym train --overwrite"
@@ -116,7 +102,7 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
         if content:
             restore_files(run, content)
         else:
-            clear(run)
+            run_folder.clear(run)
         provenance.write_json(run / CONFIG_FILE, _description_resumed(changed, stored, step))
         _say(console, f"{changed.title}, from step {step:,} to {changed.steps:,}, in {run}")
         return _learn(changed, console, store, content)
@@ -139,9 +125,10 @@ def _description_resumed(
     config: TrainingConfig, stored: dict[str, Any], step: int
 ) -> dict[str, Any]:
     resumption = {"from_step": step, **provenance.origin()}
+    changeable = [field.name for field in fields(ResumeConfig) if field.name != "run"]
     return {
         **stored,
-        **{name: getattr(config, name) for name in _CHANGEABLE},
+        **{name: getattr(config, name) for name in changeable},
         "resumed": [*stored.get("resumed", []), resumption],
     }
 
@@ -162,6 +149,7 @@ def _learn(
         SignalListener,
         StopTrainingError,
     )
+    from tpm_gym.learning.demonstrations import Demonstrations
     from tpm_gym.learning.logger import make_logger
 
     torch.set_num_threads(config.threads)
@@ -176,12 +164,14 @@ def _learn(
         logger = make_logger(config.run, None if content is None else content.step)
         stack.callback(logger.close)
         model.set_logger(logger)
-        keep = partial(_keep, config, console, BEST_FILE)
+        keep = partial(_keep, config, console, run_folder.BEST_FILE)
         evaluation = PeriodicEvaluation(config, evaluation_env, console, keep)
         seconds = _restore(model, evaluation, content, console) if content else 0.0
         checkpointing = Checkpointing(config, store, evaluation, listener, console, seconds)
         # Checkpointing sets the clock of those after it.
-        callbacks = [checkpointing, *_demonstrations(config), bar, evaluation]
+        callbacks: list[BaseCallback] = [checkpointing, bar, evaluation]
+        if config.recipe.demonstrations:
+            callbacks.insert(1, Demonstrations(**config.recipe.demonstrations))
         stack.enter_context(listener.listening())
         stopped_by = None
         try:
@@ -189,7 +179,7 @@ def _learn(
             model.learn(steps, callback=callbacks, reset_num_timesteps=content is None)
         except StopTrainingError:
             stopped_by = listener.received
-        _keep(config, console, LAST_FILE, model)
+        _keep(config, console, run_folder.LAST_FILE, model)
         if stopped_by is None:
             checkpointing.save_finished()
     _report(config.run, console, store, stopped_by)
@@ -207,15 +197,6 @@ def _restore(
     for note in notes:
         _say(console, f"note: {note}; the run goes on, but not exactly as it would have")
     return float(extra["seconds"])
-
-
-def _demonstrations(config: TrainingConfig) -> list[BaseCallback]:
-    """What fills the replay buffer before training starts, if the recipe asks for it."""
-    if not config.recipe.demonstrations:
-        return []
-    from tpm_gym.learning.demonstrations import Demonstrations
-
-    return [Demonstrations(**config.recipe.demonstrations)]
 
 
 def _keep(config: TrainingConfig, console: Console, name: str, model: BaseAlgorithm) -> None:
@@ -247,11 +228,8 @@ def _report(
 
 def make_model(config: TrainingConfig, envs: VecEnv) -> BaseAlgorithm:
     """Build the algorithm of a completed configuration."""
-    kind: Any = ALGORITHMS[config.algo].load_class()
-    model: BaseAlgorithm = kind(
-        env=envs, seed=config.seed, device=config.device, **config.recipe.keywords()
-    )
-    return model
+    kind = ALGORITHMS[config.algo].load_class()
+    return kind(env=envs, seed=config.seed, device=config.device, **config.recipe.keywords())
 
 
 def make_training_envs(config: TrainingConfig) -> VecEnv:

@@ -10,8 +10,6 @@ optimisers, and the episode under way (its first half, joined to another episode
 buffer, teaches goals that were never reached). All three are restored here.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import random
@@ -216,7 +214,7 @@ def _restore_rng(model: BaseAlgorithm, state: Mapping[str, Any], tensors: dict[s
 
 
 def _buffer_arrays(model: BaseAlgorithm) -> dict[str, NDArray[Any]]:
-    """Return views of the filled part of the replay buffer; nothing without one."""
+    """Return the place in the replay buffer, and views of its filled part; nothing without one."""
     buffer = getattr(model, "replay_buffer", None)
     if not isinstance(buffer, DictReplayBuffer):
         return {}
@@ -226,26 +224,18 @@ def _buffer_arrays(model: BaseAlgorithm) -> dict[str, NDArray[Any]]:
         arrays |= {f"{group}/{key}": rows[:size] for key, rows in getattr(buffer, group).items()}
     arrays |= {name: getattr(buffer, name)[:size] for name in _PER_ROW if hasattr(buffer, name)}
     if isinstance(buffer, HerReplayBuffer):
-        arrays["current_ep_start"] = buffer._current_ep_start.copy()
+        arrays["current_ep_start"] = buffer._current_ep_start
     return arrays
 
 
 def _restore_buffer(model: BaseAlgorithm, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Fill an empty replay buffer as it was, the bookkeeping of its episodes included."""
     buffer = getattr(model, "replay_buffer", None)
-    if not isinstance(buffer, DictReplayBuffer):
-        return
-    position, full = arrays["buffer/place"].tolist()
-    buffer.pos, buffer.full = position, bool(full)
-    size = buffer.size()
-    for group in _PER_KEY:
-        for key, rows in getattr(buffer, group).items():
-            rows[:size] = arrays[f"buffer/{group}/{key}"]
-    for name in _PER_ROW:
-        if hasattr(buffer, name):
-            getattr(buffer, name)[:size] = arrays[f"buffer/{name}"]
-    if isinstance(buffer, HerReplayBuffer):
-        buffer._current_ep_start[:] = arrays["buffer/current_ep_start"]
+    if isinstance(buffer, DictReplayBuffer):
+        position, full = arrays["buffer/place"].tolist()
+        buffer.pos, buffer.full = position, bool(full)
+    for name, view in _buffer_arrays(model).items():
+        view[:] = arrays[f"buffer/{name}"]
 
 
 # -- environments -----------------------------------------------------------------------------
@@ -262,11 +252,9 @@ def _restore_episodes(
     exact = True
     for index, episode in enumerate(state["episodes"]):
         (observation,) = envs.env_method("replay", episode, indices=[index])
-        exact = exact and observation is not None
-        if observation is not None:
-            exact = exact and all(
-                np.array_equal(observation[key], rows[index]) for key, rows in last.items()
-            )
+        exact &= observation is not None and all(
+            np.array_equal(observation[key], rows[index]) for key, rows in last.items()
+        )
     if exact:
         model._last_obs, model._last_episode_starts = last, arrays["episode_starts"]
         return []

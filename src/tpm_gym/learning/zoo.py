@@ -8,8 +8,6 @@ algorithm, so the algorithm is read off the zoo's command line. Where the zoo wo
 as Python, it gets the classes themselves.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from typing import Any

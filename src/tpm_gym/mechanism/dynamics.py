@@ -29,15 +29,17 @@ the base hangs upside down. The functions with a Pose compute with whatever thei
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tpm_gym.arrays import FloatArray, Vector, finite_points, is_tensor
+from tpm_gym.errors import ConfigurationError
 from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode, equations
 from tpm_gym.kinematics.equations import Triple
 from tpm_gym.kinematics.geometry import PAPER, Geometry
@@ -46,8 +48,6 @@ from tpm_gym.kinematics.namespaces import PLAIN, Namespace, Numbers, by_rows, na
 from tpm_gym.mechanism import tree
 from tpm_gym.mechanism.inertia import Inertia, Swing, inertia_of
 from tpm_gym.mechanism.mount import GRAVITY
-
-__all__ = ["Dynamics", "Energy", "Pose", "energies", "pose_at", "torques"]
 
 _VECTOR = np.arange(3)
 _MATRIX = np.arange(9).reshape(3, 3)
@@ -86,6 +86,36 @@ class Pose(NamedTuple):
     lengths: Geometry
 
 
+class Velocities(NamedTuple):
+    """First derivatives, m/s.
+
+    Attributes:
+        link3: Of C1, along x and z.
+        platform: Of P.
+        turn: l7 times the rate of beta.
+        rod1: Of C1 relative to B1.
+        rod2: Of C2 relative to B2, along x and z.
+        rod3: Of C3 relative to B3.
+    """
+
+    link3: tuple[Numbers, Numbers]
+    platform: Triple
+    turn: Numbers
+    rod1: Triple
+    rod2: tuple[Numbers, Numbers]
+    rod3: Triple
+
+
+class Accelerations(NamedTuple):
+    """Second derivatives, m/s^2: of B1 along y and z, B2, B3 and C1 along x and z, and P."""
+
+    elbow1: tuple[Numbers, Numbers]
+    elbow2: tuple[Numbers, Numbers]
+    elbow3: tuple[Numbers, Numbers]
+    link3: tuple[Numbers, Numbers]
+    platform: Triple
+
+
 # -- over any namespace ----------------------------------------------------------------------------
 
 
@@ -101,15 +131,20 @@ def pose_at(
 
 
 def torques(pose: Pose, rates: Triple, changes: Triple, gravity: Triple, m: Inertia) -> Triple:
-    """The motors' torques for rates (rad/s) and their changes (rad/s^2), in a gravity (m/s^2).
+    """The motors' torques for rates (rad/s) and their changes (rad/s^2), in a gravity (m/s^2)."""
+    v = velocities(pose, rates)
+    return carried(pose, v, changes, accelerations(pose, rates, changes, v), gravity, m)
+
+
+def carried(
+    pose: Pose, v: Velocities, changes: Triple, a: Accelerations, gravity: Triple, m: Inertia
+) -> Triple:
+    """The motors' torques for velocities and accelerations of the points.
 
     Weight is what inertia would be if all points accelerated by -gravity beside what they do.
     """
     (c1, c2, c3), (s1, s2, s3), (r1, _, r3) = pose.cos, pose.sin, pose.rods
-    v = _velocities(pose, rates)
-    (b1y, b1z), (b2x, b2z), (b3x, b3z), (cx, cz), (px, py, pz) = _accelerations(
-        pose, rates, changes, v
-    )
+    (b1y, b1z), (b2x, b2z), (b3x, b3z), (cx, cz), (px, py, pz) = a
     f1x, f1y, f1z = _swing(r1, v.rod1, (-b1y, cz - b1z), m.swing1)
     f3y, f3x, f3z = _swing(
         (r3[1], r3[0], r3[2]), (v.rod3[1], v.rod3[0], v.rod3[2]), (px - b3x, pz - b3z), m.swing3
@@ -141,7 +176,7 @@ def energies(pose: Pose, rates: Triple, gravity: Triple, m: Inertia) -> tuple[Nu
     (c1, c2, c3), (s1, s2, s3), found = pose.cos, pose.sin, pose.found
     (r1x, r1y, r1z), _, (r3x, r3y, r3z) = pose.rods
     (u1, u2, u3), (k1, k2, k3), (j1, j2, j3) = rates, m.couples, m.motors
-    v = _velocities(pose, rates)
+    v = velocities(pose, rates)
     (cx, cz), (px, py, pz) = v.link3, v.platform
     swing1 = (r1y * v.rod1[2] - r1z * v.rod1[1]) / (r1y * r1y + r1z * r1z)
     swing3 = (r3x * v.rod3[2] - r3z * v.rod3[0]) / (r3x * r3x + r3z * r3z)
@@ -166,21 +201,12 @@ def energies(pose: Pose, rates: Triple, gravity: Triple, m: Inertia) -> tuple[Nu
     return squares / 2 + products, potential
 
 
-class _Velocities(NamedTuple):
-    link3: tuple[Numbers, Numbers]  # of C1, along x and z
-    platform: Triple
-    turn: Numbers  # l7 times the rate of beta
-    rod1: Triple  # of C1 relative to B1
-    rod2: tuple[Numbers, Numbers]  # along x and z
-    rod3: Triple
-
-
-def _velocities(pose: Pose, rates: Triple) -> _Velocities:
-    """First derivatives of the closures, m/s."""
+def velocities(pose: Pose, rates: Triple) -> Velocities:
+    """First derivatives of the closures."""
     (c1, c2, c3), (s1, s2, s3), (u1, u2, u3), f = pose.cos, pose.sin, rates, pose.factors
     x, z, turn = _resolve(pose, f.leg1 * u1, f.leg2 * u2, f.leg3 * u3)
     px, py = x - f.sin_beta * turn, f.cos_beta * turn
-    return _Velocities(
+    return Velocities(
         (x, z),
         (px, py, z),
         turn,
@@ -190,10 +216,8 @@ def _velocities(pose: Pose, rates: Triple) -> _Velocities:
     )
 
 
-def _accelerations(
-    pose: Pose, rates: Triple, changes: Triple, v: _Velocities
-) -> tuple[Any, Any, Any, Any, Triple]:
-    """Second derivatives, m/s^2: of B1 (y, z), B2 and B3 and C1 (x, z), and P."""
+def accelerations(pose: Pose, rates: Triple, changes: Triple, v: Velocities) -> Accelerations:
+    """Second derivatives of the closures."""
     (c1, c2, c3), (s1, s2, s3), f = pose.cos, pose.sin, pose.factors
     (_, r1y, r1z), (r2x, _, r2z), (r3x, r3y, r3z) = pose.rods
     (u1, u2, u3), (a1, a2, a3) = rates, changes
@@ -210,7 +234,7 @@ def _accelerations(
         r3x * (b3x + ex) + r3y * ey + r3z * b3z - d3x * d3x - d3y * d3y - d3z * d3z,
     )
     platform = (x - f.sin_beta * turn - ex, f.cos_beta * turn - ey, z)
-    return (b1y, b1z), (b2x, b2z), (b3x, b3z), (x, z), platform
+    return Accelerations((b1y, b1z), (b2x, b2z), (b3x, b3z), (x, z), platform)
 
 
 def _resolve(pose: Pose, h1: Numbers, h2: Numbers, h3: Numbers) -> Triple:
@@ -267,7 +291,8 @@ class Dynamics:
         free_fall: Acceleration of gravity in the machine's frame, m/s^2.
 
     Raises:
-        ConfigurationError: If there is another number of factors.
+        ConfigurationError: If a mass cannot be; where it is first used, if there is another number
+            of factors.
     """
 
     geometry: Geometry = PAPER
@@ -275,6 +300,13 @@ class Dynamics:
     link_masses: tuple[float, ...] = ()
     payload: float = 0.0
     free_fall: Vector = (0.0, 0.0, GRAVITY)
+
+    def __post_init__(self) -> None:
+        """Reject masses that cannot be."""
+        if not 0 <= self.payload < math.inf:
+            raise ConfigurationError("payload", self.payload, "at least 0 kg")
+        if not all(0 < factor < math.inf for factor in self.link_masses):
+            raise ConfigurationError("link_masses", self.link_masses, "positive factors")
 
     @cached_property
     def inertia(self) -> Inertia:

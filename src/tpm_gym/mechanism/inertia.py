@@ -23,8 +23,6 @@ from tpm_gym.kinematics.geometry import Geometry
 from tpm_gym.kinematics.namespaces import Numbers
 from tpm_gym.mechanism.bodies import Link, Mechanism
 
-__all__ = ["Inertia", "Swing", "inertia_of"]
-
 X, Y, Z = range(3)
 _ROUNDING = 1e-9  # of a centre of mass, m; of two equal moments, relative
 
@@ -145,7 +143,7 @@ class _Bodies:
         self._known: set[str] = set()
 
     def require_all_known(self) -> None:
-        left = [name for name in self._links if name not in self._known]
+        left = [name for name, k in self._links.items() if k.mass and name not in self._known]
         if left:
             raise ConfigurationError("mechanism", left, "the links of mechanism.tree.build alone")
 

@@ -109,7 +109,7 @@ TORQUE_MOTOR = Motor(
     # Experts take 10 N m at most and full reversals 43, so motors at half their strength, the least
     # that may be drawn, still follow. 44 kPa of shear stress, and 18 for ever.
     peak_torque=100.0,
-    continuous_torque=40.0,  # 100 W, which 0.14 m^2 of housing give off 70 K above the room
+    continuous_torque=40.0,  # 100 W, which 0.17 m^2 of housing give off at 60 K above the room
     motor_constant=4.0,
     no_load_speed=25.0,
     gap_radius=0.060,

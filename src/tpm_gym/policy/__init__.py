@@ -3,8 +3,6 @@
 PyTorch is imported when either is first asked for, not with this package.
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:

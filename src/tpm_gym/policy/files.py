@@ -35,17 +35,6 @@ try:
 except ImportError as error:
     raise MissingPackageError(str(error.name), "policy") from error
 
-__all__ = [
-    "FORMAT",
-    "VERSION",
-    "Description",
-    "digest",
-    "files",
-    "published",
-    "read_description",
-    "read_weights",
-]
-
 FORMAT: Final = "tpm_gym.policy"
 VERSION: Final = 1
 

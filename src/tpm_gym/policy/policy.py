@@ -26,8 +26,6 @@ try:
 except ImportError as error:
     raise MissingPackageError("torch", "policy") from error
 
-__all__ = ["Policy", "load_policy"]
-
 _ACTIVATIONS = {"relu": torch.relu, "tanh": torch.tanh}
 
 

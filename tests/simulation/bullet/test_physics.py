@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import FrozenInstanceError
 from typing import Any
 
 import pytest
@@ -15,11 +14,8 @@ NAN = float("nan")
 
 
 def test_defaults_are_250_hz_physics_under_25_hz_control() -> None:
-    assert Physics().substeps == 10
-    assert Physics().solver == "direct"
+    assert (Physics().substeps, Physics().solver) == (10, "direct")
     assert Physics().time_step * Physics().substeps == pytest.approx(CONTROL_PERIOD)
-    with pytest.raises(FrozenInstanceError):
-        Physics().erp = 0.5  # type: ignore[misc]
 
 
 @pytest.mark.parametrize(("time_step", "substeps"), [(0.04, 1), (0.001, 40), (1 / 225, 9)])

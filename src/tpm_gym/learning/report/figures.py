@@ -1,7 +1,5 @@
 """The learning curve of a run, and the figures of docs/results.md."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -69,41 +67,45 @@ def _count_steps(axes: Axes) -> None:
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
 
 
-def _panels(count: int, title: str, height: float) -> tuple[Figure, list[Axes]]:
-    """A figure with some panels, row by row."""
-    columns = min(_COLUMNS, count)
-    rows = -(-count // columns)
+def _panels(
+    records: Sequence[Record], title: str, height: float
+) -> tuple[Figure, list[tuple[Axes, list[Group]]]]:
+    """A figure with a panel an id for shares of 0 to 1, row by row, and each panel's groups."""
+    ids = sorted({record["env"] for record in records})
+    columns = min(_COLUMNS, len(ids))
+    rows = -(-len(ids) // columns)
     figure = _figure(height * rows + 0.5, title)
     panels = figure.subplots(rows, columns, squeeze=False).ravel().tolist()
-    for unused in panels[count:]:
+    for unused in panels[len(ids) :]:
         unused.set_visible(False)
-    return figure, panels[:count]
+    for env_id, axes in zip(ids, panels, strict=False):
+        axes.set_title(env_id)
+        axes.set_ylim(-0.03, 1.03)
+        axes.yaxis.set_major_formatter(PercentFormatter(xmax=1))
+    groups = [grouped(r for r in records if r["env"] == env_id) for env_id in ids]
+    return figure, list(zip(panels, groups, strict=False))
 
 
 def learning_curves(records: Sequence[Record]) -> Figure:
     """Draw success against steps: a panel an id, a median and a band over seeds each method."""
-    ids = sorted({record["env"] for record in records})
     names = sorted({method(record) for record in records})
     colours = dict(zip(names, _COLOURS, strict=False))
-    figure, panels = _panels(len(ids), "Success in the evaluations during training", 2.1)
-    for env_id, axes in zip(ids, panels, strict=True):
-        for group in grouped(record for record in records if record["env"] == env_id):
+    figure, panels = _panels(records, "Success in the evaluations during training", 2.1)
+    for axes, groups in panels:
+        for group in groups:
             _draw_band(axes, group, colours[method(group[0])])
         axes.axhline(LEARNED, color=OUTLINE, linewidth=0.6, linestyle=(0, (3, 2)))
-        axes.set_title(env_id)
         axes.set_xlim(left=0)  # a curve that starts later does so because of demonstrations
         _count_steps(axes)
-        axes.set_ylim(-0.03, 1.03)
-        axes.yaxis.set_major_formatter(PercentFormatter(xmax=1))
-    panels[0].set_ylabel("successful episodes")
-    _legend(figure, panels, title="median of the seeds, band from the least to the most successful")
+    figure.axes[0].set_ylabel("successful episodes")
+    _legend(figure, "median of the seeds, band from the least to the most successful")
     return figure
 
 
-def _legend(figure: Figure, panels: Sequence[Axes], title: str | None = None) -> None:
+def _legend(figure: Figure, title: str) -> None:
     """One legend for all panels, below them."""
     entries: dict[str, Any] = {}
-    for axes in panels:
+    for axes in figure.axes:
         handles, labels = axes.get_legend_handles_labels()
         entries |= dict(zip(labels, handles, strict=True))
     figure.legend(
@@ -134,15 +136,13 @@ def _draw_band(axes: Axes, group: Group, colour: str) -> None:
 
 def penalty(records: Sequence[Record]) -> Figure:
     """Draw success and time below safe by penalty weight: a dot a seed, a bar at the mean."""
-    ids = sorted({record["env"] for record in records})
     title = "Goals that tempt towards the singularity, by penalty weight"
-    figure, panels = _panels(len(ids), title, 2.4)
+    figure, panels = _panels(records, title, 2.4)
     metrics = {
         "success_at_end": ("success", BLUE),
         "unsafe_share": ("time below safe", VERMILLION),
     }
-    for env_id, axes in zip(ids, panels, strict=True):
-        groups = grouped(record for record in records if record["env"] == env_id)
+    for axes, groups in panels:
         for place, (name, (label, colour)) in enumerate(metrics.items()):
             for index, group in enumerate(groups):
                 values = [record["tests"][TEMPTING][name]["mean"] for record in group]
@@ -152,11 +152,8 @@ def penalty(records: Sequence[Record]) -> Figure:
             axes.plot([], [], "o", color=colour, label=label)
         axes.set_xlim(-0.5, len(groups) - 0.5)
         axes.set_xticks(range(len(groups)), _weights([group[0] for group in groups]))
-        axes.set_title(env_id)
         axes.set_xlabel("penalty weight")
-        axes.set_ylim(-0.03, 1.03)
-        axes.yaxis.set_major_formatter(PercentFormatter(xmax=1))
-    _legend(figure, panels, title="a dot a seed, a bar at their mean")
+    _legend(figure, "a dot a seed, a bar at their mean")
     return figure
 
 

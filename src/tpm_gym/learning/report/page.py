@@ -1,7 +1,5 @@
 """The text of docs/results.md, from the records of runs."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Sequence
 from statistics import fmean, median
@@ -125,10 +123,10 @@ def _training(records: Group, figures: Sequence[str]) -> list[str]:
     return [*parts, "### Every run\n", _table(head, runs), *_failures(records, NOMINAL)]
 
 
-def _training_row(group: Group) -> str:
+def _training_row(group: Group) -> list[str]:
     times = [_time_to_learn(record) for record in group]
     first = group[0]
-    cells = [
+    return [
         first["env"],
         method(first),
         f"{first['steps']:,}",
@@ -140,13 +138,12 @@ def _training_row(group: Group) -> str:
         _worst(group, NOMINAL, "conditioning_min", "{:.3f}"),
         _mean(group, NOMINAL, "unsafe_share", "{:.1%}"),
     ]
-    return " | ".join(cells)
 
 
-def _run_row(record: Record) -> str:
+def _run_row(record: Record) -> list[str]:
     steps, minutes = _time_to_learn(record)
     walls = record["evaluations"]["wall_seconds"]
-    cells = [
+    return [
         record["env"],
         method(record),
         str(record["seed"]),
@@ -158,7 +155,6 @@ def _run_row(record: Record) -> str:
         _mean([record], NOMINAL, "unsafe_share", "{:.1%}"),
         _worst([record], NOMINAL, "fk_error_max", "{:.3f} mm", 1e3),
     ]
-    return " | ".join(cells)
 
 
 def _failures(records: Group, test: str) -> list[str]:
@@ -186,9 +182,8 @@ def _penalty(records: Group, figures: Sequence[str]) -> list[str]:
         "id | method | steps | penalty weight | seeds | success, IQM | time below safe (seeds) | "
         "smallest conditioning | observed P off | torque, RMS | torque, peak"
     )
-    rows = []
-    for group in grouped(records):
-        cells = [
+    rows = [
+        [
             group[0]["env"],
             method(group[0]),
             f"{group[0]['steps']:,}",
@@ -201,7 +196,8 @@ def _penalty(records: Group, figures: Sequence[str]) -> list[str]:
             _mean(group, TEMPTING, "torque_rms", "{:.1f} N m"),
             _worst(group, TEMPTING, "torque_peak", "{:.0f} N m"),
         ]
-        rows.append(" | ".join(cells))
+        for group in grouped(records)
+    ]
     text = (
         "## Does the penalty work?\n\nTrained and tested on goals that tempt towards the "
         "singularity (`--goals tempting`): goals, and pucks, lie just within the safe threshold, "
@@ -249,7 +245,7 @@ def _robustness(records: Group) -> list[str]:
             _iqm([success(record, name) for record in group]) if name in _of(group) else NONE
             for group in groups
         ]
-        rows.append(" | ".join([name.replace("_", " "), ", ".join(sorted(changes)), *cells]))
+        rows.append([name.replace("_", " "), ", ".join(sorted(changes)), *cells])
     text = (
         "## Robustness\n\nThe policies above, trained on the nominal machine alone, on others "
         f"(success, IQM over seeds; {_episodes(records, names)} episodes a seed, "
@@ -299,9 +295,9 @@ def _machine(record: Record) -> str:
 # -- cells ------------------------------------------------------------------------------------
 
 
-def _table(head: str, rows: Sequence[str]) -> str:
-    count = head.count("|") + 1
-    lines = [head, " | ".join(["---"] * count), *rows]
+def _table(head: str, rows: Sequence[Sequence[str]]) -> str:
+    rule = ["---"] * (head.count("|") + 1)
+    lines = [head, *(" | ".join(cells) for cells in [rule, *rows])]
     return "\n".join(f"| {line} |" for line in lines) + "\n"
 
 

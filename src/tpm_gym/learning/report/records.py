@@ -5,15 +5,14 @@ in ``tests/``, which a study has written there). ``write`` needs the records alo
 can do it. Runs that did not finish are kept.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from tpm_gym.learning import provenance
 from tpm_gym.learning.errors import ConfigError
+from tpm_gym.learning.report.page import Record, page
 from tpm_gym.learning.run_folder import CONFIG_FILE, TESTS, WHOLE, evaluations
 
 RECORDS: Final = Path("docs", "results")
@@ -37,8 +36,6 @@ _KEPT: Final = (
 )
 _CURVES: Final = ("success_at_end", "return", "unsafe_share")
 _NOT_KEPT: Final = ("records", "versions", "machine", "policy", "env")
-
-Record = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -131,8 +128,7 @@ def write(config: Write) -> list[Path]:
     Raises:
         ConfigError: There are no records, or one is damaged.
     """
-    from tpm_gym.learning.report.figures import draw
-    from tpm_gym.learning.report.page import page
+    from tpm_gym.learning.report.figures import draw  # here, since it imports matplotlib
 
     paths = sorted(config.records.glob(WHOLE))
     if not paths:

@@ -1,0 +1,109 @@
+"""What the drives make of the same episodes: success, singularities passed, tracking, torques.
+
+    python benchmarks/bench_drives.py --episodes 1000
+
+Rows are the expert and random actions with ideal drives, and with servos of several stiffnesses and
+feed-forwards; where the stiffness is multiplied, the damping is by its root, so that motions are as
+damped, and faster. Angles and torques are those at the end of each control step.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+
+import tpm_gym  # noqa: F401 - the ids
+from tpm_gym.simulation import Servo
+from tpm_gym.simulation.drives import FEEDFORWARDS, Reference
+from tpm_gym.tasks import Expert
+
+FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
+
+
+class Row(NamedTuple):
+    """What came of some episodes."""
+
+    successes: int
+    singular: int
+    errors: list[float]  # rad
+    torques: list[float]  # N m
+
+
+def drives() -> Iterator[tuple[str, Servo | None]]:
+    """All drives, by name."""
+    yield "ideal", None
+    for feedforward in reversed(FEEDFORWARDS):
+        for factor in FACTORS:
+            stiffness, damping = Servo.stiffness * factor, Servo.damping * factor**0.5
+            yield f"{feedforward}, {stiffness:g} N m/rad", Servo(stiffness, damping, feedforward)
+
+
+def play(env_id: str, engine: str, drive: Servo | None, scripted: bool, episodes: int) -> Row:
+    """Play the episodes of the seeds from 0 on."""
+    env: Any = gym.make(env_id, engine=engine, drive=drive)
+    expert = Expert(env) if scripted else None
+    simulated, wanted = env.unwrapped.simulation.engine, [(0.0, 0.0, 0.0)]
+    advance = simulated.advance
+
+    def noted(references: Sequence[Reference], *arguments: Any) -> None:
+        wanted[0] = references[-1].theta
+        advance(references, *arguments)
+
+    simulated.advance = noted
+    row = Row(0, 0, [], [])
+    for seed in range(episodes):
+        observation, info = env.reset(seed=seed)
+        rng = np.random.default_rng(seed)
+        if expert is not None:
+            expert.reset(observation)
+        done = False
+        while not done:
+            action = rng.uniform(-1, 1, env.action_space.shape)
+            if expert is not None:
+                action = expert.act(observation)
+            observation, _, terminated, truncated, info = env.step(action)
+            done = terminated or truncated
+            motors = simulated.motors()
+            row.errors.extend(np.abs(np.subtract(motors.theta, wanted[0])).tolist())
+            row.torques.extend(np.abs(motors.torque).tolist())
+        passed = info["assembly_mode_changed"] or info["working_mode_changed"]
+        row = row._replace(
+            successes=row.successes + bool(info["is_success"]), singular=row.singular + bool(passed)
+        )
+    env.close()
+    return row
+
+
+def line(name: str, row: Row) -> str:
+    """A row of the table, in mrad and N m."""
+    numbers = [
+        f"{scale * value:.3g}"
+        for scale, values in ((1e3, row.errors), (1.0, row.torques))
+        for value in (np.sqrt(np.mean(np.square(values))), np.max(values))
+    ]
+    cells = [name, str(row.successes), str(row.singular), *numbers]
+    return f"| {' | '.join(cells)} |"
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description="What the drives make of the same episodes.")
+    parser.add_argument("--env", default="TPMReach-v0")
+    parser.add_argument("--engine", default="pybullet")
+    parser.add_argument("--episodes", type=int, default=100)
+    options = parser.parse_args(argv)
+    print(f"{options.env}, {options.engine}, {options.episodes} episodes a row")
+    print("| actions and drive | successes | singular | error: RMS | max | torque: RMS | max |")
+    print("| --- | --- | --- | --- | --- | --- | --- |")
+    for name, drive in drives():
+        for actor in ("expert", "random"):
+            row = play(options.env, options.engine, drive, actor == "expert", options.episodes)
+            print(line(f"{actor}, {name}", row), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,395 @@
+"""The closed-form dynamics are those of the bodies, and of mechanics.
+
+Independent of the formulas: the tree of links walked joint by joint (support/motion.py), virtual
+work by differences (Machine.torque), and Pinocchio on the URDF.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import oracle
+import pytest
+import torch
+from examples import examples
+from machines import anywhere, each_machine
+from motion import IDLE, Bodies
+
+from tpm_gym.arrays import FloatArray
+from tpm_gym.errors import ConfigurationError, InputError, SingularityError, UnreachableError
+from tpm_gym.kinematics import ASSEMBLY_MODES, AssemblyMode, forward_all, inverse_all, jacobian
+from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
+from tpm_gym.mechanism import PAPER_TPM, TPM, Machine
+from tpm_gym.mechanism.bodies import Closure, Mechanism, Solid
+from tpm_gym.mechanism.dynamics import Dynamics
+from tpm_gym.mechanism.inertia import inertia_of
+from tpm_gym.mechanism.tree import ACTUATED_JOINTS, build, joint_angles
+from tpm_gym.mechanism.urdf import urdf_text
+
+LINKS = len(build().links) - 1
+HOME = np.array(PAPER_TPM.inverse(PAPER_TPM.home))
+LOADED = Dynamics(
+    link_masses=tuple(np.linspace(0.5, 2.0, LINKS)), payload=0.3, free_fall=(1.0, -2.0, 9.0)
+)
+
+
+def drawn(machine: TPM, count: int, seed: int = 0) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Angles all over the region, rates and accelerations, (count, 3)."""
+    rng = np.random.default_rng(seed)
+    theta = np.array([machine.inverse(point) for point in anywhere(machine, count, seed)])
+    return theta, rng.normal(size=theta.shape), 10 * rng.normal(size=theta.shape)
+
+
+def regular(g: Geometry, seed: int) -> Iterator[tuple[FloatArray, Dynamics]]:
+    """Postures of any working mode, in every assembly mode, away from singularities.
+
+    The nearer, the larger what the differences miss, with the square of their step.
+    """
+    rng = np.random.default_rng(seed)
+    solutions = inverse_all(oracle.reachable_points(rng, 1, g), g)
+    for theta in solutions.theta[solutions.valid][:4]:
+        for branch in ASSEMBLY_MODES:
+            if forward_all(theta, g).valid[branch.index]:
+                f = jacobian.factors(theta, branch, g)
+                shares = *(f.parallel / (1, g.l4, g.l4**2)), f.constraint / g.l4
+                if np.abs(shares).min() > 0.2:
+                    masses = tuple(rng.uniform(0.5, 2.0, LINKS).tolist())
+                    yield theta, replace(LOADED, geometry=g, branch=branch, link_masses=masses)
+
+
+def close(found: Any, expected: Any, share: float) -> bool:
+    """Whether two arrays agree to a share of the largest entry."""
+    return bool(np.abs(np.subtract(found, expected)).max() <= share * np.abs(expected).max())
+
+
+# The bodies
+
+
+@pytest.mark.parametrize("g", [PAPER, WIDE], ids=["paper", "wide"])
+def test_inertia_and_weight_are_those_of_the_bodies_in_every_assembly_mode(g: Geometry) -> None:
+    branches = set().union(*(branches_with_those_of_the_bodies(g, seed) for seed in range(8)))
+    assert branches == set(ASSEMBLY_MODES)
+
+
+@examples(25, oracle.geometries(), oracle.seeds())
+def test_inertia_and_weight_are_those_of_the_bodies_for_any_lengths(g: Geometry, seed: int) -> None:
+    branches_with_those_of_the_bodies(g, seed)
+
+
+def branches_with_those_of_the_bodies(g: Geometry, seed: int) -> set[AssemblyMode]:
+    found = set()
+    for theta, dynamics in regular(g, seed):
+        bodies = Bodies(dynamics)
+        assert close(dynamics.mass_matrix(theta), bodies.mass_matrix(theta), 1e-6)
+        assert close(dynamics.gravity(theta), bodies.weights(theta), 1e-6)
+        found.add(dynamics.branch)
+    return found
+
+
+@each_machine
+def test_torques_are_those_of_virtual_work_by_differences(machine: TPM) -> None:
+    # What is left is the differences' (2e-4 next to y = 0 in PAPER_TPM) and end link 10's roll.
+    for theta, rate, change in zip(*drawn(machine, 10), strict=True):
+        motion = tuple(theta), tuple(rate), tuple(change)
+        assert close(machine.torque(*motion), Machine.torque(machine, *motion), 1e-3)
+    theta, rate, change = (tuple(each[0]) for each in drawn(machine, 1, seed=4))
+    assert close(
+        machine.torque(theta, rate, change), Machine.torque(machine, theta, rate, change), 1e-5
+    )
+
+
+def test_a_change_of_a_body_is_felt() -> None:
+    rotor = Solid("cylinder", (0.05, 0.03, 0.0), (0.0, 0.0, 0.0), 7850.0, axis="x")
+    mechanism = build()
+    links = [
+        replace(link, solids=(*link.solids, rotor)) if link.name == "arm_2" else link
+        for link in mechanism.links
+    ]
+    before = inertia_of(mechanism, PAPER)
+    after = inertia_of(replace(mechanism, links=tuple(links)), PAPER)
+    added = np.subtract(after.motors, before.motors)
+    np.testing.assert_allclose(added, [rotor.inertia[0], 0, 0], atol=1e-15)
+    np.testing.assert_allclose(after.weights, before.weights, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("name", "wanted", "solid"),
+    [
+        ("arm_5", "on its axis", Solid("box", (0.1, 0.1, 0.1), (0.1, 0.0, 0.02), 2700.0)),
+        ("rod_4a", "equal moments", Solid("box", (0.02, 0.1, 0.01), (0.0, 0.4, 0.0), 2700.0)),
+        (
+            "rod_11b",
+            "on its axis",
+            Solid("cylinder", (0.01, 0.1, 0.0), (0.4, 0.01, 0.0), 2700.0, axis="x"),
+        ),
+        (
+            "rod_6",
+            "on its axis",
+            Solid("cylinder", (0.01, 0.1, 0.0), (0.4, 0.0, 0.01), 2700.0, axis="x"),
+        ),
+        ("link_7", "on its axis", Solid("box", (0.01, 0.01, 0.01), (0.0, 0.02, 0.0), 2700.0)),
+        ("end_link_9", "on its axis", Solid("box", (0.01, 0.01, 0.01), (0.02, 0.0, 0.0), 2700.0)),
+    ],
+)
+def test_bodies_for_which_the_formulas_do_not_hold_are_refused(
+    name: str, wanted: str, solid: Solid
+) -> None:
+    mechanism = build()
+    links = [
+        replace(link, solids=(*link.solids, solid)) if link.name == name else link
+        for link in mechanism.links
+    ]
+    with pytest.raises(ConfigurationError, match=f"{name}.*{wanted}"):
+        inertia_of(replace(mechanism, links=tuple(links)), PAPER)
+
+
+def test_links_and_factors_that_are_not_the_mechanisms_are_refused() -> None:
+    mechanism = build()
+    other = replace(mechanism.link("cup"), name="gripper")
+    with pytest.raises(ConfigurationError, match="gripper"):
+        inertia_of(replace(mechanism, links=(*mechanism.links, other)), PAPER)
+    with pytest.raises(ConfigurationError, match=f"{LINKS} moving links"):
+        Dynamics(link_masses=(1.0, 2.0)).gravity(HOME)
+    with pytest.raises(ConfigurationError, match="payload"):
+        Dynamics(payload=-0.1)
+    with pytest.raises(ConfigurationError, match="link_masses"):
+        Dynamics(link_masses=(0.0,) * LINKS)
+
+
+# Mechanics
+
+
+@each_machine
+def test_the_mass_matrix_is_symmetric_and_positive(machine: TPM) -> None:
+    theta, rate, _ = drawn(machine, 50)
+    mass = machine.dynamics.mass_matrix(theta)
+    np.testing.assert_array_equal(mass, np.swapaxes(mass, -1, -2))
+    assert (np.linalg.eigvalsh(mass) > 0).all()
+    twice = np.einsum("ni,nij,nj->n", rate, mass, rate)
+    np.testing.assert_allclose(machine.dynamics.energy(theta, rate).kinetic, twice / 2, rtol=1e-10)
+
+
+@each_machine
+def test_the_rate_of_the_mass_matrix_less_twice_c_is_skew(machine: TPM) -> None:
+    theta, rate, _ = drawn(machine, 50)
+    dynamics, step = machine.dynamics, 1e-6
+    ahead, behind = (dynamics.mass_matrix(theta + by * rate) for by in (step, -step))
+    coriolis = dynamics.coriolis(theta, rate)
+    skew = (ahead - behind) / (2 * step) - 2 * coriolis
+    scale = np.abs(coriolis).max(axis=(-1, -2), keepdims=True)
+    assert (np.abs(skew + np.swapaxes(skew, -1, -2)) < 1e-5 * scale).all()
+
+
+@each_machine
+def test_the_parts_of_the_torque_add_up_and_forward_undoes_it(machine: TPM) -> None:
+    theta, rate, change = drawn(machine, 50)
+    dynamics = replace(machine.dynamics, payload=0.5)
+    torque = dynamics.torque(theta, rate, change)
+    parts = (
+        (dynamics.mass_matrix(theta) @ change[..., None])[..., 0]
+        + (dynamics.coriolis(theta, rate) @ rate[..., None])[..., 0]
+        + dynamics.gravity(theta)
+    )
+    assert close(torque, parts, 1e-11)
+    assert close(dynamics.forward(theta, rate, torque), change, 1e-9)
+
+
+@each_machine
+def test_the_power_of_the_torque_is_the_rate_of_the_energy(machine: TPM) -> None:
+    theta, rate, change = drawn(machine, 50)
+    dynamics = replace(machine.dynamics, payload=0.3, free_fall=LOADED.free_fall)
+    step = 1e-6
+
+    def energy(t: float) -> FloatArray:
+        at = theta + t * rate + t**2 / 2 * change
+        return np.sum(dynamics.energy(at, rate + t * change), axis=0)
+
+    power = (dynamics.torque(theta, rate, change) * rate).sum(axis=-1)
+    np.testing.assert_allclose(
+        (energy(step) - energy(-step)) / (2 * step), power, rtol=1e-5, atol=1e-5
+    )
+
+
+def energy_gained_in_free_fall(machine: TPM, steps: int) -> tuple[float, float]:
+    """By Runge and Kutta's method over 0.15 s without motors, J; and the kinetic energy then."""
+    dynamics, period = machine.dynamics, 0.15 / steps
+    x, y, _ = machine.home
+    state = np.concatenate([machine.inverse((x, y, machine.region.low[2])), np.zeros(3)])
+
+    def slope(at: FloatArray) -> FloatArray:
+        return np.concatenate([at[3:], dynamics.forward(at[:3], at[3:], np.zeros(3))])
+
+    start = sum(dynamics.energy(state[:3], state[3:]))
+    for _ in range(steps):
+        one = slope(state)
+        two = slope(state + period / 2 * one)
+        three = slope(state + period / 2 * two)
+        state = state + period / 6 * (one + 2 * two + 2 * three + slope(state + period * three))
+    kinetic, potential = dynamics.energy(state[:3], state[3:])
+    return float(kinetic + potential - start), float(kinetic)
+
+
+@each_machine
+def test_free_motion_keeps_its_energy_to_the_order_of_the_integrator(machine: TPM) -> None:
+    errors = []
+    for steps in (15, 30, 60):
+        gained, kinetic = energy_gained_in_free_fall(machine, steps)
+        errors.append(abs(gained) / kinetic)
+    assert errors[-1] < 1e-8  # measured: 8e-10
+    for coarse, fine in itertools.pairwise(errors):
+        assert coarse / fine == pytest.approx(16, rel=0.1)
+
+
+# Another library
+
+
+def loaded_by_pinocchio(mechanism: Mechanism) -> tuple[Any, Callable[..., tuple[Any, Any]]]:
+    """The tree from its URDF, and a function of (data, q, v, a): the closures' Jacobian (12, nv)
+    and by how much the accelerations of their two sides differ (12,).
+    """
+    pin = pytest.importorskip("pinocchio")
+    model = pin.buildModelFromXML(urdf_text(mechanism))
+
+    def frame(link: str, point: tuple[float, ...]) -> int:
+        at = model.frames[model.getFrameId(link)]
+        place = at.placement * pin.SE3(np.eye(3), np.array(point))
+        name = f"{link} {point}"
+        return int(model.addFrame(pin.Frame(name, at.parentJoint, 0, place, pin.OP_FRAME)))
+
+    def pair(closure: Closure) -> tuple[int, int]:
+        return frame(closure.link_a, closure.point_a), frame(closure.link_b, closure.point_b)
+
+    pairs = [pair(closure) for closure in mechanism.closures]
+    axes = pin.LOCAL_WORLD_ALIGNED
+
+    def gaps(data: Any, *state: FloatArray) -> tuple[FloatArray, FloatArray]:
+        pin.forwardKinematics(model, data, *state)
+        pin.computeJointJacobians(model, data, state[0])
+        pin.updateFramePlacements(model, data)
+
+        def columns(at: int) -> FloatArray:
+            return np.array(pin.getFrameJacobian(model, data, at, axes)[:3])
+
+        def acceleration(at: int) -> FloatArray:
+            return np.array(pin.getFrameClassicalAcceleration(model, data, at, axes).linear)
+
+        return (
+            np.concatenate([columns(one) - columns(other) for one, other in pairs]),
+            np.concatenate([acceleration(one) - acceleration(other) for one, other in pairs]),
+        )
+
+    return model, gaps
+
+
+@each_machine
+@pytest.mark.parametrize("roll", [0.0, 30.0])
+def test_torques_are_those_of_pinocchio_on_the_urdf(machine: TPM, roll: float) -> None:
+    # Inverse dynamics of the open tree, less the forces in the closures: what is left is the
+    # motors'. End link 10 rolls as it likes. Measured: 2e-9 of the largest, the digits of the URDF.
+    pin = pytest.importorskip("pinocchio")
+    model, gaps = loaded_by_pinocchio(machine.mechanism)
+    model.gravity.linear = np.array(machine.mount.free_fall)
+    data = model.createData()
+    names = [name for name in model.names if name != "universe"]
+    at = [model.joints[model.getJointId(name)].idx_v for name in ACTUATED_JOINTS]
+    idle = [model.joints[model.getJointId(name)].idx_v for name in (IDLE, "cup_slide")]
+    passive = [k for k in range(model.nv) if k not in at + idle]
+    for theta, rate, change in zip(*drawn(machine, 10), strict=True):
+        angles = joint_angles(theta, machine.assembly_mode, machine.geometry)
+        v = np.zeros(model.nv)
+        v[[model.joints[model.getJointId(name)].idx_v for name in names]] = [
+            angles[name] for name in names
+        ]
+        q = pin.integrate(model, pin.neutral(model), v)
+        v, a = np.zeros(model.nv), np.zeros(model.nv)
+        v[at], v[idle[0]], a[at] = rate, roll, change
+        columns, _ = gaps(data, q, v, a)
+        v[passive] = np.linalg.lstsq(columns[:, passive], -columns @ v)[0]
+        a[passive] = np.linalg.lstsq(columns[:, passive], -gaps(data, q, v, a)[1])[0]
+        efforts = pin.rnea(model, data, q, v, a)
+        forces = np.linalg.lstsq(columns[:, passive].T, efforts[passive])[0]
+        expected = (efforts - columns.T @ forces)[at]
+        found = machine.torque(tuple(theta), tuple(rate), tuple(change))
+        assert close(found, expected, 1e-8)
+
+
+# Points, batches and tensors
+
+
+def calls(d: Dynamics) -> list[tuple[Callable[..., Any], int]]:
+    """Functions of one to three arrays."""
+    return [
+        (d.torque, 3),
+        (d.forward, 3),
+        (d.coriolis, 2),
+        (lambda *state: np.stack(d.energy(*state), axis=-1), 2),
+        (d.gravity, 1),
+        (d.mass_matrix, 1),
+    ]
+
+
+@each_machine
+def test_batches_are_their_rows(machine: TPM) -> None:
+    states = [each.reshape(2, 3, 3) for each in drawn(machine, 6)]
+    for function, count in calls(machine.dynamics):
+        batch = function(*states[:count])
+        for index in np.ndindex(2, 3):
+            one = function(*(state[index] for state in states[:count]))
+            assert close(batch[index], one, 1e-11)
+    assert machine.torque(*(tuple(state[1, 2]) for state in states)) == tuple(
+        machine.dynamics.torque(*(state[1, 2] for state in states))
+    )
+
+
+def test_states_broadcast_and_may_be_none() -> None:
+    theta, rate, _ = drawn(PAPER_TPM, 4)
+    dynamics = PAPER_TPM.dynamics
+    at_rest = dynamics.torque(theta, np.zeros(3), np.zeros(3))
+    assert close(at_rest, dynamics.gravity(theta), 1e-13)
+    assert dynamics.coriolis(HOME, rate).shape == (4, 3, 3)
+    empty = np.empty((0, 3))
+    assert dynamics.torque(empty, empty, empty).shape == (0, 3)
+
+
+@each_machine
+def test_tensors_have_the_derivatives_of_the_values(machine: TPM) -> None:
+    states = [torch.tensor(each, requires_grad=True) for each in drawn(machine, 2)]
+    dynamics = replace(machine.dynamics, payload=0.2)
+    for function, count in (
+        (dynamics.torque, 3),
+        (dynamics.forward, 3),
+        (dynamics.coriolis, 2),
+        (lambda *state: torch.stack([*dynamics.energy(*state)]), 2),
+        (dynamics.mass_matrix, 1),
+    ):
+        assert torch.autograd.gradcheck(function, states[:count], rtol=1e-3)
+    arrays = [each.detach().numpy() for each in states]
+    found = dynamics.torque(*states).detach().numpy()
+    assert close(found, dynamics.torque(*arrays), 1e-12)
+    mixed = dynamics.torque(states[0], *arrays[1:])
+    assert close(mixed.detach().numpy(), found, 1e-15)
+
+
+# What there is no torque for
+
+
+def test_states_without_a_torque_are_refused() -> None:
+    dynamics, rest = PAPER_TPM.dynamics, np.zeros(3)
+    apart = np.array([0.0, np.pi, -2.0])
+    x, _, z = PAPER_TPM.home
+    flat = np.array(PAPER_TPM.inverse((x, 0.0, z)))
+    for wrong, error in ((apart, UnreachableError), (flat, SingularityError)):
+        with pytest.raises(error):
+            dynamics.torque(wrong, rest, rest)
+        with pytest.raises(error):
+            dynamics.torque([HOME, wrong], rest, rest)
+        with pytest.raises(error):
+            PAPER_TPM.torque(tuple(wrong), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    with pytest.raises(InputError):
+        dynamics.torque(HOME, [np.nan, 0.0, 0.0], rest)
+    with pytest.raises(InputError):
+        dynamics.forward(HOME, rest, [1.0, 2.0])
