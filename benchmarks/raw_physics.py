@@ -1,9 +1,10 @@
 """The engine's own work in an episode, recorded once and repeated without anything around it.
 
 What a control step asks of the engine is taken down as calls of pybullet: a target for each motor
-and one ``stepSimulation`` a time step, and the constraint of the vacuum cup when it takes or lets
-go. Repeated on another environment from the same start, the same calls do the same physics to the
-last bit, which :func:`replay` checks; its time is the floor of ``env.step``. Two floors:
+and one ``stepSimulation`` a time step, the constraint of the vacuum cup when it takes or lets go,
+and the direction of the friction. Repeated on another environment from the same start, the same
+calls do the same physics to the last bit, which :func:`replay` checks; its time is the floor of
+``env.step``. Two floors:
 
 * physics: the ``stepSimulation`` calls alone;
 * with motors: these and the motor commands, which any controller in Python has to send as well.
@@ -12,10 +13,11 @@ last bit, which :func:`replay` checks; its time is the floor of ``env.step``. Tw
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import groupby
 from typing import Any
 
 import gymnasium as gym
@@ -30,6 +32,7 @@ __all__ = ["Floor", "Tape", "record", "recording", "replay"]
 STEP = "stepSimulation"
 MOTORS = ("setJointMotorControl2", "setJointMotorControlArray")
 GRASP = ("createConstraint", "changeConstraint", "removeConstraint", "setCollisionFilterPair")
+CONTACT = (*GRASP, "changeDynamics")
 
 
 @dataclass
@@ -98,7 +101,7 @@ class Recorder:
 @contextmanager
 def recording(recorder: Recorder) -> Iterator[None]:
     """Put the recorder's functions in the place of the engine's."""
-    real = {name: getattr(pybullet, name) for name in (STEP, *MOTORS, *GRASP)}
+    real = {name: getattr(pybullet, name) for name in (STEP, *MOTORS, *CONTACT)}
     for name, function in real.items():
         setattr(pybullet, name, recorder.wrap(name, function))
     try:
@@ -142,19 +145,20 @@ def replay(env: gym.Env[Any, Any], tape: Tape, seed: int) -> Floor:
     env.reset(seed=seed)
     physics = with_motors = 0.0
     for index, calls in enumerate(tape.steps):
-        places = [place for place, call in enumerate(calls) if call.name not in GRASP]
-        player.grasp(calls[: places[0]])
-        bound = [(player.bind(calls[place]), calls[place].name == STEP) for place in places]
-        begun = time.perf_counter()
-        for function, is_step in bound:
-            if is_step:
-                started = time.perf_counter()
-                function()
-                physics += time.perf_counter() - started
-            else:
-                function()
-        with_motors += time.perf_counter() - begun
-        player.grasp(calls[places[-1] + 1 :])
+        for of_contact, group in groupby(calls, key=lambda call: call.name in CONTACT):
+            if of_contact:
+                player.touch(group)
+                continue
+            bound = [(player.bind(call), call.name == STEP) for call in group]
+            begun = time.perf_counter()
+            for function, is_step in bound:
+                if is_step:
+                    started = time.perf_counter()
+                    function()
+                    physics += time.perf_counter() - started
+                else:
+                    function()
+            with_motors += time.perf_counter() - begun
         if not np.array_equal(_where(env, fresh=True), tape.ends[index], equal_nan=True):
             raise RuntimeError(
                 f"the repeated physics differ from the recorded ones at step {index}"
@@ -185,8 +189,8 @@ class _Player:
             physicsClientId=self._number,
         )
 
-    def grasp(self, calls: list[Call]) -> None:
-        """Take or let go as recorded."""
+    def touch(self, calls: Iterable[Call]) -> None:
+        """Take, let go, and turn the friction as recorded."""
         for call in calls:
             if call.name == "createConstraint":
                 self._constraints[call.result] = self.bind(call)()
@@ -198,7 +202,8 @@ class _Player:
                     number = self._constraints[recorded]
                 self.bind(Call(call.name, (number, *others), call.options, None))()
             else:
-                self._pair = call.arguments
+                if call.name == "setCollisionFilterPair":
+                    self._pair = call.arguments
                 self.bind(call)()
 
     def let_go(self) -> None:

@@ -60,21 +60,22 @@ class Cup:
         self._near: list[int] = []
         self.grip = Grip()
 
-    def look(self, on: bool) -> None:
+    def look(self) -> list[int]:
         """Before a control period: which objects the cup may come to."""
         self._near = []
-        if on and self._bodies:
+        if self._bodies:
             lip, _ = self._robot.cup()
             place = self._client.getBasePositionAndOrientation
             for index, (body, block) in enumerate(zip(self._bodies, self._blocks, strict=True)):
                 size = math.hypot(block.width, block.width, block.height) / 2
                 if math.dist(place(body)[0], lip) < _REACH + size:
                     self._near.append(index)
+        return self._near
 
     def suck(self, on: bool) -> None:
         """After a time step: let the air in or out, hold on or drop, take what is touched."""
         hold, pose = self.grip
-        if hold.which < 0 and not hold.vacuum and not self._near:
+        if hold.which < 0 and not hold.vacuum and not (on and self._near):
             return
         load = _NOTHING if pose is None else self._load()
         touched = self._touched() if on and pose is None else -1

@@ -13,6 +13,7 @@ from tpm_gym.arrays import Vector
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.bullet.client import Client
 from tpm_gym.simulation.bullet.cup import Cup, Grip
+from tpm_gym.simulation.bullet.friction import Friction
 from tpm_gym.simulation.bullet.physics import Physics
 from tpm_gym.simulation.bullet.robot import Robot
 from tpm_gym.simulation.bullet.scenery import Scenery
@@ -81,6 +82,10 @@ class BulletEngine:
         self.bodies = self._scenery.bodies
         self._cup = Cup(self.client, self.robot, self.bodies, scene.objects, self.physics.time_step)
 
+        self._friction = Friction(
+            self.client, self.robot, self.bodies, self._scenery.tables, scene.objects
+        )
+
     def _empty(self) -> None:
         """Take everything out of the client; a window stays, else a new client leaks least."""
         if self._gui:
@@ -97,6 +102,7 @@ class BulletEngine:
             self._servos.alter(plant)
             self.robot.rub(plant.joint_friction)
         self._scenery.alter(plant.puck_mass, plant.friction)
+        self._friction.alter(plant.friction)
 
     def place(self, joints: Mapping[str, float], objects: Sequence[Pose]) -> None:
         """See the protocol."""
@@ -105,6 +111,7 @@ class BulletEngine:
         if self._servos is not None:
             self._servos.rest(self.robot.motors().theta)
         self._scenery.place([(pose, Twist()) for pose in objects])
+        self._friction.reset()
 
     def show_goal(self, markers: Sequence[Vector]) -> None:
         """See the protocol."""
@@ -113,11 +120,12 @@ class BulletEngine:
     def advance(self, references: Sequence[Reference], vacuum: bool) -> None:
         """See the protocol."""
         robot, servos, cup = self.robot, self._servos, self._cup
-        step = self.client.stepSimulation
-        cup.look(vacuum)
+        friction, step = self._friction, self.client.stepSimulation
+        friction.look(cup.look())
         if servos is not None and references:
             servos.begin(references[0].theta)
         for reference in references:
+            friction.turn(cup.grip.hold.which)
             if servos is None:
                 robot.drive(reference.theta)
             else:
@@ -162,6 +170,7 @@ class BulletEngine:
         if self._servos is not None:
             self._servos.memory = snapshot.drives
         self._scenery.place(snapshot.objects)
+        self._friction.reset()
         self._cup.take(snapshot.grip)
 
     def picture(self, width: int, height: int) -> NDArray[np.uint8]:

@@ -35,14 +35,20 @@ class Scenery:
 
     Attributes:
         bodies: Numbers of the objects in the client, in the order of the scene.
+        tables: Numbers of their tables: one for each object, all in the same place. The first is
+            there without objects too, and the one that is drawn.
     """
 
     def __init__(self, client: Client, scene: Scene, table: tuple[float, float]) -> None:
         """Load it."""
         self._client = client
-        top = self._add_box((*table, 0.02), (0.0, 0.0, -0.02), _TABLE_COLOUR)
-        # The engine multiplies the friction of both bodies.
-        client.changeDynamics(top, -1, lateralFriction=1.0)
+        self._blocks = scene.objects
+        slab = (*table, 0.02), (0.0, 0.0, -0.02)
+        self.tables = [self._add_box(*slab, _TABLE_COLOUR)]
+        self.tables += [self._add_box(*slab) for _ in self._blocks[1:]]
+        for top in self.tables:
+            # The engine multiplies the friction of both bodies.
+            client.changeDynamics(top, -1, lateralFriction=1.0)
         self._add_box((2.0, 2.0, 0.02), (0.0, 0.0, -0.52), _FLOOR_COLOUR)
         shape = client.createVisualShape(
             client.GEOM_SPHERE, radius=scene.marker_radius, rgbaColor=_MARKER_COLOUR
@@ -50,14 +56,18 @@ class Scenery:
         self._markers = [
             client.createMultiBody(baseVisualShapeIndex=shape) for _ in range(scene.markers)
         ]
-        self._blocks = scene.objects
-        self.bodies = [self._add_block(block) for block in scene.objects]
+        self.bodies = [self._add_block(block) for block in self._blocks]
+        for index, body in enumerate(self.bodies):
+            for other, top in enumerate(self.tables):
+                client.setCollisionFilterPair(body, top, -1, -1, int(index == other))
 
-    def _add_box(self, half: Vector, centre: Vector, colour: Colour) -> int:
-        """A static box."""
+    def _add_box(self, half: Vector, centre: Vector, colour: Colour | None = None) -> int:
+        """A static box; not drawn where it has no colour."""
         client = self._client
         solid = client.createCollisionShape(client.GEOM_BOX, halfExtents=half)
-        drawn = client.createVisualShape(client.GEOM_BOX, halfExtents=half, rgbaColor=colour)
+        drawn = -1
+        if colour is not None:
+            drawn = client.createVisualShape(client.GEOM_BOX, halfExtents=half, rgbaColor=colour)
         body: int = client.createMultiBody(
             baseCollisionShapeIndex=solid, baseVisualShapeIndex=drawn, basePosition=centre
         )

@@ -1,0 +1,149 @@
+"""Coulomb's cone for the direct solver, whose friction is a box with axes of its own.
+
+The solver bounds the friction of a contact along two directions, each by mu N: at 45 degrees to
+them it is sqrt(2) too strong, and it does not point against the slip. On a level face the
+directions are the world's x and y, and the engine can scale them for each body. Scaled by the
+direction in which the contact slips, the box's corner lies on the cone, opposite to the slip;
+where it sticks, each bound is what the cone leaves beside the other force of the last time step.
+
+What is left, measured in ``tests/simulation/bullet/test_friction.py``: a direction lags a time
+step; the weaker bound never falls below :data:`_LEAST`; all points of a contact share the direction
+of its middle, so that a block which spins on the spot finds a little too little; and contacts
+between objects, or with upright faces, keep the box.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import pybullet
+
+from tpm_gym.mechanism.cup import CUP
+from tpm_gym.simulation.bullet.client import Client
+from tpm_gym.simulation.bullet.robot import Robot
+from tpm_gym.simulation.state import Block
+
+__all__ = ["Friction"]
+
+_LEAST = 0.02  # of the scales, so that no row of the solver vanishes
+_FAST = 1e-2  # m/s; beyond that it slips, whatever the last force was
+_SLIP = 1e-5  # m/s; below that the last force has the direction of the next
+_STICKS = 0.98  # of the cone, squared: below that it sticks, and what moves is the solver's noise
+_SAME = 0.01  # change of a scale that is not worth a call
+_ROUND = (1.0, 1.0)
+
+
+@dataclass
+class _Face:
+    """A body's level face, on which objects slide, and how its friction is scaled now."""
+
+    body: int
+    link: int
+    scales: tuple[float, float] = _ROUND
+
+
+class Friction:
+    """The friction of objects on their tables and below the cup.
+
+    Args:
+        client: The physics client.
+        robot: With the cup.
+        bodies: The objects' numbers in the client.
+        tables: That of each one's own table: bodies slide in different directions.
+        blocks: What the objects are.
+    """
+
+    def __init__(
+        self,
+        client: Client,
+        robot: Robot,
+        bodies: Sequence[int],
+        tables: Sequence[int],
+        blocks: Sequence[Block],
+    ) -> None:
+        """Start with nothing scaled."""
+        faces = [_Face(table, -1) for table in tables[: len(bodies)]]  # one, without objects
+        self._bodies = list(zip(bodies, faces, blocks, strict=True))
+        self._cup = _Face(*robot.tool)
+        number = client.number
+        self._client, self._factor = client, 1.0
+        self._active: list[int] = []
+        self._scale = partial(pybullet.changeDynamics, physicsClientId=number)
+        self._number = number
+
+    def reset(self) -> None:
+        """As if nothing had ever slipped."""
+        for face in (self._cup, *(face for _, face, _ in self._bodies)):
+            self._set(face, _ROUND)
+
+    def alter(self, factor: float) -> None:
+        """All objects are ``factor`` times as rough as nominal."""
+        self._factor = factor
+
+    def look(self, near: Sequence[int]) -> None:
+        """Before a control period: what may slip is ``near`` the cup, or slides."""
+        self._active = [
+            index
+            for index, (body, *_) in enumerate(self._bodies)
+            if index in near or math.hypot(*self._client.getBaseVelocity(body)[0]) > _SLIP
+        ]
+
+    def turn(self, held: int) -> None:
+        """Before a time step: scale the friction of what may slip."""
+        contacts, velocity = pybullet.getContactPoints, pybullet.getBaseVelocity
+        number, cup = self._number, self._cup
+        for index in self._active:
+            body, table, block = self._bodies[index]
+            below = contacts(body, table.body, -1, -1, number)
+            above = () if index == held else contacts(body, cup.body, -1, cup.link, number)
+            if not below and not above:
+                continue
+            (x, y, _), (p, q, _) = velocity(body, number)
+            half, rough = block.height / 2, self._factor * block.friction
+            if below:
+                self._set(table, _scales(x - half * q, y + half * p, below, rough))
+            if above:
+                state = pybullet.getLinkState(cup.body, cup.link, 1, 0, number)
+                u, v, _ = state[6]
+                self._set(
+                    cup, _scales(x + half * q - u, y - half * p - v, above, rough * CUP.friction)
+                )
+
+    def _set(self, face: _Face, scales: tuple[float, float]) -> None:
+        (a, b), (c, d) = scales, face.scales
+        if abs(a - c) > _SAME or abs(b - d) > _SAME or scales is _ROUND:
+            face.scales = scales
+            self._scale(face.body, face.link, anisotropicFriction=(a, b, 1.0))
+
+
+def _scales(x: float, y: float, points: Sequence[Any], coefficient: float) -> tuple[float, float]:
+    """Bounds along the world's axes in units of mu N, for a slip (m/s) and the last time step."""
+    speed = math.hypot(x, y)
+    if speed > _FAST:
+        return _along(x, y)
+    a, b = _used(points, coefficient)
+    if a * a + b * b < _STICKS:
+        return math.sqrt(1 - b * b), math.sqrt(1 - a * a)
+    return _along(x, y) if speed > _SLIP else _along(a, b)
+
+
+def _along(x: float, y: float) -> tuple[float, float]:
+    """Where the cone's edge is in that direction."""
+    length = math.hypot(x, y)
+    return max(abs(x) / length, _LEAST), max(abs(y) / length, _LEAST)
+
+
+def _used(points: Sequence[Any], coefficient: float) -> tuple[float, float]:
+    """Friction that these contacts bore, along the world's axes, in units of mu N."""
+    along_x = along_y = normal = 0.0
+    for point in points:
+        first, second = point[10], point[12]
+        along_x += first * point[11][0] + second * point[13][0]
+        along_y += first * point[11][1] + second * point[13][1]
+        normal += point[9]
+    most = coefficient * normal
+    return (along_x / most, along_y / most) if most > 0 else (0.0, 0.0)
