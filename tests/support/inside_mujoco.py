@@ -67,17 +67,20 @@ def at_point_p(simulation: Simulation) -> FloatArray:
     return offset
 
 
-def pressure(simulation: Simulation) -> float:
-    """Force with which the contacts between the cup and the first object push them apart, N.
+def on_object(simulation: Simulation) -> FloatArray:
+    """Force of the contacts with the cup on the first object, N, world.
 
     Known where a time step is ``solved``.
     """
     engine: Any = simulation.engine
     model, data = engine.model, engine.data
-    bodies = {model.body(simulation.machine.mechanism.tool).id, model.body(object_name(0)).id}
-    total, force = 0.0, np.empty(6)
+    cup = model.body(simulation.machine.mechanism.tool).id
+    bodies = {cup, model.body(object_name(0)).id}
+    total, force = np.zeros(3), np.empty(6)
     for index, contact in enumerate(data.contact):
-        if {model.geom_bodyid[contact.geom1], model.geom_bodyid[contact.geom2]} == bodies:
-            mujoco.mj_contactForce(model, data, index, force)
-            total += force[0]
+        first, second = model.geom_bodyid[contact.geom1], model.geom_bodyid[contact.geom2]
+        if {first, second} == bodies:
+            mujoco.mj_contactForce(model, data, index, force)  # from the first on the second
+            world = contact.frame.reshape(3, 3).T @ force[:3]
+            total += world if first == cup else -world
     return total

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from inside_mujoco import around_each_step, pressure, push
+from inside_mujoco import around_each_step, on_object, push
 from numpy.typing import ArrayLike
 
 from tpm_gym.arrays import FloatArray
@@ -97,7 +97,7 @@ def test_a_held_puck_at_rest_hangs_by_its_weight_alone() -> None:
     assert tension == pytest.approx(Block().mass * G, rel=1e-3)
     assert shear < 1e-3
     assert (
-        last(simulation, lambda: pressure(simulation), vacuum=True) == 0.0
+        last(simulation, lambda: -on_object(simulation)[2], vacuum=True) == 0.0
     )  # the weld takes the contact's place
 
 
@@ -158,8 +158,23 @@ def test_the_cup_yields_to_the_puck_at_its_preload(speed: float, offset: Any) ->
     assert (abs(heights - 0.015) < 5e-6).all()
     assert np.allclose(state.object_quaternion, (0, 0, 0, 1), atol=1e-3)
     weight = PAPER_TPM.mechanism.link("cup").mass * G
-    force = last(simulation, lambda: pressure(simulation), vacuum=False)
+    force = last(simulation, lambda: -on_object(simulation)[2], vacuum=False)
     assert force == pytest.approx(CUP.preload + weight, rel=1e-3)
+
+
+@pytest.mark.parametrize("direction", np.radians(np.arange(0, 360, 45)))
+def test_a_pressed_cup_that_slides_pulls_with_mu_n_along_its_slip(direction: float) -> None:
+    simulation, forces = start(height=0.05), []
+    go(simulation, 0.022, 6, vacuum=False)
+    along = np.array([np.cos(direction), np.sin(direction), 0.0])
+    with around_each_step(simulation, solved=lambda: forces.append(on_object(simulation))):
+        for index in range(1, 9):
+            simulation.move(level(0.022) + 0.001 * index * along)
+    force = np.mean(forces[20:], axis=0)
+    slip = PAPER_TPM.mount.rotate(along)
+    weight = PAPER_TPM.mechanism.link("cup").mass * G
+    expected = CUP.friction * Block().friction * (CUP.preload + weight)
+    np.testing.assert_allclose(force[:2], expected * slip[:2], atol=0.01 * expected)
 
 
 def test_the_cup_comes_out_again_and_stays_out_in_free_motion() -> None:
