@@ -159,7 +159,8 @@ class TPMEnv(gym.Env[Observation, Action]):
             task that is made has its own machine, reward, goals and penalty weight, and takes none.
         control: ``"cartesian"`` or ``"joints"``.
         reward: ``"sparse"`` (None too) or ``"dense"``.
-        engine: ``"pybullet"``, or a name that :func:`tpm_gym.register_engine` knows.
+        engine: ``"pybullet"``, ``"mujoco"`` (with the extra of that name; it opens no window), or a
+            name that :func:`tpm_gym.register_engine` knows.
         machine: ``"paper"`` (None too), ``"wide"``, a name that :func:`tpm_gym.register_machine`
             knows, or a :class:`~tpm_gym.Machine`.
         goals: ``"sampled"`` (None too), or ``"tempting"``: the goal, and where the puck starts, lie
@@ -175,7 +176,8 @@ class TPMEnv(gym.Env[Observation, Action]):
             their last values.
         physics: Numerical settings of the engine, or a mapping of them.
         render_mode: None, ``"rgb_array"`` or ``"human"``.
-        renderer: What draws pictures; for PyBullet ``"tiny"`` (any machine) or ``"egl"`` (GPU).
+        renderer: What draws pictures; for PyBullet ``"tiny"`` (any machine) or ``"egl"`` (GPU),
+            for MuJoCo ``"egl"``, ``"osmesa"`` or ``"glfw"``; None for what works.
         width: Of rendered pictures, pixels.
         height: Of rendered pictures, pixels.
 

@@ -129,6 +129,7 @@ Factory = Callable[..., Engine]
 
 _ENGINES: dict[str, str | Factory] = {
     "pybullet": "tpm_gym.simulation.bullet.engine:BulletEngine",
+    "mujoco": "tpm_gym.simulation.mujoco.engine:MujocoEngine",
 }
 
 
