@@ -44,7 +44,8 @@ def go(simulation: Simulation, height: float, steps: int, vacuum: bool) -> State
 def start_holding(**options: Any) -> Simulation:
     """The puck is sealed to the cup at full vacuum, in the air and at rest."""
     simulation = start(height=0.05, **options)
-    go(simulation, 0.0295, 8, vacuum=True)
+    go(simulation, 0.0295, 6, vacuum=False)
+    go(simulation, 0.0295, 6, vacuum=True)
     for height in (0.04, 0.05, 0.06, *[0.07] * 5):
         state = go(simulation, height, 1, vacuum=True)
     assert state.held == 0
