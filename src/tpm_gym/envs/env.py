@@ -150,7 +150,8 @@ class TPMEnv(gym.Env[Observation, Action]):
     | ``randomisation`` | in a reset's, with that option: what differs in the episode |
 
     Past a parallel singularity the encoders no longer tell where the platform is. No action of the
-    nominal robot leads past one; if it happens, the penalty is 1 and the episode truncated.
+    nominal robot with ideal drives leads past one; if it happens, the penalty is 1 and the episode
+    truncated.
 
     Args:
         task: Name of a task (``"reach"``, ``"pick_and_place"``, or one that
@@ -166,9 +167,9 @@ class TPMEnv(gym.Env[Observation, Action]):
             next to the singularity, which not every machine has near its goals.
         penalty_weight: Weight of the singularity penalty, None for 1; 0 switches it off.
         drive: How the motors follow their references. ``"ideal"`` (None too): exactly, with up to
-            100 N m. ``"servo"``, a :class:`~tpm_gym.simulation.Servo` or a mapping of its
-            attributes: as torque motors with servo drives do, that have stiffness, damping, a
-            feed-forward, and less torque the faster they turn.
+            100 N m at any speed. ``"servo"``, a :class:`~tpm_gym.simulation.Servo` or a mapping of
+            its attributes: with 7500 N m/rad, 60 N m s/rad, the torques of the nominal motion fed
+            forward, and 100 N m up to 18.75 rad/s, which fall to none at 25 rad/s.
         randomisation: What differs from the nominal machine, drawn anew for each episode: a
             :class:`~tpm_gym.simulation.Randomisation` or a mapping of its attributes. Where
             disturbed encoders report angles that cannot be assembled, position and velocity keep
