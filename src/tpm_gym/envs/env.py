@@ -107,7 +107,7 @@ class TPMEnv(gym.Env[Observation, Action]):
     | object_offset | 3 | top of the object minus lip of the cup |
     | object_velocity | 3 | velocity of the object, from a camera |
     | object_tilt | 2 | x and y of the object's axis |
-    | object_held | 1 | share of the vacuum that holds it, by a gauge, 0 to 1 as -1 to +1 |
+    | object_held | 1 | share of the vacuum that holds the object, by a gauge |
 
     The object's entries exist in PickAndPlace only. The robot's come from the three encoders alone,
     never from the simulator's platform.
@@ -140,8 +140,8 @@ class TPMEnv(gym.Env[Observation, Action]):
     | --- | --- |
     | ``is_success`` | whether the goal is achieved |
     | ``closure_error`` | largest gap of the simulated loops, m |
-    | ``conditioning`` | 1/cond(J) by the encoders |
     | ``vacuum`` | how far the pressure in the cup is below the ambient's, Pa |
+    | ``conditioning`` | 1/cond(J) by the encoders |
     | ``singularity_penalty`` | before weighting, 0 to 1 |
     | ``assembly_mode_changed`` | whether the platform passed y = 0, a parallel singularity |
     | ``working_mode_changed`` | whether it passed y = l7, a serial one |

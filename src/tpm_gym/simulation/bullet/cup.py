@@ -18,6 +18,7 @@ __all__ = ["Cup", "Grip"]
 
 _WELD_FORCE = 1e4  # N; the weld itself never yields
 _REACH = 0.1  # m; what is farther from the lip does not get there in a control period
+_CLEARANCE = 2e-5  # m, between lip and face where it would be less
 _NOTHING = Load()
 
 
@@ -31,8 +32,8 @@ class Grip(NamedTuple):
 class Cup:
     """The cup on a robot's platform, and the objects of which it can hold one.
 
-    While an object is held it does not collide with the cup: the weld keeps it where the lip lies
-    on its top face, and contact would fight with it.
+    Sealing keeps no penetration: the weld puts the lip on the object's face, a hair off it, so that
+    the engine's contact does not fight with the weld.
 
     Args:
         client: The physics client.
@@ -90,7 +91,6 @@ class Cup:
         client, tool = self._client, self._robot.tool
         if self.grip.pose is not None:
             client.removeConstraint(self._weld)
-            self._collide(self.grip.hold.which, True)
         self.grip = grip
         if grip.pose is not None:
             which, zero = grip.hold.which, (0.0, 0.0, 0.0)
@@ -98,11 +98,6 @@ class Cup:
             position, turn = grip.pose
             self._weld = client.createConstraint(*ends, position, zero, turn)
             client.changeConstraint(self._weld, maxForce=_WELD_FORCE)
-            self._collide(which, False)
-
-    def _collide(self, which: int, on: bool) -> None:
-        body, link = self._robot.tool
-        self._client.setCollisionFilterPair(body, self._bodies[which], link, -1, int(on))
 
     def _load(self) -> Load:
         """What the weld did to the object in the last time step.
@@ -124,13 +119,13 @@ class Cup:
         return -1
 
     def _seat(self, index: int) -> Pose:
-        """Where an object sits in the tool's inertial frame: as it is, but not inside the cup."""
+        """Where an object sits in the tool's inertial frame: as it is, but clear of the cup."""
         client, (body, link) = self._client, self._robot.tool
         state = client.getLinkState(body, link, computeForwardKinematics=True)
         inverse = client.invertTransform(state[0], state[1])
         pose = client.getBasePositionAndOrientation(self._bodies[index])
         (x, y, z), turn = client.multiplyTransforms(*inverse, *pose)
-        points = client.getClosestPoints(body, self._bodies[index], 0.0, link, -1)
-        depth = -min((point[8] for point in points), default=0.0)
+        points = client.getClosestPoints(body, self._bodies[index], _CLEARANCE, link, -1)
+        depth = _CLEARANCE - min((point[8] for point in points), default=_CLEARANCE)
         seat: Vector = (x, y, z + depth)
         return Pose(seat, turn)

@@ -4,7 +4,8 @@ The solver bounds the friction of a contact along two directions, each by mu N: 
 them it is sqrt(2) too strong, and it does not point against the slip. On a level face the
 directions are the world's x and y, and the engine can scale them for each body. Scaled by the
 direction in which the contact slips, the box's corner lies on the cone, opposite to the slip;
-where it sticks, each bound is what the cone leaves beside the other force of the last time step.
+where it sticks, each bound is what the cone leaves beside the other force of the last time step,
+and where there was none the box lies inside the cone.
 
 What is left, measured in ``tests/simulation/bullet/test_friction.py``: a direction lags a time
 step; the weaker bound never falls below :data:`_LEAST`; all points of a contact share the direction
@@ -32,9 +33,10 @@ __all__ = ["Friction"]
 _LEAST = 0.02  # of the scales, so that no row of the solver vanishes
 _FAST = 1e-2  # m/s; beyond that it slips, whatever the last force was
 _SLIP = 1e-5  # m/s; below that the last force has the direction of the next
+_LITTLE = 1e-3  # of the cone, squared: below that the next force may have any direction
 _STICKS = 0.98  # of the cone, squared: below that it sticks, and what moves is the solver's noise
 _SAME = 0.01  # change of a scale that is not worth a call
-_ROUND = (1.0, 1.0)
+_UNKNOWN = (math.sqrt(0.5), math.sqrt(0.5))
 
 
 @dataclass
@@ -43,7 +45,7 @@ class _Face:
 
     body: int
     link: int
-    scales: tuple[float, float] = _ROUND
+    scales: tuple[float, float] = _UNKNOWN
 
 
 class Friction:
@@ -78,7 +80,7 @@ class Friction:
     def reset(self) -> None:
         """As if nothing had ever slipped."""
         for face in (self._cup, *(face for _, face, _ in self._bodies)):
-            self._set(face, _ROUND)
+            self._set(face, _UNKNOWN)
 
     def alter(self, factor: float) -> None:
         """All objects are ``factor`` times as rough as nominal."""
@@ -115,7 +117,7 @@ class Friction:
 
     def _set(self, face: _Face, scales: tuple[float, float]) -> None:
         (a, b), (c, d) = scales, face.scales
-        if abs(a - c) > _SAME or abs(b - d) > _SAME or scales is _ROUND:
+        if abs(a - c) > _SAME or abs(b - d) > _SAME or scales is _UNKNOWN:
             face.scales = scales
             self._scale(face.body, face.link, anisotropicFriction=(a, b, 1.0))
 
@@ -126,6 +128,8 @@ def _scales(x: float, y: float, points: Sequence[Any], coefficient: float) -> tu
     if speed > _FAST:
         return _along(x, y)
     a, b = _used(points, coefficient)
+    if a * a + b * b < _LITTLE:
+        return _UNKNOWN
     if a * a + b * b < _STICKS:
         return math.sqrt(1 - b * b), math.sqrt(1 - a * a)
     return _along(x, y) if speed > _SLIP else _along(a, b)
