@@ -18,7 +18,7 @@ from inside_mujoco import around_each_step, at_point_p, push, throw
 
 import tpm_gym
 from tpm_gym.arrays import Vector
-from tpm_gym.errors import ConfigurationError, MissingPackageError
+from tpm_gym.errors import ClosureError, ConfigurationError, MissingPackageError
 from tpm_gym.mechanism import PAPER_TPM
 from tpm_gym.simulation import Block, Plant, Scene, Simulation
 from tpm_gym.simulation.engine import Reference
@@ -257,7 +257,26 @@ def test_nothing_is_printed(capfd: pytest.CaptureFixture[str]) -> None:
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.slow  # TODO s
+@pytest.mark.parametrize("newtons", [1e3, 1e8, float("nan")])
+def test_a_mechanism_torn_apart_is_a_typed_error_and_nothing_else(
+    simulation: Simulation,
+    newtons: float,
+    capfd: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)  # where the engine would log
+    for _ in range(2):
+        simulation.reset(THETA)
+        assert simulation.move(HOME).closure_error < 1e-6
+        push(simulation, PAPER_TPM.mechanism.platform, (newtons, newtons, newtons))
+        with pytest.raises(ClosureError):
+            simulation.move(HOME)
+    assert capfd.readouterr() == ("", "")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow  # half a minute
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs Linux")
 def test_environments_and_copies_dropped_without_close_leave_no_memory() -> None:
     script = """

@@ -72,6 +72,7 @@ class MujocoEngine:
         """See the protocol."""
         self.model = compiled(machine, scene, self.physics)
         self.data = mujoco.MjData(self.model)
+        self._reset()
         self.robot = Robot(self.model, self.data, machine, ideal=self._servo is None)
         if self._servo is not None:
             self._servos = Servos(self._servo, machine, self.physics.time_step)
@@ -88,13 +89,22 @@ class MujocoEngine:
 
     def place(self, joints: Mapping[str, float], objects: Sequence[Pose]) -> None:
         """See the protocol."""
-        mujoco.mj_resetData(self.model, self.data)
+        self._reset()
         self._cup.set(Grip())
         self.robot.place(joints)
         if self._servos is not None:
             self._servos.rest(self.robot.motors().theta)
         self._scenery.place(objects)
         mujoco.mj_step1(self.model, self.data)
+
+    def _reset(self) -> None:
+        """Forget all motion, and let no number that is too large be told but by a lost loop.
+
+        The engine would write of each kind's first one to the console and into a file.
+        """
+        mujoco.mj_resetData(self.model, self.data)
+        for warning in self.data.warning:
+            warning.number = 1
 
     def show_goal(self, markers: Sequence[Vector]) -> None:
         """See the protocol."""
