@@ -18,7 +18,7 @@ from inside_mujoco import around_each_step, at_point_p, push, throw
 
 import tpm_gym
 from tpm_gym.arrays import Vector
-from tpm_gym.errors import ConfigurationError, MissingPackageError
+from tpm_gym.errors import ClosureError, ConfigurationError, MissingPackageError
 from tpm_gym.mechanism import PAPER_TPM
 from tpm_gym.simulation import Block, Plant, Scene, Simulation
 from tpm_gym.simulation.engine import Reference
@@ -151,6 +151,18 @@ def test_friction_of_joints_holds_what_is_weaker() -> None:
     assert (drifts[1] < 1e-6).all()
 
 
+@pytest.mark.parametrize("strength", [0.5, 1.0])
+def test_servos_have_the_torque_of_their_motors_and_no_more(strength: float) -> None:
+    simulation = Simulation(Scene(), engine="mujoco", drive=tpm_gym.simulation.Servo())
+    simulation.reset(THETA, plant=Plant(motor_strength=(strength,) * 3))
+    torques: list[Vector] = []
+    note = lambda: torques.append(simulation.engine.motors().torque)  # noqa: E731
+    with around_each_step(simulation, after=note):
+        for jump in (-0.1, 0.1, -0.1, 0.1):
+            simulation.move(np.add(HOME, (0, 0, jump)))
+    assert np.abs(torques).max() == pytest.approx(strength * EFFORTS.max(), rel=1e-9)
+
+
 # -- objects ---------------------------------------------------------------------------------------
 
 
@@ -171,17 +183,23 @@ def test_a_sliding_puck_is_slowed_by_mu_g_against_its_slip(
 
 def test_a_resting_puck_neither_sinks_nor_moves(simulation: Simulation) -> None:
     simulation.reset(THETA, {"object": (0.05, -0.05, 0.015)})
-    for _ in range(50):
-        state = simulation.move(HOME)
+    heights: list[float] = []
+    objects = simulation.engine.objects
+    note = lambda: heights.append(objects()[0][0].position[2])  # noqa: E731
+    with around_each_step(simulation, after=note):
+        for _ in range(20):
+            state = simulation.move(HOME)
+    np.testing.assert_allclose(heights, 0.015, atol=2e-6)
     np.testing.assert_allclose(state.object_position[0], (0.05, -0.05, 0.015), atol=2e-6)
     assert np.abs(state.object_velocity).max() < 1e-9
     assert np.abs(state.object_axis[0] - (0, 0, 1)).max() < 1e-9
 
 
-def test_what_falls_hardly_bounces(simulation: Simulation) -> None:
-    simulation.reset(THETA, {"object": (0.2, 0.1, 0.215)})
+@pytest.mark.parametrize("height", np.arange(0.18, 0.22, 0.01))
+def test_what_falls_hardly_bounces(simulation: Simulation, height: float) -> None:
+    simulation.reset(THETA, {"object": (0.2, 0.1, height)})
     heights = [simulation.move(HOME).object_position[0, 2] for _ in range(25)]
-    assert heights[1] == pytest.approx(0.215 - 9.81 / 2 * 0.08**2, abs=2e-3)
+    assert heights[1] == pytest.approx(height - 9.81 / 2 * 0.08**2, abs=2e-3)
     landed = int(np.argmax(np.array(heights) < 0.015))
     assert max(heights[landed:]) < 0.0155
     assert heights[-1] == pytest.approx(0.015, abs=5e-6)
@@ -239,7 +257,26 @@ def test_nothing_is_printed(capfd: pytest.CaptureFixture[str]) -> None:
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.slow  # TODO s
+@pytest.mark.parametrize("newtons", [1e3, 1e8, float("nan")])
+def test_a_mechanism_torn_apart_is_a_typed_error_and_nothing_else(
+    simulation: Simulation,
+    newtons: float,
+    capfd: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)  # where the engine would log
+    for _ in range(2):
+        simulation.reset(THETA)
+        assert simulation.move(HOME).closure_error < 1e-6
+        push(simulation, PAPER_TPM.mechanism.platform, (newtons, newtons, newtons))
+        with pytest.raises(ClosureError):
+            simulation.move(HOME)
+    assert capfd.readouterr() == ("", "")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow  # half a minute
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs Linux")
 def test_environments_and_copies_dropped_without_close_leave_no_memory() -> None:
     script = """

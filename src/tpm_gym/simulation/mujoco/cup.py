@@ -11,7 +11,7 @@ import numpy as np
 from tpm_gym.arrays import Quaternion, Vector, rotate
 from tpm_gym.mechanism.cup import CUP, sealed
 from tpm_gym.simulation.engine import Pose
-from tpm_gym.simulation.mujoco.model import grip_name, object_name
+from tpm_gym.simulation.mujoco.model import grip_name
 from tpm_gym.simulation.mujoco.robot import Robot
 from tpm_gym.simulation.mujoco.scenery import Scenery
 from tpm_gym.simulation.state import Block
@@ -20,8 +20,7 @@ from tpm_gym.simulation.vacuum import EMPTY, Hold, Load, hold_after
 __all__ = ["Cup", "Grip"]
 
 _NO_LOAD = Load()
-_APART = -1.0
-"""Margin (m) at which a pair is never in contact."""
+_CLEARANCE = 2e-5  # m, between lip and face where it would be less
 
 
 class Grip(NamedTuple):
@@ -34,8 +33,8 @@ class Grip(NamedTuple):
 class Cup:
     """The cup on a robot's platform, and the objects of which it can hold one.
 
-    A weld takes the place of the contact: it bears pull, pressure and shear, so nothing else is
-    between cup and object, and its force is the seal's load.
+    A weld takes the place of the contact: it keeps the lip a hair off the object's face and bears
+    pull, pressure and shear, so nothing else is between them, and its force is the seal's load.
 
     Attributes:
         grip: What is held, and how.
@@ -54,14 +53,6 @@ class Cup:
         self._robot, self._scenery, self._blocks = robot, scenery, blocks
         names = range(len(blocks))
         self._welds = [model.equality(grip_name(index)).id for index in names]
-        tool = robot.tool_body
-        objects = [model.body(object_name(index)).id for index in names]
-        bodies = model.geom_bodyid[np.stack([model.pair_geom1, model.pair_geom2])]
-        self._pairs = [
-            np.flatnonzero((bodies == tool).any(axis=0) & (bodies == one).any(axis=0))
-            for one in objects
-        ]
-        self._margins = model.pair_margin.copy()
         self._row = 3 * (model.neq - len(blocks))  # of the weld's force, after the closures'
         self._reach = [
             math.hypot(*CUP.lip)
@@ -99,14 +90,12 @@ class Cup:
         """Hold just what ``grip`` says."""
         model, active = self._model, self._data.eq_active
         active[self._welds] = 0
-        model.pair_margin[:] = self._margins
         self.grip = grip
         which, ((x, y, z), (qx, qy, qz, qw)) = grip.hold.which, grip.pose
         if which >= 0:
             weld = self._welds[which]
             active[weld] = 1
             model.eq_data[weld, 3:10] = (x, y, z, qw, qx, qy, qz)
-            model.pair_margin[self._pairs[which]] = _APART
 
     def _touched(self) -> int:
         """Index of the first object on whose face the lip lies; -1 for none."""
@@ -120,7 +109,7 @@ class Cup:
         return -1
 
     def _sealed_pose(self, index: int) -> Pose:
-        """Where an object is in the tool's frame, once the lip is no longer pressed into it."""
+        """Where an object is in the tool's frame, but clear of the cup."""
         origin, turn = self._robot.tool()
         position, quaternion = self._scenery.pose(index)
         lip, _ = self._robot.cup()
@@ -129,7 +118,7 @@ class Cup:
         relative = np.empty(4)
         mujoco.mju_mulQuat(relative, _wxyz(_inverse(turn)), _wxyz(quaternion))
         qw, qx, qy, qz = relative.tolist()
-        return Pose((x, y, z - min(0.0, gap)), (qx, qy, qz, qw))
+        return Pose((x, y, z + max(0.0, _CLEARANCE - gap)), (qx, qy, qz, qw))
 
 
 def _inverse(quaternion: Quaternion) -> Quaternion:

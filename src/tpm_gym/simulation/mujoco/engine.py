@@ -72,6 +72,7 @@ class MujocoEngine:
         """See the protocol."""
         self.model = compiled(machine, scene, self.physics)
         self.data = mujoco.MjData(self.model)
+        self._reset()
         self.robot = Robot(self.model, self.data, machine, ideal=self._servo is None)
         if self._servo is not None:
             self._servos = Servos(self._servo, machine, self.physics.time_step)
@@ -88,7 +89,7 @@ class MujocoEngine:
 
     def place(self, joints: Mapping[str, float], objects: Sequence[Pose]) -> None:
         """See the protocol."""
-        mujoco.mj_resetData(self.model, self.data)
+        self._reset()
         self._cup.set(Grip())
         self.robot.place(joints)
         if self._servos is not None:
@@ -96,32 +97,44 @@ class MujocoEngine:
         self._scenery.place(objects)
         mujoco.mj_step1(self.model, self.data)
 
+    def _reset(self) -> None:
+        """Forget all motion, and let no number that is too large be told but by a lost loop.
+
+        The engine would write of each kind's first one to the console and into a file.
+        """
+        mujoco.mj_resetData(self.model, self.data)
+        for warning in self.data.warning:
+            warning.number = 1
+
     def show_goal(self, markers: Sequence[Vector]) -> None:
         """See the protocol."""
         self._scenery.move_markers(markers)
 
     def advance(self, references: Sequence[Reference], vacuum: bool) -> None:
         """See the protocol."""
-        model, data, robot, cup = self.model, self.data, self.robot, self._cup
-        scenery = self._scenery
-        first_half, second_half, servos = mujoco.mj_step1, mujoco.mj_step2, self._servos
-        if servos is not None:
-            servos.begin(references[0].theta)
+        model, data, cup, scenery = self.model, self.data, self._cup, self._scenery
+        first_half, second_half = mujoco.mj_step1, mujoco.mj_step2
+        if self._servos is not None:
+            self._servos.begin(references[0].theta)
         last = references[-1]
         for reference in references:
-            if servos is None:
-                robot.drive(reference.theta)
-            else:
-                theta, theta_dot, _ = robot.motors()
-                robot.apply(servos.torque(reference, theta, theta_dot))
+            self._drive(reference)
             scenery.keep_sliding()
             second_half(model, data)
-            if servos is None and reference is last:
-                robot.note_torque()
+            if reference is last:
+                self.robot.note_torque()
             load = cup.load()
             first_half(model, data)
             if cup.breathe(vacuum, load):
                 first_half(model, data)  # with another constraint
+
+    def _drive(self, reference: Reference) -> None:
+        """Let the motors follow a reference in this time step."""
+        if self._servos is None:
+            self.robot.drive(reference.theta)
+            return
+        theta, theta_dot, _ = self.robot.motors()
+        self.robot.apply(self._servos.torque(reference, theta, theta_dot))
 
     def motors(self) -> Motors:
         """See the protocol."""

@@ -33,9 +33,6 @@ class Robot:
         data: Its state.
         machine: What was compiled into it.
         ideal: Whether the motors go where they are told; else they apply the torques they are told.
-
-    Attributes:
-        tool_body: Number of the link with the vacuum cup.
     """
 
     def __init__(
@@ -49,7 +46,7 @@ class Robot:
         self._at = {joint.name: model.joint(joint.name).qposadr.item() for joint in joints}
         self._dof = {joint.name: model.joint(joint.name).dofadr.item() for joint in joints}
         self._platform = model.body(mechanism.platform).id
-        self.tool_body = model.body(mechanism.tool).id
+        self._tool = model.body(mechanism.tool).id
         moving = [model.body(link.name).id for link in mechanism.links[1:]]
         self._inertias = {
             body: (model.body_mass[body].item(), model.body_inertia[body].copy()) for body in moving
@@ -118,7 +115,9 @@ class Robot:
             wanted[first + row] = ((target - position(at)) * gain - speed(dof)) * rate
 
     def note_torque(self) -> None:
-        """Note what ideal motors apply; to be called after the second half of a time step."""
+        """Note what the motors apply; to be called after the second half of a time step."""
+        if not self._ideal:
+            return  # known before
         force, first = self._data.efc_force.item, self._data.ne
         (a, *_), (b, *_), (c, *_), _ = self._rows
         self._torque = force(first + a), force(first + b), force(first + c)
@@ -142,17 +141,17 @@ class Robot:
 
     def cup(self) -> tuple[Vector, Vector]:
         """Centre of the cup's lip (m) and the cup's outward axis, world."""
-        origin, turn = self._frame(self.tool_body)
+        origin, turn = self._frame(self._tool)
         return transform(origin, turn, self._lip), rotate(turn, (0.0, 0.0, 1.0))
 
     def tool_height(self) -> float:
         """Of the origin of the link with the cup above the table, m."""
-        height: float = self._height(self.tool_body, 2)
+        height: float = self._height(self._tool, 2)
         return height
 
     def tool(self) -> tuple[Vector, Quaternion]:
         """Origin (m) and orientation of the link with the cup, world."""
-        return self._frame(self.tool_body)
+        return self._frame(self._tool)
 
     def _frame(self, body: int) -> tuple[Vector, Quaternion]:
         x, y, z = self._data.xpos[body].tolist()
