@@ -252,6 +252,7 @@ def make_training_envs(config: TrainingConfig) -> VecEnv:
 
 def _env_options(config: TrainingConfig) -> dict[str, Any]:
     """Which environment is trained and evaluated in, as arguments of :func:`make_env`."""
-    # Not the id: a process of its own may not have it registered.
+    # A process of its own has to import the id's module, or may not have the bare id registered.
     spec = check_env_id(config.env)
-    return {"env": spec, "penalty_weight": config.penalty_weight, "goals": config.goals}
+    env = config.env if ":" in config.env else spec
+    return {"env": env, "penalty_weight": config.penalty_weight, "goals": config.goals}
