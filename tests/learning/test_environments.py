@@ -20,6 +20,7 @@ import tpm_gym
 from tpm_gym.tasks import Reach
 
 tpm_gym.register_task("Mine", type("Mine", (Reach,), {}), max_episode_steps=20)
+tpm_gym.register_machine("mine", tpm_gym.PAPER_TPM)
 """
 
 
@@ -47,11 +48,22 @@ def test_an_id_of_a_users_module_is_trained_in_workers_resumed_and_evaluated(
     (tmp_path / "my_tasks.py").write_text(MODULE)
     (tmp_path / "sac.yml").write_text(SAC_RECIPE.format(env="TPMMine-v0", train_freq=5))
     words = ["--env", "my_tasks:TPMMine-v0", "--recipe", "sac.yml", "--envs", "2"]
-    words += ["--steps", "120", "--eval-episodes", "1"]
+    words += ["--steps", "120", "--eval-episodes", "1", "--machine", "mine"]
     run("train", *words)
     folder = "runs/TPMMine-v0-sac-s0"
     run("resume", folder, "--steps", "160")
-    run("evaluate", "--policy", folder, "expert", "--episodes", "1", "--json", "out.json")
+    run(
+        "evaluate",
+        "--policy",
+        folder,
+        "expert",
+        "--machine",
+        "mine",
+        "--episodes",
+        "1",
+        "--json",
+        "out.json",
+    )
     content = json.loads((tmp_path / "out.json").read_text())
     assert content["env"] == "my_tasks:TPMMine-v0"
     assert [policy["records"][0]["length"] for policy in content["policies"]] == [20, 20]

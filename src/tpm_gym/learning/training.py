@@ -51,9 +51,11 @@ def train(config: TrainingConfig, console: Console | None = None) -> signal.Sign
 
     Raises:
         LearningError: The configuration is not valid, or the run folder is taken or not writable.
+        ConfigurationError: There is no such environment.
     """
     console = console or Console()
     config = complete(config)
+    make_env(**_env_options(config)).close()  # refused before anything is deleted
     run_folder.prepare(config.run, config.overwrite)
     store = CheckpointStore(config.run / CHECKPOINTS)
     with run_folder.disk_errors_named(config.run, store), run_folder.claimed(config.run):
@@ -255,4 +257,5 @@ def _env_options(config: TrainingConfig) -> dict[str, Any]:
     # A process of its own has to import the id's module, or may not have the bare id registered.
     spec = check_env_id(config.env)
     env = config.env if ":" in config.env else spec
-    return {"env": env, "penalty_weight": config.penalty_weight, "goals": config.goals}
+    chosen = {"penalty_weight": config.penalty_weight, "goals": config.goals}
+    return {"env": env, **chosen, **config.env_options.given()}
