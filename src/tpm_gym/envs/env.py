@@ -149,6 +149,8 @@ class TPMEnv(gym.Env[Observation, Action]):
     | ``reward_terms`` | the terms above by name; they sum to the reward |
     | ``randomisation`` | in a reset's, with that option: what differs in the episode |
 
+    An environment that is made as ``TPMEnv(...)`` has no time limit; ``gym.make`` adds it.
+
     Past a parallel singularity the encoders no longer tell where the platform is. No action of the
     nominal robot leads past one; if it happens, the penalty is 1 and the episode truncated.
 
