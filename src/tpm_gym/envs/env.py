@@ -291,6 +291,7 @@ class TPMEnv(gym.Env[Observation, Action]):
                 object into another or into the robot.
             UnreachableError: If an object or the goal is out of reach.
             EpisodeError: If the environment is closed.
+            ConfigurationError: If a method of the task does not give what it has to.
         """
         self._require_open()
         super().reset(seed=seed)
@@ -303,6 +304,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         self.episode += 1
         self._show_goal()
         self._state = self.simulation.reset(self._home, start, plant, self._draw_noise())
+        self.task.check(self._state)
         observation, info = self._report(self._state)
         if self.randomisation != Randomisation():
             latency = {"latency": self.randomisation.latency}

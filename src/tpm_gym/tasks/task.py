@@ -100,9 +100,12 @@ class Task(ABC):
         )
         if self.penalty_weight < 0:
             raise ConfigurationError("penalty_weight", penalty_weight, "0 or more")
+        if self.goal_size < 3 or self.goal_size % 3:
+            raise ConfigurationError("goal_size", self.goal_size, "three for each point")
         shown = len(self.markers(np.zeros(self.goal_size)))
         if shown != self.scene.markers:
-            raise ConfigurationError("markers", self.scene.markers, f"{shown}, as a goal shows")
+            valid = f"{shown}, as a goal shows: scene = Scene(..., markers={shown})"
+            raise ConfigurationError("markers", self.scene.markers, valid)
         self.machine, self.reward, self.goals = machine, reward, goals
         self._within = self._not_lost()
         self._set_entries()
@@ -183,6 +186,20 @@ class Task(ABC):
         return (
             rewards.sparse(gap, self.tolerance) if self.reward == "sparse" else rewards.dense(gap)
         )
+
+    def check(self, state: State) -> None:
+        """Refuse a task of which a method does not give what it has to, for one state.
+
+        Raises:
+            ConfigurationError: If it does not; named by the method.
+        """
+        achieved = np.shape(self.achieved(state))
+        if achieved != (self.goal_size,):
+            valid = f"of shape ({self.goal_size},), as goal_size says"
+            raise ConfigurationError("achieved()", f"of shape {achieved}", valid)
+        shaping: object = self.shaping(state)
+        if not isinstance(shaping, Mapping):
+            raise ConfigurationError("shaping()", shaping, "a dictionary of terms; {} for none")
 
     def penalty(self, state: State) -> FloatArray:
         """Nearness to a singularity before weighting, (...,) in [0, 1]; 1 where one was passed."""
