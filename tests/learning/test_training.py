@@ -230,7 +230,7 @@ PICK = {"env": "TPMPickAndPlace-v0", "recipe_file": recipe_file("sac")}
         ({"envs": 5}, "before the first episode ends"),
         ({**PICK, "steps": 20_000}, "more than the 20,000 of the recipe's demonst"),
         ({**PICK, "steps": 20_050, "envs": 3}, "the 20,100 of"),
-        ({"algo": "ppo", "recipe_file": None}, "no recipe for TPMReach-v0"),
+        ({"algo": "ppo", "recipe_file": None}, "no recipe for TPMReach-v0; .*--recipe FILE"),
         ({"recipe_file": Path("none.yml")}, "cannot be read"),
         ({"env_options": EnvOptions(machine="narrow")}, "machine = 'narrow'"),
     ],
