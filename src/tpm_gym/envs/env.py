@@ -149,6 +149,8 @@ class TPMEnv(gym.Env[Observation, Action]):
     | ``reward_terms`` | the terms above by name; they sum to the reward |
     | ``randomisation`` | in a reset's, with that option: what differs in the episode |
 
+    An environment that is made as ``TPMEnv(...)`` has no time limit; ``gym.make`` adds it.
+
     Past a parallel singularity the encoders no longer tell where the platform is. No action of the
     nominal robot with ideal drives leads past one; if it happens, the penalty is 1 and the episode
     truncated.
@@ -292,6 +294,7 @@ class TPMEnv(gym.Env[Observation, Action]):
                 object into another or into the robot.
             UnreachableError: If an object or the goal is out of reach.
             EpisodeError: If the environment is closed.
+            ConfigurationError: If a method of the task does not give what it has to.
         """
         self._require_open()
         super().reset(seed=seed)
@@ -304,6 +307,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         self.episode += 1
         self._show_goal()
         self._state = self.simulation.reset(self._home, start, plant, self._draw_noise())
+        self.task.check(self._state)
         observation, info = self._report(self._state)
         if self.randomisation != Randomisation():
             latency = {"latency": self.randomisation.latency}

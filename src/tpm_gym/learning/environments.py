@@ -28,9 +28,12 @@ def check_env_id(env_id: str) -> EnvSpec:
         if module:
             importlib.import_module(module)
         spec = gym.spec(name)
-    except (gym.error.Error, ImportError) as error:
+    except ImportError as error:
+        where = "run this in the folder that holds it, or install it"
+        raise ConfigError(f"{env_id}: cannot import {module!r} ({error}); {where}") from error
+    except gym.error.Error as error:
         there = f"there are {', '.join(env_ids())}, and module:id for those that a module registers"
-        raise ConfigError(f"unknown environment {env_id!r} ({error}); {there}") from error
+        raise ConfigError(f"unknown environment {env_id!r}; {there}") from error
     if not _is_ours(spec):
         raise ConfigError(f"{env_id} is no environment of tpm_gym; it makes {spec.entry_point}")
     return spec

@@ -176,7 +176,11 @@ def make_engine(
     factory = _ENGINES[name]
     if isinstance(factory, str):
         module, _, attribute = factory.partition(":")
-        factory = getattr(importlib.import_module(module), attribute)
+        try:
+            factory = getattr(importlib.import_module(module), attribute)
+        except (ModuleNotFoundError, AttributeError) as error:
+            valid = f"one that can be imported; of {factory!r} Python says: {error}"
+            raise ConfigurationError("engine", name, valid) from error
     options: dict[str, Any] = {
         "gui": gui or None,
         "renderer": renderer,
