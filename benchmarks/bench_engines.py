@@ -35,7 +35,7 @@ from engine_agreement import PICK, Trace, energy_lost, follow, motions
 from engine_matrix import IDS, cells, run_all
 
 ENGINES = ("pybullet", "mujoco")
-WEAK_STEPS = 24_000
+WEAK_STEPS = 28_000
 ROUNDS, BLOCK = 20, 100
 """Rounds of timing, and control steps in a block."""
 
