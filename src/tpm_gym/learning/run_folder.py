@@ -3,6 +3,8 @@
 Nothing is ever deleted but files that a run writes, by name, and no policy unless it is asked for.
 """
 
+from __future__ import annotations
+
 import errno
 import json
 import os
@@ -11,10 +13,12 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-from tpm_gym.learning.checkpoint import CheckpointStore
 from tpm_gym.learning.errors import RunError
+
+if TYPE_CHECKING:
+    from tpm_gym.learning.checkpoint import CheckpointStore
 
 CONFIG_FILE: Final = "config.json"
 EVALUATIONS_FILE: Final = "evaluations.jsonl"
@@ -124,6 +128,8 @@ def holds_policy(run: Path) -> bool:
 
 def clear(run: Path) -> None:
     """Delete what a training has written to its folder, but its configuration."""
+    from tpm_gym.learning.checkpoint import CheckpointStore
+
     CheckpointStore(run / CHECKPOINTS).clear()
     clear_tests(run)
     names = {*RESTORED, *_POLICIES, CURVE_FILE} - {CONFIG_FILE}
