@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -14,7 +15,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
-from tpm_gym.arrays import FloatArray, Vector, finite
+from tpm_gym.arrays import FloatArray, Vector, finite, numbers
 from tpm_gym.errors import (
     ActionError,
     ConfigurationError,
@@ -239,7 +240,7 @@ class TPMEnv(gym.Env[Observation, Action]):
             }
         )
         self.action_space = _box(1.0, self.task.action_size)
-        self.episode = 0  # how many have been started
+        self.episode = 0  # how many have been started or restored
         self._home = self.machine.inverse(self.machine.home)
         self._state: State | None = None
         self._goal = np.full(self.task.goal_size, np.nan)
@@ -295,7 +296,8 @@ class TPMEnv(gym.Env[Observation, Action]):
         rng = self.np_random
         start = self.task.start(rng, options)
         plant = self.randomisation.draw(rng, self.machine)
-        self._goal = start.pop("goal")
+        name = f"the goal of {type(self.task).__name__}.sample()"
+        self._goal = finite(name, start.pop("goal"), (self.task.goal_size,))
         self._pending = (np.zeros(self.task.action_size),) * self.randomisation.latency
         self._state = None
         self.episode += 1
@@ -354,12 +356,20 @@ class TPMEnv(gym.Env[Observation, Action]):
 
         Returns:
             A float, or (...,) of them.
+
+        Raises:
+            InputError: If the goals are no real numbers of these shapes, or ``info`` is neither.
         """
+        _require_goals(self.task.goal_size, achieved_goal, desired_goal)
         goal_term = self.task.goal_term(achieved_goal, desired_goal)
-        if isinstance(info, Mapping):
-            other: Any = _goal_free(info)
-        else:
-            other = np.array([_goal_free(entry) for entry in info]).reshape(goal_term.shape)
+        try:
+            if isinstance(info, Mapping):
+                other: Any = _goal_free(info)
+            else:
+                other = np.array([_goal_free(entry) for entry in info]).reshape(goal_term.shape)
+        except (AttributeError, TypeError, ValueError) as error:
+            valid = f"a step's info, or one for each of the {goal_term.size} transitions"
+            raise InputError("info", type(info), valid) from error
         total = goal_term + other
         return float(total) if np.ndim(total) == 0 else total
 
@@ -433,6 +443,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         self.np_random.bit_generator.state = snapshot.rng
         self._goal, self._pending = snapshot.goal.copy(), snapshot.pending
         self._state = None
+        self.episode += 1  # what was planned for the one before is void
         self._show_goal()
         self._state = self.simulation.restore(snapshot.simulation)
         return self._observe(self._state, self._goal)
@@ -487,7 +498,10 @@ class TPMEnv(gym.Env[Observation, Action]):
     def _report(self, state: State) -> tuple[Observation, dict[str, Any]]:
         task, observation = self.task, self._observe(state, self._goal)
         achieved, desired = observation["achieved_goal"], observation["desired_goal"]
-        terms = task.reward_terms(state, achieved, desired)
+        terms = {k: float(v) for k, v in task.reward_terms(state, achieved, desired).items()}
+        vector = observation["observation"]
+        if not math.isfinite(vector.dot(vector) + achieved.dot(achieved) + sum(terms.values())):
+            raise _not_finite(task, state, achieved, terms)
         return observation, {
             "is_success": bool(task.success(achieved, desired)),
             "closure_error": float(state.closure_error),
@@ -497,8 +511,34 @@ class TPMEnv(gym.Env[Observation, Action]):
             "assembly_mode_changed": bool(state.assembly_mode_changed),
             "working_mode_changed": bool(state.working_mode_changed),
             "object_lost": bool(task.lost(state)),
-            "reward_terms": {name: float(value) for name, value in terms.items()},
+            "reward_terms": terms,
         }
+
+
+def _require_goals(size: int, achieved: ArrayLike, desired: ArrayLike) -> None:
+    """Refuse what is no batch of goals; what is not finite is no success, but may be asked for."""
+    shapes = [numbers("achieved_goal", achieved).shape, numbers("desired_goal", desired).shape]
+    try:
+        np.broadcast_shapes(*shapes)
+        fit = all(shape[-1:] == (size,) for shape in shapes)
+    except ValueError:
+        fit = False
+    if not fit:
+        valid = f"of shapes (..., {size}) that go together, by shape"
+        raise InputError("achieved_goal, desired_goal", shapes, valid)
+
+
+def _not_finite(
+    task: Task, state: State, achieved: FloatArray, terms: Mapping[str, float]
+) -> InputError:
+    """Which of the values that a task made of a state is at fault for one that is not finite."""
+    values = {
+        **{f"observed(), entry {entry.name!r}": entry.source(state) for entry in task.entries},
+        "achieved()": achieved,
+        **{f"reward_terms(), term {name!r}": value for name, value in terms.items()},
+    }
+    name, value = next(item for item in values.items() if not np.isfinite(item[1]).all())
+    return InputError(f"{type(task).__name__}.{name}", np.asarray(value).tolist(), "finite")
 
 
 def _goal_free(info: Mapping[str, Any]) -> float:
