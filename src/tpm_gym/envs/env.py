@@ -296,8 +296,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         rng = self.np_random
         start = self.task.start(rng, options)
         plant = self.randomisation.draw(rng, self.machine)
-        name = f"the goal of {type(self.task).__name__}.sample()"
-        self._goal = finite(name, start.pop("goal"), (self.task.goal_size,))
+        self._goal = start.pop("goal")
         self._pending = (np.zeros(self.task.action_size),) * self.randomisation.latency
         self._state = None
         self.episode += 1
@@ -530,15 +529,15 @@ def _require_goals(size: int, achieved: ArrayLike, desired: ArrayLike) -> None:
 
 def _not_finite(
     task: Task, state: State, achieved: FloatArray, terms: Mapping[str, float]
-) -> InputError:
+) -> ConfigurationError:
     """Which of the values that a task made of a state is at fault for one that is not finite."""
     values = {
-        **{f"observed(), entry {entry.name!r}": entry.source(state) for entry in task.entries},
+        **{f"observed(), {entry.name!r}": entry.source(state) for entry in task.entries},
         "achieved()": achieved,
-        **{f"reward_terms(), term {name!r}": value for name, value in terms.items()},
+        **{f"reward_terms()[{name!r}]": value for name, value in terms.items()},
     }
     name, value = next(item for item in values.items() if not np.isfinite(item[1]).all())
-    return InputError(f"{type(task).__name__}.{name}", np.asarray(value).tolist(), "finite")
+    return ConfigurationError(name, np.asarray(value).tolist(), "finite numbers from the task")
 
 
 def _goal_free(info: Mapping[str, Any]) -> float:
