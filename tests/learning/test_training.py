@@ -34,7 +34,7 @@ from tpm_gym.learning import (
 )
 from tpm_gym.learning.algorithms import ALGORITHMS
 from tpm_gym.learning.configuration import complete, resumed
-from tpm_gym.learning.errors import ConfigError
+from tpm_gym.learning.errors import ConfigError, RunError
 from tpm_gym.learning.policies import load_model, load_policy
 from tpm_gym.learning.recipes import read_recipe, read_recipes, recipe_file
 from tpm_gym.learning.rollout import SELECTION_SEED, run_episodes
@@ -138,6 +138,38 @@ def test_runs_from_before_these_options_go_on_with_their_defaults(run: Path) -> 
     del stored["penalty_weight"], stored["goals"]
     config = resumed(ResumeConfig(run), stored, 0)
     assert (config.penalty_weight, config.goals) == (1.0, "sampled")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("algo", "zzz"),
+        ("goals", "zz"),
+        ("recipe", {}),
+        ("recipe", 3),
+        ("recipe_file", None),
+        ("steps", "abc"),
+        ("envs", "1"),
+        ("penalty_weight", [1.0]),
+        ("resumed", 3),
+    ],
+)
+def test_a_damaged_configuration_is_named_and_left_as_it_is(
+    name: str, value: Any, run: Path, tmp_path: Path
+) -> None:
+    stored = json.loads((run / "config.json").read_text(encoding="utf-8"))
+    (tmp_path / "config.json").write_text(json.dumps({**stored, name: value}))
+    before = (tmp_path / "config.json").read_bytes()
+    with pytest.raises(RunError, match=r"configuration of .* is damaged: .*--overwrite") as caught:
+        resume(ResumeConfig(tmp_path), quiet())
+    assert ("list" if name == "resumed" else name[:4]) in str(caught.value)
+    assert (tmp_path / "config.json").read_bytes() == before
+
+
+@pytest.mark.parametrize("option", [{"threads": 0}, {"eval_every": 0}, {"device": "zz"}], ids=str)
+def test_mistakes_are_named_where_there_is_nothing_to_do(run: Path, option: Any) -> None:
+    with pytest.raises(ConfigError, match=f"--{next(iter(option))[:4]}"):
+        resume(ResumeConfig(run, **option), quiet())
 
 
 def test_best_policy_is_the_one_evaluated_best(run: Path) -> None:

@@ -318,6 +318,7 @@ class TPMEnv(gym.Env[Observation, Action]):
             EpisodeError: If there is no episode: before reset, after close, after a lost loop.
             ClosureError: If a loop of the mechanism opened.
             ModeChangeError: If the mechanism passed a singularity earlier in this episode.
+            ConfigurationError: If the task makes something of the state that is no number.
         """
         values = finite("action", action, (self.task.action_size,), ActionError)
         state = self.state

@@ -1,5 +1,6 @@
 """What a training run is to do: the options of the command line, completed and checked."""
 
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
@@ -7,10 +8,11 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import tyro
+from pydantic import TypeAdapter, ValidationError
 
 from tpm_gym.learning.algorithms import ALGORITHMS
 from tpm_gym.learning.environments import check_env_id
-from tpm_gym.learning.errors import ConfigError
+from tpm_gym.learning.errors import ConfigError, RunError
 from tpm_gym.learning.recipes import Recipe, read_recipe, recipe_file
 from tpm_gym.learning.rollout import SELECTION_SEED, TEST_SEED
 
@@ -157,7 +159,9 @@ def resumed(config: ResumeConfig, stored: Mapping[str, Any], reached: int) -> Tr
 
     Raises:
         ConfigError: An option is not valid.
+        RunError: ``stored`` is damaged.
     """
+    _require_whole(config.run, stored)
     changes = {name: value for name, value in vars(config).items() if value is not UNSET}
     # A run of before an option was there had what is its default.
     names = {field.name for field in fields(TrainingConfig)} & stored.keys()
@@ -167,6 +171,31 @@ def resumed(config: ResumeConfig, stored: Mapping[str, Any], reached: int) -> Tr
         raise ConfigError(f"--steps {found.steps}: the run has already taken {reached:,}")
     _check(found)
     return found
+
+
+def _require_whole(run: Path, stored: Mapping[str, Any]) -> None:
+    """Refuse a stored configuration with entries that are missing or of other types."""
+    entries = {
+        field.name: stored.get(field.name)
+        for field in fields(TrainingConfig)
+        if field.name in stored or field.default is UNSET
+    }
+    text = json.dumps({**entries, "run": run.name})
+    try:
+        TypeAdapter(TrainingConfig).validate_json(text, strict=True)
+        TypeAdapter(list[Any]).validate_python(stored.get("resumed", []))
+        recipe_file(stored["algo"])  # there is such an algorithm
+    except ValidationError as error:
+        first = error.errors()[0]
+        problem = f"{'.'.join(map(str, first['loc']))}: {first['msg']}, not {first['input']!r:.100}"
+        raise _damaged(run, problem) from error
+    except ConfigError as error:
+        raise _damaged(run, str(error)) from error
+
+
+def _damaged(run: Path, problem: str) -> RunError:
+    anew = "start the run anew with tpm-gym train --overwrite"
+    return RunError(f"the configuration of {run} is damaged: {problem}; {anew}")
 
 
 def check_least(config: Any, least: int, *names: str) -> None:

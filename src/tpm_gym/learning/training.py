@@ -85,6 +85,7 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
     with run_folder.disk_errors_named(run, store), run_folder.claimed(run):
         stored = run_folder.description(run)
         if stored is not None and is_finished(run) and config.steps in (UNSET, stored["steps"]):
+            resumed(config, stored, 0)  # to check it
             _say(console, f"nothing to do: {run} has finished its {stored['steps']:,} steps")
             return None
         content = store.load(lambda text: _say(console, f"warning: {text}"))
@@ -99,11 +100,12 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
             )
         step = content.step if content else 0
         changed = resumed(config, stored, step)
+        description = _description_resumed(changed, stored, step)
         if content:
             restore_files(run, content)
         else:
             run_folder.clear(run)
-        provenance.write_json(run / CONFIG_FILE, _description_resumed(changed, stored, step))
+        provenance.write_json(run / CONFIG_FILE, description)
         _say(console, f"{changed.title}, from step {step:,} to {changed.steps:,}, in {run}")
         return _learn(changed, console, store, content)
 
