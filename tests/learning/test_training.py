@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -252,6 +253,7 @@ PICK = {"env": "TPMPickAndPlace-v0", "recipe_file": recipe_file("sac")}
         ({**PICK, "steps": 20_050, "envs": 3}, "the 20,100 of"),
         ({"algo": "ppo", "recipe_file": None}, "no recipe for TPMReach-v0"),
         ({"recipe_file": Path("none.yml")}, "cannot be read"),
+        ({"device": "meta"}, "--device meta"),
     ],
 )
 def test_mistakes_are_named_before_anything_is_written(
@@ -260,6 +262,19 @@ def test_mistakes_are_named_before_anything_is_written(
     with pytest.raises(ConfigError, match=message):
         train(replace(make_config("sac", tmp_path), **options), quiet())
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("size", [49, 10**12])
+def test_a_buffer_that_cannot_be_is_one_line(size: int, tmp_path: Path) -> None:
+    config = make_config("sac", tmp_path)
+    text, found = re.subn(
+        r"buffer_size: *\d+", f"buffer_size: {size}", config.recipe_file.read_text()
+    )
+    assert found == 1
+    config.recipe_file.write_text(text)
+    with pytest.raises(ConfigError, match="buffer_size: ") as caught:
+        train(config, quiet())
+    assert "\n" not in str(caught.value)
 
 
 SHIPPED = [

@@ -161,7 +161,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         reward: ``"sparse"`` (None too) or ``"dense"``.
         engine: ``"pybullet"``, or a name that :func:`tpm_gym.register_engine` knows.
         machine: ``"paper"`` (None too), ``"wide"``, a name that :func:`tpm_gym.register_machine`
-            knows, or a :class:`~tpm_gym.Machine`.
+            knows, or a :class:`~tpm_gym.Machine`; a spec that goes through JSON needs a name.
         goals: ``"sampled"`` (None too), or ``"tempting"``: the goal, and where the puck starts, lie
             next to the singularity, which not every machine has near its goals.
         penalty_weight: Weight of the singularity penalty, None for 1; 0 switches it off.

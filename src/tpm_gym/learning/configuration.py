@@ -242,6 +242,12 @@ def _check_episodes(config: TrainingConfig) -> None:
             f"--recipe {config.recipe_file}: learning_starts: {starts} is before the first episode "
             f"ends (step {horizon * envs} with {envs} environments); raise it, or use fewer --envs"
         )
+    room = int(recipe.arguments.get("buffer_size", 1_000_000))
+    if recipe.hindsight and room < horizon * envs:
+        raise ConfigError(
+            f"--recipe {config.recipe_file}: buffer_size: {room} is less than the {horizon * envs} "
+            f"steps of an episode in each of {envs} environments; raise it, or use fewer --envs"
+        )
 
 
 def _check_device(device: str) -> None:
@@ -250,6 +256,8 @@ def _check_device(device: str) -> None:
 
     try:
         kind = torch.device(device).type
+        if kind != "cuda":
+            torch.zeros(1, device=device).item()  # some hold no numbers
     except RuntimeError as error:
         raise ConfigError(f"--device {device}: is no device of PyTorch; try cpu") from error
     if kind == "cuda" and not torch.cuda.is_available():

@@ -46,10 +46,8 @@ _POLICIES: Final = tuple(
     for suffix in (".zip", *EXPORTED)
 )
 _EVENTS: Final = "events.out.tfevents.*"
-_DISK_ERRORS: Final = (
-    *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO),
-    *(errno.EROFS, errno.EACCES, errno.EPERM),
-)
+_FULL: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_DISK_ERRORS: Final = (*_FULL, errno.EIO, errno.EROFS, errno.EACCES, errno.EPERM)
 
 
 def prepare(run: Path, overwrite: bool) -> None:
@@ -203,7 +201,8 @@ def disk_errors_named(run: Path, store: CheckpointStore) -> Iterator[None]:
             else f"continue from step {store.newest:,} with: tpm-gym resume {run}"
         )
         problem = error.strerror or error
-        raise RunError(f"cannot write to {run}: {problem}; make room, then {go_on}") from error
+        remedy = "make room" if error.errno in _FULL else "make it writable"
+        raise RunError(f"cannot write to {run}: {problem}; {remedy}, then {go_on}") from error
     finally:
         threading.excepthook = before
 

@@ -30,7 +30,7 @@ from tpm_gym.learning.configuration import (
     resumed,
 )
 from tpm_gym.learning.environments import check_env_id, make_env
-from tpm_gym.learning.errors import PolicyError, RunError
+from tpm_gym.learning.errors import ConfigError, PolicyError, RunError
 from tpm_gym.learning.rollout import SELECTION_SEED
 from tpm_gym.learning.run_folder import CHECKPOINTS, CONFIG_FILE, is_finished
 
@@ -229,9 +229,16 @@ def _report(
 
 
 def make_model(config: TrainingConfig, envs: VecEnv) -> BaseAlgorithm:
-    """Build the algorithm of a completed configuration."""
+    """Build the algorithm of a completed configuration.
+
+    Raises:
+        ConfigError: Its buffer does not fit into memory.
+    """
     kind = ALGORITHMS[config.algo].load_class()
-    return kind(env=envs, seed=config.seed, device=config.device, **config.recipe.keywords())
+    try:
+        return kind(env=envs, seed=config.seed, device=config.device, **config.recipe.keywords())
+    except MemoryError as error:
+        raise ConfigError(f"--recipe {config.recipe_file}: buffer_size: {error}") from error
 
 
 def make_training_envs(config: TrainingConfig) -> VecEnv:
