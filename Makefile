@@ -49,6 +49,7 @@ test-wheel: $(INSTALLED) ## the wheel in an empty environment: train, kill, resu
 
 urdf: $(INSTALLED) ## regenerate urdf/ from the mechanism
 	$(RUN) -m tpm_gym.mechanism.urdf urdf
+	$(RUN) -m tpm_gym.mechanism.mjcf urdf
 
 pictures: $(INSTALLED) ## redraw the README's pictures
 	$(RUN) docs/draw_pictures.py

@@ -62,7 +62,7 @@ def play(env_id: str, engine: str, drive: Servo | None, scripted: bool, episodes
             expert.reset(observation)
         done = False
         while not done:
-            action = rng.uniform(-1, 1, env.action_space.shape)
+            action = rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
             if expert is not None:
                 action = expert.act(observation)
             observation, _, terminated, truncated, info = env.step(action)

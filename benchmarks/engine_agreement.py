@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 import tpm_gym  # noqa: F401  (registers the environments)
 from tpm_gym.arrays import FloatArray
-from tpm_gym.mechanism import PAPER_TPM, dynamics
+from tpm_gym.mechanism import PAPER_TPM
 from tpm_gym.simulation.randomisation import Plant
 from tpm_gym.simulation.simulation import Simulation, spline_weights
 from tpm_gym.simulation.state import CONTROL_PERIOD, Scene
@@ -24,7 +24,7 @@ REACH, PICK = "TPMReach-v0", "TPMPickAndPlace-v0"
 SEED = 3_000_000
 """Of the first episode: neither trained, nor selected, nor tested on."""
 STEPS = 50
-FALL = 5
+FALL = 4
 """Control periods for which the mechanism falls with its motors off."""
 
 
@@ -157,7 +157,8 @@ def torque_by_theory(inner: Any, commands: FloatArray) -> FloatArray:
     points = spline_weights(substeps)[-3:] @ machine.mount.to_paper(commands)
     before, at, after = (np.array(machine.inverse(tuple(point))) for point in points.tolist())
     rate, next_rate = (at - before) / step, (after - at) / step
-    return dynamics.torque(at, rate, (next_rate - rate) / step)
+    torque: FloatArray = machine.dynamics.torque(at, rate, (next_rate - rate) / step)
+    return torque
 
 
 def energy_lost(engine: str) -> float:
@@ -167,11 +168,11 @@ def energy_lost(engine: str) -> float:
     try:
         theta = machine.inverse(machine.home)
         plant = Plant(motor_strength=(0.0, 0.0, 0.0))
-        start = dynamics.energy(np.array(theta), np.zeros(3))
+        start = machine.dynamics.energy(np.array(theta), np.zeros(3))
         simulation.reset(theta, plant=plant)
         for _ in range(FALL):
             state = simulation.move(machine.home)
     finally:
         simulation.close()
-    end = dynamics.energy(state.theta, state.theta_dot)
-    return float((start.sum() - end.sum()) / end.kinetic)
+    end = machine.dynamics.energy(state.theta, state.theta_dot)
+    return float((start.potential - sum(end)) / (start.potential - end.potential))

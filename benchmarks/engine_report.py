@@ -113,9 +113,9 @@ def _costs(record: dict[str, Any]) -> str:
         ratios.append(f"{engine} {middle:.2f} [{low:.2f}, {high:.2f}] times as fast as {first}")
     lost = ", ".join(f"{name} {100 * share:.1f}%" for name, share in record["energy_lost"].items())
     return (
-        f"A control step of `TPMPickAndPlace-v0` under random actions: {times}; {'; '.join(ratios)} "
-        f"(median and quartiles of rounds that take turns). Energy that a fall of 0.2 s with the "
-        f"motors off loses: {lost}."
+        f"A control step of `TPMPickAndPlace-v0` under random actions: {times}; "
+        f"{'; '.join(ratios)} (median and quartiles of rounds that take turns). Energy that a fall "
+        f"of 0.16 s with the motors off loses: {lost}."
     )
 
 

@@ -13,7 +13,7 @@ from tpm_gym.envs.registration import env_ids, register_task
 from tpm_gym.errors import TPMError
 from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
 from tpm_gym.mechanism.machine import Machine, register_machine
-from tpm_gym.mechanism.tpm import TPM
+from tpm_gym.mechanism.tpm import PAPER_TPM, TPM, WIDE_TPM
 from tpm_gym.simulation.engine import register_engine
 
 if TYPE_CHECKING:
@@ -24,8 +24,10 @@ if TYPE_CHECKING:
 __all__ = [
     "ENV_IDS",
     "PAPER",
+    "PAPER_TPM",
     "TPM",
     "WIDE",
+    "WIDE_TPM",
     "Geometry",
     "Machine",
     "TPMEnv",

@@ -10,6 +10,7 @@ from episodes import expert_episode
 from paths import ROOT
 
 import tpm_gym
+from tpm_gym.learning.recipes import read_recipe
 from tpm_gym.tasks.registry import TASKS
 
 PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
@@ -26,6 +27,14 @@ def test_a_block_makes_an_environment_that_its_expert_solves(code):
             *_, (_, reward, info) = expert_episode(env, seed)
             assert info["is_success"]
             assert sum(info["reward_terms"].values()) == pytest.approx(reward)
+
+
+def test_the_recipe_is_one_for_the_task_above(tmp_path):
+    file = tmp_path / "stack.yml"
+    file.write_text("".join(re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)), encoding="utf-8")
+    recipe = read_recipe(file, "sac", "stacking:TPMStack-v0")
+    assert recipe.hindsight
+    assert recipe.arguments["learning_starts"] >= 100  # steps of an episode
 
 
 def test_the_table_counts_lines_as_they_are():

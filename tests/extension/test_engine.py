@@ -63,6 +63,14 @@ def test_what_is_no_engine_is_not_registered(name, engine, blamed):
     assert caught.value.name == blamed
 
 
+@pytest.mark.parametrize("place", ["nixmod:Engine", "kinematic:Engines"])
+def test_one_that_cannot_be_imported_is_refused_by_name(place):
+    tpm_gym.register_engine(place, place)
+    said = f"engine = '{place}'.*of '{place}' Python says: .*(nixmod|Engines)"
+    with pytest.raises(ConfigurationError, match=said):
+        tpm_gym.TPMEnv(engine=place)
+
+
 def test_names_are_taken_once():
     tpm_gym.register_engine("kinematic", KinematicEngine)
     with pytest.raises(ConfigurationError, match="a name other than"):

@@ -112,10 +112,25 @@ def test_a_block_that_the_cup_cannot_come_down_to_is_refused(stacking):
 
     with pytest.raises(ConfigurationError, match=r"'coin'.*at least 0\.027 m high"):
         Coin(PAPER_TPM)
-    with pytest.raises(ConfigurationError, match="objects of different names"):
-        tpm_gym.TPMEnv(
-            type("Twins", (stacking.Stack,), {"scene": Scene((Block(), Block()), markers=2)})
-        )
+    with pytest.raises(ConfigurationError, match="a name of its own"):
+        Scene((Block(), Block()), markers=2)
+
+
+@pytest.mark.parametrize(
+    ("part", "value", "message"),
+    [
+        ("goal_size", 4, "goal_size = 4 .*three for each point"),
+        ("goal_size", 3, "markers = 2 .*valid: 1, .*markers=1"),
+        ("achieved", lambda *_: np.zeros(3), r"achieved\(\) = .*\(3,\).*of shape \(6,\)"),
+        ("shaping", lambda *_: None, r"shaping\(\) = None .*a dictionary"),
+        ("observed", tpm_gym.tasks.Task.observed, r"observed\(\) = .*'red_held'.*object_entries"),
+        ("vacuum", False, "vacuum = False .*: True: the plan of Wrong"),
+    ],
+)
+def test_what_is_wrong_in_a_task_is_named(stacking, part, value, message):
+    wrong = type("Wrong", (stacking.Stack,), {part: value})
+    with pytest.raises(ConfigurationError, match=message):
+        list(expert_episode(tpm_gym.TPMEnv(wrong), 0, steps=50))
 
 
 def test_where_there_is_no_room_sampling_says_so(stacking):

@@ -4,6 +4,7 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import patch
 
 import gymnasium as gym
 import pytest
@@ -12,29 +13,30 @@ from trainings import SAC_RECIPE
 from tpm_gym.learning.command_line import main
 from tpm_gym.learning.environments import check_env_id, make_env
 from tpm_gym.learning.errors import ConfigError
+from tpm_gym.tasks.registry import TASKS
 
 MODULE = """
-import gymnasium as gym
+import tpm_gym
+from tpm_gym.tasks import Reach
 
-gym.register(
-    id="MyReach-v0",
-    entry_point="tpm_gym.envs.env:TPMEnv",
-    max_episode_steps=20,
-    kwargs={"task": "reach", "control": "joints"},
-)
+tpm_gym.register_task("Mine", type("Mine", (Reach,), {}), max_episode_steps=20)
+tpm_gym.register_machine("mine", tpm_gym.PAPER_TPM)
 """
 
 
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Runs a command in a folder from which Python imports, and which it has not imported yet."""
+    """Runs the command in a folder that Python knows nothing of, and has imported nothing from."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(tmp_path)
 
     def run_anew(*words: str) -> None:
         sys.modules.pop("my_tasks", None)
-        gym.registry.pop("MyReach-v0", None)
-        main(words)
+        with (
+            patch.dict(gym.registry),
+            patch.dict(TASKS),
+            patch.object(sys, "path", [path for path in sys.path if path]),
+        ):
+            main(words)
 
     return run_anew
 
@@ -44,23 +46,34 @@ def test_an_id_of_a_users_module_is_trained_in_workers_resumed_and_evaluated(
     tmp_path: Path, run: Callable[..., None]
 ) -> None:
     (tmp_path / "my_tasks.py").write_text(MODULE)
-    (tmp_path / "sac.yml").write_text(SAC_RECIPE.format(env="MyReach-v0", train_freq=5))
-    words = ["--env", "my_tasks:MyReach-v0", "--recipe", "sac.yml", "--envs", "2"]
-    words += ["--steps", "120", "--eval-episodes", "1"]
+    (tmp_path / "sac.yml").write_text(SAC_RECIPE.format(env="TPMMine-v0", train_freq=5))
+    words = ["--env", "my_tasks:TPMMine-v0", "--recipe", "sac.yml", "--envs", "2"]
+    words += ["--steps", "120", "--eval-episodes", "1", "--machine", "mine"]
     run("train", *words)
-    folder = "runs/MyReach-v0-sac-s0"
+    folder = "runs/TPMMine-v0-sac-s0"
     run("resume", folder, "--steps", "160")
-    run("evaluate", "--policy", folder, "expert", "--episodes", "1", "--json", "out.json")
+    run(
+        "evaluate",
+        "--policy",
+        folder,
+        "expert",
+        "--machine",
+        "mine",
+        "--episodes",
+        "1",
+        "--json",
+        "out.json",
+    )
     content = json.loads((tmp_path / "out.json").read_text())
-    assert content["env"] == "my_tasks:MyReach-v0"
+    assert content["env"] == "my_tasks:TPMMine-v0"
     assert [policy["records"][0]["length"] for policy in content["policies"]] == [20, 20]
 
 
 @pytest.mark.parametrize(
     ("env_id", "message"),
     [
-        ("TPMRech-v0", "unknown environment 'TPMRech-v0'.*TPMReach-v0.*module:id"),
-        ("no_such_module:MyReach-v0", "unknown environment .*no_such_module"),
+        ("TPMRech-v0", "unknown environment 'TPMRech-v0'; there are TPMReach-v0.*module:id"),
+        ("no_such_module:TPMMine-v0", "cannot import 'no_such_module'.*the folder that holds it"),
         ("CartPole-v1", "CartPole-v1 is no environment of tpm_gym"),
         ("not an id", "unknown environment"),
     ],

@@ -14,8 +14,9 @@ from processes import PYTHON, TPM_GYM, error_of, printed_by
 from trainings import quiet, said
 
 from tpm_gym.errors import ConfigurationError
-from tpm_gym.learning import EvaluationConfig, evaluate, evaluation, film, provenance
+from tpm_gym.learning import EnvOptions, EvaluationConfig, evaluate, evaluation, film, provenance
 from tpm_gym.learning.errors import ConfigError, PolicyError
+from tpm_gym.simulation import Servo
 
 METRICS = (
     "success_at_end",
@@ -154,7 +155,12 @@ def test_contact_sheet_runs_until_nothing_moves(still: int, sheet: list[list[int
         ({"episodes": 0}, ConfigError, "at least 1"),
         ({"video_episodes": 0}, ConfigError, "at least 1"),
         ({"seed": -1}, ConfigError, "at least 0"),
-        ({"env": None}, ConfigError, "name one with --env"),
+        ({"env": None}, ConfigError, "^expert and random have no .*: give --env ID$"),
+        (
+            {"env": None, "policy": ("TPMReach-v0", "TPMPickAndPlace-v0")},
+            ConfigError,
+            "on TPMPickAndPlace-v0, TPMReach-v0: choose one with --env",
+        ),
         ({"env": "TPMRech-v0"}, ConfigError, "TPMReach-v0"),
         ({"policy": ("expert", "gone.zip")}, PolicyError, "no file gone.zip"),
         ({"video": Path("film.xyz")}, ConfigError, "--video"),
@@ -169,6 +175,8 @@ def test_contact_sheet_runs_until_nothing_moves(still: int, sheet: list[list[int
         ({"randomisation": ("a=1", "a=2")}, ConfigError, "--randomisation"),
         ({"randomisation": ("puk_mass=2",)}, ConfigurationError, "puck_mass"),
         ({"penalty_weight": -1.0}, ConfigurationError, "penalty_weight"),
+        ({"env_options": EnvOptions(machine="narrow")}, ConfigurationError, "'paper', 'wide'"),
+        ({"env_options": EnvOptions(engine="none")}, ConfigurationError, "'pybullet'"),
     ],
 )
 def test_mistakes_are_named(options: dict[str, Any], error: type[Exception], message: str) -> None:
@@ -182,11 +190,11 @@ def test_conditions_are_recorded_and_the_defaults_are_the_nominal_machine(
 ) -> None:
     content, _ = written
     assert (content["goals"], content["penalty_weight"]) == ("sampled", 1.0)
-    assert content["randomisation"] == {}
+    assert content["randomisation"] == content["env_options"] == {}
     path = tmp_path / "other.json"
     words = ["--policy", "random", "--env", "TPMReach-v0", "--episodes", "1", "--json", str(path)]
     words += ["--randomisation", "encoder_noise=1e-4", "friction=0.5:1", "latency=1"]
-    words += ["--penalty-weight", "0.5", "--goals", "tempting"]
+    words += ["--penalty-weight", "0.5", "--goals", "tempting", "--drive", "servo"]
     printed_by(*TPM_GYM, "evaluate", *words)
     content = read_strict(path)
     assert content["randomisation"] == {
@@ -195,16 +203,22 @@ def test_conditions_are_recorded_and_the_defaults_are_the_nominal_machine(
         "latency": 1,
     }
     assert (content["goals"], content["penalty_weight"]) == ("tempting", 0.5)
+    assert content["env_options"] == {"drive": "servo"}
     assert "--randomisation encoder_noise=1e-4 friction=0.5:1" in content["command"]
 
 
 def test_the_environment_is_the_one_that_was_asked_for() -> None:
     config = EvaluationConfig(
-        policy=("random",), goals="tempting", penalty_weight=0.25, randomisation=("puck_mass=2",)
+        policy=("random",),
+        goals="tempting",
+        penalty_weight=0.25,
+        randomisation=("puck_mass=2",),
+        env_options=EnvOptions(engine="pybullet", drive="servo"),
     )
     env: Any = evaluation._make_env("TPMPickAndPlace-v0", config)
     assert env.unwrapped.task.penalty_weight == 0.25
     assert env.unwrapped.randomisation.puck_mass == (2.0, 2.0)
+    assert env.unwrapped.drive == Servo()
     plain = gym.make("TPMPickAndPlace-v0")
     goals = [made.reset(seed=3)[0]["desired_goal"] for made in (env, plain)]
     assert not np.array_equal(*goals)
@@ -277,7 +291,7 @@ def test_an_exported_policy_that_is_of_another_task_or_damaged_is_refused(
 def test_scripted_policies_load_no_torch_and_exported_ones_no_stable_baselines(run: Path) -> None:
     program = (
         "import sys; sys.modules['stable_baselines3'] = sys.modules['sb3_contrib'] = None\n"
-        "from tpm_gym.learning import EvaluationConfig, evaluate\n"
+        "from tpm_gym.learning import EnvOptions, EvaluationConfig, evaluate\n"
         "evaluate(EvaluationConfig(policy=('expert', 'random'), env='TPMReach-v0', episodes=1))\n"
         "assert 'torch' not in sys.modules\n"
         f"evaluate(EvaluationConfig(policy=({str(run / 'best')!r},), episodes=1))\n"

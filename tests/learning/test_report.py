@@ -145,6 +145,10 @@ def test_a_run_that_broke_off_is_collected_too(runs: Path, tmp_path: Path) -> No
     late.write_text("{\n")
     with pytest.raises(ConfigError, match="late: its evaluations are damaged"):
         collect(Collect(tmp_path / "runs", tmp_path / "records"))
+    other = json.dumps({**config, "env_options": {"machine": "wide"}})
+    (tmp_path / "runs" / "early" / "config.json").write_text(other)
+    with pytest.raises(ConfigError, match=r"early: was made with .*wide"):
+        collect(Collect(tmp_path / "runs", tmp_path / "records"))
 
 
 def test_the_command_line_goes_from_runs_to_page(runs: Path, tmp_path: Path) -> None:

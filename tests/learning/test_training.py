@@ -25,7 +25,9 @@ from trainings import (
 )
 
 import tpm_gym
+from tpm_gym.errors import TPMError
 from tpm_gym.learning import (
+    EnvOptions,
     EvaluationConfig,
     ResumeConfig,
     TrainingConfig,
@@ -40,6 +42,8 @@ from tpm_gym.learning.policies import load_model, load_policy
 from tpm_gym.learning.recipes import read_recipe, read_recipes, recipe_file
 from tpm_gym.learning.rollout import SELECTION_SEED, run_episodes
 from tpm_gym.learning.training import make_model
+from tpm_gym.mechanism import PAPER_TPM
+from tpm_gym.simulation import Servo
 
 RECIPE = CASES["sac"][2]
 
@@ -103,9 +107,11 @@ def test_config_records_the_whole_run(run: Path) -> None:
     assert str(run.parent) not in text
 
 
-def test_penalty_weight_and_goals_reach_every_environment_and_survive_resuming(
+def test_what_is_chosen_reaches_every_environment_and_survives_resuming(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    snug = replace(PAPER_TPM, name="snug", table=(0.4, 0.3))
+    tpm_gym.register_machine("snug", snug)
     made: list[gym.Env[Any, Any]] = []
     make = gym.make
 
@@ -114,21 +120,26 @@ def test_penalty_weight_and_goals_reach_every_environment_and_survive_resuming(
         return made[-1]
 
     monkeypatch.setattr(gym, "make", remember)
+    options = EnvOptions(machine="snug", drive="servo")
     config = replace(make_config("sac", tmp_path), steps=110, penalty_weight=0.0, goals="tempting")
+    config = replace(config, env_options=options)
     config.recipe_file.write_text(RECIPE + "  demonstrations: {episodes: 1}\n", encoding="utf-8")
     folder = config.run
     train(config, quiet())
     content = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+    changed = ("penalty_weight", "goals", "env_options")
     assert (content["penalty_weight"], content["goals"]) == (0.0, "tempting")
-    assert len(made) == 3  # training, evaluation, demonstrations
+    assert content["env_options"] == {"machine": "snug", "drive": "servo"}
+    assert len(made) == 4  # before all, training, evaluation, demonstrations
     resume(ResumeConfig(folder, steps=170), quiet())
-    assert len(made) == 5
+    assert len(made) == 6
     for env in made:
         inner: Any = env.unwrapped
         assert inner.task.penalty_weight == 0.0
         assert inner.task.goals == "tempting"
+        assert (inner.machine, inner.drive) == (snug, Servo())
     again = json.loads((folder / "config.json").read_text(encoding="utf-8"))
-    assert (again["penalty_weight"], again["goals"]) == (0.0, "tempting")
+    assert [again[name] for name in changed] == [content[name] for name in changed]
     # The exported policy is one for the id itself.
     results = evaluate(EvaluationConfig(policy=(str(folder),), episodes=1), quiet())
     assert results[0].records[0].length == 50
@@ -136,9 +147,10 @@ def test_penalty_weight_and_goals_reach_every_environment_and_survive_resuming(
 
 def test_runs_from_before_these_options_go_on_with_their_defaults(run: Path) -> None:
     stored = json.loads((run / "config.json").read_text(encoding="utf-8"))
-    del stored["penalty_weight"], stored["goals"]
+    del stored["penalty_weight"], stored["goals"], stored["env_options"]
     config = resumed(ResumeConfig(run), stored, 0)
     assert (config.penalty_weight, config.goals) == (1.0, "sampled")
+    assert config.env_options.given() == {}
 
 
 @pytest.mark.parametrize(
@@ -251,15 +263,16 @@ PICK = {"env": "TPMPickAndPlace-v0", "recipe_file": recipe_file("sac")}
         ({"envs": 5}, "before the first episode ends"),
         ({**PICK, "steps": 20_000}, "more than the 20,000 of the recipe's demonst"),
         ({**PICK, "steps": 20_050, "envs": 3}, "the 20,100 of"),
-        ({"algo": "ppo", "recipe_file": None}, "no recipe for TPMReach-v0"),
+        ({"algo": "ppo", "recipe_file": None}, "no recipe for TPMReach-v0; .*--recipe FILE"),
         ({"recipe_file": Path("none.yml")}, "cannot be read"),
         ({"device": "meta"}, "--device meta"),
+        ({"env_options": EnvOptions(machine="narrow")}, "machine = 'narrow'"),
     ],
 )
 def test_mistakes_are_named_before_anything_is_written(
     options: dict[str, Any], message: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(ConfigError, match=message):
+    with pytest.raises(TPMError, match=message):
         train(replace(make_config("sac", tmp_path), **options), quiet())
     assert not (tmp_path / "run").exists()
 

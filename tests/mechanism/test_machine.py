@@ -12,22 +12,23 @@ from hypothesis import strategies as st
 from machines import anywhere, each_machine, within
 from walk import walk
 
-import tpm_gym
 from tpm_gym.arrays import Vector
 from tpm_gym.errors import ConfigurationError, SingularityError, TPMError, UnreachableError
 from tpm_gym.kinematics import inverse
 from tpm_gym.kinematics.geometry import PAPER, Geometry
-from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism import (
     PAPER_TPM,
     TPM,
     WIDE_TPM,
     Machine,
+    Mount,
+    Region,
     find_machine,
     register_machine,
     tree,
 )
 from tpm_gym.mechanism.bodies import Mechanism
+from tpm_gym.mechanism.cup import CUP
 
 share = st.floats(0.0, 1.0)
 
@@ -147,6 +148,7 @@ LOW, HIGH = PAPER_TPM.region.low, PAPER_TPM.region.high
         ("geometry", 3, "a tpm_gym.Geometry"),
         ("safe_conditioning", 1.5, "1"),
         ("region", Region((LOW[0], -0.02, LOW[2]), HIGH), "beyond a singularity"),
+        ("mount", Mount(height=0.9229), "0.923 m or more"),
     ],
 )
 def test_a_machine_on_which_no_episode_could_run_is_refused_by_name(
@@ -168,14 +170,14 @@ def test_a_machine_of_arrays_is_that_of_tuples() -> None:
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e300, 10**400, "high", (1.0,)])
 def test_a_height_that_cannot_be_is_refused(value: Any) -> None:
     with pytest.raises(ConfigurationError) as caught:
-        tpm_gym.mechanism.Mount(value)
+        Mount(value)
     assert caught.value.name == "height"
 
 
 @pytest.mark.parametrize(("name", "value"), [("", PAPER_TPM), (3, PAPER_TPM), ("mine", "paper")])
 def test_what_is_no_machine_is_not_registered(name: Any, value: Any) -> None:
     with pytest.raises(ConfigurationError) as caught:
-        tpm_gym.register_machine(name, value)
+        register_machine(name, value)
     assert caught.value.name == ("machine" if name == "mine" else "name")
 
 
@@ -264,7 +266,7 @@ def scaled(factor: float) -> TPM:
     return TPM(
         name="mine",
         geometry=Geometry(*times(*vars(PAPER).values())),
-        mount=tpm_gym.mechanism.Mount(height=factor * PAPER_TPM.mount.height),
+        mount=Mount(height=factor * PAPER_TPM.mount.height),
         region=Region(times(*LOW), times(*HIGH)),
         goal_region=Region(times(*PAPER_TPM.goal_region.low), times(*PAPER_TPM.goal_region.high)),
         home=times(*PAPER_TPM.home),
@@ -286,6 +288,12 @@ def test_lengths_of_a_user_s_own_make_a_machine() -> None:
         mine.with_lengths((0.3, 0.07, 0.35, -0.8, 0.1, 0.01, 0.05))
 
 
+def test_at_the_least_height_the_cup_is_pushed_in_as_far_as_it_goes() -> None:
+    mount = Mount(height=0.923)
+    lip = replace(PAPER_TPM, mount=mount).mount.to_world(HIGH) - np.array(CUP.lip)
+    assert lip[2] == pytest.approx(-CUP.stroke)
+
+
 def test_machines_are_found_by_name() -> None:
     assert find_machine("paper") is find_machine(PAPER_TPM) is PAPER_TPM
     assert find_machine("wide") is WIDE_TPM
@@ -300,3 +308,4 @@ def test_machines_are_found_by_name() -> None:
         with pytest.raises(ConfigurationError, match="'paper', 'wide'") as caught:
             find_machine(unknown)
         assert (caught.value.name, caught.value.value) == ("machine", unknown)
+        assert ("replace(tpm_gym.PAPER_TPM, geometry=" in caught.value.valid) == (unknown is PAPER)

@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import yaml
-from episodes import EVERYTHING, expert_episode, fingerprint, random_episode
+from episodes import EVERYTHING, OF_SERVOS, expert_episode, fingerprint, random_episode
 from machine import memory
 
 from tpm_gym import kinematics
@@ -150,6 +150,7 @@ def test_draws_fill_the_stated_ranges_and_are_independent() -> None:
     rng = np.random.default_rng(1)
     draws = np.array([numbers(wide.draw(rng, PAPER_TPM)) for _ in range(3000)])
     counts = {"link_mass": LINKS, "puck_mass": 1, "friction": 1, "motor_strength": 3}
+    counts |= {"servo_stiffness": 3, "joint_friction": 3}
     ranges = [_RANGES[name] for name, count in counts.items() for _ in range(count)]
     for size, count in zip(sizes.values(), (3, 7), strict=True):
         ranges += [(-size, size)] * count
@@ -435,6 +436,7 @@ EXTREMES: list[dict[str, Any]] = [
     *({name: largest} for name, largest in _SIZES.items()),
     {"link_mass": _RANGES["link_mass"][1], "motor_strength": _RANGES["motor_strength"][0]},
     {**_RANGES, **_SIZES, "latency": 1},
+    {name: end for name, end in (_RANGES | _SIZES).items() if name not in OF_SERVOS},
 ]
 
 
@@ -445,7 +447,8 @@ EXTREMES: list[dict[str, Any]] = [
 def test_at_the_ends_of_the_ranges_nothing_is_lost_or_it_is_reported(
     option: dict[str, Any], seeds: range
 ) -> None:
-    env = TPMEnv("pick_and_place", randomisation=option)
+    drive = "servo" if option.keys() & OF_SERVOS.keys() else "ideal"
+    env = TPMEnv("pick_and_place", drive=drive, randomisation=option)
     for seed in seeds:
         rng = np.random.default_rng(seed)
         env.reset(seed=seed)

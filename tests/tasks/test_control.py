@@ -1,5 +1,7 @@
 """Whatever the action, the next command is one that the simulation can follow."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from examples import examples
@@ -42,6 +44,20 @@ def test_commands_stay_in_the_region_and_within_the_step_limit(
     assert (np.abs(command - current) <= np.array(machine.step_limit) * (1 + 1e-9)).all()
     np.testing.assert_array_equal(current, before)
     np.testing.assert_allclose(kind.command(np.zeros(3), current), current, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("kind", "machine"), CONTROLS)
+@examples(100, share=shares, far=st.tuples(*[st.floats(-0.5, 1.5)] * 3))
+def test_a_straight_way_takes_as_many_steps_as_it_says_even_from_beyond_the_region(
+    kind: Control, machine: Machine, share: Triple, far: Triple
+) -> None:
+    start, stop = within(machine, share), within(machine, far)
+    count = int(np.ceil(kind.steps(stop, start) * 1.1)) + 1  # joints turn nearly evenly
+    project = machine.region.project
+    points = [project(start + k / count * (stop - start)) for k in range(count + 1)]
+    for current, wanted in pairwise(points):
+        reached = kind.command(kind.action(wanted, current), current)
+        np.testing.assert_allclose(reached, wanted, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize(("kind", "machine"), CONTROLS)

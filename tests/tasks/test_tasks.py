@@ -256,6 +256,31 @@ def test_an_object_does_not_start_inside_another() -> None:
         assert caught.value.name == name
 
 
+@pytest.mark.parametrize(
+    ("sampled", "message"),
+    [
+        ({"other": None}, r"sample\(\) = \['object', 'goal'\] .*object, other, goal"),
+        ({"obj": np.zeros(3)}, r"sample\(\) = .*'obj'"),
+        ({"goal": np.zeros(3)}, r"sample\(\)\['goal'\] = .*shape \(6,\)"),
+        ({"object": np.full(3, np.nan)}, r"sample\(\)\['object'\] = .*finite"),
+        ({"other": np.array([0.01, -0.03, 0.015])}, r"sample\(\)\['object'\] = .*clear of other"),
+        (
+            {"other": PAPER_TPM.mount.to_world(PAPER_TPM.home)},
+            r"sample\(\)\['other'\] = .*clear of the robot",
+        ),
+    ],
+)
+def test_a_task_that_samples_what_cannot_be_is_refused(sampled: Any, message: str) -> None:
+    class Careless(TwoBlocks):
+        def sample(self, rng: Any, chosen: Any) -> Any:
+            start = {**super().sample(rng, chosen), **sampled}
+            return {name: place for name, place in start.items() if place is not None}
+
+    with pytest.raises(ConfigurationError, match=message) as caught:
+        Careless(PAPER_TPM).start(np.random.default_rng(0), None)
+    assert not isinstance(caught.value, ResetOptionError)
+
+
 # -- made by name, copied --------------------------------------------------------------------------
 
 

@@ -150,8 +150,11 @@ class TPMEnv(gym.Env[Observation, Action]):
     | ``reward_terms`` | the terms above by name; they sum to the reward |
     | ``randomisation`` | in a reset's, with that option: what differs in the episode |
 
+    An environment that is made as ``TPMEnv(...)`` has no time limit; ``gym.make`` adds it.
+
     Past a parallel singularity the encoders no longer tell where the platform is. No action of the
-    nominal robot leads past one; if it happens, the penalty is 1 and the episode truncated.
+    nominal robot with ideal drives leads past one; if it happens, the penalty is 1 and the episode
+    truncated.
 
     Args:
         task: Name of a task (``"reach"``, ``"pick_and_place"``, or one that
@@ -159,23 +162,25 @@ class TPMEnv(gym.Env[Observation, Action]):
             task that is made has its own machine, reward, goals and penalty weight, and takes none.
         control: ``"cartesian"`` or ``"joints"``.
         reward: ``"sparse"`` (None too) or ``"dense"``.
-        engine: ``"pybullet"``, or a name that :func:`tpm_gym.register_engine` knows.
+        engine: ``"pybullet"``, ``"mujoco"`` (with the extra of that name; it opens no window), or a
+            name that :func:`tpm_gym.register_engine` knows.
         machine: ``"paper"`` (None too), ``"wide"``, a name that :func:`tpm_gym.register_machine`
             knows, or a :class:`~tpm_gym.Machine`; a spec that goes through JSON needs a name.
         goals: ``"sampled"`` (None too), or ``"tempting"``: the goal, and where the puck starts, lie
             next to the singularity, which not every machine has near its goals.
         penalty_weight: Weight of the singularity penalty, None for 1; 0 switches it off.
         drive: How the motors follow their references. ``"ideal"`` (None too): exactly, with up to
-            100 N m. ``"servo"``, a :class:`~tpm_gym.simulation.Servo` or a mapping of its
-            attributes: as torque motors with servo drives do, that have stiffness, damping, a
-            feed-forward, and less torque the faster they turn.
+            100 N m at any speed. ``"servo"``, a :class:`~tpm_gym.simulation.Servo` or a mapping of
+            its attributes: with 7500 N m/rad, 60 N m s/rad, the torques of the nominal motion fed
+            forward, and 100 N m up to 18.75 rad/s, which fall to none at 25 rad/s.
         randomisation: What differs from the nominal machine, drawn anew for each episode: a
             :class:`~tpm_gym.simulation.Randomisation` or a mapping of its attributes. Where
             disturbed encoders report angles that cannot be assembled, position and velocity keep
             their last values.
         physics: Numerical settings of the engine, or a mapping of them.
         render_mode: None, ``"rgb_array"`` or ``"human"``.
-        renderer: What draws pictures; for PyBullet ``"tiny"`` (any machine) or ``"egl"`` (GPU).
+        renderer: What draws pictures; for PyBullet ``"tiny"`` (any machine) or ``"egl"`` (GPU),
+            for MuJoCo ``"egl"``, ``"osmesa"`` or ``"glfw"``; None for what works.
         width: Of rendered pictures, pixels.
         height: Of rendered pictures, pixels.
 
@@ -290,6 +295,7 @@ class TPMEnv(gym.Env[Observation, Action]):
                 object into another or into the robot.
             UnreachableError: If an object or the goal is out of reach.
             EpisodeError: If the environment is closed.
+            ConfigurationError: If a method of the task does not give what it has to.
         """
         self._require_open()
         super().reset(seed=seed)
@@ -302,6 +308,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         self.episode += 1
         self._show_goal()
         self._state = self.simulation.reset(self._home, start, plant, self._draw_noise())
+        self.task.check(self._state)
         observation, info = self._report(self._state)
         if self.randomisation != Randomisation():
             latency = {"latency": self.randomisation.latency}

@@ -24,9 +24,9 @@ def register_task(
 ) -> tuple[str, ...]:
     """Register a task's ids: ``TPM<name>{,Joints}{,Dense}-v<version>``; harmless the second time.
 
-    ``TPMEnv(task=...)`` and the command line then know it too, as ``name`` in snake case. In worker
-    processes that are spawned rather than forked, ids are found as ``"module:id"``, where importing
-    the module registers them.
+    ``TPMEnv(task=...)`` then knows it too, as ``name`` in snake case. The command line, and worker
+    processes that are spawned rather than forked, find ids as ``"module:id"``, where importing the
+    module registers them.
 
     Args:
         name: In CamelCase, e.g. ``"PickAndPlace"``.

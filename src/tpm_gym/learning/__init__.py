@@ -8,6 +8,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from tpm_gym.learning.configuration import EnvOptions as EnvOptions
     from tpm_gym.learning.configuration import ResumeConfig as ResumeConfig
     from tpm_gym.learning.configuration import TrainingConfig as TrainingConfig
     from tpm_gym.learning.demonstrations import Demonstrations as Demonstrations
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
 _MODULES = {
     "Demonstrations": "demonstrations",
+    "EnvOptions": "configuration",
     "EvaluationConfig": "evaluation",
     "GoalGapExtractor": "features",
     "LearningError": "errors",

@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -32,6 +32,27 @@ def shown_default(shown: str, metavar: str, **options: Any) -> Any:
     """Describe an option whose default has to be put into words."""
     hint = f"(default: {shown})"
     return tyro.conf.arg(help_behavior_hint=hint, metavar=metavar, **options)
+
+
+@dataclass(frozen=True)
+class EnvOptions:
+    """What an environment is made with, by name; what is not given is as the id has it."""
+
+    machine: Annotated[str, unset(str, "the id's own, mostly paper", "NAME")] = UNSET
+    """Machine: paper, wide, or one that the module of --env module:id registers. What a policy was
+    trained with is not known of it: evaluate asks again."""
+
+    engine: Annotated[str, unset(str, "the id's own, mostly pybullet", "NAME")] = UNSET
+    """Engine: pybullet, or one that the module of --env module:id registers."""
+
+    drive: Annotated[
+        str, unset(Literal["ideal", "servo"], "the id's own, mostly ideal", "{ideal,servo}")
+    ] = UNSET
+    """How the motors follow their references: exactly, or as torque motors with servo drives."""
+
+    def given(self) -> dict[str, Any]:
+        """Those that are given, as arguments of an environment."""
+        return {name: value for name, value in vars(self).items() if value is not UNSET}
 
 
 @dataclass(frozen=True)
@@ -69,6 +90,8 @@ class TrainingConfig:
     """As the environment samples them, or goals that tempt towards the singularity; in training and
     in its evaluations."""
 
+    env_options: tyro.conf.OmitArgPrefixes[EnvOptions] = field(default_factory=EnvOptions)
+
     eval_every: Annotated[int, unset(int, "a tenth of the steps", "INT")] = UNSET
     """Steps between evaluations on held-out seeds."""
 
@@ -97,7 +120,7 @@ class TrainingConfig:
     def record(self) -> dict[str, Any]:
         """Return the configuration as plain data, without folders outside the run."""
         paths = {"run": self.run.name, "recipe_file": self.recipe_file.name}
-        found = {**asdict(self), **paths}
+        found = {**asdict(self), **paths, "env_options": self.env_options.given()}
         del found["overwrite"]
         return found
 
@@ -164,8 +187,12 @@ def resumed(config: ResumeConfig, stored: Mapping[str, Any], reached: int) -> Tr
     _require_whole(config.run, stored)
     changes = {name: value for name, value in vars(config).items() if value is not UNSET}
     # A run of before an option was there had what is its default.
-    names = {field.name for field in fields(TrainingConfig)} & stored.keys()
-    objects = {"recipe": Recipe(**stored["recipe"]), "recipe_file": Path(stored["recipe_file"])}
+    names = {entry.name for entry in fields(TrainingConfig)} & stored.keys()
+    objects = {
+        "recipe": Recipe(**stored["recipe"]),
+        "recipe_file": Path(stored["recipe_file"]),
+        "env_options": EnvOptions(**stored.get("env_options", {})),
+    }
     found = TrainingConfig(**{**{name: stored[name] for name in names}, **objects, **changes})
     if found.steps < reached:
         raise ConfigError(f"--steps {found.steps}: the run has already taken {reached:,}")

@@ -4,7 +4,7 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -14,7 +14,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from tpm_gym.learning import provenance
-from tpm_gym.learning.configuration import UNSET, check_least, shown_default, unset
+from tpm_gym.learning.configuration import UNSET, EnvOptions, check_least, shown_default, unset
 from tpm_gym.learning.environments import check_env_id, make_env
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.estimates import Estimate
@@ -46,7 +46,8 @@ class EvaluationConfig:
     """
 
     policy: Annotated[tuple[str, ...], tyro.conf.arg(metavar="POLICY ...")]
-    """Policies: expert, random, an exported policy (.json), or the folder of a run (its best)."""
+    """Policies: expert, random, the id of a published policy, an exported one (.json), or the
+    folder of a run (its best)."""
 
     env: Annotated[str, unset(str, "the one the policy was trained on", "ID")] = UNSET
     """Environment id, or module:id for one that a module of yours registers."""
@@ -62,6 +63,8 @@ class EvaluationConfig:
 
     penalty_weight: float = 1.0
     """Weight of the singularity penalty in the return."""
+
+    env_options: tyro.conf.OmitArgPrefixes[EnvOptions] = field(default_factory=EnvOptions)
 
     randomisation: Annotated[tuple[str, ...], shown_default("nowhere", "KEY=VALUE ...")] = ()
     """Where the machine differs from the nominal one: attributes of tpm_gym's Randomisation, each
@@ -113,7 +116,7 @@ def evaluate(config: EvaluationConfig, console: Console | None = None) -> list[R
 
     Raises:
         LearningError: An option is not valid, or a policy cannot be used.
-        ConfigurationError: The environment has no such randomisation or penalty weight.
+        ConfigurationError: The environment has no such option, or not with this value.
     """
     # A file has no margin at which a table would have to be folded.
     console = console or Console(width=None if sys.stdout.isatty() else 200)
@@ -151,9 +154,12 @@ def _resolve_env(config: EvaluationConfig) -> str:
     env_id = config.env
     if env_id is UNSET:
         ids = sorted({found for spec in config.policy if (found := trained_env(spec)) is not None})
-        if len(ids) != 1:
-            found = f"policies were trained on {', '.join(ids)}" if ids else "no policy has one"
-            raise ConfigError(f"--env (not given): {found}; name one with --env")
+        if not ids:
+            raise ConfigError("expert and random have no environment of their own: give --env ID")
+        if len(ids) > 1:
+            raise ConfigError(
+                f"policies were trained on {', '.join(ids)}: choose one with --env ID"
+            )
         env_id = ids[0]
     check_env_id(env_id)
     return env_id
@@ -166,6 +172,7 @@ def _make_env(env_id: str, config: EvaluationConfig, render_mode: str | None = N
         penalty_weight=config.penalty_weight,
         randomisation=parse_randomisation(config.randomisation),
         render_mode=render_mode,
+        **config.env_options.given(),
     )
 
 
@@ -258,6 +265,7 @@ def _description(
         "goals": config.goals,
         "penalty_weight": config.penalty_weight,
         "randomisation": parse_randomisation(config.randomisation),
+        "env_options": config.env_options.given(),
         **content,
         **provenance.origin(),
         **records,

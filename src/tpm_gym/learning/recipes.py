@@ -95,7 +95,8 @@ def read_recipe(path: Path, algorithm: str, env_id: str) -> Recipe:
     recipes = read_recipes(path, algorithm)
     name = env_id.rpartition(":")[2]
     if name not in recipes:
-        raise ConfigError(f"{path}: no recipe for {name}; there are {_listed(recipes)}")
+        there = f"there are {_listed(recipes)}; a file of yours with one is --recipe FILE"
+        raise ConfigError(f"{path}: no recipe for {name}; {there}")
     arguments = dict(recipes[name])
     return Recipe(
         n_timesteps=arguments.pop("n_timesteps"),

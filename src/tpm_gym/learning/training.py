@@ -51,9 +51,11 @@ def train(config: TrainingConfig, console: Console | None = None) -> signal.Sign
 
     Raises:
         LearningError: The configuration is not valid, or the run folder is taken or not writable.
+        ConfigurationError: There is no such environment.
     """
     console = console or Console()
     config = complete(config)
+    make_env(**_env_options(config)).close()  # refused before anything is deleted
     run_folder.prepare(config.run, config.overwrite)
     store = CheckpointStore(config.run / CHECKPOINTS)
     with run_folder.disk_errors_named(config.run, store), run_folder.claimed(config.run):
@@ -261,6 +263,8 @@ def make_training_envs(config: TrainingConfig) -> VecEnv:
 
 def _env_options(config: TrainingConfig) -> dict[str, Any]:
     """Which environment is trained and evaluated in, as arguments of :func:`make_env`."""
-    # Not the id: a process of its own may not have it registered.
+    # A process of its own has to import the id's module, or may not have the bare id registered.
     spec = check_env_id(config.env)
-    return {"env": spec, "penalty_weight": config.penalty_weight, "goals": config.goals}
+    env = config.env if ":" in config.env else spec
+    chosen = {"penalty_weight": config.penalty_weight, "goals": config.goals}
+    return {"env": env, **chosen, **config.env_options.given()}

@@ -1,5 +1,6 @@
 """The robot as data: bodies and joints, machines, mount and cup, and files other tools read."""
 
+from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism.machine import Machine, find_machine, register_machine
 from tpm_gym.mechanism.mount import Mount
 from tpm_gym.mechanism.tpm import PAPER_TPM, TPM, WIDE_TPM
@@ -10,6 +11,7 @@ __all__ = [
     "WIDE_TPM",
     "Machine",
     "Mount",
+    "Region",
     "find_machine",
     "register_machine",
 ]

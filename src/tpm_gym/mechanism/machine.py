@@ -27,9 +27,11 @@ from tpm_gym.errors import (
     SingularityError,
     UnreachableError,
 )
+from tpm_gym.kinematics.geometry import Geometry
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism import virtual_work
 from tpm_gym.mechanism.bodies import Mechanism
+from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.mount import Mount
 
 __all__ = ["Machine", "Mode", "Reading", "find_machine", "register_machine"]
@@ -73,7 +75,8 @@ class Machine(ABC):
 
     Raises:
         ConfigurationError: If a value cannot be, home or the goals lie outside the region, or the
-            region reaches beyond a singularity or a motor's stop.
+            region reaches beyond a singularity, a motor's stop or, by more than the stroke of the
+            cup, the table.
         UnreachableError: If a corner of the region cannot be reached.
     """
 
@@ -110,6 +113,10 @@ class Machine(ABC):
         for corner in self.region.corners():
             self._require_usable("region", corner)
         self._require_usable("home", self.home)
+        least = self.region.high[2] + CUP.length - CUP.stroke
+        if self.mount.height < least - 1e-6:
+            valid = f"a height of {least:.6g} m or more: else the region is below the table"
+            raise ConfigurationError("mount", self.mount, valid)
 
     def _require_values(self) -> None:
         """Refuse values of other types, and what is no finite number; arrays become tuples."""
@@ -305,6 +312,8 @@ def find_machine(machine: Any) -> Machine:
     if isinstance(machine, str) and callable(found):
         found = found()
     if not isinstance(found, Machine):
-        names = ", ".join(map(repr, _MACHINES))
-        raise ConfigurationError("machine", machine, f"{names}, or a tpm_gym.Machine")
+        valid = f"{', '.join(map(repr, _MACHINES))}, or a tpm_gym.Machine"
+        if isinstance(machine, Geometry):
+            valid += ", such as dataclasses.replace(tpm_gym.PAPER_TPM, geometry=...)"
+        raise ConfigurationError("machine", machine, valid)
     return found

@@ -25,6 +25,7 @@ from tpm_gym.mechanism.bodies import Solid
 __all__ = ["TORQUE_MOTOR", "Motor"]
 
 STEEL, HOUSING = 7850.0, 2700.0  # kg/m^3; magnets weigh about as much as steel
+_FACE = 0.002  # m
 
 Axis = Literal["x", "y", "z"]
 
@@ -89,8 +90,8 @@ class Motor:
         return first, second
 
     def stator(self, axis: Axis, centre: Vector) -> tuple[Solid, Solid]:
-        """The housings, along ``axis`` about ``centre``."""
-        size = (self.stator_radius, self.reach - self.clearance, 0.0)
+        """The housings, along ``axis`` about ``centre``; the shaft ends in front of them."""
+        size = (self.stator_radius, self.reach - self.clearance - 2 * _FACE, 0.0)
         first, second = (
             Solid("cylinder", size, at, HOUSING, axis=axis, colour="dark")
             for at in self.halves(axis, centre)

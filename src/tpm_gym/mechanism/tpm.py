@@ -33,6 +33,10 @@ ASSEMBLY_LIMIT = 0.010
 class TPM(Machine):
     """The mechanism of the paper, with any lengths.
 
+    ``dataclasses.replace(PAPER_TPM, name=..., geometry=...)`` is one with lengths of yours. Where
+    they differ much, ``mount``, ``region``, ``goal_region``, ``home`` and ``step_limit`` have to
+    follow them, and so has ``table``.
+
     Attributes:
         geometry: Link lengths.
         working_mode: How its arms are bent.

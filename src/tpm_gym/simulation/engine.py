@@ -129,6 +129,7 @@ Factory = Callable[..., Engine]
 
 _ENGINES: dict[str, str | Factory] = {
     "pybullet": "tpm_gym.simulation.bullet.engine:BulletEngine",
+    "mujoco": "tpm_gym.simulation.mujoco.engine:MujocoEngine",
 }
 
 
@@ -179,7 +180,11 @@ def make_engine(
     factory = _ENGINES[name]
     if isinstance(factory, str):
         module, _, attribute = factory.partition(":")
-        factory = getattr(importlib.import_module(module), attribute)
+        try:
+            factory = getattr(importlib.import_module(module), attribute)
+        except (ModuleNotFoundError, AttributeError) as error:
+            valid = f"one that can be imported; of {factory!r} Python says: {error}"
+            raise ConfigurationError("engine", name, valid) from error
     options: dict[str, Any] = {
         "gui": gui or None,
         "renderer": renderer,

@@ -19,7 +19,7 @@ from tpm_gym.mechanism.machine import Machine
 __all__ = ["CartesianControl", "Control", "JointControl", "make_control"]
 
 _BISECTIONS = 10  # the fraction of a step to a thousandth
-_PARTS = 8  # of a way, in which joints turn nearly evenly
+_PARTS = 32  # of a way, in which joints turn nearly evenly
 
 
 class Control(Protocol):
@@ -117,10 +117,14 @@ class JointControl:
         return step / max(1.0, float(np.abs(step).max()))
 
     def steps(self, wanted: ArrayLike, current: ArrayLike) -> float:
-        """By the axis, or the joint where it turns fastest, that has farthest to go."""
-        inverse, parts = self._machine.inverse, np.linspace(0.0, 1.0, _PARTS + 1)[:, None]
+        """By the axis, or the joint where it turns fastest, that has farthest to go.
+
+        What lies beyond the region is projected into it, as commands are.
+        """
+        inverse, project = self._machine.inverse, self._machine.region.project
+        parts = np.linspace(0.0, 1.0, _PARTS + 1)[:, None]
         way = np.asarray(current) + parts * np.subtract(wanted, current)
-        turns = np.diff([inverse(_vector(point)) for point in way], axis=0) * _PARTS
+        turns = np.diff([inverse(_vector(project(point))) for point in way], axis=0) * _PARTS
         joints = float(np.abs(turns).max()) / self._machine.joint_limit
         return max(joints, float((np.abs(way[-1] - way[0]) / self._step).max()))
 

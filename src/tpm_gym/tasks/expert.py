@@ -15,7 +15,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from tpm_gym.errors import EpisodeError, InputError
+from tpm_gym.errors import ConfigurationError, EpisodeError, InputError
 from tpm_gym.tasks.motion import Motion, Move
 from tpm_gym.tasks.task import Task
 
@@ -63,6 +63,7 @@ class Expert(Motion):
         Raises:
             EpisodeError: If the expert was not reset for this episode of its environment, there is
                 none, or its plan has no moves.
+            ConfigurationError: If its plan needs a vacuum, or to see, what its task has not.
         """
         _ = self._env.state  # there has to be an episode
         if self._plan is None or self._episode != self._env.episode:
@@ -75,6 +76,9 @@ class Expert(Motion):
         action[:3] = self._control.action(self.machine.region.project(move.point), self.command)
         if self._task.vacuum:
             action[3] = 1.0 if move.vacuum else -1.0
+        elif move.vacuum:
+            valid = f"True: the plan of {type(self._task).__name__} switches it on"
+            raise ConfigurationError("vacuum", self._task.vacuum, valid)
         if self._latency:
             self._under_way = [*self._under_way[1:], action[:3]]
         return action

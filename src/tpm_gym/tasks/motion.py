@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tpm_gym.arrays import FloatArray
+from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.state import Block
@@ -61,8 +62,18 @@ class Motion:
         return command
 
     def holding(self, name: str = "object") -> bool:
-        """Whether the cup holds the object of that name."""
-        return bool(self.seen[f"{name}_held"][0] > 0.5)
+        """Whether the cup holds the object of that name.
+
+        Raises:
+            ConfigurationError: If the task does not observe it.
+        """
+        return bool(self._see(f"{name}_held")[0] > 0.5)
+
+    def _see(self, entry: str) -> FloatArray:
+        if entry not in self.seen:
+            valid = f"one with {entry!r}; add object_entries(i) of that object"
+            raise ConfigurationError("observed()", list(self.seen), valid)
+        return self.seen[entry]
 
     def go(
         self, stops: list[FloatArray], vacuum: bool, while_holding: str | None = None
@@ -82,7 +93,11 @@ class Motion:
                 yield Move(start + fraction * (stop - start), vacuum)
 
     def pick(self, block: Block, clearance: float) -> Iterator[Move]:
-        """Come down on a block from ``clearance`` (m) above it, and wait for the seal."""
+        """Come down on a block from ``clearance`` (m) above it, and wait for the seal.
+
+        Raises:
+            ConfigurationError: If the task does not observe the block.
+        """
         yield from self.go([self._above(block, clearance)], vacuum=False)
         yield from self.go([self._above(block)], vacuum=True)
         for _ in range(SEAL_STEPS):
@@ -92,7 +107,7 @@ class Motion:
 
     def _above(self, block: Block, clearance: float = 0.0) -> FloatArray:
         """Point P, machine's frame, with the lip over the top of a block where it stands now."""
-        place = self.seen[f"{block.name}_position"] + hanging(block)
+        place = self._see(f"{block.name}_position") + hanging(block)
         return self.machine.mount.to_paper(place + (0.0, 0.0, clearance))
 
     def _trapezoid(self, start: FloatArray, stop: FloatArray) -> FloatArray:

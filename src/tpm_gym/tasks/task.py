@@ -100,9 +100,12 @@ class Task(ABC):
         )
         if self.penalty_weight < 0:
             raise ConfigurationError("penalty_weight", penalty_weight, "0 or more")
+        if self.goal_size < 3 or self.goal_size % 3:
+            raise ConfigurationError("goal_size", self.goal_size, "three for each point")
         shown = len(self.markers(np.zeros(self.goal_size)))
         if shown != self.scene.markers:
-            raise ConfigurationError("markers", self.scene.markers, f"{shown}, as a goal shows")
+            valid = f"{shown}, as a goal shows: scene = Scene(..., markers={shown})"
+            raise ConfigurationError("markers", self.scene.markers, valid)
         self.machine, self.reward, self.goals = machine, reward, goals
         self._within = self._not_lost()
         self._set_entries()
@@ -190,6 +193,20 @@ class Task(ABC):
             rewards.sparse(gap, self.tolerance) if self.reward == "sparse" else rewards.dense(gap)
         )
 
+    def check(self, state: State) -> None:
+        """Refuse a task of which a method does not give what it has to, for one state.
+
+        Raises:
+            ConfigurationError: If it does not; named by the method.
+        """
+        achieved = np.shape(self.achieved(state))
+        if achieved != (self.goal_size,):
+            valid = f"of shape ({self.goal_size},), as goal_size says"
+            raise ConfigurationError("achieved()", f"of shape {achieved}", valid)
+        shaping: object = self.shaping(state)
+        if not isinstance(shaping, Mapping):
+            raise ConfigurationError("shaping()", shaping, "a dictionary of terms; {} for none")
+
     def penalty(self, state: State) -> FloatArray:
         """Nearness to a singularity before weighting, (...,) in [0, 1]; 1 where one was passed."""
         near = rewards.singularity_penalty(state.conditioning, self.machine.safe_conditioning)
@@ -213,6 +230,8 @@ class Task(ABC):
             ResetOptionError: If an option is unknown, or not so many finite numbers, or an object
                 would start inside another or inside the robot.
             UnreachableError: If the robot cannot get to an object or the goal.
+            ConfigurationError: If what the task samples lacks something, has something else, or
+                puts an object into another or into the robot.
         """
         objects = self.scene.objects
         known: dict[str, tuple[int, tuple[Block | None, ...]]] = {
@@ -227,9 +246,21 @@ class Task(ABC):
             if name not in known:
                 raise ResetOptionError(str(name), value, valid)
             chosen[name] = self._within_reach(name, value, *known[name])
-        start = self.sample(rng, chosen)
-        self._check_free(start, chosen.keys() - {"goal"})
+        start = self._sampled(rng, chosen, {name: size for name, (size, _) in known.items()})
+        self._check_free(start, chosen)
         return start
+
+    def _sampled(
+        self, rng: np.random.Generator, chosen: Mapping[str, FloatArray], sizes: Mapping[str, int]
+    ) -> dict[str, FloatArray]:
+        """What :meth:`sample` gives, if it is of these sizes, and nothing else."""
+        start = self.sample(rng, chosen)
+        if start.keys() != sizes.keys():
+            raise ConfigurationError("sample()", list(start), f"the keys {', '.join(sizes)}")
+        return {
+            name: finite(f"sample()[{name!r}]", start[name], (size,), ConfigurationError)
+            for name, size in sizes.items()
+        }
 
     def _within_reach(
         self, name: str, value: Any, size: int, blocks: tuple[Block | None, ...]
@@ -273,16 +304,18 @@ class Task(ABC):
 
     def _check_free(self, start: Mapping[str, FloatArray], chosen: Collection[str]) -> None:
         """Refuse objects that would start inside the robot at home, or inside another object."""
-        if not chosen:
-            return
         taken = [(block.name, _box(start[block.name], block)) for block in self.scene.objects]
-        boxes = self.machine.occupied(self.machine.home)
+        boxes = self.machine.occupied(self.machine.home) if taken else []
         robot = [("the robot at home", box) for box in boxes]
         for name, (low, high) in taken:
             for other, (least, most) in robot + taken:
-                if name in chosen and other != name and (low < most).all() and (high > least).all():
+                mine = name in chosen or other not in chosen  # else it is found the other way round
+                if mine and other != name and (low < most).all() and (high > least).all():
                     valid = f"clear of {other}, {_range(least, most)}"
-                    raise ResetOptionError(name, start[name].tolist(), valid)
+                    place = start[name].tolist()
+                    if name in chosen:
+                        raise ResetOptionError(name, place, valid)
+                    raise ConfigurationError(f"sample()[{name!r}]", place, valid)
 
     # -- observation ------------------------------------------------------------------------------
 

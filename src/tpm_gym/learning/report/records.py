@@ -64,7 +64,7 @@ def collect(config: Collect) -> list[Path]:
     """Condense every run of a folder; return the files written, in order of their names.
 
     Raises:
-        ConfigError: The folder holds no run, or a file of a run is damaged.
+        ConfigError: The folder holds no run, or one that :func:`condense` refuses.
     """
     folders = sorted(path.parent for path in config.runs.glob(f"*/{CONFIG_FILE}"))
     if not folders:
@@ -81,9 +81,13 @@ def condense(run: Path) -> Record:
     """Return what is kept of a run, finished or not.
 
     Raises:
-        ConfigError: A file of it is damaged.
+        ConfigError: A file of it is damaged, or the run is of another machine, engine or drive than
+            its id says, which a record has no place for.
     """
     config = _read(run / CONFIG_FILE)
+    if other := config.get("env_options"):
+        valid = "the page compares runs of the ids as they are; move this one elsewhere"
+        raise ConfigError(f"--runs {run}: was made with {other}; {valid}")
     try:
         found = evaluations(run)
     except ValueError as error:

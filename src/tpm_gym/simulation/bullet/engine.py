@@ -119,20 +119,23 @@ class BulletEngine:
 
     def advance(self, references: Sequence[Reference], vacuum: bool) -> None:
         """See the protocol."""
-        robot, servos, step = self.robot, self._servos, self.client.stepSimulation
-        cup, friction = self._cup, self._friction
+        cup, friction, step = self._cup, self._friction, self.client.stepSimulation
         friction.look(cup.look())
-        if servos is not None and references:
-            servos.begin(references[0].theta)
+        if self._servos is not None and references:
+            self._servos.begin(references[0].theta)
         for reference in references:
             friction.turn(cup.grip.hold.which)
-            if servos is None:
-                robot.drive(reference.theta)
-            else:
-                theta, theta_dot, _ = robot.motors()
-                robot.apply(servos.torque(reference, theta, theta_dot))
+            self._drive(reference)
             step()
             cup.suck(vacuum)
+
+    def _drive(self, reference: Reference) -> None:
+        """Let the motors follow a reference in the next time step."""
+        if self._servos is None:
+            self.robot.drive(reference.theta)
+            return
+        theta, theta_dot, _ = self.robot.motors()
+        self.robot.apply(self._servos.torque(reference, theta, theta_dot))
 
     def motors(self) -> Motors:
         """See the protocol."""

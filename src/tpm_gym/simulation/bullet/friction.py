@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -39,13 +38,12 @@ _SAME = 0.01  # change of a scale that is not worth a call
 _UNKNOWN = (math.sqrt(0.5), math.sqrt(0.5))
 
 
-@dataclass
 class _Face:
     """A body's level face, on which objects slide, and how its friction is scaled now."""
 
-    body: int
-    link: int
-    scales: tuple[float, float] = _UNKNOWN
+    def __init__(self, body: int, link: int) -> None:
+        self.body, self.link = body, link
+        self.scales: tuple[float, float] = _UNKNOWN
 
 
 class Friction:

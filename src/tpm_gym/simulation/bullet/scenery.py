@@ -11,18 +11,10 @@ from numpy.typing import NDArray
 from tpm_gym.arrays import Vector
 from tpm_gym.simulation.bullet.client import Client
 from tpm_gym.simulation.engine import UPRIGHT, Pose, Twist
+from tpm_gym.simulation.stage import CAMERA, FLOOR, FLOOR_EDGE, LIGHT, MARKER_COLOUR, TABLE, Slab
 from tpm_gym.simulation.state import Block, Scene
 
 __all__ = ["Scenery"]
-
-Colour = tuple[float, float, float, float]
-
-_TABLE_COLOUR: Colour = (0.86, 0.84, 0.80, 1.0)
-_FLOOR_COLOUR: Colour = (0.70, 0.72, 0.75, 1.0)
-_MARKER_COLOUR: Colour = (0.1, 0.8, 0.2, 0.6)
-
-# The camera: what it looks at (m), from how far (m), and from where (degrees).
-_TARGET, _DISTANCE, _YAW, _PITCH = (-0.01, 0.0, 0.47), 1.85, 32.0, -13.0
 
 
 class Scenery:
@@ -43,15 +35,11 @@ class Scenery:
         """Load it."""
         self._client = client
         self._blocks = scene.objects
-        slab = (*table, 0.02), (0.0, 0.0, -0.02)
-        self.tables = [self._add_box(*slab, _TABLE_COLOUR)]
-        self.tables += [self._add_box(*slab) for _ in self._blocks[1:]]
-        for top in self.tables:
-            # The engine multiplies the friction of both bodies.
-            client.changeDynamics(top, -1, lateralFriction=1.0)
-        self._add_box((2.0, 2.0, 0.02), (0.0, 0.0, -0.52), _FLOOR_COLOUR)
+        self.tables = [self._add_slab(TABLE, table)]
+        self.tables += [self._add_slab(TABLE, table, drawn=False) for _ in self._blocks[1:]]
+        self._add_slab(FLOOR, (FLOOR_EDGE, FLOOR_EDGE))
         shape = client.createVisualShape(
-            client.GEOM_SPHERE, radius=scene.marker_radius, rgbaColor=_MARKER_COLOUR
+            client.GEOM_SPHERE, radius=scene.marker_radius, rgbaColor=MARKER_COLOUR
         )
         self._markers = [
             client.createMultiBody(baseVisualShapeIndex=shape) for _ in range(scene.markers)
@@ -61,16 +49,22 @@ class Scenery:
             for other, top in enumerate(self.tables):
                 client.setCollisionFilterPair(body, top, -1, -1, int(index == other))
 
-    def _add_box(self, half: Vector, centre: Vector, colour: Colour | None = None) -> int:
-        """A static box; not drawn where it has no colour."""
-        client = self._client
+    def _add_slab(self, slab: Slab, edges: tuple[float, float], drawn: bool = True) -> int:
+        """A static board with these half edges, m."""
+        client, half = self._client, (*edges, slab.half_height)
         solid = client.createCollisionShape(client.GEOM_BOX, halfExtents=half)
-        drawn = -1
-        if colour is not None:
-            drawn = client.createVisualShape(client.GEOM_BOX, halfExtents=half, rgbaColor=colour)
+        shape = -1
+        if drawn:
+            shape = client.createVisualShape(
+                client.GEOM_BOX, halfExtents=half, rgbaColor=slab.colour
+            )
         body: int = client.createMultiBody(
-            baseCollisionShapeIndex=solid, baseVisualShapeIndex=drawn, basePosition=centre
+            baseCollisionShapeIndex=solid,
+            baseVisualShapeIndex=shape,
+            basePosition=(0.0, 0.0, slab.top - slab.half_height),
         )
+        # The engine multiplies the friction of both bodies.
+        client.changeDynamics(body, -1, lateralFriction=slab.friction)
         return body
 
     def _add_block(self, block: Block) -> int:
@@ -131,32 +125,32 @@ class Scenery:
     def aim_window(self) -> None:
         """Point the camera of the engine's window like that of :meth:`picture`."""
         self._client.resetDebugVisualizerCamera(
-            cameraDistance=0.7 * _DISTANCE,  # the window's field of view is wider
-            cameraYaw=_YAW,
-            cameraPitch=_PITCH,
-            cameraTargetPosition=_TARGET,
+            cameraDistance=0.7 * CAMERA.distance,  # the window's field of view is wider
+            cameraYaw=CAMERA.yaw,
+            cameraPitch=CAMERA.pitch,
+            cameraTargetPosition=CAMERA.target,
         )
 
     def picture(self, width: int, height: int, renderer: int) -> NDArray[np.uint8]:
         """The scene as (height, width, 3) RGB."""
         client = self._client
         view = client.computeViewMatrixFromYawPitchRoll(
-            cameraTargetPosition=_TARGET,
-            distance=_DISTANCE,
-            yaw=_YAW,
-            pitch=_PITCH,
+            cameraTargetPosition=CAMERA.target,
+            distance=CAMERA.distance,
+            yaw=CAMERA.yaw,
+            pitch=CAMERA.pitch,
             roll=0.0,
             upAxisIndex=2,
         )
         projection = client.computeProjectionMatrixFOV(
-            fov=42.0, aspect=width / height, nearVal=0.1, farVal=6.0
+            fov=CAMERA.opening, aspect=width / height, nearVal=0.1, farVal=6.0
         )
         image = client.getCameraImage(
             width,
             height,
             viewMatrix=view,
             projectionMatrix=projection,
-            lightDirection=(1.0, -1.2, 2.5),
+            lightDirection=LIGHT,
             shadow=0,  # the software renderer blotches large faces with its shadow map
             renderer=renderer,
         )

@@ -1,0 +1,8 @@
+"""MuJoCo as an engine; the only package that imports it."""
+
+from tpm_gym.errors import MissingPackageError
+
+try:
+    import mujoco as mujoco
+except ModuleNotFoundError as error:
+    raise MissingPackageError("mujoco", "mujoco") from error

@@ -1,0 +1,138 @@
+"""The vacuum cup in MuJoCo: what it takes is welded to it, with a look at the force each step."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from tpm_gym.arrays import Quaternion, Vector, rotate
+from tpm_gym.mechanism.cup import CUP, sealed
+from tpm_gym.simulation.engine import Pose
+from tpm_gym.simulation.mujoco.model import grip_name
+from tpm_gym.simulation.mujoco.robot import Robot
+from tpm_gym.simulation.mujoco.scenery import Scenery
+from tpm_gym.simulation.state import Block
+from tpm_gym.simulation.vacuum import EMPTY, Hold, Load, hold_after
+
+__all__ = ["Cup", "Grip"]
+
+_NO_LOAD = Load()
+_CLEARANCE = 2e-5  # m, between lip and face where it would be less
+
+
+class Grip(NamedTuple):
+    """What the cup holds, and where that is in the tool's frame (of no meaning without)."""
+
+    hold: Hold = EMPTY
+    pose: Pose = Pose((0.0, 0.0, 0.0))
+
+
+class Cup:
+    """The cup on a robot's platform, and the objects of which it can hold one.
+
+    A weld takes the place of the contact: it keeps the lip a hair off the object's face and bears
+    pull, pressure and shear, so nothing else is between them, and its force is the seal's load.
+
+    Attributes:
+        grip: What is held, and how.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        robot: Robot,
+        scenery: Scenery,
+        blocks: tuple[Block, ...],
+    ) -> None:
+        """Start with nothing held."""
+        self._model, self._data = model, data
+        self._robot, self._scenery, self._blocks = robot, scenery, blocks
+        names = range(len(blocks))
+        self._welds = [model.equality(grip_name(index)).id for index in names]
+        self._row = 3 * (model.neq - len(blocks))  # of the weld's force, after the closures'
+        self._reach = [
+            math.hypot(*CUP.lip)
+            + math.hypot(block.width, block.width, block.height) / 2
+            + CUP.seal_gap
+            for block in blocks
+        ]
+        self.grip = Grip()
+
+    def load(self) -> Load:
+        """What the seal bore; to be called after the second half of a time step."""
+        if self.grip.hold.which < 0:
+            return _NO_LOAD
+        row = self._row
+        x, y, z = self._data.efc_force[row : row + 3].tolist()
+        _, (a, b, c) = self._robot.cup()
+        tension = a * x + b * y + c * z
+        shear = math.hypot(x - tension * a, y - tension * b, z - tension * c)
+        return Load(tension, shear)
+
+    def breathe(self, on: bool, load: Load) -> bool:
+        """Let air in or out for a time step; whether an object was taken or dropped."""
+        before, pose = self.grip
+        if not on and before == EMPTY:
+            return False
+        touched = self._touched() if on and before.which < 0 else -1
+        hold = hold_after(before, self._model.opt.timestep, on, load, touched)
+        if hold.which == before.which:
+            self.grip = Grip(hold, pose)
+            return False
+        self.set(Grip(hold, self._sealed_pose(hold.which) if hold.which >= 0 else pose))
+        return True
+
+    def set(self, grip: Grip) -> None:
+        """Hold just what ``grip`` says."""
+        model, active = self._model, self._data.eq_active
+        active[self._welds] = 0
+        self.grip = grip
+        which, ((x, y, z), (qx, qy, qz, qw)) = grip.hold.which, grip.pose
+        if which >= 0:
+            weld = self._welds[which]
+            active[weld] = 1
+            model.eq_data[weld, 3:10] = (x, y, z, qw, qx, qy, qz)
+
+    def _touched(self) -> int:
+        """Index of the first object on whose face the lip lies; -1 for none."""
+        height = self._robot.tool_height()
+        for index, (block, reach) in enumerate(zip(self._blocks, self._reach, strict=True)):
+            if height - self._scenery.height(index) <= reach:  # else there is no need to look
+                lip, axis = self._robot.cup()
+                pose = self._scenery.pose(index)
+                if sealed(lip, axis, *pose, (block.width, block.height)):
+                    return index
+        return -1
+
+    def _sealed_pose(self, index: int) -> Pose:
+        """Where an object is in the tool's frame, but clear of the cup."""
+        origin, turn = self._robot.tool()
+        position, quaternion = self._scenery.pose(index)
+        lip, _ = self._robot.cup()
+        gap = _in_frame(position, quaternion, lip)[2] - self._blocks[index].height / 2
+        x, y, z = _in_frame(origin, turn, position)
+        relative = np.empty(4)
+        mujoco.mju_mulQuat(relative, _wxyz(_inverse(turn)), _wxyz(quaternion))
+        qw, qx, qy, qz = relative.tolist()
+        return Pose((x, y, z + max(0.0, _CLEARANCE - gap)), (qx, qy, qz, qw))
+
+
+def _inverse(quaternion: Quaternion) -> Quaternion:
+    x, y, z, w = quaternion
+    return -x, -y, -z, w
+
+
+def _in_frame(origin: Vector, quaternion: Quaternion, point: Vector) -> Vector:
+    """A point of the world in a frame."""
+    (x, y, z), (u, v, w) = point, origin
+    return rotate(_inverse(quaternion), (x - u, y - v, z - w))
+
+
+def _wxyz(quaternion: Quaternion) -> tuple[float, float, float, float]:
+    """As the engine writes it."""
+    x, y, z, w = quaternion
+    return w, x, y, z

@@ -1,0 +1,182 @@
+"""What MuJoCo is given: robot, table, floor, objects, and who may touch whom, as one model."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from xml.etree.ElementTree import Element, SubElement, tostring
+
+import mujoco
+
+from tpm_gym.mechanism.cup import CUP
+from tpm_gym.mechanism.machine import Machine
+from tpm_gym.mechanism.mjcf import SOLID, STIFF, numbers, robot
+from tpm_gym.mechanism.mount import GRAVITY
+from tpm_gym.simulation.mujoco.physics import Physics
+from tpm_gym.simulation.stage import (
+    FLOOR,
+    FLOOR_EDGE,
+    LIGHT,
+    MARKER_COLOUR,
+    TABLE,
+)
+from tpm_gym.simulation.state import Block, Scene
+
+__all__ = ["compiled", "grip_name", "marker_name", "object_name"]
+
+_RECOVERY = 0.1
+"""Share of a penetration that a contact takes out in one time step: what bounces least."""
+_MARGIN = 1e-6  # m; so that what is put down exactly on the table is in contact at once
+
+_OUT_OF_SIGHT = "0 0 -9"  # where markers are before they are shown; at 0 0 0 they could not move
+
+
+def compiled(machine: Machine, scene: Scene, physics: Physics) -> mujoco.MjModel:
+    """The model; equality constraints are the closures in their order, then a grip an object."""
+    root = robot(machine.mechanism, machine.mount, physics.time_step)
+    option = SubElement(
+        root,
+        "option",
+        timestep=repr(physics.time_step),
+        gravity=numbers((0.0, 0.0, -GRAVITY)),
+        integrator="Euler",
+        solver="Newton",
+        cone="elliptic",
+        iterations=str(physics.iterations),
+        tolerance=repr(physics.tolerance),
+    )
+    # Bad numbers shall stay, so that the caller sees a lost loop.
+    SubElement(option, "flag", autoreset="disable")
+    world, equality = root.find("worldbody"), root.find("equality")
+    assert world is not None
+    assert equality is not None
+    _light(root, world)
+    _surroundings(world, machine, scene)
+    for index, block in enumerate(scene.objects):
+        _object(world, index, block)
+        SubElement(
+            equality,
+            "weld",
+            name=grip_name(index),
+            body1=machine.mechanism.tool,
+            body2=object_name(index),
+            active="false",
+        )
+    root.append(_contacts(root, scene, physics))
+    return mujoco.MjModel.from_xml_string(tostring(root, encoding="unicode"))
+
+
+def object_name(index: int) -> str:
+    """Of an object's body, joint and geom."""
+    return f"object {index}"
+
+
+def grip_name(index: int) -> str:
+    """Of what fixes an object to the cup."""
+    return f"grip {index}"
+
+
+def marker_name(index: int) -> str:
+    """Of a site that shows a goal."""
+    return f"marker {index}"
+
+
+def _light(root: Element, world: Element) -> None:
+    """As bright as in the other engine's pictures: no shadows, a white sky."""
+    visual = SubElement(root, "visual")
+    SubElement(visual, "headlight", ambient=".45 .45 .45", diffuse=".2 .2 .2", specular="0 0 0")
+    SubElement(
+        world,
+        "light",
+        directional="true",
+        castshadow="false",
+        pos=numbers(LIGHT),
+        dir=numbers(-part for part in LIGHT),
+        diffuse=".5 .5 .5",
+        specular=".1 .1 .1",
+    )
+    asset = root.find("asset")
+    assert asset is not None
+    SubElement(
+        asset, "texture", type="skybox", builtin="flat", rgb1="1 1 1", width="16", height="96"
+    )
+
+
+def _surroundings(world: Element, machine: Machine, scene: Scene) -> None:
+    """Table, floor and markers."""
+    still = {"contype": "0", "conaffinity": "0"}  # pairs alone collide
+    SubElement(
+        world,
+        "geom",
+        still,
+        name="table",
+        type="box",
+        size=numbers((*machine.table, TABLE.half_height)),
+        pos=numbers((0.0, 0.0, TABLE.top - TABLE.half_height)),
+        rgba=numbers(TABLE.colour),
+    )
+    SubElement(
+        world,
+        "geom",
+        still,
+        name="floor",
+        type="plane",
+        size=numbers((FLOOR_EDGE, FLOOR_EDGE, 1.0)),
+        pos=numbers((0.0, 0.0, FLOOR.top)),
+        rgba=numbers(FLOOR.colour),
+    )
+    for index in range(scene.markers):
+        size = numbers([scene.marker_radius])
+        rgba = numbers(MARKER_COLOUR)
+        site = SubElement(world, "site", name=marker_name(index), type="sphere", size=size)
+        site.set("rgba", rgba)
+        site.set("pos", _OUT_OF_SIGHT)
+
+
+def _object(world: Element, index: int, block: Block) -> None:
+    name, half = object_name(index), (block.width / 2, block.width / 2, block.height / 2)
+    body = SubElement(world, "body", name=name)
+    SubElement(body, "freejoint", name=name)
+    SubElement(
+        body,
+        "inertial",
+        pos="0 0 0",
+        mass=numbers([block.mass]),
+        diaginertia=numbers(block.inertia),
+    )
+    SubElement(
+        body,
+        "geom",
+        name=name,
+        type="box",
+        size=numbers(half),
+        rgba=numbers(block.colour),
+        contype="0",
+        conaffinity="0",
+    )
+
+
+def _contacts(root: Element, scene: Scene, physics: Physics) -> Element:
+    """Who may touch whom: objects everything, the cup the table too; nothing else is near."""
+    lips = [geom.attrib["name"] for geom in root.iter("geom") if geom.get("class") == SOLID]
+    objects = [(object_name(index), block.friction) for index, block in enumerate(scene.objects)]
+    table, floor = ("table", TABLE.friction), ("floor", FLOOR.friction)
+    cups = [(name, CUP.friction) for name in lips]
+    pairs = [
+        *((one, other) for one in objects for other in (table, floor, *cups)),
+        *combinations(objects, 2),
+        *((cup, table) for cup in cups),
+    ]
+    contacts = Element("contact")
+    for (name, friction), (other, rough) in pairs:
+        SubElement(
+            contacts,
+            "pair",
+            geom1=name,
+            geom2=other,
+            condim="3",
+            friction=numbers((*[friction * rough] * 2, 0.0, 0.0, 0.0)),
+            solref=numbers((-_RECOVERY / physics.time_step**2, -1 / physics.time_step)),
+            solimp=STIFF,
+            margin=numbers([_MARGIN]),
+        )
+    return contacts

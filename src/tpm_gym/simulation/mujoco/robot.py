@@ -1,0 +1,159 @@
+"""The robot inside MuJoCo: motors, the cup's spring, encoders, and the truth.
+
+Motors that go exactly where they are told, as far as their effort lasts, are no servos but
+constraints: a rate to have at the end of the time step, with a limit of force. MuJoCo knows such a
+constraint, dry friction, whose rate is zero. The rows of friction are therefore given another rate
+where MuJoCo's own first half of a time step has set them up and before its second half solves them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import mujoco
+import numpy as np
+
+from tpm_gym.arrays import Quaternion, Vector, rotate, transform
+from tpm_gym.mechanism.machine import Machine
+from tpm_gym.mechanism.mjcf import STIFF, site_names
+from tpm_gym.simulation.engine import Motors, Truth
+from tpm_gym.simulation.randomisation import NOMINAL, Plant
+
+__all__ = ["Robot"]
+
+_SPRING_GAIN = 0.2  # share of its way back that the cup's spring takes in one time step
+
+
+class Robot:
+    """The mechanism in a model.
+
+    Args:
+        model: The model.
+        data: Its state.
+        machine: What was compiled into it.
+        ideal: Whether the motors go where they are told; else they apply the torques they are told.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, data: mujoco.MjData, machine: Machine, ideal: bool
+    ) -> None:
+        """Look up where everything is."""
+        self._model, self._data, self._ideal = model, data, ideal
+        mechanism = machine.mechanism
+        self._point_p, self._lip = mechanism.point_p, mechanism.lip
+        joints = [link.joint for link in mechanism.links if link.joint]
+        self._at = {joint.name: model.joint(joint.name).qposadr.item() for joint in joints}
+        self._dof = {joint.name: model.joint(joint.name).dofadr.item() for joint in joints}
+        self._platform = model.body(mechanism.platform).id
+        self._tool = model.body(mechanism.tool).id
+        moving = [model.body(link.name).id for link in mechanism.links[1:]]
+        self._inertias = {
+            body: (model.body_mass[body].item(), model.body_inertia[body].copy()) for body in moving
+        }
+        slide = mechanism.link(mechanism.tool).joint
+        assert slide is not None
+        self._motors = [(self._at[name], self._dof[name]) for name in mechanism.actuated]
+        efforts = {joint.name: joint.effort for joint in joints}
+        self._efforts = [efforts[name] for name in mechanism.actuated]
+        self._slide = self._at[slide.name], self._dof[slide.name]
+        self._spring = slide.effort
+        pairs = [site_names(closure.name) for closure in mechanism.closures]
+        self._sides = [[model.site(pair[side]).id for pair in pairs] for side in (0, 1)]
+        # Friction is as stiff as it can be, and stops in one time step.
+        step = model.opt.timestep
+        model.dof_solimp[:] = [float(number) for number in STIFF.split()]
+        model.dof_solref[:] = -1 / step**2, -1 / step
+        self._position, self._speed, self._height = data.qpos.item, data.qvel.item, data.xpos.item
+        self._torque: Vector = (0.0, 0.0, 0.0)
+        self.alter(NOMINAL)
+
+    def alter(self, plant: Plant) -> None:
+        """Make masses, motors and friction those of ``plant``."""
+        model, rate = self._model, 1 / self._model.opt.timestep
+        factors = plant.link_masses or [1.0] * len(self._inertias)
+        for (body, (mass, moments)), factor in zip(self._inertias.items(), factors, strict=True):
+            model.body_mass[body] = factor * mass
+            model.body_inertia[body] = factor * moments
+        limits = [a * b for a, b in zip(self._efforts, plant.motor_strength, strict=True)]
+        losses = limits if self._ideal else plant.joint_friction
+        for (_, dof), loss in zip(
+            (*self._motors, self._slide), (*losses, self._spring), strict=True
+        ):
+            model.dof_frictionloss[dof] = loss
+        driven = [(*motor, rate) for motor in self._motors] if self._ideal else []
+        driven.append((*self._slide, _SPRING_GAIN * rate))
+        rough = np.flatnonzero(model.dof_frictionloss).tolist()  # each has a row, in this order
+        self._rows = [(rough.index(dof), at, dof, gain) for at, dof, gain in driven]
+        self._rate = rate
+
+    def place(self, joints: Mapping[str, float]) -> None:
+        """Put every joint at its position (rad, m)."""
+        for name, position in joints.items():
+            self._data.qpos[self._at[name]] = position
+        self._torque = (0.0, 0.0, 0.0)
+
+    def drive(self, theta: Vector) -> None:
+        """Let ideal motors go to ``theta`` within this time step, effort permitting.
+
+        This and :meth:`apply` are to be called between the two halves of a time step.
+        """
+        self._pull((*theta, 0.0))
+
+    def apply(self, torque: Vector) -> None:
+        """Let the motors apply ``torque`` N m in this time step."""
+        self._torque = torque
+        for (_, dof), one in zip(self._motors, torque, strict=True):
+            self._data.qfrc_applied[dof] = one
+        self._pull((0.0,))
+
+    def _pull(self, targets: Sequence[float]) -> None:
+        """Let what friction drives go to ``targets``, the last of which is the slide's."""
+        data, rate, position, speed = self._data, self._rate, self._position, self._speed
+        wanted, first = data.efc_aref, data.ne
+        for (row, at, dof, gain), target in zip(self._rows, targets, strict=True):
+            wanted[first + row] = ((target - position(at)) * gain - speed(dof)) * rate
+
+    def note_torque(self) -> None:
+        """Note what the motors apply; to be called after the second half of a time step."""
+        if not self._ideal:
+            return  # known before
+        force, first = self._data.efc_force.item, self._data.ne
+        (a, *_), (b, *_), (c, *_), _ = self._rows
+        self._torque = force(first + a), force(first + b), force(first + c)
+
+    def motors(self) -> Motors:
+        """True positions (rad, m), rates and noted torques (N m, N) of the motors."""
+        position, speed = self._position, self._speed
+        (a, i), (b, j), (c, k) = self._motors
+        theta = position(a), position(b), position(c)
+        return Motors(theta, (speed(i), speed(j), speed(k)), self._torque)
+
+    def truth(self) -> Truth:
+        """Largest loop gap (m), platform position (m, world) and platform tilt (rad)."""
+        data, (side, other) = self._data, self._sides
+        gaps = data.site_xpos[side] - data.site_xpos[other]
+        origin, turn = self._frame(self._platform)
+        # The platform should stand as the base does: a half turn about x, quaternion (1, 0, 0, 0).
+        tilt = 2 * math.asin(min(1.0, math.hypot(*turn[1:])))
+        gap = math.sqrt((gaps * gaps).sum(axis=1).max(initial=0.0))
+        return Truth(gap, transform(origin, turn, self._point_p), tilt)
+
+    def cup(self) -> tuple[Vector, Vector]:
+        """Centre of the cup's lip (m) and the cup's outward axis, world."""
+        origin, turn = self._frame(self._tool)
+        return transform(origin, turn, self._lip), rotate(turn, (0.0, 0.0, 1.0))
+
+    def tool_height(self) -> float:
+        """Of the origin of the link with the cup above the table, m."""
+        height: float = self._height(self._tool, 2)
+        return height
+
+    def tool(self) -> tuple[Vector, Quaternion]:
+        """Origin (m) and orientation of the link with the cup, world."""
+        return self._frame(self._tool)
+
+    def _frame(self, body: int) -> tuple[Vector, Quaternion]:
+        x, y, z = self._data.xpos[body].tolist()
+        qw, qx, qy, qz = self._data.xquat[body].tolist()
+        return (x, y, z), (qx, qy, qz, qw)

@@ -1,0 +1,109 @@
+"""What stands around the robot in MuJoCo: the objects and the goal markers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+
+from tpm_gym.arrays import Vector, rotate
+from tpm_gym.simulation.engine import Pose, Twist
+from tpm_gym.simulation.mujoco.model import marker_name, object_name
+from tpm_gym.simulation.state import Scene
+
+__all__ = ["Scenery"]
+
+_STILL = 1e-4  # m/s
+
+
+class Scenery:
+    """Everything in the model that moves and is not the robot.
+
+    Args:
+        model: The model.
+        data: Its state.
+        scene: What was compiled into it.
+    """
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, scene: Scene) -> None:
+        """Look up where everything is."""
+        self._model, self._data, self._blocks = model, data, scene.objects
+        self._position, self._speed = data.qpos.item, data.qvel.item
+        self._resting = 4 * len(scene.objects)  # contacts of objects that lie flat
+        names = [object_name(index) for index in range(len(scene.objects))]
+        joints = [model.joint(name) for name in names]
+        self._at = [joint.qposadr.item() for joint in joints]
+        self._dof = [joint.dofadr.item() for joint in joints]
+        self._bodies = [model.body(name).id for name in names]
+        geoms = [model.geom(name).id for name in names]
+        self._touching = [
+            np.flatnonzero((model.pair_geom1 == geom) | (model.pair_geom2 == geom))
+            for geom in geoms
+        ]
+        self._friction = model.pair_friction.copy()
+        self._markers = [model.site(marker_name(index)).id for index in range(scene.markers)]
+
+    def keep_sliding(self) -> None:
+        """Let what slides slide, and not take off.
+
+        The engine's contacts are convex: where two bodies slide along each other it drives them
+        apart, at the coefficient of friction times the speed of the slip, and they would hop. The
+        normal's share of what is wanted is lowered by that much. To be called between the two
+        halves of a time step.
+        """
+        data = self._data
+        if not data.ncon or (data.ncon <= self._resting and not self._moves()):
+            return
+        contacts = data.nefc - 3 * data.ncon  # three rows each, at the end
+        _, x, y = data.efc_vel[contacts:].reshape(-1, 3).T
+        wanted = data.efc_aref[contacts::3]
+        wanted -= data.contact.friction[:, 0] * np.hypot(x, y) / self._model.opt.timestep
+
+    def _moves(self) -> bool:
+        """Whether an object is faster than solver noise."""
+        speed = self._speed
+        return any(
+            abs(speed(dof)) + abs(speed(dof + 1)) + abs(speed(dof + 2)) > _STILL
+            for dof in self._dof
+        )
+
+    def move_markers(self, positions: Sequence[Vector]) -> None:
+        """Show the goal at these points, m, world."""
+        for marker, position in zip(self._markers, positions, strict=True):
+            self._model.site_pos[marker] = self._data.site_xpos[marker] = position
+
+    def place(self, poses: Sequence[Pose]) -> None:
+        """Put the objects down."""
+        for at, (position, (x, y, z, w)) in zip(self._at, poses, strict=True):
+            self._data.qpos[at : at + 7] = (*position, w, x, y, z)
+
+    def read(self) -> list[tuple[Pose, Twist]]:
+        """Poses and velocities of the objects."""
+        return [(self.pose(index), self._twist(index, dof)) for index, dof in enumerate(self._dof)]
+
+    def height(self, index: int) -> float:
+        """Of an object's centre above the table, m."""
+        height: float = self._position(self._at[index] + 2)
+        return height
+
+    def pose(self, index: int) -> Pose:
+        """Pose of an object."""
+        at = self._at[index]
+        x, y, z, qw, qx, qy, qz = self._data.qpos[at : at + 7].tolist()
+        return Pose((x, y, z), (qx, qy, qz, qw))
+
+    def _twist(self, index: int, dof: int) -> Twist:
+        """Velocities of an object; the engine has the turning in the object's own frame."""
+        u, v, w, a, b, c = self._data.qvel[dof : dof + 6].tolist()
+        return Twist((u, v, w), rotate(self.pose(index).quaternion, (a, b, c)))
+
+    def alter(self, mass: float, friction: float) -> None:
+        """Make the objects ``mass`` times as heavy and ``friction`` times as rough as nominal."""
+        model = self._model
+        model.pair_friction[:] = self._friction
+        for body, nominal, pairs in zip(self._bodies, self._blocks, self._touching, strict=True):
+            block = replace(nominal, mass=mass * nominal.mass)
+            model.body_mass[body], model.body_inertia[body] = block.mass, block.inertia
+            model.pair_friction[pairs] *= friction
