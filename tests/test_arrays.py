@@ -97,6 +97,14 @@ def test_points_keep_leading_shapes_and_may_be_infinite_unless_they_must_not() -
             points("theta", np.zeros(shape))
 
 
+@pytest.mark.parametrize(
+    "tensor", [torch.ones(3, device="meta"), torch.ones(3).to_sparse(), torch.ones(3) * 1j], ids=str
+)
+def test_tensors_without_real_numbers_are_refused(tensor: Any) -> None:
+    with pytest.raises(InputError, match="in a dense tensor"):
+        points("theta", tensor)
+
+
 def test_points_in_tensors_stay_tensors_in_double_precision() -> None:
     single = torch.ones(2, 3, requires_grad=True)
     found: Any = points("theta", single)

@@ -76,8 +76,8 @@ def points(name: str, value: ArrayLike) -> FloatArray:
     array: Any = value
     if type(value) is np.ndarray or not is_tensor(value):
         array = numbers(name, value)
-    elif array.is_complex():
-        raise InputError(name, _brief(value), "real numbers of shape (..., 3)")
+    elif array.is_complex() or array.is_meta or str(array.layout) != "torch.strided":
+        raise InputError(name, _brief(value), "real numbers of shape (..., 3), in a dense tensor")
     else:
         array = array.double()
     if array.ndim == 0 or array.shape[-1] != 3:

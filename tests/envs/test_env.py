@@ -18,7 +18,8 @@ from tpm_gym.errors import ConfigurationError, InputError
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.tpm import PAPER_TPM, WIDE_TPM
 from tpm_gym.simulation.bullet.physics import Physics
-from tpm_gym.tasks import PickAndPlace, Reach, Task
+from tpm_gym.simulation.state import State
+from tpm_gym.tasks import Entry, PickAndPlace, Reach, Task
 from tpm_gym.tasks.rewards import singularity_penalty
 from tpm_gym.tasks.sampling import APART
 
@@ -161,6 +162,70 @@ def test_observations_are_clipped_into_their_space_and_else_exact(size: float) -
     np.testing.assert_array_equal(seen["observation"][inside], exact[inside].astype(np.float32))
     np.testing.assert_array_equal(seen["observation"][~inside], [10, -10])
     np.testing.assert_array_equal(seen["achieved_goal"][1:], [2, -2])
+
+
+MASKED = np.ma.array(np.zeros(3), mask=[True, False, False])
+
+
+@pytest.mark.parametrize(
+    "wrong", [MASKED, "far", [10**400, 0, 0], np.zeros(2), 0.0, None, [1j] * 3]
+)
+def test_goals_that_are_none_are_refused(wrong: Any) -> None:
+    env, goal = TPMEnv("reach"), np.zeros(3)
+    for achieved, desired in ((wrong, goal), (goal, wrong)):
+        with pytest.raises(InputError, match="_goal"):
+            env.compute_reward(achieved, desired, {})
+
+
+def test_batches_that_do_not_go_together_are_refused_and_what_is_nowhere_is_no_success() -> None:
+    env, goals = TPMEnv("reach"), np.zeros((4, 3))
+    with pytest.raises(InputError, match="desired_goal"):
+        env.compute_reward(goals, goals[:3], {})
+    for info in (None, [{}] * 3, 4, [None] * 4, "four", {"reward_terms": None}):
+        with pytest.raises(InputError, match="info must be"):
+            env.compute_reward(goals, goals, info)  # type: ignore[arg-type]
+    assert env.compute_reward([np.nan] * 3, [0.0, 0.0, 0.0], {}) == -1.0
+
+
+class Broken(Reach):
+    """One of its methods gives what is no number."""
+
+    where = ""
+
+    def achieved(self, state: State) -> Any:
+        return super().achieved(state) * self._factor("achieved")
+
+    def shaping(self, state: State) -> Any:
+        return {"near": self._factor("reward_terms"), "far": -1.0}
+
+    def observed(self) -> Any:
+        def source(state: State) -> Any:
+            return np.ones(1) * self._factor("observed")
+
+        return (*super().observed(), Entry("extra", "-", "", (0.0,), (1.0,), source))
+
+    def _factor(self, where: str) -> float:
+        return np.nan if self.where == where else 1.0
+
+
+@pytest.mark.parametrize(
+    ("where", "what"),
+    [
+        ("achieved", "achieved()"),
+        ("reward_terms", "reward_terms()['near']"),
+        ("observed", "observed(), 'extra'"),
+    ],
+)
+def test_what_a_task_gives_that_is_no_number_is_named(where: str, what: str) -> None:
+    env = TPMEnv(Broken)
+    env.reset(seed=0)
+    env.task.where = where  # type: ignore[attr-defined]
+    with pytest.raises(ConfigurationError, match="nan") as caught:
+        env.step(np.zeros(3))
+    assert caught.value.name == what
+    env.task.where = ""  # type: ignore[attr-defined]
+    env.reset(seed=0)
+    env.step(np.zeros(3))
 
 
 def test_the_penalty_grows_towards_the_singularity_and_follows_the_weight() -> None:

@@ -85,6 +85,12 @@ def test_registering_twice_is_harmless_and_a_class_defined_anew_replaces_its_for
         *((name, Lift, {}, "name") for name in ("lift", "", "Lift up", "Lift-v0", None, 3)),
         ("Lift", Lift(tpm_gym.mechanism.tpm.PAPER_TPM), {}, "task"),
         ("Lift", dict, {}, "task"),
+        ("Lift", tpm_gym.tasks.Task, {}, "task"),
+        *(("Lift", Lift, {"version": value}, "version") for value in (-1, 1.0, "1", None)),
+        *(
+            ("Lift", Lift, {"max_episode_steps": value}, "max_episode_steps")
+            for value in (0, 50.0, "50", None, True)
+        ),
     ],
 )
 @pytest.mark.usefixtures("registries")

@@ -36,6 +36,7 @@ class Derived(Engine):
     [
         (type("NoSave", (KinematicEngine,), {"save": None}), ["save"]),
         (type("NoSteps", (KinematicEngine,), {"substeps": None}), ["substeps"]),
+        (type("ZeroSteps", (KinematicEngine,), {"substeps": 0}), ["substeps"]),
         (Derived, ["load", "advance", "close"]),
     ],
 )
@@ -47,6 +48,19 @@ def test_an_engine_that_lacks_a_part_is_refused_by_name(engine, lacking):
     for part in lacking:
         assert part in caught.value.valid
     assert ("substeps" in caught.value.valid) == ("substeps" in lacking)
+
+
+@pytest.mark.parametrize(
+    ("name", "engine", "blamed"),
+    [
+        *((name, KinematicEngine, "name") for name in (None, "", 3)),
+        *(("other", engine, "engine") for engine in (None, 3, "module", {})),
+    ],
+)
+def test_what_is_no_engine_is_not_registered(name, engine, blamed):
+    with pytest.raises(ConfigurationError) as caught:
+        tpm_gym.register_engine(name, engine)
+    assert caught.value.name == blamed
 
 
 @pytest.mark.parametrize("place", ["nixmod:Engine", "kinematic:Engines"])

@@ -112,10 +112,8 @@ def test_a_block_that_the_cup_cannot_come_down_to_is_refused(stacking):
 
     with pytest.raises(ConfigurationError, match=r"'coin'.*at least 0\.027 m high"):
         Coin(PAPER_TPM)
-    with pytest.raises(ConfigurationError, match="objects of different names"):
-        tpm_gym.TPMEnv(
-            type("Twins", (stacking.Stack,), {"scene": Scene((Block(), Block()), markers=2)})
-        )
+    with pytest.raises(ConfigurationError, match="a name of its own"):
+        Scene((Block(), Block()), markers=2)
 
 
 @pytest.mark.parametrize(

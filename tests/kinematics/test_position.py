@@ -1,12 +1,14 @@
 """Forward and inverse kinematics invert each other, on every branch, under the promised labels."""
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import oracle
 import pytest
 from examples import examples
 
+from tpm_gym.errors import InputError
 from tpm_gym.kinematics import (
     ASSEMBLY_MODES,
     WORKING_MODES,
@@ -146,3 +148,9 @@ def test_passive_angles_point_along_the_links() -> None:
         assert np.abs(PAPER.l4 * directions - oracle.rods(s.p)[keep]).max() < 1e-11
         link7 = PAPER.l7 * oracle.vector(np.cos(found.beta), np.sin(found.beta), 0)
         assert np.abs(link7 - (s.p["E1"] - s.p["D1"])[keep]).max() < 1e-11
+
+
+@pytest.mark.parametrize("solve", [forward_all, inverse_all, forward, inverse])
+def test_what_are_no_lengths_is_refused(solve: Any) -> None:
+    with pytest.raises(InputError, match=r"geometry must be a tpm_gym\.Geometry"):
+        solve(np.zeros((2, 3)), geometry=3)

@@ -19,7 +19,7 @@ from tpm_gym.learning import checkpoint
 from tpm_gym.learning.checkpoint import CheckpointStore, Content
 from tpm_gym.learning.errors import CheckpointError
 
-FILES = ("manifest.json", "state.json", "weights.pt", "arrays.npz")
+FILES = ("manifest.json", "state.json", "torch.pt", "arrays.npz")
 KILLED = 9
 
 
@@ -29,7 +29,7 @@ def content(step: int, finished: bool = False) -> Content:
     return Content(
         step,
         finished,
-        {"state.json": json.dumps({"step": step}).encode(), "weights.pt": rng.bytes(5000)},
+        {"state.json": json.dumps({"step": step}).encode(), "torch.pt": rng.bytes(5000)},
         {"buffer/rows": rng.normal(size=(700, 3)), "buffer/place": np.array([step, 0])},
     )
 
@@ -71,11 +71,18 @@ def test_what_is_loaded_is_what_was_saved(folder: Path) -> None:
 def test_the_last_two_are_kept_and_nothing_else_is_touched(folder: Path) -> None:
     (folder / "notes.txt").write_text("mine")
     (folder / "000000001.old").mkdir()
+    mine = [folder / "123456789.old" / "mine", folder / "000000004.tmp" / "torch.pt"]
+    for path in mine:
+        path.mkdir(parents=True)
     store = CheckpointStore(folder)
     store.load(no_warning)
     for step in (3, 40):
         store.save(content(step))
-    assert names(folder) == ["000000003", "000000040", "notes.txt"]
+    kept = ["000000003", "000000004.tmp", "000000040", "123456789.old", "notes.txt"]
+    assert names(folder) == kept
+    store.clear()
+    assert names(folder) == [name for name in kept if not name.endswith(("3", "40"))]
+    assert all(path.is_dir() for path in mine)
 
 
 def test_checkpoints_are_ordered_by_number(folder: Path) -> None:
@@ -149,11 +156,11 @@ def test_another_format_is_named(folder: Path) -> None:
 def test_no_whole_checkpoint_says_what_to_do(folder: Path, tmp_path: Path) -> None:
     for where in (tmp_path / "nowhere", tmp_path):
         assert CheckpointStore(where).load(no_warning) is None
-    damage(folder / "000000001" / "weights.pt")
+    damage(folder / "000000001" / "torch.pt")
     damage(folder / "000000002" / "arrays.npz", "truncated")
     with pytest.raises(CheckpointError, match="--overwrite") as caught:
         CheckpointStore(folder).load(no_warning)
-    assert [path in str(caught.value) for path in ("weights.pt", "arrays.npz")] == [True, True]
+    assert [path in str(caught.value) for path in ("torch.pt", "arrays.npz")] == [True, True]
 
 
 def test_pickles_are_neither_written_nor_read(folder: Path) -> None:
@@ -166,13 +173,13 @@ def test_a_damaged_checkpoint_gives_way_to_the_next(folder: Path) -> None:
     store = CheckpointStore(folder)
     store.save(content(30))
     store.save(content(40))
-    damage(folder / "000000040" / "weights.pt")
+    damage(folder / "000000040" / "torch.pt")
     store = CheckpointStore(folder)
     assert store.load(lambda text: None).step == 30
     assert "000000040" in names(folder)
     store.save(content(35))
     assert names(folder) == ["000000030", "000000035"]
-    damage(folder / "000000035" / "weights.pt")
+    damage(folder / "000000035" / "torch.pt")
     store = CheckpointStore(folder)
     store.load(lambda text: None)
     store.save(content(35))  # done again, it ends at the same step

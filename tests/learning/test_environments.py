@@ -74,6 +74,7 @@ def test_an_id_of_a_users_module_is_trained_in_workers_resumed_and_evaluated(
     [
         ("TPMRech-v0", "unknown environment 'TPMRech-v0'; there are TPMReach-v0.*module:id"),
         ("no_such_module:TPMMine-v0", "cannot import 'no_such_module'.*the folder that holds it"),
+        (".x:TPMReach-v0", "cannot import .*TypeError"),
         ("CartPole-v1", "CartPole-v1 is no environment of tpm_gym"),
         ("not an id", "unknown environment"),
     ],

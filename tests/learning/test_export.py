@@ -317,6 +317,9 @@ class Trace:
         (["best.zip", "out.zip"], "not for a .zip"),
         (["broken.zip", "out"], "cannot be loaded as sac"),
         (["elsewhere/best.zip", "out"], "no config.json"),
+        (["none.zip", "/proc/out"], "no such file"),
+        (["best.zip", "/proc/out"], "OUT /proc/out: cannot be written"),
+        (["best.zip", "best.zip/out"], "cannot be written: .*; choose another name"),
     ],
 )
 def test_mistakes_on_the_command_line_are_one_line(
@@ -330,6 +333,17 @@ def test_mistakes_on_the_command_line_are_one_line(
     with pytest.raises(SystemExit, match=message) as caught:
         main(["export", str(model), str(run / words[1]), "--trust-pickle"])
     assert "\n" not in str(caught.value)
+
+
+def test_files_that_are_no_policy_are_neither_replaced_nor_removed(run: Path) -> None:
+    (run / "weights.safetensors").write_bytes(b"of another program")
+    (run / "list.json").write_text("[]")
+    before = {file: file.read_bytes() for file in run.iterdir()}
+    for out in ("config", "weights", "list.safetensors"):
+        with pytest.raises(SystemExit, match=r"is no policy of tpm_gym.* choose another name"):
+            main(["export", str(run / "best.zip"), str(run / out), "--trust-pickle"])
+        export.remove(run / out)
+    assert {file: file.read_bytes() for file in run.iterdir()} == before
 
 
 def test_a_damaged_configuration_is_named(run: Path) -> None:

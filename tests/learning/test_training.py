@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -36,7 +37,7 @@ from tpm_gym.learning import (
 )
 from tpm_gym.learning.algorithms import ALGORITHMS
 from tpm_gym.learning.configuration import complete, resumed
-from tpm_gym.learning.errors import ConfigError
+from tpm_gym.learning.errors import ConfigError, RunError
 from tpm_gym.learning.policies import load_model, load_policy
 from tpm_gym.learning.recipes import read_recipe, read_recipes, recipe_file
 from tpm_gym.learning.rollout import SELECTION_SEED, run_episodes
@@ -152,6 +153,38 @@ def test_runs_from_before_these_options_go_on_with_their_defaults(run: Path) -> 
     assert config.env_options.given() == {}
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("algo", "zzz"),
+        ("goals", "zz"),
+        ("recipe", {}),
+        ("recipe", 3),
+        ("recipe_file", None),
+        ("steps", "abc"),
+        ("envs", "1"),
+        ("penalty_weight", [1.0]),
+        ("resumed", 3),
+    ],
+)
+def test_a_damaged_configuration_is_named_and_left_as_it_is(
+    name: str, value: Any, run: Path, tmp_path: Path
+) -> None:
+    stored = json.loads((run / "config.json").read_text(encoding="utf-8"))
+    (tmp_path / "config.json").write_text(json.dumps({**stored, name: value}))
+    before = (tmp_path / "config.json").read_bytes()
+    with pytest.raises(RunError, match=r"configuration of .* is damaged: .*--overwrite") as caught:
+        resume(ResumeConfig(tmp_path), quiet())
+    assert ("list" if name == "resumed" else name[:4]) in str(caught.value)
+    assert (tmp_path / "config.json").read_bytes() == before
+
+
+@pytest.mark.parametrize("option", [{"threads": 0}, {"eval_every": 0}, {"device": "zz"}], ids=str)
+def test_mistakes_are_named_where_there_is_nothing_to_do(run: Path, option: Any) -> None:
+    with pytest.raises(ConfigError, match=f"--{next(iter(option))[:4]}"):
+        resume(ResumeConfig(run, **option), quiet())
+
+
 def test_best_policy_is_the_one_evaluated_best(run: Path) -> None:
     scores = [
         (entry["success_at_end"]["mean"], entry["return"]["mean"]) for entry in evaluations(run)
@@ -232,6 +265,7 @@ PICK = {"env": "TPMPickAndPlace-v0", "recipe_file": recipe_file("sac")}
         ({**PICK, "steps": 20_050, "envs": 3}, "the 20,100 of"),
         ({"algo": "ppo", "recipe_file": None}, "no recipe for TPMReach-v0; .*--recipe FILE"),
         ({"recipe_file": Path("none.yml")}, "cannot be read"),
+        ({"device": "meta"}, "--device meta"),
         ({"env_options": EnvOptions(machine="narrow")}, "machine = 'narrow'"),
     ],
 )
@@ -241,6 +275,19 @@ def test_mistakes_are_named_before_anything_is_written(
     with pytest.raises(TPMError, match=message):
         train(replace(make_config("sac", tmp_path), **options), quiet())
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("size", [49, 10**12])
+def test_a_buffer_that_cannot_be_is_one_line(size: int, tmp_path: Path) -> None:
+    config = make_config("sac", tmp_path)
+    text, found = re.subn(
+        r"buffer_size: *\d+", f"buffer_size: {size}", config.recipe_file.read_text()
+    )
+    assert found == 1
+    config.recipe_file.write_text(text)
+    with pytest.raises(ConfigError, match="buffer_size: ") as caught:
+        train(config, quiet())
+    assert "\n" not in str(caught.value)
 
 
 SHIPPED = [

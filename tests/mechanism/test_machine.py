@@ -140,8 +140,12 @@ LOW, HIGH = PAPER_TPM.region.low, PAPER_TPM.region.high
         ("goal_region", Region(LOW, (*HIGH[:2], 0.95)), "inside the region"),
         ("step_limit", (0.03, 0.0, 0.03), "positive"),
         ("joint_limit", -0.08, "positive"),
-        ("joint_limit", np.nan, "positive"),
+        *(("joint_limit", value, "numbers") for value in (np.nan, np.inf, "much")),
         ("table", (0.45, 0.0), "positive"),
+        *(("table", value, "numbers") for value in ((0.4,), (0.4, 0.3, 0.2), (np.inf, 0.3), None)),
+        *((name, 3, "a Region") for name in ("region", "goal_region")),
+        ("mount", 0.97, "a Mount"),
+        ("geometry", 3, "a tpm_gym.Geometry"),
         ("safe_conditioning", 1.5, "1"),
         ("region", Region((LOW[0], -0.02, LOW[2]), HIGH), "beyond a singularity"),
         ("mount", Mount(height=0.9229), "0.923 m or more"),
@@ -153,6 +157,28 @@ def test_a_machine_on_which_no_episode_could_run_is_refused_by_name(
     with pytest.raises(ConfigurationError, match=valid) as caught:
         replace(PAPER_TPM, **{name: value})
     assert caught.value.name == name
+
+
+def test_a_machine_of_arrays_is_that_of_tuples() -> None:
+    region = Region(np.array(LOW), np.array(HIGH))  # type: ignore[arg-type]
+    values: Any = {"home": np.array(PAPER_TPM.home), "table": list(PAPER_TPM.table)}
+    made = replace(PAPER_TPM, region=region, **values)
+    assert made == PAPER_TPM
+    assert hash(made) == hash(PAPER_TPM)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e300, 10**400, "high", (1.0,)])
+def test_a_height_that_cannot_be_is_refused(value: Any) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        Mount(value)
+    assert caught.value.name == "height"
+
+
+@pytest.mark.parametrize(("name", "value"), [("", PAPER_TPM), (3, PAPER_TPM), ("mine", "paper")])
+def test_what_is_no_machine_is_not_registered(name: Any, value: Any) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        register_machine(name, value)
+    assert caught.value.name == ("machine" if name == "mine" else "name")
 
 
 @pytest.mark.parametrize(

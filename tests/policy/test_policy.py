@@ -32,6 +32,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 import tpm_gym
 import tpm_gym.policy
+from tpm_gym import TPMEnv
 from tpm_gym.errors import (
     ConfigurationError,
     InputError,
@@ -221,13 +222,14 @@ def test_joint_increments_are_no_cartesian_ones() -> None:
         with closing(gym.make(env_id)) as env:
             policy.check(env)
             policy.check(env.unwrapped)
-    with closing(gym.make("TPMPickAndPlace-v0")) as env:
-        with pytest.raises(PolicyMismatchError, match=r"control joints, .* cartesian") as caught:
+    for env in (gym.make("TPMPickAndPlace-v0"), TPMEnv("pick_and_place")):
+        with closing(env), pytest.raises(PolicyMismatchError, match="control joints,") as caught:
             policy.check(env)
-        assert caught.value.kind == "control"
-    vector = DummyVecEnv([lambda: gym.make("TPMPickAndPlaceDense-v0")])
-    with closing(vector), pytest.raises(PolicyMismatchError, match="TPMPickAndPlaceJoints-v0"):
-        policy.check(vector)
+        assert (caught.value.kind, caught.value.given) == ("control", "cartesian")
+    for make in (lambda: gym.make("TPMPickAndPlaceDense-v0"), lambda: TPMEnv("pick_and_place")):
+        vector = DummyVecEnv([make])
+        with closing(vector), pytest.raises(PolicyMismatchError, match="TPMPickAndPlaceJoints-v0"):
+            policy.check(vector)
 
 
 def test_what_is_no_environment_is_refused(policy: Policy) -> None:

@@ -61,12 +61,22 @@ def out_of_range() -> Iterator[tuple[str, Any, str]]:
         below, above = low - 1e-9, 1.01 * high
         for value in (below, above, (below, high), (low, above)):
             yield name, value, limits
-        for value in (-1.0, np.nan, np.inf, (low, np.nan), True, None, "heavy"):
+        for value in (-1.0, np.nan, np.inf, (low, np.nan), True, None, "heavy", 10**400):
             yield name, value, limits
         for value in ((high, low), (1.0, 1.0, 1.0), (1.0,), {"low": 1.0}, ("1", "2")):
             yield name, value, pair
     for name, largest in _SIZES.items():
-        for value in (-1e-9, 1.01 * largest, np.nan, np.inf, True, None, "small", (0.0, largest)):
+        for value in (
+            -1e-9,
+            1.01 * largest,
+            np.nan,
+            np.inf,
+            True,
+            None,
+            "small",
+            10**400,
+            (0.0, largest),
+        ):
             yield name, value, f"from 0 to {largest}"
     for value in (2, -1, 0.5, True, None, "one", [1], np.nan):
         yield "latency", value, "0 or 1"

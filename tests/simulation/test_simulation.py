@@ -7,7 +7,7 @@ import pytest
 from machines import anywhere, each_machine, excursions
 from states import apart
 
-from tpm_gym.errors import InputError, ModeChangeError, UnreachableError
+from tpm_gym.errors import ConfigurationError, InputError, ModeChangeError, UnreachableError
 from tpm_gym.kinematics import ELBOWS_OUT, inverse, jacobian
 from tpm_gym.mechanism import PAPER_TPM
 from tpm_gym.simulation import Block, Scene, Simulation
@@ -20,6 +20,39 @@ ON_TABLE = {"object": (0.0, -0.03, 0.015)}
 
 def follow(simulation, commands):
     return [simulation.move(command) for command in commands]
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *(
+            (name, value)
+            for name in ("width", "height", "mass", "friction")
+            for value in (-0.05, 0.0, np.nan, np.inf, "heavy", None, [0.05])
+        ),
+        *(("name", value) for value in ("", 3, None)),
+        *(("colour", value) for value in ("red", (1, 0, 0), (0, 0, 0, 1.1), (-0.1, 0, 0, 1))),
+    ],
+)
+def test_blocks_that_cannot_be_are_refused(name, value):
+    with pytest.raises(ConfigurationError) as caught:
+        Block(**{name: value})
+    assert caught.value.name == name
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *(("objects", value) for value in ((Block(), Block()), (Block("goal"),), ("puck",), None)),
+        *(("markers", value) for value in (-1, 1.5, "one")),
+        *(("marker_radius", value) for value in (0.0, np.nan)),
+    ],
+    ids=lambda value: str(value)[:20],
+)
+def test_scenes_that_cannot_be_are_refused(name, value):
+    with pytest.raises(ConfigurationError) as caught:
+        Scene(**{name: value})
+    assert caught.value.name == name
 
 
 # -- the mechanism ---------------------------------------------------------------------------------

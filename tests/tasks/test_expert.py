@@ -116,6 +116,14 @@ def test_it_has_to_be_reset_for_each_episode(env: Any) -> None:
     with pytest.raises(ConfigurationError):
         env.unwrapped.reset(options={"gaol": 1})
     expert.act(observation)
+    # To go back is to begin anew: the plan has gone on meanwhile.
+    observation = env.unwrapped.restore_state(env.unwrapped.save_state())
+    with pytest.raises(EpisodeError, match="reset"):
+        expert.act(observation)
+    expert.reset(observation)
+    env.close()
+    with pytest.raises(EpisodeError, match="closed"):
+        expert.act(observation)
 
 
 class Planned(Reach):

@@ -168,6 +168,26 @@ def test_an_object_is_lost_off_the_table_and_out_of_reach(place: Any, lost: bool
     assert not Reach(PAPER_TPM).lost(states(Reach(PAPER_TPM)))
 
 
+@pytest.mark.parametrize("axis", range(3))
+def test_an_object_that_is_nowhere_is_lost(axis: int) -> None:
+    task, place = PickAndPlace(PAPER_TPM), np.array([[0.0, -0.03, 0.015]])
+    assert not task.lost(states(task, object_position=place))
+    place[0, axis] = np.nan
+    assert task.lost(states(task, object_position=place))
+
+
+@pytest.mark.parametrize("name", ["goal", "singularity"])
+def test_a_term_of_ones_own_cannot_replace_another(name: str) -> None:
+    class Replaced(Reach):
+        def shaping(self, state: State) -> Any:
+            return {name: np.zeros(np.shape(state.conditioning))}
+
+    task = Replaced(PAPER_TPM)
+    with pytest.raises(ConfigurationError, match="names other than goal, singularity") as caught:
+        task.reward_terms(states(task), np.zeros(3), np.ones(3))
+    assert (caught.value.name, caught.value.value) == ("shaping", name)
+
+
 # -- starts ----------------------------------------------------------------------------------------
 
 

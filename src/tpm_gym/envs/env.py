@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -14,7 +15,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
-from tpm_gym.arrays import FloatArray, Vector, finite
+from tpm_gym.arrays import FloatArray, Vector, finite, numbers
 from tpm_gym.errors import (
     ActionError,
     ConfigurationError,
@@ -164,7 +165,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         engine: ``"pybullet"``, ``"mujoco"`` (with the extra of that name; it opens no window), or a
             name that :func:`tpm_gym.register_engine` knows.
         machine: ``"paper"`` (None too), ``"wide"``, a name that :func:`tpm_gym.register_machine`
-            knows, or a :class:`~tpm_gym.Machine`.
+            knows, or a :class:`~tpm_gym.Machine`; a spec that goes through JSON needs a name.
         goals: ``"sampled"`` (None too), or ``"tempting"``: the goal, and where the puck starts, lie
             next to the singularity, which not every machine has near its goals.
         penalty_weight: Weight of the singularity penalty, None for 1; 0 switches it off.
@@ -244,7 +245,7 @@ class TPMEnv(gym.Env[Observation, Action]):
             }
         )
         self.action_space = _box(1.0, self.task.action_size)
-        self.episode = 0  # how many have been started
+        self.episode = 0  # how many have been started or restored
         self._home = self.machine.inverse(self.machine.home)
         self._state: State | None = None
         self._goal = np.full(self.task.goal_size, np.nan)
@@ -324,6 +325,7 @@ class TPMEnv(gym.Env[Observation, Action]):
             EpisodeError: If there is no episode: before reset, after close, after a lost loop.
             ClosureError: If a loop of the mechanism opened.
             ModeChangeError: If the mechanism passed a singularity earlier in this episode.
+            ConfigurationError: If the task makes something of the state that is no number.
         """
         values = finite("action", action, (self.task.action_size,), ActionError)
         state = self.state
@@ -361,12 +363,20 @@ class TPMEnv(gym.Env[Observation, Action]):
 
         Returns:
             A float, or (...,) of them.
+
+        Raises:
+            InputError: If the goals are no real numbers of these shapes, or ``info`` is neither.
         """
+        _require_goals(self.task.goal_size, achieved_goal, desired_goal)
         goal_term = self.task.goal_term(achieved_goal, desired_goal)
-        if isinstance(info, Mapping):
-            other: Any = _goal_free(info)
-        else:
-            other = np.array([_goal_free(entry) for entry in info]).reshape(goal_term.shape)
+        try:
+            if isinstance(info, Mapping):
+                other: Any = _goal_free(info)
+            else:
+                other = np.array([_goal_free(entry) for entry in info]).reshape(goal_term.shape)
+        except (AttributeError, TypeError, ValueError) as error:
+            valid = f"a step's info, or one for each of the {goal_term.size} transitions"
+            raise InputError("info", type(info), valid) from error
         total = goal_term + other
         return float(total) if np.ndim(total) == 0 else total
 
@@ -440,6 +450,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         self.np_random.bit_generator.state = snapshot.rng
         self._goal, self._pending = snapshot.goal.copy(), snapshot.pending
         self._state = None
+        self.episode += 1  # what was planned for the one before is void
         self._show_goal()
         self._state = self.simulation.restore(snapshot.simulation)
         return self._observe(self._state, self._goal)
@@ -494,7 +505,10 @@ class TPMEnv(gym.Env[Observation, Action]):
     def _report(self, state: State) -> tuple[Observation, dict[str, Any]]:
         task, observation = self.task, self._observe(state, self._goal)
         achieved, desired = observation["achieved_goal"], observation["desired_goal"]
-        terms = task.reward_terms(state, achieved, desired)
+        terms = {k: float(v) for k, v in task.reward_terms(state, achieved, desired).items()}
+        vector = observation["observation"]
+        if not math.isfinite(vector.dot(vector) + achieved.dot(achieved) + sum(terms.values())):
+            raise _not_finite(task, state, achieved, terms)
         return observation, {
             "is_success": bool(task.success(achieved, desired)),
             "closure_error": float(state.closure_error),
@@ -504,8 +518,34 @@ class TPMEnv(gym.Env[Observation, Action]):
             "assembly_mode_changed": bool(state.assembly_mode_changed),
             "working_mode_changed": bool(state.working_mode_changed),
             "object_lost": bool(task.lost(state)),
-            "reward_terms": {name: float(value) for name, value in terms.items()},
+            "reward_terms": terms,
         }
+
+
+def _require_goals(size: int, achieved: ArrayLike, desired: ArrayLike) -> None:
+    """Refuse what is no batch of goals; what is not finite is no success, but may be asked for."""
+    shapes = [numbers("achieved_goal", achieved).shape, numbers("desired_goal", desired).shape]
+    try:
+        np.broadcast_shapes(*shapes)
+        fit = all(shape[-1:] == (size,) for shape in shapes)
+    except ValueError:
+        fit = False
+    if not fit:
+        valid = f"of shapes (..., {size}) that go together, by shape"
+        raise InputError("achieved_goal, desired_goal", shapes, valid)
+
+
+def _not_finite(
+    task: Task, state: State, achieved: FloatArray, terms: Mapping[str, float]
+) -> ConfigurationError:
+    """Which of the values that a task made of a state is at fault for one that is not finite."""
+    values = {
+        **{f"observed(), {entry.name!r}": entry.source(state) for entry in task.entries},
+        "achieved()": achieved,
+        **{f"reward_terms()[{name!r}]": value for name, value in terms.items()},
+    }
+    name, value = next(item for item in values.items() if not np.isfinite(item[1]).all())
+    return ConfigurationError(name, np.asarray(value).tolist(), "finite numbers from the task")
 
 
 def _goal_free(info: Mapping[str, Any]) -> float:

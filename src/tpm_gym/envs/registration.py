@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from inspect import isabstract
 from typing import Any
 
 import gymnasium as gym
@@ -37,12 +38,19 @@ def register_task(
         The four ids.
 
     Raises:
-        ConfigurationError: If the name is none, or it or an id is taken; nothing is registered
-            then.
+        ConfigurationError: If the name is none, or it or an id is taken, or another argument cannot
+            be; nothing is registered then.
     """
     option = option_name(name)
-    if not (isinstance(task, type) and issubclass(task, Task)):
-        raise ConfigurationError("task", task, "a class derived from tpm_gym.tasks.Task")
+    if not (isinstance(task, type) and issubclass(task, Task)) or isabstract(task):
+        valid = "a class derived from tpm_gym.tasks.Task, with sample and achieved"
+        raise ConfigurationError("task", task, valid)
+    for label, number, least in (
+        ("version", version, 0),
+        ("max_episode_steps", max_episode_steps, 1),
+    ):
+        if type(number) is not int or number < least:
+            raise ConfigurationError(label, number, f"a whole number, {least} or more")
     if _path(TASKS.get(option, task)) != _path(task):
         raise ConfigurationError("name", name, f"another name; {TASKS[option]} has this one")
     variants: dict[str, dict[str, Any]] = {

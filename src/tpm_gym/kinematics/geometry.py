@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, fields
 from numbers import Real
 
-from tpm_gym.errors import GeometryError
+from tpm_gym.errors import GeometryError, InputError
 
 
 @dataclass(frozen=True)
@@ -54,12 +54,21 @@ class Geometry:
         value = getattr(self, name)
         if isinstance(value, bool) or not isinstance(value, Real):
             raise GeometryError(name, value, "it must be a number")
-        value = float(value)
+        try:
+            value = float(value)
+        except OverflowError:
+            raise GeometryError(name, value, "it must be finite") from None
         object.__setattr__(self, name, value)
         if not math.isfinite(value):
             raise GeometryError(name, value, "it must be finite")
         if value < 0.0 or (value == 0.0 and name != "l6"):
             raise GeometryError(name, value, "it must be positive")
+
+
+def require_geometry(geometry: object) -> None:
+    """Refuse, with an InputError, what are no lengths."""
+    if not isinstance(geometry, Geometry):
+        raise InputError("geometry", geometry, "a tpm_gym.Geometry")
 
 
 PAPER = Geometry(l1=0.300, l2=0.070, l3=0.350, l4=0.800, l5=0.100, l6=0.010, l7=0.050)

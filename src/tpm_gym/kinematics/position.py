@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from tpm_gym.arrays import FloatArray, finite_points, points, vector
 from tpm_gym.kinematics import equations
-from tpm_gym.kinematics.geometry import PAPER, Geometry
+from tpm_gym.kinematics.geometry import PAPER, Geometry, require_geometry
 from tpm_gym.kinematics.modes import (
     ASSEMBLY_MODES,
     DEFAULT_ASSEMBLY,
@@ -51,6 +51,7 @@ def forward_all(theta: ArrayLike, geometry: Geometry = PAPER) -> ForwardSolution
 
     A branch keeps its slot as theta moves, and holds NaN where it is not real.
     """
+    require_geometry(geometry)
     angles = points("theta", theta)
     position, beta = by_rows(lambda t, ns: _assemblies(t, geometry, ns), angles, _POSITION, _BETA)
     return ForwardSolutions(position, beta, beta == beta, geometry)
@@ -58,6 +59,7 @@ def forward_all(theta: ArrayLike, geometry: Geometry = PAPER) -> ForwardSolution
 
 def inverse_all(position: ArrayLike, geometry: Geometry = PAPER) -> InverseSolutions:
     """Solve the inverse kinematics on all 16 branches, for point P at position (..., 3) m."""
+    require_geometry(geometry)
     places = points("position", position)
     theta, beta = by_rows(lambda p, ns: _postures(p, geometry, ns), places, _ANGLES, _ANGLE_BETA)
     return InverseSolutions(theta, beta, beta == beta)

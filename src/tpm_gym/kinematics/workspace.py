@@ -10,7 +10,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector
+from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector, vector
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.kinematics.jacobian import conditioning_at as conditioning_at
@@ -29,14 +29,16 @@ class Region:
         high: Largest x, y, z, m.
 
     Raises:
-        ConfigurationError: If low exceeds high on an axis.
+        ConfigurationError: If they are not three finite numbers each, or low exceeds high.
     """
 
     low: Vector
     high: Vector
 
     def __post_init__(self) -> None:
-        """Reject empty boxes."""
+        """Reject empty boxes; arrays become tuples."""
+        for name in ("low", "high"):
+            object.__setattr__(self, name, vector(name, getattr(self, name), ConfigurationError))
         if not np.all(np.asarray(self.low) <= np.asarray(self.high)):
             raise ConfigurationError("low", self.low, f"at most high = {self.high} on every axis")
 

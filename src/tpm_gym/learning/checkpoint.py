@@ -23,11 +23,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tpm_gym.learning.errors import CheckpointError
+from tpm_gym.learning.run_folder import RESTORED
 
 FORMAT: Final = 1
 KEPT: Final = 2  # checkpoints; the second is there for when the first turns out to be damaged
 MANIFEST: Final = "manifest.json"
 ARRAYS: Final = "arrays.npz"
+STATE: Final = "state.json"
+TENSORS: Final = "torch.pt"
+FILES: Final = frozenset({MANIFEST, ARRAYS, STATE, TENSORS, *RESTORED})
+"""All that a checkpoint may hold; a folder with anything else in it is not ours to delete."""
 
 _NAME: Final = re.compile(r"\d{9,}")
 _OURS: Final = re.compile(r"\d{9,}(\.tmp|\.old)?")
@@ -36,7 +41,7 @@ _SPARE: Final = 1 << 20  # bytes that have to stay free besides, for logs and he
 
 @dataclass(frozen=True)
 class Content:
-    """What a checkpoint holds: small files and large arrays, by name.
+    """What a checkpoint holds: small files, named as in :data:`FILES`, and large arrays, by name.
 
     Arrays may be views into memory that training writes to.
     """
@@ -246,8 +251,10 @@ def _flush_folder(folder: Path) -> None:
 
 
 def _remove(folder: Path) -> None:
-    """Delete a folder as far as possible; what stays is deleted after the next checkpoint."""
-    shutil.rmtree(folder, ignore_errors=True)
+    """Delete a folder of ours as far as possible; what stays goes after the next checkpoint."""
+    with suppress(OSError):  # it is not there, or no folder
+        if all(entry.name in FILES and entry.is_file() for entry in folder.iterdir()):
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def _fingerprint(data: bytes) -> dict[str, Any]:

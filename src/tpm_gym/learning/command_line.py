@@ -26,7 +26,7 @@ class ExportConfig:
     """A .zip file of a training, in its run folder."""
 
     out: Positional[Path]
-    """What the two new files have in common; earlier ones are replaced."""
+    """What the two new files have in common; an earlier policy is replaced, nothing else."""
 
     trust_pickle: bool = False
     """Load the .zip file, which can run any code that is in it."""

@@ -1,5 +1,6 @@
 """What a training run is to do: the options of the command line, completed and checked."""
 
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -7,10 +8,11 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import tyro
+from pydantic import TypeAdapter, ValidationError
 
 from tpm_gym.learning.algorithms import ALGORITHMS
 from tpm_gym.learning.environments import check_env_id
-from tpm_gym.learning.errors import ConfigError
+from tpm_gym.learning.errors import ConfigError, RunError
 from tpm_gym.learning.recipes import Recipe, read_recipe, recipe_file
 from tpm_gym.learning.rollout import SELECTION_SEED, TEST_SEED
 
@@ -180,7 +182,9 @@ def resumed(config: ResumeConfig, stored: Mapping[str, Any], reached: int) -> Tr
 
     Raises:
         ConfigError: An option is not valid.
+        RunError: ``stored`` is damaged.
     """
+    _require_whole(config.run, stored)
     changes = {name: value for name, value in vars(config).items() if value is not UNSET}
     # A run of before an option was there had what is its default.
     names = {entry.name for entry in fields(TrainingConfig)} & stored.keys()
@@ -194,6 +198,31 @@ def resumed(config: ResumeConfig, stored: Mapping[str, Any], reached: int) -> Tr
         raise ConfigError(f"--steps {found.steps}: the run has already taken {reached:,}")
     _check(found)
     return found
+
+
+def _require_whole(run: Path, stored: Mapping[str, Any]) -> None:
+    """Refuse a stored configuration with entries that are missing or of other types."""
+    entries = {
+        field.name: stored.get(field.name)
+        for field in fields(TrainingConfig)
+        if field.name in stored or field.default is UNSET
+    }
+    text = json.dumps({**entries, "run": run.name})
+    try:
+        TypeAdapter(TrainingConfig).validate_json(text, strict=True)
+        TypeAdapter(list[Any]).validate_python(stored.get("resumed", []))
+        recipe_file(stored["algo"])  # there is such an algorithm
+    except ValidationError as error:
+        first = error.errors()[0]
+        problem = f"{'.'.join(map(str, first['loc']))}: {first['msg']}, not {first['input']!r:.100}"
+        raise _damaged(run, problem) from error
+    except ConfigError as error:
+        raise _damaged(run, str(error)) from error
+
+
+def _damaged(run: Path, problem: str) -> RunError:
+    anew = "start the run anew with tpm-gym train --overwrite"
+    return RunError(f"the configuration of {run} is damaged: {problem}; {anew}")
 
 
 def check_least(config: Any, least: int, *names: str) -> None:
@@ -240,6 +269,12 @@ def _check_episodes(config: TrainingConfig) -> None:
             f"--recipe {config.recipe_file}: learning_starts: {starts} is before the first episode "
             f"ends (step {horizon * envs} with {envs} environments); raise it, or use fewer --envs"
         )
+    room = int(recipe.arguments.get("buffer_size", 1_000_000))
+    if recipe.hindsight and room < horizon * envs:
+        raise ConfigError(
+            f"--recipe {config.recipe_file}: buffer_size: {room} is less than the {horizon * envs} "
+            f"steps of an episode in each of {envs} environments; raise it, or use fewer --envs"
+        )
 
 
 def _check_device(device: str) -> None:
@@ -248,6 +283,8 @@ def _check_device(device: str) -> None:
 
     try:
         kind = torch.device(device).type
+        if kind != "cuda":
+            torch.zeros(1, device=device).item()  # some hold no numbers
     except RuntimeError as error:
         raise ConfigError(f"--device {device}: is no device of PyTorch; try cpu") from error
     if kind == "cuda" and not torch.cuda.is_available():

@@ -27,10 +27,12 @@ def check_env_id(env_id: str) -> EnvSpec:
     try:
         if module:
             importlib.import_module(module)
-        spec = gym.spec(name)
-    except ImportError as error:
+    except Exception as error:  # whatever a user's module may raise
+        reason = f"{type(error).__name__}: {error}"
         where = "run this in the folder that holds it, or install it"
-        raise ConfigError(f"{env_id}: cannot import {module!r} ({error}); {where}") from error
+        raise ConfigError(f"{env_id}: cannot import {module!r} ({reason}); {where}") from error
+    try:
+        spec = gym.spec(name)
     except gym.error.Error as error:
         there = f"there are {', '.join(env_ids())}, and module:id for those that a module registers"
         raise ConfigError(f"unknown environment {env_id!r}; {there}") from error

@@ -144,6 +144,9 @@ def _check(config: EvaluationConfig) -> None:
         path = getattr(config, option)
         if path is not None and path.suffix != suffix:
             raise ConfigError(f"--{option} {path}: must end in {suffix}")
+    for option in ("json", "video", "picture"):
+        if (path := getattr(config, option)) is not None:
+            provenance.require_writable(f"--{option}", path)
 
 
 def _resolve_env(config: EvaluationConfig) -> str:

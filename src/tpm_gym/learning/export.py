@@ -7,6 +7,7 @@
 import copy
 import io
 import json
+import os
 import tempfile
 from collections.abc import Mapping
 from hashlib import sha256
@@ -51,15 +52,15 @@ def save(
 
     Args:
         model: SAC, TQC or PPO with a MultiInputPolicy.
-        path: What the files have in common; folders above are made, earlier files replaced.
+        path: What the files have in common; folders above are made, an earlier policy replaced.
         versions: Versions it was trained with; by default those installed.
 
     Raises:
-        PolicyError: The policy has something that the files cannot hold.
+        PolicyError: The policy has something that the files cannot hold, or there are files of
+            these names that are no policy.
         ConfigError: ``path`` ends in .zip.
     """
-    if path.suffix == ".zip":
-        raise ConfigError(f"OUT {path}: is a name for a .json and a .safetensors, not for a .zip")
+    _require_free(path)
     name = str(path)
     known = (a for a, row in ALGORITHMS.items() if type(model) is row.load_class())
     algorithm = next(known, None)
@@ -94,20 +95,45 @@ def save_archive(model: BaseAlgorithm, path: Path) -> None:
 
 def remove(path: Path) -> None:
     """Delete what :func:`save` wrote as ``path``, if it did."""
-    for file in files(path):
-        file.unlink(missing_ok=True)
+    json_file, weights_file = files(path)
+    if _is_policy(json_file):
+        weights_file.unlink(missing_ok=True)
+        json_file.unlink()  # last: it tells whose the other is
+
+
+def _is_policy(json_file: Path) -> bool:
+    """Whether a file is there and the JSON of a policy, whole or not."""
+    try:
+        content = json.loads(json_file.read_bytes())
+    except (OSError, ValueError):
+        return False
+    return isinstance(content, dict) and content.get("format") == FORMAT
+
+
+def _require_free(path: Path) -> None:
+    """Refuse a path that is no name for files, or whose files would replace what is no policy."""
+    if path.suffix == ".zip":
+        raise ConfigError(f"OUT {path}: is a name for a .json and a .safetensors, not for a .zip")
+    pair = files(path)
+    taken = [str(file) for file in pair if os.path.lexists(file)]
+    if taken and not _is_policy(pair[0]):
+        raise refused(
+            taken[0], "is no policy of tpm_gym, and would be replaced; choose another name"
+        )
 
 
 def convert(archive: Path, path: Path, *, trust_pickle: bool) -> Path:
     """Export ``best.zip`` or ``last.zip`` of a run as :func:`save` does; return the JSON file.
 
     Raises:
-        PolicyError: It is not trusted, or cannot be loaded or exported.
-        ConfigError: There is no such file, or ``path`` ends in .zip.
+        PolicyError: It is not trusted, or cannot be loaded or exported, or ``path`` is taken.
+        ConfigError: There is no such file, or ``path`` ends in .zip or cannot be written to.
     """
     if not archive.is_file():
         known = "is not a file" if archive.exists() else "there is no such file"
         raise ConfigError(f"MODEL {archive}: {known}; give best.zip or last.zip of a run")
+    _require_free(path)
+    provenance.require_writable("OUT", path)
     name = str(archive)
     require_trust(name, archive, trust_pickle)
     config = run_config(name, archive)
@@ -191,9 +217,10 @@ def _write(
         new_json.write_text(text, encoding="ascii")
         new_weights.write_bytes(data)
         _verify(name, model, new_json)
-        # In between, the sums tell a reader that the files do not belong together.
-        new_weights.replace(weights_file)
+        # In between, the sums tell a reader that the files do not belong together, and the first
+        # tells the next export that it may replace the second.
         new_json.replace(json_file)
+        new_weights.replace(weights_file)
     return json_file
 
 

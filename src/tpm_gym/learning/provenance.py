@@ -6,11 +6,14 @@ import platform
 import shlex
 import subprocess
 import sys
+import tempfile
 import uuid
 from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Final
+
+from tpm_gym.learning.errors import ConfigError
 
 _PACKAGES: Final = (
     "numpy",
@@ -111,6 +114,22 @@ def _portable(word: str) -> str:
         return f"{option}{equals}{path.relative_to(Path.cwd())}"
     except ValueError:
         return f"{option}{equals}{path.name}"
+
+
+def require_writable(option: str, path: Path) -> None:
+    """Make the folder of a file that is to be written at the end of long work.
+
+    Raises:
+        ConfigError: It cannot be made or written to, or there is a folder in the file's place.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path.parent):
+            problem = "is a folder" if path.is_dir() else None
+    except OSError as error:
+        problem = f"cannot be written: {error.strerror}"
+    if problem:
+        raise ConfigError(f"{option} {path}: {problem}; choose another name")
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:

@@ -3,6 +3,8 @@
 Nothing is ever deleted but files that a run writes, by name, and no policy unless it is asked for.
 """
 
+from __future__ import annotations
+
 import errno
 import json
 import os
@@ -11,10 +13,12 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-from tpm_gym.learning.checkpoint import CheckpointStore
 from tpm_gym.learning.errors import RunError
+
+if TYPE_CHECKING:
+    from tpm_gym.learning.checkpoint import CheckpointStore
 
 CONFIG_FILE: Final = "config.json"
 EVALUATIONS_FILE: Final = "evaluations.jsonl"
@@ -42,10 +46,8 @@ _POLICIES: Final = tuple(
     for suffix in (".zip", *EXPORTED)
 )
 _EVENTS: Final = "events.out.tfevents.*"
-_DISK_ERRORS: Final = (
-    *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO),
-    *(errno.EROFS, errno.EACCES, errno.EPERM),
-)
+_FULL: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_DISK_ERRORS: Final = (*_FULL, errno.EIO, errno.EROFS, errno.EACCES, errno.EPERM)
 
 
 def prepare(run: Path, overwrite: bool) -> None:
@@ -124,6 +126,8 @@ def holds_policy(run: Path) -> bool:
 
 def clear(run: Path) -> None:
     """Delete what a training has written to its folder, but its configuration."""
+    from tpm_gym.learning.checkpoint import CheckpointStore
+
     CheckpointStore(run / CHECKPOINTS).clear()
     clear_tests(run)
     names = {*RESTORED, *_POLICIES, CURVE_FILE} - {CONFIG_FILE}
@@ -197,7 +201,8 @@ def disk_errors_named(run: Path, store: CheckpointStore) -> Iterator[None]:
             else f"continue from step {store.newest:,} with: tpm-gym resume {run}"
         )
         problem = error.strerror or error
-        raise RunError(f"cannot write to {run}: {problem}; make room, then {go_on}") from error
+        remedy = "make room" if error.errno in _FULL else "make it writable"
+        raise RunError(f"cannot write to {run}: {problem}; {remedy}, then {go_on}") from error
     finally:
         threading.excepthook = before
 

@@ -30,7 +30,7 @@ from tpm_gym.learning.configuration import (
     resumed,
 )
 from tpm_gym.learning.environments import check_env_id, make_env
-from tpm_gym.learning.errors import PolicyError, RunError
+from tpm_gym.learning.errors import ConfigError, PolicyError, RunError
 from tpm_gym.learning.rollout import SELECTION_SEED
 from tpm_gym.learning.run_folder import CHECKPOINTS, CONFIG_FILE, is_finished
 
@@ -87,6 +87,7 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
     with run_folder.disk_errors_named(run, store), run_folder.claimed(run):
         stored = run_folder.description(run)
         if stored is not None and is_finished(run) and config.steps in (UNSET, stored["steps"]):
+            resumed(config, stored, 0)  # to check it
             _say(console, f"nothing to do: {run} has finished its {stored['steps']:,} steps")
             return None
         content = store.load(lambda text: _say(console, f"warning: {text}"))
@@ -101,11 +102,12 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
             )
         step = content.step if content else 0
         changed = resumed(config, stored, step)
+        description = _description_resumed(changed, stored, step)
         if content:
             restore_files(run, content)
         else:
             run_folder.clear(run)
-        provenance.write_json(run / CONFIG_FILE, _description_resumed(changed, stored, step))
+        provenance.write_json(run / CONFIG_FILE, description)
         _say(console, f"{changed.title}, from step {step:,} to {changed.steps:,}, in {run}")
         return _learn(changed, console, store, content)
 
@@ -229,9 +231,16 @@ def _report(
 
 
 def make_model(config: TrainingConfig, envs: VecEnv) -> BaseAlgorithm:
-    """Build the algorithm of a completed configuration."""
+    """Build the algorithm of a completed configuration.
+
+    Raises:
+        ConfigError: Its buffer does not fit into memory.
+    """
     kind = ALGORITHMS[config.algo].load_class()
-    return kind(env=envs, seed=config.seed, device=config.device, **config.recipe.keywords())
+    try:
+        return kind(env=envs, seed=config.seed, device=config.device, **config.recipe.keywords())
+    except MemoryError as error:
+        raise ConfigError(f"--recipe {config.recipe_file}: buffer_size: {error}") from error
 
 
 def make_training_envs(config: TrainingConfig) -> VecEnv:

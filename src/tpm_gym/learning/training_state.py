@@ -30,13 +30,12 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her import HerReplayBuffer
 
 from tpm_gym import TPMError
-from tpm_gym.learning.checkpoint import Content
+from tpm_gym.learning.checkpoint import STATE, TENSORS, Content
 from tpm_gym.learning.export import remove
 from tpm_gym.learning.provenance import versions, write_whole
 from tpm_gym.learning.rollout import Action, GoalEnv, Observation
 from tpm_gym.learning.run_folder import LAST_FILE, RESTORED, clear_tests
 
-_STATE, _TENSORS = "state.json", "torch.pt"
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining")
 _PER_KEY = ("observations", "next_observations")
 _PER_ROW = ("actions", "rewards", "dones", "timeouts", "ep_start", "ep_length")
@@ -111,8 +110,8 @@ def capture(
         "extra": dict(extra),
     }
     files = {
-        _STATE: json.dumps(state, default=lambda array: array.tolist()).encode(),
-        _TENSORS: _tensors(model),
+        STATE: json.dumps(state, default=lambda array: array.tolist()).encode(),
+        TENSORS: _tensors(model),
     }
     files |= {name: (run / name).read_bytes() for name in RESTORED if (run / name).is_file()}
     arrays = {f"last/{name}": np.array(value) for name, value in observations.items()}
@@ -146,7 +145,7 @@ def restore(model: BaseAlgorithm, content: Content) -> tuple[dict[str, Any], lis
         The plain data that was kept with it, and sentences about what keeps the continuation from
         being exact; none if it is.
     """
-    state = json.loads(content.files[_STATE])
+    state = json.loads(content.files[STATE])
     for name, value in state["counters"].items():
         setattr(model, name, value)
     size = model._stats_window_size
@@ -156,7 +155,7 @@ def restore(model: BaseAlgorithm, content: Content) -> tuple[dict[str, Any], lis
     _restore_buffer(model, content.arrays)
     notes = _version_notes(state["versions"]) + _restore_episodes(model, state, content.arrays)
     _restore_log(model, state["log"])
-    tensors = _restore_tensors(model, content.files[_TENSORS])
+    tensors = _restore_tensors(model, content.files[TENSORS])
     _restore_rng(model, state["rng"], tensors)  # last: what is above may draw
     return state["extra"], notes
 

@@ -20,7 +20,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tpm_gym.arrays import FloatArray, Vector, vector
+from tpm_gym.arrays import FloatArray, Vector, finite, vector
 from tpm_gym.errors import (
     ConfigurationError,
     JointLimitError,
@@ -92,15 +92,16 @@ class Machine(ABC):
 
     def __post_init__(self) -> None:
         """Reject machines on which no episode could run."""
+        self._require_values()
         for name, point in (
-            ("home", vector("home", self.home, ConfigurationError)),
+            ("home", self.home),
             ("goal_region", self.goal_region.low),
             ("goal_region", self.goal_region.high),
         ):
             if not self.region.contains(point):
                 raise ConfigurationError(name, point, f"inside the region, {self.region}")
         limits = {
-            "step_limit": vector("step_limit", self.step_limit, ConfigurationError),
+            "step_limit": self.step_limit,
             "joint_limit": (self.joint_limit,),
             "table": self.table,
         }
@@ -116,6 +117,18 @@ class Machine(ABC):
         if self.mount.height < least - 1e-6:
             valid = f"a height of {least:.6g} m or more: else the region is below the table"
             raise ConfigurationError("mount", self.mount, valid)
+
+    def _require_values(self) -> None:
+        """Refuse values of other types, and what is no finite number; arrays become tuples."""
+        for name, kind in (("mount", Mount), ("region", Region), ("goal_region", Region)):
+            if not isinstance(getattr(self, name), kind):
+                raise ConfigurationError(name, getattr(self, name), f"a {kind.__name__}")
+        for name in ("home", "step_limit"):
+            object.__setattr__(self, name, vector(name, getattr(self, name), ConfigurationError))
+        for name in ("joint_limit", "safe_conditioning"):
+            finite(name, getattr(self, name), (), ConfigurationError)
+        table = finite("table", self.table, (2,), ConfigurationError)
+        object.__setattr__(self, "table", tuple(table.tolist()))
 
     def _require_usable(self, name: str, point: Vector) -> None:
         """Refuse the option of that name if P cannot be worked with at ``point``."""
@@ -278,8 +291,12 @@ def register_machine(name: str, machine: Machine | Callable[[], Machine]) -> Non
     """Let environments be made with ``machine=name``; a callable is called when first asked for.
 
     Raises:
-        ConfigurationError: If the name is taken by another machine.
+        ConfigurationError: If the name is none, or taken by another machine, or that is no machine.
     """
+    if not isinstance(name, str) or not name:
+        raise ConfigurationError("name", name, "a name")
+    if not isinstance(machine, Machine) and not callable(machine):
+        raise ConfigurationError("machine", machine, "a tpm_gym.Machine, or what makes one")
     if _MACHINES.get(name, machine) != machine:
         raise ConfigurationError("machine", name, f"a name other than {', '.join(_MACHINES)}")
     _MACHINES[name] = machine

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tpm_gym.arrays import FloatArray, Vector
+from tpm_gym.arrays import FloatArray, Vector, finite
+from tpm_gym.errors import ConfigurationError
 
 __all__ = ["GRAVITY", "Mount"]
 
@@ -25,9 +26,17 @@ class Mount:
 
     Attributes:
         height: Height of the base plane above the table top (world z = 0), m.
+
+    Raises:
+        ConfigurationError: If it is no number from -100 to 100.
     """
 
     height: float
+
+    def __post_init__(self) -> None:
+        """Reject heights at which coordinates would lose their digits."""
+        if not abs(finite("height", self.height, (), ConfigurationError)) <= 100:
+            raise ConfigurationError("height", self.height, "at most 100 m")
 
     def to_world(self, point: ArrayLike) -> FloatArray:
         """Convert points (..., 3) m from the paper frame to the world frame."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tpm_gym.arrays import FloatArray, Vector
-from tpm_gym.errors import UnreachableError
+from tpm_gym.errors import ConfigurationError, UnreachableError
 from tpm_gym.kinematics import jacobian, workspace
 from tpm_gym.kinematics.equations import assemble, evaluate, posture
 from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
@@ -46,6 +46,12 @@ class TPM(Machine):
     geometry: Geometry
     working_mode: WorkingMode = ELBOWS_OUT
     assembly_mode: AssemblyMode = DEFAULT_ASSEMBLY
+
+    def __post_init__(self) -> None:
+        """See :class:`Machine`."""
+        if not isinstance(self.geometry, Geometry):
+            raise ConfigurationError("geometry", self.geometry, "a tpm_gym.Geometry")
+        super().__post_init__()
 
     def inverse(self, point: Vector) -> Vector:
         """See :class:`Machine`."""

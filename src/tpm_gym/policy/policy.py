@@ -13,7 +13,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from tpm_gym.arrays import numbers
@@ -128,7 +127,7 @@ class Policy:
         """Make sure that the policy fits an environment.
 
         Spaces are compared, and between environments of tpm_gym whether actions are Cartesian or
-        joint increments, which spaces do not tell.
+        joint increments, which spaces do not tell. What machine it was trained on is not on file.
 
         Args:
             env: An environment of Gymnasium, wrapped or not, or a vector of Stable-Baselines3.
@@ -145,7 +144,8 @@ class Policy:
             if trained != given:
                 name = kind.replace("_", " ")
                 raise PolicyMismatchError(name, trained, given, wanted.env_id)
-        own, found = _control(gym.registry.get(wanted.env_id)), _control(_spec(env))
+        spec = gym.registry.get(wanted.env_id)
+        own, found = spec.kwargs.get("control") if spec else None, _control(env)
         if own and found and own != found:
             raise PolicyMismatchError("control", own, found, wanted.env_id)
 
@@ -190,12 +190,12 @@ class Policy:
         return entries, leading != {()}
 
 
-def _spec(env: Any) -> EnvSpec | None:
-    """What an environment was made from, the first of a vector; None where it does not say."""
-    spec: EnvSpec | None = getattr(getattr(env, "unwrapped", env), "spec", None)
-    return env.get_attr("spec")[0] if spec is None and hasattr(env, "get_attr") else spec
+def _control(env: Any) -> str | None:
+    """How actions move the platform of an environment of tpm_gym, or of the first in a vector.
 
-
-def _control(spec: EnvSpec | None) -> str | None:
-    """How the actions of an environment of tpm_gym move the platform; None of others."""
-    return None if spec is None else spec.kwargs.get("control")
+    None where it does not say, as those of others.
+    """
+    control = getattr(getattr(env, "unwrapped", env), "control", None)
+    if hasattr(env, "has_attr") and env.has_attr("control"):
+        control = env.get_attr("control")[0]
+    return getattr(control, "name", None)

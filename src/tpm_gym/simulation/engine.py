@@ -144,8 +144,12 @@ def register_engine(name: str, engine: str | Factory) -> None:
             it can serve; or ``"module:attribute"`` of that, imported when first asked for.
 
     Raises:
-        ConfigurationError: If the name is taken by another engine.
+        ConfigurationError: If the name is none, or taken by another engine, or that is no engine.
     """
+    if not isinstance(name, str) or not name:
+        raise ConfigurationError("name", name, "a name")
+    if not (isinstance(engine, str) and ":" in engine) and not callable(engine):
+        raise ConfigurationError("engine", engine, "what makes an engine, or 'module:attribute'")
     if _path(_ENGINES.get(name, engine)) != _path(engine):
         raise ConfigurationError("engine", name, f"a name other than {', '.join(_ENGINES)}")
     _ENGINES[name] = engine
@@ -196,6 +200,8 @@ def make_engine(
     engine: Engine = factory(**asked)
     if lacking := [part for part in _PARTS if not _has(engine, part)]:
         raise ConfigurationError("engine", name, f"an engine that has {', '.join(lacking)}")
+    if not isinstance(engine.substeps, int) or engine.substeps < 1:
+        raise ConfigurationError("engine", name, "an engine whose substeps are 1 or more")
     return engine
 
 

@@ -8,6 +8,7 @@ expert keep believing in the nominal machine, as on a real robot.
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -172,11 +173,13 @@ def _pair(name: str, value: Any, low: float, high: float) -> Range:
 
 
 def _is_number(value: Any) -> bool:
-    return (
-        isinstance(value, (int, float, np.number))
-        and not isinstance(value, bool)
-        and math.isfinite(value)
-    )
+    with suppress(OverflowError):  # an integer beyond the range of floats
+        return (
+            isinstance(value, (int, float, np.number))
+            and not isinstance(value, bool)
+            and math.isfinite(value)
+        )
+    return False
 
 
 def _deviations(rng: np.random.Generator, size: float, count: int) -> tuple[float, ...]:

@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 from tpm_gym.arrays import FloatArray, Vector, rotate, vector
 from tpm_gym.errors import (
     ClosureError,
-    ConfigurationError,
     ModeChangeError,
     SingularityError,
     UnreachableError,
@@ -89,9 +88,6 @@ class Simulation:
         renderer: str | None = None,
     ) -> None:
         """Start the engine and load."""
-        names = [block.name for block in scene.objects]
-        if len(set(names)) < len(names) or "goal" in names:
-            raise ConfigurationError("scene", names, "objects of different names, none 'goal'")
         self.scene, self.machine = scene, machine
         self.drive = drive
         self.engine: Engine = make_engine(

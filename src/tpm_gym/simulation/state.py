@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from tpm_gym.arrays import BoolArray, FloatArray, IntArray
+from tpm_gym.arrays import BoolArray, FloatArray, IntArray, finite
+from tpm_gym.errors import ConfigurationError
 
 __all__ = ["CONTROL_PERIOD", "Block", "Scene", "State"]
 
@@ -26,6 +27,9 @@ class Block:
         mass: kg.
         friction: Coulomb coefficient against the table.
         colour: Red, green, blue, opacity, each from 0 to 1.
+
+    Raises:
+        ConfigurationError: If a value cannot be.
     """
 
     name: str = "object"
@@ -34,6 +38,16 @@ class Block:
     mass: float = 0.050
     friction: float = 0.6
     colour: tuple[float, float, float, float] = (0.83, 0.18, 0.33, 1.0)
+
+    def __post_init__(self) -> None:
+        """Reject blocks that cannot be."""
+        if not isinstance(self.name, str) or not self.name:
+            raise ConfigurationError("name", self.name, "a name")
+        for name in ("width", "height", "mass", "friction"):
+            _require_positive(name, getattr(self, name))
+        colour = finite("colour", self.colour, (4,), ConfigurationError)
+        if not ((colour >= 0) & (colour <= 1)).all():
+            raise ConfigurationError("colour", self.colour, "four numbers from 0 to 1")
 
     @property
     def inertia(self) -> tuple[float, float, float]:
@@ -50,11 +64,25 @@ class Scene:
         objects: Any number of blocks.
         markers: How many points a goal shows as translucent spheres.
         marker_radius: Their radius, m.
+
+    Raises:
+        ConfigurationError: If a value cannot be.
     """
 
     objects: tuple[Block, ...] = ()
     markers: int = 1
     marker_radius: float = 0.010
+
+    def __post_init__(self) -> None:
+        """Reject scenes that cannot be."""
+        # By their names reset's options tell them apart.
+        blocks = isinstance(self.objects, tuple) and all(isinstance(b, Block) for b in self.objects)
+        if not blocks or len({"goal", *(b.name for b in self.objects)}) <= len(self.objects):
+            valid = "a tuple of blocks, each with a name of its own that is not 'goal'"
+            raise ConfigurationError("objects", self.objects, valid)
+        if not isinstance(self.markers, int) or self.markers < 0:
+            raise ConfigurationError("markers", self.markers, "a whole number, 0 or more")
+        _require_positive("marker_radius", self.marker_radius)
 
 
 @dataclass(frozen=True)
@@ -109,3 +137,8 @@ class State:
     def passed_singularity(self) -> BoolArray | bool:
         """(...,) whether the mechanism has left one of its modes in this episode."""
         return self.assembly_mode_changed | self.working_mode_changed
+
+
+def _require_positive(name: str, value: float) -> None:
+    if not finite(name, value, (), ConfigurationError) > 0:
+        raise ConfigurationError(name, value, "a number above 0")

@@ -23,7 +23,13 @@ _PARTS = 32  # of a way, in which joints turn nearly evenly
 
 
 class Control(Protocol):
-    """What an environment asks of its kind of control; commands are point P in m."""
+    """What an environment asks of its kind of control; commands are point P in m.
+
+    Attributes:
+        name: What the environment's option calls it.
+    """
+
+    name: str
 
     def command(self, action: ArrayLike, current: ArrayLike) -> FloatArray:
         """The next command (3,), for an action (3,) in [-1, 1] and the current command (3,)."""
@@ -37,6 +43,8 @@ class Control(Protocol):
 
 class CartesianControl:
     """Actions are increments of point P along x, y, z, in units of the machine's step limit."""
+
+    name = "cartesian"
 
     def __init__(self, machine: Machine) -> None:
         """For one machine."""
@@ -64,6 +72,8 @@ class JointControl:
     be assembled, all three joints are slowed down together; what then still leaves the region is
     projected into it.
     """
+
+    name = "joints"
 
     def __init__(self, machine: Machine) -> None:
         """For one machine."""
@@ -125,10 +135,9 @@ def make_control(kind: str, machine: Machine) -> Control:
     Raises:
         ConfigurationError: If there is none.
     """
-    if kind == "cartesian":
-        return CartesianControl(machine)
-    if kind == "joints":
-        return JointControl(machine)
+    for control in (CartesianControl, JointControl):
+        if kind == control.name:
+            return control(machine)
     raise ConfigurationError("control", kind, "'cartesian' or 'joints'")
 
 

@@ -61,10 +61,11 @@ class Expert(Motion):
         """The next action, shape and range of the environment's action space.
 
         Raises:
-            EpisodeError: If the expert was not reset for this episode of its environment, or its
-                plan has no moves.
+            EpisodeError: If the expert was not reset for this episode of its environment, there is
+                none, or its plan has no moves.
             ConfigurationError: If its plan needs a vacuum, or to see, what its task has not.
         """
+        _ = self._env.state  # there has to be an episode
         if self._plan is None or self._episode != self._env.episode:
             raise EpisodeError("the expert has no plan for this episode; call its reset() first")
         self._look(observation)

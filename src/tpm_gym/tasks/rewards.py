@@ -18,8 +18,8 @@ def distance(achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
 
 
 def sparse(gap: ArrayLike, tolerance: float) -> FloatArray:
-    """0 where ``gap`` (m) is below ``tolerance`` (m), else -1."""
-    return -(np.asarray(gap) >= tolerance).astype(np.float64)
+    """0 where ``gap`` (m) is below ``tolerance`` (m), else -1, also where it is no number."""
+    return -(~(np.asarray(gap) < tolerance)).astype(np.float64)
 
 
 def dense(gap: ArrayLike, unit: float = 0.1) -> FloatArray:

@@ -173,12 +173,18 @@ class Task(ABC):
             state: The state that was reached.
             achieved: (..., goal_size) m, as in the observation.
             desired: (..., goal_size) m.
+
+        Raises:
+            ConfigurationError: If :meth:`shaping` gives a term the name of another.
         """
-        return {
+        terms = {
             "goal": self.goal_term(achieved, desired),
             "singularity": -self.penalty_weight * self.penalty(state),
-            **self.shaping(state),
         }
+        own = self.shaping(state)
+        for name in terms.keys() & own.keys():
+            raise ConfigurationError("shaping", name, f"names other than {', '.join(terms)}")
+        return {**terms, **own}
 
     def goal_term(self, achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
         """The one term that depends on the goal, (...,)."""
@@ -409,8 +415,9 @@ class Task(ABC):
     def lost(self, state: State) -> BoolArray:
         """Whether an object is off the table or where the robot cannot get to, (...,)."""
         low, high = self._within
-        beyond = (state.object_position < low) | (state.object_position > high)
-        lost: BoolArray = np.logical_or.reduce(beyond, axis=(-2, -1))
+        # So written, what is nowhere (NaN) is lost.
+        within = (state.object_position >= low) & (state.object_position <= high)
+        lost: BoolArray = ~np.logical_and.reduce(within, axis=(-2, -1))
         return lost
 
 

@@ -144,6 +144,22 @@ def test_what_is_dropped_is_given_back() -> None:
     kept.stepSimulation()
 
 
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs Linux")
+def test_the_memory_of_many_copies_goes_back_to_the_system() -> None:
+    _, kept = in_a_process("""
+from tpm_gym.simulation.bullet.client import Client, Physics
+def memory():
+    return int(open("/proc/self/statm").read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+clients = [Client(Physics())]
+before = memory()
+clients += [Client(Physics()) for _ in range(12)]
+most = memory()
+del clients[1:]
+sys.stderr.write(f"{(memory() - before) / (most - before)}")
+""")
+    assert float(kept) < 0.4
+
+
 @pytest.mark.slow  # 20 s
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs Linux")
 def test_200_environments_and_copies_dropped_without_close_leave_no_memory() -> None:

@@ -23,6 +23,8 @@ from tpm_gym.simulation.display import has_display
 __all__ = ["Client", "silence"]
 
 _stdout_lock = threading.RLock()
+_live: set[int] = set()
+_most = 0  # clients since memory was given back
 
 
 class Client:
@@ -47,6 +49,7 @@ class Client:
     def __init__(self, physics: Physics, gui: bool = False, renderer: str | None = None) -> None:
         """Connect and configure."""
         self.number = _connect(gui)
+        _count(self.number)
         # An environment that is dropped without close() would keep its 28 MB until the end.
         self._disconnect = weakref.finalize(self, _disconnect, self.number)
         try:
@@ -120,6 +123,27 @@ def _disconnect(number: int) -> None:
     # The engine may have gone first, as when the interpreter ends or after a fork.
     with suppress(pybullet.error):
         pybullet.disconnect(number)
+    _live.discard(number)
+    _give_back()
+
+
+def _count(number: int) -> None:
+    global _most
+    _live.add(number)
+    _most = max(_most, len(_live))
+
+
+def _give_back() -> None:
+    """Return the memory of clients to the system where at least half of many have gone.
+
+    glibc would keep all of it until the end. Milliseconds, so not at each client that goes: a robot
+    of other lengths takes a new one at each reset.
+    """
+    global _most
+    if _most >= 4 and len(_live) <= _most / 2:
+        _most = len(_live)
+        with suppress(AttributeError, OSError, TypeError):  # another C library
+            ctypes.CDLL(None).malloc_trim(0)
 
 
 @contextmanager
