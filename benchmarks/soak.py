@@ -129,8 +129,12 @@ class Soak:
             self._render(env)
         for index in range(length):
             self._step = index
-            if index == save_at and self._check_restore(env, rng):
-                break
+            if index == save_at:
+                if self._check_restore(env, rng):
+                    break
+                inner: Any = env.unwrapped
+                observation = inner.restore_state(inner.save_state())
+                policy = _policy(env, rng, observation)  # the expert plans anew
             observation, _, terminated, truncated, _ = self._advance(env, policy(observation))
             if terminated or truncated:
                 break
