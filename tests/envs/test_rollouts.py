@@ -1,4 +1,4 @@
-"""Rollouts are those of the first version: to the bit, or near where a processor rounds otherwise.
+"""Rollouts are those on record: to the bit, or near where a processor rounds otherwise.
 
 Their records are made by ``python tests/support/rollouts.py tests/data/rollouts.json``.
 """
@@ -31,7 +31,7 @@ def marked(case: tuple[str, str]) -> Any:
 
 
 @pytest.mark.parametrize(("env_id", "name"), [marked(case) for case in cases()])
-def test_rollouts_are_those_of_the_first_version(env_id: str, name: str) -> None:
+def test_rollouts_are_those_on_record(env_id: str, name: str) -> None:
     found, recorded = play(env_id, name, Expert), RECORDED[f"{env_id} {name}"]
     if found["sha256"] != recorded["sha256"]:
         for key in ("returns", "gaps"):

@@ -1,8 +1,8 @@
-"""Rollouts of the first version, as digests and numbers, and how to make them again.
+"""Rollouts as digests and numbers, and how to record them again.
 
     python tests/support/rollouts.py tests/data/rollouts.json
 
-Recorded before the package was taken apart into rooms, which had to keep them.
+Only where the physics, a task or a policy is meant to change are they recorded anew.
 """
 
 import hashlib
