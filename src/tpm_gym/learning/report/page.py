@@ -27,8 +27,9 @@ _INTRO: Final = f"""# Results
 
 Written by `make results` from the records in [results](results); no result here was typed by hand.
 
-**Stale:** these records are of the physics before friction in PyBullet became a cone, the vacuum a pressure with a limit, and the
-motors real ones. The published policies have been trained and tested anew since; all else here is as it was.
+**Stale:** these records are of the physics before friction in PyBullet became a cone, the vacuum a
+pressure with a limit, and the motors real ones. The published policies have been trained and tested
+anew since; all else here is as it was.
 
 - **Success** is that of the last step of an episode. Each run is tested with the policy that did
   best in the evaluations during training, on held-out seeds that neither training nor those
