@@ -130,9 +130,8 @@ def _by_policy(record: dict[str, Any]) -> dict[tuple[str, str], dict[tuple[str, 
 
 def _name(cell: dict[str, Any]) -> str:
     """The policy as a reader knows it."""
-    if cell["policy"] == cell["env_id"]:
-        return "published"
-    return "stopped early" if cell["policy"].endswith(".json") else cell["policy"]
+    name = "published" if cell["policy"] == cell["env_id"] else cell["policy"]
+    return f"{name}, trembling" if cell["noise"] else str(name)
 
 
 def _success(estimate: dict[str, float]) -> str:
