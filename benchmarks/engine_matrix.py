@@ -25,7 +25,7 @@ from tpm_gym.learning.rollout import (
 
 IDS = ("TPMPickAndPlace-v0", "TPMPickAndPlaceJoints-v0")
 DRIVES = ("ideal", "servo")
-NOISE = 0.5
+NOISE = 0.3
 """Standard deviation of what is added to the actions of weak policies: they drop, throw, shove."""
 
 
