@@ -17,7 +17,7 @@ DOCS = Path(__file__).resolve().parent
 IMAGES = DOCS / "images"
 POLICY = DOCS.parent / "train" / "policies" / "TPMPickAndPlace-v0.json"
 START, GOAL = (-0.17, -0.034, 0.015), (0.05, -0.030, 0.015)
-FRAMES = {0: "start", 6: "vacuum on: the cup has sealed", 10: "on the way", 21: "placed, vacuum off"}
+FRAMES = {0: "start", 6: "vacuum on: the cup seals", 10: "on the way", 21: "placed, vacuum off"}
 SIZE, SUPERSAMPLING = 380, 3
 CROP = (0.05, 0.0, 1.0, 0.94)  # left, top, right, bottom of the rendered picture
 
