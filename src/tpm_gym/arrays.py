@@ -76,7 +76,7 @@ def points(name: str, value: ArrayLike) -> FloatArray:
     array: Any = value
     if type(value) is np.ndarray or not is_tensor(value):
         array = numbers(name, value)
-    elif array.is_complex() or array.is_meta or str(array.layout) != "torch.strided":
+    elif array.is_complex() or str(array.layout) != "torch.strided":
         raise InputError(name, _brief(value), "real numbers of shape (..., 3), in a dense tensor")
     else:
         array = array.double()
