@@ -35,14 +35,17 @@ def solved(env: Any, **options: Any) -> bool:
 @pytest.mark.parametrize(
     ("episodes", "wanted"), [(20, 20), pytest.param(1000, 990, marks=pytest.mark.slow)]
 )
-def test_it_solves_every_task_and_keeps_clear_of_the_singularity(
+def test_it_solves_every_task_clear_of_the_singularity_with_half_the_torque(
     env_id: str, options: dict[str, str], episodes: int, wanted: int
 ) -> None:
     env: Any = gym.make(env_id, **options)
-    # With joints on the paper's machine 6 of 1000 get to 0.055: see the expert's docstring.
-    safe, successes, clear = env.unwrapped.machine.safe_conditioning, 0, 0
+    machine, successes, clear = env.unwrapped.machine, 0, 0
+    safe, effort = machine.safe_conditioning, [motor.effort for motor in machine.mechanism.motors]
     for seed in range(episodes):
-        infos = [info for *_, info in expert_episode(env, seed)]
+        infos = []
+        for *_, info in expert_episode(env, seed):
+            infos.append(info)
+            assert (np.abs(env.unwrapped.state.torque) <= 0.5 * np.array(effort)).all()
         successes += infos[-1]["is_success"]
         assert max(info["closure_error"] for info in infos) < 0.5e-3
         clear += min(info["conditioning"] for info in infos) > 0.95 * safe
