@@ -145,15 +145,24 @@ def _success(estimate: dict[str, float]) -> str:
 def draw(record: dict[str, Any]) -> None:
     """Torques off each other and off theory; success of each policy over engines and drives."""
     with style.style():
-        figure = Figure(figsize=(style.WIDTH, 3.4))
+        figure = Figure(figsize=(style.WIDTH, 3.8))
         left, *right = figure.subplots(1, 3, width_ratios=(1.1, 1, 1))
         _agreement(left, record)
         ids = list(dict.fromkeys(cell["env_id"] for cell in record["matrix"]))
         for axes, env_id in zip(right, ids, strict=True):
             _matrix(axes, record, env_id)
-        handles, labels = right[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="lower right", ncols=4, bbox_to_anchor=(0.99, 0.0))
-        figure.subplots_adjust(left=0.17, right=0.985, top=0.9, bottom=0.2, wspace=0.55)
+        right[-1].set_yticklabels([])
+        for axes, place, columns in ((left, 0.17, 1), (right[0], 0.72, 2)):
+            figure.legend(
+                *axes.get_legend_handles_labels(),
+                loc="lower center",
+                ncols=columns,
+                bbox_to_anchor=(place, 0.0),
+                frameon=False,
+            )
+        left.set_position((0.17, 0.28, 0.25, 0.64))
+        right[0].set_position((0.53, 0.28, 0.215, 0.64))
+        right[1].set_position((0.77, 0.28, 0.215, 0.64))
         style.save(figure, PICTURE)
 
 
@@ -177,7 +186,6 @@ def _agreement(axes: Axes, record: dict[str, Any]) -> None:
     axes.set(xscale="log", xlabel="relative RMS of the torques apart (%)")
     axes.set_title("Torques", loc="left")
     axes.grid(axis="x", color="0.92", linewidth=0.6)
-    axes.legend(loc="upper center", bbox_to_anchor=(0.1, -0.13), frameon=False)
 
 
 def _matrix(axes: Axes, record: dict[str, Any], env_id: str) -> None:
@@ -191,7 +199,7 @@ def _matrix(axes: Axes, record: dict[str, Any], env_id: str) -> None:
         axes.barh(at, 100 * values[:, 1], 0.9 * height, color=colour, label=", ".join(head))
         spread = 100 * np.abs(values[:, [0, 2]].T - values[:, 1])
         axes.errorbar(100 * values[:, 1], at, xerr=spread, fmt="none", ecolor="0.3", lw=0.6)
-    axes.set_yticks(range(len(rows)), list(rows))
+    axes.set_yticks(range(len(rows)), [name.replace(", ", ",\n") for name in rows])
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.set(xlim=(0, 103), xlabel="success at end (%)")
     axes.set_title(env_id, loc="left")
