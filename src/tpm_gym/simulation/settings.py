@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import fields
-from typing import Any, TypeVar
+from numbers import Integral, Real
+from typing import Any, Protocol, TypeVar
 
 from tpm_gym.errors import ConfigurationError
+from tpm_gym.simulation.state import CONTROL_PERIOD
 
-__all__ = ["settings_of"]
+__all__ = ["require_numerics", "settings_of"]
 
 T = TypeVar("T")
 
@@ -26,3 +29,43 @@ def settings_of(kind: type[T], name: str, value: Any) -> T:
         return kind(**(value or {}))
     valid = f"None, a {kind.__name__}, or a mapping with keys among {', '.join(names)}"
     raise ConfigurationError(name, value, valid)
+
+
+class Numerics(Protocol):
+    """Settings that every engine with time steps and an iterating solver has."""
+
+    @property
+    def time_step(self) -> float:
+        """s; a whole fraction of the control period."""
+
+    @property
+    def iterations(self) -> int:
+        """Of the solver, a step."""
+
+
+def require_numerics(
+    settings: Numerics, ranges: Mapping[str, tuple[Callable[[float], bool], str]]
+) -> None:
+    """Reject time steps, iterations, and other numbers by their ranges, that cannot work.
+
+    Args:
+        settings: What has them as attributes.
+        ranges: Of the other numbers: whether a value fits, and what would.
+
+    Raises:
+        ConfigurationError: If a value is out of range.
+    """
+    for name in ("time_step", *ranges):
+        value = getattr(settings, name)
+        if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
+            raise ConfigurationError(name, value, "a finite number")
+    step, count = settings.time_step, settings.iterations
+    steps = CONTROL_PERIOD / step if step > 0 else 0.0
+    if round(steps) < 1 or abs(steps - round(steps)) >= 1e-6:
+        valid = f"a whole fraction of the control period, {CONTROL_PERIOD} s"
+        raise ConfigurationError("time_step", step, valid)
+    if isinstance(count, bool) or not isinstance(count, Integral) or count < 1:
+        raise ConfigurationError("iterations", count, "a whole number, 1 or more")
+    for name, (fits, valid) in ranges.items():
+        if not fits(getattr(settings, name)):
+            raise ConfigurationError(name, getattr(settings, name), valid)

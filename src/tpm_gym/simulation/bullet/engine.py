@@ -81,7 +81,6 @@ class BulletEngine:
             self.robot.paint()
         self.bodies = self._scenery.bodies
         self._cup = Cup(self.client, self.robot, self.bodies, scene.objects, self.physics.time_step)
-
         self._friction = Friction(
             self.client, self.robot, self.bodies, self._scenery.tables, scene.objects
         )
