@@ -26,7 +26,7 @@ tpm_gym.register_machine("mine", tpm_gym.PAPER_TPM)
 
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Runs the command in a folder that Python knows nothing of, and has imported nothing from."""
+    """Runs the command as in a folder of which Python has imported nothing."""
     monkeypatch.chdir(tmp_path)
 
     def run_anew(*words: str) -> None:
@@ -34,7 +34,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
         with (
             patch.dict(gym.registry),
             patch.dict(TASKS),
-            patch.object(sys, "path", [path for path in sys.path if path]),
+            patch.object(sys, "path", [str(tmp_path), *sys.path]),  # as ``python -m`` has it
         ):
             main(words)
 

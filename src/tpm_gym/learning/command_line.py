@@ -54,11 +54,8 @@ Command = (
 def main(words: Sequence[str] | None = None) -> None:
     """Run a command line, by default that of the process, and exit with its status.
 
-    A command that a signal has stopped exits with 128 and its number, as shells do. However it was
-    called, ``module:id`` finds modules in the working folder.
+    A command that a signal has stopped exits with 128 and its number, as shells do.
     """
-    if (folder := str(Path.cwd())) not in sys.path:
-        sys.path.insert(0, folder)
     about = "Train policies on the environments of tpm_gym, and evaluate them."
     command: Any = tyro.cli(Command, prog="tpm-gym", description=about, args=words)
     try:

@@ -29,7 +29,7 @@ def check_env_id(env_id: str) -> EnvSpec:
             importlib.import_module(module)
     except Exception as error:  # whatever a user's module may raise
         reason = f"{type(error).__name__}: {error}"
-        where = "run this in the folder that holds it, or install it"
+        where = "install it, or say python -m tpm_gym.learning in the folder that holds it"
         raise ConfigError(f"{env_id}: cannot import {module!r} ({reason}); {where}") from error
     try:
         spec = gym.spec(name)
