@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import math
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -16,6 +15,14 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
 from tpm_gym.arrays import FloatArray, Vector, finite, numbers
+from tpm_gym.envs.report import (
+    GOAL_BOUND,
+    OBSERVATION_BOUND,
+    Observation,
+    goal_free,
+    observe,
+    report,
+)
 from tpm_gym.errors import (
     ActionError,
     ConfigurationError,
@@ -37,10 +44,6 @@ from tpm_gym.tasks.task import Task
 __all__ = ["EnvSnapshot", "TPMEnv"]
 
 Action = NDArray[Any]
-Observation = dict[str, Any]  # arrays of float32
-
-_OBSERVATION_BOUND = 10.0
-_GOAL_BOUND = 2.0
 
 
 @dataclass(frozen=True)
@@ -237,14 +240,8 @@ class TPMEnv(gym.Env[Observation, Action]):
             self.drive, self.randomisation.servo_stiffness, self.randomisation.joint_friction
         )
         self._size = _pixels("width", width), _pixels("height", height)
-        self.observation_space = spaces.Dict(
-            {
-                "observation": _box(_OBSERVATION_BOUND, self.task.observation_size),
-                "achieved_goal": _box(_GOAL_BOUND, self.task.goal_size),
-                "desired_goal": _box(_GOAL_BOUND, self.task.goal_size),
-            }
-        )
-        self.action_space = _box(1.0, self.task.action_size)
+        self.observation_space = observation_space(self.task)
+        self.action_space = action_space(self.task)
         self.episode = 0  # how many have been started or restored
         self._home = self.machine.inverse(self.machine.home)
         self._state: State | None = None
@@ -309,7 +306,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         self._show_goal()
         self._state = self.simulation.reset(self._home, start, plant, self._draw_noise())
         self.task.check(self._state)
-        observation, info = self._report(self._state)
+        observation, _, info = self._report(self._state)
         if self.randomisation != Randomisation():
             latency = {"latency": self.randomisation.latency}
             info["randomisation"] = {**plant.as_dict(), **latency}
@@ -339,8 +336,7 @@ class TPMEnv(gym.Env[Observation, Action]):
             self._state = state  # nothing has moved
             raise
         self._pending = tuple(pending)
-        observation, info = self._report(self._state)
-        reward = info["reward_terms"]["goal"] + _goal_free(info)
+        observation, reward, info = self._report(self._state)
         if self.render_mode == "human":
             self.render()
         return observation, reward, False, bool(self._state.passed_singularity), info
@@ -453,7 +449,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         self.episode += 1  # what was planned for the one before is void
         self._show_goal()
         self._state = self.simulation.restore(snapshot.simulation)
-        return self._observe(self._state, self._goal)
+        return observe(self.task, self._state, self._goal)
 
     # -- inside ---------------------------------------------------------------------------------
 
@@ -495,31 +491,12 @@ class TPMEnv(gym.Env[Observation, Action]):
         a, b, c = self.np_random.normal(0.0, self.randomisation.encoder_noise, 3).tolist()
         return a, b, c
 
-    def _observe(self, state: State, goal: FloatArray) -> Observation:
-        return {
-            "observation": _clip(self.task.observe(state), _OBSERVATION_BOUND),
-            "achieved_goal": _clip(self.task.achieved(state), _GOAL_BOUND),
-            "desired_goal": goal.astype(np.float32),
-        }
-
-    def _report(self, state: State) -> tuple[Observation, dict[str, Any]]:
-        task, observation = self.task, self._observe(state, self._goal)
-        achieved, desired = observation["achieved_goal"], observation["desired_goal"]
-        terms = {k: float(v) for k, v in task.reward_terms(state, achieved, desired).items()}
-        vector = observation["observation"]
-        if not math.isfinite(vector.dot(vector) + achieved.dot(achieved) + sum(terms.values())):
-            raise _not_finite(task, state, achieved, terms)
-        return observation, {
-            "is_success": bool(task.success(achieved, desired)),
-            "closure_error": float(state.closure_error),
-            "vacuum": float(state.vacuum),
-            "conditioning": float(state.conditioning),
-            "singularity_penalty": float(task.penalty(state)),
-            "assembly_mode_changed": bool(state.assembly_mode_changed),
-            "working_mode_changed": bool(state.working_mode_changed),
-            "object_lost": bool(task.lost(state)),
-            "reward_terms": terms,
-        }
+    def _report(self, state: State) -> tuple[Observation, float, dict[str, Any]]:
+        """What Gymnasium wants: Python's own numbers."""
+        observation, reward, info = report(self.task, state, self._goal)
+        terms = {name: float(value) for name, value in info.pop("reward_terms").items()}
+        plain = {name: np.asarray(value).item() for name, value in info.items()}
+        return observation, float(reward), {**plain, "reward_terms": terms}
 
 
 def _require_goals(size: int, achieved: ArrayLike, desired: ArrayLike) -> None:
@@ -535,32 +512,29 @@ def _require_goals(size: int, achieved: ArrayLike, desired: ArrayLike) -> None:
         raise InputError("achieved_goal, desired_goal", shapes, valid)
 
 
-def _not_finite(
-    task: Task, state: State, achieved: FloatArray, terms: Mapping[str, float]
-) -> ConfigurationError:
-    """Which of the values that a task made of a state is at fault for one that is not finite."""
-    values = {
-        **{f"observed(), {entry.name!r}": entry.source(state) for entry in task.entries},
-        "achieved()": achieved,
-        **{f"reward_terms()[{name!r}]": value for name, value in terms.items()},
-    }
-    name, value = next(item for item in values.items() if not np.isfinite(item[1]).all())
-    return ConfigurationError(name, np.asarray(value).tolist(), "finite numbers from the task")
-
-
 def _goal_free(info: Mapping[str, Any]) -> float:
     """Sum of the reward's terms in ``info`` that do not depend on the goal; 0 for an empty one."""
-    terms = info.get("reward_terms", {})
-    return float(sum(value for name, value in terms.items() if name != "goal"))
+    return float(goal_free(info.get("reward_terms", {})))
+
+
+def observation_space(task: Task) -> spaces.Dict:
+    """The space of a task's observations."""
+    return spaces.Dict(
+        {
+            "observation": _box(OBSERVATION_BOUND, task.observation_size),
+            "achieved_goal": _box(GOAL_BOUND, task.goal_size),
+            "desired_goal": _box(GOAL_BOUND, task.goal_size),
+        }
+    )
+
+
+def action_space(task: Task) -> spaces.Box:
+    """The space of a task's actions."""
+    return _box(1.0, task.action_size)
 
 
 def _box(bound: float, length: int) -> spaces.Box:
     return spaces.Box(-bound, bound, (length,), np.float32)
-
-
-def _clip(values: FloatArray, bound: float) -> NDArray[np.float32]:
-    clipped: NDArray[np.float32] = np.minimum(np.maximum(values, -bound), bound).astype(np.float32)
-    return clipped
 
 
 def _pixels(name: str, value: Any) -> int:

@@ -16,6 +16,7 @@ from tpm_gym.tasks.task import Task
 __all__ = ["ENTRY_POINT", "MAX_EPISODE_STEPS", "env_ids", "register_task"]
 
 ENTRY_POINT = "tpm_gym.envs.env:TPMEnv"
+VECTOR_ENTRY_POINT = "tpm_gym.envs.vector:make_vector"
 MAX_EPISODE_STEPS = 50
 
 
@@ -56,6 +57,7 @@ def register_task(
     variants: dict[str, dict[str, Any]] = {
         f"TPM{name}{joints}{dense}-v{version}": {
             "entry_point": ENTRY_POINT,
+            "vector_entry_point": VECTOR_ENTRY_POINT,
             "max_episode_steps": max_episode_steps,
             "kwargs": {"task": option, "control": control, "reward": reward},
         }

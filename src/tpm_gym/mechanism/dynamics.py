@@ -18,7 +18,7 @@ B_i, each by one division (:func:`_resolve`). Bodies enter by sixteen constants 
   stays what it is and takes no torque: it is left out.
 
 Forces of inertia and weight at B_i, C1 and P go the way back: the forces in the rods that carry
-them, one division each (:func:`_gather`), and by those to the motors. The mass matrix is the torque
+them, one division each (:func:`gather`), and by those to the motors. The mass matrix is the torque
 of unit accelerations, linear in them; C is the torque's part that is quadratic in the rates,
 polarised, which makes it that of Christoffel's symbols, so that M' - 2C is skew.
 
@@ -152,7 +152,7 @@ def carried(
     gx, gy, gz = gravity
     cx, cz, px, py, pz = cx - gx, cz - gz, px - gx, py - gy, pz - gz
     (k1, k2, k3), (w1, w2, w3), (j1, j2, j3) = m.couples, m.weights, m.motors
-    one, two, three = _gather(
+    one, two, three = gather(
         pose,
         (
             m.link3 * cx - k1 * gx + k2 * (b2x - gx) + m.link7 * px + f1x,
@@ -245,7 +245,7 @@ def _resolve(pose: Pose, h1: Numbers, h2: Numbers, h3: Numbers) -> Triple:
     return x, z, (h3 - r3x * x - r3z * z) / pose.k
 
 
-def _gather(pose: Pose, at_c: tuple[Numbers, Numbers], at_p: Triple) -> Triple:
+def gather(pose: Pose, at_c: tuple[Numbers, Numbers], at_p: Triple) -> Triple:
     """Torques that carry forces (N) at C1 (x, z) and at P: the transpose of what rates do."""
     (r1x, _, r1z), (r2x, _, r2z), (r3x, _, r3z) = pose.rods
     (cx, cz), (px, py, pz), f = at_c, at_p, pose.factors

@@ -30,6 +30,7 @@ from tpm_gym.errors import (
 from tpm_gym.kinematics.geometry import Geometry
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism import virtual_work
+from tpm_gym.mechanism.batch import Batch
 from tpm_gym.mechanism.bodies import Mechanism
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.mount import Mount
@@ -258,6 +259,16 @@ class Machine(ABC):
         if lengths:
             raise ConfigurationError("length_error", lengths, f"0: {self.name} has no lengths")
         return self
+
+    def batch(self, count: int) -> Batch:
+        """So many of these machines, for an engine that computes all of them at a time.
+
+        Raises:
+            ConfigurationError: If the machine has no closed form for arrays.
+        """
+        del count
+        valid = f"another one: {self.name!r} has no closed form for arrays (Machine.batch)"
+        raise ConfigurationError("engine", "analytic", valid)
 
     def occupied(self, position: ArrayLike) -> list[tuple[FloatArray, FloatArray]]:
         """Boxes around platform and tool with P at ``position``: low and high corners, m, world."""

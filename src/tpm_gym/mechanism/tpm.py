@@ -22,6 +22,7 @@ from tpm_gym.mechanism.bodies import Mechanism
 from tpm_gym.mechanism.dynamics import Dynamics, torques
 from tpm_gym.mechanism.machine import Machine, Mode, Reading, register_machine
 from tpm_gym.mechanism.mount import Mount
+from tpm_gym.mechanism.tpm_batch import TPMBatch
 
 __all__ = ["ASSEMBLY_LIMIT", "PAPER_TPM", "TPM", "WIDE_TPM"]
 
@@ -118,6 +119,10 @@ class TPM(Machine):
         dynamics = self.dynamics
         pose = dynamics.pose(theta)
         return torques(pose, theta_dot, theta_ddot, dynamics.free_fall, dynamics.inertia)
+
+    def batch(self, count: int) -> TPMBatch:
+        """See :class:`Machine`."""
+        return TPMBatch(self, count)
 
     @property
     def lengths(self) -> tuple[float, ...]:

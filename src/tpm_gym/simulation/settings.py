@@ -32,15 +32,11 @@ def settings_of(kind: type[T], name: str, value: Any) -> T:
 
 
 class Numerics(Protocol):
-    """Settings that every engine with time steps and an iterating solver has."""
+    """Settings that every engine has; one with an iterating solver has its ``iterations`` too."""
 
     @property
     def time_step(self) -> float:
         """s; a whole fraction of the control period."""
-
-    @property
-    def iterations(self) -> int:
-        """Of the solver, a step."""
 
 
 def require_numerics(
@@ -59,7 +55,7 @@ def require_numerics(
         value = getattr(settings, name)
         if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
             raise ConfigurationError(name, value, "a finite number")
-    step, count = settings.time_step, settings.iterations
+    step, count = settings.time_step, getattr(settings, "iterations", 1)
     steps = CONTROL_PERIOD / step if step > 0 else 0.0
     if round(steps) < 1 or abs(steps - round(steps)) >= 1e-6:
         valid = f"a whole fraction of the control period, {CONTROL_PERIOD} s"

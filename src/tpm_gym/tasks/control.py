@@ -32,7 +32,10 @@ class Control(Protocol):
     name: str
 
     def command(self, action: ArrayLike, current: ArrayLike) -> FloatArray:
-        """The next command (3,), for an action (3,) in [-1, 1] and the current command (3,)."""
+        """The next command (3,), for an action (3,) in [-1, 1] and the current command (3,).
+
+        For a batch of both, (n, 3), those of machines that have a :meth:`~tpm_gym.Machine.batch`.
+        """
 
     def action(self, wanted: ArrayLike, current: ArrayLike) -> FloatArray:
         """The action (3,) in [-1, 1] that moves the command from current towards wanted."""
@@ -82,6 +85,8 @@ class JointControl:
     def command(self, action: ArrayLike, current: ArrayLike) -> FloatArray:
         """Point P after the (slowed down) increment of the joints, projected into the region."""
         start = np.asarray(current, dtype=np.float64)
+        if start.ndim > 1:
+            return self._commands(np.asarray(action, dtype=np.float64), start)
         joints = self._machine.inverse(_vector(start))
         theta = np.array(joints)
         step = np.asarray(action, dtype=np.float64) * self._machine.joint_limit
@@ -100,6 +105,36 @@ class JointControl:
                 else:
                     low, point = middle, tried
         return self._machine.region.project(point)
+
+    def _commands(self, actions: FloatArray, current: FloatArray) -> FloatArray:
+        """The same for a batch (n, 3)."""
+        start, limit = np.ascontiguousarray(current.T), self._step[:, None]
+        batch = self._machine.batch(len(current))
+        theta = batch.inverse(start)
+        step = np.ascontiguousarray(actions.T) * self._machine.joint_limit
+        a, b, c = batch.evaluate(theta).jacobian.swapaxes(0, 1)
+        rate = np.abs(a * step[0] + b * step[1] + c * step[2])
+        linear = (limit / np.maximum(rate, 1e-12)).min(axis=0)
+        high = np.minimum(1.0, 2 * linear)
+        point = batch.forward(theta + high * step)
+        slow = np.nonzero(~(np.abs(point - start) <= limit).all(axis=0))[0]
+        if len(slow):
+            point[:, slow] = self._slowed(start[:, slow], theta[:, slow], step[:, slow], high[slow])
+        return self._machine.region.project(point.T)
+
+    def _slowed(
+        self, start: FloatArray, theta: FloatArray, step: FloatArray, high: FloatArray
+    ) -> FloatArray:
+        """Point P where the joints' step, shortened by bisection, is no more than P's (3, n)."""
+        batch, limit = self._machine.batch(start.shape[1]), self._step[:, None]
+        low, point = np.zeros_like(high), start
+        for _ in range(_BISECTIONS):
+            middle = (low + high) / 2
+            tried = batch.forward(theta + middle * step)
+            allowed = (np.abs(tried - start) <= limit).all(axis=0)
+            low, high = np.where(allowed, middle, low), np.where(allowed, high, middle)
+            point = np.where(allowed, tried, point)
+        return point
 
     def _allowed(self, theta: FloatArray, start: FloatArray) -> FloatArray | None:
         """Point P at ``theta``, if it is in the machine's modes and a step from ``start``."""

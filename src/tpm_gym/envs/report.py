@@ -1,0 +1,85 @@
+"""What an environment says of a state: the same for one and for many."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tpm_gym.arrays import FloatArray
+from tpm_gym.errors import ConfigurationError
+from tpm_gym.simulation.state import State
+from tpm_gym.tasks.task import Task
+
+__all__ = ["GOAL_BOUND", "OBSERVATION_BOUND", "Observation", "goal_free", "observe", "report"]
+
+OBSERVATION_BOUND = 10.0
+GOAL_BOUND = 2.0
+
+Observation = dict[str, Any]  # arrays of float32
+
+
+def observe(task: Task, state: State, goal: FloatArray) -> Observation:
+    """The observation, for any leading batch shape."""
+    return {
+        "observation": _clip(task.observe(state), OBSERVATION_BOUND),
+        "achieved_goal": _clip(task.achieved(state), GOAL_BOUND),
+        "desired_goal": goal.astype(np.float32),
+    }
+
+
+def report(
+    task: Task, state: State, goal: FloatArray
+) -> tuple[Observation, FloatArray, dict[str, Any]]:
+    """Observation, reward (...,) and info, whose values are numbers or arrays (...,) too.
+
+    Raises:
+        ConfigurationError: If the task makes something of the state that is no number.
+    """
+    observation = observe(task, state, goal)
+    achieved, desired = observation["achieved_goal"], observation["desired_goal"]
+    terms = task.reward_terms(state, achieved, desired)
+    reward = terms["goal"] + goal_free(terms)
+    # A sum is not finite where one of its terms is not; so written it costs least.
+    if not np.isfinite(observation["observation"].sum() + achieved.sum() + np.sum(reward)):
+        raise _not_finite(task, state, achieved, terms)
+    return (
+        observation,
+        reward,
+        {
+            "is_success": task.success(achieved, desired),
+            "closure_error": state.closure_error,
+            "vacuum": state.vacuum,
+            "conditioning": state.conditioning,
+            "singularity_penalty": task.penalty(state),
+            "assembly_mode_changed": state.assembly_mode_changed,
+            "working_mode_changed": state.working_mode_changed,
+            "object_lost": task.lost(state),
+            "reward_terms": terms,
+        },
+    )
+
+
+def goal_free(terms: Mapping[str, Any]) -> Any:
+    """Sum of the reward's terms that do not depend on the goal; 0 where there is none."""
+    return sum(value for name, value in terms.items() if name != "goal")
+
+
+def _not_finite(
+    task: Task, state: State, achieved: FloatArray, terms: Mapping[str, Any]
+) -> ConfigurationError:
+    """Which of the values that a task made of a state is at fault for one that is not finite."""
+    values = {
+        **{f"observed(), {entry.name!r}": entry.source(state) for entry in task.entries},
+        "achieved()": achieved,
+        **{f"reward_terms()[{name!r}]": value for name, value in terms.items()},
+    }
+    name, value = next(item for item in values.items() if not np.isfinite(item[1]).all())
+    return ConfigurationError(name, np.asarray(value).tolist(), "finite numbers from the task")
+
+
+def _clip(values: FloatArray, bound: float) -> NDArray[np.float32]:
+    clipped: NDArray[np.float32] = np.minimum(np.maximum(values, -bound), bound).astype(np.float32)
+    return clipped

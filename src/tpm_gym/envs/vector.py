@@ -1,0 +1,359 @@
+"""Many environments at a time, in closed form, as Gymnasium's vector environments are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import ArrayLike, NDArray
+
+from tpm_gym.arrays import BoolArray, FloatArray, IntArray, finite
+from tpm_gym.envs.env import TPMEnv, action_space, observation_space
+from tpm_gym.envs.report import Observation, report
+from tpm_gym.errors import (
+    ActionError,
+    ConfigurationError,
+    EpisodeError,
+    InputError,
+    ResetOptionError,
+)
+from tpm_gym.mechanism.machine import Machine
+from tpm_gym.simulation.analytic.simulation import AnalyticSimulation
+from tpm_gym.simulation.drives import Servo, drive_of, require_servo
+from tpm_gym.simulation.randomisation import Randomisation
+from tpm_gym.simulation.settings import settings_of
+from tpm_gym.simulation.state import CONTROL_PERIOD, State
+from tpm_gym.tasks.control import make_control
+from tpm_gym.tasks.registry import make_task
+from tpm_gym.tasks.task import Task
+
+__all__ = ["TPMVectorEnv", "make_vector"]
+
+Step = tuple[Observation, FloatArray, BoolArray, BoolArray, dict[str, Any]]
+
+
+def make_vector(num_envs: int = 1, *, engine: str = "pybullet", **options: Any) -> VectorEnv:
+    """What ``gym.make_vec`` calls: closed form where that is asked for, else one after another.
+
+    Args:
+        num_envs: How many.
+        engine: ``"analytic"`` makes a :class:`TPMVectorEnv`; others are stepped in turn, by a
+            ``SyncVectorEnv``, for whose own options ``vectorization_mode="sync"`` has to be said.
+        options: Those of an environment.
+    """
+    if engine == "analytic":
+        return TPMVectorEnv(num_envs=num_envs, **options)
+    mode = options.pop("autoreset_mode", AutoresetMode.NEXT_STEP)
+    spec = _spec_of(options)
+    envs = [lambda: gym.make(spec, engine=engine, **options)] * num_envs
+    return SyncVectorEnv(envs, autoreset_mode=mode)
+
+
+def _spec_of(options: Mapping[str, Any]) -> Any:
+    """The registered spec with these task, control and reward."""
+    for spec in gym.registry.values():
+        of_id = {**spec.kwargs, "max_episode_steps": spec.max_episode_steps}
+        if spec.vector_entry_point == f"{__name__}:make_vector" and all(
+            options.get(name, value) == value for name, value in of_id.items()
+        ):
+            return spec
+    valid = "task, control, reward and max_episode_steps of a registered id"
+    raise ConfigurationError("options", dict(options), valid)
+
+
+class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
+    """So many :class:`~tpm_gym.TPMEnv`, computed at a time by the closed form of their machine.
+
+    Spaces, rewards, resets from seeds and infos are those of ``TPMEnv``, whatever their number: an
+    environment has the same bits alone or among thousands. ``closure_error`` is zero by
+    construction. Infos come as Gymnasium's vector environments have them, a mask ``_key`` beside
+    each ``key``.
+
+    Args:
+        task: See :class:`~tpm_gym.TPMEnv`, also for the other options that are not here.
+        control: See there.
+        reward: See there.
+        num_envs: How many.
+        max_episode_steps: After so many, an episode is truncated; None for never.
+        autoreset_mode: When environments whose episode ended are reset: ``NEXT_STEP``,
+            ``SAME_STEP`` (with ``final_obs`` and ``final_info`` in the infos), or ``DISABLED`` (by
+            ``reset(options={"reset_mask": ...})``).
+        stagger: Whether the first episodes after a reset of all are of different lengths, so that
+            not all end at the same step; it makes on-policy batches more even.
+        physics: A :class:`~tpm_gym.simulation.analytic.physics.Physics`, or a mapping.
+
+    Raises:
+        ConfigurationError: If an option is out of range.
+    """
+
+    def __init__(
+        self,
+        task: str | type[Task] | Task = "reach",
+        control: str = "cartesian",
+        reward: str | None = None,
+        *,
+        num_envs: int = 1,
+        max_episode_steps: int | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        stagger: bool = False,
+        machine: str | Machine | None = None,
+        goals: str | None = None,
+        penalty_weight: float | None = None,
+        drive: str | Servo | Mapping[str, Any] | None = None,
+        randomisation: Randomisation | Mapping[str, Any] | None = None,
+        physics: Any = None,
+    ) -> None:
+        """Check the options and build the robots."""
+        if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
+            raise ConfigurationError("num_envs", num_envs, "a whole number, 1 or more")
+        self.num_envs = num_envs
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.metadata = {
+            "render_modes": [],
+            "render_fps": round(1 / CONTROL_PERIOD),
+            "autoreset_mode": self.autoreset_mode,
+        }
+        self.task = make_task(
+            task, machine=machine, reward=reward, goals=goals, penalty_weight=penalty_weight
+        )
+        self.machine = self.task.machine
+        self.control = make_control(control, self.machine)
+        self.randomisation = settings_of(Randomisation, "randomisation", randomisation)
+        self.drive = drive_of(drive)
+        require_servo(
+            self.drive, self.randomisation.servo_stiffness, self.randomisation.joint_friction
+        )
+        self.single_observation_space = observation_space(self.task)
+        self.single_action_space = action_space(self.task)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.simulation = AnalyticSimulation(
+            self.task.scene,
+            count=num_envs,
+            machine=self.machine,
+            physics=physics,
+            drive=self.drive,
+        )
+        self._home = self.machine.inverse(self.machine.home)
+        self._limit, self._stagger = max_episode_steps, stagger
+        self._rngs: list[np.random.Generator] = []
+        self._goals = np.full((num_envs, self.task.goal_size), np.nan)
+        self._elapsed = np.zeros(num_envs, dtype=np.int64)
+        self._ended = np.ones(num_envs, dtype=np.bool_)  # until they are reset
+        self._pending = np.zeros((self.randomisation.latency, num_envs, self.task.action_size))
+
+    # -- the Gymnasium interface ----------------------------------------------------------------
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode in all environments, or in those of a mask.
+
+        Args:
+            seed: Of the first environment; the others' are one more each. Or one for each.
+            options: ``reset_mask``, (num_envs,) of booleans; the rest is that of
+                :meth:`TPMEnv.reset`, the same for all.
+
+        Raises:
+            InputError: If there is another number of seeds.
+            ResetOptionError: If the mask is none; and what ``TPMEnv.reset`` raises.
+            EpisodeError: If the environments are closed.
+        """
+        self._require_open()
+        chosen = dict(options or {})
+        rows = self._rows_of(chosen.pop("reset_mask", None))
+        self._seed(rows, seed)
+        infos = self._begin(rows, chosen)
+        if self._stagger and len(rows) == self.num_envs and self._limit is not None:
+            self._elapsed[:] = np.arange(self.num_envs) * self._limit // self.num_envs
+        observation, _, told = report(self.task, self.simulation.state(), self._goals)
+        return observation, {**_masked(told, rows, self.num_envs), **infos}
+
+    def _rows_of(self, mask: Any) -> IntArray:
+        if mask is None:
+            return np.arange(self.num_envs)
+        array = np.asarray(mask)
+        if array.shape != (self.num_envs,) or array.dtype != np.bool_ or not array.any():
+            valid = f"({self.num_envs},) booleans, one of them true"
+            raise ResetOptionError("reset_mask", mask, valid)
+        return np.flatnonzero(array)
+
+    def _seed(self, rows: IntArray, seed: int | Sequence[int | None] | None) -> None:
+        if seed is None or isinstance(seed, (int, np.integer)):
+            seeds = [None if seed is None else int(seed) + k for k in range(self.num_envs)]
+        else:
+            seeds = list(seed)
+        if len(seeds) != self.num_envs:
+            raise InputError("seed", len(seeds), f"one seed, or {self.num_envs}, by number")
+        if not self._rngs:
+            self._rngs = [seeding.np_random(own)[0] for own in seeds]
+            return
+        for row in rows.tolist():
+            if seeds[row] is not None:
+                self._rngs[row] = seeding.np_random(seeds[row])[0]
+
+    def _begin(self, rows: IntArray, options: dict[str, Any] | None = None) -> dict[str, Any]:
+        """Start episodes in some environments; what is to be told of their randomisation."""
+        starts, plants = [], []
+        for row in rows.tolist():
+            start = self.task.start(self._rngs[row], options)
+            plants.append(self.randomisation.draw(self._rngs[row], self.machine))
+            self._goals[row] = start.pop("goal")
+            starts.append(start)
+        self.simulation.reset(rows, self._home, starts, plants, self._draw_noise(rows))
+        self._pending[:, rows] = 0.0
+        self._elapsed[rows] = 0
+        self._ended[rows] = False
+        infos: dict[str, Any] = {}
+        if self.randomisation != Randomisation():
+            latency = {"latency": self.randomisation.latency}
+            for row, plant in zip(rows.tolist(), plants, strict=True):
+                self._add_info(infos, {"randomisation": {**plant.as_dict(), **latency}}, row)
+        return infos
+
+    def step(self, actions: NDArray[Any]) -> Step:
+        """Run one control step of 40 ms in all environments, or reset those whose episode ended.
+
+        Raises:
+            ActionError: If the actions have the wrong shape or are not finite.
+            EpisodeError: Before reset, after close, or where an episode ended and is not reset.
+            ModeChangeError: If a mechanism passed a singularity, and was not reset.
+        """
+        self._require_open()
+        shape = (self.num_envs, self.task.action_size)
+        values = np.clip(finite("actions", actions, shape, ActionError), -1.0, 1.0)
+        ended = np.flatnonzero(self._ended)
+        if len(ended) and not (self._rngs and self.autoreset_mode == AutoresetMode.NEXT_STEP):
+            row = int(ended[0])
+            raise EpisodeError(f"no episode is running in environment {row}; call reset() first")
+        running = np.flatnonzero(~self._ended) if len(ended) else np.arange(self.num_envs)
+        self._move(values, running)
+        infos = self._begin(ended) if len(ended) else {}
+        observation, reward, told = report(self.task, self.simulation.state(), self._goals)
+        self._elapsed[running] += 1
+        truncated = told["assembly_mode_changed"] | told["working_mode_changed"]
+        if self._limit is not None:
+            truncated |= self._elapsed >= self._limit
+        reward[ended] = 0.0
+        self._ended = truncated
+        infos = {**_masked(told, None, self.num_envs), **infos}
+        if self.autoreset_mode == AutoresetMode.SAME_STEP and truncated.any():
+            observation, infos = self._begin_anew(observation, infos)
+        return observation, reward, np.zeros_like(truncated), truncated.copy(), infos
+
+    def _move(self, values: FloatArray, running: IntArray) -> None:
+        """A control period with these actions, or those that come late."""
+        if len(self._pending):
+            self._pending, values = values[None], self._pending[0]
+        simulation = self.simulation
+        command = self.control.command(values[:, :3], simulation.commands)
+        vacuum = values[:, 3] > 0 if self.task.vacuum else np.zeros(self.num_envs, dtype=np.bool_)
+        simulation.move(command, vacuum, self._draw_noise(running))
+
+    def _begin_anew(
+        self, observation: Observation, infos: dict[str, Any]
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Reset what has ended; what it ended with goes into the infos."""
+        rows, n = np.flatnonzero(self._ended), self.num_envs
+        final = np.full(n, None, dtype=object)
+        for row in rows.tolist():
+            final[row] = {name: values[row].copy() for name, values in observation.items()}
+        last = {name: value for name, value in infos.items() if not name.startswith("_")}
+        told = self._begin(rows)
+        state = _take(self.simulation.state(), rows)
+        anew, _, first = report(self.task, state, self._goals[rows])
+        for name, values in anew.items():
+            observation[name][rows] = values
+        ended = np.isin(np.arange(n), rows)
+        infos = {
+            **_updated(infos, first, rows),
+            **told,
+            "final_obs": final,
+            "_final_obs": ended,
+            "final_info": _masked(last, rows, n),
+            "_final_info": ended,
+        }
+        return observation, infos
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Nothing is held beyond memory."""
+        del kwargs
+
+    # -- beyond Gymnasium -----------------------------------------------------------------------
+
+    @property
+    def state(self) -> State:
+        """What the simulation reported last, with a leading axis.
+
+        Raises:
+            EpisodeError: If there is no episode.
+        """
+        self._require_open()
+        if not self._rngs:
+            raise EpisodeError("no episode is running; call reset() first")
+        return self.simulation.state()
+
+    @property
+    def goal(self) -> FloatArray:
+        """The episodes' goals, (num_envs, goal size) m, world."""
+        return self._goals.copy()
+
+    def compute_reward(
+        self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any
+    ) -> FloatArray:
+        """See :meth:`TPMEnv.compute_reward`."""
+        return TPMEnv.compute_reward(self, achieved_goal, desired_goal, info)  # type: ignore
+
+    def _draw_noise(self, rows: IntArray) -> FloatArray | None:
+        """Errors of one reading of these environments' encoders, rad, for all."""
+        size = self.randomisation.encoder_noise
+        if size == 0:
+            return None
+        noise = np.zeros((3, self.num_envs))
+        for row in rows.tolist():
+            noise[:, row] = self._rngs[row].normal(0.0, size, 3)
+        return noise
+
+    def _require_open(self) -> None:
+        if self.closed:
+            raise EpisodeError("the environments are closed; make new ones")
+
+
+def _masked(told: Mapping[str, Any], rows: IntArray | None, count: int) -> dict[str, Any]:
+    """Values (count,) with a mask beside each: true in ``rows``, or everywhere."""
+    mask = np.ones(count, dtype=np.bool_)
+    if rows is not None:
+        mask[:] = False
+        mask[rows] = True
+    infos: dict[str, Any] = {}
+    for name, value in told.items():
+        nested = isinstance(value, Mapping)
+        infos[name] = _masked(value, rows, count) if nested else value
+        infos[f"_{name}"] = mask
+    return infos
+
+
+def _updated(infos: dict[str, Any], told: Mapping[str, Any], rows: IntArray) -> dict[str, Any]:
+    """The same infos with other values in some rows; the old arrays stay as they were."""
+    result = dict(infos)
+    for name, value in told.items():
+        if isinstance(value, Mapping):
+            result[name] = _updated(infos[name], value, rows)
+        else:
+            result[name] = infos[name].copy()
+            result[name][rows] = value
+    return result
+
+
+def _take(state: State, rows: IntArray) -> State:
+    """Some rows of a state."""
+    return State(**{field.name: getattr(state, field.name)[rows] for field in fields(State)})

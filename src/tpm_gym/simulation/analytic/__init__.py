@@ -1,0 +1,1 @@
+"""The closed form as an engine: many robots at a time, without a solver."""
