@@ -33,9 +33,10 @@ from tpm_gym.errors import (
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.display import has_display
 from tpm_gym.simulation.drives import Servo, drive_of, require_servo
+from tpm_gym.simulation.engine import SIMULATIONS
 from tpm_gym.simulation.randomisation import Randomisation
 from tpm_gym.simulation.settings import settings_of
-from tpm_gym.simulation.simulation import Simulation, Snapshot
+from tpm_gym.simulation.simulation import Simulation, Snapshot, make_simulation
 from tpm_gym.simulation.state import CONTROL_PERIOD, State
 from tpm_gym.tasks.control import make_control
 from tpm_gym.tasks.registry import make_task
@@ -165,8 +166,8 @@ class TPMEnv(gym.Env[Observation, Action]):
             task that is made has its own machine, reward, goals and penalty weight, and takes none.
         control: ``"cartesian"`` or ``"joints"``.
         reward: ``"sparse"`` (None too) or ``"dense"``.
-        engine: ``"pybullet"``, ``"mujoco"`` (with the extra of that name; it opens no window), or a
-            name that :func:`tpm_gym.register_engine` knows.
+        engine: ``"pybullet"``, ``"analytic"`` (the closed form), ``"mujoco"`` (with the extra of
+            that name; both open no window), or a name that :func:`tpm_gym.register_engine` knows.
         machine: ``"paper"`` (None too), ``"wide"``, a name that :func:`tpm_gym.register_machine`
             knows, or a :class:`~tpm_gym.Machine`; a spec that goes through JSON needs a name.
         goals: ``"sampled"`` (None too), or ``"tempting"``: the goal, and where the puck starts, lie
@@ -265,7 +266,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         self.simulation = self._start()
 
     def _start(self) -> Simulation:
-        return Simulation(
+        return make_simulation(
             self.task.scene,
             machine=self.machine,
             engine=self._engine,
@@ -327,7 +328,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         values = finite("action", action, (self.task.action_size,), ActionError)
         state = self.state
         values, *pending = (*self._pending, np.minimum(np.maximum(values, -1.0), 1.0))
-        command = self.control.command(values[:3], self.machine.mount.to_paper(state.command))
+        command = self._command(values[:3], self.machine.mount.to_paper(state.command))
         vacuum = self.task.vacuum and bool(values[3] > 0)
         self._state = None  # until the step has gone well
         try:
@@ -483,6 +484,12 @@ class TPMEnv(gym.Env[Observation, Action]):
 
     def _show_goal(self) -> None:
         self.simulation.show_goal(self.task.markers(self._goal))
+
+    def _command(self, action: FloatArray, current: FloatArray) -> FloatArray:
+        """The next command for P; where many robots are simulated, as it is computed for many."""
+        if self._engine in SIMULATIONS:
+            return self.control.command(action[None], current[None])[0]
+        return self.control.command(action, current)
 
     def _draw_noise(self) -> Vector:
         """Errors of one reading of the encoders, rad."""

@@ -212,11 +212,13 @@ class Machine(ABC):
         Raises:
             ConfigurationError: If no draw was safe.
         """
+        low, high = np.array(region.low), np.array(region.high)
         for _ in range(_ATTEMPTS):
-            point = rng.uniform(region.low, region.high)
-            conditioning = float(self.conditioning_at(point))
-            if conditioning > 0 and conditioning >= self.safe_conditioning:
-                return point
+            point = low + (high - low) * rng.random(3)
+            a, b, c = point.tolist()
+            with suppress(UnreachableError, SingularityError):
+                if self.evaluate(self.inverse((a, b, c))).conditioning >= self.safe_conditioning:
+                    return point
         valid = f"a value that some point of {region} reaches"
         raise ConfigurationError("safe_conditioning", self.safe_conditioning, valid)
 

@@ -131,6 +131,8 @@ _ENGINES: dict[str, str | Factory] = {
     "pybullet": "tpm_gym.simulation.bullet.engine:BulletEngine",
     "mujoco": "tpm_gym.simulation.mujoco.engine:MujocoEngine",
 }
+SIMULATIONS = {"analytic": "tpm_gym.simulation.analytic.single:SingleSimulation"}
+"""Engines that are a simulation of their own, of many robots at a time."""
 
 
 def register_engine(name: str, engine: str | Factory) -> None:
@@ -176,7 +178,7 @@ def make_engine(
         ConfigurationError: If there is none, or it cannot do what is asked for.
     """
     if not isinstance(name, str) or name not in _ENGINES:
-        raise ConfigurationError("engine", name, ", ".join(map(repr, _ENGINES)))
+        raise ConfigurationError("engine", name, ", ".join(map(repr, (*_ENGINES, *SIMULATIONS))))
     factory = _ENGINES[name]
     if isinstance(factory, str):
         module, _, attribute = factory.partition(":")

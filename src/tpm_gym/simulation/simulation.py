@@ -6,6 +6,7 @@ closed and modes kept, and the :class:`~tpm_gym.simulation.state.State` that tel
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -24,11 +25,11 @@ from tpm_gym.errors import (
 from tpm_gym.mechanism.machine import Machine, Mode, Reading
 from tpm_gym.mechanism.tpm import PAPER_TPM
 from tpm_gym.simulation.drives import Reference, Servo, references, require_servo
-from tpm_gym.simulation.engine import Engine, Pose, make_engine
+from tpm_gym.simulation.engine import SIMULATIONS, Engine, Pose, make_engine
 from tpm_gym.simulation.randomisation import NOMINAL, Plant
 from tpm_gym.simulation.state import CONTROL_PERIOD, Scene, State
 
-__all__ = ["Simulation", "Snapshot"]
+__all__ = ["Simulation", "Snapshot", "make_simulation"]
 
 CLOSURE_LIMIT = 0.005
 """A loop that is open by more than this is lost, m."""
@@ -55,6 +56,19 @@ class Snapshot:
     noise: tuple[Vector, Vector]
     reading: Reading
     mode_left: Mode | None
+
+
+def make_simulation(scene: Scene, *, engine: str, **options: Any) -> Simulation:
+    """The simulation with that engine; the options are those of :class:`Simulation`.
+
+    Raises:
+        ConfigurationError: If an option is out of range, or the engine cannot do it.
+    """
+    if engine not in SIMULATIONS:
+        return Simulation(scene, engine=engine, **options)
+    module, _, name = SIMULATIONS[engine].partition(":")
+    made: Simulation = getattr(importlib.import_module(module), name)(scene, **options)
+    return made
 
 
 class Simulation:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from functools import cached_property
 
 import numpy as np
 
@@ -40,7 +41,7 @@ class PickAndPlace(Task):
         """See the base class."""
         machine, offset = self.machine, hanging(self.puck)
         to_p, from_p = machine.mount.to_paper, machine.mount.to_world
-        table = self.on_table(self.puck)
+        table, _ = self._regions
         if self.goals == "tempting":
             pair = sampling.tempting(rng, machine, table, self._draw_region)
             first, last = (from_p(point) - offset for point in pair)
@@ -56,11 +57,15 @@ class PickAndPlace(Task):
 
     def _draw_region(self, rng: np.random.Generator) -> Region:
         """Where P goes with the puck: half on the table, half in the air."""
+        table, air = self._regions
+        return table if rng.random() < 0.5 else air
+
+    @cached_property
+    def _regions(self) -> tuple[Region, Region]:
+        """Of P with the puck in the cup: on the table, in the air."""
         table = self.on_table(self.puck)
-        if rng.random() < 0.5:
-            return table
         x, y, level = table.high
-        return Region(self.machine.goal_region.low, (x, y, level - sampling.APART))
+        return table, Region(self.machine.goal_region.low, (x, y, level - sampling.APART))
 
     def observed(self) -> tuple[Entry, ...]:
         """The robot, then the puck."""

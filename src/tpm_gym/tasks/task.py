@@ -9,6 +9,7 @@ and, for an expert, :meth:`~Task.plan`; then :func:`tpm_gym.register_task`.
 
 from __future__ import annotations
 
+import operator
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
@@ -30,6 +31,7 @@ from tpm_gym.tasks.motion import Motion, Move, hanging
 __all__ = ["Entry", "Task"]
 
 Values = tuple[float, ...]
+Corners = tuple[list[float], list[float]]
 
 _ZERO = (0.0, 0.0, 0.0)
 
@@ -108,6 +110,8 @@ class Task(ABC):
             raise ConfigurationError("markers", self.scene.markers, valid)
         self.machine, self.reward, self.goals = machine, reward, goals
         self._within = self._not_lost()
+        boxes = machine.occupied(machine.home)
+        self._robot = [("the robot at home", (low.tolist(), high.tolist())) for low, high in boxes]
         self._set_entries()
 
     def _set_entries(self) -> None:
@@ -233,22 +237,28 @@ class Task(ABC):
             ConfigurationError: If what the task samples lacks something, has something else, or
                 puts an object into another or into the robot.
         """
+        chosen = {} if options is None else self._chosen(options)
+        sizes = {block.name: 3 for block in self.scene.objects} | {"goal": self.goal_size}
+        start = self._sampled(rng, chosen, sizes)
+        self._check_free(start, chosen)
+        return start
+
+    def _chosen(self, options: Any) -> dict[str, FloatArray]:
+        """What the user has chosen, by name."""
         objects = self.scene.objects
         known: dict[str, tuple[int, tuple[Block | None, ...]]] = {
             **{block.name: (3, (block,)) for block in objects},
             "goal": (self.goal_size, objects or (None,)),
         }
         valid = f"a dictionary with keys among {', '.join(map(repr, known))}"
-        if not isinstance(options, Mapping) and options is not None:
+        if not isinstance(options, Mapping):
             raise ResetOptionError("options", options, valid)
         chosen: dict[str, FloatArray] = {}
-        for name, value in (options or {}).items():
+        for name, value in options.items():
             if name not in known:
                 raise ResetOptionError(str(name), value, valid)
             chosen[name] = self._within_reach(name, value, *known[name])
-        start = self._sampled(rng, chosen, {name: size for name, (size, _) in known.items()})
-        self._check_free(start, chosen)
-        return start
+        return chosen
 
     def _sampled(
         self, rng: np.random.Generator, chosen: Mapping[str, FloatArray], sizes: Mapping[str, int]
@@ -305,12 +315,11 @@ class Task(ABC):
     def _check_free(self, start: Mapping[str, FloatArray], chosen: Collection[str]) -> None:
         """Refuse objects that would start inside the robot at home, or inside another object."""
         taken = [(block.name, _box(start[block.name], block)) for block in self.scene.objects]
-        boxes = self.machine.occupied(self.machine.home) if taken else []
-        robot = [("the robot at home", box) for box in boxes]
         for name, (low, high) in taken:
-            for other, (least, most) in robot + taken:
+            for other, (least, most) in self._robot + taken:
                 mine = name in chosen or other not in chosen  # else it is found the other way round
-                if mine and other != name and (low < most).all() and (high > least).all():
+                below = all(map(operator.lt, low, most))
+                if mine and other != name and below and all(map(operator.gt, high, least)):
                     valid = f"clear of {other}, {_range(least, most)}"
                     place = start[name].tolist()
                     if name in chosen:
@@ -421,11 +430,12 @@ class Task(ABC):
         return lost
 
 
-def _range(low: FloatArray, high: FloatArray) -> str:
-    return f"{low.round(4).tolist()} to {high.round(4).tolist()} m"
+def _range(low: ArrayLike, high: ArrayLike) -> str:
+    least, most = (np.asarray(corner).round(4).tolist() for corner in (low, high))
+    return f"{least} to {most} m"
 
 
-def _box(point: FloatArray, block: Block) -> tuple[FloatArray, FloatArray]:
+def _box(point: FloatArray, block: Block) -> Corners:
     """Corners of an upright block, m; a micrometre smaller, so that touching is not overlapping."""
-    half = np.array([block.width, block.width, block.height]) / 2 - 1e-6
-    return point - half, point + half
+    (x, y, z), half, tall = point.tolist(), block.width / 2 - 1e-6, block.height / 2 - 1e-6
+    return [x - half, y - half, z - tall], [x + half, y + half, z + tall]

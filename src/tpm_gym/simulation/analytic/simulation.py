@@ -11,12 +11,14 @@ Zero by construction, and said to be so in the State: the loops' gap and the pla
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray
 from tpm_gym.errors import ConfigurationError
+from tpm_gym.mechanism.batch import Readings
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.tpm import PAPER_TPM
 from tpm_gym.simulation.analytic.physics import Physics
@@ -27,11 +29,24 @@ from tpm_gym.simulation.settings import settings_of
 from tpm_gym.simulation.simulation import spline_weights
 from tpm_gym.simulation.state import CONTROL_PERIOD, Scene, State
 
-__all__ = ["AnalyticSimulation"]
+__all__ = ["AnalyticSimulation", "Moment"]
 
 _WATCHFUL = 0.5
 """Share of a motor's torque from which on every time step is looked at."""
+_COLUMNS = (
+    "_bias", "_effort", "_theta", "_rates", "_torque", "_position", "_jacobian", "_conditioning",
+    "_truth", "_before", "_commands", "_noise", "_left",
+)  # fmt: skip
 _TURNED = np.array([[1.0], [-1.0], [-1.0]])  # free vectors between machine's frame and world
+
+
+@dataclass(frozen=True)
+class Moment:
+    """Everything that the next steps of some robots depend on."""
+
+    plants: tuple[Plant, ...]
+    columns: dict[str, FloatArray]
+    pucks: Any
 
 
 class AnalyticSimulation:
@@ -76,7 +91,11 @@ class AnalyticSimulation:
     def _set_up(self, home: tuple[float, float, float]) -> None:
         """All columns (..., n), at rest at home."""
         n = self.count
-        self._plants: list[Plant] = [NOMINAL] * n
+        self._plants = [NOMINAL] * n
+        self._start: tuple[tuple[float, ...], Readings] = (
+            (),
+            self.machine.batch(0).evaluate(np.empty((3, 0))),
+        )
         self._bias = np.zeros((3, n))
         self._effort = np.repeat(self._nominal_effort, n, axis=1)
         self._exact = True  # whether all machines are as drawn, so that P is where it shall be
@@ -109,24 +128,33 @@ class AnalyticSimulation:
             theta: (3,) rad, by the encoders.
             objects: For each of them centre (3,) m, world, of the scene's objects by name.
             plants: For each of them the true machine.
-            noise: Of the first reading of the encoders, (3, r) rad.
+            noise: Of the first reading of the encoders, (3, n) rad.
         """
         self._become(rows, plants)
         angles = np.array(theta, dtype=np.float64)[:, None]
         self._theta[:, rows] = angles - self._bias[:, rows]
         self._rates[:, rows] = self._torque[:, rows] = 0.0
         self._left[:, rows] = False
-        at = self._nominal.take(rows).evaluate(np.repeat(angles, len(rows), axis=1))
+        at = self._reading_at(tuple(theta))
         self._commands[:, :, rows] = at.position
-        self._write(rows, at)
+        self._position[:, rows], self._jacobian[:, :, rows] = at.position, at.jacobian
+        self._conditioning[rows] = at.conditioning
         truth = at.position if self._exact else self._true_position(rows)
         self._truth[:, rows] = self._before[:, rows] = truth
-        self._noise[:, :, rows] = 0.0 if noise is None else noise
+        self._noise[:, :, rows] = 0.0
         if noise is not None:
+            self._noise[:, :, rows] = noise[:, rows]
             self._read(rows)
         if self.scene.objects:
             name = self.scene.objects[0].name
             self._pucks.place(rows, np.array([one[name] for one in objects]))
+
+    def _reading_at(self, theta: tuple[float, ...]) -> Readings:
+        """What follows from angles at which episodes start: mostly the same ones."""
+        if theta != self._start[0]:
+            columns = np.array(theta, dtype=np.float64)[:, None]
+            self._start = theta, self.machine.batch(1).evaluate(columns)
+        return self._start[1]
 
     def _become(self, rows: IntArray, plants: Sequence[Plant]) -> None:
         """Make some machines those of their plants."""
@@ -224,7 +252,7 @@ class AnalyticSimulation:
         batch = self._nominal if isinstance(rows, slice) else self._nominal.take(rows)
         self._write(rows, batch.evaluate(theta))
 
-    def _write(self, rows: IntArray | slice, reading: Any) -> None:
+    def _write(self, rows: IntArray | slice, reading: Readings) -> None:
         position, jacobian, conditioning, _ = reading
         if np.isfinite(conditioning).all() and isinstance(rows, slice):
             self._position, self._jacobian, self._conditioning = position, jacobian, conditioning
@@ -261,6 +289,19 @@ class AnalyticSimulation:
             command=_rows(self._to_world(self._commands[1])),
             **self._pucks.report(),
         )
+
+    def save(self, rows: IntArray | slice = slice(None)) -> Moment:
+        """Take down everything that the next steps of some robots depend on."""
+        columns = {name: getattr(self, name)[..., rows].copy() for name in _COLUMNS}
+        plants = tuple(self._plants[row] for row in np.arange(self.count)[rows].tolist())
+        return Moment(plants, columns, self._pucks.save(rows))
+
+    def restore(self, moment: Moment, rows: IntArray | slice = slice(None)) -> None:
+        """Go back to what ``save`` returned, for as many robots."""
+        self._become(np.arange(self.count)[rows], moment.plants)
+        for name, values in moment.columns.items():
+            getattr(self, name)[..., rows] = values
+        self._pucks.restore(rows, moment.pucks)
 
     def _to_world(self, position: FloatArray) -> FloatArray:
         return self._mount + position * _TURNED
