@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
-from tpm_gym.arrays import Quaternion, Vector, rotate
+from tpm_gym.arrays import Vector, rotate
 from tpm_gym.mechanism.bodies import Joint, Link, Solid
 
 __all__ = ["CUP", "VacuumCup", "sealed"]
@@ -101,14 +102,16 @@ CUP = VacuumCup()
 
 
 def sealed(
-    lip: Vector,
-    axis: Vector,
-    position: Vector,
-    quaternion: Quaternion,
+    lip: Any,
+    axis: Any,
+    position: Any,
+    quaternion: Any,
     size: tuple[float, float],
     cup: VacuumCup = CUP,
-) -> bool:
+) -> Any:
     """Whether the whole lip lies on the top face of a square block.
+
+    Arrays (n,) in place of numbers give an array (n,).
 
     Args:
         lip: Centre of the lip, m, world.
@@ -124,6 +127,7 @@ def sealed(
     local = rotate(inverse, (lip[0] - x, lip[1] - y, lip[2] - z))
     width, height = size
     gap = local[2] - height / 2
-    covered = max(abs(local[0]), abs(local[1])) <= width / 2 - cup.radius
+    margin = width / 2 - cup.radius
+    covered = (abs(local[0]) <= margin) & (abs(local[1]) <= margin)
     aligned = -rotate(inverse, axis)[2] >= math.cos(cup.seal_tilt)
-    return abs(gap) <= cup.seal_gap and covered and aligned
+    return (abs(gap) <= cup.seal_gap) & covered & aligned

@@ -9,11 +9,16 @@ What an engine has to say: the force between cup and object, and what the lip to
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
+import numpy as np
+
+from tpm_gym.arrays import BoolArray, FloatArray
 from tpm_gym.mechanism.cup import CUP, VacuumCup
 
-__all__ = ["EMPTY", "Hold", "Load", "hold_after", "holds", "pressure_after"]
+__all__ = ["EMPTY", "Hold", "Load", "hold_after", "hold_each_after", "holds", "pressure_after"]
+
+_Numbers = TypeVar("_Numbers", float, FloatArray)
 
 
 class Hold(NamedTuple):
@@ -43,22 +48,26 @@ class Load(NamedTuple):
     shear: float = 0.0
 
 
-def pressure_after(vacuum: float, time_step: float, pumped: bool, cup: VacuumCup = CUP) -> float:
+def pressure_after(
+    vacuum: _Numbers, time_step: float, pumped: bool, cup: VacuumCup = CUP
+) -> _Numbers:
     """The vacuum (Pa) a time step (s) later; ``pumped`` where it is on and the lip is sealed."""
     final, time = (cup.vacuum, cup.evacuation_time) if pumped else (0.0, cup.venting_time)
     return final + (vacuum - final) * math.exp(-time_step / time)
 
 
-def holds(vacuum: float, load: Load, cup: VacuumCup = CUP) -> bool:
-    """Whether a seal bears a load at that vacuum (Pa).
+def holds(vacuum: Any, load: tuple[Any, Any], cup: VacuumCup = CUP) -> Any:
+    """Whether a seal bears a load (tension and shear, N) at that vacuum (Pa); arrays too.
 
     Pull and shear count together, by the length of the force. What presses the lip on the object
     is no pull, and lets the lip's friction bear some of the shear.
     """
-    pull, shear = load
-    if pull < 0:
-        pull, shear = 0.0, max(0.0, shear + cup.seal_friction * pull)
-    return math.hypot(pull, shear) <= cup.area * vacuum
+    tension, shear = load
+    pull = (tension > 0) * tension
+    slip = shear + cup.seal_friction * (tension - pull)
+    slip = (slip > 0) * slip
+    most = cup.area * vacuum
+    return pull * pull + slip * slip <= most * most
 
 
 def hold_after(
@@ -82,3 +91,21 @@ def hold_after(
     elif on and touched >= 0 and hold.vacuum <= cup.least_vacuum:
         return Hold(touched, pressure_after(hold.vacuum, time_step, True, cup))
     return Hold(-1, pressure_after(hold.vacuum, time_step, False, cup))
+
+
+def hold_each_after(
+    held: BoolArray,
+    vacuum: FloatArray,
+    time_step: float,
+    on: BoolArray,
+    load: tuple[FloatArray, FloatArray],
+    touched: BoolArray,
+    cup: VacuumCup = CUP,
+) -> tuple[BoolArray, FloatArray]:
+    """:func:`hold_after` for cups (n,) with one object each: whether it is held, and the vacuum."""
+    pumped = pressure_after(vacuum, time_step, True, cup)
+    vented = pressure_after(vacuum, time_step, False, cup)
+    sucked = np.where(on, pumped, vented)
+    keeps = held & holds(sucked, load, cup) & (on | (sucked > cup.least_vacuum))
+    after = keeps | (~held & on & touched & (vacuum <= cup.least_vacuum))
+    return after, np.where(after, sucked, vented)

@@ -1,1 +1,1 @@
-"""The closed form as an engine: many robots at a time, without a solver."""
+"""The closed form as an engine, for batches of machines."""

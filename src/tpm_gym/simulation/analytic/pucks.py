@@ -1,37 +1,365 @@
-"""STUB."""
+"""Objects on tables, cups above them, and the vacuum between, for many machines at once.
+
+The law of contact is PyBullet's, which the numbers of this module are taken from: velocities first,
+then positions; no restitution; what has gone into something comes out by a share of its depth in
+each time step.
+
+Arrays have components first and rows last. Rows that nothing happens to cost nothing, those that
+are carried freely are computed for all time steps at once, the others step by step. All of it is
+elementwise, so that a row has the same bits alone and among others.
+"""
+
+from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 
+from tpm_gym.arrays import BoolArray, FloatArray, IntArray
+from tpm_gym.mechanism.cup import CUP, sealed
+from tpm_gym.mechanism.mount import GRAVITY
+from tpm_gym.simulation.stage import FLOOR, TABLE
+from tpm_gym.simulation.state import Block
+from tpm_gym.simulation.vacuum import hold_each_after, holds, pressure_after
+
+__all__ = ["Pucks"]
+
+_RECOVERY = 0.08  # share of a penetration that a time step takes out
+_SLOP = 1e-5  # m; a penetration that stays
+_SEEN = 2e-4  # m; contacts at this distance keep from going deeper than to touch
+_SPRING = 0.8  # share of the cup's way back that a time step leaves of it
+_SEAT = 2e-5  # m; distance of lip and face in a seal
+_SETTLED = 1e-6  # m, and m/s: less is none
+_SHALLOW = 2e-4  # m; what stands and is no deeper is at rest
+_NEAR = 0.005  # m; around what the lip may touch
+
+_CUP_MASS = CUP.link("platform", (0.0, 0.0, 0.0)).mass
+_DOWN = (0.0, 0.0, -1.0)
+
+# Rows of the table of numbers
+_POSITION, _VELOCITY, _TURN = slice(0, 3), slice(3, 6), slice(6, 10)
+_SPIN, _GRIP, _SLIDE, _VACUUM = slice(10, 13), slice(13, 16), 16, 17
+_COLUMNS = 18
+
 
 class Pucks:
-    def __init__(self, block, count, step, table):
-        self.block, self.n = block, count
-        self.p = np.zeros((3, count))
+    """One object on each of n robots' tables, and the vacuum in each cup.
 
-    def alter(self, rows, m, f):
-        pass
+    Args:
+        block: What the objects are; None for none.
+        count: n.
+        time_step: s.
+        table: Half edges of the tables along x and y, m.
+    """
 
-    def place(self, rows, positions):
-        self.p[:, rows] = positions.T
+    def __init__(
+        self,
+        block: Block | None,
+        count: int,
+        time_step: float,
+        table: tuple[float, float] = (np.inf, np.inf),
+    ) -> None:
+        """Objects in the middle of their tables."""
+        self._block, self._time_step, self._table = block, time_step, table
+        self._numbers = np.arange(count)
+        self._state = np.zeros((_COLUMNS, count))
+        self._held = np.zeros(count, dtype=bool)
+        self._still = np.zeros(count, dtype=bool)
+        self._mass = np.full(count, block.mass if block else 0.0)
+        self._rough = np.full(count, block.friction if block else 0.0)
+        if block is not None:
+            middle = np.zeros((count, 3)) + (0.0, 0.0, block.height / 2)
+            self.place(slice(None), middle)
 
-    def advance(self, rows, path, on):
-        return np.zeros((path.shape[0] - 2, 3, path.shape[2]))
+    def alter(
+        self, rows: slice | IntArray, mass_factor: FloatArray, friction_factor: FloatArray
+    ) -> None:
+        """Make objects (r,) times as heavy and as rough as nominal."""
+        if self._block is not None:
+            self._mass[rows] = self._block.mass * mass_factor
+            self._rough[rows] = self._block.friction * friction_factor
 
-    def report(self):
-        n = self.n
-        k = 1 if self.block else 0
-        return dict(
-            object_position=np.ascontiguousarray(self.p.T)[:, None][:, :k],
-            object_quaternion=np.tile([0, 0, 0, 1.0], (n, k, 1)),
-            object_axis=np.tile([0, 0, 1.0], (n, k, 1)),
-            object_velocity=np.zeros((n, k, 3)),
-            object_angular_velocity=np.zeros((n, k, 3)),
-            held=np.full(n, -1),
-            vacuum=np.zeros(n),
+    def place(self, rows: slice | IntArray, positions: FloatArray) -> None:
+        """Let go, empty the cups, and put objects upright and at rest.
+
+        Args:
+            rows: Which.
+            positions: (r, 3) m, world, of their centres.
+        """
+        self._state[:, rows] = 0.0
+        self._state[_POSITION, rows] = np.asarray(positions).T
+        self._state[_TURN.stop - 1, rows] = 1.0
+        self._held[rows] = self._still[rows] = False
+
+    def advance(self, rows: slice | IntArray, path: FloatArray, on: BoolArray) -> FloatArray:
+        """Run K time steps.
+
+        Args:
+            rows: r of the machines.
+            path: (K + 2, 3, r) m, world: point P before the last time step, now, and after each
+                time step to come.
+            on: (r,) whether the vacuum is on.
+
+        Returns:
+            (K, 3, r) N, world: what cup and object do to the platform in each time step, beside
+            the weight and inertia of the cup at rest in it.
+        """
+        force = np.zeros((len(path) - 2, *path.shape[1:]))
+        if self._block is None:
+            return force
+        number = self._numbers[rows]
+        held = self._held[rows]
+        awake = ~self._still[rows] | (self._state[_VACUUM, rows] > 0) | held
+        busy = awake | self._reached(rows, path)
+        carried = np.flatnonzero(held)
+        if len(carried):
+            which = number[carried]
+            done = self._carry(which, path, on, carried, force)
+            busy[carried[done]] = False
+        loose = np.flatnonzero(busy)
+        if len(loose):
+            force[:, :, loose] = self._run(number[loose], path[:, :, loose], on[loose])
+        return force
+
+    def report(self) -> dict[str, Any]:
+        """The entries of a :class:`~tpm_gym.simulation.state.State` about objects, rows first."""
+        some = self._block is not None
+        count = len(self._numbers)
+
+        def rows(part: slice) -> FloatArray:
+            columns = self._state[part].T
+            return columns[:, None, :].copy() if some else np.empty((count, 0, columns.shape[1]))
+
+        turn = self._state[_TURN]
+        axis = _axis(turn).T[:, None, :].copy() if some else np.empty((count, 0, 3))
+        return {
+            "object_position": rows(_POSITION),
+            "object_quaternion": rows(_TURN),
+            "object_axis": axis,
+            "object_velocity": rows(_VELOCITY),
+            "object_angular_velocity": rows(_SPIN),
+            "held": np.where(self._held, 0, -1),
+            "vacuum": self._state[_VACUUM].copy(),
+        }
+
+    def save(self, rows: slice | IntArray) -> Any:
+        """Take down everything that the next steps of rows depend on."""
+        parts = (self._state, self._held, self._still, self._mass, self._rough)
+        return tuple(part[..., rows].copy() for part in parts)
+
+    def restore(self, rows: slice | IntArray, data: Any) -> None:
+        """Go back to what :meth:`save` returned."""
+        parts = (self._state, self._held, self._still, self._mass, self._rough)
+        for part, saved in zip(parts, data, strict=True):
+            part[..., rows] = saved
+
+    # -- which rows ---------------------------------------------------------------------------
+
+    def _reached(self, rows: slice | IntArray, path: FloatArray) -> BoolArray:
+        """(r,) whether the lip may come to touch the object."""
+        assert self._block is not None
+        width, height = self._block.width, self._block.height
+        x, y, z = self._state[_POSITION, rows]
+        size = np.hypot(np.hypot(width, width), height) / 2
+        lowest = path[1:, 2].min(axis=0) - CUP.length
+        reached: BoolArray = lowest < z + size + _NEAR
+        some = np.flatnonzero(reached)
+        if len(some):
+            near = size + CUP.radius + _NEAR
+            for place, along in ((x, path[1:, 0]), (y, path[1:, 1])):
+                way, middle = along[:, some], place[some]
+                meets = (way.min(axis=0) < middle + near) & (way.max(axis=0) > middle - near)
+                reached[some] &= meets
+        return reached
+
+    # -- carried through the air, all time steps at once -----------------------------------------
+
+    def _carry(
+        self,
+        which: IntArray,
+        path: FloatArray,
+        on: BoolArray,
+        columns: IntArray,
+        force: FloatArray,
+    ) -> BoolArray:
+        """Move what is held and stays so, clear of the table; whether that was so."""
+        assert self._block is not None
+        step, state = self._time_step, self._state[:, which]
+        way = path[:, :, columns]
+        moved = np.diff(way, axis=0) / step
+        jerked = np.diff(moved, axis=0) / step
+        jerked[:, 2] += GRAVITY
+        load = self._mass[which] * jerked
+        vacuum = state[_VACUUM]
+        safe = on[columns] & (state[_SLIDE] == 0.0)
+        grip = state[_GRIP]
+        lowest = way[2:, 2].min(axis=0) + grip[2] - self._block.height / 2
+        safe &= lowest > _SEEN
+        # The first force is that of the object's own velocity, which a new seal has to change.
+        safe &= (np.abs(state[_VELOCITY] - moved[0]) < 1e-9).all(axis=0)
+        for one in load:
+            vacuum = pressure_after(vacuum, step, True)
+            safe &= holds(vacuum, (one[2], np.sqrt(one[0] * one[0] + one[1] * one[1])))
+        kept = which[safe]
+        self._state[_POSITION, kept] = (way[-1] + grip)[:, safe]
+        self._state[_VELOCITY, kept] = moved[-1][:, safe]
+        self._state[_VACUUM, kept] = vacuum[safe]
+        force[:, :, columns[safe]] = -load[:, :, safe]
+        return safe
+
+    # -- everything else, step by step ---------------------------------------------------------
+
+    def _run(self, which: IntArray, path: FloatArray, on: BoolArray) -> FloatArray:
+        """The time steps of some machines (r,), one by one; the force (K, 3, r)."""
+        state, held = self._state[:, which], self._held[which]
+        mass, rough = self._mass[which], self._rough[which]
+        still = np.zeros(len(which), dtype=bool)
+        force = np.zeros((len(path) - 2, *path.shape[1:]))
+        for k, step_force in enumerate(force):
+            load = np.zeros((2, len(which)))
+            fixed, free = np.flatnonzero(held), np.flatnonzero(~held)
+            points = path[k : k + 3]
+            if len(fixed):
+                part = state[:, fixed]
+                step_force[:, fixed], load[:, fixed] = self._move_held(
+                    part, points[:, :, fixed], mass[fixed], rough[fixed]
+                )
+                state[:, fixed] = part
+            if len(free):
+                part = state[:, free]
+                step_force[:, free], still[free] = self._move_free(
+                    part, points[:, :, free], mass[free], rough[free]
+                )
+                state[:, free] = part
+            held = self._hold(state, held, path[k + 2], on, load)
+            still &= ~held
+        self._state[:, which], self._held[which], self._still[which] = state, held, still
+        return force
+
+    def _move_held(
+        self, state: FloatArray, path: FloatArray, mass: FloatArray, rough: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """A time step of objects in the cup; the force (3, r) and the seal's load (2, r)."""
+        assert self._block is not None
+        step = self._time_step
+        position, slide = state[_POSITION], _SPRING * state[_SLIDE]
+        there = path[2] + state[_GRIP]
+        there[2] += slide
+        least = position[2] + _least_rise(self._gap(position))
+        pushed = np.maximum(least - there[2], 0.0)
+        there[2] += pushed
+        slide = slide + pushed
+        velocity = (there - position) / step
+        total = (velocity - state[_VELOCITY]) / step
+        total[2] += GRAVITY
+        seal = mass * total
+        pressed = pushed > 0
+        spring = CUP.preload + _CUP_MASS * total[2]
+        normal = pressed * np.maximum(spring + seal[2], 0.0)
+        speed = np.sqrt(velocity[0] * velocity[0] + velocity[1] * velocity[1])
+        seal[:2] += rough * normal * velocity[:2] / np.maximum(speed, _SETTLED)
+        seal[2] -= normal
+        force = -seal
+        lift = path[2, 2] - 2 * path[1, 2] + path[0, 2]
+        cup = CUP.preload + _CUP_MASS * (GRAVITY + lift / (step * step))
+        force[2] = np.where(pressed, cup, force[2])
+        state[_POSITION], state[_VELOCITY], state[_SPIN] = there, velocity, 0.0
+        state[_SLIDE] = np.where(slide < _SETTLED, 0.0, slide)
+        return force, np.stack([seal[2], np.sqrt(seal[0] * seal[0] + seal[1] * seal[1])])
+
+    def _move_free(
+        self, state: FloatArray, path: FloatArray, mass: FloatArray, rough: FloatArray
+    ) -> tuple[FloatArray, BoolArray]:
+        """A time step of objects that nothing holds; the force (3, r), and which lie still."""
+        assert self._block is not None
+        step, half = self._time_step, self._block.height / 2
+        position, velocity = state[_POSITION], state[_VELOCITY]
+        least = _least_rise(self._gap(position)) / step
+        falling = velocity[2] - GRAVITY * step
+        rising = np.maximum(falling, least)
+        # The lip: it pushes down what floats, and gives way to what stands.
+        slide = state[_SLIDE]
+        lip, lip_after = path[1, 2] + slide, path[2, 2] + _SPRING * slide
+        above = lip - CUP.length - position[2] - half
+        over = self._below(state, path[1])
+        apart = _least_rise(above) - (lip_after - lip) + rising * step
+        excess = np.where(over, np.maximum(apart, 0.0), 0.0)
+        pushed = np.maximum(rising - excess / step, least)
+        slid = excess - (rising - pushed) * step
+        slide = _SPRING * slide + slid
+        pressed = slid > 0
+        lift = path[2, 2] - 2 * path[1, 2] + path[0, 2]
+        cup = CUP.preload + _CUP_MASS * (GRAVITY + lift / (step * step))
+        force = np.zeros_like(position)
+        force[2] = np.where(pressed, cup, mass * (rising - pushed) / step)
+        # Friction on the table, at most what stops it.
+        normal = rising - falling + pressed * CUP.preload * step / mass
+        speed = np.sqrt(velocity[0] * velocity[0] + velocity[1] * velocity[1])
+        left = np.maximum(speed - rough * normal, 0.0) / np.maximum(speed, _SETTLED)
+        velocity[:2] *= left
+        velocity[2] = pushed
+        position += velocity * step
+        state[_SLIDE] = np.where(slide < _SETTLED, 0.0, slide)
+        gap = self._gap(position)
+        rests = (rising > falling) & (speed == 0.0) & (excess == 0.0) & (state[_SLIDE] == 0.0)
+        rests &= (gap > -_SHALLOW) & (gap <= 0)
+        position[2] = np.where(rests, position[2] - gap - _SLOP, position[2])
+        velocity[2] = np.where(rests, 0.0, velocity[2])
+        return force, rests
+
+    def _gap(self, position: FloatArray) -> FloatArray:
+        """Height of the bottom face over what is below, m."""
+        assert self._block is not None
+        edge_x, edge_y = self._table
+        over = (np.abs(position[0]) <= edge_x) & (np.abs(position[1]) <= edge_y)
+        level: FloatArray = np.where(over, TABLE.top, FLOOR.top)
+        gap: FloatArray = position[2] - self._block.height / 2 - level
+        return gap
+
+    def _below(self, state: FloatArray, point: FloatArray) -> BoolArray:
+        """Whether a lip below ``point`` (3, r) is over the top face, or part of it is."""
+        assert self._block is not None
+        half = self._block.width / 2
+        away = np.abs(point[:2] - state[:2])
+        outside = np.maximum(away - half, 0.0)
+        below: BoolArray = outside[0] * outside[0] + outside[1] * outside[1] < CUP.radius**2
+        return below
+
+    def _hold(
+        self,
+        state: FloatArray,
+        held: BoolArray,
+        point: FloatArray,
+        on: BoolArray,
+        load: FloatArray,
+    ) -> BoolArray:
+        """Hold on, drop, or take what the lip lies on, after a time step; what is held now."""
+        assert self._block is not None
+        size = (self._block.width, self._block.height)
+        position, slide = state[_POSITION], state[_SLIDE]
+        lip = (point[0], point[1], point[2] + slide - CUP.length)
+        touched: BoolArray = sealed(lip, _DOWN, position, state[_TURN], size)
+        after, state[_VACUUM] = hold_each_after(
+            held, state[_VACUUM], self._time_step, on, (load[0], load[1]), touched
         )
+        state[_VACUUM] = np.where(state[_VACUUM] < 1e-3, 0.0, state[_VACUUM])
+        taken = np.flatnonzero(after & ~held)
+        if len(taken):
+            grip = position[:, taken] - point[:, taken]
+            above = lip[2][taken] - position[2, taken] - size[1] / 2
+            grip[2] -= slide[taken] + np.maximum(_SEAT - above, 0.0)
+            state[_GRIP, taken] = grip
+        return after
 
-    def save(self, rows):
-        return self.p[:, rows].copy()
 
-    def restore(self, rows, data):
-        self.p[:, rows] = data
+def _least_rise(gap: FloatArray) -> FloatArray:
+    """How far a contact at a distance (m) must open at least in a time step, m."""
+    out = _RECOVERY * np.maximum(-gap - _SLOP, 0.0)
+    return np.where(gap > 0, np.where(gap < _SEEN, -gap, -np.inf), out)
+
+
+def _axis(turn: FloatArray) -> FloatArray:
+    """The block's own z axis (3, r) in the world."""
+    x, y, z, w = turn
+    axis: FloatArray = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
+    return axis
