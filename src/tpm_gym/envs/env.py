@@ -488,7 +488,8 @@ class TPMEnv(gym.Env[Observation, Action]):
     def _command(self, action: FloatArray, current: FloatArray) -> FloatArray:
         """The next command for P; where many robots are simulated, as it is computed for many."""
         if self._engine in SIMULATIONS:
-            return self.control.command(action[None], current[None])[0]
+            (command,) = self.control.command(action[None], current[None])
+            return np.asarray(command)
         return self.control.command(action, current)
 
     def _draw_noise(self) -> Vector:

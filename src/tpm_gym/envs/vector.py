@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from typing import Any
 
 import gymnasium as gym
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray, finite
 from tpm_gym.envs.env import TPMEnv, action_space, observation_space
-from tpm_gym.envs.report import Observation, report
+from tpm_gym.envs.report import Observation, observe, report
 from tpm_gym.errors import (
     ActionError,
     ConfigurationError,
@@ -24,7 +24,7 @@ from tpm_gym.errors import (
     ResetOptionError,
 )
 from tpm_gym.mechanism.machine import Machine
-from tpm_gym.simulation.analytic.simulation import AnalyticSimulation
+from tpm_gym.simulation.analytic.simulation import AnalyticSimulation, Moment
 from tpm_gym.simulation.drives import Servo, drive_of, require_servo
 from tpm_gym.simulation.randomisation import Randomisation
 from tpm_gym.simulation.settings import settings_of
@@ -33,7 +33,7 @@ from tpm_gym.tasks.control import make_control
 from tpm_gym.tasks.registry import make_task
 from tpm_gym.tasks.task import Task
 
-__all__ = ["TPMVectorEnv", "make_vector"]
+__all__ = ["TPMVectorEnv", "VectorSnapshot", "make_vector"]
 
 Step = tuple[Observation, FloatArray, BoolArray, BoolArray, dict[str, Any]]
 
@@ -65,6 +65,18 @@ def _spec_of(options: Mapping[str, Any]) -> Any:
             return spec
     valid = "task, control, reward and max_episode_steps of a registered id"
     raise ConfigurationError("options", dict(options), valid)
+
+
+@dataclass(frozen=True)
+class VectorSnapshot:
+    """Everything that the next steps of vector environments depend on."""
+
+    simulation: Moment
+    rngs: list[dict[str, Any]]
+    goals: FloatArray
+    elapsed: IntArray
+    ended: BoolArray
+    pending: FloatArray
 
 
 class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
@@ -305,13 +317,43 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
     @property
     def goal(self) -> FloatArray:
         """The episodes' goals, (num_envs, goal size) m, world."""
-        return self._goals.copy()
+        return np.array(self._goals)
 
     def compute_reward(
         self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any
     ) -> FloatArray:
         """See :meth:`TPMEnv.compute_reward`."""
         return TPMEnv.compute_reward(self, achieved_goal, desired_goal, info)  # type: ignore
+
+    def save_state(self) -> VectorSnapshot:
+        """Take down everything that the next steps depend on.
+
+        Raises:
+            EpisodeError: If there is no episode.
+        """
+        _ = self.state  # there has to be an episode
+        return VectorSnapshot(
+            self.simulation.save(),
+            [dict(rng.bit_generator.state) for rng in self._rngs],
+            *(values.copy() for values in (self._goals, self._elapsed, self._ended, self._pending)),
+        )
+
+    def restore_state(self, snapshot: VectorSnapshot) -> Observation:
+        """Go back to a moment that :meth:`save_state` took down, of as many and equal environments.
+
+        Returns:
+            The observation at that moment.
+        """
+        self._require_open()
+        self.simulation.restore(snapshot.simulation)
+        self._seed(np.arange(self.num_envs), None)
+        for rng, state in zip(self._rngs, snapshot.rngs, strict=True):
+            rng.bit_generator.state = state
+        self._goals, self._elapsed, self._ended, self._pending = (
+            values.copy()
+            for values in (snapshot.goals, snapshot.elapsed, snapshot.ended, snapshot.pending)
+        )
+        return observe(self.task, self.simulation.state(), self._goals)
 
     def _draw_noise(self, rows: IntArray) -> FloatArray | None:
         """Errors of one reading of these environments' encoders, rad, for all."""

@@ -16,13 +16,14 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
+from tpm_gym.envs.vector import TPMVectorEnv
 from tpm_gym.learning.checkpoint import CheckpointStore, Content
 from tpm_gym.learning.configuration import TrainingConfig
 from tpm_gym.learning.errors import CheckpointError
 from tpm_gym.learning.estimates import Estimate
 from tpm_gym.learning.policies import TrainedPolicy
 from tpm_gym.learning.report.figures import draw_learning_curve
-from tpm_gym.learning.rollout import SELECTION_SEED, GoalEnv, run_episodes, summarise
+from tpm_gym.learning.rollout import SELECTION_SEED, GoalEnv, run_batch, run_episodes, summarise
 from tpm_gym.learning.run_folder import CURVE_FILE, EVALUATIONS_FILE
 from tpm_gym.learning.training_state import capture
 
@@ -45,7 +46,7 @@ class PeriodicEvaluation(BaseCallback):
     def __init__(
         self,
         config: TrainingConfig,
-        env: GoalEnv,
+        env: GoalEnv | TPMVectorEnv,
         console: Console,
         keep: Callable[[BaseAlgorithm], object],
     ) -> None:
@@ -83,7 +84,11 @@ class PeriodicEvaluation(BaseCallback):
 
     def _evaluate(self) -> None:
         policy = TrainedPolicy(self.model)
-        records = run_episodes(self._env, policy, self._config.eval_episodes, SELECTION_SEED)
+        episodes = self._config.eval_episodes
+        if isinstance(self._env, TPMVectorEnv):
+            records = run_batch(self._env, policy, episodes, SELECTION_SEED)
+        else:
+            records = run_episodes(self._env, policy, episodes, SELECTION_SEED)
         metrics = summarise(records)
         self._record(metrics)
         quality = (metrics["success_at_end"].mean, metrics["return"].mean)

@@ -43,7 +43,8 @@ class EnvOptions:
     trained with is not known of it: evaluate asks again."""
 
     engine: Annotated[str, unset(str, "the id's own, mostly pybullet", "NAME")] = UNSET
-    """Engine: pybullet, or one that the module of --env module:id registers."""
+    """Engine: pybullet, analytic (the closed form, many environments at a time), mujoco, or one
+    that the module of --env module:id registers."""
 
     drive: Annotated[
         str, unset(Literal["ideal", "servo"], "the id's own, mostly ideal", "{ideal,servo}")
@@ -98,6 +99,9 @@ class TrainingConfig:
     eval_episodes: int = 20
     """Episodes per evaluation."""
 
+    test_episodes: int = 100
+    """Episodes of the test in PyBullet with which a training in --engine analytic ends; 0: none."""
+
     checkpoint_every: Annotated[int | None, unset(int, "by time", "INT")] = None
     """Steps between checkpoints. By time means every half minute, or less often where that would
     take more than 2% of the time."""
@@ -110,6 +114,11 @@ class TrainingConfig:
 
     overwrite: bool = False
     """Replace an earlier run in the same folder."""
+
+    @property
+    def in_batches(self) -> bool:
+        """Whether many environments are computed at a time."""
+        return self.env_options.engine == "analytic"
 
     @property
     def title(self) -> str:
@@ -155,7 +164,7 @@ def complete(config: TrainingConfig) -> TrainingConfig:
         ConfigError: An option, the recipe, or a combination of options is not valid.
     """
     check_env_id(config.env)
-    shipped = recipe_file(config.algo)
+    shipped = recipe_file(config.algo, config.env_options.engine)
     file = shipped if config.recipe_file is UNSET else config.recipe_file
     recipe = read_recipe(file, config.algo, config.env)
     steps = recipe.n_timesteps if config.steps is UNSET else config.steps
@@ -236,6 +245,7 @@ def check_least(config: Any, least: int, *names: str) -> None:
 def _check(config: TrainingConfig) -> None:
     counts = ("steps", "envs", "eval_every", "eval_episodes", "checkpoint_every", "threads")
     check_least(config, 1, *counts)
+    check_least(config, 0, "test_episodes")
     highest = SELECTION_SEED - config.envs
     if not 0 <= config.seed <= highest:
         held_out = f"seeds from {SELECTION_SEED} up are held out"

@@ -9,6 +9,7 @@ from gymnasium.envs.registration import EnvSpec, load_env_creator
 
 from tpm_gym.envs.env import TPMEnv
 from tpm_gym.envs.registration import env_ids
+from tpm_gym.envs.vector import TPMVectorEnv
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.rollout import GoalEnv
 
@@ -64,3 +65,10 @@ def make_env(env: str | EnvSpec, *, in_worker: bool = False, **options: Any) -> 
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_IGN)
     return gym.make(env, **options)
+
+
+def make_envs(env: str | EnvSpec, count: int, **options: Any) -> TPMVectorEnv:
+    """Make so many environments in closed form; options are as for :func:`make_env`."""
+    envs = gym.make_vec(env, num_envs=count, **options)
+    assert isinstance(envs, TPMVectorEnv)
+    return envs

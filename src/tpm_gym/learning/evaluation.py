@@ -13,14 +13,24 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from tpm_gym.envs.vector import TPMVectorEnv
 from tpm_gym.learning import provenance
 from tpm_gym.learning.configuration import UNSET, EnvOptions, check_least, shown_default, unset
-from tpm_gym.learning.environments import check_env_id, make_env
+from tpm_gym.learning.environments import check_env_id, make_env, make_envs
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.estimates import Estimate
 from tpm_gym.learning.film import write_contact_sheet, write_video
-from tpm_gym.learning.policies import load_policy, trained_env
-from tpm_gym.learning.rollout import TEST_SEED, Episode, GoalEnv, Policy, run_episodes, summarise
+from tpm_gym.learning.policies import TrainedPolicy, load_policy, trained_env
+from tpm_gym.learning.rollout import (
+    BATCH,
+    TEST_SEED,
+    Episode,
+    GoalEnv,
+    Policy,
+    run_batch,
+    run_episodes,
+    summarise,
+)
 
 # Label, key, factor and format of each row of the table.
 _ROWS = (
@@ -176,6 +186,13 @@ def _make_env(env_id: str, config: EvaluationConfig, render_mode: str | None = N
     )
 
 
+def _make_batch(env: GoalEnv, config: EvaluationConfig) -> TPMVectorEnv:
+    """As many environments like this one as are worth running at a time."""
+    assert env.spec is not None
+    options = {k: v for k, v in env.spec.kwargs.items() if k != "render_mode"}
+    return make_envs(env.spec.id, min(config.episodes, BATCH), **options)
+
+
 def parse_randomisation(entries: Sequence[str]) -> dict[str, Any]:
     """Return words such as ``friction=0.5:1`` as a mapping; tpm_gym checks keys and values.
 
@@ -209,9 +226,13 @@ def _evaluate_one(
     start = time.perf_counter()
     with Progress(console=console, disable=hidden) as bar:
         task = bar.add_task(spec, total=config.episodes)
-        records = run_episodes(
-            env, policy, config.episodes, config.seed, on_episode=lambda: bar.advance(task)
-        )
+        if config.env_options.engine == "analytic" and isinstance(policy, TrainedPolicy):
+            with closing(_make_batch(env, config)) as envs:
+                records = run_batch(envs, policy, config.episodes, config.seed)
+        else:
+            records = run_episodes(
+                env, policy, config.episodes, config.seed, on_episode=lambda: bar.advance(task)
+            )
         wall_seconds = time.perf_counter() - start
     return Result(spec, summarise(records), records, wall_seconds)
 

@@ -63,11 +63,12 @@ def recipe(env_id: str, algorithm: str = "sac") -> dict[str, Any]:
     return read_recipe(recipe_file(algorithm), algorithm, env_id).keywords()
 
 
-def recipe_file(algorithm: str) -> Path:
-    """Return the shipped recipes of an algorithm, if there is such an algorithm."""
+def recipe_file(algorithm: str, engine: str | None = None) -> Path:
+    """Return the shipped recipes of an algorithm, for an engine if that has some of its own."""
     if algorithm not in ALGORITHMS:
         raise ConfigError(f"algorithm {algorithm!r} is none of {NAMES}")
-    return RECIPES / f"{algorithm}.yml"
+    own = RECIPES / f"{algorithm}-{engine}.yml"
+    return own if own.is_file() else RECIPES / f"{algorithm}.yml"
 
 
 def with_classes(entries: Mapping[str, Any]) -> dict[str, Any]:

@@ -8,10 +8,12 @@ trained on or was selected by:
 - from ``TEST_SEED``: ``tpm-gym evaluate``.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeAlias
 
 import gymnasium as gym
 import numpy as np
@@ -19,9 +21,16 @@ from numpy.typing import NDArray
 
 from tpm_gym.learning.errors import RolloutError
 from tpm_gym.learning.estimates import Estimate, bootstrap, wilson
+from tpm_gym.simulation.state import State
+
+if TYPE_CHECKING:
+    from tpm_gym.envs.vector import TPMVectorEnv
+    from tpm_gym.learning.policies import TrainedPolicy
 
 SELECTION_SEED: Final = 1_000_000
 TEST_SEED: Final = 2_000_000
+BATCH: Final = 1000
+"""Environments that are evaluated at a time, where they can be."""
 
 Observation: TypeAlias = dict[str, NDArray[Any]]
 Action: TypeAlias = NDArray[Any]
@@ -114,55 +123,88 @@ def _run_episode(
     policy.reset(observation, seed)
     if on_frame is not None:
         on_frame()
-    rewards: list[float] = []
-    infos: list[Mapping[str, Any]] = []
-    states: list[Any] = []
+    steps: list[dict[str, Any]] = []
     inner: Any = env.unwrapped
     done = False
     while not done:
         observation, reward, terminated, truncated, info = env.step(policy.act(observation))
         done = terminated or truncated
-        rewards.append(float(reward))
-        infos.append(info)
-        states.append(inner.state)
+        steps.append(_measured(reward, info, inner.state))
         if on_frame is not None:
             on_frame()
-    return _record(seed, rewards, infos, states)
+    return _record(seed, {name: np.array([step[name] for step in steps]) for name in steps[0]})
 
 
-def _record(
-    seed: int, rewards: list[float], infos: Sequence[Mapping[str, Any]], states: Sequence[Any]
-) -> Episode:
-    conditioning = [float(info["conditioning"]) for info in infos]
-    closure = [float(info["closure_error"]) for info in infos]
-    successes = [bool(info["is_success"]) for info in infos]
-    gaps = np.array([state.fk_position - state.platform_position for state in states])  # (n, 3) m
-    fk_errors: list[float] = np.linalg.norm(gaps, axis=-1).tolist()
-    torques: list[float] = np.ravel([state.torque for state in states]).tolist()  # (3 n,) N m
-    named = {
-        "reward": rewards,
-        "conditioning": conditioning,
-        "closure_error": closure,
-        "fk_error": fk_errors,
-        "torque": torques,
+def run_batch(
+    envs: TPMVectorEnv, policy: TrainedPolicy, episodes: int, first_seed: int
+) -> list[Episode]:
+    """The same for many environments at a time, and a policy that takes batches.
+
+    Args:
+        envs: As many as run at a time, with next-step autoreset; left open.
+
+    Raises:
+        RolloutError: As for :func:`run_episodes`.
+    """
+    records = []
+    for first in range(first_seed, first_seed + episodes, envs.num_envs):
+        count = min(envs.num_envs, first_seed + episodes - first)
+        records += _run_batch(envs, policy, first, count)
+    return records
+
+
+def _run_batch(
+    envs: TPMVectorEnv, policy: TrainedPolicy, first_seed: int, count: int
+) -> list[Episode]:
+    observation, _ = envs.reset(seed=first_seed)
+    steps: list[dict[str, Any]] = []
+    lengths = np.zeros(envs.num_envs, dtype=np.int64)
+    running = np.ones(envs.num_envs, dtype=np.bool_)
+    while running[:count].any():
+        observation, reward, _, truncated, info = envs.step(policy.act(observation))
+        steps.append(_measured(reward, info, envs.state))
+        lengths += running
+        running &= ~truncated
+    table = {name: np.array([step[name] for step in steps]) for name in steps[0]}
+    return [
+        _record(first_seed + k, {name: values[: lengths[k], k] for name, values in table.items()})
+        for k in range(count)
+    ]
+
+
+def _measured(reward: Any, info: Mapping[str, Any], state: State) -> dict[str, Any]:
+    """What an episode is judged by, of one step, with the leading axes of the state."""
+    gap = state.fk_position - state.platform_position
+    told = ("conditioning", "closure_error", "is_success", "singularity_penalty")
+    return {
+        "reward": reward,
+        **{name: info[name] for name in told},
+        "fk_error": np.sqrt((gap * gap).sum(axis=-1)),
+        "torque": state.torque,
     }
-    for name, values in named.items():
-        for step, value in enumerate(values):
+
+
+def _record(seed: int, steps: Mapping[str, NDArray[Any]]) -> Episode:
+    """Condense an episode from its steps' values (n, ...)."""
+    for name, values in steps.items():
+        if not np.isfinite(values).all():
             # A NaN would pass through min and max unseen, depending on where it stands.
-            if not math.isfinite(value):
-                where = f"episode with seed {seed}, step {step * len(rewards) // len(values)}"
-                raise RolloutError(f"{where}: {name} is {value!r}, expected a finite number")
+            step, *_ = np.argwhere(~np.isfinite(values))[0].tolist()
+            where = f"episode with seed {seed}, step {step}"
+            raise RolloutError(f"{where}: {name} is {values[step]}, expected finite numbers")
+    conditioning, successes = steps["conditioning"].tolist(), steps["is_success"].tolist()
+    torques: list[float] = steps["torque"].ravel().tolist()
     return Episode(
         seed=seed,
         success_at_end=successes[-1],
         success_once=any(successes),
-        total_reward=math.fsum(rewards),
+        total_reward=math.fsum(steps["reward"].tolist()),
         conditioning_min=min(conditioning),
         conditioning_mean=math.fsum(conditioning) / len(conditioning),
-        closure_error_max=max(closure),
-        length=len(rewards),
-        unsafe_share=sum(info["singularity_penalty"] > 0 for info in infos) / len(infos),
-        fk_error_max=max(fk_errors),
+        closure_error_max=float(steps["closure_error"].max()),
+        length=len(successes),
+        unsafe_share=int((steps["singularity_penalty"] > 0).sum()) / len(successes),
+        fk_error_max=float(steps["fk_error"].max()),
         torque_rms=math.hypot(*torques) / math.sqrt(len(torques)),
         torque_peak=max(map(abs, torques)),
     )

@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import signal
 from contextlib import ExitStack
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,16 +29,19 @@ from tpm_gym.learning.configuration import (
     complete,
     resumed,
 )
-from tpm_gym.learning.environments import check_env_id, make_env
+from tpm_gym.learning.environments import check_env_id, make_env, make_envs
 from tpm_gym.learning.errors import ConfigError, PolicyError, RunError
-from tpm_gym.learning.rollout import SELECTION_SEED
-from tpm_gym.learning.run_folder import CHECKPOINTS, CONFIG_FILE, is_finished
+from tpm_gym.learning.estimates import Estimate
+from tpm_gym.learning.evaluation import EvaluationConfig, evaluate
+from tpm_gym.learning.rollout import BATCH, SELECTION_SEED, GoalEnv
+from tpm_gym.learning.run_folder import CHECKPOINTS, CONFIG_FILE, TESTS, is_finished
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.vec_env import VecEnv
 
+    from tpm_gym.envs.vector import TPMVectorEnv
     from tpm_gym.learning.callbacks import PeriodicEvaluation
 
 
@@ -64,7 +67,7 @@ def train(config: TrainingConfig, console: Console | None = None) -> signal.Sign
         starts = int(config.recipe.arguments.get("learning_starts", 0))
         if config.steps <= starts:
             console.print(f"note: learning starts at step {starts:,}, so nothing will be learned")
-        return _learn(config, console, store, None)
+        return _learn_and_test(config, console, store, None)
 
 
 def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signals | None:
@@ -109,7 +112,7 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
             run_folder.clear(run)
         provenance.write_json(run / CONFIG_FILE, description)
         _say(console, f"{changed.title}, from step {step:,} to {changed.steps:,}, in {run}")
-        return _learn(changed, console, store, content)
+        return _learn_and_test(changed, console, store, content)
 
 
 def _say(console: Console, text: str) -> None:
@@ -137,6 +140,35 @@ def _description_resumed(
     }
 
 
+def _learn_and_test(
+    config: TrainingConfig, console: Console, store: CheckpointStore, content: Content | None
+) -> signal.Signals | None:
+    """Learn; then test what was learned in closed form in PyBullet too."""
+    stopped_by = _learn(config, console, store, content)
+    if stopped_by is None and config.in_batches and config.test_episodes:
+        rates = [_test(config, engine) for engine in ("analytic", "pybullet")]
+        told = ", ".join(f"{rate.mean:.1%} [{rate.low:.1%}, {rate.high:.1%}]" for rate in rates)
+        _say(console, f"success in closed form and in PyBullet, held-out episodes: {told}")
+    return stopped_by
+
+
+def _test(config: TrainingConfig, engine: str) -> Estimate:
+    """Success of the best policy in an engine, of which the run keeps the test."""
+    (result,) = evaluate(
+        EvaluationConfig(
+            policy=(str(config.run),),
+            env=config.env,
+            episodes=config.test_episodes,
+            goals=config.goals,
+            penalty_weight=config.penalty_weight,
+            env_options=replace(config.env_options, engine=engine),
+            json=config.run / TESTS / f"{engine}.json",
+        ),
+        Console(quiet=True),
+    )
+    return result.metrics["success_at_end"]
+
+
 def _learn(
     config: TrainingConfig, console: Console, store: CheckpointStore, content: Content | None
 ) -> signal.Signals | None:
@@ -161,7 +193,12 @@ def _learn(
     with ExitStack() as stack:
         training_envs = make_training_envs(config)
         stack.callback(training_envs.close)
-        evaluation_env = make_env(**_env_options(config))
+        evaluation_env: GoalEnv | TPMVectorEnv
+        if config.in_batches:
+            count = min(config.eval_episodes, BATCH)
+            evaluation_env = make_envs(count=count, **_env_options(config))
+        else:
+            evaluation_env = make_env(**_env_options(config))
         stack.callback(evaluation_env.close)
         stack.callback(bar.close)
         model = make_model(config, training_envs)
@@ -244,13 +281,24 @@ def make_model(config: TrainingConfig, envs: VecEnv) -> BaseAlgorithm:
 
 
 def make_training_envs(config: TrainingConfig) -> VecEnv:
-    """Build the training environments, in processes of their own where there are several."""
+    """Build the training environments.
+
+    Where there are several, those in closed form are computed at a time, others run in processes of
+    their own.
+    """
     from stable_baselines3.common.env_util import make_vec_env
     from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
     from tpm_gym.learning.training_state import EpisodeRecorder
+    from tpm_gym.learning.vec_env import AnalyticVecEnv
 
     several = config.envs > 1
+    if several and config.in_batches:
+        # Episodes that end one by one make the batches of an on-policy algorithm even.
+        options = {**_env_options(config), "autoreset_mode": "SameStep", "stagger": True}
+        envs = AnalyticVecEnv(make_envs(count=config.envs, **options))
+        envs.seed(config.seed)
+        return envs
     return make_vec_env(
         make_env,
         n_envs=config.envs,

@@ -35,6 +35,7 @@ from tpm_gym.learning.export import remove
 from tpm_gym.learning.provenance import versions, write_whole
 from tpm_gym.learning.rollout import Action, GoalEnv, Observation
 from tpm_gym.learning.run_folder import LAST_FILE, RESTORED, clear_tests
+from tpm_gym.learning.vec_env import AnalyticVecEnv
 
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining")
 _PER_KEY = ("observations", "next_observations")
@@ -100,12 +101,13 @@ def capture(
     envs, observations = model.env, model._last_obs
     assert envs is not None
     assert isinstance(observations, dict)
+    episodes, columns = _episodes(envs)
     state = {
         "counters": {name: getattr(model, name) for name in _COUNTERS},
         "statistics": [list(model.ep_info_buffer or ()), list(model.ep_success_buffer or ())],
         "log": _pending_log(model),
         "rng": _rng_state(model),
-        "episodes": envs.env_method("episode"),
+        "episodes": episodes,
         "versions": versions(),
         "extra": dict(extra),
     }
@@ -116,6 +118,7 @@ def capture(
     files |= {name: (run / name).read_bytes() for name in RESTORED if (run / name).is_file()}
     arrays = {f"last/{name}": np.array(value) for name, value in observations.items()}
     arrays["episode_starts"] = np.array(model._last_episode_starts)
+    arrays |= {f"envs/{name}": values for name, values in columns.items()}
     arrays |= {f"buffer/{name}": array for name, array in _buffer_arrays(model).items()}
     return Content(model.num_timesteps, finished, files, arrays)
 
@@ -248,17 +251,35 @@ def _restore_episodes(
     assert envs is not None
     names = [name for name in arrays if name.startswith("last/")]
     last = {name.removeprefix("last/"): arrays[name] for name in names}
-    exact = True
-    for index, episode in enumerate(state["episodes"]):
-        (observation,) = envs.env_method("replay", episode, indices=[index])
-        exact &= observation is not None and all(
-            np.array_equal(observation[key], rows[index]) for key, rows in last.items()
+    if isinstance(envs, AnalyticVecEnv):
+        columns = {k.removeprefix("envs/"): v for k, v in arrays.items() if k.startswith("envs/")}
+        found = envs.restore(state["episodes"], columns)
+        exact = all(np.array_equal(found[key], rows) for key, rows in last.items())
+    else:
+        exact = all(
+            _is_repeated(envs, index, episode, last)
+            for index, episode in enumerate(state["episodes"])
         )
     if exact:
         model._last_obs, model._last_episode_starts = last, arrays["episode_starts"]
         return []
     _start_afresh(model, envs)
     return ["the episodes under way could not be repeated exactly, so new ones begin"]
+
+
+def _episodes(envs: VecEnv) -> tuple[Any, dict[str, NDArray[Any]]]:
+    """The episodes under way, as plain data and arrays."""
+    if isinstance(envs, AnalyticVecEnv):
+        return envs.state()
+    return envs.env_method("episode"), {}
+
+
+def _is_repeated(envs: VecEnv, index: int, episode: Any, last: Mapping[str, NDArray[Any]]) -> bool:
+    """Repeat an episode; whether it comes to the same observation."""
+    (observation,) = envs.env_method("replay", episode, indices=[index])
+    return observation is not None and all(
+        np.array_equal(observation[key], rows[index]) for key, rows in last.items()
+    )
 
 
 def _start_afresh(model: BaseAlgorithm, envs: VecEnv) -> None:

@@ -214,7 +214,7 @@ class Machine(ABC):
         """
         low, high = np.array(region.low), np.array(region.high)
         for _ in range(_ATTEMPTS):
-            point = low + (high - low) * rng.random(3)
+            point: FloatArray = low + (high - low) * rng.random(3)
             a, b, c = point.tolist()
             with suppress(UnreachableError, SingularityError):
                 if self.evaluate(self.inverse((a, b, c))).conditioning >= self.safe_conditioning:

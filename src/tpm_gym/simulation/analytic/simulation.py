@@ -225,7 +225,8 @@ class AnalyticSimulation:
         whole = np.concatenate([self._before[:, None], self._truth[:, None], path], axis=1)
         world = self._mount[:, None] + whole * _TURNED[:, None]
         push = self._pucks.advance(slice(None), world.transpose(1, 0, 2), vacuum)
-        return push[-1] * _TURNED
+        last: FloatArray = push[-1] * _TURNED
+        return last
 
     def _drive(self, theta: FloatArray, push: FloatArray | None) -> None:
         """Torques that take the motors through their last three angles (3, 3, n) rad."""
@@ -242,7 +243,8 @@ class AnalyticSimulation:
     @property
     def commands(self) -> FloatArray:
         """Where point P is commanded to go, (n, 3) m, machine's frame."""
-        return self._commands[1].T
+        commands: FloatArray = self._commands[1].T
+        return commands
 
     # -- reading ----------------------------------------------------------------------------
 
@@ -304,7 +306,8 @@ class AnalyticSimulation:
         self._pucks.restore(rows, moment.pucks)
 
     def _to_world(self, position: FloatArray) -> FloatArray:
-        return self._mount + position * _TURNED
+        world: FloatArray = self._mount + position * _TURNED
+        return world
 
 
 def _rows(columns: FloatArray) -> FloatArray:

@@ -1,0 +1,127 @@
+"""Many environments in closed form, as Stable-Baselines3 steps them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
+
+from tpm_gym.envs.vector import TPMVectorEnv, VectorSnapshot
+from tpm_gym.learning.rollout import Observation
+from tpm_gym.simulation.analytic.simulation import Moment
+from tpm_gym.simulation.randomisation import NOMINAL, Plant
+
+__all__ = ["AnalyticVecEnv"]
+
+_COLUMNS, _PUCKS = "column/", "pucks/"  # what arrays of the simulation are called in a state
+_OWN = ("goals", "elapsed", "ended", "pending")
+
+
+class AnalyticVecEnv(VecEnv):
+    """A :class:`~tpm_gym.envs.vector.TPMVectorEnv` behind the interface of Stable-Baselines3.
+
+    Infos hold what its algorithms read, and no more, since they want a dictionary for each
+    environment: where an episode has ended, ``terminal_observation``, ``TimeLimit.truncated``,
+    ``is_success`` and ``episode``; elsewhere nothing.
+
+    Args:
+        envs: With same-step autoreset: ``gym.make_vec(id, num_envs=256, engine="analytic",
+            autoreset_mode="SameStep", stagger=True)``.
+    """
+
+    def __init__(self, envs: TPMVectorEnv) -> None:
+        """Wrap them."""
+        self.envs = envs
+        self._actions: NDArray[Any] = np.zeros(0)
+        self._returns = np.zeros(envs.num_envs)
+        self._lengths = np.zeros(envs.num_envs, dtype=np.int64)
+        super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
+
+    def reset(self) -> Observation:
+        """Start an episode in all environments, with the seeds that :meth:`seed` was given."""
+        seeds = None if self._seeds[0] is None else self._seeds
+        observation, _ = self.envs.reset(seed=seeds)
+        self._reset_seeds()
+        self._returns[:], self._lengths[:] = 0.0, 0
+        return observation
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Remember the actions."""
+        self._actions = actions
+
+    def step_wait(self) -> Any:
+        """Run a control step."""
+        observation, rewards, _, dones, told = self.envs.step(self._actions)
+        self._returns += rewards
+        self._lengths += 1
+        infos: list[dict[str, Any]] = [{}] * self.num_envs
+        ended = np.flatnonzero(dones)
+        for row in ended.tolist():
+            infos[row] = {
+                "terminal_observation": told["final_obs"][row],
+                "TimeLimit.truncated": True,
+                "is_success": bool(told["final_info"]["is_success"][row]),
+                "episode": {"r": float(self._returns[row]), "l": int(self._lengths[row])},
+            }
+        self._returns[ended], self._lengths[ended] = 0.0, 0
+        return observation, rewards.astype(np.float32), dones, infos
+
+    def close(self) -> None:
+        """Close the environments."""
+        self.envs.close()
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """An attribute of the vector environment, once for each index."""
+        return [getattr(self.envs, attr_name) for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Set an attribute of the vector environment, so of all."""
+        del indices
+        setattr(self.envs, attr_name, value)
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> Any:
+        """What a method of the vector environment returns, once for each index."""
+        method = getattr(self.envs, method_name)
+        return [method(*args, **kwargs) for _ in self._get_indices(indices)]
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        """No environment has a wrapper of its own."""
+        del wrapper_class
+        return [False for _ in self._get_indices(indices)]
+
+    # -- checkpoints ----------------------------------------------------------------------------
+
+    def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+        """Everything that the next steps depend on: plain data, and arrays by name."""
+        snapshot = self.envs.save_state()
+        moment = snapshot.simulation
+        plants = moment.plants if any(plant != NOMINAL for plant in moment.plants) else ()
+        arrays: dict[str, NDArray[Any]] = {"returns": self._returns, "lengths": self._lengths}
+        arrays |= {name: getattr(snapshot, name) for name in _OWN}
+        arrays |= {f"{_COLUMNS}{name}": values for name, values in moment.columns.items()}
+        arrays |= {f"{_PUCKS}{k}": values for k, values in enumerate(moment.pucks)}
+        return {"rngs": snapshot.rngs, "plants": [asdict(plant) for plant in plants]}, arrays
+
+    def restore(self, plain: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Observation:
+        """Go back to what :meth:`state` returned; the observation at that moment."""
+        plants = tuple(map(_plant, plain["plants"])) or (NOMINAL,) * self.num_envs
+        pucks = tuple(_named(_PUCKS, arrays).values())
+        moment = Moment(plants, _named(_COLUMNS, arrays), pucks)
+        self._returns, self._lengths = arrays["returns"].copy(), arrays["lengths"].copy()
+        own = {name: arrays[name] for name in _OWN}
+        return self.envs.restore_state(VectorSnapshot(moment, plain["rngs"], **own))
+
+
+def _plant(entries: dict[str, Any]) -> Plant:
+    """From JSON, which has lists for tuples."""
+    tuples: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in entries.items()}
+    return Plant(**tuples)
+
+
+def _named(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Those of which the name begins so, without that."""
+    return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
