@@ -18,6 +18,7 @@ from rich.console import Console
 from tpm_gym.learning import ResumeConfig, TrainingConfig, resume, train
 from tpm_gym.learning.callbacks import Checkpointing
 from tpm_gym.learning.checkpoint import CheckpointStore, Content
+from tpm_gym.learning.configuration import EnvOptions
 
 _FOLDERS = tempfile.TemporaryDirectory()
 
@@ -37,7 +38,7 @@ SAC_RECIPE = """
   policy_kwargs: {{net_arch: [8], features_extractor_class: GoalGapExtractor}}
 """
 PPO_RECIPE = """
-TPMReachDense-v0:
+{env}:
   n_timesteps: 300
   n_envs: {envs}
   policy: MultiInputPolicy
@@ -46,6 +47,7 @@ TPMReachDense-v0:
   n_epochs: 2
   policy_kwargs: {{net_arch: [8]}}
 """
+REACH, PICK = "TPMReachDense-v0", "TPMPickAndPlaceDense-v0"
 CASES = {
     "sac": ("sac", "TPMReach-v0", SAC_RECIPE.format(env="TPMReach-v0", train_freq=2)),
     "tqc": (
@@ -53,8 +55,9 @@ CASES = {
         "TPMPickAndPlace-v0",
         SAC_RECIPE.format(env="TPMPickAndPlace-v0", train_freq=3),
     ),
-    "ppo": ("ppo", "TPMReachDense-v0", PPO_RECIPE.format(envs=1)),
-    "ppo in processes": ("ppo", "TPMReachDense-v0", PPO_RECIPE.format(envs=2)),
+    "ppo": ("ppo", REACH, PPO_RECIPE.format(env=REACH, envs=1)),
+    "ppo in processes": ("ppo", REACH, PPO_RECIPE.format(env=REACH, envs=2)),
+    "ppo in closed form": ("ppo", PICK, PPO_RECIPE.format(env=PICK, envs=3)),
 }
 
 
@@ -85,6 +88,8 @@ def make_config(case: str, folder: Path) -> TrainingConfig:
         eval_episodes=1,
         eval_every=70,
         checkpoint_every=50,
+        env_options=EnvOptions(engine="analytic") if "closed form" in case else EnvOptions(),
+        test_episodes=2,
     )
 
 

@@ -256,11 +256,11 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         if self._limit is not None:
             truncated |= self._elapsed >= self._limit
         reward[ended] = 0.0
-        self._ended = truncated
+        self._ended = truncated.copy()
         infos = {**_masked(told, None, self.num_envs), **infos}
         if self.autoreset_mode == AutoresetMode.SAME_STEP and truncated.any():
-            observation, infos = self._begin_anew(observation, infos)
-        return observation, reward, np.zeros_like(truncated), truncated.copy(), infos
+            infos = self._begin_anew(observation, told)
+        return observation, reward, np.zeros_like(truncated), truncated, infos
 
     def _move(self, values: FloatArray, running: IntArray) -> None:
         """A control period with these actions, or those that come late."""
@@ -271,30 +271,26 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         vacuum = values[:, 3] > 0 if self.task.vacuum else np.zeros(self.num_envs, dtype=np.bool_)
         simulation.move(command, vacuum, self._draw_noise(running))
 
-    def _begin_anew(
-        self, observation: Observation, infos: dict[str, Any]
-    ) -> tuple[Observation, dict[str, Any]]:
-        """Reset what has ended; what it ended with goes into the infos."""
+    def _begin_anew(self, observation: Observation, last: Mapping[str, Any]) -> dict[str, Any]:
+        """Reset what has ended, in the observation too; infos, with what it ended with."""
         rows, n = np.flatnonzero(self._ended), self.num_envs
         final = np.full(n, None, dtype=object)
         for row in rows.tolist():
             final[row] = {name: values[row].copy() for name, values in observation.items()}
-        last = {name: value for name, value in infos.items() if not name.startswith("_")}
         told = self._begin(rows)
         state = _take(self.simulation.state(), rows)
         anew, _, first = report(self.task, state, self._goals[rows])
         for name, values in anew.items():
             observation[name][rows] = values
         ended = np.isin(np.arange(n), rows)
-        infos = {
-            **_updated(infos, first, rows),
+        return {
+            **_masked(_updated(last, first, rows), None, n),
             **told,
             "final_obs": final,
             "_final_obs": ended,
             "final_info": _masked(last, rows, n),
             "_final_info": ended,
         }
-        return observation, infos
 
     def close_extras(self, **kwargs: Any) -> None:
         """Nothing is held beyond memory."""
@@ -384,15 +380,15 @@ def _masked(told: Mapping[str, Any], rows: IntArray | None, count: int) -> dict[
     return infos
 
 
-def _updated(infos: dict[str, Any], told: Mapping[str, Any], rows: IntArray) -> dict[str, Any]:
-    """The same infos with other values in some rows; the old arrays stay as they were."""
-    result = dict(infos)
-    for name, value in told.items():
+def _updated(last: Mapping[str, Any], first: Mapping[str, Any], rows: IntArray) -> dict[str, Any]:
+    """The same values (n,) with others in some rows; the old arrays stay as they were."""
+    result: dict[str, Any] = {}
+    for name, value in last.items():
         if isinstance(value, Mapping):
-            result[name] = _updated(infos[name], value, rows)
+            result[name] = _updated(value, first[name], rows)
         else:
-            result[name] = infos[name].copy()
-            result[name][rows] = value
+            result[name] = value.copy()
+            result[name][rows] = first[name]
     return result
 
 

@@ -1,0 +1,198 @@
+"""Environments in closed form, many at a time: as Gymnasium wants them, and as one alone."""
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from episodes import EVERYTHING
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+import tpm_gym
+from tpm_gym.envs.vector import TPMVectorEnv
+from tpm_gym.errors import (
+    ActionError,
+    ConfigurationError,
+    EpisodeError,
+    InputError,
+    ResetOptionError,
+)
+
+PICK, JOINTS, REACH = "TPMPickAndPlace-v0", "TPMPickAndPlaceJointsDense-v0", "TPMReach-v0"
+MODES = [mode.value for mode in AutoresetMode]
+
+
+def make(env_id: str = PICK, count: int = 5, **options: Any) -> TPMVectorEnv:
+    envs = gym.make_vec(env_id, num_envs=count, engine="analytic", **options)
+    assert isinstance(envs, TPMVectorEnv)
+    return envs
+
+
+def actions_of(envs: Any, steps: int, seed: int = 0) -> Any:
+    rng = np.random.default_rng(seed)
+    return rng.uniform(-1.0, 1.0, (steps, *envs.action_space.shape)).astype(np.float32)
+
+
+def assert_same(one: Any, other: Any) -> None:
+    """Equal to the bit, through nested dictionaries and arrays of objects."""
+    if isinstance(one, dict):
+        assert one.keys() == other.keys()
+        for key in one:
+            assert_same(one[key], other[key])
+    elif isinstance(one, np.ndarray) and one.dtype == object:
+        for pair in zip(one, other, strict=True):
+            assert_same(*pair)
+    else:
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "options"),
+    [
+        (REACH, {}),
+        (PICK, {"randomisation": EVERYTHING}),
+        (JOINTS, {"machine": "wide"}),
+        ("TPMPickAndPlaceJoints-v0", {"randomisation": EVERYTHING, "goals": "tempting"}),
+    ],
+    ids=str,
+)
+def test_one_alone_has_the_bits_of_one_among_many(env_id: str, options: dict[str, Any]) -> None:
+    count, seed = 65, 3
+    envs = make(env_id, count, **options)
+    watched = {row: gym.make(env_id, engine="analytic", **options) for row in (0, 8, 64)}
+    observation, _ = envs.reset(seed=seed)
+    for row, env in watched.items():
+        alone, _ = env.reset(seed=seed + row)
+        assert_same(alone, {name: values[row] for name, values in observation.items()})
+    for actions in actions_of(envs, 49):
+        observation, rewards, _, _, infos = envs.step(actions)
+        for row, env in watched.items():
+            alone, reward, _, _, info = env.step(actions[row])
+            assert_same(alone, {name: values[row] for name, values in observation.items()})
+            assert reward == rewards[row]
+            terms = info.pop("reward_terms")
+            assert terms == {name: infos["reward_terms"][name][row] for name in terms}
+            assert info == {name: infos[name][row] for name in info}
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_it_does_what_gymnasiums_vectors_of_single_environments_do(mode: str) -> None:
+    count = 3
+    options = {"engine": "analytic", "max_episode_steps": 7}
+    theirs = SyncVectorEnv(
+        [lambda: gym.make(PICK, **options)] * count, autoreset_mode=AutoresetMode(mode)
+    )
+    ours = make(PICK, count, max_episode_steps=7, autoreset_mode=mode)
+    assert ours.metadata["autoreset_mode"] == AutoresetMode(mode)
+    assert ours.single_observation_space == theirs.single_observation_space
+    assert ours.observation_space == theirs.observation_space
+    assert ours.action_space == theirs.action_space
+    for got, wanted in zip(ours.reset(seed=1), theirs.reset(seed=1), strict=True):
+        assert_same(got, wanted)
+    for step, actions in enumerate(actions_of(ours, 17)):
+        got, wanted = ours.step(actions), theirs.step(actions)
+        for one, other in zip(got, wanted, strict=True):
+            assert_same(one, other)
+        assert ours.observation_space.contains(got[0])
+        if mode == "Disabled" and got[3].any():
+            mask = {"reset_mask": got[3] & (np.arange(count) != step % count)}
+            rest = {"reset_mask": got[3] & ~mask["reset_mask"]}
+            for part in (mask, rest):
+                pair = ours.reset(options=dict(part)), theirs.reset(options=dict(part))
+                for row in np.flatnonzero(part["reset_mask"]):
+                    one, other = ({k: v[row] for k, v in seen.items()} for seen, _ in pair)
+                    assert_same(one, other)
+
+
+def test_without_an_engine_it_stays_pybullet() -> None:
+    envs = gym.make_vec(REACH, num_envs=2)
+    assert isinstance(envs, SyncVectorEnv)
+    assert {env.unwrapped.simulation.engine.__class__.__name__ for env in envs.envs} == {
+        "BulletEngine"
+    }
+    assert [env.spec.id for env in envs.envs] == [REACH] * 2
+    envs.close()
+
+
+def test_the_first_episodes_are_of_different_lengths_where_that_is_asked_for() -> None:
+    envs = make(REACH, 10, stagger=True, max_episode_steps=20)
+    envs.reset(seed=0)
+    ended = [envs.step(actions)[3].sum() for actions in actions_of(envs, 20)]
+    assert max(ended) <= 2
+    assert sum(ended) == 10
+
+
+def test_what_is_saved_goes_on_equally() -> None:
+    envs, other = (make(PICK, 7, randomisation=EVERYTHING, stagger=True) for _ in range(2))
+    envs.reset(seed=0)
+    course = actions_of(envs, 90)
+    for actions in course[:30]:
+        envs.step(actions)
+    moment = envs.save_state()
+    expected = [envs.step(actions) for actions in course[30:]]
+    for again in (envs, other):
+        again.restore_state(moment)
+        for actions, wanted in zip(course[30:], expected, strict=True):
+            assert_same(list(again.step(actions)[0].values()), list(wanted[0].values()))
+
+
+BAD: list[tuple[Callable[[TPMVectorEnv], Any], type[Exception], str]] = [
+    (lambda envs: envs.step(np.zeros((5, 3))), ActionError, r"\(5, 4\)"),
+    (lambda envs: envs.step(np.full((5, 4), np.nan)), ActionError, "finite"),
+    (lambda envs: envs.reset(seed=[1, 2]), InputError, "one seed, or 5"),
+    (lambda envs: envs.reset(options={"reset_mask": [1, 0]}), ResetOptionError, "booleans"),
+    (
+        lambda envs: envs.reset(options={"reset_mask": np.zeros(5, dtype=bool)}),
+        ResetOptionError,
+        "one of them true",
+    ),
+    (lambda envs: envs.reset(options={"cube": 1}), ResetOptionError, "object"),
+    (lambda envs: (envs.close(), envs.reset()), EpisodeError, "closed"),
+]
+
+
+@pytest.mark.parametrize(("misuse", "error", "message"), BAD)
+def test_misuse_is_refused(
+    misuse: Callable[[TPMVectorEnv], Any], error: type[Exception], message: str
+) -> None:
+    envs = make()
+    envs.reset(seed=0)
+    with pytest.raises(error, match=message):
+        misuse(envs)
+
+
+def test_options_are_refused_by_name() -> None:
+    stack = type("Two", (tpm_gym.tasks.PickAndPlace,), {})
+    stack.scene = tpm_gym.simulation.Scene(
+        objects=(tpm_gym.simulation.Block("object"), tpm_gym.simulation.Block("other"))
+    )
+    for options, message in (
+        ({"num_envs": 0}, "1 or more"),
+        ({"physics": {"time_step": 0.02}}, "time_step"),
+        ({"physics": {"torques": "all"}}, "'every'"),
+        ({"machine": "round"}, "'paper', 'wide'"),
+        ({"task": stack}, "one object"),
+    ):
+        with pytest.raises(ConfigurationError, match=message):
+            TPMVectorEnv(**{"task": "reach", **options})
+    with pytest.raises(EpisodeError, match="call reset"):
+        make().step(np.zeros((5, 4)))
+
+
+def test_a_reset_for_some_leaves_the_others_as_they_are() -> None:
+    envs, twin = make(PICK, 4), make(PICK, 4)
+    for each in (envs, twin):
+        each.reset(seed=0)
+    course = actions_of(envs, 20)
+    for actions in course[:10]:
+        envs.step(actions)
+        twin.step(actions)
+    mask = np.array([False, True, False, False])
+    envs.reset(seed=9, options={"reset_mask": mask, "goal": twin.goal[0]})
+    np.testing.assert_array_equal(envs.goal[1], twin.goal[0])
+    others = [0, 2, 3]
+    for actions in course[10:]:
+        one, other = (each.step(actions)[0] for each in (envs, twin))
+        for name, values in one.items():
+            np.testing.assert_array_equal(values[others], other[name][others])
