@@ -189,9 +189,9 @@ def _record(seed: int, steps: Mapping[str, NDArray[Any]]) -> Episode:
     for name, values in steps.items():
         if not np.isfinite(values).all():
             # A NaN would pass through min and max unseen, depending on where it stands.
-            step, *_ = np.argwhere(~np.isfinite(values))[0].tolist()
-            where = f"episode with seed {seed}, step {step}"
-            raise RolloutError(f"{where}: {name} is {values[step]}, expected finite numbers")
+            place = tuple(np.argwhere(~np.isfinite(values))[0].tolist())
+            where = f"episode with seed {seed}, step {place[0]}"
+            raise RolloutError(f"{where}: {name} is {values[place]}, expected a finite number")
     conditioning, successes = steps["conditioning"].tolist(), steps["is_success"].tolist()
     torques: list[float] = steps["torque"].ravel().tolist()
     return Episode(
