@@ -4,7 +4,7 @@ VENV := .venv
 RUN := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
 
-.PHONY: help demo test lint format test-fast test-slow test-wheel urdf pictures figures results bench-kinematics bench-engines bench-fidelity bench-evaluate bench-speed soak clean
+.PHONY: help demo test lint format test-fast test-slow test-wheel urdf pictures figures results bench-kinematics bench-engine bench-engines bench-fidelity bench-evaluate bench-speed soak clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -71,6 +71,10 @@ bench-evaluate: $(INSTALLED) ## what tpm-gym evaluate costs beyond the stepping
 
 bench-engines: $(INSTALLED) ## both engines and theory on the same commands; policies over engines and drives
 	$(RUN) benchmarks/bench_engines.py --jobs 2
+
+bench-engine: $(INSTALLED) ## the closed form as an engine: speed and agreement, beside PyBullet and panda-gym
+	$(RUN) -m pip install -c constraints.txt -e ".[bench]"
+	$(RUN) benchmarks/bench_engine.py
 
 bench-speed: $(INSTALLED) ## steps per second beside panda-gym and Gymnasium-Robotics
 	$(RUN) -m pip install -c constraints.txt -e ".[bench]"

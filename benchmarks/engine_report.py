@@ -73,7 +73,7 @@ def lines(record: dict[str, Any]) -> Iterator[str]:
     """Both tables as Markdown, and what the machine was."""
     yield f"`make bench-engines` on {processor_line(record['machine'])}."
     yield ""
-    yield from _table(
+    yield from table(
         ["motion", "engine", *COLUMNS],
         [
             [row["motion"], row["engine"], *(form(row) for form in COLUMNS.values())]
@@ -84,7 +84,7 @@ def lines(record: dict[str, Any]) -> Iterator[str]:
     yield _costs(record)
     yield ""
     heads = list(dict.fromkeys((row["engine"], row["drive"]) for row in record["matrix"]))
-    yield from _table(
+    yield from table(
         ["id", "policy", *(f"{engine}, {drive}" for engine, drive in heads)],
         [
             [env_id, policy, *(_success(cells[head]) for head in heads)]
@@ -93,7 +93,8 @@ def lines(record: dict[str, Any]) -> Iterator[str]:
     )
 
 
-def _table(head: list[str], rows: list[list[str]]) -> Iterator[str]:
+def table(head: list[str], rows: list[list[str]]) -> Iterator[str]:
+    """A table as Markdown."""
     yield "| " + " | ".join(head) + " |"
     yield "|---" * len(head) + "|"
     for row in rows:

@@ -51,7 +51,7 @@ class Recipe:
         return with_classes(entries)
 
 
-def recipe(env_id: str, algorithm: str = "sac") -> dict[str, Any]:
+def recipe(env_id: str, algorithm: str = "sac", engine: str | None = None) -> dict[str, Any]:
     """Return the shipped recipe of an environment as keyword arguments for Stable-Baselines3.
 
     For example ``SAC(env=env, **recipe("TPMReach-v0"))``. What is no argument of the constructor is
@@ -60,7 +60,7 @@ def recipe(env_id: str, algorithm: str = "sac") -> dict[str, Any]:
     Raises:
         ConfigError: There is none for this environment and algorithm.
     """
-    return read_recipe(recipe_file(algorithm), algorithm, env_id).keywords()
+    return read_recipe(recipe_file(algorithm, engine), algorithm, env_id).keywords()
 
 
 def recipe_file(algorithm: str, engine: str | None = None) -> Path:

@@ -1,0 +1,246 @@
+"""The closed form as an engine: how fast it is, and how far from PyBullet.
+
+    make bench-engine
+    python benchmarks/bench_engine.py --quick
+
+Speed: environment steps a second with uniformly random actions, resets included, in blocks that
+take turns: closed form at several numbers of environments, with the torques of no, the last or
+every time step; PyBullet; panda-gym. Each ratio is of blocks of one round.
+
+Torques: the same actions in both engines with free hands, at several time steps of both; what is
+observed and the conditioning too.
+
+Success: actions recorded in PyBullet and repeated blindly in closed form from the same resets;
+whether both say success at the end. Expert, published and noisy policies; the noisy ones drop,
+throw and shove. And the policies themselves, in either engine.
+
+Everything goes to docs/records/closed_form.json, and from there into docs/closed-form.md and
+docs/images/closed_form.png.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from typing import Any
+
+import closed_form_report
+import gymnasium as gym
+import machine
+import numpy as np
+import torch
+from engine_matrix import NOISE, Trembling
+from numpy.typing import NDArray
+
+from tpm_gym.learning.policies import load_policy
+from tpm_gym.learning.rollout import TEST_SEED
+
+PICK, JOINTS, REACH = "TPMPickAndPlace-v0", "TPMPickAndPlaceJoints-v0", "TPMReach-v0"
+PEER = "PandaPickAndPlace-v3"
+COUNTS = (1, 16, 256, 1024, 4096)
+ROUNDS, SINGLE, STEPS = 7, 300, 50
+"""Rounds of timing, control steps of a single environment's block, steps of an episode."""
+
+Actions = NDArray[np.float32]
+
+
+# -- speed ----------------------------------------------------------------------------------------
+
+
+def speeds(rounds: int, counts: Sequence[int]) -> dict[str, dict[str, Any]]:
+    """Steps a second in each round, by contestant."""
+    importlib.import_module("panda_gym")
+    blocks: dict[str, Callable[[int], float]] = {PEER: _single(PEER)}
+    for env_id in (PICK, JOINTS, REACH):
+        blocks[f"{env_id}, pybullet"] = _single(env_id, engine="pybullet")
+        for torques in ("none", "last", "every"):
+            blocks[f"{env_id}, analytic, {torques}, 1024"] = _many(env_id, 1024, torques)
+    for count in counts:
+        blocks.setdefault(f"{PICK}, analytic, none, {count}", _many(PICK, count, "none"))
+    found: dict[str, list[float]] = {name: [] for name in blocks}
+    for number in range(-1, rounds):  # the first is not counted
+        for name in blocks if number % 2 else reversed(blocks):
+            rate = blocks[name](number + 1)
+            if number >= 0:
+                found[name].append(rate)
+        print(f"round {number + 1} of {rounds}", file=sys.stderr)
+    return {name: {"rates": rates, "ratio": _ratio(name, found)} for name, rates in found.items()}
+
+
+def _ratio(name: str, found: dict[str, list[float]]) -> list[float] | None:
+    """To PyBullet's environment of that id, round by round."""
+    base = found.get(f"{name.split(', ')[0]}, pybullet")
+    return [one / other for one, other in zip(found[name], base, strict=True)] if base else None
+
+
+def _single(env_id: str, **options: Any) -> Callable[[int], float]:
+    """Steps a second of one environment, resets included."""
+    env = gym.make(env_id, **options)
+
+    def block(seed: int) -> float:
+        actions = _random(seed, (SINGLE, *(env.action_space.shape or ())))
+        env.reset(seed=seed)
+        start = time.perf_counter()
+        for action in actions:
+            _, _, terminated, truncated, _ = env.step(action)
+            if terminated or truncated:
+                env.reset()
+        return SINGLE / (time.perf_counter() - start)
+
+    return block
+
+
+def _many(env_id: str, count: int, torques: str) -> Callable[[int], float]:
+    """Steps a second of many, all out of phase, so that resets are spread evenly."""
+    options = {"engine": "analytic", "stagger": True, "physics": {"torques": torques}}
+    envs = gym.make_vec(env_id, num_envs=count, **options)
+
+    def block(seed: int) -> float:
+        actions = _random(seed, (STEPS, *(envs.action_space.shape or ())))
+        envs.reset(seed=1000 * seed)
+        start = time.perf_counter()
+        for action in actions:
+            envs.step(action)
+        return STEPS * count / (time.perf_counter() - start)
+
+    return block
+
+
+def _random(seed: int, shape: tuple[int, ...]) -> Actions:
+    return np.random.default_rng(seed).uniform(-1.0, 1.0, shape).astype(np.float32)
+
+
+# -- agreement ------------------------------------------------------------------------------------
+
+
+def torques(episodes: int, rates: Sequence[int]) -> list[dict[str, Any]]:
+    """Both engines on the same actions with free hands, for each time step."""
+    rows = []
+    for rate in rates:
+        for policy in ("expert", "random"):
+            print(f"torques: {policy}, {rate} Hz", file=sys.stderr)
+            rows.append({"policy": policy, "rate": rate, **_compared(policy, rate, episodes)})
+    return rows
+
+
+def _compared(policy: str, rate: int, episodes: int) -> dict[str, float]:
+    physics = {"time_step": 1 / rate}
+    seen: list[list[Any]] = [[], []]
+    with closing(gym.make(REACH, physics=physics)) as env:
+        other = gym.make(REACH, engine="analytic", physics=physics)
+        acting = load_policy(policy, env)
+        for seed in range(TEST_SEED, TEST_SEED + episodes):
+            observation, _ = env.reset(seed=seed)
+            other.reset(seed=seed)
+            acting.reset(observation, seed)
+            for _ in range(STEPS):
+                action = acting.act(observation)
+                for each, rows in zip((env, other), seen, strict=True):
+                    inner: Any = each.unwrapped
+                    observation, *_ = each.step(action)
+                    state = inner.state
+                    rows.append((*state.torque, state.conditioning, *observation["observation"]))
+    one, two = (np.array(rows) for rows in seen)
+    off = one - two
+    return {
+        "torque": float(np.sqrt((off[:, :3] ** 2).sum() / (one[:, :3] ** 2).sum())),
+        "conditioning": float(np.abs(off[:, 3]).max()),
+        "observation": float(np.abs(off[:, 4:]).max()),
+    }
+
+
+def success(episodes: int) -> list[dict[str, Any]]:
+    """The same actions, and the same policies, in either engine."""
+    rows = []
+    for env_id in (PICK, JOINTS):
+        for policy in ("expert", env_id):
+            for noise in (0.0, NOISE):
+                print(f"success: {env_id}, {policy}, noise {noise}", file=sys.stderr)
+                names = {"env_id": env_id, "policy": policy, "noise": noise}
+                rows.append({**names, **_success(env_id, policy, noise, episodes)})
+    return rows
+
+
+def _success(env_id: str, policy: str, noise: float, episodes: int) -> dict[str, Any]:
+    recorded, ended = _run(env_id, policy, noise, episodes, "pybullet")
+    _, own = _run(env_id, policy, noise, episodes, "analytic")
+    envs = gym.make_vec(env_id, num_envs=episodes, engine="analytic")
+    envs.reset(seed=TEST_SEED)
+    for actions in recorded.swapaxes(0, 1):
+        *_, infos = envs.step(actions)
+    return {
+        "episodes": episodes,
+        "pybullet": float(ended.mean()),
+        "analytic": float(own.mean()),
+        "equal": float((infos["is_success"] == ended).mean()),
+    }
+
+
+def _run(
+    env_id: str, policy: str, noise: float, episodes: int, engine: str
+) -> tuple[Actions, NDArray[np.bool_]]:
+    """Actions (episodes, steps, size), and success at the end (episodes,)."""
+    taken, ended = [], []
+    with closing(gym.make(env_id, engine=engine)) as env:
+        acting = Trembling(load_policy(policy, env), noise)
+        for seed in range(TEST_SEED, TEST_SEED + episodes):
+            observation, _ = env.reset(seed=seed)
+            acting.reset(observation, seed)
+            actions = []
+            for _ in range(STEPS):
+                actions.append(acting.act(observation))
+                observation, *_, info = env.step(actions[-1])
+            taken.append(actions)
+            ended.append(info["is_success"])
+    return np.array(taken), np.array(ended)
+
+
+def evaluation() -> float:
+    """Seconds for 1000 episodes of the published policy, records and all."""
+    import tpm_gym
+    from tpm_gym.learning.environments import make_envs
+    from tpm_gym.learning.policies import TrainedPolicy
+    from tpm_gym.learning.rollout import run_batch, summarise
+
+    envs, policy = make_envs(PICK, 1000, engine="analytic"), tpm_gym.load_policy(PICK)
+    start = time.perf_counter()
+    summarise(run_batch(envs, TrainedPolicy(policy), 1000, TEST_SEED))
+    return time.perf_counter() - start
+
+
+def main() -> None:
+    """Parse the options and run."""
+    parser = argparse.ArgumentParser(description="The closed form as an engine.")
+    parser.add_argument("--quick", action="store_true", help="a minute or two; writes no files")
+    parser.add_argument("--part", choices=("speed", "torques", "success"), help="only this one")
+    parser.add_argument("--redraw", action="store_true", help="picture and page from the record")
+    options = parser.parse_args()
+    if options.redraw:
+        closed_form_report.publish()
+        return
+    torch.set_num_threads(1)
+    quick = options.quick
+    parts: dict[str, Callable[[], Any]] = {
+        "speed": lambda: {
+            "rates": speeds(2 if quick else ROUNDS, COUNTS[3:4] if quick else COUNTS),
+            "evaluation": [evaluation() for _ in range(2 if quick else ROUNDS)],
+        },
+        "torques": lambda: torques(2 if quick else 20, (250,) if quick else (250, 500, 1000, 2000)),
+        "success": lambda: success(10 if quick else 1000),
+    }
+    chosen = [options.part] if options.part else list(parts)
+    record = {
+        name: {"machine": machine.describe(sys.argv), "rows": parts[name]()} for name in chosen
+    }
+    print("\n".join(closed_form_report.lines(record)))
+    if not quick:
+        closed_form_report.write(record)
+        closed_form_report.publish()
+
+
+if __name__ == "__main__":
+    main()

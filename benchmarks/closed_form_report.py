@@ -1,0 +1,173 @@
+"""Tables and picture of what bench_engine.py measured, in docs/closed-form.md."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from engine_report import table
+from machine import ROOT, processor_line, quartiles
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from tpm_gym.learning import figure_style as style
+from tpm_gym.learning.figure_style import BLUE, GREEN, ORANGE, VERMILLION
+
+RECORD = ROOT / "docs" / "records" / "closed_form.json"
+PICTURE = ROOT / "docs" / "images" / "closed_form.png"
+PAGE = ROOT / "docs" / "closed-form.md"
+BEGIN, END = "<!-- closed form: begin -->", "<!-- closed form: end -->"
+PICK = "TPMPickAndPlace-v0"
+COLOURS = {"expert": BLUE, "random": VERMILLION}
+
+
+def write(record: dict[str, Any]) -> None:
+    """Keep the record; parts that were not run stay as they are."""
+    RECORD.parent.mkdir(parents=True, exist_ok=True)
+    kept = json.loads(RECORD.read_text(encoding="utf-8")) if RECORD.is_file() else {}
+    RECORD.write_text(json.dumps({**kept, **record}, indent=1) + "\n", encoding="utf-8")
+
+
+def publish() -> None:
+    """Fill the page and draw the picture from the record."""
+    record = json.loads(RECORD.read_text(encoding="utf-8"))
+    before, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
+    _, after = rest.split(END)
+    text = "\n".join([BEGIN, *lines(record), END])
+    PAGE.write_text(before + text + after, encoding="utf-8")
+    draw(record)
+    for path in (PICTURE, PAGE):
+        print("wrote", path.relative_to(ROOT))
+
+
+def lines(record: dict[str, Any]) -> Iterator[str]:
+    """All tables as Markdown."""
+    for name, part in record.items():
+        yield f"{_TITLES[name]} `make bench-engine` on {processor_line(part['machine'])}."
+        yield ""
+        yield from _TABLES[name](part["rows"])
+        yield ""
+
+
+def _speed(rows: dict[str, Any]) -> Iterator[str]:
+    yield from table(
+        ["environment", "engine", "steps/s", "times PyBullet's"],
+        [
+            [name.split(", ")[0], _engine(name), _spread(row["rates"], "{:,.0f}"), _times(row)]
+            for name, row in rows["rates"].items()
+        ],
+    )
+    yield ""
+    taken = _spread(rows["evaluation"], "{:.2f}")
+    yield f"1000 episodes of the published policy of {PICK}, records and all, take {taken} s."
+
+
+def _engine(name: str) -> str:
+    _, *rest = name.split(", ")
+    if len(rest) < 3:
+        return rest[0] if rest else "its own"
+    return f"closed form, {int(rest[2]):,} at a time, torques: {rest[1]}"
+
+
+def _times(row: dict[str, Any]) -> str:
+    return "-" if row["ratio"] is None else _spread(row["ratio"], "{:.0f}")
+
+
+def _torques(rows: list[dict[str, Any]]) -> Iterator[str]:
+    yield from table(
+        [
+            "actions",
+            "time steps a second",
+            "torque off, relative RMS",
+            "conditioning off",
+            "observation off",
+        ],
+        [
+            [
+                row["policy"],
+                str(row["rate"]),
+                f"{100 * row['torque']:.3f}%",
+                f"{row['conditioning']:.1e}",
+                f"{row['observation']:.1e}",
+            ]
+            for row in rows
+        ],
+    )
+
+
+def _success(rows: list[dict[str, Any]]) -> Iterator[str]:
+    yield from table(
+        ["id", "policy", "PyBullet", "closed form", "equal, same actions"],
+        [
+            [
+                row["env_id"],
+                ("expert" if row["policy"] == "expert" else "published")
+                + (", trembling" if row["noise"] else ""),
+                *(f"{100 * row[name]:.1f}%" for name in ("pybullet", "analytic", "equal")),
+            ]
+            for row in rows
+        ],
+    )
+
+
+_TITLES = {
+    "speed": "Speed, steps of environments a second, medians and quartiles of rounds.",
+    "torques": "Torques, with free hands.",
+    "success": "Success at the end, 1000 episodes a row.",
+}
+_TABLES = {"speed": _speed, "torques": _torques, "success": _success}
+
+
+def _spread(values: list[float], form: str) -> str:
+    low, middle, high = (form.format(value) for value in quartiles(values))
+    return f"{middle} [{low}, {high}]"
+
+
+def draw(record: dict[str, Any]) -> None:
+    """Speed over the number of environments; torques over the time step."""
+    with style.style():
+        figure = Figure(figsize=(style.WIDTH, 2.7), layout="constrained")
+        left, right = figure.subplots(1, 2)
+        _draw_speed(left, record["speed"]["rows"]["rates"])
+        _draw_torques(right, record["torques"]["rows"])
+        style.save(figure, PICTURE)
+
+
+def _draw_speed(axes: Axes, rates: dict[str, Any]) -> None:
+    form = f"{PICK}, analytic, none, "
+    counts = sorted(int(name.removeprefix(form)) for name in rates if name.startswith(form))
+    spread = np.array([quartiles(rates[f"{form}{count}"]["rates"]) for count in counts])
+    axes.fill_between(counts, spread[:, 0], spread[:, 2], color=BLUE, alpha=0.25, linewidth=0)
+    axes.plot(counts, spread[:, 1], "o-", color=BLUE, markersize=3, label="closed form")
+    for name, label, colour in (
+        (f"{PICK}, pybullet", "PyBullet", VERMILLION),
+        ("PandaPickAndPlace-v3", "PandaPickAndPlace-v3", GREEN),
+    ):
+        rate = quartiles(rates[name]["rates"])[1]
+        axes.axhline(rate, color=colour, linewidth=1, label=f"one {label}")
+    axes.set(xscale="log", yscale="log", xlabel="environments at a time")
+    axes.set_title(f"steps/s of {PICK}, one core", loc="left")
+    axes.legend(loc="upper left", frameon=False)
+    axes.grid(alpha=0.3, linewidth=0.4)
+
+
+def _draw_torques(axes: Axes, rows: list[dict[str, Any]]) -> None:
+    for policy, colour in COLOURS.items():
+        own = [row for row in rows if row["policy"] == policy]
+        steps = [1e3 / row["rate"] for row in own]
+        axes.plot(steps, [100 * row["torque"] for row in own], "o-", color=colour, markersize=3)
+        axes.annotate(
+            policy,
+            (steps[0], 100 * own[0]["torque"]),
+            (4, 0),
+            textcoords="offset points",
+            color=colour,
+            va="center",
+        )
+    axes.set(xscale="log", yscale="log", xlabel="time step of PyBullet (ms)")
+    axes.set_xlim(right=9)
+    axes.axvline(4.0, color=ORANGE, linewidth=0.8, linestyle=":")
+    axes.set_title("torques off PyBullet's, relative RMS (%)", loc="left")
+    axes.grid(alpha=0.3, linewidth=0.4)
