@@ -20,8 +20,10 @@ if TYPE_CHECKING:
     from tpm_gym.learning.recipes import recipe as recipe
     from tpm_gym.learning.training import resume as resume
     from tpm_gym.learning.training import train as train
+    from tpm_gym.learning.vec_env import AnalyticVecEnv as AnalyticVecEnv
 
 _MODULES = {
+    "AnalyticVecEnv": "vec_env",
     "Demonstrations": "demonstrations",
     "EnvOptions": "configuration",
     "EvaluationConfig": "evaluation",

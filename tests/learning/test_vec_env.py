@@ -1,0 +1,82 @@
+"""Environments in closed form behind Stable-Baselines3, and policies evaluated in them."""
+
+from contextlib import closing
+from dataclasses import replace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+import tpm_gym
+from tpm_gym.learning import AnalyticVecEnv, PenaltyHerReplayBuffer
+from tpm_gym.learning.environments import make_env, make_envs
+from tpm_gym.learning.policies import TrainedPolicy, load_policy
+from tpm_gym.learning.rollout import run_batch, run_episodes
+
+PICK = "TPMPickAndPlace-v0"
+
+
+def vec_env(env_id: str = PICK, count: int = 3, **options: Any) -> AnalyticVecEnv:
+    options = {"autoreset_mode": "SameStep", "engine": "analytic", **options}
+    return AnalyticVecEnv(make_envs(env_id, count, **options))
+
+
+def test_it_is_sb3s_own_vector_of_single_environments() -> None:
+    theirs = DummyVecEnv([lambda: gym.make(PICK, engine="analytic", max_episode_steps=6)] * 3)
+    ours = vec_env(max_episode_steps=6)
+    for envs in (ours, theirs):
+        envs.seed(4)
+    one, other = ours.reset(), theirs.reset()
+    rng = np.random.default_rng(0)
+    for _ in range(15):
+        for name in one:
+            np.testing.assert_array_equal(one[name], other[name])
+        actions = rng.uniform(-1.0, 1.0, (3, 4)).astype(np.float32)
+        (one, *got), (other, *wanted) = ours.step(actions), theirs.step(actions)
+        for values, expected in zip(got[:2], wanted[:2], strict=True):
+            np.testing.assert_array_equal(values, expected)
+        for info, expected in zip(got[2], wanted[2], strict=True):
+            last = info.get("terminal_observation")
+            if last is None:
+                assert "terminal_observation" not in expected
+                continue
+            for name in last:
+                np.testing.assert_array_equal(last[name], expected["terminal_observation"][name])
+            for name in ("TimeLimit.truncated", "is_success"):
+                assert info[name] == expected[name]
+            assert info["episode"]["l"] == 6
+
+
+def test_ppo_and_hindsight_learn_in_it() -> None:
+    ppo = PPO("MultiInputPolicy", vec_env("TPMReachDense-v0", 8), n_steps=60, batch_size=120)
+    ppo.learn(960)
+    assert len(ppo.ep_info_buffer or ()) == 16
+    sac = SAC(
+        "MultiInputPolicy",
+        vec_env(count=4),
+        replay_buffer_class=PenaltyHerReplayBuffer,
+        learning_starts=210,
+        train_freq=4,
+        batch_size=32,
+    )
+    sac.learn(300)
+    assert sac.replay_buffer.size() > 60
+    assert sac._n_updates > 0
+
+
+@pytest.mark.parametrize("weight", [0.0, 1.0])
+def test_a_policy_in_batches_is_judged_as_in_one_environment(weight: float) -> None:
+    """More episodes than environments; returns only to the rounding of the network's batches."""
+    options = {"engine": "analytic", "penalty_weight": weight, "randomisation": {"latency": 1}}
+    policy = TrainedPolicy(tpm_gym.load_policy(PICK))
+    with closing(make_env(PICK, **options)) as env:
+        alone = run_episodes(env, load_policy(PICK, env), 5, 2_000_000)
+    together = run_batch(make_envs(PICK, 3, **options), policy, 5, 2_000_000)
+    for one, other in zip(alone, together, strict=True):
+        rounded = {name: 0.0 for name, value in vars(one).items() if isinstance(value, float)}
+        assert replace(one, **rounded) == replace(other, **rounded)
+        for name in rounded:
+            assert getattr(one, name) == pytest.approx(getattr(other, name), abs=1e-3), name
