@@ -18,19 +18,22 @@ import numpy as np
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray
 from tpm_gym.mechanism.cup import CUP, sealed
 from tpm_gym.mechanism.mount import GRAVITY
+from tpm_gym.simulation.analytic.tumbling import SEEN, SLOP, Body, Lip, axes, least_rise, tumble
 from tpm_gym.simulation.stage import FLOOR, TABLE
 from tpm_gym.simulation.state import Block
 from tpm_gym.simulation.vacuum import hold_each_after, holds, pressure_after
 
 __all__ = ["Pucks"]
 
-_RECOVERY = 0.08  # share of a penetration that a time step takes out
-_SLOP = 1e-5  # m; a penetration that stays
-_SEEN = 2e-4  # m; contacts at this distance keep from going deeper than to touch
 _SPRING = 0.8  # share of the cup's way back that a time step leaves of it
 _SEAT = 2e-5  # m; distance of lip and face in a seal
 _SETTLED = 1e-6  # m, and m/s: less is none
 _SHALLOW = 2e-4  # m; what stands and is no deeper is at rest
+_SURE = 0.003  # m; as far from the edge a lip lies on the face and does not push it
+_SLOW, _LAZY = 5e-3, 0.3  # m/s, rad/s: what nearly stands, or lies, and is slower comes to rest
+_LEVEL = 1e-5  # square of the sine of half the angle by which it nearly stands
+_ABOUT_Z = np.array([0.0, 0.0, 1.0, 1.0])
+_TURNING = 3.0  # a corner's distance over the radius of gyration of a square, squared
 _NEAR = 0.005  # m; around what the lip may touch
 
 _CUP_MASS = CUP.link("platform", (0.0, 0.0, 0.0)).mass
@@ -39,7 +42,8 @@ _DOWN = (0.0, 0.0, -1.0)
 # Rows of the table of numbers
 _POSITION, _VELOCITY, _TURN = slice(0, 3), slice(3, 6), slice(6, 10)
 _SPIN, _GRIP, _SLIDE, _VACUUM = slice(10, 13), slice(13, 16), 16, 17
-_COLUMNS = 18
+_NORMAL = slice(18, 21)  # of the last contact with the lip, if it was the last time step's
+_COLUMNS = 21
 
 
 class Pucks:
@@ -194,7 +198,7 @@ class Pucks:
         safe = on[columns] & (state[_SLIDE] == 0.0)
         grip = state[_GRIP]
         lowest = way[2:, 2].min(axis=0) + grip[2] - self._block.height / 2
-        safe &= lowest > _SEEN
+        safe &= lowest > SEEN
         # The first force is that of the object's own velocity, which a new seal has to change.
         safe &= (np.abs(state[_VELOCITY] - moved[0]) < 1e-9).all(axis=0)
         for one in load:
@@ -226,11 +230,14 @@ class Pucks:
                 )
                 state[:, fixed] = part
             if len(free):
-                part = state[:, free]
-                step_force[:, free], still[free] = self._move_free(
-                    part, points[:, :, free], mass[free], rough[free]
-                )
-                state[:, free] = part
+                flat = self._stays_flat(state[:, free], points[1][:, free])
+                for rows, move in ((free[flat], self._move_flat), (free[~flat], self._move_any)):
+                    if len(rows):
+                        part = state[:, rows]
+                        step_force[:, rows], still[rows] = move(
+                            part, points[:, :, rows], mass[rows], rough[rows]
+                        )
+                        state[:, rows] = part
             held = self._hold(state, held, path[k + 2], on, load)
             still &= ~held
         self._state[:, which], self._held[which], self._still[which] = state, held, still
@@ -245,7 +252,7 @@ class Pucks:
         position, slide = state[_POSITION], _SPRING * state[_SLIDE]
         there = path[2] + state[_GRIP]
         there[2] += slide
-        least = position[2] + _least_rise(self._gap(position))
+        least = position[2] + least_rise(self._gap(position))
         pushed = np.maximum(least - there[2], 0.0)
         there[2] += pushed
         slide = slide + pushed
@@ -267,14 +274,14 @@ class Pucks:
         state[_SLIDE] = np.where(slide < _SETTLED, 0.0, slide)
         return force, np.stack([seal[2], np.sqrt(seal[0] * seal[0] + seal[1] * seal[1])])
 
-    def _move_free(
+    def _move_flat(
         self, state: FloatArray, path: FloatArray, mass: FloatArray, rough: FloatArray
     ) -> tuple[FloatArray, BoolArray]:
-        """A time step of objects that nothing holds; the force (3, r), and which lie still."""
+        """A time step of upright objects that stay so; the force (3, r), and which lie still."""
         assert self._block is not None
         step, half = self._time_step, self._block.height / 2
         position, velocity = state[_POSITION], state[_VELOCITY]
-        least = _least_rise(self._gap(position)) / step
+        least = least_rise(self._gap(position)) / step
         falling = velocity[2] - GRAVITY * step
         rising = np.maximum(falling, least)
         # The lip: it pushes down what floats, and gives way to what stands.
@@ -282,7 +289,7 @@ class Pucks:
         lip, lip_after = path[1, 2] + slide, path[2, 2] + _SPRING * slide
         above = lip - CUP.length - position[2] - half
         over = self._below(state, path[1])
-        apart = _least_rise(above) - (lip_after - lip) + rising * step
+        apart = least_rise(above) - (lip_after - lip) + rising * step
         excess = np.where(over, np.maximum(apart, 0.0), 0.0)
         pushed = np.maximum(rising - excess / step, least)
         slid = excess - (rising - pushed) * step
@@ -294,26 +301,100 @@ class Pucks:
         force[2] = np.where(pressed, cup, mass * (rising - pushed) / step)
         # Friction on the table, at most what stops it.
         normal = rising - falling + pressed * CUP.preload * step / mass
-        speed = np.sqrt(velocity[0] * velocity[0] + velocity[1] * velocity[1])
-        left = np.maximum(speed - rough * normal, 0.0) / np.maximum(speed, _SETTLED)
-        velocity[:2] *= left
+        # Turning counts by the corners' speed, and their friction acts so much more on it.
+        turning = state[_SPIN][2]
+        corner = 0.5 * self._block.width**2
+        speed = np.sqrt(
+            velocity[0] * velocity[0] + velocity[1] * velocity[1] + corner * turning * turning
+        )
+        taken = rough * normal / np.maximum(speed, _SETTLED)
+        velocity[:2] *= np.maximum(1 - taken, 0.0)
         velocity[2] = pushed
         position += velocity * step
+        turning *= np.maximum(1 - _TURNING * taken, 0.0)
+        _yaw(state[_TURN], turning * step)
+        state[_NORMAL] = 0.0
         state[_SLIDE] = np.where(slide < _SETTLED, 0.0, slide)
         gap = self._gap(position)
         rests = (rising > falling) & (speed == 0.0) & (excess == 0.0) & (state[_SLIDE] == 0.0)
         rests &= (gap > -_SHALLOW) & (gap <= 0)
-        position[2] = np.where(rests, position[2] - gap - _SLOP, position[2])
+        position[2] = np.where(rests, position[2] - gap - SLOP, position[2])
         velocity[2] = np.where(rests, 0.0, velocity[2])
         return force, rests
+
+    def _stays_flat(self, state: FloatArray, point: FloatArray) -> BoolArray:
+        """Which objects neither tilt nor will: no lip near, or one that presses a standing one."""
+        assert self._block is not None
+        position, turn, spin = state[_POSITION], state[_TURN], state[_SPIN]
+        upright = (turn[0] == 0) & (turn[1] == 0) & (spin[0] == 0) & (spin[1] == 0)
+        half = self._block.width / 2
+        dx, dy = point[0] - position[0], point[1] - position[1]
+        above = point[2] + state[_SLIDE] - CUP.length - position[2] - self._block.height / 2
+        size = 1.5 * half + CUP.radius
+        near = (above < SEEN) & (dx * dx + dy * dy < size * size)
+        cosine, sine = 1 - 2 * turn[2] * turn[2], 2 * turn[2] * turn[3]
+        inside = half - _SURE
+        over = np.abs(dx * cosine + dy * sine) < inside
+        over &= np.abs(dy * cosine - dx * sine) < inside
+        stands = np.abs(self._gap(position)) < _SHALLOW
+        flat: BoolArray = upright & (~near | (over & stands))
+        return flat
+
+    def _move_any(
+        self, state: FloatArray, path: FloatArray, mass: FloatArray, rough: FloatArray
+    ) -> tuple[FloatArray, BoolArray]:
+        """A time step of objects in any posture; the force (3, r), and which lie still."""
+        assert self._block is not None
+        step, slide = self._time_step, state[_SLIDE]
+        half = (self._block.width / 2, self._block.width / 2, self._block.height / 2)
+        point, lip = path[1].copy(), (path[2] - path[1]) / step
+        point[2] += slide - CUP.length
+        lip[2] -= (1 - _SPRING) * slide / step
+        body = Body(state[_POSITION], state[_VELOCITY], state[_TURN], state[_SPIN])
+        level = self._level(body.position)
+        after, pushed, impulse, normal, _ = tumble(
+            body, Lip(point, lip, state[_NORMAL]), level, mass, rough, half, step
+        )
+        slide = _SPRING * slide + pushed
+        state[_SLIDE], state[_NORMAL] = np.where(slide < _SETTLED, 0.0, slide), normal
+        state[_POSITION], state[_VELOCITY], state[_TURN], state[_SPIN] = after
+        force = -impulse / step
+        lift = path[2, 2] - 2 * path[1, 2] + path[0, 2]
+        cup = CUP.preload + _CUP_MASS * (GRAVITY + lift / (step * step))
+        force[2] = np.where(pushed > 0, cup, force[2])
+        return force, self._settle(state)
+
+    def _settle(self, state: FloatArray) -> BoolArray:
+        """Stand upright what nearly does, and find what lies still."""
+        assert self._block is not None
+        turn, spin, velocity = state[_TURN], state[_SPIN], state[_VELOCITY]
+        alone = (state[_NORMAL] == 0).all(axis=0) & (state[_SLIDE] == 0)
+        slow = (np.abs(spin[:2]) < _LAZY).all(axis=0) & (np.abs(velocity[2]) < _SLOW)
+        down = self._gap(state[_POSITION])
+        upright = (turn[0] * turn[0] + turn[1] * turn[1] < _LEVEL) & (np.abs(down) < _SHALLOW)
+        upright &= alone & slow
+        length = np.where(upright, np.sqrt(turn[2] * turn[2] + turn[3] * turn[3]), 1.0)
+        state[_TURN] = np.where(upright, turn * _ABOUT_Z[:, None], turn) / length
+        state[_SPIN] = np.where(upright, spin * _ABOUT_Z[:3, None], spin)
+        lies = alone & ~upright & (np.abs(velocity) < _SLOW).all(axis=0)
+        lies &= (np.abs(spin) < _LAZY).all(axis=0)
+        frame = axes(turn)
+        lies &= (np.abs(frame[:, 2]).max(axis=0) > 1 - _LEVEL)
+        state[_VELOCITY.start : _VELOCITY.stop] = np.where(lies, 0.0, state[_VELOCITY])
+        state[_SPIN] = np.where(lies, 0.0, state[_SPIN])
+        return lies
+
+    def _level(self, position: FloatArray) -> FloatArray:
+        """Height of what is below, m."""
+        edge_x, edge_y = self._table
+        over = (np.abs(position[0]) <= edge_x) & (np.abs(position[1]) <= edge_y)
+        level: FloatArray = np.where(over, TABLE.top, FLOOR.top)
+        return level
 
     def _gap(self, position: FloatArray) -> FloatArray:
         """Height of the bottom face over what is below, m."""
         assert self._block is not None
-        edge_x, edge_y = self._table
-        over = (np.abs(position[0]) <= edge_x) & (np.abs(position[1]) <= edge_y)
-        level: FloatArray = np.where(over, TABLE.top, FLOOR.top)
-        gap: FloatArray = position[2] - self._block.height / 2 - level
+        gap: FloatArray = position[2] - self._block.height / 2 - self._level(position)
         return gap
 
     def _below(self, state: FloatArray, point: FloatArray) -> BoolArray:
@@ -352,14 +433,15 @@ class Pucks:
         return after
 
 
-def _least_rise(gap: FloatArray) -> FloatArray:
-    """How far a contact at a distance (m) must open at least in a time step, m."""
-    out = _RECOVERY * np.maximum(-gap - _SLOP, 0.0)
-    return np.where(gap > 0, np.where(gap < _SEEN, -gap, -np.inf), out)
-
-
 def _axis(turn: FloatArray) -> FloatArray:
     """The block's own z axis (3, r) in the world."""
     x, y, z, w = turn
     axis: FloatArray = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
     return axis
+
+
+def _yaw(turn: FloatArray, angle: FloatArray) -> None:
+    """Turn upright blocks (in place) by small angles."""
+    z, w = turn[2] + 0.5 * angle * turn[3], turn[3] - 0.5 * angle * turn[2]
+    length = np.sqrt(z * z + w * w)
+    turn[2], turn[3] = z / length, w / length
