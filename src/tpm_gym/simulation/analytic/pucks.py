@@ -18,6 +18,7 @@ import numpy as np
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray
 from tpm_gym.mechanism.cup import CUP, sealed
 from tpm_gym.mechanism.mount import GRAVITY
+from tpm_gym.simulation.analytic.shoving import Side, shove, side_of
 from tpm_gym.simulation.analytic.tumbling import SEEN, SLOP, Body, Lip, axes, least_rise, tumble
 from tpm_gym.simulation.stage import FLOOR, TABLE
 from tpm_gym.simulation.state import Block
@@ -29,7 +30,7 @@ _SPRING = 0.8  # share of the cup's way back that a time step leaves of it
 _SEAT = 2e-5  # m; distance of lip and face in a seal
 _SETTLED = 1e-6  # m, and m/s: less is none
 _SHALLOW = 2e-4  # m; what stands and is no deeper is at rest
-_SURE = 0.003  # m; as far from the edge a lip lies on the face and does not push it
+_DEEP = 0.002  # m; a lip that is less below the top face comes out there
 _SLOW, _LAZY = 5e-3, 0.3  # m/s, rad/s: what nearly stands, or lies, and is slower comes to rest
 _LEVEL = 1e-5  # square of the sine of half the angle by which it nearly stands
 _ABOUT_Z = np.array([0.0, 0.0, 1.0, 1.0])
@@ -230,14 +231,26 @@ class Pucks:
                 )
                 state[:, fixed] = part
             if len(free):
-                flat = self._stays_flat(state[:, free], points[1][:, free])
-                for rows, move in ((free[flat], self._move_flat), (free[~flat], self._move_any)):
-                    if len(rows):
-                        part = state[:, rows]
-                        step_force[:, rows], still[rows] = move(
-                            part, points[:, :, rows], mass[rows], rough[rows]
-                        )
-                        state[:, rows] = part
+                turn, spin = state[_TURN, free], state[_SPIN, free]
+                flat = (turn[0] == 0) & (turn[1] == 0) & (spin[0] == 0) & (spin[1] == 0)
+                upright, other = free[flat], free[~flat]
+                if len(upright):
+                    part = state[:, upright]
+                    its_force, its_rest, tips = self._move_flat(
+                        part, points[:, :, upright], mass[upright], rough[upright]
+                    )
+                    stays = ~tips
+                    other = np.concatenate([other, upright[tips]])
+                    upright = upright[stays]
+                    state[:, upright] = part[:, stays]
+                    step_force[:, upright] = its_force[:, stays]
+                    still[upright] = its_rest[stays]
+                if len(other):
+                    part = state[:, other]
+                    step_force[:, other], still[other] = self._move_any(
+                        part, points[:, :, other], mass[other], rough[other]
+                    )
+                    state[:, other] = part
             held = self._hold(state, held, path[k + 2], on, load)
             still &= ~held
         self._state[:, which], self._held[which], self._still[which] = state, held, still
@@ -276,69 +289,75 @@ class Pucks:
 
     def _move_flat(
         self, state: FloatArray, path: FloatArray, mass: FloatArray, rough: FloatArray
-    ) -> tuple[FloatArray, BoolArray]:
-        """A time step of upright objects that stay so; the force (3, r), and which lie still."""
+    ) -> tuple[FloatArray, BoolArray, BoolArray]:
+        """A time step of upright objects; the force (3, r), which lie still, and which tip.
+
+        What happens to those that tip is of no use.
+        """
         assert self._block is not None
-        step, half = self._time_step, self._block.height / 2
-        position, velocity = state[_POSITION], state[_VELOCITY]
+        step, half, width = self._time_step, self._block.height / 2, self._block.width
+        position, velocity, turn = state[_POSITION], state[_VELOCITY], state[_TURN]
         least = least_rise(self._gap(position)) / step
         falling = velocity[2] - GRAVITY * step
         rising = np.maximum(falling, least)
-        # The lip: it pushes down what floats, and gives way to what stands.
+        # The lip: beside or above, as it was, else by the shorter way out
         slide = state[_SLIDE]
         lip, lip_after = path[1, 2] + slide, path[2, 2] + _SPRING * slide
-        above = lip - CUP.length - position[2] - half
-        over = self._below(state, path[1])
-        apart = least_rise(above) - (lip_after - lip) + rising * step
-        excess = np.where(over, np.maximum(apart, 0.0), 0.0)
-        pushed = np.maximum(rising - excess / step, least)
-        slid = excess - (rising - pushed) * step
-        slide = _SPRING * slide + slid
-        pressed = slid > 0
+        overlap = position[2] + half + CUP.length - lip
+        side = side_of(path[1, :2] - position[:2], turn, overlap, width / 2)
+        known = state[_NORMAL.start : _NORMAL.stop - 1].any(axis=0)
+        beside = np.where(known, side.gap < SEEN, side.away >= np.minimum(_DEEP - overlap, 0.0))
+        above = (side.away < 0) & ~beside
+        apart = least_rise(-overlap) - (lip_after - lip) + rising * step
+        excess = np.where(above, np.maximum(apart, 0.0), 0.0)
+        slide = _SPRING * slide + excess
+        pressed = excess > 0
+        tips = pressed & (rising == falling)
         lift = path[2, 2] - 2 * path[1, 2] + path[0, 2]
         cup = CUP.preload + _CUP_MASS * (GRAVITY + lift / (step * step))
         force = np.zeros_like(position)
-        force[2] = np.where(pressed, cup, mass * (rising - pushed) / step)
-        # Friction on the table, at most what stops it.
+        force[2] = np.where(pressed, cup, 0.0)
         normal = rising - falling + pressed * CUP.preload * step / mass
-        # Turning counts by the corners' speed, and their friction acts so much more on it.
+        velocity[2] = rising
+        state[_NORMAL] = 0.0
+        shoved = np.flatnonzero(beside & (overlap > 0) & (side.gap < SEEN))
+        done = None
+        if len(shoved):
+            done = shove(
+                Side(*(part[..., shoved] for part in side)),
+                velocity[:2, shoved],
+                state[_SPIN][2, shoved],
+                (path[2, :2, shoved] - path[1, :2, shoved]).T / step,
+                normal[shoved],
+                rough[shoved],
+                (width, 2 * half),
+                2 * half - 0.5 * overlap[shoved],
+                step,
+            )
         turning = state[_SPIN][2]
-        corner = 0.5 * self._block.width**2
+        # Turning counts by the corners' speed, and their friction acts so much more on it.
+        corner = 0.5 * width**2
         speed = np.sqrt(
             velocity[0] * velocity[0] + velocity[1] * velocity[1] + corner * turning * turning
         )
         taken = rough * normal / np.maximum(speed, _SETTLED)
         velocity[:2] *= np.maximum(1 - taken, 0.0)
-        velocity[2] = pushed
-        position += velocity * step
         turning *= np.maximum(1 - _TURNING * taken, 0.0)
-        _yaw(state[_TURN], turning * step)
-        state[_NORMAL] = 0.0
+        if done is not None:
+            velocity[:2, shoved], turning[shoved] = done.velocity, done.turning
+            force[:2, shoved] = -mass[shoved] * done.impulse / step
+            pushes = (done.impulse != 0).any(axis=0)
+            tips[shoved] = done.tips | (pushes & (rising == falling)[shoved])
+            state[_NORMAL.start : _NORMAL.stop - 1, shoved] = side.normal[:, shoved]
+        position += velocity * step
+        _yaw(turn, turning * step)
         state[_SLIDE] = np.where(slide < _SETTLED, 0.0, slide)
         gap = self._gap(position)
         rests = (rising > falling) & (speed == 0.0) & (excess == 0.0) & (state[_SLIDE] == 0.0)
-        rests &= (gap > -_SHALLOW) & (gap <= 0)
+        rests &= (gap > -_SHALLOW) & (gap <= 0) & (state[_NORMAL] == 0).all(axis=0)
         position[2] = np.where(rests, position[2] - gap - SLOP, position[2])
         velocity[2] = np.where(rests, 0.0, velocity[2])
-        return force, rests
-
-    def _stays_flat(self, state: FloatArray, point: FloatArray) -> BoolArray:
-        """Which objects neither tilt nor will: no lip near, or one that presses a standing one."""
-        assert self._block is not None
-        position, turn, spin = state[_POSITION], state[_TURN], state[_SPIN]
-        upright = (turn[0] == 0) & (turn[1] == 0) & (spin[0] == 0) & (spin[1] == 0)
-        half = self._block.width / 2
-        dx, dy = point[0] - position[0], point[1] - position[1]
-        above = point[2] + state[_SLIDE] - CUP.length - position[2] - self._block.height / 2
-        size = 1.5 * half + CUP.radius
-        near = (above < SEEN) & (dx * dx + dy * dy < size * size)
-        cosine, sine = 1 - 2 * turn[2] * turn[2], 2 * turn[2] * turn[3]
-        inside = half - _SURE
-        over = np.abs(dx * cosine + dy * sine) < inside
-        over &= np.abs(dy * cosine - dx * sine) < inside
-        stands = np.abs(self._gap(position)) < _SHALLOW
-        flat: BoolArray = upright & (~near | (over & stands))
-        return flat
+        return force, rests, tips
 
     def _move_any(
         self, state: FloatArray, path: FloatArray, mass: FloatArray, rough: FloatArray
@@ -372,14 +391,14 @@ class Pucks:
         slow = (np.abs(spin[:2]) < _LAZY).all(axis=0) & (np.abs(velocity[2]) < _SLOW)
         down = self._gap(state[_POSITION])
         upright = (turn[0] * turn[0] + turn[1] * turn[1] < _LEVEL) & (np.abs(down) < _SHALLOW)
-        upright &= alone & slow
+        upright &= slow
         length = np.where(upright, np.sqrt(turn[2] * turn[2] + turn[3] * turn[3]), 1.0)
         state[_TURN] = np.where(upright, turn * _ABOUT_Z[:, None], turn) / length
         state[_SPIN] = np.where(upright, spin * _ABOUT_Z[:3, None], spin)
         lies = alone & ~upright & (np.abs(velocity) < _SLOW).all(axis=0)
         lies &= (np.abs(spin) < _LAZY).all(axis=0)
         frame = axes(turn)
-        lies &= (np.abs(frame[:, 2]).max(axis=0) > 1 - _LEVEL)
+        lies &= np.abs(frame[:, 2]).max(axis=0) > 1 - _LEVEL
         state[_VELOCITY.start : _VELOCITY.stop] = np.where(lies, 0.0, state[_VELOCITY])
         state[_SPIN] = np.where(lies, 0.0, state[_SPIN])
         return lies
@@ -396,15 +415,6 @@ class Pucks:
         assert self._block is not None
         gap: FloatArray = position[2] - self._block.height / 2 - self._level(position)
         return gap
-
-    def _below(self, state: FloatArray, point: FloatArray) -> BoolArray:
-        """Whether a lip below ``point`` (3, r) is over the top face, or part of it is."""
-        assert self._block is not None
-        half = self._block.width / 2
-        away = np.abs(point[:2] - state[:2])
-        outside = np.maximum(away - half, 0.0)
-        below: BoolArray = outside[0] * outside[0] + outside[1] * outside[1] < CUP.radius**2
-        return below
 
     def _hold(
         self,

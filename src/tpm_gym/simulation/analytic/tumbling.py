@@ -24,9 +24,9 @@ RECOVERY = 0.08  # share of a penetration that a time step takes out
 SLOP = 1e-5  # m; a penetration that stays
 SEEN = 2e-4  # m; contacts at this distance keep from going deeper than to touch
 
-_ROUNDING = 1e-3  # m
+ROUNDING = 1e-3  # m; of the edges of cup and block for each other
 _BELLOWS = 0.015  # m; length of the part of the cup that touches
-_SWEEPS = 6
+_SWEEPS = 20
 _RELAXATION = 1 / 5.5  # of 1/m: between the inverse inertias of heave, 4, and of tilting, 7.1
 _NEVER = -1e3  # m/s
 _LITTLE = 1e-12
@@ -172,9 +172,16 @@ def _finish(body, velocity, spin, contact, touch, total, step) -> Step:
     x, y, z = 0.5 * step * spin
     a, b, c, d = body.turn
     turn = body.turn + np.stack(
-        [x * d + y * c - z * b, y * d + z * a - x * c, z * d + x * b - y * a, -x * a - y * b - z * c]
+        [
+            x * d + y * c - z * b,
+            y * d + z * a - x * c,
+            z * d + x * b - y * a,
+            -x * a - y * b - z * c,
+        ]
     )
-    turn /= np.sqrt((turn[0] * turn[0] + turn[1] * turn[1]) + (turn[2] * turn[2] + turn[3] * turn[3]))
+    turn /= np.sqrt(
+        (turn[0] * turn[0] + turn[1] * turn[1]) + (turn[2] * turn[2] + turn[3] * turn[3])
+    )
     after = Body(body.position + step * velocity, velocity, turn, spin)
     none, nothing = np.zeros_like(body.position), np.zeros_like(total)
     if contact is None:
@@ -199,15 +206,15 @@ def _touch(
     position: FloatArray, frame: FloatArray, lip: Lip, half: tuple[float, float, float]
 ) -> _Touch:
     """Where cup and block are nearest: by projecting from one to the other."""
-    core = (np.array(half) - _ROUNDING)[:, None]
-    bottom = lip.point[2] + _ROUNDING
-    top = bottom + (_BELLOWS - 2 * _ROUNDING)
+    core = (np.array(half) - ROUNDING)[:, None]
+    bottom = lip.point[2] + ROUNDING
+    top = bottom + (_BELLOWS - 2 * ROUNDING)
     there = position
     for _ in range(4):
         # onto the cup
         away = there[:2] - lip.point[:2]
         far = np.sqrt(away[0] * away[0] + away[1] * away[1])
-        shrink = np.minimum((CUP.radius - _ROUNDING) / np.maximum(far, _LITTLE), 1.0)
+        shrink = np.minimum((CUP.radius - ROUNDING) / np.maximum(far, _LITTLE), 1.0)
         cup = np.concatenate(
             [lip.point[:2] + shrink * away, np.minimum(np.maximum(there[2], bottom), top)[None]]
         )
@@ -218,13 +225,13 @@ def _touch(
     apart = there - cup
     distance = np.sqrt(_sum3(apart * apart))
     normal = apart / np.maximum(distance, _LITTLE)
-    gap = distance - 2 * _ROUNDING
+    gap = distance - 2 * ROUNDING
     deep = np.flatnonzero(distance < 1e-7)
     if len(deep):
         gap[deep], normal[:, deep] = _inside(
             position[:, deep], frame[:, :, deep], Lip(*(part[:, deep] for part in lip)), half
         )
-    return _Touch(gap, normal, there - _ROUNDING * normal - position)
+    return _Touch(gap, normal, there - ROUNDING * normal - position)
 
 
 def _inside(
@@ -317,7 +324,7 @@ def axes(turn: FloatArray) -> FloatArray:
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """a x b, components first."""
+    """A x b, components first."""
     return np.stack(
         [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
     )
