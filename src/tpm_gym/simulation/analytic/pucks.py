@@ -19,7 +19,15 @@ from tpm_gym.arrays import BoolArray, FloatArray, IntArray
 from tpm_gym.mechanism.cup import CUP, sealed
 from tpm_gym.mechanism.mount import GRAVITY
 from tpm_gym.simulation.analytic.shoving import Side, shove, side_of
-from tpm_gym.simulation.analytic.tumbling import SEEN, SLOP, Body, Lip, axes, least_rise, tumble
+from tpm_gym.simulation.analytic.tumbling import (
+    SEEN_BY_LIP,
+    SLOP,
+    Body,
+    Lip,
+    axes,
+    least_rise,
+    tumble,
+)
 from tpm_gym.simulation.stage import FLOOR, TABLE
 from tpm_gym.simulation.state import Block
 from tpm_gym.simulation.vacuum import hold_each_after, holds, pressure_after
@@ -199,7 +207,7 @@ class Pucks:
         safe = on[columns] & (state[_SLIDE] == 0.0)
         grip = state[_GRIP]
         lowest = way[2:, 2].min(axis=0) + grip[2] - self._block.height / 2
-        safe &= lowest > SEEN
+        safe &= lowest > 0
         # The first force is that of the object's own velocity, which a new seal has to change.
         safe &= (np.abs(state[_VELOCITY] - moved[0]) < 1e-9).all(axis=0)
         for one in load:
@@ -306,9 +314,11 @@ class Pucks:
         overlap = position[2] + half + CUP.length - lip
         side = side_of(path[1, :2] - position[:2], turn, overlap, width / 2)
         known = state[_NORMAL.start : _NORMAL.stop - 1].any(axis=0)
-        beside = np.where(known, side.gap < SEEN, side.away >= np.minimum(_DEEP - overlap, 0.0))
+        beside = np.where(
+            known, side.gap < SEEN_BY_LIP, side.away >= np.minimum(_DEEP - overlap, 0.0)
+        )
         above = (side.away < 0) & ~beside
-        apart = least_rise(-overlap) - (lip_after - lip) + rising * step
+        apart = least_rise(-overlap, SEEN_BY_LIP) - (lip_after - lip) + rising * step
         excess = np.where(above, np.maximum(apart, 0.0), 0.0)
         slide = _SPRING * slide + excess
         pressed = excess > 0
@@ -320,15 +330,18 @@ class Pucks:
         normal = rising - falling + pressed * CUP.preload * step / mass
         velocity[2] = rising
         state[_NORMAL] = 0.0
-        shoved = np.flatnonzero(beside & (overlap > 0) & (side.gap < SEEN))
+        shoved = np.flatnonzero(beside & (overlap > 0) & (side.gap < SEEN_BY_LIP))
+        moved = path[2] - path[1]
         done = None
         if len(shoved):
             done = shove(
                 Side(*(part[..., shoved] for part in side)),
-                velocity[:2, shoved],
+                velocity[:, shoved],
                 state[_SPIN][2, shoved],
-                (path[2, :2, shoved] - path[1, :2, shoved]).T / step,
+                turn[:, shoved],
+                np.concatenate([moved[:2], (lip_after - lip)[None]])[:, shoved] / step,
                 normal[shoved],
+                CUP.preload * step / mass[shoved],
                 rough[shoved],
                 (width, 2 * half),
                 2 * half - 0.5 * overlap[shoved],

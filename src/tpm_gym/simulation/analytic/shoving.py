@@ -9,27 +9,33 @@ import numpy as np
 
 from tpm_gym.arrays import BoolArray, FloatArray
 from tpm_gym.mechanism.cup import CUP
-from tpm_gym.simulation.analytic.tumbling import ROUNDING, least_rise
+from tpm_gym.simulation.analytic.tumbling import ROUNDING, SEEN_BY_LIP, least_rise
 
 __all__ = ["Shove", "Side", "shove", "side_of"]
 
-_SWEEPS = 5
+_SWEEPS = 8
+_SHARE = 1 / 8  # of the masses; between the inverse masses of a drag, 4, and of a twist, 12
+_SLIP = 1e-4  # m/s
+_LEAST = 0.02  # of the friction along the axis across which it slips
+_LEAST_LEVEL = 1e-3
+_CORNERS = np.array([[1.0, 1.0, -1.0, -1.0], [1.0, -1.0, 1.0, -1.0]])
 _LITTLE = 1e-12
 _BOTH = 2 * ROUNDING
 _CORE = CUP.radius - ROUNDING
 
 
 class Side(NamedTuple):
-    """How lips stand to standing blocks (m,), seen from above.
+    """How lips stand to the sides of upright blocks (m,).
 
     Attributes:
-        gap: m, between lip and side, along the level; what is rounded is nearer the higher the lip.
-        normal: (2, m) from lip to block, world.
+        gap: m, between the two.
+        normal: (2, m) level direction from lip to block, world.
         arm: (2, m) m, from the block's middle to the point of contact, world.
         away: m, by which the rounded parts' cores are apart; negative over the top face.
         local: (2, m) the normal in the block's frame.
         place: (2, m) m, the arm in the block's frame.
-        slant: Sine by which the normal points down.
+        level: Share of the contact's normal along the level.
+        slant: Share of it that points down.
     """
 
     gap: FloatArray
@@ -38,6 +44,7 @@ class Side(NamedTuple):
     away: FloatArray
     local: FloatArray
     place: FloatArray
+    level: FloatArray
     slant: FloatArray
 
 
@@ -56,20 +63,23 @@ def side_of(away: FloatArray, turn: FloatArray, overlap: FloatArray, half: float
     nearest = np.minimum(np.maximum(local, -core), core)
     out = nearest - local
     far = np.sqrt(out[0] * out[0] + out[1] * out[1])
-    way = out / np.maximum(far, _LITTLE)
-    # A middle over the core: through the nearest side
+    # A middle over the core comes out through the nearest side.
     inside = far < _LITTLE
     first = np.abs(local[0]) > np.abs(local[1])
-    nearest_side = np.stack([first, ~first]) * -np.sign(local)
-    way = np.where(inside, nearest_side, way)
+    through = np.stack([first, ~first]) * -np.sign(local)
+    way = np.where(inside, through, out / np.maximum(far, _LITTLE))
     depth = core - np.maximum(np.abs(local[0]), np.abs(local[1]))
-    far = np.where(inside, -depth, far)
-    higher = np.minimum(np.maximum(_BOTH - overlap, 0.0), _BOTH)
-    gap = far - _CORE - np.sqrt(_BOTH * _BOTH - higher * higher)
+    apart = np.where(inside, -depth, far) - _CORE
+    higher = np.maximum(_BOTH - overlap, 0.0)
+    beside = np.maximum(apart, 0.0)
+    distance = np.sqrt(beside * beside + higher * higher)
+    gap = np.where(distance > _LITTLE, distance, apart) - _BOTH
+    slant = np.where(apart > _LITTLE, higher / np.maximum(distance, _LITTLE), 0.0)
+    level = np.sqrt(np.maximum(1 - slant * slant, _LEAST_LEVEL))
     place = nearest - ROUNDING * way
     normal = np.stack([way[0] * cosine - way[1] * sine, way[0] * sine + way[1] * cosine])
     arm = np.stack([place[0] * cosine - place[1] * sine, place[0] * sine + place[1] * cosine])
-    return Side(gap, normal, arm, far - _CORE, way, place, higher / _BOTH)
+    return Side(gap, normal, arm, apart, way, place, level, slant)
 
 
 class Shove(NamedTuple):
@@ -78,7 +88,7 @@ class Shove(NamedTuple):
     Attributes:
         velocity: (2, m) m/s after it.
         turning: (m,) rad/s after it.
-        impulse: (2, m) m/s, of the lip on the block, by its mass.
+        impulse: (2, m) m/s, of the lip on the block along the level, by its mass.
         tips: (m,) whether the table cannot hold the block upright.
     """
 
@@ -92,8 +102,10 @@ def shove(
     side: Side,
     velocity: FloatArray,
     turning: FloatArray,
+    turn: FloatArray,
     lip: FloatArray,
-    normal: FloatArray,
+    weight: FloatArray,
+    strength: FloatArray,
     rough: FloatArray,
     size: tuple[float, float],
     height: FloatArray,
@@ -101,71 +113,74 @@ def shove(
 ) -> Shove:
     """Shove standing blocks for a time step (s); all impulses by the blocks' masses.
 
+    As in PyBullet's direct solver, what friction can bear is what the normal forces would be
+    without it, and along the world's axes apart.
+
     Args:
         side: Where the lips are.
-        velocity: (2, m) m/s before it.
+        velocity: (3, m) m/s before it.
         turning: (m,) rad/s before it.
-        lip: (2, m) m/s, of the lips.
-        normal: (m,) m/s, impulse with which the tables carry the blocks.
+        turn: (4, m) quaternions.
+        lip: (3, m) m/s, of the lips.
+        weight: (m,) m/s, impulse with which the tables carry the blocks.
+        strength: (m,) m/s, impulse of the cup's spring.
         rough: (m,) Coulomb coefficient on the tables.
         size: The blocks' width and height, m.
         height: (m,) m, at which the lips push, over the table.
         step: s.
     """
-    (nx, ny), (rx, ry) = side.normal, side.arm
-    width = size[0]
-    ease = 6 / width**2  # mass over moment of inertia about the vertical
+    (nx, ny), (rx, ry), half = side.normal, side.arm, size[0] / 2
+    ease = 6 / size[0] ** 2  # mass over moment of inertia about the vertical
     lever_n, lever_t = rx * ny - ry * nx, rx * nx + ry * ny
-    along, across = velocity[0] * nx + velocity[1] * ny, velocity[1] * nx - velocity[0] * ny
-    lip_n, lip_t = lip[0] * nx + lip[1] * ny, lip[1] * nx - lip[0] * ny
-    least = np.maximum(least_rise(side.gap) / step, -1e3) + lip_n
+    vx, vy, spin = velocity[0], velocity[1], turning
+    lip_t = lip[1] * nx - lip[0] * ny
+    steep = side.slant / side.level
+    least = np.maximum(least_rise(side.gap, SEEN_BY_LIP) / step, -1e3) / side.level
+    least = least + lip[0] * nx + lip[1] * ny + steep * (velocity[2] - lip[2])
     share_n, share_t = 1 / (1 + ease * lever_n * lever_n), 1 / (1 + ease * lever_t * lever_t)
-    most = rough * normal
-    corner = width / math.sqrt(2)
-    before = along
-    push = rub = drag_n = drag_t = twist = np.zeros_like(turning)
-    friction = CUP.friction * rough
+    most = strength / np.maximum(steep, 1e-3)
+    # Without friction: what the corners carry, which the push tips towards those in front
+    push = np.minimum(np.maximum(share_n * (least - vx * nx - vy * ny - lever_n * spin), 0.0), most)
+    limit = CUP.friction * rough * push / side.level
+    total = weight + push * steep
+    ahead = push * (height - size[1] / 2)
+    load = np.maximum(total, _LITTLE)
+    a, b = (
+        np.minimum(np.maximum((ahead * n + push * steep * r) / (load * half), -1.0), 1.0)
+        for n, r in zip(side.local, side.place, strict=True)
+    )
+    corners = 0.25 * total * (1 + _CORNERS[0, :, None] * a) * (1 + _CORNERS[1, :, None] * b)
+    cosine, sine = 1 - 2 * turn[2] * turn[2], 2 * turn[2] * turn[3]
+    x = half * (_CORNERS[0, :, None] * cosine - _CORNERS[1, :, None] * sine)
+    y = half * (_CORNERS[0, :, None] * sine + _CORNERS[1, :, None] * cosine)
+    arms = np.stack([-y, x])  # of the corners' forces along x and y
+    speed = np.sqrt(vx * vx + vy * vy)
+    slips = speed > _SLIP
+    ways = np.where(slips, np.abs(velocity[:2]) / np.maximum(speed, _SLIP), math.sqrt(0.5))
+    bounds = rough * corners * np.maximum(ways, _LEAST)[:, None]
+    drag, rub = np.zeros_like(bounds), np.zeros_like(push)
+    before = vx * nx + vy * ny
+    push = np.zeros_like(push)
     for _ in range(_SWEEPS):
-        after = np.maximum(push + share_n * (least - along - lever_n * turning), 0.0)
-        along, turning = along + (after - push), turning + ease * lever_n * (after - push)
-        push = after
-        limit = friction * push
-        wish = rub - share_t * (across + lever_t * turning - lip_t)
-        after = np.minimum(np.maximum(wish, -limit), limit)
-        across, turning = across + (after - rub), turning + ease * lever_t * (after - rub)
-        rub = after
-        # The table's friction: an ellipsoid of drag and twist
-        a, b, c = drag_n - along, drag_t - across, twist - turning / ease
-        length = np.sqrt(a * a + b * b + c * c / corner**2)
-        share = np.minimum(most / np.maximum(length, _LITTLE), 1.0)
-        a, b, c = share * a, share * b, share * c
-        along, across = along + (a - drag_n), across + (b - drag_t)
-        turning = turning + ease * (c - twist)
-        drag_n, drag_t, twist = a, b, c
-    moment = push * height - (along - before) * (size[1] / 2)
-    tips = _tips(side, moment, push, normal, friction, width / 2)
-    speed = np.stack([along * nx - across * ny, along * ny + across * nx])
-    return Shove(speed, turning, np.stack([push * nx - rub * ny, push * ny + rub * nx]), tips)
-
-
-def _tips(
-    side: Side,
-    moment: FloatArray,
-    push: FloatArray,
-    weight: FloatArray,
-    friction: FloatArray,
-    half: float,
-) -> BoolArray:
-    """Whether the pressure's centre leaves the bottom, however much the lip's friction helps.
-
-    The lip's force may point down within its cone, which the rounding slants.
-    """
-    level = np.sqrt(np.maximum(1 - side.slant * side.slant, _LITTLE))
-    steep = side.slant / level
-    down = (steep + friction) / np.maximum(1 - steep * friction, _LITTLE)
-    down = np.where(steep * friction < 1, np.minimum(down, 100.0), 100.0) * push
-    # Along each of the block's axes, in the direction of the push
+        after = push + share_n * (least - vx * nx - vy * ny - lever_n * spin)
+        after = np.minimum(np.maximum(after, 0.0), most)
+        wish = rub - share_t * (vy * nx - vx * ny + lever_t * spin - lip_t)
+        beside = np.minimum(np.maximum(wish, -limit), limit)
+        p, q = after - push, beside - rub
+        push, rub = after, beside
+        vx, vy = vx + (p * nx - q * ny), vy + (p * ny + q * nx)
+        spin = spin + ease * (lever_n * p + lever_t * q)
+        slip = np.stack([vx, vy])[:, None] + arms * spin
+        after = np.minimum(np.maximum(drag - _SHARE * slip, -bounds), bounds)
+        change = after - drag
+        drag = after
+        twist = arms * change
+        change = (change[:, 0] + change[:, 1]) + (change[:, 2] + change[:, 3])
+        twist = (twist[:, 0] + twist[:, 1]) + (twist[:, 2] + twist[:, 3])
+        vx, vy, spin = vx + change[0], vy + change[1], spin + ease * (twist[0] + twist[1])
+    moment = push * height - (vx * nx + vy * ny - before) * (size[1] / 2)
     lacks = moment * np.abs(side.local) - half * weight
     reach = half - side.place * np.sign(side.local)
-    tips: BoolArray = (lacks > down * reach).any(axis=0)
-    return tips
+    tips: BoolArray = (lacks > (push * steep + limit) * reach).any(axis=0)
+    impulse = np.stack([push * nx - rub * ny, push * ny + rub * nx])
+    return Shove(np.stack([vx, vy]), spin, impulse, tips)

@@ -22,7 +22,7 @@ __all__ = ["Body", "Lip", "Step", "axes", "least_rise", "tumble"]
 
 RECOVERY = 0.08  # share of a penetration that a time step takes out
 SLOP = 1e-5  # m; a penetration that stays
-SEEN = 2e-4  # m; contacts at this distance keep from going deeper than to touch
+SEEN_BY_LIP = 6e-4  # m; at this distance lip and block keep from going deeper than to touch
 
 ROUNDING = 1e-3  # m; of the edges of cup and block for each other
 _BELLOWS = 0.015  # m; length of the part of the cup that touches
@@ -123,7 +123,7 @@ def tumble(
     resistance = mass / (1 + half[2] * half[2] * mass * across)
 
     touch = _touch(body.position, frame, lip, half)
-    touching = np.flatnonzero(touch.gap < SEEN)
+    touching = np.flatnonzero(touch.gap < SEEN_BY_LIP)
     contact = _Contact(touch, lip, mass, rough, mobility, touching, step) if len(touching) else None
 
     for _ in range(_SWEEPS):
@@ -272,7 +272,7 @@ class _Contact:
         self.normal, self._arm = touch.normal[:, rows], touch.arm[:, rows]
         self._mass, self._mobility = mass[rows], mobility[:, :, rows]
         self._lip = lip.velocity[:, rows]
-        self._least = np.maximum(least_rise(touch.gap[rows]) / step, _NEVER)
+        self._least = np.maximum(least_rise(touch.gap[rows], SEEN_BY_LIP) / step, _NEVER)
         self._rough = CUP.friction * rough[rows]
         lever = cross(self._arm, self.normal)
         self._inertia = 1 / (1 / self._mass + _sum3(lever * _turned(self._mobility, *lever)))
@@ -303,10 +303,13 @@ class _Contact:
         return np.where(self._press < self._strength, 0.0, lacks / np.maximum(-self.normal[2], 0.1))
 
 
-def least_rise(gap: FloatArray) -> FloatArray:
-    """How far a contact at a distance (m) must open at least in a time step, m."""
+def least_rise(gap: FloatArray, seen: float = 0.0) -> FloatArray:
+    """How far a contact at a distance (m) must open at least in a time step, m.
+
+    A contact is not there before it is as near as ``seen`` (m).
+    """
     out = RECOVERY * np.maximum(-gap - SLOP, 0.0)
-    return np.where(gap > 0, np.where(gap < SEEN, -gap, -np.inf), out)
+    return np.where(gap > 0, np.where(gap < seen, -gap, -np.inf), out)
 
 
 def axes(turn: FloatArray) -> FloatArray:
