@@ -10,6 +10,7 @@ As in PyBullet, block and cup have their edges rounded for each other: by 1 mm e
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -28,6 +29,9 @@ ROUNDING = 1e-3  # m; of the edges of cup and block for each other
 _BELLOWS = 0.015  # m; length of the part of the cup that touches
 _SWEEPS = 20
 _RELAXATION = 1 / 5.5  # of 1/m: between the inverse inertias of heave, 4, and of tilting, 7.1
+_RUBBING = 1 / 10  # the same for friction, of 8.9 for slipping and 12 for turning
+SLIP = 1e-4  # m/s; what is slower has no direction
+LEAST = 0.02  # of friction along an axis, whatever the direction of the slip
 _NEVER = -1e3  # m/s
 _LITTLE = 1e-12
 
@@ -116,59 +120,66 @@ def tumble(
     gap = body.position[2] + corners[2] - level
     least = np.maximum(least_rise(gap) / step, _NEVER)
     arms = np.stack([np.ones_like(gap), corners[1], -corners[0]])
-    normals = np.zeros_like(gap)
-    grip, twist = np.zeros_like(velocity[:2]), np.zeros_like(mass)
-
-    reach = corners[0] * corners[0] + corners[1] * corners[1]
-    resistance = mass / (1 + half[2] * half[2] * mass * across)
-
     touch = _touch(body.position, frame, lip, half)
     touching = np.flatnonzero(touch.gap < SEEN_BY_LIP)
     contact = _Contact(touch, lip, mass, rough, mobility, touching, step) if len(touching) else None
 
+    # Without friction: what it will be able to bear
+    freely, freely_turning, normals = velocity.copy(), spin.copy(), np.zeros_like(gap)
     for _ in range(_SWEEPS):
-        # The level below carries
-        speed = velocity[2] + corners[1] * spin[0] - corners[0] * spin[1]
-        after = np.maximum(normals + mass * _RELAXATION * (least - speed), 0.0)
-        lift, roll, pitch = _sum8(arms * (after - normals))
-        normals = after
-        velocity[2] += lift / mass
-        spin += mobility[0] * roll + mobility[1] * pitch
-        # and rubs, where its pressure has its centre
-        total = _sum8(normals)
-        held = total > _LITTLE
-        centre = _sum8(corners * normals) / np.where(held, total, 1.0)
-        slip = velocity[:2] + np.stack(
+        normals = _carry(freely, freely_turning, normals, arms, least, mass, mobility)
+        if contact is not None:
+            contact.press(freely, freely_turning)
+    if contact is not None:
+        contact.rest()
+    low = velocity[:2] + half[2] * np.stack([-spin[1], spin[0]])
+    fast = np.sqrt(low[0] * low[0] + low[1] * low[1])
+    ways = np.where(fast > SLIP, np.abs(low) / np.maximum(fast, SLIP), math.sqrt(0.5))
+    bounds = rough * normals * np.maximum(ways, LEAST)[:, None]
+    drag = np.zeros_like(bounds)
+    share = mass * _RUBBING
+    for _ in range(_SWEEPS):
+        normals = (
+            _carry(velocity, spin, normals, arms, least, mass, mobility)
+            if _
+            else _carry(velocity, spin, np.zeros_like(gap), arms, least, mass, mobility)
+        )
+        slip = velocity[:2, None] + np.stack(
             [
-                spin[1] * centre[2] - spin[2] * centre[1],
-                spin[2] * centre[0] - spin[0] * centre[2],
+                spin[1] * corners[2] - spin[2] * corners[1],
+                spin[2] * corners[0] - spin[0] * corners[2],
             ]
         )
-        # and turning about the vertical there, which counts as far out as the corners are
-        spread = _sum8(reach * normals) / np.where(held, total, 1.0)
-        spread = np.sqrt(np.maximum(spread - centre[0] * centre[0] - centre[1] * centre[1], 0.0))
-        wanted = grip - resistance * slip
-        turned = twist - spin[2] / mobility[2, 2]
-        most = rough * total
-        lever = np.maximum(spread, _LITTLE)
-        length = np.sqrt(wanted[0] ** 2 + wanted[1] ** 2 + (turned / lever) ** 2)
-        share = np.minimum(most / np.maximum(length, _LITTLE), 1.0)
-        wanted, turned = share * wanted, share * turned
-        change, about = wanted - grip, turned - twist
-        grip, twist = wanted, turned
-        velocity[:2] += change / mass
-        spin += _turned(
-            mobility,
-            -centre[2] * change[1],
-            centre[2] * change[0],
-            centre[0] * change[1] - centre[1] * change[0] + about,
-        )
+        after = np.minimum(np.maximum(drag - share * slip, -bounds), bounds)
+        x, y = after - drag
+        drag = after
+        about = np.stack([-corners[2] * y, corners[2] * x, corners[0] * y - corners[1] * x])
+        velocity[:2] += _sum8(np.stack([x, y])) / mass
+        spin += _turned(mobility, *_sum8(about))
         if contact is not None:
             contact.push(velocity, spin)
-    return _finish(body, velocity, spin, contact, touch, total, step)
+    return _finish(body, velocity, spin, contact, _sum8(normals), step)
 
 
-def _finish(body, velocity, spin, contact, touch, total, step) -> Step:
+def _carry(
+    velocity: FloatArray,
+    spin: FloatArray,
+    normals: FloatArray,
+    arms: FloatArray,
+    least: FloatArray,
+    mass: FloatArray,
+    mobility: FloatArray,
+) -> FloatArray:
+    """Let the level below push up where corners sink; its impulses (8, m)."""
+    speed = velocity[2] + arms[1] * spin[0] + arms[2] * spin[1]
+    after: FloatArray = np.maximum(normals + mass * _RELAXATION * (least - speed), 0.0)
+    lift, roll, pitch = _sum8(arms * (after - normals))
+    velocity[2] += lift / mass
+    spin += mobility[0] * roll + mobility[1] * pitch
+    return after
+
+
+def _finish(body, velocity, spin, contact, total, step) -> Step:
     x, y, z = 0.5 * step * spin
     a, b, c, d = body.turn
     turn = body.turn + np.stack(
@@ -280,21 +291,38 @@ class _Contact:
         self._across = 1 / (1 / self._mass + arm2 * self._mobility[2, 2])
         self._strength = CUP.preload * step / np.maximum(-self.normal[2], 1e-3)
         self._press, self.impulse = np.zeros(len(rows)), np.zeros((3, len(rows)))
+        self._rub, self._limit = np.zeros((3, len(rows))), np.zeros(len(rows))
+
+    def press(self, velocity: FloatArray, spin: FloatArray) -> None:
+        """Let the lip push along the normal."""
+        rows = self.rows
+        own = velocity[:, rows] + cross(spin[:, rows], self._arm) - self._lip
+        press = self._press + self._inertia * (self._least - _sum3(own * self.normal))
+        press = np.minimum(np.maximum(press, 0.0), self._strength)
+        self._give(velocity, spin, (press - self._press) * self.normal)
+        self._press = press
+
+    def rest(self) -> None:
+        """Begin anew, with a friction that bears what the push so far lets it."""
+        self._limit = self._rough * self._press
+        self._press, self.impulse = np.zeros_like(self._press), np.zeros_like(self.impulse)
 
     def push(self, velocity: FloatArray, spin: FloatArray) -> None:
+        """Let the lip push and rub."""
+        self.press(velocity, spin)
         rows, normal = self.rows, self.normal
         own = velocity[:, rows] + cross(spin[:, rows], self._arm) - self._lip
-        away = _sum3(own * normal)
-        press = self._press + self._inertia * (self._least - away)
-        press = np.minimum(np.maximum(press, 0.0), self._strength)
-        rub = self.impulse - self._press * normal - self._across * (own - away * normal)
+        slip = own - _sum3(own * normal) * normal
+        rub = self._rub - self._across * slip
         length = np.sqrt(_sum3(rub * rub))
-        rub *= np.minimum(self._rough * press / np.maximum(length, _LITTLE), 1.0)
-        impulse = press * normal + rub
-        change = impulse - self.impulse
-        self._press, self.impulse = press, impulse
-        velocity[:, rows] += change / self._mass
-        spin[:, rows] += _turned(self._mobility, *cross(self._arm, change))
+        rub *= np.minimum(self._limit / np.maximum(length, _LITTLE), 1.0)
+        self._give(velocity, spin, rub - self._rub)
+        self._rub = rub
+
+    def _give(self, velocity: FloatArray, spin: FloatArray, change: FloatArray) -> None:
+        velocity[:, self.rows] += change / self._mass
+        spin[:, self.rows] += _turned(self._mobility, *cross(self._arm, change))
+        self.impulse = self.impulse + change
 
     def given_way(self, velocity: FloatArray, spin: FloatArray) -> FloatArray:
         """Speed at which the spring gives way where it is at its strength, m/s."""
