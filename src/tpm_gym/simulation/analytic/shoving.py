@@ -139,16 +139,22 @@ def shove(
     least = least + lip[0] * nx + lip[1] * ny + steep * (velocity[2] - lip[2])
     share_n, share_t = 1 / (1 + ease * lever_n * lever_n), 1 / (1 + ease * lever_t * lever_t)
     most = strength / np.maximum(steep, 1e-3)
-    # Without friction: what the corners carry, which the push tips towards those in front
-    push = np.minimum(np.maximum(share_n * (least - vx * nx - vy * ny - lever_n * spin), 0.0), most)
+    # Without friction: what the corners carry, which the push tips over those in front
+    lever = height - size[1] / 2 + steep * (rx * nx + ry * ny)
+    front = half * (np.abs(side.local[0]) + np.abs(side.local[1]))
+    radius = (size[0] ** 2 + size[1] ** 2) / 12  # of gyration, about an edge's direction, squared
+    yields = 1 + front * front / radius
+    wanted = np.maximum(least - vx * nx - vy * ny - lever_n * spin, 0.0)
+    push = np.minimum(share_n * wanted, most)
+    total = weight + push * steep
+    tipping = total + front * lever * push / radius > total * yields
+    softer = 1 / share_n + lever * lever / (radius * yields)
+    push = np.where(tipping, np.minimum(wanted / softer, most), push)
     limit = CUP.friction * rough * push / side.level
     total = weight + push * steep
-    ahead = push * (height - size[1] / 2)
+    total = np.maximum(total, (total + front * lever * push / radius) / yields)
     load = np.maximum(total, _LITTLE)
-    a, b = (
-        np.minimum(np.maximum((ahead * n + push * steep * r) / (load * half), -1.0), 1.0)
-        for n, r in zip(side.local, side.place, strict=True)
-    )
+    a, b = (np.minimum(np.maximum(lever * push * n / (load * half), -1.0), 1.0) for n in side.local)
     corners = 0.25 * total * (1 + _CORNERS[0, :, None] * a) * (1 + _CORNERS[1, :, None] * b)
     cosine, sine = 1 - 2 * turn[2] * turn[2], 2 * turn[2] * turn[3]
     x = half * (_CORNERS[0, :, None] * cosine - _CORNERS[1, :, None] * sine)
