@@ -384,7 +384,7 @@ class Pucks:
         lip[2] -= (1 - _SPRING) * slide / step
         body = Body(state[_POSITION], state[_VELOCITY], state[_TURN], state[_SPIN])
         level = self._level(body.position)
-        after, pushed, impulse, normal, _ = tumble(
+        after, pushed, impulse, normal = tumble(
             body, Lip(point, lip, state[_NORMAL]), level, mass, rough, half, step
         )
         slide = _SPRING * slide + pushed

@@ -11,7 +11,7 @@ As in PyBullet, block and cup have their edges rounded for each other: by 1 mm e
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,7 +27,7 @@ SEEN_BY_LIP = 6e-4  # m; at this distance lip and block keep from going deeper t
 
 ROUNDING = 1e-3  # m; of the edges of cup and block for each other
 _BELLOWS = 0.015  # m; length of the part of the cup that touches
-_SWEEPS = 20
+_SWEEPS = 6
 _RELAXATION = 1 / 5.5  # of 1/m: between the inverse inertias of heave, 4, and of tilting, 7.1
 _RUBBING = 1 / 10  # the same for friction, of 8.9 for slipping and 12 for turning
 SLIP = 1e-4  # m/s; what is slower has no direction
@@ -35,6 +35,7 @@ LEAST = 0.02  # of friction along an axis, whatever the direction of the slip
 _NEVER = -1e3  # m/s
 _LITTLE = 1e-12
 
+_EAST, _NORTH, _UP = np.eye(3)
 _SIGNS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)]).T
 
 
@@ -76,14 +77,12 @@ class Step(NamedTuple):
         pushed: (m,) m, how far the cup's spring gave way.
         impulse: (3, m) N s, of the lip on the block.
         normal: (3, m) of the contact with the lip; zero for none.
-        normals: (m,) N s, of the level below.
     """
 
     body: Body
     pushed: FloatArray
     impulse: FloatArray
     normal: FloatArray
-    normals: FloatArray
 
 
 def tumble(
@@ -108,81 +107,144 @@ def tumble(
     """
     frame = axes(body.turn)
     corners = _sum3(frame[:, :, None] * (_SIGNS * np.array(half)[:, None])[:, None, :, None])
-    # 1/I: of a square block, along its own axis and across
-    across = 3 / (mass * (half[0] ** 2 + half[2] ** 2))
-    along = 3 / (mass * 2 * half[0] ** 2)
-    mobility = (along - across) * frame[2][:, None] * frame[2]
-    for i in range(3):
-        mobility[i, i] += across
-
-    velocity, spin = body.velocity.copy(), body.spin.copy()
-    velocity[2] -= GRAVITY * step
+    masses = _Masses.of(frame[2], mass, half)
     gap = body.position[2] + corners[2] - level
-    least = np.maximum(least_rise(gap) / step, _NEVER)
-    arms = np.stack([np.ones_like(gap), corners[1], -corners[0]])
+    flat, zero = np.zeros_like(gap), np.zeros_like(mass)
+    below = _Rows(masses, _jacobian(_UP, corners), _RELAXATION * mass)
+    sides = np.concatenate([_jacobian(_EAST, corners), _jacobian(_NORTH, corners)])
+    drag = _Rows(masses, sides, _RUBBING * mass)
     touch = _touch(body.position, frame, lip, half)
-    touching = np.flatnonzero(touch.gap < SEEN_BY_LIP)
-    contact = _Contact(touch, lip, mass, rough, mobility, touching, step) if len(touching) else None
+    lips = _lip_rows(masses, touch) if (touch.gap < SEEN_BY_LIP).any() else None
+
+    start = np.concatenate([body.velocity, body.spin])
+    start[2] -= GRAVITY * step
+    least = np.maximum(least_rise(gap) / step, _NEVER)
+    push = np.maximum(least_rise(touch.gap, SEEN_BY_LIP) / step, _NEVER)
+    push = push + _sum3(touch.normal * lip.velocity)
+    strength = CUP.preload * step / np.maximum(-touch.normal[2], 1e-3)
 
     # Without friction: what it will be able to bear
-    freely, freely_turning, normals = velocity.copy(), spin.copy(), np.zeros_like(gap)
+    twist, normals, press = start.copy(), flat, zero[None]
     for _ in range(_SWEEPS):
-        normals = _carry(freely, freely_turning, normals, arms, least, mass, mobility)
-        if contact is not None:
-            contact.press(freely, freely_turning)
-    if contact is not None:
-        contact.rest()
-    low = velocity[:2] + half[2] * np.stack([-spin[1], spin[0]])
-    fast = np.sqrt(low[0] * low[0] + low[1] * low[1])
-    ways = np.where(fast > SLIP, np.abs(low) / np.maximum(fast, SLIP), math.sqrt(0.5))
-    bounds = rough * normals * np.maximum(ways, LEAST)[:, None]
-    drag = np.zeros_like(bounds)
-    share = mass * _RUBBING
+        normals = below.solve(twist, normals, least, flat, np.inf)
+        if lips is not None:
+            press = lips[0].solve(twist, press, push[None], zero, strength)
+    bounds = rough * normals * _ways(body, half[2])[:, None]
+    bounds = np.concatenate([bounds[0], bounds[1]])
+    limit = CUP.friction * rough * press
+    twist, normals, press = start, flat, zero[None]
+    rub, dragged = np.zeros((2, len(mass))), np.zeros_like(bounds)
     for _ in range(_SWEEPS):
-        normals = (
-            _carry(velocity, spin, normals, arms, least, mass, mobility)
-            if _
-            else _carry(velocity, spin, np.zeros_like(gap), arms, least, mass, mobility)
+        normals = below.solve(twist, normals, least, flat, np.inf)
+        dragged = drag.solve(twist, dragged, 0.0, -bounds, bounds)
+        if lips is not None:
+            press = lips[0].solve(twist, press, push[None], zero, strength)
+            rub = lips[1].solve(twist, rub, lips[1].along(lip.velocity), -limit, limit)
+    impulse = touch.normal * press[0]
+    if lips is None:
+        return Step(_moved(body, twist, step), zero, impulse, impulse)
+    impulse = impulse + lips[1].force(rub)
+    lacks = np.maximum(push - lips[0].speed(twist)[0], 0.0) * step
+    weak = press[0] >= strength
+    pushed = np.where(weak, lacks / np.maximum(-touch.normal[2], 0.1), 0.0)
+    normal = np.where(press[0] > 0, touch.normal, 0.0)
+    return Step(_moved(body, twist, step), pushed, impulse, normal)
+
+
+class _Masses(NamedTuple):
+    """Inverses of mass (m,) and of the inertia, (3, 3, m)."""
+
+    lightness: FloatArray
+    mobility: FloatArray
+
+    @classmethod
+    def of(cls, axis: FloatArray, mass: FloatArray, half: tuple[float, float, float]) -> _Masses:
+        """Of square blocks with this axis (3, m)."""
+        across = 3 / (mass * (half[0] ** 2 + half[2] ** 2))
+        along = 3 / (mass * 2 * half[0] ** 2)
+        mobility = (along - across) * axis[:, None] * axis
+        for i in range(3):
+            mobility[i, i] += across
+        return cls(1 / mass, mobility)
+
+
+class _Rows:
+    """Some constraints (c,) on the velocities and spins (6, m) of all blocks, solved at once.
+
+    Args:
+        masses: Of the blocks.
+        jacobian: (c, 6, m).
+        share: (m,) kg, impulse for a speed that is missing; None for the exact one of one row.
+    """
+
+    def __init__(self, masses: _Masses, jacobian: FloatArray, share: FloatArray | None) -> None:
+        """Find what impulses do."""
+        self._jacobian = jacobian
+        spin = (
+            masses.mobility[0] * jacobian[:, 3, None]
+            + masses.mobility[1] * jacobian[:, 4, None]
+            + masses.mobility[2] * jacobian[:, 5, None]
         )
-        slip = velocity[:2, None] + np.stack(
-            [
-                spin[1] * corners[2] - spin[2] * corners[1],
-                spin[2] * corners[0] - spin[0] * corners[2],
-            ]
-        )
-        after = np.minimum(np.maximum(drag - share * slip, -bounds), bounds)
-        x, y = after - drag
-        drag = after
-        about = np.stack([-corners[2] * y, corners[2] * x, corners[0] * y - corners[1] * x])
-        velocity[:2] += _sum8(np.stack([x, y])) / mass
-        spin += _turned(mobility, *_sum8(about))
-        if contact is not None:
-            contact.push(velocity, spin)
-    return _finish(body, velocity, spin, contact, _sum8(normals), step)
+        self._response = np.concatenate([masses.lightness * jacobian[:, :3], spin], axis=1)
+        self._share = 1 / _sum6(jacobian * self._response) if share is None else share
+
+    def speed(self, twist: FloatArray) -> FloatArray:
+        """(c, m) m/s."""
+        return _sum6(self._jacobian * twist)
+
+    def along(self, velocity: FloatArray) -> FloatArray:
+        """(c, m) m/s of something that does not turn, along the constraints."""
+        parts = self._jacobian[:, :3] * velocity
+        return parts[:, 0] + parts[:, 1] + parts[:, 2]
+
+    def force(self, impulses: FloatArray) -> FloatArray:
+        """(3, m) N s of two constraints' impulses."""
+        return self._jacobian[0, :3] * impulses[0] + self._jacobian[1, :3] * impulses[1]
+
+    def solve(
+        self, twist: FloatArray, impulses: FloatArray, least: Any, low: Any, high: Any
+    ) -> FloatArray:
+        """Change impulses (c, m) so that speeds come to ``least``, and ``twist`` by them."""
+        after = impulses + self._share * (least - self.speed(twist))
+        after = np.minimum(np.maximum(after, low), high)
+        twist += _over_rows(self._response * (after - impulses)[:, None])
+        return after
 
 
-def _carry(
-    velocity: FloatArray,
-    spin: FloatArray,
-    normals: FloatArray,
-    arms: FloatArray,
-    least: FloatArray,
-    mass: FloatArray,
-    mobility: FloatArray,
-) -> FloatArray:
-    """Let the level below push up where corners sink; its impulses (8, m)."""
-    speed = velocity[2] + arms[1] * spin[0] + arms[2] * spin[1]
-    after: FloatArray = np.maximum(normals + mass * _RELAXATION * (least - speed), 0.0)
-    lift, roll, pitch = _sum8(arms * (after - normals))
-    velocity[2] += lift / mass
-    spin += mobility[0] * roll + mobility[1] * pitch
-    return after
+def _jacobian(direction: FloatArray, arms: FloatArray) -> FloatArray:
+    """(c, 6, m) of points at arms (3, c, m), along a direction (3,) or (3, m)."""
+    x, y, z = (np.broadcast_to(part, arms.shape[1:]) for part in direction)
+    turn = (arms[1] * z - arms[2] * y, arms[2] * x - arms[0] * z, arms[0] * y - arms[1] * x)
+    return np.stack([x, y, z, *turn], axis=1)
 
 
-def _finish(body, velocity, spin, contact, total, step) -> Step:
-    x, y, z = 0.5 * step * spin
+def _lip_rows(masses: _Masses, touch: _Touch) -> tuple[_Rows, _Rows]:
+    """The contact with the lip: along its normal, and along a level and a steep tangent."""
+    x, y, z = touch.normal
+    level = np.sqrt(x * x + y * y)
+    steep = level > 1e-6
+    far = np.where(steep, level, 1.0)
+    first = np.stack([np.where(steep, -y / far, 1.0), np.where(steep, x / far, 0.0), 0 * x])
+    second = np.stack([-z * first[1], z * first[0], x * first[1] - y * first[0]])
+    arm = touch.arm[:, None]
+    one = _jacobian(touch.normal, arm)
+    two = np.concatenate([_jacobian(first, arm), _jacobian(second, arm)])
+    return _Rows(masses, one, None), _Rows(masses, two, None)
+
+
+def _ways(body: Body, down: float) -> FloatArray:
+    """Share (2, m) of friction along the world's axes, by the direction in which bottoms slip."""
+    x, y = body.velocity[0] - down * body.spin[1], body.velocity[1] + down * body.spin[0]
+    fast = np.sqrt(x * x + y * y)
+    ways = np.where(fast > SLIP, np.abs(np.stack([x, y])) / np.maximum(fast, SLIP), math.sqrt(0.5))
+    return np.maximum(ways, LEAST)
+
+
+def _moved(body: Body, twist: FloatArray, step: float) -> Body:
+    """The blocks a time step (s) on, at velocities and spins (6, m)."""
+    x, y, z = 0.5 * step * twist[3:]
     a, b, c, d = body.turn
-    turn = body.turn + np.stack(
+    rate = np.stack(
         [
             x * d + y * c - z * b,
             y * d + z * a - x * c,
@@ -190,19 +252,10 @@ def _finish(body, velocity, spin, contact, total, step) -> Step:
             -x * a - y * b - z * c,
         ]
     )
-    turn /= np.sqrt(
-        (turn[0] * turn[0] + turn[1] * turn[1]) + (turn[2] * turn[2] + turn[3] * turn[3])
-    )
-    after = Body(body.position + step * velocity, velocity, turn, spin)
-    none, nothing = np.zeros_like(body.position), np.zeros_like(total)
-    if contact is None:
-        return Step(after, nothing, none, none.copy(), total)
-    pushed, impulse, normal = nothing, none, none.copy()
-    rows = contact.rows
-    pushed[rows] = contact.given_way(velocity, spin) * step
-    impulse[:, rows] = contact.impulse
-    normal[:, rows] = contact.normal
-    return Step(after, pushed, impulse, normal, total)
+    turn = body.turn + rate
+    squares = turn * turn
+    turn /= np.sqrt((squares[0] + squares[1]) + (squares[2] + squares[3]))
+    return Body(body.position + step * twist[:3], twist[:3], turn, twist[3:])
 
 
 class _Touch(NamedTuple):
@@ -275,62 +328,6 @@ def _along(
     return away - block - CUP.radius * level - _BELLOWS * np.maximum(normal[2], 0.0), normal
 
 
-class _Contact:
-    """Between lip and block, for the rows in which they touch."""
-
-    def __init__(self, touch, lip, mass, rough, mobility, rows, step) -> None:
-        self.rows, self._step = rows, step
-        self.normal, self._arm = touch.normal[:, rows], touch.arm[:, rows]
-        self._mass, self._mobility = mass[rows], mobility[:, :, rows]
-        self._lip = lip.velocity[:, rows]
-        self._least = np.maximum(least_rise(touch.gap[rows], SEEN_BY_LIP) / step, _NEVER)
-        self._rough = CUP.friction * rough[rows]
-        lever = cross(self._arm, self.normal)
-        self._inertia = 1 / (1 / self._mass + _sum3(lever * _turned(self._mobility, *lever)))
-        arm2 = _sum3(self._arm * self._arm)
-        self._across = 1 / (1 / self._mass + arm2 * self._mobility[2, 2])
-        self._strength = CUP.preload * step / np.maximum(-self.normal[2], 1e-3)
-        self._press, self.impulse = np.zeros(len(rows)), np.zeros((3, len(rows)))
-        self._rub, self._limit = np.zeros((3, len(rows))), np.zeros(len(rows))
-
-    def press(self, velocity: FloatArray, spin: FloatArray) -> None:
-        """Let the lip push along the normal."""
-        rows = self.rows
-        own = velocity[:, rows] + cross(spin[:, rows], self._arm) - self._lip
-        press = self._press + self._inertia * (self._least - _sum3(own * self.normal))
-        press = np.minimum(np.maximum(press, 0.0), self._strength)
-        self._give(velocity, spin, (press - self._press) * self.normal)
-        self._press = press
-
-    def rest(self) -> None:
-        """Begin anew, with a friction that bears what the push so far lets it."""
-        self._limit = self._rough * self._press
-        self._press, self.impulse = np.zeros_like(self._press), np.zeros_like(self.impulse)
-
-    def push(self, velocity: FloatArray, spin: FloatArray) -> None:
-        """Let the lip push and rub."""
-        self.press(velocity, spin)
-        rows, normal = self.rows, self.normal
-        own = velocity[:, rows] + cross(spin[:, rows], self._arm) - self._lip
-        slip = own - _sum3(own * normal) * normal
-        rub = self._rub - self._across * slip
-        length = np.sqrt(_sum3(rub * rub))
-        rub *= np.minimum(self._limit / np.maximum(length, _LITTLE), 1.0)
-        self._give(velocity, spin, rub - self._rub)
-        self._rub = rub
-
-    def _give(self, velocity: FloatArray, spin: FloatArray, change: FloatArray) -> None:
-        velocity[:, self.rows] += change / self._mass
-        spin[:, self.rows] += _turned(self._mobility, *cross(self._arm, change))
-        self.impulse = self.impulse + change
-
-    def given_way(self, velocity: FloatArray, spin: FloatArray) -> FloatArray:
-        """Speed at which the spring gives way where it is at its strength, m/s."""
-        own = velocity[:, self.rows] + cross(spin[:, self.rows], self._arm) - self._lip
-        lacks = np.maximum(self._least - _sum3(own * self.normal), 0.0)
-        return np.where(self._press < self._strength, 0.0, lacks / np.maximum(-self.normal[2], 0.1))
-
-
 def least_rise(gap: FloatArray, seen: float = 0.0) -> FloatArray:
     """How far a contact at a distance (m) must open at least in a time step, m.
 
@@ -354,19 +351,6 @@ def axes(turn: FloatArray) -> FloatArray:
     )
 
 
-def cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """A x b, components first."""
-    return np.stack(
-        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-    )
-
-
-def _turned(mobility: FloatArray, x: FloatArray, y: FloatArray, z: FloatArray) -> FloatArray:
-    """The change of spin by an angular impulse."""
-    change: FloatArray = mobility[0] * x + mobility[1] * y + mobility[2] * z
-    return change
-
-
 def _sum3(parts: FloatArray) -> FloatArray:
     """Over the first axis, in one order."""
     total: FloatArray = parts[0] + parts[1] + parts[2]
@@ -379,9 +363,17 @@ def _sum3_last(parts: FloatArray) -> FloatArray:
     return total
 
 
-def _sum8(parts: FloatArray) -> FloatArray:
-    """Over the last axis but one, of 8 corners, in one order."""
-    four = parts[..., :4, :] + parts[..., 4:, :]
-    two = four[..., :2, :] + four[..., 2:, :]
-    total: FloatArray = two[..., 0, :] + two[..., 1, :]
+def _sum6(parts: FloatArray) -> FloatArray:
+    """Over the second axis of (c, 6, m)."""
+    three = parts[:, :3] + parts[:, 3:]
+    total: FloatArray = three[:, 0] + three[:, 1] + three[:, 2]
+    return total
+
+
+def _over_rows(parts: FloatArray) -> FloatArray:
+    """Over the first axis, of 1, 2, 4, 8 or 16, in one order."""
+    while len(parts) > 1:
+        middle = len(parts) // 2
+        parts = parts[:middle] + parts[middle:]
+    total: FloatArray = parts[0]
     return total
