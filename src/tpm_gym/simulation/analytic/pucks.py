@@ -42,6 +42,7 @@ _DEEP = 0.002  # m; a lip that is less below the top face comes out there
 _SLOW, _LAZY = 5e-3, 0.3  # m/s, rad/s: what nearly stands, or lies, and is slower comes to rest
 _LEVEL = 1e-5  # square of the sine of half the angle by which it nearly stands
 _ABOUT_Z = np.array([0.0, 0.0, 1.0, 1.0])
+_LANDING = 3 * GRAVITY  # m/s^2; then the engine does not know yet where it slips, and has a box
 _TURNING = 3.0  # a corner's distance over the radius of gyration of a square, squared
 _NEAR = 0.005  # m; around what the lip may touch
 
@@ -354,7 +355,10 @@ class Pucks:
             velocity[0] * velocity[0] + velocity[1] * velocity[1] + corner * turning * turning
         )
         taken = rough * normal / np.maximum(speed, _SETTLED)
-        velocity[:2] *= np.maximum(1 - taken, 0.0)
+        landed = rising - falling > _LANDING * step
+        bound = rough * normal * np.sqrt(0.5)
+        boxed = velocity[:2] - np.minimum(np.maximum(velocity[:2], -bound), bound)
+        velocity[:2] = np.where(landed, boxed, velocity[:2] * np.maximum(1 - taken, 0.0))
         turning *= np.maximum(1 - _TURNING * taken, 0.0)
         if done is not None:
             velocity[:2, shoved], turning[shoved] = done.velocity, done.turning

@@ -13,7 +13,7 @@ from tpm_gym.simulation.analytic.tumbling import ROUNDING, SEEN_BY_LIP, least_ri
 
 __all__ = ["Shove", "Side", "shove", "side_of"]
 
-_SWEEPS = 8
+_SWEEPS = 4
 _SHARE = 1 / 8  # of the masses; between the inverse masses of a drag, 4, and of a twist, 12
 _SLIP = 1e-4  # m/s
 _LEAST = 0.02  # of the friction along the axis across which it slips
