@@ -20,6 +20,7 @@ from tpm_gym.mechanism.cup import CUP, sealed
 from tpm_gym.mechanism.mount import GRAVITY
 from tpm_gym.simulation.analytic.shoving import Side, shove, side_of
 from tpm_gym.simulation.analytic.tumbling import (
+    ROUNDING,
     SEEN_BY_LIP,
     SLOP,
     Body,
@@ -38,7 +39,7 @@ _SPRING = 0.8  # share of the cup's way back that a time step leaves of it
 _SEAT = 2e-5  # m; distance of lip and face in a seal
 _SETTLED = 1e-6  # m, and m/s: less is none
 _SHALLOW = 2e-4  # m; what stands and is no deeper is at rest
-_DEEP = 0.002  # m; a lip that is less below the top face comes out there
+_DEEP = 2 * ROUNDING  # m; a lip that is less below the top face comes out there
 _SLOW, _LAZY = 5e-3, 0.3  # m/s, rad/s: what nearly stands, or lies, and is slower comes to rest
 _LEVEL = 1e-5  # square of the sine of half the angle by which it nearly stands
 _ABOUT_Z = np.array([0.0, 0.0, 1.0, 1.0])
@@ -315,10 +316,9 @@ class Pucks:
         overlap = position[2] + half + CUP.length - lip
         side = side_of(path[1, :2] - position[:2], turn, overlap, width / 2)
         known = state[_NORMAL.start : _NORMAL.stop - 1].any(axis=0)
-        beside = np.where(
-            known, side.gap < SEEN_BY_LIP, side.away >= np.minimum(_DEEP - overlap, 0.0)
-        )
-        above = (side.away < 0) & ~beside
+        deep = overlap > _DEEP
+        beside = (side.away > 0) | (deep & (known | (side.away >= _DEEP - overlap)))
+        above = ~beside
         apart = least_rise(-overlap, SEEN_BY_LIP) - (lip_after - lip) + rising * step
         excess = np.where(above, np.maximum(apart, 0.0), 0.0)
         slide = _SPRING * slide + excess

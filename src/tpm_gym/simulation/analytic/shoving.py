@@ -167,7 +167,16 @@ def shove(
     drag, rub = np.zeros_like(bounds), np.zeros_like(push)
     before = vx * nx + vy * ny
     push = np.zeros_like(push)
+    up = np.zeros_like(push)  # friction along the slant, which presses less and pushes more
+    share_up = share_n / np.maximum(side.slant * side.slant, 1e-3)
+    rises = side.level * (velocity[2] - lip[2]) - side.slant * (lip[0] * nx + lip[1] * ny)
     for _ in range(_SWEEPS):
+        wish = up - share_up * (side.slant * (vx * nx + vy * ny + lever_n * spin) + rises)
+        after = np.minimum(np.maximum(wish, -limit), limit)
+        p = side.slant * (after - up)
+        up = after
+        vx, vy, spin = vx + p * nx, vy + p * ny, spin + ease * lever_n * p
+        most = np.maximum(strength + side.level * up, 0.0) / np.maximum(steep, 1e-3)
         after = push + share_n * (least - vx * nx - vy * ny - lever_n * spin)
         after = np.minimum(np.maximum(after, 0.0), most)
         wish = rub - share_t * (vy * nx - vx * ny + lever_t * spin - lip_t)
@@ -184,6 +193,7 @@ def shove(
         change = (change[:, 0] + change[:, 1]) + (change[:, 2] + change[:, 3])
         twist = (twist[:, 0] + twist[:, 1]) + (twist[:, 2] + twist[:, 3])
         vx, vy, spin = vx + change[0], vy + change[1], spin + ease * (twist[0] + twist[1])
+    push = push + side.slant * up
     moment = push * height - (vx * nx + vy * ny - before) * (size[1] / 2)
     lacks = moment * np.abs(side.local) - half * weight
     reach = half - side.place * np.sign(side.local)
