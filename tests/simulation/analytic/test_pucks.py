@@ -192,28 +192,29 @@ def test_what_is_pulled_harder_than_the_vacuum_can_comes_off(
     assert (ours.held[-2:] == 0).all() == kept
     if kept:
         total = PUCK.mass * (GRAVITY + acceleration)
-        assert ours.force[-1] == pytest.approx([0.0, 0.0, -total], rel=1e-6)
+        assert ours.force[-1] == pytest.approx([0.0, 0.0, -total], rel=1e-3)
 
 
 def test_a_heavier_one_comes_off_and_a_smoother_one_slides_farther() -> None:
     pucks = Pucks(PUCK, 3, STEP)
     pucks.place(ALL, np.tile(MIDDLE, (3, 1)))
     pucks.alter(ALL, np.array([1.0, 1.0, 30.0]), np.array([1.0, 0.5, 1.0]))
-    speed = 0.4
-    rising = np.minimum(np.maximum(np.arange(-92, 60), 0), 20) * 0.002
-    moving = np.maximum(np.arange(-132, 20), 0) * speed * STEP
+    rising = np.minimum(np.maximum(np.arange(-92, 90), 0), 20) * 0.0002
+    moving = np.maximum(np.arange(-132, 50), 0) * 0.4 * STEP
     path = straight(PUCK.height + rising) + moving[:, None] * [1.0, 0.0, 0.0]
     path = np.repeat(path[:, :, None], 3, axis=2)
-    for k in range(150):
+    for k in range(180):
         if k == 148:
             assert pucks.report()["held"].tolist() == [0, 0, -1]
-            before = pucks.report()["object_position"][:, 0]
+            dropped = pucks.report()["object_position"][:, 0, 0]
         pucks.advance(ALL, path[k : k + 3], np.full(3, k < 148))
-    far = path[-1:].repeat(3, axis=0)
+    assert pucks.report()["held"].tolist() == [-1] * 3
+    still = path[-1:].repeat(3, axis=0) + np.array([0.0, 0.0, 0.2])[:, None]
     for _ in range(150):
-        pucks.advance(ALL, far + np.array([0.0, 0.0, 0.2])[:, None], np.zeros(3, dtype=bool))
-    ways = (pucks.report()["object_position"][:, 0] - before)[:2, 0]
-    assert 0.02 < ways[0] < ways[1]
+        pucks.advance(ALL, still, np.zeros(3, dtype=bool))
+    ways = pucks.report()["object_position"][:, 0, 0] - dropped
+    assert 0.005 < ways[0] < ways[1]
+    assert ways[2] == 0.0
 
 
 def test_without_friction_the_platform_takes_what_the_puck_gains() -> None:
@@ -254,13 +255,14 @@ def test_without_objects_there_is_nothing_to_report() -> None:
     report = pucks.report()
     assert report["object_position"].shape == (3, 0, 3)
     assert report["object_quaternion"].shape == (3, 0, 4)
-    assert report["held"].tolist() == [-1] * 3 and not report["vacuum"].any()
+    assert report["held"].tolist() == [-1] * 3
+    assert not report["vacuum"].any()
 
 
 # -- in batches -----------------------------------------------------------------------------------
 
 
-def crowd(count: int, seed: int, periods: int = 16) -> tuple[FloatArray, FloatArray]:
+def crowd(count: int, seed: int, periods: int = 8) -> tuple[FloatArray, FloatArray]:
     """Pucks (n, 3), and ways (2 + k, 3, n) of P that pick, shove, tip, press and throw."""
     rng = np.random.default_rng(seed)
     pucks = np.concatenate([rng.uniform(-0.02, 0.02, (count, 2)), np.full((count, 1), 0.015)], 1)
@@ -285,25 +287,24 @@ def history(pucks: FloatArray, ways: FloatArray, on: FloatArray) -> list[FloatAr
 def test_a_row_has_the_same_bits_alone_and_among_others() -> None:
     count = 1024
     pucks, ways = crowd(count, seed=0)
-    on = np.random.default_rng(1).random((16, count)) < 0.6
+    on = np.random.default_rng(1).random((8, count)) < 0.6
     everything = history(pucks, ways, on)
     axis = everything[4]
     assert axis.shape == (count, 1, 3)
     tilted = np.concatenate([part[:, 0, 2] < 0.99 for part in everything[4::8]])
-    assert tilted.any() and (everything[7] == 0).any()
+    assert tilted.any()
+    assert any((part == 0).any() for part in everything[6::8])
     # Those that have tilted, and some others
     worst = np.argsort(np.min([part[:, 0, 2] for part in everything[4::8]], axis=0))
-    for size in (1, 7):
-        for start in range(0, 21, size):
-            rows = np.concatenate([worst[start : start + size], [start * 3]])[:size]
-            few = history(pucks[rows], np.ascontiguousarray(ways[:, :, rows]), on[:, rows])
-            for part, whole in zip(few, everything, strict=True):
-                np.testing.assert_array_equal(part, whole[rows])
+    for rows in (worst[:1], worst[1:2], np.array([5]), worst[2:9], np.append(worst[:4], [9, 8, 7])):
+        few = history(pucks[rows], np.ascontiguousarray(ways[:, :, rows]), on[:, rows])
+        for part, whole in zip(few, everything, strict=True):
+            np.testing.assert_array_equal(part, whole[rows])
 
 
 def test_rows_may_be_advanced_apart_and_go_on_from_what_was_saved() -> None:
     pucks, ways = crowd(12, seed=3)
-    on = np.ones((16, 12), dtype=bool)
+    on = np.ones((8, 12), dtype=bool)
     whole = history(pucks, ways, on)
     batch, other = Pucks(PUCK, 12, STEP), Pucks(PUCK, 12, STEP)
     batch.place(ALL, pucks)
@@ -312,7 +313,7 @@ def test_rows_may_be_advanced_apart_and_go_on_from_what_was_saved() -> None:
         steps = ways[k : k + STEPS + 2]
         for rows in (odd, even):
             batch.advance(rows, np.ascontiguousarray(steps[:, :, rows]), on[period, rows])
-        if period == 7:  # and go on in another one
+        if period == 4:  # and go on in another one
             other.restore(ALL, batch.save(ALL))
             batch = other
     for part, expected in zip(batch.report().values(), whole[-7:], strict=True):

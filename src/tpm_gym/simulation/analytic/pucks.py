@@ -18,7 +18,7 @@ import numpy as np
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray
 from tpm_gym.mechanism.cup import CUP, sealed
 from tpm_gym.mechanism.mount import GRAVITY
-from tpm_gym.simulation.analytic.shoving import Side, shove, side_of
+from tpm_gym.simulation.analytic.shoving import Side, Standing, Strengths, shove, side_of
 from tpm_gym.simulation.analytic.tumbling import (
     ROUNDING,
     SEEN_BY_LIP,
@@ -290,9 +290,7 @@ class Pucks:
         seal[:2] += rough * normal * velocity[:2] / np.maximum(speed, _SETTLED)
         seal[2] -= normal
         force = -seal
-        lift = path[2, 2] - 2 * path[1, 2] + path[0, 2]
-        cup = CUP.preload + _CUP_MASS * (GRAVITY + lift / (step * step))
-        force[2] = np.where(pressed, cup, force[2])
+        force[2] = np.where(pressed, self._spring(path), force[2])
         state[_POSITION], state[_VELOCITY], state[_SPIN] = there, velocity, 0.0
         state[_SLIDE] = np.where(slide < _SETTLED, 0.0, slide)
         return force, np.stack([seal[2], np.sqrt(seal[0] * seal[0] + seal[1] * seal[1])])
@@ -306,75 +304,66 @@ class Pucks:
         """
         assert self._block is not None
         step, half, width = self._time_step, self._block.height / 2, self._block.width
-        position, velocity, turn = state[_POSITION], state[_VELOCITY], state[_TURN]
-        least = least_rise(self._gap(position)) / step
+        position, velocity = state[_POSITION], state[_VELOCITY]
         falling = velocity[2] - GRAVITY * step
-        rising = np.maximum(falling, least)
+        velocity[2] = np.maximum(falling, least_rise(self._gap(position)) / step)
+        carried = velocity[2] - falling
         # The lip: beside or above, as it was, else by the shorter way out
-        slide = state[_SLIDE]
-        lip, lip_after = path[1, 2] + slide, path[2, 2] + _SPRING * slide
-        overlap = position[2] + half + CUP.length - lip
-        side = side_of(path[1, :2] - position[:2], turn, overlap, width / 2)
-        known = state[_NORMAL.start : _NORMAL.stop - 1].any(axis=0)
-        deep = overlap > _DEEP
+        moved, slide = path[2] - path[1], state[_SLIDE]
+        moved[2] -= (1 - _SPRING) * slide
+        overlap = position[2] + half + CUP.length - path[1, 2] - slide
+        side = side_of(path[1, :2] - position[:2], state[_TURN], overlap, width / 2)
+        known, deep = state[_NORMAL].any(axis=0), overlap > _DEEP
         beside = (side.away > 0) | (deep & (known | (side.away >= _DEEP - overlap)))
-        above = ~beside
-        apart = least_rise(-overlap, SEEN_BY_LIP) - (lip_after - lip) + rising * step
-        excess = np.where(above, np.maximum(apart, 0.0), 0.0)
-        slide = _SPRING * slide + excess
+        apart = least_rise(-overlap, SEEN_BY_LIP) - moved[2] + velocity[2] * step
+        excess = np.where(beside, 0.0, np.maximum(apart, 0.0))
         pressed = excess > 0
-        tips = pressed & (rising == falling)
-        lift = path[2, 2] - 2 * path[1, 2] + path[0, 2]
-        cup = CUP.preload + _CUP_MASS * (GRAVITY + lift / (step * step))
+        slide = _SPRING * slide + excess
         force = np.zeros_like(position)
-        force[2] = np.where(pressed, cup, 0.0)
-        normal = rising - falling + pressed * CUP.preload * step / mass
-        velocity[2] = rising
-        state[_NORMAL] = 0.0
+        force[2] = np.where(pressed, self._spring(path), 0.0)
+        normal = carried + pressed * CUP.preload * step / mass
         shoved = np.flatnonzero(beside & (overlap > 0) & (side.gap < SEEN_BY_LIP))
-        moved = path[2] - path[1]
+        tips, moves = pressed & (carried == 0), (velocity != 0)[:2].any(axis=0)
         done = None
         if len(shoved):
+            spin = state[_SPIN][2, shoved]
             done = shove(
                 Side(*(part[..., shoved] for part in side)),
-                velocity[:, shoved],
-                state[_SPIN][2, shoved],
-                turn[:, shoved],
-                np.concatenate([moved[:2], (lip_after - lip)[None]])[:, shoved] / step,
-                normal[shoved],
-                CUP.preload * step / mass[shoved],
-                rough[shoved],
+                Standing(velocity[:, shoved], spin, state[_TURN][:, shoved]),
+                moved[:, shoved] / step,
+                Strengths(normal[shoved], CUP.preload * step / mass[shoved], rough[shoved]),
                 (width, 2 * half),
                 2 * half - 0.5 * overlap[shoved],
                 step,
             )
-        turning = state[_SPIN][2]
-        # Turning counts by the corners' speed, and their friction acts so much more on it.
-        corner = 0.5 * width**2
-        speed = np.sqrt(
-            velocity[0] * velocity[0] + velocity[1] * velocity[1] + corner * turning * turning
-        )
-        taken = rough * normal / np.maximum(speed, _SETTLED)
-        landed = rising - falling > _LANDING * step
-        bound = rough * normal * np.sqrt(0.5)
-        boxed = velocity[:2] - np.minimum(np.maximum(velocity[:2], -bound), bound)
-        velocity[:2] = np.where(landed, boxed, velocity[:2] * np.maximum(1 - taken, 0.0))
-        turning *= np.maximum(1 - _TURNING * taken, 0.0)
+        moves |= state[_SPIN][2] != 0
+        _slow_down(state, rough * normal, carried > _LANDING * step, width)
+        state[_NORMAL] = 0.0
         if done is not None:
-            velocity[:2, shoved], turning[shoved] = done.velocity, done.turning
+            velocity[:2, shoved], state[_SPIN.start + 2, shoved] = done.velocity, done.turning
             force[:2, shoved] = -mass[shoved] * done.impulse / step
-            pushes = (done.impulse != 0).any(axis=0)
-            tips[shoved] = done.tips | (pushes & (rising == falling)[shoved])
+            aloft = (done.impulse != 0).any(axis=0) & (carried[shoved] == 0)
+            tips[shoved] = done.tips | aloft
             state[_NORMAL.start : _NORMAL.stop - 1, shoved] = side.normal[:, shoved]
         position += velocity * step
-        _yaw(turn, turning * step)
+        _yaw(state[_TURN], state[_SPIN][2] * step)
         state[_SLIDE] = np.where(slide < _SETTLED, 0.0, slide)
-        gap = self._gap(position)
-        rests = (rising > falling) & (speed == 0.0) & (excess == 0.0) & (state[_SLIDE] == 0.0)
+        rests = (carried > 0) & ~moves & ~pressed & (state[_SLIDE] == 0)
+        return force, self._come_to_rest(state, rests), tips
+
+    def _come_to_rest(self, state: FloatArray, rests: BoolArray) -> BoolArray:
+        """Which of the upright objects that could rest do, and bring these to their level."""
+        gap = self._gap(state[_POSITION])
         rests &= (gap > -_SHALLOW) & (gap <= 0) & (state[_NORMAL] == 0).all(axis=0)
-        position[2] = np.where(rests, position[2] - gap - SLOP, position[2])
-        velocity[2] = np.where(rests, 0.0, velocity[2])
-        return force, rests, tips
+        state[_POSITION][2] -= np.where(rests, gap + SLOP, 0.0)
+        state[_VELOCITY][2] = np.where(rests, 0.0, state[_VELOCITY][2])
+        return rests
+
+    def _spring(self, path: FloatArray) -> FloatArray:
+        """Force (r,) N on the platform of a cup that is pushed back and bears its own weight."""
+        lift = path[2, 2] - 2 * path[1, 2] + path[0, 2]
+        force: FloatArray = CUP.preload + _CUP_MASS * (GRAVITY + lift / self._time_step**2)
+        return force
 
     def _move_any(
         self, state: FloatArray, path: FloatArray, mass: FloatArray, rough: FloatArray
@@ -395,9 +384,7 @@ class Pucks:
         state[_SLIDE], state[_NORMAL] = np.where(slide < _SETTLED, 0.0, slide), normal
         state[_POSITION], state[_VELOCITY], state[_TURN], state[_SPIN] = after
         force = -impulse / step
-        lift = path[2, 2] - 2 * path[1, 2] + path[0, 2]
-        cup = CUP.preload + _CUP_MASS * (GRAVITY + lift / (step * step))
-        force[2] = np.where(pushed > 0, cup, force[2])
+        force[2] = np.where(pushed > 0, self._spring(path), force[2])
         return force, self._settle(state)
 
     def _settle(self, state: FloatArray) -> BoolArray:
@@ -465,6 +452,21 @@ def _axis(turn: FloatArray) -> FloatArray:
     x, y, z, w = turn
     axis: FloatArray = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
     return axis
+
+
+def _slow_down(state: FloatArray, most: FloatArray, landed: BoolArray, width: float) -> None:
+    """Let the table take impulses of at most ``most`` (m/s), by the mass, from what slides.
+
+    Turning counts by the speed of the corners, and their friction acts so much more on it.
+    """
+    velocity, turning = state[_VELOCITY], state[_SPIN][2]
+    squares = velocity[0] * velocity[0] + velocity[1] * velocity[1]
+    speed = np.sqrt(squares + 0.5 * width**2 * turning * turning)
+    taken = most / np.maximum(speed, _SETTLED)
+    bound = most * np.sqrt(0.5)
+    boxed = velocity[:2] - np.minimum(np.maximum(velocity[:2], -bound), bound)
+    velocity[:2] = np.where(landed, boxed, velocity[:2] * np.maximum(1 - taken, 0.0))
+    turning *= np.maximum(1 - _TURNING * taken, 0.0)
 
 
 def _yaw(turn: FloatArray, angle: FloatArray) -> None:

@@ -11,7 +11,7 @@ from tpm_gym.arrays import BoolArray, FloatArray
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.simulation.analytic.tumbling import ROUNDING, SEEN_BY_LIP, least_rise
 
-__all__ = ["Shove", "Side", "shove", "side_of"]
+__all__ = ["Shove", "Side", "Standing", "Strengths", "shove", "side_of"]
 
 _SWEEPS = 4
 _SHARE = 1 / 8  # of the masses; between the inverse masses of a drag, 4, and of a twist, 12
@@ -82,6 +82,28 @@ def side_of(away: FloatArray, turn: FloatArray, overlap: FloatArray, half: float
     return Side(gap, normal, arm, apart, way, place, level, slant)
 
 
+class Standing(NamedTuple):
+    """Blocks that stand: velocity (3, m) m/s, turning (m,) rad/s, quaternions (4, m)."""
+
+    velocity: FloatArray
+    turning: FloatArray
+    turn: FloatArray
+
+
+class Strengths(NamedTuple):
+    """What may act on blocks (m,).
+
+    Attributes:
+        weight: m/s, impulse with which the table carries them, by their mass.
+        spring: m/s, impulse of the cup's spring, by their mass.
+        rough: Coulomb coefficient on the table.
+    """
+
+    weight: FloatArray
+    spring: FloatArray
+    rough: FloatArray
+
+
 class Shove(NamedTuple):
     """What a shove does in a time step.
 
@@ -100,13 +122,9 @@ class Shove(NamedTuple):
 
 def shove(
     side: Side,
-    velocity: FloatArray,
-    turning: FloatArray,
-    turn: FloatArray,
+    block: Standing,
     lip: FloatArray,
-    weight: FloatArray,
-    strength: FloatArray,
-    rough: FloatArray,
+    strengths: Strengths,
     size: tuple[float, float],
     height: FloatArray,
     step: float,
@@ -118,17 +136,14 @@ def shove(
 
     Args:
         side: Where the lips are.
-        velocity: (3, m) m/s before it.
-        turning: (m,) rad/s before it.
-        turn: (4, m) quaternions.
+        block: The blocks before it.
         lip: (3, m) m/s, of the lips.
-        weight: (m,) m/s, impulse with which the tables carry the blocks.
-        strength: (m,) m/s, impulse of the cup's spring.
-        rough: (m,) Coulomb coefficient on the tables.
+        strengths: What may act.
         size: The blocks' width and height, m.
         height: (m,) m, at which the lips push, over the table.
         step: s.
     """
+    (velocity, turning, turn), (weight, strength, rough) = block, strengths
     (nx, ny), (rx, ry), half = side.normal, side.arm, size[0] / 2
     ease = 6 / size[0] ** 2  # mass over moment of inertia about the vertical
     lever_n, lever_t = rx * ny - ry * nx, rx * nx + ry * ny
