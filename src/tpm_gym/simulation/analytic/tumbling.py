@@ -1,9 +1,10 @@
 """A free block between table and cup, in any posture: rigid bodies in batches.
 
-Contacts are those of the block's eight corners with the level below, and one with the cup. A time
-step finds their impulses by sweeps over them: all corners' normals at once (Jacobi, at the step
-that converges fastest for a standing block), friction where the corners' pressure has its centre,
-then the cup. Elementwise throughout; sums over corners have one order whatever the number of rows.
+Contacts are those of the block's eight corners with the level below, and one with the cup. As in
+PyBullet's direct solver, friction bears what the normal impulses would be without it: they are
+found first, then all again with such bounds. Each time by sweeps: all corners at once (Jacobi, at
+the steps that converge fastest for a standing block), then the cup. Elementwise throughout; sums
+over corners have one order whatever the number of rows.
 
 As in PyBullet, block and cup have their edges rounded for each other: by 1 mm each.
 """
@@ -194,18 +195,19 @@ class _Rows:
 
     def along(self, velocity: FloatArray) -> FloatArray:
         """(c, m) m/s of something that does not turn, along the constraints."""
-        parts = self._jacobian[:, :3] * velocity
-        return parts[:, 0] + parts[:, 1] + parts[:, 2]
+        return _sum3_last(self._jacobian[:, :3] * velocity)
 
     def force(self, impulses: FloatArray) -> FloatArray:
         """(3, m) N s of two constraints' impulses."""
-        return self._jacobian[0, :3] * impulses[0] + self._jacobian[1, :3] * impulses[1]
+        first, second = self._jacobian[:, :3] * impulses[:, None]
+        force: FloatArray = first + second
+        return force
 
     def solve(
         self, twist: FloatArray, impulses: FloatArray, least: Any, low: Any, high: Any
     ) -> FloatArray:
         """Change impulses (c, m) so that speeds come to ``least``, and ``twist`` by them."""
-        after = impulses + self._share * (least - self.speed(twist))
+        after: FloatArray = impulses + self._share * (least - self.speed(twist))
         after = np.minimum(np.maximum(after, low), high)
         twist += _over_rows(self._response * (after - impulses)[:, None])
         return after
@@ -358,7 +360,7 @@ def _sum3(parts: FloatArray) -> FloatArray:
 
 
 def _sum3_last(parts: FloatArray) -> FloatArray:
-    """Over the second axis of (3, 3, m)."""
+    """Over the second axis of (c, 3, m)."""
     total: FloatArray = parts[:, 0] + parts[:, 1] + parts[:, 2]
     return total
 
