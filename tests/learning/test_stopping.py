@@ -24,10 +24,11 @@ from trainings import (
 
 import tpm_gym
 from tpm_gym.learning import ResumeConfig, TrainingConfig, callbacks, resume, train
-from tpm_gym.learning.callbacks import Checkpointing, SignalListener
+from tpm_gym.learning.callbacks import Checkpointing
 from tpm_gym.learning.checkpoint import CheckpointStore, Content
 from tpm_gym.learning.errors import ConfigError, RunError
 from tpm_gym.learning.run_folder import claimed
+from tpm_gym.learning.signals import SignalListener
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
 

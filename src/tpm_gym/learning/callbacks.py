@@ -1,13 +1,8 @@
 """What happens besides learning while a policy trains: evaluation, checkpoints, stopping."""
 
 import json
-import signal
-import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass
-from types import FrameType
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from rich.console import Console
@@ -25,6 +20,7 @@ from tpm_gym.learning.policies import TrainedPolicy
 from tpm_gym.learning.report.figures import draw_learning_curve
 from tpm_gym.learning.rollout import SELECTION_SEED, GoalEnv, run_batch, run_episodes, summarise
 from tpm_gym.learning.run_folder import CURVE_FILE, EVALUATIONS_FILE
+from tpm_gym.learning.signals import SignalListener
 from tpm_gym.learning.training_state import capture
 
 _SHORTEST_INTERVAL: Final = 30.0  # s between checkpoints
@@ -151,32 +147,6 @@ class ProgressBar(BaseCallback):
     def close(self) -> None:
         """Leave the terminal as it was; safe to call at any time."""
         self._progress.stop()
-
-
-@dataclass
-class SignalListener:
-    """Remembers that the process was asked to stop; a second signal ends it at once.
-
-    An exception in the middle of an update could leave a half-updated network to save.
-    """
-
-    received: signal.Signals | None = None
-
-    @contextmanager
-    def listening(self) -> Iterator[None]:
-        """Take over SIGINT (Ctrl-C) and SIGTERM inside the context."""
-        signals = (signal.SIGINT, signal.SIGTERM)
-        before = {number: signal.signal(number, self._receive) for number in signals}
-        try:
-            yield
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
-
-    def _receive(self, number: int, frame: FrameType | None) -> None:
-        if self.received is not None:
-            sys.exit(128 + number)
-        self.received = signal.Signals(number)
 
 
 class StopTrainingError(Exception):

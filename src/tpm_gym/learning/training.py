@@ -182,11 +182,11 @@ def _learn(
         Checkpointing,
         PeriodicEvaluation,
         ProgressBar,
-        SignalListener,
         StopTrainingError,
     )
     from tpm_gym.learning.demonstrations import Demonstrations
     from tpm_gym.learning.logger import make_logger
+    from tpm_gym.learning.signals import SignalListener
 
     torch.set_num_threads(config.threads)
     bar, listener = ProgressBar(console), SignalListener()
