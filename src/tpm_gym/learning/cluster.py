@@ -76,7 +76,7 @@ def _require_answer(address: str) -> None:
 
 def each(
     work: Callable[[Item], Outcome], items: Sequence[Item]
-) -> Iterator[tuple[Item, Outcome | Exception]]:
+) -> Iterator[tuple[Item, Outcome | str]]:
     """Do a piece of work for each item, in a process of its own on one CPU; yield what comes of it.
 
     Results come in the order of their ends. When a process or its node dies, its item is begun
@@ -84,7 +84,8 @@ def each(
     drops what waits; a second one leaves at once.
 
     Yields:
-        An item, and what the work returned; or the error that it raised, or that ended it.
+        An item, and what the work returned, or in words the error that ended it. Nothing of one
+        that was dropped.
     """
     import ray
 
@@ -101,6 +102,9 @@ def each(
                     ray.cancel(reference)
             for reference in done:
                 try:
-                    yield found[reference], ray.get(reference)
+                    outcome = ray.get(reference)
+                except ray.exceptions.TaskCancelledError:
+                    continue
                 except ray.exceptions.RayError as error:
-                    yield found[reference], error
+                    outcome = f"failed: {found[reference]}: {error}"
+                yield found[reference], outcome

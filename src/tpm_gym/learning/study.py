@@ -1,43 +1,52 @@
-"""Run the trainings and tests of docs/results.md as processes, some at once.
+"""Run the trainings and tests of docs/results.md on Ray: some at once here, or on a cluster.
 
 ``results``: every recipe on its ids, five seeds each, tested on 1000 held-out episodes.
 ``penalty``: the same recipes with the singularity penalty off and on, on goals that tempt towards
-the singularity. ``robustness``: the policies of ``results`` on machines never seen in training.
+the singularity. ``robustness``: the published policies on machines that differ more and more in one
+thing, until success has halved.
 
 It can be stopped with Ctrl-C at any time and started again: trainings go on from their last
-checkpoint. A training that fails is reported, and the others go on.
+checkpoint. So do, elsewhere and at once, those whose process or node dies. A training that fails is
+reported, and the others go on.
+
+Checkpoints travel by disk alone: all nodes of a cluster have to see the working folder and
+``--folder``, at the same paths. Runs fail on a node that does not.
 """
 
 import json
 import os
 import shlex
 import signal
-import subprocess
+import socket
 import sys
-import threading
-from concurrent.futures import ThreadPoolExecutor
+import tempfile
+import time
+import traceback
+from collections.abc import Sequence
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
+from tpm_gym.learning import cluster
 from tpm_gym.learning.algorithms import ALGORITHMS
 from tpm_gym.learning.configuration import UNSET, check_least, shown_default, unset
 from tpm_gym.learning.environments import check_env_id
-from tpm_gym.learning.errors import ConfigError, LearningError
+from tpm_gym.learning.errors import ConfigError, LearningError, RunError
+from tpm_gym.learning.provenance import require_writable
 from tpm_gym.learning.recipes import read_recipes, recipe_file
 from tpm_gym.learning.report.page import NOMINAL, TEMPTING
-from tpm_gym.learning.run_folder import CONFIG_FILE, TESTS, is_finished
+from tpm_gym.learning.robustness import OF_PUCK, OF_SERVOS, ends, halving
+from tpm_gym.learning.run_folder import CONFIG_FILE, TESTS, WHOLE, claimed, is_finished
+from tpm_gym.policy.files import published
+from tpm_gym.simulation.randomisation import LIMITS
 from tpm_gym.tasks.registry import TASKS
 
 _PENALTY_IDS: Final = ("TPMReach-v0", "TPMReachJoints-v0", "TPMPickAndPlaceJoints-v0")
-_ROBUSTNESS_IDS: Final = ("TPMReach-v0", "TPMPickAndPlace-v0", "TPMPickAndPlaceJoints-v0")
 _WEIGHTS: Final = (0.0, 1.0)
-_MACHINES: Final = ("encoder_noise=1e-4", "length_error=5e-4")
-_MACHINES_WITH_PUCK: Final = (*_MACHINES, "puck_mass=2", "friction=0.5")
-
-_stopping = threading.Event()
-_running: set[subprocess.Popen[bytes]] = set()
+_STOPPED: Final = (128 + signal.SIGINT, 128 + signal.SIGTERM)
+_GRACE: Final = 30  # s
 
 
 @dataclass(frozen=True)
@@ -45,32 +54,36 @@ class StudyConfig:
     """Run the trainings and tests of docs/results.md; what is done already is left out."""
 
     plan: Literal["results", "penalty", "robustness"]
-    """What to run; robustness needs the runs of results."""
+    """What to run; robustness tests the published policies, and trains nothing."""
 
-    envs: Annotated[tuple[str, ...], shown_default("all for results, else three", "ID ...")] = ()
+    envs: Annotated[tuple[str, ...], shown_default("all, for penalty three", "ID ...")] = ()
     """Environment ids."""
 
     steps: Annotated[int, unset(int, "as the recipes say", "INT")] = UNSET
-    """Steps of each training. Runs of other lengths than their recipes' have folders of their own,
-    which robustness, too, looks for."""
+    """Steps of each training. Runs of other lengths than their recipes' have folders of their
+    own."""
 
     algos: Annotated[tuple[str, ...], shown_default("all for results, else sac", "NAME ...")] = ()
     """Algorithms."""
 
     seeds: int = 5
-    """Seeds, from 0 up."""
+    """Seeds of the trainings, from 0 up."""
 
     episodes: int = 1000
     """Episodes of each test."""
 
     folder: Path = Path("runs/study")
-    """Folder of the run folders."""
+    """Folder of the run folders; all nodes of a cluster have to see it, and the working folder."""
+
+    address: Annotated[str | None, unset(str, "this machine alone", "HOST:PORT")] = None
+    """Ray cluster to run on, as ray start --head prints it; it runs as much at once as it has
+    CPUs."""
 
     jobs: int = 2
-    """Runs at once; each uses one CPU core."""
+    """Runs at once on this machine alone; each uses one CPU core."""
 
     dry_run: bool = False
-    """Print the commands that are left to run, and run none."""
+    """Print the commands that are left to run, and run none. Of a bisection that is the next."""
 
 
 @dataclass(frozen=True)
@@ -78,40 +91,112 @@ class Run:
     """A training and its tests.
 
     Attributes:
-        options: Options of the training besides the others; None: the run is only tested.
+        options: Options of the training besides the others.
         tests: Name of each test and options of its evaluation.
     """
 
     folder: Path
     env: str
     algo: str
-    options: tuple[str, ...] | None
+    options: tuple[str, ...]
     tests: tuple[tuple[str, tuple[str, ...]], ...]
 
+    def left(self, episodes: int) -> list[list[str]]:
+        """Return the commands that are left, tests of so many episodes; none where all is done."""
+        left = []
+        folder = str(self.folder)
+        if not is_finished(self.folder):
+            if (self.folder / CONFIG_FILE).is_file():
+                left.append(["tpm-gym", "resume", folder])
+            else:
+                options = ["--env", self.env, "--algo", self.algo, *self.options, "--run", folder]
+                left.append(["tpm-gym", "train", *options])
+        for name, changes in self.tests:
+            file = self.folder / TESTS / f"{name}.json"
+            # Trainings delete the tests of earlier policies.
+            if left or not (file.is_file() and _test(file)["episodes"] == episodes):
+                left.append(_evaluation(folder, self.env, episodes, changes, file))
+        return left
 
-def plan_runs(config: StudyConfig) -> list[Run]:
+
+@dataclass(frozen=True)
+class Bisection:
+    """Tests of a published policy that find at which size of an attribute success halves."""
+
+    folder: Path
+    env: str
+    attribute: str
+
+    def left(self, episodes: int) -> list[list[str]]:
+        """Return the next command, a test of so many episodes; none where all is done."""
+        successes = {}
+        for file in sorted((self.folder / TESTS).glob(WHOLE)):
+            test = _test(file)
+            if test["episodes"] == episodes:
+                value = test["randomisation"][self.attribute]
+                successes[float(value)] = test["success_at_end"]["mean"]
+        for end in ends(self.attribute):
+            value = halving(self.attribute, end, successes).missing
+            if value is not None:
+                drive = ("--drive", "servo") if self.attribute in OF_SERVOS else ()
+                changes = (*drive, "--randomisation", f"{self.attribute}={value:g}")
+                file = self.folder / TESTS / f"{value:g}.json"
+                return [_evaluation(self.env, self.env, episodes, changes, file)]
+        return []
+
+
+def _evaluation(
+    policy: str, env: str, episodes: int, changes: tuple[str, ...], file: Path
+) -> list[str]:
+    test = ["tpm-gym", "evaluate", "--policy", policy, "--env", env]
+    return [*test, "--episodes", str(episodes), *changes, "--json", str(file)]
+
+
+def _test(file: Path) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads(file.read_bytes())
+    return content
+
+
+# -- plans ----------------------------------------------------------------------------------------
+
+
+def plan_runs(config: StudyConfig) -> list[Run] | list[Bisection]:
     """Return the runs of a plan, the seeds of each id together.
 
     Raises:
         ConfigError: No run is left of the plan, or a number cannot work.
     """
     check_least(config, 1, "steps", "seeds", "episodes", "jobs")
+    runs = _bisections(config) if config.plan == "robustness" else _trainings(config)
+    if not runs:
+        left = "no published policy" if config.plan == "robustness" else "no recipe of the plan"
+        raise ConfigError(f"--envs {' '.join(config.envs)}: leaves {left}")
+    return runs
+
+
+def _bisections(config: StudyConfig) -> list[Bisection]:
+    return [
+        Bisection(config.folder / f"{env}-{attribute}", env, attribute)
+        for env in published()
+        if not config.envs or env in config.envs
+        for attribute in LIMITS
+        if attribute not in OF_PUCK or TASKS[check_env_id(env).kwargs["task"]].scene.objects
+    ]
+
+
+def _trainings(config: StudyConfig) -> list[Run]:
     usual = tuple(ALGORITHMS) if config.plan == "results" else ("sac",)
-    runs = [
+    return [
         run
         for algo in config.algos or usual
         for env in _ids(config, algo)
         for seed in range(config.seeds)
         for run in _runs_of(config, env, algo, seed)
     ]
-    if not runs:
-        raise ConfigError(f"--envs {' '.join(config.envs)}: leaves no recipe of the plan")
-    return runs
 
 
 def _ids(config: StudyConfig, algo: str) -> list[str]:
-    usual = {"results": (), "penalty": _PENALTY_IDS, "robustness": _ROBUSTNESS_IDS}
-    wanted = config.envs or usual[config.plan]
+    wanted = config.envs or (() if config.plan == "results" else _PENALTY_IDS)
     return [env for env in read_recipes(recipe_file(algo), algo) if not wanted or env in wanted]
 
 
@@ -121,111 +206,126 @@ def _runs_of(config: StudyConfig, env: str, algo: str, seed: int) -> list[Run]:
     if config.steps is not UNSET:
         name += f"-{config.steps}steps"
         options += ["--steps", str(config.steps)]
-    if config.plan == "penalty":
-        goals = ("--goals", "tempting")
-        return [
-            Run(
-                config.folder / f"{name}-tempting-w{weight:g}-s{seed}",
-                env,
-                algo,
-                (*options, *goals, "--penalty-weight", f"{weight:g}"),
-                ((TEMPTING, goals),),
-            )
-            for weight in _WEIGHTS
-        ]
-    folder = config.folder / f"{name}-s{seed}"
     if config.plan == "results":
+        folder = config.folder / f"{name}-s{seed}"
         return [Run(folder, env, algo, tuple(options), ((NOMINAL, ()),))]
-    puck = bool(TASKS[check_env_id(env).kwargs["task"]].scene.objects)
-    machines = _MACHINES_WITH_PUCK if puck else _MACHINES
-    tests = tuple((entry.split("=")[0], ("--randomisation", entry)) for entry in machines)
-    return [Run(folder, env, algo, None, tests)]
-
-
-# -- what is left to do ---------------------------------------------------------------------------
-
-
-def commands(run: Run, episodes: int) -> list[list[str]]:
-    """Return the commands that are left, tests of so many episodes; none where all is done."""
-    left = []
-    folder = str(run.folder)
-    if run.options is not None and not is_finished(run.folder):
-        if (run.folder / CONFIG_FILE).is_file():
-            left.append(["tpm-gym", "resume", folder])
-        else:
-            options = ["--env", run.env, "--algo", run.algo, *run.options, "--run", folder]
-            left.append(["tpm-gym", "train", *options])
-    for name, changes in run.tests:
-        file = run.folder / TESTS / f"{name}.json"
-        if left or not _is_tested(file, episodes):
-            test = ["tpm-gym", "evaluate", "--policy", folder, "--env", run.env]
-            left.append([*test, "--episodes", str(episodes), *changes, "--json", str(file)])
-    return left
-
-
-def _is_tested(file: Path, episodes: int) -> bool:
-    """Whether a test has been, with as many episodes; trainings delete those of other policies."""
-    return file.is_file() and json.loads(file.read_bytes())["episodes"] == episodes
+    goals = ("--goals", "tempting")
+    return [
+        Run(
+            config.folder / f"{name}-tempting-w{weight:g}-s{seed}",
+            env,
+            algo,
+            (*options, *goals, "--penalty-weight", f"{weight:g}"),
+            ((TEMPTING, goals),),
+        )
+        for weight in _WEIGHTS
+    ]
 
 
 # -- running --------------------------------------------------------------------------------------
-
-
-def execute(run: Run, episodes: int) -> bool:
-    """Run what is left, with the output in a file beside the run; return whether all went well."""
-    log = run.folder.with_suffix(".log")
-    log.parent.mkdir(parents=True, exist_ok=True)
-    for command in commands(run, episodes):
-        if _stopping.is_set():
-            return False
-        print(shlex.join(command), flush=True)
-        with log.open("ab") as file:
-            # Out of the terminal's process group: Ctrl-C is to reach a training once, from here.
-            process = subprocess.Popen(
-                [sys.executable, "-m", "tpm_gym.learning", *command[1:]],
-                stdout=file,
-                stderr=file,
-                start_new_session=True,
-            )
-            _running.add(process)
-            if _stopping.is_set():
-                process.terminate()
-            status = process.wait()
-            _running.discard(process)
-        if status != 0:
-            how = "stopped" if _stopping.is_set() else f"failed with status {status}, see {log}"
-            print(f"{how}: {shlex.join(command)}", flush=True)
-            return False
-    return True
-
-
-def _stop(*_: Any) -> None:
-    """Let the trainings save a checkpoint and end, and start nothing more."""
-    _stopping.set()
-    for process in list(_running):
-        process.terminate()
 
 
 def study(config: StudyConfig) -> None:
     """Run a plan, or show it.
 
     Raises:
-        ConfigError: An option is not valid, or robustness lacks the runs of results.
+        ConfigError: An option is not valid.
         LearningError: Some runs failed, or were stopped.
+        MissingPackageError: Ray is not installed.
     """
     runs = plan_runs(config)
     if config.dry_run:
-        left = [command for run in runs for command in commands(run, config.episodes)]
+        left = [command for run in runs for command in run.left(config.episodes)]
         print(*map(shlex.join, left), sep="\n")
         return
-    for run in runs:
-        if run.options is None and not is_finished(run.folder):
-            needed = f"needs the finished run {run.folder}; run --plan results first"
-            raise ConfigError(f"--plan {config.plan}: {needed}")
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, _stop)
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # as many threads as cores would share them
-    with ThreadPoolExecutor(config.jobs) as pool:
-        outcomes = list(pool.map(partial(execute, episodes=config.episodes), runs))
-    if failures := outcomes.count(False):
+    if failures := run_all(runs, config):
         raise LearningError(f"{failures} runs failed or were stopped; start again to go on")
+
+
+def run_all(runs: Sequence[Run | Bisection], config: StudyConfig) -> int:
+    """Run what is left of all, as the configuration says where; return how many did not end well.
+
+    Raises:
+        ConfigError: There is no cluster at the address, or the folder cannot be written.
+        MissingPackageError: Ray is not installed.
+    """
+    ended_well = 0
+    require_writable("--folder", config.folder / "log")
+    with (
+        cluster.connected(config.address, config.jobs),
+        tempfile.NamedTemporaryFile(prefix=".", dir=config.folder) as seen,
+    ):
+        work = partial(
+            _execute_there, episodes=config.episodes, here=Path.cwd(), seen=Path(seen.name)
+        )
+        for run, problem in cluster.each(work, runs):
+            print(problem or f"done: {run.folder}", flush=True)
+            ended_well += problem is None
+    return len(runs) - ended_well
+
+
+def _execute_there(run: Run | Bisection, episodes: int, here: Path, seen: Path) -> str | None:
+    """Execute a run on a node, if that sees the same files."""
+    try:
+        os.chdir(here)
+        is_shared = seen.is_file()
+    except OSError:
+        is_shared = False
+    if is_shared:
+        return execute(run, episodes)
+    return (
+        f"failed: {run.folder}: {socket.gethostname()} does not see {here} and {seen.parent} as "
+        "they are here; choose a working folder and a --folder on a disk that all nodes share"
+    )
+
+
+def execute(run: Run | Bisection, episodes: int) -> str | None:
+    """Run what is left in this process, with the output in a file beside the run.
+
+    Returns:
+        None where all went well, else a line that says what did not.
+    """
+    log = run.folder.with_suffix(".log")
+    log.parent.mkdir(parents=True, exist_ok=True)
+    _outlast(run.folder)
+    while left := run.left(episodes):
+        status = _run_command(left[0], log)
+        if status != 0:
+            how = "stopped" if status in _STOPPED else f"failed with status {status}, see {log}"
+            return f"{how}: {shlex.join(left[0])}"
+    return None
+
+
+def _outlast(run: Path) -> None:
+    """Wait for the end of a training in this folder whose node has just died; it takes seconds."""
+    for _ in range(_GRACE):
+        try:
+            with claimed(run):
+                return
+        except FileNotFoundError:  # there is none
+            return
+        except RunError:
+            time.sleep(1.0)
+
+
+def _run_command(command: list[str], log: Path) -> int:
+    """Run a command in this process, which dies with its node, and return its status."""
+    from tpm_gym.learning.command_line import main  # here, since it imports this
+
+    before, sys.argv = sys.argv, command  # what the run says that it was made with
+    with log.open("a", encoding="utf-8") as file, redirect_stdout(file), redirect_stderr(file):
+        print(f"$ {shlex.join(command)}", flush=True)
+        try:
+            main(command[1:])
+        except KeyboardInterrupt:  # before the command could see to it
+            return 128 + signal.SIGINT
+        except SystemExit as left:
+            if isinstance(left.code, str):
+                print(left.code)
+            return left.code if isinstance(left.code, int) else int(left.code is not None)
+        except Exception:
+            traceback.print_exc()
+            return 1
+        finally:
+            sys.argv = before
+    return 0

@@ -18,7 +18,7 @@ from tpm_gym.arrays import Vector
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.machine import Machine
 
-__all__ = ["NOMINAL", "Plant", "Randomisation"]
+__all__ = ["LIMITS", "NOMINAL", "Plant", "Randomisation"]
 
 Range = tuple[float, float]
 
@@ -37,6 +37,12 @@ _SIZES: dict[str, float] = {
     "encoder_bias": 1e-3,
     "length_error": 1e-3,
 }
+LIMITS: dict[str, Range] = {
+    **_RANGES,
+    **{name: (0.0, largest) for name, largest in _SIZES.items()},
+    "latency": (0.0, 1.0),
+}
+"""What each attribute of :class:`Randomisation` may be at the least and at the most."""
 
 
 @dataclass(frozen=True)
