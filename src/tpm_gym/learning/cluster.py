@@ -6,7 +6,7 @@ import socket
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, Final, TypeVar
 
 from tpm_gym.errors import MissingPackageError
@@ -75,7 +75,7 @@ def _require_answer(address: str) -> None:
 
 
 def each(
-    work: Callable[[Item], Outcome], items: Sequence[Item]
+    work: Callable[..., Outcome], items: Sequence[Item], *given: Any
 ) -> Iterator[tuple[Item, Outcome | str]]:
     """Do a piece of work for each item, in a process of its own on one CPU; yield what comes of it.
 
@@ -83,15 +83,18 @@ def each(
     again elsewhere. Ctrl-C, or SIGTERM, interrupts what is at work, as Ctrl-C would there, and
     drops what waits; a second one leaves at once.
 
+    Args:
+        work: Called with an item and what is ``given``; a function of a module.
+
     Yields:
         An item, and what the work returned, or in words the error that ended it. Nothing of one
         that was dropped.
     """
     import ray
 
-    options = ray.remote(num_cpus=1, max_calls=1, max_retries=_DEATHS)
-    task: Any = options(work)
-    found = {task.remote(item): item for item in items}
+    alone: Any = ray.remote(num_cpus=1, max_calls=1, max_retries=_DEATHS)
+    task = alone(work)
+    found = {task.remote(item, *given): item for item in items}
     waiting, interrupted, listener = list(found), False, SignalListener()
     with listener.listening():
         while waiting:
@@ -101,10 +104,17 @@ def each(
                 for reference in waiting:
                     ray.cancel(reference)
             for reference in done:
-                try:
-                    outcome = ray.get(reference)
-                except ray.exceptions.TaskCancelledError:
-                    continue
-                except ray.exceptions.RayError as error:
-                    outcome = f"failed: {found[reference]}: {error}"
-                yield found[reference], outcome
+                with suppress(ray.exceptions.TaskCancelledError):
+                    yield found[reference], _outcome(reference)
+
+
+def _outcome(reference: Any) -> Any:
+    """What came of a piece of work, an error in words."""
+    import ray
+
+    try:
+        return ray.get(reference)
+    except ray.exceptions.TaskCancelledError:
+        raise
+    except ray.exceptions.RayError as error:
+        return f"failed: {error}"

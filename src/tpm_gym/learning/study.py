@@ -23,9 +23,8 @@ import tempfile
 import time
 import traceback
 from collections.abc import Sequence
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -46,7 +45,7 @@ from tpm_gym.tasks.registry import TASKS
 _PENALTY_IDS: Final = ("TPMReach-v0", "TPMReachJoints-v0", "TPMPickAndPlaceJoints-v0")
 _WEIGHTS: Final = (0.0, 1.0)
 _STOPPED: Final = (128 + signal.SIGINT, 128 + signal.SIGTERM)
-_GRACE: Final = 30  # s
+_GRACE: Final = 30.0  # s
 
 
 @dataclass(frozen=True)
@@ -255,10 +254,8 @@ def run_all(runs: Sequence[Run | Bisection], config: StudyConfig) -> int:
         cluster.connected(config.address, config.jobs),
         tempfile.NamedTemporaryFile(prefix=".", dir=config.folder) as seen,
     ):
-        work = partial(
-            _execute_there, episodes=config.episodes, here=Path.cwd(), seen=Path(seen.name)
-        )
-        for run, problem in cluster.each(work, runs):
+        given = (config.episodes, Path.cwd(), Path(seen.name))
+        for run, problem in cluster.each(_execute_there, runs, *given):
             print(problem or f"done: {run.folder}", flush=True)
             ended_well += problem is None
     return len(runs) - ended_well
@@ -298,14 +295,11 @@ def execute(run: Run | Bisection, episodes: int) -> str | None:
 
 def _outlast(run: Path) -> None:
     """Wait for the end of a training in this folder whose node has just died; it takes seconds."""
-    for _ in range(_GRACE):
-        try:
-            with claimed(run):
-                return
-        except FileNotFoundError:  # there is none
+    latest = time.monotonic() + _GRACE
+    while run.is_dir() and time.monotonic() < latest:
+        with suppress(RunError), claimed(run):
             return
-        except RunError:
-            time.sleep(1.0)
+        time.sleep(1.0)
 
 
 def _run_command(command: list[str], log: Path) -> int:

@@ -27,12 +27,17 @@ from tpm_gym.learning.provenance import write_whole
 from tpm_gym.learning.report.page import (
     LEARNING_CURVES,
     PENALTY,
+    ROBUSTNESS,
     TEMPTING,
     Group,
     Record,
     grouped,
     method,
+    split,
+    successes,
 )
+from tpm_gym.learning.robustness import UNITS
+from tpm_gym.simulation.randomisation import LIMITS
 
 _COLUMNS = 3
 _COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
@@ -40,14 +45,17 @@ _COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
 
 def draw(records: Sequence[Record], folder: Path) -> list[Path]:
     """Draw what there are records for; return the files."""
-    plain = [r for r in records if r["goals"] == "sampled" and r["penalty_weight"] == 1.0]
-    tempted = [r for r in records if r["goals"] == "tempting" and TEMPTING in r["tests"]]
+    bisections, runs = split(records)
+    plain = [r for r in runs if r["goals"] == "sampled" and r["penalty_weight"] == 1.0]
+    tempted = [r for r in runs if r["goals"] == "tempting" and TEMPTING in r["tests"]]
     written = []
     with style():
         if any(record["evaluations"]["steps"] for record in plain):
             written.append(_save(learning_curves(plain), folder / LEARNING_CURVES))
         if tempted:
             written.append(_save(penalty(tempted), folder / PENALTY))
+        if bisections:
+            written.append(_save(robustness(bisections), folder / ROBUSTNESS))
     return written
 
 
@@ -67,23 +75,29 @@ def _count_steps(axes: Axes) -> None:
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
 
 
+def _grid(names: Sequence[str], title: str, height: float) -> tuple[Figure, list[Axes]]:
+    """A figure with a panel a name, for shares of 0 to 1, row by row."""
+    columns = min(_COLUMNS, len(names))
+    rows = -(-len(names) // columns)
+    figure = _figure(height * rows + 0.5, title)
+    panels: list[Axes] = figure.subplots(rows, columns, squeeze=False).ravel().tolist()
+    for unused in panels[len(names) :]:
+        unused.set_visible(False)
+    for name, axes in zip(names, panels, strict=False):
+        axes.set_title(name)
+        axes.set_ylim(-0.03, 1.03)
+        axes.yaxis.set_major_formatter(PercentFormatter(xmax=1))
+    return figure, panels[: len(names)]
+
+
 def _panels(
     records: Sequence[Record], title: str, height: float
 ) -> tuple[Figure, list[tuple[Axes, list[Group]]]]:
-    """A figure with a panel an id for shares of 0 to 1, row by row, and each panel's groups."""
+    """A figure with a panel an id, and each panel's groups."""
     ids = sorted({record["env"] for record in records})
-    columns = min(_COLUMNS, len(ids))
-    rows = -(-len(ids) // columns)
-    figure = _figure(height * rows + 0.5, title)
-    panels = figure.subplots(rows, columns, squeeze=False).ravel().tolist()
-    for unused in panels[len(ids) :]:
-        unused.set_visible(False)
-    for env_id, axes in zip(ids, panels, strict=False):
-        axes.set_title(env_id)
-        axes.set_ylim(-0.03, 1.03)
-        axes.yaxis.set_major_formatter(PercentFormatter(xmax=1))
+    figure, panels = _grid(ids, title, height)
     groups = [grouped(r for r in records if r["env"] == env_id) for env_id in ids]
-    return figure, list(zip(panels, groups, strict=False))
+    return figure, list(zip(panels, groups, strict=True))
 
 
 def learning_curves(records: Sequence[Record]) -> Figure:
@@ -166,6 +180,34 @@ def _weights(records: Sequence[Record]) -> list[str]:
     telling = [part for part in parts if len(set(part)) > 1]
     weights = [f"{record['penalty_weight']:g}" for record in records]
     return ["\n".join(labels) for labels in zip(weights, *telling, strict=True)]
+
+
+def robustness(records: Sequence[Record]) -> Figure:
+    """Draw success against what differs: a panel an attribute, a line an id."""
+    attributes = [name for name in LIMITS if any(r["attribute"] == name for r in records)]
+    names = [name.replace("_", " ") for name in attributes]
+    figure, panels = _grid(names, "Success of the published policies by what differs", 1.9)
+    colours = dict(zip(sorted({record["env"] for record in records}), _COLOURS, strict=False))
+    for attribute, axes in zip(attributes, panels, strict=True):
+        for record in sorted(records, key=lambda record: str(record["env"])):
+            if record["attribute"] == attribute:
+                rates = sorted(successes(record).items())
+                axes.plot(
+                    *zip(*rates, strict=True),
+                    color=colours[record["env"]],
+                    label=record["env"],
+                    marker="o",
+                    markersize=2.5,
+                )
+        axes.axhline(0.5, color=OUTLINE, linewidth=0.6, linestyle=(0, (3, 2)))
+        if attribute in UNITS:
+            axes.set_xlabel(UNITS[attribute])
+            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        else:
+            axes.set_xlabel("factor")
+            axes.set_xscale("log")
+    _legend(figure, "a dot a test; success halves near the dashed lines")
+    return figure
 
 
 # -- of one run -------------------------------------------------------------------------------

@@ -13,14 +13,17 @@ from tpm_gym.learning.estimates import (
     median_time,
     settled,
 )
+from tpm_gym.learning.robustness import OF_SERVOS, UNITS, ends, halving, nominal
 from tpm_gym.learning.rollout import WORST
 from tpm_gym.mechanism import PAPER_TPM
+from tpm_gym.simulation.randomisation import LIMITS
 
 Record = dict[str, Any]
 Group = list[Record]
 
 NOMINAL, TEMPTING = "nominal", "tempting"
 LEARNING_CURVES, PENALTY = "results_learning_curves.png", "results_penalty.png"
+ROBUSTNESS = "results_robustness.png"
 NONE: Final = "\N{EM DASH}"
 
 _INTRO: Final = f"""# Results
@@ -58,22 +61,32 @@ runs at a time on two cores, and of some runs too long: tests ran beside them. A
 tpm-gym study --plan results
 tpm-gym study --plan penalty
 tpm-gym study --plan penalty --envs TPMPickAndPlaceJoints-v0 --steps 100000
-tpm-gym study --plan robustness --episodes 500
+tpm-gym study --plan robustness --episodes 300
 tpm-gym report collect
 make results
 ```
 
-A study runs these commands for every seed; here those of the first. Each record holds its own, as
+A study runs these commands for every seed, and bisections with other values; here those of the
+first. Each record holds its own, as
 it was then: `train/train.py` is `tpm-gym train`, `train/evaluate.py` is `tpm-gym evaluate`.
 """
 
 
 def page(records: Sequence[Record], figures: Sequence[str]) -> str:
     """Return the page as Markdown."""
-    plain = [r for r in records if r["goals"] == "sampled" and r["penalty_weight"] == 1.0]
-    tempted = [r for r in records if r["goals"] == "tempting"]
-    parts = [_INTRO, *_training(plain, figures), *_penalty(tempted, figures), *_robustness(plain)]
-    return "\n".join([*parts, *_how(records)])
+    bisections, runs = split(records)
+    plain = [r for r in runs if r["goals"] == "sampled" and r["penalty_weight"] == 1.0]
+    tempted = [r for r in runs if r["goals"] == "tempting"]
+    parts = [_INTRO, *_training(plain, figures), *_penalty(tempted, figures)]
+    return "\n".join([*parts, *_robustness(bisections, figures), *_how(records)])
+
+
+def split(records: Iterable[Record]) -> tuple[Group, Group]:
+    """Return the records of bisections, and those of trainings."""
+    found: tuple[Group, Group] = ([], [])
+    for record in records:
+        found["attribute" not in record].append(record)
+    return found
 
 
 def grouped(records: Iterable[Record]) -> list[Group]:
@@ -234,38 +247,55 @@ def _compared(records: Group) -> list[str]:
     return ["Time below safe, mean over seeds:\n", "\n".join(lines) + "\n"] if lines else []
 
 
-def _robustness(records: Group) -> list[str]:
-    """How the policies do on machines that they have never seen."""
-    names = sorted({name for record in records for name in record["tests"]} - {NOMINAL})
-    groups = [group for group in grouped(records) if any(set(names) & set(_of(group)))]
-    if not names or not groups:
+def _robustness(records: Group, figures: Sequence[str]) -> list[str]:
+    """How far machines may differ from the one that the published policies were trained on."""
+    if not records:
         return []
-    titles = [f"{group[0]['env']}, {method(group[0])}" for group in groups]
+    ids = sorted({record["env"] for record in records})
+    found = {(record["env"], record["attribute"]): record for record in records}
     rows = []
-    for name in [NOMINAL, *names]:
-        tests = [record["tests"][name] for record in records if name in record["tests"]]
-        changes = {json.dumps(test["randomisation"]) for test in tests}
-        cells = [
-            _iqm([success(record, name) for record in group]) if name in _of(group) else NONE
-            for group in groups
-        ]
-        rows.append([name.replace("_", " "), ", ".join(sorted(changes)), *cells])
+    for attribute, end in [(name, end) for name in LIMITS for end in ends(name)]:
+        of = [found.get((env, attribute)) for env in ids]
+        if any(of):
+            unit = UNITS.get(attribute, "factor")
+            drive = ", servo drives" if attribute in OF_SERVOS else ""
+            name = f"{attribute.replace('_', ' ')} ({unit}{drive})"
+            cells = [_halves(record, end) if record else NONE for record in of]
+            rows.append([name, f"{nominal(attribute):g}", f"{end:g}", *cells])
     text = (
-        "## Robustness\n\nThe policies above, trained on the nominal machine alone, on others "
-        f"(success, IQM over seeds; {_episodes(records, names)} episodes a seed, "
-        f"{_episodes(records, [NOMINAL])} on the nominal one).\n"
+        "## Robustness\n\nThe published policies, trained on the nominal machine alone, on machines "
+        "that differ from it in one thing. Success halves between the two values given, found by "
+        "bisection; or it does not as far as a machine may differ here, and success there is "
+        f"given. {' or '.join(sorted({str(r['episodes']) for r in records}))} episodes a test. "
+        "Errors of lengths and biases are drawn up to the value in each episode, noise has it as "
+        "its standard deviation; all else has the value itself.\n"
     )
-    return [text, _table(" | ".join(["machine", "randomisation", *titles]), rows)]
+    parts = [text, _table(" | ".join(["what differs", "nominal", "up to", *ids]), rows)]
+    if ROBUSTNESS in figures:
+        parts.append(f"![Success by what differs](images/{ROBUSTNESS})\n")
+    return parts
+
+
+def successes(record: Record) -> dict[float, float]:
+    """Success by value in the tests of a bisection."""
+    return {float(v): test["success_at_end"]["mean"] for v, test in record["tests"].items()}
+
+
+def _halves(record: Record, end: float) -> str:
+    """Where success halves on the way to one end."""
+    rates = successes(record)
+    found = halving(record["attribute"], end, rates)
+    if found.missing is not None:
+        return "not finished"
+    if found.after is None:
+        return f"no: {rates[end]:.1%}"
+    return f"{found.before:g} to {found.after:g}"
 
 
 def _episodes(records: Group, names: Sequence[str]) -> str:
     """How many episodes the tests of these names had."""
     tests = [record["tests"].get(name) for record in records for name in names]
     return " or ".join(map(str, sorted({test["episodes"] for test in tests if test}))) or "no"
-
-
-def _of(group: Group) -> set[str]:
-    return {name for record in group for name in record["tests"]}
 
 
 def _how(records: Sequence[Record]) -> list[str]:
@@ -277,9 +307,11 @@ def _how(records: Sequence[Record]) -> list[str]:
         f"- {machine}; commits {', '.join(sorted(of))}" for machine, of in sorted(commits.items())
     )
     commands = []
-    for first, *_ in grouped(records):
+    bisections, runs = split(records)
+    for first, *_ in grouped(runs):
         commands.append(str(first["command"]))
         commands += [str(test["command"]) for test in first["tests"].values()]
+    commands += [str(record["command"]) for record in bisections]
     return ["## How\n", listed + "\n", _STUDY, "```bash", *commands, "```\n"]
 
 

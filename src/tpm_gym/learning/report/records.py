@@ -1,8 +1,8 @@
 """What is kept of runs, one small file each, and the page that is written from these files.
 
 ``collect`` condenses every run in a folder (its config.json, evaluations.jsonl and the evaluations
-in ``tests/``, which a study has written there). ``write`` needs the records alone, so a fresh clone
-can do it. Runs that did not finish are kept.
+in ``tests/``, which a study has written there), and every bisection, which has tests alone.
+``write`` needs the records alone, so a fresh clone can do it. Runs that did not finish are kept.
 """
 
 import json
@@ -13,6 +13,7 @@ from typing import Final
 from tpm_gym.learning import provenance
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.report.page import Record, page
+from tpm_gym.learning.robustness import nominal
 from tpm_gym.learning.run_folder import CONFIG_FILE, TESTS, WHOLE, evaluations
 
 RECORDS: Final = Path("docs", "results")
@@ -34,6 +35,16 @@ _KEPT: Final = (
     "machine",
     "command",
 )
+_KEPT_OF_BISECTIONS: Final = (
+    "env",
+    "policy",
+    "episodes",
+    "versions",
+    "git_commit",
+    "machine",
+    "command",
+)
+_KEPT_OF_TESTS: Final = ("success_at_end", "git_commit")
 _CURVES: Final = ("success_at_end", "return", "unsafe_share")
 _NOT_KEPT: Final = ("records", "versions", "machine", "policy", "env")
 
@@ -61,18 +72,20 @@ class Write:
 
 
 def collect(config: Collect) -> list[Path]:
-    """Condense every run of a folder; return the files written, in order of their names.
+    """Condense every run and bisection of a folder; return the files written, in order of names.
 
     Raises:
-        ConfigError: The folder holds no run, or one that :func:`condense` refuses.
+        ConfigError: The folder holds none, or one that :func:`condense` refuses.
     """
-    folders = sorted(path.parent for path in config.runs.glob(f"*/{CONFIG_FILE}"))
-    if not folders:
-        raise ConfigError(f"--runs {config.runs}: holds no folder with a {CONFIG_FILE}")
+    runs = {path.parent for path in config.runs.glob(f"*/{CONFIG_FILE}")}
+    bisections = {path.parent.parent for path in config.runs.glob(f"*/{TESTS}/{WHOLE}")} - runs
+    if not runs | bisections:
+        raise ConfigError(f"--runs {config.runs}: holds no folder with a {CONFIG_FILE} or {TESTS}")
     written = []
-    for folder in folders:
+    for folder in sorted(runs | bisections):
         path = config.to / f"{folder.name}.json"
-        provenance.write_json(path, condense(folder))
+        record = condense(folder) if folder in runs else condense_bisection(folder)
+        provenance.write_json(path, record)
         written.append(path)
     return written
 
@@ -114,6 +127,33 @@ def condense(run: Path) -> Record:
         "evaluations": curves,
         "tests": tests,
     }
+
+
+def condense_bisection(folder: Path) -> Record:
+    """Return what is kept of the tests of one attribute, in order of its values.
+
+    Raises:
+        ConfigError: A file of it is damaged.
+    """
+    tests = [_read(path) for path in folder.glob(f"{TESTS}/{WHOLE}")]
+    try:
+        (attribute,) = {name for test in tests for name in test["randomisation"]}
+        tests.sort(key=lambda test: float(test["randomisation"][attribute]))
+        (first,) = [t for t in tests if t["randomisation"][attribute] == nominal(attribute)]
+        return {
+            "run": folder.name,
+            "attribute": attribute,
+            **{name: first[name] for name in _KEPT_OF_BISECTIONS},
+            "tests": {
+                f"{test['randomisation'][attribute]:g}": {
+                    name: test[name] for name in _KEPT_OF_TESTS
+                }
+                for test in tests
+                if test["episodes"] == first["episodes"]  # others are of before
+            },
+        }
+    except (KeyError, ValueError, AttributeError) as error:
+        raise ConfigError(f"--runs {folder}: its tests are of no bisection: {error!r}") from error
 
 
 def _read(path: Path) -> Record:
