@@ -75,6 +75,6 @@ def halving(attribute: str, end: float, successes: Mapping[float, float]) -> Hal
 
 
 def _on_the_way(start: float, end: float, share: float) -> float:
-    """The value at a share of the way, to three digits: what commands can be given."""
+    """The value at a share of the way, to four digits: what commands can be given."""
     value = start * (end / start) ** share if start else end * share
-    return float(f"{value:.3g}")
+    return float(f"{value:.4g}")

@@ -263,7 +263,7 @@ def _robustness(records: Group, figures: Sequence[str]) -> list[str]:
             cells = [_halves(record, end) if record else NONE for record in of]
             rows.append([name, f"{nominal(attribute):g}", f"{end:g}", *cells])
     text = (
-        "## Robustness\n\nThe published policies, trained on the nominal machine alone, on machines "
+        "## Robustness\n\nThe published policies, trained on the nominal machine alone, on others "
         "that differ from it in one thing. Success halves between the two values given, found by "
         "bisection; or it does not as far as a machine may differ here, and success there is "
         f"given. {' or '.join(sorted({str(r['episodes']) for r in records}))} episodes a test. "

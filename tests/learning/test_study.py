@@ -1,0 +1,252 @@
+"""What a study has left to do, and that it does it whatever dies or stops on the way."""
+
+import json
+import signal
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+from processes import PYTHON, TPM_GYM, printed_by, signalled
+from trainings import SAC_RECIPE, assert_equal_runs, without_times
+
+from tpm_gym.learning.command_line import main
+from tpm_gym.learning.errors import ConfigError
+from tpm_gym.learning.report.records import condense
+from tpm_gym.learning.study import Run, StudyConfig, execute, plan_runs, run_all
+
+# -- the plan -------------------------------------------------------------------------------------
+
+
+def test_plans_have_every_recipe_and_seed(tmp_path: Path) -> None:
+    planned = plan_runs(StudyConfig("results", folder=tmp_path))
+    assert len(planned) == (6 + 4 + 2) * 5
+    assert len({run.folder for run in planned}) == len(planned)
+    weighted = plan_runs(StudyConfig("penalty", folder=tmp_path))
+    assert len(weighted) == 3 * 2 * 5
+    assert all("--goals" in run.options for run in weighted)
+    longer = plan_runs(StudyConfig("penalty", folder=tmp_path, steps=70_000))
+    assert not {run.folder for run in longer} & {run.folder for run in weighted}
+    assert all("--steps 70000" in " ".join(run.left(1)[0]) for run in longer)
+    bisections = plan_runs(StudyConfig("robustness", folder=tmp_path))
+    assert len(bisections) == 10 + 10 + 8  # without a puck there are no mass and friction of it
+    assert len({run.folder for run in bisections}) == len(bisections)
+
+
+@pytest.mark.parametrize(
+    ("message", "plan", "options"),
+    [
+        ("--envs Nope: leaves no recipe", "results", {"envs": ("Nope",)}),
+        (
+            "--envs TPMReachDense-v0: leaves no published",
+            "robustness",
+            {"envs": ["TPMReachDense-v0"]},
+        ),
+        ("--steps 0", "results", {"steps": 0}),
+        ("--seeds 0", "results", {"seeds": 0}),
+    ],
+)
+def test_plans_that_cannot_be_are_refused(message: str, plan: Any, options: Any) -> None:
+    with pytest.raises(ConfigError, match=message):
+        plan_runs(StudyConfig(plan, **options))
+
+
+def test_what_is_done_is_skipped_and_what_was_stopped_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--envs", "TPMReach-v0", "--algos", "sac", "--seeds", "1", "--episodes", "7"]
+    words = ["study", "--plan", "results", *words, "--folder", str(tmp_path), "--dry-run"]
+
+    def left() -> list[str]:
+        main(words)
+        return capsys.readouterr().out.split("\n")[:-1]
+
+    run = tmp_path / "TPMReach-v0-sac-s0"
+    done = run / "tests" / "nominal.json"
+    test = f"tpm-gym evaluate --policy {run} --env TPMReach-v0 --episodes 7"
+    test += f" --json {done}"
+    first = f"tpm-gym train --env TPMReach-v0 --algo sac --seed 0 --run {run}"
+    assert left() == [first, test]
+    run.mkdir()
+    (run / "config.json").write_text('{"steps": 100}')
+    (run / "evaluations.jsonl").write_text('{"steps": 60}\n{"steps": 100, "wa')
+    assert left() == [f"tpm-gym resume {run}", test]
+    (run / "evaluations.jsonl").write_text('{"steps": 100}\n')
+    (run / "last.zip").write_text("")
+    assert left() == [test]
+    done.parent.mkdir()
+    done.write_text('{"episodes": 10}')
+    assert left() == [test]
+    done.write_text('{"episodes": 7}')
+    assert left() == [""]
+
+
+# -- running --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("program", [list(sys.argv), ["another"]])
+def test_a_training_that_fails_is_told(
+    program: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", program)
+    failing = Run(tmp_path / "runs" / "b", "TPMReach-v0", "sac", ("--steps", "0"), ())
+    assert "failed with status 1" in (execute(failing, 1) or "")
+    assert "--steps 0" in (tmp_path / "runs" / "b.log").read_text()
+    assert sys.argv == program
+
+
+def test_without_ray_the_extra_is_named(tmp_path: Path) -> None:
+    printed_by(
+        PYTHON,
+        "-c",
+        "import sys; sys.modules['ray'] = None\n"
+        "from tpm_gym.errors import MissingPackageError\n"
+        "from tpm_gym.learning.study import StudyConfig, study\n"
+        "try: study(StudyConfig('robustness'))\n"
+        "except MissingPackageError as error: assert '[cluster]' in str(error)\n"
+        "else: sys.exit('went on')\n",
+        cwd=tmp_path,
+    )
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1:1", "nowhere"])
+def test_an_address_without_a_cluster_is_refused(address: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=f"--address {address}: no cluster answers"):
+        run_all([], StudyConfig("results", folder=tmp_path, address=address))
+    assert list(tmp_path.iterdir()) == []
+
+
+def small(folder: Path, seed: int) -> Run:
+    """A training of seconds, with a checkpoint every few moments."""
+    recipe = folder / "sac.yml"
+    recipe.write_text(SAC_RECIPE.format(env="TPMReach-v0", train_freq=20), encoding="utf-8")
+    words = ["--recipe", str(recipe), "--seed", str(seed), "--steps", "2000"]
+    words += ["--eval-every", "1000", "--eval-episodes", "2", "--checkpoint-every", "50"]
+    test = ("nominal", ())
+    return Run(folder / f"run-s{seed}", "TPMReach-v0", "sac", tuple(words), (test,))
+
+
+def newest(run: Run) -> int:
+    """Step of the last checkpoint of a run."""
+    names = [path.name for path in run.folder.glob("checkpoints/*")]
+    return max((int(name) for name in names if name.isdigit()), default=-1)
+
+
+def temporary() -> set[Path]:
+    return {*Path("/tmp").glob("tpm-*"), *Path("/tmp").glob("ray*"), *Path.home().glob(".ray/*")}
+
+
+@pytest.mark.slow
+def test_a_study_of_one_machine_runs_all_and_leaves_nothing_behind(tmp_path: Path) -> None:
+    before = temporary()
+    words = ["--plan", "robustness", "--envs", "TPMReach-v0", "--episodes", "2"]
+    printed = printed_by(*TPM_GYM, "study", *words, "--folder", str(tmp_path / "study"))
+    planned = plan_runs(StudyConfig("robustness", ("TPMReach-v0",), folder=tmp_path / "study"))
+    assert sorted(printed.splitlines()) == sorted(f"done: {run.folder}" for run in planned)
+    assert all(run.left(2) == [] for run in planned)
+    assert temporary() == before
+
+
+@pytest.mark.slow
+def test_ctrl_c_stops_a_study_with_checkpoints_saved(tmp_path: Path) -> None:
+    """As a terminal sends it: to the whole process group; a second signal would kill trainings."""
+    before = temporary()
+    words = ["--plan", "results", "--envs", "TPMReach-v0", "--algos", "sac", "--seeds", "2"]
+    words = [*TPM_GYM, "study", *words, "--folder", str(tmp_path), "--jobs", "1"]
+    run = tmp_path / "TPMReach-v0-sac-s0"
+    status, output = signalled(words, lambda: list(run.glob("checkpoints/0*")), signal.SIGINT)
+    assert status == 1, output
+    assert "stopped: tpm-gym train --env TPMReach-v0" in output
+    assert "2 runs failed or were stopped" in output
+    log = run.with_suffix(".log").read_text(encoding="utf-8")
+    assert "stopped early by SIGINT, saved at step" in log
+    assert (run / "last.zip").is_file()
+    assert not (tmp_path / "TPMReach-v0-sac-s1").exists()
+    assert temporary() == before
+
+
+# -- what dies ------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """Two nodes of one CPU each."""
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    with tempfile.TemporaryDirectory(prefix="tpm-", dir="/tmp") as folder:
+        monkeypatch.setenv("RAY_TMPDIR", folder)
+        from ray.cluster_utils import Cluster
+
+        options = {"num_cpus": 1, "include_dashboard": False, "object_store_memory": 80 << 20}
+        found = Cluster(True, head_node_args=options)
+        found.add_node(**options)
+        yield found
+        found.shutdown()
+
+
+def kill_worker(node: Any) -> None:
+    """Kill the process of a node that trains."""
+    (worker,) = [child for child in children(node) if child.name().startswith("ray::_execute")]
+    worker.kill()
+
+
+def kill_node(node: Any) -> None:
+    """Kill all processes of a node at once, as a power cut does."""
+    for process in [*children(node), raylet(node)]:
+        process.kill()
+
+
+def raylet(node: Any) -> psutil.Process:
+    return psutil.Process(node.all_processes["raylet"][0].process.pid)
+
+
+def children(node: Any) -> list[psutil.Process]:
+    return raylet(node).children(recursive=True)
+
+
+def record(run: Run) -> Any:
+    """What is kept of a run, without clocks, and without how often it went on."""
+    kept = without_times(condense(run.folder))
+    for test in kept["tests"].values():
+        del test["steps_per_second"]
+    return {name: value for name, value in kept.items() if name != "resumed"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kill", [kill_worker, kill_node])
+def test_a_death_midway_costs_what_came_after_the_last_checkpoint(
+    kill: Callable[[Any], None], cluster: Any, tmp_path: Path
+) -> None:
+    (tmp_path / "undisturbed").mkdir()
+    undisturbed = [small(tmp_path / "undisturbed", seed) for seed in range(2)]
+    for run in undisturbed:
+        assert execute(run, 2) is None
+    (tmp_path / "disturbed").mkdir()
+    runs = [small(tmp_path / "disturbed", seed) for seed in range(2)]
+    reached = []
+
+    def kill_midway() -> None:
+        while min(map(newest, runs)) < 100:
+            time.sleep(0.01)
+        (node,) = cluster.worker_nodes
+        kill(node)
+        reached.extend(map(newest, runs))
+
+    killer = threading.Thread(target=kill_midway)
+    killer.start()
+    config = StudyConfig("results", folder=tmp_path, episodes=2, address=cluster.address)
+    assert run_all(runs, config) == 0
+    killer.join()
+    assert max(reached) < 2000
+    resumed = [condense(run.folder)["resumed"] for run in runs]
+    assert sorted(resumed) == [0, 1]
+    hit = runs[resumed.index(1)]
+    from_step = json.loads((hit.folder / "config.json").read_text())["resumed"][0]["from_step"]
+    assert from_step == reached[resumed.index(1)]
+    for run, other in zip(runs, undisturbed, strict=True):
+        assert record(run) == record(other)
+        assert_equal_runs(run.folder, other.folder)
