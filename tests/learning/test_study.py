@@ -18,7 +18,7 @@ from trainings import SAC_RECIPE, assert_equal_runs, without_times
 from tpm_gym.learning.command_line import main
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.report.records import condense
-from tpm_gym.learning.study import Run, StudyConfig, execute, plan_runs, run_all
+from tpm_gym.learning.study import Bisection, Run, StudyConfig, execute, plan_runs, run_all
 
 # -- the plan -------------------------------------------------------------------------------------
 
@@ -142,13 +142,20 @@ def temporary() -> set[Path]:
 
 
 @pytest.mark.slow
-def test_a_study_of_one_machine_runs_all_and_leaves_nothing_behind(tmp_path: Path) -> None:
+def test_a_study_of_one_machine_runs_all_and_leaves_nothing_behind(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     before = temporary()
-    words = ["--plan", "robustness", "--envs", "TPMReach-v0", "--episodes", "2"]
-    printed = printed_by(*TPM_GYM, "study", *words, "--folder", str(tmp_path / "study"))
-    planned = plan_runs(StudyConfig("robustness", ("TPMReach-v0",), folder=tmp_path / "study"))
-    assert sorted(printed.splitlines()) == sorted(f"done: {run.folder}" for run in planned)
-    assert all(run.left(2) == [] for run in planned)
+    bisection = Bisection(tmp_path / "bisection", "TPMReach-v0", "latency")
+    failing = Run(tmp_path / "failing", "TPMReach-v0", "sac", ("--steps", "0"), ())
+    assert run_all([failing, bisection], StudyConfig("results", folder=tmp_path, episodes=2)) == 1
+    printed = capsys.readouterr().out.splitlines()
+    assert f"done: {bisection.folder}" in printed
+    assert any(line.startswith("failed with status 1") for line in printed)
+    assert {path.stem for path in bisection.folder.glob("tests/*")} == {"0", "1"}
+    assert bisection.left(2) == []
+    names = ["bisection", "bisection.log", "failing.log"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == names
     assert temporary() == before
 
 

@@ -75,8 +75,8 @@ class StudyConfig:
     """Folder of the run folders; all nodes of a cluster have to see it, and the working folder."""
 
     address: Annotated[str | None, unset(str, "this machine alone", "HOST:PORT")] = None
-    """Ray cluster to run on, as ray start --head prints it; it runs as much at once as it has
-    CPUs."""
+    """Ray cluster to run on, as ray start --head prints it, of which this machine is a node. It
+    runs as much at once as it has CPUs."""
 
     jobs: int = 2
     """Runs at once on this machine alone; each uses one CPU core."""
