@@ -18,7 +18,15 @@ from trainings import SAC_RECIPE, assert_equal_runs, without_times
 from tpm_gym.learning.command_line import main
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.report.records import condense
-from tpm_gym.learning.study import Bisection, Run, StudyConfig, execute, plan_runs, run_all
+from tpm_gym.learning.study import (
+    Bisection,
+    Run,
+    StudyConfig,
+    execute,
+    execute_there,
+    plan_runs,
+    run_all,
+)
 
 # -- the plan -------------------------------------------------------------------------------------
 
@@ -121,6 +129,14 @@ def test_an_address_without_a_cluster_is_refused(address: str, tmp_path: Path) -
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("missing", ["folder", "file"])
+def test_a_node_that_does_not_share_the_disk_is_told(missing: str, tmp_path: Path) -> None:
+    here = Path.cwd() if missing == "file" else tmp_path / "missing"
+    run = Run(tmp_path / "run", "TPMReach-v0", "sac", (), ())
+    assert "does not see" in (execute_there(run, 1, here, tmp_path / "missing") or "")
+    assert list(tmp_path.iterdir()) == []
+
+
 def small(folder: Path, seed: int) -> Run:
     """A training of seconds, with a checkpoint every few moments."""
     recipe = folder / "sac.yml"
@@ -197,7 +213,7 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 
 def kill_worker(node: Any) -> None:
     """Kill the process of a node that trains."""
-    (worker,) = [child for child in children(node) if child.name().startswith("ray::_execute")]
+    (worker,) = [child for child in children(node) if child.name().startswith("ray::execute")]
     worker.kill()
 
 

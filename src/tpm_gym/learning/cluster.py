@@ -43,7 +43,7 @@ def connected(address: str | None, cpus: int) -> Iterator[None]:
     except ModuleNotFoundError as error:
         raise MissingPackageError("ray", "cluster") from error
     quiet: dict[str, Any] = {"configure_logging": False, "log_to_driver": False}
-    # Paths of Ray's sockets have room for some hundred characters, less than macOS would need.
+    # Sockets lie in it, whose paths may have some hundred characters; macOS's own would be longer.
     temporary = None if sys.platform == "win32" else "/tmp"
     with tempfile.TemporaryDirectory(prefix="tpm-", dir=temporary) as folder:
         if address is None:

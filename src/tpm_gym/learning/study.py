@@ -255,14 +255,18 @@ def run_all(runs: Sequence[Run | Bisection], config: StudyConfig) -> int:
         tempfile.NamedTemporaryFile(prefix=".", dir=config.folder) as seen,
     ):
         given = (config.episodes, Path.cwd(), Path(seen.name))
-        for run, problem in cluster.each(_execute_there, runs, *given):
+        for run, problem in cluster.each(execute_there, runs, *given):
             print(problem or f"done: {run.folder}", flush=True)
             ended_well += problem is None
     return len(runs) - ended_well
 
 
-def _execute_there(run: Run | Bisection, episodes: int, here: Path, seen: Path) -> str | None:
-    """Execute a run on a node, if that sees the same files."""
+def execute_there(run: Run | Bisection, episodes: int, here: Path, seen: Path) -> str | None:
+    """Execute a run on a node of a cluster, if that sees the working folder and a file in --folder.
+
+    Returns:
+        As :func:`execute`.
+    """
     try:
         os.chdir(here)
         is_shared = seen.is_file()

@@ -66,9 +66,12 @@ tpm-gym report collect
 make results
 ```
 
-A study runs these commands for every seed, and bisections with other values; here those of the
-first. Each record holds its own, as
-it was then: `train/train.py` is `tpm-gym train`, `train/evaluate.py` is `tpm-gym evaluate`.
+A study runs on Ray (the extra `cluster`), two runs at a time on this machine alone. With
+`--address` it runs on a cluster that `ray start` has started, whose nodes see the working folder on
+a shared disk. A run whose process or node dies goes on elsewhere from its last checkpoint.
+
+These are its commands for the first seed, and the first of each bisection. Each record holds its
+own, as it was then: `train/train.py` is `tpm-gym train`, `train/evaluate.py` `tpm-gym evaluate`.
 """
 
 
