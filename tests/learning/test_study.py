@@ -166,8 +166,8 @@ def test_a_study_of_one_machine_runs_all_and_leaves_nothing_behind(
     failing = Run(tmp_path / "failing", "TPMReach-v0", "sac", ("--steps", "0"), ())
     assert run_all([failing, bisection], StudyConfig("results", folder=tmp_path, episodes=2)) == 1
     printed = capsys.readouterr().out.splitlines()
-    assert f"done: {bisection.folder}" in printed
-    assert any(line.startswith("failed with status 1") for line in printed)
+    assert f"{bisection.folder}: done" in printed
+    assert any(line.startswith(f"{failing.folder}: failed with status 1") for line in printed)
     assert {path.stem for path in bisection.folder.glob("tests/*")} == {"0", "1"}
     assert bisection.left(2) == []
     names = ["bisection", "bisection.log", "failing.log"]
@@ -184,7 +184,7 @@ def test_ctrl_c_stops_a_study_with_checkpoints_saved(tmp_path: Path) -> None:
     run = tmp_path / "TPMReach-v0-sac-s0"
     status, output = signalled(words, lambda: list(run.glob("checkpoints/0*")), signal.SIGINT)
     assert status == 1, output
-    assert "stopped: tpm-gym train --env TPMReach-v0" in output
+    assert f"{run}: stopped: tpm-gym train --env TPMReach-v0" in output
     assert "2 runs failed or were stopped" in output
     log = run.with_suffix(".log").read_text(encoding="utf-8")
     assert "stopped early by SIGINT, saved at step" in log

@@ -256,7 +256,7 @@ def run_all(runs: Sequence[Run | Bisection], config: StudyConfig) -> int:
     ):
         given = (config.episodes, Path.cwd(), Path(seen.name))
         for run, problem in cluster.each(execute_there, runs, *given):
-            print(problem or f"done: {run.folder}", flush=True)
+            print(f"{run.folder}: {problem or 'done'}", flush=True)
             ended_well += problem is None
     return len(runs) - ended_well
 
@@ -275,8 +275,8 @@ def execute_there(run: Run | Bisection, episodes: int, here: Path, seen: Path) -
     if is_shared:
         return execute(run, episodes)
     return (
-        f"failed: {run.folder}: {socket.gethostname()} does not see {here} and {seen.parent} as "
-        "they are here; choose a working folder and a --folder on a disk that all nodes share"
+        f"failed: {socket.gethostname()} does not see {here} and {seen.parent} as they are here; "
+        "choose a working folder and a --folder on a disk that all nodes share"
     )
 
 
