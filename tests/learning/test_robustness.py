@@ -157,7 +157,7 @@ def test_the_page_says_where_success_halves(records: list[Any]) -> None:
     low, high = map(float, row.strip("|").split("|")[3].split(" to "))
     assert high <= 0.8 < low < 1.05 * high
     (row,) = [row for row in rows if row.startswith("| encoder noise (rad) | 0 | 0.001 |")]
-    assert row.count("no: 97.0%") == 2
+    assert row.count("not in range: 97.0%") == 2
     del records[0]["tests"][list(records[0]["tests"])[-1]]
     assert "not finished" in page_of(records, [])
     assert f"images/{ROBUSTNESS}" in text

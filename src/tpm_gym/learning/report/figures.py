@@ -36,7 +36,7 @@ from tpm_gym.learning.report.page import (
     split,
     successes,
 )
-from tpm_gym.learning.robustness import UNITS
+from tpm_gym.learning.robustness import UNITS, ends, nominal
 from tpm_gym.simulation.randomisation import LIMITS
 
 _COLUMNS = 3
@@ -200,12 +200,12 @@ def robustness(records: Sequence[Record]) -> Figure:
                     markersize=2.5,
                 )
         axes.axhline(0.5, color=OUTLINE, linewidth=0.6, linestyle=(0, (3, 2)))
-        if attribute in UNITS:
-            axes.set_xlabel(UNITS[attribute])
-            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-        else:
-            axes.set_xlabel("factor")
+        axes.set_xlabel(UNITS.get(attribute, "factor"))
+        if attribute not in UNITS:
             axes.set_xscale("log")
+        ticks = sorted([nominal(attribute), *ends(attribute)])
+        axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+        axes.minorticks_off()
     _legend(figure, "a dot a test; success halves near the dashed lines")
     return figure
 

@@ -291,7 +291,7 @@ def _halves(record: Record, end: float) -> str:
     if found.missing is not None:
         return "not finished"
     if found.after is None:
-        return f"no: {rates[end]:.1%}"
+        return f"not in range: {rates[end]:.1%}"
     return f"{found.before:g} to {found.after:g}"
 
 
