@@ -7,6 +7,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from trainings import SAC_RECIPE, assert_equal_runs, without_times
 from tpm_gym.learning.command_line import main
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.report.records import condense
+from tpm_gym.learning.run_folder import claimed
 from tpm_gym.learning.study import (
     Bisection,
     Run,
@@ -106,6 +108,20 @@ def test_a_training_that_fails_is_told(
     assert "failed with status 1" in (execute(failing, 1) or "")
     assert "--steps 0" in (tmp_path / "runs" / "b.log").read_text()
     assert sys.argv == program
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no such locks")
+def test_a_training_that_outlives_its_node_is_waited_for(tmp_path: Path) -> None:
+    run = Run(tmp_path / "run", "TPMReach-v0", "sac", (), ())
+    run.folder.mkdir()
+    (run.folder / "config.json").write_text("{}")
+    with ExitStack() as other:
+        other.enter_context(claimed(run.folder))
+        threading.Timer(0.5, other.close).start()
+        assert "tpm-gym resume" in (execute(run, 1) or "")
+    said = run.folder.with_suffix(".log").read_text()
+    assert "holds no run of tpm_gym" in said
+    assert "another process" not in said
 
 
 def test_without_ray_the_extra_is_named(tmp_path: Path) -> None:
