@@ -280,15 +280,14 @@ class AnalyticSimulation:
         if self.physics.torques == "every":
             torques = self._torques(slice(None), start.lead(theta, self._step), push)
             self.torques, self._torque = torques, torques[-1].copy()
-            beyond: BoolArray = (np.abs(torques) > self._effort).any(axis=(0, 1))
-            return beyond
+            return _beyond(torques, self._effort)
         self._torque = self._torques(slice(None), theta, push[-1:])[0]
-        over: BoolArray = (np.abs(self._torque) > _WATCHFUL * self._effort).any(axis=0)
+        over = _beyond(self._torque[None], _WATCHFUL * self._effort)
         rows = np.flatnonzero(over)
         if len(rows):
             every = start.take(rows).lead(self._angles(path, rows), self._step)
             torques = self._torques(rows, every, push[:, :, rows])
-            over[rows] = (np.abs(torques) > self._effort[:, rows]).any(axis=(0, 1))
+            over[rows] = _beyond(torques, self._effort[:, rows])
         return over
 
     def _torques(self, rows: IntArray | slice, theta: FloatArray, push: FloatArray) -> FloatArray:
@@ -297,8 +296,9 @@ class AnalyticSimulation:
         changes = np.diff(rates, axis=1) / self._step
         against = push.transpose(1, 0, 2) if self.scene.objects else None
         batch = self._true if isinstance(rows, slice) else self._true.take(rows)
-        torques: FloatArray = batch.torque(theta[:, 1:-1], rates[:, :-1], changes, against)
-        return torques.transpose(1, 0, 2)
+        torques = batch.torque(theta[:, 1:-1], rates[:, :-1], changes, against)
+        by_steps: FloatArray = torques.transpose(1, 0, 2)
+        return by_steps
 
     def _serve(
         self, servos: ServoDrives, start: FloatArray, path: FloatArray, vacuum: BoolArray
@@ -443,6 +443,13 @@ def _columns(array: FloatArray, rows: IntArray | slice) -> FloatArray:
     return np.ascontiguousarray(array[..., rows])
 
 
+def _beyond(torques: FloatArray, effort: FloatArray) -> BoolArray:
+    """(r,) whether one of torques (m, 3, r) is more than a motor's effort (3, r)."""
+    beyond: BoolArray = np.greater(np.abs(torques), effort).any(axis=(0, 1))
+    return beyond
+
+
 def _rows(columns: FloatArray) -> FloatArray:
     """Components (3, n) as (n, 3), a copy even of one row."""
-    return columns.T.copy(order="C")
+    rows: FloatArray = columns.T.copy(order="C")
+    return rows
