@@ -237,9 +237,7 @@ class AnalyticSimulation:
         self._before, self._truth = points[-2].copy(), points[-1].copy()
         self._theta = theta[:, -1].copy()
         self._rates = (theta[:, -1] - theta[:, -2]) / self._step
-        late = self._behind | start.left.any(axis=0)
-        if not self._exact:
-            late |= ~np.isfinite(way).all(axis=(0, 1))
+        late = self._behind | start.left.any(axis=0) | ~self._true.assembled_at(way).all(axis=0)
         late |= self._find_torques(start, theta, path, push)
         rows = np.flatnonzero(late)
         if len(rows):
@@ -445,7 +443,7 @@ def _columns(array: FloatArray, rows: IntArray | slice) -> FloatArray:
 
 def _beyond(torques: FloatArray, effort: FloatArray) -> BoolArray:
     """(r,) whether one of torques (m, 3, r) is more than a motor's effort (3, r)."""
-    beyond: BoolArray = np.greater(np.abs(torques), effort).any(axis=(0, 1))
+    beyond: BoolArray = np.logical_or.reduce(np.abs(torques) > effort, axis=(0, 1))
     return beyond
 
 
