@@ -85,7 +85,9 @@ def march(
             theta = now.theta + time_step * rates
             expected = now.position + time_step * _along(at.jacobian, rates)
         at = batch.motion(theta, rates)
-        left = _left(batch, at, expected, now.left)
+        drifting = 2 * now.position - now.before
+        side = batch.assembled_at(expected) & batch.assembled_at(drifting)
+        left = _left(at, side, now.left)
         new: tuple[FloatArray, ...] = theta, rates, torque, at.position
         gone = left.any(axis=0)
         if gone.any():
@@ -138,13 +140,14 @@ def _along(jacobian: FloatArray, rates: FloatArray) -> FloatArray:
     return moved
 
 
-def _left(batch: Batch, at: Motion, expected: FloatArray, before: BoolArray) -> BoolArray:
+def _left(at: Motion, side: BoolArray, before: BoolArray) -> BoolArray:
     """Which modes have been left (2, r).
 
     Beyond a parallel singularity angles turn back, so that those of the mirrored assembly are there
-    too: it is where P was about to go that tells.
+    too. What tells is ``side`` (r,): whether P was about to stay on the side that it was on, by the
+    motors' rates and by its own.
     """
     finite = np.isfinite(at.position).all(axis=0) & np.isfinite(at.mass).all(axis=0)
-    assembly = ~finite | ~batch.assembled_at(expected)
+    assembly = ~finite | ~side
     found: BoolArray = np.where(before.any(axis=0), before, [assembly, ~assembly & ~at.working])
     return found
