@@ -231,7 +231,7 @@ def test_what_is_carried_is_felt_and_does_not_build_up(mass: float) -> None:
     def touch(points: FloatArray) -> tuple[FloatArray, FloatArray]:
         return mass * fall, np.array([mass])
 
-    steps = [Reference(theta)] * 250
+    steps = [Reference(theta)] * 1000
     drive.begin(theta)
     end, torques = march(batch, drive, steps, at_rest(theta, batch.forward(theta)), STEP, touch)
     at = batch.motion(end.theta, end.rates)
@@ -294,7 +294,7 @@ def test_servos_move_as_in_pybullet(
 def test_servos_differ_from_pybullets_as_their_time_steps_do() -> None:
     apart = []
     for step in (1 / 250, 1 / 1000):
-        theirs, ours, _, position = followed(commands(False, 25), Plant(), "servo", time_step=step)
+        theirs, ours, _, position = followed(commands(False, 12), Plant(), "servo", time_step=step)
         apart.append((rms(theirs - ours) / rms(theirs), rms(position)))
     (coarse, far), (fine, near) = apart
     assert fine < 0.5 * coarse
@@ -321,14 +321,6 @@ def test_a_servo_presses_carries_and_lets_go_as_in_pybullet() -> None:
     assert np.abs(theirs - ours)[:, 3:6].max() < 2e-4
 
 
-def way_of_the_weak() -> list[FloatArray]:
-    """Full reversals well away from y = 0, then rest."""
-    sides = (0, 1, -1, 1, 0, 0, 0, 0, 0)
-    return [HOME + (0.045 * side, 0.010, -0.05 * (k % 2)) for k, side in enumerate(sides[:4])] + [
-        HOME + (0.0, 0.010, 0.0)
-    ] * 8
-
-
 def test_motors_that_tire_do_as_in_pybullet() -> None:
     theirs, ours = (
         make_simulation(Scene(), engine=engine, physics={"time_step": 1e-3, **more})
@@ -340,7 +332,8 @@ def test_motors_that_tire_do_as_in_pybullet() -> None:
     seen: list[Any] = []
     around_each_step(theirs, after=lambda: seen.append(theirs.engine.motors().torque))
     tired, expected, found = 0, [], []
-    for command in way_of_the_weak()[:5]:
+    for k, side in enumerate((0, 1, -1, 1, 0)):  # full reversals, well away from y = 0
+        command = HOME + (0.045 * side, 0.010, -0.05 * (k % 2))
         seen.clear()
         one, other = theirs.move(command), ours.move(command)
         assert ours.batch.torques is not None
@@ -365,13 +358,14 @@ def batch_of(plants: list[Plant], **options: Any) -> AnalyticSimulation:
 
 
 def test_motors_that_tired_catch_up_and_are_ideal_again() -> None:
-    weak = batch_of([WEAK, Plant()])
-    late = 0
-    for command in way_of_the_weak():
-        weak.move(np.array([command] * 2), np.zeros(2, dtype=bool))
-        late += int(not np.allclose(*weak.state().theta, atol=1e-6))
-    state = weak.state()
-    assert late >= 2
+    pair, apart = batch_of([WEAK, Plant()]), []
+    for shift in (0.0, 0.03, *[-0.03] * 5):
+        command = HOME + (shift, 0.010, -max(0.0, shift))
+        pair.move(np.array([command] * 2), np.zeros(2, dtype=bool))
+        apart.append(float(np.abs(np.subtract(*pair.state().theta)).max()))
+    assert np.greater(apart, 1e-3).sum() == 4
+    state = pair.state()
+    assert not state.passed_singularity.any()
     np.testing.assert_allclose(*state.theta, atol=1e-12)
     np.testing.assert_allclose(*state.platform_position, atol=1e-12)
     np.testing.assert_allclose(*state.theta_dot, atol=1e-9)
@@ -394,29 +388,29 @@ def test_torques_are_of_the_last_time_step_or_of_every_one_or_none() -> None:
     assert runs["last"].torques is None
 
 
-@pytest.mark.parametrize("drive", [None, Servo()], ids=["ideal", "servo"])
-def test_what_passes_the_singularity_says_so_stays_finite_and_waits_for_a_reset(drive: Any) -> None:
-    simulation = batch_of([Plant(), Plant()], drive=drive)
-    aside = HOME + (0.02, 0.0, 0.0)
-    vacuum = np.zeros(2, dtype=bool)
-    for y in (0.020, 0.010, 0.0, -0.010, -0.020):
-        simulation.move(np.array([(HOME[0], y, HOME[2]), aside]), vacuum)
+@pytest.mark.parametrize(("drive", "seed"), [(None, 3), (Servo(), 7)], ids=["ideal", "servo"])
+def test_what_is_thrown_through_the_singularity_says_so_and_waits_for_a_reset(
+    drive: Any, seed: int
+) -> None:
+    simulation, vacuum = batch_of([WEAK, Plant()], drive=drive), np.zeros(2, dtype=bool)
+    for command in commands(False, 10, seed):
+        simulation.move(np.array([command] * 2), vacuum)
     state = simulation.state()
-    assert state.assembly_mode_changed.tolist() == [True, False]
+    assert np.array(state.assembly_mode_changed).tolist() == [True, False]
     assert not np.any(state.working_mode_changed)
     assert -state.platform_position[0, 1] > 0  # where it was last on its side
     for values in vars(state).values():
         assert np.isfinite(values).all()
-    stayed = state.platform_position[0]
-    simulation.move(np.array([HOME, aside]), vacuum)
-    np.testing.assert_array_equal(simulation.state().platform_position[0], stayed)
-    np.testing.assert_array_equal(simulation.state().theta[0], state.theta[0])
+    simulation.move(np.array([HOME] * 2), vacuum)
+    later = simulation.state()
+    for name in ("theta", "torque", "platform_position", "assembly_mode_changed"):
+        np.testing.assert_array_equal(getattr(later, name)[0], getattr(state, name)[0])
     simulation.reset(np.array([0]), PAPER_TPM.inverse(PAPER_TPM.home), [{}], [Plant()])
-    assert not simulation.state().assembly_mode_changed[0]
-    simulation.move(np.array([HOME, aside]), vacuum)
-    assert simulation.state().platform_position[0] == pytest.approx(
-        PAPER_TPM.mount.to_world(HOME), abs=1e-5
-    )
+    simulation.move(np.array([HOME] * 2), vacuum)
+    fresh = simulation.state()
+    assert not np.any(fresh.assembly_mode_changed)
+    home = PAPER_TPM.mount.to_world(HOME)
+    np.testing.assert_allclose(fresh.platform_position[0], home, atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -437,7 +431,7 @@ def test_one_alone_has_the_bits_of_one_among_many(drive: str, randomisation: Any
     many, alone, rng = envs(9), envs(1), np.random.default_rng(0)
     many.reset(seed=0)
     alone.reset(seed=4)
-    for _ in range(30):
+    for _ in range(20):
         actions = rng.choice([-1.0, 0.0, 1.0], (9, 4)).astype(np.float32)
         observed, reward, *_ = many.step(actions)
         mine, mine_reward, *_ = alone.step(actions[4:5])
