@@ -27,7 +27,8 @@ class Course(NamedTuple):
         torque: What the motors applied, (3, r) N m.
         position: Of P, (3, r) m.
         before: The same a time step ago.
-        force: Of objects on P in the time step, less what accelerates what is carried, (3, r) N.
+        force: Of objects on P in the time step, (3, r) N, less what changes of the rates take to
+            accelerate what is carried.
         carried: Mass that moves with P, (r,) kg.
         left: (2, r) whether they left their assembly mode, their working mode.
     """
@@ -53,8 +54,8 @@ class Course(NamedTuple):
 
 
 Touch = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
-"""What objects do in a time step, force and mass as in Course, for P (3, 3, r) m before the last
-one, now, and at its end."""
+"""Force on P (3, r) N and mass that moves with it (r,) kg, for P (3, 3, r) m a time step ago, now,
+and at the end of the time step."""
 
 
 def march(
@@ -84,17 +85,19 @@ def march(
             rates, torque = drive.step(reference, now.theta, now.rates, mass, load)
             theta = now.theta + time_step * rates
             expected = now.position + time_step * _along(at.jacobian, rates)
+            gain = _along(at.jacobian, rates - now.rates) / time_step
         at = batch.motion(theta, rates)
         drifting = 2 * now.position - now.before
         side = batch.assembled_at(expected) & batch.assembled_at(drifting)
         left = _left(at, side, now.left)
-        new: tuple[FloatArray, ...] = theta, rates, torque, at.position
+        new: tuple[FloatArray, ...] = theta, rates, torque, at.position, gain
         gone = left.any(axis=0)
         if gone.any():
-            old = now.theta, now.rates, now.torque, now.position
+            old = now.theta, now.rates, now.torque, now.position, np.zeros_like(gain)
             new = tuple(np.where(gone, *pair) for pair in zip(old, new, strict=True))
-        theta, rates, torque, position = new
-        force, carried = touch(np.stack([now.before, now.position, position]))
+        theta, rates, torque, position, gain = new
+        push, carried = touch(np.stack([now.before, now.position, position]))
+        force = push + carried * gain
         now = Course(theta, rates, torque, position, now.position, force, carried, left)
         torques.append(torque)
     return now, torques

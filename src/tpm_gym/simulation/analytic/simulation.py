@@ -233,7 +233,10 @@ class AnalyticSimulation:
         theta, way = self._ideal(path)
         points = np.concatenate([start.before[None], start.position[None], way.transpose(1, 0, 2)])
         push = self._touch(slice(None), points, vacuum)
-        self._force, _ = self._burden(slice(None), points[-3:], push[-1])
+        if self.scene.objects:
+            before, at, now = points[-3:]
+            change = (now - 2 * at + before) / self._step**2
+            self._force = push[-1] + self._pucks.carried(slice(None)) * change
         self._before, self._truth = points[-2].copy(), points[-1].copy()
         self._theta = theta[:, -1].copy()
         self._rates = (theta[:, -1] - theta[:, -2]) / self._step
@@ -327,8 +330,7 @@ class AnalyticSimulation:
         """Run a control period of some machines by forward dynamics."""
 
         def touch(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-            push = self._touch(rows, points, vacuum[rows])
-            return self._burden(rows, points, push[-1])
+            return self._touch(rows, points, vacuum[rows])[-1], self._pucks.carried(rows)
 
         batch = self._true if isinstance(rows, slice) else self._true.take(rows)
         end, torques = march(batch, drive, followed, start, self._step, touch)
@@ -357,14 +359,6 @@ class AnalyticSimulation:
         world = self._mount + points * _TURNED
         push: FloatArray = self._pucks.advance(rows, world, vacuum) * _TURNED
         return push
-
-    def _burden(
-        self, rows: IntArray | slice, points: FloatArray, push: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """The push (3, r) N of a time step less what accelerates what is carried, and its mass."""
-        carried = self._pucks.carried(rows)
-        before, at, now = points
-        return push + carried * (now - 2 * at + before) / self._step**2, carried
 
     @property
     def commands(self) -> FloatArray:
