@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol
 
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray
 
-__all__ = ["Batch", "Readings"]
+__all__ = ["Batch", "Motion", "Readings"]
 
 
 class Readings(NamedTuple):
@@ -29,6 +29,24 @@ class Readings(NamedTuple):
     jacobian: FloatArray
     conditioning: FloatArray
     working: BoolArray
+
+
+class Motion(NamedTuple):
+    """Where machines are, and what moves them: torque = mass theta_ddot + bias.
+
+    Attributes:
+        position: Point P (3, ..., n) m; NaN where the machine cannot be assembled.
+        jacobian: See :class:`Readings`.
+        working: See there.
+        mass: The inertia that the motors feel, kg m^2: its upper triangle by rows, (6, ..., n).
+        bias: What weight and rates take, (3, ..., n) N m.
+    """
+
+    position: FloatArray
+    jacobian: FloatArray
+    working: BoolArray
+    mass: FloatArray
+    bias: FloatArray
 
 
 class Batch(Protocol):
@@ -68,3 +86,9 @@ class Batch(Protocol):
         push: FloatArray | None = None,
     ) -> FloatArray:
         """Torques (3, ..., n) N m of the motors for a motion against a force on P (3, ..., n) N."""
+
+    def motion(self, theta: FloatArray, theta_dot: FloatArray) -> Motion:
+        """What joint positions and rates (3, ..., n) do to what comes next."""
+
+    def assembled_at(self, point: FloatArray) -> BoolArray:
+        """Whether P at ``point`` (3, ..., n) m is of the machine's assembly mode, not beyond it."""

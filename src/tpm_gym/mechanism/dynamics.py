@@ -18,9 +18,9 @@ B_i, each by one division (:func:`_resolve`). Bodies enter by sixteen constants 
   stays what it is and takes no torque: it is left out.
 
 Forces of inertia and weight at B_i, C1 and P go the way back: the forces in the rods that carry
-them, one division each (:func:`gather`), and by those to the motors. The mass matrix is the torque
-of unit accelerations, linear in them; C is the torque's part that is quadratic in the rates,
-polarised, which makes it that of Christoffel's symbols, so that M' - 2C is skew.
+them, one division each (:func:`gather`), and by those to the motors. The mass matrix is that of the
+kinetic energy; C is the torque's part that is quadratic in the rates, polarised, which makes it
+that of Christoffel's symbols, so that M' - 2C is skew.
 
 Everything is in SI units and the machine's (the paper's) frame, in which gravity points along +z:
 the base hangs upside down. The functions with a Pose compute with whatever their namespace does, as
@@ -171,6 +171,44 @@ def carried(
     )
 
 
+def masses(pose: Pose, j: tuple[Triple, Triple, Triple], m: Inertia) -> tuple[Numbers, ...]:
+    """The upper triangle of M, by rows: the kinetic energy of :func:`energies` by pairs of rates.
+
+    Args:
+        pose: The configuration.
+        j: Rows of the velocity Jacobian; motor 3 moves neither C1 nor the height of P.
+        m: The constants.
+    """
+    (c1, c2, c3), (s1, s2, s3), f = pose.cos, pose.sin, pose.factors
+    (r1x, r1y, r1z), (_, _, r2z), (r3x, r3y, r3z) = pose.rods
+    (p1, p2, p3), (q1, q2, q3), (z1, z2, _) = j  # P along x and y; P and C1 along z
+    x1, x2 = r2z * f.leg1 / f.planar, -r1z * f.leg2 / f.planar  # C1
+    (j1, j2, j3), (k1, k2, k3) = m.motors, m.couples
+    square1, square3 = r1y * r1y + r1z * r1z, r3x * r3x + r3z * r3z
+    u1, u2 = (r1y * (z1 - c1) - r1z * s1) / square1, r1y * z2 / square1  # swing of leg 1
+    v1, v2 = (r3x * z1 - r3z * p1) / square3, (r3x * z2 - r3z * p2) / square3  # of leg 3
+    v3 = -(r3x * c3 + r3z * (p3 + s3)) / square3
+    swing1 = m.swing1.fixed + m.swing1.spin * r1x * r1x
+    swing3 = m.swing3.fixed + m.swing3.spin * r3y * r3y
+    platform, link7, rising = m.platform, m.link7, m.link3 + m.platform + 2 * m.link7
+    # Momenta of C1 and P along x
+    h1, h2 = m.link3 * x1 + link7 * p1, m.link3 * x2 + link7 * p2
+    g1, g2, g3 = platform * p1 + link7 * x1, platform * p2 + link7 * x2, platform * p3
+    b1, b2 = k2 * (c2 * z1 - s2 * x1), k2 * (c2 * z2 - s2 * x2)
+    d1, d2 = k3 * (c3 * z1 - s3 * p1), k3 * (c3 * z2 - s3 * p2)
+    return (
+        j1 + h1 * x1 + g1 * p1 + platform * q1 * q1 + rising * z1 * z1
+        + swing1 * u1 * u1 + swing3 * v1 * v1 + 2 * k1 * c1 * z1,
+        h1 * x2 + g1 * p2 + platform * q1 * q2 + rising * z1 * z2
+        + swing1 * u1 * u2 + swing3 * v1 * v2 + k1 * c1 * z2 + b1,
+        g1 * p3 + platform * q1 * q3 + swing3 * v1 * v3 + d1,
+        j2 + h2 * x2 + g2 * p2 + platform * q2 * q2 + rising * z2 * z2
+        + swing1 * u2 * u2 + swing3 * v2 * v2 + 2 * b2,
+        g2 * p3 + platform * q2 * q3 + swing3 * v2 * v3 + d2,
+        j3 + g3 * p3 + platform * q3 * q3 + swing3 * v3 * v3 - 2 * k3 * s3 * p3,
+    )  # fmt: skip
+
+
 def energies(pose: Pose, rates: Triple, gravity: Triple, m: Inertia) -> tuple[Numbers, Numbers]:
     """Kinetic and potential energy, J; the latter up to a constant."""
     (c1, c2, c3), (s1, s2, s3), found = pose.cos, pose.sin, pose.found
@@ -268,6 +306,19 @@ def _swing(rod: Triple, rates: Triple, changes: tuple[Numbers, Numbers], m: Swin
     return -m.spin * out * rate * rate, -z * moment / square, level * moment / square
 
 
+def solve(matrix: tuple[Numbers, ...], right: Triple) -> Triple:
+    """Of a symmetric positive matrix, by its upper triangle: L D L^T."""
+    (a, b, c, d, e, f), (p, q, r) = matrix, right
+    below, last = b / a, c / a
+    second, rest = d - below * b, e - last * b
+    cross = rest / second
+    q = q - below * p
+    r = r - last * p - cross * q
+    z = r / (f - last * c - cross * rest)
+    y = q / second - cross * z
+    return p / a - below * y - last * z, y, z
+
+
 # -- points and batches ----------------------------------------------------------------------------
 
 
@@ -356,7 +407,7 @@ class Dynamics:
         def columns(pose: Pose, rates: Triple, given: Triple) -> Triple:
             one, two, three = self._torques(pose, rates, _REST)
             rest = given[0] - one, given[1] - two, given[2] - three
-            return _solve(self._masses(pose), rest)
+            return solve(self._masses(pose), rest)
 
         return self._rows(columns, (theta, theta_dot, torque), _VECTOR)[0]
 
@@ -372,9 +423,7 @@ class Dynamics:
         return torques(pose, rates, changes, self.free_fall, self.inertia)
 
     def _masses(self, pose: Pose) -> tuple[Numbers, ...]:
-        """The upper triangle of M, by rows: torques of unit accelerations at rest, weightless."""
-        one, two, three = (torques(pose, _REST, unit, _REST, self.inertia) for unit in _UNITS)
-        return (*one, *two[1:], three[2])
+        return masses(pose, equations.velocity(pose.rods, pose.factors), self.inertia)
 
     def _rows(
         self,
@@ -416,16 +465,3 @@ def _side_by_side(states: tuple[ArrayLike, ...]) -> FloatArray:
 def _both(rates: Triple, unit: Vector) -> tuple[Triple, Triple]:
     (u, v, w), (a, b, c) = rates, unit
     return (u + a, v + b, w + c), (u - a, v - b, w - c)
-
-
-def _solve(matrix: tuple[Numbers, ...], right: Triple) -> Triple:
-    """Of a symmetric positive matrix, by its upper triangle: L D L^T."""
-    (a, b, c, d, e, f), (p, q, r) = matrix, right
-    below, last = b / a, c / a
-    second, rest = d - below * b, e - last * b
-    cross = rest / second
-    q = q - below * p
-    r = r - last * p - cross * q
-    z = r / (f - last * c - cross * rest)
-    y = q / second - cross * z
-    return p / a - below * y - last * z, y, z

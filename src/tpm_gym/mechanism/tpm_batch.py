@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 
-from tpm_gym.arrays import FloatArray, IntArray
+from tpm_gym.arrays import BoolArray, FloatArray, IntArray
 from tpm_gym.kinematics import equations
+from tpm_gym.kinematics.equations import Triple
 from tpm_gym.kinematics.geometry import Geometry
 from tpm_gym.kinematics.namespaces import NUMPY, Numbers
 from tpm_gym.mechanism import dynamics
-from tpm_gym.mechanism.batch import Readings
+from tpm_gym.mechanism.batch import Motion, Readings
 from tpm_gym.mechanism.inertia import Inertia, Swing, inertia_of
 
 if TYPE_CHECKING:
@@ -118,12 +119,8 @@ class TPMBatch:
             rows = equations.velocity(pose.rods, pose.factors)
             conditioning = equations.conditioning(rows, NUMPY)
             position = np.where(real, np.stack([found.x, found.y, found.z]), np.nan)
-        jacobian = np.empty((3, *theta.shape))
-        for row, columns in zip(rows, jacobian, strict=True):
-            for value, column in zip(row, columns, strict=True):
-                column[:] = value
         working = found.cos_beta * machine.working_mode.cos_beta > 0
-        return Readings(position, jacobian, conditioning, working)
+        return Readings(position, _matrix(rows, theta.shape), conditioning, working)
 
     def torque(
         self,
@@ -143,10 +140,41 @@ class TPMBatch:
                 found = tuple(one - other for one, other in zip(found, carried, strict=True))
             return np.where(real, np.stack(found), np.nan)
 
+    def motion(self, theta: FloatArray, theta_dot: FloatArray) -> Motion:
+        """See the protocol."""
+        machine, inertia = self._machine, self._inertia
+        with np.errstate(all="ignore"):
+            pose, real = self._pose(theta)
+            found = pose.found
+            fall = machine.mount.free_fall
+            bias = dynamics.torques(pose, tuple(theta_dot), _NONE, fall, inertia)
+            rows = equations.velocity(pose.rods, pose.factors)
+            return Motion(
+                np.where(real, np.stack([found.x, found.y, found.z]), np.nan),
+                _matrix(rows, theta.shape),
+                found.cos_beta * machine.working_mode.cos_beta > 0,
+                np.stack(dynamics.masses(pose, rows, inertia)),
+                np.stack(bias),
+            )
+
+    def assembled_at(self, point: FloatArray) -> BoolArray:
+        """See the protocol."""
+        side: BoolArray = point[1] * self._machine.assembly_mode.sin_beta > 0
+        return side
+
     def _pose(self, theta: FloatArray) -> tuple[dynamics.Pose, Numbers]:
         one, two, three = theta
         branch = self._machine.assembly_mode
         return dynamics.pose_at((one, two, three), branch, self._geometry, NUMPY)
+
+
+def _matrix(rows: tuple[Triple, Triple, Triple], shape: tuple[int, ...]) -> FloatArray:
+    """Rows of numbers, and of columns (..., n), as one array (3, 3, ..., n)."""
+    matrix = np.empty((3, *shape))
+    for row, columns in zip(rows, matrix, strict=True):
+        for value, column in zip(row, columns, strict=True):
+            column[:] = value
+    return matrix
 
 
 def _flat(inertia: Inertia) -> FloatArray:

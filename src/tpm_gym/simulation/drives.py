@@ -17,12 +17,15 @@ import numpy as np
 
 from tpm_gym.arrays import FloatArray, Vector
 from tpm_gym.errors import ConfigurationError, SingularityError, UnreachableError
+from tpm_gym.kinematics.equations import Triple
+from tpm_gym.mechanism.batch import Batch
 from tpm_gym.mechanism.bodies import Joint
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.randomisation import NOMINAL, Plant
 from tpm_gym.simulation.settings import settings_of
 
 __all__ = [
+    "Gains",
     "Memory",
     "Reference",
     "Servo",
@@ -31,6 +34,7 @@ __all__ = [
     "limited",
     "references",
     "require_servo",
+    "wanted",
 ]
 
 FEEDFORWARDS = ("none", "gravity", "computed")
@@ -40,7 +44,7 @@ _UNITS: tuple[Vector, ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 class Reference(NamedTuple):
-    """Where the motors shall be at the end of a time step.
+    """Where the motors shall be at the end of a time step: three floats, or columns (3, n).
 
     Attributes:
         theta: rad (m for a slide).
@@ -48,9 +52,9 @@ class Reference(NamedTuple):
         torque: Fed forward in the time step, N m; zero for the ideal drive.
     """
 
-    theta: Vector
-    theta_dot: Vector = _ZERO
-    torque: Vector = _ZERO
+    theta: Any
+    theta_dot: Triple = _ZERO
+    torque: Triple = _ZERO
 
 
 @dataclass(frozen=True)
@@ -144,9 +148,11 @@ def limited(torque: float, rate: float, effort: float, motor: Joint) -> float:
 
 
 def references(
-    machine: Machine, servo: Servo, start: Vector, path: Sequence[Vector], time_step: float
+    machine: Machine | Batch, servo: Servo, start: Any, path: Sequence[Any], time_step: float
 ) -> list[Reference]:
     """Angles with their rates, and the torques fed forward in each time step.
+
+    Of one machine in plain floats; of many in arrays (3, n), with a path (K, 3, n).
 
     The torques are those of the first and the last time step, and in between a straight line: in a
     control period, they differ little from it.
@@ -172,14 +178,16 @@ def references(
             (points[-2], rates[-1], changes[-1]),
         )
     )
-    between = np.linspace(first, last, len(path)).tolist()
+    between: Any = np.linspace(first, last, len(path))
+    if between.ndim == 2:
+        between = between.tolist()
     return [
         Reference(theta, rate, (a, b, c))
         for theta, rate, (a, b, c) in zip(path, rates, between, strict=True)
     ]
 
 
-def _slope(now: Vector, before: Vector, time: float) -> Vector:
+def _slope(now: Triple, before: Triple, time: float) -> Triple:
     a, b, c = now
     d, e, f = before
     return (a - d) / time, (b - e) / time, (c - f) / time
@@ -193,8 +201,8 @@ class Memory(NamedTuple):
         theta_dot: Their rates at its beginning, rad/s.
     """
 
-    torque: Vector
-    theta_dot: Vector
+    torque: Triple
+    theta_dot: Triple
 
 
 class Servos:
@@ -255,8 +263,7 @@ class Servos:
             mass = self._inertia(self._home)
         stiffness, damping, step = np.array(self._stiffness), self._servo.damping, self._step
         inverse = np.linalg.inv(mass + np.diag(step * (step * stiffness + damping)))
-        self._mass: list[list[float]] = mass.tolist()
-        self._inverse: list[list[float]] = inverse.tolist()
+        self._gains = Gains(self._stiffness, damping, mass.tolist(), inverse.tolist(), step)
 
     def _inertia(self, theta: Vector) -> FloatArray:
         """(3, 3) kg m^2, at least as light as the true machine."""
@@ -267,31 +274,59 @@ class Servos:
 
     def torque(self, reference: Reference, theta: Vector, theta_dot: Vector) -> Vector:
         """What the motors apply in a time step, N m, from angles and rates at its beginning."""
-        step, damping = self._step, self._servo.damping
-        before, rates = self.memory
-        load = _minus(before, _times(self._mass, _slope(theta_dot, rates, step)))
-        motion = zip(
-            self._stiffness, reference.theta, reference.theta_dot, theta, theta_dot, strict=True
-        )
-        a, b, c = (
-            stiffness * (wanted - angle - step * rate) + damping * (wanted_rate - rate)
-            for stiffness, wanted, wanted_rate, angle, rate in motion
-        )
-        d, e, f = _minus(reference.torque, load)
-        x, y, z = _times(self._mass, _times(self._inverse, (a + d, b + e, c + f)))
-        u, v, w = load
-        wanted_torques = (u + x, v + y, w + z)
-        one, two, three = map(limited, wanted_torques, theta_dot, self._effort, self._motors)
+        asked = wanted(self._gains, self.memory, reference, theta, theta_dot)
+        one, two, three = map(limited, asked, theta_dot, self._effort, self._motors)
         self.memory = Memory((one, two, three), theta_dot)
         return self.memory.torque
 
 
-def _minus(left: Vector, right: Vector) -> Vector:
+class Gains(NamedTuple):
+    """What the law of servo drives multiplies by, in a control period.
+
+    Attributes:
+        stiffness: N m/rad.
+        damping: N m s/rad.
+        mass: (3, 3) kg m^2, the inertia that the drives believe in.
+        inverse: Of mass + ``step`` x (``step`` x stiffness + damping).
+        step: The time step, s.
+    """
+
+    stiffness: Triple
+    damping: float
+    mass: Sequence[Any]
+    inverse: Sequence[Any]
+    step: float
+
+
+def wanted(
+    gains: Gains, memory: Memory, reference: Reference, theta: Triple, theta_dot: Triple
+) -> Triple:
+    """The law of :class:`Servos`: torques, N m, before the motors' limits.
+
+    In plain floats, or in arrays of one for each machine.
+    """
+    step, damping = gains.step, gains.damping
+    before, rates = memory
+    load = _minus(before, _times(gains.mass, _slope(theta_dot, rates, step)))
+    motion = zip(
+        gains.stiffness, reference.theta, reference.theta_dot, theta, theta_dot, strict=True
+    )
+    a, b, c = (
+        stiffness * (wanted - angle - step * rate) + damping * (wanted_rate - rate)
+        for stiffness, wanted, wanted_rate, angle, rate in motion
+    )
+    d, e, f = _minus(reference.torque, load)
+    x, y, z = _times(gains.mass, _times(gains.inverse, (a + d, b + e, c + f)))
+    u, v, w = load
+    return u + x, v + y, w + z
+
+
+def _minus(left: Triple, right: Triple) -> Triple:
     (a, b, c), (d, e, f) = left, right
     return a - d, b - e, c - f
 
 
-def _times(matrix: list[list[float]], column: Vector) -> Vector:
+def _times(matrix: Sequence[Any], column: Triple) -> Triple:
     (a, b, c), (d, e, f), (g, h, i) = matrix
     x, y, z = column
     return a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z

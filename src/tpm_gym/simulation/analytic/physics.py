@@ -20,8 +20,9 @@ class Physics:
     Attributes:
         time_step: s; a whole fraction of the control period, of which there are three or more.
         torques: Of which time steps of a control period the motors' torques are computed, and
-            compared with what the motors have: ``"none"`` (then the State's are NaN), ``"last"``
-            or ``"every"``. Wherever one is more than half of what its motor has, every one is.
+            compared with what the motors have: ``"none"`` (then the State's are NaN, and ideal
+            motors never tire), ``"last"`` or ``"every"``. Wherever one is more than half of what
+            its motor has, every one is. Servo drives know theirs anyway.
 
     Raises:
         ConfigurationError: If a value is out of range.

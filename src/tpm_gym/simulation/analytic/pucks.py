@@ -143,6 +143,10 @@ class Pucks:
             force[:, :, loose] = self._run(number[loose], path[:, :, loose], on[loose])
         return force
 
+    def carried(self, rows: slice | IntArray) -> FloatArray:
+        """What the cups hold, (r,) kg."""
+        return np.where(self._held[rows], self._mass[rows], 0.0)
+
     def report(self) -> dict[str, Any]:
         """The entries of a :class:`~tpm_gym.simulation.state.State` about objects, rows first."""
         some = self._block is not None

@@ -21,9 +21,11 @@ from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.batch import Readings
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.tpm import PAPER_TPM
+from tpm_gym.simulation.analytic.drives import Drive, IdealDrives, ServoDrives
+from tpm_gym.simulation.analytic.motion import Course, march
 from tpm_gym.simulation.analytic.physics import Physics
 from tpm_gym.simulation.analytic.pucks import Pucks
-from tpm_gym.simulation.drives import Servo
+from tpm_gym.simulation.drives import Reference, Servo, references
 from tpm_gym.simulation.randomisation import NOMINAL, Plant
 from tpm_gym.simulation.settings import settings_of
 from tpm_gym.simulation.simulation import spline_weights
@@ -35,7 +37,7 @@ _WATCHFUL = 0.5
 """Share of a motor's torque from which on every time step is looked at."""
 _COLUMNS = (
     "_bias", "_effort", "_theta", "_rates", "_torque", "_position", "_jacobian", "_conditioning",
-    "_truth", "_before", "_commands", "_noise", "_left",
+    "_truth", "_before", "_commands", "_noise", "_left", "_behind", "_force", "_memory",
 )  # fmt: skip
 _TURNED = np.array([[1.0], [-1.0], [-1.0]])  # free vectors between machine's frame and world
 
@@ -58,6 +60,10 @@ class AnalyticSimulation:
         machine: The nominal machine, which has a :meth:`~tpm_gym.Machine.batch`.
         physics: A :class:`Physics`, or a mapping of its attributes.
         drive: The motors' servo drives; None for ideal ones.
+
+    Attributes:
+        torques: Of all time steps of the last control period, (K, 3, n) N m, where ``physics`` asks
+            for ``"every"``; else None.
 
     Raises:
         ConfigurationError: If an option is out of range, or beyond what is in closed form.
@@ -110,6 +116,15 @@ class AnalyticSimulation:
         self._commands = np.stack([reading.position] * 2)
         self._noise = np.zeros((2, 3, n))  # of the last two readings
         self._left = np.zeros((2, n), dtype=np.bool_)  # assembly mode, working mode
+        self._behind = np.zeros(n, dtype=np.bool_)  # whether ideal motors lacked torque
+        self._force = np.zeros((3, n))  # of objects on P in the last time step
+        self._memory = np.zeros((2, 3, n))  # of servo drives
+        self._servos = (
+            None
+            if self.drive is None
+            else ServoDrives(self.drive, self.machine, self._memory, self._step)
+        )
+        self.torques: FloatArray | None = None
 
     # -- running ----------------------------------------------------------------------------
 
@@ -133,8 +148,10 @@ class AnalyticSimulation:
         self._become(rows, plants)
         angles = np.array(theta, dtype=np.float64)[:, None]
         self._theta[:, rows] = angles - self._bias[:, rows]
-        self._rates[:, rows] = self._torque[:, rows] = 0.0
-        self._left[:, rows] = False
+        self._rates[:, rows] = self._torque[:, rows] = self._force[:, rows] = 0.0
+        self._left[:, rows] = self._behind[rows] = False
+        if self._servos is not None:
+            self._servos.rest(rows, np.ascontiguousarray(self._theta[:, rows]))
         at = self._reading_at(tuple(theta))
         self._commands[:, :, rows] = at.position
         self._position[:, rows], self._jacobian[:, :, rows] = at.position, at.jacobian
@@ -174,6 +191,8 @@ class AnalyticSimulation:
         self._bias[:, rows] = np.array([plant.encoder_bias for plant in plants]).T
         strength = np.array([plant.motor_strength for plant in plants]).T
         self._effort[:, rows] = self._nominal_effort * strength
+        if self._servos is not None:
+            self._servos.alter(rows, lengths, plants)
         self._exact = self._exact and not any(lengths) and not self._bias[:, rows].any()
         masses, friction = (
             [getattr(p, name) for p in plants] for name in ("puck_mass", "friction")
@@ -196,49 +215,150 @@ class AnalyticSimulation:
         first, second, third = self._weights
         path = first * before[:, None] + second * last[:, None] + third * new[:, None]
         self._commands = np.stack([last, new])
-        tail, path = self._follow(path)
-        push = self._touch(path, vacuum)
-        self._before, self._truth = path[:, -2].copy(), path[:, -1].copy()
-        self._drive(tail, push)
+        if self._servos is None:
+            self._follow(path, vacuum)
+        else:
+            self._serve(self._servos, (before + last) / 2, path, vacuum)
         self._noise[0] = self._noise[1]
         self._noise[1] = 0.0 if noise is None else noise
         self._read(slice(None))
 
-    def _follow(self, path: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Where ideal motors go for P to be on ``path`` (3, K, n) m, and where it is then.
+    def _follow(self, path: FloatArray, vacuum: BoolArray) -> None:
+        """Let ideal motors take P along ``path`` (3, K, n) m.
+
+        That is computed as if all of them could, and once more for machines of which one cannot.
+        """
+        start = self._course()
+        objects = self._pucks.save(slice(None)) if self.scene.objects else None
+        theta, way = self._ideal(path)
+        points = np.concatenate([start.before[None], start.position[None], way.transpose(1, 0, 2)])
+        push = self._touch(slice(None), points, vacuum)
+        if self.scene.objects:
+            before, at, now = points[-3:]
+            change = (now - 2 * at + before) / self._step**2
+            self._force = push[-1] + self._pucks.carried(slice(None)) * change
+        self._before, self._truth = points[-2].copy(), points[-1].copy()
+        self._theta = theta[:, -1].copy()
+        self._rates = (theta[:, -1] - theta[:, -2]) / self._step
+        late = self._behind | start.left.any(axis=0) | ~self._true.assembled_at(way).all(axis=0)
+        late |= self._find_torques(start, theta, path, push)
+        rows = np.flatnonzero(late)
+        if len(rows):
+            if objects is not None:
+                self._pucks.restore(rows, tuple(part[..., rows] for part in objects))
+            drive = IdealDrives(self._effort[:, rows], self._step)
+            followed = [Reference(one) for one in self._angles(path, rows).transpose(1, 0, 2)]
+            self._march(rows, start.take(rows), drive, followed, vacuum)
+            self._behind[rows] = drive.behind.any(axis=0)
+
+    def _ideal(self, path: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Where motors are for P to be on ``path`` (3, K, n) m, and where it is then.
 
         Returns:
-            theta (3, 3, n) rad at the last three time steps, and the true way of P (3, K, n) m.
+            theta (3, 3, n) rad at the last three time steps, or at all (3, K, n) if their torques
+            are wanted; and the true way of P (3, K, n) m, NaN where it leaves the machine's modes.
         """
+        tail = slice(None if self.physics.torques == "every" else -3, None)
         if self._exact:
-            return self._nominal.inverse(path[:, -3:]), path
-        theta = self._nominal.inverse(path) - self._bias[:, None]
-        reading = self._true.evaluate(theta)
-        self._left[0] |= ~np.isfinite(reading.position).all(axis=(0, 1))
-        self._left[1] |= ~reading.working.all(axis=0) & ~self._left[0]
-        return theta[:, -3:], reading.position
+            return self._nominal.inverse(path[:, tail]), path
+        theta = self._angles(path, slice(None))
+        return theta[:, tail], self._true.forward(theta)
 
-    def _touch(self, path: FloatArray, vacuum: BoolArray) -> FloatArray | None:
-        """Let the objects and cups do what they do along the way of P; the last force on P, N."""
-        if not self.scene.objects:
-            return None
-        whole = np.concatenate([self._before[:, None], self._truth[:, None], path], axis=1)
-        world = self._mount[:, None] + whole * _TURNED[:, None]
-        push = self._pucks.advance(slice(None), world.transpose(1, 0, 2), vacuum)
-        last: FloatArray = push[-1] * _TURNED
-        return last
+    def _angles(self, path: FloatArray, rows: IntArray | slice) -> FloatArray:
+        """Where motors are for P to be on ``path`` (3, K, n) m, (3, K, r) rad, of some machines."""
+        some, bias = _columns(path, rows), _columns(self._bias, rows)
+        batch = self._nominal if isinstance(rows, slice) else self._nominal.take(rows)
+        angles: FloatArray = batch.inverse(some) - bias[:, None]
+        return angles
 
-    def _drive(self, theta: FloatArray, push: FloatArray | None) -> None:
-        """Torques that take the motors through their last three angles (3, 3, n) rad."""
-        h = self._step
-        before, at, now = theta[:, 0], theta[:, 1], theta[:, 2]
-        rate, self._rates = (at - before) / h, (now - at) / h
-        self._theta = now.copy()
+    def _find_torques(
+        self, start: Course, theta: FloatArray, path: FloatArray, push: FloatArray
+    ) -> BoolArray:
+        """What motors apply at the angles (3, ..., n) rad; (n,) where one would need too much."""
         if self.physics.torques == "none":
-            self._torque[:] = np.nan
-            return
-        change = (self._rates - rate) / h
-        self._torque = self._true.torque(at, rate, change, push)
+            self._torque = np.full_like(self._torque, np.nan)
+            return np.zeros(self.count, dtype=np.bool_)
+        if self.physics.torques == "every":
+            torques = self._torques(slice(None), start.lead(theta, self._step), push)
+            self.torques, self._torque = torques, torques[-1].copy()
+            return _beyond(torques, self._effort)
+        self._torque = self._torques(slice(None), theta, push[-1:])[0]
+        over = _beyond(self._torque[None], _WATCHFUL * self._effort)
+        rows = np.flatnonzero(over)
+        if len(rows):
+            every = start.take(rows).lead(self._angles(path, rows), self._step)
+            torques = self._torques(rows, every, push[:, :, rows])
+            over[rows] = _beyond(torques, self._effort[:, rows])
+        return over
+
+    def _torques(self, rows: IntArray | slice, theta: FloatArray, push: FloatArray) -> FloatArray:
+        """Torques (m, 3, r) N m that take motors through theta (3, m + 2, r) rad."""
+        rates = np.diff(theta, axis=1) / self._step
+        changes = np.diff(rates, axis=1) / self._step
+        against = push.transpose(1, 0, 2) if self.scene.objects else None
+        batch = self._true if isinstance(rows, slice) else self._true.take(rows)
+        torques = batch.torque(theta[:, 1:-1], rates[:, :-1], changes, against)
+        by_steps: FloatArray = torques.transpose(1, 0, 2)
+        return by_steps
+
+    def _serve(
+        self, servos: ServoDrives, start: FloatArray, path: FloatArray, vacuum: BoolArray
+    ) -> None:
+        """Let servo drives take P from ``start`` (3, n) along ``path`` (3, K, n) m."""
+        nominal, bias = self._nominal, self._bias
+        angles = nominal.inverse(path).transpose(1, 0, 2)
+        followed = references(nominal, servos.law, nominal.inverse(start), angles, self._step)
+        followed = [one._replace(theta=one.theta - bias) for one in followed]
+        servos.begin(followed[0].theta)
+        self._march(slice(None), self._course(), servos, followed, vacuum)
+
+    def _course(self) -> Course:
+        """Where the machines are."""
+        return Course(
+            self._theta, self._rates, self._torque, self._truth, self._before,
+            self._force, self._pucks.carried(slice(None)), self._left,
+        )  # fmt: skip
+
+    def _march(
+        self,
+        rows: IntArray | slice,
+        start: Course,
+        drive: Drive,
+        followed: Sequence[Reference],
+        vacuum: BoolArray,
+    ) -> None:
+        """Run a control period of some machines by forward dynamics."""
+
+        def touch(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+            return self._touch(rows, points, vacuum[rows])[-1], self._pucks.carried(rows)
+
+        batch = self._true if isinstance(rows, slice) else self._true.take(rows)
+        end, torques = march(batch, drive, followed, start, self._step, touch)
+        self._theta[:, rows], self._rates[:, rows] = end.theta, end.rates
+        self._truth[:, rows], self._before[:, rows] = end.position, end.before
+        self._torque[:, rows], self._force[:, rows] = end.torque, end.force
+        self._left[:, rows] = end.left
+        if self.physics.torques == "every":
+            if self.torques is None:
+                self.torques = np.zeros((len(torques), 3, self.count))
+            self.torques[:, :, rows] = torques
+
+    def _touch(self, rows: IntArray | slice, points: FloatArray, vacuum: BoolArray) -> FloatArray:
+        """Let objects and cups do what they do along the way of P; forces on P.
+
+        Args:
+            rows: Of which machines.
+            points: P (K + 2, 3, r) m before the last time step, now, and after each to come.
+            vacuum: (r,) whether the cups suck.
+
+        Returns:
+            (K, 3, r) N.
+        """
+        if not self.scene.objects:
+            return np.zeros((1, 3, points.shape[2]))
+        world = self._mount + points * _TURNED
+        push: FloatArray = self._pucks.advance(rows, world, vacuum) * _TURNED
+        return push
 
     @property
     def commands(self) -> FloatArray:
@@ -310,6 +430,18 @@ class AnalyticSimulation:
         return world
 
 
+def _columns(array: FloatArray, rows: IntArray | slice) -> FloatArray:
+    """Some columns of an array (..., n), next to each other in memory as all of them are."""
+    return np.ascontiguousarray(array[..., rows])
+
+
+def _beyond(torques: FloatArray, effort: FloatArray) -> BoolArray:
+    """(r,) whether one of torques (m, 3, r) is more than a motor's effort (3, r)."""
+    beyond: BoolArray = np.logical_or.reduce(np.abs(torques) > effort, axis=(0, 1))
+    return beyond
+
+
 def _rows(columns: FloatArray) -> FloatArray:
-    """Components (3, n) as (n, 3)."""
-    return np.ascontiguousarray(columns.T)
+    """Components (3, n) as (n, 3), a copy even of one row."""
+    rows: FloatArray = columns.T.copy(order="C")
+    return rows
