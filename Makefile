@@ -4,7 +4,7 @@ VENV := .venv
 RUN := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
 
-.PHONY: help demo test lint format test-fast test-slow test-wheel urdf pictures figures results bench-kinematics bench-engine bench-engines bench-fidelity bench-evaluate bench-speed soak clean
+.PHONY: help demo test lint format test-fast test-slow test-wheel urdf pictures figures gradients results bench-kinematics bench-engine bench-engines bench-fidelity bench-evaluate bench-speed soak clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -56,6 +56,9 @@ pictures: $(INSTALLED) ## redraw the README's pictures
 
 figures: $(INSTALLED) ## redraw the paper's figures, and more, in docs/images/
 	$(RUN) docs/draw_figures.py
+
+gradients: $(INSTALLED) ## lengths and ways improved by gradients, again; see docs/gradients.md; minutes
+	$(RUN) docs/draw_gradients.py
 
 results: $(INSTALLED) ## rewrite docs/results.md and its figures from the records in docs/results/
 	$(VENV)/bin/tpm-gym report write

@@ -29,7 +29,7 @@ from tpm_gym.kinematics import (
     passive_angles,
     workspace,
 )
-from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
+from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry, Lengths
 from tpm_gym.kinematics.namespaces import NUMPY, PLAIN
 
 GEOMETRIES = [PAPER, WIDE, Geometry(l1=0.31, l2=0.06, l3=0.36, l4=0.79, l5=0.11, l6=0.02, l7=0.07)]
@@ -169,6 +169,21 @@ def test_derivatives_at_points_are_those_of_finite_differences(branch: WorkingMo
     assert gradcheck(
         lambda p: workspace.conditioning_at(p, branch, ASSEMBLY_MODES[slot]), (tensor,)
     )
+
+
+@pytest.mark.parametrize("branch", [mode for mode in WORKING_MODES if mode.cos_beta > 0])
+def test_derivatives_by_the_lengths_are_those_of_finite_differences(branch: WorkingMode) -> None:
+    points = torch.tensor(np.random.default_rng(4).uniform(LOW, HIGH, (3, 3)))
+    slot = int(workspace.assembly_of(points[0], branch))
+
+    def values(lengths: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        g = Lengths(*lengths)
+        factors = jacobian.factors_at(points, branch, g)
+        found = workspace.conditioning_at(points, branch, ASSEMBLY_MODES[slot], g)
+        return found, *vars(factors).values()
+
+    lengths = torch.tensor(np.array([*vars(PAPER).values()]), requires_grad=True)
+    assert gradcheck(values, (lengths,))
 
 
 def test_branches_that_do_not_exist_leave_the_derivatives_of_the_others_finite() -> None:

@@ -24,7 +24,7 @@ import numpy as np
 
 from tpm_gym.arrays import Vector
 from tpm_gym.errors import SingularityError, UnreachableError
-from tpm_gym.kinematics.geometry import Geometry
+from tpm_gym.kinematics.geometry import Geometry, Lengths
 from tpm_gym.kinematics.modes import AssemblyMode, WorkingMode
 from tpm_gym.kinematics.namespaces import NUMPY, PLAIN, Namespace, Numbers
 
@@ -74,7 +74,7 @@ class Factors(NamedTuple):
 # -- over any namespace ----------------------------------------------------------------------------
 
 
-def arms(theta: Triple, g: Geometry, ns: Namespace) -> tuple[Triple, Triple]:
+def arms(theta: Triple, g: Lengths, ns: Namespace) -> tuple[Triple, Triple]:
     """The arms A_iB_i in their planes: l3 cos(theta_i), and l3 sin(theta_i)."""
     one, two, three = theta
     cos, sin, l3 = ns.cos, ns.sin, g.l3
@@ -83,7 +83,7 @@ def arms(theta: Triple, g: Geometry, ns: Namespace) -> tuple[Triple, Triple]:
 
 
 def assembly_at(
-    cos: Triple, sin: Triple, planar: Numbers, side: Numbers, g: Geometry, ns: Namespace
+    cos: Triple, sin: Triple, planar: Numbers, side: Numbers, g: Lengths, ns: Namespace
 ) -> tuple[Assembly, Numbers, tuple[Numbers, Numbers, Numbers, Numbers]]:
     """Forward kinematics (Eqs. 6 to 11, corrected) for the signs of planar factor and sin(beta).
 
@@ -120,7 +120,7 @@ def assembly_at(
 
 
 def posture_at(
-    point: Triple, signs: tuple[Numbers, Numbers, Numbers, Numbers], g: Geometry, ns: Namespace
+    point: Triple, signs: tuple[Numbers, Numbers, Numbers, Numbers], g: Lengths, ns: Namespace
 ) -> tuple[
     Triple, Numbers, tuple[Numbers, Numbers, Numbers, Numbers], tuple[Triple, Triple, Triple]
 ]:
@@ -156,7 +156,7 @@ def posture_at(
 
 
 def _fold(
-    a: Numbers, b: Numbers, out: Numbers, g: Geometry, ns: Namespace
+    a: Numbers, b: Numbers, out: Numbers, g: Lengths, ns: Namespace
 ) -> tuple[Numbers, Numbers]:
     """The arm's angle to its leg's span, of |C - A - l3 e(theta)| = l4; whether the leg reaches."""
     l3, l4 = g.l3, g.l4
@@ -166,7 +166,7 @@ def _fold(
     return ns.arccos(ns.clip(ratio)), reaches
 
 
-def rods(cos: Triple, sin: Triple, found: Assembly, g: Geometry) -> tuple[Triple, Triple, Triple]:
+def rods(cos: Triple, sin: Triple, found: Assembly, g: Lengths) -> tuple[Triple, Triple, Triple]:
     """The vectors B_iC_i, m."""
     x, y, _, x_c, z_c, _, _ = found
     return (
@@ -177,7 +177,7 @@ def rods(cos: Triple, sin: Triple, found: Assembly, g: Geometry) -> tuple[Triple
 
 
 def factors(
-    cos: Triple, sin: Triple, found: Assembly, bars: tuple[Triple, Triple, Triple], g: Geometry
+    cos: Triple, sin: Triple, found: Assembly, bars: tuple[Triple, Triple, Triple], g: Lengths
 ) -> Factors:
     """What vanishes where the configuration is singular, from its arms and rods."""
     (r1x, r1y, r1z), (r2x, _, r2z), (r3x, _, r3z) = bars

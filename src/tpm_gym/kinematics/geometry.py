@@ -5,10 +5,24 @@ from dataclasses import dataclass, fields
 from numbers import Real
 
 from tpm_gym.errors import GeometryError, InputError
+from tpm_gym.kinematics.namespaces import Numbers
 
 
 @dataclass(frozen=True)
-class Geometry:
+class Lengths:
+    """l1 to l7 as any numbers, unchecked: as tensors, for what is differentiated by them."""
+
+    l1: Numbers
+    l2: Numbers
+    l3: Numbers
+    l4: Numbers
+    l5: Numbers
+    l6: Numbers
+    l7: Numbers
+
+
+@dataclass(frozen=True)
+class Geometry(Lengths):
     """Link lengths of the mechanism in metres, named as in the paper ("Establishment of ...").
 
     Attributes:

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from tpm_gym.arrays import FloatArray, finite_points, points, vector
 from tpm_gym.errors import SingularityError
 from tpm_gym.kinematics import equations
-from tpm_gym.kinematics.geometry import PAPER, Geometry
+from tpm_gym.kinematics.geometry import PAPER, Geometry, Lengths
 from tpm_gym.kinematics.modes import DEFAULT_ASSEMBLY, ELBOWS_OUT, AssemblyMode, WorkingMode
 from tpm_gym.kinematics.namespaces import Namespace, Numbers, by_rows
 
@@ -146,9 +146,13 @@ def conditioning_at(
     position: ArrayLike,
     branch: WorkingMode = ELBOWS_OUT,
     assembly: AssemblyMode = DEFAULT_ASSEMBLY,
-    geometry: Geometry = PAPER,
+    geometry: Lengths = PAPER,
 ) -> FloatArray:
-    """1/cond(J) at points, (...,); 0 where they are not reachable on both branches."""
+    """1/cond(J) at points, (...,); 0 where they are not reachable on both branches.
+
+    It can be differentiated by the lengths too: with tensors in a
+    :class:`tpm_gym.kinematics.geometry.Lengths`, and tensors for points.
+    """
 
     def columns(c: _Configuration) -> list[Numbers]:
         planar, side = (2.0 * (f > 0) - 1.0 for f in (c.factors.planar, c.factors.sin_beta))
@@ -188,7 +192,7 @@ def factors(
 
 
 def factors_at(
-    position: ArrayLike, branch: WorkingMode = ELBOWS_OUT, geometry: Geometry = PAPER
+    position: ArrayLike, branch: WorkingMode = ELBOWS_OUT, geometry: Lengths = PAPER
 ) -> Factors:
     """The factors at points instead of joint angles; NaN where not reachable on ``branch``.
 
@@ -226,7 +230,7 @@ def _from_points(
     columns: _Columns,
     position: ArrayLike,
     branch: WorkingMode,
-    g: Geometry,
+    g: Lengths,
     missing: float,
     *layouts: NDArray[np.intp],
 ) -> list[FloatArray]:
@@ -245,7 +249,7 @@ def _configuration(
     cos: equations.Triple,
     sin: equations.Triple,
     found: equations.Assembly,
-    g: Geometry,
+    g: Lengths,
     ns: Namespace,
 ) -> _Configuration:
     bars = equations.rods(cos, sin, found, g)
