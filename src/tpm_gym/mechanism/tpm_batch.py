@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray
 from tpm_gym.kinematics import equations
 from tpm_gym.kinematics.equations import Triple
-from tpm_gym.kinematics.geometry import Geometry
+from tpm_gym.kinematics.geometry import Lengths
 from tpm_gym.kinematics.namespaces import NUMPY, Numbers
 from tpm_gym.mechanism import dynamics
 from tpm_gym.mechanism.batch import Motion, Readings
@@ -20,18 +20,6 @@ if TYPE_CHECKING:
     from tpm_gym.mechanism.tpm import TPM
 
 _NONE = (0.0, 0.0, 0.0)
-
-
-class _Lengths(NamedTuple):
-    """Those of a Geometry, one (n,) for each machine."""
-
-    l1: Numbers
-    l2: Numbers
-    l3: Numbers
-    l4: Numbers
-    l5: Numbers
-    l6: Numbers
-    l7: Numbers
 
 
 class TPMBatch:
@@ -47,7 +35,8 @@ class TPMBatch:
         self._machine, self._count = machine, count
         nominal = machine.dynamics.inertia
         # Numbers while all are as designed: it saves a third of the time.
-        self._geometry, self._inertia = machine.geometry, nominal
+        self._geometry: Lengths = machine.geometry
+        self._inertia = nominal
         self._lengths: FloatArray | None = None
         self._constants: FloatArray | None = None
 
@@ -78,7 +67,7 @@ class TPMBatch:
     def _unpack(self) -> None:
         assert self._lengths is not None
         assert self._constants is not None
-        self._geometry = cast(Geometry, _Lengths(*self._lengths))
+        self._geometry = Lengths(*self._lengths)
         self._inertia = _inertia(self._constants)
 
     def take(self, rows: IntArray) -> TPMBatch:
