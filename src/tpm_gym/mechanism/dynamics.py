@@ -42,7 +42,7 @@ from tpm_gym.arrays import FloatArray, Vector, finite_points, is_tensor
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode, equations
 from tpm_gym.kinematics.equations import Triple
-from tpm_gym.kinematics.geometry import PAPER, Geometry
+from tpm_gym.kinematics.geometry import PAPER, Geometry, Lengths
 from tpm_gym.kinematics.jacobian import require_regular
 from tpm_gym.kinematics.namespaces import PLAIN, Namespace, Numbers, by_rows, namespace_of
 from tpm_gym.mechanism import tree
@@ -83,7 +83,7 @@ class Pose(NamedTuple):
     rods: tuple[Triple, Triple, Triple]
     factors: equations.Factors
     k: Numbers
-    lengths: Geometry
+    lengths: Lengths
 
 
 class Velocities(NamedTuple):
@@ -120,7 +120,7 @@ class Accelerations(NamedTuple):
 
 
 def pose_at(
-    theta: Triple, branch: AssemblyMode, g: Geometry, ns: Namespace
+    theta: Triple, branch: AssemblyMode, g: Lengths, ns: Namespace
 ) -> tuple[Pose, Numbers]:
     """The configuration at joint angles, and whether it is real."""
     cos, sin = equations.arms(theta, g, ns)
