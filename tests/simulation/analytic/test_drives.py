@@ -333,18 +333,6 @@ def test_motors_that_tire_do_as_in_pybullet() -> None:
     assert rms(np.subtract(found, expected)) < 0.02 * rms(expected)
 
 
-def test_a_puck_heavier_than_the_platform_is_carried_steadily() -> None:
-    heavy = {"puck_mass": 6.0, "link_mass": 0.5}
-    env = gym.make("TPMPickAndPlace-v0", engine="analytic", drive="servo", randomisation=heavy)
-    inside: Any = env.unwrapped
-    episode = expert_episode(env, 0)
-    states = [inside.state for _ in episode]
-    env.close()
-    assert sum(state.held == 0 for state in states) > 10
-    assert np.abs([state.torque for state in states]).max() < 15  # N m
-    assert np.abs([state.theta_dot for state in states]).max() < 3  # rad/s
-
-
 # -- in batches ------------------------------------------------------------------------------------
 
 

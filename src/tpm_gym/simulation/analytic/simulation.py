@@ -3,7 +3,8 @@
 Coupling degree zero makes every quantity a formula of where point P is. With ideal drives P is on
 its spline, so a control period is one evaluation of the inverse kinematics, the Jacobian and the
 dynamics, whatever the time step. Angles and rates are differences over the time steps of the other
-engines, as theirs are, and so are torques.
+engines, as theirs are, and so are torques. Servo drives, and ideal ones whose effort would be
+exceeded, go by forward dynamics instead, time step by time step.
 
 Zero by construction, and said to be so in the State: the loops' gap and the platform's tilt.
 """
