@@ -7,10 +7,10 @@ direction in which the contact slips, the box's corner lies on the cone, opposit
 where it sticks, each bound is what the cone leaves beside the other force of the last time step,
 and where there was none the box lies inside the cone.
 
-What is left, measured in ``tests/simulation/bullet/test_friction.py``: a direction lags a time
-step; the weaker bound never falls below :data:`_LEAST`; all points of a contact share the direction
-of its middle, so that a block which spins on the spot finds a little too little; and contacts
-between objects, or with upright faces, keep the box.
+What is left, measured (``tests/simulation/bullet/test_friction.py``, docs/fidelity.md): a direction
+lags a time step; the weaker bound never falls below :data:`_LEAST`; all points of a contact share
+the direction of its middle, so that a block which spins is braked too little; and contacts between
+objects, or with upright faces, keep the box.
 """
 
 from __future__ import annotations
