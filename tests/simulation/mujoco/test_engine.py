@@ -99,6 +99,15 @@ def test_torques_at_rest_are_those_of_the_closed_form(simulation: Simulation) ->
         np.testing.assert_allclose(state.torque, expected, atol=1e-3)
 
 
+@pytest.mark.parametrize("drive", [None, tpm_gym.simulation.Servo()], ids=["ideal", "servo"])
+def test_no_references_are_no_time(drive: Any) -> None:
+    simulation = Simulation(Scene(), engine="mujoco", drive=drive)
+    simulation.reset(THETA)
+    before = simulation.engine.motors()
+    simulation.engine.advance([], False)
+    assert simulation.engine.motors() == before
+
+
 def test_link_masses_are_altered_and_taken_back(simulation: Simulation) -> None:
     found = []
     for factor in (1.0, 1.25, 1.0):
