@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -322,32 +320,6 @@ def test_a_mechanism_torn_apart_is_a_typed_error_and_nothing_else(
             simulation.move(HOME)
     assert capfd.readouterr() == ("", "")
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.slow  # half a minute
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs Linux")
-def test_environments_and_copies_dropped_without_close_leave_no_memory() -> None:
-    script = """
-import copy, ctypes, gc, os
-import gymnasium as gym, tpm_gym
-def memory():
-    gc.collect()
-    getattr(ctypes.CDLL(None), "malloc_trim", print)(0)
-    return int(open("/proc/self/statm").read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
-def drop(count):
-    for _ in range(count):
-        env = gym.make("TPMPickAndPlace-v0", engine="mujoco", randomisation={"length_error": 1e-4})
-        env.reset(seed=0)
-        copy.deepcopy(env).step(env.action_space.sample())
-drop(10)
-before = memory()
-drop(200)
-print(memory() - before)
-"""
-    done = subprocess.run(
-        [sys.executable, "-c", script], env=os.environ, capture_output=True, text=True, check=True
-    )
-    assert float(done.stdout) < 10  # MB
 
 
 # -- what it refuses -------------------------------------------------------------------------------
