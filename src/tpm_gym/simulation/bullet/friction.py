@@ -43,7 +43,7 @@ class _Face:
 
     def __init__(self, body: int, link: int) -> None:
         self.body, self.link = body, link
-        self.scales: tuple[float, float] = _UNKNOWN
+        self.scales = (1.0, 1.0)  # the engine's own
 
 
 class Friction:
@@ -94,15 +94,17 @@ class Friction:
 
     def turn(self, held: int) -> None:
         """Before a time step: scale the friction of what may slip."""
-        contacts, velocity = pybullet.getContactPoints, pybullet.getBaseVelocity
         number, cup = self._number, self._cup
         for index in self._active:
             body, table, block = self._bodies[index]
-            below = contacts(body, table.body, -1, -1, number)
-            above = () if index == held else contacts(body, cup.body, -1, cup.link, number)
+            points = pybullet.getContactPoints(body, -1, -2, -2, number)  # with anything
+            below = [point for point in points if point[2] == table.body]
+            above = [point for point in points if point[2] == cup.body and point[4] == cup.link]
+            if index == held:
+                above = []
             if not below and not above:
                 continue
-            (x, y, _), (p, q, _) = velocity(body, number)
+            (x, y, _), (p, q, _) = pybullet.getBaseVelocity(body, number)
             half, rough = block.height / 2, self._factor * block.friction
             if below:
                 self._set(table, _scales(x - half * q, y + half * p, below, rough))
@@ -114,6 +116,8 @@ class Friction:
                 )
 
     def _set(self, face: _Face, scales: tuple[float, float]) -> None:
+        if scales is face.scales:  # unknown as before
+            return
         (a, b), (c, d) = scales, face.scales
         if abs(a - c) > _SAME or abs(b - d) > _SAME or scales is _UNKNOWN:
             face.scales = scales
