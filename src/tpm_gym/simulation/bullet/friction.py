@@ -36,6 +36,7 @@ _LITTLE = 1e-3  # of the cone, squared: below that the next force may have any d
 _STICKS = 0.98  # of the cone, squared: below that it sticks, and what moves is the solver's noise
 _SAME = 0.01  # change of a scale that is not worth a call
 _UNKNOWN = (math.sqrt(0.5), math.sqrt(0.5))
+_BOX = (1.0, 1.0)  # the engine's own
 
 
 class _Face:
@@ -43,7 +44,7 @@ class _Face:
 
     def __init__(self, body: int, link: int) -> None:
         self.body, self.link = body, link
-        self.scales = (1.0, 1.0)  # the engine's own
+        self.scales = _BOX
 
 
 class Friction:
@@ -78,6 +79,7 @@ class Friction:
     def reset(self) -> None:
         """As if nothing had ever slipped."""
         for face in (self._cup, *(face for _, face, _ in self._bodies)):
+            face.scales = _BOX  # so that it is set, whatever it is now
             self._set(face, _UNKNOWN)
 
     def alter(self, factor: float) -> None:
@@ -98,17 +100,15 @@ class Friction:
         for index in self._active:
             body, table, block = self._bodies[index]
             points = pybullet.getContactPoints(body, -1, -2, -2, number)  # with anything
+            if not points:
+                continue
             below = [point for point in points if point[2] == table.body]
             above = [point for point in points if point[2] == cup.body and point[4] == cup.link]
-            if index == held:
-                above = []
-            if not below and not above:
-                continue
             (x, y, _), (p, q, _) = pybullet.getBaseVelocity(body, number)
             half, rough = block.height / 2, self._factor * block.friction
             if below:
                 self._set(table, _scales(x - half * q, y + half * p, below, rough))
-            if above:
+            if above and index != held:
                 state = pybullet.getLinkState(cup.body, cup.link, 1, 0, number)
                 u, v, _ = state[6]
                 self._set(
