@@ -24,8 +24,6 @@ REACH, PICK = "TPMReach-v0", "TPMPickAndPlace-v0"
 SEED = 3_000_000
 """Of the first episode: neither trained, nor selected, nor tested on."""
 STEPS = 50
-WEAK = 1e-9
-"""What is left of the motors' torque when they are as good as off."""
 FALL = 4
 """Control periods for which the mechanism falls with its motors off."""
 
@@ -169,7 +167,7 @@ def energy_lost(engine: str) -> float:
     simulation = Simulation(Scene(), machine=machine, engine=engine)
     try:
         theta = machine.inverse(machine.home)
-        plant = Plant(motor_strength=(WEAK, WEAK, WEAK))
+        plant = Plant(motor_strength=(0.0, 0.0, 0.0))
         start = machine.dynamics.energy(np.array(theta), np.zeros(3))
         simulation.reset(theta, plant=plant)
         for _ in range(FALL):

@@ -27,6 +27,7 @@ from trainings import (
     uninterrupted,
 )
 
+import tpm_gym
 from tpm_gym.learning import ResumeConfig, TrainingConfig, resume, train
 from tpm_gym.learning.checkpoint import CheckpointStore, Content
 from tpm_gym.learning.configuration import complete
@@ -113,7 +114,11 @@ def test_logs_of_a_torn_write_are_put_right(killed: Kill) -> None:
     torn = ("progress.csv", "evaluations.jsonl", "best.zip", "best.json", "config.json")
     for name in torn:
         os.truncate(run / name, (run / name).stat().st_size // 2)
-    resume(ResumeConfig(run), quiet())
+    (run / "last.json").write_text('{"form')
+    console = quiet()
+    resume(ResumeConfig(run), console)
+    assert "warning" not in said(console)
+    tpm_gym.load_policy(run / "last.json")
     assert_equal_runs(uninterrupted("sac"), run)
     for name in ("best.zip", "best.json", "best.safetensors"):
         assert (run / name).read_bytes() == end_of(run).files[name]

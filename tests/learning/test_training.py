@@ -165,13 +165,20 @@ def test_runs_from_before_these_options_go_on_with_their_defaults(run: Path) -> 
         ("envs", "1"),
         ("penalty_weight", [1.0]),
         ("resumed", 3),
+        ("recipe.arguments", {"batch_size": -3}),
+        ("recipe.arguments", {"gamma": "0.95"}),
+        ("recipe.arguments", {"train_fred": 2}),
+        ("recipe.policy", "MlpPolicy"),
+        ("recipe.demonstrations", {"episodes": 0}),
     ],
 )
 def test_a_damaged_configuration_is_named_and_left_as_it_is(
     name: str, value: Any, run: Path, tmp_path: Path
 ) -> None:
     stored = json.loads((run / "config.json").read_text(encoding="utf-8"))
-    (tmp_path / "config.json").write_text(json.dumps({**stored, name: value}))
+    outer, _, inner = name.partition(".")
+    changed = {**stored[outer], inner: value} if inner else value
+    (tmp_path / "config.json").write_text(json.dumps({**stored, outer: changed}))
     before = (tmp_path / "config.json").read_bytes()
     with pytest.raises(RunError, match=r"configuration of .* is damaged: .*--overwrite") as caught:
         resume(ResumeConfig(tmp_path), quiet())
@@ -277,17 +284,20 @@ def test_mistakes_are_named_before_anything_is_written(
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("size", [49, 10**12])
-def test_a_buffer_that_cannot_be_is_one_line(size: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize("size", [49, 10**12, 10**30])
+def test_a_buffer_that_cannot_be_is_one_line_before_anything_is_written(
+    size: int, tmp_path: Path
+) -> None:
     config = make_config("sac", tmp_path)
     text, found = re.subn(
         r"buffer_size: *\d+", f"buffer_size: {size}", config.recipe_file.read_text()
     )
     assert found == 1
     config.recipe_file.write_text(text)
-    with pytest.raises(ConfigError, match="buffer_size: ") as caught:
+    with pytest.raises(ConfigError, match="buffer_size") as caught:
         train(config, quiet())
     assert "\n" not in str(caught.value)
+    assert not config.run.exists()
 
 
 SHIPPED = [

@@ -18,7 +18,7 @@ from tpm_gym.arrays import FloatArray, Vector
 from tpm_gym.mechanism import PAPER_TPM, Machine
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.motor import TORQUE_MOTOR
-from tpm_gym.simulation import Plant, Scene, Simulation
+from tpm_gym.simulation import Plant, Scene, Servo, Simulation
 
 G = 9.81
 HOME = PAPER_TPM.home
@@ -298,6 +298,17 @@ def test_a_motor_holds_its_effort_and_no_more(
         assert (np.abs(found) <= effort * (1 + 1e-9)).all()
     assert moved[0] < 1e-8
     assert moved[1] > 1e-5  # it gives way
+
+
+@pytest.mark.parametrize("drive", [None, Servo()], ids=["ideal", "servo"])
+@pytest.mark.parametrize("engine", ["pybullet", "mujoco"])
+def test_motors_without_torque_let_the_arm_fall(engine: str, drive: Servo | None) -> None:
+    simulation = Simulation(Scene(), engine=engine, drive=drive)
+    before = simulation.reset(THETA, plant=Plant(motor_strength=(0.0, 0.0, 0.0)))
+    settle(simulation, HOME, 2)
+    state = simulation.read()
+    np.testing.assert_allclose(torques(simulation), 0, atol=1e-6)
+    assert before.platform_position[2] - state.platform_position[2] > 0.01
 
 
 def test_no_command_draws_more_than_the_motors_have(simulation: Simulation) -> None:

@@ -1,4 +1,4 @@
-"""No episode begins beyond a motor's stop, whatever the machine and the engine."""
+"""No episode begins or goes beyond a motor's stop, whatever the machine and the engine."""
 
 from operator import attrgetter
 
@@ -56,3 +56,30 @@ def test_the_stops_are_those_of_the_true_joints_not_of_the_encoders(simulation):
     with pytest.raises(JointLimitError) as caught:
         simulation.reset(on, plant=outwards)
     assert caught.value.position == on[1] + 1e-3
+
+
+@pytest.mark.parametrize("engine", ["pybullet", "mujoco"])
+@pytest.mark.parametrize("machine", [PAPER_TPM, WIDE_TPM, GANTRY], ids=attrgetter("name"))
+def test_a_command_beyond_a_stop_is_refused_before_anything_moves(machine, engine):
+    simulation = Simulation(Scene(), machine=machine, engine=engine)
+    rng, motors = np.random.default_rng(0), machine.mechanism.motors
+    ranges = np.transpose([(motor.lower, motor.upper) for motor in motors])
+    while True:  # a posture in the machine's modes with the second motor on its stop
+        on = rng.uniform(*ranges)
+        on[1] = motors[1].upper
+        try:
+            point, beyond = (
+                machine.forward(tuple(on)),
+                machine.forward((on[0], on[1] + 1e-6, on[2])),
+            )
+            theta = machine.inverse(point)
+        except TPMError:
+            continue
+        if np.allclose(theta, on, rtol=0, atol=1e-9):
+            break
+    before = simulation.reset(machine.inverse(machine.home))
+    with pytest.raises(JointLimitError, match=motors[1].name) as caught:
+        simulation.move(beyond)
+    assert caught.value.position == pytest.approx(on[1] + 1e-6, abs=1e-9)
+    np.testing.assert_array_equal(simulation.read().theta, before.theta)
+    simulation.move(machine.home)

@@ -44,10 +44,11 @@ def around_each_step(
         yield
 
 
-def throw(simulation: Simulation, velocity: ArrayLike) -> None:
-    """Let the first object have a velocity, m/s."""
+def throw(simulation: Simulation, velocity: ArrayLike, spin: float = 0.0) -> None:
+    """Let the first object have a velocity, m/s, and turn about its axis, rad/s."""
     engine: Any = simulation.engine
-    engine.data.joint(object_name(0)).qvel[:3] = velocity
+    motion = engine.data.joint(object_name(0)).qvel
+    motion[:3], motion[5] = velocity, spin
     mujoco.mj_step1(engine.model, engine.data)  # what depends on it
 
 

@@ -13,8 +13,9 @@ from pydantic import TypeAdapter, ValidationError
 from tpm_gym.learning.algorithms import ALGORITHMS
 from tpm_gym.learning.environments import check_env_id
 from tpm_gym.learning.errors import ConfigError, RunError
-from tpm_gym.learning.recipes import Recipe, read_recipe, recipe_file
+from tpm_gym.learning.recipes import Recipe, check_recipes, read_recipe, recipe_file
 from tpm_gym.learning.rollout import SELECTION_SEED, TEST_SEED
+from tpm_gym.learning.run_folder import CONFIG_FILE
 
 UNSET: Final[Any] = None
 """Of an option that :func:`complete` works out, or that leaves a resumed run as it is."""
@@ -221,6 +222,8 @@ def _require_whole(run: Path, stored: Mapping[str, Any]) -> None:
         TypeAdapter(TrainingConfig).validate_json(text, strict=True)
         TypeAdapter(list[Any]).validate_python(stored.get("resumed", []))
         recipe_file(stored["algo"])  # there is such an algorithm
+        entries = Recipe(**stored["recipe"]).entries()
+        check_recipes(CONFIG_FILE, {"recipe": entries}, stored["algo"])
     except ValidationError as error:
         first = error.errors()[0]
         problem = f"{'.'.join(map(str, first['loc']))}: {first['msg']}, not {first['input']!r:.100}"

@@ -38,6 +38,20 @@ class Recipe:
     demonstrations: Mapping[str, Any]
     arguments: Mapping[str, Any]
 
+    def entries(self) -> dict[str, Any]:
+        """Return what a file has it as."""
+        optional = {
+            "replay_buffer_class": "HerReplayBuffer" if self.hindsight else None,
+            "demonstrations": self.demonstrations,
+        }
+        return {
+            "n_timesteps": self.n_timesteps,
+            "n_envs": self.n_envs,
+            "policy": self.policy,
+            **{name: value for name, value in optional.items() if value},
+            **self.arguments,
+        }
+
     def keywords(self) -> dict[str, Any]:
         """Return the keyword arguments of the algorithm's constructor, with classes for names."""
         entries = {"policy": self.policy, **self.arguments}
@@ -117,17 +131,26 @@ def read_recipes(path: Path, algorithm: str) -> dict[str, dict[str, Any]]:
             it cannot have.
     """
     recipes = _read_mapping(path)
+    check_recipes(str(path), recipes, algorithm)
+    return recipes
+
+
+def check_recipes(source: str, recipes: Mapping[str, Any], algorithm: str) -> None:
+    """Check recipes, name -> entries.
+
+    Raises:
+        ConfigError: An entry is unknown or has a value it cannot have; ``source`` is where.
+    """
     kind: Any = dict[str, ALGORITHMS[algorithm].entries()]  # type: ignore[misc]
     strict = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
     try:
         TypeAdapter(kind, config=strict).validate_python(recipes)
     except ValidationError as error:
-        raise ConfigError(f"{path}: {_explained(error, kind)}") from error
-    for env_id, entries in recipes.items():
+        raise ConfigError(f"{source}: {_explained(error, kind)}") from error
+    for name, entries in recipes.items():
         if "replay_buffer_kwargs" in entries and "replay_buffer_class" not in entries:
-            where = f"{path}: {env_id}.replay_buffer_kwargs"
+            where = f"{source}: {name}.replay_buffer_kwargs"
             raise ConfigError(f"{where}: no effect without replay_buffer_class: HerReplayBuffer")
-    return recipes
 
 
 def _read_mapping(path: Path) -> dict[str, Any]:

@@ -11,12 +11,14 @@ from __future__ import annotations
 
 import json
 import signal
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import asdict, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from gymnasium.spaces import flatdim
 from rich.console import Console
 
 from tpm_gym.learning import provenance, run_folder
@@ -58,7 +60,8 @@ def train(config: TrainingConfig, console: Console | None = None) -> signal.Sign
     """
     console = console or Console()
     config = complete(config)
-    make_env(**_env_options(config)).close()  # refused before anything is deleted
+    with closing(make_env(**_env_options(config))) as env:  # refused before anything is deleted
+        _require_room(config, flatdim(env.observation_space))
     run_folder.prepare(config.run, config.overwrite)
     store = CheckpointStore(config.run / CHECKPOINTS)
     with run_folder.disk_errors_named(config.run, store), run_folder.claimed(config.run):
@@ -268,16 +271,22 @@ def _report(
 
 
 def make_model(config: TrainingConfig, envs: VecEnv) -> BaseAlgorithm:
-    """Build the algorithm of a completed configuration.
-
-    Raises:
-        ConfigError: Its buffer does not fit into memory.
-    """
+    """Build the algorithm of a completed configuration."""
     kind = ALGORITHMS[config.algo].load_class()
+    return kind(env=envs, seed=config.seed, device=config.device, **config.recipe.keywords())
+
+
+def _require_room(config: TrainingConfig, numbers: int) -> None:
+    """Refuse a replay buffer for which there is no memory; a step has two observations in it.
+
+    Args:
+        numbers: In an observation.
+    """
+    size = int(config.recipe.arguments.get("buffer_size", 0))
     try:
-        return kind(env=envs, seed=config.seed, device=config.device, **config.recipe.keywords())
-    except MemoryError as error:
-        raise ConfigError(f"--recipe {config.recipe_file}: buffer_size: {error}") from error
+        np.empty((size, 2, numbers), np.float32)
+    except (MemoryError, ValueError) as error:  # more than there are addresses is a ValueError
+        raise ConfigError(f"--recipe {config.recipe_file}: buffer_size {size}: {error}") from error
 
 
 def make_training_envs(config: TrainingConfig) -> VecEnv:

@@ -31,10 +31,9 @@ from stable_baselines3.her import HerReplayBuffer
 
 from tpm_gym import TPMError
 from tpm_gym.learning.checkpoint import STATE, TENSORS, Content
-from tpm_gym.learning.export import remove
 from tpm_gym.learning.provenance import versions, write_whole
 from tpm_gym.learning.rollout import Action, GoalEnv, Observation
-from tpm_gym.learning.run_folder import LAST_FILE, RESTORED, clear_tests
+from tpm_gym.learning.run_folder import EXPORTED, LAST_FILE, RESTORED, clear_tests
 from tpm_gym.learning.vec_env import AnalyticVecEnv
 
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining")
@@ -129,7 +128,8 @@ def restore_files(run: Path, content: Content) -> None:
     Tests, and what was exported at the end, are deleted: the policy will soon be another.
     """
     clear_tests(run)
-    remove((run / LAST_FILE).with_suffix(""))
+    for suffix in EXPORTED:
+        (run / LAST_FILE).with_suffix(suffix).unlink(missing_ok=True)
     for name in RESTORED:
         if name in content.files:
             data = content.files[name]

@@ -6,6 +6,7 @@ Units: metres, radians, kilograms.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -194,7 +195,7 @@ class Mechanism:
         """
         return self.links[self._index[name]]
 
-    @property
+    @cached_property
     def motors(self) -> tuple[Joint, ...]:
         """The motors' joints, in the order of :attr:`actuated`."""
         joints = {link.joint.name: link.joint for link in self.links if link.joint}

@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -31,6 +31,7 @@ __all__ = [
     "Servo",
     "Servos",
     "drive_of",
+    "follow",
     "limited",
     "references",
     "require_servo",
@@ -319,6 +320,28 @@ def wanted(
     x, y, z = _times(gains.mass, _times(gains.inverse, (a + d, b + e, c + f)))
     u, v, w = load
     return u + x, v + y, w + z
+
+
+class Driven(Protocol):
+    """An engine's robot with three motors."""
+
+    def motors(self) -> tuple[Vector, Vector, Vector]:
+        """Angles (rad), rates (rad/s) and torques (N m)."""
+
+    def drive(self, theta: Vector) -> None:
+        """Let ideal motors go to ``theta`` rad in the next time step."""
+
+    def apply(self, torque: Vector) -> None:
+        """Let the motors apply ``torque`` N m in the next time step."""
+
+
+def follow(robot: Driven, servos: Servos | None, reference: Reference) -> None:
+    """Let a robot's motors follow a reference in the next time step; without servos, ideally."""
+    if servos is None:
+        robot.drive(reference.theta)
+    else:
+        theta, theta_dot, _ = robot.motors()
+        robot.apply(servos.torque(reference, theta, theta_dot))
 
 
 def _minus(left: Triple, right: Triple) -> Triple:

@@ -10,6 +10,7 @@ import importlib
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from operator import sub
 from typing import Any
 
 import numpy as np
@@ -207,6 +208,7 @@ class Simulation:
         Raises:
             InputError: If the command has the wrong shape or is not finite.
             UnreachableError: If the command is out of reach; nothing has moved then.
+            JointLimitError: If a motor would be beyond a stop there; nothing has moved then.
             ModeChangeError: If the mechanism has left its assembly or working mode before.
             ClosureError: If a loop opened.
         """
@@ -214,7 +216,9 @@ class Simulation:
             raise ModeChangeError(self._mode_left)
         before, last = self._commands
         new = vector("command", command)
-        self.machine.inverse(new)  # the spline may end before the command does
+        # The spline may end before the command does.
+        a, b, c = map(sub, self.machine.inverse(new), self.plant.encoder_bias)
+        self.machine.require_within_stops((a, b, c))
         followed = self._references(before, last, new)
         self._commands = (last, new)
         self.engine.advance(followed, vacuum)

@@ -160,31 +160,6 @@ sys.stderr.write(f"{(memory() - before) / (most - before)}")
     assert float(kept) < 0.4
 
 
-@pytest.mark.slow  # 20 s
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs Linux")
-def test_200_environments_and_copies_dropped_without_close_leave_no_memory() -> None:
-    _, grown = in_a_process("""
-import copy, ctypes, gc
-def memory():
-    gc.collect()
-    getattr(ctypes.CDLL(None), "malloc_trim", print)(0)
-    return int(open("/proc/self/statm").read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
-def drop(count):
-    for _ in range(count):
-        env = gym.make("TPMPickAndPlace-v0")
-        env.reset(seed=0)
-        copy.deepcopy(env).step(env.action_space.sample())
-drop(3)
-before = memory()
-for dropped in range(0, 100, 10):
-    drop(10)
-    if memory() > before + 20:
-        break
-sys.stderr.write(f"{memory() - before}")
-""")
-    assert float(grown) < 20  # MB
-
-
 @pytest.mark.parametrize("renderer", ["raytracer", "", 1])
 def test_an_unknown_renderer_is_refused_and_the_client_given_back(renderer: Any) -> None:
     first = Client(Physics())

@@ -17,7 +17,7 @@ from tpm_gym.simulation.bullet.friction import Friction
 from tpm_gym.simulation.bullet.physics import Physics
 from tpm_gym.simulation.bullet.robot import Robot
 from tpm_gym.simulation.bullet.scenery import Scenery
-from tpm_gym.simulation.drives import Memory, Reference, Servo, Servos
+from tpm_gym.simulation.drives import Memory, Reference, Servo, Servos, follow
 from tpm_gym.simulation.engine import Engine, Motors, Pose, Truth, Twist
 from tpm_gym.simulation.randomisation import Plant
 from tpm_gym.simulation.settings import settings_of
@@ -124,17 +124,9 @@ class BulletEngine:
             self._servos.begin(references[0].theta)
         for reference in references:
             friction.turn(cup.grip.hold.which)
-            self._drive(reference)
+            follow(self.robot, self._servos, reference)
             step()
             cup.suck(vacuum)
-
-    def _drive(self, reference: Reference) -> None:
-        """Let the motors follow a reference in the next time step."""
-        if self._servos is None:
-            self.robot.drive(reference.theta)
-            return
-        theta, theta_dot, _ = self.robot.motors()
-        self.robot.apply(self._servos.torque(reference, theta, theta_dot))
 
     def motors(self) -> Motors:
         """See the protocol."""

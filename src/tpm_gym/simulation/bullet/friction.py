@@ -7,10 +7,10 @@ direction in which the contact slips, the box's corner lies on the cone, opposit
 where it sticks, each bound is what the cone leaves beside the other force of the last time step,
 and where there was none the box lies inside the cone.
 
-What is left, measured in ``tests/simulation/bullet/test_friction.py``: a direction lags a time
-step; the weaker bound never falls below :data:`_LEAST`; all points of a contact share the direction
-of its middle, so that a block which spins on the spot finds a little too little; and contacts
-between objects, or with upright faces, keep the box.
+What is left, measured (``tests/simulation/bullet/test_friction.py``, docs/fidelity.md): a direction
+lags a time step; the weaker bound never falls below :data:`_LEAST`; all points of a contact share
+the direction of its middle, so that a block which spins is braked too little; and contacts between
+objects, or with upright faces, keep the box.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ _LITTLE = 1e-3  # of the cone, squared: below that the next force may have any d
 _STICKS = 0.98  # of the cone, squared: below that it sticks, and what moves is the solver's noise
 _SAME = 0.01  # change of a scale that is not worth a call
 _UNKNOWN = (math.sqrt(0.5), math.sqrt(0.5))
+_BOX = (1.0, 1.0)  # the engine's own
 
 
 class _Face:
@@ -43,7 +44,7 @@ class _Face:
 
     def __init__(self, body: int, link: int) -> None:
         self.body, self.link = body, link
-        self.scales: tuple[float, float] = _UNKNOWN
+        self.scales = _BOX
 
 
 class Friction:
@@ -78,6 +79,7 @@ class Friction:
     def reset(self) -> None:
         """As if nothing had ever slipped."""
         for face in (self._cup, *(face for _, face, _ in self._bodies)):
+            face.scales = _BOX  # so that it is set, whatever it is now
             self._set(face, _UNKNOWN)
 
     def alter(self, factor: float) -> None:
@@ -94,19 +96,19 @@ class Friction:
 
     def turn(self, held: int) -> None:
         """Before a time step: scale the friction of what may slip."""
-        contacts, velocity = pybullet.getContactPoints, pybullet.getBaseVelocity
         number, cup = self._number, self._cup
         for index in self._active:
             body, table, block = self._bodies[index]
-            below = contacts(body, table.body, -1, -1, number)
-            above = () if index == held else contacts(body, cup.body, -1, cup.link, number)
-            if not below and not above:
+            points = pybullet.getContactPoints(body, -1, -2, -2, number)  # with anything
+            if not points:
                 continue
-            (x, y, _), (p, q, _) = velocity(body, number)
+            below = [point for point in points if point[2] == table.body]
+            above = [point for point in points if point[2] == cup.body and point[4] == cup.link]
+            (x, y, _), (p, q, _) = pybullet.getBaseVelocity(body, number)
             half, rough = block.height / 2, self._factor * block.friction
             if below:
                 self._set(table, _scales(x - half * q, y + half * p, below, rough))
-            if above:
+            if above and index != held:
                 state = pybullet.getLinkState(cup.body, cup.link, 1, 0, number)
                 u, v, _ = state[6]
                 self._set(
@@ -114,6 +116,8 @@ class Friction:
                 )
 
     def _set(self, face: _Face, scales: tuple[float, float]) -> None:
+        if scales is face.scales:  # unknown as before
+            return
         (a, b), (c, d) = scales, face.scales
         if abs(a - c) > _SAME or abs(b - d) > _SAME or scales is _UNKNOWN:
             face.scales = scales

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tpm_gym.arrays import Vector
 from tpm_gym.mechanism.machine import Machine
-from tpm_gym.simulation.drives import Memory, Reference, Servo, Servos
+from tpm_gym.simulation.drives import Memory, Reference, Servo, Servos, follow
 from tpm_gym.simulation.engine import Engine, Motors, Pose, Truth, Twist
 from tpm_gym.simulation.mujoco.cup import Cup, Grip
 from tpm_gym.simulation.mujoco.model import compiled
@@ -114,27 +114,18 @@ class MujocoEngine:
         """See the protocol."""
         model, data, cup, scenery = self.model, self.data, self._cup, self._scenery
         first_half, second_half = mujoco.mj_step1, mujoco.mj_step2
-        if self._servos is not None:
+        if self._servos is not None and references:
             self._servos.begin(references[0].theta)
-        last = references[-1]
-        for reference in references:
-            self._drive(reference)
+        for left, reference in enumerate(references, 1 - len(references)):
+            follow(self.robot, self._servos, reference)
             scenery.keep_sliding()
             second_half(model, data)
-            if reference is last:
+            if not left:
                 self.robot.note_torque()
             load = cup.load()
             first_half(model, data)
             if cup.breathe(vacuum, load):
                 first_half(model, data)  # with another constraint
-
-    def _drive(self, reference: Reference) -> None:
-        """Let the motors follow a reference in this time step."""
-        if self._servos is None:
-            self.robot.drive(reference.theta)
-            return
-        theta, theta_dot, _ = self.robot.motors()
-        self.robot.apply(self._servos.torque(reference, theta, theta_dot))
 
     def motors(self) -> Motors:
         """See the protocol."""

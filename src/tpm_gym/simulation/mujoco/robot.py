@@ -23,6 +23,7 @@ from tpm_gym.simulation.randomisation import NOMINAL, Plant
 __all__ = ["Robot"]
 
 _SPRING_GAIN = 0.2  # share of its way back that the cup's spring takes in one time step
+_LEAST_EFFORT = 1e-9  # N m, of motors that have none, so that each has its row in the solver
 
 
 class Robot:
@@ -75,7 +76,8 @@ class Robot:
         for (body, (mass, moments)), factor in zip(self._inertias.items(), factors, strict=True):
             model.body_mass[body] = factor * mass
             model.body_inertia[body] = factor * moments
-        limits = [a * b for a, b in zip(self._efforts, plant.motor_strength, strict=True)]
+        pairs = zip(self._efforts, plant.motor_strength, strict=True)
+        limits = [max(effort * strength, _LEAST_EFFORT) for effort, strength in pairs]
         losses = limits if self._ideal else plant.joint_friction
         for (_, dof), loss in zip(
             (*self._motors, self._slide), (*losses, self._spring), strict=True

@@ -15,7 +15,7 @@ from tpm_gym.simulation.state import Scene
 
 __all__ = ["Scenery"]
 
-_STILL = 1e-4  # m/s
+_STILL = 1e-4  # m/s and rad/s
 
 
 class Scenery:
@@ -62,10 +62,11 @@ class Scenery:
         wanted -= data.contact.friction[:, 0] * np.hypot(x, y) / self._model.opt.timestep
 
     def _moves(self) -> bool:
-        """Whether an object is faster than solver noise."""
+        """Whether an object slides or spins faster than solver noise."""
         speed = self._speed
         return any(
-            abs(speed(dof)) + abs(speed(dof + 1)) + abs(speed(dof + 2)) > _STILL
+            abs(speed(dof)) + abs(speed(dof + 1)) + abs(speed(dof + 2)) + abs(speed(dof + 5))
+            > _STILL
             for dof in self._dof
         )
 
