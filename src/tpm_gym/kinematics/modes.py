@@ -77,8 +77,35 @@ class WorkingMode(_Mode):
         return self.cos_beta, self.leg1, self.leg2, self.leg3
 
 
+@dataclass(frozen=True)
+class RotatedMode(_Mode):
+    """One of the 8 branches of the forward kinematics in the second operation mode.
+
+    Attributes:
+        planar: Sign of the planar factor, as in
+            :func:`tpm_gym.kinematics.rotated.factors`: on which side of the point where rods 4a and
+            4b cross, as seen along y, rod 6 passes.
+        further: -1 for the assembly of link 3' with that sign, 1 for the other one of two: that
+            which is turned further, from 0 to 2 pi.
+        sin_beta: Sign of sin(beta), so of y.
+    """
+
+    planar: int
+    further: int
+    sin_beta: int
+
+    @property
+    def signs(self) -> tuple[int, int, int]:
+        """planar, further, sin_beta."""
+        return self.planar, self.further, self.sin_beta
+
+
 ASSEMBLY_MODES = tuple(AssemblyMode(*signs) for signs in product((-1, 1), repeat=2))
 """All forward branches, in the order of the slots of :func:`forward_all`."""
+
+ROTATED_MODES = tuple(RotatedMode(*signs) for signs in product((-1, 1), repeat=3))
+"""All forward branches with link 3' turned, in the order of the slots of
+:func:`tpm_gym.kinematics.rotated.forward_rotated`."""
 
 WORKING_MODES = tuple(WorkingMode(*signs) for signs in product((-1, 1), repeat=4))
 """All inverse branches, in the order of the slots of :func:`inverse_all`."""
