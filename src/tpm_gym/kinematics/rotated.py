@@ -16,6 +16,7 @@ points along (cos phi, 0, -sin phi). Seen along y, vectors are complex numbers x
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,33 +68,32 @@ class RotatedSolutions:
     @property
     def position(self) -> FloatArray:
         """(..., 8, 3) m, point P."""
-        return self._on_platform(self.geometry.l2, 2 * self.geometry.l6)
+        g, (cos, sin) = self.geometry, (np.cos(self.beta), np.sin(self.beta))
+        return self._moved([g.l7 * cos + g.l2, g.l7 * sin, 2 * g.l6])
 
-    def _on_platform(self, along: float, up: float) -> FloatArray:
-        """A point of the platform at these distances from E1, along F1D3 and off link 3', m."""
-        l7, cos, sin = self.geometry.l7, np.cos(self.beta), np.sin(self.beta)
-        return self._of_link3(np.stack([l7 * cos + along, l7 * sin, 0 * sin + up], axis=-1))
-
-    def _of_link3(self, offset: ArrayLike) -> FloatArray:
-        """C1, displaced by an offset (..., 8, 3) m that turns with link 3'."""
-        x, z = self.link3[..., 0], self.link3[..., 1]
-        turned = np.einsum("...ij,...j->...i", self.orientation, offset)
-        moved: FloatArray = np.stack([x, 0 * x, z], axis=-1) + turned
-        return moved
+    @property
+    def ends(self) -> FloatArray:
+        """(..., 8, 4, 3) m, the far ends of rods 4a, 4b and 6 on link 3', and C3."""
+        g, (cos, sin) = self.geometry, (np.cos(self.beta), np.sin(self.beta))
+        on_link3 = [self._moved([along, 0.0, 0.0]) for along in (g.l5, -g.l5, -2 * g.l5)]
+        c3 = self._moved([g.l7 * cos + 2 * g.l2, g.l7 * sin, g.l6])
+        return np.stack([*on_link3, c3], axis=-2)
 
     @property
     def rods(self) -> FloatArray:
-        """(..., 8, 4, 3) m, the vectors along rods 4a, 4b, 6 and 11, from arm to platform."""
-        g = self.geometry
-        b1, b2, b3 = np.moveaxis(_elbows(self.theta, g), -2, 0)[..., None, :]
-        half = np.array([g.l5, 0.0, 0.0])
-        ends = [
-            self._of_link3(half) - b1 - half,
-            self._of_link3(-half) - b1 + half,
-            self._of_link3(-2 * half) - b2,
-            self._on_platform(2 * g.l2, g.l6) - b3,
-        ]
-        return np.stack(ends, axis=-2)
+        """(..., 8, 4, 3) m, along rods 4a, 4b and 6, and B3C3, which rods 11 are parallel to."""
+        half = np.array([self.geometry.l5, 0.0, 0.0])
+        b1, b2, b3 = np.moveaxis(_elbows(self.theta, self.geometry), -2, 0)
+        feet = np.stack([b1 + half, b1 - half, b2, b3], axis=-2)
+        return self.ends - feet[..., None, :, :]
+
+    def _moved(self, offset: Sequence[FloatArray | float]) -> FloatArray:
+        """C1 (..., 8, 3) m, displaced by an offset in the frame of link 3', x, y and z in m."""
+        x, y, z = offset
+        cos, sin = np.cos(self.tilt), np.sin(self.tilt)
+        along, up = x * cos + z * sin, z * cos - x * sin
+        x_c, z_c = self.link3[..., 0], self.link3[..., 1]
+        return np.stack([x_c + along, 0 * x_c + y, z_c + up], axis=-1)
 
 
 def forward_rotated(theta: ArrayLike, geometry: Geometry = PAPER) -> RotatedSolutions:
@@ -254,3 +254,75 @@ def _link7(
     numerator, denominator = g.l4**2 - g.l7**2 - u**2 - w**2, 2 * g.l7 * u
     real = abs(numerator) <= abs(denominator) + equations.ROUNDING * g.l4**2
     return np.clip(numerator / denominator, -1.0, 1.0), real
+
+
+def factors(solutions: RotatedSolutions) -> Factors:
+    """What vanishes where a rotated assembly is singular, in :class:`.jacobian.Factors`' order.
+
+    * parallel (..., 8, 3): sin(beta); level3 = l7 cos(beta) - B3C3 . u (m), with u along link 3';
+      planar = B2C2 . dC2/dphi with motor 1 locked (m^2/rad), zero where the lines of rods 4a, 4b
+      and 6, seen along y, meet in one point.
+    * serial (..., 8, 4): cos(beta); leg 1 (m^2/rad), zero where motor 1 turns while P rests and
+      link 3' turns about it; B_iC_i . dB_i/dtheta_i (m^2/rad) for i = 2, 3.
+    * constraint (..., 8): z_C1 - z_B1 = -rho sin(phi / 2) (m), zero where both modes meet.
+    """
+    g = solutions.geometry
+    rods, rates = solutions.rods, _elbow_rates(solutions.theta, g)
+    b1 = _elbows(solutions.theta, g)[..., None, 0, :]
+    c1 = solutions.link3[..., 0] + 1j * solutions.link3[..., 1]
+    p = solutions.position[..., 0] + 1j * solutions.position[..., 2] - c1
+    u, n = np.exp(-1j * solutions.tilt), np.exp(-0.5j * solutions.tilt)
+    rho = _dot(c1 - 1j * b1[..., 2], n)
+    rod6, rod11 = (rods[..., i, 0] + 1j * rods[..., i, 2] for i in (2, 3))
+    bend = g.l5**2 * np.sin(solutions.tilt)  # -rho drho/dphi
+    planar = _dot(rod6, 2j * g.l5 * u - 0.5j * rho * n - bend / rho * n)
+    out, up = rates[..., None, 0, 1], rates[..., None, 0, 2]
+    leg1 = (_dot(p, n) + rho / 2) * (up * n.imag - b1[..., 1] * out / rho)
+    leg1 -= up * n.real * (_dot(n, 1j * p) + bend / rho)
+    leg2, leg3 = (np.sum(rods[..., i + 1, :] * rates[..., None, i, :], axis=-1) for i in (1, 2))
+    sin, cos = np.sin(solutions.beta), np.cos(solutions.beta)
+    return Factors(
+        np.stack([sin, g.l7 * cos - _dot(rod11, u), planar], axis=-1),
+        np.stack([cos, leg1, leg2, leg3], axis=-1),
+        c1.imag - b1[..., 2],
+    )
+
+
+def velocity(solutions: RotatedSolutions) -> FloatArray:
+    """Rates of P (m/rad) and of the tilt (rad/rad) per rate of each motor, (..., 8, 4, 3).
+
+    No rod changes its length: rods 4a, 4b and 6 give the twist of link 3', rod 11 the rate of link
+    7. At a parallel singularity, and where both modes meet, there are no finite rates.
+    """
+    g, rods, ends = solutions.geometry, solutions.rods, solutions.ends
+    rates = _elbow_rates(solutions.theta, g)[..., None, [0, 0, 1, 2], :]
+    pulls = np.sum(rods * rates, axis=-1)[..., None] * np.eye(3)[[0, 0, 1, 2]]
+    c1, e_y = solutions._moved([0.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
+    # What velocities of C1 along x and z, and a turn about y through it, do to each rod
+    turns = np.sum(rods * np.cross(e_y, ends - c1[..., None, :]), axis=-1)
+    moved = np.stack([rods[..., 0], rods[..., 2], turns], axis=-1)
+    cos, sin = np.cos(solutions.beta), np.sin(solutions.beta)
+    along7 = solutions._moved([-g.l7 * sin, g.l7 * cos, 0.0]) - c1  # for a unit rate of link 7
+    to_p = np.cross(e_y, solutions.position - c1)
+    with np.errstate(all="ignore"):
+        twist = _inverse(moved[..., :3, :]) @ pulls[..., :3, :]
+        wanted = pulls[..., 3, :] - np.einsum("...i,...ij->...j", moved[..., 3, :], twist)
+        link7 = wanted / np.sum(rods[..., 3, :] * along7, axis=-1)[..., None]
+        by_link3 = np.stack([twist[..., 0, :], 0 * link7, twist[..., 1, :]], axis=-2)
+        turn = twist[..., 2, :]
+        rows = by_link3 + to_p[..., None] * turn[..., None, :] + along7[..., None] * link7[..., None, :]
+    return np.concatenate([rows, turn[..., None, :]], axis=-2)
+
+
+def _elbow_rates(theta: FloatArray, g: Geometry) -> FloatArray:
+    """dB_i/dtheta_i as rows (..., 3, 3), m/rad."""
+    pivots = np.array([[0.0, g.l1, 0.0], [-g.l1, 0.0, 0.0], [g.l1, 0.0, 0.0]])
+    return _elbows(theta + np.pi / 2, g) - pivots
+
+
+def _inverse(matrix: FloatArray) -> FloatArray:
+    """Of matrices (..., 3, 3); not finite where there is none."""
+    one, two, three = np.moveaxis(matrix, -2, 0)
+    adjugate = np.stack([np.cross(two, three), np.cross(three, one), np.cross(one, two)], axis=-1)
+    inverted: FloatArray = adjugate / np.sum(one * adjugate[..., 0], axis=-1)[..., None, None]
+    return inverted

@@ -25,13 +25,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tpm_gym.arrays import Vector
+from tpm_gym.errors import InputError
 from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode, passive_angles
 from tpm_gym.kinematics.geometry import PAPER, Geometry
+from tpm_gym.kinematics.modes import RotatedMode
+from tpm_gym.kinematics.rotated import RotatedSolutions
 from tpm_gym.mechanism.bodies import Closure, Joint, Link, Mechanism, Solid
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.motor import TORQUE_MOTOR
 
-__all__ = ["ACTUATED_JOINTS", "build", "joint_angles"]
+__all__ = ["ACTUATED_JOINTS", "build", "joint_angles", "rotated_joint_angles"]
 
 ACTUATED_JOINTS = ("R11", "R21", "R31")
 """The motors, in the order of theta_1, theta_2, theta_3."""
@@ -300,5 +303,52 @@ def joint_angles(
         "R32": passive.rod11_swing - theta_3,
         "Re": passive.rod11_tilt,
         "Rf": passive.rod11_tilt,
+    }
+    return {name: float(angle) for name, angle in angles.items()}
+
+
+def rotated_joint_angles(solutions: RotatedSolutions, branch: RotatedMode) -> dict[str, float]:
+    """Angles of all joints of the spanning tree at which the loops close with link 3' turned.
+
+    Args:
+        solutions: Those at one theta (3,).
+        branch: One that is valid there.
+
+    Returns:
+        As :func:`joint_angles`.
+
+    Raises:
+        InputError: If they are for several theta, or the branch is not valid.
+    """
+    if solutions.theta.shape != (3,):
+        raise InputError("theta", solutions.theta.shape, "one theta, of shape (3,)")
+    slot = branch.index
+    if not solutions.valid[slot]:
+        real = ", ".join(map(str, np.flatnonzero(solutions.valid))) or "none here"
+        raise InputError("branch", branch, f"one whose slot is valid ({real})")
+    theta_1, theta_2, theta_3 = solutions.theta
+    tilt, beta = solutions.tilt[slot], solutions.beta[slot]
+    (x, y, z), l4 = solutions.rods[slot].T, solutions.geometry.l4
+    swing_4a, swing_4b = np.arctan2(z[:2], y[:2])
+    swing_6, swing_11 = np.arctan2(z[2:], x[2:])
+    tilt_4a, tilt_4b = np.arcsin(x[:2] / l4)
+    tilt_11 = np.arcsin(y[3] / l4)
+    angles = {
+        "R11": theta_1,
+        "Sa_swing": swing_4a - theta_1,
+        "Sa_tilt": tilt_4a,
+        "Sb_swing": swing_4b - theta_1,
+        "Sb_tilt": tilt_4b,
+        "R21": theta_2,
+        "R22": swing_6 - theta_2,
+        "R23": -swing_6 - tilt,  # joints turn about -y, the tilt about y
+        "R12": beta,
+        "R13": -beta,
+        "cup_slide": 0.0,
+        "R33": swing_11 + tilt,
+        "R31": theta_3,
+        "R32": swing_11 - theta_3,
+        "Re": tilt_11,
+        "Rf": tilt_11,
     }
     return {name: float(angle) for name, angle in angles.items()}
