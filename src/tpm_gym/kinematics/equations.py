@@ -139,9 +139,9 @@ def posture_at(
     cos_beta = side * ns.root(squared)
     x_c, z_c = x - g.l2 - g.l7 * cos_beta, z - 2 * g.l6
     a1, a2, a3, b3 = -l1, x_c + l1 - 2 * g.l5, x + g.l2 - l1, z - g.l6
-    fold1, real1 = _fold(a1, z_c, x_c, g, ns)
-    fold2, real2 = _fold(a2, z_c, 0.0, g, ns)
-    fold3, real3 = _fold(a3, b3, y, g, ns)
+    fold1, real1 = fold(a1, z_c, x_c, g, ns)
+    fold2, real2 = fold(a2, z_c, 0.0, g, ns)
+    fold3, real3 = fold(a3, b3, y, g, ns)
     # The serial factor BC . dB/dtheta is l3 (b cos - a sin), so its sign tells two angles apart.
     arctan2 = ns.arctan2
     theta_2 = arctan2(z_c, a2) - bend2 * fold2
@@ -155,7 +155,7 @@ def posture_at(
     return theta, real, (x_c, z_c, cos_beta, sin_beta), legs
 
 
-def _fold(
+def fold(
     a: Numbers, b: Numbers, out: Numbers, g: Lengths, ns: Namespace
 ) -> tuple[Numbers, Numbers]:
     """The arm's angle to its leg's span, of |C - A - l3 e(theta)| = l4; whether the leg reaches."""

@@ -16,7 +16,7 @@ points along (cos phi, 0, -sin phi). Seen along y, vectors are complex numbers x
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,22 +29,26 @@ from tpm_gym.kinematics.jacobian import Factors
 from tpm_gym.kinematics.namespaces import NUMPY
 
 _Planar = NDArray[np.complex128]
+_Pair = tuple[FloatArray, FloatArray]
+_Four = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+"""Slopes of two functions by two unknowns, in rows."""
 
 _NEAR = 1e-5  # eigenvalues so far from the unit circle, or nearer, may be on it
 _STEPS = 4  # of Newton's method, from eigenvalues good to half of the digits or better
+_FARTHEST = 0.01  # of its steps that still begin near a zero, rad or m
 _CLOSED = 1e-13  # of l4^2: what rounding leaves of a closure |rod|^2 - l4^2
 
 
 @dataclass(frozen=True)
-class RotatedSolutions:
-    """All assemblies with link 3' turned, one slot per :data:`.modes.ROTATED_MODES` entry.
+class RotatedPostures:
+    """Postures with link 3' turned, of any shape (...,); NaN where there is none.
 
     Attributes:
-        theta: (..., 3) rad, the actuated angles that they were solved for.
-        link3: (..., 8, 2) m, (xC, zC) of point C1 of link 3'; NaN where not real.
-        tilt: (..., 8) rad, in (-pi, pi], the turn of link 3' and the platform about y.
-        beta: (..., 8) rad, in (-pi, pi], the passive angle of link 7, in the plane of link 3'.
-        geometry: The lengths they were solved for.
+        theta: (..., 3) rad, the actuated angles.
+        link3: (..., 2) m, (xC, zC) of point C1 of link 3'.
+        tilt: (...,) rad, in (-pi, pi], the turn of link 3' and the platform about y.
+        beta: (...,) rad, in (-pi, pi], the passive angle of link 7, in the plane of link 3'.
+        geometry: The lengths.
     """
 
     theta: FloatArray
@@ -55,25 +59,25 @@ class RotatedSolutions:
 
     @property
     def valid(self) -> BoolArray:
-        """(..., 8) bool, which branches are real."""
+        """(...,) bool, where there is one."""
         return ~np.isnan(self.beta)
 
     @property
     def orientation(self) -> FloatArray:
-        """(..., 8, 3, 3), the rotation of link 3' and the platform: about y, by the tilt."""
+        """(..., 3, 3), the rotation of link 3' and the platform: about y, by the tilt."""
         cos, sin, zero = np.cos(self.tilt), np.sin(self.tilt), 0 * self.tilt
         rows = [cos, zero, sin, zero, zero + 1, zero, -sin, zero, cos]
         return np.stack(rows, axis=-1).reshape(*self.tilt.shape, 3, 3)
 
     @property
     def position(self) -> FloatArray:
-        """(..., 8, 3) m, point P."""
+        """(..., 3) m, point P."""
         g, (cos, sin) = self.geometry, (np.cos(self.beta), np.sin(self.beta))
         return self._moved([g.l7 * cos + g.l2, g.l7 * sin, 2 * g.l6])
 
     @property
     def ends(self) -> FloatArray:
-        """(..., 8, 4, 3) m, the far ends of rods 4a, 4b and 6 on link 3', and C3."""
+        """(..., 4, 3) m, the far ends of rods 4a, 4b and 6 on link 3', and C3."""
         g, (cos, sin) = self.geometry, (np.cos(self.beta), np.sin(self.beta))
         on_link3 = [self._moved([along, 0.0, 0.0]) for along in (g.l5, -g.l5, -2 * g.l5)]
         c3 = self._moved([g.l7 * cos + 2 * g.l2, g.l7 * sin, g.l6])
@@ -81,14 +85,13 @@ class RotatedSolutions:
 
     @property
     def rods(self) -> FloatArray:
-        """(..., 8, 4, 3) m, along rods 4a, 4b and 6, and B3C3, which rods 11 are parallel to."""
+        """(..., 4, 3) m, along rods 4a, 4b and 6, and B3C3, which rods 11 are parallel to."""
         half = np.array([self.geometry.l5, 0.0, 0.0])
         b1, b2, b3 = np.moveaxis(_elbows(self.theta, self.geometry), -2, 0)
-        feet = np.stack([b1 + half, b1 - half, b2, b3], axis=-2)
-        return self.ends - feet[..., None, :, :]
+        return self.ends - np.stack([b1 + half, b1 - half, b2, b3], axis=-2)
 
     def _moved(self, offset: Sequence[FloatArray | float]) -> FloatArray:
-        """C1 (..., 8, 3) m, displaced by an offset in the frame of link 3', x, y and z in m."""
+        """C1 (..., 3) m, displaced by an offset in the frame of link 3', x, y and z in m."""
         x, y, z = offset
         cos, sin = np.cos(self.tilt), np.sin(self.tilt)
         along, up = x * cos + z * sin, z * cos - x * sin
@@ -96,13 +99,13 @@ class RotatedSolutions:
         return np.stack([x_c + along, 0 * x_c + y, z_c + up], axis=-1)
 
 
-def forward_rotated(theta: ArrayLike, geometry: Geometry = PAPER) -> RotatedSolutions:
-    """All assemblies with link 3' turned at actuated angles theta (..., 3) rad: 8 at most.
+def forward_rotated(theta: ArrayLike, geometry: Geometry = PAPER) -> RotatedPostures:
+    """All assemblies with link 3' turned at actuated angles theta (..., 3) rad, as (..., 8).
 
     Link 3' depends on theta_1 and theta_2 alone: tan(phi / 2) is a root of a quartic, so that there
-    are 4 postures of it at most, and 2 of link 7 for each. Signs name the branches as far as signs
-    can: see :class:`.modes.RotatedMode`. Where both modes meet (phi = 0) the assembly is returned,
-    too. Entries that are not finite give no valid branch.
+    are 4 postures of it at most, and 2 of link 7 for each. One slot for each branch of
+    :data:`.modes.ROTATED_MODES`. Where both modes meet (phi = 0) the assembly is returned, too.
+    Entries that are not finite give none.
 
     Raises:
         InputError: If theta is no array (..., 3) of numbers.
@@ -112,16 +115,52 @@ def forward_rotated(theta: ArrayLike, geometry: Geometry = PAPER) -> RotatedSolu
     with np.errstate(all="ignore"):
         link3, tilt = _link3(angles, geometry)
         cos_beta, real = _link7(angles, link3, tilt, geometry)
-    beta = np.where(real, np.arccos(cos_beta), np.nan)
-    tilt = np.where(real, tilt, np.nan)
-    # Slots of link 3', then both signs of sin(beta)
-    return RotatedSolutions(
-        angles,
-        np.repeat(np.stack([link3.real, link3.imag], axis=-1) + 0 * beta[..., None], 2, axis=-2),
-        np.repeat(tilt, 2, axis=-1),
-        np.stack([-beta, beta], axis=-1).reshape(*beta.shape[:-1], 8),
+        beta = np.where(real, np.arccos(cos_beta), np.nan)
+    # Postures of link 3', then both signs of sin(beta)
+    link3, tilt = (np.repeat(np.where(real, some, np.nan), 2, axis=-1) for some in (link3, tilt))
+    return RotatedPostures(
+        np.repeat(angles[..., None, :], 8, axis=-2),
+        np.stack([link3.real, link3.imag], axis=-1),
+        tilt,
+        np.stack([-beta, beta], axis=-1).reshape(tilt.shape),
         geometry,
     )
+
+
+def inverse_rotated(position: ArrayLike, geometry: Geometry = PAPER) -> RotatedPostures:
+    """All postures with link 3' turned and point P at position (..., 3) m, as (..., 48).
+
+    tan(phi / 2) is a root of a sextic for each sign of cos(beta); then arm 1 is known, and arms 2
+    and 3 can be bent two ways. Slots: cos(beta) < 0, then > 0; six tilts, in order; legs 2 and 3,
+    each with B_iC_i . dB_i/dtheta_i < 0, then > 0. Entries that are not finite give none.
+
+    Raises:
+        InputError: If position is no array (..., 3) of numbers.
+    """
+    require_geometry(geometry)
+    g, places = geometry, points("position", numbers("position", position))
+    shape = (*places.shape[:-1], 2, 6, 2, 2)
+    with np.errstate(all="ignore"):
+        x, y, z = np.moveaxis(places, -1, 0)
+        sin_beta = (y / g.l7)[..., None]
+        cos_beta = np.sqrt((1 - sin_beta) * (1 + sin_beta)) * [-1.0, 1.0]
+        link7 = g.l7 * cos_beta + g.l2 + 2j * g.l6
+        theta_1, tilt = _leg1((x + 1j * z)[..., None], link7, g)
+        c1 = (x + 1j * z)[..., None, None] - link7[..., None] * np.exp(-1j * tilt)
+        c2 = c1 - 2 * g.l5 * np.exp(-1j * tilt) + g.l1  # from A2
+        c3 = c1 + (link7 + g.l2 - 1j * g.l6)[..., None] * np.exp(-1j * tilt) - g.l1  # from A3
+        fold2, real2 = equations.fold(c2.real, c2.imag, 0.0, g, NUMPY)
+        fold3, real3 = equations.fold(c3.real, c3.imag, y[..., None, None], g, NUMPY)
+        bends = np.array([-1.0, 1.0])
+        theta_2 = NUMPY.wrap(np.angle(c2)[..., None] - bends * fold2[..., None])[..., :, None]
+        theta_3 = NUMPY.wrap(np.angle(c3)[..., None] - bends * fold3[..., None])[..., None, :]
+        real = (~np.isnan(tilt) & real2 & real3)[..., None, None]
+    beta = np.arctan2(sin_beta, cos_beta)[..., None, None, None]
+    columns = (theta_1[..., None, None], theta_2, theta_3, c1.real[..., None, None])
+    columns += (c1.imag[..., None, None], tilt[..., None, None], beta)
+    table = np.stack([np.where(real, np.broadcast_to(c, shape), np.nan) for c in columns], axis=-1)
+    table = table.reshape(*places.shape[:-1], 48, 7)
+    return RotatedPostures(table[..., :3], table[..., 3:5], table[..., 5], table[..., 6], geometry)
 
 
 def _dot(a: _Planar, b: _Planar) -> FloatArray:
@@ -142,64 +181,118 @@ def _elbows(theta: FloatArray, g: Geometry) -> FloatArray:
     return np.stack(elbows, axis=-2)
 
 
+def _zeros(values: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Zeros (..., 2 d) of trigonometric polynomials of degree d, and whether they may be real.
+
+    Of their values (..., 2 d + 1) at equal steps from 0 through a turn: eigenvalues w = exp(i phi)
+    of the companion matrix, in order of phi in (-pi, pi]. A real phi has w on the unit circle.
+    """
+    degree = values.shape[-1] - 1
+    coefficients = np.fft.fftshift(np.fft.fft(values), axes=-1)
+    lower, highest = coefficients[..., :-1], coefficients[..., -1:]
+    least = 1e-14 * abs(lower).max(axis=-1, keepdims=True)  # where it is 0, w = 0 is another root
+    companion = np.zeros((*values.shape[:-1], degree, degree), dtype=complex)
+    companion[..., 1:, :-1] = np.eye(degree - 1)
+    companion[..., -1] = -lower / np.where(abs(highest) < least, least, highest)
+    known = np.isfinite(companion).all(axis=(-2, -1), keepdims=True)
+    w = np.linalg.eigvals(np.where(known, companion, 0.0))
+    w = np.take_along_axis(w, np.angle(w).argsort(axis=-1), axis=-1)
+    return np.angle(w), abs(np.log(abs(w))) < _NEAR
+
+
 def _link3(theta: FloatArray, g: Geometry) -> tuple[_Planar, FloatArray]:
     """Point C1 and tilt in all postures of link 3', (..., 4), in their slots.
 
-    Seen along y and from B1, with n = exp(-i phi / 2): C1 = rho n, since B1C1 halves the angle. The
-    closures of rods 4a and 4b are then one, rho^2 = reach2 - 4 l5^2 sin^2(phi / 2); that of rod 6
-    is linear in rho, 2 rho (kappa . n) = q(phi). Squared, it is a quartic in tan(phi / 2).
+    Seen along y and from B1, C1 = rho n with n = exp(-i phi / 2), since B1C1 halves the angle. Then
+    the closures of rods 4a and 4b are one, and that of rod 6 is linear in rho. Squared, it is a
+    trigonometric polynomial of degree 2, a quartic in tan(phi / 2).
     """
-    l5 = g.l5
     b1, b2, _ = np.moveaxis(_elbows(theta, g), -2, 0)
     reach2 = g.l4**2 - b1[..., 1, None] ** 2
-    kappa = (b2 - b1)[..., 0, None] + 2 * l5 + 1j * (b2 - b1)[..., 2, None]
-    # q = q0 + 2 Re(q1 w), with w = exp(i phi)
-    q0 = abs(kappa) ** 2 + reach2 - g.l4**2 - 4 * l5 * kappa.real + 6 * l5**2
-    q1 = l5 * (2 * kappa - 3 * l5)
-    w = _roots(reach2 - 2 * l5**2, kappa, q0, q1, l5)
-    tilt, near = np.angle(w), abs(np.log(abs(w))) < _NEAR
-    n = np.exp(-0.5j * tilt)
-    p, q = _dot(kappa, n), q0 + 2 * (q1 * np.exp(1j * tilt)).real
-    # Where p = q = 0, rho has both signs, and two neighbouring roots are one.
-    side = np.where(abs(p) < _NEAR * g.l4, [1, -1, 1, -1], np.sign(p * q))
-    rho = side * np.sqrt(np.maximum(reach2 - (2 * l5 * n.imag) ** 2, 0.0))
-    for _ in range(_STEPS):
-        gaps, slopes = _closures(rho, tilt, kappa, reach2, g)
-        first, second = _solved(gaps, slopes)
-        small = near & (abs(second) < 0.01)
-        rho, tilt = rho - np.where(small, first, 0.0), tilt - np.where(small, second, 0.0)
-    gaps, slopes = _closures(rho, tilt, kappa, reach2, g)
+    kappa = (b2 - b1)[..., 0, None] + 2 * g.l5 + 1j * (b2 - b1)[..., 2, None]
+
+    def terms(tilt: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """rho^2, and p and q of 2 rho p = q."""
+        n, u = np.exp(-0.5j * tilt), np.exp(-1j * tilt)
+        rho2 = reach2 - (2 * g.l5 * n.imag) ** 2
+        q = rho2 + abs(kappa + 2 * g.l5 * (u - 1)) ** 2 - g.l4**2
+        return rho2, _dot(kappa, n), q
+
+    rho2, p, q = terms(np.arange(5) * (2 * np.pi / 5))
+    tilt, near = _zeros(4 * rho2 * p**2 - q**2)
+    rho2, p, q = terms(tilt)
+    # Where p = q = 0, rho has both signs, and two neighbouring zeros are one.
+    rho = np.where(abs(p) < _NEAR * g.l4, [1, -1, 1, -1], np.sign(p * q)) * NUMPY.root(rho2)
+    (rho, tilt), gaps, slopes = _refined(
+        lambda rho, tilt: _closures(rho, tilt, kappa, reach2, g), rho, tilt
+    )
+    # Along the curve rho(phi) the closure of rod 6 changes its sign at every zero.
+    sign = (slopes[0] * slopes[3] - slopes[1] * slopes[2]) * np.where(
+        reach2 > 4 * g.l5**2, rho, 1.0
+    )
     real = near & (np.maximum(*map(abs, gaps)) < _CLOSED * g.l4**2)
-    # Along the curve rho(phi) the closure of rod 6 changes its sign at every root.
-    sign = _determinant(slopes) * np.where(reach2 > 4 * l5**2, rho, 1.0)
     c1 = 1j * b1[..., 2, None] + rho * np.exp(-0.5j * tilt)
     return _in_slots(c1, np.angle(np.exp(1j * tilt)), np.where(real, sign, np.nan))
 
 
-def _roots(m0: FloatArray, kappa: _Planar, q0: FloatArray, q1: _Planar, l5: float) -> _Planar:
-    """Roots w = exp(i phi) of 4 rho^2 (kappa . n)^2 = q^2, (..., 4), by angle.
+def _leg1(p: _Planar, link7: _Planar, g: Geometry) -> tuple[FloatArray, FloatArray]:
+    """theta_1 and tilt, (..., 6), for P and P - C1 in the frame of link 3', seen along y.
 
-    With rho^2 = m0 + 2 l5^2 Re(w) and 2 (kappa . n)^2 = |kappa|^2 + Re(kappa^2 w); eigenvalues of
-    the companion matrix. A real phi is on the unit circle.
+    B1C1 halves the angle where l3 sin(theta_1) is what ``up`` says, and the rods close where
+    l3 cos(theta_1) is ``out``. Both squares add up to l3^2: times cos^2(phi / 2), a trigonometric
+    polynomial of degree 3.
     """
-    square, size = kappa**2, abs(kappa) ** 2
-    second = l5**2 * square - q1**2
-    first = m0 * square + 2 * l5**2 * size - 2 * q0 * q1
-    middle = 2 * m0 * size + 2 * l5**2 * square.real - q0**2 - 2 * abs(q1) ** 2
-    scale = abs(first) + abs(middle)  # where second is 0, one root is at infinity, out of the way
-    second = np.where(abs(second) < 1e-14 * scale, 1e-14 * scale, second)
-    companion = np.zeros((*kappa.shape[:-1], 4, 4), dtype=complex)
-    companion[..., 1:, :-1] = np.eye(3)
-    lower = np.concatenate([second.conj(), first.conj(), middle, first], axis=-1)
-    companion[..., -1] = -lower / second
-    known = np.isfinite(companion).all(axis=(-2, -1), keepdims=True)
-    w = np.linalg.eigvals(np.where(known, companion, 0.0))
-    return np.take_along_axis(w, np.angle(w).argsort(axis=-1), axis=-1)
+    p, link7 = p[..., None], link7[..., None]
+
+    def terms(tilt: FloatArray) -> tuple[FloatArray, FloatArray]:
+        c1, n = p - link7 * np.exp(-1j * tilt), np.exp(-0.5j * tilt)
+        up = c1.imag - c1.real * n.imag / n.real
+        apart2 = (c1.real / n.real) ** 2 + (2 * g.l5 * n.imag) ** 2 - up**2
+        return up, (g.l4**2 - g.l3**2 - g.l1**2 - apart2) / (2 * g.l1)
+
+    def closures(theta_1: FloatArray, tilt: FloatArray) -> tuple[_Pair, _Four]:
+        out, up = g.l3 * np.cos(theta_1), g.l3 * np.sin(theta_1)
+        spin, n = link7 * np.exp(-1j * tilt), np.exp(-0.5j * tilt)
+        rod = p - spin - 1j * up
+        apart2 = abs(rod) ** 2 + (g.l1 + out) ** 2 + (2 * g.l5 * n.imag) ** 2
+        gaps = _dot(rod, 1j * n), (apart2 - g.l4**2) / 2
+        slopes = (
+            -out * n.real,
+            _dot(spin, n) + _dot(rod, n) / 2,
+            -out * rod.imag - (g.l1 + out) * up,
+            _dot(rod, 1j * spin) + g.l5**2 * np.sin(tilt),
+        )
+        return gaps, slopes
+
+    samples = np.arange(7) * (2 * np.pi / 7)
+    up, out = terms(samples)
+    tilt, near = _zeros((up**2 + out**2 - g.l3**2) * np.cos(samples / 2) ** 2)
+    up, out = terms(tilt)
+    (theta_1, tilt), gaps, _ = _refined(closures, np.arctan2(up, out), tilt)
+    real = near & (abs(gaps[0]) < _CLOSED * g.l4) & (abs(gaps[1]) < _CLOSED * g.l4**2)
+    tilt = np.where(real, np.angle(np.exp(1j * tilt)), np.nan)
+    order = tilt.argsort(axis=-1)
+    return np.take_along_axis(theta_1, order, axis=-1), np.take_along_axis(tilt, order, axis=-1)
+
+
+def _refined(
+    closures: Callable[[FloatArray, FloatArray], tuple[_Pair, _Four]],
+    one: FloatArray,
+    two: FloatArray,
+) -> tuple[_Pair, _Pair, _Four]:
+    """Newton's method on two closures with two unknowns: the unknowns, the gaps, the slopes."""
+    for _ in range(_STEPS):
+        (e, f), (a, b, c, d) = closures(one, two)
+        determinant = a * d - b * c
+        first, second = (d * e - b * f) / determinant, (a * f - c * e) / determinant
+        small = abs(first) + abs(second) < _FARTHEST  # not where there is nothing to find
+        one, two = one - np.where(small, first, 0.0), two - np.where(small, second, 0.0)
+    return ((one, two), *closures(one, two))
 
 
 def _closures(
     rho: FloatArray, tilt: FloatArray, kappa: _Planar, reach2: FloatArray, g: Geometry
-) -> tuple[tuple[FloatArray, ...], tuple[FloatArray, ...]]:
+) -> tuple[_Pair, _Four]:
     """Closures of rods 4a and 4b, and of rod 6, m^2, and their slopes by rho and tilt."""
     n, u = np.exp(-0.5j * tilt), np.exp(-1j * tilt)
     rod6 = rho * n - 2 * g.l5 * (u - 1) - kappa
@@ -214,19 +307,6 @@ def _closures(
         2 * _dot(rod6, 2j * g.l5 * u - 0.5j * rho * n),
     )
     return gaps, slopes
-
-
-def _determinant(slopes: tuple[FloatArray, ...]) -> FloatArray:
-    a, b, c, d = slopes
-    return a * d - b * c
-
-
-def _solved(
-    gaps: tuple[FloatArray, ...], slopes: tuple[FloatArray, ...]
-) -> tuple[FloatArray, FloatArray]:
-    a, b, c, d = slopes
-    one, two = gaps
-    return (d * one - b * two) / (a * d - b * c), (a * two - c * one) / (a * d - b * c)
 
 
 def _in_slots(c1: _Planar, tilt: FloatArray, sign: FloatArray) -> tuple[_Planar, FloatArray]:
@@ -256,31 +336,31 @@ def _link7(
     return np.clip(numerator / denominator, -1.0, 1.0), real
 
 
-def factors(solutions: RotatedSolutions) -> Factors:
+def factors(postures: RotatedPostures) -> Factors:
     """What vanishes where a rotated assembly is singular, in :class:`.jacobian.Factors`' order.
 
-    * parallel (..., 8, 3): sin(beta); level3 = l7 cos(beta) - B3C3 . u (m), with u along link 3';
+    * parallel (..., 3): sin(beta); level3 = l7 cos(beta) - B3C3 . u (m), with u along link 3';
       planar = B2C2 . dC2/dphi with motor 1 locked (m^2/rad), zero where the lines of rods 4a, 4b
       and 6, seen along y, meet in one point.
-    * serial (..., 8, 4): cos(beta); leg 1 (m^2/rad), zero where motor 1 turns while P rests and
+    * serial (..., 4): cos(beta); leg 1 (m^2/rad), zero where motor 1 turns while P rests and
       link 3' turns about it; B_iC_i . dB_i/dtheta_i (m^2/rad) for i = 2, 3.
-    * constraint (..., 8): z_C1 - z_B1 = -rho sin(phi / 2) (m), zero where both modes meet.
+    * constraint (...,): z_C1 - z_B1 = -rho sin(phi / 2) (m), zero where both modes meet.
     """
-    g = solutions.geometry
-    rods, rates = solutions.rods, _elbow_rates(solutions.theta, g)
-    b1 = _elbows(solutions.theta, g)[..., None, 0, :]
-    c1 = solutions.link3[..., 0] + 1j * solutions.link3[..., 1]
-    p = solutions.position[..., 0] + 1j * solutions.position[..., 2] - c1
-    u, n = np.exp(-1j * solutions.tilt), np.exp(-0.5j * solutions.tilt)
+    g = postures.geometry
+    rods, rates = postures.rods, _elbow_rates(postures.theta, g)
+    b1 = _elbows(postures.theta, g)[..., 0, :]
+    c1 = postures.link3[..., 0] + 1j * postures.link3[..., 1]
+    p = postures.position[..., 0] + 1j * postures.position[..., 2] - c1
+    u, n = np.exp(-1j * postures.tilt), np.exp(-0.5j * postures.tilt)
     rho = _dot(c1 - 1j * b1[..., 2], n)
     rod6, rod11 = (rods[..., i, 0] + 1j * rods[..., i, 2] for i in (2, 3))
-    bend = g.l5**2 * np.sin(solutions.tilt)  # -rho drho/dphi
+    bend = g.l5**2 * np.sin(postures.tilt)  # -rho drho/dphi
     planar = _dot(rod6, 2j * g.l5 * u - 0.5j * rho * n - bend / rho * n)
-    out, up = rates[..., None, 0, 1], rates[..., None, 0, 2]
+    out, up = rates[..., 0, 1], rates[..., 0, 2]
     leg1 = (_dot(p, n) + rho / 2) * (up * n.imag - b1[..., 1] * out / rho)
     leg1 -= up * n.real * (_dot(n, 1j * p) + bend / rho)
-    leg2, leg3 = (np.sum(rods[..., i + 1, :] * rates[..., None, i, :], axis=-1) for i in (1, 2))
-    sin, cos = np.sin(solutions.beta), np.cos(solutions.beta)
+    leg2, leg3 = (np.sum(rods[..., i + 1, :] * rates[..., i, :], axis=-1) for i in (1, 2))
+    sin, cos = np.sin(postures.beta), np.cos(postures.beta)
     return Factors(
         np.stack([sin, g.l7 * cos - _dot(rod11, u), planar], axis=-1),
         np.stack([cos, leg1, leg2, leg3], axis=-1),
@@ -288,29 +368,33 @@ def factors(solutions: RotatedSolutions) -> Factors:
     )
 
 
-def velocity(solutions: RotatedSolutions) -> FloatArray:
-    """Rates of P (m/rad) and of the tilt (rad/rad) per rate of each motor, (..., 8, 4, 3).
+def velocity(postures: RotatedPostures) -> FloatArray:
+    """Rates of P (m/rad) and of the tilt (rad/rad) per rate of each motor, (..., 4, 3).
 
     No rod changes its length: rods 4a, 4b and 6 give the twist of link 3', rod 11 the rate of link
     7. At a parallel singularity, and where both modes meet, there are no finite rates.
     """
-    g, rods, ends = solutions.geometry, solutions.rods, solutions.ends
-    rates = _elbow_rates(solutions.theta, g)[..., None, [0, 0, 1, 2], :]
+    g, rods, ends = postures.geometry, postures.rods, postures.ends
+    rates = _elbow_rates(postures.theta, g)[..., [0, 0, 1, 2], :]
     pulls = np.sum(rods * rates, axis=-1)[..., None] * np.eye(3)[[0, 0, 1, 2]]
-    c1, e_y = solutions._moved([0.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
+    c1, e_y = postures._moved([0.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
     # What velocities of C1 along x and z, and a turn about y through it, do to each rod
     turns = np.sum(rods * np.cross(e_y, ends - c1[..., None, :]), axis=-1)
     moved = np.stack([rods[..., 0], rods[..., 2], turns], axis=-1)
-    cos, sin = np.cos(solutions.beta), np.sin(solutions.beta)
-    along7 = solutions._moved([-g.l7 * sin, g.l7 * cos, 0.0]) - c1  # for a unit rate of link 7
-    to_p = np.cross(e_y, solutions.position - c1)
+    cos, sin = np.cos(postures.beta), np.sin(postures.beta)
+    along7 = postures._moved([-g.l7 * sin, g.l7 * cos, 0.0]) - c1  # for a unit rate of link 7
+    to_p = np.cross(e_y, postures.position - c1)
     with np.errstate(all="ignore"):
         twist = _inverse(moved[..., :3, :]) @ pulls[..., :3, :]
         wanted = pulls[..., 3, :] - np.einsum("...i,...ij->...j", moved[..., 3, :], twist)
         link7 = wanted / np.sum(rods[..., 3, :] * along7, axis=-1)[..., None]
         by_link3 = np.stack([twist[..., 0, :], 0 * link7, twist[..., 1, :]], axis=-2)
         turn = twist[..., 2, :]
-        rows = by_link3 + to_p[..., None] * turn[..., None, :] + along7[..., None] * link7[..., None, :]
+        rows = (
+            by_link3
+            + to_p[..., None] * turn[..., None, :]
+            + along7[..., None] * link7[..., None, :]
+        )
     return np.concatenate([rows, turn[..., None, :]], axis=-2)
 
 

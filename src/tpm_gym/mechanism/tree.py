@@ -24,12 +24,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tpm_gym.arrays import Vector
+from tpm_gym.arrays import Vector, vector
 from tpm_gym.errors import InputError
 from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode, passive_angles
 from tpm_gym.kinematics.geometry import PAPER, Geometry
-from tpm_gym.kinematics.modes import RotatedMode
-from tpm_gym.kinematics.rotated import RotatedSolutions
+from tpm_gym.kinematics.modes import ROTATED_MODES, RotatedMode
+from tpm_gym.kinematics.rotated import forward_rotated
 from tpm_gym.mechanism.bodies import Closure, Joint, Link, Mechanism, Solid
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.motor import TORQUE_MOTOR
@@ -307,28 +307,24 @@ def joint_angles(
     return {name: float(angle) for name, angle in angles.items()}
 
 
-def rotated_joint_angles(solutions: RotatedSolutions, branch: RotatedMode) -> dict[str, float]:
+def rotated_joint_angles(
+    theta: ArrayLike, branch: RotatedMode, geometry: Geometry = PAPER
+) -> dict[str, float]:
     """Angles of all joints of the spanning tree at which the loops close with link 3' turned.
 
-    Args:
-        solutions: Those at one theta (3,).
-        branch: One that is valid there.
-
-    Returns:
-        As :func:`joint_angles`.
+    As :func:`joint_angles`, but for the branch.
 
     Raises:
-        InputError: If they are for several theta, or the branch is not valid.
+        InputError: If theta has the wrong shape or is not finite, or if the branch does not exist
+            at theta.
     """
-    if solutions.theta.shape != (3,):
-        raise InputError("theta", solutions.theta.shape, "one theta, of shape (3,)")
-    slot = branch.index
-    if not solutions.valid[slot]:
-        real = ", ".join(map(str, np.flatnonzero(solutions.valid))) or "none here"
-        raise InputError("branch", branch, f"one whose slot is valid ({real})")
-    theta_1, theta_2, theta_3 = solutions.theta
-    tilt, beta = solutions.tilt[slot], solutions.beta[slot]
-    (x, y, z), l4 = solutions.rods[slot].T, solutions.geometry.l4
+    theta_1, theta_2, theta_3 = vector("theta", theta)
+    found, slot = forward_rotated((theta_1, theta_2, theta_3), geometry), branch.index
+    if not found.valid[slot]:
+        real = [str(mode) for mode in ROTATED_MODES if found.valid[mode.index]]
+        raise InputError("branch", branch, f"one that exists at theta: {', '.join(real) or 'none'}")
+    tilt, beta = found.tilt[slot], found.beta[slot]
+    (x, y, z), l4 = found.rods[slot].T, geometry.l4
     swing_4a, swing_4b = np.arctan2(z[:2], y[:2])
     swing_6, swing_11 = np.arctan2(z[2:], x[2:])
     tilt_4a, tilt_4b = np.arcsin(x[:2] / l4)
