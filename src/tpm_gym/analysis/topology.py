@@ -217,8 +217,16 @@ def mobility(
         SingularityError: If the rank is in doubt, since a singular value is between 1e-11 and 1e-7
             of the largest: very near to a constraint singularity, but not on it.
     """
+    return mobility_at(joint_angles(theta, branch, geometry), geometry)
+
+
+def mobility_at(angles: Mapping[str, float], geometry: Geometry = PAPER) -> Mobility:
+    """The same in any posture: ``angles`` holds every joint that turns, by name, in rad.
+
+    Raises:
+        SingularityError: As :func:`mobility`.
+    """
     mechanism = build(geometry)
-    angles = joint_angles(theta, branch, geometry)
     jacobian = closure_jacobian(mechanism, angles)
     _, values, right = np.linalg.svd(jacobian)
     rank = _rank(values)

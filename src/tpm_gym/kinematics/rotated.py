@@ -113,7 +113,7 @@ def forward_rotated(theta: ArrayLike, geometry: Geometry = PAPER) -> RotatedPost
     require_geometry(geometry)
     angles = points("theta", numbers("theta", theta))
     with np.errstate(all="ignore"):
-        link3, tilt = _link3(angles, geometry)
+        link3, tilt = link3_rotated(angles, geometry)
         cos_beta, real = _link7(angles, link3, tilt, geometry)
         beta = np.where(real, np.arccos(cos_beta), np.nan)
     # Postures of link 3', then both signs of sin(beta)
@@ -200,13 +200,17 @@ def _zeros(values: FloatArray) -> tuple[FloatArray, BoolArray]:
     return np.angle(w), abs(np.log(abs(w))) < _NEAR
 
 
-def _link3(theta: FloatArray, g: Geometry) -> tuple[_Planar, FloatArray]:
-    """Point C1 and tilt in all postures of link 3', (..., 4), in their slots.
+def link3_rotated(theta: FloatArray, geometry: Geometry = PAPER) -> tuple[_Planar, FloatArray]:
+    """Point C1 (xC + i zC, m) and tilt (rad) in all postures of link 3' turned, (..., 4).
+
+    They depend on theta_1 and theta_2 of theta (..., 3) rad alone. NaN where there are fewer; the
+    slots are those of :data:`.modes.ROTATED_MODES`, by pairs.
 
     Seen along y and from B1, C1 = rho n with n = exp(-i phi / 2), since B1C1 halves the angle. Then
     the closures of rods 4a and 4b are one, and that of rod 6 is linear in rho. Squared, it is a
     trigonometric polynomial of degree 2, a quartic in tan(phi / 2).
     """
+    g = geometry
     b1, b2, _ = np.moveaxis(_elbows(theta, g), -2, 0)
     reach2 = g.l4**2 - b1[..., 1, None] ** 2
     kappa = (b2 - b1)[..., 0, None] + 2 * g.l5 + 1j * (b2 - b1)[..., 2, None]
