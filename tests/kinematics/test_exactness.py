@@ -1,8 +1,7 @@
 """Every real branch closes every loop to 1e-12 m, and none is missed.
 
-The root finder here is independent of the package: it samples the closure equations, written out
-from the table of points, densely over each unknown angle, bisects every change of sign, and looks
-into every extremum that comes near zero for a pair of roots between two samples.
+The root finder (tests/support/roots.py) is independent of the package: it is given the closure
+equations, written out from the table of points.
 """
 
 from collections.abc import Callable
@@ -13,17 +12,15 @@ import oracle
 import pytest
 from examples import examples
 from hypothesis import strategies as st
-from numpy.typing import NDArray
+from roots import Equation, Rows, circle_roots, unit, unmatched
 
 from tpm_gym.arrays import FloatArray
 from tpm_gym.kinematics import ASSEMBLY_MODES, forward_all, inverse_all, jacobian
 from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
 
-Rows = NDArray[np.int64]
 Solve = Callable[..., Any]
 CLOSED = 1e-12
 BLOCK = 20_000
-SAMPLES = 180
 
 
 def angles(rng: np.random.Generator, count: int) -> FloatArray:
@@ -77,42 +74,6 @@ def test_random_inputs_close(count: int, solve: Solve, g: Geometry) -> None:
 def test_any_geometry_closes(g: Geometry, seed: int) -> None:
     assert worst(forward_all, 500, g, seed)[0] < CLOSED
     assert worst(inverse_all, 500, g, seed)[0] < CLOSED
-
-
-Equation = Callable[[Rows, FloatArray], FloatArray]
-
-
-def circle_roots(f: Equation, rows: int) -> tuple[Rows, FloatArray]:
-    """All zeros on the circle of ``rows`` equations f(row, angle): rows and angles, by rows."""
-    grid = np.linspace(-np.pi, np.pi, SAMPLES + 1)[:-1] + 0.001234
-    step = 2 * np.pi / SAMPLES
-    value = f(np.arange(rows)[:, None], np.broadcast_to(grid, (rows, SAMPLES)))
-    after, before = np.roll(value, -1, axis=1), np.roll(value, 1, axis=1)
-    row, sample = np.nonzero(np.sign(value) != np.sign(after))
-    low = grid[sample]
-    # An extremum that faces zero may hide two roots between samples: find it by a ternary search.
-    facing = (np.abs(value) <= np.abs(before)) & (np.abs(value) <= np.abs(after))
-    facing &= (np.sign(before) == np.sign(value)) & (np.sign(after) == np.sign(value))
-    other, sample = np.nonzero(facing)
-    start, sign = grid[sample] - step, np.sign(value[other, sample])
-    left, right = start, start + 2 * step
-    for _ in range(80):
-        third = (right - left) / 3
-        closer = sign * f(other, left + third) < sign * f(other, right - third)
-        left, right = np.where(closer, left, left + third), np.where(closer, right - third, right)
-    bottom = (left + right) / 2
-    twice = sign * f(other, bottom) < 0
-    pair, start, bottom = other[twice], start[twice], bottom[twice]
-    row = np.concatenate([row, pair, pair])
-    low = np.concatenate([low, start, bottom])
-    high = np.concatenate([low[: len(row) - 2 * len(pair)] + step, bottom, start + 2 * step])
-    first = np.sign(f(row, low))
-    for _ in range(60):
-        middle = (low + high) / 2
-        same = np.sign(f(row, middle)) == first
-        low, high = np.where(same, middle, low), np.where(same, high, middle)
-    order = np.argsort(row, kind="stable")
-    return row[order], (low + high)[order] / 2
 
 
 def numeric_forward(theta: FloatArray, g: Geometry) -> list[FloatArray]:
@@ -170,18 +131,6 @@ def numeric_inverse(points: FloatArray, g: Geometry) -> list[FloatArray]:
     return [np.array(some).reshape(-1, 4) for some in found]
 
 
-def unmatched(numeric: list[FloatArray], ours: list[FloatArray]) -> tuple[int, int, float]:
-    """Inputs with another number of solutions, solutions compared, and the largest distance."""
-    other, compared, worst = 0, 0, 0.0
-    for roots, solutions in zip(numeric, ours, strict=True):
-        other += len(roots) != len(solutions)
-        if len(roots) == len(solutions) and len(roots):
-            distance = np.abs(roots[:, None] - solutions).max(axis=-1)
-            worst = max(worst, distance.min(axis=0).max(), distance.min(axis=1).max())
-            compared += len(roots)
-    return other, compared, worst
-
-
 def both(solve: Solve, some: FloatArray, g: Geometry) -> tuple[list[FloatArray], list[FloatArray]]:
     """The solutions of each input by the root finder, and ours."""
     found = solve(some, g)
@@ -205,11 +154,6 @@ def check(solve: Solve, count: int, g: Geometry, seed: int) -> int:
     # Near tangency, a root is known to the square root of rounding.
     assert worst < 1e-6
     return compared
-
-
-def unit(angle: FloatArray) -> FloatArray:
-    """Angles (n, k) as points of circles (n, 2 k), so that 2 pi does not matter."""
-    return np.concatenate([np.cos(angle), np.sin(angle)], axis=-1)
 
 
 @both_lengths

@@ -75,6 +75,14 @@ def points(theta: Any, x_c: Any, z_c: Any, beta: Any, g: Lengths) -> dict[str, F
     return p
 
 
+def turn_about_y(angle: FloatArray) -> FloatArray:
+    """Rotation matrices (..., 3, 3) by angles (...,) rad."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.stack(
+        [vector(cos, 0.0, sin), vector(0 * cos, 1.0, 0.0), vector(-sin, 0.0, cos)], axis=-2
+    )
+
+
 def rods(p: dict[str, FloatArray]) -> FloatArray:
     """(..., 3, 3): row i is B_iC_i."""
     return np.stack([p[f"C{i}"] - p[f"B{i}"] for i in (1, 2, 3)], axis=-2)

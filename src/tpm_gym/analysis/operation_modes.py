@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tpm_gym.analysis.aspects import DEFAULT_SHAPE, Cells, Shape
-from tpm_gym.arrays import FloatArray
+from tpm_gym.arrays import BoolArray, FloatArray
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.kinematics.rotated import inverse_rotated
 
@@ -45,6 +45,6 @@ def rotated_set(geometry: Geometry = PAPER, shape: Shape = DEFAULT_SHAPE) -> Cel
     spacing = (high - low) / shape
     half = np.indices((shape[0], shape[1] // 2, shape[2]))  # the other is its mirror image
     centres = low + (np.moveaxis(half, 0, -1) + 0.5) * spacing
-    mask = inverse_rotated(centres, g).valid.any(axis=-1)
+    mask: BoolArray = np.any(inverse_rotated(centres, g).valid, axis=-1)
     corner, edges = tuple(low.tolist()), tuple(spacing.tolist())
     return Cells(corner, edges, np.concatenate([mask, mask[:, ::-1]], axis=1))

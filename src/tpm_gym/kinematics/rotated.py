@@ -67,7 +67,8 @@ class RotatedPostures:
         """(..., 3, 3), the rotation of link 3' and the platform: about y, by the tilt."""
         cos, sin, zero = np.cos(self.tilt), np.sin(self.tilt), 0 * self.tilt
         rows = [cos, zero, sin, zero, zero + 1, zero, -sin, zero, cos]
-        return np.stack(rows, axis=-1).reshape(*self.tilt.shape, 3, 3)
+        matrices: FloatArray = np.stack(rows, axis=-1).reshape(*self.tilt.shape, 3, 3)
+        return matrices
 
     @property
     def position(self) -> FloatArray:
@@ -88,7 +89,8 @@ class RotatedPostures:
         """(..., 4, 3) m, along rods 4a, 4b and 6, and B3C3, which rods 11 are parallel to."""
         half = np.array([self.geometry.l5, 0.0, 0.0])
         b1, b2, b3 = np.moveaxis(_elbows(self.theta, self.geometry), -2, 0)
-        return self.ends - np.stack([b1 + half, b1 - half, b2, b3], axis=-2)
+        feet: FloatArray = np.stack([b1 + half, b1 - half, b2, b3], axis=-2)
+        return self.ends - feet
 
     def _moved(self, offset: Sequence[FloatArray | float]) -> FloatArray:
         """C1 (..., 3) m, displaced by an offset in the frame of link 3', x, y and z in m."""
@@ -96,9 +98,11 @@ class RotatedPostures:
         cos, sin = np.cos(self.tilt), np.sin(self.tilt)
         along, up = x * cos + z * sin, z * cos - x * sin
         x_c, z_c = self.link3[..., 0], self.link3[..., 1]
-        return np.stack([x_c + along, 0 * x_c + y, z_c + up], axis=-1)
+        moved: FloatArray = np.stack([x_c + along, 0 * x_c + y, z_c + up], axis=-1)
+        return moved
 
 
+@np.errstate(all="ignore")
 def forward_rotated(theta: ArrayLike, geometry: Geometry = PAPER) -> RotatedPostures:
     """All assemblies with link 3' turned at actuated angles theta (..., 3) rad, as (..., 8).
 
@@ -112,10 +116,9 @@ def forward_rotated(theta: ArrayLike, geometry: Geometry = PAPER) -> RotatedPost
     """
     require_geometry(geometry)
     angles = points("theta", numbers("theta", theta))
-    with np.errstate(all="ignore"):
-        link3, tilt = link3_rotated(angles, geometry)
-        cos_beta, real = _link7(angles, link3, tilt, geometry)
-        beta = np.where(real, np.arccos(cos_beta), np.nan)
+    link3, tilt = link3_rotated(angles, geometry)
+    cos_beta, real = _link7(angles, link3, tilt, geometry)
+    beta = np.where(real, np.arccos(cos_beta), np.nan)
     # Postures of link 3', then both signs of sin(beta)
     link3, tilt = (np.repeat(np.where(real, some, np.nan), 2, axis=-1) for some in (link3, tilt))
     return RotatedPostures(
@@ -127,6 +130,7 @@ def forward_rotated(theta: ArrayLike, geometry: Geometry = PAPER) -> RotatedPost
     )
 
 
+@np.errstate(all="ignore")
 def inverse_rotated(position: ArrayLike, geometry: Geometry = PAPER) -> RotatedPostures:
     """All postures with link 3' turned and point P at position (..., 3) m, as (..., 48).
 
@@ -139,28 +143,28 @@ def inverse_rotated(position: ArrayLike, geometry: Geometry = PAPER) -> RotatedP
     """
     require_geometry(geometry)
     g, places = geometry, points("position", numbers("position", position))
-    shape = (*places.shape[:-1], 2, 6, 2, 2)
-    with np.errstate(all="ignore"):
-        x, y, z = np.moveaxis(places, -1, 0)
-        sin_beta = (y / g.l7)[..., None]
-        cos_beta = np.sqrt((1 - sin_beta) * (1 + sin_beta)) * [-1.0, 1.0]
-        link7 = g.l7 * cos_beta + g.l2 + 2j * g.l6
-        theta_1, tilt = _leg1((x + 1j * z)[..., None], link7, g)
-        c1 = (x + 1j * z)[..., None, None] - link7[..., None] * np.exp(-1j * tilt)
-        c2 = c1 - 2 * g.l5 * np.exp(-1j * tilt) + g.l1  # from A2
-        c3 = c1 + (link7 + g.l2 - 1j * g.l6)[..., None] * np.exp(-1j * tilt) - g.l1  # from A3
-        fold2, real2 = equations.fold(c2.real, c2.imag, 0.0, g, NUMPY)
-        fold3, real3 = equations.fold(c3.real, c3.imag, y[..., None, None], g, NUMPY)
-        bends = np.array([-1.0, 1.0])
-        theta_2 = NUMPY.wrap(np.angle(c2)[..., None] - bends * fold2[..., None])[..., :, None]
-        theta_3 = NUMPY.wrap(np.angle(c3)[..., None] - bends * fold3[..., None])[..., None, :]
-        real = (~np.isnan(tilt) & real2 & real3)[..., None, None]
+    x, y, z = np.moveaxis(places, -1, 0)
+    sin_beta = (y / g.l7)[..., None]
+    cos_beta = np.sqrt((1 - sin_beta) * (1 + sin_beta)) * [-1.0, 1.0]
+    link7 = g.l7 * cos_beta + g.l2 + 2j * g.l6
+    theta_1, tilt = _leg1((x + 1j * z)[..., None], link7, g)
+    c1 = (x + 1j * z)[..., None, None] - link7[..., None] * np.exp(-1j * tilt)
+    c2 = c1 - 2 * g.l5 * np.exp(-1j * tilt) + g.l1  # from A2
+    c3 = c1 + (link7 + g.l2 - 1j * g.l6)[..., None] * np.exp(-1j * tilt) - g.l1  # from A3
+    fold2, real2 = equations.fold(c2.real, c2.imag, 0.0, g, NUMPY)
+    fold3, real3 = equations.fold(c3.real, c3.imag, y[..., None, None], g, NUMPY)
+    bends = np.array([-1.0, 1.0])
+    theta_2 = NUMPY.wrap(np.angle(c2)[..., None] - bends * fold2[..., None])[..., :, None]
+    theta_3 = NUMPY.wrap(np.angle(c3)[..., None] - bends * fold3[..., None])[..., None, :]
+    real = (~np.isnan(tilt) & real2 & real3)[..., None, None]
     beta = np.arctan2(sin_beta, cos_beta)[..., None, None, None]
-    columns = (theta_1[..., None, None], theta_2, theta_3, c1.real[..., None, None])
-    columns += (c1.imag[..., None, None], tilt[..., None, None], beta)
-    table = np.stack([np.where(real, np.broadcast_to(c, shape), np.nan) for c in columns], axis=-1)
-    table = table.reshape(*places.shape[:-1], 48, 7)
-    return RotatedPostures(table[..., :3], table[..., 3:5], table[..., 5], table[..., 6], geometry)
+    by_tilt = (values[..., None, None] for values in (theta_1, tilt, c1.real, c1.imag))
+    slots = np.broadcast_arrays(*by_tilt, theta_2, theta_3, beta)
+    one, tilt, x_c, z_c, two, three, beta = (
+        np.where(real, values, np.nan).reshape(*places.shape[:-1], 48) for values in slots
+    )
+    theta, link3 = np.stack([one, two, three], axis=-1), np.stack([x_c, z_c], axis=-1)
+    return RotatedPostures(theta, link3, tilt, beta, g)
 
 
 def _dot(a: _Planar, b: _Planar) -> FloatArray:
@@ -181,6 +185,10 @@ def _elbows(theta: FloatArray, g: Geometry) -> FloatArray:
     return np.stack(elbows, axis=-2)
 
 
+def _samples(count: int) -> FloatArray:
+    return np.linspace(0.0, 2 * np.pi, count, endpoint=False)
+
+
 def _zeros(values: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Zeros (..., 2 d) of trigonometric polynomials of degree d, and whether they may be real.
 
@@ -196,10 +204,12 @@ def _zeros(values: FloatArray) -> tuple[FloatArray, BoolArray]:
     companion[..., -1] = -lower / np.where(abs(highest) < least, least, highest)
     known = np.isfinite(companion).all(axis=(-2, -1), keepdims=True)
     w = np.linalg.eigvals(np.where(known, companion, 0.0))
-    w = np.take_along_axis(w, np.angle(w).argsort(axis=-1), axis=-1)
-    return np.angle(w), abs(np.log(abs(w))) < _NEAR
+    near = abs(np.log(abs(w))) < _NEAR
+    order = np.angle(w).argsort(axis=-1)
+    return np.take_along_axis(np.angle(w), order, -1), np.take_along_axis(near, order, -1)
 
 
+@np.errstate(all="ignore")
 def link3_rotated(theta: FloatArray, geometry: Geometry = PAPER) -> tuple[_Planar, FloatArray]:
     """Point C1 (xC + i zC, m) and tilt (rad) in all postures of link 3' turned, (..., 4).
 
@@ -222,7 +232,7 @@ def link3_rotated(theta: FloatArray, geometry: Geometry = PAPER) -> tuple[_Plana
         q = rho2 + abs(kappa + 2 * g.l5 * (u - 1)) ** 2 - g.l4**2
         return rho2, _dot(kappa, n), q
 
-    rho2, p, q = terms(np.arange(5) * (2 * np.pi / 5))
+    rho2, p, q = terms(_samples(5))
     tilt, near = _zeros(4 * rho2 * p**2 - q**2)
     rho2, p, q = terms(tilt)
     # Where p = q = 0, rho has both signs, and two neighbouring zeros are one.
@@ -231,9 +241,8 @@ def link3_rotated(theta: FloatArray, geometry: Geometry = PAPER) -> tuple[_Plana
         lambda rho, tilt: _closures(rho, tilt, kappa, reach2, g), rho, tilt
     )
     # Along the curve rho(phi) the closure of rod 6 changes its sign at every zero.
-    sign = (slopes[0] * slopes[3] - slopes[1] * slopes[2]) * np.where(
-        reach2 > 4 * g.l5**2, rho, 1.0
-    )
+    a, b, c, d = slopes
+    sign = (a * d - b * c) * np.where(reach2 > 4 * g.l5**2, rho, 1.0)
     real = near & (np.maximum(*map(abs, gaps)) < _CLOSED * g.l4**2)
     c1 = 1j * b1[..., 2, None] + rho * np.exp(-0.5j * tilt)
     return _in_slots(c1, np.angle(np.exp(1j * tilt)), np.where(real, sign, np.nan))
@@ -268,9 +277,8 @@ def _leg1(p: _Planar, link7: _Planar, g: Geometry) -> tuple[FloatArray, FloatArr
         )
         return gaps, slopes
 
-    samples = np.arange(7) * (2 * np.pi / 7)
-    up, out = terms(samples)
-    tilt, near = _zeros((up**2 + out**2 - g.l3**2) * np.cos(samples / 2) ** 2)
+    up, out = terms(_samples(7))
+    tilt, near = _zeros((up**2 + out**2 - g.l3**2) * np.cos(_samples(7) / 2) ** 2)
     up, out = terms(tilt)
     (theta_1, tilt), gaps, _ = _refined(closures, np.arctan2(up, out), tilt)
     real = near & (abs(gaps[0]) < _CLOSED * g.l4) & (abs(gaps[1]) < _CLOSED * g.l4**2)
@@ -340,6 +348,7 @@ def _link7(
     return np.clip(numerator / denominator, -1.0, 1.0), real
 
 
+@np.errstate(all="ignore")
 def factors(postures: RotatedPostures) -> Factors:
     """What vanishes where a rotated assembly is singular, in :class:`.jacobian.Factors`' order.
 
@@ -372,6 +381,7 @@ def factors(postures: RotatedPostures) -> Factors:
     )
 
 
+@np.errstate(all="ignore")
 def velocity(postures: RotatedPostures) -> FloatArray:
     """Rates of P (m/rad) and of the tilt (rad/rad) per rate of each motor, (..., 4, 3).
 
@@ -388,24 +398,21 @@ def velocity(postures: RotatedPostures) -> FloatArray:
     cos, sin = np.cos(postures.beta), np.sin(postures.beta)
     along7 = postures._moved([-g.l7 * sin, g.l7 * cos, 0.0]) - c1  # for a unit rate of link 7
     to_p = np.cross(e_y, postures.position - c1)
-    with np.errstate(all="ignore"):
-        twist = _inverse(moved[..., :3, :]) @ pulls[..., :3, :]
-        wanted = pulls[..., 3, :] - np.einsum("...i,...ij->...j", moved[..., 3, :], twist)
-        link7 = wanted / np.sum(rods[..., 3, :] * along7, axis=-1)[..., None]
-        by_link3 = np.stack([twist[..., 0, :], 0 * link7, twist[..., 1, :]], axis=-2)
-        turn = twist[..., 2, :]
-        rows = (
-            by_link3
-            + to_p[..., None] * turn[..., None, :]
-            + along7[..., None] * link7[..., None, :]
-        )
-    return np.concatenate([rows, turn[..., None, :]], axis=-2)
+    twist = _inverse(moved[..., :3, :]) @ pulls[..., :3, :]
+    wanted = pulls[..., 3, :] - np.einsum("...i,...ij->...j", moved[..., 3, :], twist)
+    link7 = wanted / np.sum(rods[..., 3, :] * along7, axis=-1)[..., None]
+    by_link3 = np.stack([twist[..., 0, :], 0 * link7, twist[..., 1, :]], axis=-2)
+    by_link7 = along7[..., None] * link7[..., None, :]
+    turn = twist[..., 2:, :]
+    linear = by_link3 + to_p[..., None] * turn + by_link7
+    return np.concatenate([linear, turn], axis=-2)
 
 
 def _elbow_rates(theta: FloatArray, g: Geometry) -> FloatArray:
     """dB_i/dtheta_i as rows (..., 3, 3), m/rad."""
     pivots = np.array([[0.0, g.l1, 0.0], [-g.l1, 0.0, 0.0], [g.l1, 0.0, 0.0]])
-    return _elbows(theta + np.pi / 2, g) - pivots
+    rates: FloatArray = _elbows(theta + np.pi / 2, g) - pivots
+    return rates
 
 
 def _inverse(matrix: FloatArray) -> FloatArray:
