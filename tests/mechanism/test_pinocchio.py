@@ -8,11 +8,18 @@ import yaml
 from numpy.typing import ArrayLike
 
 from tpm_gym.arrays import FloatArray
-from tpm_gym.kinematics import ASSEMBLY_MODES, inverse, workspace
+from tpm_gym.kinematics import (
+    ASSEMBLY_MODES,
+    ROTATED_MODES,
+    forward_all,
+    forward_rotated,
+    inverse,
+    workspace,
+)
 from tpm_gym.kinematics.geometry import PAPER
 from tpm_gym.mechanism.dynamics import Dynamics
 from tpm_gym.mechanism.mount import GRAVITY
-from tpm_gym.mechanism.tree import joint_angles
+from tpm_gym.mechanism.tree import joint_angles, rotated_joint_angles
 from tpm_gym.mechanism.urdf import LOOPS_FILE, URDF_FILE
 from tpm_gym.resources import URDF as FOLDER
 
@@ -151,3 +158,44 @@ def test_what_the_motors_hold_is_what_the_files_weigh(
     for point, posture in found:
         held = dynamics.gravity(inverse(point))
         np.testing.assert_allclose(files.torque(posture), held, rtol=0, atol=1e-6)
+
+
+def test_the_files_close_with_link_3p_turned(files: Files) -> None:
+    platform, closed = files.model.getFrameId("platform"), 0
+    for theta in np.random.default_rng(2).uniform(-np.pi, np.pi, (300, 3)):
+        solutions = forward_rotated(theta)
+        for branch in (mode for mode in ROTATED_MODES if solutions.valid[mode.index]):
+            posture = files.posture(rotated_joint_angles(theta, branch))
+            assert files.open_by(posture) < CLOSED
+            placed, closed = files.data.oMf[platform], closed + 1
+            point_p = placed.act(np.array([PAPER.l2, 0, PAPER.l6]))
+            np.testing.assert_allclose(point_p, solutions.position[branch.index], atol=1e-10)
+            np.testing.assert_allclose(
+                placed.rotation, solutions.orientation[branch.index], atol=1e-10
+            )
+    assert closed > 50
+
+
+def test_from_wherever_it_starts_pinocchio_closes_the_loops_in_one_of_the_two_modes(
+    files: Files,
+) -> None:
+    """Newton's method on all passive joints, which knows of no mode."""
+    rng, platform, seen = np.random.default_rng(3), files.model.getFrameId("platform"), set()
+    for theta in ([-2.22, -1.27, -2.11], inverse(START)):
+        level, turned = forward_all(theta), forward_rotated(theta)
+        points = np.concatenate([level.position[level.valid], turned.position[turned.valid]])
+        tilts = np.concatenate([np.zeros(level.valid.sum()), turned.tilt[turned.valid]])
+        names = [(len(points), i) for i in range(len(points))]
+        for start in rng.uniform(-np.pi, np.pi, (60, files.model.nv)):
+            neutral = pin.integrate(files.model, pin.neutral(files.model), start)
+            posture = files.close(files.turn_to(neutral, theta))
+            if files.open_by(posture) > CLOSED:
+                continue
+            placed = files.data.oMf[platform]
+            point_p = placed.act(np.array([PAPER.l2, 0, PAPER.l6]))
+            rotations = [pin.utils.rotate("y", float(tilt)) for tilt in tilts]
+            apart = np.abs(points - point_p).max(axis=-1)
+            apart += [np.abs(placed.rotation - rotation).max() for rotation in rotations]
+            assert apart.min() < 1e-8
+            seen.add(names[apart.argmin()])
+    assert len(seen) > 8

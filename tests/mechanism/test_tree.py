@@ -4,12 +4,22 @@ import numpy as np
 import oracle
 import pytest
 from examples import examples
+from hypothesis import example
 from machines import each_machine
 from walk import gaps, place, walk
 
 from tpm_gym.arrays import FloatArray
-from tpm_gym.kinematics import ASSEMBLY_MODES, AssemblyMode, forward, forward_all, inverse_all
-from tpm_gym.kinematics.geometry import Geometry
+from tpm_gym.errors import InputError
+from tpm_gym.kinematics import (
+    ASSEMBLY_MODES,
+    ROTATED_MODES,
+    AssemblyMode,
+    forward,
+    forward_all,
+    forward_rotated,
+    inverse_all,
+)
+from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
 from tpm_gym.mechanism import TPM
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.motor import TORQUE_MOTOR
@@ -17,6 +27,7 @@ from tpm_gym.mechanism.tree import (
     ACTUATED_JOINTS,
     build,
     joint_angles,
+    rotated_joint_angles,
 )
 
 GAP = 1e-9
@@ -150,3 +161,29 @@ def test_the_cup_is_under_point_p_slides_back_along_its_axis_and_alone_collides(
     assert [link.name for link, _ in colliding] == [mechanism.tool]
     bellows = colliding[0][1]
     assert bellows.centre[2] + bellows.size[1] / 2 == pytest.approx(mechanism.lip[2])
+
+
+@examples(4, oracle.geometries(), oracle.seeds())
+@example(PAPER, 1)
+@example(WIDE, 1)
+def test_rotated_joint_angles_close_every_loop_and_turn_the_platform(
+    g: Geometry, seed: int
+) -> None:
+    mechanism = build(g)
+    for theta in np.random.default_rng(seed).uniform(-np.pi, np.pi, (20, 3)):
+        found = forward_rotated(theta, g)
+        for branch in ROTATED_MODES:
+            if not found.valid[branch.index]:
+                with pytest.raises(InputError, match="exists at theta"):
+                    rotated_joint_angles(theta, branch, g)
+                continue
+            joints = rotated_joint_angles(theta, branch, g)
+            assert np.abs(gaps(mechanism, joints)).max() < 1e-13
+            frames = walk(mechanism, joints)
+            point_p = place(frames, mechanism.platform, mechanism.point_p)
+            np.testing.assert_allclose(point_p, found.position[branch.index], atol=1e-13)
+            for level in (mechanism.platform, "link_3p"):
+                turned = found.orientation[branch.index]
+                np.testing.assert_allclose(frames[level][1], turned, atol=1e-13)
+            roll = [frames[link][1] for link in ("end_link_9", "end_link_10")]
+            np.testing.assert_allclose(*roll, atol=1e-13)  # idle, but set parallel
