@@ -262,6 +262,15 @@ def test_where_eq_6_has_one_circle_twice_both_ways_of_b1c1_are_found() -> None:
     assert compared > 2
 
 
+def test_two_tilts_next_to_each_other_with_b1c1_either_way_are_both_found() -> None:
+    """From a search: 7e-4 and 9e-4 rad apart."""
+    theta = np.array([[1.688993009, 1.019125755, 2.181463313], [2.024924836, 0.840101917, -2.9699]])
+    other, compared, worst = unmatched(
+        numeric(theta, random_geometry(2)), ours(theta, random_geometry(2))
+    )
+    assert (other, compared, worst < 1e-6) == (0, 8, True)
+
+
 def test_where_b2_is_at_the_foot_of_rod_4b_what_is_found_closes() -> None:
     """Seen along y; there the first coefficient of the polynomial in exp(i phi) is zero."""
     theta_2 = np.arccos((PAPER.l1 - PAPER.l5) / PAPER.l3)

@@ -34,6 +34,7 @@ _Four = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 """Slopes of two functions by two unknowns, in rows."""
 
 _NEAR = 1e-5  # eigenvalues so far from the unit circle, or nearer, may be on it
+_MERGED = 1e-7  # of l4: eigenvalues that coincide are good to half of the digits
 _STEPS = 4  # of Newton's method, from eigenvalues good to half of the digits or better
 _FARTHEST = 0.01  # of its steps that still begin near a zero, rad or m
 _CLOSED = 1e-13  # of l4^2: what rounding leaves of a closure |rod|^2 - l4^2
@@ -236,7 +237,7 @@ def link3_rotated(theta: FloatArray, geometry: Geometry = PAPER) -> tuple[_Plana
     tilt, near = _zeros(4 * rho2 * p**2 - q**2)
     rho2, p, q = terms(tilt)
     # Where p = q = 0, rho has both signs, and two neighbouring zeros are one.
-    rho = np.where(abs(p) < _NEAR * g.l4, [1, -1, 1, -1], np.sign(p * q)) * NUMPY.root(rho2)
+    rho = np.where(abs(p) < _MERGED * g.l4, [1, -1, 1, -1], np.sign(p * q)) * NUMPY.root(rho2)
     (rho, tilt), gaps, slopes = _refined(
         lambda rho, tilt: _closures(rho, tilt, kappa, reach2, g), rho, tilt
     )
