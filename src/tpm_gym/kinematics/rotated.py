@@ -168,6 +168,22 @@ def inverse_rotated(position: ArrayLike, geometry: Geometry = PAPER) -> RotatedP
     return RotatedPostures(theta, link3, tilt, beta, g)
 
 
+@np.errstate(all="ignore")
+def transition(
+    theta_1: ArrayLike, beta: ArrayLike, side: ArrayLike = -1, geometry: Geometry = PAPER
+) -> FloatArray:
+    """Points P (..., 3) m of the surface on which both modes meet.
+
+    Angles (...,) rad and ``side`` (...,), the sign of xC, broadcast. The surface is a curve of C1,
+    on which rods 4a and 4b are level in x, swept by link 7. NaN where rods 4 do not reach y = 0;
+    that arms 2 and 3 reach is not checked.
+    """
+    g, (one, turn) = geometry, (np.asarray(theta_1), np.asarray(beta))
+    x_c = np.asarray(side) * np.sqrt(g.l4**2 - (g.l1 + g.l3 * np.cos(one)) ** 2)
+    x, y = x_c + g.l7 * np.cos(turn) + g.l2, g.l7 * np.sin(turn)
+    return np.stack(np.broadcast_arrays(x, y, g.l3 * np.sin(one) + 2 * g.l6), axis=-1)
+
+
 def _dot(a: _Planar, b: _Planar) -> FloatArray:
     product: FloatArray = (a * b.conj()).real
     return product
