@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from figures import maps, postures, regions, singularities
+from figures import maps, modes, postures, regions, singularities
 from matplotlib.figure import Figure
 
 from tpm_gym.learning import figure_style as style
@@ -22,6 +22,7 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "workspace": maps.workspace_figure,
     "postures": postures.postures_figure,
     "aspects": regions.aspects_figure,
+    "operation_modes": modes.operation_modes_figure,
 }
 
 
