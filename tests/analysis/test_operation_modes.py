@@ -3,17 +3,20 @@
 import re
 
 import numpy as np
+import oracle
 import pytest
 from paths import ROOT
 
-from tpm_gym.analysis.topology import mobility_at
+from tpm_gym.analysis.topology import mobility, mobility_at
 from tpm_gym.arrays import FloatArray
 from tpm_gym.kinematics import (
+    ASSEMBLY_MODES,
     ROTATED_MODES,
     forward_all,
     forward_rotated,
     inverse_all,
     inverse_rotated,
+    jacobian,
     rotated,
 )
 from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
@@ -64,6 +67,15 @@ def test_from_there_the_platform_turns_either_way_without_a_jump() -> None:
     assert (tilt[steady][:, 0] * tilt[steady][:, -1] < 0).all()
 
 
+def test_where_they_meet_mobility_by_rank_is_4() -> None:
+    for theta in on_the_surface(-1)[1][:10]:
+        found = forward_all(theta)
+        level = np.abs(found.link3[:, 1] - PAPER.l3 * np.sin(theta[0])) < 1e-9
+        for branch in (mode for mode in ASSEMBLY_MODES if level[mode.index]):
+            met = mobility(theta, branch)
+            assert (met.dof, met.rank, str(met.platform)) == (4, 10, "t^3 r^1")
+
+
 def test_mobility_by_rank_is_3_and_the_tilt_no_freedom_of_its_own() -> None:
     counted = 0
     for theta in np.random.default_rng(0).uniform(-np.pi, np.pi, (200, 3)):
@@ -93,12 +105,15 @@ def said(name: str, *values: object) -> None:
     assert row in PAGE.read_text(encoding="utf-8")
 
 
-def shares(g: Geometry) -> tuple[str, str]:
+def shares(g: Geometry) -> tuple[str, str, str]:
     theta = np.random.default_rng(0).uniform(-np.pi, np.pi, (100_000, 3))
     link3 = np.isfinite(rotated.link3_rotated(theta, g)[1]).sum(axis=-1)
-    platform = forward_rotated(theta, g).valid.sum(axis=-1)
+    found = forward_rotated(theta, g)
+    platform = found.valid.sum(axis=-1)
     counts = ", ".join(f"{100 * (link3 == n).mean():.1f}%" for n in (0, 2, 4))
-    return counts, f"{100 * (platform > 0).mean():.1f}% ({platform.max()} at most)"
+    values = np.linalg.svd(rotated.velocity(found)[found.valid][:, :3], compute_uv=False)
+    conditioning = f"{(values[:, 2] / values[:, 0]).max():.2f}"
+    return counts, f"{100 * (platform > 0).mean():.1f}% ({platform.max()} at most)", conditioning
 
 
 def volumes(machine: TPM) -> tuple[str, ...]:
@@ -114,15 +129,20 @@ def volumes(machine: TPM) -> tuple[str, ...]:
     region = rng.uniform(machine.region.low, machine.region.high, (20_000, 3))
     there = inverse_rotated(region, g)
     share, least = there.valid.any(axis=-1).mean(), np.degrees(np.nanmin(np.abs(there.tilt)))
-    return (*found, str(back.valid.sum(axis=-1).max()), f"{100 * share:.0f}%, from {least:.0f}°")
+    grid = oracle.grid(machine.region.low, machine.region.high, (17, 17, 17))
+    height = jacobian.factors_at(grid, machine.working_mode, g).constraint.min()
+    tilts = f"{100 * share:.0f}%, from {least:.0f}°"
+    return (*found, str(back.valid.sum(axis=-1).max()), tilts, f"{1e3 * height:.0f}")
 
 
 @pytest.mark.slow
 def test_numbers_of_the_page() -> None:
-    for row in zip(("postures of link 3' turned: 0, 2, 4", "motor angles with a rotated assembly"),
-                   *map(shares, (PAPER, WIDE)), strict=True):  # fmt: skip
+    names = ("postures of link 3' turned: 0, 2, 4", "motor angles with a rotated assembly",
+             "1/cond of the rates of P, largest")  # fmt: skip
+    for row in zip(names, *map(shares, (PAPER, WIDE)), strict=True):  # fmt: skip
         said(*row)
     names = ("reachable, translating (dm³)", "reachable, rotated (dm³)", "reachable in both (dm³)",
-             "rotated postures of a point, most", "task region: reached rotated, tilt")  # fmt: skip
+             "rotated postures of a point, most", "task region: reached rotated, tilt",
+             "task region: least z_C1 - z_B1 (mm)")  # fmt: skip
     for row in zip(names, *map(volumes, (PAPER_TPM, WIDE_TPM)), strict=True):
         said(*row)

@@ -92,6 +92,13 @@ def test_the_determinant_is_the_factors() -> None:
     assert_zero(halved(DETERMINANT).subs(TURNED) - sp.expand(factors))
 
 
+def test_the_determinant_where_link_3p_is_level_is_eq_16_and_the_constraint_factor() -> None:
+    level3 = l7 * cb - halved(ROD_11.dot(U)).subs({s: 0, c: 1})
+    planar = x_c * (z_c - z_2) - (z_c - z_1) * (x_c - 2 * l5 - x_2)
+    factors = -32 * l5 * l7 * (z_c - z_1) * sb * level3 * planar
+    assert_zero(halved(DETERMINANT).subs({s: 0, c: 1}) - factors)
+
+
 @pytest.mark.parametrize("g", [PAPER, WIDE])
 def test_the_code_has_these_factors(g: Geometry) -> None:
     symbols = (*PLACES, l2, l4, l5, l6, l7, tilt, beta)
