@@ -203,6 +203,20 @@ def test_inverse_then_forward_returns_in_every_slot(g: Geometry, seed: int) -> N
     assert np.where(again.valid, apart, np.inf).min(axis=-1)[far].max(initial=0) < 1e-9
 
 
+def test_inverse_has_its_slots_in_order() -> None:
+    points = np.random.default_rng(5).uniform([-0.8, -0.05, -1.1], [0.9, 0.05, 1.1], (2000, 3))
+    found = inverse_rotated(points)
+    cos, _, leg2, leg3 = np.moveaxis(rotated.factors(found).serial, -1, 0).reshape(
+        4, -1, 2, 6, 2, 2
+    )
+    sign = np.array([-1.0, 1.0])
+    for factor, expected in ((cos, sign[:, None, None, None]), (leg2, sign[:, None]), (leg3, sign)):
+        assert not (factor * expected < 0).any()
+    tilt = found.tilt.reshape(-1, 2, 6, 2, 2)
+    assert not (np.diff(tilt, axis=2) < 0).any()
+    assert found.valid.sum() > 5000
+
+
 @examples(15, oracle.geometries(), oracle.seeds())
 @example(PAPER, 1)
 def test_velocity_is_the_derivative_and_its_determinant_is_the_factors(

@@ -82,9 +82,9 @@ class RotatedMode(_Mode):
     """One of the 8 branches of the forward kinematics in the second operation mode.
 
     Attributes:
-        planar: Sign of the planar factor, as in
-            :func:`tpm_gym.kinematics.rotated.factors`: on which side of the point where rods 4a and
-            4b cross, as seen along y, rod 6 passes.
+        planar: Sign of the planar factor of :func:`tpm_gym.kinematics.rotated.factors`: on which
+            side rod 6 passes the point where rods 4a and 4b cross, as seen along y. (Where rods 4
+            are seen shorter than links 3, the half with the smaller factors.)
         further: -1 for the assembly of link 3' with that sign, 1 for the other one of two: that
             which is turned further, from 0 to 2 pi.
         sin_beta: Sign of sin(beta), so of y.

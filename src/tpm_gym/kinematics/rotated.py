@@ -259,7 +259,7 @@ def link3_rotated(theta: FloatArray, geometry: Geometry = PAPER) -> tuple[_Plana
     )
     # Along the curve rho(phi) the closure of rod 6 changes its sign at every zero.
     a, b, c, d = slopes
-    sign = (a * d - b * c) * np.where(reach2 > 4 * g.l5**2, rho, 1.0)
+    sign = (a * d - b * c) * rho
     real = near & (np.maximum(*map(abs, gaps)) < _CLOSED * g.l4**2)
     c1 = 1j * b1[..., 2, None] + rho * np.exp(-0.5j * tilt)
     return _in_slots(c1, np.angle(np.exp(1j * tilt)), np.where(real, sign, np.nan))
