@@ -154,7 +154,7 @@ def _along_path(axes: Axes) -> None:
     axes.set(xlim=(0, 360), ylim=(-180, 180), xlabel="θ2 (°)", ylabel="tilt of link 3' (°)")
     axes.set(xticks=range(0, 361, 90), yticks=range(-180, 181, 90))
     axes.set_title(f"d  all tilts of link 3' for θ1 = {np.degrees(THETA[0]):.0f}°")
-    axes.legend(loc="lower right", fontsize=6, handlelength=1.4)
+    axes.legend(loc="lower right", bbox_to_anchor=(0.94, 0.0), fontsize=6, handlelength=1.4)
 
 
 def meeting_terms(theta_1: FloatArray, theta_2: FloatArray) -> tuple[FloatArray, FloatArray]:

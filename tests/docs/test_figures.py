@@ -8,12 +8,14 @@ from tpm_gym.analysis.aspects import aspects
 from tpm_gym.analysis.singularity import factors_at
 from tpm_gym.kinematics import ELBOWS_OUT, WORKING_MODES, inverse_all
 from tpm_gym.kinematics.geometry import PAPER, Geometry
+from tpm_gym.kinematics.rotated import link3_rotated
 from tpm_gym.kinematics.workspace import reachable
+from tpm_gym.mechanism import PAPER_TPM
 
 DOCS = ROOT / "docs"
 
 import draw_figures  # noqa: E402
-from figures import maps, postures, regions, surfaces  # noqa: E402
+from figures import maps, modes, postures, regions, surfaces  # noqa: E402
 from figures.skeleton import skeleton  # noqa: E402
 from figures.zero_sets import (  # noqa: E402
     Section,
@@ -167,6 +169,26 @@ def test_signs_tell_the_aspects_of_a_half_apart():
         assert {(a.level3, a.assembly.planar) for a in half} == set(regions.COLOURS)
         # Cells may cut the thinnest off; what they cut off is a crumb.
         assert all(a.cells.volume < 5e-5 for a in half[4:])
+
+
+def test_drawn_postures_of_both_modes_close_within_the_motors_stops():
+    motors = PAPER_TPM.mechanism.motors
+    meeting = modes.meeting_posture(modes.THETA[0], 0.6)
+    for posture in (modes.level_posture(modes.THETA), meeting, modes.turned_posture(modes.THETA)):
+        np.testing.assert_allclose(np.linalg.norm(posture.rods, axis=-1), PAPER.l4, atol=1e-12)
+        assert all(m.lower < t < m.upper for m, t in zip(motors, posture.theta, strict=True))
+
+
+def test_both_modes_meet_where_the_figure_draws_it():
+    theta_2 = np.linspace(0.0, 2 * np.pi, 2881)
+    theta = np.stack(np.broadcast_arrays(modes.THETA[0], theta_2, 0.0), axis=-1)
+    meets, _ = modes.meeting_terms(np.asarray(modes.THETA[0]), theta_2)
+    crossed = np.flatnonzero(np.sign(meets[:-1]) != np.sign(meets[1:]))
+    least = np.nanmin(np.abs(link3_rotated(theta)[1]), axis=-1)
+    assert len(crossed) == 4
+    assert least[crossed].max() < 0.2  # next to one of them the tilt changes fast
+    nearest = np.abs(np.flatnonzero(least < 0.01)[:, None] - crossed).min(axis=1)
+    assert nearest.max() < 20  # of 2881 samples
 
 
 def test_a_figure_is_drawn_twice_with_the_same_bytes(tmp_path):
