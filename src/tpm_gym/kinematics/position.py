@@ -49,7 +49,8 @@ _ANGLE_BETA = np.array([12 + (mode.cos_beta + 1) // 2 for mode in WORKING_MODES]
 def forward_all(theta: ArrayLike, geometry: Geometry = PAPER) -> ForwardSolutions:
     """Solve the forward kinematics on all 4 branches, at actuated angles theta (..., 3) rad.
 
-    A branch keeps its slot as theta moves, and holds NaN where it is not real.
+    A branch keeps its slot as theta moves, and holds NaN where it is not real. Link 3' translates;
+    assemblies with link 3' turned are those of :func:`.rotated.forward_rotated`.
     """
     require_geometry(geometry)
     angles = points("theta", theta)
