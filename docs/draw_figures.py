@@ -9,13 +9,14 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from figures import maps, postures, regions, singularities
+from figures import maps, parameters, postures, regions, singularities
 from matplotlib.figure import Figure
 
 from tpm_gym.learning import figure_style as style
 
 IMAGES = Path(__file__).parent / "images"
 FIGURES: dict[str, Callable[[], Figure]] = {
+    "parameters": parameters.parameters_figure,
     "parallel_singularities": singularities.parallel_figure,
     "serial_singularities": singularities.serial_figure,
     "conditioning": maps.conditioning_figure,
