@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from figures import maps, parameters, postures, regions, singularities
+from figures import maps, motors, parameters, postures, regions, singularities
 from matplotlib.figure import Figure
 
 from tpm_gym.learning import figure_style as style
@@ -21,6 +21,7 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "serial_singularities": singularities.serial_figure,
     "conditioning": maps.conditioning_figure,
     "workspace": maps.workspace_figure,
+    "motors": motors.motors_figure,
     "postures": postures.postures_figure,
     "aspects": regions.aspects_figure,
 }

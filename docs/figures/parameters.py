@@ -89,7 +89,9 @@ def parameters_figure() -> Figure:
     figure = Figure(figsize=(style.WIDTH, 4.9))
     at = {"ha": "center", "va": "top"}
     figure.text(0.5, 0.985, "Points, lengths and angles", fontsize=11, weight="bold", **at)
-    what = "the paper's Figs. 2 and 3; not to scale: in its case study l2, l6 and l7 are far shorter"
+    what = (
+        "the paper's Figs. 2 and 3; not to scale: in its case study l2, l6 and l7 are far shorter"
+    )
     figure.text(0.5, 0.945, what, fontsize=8.5, **at)
     posture = skeleton(POINT, ELBOWS_OUT, DRAWN)
     _space(figure.add_axes((0.0, 0.11, 0.57, 0.77)), posture)
