@@ -42,10 +42,12 @@ MUTATIONS = [
     Mutation("(1)", POC, "for unit in self.units])", "for unit in self.units[1:]])"),
     Mutation("(2)", POC, "reduce(POCSet.__and__, sets)", "reduce(POCSet.__or__, sets)"),
     Mutation("(3a)", POC, "sum(freedoms) - sum(equations)", "sum(freedoms) - equations[0]"),
-    Mutation("(3a)", TOPOLOGY, "self.loops[:loops]", "self.loops[:1]"),
+    Mutation("(3a)", POC, "self.loops[:loops]", "self.loops[:1]"),
     Mutation("(3b)", POC, "(parallel(previous) | added).dim", "(previous[-1] | added).dim"),
     Mutation("(3b)", POC, "(parallel(previous) | added).dim", "(parallel(previous) & added).dim"),
-    Mutation("(4), first", TOPOLOGY, "for _, poc in held[:2]]", "for _, poc in held[1:]]"),
+    Mutation(
+        "(4), first", TOPOLOGY, "for chain in (first, second)]", "for chain in (second, third)]"
+    ),
     Mutation("(4), second", POC, "freedoms - actuated - equations", "freedoms - equations"),
     Mutation("(5)", POC, "best = min(", "best = max("),
     Mutation("(5)", POC, "sum(abs(d) for d in run) / 2", "sum(abs(d) for d in run)"),
@@ -71,9 +73,9 @@ MUTATIONS = [
     Mutation("(17)", JACOBIAN, "[f.cos_beta * f.leg1,", "[f.leg1,"),
     # What the text claims
     Mutation("M_HSOC1", TOPOLOGY, "parallel([hsoc_1, hsoc_2])", "hsoc_1"),
-    Mutation("xi_L1", TOPOLOGY, "chains[: j + 1] if j == 1", "chains[:j] if j == 1"),
+    Mutation("xi_L1", POC, "chains[: j + 1] if j == 1", "chains[:j] if j == 1"),
     Mutation("xi_L2", POC, "(parallel(previous) | added).dim", "6"),
-    Mutation("v = m - n + 1", TOPOLOGY, "for j in range(1, len(order))", "for j in (1,)"),
+    Mutation("v = m - n + 1", POC, "for j in range(1, len(order))", "for j in (1,)"),
     Mutation("Delta_1", POC, "freedoms - actuated - equations", "freedoms - equations"),
     Mutation("3 degrees", TOPOLOGY, "free = right[rank:].T", "free = right[rank + 1 :].T"),
     Mutation("link 3'", EQUATIONS, "dx, dz = cos[1]", "dx, dz = 1e-3 * cos[2] + cos[1]"),
