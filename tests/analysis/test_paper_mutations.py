@@ -35,7 +35,7 @@ class Mutation(NamedTuple):
 
 POC, TOPOLOGY = "analysis.poc", "analysis.topology"
 EQUATIONS, JACOBIAN = "kinematics.equations", "kinematics.jacobian"
-POSITION = "kinematics.position"
+POSITION, DELTA = "kinematics.position", "analysis.delta"
 
 MUTATIONS = [
     Mutation("(1)", POC, "reduce(POCSet.__or__, sets)", "reduce(POCSet.__and__, sets)"),
@@ -82,6 +82,12 @@ MUTATIONS = [
     Mutation('"complete', EQUATIONS, "cos_beta * turn3)", "0 * turn3)"),
     Mutation("y_B1", EQUATIONS, "real = meet &", "real = (abs(y1) > 1e-9) & meet &"),
     Mutation("16 inverse", POSITION, "4 * leg + (bend + 1)", "4 * leg"),
+    Mutation(
+        "twice as", DELTA, "direction - fold, direction + fold", "direction, direction + fold"
+    ),
+    Mutation(
+        "the singularities", DELTA, "* across - np.sin(q) * arm", "* across + np.sin(q) * arm"
+    ),
     Mutation("beta = pi/2", EQUATIONS, "        found.sin_beta,\n", "        found.cos_beta,\n"),
     Mutation("the plane", EQUATIONS, "SINGULAR = 1e-6", "SINGULAR = 1e-12"),
     Mutation("Eqs. (16)", POC, "np.stack([normal, np.cross(rod, normal)])", "np.eye(3)[1:]"),
