@@ -1,1 +1,1 @@
-"""Singularities, aspects and topology; no environment imports this."""
+"""Singularities, aspects, topology, decoupling, and other mechanisms; no environment imports this."""
