@@ -103,9 +103,10 @@ def sheet(name: str, mode: Any, g: Geometry, one: FloatArray, other: FloatArray)
 
     across = value(one) * value(other) < 0
     one, other = one[across], other[across]
-    for _ in range(45):
+    sign = np.sign(value(one))
+    for _ in range(40):
         middle = (one + other) / 2
-        same = (np.sign(value(middle)) == np.sign(value(one)))[:, None]
+        same = (np.sign(value(middle)) == sign)[:, None]
         one, other = np.where(same, middle, one), np.where(same, other, middle)
     return one
 
