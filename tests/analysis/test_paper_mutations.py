@@ -80,7 +80,7 @@ MUTATIONS = [
     Mutation("3 degrees", TOPOLOGY, "free = right[rank:].T", "free = right[rank + 1 :].T"),
     Mutation("link 3'", EQUATIONS, "dx, dz = cos[1]", "dx, dz = 1e-3 * cos[2] + cos[1]"),
     Mutation('"complete', EQUATIONS, "cos_beta * turn3)", "0 * turn3)"),
-    Mutation("y_B1", EQUATIONS, "real = meet &", "real = (abs(y1) > 1e-9) & meet &"),
+    Mutation("y_B1", EQUATIONS, "meet = across2 >=", "meet = across2 - 9 * (abs(y1) < 1e-9) >="),
     Mutation("16 inverse", POSITION, "4 * leg + (bend + 1)", "4 * leg"),
     Mutation(
         "twice as", DELTA, "direction - fold, direction + fold", "direction, direction + fold"

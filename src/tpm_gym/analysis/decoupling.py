@@ -147,7 +147,7 @@ def _configuration(
     jacobian.velocity(theta, branch, geometry)  # raises where it does not, and says why
     a, b, c = np.moveaxis(finite_points("theta", theta), -1, 0)
     cos, sin = equations.arms((a, b, c), geometry, NUMPY)
-    found, _, _ = equations.assembly_at(cos, sin, branch.planar, branch.sin_beta, geometry, NUMPY)
+    found = equations.assembly_at(cos, sin, *branch.signs, geometry, NUMPY)[0]
     bars = equations.rods(cos, sin, found, geometry)
     return bars, equations.factors(cos, sin, found, bars, geometry)
 
