@@ -64,8 +64,8 @@ MUTATIONS = [
     Mutation("(11)", POSITION, "position[..., branch.index, :]", "position[..., 0, :]"),
     Mutation("(12)", EQUATIONS, "cos_beta, z - 2 * g.l6", "cos_beta, z - g.l6"),
     Mutation("(13)", EQUATIONS, "-l1, x_c + l1 - 2 * g.l5,", "-l1, x_c + l1 - g.l5,"),
-    Mutation("(13)", EQUATIONS, "_fold(a1, z_c, x_c, g, ns)", "_fold(a1, z_c, 0.0, g, ns)"),
-    Mutation("(14)", EQUATIONS, "_fold(a3, b3, y, g, ns)", "_fold(a3, b3, x, g, ns)"),
+    Mutation("(13)", EQUATIONS, "fold(a1, z_c, x_c, g, ns)", "fold(a1, z_c, 0.0, g, ns)"),
+    Mutation("(14)", EQUATIONS, "fold(a3, b3, y, g, ns)", "fold(a3, b3, x, g, ns)"),
     Mutation("(15)", EQUATIONS, "x + g.l2 - l1, z - g.l6", "x + g.l2 - l1, z - 2 * g.l6"),
     Mutation("(16)", EQUATIONS, "r1x * r2z - r1z * r2x,", "r1x * r2z,"),
     Mutation("(16)", JACOBIAN, "[cos * r1x, sin * r1x,", "[cos * r1x, cos * r1x,"),
@@ -80,7 +80,7 @@ MUTATIONS = [
     Mutation("3 degrees", TOPOLOGY, "free = right[rank:].T", "free = right[rank + 1 :].T"),
     Mutation("link 3'", EQUATIONS, "dx, dz = cos[1]", "dx, dz = 1e-3 * cos[2] + cos[1]"),
     Mutation('"complete', EQUATIONS, "cos_beta * turn3)", "0 * turn3)"),
-    Mutation("y_B1", EQUATIONS, "meet = across2 >=", "meet = across2 - 9 * (abs(y1) < 1e-9) >="),
+    Mutation("y_B1", EQUATIONS, "meet = across2 >=", "meet = across2 - 1e9 * (abs(y1) < 1e-9) >="),
     Mutation("16 inverse", POSITION, "4 * leg + (bend + 1)", "4 * leg"),
     Mutation(
         "twice as", DELTA, "direction - fold, direction + fold", "direction, direction + fold"
