@@ -9,17 +9,19 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from figures import maps, modes, postures, regions, singularities
+from figures import maps, modes, motors, parameters, postures, regions, singularities
 from matplotlib.figure import Figure
 
 from tpm_gym.learning import figure_style as style
 
 IMAGES = Path(__file__).parent / "images"
 FIGURES: dict[str, Callable[[], Figure]] = {
+    "parameters": parameters.parameters_figure,
     "parallel_singularities": singularities.parallel_figure,
     "serial_singularities": singularities.serial_figure,
     "conditioning": maps.conditioning_figure,
     "workspace": maps.workspace_figure,
+    "motors": motors.motors_figure,
     "postures": postures.postures_figure,
     "aspects": regions.aspects_figure,
     "operation_modes": modes.operation_modes_figure,

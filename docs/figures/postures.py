@@ -68,7 +68,7 @@ def postures_figure() -> Figure:
             for column, (leg2, leg3) in enumerate(((-1, 1), (-1, -1), (1, 1), (1, -1))):
                 rect = (0.015 + 0.2445 * column, bottom + 0.185 * (1 - row), 0.236, 0.178)
                 _draw_posture(figure.add_axes(rect), WorkingMode(cos_beta, leg1, leg2, leg3))
-    _legend(figure)
+    legend(figure)
     return figure
 
 
@@ -118,7 +118,8 @@ def _draw_plan(axes: Axes, cos_beta: int) -> None:
     axes.axis("off")
 
 
-def _legend(figure: Figure) -> None:
+def legend(figure: Figure) -> None:
+    """Names of the colours, below everything."""
     names = (
         ("leg 1: arm 2, link 3, rods 4", _LEG1),
         ("leg 2: arm 5, rod 6", _LEG2),

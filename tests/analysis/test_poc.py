@@ -77,8 +77,19 @@ def test_poc_sets_combine_by_column(a: POCSet, b: POCSet) -> None:
         assert same(found.translations, rule(a.translations, b.translations))
         assert same(found.rotations, rule(a.rotations, b.rotations))
         assert found.dim == found.translations.dim + found.rotations.dim
-    assert independent_equations([a], b) == (a | b).dim
     assert str(a) == f"t^{a.translations.dim} r^{a.rotations.dim}"
+
+
+@examples(100, poc_sets, poc_sets, poc_sets)
+def test_independent_equations_are_those_of_what_the_chains_so_far_share_and_the_next(
+    a: POCSet, b: POCSet, c: POCSet
+) -> None:
+    """dim(U + V) = dim U + dim V - dim(U intersected with V), in each column."""
+    expected = 0
+    for column in ("translations", "rotations"):
+        u, v, w = (getattr(poc, column) for poc in (a, b, c))
+        expected += (u & v).dim + w.dim - (u & v & w).dim
+    assert independent_equations([a, b], c) == expected
 
 
 def test_equations_1_and_2_need_a_set() -> None:

@@ -105,6 +105,8 @@ def test_number_of_loops_is_m_minus_n_plus_1() -> None:
     n = 2 + sum(chain.freedoms - 1 for chain in structure.chains)  # base, link 3', links between
     assert (m, n, m - n + 1) == (14, 13, 2)
     assert len(analyse(structure).loops) == m - n + 1
+    # Every pair and every rod: R11, 4 S, R21..23, R12, R13, R31..33, R_e..R_h; 2 rods in each Pa
+    assert len(build().closures) == 17 - 14 + 1
 
 
 def test_every_decomposition_has_the_same_freedoms_and_the_paper_s_couples_least() -> None:

@@ -5,6 +5,7 @@ import pytest
 from paths import ROOT
 
 from tpm_gym.analysis.aspects import aspects
+from tpm_gym.analysis.decoupling import LINKS, PLATFORM
 from tpm_gym.analysis.singularity import factors_at
 from tpm_gym.kinematics import ELBOWS_OUT, WORKING_MODES, inverse_all
 from tpm_gym.kinematics.geometry import PAPER, Geometry
@@ -15,7 +16,15 @@ from tpm_gym.mechanism import PAPER_TPM
 DOCS = ROOT / "docs"
 
 import draw_figures  # noqa: E402
-from figures import maps, modes, postures, regions, surfaces  # noqa: E402
+from figures import (  # noqa: E402
+    maps,
+    modes,
+    motors,
+    parameters,
+    postures,
+    regions,
+    surfaces,
+)
 from figures.skeleton import skeleton  # noqa: E402
 from figures.zero_sets import (  # noqa: E402
     Section,
@@ -205,3 +214,12 @@ def test_unknown_name_is_refused_and_every_figure_has_a_caption():
     for name in draw_figures.FIGURES:
         assert f"(images/{name}.png)" in text
         assert f"draw_figures.py {name}`" in text
+
+
+@pytest.mark.parametrize("motor", [0, 1, 2])
+def test_one_motor_is_turned_at_a_time_and_the_table_has_the_patterns(motor):
+    before = skeleton(parameters.POINT, ELBOWS_OUT, parameters.DRAWN)
+    change = motors.turned(motor).theta - before.theta
+    np.testing.assert_allclose(change, motors.TURNS[motor], atol=1e-9)
+    values, _ = motors.table()
+    np.testing.assert_array_equal(values > 0, np.concatenate([LINKS, PLATFORM]))

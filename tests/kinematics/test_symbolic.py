@@ -88,10 +88,6 @@ def test_eq_10_follows_from_eq_9_with_f1_above_e1() -> None:
     assert_zero(CLOSURES[2] - (a2 * sp.cos(beta) - b2))
 
 
-def test_eq_11_puts_p_in_the_middle_of_f1_and_d3() -> None:
-    assert (P - (F1 + D3) / 2).expand() == sp.zeros(3, 1)
-
-
 @pytest.mark.parametrize("leg", [0, 1, 2])
 def test_eqs_13_and_15_corrected_are_the_closures_in_the_half_angle(leg: int) -> None:
     x, y, z = sp.symbols("x y z", real=True)

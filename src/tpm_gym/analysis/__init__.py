@@ -1,1 +1,1 @@
-"""Singularities, aspects and topology; no environment imports this."""
+"""Singularities, aspects, topology, decoupling, a Delta beside ours; no environment imports it."""

@@ -23,6 +23,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
+from itertools import permutations
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -151,6 +152,11 @@ def revolute(name: str, axis: FloatArray, point: FloatArray, actuated: bool = Fa
     return Unit(name, point, np.empty((0, 3)), axis[None], actuated)
 
 
+def prismatic(name: str, axis: FloatArray, point: FloatArray, actuated: bool = False) -> Unit:
+    """A prismatic joint P: ``axis`` (3,), ``point`` (3,) m on it."""
+    return Unit(name, point, axis[None], np.empty((0, 3)), actuated)
+
+
 def parallelogram_4s(name: str, short: FloatArray, rod: FloatArray, point: FloatArray) -> Unit:
     """A parallelogram of four spherical pairs, P^(4S) P^(4S) R^(4S) R^(4S) of the paper.
 
@@ -274,3 +280,74 @@ class Loop:
     def constraint(self) -> int:
         """Delta_j of Eq. (4)."""
         return constraint_degree(self.freedoms, self.actuated, self.equations)
+
+
+@dataclass(frozen=True, eq=False)
+class ParallelMechanism:
+    """What :func:`analyse` finds.
+
+    Attributes:
+        platform: POC set of the platform.
+        decompositions: The independent loops, for every order in which the chains can be taken;
+            the order in which they were given comes first.
+    """
+
+    platform: POCSet
+    decompositions: tuple[tuple[Loop, ...], ...]
+
+    @property
+    def loops(self) -> tuple[Loop, ...]:
+        """The loops of the first decomposition."""
+        return self.decompositions[0]
+
+    @property
+    def coupling(self) -> tuple[float, ...]:
+        """Eq. (5): kappa of each Assur kinematic chain.
+
+        Raises:
+            InputError: If there are not as many motors as freedoms, as at a constraint singularity:
+                the constraint degrees do not add up to zero.
+        """
+        return coupling_degrees([[x.constraint for x in loops] for loops in self.decompositions])
+
+    def dof(self, loops: int | None = None) -> int:
+        """F of Eq. (3a), counting the first ``loops`` of the loops, or all."""
+        counted = self.loops[:loops]
+        return degrees_of_freedom([x.freedoms for x in counted], [x.equations for x in counted])
+
+
+def analyse(chains: Sequence[Chain], point: ArrayLike) -> ParallelMechanism:
+    """Apply Eqs. (1) to (5) to two chains or more from the base to one platform.
+
+    ``point`` (3,) m is the base point of the platform, at the configuration of the chains.
+
+    Raises:
+        InputError: If there are fewer chains.
+    """
+    if len(chains) < 2:
+        raise InputError("chains", len(chains), "two chains or more, by number")
+    platform = parallel([chain.poc(point) for chain in chains])
+    return ParallelMechanism(platform, decompositions(chains, point))
+
+
+def decompositions(chains: Sequence[Chain], point: ArrayLike) -> tuple[tuple[Loop, ...], ...]:
+    """The independent loops for every order of the chains, about ``point`` (3,) m of their end."""
+    held = [(chain, chain.poc(point)) for chain in chains]
+    return tuple(_loops(order) for order in permutations(held))
+
+
+def _loops(order: tuple[tuple[Chain, POCSet], ...]) -> tuple[Loop, ...]:
+    """The loops that form as the chains are mounted in this order, the first by two of them."""
+    chains, sets = zip(*order, strict=True)
+    loops = []
+    for j in range(1, len(order)):
+        added = chains[: j + 1] if j == 1 else chains[j : j + 1]
+        loops.append(
+            Loop(
+                chains=tuple(chain.name for chain in added),
+                freedoms=sum(chain.freedoms for chain in added),
+                actuated=sum(chain.actuated for chain in added),
+                equations=independent_equations(sets[:j], sets[j]),
+            )
+        )
+    return tuple(loops)

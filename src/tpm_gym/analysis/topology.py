@@ -19,20 +19,17 @@ UnreachableError if the branch does not exist there.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import permutations
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from tpm_gym.analysis.poc import (
     Chain,
-    Loop,
+    ParallelMechanism,
     POCSet,
     Subspace,
     Unit,
-    coupling_degrees,
-    degrees_of_freedom,
-    independent_equations,
+    decompositions,
     parallel,
     parallelogram_4r,
     parallelogram_4s,
@@ -112,76 +109,34 @@ def describe(
 
 
 @dataclass(frozen=True, eq=False)
-class Topology:
-    """What :func:`analyse` finds.
+class Topology(ParallelMechanism):
+    """What :func:`analyse` finds; the paper's decomposition (I and II, then III) comes first.
 
     Attributes:
         sub_mechanism: M_Pa(1-2) of the first Eq. (4): POC set of link 3' under branches I and II.
         hsoc_1: POC set of the platform under those and R12, R13.
         hsoc_2: POC set of the platform under branch III.
-        platform: POC set of the platform, the intersection of both.
-        decompositions: The independent loops, for every order in which the three chains can be
-            taken; the paper's (I and II, then III) comes first.
     """
 
     sub_mechanism: POCSet
     hsoc_1: POCSet
     hsoc_2: POCSet
-    platform: POCSet
-    decompositions: tuple[tuple[Loop, ...], ...]
-
-    @property
-    def loops(self) -> tuple[Loop, ...]:
-        """The paper's two loops."""
-        return self.decompositions[0]
-
-    @property
-    def coupling(self) -> tuple[float, ...]:
-        """Eq. (5): kappa of each Assur kinematic chain.
-
-        Raises:
-            InputError: At a constraint singularity, where there are more freedoms than motors and
-                the constraint degrees do not add up to zero.
-        """
-        return coupling_degrees([[x.constraint for x in loops] for loops in self.decompositions])
-
-    def dof(self, loops: int = 2) -> int:
-        """F of Eq. (3a), counting the first ``loops`` of the paper's loops."""
-        counted = self.loops[:loops]
-        return degrees_of_freedom([x.freedoms for x in counted], [x.equations for x in counted])
 
 
 def analyse(structure: Structure) -> Topology:
     """Apply Eqs. (1) to (5) to the structure at its configuration."""
-    held = [(chain, chain.poc(structure.link_3p)) for chain in structure.chains]
-    sub_mechanism = parallel([poc for _, poc in held[:2]])
+    first, second, third = structure.chains
+    sub_mechanism = parallel([chain.poc(structure.link_3p) for chain in (first, second)])
     # Where link 3' does not turn, its POC set is the same about any point.
     hsoc_1 = serial([sub_mechanism, structure.wrist.poc(structure.platform)])
     hsoc_2 = structure.branches[2].poc(structure.platform)
     return Topology(
+        platform=parallel([hsoc_1, hsoc_2]),
+        decompositions=decompositions((first, second, third), structure.link_3p),
         sub_mechanism=sub_mechanism,
         hsoc_1=hsoc_1,
         hsoc_2=hsoc_2,
-        platform=parallel([hsoc_1, hsoc_2]),
-        decompositions=tuple(_loops(order) for order in permutations(held)),
     )
-
-
-def _loops(order: tuple[tuple[Chain, POCSet], ...]) -> tuple[Loop, ...]:
-    """The loops that form as the chains are mounted in this order, the first by two of them."""
-    chains, sets = zip(*order, strict=True)
-    loops = []
-    for j in range(1, len(order)):
-        added = chains[: j + 1] if j == 1 else chains[j : j + 1]
-        loops.append(
-            Loop(
-                chains=tuple(chain.name for chain in added),
-                freedoms=sum(chain.freedoms for chain in added),
-                actuated=sum(chain.actuated for chain in added),
-                equations=independent_equations(sets[:j], sets[j]),
-            )
-        )
-    return tuple(loops)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,101 @@
+"""The singular surfaces as polynomials in x, y, z, as elimination leaves them (Figs. 4 and 5).
+
+A factor of Eqs. (16) and (17) depends on the joint angles, so on the working mode. Where the angles
+are eliminated, one polynomial remains that vanishes on the sheets of all working modes. Those of
+level3, planar, legs 1 and 2 and the constraint are curves in (xC, zC) first, :data:`CURVES`; with
+xC = x - l2 - u and u^2 = l7^2 - y^2, a surface is the product of its curve at both signs of u:
+even in u, so a polynomial in x, y, z of twice the degree.
+
+Everything here is sums and products of what is given: numbers, arrays, or symbols of sympy, which
+shows the coefficients. Lengths and coordinates share a unit.
+"""
+
+from typing import Any, Final
+
+import numpy as np
+
+from tpm_gym.kinematics.geometry import PAPER, Geometry
+
+DEGREES: Final = {
+    "sin_beta": 1,
+    "level3": 8,
+    "planar": 32,
+    "cos_beta": 2,
+    "leg1": 8,
+    "leg2": 8,
+    "leg3": 4,
+    "constraint": 8,
+}
+"""Degree in x, y, z of each polynomial, by the name of its factor."""
+
+
+def _level3(x: Any, z: Any, g: Geometry) -> Any:
+    """Two circles: C3 is sqrt(l4^2 - l7^2) above or below B3, which is on the circle of arm 12."""
+    a, b = x + 2 * g.l2 - g.l1, z + g.l6
+    height2 = g.l4**2 - g.l7**2
+    return (a**2 + b**2 + height2 - g.l3**2) ** 2 - 4 * height2 * b**2
+
+
+def _planar(x: Any, z: Any, g: Geometry) -> Any:
+    """Degree 16: two quadratics in 2 l3 sin(theta_1) = s have a root in common.
+
+    The first is cos^2 + sin^2 = 1, with 2 l1 l3 cos(theta_1) = n + z s from B1C1 = l4. The
+    second is B2 on the circle of arm 5, with B2C2 along the projection of B1C1 on y = 0, whose
+    length is the root of l4^2 - (l1 + l3 cos(theta_1))^2.
+    """
+    l1, l3, l4 = g.l1, g.l3, g.l4
+    c2 = x - 2 * g.l5 + l1  # level, from A2
+    n = l4**2 - l1**2 - l3**2 - x**2 - z**2
+    first = (z**2 + l1**2, 2 * n * z, n**2 - 4 * l1**2 * l3**2)
+    span2 = (c2**2 + z**2 + l4**2 - l3**2) ** 2
+    along, offset, scale = c2 * x + z**2, 2 * l1**2 + n, 4 * l1**2 * l4**2
+    second = (
+        -(span2 + scale) * z**2,
+        4 * scale * along * z - 2 * span2 * offset * z,
+        span2 * (scale - offset**2) - 4 * scale * along**2,
+    )
+    (a, b, c), (d, e, f) = first, second
+    return (a * f - c * d) ** 2 - (a * e - b * d) * (b * f - c * e)
+
+
+def _leg(a: Any, b: Any, out: Any, g: Geometry) -> Any:
+    """4 times the square of the leg's factor, of C - A in and out of the plane of its arm."""
+    in_plane = a**2 + b**2
+    return 4 * g.l3**2 * in_plane - (in_plane + out**2 + g.l3**2 - g.l4**2) ** 2
+
+
+def _constraint(x: Any, z: Any, g: Geometry) -> Any:
+    """z_C1 = z_B1, with cos(theta_1) from B1C1 = l4."""
+    return (g.l1**2 + g.l3**2 - g.l4**2 + x**2 - z**2) ** 2 - 4 * g.l1**2 * (g.l3**2 - z**2)
+
+
+CURVES: Final = {
+    "level3": _level3,
+    "planar": _planar,
+    "leg1": lambda x, z, g: _leg(g.l1, z, x, g),
+    "leg2": lambda x, z, g: _leg(x - 2 * g.l5 + g.l1, z, 0, g),
+    "constraint": _constraint,
+}
+"""Polynomials in xC, zC (and the lengths), by the name of their factor."""
+
+
+def polynomial(name: str, x: Any, y: Any, z: Any, geometry: Geometry = PAPER, u: Any = None) -> Any:
+    """The polynomial of one of :data:`DEGREES` at x, y, z of P.
+
+    Args:
+        name: Of the factor.
+        x: Number, array or symbol; so y and z.
+        geometry: Lengths.
+        u: What has the square l7^2 - y^2, of either sign; by default that of numbers with
+            |y| <= l7, where the workspace ends.
+    """
+    g = geometry
+    if name == "sin_beta":
+        return y
+    if name == "cos_beta":
+        return y**2 - g.l7**2
+    if name == "leg3":
+        return _leg(x + g.l2 - g.l1, z - g.l6, y, g)
+    root = np.sqrt(g.l7**2 - y**2) if u is None else u
+    curve = CURVES[name]
+    return curve(x - g.l2 - root, z - 2 * g.l6, g) * curve(x - g.l2 + root, z - 2 * g.l6, g)

@@ -1,0 +1,154 @@
+"""Which motor moves what: the formulas are derivatives and inverses, and their zeros are exact."""
+
+import re
+from typing import Any
+
+import numpy as np
+import oracle
+import pytest
+import torch
+from examples import examples
+from gantry import GANTRY
+from paths import ROOT
+from torch.autograd.functional import jacobian as derivatives
+
+from tpm_gym.analysis.decoupling import (
+    LINKS,
+    PLATFORM,
+    inverse_link_velocity,
+    inverse_velocity,
+    link_velocity,
+    motors,
+    over,
+    shares,
+)
+from tpm_gym.arrays import FloatArray
+from tpm_gym.errors import ConfigurationError, InputError, SingularityError, UnreachableError
+from tpm_gym.kinematics import ASSEMBLY_MODES, AssemblyMode, forward_all, inverse, jacobian
+from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
+from tpm_gym.kinematics.workspace import Region
+from tpm_gym.mechanism import PAPER_TPM, WIDE_TPM, Machine
+
+
+def regular(branch: AssemblyMode, seed: int, g: Geometry) -> FloatArray:
+    """Angles away from all singularities."""
+    theta = oracle.angles_on(branch, np.random.default_rng(seed), 60, g, clear=0.1)
+    legs = jacobian.factors(theta, branch, g).serial / [1.0, *[g.l3 * g.l4] * 3]
+    return theta[(np.abs(legs) > 0.05).all(axis=-1)]
+
+
+@examples(20, oracle.geometries(), oracle.seeds())
+def test_the_formulas_are_derivatives_and_inverses_with_these_zeros(g: Geometry, seed: int) -> None:
+    for branch in ASSEMBLY_MODES:
+        theta, slot = regular(branch, seed, g), branch.index
+
+        def links(angles: Any, slot: int = slot) -> Any:
+            found = forward_all(angles, g)
+            turned = g.l7 * found.beta[:, slot, None]
+            return torch.cat([found.link3[:, slot], turned], dim=-1).sum(0)
+
+        found, back = link_velocity(theta, branch, g), inverse_link_velocity(theta, branch, g)
+        slopes = derivatives(links, torch.tensor(theta)).permute(1, 0, 2).numpy()
+        np.testing.assert_allclose(found, slopes, rtol=1e-8, atol=1e-9)
+        for one, other in (
+            (found, back),
+            (jacobian.velocity(theta, branch, g), inverse_velocity(theta, branch, g)),
+        ):
+            np.testing.assert_allclose(
+                one @ other, np.broadcast_to(np.eye(3), one.shape), atol=1e-9
+            )
+        assert not found[:, ~LINKS].any()
+        assert not back[:, ~LINKS].any()
+        assert not jacobian.velocity(theta, branch, g)[:, ~PLATFORM].any()
+
+
+def test_nowhere_else_is_a_zero_by_structure() -> None:
+    branch = ASSEMBLY_MODES[1]
+    theta = regular(branch, 3, PAPER)
+    assert len(theta) > 100
+    for matrix, pattern in (
+        (link_velocity(theta, branch), LINKS),
+        (inverse_link_velocity(theta, branch), LINKS),
+        (jacobian.velocity(theta, branch), PLATFORM),
+        (inverse_velocity(theta, branch), np.ones((3, 3), dtype=bool)),
+    ):
+        assert (np.median(np.abs(matrix), axis=0)[pattern] > 1e-2).all()
+
+
+def test_motor_3_moves_p_along_the_circle_of_link_7() -> None:
+    theta = inverse(np.random.default_rng(1).uniform(*_corners(PAPER_TPM.region), (50, 3)))
+    beta = forward_all(theta).beta[:, 1]
+    column = jacobian.velocity(theta)[..., 2]
+    tangent = oracle.vector(-np.sin(beta), np.cos(beta), 0.0)
+    assert np.abs(np.cross(column, tangent)).max() < 1e-12
+    # and a motion along it is no concern of motors 1 and 2
+    rates = (inverse_velocity(theta) @ tangent[..., None])[..., 0]
+    assert np.abs(rates[:, :2]).max() < 1e-12
+    assert np.abs(rates[:, 2]).min() > 0.05
+
+
+def _corners(region: Region) -> tuple[FloatArray, FloatArray]:
+    return np.array(region.low), np.array(region.high)
+
+
+def test_shares_are_parts_of_the_variance() -> None:
+    rng = np.random.default_rng(2)
+    j = jacobian.velocity(inverse([-0.04, 0.028, 0.80]))
+    rates = rng.normal(size=(200_000, 3))
+    variance = np.var(rates @ j.T, axis=0)
+    for motor in range(3):
+        alone = np.var(rates * np.eye(3)[motor] @ j.T, axis=0)
+        np.testing.assert_allclose(alone / variance, shares(j)[:, motor], atol=0.01)
+    np.testing.assert_allclose(shares(j).sum(axis=-1), 1.0, atol=1e-15)
+    np.testing.assert_allclose(shares(j), shares(-3.0 * j), rtol=1e-14)
+
+
+def test_motors_counts_motors() -> None:
+    for matrix, expected in (
+        (np.diag([1.0, -2.0, 3.0]), [1, 1, 1]),
+        ([[0, 5, 0], [1, 1, 0], [1, -1, 1]], [1, 2, 3]),
+    ):
+        np.testing.assert_allclose(motors(matrix), expected, atol=1e-15)
+    cartesian = GANTRY.evaluate(GANTRY.inverse(GANTRY.home))[1]
+    np.testing.assert_array_equal(motors(cartesian), [1, 1, 1])
+
+
+@pytest.mark.parametrize(("machine", "g"), [(PAPER_TPM, PAPER), (WIDE_TPM, WIDE)])
+def test_the_index_over_a_region_is_the_mean_of_random_points(
+    machine: Machine, g: Geometry
+) -> None:
+    found = over(machine.region, geometry=g)
+    points = np.random.default_rng(3).uniform(*_corners(machine.region), (4000, 3))
+    j = jacobian.velocity(inverse(points, geometry=g), geometry=g)
+    np.testing.assert_allclose(found.shares, shares(j).mean(axis=0), atol=0.02)
+    np.testing.assert_allclose(found.motors, motors(j).mean(axis=0), atol=0.03)
+    assert found.shares[2, 2] == 0
+    assert found.motors[2] <= 2
+
+
+def test_the_documented_index_is_that_of_the_region() -> None:
+    text = (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
+    printed = re.search(r"x is moved by ([\d.]+) motors, y by ([\d.]+), z by ([\d.]+)", text)
+    assert printed
+    np.testing.assert_allclose(
+        over(PAPER_TPM.region).motors, [*map(float, printed.groups())], atol=0.05
+    )
+
+
+def test_what_has_no_answer_raises() -> None:
+    beyond, across = (
+        Region((0, 0.02, 0.7), (0, 0.02, 2.0)),
+        Region((0, -0.04, 0.8), (0, -0.03, 0.8)),
+    )
+    for region, error in ((beyond, UnreachableError), (across, ConfigurationError)):
+        with pytest.raises(error):
+            over(region)
+    with pytest.raises(SingularityError):
+        over(Region((0, 0, 0.8), (0, 0, 0.8)))
+    for function in (link_velocity, inverse_link_velocity, inverse_velocity):
+        with pytest.raises(UnreachableError):
+            function([0.0, 0.0, np.pi])
+    with pytest.raises(SingularityError):
+        inverse_velocity(inverse([-0.04, PAPER.l7, 0.80]))  # cos(beta) = 0
+    with pytest.raises(InputError):
+        shares([[1.0, 2.0]])

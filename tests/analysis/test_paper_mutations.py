@@ -1,0 +1,141 @@
+"""Each row of docs/paper.md names tests that fail when what it says is computed wrongly.
+
+MUTATIONS breaks one line of the package at a time, in memory, and the tests of its row have to see
+it. That takes minutes, so it is a slow test; the fast ones see to it that the table is complete.
+"""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from typing import NamedTuple
+
+import pytest
+from paths import ROOT
+
+TEXT = (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
+
+
+class Mutation(NamedTuple):
+    """One wrong line.
+
+    Attributes:
+        row: How the first cell of its row begins.
+        module: In the package.
+        right: What stands there, once.
+        wrong: What is put in its place.
+    """
+
+    row: str
+    module: str
+    right: str
+    wrong: str
+
+
+POC, TOPOLOGY = "analysis.poc", "analysis.topology"
+EQUATIONS, JACOBIAN = "kinematics.equations", "kinematics.jacobian"
+POSITION, DELTA = "kinematics.position", "analysis.delta"
+
+MUTATIONS = [
+    Mutation("(1)", POC, "reduce(POCSet.__or__, sets)", "reduce(POCSet.__and__, sets)"),
+    Mutation("(1)", POC, "for unit in self.units])", "for unit in self.units[1:]])"),
+    Mutation("(2)", POC, "reduce(POCSet.__and__, sets)", "reduce(POCSet.__or__, sets)"),
+    Mutation("(3a)", POC, "sum(freedoms) - sum(equations)", "sum(freedoms) - equations[0]"),
+    Mutation("(3a)", POC, "self.loops[:loops]", "self.loops[:1]"),
+    Mutation("(3b)", POC, "(parallel(previous) | added).dim", "(previous[-1] | added).dim"),
+    Mutation("(3b)", POC, "(parallel(previous) | added).dim", "(parallel(previous) & added).dim"),
+    Mutation(
+        "(4), first", TOPOLOGY, "for chain in (first, second)]", "for chain in (second, third)]"
+    ),
+    Mutation("(4), second", POC, "freedoms - actuated - equations", "freedoms - equations"),
+    Mutation("(5)", POC, "best = min(", "best = max("),
+    Mutation("(5)", POC, "sum(abs(d) for d in run) / 2", "sum(abs(d) for d in run)"),
+    Mutation("(6)", EQUATIONS, "y1, z1 = g.l1 + cos[0]", "y1, z1 = g.l1 - cos[0]"),
+    Mutation("(7)", EQUATIONS, "cos[1] + (2 * g.l5 - g.l1)", "cos[1] + (g.l5 - g.l1)"),
+    Mutation("(8a)", EQUATIONS, "along = 0.5 - ns.over(", "along = 0.5 + ns.over("),
+    Mutation("(8a)", EQUATIONS, "along * dx - across * dz", "along * dx + across * dz"),
+    Mutation("(8b)", EQUATIONS, "z1 + along * dz + across * dx", "z1 + along * dz - across * dx"),
+    Mutation("(9)", EQUATIONS, "cos[2] + (g.l1 - 2 * g.l2)", "cos[2] + (g.l1 - g.l2)"),
+    Mutation("(10)", EQUATIONS, "z_c - (sin[2] - g.l6)", "z_c - sin[2]"),
+    Mutation("(10)", EQUATIONS, "l7 * sin_beta, z_c + 2 * g.l6", "l7 * sin_beta, z_c + g.l6"),
+    Mutation("(11)", EQUATIONS, "l7 * sin_beta, z_c + 2 * g.l6", "l7 * sin_beta, z_c + g.l6"),
+    Mutation("(11)", EQUATIONS, "x_c + l7 * cos_beta + g.l2", "x_c + l7 * cos_beta + 2 * g.l2"),
+    Mutation("(11)", POSITION, "position[..., branch.index, :]", "position[..., 0, :]"),
+    Mutation("(12)", EQUATIONS, "cos_beta, z - 2 * g.l6", "cos_beta, z - g.l6"),
+    Mutation("(13)", EQUATIONS, "-l1, x_c + l1 - 2 * g.l5,", "-l1, x_c + l1 - g.l5,"),
+    Mutation("(13)", EQUATIONS, "fold(a1, z_c, x_c, g, ns)", "fold(a1, z_c, 0.0, g, ns)"),
+    Mutation("(14)", EQUATIONS, "fold(a3, b3, y, g, ns)", "fold(a3, b3, x, g, ns)"),
+    Mutation("(15)", EQUATIONS, "x + g.l2 - l1, z - g.l6", "x + g.l2 - l1, z - 2 * g.l6"),
+    Mutation("(16)", EQUATIONS, "r1x * r2z - r1z * r2x,", "r1x * r2z,"),
+    Mutation("(16)", JACOBIAN, "[cos * r1x, sin * r1x,", "[cos * r1x, cos * r1x,"),
+    Mutation("(17)", EQUATIONS, "r2z * cos[1] - r2x * sin[1]", "r2z * cos[1] - r1x * sin[1]"),
+    Mutation("(17)", JACOBIAN, "[f.cos_beta * f.leg1,", "[f.leg1,"),
+    # What the text claims
+    Mutation("M_HSOC1", TOPOLOGY, "parallel([hsoc_1, hsoc_2])", "hsoc_1"),
+    Mutation("xi_L1", POC, "chains[: j + 1] if j == 1", "chains[:j] if j == 1"),
+    Mutation("xi_L2", POC, "(parallel(previous) | added).dim", "6"),
+    Mutation("v = m - n + 1", POC, "for j in range(1, len(order))", "for j in (1,)"),
+    Mutation("Delta_1", POC, "freedoms - actuated - equations", "freedoms - equations"),
+    Mutation("3 degrees", TOPOLOGY, "free = right[rank:].T", "free = right[rank + 1 :].T"),
+    Mutation("link 3'", EQUATIONS, "dx, dz = cos[1]", "dx, dz = 1e-3 * cos[2] + cos[1]"),
+    Mutation('"complete', EQUATIONS, "cos_beta * turn3)", "0 * turn3)"),
+    Mutation("y_B1", EQUATIONS, "meet = across2 >=", "meet = across2 - 1e9 * (abs(y1) < 1e-9) >="),
+    Mutation("16 inverse", POSITION, "4 * leg + (bend + 1)", "4 * leg"),
+    Mutation(
+        "twice as", DELTA, "direction - fold, direction + fold", "direction, direction + fold"
+    ),
+    Mutation(
+        "the singularities", DELTA, "* across - np.sin(q) * arm", "* across + np.sin(q) * arm"
+    ),
+    Mutation("beta = pi/2", EQUATIONS, "        found.sin_beta,\n", "        found.cos_beta,\n"),
+    Mutation("the plane", EQUATIONS, "SINGULAR = 1e-6", "SINGULAR = 1e-12"),
+    Mutation("Eqs. (16)", POC, "np.stack([normal, np.cross(rod, normal)])", "np.eye(3)[1:]"),
+]
+
+
+def rows() -> dict[str, list[str]]:
+    """First cells of the rows of the page that name tests -> those tests, as pytest names them."""
+    found = {}
+    for line in TEXT.splitlines():
+        named = re.findall(r"`(test_\w+\.py)::(\w+)`", line)
+        if line.startswith("| ") and named:
+            paths = [next((ROOT / "tests").rglob(file)).relative_to(ROOT) for file, _ in named]
+            label = line.split(" | ")[0].removeprefix("| ")
+            found[label] = [f"{p}::{name}" for p, (_, name) in zip(paths, named, strict=True)]
+    return found
+
+
+ROWS = rows()
+
+
+def test_every_row_has_a_mutation_and_every_mutation_a_row() -> None:
+    assert len(ROWS) > 30
+    for mutation in MUTATIONS:
+        assert len([label for label in ROWS if label.startswith(mutation.row)]) == 1, mutation.row
+    for label in ROWS:
+        assert any(label.startswith(mutation.row) for mutation in MUTATIONS), label
+
+
+@pytest.mark.parametrize("mutation", MUTATIONS, ids=lambda m: f"{m.row}: {m.wrong}")
+def test_what_is_replaced_stands_there_once(mutation: Mutation) -> None:
+    path = ROOT / "src" / "tpm_gym" / f"{mutation.module.replace('.', '/')}.py"
+    source = path.read_text(encoding="utf-8")
+    assert source.count(mutation.right) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mutation", MUTATIONS, ids=lambda m: f"{m.row}: {m.wrong}")
+def test_the_row_s_tests_see_the_mutation(mutation: Mutation) -> None:
+    tests = next(named for label, named in ROWS.items() if label.startswith(mutation.row))
+    change = [f"tpm_gym.{mutation.module}", mutation.right, mutation.wrong]
+    path = os.pathsep.join([str(ROOT / "tests" / "support"), str(ROOT / "src")])
+    result = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-x", "-p", "mutated", *tests],
+        cwd=ROOT,
+        env=os.environ | {"PYTHONPATH": path, "MUTATION": json.dumps(change)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 1, result.stdout  # 1: tests ran and failed; 2: they did not run

@@ -1,0 +1,189 @@
+"""The polynomials are what elimination leaves, and their zeros are the sheets of the factors."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import oracle
+import pytest
+
+from tpm_gym.analysis.surfaces import CURVES, DEGREES, polynomial
+from tpm_gym.arrays import FloatArray
+from tpm_gym.kinematics import WORKING_MODES, inverse_all
+from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
+
+sp = pytest.importorskip("sympy")
+
+# The case study in centimetres, exact
+CM = SimpleNamespace(**{f"l{i}": sp.Integer(v) for i, v in enumerate((30, 7, 35, 80, 10, 1, 5), 1)})
+x_c, z_c, u = sp.symbols("x_C z_C u")  # u = l7 cos(beta)
+c1, s1, c2, s2, c3, s3 = sp.symbols("c1 s1 c2 s2 c3 s3")
+ON_CIRCLE = [c1**2 + s1**2 - 1, c2**2 + s2**2 - 1, c3**2 + s3**2 - 1]
+
+
+def closures() -> list[Any]:
+    """B_iC_i = l4, in xC, zC and u."""
+    g = CM
+    level_2, level_3 = x_c - 2 * g.l5 + g.l1 - g.l3 * c2, x_c + u + 2 * g.l2 - g.l1 - g.l3 * c3
+    return [
+        x_c**2 + (g.l1 + g.l3 * c1) ** 2 + (z_c - g.l3 * s1) ** 2 - g.l4**2,
+        level_2**2 + (z_c - g.l3 * s2) ** 2 - g.l4**2,
+        level_3**2 + (g.l7**2 - u**2) + (z_c + g.l6 - g.l3 * s3) ** 2 - g.l4**2,
+    ]
+
+
+# Each factor, as mechanism and Eqs. (16), (17) have it, with the leg that it is eliminated from
+FACTORS = {
+    "level3": (2, CM.l1 + CM.l3 * c3 - x_c - 2 * CM.l2),
+    "leg1": (0, CM.l1 * s1 + z_c * c1),
+    "leg2": (1, z_c * c2 - (x_c - 2 * CM.l5 + CM.l1) * s2),
+    "constraint": (0, z_c - CM.l3 * s1),
+}
+
+
+def assert_same_up_to_a_number(found: Any, name: str) -> None:
+    ours = sp.Poly(sp.expand(CURVES[name](x_c, z_c, CM)), x_c, z_c)
+    assert (sp.Poly(found, x_c, z_c).monic() - ours.monic()).is_zero
+
+
+@pytest.mark.parametrize("name", list(FACTORS))
+def test_groebner_bases_eliminate_to_these_curves(name: str) -> None:
+    leg, factor = FACTORS[name]
+    angles = [(c1, s1), (c2, s2), (c3, s3, u)][leg]
+    basis = sp.groebner([ON_CIRCLE[leg], closures()[leg], factor], *angles, x_c, z_c, order="lex")
+    (left,) = [e for e in basis.exprs if not e.free_symbols & set(angles)]
+    assert_same_up_to_a_number(left, name)
+
+
+def test_resultants_eliminate_to_the_planar_curve() -> None:
+    first, second, _ = closures()
+    b2, b1 = CM.l1 - CM.l3 * c2 - 2 * CM.l5, CM.l3 * s1
+    planar = x_c * (z_c - CM.l3 * s2) - (z_c - b1) * (x_c + b2)
+    # Closures and factor are linear in c1, and in c2 and s2, once the squares are taken out.
+    first = sp.expand(first - CM.l3**2 * ON_CIRCLE[0])
+    second = sp.expand(second - CM.l3**2 * ON_CIRCLE[1])
+    (arm_2,) = sp.solve([second, planar], [c2, s2], dict=True)
+    (arm_1,) = sp.solve(first, c1)
+    one, other = (
+        sp.Poly(sp.expand(sp.numer(sp.together(e.subs(arm_2).subs(c1, arm_1)))), s1)
+        for e in ON_CIRCLE[:2]
+    )
+    left = sp.expand(sp.resultant(one, other))
+    ((_, power),) = sp.factor_list(left)[1]
+    assert power == 1
+    assert_same_up_to_a_number(left, "planar")
+    assert sp.Poly(left, x_c, z_c).total_degree() == 16
+
+
+@pytest.mark.parametrize("name", list(DEGREES))
+def test_degrees_along_a_line_and_no_u_is_left(name: str) -> None:
+    t = sp.Symbol("t")
+    x, y, z = (sp.Poly(a + b * t, u, t) for a, b in ((3, 2), (1, 1), (-4, 3)))
+    whole = polynomial(name, x, y, z, CM, sp.Poly(u, u, t))
+    assert all(power % 2 == 0 for (power, _), _ in whole.terms())
+    left = whole.rem(sp.Poly(u, u, t) ** 2 - (CM.l7**2 - y**2))
+    assert left.degree(u) == 0
+    assert left.degree(t) == DEGREES[name]
+
+
+# Against the factors
+
+
+def sheet(name: str, mode: Any, g: Geometry, one: FloatArray, other: FloatArray) -> FloatArray:
+    """Points (n, 3) where a factor of a mode changes its sign between two points (m, 3)."""
+    index = {"level3": 1, "planar": 2}.get(name)
+
+    def value(points: FloatArray) -> FloatArray:
+        parallel, _ = oracle.factors_at(points, mode, g)
+        if index is not None:
+            return parallel[..., index]
+        found = inverse_all(points, g)
+        z_b = g.l3 * np.sin(found.theta[..., mode.index, 0])
+        return np.asarray(points[..., 2] - 2 * g.l6 - z_b)
+
+    across = value(one) * value(other) < 0
+    one, other = one[across], other[across]
+    sign = np.sign(value(one))
+    for _ in range(40):
+        middle = (one + other) / 2
+        same = (np.sign(value(middle)) == sign)[:, None]
+        one, other = np.where(same, middle, one), np.where(same, other, middle)
+    return one
+
+
+def boundary(leg: int, g: Geometry, seed: int) -> FloatArray:
+    """Points (n, 3) where a leg is stretched or folded."""
+    rng = np.random.default_rng(seed)
+    beta, swing = rng.uniform(-np.pi, np.pi, (2, 300))
+    out = rng.uniform(-1, 1, 300) * (0.4 * g.l4 if leg == 1 else g.l7)
+    rod = np.sqrt(g.l4**2 - out**2) if leg != 2 else g.l4
+    reach = g.l3 + rng.choice([-1, 1], 300) * rod
+    a, b = reach * np.cos(swing), reach * np.sin(swing)
+    if leg == 3:
+        return oracle.vector(a + g.l1 - g.l2, out, b + g.l6)
+    x_c = a - g.l1 + 2 * g.l5 if leg == 2 else out
+    z_c = b if leg == 2 else np.sqrt(np.maximum(reach**2 - g.l1**2, 0)) * np.sign(b)
+    kept = np.abs(reach) > (0 if leg == 2 else g.l1)
+    return oracle.vector(x_c + g.l2 + g.l7 * np.cos(beta), g.l7 * np.sin(beta), z_c + 2 * g.l6)[
+        kept
+    ]
+
+
+def assert_zero(name: str, points: FloatArray, g: Geometry) -> None:
+    """Against what the polynomial is 1% of l4 beside it."""
+    near = [
+        np.abs(polynomial(name, *(points + 0.01 * g.l4 * step).T, g))
+        for step in (*np.eye(3)[[0, 2]], *-np.eye(3)[[0, 2]])
+    ]
+    ratio = np.abs(polynomial(name, *points.T, g)) / np.max(near, axis=0)
+    assert ratio.max() < 1e-9
+
+
+GEOMETRIES = [PAPER, WIDE, Geometry(0.25, 0.06, 0.30, 0.65, 0.08, 0.02, 0.12)]
+
+
+@pytest.mark.parametrize("g", GEOMETRIES)
+@pytest.mark.parametrize("name", ["level3", "planar", "constraint"])
+def test_the_polynomials_vanish_on_the_sheets_of_all_modes(name: str, g: Geometry) -> None:
+    rng = np.random.default_rng(1)
+    one = oracle.reachable_points(rng, 500, g)
+    other = one + rng.normal(0.0, 0.04 * g.l4, one.shape)
+    found = [sheet(name, mode, g, one, other) for mode in WORKING_MODES]
+    assert sum(map(len, found)) > 20
+    assert_zero(name, np.concatenate(found), g)
+
+
+@pytest.mark.parametrize("g", GEOMETRIES)
+@pytest.mark.parametrize("leg", [1, 2, 3])
+def test_the_polynomials_vanish_where_a_leg_is_stretched_or_folded(leg: int, g: Geometry) -> None:
+    assert_zero(f"leg{leg}", boundary(leg, g, seed=2), g)
+
+
+@pytest.mark.parametrize(("name", "index"), [("level3", 1), ("planar", 2)])
+def test_every_real_zero_within_reach_is_singular_in_some_mode(name: str, index: int) -> None:
+    """Elimination adds nothing here: along lines in (xC, zC), by all roots of the polynomial."""
+    t = np.cos(np.pi * (np.arange(40) + 0.5) / 40)
+    rng, singular, checked = np.random.default_rng(6), 0, 0
+    for _ in range(60):
+        start, end = rng.uniform([-0.9, -1.1], [0.9, 1.1], (2, 2))
+        line = start + (t[:, None] + 1) / 2 * (end - start)
+        values = CURVES[name](line[:, 0], line[:, 1], PAPER)
+        roots = np.polynomial.Chebyshev.fit(t, values, 16, domain=[-1, 1]).roots()
+        roots = roots[(np.abs(roots.imag) < 1e-9) & (np.abs(roots.real) < 1)].real
+        for at in start + (roots[:, None] + 1) / 2 * (end - start):
+            beta = rng.choice([-1, 1]) * np.arcsin(0.6)
+            p = oracle.vector(
+                at[0] + PAPER.l2 + PAPER.l7 * np.cos(beta), 0.6 * PAPER.l7, at[1] + 0.02
+            )
+            factors = [oracle.factors_at(p, mode, PAPER)[0][index] for mode in WORKING_MODES]
+            if np.isfinite(factors).any():
+                checked += 1
+                singular += np.nanmin(np.abs(factors)) < 1e-6
+    assert checked > 40
+    assert singular == checked
+
+
+def test_all_surfaces_are_named() -> None:
+    assert set(DEGREES) >= set(CURVES)
+    assert polynomial("sin_beta", 1, 0, 1) == 0
+    assert polynomial("cos_beta", 1, PAPER.l7, 1) == 0
