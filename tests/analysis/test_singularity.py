@@ -26,9 +26,10 @@ SIDES = [AssemblyMode(planar, 1) for planar in (-1, 1)]
 
 
 def oracle_factors(points: FloatArray, mode: WorkingMode, g: Geometry) -> FloatArray:
-    """(..., 7) dimensionless factors by the oracle; NaN where not reachable."""
-    sizes = np.array([1, g.l4, g.l4**2, 1, g.l3 * g.l4, g.l3 * g.l4, g.l3 * g.l4])
-    return np.concatenate(oracle.factors_at(points, mode, g), axis=-1) / sizes
+    """(..., 8) dimensionless factors by the oracle; NaN where not reachable."""
+    sizes = np.array([1, g.l4, g.l4**2, 1, g.l3 * g.l4, g.l3 * g.l4, g.l3 * g.l4, g.l4])
+    elevation = oracle.elevation_at(points, mode, g)[..., None]
+    return np.concatenate([*oracle.factors_at(points, mode, g), elevation], axis=-1) / sizes
 
 
 def rays(count: int, seed: int) -> FloatArray:
