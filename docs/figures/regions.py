@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from figures.sections import MM, heading, mode_name, outline_task_region, section_axes
 from figures.zero_sets import Section, parallel_lines, reach_margin, sheets
 from tpm_gym.analysis.aspects import Aspect, aspects
+from tpm_gym.analysis.limits import clear_of_links, within_stops
 from tpm_gym.kinematics import ELBOWS_OUT, inverse_all
 from tpm_gym.kinematics.geometry import PAPER
 from tpm_gym.learning import figure_style as style
@@ -113,19 +114,43 @@ def _smallest(axes: Axes) -> None:
 
 
 def _legend(figure: Figure, found: tuple[Aspect, ...]) -> None:
+    half = [aspect for aspect in found if aspect.assembly.sin_beta > 0]
     handles: list[Patch | Line2D] = []
-    for aspect in found:
-        if aspect.assembly.sin_beta > 0:
-            signs = signs_of(aspect)
-            marks = " ".join("+" if sign > 0 else "\N{MINUS SIGN}" for sign in signs)
-            text = f"{marks}: {1e3 * aspect.cells.volume:.3g} dm³"
-            handles.append(
-                Patch(facecolor=colour(signs), edgecolor="0.4", linewidth=0.4, label=text)
-            )
-    handles.append(
-        Line2D([], [], color="white", linewidth=1.6, linestyle="--", label="motors' stops")
+    allowed = np.zeros(3)  # volume, within the stops, and clear of links as well; dm^3
+    for aspect in half:
+        parts = _allowed(aspect)
+        allowed += parts
+        signs = signs_of(aspect)
+        marks = "".join("+" if sign > 0 else "\N{MINUS SIGN}" for sign in signs)
+        patch = Patch(facecolor=colour(signs), edgecolor="0.4", linewidth=0.4)
+        patch.set_label(_row(marks, parts))
+        handles.append(patch)
+    handles.append(Patch(facecolor="none", label=_row("all", allowed)))
+    handles.append(Line2D([], [], color="white", linewidth=1.6, linestyle="--"))
+    handles[-1].set_label("motors' stops")
+    font = {"family": "monospace", "size": 6.5}
+    legend = figure.legend(
+        handles=handles, loc="upper left", bbox_to_anchor=(0.752, 0.9), prop=font
     )
-    legend = figure.legend(handles=handles, loc="upper left", bbox_to_anchor=(0.765, 0.87))
     legend.get_frame().set_facecolor("0.88")
-    legend.set_title("signs of factors 2, 3 and of\nthe constraint: volume;\neach again for y < 0")
-    legend.get_title().set_fontsize(7.5)
+    title = (
+        "signs of factors 2, 3 and of\nthe constraint; volume in dm³;\n"
+        "% of it within the motors'\nstops, and clear of links, too;\neach again for y < 0"
+    )
+    legend.set_title(title)
+    legend.get_title().set_fontsize(7.0)
+
+
+def _allowed(aspect: Aspect) -> FloatArray:
+    """Volume of an aspect, within the motors' stops, and where also no links touch, dm^3."""
+    centres = aspect.cells.centres()
+    stops = within_stops(centres, ELBOWS_OUT, PAPER)
+    clear = clear_of_links(centres[stops], ELBOWS_OUT, PAPER)
+    shares = np.array([len(centres), stops.sum(), clear.sum()]) / len(centres)
+    return 1e3 * aspect.cells.volume * shares
+
+
+def _row(name: str, parts: FloatArray) -> str:
+    volume, stops, clear = parts
+    number = f"{volume:.1f}" if volume >= 10 else f"{volume:.2f}"
+    return f"{name} {number:>5} {100 * stops / volume:3.0f} {100 * clear / volume:3.0f}"
