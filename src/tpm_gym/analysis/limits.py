@@ -44,8 +44,7 @@ def within_stops(points: FloatArray, branch: WorkingMode, geometry: Geometry) ->
     theta = inverse(points, branch, geometry)
     motors = tree.build(geometry).motors
     low, high = ([getattr(motor, end) for motor in motors] for end in ("lower", "upper"))
-    inside: BoolArray = ((theta >= low) & (theta <= high)).all(axis=-1)
-    return inside
+    return np.asarray(((theta >= low) & (theta <= high)).all(axis=-1))
 
 
 def clear_of_links(points: FloatArray, branch: WorkingMode, geometry: Geometry) -> BoolArray:

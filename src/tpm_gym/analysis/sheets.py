@@ -262,12 +262,13 @@ def _feet(
     least = (ends[..., :-1] + ends[..., 1:] - length) / 2
     row, arc, cell = np.nonzero(least <= known[:, None, None])
     here, step = link3[row][:, None], np.pi / _CELLS
+    low = cell.astype(np.float64) * step
 
     def apart(t: FloatArray) -> FloatArray:
         x, z, _, _ = arcs.at(arc, t)
         return offset(here, x, z)[0]
 
-    t = _zoom(apart, cell * step, (cell + 1) * step)
+    t = _zoom(apart, low, low + step)
     x, z, p, q = arcs.at(arc, t)
     _, level, radius = offset(link3[row], x, z)
     real = (p * radius + q * level > 0) & (mode.cos_beta * level > 0)

@@ -89,8 +89,10 @@ def dimensionless(values: Factors, geometry: Geometry = PAPER) -> FloatArray:
     l3, l4 = geometry.l3, geometry.l4
     sizes = np.array([1.0, l4, l4**2, 1.0, l3 * l4, l3 * l4, l3 * l4, l4])
     elevation = np.asarray(values.constraint)[..., None]
-    scaled: FloatArray = np.concatenate([values.parallel, values.serial, elevation], axis=-1)
-    return scaled / sizes
+    scaled: FloatArray = (
+        np.concatenate([values.parallel, values.serial, elevation], axis=-1) / sizes
+    )
+    return scaled
 
 
 def classify(
