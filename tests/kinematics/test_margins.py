@@ -167,7 +167,7 @@ def margin_of_loop_2(theta: FloatArray, mode: AssemblyMode) -> float:
     """How far l4 is from the range of |B3C3| over a full turn of link 7."""
     with np.errstate(invalid="ignore"):
         cos, sin = equations.arms(theta, PAPER, NUMPY)
-        found, *_ = equations.assembly_at(cos, sin, mode.planar, mode.sin_beta, PAPER, NUMPY)
+        found, _, _ = equations.assembly_at(cos, sin, mode.planar, mode.sin_beta, PAPER, NUMPY)
     turn = np.linspace(0, 2 * np.pi, 20_001)
     p = oracle.points(np.broadcast_to(theta, (20_001, 3)), found.x_c, found.z_c, turn, PAPER)
     rods = np.linalg.norm(oracle.rods(p), axis=-1)

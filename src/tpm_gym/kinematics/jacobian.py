@@ -215,7 +215,7 @@ def _from_angles(
 
     def text(angles: equations.Triple, ns: Namespace) -> list[Numbers]:
         cos, sin = equations.arms(angles, g, ns)
-        found, real, _, _ = equations.assembly_at(cos, sin, branch.planar, branch.sin_beta, g, ns)
+        found, real, _ = equations.assembly_at(cos, sin, branch.planar, branch.sin_beta, g, ns)
         missing = ns.where(real, 0.0, 1.0)
         return [missing, *columns(_configuration(cos, sin, found, g, ns))]
 

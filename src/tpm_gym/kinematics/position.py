@@ -134,7 +134,7 @@ def _assemblies(theta: equations.Triple, g: Geometry, ns: Namespace) -> list[Any
     """Both planar signs; the other half is the mirror image."""
     cos, sin = equations.arms(theta, g, ns)
     planar = ns.signs(theta[0], (2, 1))
-    found, real, reached, _ = equations.assembly_at(cos, sin, planar, 1.0, g, ns)
+    found, real, (reached, *_) = equations.assembly_at(cos, sin, planar, 1.0, g, ns)
     x, y, cos_beta = (
         ns.where(real, values, math.nan) for values in (found.x, found.y, found.cos_beta)
     )

@@ -124,7 +124,7 @@ def pose_at(
 ) -> tuple[Pose, Numbers]:
     """The configuration at joint angles, and whether it is real."""
     cos, sin = equations.arms(theta, g, ns)
-    found, real, _, _ = equations.assembly_at(cos, sin, branch.planar, branch.sin_beta, g, ns)
+    found, real, _ = equations.assembly_at(cos, sin, branch.planar, branch.sin_beta, g, ns)
     rods = equations.rods(cos, sin, found, g)
     factors = equations.factors(cos, sin, found, rods, g)
     return Pose(cos, sin, found, rods, factors, factors.sin_beta * factors.level3, g), real
