@@ -135,7 +135,7 @@ def _legend(figure: Figure, found: tuple[Aspect, ...]) -> None:
     legend.get_frame().set_facecolor("0.88")
     title = (
         "signs of factors 2, 3 and of\nthe constraint; volume in dm³;\n"
-        "% of it within the motors'\nstops, and clear of links, too;\neach again for y < 0"
+        "% of it within the motors'\nstops, and clear of links, too;\nof y > 0, which y < 0 mirrors"
     )
     legend.set_title(title)
     legend.get_title().set_fontsize(7.0)

@@ -78,6 +78,7 @@ SERIAL = (
 
 _X, _Z = np.linspace(-0.92, 1.06, 199), np.linspace(-1.18, 1.22, 241)
 _Y = np.linspace(-0.0529, 0.0529, 60)  # an even number: y = 0 itself is not sampled
+_ALONG = np.linspace(_X[0], _X[-1], 2000)  # for what runs along the edge of the reach
 _FINE = np.linspace(_X[0], _X[-1], 793), np.linspace(_Z[0], _Z[-1], 961)  # for what is cheap
 _LIMITS_X, _LIMITS_Z = (-900.0, 1050.0), (-1180.0, 1220.0)
 _SIGN = ELBOWS_OUT.cos_beta
@@ -103,7 +104,7 @@ def parallel_figure() -> Figure:
         section = Section("z", z)
         _reached(axes, section, None)
         for index in range(4):
-            lines = parallel_lines(index, ELBOWS_OUT, section, _X, _Y)
+            lines = parallel_lines(index, ELBOWS_OUT, section, _ALONG, _Y)
             _lines(axes, lines, PARALLEL[index][0])
         _finish_section(
             axes, section, f"z = {z * MM:.0f} mm".replace("-", "\N{MINUS SIGN}"), plans[0] is axes

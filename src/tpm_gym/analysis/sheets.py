@@ -129,14 +129,7 @@ _CURVES: dict[str, tuple[Curve, tuple[int, ...]]] = {
 
 @dataclass(frozen=True)
 class _Arcs:
-    """All arcs (m,) of one factor, and points of them.
-
-    Attributes:
-        first: The first sign, as ``second``.
-        middle: Of the angle's interval, as ``half``.
-        samples: (4, m, cells + 1), points of the arcs.
-        length: (m, cells) m, of the curve between two points.
-    """
+    """All arcs (m,) of one factor: their signs, and their intervals of the angle, rad."""
 
     curve: Curve
     geometry: Geometry

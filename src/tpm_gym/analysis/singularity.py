@@ -136,9 +136,9 @@ def nearest_singularity(
     That is the radius of the largest ball about the point in which P can move without meeting a
     singularity, of a constraint or not. The planes y = 0 (sin(beta) = 0) and |y| = l7
     (cos(beta) = 0) are exact, and so is leg 3 (its boundary is a torus). The other surfaces are
-    curves that link 7 sweeps; on each the foot is sought along its whole curve
-    (:mod:`tpm_gym.analysis.sheets`), so none is missed that bends no more sharply than some 5 mm of
-    the paper's mechanism. Points that are not finite, or not on both branches, are not valid.
+    curves that link 7 sweeps; wherever a curve can be nearer than what is known, the foot is sought
+    (:mod:`tpm_gym.analysis.sheets`). Points that are not finite, or not on both branches, are not
+    valid.
     """
     points = np.array(position, dtype=np.float64)
     values = dimensionless(factors_at(points, branch, geometry), geometry)
