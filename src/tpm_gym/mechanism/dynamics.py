@@ -119,9 +119,7 @@ class Accelerations(NamedTuple):
 # -- over any namespace ----------------------------------------------------------------------------
 
 
-def pose_at(
-    theta: Triple, branch: AssemblyMode, g: Lengths, ns: Namespace
-) -> tuple[Pose, Numbers]:
+def pose_at(theta: Triple, branch: AssemblyMode, g: Lengths, ns: Namespace) -> tuple[Pose, Numbers]:
     """The configuration at joint angles, and whether it is real."""
     cos, sin = equations.arms(theta, g, ns)
     found, real, _ = equations.assembly_at(cos, sin, branch.planar, branch.sin_beta, g, ns)
