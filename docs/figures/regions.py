@@ -6,14 +6,15 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from figures.sections import MM, heading, mode_name, outline_task_region, section_axes
-from figures.zero_sets import Section, parallel_lines, reach_margin
+from figures.zero_sets import Section, parallel_lines, reach_margin, sheets
 from tpm_gym.analysis.aspects import Aspect, aspects
-from tpm_gym.analysis.singularity import factors_at
-from tpm_gym.kinematics import ELBOWS_OUT
+from tpm_gym.analysis.limits import clear_of_links, within_stops
+from tpm_gym.kinematics import ELBOWS_OUT, inverse_all
 from tpm_gym.kinematics.geometry import PAPER
 from tpm_gym.learning import figure_style as style
 from tpm_gym.learning.figure_style import BLACK, BLUE, GREEN, ORANGE, PURPLE
@@ -22,9 +23,10 @@ from tpm_gym.mechanism import PAPER_TPM
 FloatArray = NDArray[np.float64]
 
 SHAPE = (200, 12, 260)
-# Signs of the second and third factor of Eq. (16) -> colour. No two regions of one half, as cut by
-# y = 0, have the same signs; where a grid sees two, they hang together by less than a cell.
+# Signs of the second and third factor of Eq. (16) -> colour; paler where rods 4 lead back to the
+# base, z_C1 < z_B1. Two regions of one half have the same signs only at (-1, -1, -1).
 COLOURS = {(1, -1): BLUE, (-1, -1): ORANGE, (-1, 1): GREEN, (1, 1): PURPLE}
+Signs = tuple[int, int, int]
 
 _X, _Z = np.linspace(-0.92, 1.06, 397), np.linspace(-1.18, 1.22, 481)
 _Y = np.linspace(-PAPER.l7, PAPER.l7, 160)  # an even number: y = 0 itself is not sampled
@@ -45,7 +47,7 @@ def aspects_figure() -> Figure:
         if column:
             axes.set_ylabel("")
             axes.tick_params(labelleft=False)
-    for column, height in enumerate((0.75, 0.10)):
+    for column, height in enumerate((0.75, 0.30)):
         axes = figure.add_axes((0.095 + 0.335 * column, 0.1, 0.30, 0.155))
         _section(axes, Section("z", height), _X, _Y)
         axes.set(xlim=(-880, 1020), ylim=(-56, 56), yticks=[-50, 0, 50])
@@ -57,30 +59,33 @@ def aspects_figure() -> Figure:
     return figure
 
 
-def colour(signs: tuple[int, int], sin_beta: int) -> FloatArray:
-    """The colour of an aspect; that of its mirror image in y = 0, paler."""
-    strength = 0.85 if sin_beta > 0 else 0.40
-    mixed: FloatArray = 1 - strength * (1 - np.asarray(to_rgb(COLOURS[signs])))
+def colour(signs: Signs) -> FloatArray:
+    """The colour of an aspect by its signs of level3, planar and elevation."""
+    strength = 0.90 if signs[2] > 0 else 0.45
+    mixed: FloatArray = 1 - strength * (1 - np.asarray(to_rgb(COLOURS[signs[:2]])))
     return mixed
 
 
-def _signs(aspect: Aspect) -> tuple[int, int]:
-    return aspect.level3, aspect.assembly.planar
+def signs_of(aspect: Aspect) -> Signs:
+    """Its signs of level3, planar and elevation."""
+    return aspect.level3, aspect.assembly.planar, aspect.elevation
 
 
 def _section(axes: Axes, section: Section, x: FloatArray = _X, other: FloatArray = _Z) -> None:
     """Colour the points (x, other) of a section by their signs, and draw the aspects' edges."""
     points = section.points(np.stack(np.meshgrid(x, other), axis=-1))
-    parallel = factors_at(points, ELBOWS_OUT).parallel
+    found = np.sign(sheets(points, ELBOWS_OUT)[..., 1:])
     image = np.ones(points.shape)
-    for signs in COLOURS:
-        same = np.all(np.sign(parallel[..., 1:]) == signs, axis=-1)
-        for half in (1, -1):
-            image[same & (np.sign(parallel[..., 0]) == half)] = colour(signs, half)
+    for level3, planar in COLOURS:
+        for elevation in (1, -1):
+            signs = level3, planar, elevation
+            image[np.all(found == signs, axis=-1)] = colour(signs)
     axes.pcolormesh(x * MM, other * MM, image)
     margin = reach_margin(points, ELBOWS_OUT.cos_beta)
     axes.contour(x * MM, other * MM, margin, [0], colors=[BLACK], linewidths=0.6)
-    for factor in (1, 2) if section.fixed == "y" else (0, 1, 2):
+    stops = _stop_margin(points)
+    axes.contour(x * MM, other * MM, stops, [0], colors=["white"], linewidths=1.3, linestyles="--")
+    for factor in range(section.fixed == "y", 4):
         for line in parallel_lines(factor, ELBOWS_OUT, section, x, other):
             axes.plot(*(line.T * MM), color=BLACK, linewidth=0.8)
     vertical = "z" if section.fixed == "y" else "y"
@@ -88,6 +93,15 @@ def _section(axes: Axes, section: Section, x: FloatArray = _X, other: FloatArray
     fixed = 1 if section.fixed == "y" else 2
     if PAPER_TPM.region.low[fixed] <= section.at <= PAPER_TPM.region.high[fixed]:
         outline_task_region(axes, vertical, inside=True)
+
+
+def _stop_margin(points: FloatArray) -> FloatArray:
+    """How far the motor that is nearest to a stop is from it, rad; negative beyond."""
+    theta = inverse_all(points).theta[..., ELBOWS_OUT.index, :]
+    motors = PAPER_TPM.mechanism.motors
+    low, high = ([getattr(motor, end) for motor in motors] for end in ("lower", "upper"))
+    margin: FloatArray = np.minimum(theta - low, high - theta).min(axis=-1)
+    return np.ma.masked_invalid(margin)
 
 
 def _smallest(axes: Axes) -> None:
@@ -100,17 +114,43 @@ def _smallest(axes: Axes) -> None:
 
 
 def _legend(figure: Figure, found: tuple[Aspect, ...]) -> None:
-    handles = []
-    for sin_beta, half in ((1, "y > 0"), (-1, "y < 0")):
-        for signs in COLOURS:
-            volumes = [
-                aspect.cells.volume
-                for aspect in found
-                if aspect.assembly.sin_beta == sin_beta and _signs(aspect) == signs
-            ]
-            marks = ["+" if sign > 0 else "\N{MINUS SIGN}" for sign in signs]
-            text = "{}, {} {}: {:.1f} dm³".format(half, *marks, sum(volumes) * 1e3)
-            handles.append(Patch(color=colour(signs, sin_beta), label=text))
-    legend = figure.legend(handles=handles, loc="upper left", bbox_to_anchor=(0.765, 0.87))
-    legend.set_title("half, signs of factors\n2 and 3: volume")
-    legend.get_title().set_fontsize(7.5)
+    half = [aspect for aspect in found if aspect.assembly.sin_beta > 0]
+    handles: list[Patch | Line2D] = []
+    allowed = np.zeros(3)  # volume, within the stops, and clear of links as well; dm^3
+    for aspect in half:
+        parts = _allowed(aspect)
+        allowed += parts
+        signs = signs_of(aspect)
+        marks = "".join("+" if sign > 0 else "\N{MINUS SIGN}" for sign in signs)
+        patch = Patch(facecolor=colour(signs), edgecolor="0.4", linewidth=0.4)
+        patch.set_label(_row(marks, parts))
+        handles.append(patch)
+    handles.append(Patch(facecolor="none", label=_row("all", allowed)))
+    handles.append(Line2D([], [], color="white", linewidth=1.6, linestyle="--"))
+    handles[-1].set_label("motors' stops")
+    font = {"family": "monospace", "size": 6.5}
+    legend = figure.legend(
+        handles=handles, loc="upper left", bbox_to_anchor=(0.752, 0.9), prop=font
+    )
+    legend.get_frame().set_facecolor("0.88")
+    title = (
+        "signs of factors 2, 3 and of\nthe constraint; volume in dm³;\n"
+        "% of it within the motors'\nstops, and clear of links, too;\nof y > 0, which y < 0 mirrors"
+    )
+    legend.set_title(title)
+    legend.get_title().set_fontsize(7.0)
+
+
+def _allowed(aspect: Aspect) -> FloatArray:
+    """Volume of an aspect, within the motors' stops, and where also no links touch, dm^3."""
+    centres = aspect.cells.centres()
+    stops = within_stops(centres, ELBOWS_OUT, PAPER)
+    clear = clear_of_links(centres[stops], ELBOWS_OUT, PAPER)
+    shares = np.array([len(centres), stops.sum(), clear.sum()]) / len(centres)
+    return 1e3 * aspect.cells.volume * shares
+
+
+def _row(name: str, parts: FloatArray) -> str:
+    volume, stops, clear = parts
+    number = f"{volume:.1f}" if volume >= 10 else f"{volume:.2f}"
+    return f"{name} {number:>5} {100 * stops / volume:3.0f} {100 * clear / volume:3.0f}"

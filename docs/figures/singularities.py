@@ -22,8 +22,8 @@ from figures.zero_sets import (
     reach_margin,
     serial_lines,
     serial_squares,
+    sheets,
 )
-from tpm_gym.analysis.singularity import factors_at
 from tpm_gym.kinematics import ELBOWS_OUT, WORKING_MODES
 from tpm_gym.kinematics.geometry import PAPER
 from tpm_gym.learning import figure_style as style
@@ -55,6 +55,11 @@ PARALLEL = (
         "$\\times(x_C - 2l_5 + l_1 - l_3\\cos\\theta_2) = 0$:\n"
         "seen along y, $B_1C_1$ and $B_2C_2$ are parallel",
     ),
+    (
+        PURPLE,
+        "$z_C - l_3\\sin\\theta_1 = 0$, not in the paper:\n"
+        "rods 4 lie level, and link 3' may turn about y",
+    ),
 )
 SERIAL = (
     (BLUE, "$\\cos\\beta = 0$:\nlink 7 lies along y; y = ±l7 = ±50 mm"),
@@ -73,6 +78,7 @@ SERIAL = (
 
 _X, _Z = np.linspace(-0.92, 1.06, 199), np.linspace(-1.18, 1.22, 241)
 _Y = np.linspace(-0.0529, 0.0529, 60)  # an even number: y = 0 itself is not sampled
+_ALONG = np.linspace(_X[0], _X[-1], 2000)  # for what runs along the edge of the reach
 _FINE = np.linspace(_X[0], _X[-1], 793), np.linspace(_Z[0], _Z[-1], 961)  # for what is cheap
 _LIMITS_X, _LIMITS_Z = (-900.0, 1050.0), (-1180.0, 1220.0)
 _SIGN = ELBOWS_OUT.cos_beta
@@ -80,25 +86,25 @@ _INSIDE = (1.0, 1.0 - 1e-9, 1.0)  # a surface that ends at y = +-l7 ends just in
 
 
 def parallel_figure() -> Figure:
-    """The paper's Fig. 4: where det A = 0, one colour a factor of Eq. (16)."""
-    figure, space, sections, plans = _layout("Parallel singularities, det A = 0")
+    """The paper's Fig. 4: where det A = 0, a colour a factor of Eq. (16), and the constraint's."""
+    figure, space, sections, plans = _layout("Parallel and constraint singularities")
     _draw_parallel(space)
     _legend(figure, PARALLEL)
     for axes, y in zip(sections, (0.0, 0.025, 0.048), strict=False):
         section = Section("y", y)
         _reached(axes, section, PARALLEL[0][0] if y == 0 else None)
-        for index in (1, 2):
+        for index in (1, 2, 3):
             # At y = 0 the sign of sin(beta) is lost, so take the limit.
             near = Section("y", max(y, 1e-5))
             _lines(axes, parallel_lines(index, ELBOWS_OUT, near, _X, _Z), PARALLEL[index][0])
         title = "y = 0: all singular" if y == 0 else f"y = {y * MM:.0f} mm"
         _finish_section(axes, section, title, sections[0] is axes)
     _all_modes(sections[3], Section("y", 0.025))
-    for axes, z in zip(plans, (0.750, 0.100, -0.440), strict=True):
+    for axes, z in zip(plans, (0.750, 0.300, -0.440), strict=True):
         section = Section("z", z)
         _reached(axes, section, None)
-        for index in (0, 1, 2):
-            lines = parallel_lines(index, ELBOWS_OUT, section, _X, _Y)
+        for index in range(4):
+            lines = parallel_lines(index, ELBOWS_OUT, section, _ALONG, _Y)
             _lines(axes, lines, PARALLEL[index][0])
         _finish_section(
             axes, section, f"z = {z * MM:.0f} mm".replace("-", "\N{MINUS SIGN}"), plans[0] is axes
@@ -133,15 +139,15 @@ def serial_figure() -> Figure:
 
 
 def _draw_parallel(space: Axes3D) -> None:
-    """The plane y = 0, and the two other factors swept along y behind and in front of it."""
+    """The plane y = 0, and the three other factors swept along y behind and in front of it."""
     plane = Surface(surfaces.plate(0.0, _SIGN, _X, _Z), PARALLEL[0][0], 0.30)
     behind: list[Surface] = []
     front: list[Surface] = []
     y0 = 0.025
-    for index in (1, 2):
+    for index in (1, 2, 3):
 
         def exists(points: FloatArray, index: int = index) -> BoolArray:
-            return np.isfinite(factors_at(points * _INSIDE, ELBOWS_OUT).parallel[..., index])
+            return np.isfinite(sheets(points * _INSIDE, ELBOWS_OUT)[..., index])
 
         for line in parallel_lines(index, ELBOWS_OUT, Section("y", y0), _X, _Z):
             mesh = surfaces.sweep(line, y0, surfaces.levels(), _SIGN)
@@ -218,10 +224,12 @@ def _all_modes(axes: Axes, section: Section) -> None:
     for sign in (-1, 1):
         _reached(axes, section, None, sign)
     fine = np.linspace(_X[0], _X[-1], 400), np.linspace(_Z[0], _Z[-1], 480)
-    # The second factor does not feel the bends of legs 1 and 2, the third not that of leg 3.
+    # The second factor does not feel the bends of legs 1 and 2, the third not that of leg 3, the
+    # constraint's feels that of leg 1 only.
     level3 = [(1, mode) for mode in WORKING_MODES if mode.leg1 == mode.leg2 == 1]
     planar = [(2, mode) for mode in WORKING_MODES if mode.leg3 == 1]
-    for index, mode in level3 + planar:
+    elevation = [(3, mode) for mode in WORKING_MODES if mode.leg2 == mode.leg3 == 1]
+    for index, mode in level3 + planar + elevation:
         lines = parallel_lines(index, mode, section, *fine)
         _lines(axes, lines, PARALLEL[index][0], 0.8)
     _finish_section(axes, section, f"y = {section.at * MM:.0f} mm, all 16 modes", False, False)

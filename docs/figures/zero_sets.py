@@ -1,9 +1,10 @@
 """Where a factor of det A or det B vanishes in Cartesian space, on one working mode.
 
 Fields are sampled on a grid through the inverse kinematics and contoured at zero, then every point
-found is moved along its grid edge until the factor vanishes. The factors of det A change sign
-inside the workspace. Those of det B keep theirs (they name the working mode) and end with the
-workspace; their squares go on beyond it and change sign there, so we contour those.
+found is moved along its grid edge until the factor vanishes. The factors of det A and that of the
+constraint change sign inside the workspace. Those of det B keep theirs (they name the working mode)
+and end with the workspace; their squares go on beyond it and change sign there, so we contour
+those.
 """
 
 from __future__ import annotations
@@ -137,8 +138,17 @@ def clip(lines: list[FloatArray], keep: Callable[[FloatArray], BoolArray]) -> li
 def parallel_lines(
     index: int, mode: WorkingMode, section: Section, u: FloatArray, v: FloatArray
 ) -> list[FloatArray]:
-    """Zero lines of factor ``index`` (0 to 2) of det A in a section, for the paper's lengths."""
-    return zero_lines(lambda p: factors_at(section.points(p), mode).parallel[..., index], u, v)
+    """Zero lines of a factor in a section, for the paper's lengths: of det A, or the constraint's.
+
+    ``index`` is that of :func:`sheets`.
+    """
+    return zero_lines(lambda p: sheets(section.points(p), mode)[..., index], u, v)
+
+
+def sheets(points: FloatArray, mode: WorkingMode) -> FloatArray:
+    """What changes its sign inside the workspace (..., 4): the factors of det A, and elevation."""
+    found = factors_at(points, mode)
+    return np.concatenate([found.parallel, found.constraint[..., None]], axis=-1)
 
 
 def serial_lines(

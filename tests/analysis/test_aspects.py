@@ -25,13 +25,14 @@ modes = st.sampled_from(WORKING_MODES)
 
 
 def signs(points: FloatArray, mode: WorkingMode, g: Geometry) -> FloatArray:
-    """Signs (..., 3) of the parallel factors by the oracle; NaN where not reachable."""
-    return np.sign(oracle.factors_at(points, mode, g)[0])
+    """Signs (..., 4) of parallel factors and elevation by the oracle; NaN where not reachable."""
+    elevation = oracle.elevation_at(points, mode, g)[..., None]
+    return np.sign(np.concatenate([oracle.factors_at(points, mode, g)[0], elevation], axis=-1))
 
 
 def of(aspect: Aspect) -> list[int]:
     """The signs that an aspect claims, as ``signs`` has them."""
-    return [aspect.assembly.sin_beta, aspect.level3, aspect.assembly.planar]
+    return [aspect.assembly.sin_beta, aspect.level3, aspect.assembly.planar, aspect.elevation]
 
 
 def all_centres(cells: Cells) -> FloatArray:
@@ -74,6 +75,57 @@ def test_volumes_of_aspects_converge() -> None:
         assert abs(one.cells.volume - other.cells.volume) < one.cells.volume_error
         assert other.cells.volume_error < 0.75 * one.cells.volume_error
     assert coarse[0].cells.volume == pytest.approx(fine[0].cells.volume, rel=0.01)
+
+
+VOLUMES = {  # dm^3 by the signs of level3, planar and elevation, in one half
+    (1, -1, 1): [37.2],
+    (-1, -1, -1): [30.1, 1.14],
+    (1, -1, -1): [26.6],
+    (-1, -1, 1): [8.77],
+    (-1, 1, -1): [2.86],
+    (1, 1, -1): [0.148],
+    (-1, 1, 1): [0.0506],
+}
+
+
+@pytest.mark.slow
+def test_elbows_out_has_sixteen_aspects() -> None:
+    """Eight in each half; the two thinnest need more than cells, and are measured in sections."""
+    found = aspects.aspects(shape=(200, 12, 260))
+    assert len(found) == 16
+    for side in (-1, 1):
+        half = [a for a in found if a.assembly.sin_beta == side]
+        volumes = {signs: [] for signs in VOLUMES}
+        for aspect in half:
+            volumes[of(aspect)[1], of(aspect)[2], of(aspect)[3]].append(1e3 * aspect.cells.volume)
+        for signs, expected in VOLUMES.items():
+            assert len(volumes[signs]) == len(expected)
+            if sum(expected) > 1:
+                assert volumes[signs] == pytest.approx(expected, rel=0.02)
+    for signs, low, high in (
+        ((1, 1, -1), (-0.15, -0.48), (0.30, -0.40)),
+        ((-1, 1, 1), (0.80, 0.30), (0.92, 0.45)),
+    ):
+        assert 1e3 * by_sections(signs, low, high) == pytest.approx(VOLUMES[signs][0], rel=0.02)
+
+
+def by_sections(
+    signs: tuple[int, int, int], low: tuple[float, float], high: tuple[float, float]
+) -> float:
+    """Volume of all points y > 0 with these signs, x and z between low and high, m^3."""
+    step = 0.0005
+    x, z = (np.arange(a, b, step) + step / 2 for a, b in zip(low, high, strict=True))
+    angles, weights = np.polynomial.legendre.leggauss(5)
+    angles = (angles + 1) * np.pi / 4  # y = l7 sin(angle): dense where the surfaces move fastest
+    total = 0.0
+    for angle, weight in zip(angles, weights, strict=True):
+        y = PAPER.l7 * np.sin(angle)
+        points = np.stack(np.broadcast_arrays(x[:, None], y, z), axis=-1)
+        values = singularity.factors_at(points)
+        same = (np.sign(values.parallel[..., 1:]) == signs[:2]).all(axis=-1)
+        same &= np.sign(values.constraint) == signs[2]
+        total += weight * np.pi / 4 * PAPER.l7 * np.cos(angle) * same.sum() * step**2
+    return total
 
 
 def test_volume_error_counts_no_flat_faces() -> None:

@@ -22,13 +22,16 @@ from tpm_gym.kinematics import (
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 
 HOME = np.array([-0.05, 0.03, 0.78])
+LEVEL = np.array([-0.5063602842493994, 0.03, 0.3])  # 1/cond(J) is 0.23 there, and rods 4 lie level
+LEVEL_BETA = np.arcsin(0.03 / PAPER.l7)
 SIDES = [AssemblyMode(planar, 1) for planar in (-1, 1)]
 
 
 def oracle_factors(points: FloatArray, mode: WorkingMode, g: Geometry) -> FloatArray:
-    """(..., 7) dimensionless factors by the oracle; NaN where not reachable."""
-    sizes = np.array([1, g.l4, g.l4**2, 1, g.l3 * g.l4, g.l3 * g.l4, g.l3 * g.l4])
-    return np.concatenate(oracle.factors_at(points, mode, g), axis=-1) / sizes
+    """(..., 8) dimensionless factors by the oracle; NaN where not reachable."""
+    sizes = np.array([1, g.l4, g.l4**2, 1, g.l3 * g.l4, g.l3 * g.l4, g.l3 * g.l4, g.l4])
+    elevation = oracle.elevation_at(points, mode, g)[..., None]
+    return np.concatenate([*oracle.factors_at(points, mode, g), elevation], axis=-1) / sizes
 
 
 def rays(count: int, seed: int) -> FloatArray:
@@ -51,11 +54,15 @@ def assert_feet_are_singular(
 ) -> None:
     reach = np.linalg.norm(found.point - points, axis=-1)
     np.testing.assert_allclose(reach, found.distance, rtol=0, atol=1e-12)
-    # A foot is on the boundary up to rounding; from just inside, its factor has to be zero.
-    # Legs' factors rise as the square root of the distance.
-    beside = found.point + 1e-11 * (points - found.point)
-    values = np.abs(oracle_factors(beside, mode, g))[np.arange(len(points)), found.factor]
-    assert values.max() < 2e-5
+    # A foot is on the boundary up to rounding; seen from just inside, its factor has to be zero.
+    # Legs' factors and cos(beta) rise as the square root of the distance, and next to y = l7 ever
+    # more steeply; so the squares of two values on the way have to lead to zero.
+    near, far = (
+        oracle_factors(found.point + depth * (points - found.point), mode, g) ** 2
+        for depth in (1e-11, 2e-11)
+    )
+    squares = np.abs(2 * near - far)[np.arange(len(points)), found.factor]
+    assert squares.max() < 2e-5**2
 
 
 @examples(40, oracle.geometries(), oracle.seeds(), st.sampled_from(WORKING_MODES))
@@ -83,7 +90,7 @@ def test_generic_points_are_regular_and_their_mode_is_their_signs(
     found = singularity.classify_at(points, mode, g, tolerance=1e-9)
     assert (found.kind == SingularityType.NONE).all()
     assert not found.vanishing.any()
-    assert (np.sign(found.factors[:, 3:]) == mode.signs).all()
+    assert (np.sign(found.factors[:, 3:7]) == mode.signs).all()
 
 
 @pytest.mark.parametrize("mode", WORKING_MODES)
@@ -100,7 +107,6 @@ def test_both_ways_of_naming_a_configuration_agree(mode: WorkingMode) -> None:
             close = np.abs(np.abs(at.factors) - tolerance).min(axis=-1) < 1e-6
             np.testing.assert_array_equal(at.kind[~close], by.kind[~close])
             np.testing.assert_array_equal(at.vanishing[~close], by.vanishing[~close])
-            assert (at.constraint == by.constraint).all()
             np.testing.assert_array_equal(at.vanishing, np.abs(at.factors) <= tolerance)
 
 
@@ -114,7 +120,7 @@ def edge_of_leg3(x: float, y: float, g: Geometry = PAPER) -> FloatArray:
     return np.array([x, y, g.l6 + np.sqrt(level**2 - (x + g.l2 - g.l1) ** 2)])
 
 
-def test_the_four_kinds() -> None:
+def test_the_kinds() -> None:
     plane, edge = HOME * [1, 0, 1], np.array([HOME[0], PAPER.l7, HOME[2]])
     folded = edge_of_leg3(0.2, 0.03)
     cases = [
@@ -124,32 +130,39 @@ def test_the_four_kinds() -> None:
         (edge * [1, -1, 1], SingularityType.SERIAL, ["cos_beta"]),
         (folded, SingularityType.SERIAL, ["leg3"]),
         (edge_of_leg3(0.2, 0.0), SingularityType.BOTH, ["sin_beta", "leg3"]),
+        (LEVEL, SingularityType.CONSTRAINT, ["elevation"]),
+        (
+            LEVEL * [1, 0, 1] + [PAPER.l7 * (1 - np.cos(LEVEL_BETA)), 0, 0],
+            SingularityType.PARALLEL | SingularityType.CONSTRAINT,
+            ["sin_beta", "elevation"],
+        ),
     ]
     for point, kind, names in cases:
         found = singularity.classify_at(point)
         assert found.kind == kind, point
         assert vanishing(found) == names
         assert found.kind.shape == ()
-        assert not found.constraint
     together = singularity.classify_at(np.array([point for point, _, _ in cases]))
     assert together.kind.tolist() == [int(kind) for _, kind, _ in cases]
     assert SingularityType.BOTH == SingularityType.SERIAL | SingularityType.PARALLEL
 
 
-def test_constraint_singularities_are_flagged_apart() -> None:
-    """Where z_C1 = z_B1 rod 1 lies level; no factor is small there."""
+def test_constraint_singularities_are_those_of_the_arm_that_levels_the_rods() -> None:
+    """Where z_C1 = z_B1, on half of the modes that reach the point; no other factor is small."""
     cos1 = 0.6
     point = oracle.level_rod_4(np.arccos(cos1), beta=0.6)
     kinds = []
     for mode in WORKING_MODES:
         if mode.cos_beta == 1 and workspace.reachable(point, mode):
             found = singularity.classify_at(point, mode)
-            assert found.kind == SingularityType.NONE
             slot = int(workspace.assembly_of(point, mode))
             theta = inverse(point, mode)
-            again = singularity.classify(theta, ASSEMBLY_MODES[slot])
-            assert found.constraint == again.constraint == (abs(np.cos(theta[0]) - cos1) < 1e-9)
-            kinds.append(bool(found.constraint))
+            level = abs(np.cos(theta[0]) - cos1) < 1e-9
+            assert found.kind == singularity.classify(theta, ASSEMBLY_MODES[slot]).kind
+            assert vanishing(found) == (["elevation"] if level else [])
+            distance = nearest_singularity(point, mode, ASSEMBLY_MODES[slot]).distance
+            assert (distance < 1e-12) == level
+            kinds.append(level)
     assert set(kinds) == {True, False}
 
 
@@ -183,6 +196,28 @@ def compare(
     assert_feet_are_singular(some[order], part, mode, g)
     for index in order:
         assert ball_is_clear(some[index], float(found.distance[index]), mode, g, count)
+
+
+@pytest.mark.slow
+def test_distance_is_never_too_large() -> None:
+    """1,000 points and more of all modes, half of them beside the constraint's surface."""
+    rng = np.random.default_rng(6)
+    some = oracle.reachable_points(rng, 1000, PAPER)
+    theta_1, beta = rng.uniform(-np.pi, np.pi, 1000), rng.uniform(0.05, 3.0, 1000)
+    level = zip(theta_1, beta, rng.choice([-1, 1], 1000), rng.normal(0, 0.01, 1000), strict=True)
+    beside = np.stack([oracle.level_rod_4(*row) for row in level])
+    points, factors, checked = np.concatenate([some, beside]), set(), 0
+    modes = rng.permutation(np.arange(2000) % 16)
+    for mode in WORKING_MODES:
+        for assembly in ASSEMBLY_MODES:
+            mine = points[modes == mode.index]
+            found = nearest_singularity(mine, mode, assembly)
+            for point, distance in zip(mine[found.valid], found.distance[found.valid], strict=True):
+                assert ball_is_clear(point, float(distance), mode, PAPER, 2000)
+            factors |= set(found.factor[found.valid].tolist())
+            checked += found.valid.sum()
+    assert checked > 1000  # the others are not reached on their mode
+    assert factors == set(range(8))
 
 
 @examples(4, oracle.geometries(), oracle.seeds(), st.sampled_from(WORKING_MODES))
@@ -225,7 +260,7 @@ def test_distance_to_the_planes_is_exact_in_the_middle_of_the_workspace() -> Non
 def test_every_surface_is_met_somewhere() -> None:
     points = oracle.reachable_points(np.random.default_rng(5), 6000, PAPER)
     found = nearest_singularity(points[:2500], ELBOWS_OUT, SIDES[0])
-    assert set(found.factor[found.valid].tolist()) == set(range(7))
+    assert set(found.factor[found.valid].tolist()) == set(range(8))
     assert set(found.factor[~found.valid].tolist()) == {-1}
     assert np.isnan(found.distance[~found.valid]).all()
     assert np.isnan(found.point[~found.valid]).all()
@@ -242,8 +277,8 @@ def test_leading_shapes(shape: tuple[int, ...]) -> None:
     assert found.point.shape == (*shape, 3)
     assert found.valid.all()
     kinds = singularity.classify_at(points)
-    assert kinds.kind.shape == kinds.constraint.shape == shape
-    assert kinds.vanishing.shape == kinds.factors.shape == (*shape, 7)
+    assert kinds.kind.shape == shape
+    assert kinds.vanishing.shape == kinds.factors.shape == (*shape, 8)
 
 
 def test_points_that_are_none_are_masked_in_batches() -> None:

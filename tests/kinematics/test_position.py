@@ -6,9 +6,11 @@ from typing import Any
 import numpy as np
 import oracle
 import pytest
+import torch
 from examples import examples
+from hypothesis import example
 
-from tpm_gym.errors import InputError
+from tpm_gym.errors import InputError, UnreachableError
 from tpm_gym.kinematics import (
     ASSEMBLY_MODES,
     WORKING_MODES,
@@ -154,3 +156,35 @@ def test_passive_angles_point_along_the_links() -> None:
 def test_what_are_no_lengths_is_refused(solve: Any) -> None:
     with pytest.raises(InputError, match=r"geometry must be a tpm_gym\.Geometry"):
         solve(np.zeros((2, 3)), geometry=3)
+
+
+@examples(30, oracle.geometries(), oracle.seeds())
+@example(PAPER, 1)
+def test_free_beta_is_flagged(g: Geometry, seed: int) -> None:
+    """At a2 = b2 = 0 of Eq. (10), where level3 vanishes, the angles no longer tell where P is."""
+    rng = np.random.default_rng(seed)
+    turn, beta = rng.uniform(-np.pi, np.pi, (2, 300))
+    rise = rng.choice([-1, 1], 300) * np.sqrt(g.l4**2 - g.l7**2)
+    x_c, z_c = g.l1 - 2 * g.l2 + g.l3 * np.cos(turn), g.l3 * np.sin(turn) - g.l6 + rise
+    points = oracle.points(np.stack([turn] * 3, axis=-1), x_c, z_c, beta, g)["P"]
+    s = oracle.postures(inverse_all(points, g), points, g)
+    parallel, serial = oracle.factors(s.theta, s.x_c, s.z_c, s.beta, g)
+    size = g.l3 * g.l4
+    clear = (np.abs(serial[:, 1:]) > 0.1 * size).all(axis=-1) & (abs(parallel[:, 2]) > 0.1 * size)
+    on = clear & (np.abs(parallel[:, 1]) < 1e-12)
+    theta, slot = s.theta[on], oracle.assembly_slots(parallel[on])
+    assert len(theta) > 100 or g != PAPER
+    as_tensor = forward_all(torch.tensor(theta), g)
+    row, solutions = np.arange(len(theta)), forward_all(theta, g)
+    told = solutions.free[row, slot] & as_tensor.free.numpy()[row, slot]
+    assert np.count_nonzero(~told) <= 2  # of hundreds: angles hold little beside their pivots
+    row, slot, z = row[told], slot[told], s.position[on, 2][told]
+    assert not (solutions.free & solutions.valid).any()
+    assert np.isnan(solutions.beta[row, slot]).all()
+    assert np.isnan(solutions.position[row, slot, :2]).all()
+    np.testing.assert_allclose(solutions.position[row, slot, 2], z, atol=1e-12)
+    for given, index in zip(theta[row[:20]], slot, strict=False):
+        for angles in (given, [given]):
+            with pytest.raises(UnreachableError, match="beta is free"):
+                forward(angles, ASSEMBLY_MODES[index], g)
+    assert not forward_all(theta + [0, 0, 1e-6], g).free[row, slot].any()

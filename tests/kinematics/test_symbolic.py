@@ -54,6 +54,7 @@ SERIAL = [
     l3 * (z_c * sp.cos(t2) - (x_c - 2 * l5 + l1) * sp.sin(t2)),
     l3 * ((z_c + l6) * sp.cos(t3) - (x_c + l7 * sp.cos(beta) + 2 * l2 - l1) * sp.sin(t3)),
 ]
+CONSTRAINT = z_c - l3 * sp.sin(t1)  # z_C1 - z_B1
 
 
 def assert_zero(expression: Any) -> None:
@@ -116,6 +117,32 @@ def test_eq_16_factors_are_the_determinant_of_the_closures() -> None:
     assert_zero(parallel.det() - 8 * l7 * product(PARALLEL))
 
 
+def turned_closures(phi: Any) -> list[Any]:
+    """Of both rods 4, of rod 6 and of branch III, where link 3' is turned by phi about y."""
+    along, up = column(sp.cos(phi), 0, -sp.sin(phi)), column(sp.sin(phi), 0, sp.cos(phi))
+    e1 = C1 + l6 * up + l7 * (sp.cos(beta) * along + sp.sin(beta) * column(0, 1, 0))
+    level = l5 * column(1, 0, 0)
+    rods = [
+        (C1 + l5 * along) - (B[0] + level),
+        (C1 - l5 * along) - (B[0] - level),
+        (C1 - 2 * l5 * along) - B[1],
+        (e1 + 2 * l2 * along) - B[2],  # C3 = E1 + (E1F1 - C3D3) + F1D3
+    ]
+    return [rod.dot(rod) - l4**2 for rod in rods]
+
+
+def test_the_complete_determinant_has_the_constraint_as_a_fourth_factor() -> None:
+    """Eq. (16) takes for granted that link 3' translates; let it turn, and z_C1 - z_B1 appears."""
+    phi = sp.Symbol("phi", real=True)
+    closures = turned_closures(phi)
+    difference = closures[0] - closures[1]
+    turn = {sp.cos(phi): (1 - half**2) / (1 + half**2), sp.sin(phi): 2 * half / (1 + half**2)}
+    expected = -8 * half * l5 * (half * x_c + CONSTRAINT) / (1 + half**2)
+    assert_zero(difference.subs(turn) - expected)
+    complete = sp.Matrix(closures).jacobian([x_c, z_c, phi, beta]).subs(phi, 0)
+    assert_zero(complete.det() + 32 * l5 * CONSTRAINT * l7 * product(PARALLEL))
+
+
 def test_eq_17_factors_are_the_derivatives_by_the_motors() -> None:
     serial = sp.Matrix(CLOSURES).jacobian(THETA)
     assert serial.is_diagonal()
@@ -142,7 +169,7 @@ def test_determinants_of_a_and_b_are_products_of_the_factors() -> None:
 
 SYMBOLIC = {
     name: sp.lambdify((*LENGTHS, *THETA, x_c, z_c, beta), factors, "numpy")
-    for name, factors in (("parallel", PARALLEL), ("serial", SERIAL))
+    for name, factors in (("parallel", PARALLEL), ("serial", SERIAL), ("constraint", [CONSTRAINT]))
 }
 
 
@@ -162,6 +189,8 @@ def test_the_code_returns_these_factors_a_and_b(g: Geometry, seed: int) -> None:
         found = jacobian.factors(theta, branch, g)
         np.testing.assert_allclose(found.parallel, expected["parallel"], rtol=0, atol=1e-12)
         np.testing.assert_allclose(found.serial, expected["serial"], rtol=0, atol=1e-12)
+        elevation = expected["constraint"][..., 0]
+        np.testing.assert_allclose(found.constraint, elevation, rtol=0, atol=1e-12)
         det_a = np.linalg.det(jacobian.parallel(theta, branch, g))
         det_b = np.linalg.det(jacobian.serial(theta, branch, g))
         products = [expected[name].prod(axis=-1) for name in ("parallel", "serial")]

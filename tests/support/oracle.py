@@ -128,6 +128,13 @@ def factors_at(
     return factors(theta, *link3(position, beta, g), beta, g)
 
 
+def elevation_at(position: FloatArray, mode: WorkingMode, g: Geometry) -> FloatArray:
+    """z_C1 - z_B1 at points (..., 3) on a working mode, (...,) m; NaN where not reachable."""
+    theta = inverse_all(position, g).theta[..., mode.index, :]
+    rise: FloatArray = position[..., 2] - 2 * g.l6 - g.l3 * np.sin(theta[..., 0])
+    return rise
+
+
 def level_rod_4(
     theta_1: float, beta: float, side: int = 1, offset: float = 0.0, g: Geometry = PAPER
 ) -> FloatArray:

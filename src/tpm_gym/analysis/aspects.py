@@ -5,8 +5,9 @@ singularity; between two aspects of one working mode it cannot. All sets are in 
 the paper frame, in metres, and held as cells of a grid whose cells have faces on the singular
 planes y = 0 and |y| = l7, so that only curved surfaces are cut by cells.
 
-Aspects are those of the factors of Eqs. (16) and (17); the constraint singularity of
-:mod:`tpm_gym.analysis.singularity` does not divide them.
+Singularities are those of all factors of :mod:`tpm_gym.analysis.singularity`, the constraint's
+among them. What the motors' stops and the links' own bodies forbid is left out only where
+``limits`` ask for it, see :mod:`tpm_gym.analysis.limits`.
 """
 
 import math
@@ -14,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tpm_gym.analysis.limits import Limit
 from tpm_gym.analysis.singularity import factors_at
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector
 from tpm_gym.errors import ConfigurationError
@@ -25,7 +27,7 @@ Shape = tuple[int, int, int]
 
 DEFAULT_SHAPE: Shape = (64, 16, 96)
 """Cells along x, y, z; for the paper's lengths about 27 x 6 x 24 mm each."""
-_BITS = (1, 2, 4)
+_BITS = (1, 2, 4, 8)
 
 
 @dataclass(frozen=True)
@@ -83,13 +85,17 @@ class Aspect:
     Attributes:
         branch: Names the signs of the serial factors.
         assembly: Names the signs of sin(beta) and the planar factor.
-        level3: Sign of the remaining factor, l1 + l3 c3 - xC - 2 l2.
+        level3: Sign of the third parallel factor, l1 + l3 c3 - xC - 2 l2.
+        elevation: Sign of the constraint's factor, z_C1 - z_B1.
+        limits: Within which all of it is.
     """
 
     branch: WorkingMode
     assembly: AssemblyMode
     level3: int
+    elevation: int
     geometry: Geometry
+    limits: tuple[Limit, ...]
     cells: Cells
 
 
@@ -109,16 +115,20 @@ class Box:
 
 
 def reachable_set(
-    branch: WorkingMode = ELBOWS_OUT, geometry: Geometry = PAPER, shape: Shape = DEFAULT_SHAPE
+    branch: WorkingMode = ELBOWS_OUT,
+    geometry: Geometry = PAPER,
+    shape: Shape = DEFAULT_SHAPE,
+    limits: tuple[Limit, ...] = (),
 ) -> ReachableSet:
     """The points that have a posture on ``branch``, as cells of a grid over all that rods reach.
 
-    ``shape`` counts cells along x, y, z: at least 2 each, along y an even number.
+    ``shape`` counts cells along x, y, z: at least 2 each, along y an even number. ``limits`` such
+    as :func:`~tpm_gym.analysis.limits.within_stops` have to allow the posture.
 
     Raises:
         ConfigurationError: If the shape is not possible.
     """
-    low, spacing, codes = _codes(branch, geometry, shape)
+    low, spacing, codes = _codes(branch, geometry, shape, limits)
     return ReachableSet(branch, geometry, Cells(low, spacing, codes >= 0))
 
 
@@ -127,33 +137,37 @@ def aspects(
     geometry: Geometry = PAPER,
     shape: Shape = DEFAULT_SHAPE,
     min_cells: int = 8,
+    limits: tuple[Limit, ...] = (),
 ) -> tuple[Aspect, ...]:
     """All aspects of a working mode, the largest first.
 
     Cells belong together if they share a face and all factors have the same signs at their centres.
     So regions joined by a neck narrower than a cell come out as several, and a wall of singular
     points thinner than a cell may be overlooked: compare two grids. Regions of fewer than
-    ``min_cells`` cells are dropped: crumbs along curved boundaries.
+    ``min_cells`` cells are dropped: crumbs along curved boundaries. What ``limits`` forbid divides
+    them too.
 
     Raises:
         ConfigurationError: If the shape is not possible, or min_cells is not positive.
     """
     if min_cells < 1:
         raise ConfigurationError("min_cells", min_cells, "at least 1")
-    low, spacing, codes = _codes(branch, geometry, shape)
+    low, spacing, codes = _codes(branch, geometry, shape, limits)
     labels = _components(codes)
     names, first, counts = np.unique(labels, return_index=True, return_counts=True)
     found = []
     for index in np.argsort(-counts, kind="stable"):
         code = int(codes.flat[first[index]])
         if code >= 0 and counts[index] >= min_cells:
-            sin_beta, level3, planar = (1 if code & bit else -1 for bit in _BITS)
+            sin_beta, level3, planar, elevation = (1 if code & bit else -1 for bit in _BITS)
             found.append(
                 Aspect(
                     branch=branch,
                     assembly=AssemblyMode(planar=planar, sin_beta=sin_beta),
                     level3=level3,
+                    elevation=elevation,
                     geometry=geometry,
+                    limits=limits,
                     cells=Cells(low, spacing, labels == names[index]),
                 )
             )
@@ -177,13 +191,14 @@ def sample(rng: np.random.Generator, aspect: Aspect, count: int) -> FloatArray:
     if not cells.mask.any():
         raise ConfigurationError("aspect", "without cells", "an aspect that aspects() returned")
     candidates = np.argwhere(_grown(cells.mask))
-    signs = aspect.assembly.sin_beta, aspect.level3, aspect.assembly.planar
+    assembly = aspect.assembly
+    signs = assembly.sin_beta, aspect.level3, assembly.planar, aspect.elevation
     code = sum(bit for sign, bit in zip(signs, _BITS, strict=True) if sign > 0)
     points = np.empty((0, 3))
     while len(points) < count:
         corner = candidates[rng.integers(len(candidates), size=count)]
         draws = np.asarray(cells.low) + (corner + rng.random((count, 3))) * cells.spacing
-        kept = _signs(draws, aspect.branch, aspect.geometry) == code
+        kept = _signs(draws, aspect.branch, aspect.geometry, aspect.limits) == code
         points = np.concatenate([points, draws[kept]])
     return points[:count]
 
@@ -223,7 +238,7 @@ def largest_box(aspect: Aspect, threshold: float) -> Box:
 
 
 def _codes(
-    branch: WorkingMode, geometry: Geometry, shape: Shape
+    branch: WorkingMode, geometry: Geometry, shape: Shape, limits: tuple[Limit, ...]
 ) -> tuple[Vector, Vector, IntArray]:
     """Corner and spacing of the grid, and the signs at the centres of its cells."""
     if len(shape) != 3 or any(int(n) != n or n < 2 for n in shape) or shape[1] % 2:
@@ -239,14 +254,22 @@ def _codes(
     spacing = (high - low) / shape
     points = low + (np.moveaxis(np.indices(shape), 0, -1) + 0.5) * spacing
     corner, edges = tuple(low.tolist()), tuple(spacing.tolist())
-    return corner, edges, _signs(points, branch, geometry)
+    return corner, edges, _signs(points, branch, geometry, limits)
 
 
-def _signs(points: FloatArray, branch: WorkingMode, geometry: Geometry) -> IntArray:
-    """Signs of sin(beta), level3 and planar as bits; -1 where not reachable."""
-    parallel = factors_at(points, branch, geometry).parallel
-    bits = ((parallel > 0) * np.array(_BITS)).sum(axis=-1)
-    return np.where(np.isnan(parallel[..., 0]), -1, bits)
+def _signs(
+    points: FloatArray, branch: WorkingMode, geometry: Geometry, limits: tuple[Limit, ...]
+) -> IntArray:
+    """Signs of sin(beta), level3, planar, elevation as bits; -1 where P cannot be."""
+    found = factors_at(points, branch, geometry)
+    values = np.concatenate([found.parallel, found.constraint[..., None]], axis=-1)
+    codes: IntArray = np.where(
+        np.isnan(values[..., 0]), -1, ((values > 0) * np.array(_BITS)).sum(axis=-1)
+    )
+    for limit in limits:
+        kept = codes >= 0
+        codes[kept] = np.where(limit(points[kept], branch, geometry), codes[kept], -1)
+    return codes
 
 
 def _neighbours(shape: tuple[int, ...]) -> list[tuple[tuple[slice, ...], tuple[slice, ...]]]:

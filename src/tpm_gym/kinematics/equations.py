@@ -84,7 +84,7 @@ def arms(theta: Triple, g: Lengths, ns: Namespace) -> tuple[Triple, Triple]:
 
 def assembly_at(
     cos: Triple, sin: Triple, planar: Numbers, side: Numbers, g: Lengths, ns: Namespace
-) -> tuple[Assembly, Numbers, tuple[Numbers, Numbers, Numbers, Numbers]]:
+) -> tuple[Assembly, Numbers, tuple[Numbers, Numbers, Numbers, Numbers, Numbers]]:
     """Forward kinematics (Eqs. 6 to 11, corrected) for the signs of planar factor and sin(beta).
 
     Eq. (6): C1 is on the circle about (0, z1) with radius^2 = l4^2 - y1^2 and on the circle about
@@ -92,8 +92,9 @@ def assembly_at(
     first to the second centre has a positive planar factor.
 
     Returns:
-        The assembly; whether it is real; and, for the margins, y1, the circles' distance^2, and
-        level and vertical from B3 to where C3 would be without link 7, m.
+        The assembly; whether it is real; and, for the margins, whether xC and zC are and rod 11
+        fits (for any beta if the assembly is not real, where a2 = b2 = 0), y1, the circles'
+        distance^2, and level and vertical from B3 to where C3 would be without link 7, m.
     """
     l4, l7 = g.l4, g.l7
     y1, z1 = g.l1 + cos[0], sin[0]
@@ -112,11 +113,14 @@ def assembly_at(
     # Rounding in C1 grows as the inverse of the planar factor, and in cos(beta) again as that of u;
     # the cap, 64, keeps what the clipped cosine leaves of a gap in rod 11 below l4 / 1e12.
     blur = (1 + l4 * l4 / ns.maximum(distance2 * root, l4 * l4 / 63)) * (ROUNDING * l4 * l4)
-    real = meet & (abs(numerator) <= abs(denominator) + blur)
+    turned = abs(denominator)
+    reached = meet & (abs(numerator) <= turned + blur)
+    real = reached & (turned > blur)
     cos_beta = ns.clip(numerator / denominator)
     sin_beta = side * ns.root((1 - cos_beta) * (1 + cos_beta))
     x, y, z = x_c + l7 * cos_beta + g.l2, l7 * sin_beta, z_c + 2 * g.l6  # Eq. (11)
-    return Assembly(x, y, z, x_c, z_c, cos_beta, sin_beta), real, (y1, distance2, u, w)
+    found = Assembly(x, y, z, x_c, z_c, cos_beta, sin_beta)
+    return found, real, (reached, y1, distance2, u, w)
 
 
 def posture_at(
@@ -318,9 +322,11 @@ def no_assembly(theta: Vector, branch: AssemblyMode, g: Geometry) -> Unreachable
     """Which loop keeps a branch from being assembled at theta (3) rad, and by how much."""
     with np.errstate(all="ignore"):
         cos, sin = arms(tuple(map(np.float64, theta)), g, NUMPY)
-        _, _, lengths = assembly_at(cos, sin, branch.planar, branch.sin_beta, g, NUMPY)
-    y1, distance2, level, vertical = map(float, lengths)
+        _, _, found = assembly_at(cos, sin, branch.planar, branch.sin_beta, g, NUMPY)
+    free, y1, distance2, level, vertical = map(float, found)
     hint = f"choose joint angles within reach (branch {branch})"
+    if free:
+        return UnreachableError(theta, "loop 2 (beta is free: a2 = b2 = 0)", 0.0, hint)
     if abs(y1) >= g.l4:
         return UnreachableError(theta, "loop 1 (rod B1C1 to y = 0)", g.l4 - abs(y1), hint)
     radius, distance = math.sqrt(g.l4**2 - y1**2), math.sqrt(distance2)

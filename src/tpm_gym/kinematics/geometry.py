@@ -7,6 +7,10 @@ from numbers import Real
 from tpm_gym.errors import GeometryError, InputError
 from tpm_gym.kinematics.namespaces import Numbers
 
+_CLOSE = 1e-4
+"""Of l1. Circles whose y_B1 is so small have radii that differ by less than 1e-10 of l1, and where
+they meet follows from angles with an error of rounding over that."""
+
 
 @dataclass(frozen=True)
 class Lengths:
@@ -51,12 +55,14 @@ class Geometry(Lengths):
         """Reject lengths that make no mechanism."""
         for field in fields(self):
             self._check_length(field.name)
-        if math.isclose(self.l3, self.l1, rel_tol=1e-9):
-            raise GeometryError("l3", self.l3, f"the paper requires l3 != l1 = {self.l1} m")
-        if self.l3 > self.l1 and math.isclose(self.l5, self.l1, rel_tol=1e-9):
-            # At cos(theta_1) = -l1/l3 and cos(theta_2) = (l1 - 2 l5)/l3 = -l1/l3 the two circles
-            # of Eq. (6) would be one circle: Eq. (7) reads 0 = 0, sub-chain I-II moves freely.
-            raise GeometryError("l5", self.l5, f"it must differ from l1 = {self.l1} m")
+        l1, l5 = self.l1, self.l5
+        close = _CLOSE * l1
+        if self.l3 > l1 - close and min(l5, abs(l5 - l1)) < close:
+            # At a1 = b1 = 0 the two circles of Eq. (6) are concentric, and y_B1 is 2 l5 or
+            # 2 (l1 - l5). Where it is 0 they are one circle, and sub-chain I-II moves freely.
+            raise GeometryError(
+                "l5", l5, f"it must differ from 0 and from l1 = {l1} m by {close:.3g} m or more"
+            )
         if self.l4 <= self.l1 - self.l3:
             raise GeometryError(
                 "l4",

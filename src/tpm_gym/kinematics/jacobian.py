@@ -32,14 +32,15 @@ _FACTORS = _PARALLEL, np.arange(3, 7), np.array(7)
 
 @dataclass(frozen=True)
 class Factors:
-    """Factors of both Jacobian determinants; a configuration is singular where one is zero.
+    """Factors of both Jacobian determinants and of the constraint; singular is where one is zero.
 
     Attributes:
         parallel: (..., 3): sin(beta); l1 + l3 c3 - xC - 2 l2 (m); the planar factor (m^2), as in
             Eq. (16), corrected.
         serial: (..., 4): cos(beta); B_iC_i . dB_i/dtheta_i (m^2/rad) for i = 1, 2, 3, as in
             Eq. (17), corrected.
-        constraint: (...,) m, z_C1 - z_B1: zero at a constraint singularity, a factor of neither.
+        constraint: (...,) m, z_C1 - z_B1: zero at a constraint singularity. A factor of neither,
+            but of the closures' determinant once link 3' may turn about y.
     """
 
     parallel: FloatArray

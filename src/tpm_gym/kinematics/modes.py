@@ -122,7 +122,8 @@ class ForwardSolutions:
     """All solutions of the forward kinematics, one slot per :data:`ASSEMBLY_MODES` entry.
 
     Attributes:
-        position: (..., 4, 3) m, point P in the paper frame; NaN where not real.
+        position: (..., 4, 3) m, point P in the paper frame; NaN where not real. Where beta is
+            free, z alone is a number.
         beta: (..., 4) rad, passive angle of link 7 in (-pi, pi]; NaN where not real.
         valid: (..., 4) bool, which branches are real.
         geometry: The lengths they were solved for.
@@ -132,6 +133,16 @@ class ForwardSolutions:
     beta: FloatArray
     valid: BoolArray
     geometry: Geometry
+
+    @property
+    def free(self) -> BoolArray:
+        """(..., 4) bool, where the mechanism closes for every beta, at a2 = b2 = 0 of Eq. (10).
+
+        The platform can then run along a circle with all motors held, and no branch is valid.
+        """
+        z = self.position[..., 2]
+        found: BoolArray = (z == z) & ~self.valid
+        return found
 
     @property
     def link3(self) -> FloatArray:

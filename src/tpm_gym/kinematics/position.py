@@ -49,8 +49,9 @@ _ANGLE_BETA = np.array([12 + (mode.cos_beta + 1) // 2 for mode in WORKING_MODES]
 def forward_all(theta: ArrayLike, geometry: Geometry = PAPER) -> ForwardSolutions:
     """Solve the forward kinematics on all 4 branches, at actuated angles theta (..., 3) rad.
 
-    A branch keeps its slot as theta moves, and holds NaN where it is not real. Link 3' translates;
-    assemblies with link 3' turned are those of :func:`.rotated.forward_rotated`.
+    A branch keeps its slot as theta moves, and holds NaN where it is not real, but for z where
+    beta is free. Link 3' translates; assemblies with link 3' turned are those of
+    :func:`.rotated.forward_rotated`.
     """
     require_geometry(geometry)
     angles = points("theta", theta)
@@ -133,10 +134,12 @@ def _assembled(theta: FloatArray, branch: AssemblyMode, geometry: Geometry) -> F
 def _assemblies(theta: equations.Triple, g: Geometry, ns: Namespace) -> list[Any]:
     """Both planar signs; the other half is the mirror image."""
     cos, sin = equations.arms(theta, g, ns)
-    found, real, _ = equations.assembly_at(cos, sin, ns.signs(theta[0], (2, 1)), 1.0, g, ns)
-    x, y, z, cos_beta = (
-        ns.where(real, values, math.nan) for values in (found.x, found.y, found.z, found.cos_beta)
+    planar = ns.signs(theta[0], (2, 1))
+    found, real, (reached, *_) = equations.assembly_at(cos, sin, planar, 1.0, g, ns)
+    x, y, cos_beta = (
+        ns.where(real, values, math.nan) for values in (found.x, found.y, found.cos_beta)
     )
+    z = ns.where(reached, found.z, math.nan)
     beta = ns.arccos(cos_beta)
     return [*x, *y, *-y, *z, *beta, *-beta]
 

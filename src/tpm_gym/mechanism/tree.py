@@ -24,7 +24,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tpm_gym.arrays import Vector, vector
+from tpm_gym.arrays import FloatArray, Vector, vector
 from tpm_gym.errors import InputError
 from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode, passive_angles
 from tpm_gym.kinematics.geometry import PAPER, Geometry
@@ -34,7 +34,13 @@ from tpm_gym.mechanism.bodies import Closure, Joint, Link, Mechanism, Solid
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.motor import TORQUE_MOTOR
 
-__all__ = ["ACTUATED_JOINTS", "build", "joint_angles", "rotated_joint_angles"]
+__all__ = [
+    "ACTUATED_JOINTS",
+    "build",
+    "joint_angles",
+    "joint_arrays",
+    "rotated_joint_angles",
+]
 
 ACTUATED_JOINTS = ("R11", "R21", "R31")
 """The motors, in the order of theta_1, theta_2, theta_3."""
@@ -283,10 +289,18 @@ def joint_angles(
         InputError: If theta has the wrong shape or is not finite.
         UnreachableError: If the branch does not exist at theta.
     """
+    angles = joint_arrays(theta, branch, geometry)
+    return {name: float(angle) for name, angle in angles.items()}
+
+
+def joint_arrays(
+    theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
+) -> dict[str, FloatArray]:
+    """The same for theta (..., 3), each (...,)."""
     passive = passive_angles(theta, branch, geometry)
-    theta_1, theta_2, theta_3 = np.asarray(theta, dtype=np.float64)
+    theta_1, theta_2, theta_3 = np.moveaxis(np.asarray(theta, dtype=np.float64), -1, 0)
     # Absolute directions become joint angles by subtracting the parent's direction.
-    angles = {
+    return {
         "R11": theta_1,
         "Sa_swing": passive.rod4_swing - theta_1,
         "Sa_tilt": passive.rod4_tilt,
@@ -297,14 +311,13 @@ def joint_angles(
         "R23": -passive.rod6_swing,
         "R12": passive.beta,
         "R13": -passive.beta,
-        "cup_slide": 0.0,
+        "cup_slide": 0.0 * theta_1,
         "R33": passive.rod11_swing,  # end links 9 and 10 stay parallel
         "R31": theta_3,
         "R32": passive.rod11_swing - theta_3,
         "Re": passive.rod11_tilt,
         "Rf": passive.rod11_tilt,
     }
-    return {name: float(angle) for name, angle in angles.items()}
 
 
 def rotated_joint_angles(

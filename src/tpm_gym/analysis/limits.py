@@ -1,0 +1,156 @@
+"""What the closed forms allow and the machine does not: motors' stops, and links in the way.
+
+A limit tells of points that are reached on a working mode whether the machine can be there; the
+functions of :mod:`tpm_gym.analysis.aspects` take any number of them as ``limits``. Bodies are those
+of :mod:`tpm_gym.mechanism.tree`, whose sections do not scale with the lengths.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from itertools import combinations, product
+from typing import NamedTuple
+
+import numpy as np
+
+from tpm_gym.arrays import BoolArray, FloatArray
+from tpm_gym.kinematics import ASSEMBLY_MODES, inverse
+from tpm_gym.kinematics.geometry import Geometry
+from tpm_gym.kinematics.modes import WorkingMode
+from tpm_gym.kinematics.workspace import assembly_of
+from tpm_gym.mechanism import tree
+from tpm_gym.mechanism.bodies import Joint, Link, Mechanism
+
+Limit = Callable[[FloatArray, WorkingMode, Geometry], BoolArray]
+"""From points (n, 3) m that are reached on a working mode, to which of them it allows, (n,)."""
+
+_SLENDER = 2.0  # times as long as wide
+_BLOCK = 4096
+
+Place = tuple[FloatArray, FloatArray]
+
+
+class Capsule(NamedTuple):
+    """All points within ``radius`` of a line, m, in the frame of a link."""
+
+    link: str
+    start: FloatArray
+    end: FloatArray
+    radius: float
+
+
+def within_stops(points: FloatArray, branch: WorkingMode, geometry: Geometry) -> BoolArray:
+    """Whether all motors are between their stops."""
+    theta = inverse(points, branch, geometry)
+    motors = tree.build(geometry).motors
+    low, high = ([getattr(motor, end) for motor in motors] for end in ("lower", "upper"))
+    return np.asarray(((theta >= low) & (theta <= high)).all(axis=-1))
+
+
+def clear_of_links(points: FloatArray, branch: WorkingMode, geometry: Geometry) -> BoolArray:
+    """Whether no two links touch that no joint joins, as :func:`capsules` has them."""
+    return clearance(points, branch, geometry) > 0
+
+
+def clearance(points: FloatArray, branch: WorkingMode, geometry: Geometry) -> FloatArray:
+    """Between the two links that are nearest to each other, (n,) m; negative where they overlap.
+
+    Links that a joint joins do not count, nor does what is compact: hubs, motors and the base.
+    """
+    mechanism = tree.build(geometry)
+    parts = [part for link in mechanism.links for part in capsules(link)]
+    apart = _unjoined(mechanism)
+    pairs = [(i, j) for i, j in combinations(range(len(parts)), 2)
+             if frozenset((parts[i].link, parts[j].link)) in apart]  # fmt: skip
+    result = np.full(len(points), np.inf)
+    slots = assembly_of(points, branch, geometry)
+    theta = inverse(points, branch, geometry)
+    for mode in ASSEMBLY_MODES:
+        here = np.flatnonzero(slots == mode.index)
+        for start in range(0, len(here), _BLOCK):
+            rows = here[start : start + _BLOCK]
+            joints = tree.joint_arrays(theta[rows], mode, geometry)
+            places = _places(mechanism, joints, len(rows))
+            ends = [tuple(_moved(places[p.link], end) for end in p[1:3]) for p in parts]
+            for i, j in pairs:
+                gap = _between(*ends[i], *ends[j]) - parts[i].radius - parts[j].radius
+                result[rows] = np.minimum(result[rows], gap)
+    return result
+
+
+def capsules(link: Link) -> Iterator[Capsule]:
+    """The slender solids of a link: a bar as one capsule, a flat box as several side by side."""
+    for solid in link.solids:
+        size = 2 * solid.half_extent
+        narrow, wide, long = np.argsort(size, kind="stable")
+        if solid.kind == "cylinder":
+            long = "xyz".index(solid.axis)
+            narrow = wide = (long + 1) % 3
+        if size[long] < _SLENDER * size[wide]:
+            continue
+        radius = size[narrow] / 2
+        along, across = np.zeros(3), np.zeros(3)
+        along[long], across[wide] = size[long] / 2 - radius, size[wide] / 2 - radius
+        count = int(np.ceil(size[wide] / size[narrow] - 1e-9))
+        for share in np.linspace(-1, 1, count) if count > 1 else (0.0,):
+            middle = np.asarray(solid.centre) + share * across
+            yield Capsule(link.name, middle - along, middle + along, float(radius))
+
+
+def _unjoined(mechanism: Mechanism) -> set[frozenset[str]]:
+    """Pairs of links that no joint joins; a universal joint's cross counts as part of its rod."""
+    whole = {link.name: link.name for link in mechanism.links}
+    joints = [link.joint for link in mechanism.links]
+    for link, joint in zip(mechanism.links, joints, strict=True):
+        if joint is not None and joint.kind != "prismatic" and not any(joint.origin):
+            whole[joint.parent] = link.name
+    joined = [(link.name, joint.parent) for link, joint in zip(mechanism.links, joints, strict=True)
+              if joint is not None]  # fmt: skip
+    joined += [(closure.link_a, closure.link_b) for closure in mechanism.closures]
+    near = {frozenset((whole[one], whole[other])) for one, other in joined}
+    every = {frozenset(pair) for pair in product(whole.values(), repeat=2)}
+    return {pair for pair in every - near if len(pair) == 2}
+
+
+def _places(mechanism: Mechanism, joints: dict[str, FloatArray], count: int) -> dict[str, Place]:
+    """Orientation (n, 3, 3) and origin (n, 3) m of every link."""
+    base = mechanism.links[0].name
+    places = {base: (np.broadcast_to(np.eye(3), (count, 3, 3)), np.zeros((count, 3)))}
+    for link in mechanism.links[1:]:
+        joint = link.joint
+        assert joint is not None
+        turned, _ = places[joint.parent]
+        origin = _moved(places[joint.parent], np.asarray(joint.origin))
+        if joint.kind != "prismatic":
+            turned = turned @ _turn(joint, np.broadcast_to(joints[joint.name], count))
+        places[link.name] = turned, origin
+    return places
+
+
+def _turn(joint: Joint, angle: FloatArray) -> FloatArray:
+    """Rodrigues' formula, (n, 3, 3)."""
+    x, y, z = joint.axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    sin, cos = (np.asarray(f(angle))[:, None, None] for f in (np.sin, np.cos))
+    turned: FloatArray = np.eye(3) + sin * cross + (1 - cos) * cross @ cross
+    return turned
+
+
+def _moved(place: Place, point: FloatArray) -> FloatArray:
+    """A point (3,) of a link's frame in the paper's, (n, 3) m."""
+    turned, origin = place
+    return origin + turned @ point
+
+
+def _between(p1: FloatArray, q1: FloatArray, p2: FloatArray, q2: FloatArray) -> FloatArray:
+    """Distance of the segments p1 q1 and p2 q2, (n,): least over both parameters in [0, 1]."""
+    one, other, start = q1 - p1, q2 - p2, p1 - p2
+    a, b, e = (np.einsum("ni,ni->n", *pair) for pair in ((one, one), (one, other), (other, other)))
+    c, f = (np.einsum("ni,ni->n", line, start) for line in (one, other))
+    square = a * e - b * b
+    s = np.where(square > 1e-12 * a * e, (b * f - c * e) / np.where(square > 0, square, 1.0), 0.0)
+    t = np.clip((b * np.clip(s, 0.0, 1.0) + f) / e, 0.0, 1.0)
+    s = np.clip((b * t - c) / a, 0.0, 1.0)
+    gap = start + s[:, None] * one - t[:, None] * other
+    distance: FloatArray = np.sqrt(np.einsum("ni,ni->n", gap, gap))
+    return distance
