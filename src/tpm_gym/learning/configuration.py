@@ -97,7 +97,7 @@ class TrainingConfig:
     eval_every: Annotated[int, unset(int, "a tenth of the steps", "INT")] = UNSET
     """Steps between evaluations on held-out seeds."""
 
-    eval_episodes: int = 20
+    eval_episodes: Annotated[int, unset(int, "20; 200 in --engine analytic", "INT")] = UNSET
     """Episodes per evaluation."""
 
     test_episodes: int = 100
@@ -176,6 +176,7 @@ def complete(config: TrainingConfig) -> TrainingConfig:
         "recipe_file": file,
         "run": Path("runs", f"{env}-{config.algo}-s{config.seed}"),
         "eval_every": max(1, steps // 10),
+        "eval_episodes": 200 if config.in_batches else 20,
     }
     missing = {name: v for name, v in worked_out.items() if getattr(config, name) is UNSET}
     config = replace(config, recipe=recipe, **missing)
