@@ -16,15 +16,15 @@ $(INSTALLED): pyproject.toml constraints.txt
 	$(RUN) -m pip install -c constraints.txt -e ".[train,test]"
 	touch $@
 
-demo: $(INSTALLED) ## train Reach, evaluate it, film the published pick-and-place policy; see runs/demo/
-	$(VENV)/bin/tpm-gym train --env TPMReach-v0 --algo sac --seed 0 --run runs/demo/reach --overwrite
-	cp runs/demo/reach/learning_curve.png runs/demo/learning_curve.png
-	$(VENV)/bin/tpm-gym evaluate --policy runs/demo/reach/best.json expert random \
-		--env TPMReach-v0 --episodes 100 --json runs/demo/reach.json
-	$(VENV)/bin/tpm-gym evaluate --policy train/policies/TPMPickAndPlace-v0.json --episodes 20 --seed 2000006 \
-		--json runs/demo/pick_and_place.json --video runs/demo/pick_and_place.mp4 \
-		--picture runs/demo/pick_and_place.png
-	@echo; echo "runs/demo/ now holds:"; ls runs/demo runs/demo/reach
+demo: $(INSTALLED) ## train pick-and-place in closed form, test it in PyBullet, film it; see runs/demo/
+	$(VENV)/bin/tpm-gym train --algo ppo --engine analytic --env TPMPickAndPlaceDense-v0 --seed 0 --test-episodes 0 \
+		--run runs/demo/pick_and_place --overwrite
+	cp runs/demo/pick_and_place/learning_curve.png runs/demo/learning_curve.png
+	$(VENV)/bin/tpm-gym evaluate --policy runs/demo/pick_and_place/best.json expert random \
+		--env TPMPickAndPlaceDense-v0 --episodes 100 --json runs/demo/pick_and_place.json
+	$(VENV)/bin/tpm-gym evaluate --policy runs/demo/pick_and_place/best.json --episodes 3 --seed 2000006 \
+		--video runs/demo/pick_and_place.mp4 --picture runs/demo/pick_and_place.png
+	@echo; echo "runs/demo/ now holds:"; ls runs/demo runs/demo/pick_and_place
 
 test: lint test-fast ## what CI runs: lint, types, fast tests
 
