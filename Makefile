@@ -4,7 +4,7 @@ VENV := .venv
 RUN := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
 
-.PHONY: help demo test lint format test-fast test-slow test-wheel urdf pictures figures gradients results bench-kinematics bench-engine bench-engines bench-fidelity bench-evaluate bench-speed soak clean
+.PHONY: help demo test lint format test-fast test-slow test-wheel urdf pictures figures gradients results bench-kinematics bench-engine bench-transfer bench-engines bench-fidelity bench-evaluate bench-speed soak clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -78,6 +78,9 @@ bench-engines: $(INSTALLED) ## both engines and theory on the same commands; pol
 bench-engine: $(INSTALLED) ## the closed form as an engine: speed and agreement, beside PyBullet and panda-gym
 	$(RUN) -m pip install -c constraints.txt -e ".[bench]"
 	$(RUN) benchmarks/bench_engine.py
+
+bench-transfer: $(INSTALLED) ## policies trained in one engine (the runs in runs/transfer), tested in all
+	$(RUN) benchmarks/bench_transfer.py --jobs 2
 
 bench-speed: $(INSTALLED) ## steps per second beside panda-gym and Gymnasium-Robotics
 	$(RUN) -m pip install -c constraints.txt -e ".[bench]"

@@ -1,0 +1,198 @@
+"""Where policies were trained, and where they were tested: closed form, PyBullet, MuJoCo; drives.
+
+    tpm-gym train --algo ppo --engine analytic --env TPMPickAndPlaceDense-v0 --seed 0   # and so on
+    make bench-transfer
+    python benchmarks/bench_transfer.py --runs runs --episodes 200 --jobs 2
+
+Tested is what ``--runs`` holds: each run's best policy, in the engine it was trained in and in the
+others, with ideal and servo drives. Runs that stopped early, whose policies drop and shove, come
+of ``--steps``; besides, a scripted policy shoves the puck towards the goal and never picks it up:
+that is where an engine with a simpler contact would be found out. The published policies were
+trained in PyBullet.
+
+Everything goes to docs/records/transfer.json, and from there into docs/closed-form.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import machine
+import numpy as np
+from engine_matrix import DRIVES
+from engine_report import table
+from machine import ROOT
+
+from tpm_gym.learning.environments import make_env, make_envs
+from tpm_gym.learning.estimates import wilson
+from tpm_gym.learning.policies import TrainedPolicy, load_policy
+from tpm_gym.learning.rollout import (
+    TEST_SEED,
+    Action,
+    Observation,
+    Policy,
+    run_batch,
+    run_episodes,
+)
+from tpm_gym.mechanism.cup import CUP
+
+RECORD = ROOT / "docs" / "records" / "transfer.json"
+PAGE = ROOT / "docs" / "closed-form.md"
+BEGIN, END = "<!-- transfer: begin -->", "<!-- transfer: end -->"
+ENGINES = ("analytic", "pybullet", "mujoco")
+PUBLISHED = ("TPMPickAndPlace-v0", "TPMPickAndPlaceJoints-v0")
+SHOVING = "shoving"
+_GENTLE = 0.3
+"""Of full speed, so that the puck does not slide far beyond the goal."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A policy in an engine with a drive.
+
+    Attributes:
+        kind: Which policies are put together: id, engine and steps of their training.
+    """
+
+    kind: str
+    env_id: str
+    policy: str
+    engine: str
+    drive: str
+    episodes: int
+
+
+class Shoving:
+    """Comes down behind the puck and shoves it to where the goal is, without vacuum."""
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        """Take the environment, of which it sees the state."""
+        self._inner: Any = env.unwrapped
+        self._down = False
+
+    def reset(self, observation: Observation, seed: int) -> None:
+        """Begin above the table."""
+        del observation, seed
+        self._down = False
+
+    def act(self, observation: Observation) -> Action:
+        """One step of the way."""
+        inner, state = self._inner, self._inner.state
+        puck, goal = state.object_position[0], observation["desired_goal"].astype(np.float64)
+        way = (goal - puck)[:2]
+        way /= max(float(np.linalg.norm(way)), 1e-6)
+        block = inner.task.scene.objects[0]
+        low = block.height + CUP.length - 0.003  # as low as the region goes
+        behind = puck[:2] - way * (0.75 * block.width + CUP.radius)
+        lip = state.fk_position[:2]
+        self._down |= float(np.linalg.norm(lip - behind)) < 0.006
+        ahead = goal[:2] - way * (block.width / 2 + CUP.radius)
+        target = np.array([*(ahead if self._down else behind), low])
+        if not self._down or state.fk_position[2] > low + 0.004:
+            target[:2] = behind
+            target[2] += 0.0 if self._down else 0.02
+        to_paper = inner.machine.mount.to_paper
+        wanted = inner.machine.region.project(to_paper(target))
+        action = inner.control.action(wanted, to_paper(state.command))
+        if self._down:
+            action = action * _GENTLE
+        return np.array([*action, -1.0], dtype=np.float32)
+
+
+def cells(runs: Path, episodes: int) -> Iterator[Cell]:
+    """Every policy in every engine with every drive."""
+    policies = [
+        (_kind(json.loads(file.read_text(encoding="utf-8"))), str(file.parent))
+        for file in sorted(runs.glob("*/config.json"))
+    ]
+    policies += [(f"{env_id}: SAC, pybullet, published", env_id) for env_id in PUBLISHED]
+    policies += [(f"{PUBLISHED[0]}: {SHOVING}", SHOVING)]
+    for kind, policy in policies:
+        env_id = kind.split(":")[0]
+        for engine in ENGINES:
+            for drive in DRIVES:
+                yield Cell(kind, env_id, policy, engine, drive, episodes)
+
+
+def _kind(config: dict[str, Any]) -> str:
+    engine = config["env_options"].get("engine", "pybullet")
+    return f"{config['env']}: {config['algo'].upper()}, {engine}, {config['steps']:,} steps"
+
+
+def run(cell: Cell) -> dict[str, Any]:
+    """Evaluate one cell on the seeds that ``tpm-gym evaluate`` takes."""
+    options = {"engine": cell.engine, "drive": cell.drive}
+    with closing(make_env(cell.env_id, **options)) as env:
+        policy: Policy = Shoving(env) if cell.policy == SHOVING else load_policy(cell.policy, env)
+        if cell.engine == "analytic" and isinstance(policy, TrainedPolicy):
+            envs = make_envs(cell.env_id, cell.episodes, **options)
+            found = run_batch(envs, policy, cell.episodes, TEST_SEED)
+        else:
+            found = run_episodes(env, policy, cell.episodes, TEST_SEED)
+    return {**vars(cell), "successes": [episode.success_at_end for episode in found]}
+
+
+def lines(record: dict[str, Any]) -> Iterator[str]:
+    """The table as Markdown: policies of a kind together, median and range over seeds."""
+    yield f"`make bench-transfer`, {record['episodes']} episodes a policy and cell."
+    yield ""
+    columns = [(engine, drive) for engine in ENGINES for drive in DRIVES]
+    kinds = list(dict.fromkeys(cell["kind"] for cell in record["cells"]))
+    yield from table(
+        ["trained", "policies", *(f"{engine}, {drive}" for engine, drive in columns)],
+        [[kind, *_row(kind, columns, record["cells"])] for kind in kinds],
+    )
+
+
+def _row(kind: str, columns: list[tuple[str, str]], found: list[dict[str, Any]]) -> Iterator[str]:
+    own = [cell for cell in found if cell["kind"] == kind]
+    yield str(len({cell["policy"] for cell in own}))
+    for engine, drive in columns:
+        here = [c for c in own if (c["engine"], c["drive"]) == (engine, drive)]
+        rates = [100 * float(np.mean(cell["successes"])) for cell in here]
+        if len(rates) > 1:
+            yield f"{np.median(rates):.1f}% ({min(rates):.1f} to {max(rates):.1f})"
+        else:
+            only = wilson(here[0]["successes"])
+            yield f"{rates[0]:.1f}% [{100 * only.low:.1f}, {100 * only.high:.1f}]"
+
+
+def main() -> None:
+    """Parse the options and run."""
+    parser = argparse.ArgumentParser(description="Policies trained here, tested there.")
+    parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "transfer")
+    parser.add_argument("--episodes", type=int, default=200)
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--dry", action="store_true", help="writes no files")
+    options = parser.parse_args()
+    todo = list(cells(options.runs, options.episodes))
+    found = []
+    with ProcessPoolExecutor(options.jobs) as pool:
+        for cell in pool.map(run, todo):
+            rate = 100 * np.mean(cell["successes"])
+            print(cell["kind"], cell["engine"], cell["drive"], f"{rate:.1f}%", file=sys.stderr)
+            found.append({**cell, "policy": Path(cell["policy"]).name})
+    record = {
+        "machine": machine.describe(sys.argv),
+        "episodes": options.episodes,
+        "cells": found,
+    }
+    print("\n".join(lines(record)))
+    if not options.dry:
+        RECORD.write_text(json.dumps(record) + "\n", encoding="utf-8")
+        before, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
+        text = "\n".join([BEGIN, *lines(record), END])
+        PAGE.write_text(before + text + rest.split(END)[1], encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
