@@ -5,10 +5,9 @@
     python benchmarks/bench_transfer.py --runs runs --episodes 200 --jobs 2
 
 Tested is what ``--runs`` holds: each run's best policy, in the engine it was trained in and in the
-others, with ideal and servo drives. Runs that stopped early, whose policies drop and shove, come
-of ``--steps``; besides, a scripted policy shoves the puck towards the goal and never picks it up:
-that is where an engine with a simpler contact would be found out. The published policies were
-trained in PyBullet.
+others, with ideal and servo drives. Runs that stopped early come of ``--steps``: their policies
+drop and shove, which is where an engine with a simpler contact would be found out. The published
+policies were trained in PyBullet.
 
 Everything goes to docs/records/transfer.json, and from there into docs/closed-form.md.
 """
@@ -25,7 +24,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import machine
 import numpy as np
 from engine_matrix import DRIVES
@@ -35,24 +33,13 @@ from machine import ROOT
 from tpm_gym.learning.environments import make_env, make_envs
 from tpm_gym.learning.estimates import wilson
 from tpm_gym.learning.policies import TrainedPolicy, load_policy
-from tpm_gym.learning.rollout import (
-    TEST_SEED,
-    Action,
-    Observation,
-    Policy,
-    run_batch,
-    run_episodes,
-)
-from tpm_gym.mechanism.cup import CUP
+from tpm_gym.learning.rollout import TEST_SEED, run_batch, run_episodes
 
 RECORD = ROOT / "docs" / "records" / "transfer.json"
 PAGE = ROOT / "docs" / "closed-form.md"
 BEGIN, END = "<!-- transfer: begin -->", "<!-- transfer: end -->"
 ENGINES = ("analytic", "pybullet", "mujoco")
 PUBLISHED = ("TPMPickAndPlace-v0", "TPMPickAndPlaceJoints-v0")
-SHOVING = "shoving"
-_GENTLE = 0.3
-"""Of full speed, so that the puck does not slide far beyond the goal."""
 
 
 @dataclass(frozen=True)
@@ -71,43 +58,6 @@ class Cell:
     episodes: int
 
 
-class Shoving:
-    """Comes down behind the puck and shoves it to where the goal is, without vacuum."""
-
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
-        """Take the environment, of which it sees the state."""
-        self._inner: Any = env.unwrapped
-        self._down = False
-
-    def reset(self, observation: Observation, seed: int) -> None:
-        """Begin above the table."""
-        del observation, seed
-        self._down = False
-
-    def act(self, observation: Observation) -> Action:
-        """One step of the way."""
-        inner, state = self._inner, self._inner.state
-        puck, goal = state.object_position[0], observation["desired_goal"].astype(np.float64)
-        way = (goal - puck)[:2]
-        way /= max(float(np.linalg.norm(way)), 1e-6)
-        block = inner.task.scene.objects[0]
-        low = block.height + CUP.length - 0.003  # as low as the region goes
-        behind = puck[:2] - way * (0.75 * block.width + CUP.radius)
-        lip = state.fk_position[:2]
-        self._down |= float(np.linalg.norm(lip - behind)) < 0.006
-        ahead = goal[:2] - way * (block.width / 2 + CUP.radius)
-        target = np.array([*(ahead if self._down else behind), low])
-        if not self._down or state.fk_position[2] > low + 0.004:
-            target[:2] = behind
-            target[2] += 0.0 if self._down else 0.02
-        to_paper = inner.machine.mount.to_paper
-        wanted = inner.machine.region.project(to_paper(target))
-        action = inner.control.action(wanted, to_paper(state.command))
-        if self._down:
-            action = action * _GENTLE
-        return np.array([*action, -1.0], dtype=np.float32)
-
-
 def cells(runs: Path, episodes: int) -> Iterator[Cell]:
     """Every policy in every engine with every drive."""
     policies = [
@@ -115,7 +65,6 @@ def cells(runs: Path, episodes: int) -> Iterator[Cell]:
         for file in sorted(runs.glob("*/config.json"))
     ]
     policies += [(f"{env_id}: SAC, pybullet, published", env_id) for env_id in PUBLISHED]
-    policies += [(f"{PUBLISHED[0]}: {SHOVING}", SHOVING)]
     for kind, policy in policies:
         env_id = kind.split(":")[0]
         for engine in ENGINES:
@@ -132,7 +81,7 @@ def run(cell: Cell) -> dict[str, Any]:
     """Evaluate one cell on the seeds that ``tpm-gym evaluate`` takes."""
     options = {"engine": cell.engine, "drive": cell.drive}
     with closing(make_env(cell.env_id, **options)) as env:
-        policy: Policy = Shoving(env) if cell.policy == SHOVING else load_policy(cell.policy, env)
+        policy = load_policy(cell.policy, env)
         if cell.engine == "analytic" and isinstance(policy, TrainedPolicy):
             envs = make_envs(cell.env_id, cell.episodes, **options)
             found = run_batch(envs, policy, cell.episodes, TEST_SEED)
