@@ -28,7 +28,10 @@ SEEN_BY_LIP = 6e-4  # m; at this distance lip and block keep from going deeper t
 
 ROUNDING = 1e-3  # m; of the edges of cup and block for each other
 _BELLOWS = 0.015  # m; length of the part of the cup that touches
+_COUNT, _RUB = 15, slice(13, 15)
+_BORNE = np.array([0, 1, 2, 3] * 2 + [4, 4])  # contacts whose press bears friction's impulses
 _SWEEPS = 6
+_EASE = 0.6
 _RELAXATION = 1 / 5.5  # of 1/m: between the inverse inertias of heave, 4, and of tilting, 7.1
 _RUBBING = 1 / 10  # the same for friction, of 8.9 for slipping and 12 for turning
 SLIP = 1e-4  # m/s; what is slower has no direction
@@ -36,7 +39,6 @@ LEAST = 0.02  # of friction along an axis, whatever the direction of the slip
 _NEVER = -1e3  # m/s
 _LITTLE = 1e-12
 
-_EAST, _NORTH, _UP = np.eye(3)
 _SIGNS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)]).T
 
 
@@ -107,131 +109,122 @@ def tumble(
         step: s.
     """
     frame = axes(body.turn)
-    corners = _sum3(frame[:, :, None] * (_SIGNS * np.array(half)[:, None])[:, None, :, None])
-    masses = _Masses.of(frame[2], mass, half)
-    gap = body.position[2] + corners[2] - level
-    flat, zero = np.zeros_like(gap), np.zeros_like(mass)
-    below = _Rows(masses, _jacobian(_UP, corners), _RELAXATION * mass)
-    sides = np.concatenate([_jacobian(_EAST, corners), _jacobian(_NORTH, corners)])
-    drag = _Rows(masses, sides, _RUBBING * mass)
     touch = _touch(body.position, frame, lip, half)
-    lips = _lip_rows(masses, touch) if (touch.gap < SEEN_BY_LIP).any() else None
-
+    arms, gap = _corners(body.position[2] - level, frame, half)
+    jacobian = _jacobian(arms, touch)
     start = np.concatenate([body.velocity, body.spin])
     start[2] -= GRAVITY * step
-    least = np.maximum(least_rise(gap) / step, _NEVER)
-    push = np.maximum(least_rise(touch.gap, SEEN_BY_LIP) / step, _NEVER)
-    push = push + _sum3(touch.normal * lip.velocity)
+    wanted = np.zeros((_COUNT, len(mass)))
+    wanted[:4] = least_rise(gap) / step
+    wanted[4] = least_rise(touch.gap, SEEN_BY_LIP) / step
+    wanted[:5] = np.maximum(wanted[:5], _NEVER)
+    wanted[4] += _sum3(touch.normal * lip.velocity)
+    wanted[_RUB] = _weighed(jacobian[:3, _RUB], lip.velocity[:, None])
     strength = CUP.preload * step / np.maximum(-touch.normal[2], 1e-3)
-
-    # Without friction: what it will be able to bear
-    twist, normals, press = start.copy(), flat, zero[None]
-    for _ in range(_SWEEPS):
-        normals = below.solve(twist, normals, least, flat, np.inf)
-        if lips is not None:
-            press = lips[0].solve(twist, press, push[None], zero, strength)
-    bounds = rough * normals * _ways(body, half[2])[:, None]
-    bounds = np.concatenate([bounds[0], bounds[1]])
-    limit = CUP.friction * rough * press
-    twist, normals, press = start, flat, zero[None]
-    rub, dragged = np.zeros((2, len(mass))), np.zeros_like(bounds)
-    for _ in range(_SWEEPS):
-        normals = below.solve(twist, normals, least, flat, np.inf)
-        dragged = drag.solve(twist, dragged, 0.0, -bounds, bounds)
-        if lips is not None:
-            press = lips[0].solve(twist, press, push[None], zero, strength)
-            rub = lips[1].solve(twist, rub, lips[1].along(lip.velocity), -limit, limit)
-    impulse = touch.normal * press[0]
-    if lips is None:
-        return Step(_moved(body, twist, step), zero, impulse, impulse)
-    impulse = impulse + lips[1].force(rub)
-    lacks = np.maximum(push - lips[0].speed(twist)[0], 0.0) * step
-    weak = press[0] >= strength
-    pushed = np.where(weak, lacks / np.maximum(-touch.normal[2], 0.1), 0.0)
-    normal = np.where(press[0] > 0, touch.normal, 0.0)
-    return Step(_moved(body, twist, step), pushed, impulse, normal)
+    grips = np.empty((_COUNT - 5, len(mass)))
+    grips[:8].reshape(2, 4, -1)[:] = (rough * _ways(body, half[2]))[:, None]
+    grips[8:] = CUP.friction * rough
+    twist, impulses = _solve(
+        jacobian, _response(jacobian, frame[2], mass, half), mass, start, wanted, strength, grips
+    )
+    press = impulses[4]
+    force = touch.normal * press + _weighed(
+        jacobian[:3, _RUB].swapaxes(0, 1), impulses[_RUB, None]
+    )
+    lacks = np.maximum(wanted[4] - _sum6(jacobian[:, 4] * twist), 0.0) * step
+    pushed = np.where(press >= strength, lacks / np.maximum(-touch.normal[2], 0.1), 0.0)
+    normal = np.where(press > 0, touch.normal, 0.0)
+    return Step(_moved(body, twist, step), pushed, force, normal)
 
 
-class _Masses(NamedTuple):
-    """Inverses of mass (m,) and of the inertia, (3, 3, m)."""
+def _corners(
+    height: FloatArray, frame: FloatArray, half: tuple[float, float, float]
+) -> tuple[FloatArray, FloatArray]:
+    """The four lowest corners of blocks whose middles are at a height over what is below (m,).
 
-    lightness: FloatArray
-    mobility: FloatArray
-
-    @classmethod
-    def of(cls, axis: FloatArray, mass: FloatArray, half: tuple[float, float, float]) -> _Masses:
-        """Of square blocks with this axis (3, m)."""
-        across = 3 / (mass * (half[0] ** 2 + half[2] ** 2))
-        along = 3 / (mass * 2 * half[0] ** 2)
-        mobility = (along - across) * axis[:, None] * axis
-        for i in range(3):
-            mobility[i, i] += across
-        return cls(1 / mass, mobility)
-
-
-class _Rows:
-    """Some constraints (c,) on the velocities and spins (6, m) of all blocks, solved at once.
-
-    Args:
-        masses: Of the blocks.
-        jacobian: (c, 6, m).
-        share: (m,) kg, impulse for a speed that is missing; None for the exact one of one row.
+    Returns:
+        From the middles to the corners (3, 4, m) m, and their heights (4, m) m.
     """
-
-    def __init__(self, masses: _Masses, jacobian: FloatArray, share: FloatArray | None) -> None:
-        """Find what impulses do."""
-        self._jacobian = jacobian
-        spin = (
-            masses.mobility[0] * jacobian[:, 3, None]
-            + masses.mobility[1] * jacobian[:, 4, None]
-            + masses.mobility[2] * jacobian[:, 5, None]
-        )
-        self._response = np.concatenate([masses.lightness * jacobian[:, :3], spin], axis=1)
-        self._share = 1 / _sum6(jacobian * self._response) if share is None else share
-
-    def speed(self, twist: FloatArray) -> FloatArray:
-        """(c, m) m/s."""
-        return _sum6(self._jacobian * twist)
-
-    def along(self, velocity: FloatArray) -> FloatArray:
-        """(c, m) m/s of something that does not turn, along the constraints."""
-        return _sum3_last(self._jacobian[:, :3] * velocity)
-
-    def force(self, impulses: FloatArray) -> FloatArray:
-        """(3, m) N s of two constraints' impulses."""
-        first, second = self._jacobian[:, :3] * impulses[:, None]
-        force: FloatArray = first + second
-        return force
-
-    def solve(
-        self, twist: FloatArray, impulses: FloatArray, least: Any, low: Any, high: Any
-    ) -> FloatArray:
-        """Change impulses (c, m) so that speeds come to ``least``, and ``twist`` by them."""
-        after: FloatArray = impulses + self._share * (least - self.speed(twist))
-        after = np.minimum(np.maximum(after, low), high)
-        twist += _over_rows(self._response * (after - impulses)[:, None])
-        return after
+    arms = _weighed(frame[:, :, None], (_SIGNS * np.array(half)[:, None])[:, None, :, None])
+    lowest = np.argsort(arms[2], axis=0, kind="stable")[:4]
+    some: FloatArray = arms[:, lowest, np.arange(len(height))]
+    return some, height + some[2]
 
 
-def _jacobian(direction: FloatArray, arms: FloatArray) -> FloatArray:
-    """(c, 6, m) of points at arms (3, c, m), along a direction (3,) or (3, m)."""
-    x, y, z = (np.broadcast_to(part, arms.shape[1:]) for part in direction)
-    turn = (arms[1] * z - arms[2] * y, arms[2] * x - arms[0] * z, arms[0] * y - arms[1] * x)
-    return np.stack([x, y, z, *turn], axis=1)
+def _jacobian(arms: FloatArray, touch: _Touch) -> FloatArray:
+    """What velocity and spin are along all contacts' directions (6, c, m).
 
-
-def _lip_rows(masses: _Masses, touch: _Touch) -> tuple[_Rows, _Rows]:
-    """The contact with the lip: along its normal, and along a level and a steep tangent."""
-    x, y, z = touch.normal
-    level = np.sqrt(x * x + y * y)
+    In order: up at the corners; the lip's normal; east and north at the corners; the lip's
+    tangents, one level and one steep.
+    """
+    x, y, z = arms
+    jacobian = np.zeros((6, _COUNT, arms.shape[2]))
+    jacobian[2, :4] = jacobian[0, 5:9] = jacobian[1, 9:13] = 1.0
+    jacobian[3, :4], jacobian[4, :4] = y, -x
+    jacobian[4, 5:9], jacobian[5, 5:9] = z, -y
+    jacobian[3, 9:13], jacobian[5, 9:13] = -z, x
+    a, b, c = jacobian[:3, 4] = touch.normal
+    level = np.sqrt(a * a + b * b)
     steep = level > 1e-6
     far = np.where(steep, level, 1.0)
-    first = np.stack([np.where(steep, -y / far, 1.0), np.where(steep, x / far, 0.0), 0 * x])
-    second = np.stack([-z * first[1], z * first[0], x * first[1] - y * first[0]])
-    arm = touch.arm[:, None]
-    one = _jacobian(touch.normal, arm)
-    two = np.concatenate([_jacobian(first, arm), _jacobian(second, arm)])
-    return _Rows(masses, one, None), _Rows(masses, two, None)
+    e, f = np.where(steep, -b / far, 1.0), np.where(steep, a / far, 0.0)
+    jacobian[0, 13], jacobian[1, 13] = e, f
+    jacobian[0, 14], jacobian[1, 14], jacobian[2, 14] = -c * f, c * e, a * f - b * e
+    x, y, z = touch.arm
+    for k in (4, 13, 14):
+        a, b, c = jacobian[:3, k]
+        jacobian[3, k], jacobian[4, k], jacobian[5, k] = y * c - z * b, z * a - x * c, x * b - y * a
+    return jacobian
+
+
+def _response(
+    jacobian: FloatArray, axis: FloatArray, mass: FloatArray, half: tuple[float, float, float]
+) -> FloatArray:
+    """What impulses along the contacts' directions do to velocity and spin (6, c, m)."""
+    across = 3 / (mass * (half[0] ** 2 + half[2] ** 2))
+    along = 3 / (mass * 2 * half[0] ** 2)
+    turn = jacobian[3:]
+    about = (along - across) * _weighed(turn, axis[:, None])
+    return np.concatenate([jacobian[:3] / mass, across * turn + axis[:, None] * about])
+
+
+def _solve(
+    jacobian: FloatArray,
+    response: FloatArray,
+    mass: FloatArray,
+    start: FloatArray,
+    wanted: FloatArray,
+    strength: FloatArray,
+    grips: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Find impulses (c, m), and velocity and spin (6, m) with them, from those without (start).
+
+    Side by side: without friction, which gives its bounds, and with it.
+    """
+    coupling = _weighed(jacobian[:, :, None], response[:, None])
+    share = np.empty_like(wanted)
+    share[:4], share[5:13] = _RELAXATION * mass, _RUBBING * mass
+    share[4] = _EASE / coupling[4, 4]
+    share[13], share[14] = _EASE / coupling[13, 13], _EASE / coupling[14, 14]
+    constant = share * (wanted - _weighed(jacobian, start[:, None]))
+    keeps = -share * coupling
+    keeps.reshape(_COUNT * _COUNT, -1)[:: _COUNT + 1] += 1.0
+    high = np.full((5, 1, len(mass)), np.inf)
+    high[4, 0] = strength
+    impulses = np.zeros((_COUNT, 2, len(mass)))
+    bearing, rubbing = impulses[:5], impulses[5:, 1]
+    to_bearing, to_rubbing = keeps[:, :5, None], keeps[:, 5:]
+    first, second, every = constant[:5, None], constant[5:], impulses[:, None, 1]
+    for _ in range(_SWEEPS):
+        after = _weighed(to_bearing, impulses[:, None])
+        after += first
+        np.minimum(np.maximum(after, 0.0, out=after), high, out=bearing)
+        bound = grips * impulses[_BORNE, 0]
+        after = _weighed(to_rubbing, every)
+        after += second
+        np.minimum(np.maximum(after, -bound, out=after), bound, out=rubbing)
+    found = impulses[:, 1]
+    return start + _weighed(response.swapaxes(0, 1), found[:, None]), found
 
 
 def _ways(body: Body, down: float) -> FloatArray:
@@ -271,23 +264,39 @@ class _Touch(NamedTuple):
 def _touch(
     position: FloatArray, frame: FloatArray, lip: Lip, half: tuple[float, float, float]
 ) -> _Touch:
+    """Where cup and block are nearest; nowhere for those that are clear of each other."""
+    away = position - lip.point
+    away[2] -= _BELLOWS / 2
+    reach = math.hypot(*half) + math.hypot(CUP.radius, _BELLOWS / 2) + SEEN_BY_LIP
+    near = np.flatnonzero(_sum3(away * away) < reach * reach)
+    touch = _Touch(np.full_like(away[0], np.inf), np.zeros_like(away), np.zeros_like(away))
+    touch.normal[2] = -1.0
+    if len(near):
+        some = Lip(*(part[:, near] for part in lip))
+        found = _nearest(position[:, near], frame[:, :, near], some, half)
+        touch.gap[near], touch.normal[:, near], touch.arm[:, near] = found
+    return touch
+
+
+def _nearest(
+    position: FloatArray, frame: FloatArray, lip: Lip, half: tuple[float, float, float]
+) -> _Touch:
     """Where cup and block are nearest: by projecting from one to the other."""
     core = (np.array(half) - ROUNDING)[:, None]
     bottom = lip.point[2] + ROUNDING
     top = bottom + (_BELLOWS - 2 * ROUNDING)
-    there = position
+    there, cup, across = position, np.empty_like(position), frame.swapaxes(0, 1)
     for _ in range(4):
         # onto the cup
         away = there[:2] - lip.point[:2]
-        far = np.sqrt(away[0] * away[0] + away[1] * away[1])
-        shrink = np.minimum((CUP.radius - ROUNDING) / np.maximum(far, _LITTLE), 1.0)
-        cup = np.concatenate(
-            [lip.point[:2] + shrink * away, np.minimum(np.maximum(there[2], bottom), top)[None]]
-        )
+        squares = away * away
+        far = np.maximum(np.sqrt(squares[0] + squares[1]), _LITTLE)
+        cup[:2] = lip.point[:2] + np.minimum((CUP.radius - ROUNDING) / far, 1.0) * away
+        np.minimum(np.maximum(there[2], bottom), top, out=cup[2])
         # onto the block
-        local = _sum3_last(frame * (cup - position))
+        local = _weighed(across, (cup - position)[:, None])
         inside = np.minimum(np.maximum(local, -core), core)
-        there = position + _sum3(frame * inside[:, None])
+        there = position + _weighed(frame, inside[:, None])
     apart = there - cup
     distance = np.sqrt(_sum3(apart * apart))
     normal = apart / np.maximum(distance, _LITTLE)
@@ -365,17 +374,12 @@ def _sum3_last(parts: FloatArray) -> FloatArray:
     return total
 
 
+def _weighed(parts: FloatArray, weights: FloatArray) -> FloatArray:
+    """Sum of products over the first axis, in one order as long as others are longer than one."""
+    total: FloatArray = np.add.reduce(np.multiply(parts, weights, order="C"), axis=0)
+    return total
+
+
 def _sum6(parts: FloatArray) -> FloatArray:
-    """Over the second axis of (c, 6, m)."""
-    three = parts[:, :3] + parts[:, 3:]
-    total: FloatArray = three[:, 0] + three[:, 1] + three[:, 2]
-    return total
-
-
-def _over_rows(parts: FloatArray) -> FloatArray:
-    """Over the first axis, of 1, 2, 4, 8 or 16, in one order."""
-    while len(parts) > 1:
-        middle = len(parts) // 2
-        parts = parts[:middle] + parts[middle:]
-    total: FloatArray = parts[0]
-    return total
+    """Over the first axis of (6, m)."""
+    return _sum3(parts[:3] + parts[3:])
