@@ -188,7 +188,8 @@ class Pucks:
         x, y, z = self._state[_POSITION, rows]
         size = np.hypot(np.hypot(width, width), height) / 2
         lowest = path[1:, 2].min(axis=0) - CUP.length
-        reached: BoolArray = lowest < z + size + _NEAR
+        upright = ~self._state[_TURN.start : _TURN.start + 2, rows].any(axis=0)
+        reached: BoolArray = lowest < z + np.where(upright, height / 2, size) + _NEAR
         some = np.flatnonzero(reached)
         if len(some):
             near = size + CUP.radius + _NEAR
@@ -406,6 +407,8 @@ class Pucks:
         turn, spin, velocity = state[_TURN], state[_SPIN], state[_VELOCITY]
         alone = (state[_NORMAL] == 0).all(axis=0) & (state[_SLIDE] == 0)
         slow = (np.abs(spin[:2]) < _LAZY).all(axis=0) & (np.abs(velocity[2]) < _SLOW)
+        if not slow.any():
+            return slow
         down = self._gap(state[_POSITION])
         upright = (turn[0] * turn[0] + turn[1] * turn[1] < _LEVEL) & (np.abs(down) < _SHALLOW)
         upright &= slow
@@ -445,8 +448,13 @@ class Pucks:
         assert self._block is not None
         size = (self._block.width, self._block.height)
         position, slide = state[_POSITION], state[_SLIDE]
-        lip = (point[0], point[1], point[2] + slide - CUP.length)
-        touched: BoolArray = sealed(lip, _DOWN, position, state[_TURN], size)
+        lip = np.stack([point[0], point[1], point[2] + slide - CUP.length])
+        touched = np.zeros_like(held)
+        far = (np.abs(lip - position) > np.hypot(*size) + CUP.seal_gap).any(axis=0)
+        some = np.flatnonzero(on & ~held & ~far)
+        if len(some):
+            there, turn = position[:, some], state[_TURN][:, some]
+            touched[some] = sealed(lip[:, some], _DOWN, there, turn, size)
         after, state[_VACUUM] = hold_each_after(
             held, state[_VACUUM], self._time_step, on, (load[0], load[1]), touched
         )

@@ -12,7 +12,7 @@ As in PyBullet, block and cup have their edges rounded for each other: by 1 mm e
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -128,9 +128,7 @@ def tumble(
         jacobian, _response(jacobian, frame[2], mass, half), mass, start, wanted, strength, grips
     )
     press = impulses[4]
-    force = touch.normal * press + _weighed(
-        jacobian[:3, _RUB].swapaxes(0, 1), impulses[_RUB, None]
-    )
+    force = touch.normal * press + _weighed(jacobian[:3, _RUB].swapaxes(0, 1), impulses[_RUB, None])
     lacks = np.maximum(wanted[4] - _sum6(jacobian[:, 4] * twist), 0.0) * step
     pushed = np.where(press >= strength, lacks / np.maximum(-touch.normal[2], 0.1), 0.0)
     normal = np.where(press > 0, touch.normal, 0.0)
@@ -239,15 +237,11 @@ def _moved(body: Body, twist: FloatArray, step: float) -> Body:
     """The blocks a time step (s) on, at velocities and spins (6, m)."""
     x, y, z = 0.5 * step * twist[3:]
     a, b, c, d = body.turn
-    rate = np.stack(
-        [
-            x * d + y * c - z * b,
-            y * d + z * a - x * c,
-            z * d + x * b - y * a,
-            -x * a - y * b - z * c,
-        ]
-    )
-    turn = body.turn + rate
+    turn = body.turn.copy()
+    turn[0] += x * d + y * c - z * b
+    turn[1] += y * d + z * a - x * c
+    turn[2] += z * d + x * b - y * a
+    turn[3] -= x * a + y * b + z * c
     squares = turn * turn
     turn /= np.sqrt((squares[0] + squares[1]) + (squares[2] + squares[3]))
     return Body(body.position + step * twist[:3], twist[:3], turn, twist[3:])
@@ -353,13 +347,11 @@ def axes(turn: FloatArray) -> FloatArray:
     x, y, z, w = turn
     xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
     wx, wy, wz = w * x, w * y, w * z
-    return np.stack(
-        [
-            np.stack([1 - 2 * (yy + zz), 2 * (xy + wz), 2 * (xz - wy)]),
-            np.stack([2 * (xy - wz), 1 - 2 * (xx + zz), 2 * (yz + wx)]),
-            np.stack([2 * (xz + wy), 2 * (yz - wx), 1 - 2 * (xx + yy)]),
-        ]
-    )
+    frame = np.empty((3, *turn[:3].shape))
+    frame[0, 0], frame[0, 1], frame[0, 2] = 1 - 2 * (yy + zz), 2 * (xy + wz), 2 * (xz - wy)
+    frame[1, 0], frame[1, 1], frame[1, 2] = 2 * (xy - wz), 1 - 2 * (xx + zz), 2 * (yz + wx)
+    frame[2, 0], frame[2, 1], frame[2, 2] = 2 * (xz + wy), 2 * (yz - wx), 1 - 2 * (xx + yy)
+    return frame
 
 
 def _sum3(parts: FloatArray) -> FloatArray:
