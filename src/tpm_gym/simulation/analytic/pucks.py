@@ -406,7 +406,7 @@ class Pucks:
         assert self._block is not None
         turn, spin, velocity = state[_TURN], state[_SPIN], state[_VELOCITY]
         alone = (state[_NORMAL] == 0).all(axis=0) & (state[_SLIDE] == 0)
-        slow = (np.abs(spin[:2]) < _LAZY).all(axis=0) & (np.abs(velocity[2]) < _SLOW)
+        slow: BoolArray = (np.abs(spin[:2]) < _LAZY).all(axis=0) & (np.abs(velocity[2]) < _SLOW)
         if not slow.any():
             return slow
         down = self._gap(state[_POSITION])

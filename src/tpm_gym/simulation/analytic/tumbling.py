@@ -1,10 +1,10 @@
 """A free block between table and cup, in any posture: rigid bodies in batches.
 
-Contacts are those of the block's eight corners with the level below, and one with the cup. As in
-PyBullet's direct solver, friction bears what the normal impulses would be without it: they are
-found first, then all again with such bounds. Each time by sweeps: all corners at once (Jacobi, at
-the steps that converge fastest for a standing block), then the cup. Elementwise throughout; sums
-over corners have one order whatever the number of rows.
+Contacts are those of the block's four lowest corners with the level below, and one with the cup. As
+in PyBullet's direct solver, friction bears what the normal impulses would be without it. Both are
+found side by side by sweeps over impulses: all that bear at once, then all that rub, at the steps
+that converge fastest for a standing block. Elementwise throughout; sums over contacts have one
+order whatever the number of rows.
 
 As in PyBullet, block and cup have their edges rounded for each other: by 1 mm each.
 """
@@ -28,10 +28,10 @@ SEEN_BY_LIP = 6e-4  # m; at this distance lip and block keep from going deeper t
 
 ROUNDING = 1e-3  # m; of the edges of cup and block for each other
 _BELLOWS = 0.015  # m; length of the part of the cup that touches
-_COUNT, _RUB = 15, slice(13, 15)
-_BORNE = np.array([0, 1, 2, 3] * 2 + [4, 4])  # contacts whose press bears friction's impulses
+_COUNT, _RUB = 15, slice(13, 15)  # contacts' directions; the lip's tangents
+_BORNE = np.array([0, 1, 2, 3] * 2 + [4, 4])  # those whose press bears friction, in its order
 _SWEEPS = 12
-_EASE = 0.6
+_EASE = 0.6  # of the exact steps along the lip's directions, as corners move with them
 _RELAXATION = 1 / 5.5  # of 1/m: between the inverse inertias of heave, 4, and of tilting, 7.1
 _RUBBING = 1 / 10  # the same for friction, of 8.9 for slipping and 12 for turning
 SLIP = 1e-4  # m/s; what is slower has no direction
