@@ -1,0 +1,92 @@
+"""The closed form against PyBullet: the same seeds and actions, whole episodes.
+
+In comments: what was measured, over 20 episodes (benchmarks/bench_engine.py has more).
+"""
+
+from contextlib import closing
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from tpm_gym.arrays import FloatArray
+from tpm_gym.learning.policies import load_policy
+
+REACH, PICK = "TPMReach-v0", "TPMPickAndPlace-v0"
+
+
+def played(env_id: str, policy: str, episodes: int, **options: Any) -> tuple[Any, FloatArray]:
+    """States of all steps in PyBullet, and the actions (episodes, steps, size)."""
+    states, taken = [], []
+    with closing(gym.make(env_id, **options)) as env:
+        acting, inner = load_policy(policy, env), env.unwrapped
+        for seed in range(episodes):
+            observation, _ = env.reset(seed=seed)
+            acting.reset(observation, seed)
+            for _ in range(50):
+                taken.append(acting.act(observation))
+                observation, *_ = env.step(taken[-1])
+                states.append((inner.state, observation["observation"]))
+    return states, np.array(taken).reshape(episodes, 50, -1)
+
+
+def repeated(env_id: str, actions: FloatArray, **options: Any) -> Any:
+    """States of all steps in closed form, one environment an episode."""
+    envs = gym.make_vec(env_id, num_envs=len(actions), engine="analytic", **options)
+    envs.reset(seed=0)
+    found = []
+    for step in actions.swapaxes(0, 1):
+        observation, *_ = envs.step(step)
+        found.append((envs.unwrapped.state, observation["observation"]))
+    return found
+
+
+def column(states: Any, episodes: int, name: str) -> FloatArray:
+    """(episodes, steps, ...) of single states."""
+    values = np.array([getattr(state, name) for state, _ in states])
+    return values.reshape(episodes, 50, *values.shape[1:])
+
+
+@pytest.mark.parametrize(
+    ("policy", "rate", "bound"),
+    [
+        ("expert", 250, 2e-3),  # 0.9e-3 to 1.5e-3
+        ("random", 250, 1.5e-2),  # 0.7e-2 to 0.9e-2
+        ("random", 1000, 4e-3),  # 0.3e-2
+    ],
+)
+def test_with_free_hands_it_feels_and_sees_what_pybullet_does(
+    policy: str, rate: int, bound: float
+) -> None:
+    episodes, physics = 3, {"time_step": 1 / rate}
+    states, actions = played(REACH, policy, episodes, physics=physics)
+    found = repeated(REACH, actions, physics=physics)
+    torque = column(states, episodes, "torque")
+    ours = np.stack([state.torque for state, _ in found], axis=1)
+    off = np.sqrt(((ours - torque) ** 2).sum() / (torque**2).sum())
+    assert off < bound
+    conditioning = column(states, episodes, "conditioning")
+    assert np.abs(np.stack([s.conditioning for s, _ in found], axis=1) - conditioning).max() < 1e-7
+    seen = np.array([observation for _, observation in states]).reshape(episodes, 50, -1)
+    assert np.abs(np.stack([o for _, o in found], axis=1) - seen).max() < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("policy", "median", "most"),
+    [
+        ("expert", 1e-4, 1e-3),  # 1e-5 and 2e-4 m
+        (PICK, 1e-3, 1e-2),  # which nudges the puck now and then: 5 mm
+    ],
+)
+def test_the_puck_goes_where_pybullet_takes_it(policy: str, median: float, most: float) -> None:
+    episodes = 6
+    states, actions = played(PICK, policy, episodes)
+    found = repeated(PICK, actions)
+    puck = column(states, episodes, "object_position")
+    ours = np.stack([state.object_position for state, _ in found], axis=1)
+    apart = np.linalg.norm(ours - puck, axis=-1)
+    assert np.median(apart) < median
+    assert apart.max() < most
+    held = column(states, episodes, "held")
+    assert (np.stack([state.held for state, _ in found], axis=1) == held).mean() > 0.99
