@@ -75,8 +75,8 @@ def test_with_free_hands_it_feels_and_sees_what_pybullet_does(
 @pytest.mark.parametrize(
     ("policy", "median", "most"),
     [
-        ("expert", 1e-4, 1e-3),  # 1e-5 and 2e-4 m
-        (PICK, 1e-3, 1e-2),  # which nudges the puck now and then: 5 mm
+        ("expert", 1e-5, 1e-3),  # 6e-7 and 7e-5 m
+        (PICK, 1e-3, 1e-2),  # 2e-5 m; it nudges the puck now and then: 5e-3
     ],
 )
 def test_the_puck_goes_where_pybullet_takes_it(policy: str, median: float, most: float) -> None:
