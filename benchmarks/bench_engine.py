@@ -216,6 +216,7 @@ def main() -> None:
     """Parse the options and run."""
     parser = argparse.ArgumentParser(description="The closed form as an engine.")
     parser.add_argument("--quick", action="store_true", help="a minute or two; writes no files")
+    parser.add_argument("--episodes", type=int, default=1000, help="of each row of success")
     parser.add_argument("--part", choices=("speed", "torques", "success"), help="only this one")
     parser.add_argument("--redraw", action="store_true", help="picture and page from the record")
     options = parser.parse_args()
@@ -230,7 +231,7 @@ def main() -> None:
             "evaluation": [evaluation() for _ in range(2 if quick else ROUNDS)],
         },
         "torques": lambda: torques(2 if quick else 20, (250,) if quick else (250, 500, 1000, 2000)),
-        "success": lambda: success(10 if quick else 1000),
+        "success": lambda: success(10 if quick else options.episodes),
     }
     chosen = [options.part] if options.part else list(parts)
     record = {

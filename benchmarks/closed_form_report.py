@@ -99,12 +99,13 @@ def _torques(rows: list[dict[str, Any]]) -> Iterator[str]:
 
 def _success(rows: list[dict[str, Any]]) -> Iterator[str]:
     yield from table(
-        ["id", "policy", "PyBullet", "closed form", "equal, same actions"],
+        ["id", "policy", "episodes", "PyBullet", "closed form", "equal, same actions"],
         [
             [
                 row["env_id"],
                 ("expert" if row["policy"] == "expert" else "published")
                 + (", trembling" if row["noise"] else ""),
+                f"{row['episodes']:,}",
                 *(f"{100 * row[name]:.1f}%" for name in ("pybullet", "analytic", "equal")),
             ]
             for row in rows
@@ -115,7 +116,7 @@ def _success(rows: list[dict[str, Any]]) -> Iterator[str]:
 _TITLES = {
     "speed": "Speed, steps of environments a second, medians and quartiles of rounds.",
     "torques": "Torques, with free hands.",
-    "success": "Success at the end, 1000 episodes a row.",
+    "success": "Success at the end, of the same episodes.",
 }
 _TABLES = {"speed": _speed, "torques": _torques, "success": _success}
 
