@@ -26,6 +26,10 @@ CASES: list[tuple[str, dict[str, Any]]] = [
     ("TPMReachJointsDense-v0", {"engine": "analytic"}),
     ("TPMPickAndPlace-v0", {"engine": "analytic", "randomisation": EVERYTHING}),
     ("TPMPickAndPlaceJoints-v0", {"engine": "analytic", "machine": "wide"}),
+    (
+        "TPMPickAndPlace-v0",
+        {"engine": "analytic", "drive": "servo", "randomisation": EVERYTHING | OF_SERVOS},
+    ),
     ("TPMReach-v0", {"drive": "servo"}),
     ("TPMPickAndPlaceJoints-v0", {"drive": "servo", "randomisation": EVERYTHING | OF_SERVOS}),
     ("TPMReachJoints-v0", {"machine": "gantry"}),

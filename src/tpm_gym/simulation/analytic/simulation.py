@@ -396,7 +396,7 @@ class AnalyticSimulation:
         theta, rates = self._encoders(slice(None))
         j, (a, b, c) = self._jacobian, rates
         velocity = j[:, 0] * a + j[:, 1] * b + j[:, 2] * c
-        zero = np.zeros(self.count)
+        tilt, gap = np.zeros((2, self.count))
         return State(
             theta=_rows(theta),
             theta_dot=_rows(rates),
@@ -405,8 +405,8 @@ class AnalyticSimulation:
             fk_velocity=_rows(velocity * _TURNED),
             conditioning=self._conditioning.copy(),
             platform_position=_rows(self._to_world(self._truth)),
-            platform_tilt=zero,
-            closure_error=zero,
+            platform_tilt=tilt,
+            closure_error=gap,
             assembly_mode_changed=self._left[0].copy(),
             working_mode_changed=self._left[1].copy(),
             command=_rows(self._to_world(self._commands[1])),
