@@ -17,7 +17,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
@@ -58,7 +58,7 @@ class Cell:
     episodes: int
 
 
-def cells(runs: Path, episodes: int) -> Iterator[Cell]:
+def cells(runs: Path, episodes: int, drives: Sequence[str]) -> Iterator[Cell]:
     """Every policy in every engine with every drive."""
     policies = [
         (_kind(json.loads(file.read_text(encoding="utf-8"))), str(file.parent))
@@ -68,7 +68,7 @@ def cells(runs: Path, episodes: int) -> Iterator[Cell]:
     for kind, policy in policies:
         env_id = kind.split(":")[0]
         for engine in ENGINES:
-            for drive in DRIVES:
+            for drive in drives:
                 yield Cell(kind, env_id, policy, engine, drive, episodes)
 
 
@@ -94,7 +94,7 @@ def lines(record: dict[str, Any]) -> Iterator[str]:
     """The table as Markdown: policies of a kind together, median and range over seeds."""
     yield f"`make bench-transfer`, {record['episodes']} episodes a policy and cell."
     yield ""
-    columns = [(engine, drive) for engine in ENGINES for drive in DRIVES]
+    columns = list(dict.fromkeys((cell["engine"], cell["drive"]) for cell in record["cells"]))
     kinds = list(dict.fromkeys(cell["kind"] for cell in record["cells"]))
     yield from table(
         ["trained", "policies", *(f"{engine}, {drive}" for engine, drive in columns)],
@@ -120,10 +120,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Policies trained here, tested there.")
     parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "transfer")
     parser.add_argument("--episodes", type=int, default=200)
+    parser.add_argument("--drives", nargs="+", choices=DRIVES, default=DRIVES)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--dry", action="store_true", help="writes no files")
     options = parser.parse_args()
-    todo = list(cells(options.runs, options.episodes))
+    todo = list(cells(options.runs, options.episodes, options.drives))
     found = []
     with ProcessPoolExecutor(options.jobs) as pool:
         for cell in pool.map(run, todo):
