@@ -37,7 +37,8 @@ def publish() -> None:
     _, after = rest.split(END)
     text = "\n".join([BEGIN, *lines(record), END])
     PAGE.write_text(before + text + after, encoding="utf-8")
-    draw(record)
+    if {"speed", "torques"} <= record.keys():
+        draw(record)
     for path in (PICTURE, PAGE):
         print("wrote", path.relative_to(ROOT))
 
@@ -168,6 +169,8 @@ def _draw_torques(axes: Axes, rows: list[dict[str, Any]]) -> None:
             va="center",
         )
     axes.set(xscale="log", yscale="log", xlabel="time step of PyBullet (ms)")
+    axes.set_xticks(steps, [f"{value:g}" for value in steps])
+    axes.set_xticks([], minor=True)
     axes.set_xlim(right=9)
     axes.axvline(4.0, color=ORANGE, linewidth=0.8, linestyle=":")
     axes.set_title("torques off PyBullet's, relative RMS (%)", loc="left")
