@@ -28,13 +28,13 @@ tpm_gym.register_machine("mine", tpm_gym.PAPER_TPM)
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Runs the command as in a folder of which Python has imported nothing."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)  # as ``python -m`` has it
 
     def run_anew(*words: str) -> None:
         sys.modules.pop("my_tasks", None)
         with (
             patch.dict(gym.registry),
             patch.dict(TASKS),
-            patch.object(sys, "path", [str(tmp_path), *sys.path]),  # as ``python -m`` has it
         ):
             main(words)
 
