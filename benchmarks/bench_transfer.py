@@ -28,7 +28,7 @@ import machine
 import numpy as np
 from engine_matrix import DRIVES
 from engine_report import table
-from machine import ROOT
+from machine import ROOT, fill
 
 from tpm_gym.learning.environments import make_env, make_envs
 from tpm_gym.learning.estimates import wilson
@@ -37,7 +37,6 @@ from tpm_gym.learning.rollout import TEST_SEED, run_batch, run_episodes
 
 RECORD = ROOT / "docs" / "records" / "transfer.json"
 PAGE = ROOT / "docs" / "closed-form.md"
-BEGIN, END = "<!-- transfer: begin -->", "<!-- transfer: end -->"
 ENGINES = ("analytic", "pybullet", "mujoco")
 PUBLISHED = ("TPMPickAndPlace-v0", "TPMPickAndPlaceJoints-v0")
 
@@ -139,9 +138,7 @@ def main() -> None:
     print("\n".join(lines(record)))
     if not options.dry:
         RECORD.write_text(json.dumps(record) + "\n", encoding="utf-8")
-        before, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
-        text = "\n".join([BEGIN, *lines(record), END])
-        PAGE.write_text(before + text + rest.split(END)[1], encoding="utf-8")
+        fill(PAGE, "transfer", lines(record))
 
 
 if __name__ == "__main__":

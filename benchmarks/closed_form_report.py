@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from engine_report import table
-from machine import ROOT, processor_line, quartiles
+from machine import ROOT, fill, processor_line, quartiles
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -18,7 +18,6 @@ from tpm_gym.learning.figure_style import BLUE, GREEN, ORANGE, VERMILLION
 RECORD = ROOT / "docs" / "records" / "closed_form.json"
 PICTURE = ROOT / "docs" / "images" / "closed_form.png"
 PAGE = ROOT / "docs" / "closed-form.md"
-BEGIN, END = "<!-- closed form: begin -->", "<!-- closed form: end -->"
 PICK = "TPMPickAndPlace-v0"
 COLOURS = {"expert": BLUE, "random": VERMILLION}
 
@@ -33,10 +32,7 @@ def write(record: dict[str, Any]) -> None:
 def publish() -> None:
     """Fill the page and draw the picture from the record."""
     record = json.loads(RECORD.read_text(encoding="utf-8"))
-    before, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
-    _, after = rest.split(END)
-    text = "\n".join([BEGIN, *lines(record), END])
-    PAGE.write_text(before + text + after, encoding="utf-8")
+    fill(PAGE, "closed form", lines(record))
     if {"speed", "torques"} <= record.keys():
         draw(record)
     for path in (PICTURE, PAGE):

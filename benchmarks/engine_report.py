@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from machine import ROOT, processor_line, quartiles
+from machine import ROOT, fill, processor_line, quartiles
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -17,7 +17,6 @@ from tpm_gym.learning.figure_style import BLUE, ORANGE, PURPLE, SKY, VERMILLION
 RECORD = ROOT / "docs" / "records" / "engines.json"
 PICTURE = ROOT / "docs" / "images" / "engines.png"
 PAGE = ROOT / "docs" / "fidelity.md"
-BEGIN, END = "<!-- engines: begin -->", "<!-- engines: end -->"
 
 MM = 1e3
 COLUMNS = {
@@ -55,10 +54,7 @@ def write(record: dict[str, Any]) -> None:
 def publish() -> None:
     """Fill the page and draw the picture from the record."""
     record = json.loads(RECORD.read_text(encoding="utf-8"))
-    before, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
-    _, after = rest.split(END)
-    text = "\n".join([BEGIN, *lines(record), END])
-    PAGE.write_text(before + text + after, encoding="utf-8")
+    fill(PAGE, "engines", lines(record))
     draw(record)
     for path in (PICTURE, PAGE):
         print("wrote", path.relative_to(ROOT))

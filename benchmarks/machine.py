@@ -11,7 +11,7 @@ import gc
 import os
 import platform
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from tpm_gym.learning import provenance
 ROOT = Path(__file__).resolve().parents[1]
 __all__ = [
     "describe",
+    "fill",
     "give_back_free_memory",
     "memory",
     "open_files",
@@ -110,6 +111,14 @@ def open_files() -> int | None:
         return len(os.listdir("/proc/self/fd"))
     except OSError:
         return None
+
+
+def fill(page: Path, name: str, lines: Iterable[str]) -> None:
+    """Replace what stands in a page between ``<!-- name: begin -->`` and ``<!-- name: end -->``."""
+    begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
+    before, rest = page.read_text(encoding="utf-8").split(begin)
+    _, after = rest.split(end)
+    page.write_text(before + "\n".join([begin, *lines, end]) + after, encoding="utf-8")
 
 
 def quartiles(values: ArrayLike) -> tuple[float, float, float]:

@@ -14,12 +14,12 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
-from tpm_gym.arrays import FloatArray, Vector, finite, numbers
+from tpm_gym.arrays import FloatArray, Vector, finite
 from tpm_gym.envs.report import (
     GOAL_BOUND,
     OBSERVATION_BOUND,
     Observation,
-    goal_free,
+    compute_reward,
     observe,
     report,
 )
@@ -32,10 +32,9 @@ from tpm_gym.errors import (
 )
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.display import has_display
-from tpm_gym.simulation.drives import Servo, drive_of, require_servo
+from tpm_gym.simulation.drives import Servo, drives_and_randomisation
 from tpm_gym.simulation.engine import SIMULATIONS
 from tpm_gym.simulation.randomisation import Randomisation
-from tpm_gym.simulation.settings import settings_of
 from tpm_gym.simulation.simulation import Simulation, Snapshot, make_simulation
 from tpm_gym.simulation.state import CONTROL_PERIOD, State
 from tpm_gym.tasks.control import make_control
@@ -235,11 +234,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         )
         self.machine = self.task.machine
         self.control = make_control(control, self.machine)
-        self.randomisation = settings_of(Randomisation, "randomisation", randomisation)
-        self.drive = drive_of(drive)
-        require_servo(
-            self.drive, self.randomisation.servo_stiffness, self.randomisation.joint_friction
-        )
+        self.drive, self.randomisation = drives_and_randomisation(drive, randomisation)
         self._size = _pixels("width", width), _pixels("height", height)
         self.observation_space = observation_space(self.task)
         self.action_space = action_space(self.task)
@@ -364,18 +359,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         Raises:
             InputError: If the goals are no real numbers of these shapes, or ``info`` is neither.
         """
-        _require_goals(self.task.goal_size, achieved_goal, desired_goal)
-        goal_term = self.task.goal_term(achieved_goal, desired_goal)
-        try:
-            if isinstance(info, Mapping):
-                other: Any = _goal_free(info)
-            else:
-                other = np.array([_goal_free(entry) for entry in info]).reshape(goal_term.shape)
-        except (AttributeError, TypeError, ValueError) as error:
-            valid = f"a step's info, or one for each of the {goal_term.size} transitions"
-            raise InputError("info", type(info), valid) from error
-        total = goal_term + other
-        return float(total) if np.ndim(total) == 0 else total
+        return compute_reward(self.task, achieved_goal, desired_goal, info)
 
     def render(self) -> NDArray[np.uint8] | None:
         """The scene as (height, width, 3) RGB; in ``human`` mode, wait for real time."""
@@ -505,24 +489,6 @@ class TPMEnv(gym.Env[Observation, Action]):
         terms = {name: float(value) for name, value in info.pop("reward_terms").items()}
         plain = {name: np.asarray(value).item() for name, value in info.items()}
         return observation, float(reward), {**plain, "reward_terms": terms}
-
-
-def _require_goals(size: int, achieved: ArrayLike, desired: ArrayLike) -> None:
-    """Refuse what is no batch of goals; what is not finite is no success, but may be asked for."""
-    shapes = [numbers("achieved_goal", achieved).shape, numbers("desired_goal", desired).shape]
-    try:
-        np.broadcast_shapes(*shapes)
-        fit = all(shape[-1:] == (size,) for shape in shapes)
-    except ValueError:
-        fit = False
-    if not fit:
-        valid = f"of shapes (..., {size}) that go together, by shape"
-        raise InputError("achieved_goal, desired_goal", shapes, valid)
-
-
-def _goal_free(info: Mapping[str, Any]) -> float:
-    """Sum of the reward's terms in ``info`` that do not depend on the goal; 0 for an empty one."""
-    return float(goal_free(info.get("reward_terms", {})))
 
 
 def observation_space(task: Task) -> spaces.Dict:

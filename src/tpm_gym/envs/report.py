@@ -6,14 +6,14 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from tpm_gym.arrays import FloatArray
-from tpm_gym.errors import ConfigurationError
+from tpm_gym.arrays import FloatArray, numbers
+from tpm_gym.errors import ConfigurationError, InputError
 from tpm_gym.simulation.state import State
 from tpm_gym.tasks.task import Task
 
-__all__ = ["GOAL_BOUND", "OBSERVATION_BOUND", "Observation", "goal_free", "observe", "report"]
+__all__ = ["GOAL_BOUND", "OBSERVATION_BOUND", "Observation", "compute_reward", "observe", "report"]
 
 OBSERVATION_BOUND = 10.0
 GOAL_BOUND = 2.0
@@ -41,7 +41,7 @@ def report(
     observation = observe(task, state, goal)
     achieved, desired = observation["achieved_goal"], observation["desired_goal"]
     terms = task.reward_terms(state, achieved, desired)
-    reward = terms["goal"] + goal_free(terms)
+    reward = terms["goal"] + _goal_free(terms)
     # A sum is not finite where one of its terms is not; so written it costs least.
     if not np.isfinite(observation["observation"].sum() + achieved.sum() + np.sum(reward)):
         raise _not_finite(task, state, achieved, terms)
@@ -62,9 +62,47 @@ def report(
     )
 
 
-def goal_free(terms: Mapping[str, Any]) -> Any:
+def _goal_free(terms: Mapping[str, Any]) -> Any:
     """Sum of the reward's terms that do not depend on the goal; 0 where there is none."""
     return sum(value for name, value in terms.items() if name != "goal")
+
+
+def compute_reward(task: Task, achieved: ArrayLike, desired: ArrayLike, info: Any) -> Any:
+    """The reward of transitions for any goals; see :meth:`tpm_gym.TPMEnv.compute_reward`.
+
+    Raises:
+        InputError: If the goals are no real numbers of these shapes, or ``info`` is neither.
+    """
+    _require_goals(task.goal_size, achieved, desired)
+    goal_term = task.goal_term(achieved, desired)
+    try:
+        if isinstance(info, Mapping):
+            other: Any = _goal_free_in(info)
+        else:
+            other = np.array([_goal_free_in(entry) for entry in info]).reshape(goal_term.shape)
+    except (AttributeError, TypeError, ValueError) as error:
+        valid = f"a step's info, or one for each of the {goal_term.size} transitions"
+        raise InputError("info", type(info), valid) from error
+    total = goal_term + other
+    return float(total) if np.ndim(total) == 0 else total
+
+
+def _require_goals(size: int, achieved: ArrayLike, desired: ArrayLike) -> None:
+    """Refuse what is no batch of goals; what is not finite is no success, but may be asked for."""
+    shapes = [numbers("achieved_goal", achieved).shape, numbers("desired_goal", desired).shape]
+    try:
+        np.broadcast_shapes(*shapes)
+        fit = all(shape[-1:] == (size,) for shape in shapes)
+    except ValueError:
+        fit = False
+    if not fit:
+        valid = f"of shapes (..., {size}) that go together, by shape"
+        raise InputError("achieved_goal, desired_goal", shapes, valid)
+
+
+def _goal_free_in(info: Mapping[str, Any]) -> float:
+    """Sum of the reward's terms in ``info`` that do not depend on the goal; 0 for an empty one."""
+    return float(_goal_free(info.get("reward_terms", {})))
 
 
 def _not_finite(

@@ -14,8 +14,9 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray, finite
-from tpm_gym.envs.env import TPMEnv, action_space, observation_space
-from tpm_gym.envs.report import Observation, observe, report
+from tpm_gym.envs.env import action_space, observation_space
+from tpm_gym.envs.registration import VECTOR_ENTRY_POINT
+from tpm_gym.envs.report import Observation, compute_reward, observe, report
 from tpm_gym.errors import (
     ActionError,
     ConfigurationError,
@@ -25,9 +26,8 @@ from tpm_gym.errors import (
 )
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.analytic.simulation import AnalyticSimulation, Moment
-from tpm_gym.simulation.drives import Servo, drive_of, require_servo
+from tpm_gym.simulation.drives import Servo, drives_and_randomisation
 from tpm_gym.simulation.randomisation import Randomisation
-from tpm_gym.simulation.settings import settings_of
 from tpm_gym.simulation.state import CONTROL_PERIOD, State
 from tpm_gym.tasks.control import make_control
 from tpm_gym.tasks.registry import make_task
@@ -59,7 +59,7 @@ def _spec_of(options: Mapping[str, Any]) -> Any:
     """The registered spec with these task, control and reward."""
     for spec in gym.registry.values():
         of_id = {**spec.kwargs, "max_episode_steps": spec.max_episode_steps}
-        if spec.vector_entry_point == f"{__name__}:make_vector" and all(
+        if spec.vector_entry_point == VECTOR_ENTRY_POINT and all(
             options.get(name, value) == value for name, value in of_id.items()
         ):
             return spec
@@ -136,11 +136,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         )
         self.machine = self.task.machine
         self.control = make_control(control, self.machine)
-        self.randomisation = settings_of(Randomisation, "randomisation", randomisation)
-        self.drive = drive_of(drive)
-        require_servo(
-            self.drive, self.randomisation.servo_stiffness, self.randomisation.joint_friction
-        )
+        self.drive, self.randomisation = drives_and_randomisation(drive, randomisation)
         self.single_observation_space = observation_space(self.task)
         self.single_action_space = action_space(self.task)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -155,6 +151,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         self._home = self.machine.inverse(self.machine.home)
         self._limit, self._stagger = max_episode_steps, stagger
         self._rngs: list[np.random.Generator] = []
+        self._state: State | None = None
         self._goals = np.full((num_envs, self.task.goal_size), np.nan)
         self._elapsed = np.zeros(num_envs, dtype=np.int64)
         self._ended = np.ones(num_envs, dtype=np.bool_)  # until they are reset
@@ -187,7 +184,8 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         infos = self._begin(rows, chosen)
         if self._stagger and len(rows) == self.num_envs and self._limit is not None:
             self._elapsed[:] = np.arange(self.num_envs) * self._limit // self.num_envs
-        observation, _, told = report(self.task, self.simulation.state(), self._goals)
+        self._state = self.simulation.state()
+        observation, _, told = report(self.task, self._state, self._goals)
         return observation, {**_masked(told, rows, self.num_envs), **infos}
 
     def _rows_of(self, mask: Any) -> IntArray:
@@ -238,7 +236,6 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         Raises:
             ActionError: If the actions have the wrong shape or are not finite.
             EpisodeError: Before reset, after close, or where an episode ended and is not reset.
-            ModeChangeError: If a mechanism passed a singularity, and was not reset.
         """
         self._require_open()
         shape = (self.num_envs, self.task.action_size)
@@ -250,7 +247,8 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         running = np.flatnonzero(~self._ended) if len(ended) else np.arange(self.num_envs)
         self._move(values, running)
         infos = self._begin(ended) if len(ended) else {}
-        observation, reward, told = report(self.task, self.simulation.state(), self._goals)
+        self._state = self.simulation.state()
+        observation, reward, told = report(self.task, self._state, self._goals)
         self._elapsed[running] += 1
         truncated = told["assembly_mode_changed"] | told["working_mode_changed"]
         if self._limit is not None:
@@ -278,8 +276,8 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         for row in rows.tolist():
             final[row] = {name: values[row].copy() for name, values in observation.items()}
         told = self._begin(rows)
-        state = _take(self.simulation.state(), rows)
-        anew, _, first = report(self.task, state, self._goals[rows])
+        self._state = self.simulation.state()
+        anew, _, first = report(self.task, _take(self._state, rows), self._goals[rows])
         for name, values in anew.items():
             observation[name][rows] = values
         ended = np.isin(np.arange(n), rows)
@@ -306,20 +304,18 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             EpisodeError: If there is no episode.
         """
         self._require_open()
-        if not self._rngs:
+        if self._state is None:
             raise EpisodeError("no episode is running; call reset() first")
-        return self.simulation.state()
+        return self._state
 
     @property
     def goal(self) -> FloatArray:
         """The episodes' goals, (num_envs, goal size) m, world."""
         return np.array(self._goals)
 
-    def compute_reward(
-        self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any
-    ) -> FloatArray:
+    def compute_reward(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any) -> Any:
         """See :meth:`TPMEnv.compute_reward`."""
-        return TPMEnv.compute_reward(self, achieved_goal, desired_goal, info)  # type: ignore
+        return compute_reward(self.task, achieved_goal, desired_goal, info)
 
     def save_state(self) -> VectorSnapshot:
         """Take down everything that the next steps depend on.
@@ -349,7 +345,8 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             values.copy()
             for values in (snapshot.goals, snapshot.elapsed, snapshot.ended, snapshot.pending)
         )
-        return observe(self.task, self.simulation.state(), self._goals)
+        self._state = self.simulation.state()
+        return observe(self.task, self._state, self._goals)
 
     def _draw_noise(self, rows: IntArray) -> FloatArray | None:
         """Errors of one reading of these environments' encoders, rad, for all."""

@@ -52,6 +52,11 @@ class EnvOptions:
     ] = UNSET
     """How the motors follow their references: exactly, or as torque motors with servo drives."""
 
+    @property
+    def in_batches(self) -> bool:
+        """Whether many environments are computed at a time."""
+        return self.engine == "analytic"
+
     def given(self) -> dict[str, Any]:
         """Those that are given, as arguments of an environment."""
         return {name: value for name, value in vars(self).items() if value is not UNSET}
@@ -119,7 +124,7 @@ class TrainingConfig:
     @property
     def in_batches(self) -> bool:
         """Whether many environments are computed at a time."""
-        return self.env_options.engine == "analytic"
+        return self.env_options.in_batches
 
     @property
     def title(self) -> str:

@@ -226,7 +226,7 @@ def _evaluate_one(
     start = time.perf_counter()
     with Progress(console=console, disable=hidden) as bar:
         task = bar.add_task(spec, total=config.episodes)
-        if config.env_options.engine == "analytic" and isinstance(policy, TrainedPolicy):
+        if config.env_options.in_batches and isinstance(policy, TrainedPolicy):
             with closing(_make_batch(env, config)) as envs:
                 records = run_batch(envs, policy, config.episodes, config.seed)
         else:

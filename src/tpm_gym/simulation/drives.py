@@ -21,7 +21,7 @@ from tpm_gym.kinematics.equations import Triple
 from tpm_gym.mechanism.batch import Batch
 from tpm_gym.mechanism.bodies import Joint
 from tpm_gym.mechanism.machine import Machine
-from tpm_gym.simulation.randomisation import NOMINAL, Plant
+from tpm_gym.simulation.randomisation import NOMINAL, Plant, Randomisation
 from tpm_gym.simulation.settings import settings_of
 
 __all__ = [
@@ -31,6 +31,7 @@ __all__ = [
     "Servo",
     "Servos",
     "drive_of",
+    "drives_and_randomisation",
     "follow",
     "limited",
     "references",
@@ -128,6 +129,17 @@ def require_servo(
         if np.any(np.not_equal(values, neutral)):
             valid = f"{neutral}, or drive='servo': ideal drives have neither"
             raise ConfigurationError(name, values, valid)
+
+
+def drives_and_randomisation(drive: Any, randomisation: Any) -> tuple[Servo | None, Randomisation]:
+    """The drive and the randomisation that a user names, which fit each other.
+
+    Raises:
+        ConfigurationError: If one is none, or only a servo has what is to be randomised.
+    """
+    servo, drawn = drive_of(drive), settings_of(Randomisation, "randomisation", randomisation)
+    require_servo(servo, drawn.servo_stiffness, drawn.joint_friction)
+    return servo, drawn
 
 
 def limited(torque: float, rate: float, effort: float, motor: Joint) -> float:

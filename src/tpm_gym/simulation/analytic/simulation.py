@@ -367,6 +367,11 @@ class AnalyticSimulation:
         commands: FloatArray = self._commands[1].T
         return commands
 
+    @property
+    def left(self) -> BoolArray:
+        """(2, n) whether the robots left their assembly mode, their working mode."""
+        return self._left
+
     # -- reading ----------------------------------------------------------------------------
 
     def _read(self, rows: IntArray | slice) -> None:

@@ -89,11 +89,7 @@ class SingleSimulation:
         self, command: ArrayLike, vacuum: bool = False, noise: Vector = (0.0, 0.0, 0.0)
     ) -> State:
         """See :meth:`Simulation.move`."""
-        state = self.read()
-        for mode, left in (
-            ("assembly", state.assembly_mode_changed),
-            ("working", state.working_mode_changed),
-        ):
+        for mode, left in zip(("assembly", "working"), self.batch.left[:, 0], strict=True):
             if left:
                 raise ModeChangeError(mode)
         new = vector("command", command)
