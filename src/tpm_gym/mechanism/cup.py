@@ -6,8 +6,7 @@ Engines simulate it; :func:`sealed` says, for all of them, when it can hold an o
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from tpm_gym.arrays import Vector, rotate
 from tpm_gym.mechanism.bodies import Joint, Link, Solid
@@ -18,8 +17,7 @@ _SILICONE, _STEEL, _ALUMINIUM = 1150.0, 7850.0, 2700.0  # kg/m^3
 _BELLOWS = 0.015  # length of the cup's bellows, m
 
 
-@dataclass(frozen=True)
-class VacuumCup:
+class VacuumCup(NamedTuple):
     """A cup on a spring-loaded plunger, a level compensator.
 
     Attributes:

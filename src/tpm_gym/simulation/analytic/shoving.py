@@ -7,211 +7,303 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tpm_gym.arrays import BoolArray, FloatArray
+from tpm_gym.arrays import FloatArray, Vector
 from tpm_gym.mechanism.cup import CUP
-from tpm_gym.simulation.analytic.tumbling import ROUNDING, SEEN_BY_LIP, least_rise
+from tpm_gym.simulation.analytic.body import (
+    LITTLE,
+    MASS,
+    ROUGH,
+    ROUNDING,
+    SEEN_BY_LIP,
+    SPIN,
+    TURN,
+    VX,
+    VY,
+    VZ,
+    X,
+    Y,
+    clip,
+    least_rise,
+    level_length,
+)
+from tpm_gym.simulation.analytic.compiling import compiled
+from tpm_gym.simulation.analytic.tumbling import LEAST, SLIP
 
-__all__ = ["Shove", "Side", "Standing", "Strengths", "shove", "side_of"]
+__all__ = ["Shove", "Side", "shove", "side_of"]
 
 _SWEEPS = 4
 _SHARE = 1 / 8  # of the masses; between the inverse masses of a drag, 4, and of a twist, 12
-_SLIP = 1e-4  # m/s
-_LEAST = 0.02  # of the friction along the axis across which it slips
 _LEAST_LEVEL = 1e-3
-_CORNERS = np.array([[1.0, 1.0, -1.0, -1.0], [1.0, -1.0, 1.0, -1.0]])
-_LITTLE = 1e-12
 _BOTH = 2 * ROUNDING
 _CORE = CUP.radius - ROUNDING
 
 
 class Side(NamedTuple):
-    """How lips stand to the sides of upright blocks (m,).
+    """How the lip stands to the sides of an upright block.
 
     Attributes:
         gap: m, between the two.
-        normal: (2, m) level direction from lip to block, world.
-        arm: (2, m) m, from the block's middle to the point of contact, world.
+        nx: Level direction from lip to block, world.
+        ny: The same along y.
+        rx: m, from the block's middle to the point of contact, world.
+        ry: The same along y.
         away: m, by which the rounded parts' cores are apart; negative over the top face.
-        local: (2, m) the normal in the block's frame.
-        place: (2, m) m, the arm in the block's frame.
+        u: The normal in the block's frame.
+        v: The same along y.
+        p: m, the arm in the block's frame.
+        q: The same along y.
         level: Share of the contact's normal along the level.
         slant: Share of it that points down.
     """
 
-    gap: FloatArray
-    normal: FloatArray
-    arm: FloatArray
-    away: FloatArray
-    local: FloatArray
-    place: FloatArray
-    level: FloatArray
-    slant: FloatArray
+    gap: float
+    nx: float
+    ny: float
+    rx: float
+    ry: float
+    away: float
+    u: float
+    v: float
+    p: float
+    q: float
+    level: float
+    slant: float
 
 
-def side_of(away: FloatArray, turn: FloatArray, overlap: FloatArray, half: float) -> Side:
-    """Where lips could touch the sides of upright blocks.
+@compiled
+def _heading(row: FloatArray) -> tuple[float, float]:
+    """Cosine and sine of an upright block's turn."""
+    z, w = row[TURN + 2], row[TURN + 3]
+    return 1 - 2 * z * z, 2 * z * w
+
+
+@compiled
+def side_of(row: FloatArray, lip_x: float, lip_y: float, overlap: float, half: float) -> Side:
+    """Where a lip (m, world) could touch the sides of an upright block.
 
     Args:
-        away: (2, m) m, world, from the blocks' middles to the lips'.
-        turn: (4, m) quaternions.
-        overlap: (m,) m, how far the lips are below the top faces.
-        half: Half the blocks' width, m.
+        row: The block.
+        lip_x: Of the lip's centre.
+        lip_y: Of the lip's centre.
+        overlap: m, how far the lip is below the top face.
+        half: Half the block's width, m.
     """
-    cosine, sine = 1 - 2 * turn[2] * turn[2], 2 * turn[2] * turn[3]
-    local = np.stack([away[0] * cosine + away[1] * sine, away[1] * cosine - away[0] * sine])
+    cosine, sine = _heading(row)
+    x, y = lip_x - row[X], lip_y - row[Y]
+    a, b = x * cosine + y * sine, y * cosine - x * sine
     core = half - ROUNDING
-    nearest = np.minimum(np.maximum(local, -core), core)
-    out = nearest - local
-    far = np.sqrt(out[0] * out[0] + out[1] * out[1])
-    # A middle over the core comes out through the nearest side.
-    inside = far < _LITTLE
-    first = np.abs(local[0]) > np.abs(local[1])
-    through = np.stack([first, ~first]) * -np.sign(local)
-    way = np.where(inside, through, out / np.maximum(far, _LITTLE))
-    depth = core - np.maximum(np.abs(local[0]), np.abs(local[1]))
-    apart = np.where(inside, -depth, far) - _CORE
-    higher = np.maximum(_BOTH - overlap, 0.0)
-    beside = np.maximum(apart, 0.0)
-    distance = np.sqrt(beside * beside + higher * higher)
-    gap = np.where(distance > _LITTLE, distance, apart) - _BOTH
-    slant = np.where(apart > _LITTLE, higher / np.maximum(distance, _LITTLE), 0.0)
-    level = np.sqrt(np.maximum(1 - slant * slant, _LEAST_LEVEL))
-    place = nearest - ROUNDING * way
-    normal = np.stack([way[0] * cosine - way[1] * sine, way[0] * sine + way[1] * cosine])
-    arm = np.stack([place[0] * cosine - place[1] * sine, place[0] * sine + place[1] * cosine])
-    return Side(gap, normal, arm, apart, way, place, level, slant)
-
-
-class Standing(NamedTuple):
-    """Blocks that stand: velocity (3, m) m/s, turning (m,) rad/s, quaternions (4, m)."""
-
-    velocity: FloatArray
-    turning: FloatArray
-    turn: FloatArray
-
-
-class Strengths(NamedTuple):
-    """What may act on blocks (m,).
-
-    Attributes:
-        weight: m/s, impulse with which the table carries them, by their mass.
-        spring: m/s, impulse of the cup's spring, by their mass.
-        rough: Coulomb coefficient on the table.
-    """
-
-    weight: FloatArray
-    spring: FloatArray
-    rough: FloatArray
+    nearest_a, nearest_b = clip(a, -core, core), clip(b, -core, core)
+    u, v = nearest_a - a, nearest_b - b
+    far = level_length(u, v)
+    if far < LITTLE:  # A middle over the core comes out through the nearest side.
+        apart = max(abs(a), abs(b)) - core - _CORE
+        if abs(a) > abs(b):
+            u, v = -math.copysign(1.0, a), 0.0
+        else:
+            u, v = 0.0, -math.copysign(1.0, b)
+    else:
+        apart = far - _CORE
+        u, v = u / far, v / far
+    higher, beside = max(_BOTH - overlap, 0.0), max(apart, 0.0)
+    distance = level_length(beside, higher)
+    gap = (distance if distance > LITTLE else apart) - _BOTH
+    slant = higher / max(distance, LITTLE) if apart > LITTLE else 0.0
+    level = math.sqrt(max(1 - slant * slant, _LEAST_LEVEL))
+    p, q = nearest_a - ROUNDING * u, nearest_b - ROUNDING * v
+    return Side(
+        gap,
+        u * cosine - v * sine,
+        u * sine + v * cosine,
+        p * cosine - q * sine,
+        p * sine + q * cosine,
+        apart,
+        u,
+        v,
+        p,
+        q,
+        level,
+        slant,
+    )
 
 
 class Shove(NamedTuple):
-    """What a shove does in a time step.
+    """What a shove does in a time step; impulses by the block's mass.
 
     Attributes:
-        velocity: (2, m) m/s after it.
-        turning: (m,) rad/s after it.
-        impulse: (2, m) m/s, of the lip on the block along the level, by its mass.
-        tips: (m,) whether the table cannot hold the block upright.
+        vx: m/s after it.
+        vy: m/s after it.
+        spin: rad/s after it.
+        push: (x, y) m/s, impulse of the lip on the block along the level.
+        tips: Whether the table cannot hold the block upright.
     """
 
-    velocity: FloatArray
-    turning: FloatArray
-    impulse: FloatArray
-    tips: BoolArray
+    vx: float
+    vy: float
+    spin: float
+    push: tuple[float, float]
+    tips: bool
 
 
-def shove(
+class _Bearing(NamedTuple):
+    """What bears what: the lip's friction, and how the table carries the corners.
+
+    Attributes:
+        friction: Most of it between lip and block, m/s.
+        total: What the table carries, m/s.
+        tilt: (a, b) share that moves from one corner to the other, along the block's axes.
+    """
+
+    friction: float
+    total: float
+    tilt: tuple[float, float]
+
+
+@compiled
+def _bearing(
+    row: FloatArray,
     side: Side,
-    block: Standing,
-    lip: FloatArray,
-    strengths: Strengths,
-    size: tuple[float, float],
-    height: FloatArray,
+    least: float,
+    weight: float,
+    strength: float,
+    lever: float,
+    half: Vector,
+) -> _Bearing:
+    """What would be without friction: the corners carry what the push tips over those in front."""
+    steep, width = side.slant / side.level, half[0]
+    lever_n = side.rx * side.ny - side.ry * side.nx
+    share = 1 / (1 + 1.5 / width**2 * lever_n * lever_n)
+    front = width * (abs(side.u) + abs(side.v))
+    radius = (width**2 + half[2] ** 2) / 3  # of gyration, about an edge's direction, squared
+    yields = 1 + front * front / radius
+    wanted = least - row[VX] * side.nx - row[VY] * side.ny - lever_n * row[SPIN + 2]
+    wanted, most = max(wanted, 0.0), strength / max(steep, 1e-3)
+    push = min(share * wanted, most)
+    total = weight + push * steep
+    if total + front * lever * push / radius > total * yields:
+        push = min(wanted / (1 / share + lever * lever / (radius * yields)), most)
+        total = weight + push * steep
+    friction = CUP.friction * row[ROUGH] * push / side.level
+    total = max(total, (total + front * lever * push / radius) / yields)
+    moment = lever * push / (max(total, LITTLE) * width)
+    return _Bearing(
+        friction, total, (clip(moment * side.u, -1.0, 1.0), clip(moment * side.v, -1.0, 1.0))
+    )
+
+
+@compiled
+def _bounds(row: FloatArray, bearing: _Bearing) -> FloatArray:
+    """What friction can take at each corner along the world's axes (2, 4) m/s."""
+    x, y = row[VX], row[VY]
+    speed = level_length(x, y)
+    ways = (abs(x) / speed, abs(y) / speed) if speed > SLIP else (math.sqrt(0.5), math.sqrt(0.5))
+    bounds = np.empty((2, 4))
+    for k in range(4):
+        i, j = (1.0 if k < 2 else -1.0), (1.0 if k % 2 == 0 else -1.0)
+        share = 0.25 * (1 + i * bearing.tilt[0]) * (1 + j * bearing.tilt[1])
+        bounds[0, k] = row[ROUGH] * share * bearing.total * max(ways[0], LEAST)
+        bounds[1, k] = row[ROUGH] * share * bearing.total * max(ways[1], LEAST)
+    return bounds
+
+
+@compiled
+def _arms(row: FloatArray, half: float) -> FloatArray:
+    """Arms of the corners' forces along the world's axes (2, 4) m."""
+    cosine, sine = _heading(row)
+    arms = np.empty((2, 4))
+    for k in range(4):
+        a, b = (half if k < 2 else -half), (half if k % 2 == 0 else -half)
+        arms[0, k], arms[1, k] = -(a * sine + b * cosine), a * cosine - b * sine
+    return arms
+
+
+@compiled
+def shove(
+    row: FloatArray,
+    side: Side,
+    lip: Vector,
+    weight: float,
+    height: float,
+    half: Vector,
     step: float,
 ) -> Shove:
-    """Shove standing blocks for a time step (s); all impulses by the blocks' masses.
+    """Shove a standing block for a time step.
 
     As in PyBullet's direct solver, what friction can bear is what the normal forces would be
     without it, and along the world's axes apart.
 
     Args:
-        side: Where the lips are.
-        block: The blocks before it.
-        lip: (3, m) m/s, of the lips.
-        strengths: What may act.
-        size: The blocks' width and height, m.
-        height: (m,) m, at which the lips push, over the table.
+        row: The block before it.
+        side: Where the lip is.
+        lip: Velocity of the lip, m/s.
+        weight: Impulse with which the table carries the block, by its mass, m/s.
+        height: Over the table, at which the lip pushes, m.
+        half: Half edges of the block, m.
         step: s.
     """
-    (velocity, turning, turn), (weight, strength, rough) = block, strengths
-    (nx, ny), (rx, ry), half = side.normal, side.arm, size[0] / 2
-    ease = 6 / size[0] ** 2  # mass over moment of inertia about the vertical
-    lever_n, lever_t = rx * ny - ry * nx, rx * nx + ry * ny
-    vx, vy, spin = velocity[0], velocity[1], turning
-    lip_t = lip[1] * nx - lip[0] * ny
-    steep = side.slant / side.level
-    least = np.maximum(least_rise(side.gap, SEEN_BY_LIP) / step, -1e3) / side.level
-    least = least + lip[0] * nx + lip[1] * ny + steep * (velocity[2] - lip[2])
+    nx, ny, steep = side.nx, side.ny, side.slant / side.level
+    ease = 1.5 / half[0] ** 2  # mass over moment of inertia about the vertical
+    lever_n, lever_t = side.rx * ny - side.ry * nx, side.rx * nx + side.ry * ny
     share_n, share_t = 1 / (1 + ease * lever_n * lever_n), 1 / (1 + ease * lever_t * lever_t)
-    most = strength / np.maximum(steep, 1e-3)
-    # Without friction: what the corners carry, which the push tips over those in front
-    lever = height - size[1] / 2 + steep * (rx * nx + ry * ny)
-    front = half * (np.abs(side.local[0]) + np.abs(side.local[1]))
-    radius = (size[0] ** 2 + size[1] ** 2) / 12  # of gyration, about an edge's direction, squared
-    yields = 1 + front * front / radius
-    wanted = np.maximum(least - vx * nx - vy * ny - lever_n * spin, 0.0)
-    push = np.minimum(share_n * wanted, most)
-    total = weight + push * steep
-    tipping = total + front * lever * push / radius > total * yields
-    softer = 1 / share_n + lever * lever / (radius * yields)
-    push = np.where(tipping, np.minimum(wanted / softer, most), push)
-    limit = CUP.friction * rough * push / side.level
-    total = weight + push * steep
-    total = np.maximum(total, (total + front * lever * push / radius) / yields)
-    load = np.maximum(total, _LITTLE)
-    a, b = (np.minimum(np.maximum(lever * push * n / (load * half), -1.0), 1.0) for n in side.local)
-    corners = 0.25 * total * (1 + _CORNERS[0, :, None] * a) * (1 + _CORNERS[1, :, None] * b)
-    cosine, sine = 1 - 2 * turn[2] * turn[2], 2 * turn[2] * turn[3]
-    x = half * (_CORNERS[0, :, None] * cosine - _CORNERS[1, :, None] * sine)
-    y = half * (_CORNERS[0, :, None] * sine + _CORNERS[1, :, None] * cosine)
-    arms = np.stack([-y, x])  # of the corners' forces along x and y
-    speed = np.sqrt(vx * vx + vy * vy)
-    slips = speed > _SLIP
-    ways = np.where(slips, np.abs(velocity[:2]) / np.maximum(speed, _SLIP), math.sqrt(0.5))
-    bounds = rough * corners * np.maximum(ways, _LEAST)[:, None]
-    drag, rub = np.zeros_like(bounds), np.zeros_like(push)
-    before = vx * nx + vy * ny
-    push = np.zeros_like(push)
-    up = np.zeros_like(push)  # friction along the slant, which presses less and pushes more
-    share_up = share_n / np.maximum(side.slant * side.slant, 1e-3)
-    rises = side.level * (velocity[2] - lip[2]) - side.slant * (lip[0] * nx + lip[1] * ny)
+    strength = CUP.preload * step / row[MASS]
+    least = max(least_rise(side.gap, SEEN_BY_LIP) / step, -1e3) / side.level
+    least += lip[0] * nx + lip[1] * ny + steep * (row[VZ] - lip[2])
+    lever = height - half[2] + steep * (side.rx * nx + side.ry * ny)
+    bearing = _bearing(row, side, least, weight, strength, lever, half)
+    limit = bearing.friction
+    bounds, arms, drag = _bounds(row, bearing), _arms(row, half[0]), np.zeros((2, 4))
+    vx, vy, spin = row[VX], row[VY], row[SPIN + 2]
+    push = rub = up = 0.0  # up: friction along the slant, which presses less and pushes more
+    share_up = share_n / max(side.slant * side.slant, 1e-3)
+    rises = side.level * (row[VZ] - lip[2]) - side.slant * (lip[0] * nx + lip[1] * ny)
+    lip_t = lip[1] * nx - lip[0] * ny
     for _ in range(_SWEEPS):
-        wish = up - share_up * (side.slant * (vx * nx + vy * ny + lever_n * spin) + rises)
-        after = np.minimum(np.maximum(wish, -limit), limit)
-        p = side.slant * (after - up)
-        up = after
+        before = up
+        up -= share_up * (side.slant * (vx * nx + vy * ny + lever_n * spin) + rises)
+        up = clip(up, -limit, limit)
+        p = side.slant * (up - before)
         vx, vy, spin = vx + p * nx, vy + p * ny, spin + ease * lever_n * p
-        most = np.maximum(strength + side.level * up, 0.0) / np.maximum(steep, 1e-3)
+        most = max(strength + side.level * up, 0.0) / max(steep, 1e-3)
         after = push + share_n * (least - vx * nx - vy * ny - lever_n * spin)
-        after = np.minimum(np.maximum(after, 0.0), most)
-        wish = rub - share_t * (vy * nx - vx * ny + lever_t * spin - lip_t)
-        beside = np.minimum(np.maximum(wish, -limit), limit)
+        after = clip(after, 0.0, most)
+        beside = rub - share_t * (vy * nx - vx * ny + lever_t * spin - lip_t)
+        beside = clip(beside, -limit, limit)
         p, q = after - push, beside - rub
         push, rub = after, beside
         vx, vy = vx + (p * nx - q * ny), vy + (p * ny + q * nx)
-        spin = spin + ease * (lever_n * p + lever_t * q)
-        slip = np.stack([vx, vy])[:, None] + arms * spin
-        after = np.minimum(np.maximum(drag - _SHARE * slip, -bounds), bounds)
-        change = after - drag
-        drag = after
-        twist = arms * change
-        change = (change[:, 0] + change[:, 1]) + (change[:, 2] + change[:, 3])
-        twist = (twist[:, 0] + twist[:, 1]) + (twist[:, 2] + twist[:, 3])
-        vx, vy, spin = vx + change[0], vy + change[1], spin + ease * (twist[0] + twist[1])
-    push = push + side.slant * up
-    moment = push * height - (vx * nx + vy * ny - before) * (size[1] / 2)
-    lacks = moment * np.abs(side.local) - half * weight
-    reach = half - side.place * np.sign(side.local)
-    tips: BoolArray = (lacks > (push * steep + limit) * reach).any(axis=0)
-    impulse = np.stack([push * nx - rub * ny, push * ny + rub * nx])
-    return Shove(np.stack([vx, vy]), spin, impulse, tips)
+        spin += ease * (lever_n * p + lever_t * q)
+        vx, vy, spin = _rub(vx, vy, spin, ease, drag, bounds, arms)
+    push += side.slant * up
+    moment = push * height - ((vx - row[VX]) * nx + (vy - row[VY]) * ny) * half[2]
+    tips = False
+    for way, place in ((side.u, side.p), (side.v, side.q)):
+        lacks = moment * abs(way) - half[0] * weight
+        reach = half[0] - place * ((way > 0) - (way < 0))
+        tips |= lacks > (push * steep + limit) * reach
+    return Shove(vx, vy, spin, (push * nx - rub * ny, push * ny + rub * nx), tips)
+
+
+@compiled
+def _rub(
+    vx: float,
+    vy: float,
+    spin: float,
+    ease: float,
+    drag: FloatArray,
+    bounds: FloatArray,
+    arms: FloatArray,
+) -> tuple[float, float, float]:
+    """A sweep over the corners' friction (2, 4), ``drag``; velocity and turning after it."""
+    drag_x = drag_y = twist = 0.0
+    for k in range(4):
+        for way in range(2):
+            arm = arms[way, k]
+            slip = (vx if way == 0 else vy) + arm * spin
+            after = clip(drag[way, k] - _SHARE * slip, -bounds[way, k], bounds[way, k])
+            change = after - drag[way, k]
+            drag[way, k] = after
+            twist += arm * change
+            if way == 0:
+                drag_x += change
+            else:
+                drag_y += change
+    return vx + drag_x, vy + drag_y, spin + ease * twist

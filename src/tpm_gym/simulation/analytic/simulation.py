@@ -246,7 +246,7 @@ class AnalyticSimulation:
         rows = np.flatnonzero(late)
         if len(rows):
             if objects is not None:
-                self._pucks.restore(rows, tuple(part[..., rows] for part in objects))
+                self._pucks.restore(rows, objects[rows])
             drive = IdealDrives(self._effort[:, rows], self._step)
             followed = [Reference(one) for one in self._angles(path, rows).transpose(1, 0, 2)]
             self._march(rows, start.take(rows), drive, followed, vacuum)
