@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
+import os
+import subprocess
+import sys
 from collections.abc import Sequence
 from functools import cache
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -282,6 +287,28 @@ def history(pucks: FloatArray, ways: FloatArray, on: FloatArray) -> list[FloatAr
         seen.append(batch.advance(ALL, ways[k : k + STEPS + 2], on[period]).T)
         seen += batch.report().values()
     return seen
+
+
+def digest() -> str:
+    """Of everything that happens to a crowd."""
+    on = np.random.default_rng(3).random((8, 48)) < 0.6
+    return hashlib.sha256(
+        b"".join(part.tobytes() for part in history(*crowd(48, 2), on))
+    ).hexdigest()
+
+
+def test_compiled_code_gives_the_bits_that_python_gives() -> None:
+    script = (
+        "import sys; sys.path.insert(0, sys.argv[1]); import test_pucks as t; print(t.digest())"
+    )
+    plain = subprocess.run(
+        [sys.executable, "-c", script, Path(__file__).parent],
+        env=os.environ | {"NUMBA_DISABLE_JIT": "1"},
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    assert plain.stdout.strip() == digest()
 
 
 def test_a_row_has_the_same_bits_alone_and_among_others() -> None:

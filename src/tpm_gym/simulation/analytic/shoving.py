@@ -277,7 +277,7 @@ def shove(
     tips = False
     for way, place in ((side.u, side.p), (side.v, side.q)):
         lacks = moment * abs(way) - half[0] * weight
-        reach = half[0] - place * ((way > 0) - (way < 0))
+        reach = half[0] - (math.copysign(place, place * way) if way else 0.0)
         tips |= lacks > (push * steep + limit) * reach
     return Shove(vx, vy, spin, (push * nx - rub * ny, push * ny + rub * nx), tips)
 
