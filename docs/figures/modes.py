@@ -8,6 +8,7 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
+from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from figures.postures import STROKES
@@ -30,6 +31,7 @@ FloatArray = NDArray[np.float64]
 
 THETA = np.deg2rad([90.0, 180.0, 100.0])  # of the drawn postures, and of the path
 HEIGHT = 0.025  # m, value of y of the section
+_HALO = withStroke(linewidth=2.5, foreground="white")  # names stay readable where rods cross
 
 
 def level_posture(theta: FloatArray) -> RotatedPostures:
@@ -70,9 +72,9 @@ def operation_modes_figure() -> Figure:
         _draw(axes, posture)
         axes.set_title(f"{'abc'[column]}  {title}")
     _legend(figure)
-    _along_path(figure.add_axes((0.085, 0.37, 0.37, 0.17)))
-    _joint_space(figure.add_axes((0.085, 0.115, 0.37, 0.19)))
-    _section(figure, figure.add_axes((0.56, 0.115, 0.31, 0.425)))
+    _along_path(figure.add_axes((0.085, 0.385, 0.37, 0.165)))
+    _joint_space(figure.add_axes((0.085, 0.115, 0.37, 0.185)))
+    _section(figure, figure.add_axes((0.565, 0.115, 0.305, 0.435)))
     return figure
 
 
@@ -105,14 +107,14 @@ def _draw(axes: Axes, posture: RotatedPostures) -> None:
     x, _, z = pivots.T * MM
     axes.plot(x, z, "s", color=BLACK, markersize=4)
     for name, place, offset in (
-        ("4a", feet[0] + 0.4 * rods[0], (4, 4)),
-        ("4b", feet[1] + 0.4 * rods[1], (-12, -8)),
+        ("4a", feet[0] + 0.3 * rods[0], (-6, -10)),
+        ("4b", feet[1] + 0.1 * rods[1], (-15, 3)),
         ("3", feet[0], (3, 5)),
         ("3'", (ends[1] + ends[2]) / 2, (-8, -13)),
     ):
         axes.annotate(name, (place[0] * MM, place[2] * MM), offset, textcoords="offset points",
-                      fontsize=8, weight="bold")  # fmt: skip
-    axes.set(xlim=(-990, 460), ylim=(900, -390), xticks=[], yticks=[])
+                      fontsize=8, weight="bold", path_effects=[_HALO])  # fmt: skip
+    axes.set(xlim=(-990, 460), ylim=(960, -390), xticks=[], yticks=[])
     axes.set_aspect("equal")
 
 
@@ -230,7 +232,7 @@ def _section(figure: Figure, axes: Axes) -> None:
         Line2D([], [], color=OUTLINE, linewidth=1.0, label="edge, translating"),
         Line2D([], [], color=BLACK, linewidth=1.0, label="task region"),
     ]
-    axes.legend(handles=handles, loc="upper center", ncols=3, bbox_to_anchor=(0.5, -0.107),
+    axes.legend(handles=handles, loc="upper center", ncols=3, bbox_to_anchor=(0.5, -0.115),
                 fontsize=7, columnspacing=1.0, handlelength=1.5)  # fmt: skip
     bar = figure.add_axes((0.895, 0.16, 0.016, 0.335))
     figure.colorbar(image, cax=bar, ticks=range(0, 181, 30), label="smallest tilt (°)")

@@ -64,6 +64,8 @@ def test_the_motors_allow_four_tilts_at_most() -> None:
     _, rod_6 = sp.reduced(rod_6, [c**2 + s**2 - 1], c, s)
     p, q = sp.Poly(rod_6, rho).coeff_monomial(rho), sp.Poly(rod_6, rho).coeff_monomial(1)
     assert_zero(p + 2 * ((x_2 + 2 * l5) * c - (z_2 - z_1) * s))
+    level, rise = x_2 + 2 * l5 * (c**2 - s**2), z_2 - z_1 - 4 * l5 * s * c
+    assert_zero(q - (rho2 - l4**2 + level**2 + rise**2))
     assert in_tangent(rho2 * p**2 - q**2, 4).degree() == 4
 
 
