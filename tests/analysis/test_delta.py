@@ -180,6 +180,35 @@ def test_text_on_singularities_three_serial_factors_are_a_delta_s_and_no_paralle
         assert 0.1 < agree < 0.9
 
 
+@both
+def test_the_platform_may_turn_where_the_planes_of_parallelograms_of_balls_share_a_direction(
+    name: str,
+) -> None:
+    """A constraint singularity, which parallelograms of revolutes do not have."""
+    tripod, rng = BOXES[name][0], np.random.default_rng(6)
+    hinges = np.array([leg.hinge for leg in tripod.legs])
+
+    def volume(points: FloatArray) -> FloatArray:
+        """Of the three planes' normals: 0 where they share a direction."""
+        rods = tripod.parallel(points, tripod.inverse_all(points)[:, 0])
+        return np.linalg.det(np.cross(hinges, rods))
+
+    one = rng.uniform(-1.0, 1.0, (3000, 3))
+    other = one + rng.normal(0.0, 0.02, one.shape)
+    reached = [np.isfinite(tripod.inverse_all(ends)).all(axis=(1, 2)) for ends in (one, other)]
+    one, other = (ends[reached[0] & reached[1]] for ends in (one, other))
+    across = volume(one) * volume(other) < 0
+    one, other = one[across], other[across]
+    assert len(one) > 5
+    for _ in range(60):
+        middle = (one + other) / 2
+        same = (volume(middle) * volume(one) > 0)[:, None]
+        one, other = np.where(same, middle, one), np.where(same, other, middle)
+    for point, q in zip(one, tripod.inverse_all(one)[:, 0], strict=True):
+        assert freedoms(tripod.chains(point, q, balls=True), point) == (4, 1)
+        assert freedoms(tripod.chains(point, q), point) == (3, 0)
+
+
 # What the page says
 
 
@@ -209,6 +238,7 @@ def test_the_page_s_numbers_are_computed() -> None:
     assert rows["forward solutions"] == ["4", "2", "2"]
     printed = [[float(v) for v in cell.split(", ")] for cell in rows["motors that count, x, y, z"]]
     np.testing.assert_allclose(printed, counts, atol=0.05)
+    assert f'"motors that count" is {counts[2].mean():.2f} there' in TEXT
 
 
 def test_the_page_s_code_runs() -> None:
