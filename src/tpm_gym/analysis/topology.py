@@ -8,10 +8,10 @@ Two counts of the degrees of freedom that share nothing but the joints' axes, in
   spanning tree and point closures that the simulator loads, with every rod and ball of the
   parallelograms in it.
 
-Both are taken at one configuration, and agree at singularities too. If z_C1 = z_B1, both find 4:
-the parallelogram of branch I then contains the direction y, and link 3' can turn about it. That
-constraint singularity is not among the factors of Eqs. (16) and (17), which take for granted that
-link 3' only translates.
+Both are taken at one configuration, and agree at singularities too. If z_C1 = z_B1, both find 4,
+instantaneously: the parallelogram of branch I then contains the direction y, and link 3' can begin
+to turn about it. That constraint singularity is not among the factors of Eqs. (16) and (17), which
+take for granted that link 3' only translates.
 
 Functions of joint angles raise InputError for what is not three finite numbers, and
 UnreachableError if the branch does not exist there.
