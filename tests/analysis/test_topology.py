@@ -6,6 +6,7 @@ import numpy as np
 import oracle
 import pytest
 from examples import examples
+from hypothesis import example
 from walk import gaps
 
 from tpm_gym.analysis.poc import Chain, POCSet, Subspace, degrees_of_freedom
@@ -23,7 +24,7 @@ from tpm_gym.kinematics import (
 )
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.mechanism import PAPER_TPM
-from tpm_gym.mechanism.tree import build, joint_angles
+from tpm_gym.mechanism.tree import ACTUATED_JOINTS, build, joint_angles
 
 X, Y, Z = np.eye(3)
 
@@ -246,6 +247,26 @@ def test_both_counts_find_the_constraint_singularity(theta_1: float, side: int) 
         assert topology.dof() == 4
         with pytest.raises(InputError):
             _ = topology.coupling
+
+
+@examples(6, oracle.geometries())
+@example(PAPER)
+def test_the_loops_of_all_passive_joints_have_no_other_singularity(g: Geometry) -> None:
+    """With the motors locked, the closures' volume is det A's factors, the constraint's, and zero
+    else only where a rod lies along the first axis of the universal joint that it is given here."""
+    mechanism, names = build(g), joints_of_the_mechanism()
+    passive = [name not in (*ACTUATED_JOINTS, "R33") for name in names]
+    shares = []
+    for theta, branch in configurations(3, 40, g, clear=1e-3):
+        columns = closure_jacobian(mechanism, joint_angles(theta, branch, g))[:, passive]
+        volume = np.linalg.svd(columns, compute_uv=False).prod()
+        factors, found = jacobian.factors(theta, branch, g), forward_all(theta, g)
+        x_c, y = found.link3[branch.index, 0], found.position[branch.index, 1]
+        universal = (1 - (x_c / g.l4) ** 2) * (1 - (y / g.l4) ** 2)
+        shares.append(volume / abs(factors.parallel.prod() * factors.constraint * universal))
+    assert len(shares) > 10
+    # One row of the closures depends on the others; what it adds varies by a few per cent.
+    np.testing.assert_allclose(shares, np.median(shares), rtol=0.1)
 
 
 def test_the_task_region_keeps_clear_of_the_constraint_singularity() -> None:
