@@ -88,12 +88,14 @@ def answer(bisection: Bisection, success: Any, episodes: int = 50) -> int:
         assert name == bisection.attribute
         servo = name in ("servo_stiffness", "joint_friction")
         assert options.get("--drive", "ideal") == ("servo" if servo else "ideal")
+        assert options["--engine"] == bisection.engine
         rate = success(float(text))
         test = {
             "env": bisection.env,
             "policy": options["--policy"],
             "episodes": episodes,
             "randomisation": {name: float(text)},
+            "env_options": {"engine": bisection.engine},
             "success_at_end": {"mean": rate, "low": rate, "high": rate},
             "versions": {},
             "git_commit": "0" * 40,
@@ -145,6 +147,7 @@ def test_tests_of_no_bisection_are_refused(tmp_path: Path) -> None:
 
 def test_the_page_says_where_success_halves(records: list[Any]) -> None:
     text = page_of(records, [ROBUSTNESS])
+    assert f"images/{ROBUSTNESS}" in text
     rows = [line for line in text.splitlines() if line.startswith("| ")]
     (row,) = [row for row in rows if row.startswith("| puck mass (factor) | 1 | 10 |")]
     cells = {cell.strip() for cell in row.strip("|").split("|")[3:]}
@@ -157,10 +160,14 @@ def test_the_page_says_where_success_halves(records: list[Any]) -> None:
     low, high = map(float, row.strip("|").split("|")[3].split(" to "))
     assert high <= 0.8 < low < 1.05 * high
     (row,) = [row for row in rows if row.startswith("| encoder noise (rad) | 0 | 0.001 |")]
-    assert row.count("not in range: 97.0%") == 2
+    assert row.count("97.0% at 0.001") == 2
+    again = [record | {"engine": "analytic", "episodes": 70} for record in records]
+    text = page_of([*records, *again], [])
+    assert text.count("| puck mass") == 2 * page_of(records, []).count("| puck mass") > 0
+    assert "In closed form, 70 episodes a test:" in text
+    assert "In PyBullet, 50 episodes a test:" in text
     del records[0]["tests"][list(records[0]["tests"])[-1]]
     assert "not finished" in page_of(records, [])
-    assert f"images/{ROBUSTNESS}" in text
 
 
 def test_the_figure_has_a_panel_an_attribute_and_a_line_an_id(

@@ -8,14 +8,16 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import psutil
 import pytest
 from processes import PYTHON, TPM_GYM, printed_by, signalled
-from trainings import SAC_RECIPE, assert_equal_runs, without_times
+from trainings import PPO_RECIPE, SAC_RECIPE, assert_equal_runs, without_times
 
+import tpm_gym
 from tpm_gym.learning.command_line import main
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.report.records import condense
@@ -35,17 +37,51 @@ from tpm_gym.learning.study import (
 
 def test_plans_have_every_recipe_and_seed(tmp_path: Path) -> None:
     planned = plan_runs(StudyConfig("results", folder=tmp_path))
-    assert len(planned) == (6 + 4 + 2) * 5
+    scratch = [run for run in planned if "--demonstrations 0" in " ".join(run.options)]
+    assert len(scratch) == (4 + 2) * 5  # pick-and-place but with PPO
+    assert len(planned) == (6 + 4 + 2) * 5 + len(scratch)
     assert len({run.folder for run in planned}) == len(planned)
-    weighted = plan_runs(StudyConfig("penalty", folder=tmp_path))
-    assert len(weighted) == 3 * 2 * 5
+    weighted = plan_runs(StudyConfig("penalty", folder=tmp_path, engine="analytic"))
+    assert {run.env for run in weighted} == {env for env in tpm_gym.ENV_IDS if "Dense" in env}
+    assert len(weighted) == 4 * 2 * 5
     assert all("--goals" in run.options for run in weighted)
-    longer = plan_runs(StudyConfig("penalty", folder=tmp_path, steps=70_000))
+    longer = plan_runs(StudyConfig("penalty", folder=tmp_path, engine="analytic", steps=70_000))
     assert not {run.folder for run in longer} & {run.folder for run in weighted}
     assert all("--steps 70000" in " ".join(run.left(1)[0]) for run in longer)
     bisections = plan_runs(StudyConfig("robustness", folder=tmp_path))
     assert len(bisections) == 10 + 10 + 8  # without a puck there are no mass and friction of it
     assert len({run.folder for run in bisections}) == len(bisections)
+
+
+@pytest.mark.parametrize("plan", ["results", "penalty", "robustness"])
+def test_what_differs_by_its_engine_alone_is_kept_apart(plan: Any, tmp_path: Path) -> None:
+    one, other = (
+        {run.folder for run in plan_runs(StudyConfig(plan, folder=tmp_path, engine=engine))}
+        for engine in ("analytic", "pybullet")
+    )
+    assert not one & other
+
+
+def test_what_is_learned_in_closed_form_is_tested_there_and_in_pybullet(tmp_path: Path) -> None:
+    """In both as configured, with goals that tempt too; the record says which is which."""
+    config = StudyConfig("penalty", folder=tmp_path, engine="analytic", seeds=1, episodes=3)
+    (run, _) = plan_runs(replace(config, envs=("TPMReachDense-v0",)))
+    recipe = tmp_path / "ppo.yml"
+    recipe.write_text(PPO_RECIPE.format(env=run.env, envs=3), encoding="utf-8")
+    words = ("--recipe", str(recipe), "--steps", "240", "--eval-episodes", "2")
+    run = replace(run, options=(*run.options, *words))
+    assert execute(run, 3) is None, run.folder.with_suffix(".log").read_text()
+    assert run.left(3) == []
+    for engine in ("analytic", "pybullet"):
+        test = json.loads((run.folder / "tests" / f"{engine}.json").read_text())
+        assert (test["episodes"], test["goals"]) == (3, "tempting")
+        assert test["env_options"] == {"engine": engine}
+        # Whatever the weight in training, returns are comparable.
+        assert test["penalty_weight"] == 1.0
+    kept = condense(run.folder)
+    assert (kept["engine"], kept["penalty_weight"], kept["goals"]) == ("analytic", 0.0, "tempting")
+    rates = [kept["tests"][engine]["return"]["mean"] for engine in ("analytic", "pybullet")]
+    assert rates[0] == pytest.approx(rates[1], abs=0.05)  # Reach: nothing is touched
 
 
 @pytest.mark.parametrize(
@@ -76,11 +112,12 @@ def test_what_is_done_is_skipped_and_what_was_stopped_goes_on(
         main(words)
         return capsys.readouterr().out.split("\n")[:-1]
 
-    run = tmp_path / "TPMReach-v0-sac-s0"
-    done = run / "tests" / "nominal.json"
+    run = tmp_path / "TPMReach-v0-sac-pybullet-s0"
+    done = run / "tests" / "pybullet.json"
     test = f"tpm-gym evaluate --policy {run} --env TPMReach-v0 --episodes 7"
-    test += f" --json {done}"
-    first = f"tpm-gym train --env TPMReach-v0 --algo sac --seed 0 --run {run}"
+    test += f" --engine pybullet --json {done}"
+    first = "tpm-gym train --env TPMReach-v0 --algo sac --engine pybullet --test-episodes 0"
+    first += f" --seed 0 --run {run}"
     assert left() == [first, test]
     run.mkdir()
     (run / "config.json").write_text('{"steps": 100}')
@@ -159,7 +196,7 @@ def small(folder: Path, seed: int) -> Run:
     recipe.write_text(SAC_RECIPE.format(env="TPMReach-v0", train_freq=20), encoding="utf-8")
     words = ["--recipe", str(recipe), "--seed", str(seed), "--steps", "2000"]
     words += ["--eval-every", "1000", "--eval-episodes", "2", "--checkpoint-every", "50"]
-    test = ("nominal", ())
+    test = ("pybullet", ())
     return Run(folder / f"run-s{seed}", "TPMReach-v0", "sac", tuple(words), (test,))
 
 
@@ -197,7 +234,7 @@ def test_ctrl_c_stops_a_study_with_checkpoints_saved(tmp_path: Path) -> None:
     before = temporary()
     words = ["--plan", "results", "--envs", "TPMReach-v0", "--algos", "sac", "--seeds", "2"]
     words = [*TPM_GYM, "study", *words, "--folder", str(tmp_path), "--jobs", "1"]
-    run = tmp_path / "TPMReach-v0-sac-s0"
+    run = tmp_path / "TPMReach-v0-sac-pybullet-s0"
     status, output = signalled(words, lambda: list(run.glob("checkpoints/0*")), signal.SIGINT)
     assert status == 1, output
     assert f"{run}: stopped: tpm-gym train --env TPMReach-v0" in output
@@ -205,7 +242,7 @@ def test_ctrl_c_stops_a_study_with_checkpoints_saved(tmp_path: Path) -> None:
     log = run.with_suffix(".log").read_text(encoding="utf-8")
     assert "stopped early by SIGINT, saved at step" in log
     assert (run / "last.zip").is_file()
-    assert not (tmp_path / "TPMReach-v0-sac-s1").exists()
+    assert not (tmp_path / "TPMReach-v0-sac-pybullet-s1").exists()
     assert temporary() == before
 
 

@@ -268,8 +268,10 @@ PICK = {"env": "TPMPickAndPlace-v0", "recipe_file": recipe_file("sac")}
         ({"seed": SELECTION_SEED}, "held out"),
         ({"seed": SELECTION_SEED - 2, "envs": 3}, "held out"),
         ({"envs": 5}, "before the first episode ends"),
-        ({**PICK, "steps": 20_000}, "more than the 20,000 of the recipe's demonst"),
+        ({**PICK, "steps": 20_000}, "more than the 20,000 of the demonst"),
         ({**PICK, "steps": 20_050, "envs": 3}, "the 20,100 of"),
+        ({**PICK, "steps": 500, "demonstrations": 10}, "the 500 of"),
+        ({"demonstrations": -1}, "--demonstrations -1: must be at least 0"),
         ({"algo": "ppo", "recipe_file": None}, "no recipe for TPMReach-v0; .*--recipe FILE"),
         ({"recipe_file": Path("none.yml")}, "cannot be read"),
         ({"device": "meta"}, "--device meta"),
@@ -282,6 +284,16 @@ def test_mistakes_are_named_before_anything_is_written(
     with pytest.raises(TPMError, match=message):
         train(replace(make_config("sac", tmp_path), **options), quiet())
     assert not (tmp_path / "run").exists()
+
+
+def test_demonstrations_are_as_many_as_asked_for(tmp_path: Path) -> None:
+    config = replace(make_config("sac", tmp_path), **PICK)
+    for count, found in {None: 400, 10: 10, 0: None}.items():
+        recipe = complete(replace(config, steps=30_000, demonstrations=count)).recipe
+        assert recipe.demonstrations.get("episodes") == found
+        assert recipe.demonstrations.get("noise") == (0.3 if found else None)
+    with pytest.raises(ConfigError, match=r"--demonstrations 1: ppo\.demonstrations: unknown"):
+        complete(replace(make_config("ppo", tmp_path), demonstrations=1))
 
 
 @pytest.mark.parametrize("size", [49, 10**12, 10**30])

@@ -1,9 +1,10 @@
 """Run the trainings and tests of docs/results.md on Ray: some at once here, or on a cluster.
 
-``results``: every recipe on its ids, five seeds each, tested on 1000 held-out episodes.
-``penalty``: the same recipes with the singularity penalty off and on, on goals that tempt towards
-the singularity. ``robustness``: the published policies on machines that differ more and more in one
-thing, until success has halved.
+``results``: every recipe on its ids, five seeds each, from scratch too where it has demonstrations.
+``penalty``: PPO's recipes with the singularity penalty off and on, on goals that tempt towards the
+singularity. ``robustness``: the published policies on machines that differ more and more in one
+thing, until success has halved. Trainings are tested in the engine they were made in, and in
+PyBullet.
 
 It can be stopped with Ctrl-C at any time and started again: trainings go on from their last
 checkpoint. So do, elsewhere and at once, those whose process or node dies. A training that fails is
@@ -35,14 +36,12 @@ from tpm_gym.learning.environments import check_env_id
 from tpm_gym.learning.errors import ConfigError, LearningError, RunError
 from tpm_gym.learning.provenance import require_writable
 from tpm_gym.learning.recipes import read_recipes, recipe_file
-from tpm_gym.learning.report.page import NOMINAL, TEMPTING
 from tpm_gym.learning.robustness import OF_PUCK, OF_SERVOS, ends, halving
 from tpm_gym.learning.run_folder import CONFIG_FILE, TESTS, WHOLE, claimed, is_finished
 from tpm_gym.policy.files import published
 from tpm_gym.simulation.randomisation import LIMITS
 from tpm_gym.tasks.registry import TASKS
 
-_PENALTY_IDS: Final = ("TPMReach-v0", "TPMReachJoints-v0", "TPMPickAndPlaceJoints-v0")
 _WEIGHTS: Final = (0.0, 1.0)
 _STOPPED: Final = (128 + signal.SIGINT, 128 + signal.SIGTERM)
 _GRACE: Final = 30.0  # s
@@ -55,14 +54,17 @@ class StudyConfig:
     plan: Literal["results", "penalty", "robustness"]
     """What to run; robustness tests the published policies, and trains nothing."""
 
-    envs: Annotated[tuple[str, ...], shown_default("all, for penalty three", "ID ...")] = ()
+    engine: str = "pybullet"
+    """Engine to train in, with its own recipes where there are; of robustness, to test in."""
+
+    envs: Annotated[tuple[str, ...], shown_default("all", "ID ...")] = ()
     """Environment ids."""
 
     steps: Annotated[int, unset(int, "as the recipes say", "INT")] = UNSET
     """Steps of each training. Runs of other lengths than their recipes' have folders of their
     own."""
 
-    algos: Annotated[tuple[str, ...], shown_default("all for results, else sac", "NAME ...")] = ()
+    algos: Annotated[tuple[str, ...], shown_default("all, for penalty ppo", "NAME ...")] = ()
     """Algorithms."""
 
     seeds: int = 5
@@ -125,6 +127,7 @@ class Bisection:
     folder: Path
     env: str
     attribute: str
+    engine: str = "pybullet"
 
     def left(self, episodes: int) -> list[list[str]]:
         """Return the next command, a test of so many episodes; none where all is done."""
@@ -138,7 +141,8 @@ class Bisection:
             value = halving(self.attribute, end, successes).missing
             if value is not None:
                 drive = ("--drive", "servo") if self.attribute in OF_SERVOS else ()
-                changes = (*drive, "--randomisation", f"{self.attribute}={value:g}")
+                engine = ("--engine", self.engine)
+                changes = (*engine, *drive, "--randomisation", f"{self.attribute}={value:g}")
                 file = self.folder / TESTS / f"{value:g}.json"
                 return [_evaluation(self.env, self.env, episodes, changes, file)]
         return []
@@ -175,7 +179,9 @@ def plan_runs(config: StudyConfig) -> list[Run] | list[Bisection]:
 
 def _bisections(config: StudyConfig) -> list[Bisection]:
     return [
-        Bisection(config.folder / f"{env}-{attribute}", env, attribute)
+        Bisection(
+            config.folder / f"{env}-{attribute}-{config.engine}", env, attribute, config.engine
+        )
         for env in published()
         if not config.envs or env in config.envs
         for attribute in LIMITS
@@ -184,39 +190,41 @@ def _bisections(config: StudyConfig) -> list[Bisection]:
 
 
 def _trainings(config: StudyConfig) -> list[Run]:
-    usual = tuple(ALGORITHMS) if config.plan == "results" else ("sac",)
+    usual = tuple(ALGORITHMS) if config.plan == "results" else ("ppo",)
     return [
         run
         for algo in config.algos or usual
-        for env in _ids(config, algo)
+        for env in _recipes(config, algo)
+        if not config.envs or env in config.envs
         for seed in range(config.seeds)
         for run in _runs_of(config, env, algo, seed)
     ]
 
 
-def _ids(config: StudyConfig, algo: str) -> list[str]:
-    wanted = config.envs or (() if config.plan == "results" else _PENALTY_IDS)
-    return [env for env in read_recipes(recipe_file(algo), algo) if not wanted or env in wanted]
+def _recipes(config: StudyConfig, algo: str) -> dict[str, dict[str, Any]]:
+    return read_recipes(recipe_file(algo, config.engine), algo)
 
 
 def _runs_of(config: StudyConfig, env: str, algo: str, seed: int) -> list[Run]:
-    name = f"{env}-{algo}"
-    options = ["--seed", str(seed)]
+    name = f"{env}-{algo}-{config.engine}"
+    options = ["--engine", config.engine, "--test-episodes", "0", "--seed", str(seed)]
     if config.steps is not UNSET:
         name += f"-{config.steps}steps"
         options += ["--steps", str(config.steps)]
+    engines = dict.fromkeys((config.engine, "pybullet"))
+
+    def run(variant: str, *changes: str, goals: tuple[str, ...] = ()) -> Run:
+        tests = tuple((engine, ("--engine", engine, *goals)) for engine in engines)
+        folder = config.folder / f"{name}{variant}-s{seed}"
+        return Run(folder, env, algo, (*options, *goals, *changes), tests)
+
     if config.plan == "results":
-        folder = config.folder / f"{name}-s{seed}"
-        return [Run(folder, env, algo, tuple(options), ((NOMINAL, ()),))]
+        from_scratch = [run("-scratch", "--demonstrations", "0")]
+        demonstrated = "demonstrations" in _recipes(config, algo)[env]
+        return [run(""), *(from_scratch if demonstrated else ())]
     goals = ("--goals", "tempting")
     return [
-        Run(
-            config.folder / f"{name}-tempting-w{weight:g}-s{seed}",
-            env,
-            algo,
-            (*options, *goals, "--penalty-weight", f"{weight:g}"),
-            ((TEMPTING, goals),),
-        )
+        run(f"-tempting-w{weight:g}", "--penalty-weight", f"{weight:g}", goals=goals)
         for weight in _WEIGHTS
     ]
 
