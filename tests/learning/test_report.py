@@ -60,10 +60,10 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     recipe = folder / "sac.yml"
     recipe.write_text(SAC_RECIPE.format(env="TPMReach-v0", train_freq=20), encoding="utf-8")
     words = ("--recipe", str(recipe), "--steps", "120", "--eval-every", "60", "--eval-episodes")
-    tests = (("pybullet", ()),)
+    tests = (("pybullet", 2, ()),)
     run = Run(folder / "TPMReach-v0-sac-s0", "TPMReach-v0", "sac", (*words, "2"), tests)
-    assert execute(run, 2) is None, run.folder.with_suffix(".log").read_text()
-    assert run.left(2) == []
+    assert execute(run) is None, run.folder.with_suffix(".log").read_text()
+    assert run.left() == []
     return folder
 
 

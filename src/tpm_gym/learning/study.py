@@ -71,7 +71,10 @@ class StudyConfig:
     """Seeds of the trainings, from 0 up."""
 
     episodes: int = 1000
-    """Episodes of each test."""
+    """Episodes of each test in --engine."""
+
+    pybullet_episodes: int = 200
+    """Episodes of each test in PyBullet of what was trained in another engine."""
 
     folder: Path = Path("runs/study")
     """Folder of the run folders; all nodes of a cluster have to see it, and the working folder."""
@@ -93,17 +96,17 @@ class Run:
 
     Attributes:
         options: Options of the training besides the others.
-        tests: Name of each test and options of its evaluation.
+        tests: Name of each test, number of its episodes, and options of its evaluation.
     """
 
     folder: Path
     env: str
     algo: str
     options: tuple[str, ...]
-    tests: tuple[tuple[str, tuple[str, ...]], ...]
+    tests: tuple[tuple[str, int, tuple[str, ...]], ...]
 
-    def left(self, episodes: int) -> list[list[str]]:
-        """Return the commands that are left, tests of so many episodes; none where all is done."""
+    def left(self) -> list[list[str]]:
+        """Return the commands that are left; none where all is done."""
         left = []
         folder = str(self.folder)
         if not is_finished(self.folder):
@@ -112,7 +115,7 @@ class Run:
             else:
                 options = ["--env", self.env, "--algo", self.algo, *self.options, "--run", folder]
                 left.append(["tpm-gym", "train", *options])
-        for name, changes in self.tests:
+        for name, episodes, changes in self.tests:
             file = self.folder / TESTS / f"{name}.json"
             # Trainings delete the tests of earlier policies.
             if left or not (file.is_file() and _test(file)["episodes"] == episodes):
@@ -127,14 +130,15 @@ class Bisection:
     folder: Path
     env: str
     attribute: str
+    episodes: int
     engine: str = "pybullet"
 
-    def left(self, episodes: int) -> list[list[str]]:
-        """Return the next command, a test of so many episodes; none where all is done."""
+    def left(self) -> list[list[str]]:
+        """Return the next command; none where all is done."""
         successes = {}
         for file in sorted((self.folder / TESTS).glob(WHOLE)):
             test = _test(file)
-            if test["episodes"] == episodes:
+            if test["episodes"] == self.episodes:
                 value = test["randomisation"][self.attribute]
                 successes[float(value)] = test["success_at_end"]["mean"]
         for end in ends(self.attribute):
@@ -144,7 +148,7 @@ class Bisection:
                 engine = ("--engine", self.engine)
                 changes = (*engine, *drive, "--randomisation", f"{self.attribute}={value:g}")
                 file = self.folder / TESTS / f"{value:g}.json"
-                return [_evaluation(self.env, self.env, episodes, changes, file)]
+                return [_evaluation(self.env, self.env, self.episodes, changes, file)]
         return []
 
 
@@ -169,7 +173,7 @@ def plan_runs(config: StudyConfig) -> list[Run] | list[Bisection]:
     Raises:
         ConfigError: No run is left of the plan, or a number cannot work.
     """
-    check_least(config, 1, "steps", "seeds", "episodes", "jobs")
+    check_least(config, 1, "steps", "seeds", "episodes", "pybullet_episodes", "jobs")
     runs = _bisections(config) if config.plan == "robustness" else _trainings(config)
     if not runs:
         left = "no published policy" if config.plan == "robustness" else "no recipe of the plan"
@@ -180,7 +184,11 @@ def plan_runs(config: StudyConfig) -> list[Run] | list[Bisection]:
 def _bisections(config: StudyConfig) -> list[Bisection]:
     return [
         Bisection(
-            config.folder / f"{env}-{attribute}-{config.engine}", env, attribute, config.engine
+            config.folder / f"{env}-{attribute}-{config.engine}",
+            env,
+            attribute,
+            config.episodes,
+            config.engine,
         )
         for env in published()
         if not config.envs or env in config.envs
@@ -211,10 +219,12 @@ def _runs_of(config: StudyConfig, env: str, algo: str, seed: int) -> list[Run]:
     if config.steps is not UNSET:
         name += f"-{config.steps}steps"
         options += ["--steps", str(config.steps)]
-    engines = dict.fromkeys((config.engine, "pybullet"))
+    engines = {"pybullet": config.pybullet_episodes, config.engine: config.episodes}
 
     def run(variant: str, *changes: str, goals: tuple[str, ...] = ()) -> Run:
-        tests = tuple((engine, ("--engine", engine, *goals)) for engine in engines)
+        tests = tuple(
+            (engine, episodes, ("--engine", engine, *goals)) for engine, episodes in engines.items()
+        )
         folder = config.folder / f"{name}{variant}-s{seed}"
         return Run(folder, env, algo, (*options, *goals, *changes), tests)
 
@@ -242,7 +252,7 @@ def study(config: StudyConfig) -> None:
     """
     runs = plan_runs(config)
     if config.dry_run:
-        left = [command for run in runs for command in run.left(config.episodes)]
+        left = [command for run in runs for command in run.left()]
         print(*map(shlex.join, left), sep="\n")
         return
     if failures := run_all(runs, config):
@@ -262,14 +272,14 @@ def run_all(runs: Sequence[Run | Bisection], config: StudyConfig) -> int:
         cluster.connected(config.address, config.jobs),
         tempfile.NamedTemporaryFile(prefix=".", dir=config.folder) as seen,
     ):
-        given = (config.episodes, Path.cwd(), Path(seen.name))
+        given = (Path.cwd(), Path(seen.name))
         for run, problem in cluster.each(execute_there, runs, *given):
             print(f"{run.folder}: {problem or 'done'}", flush=True)
             ended_well += problem is None
     return len(runs) - ended_well
 
 
-def execute_there(run: Run | Bisection, episodes: int, here: Path, seen: Path) -> str | None:
+def execute_there(run: Run | Bisection, here: Path, seen: Path) -> str | None:
     """Execute a run on a node of a cluster, if that sees the working folder and a file in --folder.
 
     Returns:
@@ -281,14 +291,14 @@ def execute_there(run: Run | Bisection, episodes: int, here: Path, seen: Path) -
     except OSError:
         is_shared = False
     if is_shared:
-        return execute(run, episodes)
+        return execute(run)
     return (
         f"failed: {socket.gethostname()} does not see {here} and {seen.parent} as they are here; "
         "choose a working folder and a --folder on a disk that all nodes share"
     )
 
 
-def execute(run: Run | Bisection, episodes: int) -> str | None:
+def execute(run: Run | Bisection) -> str | None:
     """Run what is left in this process, with the output in a file beside the run.
 
     Returns:
@@ -297,7 +307,7 @@ def execute(run: Run | Bisection, episodes: int) -> str | None:
     log = run.folder.with_suffix(".log")
     log.parent.mkdir(parents=True, exist_ok=True)
     _outlast(run.folder)
-    while left := run.left(episodes):
+    while left := run.left():
         status = _run_command(left[0], log)
         if status != 0:
             how = "stopped" if status in _STOPPED else f"failed with status {status}, see {log}"

@@ -25,7 +25,7 @@ STUDIES: Final = (
     StudyConfig("results", engine="analytic"),
     StudyConfig("penalty", engine="analytic"),
     StudyConfig("robustness", engine="analytic"),
-    StudyConfig("robustness", engine="pybullet", episodes=300),
+    StudyConfig("robustness", engine="pybullet", episodes=100),
 )
 
 _INTRO: Final = f"""# Results
