@@ -245,4 +245,4 @@ def test_success_in_both_engines_and_what_was_demonstrated_are_told(real: dict[s
     assert "| 100.0% (100.0) | 90.0% (90.0) |" in row
     (row,) = rows(text, "SAC + HER | PyBullet | 120 |")
     assert "| \N{EM DASH} | 80.0% (80.0) |" in row
-    assert "9 in closed form, 2 in PyBullet held-out episodes a seed" in text
+    assert "Held-out episodes a seed: 9 in closed form, 2 in PyBullet." in text

@@ -197,6 +197,7 @@ def robustness(records: Sequence[Record]) -> Figure:
                     color=colours[record["env"]],
                     label=f"{record['env']}, {ENGINES.get(record['engine'], record['engine'])}",
                     linestyle="--" if record["engine"] == "pybullet" else "-",
+                    markerfacecolor="white" if record["engine"] == "pybullet" else None,
                     marker="o",
                     markersize=2.5,
                 )

@@ -133,7 +133,7 @@ def _training(records: Group, figures: Sequence[str]) -> list[str]:
     rows = [_training_row(group) for group in grouped(records)]
     tested = (
         "Methods without demonstrations start from scratch. Steps are over all environments. "
-        f"{_episodes(records)} held-out episodes a seed.\n"
+        f"{_episodes(records)}\n"
     )
     parts = ["## Learning: from scratch, or with demonstrations\n", tested, _table(head, rows)]
     if LEARNING_CURVES in figures:
@@ -226,8 +226,7 @@ def _penalty(records: Group, figures: Sequence[str]) -> list[str]:
         "## Does the penalty work?\n\nTrained and tested on goals that tempt towards the "
         "singularity (`--goals tempting`): goals, and pucks, lie just within the safe threshold, "
         "and straight lines in the joint angles lead beyond it. Returns are counted with the "
-        f"penalty, whatever a policy was trained with. {_episodes(records)} held-out episodes a "
-        "seed.\n"
+        f"penalty, whatever a policy was trained with. {_episodes(records)}\n"
     )
     parts = [text, _table(head, rows), *_compared(records)]
     if PENALTY in figures:
@@ -308,13 +307,13 @@ def _halves(record: Record, end: float) -> str:
 
 
 def _episodes(records: Group) -> str:
-    """How many episodes the tests in each engine had."""
+    """How many episodes the tests in each engine had, as a sentence."""
     found = []
     for engine, name in ENGINES.items():
         tests = [record["tests"].get(engine) for record in records]
         counts = " or ".join(map(str, sorted({test["episodes"] for test in tests if test})))
         found.append(f"{counts or 'no'} in {name}")
-    return ", ".join(found)
+    return f"Held-out episodes a seed: {', '.join(found)}."
 
 
 def _how(records: Sequence[Record]) -> list[str]:
