@@ -344,6 +344,18 @@ def test_shipped_recipes_are_arguments_of_the_algorithm_and_relabel_sparse_rewar
     envs.close()
 
 
+def test_recipes_in_closed_form_are_for_many_environments_and_every_id() -> None:
+    options = EnvOptions(engine="analytic")
+    found = set()
+    for algorithm in ("sac", "ppo"):
+        for env_id in read_recipes(recipe_file(algorithm, "analytic"), algorithm):
+            config = complete(TrainingConfig(algo=algorithm, env=env_id, env_options=options))
+            assert config.envs > 1
+            assert config.recipe.hindsight == ("Dense" not in env_id) == (algorithm == "sac")
+            found.add(env_id)
+    assert found == set(tpm_gym.ENV_IDS)
+
+
 @pytest.mark.parametrize(
     ("before", "after", "key", "message"),
     [
