@@ -54,6 +54,7 @@ Kill = Callable[..., TrainingConfig]
         *[pytest.param("ppo", step, marks=pytest.mark.slow) for step in (39, 95)],
         ("ppo in processes", 201),
         ("ppo in closed form", 251),
+        ("sac in closed form", 251),
     ],
 )
 def test_a_killed_run_ends_as_if_nothing_had_happened(case: str, step: int, killed: Kill) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import shlex
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -78,22 +79,24 @@ def test_half_is_of_the_nominal_success() -> None:
 # -- in files -------------------------------------------------------------------------------------
 
 
-def answer(bisection: Bisection, success: Any, episodes: int = 50) -> int:
+def answer(bisection: Bisection, success: Any) -> int:
     """Write what the evaluations would that a bisection asks for; return how many there were."""
     count = 0
-    while left := bisection.left(episodes):
+    while left := bisection.left():
         (command,) = left
         options = dict(zip(command[2::2], command[3::2], strict=True))
         name, _, text = options["--randomisation"].partition("=")
         assert name == bisection.attribute
         servo = name in ("servo_stiffness", "joint_friction")
         assert options.get("--drive", "ideal") == ("servo" if servo else "ideal")
+        assert options["--engine"] == bisection.engine
         rate = success(float(text))
         test = {
             "env": bisection.env,
             "policy": options["--policy"],
-            "episodes": episodes,
+            "episodes": bisection.episodes,
             "randomisation": {name: float(text)},
+            "env_options": {"engine": bisection.engine},
             "success_at_end": {"mean": rate, "low": rate, "high": rate},
             "versions": {},
             "git_commit": "0" * 40,
@@ -118,7 +121,7 @@ def records(tmp_path: Path) -> list[Any]:
     runs = tmp_path / "runs"
     for env in ("TPMReach-v0", "TPMPickAndPlace-v0"):
         for attribute in LIMITS:
-            bisection = Bisection(runs / f"{env}-{attribute}", env, attribute)
+            bisection = Bisection(runs / f"{env}-{attribute}", env, attribute, 50)
             factor = nominal(attribute) == 1.0
             answer(bisection, law if factor else lambda value: 0.97)
     paths = collect(Collect(runs, tmp_path / "records"))
@@ -127,16 +130,16 @@ def records(tmp_path: Path) -> list[Any]:
 
 
 def test_what_was_tested_is_not_tested_again_unless_with_other_episodes(tmp_path: Path) -> None:
-    bisection = Bisection(tmp_path / "b", "TPMReach-v0", "link_mass")
+    bisection = Bisection(tmp_path / "b", "TPMReach-v0", "link_mass", 50)
     assert answer(bisection, law) == 1 + 7 + 7
-    assert bisection.left(50) == []
-    assert answer(bisection, lambda value: 0.8, 60) == 3
+    assert bisection.left() == []
+    assert answer(replace(bisection, episodes=60), lambda value: 0.8) == 3
     kept = condense_bisection(tmp_path / "b")
     assert (kept["episodes"], set(kept["tests"])) == (60, {"0.5", "1", "2"})
 
 
 def test_tests_of_no_bisection_are_refused(tmp_path: Path) -> None:
-    bisection = Bisection(tmp_path / "b", "TPMReach-v0", "link_mass")
+    bisection = Bisection(tmp_path / "b", "TPMReach-v0", "link_mass", 50)
     answer(bisection, law)
     (tmp_path / "b" / "tests" / "1.json").unlink()
     with pytest.raises(ConfigError, match="no bisection"):
@@ -145,6 +148,7 @@ def test_tests_of_no_bisection_are_refused(tmp_path: Path) -> None:
 
 def test_the_page_says_where_success_halves(records: list[Any]) -> None:
     text = page_of(records, [ROBUSTNESS])
+    assert f"images/{ROBUSTNESS}" in text
     rows = [line for line in text.splitlines() if line.startswith("| ")]
     (row,) = [row for row in rows if row.startswith("| puck mass (factor) | 1 | 10 |")]
     cells = {cell.strip() for cell in row.strip("|").split("|")[3:]}
@@ -157,10 +161,14 @@ def test_the_page_says_where_success_halves(records: list[Any]) -> None:
     low, high = map(float, row.strip("|").split("|")[3].split(" to "))
     assert high <= 0.8 < low < 1.05 * high
     (row,) = [row for row in rows if row.startswith("| encoder noise (rad) | 0 | 0.001 |")]
-    assert row.count("not in range: 97.0%") == 2
+    assert row.count("97.0% at 0.001") == 2
+    again = [record | {"engine": "analytic", "episodes": 70} for record in records]
+    text = page_of([*records, *again], [])
+    assert text.count("| puck mass") == 2 * page_of(records, []).count("| puck mass") > 0
+    assert "In closed form, 70 episodes a test:" in text
+    assert "In PyBullet, 50 episodes a test:" in text
     del records[0]["tests"][list(records[0]["tests"])[-1]]
     assert "not finished" in page_of(records, [])
-    assert f"images/{ROBUSTNESS}" in text
 
 
 def test_the_figure_has_a_panel_an_attribute_and_a_line_an_id(

@@ -8,14 +8,16 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import psutil
 import pytest
 from processes import PYTHON, TPM_GYM, printed_by, signalled
-from trainings import SAC_RECIPE, assert_equal_runs, without_times
+from trainings import PPO_RECIPE, SAC_RECIPE, assert_equal_runs, without_times
 
+import tpm_gym
 from tpm_gym.learning.command_line import main
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.report.records import condense
@@ -35,17 +37,51 @@ from tpm_gym.learning.study import (
 
 def test_plans_have_every_recipe_and_seed(tmp_path: Path) -> None:
     planned = plan_runs(StudyConfig("results", folder=tmp_path))
-    assert len(planned) == (6 + 4 + 2) * 5
+    scratch = [run for run in planned if "--demonstrations 0" in " ".join(run.options)]
+    assert len(scratch) == 4 * 5  # pick-and-place but with PPO
+    assert len(planned) == (6 + 2) * 5 + len(scratch)
     assert len({run.folder for run in planned}) == len(planned)
-    weighted = plan_runs(StudyConfig("penalty", folder=tmp_path))
-    assert len(weighted) == 3 * 2 * 5
+    weighted = plan_runs(StudyConfig("penalty", folder=tmp_path, engine="analytic"))
+    assert {run.env for run in weighted} == {env for env in tpm_gym.ENV_IDS if "Dense" in env}
+    assert len(weighted) == 4 * 2 * 5
     assert all("--goals" in run.options for run in weighted)
-    longer = plan_runs(StudyConfig("penalty", folder=tmp_path, steps=70_000))
+    longer = plan_runs(StudyConfig("penalty", folder=tmp_path, engine="analytic", steps=70_000))
     assert not {run.folder for run in longer} & {run.folder for run in weighted}
-    assert all("--steps 70000" in " ".join(run.left(1)[0]) for run in longer)
+    assert all("--steps 70000" in " ".join(run.left()[0]) for run in longer)
     bisections = plan_runs(StudyConfig("robustness", folder=tmp_path))
     assert len(bisections) == 10 + 10 + 8  # without a puck there are no mass and friction of it
     assert len({run.folder for run in bisections}) == len(bisections)
+
+
+@pytest.mark.parametrize("plan", ["results", "penalty", "robustness"])
+def test_what_differs_by_its_engine_alone_is_kept_apart(plan: Any, tmp_path: Path) -> None:
+    one, other = (
+        {run.folder for run in plan_runs(StudyConfig(plan, folder=tmp_path, engine=engine))}
+        for engine in ("analytic", "pybullet")
+    )
+    assert not one & other
+
+
+def test_what_is_learned_in_closed_form_is_tested_there_and_in_pybullet(tmp_path: Path) -> None:
+    """In both as configured, with goals that tempt too; the record says which is which."""
+    config = StudyConfig(
+        "penalty", folder=tmp_path, engine="analytic", seeds=1, episodes=4, pybullet_episodes=3
+    )
+    (run, _) = plan_runs(replace(config, envs=("TPMReachDense-v0",)))
+    recipe = tmp_path / "ppo.yml"
+    recipe.write_text(PPO_RECIPE.format(env=run.env, envs=3), encoding="utf-8")
+    words = ("--recipe", str(recipe), "--steps", "240", "--eval-episodes", "2")
+    run = replace(run, options=(*run.options, *words))
+    assert execute(run) is None, run.folder.with_suffix(".log").read_text()
+    assert run.left() == []
+    for engine, episodes in (("analytic", 4), ("pybullet", 3)):
+        test = json.loads((run.folder / "tests" / f"{engine}.json").read_text())
+        assert (test["episodes"], test["goals"]) == (episodes, "tempting")
+        assert test["env_options"] == {"engine": engine}
+        # Whatever the weight in training, returns are comparable.
+        assert test["penalty_weight"] == 1.0
+    kept = condense(run.folder)
+    assert (kept["engine"], kept["penalty_weight"], kept["goals"]) == ("analytic", 0.0, "tempting")
 
 
 @pytest.mark.parametrize(
@@ -76,11 +112,12 @@ def test_what_is_done_is_skipped_and_what_was_stopped_goes_on(
         main(words)
         return capsys.readouterr().out.split("\n")[:-1]
 
-    run = tmp_path / "TPMReach-v0-sac-s0"
-    done = run / "tests" / "nominal.json"
+    run = tmp_path / "TPMReach-v0-sac-pybullet-s0"
+    done = run / "tests" / "pybullet.json"
     test = f"tpm-gym evaluate --policy {run} --env TPMReach-v0 --episodes 7"
-    test += f" --json {done}"
-    first = f"tpm-gym train --env TPMReach-v0 --algo sac --seed 0 --run {run}"
+    test += f" --engine pybullet --json {done}"
+    first = "tpm-gym train --env TPMReach-v0 --algo sac --engine pybullet --test-episodes 0"
+    first += f" --seed 0 --run {run}"
     assert left() == [first, test]
     run.mkdir()
     (run / "config.json").write_text('{"steps": 100}')
@@ -105,7 +142,7 @@ def test_a_training_that_fails_is_told(
 ) -> None:
     monkeypatch.setattr(sys, "argv", program)
     failing = Run(tmp_path / "runs" / "b", "TPMReach-v0", "sac", ("--steps", "0"), ())
-    assert "failed with status 1" in (execute(failing, 1) or "")
+    assert "failed with status 1" in (execute(failing) or "")
     assert "--steps 0" in (tmp_path / "runs" / "b.log").read_text()
     assert sys.argv == program
 
@@ -118,7 +155,7 @@ def test_a_training_that_outlives_its_node_is_waited_for(tmp_path: Path) -> None
     with ExitStack() as other:
         other.enter_context(claimed(run.folder))
         threading.Timer(0.5, other.close).start()
-        assert "tpm-gym resume" in (execute(run, 1) or "")
+        assert "tpm-gym resume" in (execute(run) or "")
     said = run.folder.with_suffix(".log").read_text()
     assert "holds no run of tpm_gym" in said
     assert "another process" not in said
@@ -149,7 +186,7 @@ def test_an_address_without_a_cluster_is_refused(address: str, tmp_path: Path) -
 def test_a_node_that_does_not_share_the_disk_is_told(missing: str, tmp_path: Path) -> None:
     here = Path.cwd() if missing == "file" else tmp_path / "missing"
     run = Run(tmp_path / "run", "TPMReach-v0", "sac", (), ())
-    assert "does not see" in (execute_there(run, 1, here, tmp_path / "missing") or "")
+    assert "does not see" in (execute_there(run, here, tmp_path / "missing") or "")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -159,7 +196,7 @@ def small(folder: Path, seed: int) -> Run:
     recipe.write_text(SAC_RECIPE.format(env="TPMReach-v0", train_freq=20), encoding="utf-8")
     words = ["--recipe", str(recipe), "--seed", str(seed), "--steps", "2000"]
     words += ["--eval-every", "1000", "--eval-episodes", "2", "--checkpoint-every", "50"]
-    test = ("nominal", ())
+    test = ("pybullet", 2, ())
     return Run(folder / f"run-s{seed}", "TPMReach-v0", "sac", tuple(words), (test,))
 
 
@@ -178,14 +215,14 @@ def test_a_study_of_one_machine_runs_all_and_leaves_nothing_behind(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = temporary()
-    bisection = Bisection(tmp_path / "bisection", "TPMReach-v0", "latency")
+    bisection = Bisection(tmp_path / "bisection", "TPMReach-v0", "latency", 2)
     failing = Run(tmp_path / "failing", "TPMReach-v0", "sac", ("--steps", "0"), ())
-    assert run_all([failing, bisection], StudyConfig("results", folder=tmp_path, episodes=2)) == 1
+    assert run_all([failing, bisection], StudyConfig("results", folder=tmp_path)) == 1
     printed = capsys.readouterr().out.splitlines()
     assert f"{bisection.folder}: done" in printed
     assert any(line.startswith(f"{failing.folder}: failed with status 1") for line in printed)
     assert {path.stem for path in bisection.folder.glob("tests/*")} == {"0", "1"}
-    assert bisection.left(2) == []
+    assert bisection.left() == []
     names = ["bisection", "bisection.log", "failing.log"]
     assert sorted(path.name for path in tmp_path.iterdir()) == names
     assert temporary() == before
@@ -197,7 +234,7 @@ def test_ctrl_c_stops_a_study_with_checkpoints_saved(tmp_path: Path) -> None:
     before = temporary()
     words = ["--plan", "results", "--envs", "TPMReach-v0", "--algos", "sac", "--seeds", "2"]
     words = [*TPM_GYM, "study", *words, "--folder", str(tmp_path), "--jobs", "1"]
-    run = tmp_path / "TPMReach-v0-sac-s0"
+    run = tmp_path / "TPMReach-v0-sac-pybullet-s0"
     status, output = signalled(words, lambda: list(run.glob("checkpoints/0*")), signal.SIGINT)
     assert status == 1, output
     assert f"{run}: stopped: tpm-gym train --env TPMReach-v0" in output
@@ -205,7 +242,7 @@ def test_ctrl_c_stops_a_study_with_checkpoints_saved(tmp_path: Path) -> None:
     log = run.with_suffix(".log").read_text(encoding="utf-8")
     assert "stopped early by SIGINT, saved at step" in log
     assert (run / "last.zip").is_file()
-    assert not (tmp_path / "TPMReach-v0-sac-s1").exists()
+    assert not (tmp_path / "TPMReach-v0-sac-pybullet-s1").exists()
     assert temporary() == before
 
 
@@ -263,7 +300,7 @@ def test_a_death_midway_costs_what_came_after_the_last_checkpoint(
     (tmp_path / "undisturbed").mkdir()
     undisturbed = [small(tmp_path / "undisturbed", seed) for seed in range(2)]
     for run in undisturbed:
-        assert execute(run, 2) is None
+        assert execute(run) is None
     (tmp_path / "disturbed").mkdir()
     runs = [small(tmp_path / "disturbed", seed) for seed in range(2)]
     reached = []
@@ -277,7 +314,7 @@ def test_a_death_midway_costs_what_came_after_the_last_checkpoint(
 
     killer = threading.Thread(target=kill_midway)
     killer.start()
-    config = StudyConfig("results", folder=tmp_path, episodes=2, address=cluster.address)
+    config = StudyConfig("results", folder=tmp_path, address=cluster.address)
     assert run_all(runs, config) == 0
     killer.join()
     assert max(reached) < 2000

@@ -268,8 +268,10 @@ PICK = {"env": "TPMPickAndPlace-v0", "recipe_file": recipe_file("sac")}
         ({"seed": SELECTION_SEED}, "held out"),
         ({"seed": SELECTION_SEED - 2, "envs": 3}, "held out"),
         ({"envs": 5}, "before the first episode ends"),
-        ({**PICK, "steps": 20_000}, "more than the 20,000 of the recipe's demonst"),
+        ({**PICK, "steps": 20_000}, "more than the 20,000 of the demonst"),
         ({**PICK, "steps": 20_050, "envs": 3}, "the 20,100 of"),
+        ({**PICK, "steps": 500, "demonstrations": 10}, "the 500 of"),
+        ({"demonstrations": -1}, "--demonstrations -1: must be at least 0"),
         ({"algo": "ppo", "recipe_file": None}, "no recipe for TPMReach-v0; .*--recipe FILE"),
         ({"recipe_file": Path("none.yml")}, "cannot be read"),
         ({"device": "meta"}, "--device meta"),
@@ -282,6 +284,16 @@ def test_mistakes_are_named_before_anything_is_written(
     with pytest.raises(TPMError, match=message):
         train(replace(make_config("sac", tmp_path), **options), quiet())
     assert not (tmp_path / "run").exists()
+
+
+def test_demonstrations_are_as_many_as_asked_for(tmp_path: Path) -> None:
+    config = replace(make_config("sac", tmp_path), **PICK)
+    for count, found in {None: 400, 10: 10, 0: None}.items():
+        recipe = complete(replace(config, steps=30_000, demonstrations=count)).recipe
+        assert recipe.demonstrations.get("episodes") == found
+        assert recipe.demonstrations.get("noise") == (0.3 if found else None)
+    with pytest.raises(ConfigError, match=r"--demonstrations 1: ppo\.demonstrations: unknown"):
+        complete(replace(make_config("ppo", tmp_path), demonstrations=1))
 
 
 @pytest.mark.parametrize("size", [49, 10**12, 10**30])
@@ -330,6 +342,18 @@ def test_shipped_recipes_are_arguments_of_the_algorithm_and_relabel_sparse_rewar
     assert model.gamma == recipe.arguments["gamma"]
     assert model.policy_kwargs["net_arch"] == recipe.arguments["policy_kwargs"]["net_arch"]
     envs.close()
+
+
+def test_recipes_in_closed_form_are_for_many_environments_and_every_id() -> None:
+    options = EnvOptions(engine="analytic")
+    found = set()
+    for algorithm in ("sac", "ppo"):
+        for env_id in read_recipes(recipe_file(algorithm, "analytic"), algorithm):
+            config = complete(TrainingConfig(algo=algorithm, env=env_id, env_options=options))
+            assert config.envs > 1
+            assert config.recipe.hindsight == ("Dense" not in env_id) == (algorithm == "sac")
+            found.add(env_id)
+    assert found == set(tpm_gym.ENV_IDS)
 
 
 @pytest.mark.parametrize(

@@ -58,6 +58,12 @@ CASES = {
     "ppo": ("ppo", REACH, PPO_RECIPE.format(env=REACH, envs=1)),
     "ppo in processes": ("ppo", REACH, PPO_RECIPE.format(env=REACH, envs=2)),
     "ppo in closed form": ("ppo", PICK, PPO_RECIPE.format(env=PICK, envs=3)),
+    "sac in closed form": (
+        "sac",
+        "TPMPickAndPlace-v0",
+        SAC_RECIPE.format(env="TPMPickAndPlace-v0", train_freq=2)
+        + "  n_envs: 2\n  demonstrations: {episodes: 2}\n",
+    ),
 }
 
 

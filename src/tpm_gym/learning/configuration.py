@@ -87,6 +87,9 @@ class TrainingConfig:
     recipe: tyro.conf.Suppress[Annotated[Recipe, unset(type(None), "", "")]] = UNSET
     """The hyperparameters in it."""
 
+    demonstrations: Annotated[int | None, unset(int, "as the recipe says", "INT")] = None
+    """Episodes of the expert in the replay buffer before training starts; 0 trains from scratch."""
+
     run: Annotated[Path, unset(Path, "runs/<env>-<algo>-s<seed>", "FOLDER")] = UNSET
     """Folder of the run."""
 
@@ -173,6 +176,8 @@ def complete(config: TrainingConfig) -> TrainingConfig:
     shipped = recipe_file(config.algo, config.env_options.engine)
     file = shipped if config.recipe_file is UNSET else config.recipe_file
     recipe = read_recipe(file, config.algo, config.env)
+    if config.demonstrations is not UNSET:
+        recipe = _with_demonstrations(recipe, config)
     steps = recipe.n_timesteps if config.steps is UNSET else config.steps
     env = config.env.rpartition(":")[2]
     worked_out: dict[str, Any] = {
@@ -187,6 +192,16 @@ def complete(config: TrainingConfig) -> TrainingConfig:
     config = replace(config, recipe=recipe, **missing)
     _check(config)
     return config
+
+
+def _with_demonstrations(recipe: Recipe, config: TrainingConfig) -> Recipe:
+    """The recipe with so many of them as the configuration says."""
+    check_least(config, 0, "demonstrations")
+    count = config.demonstrations
+    changed = {**recipe.demonstrations, "episodes": count} if count else {}
+    recipe = replace(recipe, demonstrations=changed)
+    check_recipes(f"--demonstrations {count}", {config.algo: recipe.entries()}, config.algo)
+    return recipe
 
 
 def resumed(config: ResumeConfig, stored: Mapping[str, Any], reached: int) -> TrainingConfig:
@@ -279,8 +294,8 @@ def _check_episodes(config: TrainingConfig) -> None:
     episodes = -(-int(recipe.demonstrations.get("episodes", 0)) // envs) * envs
     if episodes and config.steps <= episodes * horizon:
         raise ConfigError(
-            f"--steps {config.steps}: must be more than the {episodes * horizon:,} of the recipe's "
-            "demonstrations; for a short trial give a --recipe with fewer"
+            f"--steps {config.steps}: must be more than the {episodes * horizon:,} of the "
+            "demonstrations; for a short trial give fewer --demonstrations"
         )
     starts = int(recipe.arguments.get("learning_starts", 100))
     if recipe.hindsight and starts < horizon * envs:

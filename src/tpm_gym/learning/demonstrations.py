@@ -7,9 +7,10 @@ steps of the environment, so that no learning curve hides them.
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -17,6 +18,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from tpm_gym.learning.environments import make_env
 from tpm_gym.learning.rollout import GoalEnv, Observation
 from tpm_gym.tasks.expert import Expert
+
+_OF_VECTORS: Final = ("num_envs", "vectorization_mode", "autoreset_mode", "stagger")
 
 
 class Demonstrations(BaseCallback):
@@ -48,7 +51,7 @@ class Demonstrations(BaseCallback):
         if model.num_timesteps > 0:
             return  # a run that goes on has them already
         specs = self.training_env.get_attr("spec")
-        envs = [make_env(spec.id, **spec.kwargs) for spec in specs]
+        envs = [make_env(spec.id, **_of_one(spec)) for spec in specs]
         rng = np.random.default_rng(model.seed)
         outcomes: list[bool] = []
         for episode in range(0, self.episodes, len(envs)):
@@ -95,6 +98,11 @@ class Demonstrations(BaseCallback):
 
     def _on_step(self) -> bool:
         return True
+
+
+def _of_one(spec: EnvSpec) -> dict[str, Any]:
+    """The arguments of an environment, where it is one of a vector without those of the vector."""
+    return {name: value for name, value in spec.kwargs.items() if name not in _OF_VECTORS}
 
 
 def _stack(observations: Sequence[Observation]) -> Observation:

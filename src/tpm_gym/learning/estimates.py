@@ -1,27 +1,19 @@
-"""Means with 95% intervals: of episodes, and of training runs; and the time a run takes to learn.
-
-Scores of a handful of seeds are few and skewed: the interquartile mean leaves the luckiest and the
-unluckiest quarter out, and its interval says how much another set of seeds might differ (Agarwal
-et al. 2021, "Deep reinforcement learning at the edge of the statistical precipice").
-"""
+"""Means over episodes with 95% intervals; and the time a run takes to learn."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import median
 from typing import Final
 
 import numpy as np
 
-from tpm_gym.arrays import FloatArray
-
-BOOTSTRAP_SAMPLES: Final = 5000
-BOOTSTRAP_SEED: Final = 0  # fixed: the same values always give the same interval
 LEARNED: Final = 0.95
 """Success rate from which a policy counts as having learned its task."""
 
 _Z95: Final = 1.959963984540054  # 97.5% quantile of the standard normal distribution
-_EPISODE_SAMPLES: Final = 2000
+_SEED: Final = 0  # fixed: the same values always give the same interval
+_SAMPLES: Final = 2000
 _BLOCK: Final = 100
 
 
@@ -53,41 +45,15 @@ def wilson(outcomes: Sequence[bool]) -> Estimate:
 
 def bootstrap(values: Sequence[float], worst: float | None = None) -> Estimate:
     """Return a mean with its 95% percentile bootstrap interval (Efron 1979)."""
-    return _resampled(values, lambda rows: rows.mean(axis=1), _EPISODE_SAMPLES, worst)
-
-
-def interquartile_mean(scores: Sequence[float], samples: int = BOOTSTRAP_SAMPLES) -> Estimate:
-    """Return the interquartile mean of runs with its 95% percentile bootstrap interval.
-
-    The mean is that without the lowest and highest quarter, rounded down to whole scores: of five
-    scores, that of the middle three.
-    """
-
-    def trimmed(rows: FloatArray) -> FloatArray:
-        count = rows.shape[1]
-        cut = count // 4
-        means: FloatArray = np.sort(rows, axis=1)[:, cut : count - cut].mean(axis=1)
-        return means
-
-    return _resampled(scores, trimmed, samples)
-
-
-def _resampled(
-    values: Sequence[float],
-    statistic: Callable[[FloatArray], FloatArray],
-    samples: int,
-    worst: float | None = None,
-) -> Estimate:
-    """Estimate a statistic, (m, n) -> (m,), with its 95% percentile bootstrap interval."""
     sample = np.asarray(values, dtype=np.float64)  # (n,)
-    rng = np.random.default_rng(BOOTSTRAP_SEED)
+    rng = np.random.default_rng(_SEED)
     # Not all resamples at once: with many values their matrix would not fit in memory.
-    blocks = [
-        statistic(sample[rng.integers(0, sample.size, (_BLOCK, sample.size))])
-        for _ in range(samples // _BLOCK)
+    means = [
+        sample[rng.integers(0, sample.size, (_BLOCK, sample.size))].mean(axis=1)
+        for _ in range(_SAMPLES // _BLOCK)
     ]
-    low, high = np.percentile(np.concatenate(blocks), [2.5, 97.5])
-    mean = float(statistic(sample[None])[0])
+    low, high = np.percentile(np.concatenate(means), [2.5, 97.5])
+    mean = float(sample.mean())
     # Equal values can differ from their mean by rounding; the interval must still hold the mean.
     return Estimate(mean, min(mean, float(low)), max(mean, float(high)), worst)
 

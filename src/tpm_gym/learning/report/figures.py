@@ -25,10 +25,10 @@ from tpm_gym.learning.figure_style import (
 )
 from tpm_gym.learning.provenance import write_whole
 from tpm_gym.learning.report.page import (
+    ENGINES,
     LEARNING_CURVES,
     PENALTY,
     ROBUSTNESS,
-    TEMPTING,
     Group,
     Record,
     grouped,
@@ -47,7 +47,7 @@ def draw(records: Sequence[Record], folder: Path) -> list[Path]:
     """Draw what there are records for; return the files."""
     bisections, runs = split(records)
     plain = [r for r in runs if r["goals"] == "sampled" and r["penalty_weight"] == 1.0]
-    tempted = [r for r in runs if r["goals"] == "tempting" and TEMPTING in r["tests"]]
+    tempted = [r for r in runs if r["goals"] == "tempting" and "pybullet" in r["tests"]]
     written = []
     with style():
         if any(record["evaluations"]["steps"] for record in plain):
@@ -126,7 +126,7 @@ def _legend(figure: Figure, title: str) -> None:
         entries.values(),
         entries,
         loc="outside lower center",
-        ncols=max(1, len(entries)),
+        ncols=max(1, min(_COLUMNS, len(entries))),
         title=title,
     )
 
@@ -159,7 +159,7 @@ def penalty(records: Sequence[Record]) -> Figure:
     for axes, groups in panels:
         for place, (name, (label, colour)) in enumerate(metrics.items()):
             for index, group in enumerate(groups):
-                values = [record["tests"][TEMPTING][name]["mean"] for record in group]
+                values = [record["tests"]["pybullet"][name]["mean"] for record in group]
                 x = index + 0.16 * (2 * place - 1)
                 axes.plot([x] * len(values), values, "o", color=colour, alpha=0.6, markersize=4)
                 axes.hlines(np.mean(values), x - 0.12, x + 0.12, color=colour, linewidth=1.6)
@@ -189,13 +189,15 @@ def robustness(records: Sequence[Record]) -> Figure:
     figure, panels = _grid(names, "Success of the published policies by what differs", 1.9)
     colours = dict(zip(sorted({record["env"] for record in records}), _COLOURS, strict=False))
     for attribute, axes in zip(attributes, panels, strict=True):
-        for record in sorted(records, key=lambda record: str(record["env"])):
+        for record in sorted(records, key=lambda r: (r["env"], r["engine"])):
             if record["attribute"] == attribute:
                 rates = sorted(successes(record).items())
                 axes.plot(
                     *zip(*rates, strict=True),
                     color=colours[record["env"]],
-                    label=record["env"],
+                    label=f"{record['env']}, {ENGINES.get(record['engine'], record['engine'])}",
+                    linestyle="--" if record["engine"] == "pybullet" else "-",
+                    markerfacecolor="white" if record["engine"] == "pybullet" else None,
                     marker="o",
                     markersize=2.5,
                 )

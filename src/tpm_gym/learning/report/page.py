@@ -5,73 +5,54 @@ from collections.abc import Iterable, Sequence
 from statistics import fmean, median
 from typing import Any, Final
 
-from tpm_gym.learning.estimates import (
-    BOOTSTRAP_SAMPLES,
-    BOOTSTRAP_SEED,
-    LEARNED,
-    interquartile_mean,
-    median_time,
-    settled,
-)
+from tpm_gym.learning.estimates import LEARNED, median_time, settled
 from tpm_gym.learning.robustness import OF_SERVOS, UNITS, ends, halving, nominal
 from tpm_gym.learning.rollout import WORST
+from tpm_gym.learning.study import StudyConfig, plan_runs
 from tpm_gym.mechanism import PAPER_TPM
 from tpm_gym.simulation.randomisation import LIMITS
 
 Record = dict[str, Any]
 Group = list[Record]
 
-NOMINAL, TEMPTING = "nominal", "tempting"
 LEARNING_CURVES, PENALTY = "results_learning_curves.png", "results_penalty.png"
 ROBUSTNESS = "results_robustness.png"
+ENGINES: Final = {"analytic": "closed form", "pybullet": "PyBullet"}
+"""Of tests, by their names."""
 NONE: Final = "\N{EM DASH}"
+
+STUDIES: Final = (
+    StudyConfig("results", engine="analytic"),
+    StudyConfig("penalty", engine="analytic"),
+    StudyConfig("robustness", engine="analytic"),
+    StudyConfig("robustness", engine="pybullet", episodes=100),
+)
 
 _INTRO: Final = f"""# Results
 
 Written by `make results` from the records in [results](results); no result here was typed by hand.
 
-**Stale:** these records are of the physics before friction in PyBullet became a cone, the vacuum a
-pressure with a limit, and the motors real ones. The published policies have been trained and tested
-anew since; all else here is as it was.
-
 - **Success** is that of the last step of an episode. Each run is tested with the policy that did
   best in the evaluations during training, on held-out seeds that neither training nor those
-  evaluations have seen; its interval is Wilson's, at 95%.
-- **IQM** is the interquartile mean over seeds (of five, the mean of the middle three), with a 95%
-  bootstrap interval ({BOOTSTRAP_SAMPLES:,} resamples of the seeds, seed {BOOTSTRAP_SEED}). A run
+  evaluations have seen, in the engine that it was trained in and in PyBullet. Intervals are
+  Wilson's, at 95%. Of several seeds it is the median, and in brackets that of each, by seed; a run
   without a test counts as 0.
 - **Time to {LEARNED:.0%}** is that of the first evaluation during training from which success stays
-  at {LEARNED:.0%} or above to the end of training; those evaluations are short (20 episodes, so at
-  most one may fail), the same episodes each time. Minutes include them; minutes and steps include
-  the playing of demonstrations. For several seeds it is the median, "never" where that is a
-  run that never did.
+  at {LEARNED:.0%} or above to the end of training. Minutes are wall-clock and include the
+  evaluations; minutes and steps include the playing of demonstrations. For several seeds it is the
+  median, "never" where that is a run that never did.
 - **Smallest conditioning** is the least 1/cond(J) of all steps of all test episodes (and seeds),
   **time below safe** the share of their steps with 1/cond(J) < \
-{PAPER_TPM.safe_conditioning} (the mean of seeds).
-- **Observed P off** is the largest distance between the observed position of the platform (forward
-  kinematics of the encoders) and the simulated one, of all steps, episodes and seeds.
+{PAPER_TPM.safe_conditioning} (the mean of seeds): as
+  tested in PyBullet.
 """
 
 
-_STUDY: Final = """\
-With `+modified`, files that git tracks differed from the commit. Minutes are wall-clock, of two
-runs at a time on two cores, and of some runs too long: tests ran beside them. All of it again:
-
-```bash
-tpm-gym study --plan results
-tpm-gym study --plan penalty
-tpm-gym study --plan penalty --envs TPMPickAndPlaceJoints-v0 --steps 100000
-tpm-gym study --plan robustness --episodes 300
-tpm-gym report collect
-make results
-```
-
-A study runs on Ray (the extra `cluster`), two runs at a time on this machine alone. With
-`--address` it runs on a cluster that `ray start` has started, whose nodes see the working folder on
-a shared disk. A run whose process or node dies goes on elsewhere from its last checkpoint.
-
-These are its commands for the first seed, and the first of each bisection. Each record holds its
-own, as it was then: `train/train.py` is `tpm-gym train`, `train/evaluate.py` `tpm-gym evaluate`.
+_HOW: Final = """\
+With `+modified`, files that git tracks differed from the commit. A study runs on Ray (the extra
+`cluster`), two runs at a time on this machine alone. With `--address` it runs on a cluster that
+`ray start` has started, whose nodes see the working folder on a shared disk. A run whose process or
+node dies goes on elsewhere from its last checkpoint. All of it again:
 """
 
 
@@ -80,8 +61,27 @@ def page(records: Sequence[Record], figures: Sequence[str]) -> str:
     bisections, runs = split(records)
     plain = [r for r in runs if r["goals"] == "sampled" and r["penalty_weight"] == 1.0]
     tempted = [r for r in runs if r["goals"] == "tempting"]
-    parts = [_INTRO, *_training(plain, figures), *_penalty(tempted, figures)]
+    parts = [_INTRO, *_missing(records), *_training(plain, figures), *_penalty(tempted, figures)]
     return "\n".join([*parts, *_robustness(bisections, figures), *_how(records)])
+
+
+def command(config: StudyConfig) -> str:
+    """The command of one of the studies."""
+    words = ["tpm-gym study", "--plan", config.plan, "--engine", config.engine]
+    return " ".join([*words, "--episodes", str(config.episodes)])
+
+
+def _missing(records: Sequence[Record]) -> list[str]:
+    """What of the studies there are no records of."""
+    there = {record["run"] for record in records}
+    lines = []
+    for config in STUDIES:
+        planned = [run.folder.name for run in plan_runs(config)]
+        left = [name for name in planned if name not in there]
+        if left:
+            names = "all of it" if left == planned else ", ".join(left)
+            lines.append(f"- `{command(config)}`: {names}.")
+    return ["## Not run yet\n", "\n".join(lines) + "\n"] if lines else []
 
 
 def split(records: Iterable[Record]) -> tuple[Group, Group]:
@@ -96,26 +96,27 @@ def grouped(records: Iterable[Record]) -> list[Group]:
     """Put runs together that differ by their seed alone, seeds in order."""
     groups: dict[str, Group] = {}
     for record in sorted(records, key=_order):
-        names = ("env", "algo", "recipe", "steps", "envs", "goals", "penalty_weight")
+        names = ("env", "algo", "recipe", "engine", "steps", "envs", "goals", "penalty_weight")
         key = json.dumps([record[name] for name in names], sort_keys=True)
         groups.setdefault(key, []).append(record)
     return list(groups.values())
 
 
 def method(record: Record) -> str:
-    """Name the algorithm of a run, and its recipe where that is not the usual one."""
-    name = str(record["algo"]).upper() + (" + HER" if record["recipe"]["hindsight"] else "")
-    usual = record["recipe_file"] == f"{record['algo']}.yml"
-    return name if usual else f"{name} ({record['recipe_file']})"
+    """Name the algorithm of a run, and whether it begins with demonstrations."""
+    recipe = record["recipe"]
+    name = str(record["algo"]).upper() + (" + HER" if recipe["hindsight"] else "")
+    return name + (", demonstrations" if recipe["demonstrations"] else "")
 
 
-def success(record: Record, test: str) -> float:
-    """Success rate of a run in a test; 0 where it has none."""
+def success(record: Record, test: str = "pybullet") -> float:
+    """Success rate of a run in the test in an engine; 0 where it has none."""
     return float(record["tests"].get(test, {}).get("success_at_end", {}).get("mean", 0.0))
 
 
 def _order(record: Record) -> tuple[Any, ...]:
-    return record["env"], record["algo"], record["steps"], record["penalty_weight"], record["seed"]
+    weight = record["penalty_weight"]
+    return record["env"], method(record), record["engine"], record["steps"], weight, record["seed"]
 
 
 # -- sections ---------------------------------------------------------------------------------
@@ -126,21 +127,24 @@ def _training(records: Group, figures: Sequence[str]) -> list[str]:
     if not records:
         return []
     head = (
-        "id | method | steps | seeds | success, IQM | median | steps to 95% | minutes to 95% | "
-        "smallest conditioning | time below safe"
+        "id | method | trained in | steps | success in closed form | success in PyBullet | "
+        "steps to 95% | minutes to 95% | minutes in all"
     )
     rows = [_training_row(group) for group in grouped(records)]
-    tested = f"Each seed is tested on {_episodes(records, [NOMINAL])} held-out episodes.\n"
-    parts = ["## Learning\n", tested, _table(head, rows)]
+    tested = (
+        "Methods without demonstrations start from scratch. Steps are over all environments. "
+        f"{_episodes(records)}\n"
+    )
+    parts = ["## Learning: from scratch, or with demonstrations\n", tested, _table(head, rows)]
     if LEARNING_CURVES in figures:
         parts.append(f"![Learning curves](images/{LEARNING_CURVES})\n")
         parts.append("A curve that does not start at 0 starts after the demonstrations.\n")
     head = (
-        "id | method | seed | success | steps to 95% | minutes to 95% | minutes in all | "
-        "smallest conditioning | time below safe | observed P off"
+        "id | method | seed | success in closed form | success in PyBullet | steps to 95% | "
+        "minutes to 95% | minutes in all | smallest conditioning | time below safe | return"
     )
     runs = [_run_row(record) for group in grouped(records) for record in group]
-    return [*parts, "### Every run\n", _table(head, runs), *_failures(records, NOMINAL)]
+    return [*parts, "### Every run\n", _table(head, runs), *_failures(records)]
 
 
 def _training_row(group: Group) -> list[str]:
@@ -149,47 +153,49 @@ def _training_row(group: Group) -> list[str]:
     return [
         first["env"],
         method(first),
+        ENGINES.get(first["engine"], first["engine"]),
         f"{first['steps']:,}",
-        str(len(group)),
-        _iqm([success(record, NOMINAL) for record in group]),
-        f"{median(success(record, NOMINAL) for record in group):.1%}",
+        *(_median(group, engine) for engine in ENGINES),
         _or_never(median_time([steps for steps, _ in times]), "{:,.0f}"),
         _or_never(median_time([minutes for _, minutes in times]), "{:.1f}"),
-        _worst(group, NOMINAL, "conditioning_min", "{:.3f}"),
-        _mean(group, NOMINAL, "unsafe_share", "{:.1%}"),
+        f"{median(map(_minutes, group)):.1f}",
     ]
 
 
 def _run_row(record: Record) -> list[str]:
     steps, minutes = _time_to_learn(record)
-    walls = record["evaluations"]["wall_seconds"]
     return [
         record["env"],
         method(record),
         str(record["seed"]),
-        _tested(record, NOMINAL),
+        *(_tested(record, engine) for engine in ENGINES),
         _or_never(steps, "{:,.0f}"),
         _or_never(minutes, "{:.1f}"),
-        f"{walls[-1] / 60:.1f}" if walls else NONE,
-        _worst([record], NOMINAL, "conditioning_min", "{:.3f}"),
-        _mean([record], NOMINAL, "unsafe_share", "{:.1%}"),
-        _worst([record], NOMINAL, "fk_error_max", "{:.3f} mm", 1e3),
+        f"{_minutes(record):.1f}",
+        _worst([record], "conditioning_min", "{:.3f}"),
+        _mean([record], "unsafe_share", "{:.1%}"),
+        _mean([record], "return", "{:.2f}"),
     ]
 
 
-def _failures(records: Group, test: str) -> list[str]:
+def _minutes(record: Record) -> float:
+    """How long a training took; 0 where it did not come to an evaluation."""
+    return float((record["evaluations"]["wall_seconds"] or [0.0])[-1]) / 60
+
+
+def _failures(records: Group) -> list[str]:
     lines = []
     for record in sorted(records, key=_order):
         name = f"{record['env']}, {method(record)}, seed {record['seed']}"
         if record["goals"] == "tempting":
-            name += f", {record['steps']:,} steps, penalty weight {record['penalty_weight']:g}"
+            name += f", penalty weight {record['penalty_weight']:g}"
         if not record["finished"]:
             reached = (record["evaluations"]["steps"] or [0])[-1]
             lines.append(f"- {name}: stopped after {reached:,} of {record['steps']:,} steps.")
-        elif test not in record["tests"]:
+        elif "pybullet" not in record["tests"]:
             lines.append(f"- {name}: not tested.")
-        elif success(record, test) < LEARNED:
-            lines.append(f"- {name}: success {_tested(record, test)}, below {LEARNED:.0%}.")
+        elif success(record) < LEARNED:
+            lines.append(f"- {name}: success {_tested(record, 'pybullet')}, below {LEARNED:.0%}.")
     body = "\n".join(lines) if lines else f"None: every run has {LEARNED:.0%} or more."
     return ["### Failures\n", body + "\n"]
 
@@ -199,53 +205,50 @@ def _penalty(records: Group, figures: Sequence[str]) -> list[str]:
     if not records:
         return []
     head = (
-        "id | method | steps | penalty weight | seeds | success, IQM | time below safe (seeds) | "
-        "smallest conditioning | observed P off | torque, RMS | torque, peak"
+        "id | method | trained in | penalty weight | success in closed form | success in PyBullet "
+        "| return | time below safe (seeds) | smallest conditioning | conditioning, mean"
     )
     rows = [
         [
             group[0]["env"],
             method(group[0]),
-            f"{group[0]['steps']:,}",
+            ENGINES.get(group[0]["engine"], group[0]["engine"]),
             f"{group[0]['penalty_weight']:g}",
-            str(len(group)),
-            _iqm([success(record, TEMPTING) for record in group]),
-            _mean(group, TEMPTING, "unsafe_share", "{:.1%}", spread=True),
-            _worst(group, TEMPTING, "conditioning_min", "{:.3f}"),
-            _worst(group, TEMPTING, "fk_error_max", "{:.3f} mm", 1e3),
-            _mean(group, TEMPTING, "torque_rms", "{:.1f} N m"),
-            _worst(group, TEMPTING, "torque_peak", "{:.0f} N m"),
+            *(_median(group, engine) for engine in ENGINES),
+            _mean(group, "return", "{:.2f}"),
+            _mean(group, "unsafe_share", "{:.1%}", spread=True),
+            _worst(group, "conditioning_min", "{:.3f}"),
+            _mean(group, "conditioning_mean", "{:.3f}"),
         ]
         for group in grouped(records)
     ]
     text = (
         "## Does the penalty work?\n\nTrained and tested on goals that tempt towards the "
         "singularity (`--goals tempting`): goals, and pucks, lie just within the safe threshold, "
-        "and straight lines in the joint angles lead beyond it. "
-        f"{_episodes(records, [TEMPTING])} held-out episodes a seed.\n"
+        "and straight lines in the joint angles lead beyond it. Returns are counted with the "
+        f"penalty, whatever a policy was trained with. {_episodes(records)}\n"
     )
     parts = [text, _table(head, rows), *_compared(records)]
     if PENALTY in figures:
         parts.append(f"![Success and time below safe by weight](images/{PENALTY})\n")
-    return [*parts, *_failures(records, TEMPTING)]
+    return [*parts, *_failures(records)]
 
 
 def _compared(records: Group) -> list[str]:
-    """One line an id, method and its steps: time below safe without the penalty and with it."""
-    shares: dict[tuple[str, str, int], dict[float, list[float]]] = {}
+    """One line an id and method: time below safe without the penalty and with it."""
+    shares: dict[tuple[str, str], dict[float, list[float]]] = {}
     for record in records:
-        by_weight = shares.setdefault((record["env"], method(record), record["steps"]), {})
+        by_weight = shares.setdefault((record["env"], method(record)), {})
         values = by_weight.setdefault(record["penalty_weight"], [])
-        values += _values([record], TEMPTING, "unsafe_share", "mean")
+        values += _values([record], "unsafe_share", "mean")
     lines = []
-    for (env, name, steps), by_weight in sorted(shares.items()):
+    for (env, name), by_weight in sorted(shares.items()):
         if not (by_weight.get(0.0) and by_weight.get(1.0)):
             continue
         without, with_it = (fmean(by_weight[weight]) for weight in (0.0, 1.0))
         times = f"{without / with_it:,.0f} times less" if with_it > 0 else "never below"
         lines.append(
-            f"- {env}, {name}, {steps:,} steps: {without:.2%} without the penalty, {with_it:.3%} "
-            f"with it: {times}."
+            f"- {env}, {name}: {without:.2%} without the penalty, {with_it:.3%} with it: {times}."
         )
     return ["Time below safe, mean over seeds:\n", "\n".join(lines) + "\n"] if lines else []
 
@@ -254,6 +257,25 @@ def _robustness(records: Group, figures: Sequence[str]) -> list[str]:
     """How far machines may differ from the one that the published policies were trained on."""
     if not records:
         return []
+    parts = [
+        "## Robustness\n\nThe published policies, trained on the nominal machine alone, on others "
+        "that differ from it in one thing. Success halves between the two values given, found by "
+        "bisection; or it does not up to the largest value, as far as a machine may differ here, "
+        "and success there is given. Errors of lengths and biases are drawn up to the value in "
+        "each episode, noise has it as its standard deviation; all else has the value itself.\n"
+    ]
+    for engine, name in ENGINES.items():
+        of = [record for record in records if record["engine"] == engine]
+        if of:
+            episodes = " or ".join(sorted({str(record["episodes"]) for record in of}))
+            parts += [f"In {name}, {episodes} episodes a test:\n", _bisections(of)]
+    if ROBUSTNESS in figures:
+        parts.append(f"![Success by what differs](images/{ROBUSTNESS})\n")
+    return parts
+
+
+def _bisections(records: Group) -> str:
+    """A row for each end of each attribute, a column an id."""
     ids = sorted({record["env"] for record in records})
     found = {(record["env"], record["attribute"]): record for record in records}
     rows = []
@@ -265,18 +287,7 @@ def _robustness(records: Group, figures: Sequence[str]) -> list[str]:
             name = f"{attribute.replace('_', ' ')} ({unit}{drive})"
             cells = [_halves(record, end) if record else NONE for record in of]
             rows.append([name, f"{nominal(attribute):g}", f"{end:g}", *cells])
-    text = (
-        "## Robustness\n\nThe published policies, trained on the nominal machine alone, on others "
-        "that differ from it in one thing. Success halves between the two values given, found by "
-        "bisection; or it does not as far as a machine may differ here, and success there is "
-        f"given. {' or '.join(sorted({str(r['episodes']) for r in records}))} episodes a test. "
-        "Errors of lengths and biases are drawn up to the value in each episode, noise has it as "
-        "its standard deviation; all else has the value itself.\n"
-    )
-    parts = [text, _table(" | ".join(["what differs", "nominal", "up to", *ids]), rows)]
-    if ROBUSTNESS in figures:
-        parts.append(f"![Success by what differs](images/{ROBUSTNESS})\n")
-    return parts
+    return _table(" | ".join(["what differs", "nominal", "up to", *ids]), rows)
 
 
 def successes(record: Record) -> dict[float, float]:
@@ -291,17 +302,24 @@ def _halves(record: Record, end: float) -> str:
     if found.missing is not None:
         return "not finished"
     if found.after is None:
-        return f"not in range: {rates[end]:.1%}"
+        return f"{rates[end]:.1%} at {end:g}"
     return f"{found.before:g} to {found.after:g}"
 
 
-def _episodes(records: Group, names: Sequence[str]) -> str:
-    """How many episodes the tests of these names had."""
-    tests = [record["tests"].get(name) for record in records for name in names]
-    return " or ".join(map(str, sorted({test["episodes"] for test in tests if test}))) or "no"
+def _episodes(records: Group) -> str:
+    """How many episodes the tests in each engine had, as a sentence."""
+    found = []
+    for engine, name in ENGINES.items():
+        tests = [record["tests"].get(engine) for record in records]
+        counts = " or ".join(map(str, sorted({test["episodes"] for test in tests if test})))
+        found.append(f"{counts or 'no'} in {name}")
+    return f"Held-out episodes a seed: {', '.join(found)}."
 
 
 def _how(records: Sequence[Record]) -> list[str]:
+    studies = ["```bash", *map(command, STUDIES), "tpm-gym report collect", "make results", "```\n"]
+    if not records:
+        return ["## How\n", _HOW, *studies]
     commits: dict[str, set[str]] = {}
     for record in records:
         used = [record, *record["tests"].values()]
@@ -315,7 +333,8 @@ def _how(records: Sequence[Record]) -> list[str]:
         commands.append(str(first["command"]))
         commands += [str(test["command"]) for test in first["tests"].values()]
     commands += [str(record["command"]) for record in bisections]
-    return ["## How\n", listed + "\n", _STUDY, "```bash", *commands, "```\n"]
+    text = "Its commands for the first seed, and the first of each bisection:\n"
+    return ["## How\n", listed + "\n", _HOW, *studies, text, "```bash", *commands, "```\n"]
 
 
 def _commit(name: str | None) -> str:
@@ -340,15 +359,18 @@ def _table(head: str, rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(f"| {line} |" for line in lines) + "\n"
 
 
-def _iqm(scores: Sequence[float]) -> str:
-    found = interquartile_mean(scores)
-    return f"{found.mean:.1%} [{found.low * 100:.1f}, {found.high * 100:.1f}]"
+def _median(group: Group, engine: str) -> str:
+    """Median success in an engine, and each seed's; a dash where none was tested there."""
+    if not any(engine in record["tests"] for record in group):
+        return NONE
+    rates = [success(record, engine) for record in group]
+    return f"{median(rates):.1%} ({', '.join(f'{rate * 100:.1f}' for rate in rates)})"
 
 
 def _tested(record: Record, test: str) -> str:
-    """Success with its interval; a run without a test says so."""
+    """Success with its interval; a run that is not finished says so."""
     if test not in record["tests"]:
-        return "not finished" if not record["finished"] else "not tested"
+        return NONE if record["finished"] else "not finished"
     found = record["tests"][test]["success_at_end"]
     return f"{found['mean']:.1%} [{found['low'] * 100:.1f}, {found['high'] * 100:.1f}]"
 
@@ -366,18 +388,19 @@ def _or_never(value: float | None, form: str) -> str:
     return "never" if value is None else form.format(value)
 
 
-def _values(group: Group, test: str, metric: str, key: str) -> list[float]:
-    found = [record["tests"].get(test, {}).get(metric, {}).get(key) for record in group]
+def _values(group: Group, metric: str, key: str) -> list[float]:
+    """A metric of the tests in PyBullet."""
+    found = [record["tests"].get("pybullet", {}).get(metric, {}).get(key) for record in group]
     return [float(value) for value in found if value is not None]
 
 
-def _worst(group: Group, test: str, metric: str, form: str, factor: float = 1.0) -> str:
-    values = _values(group, test, metric, "worst")
-    return form.format(WORST[metric](values) * factor) if values else NONE
+def _worst(group: Group, metric: str, form: str) -> str:
+    values = _values(group, metric, "worst")
+    return form.format(WORST[metric](values)) if values else NONE
 
 
-def _mean(group: Group, test: str, metric: str, form: str, spread: bool = False) -> str:
-    values = _values(group, test, metric, "mean")
+def _mean(group: Group, metric: str, form: str, spread: bool = False) -> str:
+    values = _values(group, metric, "mean")
     if not values:
         return NONE
     text = form.format(sum(values) / len(values))

@@ -28,6 +28,8 @@ _KEPT: Final = (
     "steps",
     "envs",
     "eval_episodes",
+    "penalty_weight",
+    "goals",
     "threads",
     "device",
     "versions",
@@ -94,11 +96,13 @@ def condense(run: Path) -> Record:
     """Return what is kept of a run, finished or not.
 
     Raises:
-        ConfigError: A file of it is damaged, or the run is of another machine, engine or drive than
-            its id says, which a record has no place for.
+        ConfigError: A file of it is damaged, or the run is of another machine or drive than its id
+            says, which a record has no place for.
     """
     config = _read(run / CONFIG_FILE)
-    if other := config.get("env_options"):
+    other = dict(config["env_options"])
+    engine = other.pop("engine", "pybullet")
+    if other:
         valid = "the page compares runs of the ids as they are; move this one elsewhere"
         raise ConfigError(f"--runs {run}: was made with {other}; {valid}")
     try:
@@ -119,9 +123,7 @@ def condense(run: Path) -> Record:
     return {
         "run": run.name,
         **{name: config.get(name) for name in _KEPT},
-        # Runs of before these options had what is their default.
-        "penalty_weight": config.get("penalty_weight", 1.0),
-        "goals": config.get("goals", "sampled"),
+        "engine": engine,
         "resumed": len(config.get("resumed", [])),
         "finished": bool(steps) and steps[-1] >= config["steps"],
         "evaluations": curves,
@@ -143,6 +145,7 @@ def condense_bisection(folder: Path) -> Record:
         return {
             "run": folder.name,
             "attribute": attribute,
+            "engine": first["env_options"].get("engine", "pybullet"),
             **{name: first[name] for name in _KEPT_OF_BISECTIONS},
             "tests": {
                 f"{test['randomisation'][attribute]:g}": {
@@ -170,14 +173,11 @@ def write(config: Write) -> list[Path]:
     """Write the page and its figures; return the files written.
 
     Raises:
-        ConfigError: There are no records, or one is damaged.
+        ConfigError: A record is damaged.
     """
     from tpm_gym.learning.report.figures import draw  # here, since it imports matplotlib
 
-    paths = sorted(config.records.glob(WHOLE))
-    if not paths:
-        raise ConfigError(f"--records {config.records}: holds no records; collect them first")
-    records = [_read(path) for path in paths]
+    records = [_read(path) for path in sorted(config.records.glob(WHOLE))]
     figures = draw(records, config.page.parent / "images")
     text = page(records, [figure.name for figure in figures])
     provenance.write_whole(config.page, lambda part: part.write_text(text, encoding="utf-8"))
