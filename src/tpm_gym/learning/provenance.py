@@ -17,6 +17,7 @@ from tpm_gym.learning.errors import ConfigError
 
 _PACKAGES: Final = (
     "numpy",
+    "numba",
     "torch",
     "gymnasium",
     "pybullet",
