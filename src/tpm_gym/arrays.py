@@ -52,7 +52,8 @@ def finite(
 ) -> FloatArray:
     """Finite numbers of exactly this shape."""
     array = numbers(name, value, error)
-    if array.shape != shape or not np.isfinite(array).all():
+    # all() costs twice as much
+    if array.shape != shape or np.count_nonzero(np.isfinite(array)) < array.size:
         raise error(name, _brief(value), f"finite numbers of shape {shape}")
     return array
 

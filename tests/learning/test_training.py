@@ -160,6 +160,8 @@ def test_runs_from_before_these_options_go_on_with_their_defaults(run: Path) -> 
         ("goals", "zz"),
         ("recipe", {}),
         ("recipe", 3),
+        ("recipe.fred", 2),
+        ("env_options.fred", 2),
         ("recipe_file", None),
         ("steps", "abc"),
         ("envs", "1"),

@@ -91,6 +91,15 @@ def test_beyond_a_singularity_the_mode_that_was_left_is_named(machine: TPM) -> N
 
 
 @each_machine
+def test_angles_that_were_changed_in_place_are_assembled_anew(machine: TPM) -> None:
+    theta: Any = np.array(machine.inverse(machine.home))
+    before = machine.evaluate(theta).position
+    theta += 1e-3
+    after = machine.evaluate(theta).position
+    assert after == machine.evaluate(tuple(theta)).position != before
+
+
+@each_machine
 @pytest.mark.parametrize("place", [0, 1])
 def test_boxes_hold_platform_and_cup_and_no_more(machine: TPM, place: int) -> None:
     point = anywhere(machine, 2)[place]

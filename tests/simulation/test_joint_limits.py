@@ -10,6 +10,7 @@ from gantry import GANTRY
 from tpm_gym.errors import JointLimitError, TPMError
 from tpm_gym.mechanism import PAPER_TPM, WIDE_TPM
 from tpm_gym.simulation import Plant, Scene, Simulation
+from tpm_gym.simulation.simulation import make_simulation
 
 SIDES = [("lower", -1e-6), ("upper", 1e-6)]
 
@@ -58,10 +59,12 @@ def test_the_stops_are_those_of_the_true_joints_not_of_the_encoders(simulation):
     assert caught.value.position == on[1] + 1e-3
 
 
-@pytest.mark.parametrize("engine", ["pybullet", "mujoco"])
+@pytest.mark.parametrize("engine", ["pybullet", "mujoco", "analytic"])
 @pytest.mark.parametrize("machine", [PAPER_TPM, WIDE_TPM, GANTRY], ids=attrgetter("name"))
 def test_a_command_beyond_a_stop_is_refused_before_anything_moves(machine, engine):
-    simulation = Simulation(Scene(), machine=machine, engine=engine)
+    if engine == "analytic" and machine is GANTRY:
+        return  # which has no closed form for arrays
+    simulation = make_simulation(Scene(), machine=machine, engine=engine)
     rng, motors = np.random.default_rng(0), machine.mechanism.motors
     ranges = np.transpose([(motor.lower, motor.upper) for motor in motors])
     while True:  # a posture in the machine's modes with the second motor on its stop

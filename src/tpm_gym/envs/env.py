@@ -323,7 +323,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         values = finite("action", action, (self.task.action_size,), ActionError)
         state = self.state
         values, *pending = (*self._pending, np.minimum(np.maximum(values, -1.0), 1.0))
-        command = self._command(values[:3], self.machine.mount.to_paper(state.command))
+        command = self._command(values[:3], state.command)
         vacuum = self.task.vacuum and bool(values[3] > 0)
         self._state = None  # until the step has gone well
         try:
@@ -470,11 +470,18 @@ class TPMEnv(gym.Env[Observation, Action]):
         self.simulation.show_goal(self.task.markers(self._goal))
 
     def _command(self, action: FloatArray, current: FloatArray) -> FloatArray:
-        """The next command for P; where many robots are simulated, as it is computed for many."""
+        """The next command for P; where many robots are simulated, as it is computed for many.
+
+        Args:
+            action: (3,).
+            current: (3,) m, world.
+        """
+        x, y, z = current.tolist()
+        point = np.array(self.machine.mount.swap((x, y, z)))
         if self._engine in SIMULATIONS:
-            (command,) = self.control.command(action[None], current[None])
+            (command,) = self.control.command(action[None], point[None])
             return np.asarray(command)
-        return self.control.command(action, current)
+        return self.control.command(action, point)
 
     def _draw_noise(self) -> Vector:
         """Errors of one reading of the encoders, rad."""
@@ -487,7 +494,10 @@ class TPMEnv(gym.Env[Observation, Action]):
         """What Gymnasium wants: Python's own numbers."""
         observation, reward, info = report(self.task, state, self._goal)
         terms = {name: float(value) for name, value in info.pop("reward_terms").items()}
-        plain = {name: np.asarray(value).item() for name, value in info.items()}
+        plain = {
+            name: value.item() if isinstance(value, np.generic | np.ndarray) else value
+            for name, value in info.items()
+        }
         return observation, float(reward), {**plain, "reward_terms": terms}
 
 

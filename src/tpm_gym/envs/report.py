@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -43,7 +44,8 @@ def report(
     terms = task.reward_terms(state, achieved, desired)
     reward = terms["goal"] + _goal_free(terms)
     # A sum is not finite where one of its terms is not; so written it costs least.
-    if not np.isfinite(observation["observation"].sum() + achieved.sum() + np.sum(reward)):
+    total = np.add.reduce(observation["observation"], axis=-1) + np.add.reduce(achieved, axis=-1)
+    if not math.isfinite(np.add.reduce(total + reward, axis=None)):
         raise _not_finite(task, state, achieved, terms)
     return (
         observation,

@@ -260,9 +260,18 @@ def assemble(theta: Vector, branch: AssemblyMode, geometry: Geometry) -> Assembl
     return _assembled(theta, branch, geometry)[2]
 
 
+_last: Any = (None, None, None), None
+"""What was assembled last, and the result: who reads a robot asks for the same angles again."""
+
+
 def _assembled(
     theta: Vector, branch: AssemblyMode, geometry: Geometry
 ) -> tuple[Triple, Triple, Assembly]:
+    global _last
+    result: tuple[Triple, Triple, Assembly]
+    before, result = _last
+    if theta is before[0] and branch is before[1] and geometry is before[2]:
+        return result
     cos, sin = arms(theta, geometry, PLAIN)
     try:
         found, real, _ = assembly_at(cos, sin, branch.planar, branch.sin_beta, geometry, PLAIN)
@@ -270,7 +279,9 @@ def _assembled(
         real = False
     if not real:
         raise no_assembly(theta, branch, geometry)
-    return cos, sin, found
+    result = cos, sin, found
+    _last = (tuple(theta), branch, geometry), result  # so that nothing can change in it
+    return result
 
 
 def posture(point: Vector, branch: WorkingMode, geometry: Geometry) -> Vector:

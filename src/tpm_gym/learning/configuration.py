@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import tyro
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from tpm_gym.learning.algorithms import ALGORITHMS
 from tpm_gym.learning.environments import check_env_id
@@ -238,9 +238,10 @@ def _require_whole(run: Path, stored: Mapping[str, Any]) -> None:
         for field in fields(TrainingConfig)
         if field.name in stored or field.default is UNSET
     }
-    text = json.dumps({**entries, "run": run.name})
+    text = json.dumps({CONFIG_FILE: {**entries, "run": run.name}})
+    strict = ConfigDict(strict=True, extra="forbid")
     try:
-        TypeAdapter(TrainingConfig).validate_json(text, strict=True)
+        TypeAdapter(dict[str, TrainingConfig], config=strict).validate_json(text)
         TypeAdapter(list[Any]).validate_python(stored.get("resumed", []))
         recipe_file(stored["algo"])  # there is such an algorithm
         entries = Recipe(**stored["recipe"]).entries()

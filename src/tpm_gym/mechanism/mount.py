@@ -57,6 +57,11 @@ class Mount:
         x, y, z = point
         return x, -y, self.height - z
 
+    def turn(self, vector: Vector) -> Vector:
+        """One free vector from either frame to the other, in plain floats."""
+        x, y, z = vector
+        return x, -y, -z
+
     @property
     def free_fall(self) -> Vector:
         """Acceleration of gravity in the paper frame, m/s^2."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from operator import sub
 from typing import Any
@@ -44,6 +43,7 @@ _OF_OBJECTS = {
     "object_angular_velocity": slice(13, 16),
 }
 """Columns in which an object's entries of a State are read."""
+_NO_OBJECTS = {name: np.empty((0, 16))[:, columns] for name, columns in _OF_OBJECTS.items()}
 
 
 @dataclass(frozen=True)
@@ -264,17 +264,18 @@ class Simulation:
         if moved:
             self._torque = torque
         theta, rates = self._disturb(true_theta, true_rates)
-        position, rows, conditioning = self._evaluate(theta)
+        position, jacobian, conditioning = self._evaluate(theta)
         mount, hold = self.machine.mount, self.engine.hold()
         if self._mode_left is None:
             self._mode_left = self._true_machine.mode_left(true_theta, mount.swap(platform))
         r1, r2, r3 = rates
+        x, y, z = [a * r1 + b * r2 + c * r3 for a, b, c in jacobian]
         return State(
             theta=np.array(theta),
             theta_dot=np.array(rates),
             torque=np.array(self._torque),
             fk_position=np.array(mount.swap(position)),
-            fk_velocity=mount.rotate([a * r1 + b * r2 + c * r3 for a, b, c in rows]),
+            fk_velocity=np.array(mount.turn((x, y, z))),
             conditioning=conditioning,
             platform_position=np.array(platform),
             platform_tilt=tilt,
@@ -293,7 +294,9 @@ class Simulation:
             (*position, *turn, *rotate(turn, (0.0, 0.0, 1.0)), *velocity, *angular_velocity)
             for (position, turn), (velocity, angular_velocity) in self.engine.objects()
         ]
-        table = np.array(rows, dtype=np.float64).reshape(-1, 16)
+        if not rows:
+            return _NO_OBJECTS
+        table = np.array(rows, dtype=np.float64)
         return {name: table[:, columns] for name, columns in _OF_OBJECTS.items()}
 
     def _disturb(self, theta: Vector, rates: Vector) -> tuple[Vector, Vector]:
@@ -312,9 +315,12 @@ class Simulation:
         That is what a controller can do whose disturbed encoders report angles at which no assembly
         exists, as happens near the edges of the workspace.
         """
-        with suppress(UnreachableError, SingularityError):
-            self._reading = self.machine.evaluate(theta)
-        return self._reading
+        try:
+            reading = self.machine.evaluate(theta)
+        except (UnreachableError, SingularityError):
+            reading = self._reading
+        self._reading = reading
+        return reading
 
     # -- state, pictures, end -----------------------------------------------------------------
 

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tpm_gym.arrays import FloatArray
+from tpm_gym.kinematics.namespaces import Numbers
 
 __all__ = ["dense", "distance", "singularity_penalty", "sparse"]
 
@@ -13,13 +14,14 @@ __all__ = ["dense", "distance", "singularity_penalty", "sparse"]
 def distance(achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
     """Euclidean distance of points (..., 3) m, as (...,) m."""
     gap = np.subtract(achieved, desired, dtype=np.float64)
-    result: FloatArray = np.sqrt((gap * gap).sum(axis=-1))
+    result: FloatArray = np.sqrt(np.add.reduce(gap * gap, axis=-1))
     return result
 
 
 def sparse(gap: ArrayLike, tolerance: float) -> FloatArray:
     """0 where ``gap`` (m) is below ``tolerance`` (m), else -1, also where it is no number."""
-    return -(~(np.asarray(gap) < tolerance)).astype(np.float64)
+    result: FloatArray = -(1.0 - np.less(gap, tolerance))
+    return result
 
 
 def dense(gap: ArrayLike, unit: float = 0.1) -> FloatArray:
@@ -27,7 +29,7 @@ def dense(gap: ArrayLike, unit: float = 0.1) -> FloatArray:
     return -np.asarray(gap, dtype=np.float64) / unit
 
 
-def singularity_penalty(conditioning: ArrayLike, safe: float) -> FloatArray:
+def singularity_penalty(conditioning: Numbers, safe: float) -> FloatArray:
     """Nearness to a singularity: 1 - (conditioning / safe)^4, and 0 where conditioning >= safe.
 
     1 at a singularity, smooth down to the threshold, and steepest there, so that crossing it has a
@@ -42,8 +44,7 @@ def singularity_penalty(conditioning: ArrayLike, safe: float) -> FloatArray:
     Returns:
         (...,) in [0, 1].
     """
-    share = np.asarray(conditioning, dtype=np.float64) / safe
-    share = np.minimum(np.maximum(share, 0.0), 1.0)  # np.clip costs five times as much
+    share = conditioning / safe
     squared = share * share
-    result: FloatArray = 1.0 - squared * squared
+    result: FloatArray = np.maximum(1.0 - squared * squared, 0.0)
     return result

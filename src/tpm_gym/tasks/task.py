@@ -34,6 +34,7 @@ Values = tuple[float, ...]
 Corners = tuple[list[float], list[float]]
 
 _ZERO = (0.0, 0.0, 0.0)
+_LIP = np.array(CUP.lip)
 
 
 @dataclass(frozen=True)
@@ -213,8 +214,8 @@ class Task(ABC):
 
     def penalty(self, state: State) -> FloatArray:
         """Nearness to a singularity before weighting, (...,) in [0, 1]; 1 where one was passed."""
-        near = rewards.singularity_penalty(state.conditioning, self.machine.safe_conditioning)
-        return np.maximum(near, state.passed_singularity)
+        conditioning = state.conditioning * (1 - state.passed_singularity)
+        return rewards.singularity_penalty(conditioning, self.machine.safe_conditioning)
 
     def success(self, achieved: ArrayLike, desired: ArrayLike) -> BoolArray:
         """Whether the goal is achieved, (...,)."""
@@ -373,7 +374,7 @@ class Task(ABC):
 
     def lip(self, state: State) -> FloatArray:
         """Centre of the cup's lip, pushed out, by forward kinematics, (..., 3) m."""
-        lip: FloatArray = state.fk_position - np.array(CUP.lip)
+        lip: FloatArray = state.fk_position - _LIP
         return lip
 
     def top(self, state: State, index: int = 0) -> FloatArray:
@@ -423,6 +424,8 @@ class Task(ABC):
 
     def lost(self, state: State) -> BoolArray:
         """Whether an object is off the table or where the robot cannot get to, (...,)."""
+        if not self.scene.objects:
+            return np.zeros(state.object_position.shape[:-2], dtype=np.bool_)
         low, high = self._within
         # So written, what is nowhere (NaN) is lost.
         within = (state.object_position >= low) & (state.object_position <= high)

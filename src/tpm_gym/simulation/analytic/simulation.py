@@ -372,6 +372,11 @@ class AnalyticSimulation:
         """(2, n) whether the robots left their assembly mode, their working mode."""
         return self._left
 
+    @property
+    def bias(self) -> FloatArray:
+        """(3, n) rad, what the encoders report minus what is true, without noise."""
+        return self._bias
+
     # -- reading ----------------------------------------------------------------------------
 
     def _read(self, rows: IntArray | slice) -> None:

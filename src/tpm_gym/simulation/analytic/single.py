@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields
+from operator import sub
 from typing import Any
 
 import numpy as np
@@ -93,7 +94,8 @@ class SingleSimulation:
             if left:
                 raise ModeChangeError(mode)
         new = vector("command", command)
-        self.machine.inverse(new)
+        a, b, c = map(sub, self.machine.inverse(new), self.batch.bias[:, 0].tolist())
+        self.machine.require_within_stops((a, b, c))
         errors = None if noise == (0.0, 0.0, 0.0) else np.array([noise]).T
         self.batch.move(np.array([new]), np.array([vacuum]), errors)
         return self.read()

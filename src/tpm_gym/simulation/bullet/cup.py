@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from tpm_gym.arrays import Vector
-from tpm_gym.mechanism.cup import sealed
+from tpm_gym.mechanism.cup import CUP, sealed
 from tpm_gym.simulation.bullet.client import Client
 from tpm_gym.simulation.bullet.robot import Robot
 from tpm_gym.simulation.engine import Pose
@@ -57,6 +57,8 @@ class Cup:
         """Start with nothing held."""
         self._client, self._robot, self._time_step = client, robot, time_step
         self._bodies, self._blocks = bodies, blocks
+        # From the middle of each to its farthest corner, m
+        self._sizes = [math.hypot(one.width, one.width, one.height) / 2 for one in blocks]
         self._weld = -1
         self._near: list[int] = []
         self.grip = Grip()
@@ -67,17 +69,18 @@ class Cup:
         if self._bodies:
             lip, _ = self._robot.cup()
             place = self._client.getBasePositionAndOrientation
-            for index, (body, block) in enumerate(zip(self._bodies, self._blocks, strict=True)):
-                size = math.hypot(block.width, block.width, block.height) / 2
+            for index, (body, size) in enumerate(zip(self._bodies, self._sizes, strict=True)):
                 if math.dist(place(body)[0], lip) < _REACH + size:
                     self._near.append(index)
         return self._near
 
+    def is_active(self, on: bool) -> bool:
+        """Whether :meth:`suck` has anything to do in a control period."""
+        return self.grip != Grip() or (on and bool(self._near))
+
     def suck(self, on: bool) -> None:
         """After a time step: let the air in or out, hold on or drop, take what is touched."""
         hold, pose = self.grip
-        if hold.which < 0 and not hold.vacuum and not (on and self._near):
-            return
         load = _NOTHING if pose is None else self._load()
         touched = self._touched() if on and pose is None else -1
         new = hold_after(hold, self._time_step, on, load, touched)
@@ -113,8 +116,9 @@ class Cup:
         lip, axis = self._robot.cup()
         for index in self._near:
             block = self._blocks[index]
-            pose = self._client.getBasePositionAndOrientation(self._bodies[index])
-            if sealed(lip, axis, pose[0], pose[1], (block.width, block.height)):
+            place, turn = self._client.getBasePositionAndOrientation(self._bodies[index])
+            close = math.dist(place, lip) < self._sizes[index] + CUP.seal_gap
+            if close and sealed(lip, axis, place, turn, (block.width, block.height)):
                 return index
         return -1
 

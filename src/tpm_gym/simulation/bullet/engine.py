@@ -119,14 +119,16 @@ class BulletEngine:
     def advance(self, references: Sequence[Reference], vacuum: bool) -> None:
         """See the protocol."""
         cup, friction, step = self._cup, self._friction, self.client.stepSimulation
-        friction.look(cup.look())
+        slips, sucks = friction.look(cup.look()), cup.is_active(vacuum)
         if self._servos is not None and references:
             self._servos.begin(references[0].theta)
         for reference in references:
-            friction.turn(cup.grip.hold.which)
+            if slips:
+                friction.turn(cup.grip.hold.which)
             follow(self.robot, self._servos, reference)
             step()
-            cup.suck(vacuum)
+            if sucks:
+                cup.suck(vacuum)
 
     def motors(self) -> Motors:
         """See the protocol."""

@@ -86,13 +86,14 @@ class Friction:
         """All objects are ``factor`` times as rough as nominal."""
         self._factor = factor
 
-    def look(self, near: Sequence[int]) -> None:
-        """Before a control period: what may slip is ``near`` the cup, or slides."""
+    def look(self, near: Sequence[int]) -> bool:
+        """Before a control period: whether anything may slip; it is ``near`` the cup, or slides."""
         self._active = [
             index
             for index, (body, *_) in enumerate(self._bodies)
             if index in near or math.hypot(*self._client.getBaseVelocity(body)[0]) > _SLIP
         ]
+        return bool(self._active)
 
     def turn(self, held: int) -> None:
         """Before a time step: scale the friction of what may slip."""
@@ -147,9 +148,9 @@ def _used(points: Sequence[Any], coefficient: float) -> tuple[float, float]:
     """Friction that these contacts bore, along the world's axes, in units of mu N."""
     along_x = along_y = normal = 0.0
     for point in points:
-        first, second = point[10], point[12]
-        along_x += first * point[11][0] + second * point[13][0]
-        along_y += first * point[11][1] + second * point[13][1]
-        normal += point[9]
+        force, first, (a, b, _), second, (c, d, _) = point[9:]
+        along_x += first * a + second * c
+        along_y += first * b + second * d
+        normal += force
     most = coefficient * normal
     return (along_x / most, along_y / most) if most > 0 else (0.0, 0.0)
