@@ -110,10 +110,9 @@ def matrix(todo: list[Cell], jobs: int) -> list[dict[str, Any]]:
 def renewed(record: dict[str, Any], ids: Sequence[str], jobs: int) -> dict[str, Any]:
     """A record with the cells of these published policies evaluated again."""
     again = {"renewed": machine.describe(sys.argv)}
-    todo = [cell for cell in cells(ENGINES, EPISODES) if cell.policy in ids]
-    fresh = iter(matrix(todo, jobs))
-    kept = [next(fresh) if old["policy"] in ids else old for old in record["matrix"]]
-    return record | again | {"matrix": kept}
+    fresh = matrix([cell for cell in cells(ENGINES, EPISODES) if cell.policy in ids], jobs)
+    kept = [old for old in record["matrix"] if old["policy"] not in ids]
+    return record | again | {"matrix": sorted(kept + fresh, key=lambda cell: cell["env_id"])}
 
 
 def main() -> None:
