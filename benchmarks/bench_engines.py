@@ -2,6 +2,7 @@
 
     make bench-engines
     python benchmarks/bench_engines.py --quick
+    python benchmarks/bench_engines.py --published ID
 
 Agreement: five motions, their actions recorded once and repeated blindly in every engine. Largest
 loop gap, largest distance of the platform from the forward kinematics of the encoders, torques
@@ -30,11 +31,13 @@ import gymnasium as gym
 import machine
 import numpy as np
 from engine_agreement import PICK, Trace, energy_lost, follow, motions
-from engine_matrix import cells, run_all
+from engine_matrix import IDS, Cell, cells, run_all
 
 ENGINES = ("pybullet", "mujoco")
 ROUNDS, BLOCK = 20, 100
 """Rounds of timing, and control steps in a block."""
+EPISODES = 1000
+"""In a cell of the matrix."""
 
 
 def agreement(engines: Sequence[str], episodes: int) -> list[dict[str, Any]]:
@@ -93,10 +96,10 @@ def costs(engines: Sequence[str], rounds: int) -> dict[str, list[float]]:
     return spent
 
 
-def matrix(engines: Sequence[str], episodes: int, jobs: int) -> list[dict[str, Any]]:
-    """All cells, said as they come."""
+def matrix(todo: list[Cell], jobs: int) -> list[dict[str, Any]]:
+    """Records of cells, said as they come."""
     done = []
-    for record in run_all(cells(engines, episodes), jobs):
+    for record in run_all(todo, jobs):
         success = record["metrics"]["success_at_end"]["mean"]
         shown = ("env_id", "policy", "noise", "engine", "drive")
         print(*(record[key] for key in shown), f"{100 * success:.1f}%", file=sys.stderr)
@@ -104,21 +107,32 @@ def matrix(engines: Sequence[str], episodes: int, jobs: int) -> list[dict[str, A
     return done
 
 
+def renewed(record: dict[str, Any], ids: Sequence[str], jobs: int) -> dict[str, Any]:
+    """A record with the cells of these published policies evaluated again."""
+    again = {"renewed": machine.describe(sys.argv)}
+    fresh = matrix([cell for cell in cells(ENGINES, EPISODES) if cell.policy in ids], jobs)
+    kept = [old for old in record["matrix"] if old["policy"] not in ids]
+    return record | again | {"matrix": sorted(kept + fresh, key=lambda cell: cell["env_id"])}
+
+
 def main() -> None:
     """Parse the options and run."""
     parser = argparse.ArgumentParser(description="Engines and theory on the same commands.")
     parser.add_argument("--quick", action="store_true", help="some minutes; writes no files")
     parser.add_argument("--jobs", type=int, default=1, help="processes for the matrix")
+    parser.add_argument("--published", nargs="+", choices=IDS, help="only these, in the matrix")
     parser.add_argument("--redraw", action="store_true", help="picture and page from the records")
     options = parser.parse_args()
-    if not options.redraw:
+    if options.published:
+        engine_report.write(renewed(engine_report.read(), options.published, options.jobs))
+    elif not options.redraw:
         quick = options.quick
         record = {
             "machine": machine.describe(sys.argv),
             "agreement": agreement(ENGINES, 3 if quick else 20),
             "energy_lost": {engine: energy_lost(engine) for engine in ENGINES},
             "cost": costs(ENGINES, 4 if quick else ROUNDS),
-            "matrix": matrix(ENGINES, 10 if quick else 1000, options.jobs),
+            "matrix": matrix(cells(ENGINES, 10 if quick else EPISODES), options.jobs),
         }
         engine_report.print_tables(record)
         if quick:

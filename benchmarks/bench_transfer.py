@@ -7,7 +7,7 @@
 Tested is what ``--runs`` holds: each run's best policy, in the engine it was trained in and in the
 others, with ideal and servo drives. Runs that stopped early come of ``--steps``: their policies
 drop and shove, which is where an engine with a simpler contact would be found out. The published
-policies were trained in PyBullet.
+policies are tested too.
 
 Everything goes to docs/records/transfer.json, and from there into docs/closed-form.md.
 """
@@ -63,7 +63,7 @@ def cells(runs: Path, episodes: int, drives: Sequence[str]) -> Iterator[Cell]:
         (_kind(json.loads(file.read_text(encoding="utf-8"))), str(file.parent))
         for file in sorted(runs.glob("*/config.json"))
     ]
-    policies += [(f"{env_id}: SAC, pybullet, published", env_id) for env_id in PUBLISHED]
+    policies += [(f"{env_id}: published", env_id) for env_id in PUBLISHED]
     for kind, policy in policies:
         env_id = kind.split(":")[0]
         for engine in ENGINES:

@@ -51,9 +51,15 @@ def write(record: dict[str, Any]) -> None:
     RECORD.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
 
 
+def read() -> dict[str, Any]:
+    """The record that was kept."""
+    record: dict[str, Any] = json.loads(RECORD.read_text(encoding="utf-8"))
+    return record
+
+
 def publish() -> None:
     """Fill the page and draw the picture from the record."""
-    record = json.loads(RECORD.read_text(encoding="utf-8"))
+    record = read()
     fill(PAGE, "engines", lines(record))
     draw(record)
     for path in (PICTURE, PAGE):
@@ -79,6 +85,9 @@ def lines(record: dict[str, Any]) -> Iterator[str]:
     yield ""
     yield _costs(record)
     yield ""
+    if "renewed" in record:
+        yield f"Rows of policies published since: `{record['renewed']['command']}`."
+        yield ""
     heads = list(dict.fromkeys((row["engine"], row["drive"]) for row in record["matrix"]))
     yield from table(
         ["id", "policy", *(f"{engine}, {drive}" for engine, drive in heads)],

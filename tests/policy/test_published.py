@@ -13,7 +13,7 @@ from tpm_gym.learning.rollout import TEST_SEED, run_episodes
 from tpm_gym.resources import POLICIES
 
 NAMES = sorted(path.stem for path in POLICIES.glob("*.safetensors"))
-PROMISED = {"TPMReach-v0": 1.0, "TPMPickAndPlace-v0": 0.99, "TPMPickAndPlaceJoints-v0": 0.95}
+PROMISED = {"TPMReach-v0": 1.0, "TPMPickAndPlace-v0": 0.99, "TPMPickAndPlaceJoints-v0": 0.98}
 """Least success rate of 1000 held-out episodes."""
 
 
@@ -29,7 +29,8 @@ def test_all_that_are_promised_are_there() -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_the_evaluation_is_of_this_policy_on_held_out_episodes(name: str) -> None:
     content = evaluation(name)
-    assert content["env"] == name == tpm_gym.load_policy(POLICIES / name).description.env_id
+    trained_in = tpm_gym.load_policy(POLICIES / name).description.env_id
+    assert content["env"] == name == trained_in.replace("Dense", "")  # for the same spaces
     assert content["policy"] == f"train/policies/{name}.json"
     assert content["episodes"] == len(content["records"]) >= 1000
     assert content["seed"] >= TEST_SEED
