@@ -148,6 +148,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             physics=physics,
             drive=self.drive,
         )
+        self._altered = self.randomisation != Randomisation()
         self._home = self.machine.inverse(self.machine.home)
         self._limit, self._stagger = max_episode_steps, stagger
         self._rngs: list[np.random.Generator] = []
@@ -213,18 +214,16 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
 
     def _begin(self, rows: IntArray, options: dict[str, Any] | None = None) -> dict[str, Any]:
         """Start episodes in some environments; what is to be told of their randomisation."""
-        starts, plants = [], []
-        for row in rows.tolist():
-            start = self.task.start(self._rngs[row], options)
-            plants.append(self.randomisation.draw(self._rngs[row], self.machine))
-            self._goals[row] = start.pop("goal")
-            starts.append(start)
+        rngs = [self._rngs[row] for row in rows.tolist()]
+        starts = self.task.starts(rngs, options)
+        plants = [self.randomisation.draw(rng, self.machine) for rng in rngs]
+        self._goals[rows] = starts.pop("goal")
         self.simulation.reset(rows, self._home, starts, plants, self._draw_noise(rows))
         self._pending[:, rows] = 0.0
         self._elapsed[rows] = 0
         self._ended[rows] = False
         infos: dict[str, Any] = {}
-        if self.randomisation != Randomisation():
+        if self._altered:
             latency = {"latency": self.randomisation.latency}
             for row, plant in zip(rows.tolist(), plants, strict=True):
                 self._add_info(infos, {"randomisation": {**plant.as_dict(), **latency}}, row)

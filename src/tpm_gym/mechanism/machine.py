@@ -206,19 +206,24 @@ class Machine(ABC):
         """Conditioning 1/cond(J) at joint positions (..., 3); 0 where it cannot be assembled."""
         return _each(lambda one: self.evaluate(one).conditioning, theta)
 
+    def is_safe(self, point: Vector) -> bool:
+        """Whether P can be at ``point``, with :attr:`safe_conditioning` or better."""
+        with suppress(UnreachableError, SingularityError):
+            return self.evaluate(self.inverse(point)).conditioning >= self.safe_conditioning
+        return False
+
     def sample(self, rng: np.random.Generator, region: Region) -> FloatArray:
         """Draw a point (3,) m, uniform over the part of ``region`` that is safe.
 
         Raises:
             ConfigurationError: If no draw was safe.
         """
-        low, high = np.array(region.low), np.array(region.high)
+        (x, y, z), (a, b, c) = region.low, region.high
         for _ in range(_ATTEMPTS):
-            point: FloatArray = low + (high - low) * rng.random(3)
-            a, b, c = point.tolist()
-            with suppress(UnreachableError, SingularityError):
-                if self.evaluate(self.inverse((a, b, c))).conditioning >= self.safe_conditioning:
-                    return point
+            u, v, w = rng.random(3).tolist()
+            point = x + (a - x) * u, y + (b - y) * v, z + (c - z) * w
+            if self.is_safe(point):
+                return np.array(point)
         valid = f"a value that some point of {region} reaches"
         raise ConfigurationError("safe_conditioning", self.safe_conditioning, valid)
 

@@ -13,6 +13,7 @@ Everything here is about point P, in the machine's frame, m.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Final
 
@@ -49,9 +50,11 @@ def apart_from(
     Raises:
         ConfigurationError: If no draw was.
     """
+    taken = np.reshape(others, (-1, 3)).tolist()
     for _ in range(_ATTEMPTS):
         point = machine.sample(rng, region)
-        if (rewards.distance(point, others) >= apart).all():
+        here = point.tolist()
+        if all(math.dist(here, other) >= apart for other in taken):
             return point
     valid = f"a larger one: what is drawn lies {apart} m from the start, or from other objects"
     raise ConfigurationError("goal_region", region, valid)

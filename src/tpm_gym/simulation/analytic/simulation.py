@@ -133,7 +133,7 @@ class AnalyticSimulation:
         self,
         rows: IntArray,
         theta: Sequence[float],
-        objects: Sequence[Mapping[str, Any]],
+        objects: Mapping[str, FloatArray],
         plants: Sequence[Plant],
         noise: FloatArray | None = None,
     ) -> None:
@@ -142,7 +142,7 @@ class AnalyticSimulation:
         Args:
             rows: Which, (r,).
             theta: (3,) rad, by the encoders.
-            objects: For each of them centre (3,) m, world, of the scene's objects by name.
+            objects: Centres (r, 3) m, world, of the scene's objects by name.
             plants: For each of them the true machine.
             noise: Of the first reading of the encoders, (3, n) rad.
         """
@@ -164,8 +164,7 @@ class AnalyticSimulation:
             self._noise[:, :, rows] = noise[:, rows]
             self._read(rows)
         if self.scene.objects:
-            name = self.scene.objects[0].name
-            self._pucks.place(rows, np.array([one[name] for one in objects]))
+            self._pucks.place(rows, objects[self.scene.objects[0].name])
 
     def _reading_at(self, theta: tuple[float, ...]) -> Readings:
         """What follows from angles at which episodes start: mostly the same ones."""
