@@ -121,5 +121,5 @@ def _not_finite(
 
 
 def _clip(values: FloatArray, bound: float) -> NDArray[np.float32]:
-    clipped: NDArray[np.float32] = np.minimum(np.maximum(values, -bound), bound).astype(np.float32)
-    return clipped
+    clipped = np.minimum(np.maximum(values, -bound), bound)
+    return clipped.astype(np.float32, order="C")
