@@ -11,7 +11,7 @@ in the world; for the TPM that is the paper's. Joint positions theta are in rad 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,7 +20,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tpm_gym.arrays import FloatArray, Vector, finite, vector
+from tpm_gym.arrays import BoolArray, FloatArray, Vector, finite, vector
 from tpm_gym.errors import (
     ConfigurationError,
     JointLimitError,
@@ -41,6 +41,7 @@ Mode = Literal["assembly", "working"]
 Rows = tuple[Vector, Vector, Vector]
 
 _ATTEMPTS = 1000
+_MANY = 32  # points from which on arrays are faster than floats, one by one
 
 
 class Reading(NamedTuple):
@@ -218,14 +219,30 @@ class Machine(ABC):
         Raises:
             ConfigurationError: If no draw was safe.
         """
-        (x, y, z), (a, b, c) = region.low, region.high
+        point: FloatArray = self.sample_each([rng], [region])[0]
+        return point
+
+    def sample_each(
+        self, rngs: Sequence[np.random.Generator], regions: Sequence[Region]
+    ) -> FloatArray:
+        """The same for r generators and regions, (r, 3) m."""
+        low, high = (np.array([getattr(r, end) for r in regions]) for end in ("low", "high"))
+        points, rows = np.empty_like(low), np.arange(len(rngs))
         for _ in range(_ATTEMPTS):
-            u, v, w = rng.random(3).tolist()
-            point = x + (a - x) * u, y + (b - y) * v, z + (c - z) * w
-            if self.is_safe(point):
-                return np.array(point)
-        valid = f"a value that some point of {region} reaches"
+            drawn = np.array([rngs[row].random(3) for row in rows.tolist()])
+            points[rows] = low[rows] + (high[rows] - low[rows]) * drawn
+            rows = rows[~self._are_safe(points[rows])]
+            if not len(rows):
+                return points
+        valid = f"a value that some point of {regions[rows[0]]} reaches"
         raise ConfigurationError("safe_conditioning", self.safe_conditioning, valid)
+
+    def _are_safe(self, points: FloatArray) -> BoolArray:
+        """Whether P can safely be at points (r, 3)."""
+        if len(points) < _MANY:
+            return np.array([self.is_safe((x, y, z)) for x, y, z in points.tolist()])
+        safe: BoolArray = self.conditioning_at(points) >= self.safe_conditioning
+        return safe
 
     # -- bodies -----------------------------------------------------------------------------
 

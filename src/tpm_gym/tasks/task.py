@@ -24,7 +24,7 @@ from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.state import CONTROL_PERIOD, Block, Scene, State
-from tpm_gym.tasks import rewards
+from tpm_gym.tasks import rewards, sampling
 from tpm_gym.tasks.motion import Motion, Move, hanging
 
 __all__ = ["Entry", "Task"]
@@ -143,6 +143,27 @@ class Task(ABC):
             Centre (3,) m of each of the scene's objects by name, and ``"goal"`` (goal_size,) m.
         """
 
+    def sample_each(
+        self, rngs: Sequence[np.random.Generator], chosen: Mapping[str, FloatArray]
+    ) -> dict[str, FloatArray]:
+        """The same for r episodes, of a generator each: arrays (r, ...).
+
+        One by one; who writes it for many at a time draws what :meth:`sample` would.
+        """
+        drawn, sizes = [self.sample(rng, chosen) for rng in rngs], self._sizes
+        for start in drawn:
+            if start.keys() != sizes.keys():
+                raise ConfigurationError("sample()", list(start), f"the keys {', '.join(sizes)}")
+            for name, size in sizes.items():
+                finite(f"sample()[{name!r}]", start[name], (size,), ConfigurationError)
+        return {name: np.array([start[name] for start in drawn]) for name in sizes}
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Ask one by one whoever writes :meth:`sample` only."""
+        super().__init_subclass__(**options)
+        if "sample" in vars(cls) and "sample_each" not in vars(cls):
+            cls.sample_each = Task.sample_each  # type: ignore[method-assign]
+
     @abstractmethod
     def achieved(self, state: State) -> FloatArray:
         """What is compared with the goal, (..., goal_size) m."""
@@ -235,27 +256,19 @@ class Task(ABC):
             ConfigurationError: If what the task samples lacks something, has something else, or
                 puts an object into another or into the robot.
         """
-        return {name: rows[0] for name, rows in self.starts([rng], options).items()}
+        return sampling.first_of(self.starts([rng], options))
 
     def starts(self, rngs: Sequence[np.random.Generator], options: Any) -> dict[str, FloatArray]:
         """The same for r episodes, of a generator each: arrays (r, ...)."""
         chosen = {} if options is None else self._chosen(options)
-        sizes = {block.name: 3 for block in self.scene.objects} | {"goal": self.goal_size}
-        drawn = [self.sample(rng, chosen) for rng in rngs]
-        for start in drawn:
-            if start.keys() != sizes.keys():
-                raise ConfigurationError("sample()", list(start), f"the keys {', '.join(sizes)}")
-        starts = {
-            name: np.array(
-                [
-                    finite(f"sample()[{name!r}]", start[name], (size,), ConfigurationError)
-                    for start in drawn
-                ]
-            )
-            for name, size in sizes.items()
-        }
+        starts = self.sample_each(rngs, chosen)
         self._check_free(starts, chosen)
         return starts
+
+    @property
+    def _sizes(self) -> dict[str, int]:
+        """Of what is sampled, by name."""
+        return {block.name: 3 for block in self.scene.objects} | {"goal": self.goal_size}
 
     def _chosen(self, options: Any) -> dict[str, FloatArray]:
         """What the user has chosen, by name."""
