@@ -57,9 +57,7 @@ class PickAndPlace(Task):
         if "goal" not in given:
             start = to_p(given["object"] + offset)[:, None]
             regions = [self._draw_region(rng) for rng in rngs]
-            given["goal"] = (
-                from_p(sampling.apart_from_each(start, rngs, machine, regions)) - offset
-            )
+            given["goal"] = from_p(sampling.apart_from_each(start, rngs, machine, regions)) - offset
         return given
 
     def _draw_region(self, rng: np.random.Generator) -> Region:

@@ -33,15 +33,13 @@ class Reach(Task):
         self, rngs: Sequence[np.random.Generator], chosen: Mapping[str, FloatArray]
     ) -> dict[str, FloatArray]:
         """See the base class."""
-        machine, region = self.machine, self.machine.goal_region
+        machine, home, region = self.machine, self.machine.home, self.machine.goal_region
         if "goal" in chosen:
             return sampling.repeated(chosen, len(rngs))
         if self.goals == "tempting":
-            home = machine.home
             pairs = [sampling.tempting(rng, machine, home, lambda _: region) for rng in rngs]
             goals = np.array([goal for _, goal in pairs])
         else:
-            home = np.reshape(machine.home, (1, 1, 3))
             goals = sampling.apart_from_each(home, rngs, machine, [region] * len(rngs))
         return {"goal": machine.mount.to_world(goals)}
 

@@ -25,7 +25,15 @@ from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.tasks import rewards
 
-__all__ = ["APART", "BAND", "apart_from", "apart_from_each", "line_in_joints", "line_in_space", "tempting"]
+__all__ = [
+    "APART",
+    "BAND",
+    "apart_from",
+    "apart_from_each",
+    "line_in_joints",
+    "line_in_space",
+    "tempting",
+]
 
 APART: Final = 0.030
 """A goal is at least this far from where its episode starts, m: no success for free."""
@@ -49,19 +57,19 @@ def apart_from(
     Raises:
         ConfigurationError: If no draw was.
     """
-    others = np.reshape(others, (1, -1, 3))
+    others = np.reshape(others, (-1, 3))
     point: FloatArray = apart_from_each(others, [rng], machine, [region], apart)[0]
     return point
 
 
 def apart_from_each(
-    others: FloatArray,
+    others: ArrayLike,
     rngs: Sequence[np.random.Generator],
     machine: Machine,
     regions: Sequence[Region],
     apart: float = APART,
 ) -> FloatArray:
-    """The same for r generators, others (r, k, 3) and regions: (r, 3) m."""
+    """The same for r generators and regions, others (k, 3) for all or (r, k, 3): (r, 3) m."""
     points = machine.sample_each(rngs, regions)
     for _ in range(_ATTEMPTS):
         near = rewards.distance(points[:, None], others) < apart

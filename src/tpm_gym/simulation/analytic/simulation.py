@@ -315,17 +315,15 @@ class AnalyticSimulation:
 
     def _torques(self, rows: IntArray | slice, theta: FloatArray, push: FloatArray) -> FloatArray:
         """Torques (m, 3, r) N m that take motors through theta (3, m + 2, r) rad."""
-        rates = np.diff(theta, axis=1) / self._step
-        changes = np.diff(rates, axis=1) / self._step
+        rates = (theta[:, 1:] - theta[:, :-1]) / self._step
+        changes = (rates[:, 1:] - rates[:, :-1]) / self._step
         against = push.transpose(1, 0, 2) if self.scene.objects else None
         batch = self._true if isinstance(rows, slice) else self._true.take(rows)
         torques = batch.torque(theta[:, 1:-1], rates[:, :-1], changes, against)
         by_steps: FloatArray = torques.transpose(1, 0, 2)
         return by_steps
 
-    def _serve(
-        self, servos: ServoDrives, commands: FloatArray, vacuum: BoolArray
-    ) -> None:
+    def _serve(self, servos: ServoDrives, commands: FloatArray, vacuum: BoolArray) -> None:
         """Let servo drives take P along the last three commands (3, 3, n) m."""
         nominal, bias = self._nominal, self._bias
         start = nominal.inverse((commands[0] + commands[1]) / 2)
