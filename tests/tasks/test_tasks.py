@@ -218,7 +218,7 @@ def test_many_start_where_each_would(machine: Any) -> None:
 
     for task in (Reach(machine), PickAndPlace(machine), Raised(machine)):
         many = task.starts([np.random.default_rng(seed) for seed in range(60)], None)
-        each = [task.start(np.random.default_rng(seed), None) for seed in range(60)]
+        each = [task.sample(np.random.default_rng(seed), {}) for seed in range(60)]
         for name, places in many.items():
             np.testing.assert_array_equal(places, [start[name] for start in each])
 
