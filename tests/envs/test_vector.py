@@ -150,10 +150,10 @@ def test_resets_draw_what_those_of_one_environment_do_whatever_is_chosen_between
     even = np.arange(count) % 2 == 0
     envs.reset(seed=0)
     alone.reset(seed=6)
-    goal = envs.goal[6]
-    for options in ({}, {"goal": goal}, {}, {"goal": goal}, {"goal": goal}, {}):
-        observation, _ = envs.reset(options={"reset_mask": even, **options})
-        wanted, _ = alone.reset(options=options)
+    chosen = {"goal": envs.goal[6]}
+    for seed, options in ((None, {}), (None, chosen), (None, {}), (5, {}), (None, chosen), (8, {})):
+        observation, _ = envs.reset(seed=seed, options={"reset_mask": even, **options})
+        wanted, _ = alone.reset(seed=None if seed is None else seed + 6, options=options)
         assert_same({name: values[6] for name, values in observation.items()}, wanted)
         for _ in range(2):  # then all others draw ahead
             envs.reset(options={"reset_mask": ~even})
