@@ -410,7 +410,7 @@ class AnalyticSimulation:
 
     def _read(self, rows: IntArray | slice) -> None:
         """Read the encoders, and what follows; what makes no sense leaves the last that did."""
-        theta, _ = self._encoders(rows)
+        theta = self._encoders(rows)
         batch = self._nominal if isinstance(rows, slice) else self._nominal.take(rows)
         self._write(rows, batch.evaluate(theta))
 
@@ -424,20 +424,20 @@ class AnalyticSimulation:
         self._jacobian[:, :, rows] = np.where(known, jacobian, self._jacobian[:, :, rows])
         self._conditioning[rows] = np.where(known, conditioning, self._conditioning[rows])
 
-    def _encoders(self, rows: IntArray | slice) -> tuple[FloatArray, FloatArray]:
-        """Angles (rad) and rates (rad/s) that the encoders report, (3, r) each."""
-        earlier, noise = self._noise[:, :, rows]
-        theta = self._theta[:, rows] + self._bias[:, rows] + noise
-        return theta, self._rates[:, rows] + (noise - earlier) / CONTROL_PERIOD
+    def _encoders(self, rows: IntArray | slice) -> FloatArray:
+        """Angles that the encoders report, (3, r) rad."""
+        angles: FloatArray = self._theta[:, rows] + self._bias[:, rows] + self._noise[1][:, rows]
+        return angles
 
     def state(self) -> State:
         """What is known of all robots, with a leading axis (n,)."""
-        theta, rates = self._encoders(slice(None))
+        earlier, noise = self._noise
+        rates = self._rates + (noise - earlier) / CONTROL_PERIOD
         j, (a, b, c) = self._jacobian, rates
         velocity = j[:, 0] * a + j[:, 1] * b + j[:, 2] * c
         tilt, gap = np.zeros((2, self.count))
         return State(
-            theta=theta.T,
+            theta=self._encoders(slice(None)).T,
             theta_dot=rates.T,
             torque=self._torque.copy().T,
             fk_position=self._to_world(self._position).T,
