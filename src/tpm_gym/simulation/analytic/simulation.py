@@ -88,11 +88,10 @@ class AnalyticSimulation:
         self._step = self.physics.time_step
         steps = self.physics.substeps
         self._weights = spline_weights(steps).T[:, :, None, None]  # (3, K, 1, 1)
-        # Of the last of these time steps angles are wanted, of the last of those the way of P
+        # Of so many of the last time steps angles are wanted
         self._tail = {"none": 2, "last": 3, "every": steps}[self.physics.torques]
-        shown = steps if scene.objects else self._tail
         # Made once: memory of this size would be fetched anew in every control period.
-        self._ways = np.empty((2, shown + 2, 3, count))
+        self._ways = np.empty((2, steps + 2, 3, count))
         self._nominal, self._true = machine.batch(count), machine.batch(count)
         block = scene.objects[0] if scene.objects else None
         self._pucks = Pucks(block, count, self._step, machine.table)
@@ -247,7 +246,8 @@ class AnalyticSimulation:
         """
         start = self._course()
         objects = self._pucks.save(slice(None)) if self.scene.objects else None
-        points, other = self._ways
+        last = self._exact and not self.scene.objects  # then no more of the way matters
+        points, other = self._ways[:, : self._tail + 2] if last else self._ways
         theta = self._ideal(self._spline_into(points[2:], commands, other[2:]))
         points[0], points[1] = start.before, start.position
         push = self._touch(slice(None), points, vacuum, other)
