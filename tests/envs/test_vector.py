@@ -123,18 +123,40 @@ def test_the_first_episodes_are_of_different_lengths_where_that_is_asked_for() -
     assert sum(ended) == 10
 
 
-def test_what_is_saved_goes_on_equally() -> None:
-    envs, other = (make(PICK, 7, randomisation=EVERYTHING, stagger=True) for _ in range(2))
-    envs.reset(seed=0)
+@pytest.mark.parametrize("randomisation", [None, EVERYTHING], ids=["nominal", "everything"])
+def test_what_is_saved_goes_on_equally(randomisation: Any) -> None:
+    envs, other, unsaved = (
+        make(PICK, 7, randomisation=randomisation, stagger=True) for _ in range(3)
+    )
     course = actions_of(envs, 90)
-    for actions in course[:30]:
-        envs.step(actions)
+    for each in (envs, unsaved):
+        each.reset(seed=0)
+        for actions in course[:30]:
+            each.step(actions)
     moment = envs.save_state()
-    expected = [envs.step(actions) for actions in course[30:]]
-    for again in (envs, other):
+    expected = [unsaved.step(actions) for actions in course[30:]]
+    for again in (envs, other, envs):
         again.restore_state(moment)
         for actions, wanted in zip(course[30:], expected, strict=True):
             assert_same(again.step(actions)[0], wanted[0])
+
+
+@pytest.mark.parametrize("env_id", [REACH, PICK])
+def test_resets_draw_what_those_of_one_environment_do_whatever_is_chosen_between(
+    env_id: str,
+) -> None:
+    count = 40
+    envs, alone = make(env_id, count), gym.make(env_id, engine="analytic")
+    even = np.arange(count) % 2 == 0
+    envs.reset(seed=0)
+    alone.reset(seed=6)
+    chosen = {"goal": envs.goal[6]}
+    for seed, options in ((None, {}), (None, chosen), (None, {}), (5, {}), (None, chosen), (8, {})):
+        observation, _ = envs.reset(seed=seed, options={"reset_mask": even, **options})
+        wanted, _ = alone.reset(seed=None if seed is None else seed + 6, options=options)
+        assert_same({name: values[6] for name, values in observation.items()}, wanted)
+        for _ in range(2):  # then all others draw ahead
+            envs.reset(options={"reset_mask": ~even})
 
 
 BAD: list[tuple[Callable[[TPMVectorEnv], Any], type[Exception], str]] = [

@@ -209,6 +209,20 @@ def test_starts_repeat_with_the_rng_and_take_what_is_chosen(task: Task) -> None:
     np.testing.assert_array_equal(kept, first["goal"])
 
 
+@each_machine
+def test_many_start_where_each_would(machine: Any) -> None:
+    class Raised(PickAndPlace):
+        def sample(self, rng: Any, chosen: Any) -> Any:
+            start = super().sample(rng, chosen)
+            return {**start, "goal": start["goal"] + (0.0, 0.0, 1e-3 * rng.random())}
+
+    for task in (Reach(machine), PickAndPlace(machine), Raised(machine)):
+        many = task.starts([np.random.default_rng(seed) for seed in range(60)], None)
+        each = [task.sample(np.random.default_rng(seed), {}) for seed in range(60)]
+        for name, places in many.items():
+            np.testing.assert_array_equal(places, [start[name] for start in each])
+
+
 @pytest.mark.parametrize("options", [{"gaol": (0, 0, 0)}, [("goal", (0, 0, 0))], {3: 4}, "goal"])
 def test_unknown_options_are_refused_with_the_known_ones(task: Task, options: Any) -> None:
     with pytest.raises(ResetOptionError, match="'goal'") as caught:

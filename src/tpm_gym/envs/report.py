@@ -121,5 +121,6 @@ def _not_finite(
 
 
 def _clip(values: FloatArray, bound: float) -> NDArray[np.float32]:
-    clipped: NDArray[np.float32] = np.minimum(np.maximum(values, -bound), bound).astype(np.float32)
-    return clipped
+    with np.errstate(over="ignore"):  # what is beyond float32 is beyond the bound
+        clipped = np.array(values, dtype=np.float32, order="C")
+    return np.minimum(np.maximum(clipped, -bound, out=clipped), bound, out=clipped)

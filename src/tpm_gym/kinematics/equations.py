@@ -13,7 +13,8 @@ check nothing and raise nothing: beside a solution they return whether it is rea
 from which the errors of the last part explain why it is not.
 
 The second part is the first in plain floats, for one configuration at every time step, with errors:
-:func:`assemble`, :func:`posture` and :func:`evaluate`. Three finite floats are expected.
+:func:`assemble`, :func:`posture`, :func:`evaluate` and :func:`conditioning_at`. Three finite floats
+are expected.
 """
 
 import math
@@ -317,6 +318,22 @@ def evaluate(
     require_regular(values, geometry)
     rows = velocity(bars, values)
     return found, rows, conditioning(rows, PLAIN)
+
+
+def conditioning_at(
+    point: Vector, branch: WorkingMode, assembly: AssemblyMode, geometry: Geometry
+) -> float:
+    """1/cond(J) with P at ``point`` (3) m; 0 where that is not reachable on both branches."""
+    try:
+        theta, real, link7, _ = posture_at(point, branch.signs, geometry, PLAIN)
+        cos, sin = arms(theta, geometry, PLAIN)
+        found = Assembly(*point, *link7)
+        bars = rods(cos, sin, found, geometry)
+        values = factors(cos, sin, found, bars, geometry)
+        same = values.planar * assembly.planar > 0 and values.sin_beta * assembly.sin_beta > 0
+        return conditioning(velocity(bars, values), PLAIN) if real and same else 0.0
+    except ZeroDivisionError:  # a rod's end at the pivot, or a parallel singularity
+        return 0.0
 
 
 def require_regular(values: Factors, geometry: Geometry) -> None:

@@ -225,11 +225,9 @@ def summarise(records: Sequence[Episode]) -> dict[str, Estimate]:
     Success rates have Wilson intervals, which stay honest at 0 and 1; the others have percentile
     bootstrap intervals, and those that are the extreme of an episode the worst of all episodes.
     """
-    values = {
-        name: [record.as_dict()[name] for record in records]
-        for name in records[0].as_dict()
-        if name not in ("seed", "length")
-    }
+    rows = [record.as_dict() for record in records]
+    names = [name for name in rows[0] if name not in ("seed", "length")]
+    values = {name: [row[name] for row in rows] for name in names}
     return {
         name: wilson(column)
         if name.startswith("success")

@@ -11,7 +11,7 @@ in the world; for the TPM that is the paper's. Joint positions theta are in rad 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,7 +20,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tpm_gym.arrays import FloatArray, Vector, finite, vector
+from tpm_gym.arrays import BoolArray, FloatArray, Vector, finite, vector
 from tpm_gym.errors import (
     ConfigurationError,
     JointLimitError,
@@ -41,6 +41,7 @@ Mode = Literal["assembly", "working"]
 Rows = tuple[Vector, Vector, Vector]
 
 _ATTEMPTS = 1000
+_MANY = 32  # points from which on arrays are faster than floats, one by one
 
 
 class Reading(NamedTuple):
@@ -206,21 +207,42 @@ class Machine(ABC):
         """Conditioning 1/cond(J) at joint positions (..., 3); 0 where it cannot be assembled."""
         return _each(lambda one: self.evaluate(one).conditioning, theta)
 
+    def is_safe(self, point: Vector) -> bool:
+        """Whether P can be at ``point``, with :attr:`safe_conditioning` or better."""
+        with suppress(UnreachableError, SingularityError):
+            return self.evaluate(self.inverse(point)).conditioning >= self.safe_conditioning
+        return False
+
     def sample(self, rng: np.random.Generator, region: Region) -> FloatArray:
         """Draw a point (3,) m, uniform over the part of ``region`` that is safe.
 
         Raises:
             ConfigurationError: If no draw was safe.
         """
-        low, high = np.array(region.low), np.array(region.high)
+        point: FloatArray = self.sample_each([rng], [region])[0]
+        return point
+
+    def sample_each(
+        self, rngs: Sequence[np.random.Generator], regions: Sequence[Region]
+    ) -> FloatArray:
+        """The same for r generators and regions, (r, 3) m."""
+        low, high = (np.array([getattr(r, end) for r in regions]) for end in ("low", "high"))
+        points, rows = np.empty_like(low), np.arange(len(rngs))
         for _ in range(_ATTEMPTS):
-            point: FloatArray = low + (high - low) * rng.random(3)
-            a, b, c = point.tolist()
-            with suppress(UnreachableError, SingularityError):
-                if self.evaluate(self.inverse((a, b, c))).conditioning >= self.safe_conditioning:
-                    return point
-        valid = f"a value that some point of {region} reaches"
+            drawn = np.array([rngs[row].random(3) for row in rows.tolist()])
+            points[rows] = low[rows] + (high[rows] - low[rows]) * drawn
+            rows = rows[~self._are_safe(points[rows])]
+            if not len(rows):
+                return points
+        valid = f"a value that some point of {regions[rows[0]]} reaches"
         raise ConfigurationError("safe_conditioning", self.safe_conditioning, valid)
+
+    def _are_safe(self, points: FloatArray) -> BoolArray:
+        """Whether P can safely be at points (r, 3)."""
+        if len(points) < _MANY:
+            return np.array([self.is_safe((x, y, z)) for x, y, z in points.tolist()])
+        safe: BoolArray = self.conditioning_at(points) >= self.safe_conditioning
+        return safe
 
     # -- bodies -----------------------------------------------------------------------------
 

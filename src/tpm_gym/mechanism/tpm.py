@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from tpm_gym.arrays import FloatArray, Vector
 from tpm_gym.errors import ConfigurationError, UnreachableError
 from tpm_gym.kinematics import jacobian, workspace
-from tpm_gym.kinematics.equations import assemble, evaluate, posture
+from tpm_gym.kinematics.equations import assemble, conditioning_at, evaluate, posture
 from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
 from tpm_gym.kinematics.modes import DEFAULT_ASSEMBLY, ELBOWS_OUT, AssemblyMode, WorkingMode
 from tpm_gym.kinematics.position import forward_all
@@ -81,6 +81,11 @@ class TPM(Machine):
         if mirrored or not math.dist(there[:3], position) <= ASSEMBLY_LIMIT:
             return "assembly"
         return "working" if there.cos_beta * self.working_mode.cos_beta <= 0 else None
+
+    def is_safe(self, point: Vector) -> bool:
+        """See :class:`Machine`."""
+        modes = self.working_mode, self.assembly_mode
+        return conditioning_at(point, *modes, self.geometry) >= self.safe_conditioning
 
     def conditioning_at(self, points: ArrayLike) -> FloatArray:
         """See :class:`Machine`."""

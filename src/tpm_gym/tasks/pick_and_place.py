@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -39,21 +39,26 @@ class PickAndPlace(Task):
         self, rng: np.random.Generator, chosen: Mapping[str, FloatArray]
     ) -> dict[str, FloatArray]:
         """See the base class."""
-        machine, offset = self.machine, hanging(self.puck)
+        return sampling.first_of(PickAndPlace.sample_each(self, [rng], chosen))
+
+    def sample_each(
+        self, rngs: Sequence[np.random.Generator], chosen: Mapping[str, FloatArray]
+    ) -> dict[str, FloatArray]:
+        """See the base class."""
+        machine, offset, count = self.machine, hanging(self.puck), len(rngs)
         to_p, from_p = machine.mount.to_paper, machine.mount.to_world
-        table, _ = self._regions
+        (table, _), given = self._regions, sampling.repeated(chosen, count)
         if self.goals == "tempting":
-            pair = sampling.tempting(rng, machine, table, self._draw_region)
-            first, last = (from_p(point) - offset for point in pair)
-            return {"object": first, "goal": last, **chosen}
-        start = (
-            chosen["object"] if "object" in chosen else from_p(machine.sample(rng, table)) - offset
-        )
-        if "goal" in chosen:
-            return {"object": start, **chosen}
-        region = self._draw_region(rng)
-        goal = sampling.apart_from(to_p(start + offset), rng, machine, region)
-        return {"object": start, "goal": from_p(goal) - offset}
+            pairs = [sampling.tempting(rng, machine, table, self._draw_region) for rng in rngs]
+            first, last = (from_p(points) - offset for points in zip(*pairs, strict=True))
+            return {"object": first, "goal": last, **given}
+        if "object" not in given:
+            given["object"] = from_p(machine.sample_each(rngs, [table] * count)) - offset
+        if "goal" not in given:
+            start = to_p(given["object"] + offset)[:, None]
+            regions = [self._draw_region(rng) for rng in rngs]
+            given["goal"] = from_p(sampling.apart_from_each(start, rngs, machine, regions)) - offset
+        return given
 
     def _draw_region(self, rng: np.random.Generator) -> Region:
         """Where P goes with the puck: half on the table, half in the air."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -27,14 +27,21 @@ class Reach(Task):
         self, rng: np.random.Generator, chosen: Mapping[str, FloatArray]
     ) -> dict[str, FloatArray]:
         """See the base class."""
-        machine, region = self.machine, self.machine.goal_region
+        return sampling.first_of(Reach.sample_each(self, [rng], chosen))
+
+    def sample_each(
+        self, rngs: Sequence[np.random.Generator], chosen: Mapping[str, FloatArray]
+    ) -> dict[str, FloatArray]:
+        """See the base class."""
+        machine, home, region = self.machine, self.machine.home, self.machine.goal_region
         if "goal" in chosen:
-            return dict(chosen)
+            return sampling.repeated(chosen, len(rngs))
         if self.goals == "tempting":
-            _, goal = sampling.tempting(rng, machine, machine.home, lambda _: region)
+            pairs = [sampling.tempting(rng, machine, home, lambda _: region) for rng in rngs]
+            goals = np.array([goal for _, goal in pairs])
         else:
-            goal = sampling.apart_from(machine.home, rng, machine, region)
-        return {"goal": machine.mount.to_world(goal)}
+            goals = sampling.apart_from_each(home, rngs, machine, [region] * len(rngs))
+        return {"goal": machine.mount.to_world(goals)}
 
     def achieved(self, state: State) -> FloatArray:
         """Point P by forward kinematics of the encoders."""

@@ -14,7 +14,8 @@ __all__ = ["dense", "distance", "singularity_penalty", "sparse"]
 def distance(achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
     """Euclidean distance of points (..., 3) m, as (...,) m."""
     gap = np.subtract(achieved, desired, dtype=np.float64)
-    result: FloatArray = np.sqrt(np.add.reduce(gap * gap, axis=-1))
+    x, y, z = gap.T  # numpy's sum costs several times as much
+    result: FloatArray = np.sqrt(x * x + y * y + z * z).T
     return result
 
 

@@ -13,7 +13,7 @@ Everything here is about point P, in the machine's frame, m.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -25,7 +25,15 @@ from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.tasks import rewards
 
-__all__ = ["APART", "BAND", "apart_from", "line_in_joints", "line_in_space", "tempting"]
+__all__ = [
+    "APART",
+    "BAND",
+    "apart_from",
+    "apart_from_each",
+    "line_in_joints",
+    "line_in_space",
+    "tempting",
+]
 
 APART: Final = 0.030
 """A goal is at least this far from where its episode starts, m: no success for free."""
@@ -49,12 +57,38 @@ def apart_from(
     Raises:
         ConfigurationError: If no draw was.
     """
+    others = np.reshape(others, (-1, 3))
+    point: FloatArray = apart_from_each(others, [rng], machine, [region], apart)[0]
+    return point
+
+
+def apart_from_each(
+    others: ArrayLike,
+    rngs: Sequence[np.random.Generator],
+    machine: Machine,
+    regions: Sequence[Region],
+    apart: float = APART,
+) -> FloatArray:
+    """The same for r generators and regions, others (k, 3) for all or (r, k, 3): (r, 3) m."""
+    points = machine.sample_each(rngs, regions)
     for _ in range(_ATTEMPTS):
-        point = machine.sample(rng, region)
-        if (rewards.distance(point, others) >= apart).all():
-            return point
+        near = rewards.distance(points[:, None], others) < apart
+        rows = np.flatnonzero(near.any(axis=1)).tolist()
+        if not rows:
+            return points
+        points[rows] = machine.sample_each([rngs[k] for k in rows], [regions[k] for k in rows])
     valid = f"a larger one: what is drawn lies {apart} m from the start, or from other objects"
-    raise ConfigurationError("goal_region", region, valid)
+    raise ConfigurationError("goal_region", regions[rows[0]], valid)
+
+
+def repeated(places: Mapping[str, FloatArray], count: int) -> dict[str, FloatArray]:
+    """Arrays (count, ...) of so many equal ones."""
+    return {name: np.tile(place, (count, 1)) for name, place in places.items()}
+
+
+def first_of(starts: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    """The first rows."""
+    return {name: rows[0] for name, rows in starts.items()}
 
 
 def tempting(

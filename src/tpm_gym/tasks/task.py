@@ -9,9 +9,8 @@ and, for an expert, :meth:`~Task.plan`; then :func:`tpm_gym.register_task`.
 
 from __future__ import annotations
 
-import operator
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
 from typing import Any, ClassVar
@@ -25,13 +24,12 @@ from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.state import CONTROL_PERIOD, Block, Scene, State
-from tpm_gym.tasks import rewards
+from tpm_gym.tasks import rewards, sampling
 from tpm_gym.tasks.motion import Motion, Move, hanging
 
 __all__ = ["Entry", "Task"]
 
 Values = tuple[float, ...]
-Corners = tuple[list[float], list[float]]
 
 _ZERO = (0.0, 0.0, 0.0)
 _LIP = np.array(CUP.lip)
@@ -111,8 +109,7 @@ class Task(ABC):
             raise ConfigurationError("markers", self.scene.markers, valid)
         self.machine, self.reward, self.goals = machine, reward, goals
         self._within = self._not_lost()
-        boxes = machine.occupied(machine.home)
-        self._robot = [("the robot at home", (low.tolist(), high.tolist())) for low, high in boxes]
+        self._robot = [("the robot at home", *box) for box in machine.occupied(machine.home)]
         self._set_entries()
 
     def _set_entries(self) -> None:
@@ -145,6 +142,27 @@ class Task(ABC):
         Returns:
             Centre (3,) m of each of the scene's objects by name, and ``"goal"`` (goal_size,) m.
         """
+
+    def sample_each(
+        self, rngs: Sequence[np.random.Generator], chosen: Mapping[str, FloatArray]
+    ) -> dict[str, FloatArray]:
+        """The same for r episodes, of a generator each: arrays (r, ...).
+
+        One by one; who writes it for many at a time draws what :meth:`sample` would.
+        """
+        drawn, sizes = [self.sample(rng, chosen) for rng in rngs], self._sizes
+        for start in drawn:
+            if start.keys() != sizes.keys():
+                raise ConfigurationError("sample()", list(start), f"the keys {', '.join(sizes)}")
+            for name, size in sizes.items():
+                finite(f"sample()[{name!r}]", start[name], (size,), ConfigurationError)
+        return {name: np.array([start[name] for start in drawn]) for name in sizes}
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Ask one by one whoever writes :meth:`sample` only."""
+        super().__init_subclass__(**options)
+        if "sample" in vars(cls) and "sample_each" not in vars(cls):
+            cls.sample_each = Task.sample_each  # type: ignore[method-assign]
 
     @abstractmethod
     def achieved(self, state: State) -> FloatArray:
@@ -238,11 +256,19 @@ class Task(ABC):
             ConfigurationError: If what the task samples lacks something, has something else, or
                 puts an object into another or into the robot.
         """
+        return sampling.first_of(self.starts([rng], options))
+
+    def starts(self, rngs: Sequence[np.random.Generator], options: Any) -> dict[str, FloatArray]:
+        """The same for r episodes, of a generator each: arrays (r, ...)."""
         chosen = {} if options is None else self._chosen(options)
-        sizes = {block.name: 3 for block in self.scene.objects} | {"goal": self.goal_size}
-        start = self._sampled(rng, chosen, sizes)
-        self._check_free(start, chosen)
-        return start
+        starts = self.sample_each(rngs, chosen)
+        self._check_free(starts, chosen)
+        return starts
+
+    @property
+    def _sizes(self) -> dict[str, int]:
+        """Of what is sampled, by name."""
+        return {block.name: 3 for block in self.scene.objects} | {"goal": self.goal_size}
 
     def _chosen(self, options: Any) -> dict[str, FloatArray]:
         """What the user has chosen, by name."""
@@ -260,18 +286,6 @@ class Task(ABC):
                 raise ResetOptionError(str(name), value, valid)
             chosen[name] = self._within_reach(name, value, *known[name])
         return chosen
-
-    def _sampled(
-        self, rng: np.random.Generator, chosen: Mapping[str, FloatArray], sizes: Mapping[str, int]
-    ) -> dict[str, FloatArray]:
-        """What :meth:`sample` gives, if it is of these sizes, and nothing else."""
-        start = self.sample(rng, chosen)
-        if start.keys() != sizes.keys():
-            raise ConfigurationError("sample()", list(start), f"the keys {', '.join(sizes)}")
-        return {
-            name: finite(f"sample()[{name!r}]", start[name], (size,), ConfigurationError)
-            for name, size in sizes.items()
-        }
 
     def _within_reach(
         self, name: str, value: Any, size: int, blocks: tuple[Block | None, ...]
@@ -313,16 +327,20 @@ class Task(ABC):
         level = float(self.machine.mount.to_paper(touching)[2])
         return Region((*low[:2], level), (*high[:2], level))
 
-    def _check_free(self, start: Mapping[str, FloatArray], chosen: Collection[str]) -> None:
+    def _check_free(self, starts: Mapping[str, FloatArray], chosen: Collection[str]) -> None:
         """Refuse objects that would start inside the robot at home, or inside another object."""
-        taken = [(block.name, _box(start[block.name], block)) for block in self.scene.objects]
-        for name, (low, high) in taken:
-            for other, (least, most) in self._robot + taken:
+        taken = [(block.name, *_boxes(starts[block.name], block)) for block in self.scene.objects]
+        for name, low, high in taken:
+            for other, least, most in self._robot + taken:
                 mine = name in chosen or other not in chosen  # else it is found the other way round
-                below = all(map(operator.lt, low, most))
-                if mine and other != name and below and all(map(operator.gt, high, least)):
-                    valid = f"clear of {other}, {_range(least, most)}"
-                    place = start[name].tolist()
+                if other == name or not mine:
+                    continue
+                inside = np.flatnonzero(((low < most) & (high > least)).all(axis=1))
+                if len(inside):
+                    row = inside[0]
+                    corners = (np.broadcast_to(c, low.shape)[row] for c in (least, most))
+                    valid = f"clear of {other}, {_range(*corners)}"
+                    place = starts[name][row].tolist()
                     if name in chosen:
                         raise ResetOptionError(name, place, valid)
                     raise ConfigurationError(f"sample()[{name!r}]", place, valid)
@@ -438,7 +456,7 @@ def _range(low: ArrayLike, high: ArrayLike) -> str:
     return f"{least} to {most} m"
 
 
-def _box(point: FloatArray, block: Block) -> Corners:
-    """Corners of an upright block, m; a micrometre smaller, so that touching is not overlapping."""
-    (x, y, z), half, tall = point.tolist(), block.width / 2 - 1e-6, block.height / 2 - 1e-6
-    return [x - half, y - half, z - tall], [x + half, y + half, z + tall]
+def _boxes(points: FloatArray, block: Block) -> tuple[FloatArray, FloatArray]:
+    """Corners of upright blocks (r, 3) m; a micrometre in, so that touching is not overlapping."""
+    half = np.array([block.width, block.width, block.height]) / 2 - 1e-6
+    return points - half, points + half

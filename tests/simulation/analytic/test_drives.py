@@ -339,7 +339,7 @@ def test_motors_that_tire_do_as_in_pybullet() -> None:
 def batch_of(plants: list[Plant], **options: Any) -> AnalyticSimulation:
     simulation = AnalyticSimulation(Scene(), count=len(plants), **options)
     start = PAPER_TPM.inverse(PAPER_TPM.home)
-    simulation.reset(np.arange(len(plants)), start, [{}] * len(plants), plants)
+    simulation.reset(np.arange(len(plants)), start, {}, plants)
     return simulation
 
 
@@ -391,7 +391,7 @@ def test_what_is_thrown_through_the_singularity_says_so_and_waits_for_a_reset(
     later = simulation.state()
     for name in ("theta", "torque", "platform_position", "assembly_mode_changed"):
         np.testing.assert_array_equal(getattr(later, name)[0], getattr(state, name)[0])
-    simulation.reset(np.array([0]), PAPER_TPM.inverse(PAPER_TPM.home), [{}], [Plant()])
+    simulation.reset(np.array([0]), PAPER_TPM.inverse(PAPER_TPM.home), {}, [Plant()])
     simulation.move(np.array([HOME] * 2), vacuum)
     fresh = simulation.state()
     assert not np.any(fresh.assembly_mode_changed)

@@ -98,22 +98,23 @@ class Pucks:
 
     def report(self) -> dict[str, Any]:
         """The entries of a :class:`~tpm_gym.simulation.state.State` about objects, rows first."""
-        state, some = self._state, self._block is not None
+        columns = self._state[:, :MASS].T.copy()  # in which tasks compute several times as fast
+        some = slice(None if self._block else 0)
 
-        def numbers(first: int, count: int = 3) -> FloatArray:
-            part: FloatArray = state[:, None, first : first + count].copy()
-            return part if some else np.empty((len(state), 0, count))
+        def entries(first: int, count: int = 3) -> FloatArray:
+            part: FloatArray = columns[first : first + count].T[:, None][:, some]
+            return part
 
-        x, y, z, w = np.moveaxis(numbers(TURN, 4), -1, 0)
-        axis = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], -1)
+        x, y, z, w = columns[TURN : TURN + 4]
+        axis = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
         return {
-            "object_position": numbers(X),
-            "object_quaternion": numbers(TURN, 4),
-            "object_axis": axis,
-            "object_velocity": numbers(VX),
-            "object_angular_velocity": numbers(SPIN),
-            "held": np.where(state[:, HELD], 0, -1),
-            "vacuum": state[:, VACUUM].copy(),
+            "object_position": entries(X),
+            "object_quaternion": entries(TURN, 4),
+            "object_axis": axis.T[:, None][:, some],
+            "object_velocity": entries(VX),
+            "object_angular_velocity": entries(SPIN),
+            "held": np.where(columns[HELD], 0, -1),
+            "vacuum": columns[VACUUM],
         }
 
     def save(self, rows: slice | IntArray) -> FloatArray:

@@ -86,7 +86,12 @@ class AnalyticSimulation:
             raise ConfigurationError("engine", "analytic", valid)
         self.scene, self.machine, self.drive, self.count = scene, machine, drive, count
         self._step = self.physics.time_step
-        self._weights = spline_weights(self.physics.substeps).T[:, :, None]  # (3, K, 1)
+        steps = self.physics.substeps
+        self._weights = spline_weights(steps).T[:, :, None, None]  # (3, K, 1, 1)
+        # Of so many of the last time steps angles are wanted
+        self._tail = {"none": 2, "last": 3, "every": steps}[self.physics.torques]
+        # Made once: memory of this size would be fetched anew in every control period.
+        self._ways = np.empty((2, steps + 2, 3, count))
         self._nominal, self._true = machine.batch(count), machine.batch(count)
         block = scene.objects[0] if scene.objects else None
         self._pucks = Pucks(block, count, self._step, machine.table)
@@ -133,7 +138,7 @@ class AnalyticSimulation:
         self,
         rows: IntArray,
         theta: Sequence[float],
-        objects: Sequence[Mapping[str, Any]],
+        objects: Mapping[str, FloatArray],
         plants: Sequence[Plant],
         noise: FloatArray | None = None,
     ) -> None:
@@ -142,7 +147,7 @@ class AnalyticSimulation:
         Args:
             rows: Which, (r,).
             theta: (3,) rad, by the encoders.
-            objects: For each of them centre (3,) m, world, of the scene's objects by name.
+            objects: Centres (r, 3) m, world, of the scene's objects by name.
             plants: For each of them the true machine.
             noise: Of the first reading of the encoders, (3, n) rad.
         """
@@ -164,8 +169,7 @@ class AnalyticSimulation:
             self._noise[:, :, rows] = noise[:, rows]
             self._read(rows)
         if self.scene.objects:
-            name = self.scene.objects[0].name
-            self._pucks.place(rows, np.array([one[name] for one in objects]))
+            self._pucks.place(rows, objects[self.scene.objects[0].name])
 
     def _reading_at(self, theta: tuple[float, ...]) -> Readings:
         """What follows from angles at which episodes start: mostly the same ones."""
@@ -212,68 +216,84 @@ class AnalyticSimulation:
             noise: Of the encoders' readings at the end, (3, n) rad.
         """
         new = np.ascontiguousarray(np.asarray(command, dtype=np.float64).T)
-        before, last = self._commands
-        first, second, third = self._weights
-        path = first * before[:, None] + second * last[:, None] + third * new[:, None]
-        self._commands = np.stack([last, new])
+        commands = np.concatenate([self._commands, new[None]])
+        self._commands = commands[1:]
         if self._servos is None:
-            self._follow(path, vacuum)
+            self._follow(commands, vacuum)
         else:
-            self._serve(self._servos, (before + last) / 2, path, vacuum)
+            self._serve(self._servos, commands, vacuum)
         self._noise[0] = self._noise[1]
         self._noise[1] = 0.0 if noise is None else noise
         self._read(slice(None))
 
-    def _follow(self, path: FloatArray, vacuum: BoolArray) -> None:
-        """Let ideal motors take P along ``path`` (3, K, n) m.
+    def _spline(self, commands: FloatArray) -> FloatArray:
+        """The way of P along the last three commands (3, 3, r) m, (K, 3, r) m."""
+        path, term = np.empty((2, self.physics.substeps, *commands.shape[1:]))
+        return self._spline_into(path, commands, term)
+
+    def _spline_into(self, path: FloatArray, commands: FloatArray, term: FloatArray) -> FloatArray:
+        """The last time steps of it, as many as ``path`` and ``term`` have room for."""
+        first, second, third = self._weights[:, -len(path) :]
+        np.multiply(first, commands[0], out=path)
+        path += np.multiply(second, commands[1], out=term)
+        path += np.multiply(third, commands[2], out=term)
+        return path
+
+    def _follow(self, commands: FloatArray, vacuum: BoolArray) -> None:
+        """Let ideal motors take P along the last three commands (3, 3, n) m.
 
         That is computed as if all of them could, and once more for machines of which one cannot.
         """
         start = self._course()
         objects = self._pucks.save(slice(None)) if self.scene.objects else None
-        theta, way = self._ideal(path)
-        points = np.concatenate([start.before[None], start.position[None], way.transpose(1, 0, 2)])
-        push = self._touch(slice(None), points, vacuum)
+        last = self._exact and not self.scene.objects  # then no more of the way matters
+        points, other = self._ways[:, : self._tail + 2] if last else self._ways
+        theta = self._ideal(self._spline_into(points[2:], commands, other[2:]))
+        points[0], points[1] = start.before, start.position
+        push = self._touch(slice(None), points, vacuum, other)
+        before, at, now = points[-3:]
         if self.scene.objects:
-            before, at, now = points[-3:]
             change = (now - 2 * at + before) / self._step**2
             self._force = push[-1] + self._pucks.carried(slice(None)) * change
-        self._before, self._truth = points[-2].copy(), points[-1].copy()
+        self._before, self._truth = at.copy(), now.copy()
         self._theta = theta[:, -1].copy()
         self._rates = (theta[:, -1] - theta[:, -2]) / self._step
-        late = self._behind | start.left.any(axis=0) | ~self._true.assembled_at(way).all(axis=0)
-        late |= self._find_torques(start, theta, path, push)
+        on_side = self._true.assembled_at(points[2:].swapaxes(0, 1)).all(axis=0)
+        late = self._behind | start.left.any(axis=0) | ~on_side
+        late |= self._find_torques(start, theta, commands, push)
         rows = np.flatnonzero(late)
         if len(rows):
             if objects is not None:
                 self._pucks.restore(rows, objects[rows])
             drive = IdealDrives(self._effort[:, rows], self._step)
-            followed = [Reference(one) for one in self._angles(path, rows).transpose(1, 0, 2)]
+            angles = self._angles(self._spline(commands[..., rows]), rows)
+            followed = [Reference(one) for one in angles.transpose(1, 0, 2)]
             self._march(rows, start.take(rows), drive, followed, vacuum)
             self._behind[rows] = drive.behind.any(axis=0)
 
-    def _ideal(self, path: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Where motors are for P to be on ``path`` (3, K, n) m, and where it is then.
+    def _ideal(self, path: FloatArray) -> FloatArray:
+        """Where motors are for P to be on ``path`` (k, 3, n) m.
+
+        Where machines are not as drawn, ``path`` becomes the true way of P, NaN where it leaves
+        their modes.
 
         Returns:
-            theta (3, 3, n) rad at the last three time steps, or at all (3, K, n) if their torques
-            are wanted; and the true way of P (3, K, n) m, NaN where it leaves the machine's modes.
+            (3, ..., n) rad at the last time steps.
         """
-        tail = slice(None if self.physics.torques == "every" else -3, None)
         if self._exact:
-            return self._nominal.inverse(path[:, tail]), path
+            return self._nominal.inverse(path[-self._tail :].swapaxes(0, 1))
         theta = self._angles(path, slice(None))
-        return theta[:, tail], self._true.forward(theta)
+        path[:] = self._true.forward(theta).swapaxes(0, 1)
+        return theta[:, -self._tail :]
 
     def _angles(self, path: FloatArray, rows: IntArray | slice) -> FloatArray:
-        """Where motors are for P to be on ``path`` (3, K, n) m, (3, K, r) rad, of some machines."""
-        some, bias = _columns(path, rows), _columns(self._bias, rows)
+        """Where motors of some machines are for P to be on ``path`` (k, 3, r) m, (3, k, r) rad."""
         batch = self._nominal if isinstance(rows, slice) else self._nominal.take(rows)
-        angles: FloatArray = batch.inverse(some) - bias[:, None]
+        angles: FloatArray = batch.inverse(path.swapaxes(0, 1)) - self._bias[:, None, rows]
         return angles
 
     def _find_torques(
-        self, start: Course, theta: FloatArray, path: FloatArray, push: FloatArray
+        self, start: Course, theta: FloatArray, commands: FloatArray, push: FloatArray
     ) -> BoolArray:
         """What motors apply at the angles (3, ..., n) rad; (n,) where one would need too much."""
         if self.physics.torques == "none":
@@ -287,28 +307,28 @@ class AnalyticSimulation:
         over = _beyond(self._torque[None], _WATCHFUL * self._effort)
         rows = np.flatnonzero(over)
         if len(rows):
-            every = start.take(rows).lead(self._angles(path, rows), self._step)
+            angles = self._angles(self._spline(commands[..., rows]), rows)
+            every = start.take(rows).lead(angles, self._step)
             torques = self._torques(rows, every, push[:, :, rows])
             over[rows] = _beyond(torques, self._effort[:, rows])
         return over
 
     def _torques(self, rows: IntArray | slice, theta: FloatArray, push: FloatArray) -> FloatArray:
         """Torques (m, 3, r) N m that take motors through theta (3, m + 2, r) rad."""
-        rates = np.diff(theta, axis=1) / self._step
-        changes = np.diff(rates, axis=1) / self._step
+        rates = (theta[:, 1:] - theta[:, :-1]) / self._step
+        changes = (rates[:, 1:] - rates[:, :-1]) / self._step
         against = push.transpose(1, 0, 2) if self.scene.objects else None
         batch = self._true if isinstance(rows, slice) else self._true.take(rows)
         torques = batch.torque(theta[:, 1:-1], rates[:, :-1], changes, against)
         by_steps: FloatArray = torques.transpose(1, 0, 2)
         return by_steps
 
-    def _serve(
-        self, servos: ServoDrives, start: FloatArray, path: FloatArray, vacuum: BoolArray
-    ) -> None:
-        """Let servo drives take P from ``start`` (3, n) along ``path`` (3, K, n) m."""
+    def _serve(self, servos: ServoDrives, commands: FloatArray, vacuum: BoolArray) -> None:
+        """Let servo drives take P along the last three commands (3, 3, n) m."""
         nominal, bias = self._nominal, self._bias
-        angles = nominal.inverse(path).transpose(1, 0, 2)
-        followed = references(nominal, servos.law, nominal.inverse(start), angles, self._step)
+        start = nominal.inverse((commands[0] + commands[1]) / 2)
+        angles = nominal.inverse(self._spline(commands).swapaxes(0, 1)).swapaxes(0, 1)
+        followed = references(nominal, servos.law, start, angles, self._step)
         followed = [one._replace(theta=one.theta - bias) for one in followed]
         servos.begin(followed[0].theta)
         self._march(slice(None), self._course(), servos, followed, vacuum)
@@ -344,21 +364,30 @@ class AnalyticSimulation:
                 self.torques = np.zeros((len(torques), 3, self.count))
             self.torques[:, :, rows] = torques
 
-    def _touch(self, rows: IntArray | slice, points: FloatArray, vacuum: BoolArray) -> FloatArray:
+    def _touch(
+        self,
+        rows: IntArray | slice,
+        points: FloatArray,
+        vacuum: BoolArray,
+        room: FloatArray | None = None,
+    ) -> FloatArray:
         """Let objects and cups do what they do along the way of P; forces on P.
 
         Args:
             rows: Of which machines.
             points: P (K + 2, 3, r) m before the last time step, now, and after each to come.
             vacuum: (r,) whether the cups suck.
+            room: An array like ``points``, to be overwritten.
 
         Returns:
             (K, 3, r) N.
         """
         if not self.scene.objects:
             return np.zeros((1, 3, points.shape[2]))
-        world = self._mount + points * _TURNED
-        push: FloatArray = self._pucks.advance(rows, world, vacuum) * _TURNED
+        world = np.multiply(points, _TURNED, out=room)
+        world += self._mount
+        push = self._pucks.advance(rows, world, vacuum)
+        push *= _TURNED
         return push
 
     @property
@@ -381,7 +410,7 @@ class AnalyticSimulation:
 
     def _read(self, rows: IntArray | slice) -> None:
         """Read the encoders, and what follows; what makes no sense leaves the last that did."""
-        theta, _ = self._encoders(rows)
+        theta = self._encoders(rows)
         batch = self._nominal if isinstance(rows, slice) else self._nominal.take(rows)
         self._write(rows, batch.evaluate(theta))
 
@@ -395,31 +424,31 @@ class AnalyticSimulation:
         self._jacobian[:, :, rows] = np.where(known, jacobian, self._jacobian[:, :, rows])
         self._conditioning[rows] = np.where(known, conditioning, self._conditioning[rows])
 
-    def _encoders(self, rows: IntArray | slice) -> tuple[FloatArray, FloatArray]:
-        """Angles (rad) and rates (rad/s) that the encoders report, (3, r) each."""
-        earlier, noise = self._noise[:, :, rows]
-        theta = self._theta[:, rows] + self._bias[:, rows] + noise
-        return theta, self._rates[:, rows] + (noise - earlier) / CONTROL_PERIOD
+    def _encoders(self, rows: IntArray | slice) -> FloatArray:
+        """Angles that the encoders report, (3, r) rad."""
+        angles: FloatArray = self._theta[:, rows] + self._bias[:, rows] + self._noise[1][:, rows]
+        return angles
 
     def state(self) -> State:
         """What is known of all robots, with a leading axis (n,)."""
-        theta, rates = self._encoders(slice(None))
+        earlier, noise = self._noise
+        rates = self._rates + (noise - earlier) / CONTROL_PERIOD
         j, (a, b, c) = self._jacobian, rates
         velocity = j[:, 0] * a + j[:, 1] * b + j[:, 2] * c
         tilt, gap = np.zeros((2, self.count))
         return State(
-            theta=_rows(theta),
-            theta_dot=_rows(rates),
-            torque=_rows(self._torque),
-            fk_position=_rows(self._to_world(self._position)),
-            fk_velocity=_rows(velocity * _TURNED),
+            theta=self._encoders(slice(None)).T,
+            theta_dot=rates.T,
+            torque=self._torque.copy().T,
+            fk_position=self._to_world(self._position).T,
+            fk_velocity=(velocity * _TURNED).T,
             conditioning=self._conditioning.copy(),
-            platform_position=_rows(self._to_world(self._truth)),
+            platform_position=self._to_world(self._truth).T,
             platform_tilt=tilt,
             closure_error=gap,
             assembly_mode_changed=self._left[0].copy(),
             working_mode_changed=self._left[1].copy(),
-            command=_rows(self._to_world(self._commands[1])),
+            command=self._to_world(self._commands[1]).T,
             **self._pucks.report(),
         )
 
@@ -441,18 +470,7 @@ class AnalyticSimulation:
         return world
 
 
-def _columns(array: FloatArray, rows: IntArray | slice) -> FloatArray:
-    """Some columns of an array (..., n), next to each other in memory as all of them are."""
-    return np.ascontiguousarray(array[..., rows])
-
-
 def _beyond(torques: FloatArray, effort: FloatArray) -> BoolArray:
     """(r,) whether one of torques (m, 3, r) is more than a motor's effort (3, r)."""
     beyond: BoolArray = np.logical_or.reduce(np.abs(torques) > effort, axis=(0, 1))
     return beyond
-
-
-def _rows(columns: FloatArray) -> FloatArray:
-    """Components (3, n) as (n, 3), a copy even of one row."""
-    rows: FloatArray = columns.T.copy(order="C")
-    return rows

@@ -79,11 +79,13 @@ class SingleSimulation:
         machine = plant.of(self.machine)
         machine.require_within_stops((a, b, c))
         machine.evaluate((a, b, c))
-        start = {block.name: (0.0, 0.0, block.height / 2) for block in self.scene.objects}
+        start = {
+            block.name: np.array([[0.0, 0.0, block.height / 2]]) for block in self.scene.objects
+        }
         for name, place in (objects or {}).items():
-            start[name] = vector(name, place)
+            start[name] = np.array([vector(name, place)])
         errors = None if noise == (0.0, 0.0, 0.0) else np.array([noise]).T
-        self.batch.reset(_ROW, angles, [start], [plant], errors)
+        self.batch.reset(_ROW, angles, start, [plant], errors)
         return self.read()
 
     def move(
