@@ -50,7 +50,7 @@ def test_links_lead_to_files_and_headings(page):
         place = (ROOT / page).parent / path
         assert place.exists(), path
         if heading:
-            titles = re.findall(r"^## (.*)$", place.read_text(encoding="utf-8"), re.MULTILINE)
+            titles = re.findall(r"^##+ (.*)$", place.read_text(encoding="utf-8"), re.MULTILINE)
             slugs = [re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles]
             assert heading in slugs
 

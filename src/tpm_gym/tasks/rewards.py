@@ -12,10 +12,12 @@ __all__ = ["dense", "distance", "singularity_penalty", "sparse"]
 
 
 def distance(achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
-    """Euclidean distance of points (..., 3) m, as (...,) m."""
+    """Euclidean distance of points (..., k) m, as (...,) m."""
     gap = np.subtract(achieved, desired, dtype=np.float64)
-    x, y, z = gap.T  # numpy's sum costs several times as much
-    result: FloatArray = np.sqrt(x * x + y * y + z * z).T
+    first, *others = (gap * gap).T
+    for other in others:  # numpy's sum costs several times as much
+        first = first + other
+    result: FloatArray = np.sqrt(first).T
     return result
 
 
