@@ -1,6 +1,8 @@
 """The text of docs/results.md, from the records of runs."""
 
 import json
+import re
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from statistics import fmean, median
 from typing import Any, Final
@@ -79,8 +81,9 @@ def _missing(records: Sequence[Record]) -> list[str]:
         planned = [run.folder.name for run in plan_runs(config)]
         left = [name for name in planned if name not in there]
         if left:
-            names = "all of it" if left == planned else ", ".join(left)
-            lines.append(f"- `{command(config)}`: {names}.")
+            kinds = Counter(re.sub(r"-s\d+$", "", name) for name in left)
+            names = ", ".join(f"{kind} ({count})" for kind, count in kinds.items())
+            lines.append(f"- `{command(config)}`: {'all of it' if left == planned else names}.")
     return ["## Not run yet\n", "\n".join(lines) + "\n"] if lines else []
 
 
