@@ -228,7 +228,10 @@ def test_joint_increments_are_no_cartesian_ones() -> None:
         assert (caught.value.kind, caught.value.given) == ("control", "cartesian")
     for make in (lambda: gym.make("TPMPickAndPlaceDense-v0"), lambda: TPMEnv("pick_and_place")):
         vector = DummyVecEnv([make])
-        with closing(vector), pytest.raises(PolicyMismatchError, match="TPMPickAndPlaceJoints"):
+        with (
+            closing(vector),
+            pytest.raises(PolicyMismatchError, match="TPMPickAndPlaceJointsDense-v0"),
+        ):
             policy.check(vector)
 
 

@@ -14,7 +14,6 @@ from tpm_gym.mechanism.bodies import Joint, Link, Solid
 __all__ = ["CUP", "VacuumCup", "sealed"]
 
 _SILICONE, _STEEL, _ALUMINIUM = 1150.0, 7850.0, 2700.0  # kg/m^3
-_BELLOWS = 0.015  # length of the cup's bellows, m
 
 
 class VacuumCup(NamedTuple):
@@ -23,6 +22,7 @@ class VacuumCup(NamedTuple):
     Attributes:
         length: From point P of the platform to the lip, m.
         radius: Radius of the lip, m.
+        bellows: Length of the part of that radius, m.
         stroke: How far the cup slides back into its stem when it meets something, m.
         preload: Force with which the spring keeps the cup out, N: more than the vacuum can hold.
         vacuum: How far below the ambient's the ejector gets the pressure in the cup, Pa.
@@ -40,6 +40,7 @@ class VacuumCup(NamedTuple):
 
     length: float = 0.040
     radius: float = 0.008
+    bellows: float = 0.015
     stroke: float = 0.020
     preload: float = 15.0
     vacuum: float = 60e3
@@ -65,7 +66,7 @@ class VacuumCup(NamedTuple):
     def stem(self, point_p: Vector) -> Solid:
         """The tube below point P (m, in the platform's frame) in which the cup slides."""
         x, y, z = point_p
-        half = (self.length - _BELLOWS) / 2
+        half = (self.length - self.bellows) / 2
         size = (0.005, 2 * half, 0.0)
         return Solid("cylinder", size, (x, y, z + half), _ALUMINIUM, colour="steel")
 
@@ -73,8 +74,8 @@ class VacuumCup(NamedTuple):
         """The cup as a link that slides in the platform of that name."""
         bellows = Solid(
             "cylinder",
-            (self.radius, _BELLOWS, 0.0),
-            (0.0, 0.0, self.length - _BELLOWS / 2),
+            (self.radius, self.bellows, 0.0),
+            (0.0, 0.0, self.length - self.bellows / 2),
             _SILICONE,
             colour="red",
             collides=True,

@@ -9,16 +9,11 @@ What an engine has to say: the force between cup and object, and what the lip to
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
-import numpy as np
-
-from tpm_gym.arrays import BoolArray, FloatArray
 from tpm_gym.mechanism.cup import CUP, VacuumCup
 
-__all__ = ["EMPTY", "Hold", "Load", "hold_after", "hold_each_after", "holds", "pressure_after"]
-
-_Numbers = TypeVar("_Numbers", float, FloatArray)
+__all__ = ["EMPTY", "Hold", "Load", "hold_after", "holds", "pressure_after"]
 
 
 class Hold(NamedTuple):
@@ -48,9 +43,7 @@ class Load(NamedTuple):
     shear: float = 0.0
 
 
-def pressure_after(
-    vacuum: _Numbers, time_step: float, pumped: bool, cup: VacuumCup = CUP
-) -> _Numbers:
+def pressure_after(vacuum: float, time_step: float, pumped: bool, cup: VacuumCup = CUP) -> float:
     """The vacuum (Pa) a time step (s) later; ``pumped`` where it is on and the lip is sealed."""
     final, time = (cup.vacuum, cup.evacuation_time) if pumped else (0.0, cup.venting_time)
     return final + (vacuum - final) * math.exp(-time_step / time)
@@ -91,21 +84,3 @@ def hold_after(
     elif on and touched >= 0 and hold.vacuum <= cup.least_vacuum:
         return Hold(touched, pressure_after(hold.vacuum, time_step, True, cup))
     return Hold(-1, pressure_after(hold.vacuum, time_step, False, cup))
-
-
-def hold_each_after(
-    held: BoolArray,
-    vacuum: FloatArray,
-    time_step: float,
-    on: BoolArray,
-    load: tuple[FloatArray, FloatArray],
-    touched: BoolArray,
-    cup: VacuumCup = CUP,
-) -> tuple[BoolArray, FloatArray]:
-    """:func:`hold_after` for cups (n,) with one object each: whether it is held, and the vacuum."""
-    pumped = pressure_after(vacuum, time_step, True, cup)
-    vented = pressure_after(vacuum, time_step, False, cup)
-    sucked = np.where(on, pumped, vented)
-    keeps = held & holds(sucked, load, cup) & (on | (sucked > cup.least_vacuum))
-    after = keeps | (~held & on & touched & (vacuum <= cup.least_vacuum))
-    return after, np.where(after, sucked, vented)

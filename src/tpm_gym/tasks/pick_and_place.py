@@ -39,6 +39,7 @@ class PickAndPlace(Task):
         self, rng: np.random.Generator, chosen: Mapping[str, FloatArray]
     ) -> dict[str, FloatArray]:
         """See the base class."""
+        # Not self's: that of a subclass may ask this.
         return sampling.first_of(PickAndPlace.sample_each(self, [rng], chosen))
 
     def sample_each(

@@ -29,6 +29,9 @@ SPRING = 0.8  # share of the cup's way back that a time step leaves of it
 SETTLED = 1e-6  # m, and m/s: less is none
 LITTLE = 1e-12
 
+_SLIP = 1e-4  # m/s; what is slower has no direction
+_LEAST = 0.02  # of friction along an axis, whatever the direction of the slip
+
 
 class Setting(NamedTuple):
     """What is the same for all objects.
@@ -84,6 +87,15 @@ def clip(value: float, low: float, high: float) -> float:
 def level_length(x: float, y: float) -> float:
     """Length of a level vector: plain, or bits would be those of a machine's own hypot."""
     return math.sqrt(x * x + y * y)
+
+
+@compiled
+def slip_shares(x: float, y: float) -> tuple[float, float]:
+    """Shares of friction along the world's axes for a slip, m/s."""
+    speed = level_length(x, y)
+    if speed > _SLIP:
+        return max(abs(x) / speed, _LEAST), max(abs(y) / speed, _LEAST)
+    return math.sqrt(0.5), math.sqrt(0.5)
 
 
 @compiled

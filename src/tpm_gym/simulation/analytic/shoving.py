@@ -25,9 +25,9 @@ from tpm_gym.simulation.analytic.body import (
     clip,
     least_rise,
     level_length,
+    slip_shares,
 )
 from tpm_gym.simulation.analytic.compiling import compiled
-from tpm_gym.simulation.analytic.tumbling import LEAST, SLIP
 
 __all__ = ["Shove", "Side", "shove", "side_of"]
 
@@ -193,15 +193,13 @@ def _bearing(
 @compiled
 def _bounds(row: FloatArray, bearing: _Bearing) -> FloatArray:
     """What friction can take at each corner along the world's axes (2, 4) m/s."""
-    x, y = row[VX], row[VY]
-    speed = level_length(x, y)
-    ways = (abs(x) / speed, abs(y) / speed) if speed > SLIP else (math.sqrt(0.5), math.sqrt(0.5))
+    east, north = slip_shares(row[VX], row[VY])
     bounds = np.empty((2, 4))
     for k in range(4):
         i, j = (1.0 if k < 2 else -1.0), (1.0 if k % 2 == 0 else -1.0)
         share = 0.25 * (1 + i * bearing.tilt[0]) * (1 + j * bearing.tilt[1])
-        bounds[0, k] = row[ROUGH] * share * bearing.total * max(ways[0], LEAST)
-        bounds[1, k] = row[ROUGH] * share * bearing.total * max(ways[1], LEAST)
+        bounds[0, k] = row[ROUGH] * share * bearing.total * east
+        bounds[1, k] = row[ROUGH] * share * bearing.total * north
     return bounds
 
 

@@ -39,16 +39,13 @@ from tpm_gym.simulation.analytic.body import (
     level_length,
     plus,
     put,
+    slip_shares,
     three,
 )
 from tpm_gym.simulation.analytic.compiling import compiled
 
 __all__ = ["Push", "tumble"]
 
-SLIP = 1e-4  # m/s; what is slower has no direction
-LEAST = 0.02  # of friction along an axis, whatever the direction of the slip
-
-_BELLOWS = 0.015  # m; length of the part of the cup that touches
 # Contacts' directions, in order: up at the corners; the lip's normal; east and north at the
 # corners; the lip's tangents, one level and one steep
 _COUNT, _BEARING, _LIP, _EAST, _NORTH, _RUB = 15, 5, 4, 5, 9, 13
@@ -104,7 +101,9 @@ def tumble(
     for rub in (_RUB, _RUB + 1):
         wanted[rub] = dot(three(jacobian[rub], 0), speed)
     strength = CUP.preload * step / max(-normal[2], 1e-3)
-    impulses = _solve(jacobian, row, half, frame[2], twist, wanted, strength, _grips(row, half))
+    impulses = _solve(
+        jacobian, row[MASS], half, frame[2], twist, wanted, strength, _grips(row, half)
+    )
     press = impulses[_LIP]
     lacks = max(wanted[_LIP] - _weighed(jacobian[_LIP], twist), 0.0) * step
     back = lacks / max(-normal[2], 0.1) if press >= strength else 0.0
@@ -172,7 +171,7 @@ def _response(jacobian: FloatArray, mass: float, half: Vector, axis: Vector) -> 
 @compiled
 def _solve(
     jacobian: FloatArray,
-    row: FloatArray,
+    mass: float,
     half: Vector,
     axis: Vector,
     twist: FloatArray,
@@ -181,7 +180,6 @@ def _solve(
     grips: FloatArray,
 ) -> FloatArray:
     """Find impulses (c,), and with them velocity and spin (6,) from those without, ``twist``."""
-    mass = row[MASS]
     response = _response(jacobian, mass, half, axis)
     keeps, constant = np.empty((_COUNT, _COUNT)), np.empty(_COUNT)
     for k in range(_COUNT):
@@ -226,11 +224,10 @@ def _weighed(parts: FloatArray, weights: FloatArray) -> float:
 def _grips(row: FloatArray, half: Vector) -> FloatArray:
     """What share of what bears it each friction can be (c - 5,)."""
     x, y = row[VX] - half[2] * row[SPIN + 1], row[VY] + half[2] * row[SPIN]
-    speed = level_length(x, y)
-    ways = (abs(x) / speed, abs(y) / speed) if speed > SLIP else (math.sqrt(0.5), math.sqrt(0.5))
+    east, north = slip_shares(x, y)
     grips = np.empty(_COUNT - _BEARING)
     for k in range(4):
-        grips[k], grips[4 + k] = row[ROUGH] * max(ways[0], LEAST), row[ROUGH] * max(ways[1], LEAST)
+        grips[k], grips[4 + k] = row[ROUGH] * east, row[ROUGH] * north
     grips[8] = grips[9] = CUP.friction * row[ROUGH]
     return grips
 
@@ -257,8 +254,8 @@ def _touch(
 ) -> tuple[float, Vector, Vector]:
     """Where cup and block are nearest: gap m, normal, arm on the block m; far off if they are."""
     middle = three(row, X)
-    away = plus(middle, (lip[0], lip[1], lip[2] + _BELLOWS / 2), -1.0)
-    cup = math.sqrt(CUP.radius**2 + (_BELLOWS / 2) ** 2)
+    away = plus(middle, (lip[0], lip[1], lip[2] + CUP.bellows / 2), -1.0)
+    cup = math.sqrt(CUP.radius**2 + (CUP.bellows / 2) ** 2)
     if dot(away, away) >= (math.sqrt(dot(half, half)) + cup + SEEN_BY_LIP) ** 2:
         return math.inf, (0.0, 0.0, -1.0), (0.0, 0.0, 0.0)
     there, cup_point = _nearest(middle, frame, lip, half)
@@ -277,7 +274,7 @@ def _touch(
 def _nearest(middle: Vector, frame: _Frame, lip: Vector, half: Vector) -> tuple[Vector, Vector]:
     """Nearest points of the cores of block and cup: by projecting from one to the other."""
     bottom = lip[2] + ROUNDING
-    top = bottom + (_BELLOWS - 2 * ROUNDING)
+    top = bottom + (CUP.bellows - 2 * ROUNDING)
     there, cup = middle, lip
     for _ in range(4):
         x, y = there[0] - lip[0], there[1] - lip[1]
@@ -315,4 +312,4 @@ def _apart(normal: Vector, middle: Vector, frame: _Frame, lip: Vector, half: Vec
     for k in range(3):
         block += half[k] * abs(dot(frame[k], normal))
     level = level_length(normal[0], normal[1])
-    return away - block - CUP.radius * level - _BELLOWS * max(normal[2], 0.0)
+    return away - block - CUP.radius * level - CUP.bellows * max(normal[2], 0.0)
