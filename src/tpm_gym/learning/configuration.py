@@ -102,7 +102,9 @@ class TrainingConfig:
 
     env_options: tyro.conf.OmitArgPrefixes[EnvOptions] = field(default_factory=EnvOptions)
 
-    eval_every: Annotated[int, unset(int, "a tenth of the steps", "INT")] = UNSET
+    eval_every: Annotated[
+        int, unset(int, "a tenth of the steps; a twentieth in --engine analytic", "INT")
+    ] = UNSET
     """Steps between evaluations on held-out seeds."""
 
     eval_episodes: Annotated[int, unset(int, "20; 200 in --engine analytic", "INT")] = UNSET
@@ -185,7 +187,7 @@ def complete(config: TrainingConfig) -> TrainingConfig:
         "envs": recipe.n_envs,
         "recipe_file": file,
         "run": Path("runs", f"{env}-{config.algo}-s{config.seed}"),
-        "eval_every": max(1, steps // 10),
+        "eval_every": max(1, steps // (20 if config.in_batches else 10)),
         "eval_episodes": 200 if config.in_batches else 20,
     }
     missing = {name: v for name, v in worked_out.items() if getattr(config, name) is UNSET}

@@ -225,7 +225,7 @@ class Machine(ABC):
     def sample_each(
         self, rngs: Sequence[np.random.Generator], regions: Sequence[Region]
     ) -> FloatArray:
-        """The same for r generators and regions, (r, 3) m."""
+        """The same for r generators and regions, (r, 3) m; this is what tasks ask."""
         low, high = (np.array([getattr(r, end) for r in regions]) for end in ("low", "high"))
         points, rows = np.empty_like(low), np.arange(len(rngs))
         for _ in range(_ATTEMPTS):
