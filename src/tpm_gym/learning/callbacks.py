@@ -1,6 +1,7 @@
 """What happens besides learning while a policy trains: evaluation, checkpoints, stopping."""
 
 import json
+import math
 import time
 from collections.abc import Callable, Mapping
 from typing import Any, Final
@@ -23,6 +24,7 @@ from tpm_gym.learning.run_folder import CURVE_FILE, EVALUATIONS_FILE
 from tpm_gym.learning.signals import SignalListener
 from tpm_gym.learning.training_state import capture
 
+_DRAWING_INTERVAL: Final = 10.0  # s between drawings of the curve
 _SHORTEST_INTERVAL: Final = 30.0  # s between checkpoints
 _LARGEST_SHARE: Final = 0.02  # of the time may go into checkpoints
 
@@ -31,7 +33,8 @@ class PeriodicEvaluation(BaseCallback):
     """Evaluates the policy on held-out seeds before, during and after training.
 
     Every evaluation uses the same episodes, so the points of a learning curve differ by the policy
-    alone. Each is appended to evaluations.jsonl and drawn; the best policy so far is kept.
+    alone. Each is appended to evaluations.jsonl and, before long, drawn; the best policy so far is
+    kept.
 
     Args:
         env: An environment of its own, so that training is not disturbed.
@@ -52,6 +55,7 @@ class PeriodicEvaluation(BaseCallback):
         self._console, self._keep = console, keep
         self._evaluations: list[dict[str, Any]] = []
         self._best: tuple[float, float] | None = None
+        self._drawn = -math.inf  # when the curve was
 
     def state(self) -> dict[str, Any]:
         """Return what a checkpoint has to keep, as plain data."""
@@ -77,6 +81,7 @@ class PeriodicEvaluation(BaseCallback):
 
     def _on_training_end(self) -> None:
         self._evaluate()
+        self._draw()
 
     def _evaluate(self) -> None:
         policy = TrainedPolicy(self.model)
@@ -93,10 +98,13 @@ class PeriodicEvaluation(BaseCallback):
             self._best = quality
             self._keep(self.model)
         self._print(metrics, best)
-        self._draw()
+        # To draw takes longer than to evaluate in closed form.
+        if time.perf_counter() - self._drawn > _DRAWING_INTERVAL:
+            self._draw()
 
     def _draw(self) -> None:
         config = self._config
+        self._drawn = time.perf_counter()
         draw_learning_curve(config.run / CURVE_FILE, config.title, self._evaluations)
 
     def _record(self, metrics: Mapping[str, Estimate]) -> None:
