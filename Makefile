@@ -26,7 +26,7 @@ demo: $(INSTALLED) ## train pick-and-place in closed form, test it in PyBullet, 
 		--video runs/demo/pick_and_place.mp4 --picture runs/demo/pick_and_place.png
 	@echo; echo "runs/demo/ now holds:"; ls runs/demo runs/demo/pick_and_place
 
-test: lint test-fast ## what CI runs: lint, types, fast tests
+test: lint test-fast ## the gate, here and in CI: lint, types, fast tests
 
 lint: $(INSTALLED)
 	$(RUN) -m ruff check .
@@ -86,7 +86,7 @@ bench-speed: $(INSTALLED) ## steps per second beside panda-gym and Gymnasium-Rob
 	$(RUN) -m pip install -c constraints.txt -e ".[bench]"
 	$(RUN) benchmarks/bench_speed.py --json runs/speed.json --plot docs/images/speed.png
 
-soak: $(INSTALLED) ## a million steps over all ids in each engine: memory, loop gaps, speed; an hour
+soak: $(INSTALLED) ## a million steps over all ids in PyBullet, and in MuJoCo: memory, loop gaps, speed; an hour
 	$(RUN) benchmarks/soak.py --json runs/soak.json --plot docs/images/soak.png
 	$(RUN) benchmarks/soak.py --engine mujoco --json runs/soak_mujoco.json --plot runs/soak_mujoco.png
 
