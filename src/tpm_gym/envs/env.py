@@ -143,7 +143,7 @@ class TPMEnv(gym.Env[Observation, Action]):
     | key | meaning |
     | --- | --- |
     | ``is_success`` | whether the goal is achieved |
-    | ``closure_error`` | largest gap of the simulated loops, m |
+    | ``closure_error`` | largest gap of the simulated loops, m; 0 in closed form, by construction |
     | ``vacuum`` | how far the pressure in the cup is below the ambient's, Pa |
     | ``conditioning`` | 1/cond(J) by the encoders |
     | ``singularity_penalty`` | before weighting, 0 to 1 |
@@ -189,6 +189,7 @@ class TPMEnv(gym.Env[Observation, Action]):
 
     Raises:
         ConfigurationError: If an option is out of range.
+        MissingPackageError: If the engine's package is not installed.
 
     An environment keeps some 29 MB, 28 of them PyBullet's client, until it is closed or dropped.
 

@@ -79,7 +79,7 @@ class TrainingConfig:
     """Environment steps, over all environments."""
 
     envs: Annotated[int, unset(int, "as the recipe says", "INT")] = UNSET
-    """Parallel environments, in processes of their own if several."""
+    """Parallel environments; several are in processes of their own, in --engine analytic in one."""
 
     recipe_file: Annotated[Path, unset(Path, "the shipped one of <algo>", "PATH", "recipe")] = UNSET
     """YAML file of hyperparameters by environment id."""
@@ -118,7 +118,8 @@ class TrainingConfig:
     take more than 2% of the time."""
 
     threads: int = 1
-    """Threads of PyTorch. With one thread and one environment a seed repeats exactly."""
+    """Threads of PyTorch. With one thread and one environment, or --engine analytic, a seed repeats
+    exactly."""
 
     device: str = "cpu"
     """Device of PyTorch. The networks are small; a GPU pays only with large batches."""

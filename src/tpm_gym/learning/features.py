@@ -28,5 +28,5 @@ class GoalGapExtractor(BaseFeaturesExtractor):
 
     def forward(self, observations: dict[str, torch.Tensor]) -> torch.Tensor:
         """Return the features of a batch, (n, observation size + goal size)."""
-        gap = observations["desired_goal"] - observations["achieved_goal"]  # (n, 3) m
+        gap = observations["desired_goal"] - observations["achieved_goal"]  # (n, goal size) m
         return torch.cat([observations["observation"], gap / self.unit], dim=1)

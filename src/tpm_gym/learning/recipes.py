@@ -71,6 +71,9 @@ def recipe(env_id: str, algorithm: str = "sac", engine: str | None = None) -> di
     For example ``SAC(env=env, **recipe("TPMReach-v0"))``. What is no argument of the constructor is
     left out: the number of steps and of environments, and the demonstrations.
 
+    Args:
+        engine: What is trained in; ``"analytic"`` has recipes of its own.
+
     Raises:
         ConfigError: There is none for this environment and algorithm.
     """

@@ -324,8 +324,8 @@ def solve(matrix: tuple[Numbers, ...], right: Triple) -> Triple:
 class Dynamics:
     """The dynamics of one mechanism, for points and batches.
 
-    Joint angles, rates and so on are arrays (..., 3) that broadcast with each other; torch tensors
-    among them give tensors, in float64, that can be differentiated.
+    Joint angles (rad), rates (rad/s) and their changes (rad/s^2) are arrays (..., 3) that broadcast
+    with each other; torch tensors among them give tensors, in float64, that can be differentiated.
 
     All methods raise InputError for what is no array (..., 3) of finite numbers, UnreachableError
     if the branch does not exist at some theta, and SingularityError if one is a parallel
@@ -410,7 +410,7 @@ class Dynamics:
         return self._rows(columns, (theta, theta_dot, torque), _VECTOR)[0]
 
     def energy(self, theta: ArrayLike, theta_dot: ArrayLike) -> Energy:
-        """Kinetic and potential energy."""
+        """Kinetic and potential energy, (...,) J."""
 
         def columns(pose: Pose, rates: Triple) -> tuple[Numbers, Numbers]:
             return energies(pose, rates, self.free_fall, self.inertia)

@@ -65,12 +65,12 @@ class Machine(ABC):
     Attributes:
         name: What the machine is called in messages.
         mount: Where its frame is in the world.
-        region: Where the environments let point P go.
-        goal_region: Where point P has to go to reach a goal, or an object on the table; cut by
-            ``safe_conditioning`` when sampled.
-        home: Where point P is at the start of an episode, m.
+        region: Where the environments let point P go, a box in the machine's frame, m.
+        goal_region: Where point P has to go to reach a goal, or an object on the table, in it; cut
+            by ``safe_conditioning`` when sampled.
+        home: Where point P is at the start of an episode, machine's frame, m.
         step_limit: Largest change of the command for P along x, y, z in one control step, m.
-        joint_limit: Largest change of a joint's command in one control step, rad.
+        joint_limit: Largest change of a joint's command in one control step, rad (m for a slide).
         safe_conditioning: Conditioning 1/cond(J) from which on the machine counts as safe from
             singularities; the penalty of the reward begins below it.
         table: Half edges of the table along x and y, m; its top is the world's z = 0.

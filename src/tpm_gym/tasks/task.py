@@ -61,7 +61,8 @@ class Task(ABC):
 
     Args:
         machine: What the task is done with.
-        reward: ``"sparse"`` (-1 until success, then 0) or ``"dense"`` (minus the distance).
+        reward: ``"sparse"`` (0 where the goal is achieved, else -1) or ``"dense"`` (minus the
+            distance in units of 0.1 m).
         goals: How goals and starts are sampled: one of :attr:`samplings`.
         penalty_weight: Weight of the singularity penalty; 0 switches it off.
 
