@@ -50,6 +50,13 @@ def test_it_is_sb3s_own_vector_of_single_environments() -> None:
             assert info["episode"]["l"] == 6
 
 
+def test_another_autoreset_is_refused() -> None:
+    with pytest.raises(
+        tpm_gym.errors.ConfigurationError, match=r"'NextStep'.*'SameStep' for Stable"
+    ):
+        vec_env(autoreset_mode="NextStep")
+
+
 def test_ppo_and_hindsight_learn_in_it() -> None:
     ppo = PPO("MultiInputPolicy", vec_env("TPMReachDense-v0", 8), n_steps=60, batch_size=120)
     ppo.learn(960)

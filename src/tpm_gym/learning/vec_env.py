@@ -7,10 +7,12 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
+from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
 from tpm_gym.envs.vector import TPMVectorEnv, VectorSnapshot
+from tpm_gym.errors import ConfigurationError
 from tpm_gym.learning.rollout import Observation
 from tpm_gym.simulation.analytic.simulation import Moment
 from tpm_gym.simulation.randomisation import NOMINAL, Plant
@@ -31,10 +33,16 @@ class AnalyticVecEnv(VecEnv):
     Args:
         envs: With same-step autoreset: ``gym.make_vec(id, num_envs=256, engine="analytic",
             autoreset_mode="SameStep", stagger=True)``.
+
+    Raises:
+        ConfigurationError: If they have another autoreset.
     """
 
     def __init__(self, envs: TPMVectorEnv) -> None:
         """Wrap them."""
+        if envs.autoreset_mode != AutoresetMode.SAME_STEP:
+            valid = f"{AutoresetMode.SAME_STEP.value!r} for Stable-Baselines3"
+            raise ConfigurationError("autoreset_mode", envs.autoreset_mode.value, valid)
         self.envs = envs
         self._actions: NDArray[Any] = np.zeros(0)
         self._returns = np.zeros(envs.num_envs)
