@@ -77,7 +77,7 @@ def _count_steps(axes: Axes) -> None:
 
 def _grid(names: Sequence[str], title: str, height: float) -> tuple[Figure, list[Axes]]:
     """A figure with a panel a name, for shares of 0 to 1, row by row."""
-    columns = min(_COLUMNS, len(names))
+    columns = 2 if len(names) == 4 else min(_COLUMNS, len(names))
     rows = -(-len(names) // columns)
     figure = _figure(height * rows + 0.5, title)
     panels: list[Axes] = figure.subplots(rows, columns, squeeze=False).ravel().tolist()
