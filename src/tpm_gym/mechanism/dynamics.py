@@ -442,7 +442,7 @@ class Dynamics:
             (a, b, c), *rest = table.reshape(-1, 3).tolist()
             found = np.array(text(self.pose((a, b, c)), *rest))
             return [found[layout] for layout in layouts]
-        shifted = (layout + 4 for layout in layouts)
+        shifted = (layout + _CHECKS for layout in layouts)
         missing, factors, *results = by_rows(columns, table, np.array(0), _VECTOR + 1, *shifted)
         if missing.any():
             a, b, c = table[..., :3][missing != 0][0].tolist()

@@ -199,23 +199,18 @@ def _geom(solid: Solid, link: str) -> Element:
 def _actuators(mechanism: Mechanism) -> Element:
     """A servo for each motor: torque = stiffness (ctrl - theta) - damping theta_dot, limited."""
     actuators = Element("actuator")
-    for link in mechanism.links:
-        joint = link.joint
-        if joint is None or joint.name not in mechanism.actuated:
-            continue
+    for motor in mechanism.motors:
         SubElement(
             actuators,
             "general",
-            name=joint.name,
-            joint=joint.name,
+            name=motor.name,
+            joint=motor.name,
             biastype="affine",
             gainprm=numbers([_STIFFNESS]),
             biasprm=numbers((0.0, -_STIFFNESS, -_DAMPING)),
-            ctrlrange=numbers((joint.lower, joint.upper)),
-            forcerange=numbers((-joint.effort, joint.effort)),
+            ctrlrange=numbers((motor.lower, motor.upper)),
+            forcerange=numbers((-motor.effort, motor.effort)),
         )
-    # In the order of theta_1, theta_2, theta_3.
-    actuators[:] = sorted(actuators, key=lambda one: mechanism.actuated.index(one.attrib["name"]))
     return actuators
 
 

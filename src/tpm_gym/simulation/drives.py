@@ -245,8 +245,7 @@ class Servos:
     def __init__(self, servo: Servo, machine: Machine, time_step: float) -> None:
         """Be the nominal drives, the machine at rest at home."""
         self._servo, self._machine, self._step = servo, machine, time_step
-        joints = {link.joint.name: link.joint for link in machine.mechanism.links if link.joint}
-        self._motors = [joints[name] for name in machine.mechanism.actuated]
+        self._motors = machine.mechanism.motors
         for motor in self._motors:
             if not 0 <= motor.corner < motor.speed:
                 valid = f"motors whose corner speed is below their speed, unlike {motor}"

@@ -65,8 +65,7 @@ class Robot:
         self.bodies = [self._load(leg, mount) for leg in mechanism.legs()]
         self._motors = [self.joints[name] for name in mechanism.actuated]
         self._inertias = {link: self._inertia(link) for link in self.links.values()}
-        joints = {link.joint.name: link.joint for link in mechanism.links if link.joint}
-        self._nominal_effort = [joints[name].effort for name in mechanism.actuated]
+        self._nominal_effort = [motor.effort for motor in mechanism.motors]
         self._effort = self._nominal_effort
         slide = mechanism.link(mechanism.tool).joint
         assert slide is not None

@@ -55,8 +55,7 @@ class Robot:
         slide = mechanism.link(mechanism.tool).joint
         assert slide is not None
         self._motors = [(self._at[name], self._dof[name]) for name in mechanism.actuated]
-        efforts = {joint.name: joint.effort for joint in joints}
-        self._efforts = [efforts[name] for name in mechanism.actuated]
+        self._efforts = [motor.effort for motor in mechanism.motors]
         self._slide = self._at[slide.name], self._dof[slide.name]
         self._spring = slide.effort
         pairs = [site_names(closure.name) for closure in mechanism.closures]
