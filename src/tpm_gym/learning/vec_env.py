@@ -19,7 +19,7 @@ from tpm_gym.simulation.randomisation import NOMINAL, Plant
 
 __all__ = ["AnalyticVecEnv"]
 
-_COLUMNS, _PUCKS = "column/", "pucks/"  # what arrays of the simulation are called in a state
+_COLUMN = "column/"  # what names of the simulation's columns begin with in a state
 _OWN = ("goals", "elapsed", "ended", "pending")
 
 
@@ -110,15 +110,19 @@ class AnalyticVecEnv(VecEnv):
         plants = moment.plants if any(plant != NOMINAL for plant in moment.plants) else ()
         arrays: dict[str, NDArray[Any]] = {"returns": self._returns, "lengths": self._lengths}
         arrays |= {name: getattr(snapshot, name) for name in _OWN}
-        arrays |= {f"{_COLUMNS}{name}": values for name, values in moment.columns.items()}
-        arrays |= {f"{_PUCKS}{k}": values for k, values in enumerate(moment.pucks)}
+        arrays |= {f"{_COLUMN}{name}": values for name, values in moment.columns.items()}
+        arrays["pucks"] = moment.pucks
         return {"rngs": snapshot.rngs, "plants": [asdict(plant) for plant in plants]}, arrays
 
     def restore(self, plain: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Observation:
         """Go back to what :meth:`state` returned; the observation at that moment."""
         plants = tuple(map(_plant, plain["plants"])) or (NOMINAL,) * self.num_envs
-        pucks = tuple(_named(_PUCKS, arrays).values())
-        moment = Moment(plants, _named(_COLUMNS, arrays), pucks)
+        columns = {
+            name.removeprefix(_COLUMN): values
+            for name, values in arrays.items()
+            if name.startswith(_COLUMN)
+        }
+        moment = Moment(plants, columns, arrays["pucks"])
         self._returns, self._lengths = arrays["returns"].copy(), arrays["lengths"].copy()
         own = {name: arrays[name] for name in _OWN}
         return self.envs.restore_state(VectorSnapshot(moment, plain["rngs"], **own))
@@ -128,8 +132,3 @@ def _plant(entries: dict[str, Any]) -> Plant:
     """From JSON, which has lists for tuples."""
     tuples: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in entries.items()}
     return Plant(**tuples)
-
-
-def _named(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Those of which the name begins so, without that."""
-    return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}

@@ -49,7 +49,7 @@ class Moment:
 
     plants: tuple[Plant, ...]
     columns: dict[str, FloatArray]
-    pucks: Any
+    pucks: FloatArray
 
 
 class AnalyticSimulation:
