@@ -7,7 +7,6 @@ feed-forward, and a motor with a torque-speed line.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
@@ -22,7 +21,7 @@ from tpm_gym.mechanism.batch import Batch
 from tpm_gym.mechanism.bodies import Joint
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.randomisation import NOMINAL, Plant, Randomisation
-from tpm_gym.simulation.settings import settings_of
+from tpm_gym.simulation.settings import is_number, settings_of
 
 __all__ = [
     "Gains",
@@ -87,8 +86,7 @@ class Servo:
         """Reject what is no servo."""
         for name in ("stiffness", "damping"):
             value = getattr(self, name)
-            number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
-            if not number or not math.isfinite(value) or not value > 0:
+            if not is_number(value) or not value > 0:
                 raise ConfigurationError(name, value, "a positive number")
         if self.feedforward not in FEEDFORWARDS:
             valid = ", ".join(map(repr, FEEDFORWARDS))

@@ -7,8 +7,6 @@ expert keep believing in the nominal machine, as on a real robot.
 
 from __future__ import annotations
 
-import math
-from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -17,6 +15,7 @@ import numpy as np
 from tpm_gym.arrays import Vector
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.machine import Machine
+from tpm_gym.simulation.settings import is_number
 
 __all__ = ["LIMITS", "NOMINAL", "Plant", "Randomisation"]
 
@@ -136,9 +135,9 @@ class Randomisation:
             object.__setattr__(self, name, _pair(name, getattr(self, name), low, high))
         for name, largest in _SIZES.items():
             value = getattr(self, name)
-            if not _is_number(value) or not 0 <= value <= largest:
+            if not is_number(value) or not 0 <= value <= largest:
                 raise ConfigurationError(name, value, f"a number from 0 to {largest}")
-        if not _is_number(self.latency) or self.latency not in (0, 1):
+        if not is_number(self.latency) or self.latency not in (0, 1):
             raise ConfigurationError("latency", self.latency, "0 or 1 control steps")
         object.__setattr__(self, "latency", int(self.latency))
 
@@ -168,24 +167,14 @@ class Randomisation:
 
 def _pair(name: str, value: Any, low: float, high: float) -> Range:
     """A number, or a pair of them, as a pair within the limits."""
-    pair = (value, value) if _is_number(value) else value
+    pair = (value, value) if is_number(value) else value
     sized = isinstance(pair, (tuple, list, np.ndarray)) and len(pair) == 2
-    if sized and all(map(_is_number, pair)):
+    if sized and all(map(is_number, pair)):
         first, last = float(pair[0]), float(pair[1])
         if low <= first <= last <= high:
             return first, last
     valid = f"a number, or (low, high) with low <= high, within {low} to {high}"
     raise ConfigurationError(name, value, valid)
-
-
-def _is_number(value: Any) -> bool:
-    with suppress(OverflowError):  # an integer beyond the range of floats
-        return (
-            isinstance(value, (int, float, np.number))
-            and not isinstance(value, bool)
-            and math.isfinite(value)
-        )
-    return False
 
 
 def _deviations(rng: np.random.Generator, size: float, count: int) -> tuple[float, ...]:

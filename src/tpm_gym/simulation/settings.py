@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import fields
+from contextlib import suppress
+from dataclasses import dataclass, fields
 from numbers import Integral, Real
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.simulation.state import CONTROL_PERIOD
 
-__all__ = ["require_numerics", "settings_of"]
+__all__ = ["Numerics", "is_number", "require_numerics", "settings_of"]
 
 T = TypeVar("T")
 
@@ -31,29 +32,43 @@ def settings_of(kind: type[T], name: str, value: Any) -> T:
     raise ConfigurationError(name, value, valid)
 
 
-class Numerics(Protocol):
-    """Settings that every engine has; one with an iterating solver has its ``iterations`` too."""
+def is_number(value: Any) -> bool:
+    """Whether that is a finite real number, and no boolean."""
+    with suppress(OverflowError):  # an integer beyond the range of floats
+        return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+    return False
+
+
+@dataclass(frozen=True)
+class Numerics:
+    """Settings that every engine has.
+
+    Attributes:
+        time_step: s; a whole fraction of the control period.
+    """
+
+    time_step: float = 1 / 250
 
     @property
-    def time_step(self) -> float:
-        """s; a whole fraction of the control period."""
+    def substeps(self) -> int:
+        """Time steps in a control period."""
+        return round(CONTROL_PERIOD / self.time_step)
 
 
 def require_numerics(
     settings: Numerics, ranges: Mapping[str, tuple[Callable[[float], bool], str]]
 ) -> None:
-    """Reject time steps, iterations, and other numbers by their ranges, that cannot work.
+    """Reject time steps, iterations of a solver, and other numbers, that cannot work.
 
     Args:
-        settings: What has them as attributes.
+        settings: What has them as attributes; an engine without a solver has no ``iterations``.
         ranges: Of the other numbers: whether a value fits, and what would.
 
     Raises:
         ConfigurationError: If a value is out of range.
     """
     for name in ("time_step", *ranges):
-        value = getattr(settings, name)
-        if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
+        if not is_number(value := getattr(settings, name)):
             raise ConfigurationError(name, value, "a finite number")
     step, count = settings.time_step, getattr(settings, "iterations", 1)
     steps = CONTROL_PERIOD / step if step > 0 else 0.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from tpm_gym.errors import ConfigurationError
-from tpm_gym.simulation.settings import require_numerics
+from tpm_gym.simulation.settings import Numerics, require_numerics
 from tpm_gym.simulation.state import CONTROL_PERIOD
 
 __all__ = ["Physics"]
@@ -14,7 +14,7 @@ TORQUES = ("none", "last", "every")
 
 
 @dataclass(frozen=True)
-class Physics:
+class Physics(Numerics):
     """Numerical settings of the engine.
 
     Attributes:
@@ -28,7 +28,6 @@ class Physics:
         ConfigurationError: If a value is out of range.
     """
 
-    time_step: float = 1 / 250
     torques: str = "last"
 
     def __post_init__(self) -> None:
@@ -38,8 +37,3 @@ class Physics:
             raise ConfigurationError("time_step", self.time_step, f"at most {CONTROL_PERIOD} s / 3")
         if self.torques not in TORQUES:
             raise ConfigurationError("torques", self.torques, ", ".join(map(repr, TORQUES)))
-
-    @property
-    def substeps(self) -> int:
-        """Time steps in a control period."""
-        return round(CONTROL_PERIOD / self.time_step)

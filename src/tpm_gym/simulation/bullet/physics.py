@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from tpm_gym.errors import ConfigurationError
-from tpm_gym.simulation.settings import require_numerics
-from tpm_gym.simulation.state import CONTROL_PERIOD
+from tpm_gym.simulation.settings import Numerics, require_numerics
 
 __all__ = ["Physics"]
 
@@ -18,7 +17,7 @@ MOTOR_GAIN = 1.0
 
 
 @dataclass(frozen=True)
-class Physics:
+class Physics(Numerics):
     """Numerical settings of the engine.
 
     Attributes:
@@ -32,7 +31,6 @@ class Physics:
         ConfigurationError: If a value is out of range.
     """
 
-    time_step: float = 1 / 250
     solver: str = "direct"
     iterations: int = 50
     erp: float = 1.0
@@ -42,8 +40,3 @@ class Physics:
         require_numerics(self, {"erp": (lambda value: 0 < value <= 1, "0 < erp <= 1")})
         if self.solver not in SOLVERS:
             raise ConfigurationError("solver", self.solver, " or ".join(map(repr, SOLVERS)))
-
-    @property
-    def substeps(self) -> int:
-        """Time steps in a control period."""
-        return round(CONTROL_PERIOD / self.time_step)

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from tpm_gym.simulation.settings import require_numerics
-from tpm_gym.simulation.state import CONTROL_PERIOD
+from tpm_gym.simulation.settings import Numerics, require_numerics
 
 __all__ = ["Physics"]
 
 
 @dataclass(frozen=True)
-class Physics:
+class Physics(Numerics):
     """Numerical settings of the engine.
 
     Attributes:
@@ -23,15 +22,9 @@ class Physics:
         ConfigurationError: If a value is out of range.
     """
 
-    time_step: float = 1 / 250
     iterations: int = 50
     tolerance: float = 1e-10
 
     def __post_init__(self) -> None:
         """Reject settings that cannot work."""
         require_numerics(self, {"tolerance": (lambda value: 0 <= value < 1, "0 <= tolerance < 1")})
-
-    @property
-    def substeps(self) -> int:
-        """Time steps in a control period."""
-        return round(CONTROL_PERIOD / self.time_step)
