@@ -13,7 +13,9 @@ import numpy as np
 
 from tpm_gym.arrays import FloatArray, Vector
 
-__all__ = ["Closure", "Joint", "Link", "Mechanism", "Solid"]
+__all__ = ["ALUMINIUM", "STEEL", "Closure", "Joint", "Link", "Mechanism", "Solid"]
+
+ALUMINIUM, STEEL = 2700.0, 7850.0  # kg/m^3
 
 
 @dataclass(frozen=True)

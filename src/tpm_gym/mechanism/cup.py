@@ -9,11 +9,11 @@ import math
 from typing import Any, NamedTuple
 
 from tpm_gym.arrays import Vector, rotate
-from tpm_gym.mechanism.bodies import Joint, Link, Solid
+from tpm_gym.mechanism.bodies import ALUMINIUM, STEEL, Joint, Link, Solid
 
 __all__ = ["CUP", "VacuumCup", "sealed"]
 
-_SILICONE, _STEEL, _ALUMINIUM = 1150.0, 7850.0, 2700.0  # kg/m^3
+_SILICONE = 1150.0  # kg/m^3
 
 
 class VacuumCup(NamedTuple):
@@ -68,7 +68,7 @@ class VacuumCup(NamedTuple):
         x, y, z = point_p
         half = (self.length - self.bellows) / 2
         size = (0.005, 2 * half, 0.0)
-        return Solid("cylinder", size, (x, y, z + half), _ALUMINIUM, colour="steel")
+        return Solid("cylinder", size, (x, y, z + half), ALUMINIUM, colour="steel")
 
     def link(self, platform: str, point_p: Vector) -> Link:
         """The cup as a link that slides in the platform of that name."""
@@ -81,7 +81,7 @@ class VacuumCup(NamedTuple):
             collides=True,
         )
         plunger = Solid(
-            "cylinder", (0.003, 0.04, 0.0), (0.0, 0.0, self.length - 0.02), _STEEL, colour="steel"
+            "cylinder", (0.003, 0.04, 0.0), (0.0, 0.0, self.length - 0.02), STEEL, colour="steel"
         )
         # The stop lies a millimetre beyond the rest position, or the engine would let them fight.
         slide = Joint(

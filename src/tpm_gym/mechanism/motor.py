@@ -20,11 +20,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 from tpm_gym.arrays import Vector
-from tpm_gym.mechanism.bodies import Solid
+from tpm_gym.mechanism.bodies import ALUMINIUM, STEEL, Solid
 
 __all__ = ["TORQUE_MOTOR", "Motor"]
 
-STEEL, HOUSING = 7850.0, 2700.0  # kg/m^3; magnets weigh about as much as steel
 _FACE = 0.002  # m
 
 Axis = Literal["x", "y", "z"]
@@ -80,7 +79,7 @@ class Motor:
         return self.clearance + self.length / 2 + 2 * self.end_turns
 
     def rotor(self, axis: Axis) -> tuple[Solid, Solid]:
-        """The rings, along ``axis`` about the origin."""
+        """The rings, along ``axis`` about the origin; magnets weigh about as much as steel."""
         size = (self.gap_radius, self.length / 2, 0.0)
         bore = (self.gap_radius - self.ring, self.length / 2, 0.0)
         first, second = (
@@ -93,7 +92,7 @@ class Motor:
         """The housings, along ``axis`` about ``centre``; the shaft ends in front of them."""
         size = (self.stator_radius, self.reach - self.clearance - 2 * _FACE, 0.0)
         first, second = (
-            Solid("cylinder", size, at, HOUSING, axis=axis, colour="dark")
+            Solid("cylinder", size, at, ALUMINIUM, axis=axis, colour="dark")
             for at in self.halves(axis, centre)
         )
         return first, second

@@ -30,7 +30,7 @@ from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode, passive_angles
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.kinematics.modes import ROTATED_MODES, RotatedMode
 from tpm_gym.kinematics.rotated import forward_rotated
-from tpm_gym.mechanism.bodies import Closure, Joint, Link, Mechanism, Solid
+from tpm_gym.mechanism.bodies import ALUMINIUM, STEEL, Closure, Joint, Link, Mechanism, Solid
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.motor import TORQUE_MOTOR
 
@@ -45,8 +45,7 @@ __all__ = [
 ACTUATED_JOINTS = ("R11", "R21", "R31")
 """The motors, in the order of theta_1, theta_2, theta_3."""
 
-# Materials, kg/m^3.
-ALUMINIUM, STEEL, CARBON_FIBRE = 2700.0, 7850.0, 1600.0
+CARBON_FIBRE = 1600.0  # kg/m^3
 
 # How far each arm may turn from pointing level outwards, towards the base and the platform.
 ARM_RAISED, ARM_LOWERED = np.deg2rad(75.0), np.deg2rad(115.0)
