@@ -16,9 +16,9 @@ from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.mount import Mount
 from tpm_gym.mechanism.tpm import PAPER_TPM
-from tpm_gym.mechanism.urdf import COLOURS
+from tpm_gym.mechanism.urdf import COLOURS, numbers
 
-__all__ = ["MJCF_FILE", "SOLID", "STIFF", "mjcf_text", "numbers", "robot", "site_names", "write"]
+__all__ = ["MJCF_FILE", "SOLID", "STIFF", "mjcf_text", "robot", "site_names", "write"]
 
 MJCF_FILE = "tpm.xml"
 
@@ -132,11 +132,6 @@ def write(folder: Path, machine: Machine = PAPER_TPM) -> Path:
     path = folder / MJCF_FILE
     path.write_text(mjcf_text(machine), encoding="utf-8", newline="\n")
     return path
-
-
-def numbers(values: Iterable[float]) -> str:
-    """Nine significant digits: a nanometre in a metre; never ``-0``."""
-    return " ".join(f"{float(value) + 0.0:.9g}" if abs(value) > 1e-15 else "0" for value in values)
 
 
 def _body(world: Element, bodies: dict[str, Element], link: Link, mount: Mount) -> Element:

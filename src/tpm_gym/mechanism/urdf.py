@@ -23,7 +23,7 @@ from tpm_gym.arrays import Vector
 from tpm_gym.mechanism.bodies import Link, Mechanism, Solid
 from tpm_gym.mechanism.tree import build
 
-__all__ = ["COLOURS", "LOOPS_FILE", "URDF_FILE", "loops_text", "urdf_text", "write"]
+__all__ = ["COLOURS", "LOOPS_FILE", "URDF_FILE", "loops_text", "numbers", "urdf_text", "write"]
 
 URDF_FILE, LOOPS_FILE = "tpm.urdf", "tpm.loops.yaml"
 
@@ -67,7 +67,7 @@ def urdf_text(mechanism: Mechanism, closure_frames: bool = False) -> str:
     root.append(ElementTree.Comment(" Generated from tpm_gym.mechanism; do not edit (make urdf). "))
     for name, rgba in COLOURS.items():
         material = ElementTree.SubElement(root, "material", name=name)
-        ElementTree.SubElement(material, "color", rgba=_numbers(rgba))
+        ElementTree.SubElement(material, "color", rgba=numbers(rgba))
     for link in mechanism.links:
         root.append(_link_element(link))
     for link in mechanism.links:
@@ -105,6 +105,15 @@ def write(folder: Path, mechanism: Mechanism | None = None) -> tuple[Path, Path]
     return urdf, loops
 
 
+def numbers(values: Iterable[float]) -> str:
+    """Nine significant digits: a nanometre in a metre; never ``-0``."""
+    return " ".join(map(_number, values))
+
+
+def _number(value: float) -> str:
+    return f"{float(value) + 0.0:.9g}" if abs(value) > 1e-15 else "0"
+
+
 def _closure_frames(mechanism: Mechanism) -> list[tuple[str, str, Vector]]:
     """Both sides of each closure in turn: name, link that it is on, place in that link's frame."""
     return [
@@ -126,14 +135,14 @@ def _frame_elements(name: str, parent: str, point: Vector) -> tuple[Element, Ele
     joint = Element("joint", name=f"{name}_frame", type="fixed")
     ElementTree.SubElement(joint, "parent", link=parent)
     ElementTree.SubElement(joint, "child", link=name)
-    ElementTree.SubElement(joint, "origin", xyz=_numbers(point), rpy="0 0 0")
+    ElementTree.SubElement(joint, "origin", xyz=numbers(point), rpy="0 0 0")
     return link, joint
 
 
 def _link_element(link: Link) -> Element:
     element = Element("link", name=link.name)
     inertial = ElementTree.SubElement(element, "inertial")
-    ElementTree.SubElement(inertial, "origin", xyz=_numbers(link.centre_of_mass), rpy="0 0 0")
+    ElementTree.SubElement(inertial, "origin", xyz=numbers(link.centre_of_mass), rpy="0 0 0")
     ElementTree.SubElement(inertial, "mass", value=_number(link.mass))
     moments = link.inertia
     ElementTree.SubElement(
@@ -149,10 +158,10 @@ def _link_element(link: Link) -> Element:
 def _solid_element(tag: str, solid: Solid) -> Element:
     element = Element(tag)
     rpy = _AXIS_RPY[solid.axis] if solid.kind == "cylinder" else (0.0, 0.0, 0.0)
-    ElementTree.SubElement(element, "origin", xyz=_numbers(solid.centre), rpy=_numbers(rpy))
+    ElementTree.SubElement(element, "origin", xyz=numbers(solid.centre), rpy=numbers(rpy))
     shape = ElementTree.SubElement(element, "geometry")
     if solid.kind == "box":
-        ElementTree.SubElement(shape, "box", size=_numbers(solid.size))
+        ElementTree.SubElement(shape, "box", size=numbers(solid.size))
     else:
         radius, length, _ = solid.size
         ElementTree.SubElement(shape, "cylinder", radius=_number(radius), length=_number(length))
@@ -168,8 +177,8 @@ def _joint_element(link: Link) -> Element:
     element = Element("joint", name=joint.name, type=joint.kind)
     ElementTree.SubElement(element, "parent", link=joint.parent)
     ElementTree.SubElement(element, "child", link=link.name)
-    ElementTree.SubElement(element, "origin", xyz=_numbers(joint.origin), rpy="0 0 0")
-    ElementTree.SubElement(element, "axis", xyz=_numbers(joint.axis))
+    ElementTree.SubElement(element, "origin", xyz=numbers(joint.origin), rpy="0 0 0")
+    ElementTree.SubElement(element, "axis", xyz=numbers(joint.axis))
     if joint.kind != "continuous":
         ElementTree.SubElement(
             element,
@@ -180,15 +189,6 @@ def _joint_element(link: Link) -> Element:
             velocity=_number(joint.speed),
         )
     return element
-
-
-def _number(value: float) -> str:
-    """Nine significant digits: a nanometre in a metre; never ``-0``."""
-    return f"{float(value) + 0.0:.9g}" if abs(value) > 1e-15 else "0"
-
-
-def _numbers(values: Iterable[float]) -> str:
-    return " ".join(_number(value) for value in values)
 
 
 def main() -> None:

@@ -9,8 +9,9 @@ import mujoco
 
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
-from tpm_gym.mechanism.mjcf import SOLID, STIFF, numbers, robot
+from tpm_gym.mechanism.mjcf import SOLID, STIFF, robot
 from tpm_gym.mechanism.mount import GRAVITY
+from tpm_gym.mechanism.urdf import numbers
 from tpm_gym.simulation.mujoco.physics import Physics
 from tpm_gym.simulation.stage import (
     FLOOR,
