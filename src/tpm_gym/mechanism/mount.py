@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tpm_gym.arrays import FloatArray, Vector, finite
+from tpm_gym.arrays import FloatArray, Quaternion, Vector, finite
 from tpm_gym.errors import ConfigurationError
 
 __all__ = ["GRAVITY", "Mount"]
@@ -65,13 +66,17 @@ class Mount:
     @property
     def free_fall(self) -> Vector:
         """Acceleration of gravity in the paper frame, m/s^2."""
-        x, y, z = self.rotate((0.0, 0.0, -GRAVITY)).tolist()
-        return x, y, z
+        return self.turn((0.0, 0.0, -GRAVITY))
 
     @property
-    def quaternion(self) -> tuple[float, float, float, float]:
+    def quaternion(self) -> Quaternion:
         """Orientation of the paper frame in the world, (x, y, z, w)."""
         return (1.0, 0.0, 0.0, 0.0)
+
+    @staticmethod
+    def tilt(quaternion: Quaternion) -> float:
+        """Angle between an orientation in the world, (x, y, z, w), and the paper frame's, rad."""
+        return 2 * math.asin(min(1.0, math.hypot(*quaternion[1:])))
 
 
 _HALF_TURN = np.array([1.0, -1.0, -1.0])

@@ -36,6 +36,8 @@ __all__ = [
 ]
 
 UPRIGHT: Quaternion = (0.0, 0.0, 0.0, 1.0)
+SPRING_GAIN = 0.2
+"""Share of its way back that the cup's spring takes in one time step."""
 
 
 class Pose(NamedTuple):

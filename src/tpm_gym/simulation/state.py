@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
-from tpm_gym.arrays import BoolArray, FloatArray, IntArray, finite
+from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector, finite
 from tpm_gym.errors import ConfigurationError
 
 __all__ = ["CONTROL_PERIOD", "Block", "Scene", "State"]
@@ -50,7 +51,17 @@ class Block:
             raise ConfigurationError("colour", self.colour, "four numbers from 0 to 1")
 
     @property
-    def inertia(self) -> tuple[float, float, float]:
+    def half(self) -> Vector:
+        """Half edges, m."""
+        return self.width / 2, self.width / 2, self.height / 2
+
+    @property
+    def radius(self) -> float:
+        """From the centre to the corners, m."""
+        return math.hypot(self.width, self.width, self.height) / 2
+
+    @property
+    def inertia(self) -> Vector:
         """Principal moments about the centre, kg m^2."""
         level = self.mass * (self.width**2 + self.height**2) / 12
         return level, level, self.mass * self.width**2 / 6

@@ -13,7 +13,10 @@ from typing import Any, NamedTuple
 
 from tpm_gym.mechanism.cup import CUP, VacuumCup
 
-__all__ = ["EMPTY", "Hold", "Load", "hold_after", "holds", "pressure_after"]
+__all__ = ["CLEARANCE", "EMPTY", "Hold", "Load", "hold_after", "holds", "pressure_after"]
+
+CLEARANCE = 2e-5
+"""Between the lip and the face that it has sealed on, m: else contact and seal would fight."""
 
 
 class Hold(NamedTuple):

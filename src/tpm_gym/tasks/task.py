@@ -459,5 +459,5 @@ def _range(low: ArrayLike, high: ArrayLike) -> str:
 
 def _boxes(points: FloatArray, block: Block) -> tuple[FloatArray, FloatArray]:
     """Corners of upright blocks (r, 3) m; a micrometre in, so that touching is not overlapping."""
-    half = np.array([block.width, block.width, block.height]) / 2 - 1e-6
+    half = np.array(block.half) - 1e-6
     return points - half, points + half

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from tpm_gym.arrays import FloatArray, Vector
 from tpm_gym.simulation.analytic.compiling import compiled
+from tpm_gym.simulation.engine import SPRING_GAIN
 
 # Where in the row; world, SI units
 X, Y, Z = 0, 1, 2  # of the object's centre
@@ -25,7 +26,7 @@ RECOVERY = 0.08  # share of a penetration that a time step takes out
 SLOP = 1e-5  # m; a penetration that stays
 SEEN_BY_LIP = 6e-4  # m; at this distance lip and block keep from going deeper than to touch
 ROUNDING = 1e-3  # m; of the edges of cup and block for each other
-SPRING = 0.8  # share of the cup's way back that a time step leaves of it
+SPRING = 1 - SPRING_GAIN  # share of the cup's way back that a time step leaves of it
 SETTLED = 1e-6  # m, and m/s: less is none
 LITTLE = 1e-12
 

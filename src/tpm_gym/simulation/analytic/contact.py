@@ -57,11 +57,10 @@ from tpm_gym.simulation.analytic.compiling import SOURCES, compiled, kept
 from tpm_gym.simulation.analytic.shoving import shove, side_of
 from tpm_gym.simulation.analytic.tumbling import tumble
 from tpm_gym.simulation.stage import FLOOR, TABLE
-from tpm_gym.simulation.vacuum import Hold, Load, hold_after
+from tpm_gym.simulation.vacuum import CLEARANCE, Hold, Load, hold_after
 
 __all__ = ["advance"]
 
-_SEAT = 2e-5  # m; distance of lip and face in a seal
 _SHALLOW = 2e-4  # m; what stands and is no deeper is at rest
 _DEEP = 2 * ROUNDING  # m; a lip that is less below the top face comes out there
 _SLOW, _LAZY = 5e-3, 0.3  # m/s, rad/s: what nearly stands, or lies, and is slower comes to rest
@@ -325,7 +324,7 @@ def _hold(row: FloatArray, point: Vector, on: bool, load: Load, setting: Setting
     if after.which == 0 and not row[HELD]:
         above = lip[2] - row[Z] - height
         x, y, z = plus(three(row, X), point, -1.0)
-        put(row, GRIP, (x, y, z - (row[SLIDE] + max(_SEAT - above, 0.0))))
+        put(row, GRIP, (x, y, z - (row[SLIDE] + max(CLEARANCE - above, 0.0))))
     row[HELD] = after.which == 0
     if row[HELD]:
         row[STILL] = 0.0

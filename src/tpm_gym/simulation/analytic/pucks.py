@@ -46,8 +46,7 @@ class Pucks:
         self._block, self._numbers = block, np.arange(count)
         self._state: FloatArray = np.zeros((count, COLUMNS))
         if block is not None:
-            half = (block.width / 2, block.width / 2, block.height / 2)
-            self._setting = Setting(half, table, time_step)
+            self._setting = Setting(block.half, table, time_step)
             self._state[:, MASS], self._state[:, ROUGH] = block.mass, block.friction
             middle = np.zeros((count, 3)) + (0.0, 0.0, block.height / 2)
             self.place(slice(None), middle)

@@ -12,13 +12,12 @@ from tpm_gym.simulation.bullet.client import Client
 from tpm_gym.simulation.bullet.robot import Robot
 from tpm_gym.simulation.engine import Pose
 from tpm_gym.simulation.state import Block
-from tpm_gym.simulation.vacuum import EMPTY, Hold, Load, hold_after
+from tpm_gym.simulation.vacuum import CLEARANCE, EMPTY, Hold, Load, hold_after
 
 __all__ = ["Cup", "Grip"]
 
 _WELD_FORCE = 1e4  # N; the weld itself never yields
 _REACH = 0.1  # m; what is farther from the lip does not get there in a control period
-_CLEARANCE = 2e-5  # m, between lip and face where it would be less
 _NOTHING = Load()
 
 
@@ -57,8 +56,7 @@ class Cup:
         """Start with nothing held."""
         self._client, self._robot, self._time_step = client, robot, time_step
         self._bodies, self._blocks = bodies, blocks
-        # From the middle of each to its farthest corner, m
-        self._sizes = [math.hypot(one.width, one.width, one.height) / 2 for one in blocks]
+        self._radii = [block.radius for block in blocks]
         self._weld = -1
         self._near: list[int] = []
         self.grip = Grip()
@@ -69,8 +67,8 @@ class Cup:
         if self._bodies:
             lip, _ = self._robot.cup()
             place = self._client.getBasePositionAndOrientation
-            for index, (body, size) in enumerate(zip(self._bodies, self._sizes, strict=True)):
-                if math.dist(place(body)[0], lip) < _REACH + size:
+            for index, (body, radius) in enumerate(zip(self._bodies, self._radii, strict=True)):
+                if math.dist(place(body)[0], lip) < _REACH + radius:
                     self._near.append(index)
         return self._near
 
@@ -117,7 +115,7 @@ class Cup:
         for index in self._near:
             block = self._blocks[index]
             place, turn = self._client.getBasePositionAndOrientation(self._bodies[index])
-            close = math.dist(place, lip) < self._sizes[index] + CUP.seal_gap
+            close = math.dist(place, lip) < self._radii[index] + CUP.seal_gap
             if close and sealed(lip, axis, place, turn, (block.width, block.height)):
                 return index
         return -1
@@ -129,7 +127,7 @@ class Cup:
         inverse = client.invertTransform(state[0], state[1])
         pose = client.getBasePositionAndOrientation(self._bodies[index])
         (x, y, z), turn = client.multiplyTransforms(*inverse, *pose)
-        points = client.getClosestPoints(body, self._bodies[index], _CLEARANCE, link, -1)
-        depth = _CLEARANCE - min((point[8] for point in points), default=_CLEARANCE)
+        points = client.getClosestPoints(body, self._bodies[index], CLEARANCE, link, -1)
+        depth = CLEARANCE - min((point[8] for point in points), default=CLEARANCE)
         seat: Vector = (x, y, z + depth)
         return Pose(seat, turn)

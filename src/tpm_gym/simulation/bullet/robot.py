@@ -27,7 +27,7 @@ from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.mount import Mount
 from tpm_gym.simulation.bullet.client import Client
 from tpm_gym.simulation.bullet.physics import MOTOR_GAIN
-from tpm_gym.simulation.engine import Motors, Truth
+from tpm_gym.simulation.engine import SPRING_GAIN, Motors, Truth
 
 __all__ = ["Robot"]
 
@@ -39,7 +39,6 @@ Address = tuple[int, int]
 """A body in the client, and one of its links (or the joint above it)."""
 
 _CLOSURE_FORCE = 1e6  # N; the loops never yield
-_SPRING_GAIN = 0.2  # share of its way back that the cup's spring takes in one time step
 
 
 class Robot:
@@ -76,7 +75,7 @@ class Robot:
             client.POSITION_CONTROL,
             targetPosition=0.0,
             force=slide.effort,
-            positionGain=_SPRING_GAIN,
+            positionGain=SPRING_GAIN,
         )
         self._close_loops()
 
@@ -234,9 +233,8 @@ class Robot:
             u, v, w = transform(*frames[at_b], point_b)
             squared = max(squared, (x - u) ** 2 + (y - v) ** 2 + (z - w) ** 2)
         origin, turn = frames[self._platform]
-        # The platform should stand as the base does: a half turn about x, quaternion (1, 0, 0, 0).
-        tilt = 2 * math.asin(min(1.0, math.hypot(*turn[1:])))
-        return Truth(math.sqrt(squared), transform(origin, turn, self._mechanism.point_p), tilt)
+        place = transform(origin, turn, self._mechanism.point_p)
+        return Truth(math.sqrt(squared), place, Mount.tilt(turn))
 
     def cup(self) -> tuple[Vector, Vector]:
         """Centre of the cup's lip (m) and the cup's outward axis, world."""

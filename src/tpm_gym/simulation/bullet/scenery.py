@@ -68,8 +68,7 @@ class Scenery:
         return body
 
     def _add_block(self, block: Block) -> int:
-        client = self._client
-        half = (block.width / 2, block.width / 2, block.height / 2)
+        client, half = self._client, block.half
         solid = client.createCollisionShape(client.GEOM_BOX, halfExtents=half)
         drawn = client.createVisualShape(client.GEOM_BOX, halfExtents=half, rgbaColor=block.colour)
         body: int = client.createMultiBody(

@@ -15,12 +15,11 @@ from tpm_gym.simulation.mujoco.model import grip_name
 from tpm_gym.simulation.mujoco.robot import Robot
 from tpm_gym.simulation.mujoco.scenery import Scenery
 from tpm_gym.simulation.state import Block
-from tpm_gym.simulation.vacuum import EMPTY, Hold, Load, hold_after
+from tpm_gym.simulation.vacuum import CLEARANCE, EMPTY, Hold, Load, hold_after
 
 __all__ = ["Cup", "Grip"]
 
 _NO_LOAD = Load()
-_CLEARANCE = 2e-5  # m, between lip and face where it would be less
 
 
 class Grip(NamedTuple):
@@ -54,12 +53,7 @@ class Cup:
         names = range(len(blocks))
         self._welds = [model.equality(grip_name(index)).id for index in names]
         self._row = 3 * (model.neq - len(blocks))  # of the weld's force, after the closures'
-        self._reach = [
-            math.hypot(*CUP.lip)
-            + math.hypot(block.width, block.width, block.height) / 2
-            + CUP.seal_gap
-            for block in blocks
-        ]
+        self._reach = [math.hypot(*CUP.lip) + block.radius + CUP.seal_gap for block in blocks]
         self.grip = Grip()
 
     def load(self) -> Load:
@@ -118,7 +112,7 @@ class Cup:
         relative = np.empty(4)
         mujoco.mju_mulQuat(relative, _wxyz(_inverse(turn)), _wxyz(quaternion))
         qw, qx, qy, qz = relative.tolist()
-        return Pose((x, y, z + max(0.0, _CLEARANCE - gap)), (qx, qy, qz, qw))
+        return Pose((x, y, z + max(0.0, CLEARANCE - gap)), (qx, qy, qz, qw))
 
 
 def _inverse(quaternion: Quaternion) -> Quaternion:

@@ -134,7 +134,7 @@ def _surroundings(world: Element, machine: Machine, scene: Scene) -> None:
 
 
 def _object(world: Element, index: int, block: Block) -> None:
-    name, half = object_name(index), (block.width / 2, block.width / 2, block.height / 2)
+    name = object_name(index)
     body = SubElement(world, "body", name=name)
     SubElement(body, "freejoint", name=name)
     SubElement(
@@ -149,7 +149,7 @@ def _object(world: Element, index: int, block: Block) -> None:
         "geom",
         name=name,
         type="box",
-        size=numbers(half),
+        size=numbers(block.half),
         rgba=numbers(block.colour),
         contype="0",
         conaffinity="0",

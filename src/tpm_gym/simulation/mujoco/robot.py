@@ -17,12 +17,12 @@ import numpy as np
 from tpm_gym.arrays import Quaternion, Vector, rotate, transform
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.mjcf import STIFF, site_names
-from tpm_gym.simulation.engine import Motors, Truth
+from tpm_gym.mechanism.mount import Mount
+from tpm_gym.simulation.engine import SPRING_GAIN, Motors, Truth
 from tpm_gym.simulation.randomisation import NOMINAL, Plant
 
 __all__ = ["Robot"]
 
-_SPRING_GAIN = 0.2  # share of its way back that the cup's spring takes in one time step
 _LEAST_EFFORT = 1e-9  # N m, of motors that have none, so that each has its row in the solver
 
 
@@ -83,7 +83,7 @@ class Robot:
         ):
             model.dof_frictionloss[dof] = loss
         driven = [(*motor, rate) for motor in self._motors] if self._ideal else []
-        driven.append((*self._slide, _SPRING_GAIN * rate))
+        driven.append((*self._slide, SPRING_GAIN * rate))
         rough = np.flatnonzero(model.dof_frictionloss).tolist()  # each has a row, in this order
         self._rows = [(rough.index(dof), at, dof, gain) for at, dof, gain in driven]
         self._rate = rate
@@ -135,10 +135,8 @@ class Robot:
         data, (side, other) = self._data, self._sides
         gaps = data.site_xpos[side] - data.site_xpos[other]
         origin, turn = self._frame(self._platform)
-        # The platform should stand as the base does: a half turn about x, quaternion (1, 0, 0, 0).
-        tilt = 2 * math.asin(min(1.0, math.hypot(*turn[1:])))
         gap = math.sqrt((gaps * gaps).sum(axis=1).max(initial=0.0))
-        return Truth(gap, transform(origin, turn, self._point_p), tilt)
+        return Truth(gap, transform(origin, turn, self._point_p), Mount.tilt(turn))
 
     def cup(self) -> tuple[Vector, Vector]:
         """Centre of the cup's lip (m) and the cup's outward axis, world."""
