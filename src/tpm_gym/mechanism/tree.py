@@ -19,6 +19,7 @@ along +y (branch I) or +x (branches II, III). Units: metres, radians, kilograms.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -296,27 +297,10 @@ def joint_arrays(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> dict[str, FloatArray]:
     """The same for theta (..., 3), each (...,)."""
-    passive = passive_angles(theta, branch, geometry)
-    theta_1, theta_2, theta_3 = np.moveaxis(np.asarray(theta, dtype=np.float64), -1, 0)
-    # Absolute directions become joint angles by subtracting the parent's direction.
-    return {
-        "R11": theta_1,
-        "Sa_swing": passive.rod4_swing - theta_1,
-        "Sa_tilt": passive.rod4_tilt,
-        "Sb_swing": passive.rod4_swing - theta_1,
-        "Sb_tilt": passive.rod4_tilt,
-        "R21": theta_2,
-        "R22": passive.rod6_swing - theta_2,
-        "R23": -passive.rod6_swing,
-        "R12": passive.beta,
-        "R13": -passive.beta,
-        "cup_slide": 0.0 * theta_1,
-        "R33": passive.rod11_swing,  # end links 9 and 10 stay parallel
-        "R31": theta_3,
-        "R32": passive.rod11_swing - theta_3,
-        "Re": passive.rod11_tilt,
-        "Rf": passive.rod11_tilt,
-    }
+    found = passive_angles(theta, branch, geometry)
+    swings = found.rod4_swing, found.rod4_swing, found.rod6_swing, found.rod11_swing
+    tilts = found.rod4_tilt, found.rod4_tilt, found.rod11_tilt
+    return _by_joint(np.asarray(theta, dtype=np.float64), swings, tilts, found.beta)
 
 
 def rotated_joint_angles(
@@ -330,18 +314,38 @@ def rotated_joint_angles(
         InputError: If theta has the wrong shape or is not finite, or if the branch does not exist
             at theta.
     """
-    theta_1, theta_2, theta_3 = vector("theta", theta)
-    found, slot = forward_rotated((theta_1, theta_2, theta_3), geometry), branch.index
+    angles = vector("theta", theta)
+    found, slot = forward_rotated(angles, geometry), branch.index
     if not found.valid[slot]:
         real = [str(mode) for mode in ROTATED_MODES if found.valid[mode.index]]
         raise InputError("branch", branch, f"one that exists at theta: {', '.join(real) or 'none'}")
-    tilt, beta = found.tilt[slot], found.beta[slot]
     (x, y, z), l4 = found.rods[slot].T, geometry.l4
-    swing_4a, swing_4b = np.arctan2(z[:2], y[:2])
-    swing_6, swing_11 = np.arctan2(z[2:], x[2:])
-    tilt_4a, tilt_4b = np.arcsin(x[:2] / l4)
-    tilt_11 = np.arcsin(y[3] / l4)
-    angles = {
+    swings = *np.arctan2(z[:2], y[:2]), *np.arctan2(z[2:], x[2:])
+    tilts = *np.arcsin(x[:2] / l4), np.arcsin(y[3] / l4)
+    joints = _by_joint(np.array(angles), swings, tilts, found.beta[slot], found.tilt[slot])
+    return {name: float(angle) for name, angle in joints.items()}
+
+
+def _by_joint(
+    theta: FloatArray,
+    swings: Sequence[FloatArray],
+    tilts: Sequence[FloatArray],
+    beta: FloatArray,
+    turn: FloatArray | float = 0.0,
+) -> dict[str, FloatArray]:
+    """Absolute directions as joint angles: each less that of the parent, all in rad.
+
+    Args:
+        theta: (..., 3), the motors.
+        swings: Of rods 4a, 4b, 6 and 11, as :class:`~tpm_gym.kinematics.PassiveAngles` has them.
+        tilts: Of rods 4a, 4b and 11.
+        beta: Of link 7.
+        turn: Of link 3' and the platform about y; joints turn about -y.
+    """
+    theta_1, theta_2, theta_3 = np.moveaxis(theta, -1, 0)
+    swing_4a, swing_4b, swing_6, swing_11 = swings
+    tilt_4a, tilt_4b, tilt_11 = tilts
+    return {
         "R11": theta_1,
         "Sa_swing": swing_4a - theta_1,
         "Sa_tilt": tilt_4a,
@@ -349,14 +353,13 @@ def rotated_joint_angles(
         "Sb_tilt": tilt_4b,
         "R21": theta_2,
         "R22": swing_6 - theta_2,
-        "R23": -swing_6 - tilt,  # joints turn about -y, the tilt about y
+        "R23": -swing_6 - turn,
         "R12": beta,
         "R13": -beta,
-        "cup_slide": 0.0,
-        "R33": swing_11 + tilt,
+        "cup_slide": 0.0 * theta_1,
+        "R33": swing_11 + turn,  # end links 9 and 10 stay parallel
         "R31": theta_3,
         "R32": swing_11 - theta_3,
         "Re": tilt_11,
         "Rf": tilt_11,
     }
-    return {name: float(angle) for name, angle in angles.items()}
