@@ -25,7 +25,7 @@ from tpm_gym.kinematics import jacobian
 from tpm_gym.mechanism import PAPER_TPM
 from tpm_gym.mechanism.motor import TORQUE_MOTOR
 from tpm_gym.mechanism.tpm import ASSEMBLY_LIMIT
-from tpm_gym.simulation.bullet.client import GRAVITY, Client, silence
+from tpm_gym.simulation.bullet.client import Client, silence
 from tpm_gym.simulation.bullet.physics import REGULARISATION, Physics
 from tpm_gym.simulation.bullet.robot import Robot
 from tpm_gym.simulation.simulation import CLOSURE_LIMIT, spline_weights
@@ -241,41 +241,9 @@ def references(motion: Motion, config: Config) -> list[FloatArray]:
         theta = kinematics.inverse(points)
         if config.motor == "torque":
             rates = np.gradient(theta, config.time_step, axis=0)
-            theta = np.hstack([theta, rates, gravity_torques(points)])
+            theta = np.hstack([theta, rates, PAPER_TPM.dynamics.gravity(theta)])
         episodes.append(theta)
     return episodes
-
-
-def gravity_torques(points: FloatArray, stride: int = 5) -> FloatArray:
-    """Motor torques (n, 3) N m that carry the weight of the mechanism, with P at (n, 3) m.
-
-    Virtual work: what the motors do along dtheta is what the potential energy U gains along
-    dP = J dtheta, so the torques are J^T grad U. They vary slowly: every ``stride`` rows are
-    computed, the others interpolated.
-    """
-    count, step = len(points), 1e-5
-    rows = np.unique(np.r_[0:count:stride, count - 1])
-    at = points[rows]
-    shifts = step * np.vstack([np.eye(3), -np.eye(3)])
-    energy = np.array([_potential(at + shift) for shift in shifts])
-    gradient = (energy[:3] - energy[3:]).T / (2 * step)
-    velocity = jacobian.velocity(kinematics.inverse(at))
-    torques = np.einsum("nij,ni->nj", velocity, gradient)
-    return np.column_stack([np.interp(np.arange(count), rows, torque) for torque in torques.T])
-
-
-def _potential(points: FloatArray) -> FloatArray:
-    """Potential energy (n,) J of the mechanism with P at (n, 3) m, paper frame."""
-    default = variants.all_variants()[0]
-    rows = [default.angles(theta) for theta in kinematics.inverse(points)]
-    angles = {name: np.array([row[name] for row in rows]) for name in rows[0]}
-    frames = variants.link_frames(default.mechanism, angles)
-    energy = np.zeros(len(points))
-    for link in default.mechanism.links[1:]:
-        origin, rotation = frames[link.name]
-        centre = origin + rotation @ link.centre_of_mass
-        energy -= link.mass * GRAVITY * centre[:, 2]  # paper's z points down
-    return energy
 
 
 # -- measuring ---------------------------------------------------------------------------------

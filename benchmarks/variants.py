@@ -213,54 +213,14 @@ def _welded(link: Link, mechanism: Mechanism, bar: tuple[str, Vector] | None) ->
     )
 
 
-# -- kinematics of a tree -----------------------------------------------------------------------
-
-
-def link_frames(
-    mechanism: Mechanism, angles: Mapping[str, ArrayLike]
-) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """Origin (..., 3) m and rotation (..., 3, 3) of every link in the paper frame.
-
-    Args:
-        mechanism: Its links.
-        angles: Joint name -> (...,) rad (m for slides).
-    """
-    shape = np.shape(next(iter(angles.values())))
-    identity = np.broadcast_to(np.eye(3), (*shape, 3, 3))
-    frames = {mechanism.links[0].name: (np.zeros((*shape, 3)), identity)}
-    for link in mechanism.links[1:]:
-        joint = link.joint
-        assert joint is not None
-        origin, rotation = frames[joint.parent]
-        value = np.asarray(angles[joint.name], dtype=np.float64)
-        at = origin + rotation @ np.asarray(joint.origin)
-        if joint.kind == "prismatic":
-            slide = value[..., None] * np.asarray(joint.axis)
-            frames[link.name] = at + (rotation @ slide[..., None])[..., 0], rotation
-        else:
-            frames[link.name] = at, rotation @ _turn(joint.axis, value)
-    return frames
-
-
-def _turn(axis: Vector, angle: FloatArray) -> FloatArray:
-    """Rodrigues' rotation about a unit axis, (..., 3, 3)."""
-    x, y, z = axis
-    k = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    sin, cos = np.sin(angle)[..., None, None], np.cos(angle)[..., None, None]
-    return np.asarray(np.eye(3) + sin * k + (1 - cos) * (k @ k))
-
-
 def gaps(mechanism: Mechanism, angles: Mapping[str, ArrayLike]) -> FloatArray:
     """Opening of every closure, (closures, ...) m."""
-    frames = link_frames(mechanism, angles)
-
-    def point(name: str, local: Vector) -> FloatArray:
-        origin, rotation = frames[name]
-        return np.asarray(origin + rotation @ np.asarray(local))
-
+    places = mechanism.places(angles)
     return np.stack(
         [
-            np.linalg.norm(point(c.link_a, c.point_a) - point(c.link_b, c.point_b), axis=-1)
+            np.linalg.norm(
+                places[c.link_a].point(c.point_a) - places[c.link_b].point(c.point_b), axis=-1
+            )
             for c in mechanism.closures
         ]
     )

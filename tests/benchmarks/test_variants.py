@@ -8,11 +8,11 @@ import fidelity_lab
 import gauss_seidel
 import numpy as np
 import pytest
-from fidelity_lab import Config, Rig, gravity_torques, measure, random_motion
+from fidelity_lab import Config, Rig, measure, random_motion
 from fidelity_long import Histogram
 from fidelity_sweep import pareto, sweep
 from machines import anywhere
-from variants import Variant, all_variants, gaps, link_frames
+from variants import Variant, all_variants, gaps
 
 from tpm_gym.kinematics import inverse
 from tpm_gym.mechanism import PAPER_TPM
@@ -48,14 +48,14 @@ def test_loops_close_and_the_platform_stands_as_in_the_default(variant: Variant)
         angles = variant.angles(theta)
         assert set(angles) == {link.joint.name for link in variant.mechanism.links[1:]}
         assert gaps(variant.mechanism, angles).max() < GAP
-        frames = link_frames(variant.mechanism, angles)
-        default = link_frames(VARIANTS[0].mechanism, VARIANTS[0].angles(theta))
+        frames = variant.mechanism.places(angles)
+        default = VARIANTS[0].mechanism.places(VARIANTS[0].angles(theta))
         for link in ("platform", "cup", "link_3p", "arm_2", "arm_5", "arm_12"):
             for found, expected in zip(frames[link], default[link], strict=True):
                 np.testing.assert_allclose(found, expected, rtol=0, atol=GAP)
         for rod in ("rod_4a", "rod_4b", "rod_11a", "rod_11b"):
             centres = [
-                f[rod][0] + f[rod][1] @ m.link(rod).centre_of_mass
+                f[rod].point(m.link(rod).centre_of_mass)
                 for f, m in ((frames, variant.mechanism), (default, VARIANTS[0].mechanism))
             ]
             np.testing.assert_allclose(*centres, rtol=0, atol=GAP)
@@ -169,10 +169,10 @@ def test_iterations_per_decade_of_a_known_matrix() -> None:
     assert found == pytest.approx(2 / -np.log10(c**2))
 
 
-def test_gravity_torques_hold_the_mechanism_in_the_engine() -> None:
-    """With the motors' torques of virtual work alone it hardly moves; without them it falls."""
-    point = np.array([(-0.1, 0.03, 0.75)])
-    theta, torques = inverse(point)[0], gravity_torques(point)[0]
+def test_torque_control_applies_what_is_fed_forward() -> None:
+    """With the torques that carry the weight alone it hardly moves; with less it falls."""
+    theta = inverse(np.array([-0.1, 0.03, 0.75]))
+    torques = PAPER_TPM.dynamics.gravity(theta)
     speeds = []
     for share in (1.0, 0.9):
         rig = Rig(Config("", "", motor="torque"))

@@ -19,15 +19,13 @@ from tpm_gym.kinematics.geometry import Geometry
 from tpm_gym.kinematics.modes import WorkingMode
 from tpm_gym.kinematics.workspace import assembly_of
 from tpm_gym.mechanism import tree
-from tpm_gym.mechanism.bodies import Joint, Link, Mechanism
+from tpm_gym.mechanism.bodies import Link, Mechanism
 
 Limit = Callable[[FloatArray, WorkingMode, Geometry], BoolArray]
 """From points (n, 3) m that are reached on a working mode, to which of them it allows, (n,)."""
 
 _SLENDER = 2.0  # times as long as wide
 _BLOCK = 4096
-
-Place = tuple[FloatArray, FloatArray]
 
 
 class Capsule(NamedTuple):
@@ -70,8 +68,8 @@ def clearance(points: FloatArray, branch: WorkingMode, geometry: Geometry) -> Fl
         for start in range(0, len(here), _BLOCK):
             rows = here[start : start + _BLOCK]
             joints = tree.joint_arrays(theta[rows], mode, geometry)
-            places = _places(mechanism, joints, len(rows))
-            ends = [tuple(_moved(places[p.link], end) for end in p[1:3]) for p in parts]
+            places = mechanism.places(joints)
+            ends = [tuple(map(places[part.link].point, part[1:3])) for part in parts]
             for i, j in pairs:
                 gap = _between(*ends[i], *ends[j]) - parts[i].radius - parts[j].radius
                 result[rows] = np.minimum(result[rows], gap)
@@ -110,36 +108,6 @@ def _unjoined(mechanism: Mechanism) -> set[frozenset[str]]:
     near = {frozenset((whole[one], whole[other])) for one, other in joined}
     every = {frozenset(pair) for pair in product(whole.values(), repeat=2)}
     return {pair for pair in every - near if len(pair) == 2}
-
-
-def _places(mechanism: Mechanism, joints: dict[str, FloatArray], count: int) -> dict[str, Place]:
-    """Orientation (n, 3, 3) and origin (n, 3) m of every link."""
-    base = mechanism.links[0].name
-    places = {base: (np.broadcast_to(np.eye(3), (count, 3, 3)), np.zeros((count, 3)))}
-    for link in mechanism.links[1:]:
-        joint = link.joint
-        assert joint is not None
-        turned, _ = places[joint.parent]
-        origin = _moved(places[joint.parent], np.asarray(joint.origin))
-        if joint.kind != "prismatic":
-            turned = turned @ _turn(joint, np.broadcast_to(joints[joint.name], count))
-        places[link.name] = turned, origin
-    return places
-
-
-def _turn(joint: Joint, angle: FloatArray) -> FloatArray:
-    """Rodrigues' formula, (n, 3, 3)."""
-    x, y, z = joint.axis
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    sin, cos = (np.asarray(f(angle))[:, None, None] for f in (np.sin, np.cos))
-    turned: FloatArray = np.eye(3) + sin * cross + (1 - cos) * cross @ cross
-    return turned
-
-
-def _moved(place: Place, point: FloatArray) -> FloatArray:
-    """A point (3,) of a link's frame in the paper's, (n, 3) m."""
-    turned, origin = place
-    return origin + turned @ point
 
 
 def _between(p1: FloatArray, q1: FloatArray, p2: FloatArray, q2: FloatArray) -> FloatArray:

@@ -40,10 +40,8 @@ from tpm_gym.arrays import FloatArray, Vector
 from tpm_gym.errors import SingularityError
 from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode
 from tpm_gym.kinematics.geometry import PAPER, Geometry
-from tpm_gym.mechanism.bodies import Mechanism
+from tpm_gym.mechanism.bodies import Mechanism, Place
 from tpm_gym.mechanism.tree import ACTUATED_JOINTS, build, joint_angles
-
-Frame = tuple[FloatArray, FloatArray]
 
 # Singular values up to the first fraction of the largest are zeros, from the second on they are
 # not, and in between the rank is in doubt. Rounding leaves zeros of some 1e-16.
@@ -79,19 +77,21 @@ def describe(
 ) -> Structure:
     """Axes and rods of :mod:`tpm_gym.mechanism.tree` at theta (3,) rad, named as in the paper."""
     mechanism = build(geometry)
-    frames = _frames(mechanism, joint_angles(theta, branch, geometry))
+    places = mechanism.places(joint_angles(theta, branch, geometry))
     joints = {link.joint.name: link for link in mechanism.links if link.joint}
-    ends = {c.name: _place(frames, c.link_b, c.point_b) for c in mechanism.closures}
+    ends = {c.name: places[c.link_b].point(c.point_b) for c in mechanism.closures}
 
     def turning(*names: str) -> tuple[Unit, ...]:
         return tuple(
-            revolute(name, _axis(mechanism, frames, link), frames[link][1], name in ACTUATED_JOINTS)
+            revolute(
+                name, _axis(mechanism, places, link), places[link].origin, name in ACTUATED_JOINTS
+            )
             for name, link in ((name, joints[name].name) for name in names)
         )
 
     def sides(near: str, far: str, other: str) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Short link, rod, and middle of the far short link of a parallelogram."""
-        foot = frames[joints[near].name][1]
+        foot = places[joints[near].name].origin
         return ends[far] - ends[other], ends[far] - foot, (ends[far] + ends[other]) / 2
 
     four_s = parallelogram_4s("Pa(4S)", *sides("Sa_swing", "Sc", "Sd"))
@@ -104,7 +104,7 @@ def describe(
         ),
         wrist=Chain("wrist", turning("R12", "R13")),
         link_3p=four_s.point,
-        platform=frames[joints["R13"].name][1],
+        platform=places[joints["R13"].name].origin,
     )
 
 
@@ -186,10 +186,10 @@ def mobility_at(angles: Mapping[str, float], geometry: Geometry = PAPER) -> Mobi
     _, values, right = np.linalg.svd(jacobian)
     rank = _rank(values)
     free = right[rank:].T  # columns: joint rates that keep the loops closed
-    frames = _frames(mechanism, angles)
-    point = _place(frames, mechanism.platform, mechanism.point_p)
+    places = mechanism.places(angles)
+    point = places[mechanism.platform].point(mechanism.point_p)
     joints = _moving_joints(mechanism)
-    linear, angular = _rates(mechanism, frames, mechanism.platform, point)
+    linear, angular = _rates(mechanism, places, mechanism.platform, point)
     motors = np.eye(len(joints))[[joints.index(name) for name in ACTUATED_JOINTS]]
     seen = np.linalg.svd(np.concatenate([linear, angular, motors]) @ free, compute_uv=False)
     dof = _rank(seen)
@@ -210,10 +210,10 @@ def closure_jacobian(mechanism: Mechanism, angles: Mapping[str, float]) -> Float
     (x, y, z of ``point_a`` - ``point_b``), columns in the order of ``mechanism.links``. ``angles``
     holds every joint that turns, by name, in rad.
     """
-    frames = _frames(mechanism, angles)
+    places = mechanism.places(angles)
 
     def velocity(link: str, point: Vector) -> FloatArray:
-        return _rates(mechanism, frames, link, _place(frames, link, point))[0]
+        return _rates(mechanism, places, link, places[link].point(point))[0]
 
     return np.concatenate(
         [velocity(c.link_a, c.point_a) - velocity(c.link_b, c.point_b) for c in mechanism.closures]
@@ -237,52 +237,23 @@ def _moving_joints(mechanism: Mechanism) -> list[str]:
     return [joint.name for joint in joints if joint and joint.kind != "prismatic"]
 
 
-def _frames(mechanism: Mechanism, angles: Mapping[str, float]) -> dict[str, Frame]:
-    """Rotation (3, 3) and origin (3,) m of every link."""
-    frames: dict[str, Frame] = {}
-    for link in mechanism.links:
-        joint = link.joint
-        if joint is None:
-            frames[link.name] = (np.eye(3), np.zeros(3))
-            continue
-        rotation = frames[joint.parent][0]
-        if joint.kind != "prismatic":
-            rotation = rotation @ _turn(joint.axis, angles[joint.name])
-        frames[link.name] = (rotation, _place(frames, joint.parent, joint.origin))
-    return frames
-
-
-def _turn(axis: Vector, angle: float) -> FloatArray:
-    """Rotation matrix about a unit axis (Rodrigues)."""
-    cross = np.cross(np.eye(3), axis)
-    turned: FloatArray = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-    return turned
-
-
-def _place(frames: Mapping[str, Frame], link: str, point: Vector) -> FloatArray:
-    """A point of a link in the paper frame, (3,) m."""
-    rotation, origin = frames[link]
-    placed: FloatArray = origin + rotation @ np.asarray(point)
-    return placed
-
-
-def _axis(mechanism: Mechanism, frames: Mapping[str, Frame], link: str) -> FloatArray:
+def _axis(mechanism: Mechanism, places: Mapping[str, Place], link: str) -> FloatArray:
     """Axis of the joint that holds a link, in the paper frame; a joint does not turn its axis."""
     joint = mechanism.link(link).joint
-    axis: FloatArray = frames[link][0] @ np.asarray(joint.axis if joint else (0.0, 0.0, 0.0))
+    axis: FloatArray = places[link].rotation @ np.asarray(joint.axis if joint else (0.0, 0.0, 0.0))
     return axis
 
 
 def _rates(
-    mechanism: Mechanism, frames: Mapping[str, Frame], link: str, point: FloatArray
+    mechanism: Mechanism, places: Mapping[str, Place], link: str, point: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Velocity of a point of a link (3, n) m/rad, and its angular velocity (3, n), per joint."""
     joints = _moving_joints(mechanism)
     linear, angular = np.zeros((3, len(joints))), np.zeros((3, len(joints)))
     while (joint := mechanism.link(link).joint) is not None:
         if joint.kind != "prismatic":
-            column, axis = joints.index(joint.name), _axis(mechanism, frames, link)
+            column, axis = joints.index(joint.name), _axis(mechanism, places, link)
             angular[:, column] = axis
-            linear[:, column] = np.cross(axis, point - frames[link][1])
+            linear[:, column] = np.cross(axis, point - places[link].origin)
         link = joint.parent
     return linear, angular

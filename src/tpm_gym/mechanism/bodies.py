@@ -5,15 +5,17 @@ Units: metres, radians, kilograms.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tpm_gym.arrays import FloatArray, Vector
 
-__all__ = ["ALUMINIUM", "STEEL", "Closure", "Joint", "Link", "Mechanism", "Solid"]
+__all__ = ["ALUMINIUM", "STEEL", "Closure", "Joint", "Link", "Mechanism", "Place", "Solid"]
 
 ALUMINIUM, STEEL = 2700.0, 7850.0  # kg/m^3
 
@@ -162,6 +164,23 @@ class Closure:
     point_b: Vector
 
 
+class Place(NamedTuple):
+    """Where a link is.
+
+    Attributes:
+        origin: (..., 3) m.
+        rotation: (..., 3, 3).
+    """
+
+    origin: FloatArray
+    rotation: FloatArray
+
+    def point(self, point: ArrayLike) -> FloatArray:
+        """A point of the link's frame, as (..., 3) m."""
+        placed: FloatArray = self.origin + self.rotation @ np.asarray(point)
+        return placed
+
+
 @dataclass(frozen=True)
 class Mechanism:
     """Everything an engine needs to build the mechanism.
@@ -203,6 +222,28 @@ class Mechanism:
         joints = {link.joint.name: link.joint for link in self.links if link.joint}
         return tuple(joints[name] for name in self.actuated)
 
+    def places(self, joints: Mapping[str, ArrayLike]) -> dict[str, Place]:
+        """Where all links are, in the base's frame.
+
+        Args:
+            joints: Position (...,) of each joint by name, rad or m; slides may be left out.
+        """
+        shape = np.shape(next(iter(joints.values())))
+        identity = np.broadcast_to(np.eye(3), (*shape, 3, 3))
+        found = {self.links[0].name: Place(np.zeros((*shape, 3)), identity)}
+        for link in self.links[1:]:
+            joint = link.joint
+            assert joint is not None
+            parent = found[joint.parent]
+            origin, rotation = parent.point(joint.origin), parent.rotation
+            if joint.kind == "prismatic":
+                slide = np.asarray(joints.get(joint.name, 0.0))[..., None]
+                origin = origin + slide * (rotation @ np.asarray(joint.axis))
+            else:
+                rotation = rotation @ _rotation(joint.axis, np.asarray(joints[joint.name]))
+            found[link.name] = Place(origin, rotation)
+        return found
+
     def legs(self) -> tuple[Mechanism, ...]:
         """The spanning tree taken apart at the base: one tree for each arm and what hangs on it."""
         arm: dict[str, str] = {}
@@ -216,3 +257,12 @@ class Mechanism:
             )
             for name in dict.fromkeys(arm.values())
         )
+
+
+def _rotation(axis: Vector, angle: FloatArray) -> FloatArray:
+    """Rodrigues' formula, (..., 3, 3)."""
+    x, y, z = axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    sin, cos = np.sin(angle)[..., None, None], np.cos(angle)[..., None, None]
+    turned: FloatArray = np.eye(3) + sin * cross + (1 - cos) * cross @ cross
+    return turned

@@ -16,7 +16,7 @@ from collections.abc import Callable
 import numpy as np
 
 from tpm_gym.arrays import FloatArray, Vector
-from tpm_gym.mechanism.bodies import Joint, Mechanism
+from tpm_gym.mechanism.bodies import Mechanism
 
 _STEP = 1e-5  # rad or m
 _TIME = 1e-5  # s
@@ -69,25 +69,6 @@ def _second_moments(mechanism: Mechanism) -> FloatArray:
 
 def _frames(mechanism: Mechanism, joints: dict[str, float]) -> FloatArray:
     """[R | centre of mass] of the moving links, (links, 3, 4), in the machine's frame."""
-    places = {mechanism.links[0].name: (np.eye(3), np.zeros(3))}
-    found = []
-    for link in mechanism.links[1:]:
-        joint = link.joint
-        assert joint is not None
-        turned, origin = places[joint.parent]
-        origin = origin + turned @ joint.origin
-        if joint.kind == "prismatic":
-            origin = origin + joints[joint.name] * (turned @ joint.axis)
-        else:
-            turned = turned @ _rotation(joint, joints[joint.name])
-        places[link.name] = turned, origin
-        found.append(np.column_stack([turned, origin + turned @ link.centre_of_mass]))
-    return np.array(found)
-
-
-def _rotation(joint: Joint, angle: float) -> FloatArray:
-    """Rodrigues' formula."""
-    x, y, z = joint.axis
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    turned: FloatArray = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-    return turned
+    places = mechanism.places(joints)
+    moving = [(places[link.name], link.centre_of_mass) for link in mechanism.links[1:]]
+    return np.array([np.column_stack([at.rotation, at.point(centre)]) for at, centre in moving])
