@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from engine_report import table
 from fidelity_sweep import QUANTITIES, Result, pareto
+from machine import ROOT, fill
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -17,11 +19,9 @@ from matplotlib.ticker import NullLocator
 from tpm_gym.learning import figure_style as style
 from tpm_gym.learning.figure_style import BLACK, BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION
 
-ROOT = Path(__file__).resolve().parents[1]
 JSON = ROOT / "runs" / "fidelity.json"
 PICTURE = ROOT / "docs" / "images" / "fidelity.png"
 PAGE = ROOT / "docs" / "fidelity.md"
-BEGIN, END = "<!-- sweep: begin -->", "<!-- sweep: end -->"
 
 MM = 1e3
 UNITS = {"gap": MM, "fk": MM, "fk_near": MM, "tilt": float(np.rad2deg(1.0)), "tracking": MM}
@@ -98,18 +98,14 @@ def read_json(path: Path = JSON) -> tuple[list[Result], dict[str, Any]]:
 
 def write_page(results: Sequence[Result], machine: str) -> None:
     """Put the table between the marks of docs/fidelity.md."""
-    text = PAGE.read_text(encoding="utf-8")
-    before, rest = text.split(BEGIN)
-    _, after = rest.split(END)
-    lines = ["| " + " | ".join(COLUMNS) + " |", "|---" * len(COLUMNS) + "|"]
-    for result in results:
-        row = cells(result)
-        if result.config.family == "default":
-            row = [f"**{cell}**" for cell in row]
-        lines.append("| " + " | ".join(row) + " |")
+    rows = [
+        [f"**{cell}**" for cell in cells(result)]
+        if result.config.family == "default"
+        else cells(result)
+        for result in results
+    ]
     note = f"`make bench-fidelity` on {machine}. {LEGEND}"
-    table = "\n".join([BEGIN, note, "", *lines, END])
-    PAGE.write_text(before + table + after, encoding="utf-8")
+    fill(PAGE, "sweep", [note, "", *table(list(COLUMNS), rows)])
 
 
 # -- picture -----------------------------------------------------------------------------------
