@@ -30,9 +30,8 @@ from tpm_gym.arrays import FloatArray
 __all__ = ["Floor", "Tape", "record", "recording", "replay"]
 
 STEP = "stepSimulation"
-MOTORS = ("setJointMotorControl2", "setJointMotorControlArray")
-GRASP = ("createConstraint", "changeConstraint", "removeConstraint", "setCollisionFilterPair")
-CONTACT = (*GRASP, "changeDynamics")
+MOTOR = "setJointMotorControl2"
+CONTACT = ("createConstraint", "changeConstraint", "removeConstraint", "changeDynamics")
 
 _SAME = 1e-12
 """Rad or m. Bullet repeats a puck at rest to 2e-18 m, not always to the last bit."""
@@ -87,7 +86,7 @@ class Recorder:
 
         def noting(*arguments: Any, **options: Any) -> Any:
             result = function(*arguments, **options)
-            if name == MOTORS[0]:
+            if name == MOTOR:
                 arguments = arguments[:9]  # the tenth is the client's number
             kept = {key: value for key, value in options.items() if key != "physicsClientId"}
             self.calls.append(Call(name, arguments, kept, result))
@@ -104,7 +103,7 @@ class Recorder:
 @contextmanager
 def recording(recorder: Recorder) -> Iterator[None]:
     """Put the recorder's functions in the place of the engine's."""
-    real = {name: getattr(pybullet, name) for name in (STEP, *MOTORS, *CONTACT)}
+    real = {name: getattr(pybullet, name) for name in (STEP, MOTOR, *CONTACT)}
     for name, function in real.items():
         setattr(pybullet, name, recorder.wrap(name, function))
     try:
@@ -182,7 +181,6 @@ class _Player:
         unwrapped: Any = env.unwrapped
         self._number = unwrapped.simulation.engine.client.number
         self._constraints: dict[int, int] = {}  # number when recorded -> number here
-        self._pair: tuple[Any, ...] | None = None
 
     def bind(self, call: Call) -> Callable[[], Any]:
         """The call, ready to be made on this client."""
@@ -206,17 +204,12 @@ class _Player:
                     number = self._constraints[recorded]
                 self.bind(Call(call.name, (number, *others), call.options, None))()
             else:
-                if call.name == "setCollisionFilterPair":
-                    self._pair = call.arguments
                 self.bind(call)()
 
     def let_go(self) -> None:
         """Leave the environment without a grasp that it does not know of."""
         for number in self._constraints.values():
             pybullet.removeConstraint(number, physicsClientId=self._number)
-        if self._constraints and self._pair is not None:
-            *pair, _ = self._pair
-            pybullet.setCollisionFilterPair(*pair, 1, physicsClientId=self._number)
         self._constraints.clear()
 
 
