@@ -12,6 +12,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from tpm_gym import load_policy  # registers the ids as well
+from tpm_gym.simulation.state import CONTROL_PERIOD
 
 DOCS = Path(__file__).resolve().parent
 IMAGES = DOCS / "images"
@@ -50,7 +51,7 @@ def strip(pictures: dict[int, Image.Image]) -> Image.Image:
         cropped = picture.crop((int(left), int(top), int(right), int(bottom)))
         x = column * (width + gap)
         sheet.paste(cropped.resize((width, height), Image.Resampling.LANCZOS), (x, 0))
-        text = f"{0.04 * step:.2f} s: {FRAMES[step]}"
+        text = f"{CONTROL_PERIOD * step:.2f} s: {FRAMES[step]}"
         draw.text((x + width / 2, height + caption / 2), text, "black", font, anchor="mm")
     return sheet
 

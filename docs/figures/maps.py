@@ -8,18 +8,16 @@ from matplotlib.colors import PowerNorm, to_rgba
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from numpy.typing import NDArray
 
 from figures.sections import MM, heading, mode_name, outline_task_region, section_axes
 from figures.zero_sets import Section, reach_margin
+from tpm_gym.arrays import FloatArray
 from tpm_gym.kinematics import ELBOWS_OUT
 from tpm_gym.kinematics.geometry import PAPER
 from tpm_gym.kinematics.workspace import conditioning_at
 from tpm_gym.learning import figure_style as style
 from tpm_gym.learning.figure_style import BLACK, BLUE, GREEN, OUTLINE, VERMILLION
 from tpm_gym.mechanism import PAPER_TPM
-
-FloatArray = NDArray[np.float64]
 
 HEIGHTS = (0.005, 0.012, 0.025, 0.040, 0.048)  # values of y, m
 _SAFE = PAPER_TPM.safe_conditioning

@@ -9,11 +9,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.patheffects import withStroke
-from numpy.typing import NDArray
 
 from figures.postures import STROKES
 from figures.sections import MM, heading, outline_task_region, section_axes
 from figures.zero_sets import Section, reach_margin
+from tpm_gym.arrays import FloatArray
 from tpm_gym.kinematics import (
     DEFAULT_ASSEMBLY,
     RotatedPostures,
@@ -26,8 +26,6 @@ from tpm_gym.kinematics.rotated import inverse_rotated, link3_rotated, transitio
 from tpm_gym.learning import figure_style as style
 from tpm_gym.learning.figure_style import BLACK, BLUE, OUTLINE, PURPLE, VERMILLION
 from tpm_gym.mechanism import PAPER_TPM
-
-FloatArray = NDArray[np.float64]
 
 THETA = np.deg2rad([90.0, 180.0, 100.0])  # of the drawn postures, and of the path
 HEIGHT = 0.025  # m, value of y of the section

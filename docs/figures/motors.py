@@ -5,18 +5,16 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from figures.parameters import DRAWN, POINT, project
 from figures.postures import STROKES
 from figures.skeleton import Skeleton, skeleton
 from tpm_gym.analysis.decoupling import link_velocity, motors, over, shares
+from tpm_gym.arrays import FloatArray
 from tpm_gym.kinematics import DEFAULT_ASSEMBLY, ELBOWS_OUT, forward, inverse
 from tpm_gym.learning import figure_style as style
 from tpm_gym.learning.figure_style import BLACK
 from tpm_gym.mechanism import PAPER_TPM
-
-FloatArray = NDArray[np.float64]
 
 TURNS = np.deg2rad([-4.0, 12.0, 8.0]) * np.eye(3)  # towards where all legs reach
 _ASSEMBLY = DEFAULT_ASSEMBLY  # of the posture of the labelled figure

@@ -7,23 +7,22 @@ from collections.abc import Callable
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from figures.postures import STROKES, legend
-from figures.skeleton import Skeleton, skeleton
+from figures.skeleton import Skeleton, seen_from, skeleton
+from tpm_gym.arrays import FloatArray
 from tpm_gym.kinematics import ELBOWS_OUT
 from tpm_gym.kinematics.geometry import Geometry
 from tpm_gym.learning import figure_style as style
 from tpm_gym.learning.figure_style import BLACK
 
-FloatArray = NDArray[np.float64]
 View = Callable[[FloatArray], FloatArray]
 Offset = tuple[float, float]
 
 # The case study's l2, l6 and l7 are too short for labels.
 DRAWN = Geometry(l1=0.30, l2=0.14, l3=0.33, l4=0.66, l5=0.085, l6=0.085, l7=0.21)
 POINT = np.array([0.24, 0.14, 0.82])
-_AZIMUTH, _ELEVATION = np.deg2rad(-62.0), np.deg2rad(20.0)  # of the eye; z points up
+_AZIMUTH = np.deg2rad(-62.0)  # of the eye; z points up
 _THIN = {"color": "0.4", "linewidth": 0.7}
 X, Y, Z = np.eye(3)
 
@@ -71,12 +70,8 @@ _PLAN_LENGTHS: dict[str, tuple[str, Offset]] = {
 
 
 def project(points: FloatArray) -> FloatArray:
-    """Parallel projection of points (..., 3) m to (..., 2) m, z up; leg 1 is at the back."""
-    sin_a, cos_a = np.sin(_AZIMUTH), np.cos(_AZIMUTH)
-    sin_e, cos_e = np.sin(_ELEVATION), np.cos(_ELEVATION)
-    right = np.array([-sin_a, cos_a, 0.0])
-    up = np.array([-sin_e * cos_a, -sin_e * sin_a, cos_e])
-    return np.stack([points @ right, points @ up], axis=-1)
+    """Points (..., 3) m as (..., 2) m, z up; leg 1 is at the back."""
+    return seen_from(_AZIMUTH, points)
 
 
 def from_above(points: FloatArray) -> FloatArray:

@@ -6,18 +6,16 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from numpy.typing import NDArray
 
 from figures.sections import MM, heading
-from figures.skeleton import skeleton
+from figures.skeleton import seen_from, skeleton
+from tpm_gym.arrays import FloatArray
 from tpm_gym.kinematics import ELBOWS_OUT, WorkingMode
 from tpm_gym.learning import figure_style as style
 from tpm_gym.learning.figure_style import BLACK, BLUE, GREEN, ORANGE, PURPLE, VERMILLION
 
-FloatArray = NDArray[np.float64]
-
 POINT = np.array([-0.020, 0.025, 0.750])  # m; the middle of what the environments use
-_AZIMUTH, _ELEVATION = np.deg2rad(-58.0), np.deg2rad(20.0)  # of the eye, hanging machine
+_AZIMUTH = np.deg2rad(-58.0)  # of the eye, hanging machine
 
 # Link -> colour and width. The offsets l6 are too short to be seen.
 _LEG1, _LEG2, _LEG3 = VERMILLION, GREEN, BLUE
@@ -40,16 +38,11 @@ STROKES: dict[str, tuple[str, float]] = {
 
 
 def project(points: FloatArray) -> FloatArray:
-    """Parallel projection of points (..., 3) m to (..., 2) m, hanging: paper z points down.
+    """Points (..., 3) m as (..., 2) m, hanging: paper z points down.
 
     The eye is on the side of leg 1, a little to the right of it.
     """
-    sin_a, cos_a = np.sin(_AZIMUTH), np.cos(_AZIMUTH)
-    sin_e, cos_e = np.sin(_ELEVATION), np.cos(_ELEVATION)
-    hanging = points * (1.0, -1.0, -1.0)  # a half turn about x
-    right = np.array([-sin_a, cos_a, 0.0])
-    up = np.array([-sin_e * cos_a, -sin_e * sin_a, cos_e])
-    return np.stack([hanging @ right, hanging @ up], axis=-1)
+    return seen_from(_AZIMUTH, points * (1.0, -1.0, -1.0))  # a half turn about x
 
 
 def postures_figure() -> Figure:

@@ -8,19 +8,17 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from numpy.typing import NDArray
 
 from figures.sections import MM, heading, mode_name, outline_task_region, section_axes
 from figures.zero_sets import Section, parallel_lines, reach_margin, sheets
 from tpm_gym.analysis.aspects import Aspect, aspects
 from tpm_gym.analysis.limits import clear_of_links, within_stops
+from tpm_gym.arrays import FloatArray
 from tpm_gym.kinematics import ELBOWS_OUT, inverse_all
 from tpm_gym.kinematics.geometry import PAPER
 from tpm_gym.learning import figure_style as style
 from tpm_gym.learning.figure_style import BLACK, BLUE, GREEN, ORANGE, PURPLE
 from tpm_gym.mechanism import PAPER_TPM
-
-FloatArray = NDArray[np.float64]
 
 SHAPE = (200, 12, 260)
 # Signs of the second and third factor of Eq. (16) -> colour; paler where rods 4 lead back to the

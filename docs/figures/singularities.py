@@ -11,7 +11,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from mpl_toolkits.mplot3d import Axes3D
-from numpy.typing import NDArray
 
 from figures import surfaces
 from figures.sections import MM, heading, mode_name, outline_task_region, section_axes
@@ -24,6 +23,7 @@ from figures.zero_sets import (
     serial_squares,
     sheets,
 )
+from tpm_gym.arrays import BoolArray, FloatArray
 from tpm_gym.kinematics import ELBOWS_OUT, WORKING_MODES
 from tpm_gym.kinematics.geometry import PAPER
 from tpm_gym.learning import figure_style as style
@@ -38,9 +38,6 @@ from tpm_gym.learning.figure_style import (
     VERMILLION,
 )
 from tpm_gym.mechanism import PAPER_TPM
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 PARALLEL = (
     (BLUE, "$\\sin\\beta = 0$:\nlink 7 lies along x; the plane y = 0"),

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tpm_gym.arrays import FloatArray
 from tpm_gym.kinematics import WorkingMode, inverse_all
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 
-FloatArray = NDArray[np.float64]
+_ELEVATION = np.deg2rad(20.0)  # of the eye
 
 
 @dataclass(frozen=True)
@@ -87,3 +87,12 @@ def skeleton(position: FloatArray, mode: WorkingMode, geometry: Geometry = PAPER
     d3 = f1 + (2 * g.l2, 0.0, 0.0)
     c = np.stack([d1 - up, d1 - up - (2 * g.l5, 0.0, 0.0), d3 - up], axis=-2)
     return Skeleton(pivots, pivots + along, c, d1, e1, f1, d3, theta, geometry)
+
+
+def seen_from(azimuth: float, points: FloatArray) -> FloatArray:
+    """Parallel projection of points (..., 3) m to (..., 2) m, from an eye (rad) above the level."""
+    sin_a, cos_a = np.sin(azimuth), np.cos(azimuth)
+    sin_e, cos_e = np.sin(_ELEVATION), np.cos(_ELEVATION)
+    right = np.array([-sin_a, cos_a, 0.0])
+    up = np.array([-sin_e * cos_a, -sin_e * sin_a, cos_e])
+    return np.stack([points @ right, points @ up], axis=-1)

@@ -14,14 +14,11 @@ import numpy as np
 from matplotlib.colors import to_rgb
 from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
-from numpy.typing import NDArray
 
 from figures.sections import MM
 from figures.zero_sets import reach_margin
+from tpm_gym.arrays import BoolArray, FloatArray
 from tpm_gym.kinematics.geometry import PAPER
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 STRETCH = 6.0  # y is drawn this many times too long: the workspace is a disc 100 mm thick
 _LIGHT = np.array([-0.35, -0.75, 0.56])

@@ -14,14 +14,12 @@ from dataclasses import dataclass
 
 import contourpy
 import numpy as np
-from numpy.typing import NDArray
 
 from tpm_gym.analysis.singularity import factors_at
+from tpm_gym.arrays import BoolArray, FloatArray
 from tpm_gym.kinematics import WorkingMode
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 Field = Callable[[FloatArray], FloatArray]
 
 _HALVINGS = 40  # of a grid edge of about 1 cm: to the last digit of a double
