@@ -18,12 +18,17 @@ from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.tpm import PAPER_TPM, WIDE_TPM
 from tpm_gym.tasks import PickAndPlace, Reach, Task
 from tpm_gym.tasks.rewards import distance
-from tpm_gym.tasks.sampling import APART, BAND, line_in_joints, line_in_space
+from tpm_gym.tasks.sampling import APART, BAND, line_in_joints
 
 SAFE = PAPER_TPM.safe_conditioning
 PUCK = PickAndPlace.puck
 ON_TABLE = PUCK.height / 2
 KINDS = [Reach, PickAndPlace]
+
+
+def line_in_space(start: FloatArray, end: FloatArray) -> FloatArray:
+    """Conditioning (33, ...) along the straight line of P."""
+    return PAPER_TPM.conditioning_at(np.linspace(start, end, 33))
 
 
 @cache
@@ -84,7 +89,7 @@ def test_the_line_in_joints_leads_beyond_the_threshold_and_that_in_space_along_i
     assert unsafe.any(axis=0).all()
     # With a puck both ends are at the threshold, and most of the way lies beyond.
     assert unsafe.mean() > (0.6 if kind is PickAndPlace else 0.1)
-    in_space = line_in_space(PAPER_TPM, starts, goals)
+    in_space = line_in_space(starts, goals)
     assert (in_space >= SAFE - 1e-9).all()
     assert (in_space.min(axis=0) < SAFE + BAND).all()
 
@@ -96,12 +101,12 @@ def test_straight_lines_in_space_between_safe_points_stay_safe() -> None:
     safe = points[PAPER_TPM.conditioning_at(points) >= SAFE]
     half = len(safe) // 2
     assert half > 1000
-    assert (line_in_space(PAPER_TPM, safe[:half], safe[half : 2 * half]) >= SAFE).all()
+    assert (line_in_space(safe[:half], safe[half : 2 * half]) >= SAFE).all()
 
 
 def test_lines_start_and_end_where_they_should() -> None:
     pair = np.array([PAPER_TPM.home, [0.05, 0.025, 0.85]])
-    for line in (line_in_space(PAPER_TPM, *pair), line_in_joints(PAPER_TPM, *pair)):
+    for line in (line_in_space(*pair), line_in_joints(PAPER_TPM, *pair)):
         np.testing.assert_allclose(line[[0, -1]], PAPER_TPM.conditioning_at(pair), rtol=1e-9)
 
 

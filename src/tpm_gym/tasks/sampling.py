@@ -31,7 +31,6 @@ __all__ = [
     "apart_from",
     "apart_from_each",
     "line_in_joints",
-    "line_in_space",
     "tempting",
 ]
 
@@ -123,24 +122,16 @@ def tempting(
     raise ConfigurationError("goals", "tempting", valid)
 
 
-def line_in_space(machine: Machine, start: ArrayLike, end: ArrayLike) -> FloatArray:
-    """Conditioning (33, ...) along the straight line of P from ``start`` (..., 3) to ``end``."""
-    return machine.conditioning_at(_between(np.asarray(start), np.asarray(end)))
-
-
 def line_in_joints(machine: Machine, start: ArrayLike, end: ArrayLike) -> FloatArray:
-    """The same for the straight line of the joints; 0 where they cannot be assembled."""
+    """Conditioning (33, ...) along the straight line of the joints between points (..., 3) of P.
+
+    0 where they cannot be assembled.
+    """
     ends = np.asarray([start, end], dtype=np.float64)
     flat = [machine.inverse((x, y, z)) for x, y, z in ends.reshape(-1, 3).tolist()]
     first, last = np.array(flat).reshape(ends.shape)
-    return machine.conditioning(_between(first, last))
-
-
-def _between(first: FloatArray, last: FloatArray) -> FloatArray:
-    """Points (33, ..., 3) of a straight line."""
     fractions = _FRACTIONS.reshape(-1, *(1,) * first.ndim)
-    line: FloatArray = first + fractions * (last - first)
-    return line
+    return machine.conditioning(first + fractions * (last - first))
 
 
 def _at_the_threshold(rng: np.random.Generator, machine: Machine, region: Region) -> FloatArray:
