@@ -65,9 +65,9 @@ class Inertia(NamedTuple):
 
 
 class _Bar(NamedTuple):
-    near: Numbers
-    couple: Numbers
-    far: Numbers
+    near: float
+    couple: float
+    far: float
 
     def __add__(self, other: _Bar) -> _Bar:  # type: ignore[override]
         """Two bars between the same points."""
@@ -77,16 +77,16 @@ class _Bar(NamedTuple):
 def inertia_of(
     mechanism: Mechanism,
     geometry: Geometry,
-    link_masses: Sequence[Numbers] = (),
-    payload: Numbers = 0.0,
+    link_masses: Sequence[float] = (),
+    payload: float = 0.0,
 ) -> Inertia:
     """The constants of the mechanism of :func:`tpm_gym.mechanism.tree.build`.
 
     Args:
         mechanism: Its bodies.
         geometry: Its lengths.
-        link_masses: Factors of mass and inertia, one for each link but the base, each a number or
-            an array; empty if all are one.
+        link_masses: Factors of mass and inertia, one for each link but the base; empty if all are
+            one.
         payload: What the cup carries, kg.
 
     Raises:
@@ -133,7 +133,7 @@ def inertia_of(
 class _Bodies:
     """The links, with their factors; remembers which were asked for."""
 
-    def __init__(self, mechanism: Mechanism, factors: Sequence[Numbers]) -> None:
+    def __init__(self, mechanism: Mechanism, factors: Sequence[float]) -> None:
         moving = mechanism.links[1:]
         if len(factors) not in (0, len(moving)):
             valid = f"one factor for each of the {len(moving)} moving links, or none"
@@ -147,14 +147,14 @@ class _Bodies:
         if left:
             raise ConfigurationError("mechanism", left, "the links of mechanism.tree.build alone")
 
-    def mass(self, name: str) -> Numbers:
+    def mass(self, name: str) -> float:
         return self._factors[name] * self._link(name).mass
 
-    def moment(self, name: str, axis: int) -> Numbers:
+    def moment(self, name: str, axis: int) -> float:
         """About the axis through the centre of mass, kg m^2."""
         return self._factors[name] * float(self._link(name).inertia[axis, axis])
 
-    def shaft(self, name: str, axis: int) -> tuple[Numbers, Numbers]:
+    def shaft(self, name: str, axis: int) -> tuple[float, float]:
         """Mass, and moment about its own axis, of a body with its centre on it."""
         self._require_on_axis(name, [k for k in (X, Y, Z) if k != axis])
         return self.mass(name), self.moment(name, axis)
@@ -191,6 +191,6 @@ class _Bodies:
         return self._links[name]
 
 
-def _three(values: list[Numbers]) -> tuple[Numbers, Numbers, Numbers]:
+def _three(values: list[float]) -> tuple[float, float, float]:
     one, two, three = values
     return one, two, three
