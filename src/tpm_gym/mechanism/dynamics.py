@@ -49,9 +49,11 @@ from tpm_gym.mechanism import tree
 from tpm_gym.mechanism.inertia import Inertia, Swing, inertia_of
 from tpm_gym.mechanism.mount import GRAVITY
 
+SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+"""Where a symmetric matrix has the numbers of its upper triangle, by rows."""
+
 _VECTOR = np.arange(3)
 _MATRIX = np.arange(9).reshape(3, 3)
-_SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 _CHECKS = 4  # columns before the results: whether it is not assembled, and the factors of det A
 _REST = (0.0, 0.0, 0.0)
 _UNITS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -384,7 +386,7 @@ class Dynamics:
 
     def mass_matrix(self, theta: ArrayLike) -> FloatArray:
         """The inertia that the motors feel, (..., 3, 3) kg m^2: symmetric and positive."""
-        return self._rows(self._masses, (theta,), _SYMMETRIC)[0]
+        return self._rows(self._masses, (theta,), SYMMETRIC)[0]
 
     def coriolis(self, theta: ArrayLike, theta_dot: ArrayLike) -> FloatArray:
         """C (..., 3, 3) kg m^2/s, of Christoffel's symbols: M' - 2 C is skew."""

@@ -12,14 +12,13 @@ from typing import Protocol
 import numpy as np
 
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray
-from tpm_gym.mechanism.dynamics import solve
+from tpm_gym.mechanism.dynamics import SYMMETRIC, solve
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.drives import Gains, Memory, Reference, Servo, wanted
 from tpm_gym.simulation.randomisation import NOMINAL, Plant
 
 __all__ = ["Drive", "IdealDrives", "ServoDrives", "limited", "resisted"]
 
-_FULL = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # where a matrix has its upper triangle
 _SIGNS = np.array(list(product((0.0, 1.0, -1.0), repeat=3))).T[:, :, None]  # (3, 27, 1)
 
 
@@ -137,7 +136,7 @@ class ServoDrives:
         units = np.eye(3)[:, :, None]
         inverse = [np.stack(np.broadcast_arrays(*solve(tuple(braced), u))) for u in units]
         a, b, c = self._stiffness
-        self._gains = Gains((a, b, c), damping, mass[_FULL], inverse, step)
+        self._gains = Gains((a, b, c), damping, mass[SYMMETRIC], inverse, step)
 
     def _inertia(self, theta: FloatArray) -> FloatArray:
         """(6, n) kg m^2; that at home where a machine, its lengths being off, cannot be there."""
