@@ -23,7 +23,6 @@ import argparse
 import sys
 import time
 from collections.abc import Sequence
-from contextlib import closing
 from typing import Any
 
 import engine_report
@@ -83,16 +82,15 @@ def costs(engines: Sequence[str], rounds: int) -> dict[str, list[float]]:
     for number in range(rounds):
         actions = rng.uniform(-1.0, 1.0, (BLOCK, 4)).astype(np.float32)
         for engine in engines if number % 2 else reversed(engines):
-            with_resets = envs[engine]
+            env = envs[engine]
             start = time.perf_counter()
             for k, action in enumerate(actions):
                 if k % 50 == 0:
-                    with_resets.reset(seed=number)
-                with_resets.step(action)
+                    env.reset(seed=number)
+                env.step(action)
             spent[engine].append((time.perf_counter() - start) / BLOCK)
     for env in envs.values():
-        with closing(env):
-            pass
+        env.close()
     return spent
 
 

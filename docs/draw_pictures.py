@@ -14,9 +14,8 @@ from PIL import Image, ImageDraw, ImageFont
 from tpm_gym import load_policy  # registers the ids as well
 from tpm_gym.simulation.state import CONTROL_PERIOD
 
-DOCS = Path(__file__).resolve().parent
-IMAGES = DOCS / "images"
-POLICY = DOCS.parent / "train" / "policies" / "TPMPickAndPlace-v0.json"
+IMAGES = Path(__file__).resolve().parent / "images"
+ENV_ID = "TPMPickAndPlace-v0"
 START, GOAL = (-0.17, -0.034, 0.015), (0.05, -0.030, 0.015)
 FRAMES = {0: "start", 6: "vacuum on: the cup seals", 10: "on the way", 21: "placed, vacuum off"}
 SIZE, SUPERSAMPLING = 380, 3
@@ -26,9 +25,9 @@ CROP = (0.05, 0.0, 1.0, 0.94)  # left, top, right, bottom of the rendered pictur
 def frames() -> dict[int, Image.Image]:
     """Render the steps of an episode that FRAMES names."""
     side = SIZE * SUPERSAMPLING
-    env = gym.make("TPMPickAndPlace-v0", render_mode="rgb_array", width=side, height=side)
+    env = gym.make(ENV_ID, render_mode="rgb_array", width=side, height=side)
     observation, _ = env.reset(seed=0, options={"object": START, "goal": GOAL})
-    policy = load_policy(POLICY)
+    policy = load_policy(ENV_ID)
     pictures = {}
     for step in range(max(FRAMES) + 1):
         if step in FRAMES:

@@ -53,7 +53,7 @@ class Region:
         inside: FloatArray = np.minimum(np.maximum(points, self.low), self.high)
         return inside
 
-    def corners(self) -> Iterator[tuple[float, float, float]]:
+    def corners(self) -> Iterator[Vector]:
         """The eight corners, m."""
         return product(*zip(self.low, self.high, strict=True))  # type: ignore[return-value]
 

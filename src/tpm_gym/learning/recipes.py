@@ -81,7 +81,11 @@ def recipe(env_id: str, algorithm: str = "sac", engine: str | None = None) -> di
 
 
 def recipe_file(algorithm: str, engine: str | None = None) -> Path:
-    """Return the shipped recipes of an algorithm, for an engine if that has some of its own."""
+    """Return the shipped recipes of an algorithm, for an engine if that has some of its own.
+
+    Raises:
+        ConfigError: There is no such algorithm.
+    """
     if algorithm not in ALGORITHMS:
         raise ConfigError(f"algorithm {algorithm!r} is none of {NAMES}")
     own = RECIPES / f"{algorithm}-{engine}.yml"

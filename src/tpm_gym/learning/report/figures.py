@@ -25,12 +25,12 @@ from tpm_gym.learning.figure_style import (
 )
 from tpm_gym.learning.provenance import write_whole
 from tpm_gym.learning.report.page import (
-    ENGINES,
     LEARNING_CURVES,
     PENALTY,
     ROBUSTNESS,
     Group,
     Record,
+    engine_of,
     grouped,
     method,
     split,
@@ -195,7 +195,7 @@ def robustness(records: Sequence[Record]) -> Figure:
                 axes.plot(
                     *zip(*rates, strict=True),
                     color=colours[record["env"]],
-                    label=f"{record['env']}, {ENGINES.get(record['engine'], record['engine'])}",
+                    label=f"{record['env']}, {engine_of(record)}",
                     linestyle="--" if record["engine"] == "pybullet" else "-",
                     markerfacecolor="white" if record["engine"] == "pybullet" else None,
                     marker="o",

@@ -20,7 +20,7 @@ Group = list[Record]
 LEARNING_CURVES, PENALTY = "results_learning_curves.png", "results_penalty.png"
 ROBUSTNESS = "results_robustness.png"
 ENGINES: Final = {"analytic": "closed form", "pybullet": "PyBullet"}
-"""Of tests, by their names."""
+"""Of tests: what the page calls them."""
 NONE: Final = "\N{EM DASH}"
 
 STUDIES: Final = (
@@ -112,6 +112,11 @@ def method(record: Record) -> str:
     return name + (", demonstrations" if recipe["demonstrations"] else "")
 
 
+def engine_of(record: Record) -> str:
+    """Name the engine of a record as the page does."""
+    return ENGINES.get(record["engine"], str(record["engine"]))
+
+
 def success(record: Record, test: str = "pybullet") -> float:
     """Success rate of a run in the test in an engine; 0 where it has none."""
     return float(record["tests"].get(test, {}).get("success_at_end", {}).get("mean", 0.0))
@@ -156,7 +161,7 @@ def _training_row(group: Group) -> list[str]:
     return [
         first["env"],
         method(first),
-        ENGINES.get(first["engine"], first["engine"]),
+        engine_of(first),
         f"{first['steps']:,}",
         *(_median(group, engine) for engine in ENGINES),
         _or_never(median_time([steps for steps, _ in times]), "{:,.0f}"),
@@ -215,7 +220,7 @@ def _penalty(records: Group, figures: Sequence[str]) -> list[str]:
         [
             group[0]["env"],
             method(group[0]),
-            ENGINES.get(group[0]["engine"], group[0]["engine"]),
+            engine_of(group[0]),
             f"{group[0]['penalty_weight']:g}",
             *(_median(group, engine) for engine in ENGINES),
             _mean(group, "return", "{:.2f}"),
