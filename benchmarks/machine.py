@@ -12,7 +12,6 @@ import os
 import platform
 import sys
 from collections.abc import Iterable, Sequence
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -46,18 +45,10 @@ def describe(arguments: Sequence[str]) -> dict[str, Any]:
     return {
         "command": provenance.command_line(arguments),
         "commit": provenance.git_commit(),
-        "versions": provenance.versions() | {name: _version(name) for name in _PACKAGES},
+        "versions": provenance.versions() | {name: provenance.version(name) for name in _PACKAGES},
         "machine": provenance.machine(),
         "load_before": None if loads is None else round(loads[0], 2),
     }
-
-
-def _version(package: str) -> str | None:
-    """The version of an installed package, None where it is not installed."""
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return None
 
 
 def processor_line(description: dict[str, Any]) -> str:

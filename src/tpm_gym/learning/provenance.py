@@ -39,10 +39,11 @@ def origin() -> dict[str, Any]:
 
 def versions() -> dict[str, str | None]:
     """Return the versions of Python, tpm_gym and the packages below it; None where absent."""
-    return {"python": platform.python_version()} | {name: _version(name) for name in _PACKAGES}
+    return {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES}
 
 
-def _version(package: str) -> str | None:
+def version(package: str) -> str | None:
+    """Return the version of an installed package, None where it is not installed."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
