@@ -305,8 +305,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         self.task.check(self._state)
         observation, _, info = self._report(self._state)
         if self.randomisation != Randomisation():
-            latency = {"latency": self.randomisation.latency}
-            info["randomisation"] = {**plant.as_dict(), **latency}
+            info["randomisation"] = self.randomisation.told(plant)
         if self.render_mode == "human":
             self.render()
         return observation, info

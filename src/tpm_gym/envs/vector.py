@@ -235,9 +235,8 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         self._ended[rows] = False
         infos: dict[str, Any] = {}
         if self._altered:
-            latency = {"latency": self.randomisation.latency}
             for row, plant in zip(rows.tolist(), plants, strict=True):
-                self._add_info(infos, {"randomisation": {**plant.as_dict(), **latency}}, row)
+                self._add_info(infos, {"randomisation": self.randomisation.told(plant)}, row)
         return infos
 
     def _rngs_of(self, rows: IntArray) -> list[np.random.Generator]:

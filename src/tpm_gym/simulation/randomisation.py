@@ -76,10 +76,6 @@ class Plant:
         lengths = zip(nominal.lengths, self.length_errors, strict=True)
         return nominal.with_lengths(tuple(length + error for length, error in lengths))
 
-    def as_dict(self) -> dict[str, Any]:
-        """As plain data, for ``info``."""
-        return asdict(self)
-
 
 NOMINAL = Plant()
 """The machine as designed."""
@@ -159,6 +155,10 @@ class Randomisation:
         a, b, c = self._numbers(rng, "servo_stiffness", 3)
         d, e, f = self._numbers(rng, "joint_friction", 3)
         return replace(plant, servo_stiffness=(a, b, c), joint_friction=(d, e, f))
+
+    def told(self, plant: Plant) -> dict[str, Any]:
+        """What ``info`` says of an episode: how its machine differs, and the latency."""
+        return {**asdict(plant), "latency": self.latency}
 
     def _numbers(self, rng: np.random.Generator, name: str, count: int) -> tuple[float, ...]:
         low, high = getattr(self, name)
