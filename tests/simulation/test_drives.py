@@ -69,6 +69,7 @@ def watched(simulation: Simulation) -> list[tuple[Any, Vector]]:
         ({"gain": 1.0}, "drive"),
         ({"stiffness": 0.0}, "stiffness"),
         ({"stiffness": "high"}, "stiffness"),
+        ({"stiffness": 10**400}, "stiffness"),
         ({"damping": -1.0}, "damping"),
         ({"damping": float("nan")}, "damping"),
         ({"feedforward": "full"}, "feedforward"),
