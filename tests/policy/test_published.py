@@ -52,6 +52,18 @@ def test_its_episodes_repeat(name: str) -> None:
         assert found.conditioning_min == pytest.approx(published["conditioning_min"], abs=0.01)
 
 
+@pytest.mark.parametrize("name", [name for name in NAMES if "Pick" in name])
+def test_its_motors_need_the_same_torque_in_both_engines(name: str) -> None:
+    torques = []
+    for engine in ("pybullet", "mujoco"):
+        env = gym.make(name, engine=engine)
+        policy = policies.load_policy(str(POLICIES / f"{name}.json"), env)
+        torques += [[r.torque_rms for r in run_episodes(env, policy, 40, TEST_SEED)]]
+        env.close()
+    pybullet, mujoco = (sum(one) for one in torques)
+    assert mujoco == pytest.approx(pybullet, rel=0.02)
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_the_readme_tells_its_success_and_steps(name: str) -> None:
     success = evaluation(name)["success_at_end"]
