@@ -51,3 +51,16 @@ def test_make_knows_the_commands():
     for target in targets:
         command = ["make", "--dry-run", "--directory", str(ROOT), target]
         subprocess.run(command, check=True, capture_output=True)
+
+
+def test_what_the_penalty_does_is_as_measured():
+    results = (ROOT / "docs/results.md").read_text(encoding="utf-8")
+    told = r"of\s+their\s+time\s+below\s+that\s+without\s+the\s+penalty\s+and"
+    claimed = re.search(rf"([\d.]+%) {told} ([\d.]+%)", README).groups()
+    line = r"^- TPMReachJointsDense-v0, PPO: ([\d.]+%) without the penalty, ([\d.]+%) with it"
+    assert re.search(line, results, re.MULTILINE).groups() == claimed
+    rows = re.findall(
+        r"^\| TPMReachJointsDense-v0 \| PPO .* \| [01] \| ([\d.]+)%", results, re.MULTILINE
+    )
+    successes = re.search(r"pay with success, (\d+)% and (\d+)% as medians", README).groups()
+    assert [round(float(row)) for row in rows] == [int(value) for value in successes]
