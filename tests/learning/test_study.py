@@ -38,8 +38,8 @@ from tpm_gym.learning.study import (
 def test_plans_have_every_recipe_and_seed(tmp_path: Path) -> None:
     planned = plan_runs(StudyConfig("results", folder=tmp_path))
     scratch = [run for run in planned if "--demonstrations 0" in " ".join(run.options)]
-    assert len(scratch) == 4 * 5  # pick-and-place but with PPO
-    assert len(planned) == (6 + 2) * 5 + len(scratch)
+    assert len(scratch) == 3 * 5  # pick-and-place with SAC
+    assert len(planned) == (5 + 2) * 5 + len(scratch)
     assert len({run.folder for run in planned}) == len(planned)
     weighted = plan_runs(StudyConfig("penalty", folder=tmp_path, engine="analytic"))
     assert {run.env for run in weighted} == {env for env in tpm_gym.ENV_IDS if "Dense" in env}
