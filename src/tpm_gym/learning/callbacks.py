@@ -1,7 +1,6 @@
 """What happens besides learning while a policy trains: evaluation, checkpoints, stopping."""
 
 import json
-import math
 import time
 from collections.abc import Callable, Mapping
 from typing import Any, Final
@@ -55,7 +54,7 @@ class PeriodicEvaluation(BaseCallback):
         self._console, self._keep = console, keep
         self._evaluations: list[dict[str, Any]] = []
         self._best: tuple[float, float] | None = None
-        self._drawn = -math.inf  # when the curve was
+        self._drawn = 0.0  # when the curve was
 
     def state(self) -> dict[str, Any]:
         """Return what a checkpoint has to keep, as plain data."""
@@ -67,16 +66,18 @@ class PeriodicEvaluation(BaseCallback):
         self._best = tuple(state["best"]) if state["best"] else None
 
     def _on_training_start(self) -> None:
-        if self._evaluations:  # resumed: the curve loses what is done again
-            self._draw()
-        else:
+        if not self._evaluations:
             self._evaluate()
+        self._draw()  # of a resumed run, the curve loses what is done again
 
     def _on_step(self) -> bool:
         due = self.num_timesteps - self._evaluations[-1]["steps"] >= self._config.eval_every
         # The last evaluation waits for the last update, to be that of the policy which is saved.
         if due and self.num_timesteps < self._config.steps:
             self._evaluate()
+            # To draw takes longer than to evaluate in closed form.
+            if time.perf_counter() - self._drawn > _DRAWING_INTERVAL:
+                self._draw()
         return True
 
     def _on_training_end(self) -> None:
@@ -98,9 +99,6 @@ class PeriodicEvaluation(BaseCallback):
             self._best = quality
             self._keep(self.model)
         self._print(metrics, best)
-        # To draw takes longer than to evaluate in closed form.
-        if time.perf_counter() - self._drawn > _DRAWING_INTERVAL:
-            self._draw()
 
     def _draw(self) -> None:
         config = self._config
