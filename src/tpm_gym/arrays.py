@@ -119,8 +119,9 @@ def rotate(quaternion: Quaternion, vector: Vector) -> Vector:
 
 def transform(origin: Vector, quaternion: Quaternion, point: Vector) -> Vector:
     """A point of a frame in the frame's parent, m."""
+    x, y, z = origin
     a, b, c = rotate(quaternion, point)
-    return origin[0] + a, origin[1] + b, origin[2] + c
+    return x + a, y + b, z + c
 
 
 def _holds_masked(value: Any) -> bool:

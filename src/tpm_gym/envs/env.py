@@ -495,7 +495,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         observation, reward, info = report(self.task, state, self._goal)
         terms = {name: float(value) for name, value in info.pop("reward_terms").items()}
         plain = {
-            name: value.item() if isinstance(value, np.generic | np.ndarray) else value
+            name: value.item() if isinstance(value, (np.generic, np.ndarray)) else value
             for name, value in info.items()
         }
         return observation, float(reward), {**plain, "reward_terms": terms}

@@ -44,8 +44,9 @@ def report(
     terms = task.reward_terms(state, achieved, desired)
     reward = terms["goal"] + _goal_free(terms)
     # A sum is not finite where one of its terms is not; so written it costs least.
-    total = np.add.reduce(observation["observation"], axis=-1) + np.add.reduce(achieved, axis=-1)
-    if not math.isfinite(np.add.reduce(total + reward, axis=None)):
+    observed = observation["observation"]
+    total = np.vdot(observed, observed) + np.vdot(achieved, achieved)
+    if not math.isfinite(total + np.add.reduce(reward, axis=None)):
         raise _not_finite(task, state, achieved, terms)
     return (
         observation,
@@ -121,6 +122,4 @@ def _not_finite(
 
 
 def _clip(values: FloatArray, bound: float) -> NDArray[np.float32]:
-    with np.errstate(over="ignore"):  # what is beyond float32 is beyond the bound
-        clipped = np.array(values, dtype=np.float32, order="C")
-    return np.minimum(np.maximum(clipped, -bound, out=clipped), bound, out=clipped)
+    return np.minimum(np.maximum(values, -bound), bound).astype(np.float32, order="C")

@@ -17,7 +17,7 @@ from tpm_gym.simulation.vacuum import CLEARANCE, EMPTY, Hold, Load, hold_after
 __all__ = ["Cup", "Grip"]
 
 _WELD_FORCE = 1e4  # N; the weld itself never yields
-_REACH = 0.1  # m; what is farther from the lip does not get there in a control period
+_FASTEST = 2.5  # m/s, of the lip towards an object; twice what the machines are commanded
 _NOTHING = Load()
 
 
@@ -43,6 +43,7 @@ class Cup:
 
     Attributes:
         grip: What it holds.
+        first: In which time step of the control period the lip may first come to an object.
     """
 
     def __init__(
@@ -59,22 +60,26 @@ class Cup:
         self._radii = [block.radius for block in blocks]
         self._weld = -1
         self._near: list[int] = []
+        self.first = self._steps = 0
         self.grip = Grip()
 
-    def look(self) -> list[int]:
-        """Before a control period: which objects the cup may come to."""
-        self._near = []
+    def look(self, steps: int) -> list[int]:
+        """Before a control period of so many time steps: which objects the lip may come to."""
+        self._near, self.first, self._steps = [], steps, steps
         if self._bodies:
             lip, _ = self._robot.cup()
             place = self._client.getBasePositionAndOrientation
             for index, (body, radius) in enumerate(zip(self._bodies, self._radii, strict=True)):
-                if math.dist(place(body)[0], lip) < _REACH + radius:
+                way = math.dist(place(body)[0], lip) - radius - CUP.radius
+                wait = int(way / (_FASTEST * self._time_step)) if way > 0 else 0
+                if wait < steps:
                     self._near.append(index)
+                    self.first = min(self.first, wait)
         return self._near
 
-    def is_active(self, on: bool) -> bool:
-        """Whether :meth:`suck` has anything to do in a control period."""
-        return self.grip != Grip() or (on and bool(self._near))
+    def wakes(self, on: bool) -> int:
+        """After which time step of the control period :meth:`suck` first has anything to do."""
+        return 0 if self.grip != Grip() else self.first if on else self._steps
 
     def suck(self, on: bool) -> None:
         """After a time step: let the air in or out, hold on or drop, take what is touched."""

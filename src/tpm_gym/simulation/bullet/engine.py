@@ -119,15 +119,16 @@ class BulletEngine:
     def advance(self, references: Sequence[Reference], vacuum: bool) -> None:
         """See the protocol."""
         cup, friction, step = self._cup, self._friction, self.client.stepSimulation
-        slips, sucks = friction.look(cup.look()), cup.is_active(vacuum)
+        near = cup.look(len(references))
+        turns, sucks = friction.look(near, cup.first), cup.wakes(vacuum)
         if self._servos is not None and references:
             self._servos.begin(references[0].theta)
-        for reference in references:
-            if slips:
+        for number, reference in enumerate(references):
+            if number >= turns:
                 friction.turn(cup.grip.hold.which)
             follow(self.robot, self._servos, reference)
             step()
-            if sucks:
+            if number >= sucks:
                 cup.suck(vacuum)
 
     def motors(self) -> Motors:

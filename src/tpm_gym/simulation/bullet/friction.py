@@ -86,14 +86,19 @@ class Friction:
         """All objects are ``factor`` times as rough as nominal."""
         self._factor = factor
 
-    def look(self, near: Sequence[int]) -> bool:
-        """Before a control period: whether anything may slip; it is ``near`` the cup, or slides."""
-        self._active = [
+    def look(self, near: Sequence[int], first: int) -> int:
+        """Before a control period: from which of its time steps on to :meth:`turn`.
+
+        From the beginning if an object slides, else from ``first``, when the cup comes to one of
+        those that are ``near``.
+        """
+        sliding = [
             index
             for index, (body, *_) in enumerate(self._bodies)
-            if index in near or math.hypot(*self._client.getBaseVelocity(body)[0]) > _SLIP
+            if math.hypot(*self._client.getBaseVelocity(body)[0]) > _SLIP
         ]
-        return bool(self._active)
+        self._active = sorted({*sliding, *near})
+        return 0 if sliding else first
 
     def turn(self, held: int) -> None:
         """Before a time step: scale the friction of what may slip."""
