@@ -135,6 +135,8 @@ def test_what_is_saved_goes_on_equally(randomisation: Any) -> None:
             each.step(actions)
     moment = envs.save_state()
     expected = [unsaved.step(actions) for actions in course[30:]]
+    with pytest.raises(InputError, match="of as many of the same kind"):
+        make(PICK, 7, machine="wide").restore_state(moment)
     for again in (envs, other, envs):
         again.restore_state(moment)
         for actions, wanted in zip(course[30:], expected, strict=True):
@@ -191,6 +193,8 @@ def test_options_are_refused_by_name() -> None:
     )
     for options, message in (
         ({"num_envs": 0}, "1 or more"),
+        ({"max_episode_steps": 0}, "1 or more"),
+        ({"autoreset_mode": "Never"}, "'NextStep', 'SameStep', 'Disabled'"),
         ({"physics": {"time_step": 0.02}}, "time_step"),
         ({"physics": {"torques": "all"}}, "'every'"),
         ({"machine": "round"}, "'paper', 'wide'"),

@@ -45,7 +45,7 @@ def test_blocks_that_cannot_be_are_refused(name, value):
     [
         *(("objects", value) for value in ((Block(), Block()), (Block("goal"),), ("puck",), None)),
         *(("markers", value) for value in (-1, 1.5, "one")),
-        *(("marker_radius", value) for value in (0.0, np.nan)),
+        *(("marker_radius", value) for value in (0.0, np.nan, True)),
     ],
     ids=lambda value: str(value)[:20],
 )

@@ -69,8 +69,9 @@ def _spec_of(options: Mapping[str, Any]) -> Any:
 
 @dataclass(frozen=True)
 class VectorSnapshot:
-    """Everything that the next steps of vector environments depend on."""
+    """Everything that the next steps of vector environments depend on, and of which kind."""
 
+    kind: tuple[Any, ...]
     simulation: Moment
     rngs: list[dict[str, Any]]
     goals: FloatArray
@@ -100,6 +101,9 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             not all end at the same step; it makes on-policy batches more even.
         physics: A :class:`~tpm_gym.simulation.analytic.physics.Physics`, or a mapping.
 
+    Attributes:
+        kind: What has to be equal for a snapshot of other environments to fit.
+
     Raises:
         ConfigurationError: If an option is out of range.
     """
@@ -122,10 +126,13 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         physics: Any = None,
     ) -> None:
         """Check the options and build the robots."""
-        if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
+        if not _is_count(num_envs):
             raise ConfigurationError("num_envs", num_envs, "a whole number, 1 or more")
         self.num_envs = num_envs
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        if max_episode_steps is not None and not _is_count(max_episode_steps):
+            valid = "a whole number, 1 or more, or None for no end"
+            raise ConfigurationError("max_episode_steps", max_episode_steps, valid)
+        self.autoreset_mode = _mode_of(autoreset_mode)
         self.metadata = {
             "render_modes": [],
             "render_fps": round(1 / CONTROL_PERIOD),
@@ -148,6 +155,9 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             physics=physics,
             drive=self.drive,
         )
+        numerics = self.simulation.physics
+        own = (num_envs, self.machine, self.drive, self.randomisation, numerics)
+        self.kind = (type(self.task), *own)
         self._altered = self.randomisation != Randomisation()
         many = type(self.task).sample_each is not Task.sample_each
         self._ahead_of_time = many and not self._altered
@@ -362,6 +372,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         _ = self.state  # there has to be an episode
         self._undraw(np.arange(self.num_envs))
         return VectorSnapshot(
+            self.kind,
             self.simulation.save(),
             [dict(rng.bit_generator.state) for rng in self._rngs],
             *(values.copy() for values in (self._goals, self._elapsed, self._ended, self._pending)),
@@ -372,8 +383,16 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
 
         Returns:
             The observation at that moment.
+
+        Raises:
+            InputError: If the moment is none, or that of other environments; nothing has happened
+                then.
         """
         self._require_open()
+        if not isinstance(snapshot, VectorSnapshot):
+            raise InputError("snapshot", type(snapshot), "what save_state() returned")
+        if snapshot.kind != self.kind:
+            raise InputError("snapshot", snapshot.kind, f"of as many of the same kind, {self.kind}")
         self.simulation.restore(snapshot.simulation)
         self._seed(np.arange(self.num_envs), None)
         self._drawn[:] = False
@@ -399,6 +418,18 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
     def _require_open(self) -> None:
         if self.closed:
             raise EpisodeError("the environments are closed; make new ones")
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 1
+
+
+def _mode_of(value: AutoresetMode | str) -> AutoresetMode:
+    try:
+        return AutoresetMode(value)
+    except ValueError as error:
+        valid = ", ".join(repr(mode.value) for mode in AutoresetMode)
+        raise ConfigurationError("autoreset_mode", value, valid) from error
 
 
 def _masked(told: Mapping[str, Any], rows: IntArray | None, count: int) -> dict[str, Any]:

@@ -125,7 +125,7 @@ class AnalyticVecEnv(VecEnv):
         moment = Moment(plants, columns, arrays["pucks"])
         self._returns, self._lengths = arrays["returns"].copy(), arrays["lengths"].copy()
         own = {name: arrays[name] for name in _OWN}
-        return self.envs.restore_state(VectorSnapshot(moment, plain["rngs"], **own))
+        return self.envs.restore_state(VectorSnapshot(self.envs.kind, moment, plain["rngs"], **own))
 
 
 def _plant(entries: dict[str, Any]) -> Plant:

@@ -151,5 +151,5 @@ class State:
 
 
 def _require_positive(name: str, value: float) -> None:
-    if not finite(name, value, (), ConfigurationError) > 0:
+    if isinstance(value, bool) or not finite(name, value, (), ConfigurationError) > 0:
         raise ConfigurationError(name, value, "a number above 0")
