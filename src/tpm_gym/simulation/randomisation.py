@@ -21,18 +21,19 @@ __all__ = ["LIMITS", "NOMINAL", "Plant", "Randomisation"]
 
 Range = tuple[float, float]
 
-# What may be asked for: far enough for any machine of this kind, near enough to stay one.
+# What may be asked for: so far that trained policies fail, where something makes them.
 _RANGES: dict[str, Range] = {
-    "link_mass": (0.5, 2.0),
+    "link_mass": (0.5, 16.0),
     "puck_mass": (0.1, 10.0),
     "friction": (0.1, 3.0),
-    "motor_strength": (0.5, 1.5),
-    "servo_stiffness": (0.25, 4.0),
-    "joint_friction": (0.0, 5.0),
+    "motor_strength": (0.05, 1.5),
+    "servo_stiffness": (0.01, 4.0),
+    "joint_friction": (0.0, 100.0),
 }
-# With bias and lengths off by all of this at once, the arm at home still stands on its own side.
+# With bias and lengths off by all of this at once, the arm at home still stands on its own side;
+# with a few times as much, no assembly is where the encoders say.
 _SIZES: dict[str, float] = {
-    "encoder_noise": 1e-3,
+    "encoder_noise": 0.02,
     "encoder_bias": 1e-3,
     "length_error": 1e-3,
 }
@@ -89,15 +90,15 @@ class Randomisation:
 
     Attributes:
         link_mass: Factor of each moving link's mass and inertia, drawn for each link;
-            within 0.5 to 2.
+            within 0.5 to 16.
         puck_mass: Factor of the objects' mass (50 g); within 0.1 to 10.
         friction: Factor of the objects' friction (0.6 on the table); within 0.1 to 3.
-        motor_strength: Factor of each motor's largest torque (100 N m); within 0.5 to 1.5.
-        servo_stiffness: Factor of each drive's stiffness, its damping left as it is; within 0.25 to
+        motor_strength: Factor of each motor's largest torque (100 N m); within 0.05 to 1.5.
+        servo_stiffness: Factor of each drive's stiffness, its damping left as it is; within 0.01 to
             4. With ``drive="servo"`` only.
-        joint_friction: Coulomb friction on each motor's axis, N m; within 0 to 5. With
+        joint_friction: Coulomb friction on each motor's axis, N m; within 0 to 100. With
             ``drive="servo"`` only.
-        encoder_noise: Standard deviation of each reading of an encoder, rad; at most 0.001.
+        encoder_noise: Standard deviation of each reading of an encoder, rad; at most 0.02.
             The rates are differences of readings over a control period, and as noisy.
         encoder_bias: Each encoder is off by up to this, rad; at most 0.001. Its motor goes where
             the encoder says, so the arm is off too.

@@ -335,14 +335,8 @@ def _how(records: Sequence[Record]) -> list[str]:
     listed = "\n".join(
         f"- {machine}; commits {', '.join(sorted(of))}" for machine, of in sorted(commits.items())
     )
-    commands = []
-    bisections, runs = split(records)
-    for first, *_ in grouped(runs):
-        commands.append(str(first["command"]))
-        commands += [str(test["command"]) for test in first["tests"].values()]
-    commands += [str(record["command"]) for record in bisections]
-    text = "Its commands for the first seed, and the first of each bisection:\n"
-    return ["## How\n", listed + "\n", _HOW, *studies, text, "```bash", *commands, "```\n"]
+    text = "The commands of a single run are in its record in `docs/results`.\n"
+    return ["## How\n", listed + "\n", _HOW, *studies, text]
 
 
 def _commit(name: str | None) -> str:
