@@ -51,6 +51,7 @@ def assert_same(one: Any, other: Any) -> None:
     ("env_id", "options"),
     [
         (REACH, {}),
+        (REACH, {"randomisation": {"latency": 3}}),
         (PICK, {"randomisation": EVERYTHING}),
         (JOINTS, {"machine": "wide"}),
         ("TPMPickAndPlaceJoints-v0", {"randomisation": EVERYTHING, "goals": "tempting"}),

@@ -70,10 +70,16 @@ def test_where_success_stays_two_tests_are_enough(attribute: str, end: float) ->
 
 
 def test_half_is_of_the_nominal_success() -> None:
-    result, _ = bisected("latency", 1.0, {0.0: 0.6, 1.0: 0.31}.__getitem__)
-    assert result.after is None
-    result, _ = bisected("latency", 1.0, {0.0: 0.6, 1.0: 0.3}.__getitem__)
-    assert (result.before, result.after) == (0.0, 1.0)
+    for limit, halved in ((0.31, False), (0.3, True)):
+        result, _ = bisected("friction", 3.0, lambda value, least=limit: max(1.6 - value, least))
+        assert (result.after is not None) == halved
+
+
+@pytest.mark.parametrize("edge", range(1, 6))
+def test_a_latency_is_a_whole_number_of_steps(edge: int) -> None:
+    result, found = bisected("latency", 5.0, lambda steps: float(steps < edge))
+    assert (result.before, result.after) == (edge - 1, edge)
+    assert all(Randomisation(latency=steps).latency == steps for steps in found)
 
 
 # -- in files -------------------------------------------------------------------------------------
@@ -135,7 +141,7 @@ def test_what_was_tested_is_not_tested_again_unless_with_other_episodes(tmp_path
     assert bisection.left() == []
     assert answer(replace(bisection, episodes=60), lambda value: 0.8) == 3
     kept = condense_bisection(tmp_path / "b")
-    assert (kept["episodes"], set(kept["tests"])) == (60, {"0.5", "1", "2"})
+    assert (kept["episodes"], set(kept["tests"])) == (60, {"0.5", "1", "16"})
 
 
 def test_tests_of_no_bisection_are_refused(tmp_path: Path) -> None:
@@ -156,11 +162,11 @@ def test_the_page_says_where_success_halves(records: list[Any]) -> None:
     low, high = map(float, cell.split(" to "))
     assert low < 1.5 <= high < 1.05 * low
     (row,) = [
-        row for row in rows if row.startswith("| servo stiffness (factor, servo drives) | 1 | 0.25")
+        row for row in rows if row.startswith("| servo stiffness (factor, servo drives) | 1 | 0.01")
     ]
     low, high = map(float, row.strip("|").split("|")[3].split(" to "))
-    assert high <= 0.8 < low < 1.05 * high
-    (row,) = [row for row in rows if row.startswith("| encoder noise (rad) | 0 | 0.001 |")]
+    assert high <= 0.8 < low < 1.1 * high
+    (row,) = [row for row in rows if row.startswith("| encoder bias (rad) | 0 | 0.001 |")]
     assert row.count("97.0% at 0.001") == 2
     again = [record | {"engine": "analytic", "episodes": 70} for record in records]
     text = page_of([*records, *again], [])

@@ -309,7 +309,8 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
     def _move(self, values: FloatArray, running: IntArray) -> None:
         """A control period with these actions, or those that come late."""
         if len(self._pending):
-            self._pending, values = values[None], self._pending[0]
+            values, *pending = (*self._pending, values)
+            self._pending = np.array(pending)
         simulation = self.simulation
         command = self.control.command(values[:, :3], simulation.commands)
         vacuum = values[:, 3] > 0 if self.task.vacuum else np.zeros(self.num_envs, dtype=np.bool_)

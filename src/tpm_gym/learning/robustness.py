@@ -24,7 +24,7 @@ UNITS: Final = {
 }
 """Of the attributes that are no factors."""
 
-_HALVINGS: Final = 6  # leave a 64th of the way
+_PARTS: Final = 64  # of the way from nominal to an end
 
 
 def nominal(attribute: str) -> float:
@@ -63,18 +63,23 @@ def halving(attribute: str, end: float, successes: Mapping[float, float]) -> Hal
     half = successes[start] / 2
     if successes[end] > half:
         return Halving(end, end, None, None)
-    near, far, missing = 0.0, 1.0, None
-    for _ in range(0 if attribute == "latency" else _HALVINGS):
-        middle = (near + far) / 2
-        value = _on_the_way(start, end, middle)
-        if value not in successes:
-            missing = value
-            break
-        near, far = (middle, far) if successes[value] > half else (near, middle)
-    return Halving(end, _on_the_way(start, end, near), _on_the_way(start, end, far), missing)
+    values = _way(attribute, start, end)
+    near, far, missing = 0, len(values) - 1, None
+    while far - near > 1 and missing is None:
+        middle = (near + far) // 2
+        if values[middle] not in successes:
+            missing = values[middle]
+        elif successes[values[middle]] > half:
+            near = middle
+        else:
+            far = middle
+    return Halving(end, values[near], values[far], missing)
 
 
-def _on_the_way(start: float, end: float, share: float) -> float:
-    """The value at a share of the way, to four digits: what commands can be given."""
-    value = start * (end / start) ** share if start else end * share
-    return float(f"{value:.4g}")
+def _way(attribute: str, start: float, end: float) -> list[float]:
+    """The values from nominal to an end, to four digits: what commands can be given."""
+    if attribute == "latency":
+        return [float(steps) for steps in range(int(end) + 1)]
+    shares = [part / _PARTS for part in range(_PARTS + 1)]
+    way = [start * (end / start) ** share if start else end * share for share in shares]
+    return [float(f"{value:.4g}") for value in way]

@@ -37,10 +37,11 @@ _SIZES: dict[str, float] = {
     "encoder_bias": 1e-3,
     "length_error": 1e-3,
 }
+_LATEST = 5  # control steps
 LIMITS: dict[str, Range] = {
     **_RANGES,
     **{name: (0.0, largest) for name, largest in _SIZES.items()},
-    "latency": (0.0, 1.0),
+    "latency": (0.0, _LATEST),
 }
 """What each attribute of :class:`Randomisation` may be at the least and at the most."""
 
@@ -102,7 +103,7 @@ class Randomisation:
             The rates are differences of readings over a control period, and as noisy.
         encoder_bias: Each encoder is off by up to this, rad; at most 0.001. Its motor goes where
             the encoder says, so the arm is off too.
-        latency: Control steps by which actions come late, 0 or 1.
+        latency: Control steps by which actions come late, at most 5.
         length_error: Each of l1 to l7 is off by up to this, m; at most 0.001. The robot is then
             built anew at each reset, which takes several times as long, and of which Bullet keeps
             some 13 kB of memory.
@@ -134,8 +135,9 @@ class Randomisation:
             value = getattr(self, name)
             if not is_number(value) or not 0 <= value <= largest:
                 raise ConfigurationError(name, value, f"a number from 0 to {largest}")
-        if not is_number(self.latency) or self.latency not in (0, 1):
-            raise ConfigurationError("latency", self.latency, "0 or 1 control steps")
+        if not is_number(self.latency) or self.latency not in range(_LATEST + 1):
+            valid = f"a whole number of control steps from 0 to {_LATEST}"
+            raise ConfigurationError("latency", self.latency, valid)
         object.__setattr__(self, "latency", int(self.latency))
 
     def draw(self, rng: np.random.Generator, machine: Machine) -> Plant:
