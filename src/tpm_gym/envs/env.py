@@ -54,7 +54,7 @@ class EnvSnapshot:
     rng: dict[str, Any]
     goal: FloatArray
     pending: tuple[FloatArray, ...]
-    kind: tuple[Any, ...]
+    kind: Mapping[str, Any]
     digest: str
 
     def is_intact(self) -> bool:
@@ -251,14 +251,14 @@ class TPMEnv(gym.Env[Observation, Action]):
         numerics = physics
         if is_dataclass(physics) and not isinstance(physics, type):
             numerics = asdict(physics)
-        self._kind = (
-            type(self.task),
-            self.machine,
-            engine,
-            self.drive,
-            self.randomisation,
-            numerics,
-        )
+        self._kind = {
+            "task": type(self.task),
+            "machine": self.machine,
+            "engine": engine,
+            "drive": self.drive,
+            "randomisation": self.randomisation,
+            "physics": numerics,
+        }
         self.simulation = self._start()
 
     def _start(self) -> Simulation:
@@ -425,9 +425,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         self._require_open()
         if not isinstance(snapshot, EnvSnapshot) or not snapshot.is_intact():
             raise InputError("snapshot", type(snapshot), "what save_state() returned, unchanged")
-        if snapshot.kind != self._kind:
-            valid = f"of the same task and options, {self._kind}"
-            raise InputError("snapshot", snapshot.kind, valid)
+        require_same(snapshot.kind, self._kind)
         self.np_random.bit_generator.state = snapshot.rng
         self._goal, self._pending = snapshot.goal.copy(), snapshot.pending
         self._state = None
@@ -525,6 +523,17 @@ def _pixels(name: str, value: Any) -> int:
     if isinstance(value, (int, np.integer)) and 16 <= value <= 4096:
         return int(value)
     raise ConfigurationError(name, value, "a whole number of pixels from 16 to 4096")
+
+
+def require_same(kind: Mapping[str, Any], own: Mapping[str, Any]) -> None:
+    """Refuse a snapshot of one kind of environment in one of another.
+
+    Raises:
+        InputError: If they differ, with the names of what does.
+    """
+    other = [name for name in own if kind.get(name) != own[name]]
+    if other:
+        raise InputError("snapshot", f"another {', '.join(other)}", "of the same task and options")
 
 
 def _digest(values: tuple[Any, ...]) -> str:
