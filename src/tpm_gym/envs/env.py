@@ -227,7 +227,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         modes = [mode for mode in self.metadata["render_modes"] if mode != "human" or has_display()]
         self.metadata = {**self.metadata, "render_modes": modes}
         if render_mode is not None and render_mode not in modes:
-            valid = f"None, {', '.join(map(repr, modes))} ('human' needs a display)"
+            valid = f"None, {', '.join(map(repr, modes))} ('human' needs a display and PyBullet)"
             raise ConfigurationError("render_mode", render_mode, valid)
         self.render_mode = render_mode
         self.task = make_task(
