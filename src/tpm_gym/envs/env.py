@@ -180,7 +180,8 @@ class TPMEnv(gym.Env[Observation, Action]):
             :class:`~tpm_gym.simulation.Randomisation` or a mapping of its attributes. Where
             disturbed encoders report angles that cannot be assembled, position and velocity keep
             their last values.
-        physics: Numerical settings of the engine, or a mapping of them.
+        physics: Numerical settings of the engine, or a mapping of them: for all of them
+            ``time_step``, s; more in ``tpm_gym.simulation.{bullet,mujoco,analytic}.physics``.
         render_mode: None, ``"rgb_array"`` or ``"human"``.
         renderer: What draws pictures; for PyBullet ``"tiny"`` (any machine) or ``"egl"`` (GPU),
             for MuJoCo ``"egl"``, ``"osmesa"`` or ``"glfw"``; None for what works.
