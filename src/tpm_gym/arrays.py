@@ -44,7 +44,7 @@ def numbers(name: str, value: ArrayLike, error: _Error = InputError) -> FloatArr
             if array.dtype.kind in "biufO" and all(isinstance(v, Real) for v in items):
                 with np.errstate(over="ignore"):
                     return array.astype(np.float64)
-    raise error(name, _brief(value), "real numbers in an array of regular shape")
+    raise error(name, brief(value), "real numbers in an array of regular shape")
 
 
 def finite(
@@ -54,7 +54,8 @@ def finite(
     array = numbers(name, value, error)
     # all() costs twice as much
     if array.shape != shape or np.count_nonzero(np.isfinite(array)) < array.size:
-        raise error(name, _brief(value), f"finite numbers of shape {shape}")
+        valid = f"finite numbers of shape {shape}" if shape else "a finite number"
+        raise error(name, brief(value), valid)
     return array
 
 
@@ -65,7 +66,7 @@ def vector(name: str, value: ArrayLike, error: _Error = InputError) -> Vector:
         a, b, c = array.tolist()
         if math.isfinite(a) and math.isfinite(b) and math.isfinite(c):
             return a, b, c
-    raise error(name, _brief(value), "three finite numbers, of shape (3,)")
+    raise error(name, brief(value), "three finite numbers, of shape (3,)")
 
 
 def points(name: str, value: ArrayLike) -> FloatArray:
@@ -78,7 +79,7 @@ def points(name: str, value: ArrayLike) -> FloatArray:
     if type(value) is np.ndarray or not is_tensor(value):
         array = numbers(name, value)
     elif array.is_complex() or str(array.layout) != "torch.strided":
-        raise InputError(name, _brief(value), "real numbers of shape (..., 3), in a dense tensor")
+        raise InputError(name, brief(value), "real numbers of shape (..., 3), in a dense tensor")
     else:
         array = array.double()
     if array.ndim == 0 or array.shape[-1] != 3:
@@ -130,7 +131,7 @@ def _holds_masked(value: Any) -> bool:
     return any(issubclass(kind, np.ma.MaskedArray) for kind in items)
 
 
-def _brief(value: Any) -> Any:
+def brief(value: Any) -> Any:
     """What a message can repeat of a value: itself, or the beginning of a long one."""
     try:
         text = repr(value)

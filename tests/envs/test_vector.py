@@ -136,7 +136,7 @@ def test_what_is_saved_goes_on_equally(randomisation: Any) -> None:
             each.step(actions)
     moment = envs.save_state()
     expected = [unsaved.step(actions) for actions in course[30:]]
-    with pytest.raises(InputError, match="of as many of the same kind"):
+    with pytest.raises(InputError, match=r"same task and options, got 'another machine"):
         make(PICK, 7, machine="wide").restore_state(moment)
     for again in (envs, other, envs):
         again.restore_state(moment)
@@ -165,12 +165,16 @@ def test_resets_draw_what_those_of_one_environment_do_whatever_is_chosen_between
 BAD: list[tuple[Callable[[TPMVectorEnv], Any], type[Exception], str]] = [
     (lambda envs: envs.step(np.zeros((5, 3))), ActionError, r"\(5, 4\)"),
     (lambda envs: envs.step(np.full((5, 4), np.nan)), ActionError, "finite"),
-    (lambda envs: envs.reset(seed=[1, 2]), InputError, "one seed, or 5"),
+    *(
+        (lambda envs, seed=seed: envs.reset(seed=seed), InputError, "one seed, or 5")
+        for seed in ([1, 2], 1.5, "1")
+    ),
+    (lambda envs: envs.reset(options=[1]), ResetOptionError, "a dictionary"),
     (lambda envs: envs.reset(options={"reset_mask": [1, 0]}), ResetOptionError, "booleans"),
     (
         lambda envs: envs.reset(options={"reset_mask": np.zeros(5, dtype=bool)}),
         ResetOptionError,
-        "one of them true",
+        "at least one of them true",
     ),
     (lambda envs: envs.reset(options={"cube": 1}), ResetOptionError, "object"),
     (lambda envs: (envs.close(), envs.reset()), EpisodeError, "closed"),
@@ -197,6 +201,7 @@ def test_options_are_refused_by_name() -> None:
         ({"max_episode_steps": 0}, "1 or more"),
         ({"autoreset_mode": "Never"}, "'NextStep', 'SameStep', 'Disabled'"),
         ({"physics": {"time_step": 0.02}}, "time_step"),
+        ({"physics": {"time_step": 1e-12}}, "at least 1e-06 s"),
         ({"physics": {"torques": "all"}}, "'every'"),
         ({"machine": "round"}, "'paper', 'wide'"),
         ({"task": stack}, "one object"),
@@ -205,6 +210,11 @@ def test_options_are_refused_by_name() -> None:
             TPMVectorEnv(**{"task": "reach", **options})
     with pytest.raises(EpisodeError, match="call reset"):
         make().step(np.zeros((5, 4)))
+    envs = make(autoreset_mode="Disabled", max_episode_steps=1)
+    envs.reset(seed=0)
+    envs.step(np.zeros((5, 4)))
+    with pytest.raises(EpisodeError, match="reset_mask"):
+        envs.step(np.zeros((5, 4)))
 
 
 def test_a_reset_for_some_leaves_the_others_as_they_are() -> None:

@@ -58,5 +58,7 @@ def test_a_recipe_is_ready_for_stable_baselines() -> None:
     assert not {"demonstrations", "n_timesteps", "n_envs"} & set(keywords)
     with pytest.raises(errors.ConfigError, match="no recipe for TPMReach-v0"):
         learning.recipe("TPMReach-v0", "ppo")
+    with pytest.raises(errors.ConfigError, match="--engine analytic has one"):
+        learning.recipe("TPMPickAndPlaceDense-v0", "ppo")
     with pytest.raises(errors.ConfigError, match="none of sac, tqc, ppo"):
         learning.recipe("TPMReach-v0", "dqn")

@@ -87,7 +87,7 @@ def test_what_is_learned_in_closed_form_is_tested_there_and_in_pybullet(tmp_path
 @pytest.mark.parametrize(
     ("message", "plan", "options"),
     [
-        ("--envs Nope: leaves no recipe", "results", {"envs": ("Nope",)}),
+        ("--envs Nope: leaves no recipe of the plan; the default", "results", {"envs": ("Nope",)}),
         (
             "--envs TPMReachDense-v0: leaves no published",
             "robustness",

@@ -55,6 +55,9 @@ def test_another_autoreset_is_refused() -> None:
         tpm_gym.errors.ConfigurationError, match=r"'NextStep'.*'SameStep' for Stable"
     ):
         vec_env(autoreset_mode="NextStep")
+    one: Any = gym.make(PICK, engine="analytic")
+    with pytest.raises(tpm_gym.errors.ConfigurationError, match=r"gym\.make_vec"):
+        AnalyticVecEnv(one)
 
 
 def test_ppo_and_hindsight_learn_in_it() -> None:

@@ -154,10 +154,24 @@ def test_links_and_factors_that_are_not_the_mechanisms_are_refused() -> None:
         inertia_of(replace(mechanism, links=(*mechanism.links, other)), PAPER)
     with pytest.raises(ConfigurationError, match=f"{LINKS} moving links"):
         Dynamics(link_masses=(1.0, 2.0)).gravity(HOME)
-    with pytest.raises(ConfigurationError, match="payload"):
-        Dynamics(payload=-0.1)
-    with pytest.raises(ConfigurationError, match="link_masses"):
-        Dynamics(link_masses=(0.0,) * LINKS)
+    odd: dict[str, tuple[Any, ...]] = {
+        "payload": (-0.1, "1", np.nan),
+        "link_masses": ((0.0,) * LINKS, 2.0, "heavy"),
+        "free_fall": (9.81, (0.0, 9.81), (0.0, 0.0, np.nan)),
+    }
+    for name, values in odd.items():
+        for value in values:
+            with pytest.raises(ConfigurationError, match=name):
+                Dynamics(**{name: value})
+
+
+def test_states_that_do_not_go_together_are_named() -> None:
+    five, four = np.tile(HOME, (5, 1)), np.zeros((4, 3))
+    for batch in (five, torch.tensor(five)):
+        with pytest.raises(InputError, match=r"theta, theta_dot must .*\(5, 3\), \(4, 3\)"):
+            Dynamics().energy(batch, four)
+    with pytest.raises(InputError, match="torque must be finite"):
+        Dynamics().forward(HOME, np.zeros(3), np.full(3, np.nan))
 
 
 # Mechanics

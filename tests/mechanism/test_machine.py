@@ -149,7 +149,7 @@ LOW, HIGH = PAPER_TPM.region.low, PAPER_TPM.region.high
         ("goal_region", Region(LOW, (*HIGH[:2], 0.95)), "inside the region"),
         ("step_limit", (0.03, 0.0, 0.03), "positive"),
         ("joint_limit", -0.08, "positive"),
-        *(("joint_limit", value, "numbers") for value in (np.nan, np.inf, "much")),
+        *(("joint_limit", value, "number") for value in (np.nan, np.inf, "much")),
         ("table", (0.45, 0.0), "positive"),
         *(("table", value, "numbers") for value in ((0.4,), (0.4, 0.3, 0.2), (np.inf, 0.3), None)),
         *((name, 3, "a Region") for name in ("region", "goal_region")),
@@ -198,6 +198,7 @@ def test_a_region_out_of_reach_is_refused_with_what_fails_where(high: Vector, le
         replace(PAPER_TPM, region=Region(LOW, high))
     assert caught.value.point[1:] in {(high[1], z) for z in (LOW[2], high[2])} | {(LOW[1], high[2])}
     assert caught.value.margin < 0
+    assert "the machine's region" in str(caught.value)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -54,7 +54,7 @@ class EnvSnapshot:
     rng: dict[str, Any]
     goal: FloatArray
     pending: tuple[FloatArray, ...]
-    kind: tuple[Any, ...]
+    kind: Mapping[str, Any]
     digest: str
 
     def is_intact(self) -> bool:
@@ -180,7 +180,8 @@ class TPMEnv(gym.Env[Observation, Action]):
             :class:`~tpm_gym.simulation.Randomisation` or a mapping of its attributes. Where
             disturbed encoders report angles that cannot be assembled, position and velocity keep
             their last values.
-        physics: Numerical settings of the engine, or a mapping of them.
+        physics: Numerical settings of the engine, or a mapping of them: for all of them
+            ``time_step``, s; more in ``tpm_gym.simulation.{bullet,mujoco,analytic}.physics``.
         render_mode: None, ``"rgb_array"`` or ``"human"``.
         renderer: What draws pictures; for PyBullet ``"tiny"`` (any machine) or ``"egl"`` (GPU),
             for MuJoCo ``"egl"``, ``"osmesa"`` or ``"glfw"``; None for what works.
@@ -227,7 +228,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         modes = [mode for mode in self.metadata["render_modes"] if mode != "human" or has_display()]
         self.metadata = {**self.metadata, "render_modes": modes}
         if render_mode is not None and render_mode not in modes:
-            valid = f"None, {', '.join(map(repr, modes))} ('human' needs a display)"
+            valid = f"None, {', '.join(map(repr, modes))} ('human' needs a display and PyBullet)"
             raise ConfigurationError("render_mode", render_mode, valid)
         self.render_mode = render_mode
         self.task = make_task(
@@ -251,14 +252,14 @@ class TPMEnv(gym.Env[Observation, Action]):
         numerics = physics
         if is_dataclass(physics) and not isinstance(physics, type):
             numerics = asdict(physics)
-        self._kind = (
-            type(self.task),
-            self.machine,
-            engine,
-            self.drive,
-            self.randomisation,
-            numerics,
-        )
+        self._kind = {
+            "task": type(self.task),
+            "machine": self.machine,
+            "engine": engine,
+            "drive": self.drive,
+            "randomisation": self.randomisation,
+            "physics": numerics,
+        }
         self.simulation = self._start()
 
     def _start(self) -> Simulation:
@@ -425,9 +426,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         self._require_open()
         if not isinstance(snapshot, EnvSnapshot) or not snapshot.is_intact():
             raise InputError("snapshot", type(snapshot), "what save_state() returned, unchanged")
-        if snapshot.kind != self._kind:
-            valid = f"of the same task and options, {self._kind}"
-            raise InputError("snapshot", snapshot.kind, valid)
+        require_same(snapshot.kind, self._kind)
         self.np_random.bit_generator.state = snapshot.rng
         self._goal, self._pending = snapshot.goal.copy(), snapshot.pending
         self._state = None
@@ -525,6 +524,17 @@ def _pixels(name: str, value: Any) -> int:
     if isinstance(value, (int, np.integer)) and 16 <= value <= 4096:
         return int(value)
     raise ConfigurationError(name, value, "a whole number of pixels from 16 to 4096")
+
+
+def require_same(kind: Mapping[str, Any], own: Mapping[str, Any]) -> None:
+    """Refuse a snapshot of one kind of environment in one of another.
+
+    Raises:
+        InputError: If they differ, with the names of what does.
+    """
+    other = [name for name in own if kind.get(name) != own[name]]
+    if other:
+        raise InputError("snapshot", f"another {', '.join(other)}", "of the same task and options")
 
 
 def _digest(values: tuple[Any, ...]) -> str:

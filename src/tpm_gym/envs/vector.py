@@ -13,8 +13,8 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
-from tpm_gym.arrays import BoolArray, FloatArray, IntArray, finite
-from tpm_gym.envs.env import action_space, observation_space
+from tpm_gym.arrays import BoolArray, FloatArray, IntArray, brief, finite
+from tpm_gym.envs.env import action_space, observation_space, require_same
 from tpm_gym.envs.registration import VECTOR_ENTRY_POINT
 from tpm_gym.envs.report import Observation, compute_reward, observe, report
 from tpm_gym.errors import (
@@ -71,7 +71,7 @@ def _spec_of(options: Mapping[str, Any]) -> Any:
 class VectorSnapshot:
     """Everything that the next steps of vector environments depend on, and of which kind."""
 
-    kind: tuple[Any, ...]
+    kind: Mapping[str, Any]
     simulation: Moment
     rngs: list[dict[str, Any]]
     goals: FloatArray
@@ -156,8 +156,14 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             drive=self.drive,
         )
         numerics = self.simulation.physics
-        own = (num_envs, self.machine, self.drive, self.randomisation, numerics)
-        self.kind = (type(self.task), *own)
+        self.kind = {
+            "task": type(self.task),
+            "num_envs": num_envs,
+            "machine": self.machine,
+            "drive": self.drive,
+            "randomisation": self.randomisation,
+            "physics": numerics,
+        }
         self._altered = self.randomisation != Randomisation()
         many = type(self.task).sample_each is not Task.sample_each
         self._ahead_of_time = many and not self._altered
@@ -194,8 +200,11 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             EpisodeError: If the environments are closed.
         """
         self._require_open()
-        chosen = dict(options or {})
-        rows = self._rows_of(chosen.pop("reset_mask", None))
+        chosen, mask = options, None
+        if isinstance(options, Mapping) and "reset_mask" in options:
+            chosen = {name: value for name, value in options.items() if name != "reset_mask"}
+            mask = options["reset_mask"]
+        rows = self._rows_of(mask)
         self._seed(rows, seed)
         infos = self._begin(rows, chosen)
         if self._stagger and len(rows) == self.num_envs and self._limit is not None:
@@ -209,17 +218,17 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             return np.arange(self.num_envs)
         array = np.asarray(mask)
         if array.shape != (self.num_envs,) or array.dtype != np.bool_ or not array.any():
-            valid = f"({self.num_envs},) booleans, one of them true"
-            raise ResetOptionError("reset_mask", mask, valid)
+            valid = f"({self.num_envs},) booleans, at least one of them true"
+            raise ResetOptionError("reset_mask", brief(mask), valid)
         return np.flatnonzero(array)
 
     def _seed(self, rows: IntArray, seed: int | Sequence[int | None] | None) -> None:
         if seed is None or isinstance(seed, (int, np.integer)):
             seeds = [None if seed is None else int(seed) + k for k in range(self.num_envs)]
         else:
-            seeds = list(seed)
+            seeds = list(seed) if isinstance(seed, (Sequence, np.ndarray)) else []
         if len(seeds) != self.num_envs:
-            raise InputError("seed", len(seeds), f"one seed, or {self.num_envs}, by number")
+            raise InputError("seed", brief(seed), f"one seed, or {self.num_envs}")
         if not self._rngs:
             self._rngs = [seeding.np_random(own)[0] for own in seeds]
             return
@@ -289,8 +298,10 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         values = np.minimum(np.maximum(np.asfortranarray(values), -1.0), 1.0)
         ended = np.flatnonzero(self._ended)
         if len(ended) and not (self._rngs and self.autoreset_mode == AutoresetMode.NEXT_STEP):
-            row = int(ended[0])
-            raise EpisodeError(f"no episode is running in environment {row}; call reset() first")
+            own = ', for some with options={"reset_mask": ...}' if self._rngs else " first"
+            raise EpisodeError(
+                f"no episode is running in environment {ended[0]}; call reset(){own}"
+            )
         self._move(values, np.flatnonzero(~self._ended))
         self._elapsed += 1
         infos = self._begin(ended) if len(ended) else {}
@@ -392,8 +403,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         self._require_open()
         if not isinstance(snapshot, VectorSnapshot):
             raise InputError("snapshot", type(snapshot), "what save_state() returned")
-        if snapshot.kind != self.kind:
-            raise InputError("snapshot", snapshot.kind, f"of as many of the same kind, {self.kind}")
+        require_same(snapshot.kind, self.kind)
         self.simulation.restore(snapshot.simulation)
         self._seed(np.arange(self.num_envs), None)
         self._drawn[:] = False

@@ -117,8 +117,14 @@ def read_recipe(path: Path, algorithm: str, env_id: str) -> Recipe:
     recipes = read_recipes(path, algorithm)
     name = env_id.rpartition(":")[2]
     if name not in recipes:
-        there = f"there are {_listed(recipes)}; a file of yours with one is --recipe FILE"
-        raise ConfigError(f"{path}: no recipe for {name}; {there}")
+        elsewhere = [
+            f"; --engine {file.stem.partition('-')[2]} has one"
+            for file in RECIPES.glob(f"{algorithm}-*.yml")
+            if name in read_recipes(file, algorithm)
+        ]
+        there = f"there are {_listed(recipes)}{''.join(elsewhere)}"
+        own = "a file of yours with one is --recipe FILE"
+        raise ConfigError(f"{path}: no recipe for {name}; {there}; {own}")
     arguments = dict(recipes[name])
     return Recipe(
         n_timesteps=arguments.pop("n_timesteps"),

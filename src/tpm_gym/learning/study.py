@@ -176,7 +176,7 @@ def plan_runs(config: StudyConfig) -> list[Run] | list[Bisection]:
     runs = _bisections(config) if config.plan == "robustness" else _trainings(config)
     if not runs:
         left = "no published policy" if config.plan == "robustness" else "no recipe of the plan"
-        raise ConfigError(f"--envs {' '.join(config.envs)}: leaves {left}")
+        raise ConfigError(f"--envs {' '.join(config.envs)}: leaves {left}; the default is all")
     return runs
 
 

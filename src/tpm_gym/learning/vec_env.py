@@ -35,11 +35,14 @@ class AnalyticVecEnv(VecEnv):
             autoreset_mode="SameStep", stagger=True)``.
 
     Raises:
-        ConfigurationError: If they have another autoreset.
+        ConfigurationError: If they are others, or have another autoreset.
     """
 
     def __init__(self, envs: TPMVectorEnv) -> None:
         """Wrap them."""
+        if not isinstance(getattr(envs, "unwrapped", None), TPMVectorEnv):
+            valid = "gym.make_vec(id, num_envs=..., engine='analytic', autoreset_mode='SameStep')"
+            raise ConfigurationError("envs", envs, valid)
         if envs.autoreset_mode != AutoresetMode.SAME_STEP:
             valid = f"{AutoresetMode.SAME_STEP.value!r} for Stable-Baselines3"
             raise ConfigurationError("autoreset_mode", envs.autoreset_mode.value, valid)

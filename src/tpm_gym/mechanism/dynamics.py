@@ -30,7 +30,7 @@ the base hangs upside down. The functions with a Pose compute with whatever thei
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -38,8 +38,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tpm_gym.arrays import FloatArray, Vector, finite_points, is_tensor
-from tpm_gym.errors import ConfigurationError
+from tpm_gym.arrays import FloatArray, Vector, finite, finite_points, is_tensor, numbers, vector
+from tpm_gym.errors import ConfigurationError, InputError
 from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode, equations
 from tpm_gym.kinematics.equations import Triple
 from tpm_gym.kinematics.geometry import PAPER, Geometry, Lengths
@@ -342,8 +342,8 @@ class Dynamics:
         free_fall: Acceleration of gravity in the machine's frame, m/s^2.
 
     Raises:
-        ConfigurationError: If a mass cannot be; where it is first used, if there is another number
-            of factors.
+        ConfigurationError: If a mass or gravity cannot be; where it is first used, if there is
+            another number of factors.
     """
 
     geometry: Geometry = PAPER
@@ -354,10 +354,12 @@ class Dynamics:
 
     def __post_init__(self) -> None:
         """Reject masses that cannot be."""
-        if not 0 <= self.payload < math.inf:
+        if finite("payload", self.payload, (), ConfigurationError) < 0:
             raise ConfigurationError("payload", self.payload, "at least 0 kg")
-        if not all(0 < factor < math.inf for factor in self.link_masses):
+        factors = numbers("link_masses", self.link_masses, ConfigurationError)
+        if factors.ndim != 1 or not ((factors > 0) & (factors < math.inf)).all():
             raise ConfigurationError("link_masses", self.link_masses, "positive factors")
+        vector("free_fall", self.free_fall, ConfigurationError)
 
     @cached_property
     def inertia(self) -> Inertia:
@@ -378,15 +380,18 @@ class Dynamics:
 
     def torque(self, theta: ArrayLike, theta_dot: ArrayLike, theta_ddot: ArrayLike) -> FloatArray:
         """The motors' torques (..., 3) N m for a motion: M theta_ddot + C theta_dot + g."""
-        return self._rows(self._torques, (theta, theta_dot, theta_ddot), _VECTOR)[0]
+        states = {"theta": theta, "theta_dot": theta_dot, "theta_ddot": theta_ddot}
+        return self._rows(self._torques, states, _VECTOR)[0]
 
     def gravity(self, theta: ArrayLike) -> FloatArray:
         """The torques (..., 3) N m that carry the machine at rest."""
-        return self._rows(lambda pose: self._torques(pose, _REST, _REST), (theta,), _VECTOR)[0]
+        return self._rows(
+            lambda pose: self._torques(pose, _REST, _REST), {"theta": theta}, _VECTOR
+        )[0]
 
     def mass_matrix(self, theta: ArrayLike) -> FloatArray:
         """The inertia that the motors feel, (..., 3, 3) kg m^2: symmetric and positive."""
-        return self._rows(self._masses, (theta,), SYMMETRIC)[0]
+        return self._rows(self._masses, {"theta": theta}, SYMMETRIC)[0]
 
     def coriolis(self, theta: ArrayLike, theta_dot: ArrayLike) -> FloatArray:
         """C (..., 3, 3) kg m^2/s, of Christoffel's symbols: M' - 2 C is skew."""
@@ -399,7 +404,7 @@ class Dynamics:
             ]
             return [(up[row] - down[row]) / 4 for row in range(3) for up, down in pairs]
 
-        return self._rows(columns, (theta, theta_dot), _MATRIX)[0]
+        return self._rows(columns, {"theta": theta, "theta_dot": theta_dot}, _MATRIX)[0]
 
     def forward(self, theta: ArrayLike, theta_dot: ArrayLike, torque: ArrayLike) -> FloatArray:
         """The accelerations (..., 3) rad/s^2 under the motors' torques (..., 3) N m."""
@@ -409,7 +414,8 @@ class Dynamics:
             rest = given[0] - one, given[1] - two, given[2] - three
             return solve(self._masses(pose), rest)
 
-        return self._rows(columns, (theta, theta_dot, torque), _VECTOR)[0]
+        states = {"theta": theta, "theta_dot": theta_dot, "torque": torque}
+        return self._rows(columns, states, _VECTOR)[0]
 
     def energy(self, theta: ArrayLike, theta_dot: ArrayLike) -> Energy:
         """Kinetic and potential energy, (...,) J."""
@@ -417,7 +423,8 @@ class Dynamics:
         def columns(pose: Pose, rates: Triple) -> tuple[Numbers, Numbers]:
             return energies(pose, rates, self.free_fall, self.inertia)
 
-        return Energy(*self._rows(columns, (theta, theta_dot), np.array(0), np.array(1)))
+        states = {"theta": theta, "theta_dot": theta_dot}
+        return Energy(*self._rows(columns, states, np.array(0), np.array(1)))
 
     def _torques(self, pose: Pose, rates: Triple, changes: Triple) -> Triple:
         return torques(pose, rates, changes, self.free_fall, self.inertia)
@@ -428,13 +435,13 @@ class Dynamics:
     def _rows(
         self,
         text: Callable[..., Sequence[Numbers]],
-        states: tuple[ArrayLike, ...],
+        states: Mapping[str, ArrayLike],
         *layouts: NDArray[np.intp],
     ) -> list[FloatArray]:
         """What is computed of a pose and triples of numbers, for each row of the states."""
 
-        def columns(numbers: tuple[Numbers, ...], ns: Namespace) -> list[Numbers]:
-            theta, *rest = (numbers[i : i + 3] for i in range(0, len(numbers), 3))
+        def columns(values: tuple[Numbers, ...], ns: Namespace) -> list[Numbers]:
+            theta, *rest = (values[i : i + 3] for i in range(0, len(values), 3))
             pose, real = pose_at(theta, self.branch, self.geometry, ns)
             missing = ns.where(real, 0.0, 1.0)
             return [missing, *pose.factors[:3], *text(pose, *rest)]
@@ -453,12 +460,16 @@ class Dynamics:
         return results
 
 
-def _side_by_side(states: tuple[ArrayLike, ...]) -> FloatArray:
+def _side_by_side(states: Mapping[str, ArrayLike]) -> FloatArray:
     """Arrays (..., 3), broadcast with each other, in one (..., 3 n)."""
-    names = ("theta", "theta_dot", "the third")
-    arrays = [finite_points(name, state) for name, state in zip(names, states, strict=False)]
+    arrays = [finite_points(name, state) for name, state in states.items()]
     like = next((array for array in arrays if is_tensor(array)), arrays[0])
-    table: FloatArray = namespace_of(like).join(arrays)
+    try:
+        table: FloatArray = namespace_of(like).join(arrays)
+    except (ValueError, RuntimeError) as error:  # numpy's and torch's
+        shapes = [tuple(array.shape) for array in arrays]
+        valid = "of shapes (..., 3) that go together, by shape"
+        raise InputError(", ".join(states), shapes, valid) from error
     return table
 
 

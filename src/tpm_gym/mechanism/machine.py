@@ -134,7 +134,11 @@ class Machine(ABC):
 
     def _require_usable(self, name: str, point: Vector) -> None:
         """Refuse the option of that name if P cannot be worked with at ``point``."""
-        theta = self.inverse(point)
+        try:
+            theta = self.inverse(point)
+        except UnreachableError as error:
+            error.hint = f"the machine's {name} has to lie within reach of its legs; choose another"
+            raise
         if (mode := self.mode_left(theta, point)) is not None:
             valid = f"in one {mode} mode; {point} is beyond a singularity"
             raise ConfigurationError(name, getattr(self, name), valid)

@@ -65,6 +65,7 @@ def urdf_text(mechanism: Mechanism, closure_frames: bool = False) -> str:
     """
     root = Element("robot", name="tpm")
     root.append(ElementTree.Comment(" Generated from tpm_gym.mechanism; do not edit (make urdf). "))
+    root.append(ElementTree.Comment(" z points down: where the robot hangs, gravity is along +z. "))
     for name, rgba in COLOURS.items():
         material = ElementTree.SubElement(root, "material", name=name)
         ElementTree.SubElement(material, "color", rgba=numbers(rgba))
@@ -84,7 +85,8 @@ def loops_text(mechanism: Mechanism) -> str:
     """The loop closures and the motors as YAML, for the URDF with its closure frames."""
     names = [name for name, _, _ in _closure_frames(mechanism)]
     pairs = zip(names[::2], names[1::2], strict=True)
-    lines = ["# Generated from tpm_gym.mechanism; do not edit (make urdf).", "closed_loop:"]
+    lines = ["# Generated from tpm_gym.mechanism; do not edit (make urdf)."]
+    lines += ["# Pairs of frames of the URDF whose origins coincide (3d).", "closed_loop:"]
     lines += [f"  - [{a}, {b}]" for a, b in pairs]
     lines.append(f"type: [{', '.join(['3d'] * len(mechanism.closures))}]")
     lines.append(f"name_mot: [{', '.join(mechanism.actuated)}]")

@@ -16,6 +16,8 @@ __all__ = ["Numerics", "is_number", "require_numerics", "settings_of"]
 
 T = TypeVar("T")
 
+_SHORTEST = 1e-6  # s; shorter time steps take for ever
+
 
 def settings_of(kind: type[T], name: str, value: Any) -> T:
     """A dataclass of settings: ``value`` itself, made from a mapping, or for None the defaults.
@@ -72,8 +74,10 @@ def require_numerics(
             raise ConfigurationError(name, value, "a finite number")
     step, count = settings.time_step, getattr(settings, "iterations", 1)
     steps = CONTROL_PERIOD / step if step > 0 else 0.0
-    if round(steps) < 1 or abs(steps - round(steps)) >= 1e-6:
-        valid = f"a whole fraction of the control period, {CONTROL_PERIOD} s"
+    if step < _SHORTEST or round(steps) < 1 or abs(steps - round(steps)) >= 1e-6:
+        valid = (
+            f"a whole fraction of the control period, {CONTROL_PERIOD} s; at least {_SHORTEST} s"
+        )
         raise ConfigurationError("time_step", step, valid)
     if isinstance(count, bool) or not isinstance(count, Integral) or count < 1:
         raise ConfigurationError("iterations", count, "a whole number, 1 or more")

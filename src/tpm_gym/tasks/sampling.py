@@ -118,7 +118,7 @@ def tempting(
             apart = rewards.distance(first, last) >= APART
             if apart and (line_in_joints(machine, first, last) < machine.safe_conditioning).any():
                 return first, last
-    valid = f"'sampled': on {machine.name!r} no careless way was found that passes the singularity"
+    valid = f"'sampled': on {machine.name!r} no straight line in the joints nears the singularity"
     raise ConfigurationError("goals", "tempting", valid)
 
 

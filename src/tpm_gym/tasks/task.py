@@ -100,8 +100,8 @@ class Task(ABC):
         self.penalty_weight = float(
             finite("penalty_weight", penalty_weight, (), ConfigurationError)
         )
-        if self.penalty_weight < 0:
-            raise ConfigurationError("penalty_weight", penalty_weight, "0 or more")
+        if isinstance(penalty_weight, bool) or self.penalty_weight < 0:
+            raise ConfigurationError("penalty_weight", penalty_weight, "a number, 0 or more")
         if self.goal_size < 3 or self.goal_size % 3:
             raise ConfigurationError("goal_size", self.goal_size, "three for each point")
         shown = len(self.markers(np.zeros(self.goal_size)))
