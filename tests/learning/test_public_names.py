@@ -4,6 +4,7 @@ import pytest
 from processes import PYTHON, printed_by
 
 from tpm_gym import TPMError, learning
+from tpm_gym.errors import ConfigurationError
 from tpm_gym.learning import errors
 from tpm_gym.learning.command_line import main
 
@@ -62,3 +63,5 @@ def test_a_recipe_is_ready_for_stable_baselines() -> None:
         learning.recipe("TPMPickAndPlaceDense-v0", "ppo")
     with pytest.raises(errors.ConfigError, match="none of sac, tqc, ppo"):
         learning.recipe("TPMReach-v0", "dqn")
+    with pytest.raises(ConfigurationError, match="'pybullet', 'mujoco', 'analytic'"):
+        learning.recipe("TPMReachDense-v0", "ppo", engine="analytik")

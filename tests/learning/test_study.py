@@ -18,6 +18,7 @@ from processes import PYTHON, TPM_GYM, printed_by, signalled
 from trainings import PPO_RECIPE, SAC_RECIPE, assert_equal_runs, without_times
 
 import tpm_gym
+from tpm_gym.errors import ConfigurationError
 from tpm_gym.learning.command_line import main
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.report.records import condense
@@ -95,10 +96,11 @@ def test_what_is_learned_in_closed_form_is_tested_there_and_in_pybullet(tmp_path
         ),
         ("--steps 0", "results", {"steps": 0}),
         ("--seeds 0", "results", {"seeds": 0}),
+        ("engine = 'bullet'", "robustness", {"engine": "bullet"}),
     ],
 )
 def test_plans_that_cannot_be_are_refused(message: str, plan: Any, options: Any) -> None:
-    with pytest.raises(ConfigError, match=message):
+    with pytest.raises((ConfigError, ConfigurationError), match=message):
         plan_runs(StudyConfig(plan, **options))
 
 

@@ -18,6 +18,7 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from tpm_gym.learning.algorithms import ALGORITHMS, NAMES
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.resources import RECIPES
+from tpm_gym.simulation.engine import require_engine
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,10 @@ def recipe(env_id: str, algorithm: str = "sac", engine: str | None = None) -> di
 
     Raises:
         ConfigError: There is none for this environment and algorithm.
+        ConfigurationError: There is no such engine.
     """
+    if engine is not None:
+        require_engine(engine)
     return read_recipe(recipe_file(algorithm, engine), algorithm, env_id).keywords()
 
 

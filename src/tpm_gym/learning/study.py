@@ -38,6 +38,7 @@ from tpm_gym.learning.recipes import read_recipes, recipe_file
 from tpm_gym.learning.robustness import OF_PUCK, OF_SERVOS, ends, halving
 from tpm_gym.learning.run_folder import CONFIG_FILE, TESTS, WHOLE, claimed, is_finished
 from tpm_gym.policy.files import published
+from tpm_gym.simulation.engine import require_engine
 from tpm_gym.simulation.randomisation import LIMITS
 from tpm_gym.tasks.registry import TASKS
 
@@ -171,7 +172,9 @@ def plan_runs(config: StudyConfig) -> list[Run] | list[Bisection]:
 
     Raises:
         ConfigError: No run is left of the plan, or a number cannot work.
+        ConfigurationError: There is no such engine.
     """
+    require_engine(config.engine)
     check_least(config, 1, "steps", "seeds", "episodes", "pybullet_episodes", "jobs")
     runs = _bisections(config) if config.plan == "robustness" else _trainings(config)
     if not runs:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -33,6 +33,7 @@ __all__ = [
     "Twist",
     "make_engine",
     "register_engine",
+    "require_engine",
 ]
 
 UPRIGHT: Quaternion = (0.0, 0.0, 0.0, 1.0)
@@ -166,6 +167,17 @@ def _path(engine: str | Factory) -> str:
     return f"{engine.__module__}:{getattr(engine, '__qualname__', engine)}"
 
 
+def require_engine(name: Any, among: Collection[str] = ()) -> None:
+    """Refuse what is no engine's name.
+
+    Raises:
+        ConfigurationError: If there is none of that name, or it is not ``among`` those.
+    """
+    known = (*_ENGINES, *SIMULATIONS)
+    if not isinstance(name, str) or name not in (among or known):
+        raise ConfigurationError("engine", name, ", ".join(map(repr, known)))
+
+
 def make_engine(
     name: str,
     *,
@@ -179,8 +191,7 @@ def make_engine(
     Raises:
         ConfigurationError: If there is none, or it cannot do what is asked for.
     """
-    if not isinstance(name, str) or name not in _ENGINES:
-        raise ConfigurationError("engine", name, ", ".join(map(repr, (*_ENGINES, *SIMULATIONS))))
+    require_engine(name, _ENGINES)
     factory = _ENGINES[name]
     if isinstance(factory, str):
         module, _, attribute = factory.partition(":")
