@@ -63,5 +63,5 @@ def test_a_recipe_is_ready_for_stable_baselines() -> None:
         learning.recipe("TPMPickAndPlaceDense-v0", "ppo")
     with pytest.raises(errors.ConfigError, match="none of sac, tqc, ppo"):
         learning.recipe("TPMReach-v0", "dqn")
-    with pytest.raises(ConfigurationError, match="'pybullet', 'mujoco', 'analytic'"):
+    with pytest.raises(ConfigurationError, match="engine = 'analytik'"):
         learning.recipe("TPMReachDense-v0", "ppo", engine="analytik")
