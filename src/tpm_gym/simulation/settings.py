@@ -30,7 +30,8 @@ def settings_of(kind: type[T], name: str, value: Any) -> T:
     names = [field.name for field in fields(kind)]  # type: ignore[arg-type]
     if value is None or (isinstance(value, Mapping) and set(value) <= set(names)):
         return kind(**(value or {}))
-    valid = f"None, a {kind.__name__}, or a mapping with keys among {', '.join(names)}"
+    full = f"{kind.__module__}.{kind.__name__}"
+    valid = f"None, a {full}, or a mapping with keys among {', '.join(names)}"
     raise ConfigurationError(name, value, valid)
 
 
