@@ -270,7 +270,9 @@ def _robustness(records: Group, figures: Sequence[str]) -> list[str]:
         "that differ from it in one thing. Success halves between the two values given, found by "
         "bisection; or it does not up to the largest value, as far as a machine may differ here, "
         "and success there is given. Errors of lengths and biases are drawn up to the value in "
-        "each episode, noise has it as its standard deviation; all else has the value itself.\n"
+        "each episode, noise has it as its standard deviation; all else has the value itself. "
+        "With lengths and biases twice as far off, no assembly may be where the encoders say that "
+        "the arm is at home.\n"
     ]
     for engine, name in ENGINES.items():
         of = [record for record in records if record["engine"] == engine]
