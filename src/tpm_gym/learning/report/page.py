@@ -271,8 +271,8 @@ def _robustness(records: Group, figures: Sequence[str]) -> list[str]:
         "bisection; or it does not up to the largest value, as far as a machine may differ here, "
         "and success there is given. Errors of lengths and biases are drawn up to the value in "
         "each episode, noise has it as its standard deviation; all else has the value itself. "
-        "With lengths and biases twice as far off, no assembly may be where the encoders say that "
-        "the arm is at home.\n"
+        "Twice as far off in lengths and biases, some machines have no assembly where their "
+        "encoders say that they are at home.\n"
     ]
     for engine, name in ENGINES.items():
         of = [record for record in records if record["engine"] == engine]
