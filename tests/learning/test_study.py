@@ -223,7 +223,7 @@ def test_a_study_of_one_machine_runs_all_and_leaves_nothing_behind(
     printed = capsys.readouterr().out.splitlines()
     assert f"{bisection.folder}: done" in printed
     assert any(line.startswith(f"{failing.folder}: failed with status 1") for line in printed)
-    assert {path.stem for path in bisection.folder.glob("tests/*")} == {"0", "1"}
+    assert {"0", "5"} <= {path.stem for path in bisection.folder.glob("tests/*")}
     assert bisection.left() == []
     names = ["bisection", "bisection.log", "failing.log"]
     assert sorted(path.name for path in tmp_path.iterdir()) == names
