@@ -91,7 +91,8 @@ def run(cell: Cell) -> dict[str, Any]:
 
 def lines(record: dict[str, Any]) -> Iterator[str]:
     """The table as Markdown: policies of a kind together, median and range over seeds."""
-    yield f"`make bench-transfer`, {record['episodes']} episodes a policy and cell."
+    command = record["machine"]["command"]
+    yield f"`{command}`, {record['episodes']} episodes a policy and cell."
     yield ""
     columns = list(dict.fromkeys((cell["engine"], cell["drive"]) for cell in record["cells"]))
     kinds = list(dict.fromkeys(cell["kind"] for cell in record["cells"]))

@@ -155,14 +155,13 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             physics=physics,
             drive=self.drive,
         )
-        numerics = self.simulation.physics
         self.kind = {
             "task": type(self.task),
             "num_envs": num_envs,
             "machine": self.machine,
             "drive": self.drive,
             "randomisation": self.randomisation,
-            "physics": numerics,
+            "physics": self.simulation.physics,
         }
         self._altered = self.randomisation != Randomisation()
         many = type(self.task).sample_each is not Task.sample_each
