@@ -165,6 +165,19 @@ def test_a_press_without_vacuum_moves_nothing() -> None:
     assert ours.force[-1] == pytest.approx([0.0, 0.0, lift])
 
 
+@pytest.mark.parametrize("way", [(1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)])
+@pytest.mark.parametrize("depth", [0.0025, 0.006])
+def test_a_lip_dragged_over_an_edge_tips_it_as_in_pybullet(way: Vector, depth: float) -> None:
+    high, low = ON_TOP + [0.0, 0.0, 0.01], ON_TOP + [0.0, 0.0, -depth]
+    end = low + 0.05 * np.array(way)
+    commands = [high, *line(high, low, 3, 2), *line(low, end, 4, 8)]
+    ours, theirs = compared(commands, [False] * len(commands), MIDDLE)
+    assert theirs.tilt.max() > math.radians(20)
+    assert ours.tilt.max() == pytest.approx(theirs.tilt.max(), rel=0.15)
+    assert math.dist(ours.position[-1], theirs.position[-1]) < 1e-3
+    assert max(ours.tilt[-1], theirs.tilt[-1]) < 1e-3
+
+
 # -- by the laws --------------------------------------------------------------------------------
 
 

@@ -18,6 +18,7 @@ import tpm_gym
 from tpm_gym.arrays import Vector
 from tpm_gym.errors import ClosureError, ConfigurationError, MissingPackageError
 from tpm_gym.mechanism import PAPER_TPM
+from tpm_gym.mechanism.cup import CUP
 from tpm_gym.simulation import Block, Plant, Scene, Simulation
 from tpm_gym.simulation.engine import Reference
 from tpm_gym.simulation.mujoco.model import object_name
@@ -225,6 +226,18 @@ def test_a_puck_that_slides_on_another_object_is_slowed_by_mu_n_against_its_slip
     lost = along - simulation.move(HOME).object_velocity[0]
     expected = Block().friction * base.friction * 9.81 * 0.04 * along / 0.6
     np.testing.assert_allclose(lost, expected, atol=0.02 * np.linalg.norm(expected))
+
+
+@pytest.mark.parametrize("overlap", [0.006, 0.010])  # m; with less it tips
+def test_a_struck_puck_slides_and_does_not_take_off(simulation: Simulation, overlap: float) -> None:
+    mount, half = PAPER_TPM.mount, Block().height / 2
+    x, y, _ = mount.to_world(HOME)
+    start = np.array([x, y, 2 * half - overlap + CUP.length])
+    path = [start + (0.025 * k, 0.0, 0.0) for k in range(10)]  # at 0.6 m/s
+    simulation.reset(PAPER_TPM.inverse(mount.to_paper(start)), {"object": (x + 0.08, y, half)})
+    states = [simulation.move(mount.to_paper(point)) for point in path]
+    assert states[-1].object_position[0, 0] > x + 0.2
+    assert max(state.object_position[0, 2] for state in states) < half + 0.001
 
 
 def test_a_resting_puck_neither_sinks_nor_moves(simulation: Simulation) -> None:

@@ -8,8 +8,8 @@ An object is held, stands (:mod:`.shoving`) as long as it does, or is in any pos
 (:mod:`.tumbling`).
 
 What is left out: what stands exactly on the table sinks no 0.16 mm in the first time steps, as it
-does in PyBullet; an open lip that is dragged over the top face neither drags nor tips a standing
-block; a block stands until its middle is beyond the table's edge, and then falls as it is, past the
+does in PyBullet; an open lip that is dragged over the top face does not turn a standing block; a
+block stands until its middle is beyond the table's edge, and then falls as it is, past the
 table; one that is held askew is pressed on the table by the middle of its bottom; only block and
 lip touch, not the stem and the platform; lip and block touch in one point.
 """
@@ -54,7 +54,7 @@ from tpm_gym.simulation.analytic.body import (
     three,
 )
 from tpm_gym.simulation.analytic.compiling import SOURCES, compiled, kept
-from tpm_gym.simulation.analytic.shoving import shove, side_of
+from tpm_gym.simulation.analytic.shoving import drags_over, shove, side_of
 from tpm_gym.simulation.analytic.tumbling import tumble
 from tpm_gym.simulation.stage import FLOOR, TABLE
 from tpm_gym.simulation.vacuum import CLEARANCE, Hold, Load, hold_after
@@ -201,7 +201,7 @@ def _move_flat(row: FloatArray, way: Way, setting: Setting) -> tuple[Vector, boo
             return _NONE, True
         row[VX], row[VY], row[SPIN + 2] = done.vx, done.vy, done.spin
         force_x, force_y = -mass * done.push[0] / step, -mass * done.push[1] / step
-    elif pressed and carried == 0:
+    elif pressed and (carried == 0 or _tips(row, way.now, lip, carried, setting)):
         return _NONE, True
     else:
         _slow_down(row, row[ROUGH] * weight, carried > _LANDING * step, 2 * width)
@@ -218,6 +218,15 @@ def _move_flat(row: FloatArray, way: Way, setting: Setting) -> tuple[Vector, boo
         row[Z], row[VZ] = row[Z] - (gap + SLOP), 0.0
     row[STILL] = rests
     return (force_x, force_y, _spring(way, step) if pressed else 0.0), False
+
+
+@compiled
+def _tips(row: FloatArray, place: Vector, moved: Vector, carried: float, setting: Setting) -> bool:
+    """Whether a lip that presses on the top face tips the block, as it moves by so much (m)."""
+    step = setting.step
+    slip = (moved[0] - row[VX] * step, moved[1] - row[VY] * step, 0.0)
+    press = CUP.preload * step / row[MASS]
+    return drags_over(row, place, slip, press, carried, setting.half)
 
 
 @compiled

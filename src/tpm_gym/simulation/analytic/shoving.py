@@ -29,7 +29,7 @@ from tpm_gym.simulation.analytic.body import (
 )
 from tpm_gym.simulation.analytic.compiling import compiled
 
-__all__ = ["Shove", "Side", "shove", "side_of"]
+__all__ = ["Shove", "Side", "drags_over", "shove", "side_of"]
 
 _SWEEPS = 4
 _SHARE = 1 / 8  # of the masses; between the inverse masses of a drag, 4, and of a twist, 12
@@ -278,6 +278,34 @@ def shove(
         reach = half[0] - (math.copysign(place, place * way) if way else 0.0)
         tips |= lacks > (push * steep + limit) * reach
     return Shove(vx, vy, spin, (push * nx - rub * ny, push * ny + rub * nx), tips)
+
+
+@compiled
+def drags_over(
+    row: FloatArray, lip: Vector, slip: Vector, press: float, weight: float, half: Vector
+) -> bool:
+    """Whether a lip that slides over the top face of a standing block tips it over an edge.
+
+    It drags along its slip, at the height of the face, and holds down where it is farthest from
+    that edge. It never drags a block along: the table, which bears the block too, is as rough.
+
+    Args:
+        row: The block.
+        lip: Centre of the lip, m, world.
+        slip: Of the lip over the face, in any unit.
+        press: Impulse of the lip, by the block's mass, m/s.
+        weight: Impulse of the table without the lip, by the mass, m/s.
+        half: Half edges of the block, m.
+    """
+    cosine, sine = _heading(row)
+    x, y, fast = lip[0] - row[X], lip[1] - row[Y], max(level_length(slip[0], slip[1]), LITTLE)
+    drag = CUP.friction * row[ROUGH] * press
+    for east, north in ((cosine, sine), (-sine, cosine)):
+        along, place = (slip[0] * east + slip[1] * north) / fast, x * east + y * north
+        arm = half[0] - max(math.copysign(place, place * along) - _CORE, -half[0])
+        if drag * abs(along) * 2 * half[2] > press * arm + weight * half[0]:
+            return True
+    return False
 
 
 @compiled

@@ -2,8 +2,7 @@
 
 Contacts are those of the block's four lowest corners with the level below, and one with the cup. As
 in PyBullet's direct solver, friction bears what the normal impulses would be without it. Both are
-found side by side by sweeps over impulses: all that bear at once, then all that rub, at the steps
-that converge fastest for a standing block.
+found side by side by sweeps over impulses, one contact after the other (projected Gauss-Seidel).
 
 As in PyBullet, block and cup have their edges rounded for each other.
 """
@@ -49,10 +48,7 @@ __all__ = ["Push", "tumble"]
 # Contacts' directions, in order: up at the corners; the lip's normal; east and north at the
 # corners; the lip's tangents, one level and one steep
 _COUNT, _BEARING, _LIP, _EAST, _NORTH, _RUB = 15, 5, 4, 5, 9, 13
-_SWEEPS = 12
-_EASE = 0.6  # of the exact steps along the lip's directions, as corners move with them
-_RELAXATION = 1 / 5.5  # of 1/m: between the inverse inertias of heave, 4, and of tilting, 7.1
-_RUBBING = 1 / 10  # the same for friction, of 8.9 for slipping and 12 for turning
+_SWEEPS = 48  # so many, as the cup's spring can press thirty times as hard as the block's weight
 _NEVER = -1e3  # m/s
 
 _Frame = tuple[Vector, Vector, Vector]
@@ -183,28 +179,21 @@ def _solve(
     response = _response(jacobian, mass, half, axis)
     keeps, constant = np.empty((_COUNT, _COUNT)), np.empty(_COUNT)
     for k in range(_COUNT):
-        if k in (_LIP, _RUB, _RUB + 1):
-            share = _EASE / _weighed(jacobian[k], response[k])
-        else:
-            share = (_RELAXATION if k < _BEARING else _RUBBING) * mass
+        share = 1 / _weighed(jacobian[k], response[k])
         constant[k] = share * (wanted[k] - _weighed(jacobian[k], twist))
         for other in range(_COUNT):
-            keeps[k, other] = (k == other) - share * _weighed(jacobian[k], response[other])
-    found, after = np.zeros(_COUNT), np.empty(_COUNT)
-    plain, next_plain = np.zeros(_BEARING), np.empty(_BEARING)  # without friction, for its bounds
+            keeps[k, other] = -share * _weighed(jacobian[k], response[other])
+        keeps[k, k] = 0.0
+    found, plain = np.zeros(_COUNT), np.zeros(_BEARING)  # plain: without friction, for its bounds
     for _ in range(_SWEEPS):
         for k in range(_BEARING):
             high = strength if k == _LIP else math.inf
-            next_plain[k] = clip(constant[k] + _weighed(keeps[k], plain), 0.0, high)
-            after[k] = clip(constant[k] + _weighed(keeps[k], found), 0.0, high)
-        for k in range(_BEARING):
-            plain[k], found[k] = next_plain[k], after[k]
+            plain[k] = clip(constant[k] + _weighed(keeps[k], plain), 0.0, high)
+            found[k] = clip(constant[k] + _weighed(keeps[k], found), 0.0, high)
         for k in range(_BEARING, _COUNT):
             bearer = _LIP if k >= _RUB else (k - _EAST) % 4
             bound = grips[k - _BEARING] * plain[bearer]
-            after[k] = clip(constant[k] + _weighed(keeps[k], found), -bound, bound)
-        for k in range(_BEARING, _COUNT):
-            found[k] = after[k]
+            found[k] = clip(constant[k] + _weighed(keeps[k], found), -bound, bound)
     for k in range(_COUNT):
         for d in range(6):
             twist[d] += response[k, d] * found[k]

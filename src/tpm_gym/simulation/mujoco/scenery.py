@@ -8,7 +8,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from tpm_gym.arrays import Vector, rotate
+from tpm_gym.arrays import FloatArray, Vector, rotate
 from tpm_gym.simulation.engine import Pose, Twist
 from tpm_gym.simulation.mujoco.model import marker_name, object_name
 from tpm_gym.simulation.state import Scene
@@ -16,6 +16,8 @@ from tpm_gym.simulation.state import Scene
 __all__ = ["Scenery"]
 
 _STILL = 1e-4  # m/s and rad/s
+_LOOKS = 5  # ahead, at most
+_ALIKE = 1e-3  # m/s
 
 
 class Scenery:
@@ -56,10 +58,40 @@ class Scenery:
         data = self._data
         if not data.ncon or (data.ncon <= self._resting and not self._moves()):
             return
-        contacts = data.nefc - 3 * data.ncon  # three rows each, at the end
-        _, x, y = data.efc_vel[contacts:].reshape(-1, 3).T
-        wanted = data.efc_aref[contacts::3]
-        wanted -= data.contact.friction[:, 0] * np.hypot(x, y) / self._model.opt.timestep
+        wanted = data.efc_aref[self._rows()][::3]
+        before = wanted.copy()
+        slip = self._slip(data.efc_vel)
+        wanted -= self._hop(slip)
+        if not (self._model.geom_bodyid[data.contact.geom] > 0).all(axis=1).any():
+            return
+        for _ in range(_LOOKS):  # What something strikes slides by the end of the time step only.
+            slip, known = self._slip(self._velocity_to_come()), slip
+            if np.abs(slip - known).max() < _ALIKE:
+                break
+            wanted[:] = before - self._hop(slip)
+
+    def _rows(self) -> slice:
+        """Of the contacts among the constraints: three each, at the end."""
+        return slice(self._data.nefc - 3 * self._data.ncon, None)
+
+    def _slip(self, velocity: FloatArray) -> FloatArray:
+        """Speed of each contact's slip, m/s, of the constraints' velocities."""
+        _, x, y = velocity[self._rows()].reshape(-1, 3).T
+        return np.hypot(x, y)
+
+    def _hop(self, slip: FloatArray) -> FloatArray:
+        """Acceleration with which the engine drives apart what slips, m/s^2."""
+        return self._data.contact.friction[:, 0] * slip / self._model.opt.timestep
+
+    def _velocity_to_come(self) -> FloatArray:
+        """Velocities of the constraints after this time step, if it were done as it is."""
+        model, data = self._model, self._data
+        mujoco.mj_fwdActuation(model, data)
+        mujoco.mj_fwdAcceleration(model, data)
+        mujoco.mj_fwdConstraint(model, data)
+        after = np.empty(data.nefc)
+        mujoco.mj_mulJacVec(model, data, after, data.qvel + model.opt.timestep * data.qacc)
+        return after
 
     def _moves(self) -> bool:
         """Whether an object slides or spins faster than solver noise."""
