@@ -77,11 +77,13 @@ class Scenery:
     def _slip(self, velocity: FloatArray) -> FloatArray:
         """Speed of each contact's slip, m/s, of the constraints' velocities."""
         _, x, y = velocity[self._rows()].reshape(-1, 3).T
-        return np.hypot(x, y)
+        speed: FloatArray = np.hypot(x, y)
+        return speed
 
     def _hop(self, slip: FloatArray) -> FloatArray:
         """Acceleration with which the engine drives apart what slips, m/s^2."""
-        return self._data.contact.friction[:, 0] * slip / self._model.opt.timestep
+        hop: FloatArray = self._data.contact.friction[:, 0] * slip / self._model.opt.timestep
+        return hop
 
     def _velocity_to_come(self) -> FloatArray:
         """Velocities of the constraints after this time step, if it were done as it is."""
