@@ -5,9 +5,9 @@
     python benchmarks/bench_transfer.py --runs runs --episodes 200 --jobs 2
 
 Tested is what ``--runs`` holds: each run's best policy, in the engine it was trained in and in the
-others, with ideal and servo drives. Runs that stopped early come of ``--steps``: their policies
-drop and shove, which is where an engine with a simpler contact would be found out. The published
-policies are tested too.
+others, with ideal and servo drives. Runs that stopped early come of ``--steps``, and those that
+shove of ``shoving.py``: what drops and shoves is where an engine with a simpler contact would be
+found out. The published policies are tested too.
 
 Everything goes to docs/records/transfer.json, and from there into docs/closed-form.md.
 """
@@ -46,7 +46,7 @@ class Cell:
     """A policy in an engine with a drive.
 
     Attributes:
-        kind: Which policies are put together: id, engine and steps of their training.
+        kind: Which policies are put together: how they were trained.
     """
 
     kind: str
@@ -59,21 +59,25 @@ class Cell:
 
 def cells(runs: Path, episodes: int, drives: Sequence[str]) -> Iterator[Cell]:
     """Every policy in every engine with every drive."""
-    policies = [
-        (_kind(json.loads(file.read_text(encoding="utf-8"))), str(file.parent))
-        for file in sorted(runs.glob("*/config.json"))
-    ]
-    policies += [(f"{env_id}: published", env_id) for env_id in PUBLISHED]
-    for kind, policy in policies:
-        env_id = kind.split(":")[0]
+    policies = [(_kind(config), config["env"], str(folder)) for folder, config in _trained(runs)]
+    policies += [(f"{env_id}: published", env_id, env_id) for env_id in PUBLISHED]
+    for kind, env_id, policy in policies:
         for engine in ENGINES:
             for drive in drives:
                 yield Cell(kind, env_id, policy, engine, drive, episodes)
 
 
+def _trained(runs: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """The folders of runs, and what was asked of them."""
+    for file in sorted(runs.glob("*/config.json")):
+        yield file.parent, json.loads(file.read_text(encoding="utf-8"))
+
+
 def _kind(config: dict[str, Any]) -> str:
-    engine = config["env_options"].get("engine", "pybullet")
-    return f"{config['env']}: {config['algo'].upper()}, {engine}, {config['steps']:,} steps"
+    asked = config["env_options"]
+    engine, drive = asked.get("engine", "pybullet"), asked.get("drive", "ideal")
+    env_id = config["env"].rpartition(":")[-1]
+    return f"{env_id}: {config['algo'].upper()}, {engine}, {drive}, {config['steps']:,} steps"
 
 
 def run(cell: Cell) -> dict[str, Any]:
@@ -86,7 +90,8 @@ def run(cell: Cell) -> dict[str, Any]:
             found = run_batch(envs, policy, cell.episodes, TEST_SEED)
         else:
             found = run_episodes(env, policy, cell.episodes, TEST_SEED)
-    return {**vars(cell), "successes": [episode.success_at_end for episode in found]}
+    marks = "".join("01"[episode.success_at_end] for episode in found)
+    return {**vars(cell), "successes": marks}
 
 
 def lines(record: dict[str, Any]) -> Iterator[str]:
@@ -107,12 +112,18 @@ def _row(kind: str, columns: list[tuple[str, str]], found: list[dict[str, Any]])
     yield str(len({cell["policy"] for cell in own}))
     for engine, drive in columns:
         here = [c for c in own if (c["engine"], c["drive"]) == (engine, drive)]
-        rates = [100 * float(np.mean(cell["successes"])) for cell in here]
+        rates = [_rate(cell) for cell in here]
         if len(rates) > 1:
             yield f"{np.median(rates):.1f}% ({min(rates):.1f} to {max(rates):.1f})"
         else:
-            only = wilson(here[0]["successes"])
+            only = wilson([mark == "1" for mark in here[0]["successes"]])
             yield f"{rates[0]:.1f}% [{100 * only.low:.1f}, {100 * only.high:.1f}]"
+
+
+def _rate(cell: dict[str, Any]) -> float:
+    """Of success, %."""
+    marks = cell["successes"]
+    return 100 * marks.count("1") / len(marks)
 
 
 def main() -> None:
@@ -128,8 +139,7 @@ def main() -> None:
     found = []
     with ProcessPoolExecutor(options.jobs) as pool:
         for cell in pool.map(run, todo):
-            rate = 100 * np.mean(cell["successes"])
-            print(cell["kind"], cell["engine"], cell["drive"], f"{rate:.1f}%", file=sys.stderr)
+            print(*(cell[k] for k in ("kind", "engine", "drive")), _rate(cell), file=sys.stderr)
             found.append({**cell, "policy": Path(cell["policy"]).name})
     record = {
         "machine": machine.describe(sys.argv),

@@ -1,0 +1,80 @@
+r"""A task for policies that shove: where engines differ most, since the puck is about to tip.
+
+The puck has to be slid to a goal on the table, without vacuum. The cup comes no lower than 12 mm
+above the puck's middle, so a push nearly tips it; and policies also drag it by its upper edge.
+
+    cd benchmarks
+    python -m tpm_gym.learning train --algo ppo --engine analytic --env shoving:TPMShoveDense-v0 \
+        --recipe shoving.yml --seed 0 --run ../runs/transfer/shove-s0
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+import tpm_gym
+from tpm_gym.arrays import FloatArray
+from tpm_gym.simulation.state import State
+from tpm_gym.tasks import Entry, PickAndPlace, hanging, rewards, sampling
+
+FARTHEST = 0.100  # m, from start to goal
+FAST = 0.15  # m/s
+
+
+class Shove(PickAndPlace):
+    """Slide the puck to a goal on the table.
+
+    Attributes:
+        haste: What it costs a control step, for each m/s, that the puck is faster than FAST.
+    """
+
+    vacuum = False
+    samplings = ("sampled",)
+    haste = 3.0
+
+    def sample_each(
+        self, rngs: Sequence[np.random.Generator], chosen: Mapping[str, FloatArray]
+    ) -> dict[str, FloatArray]:
+        """Both on the table, APART to FARTHEST from each other."""
+        table, machine = self.on_table(self.puck), self.machine
+        first = machine.sample_each(rngs, [table] * len(rngs))
+        last = first.copy()
+        rows = np.arange(len(rngs))
+        while len(rows):
+            own = [rngs[row] for row in rows]
+            last[rows] = machine.sample_each(own, [table] * len(own))
+            way = rewards.distance(first, last)
+            rows = np.flatnonzero((way < sampling.APART) | (way > FARTHEST))
+        offset, to_world = hanging(self.puck), machine.mount.to_world
+        drawn = {"object": to_world(first) - offset, "goal": to_world(last) - offset}
+        return {**drawn, **sampling.repeated(chosen, len(rngs))}
+
+    def sample(self, rng: np.random.Generator, chosen: Mapping[str, FloatArray]) -> Any:
+        """See the base class."""
+        return sampling.first_of(self.sample_each([rng], chosen))
+
+    def observed(self) -> tuple[Entry, ...]:
+        """The robot, then the puck, which is never held."""
+        return (*self.robot_entries(), *self.object_entries()[:-1])
+
+    def shaping(self, state: State) -> dict[str, FloatArray]:
+        """Minus the distance from the lip to the puck's middle, and haste."""
+        speed = np.linalg.norm(state.object_velocity[..., 0, :], axis=-1)
+        away = rewards.distance(self.lip(state), state.object_position[..., 0, :])
+        return {
+            "approach": 0.25 * rewards.dense(away),
+            "haste": -self.haste * np.maximum(speed - FAST, 0.0),
+        }
+
+
+class ShoveGently(Shove):
+    """The same, where haste is dear."""
+
+    haste = 10.0
+
+
+tpm_gym.register_task("Shove", Shove)
+tpm_gym.register_task("ShoveGently", ShoveGently)
