@@ -199,6 +199,8 @@ def test_options_are_refused_by_name() -> None:
     for options, message in (
         ({"num_envs": 0}, "1 or more"),
         ({"max_episode_steps": 0}, "1 or more"),
+        ({"stagger": "no"}, "True or False"),
+        ({"render_mode": "rgb_array"}, "pictures are of one"),
         ({"autoreset_mode": "Never"}, "'NextStep', 'SameStep', 'Disabled'"),
         ({"physics": {"time_step": 0.02}}, "time_step"),
         ({"physics": {"time_step": 1e-12}}, "at least 1e-06 s"),

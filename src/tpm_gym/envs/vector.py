@@ -99,6 +99,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             ``reset(options={"reset_mask": ...})``).
         stagger: Whether the first episodes after a reset of all are of different lengths, so that
             not all end at the same step; it makes on-policy batches more even.
+        render_mode: None: there are no pictures of many.
         physics: A :class:`~tpm_gym.simulation.analytic.physics.Physics`, or a mapping.
 
     Attributes:
@@ -118,6 +119,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         max_episode_steps: int | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         stagger: bool = False,
+        render_mode: None = None,
         machine: str | Machine | None = None,
         goals: str | None = None,
         penalty_weight: float | None = None,
@@ -132,6 +134,11 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         if max_episode_steps is not None and not _is_count(max_episode_steps):
             valid = "a whole number, 1 or more, or None for no end"
             raise ConfigurationError("max_episode_steps", max_episode_steps, valid)
+        if not isinstance(stagger, bool):
+            raise ConfigurationError("stagger", stagger, "True or False")
+        if render_mode is not None:
+            valid = "None; pictures are of one: gym.make(..., engine='analytic', render_mode=...)"
+            raise ConfigurationError("render_mode", render_mode, valid)
         self.autoreset_mode = _mode_of(autoreset_mode)
         self.metadata = {
             "render_modes": [],
