@@ -174,7 +174,7 @@ def test_a_lip_dragged_over_an_edge_tips_it_as_in_pybullet(way: Vector, depth: f
     ours, theirs = compared(commands, [False] * len(commands), MIDDLE)
     assert theirs.tilt.max() > math.radians(20)
     assert ours.tilt.max() == pytest.approx(theirs.tilt.max(), rel=0.15)
-    assert math.dist(ours.position[-1], theirs.position[-1]) < 1e-3
+    assert math.dist(ours.position[-1], theirs.position[-1]) < 3e-3
     assert max(ours.tilt[-1], theirs.tilt[-1]) < 1e-3
 
 

@@ -31,6 +31,7 @@ SETTLED = 1e-6  # m, and m/s: less is none
 LITTLE = 1e-12
 
 _SLIP = 1e-4  # m/s; what is slower has no direction
+TILTED_SLIP = 1e-2  # m/s; nor has what tips, and is slower: it turns about what stands still
 _LEAST = 0.02  # of friction along an axis, whatever the direction of the slip
 
 
@@ -91,10 +92,10 @@ def level_length(x: float, y: float) -> float:
 
 
 @compiled
-def slip_shares(x: float, y: float) -> tuple[float, float]:
-    """Shares of friction along the world's axes for a slip, m/s."""
+def slip_shares(x: float, y: float, least: float = _SLIP) -> tuple[float, float]:
+    """Shares of friction along the world's axes for a slip (m/s), of which none is below least."""
     speed = level_length(x, y)
-    if speed > _SLIP:
+    if speed > least:
         return max(abs(x) / speed, _LEAST), max(abs(y) / speed, _LEAST)
     return math.sqrt(0.5), math.sqrt(0.5)
 

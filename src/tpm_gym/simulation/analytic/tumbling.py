@@ -25,6 +25,7 @@ from tpm_gym.simulation.analytic.body import (
     ROUNDING,
     SEEN_BY_LIP,
     SPIN,
+    TILTED_SLIP,
     TURN,
     VX,
     VY,
@@ -213,7 +214,7 @@ def _weighed(parts: FloatArray, weights: FloatArray) -> float:
 def _grips(row: FloatArray, half: Vector) -> FloatArray:
     """What share of what bears it each friction can be (c - 5,)."""
     x, y = row[VX] - half[2] * row[SPIN + 1], row[VY] + half[2] * row[SPIN]
-    east, north = slip_shares(x, y)
+    east, north = slip_shares(x, y, TILTED_SLIP)
     grips = np.empty(_COUNT - _BEARING)
     for k in range(4):
         grips[k], grips[4 + k] = row[ROUGH] * east, row[ROUGH] * north
