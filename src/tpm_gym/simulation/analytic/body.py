@@ -93,7 +93,7 @@ def level_length(x: float, y: float) -> float:
 
 @compiled
 def slip_shares(x: float, y: float, least: float = _SLIP) -> tuple[float, float]:
-    """Shares of friction along the world's axes for a slip (m/s), of which none is below least."""
+    """Shares of friction along the world's axes for a slip, m/s; below ``least`` it has none."""
     speed = level_length(x, y)
     if speed > least:
         return max(abs(x) / speed, _LEAST), max(abs(y) / speed, _LEAST)

@@ -287,7 +287,7 @@ def drags_over(
     """Whether a lip that slides over the top face of a standing block tips it over an edge.
 
     It drags along its slip, at the height of the face, and holds down where it is farthest from
-    that edge. It never drags a block along: the table, which bears the block too, is as rough.
+    that edge. It never drags a block along: the table, which bears more, is twice as rough.
 
     Args:
         row: The block.
