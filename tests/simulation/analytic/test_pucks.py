@@ -122,6 +122,33 @@ def test_a_pick_a_way_and_a_release_are_those_of_pybullet() -> None:
     assert math.dist(ours.position[-1], theirs.position[-1]) < 2e-5
 
 
+@pytest.mark.parametrize(
+    ("way", "speed", "holds"),
+    [
+        ((1.0, 0.0, 0.0), 0.50, True),
+        ((1.0, 0.0, 0.0), 0.65, True),  # at the second try
+        ((-1.0, 0.0, 0.0), 0.75, False),
+        ((0.8, 0.6, 0.0), 0.50, True),
+        ((0.8, 0.6, 0.0), 0.60, False),
+        ((0.8, 0.6, 0.0), 0.70, False),
+        ((0.05, -1.0, 0.0), 0.75, False),
+    ],
+)
+def test_what_is_grabbed_in_full_sweep_is_held_or_lost_as_in_pybullet(
+    way: Vector, speed: float, holds: bool
+) -> None:
+    step = speed * STEP * STEPS * np.array(way) / math.hypot(*way)
+    commands = [ON_TOP + [0.0, 0.0, 0.02] + (k - 6) * step for k in range(12)]
+    for k, command in enumerate(commands):
+        command[2] = max(ON_TOP[2] + 0.02 - 0.03 * max(0, k - 4), ON_TOP[2] - 0.003)
+    ours, theirs = compared(commands, [True] * len(commands), MIDDLE)
+    np.testing.assert_array_equal(ours.held, theirs.held)
+    assert (theirs.held == 0).any()
+    assert (theirs.held[-1] == 0) == holds
+    if holds:
+        assert math.dist(ours.position[-1], theirs.position[-1]) < 1e-3
+
+
 @pytest.mark.parametrize("way", [(0.03, 0.0, 0.0), (0.0, 0.02, 0.01), (0.015, -0.02, -0.004)])
 def test_what_is_thrown_comes_to_rest_where_it_does_in_pybullet(way: Vector) -> None:
     top = ON_TOP + [0.0, 0.0, 0.06]

@@ -20,7 +20,9 @@ VACUUM = 17
 NORMAL = 18  # of three: of the last contact with the lip, if it was the last time step's
 HELD, STILL = 21, 22  # 0 or 1
 MASS, ROUGH = 23, 24  # ROUGH is the object's Coulomb coefficient on the table
-COLUMNS = 25
+CHANGED = 25  # what the last time step has made of it: TAKEN, TAKEN_PRESSED, LET_GO, or 0
+COLUMNS = 26
+TAKEN, TAKEN_PRESSED, LET_GO = 1.0, 2.0, 3.0
 
 RECOVERY = 0.08  # share of a penetration that a time step takes out
 SLOP = 1e-5  # m; a penetration that stays

@@ -23,8 +23,10 @@ from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector
 from tpm_gym.mechanism.cup import CUP, sealed
 from tpm_gym.mechanism.mount import GRAVITY
 from tpm_gym.simulation.analytic.body import (
+    CHANGED,
     GRIP,
     HELD,
+    LET_GO,
     MASS,
     NORMAL,
     ROUGH,
@@ -36,6 +38,8 @@ from tpm_gym.simulation.analytic.body import (
     SPIN,
     SPRING,
     STILL,
+    TAKEN,
+    TAKEN_PRESSED,
     TURN,
     VACUUM,
     VX,
@@ -68,6 +72,7 @@ _LEVEL = 1e-5  # square of the sine of half the angle by which it nearly stands
 _LANDING = 3 * GRAVITY  # m/s^2; then the engine does not know yet where it slips, and has a box
 _TURNING = 3.0  # a corner's distance over the radius of gyration of a square, squared
 _NEAR = 0.005  # m; around what the lip may touch
+_BESIDE_LIP = 0.94  # of the table's friction along an axis, beside what the lip rubbed off it
 _NONE: Vector = (0.0, 0.0, 0.0)
 _DOWN: Vector = (0.0, 0.0, -1.0)
 
@@ -136,8 +141,8 @@ def _reached(row: FloatArray, path: FloatArray, half: Vector) -> bool:
 @compiled
 def _step(row: FloatArray, way: Way, on: bool, setting: Setting) -> Vector:
     """A time step of an object; the force on the platform."""
-    load = Load(0.0, 0.0)
-    if row[HELD]:
+    load, held, pressed = Load(0.0, 0.0), row[HELD], row[SLIDE] > 0
+    if held:
         force, load = _move_held(row, way, setting)
     else:
         flat = not (row[TURN] or row[TURN + 1] or row[SPIN] or row[SPIN + 1])
@@ -145,6 +150,9 @@ def _step(row: FloatArray, way: Way, on: bool, setting: Setting) -> Vector:
         if tips:
             force = _move_any(row, way, setting)
     _hold(row, way.then, on, load, setting)
+    row[CHANGED] = 0.0
+    if row[HELD] != held:
+        row[CHANGED] = LET_GO if held else TAKEN_PRESSED if pressed else TAKEN
     return force
 
 
@@ -162,13 +170,27 @@ def _move_held(row: FloatArray, way: Way, setting: Setting) -> tuple[Vector, Loa
     pressed = pushed > 0
     if pressed:
         normal = max(CUP.preload + _CUP_MASS * lift + c, 0.0)
-        drag = row[ROUGH] * normal / max(level_length(u, v), SETTLED)
-        a, b, c = a + drag * u, b + drag * v, c - normal
+        east, north = _drag(row, u, v)
+        most = row[ROUGH] * normal
+        a, b, c = a + most * east, b + most * north, c - normal
     put(row, X, (x, y, z))
     put(row, VX, (u, v, w))
     put(row, SPIN, _NONE)
     row[SLIDE] = 0.0 if slide < SETTLED else slide
     return (-a, -b, _spring(way, step) if pressed else -c), Load(c, level_length(a, b))
+
+
+@compiled
+def _drag(row: FloatArray, u: float, v: float) -> tuple[float, float]:
+    """The table's friction, east and north, on what is held and slides, by what it can be.
+
+    In the first time step the engine does not know yet where it will slip, and has a box.
+    """
+    if row[CHANGED]:
+        share = _BESIDE_LIP if row[CHANGED] == TAKEN_PRESSED else math.sqrt(0.5)
+        return share * clip(u / SETTLED, -1.0, 1.0), share * clip(v / SETTLED, -1.0, 1.0)
+    speed = max(level_length(u, v), SETTLED)
+    return u / speed, v / speed
 
 
 @compiled
@@ -186,9 +208,10 @@ def _move_flat(row: FloatArray, way: Way, setting: Setting) -> tuple[Vector, boo
     known, deep = level_length(row[NORMAL], row[NORMAL + 1]) > 0.5, overlap > _DEEP
     beside = side.away > 0 or (deep and (known or side.away >= _DEEP - overlap))
     excess = max(least_rise(-overlap, SEEN_BY_LIP) - lip[2] + rising * step, 0.0)
-    excess = 0.0 if beside else excess
-    pressed = excess > 0
-    weight = carried + (CUP.preload * step / mass if pressed else 0.0)
+    # What was let go is a hair off the lip, and the engine sees them touch a time step later
+    pressed = excess > 0 and not (beside or row[CHANGED] == LET_GO)
+    excess, press = (excess, CUP.preload * step / mass) if pressed else (0.0, 0.0)
+    weight = carried + press
     shoved = beside and overlap > 0 and side.gap < SEEN_BY_LIP
     moved = row[VX] != 0 or row[VY] != 0 or row[SPIN + 2] != 0
     force_x = force_y = 0.0
@@ -201,9 +224,11 @@ def _move_flat(row: FloatArray, way: Way, setting: Setting) -> tuple[Vector, boo
             return _NONE, True
         row[VX], row[VY], row[SPIN + 2] = done.vx, done.vy, done.spin
         force_x, force_y = -mass * done.push[0] / step, -mass * done.push[1] / step
-    elif pressed and (carried == 0 or _tips(row, way.now, lip, carried, setting)):
+    elif pressed and (carried == 0 or _tips(row, way.now, lip, (press, carried), setting)):
         return _NONE, True
     else:
+        if pressed and moved:
+            _take_along(row, (lip[0] / step, lip[1] / step), press, row[ROUGH] * weight)
         _slow_down(row, row[ROUGH] * weight, carried > _LANDING * step, 2 * width)
     row[VZ] = rising
     put(row, NORMAL, (side.nx, side.ny, 0.0) if shoved else _NONE)
@@ -221,11 +246,15 @@ def _move_flat(row: FloatArray, way: Way, setting: Setting) -> tuple[Vector, boo
 
 
 @compiled
-def _tips(row: FloatArray, place: Vector, moved: Vector, carried: float, setting: Setting) -> bool:
-    """Whether a lip that presses on the top face tips the block, as it moves by so much (m)."""
-    step = setting.step
+def _tips(
+    row: FloatArray, place: Vector, moved: Vector, impulses: tuple[float, float], setting: Setting
+) -> bool:
+    """Whether a lip that presses on the top face tips the block, as it moves by so much (m).
+
+    The impulses are those of the lip and of the table without it, by the mass, m/s.
+    """
+    step, (press, carried) = setting.step, impulses
     slip = (moved[0] - row[VX] * step, moved[1] - row[VY] * step, 0.0)
-    press = CUP.preload * step / row[MASS]
     return drags_over(row, place, slip, press, carried, setting.half)
 
 
@@ -234,6 +263,15 @@ def _spring(way: Way, step: float) -> float:
     """Force (N) on the platform of a cup that is pushed back and bears its own weight."""
     lift = way.then[2] - 2 * way.now[2] + way.before[2]
     return CUP.preload + _CUP_MASS * (GRAVITY + lift / step**2)
+
+
+@compiled
+def _take_along(row: FloatArray, lip: tuple[float, float], press: float, table: float) -> None:
+    """Let a lip (m/s) that presses take along what slides, of which the table takes its own."""
+    left = max(1 - table / max(level_length(row[VX], row[VY]), SETTLED), 0.0)
+    x, y = lip[0] - left * row[VX], lip[1] - left * row[VY]
+    share = min(CUP.friction * row[ROUGH] * press / max(level_length(x, y), SETTLED), 1.0)
+    row[VX], row[VY] = row[VX] + share * x, row[VY] + share * y
 
 
 @compiled
