@@ -35,6 +35,7 @@ LITTLE = 1e-12
 _SLIP = 1e-4  # m/s; what is slower has no direction
 TILTED_SLIP = 1e-2  # m/s; nor has what tips, and is slower: it turns about what stands still
 _LEAST = 0.02  # of friction along an axis, whatever the direction of the slip
+UNKNOWN_SLIP = math.sqrt(0.5)  # of friction along either axis, where it is not known yet
 
 
 class Setting(NamedTuple):
@@ -99,7 +100,7 @@ def slip_shares(x: float, y: float, least: float = _SLIP) -> tuple[float, float]
     speed = level_length(x, y)
     if speed > least:
         return max(abs(x) / speed, _LEAST), max(abs(y) / speed, _LEAST)
-    return math.sqrt(0.5), math.sqrt(0.5)
+    return UNKNOWN_SLIP, UNKNOWN_SLIP
 
 
 @compiled

@@ -41,6 +41,7 @@ from tpm_gym.simulation.analytic.body import (
     TAKEN,
     TAKEN_PRESSED,
     TURN,
+    UNKNOWN_SLIP,
     VACUUM,
     VX,
     VY,
@@ -187,7 +188,7 @@ def _drag(row: FloatArray, u: float, v: float) -> tuple[float, float]:
     In the first time step the engine does not know yet where it will slip, and has a box.
     """
     if row[CHANGED]:
-        share = _BESIDE_LIP if row[CHANGED] == TAKEN_PRESSED else math.sqrt(0.5)
+        share = _BESIDE_LIP if row[CHANGED] == TAKEN_PRESSED else UNKNOWN_SLIP
         return share * clip(u / SETTLED, -1.0, 1.0), share * clip(v / SETTLED, -1.0, 1.0)
     speed = max(level_length(u, v), SETTLED)
     return u / speed, v / speed
@@ -284,7 +285,7 @@ def _slow_down(row: FloatArray, most: float, landed: bool, width: float) -> None
     speed = math.sqrt(x * x + y * y + 0.5 * width**2 * turning * turning)
     taken = most / max(speed, SETTLED)
     if landed:
-        bound = most * math.sqrt(0.5)
+        bound = most * UNKNOWN_SLIP
         row[VX], row[VY] = x - clip(x, -bound, bound), y - clip(y, -bound, bound)
     else:
         row[VX], row[VY] = x * max(1 - taken, 0.0), y * max(1 - taken, 0.0)
