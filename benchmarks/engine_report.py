@@ -180,9 +180,10 @@ def _agreement(axes: Axes, record: dict[str, Any]) -> None:
         ("MuJoCo off theory", "s", VERMILLION, "mujoco", "off_theory"),
         ("MuJoCo off PyBullet", "D", PURPLE, "mujoco", "off_engine"),
     )
-    for label, marker, colour, engine, key in marks:
+    for aside, (label, marker, colour, engine, key) in zip((-0.2, 0.0, 0.2), marks, strict=True):
         found = {row["motion"]: row[key] for row in rows if row["engine"] == engine}
-        shown = [(found[name], at) for at, name in enumerate(names) if found.get(name)]
+        # Each at a height of its own, so that none hides another.
+        shown = [(found[name], at + aside) for at, name in enumerate(names) if found.get(name)]
         x, y = zip(*shown, strict=True)
         axes.plot(
             100 * np.array(x), y, marker, color=colour, label=label, markersize=5, mec="white"
