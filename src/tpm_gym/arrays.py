@@ -69,6 +69,12 @@ def vector(name: str, value: ArrayLike, error: _Error = InputError) -> Vector:
     raise error(name, brief(value), "three finite numbers, of shape (3,)")
 
 
+def is_whole(value: Any, least: int) -> bool:
+    """Whether that is a whole number, and no boolean, of at least so much."""
+    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    return whole and bool(value >= least)
+
+
 def points(name: str, value: ArrayLike) -> FloatArray:
     """Points (..., 3), finite or not; a torch tensor stays one, on its device, in float64.
 

@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
-from tpm_gym.arrays import FloatArray, Vector, finite
+from tpm_gym.arrays import FloatArray, Vector, finite, is_whole
 from tpm_gym.envs.report import (
     GOAL_BOUND,
     OBSERVATION_BOUND,
@@ -166,7 +166,8 @@ class TPMEnv(gym.Env[Observation, Action]):
         control: ``"cartesian"`` or ``"joints"``.
         reward: ``"sparse"`` (None too) or ``"dense"``.
         engine: ``"pybullet"``, ``"analytic"`` (the closed form), ``"mujoco"`` (with the extra of
-            that name; both open no window), or a name that :func:`tpm_gym.register_engine` knows.
+            that name; neither of these two opens a window), or a name that
+            :func:`tpm_gym.register_engine` knows.
         machine: ``"paper"`` (None too), ``"wide"``, a name that :func:`tpm_gym.register_machine`
             knows, or a :class:`~tpm_gym.Machine`; a spec that goes through JSON needs a name.
         goals: ``"sampled"`` (None too), or ``"tempting"``: the goal, and where the puck starts, lie
@@ -521,7 +522,7 @@ def _box(bound: float, length: int) -> spaces.Box:
 
 
 def _pixels(name: str, value: Any) -> int:
-    if isinstance(value, (int, np.integer)) and 16 <= value <= 4096:
+    if is_whole(value, 16) and value <= 4096:
         return int(value)
     raise ConfigurationError(name, value, "a whole number of pixels from 16 to 4096")
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import gymnasium as gym
 
+from tpm_gym.arrays import is_whole
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.tasks.pick_and_place import PickAndPlace
 from tpm_gym.tasks.reach import Reach
@@ -50,7 +51,7 @@ def register_task(
         ("version", version, 0),
         ("max_episode_steps", max_episode_steps, 1),
     ):
-        if type(number) is not int or number < least:
+        if not is_whole(number, least):
             raise ConfigurationError(label, number, f"a whole number, {least} or more")
     if _path(TASKS.get(option, task)) != _path(task):
         raise ConfigurationError("name", name, f"another name; {TASKS[option]} has this one")
@@ -58,7 +59,7 @@ def register_task(
         f"TPM{name}{joints}{dense}-v{version}": {
             "entry_point": ENTRY_POINT,
             "vector_entry_point": VECTOR_ENTRY_POINT,
-            "max_episode_steps": max_episode_steps,
+            "max_episode_steps": int(max_episode_steps),  # for JSON
             "kwargs": {"task": option, "control": control, "reward": reward},
         }
         for control, joints in (("cartesian", ""), ("joints", "Joints"))

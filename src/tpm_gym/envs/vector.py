@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
-from tpm_gym.arrays import BoolArray, FloatArray, IntArray, brief, finite
+from tpm_gym.arrays import BoolArray, FloatArray, IntArray, brief, finite, is_whole
 from tpm_gym.envs.env import action_space, observation_space, require_same
 from tpm_gym.envs.registration import VECTOR_ENTRY_POINT
 from tpm_gym.envs.report import Observation, compute_reward, observe, report
@@ -128,10 +128,10 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         physics: Any = None,
     ) -> None:
         """Check the options and build the robots."""
-        if not _is_count(num_envs):
+        if not is_whole(num_envs, 1):
             raise ConfigurationError("num_envs", num_envs, "a whole number, 1 or more")
-        self.num_envs = num_envs
-        if max_episode_steps is not None and not _is_count(max_episode_steps):
+        self.num_envs = int(num_envs)
+        if max_episode_steps is not None and not is_whole(max_episode_steps, 1):
             valid = "a whole number, 1 or more, or None for no end"
             raise ConfigurationError("max_episode_steps", max_episode_steps, valid)
         if not isinstance(stagger, bool):
@@ -435,10 +435,6 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
     def _require_open(self) -> None:
         if self.closed:
             raise EpisodeError("the environments are closed; make new ones")
-
-
-def _is_count(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= 1
 
 
 def _mode_of(value: AutoresetMode | str) -> AutoresetMode:

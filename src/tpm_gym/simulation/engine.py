@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from tpm_gym.arrays import Quaternion, Vector
+from tpm_gym.arrays import Quaternion, Vector, is_whole
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.drives import Reference, Servo
@@ -215,7 +215,7 @@ def make_engine(
     engine: Engine = factory(**asked)
     if lacking := [part for part in _PARTS if not _has(engine, part)]:
         raise ConfigurationError("engine", name, f"an engine that has {', '.join(lacking)}")
-    if not isinstance(engine.substeps, int) or engine.substeps < 1:
+    if not is_whole(engine.substeps, 1):
         raise ConfigurationError("engine", name, "an engine whose substeps are 1 or more")
     return engine
 

@@ -31,7 +31,7 @@ _RANGES: dict[str, Range] = {
     "joint_friction": (0.0, 100.0),
 }
 # With bias and lengths off by all of this at once, the arm at home still stands on its own side;
-# with a few times as much, no assembly is where the encoders say.
+# with twice as much, some machines have no assembly where the encoders say.
 _SIZES: dict[str, float] = {
     "encoder_noise": 0.02,
     "encoder_bias": 1e-3,

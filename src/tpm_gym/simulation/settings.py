@@ -6,9 +6,10 @@ import math
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, fields
-from numbers import Integral, Real
+from numbers import Real
 from typing import Any, TypeVar
 
+from tpm_gym.arrays import is_whole
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.simulation.state import CONTROL_PERIOD
 
@@ -80,7 +81,7 @@ def require_numerics(
             f"a whole fraction of the control period, {CONTROL_PERIOD} s; at least {_SHORTEST} s"
         )
         raise ConfigurationError("time_step", step, valid)
-    if isinstance(count, bool) or not isinstance(count, Integral) or count < 1:
+    if not is_whole(count, 1):
         raise ConfigurationError("iterations", count, "a whole number, 1 or more")
     for name, (fits, valid) in ranges.items():
         if not fits(getattr(settings, name)):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector, finite
+from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector, finite, is_whole
 from tpm_gym.errors import ConfigurationError
 
 __all__ = ["CONTROL_PERIOD", "Block", "Scene", "State"]
@@ -91,7 +91,7 @@ class Scene:
         if not blocks or len({"goal", *(b.name for b in self.objects)}) <= len(self.objects):
             valid = "a tuple of blocks, each with a name of its own that is not 'goal'"
             raise ConfigurationError("objects", self.objects, valid)
-        if not isinstance(self.markers, int) or self.markers < 0:
+        if not is_whole(self.markers, 0):
             raise ConfigurationError("markers", self.markers, "a whole number, 0 or more")
         _require_positive("marker_radius", self.marker_radius)
 

@@ -25,6 +25,9 @@ NONE: Final = "\N{EM DASH}"
 
 STUDIES: Final = (
     StudyConfig("results", engine="analytic"),
+    StudyConfig(
+        "results", engine="analytic", algos=("tqc",), envs=("TPMPickAndPlace-v0",), seeds=1
+    ),
     StudyConfig("penalty", engine="analytic"),
     StudyConfig("robustness", engine="analytic"),
     StudyConfig("robustness", engine="pybullet", episodes=100),
@@ -70,6 +73,11 @@ def page(records: Sequence[Record], figures: Sequence[str]) -> str:
 def command(config: StudyConfig) -> str:
     """The command of one of the studies."""
     words = ["tpm-gym study", "--plan", config.plan, "--engine", config.engine]
+    for name in ("algos", "envs"):
+        if chosen := getattr(config, name):
+            words += [f"--{name}", *chosen]
+    if config.seeds != StudyConfig.seeds:
+        words += ["--seeds", str(config.seeds)]
     return " ".join([*words, "--episodes", str(config.episodes)])
 
 
