@@ -71,7 +71,7 @@ def _engine(name: str) -> str:
 def _times(row: dict[str, Any]) -> str:
     if row["ratio"] is None:
         return "-"
-    return _spread(row["ratio"], "{:.0f}" if row["ratio"]["median"] >= 10 else "{:.1f}")
+    return _spread(row["ratio"], "{:.0f}" if min(row["ratio"]) >= 10 else "{:.1f}")
 
 
 def _torques(rows: list[dict[str, Any]]) -> Iterator[str]:

@@ -87,19 +87,20 @@ class JointControl:
         start = np.asarray(current, dtype=np.float64)
         if start.ndim > 1:
             return self._commands(np.asarray(action, dtype=np.float64), start)
-        joints = self._machine.inverse(_vector(start))
-        theta = np.array(joints)
+        here = _vector(start)
+        joints = self._machine.inverse(here)
         step = np.asarray(action, dtype=np.float64) * self._machine.joint_limit
         # By J, this fraction of the step uses the limit up; the exact one is near.
         rate = np.abs(np.array(self._machine.evaluate(joints).jacobian) @ step)
         linear = float((self._step / np.maximum(rate, 1e-12)).min())
         low, high = 0.0, min(1.0, 2 * linear)
-        point = self._allowed(theta + high * step, start)
+        turn = _vector(step)
+        point = self._allowed(joints, turn, high, here)
         if point is None:
-            point = start
+            point = here
             for _ in range(_BISECTIONS):
                 middle = (low + high) / 2
-                tried = self._allowed(theta + middle * step, start)
+                tried = self._allowed(joints, turn, middle, here)
                 if tried is None:
                     high = middle
                 else:
@@ -136,13 +137,17 @@ class JointControl:
             point = np.where(allowed, tried, point)
         return point
 
-    def _allowed(self, theta: FloatArray, start: FloatArray) -> FloatArray | None:
-        """Point P at ``theta``, if it is in the machine's modes and a step from ``start``."""
+    def _allowed(self, joints: Vector, turn: Vector, share: float, start: Vector) -> Vector | None:
+        """Point P that ``share`` of the turn further, if it is in the modes and a step away."""
+        a, b, c = joints
+        d, e, f = turn
         try:
-            point = np.array(self._machine.forward(_vector(theta)))
+            x, y, z = self._machine.forward((a + share * d, b + share * e, c + share * f))
         except UnreachableError:
             return None
-        return point if (np.abs(point - start) <= self._step).all() else None
+        # In plain floats: asked up to eleven times in a control step
+        (u, v, w), (p, q, r) = start, self._machine.step_limit
+        return (x, y, z) if abs(x - u) <= p and abs(y - v) <= q and abs(z - w) <= r else None
 
     def action(self, wanted: ArrayLike, current: ArrayLike) -> FloatArray:
         """The increment of the joints, scaled down as a whole where it is too large."""
