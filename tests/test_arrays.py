@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from tpm_gym.arrays import finite, finite_points, numbers, points, rotate, transform, vector
-from tpm_gym.errors import InputError, ResetOptionError
+from tpm_gym.envs.vector import TPMVectorEnv
+from tpm_gym.errors import ConfigurationError, InputError, ResetOptionError
 
 NO_NUMBERS = {
     "beyond the range of floats": [10**400, 0, 0],
@@ -113,6 +114,19 @@ def test_points_in_tensors_stay_tensors_in_double_precision() -> None:
     assert single.grad is not None
     double = torch.ones(2, 3, dtype=torch.float64)
     assert points("theta", double) is double
+
+
+@pytest.mark.parametrize("count", [True, np.True_, 1.0, np.float64(2.0), "3", None, 0, np.int64(0)])
+def test_what_is_no_whole_number_of_one_or_more_makes_no_vector_environment(count: Any) -> None:
+    with pytest.raises(ConfigurationError, match="num_envs"):
+        TPMVectorEnv("reach", num_envs=count)
+
+
+def test_numpys_whole_numbers_are_whole_numbers() -> None:
+    envs = TPMVectorEnv("reach", num_envs=np.int64(2), max_episode_steps=np.int32(5))
+    assert envs.num_envs == 2
+    assert type(envs.num_envs) is int
+    envs.close()
 
 
 @pytest.mark.parametrize("seed", range(5))
