@@ -69,6 +69,13 @@ def vector(name: str, value: ArrayLike, error: _Error = InputError) -> Vector:
     raise error(name, brief(value), "three finite numbers, of shape (3,)")
 
 
+def is_number(value: Any) -> bool:
+    """Whether that is a finite real number, and no boolean."""
+    with suppress(OverflowError):  # an integer beyond the range of floats
+        return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+    return False
+
+
 def is_whole(value: Any, least: int) -> bool:
     """Whether that is a whole number, and no boolean, of at least so much."""
     whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)

@@ -14,14 +14,14 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from tpm_gym.arrays import FloatArray, Vector
+from tpm_gym.arrays import FloatArray, Vector, is_number
 from tpm_gym.errors import ConfigurationError, SingularityError, UnreachableError
 from tpm_gym.kinematics.equations import Triple
 from tpm_gym.mechanism.batch import Batch
 from tpm_gym.mechanism.bodies import Joint
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.randomisation import NOMINAL, Plant, Randomisation
-from tpm_gym.simulation.settings import is_number, settings_of
+from tpm_gym.simulation.settings import settings_of
 
 __all__ = [
     "Gains",

@@ -12,10 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from tpm_gym.arrays import Vector
+from tpm_gym.arrays import Vector, is_number
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.machine import Machine
-from tpm_gym.simulation.settings import is_number
 
 __all__ = ["LIMITS", "NOMINAL", "Plant", "Randomisation"]
 

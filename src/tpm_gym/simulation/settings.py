@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, fields
-from numbers import Real
 from typing import Any, TypeVar
 
-from tpm_gym.arrays import is_whole
+from tpm_gym.arrays import is_number, is_whole
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.simulation.state import CONTROL_PERIOD
 
-__all__ = ["Numerics", "is_number", "require_numerics", "settings_of"]
+__all__ = ["Numerics", "require_numerics", "settings_of"]
 
 T = TypeVar("T")
 
@@ -34,13 +31,6 @@ def settings_of(kind: type[T], name: str, value: Any) -> T:
     full = f"{kind.__module__}.{kind.__name__}"
     valid = f"None, a {full}, or a mapping with keys among {', '.join(names)}"
     raise ConfigurationError(name, value, valid)
-
-
-def is_number(value: Any) -> bool:
-    """Whether that is a finite real number, and no boolean."""
-    with suppress(OverflowError):  # an integer beyond the range of floats
-        return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
-    return False
 
 
 @dataclass(frozen=True)
