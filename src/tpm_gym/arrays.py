@@ -59,8 +59,24 @@ def finite(
     return array
 
 
+def floats(
+    name: str, value: ArrayLike, count: int, error: _Error = InputError
+) -> tuple[float, ...]:
+    """So many finite numbers, as plain floats."""
+    array = numbers(name, value, error)
+    if array.shape == (count,):
+        plain = tuple(array.tolist())
+        if all(map(math.isfinite, plain)):
+            return plain
+    raise error(name, brief(value), f"finite numbers of shape ({count},)")
+
+
 def vector(name: str, value: ArrayLike, error: _Error = InputError) -> Vector:
     """Three finite numbers, as plain floats."""
+    if isinstance(value, tuple) and len(value) == 3:
+        a, b, c = value
+        if type(a) is type(b) is type(c) is float and math.isfinite(a + b + c):
+            return a, b, c  # as they shall be, fast
     array = numbers(name, value, error)
     if array.shape == (3,):
         a, b, c = array.tolist()
@@ -133,9 +149,16 @@ def rotate(quaternion: Quaternion, vector: Vector) -> Vector:
 
 def transform(origin: Vector, quaternion: Quaternion, point: Vector) -> Vector:
     """A point of a frame in the frame's parent, m."""
-    x, y, z = origin
-    a, b, c = rotate(quaternion, point)
-    return x + a, y + b, z + c
+    # As rotate(), written out: an engine asks for nine points in each control step.
+    u, v, w = origin
+    x, y, z, r = quaternion
+    a, b, c = point
+    s, t, p = 2 * (y * c - z * b), 2 * (z * a - x * c), 2 * (x * b - y * a)
+    return (
+        u + (a + r * s + y * p - z * t),
+        v + (b + r * t + z * s - x * p),
+        w + (c + r * p + x * t - y * s),
+    )
 
 
 def _holds_masked(value: Any) -> bool:

@@ -63,7 +63,8 @@ def test_the_worse_placed_block_decides(env):
     task, place = env.unwrapped.task, np.array([0.0, -0.03, 0.015, 0.0, -0.03, 0.048])
     both, red, blue = np.array([[1, 0, 0, 0, 1, 0], [1, 0, 0, 0, 0, 0], [0, 0, 0, 0, 1, 0]])
     offsets = [0.009 * both, 0.011 * red, 0.011 * blue]
-    assert [bool(task.success(place + off, place)) for off in offsets] == [True, False, False]
+    gaps = [task.gap(place + off, place) for off in offsets]
+    assert [bool(task.success(gap)) for gap in gaps] == [True, False, False]
 
 
 def test_users_place_the_blocks_by_name(env):

@@ -37,7 +37,7 @@ def test_distance_is_euclidean_and_broadcasts() -> None:
 
 
 def test_sparse_is_zero_strictly_within_the_tolerance_and_minus_one_elsewhere() -> None:
-    gaps = [0.0, 0.0099, 0.01, 0.0101, 3.0, np.nan]
+    gaps = np.array([0.0, 0.0099, 0.01, 0.0101, 3.0, np.nan])
     np.testing.assert_array_equal(sparse(gaps, 0.01), [0, 0, -1, -1, -1, -1])
     assert sparse(gaps, 0.01).dtype == np.float64
 

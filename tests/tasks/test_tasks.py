@@ -53,15 +53,17 @@ def test_every_function_of_a_state_accepts_a_batch(task: Task) -> None:
     desired = np.random.default_rng(1).normal(size=(4, 2, task.goal_size))
 
     def results(state: State, goal: Any) -> dict[str, Any]:
-        achieved = task.achieved(state)
+        achieved, penalty = task.achieved(state), task.penalty(state)
+        gap = task.gap(achieved, goal)
         return {
             "observed": task.observe(state),
             "achieved": achieved,
-            "success": task.success(achieved, goal),
-            "goal term": task.goal_term(achieved, goal),
-            "penalty": task.penalty(state),
+            "gap": gap,
+            "success": task.success(gap),
+            "goal term": task.goal_term(gap),
+            "penalty": penalty,
             "lost": task.lost(state),
-            **task.reward_terms(state, achieved, goal),
+            **task.reward_terms(state, gap, penalty),
         }
 
     batched = results(batch, desired)
@@ -112,7 +114,7 @@ def test_the_offset_to_the_puck_vanishes_when_the_cup_touches_it() -> None:
 
 
 def test_the_reward_has_the_documented_terms() -> None:
-    gap, near = np.array([0.03, 0.0, 0.04]), 1 - 0.5**4
+    goal, near = np.array([0.03, 0.0, 0.04]), 1 - 0.5**4
     for kind, reward, names in (
         (Reach, "sparse", {"goal": -1.0, "singularity": -2 * near}),
         (Reach, "dense", {"goal": -0.5, "singularity": -2 * near}),
@@ -124,7 +126,8 @@ def test_the_reward_has_the_documented_terms() -> None:
         state = states(task, conditioning=0.04, object_axis=upright)
         below = state.fk_position - HANGING - (0.0, 0.0, 0.03)
         state = replace(state, object_position=below[None])
-        assert task.reward_terms(state, np.zeros(3), gap) == pytest.approx(names)
+        gap, penalty = task.gap(np.zeros(3), goal), task.penalty(state)
+        assert task.reward_terms(state, gap, penalty) == pytest.approx(names)
 
 
 @pytest.mark.parametrize("mode", ["assembly", "working"])
@@ -132,15 +135,17 @@ def test_the_reward_has_the_documented_terms() -> None:
 def test_a_mode_change_costs_the_whole_penalty(mode: str, conditioning: float) -> None:
     task = Reach(PAPER_TPM)
     state = states(task, conditioning=conditioning, **{f"{mode}_mode_changed": np.True_})
-    assert task.penalty(state) == 1
-    assert task.reward_terms(state, np.zeros(3), np.zeros(3))["singularity"] == -1
+    penalty = task.penalty(state)
+    assert penalty == 1
+    assert task.reward_terms(state, np.zeros(()), penalty)["singularity"] == -1
 
 
 def test_sparse_rewards_follow_success() -> None:
     task = PickAndPlace(PAPER_TPM)
-    for gap, reward in ((0.0099, 0.0), (0.0101, -1.0)):
-        assert task.goal_term((gap, 0.0, 0.0), np.zeros(3)) == reward
-        assert task.success((gap, 0.0, 0.0), np.zeros(3)) == (reward == 0.0)
+    for off, reward in ((0.0099, 0.0), (0.0101, -1.0)):
+        gap = task.gap((off, 0.0, 0.0), np.zeros(3))
+        assert task.goal_term(gap) == reward
+        assert task.success(gap) == (reward == 0.0)
 
 
 def test_the_penalty_begins_where_the_machine_says() -> None:
@@ -184,7 +189,7 @@ def test_a_term_of_ones_own_cannot_replace_another(name: str) -> None:
 
     task = Replaced(PAPER_TPM)
     with pytest.raises(ConfigurationError, match="names other than goal, singularity") as caught:
-        task.reward_terms(states(task), np.zeros(3), np.ones(3))
+        task.reward_terms(states(task), np.ones(()), np.zeros(()))
     assert (caught.value.name, caught.value.value) == ("shaping", name)
 
 

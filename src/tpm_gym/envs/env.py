@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
-from tpm_gym.arrays import FloatArray, Vector, finite, is_whole
+from tpm_gym.arrays import FloatArray, Vector, floats, is_whole
 from tpm_gym.envs.report import (
     GOAL_BOUND,
     OBSERVATION_BOUND,
@@ -45,6 +45,8 @@ __all__ = ["EnvSnapshot", "TPMEnv"]
 
 Action = NDArray[Any]
 
+_OF_NUMPY = (np.generic, np.ndarray)
+
 
 @dataclass(frozen=True)
 class EnvSnapshot:
@@ -53,7 +55,7 @@ class EnvSnapshot:
     simulation: Snapshot
     rng: dict[str, Any]
     goal: FloatArray
-    pending: tuple[FloatArray, ...]
+    pending: tuple[tuple[float, ...], ...]
     kind: Mapping[str, Any]
     digest: str
 
@@ -245,7 +247,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         self._home = self.machine.inverse(self.machine.home)
         self._state: State | None = None
         self._goal = np.full(self.task.goal_size, np.nan)
-        self._pending: tuple[FloatArray, ...] = ()  # actions that come late
+        self._pending: tuple[tuple[float, ...], ...] = ()  # actions that come late
         self._closed = False
         self._shown = 0.0  # when the last frame was due, s of the performance counter
         self._engine, self._physics, self._renderer = engine, physics, renderer
@@ -299,7 +301,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         start = self.task.start(rng, options)
         plant = self.randomisation.draw(rng, self.machine)
         self._goal = start.pop("goal")
-        self._pending = (np.zeros(self.task.action_size),) * self.randomisation.latency
+        self._pending = ((0.0,) * self.task.action_size,) * self.randomisation.latency
         self._state = None
         self.episode += 1
         self._show_goal()
@@ -322,11 +324,11 @@ class TPMEnv(gym.Env[Observation, Action]):
             ModeChangeError: If the mechanism passed a singularity earlier in this episode.
             ConfigurationError: If the task makes something of the state that is no number.
         """
-        values = finite("action", action, (self.task.action_size,), ActionError)
+        asked = floats("action", action, self.task.action_size, ActionError)
         state = self.state
-        values, *pending = (*self._pending, np.minimum(np.maximum(values, -1.0), 1.0))
-        command = self._command(values[:3], state.command)
-        vacuum = self.task.vacuum and bool(values[3] > 0)
+        now, *pending = (*self._pending, tuple([min(max(value, -1.0), 1.0) for value in asked]))
+        command = self._command(now[:3], state.command)  # type: ignore[arg-type]
+        vacuum = self.task.vacuum and now[3] > 0
         self._state = None  # until the step has gone well
         try:
             self._state = self.simulation.move(command, vacuum, self._draw_noise())
@@ -469,19 +471,19 @@ class TPMEnv(gym.Env[Observation, Action]):
     def _show_goal(self) -> None:
         self.simulation.show_goal(self.task.markers(self._goal))
 
-    def _command(self, action: FloatArray, current: FloatArray) -> FloatArray:
+    def _command(self, action: Vector, current: FloatArray) -> Vector:
         """The next command for P; where many robots are simulated, as it is computed for many.
 
         Args:
-            action: (3,).
+            action: In [-1, 1].
             current: (3,) m, world.
         """
         x, y, z = current.tolist()
-        point = np.array(self.machine.mount.swap((x, y, z)))
+        point = self.machine.mount.swap((x, y, z))
         if self._engine in SIMULATIONS:
-            (command,) = self.control.command(action[None], point[None])
-            return np.asarray(command)
-        return self.control.command(action, point)
+            ((x, y, z),) = self.control.command(np.array([action]), np.array([point])).tolist()
+            return x, y, z
+        return self.control.next(action, point)
 
     def _draw_noise(self) -> Vector:
         """Errors of one reading of the encoders, rad."""
@@ -493,12 +495,11 @@ class TPMEnv(gym.Env[Observation, Action]):
     def _report(self, state: State) -> tuple[Observation, float, dict[str, Any]]:
         """What Gymnasium wants: Python's own numbers."""
         observation, reward, info = report(self.task, state, self._goal)
-        terms = {name: float(value) for name, value in info.pop("reward_terms").items()}
-        plain = {
-            name: value.item() if isinstance(value, (np.generic, np.ndarray)) else value
-            for name, value in info.items()
-        }
-        return observation, float(reward), {**plain, "reward_terms": terms}
+        info["reward_terms"] = {name: float(v) for name, v in info["reward_terms"].items()}
+        for name, value in info.items():
+            if isinstance(value, _OF_NUMPY):
+                info[name] = value.item()
+        return observation, float(reward), info
 
 
 def observation_space(task: Task) -> spaces.Dict:

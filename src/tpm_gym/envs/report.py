@@ -41,28 +41,34 @@ def report(
     """
     observation = observe(task, state, goal)
     achieved, desired = observation["achieved_goal"], observation["desired_goal"]
-    terms = task.reward_terms(state, achieved, desired)
+    gap, penalty = task.gap(achieved, desired), task.penalty(state)
+    terms = task.reward_terms(state, gap, penalty)
     reward = terms["goal"] + _goal_free(terms)
-    # A sum is not finite where one of its terms is not; so written it costs least.
-    observed = observation["observation"]
-    total = np.vdot(observed, observed) + np.vdot(achieved, achieved)
-    if not math.isfinite(total + np.add.reduce(reward, axis=None)):
+    if not math.isfinite(_total(observation["observation"], achieved, reward)):
         raise _not_finite(task, state, achieved, terms)
     return (
         observation,
         reward,
         {
-            "is_success": task.success(achieved, desired),
+            "is_success": task.success(gap),
             "closure_error": state.closure_error,
             "vacuum": state.vacuum,
             "conditioning": state.conditioning,
-            "singularity_penalty": task.penalty(state),
+            "singularity_penalty": penalty,
             "assembly_mode_changed": state.assembly_mode_changed,
             "working_mode_changed": state.working_mode_changed,
             "object_lost": task.lost(state),
             "reward_terms": terms,
         },
     )
+
+
+def _total(observed: FloatArray, achieved: FloatArray, reward: FloatArray) -> float:
+    """A number that is finite where all of these are, in the cheapest way for one and for many."""
+    if observed.ndim == 1:
+        return float(sum(observed.tolist()) + sum(achieved.tolist()) + reward)
+    squares = np.vdot(observed, observed) + np.vdot(achieved, achieved)
+    return float(squares + np.add.reduce(reward, axis=None))
 
 
 def _goal_free(terms: Mapping[str, Any]) -> Any:
@@ -77,7 +83,7 @@ def compute_reward(task: Task, achieved: ArrayLike, desired: ArrayLike, info: An
         InputError: If the goals are no real numbers of these shapes, or ``info`` is neither.
     """
     _require_goals(task.goal_size, achieved, desired)
-    goal_term = task.goal_term(achieved, desired)
+    goal_term = task.goal_term(task.gap(achieved, desired))
     try:
         if isinstance(info, Mapping):
             other: Any = _goal_free_in(info)
@@ -122,4 +128,4 @@ def _not_finite(
 
 
 def _clip(values: FloatArray, bound: float) -> NDArray[np.float32]:
-    return np.minimum(np.maximum(values, -bound), bound).astype(np.float32, order="C")
+    return values.clip(-bound, bound).astype(np.float32, order="C")

@@ -32,9 +32,12 @@ from tpm_gym.kinematics.namespaces import NUMPY, PLAIN, Namespace, Numbers
 ROUNDING = 64 * sys.float_info.epsilon
 """Where two solutions merge, rounding alone can push a discriminant (always scaled to order one)
 below zero by a few units in the last place. Those are solutions, not misses."""
+_REACH = 1.0 + ROUNDING
 SINGULAR = 1e-6
 """A factor of det A below this cannot be told from zero: cos(beta) is known to about 1e-14, and
 where it is 1, sin(beta) to the square root of that only (y to 50 nm)."""
+
+_TINY = sys.float_info.min  # no quotient is by less
 
 Triple = tuple[Numbers, Numbers, Numbers]
 
@@ -99,27 +102,27 @@ def assembly_at(
     """
     l4, l7 = g.l4, g.l7
     y1, z1 = g.l1 + cos[0], sin[0]
-    dx, dz = cos[1] + (2 * g.l5 - g.l1), sin[1] - z1
+    dx, dz = cos[1] + (2.0 * g.l5 - g.l1), sin[1] - z1
     distance2 = dx * dx + dz * dz
     along = 0.5 - ns.over(0.5 * y1 * y1, distance2)
     across2 = ns.over(l4 * l4 - y1 * y1, distance2) - along * along
     # Both terms can be large against their difference; scale the tolerance by them.
-    meet = across2 >= -ROUNDING * (1 + along * along)
+    meet = across2 >= -ROUNDING * (1.0 + along * along)
     root = ns.root(across2)
     across = planar * root
     x_c, z_c = along * dx - across * dz, z1 + along * dz + across * dx
     # Eqs. (9) and (10), with z_C3 = z_C + l6
-    u, w = x_c - (cos[2] + (g.l1 - 2 * g.l2)), z_c - (sin[2] - g.l6)
-    numerator, denominator = l4 * l4 - l7 * l7 - u * u - w * w, 2 * l7 * u
+    u, w = x_c - (cos[2] + (g.l1 - 2.0 * g.l2)), z_c - (sin[2] - g.l6)
+    numerator, denominator = l4 * l4 - l7 * l7 - u * u - w * w, 2.0 * l7 * u
     # Rounding in C1 grows as the inverse of the planar factor, and in cos(beta) again as that of u;
     # the cap, 64, keeps what the clipped cosine leaves of a gap in rod 11 below l4 / 1e12.
-    blur = (1 + l4 * l4 / ns.maximum(distance2 * root, l4 * l4 / 63)) * (ROUNDING * l4 * l4)
+    blur = (1.0 + l4 * l4 / ns.maximum(distance2 * root, l4 * l4 / 63.0)) * (ROUNDING * l4 * l4)
     turned = abs(denominator)
     reached = meet & (abs(numerator) <= turned + blur)
     real = reached & (turned > blur)
     cos_beta = ns.clip(numerator / denominator)
-    sin_beta = side * ns.root((1 - cos_beta) * (1 + cos_beta))
-    x, y, z = x_c + l7 * cos_beta + g.l2, l7 * sin_beta, z_c + 2 * g.l6  # Eq. (11)
+    sin_beta = side * ns.root((1.0 - cos_beta) * (1.0 + cos_beta))
+    x, y, z = x_c + l7 * cos_beta + g.l2, l7 * sin_beta, z_c + 2.0 * g.l6  # Eq. (11)
     found = Assembly(x, y, z, x_c, z_c, cos_beta, sin_beta)
     return found, real, (reached, y1, distance2, u, w)
 
@@ -127,23 +130,26 @@ def assembly_at(
 def posture_at(
     point: Triple, signs: tuple[Numbers, Numbers, Numbers, Numbers], g: Lengths, ns: Namespace
 ) -> tuple[
-    Triple, Numbers, tuple[Numbers, Numbers, Numbers, Numbers], tuple[Triple, Triple, Triple]
+    Triple,
+    Numbers,
+    tuple[Numbers, Numbers, Numbers, Numbers],
+    tuple[Numbers, Numbers, Numbers, Numbers],
 ]:
     """Inverse kinematics (Eqs. 12 to 15, corrected) for the signs of a working mode.
 
     Returns:
         theta_1 and theta_3 in (-pi, pi], theta_2 in [0, 2 pi): arms 1 and 3 point inwards at pi,
-        arm 2 at 0. Whether they are real. xC, zC, cos(beta) and sin(beta). For the margins,
-        C_i - A_i of each leg, m: level and vertical in the arm's plane, and out of it.
+        arm 2 at 0. Whether they are real. xC, zC, cos(beta) and sin(beta). For the margins, how far
+        C_i is from A_i along the arm's plane, level for each leg and vertical for leg 3, m.
     """
     x, y, z = point
     side, bend1, bend2, bend3 = signs
     l1 = g.l1
     sin_beta = y / g.l7
-    squared = (1 - sin_beta) * (1 + sin_beta)
+    squared = (1.0 - sin_beta) * (1.0 + sin_beta)
     cos_beta = side * ns.root(squared)
-    x_c, z_c = x - g.l2 - g.l7 * cos_beta, z - 2 * g.l6
-    a1, a2, a3, b3 = -l1, x_c + l1 - 2 * g.l5, x + g.l2 - l1, z - g.l6
+    x_c, z_c = x - g.l2 - g.l7 * cos_beta, z - 2.0 * g.l6
+    a1, a2, a3, b3 = -l1, x_c + l1 - 2.0 * g.l5, x + g.l2 - l1, z - g.l6
     fold1, real1 = fold(a1, z_c, x_c, g, ns)
     fold2, real2 = fold(a2, z_c, 0.0, g, ns)
     fold3, real3 = fold(a3, b3, y, g, ns)
@@ -156,8 +162,7 @@ def posture_at(
         ns.wrap(arctan2(b3, a3) - bend3 * fold3),
     )
     real = (squared >= -ROUNDING) & real1 & real2 & real3
-    legs = (a1, z_c, x_c), (a2, z_c, 0.0), (a3, b3, y)
-    return theta, real, (x_c, z_c, cos_beta, sin_beta), legs
+    return theta, real, (x_c, z_c, cos_beta, sin_beta), (a1, a2, a3, b3)
 
 
 def fold(
@@ -166,9 +171,9 @@ def fold(
     """The arm's angle to its leg's span, of |C - A - l3 e(theta)| = l4; whether the leg reaches."""
     l3, l4 = g.l3, g.l4
     radius2 = a * a + b * b
-    ratio = (radius2 + out * out + (l3 * l3 - l4 * l4)) / (2 * l3 * ns.sqrt(radius2))
-    reaches = abs(ratio) <= 1 + ROUNDING  # not where it is NaN, from lengths without end
-    return ns.arccos(ns.clip(ratio)), reaches
+    ratio = (radius2 + out * out + (l3 * l3 - l4 * l4)) / (2.0 * l3 * ns.sqrt(radius2))
+    reaches = abs(ratio) <= _REACH  # not where it is NaN, from lengths without end
+    return ns.arccos(ratio), reaches
 
 
 def rods(cos: Triple, sin: Triple, found: Assembly, g: Lengths) -> tuple[Triple, Triple, Triple]:
@@ -232,7 +237,7 @@ def conditioning(rows: tuple[Triple, Triple, Triple], ns: Namespace) -> Numbers:
     third = (b * f - c * e, c * d - a * f, a * e - b * d)
     determinant = a * first[0] + b * first[1] + c * first[2]
     scale = _largest_singular_value(rows, ns) * _largest_singular_value((first, second, third), ns)
-    return ns.clip(abs(determinant) / ns.maximum(scale, sys.float_info.min))
+    return ns.clip(abs(determinant) / ns.maximum(scale, _TINY))
 
 
 def _largest_singular_value(rows: tuple[Triple, Triple, Triple], ns: Namespace) -> Numbers:
@@ -240,13 +245,13 @@ def _largest_singular_value(rows: tuple[Triple, Triple, Triple], ns: Namespace) 
     (a, b, c), (d, e, f), (g, h, i) = rows
     xx, yy, zz = a * a + b * b + c * c, d * d + e * e + f * f, g * g + h * h + i * i
     xy, xz, yz = a * d + b * e + c * f, a * g + b * h + c * i, d * g + e * h + f * i
-    mean = (xx + yy + zz) / 3
+    mean = (xx + yy + zz) / 3.0
     p, q, r = xx - mean, yy - mean, zz - mean
     yz2 = yz * yz
-    spread = ns.root((p * p + q * q + r * r + 2 * (xy * xy + xz * xz + yz2)) / 6)
+    spread = ns.root((p * p + q * q + r * r + 2.0 * (xy * xy + xz * xz + yz2)) / 6.0)
     half = p * (q * r - yz2) - xy * (xy * r - yz * xz) + xz * (xy * yz - q * xz)
-    turn = ns.arccos(ns.clip(half / ns.maximum(ns.cube(spread), sys.float_info.min) / 2)) / 3
-    return ns.sqrt(mean + 2 * spread * ns.cos(turn))
+    turn = ns.arccos(half / ns.maximum(ns.cube(spread), _TINY) / 2.0) / 3.0
+    return ns.sqrt(mean + 2.0 * spread * ns.cos(turn))
 
 
 # -- one configuration in plain floats, with errors ------------------------------------------------
@@ -338,7 +343,12 @@ def conditioning_at(
 
 def require_regular(values: Factors, geometry: Geometry) -> None:
     """Raise SingularityError if a factor of det A is zero."""
-    for name, value in parallel_factors(values[:3], geometry).items():
+    sin_beta, level3, planar, *_ = values
+    near, l4 = 2.0 * SINGULAR, geometry.l4
+    # Asked in each control step: the names can wait until one is near.
+    if abs(sin_beta) > near and abs(level3) > near * l4 and abs(planar) > near * l4 * l4:
+        return
+    for name, value in parallel_factors((sin_beta, level3, planar), geometry).items():
         if abs(value) < SINGULAR:
             raise SingularityError(name, value)
 
@@ -373,7 +383,10 @@ def no_posture(point: Vector, branch: WorkingMode, g: Geometry) -> UnreachableEr
     if beyond < 0:
         return UnreachableError(point, "beta (|y| <= l7)", beyond, hint)
     with np.errstate(all="ignore"):
-        _, _, _, legs = posture_at(tuple(map(np.float64, point)), branch.signs, g, NUMPY)
+        _, _, (x_c, z_c, *_), (a1, a2, a3, b3) = posture_at(
+            tuple(map(np.float64, point)), branch.signs, g, NUMPY
+        )
+    legs = (a1, z_c, x_c), (a2, z_c, 0.0), (a3, b3, point[1])
     margin, leg = min((_leg_margin(*leg, g), i) for i, leg in enumerate(legs, 1))
     return UnreachableError(point, f"leg {leg}", margin, hint)
 

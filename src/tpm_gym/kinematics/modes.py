@@ -9,6 +9,7 @@ Branches are named by signs that change only at a singularity:
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 
 from tpm_gym.arrays import BoolArray, FloatArray
@@ -71,7 +72,7 @@ class WorkingMode(_Mode):
     leg2: int
     leg3: int
 
-    @property
+    @cached_property  # asked eleven times in a control step
     def signs(self) -> tuple[int, int, int, int]:
         """cos_beta, leg1, leg2, leg3."""
         return self.cos_beta, self.leg1, self.leg2, self.leg3

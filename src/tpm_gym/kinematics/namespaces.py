@@ -34,6 +34,7 @@ class Namespace:
             postures in which simulations begin, keep the last bits they have always had.
         root: The square root; 0 for negative numbers.
         clip: The nearest number in [-1, 1].
+        arccos: Of the clipped number.
         arcsin: Of the clipped number.
         wrap: An angle within a turn of it, in (-pi, pi].
         signs: Of a shape, as numbers like those that are given: -1 and 1.
@@ -68,6 +69,10 @@ def _clip(x: float) -> float:
     return -1.0 if x < -1.0 else 1.0 if x > 1.0 else x
 
 
+def _arccos(x: float) -> float:
+    return math.acos(-1.0 if x < -1.0 else 1.0 if x > 1.0 else x)
+
+
 def _wrap(angle: float) -> float:
     if angle > math.pi:
         return angle - _TURN
@@ -82,7 +87,7 @@ PLAIN = Namespace(
     sqrt=math.sqrt,
     root=lambda x: math.sqrt(x) if x > 0.0 else 0.0,
     clip=_clip,
-    arccos=math.acos,
+    arccos=_arccos,
     arcsin=lambda x: math.asin(_clip(x)),
     maximum=lambda x, least: x if x > least else least,
     where=lambda condition, one, other: one if condition else other,
@@ -101,7 +106,7 @@ NUMPY = Namespace(
     sqrt=np.sqrt,
     root=lambda x: np.sqrt(np.maximum(x, 0.0)),
     clip=lambda x: np.minimum(np.maximum(x, -1.0), 1.0),
-    arccos=np.arccos,
+    arccos=lambda x: np.arccos(np.minimum(np.maximum(x, -1.0), 1.0)),
     arcsin=lambda x: np.arcsin(np.clip(x, -1.0, 1.0)),
     maximum=np.maximum,
     where=np.where,

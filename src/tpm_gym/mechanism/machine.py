@@ -196,8 +196,7 @@ class Machine(ABC):
             JointLimitError: If there is one.
         """
         for motor, position in zip(self.mechanism.motors, theta, strict=True):
-            endless = motor.kind == "continuous"
-            if not (endless or motor.lower <= position <= motor.upper):
+            if motor.kind != "continuous" and not motor.lower <= position <= motor.upper:
                 limits = motor.lower, motor.upper
                 raise JointLimitError(motor.name, position, *limits, motor.unit)
 

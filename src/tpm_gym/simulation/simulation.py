@@ -234,7 +234,7 @@ class Simulation:
             for u, v, w in self._spline
         ]
         if self.drive is None:
-            found = [Reference(theta) for theta in path]
+            found = list(map(Reference, path))
         else:
             start = inverse(((a + d) / 2, (b + e) / 2, (c + f) / 2))
             found = references(self.machine, self.drive, start, path, CONTROL_PERIOD / len(path))
@@ -274,22 +274,24 @@ class Simulation:
         place, speed, command = swap(position), mount.turn((x, y, z)), swap(self._commands[1])
         # All in one array cost half of what an array of each does.
         rows = np.array((theta, rates, self._torque, place, speed, platform, command))
-        return State(
-            theta=rows[0],
-            theta_dot=rows[1],
-            torque=rows[2],
-            fk_position=rows[3],
-            fk_velocity=rows[4],
-            conditioning=conditioning,
-            platform_position=rows[5],
-            platform_tilt=tilt,
-            closure_error=gap,
-            assembly_mode_changed=self._mode_left == "assembly",
-            working_mode_changed=self._mode_left == "working",
-            command=rows[6],
-            held=hold.which,
-            vacuum=hold.vacuum,
-            **self._read_objects(),
+        return State.of(
+            {
+                "theta": rows[0],
+                "theta_dot": rows[1],
+                "torque": rows[2],
+                "fk_position": rows[3],
+                "fk_velocity": rows[4],
+                "conditioning": conditioning,
+                "platform_position": rows[5],
+                "platform_tilt": tilt,
+                "closure_error": gap,
+                "assembly_mode_changed": self._mode_left == "assembly",
+                "working_mode_changed": self._mode_left == "working",
+                "command": rows[6],
+                "held": hold.which,
+                "vacuum": hold.vacuum,
+                **self._read_objects(),
+            }
         )
 
     def _read_objects(self) -> dict[str, FloatArray]:

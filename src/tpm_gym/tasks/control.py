@@ -31,10 +31,13 @@ class Control(Protocol):
 
     name: str
 
-    def command(self, action: ArrayLike, current: ArrayLike) -> FloatArray:
-        """The next command (3,), for an action (3,) in [-1, 1] and the current command (3,).
+    def next(self, action: Vector, current: Vector) -> Vector:
+        """The next command, for an action in [-1, 1] and the current command."""
 
-        For a batch of both, (n, 3), those of machines that have a :meth:`~tpm_gym.Machine.batch`.
+    def command(self, action: ArrayLike, current: ArrayLike) -> FloatArray:
+        """The same for arrays of both, (3,).
+
+        Or (n, 3), of machines that have a :meth:`~tpm_gym.Machine.batch`.
         """
 
     def action(self, wanted: ArrayLike, current: ArrayLike) -> FloatArray:
@@ -51,10 +54,16 @@ class CartesianControl:
 
     def __init__(self, machine: Machine) -> None:
         """For one machine."""
-        self._region, self._step = machine.region, np.array(machine.step_limit)
+        self._region, self._limit = machine.region, machine.step_limit
+        self._step = np.array(machine.step_limit)
+
+    def next(self, action: Vector, current: Vector) -> Vector:
+        """The current command plus the increment, projected into the region."""
+        (a, b, c), (d, e, f), (x, y, z) = action, self._limit, current
+        return self._region.nearest((x + a * d, y + b * e, z + c * f))
 
     def command(self, action: ArrayLike, current: ArrayLike) -> FloatArray:
-        """The current command plus the increment, projected into the region."""
+        """The same for arrays (..., 3)."""
         return self._region.project(np.asarray(current) + np.asarray(action) * self._step)
 
     def action(self, wanted: ArrayLike, current: ArrayLike) -> FloatArray:
@@ -82,30 +91,33 @@ class JointControl:
         """For one machine."""
         self._machine, self._step = machine, np.array(machine.step_limit)
 
-    def command(self, action: ArrayLike, current: ArrayLike) -> FloatArray:
+    def next(self, action: Vector, current: Vector) -> Vector:
         """Point P after the (slowed down) increment of the joints, projected into the region."""
-        start = np.asarray(current, dtype=np.float64)
-        if start.ndim > 1:
-            return self._commands(np.asarray(action, dtype=np.float64), start)
-        here = _vector(start)
-        joints = self._machine.inverse(here)
-        step = np.asarray(action, dtype=np.float64) * self._machine.joint_limit
+        joints = self._machine.inverse(current)
+        step = np.array(action) * self._machine.joint_limit
         # By J, this fraction of the step uses the limit up; the exact one is near.
         rate = np.abs(np.array(self._machine.evaluate(joints).jacobian) @ step)
         linear = float((self._step / np.maximum(rate, 1e-12)).min())
         low, high = 0.0, min(1.0, 2 * linear)
         turn = _vector(step)
-        point = self._allowed(joints, turn, high, here)
+        point = self._allowed(joints, turn, high, current)
         if point is None:
-            point = here
+            point = current
             for _ in range(_BISECTIONS):
                 middle = (low + high) / 2
-                tried = self._allowed(joints, turn, middle, here)
+                tried = self._allowed(joints, turn, middle, current)
                 if tried is None:
                     high = middle
                 else:
                     low, point = middle, tried
-        return self._machine.region.project(point)
+        return self._machine.region.nearest(point)
+
+    def command(self, action: ArrayLike, current: ArrayLike) -> FloatArray:
+        """The same for arrays (..., 3)."""
+        actions, start = (np.asarray(a, dtype=np.float64) for a in (action, current))
+        if start.ndim == 1:
+            return np.array(self.next(_vector(actions), _vector(start)))
+        return self._commands(actions, start)
 
     def _commands(self, actions: FloatArray, current: FloatArray) -> FloatArray:
         """The same for a batch (n, 3)."""

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -13,17 +16,23 @@ __all__ = ["dense", "distance", "singularity_penalty", "sparse"]
 
 def distance(achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
     """Euclidean distance of points (..., k) m, as (...,) m."""
-    gap = np.subtract(achieved, desired, dtype=np.float64)
+    one, other = np.asarray(achieved, np.float64), np.asarray(desired, np.float64)
+    if one.ndim == other.ndim == 1:  # plain floats: numpy's calls cost more than they compute
+        squares = [(a - b) * (a - b) for a, b in zip(one.tolist(), other.tolist(), strict=True)]
+        length: FloatArray = np.float64(math.sqrt(sum(squares)))
+        return length
+    gap = one - other
     first, *others = (gap * gap).T
-    for other in others:  # numpy's sum costs several times as much
-        first = first + other
+    for part in others:  # numpy's sum costs several times as much
+        first = first + part
     result: FloatArray = np.sqrt(first).T
     return result
 
 
-def sparse(gap: ArrayLike, tolerance: float) -> FloatArray:
+def sparse(gap: FloatArray, tolerance: float) -> FloatArray:
     """0 where ``gap`` (m) is below ``tolerance`` (m), else -1, also where it is no number."""
-    result: FloatArray = -(1.0 - np.less(gap, tolerance))
+    near: Any = gap < tolerance  # numpy's booleans count
+    result: FloatArray = -(1.0 - near)
     return result
 
 
@@ -49,5 +58,7 @@ def singularity_penalty(conditioning: Numbers, safe: float) -> FloatArray:
     """
     share = conditioning / safe
     squared = share * share
-    result: FloatArray = np.maximum(1.0 - squared * squared, 0.0)
+    penalty = 1.0 - squared * squared
+    one = isinstance(penalty, float)  # numpy's call costs more than it computes
+    result: FloatArray = np.float64(max(penalty, 0.0)) if one else np.maximum(penalty, 0.0)
     return result

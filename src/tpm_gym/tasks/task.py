@@ -110,6 +110,7 @@ class Task(ABC):
             raise ConfigurationError("markers", self.scene.markers, valid)
         self.machine, self.reward, self.goals = machine, reward, goals
         self._within = self._not_lost()
+        self._bounds = [corners.tolist() for corners in self._within]
         self._robot = [("the robot at home", *box) for box in machine.occupied(machine.home)]
         self._set_entries()
 
@@ -189,30 +190,26 @@ class Task(ABC):
     # -- reward: here and nowhere else ------------------------------------------------------------
 
     def reward_terms(
-        self, state: State, achieved: ArrayLike, desired: ArrayLike
+        self, state: State, gap: FloatArray, penalty: FloatArray
     ) -> dict[str, FloatArray]:
         """The terms of the reward, weighted: name -> (...,); their sum is the reward.
 
         Args:
             state: The state that was reached.
-            achieved: (..., goal_size) m, as in the observation.
-            desired: (..., goal_size) m.
+            gap: What :meth:`gap` says of the goal, (...,) m.
+            penalty: What :meth:`penalty` says of the state, (...,).
 
         Raises:
             ConfigurationError: If :meth:`shaping` gives a term the name of another.
         """
-        terms = {
-            "goal": self.goal_term(achieved, desired),
-            "singularity": -self.penalty_weight * self.penalty(state),
-        }
+        terms = {"goal": self.goal_term(gap), "singularity": -self.penalty_weight * penalty}
         own = self.shaping(state)
         for name in terms.keys() & own.keys():
             raise ConfigurationError("shaping", name, f"names other than {', '.join(terms)}")
         return {**terms, **own}
 
-    def goal_term(self, achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
-        """The one term that depends on the goal, (...,)."""
-        gap = self.gap(achieved, desired)
+    def goal_term(self, gap: FloatArray) -> FloatArray:
+        """The one term that depends on the goal, (...,), for a gap (...,) m."""
         return (
             rewards.sparse(gap, self.tolerance) if self.reward == "sparse" else rewards.dense(gap)
         )
@@ -236,10 +233,9 @@ class Task(ABC):
         conditioning = state.conditioning * (1 - state.passed_singularity)
         return rewards.singularity_penalty(conditioning, self.machine.safe_conditioning)
 
-    def success(self, achieved: ArrayLike, desired: ArrayLike) -> BoolArray:
-        """Whether the goal is achieved, (...,)."""
-        result: BoolArray = self.gap(achieved, desired) < self.tolerance
-        return result
+    def success(self, gap: FloatArray) -> BoolArray:
+        """Whether the goal is achieved, (...,), for a gap (...,) m."""
+        return gap < self.tolerance
 
     def gap(self, achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
         """How far from the goal, (...,) m: what reward and success are made of."""
@@ -376,7 +372,7 @@ class Task(ABC):
                   lambda s: s.object_axis[..., index, :2]),
             Entry(f"{name}_held", "-", f"share of the vacuum that holds the {name}, by a gauge",
                   (0.5,), (0.5,),
-                  lambda s: ((s.held == index) * np.divide(s.vacuum, CUP.vacuum))[..., None]),
+                  lambda s: np.asarray((s.held == index) * (s.vacuum / CUP.vacuum))[..., None]),
         )  # fmt: skip
 
     def _scales(self) -> tuple[Values, Values, Values, Values]:
@@ -441,12 +437,18 @@ class Task(ABC):
         low[:, 2], high[:, 2] = 0.0, np.inf
         return low, high
 
-    def lost(self, state: State) -> BoolArray:
+    def lost(self, state: State) -> BoolArray | bool:
         """Whether an object is off the table or where the robot cannot get to, (...,)."""
         if not self.scene.objects:
             return np.zeros(state.object_position.shape[:-2], dtype=np.bool_)
         low, high = self._within
         # So written, what is nowhere (NaN) is lost.
+        if state.object_position.ndim == 2:  # numpy's calls cost more than they compute
+            corners = zip(state.object_position.tolist(), *self._bounds, strict=True)
+            return not all(
+                a <= x <= d and b <= y <= e and c <= z <= f
+                for (x, y, z), (a, b, c), (d, e, f) in corners
+            )
         within = (state.object_position >= low) & (state.object_position <= high)
         lost: BoolArray = ~np.logical_and.reduce(within, axis=(-2, -1))
         return lost

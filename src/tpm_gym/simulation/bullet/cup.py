@@ -6,6 +6,8 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import pybullet
+
 from tpm_gym.arrays import Vector
 from tpm_gym.mechanism.cup import CUP, sealed
 from tpm_gym.simulation.bullet.client import Client
@@ -26,6 +28,9 @@ class Grip(NamedTuple):
 
     hold: Hold = EMPTY
     pose: Pose | None = None
+
+
+_OPEN = Grip()
 
 
 class Cup:
@@ -60,18 +65,20 @@ class Cup:
         self._radii = [block.radius for block in blocks]
         self._weld = -1
         self._near: list[int] = []
+        self._fastest = _FASTEST * time_step  # m in a time step
+        self._wait = 0  # time steps in which the lip cannot come to an object
         self.first = self._steps = 0
         self.grip = Grip()
 
     def look(self, steps: int) -> list[int]:
         """Before a control period of so many time steps: which objects the lip may come to."""
-        self._near, self.first, self._steps = [], steps, steps
+        self._near, self._wait, self.first, self._steps = [], 0, steps, steps
         if self._bodies:
-            lip, _ = self._robot.cup()
-            place = self._client.getBasePositionAndOrientation
+            lip, number = self._robot.lip(), self._client.number
+            place = pybullet.getBasePositionAndOrientation
             for index, (body, radius) in enumerate(zip(self._bodies, self._radii, strict=True)):
-                way = math.dist(place(body)[0], lip) - radius - CUP.radius
-                wait = int(way / (_FASTEST * self._time_step)) if way > 0 else 0
+                way = math.dist(place(body, number)[0], lip) - radius - CUP.radius
+                wait = int(way / self._fastest) if way > 0 else 0
                 if wait < steps:
                     self._near.append(index)
                     self.first = min(self.first, wait)
@@ -79,13 +86,15 @@ class Cup:
 
     def wakes(self, on: bool) -> int:
         """After which time step of the control period :meth:`suck` first has anything to do."""
-        return 0 if self.grip != Grip() else self.first if on else self._steps
+        return 0 if self.grip != _OPEN else self.first if on else self._steps
 
     def suck(self, on: bool) -> None:
         """After a time step: let the air in or out, hold on or drop, take what is touched."""
         hold, pose = self.grip
         load = _NOTHING if pose is None else self._load()
         touched = self._touched() if on and pose is None else -1
+        if touched < 0 and hold == EMPTY:
+            return
         new = hold_after(hold, self._time_step, on, load, touched)
         if new.which == hold.which:
             self.grip = Grip(new, pose)
@@ -116,13 +125,20 @@ class Cup:
 
     def _touched(self) -> int:
         """The first of the objects nearby that the lip lies on; -1 for none."""
-        lip, axis = self._robot.cup()
+        if self._wait > 0:
+            self._wait -= 1
+            return -1
+        lip, number, least = self._robot.lip(), self._client.number, self._steps * self._fastest
         for index in self._near:
             block = self._blocks[index]
-            place, turn = self._client.getBasePositionAndOrientation(self._bodies[index])
-            close = math.dist(place, lip) < self._radii[index] + CUP.seal_gap
-            if close and sealed(lip, axis, place, turn, (block.width, block.height)):
-                return index
+            place, turn = pybullet.getBasePositionAndOrientation(self._bodies[index], number)
+            way = math.dist(place, lip) - self._radii[index] - CUP.seal_gap
+            least = min(least, way)
+            if way < 0:
+                size, axis = (block.width, block.height), self._robot.cup_axis()
+                if sealed(lip, axis, place, turn, size):
+                    return index
+        self._wait = int(max(least, 0.0) / self._fastest)
         return -1
 
     def _seat(self, index: int) -> Pose:

@@ -123,12 +123,12 @@ class BulletEngine:
         turns, sucks = friction.look(near, cup.first), cup.wakes(vacuum)
         if self._servos is not None and references:
             self._servos.begin(references[0].theta)
-        for number, reference in enumerate(references):
-            if number >= turns:
+        for index, reference in enumerate(references):
+            if index >= turns:
                 friction.turn(cup.grip.hold.which)
             follow(self.robot, self._servos, reference)
             step()
-            if number >= sucks:
+            if index >= sucks:
                 cup.suck(vacuum)
 
     def motors(self) -> Motors:

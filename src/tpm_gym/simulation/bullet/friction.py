@@ -71,10 +71,10 @@ class Friction:
         self._bodies = list(zip(bodies, faces, blocks, strict=True))
         self._cup = _Face(*robot.tool)
         number = client.number
-        self._client, self._factor = client, 1.0
+        self._number, self._factor = number, 1.0
         self._active: list[int] = []
+        self._resting: set[int] = set()
         self._scale = partial(pybullet.changeDynamics, physicsClientId=number)
-        self._number = number
 
     def reset(self) -> None:
         """As if nothing had ever slipped."""
@@ -89,22 +89,32 @@ class Friction:
     def look(self, near: Sequence[int], first: int) -> int:
         """Before a control period: from which of its time steps on to :meth:`turn`.
 
-        From the beginning if an object slides, else from ``first``, when the cup comes to one of
+        From the beginning if an object moves, else from ``first``, when the cup comes to one of
         those that are ``near``.
         """
-        sliding = [
-            index
-            for index, (body, *_) in enumerate(self._bodies)
-            if math.hypot(*self._client.getBaseVelocity(body)[0]) > _SLIP
-        ]
-        self._active = sorted({*sliding, *near})
-        return 0 if sliding else first
+        moving = [index for index in range(len(self._bodies)) if self._moves(index)]
+        self._resting = {index for index in near if index not in moving}
+        self._active = sorted({*moving, *near}) if moving else list(near)
+        return 0 if moving else first
+
+    def _moves(self, index: int) -> bool:
+        """Whether an object slides, tips or falls; one that only settles does not."""
+        body, _, block = self._bodies[index]
+        (x, y, z), (p, q, _) = pybullet.getBaseVelocity(body, self._number)
+        half = block.height / 2
+        return math.hypot(x - half * q, y + half * p) > _SLIP or abs(z) > _FAST
 
     def turn(self, held: int) -> None:
         """Before a time step: scale the friction of what may slip."""
         number, cup = self._number, self._cup
         for index in self._active:
             body, table, block = self._bodies[index]
+            if index in self._resting and table.scales is _UNKNOWN:
+                # Nothing to turn before it is touched or lifted; asking that costs a sixth.
+                touched = pybullet.getContactPoints(body, cup.body, -1, cup.link, number)
+                if not touched and index != held:
+                    continue
+                self._resting.discard(index)
             points = pybullet.getContactPoints(body, -1, -2, -2, number)  # with anything
             if not points:
                 continue

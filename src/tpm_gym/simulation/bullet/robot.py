@@ -14,12 +14,13 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pybullet
 from numpy.typing import NDArray
 
-from tpm_gym.arrays import Quaternion, Vector, rotate, transform
+from tpm_gym.arrays import Vector, rotate, transform
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism import urdf
 from tpm_gym.mechanism.bodies import Mechanism
@@ -30,10 +31,6 @@ from tpm_gym.simulation.bullet.physics import MOTOR_GAIN
 from tpm_gym.simulation.engine import SPRING_GAIN, Motors, Truth
 
 __all__ = ["Robot"]
-
-Frame = tuple[Vector, Quaternion]
-"""Origin (m) and orientation (x, y, z, w) of a link in the world."""
-
 
 Address = tuple[int, int]
 """A body in the client, and one of its links (or the joint above it)."""
@@ -206,7 +203,8 @@ class Robot:
     def motors(self) -> Motors:
         """True angles (rad), rates (rad/s) and last torques (N m) of the motors."""
         state, number = pybullet.getJointState, self._client.number
-        a, b, c = (state(body, joint, number) for body, joint in self._motors)
+        (one, i), (two, j), (three, k) = self._motors
+        a, b, c = state(one, i, number), state(two, j, number), state(three, k, number)
         return Motors((a[0], b[0], c[0]), (a[1], b[1], c[1]), (a[3], b[3], c[3]))
 
     def joint_states(self) -> tuple[tuple[float, float], ...]:
@@ -222,25 +220,34 @@ class Robot:
     def truth(self) -> Truth:
         """Largest loop gap (m), platform position (m, world) and platform tilt (rad)."""
         number = self._client.number
-        frames: list[Frame] = [
-            state[4:6]
+        states = [
+            state
             for body, links in self._watched.items()
             for state in pybullet.getLinkStates(body, links, 0, 1, number)
         ]
         squared = 0.0
         for at_a, point_a, at_b, point_b in self._pairs:
-            x, y, z = transform(*frames[at_a], point_a)
-            u, v, w = transform(*frames[at_b], point_b)
-            squared = max(squared, (x - u) ** 2 + (y - v) ** 2 + (z - w) ** 2)
-        origin, turn = frames[self._platform]
-        place = transform(origin, turn, self._mechanism.point_p)
-        return Truth(math.sqrt(squared), place, Mount.tilt(turn))
+            a, b = states[at_a], states[at_b]
+            x, y, z = transform(a[4], a[5], point_a)
+            u, v, w = transform(b[4], b[5], point_b)
+            gap = (x - u) ** 2 + (y - v) ** 2 + (z - w) ** 2
+            if gap > squared or gap != gap:  # what is nowhere stays so
+                squared = gap
+        platform = states[self._platform]
+        place = transform(platform[4], platform[5], self._mechanism.point_p)
+        return Truth(math.sqrt(squared), place, Mount.tilt(platform[5]))
 
-    def cup(self) -> tuple[Vector, Vector]:
-        """Centre of the cup's lip (m) and the cup's outward axis, world."""
-        state = pybullet.getLinkState(*self.tool, 0, 1, self._client.number)
-        origin, turn = state[4], state[5]
-        return transform(origin, turn, self._mechanism.lip), rotate(turn, (0.0, 0.0, 1.0))
+    def lip(self) -> Vector:
+        """Centre of the cup's lip, m, world."""
+        state = self._tool()
+        return transform(state[4], state[5], self._mechanism.lip)
+
+    def cup_axis(self) -> Vector:
+        """The cup's outward axis, world."""
+        return rotate(self._tool()[5], (0.0, 0.0, 1.0))
+
+    def _tool(self) -> Any:
+        return pybullet.getLinkState(*self.tool, 0, 1, self._client.number)
 
 
 @contextmanager

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+import pybullet
 from numpy.typing import NDArray
 
 from tpm_gym.arrays import Vector
@@ -106,8 +107,9 @@ class Scenery:
 
     def read(self) -> list[tuple[Pose, Twist]]:
         """Poses and velocities of the objects."""
-        pose, velocity = self._client.getBasePositionAndOrientation, self._client.getBaseVelocity
-        return [(Pose(*pose(body)), Twist(*velocity(body))) for body in self.bodies]
+        pose, velocity = pybullet.getBasePositionAndOrientation, pybullet.getBaseVelocity
+        number = self._client.number
+        return [(Pose(*pose(body, number)), Twist(*velocity(body, number))) for body in self.bodies]
 
     def alter(self, mass: float, friction: float) -> None:
         """Make the objects ``mass`` times as heavy and ``friction`` times as rough as nominal."""
