@@ -45,7 +45,7 @@ __all__ = ["EnvSnapshot", "TPMEnv"]
 
 Action = NDArray[Any]
 
-_OF_NUMPY = (np.generic, np.ndarray)
+_PLAIN = {bool, int, float}
 
 
 @dataclass(frozen=True)
@@ -326,7 +326,8 @@ class TPMEnv(gym.Env[Observation, Action]):
         """
         asked = floats("action", action, self.task.action_size, ActionError)
         state = self.state
-        now, *pending = (*self._pending, tuple([min(max(value, -1.0), 1.0) for value in asked]))
+        clipped = tuple([-1.0 if x < -1.0 else 1.0 if x > 1.0 else x for x in asked])
+        now, *pending = (*self._pending, clipped)
         command = self._command(now[:3], state.command)  # type: ignore[arg-type]
         vacuum = self.task.vacuum and now[3] > 0
         self._state = None  # until the step has gone well
@@ -497,7 +498,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         observation, reward, info = report(self.task, state, self._goal)
         info["reward_terms"] = {name: float(v) for name, v in info["reward_terms"].items()}
         for name, value in info.items():
-            if isinstance(value, _OF_NUMPY):
+            if type(value) not in _PLAIN and isinstance(value, (np.generic, np.ndarray)):
                 info[name] = value.item()
         return observation, float(reward), info
 

@@ -73,7 +73,7 @@ def _total(observed: FloatArray, achieved: FloatArray, reward: FloatArray) -> fl
 
 def _goal_free(terms: Mapping[str, Any]) -> Any:
     """Sum of the reward's terms that do not depend on the goal; 0 where there is none."""
-    return sum(value for name, value in terms.items() if name != "goal")
+    return sum([value for name, value in terms.items() if name != "goal"])
 
 
 def compute_reward(task: Task, achieved: ArrayLike, desired: ArrayLike, info: Any) -> Any:

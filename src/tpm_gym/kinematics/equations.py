@@ -27,7 +27,7 @@ from tpm_gym.arrays import Vector
 from tpm_gym.errors import SingularityError, UnreachableError
 from tpm_gym.kinematics.geometry import Geometry, Lengths
 from tpm_gym.kinematics.modes import AssemblyMode, WorkingMode
-from tpm_gym.kinematics.namespaces import NUMPY, PLAIN, Namespace, Numbers
+from tpm_gym.kinematics.namespaces import MATH, NUMPY, PLAIN, Namespace, Numbers
 
 ROUNDING = 64 * sys.float_info.epsilon
 """Where two solutions merge, rounding alone can push a discriminant (always scaled to order one)
@@ -155,10 +155,9 @@ def posture_at(
     fold3, real3 = fold(a3, b3, y, g, ns)
     # The serial factor BC . dB/dtheta is l3 (b cos - a sin), so its sign tells two angles apart.
     arctan2 = ns.arctan2
-    theta_2 = arctan2(z_c, a2) - bend2 * fold2
     theta = (
         ns.wrap(arctan2(z_c, a1) - bend1 * fold1),
-        ns.where(theta_2 < 0, theta_2 + 2 * math.pi, theta_2),
+        ns.positive(arctan2(z_c, a2) - bend2 * fold2),
         ns.wrap(arctan2(b3, a3) - bend3 * fold3),
     )
     real = (squared >= -ROUNDING) & real1 & real2 & real3
@@ -279,8 +278,12 @@ def _assembled(
     if theta is before[0] and branch is before[1] and geometry is before[2]:
         return result
     cos, sin = arms(theta, geometry, PLAIN)
+    planar, side = branch.planar, branch.sin_beta
     try:
-        found, real, _ = assembly_at(cos, sin, branch.planar, branch.sin_beta, geometry, PLAIN)
+        try:
+            found, real, _ = assembly_at(cos, sin, planar, side, geometry, MATH)
+        except ValueError:  # on an edge, or beyond it
+            found, real, _ = assembly_at(cos, sin, planar, side, geometry, PLAIN)
     except ZeroDivisionError:  # concentric circles, or link 7 beside B3
         real = False
     if not real:
@@ -300,7 +303,10 @@ def posture(point: Vector, branch: WorkingMode, geometry: Geometry) -> Vector:
         UnreachableError: If the branch does not exist at the point.
     """
     try:
-        theta, real, _, _ = posture_at(point, branch.signs, geometry, PLAIN)
+        try:
+            theta, real, _, _ = posture_at(point, branch.signs, geometry, MATH)
+        except ValueError:  # on an edge, or beyond it
+            theta, real, _, _ = posture_at(point, branch.signs, geometry, PLAIN)
     except ZeroDivisionError:  # a rod's end at the pivot
         real = False
     if not real:
@@ -322,7 +328,10 @@ def evaluate(
     values = factors(cos, sin, found, bars, geometry)
     require_regular(values, geometry)
     rows = velocity(bars, values)
-    return found, rows, conditioning(rows, PLAIN)
+    try:
+        return found, rows, conditioning(rows, MATH)
+    except ValueError:  # two singular values nearly coincide
+        return found, rows, conditioning(rows, PLAIN)
 
 
 def conditioning_at(

@@ -9,7 +9,7 @@ import itertools
 import math
 import operator
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -37,6 +37,7 @@ class Namespace:
         arccos: Of the clipped number.
         arcsin: Of the clipped number.
         wrap: An angle within a turn of it, in (-pi, pi].
+        positive: An angle of more than minus a turn, in [0, 2 pi) if it is less than a turn.
         signs: Of a shape, as numbers like those that are given: -1 and 1.
         stack: Components (...,), joined along a new last axis.
         join: Points (..., 3), broadcast with each other, joined along their last axis.
@@ -54,6 +55,7 @@ class Namespace:
     maximum: Callable[[Any, float], Any]
     where: Callable[[Any, Any, Any], Any]
     wrap: _One
+    positive: _One
     cube: _One
     signs: Callable[[Any, tuple[int, ...]], Any]
     stack: Callable[[Sequence[Any]], Any]
@@ -74,9 +76,9 @@ def _arccos(x: float) -> float:
 
 
 def _wrap(angle: float) -> float:
-    if angle > math.pi:
-        return angle - _TURN
-    return angle + _TURN if angle <= -math.pi else angle
+    if -math.pi < angle <= math.pi:
+        return angle
+    return angle - _TURN if angle > 0 else angle + _TURN
 
 
 PLAIN = Namespace(
@@ -92,11 +94,15 @@ PLAIN = Namespace(
     maximum=lambda x, least: x if x > least else least,
     where=lambda condition, one, other: one if condition else other,
     wrap=_wrap,
+    positive=lambda angle: angle + _TURN if angle < 0.0 else angle,
     cube=lambda x: x**3,
     signs=lambda like, shape: (-1, 1),
     stack=tuple,
     join=lambda points: tuple(itertools.chain(*points)),
 )
+
+MATH = replace(PLAIN, root=math.sqrt, arccos=math.acos)
+"""Twice as fast, but what PLAIN rounds to the edge of their domain is a ValueError."""
 
 NUMPY = Namespace(
     cos=np.cos,
@@ -111,6 +117,7 @@ NUMPY = Namespace(
     maximum=np.maximum,
     where=np.where,
     wrap=lambda x: x + _TURN * (x <= -math.pi) - _TURN * (x > math.pi),
+    positive=lambda x: np.where(x < 0, x + _TURN, x),
     cube=lambda x: x * x * x,  # its power of 3 costs 20 times as much
     signs=lambda like, shape: np.array([-1.0, 1.0]).reshape(shape),
     stack=lambda columns: np.stack(columns, axis=-1),
@@ -158,6 +165,7 @@ def _torch() -> Namespace:
         maximum=lambda x, least: torch.clip(x, min=least),
         where=torch.where,
         wrap=wrap,
+        positive=lambda x: torch.where(x < 0, x + _TURN, x),
         cube=lambda x: x * x * x,
         signs=lambda other, shape: like([-1.0, 1.0], other).reshape(shape),
         stack=lambda columns: torch.stack(list(columns), -1),

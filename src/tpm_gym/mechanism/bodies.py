@@ -5,6 +5,7 @@ Units: metres, radians, kilograms.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -221,6 +222,15 @@ class Mechanism:
         """The motors' joints, in the order of :attr:`actuated`."""
         joints = {link.joint.name: link.joint for link in self.links if link.joint}
         return tuple(joints[name] for name in self.actuated)
+
+    @cached_property
+    def stops(self) -> tuple[tuple[float, float], ...]:
+        """Lowest and highest positions of the motors, rad or m; infinite where one is endless."""
+        endless = (-math.inf, math.inf)
+        return tuple(
+            endless if motor.kind == "continuous" else (motor.lower, motor.upper)
+            for motor in self.motors
+        )
 
     def places(self, joints: Mapping[str, ArrayLike]) -> dict[str, Place]:
         """Where all links are, in the base's frame.

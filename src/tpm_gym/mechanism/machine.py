@@ -195,10 +195,11 @@ class Machine(ABC):
         Raises:
             JointLimitError: If there is one.
         """
-        for motor, position in zip(self.mechanism.motors, theta, strict=True):
-            if motor.kind != "continuous" and not motor.lower <= position <= motor.upper:
-                limits = motor.lower, motor.upper
-                raise JointLimitError(motor.name, position, *limits, motor.unit)
+        mechanism = self.mechanism
+        for index, (lower, upper) in enumerate(mechanism.stops):
+            if not lower <= theta[index] <= upper:
+                motor = mechanism.motors[index]
+                raise JointLimitError(motor.name, theta[index], lower, upper, motor.unit)
 
     # -- regions ----------------------------------------------------------------------------
 

@@ -76,7 +76,8 @@ class Mount:
     @staticmethod
     def tilt(quaternion: Quaternion) -> float:
         """Angle between an orientation in the world, (x, y, z, w), and the paper frame's, rad."""
-        return 2 * math.asin(min(1.0, math.hypot(*quaternion[1:])))
+        _, y, z, w = quaternion
+        return 2 * math.asin(min(1.0, math.hypot(y, z, w)))
 
 
 _HALF_TURN = np.array([1.0, -1.0, -1.0])

@@ -35,15 +35,7 @@ CLOSURE_LIMIT = 0.005
 """A loop that is open by more than this is lost, m."""
 
 _ZERO: Vector = (0.0, 0.0, 0.0)
-_OF_OBJECTS = {
-    "object_position": slice(0, 3),
-    "object_quaternion": slice(3, 7),
-    "object_axis": slice(7, 10),
-    "object_velocity": slice(10, 13),
-    "object_angular_velocity": slice(13, 16),
-}
-"""Columns in which an object's entries of a State are read."""
-_NO_OBJECTS = {name: np.empty((0, 16))[:, columns] for name, columns in _OF_OBJECTS.items()}
+_UP: Vector = (0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -273,37 +265,34 @@ class Simulation:
         swap = mount.swap
         place, speed, command = swap(position), mount.turn((x, y, z)), swap(self._commands[1])
         # All in one array cost half of what an array of each does.
-        rows = np.array((theta, rates, self._torque, place, speed, platform, command))
+        numbers = [*theta, *rates, *self._torque, *place, *speed, *platform, *command]
+        for (where, turn), (velocity, spin) in self.engine.objects():
+            numbers += (*where, *turn, *rotate(turn, _UP), *velocity, *spin)
+        array = np.array(numbers)
+        objects = array[21:].reshape(-1, 16)
         return State.of(
             {
-                "theta": rows[0],
-                "theta_dot": rows[1],
-                "torque": rows[2],
-                "fk_position": rows[3],
-                "fk_velocity": rows[4],
+                "theta": array[0:3],
+                "theta_dot": array[3:6],
+                "torque": array[6:9],
+                "fk_position": array[9:12],
+                "fk_velocity": array[12:15],
                 "conditioning": conditioning,
-                "platform_position": rows[5],
+                "platform_position": array[15:18],
                 "platform_tilt": tilt,
                 "closure_error": gap,
                 "assembly_mode_changed": self._mode_left == "assembly",
                 "working_mode_changed": self._mode_left == "working",
-                "command": rows[6],
+                "command": array[18:21],
                 "held": hold.which,
                 "vacuum": hold.vacuum,
-                **self._read_objects(),
+                "object_position": objects[:, 0:3],
+                "object_quaternion": objects[:, 3:7],
+                "object_axis": objects[:, 7:10],
+                "object_velocity": objects[:, 10:13],
+                "object_angular_velocity": objects[:, 13:16],
             }
         )
-
-    def _read_objects(self) -> dict[str, FloatArray]:
-        """The entries of a State about the scene's objects."""
-        rows = [
-            (*position, *turn, *rotate(turn, (0.0, 0.0, 1.0)), *velocity, *angular_velocity)
-            for (position, turn), (velocity, angular_velocity) in self.engine.objects()
-        ]
-        if not rows:
-            return _NO_OBJECTS
-        table = np.array(rows, dtype=np.float64)
-        return {name: table[:, columns] for name, columns in _OF_OBJECTS.items()}
 
     def _disturb(self, theta: Vector, rates: Vector) -> tuple[Vector, Vector]:
         """What the encoders report: with their bias and noise, and rates by differences."""

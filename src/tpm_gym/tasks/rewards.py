@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,14 +13,13 @@ from tpm_gym.kinematics.namespaces import Numbers
 __all__ = ["dense", "distance", "singularity_penalty", "sparse"]
 
 
-def distance(achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
-    """Euclidean distance of points (..., k) m, as (...,) m."""
-    one, other = np.asarray(achieved, np.float64), np.asarray(desired, np.float64)
+def distance(achieved: ArrayLike, desired: ArrayLike) -> Numbers:
+    """Euclidean distance of points (..., k) m, as (...,) m; of one pair as a plain float."""
+    one, other = np.asarray(achieved), np.asarray(desired)
     if one.ndim == other.ndim == 1:  # plain floats: numpy's calls cost more than they compute
         squares = [(a - b) * (a - b) for a, b in zip(one.tolist(), other.tolist(), strict=True)]
-        length: FloatArray = np.float64(math.sqrt(sum(squares)))
-        return length
-    gap = one - other
+        return math.sqrt(sum(squares))
+    gap = np.subtract(one, other, dtype=np.float64)
     first, *others = (gap * gap).T
     for part in others:  # numpy's sum costs several times as much
         first = first + part
@@ -29,11 +27,9 @@ def distance(achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
     return result
 
 
-def sparse(gap: FloatArray, tolerance: float) -> FloatArray:
+def sparse(gap: Numbers, tolerance: float) -> Numbers:
     """0 where ``gap`` (m) is below ``tolerance`` (m), else -1, also where it is no number."""
-    near: Any = gap < tolerance  # numpy's booleans count
-    result: FloatArray = -(1.0 - near)
-    return result
+    return -(1.0 - (gap < tolerance))
 
 
 def dense(gap: ArrayLike, unit: float = 0.1) -> FloatArray:
@@ -41,7 +37,7 @@ def dense(gap: ArrayLike, unit: float = 0.1) -> FloatArray:
     return -np.asarray(gap, dtype=np.float64) / unit
 
 
-def singularity_penalty(conditioning: Numbers, safe: float) -> FloatArray:
+def singularity_penalty(conditioning: Numbers, safe: float) -> Numbers:
     """Nearness to a singularity: 1 - (conditioning / safe)^4, and 0 where conditioning >= safe.
 
     1 at a singularity, smooth down to the threshold, and steepest there, so that crossing it has a
@@ -54,11 +50,9 @@ def singularity_penalty(conditioning: Numbers, safe: float) -> FloatArray:
         safe: Conditioning from which on the penalty is zero; positive.
 
     Returns:
-        (...,) in [0, 1].
+        (...,) in [0, 1]; for a float a float.
     """
     share = conditioning / safe
     squared = share * share
     penalty = 1.0 - squared * squared
-    one = isinstance(penalty, float)  # numpy's call costs more than it computes
-    result: FloatArray = np.float64(max(penalty, 0.0)) if one else np.maximum(penalty, 0.0)
-    return result
+    return max(penalty, 0.0) if isinstance(penalty, float) else np.maximum(penalty, 0.0)

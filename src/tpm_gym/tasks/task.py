@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from tpm_gym.arrays import BoolArray, FloatArray, finite
 from tpm_gym.errors import ConfigurationError, ResetOptionError, UnreachableError
+from tpm_gym.kinematics.namespaces import Numbers
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
@@ -189,9 +190,7 @@ class Task(ABC):
 
     # -- reward: here and nowhere else ------------------------------------------------------------
 
-    def reward_terms(
-        self, state: State, gap: FloatArray, penalty: FloatArray
-    ) -> dict[str, FloatArray]:
+    def reward_terms(self, state: State, gap: Numbers, penalty: Numbers) -> dict[str, Numbers]:
         """The terms of the reward, weighted: name -> (...,); their sum is the reward.
 
         Args:
@@ -203,12 +202,13 @@ class Task(ABC):
             ConfigurationError: If :meth:`shaping` gives a term the name of another.
         """
         terms = {"goal": self.goal_term(gap), "singularity": -self.penalty_weight * penalty}
-        own = self.shaping(state)
-        for name in terms.keys() & own.keys():
-            raise ConfigurationError("shaping", name, f"names other than {', '.join(terms)}")
-        return {**terms, **own}
+        for name, term in self.shaping(state).items():
+            if name in ("goal", "singularity"):
+                raise ConfigurationError("shaping", name, f"names other than {', '.join(terms)}")
+            terms[name] = term
+        return terms
 
-    def goal_term(self, gap: FloatArray) -> FloatArray:
+    def goal_term(self, gap: Numbers) -> Numbers:
         """The one term that depends on the goal, (...,), for a gap (...,) m."""
         return (
             rewards.sparse(gap, self.tolerance) if self.reward == "sparse" else rewards.dense(gap)
@@ -228,16 +228,17 @@ class Task(ABC):
         if not isinstance(shaping, Mapping):
             raise ConfigurationError("shaping()", shaping, "a dictionary of terms; {} for none")
 
-    def penalty(self, state: State) -> FloatArray:
+    def penalty(self, state: State) -> Numbers:
         """Nearness to a singularity before weighting, (...,) in [0, 1]; 1 where one was passed."""
         conditioning = state.conditioning * (1 - state.passed_singularity)
         return rewards.singularity_penalty(conditioning, self.machine.safe_conditioning)
 
-    def success(self, gap: FloatArray) -> BoolArray:
+    def success(self, gap: Numbers) -> BoolArray | bool:
         """Whether the goal is achieved, (...,), for a gap (...,) m."""
-        return gap < self.tolerance
+        near: BoolArray | bool = gap < self.tolerance
+        return near
 
-    def gap(self, achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
+    def gap(self, achieved: ArrayLike, desired: ArrayLike) -> Numbers:
         """How far from the goal, (...,) m: what reward and success are made of."""
         return rewards.distance(achieved, desired)
 
@@ -444,11 +445,13 @@ class Task(ABC):
         low, high = self._within
         # So written, what is nowhere (NaN) is lost.
         if state.object_position.ndim == 2:  # numpy's calls cost more than they compute
-            corners = zip(state.object_position.tolist(), *self._bounds, strict=True)
-            return not all(
-                a <= x <= d and b <= y <= e and c <= z <= f
-                for (x, y, z), (a, b, c), (d, e, f) in corners
-            )
+            for place, (a, b, c), (d, e, f) in zip(
+                state.object_position, *self._bounds, strict=True
+            ):
+                x, y, z = place.tolist()
+                if not (a <= x <= d and b <= y <= e and c <= z <= f):
+                    return True
+            return False
         within = (state.object_position >= low) & (state.object_position <= high)
         lost: BoolArray = ~np.logical_and.reduce(within, axis=(-2, -1))
         return lost

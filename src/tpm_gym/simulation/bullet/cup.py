@@ -76,8 +76,8 @@ class Cup:
         if self._bodies:
             lip, number = self._robot.lip(), self._client.number
             place = pybullet.getBasePositionAndOrientation
-            for index, (body, radius) in enumerate(zip(self._bodies, self._radii, strict=True)):
-                way = math.dist(place(body, number)[0], lip) - radius - CUP.radius
+            for index, body in enumerate(self._bodies):
+                way = math.dist(place(body, number)[0], lip) - self._radii[index] - CUP.radius
                 wait = int(way / self._fastest) if way > 0 else 0
                 if wait < steps:
                     self._near.append(index)

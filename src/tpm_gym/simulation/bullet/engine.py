@@ -123,10 +123,11 @@ class BulletEngine:
         turns, sucks = friction.look(near, cup.first), cup.wakes(vacuum)
         if self._servos is not None and references:
             self._servos.begin(references[0].theta)
+        robot, servos = self.robot, self._servos
         for index, reference in enumerate(references):
             if index >= turns:
                 friction.turn(cup.grip.hold.which)
-            follow(self.robot, self._servos, reference)
+            follow(robot, servos, reference)
             step()
             if index >= sucks:
                 cup.suck(vacuum)
