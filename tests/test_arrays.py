@@ -7,7 +7,16 @@ import numpy as np
 import pytest
 import torch
 
-from tpm_gym.arrays import finite, finite_points, numbers, points, rotate, transform, vector
+from tpm_gym.arrays import (
+    finite,
+    finite_points,
+    floats,
+    numbers,
+    points,
+    rotate,
+    transform,
+    vector,
+)
 from tpm_gym.envs.vector import TPMVectorEnv
 from tpm_gym.errors import ConfigurationError, InputError, ResetOptionError
 
@@ -78,6 +87,26 @@ def test_other_shapes_and_numbers_without_end_are_refused_as_the_caller_wishes(b
         with pytest.raises(ResetOptionError, match=r"finite numbers.*of shape \(3,\)") as caught:
             call("goal", bad, ResetOptionError)
         assert caught.value.name == "goal"
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [(0.0, 0.0), (0.0, np.nan, 0.0), (0.0, -np.inf, np.inf), (0.0, True, "1"), (0.0, 0.0, [])],
+)
+def test_tuples_are_looked_at_as_closely(bad: Any) -> None:
+    with pytest.raises(InputError):
+        vector("goal", bad)
+    assert vector("goal", (1e308, 1e308, 1e308)) == (1e308,) * 3
+
+
+@pytest.mark.parametrize("value", [(1.0, 2.0), [1, 2], np.array([1.0, 2.0], dtype=np.float32)])
+def test_so_many_numbers_become_plain_floats(value: Any) -> None:
+    found = floats("action", value, 2)
+    assert found == (1.0, 2.0)
+    assert {type(v) for v in found} == {float}
+    for bad in ([1.0], [[1.0, 2.0]], [1.0, np.nan], [np.inf, 0.0], "12", None):
+        with pytest.raises(InputError, match=r"numbers .* shape|finite numbers of shape \(2,\)"):
+            floats("action", bad, 2)
 
 
 def test_integers_that_only_floats_can_hold_are_numbers() -> None:

@@ -74,9 +74,9 @@ def floats(
 def vector(name: str, value: ArrayLike, error: _Error = InputError) -> Vector:
     """Three finite numbers, as plain floats."""
     if isinstance(value, tuple) and len(value) == 3:
-        a, b, c = value
+        a, b, c = value  # the common case, fast
         if type(a) is type(b) is type(c) is float and math.isfinite(a + b + c):
-            return a, b, c  # as they shall be, fast
+            return a, b, c
     array = numbers(name, value, error)
     if array.shape == (3,):
         a, b, c = array.tolist()

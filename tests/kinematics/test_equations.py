@@ -17,6 +17,7 @@ from tpm_gym.errors import SingularityError, UnreachableError
 from tpm_gym.kinematics import (
     ASSEMBLY_MODES,
     DEFAULT_ASSEMBLY,
+    ELBOWS_OUT,
     WORKING_MODES,
     AssemblyMode,
     WorkingMode,
@@ -96,6 +97,37 @@ def test_single_points_give_what_batches_give(branch: WorkingMode, g: Geometry) 
         assert caught.value.point == tuple(point)
     found = [inverse(point, branch, g) for point in points[valid]]
     np.testing.assert_allclose(found, solutions.theta[valid, slot], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("g", GEOMETRIES)
+def test_what_rounding_pushes_over_an_edge_is_on_it(g: Geometry) -> None:
+    inside, beyond = (0.05, 0.5 * g.l7, 0.75), (0.05, 0.5 * g.l7, 3.0)
+    for _ in range(60):  # until nothing lies between the two: leg 1 to 3, whichever ends first
+        between = tuple((a + b) / 2 for a, b in zip(inside, beyond, strict=True))
+        reached = inverse_all(between, g).valid[ELBOWS_OUT.index]
+        inside, beyond = (between, beyond) if reached else (inside, between)
+    edges = [inside] + [(0.05, sign * np.nextafter(g.l7, np.inf), 0.75) for sign in (-1, 1)]
+    for point in edges:
+        found = inverse_all(point, g).theta[ELBOWS_OUT.index]
+        np.testing.assert_allclose(inverse(point, ELBOWS_OUT, g), found, rtol=0, atol=1e-7)
+    with pytest.raises(UnreachableError):
+        inverse(beyond, ELBOWS_OUT, g)
+
+
+# Where the cosine of the angle that the cubic's roots lie on is rounded to more than 1
+@pytest.mark.parametrize(
+    ("theta", "g"),
+    [
+        ((0.2248458852711428, -0.8083631374888043, 0.8632312500612471), PAPER),
+        ((-2.2912464026315247, 0.544275213294847, 0.27117719284950903), WIDE),
+    ],
+)
+def test_two_singular_values_that_coincide_are_a_conditioning_too(
+    theta: tuple[float, ...], g: Geometry
+) -> None:
+    single = jacobian.evaluate(theta, DEFAULT_ASSEMBLY, g)
+    values = np.linalg.svd(single.velocity, compute_uv=False)
+    assert single.conditioning == pytest.approx(values[2] / values[0], abs=1e-8)
 
 
 @pytest.mark.parametrize("g", GEOMETRIES)

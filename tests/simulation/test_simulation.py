@@ -1,6 +1,6 @@
 """The mechanism in the engine stays a mechanism, and the engine's quirks stay inside."""
 
-from dataclasses import replace
+from dataclasses import FrozenInstanceError, fields, replace
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from states import apart
 from tpm_gym.errors import ConfigurationError, InputError, ModeChangeError, UnreachableError
 from tpm_gym.kinematics import ELBOWS_OUT, inverse, jacobian
 from tpm_gym.mechanism import PAPER_TPM
-from tpm_gym.simulation import Block, Scene, Simulation
+from tpm_gym.simulation import Block, Scene, Simulation, State
 from tpm_gym.simulation.simulation import spline_weights
 
 HOME = np.array(PAPER_TPM.home)
@@ -53,6 +53,17 @@ def test_scenes_that_cannot_be_are_refused(name, value):
     with pytest.raises(ConfigurationError) as caught:
         Scene(**{name: value})
     assert caught.value.name == name
+
+
+@pytest.mark.parametrize("blocks", [(), (Block("one"), Block("other"))], ids=len)
+def test_a_state_has_all_of_its_attributes_and_no_other(blocks):
+    simulation = Simulation(Scene(objects=blocks))
+    places = {block.name: (0.1 * i, -0.03, 0.015) for i, block in enumerate(blocks)}
+    state = simulation.reset(THETA, places)
+    assert [*vars(state)] == [field.name for field in fields(State)]
+    assert state.object_quaternion.shape == (len(blocks), 4)
+    with pytest.raises(FrozenInstanceError):
+        state.vacuum = 1.0
 
 
 # -- the mechanism ---------------------------------------------------------------------------------

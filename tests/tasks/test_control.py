@@ -40,6 +40,7 @@ def test_commands_stay_in_the_region_and_within_the_step_limit(
     before = current.copy()
     command = kind.command(action, current)
     assert command.shape == (3,)
+    assert kind.next(action, tuple(current.tolist())) == tuple(command.tolist())
     assert machine.region.contains(command)
     assert (np.abs(command - current) <= np.array(machine.step_limit) * (1 + 1e-9)).all()
     np.testing.assert_array_equal(current, before)

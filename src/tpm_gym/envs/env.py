@@ -45,7 +45,7 @@ __all__ = ["EnvSnapshot", "TPMEnv"]
 
 Action = NDArray[Any]
 
-_PLAIN = {bool, int, float}
+_PLAIN = {bool, int, float}  # Python's own numbers
 
 
 @dataclass(frozen=True)

@@ -282,7 +282,7 @@ def _assembled(
     try:
         try:
             found, real, _ = assembly_at(cos, sin, planar, side, geometry, MATH)
-        except ValueError:  # on an edge, or beyond it
+        except ValueError:  # at the edge of what can be assembled, or beyond it
             found, real, _ = assembly_at(cos, sin, planar, side, geometry, PLAIN)
     except ZeroDivisionError:  # concentric circles, or link 7 beside B3
         real = False
@@ -305,7 +305,7 @@ def posture(point: Vector, branch: WorkingMode, geometry: Geometry) -> Vector:
     try:
         try:
             theta, real, _, _ = posture_at(point, branch.signs, geometry, MATH)
-        except ValueError:  # on an edge, or beyond it
+        except ValueError:  # at the edge of what can be reached, or beyond it
             theta, real, _, _ = posture_at(point, branch.signs, geometry, PLAIN)
     except ZeroDivisionError:  # a rod's end at the pivot
         real = False

@@ -102,7 +102,8 @@ PLAIN = Namespace(
 )
 
 MATH = replace(PLAIN, root=math.sqrt, arccos=math.acos)
-"""Twice as fast, but what PLAIN rounds to the edge of their domain is a ValueError."""
+"""PLAIN without the corrections that take a sixth of its time: what rounding has pushed out of the
+domain of a root or an arccosine is a ValueError."""
 
 NUMPY = Namespace(
     cos=np.cos,

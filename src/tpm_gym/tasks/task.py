@@ -202,11 +202,11 @@ class Task(ABC):
             ConfigurationError: If :meth:`shaping` gives a term the name of another.
         """
         terms = {"goal": self.goal_term(gap), "singularity": -self.penalty_weight * penalty}
-        for name, term in self.shaping(state).items():
-            if name in ("goal", "singularity"):
-                raise ConfigurationError("shaping", name, f"names other than {', '.join(terms)}")
-            terms[name] = term
-        return terms
+        own = self.shaping(state)
+        if not terms.keys().isdisjoint(own):
+            name = next(name for name in own if name in terms)
+            raise ConfigurationError("shaping", name, f"names other than {', '.join(terms)}")
+        return {**terms, **own}
 
     def goal_term(self, gap: Numbers) -> Numbers:
         """The one term that depends on the goal, (...,), for a gap (...,) m."""
@@ -442,16 +442,14 @@ class Task(ABC):
         """Whether an object is off the table or where the robot cannot get to, (...,)."""
         if not self.scene.objects:
             return np.zeros(state.object_position.shape[:-2], dtype=np.bool_)
-        low, high = self._within
         # So written, what is nowhere (NaN) is lost.
-        if state.object_position.ndim == 2:  # numpy's calls cost more than they compute
-            for place, (a, b, c), (d, e, f) in zip(
-                state.object_position, *self._bounds, strict=True
-            ):
-                x, y, z = place.tolist()
-                if not (a <= x <= d and b <= y <= e and c <= z <= f):
-                    return True
-            return False
+        if state.object_position.ndim == 2:  # of one robot: numpy's calls cost more than that
+            bounds = zip(state.object_position.tolist(), *self._bounds, strict=True)
+            return any(
+                not (a <= x <= d and b <= y <= e and c <= z <= f)
+                for (x, y, z), (a, b, c), (d, e, f) in bounds
+            )
+        low, high = self._within
         within = (state.object_position >= low) & (state.object_position <= high)
         lost: BoolArray = ~np.logical_and.reduce(within, axis=(-2, -1))
         return lost

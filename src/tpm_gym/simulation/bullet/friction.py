@@ -101,8 +101,8 @@ class Friction:
         """Whether an object slides, tips or falls; one that only settles does not."""
         body, _, block = self._bodies[index]
         (x, y, z), (p, q, _) = pybullet.getBaseVelocity(body, self._number)
-        half = block.height / 2
-        return math.hypot(x - half * q, y + half * p) > _SLIP or abs(z) > _FAST
+        tips = block.height / 2 * math.hypot(p, q)
+        return math.hypot(x, y) > _SLIP or tips > _SLIP or abs(z) > _FAST
 
     def turn(self, held: int) -> None:
         """Before a time step: scale the friction of what may slip."""
@@ -110,7 +110,7 @@ class Friction:
         for index in self._active:
             body, table, block = self._bodies[index]
             if index in self._resting and table.scales is _UNKNOWN:
-                # Nothing to turn before it is touched or lifted; asking that costs a sixth.
+                # Until it is touched or lifted; to ask costs a sixth of what turning does.
                 touched = pybullet.getContactPoints(body, cup.body, -1, cup.link, number)
                 if not touched and index != held:
                     continue
