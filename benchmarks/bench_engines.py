@@ -119,9 +119,13 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="some minutes; writes no files")
     parser.add_argument("--jobs", type=int, default=1, help="processes for the matrix")
     parser.add_argument("--published", nargs="+", choices=IDS, help="only these, in the matrix")
+    parser.add_argument("--cost", action="store_true", help="of a control step only")
     parser.add_argument("--redraw", action="store_true", help="picture and page from the records")
     options = parser.parse_args()
-    if options.published:
+    if options.cost:
+        again = {"renewed": machine.describe(sys.argv), "cost": costs(ENGINES, ROUNDS)}
+        engine_report.write(engine_report.read() | again)
+    elif options.published:
         engine_report.write(renewed(engine_report.read(), options.published, options.jobs))
     elif not options.redraw:
         quick = options.quick

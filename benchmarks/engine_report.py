@@ -86,7 +86,7 @@ def lines(record: dict[str, Any]) -> Iterator[str]:
     yield _costs(record)
     yield ""
     if "renewed" in record:
-        yield f"Rows of policies published since: `{record['renewed']['command']}`."
+        yield f"Made again since: `{record['renewed']['command']}`."
         yield ""
     heads = list(dict.fromkeys((row["engine"], row["drive"]) for row in record["matrix"]))
     yield from table(
