@@ -185,6 +185,9 @@ def test_batches_that_do_not_go_together_are_refused_and_what_is_nowhere_is_no_s
         with pytest.raises(InputError, match="info must be"):
             env.compute_reward(goals, goals, info)  # type: ignore[arg-type]
     assert env.compute_reward([np.nan] * 3, [0.0, 0.0, 0.0], {}) == -1.0
+    assert env.compute_reward(goals[0], goals[0], [{}]) == 0.0
+    with pytest.raises(InputError, match="info must be"):
+        env.compute_reward(goals[0], goals[0], [{}, {}])
 
 
 class Broken(Reach):
@@ -226,6 +229,20 @@ def test_what_a_task_gives_that_is_no_number_is_named(where: str, what: str) -> 
     env.task.where = ""  # type: ignore[attr-defined]
     env.reset(seed=0)
     env.step(np.zeros(3))
+
+
+class Single(Reach):
+    """With a term in single precision."""
+
+    def shaping(self, state: State) -> Any:
+        return {"own": np.float32(-0.1)}
+
+
+def test_a_term_in_single_precision_takes_nothing_from_the_others() -> None:
+    env = TPMEnv(Single)
+    env.reset(seed=0)
+    _, reward, _, _, info = env.step(np.ones(3))
+    assert reward == pytest.approx(sum(info["reward_terms"].values()), rel=1e-14)
 
 
 def test_the_penalty_grows_towards_the_singularity_and_follows_the_weight() -> None:

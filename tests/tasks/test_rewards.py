@@ -36,6 +36,12 @@ def test_distance_is_euclidean_and_broadcasts() -> None:
     np.testing.assert_array_equal(distance(batch, goal), distance(goal, batch))
 
 
+def test_one_pair_is_as_far_apart_as_in_a_batch_to_the_last_bit() -> None:
+    one, other = np.random.default_rng(0).normal(size=(2, 2000, 3)).astype(np.float32)
+    single = [distance(a, b) for a, b in zip(one, other, strict=True)]
+    np.testing.assert_array_equal(single, distance(one, other))
+
+
 def test_sparse_is_zero_strictly_within_the_tolerance_and_minus_one_elsewhere() -> None:
     gaps = np.array([0.0, 0.0099, 0.01, 0.0101, 3.0, np.nan])
     np.testing.assert_array_equal(sparse(gaps, 0.01), [0, 0, -1, -1, -1, -1])

@@ -73,7 +73,11 @@ def _total(observed: FloatArray, achieved: FloatArray, reward: FloatArray) -> fl
 
 def _goal_free(terms: Mapping[str, Any]) -> Any:
     """Sum of the reward's terms that do not depend on the goal; 0 where there is none."""
-    return sum([value for name, value in terms.items() if name != "goal"])
+    total: Any = np.float64(0.0)  # whatever precision a task's own terms have
+    for name, value in terms.items():
+        if name != "goal":
+            total = total + value
+    return total
 
 
 def compute_reward(task: Task, achieved: ArrayLike, desired: ArrayLike, info: Any) -> Any:
@@ -83,7 +87,7 @@ def compute_reward(task: Task, achieved: ArrayLike, desired: ArrayLike, info: An
         InputError: If the goals are no real numbers of these shapes, or ``info`` is neither.
     """
     _require_goals(task.goal_size, achieved, desired)
-    goal_term = task.goal_term(task.gap(achieved, desired))
+    goal_term = np.asarray(task.goal_term(task.gap(achieved, desired)))
     try:
         if isinstance(info, Mapping):
             other: Any = _goal_free_in(info)
@@ -128,4 +132,4 @@ def _not_finite(
 
 
 def _clip(values: FloatArray, bound: float) -> NDArray[np.float32]:
-    return values.clip(-bound, bound).astype(np.float32, order="C")
+    return np.minimum(np.maximum(values, -bound), bound).astype(np.float32, order="C")

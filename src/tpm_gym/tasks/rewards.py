@@ -17,8 +17,10 @@ def distance(achieved: ArrayLike, desired: ArrayLike) -> Numbers:
     """Euclidean distance of points (..., k) m, as (...,) m; of one pair as a plain float."""
     one, other = np.asarray(achieved), np.asarray(desired)
     if one.ndim == other.ndim == 1:  # plain floats: numpy's calls cost more than they compute
-        squares = [(a - b) * (a - b) for a, b in zip(one.tolist(), other.tolist(), strict=True)]
-        return math.sqrt(sum(squares))
+        total = 0.0  # not by sum(), which rounds otherwise from Python 3.12 on
+        for a, b in zip(one.tolist(), other.tolist(), strict=True):
+            total += (a - b) * (a - b)
+        return math.sqrt(total)
     gap = np.subtract(one, other, dtype=np.float64)
     first, *others = (gap * gap).T
     for part in others:  # numpy's sum costs several times as much

@@ -126,6 +126,32 @@ def test_what_rests_breaks_away_at_mu_n(degrees, factor):
     assert 0.002 * begun == pytest.approx(1, rel=0.08)
 
 
+@pytest.mark.parametrize("blocks", [1, 2])
+def test_what_is_struck_below_the_cup_is_braked_by_mu_n_from_the_second_time_step_on(blocks):
+    # By a hand from outside, or by another block; the cup is near, and touches neither.
+    struck, other = Block("struck"), Block("other")
+    gap = (UNDER[0] - PUCK.width - 0.002, UNDER[1])
+    simulation = start(*(struck, other)[:blocks], places=(UNDER, gap))
+    client, rows = simulation.engine.client, []
+
+    def strike():
+        if not rows and blocks == 1:
+            client.resetBaseVelocity(simulation.engine.bodies[0], (0.5, 0, 0), (0, 0, 0))
+
+    def note():
+        force, normal = friction(simulation, table(simulation))
+        rows.append((client.getBaseVelocity(simulation.engine.bodies[0])[0][0], force[0], normal))
+
+    if blocks == 2:
+        client.resetBaseVelocity(simulation.engine.bodies[1], (0.8, 0, 0), (0, 0, 0))
+    around_each_step(simulation, before=strike, after=note)
+    rest(simulation)
+    speed, force, normal = np.transpose(rows)
+    sliding = np.flatnonzero(speed > 0.05)[1:]
+    assert len(sliding) >= 5
+    np.testing.assert_allclose(-force[sliding], PUCK.friction * normal[sliding], rtol=0.01)
+
+
 @pytest.mark.parametrize(("x", "y"), [(0, 1), (1, 0), (1, 1), (-1, 0.5)])
 def test_a_pressing_cup_that_moves_drags_with_mu_n_against_its_way(x, y):
     # Moved along y it dragged along x as well, sqrt(2) too hard: (-4.54, 4.59) N for (0, 4.54).

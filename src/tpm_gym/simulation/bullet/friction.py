@@ -93,28 +93,26 @@ class Friction:
         those that are ``near``.
         """
         moving = [index for index in range(len(self._bodies)) if self._moves(index)]
-        self._resting = {index for index in near if index not in moving}
         self._active = sorted({*moving, *near}) if moving else list(near)
+        # An object that is alone rests until the cup comes; others may push each other.
+        alone = len(self._bodies) == 1
+        self._resting = {index for index in near if alone and index not in moving}
         return 0 if moving else first
 
     def _moves(self, index: int) -> bool:
-        """Whether an object slides, tips or falls; one that only settles does not."""
-        body, _, block = self._bodies[index]
-        (x, y, z), (p, q, _) = pybullet.getBaseVelocity(body, self._number)
-        tips = block.height / 2 * math.hypot(p, q)
-        return math.hypot(x, y) > _SLIP or tips > _SLIP or abs(z) > _FAST
+        """Whether an object slides or falls; one that settles after it fell flat does not."""
+        body, table, _ = self._bodies[index]
+        (x, y, z), _ = pybullet.getBaseVelocity(body, self._number)
+        settles = table.scales is _UNKNOWN and math.hypot(x, y) <= _SLIP and abs(z) < _FAST
+        return not settles and math.hypot(x, y, z) > _SLIP
 
     def turn(self, held: int) -> None:
         """Before a time step: scale the friction of what may slip."""
         number, cup = self._number, self._cup
         for index in self._active:
             body, table, block = self._bodies[index]
-            if index in self._resting and table.scales is _UNKNOWN:
-                # Until it is touched or lifted; to ask costs a sixth of what turning does.
-                touched = pybullet.getContactPoints(body, cup.body, -1, cup.link, number)
-                if not touched and index != held:
-                    continue
-                self._resting.discard(index)
+            if index != held and self._rests(index):
+                continue
             points = pybullet.getContactPoints(body, -1, -2, -2, number)  # with anything
             if not points:
                 continue
@@ -130,6 +128,21 @@ class Friction:
                 self._set(
                     cup, _scales(x + half * q - u, y - half * p - v, above, rough * CUP.friction)
                 )
+
+    def _rests(self, index: int) -> bool:
+        """Whether an object still stands as it did at the last look, and nothing touches it.
+
+        Then there is nothing to turn; to ask costs a third of what turning does.
+        """
+        body, table, _ = self._bodies[index]
+        if index not in self._resting or table.scales is not _UNKNOWN:
+            return False
+        (x, y, _), _ = pybullet.getBaseVelocity(body, self._number)
+        lip = self._cup.body, -1, self._cup.link, self._number
+        if math.hypot(x, y) > _SLIP or pybullet.getContactPoints(body, *lip):
+            self._resting.discard(index)
+            return False
+        return True
 
     def _set(self, face: _Face, scales: tuple[float, float]) -> None:
         if scales is face.scales:  # unknown as before
