@@ -71,10 +71,6 @@ def _clip(x: float) -> float:
     return -1.0 if x < -1.0 else 1.0 if x > 1.0 else x
 
 
-def _arccos(x: float) -> float:
-    return math.acos(-1.0 if x < -1.0 else 1.0 if x > 1.0 else x)
-
-
 def _wrap(angle: float) -> float:
     if -math.pi < angle <= math.pi:
         return angle
@@ -89,7 +85,7 @@ PLAIN = Namespace(
     sqrt=math.sqrt,
     root=lambda x: math.sqrt(x) if x > 0.0 else 0.0,
     clip=_clip,
-    arccos=_arccos,
+    arccos=lambda x: math.acos(_clip(x)),
     arcsin=lambda x: math.asin(_clip(x)),
     maximum=lambda x, least: x if x > least else least,
     where=lambda condition, one, other: one if condition else other,
