@@ -27,7 +27,8 @@ from tpm_gym.arrays import Vector
 from tpm_gym.errors import SingularityError, UnreachableError
 from tpm_gym.kinematics.geometry import Geometry, Lengths
 from tpm_gym.kinematics.modes import AssemblyMode, WorkingMode
-from tpm_gym.kinematics.namespaces import MATH, NUMPY, PLAIN, Namespace, Numbers
+from tpm_gym.kinematics.namespaces import NUMPY, PLAIN, Namespace, Numbers
+from tpm_gym.kinematics.straight import straight_line
 
 ROUNDING = 64 * sys.float_info.epsilon
 """Where two solutions merge, rounding alone can push a discriminant (always scaled to order one)
@@ -256,6 +257,40 @@ def _largest_singular_value(rows: tuple[Triple, Triple, Triple], ns: Namespace) 
 # -- one configuration in plain floats, with errors ------------------------------------------------
 
 
+def _assembly(
+    theta: Triple, signs: tuple[Numbers, Numbers], g: Lengths, ns: Namespace
+) -> tuple[Triple, Triple, Assembly, Numbers]:
+    """The arms, level and vertical, the assembly, and whether it is real."""
+    cos, sin = arms(theta, g, ns)
+    found, real, _ = assembly_at(cos, sin, *signs, g, ns)
+    return cos, sin, found, real
+
+
+def _posture(
+    point: Triple, signs: tuple[Numbers, Numbers, Numbers, Numbers], g: Lengths, ns: Namespace
+) -> tuple[Triple, Numbers]:
+    """The posture, and whether it is real."""
+    return posture_at(point, signs, g, ns)[:2]
+
+
+def _motion(
+    cos: Triple, sin: Triple, assembly: tuple[Numbers, ...], g: Lengths, ns: Namespace
+) -> tuple[Triple, tuple[Triple, Triple, Triple], Numbers]:
+    """The factors of det A, the rows of J and the conditioning."""
+    found = Assembly(*assembly)
+    bars = rods(cos, sin, found, g)
+    values = factors(cos, sin, found, bars, g)
+    rows = velocity(bars, values)
+    return values[:3], rows, conditioning(rows, ns)
+
+
+_straight_assembly = straight_line(_assembly, "one two three", "planar side")
+_straight_posture = straight_line(_posture, "x y z", "side bend1 bend2 bend3")
+_straight_motion = straight_line(
+    _motion, "cos1 cos2 cos3", "sin1 sin2 sin3", "x y z x_c z_c cos_beta sin_beta"
+)
+
+
 def assemble(theta: Vector, branch: AssemblyMode, geometry: Geometry) -> Assembly:
     """Forward kinematics on one branch (Eqs. 6 to 11, corrected), at theta (3) rad.
 
@@ -277,13 +312,11 @@ def _assembled(
     before, result = _last
     if theta is before[0] and branch is before[1] and geometry is before[2]:
         return result
-    cos, sin = arms(theta, geometry, PLAIN)
-    planar, side = branch.planar, branch.sin_beta
     try:
         try:
-            found, real, _ = assembly_at(cos, sin, planar, side, geometry, MATH)
+            cos, sin, found, real = _straight_assembly(theta, branch.signs, geometry)
         except ValueError:  # at the edge of what can be assembled, or beyond it
-            found, real, _ = assembly_at(cos, sin, planar, side, geometry, PLAIN)
+            cos, sin, found, real = _assembly(theta, branch.signs, geometry, PLAIN)
     except ZeroDivisionError:  # concentric circles, or link 7 beside B3
         real = False
     if not real:
@@ -302,11 +335,12 @@ def posture(point: Vector, branch: WorkingMode, geometry: Geometry) -> Vector:
     Raises:
         UnreachableError: If the branch does not exist at the point.
     """
+    theta: Vector
     try:
         try:
-            theta, real, _, _ = posture_at(point, branch.signs, geometry, MATH)
+            theta, real = _straight_posture(point, branch.signs, geometry)
         except ValueError:  # at the edge of what can be reached, or beyond it
-            theta, real, _, _ = posture_at(point, branch.signs, geometry, PLAIN)
+            theta, real = _posture(point, branch.signs, geometry, PLAIN)
     except ZeroDivisionError:  # a rod's end at the pivot
         real = False
     if not real:
@@ -324,14 +358,15 @@ def evaluate(
         SingularityError: If theta is a parallel singularity.
     """
     cos, sin, found = _assembled(theta, branch, geometry)
-    bars = rods(cos, sin, found, geometry)
-    values = factors(cos, sin, found, bars, geometry)
-    require_regular(values, geometry)
-    rows = velocity(bars, values)
     try:
-        return found, rows, conditioning(rows, MATH)
-    except ValueError:  # two singular values nearly coincide
-        return found, rows, conditioning(rows, PLAIN)
+        values, rows, least = _straight_motion(cos, sin, found, geometry)
+    except (ArithmeticError, ValueError):  # singular, or two singular values nearly coincide
+        bars = rods(cos, sin, found, geometry)
+        require_regular(factors(cos, sin, found, bars, geometry)[:3], geometry)
+        _, rows, least = _motion(cos, sin, found, geometry, PLAIN)
+    else:
+        require_regular(values, geometry)
+    return found, rows, least
 
 
 def conditioning_at(
@@ -350,9 +385,9 @@ def conditioning_at(
         return 0.0
 
 
-def require_regular(values: Factors, geometry: Geometry) -> None:
-    """Raise SingularityError if a factor of det A is zero."""
-    sin_beta, level3, planar, *_ = values
+def require_regular(values: Triple, geometry: Geometry) -> None:
+    """Raise SingularityError if a factor of det A (the first three of Factors) is zero."""
+    sin_beta, level3, planar = values
     near, l4 = 2.0 * SINGULAR, geometry.l4
     # Asked in each control step: the names can wait until one is near.
     if abs(sin_beta) > near and abs(level3) > near * l4 and abs(planar) > near * l4 * l4:

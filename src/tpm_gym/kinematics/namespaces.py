@@ -9,7 +9,7 @@ import itertools
 import math
 import operator
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -96,10 +96,6 @@ PLAIN = Namespace(
     stack=tuple,
     join=lambda points: tuple(itertools.chain(*points)),
 )
-
-MATH = replace(PLAIN, root=math.sqrt, arccos=math.acos)
-"""PLAIN without the corrections that take a sixth of its time: what rounding has pushed out of the
-domain of a root or an arccosine is a ValueError."""
 
 NUMPY = Namespace(
     cos=np.cos,

@@ -375,7 +375,7 @@ class Dynamics:
             real = False
         if not real:
             raise equations.no_assembly(theta, self.branch, self.geometry)
-        equations.require_regular(pose.factors, self.geometry)
+        equations.require_regular(pose.factors[:3], self.geometry)
         return pose
 
     def torque(self, theta: ArrayLike, theta_dot: ArrayLike, theta_ddot: ArrayLike) -> FloatArray:
