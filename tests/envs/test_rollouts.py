@@ -33,6 +33,8 @@ def marked(case: tuple[str, str]) -> Any:
 @pytest.mark.parametrize(("env_id", "name"), [marked(case) for case in cases()])
 def test_rollouts_are_those_on_record(env_id: str, name: str) -> None:
     found, recorded = play(env_id, name, Expert), RECORDED[f"{env_id} {name}"]
+    # A policy computes in single precision, and its puck may be about to slip or to tip.
+    near = 1e-4 if name == "published" else 1e-9
     if found["sha256"] != recorded["sha256"]:
         for key in ("returns", "gaps"):
-            assert found[key] == pytest.approx(recorded[key], rel=0, abs=1e-9)
+            assert found[key] == pytest.approx(recorded[key], rel=0, abs=near)

@@ -259,11 +259,9 @@ def _largest_singular_value(rows: tuple[Triple, Triple, Triple], ns: Namespace) 
 
 def _assembly(
     theta: Triple, signs: tuple[Numbers, Numbers], g: Lengths, ns: Namespace
-) -> tuple[Triple, Triple, Assembly, Numbers]:
-    """The arms, level and vertical, the assembly, and whether it is real."""
-    cos, sin = arms(theta, g, ns)
-    found, real, _ = assembly_at(cos, sin, *signs, g, ns)
-    return cos, sin, found, real
+) -> tuple[Assembly, Numbers]:
+    """The assembly, and whether it is real."""
+    return assembly_at(*arms(theta, g, ns), *signs, g, ns)[:2]
 
 
 def _posture(
@@ -274,21 +272,23 @@ def _posture(
 
 
 def _motion(
-    cos: Triple, sin: Triple, assembly: tuple[Numbers, ...], g: Lengths, ns: Namespace
-) -> tuple[Triple, tuple[Triple, Triple, Triple], Numbers]:
-    """The factors of det A, the rows of J and the conditioning."""
-    found = Assembly(*assembly)
+    theta: Triple, signs: tuple[Numbers, Numbers], g: Lengths, ns: Namespace
+) -> tuple[Assembly, Numbers, Triple, tuple[Triple, Triple, Triple], Numbers]:
+    """The assembly, whether it is real, the factors of det A, the rows of J, the conditioning."""
+    cos, sin = arms(theta, g, ns)
+    found, real, _ = assembly_at(cos, sin, *signs, g, ns)
     bars = rods(cos, sin, found, g)
     values = factors(cos, sin, found, bars, g)
     rows = velocity(bars, values)
-    return values[:3], rows, conditioning(rows, ns)
+    return found, real, values[:3], rows, conditioning(rows, ns)
 
 
 _straight_assembly = straight_line(_assembly, "one two three", "planar side")
 _straight_posture = straight_line(_posture, "x y z", "side bend1 bend2 bend3")
-_straight_motion = straight_line(
-    _motion, "cos1 cos2 cos3", "sin1 sin2 sin3", "x y z x_c z_c cos_beta sin_beta"
-)
+_straight_motion = straight_line(_motion, "one two three", "planar side")
+
+_last: Any = (None, None, None), None
+"""What was assembled last, and the result: who reads a robot asks for the same angles again."""
 
 
 def assemble(theta: Vector, branch: AssemblyMode, geometry: Geometry) -> Assembly:
@@ -297,33 +297,26 @@ def assemble(theta: Vector, branch: AssemblyMode, geometry: Geometry) -> Assembl
     Raises:
         UnreachableError: If the branch does not exist at theta.
     """
-    return _assembled(theta, branch, geometry)[2]
-
-
-_last: Any = (None, None, None), None
-"""What was assembled last, and the result: who reads a robot asks for the same angles again."""
-
-
-def _assembled(
-    theta: Vector, branch: AssemblyMode, geometry: Geometry
-) -> tuple[Triple, Triple, Assembly]:
-    global _last
-    result: tuple[Triple, Triple, Assembly]
-    before, result = _last
+    found: Assembly
+    before, found = _last
     if theta is before[0] and branch is before[1] and geometry is before[2]:
-        return result
+        return found
     try:
         try:
-            cos, sin, found, real = _straight_assembly(theta, branch.signs, geometry)
+            found, real = _straight_assembly(theta, branch.signs, geometry)
         except ValueError:  # at the edge of what can be assembled, or beyond it
-            cos, sin, found, real = _assembly(theta, branch.signs, geometry, PLAIN)
+            found, real = _assembly(theta, branch.signs, geometry, PLAIN)
     except ZeroDivisionError:  # concentric circles, or link 7 beside B3
         real = False
     if not real:
         raise no_assembly(theta, branch, geometry)
-    result = cos, sin, found
-    _last = (tuple(theta), branch, geometry), result  # so that nothing can change in it
-    return result
+    _remember(theta, branch, geometry, found)
+    return found
+
+
+def _remember(theta: Vector, branch: AssemblyMode, geometry: Geometry, found: Assembly) -> None:
+    global _last
+    _last = (tuple(theta), branch, geometry), found  # so that nothing can change in it
 
 
 def posture(point: Vector, branch: WorkingMode, geometry: Geometry) -> Vector:
@@ -357,15 +350,19 @@ def evaluate(
         UnreachableError: If the branch does not exist at theta.
         SingularityError: If theta is a parallel singularity.
     """
-    cos, sin, found = _assembled(theta, branch, geometry)
     try:
-        values, rows, least = _straight_motion(cos, sin, found, geometry)
-    except (ArithmeticError, ValueError):  # singular, or two singular values nearly coincide
+        found, real, values, rows, least = _straight_motion(theta, branch.signs, geometry)
+    except (ArithmeticError, ValueError):  # nowhere, singular, or at an edge of either
+        found = assemble(theta, branch, geometry)
+        cos, sin = arms(theta, geometry, PLAIN)
         bars = rods(cos, sin, found, geometry)
         require_regular(factors(cos, sin, found, bars, geometry)[:3], geometry)
-        _, rows, least = _motion(cos, sin, found, geometry, PLAIN)
+        *_, rows, least = _motion(theta, branch.signs, geometry, PLAIN)
     else:
+        if not real:
+            raise no_assembly(theta, branch, geometry)
         require_regular(values, geometry)
+        _remember(theta, branch, geometry, found)
     return found, rows, least
 
 

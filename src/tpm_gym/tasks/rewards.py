@@ -34,9 +34,11 @@ def sparse(gap: Numbers, tolerance: float) -> Numbers:
     return -(1.0 - (gap < tolerance))
 
 
-def dense(gap: ArrayLike, unit: float = 0.1) -> FloatArray:
+def dense(gap: ArrayLike, unit: float = 0.1) -> Numbers:
     """Minus ``gap`` (m) in units of ``unit`` (m), so that a typical error costs about 1."""
-    return -np.asarray(gap, dtype=np.float64) / unit
+    if not isinstance(gap, float):  # which is fastest as it is
+        gap = np.asarray(gap, dtype=np.float64)
+    return -gap / unit
 
 
 def singularity_penalty(conditioning: Numbers, safe: float) -> Numbers:
