@@ -13,8 +13,8 @@ check nothing and raise nothing: beside a solution they return whether it is rea
 from which the errors of the last part explain why it is not.
 
 The second part is the first in plain floats, for one configuration at every time step, with errors:
-:func:`assemble`, :func:`posture`, :func:`evaluate` and :func:`conditioning_at`. Three finite floats
-are expected.
+:func:`assemble`, :func:`posture` and :func:`evaluate`, which run it as straight-line code, see
+:mod:`tpm_gym.kinematics.straight`, and :func:`conditioning_at`. Three finite floats are expected.
 """
 
 import math
