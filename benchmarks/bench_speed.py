@@ -236,7 +236,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         help=f"default: all of {', '.join(known)}",
     )  # fmt: skip
     parser.add_argument("--rounds", type=int, default=10)
-    parser.add_argument("--steps", type=int, default=300, help="of a contestant in a round")
+    parser.add_argument("--steps", type=int, default=1000, help="of a contestant in a round")
     parser.add_argument(
         "--scaling-steps", type=int, default=1000, help="of a process in a round; 0: no scaling"
     )
