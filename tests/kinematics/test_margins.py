@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from tpm_gym.arrays import FloatArray
-from tpm_gym.errors import InputError, UnreachableError
+from tpm_gym.errors import InputError, SingularityError, UnreachableError
 from tpm_gym.kinematics import (
     ASSEMBLY_MODES,
     ELBOWS_OUT,
@@ -206,3 +206,17 @@ def test_concentric_circles_are_named_without_a_warning() -> None:
     assert not forward_all(theta, geometry).valid.any()
     with pytest.raises(UnreachableError, match="loop 1"):
         forward(theta, geometry=geometry)
+
+
+@pytest.mark.parametrize(
+    ("theta", "error"),
+    [
+        ([0.0, 0.0, 0.0], UnreachableError),
+        ([np.pi / 2, np.pi, np.pi / 2], UnreachableError),
+        (inverse([-0.04, 0.0, 0.8]), SingularityError),
+    ],
+)
+def test_one_configuration_is_refused_with_nothing_behind_the_error(theta: Any, error: Any) -> None:
+    with pytest.raises(error) as caught:
+        jacobian.evaluate(theta)
+    assert caught.value.__context__ is None

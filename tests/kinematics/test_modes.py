@@ -8,7 +8,7 @@ import oracle
 import pytest
 
 from tpm_gym import kinematics
-from tpm_gym.errors import InputError
+from tpm_gym.errors import InputError, UnreachableError
 from tpm_gym.kinematics import modes as branches
 from tpm_gym.kinematics.geometry import PAPER
 from tpm_gym.kinematics.modes import (
@@ -42,6 +42,16 @@ def test_anything_but_signs_is_refused(bad: Any) -> None:
             with pytest.raises(InputError) as caught:
                 kind(*signs)
             assert caught.value.name == kind.__name__
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("kind", [int, float, bool, np.int64, np.float64, np.float32])
+def test_signs_that_were_computed_serve_as_plain_ones(kind: Any) -> None:
+    mode = AssemblyMode(kind(1), kind(1))
+    assert mode == AssemblyMode(1, 1)
+    assert all(type(sign) is int for sign in (*mode.signs, *WorkingMode(*[kind(1)] * 4).signs))
+    with pytest.raises(UnreachableError):  # and not NumPy's warning that something is divided by 0
+        kinematics.jacobian.evaluate([np.pi / 2, np.pi, np.pi / 2], mode)
 
 
 def elbow_distances(mode: WorkingMode) -> np.ndarray:

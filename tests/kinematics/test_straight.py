@@ -96,5 +96,15 @@ def test_a_text_that_asks_whether_something_holds_is_refused() -> None:
 
     with pytest.raises(TypeError, match="not known yet"):
         straight_line(branching, "x")
-    with pytest.raises(TypeError, match="not known yet"):
-        straight_line(lambda numbers, g, ns: (max(numbers),), "x y")
+    for asks in (max, lambda numbers: 1.0 if numbers[0] == 0.0 else 2.0, lambda ns: 0.0 in ns):
+        with pytest.raises(TypeError, match="not known yet"):
+            straight_line(lambda numbers, g, ns, asks=asks: (asks(numbers),), "x y")
+
+
+@pytest.mark.parametrize("x", [0.0, 1.0, math.nan])
+def test_what_is_compared_is_compared_when_it_is_known(x: float) -> None:
+    def text(numbers: Any, g: Any, ns: Any) -> Any:
+        (x,) = numbers
+        return x == 0.0, x != 0.0, ns.where(x == x, 1.0, 2.0), x <= 0.0, x >= g.l1
+
+    assert straight_line(text, "x")((x,), PAPER) == text((x,), PAPER, PLAIN)

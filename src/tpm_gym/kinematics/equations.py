@@ -301,11 +301,12 @@ def assemble(theta: Vector, branch: AssemblyMode, geometry: Geometry) -> Assembl
     before, found = _last
     if theta is before[0] and branch is before[1] and geometry is before[2]:
         return found
+    signs = branch.planar, branch.sin_beta
     try:
         try:
-            found, real = _straight_assembly(theta, branch.signs, geometry)
+            found, real = _straight_assembly(theta, signs, geometry)
         except ValueError:  # at the edge of what can be assembled, or beyond it
-            found, real = _assembly(theta, branch.signs, geometry, PLAIN)
+            found, real = _assembly(theta, signs, geometry, PLAIN)
     except ZeroDivisionError:  # concentric circles, or link 7 beside B3
         real = False
     if not real:
@@ -351,19 +352,30 @@ def evaluate(
         SingularityError: If theta is a parallel singularity.
     """
     try:
-        found, real, values, rows, least = _straight_motion(theta, branch.signs, geometry)
+        motion = _straight_motion(theta, (branch.planar, branch.sin_beta), geometry)
     except (ArithmeticError, ValueError):  # nowhere, singular, or at an edge of either
-        found = assemble(theta, branch, geometry)
-        cos, sin = arms(theta, geometry, PLAIN)
-        bars = rods(cos, sin, found, geometry)
-        require_regular(factors(cos, sin, found, bars, geometry)[:3], geometry)
-        *_, rows, least = _motion(theta, branch.signs, geometry, PLAIN)
-    else:
-        if not real:
-            raise no_assembly(theta, branch, geometry)
-        require_regular(values, geometry)
-        _remember(theta, branch, geometry, found)
+        motion = None
+    if motion is None:
+        return _evaluate_plainly(theta, branch, geometry)
+    found, real, values, rows, least = motion
+    if not real:
+        raise no_assembly(theta, branch, geometry)
+    require_regular(values, geometry)
+    _remember(theta, branch, geometry, found)
     return found, rows, least
+
+
+def _evaluate_plainly(
+    theta: Vector, branch: AssemblyMode, geometry: Geometry
+) -> tuple[Assembly, tuple[Vector, Vector, Vector], float]:
+    """The same step by step, each of which asks whether the next can be done."""
+    found = assemble(theta, branch, geometry)
+    cos, sin = arms(theta, geometry, PLAIN)
+    bars = rods(cos, sin, found, geometry)
+    values = factors(cos, sin, found, bars, geometry)
+    require_regular(values[:3], geometry)
+    rows = velocity(bars, values)
+    return found, rows, conditioning(rows, PLAIN)
 
 
 def conditioning_at(

@@ -27,9 +27,13 @@ class _Mode:
         raise NotImplementedError
 
     def __post_init__(self) -> None:
-        """Reject anything but signs."""
-        if any(sign not in (-1, 1) for sign in self.signs):
-            raise InputError(type(self).__name__, self.signs, "made of signs, each +1 or -1")
+        """Reject anything but signs, and make plain numbers of NumPy's, which divide by zero."""
+        signs = dict(vars(self))
+        if any(sign not in (-1, 1) for sign in signs.values()):
+            valid = "made of signs, each +1 or -1"
+            raise InputError(type(self).__name__, tuple(signs.values()), valid)
+        for name, sign in signs.items():
+            object.__setattr__(self, name, int(sign))
 
     @property
     def index(self) -> int:

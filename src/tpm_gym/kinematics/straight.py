@@ -128,7 +128,7 @@ def _operator(form: str) -> Callable[..., _Number]:
 for _name, _sign in {"add": "+", "sub": "-", "mul": "*", "truediv": "/", "and": "&"}.items():
     setattr(_Number, f"__{_name}__", _operator(f"{{0}} {_sign} {{1}}"))
     setattr(_Number, f"__r{_name}__", _operator(f"{{1}} {_sign} {{0}}"))
-for _name, _sign in {"lt": "<", "le": "<=", "gt": ">", "ge": ">="}.items():
+for _name, _sign in {"lt": "<", "le": "<=", "gt": ">", "ge": ">=", "eq": "==", "ne": "!="}.items():
     setattr(_Number, f"__{_name}__", _operator(f"{{0}} {_sign} {{1}}"))
 for _name, _form in {"neg": "-{0}", "abs": "abs({0})"}.items():
     setattr(_Number, f"__{_name}__", _operator(_form))
