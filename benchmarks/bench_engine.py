@@ -5,7 +5,7 @@
 
 Speed: environment steps a second with uniformly random actions, resets included, in blocks that
 take turns: closed form at several numbers of environments, with the torques of no, the last or
-every time step; PyBullet; panda-gym. Each ratio is of blocks of one round.
+every time step, and with servo drives; PyBullet; panda-gym. Each ratio is of blocks of one round.
 
 Torques: the same actions in both engines with free hands, at several time steps of both; what is
 observed and the conditioning too.
@@ -61,6 +61,10 @@ def speeds(rounds: int, counts: Sequence[int]) -> dict[str, dict[str, Any]]:
             blocks[f"{env_id}, analytic, {torques}, 1024"] = _many(env_id, 1024, torques)
     for count in counts:
         blocks.setdefault(f"{PICK}, analytic, none, {count}", _many(PICK, count, "none"))
+    servo = f"{PICK} with servo drives"
+    blocks[f"{servo}, pybullet"] = _single(PICK, engine="pybullet", drive="servo")
+    for count in (1, 1024):
+        blocks[f"{servo}, analytic, last, {count}"] = _many(PICK, count, "last", drive="servo")
     found: dict[str, list[float]] = {name: [] for name in blocks}
     for number in range(-1, rounds):  # the first is not counted
         for name in blocks if number % 2 else reversed(blocks):
@@ -94,9 +98,9 @@ def _single(env_id: str, **options: Any) -> Callable[[int], float]:
     return block
 
 
-def _many(env_id: str, count: int, torques: str) -> Callable[[int], float]:
+def _many(env_id: str, count: int, torques: str, **others: Any) -> Callable[[int], float]:
     """Steps a second of many, all out of phase, so that resets are spread evenly."""
-    options = {"engine": "analytic", "stagger": True, "physics": {"torques": torques}}
+    options = {"engine": "analytic", "stagger": True, "physics": {"torques": torques}, **others}
     envs = gym.make_vec(env_id, num_envs=count, **options)
 
     def block(seed: int) -> float:

@@ -27,6 +27,15 @@ __all__ = ["COLOURS", "LOOPS_FILE", "URDF_FILE", "loops_text", "numbers", "urdf_
 
 URDF_FILE, LOOPS_FILE = "tpm.urdf", "tpm.loops.yaml"
 
+_CLOSING = f"""
+  A tree, whose loops are to be closed: {LOOPS_FILE} pairs the frames whose origins shall coincide.
+  At angles of 0 they do not. Angles where they do are in tpm.xml, for one posture (the key frame
+  "home"), and in tpm_gym.PAPER_TPM.joint_positions(theta), for any angles of the motors.
+
+  PyBullet: a point-to-point constraint for each pair; erp=1, and 300 iterations of its own solver,
+  or more. Its direct ones lose loops within one body (docs/fidelity.md), which this is.
+  """
+
 COLOURS = {
     "white": (0.72, 0.76, 0.82, 1.0),
     "light": (0.80, 0.83, 0.87, 1.0),
@@ -66,6 +75,8 @@ def urdf_text(mechanism: Mechanism, closure_frames: bool = False) -> str:
     root = Element("robot", name="tpm")
     root.append(ElementTree.Comment(" Generated from tpm_gym.mechanism; do not edit (make urdf). "))
     root.append(ElementTree.Comment(" z points down: where the robot hangs, gravity is along +z. "))
+    if closure_frames:
+        root.append(ElementTree.Comment(_CLOSING))
     for name, rgba in COLOURS.items():
         material = ElementTree.SubElement(root, "material", name=name)
         ElementTree.SubElement(material, "color", rgba=numbers(rgba))
