@@ -27,7 +27,7 @@ class _Mode:
         raise NotImplementedError
 
     def __post_init__(self) -> None:
-        """Reject anything but signs, and make plain numbers of NumPy's, which divide by zero."""
+        """Reject anything but signs; keep ints, as NumPy's numbers warn where plain ones raise."""
         signs = dict(vars(self))
         if any(sign not in (-1, 1) for sign in signs.values()):
             valid = "made of signs, each +1 or -1"
