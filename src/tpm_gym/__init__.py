@@ -8,8 +8,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tpm_gym.envs.env import TPMEnv
-from tpm_gym.envs.registration import env_ids, register_task
+from tpm_gym.envs.ids import env_ids, register_task
+from tpm_gym.envs.single import TPMEnv
+from tpm_gym.envs.vector import TPMVectorEnv
 from tpm_gym.errors import TPMError
 from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
 from tpm_gym.mechanism.machine import Machine, register_machine
@@ -32,6 +33,7 @@ __all__ = [
     "Machine",
     "TPMEnv",
     "TPMError",
+    "TPMVectorEnv",
     "__version__",
     "load_policy",
     "register_engine",

@@ -1,61 +1,39 @@
-"""Drives: how motors follow their references.
+"""Drives of the motors.
 
-The ideal drive (``None`` here) is each engine's own: it is where it shall be at the end of a time
-step, its motor's effort permitting. A :class:`Servo` is what a real axis has: stiffness, damping, a
+Each engine has its own ideal drive (``None`` here): the motor reaches its reference within a time
+step, as far as its effort allows. A :class:`Servo` is the drive of a real axis: stiffness, damping,
 feed-forward, and a motor with a torque-speed line.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from itertools import pairwise
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
-from tpm_gym.arrays import FloatArray, Vector, is_number
-from tpm_gym.errors import ConfigurationError, SingularityError, UnreachableError
-from tpm_gym.kinematics.equations import Triple
-from tpm_gym.mechanism.batch import Batch
-from tpm_gym.mechanism.bodies import Joint
+from tpm_gym.arrays import FloatArray, IntArray, Vector, is_number
+from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.randomisation import NOMINAL, Plant, Randomisation
 from tpm_gym.simulation.settings import settings_of
 
+if TYPE_CHECKING:
+    from tpm_gym.simulation.path import Path
+
 __all__ = [
-    "Gains",
-    "Memory",
-    "Reference",
+    "References",
     "Servo",
-    "Servos",
+    "ServoDrives",
     "drive_of",
     "drives_and_randomisation",
-    "follow",
-    "limited",
-    "references",
     "require_servo",
-    "wanted",
+    "steering",
 ]
 
 FEEDFORWARDS = ("none", "gravity", "computed")
 
-_ZERO: Vector = (0.0, 0.0, 0.0)
-_UNITS: tuple[Vector, ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-
-
-class Reference(NamedTuple):
-    """Where the motors shall be at the end of a time step: three floats, or columns (3, n).
-
-    Attributes:
-        theta: rad (m for a slide).
-        theta_dot: rad/s; zero for the ideal drive, which needs none.
-        torque: Fed forward in the time step, N m; zero for the ideal drive.
-    """
-
-    theta: Any
-    theta_dot: Triple = _ZERO
-    torque: Triple = _ZERO
 
 
 @dataclass(frozen=True)
@@ -140,202 +118,150 @@ def drives_and_randomisation(drive: Any, randomisation: Any) -> tuple[Servo | No
     return servo, drawn
 
 
-def limited(torque: float, rate: float, effort: float, motor: Joint) -> float:
-    """What a motor gives of a torque.
-
-    Up to its corner speed that is ``effort`` at most; driving faster it falls in a straight line to
-    nothing at the no-load speed, while braking, the voltage helps.
-
-    Args:
-        torque: Wanted, N m.
-        rate: rad/s.
-        effort: The largest torque, N m.
-        motor: Its corner and no-load speeds.
-    """
-    share = (motor.speed - abs(rate)) / (motor.speed - motor.corner)
-    driving = effort * min(1.0, max(0.0, share))
-    high, low = (driving, -effort) if rate > 0 else (effort, -driving)
-    return min(high, max(low, torque))
-
-
-def references(
-    machine: Machine | Batch, servo: Servo, start: Any, path: Sequence[Any], time_step: float
-) -> list[Reference]:
-    """Angles with their rates, and the torques fed forward in each time step.
-
-    Of one machine in plain floats; of many in arrays (3, n), with a path (K, 3, n).
-
-    The torques are those of the first and the last time step, and in between a straight line: in a
-    control period, they differ little from it.
-
-    Args:
-        machine: The nominal one.
-        servo: Whose feed-forward it is.
-        start: Angles at the beginning, rad.
-        path: Angles at the end of each time step, rad.
-        time_step: s.
-    """
-    points = [start, *path]
-    rates = [_slope(now, before, time_step) for before, now in pairwise(points)]
-    if servo.feedforward == "none":
-        return [Reference(*one) for one in zip(path, rates, strict=True)]
-    moving = servo.feedforward == "computed"
-    # Across a border of control periods the acceleration jumps: to that of the new one.
-    changes = [_slope(now, before, time_step) for before, now in pairwise(rates)] or [_ZERO]
-    first, last = (
-        machine.torque(theta, *(motion if moving else (_ZERO, _ZERO)))
-        for theta, *motion in (
-            (points[0], rates[0], changes[0]),
-            (points[-2], rates[-1], changes[-1]),
-        )
-    )
-    between: Any = np.linspace(first, last, len(path))
-    if between.ndim == 2:
-        between = between.tolist()
-    return [
-        Reference(theta, rate, (a, b, c))
-        for theta, rate, (a, b, c) in zip(path, rates, between, strict=True)
-    ]
-
-
-def _slope(now: Triple, before: Triple, time: float) -> Triple:
-    a, b, c = now
-    d, e, f = before
-    return (a - d) / time, (b - e) / time, (c - f) / time
-
-
-class Memory(NamedTuple):
-    """What servo drives remember of the last time step.
+class References(NamedTuple):
+    """What servo drives follow in the K time steps of a control period, for n robots.
 
     Attributes:
-        torque: What the motors applied, N m.
-        theta_dot: Their rates at its beginning, rad/s.
+        theta: (K, n, 3) rad (m for a slide), at the end of each time step.
+        theta_dot: (K, n, 3) rad/s.
+        torque: (K, n, 3) N m, fed forward in each time step.
     """
 
-    torque: Triple
-    theta_dot: Triple
+    theta: FloatArray
+    theta_dot: FloatArray
+    torque: FloatArray
 
 
-class Servos:
-    """The three drives of a machine, in an engine of fixed time steps.
+class ServoDrives:
+    """Servo drives of n machines, in an engine of fixed time steps.
 
     A real amplifier closes its loops some ten thousand times a second, an engine a few hundred
-    times. Computed from the angles at the beginning of each time step, the law would then explode
-    at the stiffness of a real axis. It is taken at the end of the time step instead (backward
-    Euler), which is stable at any stiffness. To foresee that end, the acceleration follows from
-    the machine's inertia M and from the load, which is what the last time step's torque was more
-    than M times its acceleration. So the static stiffness is the stated one against any force, and
-    motion is that of a spring and a damper that Euler's backward method integrates: it damps
-    ``stiffness`` x ``time_step`` more than the stated damping.
+    times. Computed from the joint positions at the beginning of each time step, the law would
+    explode at the stiffness of a real axis. It is therefore taken at the end of the time step
+    (backward Euler), which is stable at any stiffness. The acceleration until then follows from the
+    machine's inertia M and from the load. The load is the last time step's torque minus M times
+    its acceleration. So the static stiffness is the stated one against any force, and motion is
+    that of a spring and a damper under backward Euler, which damps ``stiffness`` x ``time_step``
+    more than the stated damping.
 
     Args:
         servo: The law.
-        machine: The one that is driven; its ``torque`` gives M.
+        machine: The nominal machine.
+        count: Number of machines, n.
         time_step: s.
 
     Attributes:
-        memory: What the next time step depends on besides the motors' angles and rates.
+        memory: (2, n, 3), the torques (N m) of the last time step and the joint velocities (rad/s)
+            at its beginning.
+        friction: (n, 3) N m, Coulomb friction of the motors' axes.
 
     Raises:
         ConfigurationError: If a motor of the machine has no torque-speed line.
     """
 
-    def __init__(self, servo: Servo, machine: Machine, time_step: float) -> None:
-        """Be the nominal drives, the machine at rest at home."""
+    def __init__(self, servo: Servo, machine: Machine, count: int, time_step: float) -> None:
+        """Start as the nominal drives, with the machines at rest at home."""
+        from tpm_gym.simulation import compiled  # imports Numba
+
+        self._step_law, self._braced = compiled.servo_torques, compiled.braced_inverse
         self._servo, self._machine, self._step = servo, machine, time_step
-        self._motors = machine.mechanism.motors
-        for motor in self._motors:
+        motors = machine.mechanism.motors
+        for motor in motors:
             if not 0 <= motor.corner < motor.speed:
                 valid = f"motors whose corner speed is below their speed, unlike {motor}"
                 raise ConfigurationError("drive", servo, valid)
-        self._home = machine.inverse(machine.home)
-        self.alter(NOMINAL)
-        self.rest(self._home)
+        self._line = np.array([(motor.corner, motor.speed) for motor in motors])
+        self._nominal_effort = np.array([motor.effort for motor in motors])
+        self._home = machine.require_inverse(np.array(machine.home))
+        self._built: FloatArray | None = None  # parameters of machines with other lengths
+        self._stiffness, self._effort, self.friction = np.zeros((3, count, 3))
+        self._lightest = np.ones((count, 1, 1))
+        self.memory = np.zeros((2, count, 3))
+        rows = np.arange(count)
+        self.alter(rows, [NOMINAL] * count)
+        self.rest(rows, np.tile(self._home, (count, 1)))
 
-    def alter(self, plant: Plant) -> None:
-        """Become the drives of ``plant``."""
-        strengths = zip(self._motors, plant.motor_strength, strict=True)
-        self._effort = [motor.effort * strength for motor, strength in strengths]
-        a, b, c = (self._servo.stiffness * factor for factor in plant.servo_stiffness)
-        self._stiffness = (a, b, c)
-        # Too large an inertia would be unstable; with each link's own factor M is between these.
-        self._lightest = min(plant.link_masses, default=1.0)
+    def alter(self, rows: IntArray, plants: Sequence[Plant]) -> None:
+        """Become the drives of some plants."""
+        lengths = [plant.lengths_of(self._machine) for plant in plants]
+        if self._built is None and any(lengths):
+            self._built = np.tile(self._machine.built(), (len(self.friction), 1))
+        if self._built is not None:
+            self._built[rows] = [self._machine.built(own) for own in lengths]
+        self._stiffness[rows] = self._servo.stiffness * np.array([p.servo_stiffness for p in plants])
+        self._effort[rows] = self._nominal_effort * np.array([p.motor_strength for p in plants])
+        self.friction[rows] = [p.joint_friction for p in plants]
+        # Too large an inertia would be unstable. M with each link's own factor lies between those
+        # with the smallest and the largest factor for all links.
+        self._lightest[rows, 0, 0] = [min(p.link_masses, default=1.0) for p in plants]
 
-    def rest(self, theta: Vector) -> None:
-        """Start at rest at ``theta`` rad, with what carries the machine there."""
-        self.memory = Memory(self._machine.torque(theta, _ZERO, _ZERO), _ZERO)
+    def rest(self, rows: IntArray, theta: FloatArray) -> None:
+        """Start at rest at ``theta`` (r, 3) rad, with the torques that carry the machines."""
+        built = None if self._built is None else self._built[rows]
+        self.memory[0, rows] = self._machine.motion(theta, np.zeros_like(theta), built).bias
+        self.memory[1, rows] = 0.0
 
-    def begin(self, theta: Vector) -> None:
-        """Take up the inertia at ``theta`` rad, for a control period."""
-        try:
-            mass = self._inertia(theta)
-        except (UnreachableError, SingularityError):  # not this machine, if its lengths are off
-            mass = self._inertia(self._home)
-        stiffness, damping, step = np.array(self._stiffness), self._servo.damping, self._step
-        inverse = np.linalg.inv(mass + np.diag(step * (step * stiffness + damping)))
-        self._gains = Gains(self._stiffness, damping, mass.tolist(), inverse.tolist(), step)
+    def references(self, path: Path) -> References:
+        """Compute references along a path, and the feed-forward of the nominal machine.
 
-    def _inertia(self, theta: Vector) -> FloatArray:
-        """(3, 3) kg m^2, at least as light as the true machine."""
-        torque = self._machine.torque
-        weight = torque(theta, _ZERO, _ZERO)
-        columns = [_minus(torque(theta, _ZERO, unit), weight) for unit in _UNITS]
-        return self._lightest * np.array(columns)
+        The feed-forward is computed for the first and the last time step and interpolated: within a
+        control period it differs little from a straight line.
+        """
+        machine, step = path.machine, self._step
+        points = np.concatenate([path.start[:, None], path.points()], axis=1)
+        theta = machine.reach(points)  # (n, K + 1, 3)
+        rates = np.diff(theta, axis=1) / step
+        torque = np.zeros((rates.shape[1], len(theta), 3))
+        if self._servo.feedforward != "none":
+            moving = float(self._servo.feedforward == "computed")
+            # Across a border of control periods the acceleration jumps to that of the new one.
+            changes = np.diff(rates, axis=1) / step if rates.shape[1] > 1 else 0.0 * rates
+            first = machine.torque(theta[:, 0], moving * rates[:, 0], moving * changes[:, 0])
+            last = machine.torque(theta[:, -2], moving * rates[:, -1], moving * changes[:, -1])
+            torque = np.linspace(first, last, len(torque))
+        true = path.true(theta[:, 1:])
+        return References(
+            np.ascontiguousarray(true.swapaxes(0, 1)),
+            np.ascontiguousarray(rates.swapaxes(0, 1)),
+            torque,
+        )
 
-    def torque(self, reference: Reference, theta: Vector, theta_dot: Vector) -> Vector:
-        """What the motors apply in a time step, N m, from angles and rates at its beginning."""
-        asked = wanted(self._gains, self.memory, reference, theta, theta_dot)
-        one, two, three = map(limited, asked, theta_dot, self._effort, self._motors)
-        self.memory = Memory((one, two, three), theta_dot)
-        return self.memory.torque
+    def begin(self, theta: FloatArray) -> None:
+        """Compute the inertia at ``theta`` (n, 3) rad, for a control period."""
+        still = np.zeros_like(theta)
+        mass = self._machine.motion(theta, still, self._built).mass
+        lost = np.isnan(mass).any(axis=(1, 2))
+        if lost.any():  # a machine of other lengths cannot be there
+            home = np.tile(self._home, (int(lost.sum()), 1))
+            built = None if self._built is None else self._built[lost]
+            mass[lost] = self._machine.motion(home, 0.0 * home, built).mass
+        self._mass = self._lightest * mass
+        self._inverse = self._braced(self._mass, self._stiffness, self._servo.damping, self._step)
 
+    def torque(
+        self, references: References, index: int, theta: FloatArray, theta_dot: FloatArray
+    ) -> FloatArray:
+        """Compute what the motors apply in a time step, (n, 3) N m.
 
-class Gains(NamedTuple):
-    """What the law of servo drives multiplies by, in a control period.
-
-    Attributes:
-        stiffness: N m/rad.
-        damping: N m s/rad.
-        mass: (3, 3) kg m^2, the inertia that the drives believe in.
-        inverse: Of mass + ``step`` x (``step`` x stiffness + damping).
-        step: The time step, s.
-    """
-
-    stiffness: Triple
-    damping: float
-    mass: Sequence[Any]
-    inverse: Sequence[Any]
-    step: float
-
-
-def wanted(
-    gains: Gains, memory: Memory, reference: Reference, theta: Triple, theta_dot: Triple
-) -> Triple:
-    """The law of :class:`Servos`: torques, N m, before the motors' limits.
-
-    In plain floats, or in arrays of one for each machine.
-    """
-    step, damping = gains.step, gains.damping
-    before, rates = memory
-    load = _minus(before, _times(gains.mass, _slope(theta_dot, rates, step)))
-    motion = zip(
-        gains.stiffness, reference.theta, reference.theta_dot, theta, theta_dot, strict=True
-    )
-    a, b, c = (
-        stiffness * (wanted - angle - step * rate) + damping * (wanted_rate - rate)
-        for stiffness, wanted, wanted_rate, angle, rate in motion
-    )
-    d, e, f = _minus(reference.torque, load)
-    x, y, z = _times(gains.mass, _times(gains.inverse, (a + d, b + e, c + f)))
-    u, v, w = load
-    return u + x, v + y, w + z
+        Args:
+            references: For the control period.
+            index: Number of the time step in it.
+            theta: (n, 3) rad, at the beginning of the time step.
+            theta_dot: (n, 3) rad/s.
+        """
+        self._step_law(
+            references.theta[index], references.theta_dot[index], references.torque[index],
+            theta, theta_dot, self._stiffness, self._servo.damping, self._mass, self._inverse,
+            self._effort, self._line, self._step, self.memory,
+        )  # fmt: skip
+        return self.memory[0]
 
 
 class Driven(Protocol):
-    """An engine's robot with three motors."""
+    """The robot of an engine that simulates one, with three motors."""
 
     def motors(self) -> tuple[Vector, Vector, Vector]:
-        """Angles (rad), rates (rad/s) and torques (N m)."""
+        """Return joint positions (rad), velocities (rad/s) and torques (N m)."""
 
     def drive(self, theta: Vector) -> None:
         """Let ideal motors go to ``theta`` rad in the next time step."""
@@ -344,21 +270,18 @@ class Driven(Protocol):
         """Let the motors apply ``torque`` N m in the next time step."""
 
 
-def follow(robot: Driven, servos: Servos | None, reference: Reference) -> None:
-    """Let a robot's motors follow a reference in the next time step; without servos, ideally."""
-    if servos is None:
-        robot.drive(reference.theta)
-    else:
-        theta, theta_dot, _ = robot.motors()
-        robot.apply(servos.torque(reference, theta, theta_dot))
+def steering(
+    drives: ServoDrives | None, path: Path, robot: Driven
+) -> tuple[Sequence[Any], Callable[[Any], None]]:
+    """Return a target for each time step of a path, and the function that drives a robot to it."""
+    if drives is None:
+        return path.joints()[0].tolist(), robot.drive
+    references = drives.references(path)
+    drives.begin(references.theta[0])
 
+    def drive(index: int) -> None:
+        theta, rates, _ = robot.motors()
+        torque = drives.torque(references, index, np.array([theta]), np.array([rates]))
+        robot.apply(torque[0].tolist())
 
-def _minus(left: Triple, right: Triple) -> Triple:
-    (a, b, c), (d, e, f) = left, right
-    return a - d, b - e, c - f
-
-
-def _times(matrix: Sequence[Any], column: Triple) -> Triple:
-    (a, b, c), (d, e, f), (g, h, i) = matrix
-    x, y, z = column
-    return a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z
+    return range(len(references.theta)), drive

@@ -1,37 +1,38 @@
-"""What an engine is asked to do, and the engines by name.
+"""The interface of engines, and the engines by name.
 
-An engine knows a machine, a scene and a drive; never a goal, a reward or gymnasium. What is the
-same for all of them (references, encoders' errors, modes, the State) is in
-:mod:`tpm_gym.simulation.simulation`.
+An engine moves n machines over n tables, and knows a machine, a scene and a drive; never a goal, a
+reward or Gymnasium. Paths, encoder errors, modes and the State are the same for all engines and
+are in :mod:`tpm_gym.simulation.simulation`.
 """
 
 from __future__ import annotations
 
 import importlib
 import inspect
-from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable, Collection, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tpm_gym.arrays import Quaternion, Vector, is_whole
+from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Quaternion, Vector, is_whole
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.machine import Machine
-from tpm_gym.simulation.drives import Reference, Servo
+from tpm_gym.simulation.drives import Servo
 from tpm_gym.simulation.randomisation import Plant
 from tpm_gym.simulation.state import Scene
 from tpm_gym.simulation.vacuum import Hold
 
+if TYPE_CHECKING:
+    from tpm_gym.simulation.path import Path
+
 __all__ = [
     "Engine",
-    "Hold",
-    "Motors",
     "Pose",
-    "Reference",
-    "Truth",
+    "Readout",
     "Twist",
     "make_engine",
+    "most_robots",
     "register_engine",
     "require_engine",
 ]
@@ -47,6 +48,13 @@ class Pose(NamedTuple):
     position: Vector
     quaternion: Quaternion = UPRIGHT
 
+    @classmethod
+    def of(cls, numbers: Sequence[float]) -> Pose:
+        """Make a pose of seven numbers."""
+        x, y, z, *turn = numbers
+        a, b, c, d = turn
+        return cls((x, y, z), (a, b, c, d))
+
 
 class Twist(NamedTuple):
     """Velocity (m/s) and angular velocity (rad/s)."""
@@ -55,76 +63,122 @@ class Twist(NamedTuple):
     angular_velocity: Vector = (0.0, 0.0, 0.0)
 
 
-class Motors(NamedTuple):
-    """True positions (rad, m for a slide) and rates of the motors, and what they last applied."""
+class Readout(NamedTuple):
+    """Everything that an engine reports of n robots and k objects on each table; world frame.
 
-    theta: Vector
-    theta_dot: Vector
-    torque: Vector
+    Attributes:
+        theta: (n, 3) rad (m for a slide), true joint positions.
+        theta_dot: (n, 3) rad/s.
+        torque: (n, 3) N m, in the last time step.
+        position: (n, 3) m, point P of the platform.
+        tilt: (n,) rad, rotation of the platform.
+        gap: (n,) m, largest gap of the loops.
+        mode_left: (n,) mode that the machine left, as :meth:`tpm_gym.Machine.mode_left` codes it.
+        held: (n,) index of the object in the cup; -1 for none.
+        vacuum: (n,) Pa below the ambient pressure.
+        object_position: (n, k, 3) m.
+        object_quaternion: (n, k, 4), (x, y, z, w).
+        object_velocity: (n, k, 3) m/s.
+        object_angular_velocity: (n, k, 3) rad/s.
+    """
 
+    theta: FloatArray
+    theta_dot: FloatArray
+    torque: FloatArray
+    position: FloatArray
+    tilt: FloatArray
+    gap: FloatArray
+    mode_left: IntArray
+    held: IntArray
+    vacuum: FloatArray
+    object_position: FloatArray
+    object_quaternion: FloatArray
+    object_velocity: FloatArray
+    object_angular_velocity: FloatArray
 
-class Truth(NamedTuple):
-    """What a real robot does not know: largest loop gap (m), point P (m, world), tilt (rad)."""
+    @classmethod
+    def of_one(
+        cls,
+        machine: Machine,
+        motors: tuple[Vector, Vector, Vector],
+        truth: tuple[float, Vector, float],
+        hold: Hold,
+        objects: Sequence[tuple[Pose, Twist]],
+    ) -> Readout:
+        """Make the readout of one robot from plain floats.
 
-    gap: float
-    position: Vector
-    tilt: float
+        Args:
+            machine: The true machine, whose modes are checked.
+            motors: Joint positions (rad), velocities (rad/s) and torques (N m).
+            truth: Largest gap (m), point P (m) and tilt (rad).
+            hold: What the cup holds.
+            objects: Poses and velocities.
+        """
+        (theta, rates, torque), (gap, place, tilt) = motors, truth
+        numbers = [*theta, *rates, *torque, *place, tilt, gap, hold.vacuum]
+        for (where, turn), (velocity, spin) in objects:
+            numbers += (*where, *turn, *velocity, *spin)
+        # One array for all numbers costs half of an array for each entry.
+        row = np.array([numbers])
+        table = row[:, 15:].reshape(1, -1, 13)
+        left = machine.mode_left(row[:, 0:3], machine.mount.to_paper(row[:, 9:12]))
+        return cls(
+            row[:, 0:3], row[:, 3:6], row[:, 6:9], row[:, 9:12],
+            row[:, 12], row[:, 13], left, np.array([hold.which]), row[:, 14],
+            table[..., 0:3], table[..., 3:7], table[..., 7:10], table[..., 10:13],
+        )  # fmt: skip
 
 
 class Engine(Protocol):
-    """One machine over one table. World frame, SI units, plain floats.
+    """n machines, each over a table of its own. Rows first, SI units, world frame.
 
-    ``load`` comes first, then ``place``; what an engine cannot do it refuses with a
-    :class:`~tpm_gym.errors.ConfigurationError` that names it.
+    ``load`` comes first, then ``place``. An engine refuses what it cannot do with a
+    :class:`~tpm_gym.errors.ConfigurationError` that names the option.
 
     Attributes:
-        substeps: Time steps in a control period.
+        time_step: s; a whole fraction of the control period.
     """
 
-    substeps: int
+    time_step: float
 
-    def load(self, machine: Machine, scene: Scene) -> None:
-        """Hold this machine and scene, and nothing else; loops closed, nothing altered."""
+    def load(self, machine: Machine, scene: Scene, count: int) -> None:
+        """Load ``count`` machines as designed, each with this scene."""
 
-    def alter(self, plant: Plant) -> None:
-        """Make the machine that of ``plant``, but for its lengths, which ``load`` has seen to."""
+    def alter(self, rows: IntArray, plants: Sequence[Plant]) -> None:
+        """Turn some machines into those of their plants, masses, motors and lengths."""
 
-    def place(self, joints: Mapping[str, float], objects: Sequence[Pose]) -> None:
-        """Let go, then put all joints (rad, m) and objects where they are wanted, at rest."""
+    def place(self, rows: IntArray, theta: FloatArray, objects: FloatArray) -> None:
+        """Open the cups, and put joints and objects in their places, at rest.
 
-    def show_goal(self, markers: Sequence[Vector]) -> None:
-        """Move the goal markers."""
-
-    def advance(self, references: Sequence[Reference], vacuum: bool) -> None:
-        """Run a control period: drive the motors to one reference in each time step."""
-
-    def motors(self) -> Motors:
-        """Read the motors."""
-
-    def truth(self) -> Truth:
-        """Read what only a simulation knows."""
-
-    def objects(self) -> list[tuple[Pose, Twist]]:
-        """Read the scene's objects, in its order."""
-
-    def hold(self) -> Hold:
-        """What the cup holds, and how well; by :mod:`tpm_gym.simulation.vacuum` each time step."""
-
-    def save(self) -> Any:
-        """Take down everything that the next steps depend on, as plain data, all in its repr.
-
-        What an engine cannot read out (old contacts' impulses) is not part of it, and ``restore``
-        drops it.
+        Args:
+            rows: (r,) machines to place.
+            theta: (r, 3) rad (m for a slide), true joint positions.
+            objects: (r, k, 7) centres (m) and orientations (x, y, z, w).
         """
 
-    def restore(self, snapshot: Any) -> None:
-        """Go back to what ``save`` returned, for the same machine and scene, altered alike."""
+    def advance(self, path: Path, vacuum: BoolArray) -> None:
+        """Run a control period along ``path``, with the vacuum on or off (n,)."""
+
+    def read(self) -> Readout:
+        """Read everything; the arrays belong to the caller."""
+
+    def save(self) -> Any:
+        """Return everything that the next steps depend on, as plain data or arrays.
+
+        Leave out what cannot be read, such as impulses of old contacts; ``restore`` clears it.
+        """
+
+    def restore(self, saved: Any) -> None:
+        """Continue from what ``save`` returned, for as many machines, altered alike."""
+
+    def show_goal(self, markers: FloatArray) -> None:
+        """Move the goal markers of the first robot to (k, 3) m."""
 
     def picture(self, width: int, height: int) -> NDArray[np.uint8]:
-        """Draw the scene as (height, width, 3) RGB."""
+        """Draw the first robot and its scene as (height, width, 3) RGB."""
 
     def close(self) -> None:
-        """Give everything back; harmless the second time."""
+        """Release everything; harmless the second time."""
 
 
 Factory = Callable[..., Engine]
@@ -133,49 +187,57 @@ Factory = Callable[..., Engine]
 _ENGINES: dict[str, str | Factory] = {
     "pybullet": "tpm_gym.simulation.bullet.engine:BulletEngine",
     "mujoco": "tpm_gym.simulation.mujoco.engine:MujocoEngine",
+    "analytic": "tpm_gym.simulation.analytic.engine:AnalyticEngine",
 }
-SIMULATIONS = {"analytic": "tpm_gym.simulation.analytic.single:SingleSimulation"}
-"""Engines that are a simulation of their own, of many robots at a time."""
+_MOST: dict[str, int | None] = {"analytic": None}
 
 
-def register_engine(name: str, engine: str | Factory) -> None:
-    """Let environments be made with ``engine=name``.
+def register_engine(name: str, engine: str | Factory, *, robots: int | None = 1) -> None:
+    """Register an engine, so that environments can be made with ``engine=name``.
 
     Args:
-        name: The name.
-        engine: What makes the engine, from those of the keywords ``gui`` (to open a window),
-            ``renderer`` (other than its own), ``physics`` (its numerical settings) and ``drive`` (a
-            :class:`~tpm_gym.simulation.drives.Servo` on each motor, instead of ideal drives) that
-            it can serve; or ``"module:attribute"`` of that, imported when first asked for.
+        name: Its name.
+        engine: Callable that makes the engine. It takes those of the keywords ``gui`` (open a
+            window), ``renderer``, ``physics`` (numerical settings) and ``drive`` (a
+            :class:`~tpm_gym.simulation.Servo` on each motor instead of ideal drives) that the
+            engine can serve. Or ``"module:attribute"``, imported when first used.
+        robots: Largest number of robots in one engine; None for any number.
 
     Raises:
-        ConfigurationError: If the name is none, or taken by another engine, or that is no engine.
+        ConfigurationError: If an argument is not possible, or another engine has the name.
     """
     if not isinstance(name, str) or not name:
         raise ConfigurationError("name", name, "a name")
     if not (isinstance(engine, str) and ":" in engine) and not callable(engine):
-        raise ConfigurationError("engine", engine, "what makes an engine, or 'module:attribute'")
+        raise ConfigurationError("engine", engine, "a callable, or 'module:attribute'")
+    if robots is not None and not is_whole(robots, 1):
+        raise ConfigurationError("robots", robots, "a whole number, 1 or more, or None")
     if _path(_ENGINES.get(name, engine)) != _path(engine):
         raise ConfigurationError("engine", name, f"a name other than {', '.join(_ENGINES)}")
-    _ENGINES[name] = engine
+    _ENGINES[name], _MOST[name] = engine, robots
 
 
 def _path(engine: str | Factory) -> str:
-    """Where it is defined: there the same one may be registered as itself."""
+    """Return where an engine is defined: from there it may be registered again."""
     if isinstance(engine, str):
         return engine
     return f"{engine.__module__}:{getattr(engine, '__qualname__', engine)}"
 
 
 def require_engine(name: Any, among: Collection[str] = ()) -> None:
-    """Refuse what is no engine's name.
+    """Raise if no engine has this name.
 
     Raises:
         ConfigurationError: If there is none of that name, or it is not ``among`` those.
     """
-    known = (*_ENGINES, *SIMULATIONS)
-    if not isinstance(name, str) or name not in (among or known):
-        raise ConfigurationError("engine", name, ", ".join(map(repr, known)))
+    if not isinstance(name, str) or name not in (among or _ENGINES):
+        raise ConfigurationError("engine", name, ", ".join(map(repr, _ENGINES)))
+
+
+def most_robots(name: str) -> int | None:
+    """Return the largest number of robots in one engine; None for any number."""
+    require_engine(name)
+    return _MOST.get(name, 1)
 
 
 def make_engine(
@@ -186,19 +248,19 @@ def make_engine(
     physics: Any = None,
     drive: Servo | None = None,
 ) -> Engine:
-    """The engine of that name.
+    """Make the engine of that name.
 
     Raises:
-        ConfigurationError: If there is none, or it cannot do what is asked for.
+        ConfigurationError: If there is none, or the engine cannot serve an option.
     """
-    require_engine(name, _ENGINES)
+    require_engine(name)
     factory = _ENGINES[name]
     if isinstance(factory, str):
         module, _, attribute = factory.partition(":")
         try:
             factory = getattr(importlib.import_module(module), attribute)
         except (ModuleNotFoundError, AttributeError) as error:
-            valid = f"one that can be imported; of {factory!r} Python says: {error}"
+            valid = f"an engine that can be imported; for {factory!r} Python says: {error}"
             raise ConfigurationError("engine", name, valid) from error
     options: dict[str, Any] = {
         "gui": gui or None,
@@ -210,13 +272,14 @@ def make_engine(
     known = inspect.signature(factory).parameters
     if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in known.values()):
         for option in asked.keys() - known.keys():
+            if option == "gui":  # users ask for it by the name of the environment's option
+                valid = f"None or 'rgb_array': the engine {name!r} opens no window"
+                raise ConfigurationError("render_mode", "human", valid)
             valid = f"left out: the engine {name!r} has no such option"
             raise ConfigurationError(option, asked[option], valid)
     engine: Engine = factory(**asked)
     if lacking := [part for part in _PARTS if not _has(engine, part)]:
         raise ConfigurationError("engine", name, f"an engine that has {', '.join(lacking)}")
-    if not is_whole(engine.substeps, 1):
-        raise ConfigurationError("engine", name, "an engine whose substeps are 1 or more")
     return engine
 
 
@@ -224,6 +287,6 @@ _PARTS = [name for name in (*Engine.__annotations__, *vars(Engine)) if not name.
 
 
 def _has(engine: Engine, part: str) -> bool:
-    """Whether it has that part of the protocol, and of its own: the protocol's do nothing."""
+    """Return whether an engine defines a part itself; the protocol's methods do nothing."""
     own = getattr(engine, part, None)
     return own is not None and getattr(own, "__func__", None) is not vars(Engine).get(part, own)

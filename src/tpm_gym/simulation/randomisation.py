@@ -70,12 +70,17 @@ class Plant:
     encoder_bias: Vector = (0.0, 0.0, 0.0)
     length_errors: tuple[float, ...] = ()
 
-    def of(self, nominal: Machine) -> Machine:
-        """The true machine."""
+    def lengths_of(self, nominal: Machine) -> tuple[float, ...]:
+        """Return the true lengths, m; empty for nominal ones."""
         if not self.length_errors:
-            return nominal
+            return ()
         lengths = zip(nominal.lengths, self.length_errors, strict=True)
-        return nominal.with_lengths(tuple(length + error for length, error in lengths))
+        return tuple(length + error for length, error in lengths)
+
+    def of(self, nominal: Machine) -> Machine:
+        """Return the true machine."""
+        lengths = self.lengths_of(nominal)
+        return nominal.with_lengths(lengths) if lengths else nominal
 
 
 NOMINAL = Plant()

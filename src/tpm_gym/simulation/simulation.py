@@ -1,86 +1,65 @@
-"""The simulated machine, whatever engine moves it.
-
-References along a spline, the encoders' errors, what follows from the encoders, whether loops are
-closed and modes kept, and the :class:`~tpm_gym.simulation.state.State` that tells it all.
-"""
+"""The simulation of n robots: paths, encoders, modes and the State, the same for all engines."""
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from operator import sub
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tpm_gym.arrays import FloatArray, Vector, rotate, vector
-from tpm_gym.errors import (
-    ClosureError,
-    ModeChangeError,
-    SingularityError,
-    UnreachableError,
-)
-from tpm_gym.mechanism.machine import Machine, Mode, Reading
+from tpm_gym.arrays import BoolArray, FloatArray, IntArray, finite
+from tpm_gym.errors import ClosureError
+from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.tpm import PAPER_TPM
-from tpm_gym.simulation.drives import Reference, Servo, references, require_servo
-from tpm_gym.simulation.engine import SIMULATIONS, Engine, Pose, make_engine
+from tpm_gym.simulation.drives import Servo, require_servo
+from tpm_gym.simulation.engine import Engine, Readout, make_engine
+from tpm_gym.simulation.path import Path, spline_weights
 from tpm_gym.simulation.randomisation import NOMINAL, Plant
 from tpm_gym.simulation.state import CONTROL_PERIOD, Scene, State
 
-__all__ = ["Simulation", "Snapshot", "make_simulation"]
+__all__ = ["Simulation", "Snapshot"]
 
 CLOSURE_LIMIT = 0.005
-"""A loop that is open by more than this is lost, m."""
+"""Largest gap of a loop, m; a loop that is open further is lost."""
 
-_ZERO: Vector = (0.0, 0.0, 0.0)
-_UP: Vector = (0.0, 0.0, 1.0)
+_COLUMNS = ("commands", "noise", "position", "jacobian", "conditioning", "mode_left", "bias")
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Everything that the next steps of a :class:`Simulation` depend on."""
+    """Everything that the next steps of a :class:`Simulation` depend on.
 
-    plant: Plant
-    engine: Any
-    torque: Vector
-    commands: tuple[Vector, Vector]
-    noise: tuple[Vector, Vector]
-    reading: Reading
-    mode_left: Mode | None
-
-
-def make_simulation(scene: Scene, *, engine: str, **options: Any) -> Simulation:
-    """The simulation with that engine; the options are those of :class:`Simulation`.
-
-    Raises:
-        ConfigurationError: If an option is out of range, or the engine cannot do it.
+    Attributes:
+        plants: The n plants of the episodes.
+        columns: Arrays (n, ...) by name.
+        engine: The engine's own part.
     """
-    if engine not in SIMULATIONS:
-        return Simulation(scene, engine=engine, **options)
-    module, _, name = SIMULATIONS[engine].partition(":")
-    made: Simulation = getattr(importlib.import_module(module), name)(scene, **options)
-    return made
+
+    plants: tuple[Plant, ...]
+    columns: dict[str, NDArray[Any]]
+    engine: Any
 
 
 class Simulation:
-    """One robot over one table in one engine of its own.
+    """n robots in one engine, each over a table of its own.
 
-    What control and encoders believe in is ``machine``; the true one is that of the
-    :class:`~tpm_gym.simulation.randomisation.Plant` of the episode.
+    Control and forward kinematics use the nominal ``machine``; the true machine of each row is
+    that of its :class:`~tpm_gym.simulation.Plant`.
 
     Args:
-        scene: What stands on the table besides the robot.
+        scene: Objects on each table.
         machine: The nominal machine.
         engine: Name of the engine.
-        physics: The engine's numerical settings; None for its own.
-        drive: The motors' servo drives; None for ideal ones.
+        count: Number of robots, n.
+        physics: The engine's numerical settings; None for its defaults.
+        drive: Servo drives of the motors; None for ideal drives.
         gui: Whether to open a window.
-        renderer: What draws pictures; None for the engine's own choice.
+        renderer: Renderer of pictures; None for the engine's default.
 
     Raises:
-        ConfigurationError: If an option is out of range, or the engine cannot do it.
+        ConfigurationError: If an option is out of range, or the engine cannot serve it.
     """
 
     def __init__(
@@ -89,266 +68,236 @@ class Simulation:
         *,
         machine: Machine = PAPER_TPM,
         engine: str = "pybullet",
+        count: int = 1,
         physics: Any = None,
         drive: Servo | None = None,
         gui: bool = False,
         renderer: str | None = None,
     ) -> None:
-        """Start the engine and load."""
-        self.scene, self.machine = scene, machine
-        self.drive = drive
+        """Start the engine and load the machines."""
+        self.scene, self.machine, self.count, self.drive = scene, machine, count, drive
         self.engine: Engine = make_engine(
             engine, gui=gui, renderer=renderer, physics=physics, drive=drive
         )
         try:
-            self._load(machine, NOMINAL.length_errors)
+            self.engine.load(machine, scene, count)
         except BaseException:
             self.close()
             raise
-        self._torque = _ZERO  # of the motors in the last time step, N m
-        self._commands = (_ZERO, _ZERO)  # the last two, machine's frame, m
-        self._noise = (_ZERO, _ZERO)  # of the last two readings of the encoders, rad
-        self._reading: Reading  # the last one that made sense
-        self._mode_left: Mode | None = None
-        self._spline: list[list[float]] = spline_weights(self.engine.substeps).tolist()
-
-    def _load(self, machine: Machine, lengths: tuple[float, ...]) -> None:
-        """Fill the engine with a machine off by ``lengths`` (m) and all that stands around it."""
-        self._true_machine = machine
-        self.engine.load(machine, self.scene)
-        self.plant = Plant(length_errors=lengths)
-
-    def _true(self, plant: Plant) -> Machine:
-        """The machine of that plant."""
-        same = plant.length_errors == self.plant.length_errors
-        return self._true_machine if same else plant.of(self.machine)
-
-    def _become(self, plant: Plant, machine: Machine) -> None:
-        """Make the simulated machine that of ``plant``, whose lengths ``machine`` has."""
-        if plant == self.plant:
-            return
-        if machine is not self._true_machine:
-            self._load(machine, plant.length_errors)
-        self.engine.alter(plant)
-        self.plant = plant
+        self._plants = [NOMINAL] * count
+        self._weights = spline_weights(round(CONTROL_PERIOD / self.engine.time_step))
+        self._frame = machine.mount.frame
+        self._commands = np.zeros((count, 2, 3))  # the last two, machine's frame, m
+        self._noise = np.zeros((count, 2, 3))  # of the last two readings of the encoders, rad
+        self._bias = np.zeros((count, 3))  # of the encoders, rad
+        self._disturbed = False  # whether any encoder has bias or noise
+        self._position = np.zeros((count, 3))  # by forward kinematics, machine's frame, m
+        self._jacobian = np.zeros((count, 3, 3))
+        self._conditioning = np.zeros(count)
+        self._mode_left = np.zeros(count, dtype=np.int64)
+        self._readout: Readout
 
     # -- running ----------------------------------------------------------------------------
 
     def reset(
         self,
+        rows: IntArray,
         theta: ArrayLike,
-        objects: Mapping[str, ArrayLike] | None = None,
-        plant: Plant = NOMINAL,
-        noise: Vector = _ZERO,
-    ) -> State:
-        """Put everything at rest: the arms at ``theta``, the loops closed, the objects upright.
+        objects: Mapping[str, FloatArray] | None = None,
+        plants: Sequence[Plant] | None = None,
+        noise: FloatArray | None = None,
+    ) -> None:
+        """Place some robots at rest: arms at ``theta``, loops closed, objects upright.
 
         Args:
+            rows: (r,) robots to place.
             theta: (3,) rad, by the encoders.
-            objects: Centre (3,) m, world, of each of the scene's objects by name; where one is not
-                named it stands on the table, in the middle.
-            plant: The true machine.
-            noise: Of the first reading of the encoders, rad.
+            objects: Centres (r, 3) m, world, of the scene's objects by name. Objects without an
+                entry stand in the middle of the table.
+            plants: The r true machines; None for nominal ones.
+            noise: (r, 3) rad, of the first reading of the encoders; None for none.
 
         Raises:
-            ConfigurationError: If the plant differs in what only a servo drive has.
+            ConfigurationError: If a plant has what only a servo drive can serve.
             InputError: If theta or a position is not three finite numbers.
-            UnreachableError: If the mechanism cannot be assembled at theta.
-            JointLimitError: If a motor is beyond a stop there; nothing has moved then.
+            UnreachableError: If a mechanism cannot be assembled at theta; nothing has moved then.
+            JointLimitError: If a motor is beyond a stop at theta; nothing has moved then.
         """
-        require_servo(self.drive, plant.servo_stiffness, plant.joint_friction)
-        angles = vector("theta", theta)
-        reading = self.machine.evaluate(angles)
-        a, b, c = (angle - bias for angle, bias in zip(angles, plant.encoder_bias, strict=True))
-        true_machine = self._true(plant)
-        true_machine.require_within_stops((a, b, c))
-        joints = true_machine.joint_positions((a, b, c))
-        placed = self._poses(objects or {})
-        self._become(plant, true_machine)
-        self.engine.place(joints, placed)
-        self._torque = _ZERO
-        # What is true of the nominal machine, in case the encoders' errors make no sense.
-        self._reading = reading
-        self._mode_left, self._noise = None, (noise, noise)
-        self._commands = (reading.position,) * 2
-        return self.read()
+        plants = [NOMINAL] * len(rows) if plants is None else plants
+        for plant in plants:
+            if plant is not NOMINAL:
+                require_servo(self.drive, plant.servo_stiffness, plant.joint_friction)
+        angles = finite("theta", theta, (3,))
+        reading = self.machine.require_evaluate(angles)
+        bias = np.array([plant.encoder_bias for plant in plants])
+        true = angles - bias
+        self.machine.require_within_stops(true)
+        if any(plant.length_errors for plant in plants):
+            self.machine.require_evaluate(true, self._built(plants))
+        placed = self._places(len(rows), objects or {})
+        self._become(rows, plants)
+        self.engine.place(rows, true, placed)
+        self._position[rows], self._jacobian[rows] = reading.position, reading.jacobian
+        self._conditioning[rows] = reading.conditioning
+        self._commands[rows] = reading.position
+        self._bias[rows], self._mode_left[rows] = bias, 0
+        self._noise[rows] = 0.0 if noise is None else noise[:, None]
+        self._disturbed = bool(self._bias.any() or self._noise.any())
+        self._read(rows)
 
-    def _poses(self, objects: Mapping[str, ArrayLike]) -> list[Pose]:
-        """Upright poses of the scene's objects, in its order."""
-        return [
-            Pose(vector(block.name, objects.get(block.name, (0.0, 0.0, block.height / 2))))
-            for block in self.scene.objects
-        ]
+    def _built(self, plants: Sequence[Plant]) -> FloatArray:
+        """Return the parameters (r, k) of plants by their lengths."""
+        return np.array([self.machine.built(plant.lengths_of(self.machine)) for plant in plants])
+
+    def _places(self, count: int, objects: Mapping[str, ArrayLike]) -> FloatArray:
+        """Return upright poses (r, k, 7) of the scene's objects, in its order."""
+        places = np.zeros((count, len(self.scene.objects), 7))
+        places[..., 6] = 1.0
+        for index, block in enumerate(self.scene.objects):
+            places[:, index, 2] = block.height / 2
+            if block.name in objects:
+                places[:, index, :3] = finite(block.name, objects[block.name], (count, 3))
+        return places
+
+    def _become(self, rows: IntArray, plants: Sequence[Plant]) -> None:
+        """Alter the machines whose plant changes."""
+        changed = [k for k, row in enumerate(rows.tolist()) if self._plants[row] != plants[k]]
+        if changed:
+            self.engine.alter(rows[changed], [plants[k] for k in changed])
+        for k in changed:
+            self._plants[rows[k]] = plants[k]
 
     def show_goal(self, markers: FloatArray) -> None:
-        """Move the goal markers to ``markers`` (k, 3) m, world."""
-        self.engine.show_goal([(x, y, z) for x, y, z in markers.tolist()])
+        """Move the goal markers of the first robot to ``markers`` (k, 3) m, world."""
+        self.engine.show_goal(markers)
 
-    def move(self, command: ArrayLike, vacuum: bool = False, noise: Vector = _ZERO) -> State:
-        """Command point P to ``command`` and run one control period.
-
-        The motors follow a quadratic B-spline through the commands: it lags the commands by half a
-        period, stays in their convex hull, and keeps the accelerations finite. It is a curve of
-        point P, not of the joints: near a singularity, a straight line between two postures would
-        wander by centimetres.
+    def move(
+        self, commands: FloatArray, vacuum: BoolArray, noise: FloatArray | None = None
+    ) -> None:
+        """Command point P and run one control period.
 
         Args:
-            command: (3,) m, machine's frame; inside the region (the caller projects).
-            vacuum: Whether the cup sucks.
-            noise: Of the encoders' reading at the end, rad.
+            commands: (n, 3) m, machine's frame; the caller projects them into the region.
+            vacuum: (n,) whether the cups suck.
+            noise: (n, 3) rad, of the encoders' reading at the end; None for none.
 
         Raises:
-            InputError: If the command has the wrong shape or is not finite.
-            UnreachableError: If the command is out of reach; nothing has moved then.
-            JointLimitError: If a motor would be beyond a stop there; nothing has moved then.
-            ModeChangeError: If the mechanism has left its assembly or working mode before.
+            UnreachableError: If a command is out of reach; nothing has moved then.
+            JointLimitError: If a motor would be beyond a stop; nothing has moved then.
             ClosureError: If a loop opened.
         """
-        if self._mode_left is not None:
-            raise ModeChangeError(self._mode_left)
-        before, last = self._commands
-        new = vector("command", command)
-        # The spline may end before the command does.
-        a, b, c = map(sub, self.machine.inverse(new), self.plant.encoder_bias)
-        self.machine.require_within_stops((a, b, c))
-        followed = self._references(before, last, new)
-        self._commands = (last, new)
-        self.engine.advance(followed, vacuum)
-        self._noise = (self._noise[1], noise)
-        return self.read(moved=True)
-
-    def _references(self, before: Vector, last: Vector, new: Vector) -> list[Reference]:
-        """Where the motors shall be along the spline through three commands (m)."""
-        inverse, bias = self.machine.inverse, self.plant.encoder_bias
-        (a, b, c), (d, e, f), (x, y, z) = before, last, new
-        path = [
-            inverse((u * a + v * d + w * x, u * b + v * e + w * y, u * c + v * f + w * z))
-            for u, v, w in self._spline
-        ]
-        if self.drive is None:
-            found = list(map(Reference, path))
-        else:
-            start = inverse(((a + d) / 2, (b + e) / 2, (c + f) / 2))
-            found = references(self.machine, self.drive, start, path, CONTROL_PERIOD / len(path))
-        if bias != _ZERO:
-            b1, b2, b3 = bias
-            found = [
-                Reference((one - b1, two - b2, three - b3), rates, torque)
-                for (one, two, three), rates, torque in found
-            ]
-        return found
+        if not self.machine.region.contains(commands).all():
+            self.machine.reach(commands)  # the spline ends before the command does
+        path = Path(
+            self.machine,
+            np.concatenate([self._commands, commands[:, None]], axis=1),
+            self._weights,
+            self._bias if self._disturbed else None,
+        )
+        self.engine.advance(path, vacuum)
+        self._commands[:, 0] = self._commands[:, 1]
+        self._commands[:, 1] = commands
+        if self._disturbed or noise is not None:
+            self._noise[:, 0] = self._noise[:, 1]
+            self._noise[:, 1] = 0.0 if noise is None else noise
+            self._disturbed = bool(self._bias.any() or self._noise.any())
+        self._read(slice(None))
 
     # -- reading ----------------------------------------------------------------------------
 
-    def read(self, moved: bool = False) -> State:
-        """Read the encoders, what follows from them, and the truth.
+    @property
+    def commands(self) -> FloatArray:
+        """Where point P is commanded to go, (n, 3) m, machine's frame."""
+        return self._commands[:, 1]
 
-        Args:
-            moved: Whether a time step has been run since everything was put in its place.
+    @property
+    def mode_left(self) -> IntArray:
+        """(n,) mode that each machine left in this episode: 0 none, 1 assembly, 2 working."""
+        return self._mode_left
+
+    def _read(self, rows: IntArray | slice) -> None:
+        """Read the engine, and compute the forward kinematics of some robots.
 
         Raises:
             ClosureError: If a loop is open.
         """
-        true_theta, true_rates, torque = self.engine.motors()
-        gap, platform, tilt = self.engine.truth()
-        if not gap <= CLOSURE_LIMIT:  # so that a NaN fails too
-            raise ClosureError(gap, CLOSURE_LIMIT)
-        if moved:
-            self._torque = torque
-        theta, rates = self._disturb(true_theta, true_rates)
-        position, jacobian, conditioning = self._evaluate(theta)
-        mount, hold = self.machine.mount, self.engine.hold()
-        if self._mode_left is None:
-            self._mode_left = self._true_machine.mode_left(true_theta, mount.swap(platform))
-        r1, r2, r3 = rates
-        x, y, z = [a * r1 + b * r2 + c * r3 for a, b, c in jacobian]
-        swap = mount.swap
-        place, speed, command = swap(position), mount.turn((x, y, z)), swap(self._commands[1])
-        # All in one array cost half of what an array of each does.
-        numbers = [*theta, *rates, *self._torque, *place, *speed, *platform, *command]
-        for (where, turn), (velocity, spin) in self.engine.objects():
-            numbers += (*where, *turn, *rotate(turn, _UP), *velocity, *spin)
-        array = np.array(numbers)
-        objects = array[21:].reshape(-1, 16)
+        now = self._readout = self.engine.read()
+        gap = now.gap.max()
+        if not gap <= CLOSURE_LIMIT:  # so written, a NaN fails too
+            raise ClosureError(float(gap), CLOSURE_LIMIT)
+        if now.mode_left.any():
+            self._mode_left = np.where(self._mode_left, self._mode_left, now.mode_left)
+        theta = now.theta[rows]
+        if self._disturbed:
+            theta = theta + self._bias[rows] + self._noise[rows, 1]
+        position, jacobian, conditioning, _ = self.machine.evaluate(theta)
+        lost = np.isnan(conditioning)
+        if lost.any():
+            # Disturbed encoders may report joint positions at which no assembly exists. The last
+            # reading that made sense stays, as a controller can do no better.
+            position[lost], jacobian[lost] = self._position[rows][lost], self._jacobian[rows][lost]
+            conditioning[lost] = self._conditioning[rows][lost]
+        self._position[rows], self._jacobian[rows] = position, jacobian
+        self._conditioning[rows] = conditioning
+
+    def state(self) -> State:
+        """Return the state of all robots after the last move or reset."""
+        now, (turn, origin) = self._readout, self._frame
+        theta, rates = now.theta, now.theta_dot
+        if self._disturbed:
+            before, last = self._noise[:, 0], self._noise[:, 1]
+            theta = theta + self._bias + last
+            rates = rates + (last - before) / CONTROL_PERIOD
+        j, (a, b, c) = self._jacobian, rates.T[..., None]
+        velocity = j[:, :, 0] * a + j[:, :, 1] * b + j[:, :, 2] * c
         return State.of(
             {
-                "theta": array[0:3],
-                "theta_dot": array[3:6],
-                "torque": array[6:9],
-                "fk_position": array[9:12],
-                "fk_velocity": array[12:15],
-                "conditioning": conditioning,
-                "platform_position": array[15:18],
-                "platform_tilt": tilt,
-                "closure_error": gap,
-                "assembly_mode_changed": self._mode_left == "assembly",
-                "working_mode_changed": self._mode_left == "working",
-                "command": array[18:21],
-                "held": hold.which,
-                "vacuum": hold.vacuum,
-                "object_position": objects[:, 0:3],
-                "object_quaternion": objects[:, 3:7],
-                "object_axis": objects[:, 7:10],
-                "object_velocity": objects[:, 10:13],
-                "object_angular_velocity": objects[:, 13:16],
+                "theta": theta,
+                "theta_dot": rates,
+                "torque": now.torque,
+                "fk_position": self._position * turn + origin,
+                "fk_velocity": velocity * turn,
+                "conditioning": self._conditioning.copy(),
+                "platform_position": now.position,
+                "platform_tilt": now.tilt,
+                "closure_error": now.gap,
+                "assembly_mode_changed": self._mode_left == 1,
+                "working_mode_changed": self._mode_left == 2,
+                "command": self._commands[:, 1] * turn + origin,
+                "held": now.held,
+                "vacuum": now.vacuum,
+                "object_position": now.object_position,
+                "object_quaternion": now.object_quaternion,
+                "object_axis": _upward(now.object_quaternion),
+                "object_velocity": now.object_velocity,
+                "object_angular_velocity": now.object_angular_velocity,
             }
         )
 
-    def _disturb(self, theta: Vector, rates: Vector) -> tuple[Vector, Vector]:
-        """What the encoders report: with their bias and noise, and rates by differences."""
-        bias, (before, now) = self.plant.encoder_bias, self._noise
-        if bias == before == now == _ZERO:
-            return theta, rates
-        return (
-            vector("theta", np.array(theta) + bias + now),
-            vector("theta_dot", rates + np.subtract(now, before) / CONTROL_PERIOD),
-        )
-
-    def _evaluate(self, theta: Vector) -> Reading:
-        """What follows from the encoders; the last reading that made sense where this one does not.
-
-        That is what a controller can do whose disturbed encoders report angles at which no assembly
-        exists, as happens near the edges of the workspace.
-        """
-        try:
-            reading = self.machine.evaluate(theta)
-        except (UnreachableError, SingularityError):
-            reading = self._reading
-        self._reading = reading
-        return reading
-
-    # -- state, pictures, end -----------------------------------------------------------------
+    # -- state, pictures, end ---------------------------------------------------------------
 
     def save(self) -> Snapshot:
-        """Take down everything that the physics depend on, and go on from exactly that.
+        """Return everything that the physics depend on, and continue from exactly that.
 
-        Engines keep memories that cannot be read out, such as the impulses of old contacts. So that
-        what follows here and what follows a :meth:`restore` are equal to the last bit, they are
-        dropped here too.
+        Engines keep what cannot be read, such as impulses of old contacts. It is cleared here as
+        it is by :meth:`restore`, so that continuing and restoring give equal results.
         """
-        snapshot = Snapshot(
-            plant=self.plant,
-            engine=self.engine.save(),
-            torque=self._torque,
-            commands=self._commands,
-            noise=self._noise,
-            reading=self._reading,
-            mode_left=self._mode_left,
-        )
+        columns = {name: getattr(self, f"_{name}").copy() for name in _COLUMNS}
+        snapshot = Snapshot(tuple(self._plants), columns, self.engine.save())
         self.restore(snapshot)
         return snapshot
 
-    def restore(self, snapshot: Snapshot) -> State:
-        """Go back to a moment that :meth:`save` took down, of this or an equal simulation."""
-        self._become(snapshot.plant, self._true(snapshot.plant))
+    def restore(self, snapshot: Snapshot) -> None:
+        """Continue from a snapshot of this simulation or of an equal one."""
+        self._become(np.arange(self.count), snapshot.plants)
         self.engine.restore(snapshot.engine)
-        self._torque = snapshot.torque
-        self._commands, self._noise = snapshot.commands, snapshot.noise
-        self._reading, self._mode_left = snapshot.reading, snapshot.mode_left
-        return self.read()
+        for name, values in snapshot.columns.items():
+            setattr(self, f"_{name}", values.copy())
+        self._disturbed = bool(self._bias.any() or self._noise.any())
+        self._readout = self.engine.read()
 
     def render(self, width: int, height: int) -> NDArray[np.uint8]:
-        """Draw the scene as (height, width, 3) RGB."""
+        """Draw the first robot and its scene as (height, width, 3) RGB."""
         return self.engine.picture(width, height)
 
     def close(self) -> None:
@@ -356,7 +305,10 @@ class Simulation:
         self.engine.close()
 
 
-def spline_weights(substeps: int) -> FloatArray:
-    """(substeps, 3) weights of the last three commands along the quadratic B-spline."""
-    s = np.arange(1, substeps + 1) / substeps
-    return np.stack([(1 - s) ** 2, 1 + 2 * s - 2 * s**2, s**2], axis=1) / 2
+def _upward(quaternion: FloatArray) -> FloatArray:
+    """Return the own z axes (..., 3) of orientations (..., 4)."""
+    x, y, z, w = quaternion[..., 0], quaternion[..., 1], quaternion[..., 2], quaternion[..., 3]
+    axis = np.empty((*quaternion.shape[:-1], 3))
+    axis[..., 0], axis[..., 1] = 2 * (x * z + w * y), 2 * (y * z - w * x)
+    axis[..., 2] = 1 - 2 * (x * x + y * y)
+    return axis

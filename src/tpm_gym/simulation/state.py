@@ -1,4 +1,4 @@
-"""Plain data that passes between the simulation and the tasks."""
+"""Plain data that passes between engines, simulation and tasks."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from tpm_gym.errors import ConfigurationError
 __all__ = ["CONTROL_PERIOD", "Block", "Scene", "State"]
 
 CONTROL_PERIOD = 1 / 25
-"""Time between two commands of an environment, s."""
+"""Control period: time between two commands of an environment, s."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """An object of a task: a square block.
+    """A square block, the object of a task.
 
-    Square, not round: between boxes an engine finds all four corners of a contact at once, while a
-    cylinder rests on one to three points and is pressed through the table where they miss.
+    Blocks are square because engines find all four corners of a contact between boxes at once. A
+    cylinder rests on one to three points and is pressed through the table beside them.
 
     Attributes:
-        name: What ``reset(options=...)`` calls it; unique in its scene.
+        name: Name in ``reset(options=...)``; unique in its scene.
         width: Edge of the square, m.
         height: m.
         mass: kg.
@@ -43,7 +43,7 @@ class Block:
     colour: tuple[float, float, float, float] = (0.83, 0.18, 0.33, 1.0)
 
     def __post_init__(self) -> None:
-        """Reject blocks that cannot be."""
+        """Reject impossible values."""
         if not isinstance(self.name, str) or not self.name:
             raise ConfigurationError("name", self.name, "a name")
         for name in ("width", "height", "mass", "friction"):
@@ -59,7 +59,7 @@ class Block:
 
     @property
     def radius(self) -> float:
-        """From the centre to the corners, m."""
+        """Distance of the corners from the centre, m."""
         return math.hypot(self.width, self.width, self.height) / 2
 
     @property
@@ -71,12 +71,12 @@ class Block:
 
 @dataclass(frozen=True)
 class Scene:
-    """What a task needs the simulation to hold besides the robot and the table.
+    """Objects and goal markers that a task adds to robot and table.
 
     Attributes:
         objects: Any number of blocks.
-        markers: How many points a goal shows as translucent spheres.
-        marker_radius: Their radius, m.
+        markers: Number of points that a goal shows, as translucent spheres.
+        marker_radius: Radius of the spheres, m.
 
     Raises:
         ConfigurationError: If a value cannot be.
@@ -87,7 +87,7 @@ class Scene:
     marker_radius: float = 0.010
 
     def __post_init__(self) -> None:
-        """Reject scenes that cannot be."""
+        """Reject impossible values."""
         # By their names reset's options tell them apart.
         blocks = isinstance(self.objects, tuple) and all(isinstance(b, Block) for b in self.objects)
         if not blocks or len({"goal", *(b.name for b in self.objects)}) <= len(self.objects):
@@ -100,30 +100,32 @@ class Scene:
 
 @dataclass(frozen=True)
 class State:
-    """What a simulation reports at the end of a control step; leading batch axes are allowed.
+    """State of n robots at the end of a control step; world frame.
+
+    Every attribute has a leading axis of n rows, one for each robot. :meth:`take` gives some
+    robots, or one without that axis.
 
     Attributes:
-        theta: (..., 3) rad (m for a slide), the encoders (with their errors, if simulated).
-        theta_dot: (..., 3) rad/s, the encoders' rates.
-        torque: (..., 3) N m, what the motors applied in the last time step; zero after a reset.
-        fk_position: (..., 3) m, world: point P by forward kinematics of ``theta``.
-        fk_velocity: (..., 3) m/s, world: J(theta) theta_dot.
-        conditioning: (...,) 1/cond(J) at ``theta``, in [0, 1].
-        platform_position: (..., 3) m, world: point P of the simulated platform, the truth that a
-            real robot does not know. Never part of an observation.
-        platform_tilt: (...,) rad, rotation of the simulated platform, zero by design.
-        closure_error: (...,) m, the largest gap of the simulated loops.
-        assembly_mode_changed: (...,) whether the mechanism has passed a parallel singularity in
-            this episode.
-        working_mode_changed: (...,) the same for a serial one.
-        command: (..., 3) m, world: where point P is commanded to go.
-        held: (...,) index of the object that the vacuum cup holds; -1 for none.
-        vacuum: (...,) Pa, how far the pressure in the cup is below the ambient's.
-        object_position: (..., n, 3) m, world: centres of the scene's objects.
-        object_quaternion: (..., n, 4), their orientations in the world, (x, y, z, w).
-        object_axis: (..., n, 3) unit vectors, world: the objects' own z axes.
-        object_velocity: (..., n, 3) m/s, world.
-        object_angular_velocity: (..., n, 3) rad/s, world.
+        theta: (n, 3) rad (m for a slide), joint positions by the encoders, with their errors.
+        theta_dot: (n, 3) rad/s, joint velocities by the encoders.
+        torque: (n, 3) N m, torques of the motors in the last time step; zero after a reset.
+        fk_position: (n, 3) m, point P by forward kinematics of ``theta``.
+        fk_velocity: (n, 3) m/s, J(theta) theta_dot.
+        conditioning: (n,) 1/cond(J) at ``theta``, in [0, 1].
+        platform_position: (n, 3) m, point P of the simulated platform, which a real robot does not
+            know. Never part of an observation.
+        platform_tilt: (n,) rad, rotation of the simulated platform; zero by design.
+        closure_error: (n,) m, largest gap of the simulated loops.
+        assembly_mode_changed: (n,) whether the robot passed a parallel singularity in this episode.
+        working_mode_changed: (n,) whether the robot passed a serial singularity in this episode.
+        command: (n, 3) m, where point P is commanded to go.
+        held: (n,) index of the object in the vacuum cup; -1 for none.
+        vacuum: (n,) Pa, pressure in the cup below the ambient pressure.
+        object_position: (n, k, 3) m, centres of the scene's objects.
+        object_quaternion: (n, k, 4), their orientations (x, y, z, w).
+        object_axis: (n, k, 3) unit vectors, the objects' own z axes.
+        object_velocity: (n, k, 3) m/s.
+        object_angular_velocity: (n, k, 3) rad/s.
     """
 
     theta: FloatArray
@@ -131,15 +133,15 @@ class State:
     torque: FloatArray
     fk_position: FloatArray
     fk_velocity: FloatArray
-    conditioning: FloatArray | float
+    conditioning: FloatArray
     platform_position: FloatArray
-    platform_tilt: FloatArray | float
-    closure_error: FloatArray | float
-    assembly_mode_changed: BoolArray | bool
-    working_mode_changed: BoolArray | bool
+    platform_tilt: FloatArray
+    closure_error: FloatArray
+    assembly_mode_changed: BoolArray
+    working_mode_changed: BoolArray
     command: FloatArray
-    held: IntArray | int
-    vacuum: FloatArray | float
+    held: IntArray
+    vacuum: FloatArray
     object_position: FloatArray
     object_quaternion: FloatArray
     object_axis: FloatArray
@@ -148,15 +150,19 @@ class State:
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> State:
-        """One with exactly these attributes, in each control step: a tenth of the time."""
+        """Make a state of exactly these attributes; a tenth of the constructor's time."""
         # A frozen dataclass sets them one by one through object.__setattr__.
         state = object.__new__(cls)
         vars(state).update(values)
         return state
 
+    def take(self, rows: Any) -> State:
+        """Return the state of some robots, or with an integer the state of one, without n."""
+        return State.of({name: values[rows] for name, values in vars(self).items()})
+
     @property
-    def passed_singularity(self) -> BoolArray | bool:
-        """(...,) whether the mechanism has left one of its modes in this episode."""
+    def passed_singularity(self) -> BoolArray:
+        """(n,) whether the robot left one of its modes in this episode."""
         return self.assembly_mode_changed | self.working_mode_changed
 
 

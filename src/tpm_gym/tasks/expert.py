@@ -1,9 +1,9 @@
 """The scripted controller of all tasks, on closed-form kinematics.
 
-It sees the same observation as a policy does, follows the task's plan of commands for point P with
-trapezoidal speed, and turns each of them into an action of the environment's control, through the
-inverse kinematics where that is joints. Between two points of the safe region its plan stays in the
-safe region: y, which the conditioning follows, is changed along with x and z, never beyond both.
+It sees the observation that a policy sees. For each robot it follows the task's plan of commands
+for point P with trapezoidal speed, and converts each command into an action of the environment's
+control. Between two points of the safe region its plan stays in the safe region: y, on which the
+conditioning depends, changes along with x and z, never beyond both ends.
 """
 
 from __future__ import annotations
@@ -22,67 +22,86 @@ from tpm_gym.tasks.task import Task
 __all__ = ["Expert"]
 
 
-class Expert(Motion):
-    """Scripted policy for one environment.
+class Expert:
+    """Scripted policy for an environment, or for all environments of a vector.
 
-    Use it as ``expert.reset(observation)`` at the start of an episode, then
-    ``action = expert.act(observation)``.
+    Call :meth:`act` with each observation. It plans anew whenever an episode has begun.
 
     Args:
-        env: An environment of tpm_gym, wrapped or not. Its task, control and latency are taken, and
-            whether it has been reset; nothing else is used.
+        env: A :class:`~tpm_gym.TPMEnv`, wrapped or not, or a :class:`~tpm_gym.TPMVectorEnv`. Its
+            task, control, latency and count of episodes are used, and nothing else.
 
     Raises:
-        InputError: If the environment is none of tpm_gym's.
-        ConfigurationError: If its task has no plan, on :meth:`reset`.
+        InputError: If it is another environment.
+        ConfigurationError: If its task has no plan, on the first action.
     """
 
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
+    def __init__(self, env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]) -> None:
         """Take what is needed from the environment."""
         inner: Any = getattr(env, "unwrapped", None)
         if not isinstance(getattr(inner, "task", None), Task):
             raise InputError("env", env, "an environment of tpm_gym")
-        super().__init__(inner.machine, inner.control)
-        self._env = inner
+        self._env, self._alone = inner, isinstance(inner, gym.Env)
         self._task: Task = inner.task
-        self._latency: int = inner.randomisation.latency
-        self._plan: Iterator[Move] | None = None
-        self._move: Move | None = None
-        self._episode: int | None = None
+        self._control, self._latency = inner.control, inner.randomisation.latency
+        self._motions: dict[int, Motion] = {}
+        self._plans: dict[int, Iterator[Move]] = {}
+        self._moves: dict[int, Move | None] = {}
+        self._episodes = np.full(np.shape(np.atleast_1d(inner.episode)), -1)
 
     def reset(self, observation: dict[str, Any]) -> None:
-        """Plan anew for the episode that starts with ``observation``."""
-        self._episode = self._env.episode
-        self._under_way = [np.zeros(3)] * self._latency
+        """Plan anew for the episodes that ``observation`` belongs to."""
+        self._episodes[:] = -1
         self._look(observation)
-        self._plan, self._move = self._task.plan(self), None
 
     def act(self, observation: dict[str, Any]) -> NDArray[np.float32]:
-        """The next action, shape and range of the environment's action space.
+        """Return the next action, with shape and range of the environment's action space.
 
         Raises:
-            EpisodeError: If the expert was not reset for this episode of its environment, there is
-                none, or its plan has no moves.
-            ConfigurationError: If its plan needs a vacuum, or to see, what its task has not.
+            EpisodeError: If no episode is running, or a plan has no moves.
+            ConfigurationError: If a plan needs a vacuum, or an entry, that the task lacks.
         """
         _ = self._env.state  # there has to be an episode
-        if self._plan is None or self._episode != self._env.episode:
-            raise EpisodeError("the expert has no plan for this episode; call its reset() first")
         self._look(observation)
-        self._move = move = next(self._plan, self._move)
-        if move is None:
-            raise EpisodeError(f"the plan of {type(self._task).__name__} has no moves")
-        action = np.zeros(self._task.action_size, dtype=np.float32)
-        action[:3] = self._control.action(self.machine.region.project(move.point), self.command)
+        count = len(self._episodes)
+        moves = [self._next(row) for row in range(count)]
+        machine = self._task.machine
+        wanted = machine.region.project(np.array([move.point for move in moves]))
+        current = np.array([self._motions[row].command for row in range(count)])
+        actions = np.zeros((count, self._task.action_size), dtype=np.float32)
+        actions[:, :3] = self._control.action(wanted, current)
+        on = np.array([move.vacuum for move in moves])
         if self._task.vacuum:
-            action[3] = 1.0 if move.vacuum else -1.0
-        elif move.vacuum:
+            actions[:, 3] = np.where(on, 1.0, -1.0)
+        elif on.any():
             valid = f"True: the plan of {type(self._task).__name__} switches it on"
             raise ConfigurationError("vacuum", self._task.vacuum, valid)
         if self._latency:
-            self._under_way = [*self._under_way[1:], action[:3]]
-        return action
+            for row, motion in self._motions.items():
+                motion.under_way = [*motion.under_way[1:], actions[row, :3].astype(np.float64)]
+        return actions[0] if self._alone else actions
 
     def _look(self, observation: dict[str, Any]) -> None:
-        self.seen = self._task.decode(observation["observation"])
-        self.goal = np.asarray(observation["desired_goal"], dtype=np.float64)
+        """Show each plan its robot, and begin the plans of new episodes."""
+        seen = self._task.decode(np.atleast_2d(observation["observation"]))
+        goals = np.atleast_2d(np.asarray(observation["desired_goal"], dtype=np.float64))
+        episodes = np.atleast_1d(self._env.episode)
+        for row in range(len(episodes)):
+            new = episodes[row] != self._episodes[row]
+            if new:
+                self._motions[row] = Motion(self._task.machine, self._control)
+                self._motions[row].under_way = [np.zeros(3)] * self._latency
+            motion = self._motions[row]
+            motion.seen = {name: values[row] for name, values in seen.items()}
+            motion.goal = goals[row]
+            if new:
+                self._plans[row], self._moves[row] = self._task.plan(motion), None
+                self._episodes[row] = episodes[row]
+
+    def _next(self, row: int) -> Move:
+        move = self._moves[row] = next(self._plans[row], self._moves[row])
+        if move is None:
+            raise EpisodeError(f"the plan of {type(self._task).__name__} has no moves")
+        if not isinstance(move, Move):
+            raise ConfigurationError("plan()", move, "an iterator of tpm_gym.tasks.Move")
+        return move

@@ -1,12 +1,11 @@
-"""What the plans of tasks are made of: what is seen, and ways for point P."""
+"""Building blocks of plans: what a plan sees of one robot, and ways for point P."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import ConfigurationError
@@ -22,11 +21,11 @@ RAMP = 3
 ROUNDING = 1e-5
 """Of a control step; more than the 1e-6 by which single precision is off."""
 SEAL_STEPS = 4
-"""Control steps for which to wait for the cup to seal before giving up."""
+"""Control steps to wait for the cup to seal before giving up."""
 
 
 def hanging(block: Block) -> FloatArray:
-    """From the centre of a block in the cup to point P, (3,) m."""
+    """Return the way (3,) m from the centre of a block in the cup to point P."""
     return np.array([0.0, 0.0, block.height / 2 + CUP.length])
 
 
@@ -38,12 +37,13 @@ class Move(NamedTuple):
 
 
 class Motion:
-    """What a plan sees, and the ways it can take, with trapezoidal speed.
+    """What a plan sees of its robot, and ways with trapezoidal speed.
 
     Attributes:
         machine: The machine that moves.
         seen: The observation in SI units, by entry, world frame.
         goal: The goal, m, world frame.
+        under_way: Actions (3,) that the environment's latency holds back, oldest first.
     """
 
     def __init__(self, machine: Machine, control: Control) -> None:
@@ -51,18 +51,18 @@ class Motion:
         self.machine, self._control = machine, control
         self.seen: dict[str, FloatArray] = {}
         self.goal: FloatArray = np.empty(0)
-        self._under_way: list[NDArray[Any]] = []  # actions that come late
+        self.under_way: list[FloatArray] = []
 
     @property
     def command(self) -> FloatArray:
         """Where P is commanded to be once the actions under way have arrived, machine's frame."""
         command = self.machine.mount.to_paper(self.seen["position"] + self.seen["command"])
-        for action in self._under_way:
-            command = self._control.command(action, command)
+        for action in self.under_way:
+            command = self._control.command(action[None], command[None])[0]
         return command
 
     def holding(self, name: str = "object") -> bool:
-        """Whether the cup holds the object of that name.
+        """Return whether the cup holds the object of that name.
 
         Raises:
             ConfigurationError: If the task does not observe it.
@@ -71,19 +71,19 @@ class Motion:
 
     def _see(self, entry: str) -> FloatArray:
         if entry not in self.seen:
-            valid = f"one with {entry!r}; add object_entries(i) of that object"
+            valid = f"entries with {entry!r}; add object_entries(i) of that object"
             raise ConfigurationError("observed()", list(self.seen), valid)
         return self.seen[entry]
 
     def go(
         self, stops: list[FloatArray], vacuum: bool, while_holding: str | None = None
     ) -> Iterator[Move]:
-        """Straight lines through ``stops`` (machine's frame), from rest to rest.
+        """Move in straight lines through ``stops`` (machine's frame), from rest to rest.
 
         Args:
             stops: Points (3,) m.
             vacuum: Whether the vacuum is on.
-            while_holding: Name of an object; where the cup loses it the way ends early.
+            while_holding: Name of an object; the way ends early where the cup loses it.
         """
         for stop in stops:
             start = self.command
@@ -106,15 +106,15 @@ class Motion:
             yield Move(self._above(block), True)
 
     def _above(self, block: Block, clearance: float = 0.0) -> FloatArray:
-        """Point P, machine's frame, with the lip over the top of a block where it stands now."""
+        """Return point P, machine's frame, with the lip over the top of a block as it stands."""
         place = self._see(f"{block.name}_position") + hanging(block)
         return self.machine.mount.to_paper(place + (0.0, 0.0, clearance))
 
     def _trapezoid(self, start: FloatArray, stop: FloatArray) -> FloatArray:
-        """Fractions of the way at the control steps from ``start`` to ``stop``.
+        """Return fractions of the way at the control steps from ``start`` to ``stop``.
 
-        Speed rises over RAMP steps, holds, and falls; neither P nor a joint that is controlled
-        exceeds its limit. What observation rounds off (float32) takes no step more.
+        Speed rises over RAMP steps, holds, and falls. Neither P nor a controlled joint exceeds its
+        limit. Rounding of the observation (float32) takes no step more.
         """
         steps = self._control.steps(stop, start)
         count = int(np.ceil(steps - ROUNDING)) + RAMP - 1

@@ -1,4 +1,4 @@
-"""Pick and place: pick up a puck with the vacuum cup and bring it to the goal."""
+"""Pick and place: pick up a block with the vacuum cup and bring it to the goal."""
 
 from __future__ import annotations
 
@@ -17,72 +17,65 @@ from tpm_gym.tasks.task import Entry, Task
 __all__ = ["PickAndPlace"]
 
 CLEARANCE = 0.028
-"""Height over the puck, or over its place, at which the expert arrives and leaves, m.
+"""Height over the block, or over its place, at which the expert arrives and leaves, m.
 
-Not 0.030, of which a third is the tolerance: the last bit would tell whether a step is a success.
+It is no multiple of the tolerance: otherwise the last bit would decide about successes.
 """
 
 
 class PickAndPlace(Task):
-    """Pick up a puck with the vacuum cup and bring its centre to the goal.
+    """Pick up a block with the vacuum cup and bring its centre to the goal.
 
-    Half of the goals lie on the table, half in the air, away from where the puck starts; both where
-    the machine is safe.
+    Half of the goals lie on the table, half in the air, away from the start of the block. Goals and
+    starts lie where the machine is safe.
     """
 
-    puck = Block()
-    scene = Scene(objects=(puck,))
+    block = Block()
+    scene = Scene(objects=(block,))
     vacuum = True
     samplings = ("sampled", "tempting")
 
     def sample(
-        self, rng: np.random.Generator, chosen: Mapping[str, FloatArray]
-    ) -> dict[str, FloatArray]:
-        """See the base class."""
-        # Not self's: that of a subclass may ask this.
-        return sampling.first_of(PickAndPlace.sample_each(self, [rng], chosen))
-
-    def sample_each(
         self, rngs: Sequence[np.random.Generator], chosen: Mapping[str, FloatArray]
     ) -> dict[str, FloatArray]:
         """See the base class."""
-        machine, offset, count = self.machine, hanging(self.puck), len(rngs)
+        machine, offset, starts = self.machine, hanging(self.block), dict(chosen)
         to_p, from_p = machine.mount.to_paper, machine.mount.to_world
-        (table, _), given = self._regions, sampling.repeated(chosen, count)
+        table, _ = self._regions
         if self.goals == "tempting":
-            pairs = [sampling.tempting(rng, machine, table, self._draw_region) for rng in rngs]
-            first, last = (from_p(points) - offset for points in zip(*pairs, strict=True))
-            return {"object": first, "goal": last, **given}
-        if "object" not in given:
-            given["object"] = from_p(machine.sample_each(rngs, [table] * count)) - offset
-        if "goal" not in given:
-            start = to_p(given["object"] + offset)[:, None]
+            pairs = sampling.tempting(rngs, machine, table, self._draw_region)
+            first, last = (from_p(points) - offset for points in pairs)
+            return {"object": first, "goal": last, **starts}
+        if "object" not in starts:
+            starts["object"] = from_p(machine.sample(rngs, [table] * len(rngs))) - offset
+        if "goal" not in starts:
+            begin = to_p(starts["object"] + offset)[:, None]
             regions = [self._draw_region(rng) for rng in rngs]
-            given["goal"] = from_p(sampling.apart_from_each(start, rngs, machine, regions)) - offset
-        return given
+            starts["goal"] = from_p(sampling.apart_from(begin, rngs, machine, regions)) - offset
+        return starts
 
     def _draw_region(self, rng: np.random.Generator) -> Region:
-        """Where P goes with the puck: half on the table, half in the air."""
+        """Draw where P goes with the block: half on the table, half in the air."""
         table, air = self._regions
         return table if rng.random() < 0.5 else air
 
     @cached_property
     def _regions(self) -> tuple[Region, Region]:
-        """Of P with the puck in the cup: on the table, in the air."""
-        table = self.on_table(self.puck)
+        """Regions of P with the block in the cup: on the table, in the air."""
+        table = self.on_table(self.block)
         x, y, level = table.high
         return table, Region(self.machine.goal_region.low, (x, y, level - sampling.APART))
 
     def observed(self) -> tuple[Entry, ...]:
-        """The robot, then the puck."""
+        """Return the entries of the robot, then those of the block."""
         return (*self.robot_entries(), *self.object_entries())
 
     def achieved(self, state: State) -> FloatArray:
-        """Centre of the puck."""
-        return state.object_position[..., 0, :]
+        """Return the centre of the block."""
+        return state.object_position[:, 0]
 
     def shaping(self, state: State) -> dict[str, FloatArray]:
-        """Dense only: minus the distance from the cup to the puck, half as dear as the goal."""
+        """Return minus half the distance from cup to block, for a dense reward only."""
         if self.reward == "sparse":
             return {}
         return {"approach": 0.5 * rewards.dense(rewards.distance(self.lip(state), self.top(state)))}
@@ -90,22 +83,22 @@ class PickAndPlace(Task):
     # -- the expert -------------------------------------------------------------------------------
 
     def plan(self, motion: Motion) -> Iterator[Move]:
-        """Come down on the puck, carry it, let go on the table or hold it in the air."""
+        """Come down on the block, carry it, release it on the table or hold it in the air."""
         to_paper = motion.machine.mount.to_paper
         up = np.array([0.0, 0.0, -CLEARANCE])  # paper z points down
         while True:
-            yield from motion.pick(self.puck, CLEARANCE)
+            yield from motion.pick(self.block, CLEARANCE)
             if not motion.holding():
                 continue
-            # Where the cup sits on the puck is where it took it, not the puck's middle.
+            # The cup sits where it took the block, not on the block's middle.
             grip = motion.seen["position"] - motion.seen["object_position"]
             place = to_paper(motion.goal + grip)
-            on_table = bool(motion.goal[2] < self.puck.height / 2 + 0.005)
+            on_table = bool(motion.goal[2] < self.block.height / 2 + 0.005)
             stops = [motion.command + up, place + up, place] if on_table else [place]
             if not on_table:
                 # Off the table first, then straight on.
                 stops.insert(0, motion.command + up / 2)
-            yield from motion.go(stops, vacuum=True, while_holding=self.puck.name)
+            yield from motion.go(stops, vacuum=True, while_holding=self.block.name)
             if motion.holding():
                 break
         yield from self._finish(motion, place, place + up, release=on_table)
@@ -113,7 +106,7 @@ class PickAndPlace(Task):
     def _finish(
         self, motion: Motion, place: FloatArray, above: FloatArray, release: bool
     ) -> Iterator[Move]:
-        """Let go and move away, or hold the puck in the air."""
+        """Release the block and move away, or hold it in the air."""
         for _ in range(2):  # the platform lags its command
             yield Move(place, True)
         if release:

@@ -24,32 +24,24 @@ class Reach(Task):
     samplings = ("sampled", "tempting")
 
     def sample(
-        self, rng: np.random.Generator, chosen: Mapping[str, FloatArray]
-    ) -> dict[str, FloatArray]:
-        """See the base class."""
-        # Not self's: that of a subclass may ask this.
-        return sampling.first_of(Reach.sample_each(self, [rng], chosen))
-
-    def sample_each(
         self, rngs: Sequence[np.random.Generator], chosen: Mapping[str, FloatArray]
     ) -> dict[str, FloatArray]:
         """See the base class."""
         machine, home, region = self.machine, self.machine.home, self.machine.goal_region
         if "goal" in chosen:
-            return sampling.repeated(chosen, len(rngs))
+            return dict(chosen)
         if self.goals == "tempting":
-            pairs = [sampling.tempting(rng, machine, home, lambda _: region) for rng in rngs]
-            goals = np.array([goal for _, goal in pairs])
+            _, goals = sampling.tempting(rngs, machine, home, lambda _: region)
         else:
-            goals = sampling.apart_from_each(home, rngs, machine, [region] * len(rngs))
+            goals = sampling.apart_from(home, rngs, machine, [region] * len(rngs))
         return {"goal": machine.mount.to_world(goals)}
 
     def achieved(self, state: State) -> FloatArray:
-        """Point P by forward kinematics of the encoders."""
+        """Return point P by forward kinematics of the encoders."""
         return state.fk_position
 
     def plan(self, motion: Motion) -> Iterator[Move]:
-        """Straight to the goal."""
+        """Move straight to the goal."""
         goal = motion.machine.mount.to_paper(motion.goal)
         yield from motion.go([goal], vacuum=False)
         yield Move(goal, False)

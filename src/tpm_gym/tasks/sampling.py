@@ -1,19 +1,19 @@
-"""Goals and starts of the tasks: safe ones, and tempting ones.
+"""Sampling of goals and starts: safe ones, and tempting ones.
 
-To reach a tempting goal carelessly, one passes too near to the singularity. In point P a straight
-line between two safe points stays safe (the safe set shows no dent; a test draws pairs), so with
+Who reaches a tempting goal carelessly passes too near to the singularity. Between two safe points,
+point P stays safe on a straight line (the safe set has no dent; a test draws pairs). So with
 Cartesian actions the temptation lies at the ends: the goal, and an object's start, lie just within
-the threshold, and nearly half of what counts as reaching the goal lies beyond it. With joint
-actions it also lies on the way: the straight line in the joint angles from the start to the goal
-leads through the unsafe region, often all the way. Both are asked for of every pair, so that all
-ids meet the same goals.
+the threshold, and nearly half of the sphere around the goal lies beyond it. With joint actions the
+temptation lies on the way too: the straight line in the joints from start to goal leads through the
+unsafe region, often all the way. Every pair has both, so that all ids meet the same goals.
 
-Everything here is about point P, in the machine's frame, m.
+Everything here is about point P, in the machine's frame, m. Every function takes one generator for
+each row, and a row draws from its own generator only.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Final
 
 import numpy as np
@@ -29,7 +29,6 @@ __all__ = [
     "APART",
     "BAND",
     "apart_from",
-    "apart_from_each",
     "line_in_joints",
     "tempting",
 ]
@@ -46,67 +45,62 @@ _FRACTIONS: Final = np.linspace(0.0, 1.0, 33)
 
 def apart_from(
     others: ArrayLike,
-    rng: np.random.Generator,
-    machine: Machine,
-    region: Region,
-    apart: float = APART,
-) -> FloatArray:
-    """A safe point (3,) of ``region`` at least ``apart`` (m) from all ``others`` (..., 3).
-
-    Raises:
-        ConfigurationError: If no draw was.
-    """
-    others = np.reshape(others, (-1, 3))
-    point: FloatArray = apart_from_each(others, [rng], machine, [region], apart)[0]
-    return point
-
-
-def apart_from_each(
-    others: ArrayLike,
     rngs: Sequence[np.random.Generator],
     machine: Machine,
     regions: Sequence[Region],
     apart: float = APART,
 ) -> FloatArray:
-    """The same for r generators and regions, others (k, 3) for all or (r, k, 3): (r, 3) m."""
-    points = machine.sample_each(rngs, regions)
+    """Draw safe points (r, 3) of regions at least ``apart`` (m) from others.
+
+    Args:
+        others: (k, 3) m for all rows, or (r, k, 3).
+        rngs: One for each row.
+        machine: Whose points are safe.
+        regions: One for each row.
+        apart: m.
+
+    Raises:
+        ConfigurationError: If no draw is far enough.
+    """
+    points = machine.sample(rngs, regions)
     for _ in range(_ATTEMPTS):
         near = rewards.distance(points[:, None], others) < apart
         rows = np.flatnonzero(near.any(axis=1)).tolist()
         if not rows:
             return points
-        points[rows] = machine.sample_each([rngs[k] for k in rows], [regions[k] for k in rows])
+        points[rows] = machine.sample([rngs[k] for k in rows], [regions[k] for k in rows])
     valid = f"a larger one: what is drawn lies {apart} m from the start, or from other objects"
     raise ConfigurationError("goal_region", regions[rows[0]], valid)
 
 
-def repeated(places: Mapping[str, FloatArray], count: int) -> dict[str, FloatArray]:
-    """Arrays (count, ...) of so many equal ones."""
-    return {name: np.tile(place, (count, 1)) for name, place in places.items()}
-
-
-def first_of(starts: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
-    """The first rows."""
-    return {name: rows[0] for name, rows in starts.items()}
-
-
 def tempting(
+    rngs: Sequence[np.random.Generator],
+    machine: Machine,
+    start: Region | Vector,
+    goal: Callable[[np.random.Generator], Region],
+) -> tuple[FloatArray, FloatArray]:
+    """Draw tempting pairs of starts and goals, (r, 3) each.
+
+    Args:
+        rngs: One for each row.
+        machine: The machine.
+        start: Region of the starts, or the start itself.
+        goal: Draws the region of a goal.
+
+    Raises:
+        ConfigurationError: If none was drawn: not every machine has some.
+    """
+    pairs = np.array([_tempting(rng, machine, start, goal) for rng in rngs])
+    return pairs[:, 0], pairs[:, 1]
+
+
+def _tempting(
     rng: np.random.Generator,
     machine: Machine,
     start: Region | Vector,
     goal: Callable[[np.random.Generator], Region],
 ) -> tuple[FloatArray, FloatArray]:
-    """A tempting pair of a start and a goal, (3,) each.
-
-    Args:
-        rng: Source of randomness.
-        machine: The machine.
-        start: Where the start lies, or the start itself.
-        goal: Draws the region of the goal.
-
-    Raises:
-        ConfigurationError: If none was drawn: not every machine has some.
-    """
+    """Draw one tempting pair, (3,) each."""
     for _ in range(_ATTEMPTS):
         goals = _at_the_threshold(rng, machine, goal(rng))  # (n, 3)
         starts = (
@@ -123,19 +117,17 @@ def tempting(
 
 
 def line_in_joints(machine: Machine, start: ArrayLike, end: ArrayLike) -> FloatArray:
-    """Conditioning (33, ...) along the straight line of the joints between points (..., 3) of P.
+    """Return the conditioning (33, ...) along straight lines of the joints between points (..., 3).
 
-    0 where they cannot be assembled.
+    It is 0 where the machine cannot be assembled.
     """
-    ends = np.asarray([start, end], dtype=np.float64)
-    flat = [machine.inverse((x, y, z)) for x, y, z in ends.reshape(-1, 3).tolist()]
-    first, last = np.array(flat).reshape(ends.shape)
+    first, last = machine.require_inverse(np.stack(np.broadcast_arrays(start, end)))
     fractions = _FRACTIONS.reshape(-1, *(1,) * first.ndim)
     return machine.conditioning(first + fractions * (last - first))
 
 
 def _at_the_threshold(rng: np.random.Generator, machine: Machine, region: Region) -> FloatArray:
-    """The points of a batch drawn from ``region`` that are safe, but only just, (n, 3)."""
+    """Draw points from ``region``, and return those that are only just safe, (n, 3)."""
     points = rng.uniform(region.low, region.high, (_BATCH, 3))
     conditioning, safe = machine.conditioning_at(points), machine.safe_conditioning
     chosen: FloatArray = points[(conditioning >= safe) & (conditioning < safe + BAND)]

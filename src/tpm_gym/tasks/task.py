@@ -1,10 +1,11 @@
-"""What a task is: the scene, what is sampled, observed, rewarded, called a success; its expert.
+"""Base class of tasks: scene, sampling, observation, reward, success and expert.
 
-A task sees only :class:`~tpm_gym.simulation.state.State`; every function of a state accepts any
-leading batch shape. Goals, positions and velocities are in the world frame, in metres and seconds.
+A task sees only :class:`~tpm_gym.simulation.state.State`, whose first axis is the robots; goals,
+positions and velocities are in the world frame, in metres and seconds.
 
-A new one is one file: derive from :class:`Task`, write :meth:`~Task.sample`, :meth:`~Task.achieved`
-and, for an expert, :meth:`~Task.plan`; then :func:`tpm_gym.register_task`.
+A new task is one file: derive from :class:`Task`, write :meth:`~Task.sample`,
+:meth:`~Task.achieved` and, for an expert, :meth:`~Task.plan`; then
+:func:`tpm_gym.register_task`.
 """
 
 from __future__ import annotations
@@ -20,7 +21,6 @@ from numpy.typing import ArrayLike
 
 from tpm_gym.arrays import BoolArray, FloatArray, finite
 from tpm_gym.errors import ConfigurationError, ResetOptionError, UnreachableError
-from tpm_gym.kinematics.namespaces import Numbers
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
@@ -43,10 +43,10 @@ class Entry:
     Attributes:
         name: Its name.
         unit: Unit of the value before scaling.
-        meaning: What it is and where it comes from.
-        centre: Subtracted.
-        scale: Divided by.
-        source: How it is read from a state.
+        meaning: Description, with the sensor.
+        centre: Value that is stored as 0.
+        scale: Difference that is stored as 1.
+        source: Function that reads the values (n, k) from a state.
     """
 
     name: str
@@ -58,26 +58,26 @@ class Entry:
 
 
 class Task(ABC):
-    """Base of all tasks: the robot's own observation, the reward, success by distance.
+    """Base class of tasks: observation of the robot, reward, and success by distance.
 
     Args:
-        machine: What the task is done with.
+        machine: Machine that performs the task.
         reward: ``"sparse"`` (0 where the goal is achieved, else -1) or ``"dense"`` (minus the
             distance in units of 0.1 m).
-        goals: How goals and starts are sampled: one of :attr:`samplings`.
+        goals: Name of the sampling of goals and starts, one of :attr:`samplings`.
         penalty_weight: Weight of the singularity penalty; 0 switches it off.
 
     Attributes:
-        scene: What the simulation must hold.
+        scene: Objects and goal markers.
         vacuum: Whether actions have a fourth entry, which switches the vacuum.
-        goal_size: Length of a goal; three for each point that has to be somewhere: those of the
-            scene's objects in its order, or P.
+        goal_size: Length of a goal: three for each point, those of the scene's objects in its
+            order, or P.
         tolerance: Distance below which a goal is achieved, m.
-        samplings: What ``goals`` may be.
-        entries: What the observation vector consists of, in order.
+        samplings: Values of ``goals``.
+        entries: Entries of the observation vector, in order.
 
     Raises:
-        ConfigurationError: If an option is none of those.
+        ConfigurationError: If an option is out of range.
     """
 
     scene: ClassVar[Scene] = Scene()
@@ -111,7 +111,6 @@ class Task(ABC):
             raise ConfigurationError("markers", self.scene.markers, valid)
         self.machine, self.reward, self.goals = machine, reward, goals
         self._within = self._not_lost()
-        self._bounds = [corners.tolist() for corners in self._within]
         self._robot = [("the robot at home", *box) for box in machine.occupied(machine.home)]
         self._set_entries()
 
@@ -121,11 +120,11 @@ class Task(ABC):
         self._scale = np.concatenate([entry.scale for entry in self.entries])
 
     def __getstate__(self) -> dict[str, Any]:
-        """Entries hold functions, which cannot be pickled; they follow from the rest."""
+        """Leave the entries out: they hold functions, which cannot be pickled."""
         return {name: value for name, value in vars(self).items() if name != "entries"}
 
     def __setstate__(self, values: dict[str, Any]) -> None:
-        """Take all but the entries from another task, and make those anew."""
+        """Take everything from another task, and make the entries anew."""
         vars(self).update(values)
         self._set_entries()
 
@@ -133,46 +132,26 @@ class Task(ABC):
 
     @abstractmethod
     def sample(
-        self, rng: np.random.Generator, chosen: Mapping[str, FloatArray]
-    ) -> dict[str, FloatArray]:
-        """Where an episode starts and what it aims at.
-
-        Args:
-            rng: Source of randomness.
-            chosen: What the user has chosen of it, within reach; to be taken as it is. What is
-                sampled beside it keeps clear of it.
-
-        Returns:
-            Centre (3,) m of each of the scene's objects by name, and ``"goal"`` (goal_size,) m.
-        """
-
-    def sample_each(
         self, rngs: Sequence[np.random.Generator], chosen: Mapping[str, FloatArray]
     ) -> dict[str, FloatArray]:
-        """The same for r episodes, of a generator each: arrays (r, ...).
+        """Draw where r episodes start and what they aim at.
 
-        One by one; who writes it for many at a time draws what :meth:`sample` would.
+        Args:
+            rngs: A generator for each episode. An episode draws from its own generator only, so
+                that it has the same numbers alone and among thousands.
+            chosen: Entries (r, ...) that the user has chosen, within reach. They are returned as
+                they are; what is sampled beside them keeps clear of them.
+
+        Returns:
+            Centres (r, 3) m of the scene's objects by name, and ``"goal"`` (r, goal_size) m.
         """
-        drawn, sizes = [self.sample(rng, chosen) for rng in rngs], self._sizes
-        for start in drawn:
-            if start.keys() != sizes.keys():
-                raise ConfigurationError("sample()", list(start), f"the keys {', '.join(sizes)}")
-            for name, size in sizes.items():
-                finite(f"sample()[{name!r}]", start[name], (size,), ConfigurationError)
-        return {name: np.array([start[name] for start in drawn]) for name in sizes}
-
-    def __init_subclass__(cls, **options: Any) -> None:
-        """Ask one by one whoever writes :meth:`sample` only."""
-        super().__init_subclass__(**options)
-        if "sample" in vars(cls) and "sample_each" not in vars(cls):
-            cls.sample_each = Task.sample_each  # type: ignore[method-assign]
 
     @abstractmethod
     def achieved(self, state: State) -> FloatArray:
-        """What is compared with the goal, (..., goal_size) m."""
+        """Return what is compared with the goal, (n, goal_size) m."""
 
     def plan(self, motion: Motion) -> Iterator[Move]:
-        """The moves of the scripted controller, from what it sees; the last one is kept.
+        """Yield the moves of the scripted controller for one robot; the last move is kept.
 
         Raises:
             ConfigurationError: If the task has none.
@@ -180,96 +159,126 @@ class Task(ABC):
         raise ConfigurationError("expert", type(self).__name__, "a task that has a plan")
 
     def shaping(self, state: State) -> dict[str, FloatArray]:
-        """Weighted terms of the reward that do not depend on the goal: name -> (...,)."""
+        """Return weighted terms of the reward that do not depend on the goal: name -> (n,)."""
         del state
         return {}
 
     def observed(self) -> tuple[Entry, ...]:
-        """What the observation vector consists of; the robot's own entries come first."""
+        """Return the entries of the observation vector; the robot's own come first."""
         return self.robot_entries()
 
     # -- reward: here and nowhere else ------------------------------------------------------------
 
-    def reward_terms(self, state: State, gap: Numbers, penalty: Numbers) -> dict[str, Numbers]:
-        """The terms of the reward, weighted: name -> (...,); their sum is the reward.
+    def reward_terms(
+        self, state: State, gap: FloatArray, penalty: FloatArray
+    ) -> dict[str, FloatArray]:
+        """Return the weighted terms of the reward: name -> (n,); their sum is the reward.
 
         Args:
             state: The state that was reached.
-            gap: What :meth:`gap` says of the goal, (...,) m.
-            penalty: What :meth:`penalty` says of the state, (...,).
+            gap: (n,) m, distance to the goal by :meth:`gap`.
+            penalty: (n,), singularity penalty by :meth:`penalty`.
+        """
+        goal, singularity = self.goal_term(gap), -self.penalty_weight * penalty
+        return {"goal": goal, "singularity": singularity, **self.shaping(state)}
+
+    def goal_term(self, gap: FloatArray) -> FloatArray:
+        """Return the one term that depends on the goal, (...,), for a gap (...,) m."""
+        if self.reward == "sparse":
+            return rewards.sparse(gap, self.tolerance)
+        return rewards.dense(gap)
+
+    def penalty(self, state: State) -> FloatArray:
+        """Return the singularity penalty before weighting, (n,) in [0, 1]; 1 past a singularity."""
+        conditioning = state.conditioning * ~state.passed_singularity
+        return rewards.singularity_penalty(conditioning, self.machine.safe_conditioning)
+
+    def success(self, gap: FloatArray) -> BoolArray:
+        """Return whether the goal is achieved, (...,), for a gap (...,) m."""
+        near: BoolArray = gap < self.tolerance
+        return near
+
+    def gap(self, achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
+        """Return the distance to the goal, (...,) m, on which reward and success depend."""
+        return rewards.distance(achieved, desired)
+
+    def check(self) -> None:
+        """Compare the task's methods for two states at once with each state alone.
+
+        A method that reduces over the robots (``np.linalg.norm(x)`` without ``axis=-1``), or takes
+        rows for columns, gives wrong rewards in vector environments without an error.
 
         Raises:
-            ConfigurationError: If :meth:`shaping` gives a term the name of another.
+            ConfigurationError: If a method does not give what it has to, named by the method.
         """
-        terms = {"goal": self.goal_term(gap), "singularity": -self.penalty_weight * penalty}
-        own = self.shaping(state)
-        if not terms.keys().isdisjoint(own):
-            name = next(name for name in own if name in terms)
-            raise ConfigurationError("shaping", name, f"names other than {', '.join(terms)}")
-        return {**terms, **own}
+        both, goals = example_states(self.machine, self.scene), np.zeros((2, self.goal_size))
+        self._check_shapes(both)
+        for row in (0, 1):
+            alone, goal = both.take([row]), goals[row : row + 1]
+            for name, together, single in (
+                *_entries_of("achieved()", self.achieved(both), self.achieved(alone)),
+                *_entries_of("observe()", self.observe(both), self.observe(alone)),
+                *_entries_of("shaping()", self.shaping(both), self.shaping(alone)),
+                *_entries_of(
+                    "gap()", self.gap(self.achieved(both), goals), self.gap(self.achieved(alone), goal)
+                ),
+            ):
+                if np.shape(together)[:1] != (2,) or not _equal(together[row], single):
+                    valid = "values (n, ...) for n robots, each from its own row; reduce by axis=-1"
+                    raise ConfigurationError(name, f"of shape {np.shape(together)} for 2", valid)
 
-    def goal_term(self, gap: Numbers) -> Numbers:
-        """The one term that depends on the goal, (...,), for a gap (...,) m."""
-        return (
-            rewards.sparse(gap, self.tolerance) if self.reward == "sparse" else rewards.dense(gap)
-        )
-
-    def check(self, state: State) -> None:
-        """Refuse a task of which a method does not give what it has to, for one state.
-
-        Raises:
-            ConfigurationError: If it does not; named by the method.
-        """
+    def _check_shapes(self, state: State) -> None:
+        """Refuse methods whose results have the wrong shape or type, for two states."""
         achieved = np.shape(self.achieved(state))
-        if achieved != (self.goal_size,):
-            valid = f"of shape ({self.goal_size},), as goal_size says"
-            raise ConfigurationError("achieved()", f"of shape {achieved}", valid)
+        if achieved != (2, self.goal_size):
+            valid = f"of shape (n, {self.goal_size}), as goal_size says"
+            raise ConfigurationError("achieved()", f"of shape {achieved} for 2", valid)
         shaping: object = self.shaping(state)
         if not isinstance(shaping, Mapping):
             raise ConfigurationError("shaping()", shaping, "a dictionary of terms; {} for none")
-
-    def penalty(self, state: State) -> Numbers:
-        """Nearness to a singularity before weighting, (...,) in [0, 1]; 1 where one was passed."""
-        conditioning = state.conditioning * (1 - state.passed_singularity)
-        return rewards.singularity_penalty(conditioning, self.machine.safe_conditioning)
-
-    def success(self, gap: Numbers) -> BoolArray | bool:
-        """Whether the goal is achieved, (...,), for a gap (...,) m."""
-        near: BoolArray | bool = gap < self.tolerance
-        return near
-
-    def gap(self, achieved: ArrayLike, desired: ArrayLike) -> Numbers:
-        """How far from the goal, (...,) m: what reward and success are made of."""
-        return rewards.distance(achieved, desired)
+        for name, values in shaping.items():
+            if name in ("goal", "singularity"):
+                raise ConfigurationError("shaping()", name, "names other than goal, singularity")
+            finite(f"shaping()[{name!r}]", values, (2,), ConfigurationError)
 
     # -- start of an episode ----------------------------------------------------------------------
 
-    def start(self, rng: np.random.Generator, options: Any) -> dict[str, FloatArray]:
-        """What :meth:`sample` gives, with what ``reset(options=...)`` asks for.
+    def start(
+        self, rngs: Sequence[np.random.Generator], options: Any = None
+    ) -> dict[str, FloatArray]:
+        """Sample the starts of r episodes, with the choices of ``reset(options=...)``.
+
+        Returns:
+            As :meth:`sample`.
 
         Raises:
-            ResetOptionError: If an option is unknown, or not so many finite numbers, or an object
-                would start inside another or inside the robot.
+            ResetOptionError: If an option is unknown, is no such array of finite numbers, or would
+                put an object into another or into the robot.
             UnreachableError: If the robot cannot get to an object or the goal.
-            ConfigurationError: If what the task samples lacks something, has something else, or
-                puts an object into another or into the robot.
+            ConfigurationError: If :meth:`sample` does not return what it has to.
         """
-        return sampling.first_of(self.starts([rng], options))
-
-    def starts(self, rngs: Sequence[np.random.Generator], options: Any) -> dict[str, FloatArray]:
-        """The same for r episodes, of a generator each: arrays (r, ...)."""
         chosen = {} if options is None else self._chosen(options)
-        starts = self.sample_each(rngs, chosen)
+        given = {name: np.tile(value, (len(rngs), 1)) for name, value in chosen.items()}
+        starts = self.sample(rngs, dict(given))
+        if starts.keys() != self._sizes.keys():
+            valid = f"the keys {', '.join(self._sizes)}"
+            raise ConfigurationError("sample()", list(starts), valid)
+        for name, size in self._sizes.items():
+            label, shape = f"sample()[{name!r}]", (len(rngs), size)
+            starts[name] = finite(label, starts[name], shape, ConfigurationError)
+            if name in given and not np.array_equal(starts[name], given[name]):
+                valid = f"chosen[{name!r}], {given[name][0].tolist()}, as the user chose it"
+                raise ConfigurationError(label, starts[name][0].tolist(), valid)
         self._check_free(starts, chosen)
         return starts
 
     @property
     def _sizes(self) -> dict[str, int]:
-        """Of what is sampled, by name."""
+        """Lengths of what is sampled, by name."""
         return {block.name: 3 for block in self.scene.objects} | {"goal": self.goal_size}
 
     def _chosen(self, options: Any) -> dict[str, FloatArray]:
-        """What the user has chosen, by name."""
+        """Check what the user has chosen, and return it by name."""
         objects = self.scene.objects
         known: dict[str, tuple[int, tuple[Block | None, ...]]] = {
             **{block.name: (3, (block,)) for block in objects},
@@ -288,7 +297,7 @@ class Task(ABC):
     def _within_reach(
         self, name: str, value: Any, size: int, blocks: tuple[Block | None, ...]
     ) -> FloatArray:
-        """Points (size,) m that the user chose, of P or of blocks' centres in turn; a copy."""
+        """Return a copy of the points (size,) m that the user chose, for P or for blocks in turn."""
         points = np.array(finite(name, value, (size,), ResetOptionError))
         for point, block in zip(points.reshape(-1, 3), cycle(blocks), strict=False):
             low, high = self.reach_of(block)
@@ -299,7 +308,7 @@ class Task(ABC):
         return points
 
     def reach_of(self, block: Block | None) -> tuple[FloatArray, FloatArray]:
-        """Lowest and highest place (3,) m for point P, or for the centre of a block in the cup."""
+        """Return the lowest and highest place (3,) m of point P, or of a block in the cup."""
         region, mount = self.machine.region, self.machine.mount
         corners = np.stack([mount.to_world(corner) for corner in (region.low, region.high)])
         low, high = corners.min(axis=0), corners.max(axis=0)
@@ -310,7 +319,7 @@ class Task(ABC):
         return low, high
 
     def _place_of(self, block: Block) -> tuple[FloatArray, FloatArray]:
-        """The same, for a block that has to be in reach where it stands on the table."""
+        """Return :meth:`reach_of` for a block that has to be in reach where it stands on the table."""
         low, high = self.reach_of(block)
         if low[2] > block.height / 2 + 1e-9:
             least = f"at least {low[2] + block.height / 2:.4g} m high"
@@ -319,14 +328,14 @@ class Task(ABC):
         return low, high
 
     def on_table(self, block: Block) -> Region:
-        """Goals for point P, machine's frame, with a block in the cup that stands on the table."""
+        """Return the goals for point P, machine's frame, with a block in the cup on the table."""
         low, high = self.machine.goal_region.low, self.machine.goal_region.high
         touching = hanging(block) + (0.0, 0.0, block.height / 2)
         level = float(self.machine.mount.to_paper(touching)[2])
         return Region((*low[:2], level), (*high[:2], level))
 
     def _check_free(self, starts: Mapping[str, FloatArray], chosen: Collection[str]) -> None:
-        """Refuse objects that would start inside the robot at home, or inside another object."""
+        """Raise if objects would start inside the robot at home, or inside another object."""
         taken = [(block.name, *_boxes(starts[block.name], block)) for block in self.scene.objects]
         for name, low, high in taken:
             for other, least, most in self._robot + taken:
@@ -346,7 +355,7 @@ class Task(ABC):
     # -- observation ------------------------------------------------------------------------------
 
     def robot_entries(self) -> tuple[Entry, ...]:
-        """What encoders and forward kinematics tell."""
+        """Return the entries that encoders and forward kinematics measure."""
         centre, extent, speed, step = self._scales()
         return (
             Entry("position", "m", "P by forward kinematics of the encoders", centre, extent,
@@ -358,26 +367,26 @@ class Task(ABC):
         )  # fmt: skip
 
     def object_entries(self, index: int = 0) -> tuple[Entry, ...]:
-        """What a camera and the vacuum gauge tell of one of the scene's objects."""
+        """Return the entries that a camera and the vacuum gauge measure of one object."""
         centre, extent, speed, _ = self._scales()
         name = self.scene.objects[index].name
         near = tuple(min(0.1, max(0.02, half)) for half in extent)
         return (
             Entry(f"{name}_position", "m", f"centre of the {name}, from a camera", centre, extent,
-                  lambda s: s.object_position[..., index, :]),
+                  lambda s: s.object_position[:, index]),
             Entry(f"{name}_offset", "m", f"top of the {name} minus lip of the cup", _ZERO, near,
                   lambda s: self.top(s, index) - self.lip(s)),
             Entry(f"{name}_velocity", "m/s", f"velocity of the {name}, from a camera", _ZERO, speed,
-                  lambda s: s.object_velocity[..., index, :]),
+                  lambda s: s.object_velocity[:, index]),
             Entry(f"{name}_tilt", "-", f"x and y of the {name}'s axis", (0.0, 0.0), (1.0, 1.0),
-                  lambda s: s.object_axis[..., index, :2]),
+                  lambda s: s.object_axis[:, index, :2]),
             Entry(f"{name}_held", "-", f"share of the vacuum that holds the {name}, by a gauge",
                   (0.5,), (0.5,),
-                  lambda s: np.asarray((s.held == index) * (s.vacuum / CUP.vacuum))[..., None]),
+                  lambda s: ((s.held == index) * (s.vacuum / CUP.vacuum))[:, None]),
         )  # fmt: skip
 
     def _scales(self) -> tuple[Values, Values, Values, Values]:
-        """Centre and extent of the region (m, world), full speed (m/s), largest step (m)."""
+        """Return centre and extent of the region (m, world), full speed (m/s), largest step (m)."""
         region, mount, step = self.machine.region, self.machine.mount, self.machine.step_limit
         low, high = np.array(region.low), np.array(region.high)
         columns = (
@@ -389,23 +398,23 @@ class Task(ABC):
         return centre, extent, speed, step
 
     def lip(self, state: State) -> FloatArray:
-        """Centre of the cup's lip, pushed out, by forward kinematics, (..., 3) m."""
+        """Return the centre (n, 3) m of the cup's lip, pushed out, by forward kinematics."""
         lip: FloatArray = state.fk_position - _LIP
         return lip
 
     def top(self, state: State, index: int = 0) -> FloatArray:
-        """Centre of an object's top face, (..., 3) m."""
+        """Return the centre (n, 3) m of an object's top face."""
         half = self.scene.objects[index].height / 2
-        return state.object_position[..., index, :] + state.object_axis[..., index, :] * half
+        return state.object_position[:, index] + state.object_axis[:, index] * half
 
     def observe(self, state: State) -> FloatArray:
-        """The observation vector (..., n), each entry of order one."""
+        """Return the observation vectors (n, k), each entry of order one."""
         values = np.concatenate([entry.source(state) for entry in self.entries], axis=-1)
         scaled: FloatArray = (values - self._centre) / self._scale
         return scaled
 
     def decode(self, observation: ArrayLike) -> dict[str, FloatArray]:
-        """The inverse of :meth:`observe`: name -> (..., k) in SI units."""
+        """Invert :meth:`observe`: name -> (..., k) in SI units."""
         vector = np.asarray(observation, dtype=np.float64)
         result, start = {}, 0
         for entry in self.entries:
@@ -425,11 +434,11 @@ class Task(ABC):
         return 4 if self.vacuum else 3
 
     def markers(self, goal: FloatArray) -> FloatArray:
-        """The points (k, 3) m that show a goal (goal_size,)."""
+        """Return the points (k, 3) m that show a goal (goal_size,)."""
         return goal.reshape(-1, 3)
 
     def _not_lost(self) -> tuple[FloatArray, FloatArray]:
-        """Between what corners (n, 3) m the objects are not lost."""
+        """Return the corners (k, 3) m between which the objects are not lost."""
         low, high = np.empty((2, len(self.scene.objects), 3))
         for index, block in enumerate(self.scene.objects):
             least, most = self._place_of(block)
@@ -438,21 +447,50 @@ class Task(ABC):
         low[:, 2], high[:, 2] = 0.0, np.inf
         return low, high
 
-    def lost(self, state: State) -> BoolArray | bool:
-        """Whether an object is off the table or where the robot cannot get to, (...,)."""
+    def lost(self, state: State) -> BoolArray:
+        """Return whether an object is off the table or out of the robot's reach, (n,)."""
         if not self.scene.objects:
-            return np.zeros(state.object_position.shape[:-2], dtype=np.bool_)
-        # So written, what is nowhere (NaN) is lost.
-        if state.object_position.ndim == 2:  # of one robot: numpy's calls cost more than that
-            bounds = zip(state.object_position.tolist(), *self._bounds, strict=True)
-            return any(
-                not (a <= x <= d and b <= y <= e and c <= z <= f)
-                for (x, y, z), (a, b, c), (d, e, f) in bounds
-            )
+            return np.zeros(len(state.object_position), dtype=np.bool_)
         low, high = self._within
+        # So written, an object whose position is NaN is lost.
         within = (state.object_position >= low) & (state.object_position <= high)
-        lost: BoolArray = ~np.logical_and.reduce(within, axis=(-2, -1))
+        lost: BoolArray = ~within.all(axis=(1, 2))
         return lost
+
+
+def example_states(machine: Machine, scene: Scene) -> State:
+    """Return two different states that a machine could be in, with a scene's objects."""
+    rng, objects = np.random.default_rng(0), len(scene.objects)
+    low, high = (machine.mount.to_world(corner) for corner in (machine.region.low, machine.region.high))
+    inside = rng.uniform(np.minimum(low, high), np.maximum(low, high), (2, 3 + objects, 3))
+    turn = rng.normal(size=(2, objects, 4)) * (0.1, 0.1, 1.0, 1.0)
+    turn /= np.linalg.norm(turn, axis=2, keepdims=True)
+    x, y, z, w = np.moveaxis(turn, 2, 0)
+    axis = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=2)
+    never = np.zeros(2, dtype=np.bool_)
+    return State(
+        theta=rng.normal(size=(2, 3)), theta_dot=rng.normal(size=(2, 3)),
+        torque=rng.normal(size=(2, 3)), fk_position=inside[:, 0],
+        fk_velocity=rng.normal(size=(2, 3)), conditioning=rng.uniform(0.05, 0.2, 2),
+        platform_position=inside[:, 1], platform_tilt=rng.random(2), closure_error=rng.random(2),
+        assembly_mode_changed=never, working_mode_changed=never, command=inside[:, 2],
+        held=np.array([-1, 0]), vacuum=rng.uniform(0.0, CUP.vacuum, 2),
+        object_position=inside[:, 3:], object_quaternion=turn, object_axis=axis,
+        object_velocity=rng.normal(size=(2, objects, 3)),
+        object_angular_velocity=rng.normal(size=(2, objects, 3)),
+    )  # fmt: skip
+
+
+def _entries_of(name: str, together: Any, single: Any) -> list[tuple[str, Any, Any]]:
+    """Pair the results of a method for two states with those for one, by entry."""
+    if isinstance(together, Mapping):
+        return [(f"{name}[{key!r}]", together[key], single.get(key)) for key in together]
+    return [(name, together, single)]
+
+
+def _equal(row: Any, single: Any) -> bool:
+    """Return whether a row is what the state alone gives, (1, ...)."""
+    return np.shape(single) == (1, *np.shape(row)) and np.allclose(row, single[0], equal_nan=True)
 
 
 def _range(low: ArrayLike, high: ArrayLike) -> str:
@@ -461,6 +499,6 @@ def _range(low: ArrayLike, high: ArrayLike) -> str:
 
 
 def _boxes(points: FloatArray, block: Block) -> tuple[FloatArray, FloatArray]:
-    """Corners of upright blocks (r, 3) m; a micrometre in, so that touching is not overlapping."""
+    """Return the corners of upright blocks (r, 3) m, 1 um inside, so that blocks may touch."""
     half = np.array(block.half) - 1e-6
     return points - half, points + half

@@ -1,15 +1,16 @@
-"""PyBullet behind the seam of :class:`tpm_gym.simulation.engine.Engine`."""
+"""PyBullet behind the interface of :class:`tpm_gym.simulation.engine.Engine`: one robot."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tpm_gym.arrays import Vector
+from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector
+from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.bullet.client import Client
 from tpm_gym.simulation.bullet.cup import Cup, Grip
@@ -17,20 +18,23 @@ from tpm_gym.simulation.bullet.friction import Friction
 from tpm_gym.simulation.bullet.physics import Physics
 from tpm_gym.simulation.bullet.robot import Robot
 from tpm_gym.simulation.bullet.scenery import Scenery
-from tpm_gym.simulation.drives import Memory, Reference, Servo, Servos, follow
-from tpm_gym.simulation.engine import Engine, Motors, Pose, Truth, Twist
-from tpm_gym.simulation.randomisation import Plant
+from tpm_gym.simulation.drives import Servo, ServoDrives, steering
+from tpm_gym.simulation.engine import Engine, Pose, Readout, Twist
+from tpm_gym.simulation.path import Path
+from tpm_gym.simulation.randomisation import NOMINAL, Plant
 from tpm_gym.simulation.settings import settings_of
 from tpm_gym.simulation.state import Scene
-from tpm_gym.simulation.vacuum import Hold
 
 __all__ = ["BulletEngine"]
 
+_ZERO: Vector = (0.0, 0.0, 0.0)
+
 
 @dataclass(frozen=True)
-class _Moment:
+class _Saved:
     joints: tuple[tuple[float, float], ...]  # rad and rad/s, passive ones too
-    drives: Memory | None
+    torque: Vector
+    drives: NDArray[Any] | None
     objects: list[tuple[Pose, Twist]]
     grip: Grip
 
@@ -43,8 +47,7 @@ class BulletEngine:
         renderer: ``"tiny"`` (None too) draws on the CPU anywhere; ``"egl"`` on a GPU, where the
             driver has it.
         physics: A :class:`Physics` or a mapping of its attributes.
-        drive: The motors' servo drives; None for ideal ones, of which Bullet's solver finds the
-            torques.
+        drive: The motors' servo drives; None for ideal ones, whose torques Bullet's solver finds.
 
     Raises:
         ConfigurationError: If an option is out of range, no window opened, or EGL is not there.
@@ -60,33 +63,39 @@ class BulletEngine:
     ) -> None:
         """Connect."""
         self.physics = settings_of(Physics, "physics", physics)
-        self.substeps = self.physics.substeps
+        self.time_step = self.physics.time_step
         self._gui, self._renderer, self._servo = gui, renderer, drive
-        self._servos: Servos | None = None
+        self._drives: ServoDrives | None = None
+        self._torque: Vector | None = _ZERO
         self.client = Client(self.physics, gui, renderer)
-        self._loaded = False
 
-    def load(self, machine: Machine, scene: Scene) -> None:
+    def load(self, machine: Machine, scene: Scene, count: int) -> None:
         """See the protocol."""
-        if self._loaded:
-            self._empty()
-        self._loaded = True
-        self.robot = Robot(self.client, machine.mechanism, machine.mount)
+        if count != 1:
+            raise ConfigurationError("count", count, "1: PyBullet simulates one robot in an engine")
+        self._nominal, self._scene, self._plant = machine, scene, NOMINAL
         if self._servo is not None:
-            self._servos = Servos(self._servo, machine, self.physics.time_step)
+            self._drives = ServoDrives(self._servo, machine, 1, self.time_step)
+        self._load(machine)
+
+    def _load(self, machine: Machine) -> None:
+        """Load a machine and all that stands around it into an empty client."""
+        self._machine = machine
+        self.robot = Robot(self.client, machine.mechanism, machine.mount)
+        scene = self._scene
         self._scenery = Scenery(self.client, scene, machine.table)
         if self._gui:
             self._scenery.aim_window()
         if self._gui or self._renderer == "egl":
             self.robot.paint()
         self.bodies = self._scenery.bodies
-        self._cup = Cup(self.client, self.robot, self.bodies, scene.objects, self.physics.time_step)
+        self._cup = Cup(self.client, self.robot, self.bodies, scene.objects, self.time_step)
         self._friction = Friction(
             self.client, self.robot, self.bodies, self._scenery.tables, scene.objects
         )
 
     def _empty(self) -> None:
-        """Take everything out of the client; a window stays, else a new client leaks least."""
+        """Remove everything from the client; a window stays, else a new client leaks least."""
         if self._gui:
             self.client.resetSimulation()
             self.client.configure(self.physics)
@@ -94,82 +103,89 @@ class BulletEngine:
             self.client.close()
             self.client = Client(self.physics, renderer=self._renderer)
 
-    def alter(self, plant: Plant) -> None:
+    def alter(self, rows: IntArray, plants: Sequence[Plant]) -> None:
         """See the protocol."""
+        (plant,) = plants
+        if plant.length_errors != self._plant.length_errors:
+            self._empty()
+            self._load(plant.of(self._nominal))
+        self._plant = plant
         self.robot.alter(plant.link_masses, plant.motor_strength)
-        if self._servos is not None:
-            self._servos.alter(plant)
+        if self._drives is not None:
+            self._drives.alter(rows, plants)
             self.robot.rub(plant.joint_friction)
         self._scenery.alter(plant.puck_mass, plant.friction)
         self._friction.alter(plant.friction)
 
-    def place(self, joints: Mapping[str, float], objects: Sequence[Pose]) -> None:
+    def place(self, rows: IntArray, theta: FloatArray, objects: FloatArray) -> None:
         """See the protocol."""
         self._cup.take(Grip())
-        self.robot.place(joints)
-        if self._servos is not None:
-            self._servos.rest(self.robot.motors().theta)
-        self._scenery.place([(pose, Twist()) for pose in objects])
+        self.robot.place(self._machine.joint_positions(theta[0]))
+        if self._drives is not None:
+            self._drives.rest(rows, theta)
+        self._scenery.place([(Pose.of(row), Twist()) for row in objects[0].tolist()])
         self._friction.reset()
+        self._torque = _ZERO
 
-    def show_goal(self, markers: Sequence[Vector]) -> None:
+    def advance(self, path: Path, vacuum: BoolArray) -> None:
         """See the protocol."""
-        self._scenery.move_markers(markers)
-
-    def advance(self, references: Sequence[Reference], vacuum: bool) -> None:
-        """See the protocol."""
-        cup, friction, step = self._cup, self._friction, self.client.stepSimulation
-        near = cup.look(len(references))
-        turns, sucks = friction.look(near, cup.first), cup.wakes(vacuum)
-        if self._servos is not None and references:
-            self._servos.begin(references[0].theta)
-        robot, servos = self.robot, self._servos
-        for index, reference in enumerate(references):
+        cup, friction, step, on = self._cup, self._friction, self.client.stepSimulation, vacuum[0]
+        targets, drive = steering(self._drives, path, self.robot)
+        near = cup.look(len(targets))
+        turns, sucks = friction.look(near, cup.first), cup.wakes(on)
+        for index, target in enumerate(targets):
             if index >= turns:
                 friction.turn(cup.grip.hold.which)
-            follow(robot, servos, reference)
+            drive(target)
             step()
             if index >= sucks:
-                cup.suck(vacuum)
+                cup.suck(on)
+        self._torque = None
 
-    def motors(self) -> Motors:
+    def read(self) -> Readout:
         """See the protocol."""
-        motors = self.robot.motors()
-        # The engine reports what its own motors apply, here friction.
-        return (
-            motors if self._servos is None else motors._replace(torque=self._servos.memory.torque)
+        theta, rates, torque = self.robot.motors()
+        return Readout.of_one(
+            self._machine,
+            (theta, rates, self._applied(torque)),
+            self.robot.truth(),
+            self._cup.grip.hold,
+            self._scenery.read(),
         )
 
-    def truth(self) -> Truth:
-        """See the protocol."""
-        return self.robot.truth()
+    def _applied(self, torque: Vector) -> Vector:
+        """Return the torques of the last time step, N m, of which Bullet reports ``torque``."""
+        if self._torque is not None:  # at rest after a reset, or restored
+            return self._torque
+        if self._drives is None:
+            return torque
+        a, b, c = self._drives.memory[0, 0].tolist()  # Bullet reports the axes' friction
+        return a, b, c
 
-    def objects(self) -> list[tuple[Pose, Twist]]:
+    def show_goal(self, markers: FloatArray) -> None:
         """See the protocol."""
-        return self._scenery.read()
-
-    def hold(self) -> Hold:
-        """See the protocol."""
-        return self._cup.grip.hold
+        self._scenery.move_markers(markers.tolist())
 
     def save(self) -> Any:
         """See the protocol."""
-        return _Moment(
+        return _Saved(
             self.robot.joint_states(),
-            None if self._servos is None else self._servos.memory,
-            self.objects(),
+            self._applied(self.robot.motors()[2]),
+            None if self._drives is None else self._drives.memory.copy(),
+            self._scenery.read(),
             self._cup.grip,
         )
 
-    def restore(self, snapshot: Any) -> None:
+    def restore(self, saved: Any) -> None:
         """See the protocol."""
         self._cup.take(Grip())
-        self.robot.set_joint_states(snapshot.joints)
-        if self._servos is not None:
-            self._servos.memory = snapshot.drives
-        self._scenery.place(snapshot.objects)
+        self.robot.set_joint_states(saved.joints)
+        self._torque = saved.torque
+        if self._drives is not None:
+            self._drives.memory[:] = saved.drives
+        self._scenery.place(saved.objects)
         self._friction.reset()
-        self._cup.take(snapshot.grip)
+        self._cup.take(saved.grip)
 
     def picture(self, width: int, height: int) -> NDArray[np.uint8]:
         """See the protocol."""

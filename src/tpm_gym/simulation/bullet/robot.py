@@ -28,7 +28,7 @@ from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.mount import Mount
 from tpm_gym.simulation.bullet.client import Client
 from tpm_gym.simulation.bullet.physics import MOTOR_GAIN
-from tpm_gym.simulation.engine import SPRING_GAIN, Motors, Truth
+from tpm_gym.simulation.engine import SPRING_GAIN
 
 __all__ = ["Robot"]
 
@@ -200,12 +200,12 @@ class Robot:
         for motor, one in zip(self._motors, friction, strict=True):
             turn(*motor, mode, targetVelocity=0.0, force=one)
 
-    def motors(self) -> Motors:
-        """True angles (rad), rates (rad/s) and last torques (N m) of the motors."""
+    def motors(self) -> tuple[Vector, Vector, Vector]:
+        """Return joint positions (rad), velocities (rad/s) and last torques (N m) of the motors."""
         state, number = pybullet.getJointState, self._client.number
         (one, i), (two, j), (three, k) = self._motors
         a, b, c = state(one, i, number), state(two, j, number), state(three, k, number)
-        return Motors((a[0], b[0], c[0]), (a[1], b[1], c[1]), (a[3], b[3], c[3]))
+        return (a[0], b[0], c[0]), (a[1], b[1], c[1]), (a[3], b[3], c[3])
 
     def joint_states(self) -> tuple[tuple[float, float], ...]:
         """Angle and rate of every joint, passive ones too."""
@@ -217,8 +217,8 @@ class Robot:
         for joint, (angle, rate) in zip(self.joints.values(), states, strict=True):
             self._client.resetJointState(*joint, angle, rate)
 
-    def truth(self) -> Truth:
-        """Largest loop gap (m), platform position (m, world) and platform tilt (rad)."""
+    def truth(self) -> tuple[float, Vector, float]:
+        """Return the largest loop gap (m), point P (m, world) and the platform's tilt (rad)."""
         number = self._client.number
         states = [
             state
@@ -235,7 +235,7 @@ class Robot:
                 squared = gap
         platform = states[self._platform]
         place = transform(platform[4], platform[5], self._mechanism.point_p)
-        return Truth(math.sqrt(squared), place, Mount.tilt(platform[5]))
+        return math.sqrt(squared), place, Mount.tilt(platform[5])
 
     def lip(self) -> Vector:
         """Centre of the cup's lip, m, world."""

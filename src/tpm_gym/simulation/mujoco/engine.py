@@ -1,8 +1,8 @@
-"""MuJoCo behind the seam of :class:`tpm_gym.simulation.engine.Engine`."""
+"""MuJoCo behind the interface of :class:`tpm_gym.simulation.engine.Engine`: one robot."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,20 +10,21 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from tpm_gym.arrays import Vector
+from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector
+from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.machine import Machine
-from tpm_gym.simulation.drives import Memory, Reference, Servo, Servos, follow
-from tpm_gym.simulation.engine import Engine, Motors, Pose, Truth, Twist
+from tpm_gym.simulation.drives import Servo, ServoDrives, steering
+from tpm_gym.simulation.engine import Engine, Pose, Readout
 from tpm_gym.simulation.mujoco.cup import Cup, Grip
 from tpm_gym.simulation.mujoco.model import compiled
 from tpm_gym.simulation.mujoco.physics import Physics
 from tpm_gym.simulation.mujoco.pictures import Pictures
 from tpm_gym.simulation.mujoco.robot import Robot
 from tpm_gym.simulation.mujoco.scenery import Scenery
-from tpm_gym.simulation.randomisation import Plant
+from tpm_gym.simulation.path import Path
+from tpm_gym.simulation.randomisation import NOMINAL, Plant
 from tpm_gym.simulation.settings import settings_of
 from tpm_gym.simulation.state import Scene
-from tpm_gym.simulation.vacuum import Hold
 
 __all__ = ["MujocoEngine"]
 
@@ -36,9 +37,10 @@ _STATE = int(
 
 
 @dataclass(frozen=True)
-class _Moment:
+class _Saved:
     numbers: tuple[float, ...]
-    drives: Memory | None
+    torque: Vector
+    drives: NDArray[Any] | None
     grip: Grip
 
 
@@ -63,99 +65,100 @@ class MujocoEngine:
     ) -> None:
         """Check the options."""
         self.physics = settings_of(Physics, "physics", physics)
-        self.substeps = self.physics.substeps
+        self.time_step = self.physics.time_step
         self._pictures = Pictures(renderer)
         self._servo = drive
-        self._servos: Servos | None = None
+        self._drives: ServoDrives | None = None
 
-    def load(self, machine: Machine, scene: Scene) -> None:
+    def load(self, machine: Machine, scene: Scene, count: int) -> None:
         """See the protocol."""
-        self.model = compiled(machine, scene, self.physics)
+        if count != 1:
+            raise ConfigurationError("count", count, "1: MuJoCo simulates one robot in an engine")
+        self._nominal, self._scene, self._plant = machine, scene, NOMINAL
+        if self._servo is not None:
+            self._drives = ServoDrives(self._servo, machine, 1, self.time_step)
+        self._load(machine)
+
+    def _load(self, machine: Machine) -> None:
+        self._machine = machine
+        self.model = compiled(machine, self._scene, self.physics)
         self.data = mujoco.MjData(self.model)
         self._reset()
         self.robot = Robot(self.model, self.data, machine, ideal=self._servo is None)
-        if self._servo is not None:
-            self._servos = Servos(self._servo, machine, self.physics.time_step)
-        self._scenery = Scenery(self.model, self.data, scene)
-        self._cup = Cup(self.model, self.data, self.robot, self._scenery, scene.objects)
+        self._scenery = Scenery(self.model, self.data, self._scene)
+        self._cup = Cup(self.model, self.data, self.robot, self._scenery, self._scene.objects)
 
-    def alter(self, plant: Plant) -> None:
+    def alter(self, rows: IntArray, plants: Sequence[Plant]) -> None:
         """See the protocol."""
+        (plant,) = plants
+        if plant.length_errors != self._plant.length_errors:
+            self._load(plant.of(self._nominal))
+        self._plant = plant
         self.robot.alter(plant)
-        if self._servos is not None:
-            self._servos.alter(plant)
+        if self._drives is not None:
+            self._drives.alter(rows, plants)
         self._scenery.alter(plant.puck_mass, plant.friction)
         mujoco.mj_setConst(self.model, self.data)
 
-    def place(self, joints: Mapping[str, float], objects: Sequence[Pose]) -> None:
+    def place(self, rows: IntArray, theta: FloatArray, objects: FloatArray) -> None:
         """See the protocol."""
         self._reset()
         self._cup.set(Grip())
-        self.robot.place(joints)
-        if self._servos is not None:
-            self._servos.rest(self.robot.motors().theta)
-        self._scenery.place(objects)
+        self.robot.place(self._machine.joint_positions(theta[0]))
+        if self._drives is not None:
+            self._drives.rest(rows, theta)
+        self._scenery.place([Pose.of(row) for row in objects[0].tolist()])
         mujoco.mj_step1(self.model, self.data)
 
     def _reset(self) -> None:
-        """Forget all motion, and let no number that is too large be told but by a lost loop.
+        """Clear all motion, and silence MuJoCo's warnings: a lost loop raises an error of ours.
 
-        The engine would write of each kind's first one to the console and into a file.
+        MuJoCo would write the first warning of each kind to the console and into a file.
         """
         mujoco.mj_resetData(self.model, self.data)
         for warning in self.data.warning:
             warning.number = 1
 
-    def show_goal(self, markers: Sequence[Vector]) -> None:
+    def advance(self, path: Path, vacuum: BoolArray) -> None:
         """See the protocol."""
-        self._scenery.move_markers(markers)
-
-    def advance(self, references: Sequence[Reference], vacuum: bool) -> None:
-        """See the protocol."""
-        model, data, cup, scenery = self.model, self.data, self._cup, self._scenery
+        model, data, cup, scenery, on = self.model, self.data, self._cup, self._scenery, vacuum[0]
         first_half, second_half = mujoco.mj_step1, mujoco.mj_step2
-        if self._servos is not None and references:
-            self._servos.begin(references[0].theta)
-        for left, reference in enumerate(references, 1 - len(references)):
-            follow(self.robot, self._servos, reference)
+        targets, drive = steering(self._drives, path, self.robot)
+        for left, target in enumerate(targets, 1 - len(targets)):
+            drive(target)
             scenery.keep_sliding()
             second_half(model, data)
             if not left:
                 self.robot.note_torque()
             load = cup.load()
             first_half(model, data)
-            if cup.breathe(vacuum, load):
+            if cup.breathe(on, load):
                 first_half(model, data)  # with another constraint
 
-    def motors(self) -> Motors:
+    def read(self) -> Readout:
         """See the protocol."""
-        return self.robot.motors()
+        robot, objects = self.robot, self._scenery.read()
+        hold = self._cup.grip.hold
+        return Readout.of_one(self._machine, robot.motors(), robot.truth(), hold, objects)
 
-    def truth(self) -> Truth:
+    def show_goal(self, markers: FloatArray) -> None:
         """See the protocol."""
-        return self.robot.truth()
-
-    def objects(self) -> list[tuple[Pose, Twist]]:
-        """See the protocol."""
-        return self._scenery.read()
-
-    def hold(self) -> Hold:
-        """See the protocol."""
-        return self._cup.grip.hold
+        self._scenery.move_markers(markers.tolist())
 
     def save(self) -> Any:
         """See the protocol."""
         numbers = np.empty(mujoco.mj_stateSize(self.model, _STATE))
         mujoco.mj_getState(self.model, self.data, numbers, _STATE)
-        memory = None if self._servos is None else self._servos.memory
-        return _Moment(tuple(numbers.tolist()), memory, self._cup.grip)
+        memory = None if self._drives is None else self._drives.memory.copy()
+        return _Saved(tuple(numbers.tolist()), self.robot.torque, memory, self._cup.grip)
 
-    def restore(self, snapshot: Any) -> None:
+    def restore(self, saved: Any) -> None:
         """See the protocol."""
-        mujoco.mj_setState(self.model, self.data, np.array(snapshot.numbers), _STATE)
-        self._cup.set(snapshot.grip)
-        if self._servos is not None:
-            self._servos.memory = snapshot.drives
+        mujoco.mj_setState(self.model, self.data, np.array(saved.numbers), _STATE)
+        self._cup.set(saved.grip)
+        self.robot.torque = saved.torque
+        if self._drives is not None:
+            self._drives.memory[:] = saved.drives
         mujoco.mj_step1(self.model, self.data)
 
     def picture(self, width: int, height: int) -> NDArray[np.uint8]:

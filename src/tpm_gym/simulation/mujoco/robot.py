@@ -18,7 +18,7 @@ from tpm_gym.arrays import Quaternion, Vector, rotate, transform
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.mjcf import STIFF, site_names
 from tpm_gym.mechanism.mount import Mount
-from tpm_gym.simulation.engine import SPRING_GAIN, Motors, Truth
+from tpm_gym.simulation.engine import SPRING_GAIN
 from tpm_gym.simulation.randomisation import NOMINAL, Plant
 
 __all__ = ["Robot"]
@@ -33,7 +33,10 @@ class Robot:
         model: The model.
         data: Its state.
         machine: What was compiled into it.
-        ideal: Whether the motors go where they are told; else they apply the torques they are told.
+        ideal: Whether the motors have ideal drives; else they apply given torques.
+
+    Attributes:
+        torque: Torques of the motors in the last time step, N m; zero after :meth:`place`.
     """
 
     def __init__(
@@ -65,7 +68,7 @@ class Robot:
         model.dof_solimp[:] = [float(number) for number in STIFF.split()]
         model.dof_solref[:] = -1 / step**2, -1 / step
         self._position, self._speed, self._height = data.qpos.item, data.qvel.item, data.xpos.item
-        self._torque: Vector = (0.0, 0.0, 0.0)
+        self.torque: Vector = (0.0, 0.0, 0.0)
         self.alter(NOMINAL)
 
     def alter(self, plant: Plant) -> None:
@@ -92,7 +95,7 @@ class Robot:
         """Put every joint at its position (rad, m)."""
         for name, position in joints.items():
             self._data.qpos[self._at[name]] = position
-        self._torque = (0.0, 0.0, 0.0)
+        self.torque = (0.0, 0.0, 0.0)
 
     def drive(self, theta: Vector) -> None:
         """Let ideal motors go to ``theta`` within this time step, effort permitting.
@@ -103,7 +106,7 @@ class Robot:
 
     def apply(self, torque: Vector) -> None:
         """Let the motors apply ``torque`` N m in this time step."""
-        self._torque = torque
+        self.torque = torque
         for (_, dof), one in zip(self._motors, torque, strict=True):
             self._data.qfrc_applied[dof] = one
         self._pull((0.0,))
@@ -121,22 +124,22 @@ class Robot:
             return  # known before
         force, first = self._data.efc_force.item, self._data.ne
         (a, *_), (b, *_), (c, *_), _ = self._rows
-        self._torque = force(first + a), force(first + b), force(first + c)
+        self.torque = force(first + a), force(first + b), force(first + c)
 
-    def motors(self) -> Motors:
-        """True positions (rad, m), rates and noted torques (N m, N) of the motors."""
+    def motors(self) -> tuple[Vector, Vector, Vector]:
+        """Return joint positions (rad, m), velocities and noted torques (N m, N) of the motors."""
         position, speed = self._position, self._speed
         (a, i), (b, j), (c, k) = self._motors
         theta = position(a), position(b), position(c)
-        return Motors(theta, (speed(i), speed(j), speed(k)), self._torque)
+        return theta, (speed(i), speed(j), speed(k)), self.torque
 
-    def truth(self) -> Truth:
-        """Largest loop gap (m), platform position (m, world) and platform tilt (rad)."""
+    def truth(self) -> tuple[float, Vector, float]:
+        """Return the largest loop gap (m), point P (m, world) and the platform's tilt (rad)."""
         data, (side, other) = self._data, self._sides
         gaps = data.site_xpos[side] - data.site_xpos[other]
         origin, turn = self._frame(self._platform)
         gap = math.sqrt((gaps * gaps).sum(axis=1).max(initial=0.0))
-        return Truth(gap, transform(origin, turn, self._point_p), Mount.tilt(turn))
+        return gap, transform(origin, turn, self._point_p), Mount.tilt(turn)
 
     def cup(self) -> tuple[Vector, Vector]:
         """Centre of the cup's lip (m) and the cup's outward axis, world."""

@@ -1,71 +1,39 @@
-"""The Gymnasium environment."""
+"""One environment, as Gymnasium has it."""
 
 from __future__ import annotations
 
-import hashlib
-import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, is_dataclass
-from typing import Any, SupportsFloat
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
+from gymnasium.utils import seeding
 from numpy.typing import ArrayLike, NDArray
 
-from tpm_gym.arrays import FloatArray, Vector, floats, is_whole
-from tpm_gym.envs.report import (
-    GOAL_BOUND,
-    OBSERVATION_BOUND,
+from tpm_gym.arrays import FloatArray, finite, is_whole
+from tpm_gym.envs.core import (
+    Core,
+    EnvSnapshot,
     Observation,
+    action_space,
     compute_reward,
-    observe,
-    report,
+    observation_space,
 )
-from tpm_gym.errors import (
-    ActionError,
-    ConfigurationError,
-    EpisodeError,
-    InputError,
-    ModeChangeError,
-)
+from tpm_gym.errors import ActionError, ConfigurationError, EpisodeError, ModeChangeError
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.display import has_display
-from tpm_gym.simulation.drives import Servo, drives_and_randomisation
-from tpm_gym.simulation.engine import SIMULATIONS
+from tpm_gym.simulation.drives import Servo
 from tpm_gym.simulation.randomisation import Randomisation
-from tpm_gym.simulation.simulation import Simulation, Snapshot, make_simulation
+from tpm_gym.simulation.simulation import Simulation
 from tpm_gym.simulation.state import CONTROL_PERIOD, State
-from tpm_gym.tasks.control import make_control
-from tpm_gym.tasks.registry import make_task
 from tpm_gym.tasks.task import Task
 
-__all__ = ["EnvSnapshot", "TPMEnv"]
+__all__ = ["TPMEnv"]
 
 Action = NDArray[Any]
 
-_PLAIN = {bool, int, float}  # Python's own numbers
-
-
-@dataclass(frozen=True)
-class EnvSnapshot:
-    """Everything that the next steps of an unwrapped environment depend on."""
-
-    simulation: Snapshot
-    rng: dict[str, Any]
-    goal: FloatArray
-    pending: tuple[tuple[float, ...], ...]
-    kind: Mapping[str, Any]
-    digest: str
-
-    def is_intact(self) -> bool:
-        """Whether nothing has been changed since it was taken, by the digest."""
-        own = (self.simulation, self.rng, self.goal, self.pending, self.kind)
-        try:
-            return bool(self.digest == _digest(own))
-        except Exception:  # of the repr of whatever somebody put in
-            return False
+_ROW = np.array([0])
 
 
 class TPMEnv(gym.Env[Observation, Action]):
@@ -234,47 +202,27 @@ class TPMEnv(gym.Env[Observation, Action]):
             valid = f"None, {', '.join(map(repr, modes))} ('human' needs a display and PyBullet)"
             raise ConfigurationError("render_mode", render_mode, valid)
         self.render_mode = render_mode
-        self.task = make_task(
-            task, machine=machine, reward=reward, goals=goals, penalty_weight=penalty_weight
-        )
-        self.machine = self.task.machine
-        self.control = make_control(control, self.machine)
-        self.drive, self.randomisation = drives_and_randomisation(drive, randomisation)
         self._size = _pixels("width", width), _pixels("height", height)
+        self._core = Core(
+            task,
+            control,
+            reward,
+            engine=engine,
+            machine=machine,
+            goals=goals,
+            penalty_weight=penalty_weight,
+            drive=drive,
+            randomisation=randomisation,
+            physics=physics,
+            gui=render_mode == "human",
+            renderer=renderer,
+        )
+        self.task, self.machine = self._core.task, self._core.machine
+        self.control, self.drive = self._core.control, self._core.drive
+        self.randomisation = self._core.randomisation
         self.observation_space = observation_space(self.task)
         self.action_space = action_space(self.task)
-        self.episode = 0  # how many have been started or restored
-        self._home = self.machine.inverse(self.machine.home)
-        self._state: State | None = None
-        self._goal = np.full(self.task.goal_size, np.nan)
-        self._pending: tuple[tuple[float, ...], ...] = ()  # actions that come late
-        self._closed = False
         self._shown = 0.0  # when the last frame was due, s of the performance counter
-        self._engine, self._physics, self._renderer = engine, physics, renderer
-        # As a dictionary, which is what a spec that went through JSON has.
-        numerics = physics
-        if is_dataclass(physics) and not isinstance(physics, type):
-            numerics = asdict(physics)
-        self._kind = {
-            "task": type(self.task),
-            "machine": self.machine,
-            "engine": engine,
-            "drive": self.drive,
-            "randomisation": self.randomisation,
-            "physics": numerics,
-        }
-        self.simulation = self._start()
-
-    def _start(self) -> Simulation:
-        return make_simulation(
-            self.task.scene,
-            machine=self.machine,
-            engine=self._engine,
-            physics=self._physics,
-            drive=self.drive,
-            gui=self.render_mode == "human",
-            renderer=self._renderer,
-        )
 
     # -- the Gymnasium interface ----------------------------------------------------------------
 
@@ -289,32 +237,27 @@ class TPMEnv(gym.Env[Observation, Action]):
                 sampled ones.
 
         Raises:
-            ResetOptionError: If an option is unknown, not so many finite numbers, or would put an
-                object into another or into the robot.
-            UnreachableError: If an object or the goal is out of reach.
+            ResetOptionError: If an option is unknown, no such array of finite numbers, or would put
+                an object into another or into the robot; nothing has happened then.
+            UnreachableError: If an object or the goal is out of reach; nothing has happened then.
             EpisodeError: If the environment is closed.
-            ConfigurationError: If a method of the task does not give what it has to.
+            ConfigurationError: If a method of the task does not return what it has to.
         """
-        self._require_open()
-        super().reset(seed=seed)
-        rng = self.np_random
-        start = self.task.start(rng, options)
-        plant = self.randomisation.draw(rng, self.machine)
-        self._goal = start.pop("goal")
-        self._pending = ((0.0,) * self.task.action_size,) * self.randomisation.latency
-        self._state = None
-        self.episode += 1
-        self._show_goal()
-        self._state = self.simulation.reset(self._home, start, plant, self._draw_noise())
-        self.task.check(self._state)
-        observation, _, info = self._report(self._state)
-        if self.randomisation != Randomisation():
-            info["randomisation"] = self.randomisation.told(plant)
+        core, rng = self._core, None
+        core.require_open()
+        if seed is not None:
+            rng, seed = seeding.np_random(seed)
+        (randomisation,) = core.reset(_ROW, [self.np_random if rng is None else rng], options)
+        if rng is not None:
+            self._np_random, self._np_random_seed = rng, seed
+        observation, _, info = _row(*core.report())
+        if randomisation:
+            info["randomisation"] = randomisation
         if self.render_mode == "human":
             self.render()
         return observation, info
 
-    def step(self, action: Action) -> tuple[Observation, SupportsFloat, bool, bool, dict[str, Any]]:
+    def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Run one control step of 40 ms.
 
         Raises:
@@ -322,25 +265,19 @@ class TPMEnv(gym.Env[Observation, Action]):
             EpisodeError: If there is no episode: before reset, after close, after a lost loop.
             ClosureError: If a loop of the mechanism opened.
             ModeChangeError: If the mechanism passed a singularity earlier in this episode.
-            ConfigurationError: If the task makes something of the state that is no number.
+            ConfigurationError: If the task makes something of the state that is not finite.
         """
-        asked = floats("action", action, self.task.action_size, ActionError)
-        state = self.state
-        clipped = tuple([-1.0 if x < -1.0 else 1.0 if x > 1.0 else x for x in asked])
-        now, *pending = (*self._pending, clipped)
-        command = self._command(now[:3], state.command)  # type: ignore[arg-type]
-        vacuum = self.task.vacuum and now[3] > 0
-        self._state = None  # until the step has gone well
-        try:
-            self._state = self.simulation.move(command, vacuum, self._draw_noise())
-        except ModeChangeError:
-            self._state = state  # nothing has moved
-            raise
-        self._pending = tuple(pending)
-        observation, reward, info = self._report(self._state)
+        core = self._core
+        asked = finite("action", action, (self.task.action_size,), ActionError)
+        state = core.state
+        if state.passed_singularity[0]:
+            raise ModeChangeError("assembly" if state.assembly_mode_changed[0] else "working")
+        core.step(asked[None], _ROW)
+        observation, reward, info = _row(*core.report())
+        truncated = info["assembly_mode_changed"] or info["working_mode_changed"]
         if self.render_mode == "human":
             self.render()
-        return observation, reward, False, bool(self._state.passed_singularity), info
+        return observation, reward, False, truncated, info
 
     def compute_reward(
         self,
@@ -348,10 +285,10 @@ class TPMEnv(gym.Env[Observation, Action]):
         desired_goal: ArrayLike,
         info: Mapping[str, Any] | Sequence[Mapping[str, Any]] | NDArray[Any],
     ) -> Any:
-        """The reward of a transition, or of a batch of them, for any goal.
+        """Compute the reward of a transition, or of a batch of them, for any goal.
 
-        Terms that do not depend on the goal are taken from ``info``; where it is empty, as SB3's
-        HerReplayBuffer hands it over, they are left out, and what remains is the goal term.
+        Terms that do not depend on the goal are taken from ``info``. They are left out where it is
+        empty, as SB3's HerReplayBuffer passes it, so that the goal term remains.
 
         Args:
             achieved_goal: (..., goal size) m.
@@ -362,13 +299,13 @@ class TPMEnv(gym.Env[Observation, Action]):
             A float, or (...,) of them.
 
         Raises:
-            InputError: If the goals are no real numbers of these shapes, or ``info`` is neither.
+            InputError: If the goals are no real numbers of these shapes, or ``info`` does not fit.
         """
         return compute_reward(self.task, achieved_goal, desired_goal, info)
 
     def render(self) -> NDArray[np.uint8] | None:
-        """The scene as (height, width, 3) RGB; in ``human`` mode, wait for real time."""
-        self._require_open()
+        """Draw the scene as (height, width, 3) RGB; in ``human`` mode, wait for real time."""
+        self._core.require_open()
         if self.render_mode == "rgb_array":
             return self.simulation.render(*self._size)
         if self.render_mode == "human":
@@ -379,148 +316,59 @@ class TPMEnv(gym.Env[Observation, Action]):
 
     def close(self) -> None:
         """Close the simulation; harmless the second time."""
-        if not self._closed:
-            self._closed = True
-            self._state = None
-            self.simulation.close()
+        self._core.close()
 
     # -- beyond Gymnasium -----------------------------------------------------------------------
 
     @property
+    def simulation(self) -> Simulation:
+        """The simulation behind the environment."""
+        return self._core.simulation
+
+    @property
+    def episode(self) -> int:
+        """Number of episodes that were started or restored."""
+        return int(self._core.episode[0])
+
+    @property
     def state(self) -> State:
-        """What the simulation reported last.
+        """The state after the last step or reset, without a leading axis.
 
         Raises:
-            EpisodeError: If there is no episode.
+            EpisodeError: If no episode is running.
         """
-        self._require_open()
-        if self._state is None:
-            raise EpisodeError("no episode is running; call reset() first")
-        return self._state
+        return self._core.state.take(0)
 
     @property
     def goal(self) -> FloatArray:
         """The episode's goal, (goal size,) m, world."""
-        return np.array(self._goal)
+        return self._core.goals[0].copy()
 
     def save_state(self) -> EnvSnapshot:
-        """Take down physics, rng, goal, commands and grasp; TimeLimit's count is not part of it.
+        """Return physics, rng, goal, delayed actions and grasp.
 
-        What follows, here or after :meth:`restore_state`, is equal to the last bit.
+        Steps from here, and steps after :meth:`restore_state`, are equal to the last bit. The
+        count of the wrapper ``TimeLimit`` is not part of the snapshot.
 
         Raises:
-            EpisodeError: If there is no episode.
+            EpisodeError: If no episode is running.
         """
-        _ = self.state  # there has to be an episode
-        rng = dict(self.np_random.bit_generator.state)
-        moment = (self.simulation.save(), rng, self.goal, self._pending, self._kind)
-        return EnvSnapshot(*moment, _digest(moment))
+        return self._core.save()
 
     def restore_state(self, snapshot: EnvSnapshot) -> Observation:
-        """Go back to a moment that :meth:`save_state` took down.
+        """Continue from a snapshot of this environment or of an equal one.
 
         Returns:
             The observation at that moment.
 
         Raises:
             EpisodeError: If the environment is closed.
-            InputError: If the moment is none, was changed, or is that of another kind of
-                environment; nothing has happened then.
+            InputError: If it is no snapshot, or one of another kind of environment; nothing has
+                happened then.
         """
-        self._require_open()
-        if not isinstance(snapshot, EnvSnapshot) or not snapshot.is_intact():
-            raise InputError("snapshot", type(snapshot), "what save_state() returned, unchanged")
-        require_same(snapshot.kind, self._kind)
-        self.np_random.bit_generator.state = snapshot.rng
-        self._goal, self._pending = snapshot.goal.copy(), snapshot.pending
-        self._state = None
-        self.episode += 1  # what was planned for the one before is void
-        self._show_goal()
-        self._state = self.simulation.restore(snapshot.simulation)
-        return observe(self.task, self._state, self._goal)
-
-    # -- inside ---------------------------------------------------------------------------------
-
-    def _require_open(self) -> None:
-        if self._closed:
-            raise EpisodeError("the environment is closed; make a new one")
-
-    def __getstate__(self) -> dict[str, Any]:
-        """For :func:`copy.deepcopy` and :mod:`pickle`: all of it, in the midst of an episode.
-
-        Raises:
-            ConfigurationError: With a window, of which PyBullet opens only one in a process.
-        """
-        if self.render_mode == "human":
-            valid = "None or 'rgb_array' for an environment that is copied or pickled"
-            raise ConfigurationError("render_mode", self.render_mode, valid)
-        running = self._state is not None
-        snapshot = self.simulation.save() if running else None
-        return {**vars(self), "simulation": snapshot, "_state": None}
-
-    def __setstate__(self, values: dict[str, Any]) -> None:
-        """Start a simulation of its own, and take it to where the original was."""
-        vars(self).update(values)
-        snapshot: Snapshot | None = values["simulation"]
-        self.simulation = self._start()
-        if self._closed:
-            self.simulation.close()
-        elif snapshot is not None:
-            self._show_goal()
-            self._state = self.simulation.restore(snapshot)
-
-    def _show_goal(self) -> None:
-        self.simulation.show_goal(self.task.markers(self._goal))
-
-    def _command(self, action: Vector, current: FloatArray) -> Vector:
-        """The next command for P; where many robots are simulated, as it is computed for many.
-
-        Args:
-            action: In [-1, 1].
-            current: (3,) m, world.
-        """
-        x, y, z = current.tolist()
-        point = self.machine.mount.swap((x, y, z))
-        if self._engine in SIMULATIONS:
-            ((x, y, z),) = self.control.command(np.array([action]), np.array([point])).tolist()
-            return x, y, z
-        return self.control.next(action, point)
-
-    def _draw_noise(self) -> Vector:
-        """Errors of one reading of the encoders, rad."""
-        if self.randomisation.encoder_noise == 0:
-            return (0.0, 0.0, 0.0)
-        a, b, c = self.np_random.normal(0.0, self.randomisation.encoder_noise, 3).tolist()
-        return a, b, c
-
-    def _report(self, state: State) -> tuple[Observation, float, dict[str, Any]]:
-        """What Gymnasium wants: Python's own numbers."""
-        observation, reward, info = report(self.task, state, self._goal)
-        info["reward_terms"] = {name: float(v) for name, v in info["reward_terms"].items()}
-        for name, value in info.items():
-            if type(value) not in _PLAIN and isinstance(value, (np.generic, np.ndarray)):
-                info[name] = value.item()
-        return observation, float(reward), info
-
-
-def observation_space(task: Task) -> spaces.Dict:
-    """The space of a task's observations."""
-    return spaces.Dict(
-        {
-            "observation": _box(OBSERVATION_BOUND, task.observation_size),
-            "achieved_goal": _box(GOAL_BOUND, task.goal_size),
-            "desired_goal": _box(GOAL_BOUND, task.goal_size),
-        }
-    )
-
-
-def action_space(task: Task) -> spaces.Box:
-    """The space of a task's actions."""
-    return _box(1.0, task.action_size)
-
-
-def _box(bound: float, length: int) -> spaces.Box:
-    return spaces.Box(-bound, bound, (length,), np.float32)
+        observation = self._core.restore(snapshot)
+        self._np_random = self._core.rngs[0]
+        return {name: values[0] for name, values in observation.items()}
 
 
 def _pixels(name: str, value: Any) -> int:
@@ -529,18 +377,14 @@ def _pixels(name: str, value: Any) -> int:
     raise ConfigurationError(name, value, "a whole number of pixels from 16 to 4096")
 
 
-def require_same(kind: Mapping[str, Any], own: Mapping[str, Any]) -> None:
-    """Refuse a snapshot of one kind of environment in one of another.
-
-    Raises:
-        InputError: If they differ, with the names of what does.
-    """
-    other = [name for name in own if kind.get(name) != own[name]]
-    if other:
-        raise InputError("snapshot", f"another {', '.join(other)}", "of the same task and options")
-
-
-def _digest(values: tuple[Any, ...]) -> str:
-    """A hash of plain data; of its repr, which unlike a pickle tells values, not identities."""
-    with np.printoptions(threshold=sys.maxsize, floatmode="unique"):
-        return hashlib.sha256(repr(values).encode()).hexdigest()
+def _row(
+    observation: Observation, reward: FloatArray, info: Mapping[str, Any]
+) -> tuple[Observation, float, dict[str, Any]]:
+    """Take the one row of a report, in Python's own numbers."""
+    told = {
+        name: {term: float(own[0]) for term, own in value.items()}
+        if name == "reward_terms"
+        else value[0].item()
+        for name, value in info.items()
+    }
+    return {name: values[0] for name, values in observation.items()}, float(reward[0]), told

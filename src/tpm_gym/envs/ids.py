@@ -1,4 +1,4 @@
-"""The ids that Gymnasium knows."""
+"""Ids of the environments in Gymnasium's registry."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from tpm_gym.tasks.task import Task
 
 __all__ = ["ENTRY_POINT", "MAX_EPISODE_STEPS", "env_ids", "register_task"]
 
-ENTRY_POINT = "tpm_gym.envs.env:TPMEnv"
-VECTOR_ENTRY_POINT = "tpm_gym.envs.vector:make_vector"
+ENTRY_POINT = "tpm_gym.envs.single:TPMEnv"
+VECTOR_ENTRY_POINT = "tpm_gym.envs.vector:TPMVectorEnv"
 MAX_EPISODE_STEPS = 50
 
 
@@ -26,22 +26,22 @@ def register_task(
 ) -> tuple[str, ...]:
     """Register a task's ids: ``TPM<name>{,Joints}{,Dense}-v<version>``; harmless the second time.
 
-    ``TPMEnv(task=...)`` then knows it too, as ``name`` in snake case. The command line, and worker
+    ``TPMEnv(task=...)`` takes it too, as ``name`` in snake case. The command line, and worker
     processes that are spawned rather than forked, find ids as ``"module:id"``, where importing the
     module registers them.
 
     Args:
-        name: In CamelCase, e.g. ``"PickAndPlace"``.
-        task: The class; one that was defined anew, as in a notebook, replaces its forerunner.
-        version: At the end of the ids.
-        max_episode_steps: After so many, episodes are truncated.
+        name: Name in CamelCase, e.g. ``"PickAndPlace"``.
+        task: The class. A class that was defined again, as in a notebook, replaces the old one.
+        version: Version at the end of the ids.
+        max_episode_steps: Steps after which episodes are truncated.
 
     Returns:
         The four ids.
 
     Raises:
-        ConfigurationError: If the name is none, or it or an id is taken, or another argument cannot
-            be; nothing is registered then.
+        ConfigurationError: If an argument is not possible, or the name or an id is taken; nothing
+            is registered then.
     """
     option = option_name(name)
     if not (isinstance(task, type) and issubclass(task, Task)) or isabstract(task):
@@ -78,7 +78,7 @@ def register_task(
 
 
 def env_ids() -> tuple[str, ...]:
-    """All ids whose environments are of tpm_gym, those of a user's tasks too."""
+    """Return all ids of tpm_gym's environments, those of users' tasks too."""
     return tuple(env_id for env_id, spec in gym.registry.items() if spec.entry_point == ENTRY_POINT)
 
 

@@ -1,0 +1,419 @@
+"""n environments of one task in one engine: what one environment and many have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, is_dataclass
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import ArrayLike, NDArray
+
+from tpm_gym.arrays import BoolArray, FloatArray, IntArray, numbers
+from tpm_gym.errors import ConfigurationError, EpisodeError, InputError
+from tpm_gym.mechanism.machine import Machine
+from tpm_gym.simulation.drives import Servo, drives_and_randomisation
+from tpm_gym.simulation.randomisation import NOMINAL, Randomisation
+from tpm_gym.simulation.simulation import Simulation, Snapshot
+from tpm_gym.simulation.state import State
+from tpm_gym.tasks.control import make_control
+from tpm_gym.tasks.registry import make_task
+from tpm_gym.tasks.task import Task
+
+__all__ = ["Core", "EnvSnapshot", "Observation", "action_space", "compute_reward", "observation_space"]
+
+OBSERVATION_BOUND = 10.0
+GOAL_BOUND = 2.0
+
+Observation = dict[str, Any]  # arrays of float32
+Report = tuple[Observation, FloatArray, dict[str, Any]]
+"""Observation, reward (n,) and info, whose values are arrays (n,)."""
+
+
+@dataclass(frozen=True)
+class EnvSnapshot:
+    """Everything that the next steps of n environments depend on.
+
+    Attributes:
+        kind: Task and options, which must be equal where the snapshot is restored.
+        simulation: The simulation's part.
+        rngs: States of the n generators.
+        columns: Arrays by name: goals and delayed actions, and of a vector environment's episodes
+            their lengths and ends.
+    """
+
+    kind: Mapping[str, Any]
+    simulation: Snapshot
+    rngs: list[dict[str, Any]]
+    columns: dict[str, NDArray[Any]]
+
+
+class Core:
+    """n environments of one task in one engine; rows are environments.
+
+    The arguments are those of :class:`tpm_gym.TPMEnv`.
+
+    Attributes:
+        task: The task.
+        control: The control.
+        rngs: A generator for each environment, once they are reset.
+        episode: (n,) number of episodes that were started or restored.
+        goals: (n, goal_size) m, world.
+    """
+
+    def __init__(
+        self,
+        task: str | type[Task] | Task = "reach",
+        control: str = "cartesian",
+        reward: str | None = None,
+        *,
+        count: int = 1,
+        engine: str = "pybullet",
+        machine: str | Machine | None = None,
+        goals: str | None = None,
+        penalty_weight: float | None = None,
+        drive: str | Servo | Mapping[str, Any] | None = None,
+        randomisation: Randomisation | Mapping[str, Any] | None = None,
+        physics: Any = None,
+        gui: bool = False,
+        renderer: str | None = None,
+    ) -> None:
+        """Check the options and start the simulation."""
+        self.count = count
+        self.task = make_task(
+            task, machine=machine, reward=reward, goals=goals, penalty_weight=penalty_weight
+        )
+        self.task.check()
+        self.machine = self.task.machine
+        self.control = make_control(control, self.machine)
+        self.drive, self.randomisation = drives_and_randomisation(drive, randomisation)
+        self._altered = self.randomisation != Randomisation()
+        self._engine = {"engine": engine, "physics": physics, "gui": gui, "renderer": renderer}
+        # As a dictionary, like in a spec that went through JSON.
+        settings = is_dataclass(physics) and not isinstance(physics, type)
+        self.kind = {
+            "task": type(self.task),
+            "machine": self.machine,
+            "engine": engine,
+            "drive": self.drive,
+            "randomisation": self.randomisation,
+            "physics": asdict(physics) if settings else physics,
+            "number of environments": count,
+        }
+        self._home = self.machine.require_inverse(np.array(self.machine.home))
+        self._state: State | None = None
+        self.closed = False
+        self.rngs: list[np.random.Generator] = []
+        self.episode = np.zeros(count, dtype=np.int64)
+        self.goals = np.full((count, self.task.goal_size), np.nan)
+        self._pending = np.zeros((self.randomisation.latency, count, self.task.action_size))
+        self.simulation = self._start()
+
+    def _start(self) -> Simulation:
+        return Simulation(
+            self.task.scene,
+            machine=self.machine,
+            count=self.count,
+            drive=self.drive,
+            **self._engine,  # type: ignore[arg-type]
+        )
+
+    # -- running ----------------------------------------------------------------------------
+
+    def reset(
+        self, rows: IntArray, rngs: Sequence[np.random.Generator], options: Any = None
+    ) -> list[dict[str, Any]]:
+        """Start episodes in some environments.
+
+        Args:
+            rows: (r,) environments.
+            rngs: Their generators from now on.
+            options: As in :meth:`tpm_gym.TPMEnv.reset`.
+
+        Returns:
+            For each of them the randomisation of the episode; empty dictionaries without one.
+
+        Raises:
+            ResetOptionError: If an option is not possible; nothing has happened then.
+            UnreachableError: If an object or the goal is out of reach; nothing has happened then.
+        """
+        self.require_open()
+        before = [rng.bit_generator.state for rng in rngs] if options else []
+        try:
+            starts = self.task.start(rngs, options)
+        except BaseException:
+            for rng, state in zip(rngs, before, strict=False):
+                rng.bit_generator.state = state
+            raise
+        plants = [NOMINAL] * len(rows)
+        if self._altered:
+            plants = [self.randomisation.draw(rng, self.machine) for rng in rngs]
+        self.rngs = self.rngs or [*rngs]
+        for row, rng in zip(rows.tolist(), rngs, strict=True):
+            self.rngs[row] = rng
+        self.goals = self.goals.copy()
+        self.goals[rows] = starts.pop("goal")
+        self._state = None
+        self.episode[rows] += 1
+        self._pending[:, rows] = 0.0
+        self._show_goal()
+        noise = self._noise(rows)
+        self.simulation.reset(
+            rows, self._home, starts, plants, None if noise is None else noise[rows]
+        )
+        return [self.randomisation.told(plant) if self._altered else {} for plant in plants]
+
+    def step(self, actions: FloatArray, running: IntArray) -> None:
+        """Run a control period in all environments.
+
+        Args:
+            actions: (n, action_size) finite numbers; clipped to [-1, 1].
+            running: (r,) environments whose encoders are read with noise.
+        """
+        actions = np.minimum(np.maximum(actions, -1.0), 1.0)
+        late = self._pending
+        if len(late):
+            late = np.concatenate([late, actions[None]])
+            actions, late = late[0], late[1:]
+        simulation = self.simulation
+        commands = self.control.command(actions[:, :3], simulation.commands)
+        vacuum = actions[:, 3] > 0 if self.task.vacuum else np.zeros(self.count, dtype=np.bool_)
+        state, self._state = self._state, None  # until the step has gone well
+        simulation.move(commands, vacuum, self._noise(running))
+        self._state, self._pending = state, late
+
+    def report(self, rows: IntArray | None = None) -> Report:
+        """Read the state, and return observation, reward and info of all or of some environments.
+
+        Raises:
+            ConfigurationError: If the task makes something of the state that is not finite.
+        """
+        state, goals = self.simulation.state(), self.goals
+        self._state = state
+        if rows is not None:
+            state, goals = state.take(rows), goals[rows]
+        return report(self.task, state, goals)
+
+    def _noise(self, rows: IntArray) -> FloatArray | None:
+        """Draw the errors (n, 3) rad of one reading of the encoders, for some environments."""
+        size = self.randomisation.encoder_noise
+        if size == 0:
+            return None
+        noise = np.zeros((self.count, 3))
+        for row in rows.tolist():
+            noise[row] = self.rngs[row].normal(0.0, size, 3)
+        return noise
+
+    def _show_goal(self) -> None:
+        self.simulation.show_goal(self.task.markers(self.goals[0]))
+
+    # -- state, end -------------------------------------------------------------------------
+
+    @property
+    def state(self) -> State:
+        """The state after the last step or reset.
+
+        Raises:
+            EpisodeError: If no episode is running.
+        """
+        self.require_open()
+        if self._state is None:
+            raise EpisodeError("no episode is running; call reset() first")
+        return self._state
+
+    def save(self, **columns: NDArray[Any]) -> EnvSnapshot:
+        """Return everything that the next steps depend on, with the caller's own columns.
+
+        Raises:
+            EpisodeError: If no episode is running.
+        """
+        _ = self.state  # there has to be an episode
+        rngs = [dict(rng.bit_generator.state) for rng in self.rngs]
+        own = {"goals": self.goals, "pending": self._pending, **columns}
+        copies = {name: values.copy() for name, values in own.items()}
+        return EnvSnapshot(self.kind, self.simulation.save(), rngs, copies)
+
+    def restore(self, snapshot: Any) -> Observation:
+        """Continue from a snapshot of these or equal environments; return the observation.
+
+        Raises:
+            EpisodeError: If the environments are closed.
+            InputError: If it is no snapshot, or one of other environments; nothing has happened
+                then.
+        """
+        self.require_open()
+        if not isinstance(snapshot, EnvSnapshot):
+            raise InputError("snapshot", type(snapshot), "what save_state() returned")
+        other = [name for name in self.kind if snapshot.kind.get(name) != self.kind[name]]
+        if other:
+            differing = f"another {', '.join(other)}"
+            raise InputError("snapshot", differing, "of the same task and options")
+        self.rngs = [np.random.default_rng() for _ in snapshot.rngs]
+        for rng, state in zip(self.rngs, snapshot.rngs, strict=True):
+            rng.bit_generator.state = state
+        self.goals = snapshot.columns["goals"].copy()
+        self._pending = snapshot.columns["pending"].copy()
+        self._state = None
+        self.episode += 1  # plans for the episode before are void
+        self._show_goal()
+        self.simulation.restore(snapshot.simulation)
+        return self.report()[0]
+
+    def require_open(self) -> None:
+        """Raise EpisodeError if the environments are closed."""
+        if self.closed:
+            raise EpisodeError("the environment is closed; make a new one")
+
+    def close(self) -> None:
+        """Close the simulation; harmless the second time."""
+        if not self.closed:
+            self.closed, self._state = True, None
+            self.simulation.close()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return everything, for :func:`copy.deepcopy` and :mod:`pickle`, in an episode too.
+
+        Raises:
+            ConfigurationError: With a window: PyBullet opens only one in a process.
+        """
+        if self._engine["gui"]:
+            valid = "None or 'rgb_array' for an environment that is copied or pickled"
+            raise ConfigurationError("render_mode", "human", valid)
+        snapshot = None if self._state is None else self.simulation.save()
+        return {**vars(self), "simulation": snapshot}
+
+    def __setstate__(self, values: dict[str, Any]) -> None:
+        """Start a simulation of its own, and continue where the original was."""
+        vars(self).update(values)
+        snapshot: Snapshot | None = values["simulation"]
+        self.simulation = self._start()
+        if self.closed:
+            self.simulation.close()
+        elif snapshot is not None:
+            self._show_goal()
+            self.simulation.restore(snapshot)
+
+
+# -- observation, reward, info ------------------------------------------------------------------
+
+
+def observation_space(task: Task) -> spaces.Dict:
+    """Return the space of a task's observations."""
+    return spaces.Dict(
+        {
+            "observation": _box(OBSERVATION_BOUND, task.observation_size),
+            "achieved_goal": _box(GOAL_BOUND, task.goal_size),
+            "desired_goal": _box(GOAL_BOUND, task.goal_size),
+        }
+    )
+
+
+def action_space(task: Task) -> spaces.Box:
+    """Return the space of a task's actions."""
+    return _box(1.0, task.action_size)
+
+
+def _box(bound: float, length: int) -> spaces.Box:
+    return spaces.Box(-bound, bound, (length,), np.float32)
+
+
+def report(task: Task, state: State, goals: FloatArray) -> Report:
+    """Build observation, reward and info from a state.
+
+    Raises:
+        ConfigurationError: If the task makes something of the state that is not finite.
+    """
+    observation = {
+        "observation": _clip(task.observe(state), OBSERVATION_BOUND),
+        "achieved_goal": _clip(task.achieved(state), GOAL_BOUND),
+        "desired_goal": goals.astype(np.float32),
+    }
+    achieved = observation["achieved_goal"]
+    gap, penalty = task.gap(achieved, observation["desired_goal"]), task.penalty(state)
+    terms = task.reward_terms(state, gap, penalty)
+    reward = terms["goal"] + _goal_free(terms)
+    flat = observation["observation"].ravel()
+    if not np.isfinite(np.dot(flat, flat) + achieved.sum() + reward.sum()):
+        raise _not_finite(task, state, achieved, terms)
+    return (
+        observation,
+        reward,
+        {
+            "is_success": task.success(gap),
+            "closure_error": state.closure_error,
+            "vacuum": state.vacuum,
+            "conditioning": state.conditioning,
+            "singularity_penalty": penalty,
+            "assembly_mode_changed": state.assembly_mode_changed,
+            "working_mode_changed": state.working_mode_changed,
+            "object_lost": task.lost(state),
+            "reward_terms": terms,
+        },
+    )
+
+
+def _clip(values: FloatArray, bound: float) -> NDArray[np.float32]:
+    return np.minimum(np.maximum(values, -bound), bound).astype(np.float32, order="C")
+
+
+def _goal_free(terms: Mapping[str, Any]) -> Any:
+    """Add the reward's terms that do not depend on the goal."""
+    total: Any = np.float64(0.0)  # in double precision, whatever a task's own terms have
+    for name, value in terms.items():
+        if name != "goal":
+            total = total + value
+    return total
+
+
+def _not_finite(
+    task: Task, state: State, achieved: FloatArray, terms: Mapping[str, Any]
+) -> ConfigurationError:
+    """Find the value of a task that is not finite."""
+    values = {
+        **{f"observed(), {entry.name!r}": entry.source(state) for entry in task.entries},
+        "achieved()": achieved,
+        **{f"reward_terms()[{name!r}]": value for name, value in terms.items()},
+    }
+    name, value = next(item for item in values.items() if not np.isfinite(item[1]).all())
+    return ConfigurationError(name, np.asarray(value).tolist(), "finite numbers from the task")
+
+
+def compute_reward(task: Task, achieved: ArrayLike, desired: ArrayLike, info: Any) -> Any:
+    """Compute the reward of transitions for any goals; see :meth:`tpm_gym.TPMEnv.compute_reward`.
+
+    Raises:
+        InputError: If the goals are no real numbers of fitting shapes, or ``info`` does not fit.
+    """
+    _require_goals(task.goal_size, achieved, desired)
+    goal_term = np.asarray(task.goal_term(task.gap(achieved, desired)))
+    try:
+        if isinstance(info, Mapping):
+            other: Any = float(_goal_free(info.get("reward_terms", {})))
+        else:
+            others = [float(_goal_free(entry.get("reward_terms", {}))) for entry in info]
+            other = np.array(others).reshape(goal_term.shape)
+    except (AttributeError, TypeError, ValueError) as error:
+        valid = f"a step's info, or one for each of the {goal_term.size} transitions"
+        raise InputError("info", type(info), valid) from error
+    total = goal_term + other
+    return float(total) if np.ndim(total) == 0 else total
+
+
+def _require_goals(size: int, achieved: ArrayLike, desired: ArrayLike) -> None:
+    """Refuse arrays that are no batch of goals; goals that are not finite are no success."""
+    shapes = [numbers("achieved_goal", achieved).shape, numbers("desired_goal", desired).shape]
+    try:
+        np.broadcast_shapes(*shapes)
+        fit = all(shape[-1:] == (size,) for shape in shapes)
+    except ValueError:
+        fit = False
+    if not fit:
+        valid = f"of shapes (..., {size}) that go together, by shape"
+        raise InputError("achieved_goal, desired_goal", shapes, valid)
+
+
+def truncated(info: Mapping[str, Any]) -> BoolArray:
+    """Return (n,) whether episodes end because the mechanism passed a singularity."""
+    ended: BoolArray = info["assembly_mode_changed"] | info["working_mode_changed"]
+    return ended

@@ -1,0 +1,339 @@
+"""The analytic engine: many machines, computed in closed form.
+
+Coupling degree zero makes every quantity a formula of where point P is. With ideal drives P is on
+its spline, so a control period is one evaluation of inverse kinematics, Jacobian and dynamics,
+whatever the time step. Joint positions and velocities are differences over time steps, as those of
+other engines are, and so are torques. Servo drives, and ideal drives whose effort would be
+exceeded, take forward dynamics instead, time step by time step.
+
+The loops' gap and the platform's tilt are always 0 here; use another engine to measure them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tpm_gym.arrays import BoolArray, FloatArray, IntArray
+from tpm_gym.mechanism.machine import Machine
+from tpm_gym.simulation.analytic.contact import Contact
+from tpm_gym.simulation.analytic.forward_dynamics import (
+    Course,
+    IdealSteps,
+    ServoSteps,
+    Steps,
+    march,
+)
+from tpm_gym.simulation.analytic.physics import Physics
+from tpm_gym.simulation.drives import Servo, ServoDrives
+from tpm_gym.simulation.engine import Engine, Readout, make_engine
+from tpm_gym.simulation.path import Path
+from tpm_gym.simulation.randomisation import Plant
+from tpm_gym.simulation.settings import settings_of
+from tpm_gym.simulation.state import Scene
+
+__all__ = ["AnalyticEngine"]
+
+_WATCHFUL = 0.5
+"""Share of a motor's effort above which the torques of every time step are computed."""
+_COLUMNS = (
+    "_theta", "_rates", "_torque", "_position", "_before", "_force", "_mode_left", "_behind",
+)  # fmt: skip
+
+
+class AnalyticEngine:
+    """See :class:`~tpm_gym.simulation.engine.Engine`; any number of robots.
+
+    PyBullet draws the pictures; it is started for the first one.
+
+    Args:
+        renderer: PyBullet's renderer.
+        physics: A :class:`Physics`, or a mapping of its attributes.
+        drive: The motors' servo drives; None for ideal ones.
+
+    Attributes:
+        torques: (K, n, 3) N m, of all time steps of the last control period, where ``physics`` asks
+            for ``"every"``; else None.
+
+    Raises:
+        ConfigurationError: If an option is out of range.
+    """
+
+    def __init__(
+        self, *, renderer: str | None = None, physics: Any = None, drive: Servo | None = None
+    ) -> None:
+        """Check the options."""
+        self.physics = settings_of(Physics, "physics", physics)
+        self.time_step = self.physics.time_step
+        self._servo, self._renderer = drive, renderer
+        self._steps = self.physics.substeps
+        # Number of last time steps of which joint positions are needed.
+        self._tail = {"none": 2, "last": 3, "every": self._steps}[self.physics.torques]
+        self._artist: Engine | None = None
+        self._markers: FloatArray | None = None
+        self.torques: FloatArray | None = None
+
+    def load(self, machine: Machine, scene: Scene, count: int) -> None:
+        """See the protocol."""
+        self._machine, self._scene, self._count = machine, scene, count
+        self._rows = np.arange(count)
+        self._turn, self._origin = machine.mount.frame
+        self._built: FloatArray | None = None
+        self._exact = True  # whether encoders and lengths are exact, so that P is on its spline
+        self._nominal_effort = np.array([motor.effort for motor in machine.mechanism.motors])
+        self._effort = np.tile(self._nominal_effort, (count, 1))
+        self._bias = np.zeros((count, 3))
+        self._contact = Contact(scene.objects, count, self.time_step, machine.table)
+        self._drives = (
+            None
+            if self._servo is None
+            else ServoDrives(self._servo, machine, count, self.time_step)
+        )
+        home = machine.require_inverse(np.array(machine.home))
+        self._theta = np.tile(home, (count, 1))
+        self._position = np.tile(machine.home, (count, 1))
+        self._before = self._position.copy()
+        self._rates, self._torque, self._force = np.zeros((3, count, 3))
+        self._mode_left = np.zeros(count, dtype=np.int64)
+        self._behind = np.zeros(count, dtype=np.bool_)  # whether ideal motors lacked torque
+
+    def alter(self, rows: IntArray, plants: Sequence[Plant]) -> None:
+        """See the protocol."""
+        machine = self._machine
+        if self._built is None and any(p.length_errors or p.link_masses for p in plants):
+            self._built = np.tile(machine.built(), (self._count, 1))
+        if self._built is not None:
+            self._built[rows] = [
+                machine.built(plant.lengths_of(machine), plant.link_masses) for plant in plants
+            ]
+        self._effort[rows] = self._nominal_effort * np.array([p.motor_strength for p in plants])
+        biases = np.array([plant.encoder_bias for plant in plants])
+        self._exact &= not (biases.any() or any(plant.length_errors for plant in plants))
+        if self._drives is not None:
+            self._drives.alter(rows, plants)
+        masses, friction = ([getattr(p, k) for p in plants] for k in ("puck_mass", "friction"))
+        self._contact.alter(rows, np.array(masses), np.array(friction))
+
+    def place(self, rows: IntArray, theta: FloatArray, objects: FloatArray) -> None:
+        """See the protocol."""
+        built = None if self._built is None else self._built[rows]
+        self._theta[rows] = theta
+        self._position[rows] = self._machine.evaluate(theta, built).position
+        self._before[rows] = self._position[rows]
+        self._rates[rows] = self._torque[rows] = self._force[rows] = 0.0
+        self._mode_left[rows], self._behind[rows] = 0, False
+        if self._drives is not None:
+            self._drives.rest(rows, theta)
+        self._contact.place(rows, objects[..., :3], objects[..., 3:])
+
+    # -- a control period -------------------------------------------------------------------
+
+    def advance(self, path: Path, vacuum: BoolArray) -> None:
+        """See the protocol."""
+        self.torques = None
+        if self._drives is None:
+            self._follow(path, vacuum)
+            return
+        steps = ServoSteps(self._drives, self._drives.references(path), self.time_step)
+        self._march(self._rows, steps, vacuum)
+
+    def _follow(self, path: Path, vacuum: BoolArray) -> None:
+        """Let ideal motors take P along its path.
+
+        All machines are computed as if their motors could, and once more by forward dynamics those
+        of which one cannot.
+        """
+        objects, step = bool(self._scene.objects), self.time_step
+        saved = self._contact.save(self._rows) if objects else None
+        if self._exact:
+            theta = path.joints(self._tail)
+            points = path.points(self._steps if objects else 2)
+            late = self._behind | (self._mode_left != 0)
+        else:
+            joints = path.joints()
+            points = self._machine.forward(joints, self._built)
+            theta = joints[:, -self._tail :]
+            late = self._behind | (self._mode_left != 0)
+            late |= ~self._machine.same_side(points).all(axis=1)
+        push = np.zeros((self._count, self._steps, 3))
+        if objects:
+            push = self._touch(self._rows, points, vacuum)
+            before, at, now = points[:, -3], points[:, -2], points[:, -1]
+            carried = self._contact.carried(self._rows)[:, None]
+            force = push[:, -1] + carried * (now - 2 * at + before) / step**2
+        start = self._theta, self._rates, self._position, self._before, self._force, self._torque
+        lead = self._lead(theta)
+        self._before, self._position = points[:, -2].copy(), points[:, -1].copy()
+        self._theta = theta[:, -1].copy()
+        self._rates = (theta[:, -1] - theta[:, -2]) / step
+        if objects:
+            self._force = force
+        late |= self._find_torques(lead, theta, path, push)
+        rows = np.flatnonzero(late)
+        if len(rows):
+            self._repeat(rows, start, saved, path, vacuum)
+
+    def _lead(self, theta: FloatArray) -> FloatArray:
+        """Return joint positions (n, K + 2, 3) of the last two time steps and of all to come."""
+        earlier = self._theta - self.time_step * self._rates
+        return np.concatenate([earlier[:, None], self._theta[:, None], theta], axis=1)
+
+    def _repeat(
+        self, rows: IntArray, start: Any, saved: Any, path: Path, vacuum: BoolArray
+    ) -> None:
+        """Run the control period of some machines again, by forward dynamics."""
+        for name, values in zip(
+            ("_theta", "_rates", "_position", "_before", "_force", "_torque"), start, strict=True
+        ):
+            getattr(self, name)[rows] = values[rows]
+        if saved is not None:
+            self._contact.restore(rows, saved[rows])
+        joints = np.ascontiguousarray(path.joints()[rows].swapaxes(0, 1))
+        steps = IdealSteps(joints, self._effort[rows], self.time_step)
+        self._march(rows, steps, vacuum)
+        self._behind[rows] = steps.behind
+
+    def _march(self, rows: IntArray, steps: Steps, vacuum: BoolArray) -> None:
+        """Run a control period of some machines by forward dynamics."""
+        on = vacuum[rows]
+
+        def touch(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+            push = self._contact.advance(rows, points * self._turn + self._origin, on)[:, -1]
+            return push * self._turn, self._contact.carried(rows)
+
+        course = Course(
+            self._theta[rows], self._rates[rows], self._torque[rows], self._position[rows],
+            self._before[rows], self._force[rows], self._contact.carried(rows),
+            self._mode_left[rows],
+        )  # fmt: skip
+        built = None if self._built is None else self._built[rows]
+        torques = march(
+            self._machine, built, steps, self._steps, course, self.time_step, touch
+        )
+        self._theta[rows], self._rates[rows], self._torque[rows] = (
+            course.theta, course.rates, course.torque,
+        )  # fmt: skip
+        self._position[rows], self._before[rows] = course.position, course.before
+        self._force[rows], self._mode_left[rows] = course.force, course.mode_left
+        if self.physics.torques == "every":
+            if self.torques is None:
+                self.torques = np.zeros((self._steps, self._count, 3))
+            self.torques[:, rows] = torques
+
+    def _touch(self, rows: IntArray, points: FloatArray, vacuum: BoolArray) -> FloatArray:
+        """Let objects and cups act along the way of P (r, K, 3) m; return forces (r, K, 3) N."""
+        ways = np.concatenate([self._before[rows, None], self._position[rows, None], points], axis=1)
+        ways *= self._turn
+        ways += self._origin
+        push: FloatArray = self._contact.advance(rows, ways, vacuum) * self._turn
+        return push
+
+    def _find_torques(
+        self, lead: FloatArray, theta: FloatArray, path: Path, push: FloatArray
+    ) -> BoolArray:
+        """Compute what motors apply, and return (n,) whether one would need too much.
+
+        Args:
+            lead: (n, k + 2, 3) rad, joint positions of the last two time steps and of the tail.
+            theta: (n, k, 3) rad, of the tail alone.
+            path: Of the control period.
+            push: (n, K, 3) N on P.
+        """
+        everywhere = np.arange(self._count)
+        if self.physics.torques == "none":
+            self._torque = np.full_like(self._torque, np.nan)
+            return np.zeros(self._count, dtype=np.bool_)
+        if self.physics.torques == "every":
+            torques = self._torques(everywhere, lead, push)
+            self.torques, self._torque = torques.swapaxes(0, 1), torques[:, -1].copy()
+            return _beyond(torques, self._effort)
+        last = self._torques(everywhere, theta, push[:, -1:])
+        self._torque = last[:, 0].copy()
+        over = _beyond(last, _WATCHFUL * self._effort)
+        rows = np.flatnonzero(over)
+        if len(rows):
+            full = np.concatenate([lead[rows, :2], path.joints()[rows]], axis=1)
+            over[rows] = _beyond(self._torques(rows, full, push[rows]), self._effort[rows])
+        return over
+
+    def _torques(self, rows: IntArray, theta: FloatArray, push: FloatArray) -> FloatArray:
+        """Compute the torques (r, m, 3) N m that take motors through theta (r, m + 2, 3) rad."""
+        rates = np.diff(theta, axis=1) / self.time_step
+        changes = np.diff(rates, axis=1) / self.time_step
+        built = None if self._built is None else self._built[rows]
+        against = push if self._scene.objects else None
+        torques: FloatArray = self._machine.torque(
+            theta[:, 1:-1], rates[:, :-1], changes, against, built
+        )
+        return torques
+
+    # -- reading, saving, pictures ----------------------------------------------------------
+
+    def read(self) -> Readout:
+        """See the protocol."""
+        objects = self._contact.read()
+        gap, tilt = np.zeros((2, self._count))
+        return Readout(
+            theta=self._theta.copy(),
+            theta_dot=self._rates.copy(),
+            torque=self._torque.copy(),
+            position=self._position * self._turn + self._origin,
+            tilt=tilt,
+            gap=gap,
+            mode_left=self._mode_left.copy(),
+            held=objects.held,
+            vacuum=objects.vacuum,
+            object_position=objects.position,
+            object_quaternion=objects.quaternion,
+            object_velocity=objects.velocity,
+            object_angular_velocity=objects.angular_velocity,
+        )
+
+    def save(self) -> Any:
+        """See the protocol; a dictionary of arrays by name."""
+        saved = {name.lstrip("_"): getattr(self, name).copy() for name in _COLUMNS}
+        saved["objects"] = self._contact.save(self._rows)
+        if self._drives is not None:
+            saved["drives"] = self._drives.memory.copy()
+        return saved
+
+    def restore(self, saved: Any) -> None:
+        """See the protocol."""
+        for name in _COLUMNS:
+            setattr(self, name, saved[name.lstrip("_")].copy())
+        self._contact.restore(self._rows, saved["objects"])
+        if self._drives is not None:
+            self._drives.memory[:] = saved["drives"]
+
+    def show_goal(self, markers: FloatArray) -> None:
+        """See the protocol."""
+        self._markers = markers
+
+    def picture(self, width: int, height: int) -> NDArray[np.uint8]:
+        """See the protocol."""
+        first = np.zeros(1, dtype=np.int64)
+        if self._artist is None:
+            self._artist = make_engine("pybullet", renderer=self._renderer)
+            self._artist.load(self._machine, self._scene, 1)
+        theta = self._machine.require_inverse(self._position[:1])
+        now = self._contact.read()
+        objects = np.concatenate([now.position[:1], now.quaternion[:1]], axis=2)
+        self._artist.place(first, theta, objects)
+        if self._markers is not None:
+            self._artist.show_goal(self._markers)
+        return self._artist.picture(width, height)
+
+    def close(self) -> None:
+        """See the protocol."""
+        if self._artist is not None:
+            self._artist.close()
+            self._artist = None
+
+
+def _beyond(torques: FloatArray, effort: FloatArray) -> BoolArray:
+    """Return (r,) whether one of torques (r, m, 3) is more than a motor's effort (r, 3)."""
+    beyond: BoolArray = (np.abs(torques) > effort[:, None]).any(axis=(1, 2))
+    return beyond

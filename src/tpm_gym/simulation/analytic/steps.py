@@ -1,0 +1,195 @@
+"""Compiled time steps of forward dynamics, for many machines."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tpm_gym.arrays import BoolArray, FloatArray
+from tpm_gym.compiling import compiled, kept
+from tpm_gym.simulation.compiled import inverted
+
+__all__ = ["driven_ideally", "driven_by_torque"]
+
+_CREEP = 2e-5  # m/s, at which friction gives way, instead of not at all
+_SIGNS = np.array([(i, j, k) for i in (0, 1, -1) for j in (0, 1, -1) for k in (0, 1, -1)], float)
+
+
+@kept
+def driven_ideally(
+    reference: FloatArray,
+    effort: FloatArray,
+    theta: FloatArray,
+    rates: FloatArray,
+    mass: FloatArray,
+    load: FloatArray,
+    step: float,
+    new_rates: FloatArray,
+    torque: FloatArray,
+    behind: BoolArray,
+) -> None:
+    """Run a time step of ideal drives, which remove their error as far as their effort allows.
+
+    Args:
+        reference: (r, 3) rad, at the end of the time step.
+        effort: (r, 3) N m, largest torques.
+        theta: (r, 3) rad.
+        rates: (r, 3) rad/s.
+        mass: (r, 3, 3) kg m^2; mass theta_ddot = torque - load.
+        load: (r, 3) N m.
+        step: s.
+        new_rates: (r, 3) rad/s, at the end of the time step; written.
+        torque: (r, 3) N m; written.
+        behind: (r,) whether a motor was at its limit; written.
+    """
+    goal, impulse, limit, short = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    for row in range(len(theta)):
+        for i in range(3):
+            goal[i] = (reference[row, i] - theta[row, i]) / step
+        for i in range(3):
+            impulse[i] = -step * load[row, i]
+            for k in range(3):
+                impulse[i] += mass[row, i, k] * (rates[row, k] - goal[k])
+            limit[i] = step * effort[row, i]
+        resisted(mass[row], impulse, limit, short)
+        behind[row] = short[0] != 0 or short[1] != 0 or short[2] != 0
+        for i in range(3):
+            new_rates[row, i] = goal[i] + short[i]
+            needed = -impulse[i]
+            for k in range(3):
+                needed += mass[row, i, k] * short[k]
+            torque[row, i] = needed / step
+
+
+@kept
+def driven_by_torque(
+    torque: FloatArray,
+    friction: FloatArray,
+    rates: FloatArray,
+    mass: FloatArray,
+    load: FloatArray,
+    step: float,
+    new_rates: FloatArray,
+) -> None:
+    """Run a time step of motors that apply a torque against Coulomb friction.
+
+    Args:
+        torque: (r, 3) N m.
+        friction: (r, 3) N m, on the motors' axes.
+        rates: (r, 3) rad/s.
+        mass: (r, 3, 3) kg m^2; mass theta_ddot = torque - load - friction.
+        load: (r, 3) N m.
+        step: s.
+        new_rates: (r, 3) rad/s, at the end of the time step; written.
+    """
+    impulse, limit = np.empty(3), np.empty(3)
+    for row in range(len(rates)):
+        for i in range(3):
+            impulse[i] = step * (torque[row, i] - load[row, i])
+            for k in range(3):
+                impulse[i] += mass[row, i, k] * rates[row, k]
+            limit[i] = step * friction[row, i]
+        resisted(mass[row], impulse, limit, new_rates[row])
+
+
+@compiled
+def resisted(mass: FloatArray, impulse: FloatArray, limit: FloatArray, rates: FloatArray) -> None:
+    """Find the rates u (3,) that an impulse gives against Coulomb friction.
+
+    mass u = impulse - resistance. The resistance is limit sign(u), and up to limit where u is zero.
+    So u minimises u mass u / 2 - impulse u + limit |u|.
+
+    Args:
+        mass: (3, 3) kg m^2, symmetric.
+        impulse: (3,) N m s.
+        limit: (3,) N m s, zero or more.
+        rates: (3,) rad/s; written.
+    """
+    signs, best = np.zeros(3), np.inf
+    _solved(mass, impulse, limit, signs, np.ones(3), rates)
+    if limit[0] == 0 and limit[1] == 0 and limit[2] == 0:
+        return
+    tried = np.empty(3)
+    signs[:] = np.sign(rates)
+    _solved(mass, impulse, limit, signs, np.ones(3), tried)
+    if tried[0] * signs[0] > 0 and tried[1] * signs[1] > 0 and tried[2] * signs[2] > 0:
+        rates[:] = tried
+        return
+    for choice in range(27):  # all ways in which three rates are zero or have a sign
+        signs[:] = _SIGNS[choice]
+        _solved(mass, impulse, limit, signs, np.abs(signs), tried)
+        cost = 0.0
+        for i in range(3):
+            share = 0.0
+            for k in range(3):
+                share += mass[i, k] * tried[k]
+            cost += tried[i] * (share / 2 - impulse[i]) + limit[i] * abs(tried[i])
+        if cost < best:
+            best = cost
+            rates[:] = tried
+
+
+@compiled
+def _solved(
+    mass: FloatArray,
+    impulse: FloatArray,
+    limit: FloatArray,
+    signs: FloatArray,
+    moving: FloatArray,
+    rates: FloatArray,
+) -> None:
+    """Solve mass u = impulse - limit signs for what moves (1); the rest (0) has u = 0."""
+    inverse = np.empty((3, 3))
+    m0, m1, m2 = moving
+    inverted(
+        mass[0, 0] * m0 + 1 - m0, mass[0, 1] * m0 * m1, mass[0, 2] * m0 * m2,
+        mass[1, 1] * m1 + 1 - m1, mass[1, 2] * m1 * m2, mass[2, 2] * m2 + 1 - m2, inverse,
+    )  # fmt: skip
+    for i in range(3):
+        rates[i] = 0.0
+        for k in range(3):
+            rates[i] += inverse[i, k] * moving[k] * (impulse[k] - limit[k] * signs[k])
+
+
+@kept
+def felt(
+    mass: FloatArray,
+    bias: FloatArray,
+    jacobian: FloatArray,
+    force: FloatArray,
+    carried: FloatArray,
+    travel: FloatArray,
+    step: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Compute the inertia (r, 3, 3) and load (r, 3) that motors feel, with objects on P.
+
+    The level part of a force that opposes the motion is friction. It is taken as proportional to
+    the velocity at the end of the time step: taken from the beginning, friction would overshoot
+    what it stops, and push it to and fro.
+
+    Args:
+        mass: (r, 3, 3) kg m^2, of the machine alone.
+        bias: (r, 3) N m, of the machine alone.
+        jacobian: (r, 3, 3) m/rad.
+        force: (r, 3) N on P, in the last time step, machine's frame.
+        carried: (r,) kg, moving with P.
+        travel: (r, 3) m, of P in the last time step.
+        step: s.
+    """
+    inertia, load = mass.copy(), bias.copy()
+    for row in range(len(mass)):
+        x, y, z = force[row]
+        if x == 0 and y == 0 and z == 0 and carried[row] == 0:
+            continue
+        u, v = travel[row, 0] / step, travel[row, 1] / step
+        speed = np.sqrt(u * u + v * v)
+        slow = max(speed, _CREEP)
+        opposing = max(-(x * u + y * v), 0.0)
+        share = speed / slow if opposing > 0 else 1.0
+        level = carried[row] + step * opposing / (max(speed, 1e-12) * slow)
+        j = jacobian[row]
+        for i in range(3):
+            load[row, i] -= share * (j[0, i] * x + j[1, i] * y) + j[2, i] * z
+            for k in range(3):
+                inertia[row, i, k] += level * (j[0, i] * j[0, k] + j[1, i] * j[1, k])
+                inertia[row, i, k] += carried[row] * (j[2, i] * j[2, k])
+    return inertia, load

@@ -1,0 +1,123 @@
+"""Compiled loops over robots that all engines share. Importing this module imports Numba."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tpm_gym.arrays import FloatArray
+from tpm_gym.compiling import compiled, kept
+
+__all__ = ["braced_inverse", "inverted", "limited", "servo_torques", "spline_points"]
+
+
+@kept
+def spline_points(commands: FloatArray, weights: FloatArray) -> FloatArray:
+    """Compute points (n, k, 3) along splines, from commands (n, 3, 3) and weights (k, 3)."""
+    points = np.empty((len(commands), len(weights), 3))
+    for row in range(len(commands)):
+        one, two, three = commands[row]
+        for k in range(len(weights)):
+            u, v, w = weights[k]
+            for axis in range(3):
+                points[row, k, axis] = u * one[axis] + v * two[axis] + w * three[axis]
+    return points
+
+
+@kept
+def braced_inverse(
+    mass: FloatArray, stiffness: FloatArray, damping: float, step: float
+) -> FloatArray:
+    """Invert mass + step (step stiffness + damping), row by row (n, 3, 3)."""
+    inverse = np.empty_like(mass)
+    for row in range(len(mass)):
+        a, d, f = (
+            mass[row, 0, 0] + step * (step * stiffness[row, 0] + damping),
+            mass[row, 1, 1] + step * (step * stiffness[row, 1] + damping),
+            mass[row, 2, 2] + step * (step * stiffness[row, 2] + damping),
+        )
+        inverted(a, mass[row, 0, 1], mass[row, 0, 2], d, mass[row, 1, 2], f, inverse[row])
+    return inverse
+
+
+@compiled
+def inverted(
+    a: float, b: float, c: float, d: float, e: float, f: float, inverse: FloatArray
+) -> None:
+    """Invert a symmetric matrix, given by its upper triangle, into ``inverse`` (3, 3)."""
+    p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
+    determinant = a * p + b * q + c * r
+    inverse[0, 0], inverse[0, 1], inverse[0, 2] = p / determinant, q / determinant, r / determinant
+    inverse[1, 0], inverse[2, 0] = inverse[0, 1], inverse[0, 2]
+    inverse[1, 1], inverse[1, 2] = (a * f - c * c) / determinant, (b * c - a * e) / determinant
+    inverse[2, 1], inverse[2, 2] = inverse[1, 2], (a * d - b * b) / determinant
+
+
+@kept
+def servo_torques(
+    reference: FloatArray,
+    reference_dot: FloatArray,
+    forward: FloatArray,
+    theta: FloatArray,
+    theta_dot: FloatArray,
+    stiffness: FloatArray,
+    damping: float,
+    mass: FloatArray,
+    inverse: FloatArray,
+    effort: FloatArray,
+    line: FloatArray,
+    step: float,
+    memory: FloatArray,
+) -> None:
+    """Apply the law of :class:`tpm_gym.simulation.drives.ServoDrives` in one time step.
+
+    Args:
+        reference: (n, 3) rad, at the end of the time step.
+        reference_dot: (n, 3) rad/s.
+        forward: (n, 3) N m, fed forward.
+        theta: (n, 3) rad, at the beginning of the time step.
+        theta_dot: (n, 3) rad/s.
+        stiffness: (n, 3) N m/rad.
+        damping: N m s/rad.
+        mass: (n, 3, 3) kg m^2, the inertia that the drives reckon with.
+        inverse: (n, 3, 3), of mass + step (step stiffness + damping).
+        effort: (n, 3) N m, largest torques.
+        line: (3, 2) rad/s, corner and no-load speed of each motor.
+        step: s.
+        memory: (2, n, 3) torques and joint velocities of the last time step; overwritten.
+    """
+    load, wanted, change = np.empty(3), np.empty(3), np.empty(3)
+    for row in range(len(theta)):
+        for i in range(3):
+            load[i] = memory[0, row, i]
+            for k in range(3):
+                acceleration = (theta_dot[row, k] - memory[1, row, k]) / step
+                load[i] -= mass[row, i, k] * acceleration
+        for i in range(3):
+            rate = theta_dot[row, i]
+            behind = reference[row, i] - theta[row, i] - step * rate
+            slower = reference_dot[row, i] - rate
+            wanted[i] = stiffness[row, i] * behind + damping * slower + forward[row, i] - load[i]
+        for i in range(3):
+            change[i] = 0.0
+            for k in range(3):
+                change[i] += inverse[row, i, k] * wanted[k]
+        for i in range(3):
+            torque, rate = load[i], theta_dot[row, i]
+            for k in range(3):
+                torque += mass[row, i, k] * change[k]
+            memory[0, row, i] = limited(torque, rate, effort[row, i], line[i, 0], line[i, 1])
+            memory[1, row, i] = rate
+
+
+@compiled
+def limited(torque: float, rate: float, effort: float, corner: float, speed: float) -> float:
+    """Limit a torque (N m) to what the motor has at its rate (rad/s).
+
+    Up to the corner speed the limit is ``effort``. Above it, it falls in a straight line to zero at
+    the no-load ``speed`` for a motor that drives; for one that brakes it stays, because the voltage
+    helps.
+    """
+    driving = effort * min(1.0, max(0.0, (speed - abs(rate)) / (speed - corner)))
+    high = driving if rate > 0 else effort
+    low = -effort if rate > 0 else -driving
+    return min(high, max(low, torque))
