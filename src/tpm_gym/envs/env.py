@@ -244,7 +244,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         self.observation_space = observation_space(self.task)
         self.action_space = action_space(self.task)
         self.episode = 0  # how many have been started or restored
-        self._home = self.machine.inverse(self.machine.home)
+        self._home = tuple(self.machine.require_inverse(self.machine.home).tolist())
         self._state: State | None = None
         self._goal = np.full(self.task.goal_size, np.nan)
         self._pending: tuple[tuple[float, ...], ...] = ()  # actions that come late

@@ -173,7 +173,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         self._altered = self.randomisation != Randomisation()
         many = type(self.task).sample_each is not Task.sample_each
         self._ahead_of_time = many and not self._altered
-        self._home = self.machine.inverse(self.machine.home)
+        self._home = tuple(self.machine.require_inverse(self.machine.home).tolist())
         self._limit, self._stagger = max_episode_steps, stagger
         self._rngs: list[np.random.Generator] = []
         self._ahead: dict[str, FloatArray] = {}  # starts of next episodes, where they are drawn

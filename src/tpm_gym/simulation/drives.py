@@ -15,9 +15,8 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from tpm_gym.arrays import FloatArray, Vector, is_number
-from tpm_gym.errors import ConfigurationError, SingularityError, UnreachableError
+from tpm_gym.errors import ConfigurationError
 from tpm_gym.kinematics.equations import Triple
-from tpm_gym.mechanism.batch import Batch
 from tpm_gym.mechanism.bodies import Joint
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.randomisation import NOMINAL, Plant, Randomisation
@@ -159,7 +158,7 @@ def limited(torque: float, rate: float, effort: float, motor: Joint) -> float:
 
 
 def references(
-    machine: Machine | Batch, servo: Servo, start: Any, path: Sequence[Any], time_step: float
+    machine: Any, servo: Servo, start: Any, path: Sequence[Any], time_step: float
 ) -> list[Reference]:
     """Angles with their rates, and the torques fed forward in each time step.
 
@@ -248,7 +247,7 @@ class Servos:
             if not 0 <= motor.corner < motor.speed:
                 valid = f"motors whose corner speed is below their speed, unlike {motor}"
                 raise ConfigurationError("drive", servo, valid)
-        self._home = machine.inverse(machine.home)
+        self._home: Vector = tuple(machine.require_inverse(machine.home).tolist())
         self.alter(NOMINAL)
         self.rest(self._home)
 
@@ -263,13 +262,12 @@ class Servos:
 
     def rest(self, theta: Vector) -> None:
         """Start at rest at ``theta`` rad, with what carries the machine there."""
-        self.memory = Memory(self._machine.torque(theta, _ZERO, _ZERO), _ZERO)
+        self.memory = Memory(tuple(self._machine.torque(theta, _ZERO, _ZERO).tolist()), _ZERO)
 
     def begin(self, theta: Vector) -> None:
         """Take up the inertia at ``theta`` rad, for a control period."""
-        try:
-            mass = self._inertia(theta)
-        except (UnreachableError, SingularityError):  # not this machine, if its lengths are off
+        mass = self._inertia(theta)
+        if np.isnan(mass).any():  # not this machine, if its lengths are off
             mass = self._inertia(self._home)
         stiffness, damping, step = np.array(self._stiffness), self._servo.damping, self._step
         inverse = np.linalg.inv(mass + np.diag(step * (step * stiffness + damping)))
@@ -279,7 +277,7 @@ class Servos:
         """(3, 3) kg m^2, at least as light as the true machine."""
         torque = self._machine.torque
         weight = torque(theta, _ZERO, _ZERO)
-        columns = [_minus(torque(theta, _ZERO, unit), weight) for unit in _UNITS]
+        columns = [torque(theta, _ZERO, unit) - weight for unit in _UNITS]
         return self._lightest * np.array(columns)
 
     def torque(self, reference: Reference, theta: Vector, theta_dot: Vector) -> Vector:

@@ -16,13 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tpm_gym.arrays import FloatArray, Vector, rotate, vector
-from tpm_gym.errors import (
-    ClosureError,
-    ModeChangeError,
-    SingularityError,
-    UnreachableError,
-)
-from tpm_gym.mechanism.machine import Machine, Mode, Reading
+from tpm_gym.errors import ClosureError, ModeChangeError
+from tpm_gym.mechanism.machine import MODES, Machine, Reading
 from tpm_gym.mechanism.tpm import PAPER_TPM
 from tpm_gym.simulation.drives import Reference, Servo, references, require_servo
 from tpm_gym.simulation.engine import SIMULATIONS, Engine, Pose, make_engine
@@ -48,7 +43,7 @@ class Snapshot:
     commands: tuple[Vector, Vector]
     noise: tuple[Vector, Vector]
     reading: Reading
-    mode_left: Mode | None
+    mode_left: str | None
 
 
 def make_simulation(scene: Scene, *, engine: str, **options: Any) -> Simulation:
@@ -109,7 +104,7 @@ class Simulation:
         self._commands = (_ZERO, _ZERO)  # the last two, machine's frame, m
         self._noise = (_ZERO, _ZERO)  # of the last two readings of the encoders, rad
         self._reading: Reading  # the last one that made sense
-        self._mode_left: Mode | None = None
+        self._mode_left: str | None = None
         self._spline: list[list[float]] = spline_weights(self.engine.substeps).tolist()
 
     def _load(self, machine: Machine, lengths: tuple[float, ...]) -> None:
@@ -158,7 +153,7 @@ class Simulation:
         """
         require_servo(self.drive, plant.servo_stiffness, plant.joint_friction)
         angles = vector("theta", theta)
-        reading = self.machine.evaluate(angles)
+        reading = self.machine.require_evaluate(angles)
         a, b, c = (angle - bias for angle, bias in zip(angles, plant.encoder_bias, strict=True))
         true_machine = self._true(plant)
         true_machine.require_within_stops((a, b, c))
@@ -170,7 +165,8 @@ class Simulation:
         # What is true of the nominal machine, in case the encoders' errors make no sense.
         self._reading = reading
         self._mode_left, self._noise = None, (noise, noise)
-        self._commands = (reading.position,) * 2
+        x, y, z = reading.position.tolist()
+        self._commands = ((x, y, z),) * 2
         return self.read()
 
     def _poses(self, objects: Mapping[str, ArrayLike]) -> list[Pose]:
@@ -209,7 +205,7 @@ class Simulation:
         before, last = self._commands
         new = vector("command", command)
         # The spline may end before the command does.
-        a, b, c = map(sub, self.machine.inverse(new), self.plant.encoder_bias)
+        a, b, c = map(sub, self.machine.require_inverse(new).tolist(), self.plant.encoder_bias)
         self.machine.require_within_stops((a, b, c))
         followed = self._references(before, last, new)
         self._commands = (last, new)
@@ -219,16 +215,12 @@ class Simulation:
 
     def _references(self, before: Vector, last: Vector, new: Vector) -> list[Reference]:
         """Where the motors shall be along the spline through three commands (m)."""
-        inverse, bias = self.machine.inverse, self.plant.encoder_bias
-        (a, b, c), (d, e, f), (x, y, z) = before, last, new
-        path = [
-            inverse((u * a + v * d + w * x, u * b + v * e + w * y, u * c + v * f + w * z))
-            for u, v, w in self._spline
-        ]
+        bias, commands = self.plant.encoder_bias, np.array([before, last, new])
+        path = list(map(_triple, self.machine.require_inverse(np.array(self._spline) @ commands)))
         if self.drive is None:
             found = list(map(Reference, path))
         else:
-            start = inverse(((a + d) / 2, (b + e) / 2, (c + f) / 2))
+            start = _triple(self.machine.require_inverse((commands[0] + commands[1]) / 2))
             found = references(self.machine, self.drive, start, path, CONTROL_PERIOD / len(path))
         if bias != _ZERO:
             b1, b2, b3 = bias
@@ -256,14 +248,16 @@ class Simulation:
         if moved:
             self._torque = torque
         theta, rates = self._disturb(true_theta, true_rates)
-        position, jacobian, conditioning = self._evaluate(theta)
+        position, jacobian, conditioning, _ = self._evaluate(theta)
         mount, hold = self.machine.mount, self.engine.hold()
         if self._mode_left is None:
-            self._mode_left = self._true_machine.mode_left(true_theta, mount.swap(platform))
+            left = self._true_machine.mode_left(true_theta, mount.swap(platform))
+            self._mode_left = MODES[int(left)]
         r1, r2, r3 = rates
-        x, y, z = [a * r1 + b * r2 + c * r3 for a, b, c in jacobian]
+        x, y, z = [a * r1 + b * r2 + c * r3 for a, b, c in jacobian.tolist()]
         swap = mount.swap
-        place, speed, command = swap(position), mount.turn((x, y, z)), swap(self._commands[1])
+        place, speed = swap(_triple(position)), mount.turn((x, y, z))
+        command = swap(self._commands[1])
         # All in one array cost half of what an array of each does.
         numbers = [*theta, *rates, *self._torque, *place, *speed, *platform, *command]
         for (where, turn), (velocity, spin) in self.engine.objects():
@@ -277,7 +271,7 @@ class Simulation:
                 "torque": array[6:9],
                 "fk_position": array[9:12],
                 "fk_velocity": array[12:15],
-                "conditioning": conditioning,
+                "conditioning": float(conditioning),
                 "platform_position": array[15:18],
                 "platform_tilt": tilt,
                 "closure_error": gap,
@@ -310,9 +304,8 @@ class Simulation:
         That is what a controller can do whose disturbed encoders report angles at which no assembly
         exists, as happens near the edges of the workspace.
         """
-        try:
-            reading = self.machine.evaluate(theta)
-        except (UnreachableError, SingularityError):
+        reading = self.machine.evaluate(theta)
+        if np.isnan(reading.conditioning):
             reading = self._reading
         self._reading = reading
         return reading
@@ -360,3 +353,8 @@ def spline_weights(substeps: int) -> FloatArray:
     """(substeps, 3) weights of the last three commands along the quadratic B-spline."""
     s = np.arange(1, substeps + 1) / substeps
     return np.stack([(1 - s) ** 2, 1 + 2 * s - 2 * s**2, s**2], axis=1) / 2
+
+
+def _triple(array: FloatArray) -> Vector:
+    a, b, c = array.tolist()
+    return a, b, c

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tpm_gym.arrays import FloatArray, Vector
-from tpm_gym.errors import ConfigurationError, UnreachableError
+from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.machine import Machine
 
 __all__ = ["CartesianControl", "Control", "JointControl", "make_control"]
@@ -35,10 +35,7 @@ class Control(Protocol):
         """The next command, for an action in [-1, 1] and the current command."""
 
     def command(self, action: ArrayLike, current: ArrayLike) -> FloatArray:
-        """The same for arrays of both, (3,).
-
-        Or (n, 3), of machines that have a :meth:`~tpm_gym.Machine.batch`.
-        """
+        """Compute the next commands (..., 3) for arrays of both."""
 
     def action(self, wanted: ArrayLike, current: ArrayLike) -> FloatArray:
         """The action (3,) in [-1, 1] that moves the command from current towards wanted."""
@@ -92,79 +89,32 @@ class JointControl:
         self._machine, self._step = machine, np.array(machine.step_limit)
 
     def next(self, action: Vector, current: Vector) -> Vector:
-        """Point P after the (slowed down) increment of the joints, projected into the region."""
-        joints = self._machine.inverse(current)
-        step = np.array(action) * self._machine.joint_limit
-        # By J, this fraction of the step uses the limit up; the exact one is near.
-        rate = np.abs(np.array(self._machine.evaluate(joints).jacobian) @ step)
-        linear = float((self._step / np.maximum(rate, 1e-12)).min())
-        low, high = 0.0, min(1.0, 2 * linear)
-        turn = _vector(step)
-        point = self._allowed(joints, turn, high, current)
-        if point is None:
-            point = current
-            for _ in range(_BISECTIONS):
-                middle = (low + high) / 2
-                tried = self._allowed(joints, turn, middle, current)
-                if tried is None:
-                    high = middle
-                else:
-                    low, point = middle, tried
-        return self._machine.region.nearest(point)
+        """Compute the next command; see :meth:`command`."""
+        return _vector(self.command(action, current))
 
     def command(self, action: ArrayLike, current: ArrayLike) -> FloatArray:
-        """The same for arrays (..., 3)."""
-        actions, start = (np.asarray(a, dtype=np.float64) for a in (action, current))
-        if start.ndim == 1:
-            return np.array(self.next(_vector(actions), _vector(start)))
-        return self._commands(actions, start)
-
-    def _commands(self, actions: FloatArray, current: FloatArray) -> FloatArray:
-        """The same for a batch (n, 3)."""
-        start, limit = np.ascontiguousarray(current.T), self._step[:, None]
-        batch = self._machine.batch(len(current))
-        theta = batch.inverse(start)
-        step = np.ascontiguousarray(actions.T) * self._machine.joint_limit
-        a, b, c = batch.evaluate(theta).jacobian.swapaxes(0, 1)
-        rate = np.abs(a * step[0] + b * step[1] + c * step[2])
-        linear = (limit / np.maximum(rate, 1e-12)).min(axis=0)
-        high = np.minimum(1.0, 2 * linear)
-        point = batch.forward(theta + high * step)
-        slow = np.nonzero(~(np.abs(point - start) <= limit).all(axis=0))[0]
-        if len(slow):
-            point[:, slow] = self._slowed(start[:, slow], theta[:, slow], step[:, slow], high[slow])
-        return self._machine.region.project(point.T)
-
-    def _slowed(
-        self, start: FloatArray, theta: FloatArray, step: FloatArray, high: FloatArray
-    ) -> FloatArray:
-        """Point P where the joints' step, shortened by bisection, is no more than P's (3, n)."""
-        batch, limit = self._machine.batch(start.shape[1]), self._step[:, None]
-        low, point = np.zeros_like(high), start
-        for _ in range(_BISECTIONS):
+        """Compute P (..., 3) after the (slowed down) increment of the joints, within the region."""
+        start, limit, forward = np.asarray(current), self._step, self._machine.forward
+        theta = self._machine.inverse(start)
+        step = np.asarray(action) * self._machine.joint_limit
+        # By J, this fraction of the step uses the limit up; the exact one is near.
+        rate = np.abs(np.einsum("...ij,...j->...i", self._machine.evaluate(theta).jacobian, step))
+        linear = (limit / np.maximum(rate, 1e-12)).min(axis=-1, keepdims=True)
+        low, high = np.zeros_like(linear), np.minimum(1.0, 2 * linear)
+        whole = forward(theta + high * step)
+        fits = (np.abs(whole - start) <= limit).all(axis=-1, keepdims=True)
+        point = np.where(fits, whole, start)
+        for _ in range(0 if fits.all() else _BISECTIONS):
             middle = (low + high) / 2
-            tried = batch.forward(theta + middle * step)
-            allowed = (np.abs(tried - start) <= limit).all(axis=0)
+            tried = forward(theta + middle * step)
+            allowed = (np.abs(tried - start) <= limit).all(axis=-1, keepdims=True)
             low, high = np.where(allowed, middle, low), np.where(allowed, high, middle)
-            point = np.where(allowed, tried, point)
-        return point
-
-    def _allowed(self, joints: Vector, turn: Vector, share: float, start: Vector) -> Vector | None:
-        """Point P that ``share`` of the turn further, if it is in the modes and a step away."""
-        a, b, c = joints
-        d, e, f = turn
-        try:
-            x, y, z = self._machine.forward((a + share * d, b + share * e, c + share * f))
-        except UnreachableError:
-            return None
-        # In plain floats: asked up to eleven times in a control step
-        (u, v, w), (p, q, r) = start, self._machine.step_limit
-        return (x, y, z) if abs(x - u) <= p and abs(y - v) <= q and abs(z - w) <= r else None
+            point = np.where(allowed & ~fits, tried, point)
+        return self._machine.region.project(point)
 
     def action(self, wanted: ArrayLike, current: ArrayLike) -> FloatArray:
         """The increment of the joints, scaled down as a whole where it is too large."""
-        inverse = self._machine.inverse
-        there, here = (inverse(_vector(np.asarray(p))) for p in (wanted, current))
+        there, here = self._machine.require_inverse(np.array([wanted, current]))
         step: FloatArray = np.subtract(there, here) / self._machine.joint_limit
         return step / max(1.0, float(np.abs(step).max()))
 
@@ -173,10 +123,10 @@ class JointControl:
 
         What lies beyond the region is projected into it, as commands are.
         """
-        inverse, project = self._machine.inverse, self._machine.region.project
         parts = np.linspace(0.0, 1.0, _PARTS + 1)[:, None]
         way = np.asarray(current) + parts * np.subtract(wanted, current)
-        turns = np.diff([inverse(_vector(project(point))) for point in way], axis=0) * _PARTS
+        theta = self._machine.require_inverse(self._machine.region.project(way))
+        turns = np.diff(theta, axis=0) * _PARTS
         joints = float(np.abs(turns).max()) / self._machine.joint_limit
         return max(joints, float((np.abs(way[-1] - way[0]) / self._step).max()))
 

@@ -54,7 +54,7 @@ class PickAndPlace(Task):
             first, last = (from_p(points) - offset for points in zip(*pairs, strict=True))
             return {"object": first, "goal": last, **given}
         if "object" not in given:
-            given["object"] = from_p(machine.sample_each(rngs, [table] * count)) - offset
+            given["object"] = from_p(machine.sample(rngs, [table] * count)) - offset
         if "goal" not in given:
             start = to_p(given["object"] + offset)[:, None]
             regions = [self._draw_region(rng) for rng in rngs]

@@ -69,13 +69,13 @@ def apart_from_each(
     apart: float = APART,
 ) -> FloatArray:
     """The same for r generators and regions, others (k, 3) for all or (r, k, 3): (r, 3) m."""
-    points = machine.sample_each(rngs, regions)
+    points = machine.sample(rngs, regions)
     for _ in range(_ATTEMPTS):
         near = rewards.distance(points[:, None], others) < apart
         rows = np.flatnonzero(near.any(axis=1)).tolist()
         if not rows:
             return points
-        points[rows] = machine.sample_each([rngs[k] for k in rows], [regions[k] for k in rows])
+        points[rows] = machine.sample([rngs[k] for k in rows], [regions[k] for k in rows])
     valid = f"a larger one: what is drawn lies {apart} m from the start, or from other objects"
     raise ConfigurationError("goal_region", regions[rows[0]], valid)
 
@@ -128,8 +128,7 @@ def line_in_joints(machine: Machine, start: ArrayLike, end: ArrayLike) -> FloatA
     0 where they cannot be assembled.
     """
     ends = np.asarray([start, end], dtype=np.float64)
-    flat = [machine.inverse((x, y, z)) for x, y, z in ends.reshape(-1, 3).tolist()]
-    first, last = np.array(flat).reshape(ends.shape)
+    first, last = machine.require_inverse(ends)
     fractions = _FRACTIONS.reshape(-1, *(1,) * first.ndim)
     return machine.conditioning(first + fractions * (last - first))
 

@@ -14,6 +14,7 @@ import numpy as np
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray
 from tpm_gym.mechanism.dynamics import SYMMETRIC, solve
 from tpm_gym.mechanism.machine import Machine
+from tpm_gym.simulation.analytic.columns import Batch
 from tpm_gym.simulation.drives import Gains, Memory, Reference, Servo, wanted
 from tpm_gym.simulation.randomisation import NOMINAL, Plant
 
@@ -97,7 +98,7 @@ class ServoDrives:
         """Be the nominal drives, the machines at rest at home."""
         count = memory.shape[2]
         self.law, self._memory, self._step = law, memory, time_step
-        self._machine, self._model = machine, machine.batch(count)
+        self._machine, self._model = machine, Batch(machine, count)
         motors = machine.mechanism.motors
         self._speed = np.array([[motor.speed] for motor in motors])
         self._corner = np.array([[motor.corner] for motor in motors])

@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray
-from tpm_gym.mechanism.batch import Batch, Motion
+from tpm_gym.mechanism.machine import Motion
+from tpm_gym.simulation.analytic.columns import Batch
 from tpm_gym.simulation.analytic.drives import Drive
 from tpm_gym.simulation.drives import Reference
 

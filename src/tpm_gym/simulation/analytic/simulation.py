@@ -19,9 +19,9 @@ import numpy as np
 
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray
 from tpm_gym.errors import ConfigurationError
-from tpm_gym.mechanism.batch import Readings
-from tpm_gym.mechanism.machine import Machine
+from tpm_gym.mechanism.machine import Machine, Reading
 from tpm_gym.mechanism.tpm import PAPER_TPM
+from tpm_gym.simulation.analytic.columns import Batch
 from tpm_gym.simulation.analytic.drives import Drive, IdealDrives, ServoDrives
 from tpm_gym.simulation.analytic.motion import Course, march
 from tpm_gym.simulation.analytic.physics import Physics
@@ -58,7 +58,7 @@ class AnalyticSimulation:
     Args:
         scene: What stands on each table besides the robot: one object at most.
         count: How many.
-        machine: The nominal machine, which has a :meth:`~tpm_gym.Machine.batch`.
+        machine: The nominal machine, the same for all.
         physics: A :class:`Physics`, or a mapping of its attributes.
         drive: The motors' servo drives; None for ideal ones.
 
@@ -92,21 +92,21 @@ class AnalyticSimulation:
         self._tail = {"none": 2, "last": 3, "every": steps}[self.physics.torques]
         # Made once: memory of this size would be fetched anew in every control period.
         self._ways = np.empty((2, steps + 2, 3, count))
-        self._nominal, self._true = machine.batch(count), machine.batch(count)
+        self._nominal, self._true = Batch(machine, count), Batch(machine, count)
         block = scene.objects[0] if scene.objects else None
         self._pucks = Pucks(block, count, self._step, machine.table)
         self._mount = np.array([[0.0], [0.0], [machine.mount.height]])
         motors = machine.mechanism.motors
         self._nominal_effort = np.array([[motor.effort] for motor in motors])
-        self._set_up(machine.inverse(machine.home))
+        self._set_up(tuple(machine.inverse(machine.home).tolist()))
 
     def _set_up(self, home: tuple[float, float, float]) -> None:
         """All columns (..., n), at rest at home."""
         n = self.count
         self._plants = [NOMINAL] * n
-        self._start: tuple[tuple[float, ...], Readings] = (
+        self._start: tuple[tuple[float, ...], Reading] = (
             (),
-            self.machine.batch(0).evaluate(np.empty((3, 0))),
+            Batch(self.machine, 0).evaluate(np.empty((3, 0))),
         )
         self._bias = np.zeros((3, n))
         self._effort = np.repeat(self._nominal_effort, n, axis=1)
@@ -171,11 +171,11 @@ class AnalyticSimulation:
         if self.scene.objects:
             self._pucks.place(rows, objects[self.scene.objects[0].name])
 
-    def _reading_at(self, theta: tuple[float, ...]) -> Readings:
+    def _reading_at(self, theta: tuple[float, ...]) -> Reading:
         """What follows from angles at which episodes start: mostly the same ones."""
         if theta != self._start[0]:
             columns = np.array(theta, dtype=np.float64)[:, None]
-            self._start = theta, self.machine.batch(1).evaluate(columns)
+            self._start = theta, Batch(self.machine, 1).evaluate(columns)
         return self._start[1]
 
     def _become(self, rows: IntArray, plants: Sequence[Plant]) -> None:
@@ -414,7 +414,7 @@ class AnalyticSimulation:
         batch = self._nominal if isinstance(rows, slice) else self._nominal.take(rows)
         self._write(rows, batch.evaluate(theta))
 
-    def _write(self, rows: IntArray | slice, reading: Readings) -> None:
+    def _write(self, rows: IntArray | slice, reading: Reading) -> None:
         position, jacobian, conditioning, _ = reading
         if np.isfinite(conditioning).all() and isinstance(rows, slice):
             self._position, self._jacobian, self._conditioning = position, jacobian, conditioning

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields
-from operator import sub
 from typing import Any
 
 import numpy as np
@@ -74,11 +73,11 @@ class SingleSimulation:
         """See :meth:`Simulation.reset`."""
         require_servo(self.drive, plant.servo_stiffness, plant.joint_friction)
         angles = vector("theta", theta)
-        self.machine.evaluate(angles)
+        self.machine.require_evaluate(angles)
         a, b, c = (angle - bias for angle, bias in zip(angles, plant.encoder_bias, strict=True))
         machine = plant.of(self.machine)
         machine.require_within_stops((a, b, c))
-        machine.evaluate((a, b, c))
+        machine.require_evaluate((a, b, c))
         start = {
             block.name: np.array([[0.0, 0.0, block.height / 2]]) for block in self.scene.objects
         }
@@ -96,7 +95,7 @@ class SingleSimulation:
             if left:
                 raise ModeChangeError(mode)
         new = vector("command", command)
-        a, b, c = map(sub, self.machine.inverse(new), self.batch.bias[:, 0].tolist())
+        a, b, c = (self.machine.require_inverse(new) - self.batch.bias[:, 0]).tolist()
         self.machine.require_within_stops((a, b, c))
         errors = None if noise == (0.0, 0.0, 0.0) else np.array([noise]).T
         self.batch.move(np.array([new]), np.array([vacuum]), errors)
@@ -127,7 +126,8 @@ class SingleSimulation:
             self._artist.load(self.machine, self.scene)
         state = self.read()
         point = self.machine.mount.to_paper(state.platform_position)
-        joints = self.machine.joint_positions(self.machine.inverse(vector("point", point)))
+        a, b, c = self.machine.require_inverse(point).tolist()
+        joints = self.machine.joint_positions((a, b, c))
         poses = zip(state.object_position.tolist(), state.object_quaternion.tolist(), strict=True)
         self._artist.place(joints, [Pose(tuple(at), tuple(turn)) for at, turn in poses])
         self._artist.show_goal(self._markers)
