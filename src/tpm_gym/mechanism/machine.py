@@ -260,7 +260,8 @@ class Machine(ABC):
     @cached_property
     def _stops(self) -> FloatArray:
         """Lowest and highest joint positions, (2, 3)."""
-        return np.array(self.mechanism.stops).T
+        stops: FloatArray = np.array(self.mechanism.stops).T
+        return stops
 
     # -- regions ----------------------------------------------------------------------------
 
