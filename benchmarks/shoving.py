@@ -40,12 +40,12 @@ class Shove(PickAndPlace):
     ) -> dict[str, FloatArray]:
         """Both on the table, APART to FARTHEST from each other."""
         table, machine = self.on_table(self.puck), self.machine
-        first = machine.sample_each(rngs, [table] * len(rngs))
+        first = machine.sample(rngs, [table] * len(rngs))
         last = first.copy()
         rows = np.arange(len(rngs))
         while len(rows):
             own = [rngs[row] for row in rows]
-            last[rows] = machine.sample_each(own, [table] * len(own))
+            last[rows] = machine.sample(own, [table] * len(own))
             way = rewards.distance(first, last)
             rows = np.flatnonzero((way < sampling.APART) | (way > FARTHEST))
         offset, to_world = hanging(self.puck), machine.mount.to_world

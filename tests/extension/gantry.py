@@ -2,8 +2,11 @@
 
 from functools import cached_property
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 from tpm_gym import register_machine
-from tpm_gym.arrays import Vector
+from tpm_gym.arrays import FloatArray, Vector
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism import Machine, Mount
 from tpm_gym.mechanism.bodies import Joint, Link, Mechanism, Solid
@@ -25,13 +28,16 @@ def beam(size: Vector, wall: float, centre: Vector, colour: str) -> Solid:
 class Gantry(Machine):
     """The positions of the slides (m) are the coordinates of P."""
 
-    def inverse(self, point: Vector) -> Vector:
+    def inverse(self, position: ArrayLike, built: FloatArray | None = None) -> FloatArray:
         """Every point is reached."""
-        return point
+        return np.array(position, dtype=float)
 
-    def evaluate(self, theta: Vector) -> Reading:
+    def evaluate(self, theta: ArrayLike, built: FloatArray | None = None) -> Reading:
         """No singularity anywhere."""
-        return Reading(theta, IDENTITY, 1.0)
+        position = np.array(theta, dtype=float)
+        shape = position.shape[:-1]
+        jacobian = np.broadcast_to(np.eye(3), (*shape, 3, 3))
+        return Reading(position, jacobian, np.ones(shape), np.ones(shape, dtype=bool))
 
     def joint_positions(self, theta: Vector) -> dict[str, float]:
         """A tree: no loop to close."""

@@ -7,13 +7,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from examples import examples
-from hypothesis import strategies as st
 from machines import anywhere, each_machine, within
 from walk import walk
 
 from tpm_gym.arrays import Vector
-from tpm_gym.errors import ConfigurationError, SingularityError, TPMError, UnreachableError
+from tpm_gym.errors import (
+    ConfigurationError,
+    JointLimitError,
+    SingularityError,
+    TPMError,
+    UnreachableError,
+)
 from tpm_gym.kinematics import inverse
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.mechanism import (
@@ -29,74 +33,66 @@ from tpm_gym.mechanism import (
 )
 from tpm_gym.mechanism.bodies import Mechanism
 from tpm_gym.mechanism.cup import CUP
-
-share = st.floats(0.0, 1.0)
+from tpm_gym.mechanism.machine import MODES
 
 
 @each_machine
-@examples(100, st.tuples(share, share, share))
-def test_kinematics_agree_all_over_the_region(machine: TPM, shares: Vector) -> None:
-    point = within(machine, shares)
-    theta = machine.inverse(tuple(point.tolist()))
-    position, rows, conditioning = machine.evaluate(theta)
-    np.testing.assert_allclose(position, point, rtol=0, atol=1e-9)
-    assert machine.forward(theta) == position
-    assert machine.mode_left(theta, position) is None
+def test_kinematics_agree_all_over_the_region(machine: TPM) -> None:
+    points = np.array(anywhere(machine, 100))
+    theta = machine.require_inverse(points)
+    position, rows, conditioning, working = machine.require_evaluate(theta)
+    np.testing.assert_allclose(position, points, rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(machine.forward(theta), position)
+    assert working.all()
+    assert machine.same_side(points).all()
+    assert not machine.mode_left(theta, position).any()
     steps = 1e-6 * np.eye(3)
-    ends = [[machine.forward(tuple(theta + by)) for by in (step, -step)] for step in steps]
-    jacobian = np.array([np.subtract(*pair) / 2e-6 for pair in ends]).T
-    np.testing.assert_allclose(rows, jacobian, rtol=1e-5, atol=1e-5)
-    assert conditioning == pytest.approx(1 / np.linalg.cond(rows), rel=1e-9)
-    positions = machine.joint_positions(theta)
-    assert positions == tree.joint_angles(theta, machine.assembly_mode, machine.geometry)
-    assert tuple(positions[name] for name in machine.mechanism.actuated) == theta
+    columns = [(machine.forward(theta + s) - machine.forward(theta - s)) / 2e-6 for s in steps]
+    np.testing.assert_allclose(rows, np.stack(columns, axis=-1), rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(conditioning, 1 / np.linalg.cond(rows), rtol=1e-9)
+    one = tuple(theta[0].tolist())
+    positions = machine.joint_positions(one)
+    assert positions == tree.joint_angles(one, machine.assembly_mode, machine.geometry)
+    assert tuple(positions[name] for name in machine.mechanism.actuated) == one
 
 
 @each_machine
-def test_batched_conditioning_is_that_of_each_point_and_0_where_p_cannot_be(machine: TPM) -> None:
+def test_conditioning_is_0_where_p_cannot_be(machine: TPM) -> None:
     points = np.array(anywhere(machine, 12)).reshape(3, 4, 3)
-    theta = np.array([machine.inverse(point) for point in anywhere(machine, 12)]).reshape(3, 4, 3)
+    theta = machine.inverse(points)
+    expected = machine.evaluate(theta).conditioning
+    expected[0, 0] = 0.0
     points[0, 0, 2] = 3.0
     theta[0, 0] = (0.0, np.pi, -2.0)
-    for of_points, of_joints in (
-        (machine.conditioning_at, machine.conditioning),
-        # The loops of the base class, for machines that have nothing faster.
-        (
-            lambda at: Machine.conditioning_at(machine, at),
-            lambda at: Machine.conditioning(machine, at),
-        ),
+    for found in (
+        machine.conditioning_at(points),
+        machine.conditioning(theta),
+        Machine.conditioning_at(machine, points),  # for machines that have nothing faster
     ):
-        for found in (of_points(points), of_joints(theta)):
-            assert found.shape == (3, 4)
-            assert found[0, 0] == 0
-            expected = [
-                machine.evaluate(tuple(row)).conditioning for row in theta.reshape(-1, 3)[1:]
-            ]
-            np.testing.assert_allclose(found.ravel()[1:], expected, rtol=1e-9)
+        np.testing.assert_allclose(found, expected, rtol=1e-9)
+    np.testing.assert_array_equal(machine.is_safe(points), expected >= machine.safe_conditioning)
 
 
 @each_machine
 def test_beyond_a_singularity_the_mode_that_was_left_is_named(machine: TPM) -> None:
     x, y, z = machine.home
-    theta = machine.inverse(machine.home)
-    assert machine.mode_left(theta, (x, -y, z)) == "assembly"
-    assert machine.mode_left(theta, (x, y + 0.02, z)) == "assembly"
-    assert machine.mode_left((0.0, np.pi, -2.0), machine.home) == "assembly"
-    mode = machine.working_mode
+    theta, mode = machine.inverse(machine.home), machine.working_mode
     edge = (x, 0.98 * machine.geometry.l7, 0.65)  # near l7, where the two modes meet
     folded = inverse(edge, replace(mode, cos_beta=-mode.cos_beta), machine.geometry)
-    assert machine.mode_left(tuple(folded), edge) == "working"
-    with pytest.raises(UnreachableError, match="working mode"):
-        machine.forward(tuple(folded))
-
-
-@each_machine
-def test_angles_that_were_changed_in_place_are_assembled_anew(machine: TPM) -> None:
-    theta: Any = np.array(machine.inverse(machine.home))
-    before = machine.evaluate(theta).position
-    theta += 1e-3
-    after = machine.evaluate(theta).position
-    assert after == machine.evaluate(tuple(theta)).position != before
+    cases: list[tuple[Any, Any, str | None]] = [
+        (theta, machine.home, None),
+        (theta, (x, -y, z), "assembly"),
+        (theta, (x, y + 0.02, z), "assembly"),
+        ((0.0, np.pi, -2.0), machine.home, "assembly"),
+        (theta, (np.nan, y, z), "assembly"),
+        (folded, edge, "working"),
+    ]
+    joints, points, modes = zip(*cases, strict=True)
+    left = machine.mode_left(np.array(joints), np.array(points))
+    assert [MODES[k] for k in left] == list(modes)
+    assert machine.same_side([machine.home, (x, -y, z)]).tolist() == [True, False]
+    assert np.isnan(machine.forward(folded)).all()
+    assert "working mode" in str(machine.unassembled(folded))
 
 
 @each_machine
@@ -104,7 +100,7 @@ def test_angles_that_were_changed_in_place_are_assembled_anew(machine: TPM) -> N
 def test_boxes_hold_platform_and_cup_and_no_more(machine: TPM, place: int) -> None:
     point = anywhere(machine, 2)[place]
     mechanism = machine.mechanism
-    frames = walk(mechanism, machine.joint_positions(machine.inverse(point)))
+    frames = walk(mechanism, machine.joint_positions(tuple(machine.inverse(point))))
     boxes = iter(machine.occupied(point))
     for name in (mechanism.platform, mechanism.tool):
         origin, rotation = frames[name]
@@ -240,28 +236,43 @@ def test_a_region_or_home_beyond_a_stop_is_refused_and_the_stop_is_named() -> No
 
 @each_machine
 def test_the_whole_region_is_between_the_stops(machine: TPM) -> None:
-    for shares in product(np.linspace(0, 1, 9), repeat=3):
-        machine.require_within_stops(machine.inverse(tuple(within(machine, shares).tolist())))
+    shares = list(product(np.linspace(0, 1, 9), repeat=3))
+    theta = machine.inverse(within(machine, shares))
+    machine.require_within_stops(theta)
+    theta[500, 1] = 7.0
+    with pytest.raises(JointLimitError, match="R21 cannot be at 7 rad"):
+        machine.require_within_stops(theta)
 
 
-def test_where_there_is_no_posture_the_errors_say_so() -> None:
+def test_the_first_row_without_a_solution_is_explained() -> None:
+    apart, flat = (0.0, np.pi, -2.0), PAPER_TPM.inverse((0.0, 0.0, 0.8))
+    home = PAPER_TPM.inverse(PAPER_TPM.home)
+    with pytest.raises(UnreachableError, match="leg") as caught:
+        PAPER_TPM.require_inverse([PAPER_TPM.home, (0.0, 0.03, 3.0), (0.0, 1.0, 0.8)])
+    assert caught.value.point == (0.0, 0.03, 3.0)
+    with pytest.raises(UnreachableError, match="loop") as caught:
+        PAPER_TPM.require_evaluate([[home, apart], [flat, home]])
+    assert caught.value.point == apart
+    with pytest.raises((SingularityError, UnreachableError), match="beta"):
+        PAPER_TPM.require_evaluate([home, flat])
     with pytest.raises(UnreachableError):
-        PAPER_TPM.inverse((0.0, 0.03, 3.0))
-    for ask in (PAPER_TPM.evaluate, PAPER_TPM.forward, PAPER_TPM.joint_positions):
-        with pytest.raises(UnreachableError):
-            ask((0.0, np.pi, -2.0))
-    with pytest.raises((SingularityError, UnreachableError)):
-        PAPER_TPM.evaluate(PAPER_TPM.inverse((0.0, 0.0, 0.8)))
+        PAPER_TPM.joint_positions(apart)
 
 
 def test_sampling_keeps_to_the_safe_part_and_says_where_there_is_none() -> None:
-    rng = np.random.default_rng(0)
-    points = [PAPER_TPM.sample(rng, PAPER_TPM.region) for _ in range(100)]
-    assert PAPER_TPM.region.contains(points).all()
+    regions = [PAPER_TPM.region, PAPER_TPM.goal_region] * 50
+
+    def generators() -> list[np.random.Generator]:
+        return [np.random.default_rng(seed) for seed in range(100)]
+
+    points = PAPER_TPM.sample(generators(), regions)
+    assert all(region.contains(point) for region, point in zip(regions, points, strict=True))
     assert PAPER_TPM.conditioning_at(points).min() >= PAPER_TPM.safe_conditioning
+    alone = [PAPER_TPM.sample([rng], [r])[0] for rng, r in zip(generators(), regions, strict=True)]
+    np.testing.assert_array_equal(points, alone)
     strict = replace(PAPER_TPM, safe_conditioning=0.9)
     with pytest.raises(ConfigurationError, match="safe_conditioning"):
-        strict.sample(rng, strict.region)
+        strict.sample(generators()[:1], [strict.region])
 
 
 # -- other machines --------------------------------------------------------------------------------
@@ -275,7 +286,7 @@ def scaled(factor: float) -> TPM:
 
     return TPM(
         name="mine",
-        geometry=Geometry(*times(*vars(PAPER).values())),
+        geometry=Geometry(*times(*PAPER.lengths)),
         mount=Mount(height=factor * PAPER_TPM.mount.height),
         region=Region(times(*LOW), times(*HIGH)),
         goal_region=Region(times(*PAPER_TPM.goal_region.low), times(*PAPER_TPM.goal_region.high)),
@@ -285,13 +296,12 @@ def scaled(factor: float) -> TPM:
 
 def test_lengths_of_a_user_s_own_make_a_machine() -> None:
     mine = scaled(1.25)
-    for point in anywhere(PAPER_TPM, 10):
-        theta = PAPER_TPM.inverse(point)
-        larger = (1.25 * point[0], 1.25 * point[1], 1.25 * point[2])
-        np.testing.assert_allclose(mine.inverse(larger), theta, atol=1e-12)
-        np.testing.assert_allclose(mine.forward(theta), larger, atol=1e-12)
-        conditioning = PAPER_TPM.evaluate(theta).conditioning
-        assert mine.evaluate(theta).conditioning == pytest.approx(conditioning)
+    points = np.array(anywhere(PAPER_TPM, 10))
+    theta = PAPER_TPM.inverse(points)
+    np.testing.assert_allclose(mine.inverse(1.25 * points), theta, atol=1e-12)
+    np.testing.assert_allclose(mine.forward(theta), 1.25 * points, atol=1e-12)
+    conditioning = PAPER_TPM.evaluate(theta).conditioning
+    np.testing.assert_allclose(mine.evaluate(theta).conditioning, conditioning)
     longer = tuple(length + 1e-3 for length in mine.lengths)
     assert mine.with_lengths(longer) == replace(mine, geometry=Geometry(*longer))
     with pytest.raises(TPMError, match="l4"):

@@ -243,7 +243,7 @@ def _codes(
     """Corner and spacing of the grid, and the signs at the centres of its cells."""
     if len(shape) != 3 or any(int(n) != n or n < 2 for n in shape) or shape[1] % 2:
         raise ConfigurationError("shape", shape, "three integers from 2 up, that along y even")
-    l1, l2, l3, l4, l5, l6, l7 = vars(geometry).values()
+    l1, l2, l3, l4, l5, l6, l7 = geometry.lengths
     reach = l3 + l4
     # Leg 2 is in the plane of its arm; rod 1 spans x_C and leg 3 is within a torus.
     x_low = max(l2 - l7 - l4, l2 - l7 + 2 * l5 - l1 - reach, l1 - l2 - reach)

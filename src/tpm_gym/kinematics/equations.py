@@ -6,15 +6,12 @@ problems reduce to intersecting circles. We solve those intersections as vectors
 ``a cos + b sin = c``, not with the paper's half-angle forms (Eqs. 13 and 15), which break where
 ``g_i = 0`` or ``theta_i = pi``.
 
-The functions of the first part compute with whatever their namespace ``ns`` does, see
-:mod:`tpm_gym.kinematics.namespaces`. Components (x, y, z or theta_1 to theta_3) are separate
-floats, arrays or tensors (...,), and signs of branches may be arrays that broadcast with them. They
-check nothing and raise nothing: beside a solution they return whether it is real, and the lengths
-from which the errors of the last part explain why it is not.
-
-The second part is the first in plain floats, for one configuration at every time step, with errors:
-:func:`assemble`, :func:`posture` and :func:`evaluate`, which run it as straight-line code, see
-:mod:`tpm_gym.kinematics.straight`, and :func:`conditioning_at`. Three finite floats are expected.
+The functions compute with the numbers of their namespace ``ns``: arrays and tensors (see
+:mod:`tpm_gym.kinematics.namespaces`), or floats in compiled code (see
+:mod:`tpm_gym.kinematics.compiled`). Components (x, y, z or theta_1 to theta_3) are separate floats,
+arrays or tensors (...,). Signs of branches may be arrays that broadcast with them. The functions
+check and raise nothing. Beside a solution they return whether it is real, and the lengths from
+which the errors of the last part explain why it is not.
 """
 
 import math
@@ -24,11 +21,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tpm_gym.arrays import Vector
-from tpm_gym.errors import SingularityError, UnreachableError
-from tpm_gym.kinematics.geometry import Geometry, Lengths
+from tpm_gym.errors import UnreachableError
+from tpm_gym.kinematics.geometry import AnyLengths, Geometry
 from tpm_gym.kinematics.modes import AssemblyMode, WorkingMode
-from tpm_gym.kinematics.namespaces import NUMPY, PLAIN, Namespace, Numbers
-from tpm_gym.kinematics.straight import straight_line
+from tpm_gym.kinematics.namespaces import NUMPY, Namespace, Numbers
 
 ROUNDING = 64 * sys.float_info.epsilon
 """Where two solutions merge, rounding alone can push a discriminant (always scaled to order one)
@@ -76,11 +72,8 @@ class Factors(NamedTuple):
     elevation: Numbers
 
 
-# -- over any namespace ----------------------------------------------------------------------------
-
-
-def arms(theta: Triple, g: Lengths, ns: Namespace) -> tuple[Triple, Triple]:
-    """The arms A_iB_i in their planes: l3 cos(theta_i), and l3 sin(theta_i)."""
+def arms(theta: Triple, g: AnyLengths, ns: Namespace) -> tuple[Triple, Triple]:
+    """Compute the arms A_iB_i in their planes: l3 cos(theta_i), and l3 sin(theta_i), m."""
     one, two, three = theta
     cos, sin, l3 = ns.cos, ns.sin, g.l3
     level = l3 * cos(one), l3 * cos(two), l3 * cos(three)
@@ -88,7 +81,7 @@ def arms(theta: Triple, g: Lengths, ns: Namespace) -> tuple[Triple, Triple]:
 
 
 def assembly_at(
-    cos: Triple, sin: Triple, planar: Numbers, side: Numbers, g: Lengths, ns: Namespace
+    cos: Triple, sin: Triple, planar: Numbers, side: Numbers, g: AnyLengths, ns: Namespace
 ) -> tuple[Assembly, Numbers, tuple[Numbers, Numbers, Numbers, Numbers, Numbers]]:
     """Forward kinematics (Eqs. 6 to 11, corrected) for the signs of planar factor and sin(beta).
 
@@ -105,8 +98,8 @@ def assembly_at(
     y1, z1 = g.l1 + cos[0], sin[0]
     dx, dz = cos[1] + (2.0 * g.l5 - g.l1), sin[1] - z1
     distance2 = dx * dx + dz * dz
-    along = 0.5 - ns.over(0.5 * y1 * y1, distance2)
-    across2 = ns.over(l4 * l4 - y1 * y1, distance2) - along * along
+    along = 0.5 - 0.5 * y1 * y1 / distance2
+    across2 = (l4 * l4 - y1 * y1) / distance2 - along * along
     # Both terms can be large against their difference; scale the tolerance by them.
     meet = across2 >= -ROUNDING * (1.0 + along * along)
     root = ns.root(across2)
@@ -129,7 +122,10 @@ def assembly_at(
 
 
 def posture_at(
-    point: Triple, signs: tuple[Numbers, Numbers, Numbers, Numbers], g: Lengths, ns: Namespace
+    point: Triple,
+    signs: tuple[Numbers, Numbers, Numbers, Numbers],
+    g: AnyLengths,
+    ns: Namespace,
 ) -> tuple[
     Triple,
     Numbers,
@@ -166,7 +162,7 @@ def posture_at(
 
 
 def fold(
-    a: Numbers, b: Numbers, out: Numbers, g: Lengths, ns: Namespace
+    a: Numbers, b: Numbers, out: Numbers, g: AnyLengths, ns: Namespace
 ) -> tuple[Numbers, Numbers]:
     """The arm's angle to its leg's span, of |C - A - l3 e(theta)| = l4; whether the leg reaches."""
     l3, l4 = g.l3, g.l4
@@ -176,7 +172,7 @@ def fold(
     return ns.arccos(ratio), reaches
 
 
-def rods(cos: Triple, sin: Triple, found: Assembly, g: Lengths) -> tuple[Triple, Triple, Triple]:
+def rods(cos: Triple, sin: Triple, found: Assembly, g: AnyLengths) -> tuple[Triple, Triple, Triple]:
     """The vectors B_iC_i, m."""
     x, y, _, x_c, z_c, _, _ = found
     return (
@@ -187,7 +183,11 @@ def rods(cos: Triple, sin: Triple, found: Assembly, g: Lengths) -> tuple[Triple,
 
 
 def factors(
-    cos: Triple, sin: Triple, found: Assembly, bars: tuple[Triple, Triple, Triple], g: Lengths
+    cos: Triple,
+    sin: Triple,
+    found: Assembly,
+    bars: tuple[Triple, Triple, Triple],
+    g: AnyLengths,
 ) -> Factors:
     """What vanishes where the configuration is singular, from its arms and rods."""
     (r1x, r1y, r1z), (r2x, _, r2z), (r3x, _, r3z) = bars
@@ -202,6 +202,13 @@ def factors(
         r3z * cos[2] - r3x * sin[2],
         r1z,
     )
+
+
+def regular(values: Factors, g: AnyLengths) -> Numbers:
+    """Return whether no factor of det A is zero, so that J exists."""
+    flat = SINGULAR * g.l4
+    turned = abs(values.sin_beta) >= SINGULAR
+    return turned & (abs(values.level3) >= flat) & (abs(values.planar) >= flat * g.l4)
 
 
 def velocity(bars: tuple[Triple, Triple, Triple], values: Factors) -> tuple[Triple, Triple, Triple]:
@@ -250,160 +257,8 @@ def _largest_singular_value(rows: tuple[Triple, Triple, Triple], ns: Namespace) 
     yz2 = yz * yz
     spread = ns.root((p * p + q * q + r * r + 2.0 * (xy * xy + xz * xz + yz2)) / 6.0)
     half = p * (q * r - yz2) - xy * (xy * r - yz * xz) + xz * (xy * yz - q * xz)
-    turn = ns.arccos(half / ns.maximum(ns.cube(spread), _TINY) / 2.0) / 3.0
+    turn = ns.arccos(half / ns.maximum(spread * spread * spread, _TINY) / 2.0) / 3.0
     return ns.sqrt(mean + 2.0 * spread * ns.cos(turn))
-
-
-# -- one configuration in plain floats, with errors ------------------------------------------------
-
-
-def _assembly(
-    theta: Triple, signs: tuple[Numbers, Numbers], g: Lengths, ns: Namespace
-) -> tuple[Assembly, Numbers]:
-    """The assembly, and whether it is real."""
-    return assembly_at(*arms(theta, g, ns), *signs, g, ns)[:2]
-
-
-def _posture(
-    point: Triple, signs: tuple[Numbers, Numbers, Numbers, Numbers], g: Lengths, ns: Namespace
-) -> tuple[Triple, Numbers]:
-    """The posture, and whether it is real."""
-    return posture_at(point, signs, g, ns)[:2]
-
-
-def _motion(
-    theta: Triple, signs: tuple[Numbers, Numbers], g: Lengths, ns: Namespace
-) -> tuple[Assembly, Numbers, Triple, tuple[Triple, Triple, Triple], Numbers]:
-    """The assembly, whether it is real, the factors of det A, the rows of J, the conditioning."""
-    cos, sin = arms(theta, g, ns)
-    found, real, _ = assembly_at(cos, sin, *signs, g, ns)
-    bars = rods(cos, sin, found, g)
-    values = factors(cos, sin, found, bars, g)
-    rows = velocity(bars, values)
-    return found, real, values[:3], rows, conditioning(rows, ns)
-
-
-_straight_assembly = straight_line(_assembly, "one two three", "planar side")
-_straight_posture = straight_line(_posture, "x y z", "side bend1 bend2 bend3")
-_straight_motion = straight_line(_motion, "one two three", "planar side")
-
-_last: Any = (None, None, None), None
-"""What was assembled last, and the result: who reads a robot asks for the same angles again."""
-
-
-def assemble(theta: Vector, branch: AssemblyMode, geometry: Geometry) -> Assembly:
-    """Forward kinematics on one branch (Eqs. 6 to 11, corrected), at theta (3) rad.
-
-    Raises:
-        UnreachableError: If the branch does not exist at theta.
-    """
-    found: Assembly
-    before, found = _last
-    if theta is before[0] and branch is before[1] and geometry is before[2]:
-        return found
-    signs = branch.planar, branch.sin_beta
-    try:
-        try:
-            found, real = _straight_assembly(theta, signs, geometry)
-        except ValueError:  # at the edge of what can be assembled, or beyond it
-            found, real = _assembly(theta, signs, geometry, PLAIN)
-    except ZeroDivisionError:  # concentric circles, or link 7 beside B3
-        real = False
-    if not real:
-        raise no_assembly(theta, branch, geometry)
-    _remember(theta, branch, geometry, found)
-    return found
-
-
-def _remember(theta: Vector, branch: AssemblyMode, geometry: Geometry, found: Assembly) -> None:
-    global _last
-    _last = (tuple(theta), branch, geometry), found  # so that nothing can change in it
-
-
-def posture(point: Vector, branch: WorkingMode, geometry: Geometry) -> Vector:
-    """Inverse kinematics on one branch (Eqs. 12 to 15, corrected), for point P (3) m.
-
-    Returns:
-        (3) rad; theta_1 and theta_3 in (-pi, pi], theta_2 in [0, 2 pi).
-
-    Raises:
-        UnreachableError: If the branch does not exist at the point.
-    """
-    theta: Vector
-    try:
-        try:
-            theta, real = _straight_posture(point, branch.signs, geometry)
-        except ValueError:  # at the edge of what can be reached, or beyond it
-            theta, real = _posture(point, branch.signs, geometry, PLAIN)
-    except ZeroDivisionError:  # a rod's end at the pivot
-        real = False
-    if not real:
-        raise no_posture(point, branch, geometry)
-    return theta
-
-
-def evaluate(
-    theta: Vector, branch: AssemblyMode, geometry: Geometry
-) -> tuple[Assembly, tuple[Vector, Vector, Vector], float]:
-    """The assembly, the rows of J (m/rad) and the conditioning 1/cond(J), at theta (3) rad.
-
-    Raises:
-        UnreachableError: If the branch does not exist at theta.
-        SingularityError: If theta is a parallel singularity.
-    """
-    try:
-        motion = _straight_motion(theta, (branch.planar, branch.sin_beta), geometry)
-    except (ArithmeticError, ValueError):  # nowhere, singular, or at an edge of either
-        motion = None
-    if motion is None:
-        return _evaluate_plainly(theta, branch, geometry)
-    found, real, values, rows, least = motion
-    if not real:
-        raise no_assembly(theta, branch, geometry)
-    require_regular(values, geometry)
-    _remember(theta, branch, geometry, found)
-    return found, rows, least
-
-
-def _evaluate_plainly(
-    theta: Vector, branch: AssemblyMode, geometry: Geometry
-) -> tuple[Assembly, tuple[Vector, Vector, Vector], float]:
-    """The same step by step, each of which asks whether the next can be done."""
-    found = assemble(theta, branch, geometry)
-    cos, sin = arms(theta, geometry, PLAIN)
-    bars = rods(cos, sin, found, geometry)
-    values = factors(cos, sin, found, bars, geometry)
-    require_regular(values[:3], geometry)
-    rows = velocity(bars, values)
-    return found, rows, conditioning(rows, PLAIN)
-
-
-def conditioning_at(
-    point: Vector, branch: WorkingMode, assembly: AssemblyMode, geometry: Geometry
-) -> float:
-    """1/cond(J) with P at ``point`` (3) m; 0 where that is not reachable on both branches."""
-    try:
-        theta, real, link7, _ = posture_at(point, branch.signs, geometry, PLAIN)
-        cos, sin = arms(theta, geometry, PLAIN)
-        found = Assembly(*point, *link7)
-        bars = rods(cos, sin, found, geometry)
-        values = factors(cos, sin, found, bars, geometry)
-        same = values.planar * assembly.planar > 0 and values.sin_beta * assembly.sin_beta > 0
-        return conditioning(velocity(bars, values), PLAIN) if real and same else 0.0
-    except ZeroDivisionError:  # a rod's end at the pivot, or a parallel singularity
-        return 0.0
-
-
-def require_regular(values: Triple, geometry: Geometry) -> None:
-    """Raise SingularityError if a factor of det A (the first three of Factors) is zero."""
-    sin_beta, level3, planar = values
-    near, l4 = 2.0 * SINGULAR, geometry.l4
-    # Asked in each control step: the names can wait until one is near.
-    if abs(sin_beta) > near and abs(level3) > near * l4 and abs(planar) > near * l4 * l4:
-        return
-    for name, value in parallel_factors((sin_beta, level3, planar), geometry).items():
-        if abs(value) < SINGULAR:
-            raise SingularityError(name, value)
 
 
 # -- why there is no configuration, or no velocity -------------------------------------------------

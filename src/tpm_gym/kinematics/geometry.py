@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass, fields
 from numbers import Real
+from typing import NamedTuple
 
 from tpm_gym.errors import GeometryError, InputError
 from tpm_gym.kinematics.namespaces import Numbers
@@ -12,9 +13,8 @@ _CLOSE = 1e-4
 they meet follows from angles with an error of rounding over that."""
 
 
-@dataclass(frozen=True)
-class Lengths:
-    """l1 to l7 as any numbers, unchecked: as tensors, for what is differentiated by them."""
+class Lengths(NamedTuple):
+    """l1 to l7 as any numbers, unchecked, such as tensors to differentiate by."""
 
     l1: Numbers
     l2: Numbers
@@ -26,7 +26,7 @@ class Lengths:
 
 
 @dataclass(frozen=True)
-class Geometry(Lengths):
+class Geometry:
     """Link lengths of the mechanism in metres, named as in the paper ("Establishment of ...").
 
     Attributes:
@@ -70,6 +70,11 @@ class Geometry(Lengths):
                 f"it must exceed l1 - l3 = {self.l1 - self.l3} m, or rod 4 never reaches y = 0",
             )
 
+    @property
+    def lengths(self) -> Lengths:
+        """l1 to l7, m."""
+        return Lengths(*vars(self).values())
+
     def _check_length(self, name: str) -> None:
         value = getattr(self, name)
         if isinstance(value, bool) or not isinstance(value, Real):
@@ -83,6 +88,9 @@ class Geometry(Lengths):
             raise GeometryError(name, value, "it must be finite")
         if value < 0.0 or (value == 0.0 and name != "l6"):
             raise GeometryError(name, value, "it must be positive")
+
+
+AnyLengths = Geometry | Lengths
 
 
 def require_geometry(geometry: object) -> None:

@@ -16,10 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tpm_gym.arrays import FloatArray, finite_points, points, vector
+from tpm_gym.arrays import FloatArray, finite_points, points
 from tpm_gym.errors import SingularityError
 from tpm_gym.kinematics import equations
-from tpm_gym.kinematics.geometry import PAPER, Geometry, Lengths
+from tpm_gym.kinematics.geometry import PAPER, AnyLengths, Geometry
 from tpm_gym.kinematics.modes import DEFAULT_ASSEMBLY, ELBOWS_OUT, AssemblyMode, WorkingMode
 from tpm_gym.kinematics.namespaces import Namespace, Numbers, by_rows
 
@@ -147,7 +147,7 @@ def conditioning_at(
     position: ArrayLike,
     branch: WorkingMode = ELBOWS_OUT,
     assembly: AssemblyMode = DEFAULT_ASSEMBLY,
-    geometry: Lengths = PAPER,
+    geometry: AnyLengths = PAPER,
 ) -> FloatArray:
     """1/cond(J) at points, (...,); 0 where they are not reachable on both branches.
 
@@ -171,16 +171,12 @@ def evaluate(
     Raises:
         SingularityError: If theta is a parallel singularity.
     """
-    angles = points("theta", theta)
-    if angles.ndim == 1 and isinstance(angles, np.ndarray):
-        one = equations.evaluate(vector("theta", angles), branch, geometry)
-        return Evaluation(np.array(one[0][:3]), np.array(one[1]), np.array(one[2]))
 
     def columns(c: _Configuration) -> list[Numbers]:
         return [_conditioning(c), *c.factors[:3], *c.position, *_velocity(c)]
 
     layouts = _COLUMN, _PARALLEL + 1, np.arange(4, 7), _MATRIX + 7
-    quality, singular, position, rows = _from_angles(columns, angles, branch, geometry, *layouts)
+    quality, singular, position, rows = _from_angles(columns, theta, branch, geometry, *layouts)
     require_regular(singular, geometry)
     return Evaluation(position, rows, quality)
 
@@ -193,7 +189,7 @@ def factors(
 
 
 def factors_at(
-    position: ArrayLike, branch: WorkingMode = ELBOWS_OUT, geometry: Lengths = PAPER
+    position: ArrayLike, branch: WorkingMode = ELBOWS_OUT, geometry: AnyLengths = PAPER
 ) -> Factors:
     """The factors at points instead of joint angles; NaN where not reachable on ``branch``.
 
@@ -231,7 +227,7 @@ def _from_points(
     columns: _Columns,
     position: ArrayLike,
     branch: WorkingMode,
-    g: Lengths,
+    g: AnyLengths,
     missing: float,
     *layouts: NDArray[np.intp],
 ) -> list[FloatArray]:
@@ -250,7 +246,7 @@ def _configuration(
     cos: equations.Triple,
     sin: equations.Triple,
     found: equations.Assembly,
-    g: Lengths,
+    g: AnyLengths,
     ns: Namespace,
 ) -> _Configuration:
     bars = equations.rods(cos, sin, found, g)

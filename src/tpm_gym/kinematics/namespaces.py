@@ -1,13 +1,10 @@
-"""What the equations are computed with: plain floats, numpy arrays, or torch tensors.
+"""Elementwise functions of numpy arrays and torch tensors, for the equations.
 
-:mod:`tpm_gym.kinematics.equations` stands once, over a :class:`Namespace`: for one configuration at
-every time step, where numpy's calls cost ten times what they compute; for batches; and for
-gradients and GPUs.
+:mod:`tpm_gym.kinematics.equations` is written once, over a :class:`Namespace`. Tensors serve
+gradients and GPUs. :mod:`tpm_gym.kinematics.compiled` has the same functions for compiled code.
 """
 
-import itertools
 import math
-import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -19,7 +16,7 @@ from numpy.typing import NDArray
 from tpm_gym.arrays import FloatArray, is_tensor
 
 Numbers = Any
-"""A float, an array (...,) or a tensor (...,): what a namespace computes with."""
+"""A float, an array (...,) or a tensor (...,), as the functions of a namespace take them."""
 _One = Callable[[Any], Any]
 _TURN = 2 * math.pi
 _BLOCK = 4096  # rows of arrays computed at a time, so that what is between stays in the cache
@@ -30,8 +27,6 @@ class Namespace:
     """Functions of one kind of numbers, elementwise.
 
     Attributes:
-        over: The quotient. In numpy by way of the reciprocal, so that results, and with them the
-            postures in which simulations begin, keep the last bits they have always had.
         root: The square root; 0 for negative numbers.
         clip: The nearest number in [-1, 1].
         arccos: Of the clipped number.
@@ -46,7 +41,6 @@ class Namespace:
     cos: _One
     sin: _One
     arctan2: Callable[[Any, Any], Any]
-    over: Callable[[Any, Any], Any]
     sqrt: _One
     root: _One
     clip: _One
@@ -56,7 +50,6 @@ class Namespace:
     where: Callable[[Any, Any, Any], Any]
     wrap: _One
     positive: _One
-    cube: _One
     signs: Callable[[Any, tuple[int, ...]], Any]
     stack: Callable[[Sequence[Any]], Any]
     join: Callable[[Sequence[Any]], Any]
@@ -67,41 +60,10 @@ def namespace_of(value: object) -> Namespace:
     return _torch() if is_tensor(value) else NUMPY
 
 
-def _clip(x: float) -> float:
-    return -1.0 if x < -1.0 else 1.0 if x > 1.0 else x
-
-
-def _wrap(angle: float) -> float:
-    if -math.pi < angle <= math.pi:
-        return angle
-    return angle - _TURN if angle > 0 else angle + _TURN
-
-
-PLAIN = Namespace(
-    cos=math.cos,
-    sin=math.sin,
-    arctan2=math.atan2,
-    over=operator.truediv,
-    sqrt=math.sqrt,
-    root=lambda x: math.sqrt(x) if x > 0.0 else 0.0,
-    clip=_clip,
-    arccos=lambda x: math.acos(_clip(x)),
-    arcsin=lambda x: math.asin(_clip(x)),
-    maximum=lambda x, least: x if x > least else least,
-    where=lambda condition, one, other: one if condition else other,
-    wrap=_wrap,
-    positive=lambda angle: angle + _TURN if angle < 0.0 else angle,
-    cube=lambda x: x**3,
-    signs=lambda like, shape: (-1, 1),
-    stack=tuple,
-    join=lambda points: tuple(itertools.chain(*points)),
-)
-
 NUMPY = Namespace(
     cos=np.cos,
     sin=np.sin,
     arctan2=np.arctan2,
-    over=lambda a, b: a * (1 / b),
     sqrt=np.sqrt,
     root=lambda x: np.sqrt(np.maximum(x, 0.0)),
     clip=lambda x: np.minimum(np.maximum(x, -1.0), 1.0),
@@ -111,7 +73,6 @@ NUMPY = Namespace(
     where=np.where,
     wrap=lambda x: x + _TURN * (x <= -math.pi) - _TURN * (x > math.pi),
     positive=lambda x: np.where(x < 0, x + _TURN, x),
-    cube=lambda x: x * x * x,  # its power of 3 costs 20 times as much
     signs=lambda like, shape: np.array([-1.0, 1.0]).reshape(shape),
     stack=lambda columns: np.stack(columns, axis=-1),
     join=lambda points: np.concatenate(np.broadcast_arrays(*points), axis=-1),
@@ -149,7 +110,6 @@ def _torch() -> Namespace:
         cos=torch.cos,
         sin=torch.sin,
         arctan2=lambda y, x: torch.arctan2(y, like(x, y)),
-        over=operator.truediv,
         sqrt=torch.sqrt,
         root=root,
         clip=lambda x: torch.clip(x, -1.0, 1.0),
@@ -159,7 +119,6 @@ def _torch() -> Namespace:
         where=torch.where,
         wrap=wrap,
         positive=lambda x: torch.where(x < 0, x + _TURN, x),
-        cube=lambda x: x * x * x,
         signs=lambda other, shape: like([-1.0, 1.0], other).reshape(shape),
         stack=lambda columns: torch.stack(list(columns), -1),
         join=join,

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tpm_gym.arrays import FloatArray, finite_points, points, vector
+from tpm_gym.arrays import FloatArray, finite_points, points
 from tpm_gym.kinematics import equations
 from tpm_gym.kinematics.geometry import PAPER, Geometry, require_geometry
 from tpm_gym.kinematics.modes import (
@@ -75,10 +75,7 @@ def forward(
     Both y and -y belong to the same angles: the default branch gives y > 0,
     ``AssemblyMode(-1, -1)`` its mirror image.
     """
-    angles = points("theta", theta)
-    if angles.ndim == 1 and isinstance(angles, np.ndarray):
-        return np.array(equations.assemble(vector("theta", angles), branch, geometry)[:3])
-    return _assembled(angles, branch, geometry).position[..., branch.index, :]
+    return _assembled(points("theta", theta), branch, geometry).position[..., branch.index, :]
 
 
 def inverse(
@@ -89,8 +86,6 @@ def inverse(
     theta_1 and theta_3 are in (-pi, pi], theta_2 in [0, 2 pi).
     """
     places = points("position", position)
-    if places.ndim == 1 and isinstance(places, np.ndarray):
-        return np.array(equations.posture(vector("position", places), branch, geometry))
     solutions = inverse_all(finite_points("position", places), geometry)
     valid = solutions.valid[..., branch.index]
     if not valid.all():

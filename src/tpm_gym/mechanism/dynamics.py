@@ -42,9 +42,9 @@ from tpm_gym.arrays import FloatArray, Vector, finite, finite_points, is_tensor,
 from tpm_gym.errors import ConfigurationError, InputError
 from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode, equations
 from tpm_gym.kinematics.equations import Triple
-from tpm_gym.kinematics.geometry import PAPER, Geometry, Lengths
+from tpm_gym.kinematics.geometry import PAPER, AnyLengths, Geometry
 from tpm_gym.kinematics.jacobian import require_regular
-from tpm_gym.kinematics.namespaces import PLAIN, Namespace, Numbers, by_rows, namespace_of
+from tpm_gym.kinematics.namespaces import Namespace, Numbers, by_rows, namespace_of
 from tpm_gym.mechanism import tree
 from tpm_gym.mechanism.inertia import Inertia, Swing, inertia_of
 from tpm_gym.mechanism.mount import GRAVITY
@@ -85,7 +85,7 @@ class Pose(NamedTuple):
     rods: tuple[Triple, Triple, Triple]
     factors: equations.Factors
     k: Numbers
-    lengths: Lengths
+    lengths: AnyLengths
 
 
 class Velocities(NamedTuple):
@@ -121,10 +121,16 @@ class Accelerations(NamedTuple):
 # -- over any namespace ----------------------------------------------------------------------------
 
 
-def pose_at(theta: Triple, branch: AssemblyMode, g: Lengths, ns: Namespace) -> tuple[Pose, Numbers]:
-    """The configuration at joint angles, and whether it is real."""
+def pose_at(
+    theta: Triple, signs: tuple[Numbers, Numbers], g: AnyLengths, ns: Namespace
+) -> tuple[Pose, Numbers]:
+    """Assemble the mechanism at joint angles, for the signs of an assembly mode.
+
+    Returns:
+        The configuration, and whether it is real.
+    """
     cos, sin = equations.arms(theta, g, ns)
-    found, real, _ = equations.assembly_at(cos, sin, branch.planar, branch.sin_beta, g, ns)
+    found, real, _ = equations.assembly_at(cos, sin, signs[0], signs[1], g, ns)
     rods = equations.rods(cos, sin, found, g)
     factors = equations.factors(cos, sin, found, rods, g)
     return Pose(cos, sin, found, rods, factors, factors.sin_beta * factors.level3, g), real
@@ -367,17 +373,6 @@ class Dynamics:
         mechanism = tree.build(self.geometry)
         return inertia_of(mechanism, self.geometry, self.link_masses, self.payload)
 
-    def pose(self, theta: Vector) -> Pose:
-        """The configuration at three joint angles, in plain floats, for :func:`torques`."""
-        try:
-            pose, real = pose_at(theta, self.branch, self.geometry, PLAIN)
-        except ZeroDivisionError:  # concentric circles, or link 7 beside B3
-            real = False
-        if not real:
-            raise equations.no_assembly(theta, self.branch, self.geometry)
-        equations.require_regular(pose.factors[:3], self.geometry)
-        return pose
-
     def torque(self, theta: ArrayLike, theta_dot: ArrayLike, theta_ddot: ArrayLike) -> FloatArray:
         """The motors' torques (..., 3) N m for a motion: M theta_ddot + C theta_dot + g."""
         states = {"theta": theta, "theta_dot": theta_dot, "theta_ddot": theta_ddot}
@@ -442,15 +437,11 @@ class Dynamics:
 
         def columns(values: tuple[Numbers, ...], ns: Namespace) -> list[Numbers]:
             theta, *rest = (values[i : i + 3] for i in range(0, len(values), 3))
-            pose, real = pose_at(theta, self.branch, self.geometry, ns)
+            pose, real = pose_at(theta, self.branch.signs, self.geometry, ns)
             missing = ns.where(real, 0.0, 1.0)
             return [missing, *pose.factors[:3], *text(pose, *rest)]
 
         table = _side_by_side(states)
-        if table.ndim == 1 and isinstance(table, np.ndarray):
-            (a, b, c), *rest = table.reshape(-1, 3).tolist()
-            found = np.array(text(self.pose((a, b, c)), *rest))
-            return [found[layout] for layout in layouts]
         shifted = (layout + _CHECKS for layout in layouts)
         missing, factors, *results = by_rows(columns, table, np.array(0), _VECTOR + 1, *shifted)
         if missing.any():

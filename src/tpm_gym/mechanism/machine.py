@@ -1,11 +1,12 @@
-"""What an environment is built for: a translational robot with closed-form kinematics, as a value.
+"""Robots that environments are built for: translational, with closed-form kinematics, as values.
 
-A :class:`Machine` is asked only what any such robot can answer, so that another one (a Delta, a
-gantry) stands under the same tasks: forward and inverse kinematics, the Jacobian, whether it is
-still in its modes, where it may go, and the bodies to load.
+A :class:`Machine` answers what any such robot can: forward and inverse kinematics, the Jacobian,
+its modes, its dynamics, where it may go, and the bodies to load. So another robot (a Delta, a
+gantry) stands under the same tasks.
 
-Everything is in the machine's own frame, which its :class:`~tpm_gym.mechanism.mount.Mount` places
-in the world; for the TPM that is the paper's. Joint positions theta are in rad (m for a slide).
+Arrays have one robot a row and (x, y, z) or the three joints last, (..., 3), in SI units and the
+machine's own frame, which its :class:`~tpm_gym.mechanism.mount.Mount` places in the world. Joint
+positions theta are in rad (m for a slide). Results are NaN in rows without a solution.
 """
 
 from __future__ import annotations
@@ -15,10 +16,10 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from tpm_gym.arrays import BoolArray, FloatArray, Vector, finite, vector
 from tpm_gym.errors import (
@@ -30,32 +31,50 @@ from tpm_gym.errors import (
 from tpm_gym.kinematics.geometry import Geometry
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism import virtual_work
-from tpm_gym.mechanism.batch import Batch
 from tpm_gym.mechanism.bodies import Mechanism
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.mount import Mount
 
-__all__ = ["Machine", "Mode", "Reading", "find_machine", "register_machine"]
+__all__ = ["MODES", "Machine", "Motion", "Reading", "find_machine", "register_machine"]
 
-Mode = Literal["assembly", "working"]
-Rows = tuple[Vector, Vector, Vector]
+MODES: Final = (None, "assembly", "working")
+"""Names of the numbers of :meth:`Machine.mode_left`."""
 
 _ATTEMPTS = 1000
-_MANY = 32  # points from which on arrays are faster than floats, one by one
 
 
 class Reading(NamedTuple):
-    """What follows from joint positions.
+    """Position, Jacobian and modes at joint positions.
 
     Attributes:
-        position: Point P, m.
-        jacobian: Rows of J with v = J theta_dot, m/rad.
-        conditioning: 1/cond(J), in [0, 1].
+        position: Point P (..., 3) m; NaN where the machine cannot be assembled or is singular.
+        jacobian: J (..., 3, 3) with v = J theta_dot, m/rad.
+        conditioning: 1/cond(J), (...,) in [0, 1].
+        working: (...,) whether the machine is in its working mode.
     """
 
-    position: Vector
-    jacobian: Rows
-    conditioning: float
+    position: FloatArray
+    jacobian: FloatArray
+    conditioning: FloatArray
+    working: BoolArray
+
+
+class Motion(NamedTuple):
+    """Position, Jacobian and equation of motion: torque = mass theta_ddot + bias.
+
+    Attributes:
+        position: See :class:`Reading`.
+        jacobian: See :class:`Reading`.
+        working: See :class:`Reading`.
+        mass: Inertia that the motors feel, (..., 3, 3) kg m^2.
+        bias: Torque that weight and rates take, (..., 3) N m.
+    """
+
+    position: FloatArray
+    jacobian: FloatArray
+    working: BoolArray
+    mass: FloatArray
+    bias: FloatArray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,9 +131,8 @@ class Machine(ABC):
                 raise ConfigurationError(name, getattr(self, name), "positive")
         if not 0 < self.safe_conditioning <= 1:  # the penalty is in units of it
             raise ConfigurationError("safe_conditioning", self.safe_conditioning, "in (0, 1]")
-        for corner in self.region.corners():
-            self._require_usable("region", corner)
-        self._require_usable("home", self.home)
+        self._require_usable("region", list(self.region.corners()))
+        self._require_usable("home", [self.home])
         least = self.region.high[2] + CUP.length - CUP.stroke
         if self.mount.height < least - 1e-6:
             valid = f"a height of {least:.6g} m or more: else the region is below the table"
@@ -132,121 +150,159 @@ class Machine(ABC):
         table = finite("table", self.table, (2,), ConfigurationError)
         object.__setattr__(self, "table", tuple(table.tolist()))
 
-    def _require_usable(self, name: str, point: Vector) -> None:
-        """Refuse the option of that name if P cannot be worked with at ``point``."""
+    def _require_usable(self, name: str, points: list[Vector]) -> None:
+        """Refuse the option of that name if P cannot be worked with at ``points``."""
         try:
-            theta = self.inverse(point)
+            theta, left = self._postures(np.array(points))
         except UnreachableError as error:
             error.hint = f"the machine's {name} has to lie within reach of its legs; choose another"
             raise
-        if (mode := self.mode_left(theta, point)) is not None:
-            valid = f"in one {mode} mode; {point} is beyond a singularity"
-            raise ConfigurationError(name, getattr(self, name), valid)
-        try:
-            self.require_within_stops(theta)
-        except JointLimitError as error:
-            valid = f"where every motor is between its stops; at {point}, {error}"
-            raise ConfigurationError(name, getattr(self, name), valid) from error
+        for point, one, mode in zip(points, theta, left.tolist(), strict=True):
+            if mode:
+                valid = f"in one {MODES[mode]} mode; {point} is beyond a singularity"
+                raise ConfigurationError(name, getattr(self, name), valid)
+            try:
+                self.require_within_stops(one)
+            except JointLimitError as error:
+                valid = f"where every motor is between its stops; at {point}, {error}"
+                raise ConfigurationError(name, getattr(self, name), valid) from error
+
+    def _postures(self, points: FloatArray) -> tuple[FloatArray, NDArray[np.int8]]:
+        """Return joint positions (k, 3) at points (k, 3), and which modes are left there (k,)."""
+        theta = self.require_inverse(points)
+        return theta, self.mode_left(theta, points)
 
     # -- kinematics -------------------------------------------------------------------------
 
     @abstractmethod
-    def inverse(self, point: Vector) -> Vector:
-        """Joint positions at which P is at ``point``, on the machine's working mode.
+    def inverse(self, position: ArrayLike, built: FloatArray | None = None) -> FloatArray:
+        """Compute joint positions (..., 3) for P at ``position``, on the machine's working mode.
 
-        Raises:
-            UnreachableError: If there are none.
+        Args:
+            position: Point P (..., 3) m.
+            built: Parameters (b, k) of b machines from :meth:`built`; None for the nominal machine.
+                Of m rows, row i is of machine ``built[i // (m // b)]``: (n, K, 3) goes with (n, k).
         """
 
     @abstractmethod
-    def evaluate(self, theta: Vector) -> Reading:
-        """Point P, J and conditioning at ``theta``, on the machine's assembly mode.
+    def evaluate(self, theta: ArrayLike, built: FloatArray | None = None) -> Reading:
+        """Compute P, J and conditioning at ``theta`` (..., 3), on the machine's assembly mode."""
+
+    def forward(self, theta: ArrayLike, built: FloatArray | None = None) -> FloatArray:
+        """Compute P (..., 3) m at ``theta`` (..., 3), in the machine's modes."""
+        position = self.evaluate(theta, built).position
+        left = self.mode_left(theta, position, built)
+        found: FloatArray = np.where(left[..., None], np.nan, position)
+        return found
+
+    def mode_left(
+        self, theta: ArrayLike, position: ArrayLike, built: FloatArray | None = None
+    ) -> NDArray[np.int8]:
+        """Find the mode that a machine has left with joints at ``theta`` and P at ``position``.
+
+        Returns:
+            (...,): 0 for none. 1 for the assembly mode: the machine passed a parallel singularity,
+            so that the forward kinematics no longer give P. 2 for the working mode: it passed a
+            serial singularity, so that the inverse kinematics no longer give its joints.
+        """
+        del theta, built
+        return np.zeros(np.shape(position)[:-1], dtype=np.int8)
+
+    def same_side(self, position: ArrayLike) -> BoolArray:
+        """Return whether P at ``position`` (..., 3) is on the assembly mode's side, as (...,)."""
+        return np.ones(np.shape(position)[:-1], dtype=np.bool_)
+
+    def unreachable(self, position: Vector) -> UnreachableError:
+        """Explain why :meth:`inverse` has no solution at a position (3,) m."""
+        return UnreachableError(position, self.name, 0.0, "choose a point of its workspace")
+
+    def unassembled(self, theta: Vector) -> UnreachableError | SingularityError:
+        """Explain why :meth:`evaluate` or :meth:`forward` has no solution at ``theta`` (3,)."""
+        return UnreachableError(theta, self.name, 0.0, "choose joint positions in its modes")
+
+    def require_inverse(self, position: ArrayLike) -> FloatArray:
+        """Compute joint positions as :meth:`inverse` does, all of which have to exist.
 
         Raises:
-            UnreachableError: If the machine cannot be assembled there.
-            SingularityError: If theta is a parallel singularity.
+            UnreachableError: If one does not.
         """
+        theta = self.inverse(position)
+        if (missing := np.isnan(theta[..., 0])).any():
+            raise self.unreachable(_first(position, missing))
+        return theta
 
-    def forward(self, theta: Vector) -> Vector:
-        """Point P at ``theta``, in the machine's modes.
+    def require_evaluate(self, theta: ArrayLike) -> Reading:
+        """Compute P, J and conditioning as :meth:`evaluate` does, all of which have to exist.
 
         Raises:
-            UnreachableError: If the machine cannot be assembled there, or only in other modes.
+            UnreachableError: If the machine cannot be assembled.
+            SingularityError: If it is at a parallel singularity.
         """
-        position = self.evaluate(theta).position
-        if (mode := self.mode_left(theta, position)) is not None:
-            hint = "choose joint positions in the machine's modes"
-            raise UnreachableError(theta, f"{mode} mode", 0.0, hint)
-        return position
+        reading = self.evaluate(theta)
+        if (missing := np.isnan(reading.conditioning)).any():
+            raise self.unassembled(_first(theta, missing))
+        return reading
 
-    def mode_left(self, theta: Vector, position: Vector) -> Mode | None:
-        """The mode that a machine has left whose joints are at ``theta`` and P at ``position``.
-
-        ``"assembly"`` where it passed a parallel singularity, so that the forward kinematics no
-        longer say where P is; ``"working"`` where it passed a serial one, and the inverse
-        kinematics no longer say how to get where. A machine without singularities leaves none.
-        """
-        del theta, position
-        return None
-
-    def require_within_stops(self, theta: Vector) -> None:
-        """Refuse joint positions beyond a motor's stop.
+    def require_within_stops(self, theta: ArrayLike) -> None:
+        """Refuse joint positions (..., 3) beyond a motor's stop.
 
         Raises:
             JointLimitError: If there is one.
         """
-        mechanism = self.mechanism
-        for index, (lower, upper) in enumerate(mechanism.stops):
-            if not lower <= theta[index] <= upper:
-                motor = mechanism.motors[index]
-                raise JointLimitError(motor.name, theta[index], lower, upper, motor.unit)
+        lower, upper = self._stops
+        within = (theta >= lower) & (theta <= upper)
+        if not within.all():
+            index = int(np.argwhere(~within)[0, -1])
+            motor, position = self.mechanism.motors[index], np.asarray(theta)[~within][0]
+            ends = float(lower[index]), float(upper[index])
+            raise JointLimitError(motor.name, float(position), *ends, motor.unit)
+
+    @cached_property
+    def _stops(self) -> FloatArray:
+        """Lowest and highest joint positions, (2, 3)."""
+        stops: FloatArray = np.array(self.mechanism.stops).T
+        return stops
 
     # -- regions ----------------------------------------------------------------------------
 
-    def conditioning_at(self, points: ArrayLike) -> FloatArray:
-        """Conditioning 1/cond(J) at points (..., 3) m, as (...,); 0 where P cannot be."""
-        return _each(lambda point: self.evaluate(self.inverse(point)).conditioning, points)
+    def conditioning_at(self, position: ArrayLike) -> FloatArray:
+        """Compute 1/cond(J) (...,) with P at ``position`` (..., 3) m; 0 where P cannot be."""
+        return self.conditioning(self.inverse(position))
 
     def conditioning(self, theta: ArrayLike) -> FloatArray:
-        """Conditioning 1/cond(J) at joint positions (..., 3); 0 where it cannot be assembled."""
-        return _each(lambda one: self.evaluate(one).conditioning, theta)
+        """Compute 1/cond(J) (...,) at ``theta`` (..., 3); 0 where the machine cannot be assembled.
 
-    def is_safe(self, point: Vector) -> bool:
-        """Whether P can be at ``point``, with :attr:`safe_conditioning` or better."""
-        with suppress(UnreachableError, SingularityError):
-            return self.evaluate(self.inverse(point)).conditioning >= self.safe_conditioning
-        return False
+        It is 0 at a parallel singularity too.
+        """
+        found = self.evaluate(theta).conditioning
+        known: FloatArray = np.where(np.isnan(found), 0.0, found)
+        return known
 
-    def sample(self, rng: np.random.Generator, region: Region) -> FloatArray:
-        """Draw a point (3,) m, uniform over the part of ``region`` that is safe.
+    def is_safe(self, position: ArrayLike) -> BoolArray:
+        """Return whether P can be at ``position`` (..., 3) with :attr:`safe_conditioning`."""
+        return np.asarray(self.conditioning_at(position) >= self.safe_conditioning)
+
+    def sample(self, rngs: Sequence[np.random.Generator], regions: Sequence[Region]) -> FloatArray:
+        """Draw a point (3,) m for each of r generators, uniform over the safe part of its region.
+
+        Each generator draws for its own row only: a row has the same values alone and among many.
+
+        Returns:
+            (r, 3) m.
 
         Raises:
-            ConfigurationError: If no draw was safe.
+            ConfigurationError: If no draw for a region was safe.
         """
-        point: FloatArray = self.sample_each([rng], [region])[0]
-        return point
-
-    def sample_each(
-        self, rngs: Sequence[np.random.Generator], regions: Sequence[Region]
-    ) -> FloatArray:
-        """The same for r generators and regions, (r, 3) m; this is what tasks ask."""
         low, high = (np.array([getattr(r, end) for r in regions]) for end in ("low", "high"))
         points, rows = np.empty_like(low), np.arange(len(rngs))
         for _ in range(_ATTEMPTS):
             drawn = np.array([rngs[row].random(3) for row in rows.tolist()])
             points[rows] = low[rows] + (high[rows] - low[rows]) * drawn
-            rows = rows[~self._are_safe(points[rows])]
+            rows = rows[~self.is_safe(points[rows])]
             if not len(rows):
                 return points
         valid = f"a value that some point of {regions[rows[0]]} reaches"
         raise ConfigurationError("safe_conditioning", self.safe_conditioning, valid)
-
-    def _are_safe(self, points: FloatArray) -> BoolArray:
-        """Whether P can safely be at points (r, 3)."""
-        if len(points) < _MANY:
-            return np.array([self.is_safe((x, y, z)) for x, y, z in points.tolist()])
-        safe: BoolArray = self.conditioning_at(points) >= self.safe_conditioning
-        return safe
 
     # -- bodies -----------------------------------------------------------------------------
 
@@ -263,40 +319,81 @@ class Machine(ABC):
             UnreachableError: If it cannot be assembled at theta.
         """
 
-    def torque(self, theta: Vector, theta_dot: Vector, theta_ddot: Vector) -> Vector:
-        """Torques of the motors for a motion of the empty machine, N m (N for a slide).
+    def torque(
+        self,
+        theta: ArrayLike,
+        theta_dot: ArrayLike,
+        theta_ddot: ArrayLike,
+        force: ArrayLike | None = None,
+        built: FloatArray | None = None,
+    ) -> FloatArray:
+        """Compute the motors' torques (..., 3) N m (N for a slide) for a motion.
 
-        From the bodies, by differences, which takes milliseconds; a machine with a closed form
-        overrides it.
+        The base class computes them from the bodies by differences, which takes milliseconds a row.
 
-        Raises:
-            UnreachableError: If it cannot be assembled at theta.
-            SingularityError: If theta is a parallel singularity.
+        Args:
+            theta: Joint positions (..., 3).
+            theta_dot: Joint velocities (..., 3) per s.
+            theta_ddot: Joint accelerations (..., 3) per s^2.
+            force: Force on P (..., 3) N that the motors hold against; None for none.
+            built: See :meth:`inverse`.
         """
-        fall = self.mount.free_fall
-        motion = theta, theta_dot, theta_ddot
-        return virtual_work.torque(self.mechanism, self.joint_positions, fall, *motion)
+        motion = np.stack(np.broadcast_arrays(theta, theta_dot, theta_ddot), axis=-2, dtype=float)
+        rows = motion.reshape(-1, 3, 3)
+        factors = np.ones((1, len(self.mechanism.links) - 1)) if built is None else built
+        factors = np.repeat(factors, len(rows) // len(factors), axis=0)
+        found = np.full((len(rows), 3), np.nan)
+        for row, (one, masses) in enumerate(zip(rows, factors, strict=True)):
+            with suppress(UnreachableError, SingularityError):
+                found[row] = virtual_work.torque(
+                    self.mechanism, self.joint_positions, self.mount.free_fall, masses, *one
+                )
+        torques = found.reshape(motion.shape[:-1])
+        if force is not None:
+            jacobian = self.evaluate(theta, built).jacobian
+            torques -= (jacobian * np.asarray(force)[..., None]).sum(axis=-2)
+        return torques
+
+    def motion(
+        self, theta: ArrayLike, theta_dot: ArrayLike, built: FloatArray | None = None
+    ) -> Motion:
+        """Compute P, J and the equation of motion at ``theta`` and ``theta_dot`` (..., 3)."""
+        position, jacobian, _, working = self.evaluate(theta, built)
+        still = np.zeros_like(position)
+        rest = self.torque(theta, still, still, None, built)
+        columns = [self.torque(theta, still, still + unit, None, built) for unit in np.eye(3)]
+        bias = self.torque(theta, theta_dot, still, None, built)
+        mass = np.stack([column - rest for column in columns], axis=-1)
+        return Motion(position, jacobian, working, mass, bias)
 
     @property
     def lengths(self) -> tuple[float, ...]:
-        """The lengths, m, in which a machine that was built may differ from its drawing."""
+        """The lengths, m, in which a machine as built may differ from its drawing."""
         return ()
 
     def with_lengths(self, lengths: tuple[float, ...]) -> Machine:
-        """The machine with other lengths (m, in the order of :attr:`lengths`)."""
+        """Return the machine with other lengths (m, in the order of :attr:`lengths`)."""
         if lengths:
             raise ConfigurationError("length_error", lengths, f"0: {self.name} has no lengths")
         return self
 
-    def batch(self, count: int) -> Batch:
-        """So many of these machines, for an engine that computes all of them at a time.
+    def built(
+        self, lengths: tuple[float, ...] = (), link_masses: tuple[float, ...] = ()
+    ) -> FloatArray:
+        """Return the parameters (k,) of one machine as it was built.
+
+        Args:
+            lengths: Its lengths, m, in the order of :attr:`lengths`; empty for the nominal ones.
+            link_masses: Factors of the mass and inertia of its moving links; empty if all are 1.
 
         Raises:
-            ConfigurationError: If the machine has no closed form for arrays.
+            ConfigurationError: If there is another number of factors.
         """
-        del count
-        valid = f"another one: {self.name!r} has no closed form for arrays (Machine.batch)"
-        raise ConfigurationError("engine", "analytic", valid)
+        links = self.with_lengths(lengths).mechanism.links[1:]
+        if len(link_masses) not in (0, len(links)):
+            valid = f"one factor for each of the {len(links)} moving links, or none"
+            raise ConfigurationError("link_masses", link_masses, valid)
+        return np.array(link_masses or [1.0] * len(links))
 
     def occupied(self, position: ArrayLike) -> list[tuple[FloatArray, FloatArray]]:
         """Boxes around platform and tool with P at ``position``: low and high corners, m, world."""
@@ -312,15 +409,10 @@ class Machine(ABC):
         return boxes
 
 
-def _each(function: Callable[[Vector], float], vectors: ArrayLike) -> FloatArray:
-    """A function of vectors (..., 3), one by one, as (...,); 0 where there is no solution."""
-    array = np.asarray(vectors, dtype=np.float64)
-    values = np.zeros(array.shape[:-1])
-    for index in np.ndindex(values.shape):
-        with suppress(UnreachableError, SingularityError):
-            a, b, c = array[index].tolist()
-            values[index] = function((a, b, c))
-    return values
+def _first(vectors: ArrayLike, chosen: BoolArray) -> Vector:
+    """Return the first of vectors (..., 3) that is chosen (...,)."""
+    x, y, z = np.asarray(vectors, dtype=np.float64)[chosen][0].tolist()
+    return x, y, z
 
 
 _MACHINES: dict[str, Machine | Callable[[], Machine]] = {}

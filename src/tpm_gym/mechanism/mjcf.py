@@ -211,8 +211,8 @@ def _actuators(mechanism: Mechanism) -> Element:
 
 def _home(machine: Machine, joints: Iterable[str]) -> Element:
     """A key frame with P at home, all ``joints`` at rest, and the motors told to stay."""
-    theta = machine.inverse(machine.home)
-    at = machine.joint_positions(theta)
+    a, b, c = theta = machine.require_inverse(machine.home).tolist()
+    at = machine.joint_positions((a, b, c))
     frames = Element("keyframe")
     qpos = numbers(at[name] for name in joints)
     SubElement(frames, "key", name="home", qpos=qpos, ctrl=numbers(theta))

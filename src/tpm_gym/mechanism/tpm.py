@@ -2,27 +2,27 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
+from types import ModuleType
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from tpm_gym.arrays import FloatArray, Vector
-from tpm_gym.errors import ConfigurationError, UnreachableError
+from tpm_gym.arrays import BoolArray, FloatArray, Vector
+from tpm_gym.errors import ConfigurationError, InputError, SingularityError, UnreachableError
 from tpm_gym.kinematics import jacobian, workspace
-from tpm_gym.kinematics.equations import assemble, conditioning_at, evaluate, posture
+from tpm_gym.kinematics.equations import no_posture
 from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
 from tpm_gym.kinematics.modes import DEFAULT_ASSEMBLY, ELBOWS_OUT, AssemblyMode, WorkingMode
-from tpm_gym.kinematics.position import forward_all
+from tpm_gym.kinematics.position import inverse
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism import tree
 from tpm_gym.mechanism.bodies import Mechanism
-from tpm_gym.mechanism.dynamics import Dynamics, torques
-from tpm_gym.mechanism.machine import Machine, Mode, Reading, register_machine
+from tpm_gym.mechanism.dynamics import Dynamics
+from tpm_gym.mechanism.inertia import flat, inertia_of
+from tpm_gym.mechanism.machine import Machine, Motion, Reading, register_machine
 from tpm_gym.mechanism.mount import Mount
-from tpm_gym.mechanism.tpm_batch import TPMBatch
 
 __all__ = ["ASSEMBLY_LIMIT", "PAPER_TPM", "TPM", "WIDE_TPM"]
 
@@ -54,54 +54,117 @@ class TPM(Machine):
             raise ConfigurationError("geometry", self.geometry, "a tpm_gym.Geometry")
         super().__post_init__()
 
-    def inverse(self, point: Vector) -> Vector:
-        """See :class:`Machine`."""
-        return posture(point, self.working_mode, self.geometry)
+    # -- kinematics -------------------------------------------------------------------------
 
-    def evaluate(self, theta: Vector) -> Reading:
+    def inverse(self, position: ArrayLike, built: FloatArray | None = None) -> FloatArray:
         """See :class:`Machine`."""
-        (x, y, z, *_), rows, conditioning = evaluate(theta, self.assembly_mode, self.geometry)
-        return Reading((x, y, z), rows, conditioning)
+        points = _rows(position)
+        theta = np.empty_like(points)
+        _loops().inverse(points.reshape(-1, 3), *self._of(built, points), theta.reshape(-1, 3))
+        return theta
 
-    def forward(self, theta: Vector) -> Vector:
+    def forward(self, theta: ArrayLike, built: FloatArray | None = None) -> FloatArray:
         """See :class:`Machine`."""
-        there = assemble(theta, self.assembly_mode, self.geometry)
-        if there.cos_beta * self.working_mode.cos_beta <= 0:
-            hint = "choose joint angles on the machine's side of y = l7"
-            raise UnreachableError(theta, "working mode (cos(beta))", 0.0, hint)
-        return there[:3]
+        angles = _rows(theta)
+        position = np.empty_like(angles)
+        _loops().forward(angles.reshape(-1, 3), *self._of(built, angles), position.reshape(-1, 3))
+        return position
 
-    def mode_left(self, theta: Vector, position: Vector) -> Mode | None:
+    def evaluate(self, theta: ArrayLike, built: FloatArray | None = None) -> Reading:
+        """See :class:`Machine`."""
+        angles = _rows(theta)
+        flat, shape = angles.reshape(-1, 3), angles.shape
+        found = _room(len(flat))
+        _loops().evaluate(flat, *self._of(built, angles), *found)
+        position, jacobian, conditioning, working = found
+        if len(shape) == 2:
+            return Reading(position, jacobian, conditioning, working)
+        return Reading(
+            position.reshape(shape),
+            jacobian.reshape(*shape, 3),
+            conditioning.reshape(shape[:-1]),
+            working.reshape(shape[:-1]),
+        )
+
+    def mode_left(
+        self, theta: ArrayLike, position: ArrayLike, built: FloatArray | None = None
+    ) -> NDArray[np.int8]:
+        """See :class:`Machine`."""
+        angles = _rows(theta)
+        points = _rows(position, angles.shape)
+        left = np.empty(angles.shape[:-1], dtype=np.int8)
+        _loops().mode_left(
+            angles.reshape(-1, 3),
+            points.reshape(-1, 3),
+            ASSEMBLY_LIMIT,
+            *self._of(built, angles),
+            left.reshape(-1),
+        )
+        return left
+
+    def same_side(self, position: ArrayLike) -> BoolArray:
+        """See :class:`Machine`."""
+        side: BoolArray = np.asarray(position)[..., 1] * self.assembly_mode.sin_beta > 0
+        return side
+
+    def conditioning_at(self, position: ArrayLike) -> FloatArray:
+        """See :class:`Machine`."""
+        points = _rows(position)
+        found = np.empty(points.shape[:-1])
+        _loops().conditioning_at(points.reshape(-1, 3), *self._of(None, points), found.reshape(-1))
+        return found
+
+    def unreachable(self, position: Vector) -> UnreachableError:
+        """See :class:`Machine`."""
+        return no_posture(position, self.working_mode, self.geometry)
+
+    def unassembled(self, theta: Vector) -> UnreachableError | SingularityError:
         """See :class:`Machine`."""
         try:
-            there = assemble(theta, self.assembly_mode, self.geometry)
-        except UnreachableError:
-            return "assembly"
-        mirrored = position[1] * self.assembly_mode.sin_beta <= 0
-        if mirrored or not math.dist(there[:3], position) <= ASSEMBLY_LIMIT:
-            return "assembly"
-        return "working" if there.cos_beta * self.working_mode.cos_beta <= 0 else None
+            found = jacobian.factors(theta, self.assembly_mode, self.geometry)
+            jacobian.require_regular(found.parallel, self.geometry)
+        except (UnreachableError, SingularityError) as error:
+            return error
+        hint = "choose joint angles on the machine's side of y = l7"
+        return UnreachableError(theta, "working mode (cos(beta))", 0.0, hint)
 
-    def is_safe(self, point: Vector) -> bool:
-        """See :class:`Machine`."""
-        modes = self.working_mode, self.assembly_mode
-        return conditioning_at(point, *modes, self.geometry) >= self.safe_conditioning
+    def _postures(self, points: FloatArray) -> tuple[FloatArray, NDArray[np.int8]]:
+        # By numpy: machines are made when the package is imported, which must not import Numba.
+        theta = inverse(points, self.working_mode, self.geometry)
+        slots = workspace.assembly_of(points, self.working_mode, self.geometry)
+        return theta, (slots != self.assembly_mode.index).astype(np.int8)
 
-    def conditioning_at(self, points: ArrayLike) -> FloatArray:
-        """See :class:`Machine`."""
-        return workspace.conditioning_at(
-            points, self.working_mode, self.assembly_mode, self.geometry
-        )
+    def built(
+        self, lengths: tuple[float, ...] = (), link_masses: tuple[float, ...] = ()
+    ) -> FloatArray:
+        """Return l1 to l7 (m) and the constants of the dynamics, (23,); see :class:`Machine`."""
+        machine = self.with_lengths(lengths) if lengths else self
+        geometry = machine.geometry
+        inertia = inertia_of(machine.mechanism, geometry, link_masses)
+        return np.array([*geometry.lengths, *flat(inertia)])
 
-    def conditioning(self, theta: ArrayLike) -> FloatArray:
-        """See :class:`Machine`."""
-        angles = np.asarray(theta, dtype=np.float64)
-        assembled = forward_all(angles, self.geometry).valid[..., self.assembly_mode.index]
-        result = np.zeros(angles.shape[:-1])
-        result[assembled] = jacobian.conditioning(
-            angles[assembled], self.assembly_mode, self.geometry
-        )
-        return result
+    @cached_property
+    def _nominal(self) -> FloatArray:
+        """Parameters of the nominal machine, (1, 23)."""
+        return self.built()[None]
+
+    @cached_property
+    def _constants(self) -> FloatArray:
+        """Signs of the modes, and gravity, (9,); see :mod:`tpm_gym.mechanism.tpm_rows`."""
+        signs = *self.assembly_mode.signs, *self.working_mode.signs
+        return np.array([*signs, *self.mount.free_fall])
+
+    def _of(self, built: FloatArray | None, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the parameters of the machines and the constants that they share."""
+        if built is None:
+            return self._nominal, self._constants
+        rows, count = inputs.size // 3, len(built)
+        if not count or rows % count or built.shape != (count, self._nominal.shape[1]):
+            valid = f"parameters (b, {self._nominal.shape[1]}), with b a divisor of {rows} rows"
+            raise InputError("built", built.shape, valid)
+        return np.ascontiguousarray(built, dtype=np.float64), self._constants
+
+    # -- bodies -----------------------------------------------------------------------------
 
     @cached_property
     def mechanism(self) -> Mechanism:
@@ -119,24 +182,84 @@ class TPM(Machine):
             geometry=self.geometry, branch=self.assembly_mode, free_fall=self.mount.free_fall
         )
 
-    def torque(self, theta: Vector, theta_dot: Vector, theta_ddot: Vector) -> Vector:
+    def torque(
+        self,
+        theta: ArrayLike,
+        theta_dot: ArrayLike,
+        theta_ddot: ArrayLike,
+        force: ArrayLike | None = None,
+        built: FloatArray | None = None,
+    ) -> FloatArray:
         """See :class:`Machine`."""
-        dynamics = self.dynamics
-        pose = dynamics.pose(theta)
-        return torques(pose, theta_dot, theta_ddot, dynamics.free_fall, dynamics.inertia)
+        angles = _rows(theta)
+        shape = angles.shape
+        inputs = [angles, _rows(theta_dot, shape), _rows(theta_ddot, shape)]
+        inputs.append(np.empty((0, 3)) if force is None else _rows(force, shape))
+        torques = np.empty(shape)
+        _loops().torque(
+            *(rows.reshape(-1, 3) for rows in inputs),
+            *self._of(built, angles),
+            torques.reshape(-1, 3),
+        )
+        return torques
 
-    def batch(self, count: int) -> TPMBatch:
+    def motion(
+        self, theta: ArrayLike, theta_dot: ArrayLike, built: FloatArray | None = None
+    ) -> Motion:
         """See :class:`Machine`."""
-        return TPMBatch(self, count)
+        angles = _rows(theta)
+        rates = _rows(theta_dot, angles.shape)
+        flat, shape = angles.reshape(-1, 3), angles.shape
+        position, jacobian, _, working = _room(len(flat))
+        mass, bias = np.empty((len(flat), 3, 3)), np.empty((len(flat), 3))
+        found = position, jacobian, working, mass, bias
+        _loops().motion(flat, rates.reshape(-1, 3), *self._of(built, angles), *found)
+        if len(shape) == 2:
+            return Motion(*found)
+        return Motion(
+            position.reshape(shape),
+            jacobian.reshape(*shape, 3),
+            working.reshape(shape[:-1]),
+            mass.reshape(*shape, 3),
+            bias.reshape(shape),
+        )
 
     @property
     def lengths(self) -> tuple[float, ...]:
         """l1 to l7, m."""
-        return tuple(vars(self.geometry).values())
+        return self.geometry.lengths
 
     def with_lengths(self, lengths: tuple[float, ...]) -> TPM:
         """The machine with these l1 to l7, m."""
         return replace(self, geometry=Geometry(*lengths))
+
+
+@cache
+def _loops() -> ModuleType:
+    """Import the compiled loops, and with them Numba."""
+    from tpm_gym.mechanism import tpm_rows
+
+    return tpm_rows
+
+
+def _rows(vectors: ArrayLike, shape: tuple[int, ...] | None = None) -> FloatArray:
+    """Return vectors (..., 3) as a contiguous array, broadcast to ``shape``."""
+    array = np.ascontiguousarray(vectors, dtype=np.float64)
+    if shape is not None and array.shape != shape:
+        array = np.ascontiguousarray(np.broadcast_to(array, shape))
+    if array.shape[-1] != 3:
+        raise InputError("vectors", array.shape, "an array of shape (..., 3), by shape")
+    return array
+
+
+def _room(count: int) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+    """Return arrays for positions, Jacobians, conditioning and modes."""
+    return (
+        np.empty((count, 3)),
+        np.empty((count, 3, 3)),
+        np.empty(count),
+        np.empty(count, dtype=np.bool_),
+    )
 
 
 PAPER_TPM = TPM(

@@ -26,36 +26,37 @@ def torque(
     mechanism: Mechanism,
     joint_positions: Callable[[Vector], dict[str, float]],
     free_fall: Vector,
-    theta: Vector,
-    theta_dot: Vector,
-    theta_ddot: Vector,
-) -> Vector:
-    """The motors' torques for a motion, N m (N for a slide).
+    link_masses: FloatArray,
+    theta: FloatArray,
+    theta_dot: FloatArray,
+    theta_ddot: FloatArray,
+) -> FloatArray:
+    """Compute the motors' torques (3,) N m (N for a slide) for a motion.
 
     Args:
         mechanism: The bodies.
-        joint_positions: Positions of all joints for those of the motors.
+        joint_positions: Returns the positions of all joints for those of the motors.
         free_fall: Acceleration of gravity in the machine's frame, m/s^2.
-        theta: Positions of the motors, rad or m.
-        theta_dot: Their rates, per s.
-        theta_ddot: Their accelerations, per s^2.
+        link_masses: Factors of mass and inertia of the moving links.
+        theta: Positions of the motors (3,), rad or m.
+        theta_dot: Velocities of the motors (3,), per s.
+        theta_ddot: Accelerations of the motors (3,), per s^2.
     """
-    at, rate, change = map(np.array, (theta, theta_dot, theta_ddot))
 
     def frames(motors: FloatArray) -> FloatArray:
         a, b, c = motors.tolist()
         return _frames(mechanism, joint_positions((a, b, c)))
 
-    before, now, after = (frames(at + t * rate + t * t / 2 * change) for t in (-_TIME, 0.0, _TIME))
+    before, now, after = (
+        frames(theta + t * theta_dot + t * t / 2 * theta_ddot) for t in (-_TIME, 0.0, _TIME)
+    )
     acceleration = (before - 2 * now + after) / _TIME**2
     acceleration[:, :, 3] -= free_fall
-    forces = acceleration @ _second_moments(mechanism)
+    forces = acceleration @ (link_masses[:, None, None] * _second_moments(mechanism))
     steps = _STEP * np.eye(3)
-    a, b, c = (
-        float((forces * (frames(at + step) - frames(at - step))).sum() / (2 * _STEP))
-        for step in steps
+    return np.array(
+        [(forces * (frames(theta + s) - frames(theta - s))).sum() / (2 * _STEP) for s in steps]
     )
-    return a, b, c
 
 
 def _second_moments(mechanism: Mechanism) -> FloatArray:
