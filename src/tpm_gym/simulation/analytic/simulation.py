@@ -22,10 +22,10 @@ from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.batch import Readings
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.tpm import PAPER_TPM
+from tpm_gym.simulation.analytic.contact import Contact
 from tpm_gym.simulation.analytic.drives import Drive, IdealDrives, ServoDrives
 from tpm_gym.simulation.analytic.motion import Course, march
 from tpm_gym.simulation.analytic.physics import Physics
-from tpm_gym.simulation.analytic.pucks import Pucks
 from tpm_gym.simulation.drives import Reference, Servo, references
 from tpm_gym.simulation.randomisation import NOMINAL, Plant
 from tpm_gym.simulation.settings import settings_of
@@ -49,7 +49,7 @@ class Moment:
 
     plants: tuple[Plant, ...]
     columns: dict[str, FloatArray]
-    pucks: FloatArray
+    objects: Any
 
 
 class AnalyticSimulation:
@@ -81,9 +81,6 @@ class AnalyticSimulation:
     ) -> None:
         """Put all robots at rest at home."""
         self.physics = settings_of(Physics, "physics", physics)
-        if len(scene.objects) > 1:
-            valid = f"another one: it knows one object, the scene has {len(scene.objects)}"
-            raise ConfigurationError("engine", "analytic", valid)
         self.scene, self.machine, self.drive, self.count = scene, machine, drive, count
         self._step = self.physics.time_step
         steps = self.physics.substeps
@@ -93,8 +90,7 @@ class AnalyticSimulation:
         # Made once: memory of this size would be fetched anew in every control period.
         self._ways = np.empty((2, steps + 2, 3, count))
         self._nominal, self._true = machine.batch(count), machine.batch(count)
-        block = scene.objects[0] if scene.objects else None
-        self._pucks = Pucks(block, count, self._step, machine.table)
+        self._contact = Contact(scene.objects, count, self._step, machine.table)
         self._mount = np.array([[0.0], [0.0], [machine.mount.height]])
         motors = machine.mechanism.motors
         self._nominal_effort = np.array([[motor.effort] for motor in motors])
@@ -169,7 +165,8 @@ class AnalyticSimulation:
             self._noise[:, :, rows] = noise[:, rows]
             self._read(rows)
         if self.scene.objects:
-            self._pucks.place(rows, objects[self.scene.objects[0].name])
+            places = [objects[block.name] for block in self.scene.objects]
+            self._contact.place(rows, np.stack(places, axis=1))
 
     def _reading_at(self, theta: tuple[float, ...]) -> Readings:
         """What follows from angles at which episodes start: mostly the same ones."""
@@ -202,7 +199,7 @@ class AnalyticSimulation:
         masses, friction = (
             [getattr(p, name) for p in plants] for name in ("puck_mass", "friction")
         )
-        self._pucks.alter(rows, np.array(masses), np.array(friction))
+        self._contact.alter(rows, np.array(masses), np.array(friction))
 
     def _true_position(self, rows: IntArray) -> FloatArray:
         return self._true.take(rows).evaluate(self._theta[:, rows]).position
@@ -245,7 +242,7 @@ class AnalyticSimulation:
         That is computed as if all of them could, and once more for machines of which one cannot.
         """
         start = self._course()
-        objects = self._pucks.save(slice(None)) if self.scene.objects else None
+        objects = self._contact.save(slice(None)) if self.scene.objects else None
         last = self._exact and not self.scene.objects  # then no more of the way matters
         points, other = self._ways[:, : self._tail + 2] if last else self._ways
         theta = self._ideal(self._spline_into(points[2:], commands, other[2:]))
@@ -254,7 +251,7 @@ class AnalyticSimulation:
         before, at, now = points[-3:]
         if self.scene.objects:
             change = (now - 2 * at + before) / self._step**2
-            self._force = push[-1] + self._pucks.carried(slice(None)) * change
+            self._force = push[-1] + self._contact.carried(slice(None)) * change
         self._before, self._truth = at.copy(), now.copy()
         self._theta = theta[:, -1].copy()
         self._rates = (theta[:, -1] - theta[:, -2]) / self._step
@@ -264,7 +261,7 @@ class AnalyticSimulation:
         rows = np.flatnonzero(late)
         if len(rows):
             if objects is not None:
-                self._pucks.restore(rows, objects[rows])
+                self._contact.restore(rows, tuple(part[rows] for part in objects))
             drive = IdealDrives(self._effort[:, rows], self._step)
             angles = self._angles(self._spline(commands[..., rows]), rows)
             followed = [Reference(one) for one in angles.transpose(1, 0, 2)]
@@ -337,7 +334,7 @@ class AnalyticSimulation:
         """Where the machines are."""
         return Course(
             self._theta, self._rates, self._torque, self._truth, self._before,
-            self._force, self._pucks.carried(slice(None)), self._left,
+            self._force, self._contact.carried(slice(None)), self._left,
         )  # fmt: skip
 
     def _march(
@@ -351,7 +348,7 @@ class AnalyticSimulation:
         """Run a control period of some machines by forward dynamics."""
 
         def touch(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-            return self._touch(rows, points, vacuum[rows])[-1], self._pucks.carried(rows)
+            return self._touch(rows, points, vacuum[rows])[-1], self._contact.carried(rows)
 
         batch = self._true if isinstance(rows, slice) else self._true.take(rows)
         end, torques = march(batch, drive, followed, start, self._step, touch)
@@ -386,7 +383,9 @@ class AnalyticSimulation:
             return np.zeros((1, 3, points.shape[2]))
         world = np.multiply(points, _TURNED, out=room)
         world += self._mount
-        push = self._pucks.advance(rows, world, vacuum)
+        path = np.ascontiguousarray(world.transpose(2, 0, 1))
+        force = self._contact.advance(np.arange(self.count)[rows], path, vacuum)
+        push = np.ascontiguousarray(force.transpose(1, 2, 0))
         push *= _TURNED
         return push
 
@@ -436,6 +435,9 @@ class AnalyticSimulation:
         j, (a, b, c) = self._jacobian, rates
         velocity = j[:, 0] * a + j[:, 1] * b + j[:, 2] * c
         tilt, gap = np.zeros((2, self.count))
+        contact = self._contact.read()
+        x, y, z, w = np.moveaxis(contact.quaternion, -1, 0)
+        axis = 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)
         return State(
             theta=self._encoders(slice(None)).T,
             theta_dot=rates.T,
@@ -449,21 +451,27 @@ class AnalyticSimulation:
             assembly_mode_changed=self._left[0].copy(),
             working_mode_changed=self._left[1].copy(),
             command=self._to_world(self._commands[1]).T,
-            **self._pucks.report(),
+            held=contact.held,
+            vacuum=contact.vacuum,
+            object_position=contact.position,
+            object_quaternion=contact.quaternion,
+            object_axis=np.stack(axis, axis=-1),
+            object_velocity=contact.velocity,
+            object_angular_velocity=contact.angular_velocity,
         )
 
     def save(self, rows: IntArray | slice = slice(None)) -> Moment:
         """Take down everything that the next steps of some robots depend on."""
         columns = {name: getattr(self, name)[..., rows].copy() for name in _COLUMNS}
         plants = tuple(self._plants[row] for row in np.arange(self.count)[rows].tolist())
-        return Moment(plants, columns, self._pucks.save(rows))
+        return Moment(plants, columns, self._contact.save(rows))
 
     def restore(self, moment: Moment, rows: IntArray | slice = slice(None)) -> None:
         """Go back to what ``save`` returned, for as many robots."""
         self._become(np.arange(self.count)[rows], moment.plants)
         for name, values in moment.columns.items():
             getattr(self, name)[..., rows] = values
-        self._pucks.restore(rows, moment.pucks)
+        self._contact.restore(rows, moment.objects)
 
     def _to_world(self, position: FloatArray) -> FloatArray:
         world: FloatArray = self._mount + position * _TURNED
