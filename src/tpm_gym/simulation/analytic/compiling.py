@@ -44,7 +44,7 @@ def kept(function: _Function) -> _Function:
 def source_files() -> list[Path]:
     """All that may be compiled into a function."""
     package = Path(__file__).parents[2]
-    rooms = ("mechanism", "simulation", "simulation/analytic")
+    rooms = ("mechanism", "simulation", "simulation/analytic", "simulation/analytic/contact")
     return [package / "arrays.py", *(f for room in rooms for f in (package / room).glob("*.py"))]
 
 

@@ -19,14 +19,14 @@ from tpm_gym.arrays import FloatArray, Vector
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.mount import GRAVITY
 from tpm_gym.mechanism.tpm import WIDE_TPM
-from tpm_gym.simulation.analytic.pucks import Pucks
+from tpm_gym.simulation.analytic.contact import Contact, Reading
 from tpm_gym.simulation.drives import Reference
 from tpm_gym.simulation.simulation import Simulation, spline_weights
 from tpm_gym.simulation.state import Block, Scene
 
 STEP, STEPS = 1 / 250, 10
 PUCK = Block()
-ALL = slice(None)
+ONE = np.arange(1)
 MIDDLE = np.array([0.3, -0.36, PUCK.height / 2])
 ON_TOP = MIDDLE + [0.0, 0.0, PUCK.height / 2 + CUP.length]
 """Point P with the lip on a puck in the middle."""
@@ -49,6 +49,12 @@ def spline(commands: Sequence[FloatArray]) -> FloatArray:
     return np.array(points)
 
 
+def tilts(reading: Reading) -> FloatArray:
+    """(n, k) rad, by which objects lean from the vertical."""
+    x, y = reading.quaternion[..., 0], reading.quaternion[..., 1]
+    return np.arccos(np.clip(1 - 2 * (x * x + y * y), -1.0, 1.0))
+
+
 def line(start: FloatArray, end: FloatArray, count: int, wait: int = 0) -> list[FloatArray]:
     """Commands from one point to another, not counting the first."""
     return [start + (end - start) * (i + 1) / count for i in range(count)] + [end] * wait
@@ -56,21 +62,14 @@ def line(start: FloatArray, end: FloatArray, count: int, wait: int = 0) -> list[
 
 def analytic(path: FloatArray, on: Sequence[bool], puck: FloatArray, batch: int = STEPS) -> Run:
     """Lead one cup along a path."""
-    pucks = Pucks(PUCK, 1, STEP, WIDE_TPM.table)
-    pucks.place(ALL, puck[None])
+    contact = Contact([PUCK], 1, STEP, WIDE_TPM.table)
+    contact.place(ONE, puck[None, None])
     seen = []
     for k in range(0, len(path) - 2, batch):
-        steps = np.ascontiguousarray(path[k : k + batch + 2, :, None])
-        force = pucks.advance(ALL, steps, np.array([on[k // STEPS]]))
-        now = pucks.report()
-        seen.append(
-            (
-                now["object_position"][0, 0],
-                math.acos(min(1.0, now["object_axis"][0, 0, 2])),
-                now["held"][0],
-                force[-1, :, 0],
-            )
-        )
+        steps = np.ascontiguousarray(path[None, k : k + batch + 2])
+        force = contact.advance(ONE, steps, np.array([on[k // STEPS]]))
+        now = contact.read()
+        seen.append((now.position[0, 0], tilts(now)[0, 0], now.held[0], force[0, -1]))
     return Run(*(np.array(part) for part in zip(*seen, strict=True)))
 
 

@@ -1,0 +1,162 @@
+"""Objects on a table, the cup above them, and the vacuum between: many tables, each by itself.
+
+A time step (:mod:`.stepping`) finds contacts (:mod:`.collision`) and impulses (:mod:`.solver`), moves
+the objects, and lets the vacuum take or drop one (:mod:`.grasp`).
+
+Left out: an object stands on the table as long as its centre is over it, and then falls past it;
+the stem and the platform pass through objects; the cup's spring has no end stop; the lip passes
+through the table; point P does not yield to contacts.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tpm_gym.arrays import BoolArray, FloatArray, IntArray
+from tpm_gym.simulation.analytic.contact.state import (
+    AT_REST,
+    CUP_STATE,
+    OBJECT,
+    Setting,
+    slots,
+    work_for,
+)
+from tpm_gym.simulation.analytic.contact.stepping import advance
+from tpm_gym.simulation.stage import TABLE
+from tpm_gym.simulation.state import Block
+
+__all__ = ["Contact", "Reading"]
+
+_PART = 1e-3  # s
+_ON_TABLE = 2e-5  # m
+
+
+class Reading(NamedTuple):
+    """State of n tables with k objects each.
+
+    Attributes:
+        position: (n, k, 3) m, world, of the centres.
+        quaternion: (n, k, 4), x, y, z, w.
+        velocity: (n, k, 3) m/s.
+        angular_velocity: (n, k, 3) rad/s, world.
+        held: (n,) index of the held object; -1 for none.
+        vacuum: (n,) Pa.
+    """
+
+    position: FloatArray
+    quaternion: FloatArray
+    velocity: FloatArray
+    angular_velocity: FloatArray
+    held: IntArray
+    vacuum: FloatArray
+
+
+class Contact:
+    """Objects, cups and vacuum of n robots, each over a table of its own.
+
+    Args:
+        blocks: The objects, k.
+        count: n.
+        time_step: s.
+        table: Half edges of the tables along x and y, m.
+    """
+
+    def __init__(
+        self, blocks: Sequence[Block], count: int, time_step: float, table: tuple[float, float]
+    ) -> None:
+        """Put all objects in the middle of their tables, one on the other."""
+        self._blocks, number = tuple(blocks), len(blocks)
+        half = np.array([block.half for block in blocks]).reshape(number, 3)
+        parts = max(1, math.ceil(time_step / _PART - 1e-9))
+        self._setting = Setting(half, table, time_step, parts)
+        self._objects = np.zeros((count, number), OBJECT)
+        self._cups = np.zeros(count, CUP_STATE)
+        self._memory = np.zeros((count, slots(number), 3))
+        self._work = work_for(number)
+        everything = np.arange(count)
+        self.alter(everything, np.ones(count), np.ones(count))
+        middle = np.zeros((count, number, 3))
+        middle[..., 2] = 2 * half[:, 2].cumsum() - half[:, 2]
+        self.place(everything, middle)
+
+    def alter(self, rows: Any, mass_factor: FloatArray, friction_factor: FloatArray) -> None:
+        """Make objects ``mass_factor`` (r,) times as heavy as nominal; friction likewise."""
+        mass, friction = (
+            np.array([getattr(block, name) for block in self._blocks])
+            for name in ("mass", "friction")
+        )
+        self._objects["mass"][rows] = mass_factor[:, None] * mass
+        self._objects["friction"][rows] = friction_factor[:, None] * friction
+
+    def place(self, rows: Any, positions: FloatArray, quaternions: FloatArray | None = None) -> None:
+        """Let go, empty the cups, and put objects at rest.
+
+        Args:
+            rows: Which tables, r.
+            positions: (r, k, 3) m, world, of the centres.
+            quaternions: (r, k, 4); None for upright.
+        """
+        objects = self._objects[rows]
+        objects["position"] = positions
+        objects["quaternion"] = (0.0, 0.0, 0.0, 1.0) if quaternions is None else quaternions
+        objects["velocity"] = objects["spin"] = 0.0
+        gap = np.abs(objects["position"][..., 2] - self._setting.half[:, 2] - TABLE.top)
+        stands = (gap < _ON_TABLE) & ~objects["quaternion"][..., :2].any(axis=-1)
+        objects["rest"] = np.where(stands.all(axis=-1, keepdims=True), AT_REST, 0)
+        self._objects[rows] = objects
+        empty = np.zeros((), CUP_STATE)
+        empty["held"] = -1
+        self._cups[rows] = empty
+        self._memory[rows] = 0.0
+
+    def advance(self, rows: IntArray, path: FloatArray, vacuum_on: BoolArray) -> FloatArray:
+        """Run K time steps.
+
+        Args:
+            rows: (r,) which tables.
+            path: (r, K + 2, 3) m, world: point P before the last time step, now, and after each
+                time step to come; contiguous.
+            vacuum_on: (r,) whether the vacuum is on.
+
+        Returns:
+            (r, K, 3) N, world: force of cup and objects on the platform in each time step, beside
+            weight and inertia of the cup at rest in it.
+        """
+        force = np.zeros((len(rows), path.shape[1] - 2, 3))
+        if self._blocks:
+            states = self._objects, self._cups, self._memory
+            advance(states, rows, path, vacuum_on, self._setting, self._work, force)
+        return force
+
+    def carried(self, rows: Any) -> FloatArray:
+        """Return the masses that cups hold, (r,) kg."""
+        held = self._cups["held"][rows]
+        if not self._blocks:
+            return np.zeros(len(held))
+        mass = np.take_along_axis(self._objects["mass"][rows], held[:, None], axis=1)[:, 0]
+        carried: FloatArray = np.where(held >= 0, mass, 0.0)
+        return carried
+
+    def read(self) -> Reading:
+        """Return copies of the state of all tables."""
+        objects, cups = self._objects, self._cups
+        return Reading(
+            objects["position"].copy(),
+            objects["quaternion"].copy(),
+            objects["velocity"].copy(),
+            objects["spin"].copy(),
+            cups["held"].copy(),
+            cups["vacuum"].copy(),
+        )
+
+    def save(self, rows: Any) -> Any:
+        """Return everything that the next time steps of some tables depend on."""
+        return self._objects[rows].copy(), self._cups[rows].copy(), self._memory[rows].copy()
+
+    def restore(self, rows: Any, saved: Any) -> None:
+        """Continue from what :meth:`save` returned."""
+        self._objects[rows], self._cups[rows], self._memory[rows] = saved

@@ -1,0 +1,108 @@
+"""The cup on its spring, and the object that its vacuum holds."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from tpm_gym.arrays import Vector
+from tpm_gym.mechanism.cup import CUP, sealed
+from tpm_gym.mechanism.mount import GRAVITY
+from tpm_gym.simulation.analytic.compiling import compiled
+from tpm_gym.simulation.analytic.contact.state import Record, Records, Setting
+from tpm_gym.simulation.analytic.contact.vectors import length, level_length, plus, put, three
+from tpm_gym.simulation.vacuum import CLEARANCE, Hold, Load, hold_after
+
+__all__ = ["CUP_MASS", "Way", "breathe", "lip_of", "seal_load"]
+
+CUP_MASS = CUP.link("platform", (0.0, 0.0, 0.0)).mass
+_DOWN: Vector = (0.0, 0.0, -1.0)
+_EMPTY = 1e-3  # Pa
+
+
+class Way(NamedTuple):
+    """Point P before the last time step, now, and after the time step, m, world."""
+
+    before: Vector
+    now: Vector
+    then: Vector
+
+
+@compiled
+def lip_of(point: Vector, slide: float) -> Vector:
+    """Return the centre of the lip below a point P, m, world."""
+    return point[0], point[1], point[2] + slide - CUP.length
+
+
+@compiled
+def seal_load(item: Record, velocity: Vector, touched: Vector, step: float) -> Vector:
+    """Return the mean force of the cup on the object that it holds, N, world.
+
+    Args:
+        item: The object, with its velocity in the last time step.
+        velocity: In this time step, m/s.
+        touched: Impulse of table and other objects on it in this time step, N s.
+        step: Time step, s.
+    """
+    change = plus(velocity, three(item["velocity"]), -1.0)
+    mass = item["mass"]
+    return (
+        (mass * change[0] - touched[0]) / step,
+        (mass * change[1] - touched[1]) / step,
+        (mass * (change[2] + GRAVITY * step) - touched[2]) / step,
+    )
+
+
+@compiled
+def breathe(
+    objects: Records, cup: Record, way: Way, on: bool, seal: Vector, setting: Setting
+) -> None:
+    """Update the vacuum after a time step, and take or drop an object.
+
+    Args:
+        objects: (k,) the objects.
+        cup: The cup.
+        way: Point P.
+        on: Whether the vacuum is on.
+        seal: Force of the cup on the held object, N, world.
+        setting: Constants.
+    """
+    held, lip, touched = cup["held"], lip_of(way.then, cup["slide"]), -1
+    if on and held < 0:
+        for index in range(len(objects)):
+            if touched < 0 and _seals(objects[index], lip, index, setting):
+                touched = index
+    load = Load(seal[2], level_length(seal[0], seal[1]))
+    after = hold_after(Hold(held, cup["vacuum"]), setting.step, on, load, touched)
+    cup["vacuum"] = after.vacuum if after.vacuum > _EMPTY else 0.0
+    cup["held"] = after.which
+    if held < 0 <= after.which:
+        _take(objects[after.which], cup, way.then, lip, setting.half[after.which][2])
+    elif after.which < 0 <= held:
+        # Until now its velocity was the mean over the time step
+        velocity, step = objects[held]["velocity"], setting.step
+        bend = plus(plus(way.then, way.now, -2.0), way.before)
+        put(velocity, plus(three(velocity), bend, 0.5 / step))
+
+
+@compiled
+def _seals(item: Record, lip: Vector, index: int, setting: Setting) -> bool:
+    """Return whether the lip lies on the upper face of an object."""
+    half, (x, y, z), turn = setting.half[index], three(item["position"]), item["quaternion"]
+    away = length(plus((x, y, z), lip, -1.0))
+    if away > length(three(half)) + CUP.seal_gap:
+        return False
+    size = (2 * half[0], 2 * half[2])
+    quaternion = (turn[0], turn[1], turn[2], turn[3])
+    result: bool = sealed(lip, _DOWN, (x, y, z), quaternion, size)
+    return result
+
+
+@compiled
+def _take(item: Record, cup: Record, point: Vector, lip: Vector, half: float) -> None:
+    """Hold an object where it is, but clear of the lip by what engines leave between the two."""
+    position = three(item["position"])
+    x, y, z = plus(position, point, -1.0)
+    lower = max(CLEARANCE - (lip[2] - position[2] - half), 0.0)
+    put(cup["grip"], (x, y, z - cup["slide"] - lower))
+    put(item["spin"], (0.0, 0.0, 0.0))
+    item["rest"] = 0

@@ -1,0 +1,76 @@
+"""Algebra of three-vectors as tuples, for compiled functions."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from tpm_gym.arrays import Vector
+from tpm_gym.simulation.analytic.compiling import compiled
+
+__all__ = ["Frame", "axes", "clip", "cross", "dot", "length", "level_length", "plus", "put", "three"]
+
+Frame = tuple[Vector, Vector, Vector]
+"""Unit vectors along a body's own axes, in the world frame."""
+
+
+@compiled
+def three(values: Any) -> Vector:
+    """Return the first three numbers of an array."""
+    return values[0], values[1], values[2]
+
+
+@compiled
+def put(values: Any, vector: Vector) -> None:
+    """Write a vector into the first three numbers of an array."""
+    values[0], values[1], values[2] = vector
+
+
+@compiled
+def plus(a: Vector, b: Vector, times: float = 1.0) -> Vector:
+    """Return a + times b."""
+    return a[0] + times * b[0], a[1] + times * b[1], a[2] + times * b[2]
+
+
+@compiled
+def dot(a: Vector, b: Vector) -> float:
+    """Return the scalar product."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@compiled
+def cross(a: Vector, b: Vector) -> Vector:
+    """Return the vector product."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@compiled
+def length(a: Vector) -> float:
+    """Return the Euclidean length."""
+    return math.sqrt(dot(a, a))
+
+
+@compiled
+def level_length(x: float, y: float) -> float:
+    """Return the length of a horizontal vector.
+
+    ``math.hypot`` differs in its last bit between platforms; this does not.
+    """
+    return math.sqrt(x * x + y * y)
+
+
+@compiled
+def clip(value: float, low: float, high: float) -> float:
+    """Clip a number to an interval."""
+    return min(max(value, low), high)
+
+
+@compiled
+def axes(quaternion: Any) -> Frame:
+    """Return the axes of a body with an orientation (x, y, z, w)."""
+    x, y, z, w = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
+        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
+        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
+    )
