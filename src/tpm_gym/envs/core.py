@@ -21,7 +21,14 @@ from tpm_gym.tasks.control import make_control
 from tpm_gym.tasks.registry import make_task
 from tpm_gym.tasks.task import Task
 
-__all__ = ["Core", "EnvSnapshot", "Observation", "action_space", "compute_reward", "observation_space"]
+__all__ = [
+    "Core",
+    "EnvSnapshot",
+    "Observation",
+    "action_space",
+    "compute_reward",
+    "observation_space",
+]
 
 OBSERVATION_BOUND = 10.0
 GOAL_BOUND = 2.0
@@ -116,7 +123,7 @@ class Core:
             machine=self.machine,
             count=self.count,
             drive=self.drive,
-            **self._engine,  # type: ignore[arg-type]
+            **self._engine,
         )
 
     # -- running ----------------------------------------------------------------------------
@@ -367,7 +374,7 @@ def _goal_free(terms: Mapping[str, Any]) -> Any:
 
 
 def _not_finite(
-    task: Task, state: State, achieved: FloatArray, terms: Mapping[str, Any]
+    task: Task, state: State, achieved: NDArray[Any], terms: Mapping[str, Any]
 ) -> ConfigurationError:
     """Find the value of a task that is not finite."""
     values = {

@@ -20,7 +20,7 @@ from tpm_gym.envs.core import (
     compute_reward,
     observation_space,
 )
-from tpm_gym.errors import ActionError, ConfigurationError, EpisodeError, ModeChangeError
+from tpm_gym.errors import ActionError, ConfigurationError, ModeChangeError
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.display import has_display
 from tpm_gym.simulation.drives import Servo
@@ -342,7 +342,8 @@ class TPMEnv(gym.Env[Observation, Action]):
     @property
     def goal(self) -> FloatArray:
         """The episode's goal, (goal size,) m, world."""
-        return self._core.goals[0].copy()
+        goal: FloatArray = self._core.goals[0].copy()
+        return goal
 
     def save_state(self) -> EnvSnapshot:
         """Return physics, rng, goal, delayed actions and grasp.

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -449,7 +448,7 @@ def _joined(infos: Sequence[Mapping[str, Any]], counts: Sequence[int]) -> dict[s
         kind = next(value.dtype for value in values if value is not None)
         joined[name] = np.concatenate(
             [
-                np.full(count, None if kind == object else 0, kind) if value is None else value
+                np.full(count, None if kind.hasobject else 0, kind) if value is None else value
                 for value, count in zip(values, counts, strict=True)
             ]
         )

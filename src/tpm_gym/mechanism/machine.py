@@ -231,14 +231,14 @@ class Machine(ABC):
             raise self.unreachable(_first(position, missing))
         return theta
 
-    def require_evaluate(self, theta: ArrayLike) -> Reading:
+    def require_evaluate(self, theta: ArrayLike, built: FloatArray | None = None) -> Reading:
         """Compute P, J and conditioning as :meth:`evaluate` does, all of which have to exist.
 
         Raises:
             UnreachableError: If the machine cannot be assembled.
             SingularityError: If it is at a parallel singularity.
         """
-        reading = self.evaluate(theta)
+        reading = self.evaluate(theta, built)
         if (missing := np.isnan(reading.conditioning)).any():
             raise self.unassembled(_first(theta, missing))
         return reading
@@ -256,6 +256,19 @@ class Machine(ABC):
             motor, position = self.mechanism.motors[index], np.asarray(theta)[~within][0]
             ends = float(lower[index]), float(upper[index])
             raise JointLimitError(motor.name, float(position), *ends, motor.unit)
+
+    def reach(self, position: ArrayLike) -> FloatArray:
+        """Compute joint positions as :meth:`inverse` does, all of which have to be between stops.
+
+        Raises:
+            UnreachableError: If a position is out of reach.
+            JointLimitError: If a motor is beyond a stop at a position.
+        """
+        theta = self.inverse(position)
+        lower, upper = self._stops
+        if not ((theta >= lower) & (theta <= upper)).all():  # so written, NaN fails too
+            self.require_within_stops(self.require_inverse(position))
+        return theta
 
     @cached_property
     def _stops(self) -> FloatArray:

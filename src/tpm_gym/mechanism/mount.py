@@ -64,6 +64,11 @@ class Mount:
         return x, -y, -z
 
     @property
+    def frame(self) -> tuple[FloatArray, FloatArray]:
+        """Factors and origin (3,), so that world = factors * point + origin, and back."""
+        return _HALF_TURN, np.array([0.0, 0.0, self.height])
+
+    @property
     def free_fall(self) -> Vector:
         """Acceleration of gravity in the paper frame, m/s^2."""
         return self.turn((0.0, 0.0, -GRAVITY))

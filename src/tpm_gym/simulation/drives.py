@@ -35,7 +35,6 @@ __all__ = [
 FEEDFORWARDS = ("none", "gravity", "computed")
 
 
-
 @dataclass(frozen=True)
 class Servo:
     """A servo drive on each motor's axis.
@@ -188,7 +187,9 @@ class ServoDrives:
             self._built = np.tile(self._machine.built(), (len(self.friction), 1))
         if self._built is not None:
             self._built[rows] = [self._machine.built(own) for own in lengths]
-        self._stiffness[rows] = self._servo.stiffness * np.array([p.servo_stiffness for p in plants])
+        self._stiffness[rows] = self._servo.stiffness * np.array(
+            [p.servo_stiffness for p in plants]
+        )
         self._effort[rows] = self._nominal_effort * np.array([p.motor_strength for p in plants])
         self.friction[rows] = [p.joint_friction for p in plants]
         # Too large an inertia would be unstable. M with each link's own factor lies between those
@@ -254,7 +255,8 @@ class ServoDrives:
             theta, theta_dot, self._stiffness, self._servo.damping, self._mass, self._inverse,
             self._effort, self._line, self._step, self.memory,
         )  # fmt: skip
-        return self.memory[0]
+        torque: FloatArray = self.memory[0]
+        return torque
 
 
 class Driven(Protocol):

@@ -88,7 +88,7 @@ class Readout(NamedTuple):
     position: FloatArray
     tilt: FloatArray
     gap: FloatArray
-    mode_left: IntArray
+    mode_left: NDArray[np.int8]
     held: IntArray
     vacuum: FloatArray
     object_position: FloatArray

@@ -94,7 +94,7 @@ class Simulation:
         self._position = np.zeros((count, 3))  # by forward kinematics, machine's frame, m
         self._jacobian = np.zeros((count, 3, 3))
         self._conditioning = np.zeros(count)
-        self._mode_left = np.zeros(count, dtype=np.int64)
+        self._mode_left = np.zeros(count, dtype=np.int8)
         self._readout: Readout
 
     # -- running ----------------------------------------------------------------------------
@@ -211,7 +211,7 @@ class Simulation:
         return self._commands[:, 1]
 
     @property
-    def mode_left(self) -> IntArray:
+    def mode_left(self) -> NDArray[np.int8]:
         """(n,) mode that each machine left in this episode: 0 none, 1 assembly, 2 working."""
         return self._mode_left
 

@@ -59,7 +59,8 @@ class CartesianControl:
 
     def action(self, wanted: FloatArray, current: FloatArray) -> FloatArray:
         """Clip the wanted increment axis by axis."""
-        return np.clip((wanted - current) / self._step, -1.0, 1.0)
+        actions: FloatArray = np.clip((wanted - current) / self._step, -1.0, 1.0)
+        return actions
 
     def steps(self, wanted: FloatArray, current: FloatArray) -> float:
         """Count the steps of the axis that has farthest to go."""

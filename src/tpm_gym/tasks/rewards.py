@@ -12,11 +12,12 @@ __all__ = ["dense", "distance", "singularity_penalty", "sparse"]
 
 def distance(achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
     """Return the Euclidean distance (...,) m of points (..., k) m."""
-    gap = np.subtract(achieved, desired, dtype=np.float64)
+    gap: FloatArray = np.subtract(achieved, desired, dtype=np.float64)
     first, *others = (gap * gap).T
+    total: FloatArray = first
     for part in others:  # numpy's sum costs several times as much
-        first = first + part
-    result: FloatArray = np.sqrt(first).T
+        total = total + part
+    result: FloatArray = np.sqrt(total).T
     return result
 
 

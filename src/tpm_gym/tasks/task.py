@@ -25,7 +25,7 @@ from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.state import CONTROL_PERIOD, Block, Scene, State
-from tpm_gym.tasks import rewards, sampling
+from tpm_gym.tasks import rewards
 from tpm_gym.tasks.motion import Motion, Move, hanging
 
 __all__ = ["Entry", "Task"]
@@ -220,7 +220,9 @@ class Task(ABC):
                 *_entries_of("observe()", self.observe(both), self.observe(alone)),
                 *_entries_of("shaping()", self.shaping(both), self.shaping(alone)),
                 *_entries_of(
-                    "gap()", self.gap(self.achieved(both), goals), self.gap(self.achieved(alone), goal)
+                    "gap()",
+                    self.gap(self.achieved(both), goals),
+                    self.gap(self.achieved(alone), goal),
                 ),
             ):
                 if np.shape(together)[:1] != (2,) or not _equal(together[row], single):
@@ -297,7 +299,7 @@ class Task(ABC):
     def _within_reach(
         self, name: str, value: Any, size: int, blocks: tuple[Block | None, ...]
     ) -> FloatArray:
-        """Return a copy of the points (size,) m that the user chose, for P or for blocks in turn."""
+        """Return a copy of points (size,) m that the user chose, for P or for blocks in turn."""
         points = np.array(finite(name, value, (size,), ResetOptionError))
         for point, block in zip(points.reshape(-1, 3), cycle(blocks), strict=False):
             low, high = self.reach_of(block)
@@ -319,7 +321,7 @@ class Task(ABC):
         return low, high
 
     def _place_of(self, block: Block) -> tuple[FloatArray, FloatArray]:
-        """Return :meth:`reach_of` for a block that has to be in reach where it stands on the table."""
+        """Return :meth:`reach_of` for a block that has to be in reach on the table."""
         low, high = self.reach_of(block)
         if low[2] > block.height / 2 + 1e-9:
             least = f"at least {low[2] + block.height / 2:.4g} m high"
@@ -454,15 +456,15 @@ class Task(ABC):
         low, high = self._within
         # So written, an object whose position is NaN is lost.
         within = (state.object_position >= low) & (state.object_position <= high)
-        lost: BoolArray = ~within.all(axis=(1, 2))
+        lost: BoolArray = np.logical_not(within.all(axis=(1, 2)))
         return lost
 
 
 def example_states(machine: Machine, scene: Scene) -> State:
     """Return two different states that a machine could be in, with a scene's objects."""
     rng, objects = np.random.default_rng(0), len(scene.objects)
-    low, high = (machine.mount.to_world(corner) for corner in (machine.region.low, machine.region.high))
-    inside = rng.uniform(np.minimum(low, high), np.maximum(low, high), (2, 3 + objects, 3))
+    shape = (2, 3 + objects, 3)
+    inside = machine.mount.to_world(rng.uniform(machine.region.low, machine.region.high, shape))
     turn = rng.normal(size=(2, objects, 4)) * (0.1, 0.1, 1.0, 1.0)
     turn /= np.linalg.norm(turn, axis=2, keepdims=True)
     x, y, z, w = np.moveaxis(turn, 2, 0)

@@ -97,7 +97,7 @@ class AnalyticEngine:
         self._position = np.tile(machine.home, (count, 1))
         self._before = self._position.copy()
         self._rates, self._torque, self._force = np.zeros((3, count, 3))
-        self._mode_left = np.zeros(count, dtype=np.int64)
+        self._mode_left = np.zeros(count, dtype=np.int8)
         self._behind = np.zeros(count, dtype=np.bool_)  # whether ideal motors lacked torque
 
     def alter(self, rows: IntArray, plants: Sequence[Plant]) -> None:
@@ -210,9 +210,7 @@ class AnalyticEngine:
             self._mode_left[rows],
         )  # fmt: skip
         built = None if self._built is None else self._built[rows]
-        torques = march(
-            self._machine, built, steps, self._steps, course, self.time_step, touch
-        )
+        torques = march(self._machine, built, steps, self._steps, course, self.time_step, touch)
         self._theta[rows], self._rates[rows], self._torque[rows] = (
             course.theta, course.rates, course.torque,
         )  # fmt: skip
@@ -225,7 +223,9 @@ class AnalyticEngine:
 
     def _touch(self, rows: IntArray, points: FloatArray, vacuum: BoolArray) -> FloatArray:
         """Let objects and cups act along the way of P (r, K, 3) m; return forces (r, K, 3) N."""
-        ways = np.concatenate([self._before[rows, None], self._position[rows, None], points], axis=1)
+        ways = np.concatenate(
+            [self._before[rows, None], self._position[rows, None], points], axis=1
+        )
         ways *= self._turn
         ways += self._origin
         push: FloatArray = self._contact.advance(rows, ways, vacuum) * self._turn
@@ -335,5 +335,5 @@ class AnalyticEngine:
 
 def _beyond(torques: FloatArray, effort: FloatArray) -> BoolArray:
     """Return (r,) whether one of torques (r, m, 3) is more than a motor's effort (r, 3)."""
-    beyond: BoolArray = (np.abs(torques) > effort[:, None]).any(axis=(1, 2))
+    beyond: BoolArray = np.any(np.abs(torques) > effort[:, None], axis=(1, 2))
     return beyond

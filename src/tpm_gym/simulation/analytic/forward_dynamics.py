@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
-from tpm_gym.arrays import BoolArray, FloatArray, IntArray
+from tpm_gym.arrays import BoolArray, FloatArray
 from tpm_gym.mechanism.machine import Machine, Motion
 from tpm_gym.simulation.analytic.steps import driven_by_torque, driven_ideally, felt
 from tpm_gym.simulation.drives import References, ServoDrives
@@ -38,7 +39,7 @@ class Course:
     before: FloatArray
     force: FloatArray
     carried: FloatArray
-    mode_left: IntArray
+    mode_left: NDArray[np.int8]
 
 
 class Steps(Protocol):
@@ -82,7 +83,7 @@ class IdealSteps:
     @property
     def behind(self) -> BoolArray:
         """See the class."""
-        behind: BoolArray = self._behind.any(axis=0)
+        behind: BoolArray = self._behind[0] | self._behind[1]
         return behind
 
 
@@ -100,9 +101,7 @@ class ServoSteps:
         """See the protocol."""
         torque = self._drives.torque(self._references, index, course.theta, course.rates).copy()
         rates = np.empty_like(torque)
-        driven_by_torque(
-            torque, self._drives.friction, course.rates, mass, load, self._step, rates
-        )
+        driven_by_torque(torque, self._drives.friction, course.rates, mass, load, self._step, rates)
         return rates, torque
 
 
@@ -140,9 +139,7 @@ def march(
     at = machine.motion(course.theta, course.rates, built)
     for index in range(count):
         travel = course.position - course.before
-        mass, load = felt(
-            at.mass, at.bias, at.jacobian, course.force, course.carried, travel, step
-        )
+        mass, load = felt(at.mass, at.bias, at.jacobian, course.force, course.carried, travel, step)
         rates, torque = steps.move(index, course, mass, load)
         theta = course.theta + step * rates
         expected = course.position + step * _along(at.jacobian, rates)
@@ -167,10 +164,11 @@ def march(
 def _along(jacobian: FloatArray, rates: FloatArray) -> FloatArray:
     """Return J theta_dot, (r, 3)."""
     a, b, c = rates.T[..., None]
-    return jacobian[:, :, 0] * a + jacobian[:, :, 1] * b + jacobian[:, :, 2] * c
+    along: FloatArray = jacobian[:, :, 0] * a + jacobian[:, :, 1] * b + jacobian[:, :, 2] * c
+    return along
 
 
-def _mode_left(at: Motion, side: BoolArray, before: IntArray) -> IntArray:
+def _mode_left(at: Motion, side: BoolArray, before: NDArray[np.int8]) -> NDArray[np.int8]:
     """Return which mode each machine has left, (r,).
 
     Beyond a parallel singularity the joints turn back, so that the positions of the mirrored
@@ -178,5 +176,5 @@ def _mode_left(at: Motion, side: BoolArray, before: IntArray) -> IntArray:
     side, by the joint velocities and by its own velocity.
     """
     finite = np.isfinite(at.position).all(axis=1) & np.isfinite(at.mass).all(axis=(1, 2))
-    found = np.where(~finite | ~side, 1, np.where(at.working, 0, 2))
+    found = np.where(~finite | ~side, 1, np.where(at.working, 0, 2)).astype(np.int8)
     return np.where(before, before, found)

@@ -8,7 +8,7 @@ from tpm_gym.arrays import BoolArray, FloatArray
 from tpm_gym.compiling import compiled, kept
 from tpm_gym.simulation.compiled import inverted
 
-__all__ = ["driven_ideally", "driven_by_torque"]
+__all__ = ["driven_by_torque", "driven_ideally"]
 
 _CREEP = 2e-5  # m/s, at which friction gives way, instead of not at all
 _SIGNS = np.array([(i, j, k) for i in (0, 1, -1) for j in (0, 1, -1) for k in (0, 1, -1)], float)

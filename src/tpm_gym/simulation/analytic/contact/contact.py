@@ -92,7 +92,9 @@ class Contact:
         self._objects["mass"][rows] = mass_factor[:, None] * mass
         self._objects["friction"][rows] = friction_factor[:, None] * friction
 
-    def place(self, rows: Any, positions: FloatArray, quaternions: FloatArray | None = None) -> None:
+    def place(
+        self, rows: Any, positions: FloatArray, quaternions: FloatArray | None = None
+    ) -> None:
         """Let go, empty the cups, and put objects at rest.
 
         Args:

@@ -231,7 +231,9 @@ def _clear(objects: Records, cup: Record, way: Way, setting: Setting) -> bool:
     for index in range(len(objects)):
         if index != held:
             away = length(plus(three(objects[index]["position"]), place, -1.0))
-            if objects[index]["rest"] < AT_REST or away < reach + length(three(setting.half[index])):
+            if objects[index]["rest"] < AT_REST or away < reach + length(
+                three(setting.half[index])
+            ):
                 return False
     return True
 
