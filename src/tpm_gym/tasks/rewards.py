@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -14,7 +16,7 @@ def distance(achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
     """Return the Euclidean distance (...,) m of points (..., k) m."""
     gap: FloatArray = np.subtract(achieved, desired, dtype=np.float64)
     first, *others = (gap * gap).T
-    total: FloatArray = first
+    total: Any = first
     for part in others:  # numpy's sum costs several times as much
         total = total + part
     result: FloatArray = np.sqrt(total).T
