@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, is_dataclass
 from typing import Any
@@ -340,8 +341,7 @@ def report(task: Task, state: State, goals: FloatArray) -> Report:
     gap, penalty = task.gap(achieved, observation["desired_goal"]), task.penalty(state)
     terms = task.reward_terms(state, gap, penalty)
     reward = terms["goal"] + _goal_free(terms)
-    flat = observation["observation"].ravel()
-    if not np.isfinite(np.dot(flat, flat) + achieved.sum() + reward.sum()):
+    if not math.isfinite(sum(map(_square, (observation["observation"], achieved, reward)))):
         raise _not_finite(task, state, achieved, terms)
     return (
         observation,
@@ -358,6 +358,11 @@ def report(task: Task, state: State, goals: FloatArray) -> Report:
             "reward_terms": terms,
         },
     )
+
+
+def _square(values: NDArray[Any]) -> float:
+    """Return a number that is finite if all values are."""
+    return float(np.vdot(values, values))
 
 
 def _clip(values: FloatArray, bound: float) -> NDArray[np.float32]:

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium.utils import seeding
 from numpy.typing import ArrayLike, NDArray
 
-from tpm_gym.arrays import FloatArray, finite, is_whole
+from tpm_gym.arrays import FloatArray, floats, is_whole
 from tpm_gym.envs.core import (
     Core,
     EnvSnapshot,
@@ -268,7 +268,7 @@ class TPMEnv(gym.Env[Observation, Action]):
             ConfigurationError: If the task makes something of the state that is not finite.
         """
         core = self._core
-        asked = finite("action", action, (self.task.action_size,), ActionError)
+        asked = np.array(floats("action", action, self.task.action_size, ActionError))
         state = core.state
         if state.passed_singularity[0]:
             raise ModeChangeError("assembly" if state.assembly_mode_changed[0] else "working")
@@ -383,9 +383,9 @@ def _row(
 ) -> tuple[Observation, float, dict[str, Any]]:
     """Take the one row of a report, in Python's own numbers."""
     told = {
-        name: {term: float(own[0]) for term, own in value.items()}
+        name: {term: float(own.item()) for term, own in value.items()}
         if name == "reward_terms"
-        else value[0].item()
+        else value.item()
         for name, value in info.items()
     }
-    return {name: values[0] for name, values in observation.items()}, float(reward[0]), told
+    return {name: values[0] for name, values in observation.items()}, float(reward.item()), told

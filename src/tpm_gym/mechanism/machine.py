@@ -264,9 +264,10 @@ class Machine(ABC):
             UnreachableError: If a position is out of reach.
             JointLimitError: If a motor is beyond a stop at a position.
         """
+        from tpm_gym.kinematics.boxes import all_within  # imports Numba
+
         theta = self.inverse(position)
-        lower, upper = self._stops
-        if not ((theta >= lower) & (theta <= upper)).all():  # so written, NaN fails too
+        if not all_within(theta.reshape(-1, 3), *self._stops):  # which NaN is not
             self.require_within_stops(self.require_inverse(position))
         return theta
 

@@ -4,10 +4,82 @@ from __future__ import annotations
 
 import numpy as np
 
-from tpm_gym.arrays import FloatArray
+from tpm_gym.arrays import FloatArray, IntArray
 from tpm_gym.compiling import compiled, kept
 
-__all__ = ["braced_inverse", "inverted", "limited", "servo_torques", "spline_points"]
+__all__ = [
+    "braced_inverse",
+    "in_world",
+    "inverted",
+    "limited",
+    "servo_torques",
+    "spline_points",
+    "unusual",
+]
+
+
+@kept
+def unusual(
+    gap: FloatArray, limit: float, mode_left: IntArray, conditioning: FloatArray
+) -> tuple[bool, bool, bool]:
+    """Return whether a loop is open, a mode was left, and a reading makes no sense, in any row.
+
+    Args:
+        gap: (n,) m; NaN counts as open.
+        limit: m.
+        mode_left: (n,).
+        conditioning: (r,); NaN makes no sense.
+    """
+    opened = left = senseless = False
+    for row in range(len(gap)):
+        opened |= not gap[row] <= limit
+        left |= mode_left[row] != 0
+    for row in range(len(conditioning)):
+        senseless |= np.isnan(conditioning[row])
+    return opened, left, senseless
+
+
+@kept
+def in_world(
+    position: FloatArray,
+    jacobian: FloatArray,
+    theta_dot: FloatArray,
+    commands: FloatArray,
+    quaternion: FloatArray,
+    turn: FloatArray,
+    origin: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Compute P, velocity of P and command (n, 3) in the world, and objects' z axes (n, k, 3).
+
+    Args:
+        position: (n, 3) m, machine's frame.
+        jacobian: (n, 3, 3) m/rad.
+        theta_dot: (n, 3) rad/s.
+        commands: (n, 2, 3) m, machine's frame; the second one is converted.
+        quaternion: (n, k, 4) orientations of objects in the world.
+        turn: (3,) factors of the machine's frame.
+        origin: (3,) m.
+    """
+    place, speed, wanted = (
+        np.empty_like(position),
+        np.empty_like(position),
+        np.empty_like(position),
+    )
+    axes = np.empty((quaternion.shape[0], quaternion.shape[1], 3))
+    for row in range(len(position)):
+        for i in range(3):
+            place[row, i] = turn[i] * position[row, i] + origin[i]
+            wanted[row, i] = turn[i] * commands[row, 1, i] + origin[i]
+            rate = 0.0
+            for k in range(3):
+                rate += jacobian[row, i, k] * theta_dot[row, k]
+            speed[row, i] = turn[i] * rate
+        for item in range(quaternion.shape[1]):
+            x, y, z, w = quaternion[row, item]
+            axes[row, item, 0] = 2 * (x * z + w * y)
+            axes[row, item, 1] = 2 * (y * z - w * x)
+            axes[row, item, 2] = 1 - 2 * (x * x + y * y)
+    return place, speed, wanted, axes
 
 
 @kept

@@ -75,6 +75,10 @@ class Simulation:
         renderer: str | None = None,
     ) -> None:
         """Start the engine and load the machines."""
+        from tpm_gym.kinematics.boxes import all_within  # imports Numba
+        from tpm_gym.simulation import compiled
+
+        self._loops, self._all_within = compiled, all_within
         self.scene, self.machine, self.count, self.drive = scene, machine, count, drive
         self.engine: Engine = make_engine(
             engine, gui=gui, renderer=renderer, physics=physics, drive=drive
@@ -87,6 +91,7 @@ class Simulation:
         self._plants = [NOMINAL] * count
         self._weights = spline_weights(round(CONTROL_PERIOD / self.engine.time_step))
         self._frame = machine.mount.frame
+        self._region = np.array(machine.region.low), np.array(machine.region.high)
         self._commands = np.zeros((count, 2, 3))  # the last two, machine's frame, m
         self._noise = np.zeros((count, 2, 3))  # of the last two readings of the encoders, rad
         self._bias = np.zeros((count, 3))  # of the encoders, rad
@@ -186,7 +191,7 @@ class Simulation:
             JointLimitError: If a motor would be beyond a stop; nothing has moved then.
             ClosureError: If a loop opened.
         """
-        if not self.machine.region.contains(commands).all():
+        if not self._all_within(commands, *self._region):
             self.machine.reach(commands)  # the spline ends before the command does
         path = Path(
             self.machine,
@@ -222,21 +227,26 @@ class Simulation:
             ClosureError: If a loop is open.
         """
         now = self._readout = self.engine.read()
-        gap = now.gap.max()
-        if not gap <= CLOSURE_LIMIT:  # so written, a NaN fails too
-            raise ClosureError(float(gap), CLOSURE_LIMIT)
-        if now.mode_left.any():
-            self._mode_left = np.where(self._mode_left, self._mode_left, now.mode_left)
         theta = now.theta[rows]
         if self._disturbed:
             theta = theta + self._bias[rows] + self._noise[rows, 1]
         position, jacobian, conditioning, _ = self.machine.evaluate(theta)
-        lost = np.isnan(conditioning)
-        if lost.any():
+        opened, left, senseless = self._loops.unusual(
+            now.gap, CLOSURE_LIMIT, now.mode_left, conditioning
+        )
+        if opened:
+            raise ClosureError(float(now.gap.max()), CLOSURE_LIMIT)
+        if left:
+            self._mode_left = np.where(self._mode_left, self._mode_left, now.mode_left)
+        if senseless:
             # Disturbed encoders may report joint positions at which no assembly exists. The last
             # reading that made sense stays, as a controller can do no better.
+            lost = np.isnan(conditioning)
             position[lost], jacobian[lost] = self._position[rows][lost], self._jacobian[rows][lost]
             conditioning[lost] = self._conditioning[rows][lost]
+        if isinstance(rows, slice):
+            self._position, self._jacobian, self._conditioning = position, jacobian, conditioning
+            return
         self._position[rows], self._jacobian[rows] = position, jacobian
         self._conditioning[rows] = conditioning
 
@@ -248,27 +258,29 @@ class Simulation:
             before, last = self._noise[:, 0], self._noise[:, 1]
             theta = theta + self._bias + last
             rates = rates + (last - before) / CONTROL_PERIOD
-        j, (a, b, c) = self._jacobian, rates.T[..., None]
-        velocity = j[:, :, 0] * a + j[:, :, 1] * b + j[:, :, 2] * c
+        place, velocity, command, axis = self._loops.in_world(
+            self._position, self._jacobian, rates, self._commands,
+            np.ascontiguousarray(now.object_quaternion), turn, origin,
+        )  # fmt: skip
         return State.of(
             {
                 "theta": theta,
                 "theta_dot": rates,
                 "torque": now.torque,
-                "fk_position": self._position * turn + origin,
-                "fk_velocity": velocity * turn,
+                "fk_position": place,
+                "fk_velocity": velocity,
                 "conditioning": self._conditioning.copy(),
                 "platform_position": now.position,
                 "platform_tilt": now.tilt,
                 "closure_error": now.gap,
                 "assembly_mode_changed": self._mode_left == 1,
                 "working_mode_changed": self._mode_left == 2,
-                "command": self._commands[:, 1] * turn + origin,
+                "command": command,
                 "held": now.held,
                 "vacuum": now.vacuum,
                 "object_position": now.object_position,
                 "object_quaternion": now.object_quaternion,
-                "object_axis": _upward(now.object_quaternion),
+                "object_axis": axis,
                 "object_velocity": now.object_velocity,
                 "object_angular_velocity": now.object_angular_velocity,
             }
@@ -303,12 +315,3 @@ class Simulation:
     def close(self) -> None:
         """Close the engine; harmless the second time."""
         self.engine.close()
-
-
-def _upward(quaternion: FloatArray) -> FloatArray:
-    """Return the own z axes (..., 3) of orientations (..., 4)."""
-    x, y, z, w = quaternion[..., 0], quaternion[..., 1], quaternion[..., 2], quaternion[..., 3]
-    axis = np.empty((*quaternion.shape[:-1], 3))
-    axis[..., 0], axis[..., 1] = 2 * (x * z + w * y), 2 * (y * z - w * x)
-    axis[..., 2] = 1 - 2 * (x * x + y * y)
-    return axis
