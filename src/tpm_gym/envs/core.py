@@ -166,10 +166,8 @@ class Core:
         self.episode[rows] += 1
         self._pending[:, rows] = 0.0
         self._show_goal()
-        noise = self._noise(rows)
-        self.simulation.reset(
-            rows, self._home, starts, plants, None if noise is None else noise[rows]
-        )
+        noise = self._noise(rows)[rows] if self.randomisation.encoder_noise > 0 else None
+        self.simulation.reset(rows, self._home, starts, plants, noise)
         return [self.randomisation.told(plant) if self._altered else {} for plant in plants]
 
     def step(self, actions: FloatArray, running: IntArray) -> None:
@@ -188,7 +186,8 @@ class Core:
         commands = self.control.command(actions[:, :3], simulation.commands)
         vacuum = actions[:, 3] > 0 if self.task.vacuum else np.zeros(self.count, dtype=np.bool_)
         state, self._state = self._state, None  # until the step has gone well
-        simulation.move(commands, vacuum, self._noise(running))
+        noisy = self.randomisation.encoder_noise > 0
+        simulation.move(commands, vacuum, self._noise(running) if noisy else None)
         self._state, self._pending = state, late
 
     def report(self, rows: IntArray | None = None) -> Report:
@@ -203,14 +202,11 @@ class Core:
             state, goals = state.take(rows), goals[rows]
         return report(self.task, state, goals)
 
-    def _noise(self, rows: IntArray) -> FloatArray | None:
+    def _noise(self, rows: IntArray) -> FloatArray:
         """Draw the errors (n, 3) rad of one reading of the encoders, for some environments."""
-        size = self.randomisation.encoder_noise
-        if size == 0:
-            return None
         noise = np.zeros((self.count, 3))
         for row in rows.tolist():
-            noise[row] = self.rngs[row].normal(0.0, size, 3)
+            noise[row] = self.rngs[row].normal(0.0, self.randomisation.encoder_noise, 3)
         return noise
 
     def _show_goal(self) -> None:
@@ -333,15 +329,16 @@ def report(task: Task, state: State, goals: FloatArray) -> Report:
         ConfigurationError: If the task makes something of the state that is not finite.
     """
     observation = {
-        "observation": _clip(task.observe(state), OBSERVATION_BOUND),
-        "achieved_goal": _clip(task.achieved(state), GOAL_BOUND),
+        "observation": _clipped(task.observe(state), OBSERVATION_BOUND),
+        "achieved_goal": _clipped(task.achieved(state), GOAL_BOUND),
         "desired_goal": goals.astype(np.float32),
     }
     achieved = observation["achieved_goal"]
     gap, penalty = task.gap(achieved, observation["desired_goal"]), task.penalty(state)
     terms = task.reward_terms(state, gap, penalty)
     reward = terms["goal"] + _goal_free(terms)
-    if not math.isfinite(sum(map(_square, (observation["observation"], achieved, reward)))):
+    squares = np.vdot(reward, reward) + np.vdot(achieved, achieved)
+    if not math.isfinite(squares + np.vdot(observation["observation"], observation["observation"])):
         raise _not_finite(task, state, achieved, terms)
     return (
         observation,
@@ -360,12 +357,7 @@ def report(task: Task, state: State, goals: FloatArray) -> Report:
     )
 
 
-def _square(values: NDArray[Any]) -> float:
-    """Return a number that is finite if all values are."""
-    return float(np.vdot(values, values))
-
-
-def _clip(values: FloatArray, bound: float) -> NDArray[np.float32]:
+def _clipped(values: FloatArray, bound: float) -> NDArray[np.float32]:
     return np.minimum(np.maximum(values, -bound), bound).astype(np.float32, order="C")
 
 
@@ -383,7 +375,10 @@ def _not_finite(
 ) -> ConfigurationError:
     """Find the value of a task that is not finite."""
     values = {
-        **{f"observed(), {entry.name!r}": entry.source(state) for entry in task.entries},
+        **{
+            f"observed(), {entry.name!r}": entry.source(state)[:, slice(*entry.columns or (None,))]
+            for entry in task.entries
+        },
         "achieved()": achieved,
         **{f"reward_terms()[{name!r}]": value for name, value in terms.items()},
     }

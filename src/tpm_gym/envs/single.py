@@ -382,10 +382,13 @@ def _row(
     observation: Observation, reward: FloatArray, info: Mapping[str, Any]
 ) -> tuple[Observation, float, dict[str, Any]]:
     """Take the one row of a report, in Python's own numbers."""
-    told = {
-        name: {term: float(own.item()) for term, own in value.items()}
-        if name == "reward_terms"
-        else value.item()
-        for name, value in info.items()
-    }
-    return {name: values[0] for name, values in observation.items()}, float(reward.item()), told
+    told: dict[str, Any] = {}
+    for name, value in info.items():
+        if name != "reward_terms":
+            told[name] = value.item()
+    told["reward_terms"] = terms = {}
+    for name, value in info["reward_terms"].items():
+        terms[name] = float(value.item())
+    for name, value in observation.items():
+        observation[name] = value[0]
+    return observation, reward.item(), told

@@ -254,8 +254,8 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         self._require_open()
         states = [vars(part.core.state) for part in self._parts]
         if len(states) == 1:
-            return State.of(states[0])
-        return State.of({k: np.concatenate([s[k] for s in states]) for k in states[0]})
+            return State(**states[0])
+        return State(**{k: np.concatenate([s[k] for s in states]) for k in states[0]})
 
     @property
     def episode(self) -> IntArray:

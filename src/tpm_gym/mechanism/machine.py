@@ -249,7 +249,7 @@ class Machine(ABC):
         Raises:
             JointLimitError: If there is one.
         """
-        lower, upper = self._stops
+        lower, upper = self.stops
         within = (theta >= lower) & (theta <= upper)
         if not within.all():
             index = int(np.argwhere(~within)[0, -1])
@@ -264,15 +264,12 @@ class Machine(ABC):
             UnreachableError: If a position is out of reach.
             JointLimitError: If a motor is beyond a stop at a position.
         """
-        from tpm_gym.kinematics.boxes import all_within  # imports Numba
-
-        theta = self.inverse(position)
-        if not all_within(theta.reshape(-1, 3), *self._stops):  # which NaN is not
-            self.require_within_stops(self.require_inverse(position))
+        theta = self.require_inverse(position)
+        self.require_within_stops(theta)
         return theta
 
     @cached_property
-    def _stops(self) -> FloatArray:
+    def stops(self) -> FloatArray:
         """Lowest and highest joint positions, (2, 3)."""
         stops: FloatArray = np.array(self.mechanism.stops).T
         return stops

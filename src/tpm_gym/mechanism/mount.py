@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -63,7 +64,7 @@ class Mount:
         x, y, z = vector
         return x, -y, -z
 
-    @property
+    @cached_property
     def frame(self) -> tuple[FloatArray, FloatArray]:
         """Factors and origin (3,), so that world = factors * point + origin, and back."""
         return _HALF_TURN, np.array([0.0, 0.0, self.height])

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from tpm_gym.arrays import FloatArray, IntArray
+from tpm_gym.arrays import FloatArray
 from tpm_gym.compiling import compiled, kept
 
 __all__ = [
+    "all_within",
     "braced_inverse",
     "in_world",
     "inverted",
@@ -19,8 +21,18 @@ __all__ = [
 
 
 @kept
+def all_within(points: FloatArray, low: FloatArray, high: FloatArray) -> bool:
+    """Return whether all points (m, 3) are in the box between low and high (3,); NaN is not."""
+    for row in range(len(points)):
+        for axis in range(3):
+            if not low[axis] <= points[row, axis] <= high[axis]:
+                return False
+    return True
+
+
+@kept
 def unusual(
-    gap: FloatArray, limit: float, mode_left: IntArray, conditioning: FloatArray
+    gap: FloatArray, limit: float, mode_left: NDArray[np.int8], conditioning: FloatArray
 ) -> tuple[bool, bool, bool]:
     """Return whether a loop is open, a mode was left, and a reading makes no sense, in any row.
 

@@ -20,7 +20,7 @@ from tpm_gym.simulation.randomisation import NOMINAL, Plant, Randomisation
 from tpm_gym.simulation.settings import settings_of
 
 if TYPE_CHECKING:
-    from tpm_gym.simulation.path import Path
+    from tpm_gym.simulation.engine import Path
 
 __all__ = [
     "References",

@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib
 import inspect
 from collections.abc import Callable, Collection, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,11 +23,9 @@ from tpm_gym.simulation.randomisation import Plant
 from tpm_gym.simulation.state import Scene
 from tpm_gym.simulation.vacuum import Hold
 
-if TYPE_CHECKING:
-    from tpm_gym.simulation.path import Path
-
 __all__ = [
     "Engine",
+    "Path",
     "Pose",
     "Readout",
     "Twist",
@@ -35,6 +33,7 @@ __all__ = [
     "most_robots",
     "register_engine",
     "require_engine",
+    "spline_weights",
 ]
 
 UPRIGHT: Quaternion = (0.0, 0.0, 0.0, 1.0)
@@ -116,17 +115,82 @@ class Readout(NamedTuple):
         """
         (theta, rates, torque), (gap, place, tilt) = motors, truth
         numbers = [*theta, *rates, *torque, *place, tilt, gap, hold.vacuum]
-        for (where, turn), (velocity, spin) in objects:
-            numbers += (*where, *turn, *velocity, *spin)
+        for (where, orientation), (velocity, spin) in objects:
+            numbers += (*where, *orientation, *velocity, *spin)
         # One array for all numbers costs half of an array for each entry.
         row = np.array([numbers])
         table = row[:, 15:].reshape(1, -1, 13)
-        left = machine.mode_left(row[:, 0:3], machine.mount.to_paper(row[:, 9:12]))
+        turn, origin = machine.mount.frame
+        left = machine.mode_left(row[:, 0:3], (row[:, 9:12] - origin) * turn)
         return cls(
             row[:, 0:3], row[:, 3:6], row[:, 6:9], row[:, 9:12],
             row[:, 12], row[:, 13], left, np.array([hold.which]), row[:, 14],
             table[..., 0:3], table[..., 3:7], table[..., 7:10], table[..., 10:13],
         )  # fmt: skip
+
+
+def spline_weights(steps: int) -> FloatArray:
+    """Return the weights (steps, 3) of the last three commands along the quadratic B-spline."""
+    s = np.arange(1, steps + 1) / steps
+    return np.stack([(1 - s) ** 2, 1 + 2 * s - 2 * s**2, s**2], axis=1) / 2
+
+
+class Path:
+    """Path of point P of n robots in a control period: a quadratic B-spline through the commands.
+
+    The spline lags the commands by half a period, stays in their convex hull, and keeps the
+    accelerations finite. It is a curve of point P, not of the joints: near a singularity, a
+    straight line between two postures would wander by centimetres.
+
+    Args:
+        machine: The nominal machine, whose inverse kinematics the control believes in.
+        commands: (n, 3, 3) m, machine's frame: the last three commands, oldest first.
+        weights: (K, 3), of :func:`spline_weights`.
+        bias: (n, 3) rad, what the encoders report minus the truth; None for none.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        commands: FloatArray,
+        weights: FloatArray,
+        bias: FloatArray | None = None,
+    ) -> None:
+        """Compute nothing yet."""
+        self.machine, self._commands, self._weights, self._bias = machine, commands, weights, bias
+
+    @property
+    def start(self) -> FloatArray:
+        """(n, 3) m, point P at the beginning of the period."""
+        start: FloatArray = (self._commands[:, 0] + self._commands[:, 1]) / 2
+        return start
+
+    def points(self, last: int = 0) -> FloatArray:
+        """Return point P (n, k, 3) m at the ends of the last k time steps; 0 for all of them."""
+        from tpm_gym.simulation import compiled  # imports Numba
+
+        return compiled.spline_points(self._commands, self._weights[-last:])
+
+    def joints(self, last: int = 0) -> FloatArray:
+        """Return true joint positions (n, k, 3) rad at the ends of the last k time steps.
+
+        Raises:
+            JointLimitError: If a motor would be beyond a stop.
+            UnreachableError: If a point is out of reach.
+        """
+        from tpm_gym.simulation import compiled  # imports Numba
+
+        points = compiled.spline_points(self._commands, self._weights[-last:])
+        theta = self.machine.inverse(points)
+        if not compiled.all_within(theta.reshape(-1, 3), *self.machine.stops):  # NaN is not
+            theta = self.machine.reach(points)
+        return theta if self._bias is None else self.true(theta)
+
+    def true(self, theta: FloatArray) -> FloatArray:
+        """Convert joint positions (n, ..., 3) by the encoders into true ones."""
+        if self._bias is None:
+            return theta
+        return theta - self._bias.reshape(-1, *(1,) * (theta.ndim - 2), 3)
 
 
 class Engine(Protocol):

@@ -14,8 +14,7 @@ from tpm_gym.errors import ClosureError
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.tpm import PAPER_TPM
 from tpm_gym.simulation.drives import Servo, require_servo
-from tpm_gym.simulation.engine import Engine, Readout, make_engine
-from tpm_gym.simulation.path import Path, spline_weights
+from tpm_gym.simulation.engine import Engine, Path, Readout, make_engine, spline_weights
 from tpm_gym.simulation.randomisation import NOMINAL, Plant
 from tpm_gym.simulation.state import CONTROL_PERIOD, Scene, State
 
@@ -75,10 +74,9 @@ class Simulation:
         renderer: str | None = None,
     ) -> None:
         """Start the engine and load the machines."""
-        from tpm_gym.kinematics.boxes import all_within  # imports Numba
-        from tpm_gym.simulation import compiled
+        from tpm_gym.simulation import compiled  # imports Numba
 
-        self._loops, self._all_within = compiled, all_within
+        self._loops = compiled
         self.scene, self.machine, self.count, self.drive = scene, machine, count, drive
         self.engine: Engine = make_engine(
             engine, gui=gui, renderer=renderer, physics=physics, drive=drive
@@ -191,7 +189,7 @@ class Simulation:
             JointLimitError: If a motor would be beyond a stop; nothing has moved then.
             ClosureError: If a loop opened.
         """
-        if not self._all_within(commands, *self._region):
+        if not self._loops.all_within(commands, *self._region):
             self.machine.reach(commands)  # the spline ends before the command does
         path = Path(
             self.machine,
@@ -262,28 +260,26 @@ class Simulation:
             self._position, self._jacobian, rates, self._commands,
             np.ascontiguousarray(now.object_quaternion), turn, origin,
         )  # fmt: skip
-        return State.of(
-            {
-                "theta": theta,
-                "theta_dot": rates,
-                "torque": now.torque,
-                "fk_position": place,
-                "fk_velocity": velocity,
-                "conditioning": self._conditioning.copy(),
-                "platform_position": now.position,
-                "platform_tilt": now.tilt,
-                "closure_error": now.gap,
-                "assembly_mode_changed": self._mode_left == 1,
-                "working_mode_changed": self._mode_left == 2,
-                "command": command,
-                "held": now.held,
-                "vacuum": now.vacuum,
-                "object_position": now.object_position,
-                "object_quaternion": now.object_quaternion,
-                "object_axis": axis,
-                "object_velocity": now.object_velocity,
-                "object_angular_velocity": now.object_angular_velocity,
-            }
+        return State(
+            theta=theta,
+            theta_dot=rates,
+            torque=now.torque,
+            fk_position=place,
+            fk_velocity=velocity,
+            conditioning=self._conditioning.copy(),
+            platform_position=now.position,
+            platform_tilt=now.tilt,
+            closure_error=now.gap,
+            assembly_mode_changed=self._mode_left == 1,
+            working_mode_changed=self._mode_left == 2,
+            command=command,
+            held=now.held,
+            vacuum=now.vacuum,
+            object_position=now.object_position,
+            object_quaternion=now.object_quaternion,
+            object_axis=axis,
+            object_velocity=now.object_velocity,
+            object_angular_velocity=now.object_angular_velocity,
         )
 
     # -- state, pictures, end ---------------------------------------------------------------

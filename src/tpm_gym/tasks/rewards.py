@@ -14,9 +14,9 @@ __all__ = ["dense", "distance", "singularity_penalty", "sparse"]
 
 def distance(achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
     """Return the Euclidean distance (...,) m of points (..., k) m."""
-    gap: FloatArray = np.subtract(achieved, desired, dtype=np.float64)
-    first, *others = (gap * gap).T
-    total: Any = first
+    gap = np.subtract(achieved, desired, dtype=np.float64)
+    total: Any
+    total, *others = (gap * gap).T
     for part in others:  # numpy's sum costs several times as much
         total = total + part
     result: FloatArray = np.sqrt(total).T

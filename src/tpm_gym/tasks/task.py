@@ -13,7 +13,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import cycle
+from functools import partial
+from itertools import cycle, groupby
 from typing import Any, ClassVar
 
 import numpy as np
@@ -46,7 +47,8 @@ class Entry:
         meaning: Description, with the sensor.
         centre: Value that is stored as 0.
         scale: Difference that is stored as 1.
-        source: Function that reads the values (n, k) from a state.
+        source: Function that reads values (n, ...) from a state. Entries in a row may share one.
+        columns: The entry's columns (start, stop) of what the source reads; None for all.
     """
 
     name: str
@@ -54,7 +56,8 @@ class Entry:
     meaning: str
     centre: Values
     scale: Values
-    source: Callable[[State], ArrayLike]
+    source: Callable[[State], FloatArray]
+    columns: tuple[int, int] | None = None
 
 
 class Task(ABC):
@@ -118,10 +121,12 @@ class Task(ABC):
         self.entries = self.observed()
         self._centre = np.concatenate([entry.centre for entry in self.entries])
         self._scale = np.concatenate([entry.scale for entry in self.entries])
+        self._sources = [source for source, _ in groupby(entry.source for entry in self.entries)]
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave the entries out: they hold functions, which cannot be pickled."""
-        return {name: value for name, value in vars(self).items() if name != "entries"}
+        own = vars(self).items()
+        return {name: value for name, value in own if name not in ("entries", "_sources")}
 
     def __setstate__(self, values: dict[str, Any]) -> None:
         """Take everything from another task, and make the entries anew."""
@@ -190,8 +195,10 @@ class Task(ABC):
 
     def penalty(self, state: State) -> FloatArray:
         """Return the singularity penalty before weighting, (n,) in [0, 1]; 1 past a singularity."""
-        conditioning = state.conditioning * ~state.passed_singularity
-        return rewards.singularity_penalty(conditioning, self.machine.safe_conditioning)
+        passed = state.assembly_mode_changed | state.working_mode_changed
+        return rewards.singularity_penalty(
+            state.conditioning * ~passed, self.machine.safe_conditioning
+        )
 
     def success(self, gap: FloatArray) -> BoolArray:
         """Return whether the goal is achieved, (...,), for a gap (...,) m."""
@@ -361,31 +368,40 @@ class Task(ABC):
         centre, extent, speed, step = self._scales()
         return (
             Entry("position", "m", "P by forward kinematics of the encoders", centre, extent,
-                  lambda s: s.fk_position),
+                  _measure_robot, (0, 3)),
             Entry("velocity", "m/s", "J(theta) theta_dot, from the encoders", _ZERO, speed,
-                  lambda s: s.fk_velocity),
+                  _measure_robot, (3, 6)),
             Entry("command", "m", "commanded P minus position", _ZERO, step,
-                  lambda s: s.command - s.fk_position),
+                  _measure_robot, (6, 9)),
         )  # fmt: skip
 
     def object_entries(self, index: int = 0) -> tuple[Entry, ...]:
         """Return the entries that a camera and the vacuum gauge measure of one object."""
         centre, extent, speed, _ = self._scales()
-        name = self.scene.objects[index].name
+        name, measure = self.scene.objects[index].name, partial(self._measure_object, index)
         near = tuple(min(0.1, max(0.02, half)) for half in extent)
         return (
             Entry(f"{name}_position", "m", f"centre of the {name}, from a camera", centre, extent,
-                  lambda s: s.object_position[:, index]),
+                  measure, (0, 3)),
             Entry(f"{name}_offset", "m", f"top of the {name} minus lip of the cup", _ZERO, near,
-                  lambda s: self.top(s, index) - self.lip(s)),
+                  measure, (3, 6)),
             Entry(f"{name}_velocity", "m/s", f"velocity of the {name}, from a camera", _ZERO, speed,
-                  lambda s: s.object_velocity[:, index]),
+                  measure, (6, 9)),
             Entry(f"{name}_tilt", "-", f"x and y of the {name}'s axis", (0.0, 0.0), (1.0, 1.0),
-                  lambda s: s.object_axis[:, index, :2]),
+                  measure, (9, 11)),
             Entry(f"{name}_held", "-", f"share of the vacuum that holds the {name}, by a gauge",
-                  (0.5,), (0.5,),
-                  lambda s: ((s.held == index) * (s.vacuum / CUP.vacuum))[:, None]),
+                  (0.5,), (0.5,), measure, (11, 12)),
         )  # fmt: skip
+
+    def _measure_object(self, index: int, state: State) -> FloatArray:
+        """Return centre, offset, velocity, tilt and hold (n, 12) of one object."""
+        values = np.empty((len(state.held), 12))
+        values[:, :3] = state.object_position[:, index]
+        values[:, 3:6] = self.top(state, index) - self.lip(state)
+        values[:, 6:9] = state.object_velocity[:, index]
+        values[:, 9:11] = state.object_axis[:, index, :2]
+        values[:, 11] = (state.held == index) * (state.vacuum / CUP.vacuum)
+        return values
 
     def _scales(self) -> tuple[Values, Values, Values, Values]:
         """Return centre and extent of the region (m, world), full speed (m/s), largest step (m)."""
@@ -411,8 +427,8 @@ class Task(ABC):
 
     def observe(self, state: State) -> FloatArray:
         """Return the observation vectors (n, k), each entry of order one."""
-        values = np.concatenate([entry.source(state) for entry in self.entries], axis=-1)
-        scaled: FloatArray = (values - self._centre) / self._scale
+        values = [source(state) for source in self._sources]
+        scaled: FloatArray = (np.concatenate(values, axis=1) - self._centre) / self._scale
         return scaled
 
     def decode(self, observation: ArrayLike) -> dict[str, FloatArray]:
@@ -493,6 +509,12 @@ def _entries_of(name: str, together: Any, single: Any) -> list[tuple[str, Any, A
 def _equal(row: Any, single: Any) -> bool:
     """Return whether a row is what the state alone gives, (1, ...)."""
     return np.shape(single) == (1, *np.shape(row)) and np.allclose(row, single[0], equal_nan=True)
+
+
+def _measure_robot(state: State) -> FloatArray:
+    """Return position, velocity and command (n, 9) of the robot."""
+    position = state.fk_position
+    return np.concatenate([position, state.fk_velocity, state.command - position], axis=1)
 
 
 def _range(low: ArrayLike, high: ArrayLike) -> str:

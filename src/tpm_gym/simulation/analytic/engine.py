@@ -29,8 +29,7 @@ from tpm_gym.simulation.analytic.forward_dynamics import (
 )
 from tpm_gym.simulation.analytic.physics import Physics
 from tpm_gym.simulation.drives import Servo, ServoDrives
-from tpm_gym.simulation.engine import Engine, Readout, make_engine
-from tpm_gym.simulation.path import Path
+from tpm_gym.simulation.engine import Engine, Path, Readout, make_engine
 from tpm_gym.simulation.randomisation import Plant
 from tpm_gym.simulation.settings import settings_of
 from tpm_gym.simulation.state import Scene

@@ -19,8 +19,7 @@ from tpm_gym.simulation.bullet.physics import Physics
 from tpm_gym.simulation.bullet.robot import Robot
 from tpm_gym.simulation.bullet.scenery import Scenery
 from tpm_gym.simulation.drives import Servo, ServoDrives, steering
-from tpm_gym.simulation.engine import Engine, Pose, Readout, Twist
-from tpm_gym.simulation.path import Path
+from tpm_gym.simulation.engine import Engine, Path, Pose, Readout, Twist
 from tpm_gym.simulation.randomisation import NOMINAL, Plant
 from tpm_gym.simulation.settings import settings_of
 from tpm_gym.simulation.state import Scene
@@ -144,23 +143,19 @@ class BulletEngine:
 
     def read(self) -> Readout:
         """See the protocol."""
-        theta, rates, torque = self.robot.motors()
-        return Readout.of_one(
-            self._machine,
-            (theta, rates, self._applied(torque)),
-            self.robot.truth(),
-            self._cup.grip.hold,
-            self._scenery.read(),
-        )
+        robot = self.robot
+        objects, hold = self._scenery.read(), self._cup.grip.hold
+        return Readout.of_one(self._machine, self._motors(), robot.truth(), hold, objects)
 
-    def _applied(self, torque: Vector) -> Vector:
-        """Return the torques of the last time step, N m, of which Bullet reports ``torque``."""
+    def _motors(self) -> tuple[Vector, Vector, Vector]:
+        """Return joint positions, velocities and torques of the motors."""
+        theta, rates, torque = self.robot.motors()
         if self._torque is not None:  # at rest after a reset, or restored
-            return self._torque
-        if self._drives is None:
-            return torque
-        a, b, c = self._drives.memory[0, 0].tolist()  # Bullet reports the axes' friction
-        return a, b, c
+            torque = self._torque
+        elif self._drives is not None:  # Bullet reports the axes' friction
+            a, b, c = self._drives.memory[0, 0].tolist()
+            torque = a, b, c
+        return theta, rates, torque
 
     def show_goal(self, markers: FloatArray) -> None:
         """See the protocol."""
@@ -170,7 +165,7 @@ class BulletEngine:
         """See the protocol."""
         return _Saved(
             self.robot.joint_states(),
-            self._applied(self.robot.motors()[2]),
+            self._motors()[2],
             None if self._drives is None else self._drives.memory.copy(),
             self._scenery.read(),
             self._cup.grip,

@@ -220,11 +220,9 @@ class Robot:
     def truth(self) -> tuple[float, Vector, float]:
         """Return the largest loop gap (m), point P (m, world) and the platform's tilt (rad)."""
         number = self._client.number
-        states = [
-            state
-            for body, links in self._watched.items()
-            for state in pybullet.getLinkStates(body, links, 0, 1, number)
-        ]
+        states: list[Any] = []
+        for body, links in self._watched.items():
+            states += pybullet.getLinkStates(body, links, 0, 1, number)
         squared = 0.0
         for at_a, point_a, at_b, point_b in self._pairs:
             a, b = states[at_a], states[at_b]
@@ -238,16 +236,14 @@ class Robot:
         return math.sqrt(squared), place, Mount.tilt(platform[5])
 
     def lip(self) -> Vector:
-        """Centre of the cup's lip, m, world."""
-        state = self._tool()
+        """Return the centre of the cup's lip, m, world."""
+        state = pybullet.getLinkState(*self.tool, 0, 1, self._client.number)
         return transform(state[4], state[5], self._mechanism.lip)
 
     def cup_axis(self) -> Vector:
-        """The cup's outward axis, world."""
-        return rotate(self._tool()[5], (0.0, 0.0, 1.0))
-
-    def _tool(self) -> Any:
-        return pybullet.getLinkState(*self.tool, 0, 1, self._client.number)
+        """Return the cup's outward axis, world."""
+        state = pybullet.getLinkState(*self.tool, 0, 1, self._client.number)
+        return rotate(state[5], (0.0, 0.0, 1.0))
 
 
 @contextmanager

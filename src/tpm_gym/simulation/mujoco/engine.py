@@ -14,14 +14,13 @@ from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.drives import Servo, ServoDrives, steering
-from tpm_gym.simulation.engine import Engine, Pose, Readout
+from tpm_gym.simulation.engine import Engine, Path, Pose, Readout
 from tpm_gym.simulation.mujoco.cup import Cup, Grip
 from tpm_gym.simulation.mujoco.model import compiled
 from tpm_gym.simulation.mujoco.physics import Physics
 from tpm_gym.simulation.mujoco.pictures import Pictures
 from tpm_gym.simulation.mujoco.robot import Robot
 from tpm_gym.simulation.mujoco.scenery import Scenery
-from tpm_gym.simulation.path import Path
 from tpm_gym.simulation.randomisation import NOMINAL, Plant
 from tpm_gym.simulation.settings import settings_of
 from tpm_gym.simulation.state import Scene
