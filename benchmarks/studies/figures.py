@@ -86,7 +86,7 @@ def learning_curves(runs: Frame) -> Figure:
 def penalty(runs: Frame) -> Figure:
     """Draw success and time below safe by penalty weight: a dot a seed, a bar at the mean."""
     ids = sorted(runs["env"].unique())
-    figure, panels = _grid(ids, "Goals that tempt towards the singularity, by penalty weight", 2.4)
+    figure, panels = _grid(ids, "Goals that tempt towards the singularity", 2.4)
     metrics = (("success_at_end", "success", BLUE), ("unsafe_share", "time below safe", VERMILLION))
     for env, axes in zip(ids, panels, strict=True):
         found = groups(runs[runs["env"] == env])
@@ -111,7 +111,7 @@ def robustness(bisections: Sequence[Record]) -> Figure:
     """Draw success against the size of a difference: a panel an attribute, a line an id."""
     attributes = [name for name in LIMITS if any(r["attribute"] == name for r in bisections)]
     names = [name.replace("_", " ") for name in attributes]
-    figure, panels = _grid(names, "Success of the published policies by what differs", 1.9)
+    figure, panels = _grid(names, "Success of the published policies on machines that differ", 1.9)
     colours = _colours(record["env"] for record in bisections)
     for attribute, axes in zip(attributes, panels, strict=True):
         for record in sorted(bisections, key=lambda r: (r["env"], r["engine"])):

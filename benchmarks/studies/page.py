@@ -25,7 +25,7 @@ from .records import RECORDS, Record, read_records
 PAGE: Final = Path("docs", "results.md")
 LEARNED: Final = 0.95
 """Success rate of a policy that has learned its task."""
-ENGINES: Final = {"analytic": "closed form", "pybullet": "PyBullet"}
+ENGINES: Final = {"analytic": "analytic engine", "pybullet": "PyBullet"}
 """Display names of the engines."""
 NONE: Final = "\N{EM DASH}"
 STUDIES: Final = (
@@ -183,7 +183,7 @@ def _labelled(runs: Frame) -> Frame:
     by_steps = runs.groupby(["env", "method", "engine"])["steps"].transform("nunique") > 1
     labels = [
         run.method
-        + (f", trained in {run.engine}" if engine else "")
+        + (f", {run.engine}" if engine else "")
         + (f", {run.steps:,} steps" if steps else "")
         for run, engine, steps in zip(runs.itertuples(), by_engine, by_steps, strict=True)
     ]
@@ -234,7 +234,7 @@ def _runs_table(runs: Frame) -> Frame:
             "id": run["env"],
             "method": run["label"],
             "seed": str(run["seed"]),
-            **{f"success in {name}": _tested(run, engine) for engine, name in ENGINES.items()},
+            **{f"success ({name})": _tested(run, engine) for engine, name in ENGINES.items()},
             "steps to 95%": _or_never(run["learned_steps"], "{:,.0f}"),
             "minutes to 95%": _or_never(run["learned_minutes"], "{:.1f}"),
             "minutes in all": f"{run['minutes']:.1f}",
@@ -258,11 +258,11 @@ def _penalty_table(runs: Frame) -> Frame:
             "penalty weight": f"{first.penalty_weight:g}",
             **_successes(group),
             "return": _cell(group["pybullet.return.mean"].mean(), "{:.2f}"),
-            "time below safe (seeds)": _cell(unsafe.mean(), "{:.1%}" + spread),
+            "time below safe (range of seeds)": _cell(unsafe.mean(), "{:.1%}" + spread),
             "smallest conditioning": _cell(
                 group["pybullet.conditioning_min.worst"].min(), "{:.3f}"
             ),
-            "conditioning, mean": _cell(group["pybullet.conditioning_mean.mean"].mean(), "{:.3f}"),
+            "mean conditioning": _cell(group["pybullet.conditioning_mean.mean"].mean(), "{:.3f}"),
         }
 
     return pd.DataFrame([row(group) for group in groups(runs)])
@@ -312,9 +312,9 @@ def _robustness(records: Sequence[Record]) -> Iterator[tuple[str, str, Frame]]:
             unit = UNITS.get(attribute, "factor") + drive
             rows.append(
                 {
-                    "what differs": f"{attribute.replace('_', ' ')} ({unit})",
+                    "attribute": f"{attribute.replace('_', ' ')} ({unit})",
                     "nominal": f"{nominal(attribute):g}",
-                    "up to": f"{end:g}",
+                    "limit": f"{end:g}",
                     **{env: _halves(found.get((env, attribute)), end) for env in ids},
                 }
             )
@@ -351,7 +351,7 @@ def _episodes(runs: Frame) -> str:
         for engine, name in ENGINES.items()
     }
     return ", ".join(
-        f"{' or '.join(map(str, count)) or 'no'} in {name}" for name, count in counts.items()
+        f"{' or '.join(map(str, count)) or 'no'} ({name})" for name, count in counts.items()
     )
 
 
@@ -362,7 +362,7 @@ def _successes(group: Frame) -> dict[str, str]:
         rates = group[f"{engine}.{_SUCCESS}"]
         seeds = ", ".join(f"{rate * 100:.1f}" for rate in rates.fillna(0.0))
         cell = NONE if rates.isna().all() else f"{rates.fillna(0.0).median():.1%} ({seeds})"
-        cells[f"success in {name}"] = cell
+        cells[f"success ({name})"] = cell
     return cells
 
 

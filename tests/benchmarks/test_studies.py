@@ -488,7 +488,7 @@ def test_failures_are_counted_and_named() -> None:
         ({"steps": 999}, ["SAC + HER, 120 steps", "SAC + HER, 999 steps"]),
         (
             {"engine": "mujoco"},
-            ["SAC + HER, trained in PyBullet", "SAC + HER, trained in mujoco"],
+            ["SAC + HER, PyBullet", "SAC + HER, mujoco"],
         ),
         ({"recipe": DEMONSTRATED}, ["SAC + HER", "SAC + HER, demonstrations"]),
     ],
@@ -556,8 +556,7 @@ def test_success_in_both_engines_and_what_was_demonstrated_are_told() -> None:
     text = page([record, other], [])
     assert rows(text, "SAC + HER, demonstrations |", "| 120 | 100.0% (100.0) | 90.0% (90.0) |")
     assert rows(text, "SAC + HER | PyBullet | 120 | \N{EM DASH} | 80.0% (80.0) |")
-    assert "Held-out episodes a seed: 9 in" in text
-    assert "200 in PyBullet." in text
+    assert "Test episodes of each seed: 9 (analytic engine), 200 (PyBullet)." in text
 
 
 # -- bisections -----------------------------------------------------------------------------------
@@ -691,8 +690,8 @@ def test_the_page_says_where_success_halves(bisections: list[Any]) -> None:
     again = [record | {"engine": "analytic", "episodes": 70} for record in bisections]
     both = page([*bisections, *again], [])
     assert both.count("| puck mass") == 2 * text.count("| puck mass") > 0
-    assert ", 70 episodes a test:" in both
-    assert "In PyBullet, 50 episodes a test:" in both
+    assert "analytic engine, 70 episodes" in both
+    assert "PyBullet, 50 episodes" in both
     del bisections[0]["tests"][list(bisections[0]["tests"])[-1]]
     assert "not finished" in page(bisections, [])
 
