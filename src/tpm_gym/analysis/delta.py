@@ -95,7 +95,7 @@ class Tripod:
         return rods
 
     def serial(self, position: ArrayLike, motors: ArrayLike) -> FloatArray:
-        """Compute the diagonal of B (..., 3): 0 if rod and velocity of an elbow are perpendicular."""
+        """Compute the diagonal of B (..., 3): 0 where the rod is normal to the elbow's velocity."""
         _, rates = _elbows(self, finite_points("motors", motors))
         factors: FloatArray = (self.parallel(position, motors) * rates).sum(axis=-1)
         return factors

@@ -177,8 +177,9 @@ def parallelogram_4s(name: str, short: FloatArray, rod: FloatArray, point: Float
 def parallelogram_4r(name: str, short: FloatArray, rod: FloatArray, point: FloatArray) -> Unit:
     """Return a parallelogram of four revolutes, P^(4R).
 
-    It translates in its plane, across the rods. The paper writes t^1(|| R32), the direction of the short links. This is exact only if the rods
-    are perpendicular to them. Arguments are as in :func:`parallelogram_4s`.
+    It translates in its plane, across the rods. The paper writes t^1(|| R32), the direction of the
+    short links; this is exact only if the rods are perpendicular to them. Arguments are as in
+    :func:`parallelogram_4s`.
     """
     normal = np.cross(short, rod)
     return Unit(name, point, np.cross(rod, normal)[None], np.empty((0, 3)))
