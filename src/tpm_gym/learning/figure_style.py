@@ -1,4 +1,4 @@
-"""Style of all figures: palette, fonts, and files with the same bytes each time."""
+"""Style of all figures: palette, fonts, and saving with equal bytes each time."""
 
 import io
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ from tpm_gym.learning.provenance import write_whole
 DPI = 160
 WIDTH = 7.2  # inches: a paper's page, both columns
 
-# Palette of Okabe and Ito, whose colours differ with every kind of colour blindness.
+# Palette of Okabe and Ito, which is clear with every kind of colour blindness.
 BLUE, VERMILLION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 ORANGE, SKY, BLACK = "#E69F00", "#56B4E9", "#000000"
 REACHED, OUTLINE = "#EBEBEB", "#8C8C8C"  # the reachable set, and its edge
@@ -39,7 +39,7 @@ _SETTINGS: dict[Any, Any] = {
 
 @contextmanager
 def style() -> Iterator[None]:
-    """Use Matplotlib's defaults with our sizes, in place of the settings of the user."""
+    """Set Matplotlib's defaults and our sizes, regardless of the user's settings."""
     with matplotlib.rc_context(fname=None):
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(_SETTINGS)
@@ -47,7 +47,7 @@ def style() -> Iterator[None]:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a PNG without the entries (program, date) that would change its bytes.
+    """Write a PNG without the program and date, which would change its bytes.
 
     Drawing takes a second. It happens in memory, so that a process that is killed meanwhile leaves
     no part of a file.
