@@ -25,7 +25,6 @@ from tpm_gym.simulation.state import State
 
 if TYPE_CHECKING:
     from tpm_gym.envs.vector import TPMVectorEnv
-    from tpm_gym.learning.policies import TrainedPolicy
 
 SELECTION_SEED: Final = 1_000_000
 TEST_SEED: Final = 2_000_000
@@ -135,9 +134,7 @@ def _run_episode(
     return _record(seed, {name: np.array([step[name] for step in steps]) for name in steps[0]})
 
 
-def run_batch(
-    envs: TPMVectorEnv, policy: TrainedPolicy, episodes: int, first_seed: int
-) -> list[Episode]:
+def run_batch(envs: TPMVectorEnv, policy: Policy, episodes: int, first_seed: int) -> list[Episode]:
     """The same for many environments at a time, and a policy that takes batches.
 
     Args:
@@ -153,9 +150,7 @@ def run_batch(
     return records
 
 
-def _run_batch(
-    envs: TPMVectorEnv, policy: TrainedPolicy, first_seed: int, count: int
-) -> list[Episode]:
+def _run_batch(envs: TPMVectorEnv, policy: Policy, first_seed: int, count: int) -> list[Episode]:
     observation, _ = envs.reset(seed=first_seed)
     steps: list[dict[str, Any]] = []
     lengths = np.zeros(envs.num_envs, dtype=np.int64)
