@@ -269,6 +269,7 @@ def run(tmp_path: Path, model: Any) -> Path:
         "env": "TPMPickAndPlace-v0",
         "seed": 5,
         "recipe": RECIPE,
+        "env_options": {"machine": "wide"},
         "versions": {"torch": "2.0.0", "tpm_gym": None},
     }
     (folder / "config.json").write_text(json.dumps(config))
@@ -285,7 +286,7 @@ def test_what_is_converted_says_what_the_run_says(
     expected, _ = model.predict(batch, deterministic=True)
     np.testing.assert_allclose(loaded.act(batch), expected, atol=1e-6)
     about = loaded.description
-    assert (about.seed, about.recipe) == (5, RECIPE)
+    assert (about.seed, about.recipe, about.env_options) == (5, RECIPE, {"machine": "wide"})
     assert about.versions == {"torch": "2.0.0", "tpm_gym": None}
 
 

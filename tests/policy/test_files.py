@@ -1,5 +1,6 @@
 """A policy on file loads without trust: damage and ill will are named, and nothing grows."""
 
+import functools
 import json
 import tempfile
 from collections.abc import Sequence
@@ -83,10 +84,10 @@ def test_files_cut_off_anywhere_or_followed_by_anything_are_refused(
 
 
 def test_cut_off_and_swapped_weights_are_told_apart(tmp_path: Path) -> None:
-    with pytest.raises(PolicyFileError, match=f"damaged: 100 of {len(DATA)} bytes"):
+    with pytest.raises(PolicyFileError, match=f"is damaged: 100 of {len(DATA)} bytes"):
         load_policy(write_raw(tmp_path, TEXT, DATA[:100]))
     changed = {name: values + 1 for name, values in WEIGHTS.items()}
-    with pytest.raises(PolicyFileError, match="of another policy"):
+    with pytest.raises(PolicyFileError, match="belongs to another policy"):
         load_policy(write_raw(tmp_path, TEXT, safetensors.numpy.save(changed)))
 
 
@@ -123,7 +124,7 @@ def put(path: Sequence[Any], value: Any) -> dict[str, Any]:
         ("version", 2, "equal to 1, not 2; .*update tpm_gym"),
         ("version", True, "integer, not True"),
         ("version", 1.0, "integer, not 1.0"),
-        ("version", [[[[]]]], "integer"),
+        ("version", functools.reduce(lambda inner, _: [inner], range(300), 0), "integer;"),
         ("extra", 1, "not permitted"),
         ("ext\nra" * 99, 1, r"entry 'ext\\nra.{52}\.\.\.: Extra inputs"),
         ("network.extra", 1, "not permitted"),
@@ -203,16 +204,14 @@ def test_no_entry_may_be_missing(tmp_path: Path, key: str) -> None:
         (TEXT.decode().encode("utf-16"), "no valid JSON"),
         (b"[" * 500_000, "recursion depth"),
         (b'{"a":' * 150_000, "recursion depth"),
-        (b"[" * 40 + b"]" * 40, "nested too deeply"),
-        (TEXT.replace(b"0.95", b"[" * 40 + b"]" * 40, 1), "nested too deeply"),
         (TEXT.replace(b"5000", b"NaN", 1), "a valid integer, not nan"),
         (TEXT.replace(b"0.95", b"NaN", 1), "Out of range"),
         (TEXT.replace(b"0.95", b"-Infinity", 1), "Out of range"),
         (TEXT.replace(b"0.95", b"1e999", 1), "Out of range"),
         (TEXT.replace(b"0.05", b"1e999", 1), "'network.features.unit'.*not inf"),
-        (TEXT.replace(b"5000", b"9" * 100_000, 1), "too large"),
-        (TEXT.replace(b"0.95", b"9" * 21, 1), "too large"),
-        (TEXT.replace(b'"seed"', b'"steps"', 1), "a key stands twice"),
+        (TEXT.replace(b"0.95", b"[" * 400 + b"]" * 400, 1), "edited by hand"),
+        (TEXT.replace(b"5000", b"9" * 100_000, 1), "no valid JSON .*4300 digits"),
+        (TEXT.replace(b'"seed"', b'"steps"', 1), "'seed': Field required"),
         (b"[]", "a valid dictionary"),
         (b"3", "a valid dictionary"),
         (TEXT.replace(b"5000", b"5001", 1), "edited by hand"),

@@ -1,4 +1,4 @@
-"""What all figures share: palette, fonts, and saving with the same bytes each time."""
+"""Style of all figures: palette, fonts, and saving with equal bytes each time."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 DPI = 160
 WIDTH = 7.2  # inches: a paper's page, both columns
 
-# Okabe and Ito's palette: told apart with every kind of colour blindness.
+# Palette of Okabe and Ito, which is clear with every kind of colour blindness.
 BLUE, VERMILLION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 ORANGE, SKY, BLACK = "#E69F00", "#56B4E9", "#000000"
 REACHED, OUTLINE = "#EBEBEB", "#8C8C8C"  # the reachable set, and its edge
@@ -36,7 +36,7 @@ _SETTINGS: dict[Any, Any] = {
 
 @contextmanager
 def style() -> Iterator[None]:
-    """Matplotlib's defaults with our sizes, whatever the user's own settings are."""
+    """Set Matplotlib's defaults and our sizes, regardless of the user's settings."""
     with matplotlib.rc_context(fname=None):
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(_SETTINGS)
@@ -44,5 +44,5 @@ def style() -> Iterator[None]:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a PNG without the entries (program, date) that would change its bytes."""
+    """Write a PNG without the program and date, which would change its bytes."""
     figure.savefig(path, dpi=DPI, metadata={"Software": None})

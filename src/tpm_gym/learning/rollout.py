@@ -1,7 +1,7 @@
-"""Run a policy over seeded episodes, and condense what happened.
+"""Rollouts of a policy over seeded episodes, and their metrics.
 
-Seeds fall into three ranges that never meet, so no figure is taken on episodes that a policy has
-trained on or was selected by:
+Seeds fall into three disjoint ranges, so that no result comes from episodes that a policy was
+trained on or selected by:
 
 - below ``SELECTION_SEED``: training;
 - from ``SELECTION_SEED``: the periodic evaluations during training, which select ``best.zip``;
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 SELECTION_SEED: Final = 1_000_000
 TEST_SEED: Final = 2_000_000
 BATCH: Final = 1000
-"""Environments that are evaluated at a time, where they can be."""
+"""Largest number of environments that are evaluated at once."""
 
 Observation: TypeAlias = dict[str, NDArray[Any]]
 Action: TypeAlias = NDArray[Any]
@@ -37,7 +37,7 @@ GoalEnv: TypeAlias = gym.Env[Observation, Action]
 
 
 class Policy(Protocol):
-    """What acts in an episode."""
+    """Policy that acts in episodes, one at a time or in batches."""
 
     def reset(self, observation: Observation, seed: int) -> None:
         """Prepare for an episode that starts with ``observation`` and was reset with ``seed``."""
@@ -48,7 +48,7 @@ class Policy(Protocol):
 
 @dataclass(frozen=True)
 class Episode:
-    """What one episode came to.
+    """Outcome of one episode.
 
     Attributes:
         success_at_end: Whether the last step was a success.
