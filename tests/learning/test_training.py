@@ -186,9 +186,9 @@ def test_what_is_chosen_reaches_every_environment_and_survives_resuming(
         assert (inner.machine, inner.drive) == (snug, Servo())
     again = json.loads((folder / "config.json").read_text(encoding="utf-8"))
     assert [again[name] for name in changed] == [content[name] for name in changed]
-    # The exported policy is one for the id itself.
-    results = evaluate(EvaluationConfig(policy=(str(folder),), episodes=1), quiet())
-    assert results[0].records[0].length == 50
+    evaluate(EvaluationConfig(policy=(str(folder),), episodes=1), quiet())
+    inner = made[-1].unwrapped
+    assert (inner.machine, inner.drive) == (snug, Servo())
 
 
 @pytest.mark.parametrize(
@@ -227,12 +227,6 @@ def test_a_damaged_configuration_is_named_and_left_as_it_is(
     assert (tmp_path / "config.json").read_bytes() == before
 
 
-@pytest.mark.parametrize("option", [{"threads": 0}, {"eval_every": 0}, {"device": "zz"}], ids=str)
-def test_mistakes_are_named_where_there_is_nothing_to_do(run: Path, option: Any) -> None:
-    with pytest.raises(ConfigError, match=f"--{next(iter(option))[:4]}"):
-        resume(ResumeConfig(run, **option), quiet())
-
-
 def test_best_policy_is_the_one_evaluated_best(run: Path) -> None:
     scores = [
         (entry["success_at_end"]["mean"], entry["return"]["mean"]) for entry in evaluations(run)
@@ -248,13 +242,6 @@ def score(path: Path) -> tuple[float, float]:
     (record,) = run_episodes(env, policy, 1, SELECTION_SEED)
     env.close()
     return record.success_at_end, record.total_reward
-
-
-def test_logs_hold_training_and_evaluation(run: Path) -> None:
-    rows = table(run)
-    assert {"time/total_timesteps", "train/critic_loss", "rollout/ep_rew_mean"} <= set(rows[-1])
-    assert sum(row["eval/success_at_end"] != "" for row in rows) == 6
-    assert list(run.glob("events.out.tfevents.*"))
 
 
 def test_both_policies_are_exported_and_nothing_is_unpickled_for_it(run: Path) -> None:

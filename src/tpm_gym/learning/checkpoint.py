@@ -62,12 +62,7 @@ class CheckpointStore:
         return self.folder / f"{step:09d}.checkpoint"
 
     def save(self, content: Content) -> None:
-        """Write a checkpoint, then delete all but the newest two.
-
-        Raises:
-            CheckpointError: The file cannot be written, for example because the disk is full. The
-                part that was written is removed. Earlier checkpoints stay.
-        """
+        """Write a checkpoint, then delete all but the newest two."""
         if content.step == self.newest and not content.finished:
             return
         target = self.path(content.step)
@@ -96,9 +91,6 @@ class CheckpointStore:
 
         Returns:
             The content; None if there are no checkpoints.
-
-        Raises:
-            CheckpointError: All checkpoints are damaged.
         """
         steps = self._steps()
         problems = []

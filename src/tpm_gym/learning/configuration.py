@@ -194,11 +194,7 @@ class ResumeConfig:
 
 
 def complete(config: TrainingConfig) -> TrainingConfig:
-    """Compute the options that are not given, and check all.
-
-    Raises:
-        ConfigError: An option, the recipe, or a combination of options is not valid.
-    """
+    """Compute the options that are not given, and check all."""
     import_module_of(config.env)
     check_env_id(config.env)
     shipped = recipe_file(config.algo, config.env_options.engine)
@@ -248,51 +244,37 @@ def resumed(config: ResumeConfig, stored: Mapping[str, Any], reached: int) -> Tr
     Args:
         stored: Content of the run's config.json.
         reached: Steps that the run has taken.
-
-    Raises:
-        ConfigError: An option is not valid, or the environment's module was not named.
-        RunError: ``stored`` is damaged.
     """
-    _require_whole(config.run, stored)
-    if config.env not in (UNSET, stored["env"]):
-        raise ConfigError(f"--env {config.env}: the run was trained in {stored['env']}; give that")
+    found = _stored(config.run, stored)
+    if config.env not in (UNSET, found.env):
+        raise ConfigError(f"--env {config.env}: the run was trained in {found.env}; give that")
     if config.env is not UNSET:
         import_module_of(config.env)
     changes = {name: value for name, value in vars(config).items() if value is not UNSET}
-    names = {entry.name for entry in fields(TrainingConfig)} & stored.keys()
-    objects = {
-        "recipe": Recipe(**stored["recipe"]),
-        "recipe_file": Path(stored["recipe_file"]),
-        "env_options": EnvOptions(**stored["env_options"]),
-    }
-    found = TrainingConfig(**{**{name: stored[name] for name in names}, **objects, **changes})
+    found = replace(found, **changes)
     if found.steps < reached:
         raise ConfigError(f"--steps {found.steps}: the run has already taken {reached:,}")
     _check(found)
     return _in_whole_rollouts(found, reached)
 
 
-def _require_whole(run: Path, stored: Mapping[str, Any]) -> None:
-    """Refuse a stored configuration with missing entries, or entries of other types."""
-    entries = {
-        name: stored.get(name)
-        for name in (entry.name for entry in fields(TrainingConfig))
-        if name != "overwrite"
-    }
-    text = json.dumps({CONFIG_FILE: {**entries, "run": run.name}})
-    strict = ConfigDict(strict=True, extra="forbid")
+def _stored(run: Path, stored: Mapping[str, Any]) -> TrainingConfig:
+    """Build the configuration of a run; refuse missing entries, and entries of other types."""
+    names = {entry.name for entry in fields(TrainingConfig)} - {"overwrite"}
+    text = json.dumps({CONFIG_FILE: {name: stored.get(name) for name in names}})
+    kind = TypeAdapter(dict[str, TrainingConfig], config=ConfigDict(strict=True, extra="forbid"))
     try:
-        TypeAdapter(dict[str, TrainingConfig], config=strict).validate_json(text)
+        found = kind.validate_json(text)[CONFIG_FILE]
         TypeAdapter(list[Any]).validate_python(stored.get("resumed", []))
-        recipe_file(stored["algo"])  # refuses an unknown algorithm
-        recipe = Recipe(**stored["recipe"]).entries()
-        check_recipes(CONFIG_FILE, {"recipe": recipe}, stored["algo"])
+        recipe_file(found.algo)  # refuses an unknown algorithm
+        check_recipes(CONFIG_FILE, {"recipe": found.recipe.entries()}, found.algo)
     except ValidationError as error:
         first = error.errors()[0]
         problem = f"{'.'.join(map(str, first['loc']))}: {first['msg']}, not {first['input']!r:.100}"
         raise _damaged(run, problem) from error
-    except ConfigError as error:
+    except (AttributeError, ConfigError) as error:  # no recipe is None
         raise _damaged(run, str(error)) from error
+    return found
 
 
 def _damaged(run: Path, problem: str) -> RunError:

@@ -19,9 +19,6 @@ def import_module_of(env_id: str) -> None:
     """Import the module of an id ``module:id`` that the user has typed; do nothing for other ids.
 
     Ids from files must not come here: a module runs any code when it is imported.
-
-    Raises:
-        ConfigError: The module cannot be imported.
     """
     module = env_id.rpartition(":")[0]
     try:
@@ -37,10 +34,6 @@ def check_env_id(env_id: str) -> EnvSpec:
     """Return the registration of an id of ours, or of ``module:id`` if the module is imported.
 
     Nothing is imported.
-
-    Raises:
-        ConfigError: The module of ``module:id`` is not imported, the id is not registered, or it
-            makes no environment of tpm_gym.
     """
     module, _, name = env_id.rpartition(":")
     if module and module not in sys.modules:

@@ -216,11 +216,7 @@ def _make_batch(env: GoalEnv, config: EvaluationConfig) -> TPMVectorEnv:
 
 
 def parse_randomisation(entries: Sequence[str]) -> dict[str, Any]:
-    """Parse words such as ``friction=0.5:1`` into a mapping; environments check keys and values.
-
-    Raises:
-        ConfigError: A word has another form, or a key is given twice.
-    """
+    """Parse words such as ``friction=0.5:1`` into a mapping; environments check keys and values."""
     result: dict[str, Any] = {}
     for entry in entries:
         name, equals, text = entry.partition("=")

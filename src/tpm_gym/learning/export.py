@@ -69,6 +69,9 @@ def save(
         raise refused(name, f"{type(model).__name__} is none of {NAMES}")
     network, weights = _network(name, model, ALGORITHMS[algorithm].actor)
     data = safetensors_bytes(weights)
+    if not isinstance(model.observation_space, spaces.Dict):
+        raise refused(name, f"observations in {model.observation_space}, not in a Dict")
+    boxes = {key: _box(name, key, box) for key, box in model.observation_space.items()}
     content: dict[str, Any] = {
         "format": FORMAT,
         "version": VERSION,
@@ -81,7 +84,7 @@ def save(
         "versions": dict(provenance.versions() if versions is None else versions),
         "network": network,
         "action_space": _box(name, "actions", model.action_space),
-        "observation_space": _boxes(name, model.observation_space),
+        "observation_space": boxes,
         "weights": {"bytes": len(data), "sha256": sha256(data).hexdigest()},
     }
     content["sha256"] = digest(content)
@@ -124,13 +127,7 @@ def _require_free(path: Path) -> None:
 
 
 def convert(archive: Path, path: Path, *, trust_pickle: bool) -> Path:
-    """Export ``best.zip`` or ``last.zip`` of a run as :func:`save` does; return the JSON file.
-
-    Raises:
-        PolicyError: The archive is not trusted or cannot be loaded or exported, or ``path`` is
-            taken.
-        ConfigError: There is no such archive, or ``path`` ends in .zip or cannot be written to.
-    """
+    """Export ``best.zip`` or ``last.zip`` of a run with :func:`save`; return the JSON file."""
     if not archive.is_file():
         known = "is not a file" if archive.exists() else "there is no such file"
         raise ConfigError(f"MODEL {archive}: {known}; give best.zip or last.zip of a run")
@@ -191,12 +188,6 @@ def _features(name: str, extractor: nn.Module) -> dict[str, Any]:
     raise refused(name, f"features of {type(extractor).__name__}, not of {wanted}")
 
 
-def _boxes(name: str, space: spaces.Space[Any]) -> dict[str, Any]:
-    if not isinstance(space, spaces.Dict):
-        raise refused(name, f"observations in {space}, not in a Dict")
-    return {key: _box(name, key, box) for key, box in space.items()}
-
-
 def _box(name: str, what: str, space: spaces.Space[Any]) -> dict[str, Any]:
     if not isinstance(space, spaces.Box) or not space.is_bounded() or space.dtype.kind != "f":
         raise refused(name, f"{what} in {space}, not in a bounded Box of floats")
@@ -231,10 +222,8 @@ def _verify(name: str, model: BaseAlgorithm, written: Path) -> None:
     """Compare the actions of the written policy with those of the model."""
     rng = np.random.default_rng(0)
     boxes: Any = model.observation_space
-    batch = {
-        key: rng.uniform(box.low, box.high, (_TRIALS, *box.shape)).astype(box.dtype)
-        for key, box in boxes.items()
-    }
+    shapes = {key: (_TRIALS, *box.shape) for key, box in boxes.items()}
+    batch = {k: rng.uniform(b.low, b.high, shapes[k]).astype(b.dtype) for k, b in boxes.items()}
     # PPO's last update leaves its graph in the distribution, and graphs cannot be copied.
     training = model.policy.training
     model.policy.predict(batch, deterministic=True)

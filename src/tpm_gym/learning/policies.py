@@ -18,7 +18,6 @@ from tpm_gym import TPMError
 from tpm_gym.learning.algorithms import ALGORITHMS, NAMES
 from tpm_gym.learning.errors import PolicyError
 from tpm_gym.learning.provenance import read_json
-from tpm_gym.learning.recipes import with_classes
 from tpm_gym.learning.rollout import Action, GoalEnv, Observation, Policy
 from tpm_gym.learning.run_folder import BEST_FILE, CONFIG_FILE, EXPORTED, LAST_FILE
 from tpm_gym.resources import POLICIES
@@ -119,9 +118,6 @@ def trained_in(spec: str) -> tuple[str, dict[str, str]] | None:
     """Return the environment id and its options that a policy was trained with.
 
     Nothing is unpickled. A scripted policy has none.
-
-    Raises:
-        PolicyError: There is no such policy, or its run folder does not say.
     """
     if spec in SCRIPTED:
         return None
@@ -174,11 +170,7 @@ def _policy_file(spec: str) -> Path:
 
 
 def run_config(spec: str, path: Path) -> dict[str, Any]:
-    """Return the run's configuration, from beside or above a .zip file.
-
-    Raises:
-        PolicyError: There is none, or it lacks an entry that a training writes.
-    """
+    """Return the run's configuration, from beside or above a .zip file."""
     wanted = {"algo": str, "env": str, "seed": int, "recipe": dict, "env_options": dict}
     for folder in path.resolve().parents[:2]:  # the run folder, or one inside it
         file = folder / CONFIG_FILE
@@ -213,13 +205,8 @@ def load_model(spec: str, path: Path) -> BaseAlgorithm:
         raise refused(spec, f"algorithm {algorithm!r} is none of {NAMES}")
     _use_one_thread()
     # Acting needs no replay buffer, and a hindsight buffer would need an environment.
-    replaced: dict[str, Any]
     replaced = {"replay_buffer_class": None, "replay_buffer_kwargs": {}, "buffer_size": 1}
     try:
-        arguments = config["recipe"].get("arguments", {})
-        if "features_extractor_class" in arguments.get("policy_kwargs", {}):
-            # The pickle names the module of this class, which may have moved.
-            replaced["policy_kwargs"] = with_classes(arguments)["policy_kwargs"]
         kind = ALGORITHMS[algorithm].load_class()
         return kind.load(path, device="cpu", custom_objects=replaced)
     except Exception as error:  # a damaged archive or pickle can raise anything

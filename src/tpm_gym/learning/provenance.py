@@ -107,11 +107,7 @@ def _portable(word: str) -> str:
 
 
 def require_writable(option: str, path: Path) -> None:
-    """Make the folder of a file that will be written later, and check that it can be written.
-
-    Raises:
-        ConfigError: The folder cannot be made or written to, or ``path`` is a folder.
-    """
+    """Make the folder of a file that will be written later, and check that it can be written."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path.parent):
@@ -123,12 +119,7 @@ def require_writable(option: str, path: Path) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file.
-
-    Raises:
-        OSError: The file cannot be read.
-        ValueError: The file holds no JSON, or JSON that is nested too deeply.
-    """
+    """Read a JSON file."""
     try:
         return json.loads(path.read_bytes())
     except RecursionError as error:
@@ -136,11 +127,7 @@ def read_json(path: Path) -> Any:
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write strictly valid JSON with :func:`write_whole`.
-
-    Raises:
-        ValueError: ``content`` holds NaN or an infinity, which JSON cannot express.
-    """
+    """Write strictly valid JSON with :func:`write_whole`."""
     text = json.dumps(content, indent=2, allow_nan=False) + "\n"
     write_whole(path, lambda part: part.write_text(text, encoding="utf-8"))
 

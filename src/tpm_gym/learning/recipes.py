@@ -102,11 +102,7 @@ def recipe(env_id: str, algorithm: str = "sac", engine: str | None = None) -> di
 
 
 def recipe_file(algorithm: str, engine: str | None = None) -> Path:
-    """Return the shipped recipes of an algorithm, those for an engine if there are any.
-
-    Raises:
-        ConfigError: There is no such algorithm.
-    """
+    """Return the shipped recipes of an algorithm, those for an engine if there are any."""
     if algorithm not in ALGORITHMS:
         raise ConfigError(f"algorithm {algorithm!r} is none of {NAMES}")
     own = RECIPES / f"{algorithm}-{engine}.yml"
@@ -129,12 +125,7 @@ def with_classes(entries: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_recipe(path: Path, algorithm: str, env_id: str) -> Recipe:
-    """Read the recipe of an environment, ``id`` or ``module:id``, after checking the whole file.
-
-    Raises:
-        ConfigError: The file cannot be read, has no recipe for ``env_id``, or holds an entry that
-            is unknown or not valid.
-    """
+    """Read the recipe of an environment, ``id`` or ``module:id``, after checking the whole file."""
     recipes = read_recipes(path, algorithm)
     name = env_id.rpartition(":")[2]
     if name not in recipes:
@@ -158,11 +149,7 @@ def read_recipe(path: Path, algorithm: str, env_id: str) -> Recipe:
 
 
 def read_recipes(path: Path, algorithm: str) -> dict[str, dict[str, Any]]:
-    """Read and check all recipes of a file: environment id -> entries.
-
-    Raises:
-        ConfigError: The file cannot be read, or holds an entry that is unknown or not valid.
-    """
+    """Read and check all recipes of a file: environment id -> entries."""
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -176,11 +163,7 @@ def read_recipes(path: Path, algorithm: str) -> dict[str, dict[str, Any]]:
 
 
 def check_recipes(source: str, recipes: Mapping[str, Any], algorithm: str) -> None:
-    """Check recipes, name -> entries.
-
-    Raises:
-        ConfigError: An entry is unknown or not valid. The message begins with ``source``.
-    """
+    """Check recipes, name -> entries."""
     kind: Any = dict[str, ALGORITHMS[algorithm].entries()]  # type: ignore[misc]
     strict = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
     try:

@@ -49,12 +49,7 @@ _IN_THE_WAY: Final = (errno.EISDIR, errno.ENOTDIR)
 
 
 def prepare(run: Path, overwrite: bool) -> None:
-    """Make the folder of a new run; with ``overwrite``, delete an earlier run but no other files.
-
-    Raises:
-        RunError: The folder cannot be made or is not empty, holds no run that could be deleted, or
-            another process trains in it.
-    """
+    """Make the folder of a new run; with ``overwrite``, delete an earlier run, no other files."""
     try:
         run.mkdir(parents=True, exist_ok=True)
         # A process that is killed in its first moment leaves a hidden part of a file.
@@ -109,12 +104,7 @@ def resume_command(run: Path) -> str:
 
 
 def evaluations(run: Path) -> list[dict[str, Any]]:
-    """Return the evaluations of a run, without a last line that was cut off by a kill.
-
-    Raises:
-        OSError: The file cannot be read.
-        ValueError: A whole line is no JSON.
-    """
+    """Return the evaluations of a run, without a last line that was cut off by a kill."""
     try:
         lines = (run / EVALUATIONS_FILE).read_text(encoding="utf-8").splitlines(keepends=True)
     except FileNotFoundError:
@@ -159,11 +149,7 @@ def clear_tests(run: Path) -> None:
 
 @contextmanager
 def claimed(run: Path) -> Iterator[None]:
-    """Lock a run; the system releases the lock however the process ends.
-
-    Raises:
-        RunError: Another process has the lock.
-    """
+    """Lock a run; the system releases the lock however the process ends."""
     if sys.platform == "win32":
         yield
         return
@@ -189,9 +175,6 @@ def disk_errors_named(run: Path, store: CheckpointStore) -> Iterator[None]:
     """Replace errors of a full or broken disk by an error that tells how to continue.
 
     A training without its logs is of no use, so it ends. Only a checkpoint may fail.
-
-    Raises:
-        RunError: The disk is full, broken or read-only, or a folder has the name of a file.
     """
     try:
         yield

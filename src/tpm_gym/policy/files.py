@@ -77,7 +77,7 @@ class Box(_Entries):
 
     @property
     def space(self) -> spaces.Box[Any]:
-        """The space for Gymnasium."""
+        """Space for Gymnasium."""
         dtype = np.dtype(self.dtype).type
         low, high = (np.array(flat, dtype).reshape(self.shape) for flat in (self.low, self.high))
         return spaces.Box(low, high, dtype=dtype)
@@ -184,12 +184,7 @@ class Description(_Entries):
 
 
 def files(path: str | Path) -> tuple[Path, Path]:
-    """Return the JSON file and the file of weights; ``path`` is either, or their common name.
-
-    Raises:
-        InputError: ``path`` is no path.
-        PolicyFileError: ``path`` is a folder, or an archive of Stable-Baselines3.
-    """
+    """Return the JSON file and the file of weights; ``path`` is either, or their common name."""
     if not isinstance(path, str | Path) or not str(path):
         given = path if path == "" else type(path)
         raise InputError("path", given, "the str or Path of a policy, as in 'runs/reach/best.json'")
@@ -214,11 +209,7 @@ def digest(content: Mapping[str, Any]) -> str:
 
 
 def read_description(path: str | Path) -> Description:
-    """Read and check the JSON file of a policy, named as for :func:`files`.
-
-    Raises:
-        PolicyFileError: The file is missing or damaged, or an entry is not valid.
-    """
+    """Read the JSON file of a policy, named as for :func:`files`; refuse a damaged one."""
     file, _ = files(path)
     data = _read(file, MAX_JSON)
     try:
@@ -227,11 +218,10 @@ def read_description(path: str | Path) -> Description:
         intact = description.sha256 == digest(content)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        place = _shown(".".join(map(str, first["loc"])) or "(all)")
-        given = first["input"]
+        place, given = ".".join(map(str, first["loc"])) or "(all)", first["input"]
         # A deeply nested value cannot be printed.
         value = "" if isinstance(given, dict | list) else f", not {_shown(given)}"
-        reason = f"describes no policy: entry {place}: {first['msg']}{value}"
+        reason = f"describes no policy: entry {_shown(place)}: {first['msg']}{value}"
         raise _damaged(file, reason) from error
     except (ValueError, RecursionError) as error:
         raise _damaged(file, f"is no valid JSON ({error})") from error
@@ -241,14 +231,7 @@ def read_description(path: str | Path) -> Description:
 
 
 def read_weights(path: str | Path, description: Description) -> dict[str, NDArray[np.float32]]:
-    """Read and check the weights of a policy, named as for :func:`files`.
-
-    Returns:
-        Finite weights by name, of the shapes in ``description.shapes``.
-
-    Raises:
-        PolicyFileError: The file is missing or damaged, or does not fit the description.
-    """
+    """Read finite weights by name, of the shapes in ``description.shapes``; refuse others."""
     _, file = files(path)
     data = _read(file, description.weights.bytes)
     if hashlib.sha256(data).hexdigest() != description.weights.sha256:

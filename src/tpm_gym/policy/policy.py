@@ -111,16 +111,10 @@ class Policy:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[Any], None]:
-        """Return the action of :meth:`act`, and no state, as Stable-Baselines3 does.
-
-        Raises:
-            ConfigurationError: ``deterministic`` is off; only the mean action is on file.
-            InputError: As for ``act``.
-        """
+        """Return the action of :meth:`act`, and no state, as Stable-Baselines3 does."""
         if not deterministic:
-            raise ConfigurationError(
-                "deterministic", deterministic, "True; an exported policy has no random actions"
-            )
+            valid = "True; an exported policy has no random actions"
+            raise ConfigurationError("deterministic", deterministic, valid)
         return self.act(observation), None
 
     def check(self, env: Any) -> None:
