@@ -87,10 +87,12 @@ def test_a_run_killed_before_its_first_checkpoint_begins_again(
         raise Killed
 
     with monkeypatch.context() as patched:
-        patched.setattr(CheckpointStore, "_check_space", die)
+        patched.setattr(CheckpointStore, "save", die)
         with pytest.raises(Killed):
             train(config, quiet())
-    (tmp_path / "run" / "checkpoints" / "000000000.tmp").mkdir(parents=True)
+    part = tmp_path / "run" / "checkpoints" / "000000000.checkpoint.tmp"
+    part.parent.mkdir()
+    part.write_text("")
     console = quiet()
     assert resume(ResumeConfig(config.run), console) is None
     assert "from step 0 to 300" in said(console)
@@ -127,7 +129,7 @@ def test_logs_of_a_torn_write_are_put_right(killed: Kill) -> None:
 
 def test_a_damaged_checkpoint_costs_only_time(killed: Kill) -> None:
     run, console = killed(240).run, quiet()
-    damaged = run / "checkpoints" / "000000200" / "arrays.npz"
+    damaged = run / "checkpoints" / "000000200.checkpoint"
     os.truncate(damaged, damaged.stat().st_size - 1)
     resume(ResumeConfig(run), console)
     assert f"warning: damaged checkpoint: {damaged}" in said(console)
@@ -240,8 +242,7 @@ def kill_beyond(run: Path, step: int, words: list[str]) -> None:
 
 
 def newest(run: Path) -> int:
-    names = [path.name for path in run.glob("checkpoints/*")]
-    return max((int(name) for name in names if name.isdigit()), default=-1)
+    return max((int(path.stem) for path in run.glob("checkpoints/*.checkpoint")), default=-1)
 
 
 def test_kill_9_costs_nothing(tmp_path: Path) -> None:
