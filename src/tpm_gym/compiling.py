@@ -34,7 +34,7 @@ _LOGGER: Final = logging.getLogger("tpm_gym")
 def compilable(*functions: Callable[..., Any]) -> None:
     """Let compiled functions call these functions, which stay callable from Python."""
     for function in functions:
-        register_jitable(function)
+        register_jitable(forceinline=True)(function)
 
 
 def compiled(function: _Function) -> _Function:
