@@ -53,7 +53,7 @@ MUTATIONS = [
     Mutation("(5)", POC, "sum(abs(d) for d in run) / 2", "sum(abs(d) for d in run)"),
     Mutation("(6)", EQUATIONS, "y1, z1 = g.l1 + cos[0]", "y1, z1 = g.l1 - cos[0]"),
     Mutation("(7)", EQUATIONS, "cos[1] + (2.0 * g.l5 - g.l1)", "cos[1] + (g.l5 - g.l1)"),
-    Mutation("(8a)", EQUATIONS, "along = 0.5 - ns.over(", "along = 0.5 + ns.over("),
+    Mutation("(8a)", EQUATIONS, "along = 0.5 - 0.5", "along = 0.5 + 0.5"),
     Mutation("(8a)", EQUATIONS, "along * dx - across * dz", "along * dx + across * dz"),
     Mutation("(8b)", EQUATIONS, "z1 + along * dz + across * dx", "z1 + along * dz - across * dx"),
     Mutation("(9)", EQUATIONS, "cos[2] + (g.l1 - 2.0 * g.l2)", "cos[2] + (g.l1 - g.l2)"),
