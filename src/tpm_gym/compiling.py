@@ -21,19 +21,20 @@ import numba
 from numba.core import caching
 from numba.extending import register_jitable
 
-__all__ = ["compilable", "compiled", "kept"]
+__all__ = ["PATIENCE", "compilable", "compiled", "kept", "stamp"]
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 _CACHING: Any = caching
-_PATIENCE: Final = 1.0  # s of compiling without a message
+PATIENCE: Final = 1.0
+"""Time of compiling without a message, s."""
 _LOGGER: Final = logging.getLogger("tpm_gym")
 
 
 def compilable(*functions: Callable[..., Any]) -> None:
     """Let compiled functions call these functions, which stay callable from Python."""
     for function in functions:
-        register_jitable(function)
+        register_jitable(forceinline=True)(function)
 
 
 def compiled(function: _Function) -> _Function:
@@ -84,7 +85,7 @@ class _Cache:
         # Two processes that wrote at the same time may have left another signature's code.
         if found is not None and found.signature.args == sig:
             return found
-        self._timer = threading.Timer(_PATIENCE, self._announce)
+        self._timer = threading.Timer(PATIENCE, self._announce)
         self._timer.daemon = True
         self._timer.start()
         return None

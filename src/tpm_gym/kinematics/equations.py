@@ -147,29 +147,37 @@ def posture_at(
     cos_beta = side * ns.root(squared)
     x_c, z_c = x - g.l2 - g.l7 * cos_beta, z - 2.0 * g.l6
     a1, a2, a3, b3 = -l1, x_c + l1 - 2.0 * g.l5, x + g.l2 - l1, z - g.l6
-    fold1, real1 = fold(a1, z_c, x_c, g, ns)
-    fold2, real2 = fold(a2, z_c, 0.0, g, ns)
-    fold3, real3 = fold(a3, b3, y, g, ns)
-    # The serial factor BC . dB/dtheta is l3 (b cos - a sin), so its sign tells two angles apart.
-    arctan2 = ns.arctan2
-    theta = (
-        ns.wrap(arctan2(z_c, a1) - bend1 * fold1),
-        ns.positive(arctan2(z_c, a2) - bend2 * fold2),
-        ns.wrap(arctan2(b3, a3) - bend3 * fold3),
-    )
+    one, real1 = arm(a1, z_c, x_c, bend1, g, ns)
+    two, real2 = arm(a2, z_c, 0.0, bend2, g, ns)
+    three, real3 = arm(a3, b3, y, bend3, g, ns)
     real = (squared >= -ROUNDING) & real1 & real2 & real3
+    theta = one, ns.positive(two), three
     return theta, real, (x_c, z_c, cos_beta, sin_beta), (a1, a2, a3, b3)
 
 
-def fold(
-    a: Numbers, b: Numbers, out: Numbers, g: AnyLengths, ns: Namespace
+def arm(
+    a: Numbers, b: Numbers, out: Numbers, bend: Numbers, g: AnyLengths, ns: Namespace
 ) -> tuple[Numbers, Numbers]:
-    """The arm's angle to its leg's span, of |C - A - l3 e(theta)| = l4; whether the leg reaches."""
+    """Compute the arm's angle in (-pi, pi] from |C - A - l3 e(theta)| = l4.
+
+    Args:
+        a: How far C is from A, level in the arm's plane, m.
+        b: The same, vertical, m.
+        out: The same, out of the arm's plane, m.
+        bend: Sign of BC . dB/dtheta = l3 (b cos(theta) - a sin(theta)), which tells the two
+            solutions apart.
+
+    Returns:
+        The angle, and whether the leg reaches.
+    """
     l3, l4 = g.l3, g.l4
     radius2 = a * a + b * b
     ratio = (radius2 + out * out + (l3 * l3 - l4 * l4)) / (2.0 * l3 * ns.sqrt(radius2))
     reaches = abs(ratio) <= _REACH  # not where it is NaN, from lengths without end
-    return ns.arccos(ratio), reaches
+    # The arm is turned from the direction of C by the angle of this cosine and sine.
+    cos = ns.clip(ratio)
+    sin = bend * ns.root((1.0 - cos) * (1.0 + cos))
+    return ns.arctan2(b * cos - a * sin, a * cos + b * sin), reaches
 
 
 def rods(cos: Triple, sin: Triple, found: Assembly, g: AnyLengths) -> tuple[Triple, Triple, Triple]:
@@ -257,8 +265,8 @@ def _largest_singular_value(rows: tuple[Triple, Triple, Triple], ns: Namespace) 
     yz2 = yz * yz
     spread = ns.root((p * p + q * q + r * r + 2.0 * (xy * xy + xz * xz + yz2)) / 6.0)
     half = p * (q * r - yz2) - xy * (xy * r - yz * xz) + xz * (xy * yz - q * xz)
-    turn = ns.arccos(half / ns.maximum(spread * spread * spread, _TINY) / 2.0) / 3.0
-    return ns.sqrt(mean + 2.0 * spread * ns.cos(turn))
+    turned = ns.cos_third(half / ns.maximum(spread * spread * spread, _TINY) / 2.0)
+    return ns.sqrt(mean + 2.0 * spread * turned)
 
 
 # -- why there is no configuration, or no velocity -------------------------------------------------

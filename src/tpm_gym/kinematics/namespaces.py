@@ -31,8 +31,8 @@ class Namespace:
         clip: The nearest number in [-1, 1].
         arccos: Of the clipped number.
         arcsin: Of the clipped number.
-        wrap: An angle within a turn of it, in (-pi, pi].
-        positive: An angle of more than minus a turn, in [0, 2 pi) if it is less than a turn.
+        cos_third: Cosine of a third of the arccosine of the clipped number.
+        positive: Angle in [0, 2 pi) of one in [-pi, pi].
         signs: Of a shape, as numbers like those that are given: -1 and 1.
         stack: Components (...,), joined along a new last axis.
         join: Points (..., 3), broadcast with each other, joined along their last axis.
@@ -46,9 +46,9 @@ class Namespace:
     clip: _One
     arccos: _One
     arcsin: _One
+    cos_third: _One
     maximum: Callable[[Any, float], Any]
     where: Callable[[Any, Any, Any], Any]
-    wrap: _One
     positive: _One
     signs: Callable[[Any, tuple[int, ...]], Any]
     stack: Callable[[Sequence[Any]], Any]
@@ -69,9 +69,9 @@ NUMPY = Namespace(
     clip=lambda x: np.minimum(np.maximum(x, -1.0), 1.0),
     arccos=lambda x: np.arccos(np.minimum(np.maximum(x, -1.0), 1.0)),
     arcsin=lambda x: np.arcsin(np.clip(x, -1.0, 1.0)),
+    cos_third=lambda x: np.cos(np.arccos(np.minimum(np.maximum(x, -1.0), 1.0)) / 3.0),
     maximum=np.maximum,
     where=np.where,
-    wrap=lambda x: x + _TURN * (x <= -math.pi) - _TURN * (x > math.pi),
     positive=lambda x: np.where(x < 0, x + _TURN, x),
     signs=lambda like, shape: np.array([-1.0, 1.0]).reshape(shape),
     stack=lambda columns: np.stack(columns, axis=-1),
@@ -98,9 +98,6 @@ def _torch() -> Namespace:
         end = abs(x) >= 1
         return torch.where(end, like(math.pi, x) * (x < 0), torch.where(end, 0.0, x).arccos())
 
-    def wrap(x: Any) -> Any:
-        return torch.where(x > math.pi, x - _TURN, torch.where(x <= -math.pi, x + _TURN, x))
-
     def join(points: Sequence[Any]) -> Any:
         tensor = next(point for point in points if is_tensor(point))
         shape = np.broadcast_shapes(*(tuple(point.shape) for point in points))
@@ -115,9 +112,9 @@ def _torch() -> Namespace:
         clip=lambda x: torch.clip(x, -1.0, 1.0),
         arccos=arccos,
         arcsin=lambda x: math.pi / 2 - arccos(x),
+        cos_third=lambda x: torch.cos(arccos(x) / 3.0),
         maximum=lambda x, least: torch.clip(x, min=least),
         where=torch.where,
-        wrap=wrap,
         positive=lambda x: torch.where(x < 0, x + _TURN, x),
         signs=lambda other, shape: like([-1.0, 1.0], other).reshape(shape),
         stack=lambda columns: torch.stack(list(columns), -1),

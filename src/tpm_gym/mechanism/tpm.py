@@ -77,8 +77,6 @@ class TPM(Machine):
         found = _room(len(flat))
         _loops().evaluate(flat, *self._of(built, angles), *found)
         position, jacobian, conditioning, working = found
-        if len(shape) == 2:
-            return Reading(position, jacobian, conditioning, working)
         return Reading(
             position.reshape(shape),
             jacobian.reshape(*shape, 3),
@@ -211,11 +209,9 @@ class TPM(Machine):
         rates = _rows(theta_dot, angles.shape)
         flat, shape = angles.reshape(-1, 3), angles.shape
         position, jacobian, _, working = _room(len(flat))
-        mass, bias = np.empty((len(flat), 3, 3)), np.empty((len(flat), 3))
+        mass, bias = np.empty((len(flat), 9)), np.empty((len(flat), 3))
         found = position, jacobian, working, mass, bias
         _loops().motion(flat, rates.reshape(-1, 3), *self._of(built, angles), *found)
-        if len(shape) == 2:
-            return Motion(*found)
         return Motion(
             position.reshape(shape),
             jacobian.reshape(*shape, 3),
@@ -256,7 +252,7 @@ def _room(count: int) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
     """Return arrays for positions, Jacobians, conditioning and modes."""
     return (
         np.empty((count, 3)),
-        np.empty((count, 3, 3)),
+        np.empty((count, 9)),
         np.empty(count),
         np.empty(count, dtype=np.bool_),
     )

@@ -5,13 +5,17 @@ Row i of the m rows of an input is of the machine ``built[i // (m // b)]``, of b
 ``machine`` (9,) holds the signs of the assembly mode (2) and of the working mode (4), and gravity
 (3) m/s^2. Results are written to the last arguments, NaN where there is none. Each row is computed
 by itself, so that it has the same bits alone and among thousands.
+
+Rows are copied to columns of a block, over which the compiler computes several rows at a time.
 """
 
 import math
 from typing import Any
 
+import numpy as np
+
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray
-from tpm_gym.compiling import compilable, compiled, kept
+from tpm_gym.compiling import compilable, kept
 from tpm_gym.kinematics import compiled as functions
 from tpm_gym.kinematics import equations
 from tpm_gym.kinematics.equations import Triple
@@ -33,15 +37,14 @@ compilable(
 )
 
 _NONE = (0.0, 0.0, 0.0)
+_BLOCK = 64  # rows; their columns stay in the cache
 NS: Any = functions
 
 
-@compiled
 def _lengths(p: FloatArray) -> Lengths:
     return Lengths(p[0], p[1], p[2], p[3], p[4], p[5], p[6])
 
 
-@compiled
 def _inertia(p: FloatArray) -> Inertia:
     return Inertia(
         (p[7], p[8], p[9]),
@@ -55,25 +58,51 @@ def _inertia(p: FloatArray) -> Inertia:
     )
 
 
-@compiled
-def _triple(row: FloatArray) -> Triple:
-    return row[0], row[1], row[2]
+def _read(rows: FloatArray, start: int, count: int, columns: FloatArray, first: int) -> None:
+    """Copy rows (count, 3) to the columns from ``first`` on."""
+    for j in range(count):
+        columns[first, j] = rows[start + j, 0]
+        columns[first + 1, j] = rows[start + j, 1]
+        columns[first + 2, j] = rows[start + j, 2]
 
 
-@compiled
-def _write(row: FloatArray, values: Triple, real: bool) -> None:
-    row[0] = values[0] if real else math.nan
-    row[1] = values[1] if real else math.nan
-    row[2] = values[2] if real else math.nan
+def _write(columns: FloatArray, first: int, start: int, count: int, rows: FloatArray) -> None:
+    """Copy as many columns from ``first`` on to rows (count, ...)."""
+    width = rows.shape[1]
+    for j in range(count):
+        for k in range(width):
+            rows[start + j, k] = columns[first + k, j]
 
 
-@compiled
-def _pose(theta: FloatArray, p: FloatArray, machine: FloatArray) -> tuple[Pose, bool, bool]:
+def _put(columns: FloatArray, first: int, j: int, values: Triple, real: bool) -> None:
+    """Set three columns of a row, to NaN if there is no solution."""
+    columns[first, j] = values[0] if real else math.nan
+    columns[first + 1, j] = values[1] if real else math.nan
+    columns[first + 2, j] = values[2] if real else math.nan
+
+
+def _get(columns: FloatArray, first: int, j: int) -> Triple:
+    return columns[first, j], columns[first + 1, j], columns[first + 2, j]
+
+
+def _pose(theta: Triple, g: Lengths, modes: Triple) -> tuple[Pose, bool, bool]:
     """Assemble the machine; whether that is real and regular, and in the working mode."""
-    g = _lengths(p)
-    pose, real = dynamics.pose_at(_triple(theta), (machine[0], machine[1]), g, NS)
-    working = real and pose.found.cos_beta * machine[2] > 0.0
-    return pose, real and equations.regular(pose.factors, g), working
+    pose, real = dynamics.pose_at(theta, (modes[0], modes[1]), g, NS)
+    working = real & (pose.found.cos_beta * modes[2] > 0.0)
+    return pose, real & equations.regular(pose.factors, g), working
+
+
+def _place(columns: FloatArray, j: int, pose: Pose, real: bool) -> tuple[Triple, Triple, Triple]:
+    """Set the first columns of a row to P and to the rows of J, and return these."""
+    rows = equations.velocity(pose.rods, pose.factors)
+    _put(columns, 0, j, (pose.found.x, pose.found.y, pose.found.z), real)
+    _put(columns, 3, j, rows[0], real)
+    _put(columns, 6, j, rows[1], real)
+    _put(columns, 9, j, rows[2], real)
+    return rows
+
+
+compilable(_lengths, _inertia, _read, _write, _put, _get, _pose, _place)
 
 
 @kept
@@ -82,12 +111,17 @@ def inverse(
 ) -> None:
     """Compute joint positions (m, 3) for P at ``position`` (m, 3)."""
     signs = machine[2], machine[3], machine[4], machine[5]
+    given, found = np.empty((3, _BLOCK)), np.empty((3, _BLOCK))
     each = len(position) // len(built)
     for k in range(len(built)):
         g = _lengths(built[k])
-        for i in range(k * each, (k + 1) * each):
-            found, real, _, _ = equations.posture_at(_triple(position[i]), signs, g, NS)
-            _write(theta[i], found, real)
+        for start in range(k * each, (k + 1) * each, _BLOCK):
+            count = min(_BLOCK, (k + 1) * each - start)
+            _read(position, start, count, given, 0)
+            for j in range(count):
+                angles, real, _, _ = equations.posture_at(_get(given, 0, j), signs, g, NS)
+                _put(found, 0, j, angles, real)
+            _write(found, 0, start, count, theta)
 
 
 @kept
@@ -95,14 +129,20 @@ def forward(
     theta: FloatArray, built: FloatArray, machine: FloatArray, position: FloatArray
 ) -> None:
     """Compute P (m, 3) at joint positions (m, 3), in the modes of the machine."""
+    planar, side, turned = machine[0], machine[1], machine[2]
+    given, found = np.empty((3, _BLOCK)), np.empty((3, _BLOCK))
     each = len(theta) // len(built)
     for k in range(len(built)):
         g = _lengths(built[k])
-        for i in range(k * each, (k + 1) * each):
-            cos, sin = equations.arms(_triple(theta[i]), g, NS)
-            found, real, _ = equations.assembly_at(cos, sin, machine[0], machine[1], g, NS)
-            working = found.cos_beta * machine[2] > 0.0
-            _write(position[i], (found.x, found.y, found.z), real and working)
+        for start in range(k * each, (k + 1) * each, _BLOCK):
+            count = min(_BLOCK, (k + 1) * each - start)
+            _read(theta, start, count, given, 0)
+            for j in range(count):
+                cos, sin = equations.arms(_get(given, 0, j), g, NS)
+                there, real, _ = equations.assembly_at(cos, sin, planar, side, g, NS)
+                working = there.cos_beta * turned > 0.0
+                _put(found, 0, j, (there.x, there.y, there.z), real & working)
+            _write(found, 0, start, count, position)
 
 
 @kept
@@ -115,16 +155,23 @@ def evaluate(
     conditioning: FloatArray,
     working: BoolArray,
 ) -> None:
-    """Compute P (m, 3), J (m, 3, 3), 1/cond(J) (m,) and whether in the working mode (m,)."""
+    """Compute P (m, 3), J (m, 9), 1/cond(J) (m,) and whether in the working mode (m,)."""
+    modes = machine[0], machine[1], machine[2]
+    given, found = np.empty((3, _BLOCK)), np.empty((14, _BLOCK))
     each = len(theta) // len(built)
     for k in range(len(built)):
-        for i in range(k * each, (k + 1) * each):
-            pose, real, working[i] = _pose(theta[i], built[k], machine)
-            rows = equations.velocity(pose.rods, pose.factors)
-            _write(position[i], (pose.found.x, pose.found.y, pose.found.z), real)
-            for axis in range(3):
-                _write(jacobian[i, axis], rows[axis], real)
-            conditioning[i] = equations.conditioning(rows, NS) if real else math.nan
+        g = _lengths(built[k])
+        for start in range(k * each, (k + 1) * each, _BLOCK):
+            count = min(_BLOCK, (k + 1) * each - start)
+            _read(theta, start, count, given, 0)
+            for j in range(count):
+                pose, real, found[13, j] = _pose(_get(given, 0, j), g, modes)
+                rows = _place(found, j, pose, real)
+                found[12, j] = equations.conditioning(rows, NS) if real else math.nan
+            _write(found, 0, start, count, position)
+            _write(found, 3, start, count, jacobian)
+            for j in range(count):
+                conditioning[start + j], working[start + j] = found[12, j], found[13, j] > 0.0
 
 
 @kept
@@ -138,18 +185,25 @@ def torque(
     torques: FloatArray,
 ) -> None:
     """Compute the motors' torques (m, 3) N m for a motion against forces on P (m, 3) N."""
-    fall = machine[6], machine[7], machine[8]
+    modes, fall = (machine[0], machine[1], machine[2]), (machine[6], machine[7], machine[8])
+    given, found = np.zeros((12, _BLOCK)), np.empty((3, _BLOCK))
     each = len(theta) // len(built)
     for k in range(len(built)):
-        inertia = _inertia(built[k])
-        for i in range(k * each, (k + 1) * each):
-            pose, real, _ = _pose(theta[i], built[k], machine)
-            rates, changes = _triple(theta_dot[i]), _triple(theta_ddot[i])
-            one, two, three = dynamics.torques(pose, rates, changes, fall, inertia)
+        g, inertia = _lengths(built[k]), _inertia(built[k])
+        for start in range(k * each, (k + 1) * each, _BLOCK):
+            count = min(_BLOCK, (k + 1) * each - start)
+            _read(theta, start, count, given, 0)
+            _read(theta_dot, start, count, given, 3)
+            _read(theta_ddot, start, count, given, 6)
             if len(force):
-                a, b, c = dynamics.gather(pose, (0.0, 0.0), _triple(force[i]))
-                one, two, three = one - a, two - b, three - c
-            _write(torques[i], (one, two, three), real)
+                _read(force, start, count, given, 9)
+            for j in range(count):
+                pose, real, _ = _pose(_get(given, 0, j), g, modes)
+                rates, changes = _get(given, 3, j), _get(given, 6, j)
+                one, two, three = dynamics.torques(pose, rates, changes, fall, inertia)
+                a, b, c = dynamics.gather(pose, (0.0, 0.0), _get(given, 9, j))
+                _put(found, 0, j, (one - a, two - b, three - c), real)
+            _write(found, 0, start, count, torques)
 
 
 @kept
@@ -164,23 +218,31 @@ def motion(
     mass: FloatArray,
     bias: FloatArray,
 ) -> None:
-    """Compute P (m, 3), J (m, 3, 3), the mode (m,), masses (m, 3, 3) and bias (m, 3)."""
-    fall = machine[6], machine[7], machine[8]
+    """Compute P (m, 3), J (m, 9), the mode (m,), masses (m, 9) and bias (m, 3)."""
+    modes, fall = (machine[0], machine[1], machine[2]), (machine[6], machine[7], machine[8])
+    given, found = np.empty((6, _BLOCK)), np.empty((25, _BLOCK))
     each = len(theta) // len(built)
     for k in range(len(built)):
-        inertia = _inertia(built[k])
-        for i in range(k * each, (k + 1) * each):
-            pose, real, working[i] = _pose(theta[i], built[k], machine)
-            rows = equations.velocity(pose.rods, pose.factors)
-            _write(position[i], (pose.found.x, pose.found.y, pose.found.z), real)
-            for axis in range(3):
-                _write(jacobian[i, axis], rows[axis], real)
-            a, b, c, d, e, f = dynamics.masses(pose, rows, inertia)
-            _write(mass[i, 0], (a, b, c), real)
-            _write(mass[i, 1], (b, d, e), real)
-            _write(mass[i, 2], (c, e, f), real)
-            load = dynamics.torques(pose, _triple(theta_dot[i]), _NONE, fall, inertia)
-            _write(bias[i], load, real)
+        g, inertia = _lengths(built[k]), _inertia(built[k])
+        for start in range(k * each, (k + 1) * each, _BLOCK):
+            count = min(_BLOCK, (k + 1) * each - start)
+            _read(theta, start, count, given, 0)
+            _read(theta_dot, start, count, given, 3)
+            for j in range(count):
+                pose, real, found[24, j] = _pose(_get(given, 0, j), g, modes)
+                rows = _place(found, j, pose, real)
+                a, b, c, d, e, f = dynamics.masses(pose, rows, inertia)
+                _put(found, 12, j, (a, b, c), real)
+                _put(found, 15, j, (b, d, e), real)
+                _put(found, 18, j, (c, e, f), real)
+                load = dynamics.torques(pose, _get(given, 3, j), _NONE, fall, inertia)
+                _put(found, 21, j, load, real)
+            _write(found, 0, start, count, position)
+            _write(found, 3, start, count, jacobian)
+            _write(found, 12, start, count, mass)
+            _write(found, 21, start, count, bias)
+            for j in range(count):
+                working[start + j] = found[24, j] > 0.0
 
 
 @kept
@@ -189,19 +251,21 @@ def conditioning_at(
 ) -> None:
     """Compute 1/cond(J) (m,) at P (m, 3); 0 where P cannot be in the machine's modes."""
     signs = machine[2], machine[3], machine[4], machine[5]
-    g = _lengths(built[0])
-    for i in range(len(position)):
-        point = _triple(position[i])
-        theta, real, link7, _ = equations.posture_at(point, signs, g, NS)
-        cos, sin = equations.arms(theta, g, NS)
-        found = equations.Assembly(
-            point[0], point[1], point[2], link7[0], link7[1], link7[2], link7[3]
-        )
-        bars = equations.rods(cos, sin, found, g)
-        values = equations.factors(cos, sin, found, bars, g)
-        same = values.planar * machine[0] > 0.0 and values.sin_beta * machine[1] > 0.0
-        least = equations.conditioning(equations.velocity(bars, values), NS)
-        conditioning[i] = least if real and same and least <= 1.0 else 0.0
+    planar, side, g = machine[0], machine[1], _lengths(built[0])
+    given = np.empty((3, _BLOCK))
+    for start in range(0, len(position), _BLOCK):
+        count = min(_BLOCK, len(position) - start)
+        _read(position, start, count, given, 0)
+        for j in range(count):
+            x, y, z = _get(given, 0, j)
+            theta, real, link7, _ = equations.posture_at((x, y, z), signs, g, NS)
+            cos, sin = equations.arms(theta, g, NS)
+            there = equations.Assembly(x, y, z, link7[0], link7[1], link7[2], link7[3])
+            bars = equations.rods(cos, sin, there, g)
+            values = equations.factors(cos, sin, there, bars, g)
+            same = (values.planar * planar > 0.0) & (values.sin_beta * side > 0.0)
+            least = equations.conditioning(equations.velocity(bars, values), NS)
+            conditioning[start + j] = least if real & same & (least <= 1.0) else 0.0
 
 
 @kept
@@ -214,15 +278,19 @@ def mode_left(
     left: IntArray,
 ) -> None:
     """Find which mode (m,) int8 is left with P at ``position`` (m, 3): 1 assembly, 2 working."""
+    planar, side, turned = machine[0], machine[1], machine[2]
+    given = np.empty((6, _BLOCK))
     each = len(theta) // len(built)
     for k in range(len(built)):
         g = _lengths(built[k])
-        for i in range(k * each, (k + 1) * each):
-            cos, sin = equations.arms(_triple(theta[i]), g, NS)
-            found, real, _ = equations.assembly_at(cos, sin, machine[0], machine[1], g, NS)
-            x, y, z = _triple(position[i])
-            off = math.sqrt((found.x - x) ** 2 + (found.y - y) ** 2 + (found.z - z) ** 2)
-            if not (real and y * machine[1] > 0.0 and off <= limit):
-                left[i] = 1
-            else:
-                left[i] = 2 if found.cos_beta * machine[2] <= 0.0 else 0
+        for start in range(k * each, (k + 1) * each, _BLOCK):
+            count = min(_BLOCK, (k + 1) * each - start)
+            _read(theta, start, count, given, 0)
+            _read(position, start, count, given, 3)
+            for j in range(count):
+                cos, sin = equations.arms(_get(given, 0, j), g, NS)
+                there, real, _ = equations.assembly_at(cos, sin, planar, side, g, NS)
+                x, y, z = _get(given, 3, j)
+                off2 = (there.x - x) ** 2 + (there.y - y) ** 2 + (there.z - z) ** 2
+                kept = real & (y * side > 0.0) & (off2 <= limit * limit)
+                left[start + j] = (2 if there.cos_beta * turned <= 0.0 else 0) if kept else 1

@@ -16,6 +16,7 @@ from tpm_gym.arrays import FloatArray
 from tpm_gym.mechanism import PAPER_TPM, TPM
 from tpm_gym.mechanism.dynamics import Dynamics
 from tpm_gym.simulation import Block, Plant, Scene, Servo
+from tpm_gym.simulation.analytic.columns import Batch
 from tpm_gym.simulation.analytic.drives import (
     Drive,
     IdealDrives,
@@ -70,7 +71,7 @@ def test_columns_move_as_the_dynamics_of_each_machine_say(machine: TPM) -> None:
     plants, rng = plants_of(machine, 4), np.random.default_rng(0)
     rows = np.arange(4)
     built = [plant.of(machine) for plant in plants]
-    batch = machine.batch(4)
+    batch = Batch(machine, 4)
     batch.build(rows, [one.lengths for one in built], [plant.link_masses for plant in plants])
     theta = columns([machine.inverse(point) for point in anywhere(machine, 4)])
     rates = rng.normal(size=(3, 4))
@@ -110,7 +111,7 @@ def test_the_law_is_that_of_one_machines_servos(machine: TPM, feedforward: str) 
     theta = columns([start] * 4)
     many.rest(np.arange(4), theta)
     repeated = np.repeat(np.array(path)[:, :, None], 4, axis=2)
-    steps = references(machine.batch(4), law, theta, repeated, STEP)
+    steps = references(Batch(machine, 4), law, theta, repeated, STEP)
     many.begin(steps[0].theta)
     alone = []
     for one, plant in zip(machines, plants, strict=True):
@@ -172,7 +173,7 @@ def energy_gained(time_step: float, payload: float) -> FloatArray:
     """By machines that swing freely for 80 ms, (r,) J."""
     theta = columns([PAPER_TPM.inverse(point) for point in [(-0.1, 0.03, 0.75), (0.0, 0.035, 0.7)]])
     fall = PAPER_TPM.mount.free_fall
-    batch, dynamics = PAPER_TPM.batch(2), Dynamics(payload=payload, free_fall=fall)
+    batch, dynamics = Batch(PAPER_TPM, 2), Dynamics(payload=payload, free_fall=fall)
     weight, carried = payload * np.repeat(np.array([fall]).T, 2, axis=1), np.full(2, payload)
 
     def touch(points: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -200,7 +201,7 @@ def test_springs_and_dampers_give_nothing_that_was_not_put_in() -> None:
     theta, goal = columns([PAPER_TPM.inverse(p) for p in (HOME, HOME + (0.02, 0.0, 0.02))]).T
     drive = ServoDrives(law, PAPER_TPM, np.zeros((2, 3, 1)), STEP)
     drive.begin(goal[:, None])
-    batch, totals = PAPER_TPM.batch(1), []
+    batch, totals = Batch(PAPER_TPM, 1), []
     now = at_rest(theta[:, None], HOME[:, None])
     for _ in range(60):
         now, _ = march(batch, drive, [Reference(goal[:, None])], now, STEP, untouched)
@@ -213,7 +214,7 @@ def test_springs_and_dampers_give_nothing_that_was_not_put_in() -> None:
 def test_motors_with_torque_to_spare_are_where_they_shall_be() -> None:
     # So forward dynamics give what inverse dynamics give.
     way = np.linspace(HOME, HOME + (0.03, 0.01, -0.03), 14)[:, :, None]
-    batch = PAPER_TPM.batch(1)
+    batch = Batch(PAPER_TPM, 1)
     theta = batch.inverse(way.transpose(1, 0, 2))
     start = at_rest(theta[:, 1], way[1])._replace(rates=(theta[:, 1] - theta[:, 0]) / STEP)
     drive = IdealDrives(np.full((3, 1), 1e6), STEP)

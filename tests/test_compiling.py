@@ -1,0 +1,116 @@
+"""Compiled functions are those of today's sources, whatever the files on disk say."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numba
+import pytest
+
+from tpm_gym import compiling
+
+SOURCES = {
+    "__init__": "",
+    "scale": "SCALE = 2.0\n",
+    "law": "from own.scale import SCALE\n\ndef law(x: float) -> float:\n    return SCALE * x\n",
+    "other": "OTHER = 1\n",
+    "main": """
+from tpm_gym.compiling import compilable, kept
+from own import law
+
+compilable(law.law)
+
+@kept
+def apply(x: float) -> float:
+    return law.law(x)
+""",
+}
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    (tmp_path / "own").mkdir()
+    for name, text in SOURCES.items():
+        (tmp_path / "own" / f"{name}.py").write_text(text)
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "kept"))
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    monkeypatch.syspath_prepend(tmp_path)
+    return tmp_path
+
+
+def fresh() -> Any:
+    """The function, as a new process has it."""
+    for name in [name for name in sys.modules if name.partition(".")[0] == "own"]:
+        del sys.modules[name]
+    importlib.invalidate_caches()
+    return importlib.import_module("own.main").apply
+
+
+def called() -> tuple[float, int]:
+    """What the function returns, and how many signatures were on disk."""
+    function = fresh()
+    return function(1.5), sum(function.stats.cache_hits.values())
+
+
+def test_a_kept_function_is_compiled_again_when_what_is_compiled_into_it_changes(
+    folder: Path,
+) -> None:
+    assert [called(), called()] == [(3.0, 0), (3.0, 1)]
+    (folder / "own/other.py").write_text("OTHER = 2\n")
+    assert called() == (3.0, 1)
+    (folder / "own/scale.py").write_text("SCALE = 4.0\n")
+    assert [called(), called()] == [(6.0, 0), (6.0, 1)]
+    (folder / "own/law.py").write_text("def law(x: float) -> float:\n    return x\n")
+    assert [called(), called()] == [(1.5, 0), (1.5, 1)]
+
+
+@pytest.mark.parametrize("ending", ["nbi", "nbc"])
+@pytest.mark.parametrize("content", [b"", b"nonsense", None])
+def test_a_damaged_file_is_replaced(folder: Path, ending: str, content: bytes | None) -> None:
+    called()
+    (damaged,) = folder.glob(f"kept/*/*.{ending}")
+    whole = damaged.read_bytes()
+    damaged.write_bytes(whole[: len(whole) // 2] if content is None else content)
+    assert [called(), called()] == [(3.0, 0), (3.0, 1)]
+
+
+def test_where_nothing_can_be_kept_functions_are_compiled_all_the_same(folder: Path) -> None:
+    function = fresh()
+    place = Path(function.stats.cache_path)
+    shutil.rmtree(place)
+    place.touch()  # a file where the folder was
+    assert function(1.5) == 3.0
+    scope: dict[str, Any] = {"compiling": compiling, "__name__": "nowhere"}
+    exec("@compiling.kept\ndef triple(x):\n    return 3 * x\n", scope)  # a function of no file
+    assert scope["triple"](1.5) == 4.5
+
+
+def test_processes_that_start_together_are_all_right(folder: Path) -> None:
+    paths = os.pathsep.join([str(folder), *sys.path])
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(folder / "kept"), "PYTHONPATH": paths}
+    command = [sys.executable, "-B", "-c", "from own.main import apply; print(apply(1.5))"]
+    together = [
+        subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
+        for _ in range(2)
+    ]
+    assert [process.communicate(timeout=120)[0] for process in together] == ["3.0\n"] * 2
+    assert called() == (3.0, 1)
+
+
+def test_a_long_wait_is_announced_once(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(compiling, "PATIENCE", 0.0)
+    monkeypatch.setattr(compiling._Cache, "_announced", False)
+    called()
+    (folder / "own/scale.py").write_text("SCALE = 4.0\n")
+    assert [called(), called()] == [(6.0, 0), (6.0, 1)]
+    (message,) = caplog.messages
+    assert message.startswith("compiling own.main.apply")
+    assert str(folder / "kept") in message
