@@ -155,7 +155,7 @@ def _collide_table(
 
 @compiled
 def collide_lip(
-    objects: Records, held: int, lip: Vector, setting: Setting, contacts: Records
+    objects: Records, held: int, lip: Vector, near: float, setting: Setting, contacts: Records
 ) -> int:
     """Find contacts of the lip with objects that it does not hold.
 
@@ -163,6 +163,7 @@ def collide_lip(
         objects: (k,) the objects.
         held: Index of the held object; -1 for none.
         lip: Centre of the lip, m, world.
+        near: Distance up to which there is a contact, m.
         setting: Constants.
         contacts: Receives the contacts.
 
@@ -173,12 +174,12 @@ def collide_lip(
     for index in range(len(objects)):
         half = setting.half[index]
         x, y, z = plus(three(objects[index]["position"]), lip, -1.0)
-        reach = length(three(half)) + _NEAR
+        reach = length(three(half)) + near
         over = level_length(x, y) < reach + CUP.radius and -reach < z < reach + CUP.bellows
         if over and index != held:
             place = (count, TABLE_SLOTS * len(objects) + LIP_SLOTS * index)
             pair = (0, index + 1), CUP.friction * objects[index]["friction"]
-            count = _collide_cylinder(objects[index], half, lip, contacts, place, pair)
+            count = _collide_cylinder(objects[index], half, lip, near, contacts, place, pair)
     return count
 
 
@@ -187,6 +188,7 @@ def _collide_cylinder(
     item: Record,
     half: FloatArray,
     lip: Vector,
+    near: float,
     contacts: Records,
     place: tuple[int, int],
     pair: _Pair,
@@ -211,7 +213,7 @@ def _collide_cylinder(
     beside = dot(radial, away) - _extent(frame, half, radial) - CUP.radius
     if far > _LITTLE and beside > apart + _FLAT:
         face, apart = 4, beside  # the lip's side at an edge or corner
-    if apart > _NEAR:
+    if apart > near:
         return place[0]
     if face == 4:
         arms = (_ZERO, plus(point, middle, -1.0))
@@ -220,8 +222,8 @@ def _collide_cylinder(
         return _press_edge(middle, frame, half, lip, contacts, place, pair)
     normal = frame[face] if dot(frame[face], away) > 0 else plus(_ZERO, frame[face], -1.0)
     if abs(normal[2]) > _STEEP:
-        return _press_face(middle, frame, half, lip, contacts, place, pair, face, normal)
-    return _push_face(middle, frame, half, lip, contacts, place, pair, face, normal)
+        return _press_face(middle, frame, half, lip, near, contacts, place, pair, face, normal)
+    return _push_face(middle, frame, half, lip, near, contacts, place, pair, face, normal)
 
 
 @compiled
@@ -280,6 +282,7 @@ def _press_face(
     frame: Frame,
     half: FloatArray,
     lip: Vector,
+    near: float,
     contacts: Records,
     place: tuple[int, int],
     pair: _Pair,
@@ -301,7 +304,7 @@ def _press_face(
             inside = dot(frame[k], arm)
             arm = plus(arm, frame[k], clip(inside, -half[k], half[k]) - inside)
         gap = -dot(normal, (arm[0], arm[1], lip[2] - middle[2])) - half[face]
-        if gap < _NEAR:
+        if gap < near:
             count = _add(contacts, (count, slot), pair, (_ZERO, arm), normal, gap)
         slot += 1
     return count
@@ -313,6 +316,7 @@ def _push_face(
     frame: Frame,
     half: FloatArray,
     lip: Vector,
+    near: float,
     contacts: Records,
     place: tuple[int, int],
     pair: _Pair,
@@ -336,7 +340,7 @@ def _push_face(
     for k in range(2):
         arm = plus(foot, _UP, high if k else low)
         gap = -dot(normal, arm) - half[face]
-        if gap < _NEAR:
+        if gap < near:
             count = _add(contacts, (count, slot + k), pair, (_ZERO, arm), normal, gap)
     return count
 

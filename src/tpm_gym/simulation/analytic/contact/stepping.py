@@ -15,7 +15,7 @@ from tpm_gym.mechanism.mount import GRAVITY
 from tpm_gym.simulation.analytic.compiling import SOURCES, compiled, kept
 from tpm_gym.simulation.analytic.contact.collision import collide_lip, collide_objects
 from tpm_gym.simulation.analytic.contact.grasp import CUP_MASS, Way, breathe, lip_of, seal_load
-from tpm_gym.simulation.analytic.contact.solver import Motor, prepare, solve
+from tpm_gym.simulation.analytic.contact.solver import Motor, prepare, solve, still
 from tpm_gym.simulation.analytic.contact.state import AT_REST, Record, Records, Setting, Work
 from tpm_gym.simulation.analytic.contact.vectors import (
     axes,
@@ -32,6 +32,7 @@ from tpm_gym.simulation.stage import TABLE
 __all__ = ["advance"]
 
 _SLOW, _LAZY = 2e-3, 0.05  # m/s, rad/s: slower objects come to rest
+_NEARBY = 5e-4  # m
 _SETTLED = 1e-6  # m; the cup is back when it is nearer
 _STOPPED = 1e-3  # m/s
 _NEAR = 0.005  # m
@@ -74,8 +75,12 @@ def advance(
 @compiled
 def _rests(objects: Records, cup: Record) -> bool:
     """Return whether nothing moves but the cup as a whole."""
-    if cup["held"] >= 0 or cup["slide"] > 0:
-        return False
+    return cup["held"] < 0 and cup["slide"] == 0 and _calm(objects)
+
+
+@compiled
+def _calm(objects: Records) -> bool:
+    """Return whether all objects are at rest."""
     for index in range(len(objects)):
         if objects[index]["rest"] < AT_REST:
             return False
@@ -114,50 +119,58 @@ def _step(
     work: Work,
 ) -> Vector:
     """Run a time step of a table; return the force on the platform, N."""
-    held, step, contacts, bodies = cup["held"], setting.step, work.contacts, work.bodies
-    if _rests(objects, cup) and not collide_lip(
-        objects, -1, lip_of(way.now, 0.0), setting, contacts
-    ):
-        if cup["vacuum"] > 0 or on:
-            breathe(objects, cup, way, on, _ZERO, setting)
-        return _ZERO
-    parts = 1 if held >= 0 and _clear(objects, cup, way, setting) else setting.parts
-    part, rate, first = step / parts, cup["slide_rate"], 0
-    mass, start = CUP_MASS, _ZERO
-    if held >= 0:
-        mass, start = CUP_MASS + objects[held]["mass"], three(objects[held]["position"])
-    lip_push, touched = _ZERO, _ZERO
-    last, point = _point(way, -1 / parts), way.now
-    speed = (point[2] - last[2]) / part + rate
-    for number in range(parts):
-        last, point = point, _point(way, (number + 1) / parts)
+    held, step, contacts, rate = cup["held"], setting.step, work.contacts, cup["slide_rate"]
+    start = three(objects[held]["position"]) if held >= 0 else _ZERO
+    parts, calm = setting.parts, held < 0 and _calm(objects)
+    if calm:
+        # Mostly everything stays at rest; if not, the time step is computed again in parts
+        count, first = _collide(objects, cup, way.now, way.then, setting, work)
+        if first == 0 and cup["slide"] == 0:
+            if cup["vacuum"] > 0 or on:
+                breathe(objects, cup, way, on, _ZERO, setting)
+            return _ZERO
+        parts = 1
+    elif held >= 0 and _clear(objects, cup, way, setting):
+        parts = 1
+    lip_push, touched, first = _ZERO, _ZERO, 0
+    speed = (way.now[2] - _point(way, -1 / parts)[2]) * parts / step + rate
+    number = 0
+    while number < parts:
+        part = step / parts
+        last, point = _point(way, number / parts), _point(way, (number + 1) / parts)
         velocity = plus(point, last, -1.0)
         velocity = velocity[0] / part, velocity[1] / part, velocity[2] / part
-        _fill(objects, (velocity[0], velocity[1], speed), mass, setting.half, part, bodies)
-        lip = lip_of(last, cup["slide"])
-        first = collide_lip(objects, held, lip, setting, contacts)
-        count = collide_objects(objects, held, setting, work.polygons, contacts, first)
-        prepare(contacts, count, bodies, memory, part)
+        mass = CUP_MASS + (objects[held]["mass"] if held >= 0 else 0.0)
+        _fill(objects, (velocity[0], velocity[1], speed), mass, setting.half, part, work.bodies)
+        count, first = _collide(objects, cup, last, point, setting, work)
+        prepare(contacts, count, work.bodies, memory, part)
         target = velocity[2] - SPRING_GAIN * cup["slide"] / part
-        solve(contacts, count, bodies, Motor(target, mass, CUP.preload * part))
+        solve(contacts, count, work.bodies, Motor(target, mass, CUP.preload * part), calm)
+        if calm and not still(work.bodies):
+            calm, parts = False, setting.parts
+            speed = (way.now[2] - _point(way, -1 / parts)[2]) * parts / step + rate
+            continue
+        memory[:] = 0.0
         for j in range(count):
             contact = contacts[j]
             impulse = three(contact["impulse"])
-            put(memory[contact["slot"]], impulse)
+            put(memory[contact["slot"]], plus(_ZERO, impulse, 1 / part))
             if j < first:
                 lip_push = plus(lip_push, impulse, -1.0)
             elif contact["b"] == 0:
                 touched = plus(touched, impulse)
             elif contact["a"] == 0:
                 touched = plus(touched, impulse, -1.0)
-        speed = bodies[0]["velocity"][2]
+        speed = work.bodies[0]["velocity"][2]
         cup["slide_rate"] = speed - velocity[2]
         cup["slide"] = max(cup["slide"] + part * cup["slide_rate"], 0.0)
-        _move(objects, held, bodies, part)
+        if not calm:
+            _move(objects, held, work.bodies, part)
         if held >= 0:
             hung = plus(point, three(cup["grip"]))
             put(objects[held]["position"], (hung[0], hung[1], hung[2] + cup["slide"]))
-    if cup["slide"] < _SETTLED and abs(cup["slide_rate"]) < 1e-3:
+        number += 1
+    if cup["slide"] < _SETTLED and abs(cup["slide_rate"]) < _STOPPED:
         cup["slide"] = cup["slide_rate"] = 0.0
     seal = _ZERO
     if held >= 0:
@@ -165,10 +178,25 @@ def _step(
         velocity = moved[0] / step, moved[1] / step, moved[2] / step
         seal = seal_load(objects[held], velocity, touched, step)
         put(objects[held]["velocity"], velocity)
-    _settle(objects, held, contacts, first)
+    if not calm:
+        _settle(objects, held)
     breathe(objects, cup, way, on, seal, setting)
     x, y, z = plus(lip_push, seal, -step)
     return x / step, y / step, (z - CUP_MASS * (cup["slide_rate"] - rate)) / step
+
+
+@compiled
+def _collide(
+    objects: Records, cup: Record, last: Vector, point: Vector, setting: Setting, work: Work
+) -> tuple[int, int]:
+    """Find all contacts as P moves; return their number and that of the lip's, which come first."""
+    held, near = cup["held"], length(plus(point, last, -1.0)) + _NEARBY
+    lip = lip_of(last, cup["slide"])
+    first = collide_lip(objects, held, lip, near, setting, work.contacts)
+    if first == 0 and held < 0 and _calm(objects):
+        return 0, 0
+    count = collide_objects(objects, held, setting, work.polygons, work.contacts, first)
+    return count, first
 
 
 @compiled
@@ -239,13 +267,11 @@ def _clear(objects: Records, cup: Record, way: Way, setting: Setting) -> bool:
 
 
 @compiled
-def _settle(objects: Records, held: int, contacts: Records, pressed: int) -> None:
-    """Stop objects that have hardly moved for some time steps, and that the lip does not touch."""
+def _settle(objects: Records, held: int) -> None:
+    """Stop objects that have hardly moved for some time steps."""
     for index in range(len(objects)):
         item = objects[index]
         slow = length(three(item["velocity"])) < _SLOW and length(three(item["spin"])) < _LAZY
-        for k in range(pressed):
-            slow = slow and (contacts[k]["b"] != index + 1 or contacts[k]["press"] == 0)
         item["rest"] = item["rest"] + 1 if slow and index != held else 0
         if item["rest"] >= AT_REST:
             put(item["velocity"], _ZERO)
