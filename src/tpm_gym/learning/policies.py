@@ -205,6 +205,7 @@ def load_model(spec: str, path: Path) -> BaseAlgorithm:
         raise refused(spec, f"algorithm {algorithm!r} is none of {NAMES}")
     _use_one_thread()
     # Acting needs no replay buffer, and a hindsight buffer would need an environment.
+    replaced: dict[str, Any]
     replaced = {"replay_buffer_class": None, "replay_buffer_kwargs": {}, "buffer_size": 1}
     try:
         kind = ALGORITHMS[algorithm].load_class()
