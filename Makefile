@@ -61,7 +61,7 @@ gradients: $(INSTALLED) ## lengths and ways improved by gradients, again; see do
 	$(RUN) docs/draw_gradients.py
 
 results: $(INSTALLED) ## rewrite docs/results.md and its figures from the records in docs/results/
-	$(VENV)/bin/tpm-gym report write
+	$(RUN) -m benchmarks.studies write
 
 bench-kinematics: $(INSTALLED) ## speed of the kinematics against a floor and a general solver
 	$(RUN) benchmarks/bench_kinematics.py

@@ -1,10 +1,10 @@
-"""What the drives make of the same episodes: success, singularities passed, tracking, torques.
+"""Compare drives on the same episodes: success, singularities passed, tracking, torques.
 
     python benchmarks/bench_drives.py --episodes 1000
 
-Rows are the expert and random actions with ideal drives, and with servos of several stiffnesses and
-feed-forwards; where the stiffness is multiplied, the damping is by its root, so that motions are as
-damped, and faster. Angles and torques are those at the end of each control step.
+The table has rows for the expert and for random actions, with ideal drives and with servos of
+several stiffnesses and feed-forwards. The damping grows with the root of the stiffness, so that the
+damping ratio stays the same. Angles and torques are taken at the end of each control step.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
 
 
 class Row(NamedTuple):
-    """What came of some episodes."""
+    """Outcomes of a set of episodes."""
 
     successes: int
     singular: int
@@ -34,7 +34,7 @@ class Row(NamedTuple):
 
 
 def drives() -> Iterator[tuple[str, Servo | None]]:
-    """All drives, by name."""
+    """Yield all drives with their names."""
     yield "ideal", None
     for feedforward in reversed(FEEDFORWARDS):
         for factor in FACTORS:
@@ -43,7 +43,7 @@ def drives() -> Iterator[tuple[str, Servo | None]]:
 
 
 def play(env_id: str, engine: str, drive: Servo | None, scripted: bool, episodes: int) -> Row:
-    """Play the episodes of the seeds from 0 on."""
+    """Play one episode for each seed from 0 up."""
     env: Any = gym.make(env_id, engine=engine, drive=drive)
     expert = Expert(env) if scripted else None
     simulated, wanted = env.unwrapped.simulation.engine, [(0.0, 0.0, 0.0)]
@@ -79,7 +79,7 @@ def play(env_id: str, engine: str, drive: Servo | None, scripted: bool, episodes
 
 
 def line(name: str, row: Row) -> str:
-    """A row of the table, in mrad and N m."""
+    """Return a row of the table, in mrad and N m."""
     numbers = [
         f"{scale * value:.3g}"
         for scale, values in ((1e3, row.errors), (1.0, row.torques))
@@ -91,7 +91,7 @@ def line(name: str, row: Row) -> str:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description="What the drives make of the same episodes.")
+    parser = argparse.ArgumentParser(description="Compare drives on the same episodes.")
     parser.add_argument("--env", default="TPMReach-v0")
     parser.add_argument("--engine", default="pybullet")
     parser.add_argument("--episodes", type=int, default=100)

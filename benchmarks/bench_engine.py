@@ -1,20 +1,21 @@
-"""The closed form as an engine: how fast it is, and how far from PyBullet.
+"""Measure the speed of the analytic engine, and its differences from PyBullet.
 
     make bench-engine
     python benchmarks/bench_engine.py --quick
 
-Speed: environment steps a second with uniformly random actions, resets included, in blocks that
-take turns: closed form at several numbers of environments, with the torques of no, the last or
-every time step, and with servo drives; PyBullet; panda-gym. Each ratio is of blocks of one round.
+Speed: environment steps per second with uniform random actions, resets included. Contestants take
+turns: the analytic engine with several numbers of environments, with the torques of no, the last or
+every time step, and with servo drives; PyBullet; panda-gym. Ratios compare blocks of one round.
 
-Torques: the same actions in both engines with free hands, at several time steps of both; what is
-observed and the conditioning too.
+Torques: both engines get the same actions with nothing to touch, at several time steps. Torques,
+observations and conditioning are compared.
 
-Success: actions recorded in PyBullet and repeated blindly in closed form from the same resets;
-whether both say success at the end. Expert, published and noisy policies; the noisy ones drop,
-throw and shove. And the policies themselves, in either engine.
+Success: actions are recorded in PyBullet and replayed in the analytic engine from the same resets.
+The table has the share of episodes with the same success at the end. Policies are the expert and
+the published ones, with and without noise, which makes them drop, throw and shove. The same
+policies also act on the observations of each engine.
 
-Everything goes to docs/records/closed_form.json, and from there into docs/closed-form.md and
+Results go to docs/records/closed_form.json, and from there to docs/closed-form.md and
 docs/images/closed_form.png.
 """
 
@@ -30,8 +31,8 @@ from typing import Any
 
 import closed_form_report
 import gymnasium as gym
-import machine
 import numpy as np
+import shared
 import torch
 from engine_matrix import NOISE, Trembling
 from numpy.typing import NDArray
@@ -43,7 +44,7 @@ PICK, JOINTS, REACH = "TPMPickAndPlace-v0", "TPMPickAndPlaceJoints-v0", "TPMReac
 PEER = "PandaPickAndPlace-v3"
 COUNTS = (1, 16, 256, 1024, 4096)
 ROUNDS, SINGLE, STEPS = 7, 300, 50
-"""Rounds of timing, control steps of a single environment's block, steps of an episode."""
+"""Rounds of timing, control steps of a block of one environment, steps of an episode."""
 
 Actions = NDArray[np.float32]
 
@@ -52,7 +53,7 @@ Actions = NDArray[np.float32]
 
 
 def speeds(rounds: int, counts: Sequence[int]) -> dict[str, dict[str, Any]]:
-    """Steps a second in each round, by contestant."""
+    """Measure steps per second in each round, by contestant."""
     importlib.import_module("panda_gym")
     blocks: dict[str, Callable[[int], float]] = {PEER: _single(PEER)}
     for env_id in (PICK, JOINTS, REACH):
@@ -76,13 +77,13 @@ def speeds(rounds: int, counts: Sequence[int]) -> dict[str, dict[str, Any]]:
 
 
 def _ratio(name: str, found: dict[str, list[float]]) -> list[float] | None:
-    """To PyBullet's environment of that id, round by round."""
+    """Return the ratios to the PyBullet environment of the same id, round by round."""
     base = found.get(f"{name.split(', ')[0]}, pybullet")
     return [one / other for one, other in zip(found[name], base, strict=True)] if base else None
 
 
 def _single(env_id: str, **options: Any) -> Callable[[int], float]:
-    """Steps a second of one environment, resets included."""
+    """Return a function that measures steps per second of one environment, resets included."""
     env = gym.make(env_id, **options)
 
     def block(seed: int) -> float:
@@ -99,7 +100,10 @@ def _single(env_id: str, **options: Any) -> Callable[[int], float]:
 
 
 def _many(env_id: str, count: int, torques: str, **others: Any) -> Callable[[int], float]:
-    """Steps a second of many, all out of phase, so that resets are spread evenly."""
+    """Return a function that measures steps per second of a vector environment.
+
+    The environments are out of phase, so that resets are spread evenly.
+    """
     options = {"engine": "analytic", "stagger": True, "physics": {"torques": torques}, **others}
     envs = gym.make_vec(env_id, num_envs=count, **options)
 
@@ -122,7 +126,7 @@ def _random(seed: int, shape: tuple[int, ...]) -> Actions:
 
 
 def torques(episodes: int, rates: Sequence[int]) -> list[dict[str, Any]]:
-    """Both engines on the same actions with free hands, for each time step."""
+    """Compare both engines on the same actions with nothing to touch, for each time step."""
     rows = []
     for rate in rates:
         for policy in ("expert", "random"):
@@ -158,7 +162,7 @@ def _compared(policy: str, rate: int, episodes: int) -> dict[str, float]:
 
 
 def success(episodes: int) -> list[dict[str, Any]]:
-    """The same actions, and the same policies, in either engine."""
+    """Compare success of the same actions, and of the same policies, in both engines."""
     rows = []
     for env_id in (PICK, JOINTS):
         for policy in ("expert", env_id):
@@ -187,7 +191,7 @@ def _success(env_id: str, policy: str, noise: float, episodes: int) -> dict[str,
 def _run(
     env_id: str, policy: str, noise: float, episodes: int, engine: str
 ) -> tuple[Actions, NDArray[np.bool_]]:
-    """Actions (episodes, steps, size), and success at the end (episodes,)."""
+    """Run episodes; return actions (episodes, steps, size) and success at the end (episodes,)."""
     taken, ended = [], []
     with closing(gym.make(env_id, engine=engine)) as env:
         acting = Trembling(load_policy(policy, env), noise)
@@ -204,7 +208,7 @@ def _run(
 
 
 def evaluation() -> float:
-    """Seconds for 1000 episodes of the published policy, records and all."""
+    """Measure the seconds of 1000 episodes of the published policy, with their statistics."""
     import tpm_gym
     from tpm_gym.learning.environments import make_envs
     from tpm_gym.learning.policies import TrainedPolicy
@@ -218,7 +222,7 @@ def evaluation() -> float:
 
 def main() -> None:
     """Parse the options and run."""
-    parser = argparse.ArgumentParser(description="The closed form as an engine.")
+    parser = argparse.ArgumentParser(description="Speed and accuracy of the analytic engine.")
     parser.add_argument("--quick", action="store_true", help="a minute or two; writes no files")
     parser.add_argument("--episodes", type=int, default=1000, help="of each row of success")
     parser.add_argument("--part", choices=("speed", "torques", "success"), help="only this one")
@@ -239,7 +243,7 @@ def main() -> None:
     }
     chosen = [options.part] if options.part else list(parts)
     record = {
-        name: {"machine": machine.describe(sys.argv), "rows": parts[name]()} for name in chosen
+        name: {"machine": shared.describe(sys.argv), "rows": parts[name]()} for name in chosen
     }
     print("\n".join(closed_form_report.lines(record)))
     if not quick:

@@ -1,19 +1,20 @@
-"""Two engines and theory on the same commands, and policies over engines and drives.
+"""Compare PyBullet, MuJoCo and theory on the same commands, and policies over engines and drives.
 
     make bench-engines
     python benchmarks/bench_engines.py --quick
     python benchmarks/bench_engines.py --published ID
 
-Agreement: five motions, their actions recorded once and repeated blindly in every engine. Largest
-loop gap, largest distance of the platform from the forward kinematics of the encoders, torques
-against those of the other engine and of the closed form, and where the puck ends. Energy: what is
-missing after a fall of 0.16 s with the motors off. Cost: control steps of TPMPickAndPlace-v0 under
-random actions, in blocks that take turns.
+Agreement: the actions of five motions are recorded once and replayed in each engine. The table has
+the largest loop gap, the largest distance of the platform from the forward kinematics of the
+encoders, differences of the torques from the other engine and from closed-form dynamics, and
+differences of the final position of the puck. Energy: share that is lost in a fall of 0.16 s with
+the motors off. Cost: control steps of TPMPickAndPlace-v0 with random actions, in blocks that take
+turns.
 
-Matrix: success of the expert and of the published policies, steady and trembling (which makes weak
-ones of them: they drop, throw and shove), in every engine with every drive.
+Matrix: success of the expert and of the published policies in each engine with each drive, with and
+without noise on their actions, which makes them drop, throw and shove.
 
-Everything goes to docs/records/engines.json, and from there into docs/fidelity.md and
+Results go to docs/records/engines.json, and from there to docs/fidelity.md and
 docs/images/engines.png.
 """
 
@@ -25,22 +26,23 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-import engine_report
 import gymnasium as gym
-import machine
 import numpy as np
+import shared
 from engine_agreement import PICK, Trace, energy_lost, follow, motions
 from engine_matrix import IDS, Cell, cells, run_all
+from engine_report import RECORD, lines, publish
+from shared import provenance, read_record
 
 ENGINES = ("pybullet", "mujoco")
 ROUNDS, BLOCK = 20, 100
 """Rounds of timing, and control steps in a block."""
 EPISODES = 1000
-"""In a cell of the matrix."""
+"""Episodes of a cell of the matrix."""
 
 
 def agreement(engines: Sequence[str], episodes: int) -> list[dict[str, Any]]:
-    """A row for each motion and engine."""
+    """Return a row for each motion and engine."""
     rows = []
     for motion in motions(episodes):
         print(f"following: {motion.name}", file=sys.stderr)
@@ -54,7 +56,7 @@ def agreement(engines: Sequence[str], episodes: int) -> list[dict[str, Any]]:
 
 
 def _compare(trace: Trace, reference: Trace) -> dict[str, Any]:
-    """A motion in one engine, against the first engine and theory."""
+    """Compare a motion in one engine with the first engine and with theory."""
     rms = float(np.sqrt((trace.torque**2).mean()))
     apart = np.linalg.norm(trace.puck - reference.puck, axis=-1)
     return {
@@ -70,12 +72,12 @@ def _compare(trace: Trace, reference: Trace) -> dict[str, Any]:
 
 
 def _off(torque: Any, other: Any) -> float:
-    """Relative root mean square of a difference of torques."""
+    """Return the relative root mean square of a difference of torques."""
     return float(np.sqrt(((torque - other) ** 2).mean() / (other**2).mean()))
 
 
 def costs(engines: Sequence[str], rounds: int) -> dict[str, list[float]]:
-    """Seconds a control step in each round, engine by engine in turn."""
+    """Measure the seconds of a control step in each round; engines take turns."""
     spent: dict[str, list[float]] = {engine: [] for engine in engines}
     envs = {engine: gym.make(PICK, engine=engine) for engine in engines}
     rng = np.random.default_rng(0)
@@ -95,7 +97,7 @@ def costs(engines: Sequence[str], rounds: int) -> dict[str, list[float]]:
 
 
 def matrix(todo: list[Cell], jobs: int) -> list[dict[str, Any]]:
-    """Records of cells, said as they come."""
+    """Evaluate cells and print each result; return the records."""
     done = []
     for record in run_all(todo, jobs):
         success = record["metrics"]["success_at_end"]["mean"]
@@ -106,8 +108,8 @@ def matrix(todo: list[Cell], jobs: int) -> list[dict[str, Any]]:
 
 
 def renewed(record: dict[str, Any], ids: Sequence[str], jobs: int) -> dict[str, Any]:
-    """A record with the cells of these published policies evaluated again."""
-    again = {"renewed": machine.describe(sys.argv)}
+    """Return a record in which the cells of some published policies are evaluated again."""
+    again = {"renewed": shared.describe(sys.argv)}
     fresh = matrix([cell for cell in cells(ENGINES, EPISODES) if cell.policy in ids], jobs)
     kept = [old for old in record["matrix"] if old["policy"] not in ids]
     return record | again | {"matrix": sorted(kept + fresh, key=lambda cell: cell["env_id"])}
@@ -115,32 +117,32 @@ def renewed(record: dict[str, Any], ids: Sequence[str], jobs: int) -> dict[str, 
 
 def main() -> None:
     """Parse the options and run."""
-    parser = argparse.ArgumentParser(description="Engines and theory on the same commands.")
+    parser = argparse.ArgumentParser(description="Compare engines and theory.")
     parser.add_argument("--quick", action="store_true", help="some minutes; writes no files")
     parser.add_argument("--jobs", type=int, default=1, help="processes for the matrix")
-    parser.add_argument("--published", nargs="+", choices=IDS, help="only these, in the matrix")
-    parser.add_argument("--cost", action="store_true", help="of a control step only")
+    parser.add_argument("--published", nargs="+", choices=IDS, help="renew these in the matrix")
+    parser.add_argument("--cost", action="store_true", help="renew the cost of a control step")
     parser.add_argument("--redraw", action="store_true", help="picture and page from the records")
     options = parser.parse_args()
     if options.cost:
-        again = {"renewed": machine.describe(sys.argv), "cost": costs(ENGINES, ROUNDS)}
-        engine_report.write(engine_report.read() | again)
+        again = {"renewed": shared.describe(sys.argv), "cost": costs(ENGINES, ROUNDS)}
+        provenance.write_json(RECORD, read_record(RECORD) | again)
     elif options.published:
-        engine_report.write(renewed(engine_report.read(), options.published, options.jobs))
+        provenance.write_json(RECORD, renewed(read_record(RECORD), options.published, options.jobs))
     elif not options.redraw:
         quick = options.quick
         record = {
-            "machine": machine.describe(sys.argv),
+            "machine": shared.describe(sys.argv),
             "agreement": agreement(ENGINES, 3 if quick else 20),
             "energy_lost": {engine: energy_lost(engine) for engine in ENGINES},
             "cost": costs(ENGINES, 4 if quick else ROUNDS),
             "matrix": matrix(cells(ENGINES, 10 if quick else EPISODES), options.jobs),
         }
-        engine_report.print_tables(record)
+        print("\n".join(lines(record)))
         if quick:
             return
-        engine_report.write(record)
-    engine_report.publish()
+        provenance.write_json(RECORD, record)
+    publish()
 
 
 if __name__ == "__main__":

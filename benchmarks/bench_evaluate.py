@@ -1,10 +1,10 @@
-"""How much tpm-gym evaluate costs beyond the environment it steps.
+"""Measure the cost of tpm-gym evaluate beyond the steps of its environment.
 
     make bench-evaluate
 
-Each round runs the command ``tpm-gym evaluate`` on a policy, start-up, statistics and JSON
-included, and then steps the bare environment through the same episodes: the same resets, and the
-actions of the policy, played from a record. The ratio is taken within a round.
+Each round runs the command ``tpm-gym evaluate`` on a policy, with start-up, statistics and JSON.
+Then it steps the bare environment through the same episodes, with the same resets and the recorded
+actions of the policy. The ratio is taken within a round.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-from machine import describe, processor_line, quartiles
+from shared import describe, processor_line, quartiles
 
 from tpm_gym.learning.policies import load_policy, trained_in
 from tpm_gym.learning.rollout import TEST_SEED
 from tpm_gym.resources import POLICIES
 
 Episode = list[Any]
-"""The actions of an episode."""
+"""Actions of an episode."""
 
 
 def record(env_id: str, policy_name: str, episodes: int) -> list[Episode]:
-    """Let the policy act, and keep what it did."""
+    """Record the actions of a policy."""
     env = gym.make(env_id)
     policy = load_policy(policy_name, env)
     tape: list[Episode] = []
@@ -49,7 +49,7 @@ def record(env_id: str, policy_name: str, episodes: int) -> list[Episode]:
 
 
 def bare(env_id: str, tape: list[Episode]) -> float:
-    """Seconds to step the environment through recorded episodes."""
+    """Measure the seconds of stepping the environment through recorded episodes."""
     env = gym.make(env_id)
     started = time.perf_counter()
     for seed, actions in enumerate(tape, TEST_SEED):
@@ -62,7 +62,7 @@ def bare(env_id: str, tape: list[Episode]) -> float:
 
 
 def evaluated(env_id: str, policy_name: str, episodes: int) -> float:
-    """Seconds of the command tpm-gym evaluate."""
+    """Measure the seconds of the command tpm-gym evaluate."""
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "tpm_gym.learning", "evaluate", "--policy", policy_name]
         command += ["--env", env_id, "--episodes", str(episodes)]
@@ -73,7 +73,7 @@ def evaluated(env_id: str, policy_name: str, episodes: int) -> float:
 
 
 def main(arguments: list[str] | None = None) -> dict[str, Any]:
-    """Measure, print, and return what was measured."""
+    """Measure; print and return the results."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     published = POLICIES / "TPMPickAndPlace-v0.json"
     parser.add_argument("--policy", default=str(published), help="an exported policy")

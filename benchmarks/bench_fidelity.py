@@ -1,17 +1,17 @@
-"""How true the closed loops are, and what that costs: sweep of tree, closures, solver and step.
+"""Measure errors of the closed loops against cost, over trees, closures, solvers and time steps.
 
     make bench-fidelity
     python benchmarks/bench_fidelity.py --quick
     python benchmarks/bench_fidelity.py --long 1000000
 
-Every time step of three motions is measured: the largest loop gap, the platform against the forward
-kinematics of the true encoders, and the tilt. Random: uniform random Cartesian actions. Expert: the
-commands of the scripted expert in TPMPickAndPlace-v0. Fast: full speed with sudden changes of
-direction, and sweeps of 1.5 Hz over the whole region, at more than twice the speed that the
-environments allow.
+Three quantities are measured at each time step of three motions: the largest loop gap, the distance
+of the platform from the forward kinematics of the true encoders, and the tilt. Random: uniform
+random Cartesian actions. Expert: commands of the scripted expert in TPMPickAndPlace-v0. Fast: full
+speed with sudden changes of direction, and sweeps of 1.5 Hz over the whole region, more than twice
+as fast as the environments allow.
 
-The sweep goes to stdout, runs/fidelity.json, docs/images/fidelity.png and docs/fidelity.md.
-``--long N`` runs the default alone, for N time steps a motion, in the real environment.
+Results go to stdout, runs/fidelity.json, docs/images/fidelity.png and docs/fidelity.md.
+``--long N`` runs the default alone in the real environment, for N time steps of each motion.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from functools import partial
 
 import fidelity_long
 import fidelity_report as report
-import machine
+import shared
 from fidelity_lab import Motion, expert_motion, fast_motion, random_motion
 from fidelity_sweep import errors_of, sweep, time_all
 
@@ -31,7 +31,7 @@ ROUNDS, BLOCK = 9, 25
 
 
 def motions(quick: bool) -> list[Motion]:
-    """The three motions, shorter for a quick look."""
+    """Return the three motions, shorter if ``quick``."""
     return [
         random_motion(100 if quick else 800),
         expert_motion(2 if quick else 12),
@@ -40,15 +40,15 @@ def motions(quick: bool) -> list[Motion]:
 
 
 def run_sweep(quick: bool, keep: bool) -> None:
-    """Measure, print, and unless ``keep`` write the files."""
-    description = machine.describe(sys.argv)
+    """Measure and print; also write the files unless ``keep`` says to keep the old ones."""
+    description = shared.describe(sys.argv)
     followed, results = motions(quick), []
     for config in sweep():
         print(f"{len(results) + 1} of {len(sweep())}: {config.name}", file=sys.stderr)
         results.append(errors_of(config, followed))
     print("timing", file=sys.stderr)
     time_all(results, random_motion(BLOCK, seed=2), 3 if quick else ROUNDS)
-    line = machine.processor_line(description)
+    line = shared.processor_line(description)
     print(f"{line}\n")
     report.print_table(results)
     if keep:
@@ -60,11 +60,9 @@ def run_sweep(quick: bool, keep: bool) -> None:
 def publish() -> None:
     """Draw the picture and fill the page from runs/fidelity.json."""
     results, description = report.read_json()
-    line = machine.processor_line(description)
+    line = shared.processor_line(description)
     report.draw(results, line)
     report.write_page(results, line)
-    for path in (report.PICTURE, report.PAGE):
-        print("wrote", path.relative_to(machine.ROOT))
 
 
 def main() -> None:
@@ -75,7 +73,7 @@ def main() -> None:
     parser.add_argument("--long", type=int, metavar="N", help="N time steps a motion, default only")
     options = parser.parse_args()
     if options.long is not None:
-        fidelity_long.run(options.long, partial(machine.describe, sys.argv))
+        fidelity_long.run(options.long, partial(shared.describe, sys.argv))
     elif options.redraw:
         publish()
     else:

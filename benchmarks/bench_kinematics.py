@@ -1,11 +1,11 @@
-"""How fast the kinematics are, as ratios to a floor and to a general solver in the same run.
+"""Measure the speed of the kinematics as ratios to a floor and to general solvers.
 
     make bench-kinematics
 
-The floor of the batched functions is numpy's sine and cosine of as many angles as the inputs hold:
-no method that evaluates the mechanism's trigonometry in numpy can be faster. The peer of the single
-call is scipy.optimize.root on the three closure equations, started 20 mm beside the solution; that
-of the conditioning is numpy's SVD of the Jacobians.
+The floor of the batched functions is numpy's sine and cosine of all input angles: no evaluation of
+the mechanism's trigonometry in numpy can be faster. The single call is compared with
+scipy.optimize.root on the three closure equations, started 20 mm from the solution. The
+conditioning is compared with numpy's SVD of the Jacobians.
 """
 
 from __future__ import annotations
@@ -21,31 +21,23 @@ import numpy as np
 from scipy.optimize import root
 
 from tpm_gym.arrays import FloatArray
-from tpm_gym.kinematics import (
-    DEFAULT_ASSEMBLY,
-    ELBOWS_OUT,
-    equations,
-    forward,
-    forward_all,
-    inverse,
-    inverse_all,
-    jacobian,
-)
+from tpm_gym.kinematics import forward, forward_all, inverse, inverse_all, jacobian
 from tpm_gym.kinematics.geometry import PAPER
+from tpm_gym.mechanism import PAPER_TPM
 
 ROWS, REPEATS, CALLS = 1_000_000, 7, 300
 TARGETS = {"forward_all": 4.0, "inverse_all": 10.0}
 
 
 def seconds(function: Callable[[], object]) -> float:
-    """Wall-clock seconds of one call."""
+    """Measure the wall-clock seconds of one call."""
     start = time.perf_counter()
     function()
     return time.perf_counter() - start
 
 
 def peak_megabytes(function: Callable[[], object]) -> float:
-    """Most memory that numpy and Python held during one call, beyond what they held before."""
+    """Measure the peak of the additional memory of numpy and Python during one call, MB."""
     tracemalloc.start()
     function()
     peak = tracemalloc.get_traced_memory()[1]
@@ -54,7 +46,7 @@ def peak_megabytes(function: Callable[[], object]) -> float:
 
 
 def closure(position: FloatArray, theta: FloatArray) -> FloatArray:
-    """|B_iC_i|^2 - l4^2 (m^2) for point P on the branch cos(beta) > 0."""
+    """Compute |B_iC_i|^2 - l4^2 (m^2) for point P on the branch cos(beta) > 0."""
     g = PAPER
     x, y, z = position
     x_c = x - g.l2 - np.sqrt(max(0.0, g.l7**2 - y**2))
@@ -70,13 +62,13 @@ def closure(position: FloatArray, theta: FloatArray) -> FloatArray:
 
 
 def report(name: str, ratios: list[float], detail: str) -> None:
-    """One line: median ratio and its spread."""
+    """Print the median ratio and its range."""
     low, high = min(ratios), max(ratios)
     print(f"{name:<12} {statistics.median(ratios):7.2f}  [{low:.2f}, {high:.2f}]  {detail}")
 
 
 def batched() -> None:
-    """forward_all and inverse_all against the floor, alternating."""
+    """Compare forward_all and inverse_all with the floor, in turns."""
     rng = np.random.default_rng(0)
     theta = rng.uniform(-np.pi, np.pi, (ROWS, 3))
     position = rng.uniform((-0.6, -0.05, 0.2), (0.6, 0.05, 1.1), (ROWS, 3))
@@ -108,7 +100,7 @@ def batched() -> None:
 
 
 def conditioning() -> None:
-    """Of a batch of joint angles, against numpy's SVD of their Jacobians, alternating."""
+    """Compare the conditioning of a batch with numpy's SVD of the Jacobians, in turns."""
     points = np.random.default_rng(2).uniform((-0.2, 0.015, 0.7), (0.1, 0.042, 0.9), (50_000, 3))
     theta, ratios, times = inverse(points), [], []
     for _ in range(REPEATS):
@@ -121,14 +113,13 @@ def conditioning() -> None:
 
 
 def one_call() -> None:
-    """What one configuration costs at every time step, and through the public functions."""
+    """Measure one configuration, by the machine and by the public functions."""
     point = (-0.04, 0.028, 0.80)
-    theta = equations.posture(point, ELBOWS_OUT, PAPER)
+    theta = PAPER_TPM.inverse(point)
     array, angles = np.array(point), np.array(theta)
     calls: dict[str, Callable[[], object]] = {
-        "posture": lambda: equations.posture(point, ELBOWS_OUT, PAPER),
-        "assemble": lambda: equations.assemble(theta, DEFAULT_ASSEMBLY, PAPER),
-        "evaluate": lambda: equations.evaluate(theta, DEFAULT_ASSEMBLY, PAPER),
+        "machine.inverse": lambda: PAPER_TPM.inverse(point),
+        "machine.evaluate": lambda: PAPER_TPM.evaluate(theta),
         "inverse": lambda: inverse(array),
         "forward": lambda: forward(angles),
         "jacobian.evaluate": lambda: jacobian.evaluate(angles),
@@ -140,7 +131,7 @@ def one_call() -> None:
 
 
 def single() -> None:
-    """One forward call against scipy.optimize.root, alternating."""
+    """Compare one forward call with scipy.optimize.root, in turns."""
     rng = np.random.default_rng(1)
     points = rng.uniform((-0.2, 0.015, 0.7), (0.1, 0.042, 0.9), (CALLS, 3))
     ratios, ours, peers, errors = [], [], [], []

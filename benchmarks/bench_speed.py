@@ -1,17 +1,17 @@
-"""How many steps a second the environments do, against their peers, the engine and two processes.
+"""Measure steps per second, compared with other packages, raw physics and two processes.
 
     make bench-speed
 
-Every round runs every contestant once, in an order shuffled anew: the environments of tpm_gym,
-panda-gym's and gymnasium-robotics' as ``gymnasium.make`` gives them, all with 25 control steps a
-second of simulated time. All get the same uniform random actions, cut to their action space, and
-are reset when an episode ends; steps a second are with these resets. Ratios are taken within each
-round, between neighbours in time, so that they survive a machine whose speed wanders.
+Each round runs each contestant once, in random order: the environments of tpm_gym, panda-gym and
+gymnasium-robotics as made by ``gymnasium.make``, all with 25 control steps per second of simulated
+time. All get the same uniform random actions, cut to their action space, and are reset when an
+episode ends. Steps per second include these resets. Ratios are taken within a round, so that they
+hold on a computer whose speed varies.
 
-The floor of an environment of tpm_gym is its raw physics: the same calls of the engine that its
-steps made, repeated from the same starts (see raw_physics.py), once counting the
-``stepSimulation`` calls alone and once with the motor commands between them. The reading of
-encoders and truth is not in the floor, nor are kinematics, observation, reward and wrappers.
+The floor of an environment of tpm_gym is its raw physics: the calls of the engine that its steps
+made, replayed from the same starts (raw_physics.py). It is measured with the ``stepSimulation``
+calls alone, and with the motor commands between them. Reading encoders and the true state,
+kinematics, observations, rewards and wrappers are not in the floor.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import machine
 import numpy as np
+import shared
 import speed_scaling
-from machine import provenance, quartiles
 from numpy.typing import NDArray
 from raw_physics import Floor, Recorder, Tape, record, recording, replay
+from shared import provenance, quartiles
 from speed_report import print_report, save_plot
 
 from tpm_gym import ENV_IDS
@@ -53,12 +53,13 @@ CONTROL_RATE = 25.0  # Hz
 
 @dataclass
 class Contestant:
-    """An environment and what was measured of it, one entry a round.
+    """Environment and its measurements, one entry for each round.
 
     Attributes:
-        steps: Seconds of the steps of a round.
-        resets: Seconds of the resets of a round, ``count`` of them.
-        floors: Raw physics of the same round's steps; of our environments only.
+        steps: Seconds of the steps.
+        resets: Seconds of the resets.
+        count: Number of resets.
+        floors: Raw physics of the same steps, for environments of tpm_gym only.
     """
 
     env_id: str
@@ -76,7 +77,7 @@ class Contestant:
         return int(np.prod(self.env.action_space.shape or (0,)))
 
     def run(self, actions: NDArray[np.float32], seed: int) -> None:
-        """One round: all actions, with resets where episodes end."""
+        """Run one round: all actions, with a reset at the end of each episode."""
         env, clock = self.env, time.perf_counter
         env.reset(seed=seed)
         resets, count = 0.0, 0
@@ -93,7 +94,7 @@ class Contestant:
         self.count.append(count)
 
     def tape(self, actions: NDArray[np.float32], seed: int) -> Tape:
-        """What the engine is asked in such a round, by an environment of its own."""
+        """Record the calls of the engine in such a round, by a second environment."""
         with recording(self.recorder):
             if self.recorded is None:
                 self.recorded = gym.make(self.env_id)
@@ -107,7 +108,7 @@ class Contestant:
 
 
 def open_contestants(env_ids: Sequence[str]) -> tuple[list[Contestant], dict[str, str]]:
-    """Make the environments; those that cannot be made are returned with the reason."""
+    """Make the environments; return them, and the reasons of those that cannot be made."""
     made, missing = [], {}
     for env_id in env_ids:
         try:
@@ -120,7 +121,7 @@ def open_contestants(env_ids: Sequence[str]) -> tuple[list[Contestant], dict[str
         except Exception as error:
             if env_id not in PEERS:
                 raise
-            # A peer that cannot run is a line in the table, whatever the reason.
+            # A peer that cannot run, for any reason, gets a line in the table.
             missing[env_id] = _reason(env_id, error)
             continue
         _check_rate(env_id, env)
@@ -129,17 +130,17 @@ def open_contestants(env_ids: Sequence[str]) -> tuple[list[Contestant], dict[str
 
 
 def _reason(env_id: str, error: Exception) -> str:
-    """Why a peer is missing, in one line."""
+    """Return in one line why a peer is missing."""
     text = f"{type(error).__name__}: {error}".rstrip(": ")
     if PEERS[env_id] == "gymnasium_robotics" and isinstance(error, AssertionError):
-        # From 3.12 on, mujoco's enumerations no longer equal numpy's integers, and
-        # gymnasium-robotics 1.4.2 looks for one among the other in an assertion.
+        # Since mujoco 3.12 its enumerations do not equal numpy's integers, and an assertion of
+        # gymnasium-robotics 1.4.2 compares them.
         text += " (gymnasium-robotics 1.4.2 runs with mujoco below 3.12)"
     return " ".join(text.split())
 
 
 def _check_rate(env_id: str, env: gym.Env[Any, Any]) -> None:
-    """Raise where an environment's control step is not 40 ms, so that steps are not comparable."""
+    """Raise if a control step is not 40 ms, because steps would not be comparable."""
     unwrapped: Any = env.unwrapped
     if env_id in ENV_IDS:
         period = CONTROL_PERIOD
@@ -152,7 +153,7 @@ def _check_rate(env_id: str, env: gym.Env[Any, Any]) -> None:
 
 
 def race(contestants: Sequence[Contestant], rounds: int, steps: int, seed: int) -> None:
-    """Run all rounds, each contestant once a round, after one that is not counted."""
+    """Run all rounds, each contestant once a round, after a round that does not count."""
     rng = np.random.default_rng(seed)
     for number in range(-1, rounds):
         actions = rng.uniform(-1.0, 1.0, (steps, 4)).astype(np.float32)
@@ -172,7 +173,7 @@ def race(contestants: Sequence[Contestant], rounds: int, steps: int, seed: int) 
 def _turn(
     contestant: Contestant, actions: NDArray[np.float32], seed: int, rng: np.random.Generator
 ) -> None:
-    """One contestant's part of a round: its steps and its floor, in random order."""
+    """Run one contestant of a round: its steps and its floor, in random order."""
     actions = actions[:, : contestant.action_size]
     if contestant.env_id in PEERS:
         contestant.run(actions, seed)
@@ -187,7 +188,7 @@ def _turn(
 
 
 def summary(contestants: Sequence[Contestant], steps: int) -> dict[str, Any]:
-    """Quartiles of everything measured, by id."""
+    """Return quartiles of all measurements, by id."""
     totals = {c.env_id: np.add(c.steps, c.resets) for c in contestants}
     result: dict[str, Any] = {}
     for c in contestants:
@@ -211,7 +212,7 @@ def summary(contestants: Sequence[Contestant], steps: int) -> dict[str, Any]:
 
 
 def profile(steps: int) -> None:
-    """Print where the time of env.step goes."""
+    """Profile env.step."""
     env = gym.make(OURS)
     env.reset(seed=0)
     actions = np.random.default_rng(0).uniform(-1, 1, (steps, 4)).astype(np.float32)
@@ -255,13 +256,13 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
-    """Measure, print the tables, and return what --json writes."""
+    """Measure and print the tables; return the content of --json."""
     options = parse(arguments)
     words = sys.argv if arguments is None else ["benchmarks/bench_speed.py", *arguments]
     if options.profile:
         profile(10 * options.steps)
         return {}
-    content: dict[str, Any] = machine.describe(words) | {
+    content: dict[str, Any] = shared.describe(words) | {
         "rounds": options.rounds,
         "steps": options.steps,
         "seed": options.seed,

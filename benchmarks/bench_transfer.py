@@ -1,15 +1,14 @@
-"""Where policies were trained, and where they were tested: closed form, PyBullet, MuJoCo; drives.
+"""Test policies of one engine in all engines and with all drives.
 
     tpm-gym train --algo ppo --engine analytic --env TPMPickAndPlaceDense-v0 --seed 0   # and so on
     make bench-transfer
     python benchmarks/bench_transfer.py --runs runs --episodes 200 --jobs 2
 
-Tested is what ``--runs`` holds: each run's best policy, in the engine it was trained in and in the
-others, with ideal and servo drives. Runs that stopped early come of ``--steps``, and those that
-shove of ``shoving.py``: what drops and shoves is where an engine with a simpler contact would be
-found out. The published policies are tested too.
+The best policy of each run in ``--runs`` and the published policies are tested in each engine, with
+ideal and servo drives. Include runs of few steps (``--steps``), whose policies drop the puck, and
+of ``shoving.py``, because errors of contact would show in both.
 
-Everything goes to docs/records/transfer.json, and from there into docs/closed-form.md.
+Results go to docs/records/transfer.json, and from there to docs/closed-form.md.
 """
 
 from __future__ import annotations
@@ -24,11 +23,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import machine
 import numpy as np
 from engine_matrix import DRIVES
-from engine_report import table
-from machine import ROOT, fill
+from shared import ROOT, describe, fill, provenance, table
 
 from tpm_gym.learning.environments import make_env, make_envs
 from tpm_gym.learning.estimates import wilson
@@ -43,10 +40,10 @@ PUBLISHED = ("TPMPickAndPlace-v0", "TPMPickAndPlaceJoints-v0")
 
 @dataclass(frozen=True)
 class Cell:
-    """A policy in an engine with a drive.
+    """Policy in an engine with a drive.
 
     Attributes:
-        kind: Which policies are put together: how they were trained.
+        kind: Training of the policy; policies of one kind share a row.
     """
 
     kind: str
@@ -58,7 +55,7 @@ class Cell:
 
 
 def cells(runs: Path, episodes: int, drives: Sequence[str]) -> Iterator[Cell]:
-    """Every policy in every engine with every drive."""
+    """Yield each policy in each engine with each drive."""
     policies = [(_kind(config), config["env"], str(folder)) for folder, config in _trained(runs)]
     policies += [(f"{env_id}: published", env_id, env_id) for env_id in PUBLISHED]
     for kind, env_id, policy in policies:
@@ -68,7 +65,7 @@ def cells(runs: Path, episodes: int, drives: Sequence[str]) -> Iterator[Cell]:
 
 
 def _trained(runs: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """The folders of runs, and what was asked of them."""
+    """Yield the folders of runs, with their configurations."""
     for file in sorted(runs.glob("*/config.json")):
         yield file.parent, json.loads(file.read_text(encoding="utf-8"))
 
@@ -81,7 +78,7 @@ def _kind(config: dict[str, Any]) -> str:
 
 
 def run(cell: Cell) -> dict[str, Any]:
-    """Evaluate one cell on the seeds that ``tpm-gym evaluate`` takes."""
+    """Evaluate one cell on the seeds of ``tpm-gym evaluate``."""
     options = {"engine": cell.engine, "drive": cell.drive}
     with closing(make_env(cell.env_id, **options)) as env:
         policy = load_policy(cell.policy, env)
@@ -95,7 +92,7 @@ def run(cell: Cell) -> dict[str, Any]:
 
 
 def lines(record: dict[str, Any]) -> Iterator[str]:
-    """The table as Markdown: policies of a kind together, median and range over seeds."""
+    """Yield the table in Markdown: one row for policies of a kind, median and range over seeds."""
     command = record["machine"]["command"]
     yield f"`{command}`, {record['episodes']} episodes a policy and cell."
     yield ""
@@ -121,14 +118,14 @@ def _row(kind: str, columns: list[tuple[str, str]], found: list[dict[str, Any]])
 
 
 def _rate(cell: dict[str, Any]) -> float:
-    """Of success, %."""
+    """Return the success rate, %."""
     marks = cell["successes"]
     return 100 * marks.count("1") / len(marks)
 
 
 def main() -> None:
     """Parse the options and run."""
-    parser = argparse.ArgumentParser(description="Policies trained here, tested there.")
+    parser = argparse.ArgumentParser(description="Test policies in all engines.")
     parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "transfer")
     parser.add_argument("--episodes", type=int, default=200)
     parser.add_argument("--drives", nargs="+", choices=DRIVES, default=DRIVES)
@@ -142,13 +139,13 @@ def main() -> None:
             print(*(cell[k] for k in ("kind", "engine", "drive")), _rate(cell), file=sys.stderr)
             found.append({**cell, "policy": Path(cell["policy"]).name})
     record = {
-        "machine": machine.describe(sys.argv),
+        "machine": describe(sys.argv),
         "episodes": options.episodes,
         "cells": found,
     }
     print("\n".join(lines(record)))
     if not options.dry:
-        RECORD.write_text(json.dumps(record) + "\n", encoding="utf-8")
+        provenance.write_json(RECORD, record)
         fill(PAGE, "transfer", lines(record))
 
 

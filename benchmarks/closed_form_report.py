@@ -1,16 +1,14 @@
-"""Tables and picture of what bench_engine.py measured, in docs/closed-form.md."""
+"""Tables and picture of bench_engine.py, in docs/closed-form.md."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from engine_report import table
-from machine import ROOT, fill, processor_line, quartiles
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from shared import ROOT, fill, processor_line, provenance, quartiles, read_record, spread, table
 
 from tpm_gym.learning import figure_style as style
 from tpm_gym.learning.figure_style import BLUE, GREEN, ORANGE, VERMILLION
@@ -23,24 +21,20 @@ COLOURS = {"expert": BLUE, "random": VERMILLION}
 
 
 def write(record: dict[str, Any]) -> None:
-    """Keep the record; parts that were not run stay as they are."""
-    RECORD.parent.mkdir(parents=True, exist_ok=True)
-    kept = json.loads(RECORD.read_text(encoding="utf-8")) if RECORD.is_file() else {}
-    RECORD.write_text(json.dumps({**kept, **record}, indent=1) + "\n", encoding="utf-8")
+    """Write the parts that were run to the record, and keep its other parts."""
+    provenance.write_json(RECORD, read_record(RECORD) | record)
 
 
 def publish() -> None:
     """Fill the page and draw the picture from the record."""
-    record = json.loads(RECORD.read_text(encoding="utf-8"))
+    record = read_record(RECORD)
     fill(PAGE, "closed form", lines(record))
     if {"speed", "torques"} <= record.keys():
         draw(record)
-    for path in (PICTURE, PAGE):
-        print("wrote", path.relative_to(ROOT))
 
 
 def lines(record: dict[str, Any]) -> Iterator[str]:
-    """All tables as Markdown."""
+    """Yield all tables in Markdown."""
     for name, part in record.items():
         yield f"{_TITLES[name]} `make bench-engine` on {processor_line(part['machine'])}."
         yield ""
@@ -52,12 +46,12 @@ def _speed(rows: dict[str, Any]) -> Iterator[str]:
     yield from table(
         ["environment", "engine", "steps/s", "times PyBullet's"],
         [
-            [name.split(", ")[0], _engine(name), _spread(row["rates"], "{:,.0f}"), _times(row)]
+            [name.split(", ")[0], _engine(name), _quartiles(row["rates"], "{:,.0f}"), _times(row)]
             for name, row in rows["rates"].items()
         ],
     )
     yield ""
-    taken = _spread(rows["evaluation"], "{:.2f}")
+    taken = _quartiles(rows["evaluation"], "{:.2f}")
     yield f"1000 episodes of the published policy of {PICK}, records and all, take {taken} s."
 
 
@@ -71,7 +65,7 @@ def _engine(name: str) -> str:
 def _times(row: dict[str, Any]) -> str:
     if row["ratio"] is None:
         return "-"
-    return _spread(row["ratio"], "{:.0f}" if min(row["ratio"]) >= 10 else "{:.1f}")
+    return _quartiles(row["ratio"], "{:.0f}" if min(row["ratio"]) >= 10 else "{:.1f}")
 
 
 def _torques(rows: list[dict[str, Any]]) -> Iterator[str]:
@@ -120,13 +114,12 @@ _TITLES = {
 _TABLES = {"speed": _speed, "torques": _torques, "success": _success}
 
 
-def _spread(values: list[float], form: str) -> str:
-    low, middle, high = (form.format(value) for value in quartiles(values))
-    return f"{middle} [{low}, {high}]"
+def _quartiles(values: list[float], form: str) -> str:
+    return spread(quartiles(values), form)
 
 
 def draw(record: dict[str, Any]) -> None:
-    """Speed over the number of environments; torques over the time step."""
+    """Draw speed over the number of environments, and torques over the time step."""
     with style.style():
         figure = Figure(figsize=(style.WIDTH, 2.7), layout="constrained")
         left, right = figure.subplots(1, 2)

@@ -1,4 +1,4 @@
-"""The same actions in every engine: loops, platform, torques, puck, energy, beside theory."""
+"""Replay of the same actions in each engine: loops, platform, torques, puck, energy, and theory."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from tpm_gym.tasks.motion import hanging
 
 REACH, PICK = "TPMReach-v0", "TPMPickAndPlace-v0"
 SEED = 3_000_000
-"""Of the first episode: neither trained, nor selected, nor tested on."""
+"""Seed of the first episode; no training, selection or test uses it."""
 STEPS = 50
 FALL = 4
-"""Control periods for which the mechanism falls with its motors off."""
+"""Control periods of a fall with the motors off."""
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Actions to be repeated in every engine.
+    """Actions for all engines.
 
     Attributes:
-        name: What it is called in the table.
-        env_id: Where.
-        actions: An array (steps, action size) an episode; episode i is reset with SEED + i.
-        free: Whether nothing is touched, so that theory knows the torques.
+        name: Name in the table.
+        env_id: Environment.
+        actions: An array (steps, action size) for each episode; episode i is reset with SEED + i.
+        free: Whether nothing is touched, so that theory has the torques.
     """
 
     name: str
@@ -47,14 +47,15 @@ class Motion:
 
 @dataclass(frozen=True)
 class Trace:
-    """What came of a motion; one row for each control step, of all episodes in turn.
+    """Results of a motion, a row for each control step of all episodes.
 
     Attributes:
-        gap: (n,) m, the largest loop gap.
-        apart: (n,) m, platform against forward kinematics of the encoders.
+        gap: (n,) m, largest loop gap.
+        apart: (n,) m, distance of the platform from the forward kinematics of the encoders.
         torque: (n, 3) N m, in the last time step.
-        theory: (n, 3) N m, closed form at the references of that time step; empty if not free.
-        puck: (episodes, 3) m, where the puck ended; empty without one.
+        theory: (n, 3) N m, from closed-form dynamics at the references of this time step; empty if
+            the motion is not free.
+        puck: (episodes, 3) m, final position of the puck; empty without a puck.
     """
 
     gap: FloatArray
@@ -65,7 +66,7 @@ class Trace:
 
 
 def motions(episodes: int) -> list[Motion]:
-    """Expert, random and fast with free hands; expert and pressing with the puck."""
+    """Return the five motions: three with nothing to touch, and two with the puck."""
     return [
         Motion("expert, reaching", REACH, _recorded(REACH, episodes, _expert), free=True),
         Motion("random", REACH, _drawn(episodes, hold=1), free=True),
@@ -76,7 +77,7 @@ def motions(episodes: int) -> list[Motion]:
 
 
 def _drawn(episodes: int, hold: int) -> tuple[NDArray[Any], ...]:
-    """Uniform actions; those that are held for some steps are at full speed, one way or other."""
+    """Sample uniform actions, or actions at full speed that are held for some steps."""
     rng = np.random.default_rng(SEED + hold)
     drawn = rng.uniform(-1.0, 1.0, (episodes, -(-STEPS // hold), 3))
     if hold > 1:
@@ -88,7 +89,7 @@ Actions = Callable[[Any, dict[str, Any]], Iterator[NDArray[Any]]]
 
 
 def _recorded(env_id: str, episodes: int, actions: Actions) -> tuple[NDArray[Any], ...]:
-    """What ``actions`` does in PyBullet, to be repeated blindly."""
+    """Record ``actions`` in PyBullet."""
     recorded = []
     with closing(gym.make(env_id)) as env:
         for episode in range(episodes):
@@ -109,7 +110,7 @@ def _expert(env: Any, observation: dict[str, Any]) -> Iterator[NDArray[Any]]:
 
 
 def _press(env: Any, observation: dict[str, Any]) -> Iterator[NDArray[Any]]:
-    """Come down on the puck, press it with the cup's spring, and push it along, without vacuum."""
+    """Yield actions that press the puck with the spring of the cup and push it, without vacuum."""
     inner = env.unwrapped
     to_paper, block = inner.machine.mount.to_paper, inner.task.scene.objects[0]
     top = inner.state.object_position[0] + hanging(block)
@@ -121,7 +122,7 @@ def _press(env: Any, observation: dict[str, Any]) -> Iterator[NDArray[Any]]:
 
 
 def follow(motion: Motion, engine: str, drive: str = "ideal") -> Trace:
-    """Repeat a motion in an engine."""
+    """Replay a motion in an engine."""
     rows: list[tuple[FloatArray, ...]] = []
     theory: list[FloatArray] = []
     pucks: list[FloatArray] = []
@@ -144,13 +145,13 @@ def follow(motion: Motion, engine: str, drive: str = "ideal") -> Trace:
 
 
 def torque_by_theory(inner: Any, commands: FloatArray) -> FloatArray:
-    """Torques (3,) N m that the closed form asks for in the last time step of a control period.
+    """Compute torques (3,) N m in the last time step of a control period by closed-form dynamics.
 
-    Velocities are backward differences of the references, as the engines have them.
+    Velocities are backward differences of the references, as in the engines.
 
     Args:
         inner: The environment.
-        commands: The last three (3, 3) m, world.
+        commands: The last three commands (3, 3) m, world.
     """
     substeps = inner.simulation.engine.substeps
     step, machine = CONTROL_PERIOD / substeps, inner.machine
@@ -162,7 +163,7 @@ def torque_by_theory(inner: Any, commands: FloatArray) -> FloatArray:
 
 
 def energy_lost(engine: str) -> float:
-    """Share of the released potential energy that is missing after a fall with the motors off."""
+    """Measure the share of the potential energy that is lost in a fall with the motors off."""
     machine = PAPER_TPM
     simulation = Simulation(Scene(), machine=machine, engine=engine)
     try:

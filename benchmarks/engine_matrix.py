@@ -1,4 +1,4 @@
-"""Success of policies, good and weak, in every engine with every drive."""
+"""Success of policies, with and without noise, in each engine with each drive."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from tpm_gym.learning.rollout import (
 IDS = ("TPMPickAndPlace-v0", "TPMPickAndPlaceJoints-v0")
 DRIVES = ("ideal", "servo")
 NOISE = 0.3
-"""Standard deviation of what is added to the actions of weak policies: they drop, throw, shove."""
+"""Standard deviation of the noise on actions, which makes policies drop, throw and shove."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One policy with so much noise on its actions, in one engine with one drive."""
+    """Policy with noise on its actions, in an engine with a drive."""
 
     env_id: str
     policy: str
@@ -43,7 +43,7 @@ class Cell:
 
 @dataclass
 class Trembling:
-    """A policy with normal noise on its actions, from the seed of the episode."""
+    """Policy with normal noise on its actions, seeded by the seed of the episode."""
 
     policy: Policy
     noise: float
@@ -55,14 +55,14 @@ class Trembling:
         self.policy.reset(observation, seed)
 
     def act(self, observation: Observation) -> Action:
-        """What the policy does, and noise."""
+        """Return the action of the policy, with noise."""
         action = self.policy.act(observation)
         noise = self.rng.normal(0.0, self.noise, action.shape)
         return np.clip(action + noise, -1.0, 1.0).astype(np.float32)
 
 
 def cells(engines: Iterable[str], episodes: int) -> list[Cell]:
-    """All combinations: expert and published policy, steady and trembling."""
+    """Return all combinations of expert and published policy, with and without noise."""
     policies = [(env_id, name) for env_id in IDS for name in ("expert", env_id)]
     return [
         Cell(env_id, policy, noise, engine, drive, episodes)
@@ -73,13 +73,13 @@ def cells(engines: Iterable[str], episodes: int) -> list[Cell]:
 
 
 def run_all(todo: list[Cell], jobs: int) -> Iterator[dict[str, Any]]:
-    """Evaluate cells in so many processes, and give their records in order."""
+    """Evaluate cells in ``jobs`` processes; yield their records in order."""
     with ProcessPoolExecutor(jobs) as pool:
         yield from pool.map(run, todo)
 
 
 def run(cell: Cell) -> dict[str, Any]:
-    """Evaluate one cell on the seeds that ``tpm-gym evaluate`` takes."""
+    """Evaluate one cell on the seeds of ``tpm-gym evaluate``."""
     start = time.perf_counter()
     with closing(make_env(cell.env_id, engine=cell.engine, drive=cell.drive)) as env:
         policy = load_policy(cell.policy, env)

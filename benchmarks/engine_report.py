@@ -1,15 +1,14 @@
-"""Tables and picture of what bench_engines.py measured, in docs/fidelity.md."""
+"""Tables and picture of bench_engines.py, in docs/fidelity.md."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from machine import ROOT, fill, processor_line, quartiles
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from shared import ROOT, fill, processor_line, quartiles, read_record, spread, table
 
 from tpm_gym.learning import figure_style as style
 from tpm_gym.learning.figure_style import BLUE, ORANGE, PURPLE, SKY, VERMILLION
@@ -45,34 +44,15 @@ def _length(value: float | None) -> str:
     return "-" if value is None else f"{MM * value:.2f}"
 
 
-def write(record: dict[str, Any]) -> None:
-    """Keep the record."""
-    RECORD.parent.mkdir(parents=True, exist_ok=True)
-    RECORD.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
-
-
-def read() -> dict[str, Any]:
-    """The record that was kept."""
-    record: dict[str, Any] = json.loads(RECORD.read_text(encoding="utf-8"))
-    return record
-
-
 def publish() -> None:
     """Fill the page and draw the picture from the record."""
-    record = read()
+    record = read_record(RECORD)
     fill(PAGE, "engines", lines(record))
     draw(record)
-    for path in (PICTURE, PAGE):
-        print("wrote", path.relative_to(ROOT))
-
-
-def print_tables(record: dict[str, Any]) -> None:
-    """The same tables on the screen."""
-    print("\n".join(lines(record)))
 
 
 def lines(record: dict[str, Any]) -> Iterator[str]:
-    """Both tables as Markdown, and what the machine was."""
+    """Yield both tables in Markdown, with the computer and the cost."""
     yield f"`make bench-engines` on {processor_line(record['machine'])}."
     yield ""
     yield from table(
@@ -98,16 +78,8 @@ def lines(record: dict[str, Any]) -> Iterator[str]:
     )
 
 
-def table(head: list[str], rows: list[list[str]]) -> Iterator[str]:
-    """A table as Markdown."""
-    yield "| " + " | ".join(head) + " |"
-    yield "|---" * len(head) + "|"
-    for row in rows:
-        yield "| " + " | ".join(row) + " |"
-
-
 def _costs(record: dict[str, Any]) -> str:
-    """One sentence on cost and energy."""
+    """Return a sentence on cost and energy."""
     cost = {engine: np.array(seconds) for engine, seconds in record["cost"].items()}
     first, *others = cost
     times = ", ".join(
@@ -115,8 +87,8 @@ def _costs(record: dict[str, Any]) -> str:
     )
     ratios = []
     for engine in others:
-        low, middle, high = quartiles(cost[first] / cost[engine])
-        ratios.append(f"{engine} {middle:.2f} [{low:.2f}, {high:.2f}] times as fast as {first}")
+        ratio = spread(quartiles(cost[first] / cost[engine]), "{:.2f}")
+        ratios.append(f"{engine} {ratio} times as fast as {first}")
     lost = ", ".join(f"{name} {100 * share:.1f}%" for name, share in record["energy_lost"].items())
     return (
         f"A control step of `TPMPickAndPlace-v0` under random actions: {times}; "
@@ -126,7 +98,7 @@ def _costs(record: dict[str, Any]) -> str:
 
 
 def _by_policy(record: dict[str, Any]) -> dict[tuple[str, str], dict[tuple[str, str], Any]]:
-    """Cells of the matrix by id and policy, then by engine and drive."""
+    """Return the cells of the matrix by id and policy, then by engine and drive."""
     found: dict[tuple[str, str], dict[tuple[str, str], Any]] = {}
     for cell in record["matrix"]:
         row = found.setdefault((cell["env_id"], _name(cell)), {})
@@ -135,7 +107,7 @@ def _by_policy(record: dict[str, Any]) -> dict[tuple[str, str], dict[tuple[str, 
 
 
 def _name(cell: dict[str, Any]) -> str:
-    """The policy as a reader knows it."""
+    """Return the name of the policy in the table."""
     name = "published" if cell["policy"] == cell["env_id"] else cell["policy"]
     return f"{name}, trembling" if cell["noise"] else str(name)
 
@@ -149,7 +121,7 @@ def _success(estimate: dict[str, float]) -> str:
 
 
 def draw(record: dict[str, Any]) -> None:
-    """Torques off each other and off theory; success of each policy over engines and drives."""
+    """Draw differences of torques, and success of each policy over engines and drives."""
     with style.style():
         figure = Figure(figsize=(style.WIDTH, 3.8))
         left, *right = figure.subplots(1, 3, width_ratios=(1.1, 1, 1))
@@ -182,7 +154,7 @@ def _agreement(axes: Axes, record: dict[str, Any]) -> None:
     )
     for aside, (label, marker, colour, engine, key) in zip((-0.2, 0.0, 0.2), marks, strict=True):
         found = {row["motion"]: row[key] for row in rows if row["engine"] == engine}
-        # Each at a height of its own, so that none hides another.
+        # Marks have different heights, so that none hides another.
         shown = [(found[name], at + aside) for at, name in enumerate(names) if found.get(name)]
         x, y = zip(*shown, strict=True)
         axes.plot(

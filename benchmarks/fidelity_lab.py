@@ -1,8 +1,7 @@
-"""A mechanism in a physics client, motions to follow, and what to measure on the way.
+"""Mechanisms in a physics client, motions, and measurements of their errors.
 
-The production classes load the mechanism and close its loops
-(:class:`tpm_gym.simulation.bullet.robot.Robot`); only the engine's settings and the motors vary
-here.
+The mechanism is loaded and its loops are closed by the same class as in the environments
+(:class:`tpm_gym.simulation.bullet.robot.Robot`). Only settings of the engine and motors vary.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ from tpm_gym.tasks.control import CartesianControl
 
 DEFAULT = Physics()
 CONDITIONED = 0.05
-"""1/cond(J) above which forward kinematics is held to its strict limit."""
+"""1/cond(J) above which forward kinematics must meet its strict limit."""
 HOME, REGION, MOUNT = np.array(PAPER_TPM.home), PAPER_TPM.region, PAPER_TPM.mount
 
 
@@ -44,20 +43,20 @@ HOME, REGION, MOUNT = np.array(PAPER_TPM.home), PAPER_TPM.region, PAPER_TPM.moun
 
 @dataclass(frozen=True)
 class Config:
-    """One row of the sweep; whatever is not said is as in production.
+    """Settings of one row of the sweep; the defaults are those of the environments.
 
     Attributes:
-        family: What it is compared with, and its colour in the plot.
-        name: What differs from the default.
+        family: Group in the table, and colour in the plot.
+        name: Difference from the default.
         variant: Name of a variant of :mod:`variants`.
         solver: ``"direct"`` (Dantzig), ``"iterative"`` (sequential impulses) or ``"lcp pgs"``.
-        time_step: s.
-        iterations: Of the iterative solvers.
-        erp: Share of a constraint's error taken out in one step.
+        time_step: Time step, s.
+        iterations: Iterations of the iterative solvers.
+        erp: Share of a constraint's error that is removed in one step.
         cfm: Compliance added to the constraints.
-        residual: Threshold at which the iterative solver stops early; None leaves the engine's.
+        residual: Threshold at which the iterative solver stops early; None: the engine's default.
         motor: ``"servo"`` (a velocity constraint) or ``"torque"``.
-        gains: Of torque control, N m/rad and N m s/rad.
+        gains: Gains of torque control, N m/rad and N m s/rad.
     """
 
     family: str
@@ -74,18 +73,18 @@ class Config:
 
     @property
     def substeps(self) -> int:
-        """Time steps in a control period."""
+        """Number of time steps in a control period."""
         return self.physics.substeps
 
     @property
     def physics(self) -> Physics:
-        """The settings that production knows."""
+        """Settings that the environments offer."""
         solver = "direct" if self.solver == "direct" else "iterative"
         return Physics(self.time_step, solver, self.iterations, self.erp)
 
     @property
     def beyond(self) -> dict[str, float]:
-        """The engine's settings that production does not offer."""
+        """Settings of the engine that the environments do not offer."""
         settings: dict[str, float] = {}
         if self.solver == "lcp pgs":
             settings["constraintSolverType"] = pybullet.CONSTRAINT_SOLVER_LCP_PGS
@@ -97,7 +96,7 @@ class Config:
 
 
 class Rig:
-    """A mechanism in a client of its own, with nothing else in it.
+    """Mechanism alone in a client of its own.
 
     Args:
         config: Settings.
@@ -119,14 +118,17 @@ class Rig:
                 self.client.setJointMotorControl2(*motor, self.client.VELOCITY_CONTROL, force=0.0)
 
     def place(self, theta: FloatArray) -> None:
-        """At rest, with closed loops."""
+        """Put the mechanism at rest at theta (3,) rad, with closed loops."""
         self.robot.place(self.variant.angles(theta))
 
     def drive(self, target: list[float]) -> None:
-        """Command the motors for one time step: three angles, and for torque what goes with them.
+        """Command the motors for one time step.
 
-        The servo is a velocity constraint; torque control is a PD law about the reference plus the
-        torques that carry the weight there, within the same limit.
+        A servo is a velocity constraint. Torque control is a PD law about the reference plus the
+        torques that balance gravity there, within the same limit.
+
+        Args:
+            target: Three angles, rad; for torque control also three rates and three torques.
         """
         if self.config.motor == "servo":
             self.robot.drive(target[:3])
@@ -146,7 +148,7 @@ class Rig:
             )
 
     def step(self) -> None:
-        """One time step of the engine."""
+        """Run one time step of the engine."""
         self.client.stepSimulation()
 
     def close(self) -> None:
@@ -159,14 +161,13 @@ class Rig:
 
 @dataclass(frozen=True)
 class Motion:
-    """What point P is asked to do: episodes that each start at rest.
+    """Motion of point P: episodes that start at rest.
 
     Attributes:
         name: ``"random"``, ``"expert"`` or ``"fast"``.
-        commands: Episodes as commands of 25 Hz, (n, 3) m, to be splined as the simulation does.
-        sweeps: Episodes as frequencies (3,) Hz with which P sweeps the whole region, for a second
-            or more of them.
-        seconds: Length of each sweep.
+        commands: Episodes as commands of 25 Hz, (n, 3) m, that are splined as in the simulation.
+        sweeps: Episodes as frequencies (3,) Hz of sweeps of P over the whole region.
+        seconds: Length of each sweep, s.
     """
 
     name: str
@@ -175,7 +176,7 @@ class Motion:
     seconds: float = 0.0
 
     def points(self, time_step: float) -> Iterator[FloatArray]:
-        """References of point P, one (n + 1, 3) m an episode; the first row is the start."""
+        """Yield the references of P for each episode, (n + 1, 3) m; the first row is the start."""
         weights = spline_weights(round(CONTROL_PERIOD / time_step))
         for commands in self.commands:
             padded = np.vstack([commands[:1], commands[:1], commands[1:]])
@@ -189,18 +190,18 @@ class Motion:
 
 
 def random_motion(periods: int, seed: int = 0) -> Motion:
-    """Uniform random Cartesian actions, on and on, without the resets of the environment."""
+    """Return a motion of uniform random Cartesian actions, without resets."""
     rng = np.random.default_rng(seed)
     return Motion("random", (_walk(rng.uniform(-1.0, 1.0, (periods, 3))),))
 
 
 def fast_motion(periods: int, seed: int = 1) -> Motion:
-    """Sweeps of 1.5 Hz over the whole region, and full speed with sudden changes of direction."""
+    """Return a motion at full speed with sudden changes of direction, and sweeps of 1.5 Hz."""
     rng = np.random.default_rng(seed)
     turns = rng.choice((-1.0, 1.0), (periods // 16 + 1, 3))
     bangs = _walk(np.repeat(turns, 8, axis=0)[: periods // 2])
     seconds = periods * CONTROL_PERIOD / 4
-    # x with y and z held, then all three at frequencies that do not repeat
+    # First x sweeps alone, then all three axes at frequencies without a common period.
     return Motion("fast", (bangs,), SWEEPS, seconds)
 
 
@@ -209,7 +210,7 @@ SWEEPS = ((1.5, 0.0, 0.0), (1.5, 0.37, 1.13))
 
 
 def expert_motion(episodes: int, seed: int = 0) -> Motion:
-    """The commands of the scripted expert in TPMPickAndPlace-v0, recorded from the environment."""
+    """Return the recorded commands of the scripted expert in TPMPickAndPlace-v0."""
     env = gym.make("TPMPickAndPlace-v0")
     inside: Any = env.unwrapped
     expert, recorded = Expert(env), []
@@ -227,7 +228,7 @@ def expert_motion(episodes: int, seed: int = 0) -> Motion:
 
 
 def _walk(actions: FloatArray) -> FloatArray:
-    """Commands that Cartesian actions (n, 3) lead to from HOME, (n + 1, 3) m."""
+    """Return the commands (n + 1, 3) m of Cartesian actions (n, 3) that start at HOME."""
     control, commands = CartesianControl(PAPER_TPM), [HOME]
     for action in actions:
         commands.append(control.command(action, commands[-1]))
@@ -235,7 +236,7 @@ def _walk(actions: FloatArray) -> FloatArray:
 
 
 def references(motion: Motion, config: Config) -> list[FloatArray]:
-    """What :meth:`Rig.drive` takes, a row a time step after the start, an array an episode."""
+    """Return targets of :meth:`Rig.drive`: an array for each episode, a row for each time step."""
     episodes = []
     for points in motion.points(config.time_step):
         theta = kinematics.inverse(points)
@@ -251,15 +252,15 @@ def references(motion: Motion, config: Config) -> list[FloatArray]:
 
 @dataclass
 class Errors:
-    """What was measured along one motion; one row for each time step.
+    """Errors along one motion, a row for each time step.
 
     Attributes:
-        gap: (n,) m, the largest loop gap.
-        apart: (n,) m, platform against forward kinematics of the encoders.
-        tilt: (n,) rad.
+        gap: (n,) m, largest loop gap.
+        apart: (n,) m, distance of the platform from the forward kinematics of the encoders.
+        tilt: (n,) rad, tilt of the platform.
         conditioning: (n,) 1/cond(J) at the encoders.
-        tracking: (n,) m, platform against its reference.
-        lost: Time step at which the mechanism came apart, or None.
+        tracking: (n,) m, distance of the platform from its reference.
+        lost: Time step at which the mechanism lost a loop, or None.
     """
 
     gap: FloatArray
@@ -283,13 +284,13 @@ def measure(rig: Rig, motion: Motion) -> Errors:
             gap, position, tilt = rig.robot.truth()
             rows.append((gap, tilt, *position, *rig.robot.motors().theta))
             wanted.append(point)
-            if not gap <= CLOSURE_LIMIT:  # a NaN ends it too
+            if not gap <= CLOSURE_LIMIT:  # also true for NaN
                 return _evaluate(np.array(rows), np.array(wanted))
     return _evaluate(np.array(rows), np.array(wanted))
 
 
 def _evaluate(rows: FloatArray, wanted: FloatArray) -> Errors:
-    """Errors of (n, 8) rows of gap, tilt, platform (world) and encoders, up to where it is lost."""
+    """Return the errors of rows (n, 8) of gap, tilt, platform (world) and encoders until a loss."""
     gap, tilt, position, theta = rows[:, 0], rows[:, 1], rows[:, 2:5], rows[:, 5:8]
     apart, conditioning = against_kinematics(theta, position)
     tracking = np.linalg.norm(MOUNT.to_paper(position) - wanted, axis=-1)
@@ -300,9 +301,11 @@ def _evaluate(rows: FloatArray, wanted: FloatArray) -> Errors:
 
 
 def against_kinematics(theta: FloatArray, position: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Distance of P (n, 3) m, world, to where the encoders (n, 3) rad put it, and 1/cond(J) there.
+    """Compare P (n, 3) m, world, with the forward kinematics of the encoders theta (n, 3) rad.
 
-    Where no assembly explains the encoders, the distance is infinite and 1/cond(J) zero.
+    Returns:
+        Distance (n,) m, and 1/cond(J) (n,). For encoders without an assembly the distance is
+        infinite and 1/cond(J) is zero.
     """
     apart, conditioning = np.full(len(theta), np.inf), np.zeros(len(theta))
     finite = np.isfinite(theta).all(axis=-1) & np.isfinite(position).all(axis=-1)
@@ -316,10 +319,10 @@ def against_kinematics(theta: FloatArray, position: FloatArray) -> tuple[FloatAr
 
 
 def seconds_per_step(rig: Rig, reference: FloatArray) -> float:
-    """CPU time of a time step with its motor commands along one episode, s.
+    """Measure the CPU time of a time step with its motor commands along one episode, s.
 
-    CPU time, because other work on the machine stretches the clock but hardly this. NaN where
-    the mechanism does not hold together.
+    Other work on the computer changes CPU time far less than wall-clock time. The result is NaN if
+    a loop is lost.
     """
     rig.place(reference[0, :3])
     targets = reference[1:].tolist()

@@ -1,11 +1,10 @@
-"""The default in the real environment, at every time step, for as long as one likes.
+"""Errors of the default settings in the real environment, at each of many time steps.
 
-Nothing is kept but histograms, so a million time steps take no more memory than a thousand.
+Only histograms are kept, so that memory does not grow with the number of time steps.
 """
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -14,18 +13,18 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from fidelity_lab import CONDITIONED, against_kinematics
-from machine import ROOT
+from shared import ROOT, provenance
 
 from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import ClosureError
 from tpm_gym.tasks import Expert
 
-BUFFER = 5000  # time steps that wait for their kinematics
+BUFFER = 5000  # time steps whose kinematics are computed at once
 JSON = ROOT / "runs" / "fidelity_long.json"
 
 
 class Histogram:
-    """Streamed samples of a positive quantity: exact mean and maximum, quantiles to 1 %.
+    """Histogram of a positive quantity: exact mean and maximum, quantiles to 1 %.
 
     Bins have equal widths in the logarithm, from 1e-12 to 1e3 in SI units.
     """
@@ -33,12 +32,12 @@ class Histogram:
     LOW, HIGH, BINS = -12.0, 3.0, 3600  # 10 ** (15 / 3600) = 1.0096
 
     def __init__(self) -> None:
-        """Empty."""
+        """Start empty."""
         self._counts = np.zeros(self.BINS, dtype=np.int64)
         self.count, self._sum, self.maximum = 0, 0.0, 0.0
 
     def add(self, values: FloatArray) -> None:
-        """Take in (n,) values."""
+        """Add values (n,)."""
         if not len(values):
             return
         position = (np.log10(np.maximum(values, 1e-300)) - self.LOW) / (self.HIGH - self.LOW)
@@ -50,11 +49,11 @@ class Histogram:
 
     @property
     def mean(self) -> float:
-        """Of all samples; NaN without any."""
+        """Mean of all samples; NaN without samples."""
         return self._sum / self.count if self.count else float("nan")
 
     def quantile(self, share: float) -> float:
-        """Upper edge of the bin that holds it, or the maximum where that is less."""
+        """Return the upper edge of the bin of a quantile, or the maximum if it is smaller."""
         if not self.count:
             return float("nan")
         at = int(np.searchsorted(np.cumsum(self._counts), share * self.count))
@@ -63,17 +62,16 @@ class Histogram:
 
 
 class Probe:
-    """Looks at the robot after every time step that an environment runs.
+    """Measurement of the robot after each time step of an environment.
 
-    It puts itself in the place of the client's ``stepSimulation``, so the environment runs as it
-    always does.
+    It wraps ``stepSimulation`` of the client, so that the environment itself is unchanged.
 
     Args:
         env: TPMPickAndPlace-v0.
     """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
-        """Hook in."""
+        """Wrap ``stepSimulation``."""
         inside: Any = env.unwrapped
         self._robot, client = inside.simulation.engine.robot, inside.simulation.engine.client
         self._step = client.stepSimulation
@@ -94,7 +92,7 @@ class Probe:
         return result
 
     def flush(self) -> None:
-        """Sort what was measured into the histograms."""
+        """Add the buffered measurements to the histograms."""
         rows, self._filled = self._rows[: self._filled], 0
         apart, conditioning = against_kinematics(rows[:, 5:8], rows[:, 2:5])
         good = conditioning > CONDITIONED
@@ -105,7 +103,7 @@ class Probe:
         self.fk_near.add(apart[~good])
 
     def summary(self) -> dict[str, Any]:
-        """Mean, 99.9 % and maximum of each quantity, SI units."""
+        """Return mean, 99.9 % quantile and maximum of each quantity, in SI units."""
         named = {"gap": self.gap, "fk": self.fk, "fk_near": self.fk_near, "tilt": self.tilt}
         found: dict[str, Any] = {
             name: {"samples": h.count, "mean": h.mean, "p999": h.quantile(0.999), "max": h.maximum}
@@ -115,7 +113,7 @@ class Probe:
 
 
 def follow(motion: str, steps: int, seed: int = 0) -> dict[str, Any]:
-    """Run TPMPickAndPlace-v0 for ``steps`` time steps; ``"random"`` or ``"expert"`` actions."""
+    """Run TPMPickAndPlace-v0 for ``steps`` time steps with "random" or "expert" actions."""
     env = gym.make("TPMPickAndPlace-v0")
     env.action_space.seed(seed)
     probe, expert = Probe(env), Expert(env)
@@ -148,7 +146,7 @@ def follow(motion: str, steps: int, seed: int = 0) -> dict[str, Any]:
 
 
 def run(steps: int, describe: Callable[[], dict[str, Any]], path: Path = JSON) -> None:
-    """Random actions and the expert; print and write what was found."""
+    """Run random actions and the expert; print and write the results."""
     description = describe()
     results = {motion: follow(motion, steps) for motion in ("random", "expert")}
     for motion, found in results.items():
@@ -165,6 +163,5 @@ def run(steps: int, describe: Callable[[], dict[str, Any]], path: Path = JSON) -
             f"  FK elsewhere: max {1e3 * near['max']:.4f} mm ({near['samples']:,} time steps)\n"
             f"  tilt: max {np.rad2deg(tilt['max']):.2e} degrees"
         )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({**description, "results": results}, indent=1) + "\n", "utf-8")
+    provenance.write_json(path, {**description, "results": results})
     print(f"wrote {path.relative_to(ROOT)}")

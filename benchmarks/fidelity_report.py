@@ -1,20 +1,18 @@
-"""Table, JSON and picture of the fidelity sweep, and the table in docs/fidelity.md."""
+"""Table, JSON and picture of the fidelity sweep, in docs/fidelity.md."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from engine_report import table
 from fidelity_sweep import QUANTITIES, Result, pareto
-from machine import ROOT, fill
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import NullLocator
+from shared import ROOT, fill, provenance, read_record, table
 
 from tpm_gym.learning import figure_style as style
 from tpm_gym.learning.figure_style import BLACK, BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION
@@ -47,7 +45,7 @@ LEGEND = (
 
 
 def cells(result: Result) -> list[str]:
-    """A row of the table."""
+    """Return a row of the table."""
     c, lost = result.config, ", ".join(f"{name} {n}" for name, n in result.lost.items())
     if np.isfinite(result.step_time):
         cost = [f"{1e6 * result.step_time:.0f}", f"{1e3 * result.period_time:.2f}"]
@@ -69,7 +67,7 @@ def _number(value: float | None, unit: float) -> str:
 
 
 def print_table(results: Sequence[Result]) -> None:
-    """Families under each other, columns aligned."""
+    """Print the table by families, with aligned columns."""
     rows = [list(COLUMNS), *(cells(result) for result in results)]
     widths = [max(len(row[k]) for row in rows) for k in range(len(COLUMNS))]
     family = ""
@@ -84,20 +82,18 @@ def print_table(results: Sequence[Result]) -> None:
 
 
 def write_json(results: Sequence[Result], description: dict[str, Any], path: Path = JSON) -> None:
-    """Machine, versions, command, and all that was measured, in SI units."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    rows = [result.as_json() for result in results]
-    path.write_text(json.dumps({**description, "results": rows}, indent=1) + "\n", "utf-8")
+    """Write the description of the computer and all results, in SI units."""
+    provenance.write_json(path, {**description, "results": [r.as_json() for r in results]})
 
 
 def read_json(path: Path = JSON) -> tuple[list[Result], dict[str, Any]]:
-    """What :func:`write_json` wrote."""
-    description = json.loads(path.read_text(encoding="utf-8"))
+    """Read the results and the description of :func:`write_json`."""
+    description = read_record(path)
     return [Result.from_json(row) for row in description.pop("results")], description
 
 
 def write_page(results: Sequence[Result], machine: str) -> None:
-    """Put the table between the marks of docs/fidelity.md."""
+    """Write the table to docs/fidelity.md."""
     rows = [
         [f"**{cell}**" for cell in cells(result)]
         if result.config.family == "default"
@@ -119,7 +115,7 @@ SERIES = tuple(
     [f"1/{rate} s, {n} iterations" for n in counts]
     for rate, counts in ((250, (25, 50, 100, 200, 400)), (500, (25, 50, 100, 200)))
 )
-"""Rows that a thin line joins in the picture: more and more iterations."""
+"""Rows with increasing iterations, which a thin line joins in the picture."""
 LABELS: dict[str, dict[str, tuple[str, tuple[float, float], str]]] = {
     "gap": {
         "default": ("default", (-5, -10), "right"),
@@ -136,11 +132,11 @@ LABELS: dict[str, dict[str, tuple[str, tuple[float, float], str]]] = {
     },
     "tilt": {"CFM 0": ("CFM 0", (-6, -3), "right"), "CFM 1e-06": ("CFM 1e-6", (6, -3), "left")},
 }
-"""Panel -> row -> text, offset in points and alignment of its label."""
+"""Text, offset in points and alignment of labels, by panel and row."""
 
 
 def draw(results: Sequence[Result], machine: str, path: Path = PICTURE) -> None:
-    """Cost against each error, with the Pareto front."""
+    """Draw each error over the cost, with the Pareto front."""
     held = [result for result in results if not result.lost]
     with style.style():
         figure = Figure(figsize=(style.WIDTH, 3.9))
@@ -172,7 +168,7 @@ def _handles(families: set[str]) -> list[Line2D]:
 
 
 def _panel(axes: Axes, held: Sequence[Result], quantity: str) -> None:
-    # The ratio within a round is steadier than the time itself.
+    # Ratios within a round vary less than times.
     unit = 1e3 * held[0].period_time
     costs = np.array([unit * np.median(r.ratios) for r in held])
     errors = np.array([r.overall[quantity].maximum or 0.0 for r in held]) * UNITS[quantity]

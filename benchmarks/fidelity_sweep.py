@@ -1,4 +1,4 @@
-"""The settings that the sweep compares, and how it measures them against each other."""
+"""Settings of the fidelity sweep, and their measurement."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 from fidelity_lab import CONDITIONED, Config, Errors, Motion, Rig, measure, references
 from fidelity_lab import seconds_per_step as timed
-from machine import quartiles
+from shared import quartiles
 
 from tpm_gym.arrays import FloatArray
 
 QUANTITIES = ("gap", "fk", "fk_near", "tilt", "tracking")
-"""Loop gap (m); platform against forward kinematics where 1/cond(J) exceeds CONDITIONED, and where
-it does not (m); tilt (rad); platform against its reference (m)."""
+"""Loop gap (m); distance of the platform from forward kinematics (m), where 1/cond(J) exceeds
+CONDITIONED and elsewhere; tilt (rad); distance of the platform from its reference (m)."""
 
 
 def sweep() -> tuple[Config, ...]:
-    """The default first, then a star around it."""
+    """Return all settings: the default first, then settings that differ from it in one respect."""
     return (
         Config("default", "default"),
         *_direct(),
@@ -42,7 +42,7 @@ def _direct() -> list[Config]:
 
 
 def _iterative() -> list[Config]:
-    """Bullet's default solver: iterations, steps, erp, and where it may stop early."""
+    """Return settings of Bullet's default solver: iterations, time steps, erp, early stops."""
 
     def row(name: str, **settings: Any) -> Config:
         return Config("iterative", name, solver="iterative", **settings)
@@ -65,7 +65,7 @@ def _iterative() -> list[Config]:
 
 
 def _torque() -> list[Config]:
-    """Torque control: gains that 250 Hz bears, gains that it does not, and 1000 Hz with those."""
+    """Return settings of torque control, with gains for 250 Hz, and gains for 1000 Hz only."""
     soft, stiff = (4000.0, 40.0), (8000.0, 160.0)
 
     def row(name: str, **settings: Any) -> Config:
@@ -79,7 +79,7 @@ def _torque() -> list[Config]:
 
 
 def _one_body() -> list[Config]:
-    """What the direct solvers make of loops inside one multibody."""
+    """Return settings with all loops inside one multibody."""
     return [
         Config("one body", "one body, direct", variant="one body"),
         Config("one body", "one body, PGS, 200 iterations", variant="one body", solver="lcp pgs",
@@ -93,7 +93,7 @@ def _one_body() -> list[Config]:
 
 
 def _structure() -> list[Config]:
-    """Which joints end the rods, and which side is cut, under both solvers."""
+    """Return settings with other joints at the ends of the rods, and other cuts."""
     rows = []
     for name in (
         "rods 4 spherical",
@@ -114,7 +114,7 @@ def _structure() -> list[Config]:
 
 @dataclass
 class Summary:
-    """Mean, 99.9 % quantile and maximum of one quantity, in SI units; None without samples."""
+    """Mean, 99.9 % quantile and maximum of a quantity, in SI units; None without samples."""
 
     mean: float | None
     p999: float | None
@@ -122,7 +122,7 @@ class Summary:
 
     @classmethod
     def of(cls, values: FloatArray) -> Summary:
-        """Of all samples."""
+        """Summarise samples (n,)."""
         if not len(values):
             return cls(None, None, None)
         return cls(float(values.mean()), float(np.quantile(values, 0.999)), float(values.max()))
@@ -130,15 +130,15 @@ class Summary:
 
 @dataclass
 class Result:
-    """One row of the table.
+    """Results of one configuration, a row of the table.
 
     Attributes:
-        config: What was measured.
-        motions: Motion -> quantity -> summary.
-        overall: Quantity -> summary over all motions.
-        lost: Motion -> time step at which the mechanism came apart.
-        step_times: s a time step with its motor commands, one value a block.
-        ratios: Cost of a control period against the default's in the same round.
+        config: Settings.
+        motions: Summaries by motion and quantity.
+        overall: Summaries over all motions, by quantity.
+        lost: Time step at which a loop was lost, by motion.
+        step_times: Seconds of a time step with its motor commands, by block.
+        ratios: Cost of a control period over that of the default in the same round.
     """
 
     config: Config
@@ -150,16 +150,16 @@ class Result:
 
     @property
     def step_time(self) -> float:
-        """Median s a time step; NaN where the mechanism does not hold together."""
+        """Median of ``step_times``, s; NaN if a loop was lost."""
         return float(np.median(self.step_times)) if self.step_times else float("nan")
 
     @property
     def period_time(self) -> float:
-        """Median s a control period."""
+        """Median of the seconds of a control period."""
         return self.step_time * self.config.substeps
 
     def as_json(self) -> dict[str, Any]:
-        """Plain data in SI units."""
+        """Return plain data in SI units."""
         held = np.isfinite(self.step_time)
         return {
             "config": asdict(self.config),
@@ -177,7 +177,7 @@ class Result:
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> Result:
-        """What :meth:`as_json` wrote."""
+        """Make a result from the data of :meth:`as_json`."""
         config = {**data["config"], "gains": tuple(data["config"]["gains"])}
         return cls(
             Config(**config),
@@ -193,7 +193,7 @@ class Result:
 
 
 def samples(errors: Errors) -> dict[str, FloatArray]:
-    """The samples of each quantity."""
+    """Return the samples of each quantity."""
     good = errors.conditioning > CONDITIONED
     return {
         "gap": errors.gap,
@@ -205,7 +205,7 @@ def samples(errors: Errors) -> dict[str, FloatArray]:
 
 
 def errors_of(config: Config, motions: Sequence[Motion]) -> Result:
-    """Follow all motions, each in a fresh client, and sum up."""
+    """Follow all motions, each in a new client; return the summaries."""
     result, pool = Result(config), {name: [] for name in QUANTITIES}
     for motion in motions:
         rig = Rig(config)
@@ -222,9 +222,9 @@ def errors_of(config: Config, motions: Sequence[Motion]) -> Result:
 
 
 def time_all(results: Sequence[Result], motion: Motion, rounds: int) -> None:
-    """Time every configuration in every round, so that noise of the machine hits all alike.
+    """Time each configuration in each round, so that noise of the computer affects all alike.
 
-    The ratio to the default, the first, is taken within a round.
+    Ratios to the default, which comes first, are taken within a round.
     """
     rigs = [Rig(result.config) for result in results]
     paths = [references(motion, result.config)[0] for result in results]
@@ -241,7 +241,7 @@ def time_all(results: Sequence[Result], motion: Motion, rounds: int) -> None:
 
 
 def pareto(costs: FloatArray, errors: FloatArray) -> list[int]:
-    """Indices, by rising cost, of the points that no other beats in both."""
+    """Return the indices of the Pareto front, in order of cost."""
     front: list[int] = []
     for i in np.lexsort((errors, costs)):
         if np.isfinite(costs[i] + errors[i]) and (not front or errors[i] < errors[front[-1]]):

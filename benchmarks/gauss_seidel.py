@@ -1,15 +1,15 @@
-"""How fast sequential impulses converge on the closures, and which solvers solve one step.
+"""Measure the convergence of sequential impulses on the closures, and the error of each solver.
 
     python benchmarks/gauss_seidel.py
 
-Sequential impulses are Gauss-Seidel on W lambda = b, with W = G M^-1 G^T, the coupling of all rows
-(three motors, the cup's spring, three rows for each ball); Bullet goes through the rows forwards
-and backwards by turns. The error shrinks by the largest eigenvalue of that double sweep, less the
-eigenvalue 1 of the one combination of closures that is redundant, which moves nothing. G and M are
-the engine's own; the order of the rows is ours.
+Sequential impulses are the Gauss-Seidel method on W lambda = b. W = G M^-1 G^T couples all rows:
+three motors, the spring of the cup, and three rows for each ball. Bullet sweeps the rows forwards
+and backwards in turns. The error shrinks by the largest eigenvalue of this double sweep, except for
+the eigenvalue 1 of the one redundant combination of closures, which has no effect. G and M come
+from the engine; the order of the rows is ours.
 
-One step from rest then tells which solver solves W lambda = b: the rates that should be zero, the
-motors' and the closures', are compared with what the engine leaves of them.
+One step from rest then shows whether a solver solves W lambda = b. The rates of motors and closures
+should be zero; the script prints the largest rate that the engine leaves.
 """
 
 from __future__ import annotations
@@ -28,9 +28,10 @@ HEIGHTS = (0.002, 0.005, 0.012, 0.020, 0.030, 0.046)
 
 
 def constraint_rows(rig: Rig) -> tuple[FloatArray, FloatArray]:
-    """G (rows, joints), and the mass matrix M (joints, joints), where the rig now stands.
+    """Return G (rows, joints) and the mass matrix M (joints, joints) at the pose of the rig.
 
-    Rows: the motors, the cup's slide, and x, y, z of each closure. The rig must be one multibody.
+    Rows are the motors, the slide of the cup, and x, y, z of each closure. The rig must be one
+    multibody.
     """
     client, robot, mechanism = rig.client, rig.robot, rig.variant.mechanism
     body = robot.bodies[0]
@@ -52,7 +53,7 @@ def constraint_rows(rig: Rig) -> tuple[FloatArray, FloatArray]:
 
 
 def iterations_per_decade(coupling: FloatArray) -> float:
-    """Iterations in which symmetric Gauss-Seidel on ``coupling`` gains a decimal digit."""
+    """Compute the iterations in which symmetric Gauss-Seidel on W gains a decimal digit."""
     scale = np.sqrt(np.diag(coupling))
     unit = coupling / np.outer(scale, scale)
     identity = np.eye(len(unit))
@@ -64,7 +65,7 @@ def iterations_per_decade(coupling: FloatArray) -> float:
 
 
 def convergence() -> None:
-    """Iterations a decade over the task region, by y."""
+    """Print the iterations per decimal digit over the task region, by y."""
     rig = Rig(Config("", "", variant="one body"))
     low, high = PAPER_TPM.region.low, PAPER_TPM.region.high
     print("iterations of sequential impulses a decimal digit, over x and z of the task region")
@@ -79,9 +80,10 @@ def convergence() -> None:
 
 
 def left_over(config: Config, point: Vector) -> float:
-    """Largest rate (rad/s or m/s) of a motor or closure, of all that one step should have stopped.
+    """Measure the largest rate of motors and closures after one step, rad/s or m/s.
 
-    The mechanism starts at rest at ``point``; its motors are told to stay.
+    The mechanism starts at rest at ``point``, and its motors have to hold it, so that all rates
+    should be zero.
     """
     theta = PAPER_TPM.inverse(point)
     whole = Rig(Config("", "", variant="one body"))
@@ -101,7 +103,7 @@ def left_over(config: Config, point: Vector) -> float:
 
 
 def one_step() -> None:
-    """Who stops the motors and closures, in one multibody and in three."""
+    """Print the largest rate after one step, by solver, in one multibody and in three."""
     point = PAPER_TPM.home
     print("largest rate left of motors and closures after one step from rest (rad/s, m/s)")
     for variant in ("one body", "three legs"):

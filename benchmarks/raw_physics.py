@@ -1,13 +1,12 @@
-"""The engine's own work in an episode, recorded once and repeated without anything around it.
+"""Record of the calls of the engine in an episode, and their replay without anything else.
 
-What a control step asks of the engine is taken down as calls of pybullet: a target for each motor
-and one ``stepSimulation`` a time step, the constraint of the vacuum cup when it takes or lets go,
-and the direction of the friction. Repeated on another environment from the same start, the same
-calls do the same physics, which :func:`replay` checks; its time is the floor of ``env.step``. Two
-floors:
+The calls of a control step are a target for each motor and one ``stepSimulation`` for each time
+step, the constraint of the vacuum cup when it grasps or releases, and the direction of friction.
+Replayed on another environment from the same start, the same calls do the same physics, which
+:func:`replay` checks. Their time is a floor of ``env.step``. There are two floors:
 
 * physics: the ``stepSimulation`` calls alone;
-* with motors: these and the motor commands, which any controller in Python has to send as well.
+* with motors: these and the motor commands, which any controller in Python has to send.
 """
 
 from __future__ import annotations
@@ -34,12 +33,12 @@ MOTOR = "setJointMotorControl2"
 CONTACT = ("createConstraint", "changeConstraint", "removeConstraint", "changeDynamics")
 
 _SAME = 1e-12
-"""Rad or m. Bullet repeats a puck at rest to 2e-18 m, not always to the last bit."""
+"""Tolerance, rad or m. Bullet replays a puck at rest to 2e-18 m, not always to the last bit."""
 
 
 @dataclass
 class Call:
-    """One call of the engine, less the number of the client."""
+    """Call of the engine, without the number of the client."""
 
     name: str
     arguments: tuple[Any, ...]
@@ -49,12 +48,12 @@ class Call:
 
 @dataclass
 class Tape:
-    """What the engine was asked in a block of steps.
+    """Calls of the engine in a block of steps.
 
     Attributes:
-        steps: The calls of each control step.
+        steps: Calls of each control step.
         resets: Indices of the steps after which the environment was reset.
-        ends: Where each step left the motors and the object, to compare with.
+        ends: Motors, P and objects after each step, to compare with.
     """
 
     steps: list[list[Call]] = field(default_factory=list)
@@ -64,25 +63,25 @@ class Tape:
 
 @dataclass(frozen=True)
 class Floor:
-    """Seconds of a whole block: ``stepSimulation`` alone, and with the motor commands."""
+    """Seconds of a block: ``stepSimulation`` alone, and with the motor commands."""
 
     physics: float
     with_motors: float
 
 
 class Recorder:
-    """Functions of pybullet that take down how they are called.
+    """Wrappers of pybullet's functions that record their calls.
 
-    A client binds the engine's functions when it first uses them, so a client that was first used
-    inside :func:`recording` must be used inside it only, and one to be timed must never be.
+    A client binds the functions when it first uses them. So a client that was first used inside
+    :func:`recording` must only be used there, and a client that is timed must never be.
     """
 
     def __init__(self) -> None:
-        """Start with nothing taken down."""
+        """Start without calls."""
         self.calls: list[Call] = []
 
     def wrap(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        """The function, noting its calls."""
+        """Return the function with a record of its calls."""
 
         def noting(*arguments: Any, **options: Any) -> Any:
             result = function(*arguments, **options)
@@ -95,14 +94,14 @@ class Recorder:
         return noting
 
     def take(self) -> list[Call]:
-        """What was called since the last time."""
+        """Return the calls since the last time."""
         calls, self.calls = self.calls, []
         return calls
 
 
 @contextmanager
 def recording(recorder: Recorder) -> Iterator[None]:
-    """Put the recorder's functions in the place of the engine's."""
+    """Replace the engine's functions by the recorder's."""
     real = {name: getattr(pybullet, name) for name in (STEP, MOTOR, *CONTACT)}
     for name, function in real.items():
         setattr(pybullet, name, recorder.wrap(name, function))
@@ -116,10 +115,10 @@ def recording(recorder: Recorder) -> Iterator[None]:
 def record(
     env: gym.Env[Any, Any], recorder: Recorder, actions: NDArray[np.float32], seed: int
 ) -> Tape:
-    """Run the block of ``actions`` (n, k) from ``reset(seed=seed)``; inside :func:`recording`.
+    """Record a block of ``actions`` (n, k) after ``reset(seed=seed)``, inside :func:`recording`.
 
     Raises:
-        RuntimeError: If a step asked nothing of the engine, so that there is nothing to repeat.
+        RuntimeError: A step did not call the engine.
     """
     tape = Tape()
     env.reset(seed=seed)
@@ -137,11 +136,11 @@ def record(
 
 
 def replay(env: gym.Env[Any, Any], tape: Tape, seed: int) -> Floor:
-    """Repeat the engine's calls on an environment that was never recorded, timing them alone.
+    """Replay the calls on an environment that was never recorded, and time them alone.
 
     Raises:
-        RuntimeError: If a step ended elsewhere than when it was recorded: then the calls taken down
-            are not all that the step does to the engine, and their time is no floor.
+        RuntimeError: A step ended elsewhere than in the record. Then calls are missing from the
+            record, and its time is no floor.
     """
     player = _Player(env)
     env.reset(seed=seed)
@@ -174,23 +173,23 @@ def replay(env: gym.Env[Any, Any], tape: Tape, seed: int) -> Floor:
 
 
 class _Player:
-    """Calls the engine in the name of an environment's client."""
+    """Calls of the engine for the client of an environment."""
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
-        """Take the number of the client."""
+        """Find the number of the client."""
         unwrapped: Any = env.unwrapped
         self._number = unwrapped.simulation.engine.client.number
         self._constraints: dict[int, int] = {}  # number when recorded -> number here
 
     def bind(self, call: Call) -> Callable[[], Any]:
-        """The call, ready to be made on this client."""
+        """Return the call as a function without arguments."""
         function = getattr(pybullet, call.name)
         if call.name in (STEP, MOTOR):  # in the cheapest way there is
             return partial(function, *call.arguments, self._number)
         return partial(function, *call.arguments, **call.options, physicsClientId=self._number)
 
     def touch(self, calls: Iterable[Call]) -> None:
-        """Take, let go, and turn the friction as recorded."""
+        """Grasp, release, and turn the friction as recorded."""
         for call in calls:
             if call.name == "createConstraint":
                 self._constraints[call.result] = self.bind(call)()
@@ -205,14 +204,14 @@ class _Player:
                 self.bind(call)()
 
     def let_go(self) -> None:
-        """Leave the environment without a grasp that it does not know of."""
+        """Remove all grasps, because the environment does not know them."""
         for number in self._constraints.values():
             pybullet.removeConstraint(number, physicsClientId=self._number)
         self._constraints.clear()
 
 
 def _where(env: gym.Env[Any, Any], fresh: bool = False) -> FloatArray:
-    """Angles of the motors, P and the objects as last reported, or as the engine has them now."""
+    """Return angles of the motors, P and objects as last reported, or as they are now."""
     unwrapped: Any = env.unwrapped
     state = unwrapped.simulation.read() if fresh else unwrapped.state
     return np.concatenate([state.theta, state.platform_position, *state.object_position])

@@ -1,7 +1,7 @@
-r"""A task for policies that shove: where engines differ most, since the puck is about to tip.
+r"""Task of pushing the puck, in which engines differ most, because the puck nearly tips over.
 
-The puck has to be slid to a goal on the table, without vacuum. The cup comes no lower than 12 mm
-above the puck's middle, so a push nearly tips it; and policies also drag it by its upper edge.
+The puck has to slide to a goal on the table, without vacuum. The cup stays at least 12 mm above the
+middle of the puck, so that a push nearly tips it. Policies also drag the puck by its upper edge.
 
     cd benchmarks
     python -m tpm_gym.learning train --algo ppo --engine analytic --env shoving:TPMShoveDense-v0 \
@@ -20,15 +20,15 @@ from tpm_gym.arrays import FloatArray
 from tpm_gym.simulation.state import State
 from tpm_gym.tasks import Entry, PickAndPlace, hanging, rewards, sampling
 
-FARTHEST = 0.100  # m, from start to goal
-FAST = 0.15  # m/s
+FARTHEST = 0.100  # largest distance from start to goal, m
+FAST = 0.15  # speed without a penalty, m/s
 
 
 class Shove(PickAndPlace):
     """Slide the puck to a goal on the table.
 
     Attributes:
-        haste: What it costs a control step, for each m/s, that the puck is faster than FAST.
+        haste: Penalty per control step, for each m/s of the puck's speed beyond FAST.
     """
 
     vacuum = False
@@ -57,11 +57,11 @@ class Shove(PickAndPlace):
         return sampling.first_of(self.sample_each([rng], chosen))
 
     def observed(self) -> tuple[Entry, ...]:
-        """The robot, then the puck, which is never held."""
+        """Return entries of the robot and the puck, without whether the puck is held."""
         return (*self.robot_entries(), *self.object_entries()[:-1])
 
     def shaping(self, state: State) -> dict[str, FloatArray]:
-        """Minus the distance from the lip to the puck's middle, and haste."""
+        """Return minus the distance from the lip to the puck's middle, and the penalty on speed."""
         speed = np.linalg.norm(state.object_velocity[..., 0, :], axis=-1)
         away = rewards.distance(self.lip(state), state.object_position[..., 0, :])
         return {
@@ -71,7 +71,7 @@ class Shove(PickAndPlace):
 
 
 class ShoveGently(Shove):
-    """The same, where haste is dear."""
+    """Variant with a stronger penalty on speed."""
 
     haste = 10.0
 

@@ -1,18 +1,17 @@
-"""Run the environments for a million steps and watch memory, loop gaps and speed.
+"""Run the environments for a million steps, and measure memory, loop gaps and speed.
 
     make soak
     python benchmarks/soak.py --engine mujoco
 
-All ids in turn get visits of one to three episodes each. A visit is drawn from (seed, number of the
-visit) alone: resets with and without seeds, with options, in the middle of an episode and at its
-end; uniform, bang-bang and expert actions; a moment saved, left and gone back to, which must repeat
-itself to the last bit; now and then a picture; now and then the environment is closed and a new one
-made. What raises is taken down and does not end the soak: ``--replay VISIT`` raises it again.
+Ids take turns. Each visit has one to three episodes, which depend on (seed, number of the visit)
+alone. There are resets with and without seeds, with options, in the middle of an episode and at its
+end; uniform, bang-bang and expert actions; states that are saved, left and restored, after which
+the episode must repeat itself to the last bit; some pictures; and some environments are closed and
+made anew. An exception is recorded and does not end the run: ``--replay VISIT`` raises it again.
 
-The memory is compared with that of the first sample after the warm-up, by which every id has been
-opened and has drawn a picture (each new environment draws one, so that all are alike), and caches
-have filled. Before a sample is taken, garbage is collected and what the C library holds free is
-returned, outside the time that counts as speed.
+Memory is compared with the first sample after the warm-up. By then each id has been opened and has
+drawn a picture (each new environment draws one), and caches are full. Before each sample, garbage
+is collected and the C library returns free memory; this time does not count.
 """
 
 from __future__ import annotations
@@ -29,10 +28,10 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import machine
 import numpy as np
-from machine import provenance
+import shared
 from numpy.typing import NDArray
+from shared import provenance
 from soak_report import judge, print_verdict, save_plot
 
 from tpm_gym import ENV_IDS
@@ -43,9 +42,9 @@ Make = Callable[..., Env]
 Policy = Callable[[dict[str, Any]], NDArray[np.float32]]
 
 REOPEN, RENDER, SAVE, WHOLE = 0.02, 0.01, 0.1, 0.5
-"""Shares: of visits that reopen; of episodes that draw another picture, save and restore, are run
-to their end. Of each environment that is closed, Bullet keeps some 20 kB, mostly scratch memory of
-its direct solver, so the memory grows with the number of openings and with nothing else."""
+"""Shares of visits that reopen, and of episodes that draw another picture, save and restore, and
+run to their end. Bullet keeps about 20 kB of each environment that is closed, mostly scratch memory
+of its direct solver. So memory grows with the number of openings only."""
 POLICIES = {"uniform": 0.7, "bang-bang": 0.15, "expert": 0.15}
 PICTURE = {"render_mode": "rgb_array", "width": 32, "height": 24}
 MOST_FAILURES = 100
@@ -53,7 +52,7 @@ MOST_FAILURES = 100
 
 @dataclass
 class Window:
-    """What is added up between two samples; gaps in metres."""
+    """Sums between two samples; gaps in m."""
 
     steps: int = 0
     gap_sum: float = 0.0
@@ -63,12 +62,12 @@ class Window:
 
 
 class Soak:
-    """A pool of environments, one of each id, and what happened to it.
+    """Pool of environments, one of each id, and a record of its events.
 
     Args:
-        seed: Of all visits.
-        engine: Of all environments.
-        make: Makes an environment from an id; ``gymnasium.make``, or a test's.
+        seed: Seed of all visits.
+        engine: Engine of all environments.
+        make: Function that makes an environment from an id.
     """
 
     def __init__(self, seed: int, engine: str = "pybullet", make: Make = gym.make) -> None:
@@ -85,13 +84,13 @@ class Soak:
     # -- visits -------------------------------------------------------------------------------
 
     def visit(self) -> None:
-        """The next visit; what it raises is taken down, and its environment thrown away."""
+        """Run the next visit; after an exception, record it and close the environment."""
         number, self.visits = self.visits, self.visits + 1
         env_id = ENV_IDS[number % len(ENV_IDS)]
         try:
             self.run_visit(number)
         except Exception as error:
-            # An endurance test outlives whatever happens, and fails at the end.
+            # The run goes on after any exception, and fails at its end.
             self._fail(env_id, number, error)
             env = self._pool.pop(env_id, None)
             with contextlib.suppress(Exception):
@@ -99,7 +98,7 @@ class Soak:
                     env.close()
 
     def run_visit(self, number: int) -> None:
-        """Visit ``number``: a function of it and the seed alone."""
+        """Run a visit, which depends on its number and the seed alone."""
         rng = np.random.default_rng([self.seed, number])
         self._episode = self._step = 0
         env_id = ENV_IDS[number % len(ENV_IDS)]
@@ -120,7 +119,7 @@ class Soak:
     def _run_episode(
         self, env: Env, rng: np.random.Generator, *, first: bool, picture: bool
     ) -> None:
-        """One reset and the steps after it."""
+        """Run one reset and the steps after it."""
         observation = self._reset(env, rng, first)
         policy = _policy(env, rng, observation)
         length = 10_000 if rng.random() < WHOLE else int(rng.integers(1, 50))
@@ -134,13 +133,13 @@ class Soak:
                     break
                 inner: Any = env.unwrapped
                 observation = inner.restore_state(inner.save_state())
-                policy = _policy(env, rng, observation)  # the expert plans anew
+                policy = _policy(env, rng, observation)  # the expert needs a new plan
             observation, _, terminated, truncated, _ = self._advance(env, policy(observation))
             if terminated or truncated:
                 break
 
     def _reset(self, env: Env, rng: np.random.Generator, first: bool) -> dict[str, Any]:
-        """With a seed (always at the start of a visit), without, or with options."""
+        """Reset with a seed (always at the start of a visit), without, or with options."""
         kind = "seeded" if first else str(rng.choice(["seeded", "plain", "options"]))
         self.events[f"resets {kind}"] += 1
         seed, options = None, None
@@ -153,7 +152,7 @@ class Soak:
         return observation
 
     def _advance(self, env: Env, action: NDArray[np.float32]) -> tuple[Any, ...]:
-        """One step, counted even if it raises."""
+        """Take one step, which counts even if it raises."""
         self.steps += 1
         self.window.steps += 1
         result = env.step(action)
@@ -169,16 +168,16 @@ class Soak:
         return result
 
     def _render(self, env: Env) -> None:
-        """Draw a picture."""
+        """Draw a picture and check its size."""
         picture: Any = env.render()
         if picture is None or picture.shape != (PICTURE["height"], PICTURE["width"], 3):
             raise RuntimeError("render() gave no picture of the size asked for")
         self.events["pictures"] += 1
 
     def _check_restore(self, env: Env, rng: np.random.Generator) -> bool:
-        """Save, go on, go back, go on again in the same way; whether that ended the episode.
+        """Save, step, restore, repeat the steps; return whether they ended the episode.
 
-        The steps are the unwrapped environment's, whose episode the time limit does not end.
+        The steps are taken in the unwrapped environment, which has no time limit.
         """
         inner: Any = env.unwrapped
         actions = _uniform(env, rng, 5)
@@ -190,7 +189,7 @@ class Soak:
             for action in actions:
                 observation, _, _, ended, _ = self._advance(inner, action)
                 seen.append(np.concatenate([observation[name] for name in sorted(observation)]))
-                if ended:  # by a change of mode: there are no steps after that
+                if ended:  # a change of mode ends the episode
                     break
             ways.append(seen)
             if len(ways) == 1:
@@ -201,7 +200,7 @@ class Soak:
         return bool(ended)
 
     def _fail(self, env_id: str, number: int, error: Exception) -> None:
-        """Take down an exception with all that is needed to see it again."""
+        """Record an exception with all that its replay needs."""
         last = traceback.extract_tb(error.__traceback__)[-1]
         self.failures.append(
             {
@@ -220,15 +219,15 @@ class Soak:
     # -- samples ------------------------------------------------------------------------------
 
     def sample(self) -> dict[str, Any]:
-        """What the last window gave, and the memory that the process has in use."""
+        """Return the results of the last window, and the memory in use."""
         window, seconds = self.window, time.perf_counter() - self.window.begun
-        machine.give_back_free_memory()
+        shared.give_back_free_memory()
         result = {
             "steps": self.steps,
             "visits": self.visits,
             "all_opened": len(self.opened) == len(ENV_IDS),
-            "memory_mb": machine.memory()[0],
-            "open_files": machine.open_files(),
+            "memory_mb": shared.memory()[0],
+            "open_files": shared.open_files(),
             "closure_mean": window.gap_sum / window.gaps if window.gaps else None,
             "closure_max": window.gap_max if window.gaps else None,
             "steps_per_second": window.steps / seconds,
@@ -237,7 +236,7 @@ class Soak:
         return result
 
     def close(self) -> None:
-        """Close all that is open."""
+        """Close all environments."""
         while self._pool:
             _, env = self._pool.popitem()
             with contextlib.suppress(Exception):
@@ -245,13 +244,13 @@ class Soak:
 
 
 def _uniform(env: Env, rng: np.random.Generator, count: int) -> NDArray[np.float32]:
-    """(count, n) uniform actions."""
+    """Return uniform actions (count, n)."""
     shape = env.action_space.shape or (0,)
     return rng.uniform(-1.0, 1.0, (count, *shape)).astype(np.float32)
 
 
 def _policy(env: Env, rng: np.random.Generator, observation: dict[str, Any]) -> Policy:
-    """What acts in an episode."""
+    """Return the policy of an episode."""
     kind = str(rng.choice(list(POLICIES), p=list(POLICIES.values())))
     if kind == "expert":
         expert = Expert(env)
@@ -285,7 +284,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def main(arguments: Sequence[str] | None = None, make: Make = gym.make) -> int:
-    """Run the soak; the exit status is 0 only if it was finished and nothing was found."""
+    """Run the soak; return the exit status, 0 if the run was finished and passed."""
     options = parse(arguments)
     words = sys.argv if arguments is None else ["benchmarks/soak.py", *arguments]
     soak = Soak(options.seed, options.engine, make)
@@ -294,14 +293,14 @@ def main(arguments: Sequence[str] | None = None, make: Make = gym.make) -> int:
         print(f"visit {options.replay} of seed {options.seed} raised nothing")
         soak.close()
         return 0
-    content: dict[str, Any] = machine.describe(words) | {
+    content: dict[str, Any] = shared.describe(words) | {
         "seed": options.seed,
         "engine": options.engine,
         "steps": options.steps,
         "warm_up": options.warm_up,
         "limit_mb": options.limit_mb,
-        "memory_kind": machine.memory()[1],
-        "memory_before_mb": machine.memory()[0],
+        "memory_kind": shared.memory()[1],
+        "memory_before_mb": shared.memory()[0],
         "finished": False,
         "samples": [],
         "failures": soak.failures,
@@ -318,7 +317,7 @@ def main(arguments: Sequence[str] | None = None, make: Make = gym.make) -> int:
 
 
 def _run(soak: Soak, options: argparse.Namespace, content: dict[str, Any]) -> None:
-    """Visit until all steps are done, or too much has failed."""
+    """Run visits until all steps are done, or too many have failed."""
     due = options.every
     while soak.steps < options.steps and len(soak.failures) < MOST_FAILURES:
         soak.visit()
@@ -331,7 +330,7 @@ def _run(soak: Soak, options: argparse.Namespace, content: dict[str, Any]) -> No
 
 
 def _progress(sample: dict[str, Any]) -> None:
-    """One line a sample."""
+    """Print a sample."""
     gap = sample["closure_max"]
     print(
         f"{sample['steps']:>9} steps, {sample['memory_mb']:.1f} MB, largest gap "
@@ -342,7 +341,7 @@ def _progress(sample: dict[str, Any]) -> None:
 
 
 def _write(options: argparse.Namespace, content: dict[str, Any], soak: Soak) -> None:
-    """Write all there is so far, so that an interrupted soak keeps its samples."""
+    """Write the results so far, so that an interrupted run keeps its samples."""
     content["events"] = dict(sorted(soak.events.items()))
     if options.json:
         provenance.write_json(options.json, content)

@@ -1,4 +1,4 @@
-"""The verdict and the figure of soak.py."""
+"""Verdict and figure of soak.py."""
 
 from __future__ import annotations
 
@@ -6,24 +6,24 @@ import math
 from pathlib import Path
 from typing import Any
 
-import machine
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from shared import processor_line
 
 from tpm_gym.learning import figure_style as style
 
 __all__ = ["judge", "print_verdict", "save_plot"]
 
 SIGMAS = 3.0
-"""A slope counts as one beyond this many standard errors ..."""
+"""A drift has a slope of more than this number of standard errors, ..."""
 NEGLIGIBLE = 0.01
-"""... and if it amounts to more than this share of the mean over the soak."""
+"""... and changes the mean by more than this share over the run."""
 _MOST_SHOWN = 20  # failures printed one by one
 
 
 def settled(content: dict[str, Any]) -> list[dict[str, Any]]:
-    """The samples after the warm-up; the first is the baseline."""
+    """Return the samples after the warm-up; the first one is the baseline."""
     return [
         sample
         for sample in content["samples"]
@@ -32,7 +32,7 @@ def settled(content: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def judge(content: dict[str, Any]) -> dict[str, Any]:
-    """What the samples say; entries that cannot be told are None, and do not pass."""
+    """Return the verdict on the samples; entries with too few samples are None, and do not pass."""
     samples = settled(content)
     memory, drift = _memory(samples), _drift(samples)
     within = memory is not None and memory["growth_mb"] <= content["limit_mb"]
@@ -49,7 +49,7 @@ def judge(content: dict[str, Any]) -> dict[str, Any]:
 
 
 def _memory(samples: list[dict[str, Any]]) -> dict[str, Any] | None:
-    """Growth from the baseline to the end."""
+    """Return the growth of memory from the baseline to the end."""
     if len(samples) < 2:
         return None
     values = [sample["memory_mb"] for sample in samples]
@@ -65,7 +65,7 @@ def _memory(samples: list[dict[str, Any]]) -> dict[str, Any] | None:
 
 
 def _drift(samples: list[dict[str, Any]]) -> dict[str, Any] | None:
-    """Slope of the windows' mean closure error, m a million steps."""
+    """Return the slope of the mean closure error of the windows, m per million steps."""
     line = _line(samples, "closure_mean")
     if line is None:
         return None
@@ -82,7 +82,7 @@ def _drift(samples: list[dict[str, Any]]) -> dict[str, Any] | None:
 
 
 def _line(samples: list[dict[str, Any]], name: str) -> dict[str, float] | None:
-    """Least squares through (million steps, value); None with too few samples to know the error."""
+    """Fit a line to (million steps, value) by least squares; None with fewer than 4 samples."""
     kept = [sample for sample in samples if sample[name] is not None]
     if len(kept) < 4:
         return None
@@ -102,7 +102,7 @@ def _line(samples: list[dict[str, Any]], name: str) -> dict[str, float] | None:
 
 
 def _speed(samples: list[dict[str, Any]]) -> dict[str, float] | None:
-    """Median steps a second of the first and the last tenth."""
+    """Return the median steps per second of the first and the last tenth."""
     if not samples:
         return None
     rates = [sample["steps_per_second"] for sample in samples]
@@ -111,9 +111,9 @@ def _speed(samples: list[dict[str, Any]]) -> dict[str, float] | None:
 
 
 def print_verdict(content: dict[str, Any]) -> None:
-    """Print what was done and what was found."""
+    """Print the events and the verdict."""
     verdict, samples = content["verdict"], content["samples"]
-    print(machine.processor_line(content))
+    print(processor_line(content))
     done = samples[-1]["steps"] if samples else 0
     state = "" if content["finished"] else f" of {content['steps']}: NOT FINISHED"
     events = ", ".join(f"{count} {name}" for name, count in content["events"].items())
@@ -133,7 +133,7 @@ def print_verdict(content: dict[str, Any]) -> None:
 
 
 def _memory_line(content: dict[str, Any]) -> str:
-    """Memory at the end against the baseline."""
+    """Return a sentence on memory at the end and at the baseline."""
     memory = content["verdict"]["memory"]
     if memory is None:
         return "memory: not known, too few samples after the warm-up"
@@ -148,7 +148,7 @@ def _memory_line(content: dict[str, Any]) -> str:
 
 
 def _drift_line(drift: dict[str, Any] | None) -> str:
-    """Slope of the closure error."""
+    """Return a sentence on the slope of the closure error."""
     if drift is None:
         return "closure error: drift not known, too few samples after the warm-up"
     return (
@@ -164,12 +164,11 @@ def _drift_line(drift: dict[str, Any] | None) -> str:
 def save_plot(content: dict[str, Any], path: Path) -> None:
     """Draw memory, closure error and speed over the steps."""
     with style.style():
-        path.parent.mkdir(parents=True, exist_ok=True)
         style.save(_figure(content), path)
 
 
 def _figure(content: dict[str, Any]) -> Figure:
-    """Three panels, one above the other."""
+    """Return three panels, one above the other."""
     figure = Figure(figsize=(style.WIDTH, 5.4))
     panels = figure.subplots(3, 1, sharex=True)
     figure.subplots_adjust(left=0.095, right=0.98, top=0.885, bottom=0.075, hspace=0.14)
@@ -207,13 +206,13 @@ def _figure(content: dict[str, Any]) -> Figure:
 
 
 def _warm_until(content: dict[str, Any]) -> float:
-    """Steps at the baseline; what has been done where there is none yet."""
+    """Return the steps at the baseline, or all steps if there is no baseline yet."""
     samples = settled(content) or content["samples"][-1:]
     return float(samples[0]["steps"])
 
 
 def _memory_panel(axes: Axes, content: dict[str, Any], scale: float) -> None:
-    """Memory, and the limit from the baseline on."""
+    """Draw memory, and its limit from the baseline on."""
     samples, memory = content["samples"], content["verdict"]["memory"]
     steps = [sample["steps"] / scale for sample in samples]
     values = [sample["memory_mb"] for sample in samples]
@@ -227,7 +226,7 @@ def _memory_panel(axes: Axes, content: dict[str, Any], scale: float) -> None:
             ends, [limit, limit], color=style.VERMILLION, lw=1.0, ls=(0, (4, 2)),
             label=f"limit, {content['limit_mb']:.0f} MB more",
         )  # fmt: skip
-        # What came before would hide what matters: a few MB.
+        # The axis starts at the baseline: growth of a few MB would not show beside the warm-up.
         kept = [sample["memory_mb"] for sample in settled(content)]
         low, high = min(*kept, base - content["limit_mb"] / 2), max(*kept, limit)
     margin = 0.08 * (high - low) or 1.0
@@ -237,7 +236,7 @@ def _memory_panel(axes: Axes, content: dict[str, Any], scale: float) -> None:
 
 
 def _closure_panel(axes: Axes, content: dict[str, Any], scale: float) -> None:
-    """Mean and largest gap of each window, with the line through the means."""
+    """Draw mean and largest gap of each window, and the line through the means."""
     kept = [sample for sample in content["samples"] if sample["closure_mean"] is not None]
     steps = [sample["steps"] / scale for sample in kept]
     axes.plot(

@@ -1,33 +1,31 @@
-"""The tables and the figure of bench_speed.py."""
+"""Tables and figure of bench_speed.py."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
-import machine
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from shared import processor_line, spread
 
 from tpm_gym.learning import figure_style as style
 
 __all__ = ["TARGETS", "print_report", "save_plot"]
 
 TARGETS = {"ratio_to_baseline": 1.3, "step_over_with_motors": 1.4, "two_over_one": 1.8}
-"""Least steps/s of TPMPickAndPlace-v0 over the baseline's, most time of its env.step over its raw
-physics, least steps/s of two processes over one's."""
+"""Targets of TPMPickAndPlace-v0: least steps/s over the baseline, most time of env.step over its
+raw physics with motors, least steps/s of two processes over one."""
 _OURS = "TPMPickAndPlace-v0"
 
 
 def _spread(values: tuple[float, float, float], digits: int) -> str:
-    """Median and quartiles."""
-    low, middle, high = values
-    return f"{middle:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+    return spread(values, f"{{:.{digits}f}}")
 
 
 def print_report(content: dict[str, Any]) -> None:
     """Print all tables."""
-    print(machine.processor_line(content))
+    print(processor_line(content))
     print(
         f"{content['rounds']} rounds of {content['steps']} steps each, order shuffled; "
         "medians and quartiles; ratios within each round"
@@ -40,7 +38,7 @@ def print_report(content: dict[str, Any]) -> None:
 
 
 def _print_race(content: dict[str, Any]) -> None:
-    """Steps a second, ratios to the baseline, and resets."""
+    """Print steps per second, ratios to the baseline, and resets."""
     baseline = content["baseline"]
     print(f"\n{'environment':<29} {'steps/s with resets':<20} {'over ' + baseline:<26} reset (ms)")
     entries = content["contestants"]
@@ -57,7 +55,7 @@ def _print_race(content: dict[str, Any]) -> None:
 
 
 def _print_floor(entries: dict[str, Any]) -> None:
-    """env.step against the engine's own work."""
+    """Print the time of env.step and of its raw physics."""
     ours = {env_id: entry for env_id, entry in entries.items() if "step_milliseconds" in entry}
     if not ours:
         return
@@ -76,7 +74,7 @@ def _print_floor(entries: dict[str, Any]) -> None:
 
 
 def _print_scaling(scaling: dict[str, Any]) -> None:
-    """One process against two."""
+    """Print the speed of one process and of two."""
     print(
         f"\nscaling, {scaling['env_id']}, {scaling['rounds']} rounds of {scaling['steps']} steps "
         "a process"
@@ -92,7 +90,7 @@ def _print_scaling(scaling: dict[str, Any]) -> None:
 
 
 def _print_verdicts(content: dict[str, Any]) -> None:
-    """Each target and what was measured against it."""
+    """Print each target and its measurement."""
     entry = content["contestants"].get(_OURS, {})
     found = [
         ("ratio_to_baseline", entry.get("ratio_to_baseline"),
@@ -114,14 +112,13 @@ def _print_verdicts(content: dict[str, Any]) -> None:
 
 
 def save_plot(content: dict[str, Any], path: Path) -> None:
-    """Draw steps a second of all contestants as bars with their quartiles."""
+    """Draw steps per second of all contestants as bars with their quartiles."""
     with style.style():
-        path.parent.mkdir(parents=True, exist_ok=True)
         style.save(_figure(content), path)
 
 
 def _figure(content: dict[str, Any]) -> Figure:
-    """Bars, the fastest on top."""
+    """Return the figure, the fastest contestant on top."""
     entries = sorted(
         content["contestants"].items(), key=lambda item: item[1]["steps_per_second"][1]
     )
@@ -143,7 +140,7 @@ def _figure(content: dict[str, Any]) -> Figure:
 
 
 def _bars(axes: Axes, entries: list[tuple[str, Any]], baseline: str) -> None:
-    """One bar an environment, with its quartiles and its ratio to the baseline."""
+    """Draw a bar for each environment, with its quartiles and its ratio to the baseline."""
     right = max(entry["steps_per_second"][2] for _, entry in entries)
     for row, (env_id, entry) in enumerate(entries):
         low, middle, high = entry["steps_per_second"]

@@ -1,7 +1,8 @@
-"""How the steps a second grow with two processes, and with gymnasium's vector environments.
+"""Steps per second of two processes, and of Gymnasium's vector environments.
 
-Two processes hold an environment each and run the same loop: one alone while the other sleeps, or
-both at once from a barrier on. Alternating, so that both cases see the same machine.
+Two processes have an environment each and run the same loop. One runs alone while the other sleeps,
+or both start together at a barrier. Both cases take turns, so that noise of the computer affects
+them alike.
 """
 
 from __future__ import annotations
@@ -14,24 +15,24 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from machine import quartiles
+from shared import quartiles
 
 import tpm_gym  # noqa: F401  (registers the ids, in the processes too)
 
 __all__ = ["measure"]
 
 _WARM_UP = 100  # steps
-_PATIENCE = 120.0  # s until a process that does not answer is given up
+_PATIENCE = 120.0  # longest wait for a process, s
 
 
 def worker(env_id: str, seed: int, pipe: Connection, barrier: Barrier) -> None:
-    """Run as many steps as asked for, alone or from the barrier on, and answer with the seconds.
+    """Run steps on request, alone or from the barrier on, and send the seconds.
 
     Args:
-        env_id: What to run.
-        seed: Of the actions and the first reset.
-        pipe: Receives (steps, together) or None to end; sends seconds.
-        barrier: Of all processes.
+        env_id: Environment.
+        seed: Seed of the actions and the first reset.
+        pipe: Receives (steps, together), or None to end; sends seconds.
+        barrier: Barrier of all processes.
     """
     env = gym.make(env_id)
     env.reset(seed=seed)
@@ -47,7 +48,7 @@ def worker(env_id: str, seed: int, pipe: Connection, barrier: Barrier) -> None:
 
 
 def _run(env: gym.Env[Any, Any], rng: np.random.Generator, steps: int) -> float:
-    """Seconds of ``steps`` random steps with resets where episodes end."""
+    """Measure the seconds of random steps, with a reset at the end of each episode."""
     shape = env.action_space.shape or (0,)
     actions = rng.uniform(-1.0, 1.0, (steps, *shape)).astype(np.float32)
     begun = time.perf_counter()
@@ -62,7 +63,7 @@ class _Pair:
     """Two processes with an environment each."""
 
     def __init__(self, env_id: str) -> None:
-        """Start them and wait until they have warmed up."""
+        """Start both processes and wait until they have warmed up."""
         context = multiprocessing.get_context("spawn")
         barrier = context.Barrier(2)
         self._pipes, self._processes = [], []
@@ -72,25 +73,25 @@ class _Pair:
                 target=worker, args=(env_id, seed, theirs, barrier), daemon=True
             )
             process.start()
-            theirs.close()  # so that a process that died is seen as the end of the pipe
+            theirs.close()  # so that the pipe ends when the process dies
             self._pipes.append(ours)
             self._processes.append(process)
         for pipe in self._pipes:
             _answer(pipe)
 
     def alone(self, which: int, steps: int) -> float:
-        """Steps a second of one process while the other sleeps."""
+        """Measure steps per second of one process while the other sleeps."""
         self._pipes[which].send((steps, False))
         return steps / _answer(self._pipes[which])
 
     def together(self, steps: int) -> float:
-        """Steps a second of both, by the slower one."""
+        """Measure steps per second of both processes, by the slower one."""
         for pipe in self._pipes:
             pipe.send((steps, True))
         return 2 * steps / max(_answer(pipe) for pipe in self._pipes)
 
     def close(self) -> None:
-        """End both."""
+        """End both processes."""
         for pipe, process in zip(self._pipes, self._processes, strict=True):
             if process.is_alive():
                 pipe.send(None)
@@ -100,10 +101,10 @@ class _Pair:
 
 
 def _answer(pipe: Connection) -> float:
-    """What a process sends.
+    """Return the answer of a process.
 
     Raises:
-        RuntimeError: If it sends nothing.
+        RuntimeError: The process does not answer, or has died.
     """
     if not pipe.poll(_PATIENCE):
         raise RuntimeError(f"a process has not answered for {_PATIENCE:.0f} s")
@@ -117,9 +118,9 @@ def measure(env_id: str, rounds: int, steps: int) -> dict[str, Any]:
     """Run the rounds and return quartiles of rates and ratios.
 
     Args:
-        env_id: What to run.
-        rounds: Of one process, two processes, and both kinds of vector environment.
-        steps: Of each process in a round.
+        env_id: Environment.
+        rounds: Rounds of one process, two processes, and both kinds of vector environment.
+        steps: Steps of each process in a round.
     """
     alone, together = _processes(env_id, rounds, steps)
     synchronous, asynchronous = _vectors(env_id, rounds, steps)
@@ -137,7 +138,7 @@ def measure(env_id: str, rounds: int, steps: int) -> dict[str, Any]:
 
 
 def _processes(env_id: str, rounds: int, steps: int) -> tuple[list[float], list[float]]:
-    """Steps a second of one process and of two, a round each; the order alternates."""
+    """Measure steps per second of one process and of two in each round, in changing order."""
     alone, together = [], []
     pair = _Pair(env_id)
     try:
@@ -153,7 +154,7 @@ def _processes(env_id: str, rounds: int, steps: int) -> tuple[list[float], list[
 
 
 def _vectors(env_id: str, rounds: int, steps: int) -> tuple[list[float], list[float]]:
-    """Steps a second of SyncVectorEnv and AsyncVectorEnv with two environments."""
+    """Measure steps per second of SyncVectorEnv and AsyncVectorEnv with two environments."""
     both = [
         gym.make_vec(env_id, num_envs=2, vectorization_mode="sync"),
         gym.make_vec(

@@ -1,10 +1,8 @@
-"""Other ways to cut the same mechanism into a tree, as data: what the default was chosen against.
+"""Other spanning trees of the same mechanism, for comparison with the default.
 
-All variants are the same machine, link for link: only the spanning tree and the joints at the ends
-of the rods differ. Each comes with the closed-form angles at which its loops close.
-
-The links' solids are those of :func:`tpm_gym.mechanism.tree.build`, so lengths, masses and inertias
-stay in one place.
+All variants have the same links. Only the spanning tree and the joints at the ends of the rods
+differ. Each variant has closed-form angles at which its loops close. Solids come from
+:func:`tpm_gym.mechanism.tree.build`, so that lengths, masses and inertias are defined once.
 """
 
 from __future__ import annotations
@@ -29,13 +27,13 @@ SIDES = (("a", 1), ("b", -1))
 
 @dataclass(frozen=True)
 class Variant:
-    """One way to cut the loops.
+    """Mechanism with other cuts of its loops.
 
     Attributes:
-        name: Short, for tables.
+        name: Name in tables.
         mechanism: Links and closures.
-        angles: theta (3,) rad -> joint name -> rad at which all loops close.
-        about: What differs from the default, in a few words.
+        angles: Function of theta (3,) rad that returns the angle of each joint, rad.
+        about: Difference from the default.
     """
 
     name: str
@@ -46,20 +44,20 @@ class Variant:
 
 @dataclass(frozen=True)
 class OneBody(Mechanism):
-    """A mechanism whose spanning tree is loaded as one multibody."""
+    """Mechanism whose spanning tree is loaded as one multibody."""
 
     def legs(self) -> tuple[Mechanism, ...]:
-        """The whole tree."""
+        """Return the whole tree."""
         return (self,)
 
 
 def one_body(mechanism: Mechanism) -> OneBody:
-    """The same mechanism, loaded as one multibody."""
+    """Return the same mechanism, loaded as one multibody."""
     return OneBody(**{f.name: getattr(mechanism, f.name) for f in fields(mechanism) if f.init})
 
 
 def all_variants() -> tuple[Variant, ...]:
-    """The default first."""
+    """Return all variants, the default first."""
     return (
         Variant("three legs", build(), joint_angles, "the default: one multibody a leg"),
         Variant("one body", one_body(build()), joint_angles, "the tree as one multibody"),
@@ -71,7 +69,7 @@ def all_variants() -> tuple[Variant, ...]:
 
 
 def spherical_rods() -> Variant:
-    """Rods 4 with a ball at the arm too: they are free to spin about themselves."""
+    """Return a variant with balls at both ends of rods 4, which can then spin about themselves."""
     mechanism = build()
     links: list[Link] = []
     for link in mechanism.links:
@@ -80,7 +78,7 @@ def spherical_rods() -> Variant:
             links.append(link)
             continue
         suffix = link.name[-1]
-        # The roll needs a link of its own: the centre of the ball, like the cross before it.
+        # The roll needs a link of its own: the centre of the ball, like the cross that it replaces.
         ball = replace(mechanism.link(f"cross_4{suffix}"), name=f"ball_4{suffix}", joint=joint)
         roll = Joint(f"S{suffix}_roll", "continuous", ball.name, ORIGIN, (0.0, 1.0, 0.0))
         links += [ball, replace(link, joint=roll)]
@@ -93,7 +91,7 @@ def spherical_rods() -> Variant:
 
 
 def rods_4_cut_at_arm() -> Variant:
-    """Rods 4 hang on link 3' by universal joints; the balls are at the arm."""
+    """Return a variant whose rods 4 hang on link 3' by universal joints, with balls at the arm."""
     mechanism = build()
     g = PAPER
     links, closures = _without(mechanism, "cross_4", "rod_4"), list(mechanism.closures[2:])
@@ -120,11 +118,11 @@ def rods_4_cut_at_arm() -> Variant:
 
 
 def spherical_parallelogram() -> Variant:
-    """Rods 11 of universal joints and balls, as in a Delta robot: no end links that turn.
+    """Return a variant whose rods 11 have universal joints and balls, as in a Delta robot.
 
-    The end links become parts of arm 12 and of the platform. On the platform the bar is moved to
-    the middle: at its own place it would give the platform a product of inertia, and then the
-    engine turns the frame in which it is given the closures' pivots.
+    The end links become parts of arm 12 and of the platform. On the platform the bar moves to the
+    middle. At its own place it would give the platform a product of inertia, and the engine would
+    turn the frame of the closures' pivots.
     """
     mechanism = build()
     g = PAPER
@@ -158,7 +156,7 @@ def spherical_parallelogram() -> Variant:
 
 
 def rods_11_cut_at_arm() -> Variant:
-    """Rods 11 hang on end link 10 by revolutes; the balls are at end link 9."""
+    """Return a variant whose rods 11 hang on end link 10 by revolutes, with balls at end link 9."""
     mechanism = build()
     g = PAPER
     links, closures = _without(mechanism, "rod_11"), list(mechanism.closures[:2])
@@ -192,19 +190,19 @@ def _moved(solid: Solid, by: Vector) -> Solid:
 
 
 def _backwards(rod: Link, length: Vector) -> Link:
-    """A rod whose origin is at its other end, so that it points backwards from its joint."""
+    """Return a rod with its origin at the other end, so that it points backwards from its joint."""
     x, y, z = length
     return replace(rod, solids=tuple(_moved(solid, (-x, -y, -z)) for solid in rod.solids))
 
 
 def _hung(link: Link, parent: str, origin: Vector) -> Link:
-    """A link whose joint sits elsewhere."""
+    """Return a link with its joint elsewhere."""
     assert link.joint is not None
     return replace(link, joint=replace(link.joint, parent=parent, origin=origin))
 
 
 def _welded(link: Link, mechanism: Mechanism, bar: tuple[str, Vector] | None) -> Link:
-    """A link with the solids of another one fixed to it."""
+    """Return a link with the solids of another link fixed to it."""
     if bar is None:
         return link
     name, at = bar
@@ -214,7 +212,7 @@ def _welded(link: Link, mechanism: Mechanism, bar: tuple[str, Vector] | None) ->
 
 
 def gaps(mechanism: Mechanism, angles: Mapping[str, ArrayLike]) -> FloatArray:
-    """Opening of every closure, (closures, ...) m."""
+    """Return the gap of each closure, (closures, ...) m."""
     places = mechanism.places(angles)
     return np.stack(
         [

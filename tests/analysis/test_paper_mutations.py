@@ -1,9 +1,10 @@
 """Each row of docs/paper.md names tests that fail when what it says is computed wrongly.
 
-MUTATIONS breaks one line of the package at a time, in memory, and the tests of its row have to see
-it. That takes minutes, so it is a slow test; the fast ones see to it that the table is complete.
+Each of MUTATIONS breaks one expression of the package in memory, and the tests of its row must fail
+then. That takes minutes, so it is a slow test. The fast tests check that the table is complete.
 """
 
+import ast
 import json
 import os
 import re
@@ -12,19 +13,20 @@ import sys
 from typing import NamedTuple
 
 import pytest
+from mutated import mutate
 from paths import ROOT
 
 TEXT = (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
 
 
 class Mutation(NamedTuple):
-    """One wrong line.
+    """One wrong expression.
 
     Attributes:
-        row: How the first cell of its row begins.
-        module: In the package.
-        right: What stands there, once.
-        wrong: What is put in its place.
+        row: Begin of the first cell of a row of the page.
+        module: Module of the package.
+        right: Expression that stands there once; _1, _2, ... stand for any expression.
+        wrong: Expression in its place.
     """
 
     row: str
@@ -39,63 +41,69 @@ POSITION, DELTA = "kinematics.position", "analysis.delta"
 
 MUTATIONS = [
     Mutation("(1)", POC, "reduce(POCSet.__or__, sets)", "reduce(POCSet.__and__, sets)"),
-    Mutation("(1)", POC, "for unit in self.units])", "for unit in self.units[1:]])"),
+    Mutation("(1)", POC, "[_1 for unit in self.units]", "[_1 for unit in self.units[1:]]"),
     Mutation("(2)", POC, "reduce(POCSet.__and__, sets)", "reduce(POCSet.__or__, sets)"),
     Mutation("(3a)", POC, "sum(freedoms) - sum(equations)", "sum(freedoms) - equations[0]"),
     Mutation("(3a)", POC, "self.loops[:loops]", "self.loops[:1]"),
     Mutation("(3b)", POC, "(parallel(previous) | added).dim", "(previous[-1] | added).dim"),
     Mutation("(3b)", POC, "(parallel(previous) | added).dim", "(parallel(previous) & added).dim"),
     Mutation(
-        "(4), first", TOPOLOGY, "for chain in (first, second)]", "for chain in (second, third)]"
+        "(4), first",
+        TOPOLOGY,
+        "[_1 for chain in (first, second)]",
+        "[_1 for chain in (second, third)]",
     ),
     Mutation("(4), second", POC, "freedoms - actuated - equations", "freedoms - equations"),
-    Mutation("(5)", POC, "best = min(", "best = max("),
+    Mutation("(5)", POC, "min(_1, key=_2, default=_3)", "max(_1, key=_2, default=_3)"),
     Mutation("(5)", POC, "sum(abs(d) for d in run) / 2", "sum(abs(d) for d in run)"),
-    Mutation("(6)", EQUATIONS, "y1, z1 = g.l1 + cos[0]", "y1, z1 = g.l1 - cos[0]"),
+    Mutation("(6)", EQUATIONS, "g.l1 + cos[0]", "g.l1 - cos[0]"),
     Mutation("(7)", EQUATIONS, "cos[1] + (2.0 * g.l5 - g.l1)", "cos[1] + (g.l5 - g.l1)"),
-    Mutation("(8a)", EQUATIONS, "along = 0.5 - ns.over(", "along = 0.5 + ns.over("),
+    Mutation("(8a)", EQUATIONS, "0.5 - _1", "0.5 + _1"),
     Mutation("(8a)", EQUATIONS, "along * dx - across * dz", "along * dx + across * dz"),
     Mutation("(8b)", EQUATIONS, "z1 + along * dz + across * dx", "z1 + along * dz - across * dx"),
     Mutation("(9)", EQUATIONS, "cos[2] + (g.l1 - 2.0 * g.l2)", "cos[2] + (g.l1 - g.l2)"),
     Mutation("(10)", EQUATIONS, "z_c - (sin[2] - g.l6)", "z_c - sin[2]"),
-    Mutation("(10)", EQUATIONS, "l7 * sin_beta, z_c + 2.0 * g.l6", "l7 * sin_beta, z_c + g.l6"),
-    Mutation("(11)", EQUATIONS, "l7 * sin_beta, z_c + 2.0 * g.l6", "l7 * sin_beta, z_c + g.l6"),
+    Mutation("(10)", EQUATIONS, "z_c + 2.0 * g.l6", "z_c + g.l6"),
+    Mutation("(11)", EQUATIONS, "z_c + 2.0 * g.l6", "z_c + g.l6"),
     Mutation("(11)", EQUATIONS, "x_c + l7 * cos_beta + g.l2", "x_c + l7 * cos_beta + 2 * g.l2"),
-    Mutation("(11)", POSITION, "position[..., branch.index, :]", "position[..., 0, :]"),
-    Mutation("(12)", EQUATIONS, "cos_beta, z - 2.0 * g.l6", "cos_beta, z - g.l6"),
-    Mutation("(13)", EQUATIONS, "-l1, x_c + l1 - 2.0 * g.l5,", "-l1, x_c + l1 - g.l5,"),
-    Mutation("(13)", EQUATIONS, "fold(a1, z_c, x_c, g, ns)", "fold(a1, z_c, 0.0, g, ns)"),
-    Mutation("(14)", EQUATIONS, "fold(a3, b3, y, g, ns)", "fold(a3, b3, x, g, ns)"),
-    Mutation("(15)", EQUATIONS, "x + g.l2 - l1, z - g.l6", "x + g.l2 - l1, z - 2.0 * g.l6"),
-    Mutation("(16)", EQUATIONS, "r1x * r2z - r1z * r2x,", "r1x * r2z,"),
-    Mutation("(16)", JACOBIAN, "[cos * r1x, sin * r1x,", "[cos * r1x, cos * r1x,"),
+    Mutation("(11)", POSITION, "_1.position[..., branch.index, :]", "_1.position[..., 0, :]"),
+    Mutation("(12)", EQUATIONS, "z - 2.0 * g.l6", "z - g.l6"),
+    Mutation("(13)", EQUATIONS, "x_c + l1 - 2.0 * g.l5", "x_c + l1 - g.l5"),
+    Mutation("(13)", EQUATIONS, "_1(a1, z_c, x_c, *_2)", "_1(a1, z_c, 0.0, *_2)"),
+    Mutation("(14)", EQUATIONS, "_1(a3, b3, y, *_2)", "_1(a3, b3, x, *_2)"),
+    Mutation("(15)", EQUATIONS, "z - g.l6", "z - 2.0 * g.l6"),
+    Mutation("(16)", EQUATIONS, "r1x * r2z - r1z * r2x", "r1x * r2z"),
+    Mutation("(16)", JACOBIAN, "sin * r1x", "cos * r1x"),
     Mutation("(17)", EQUATIONS, "r2z * cos[1] - r2x * sin[1]", "r2z * cos[1] - r1x * sin[1]"),
-    Mutation("(17)", JACOBIAN, "[f.cos_beta * f.leg1,", "[f.leg1,"),
+    Mutation("(17)", JACOBIAN, "f.cos_beta * f.leg1", "f.leg1"),
     # What the text claims
     Mutation("M_HSOC1", TOPOLOGY, "parallel([hsoc_1, hsoc_2])", "hsoc_1"),
-    Mutation("xi_L1", POC, "chains[: j + 1] if j == 1", "chains[:j] if j == 1"),
+    Mutation("xi_L1", POC, "chains[: j + 1]", "chains[:j]"),
     Mutation("xi_L2", POC, "(parallel(previous) | added).dim", "6"),
-    Mutation("v = m - n + 1", POC, "for j in range(1, len(order))", "for j in (1,)"),
+    Mutation("v = m - n + 1", POC, "range(1, len(order))", "(1,)"),
     Mutation("Delta_1", POC, "freedoms - actuated - equations", "freedoms - equations"),
-    Mutation("3 degrees", TOPOLOGY, "free = right[rank:].T", "free = right[rank + 1 :].T"),
-    Mutation("link 3'", EQUATIONS, "dx, dz = cos[1]", "dx, dz = 1e-3 * cos[2] + cos[1]"),
-    Mutation('"complete', EQUATIONS, "cos_beta * turn3)", "0 * turn3)"),
-    Mutation("y_B1", EQUATIONS, "meet = across2 >=", "meet = across2 - 1e9 * (abs(y1) < 1e-9) >="),
+    Mutation("3 degrees", TOPOLOGY, "right[rank:]", "right[rank + 1 :]"),
+    Mutation(
+        "link 3'",
+        EQUATIONS,
+        "cos[1] + (2.0 * g.l5 - _1)",
+        "cos[1] + 1e-3 * cos[2] + (2.0 * g.l5 - _1)",
+    ),
+    Mutation('"complete', EQUATIONS, "cos_beta * turn3", "0 * turn3"),
+    Mutation("y_B1", EQUATIONS, "across2 >= _1", "across2 - 1e9 * (abs(y1) < 1e-9) >= _1"),
     Mutation("16 inverse", POSITION, "4 * leg + (bend + 1)", "4 * leg"),
+    Mutation("twice as", DELTA, "direction - fold", "direction"),
     Mutation(
-        "twice as", DELTA, "direction - fold, direction + fold", "direction, direction + fold"
+        "the singularities", DELTA, "_1 * across - np.sin(q) * arm", "_1 * across + np.sin(q) * arm"
     ),
-    Mutation(
-        "the singularities", DELTA, "* across - np.sin(q) * arm", "* across + np.sin(q) * arm"
-    ),
-    Mutation("beta = pi/2", EQUATIONS, "        found.sin_beta,\n", "        found.cos_beta,\n"),
-    Mutation("the plane", EQUATIONS, "SINGULAR = 1e-6", "SINGULAR = 1e-12"),
+    Mutation("beta = pi/2", EQUATIONS, "found.sin_beta", "found.cos_beta"),
+    Mutation("the plane", EQUATIONS, "1e-6", "1e-12"),
     Mutation("Eqs. (16)", POC, "np.stack([normal, np.cross(rod, normal)])", "np.eye(3)[1:]"),
 ]
 
 
 def rows() -> dict[str, list[str]]:
-    """First cells of the rows of the page that name tests -> those tests, as pytest names them."""
+    """Return the tests that each row of the page names, by the first cell of the row."""
     found = {}
     for line in TEXT.splitlines():
         named = re.findall(r"`(test_\w+\.py)::(\w+)`", line)
@@ -121,7 +129,9 @@ def test_every_row_has_a_mutation_and_every_mutation_a_row() -> None:
 def test_what_is_replaced_stands_there_once(mutation: Mutation) -> None:
     path = ROOT / "src" / "tpm_gym" / f"{mutation.module.replace('.', '/')}.py"
     source = path.read_text(encoding="utf-8")
-    assert source.count(mutation.right) == 1
+    broken, count = mutate(source, mutation.right, mutation.wrong)
+    assert count == 1
+    assert ast.dump(broken) != ast.dump(ast.parse(source))
 
 
 @pytest.mark.slow

@@ -34,9 +34,7 @@ def test_what_is_not_installed_is_named_with_the_extra_that_installs_it() -> Non
     )
 
 
-@pytest.mark.parametrize(
-    "command", ["train", "resume", "evaluate", "export", "study", "report collect", "report write"]
-)
+@pytest.mark.parametrize("command", ["train", "resume", "evaluate", "export"])
 def test_every_command_has_its_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as caught:
         main([*command.split(), "--help"])

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 from episodes import EVERYTHING, OF_SERVOS, expert_episode, fingerprint, random_episode
-from machine import memory
+from shared import memory
 
 from tpm_gym import kinematics
 from tpm_gym.arrays import FloatArray

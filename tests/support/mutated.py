@@ -1,21 +1,75 @@
-"""A pytest plugin that breaks one line of the package in memory; see test_paper_mutations.py.
+"""A pytest plugin that breaks one expression of the package in memory.
 
-MUTATION in the environment is JSON: [module, right, wrong]. The package is imported whole first,
-since a machine that is checked as it is imported would not come up with broken kinematics.
+It serves test_paper_mutations.py. MUTATION in the environment is JSON: [module, right, wrong]. The
+package is imported whole first, because machines check their kinematics when they are imported.
 """
 
+import ast
 import importlib
 import inspect
 import json
 import os
+import re
 from types import FunctionType
 from typing import Any
 
 import tpm_gym  # noqa: F401
 
 
+def mutate(source: str, right: str, wrong: str) -> tuple[ast.Module, int]:
+    """Replace an expression wherever it stands; return the module and the number of replacements.
+
+    Expressions are compared by their syntax trees, so that neither layout nor comments matter. In
+    ``right``, the names _1, _2, ... stand for any expression, and *_1, *_2, ... for any further
+    arguments. In ``wrong`` they stand for the same.
+    """
+    pattern, count = ast.parse(right, mode="eval").body, 0
+
+    class Replace(ast.NodeTransformer):
+        def generic_visit(self, node: ast.AST) -> ast.AST:
+            nonlocal count
+            found: dict[str, Any] = {}
+            if not _equal(pattern, node, found):
+                return super().generic_visit(node)
+            count += 1
+            new = _Fill(found).visit(ast.parse(wrong, mode="eval").body)
+            return ast.copy_location(new, node)
+
+    return ast.fix_missing_locations(Replace().visit(ast.parse(source))), count
+
+
+class _Fill(ast.NodeTransformer):
+    def __init__(self, found: dict[str, Any]) -> None:
+        self._found = found
+
+    def visit_Name(self, node: ast.Name) -> ast.AST:
+        return self._found.get(node.id, node)
+
+    def visit_Starred(self, node: ast.Starred) -> Any:
+        return self._found[ast.unparse(node)]
+
+
+def _equal(pattern: Any, node: Any, found: dict[str, Any]) -> bool:
+    if isinstance(pattern, ast.Name) and re.fullmatch(r"_\d", pattern.id):
+        found[pattern.id] = node
+        return isinstance(node, ast.expr)
+    if isinstance(pattern, list):
+        if pattern and isinstance(pattern[-1], ast.Starred):
+            *pattern, rest = pattern
+            found[ast.unparse(rest)] = node[len(pattern) :]
+            node = node[: len(pattern)]
+        pairs = zip(pattern, node, strict=False)
+        return len(pattern) == len(node) and all(_equal(*pair, found) for pair in pairs)
+    if type(pattern) is not type(node):
+        return False
+    if not isinstance(pattern, ast.AST):
+        return bool(pattern == node)
+    fields = (name for name in pattern._fields if name not in ("ctx", "kind"))
+    return all(_equal(getattr(pattern, f), getattr(node, f), found) for f in fields)
+
+
 def _functions(value: Any) -> dict[str, FunctionType]:
-    """A function, or those that a class defines, its properties among them."""
+    """Return a function, or the functions and properties that a class defines."""
     found = {"": value} if inspect.isfunction(value) else {}
     if inspect.isclass(value):
         for name, member in vars(value).items():
@@ -25,13 +79,13 @@ def _functions(value: Any) -> dict[str, FunctionType]:
     return found
 
 
-def mutate(name: str, right: str, wrong: str) -> None:
-    """Give functions of a module, whoever holds them, the code that they have with another line."""
+def install(name: str, right: str, wrong: str) -> None:
+    """Give the functions of a module their mutated code, so that whoever holds them has it."""
     module = importlib.import_module(name)
-    source = inspect.getsource(module)
-    assert source.count(right) == 1
+    tree, count = mutate(inspect.getsource(module), right, wrong)
+    assert count == 1
     broken = {**vars(module)}
-    exec(compile(source.replace(right, wrong), f"mutated {name}", "exec"), broken)
+    exec(compile(tree, f"mutated {name}", "exec"), broken)
     for key, new in broken.items():
         if getattr(new, "__module__", name) != name:
             continue
@@ -42,4 +96,5 @@ def mutate(name: str, right: str, wrong: str) -> None:
             setattr(module, key, new)
 
 
-mutate(*json.loads(os.environ["MUTATION"]))
+if "MUTATION" in os.environ:
+    install(*json.loads(os.environ["MUTATION"]))

@@ -1,1 +1,1 @@
-"""Singularities, aspects, topology, decoupling, a Delta beside ours; no environment imports it."""
+"""Singularities, aspects, topology, decoupling, and a Delta; environments do not need this."""

@@ -1,13 +1,12 @@
 """The reachable set of a working mode, and its aspects: maximal regions free of singularities.
 
-Between two points of one aspect (Wenger and Chablat) the platform can go without meeting a
-singularity; between two aspects of one working mode it cannot. All sets are in Cartesian space, in
-the paper frame, in metres, and held as cells of a grid whose cells have faces on the singular
-planes y = 0 and |y| = l7, so that only curved surfaces are cut by cells.
+The platform can move between two points of one aspect (Wenger and Chablat) without a singularity,
+and not between two aspects of one working mode. All sets are in Cartesian space, in the paper
+frame, in metres. A set is a grid of cells. The singular planes y = 0 and |y| = l7 are faces of
+cells, so that only curved surfaces run through cells.
 
-Singularities are those of all factors of :mod:`tpm_gym.analysis.singularity`, the constraint's
-among them. What the motors' stops and the links' own bodies forbid is left out only where
-``limits`` ask for it, see :mod:`tpm_gym.analysis.limits`.
+All factors of :mod:`tpm_gym.analysis.singularity` count, the elevation included. Stops of motors
+and collisions of links count only if ``limits`` say so, see :mod:`tpm_gym.analysis.limits`.
 """
 
 import math
@@ -26,19 +25,19 @@ from tpm_gym.kinematics.workspace import Region, conditioning_at
 Shape = tuple[int, int, int]
 
 DEFAULT_SHAPE: Shape = (64, 16, 96)
-"""Cells along x, y, z; for the paper's lengths about 27 x 6 x 24 mm each."""
+"""Numbers of cells along x, y, z; for the paper's lengths, cells of about 27 x 6 x 24 mm."""
 _BITS = (1, 2, 4, 8)
 
 
 @dataclass(frozen=True)
 class Cells:
-    """A set of points, as the cells of a grid whose centres belong to it.
+    """Set of points, as the cells of a grid whose centres belong to the set.
 
     Attributes:
         low: Corner of the grid with the smallest x, y, z, m.
         spacing: Edges of a cell, m.
-        mask: (nx, ny, nz) bool, which cells belong to the set. The plane y = 0 runs between the
-            cells ny / 2 - 1 and ny / 2.
+        mask: (nx, ny, nz) bool, true for cells of the set. The plane y = 0 runs between the cells
+            ny / 2 - 1 and ny / 2.
     """
 
     low: Vector
@@ -52,11 +51,11 @@ class Cells:
 
     @property
     def volume_error(self) -> float:
-        """What the grid can hide, m^3: half the volume of the cells along the curved boundary.
+        """Bound of the error of the volume, m^3: half of all cells along the curved boundary.
 
-        It falls in proportion to the spacing; the actual error is mostly far smaller, since cells
-        judged too full and too empty cancel. The planes y = 0 and |y| = l7 are faces of cells and
-        add nothing.
+        It is proportional to the spacing. The error itself is mostly far smaller, because cells
+        that count too much and too little cancel. The planes y = 0 and |y| = l7 are faces of cells
+        and add no error.
         """
         halves = np.array_split(np.pad(self.mask, ((1, 1), (0, 0), (1, 1))), 2, axis=1)
         inside = sum((half & _grown(~half, corners=False)).sum() for half in halves)
@@ -64,14 +63,14 @@ class Cells:
         return 0.5 * math.prod(self.spacing) * int(max(inside, outside))
 
     def centres(self) -> FloatArray:
-        """Centres of the cells of the set, (count, 3) m."""
+        """Return the centres of the cells of the set, (count, 3) m."""
         centres: FloatArray = np.asarray(self.low) + (np.argwhere(self.mask) + 0.5) * self.spacing
         return centres
 
 
 @dataclass(frozen=True)
 class ReachableSet:
-    """Where point P can be on one working mode."""
+    """Positions of point P that one working mode can reach."""
 
     branch: WorkingMode
     geometry: Geometry
@@ -80,14 +79,14 @@ class ReachableSet:
 
 @dataclass(frozen=True)
 class Aspect:
-    """A connected region of one working mode without singularities.
+    """Connected region of one working mode without singularities.
 
     Attributes:
-        branch: Names the signs of the serial factors.
-        assembly: Names the signs of sin(beta) and the planar factor.
+        branch: Working mode: the signs of the serial factors.
+        assembly: Assembly mode: the signs of sin(beta) and the planar factor.
         level3: Sign of the third parallel factor, l1 + l3 c3 - xC - 2 l2.
         elevation: Sign of the constraint's factor, z_C1 - z_B1.
-        limits: Within which all of it is.
+        limits: Limits that the whole region respects.
     """
 
     branch: WorkingMode
@@ -101,12 +100,12 @@ class Aspect:
 
 @dataclass(frozen=True)
 class Box:
-    """What :func:`largest_box` returns.
+    """Axis-aligned box of good conditioning, from :func:`largest_box`.
 
     Attributes:
-        region: The box; its corners are nodes of the grid.
-        volume: Its volume, m^3.
-        conditioning: The smallest 1/cond(J) over the nodes in it.
+        region: The box; its corners are centres of cells.
+        volume: Volume, m^3.
+        conditioning: Smallest 1/cond(J) at the centres of cells in the box.
     """
 
     region: Region
@@ -120,13 +119,18 @@ def reachable_set(
     shape: Shape = DEFAULT_SHAPE,
     limits: tuple[Limit, ...] = (),
 ) -> ReachableSet:
-    """The points that have a posture on ``branch``, as cells of a grid over all that rods reach.
+    """Find the points that have a posture on ``branch``.
 
-    ``shape`` counts cells along x, y, z: at least 2 each, along y an even number. ``limits`` such
-    as :func:`~tpm_gym.analysis.limits.within_stops` have to allow the posture.
+    Args:
+        branch: Working mode.
+        geometry: Lengths.
+        shape: Numbers of cells along x, y, z: at least 2 each, and even along y. The grid holds
+            every point that the rods reach.
+        limits: Limits that the posture must respect, such as
+            :func:`~tpm_gym.analysis.limits.within_stops`.
 
     Raises:
-        ConfigurationError: If the shape is not possible.
+        ConfigurationError: The shape is not possible.
     """
     low, spacing, codes = _codes(branch, geometry, shape, limits)
     return ReachableSet(branch, geometry, Cells(low, spacing, codes >= 0))
@@ -139,16 +143,16 @@ def aspects(
     min_cells: int = 8,
     limits: tuple[Limit, ...] = (),
 ) -> tuple[Aspect, ...]:
-    """All aspects of a working mode, the largest first.
+    """Find all aspects of a working mode, the largest first.
 
-    Cells belong together if they share a face and all factors have the same signs at their centres.
-    So regions joined by a neck narrower than a cell come out as several, and a wall of singular
-    points thinner than a cell may be overlooked: compare two grids. Regions of fewer than
-    ``min_cells`` cells are dropped: crumbs along curved boundaries. What ``limits`` forbid divides
-    them too.
+    Two cells belong to one aspect if they share a face and all factors have the same signs at their
+    centres. So a neck narrower than a cell divides an aspect, and a singular wall thinner than a
+    cell may be missed: compare two grids. Regions of fewer than ``min_cells`` cells, which are
+    fragments along curved boundaries, are left out. Forbidden points of ``limits`` divide aspects
+    too.
 
     Raises:
-        ConfigurationError: If the shape is not possible, or min_cells is not positive.
+        ConfigurationError: The shape is not possible, or min_cells is not positive.
     """
     if min_cells < 1:
         raise ConfigurationError("min_cells", min_cells, "at least 1")
@@ -175,15 +179,15 @@ def aspects(
 
 
 def sample(rng: np.random.Generator, aspect: Aspect, count: int) -> FloatArray:
-    """Draw points (count, 3) m, uniform over an aspect, not only over its cells.
+    """Sample points (count, 3) m, uniform over an aspect, not only over its cells.
 
-    Draws from the aspect's cells and those around them, and keeps the points whose factors have the
-    aspect's signs. So the boundary is the true one, except that a part of it which strays more than
-    a cell from the aspect's cells is missing, and that another region with the same signs less than
-    a cell away would be let in.
+    Points are sampled in the cells of the aspect and their neighbours, and kept if their factors
+    have the signs of the aspect. So the boundary is exact, with two exceptions: parts of the aspect
+    more than a cell away from its cells are missing, and another region with the same signs less
+    than a cell away is included.
 
     Raises:
-        ConfigurationError: If count is negative, or if the aspect has no cells.
+        ConfigurationError: count is negative, or the aspect has no cells.
     """
     cells = aspect.cells
     if count < 0:
@@ -204,16 +208,16 @@ def sample(rng: np.random.Generator, aspect: Aspect, count: int) -> FloatArray:
 
 
 def largest_box(aspect: Aspect, threshold: float) -> Box:
-    """The largest axis-aligned box in an aspect whose conditioning is good enough throughout.
+    """Find the largest axis-aligned box in an aspect with 1/cond(J) >= threshold.
 
-    Exact on the grid: no box with nodes (centres of cells) as corners, all of whose nodes belong to
-    the aspect and have 1/cond(J) >= threshold, is larger. The box ends at the outermost nodes, so
-    every face was looked at; between the nodes the conditioning is not known, but it varies little
-    from node to node.
+    The result is exact on the grid, whose nodes are the centres of cells: no larger box has nodes
+    as corners, all nodes in the aspect, and 1/cond(J) >= threshold at all nodes. Faces of the box
+    run through nodes. The conditioning between nodes is not checked; it varies little from node to
+    node.
 
     Raises:
-        ConfigurationError: If the threshold is not between 0 and 1, or if no box of at least two
-            nodes along every axis meets it.
+        ConfigurationError: The threshold is not between 0 and 1, or no box of at least two nodes
+            along each axis meets it.
     """
     if not 0 <= threshold <= 1:
         raise ConfigurationError("threshold", threshold, "between 0 and 1")
@@ -240,16 +244,16 @@ def largest_box(aspect: Aspect, threshold: float) -> Box:
 def _codes(
     branch: WorkingMode, geometry: Geometry, shape: Shape, limits: tuple[Limit, ...]
 ) -> tuple[Vector, Vector, IntArray]:
-    """Corner and spacing of the grid, and the signs at the centres of its cells."""
+    """Return corner and spacing of the grid, and the signs at the centres of its cells."""
     if len(shape) != 3 or any(int(n) != n or n < 2 for n in shape) or shape[1] % 2:
         raise ConfigurationError("shape", shape, "three integers from 2 up, that along y even")
     l1, l2, l3, l4, l5, l6, l7 = vars(geometry).values()
     reach = l3 + l4
-    # Leg 2 is in the plane of its arm; rod 1 spans x_C and leg 3 is within a torus.
+    # Leg 2 stays in the plane of its arm, rod 1 spans x_C, and leg 3 stays within a torus.
     x_low = max(l2 - l7 - l4, l2 - l7 + 2 * l5 - l1 - reach, l1 - l2 - reach)
     x_high = min(l2 + l7 + l4, l2 + l7 + 2 * l5 - l1 + reach, l1 - l2 + reach)
     low, high = np.array([x_low, -l7, l6 - reach]), np.array([x_high, l7, 2 * l6 + reach])
-    if x_low >= x_high:  # nothing can be reached; any box will show it
+    if x_low >= x_high:  # nothing can be reached, and any grid shows this
         low[0], high[0] = l2 - l7 - l4, l2 + l7 + l4
     spacing = (high - low) / shape
     points = low + (np.moveaxis(np.indices(shape), 0, -1) + 0.5) * spacing
@@ -260,7 +264,7 @@ def _codes(
 def _signs(
     points: FloatArray, branch: WorkingMode, geometry: Geometry, limits: tuple[Limit, ...]
 ) -> IntArray:
-    """Signs of sin(beta), level3, planar, elevation as bits; -1 where P cannot be."""
+    """Return the signs of sin(beta), level3, planar, elevation as bits; -1 where P cannot be."""
     found = factors_at(points, branch, geometry)
     values = np.concatenate([found.parallel, found.constraint[..., None]], axis=-1)
     codes: IntArray = np.where(
@@ -273,7 +277,7 @@ def _signs(
 
 
 def _neighbours(shape: tuple[int, ...]) -> list[tuple[tuple[slice, ...], tuple[slice, ...]]]:
-    """Pairs of views of a grid whose entries share a face, one pair an axis."""
+    """Return a pair of views for each axis of a grid, whose entries share a face."""
     pairs = []
     for axis in range(len(shape)):
         before, after = [slice(None)] * len(shape), [slice(None)] * len(shape)
@@ -283,7 +287,7 @@ def _neighbours(shape: tuple[int, ...]) -> list[tuple[tuple[slice, ...], tuple[s
 
 
 def _components(codes: IntArray) -> IntArray:
-    """Labels of the connected sets of equal codes: union-find on all faces at once."""
+    """Label the connected sets of equal codes, by union-find on all faces at once."""
     parent = np.arange(codes.size)
     index = parent.reshape(codes.shape)
     first, second = [], []
@@ -296,15 +300,15 @@ def _components(codes: IntArray) -> IntArray:
         roots = parent[one], parent[other]
         if (roots[0] == roots[1]).all():
             return parent.reshape(codes.shape)
-        # The larger root of each open pair is hung below the smaller, then all paths are halved
-        # until everyone points at its root.
+        # The smaller root of each pair becomes the parent of the larger. Then all paths are halved
+        # until every cell points at its root.
         np.minimum.at(parent, np.maximum(*roots), np.minimum(*roots))
         while (parent != parent[parent]).any():
             parent = parent[parent]
 
 
 def _grown(mask: BoolArray, corners: bool = True) -> BoolArray:
-    """The cells of a set and all that touch them: at a face, or be it at a corner."""
+    """Return the cells of a set and those that touch them at a face, or even at a corner."""
     grown: BoolArray = mask.copy()
     for before, after in _neighbours(mask.shape):
         reached = grown.copy() if corners else mask
@@ -314,10 +318,10 @@ def _grown(mask: BoolArray, corners: bool = True) -> BoolArray:
 
 
 def _largest_block(mask: BoolArray) -> tuple[Shape, Shape] | None:
-    """First and last node of the largest all-true block, by (nx - 1)(ny - 1)(nz - 1).
+    """Return the first and last node of the largest all-true block, by (nx - 1)(ny - 1)(nz - 1).
 
-    For every range of y the nodes that are true throughout it; for every width in x the columns
-    true throughout that width; in those the longest run along z. None if no block has a volume.
+    The search takes each range of y, each width in x, and in the columns that are true over both
+    the longest run along z. It returns None if no block has a volume.
     """
     nx, ny, nz = mask.shape
     count = np.cumsum(np.pad(mask, ((0, 0), (1, 0), (0, 0))), axis=1)

@@ -1,19 +1,19 @@
-"""Which motor moves what: the partial decoupling of the mechanism, in formulas and numbers.
+"""Partial decoupling of the mechanism: which motor moves which coordinate.
 
-With r_i = B_iC_i, leg_i and planar the factors of Eqs. (16) and (17), corrected, w_i the rate of
-motor i and k = sin(beta) level3, the closures differentiated read
+Let r_i = B_iC_i, leg_i and planar the factors of Eqs. (16) and (17), corrected, w_i the speed of
+motor i, and k = sin(beta) level3. The differentiated closures are
 
     leg_1 w_1 = r_1x xC' + r_1z zC'
     leg_2 w_2 = r_2x xC' + r_2z zC'
     leg_3 w_3 = r_3x xC' + r_3z zC' + k l7 beta'
 
-Motors 1 and 2 alone move link 3', and link 3' alone moves them; motor 3 turns link 7 and moves
-nothing else, so P runs along (-sin(beta), cos(beta), 0). In xC, zC and beta the velocity
-Jacobian and its inverse have zeros in the same two places, :data:`LINKS`. In x, y and z one of
-them is left, that of z (:data:`PLATFORM`), and the inverse has none.
+Only motors 1 and 2 move link 3'. Motor 3 turns link 7 and moves nothing else, so it moves P along
+(-sin(beta), cos(beta), 0). In xC, zC and beta, the velocity Jacobian and its inverse are zero in
+the same two entries (:data:`LINKS`). In x, y and z, the velocity Jacobian has one zero, in the row
+of z (:data:`PLATFORM`), and its inverse has none.
 
-:func:`shares` and :func:`motors` take the velocity Jacobian of any mechanism whose motors share a
-unit. Functions of joint angles raise as :func:`tpm_gym.kinematics.jacobian.velocity` does.
+:func:`shares` and :func:`motors` take the velocity Jacobian of any mechanism whose motors have the
+same unit. Functions of joint angles raise like :func:`tpm_gym.kinematics.jacobian.velocity`.
 """
 
 from dataclasses import dataclass
@@ -30,19 +30,19 @@ from tpm_gym.kinematics.namespaces import NUMPY
 from tpm_gym.kinematics.workspace import Region
 
 PLATFORM = np.array([[True, True, True], [True, True, True], [True, True, False]])
-"""Where J is not zero by structure: rows x, y, z of P, columns motors 1, 2, 3."""
+"""Entries of J that are not always zero: rows x, y, z of P, columns motors 1, 2, 3."""
 
 LINKS = np.array([[True, True, False], [True, True, False], [True, True, True]])
-"""The same for xC, zC of link 3' and beta of link 7, and for the inverse."""
+"""Entries that are not always zero: rows xC, zC of link 3' and beta of link 7; also the inverse."""
 
 
 @dataclass(frozen=True, eq=False)
 class Index:
-    """What :func:`over` returns.
+    """Means over a region, from :func:`over`.
 
     Attributes:
-        shares: (3, 3), the mean of :func:`shares`.
-        motors: (3,), the mean of :func:`motors`.
+        shares: (3, 3), mean of :func:`shares`.
+        motors: (3,), mean of :func:`motors`.
     """
 
     shares: FloatArray
@@ -52,7 +52,7 @@ class Index:
 def link_velocity(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> FloatArray:
-    """Rates of xC, zC and l7 beta by the motors, (..., 3, 3) m/rad, at theta (..., 3) rad."""
+    """Compute d(xC, zC, l7 beta) / d(theta), (..., 3, 3) m/rad, at theta (..., 3) rad."""
     (r1, r2, r3), f = _configuration(theta, branch, geometry)
     nothing = 0 * f.planar
     x = np.stack([r2[2] * f.leg1, -r1[2] * f.leg2, nothing], axis=-1) / f.planar[..., None]
@@ -65,10 +65,10 @@ def link_velocity(
 def inverse_link_velocity(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> FloatArray:
-    """Rates of the motors by xC, zC and l7 beta, (..., 3, 3) rad/m, at theta (..., 3) rad.
+    """Compute d(theta) / d(xC, zC, l7 beta), (..., 3, 3) rad/m, at theta (..., 3) rad.
 
     Raises:
-        SingularityError: If a leg is stretched or folded, too.
+        SingularityError: A leg is stretched or folded, or J does not exist.
     """
     (r1, r2, r3), f = _configuration(theta, branch, geometry)
     turns = 0 * f.planar, 0 * f.planar, f.sin_beta * f.level3
@@ -82,10 +82,10 @@ def inverse_link_velocity(
 def inverse_velocity(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> FloatArray:
-    """J^-1 = B^-1 A: rates of the motors by x, y, z of P, (..., 3, 3) rad/m.
+    """Compute J^-1 = B^-1 A = d(theta) / d(x, y, z), (..., 3, 3) rad/m, at theta (..., 3) rad.
 
     Raises:
-        SingularityError: If theta is a serial singularity, where it does not exist.
+        SingularityError: theta is a serial singularity, or J does not exist.
     """
     a = jacobian.parallel(theta, branch, geometry)
     b = np.diagonal(jacobian.serial(theta, branch, geometry), axis1=-2, axis2=-1)
@@ -93,11 +93,11 @@ def inverse_velocity(
 
 
 def shares(velocity: ArrayLike) -> FloatArray:
-    """The part that each motor has in each coordinate's motion, (..., 3, 3), in [0, 1].
+    """Compute the share of each motor in the motion of each coordinate, (..., 3, 3), in [0, 1].
 
-    J_ij^2 / sum_j J_ij^2 of a velocity Jacobian (..., 3, 3): where the rates of the motors are
-    independent and equally large, the part of coordinate i's variance that motor j makes. Rows add
-    up to 1; where a coordinate cannot move, they are NaN.
+    The share is J_ij^2 / sum_j J_ij^2 of a velocity Jacobian (..., 3, 3). If the speeds of the
+    motors are independent and equally large, it is the part of the variance of coordinate i that
+    motor j causes. Rows add up to 1. The row of a coordinate that cannot move is NaN.
     """
     squares = finite_points("velocity", velocity) ** 2
     with np.errstate(invalid="ignore"):
@@ -106,9 +106,10 @@ def shares(velocity: ArrayLike) -> FloatArray:
 
 
 def motors(velocity: ArrayLike) -> FloatArray:
-    """How many motors move each coordinate, (..., 3), in [1, 3]: 1 / sum_j shares_ij^2.
+    """Compute how many motors move each coordinate, (..., 3), in [1, 3]: 1 / sum_j shares_ij^2.
 
-    1 where one motor alone does, as in a Cartesian robot; 3 where all do alike.
+    The number is 1 if one motor alone moves the coordinate, as in a Cartesian robot, and 3 if all
+    motors have equal shares.
     """
     count: FloatArray = 1 / (shares(velocity) ** 2).sum(axis=-1)
     return count
@@ -121,12 +122,12 @@ def over(
     geometry: Geometry = PAPER,
     shape: tuple[int, int, int] = (9, 9, 9),
 ) -> Index:
-    """The means over the cells of a grid of ``shape`` in a region, of x, y and z of P.
+    """Average shares and numbers of motors over a grid of ``shape`` in a region, for x, y, z of P.
 
     Raises:
-        UnreachableError: If a point is not reachable on ``branch``.
-        SingularityError: If a point is singular.
-        ConfigurationError: If a point is in another assembly mode.
+        UnreachableError: A point is not reachable on ``branch``.
+        SingularityError: A point is singular.
+        ConfigurationError: A point is in another assembly mode.
     """
     low, high = np.array(region.low), np.array(region.high)
     cells = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1).reshape(-1, 3)
@@ -143,8 +144,8 @@ def over(
 def _configuration(
     theta: ArrayLike, branch: AssemblyMode, geometry: Geometry
 ) -> tuple[tuple[equations.Triple, equations.Triple, equations.Triple], equations.Factors]:
-    """Rods and factors at theta, where J exists."""
-    jacobian.velocity(theta, branch, geometry)  # raises where it does not, and says why
+    """Return rods and factors at theta, if J exists there."""
+    jacobian.velocity(theta, branch, geometry)  # raises with the reason if J does not exist
     a, b, c = np.moveaxis(finite_points("theta", theta), -1, 0)
     cos, sin = equations.arms((a, b, c), geometry, NUMPY)
     found = equations.assembly_at(cos, sin, *branch.signs, geometry, NUMPY)[0]
@@ -153,7 +154,7 @@ def _configuration(
 
 
 def _over_legs(rows: FloatArray, legs: FloatArray, geometry: Geometry) -> FloatArray:
-    """Rows (..., 3, 3) over the diagonal of B (..., 3), or what is singular."""
+    """Divide rows (..., 3, 3) by the diagonal of B (..., 3), if no leg is singular."""
     scaled = legs / (geometry.l3 * geometry.l4)
     if scaled.size and np.abs(scaled).min() < equations.SINGULAR:
         smallest = scaled.flat[np.abs(scaled).argmin()].item()

@@ -1,12 +1,12 @@
-"""Mechanisms of the Delta's kind, to be compared with ours: the Delta itself and the Orthoglide.
+"""Delta and Orthoglide, for comparison with the paper's mechanism.
 
-Three legs hold the platform; each is a motor, an arm that it turns or a slider that it moves, and a
-parallelogram that keeps the platform from turning. So the closures are |B_iC_i| = l_i, as in
-Eqs. (6) and (9), with C_i fixed to the platform, and A v = B q_dot has the rods B_iC_i as the rows
-of A and B_iC_i . dB_i/dq_i on the diagonal of B. Lengths in m, motors in rad or m, any frame.
+Three legs hold the platform. Each has a motor, which turns an arm or moves a slider, and a
+parallelogram, which keeps the platform from turning. So the closures are |B_iC_i| = l_i, as in
+Eqs. (6) and (9), with C_i fixed to the platform. In A v = B q_dot the rods B_iC_i are the rows of
+A, and B_iC_i . dB_i/dq_i are the diagonal of B. Lengths are in m, motors in rad or m, in any frame.
 
-Functions raise InputError for what is no array (..., 3) of finite numbers; what has no solution is
-NaN.
+Functions take arrays (..., 3) of finite numbers and raise InputError for anything else. Rows
+without a solution are NaN.
 """
 
 import math
@@ -29,16 +29,16 @@ from tpm_gym.kinematics.geometry import PAPER
 
 @dataclass(frozen=True)
 class Leg:
-    """One leg.
+    """One leg of a tripod.
 
     Attributes:
-        pivot: A, a point on the motor's axis, m.
-        axis: Unit vector, about which the arm turns or along which the slider moves.
+        pivot: Point A on the motor's axis, m.
+        axis: Unit vector; the arm turns about it, or the slider moves along it.
         hinge: Unit vector, the axis of the revolutes at both ends of the parallelogram, and the
             direction of its short links.
-        tip: From P to C, m.
+        tip: Vector from P to C, m.
         rod: Length of the rods, m.
-        arm: From A to B at angle 0, m, perpendicular to the axis; None for a slider.
+        arm: Vector from A to B at angle 0, m, perpendicular to the axis; None for a slider.
     """
 
     pivot: Vector
@@ -51,12 +51,12 @@ class Leg:
 
 @dataclass(frozen=True)
 class Tripod:
-    """A platform on three legs, which translates with three freedoms."""
+    """Platform on three legs with three translational degrees of freedom."""
 
     legs: tuple[Leg, Leg, Leg]
 
     def inverse_all(self, position: ArrayLike) -> FloatArray:
-        """The 8 solutions (..., 8, 3) for P at ``position`` (..., 3) m: two for each leg."""
+        """Compute all 8 solutions (..., 8, 3) for P at ``position`` (..., 3) m, 2 for each leg."""
         points = finite_points("position", position)
         both = np.stack([_motor(leg, points) for leg in self.legs], axis=-1)  # (2, ..., 3)
         choices = [
@@ -66,51 +66,54 @@ class Tripod:
         return np.stack(choices, axis=-2)
 
     def forward_all(self, motors: ArrayLike) -> FloatArray:
-        """The 2 positions (..., 2, 3) m of P: where three spheres meet."""
+        """Compute both positions (..., 2, 3) m of P, the intersections of three spheres."""
         centres = self.elbows(motors) - np.array([leg.tip for leg in self.legs])
         squares = np.array([leg.rod**2 for leg in self.legs])
         first, others = centres[..., :1, :], centres[..., 1:, :] - centres[..., :1, :]
         normal = np.cross(others[..., 0, :], others[..., 1, :])
         with np.errstate(all="ignore"):
-            # From the first centre: the planes in which spheres 2 and 3 meet sphere 1 ...
+            # Spheres 2 and 3 meet sphere 1 in two planes; reach has their distances ...
             reach = (squares[0] - squares[1:] + (others**2).sum(axis=-1)) / 2
             crossed = [np.cross(others[..., 1, :], normal), np.cross(normal, others[..., 0, :])]
             size = (normal**2).sum(axis=-1)[..., None]
             foot = sum(reach[..., i, None] * crossed[i] for i in range(2)) / size
-            # ... and along their common line to the sphere.
+            # ... and height goes along the common line of the planes to the sphere.
             height = np.sqrt((squares[0] - (foot**2).sum(axis=-1, keepdims=True)) / size)
         ways = np.array([[-1.0], [1.0]]) * (height * normal)[..., None, :]
         found: FloatArray = first + foot[..., None, :] + ways
         return found
 
     def elbows(self, motors: ArrayLike) -> FloatArray:
-        """B1, B2, B3 (..., 3, 3) m at ``motors`` (..., 3)."""
+        """Compute B1, B2, B3 (..., 3, 3) m at ``motors`` (..., 3)."""
         return _elbows(self, finite_points("motors", motors))[0]
 
     def parallel(self, position: ArrayLike, motors: ArrayLike) -> FloatArray:
-        """A (..., 3, 3) m: singular where the directions of the rods lie in one plane."""
+        """Compute A (..., 3, 3) m; it is singular where the rods are parallel to one plane."""
         tips = np.array([leg.tip for leg in self.legs])
         points = finite_points("position", position)[..., None, :]
         rods: FloatArray = points + tips - self.elbows(motors)
         return rods
 
     def serial(self, position: ArrayLike, motors: ArrayLike) -> FloatArray:
-        """The diagonal of B (..., 3): zero where a rod is perpendicular to what moves its elbow."""
+        """Compute the diagonal of B (..., 3): 0 where the rod is normal to the elbow's velocity."""
         _, rates = _elbows(self, finite_points("motors", motors))
         factors: FloatArray = (self.parallel(position, motors) * rates).sum(axis=-1)
         return factors
 
     def velocity(self, position: ArrayLike, motors: ArrayLike) -> FloatArray:
-        """J = A^-1 B (..., 3, 3), v = J q_dot."""
+        """Compute J = A^-1 B (..., 3, 3), with v = J q_dot."""
         b = self.serial(position, motors)
         jacobian: FloatArray = np.linalg.inv(self.parallel(position, motors)) * b[..., None, :]
         return jacobian
 
     def chains(self, position: ArrayLike, motors: ArrayLike, balls: bool = False) -> list[Chain]:
-        """The legs at one configuration, P (3,) m, for :func:`tpm_gym.analysis.poc.analyse`.
+        """Return the legs at one configuration for :func:`tpm_gym.analysis.poc.analyse`.
 
-        Motor, R, parallelogram of revolutes, R, as the paper's branch III; or, with ``balls``,
-        motor and parallelogram of spherical pairs, as its branch I.
+        Args:
+            position: P (3,) m.
+            motors: Motor positions (3,).
+            balls: Whether a leg is a motor and a parallelogram of spherical pairs, as in the
+                paper's branch I, or motor, R, parallelogram of revolutes, R, as in branch III.
         """
         rods, elbows = self.parallel(position, motors), self.elbows(motors)
         chains = []
@@ -131,7 +134,7 @@ class Tripod:
 
 
 def _motor(leg: Leg, position: FloatArray) -> FloatArray:
-    """The two solutions (2, ...) of one leg."""
+    """Return both solutions (2, ...) of one leg."""
     span = position + leg.tip - np.array(leg.pivot)
     square = (span**2).sum(axis=-1)
     with np.errstate(invalid="ignore"):
@@ -147,7 +150,7 @@ def _motor(leg: Leg, position: FloatArray) -> FloatArray:
 
 
 def _elbows(tripod: Tripod, motors: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """B_i and dB_i/dq_i, each (..., 3, 3)."""
+    """Return B_i and dB_i/dq_i, each (..., 3, 3)."""
     elbows, rates = [], []
     for i, leg in enumerate(tripod.legs):
         q, axis = motors[..., i, None], np.array(leg.axis)
@@ -162,11 +165,14 @@ def _elbows(tripod: Tripod, motors: FloatArray) -> tuple[FloatArray, FloatArray]
 
 
 def delta(base: float, platform: float, arm: float, rod: float) -> Tripod:
-    """Clavel's Delta: radii of base and platform, and lengths of arms and rods, m; z as ours."""
+    """Build Clavel's Delta from radii of base and platform, and lengths of arms and rods, m.
+
+    z points from the base to the platform, as in the paper.
+    """
     legs = []
     for turn in (0.0, 2 * math.pi / 3, 4 * math.pi / 3):
         x, y = math.cos(turn), math.sin(turn)
-        axis = (y, -x, 0.0)  # turns the arm from its level direction towards +z
+        axis = (y, -x, 0.0)  # positive angles turn the arm towards +z
         legs.append(
             Leg(
                 pivot=(base * x, base * y, 0.0),
@@ -181,9 +187,9 @@ def delta(base: float, platform: float, arm: float, rod: float) -> Tripod:
 
 
 def orthoglide(rod: float) -> Tripod:
-    """The Orthoglide of Chablat and Wenger: three sliders at right angles, rods in m.
+    """Build the Orthoglide of Chablat and Wenger: three sliders at right angles, rod length in m.
 
-    At P = 0 each rod is along its slider and J is the identity.
+    At P = 0 each rod is parallel to its slider, and J is the identity.
     """
     x, y, z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
     origin = (0.0, 0.0, 0.0)
@@ -194,6 +200,6 @@ def orthoglide(rod: float) -> Tripod:
 
 
 DELTA = delta(PAPER.l1, PAPER.l2, PAPER.l3, PAPER.l4)
-"""With the lengths of the paper's case study."""
+"""Delta with the lengths of the paper's case study."""
 
 ORTHOGLIDE = orthoglide(PAPER.l4)

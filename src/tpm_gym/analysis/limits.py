@@ -1,8 +1,8 @@
-"""What the closed forms allow and the machine does not: motors' stops, and links in the way.
+"""Limits that closed-form kinematics does not have: stops of the motors, and collisions of links.
 
-A limit tells of points that are reached on a working mode whether the machine can be there; the
-functions of :mod:`tpm_gym.analysis.aspects` take any number of them as ``limits``. Bodies are those
-of :mod:`tpm_gym.mechanism.tree`, whose sections do not scale with the lengths.
+A limit says for each point that a working mode reaches whether the machine can be there. The
+functions of :mod:`tpm_gym.analysis.aspects` take any number of ``limits``. Bodies come from
+:mod:`tpm_gym.mechanism.tree`; their cross sections do not scale with the lengths.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from tpm_gym.mechanism import tree
 from tpm_gym.mechanism.bodies import Link, Mechanism
 
 Limit = Callable[[FloatArray, WorkingMode, Geometry], BoolArray]
-"""From points (n, 3) m that are reached on a working mode, to which of them it allows, (n,)."""
+"""Function of points (n, 3) m that a working mode reaches; it returns (n,), true if allowed."""
 
-_SLENDER = 2.0  # times as long as wide
+_SLENDER = 2.0  # least ratio of length to width of a solid that counts
 _BLOCK = 4096
 
 
 class Capsule(NamedTuple):
-    """All points within ``radius`` of a line, m, in the frame of a link."""
+    """All points within ``radius`` of a line segment, m, in the frame of a link."""
 
     link: str
     start: FloatArray
@@ -38,7 +38,7 @@ class Capsule(NamedTuple):
 
 
 def within_stops(points: FloatArray, branch: WorkingMode, geometry: Geometry) -> BoolArray:
-    """Whether all motors are between their stops."""
+    """Return whether all motors are between their stops, (n,)."""
     theta = inverse(points, branch, geometry)
     motors = tree.build(geometry).motors
     low, high = ([getattr(motor, end) for motor in motors] for end in ("lower", "upper"))
@@ -46,14 +46,15 @@ def within_stops(points: FloatArray, branch: WorkingMode, geometry: Geometry) ->
 
 
 def clear_of_links(points: FloatArray, branch: WorkingMode, geometry: Geometry) -> BoolArray:
-    """Whether no two links touch that no joint joins, as :func:`capsules` has them."""
+    """Return whether the links are clear of each other, (n,); see :func:`clearance`."""
     return clearance(points, branch, geometry) > 0
 
 
 def clearance(points: FloatArray, branch: WorkingMode, geometry: Geometry) -> FloatArray:
-    """Between the two links that are nearest to each other, (n,) m; negative where they overlap.
+    """Compute the smallest distance between two links, (n,) m; negative where links overlap.
 
-    Links that a joint joins do not count, nor does what is compact: hubs, motors and the base.
+    Pairs of links with a common joint do not count. Compact solids (hubs, motors, base) do not
+    count either.
     """
     mechanism = tree.build(geometry)
     parts = [part for link in mechanism.links for part in capsules(link)]
@@ -77,7 +78,7 @@ def clearance(points: FloatArray, branch: WorkingMode, geometry: Geometry) -> Fl
 
 
 def capsules(link: Link) -> Iterator[Capsule]:
-    """The slender solids of a link: a bar as one capsule, a flat box as several side by side."""
+    """Yield the slender solids of a link: a bar as one capsule, a flat box as several in a row."""
     for solid in link.solids:
         size = 2 * solid.half_extent
         narrow, wide, long = np.argsort(size, kind="stable")
@@ -96,7 +97,10 @@ def capsules(link: Link) -> Iterator[Capsule]:
 
 
 def _unjoined(mechanism: Mechanism) -> set[frozenset[str]]:
-    """Pairs of links that no joint joins; a universal joint's cross counts as part of its rod."""
+    """Return the pairs of links without a common joint.
+
+    The cross of a universal joint counts as part of its rod.
+    """
     whole = {link.name: link.name for link in mechanism.links}
     joints = [link.joint for link in mechanism.links]
     for link, joint in zip(mechanism.links, joints, strict=True):
@@ -111,7 +115,7 @@ def _unjoined(mechanism: Mechanism) -> set[frozenset[str]]:
 
 
 def _between(p1: FloatArray, q1: FloatArray, p2: FloatArray, q2: FloatArray) -> FloatArray:
-    """Distance of the segments p1 q1 and p2 q2, (n,): least over both parameters in [0, 1]."""
+    """Compute the distance of the segments p1 q1 and p2 q2, (n,)."""
     one, other, start = q1 - p1, q2 - p2, p1 - p2
     a, b, e = (np.einsum("ni,ni->n", *pair) for pair in ((one, one), (one, other), (other, other)))
     c, f = (np.einsum("ni,ni->n", line, start) for line in (one, other))

@@ -1,21 +1,21 @@
-"""POC sets (position and orientation characteristics) and the counts made of them, Eqs. 1 to 5.
+"""POC sets (position and orientation characteristics) and the counts of Eqs. (1) to (5).
 
-How the theory is applied. A POC set is a pair of subspaces of R^3, one spanned by the directions
-of translation, one by the axes of rotation, of a link's motion relative to the base. Union is the
-span and intersection the common subspace, for translations and rotations apart, as the paper
-writes its columns [t; r]; dim is the sum of the two ranks, so every number is a rank. About a base
-point o' of the chain's end link, a revolute joint of axis s through a point p contributes r(|| s)
-and the translation t along s x (o' - p), perpendicular to the axis; none if the axis passes through
-o'. A group of three parallel revolutes thus contributes t^2(perpendicular to s), r^1(|| s).
+A POC set is a pair of subspaces of R^3 for the motion of a link relative to the base: the span of
+its directions of translation, and the span of its axes of rotation. Union is the span of both,
+intersection the common subspace, separately for translations and rotations, as in the columns
+[t; r] of the paper. dim is the sum of the two ranks. Let o' be the base point of the end link of a
+chain. A revolute joint with axis s through a point p contributes r(|| s), and the translation t
+along s x (o' - p) unless the axis passes through o'. So three parallel revolutes contribute
+t^2(perpendicular to s), r^1(|| s).
 
-Where the paper's notation is simplified. A subspace holds all its directions, so the paper's
-symbols for them (perpendicular, parallel, in the plane of) are not reproduced, and neither are
-braces around dependent elements: choose the base point so that there are none. (The paper writes
-t^2 r^1 for R12, R13 alone, three elements of two revolutes; about a base point on one of the two
-axes it is t^1 r^1.) Rules by column are exact for a chain that translates and rotates
-independently; all chains of this mechanism do, and a test compares them with screw theory.
-Directions are those at one configuration: dimensions can change at a singularity, and elsewhere
-they are the full-cycle values of the paper.
+The paper's notation is simplified in two ways. A subspace holds all its directions, so there are no
+symbols for them (perpendicular, parallel, in the plane of). There are no braces around dependent
+elements either: choose the base point so that no element is dependent. (The paper writes t^2 r^1
+for R12, R13 alone, three elements of two revolutes; about a base point on one of the two axes the
+set is t^1 r^1.) Treating translations and rotations separately is exact for a chain that translates
+and rotates independently. All chains of this mechanism do, and a test compares them with screw
+theory. Directions are those at one configuration. Dimensions can change at a singularity;
+elsewhere they are the full-cycle values of the paper.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from numpy.typing import ArrayLike
 from tpm_gym.arrays import FloatArray, finite_points, numbers
 from tpm_gym.errors import InputError
 
-# Directions closer than this (sine of the angle) count as one, and vectors shorter than this as
-# none: far above rounding, far below anything away from a singularity.
+# Directions closer than this (sine of the angle) are equal, and shorter vectors are zero. It is far
+# above rounding, and far below any value away from a singularity.
 _SAME = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class Subspace:
-    """A subspace of R^3.
+    """Subspace of R^3.
 
     Attributes:
         basis: (k, 3), orthonormal rows; k is the dimension.
@@ -48,10 +48,10 @@ class Subspace:
 
     @classmethod
     def span(cls, vectors: ArrayLike) -> Subspace:
-        """The smallest subspace that holds ``vectors`` (n, 3), of any lengths, zero included.
+        """Return the span of ``vectors`` (n, 3) of any lengths, zero included.
 
         Raises:
-            InputError: If the shape is wrong or an entry is not finite.
+            InputError: The shape is wrong, or an entry is not finite.
         """
         rows = numbers("vectors", vectors)
         rows = finite_points("vectors", rows if rows.size else rows.reshape(0, 3))
@@ -69,21 +69,21 @@ class Subspace:
 
     @property
     def projector(self) -> FloatArray:
-        """(3, 3): the orthogonal projection onto the subspace; equal for equal subspaces."""
+        """Orthogonal projection (3, 3) onto the subspace; equal for equal subspaces."""
         result: FloatArray = self.basis.T @ self.basis
         return result
 
     @property
     def complement(self) -> Subspace:
-        """All vectors perpendicular to the subspace."""
+        """Subspace of all vectors perpendicular to this one."""
         return Subspace(np.linalg.svd(self.basis)[2][self.dim :])
 
     def __or__(self, other: Subspace) -> Subspace:
-        """Union in the sense of POC theory: the span of both."""
+        """Return the union in the sense of POC theory: the span of both."""
         return Subspace.span(np.concatenate([self.basis, other.basis]))
 
     def __and__(self, other: Subspace) -> Subspace:
-        """Intersection: what is perpendicular to everything that is perpendicular to either."""
+        """Return the intersection, by the rule of complements."""
         return (self.complement | other.complement).complement
 
 
@@ -105,28 +105,28 @@ class POCSet:
         return self.translations.dim + self.rotations.dim
 
     def __or__(self, other: POCSet) -> POCSet:
-        """Union, the rule of Eq. (1)."""
+        """Return the union, the rule of Eq. (1)."""
         return POCSet(self.translations | other.translations, self.rotations | other.rotations)
 
     def __and__(self, other: POCSet) -> POCSet:
-        """Intersection, the rule of Eq. (2)."""
+        """Return the intersection, the rule of Eq. (2)."""
         return POCSet(self.translations & other.translations, self.rotations & other.rotations)
 
     def __str__(self) -> str:
-        """The paper's notation without directions, e.g. ``t^3 r^0``."""
+        """Return the paper's notation without directions, for example ``t^3 r^0``."""
         return f"t^{self.translations.dim} r^{self.rotations.dim}"
 
 
 @dataclass(frozen=True, eq=False)
 class Unit:
-    """A joint, or a parallelogram that serves as one, at one configuration; see the makers below.
+    """Joint, or parallelogram that serves as a joint, at one configuration.
 
     Attributes:
-        name: The paper's name.
-        point: (3,) m, a point that all its axes of rotation pass through.
-        translations: (n, 3) directions in which that point can move.
+        name: Name in the paper.
+        point: (3,) m, common point of all axes of rotation.
+        translations: (n, 3) directions in which this point can move.
         rotations: (n, 3) axes.
-        actuated: Whether a motor drives it.
+        actuated: Whether a motor drives the joint.
     """
 
     name: str
@@ -137,33 +137,37 @@ class Unit:
 
     @property
     def freedoms(self) -> int:
-        """f_i of Eq. (3a)."""
+        """Degrees of freedom f_i of Eq. (3a)."""
         return len(self.translations) + len(self.rotations)
 
     def poc(self, base_point: ArrayLike) -> POCSet:
-        """M_Ji of Eq. (1), about ``base_point`` (3,) m of the chain's end link."""
+        """Return M_Ji of Eq. (1) about ``base_point`` (3,) m of the chain's end link."""
         arm = np.asarray(base_point, dtype=np.float64) - self.point
         carried = np.concatenate([self.translations, np.cross(self.rotations, arm)])
         return POCSet(Subspace.span(carried), Subspace.span(self.rotations))
 
 
 def revolute(name: str, axis: FloatArray, point: FloatArray, actuated: bool = False) -> Unit:
-    """A revolute joint R: ``axis`` (3,), ``point`` (3,) m on it."""
+    """Return a revolute joint R with ``axis`` (3,) through ``point`` (3,) m."""
     return Unit(name, point, np.empty((0, 3)), axis[None], actuated)
 
 
 def prismatic(name: str, axis: FloatArray, point: FloatArray, actuated: bool = False) -> Unit:
-    """A prismatic joint P: ``axis`` (3,), ``point`` (3,) m on it."""
+    """Return a prismatic joint P with ``axis`` (3,) through ``point`` (3,) m."""
     return Unit(name, point, axis[None], np.empty((0, 3)), actuated)
 
 
 def parallelogram_4s(name: str, short: FloatArray, rod: FloatArray, point: FloatArray) -> Unit:
-    """A parallelogram of four spherical pairs, P^(4S) P^(4S) R^(4S) R^(4S) of the paper.
+    """Return a parallelogram of four spherical pairs, the paper's P^(4S) P^(4S) R^(4S) R^(4S).
 
-    Its rods, which spin idly about themselves, keep one distance each: the far short link loses
-    the translation along the rods and the rotation about the normal of the parallelogram. ``short``
-    and ``rod`` (3,) are directions of short links and rods, ``point`` (3,) m is the middle of the
-    far short link.
+    Each rod keeps one distance and spins idly about itself. So the far short link cannot translate
+    along the rods, nor rotate about the normal of the parallelogram.
+
+    Args:
+        name: Name in the paper.
+        short: (3,) direction of the short links.
+        rod: (3,) direction of the rods.
+        point: (3,) m, middle of the far short link.
     """
     normal = np.cross(short, rod)
     translations = np.stack([normal, np.cross(rod, normal)])
@@ -171,10 +175,11 @@ def parallelogram_4s(name: str, short: FloatArray, rod: FloatArray, point: Float
 
 
 def parallelogram_4r(name: str, short: FloatArray, rod: FloatArray, point: FloatArray) -> Unit:
-    """A parallelogram of four revolutes, P^(4R): a translation in its plane, across the rods.
+    """Return a parallelogram of four revolutes, P^(4R).
 
-    The paper writes t^1(|| R32), the direction of its short links; that is where the rods are
-    perpendicular to them. The arguments are those of :func:`parallelogram_4s`.
+    It translates in its plane, across the rods. The paper writes t^1(|| R32), the direction of the
+    short links; this is exact only if the rods are perpendicular to them. Arguments are as in
+    :func:`parallelogram_4s`.
     """
     normal = np.cross(short, rod)
     return Unit(name, point, np.cross(rod, normal)[None], np.empty((0, 3)))
@@ -189,7 +194,7 @@ class Chain:
 
     @property
     def freedoms(self) -> int:
-        """Sum of f_i."""
+        """Sum of the degrees of freedom f_i."""
         return sum(unit.freedoms for unit in self.units)
 
     @property
@@ -198,15 +203,15 @@ class Chain:
         return sum(unit.actuated for unit in self.units)
 
     def poc(self, base_point: ArrayLike) -> POCSet:
-        """Eq. (1) for this chain, about ``base_point`` (3,) m of its end link."""
+        """Return the POC set of the chain, Eq. (1), about ``base_point`` (3,) m of its end link."""
         return serial([unit.poc(base_point) for unit in self.units])
 
 
 def serial(sets: Sequence[POCSet]) -> POCSet:
-    """Eq. (1): POC set of a serial chain, the union of those of its joints.
+    """Return the POC set of a serial chain: the union of the sets of its joints, Eq. (1).
 
     Raises:
-        InputError: If there is none.
+        InputError: There is no set.
     """
     if not sets:
         raise InputError("sets", sets, "at least one POC set")
@@ -214,10 +219,10 @@ def serial(sets: Sequence[POCSet]) -> POCSet:
 
 
 def parallel(sets: Sequence[POCSet]) -> POCSet:
-    """Eq. (2): POC set of a link that several chains hold, the intersection of theirs.
+    """Return the POC set of a link that several chains hold: their intersection, Eq. (2).
 
     Raises:
-        InputError: If there is none.
+        InputError: There is no set.
     """
     if not sets:
         raise InputError("sets", sets, "at least one POC set")
@@ -225,28 +230,31 @@ def parallel(sets: Sequence[POCSet]) -> POCSet:
 
 
 def degrees_of_freedom(freedoms: Sequence[int], equations: Sequence[int]) -> int:
-    """Eq. (3a): F = sum of f_i - sum of xi_Lj."""
+    """Return F = sum of f_i - sum of xi_Lj, Eq. (3a)."""
     return sum(freedoms) - sum(equations)
 
 
 def independent_equations(previous: Sequence[POCSet], added: POCSet) -> int:
-    """Eq. (3b): xi_Lj = dim{(intersection of the j previous chains) union chain j + 1}."""
+    """Return xi_Lj = dim{(intersection of the j previous chains) union chain j + 1}, Eq. (3b)."""
     return (parallel(previous) | added).dim
 
 
 def constraint_degree(freedoms: int, actuated: int, equations: int) -> int:
-    """Eq. (4), the second of that number: Delta_j = sum of f_i - I_j - xi_Lj."""
+    """Return Delta_j = sum of f_i - I_j - xi_Lj, the second Eq. (4)."""
     return freedoms - actuated - equations
 
 
 def coupling_degrees(decompositions: Sequence[Sequence[int]]) -> tuple[float, ...]:
-    """Eq. (5): kappa of each Assur kinematic chain (AKC), from the Delta_j of each decomposition.
+    """Return kappa of each Assur kinematic chain (AKC), Eq. (5).
 
-    The decomposition with the least sum of |Delta_j| counts. An AKC ends where the constraint
-    degrees so far add up to zero.
+    The decomposition with the smallest sum of |Delta_j| counts. An AKC ends where its constraint
+    degrees add up to zero.
+
+    Args:
+        decompositions: Delta_j of each decomposition.
 
     Raises:
-        InputError: If the constraint degrees of the one that counts do not add up to zero.
+        InputError: The constraint degrees of the decomposition do not add up to zero.
     """
     best = min(decompositions, key=lambda deltas: sum(abs(delta) for delta in deltas), default=())
     found, run = [], list[int]()
@@ -262,13 +270,13 @@ def coupling_degrees(decompositions: Sequence[Sequence[int]]) -> tuple[float, ..
 
 @dataclass(frozen=True)
 class Loop:
-    """One independent loop, closed by one single open chain (SOC).
+    """Independent loop, closed by one single open chain (SOC).
 
     Attributes:
-        chains: Names of the chains that the SOC is made of.
+        chains: Names of the chains of the SOC.
         freedoms: Sum of f_i over the SOC.
-        actuated: Number of its motors, I_j.
-        equations: xi_Lj.
+        actuated: Number of motors, I_j.
+        equations: Number of independent equations, xi_Lj.
     """
 
     chains: tuple[str, ...]
@@ -278,18 +286,17 @@ class Loop:
 
     @property
     def constraint(self) -> int:
-        """Delta_j of Eq. (4)."""
+        """Constraint degree Delta_j of Eq. (4)."""
         return constraint_degree(self.freedoms, self.actuated, self.equations)
 
 
 @dataclass(frozen=True, eq=False)
 class ParallelMechanism:
-    """What :func:`analyse` finds.
+    """Structure of a parallel mechanism, from :func:`analyse`.
 
     Attributes:
         platform: POC set of the platform.
-        decompositions: The independent loops, for every order in which the chains can be taken;
-            the order in which they were given comes first.
+        decompositions: Independent loops for each order of the chains, the given order first.
     """
 
     platform: POCSet
@@ -297,21 +304,21 @@ class ParallelMechanism:
 
     @property
     def loops(self) -> tuple[Loop, ...]:
-        """The loops of the first decomposition."""
+        """Loops of the first decomposition."""
         return self.decompositions[0]
 
     @property
     def coupling(self) -> tuple[float, ...]:
-        """Eq. (5): kappa of each Assur kinematic chain.
+        """Coupling degree kappa of each Assur kinematic chain, Eq. (5).
 
         Raises:
-            InputError: If there are not as many motors as freedoms, as at a constraint singularity:
-                the constraint degrees do not add up to zero.
+            InputError: The constraint degrees do not add up to zero, because the numbers of motors
+                and freedoms differ, as at a constraint singularity.
         """
         return coupling_degrees([[x.constraint for x in loops] for loops in self.decompositions])
 
     def dof(self, loops: int | None = None) -> int:
-        """F of Eq. (3a), counting the first ``loops`` of the loops, or all."""
+        """Return F of Eq. (3a) for the first ``loops`` loops; default: all."""
         counted = self.loops[:loops]
         return degrees_of_freedom([x.freedoms for x in counted], [x.equations for x in counted])
 
@@ -319,10 +326,12 @@ class ParallelMechanism:
 def analyse(chains: Sequence[Chain], point: ArrayLike) -> ParallelMechanism:
     """Apply Eqs. (1) to (5) to two chains or more from the base to one platform.
 
-    ``point`` (3,) m is the base point of the platform, at the configuration of the chains.
+    Args:
+        chains: Chains at one configuration.
+        point: Base point of the platform (3,) m.
 
     Raises:
-        InputError: If there are fewer chains.
+        InputError: There are fewer than two chains.
     """
     if len(chains) < 2:
         raise InputError("chains", len(chains), "two chains or more, by number")
@@ -331,13 +340,13 @@ def analyse(chains: Sequence[Chain], point: ArrayLike) -> ParallelMechanism:
 
 
 def decompositions(chains: Sequence[Chain], point: ArrayLike) -> tuple[tuple[Loop, ...], ...]:
-    """The independent loops for every order of the chains, about ``point`` (3,) m of their end."""
+    """Return the independent loops for each order of the chains, about ``point`` (3,) m."""
     held = [(chain, chain.poc(point)) for chain in chains]
     return tuple(_loops(order) for order in permutations(held))
 
 
 def _loops(order: tuple[tuple[Chain, POCSet], ...]) -> tuple[Loop, ...]:
-    """The loops that form as the chains are mounted in this order, the first by two of them."""
+    """Return the loops that form as the chains are mounted in order; two chains form the first."""
     chains, sets = zip(*order, strict=True)
     loops = []
     for j in range(1, len(order)):

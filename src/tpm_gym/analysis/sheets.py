@@ -1,13 +1,12 @@
-"""The singular surfaces as curves of link 3' that link 7 sweeps, and the feet of points on them.
+"""Singular surfaces as curves of C1 that link 7 sweeps, and the nearest points on them.
 
-Where xC and zC alone decide whether a factor vanishes, its surface is a curve of C1 in the plane
-y = 0, and P is on the circle of radius l7 about (xC + l2, 0, zC + 2 l6) that is parallel to xy.
-That is so for level3, planar, leg 1, leg 2 and elevation, and each curve has a closed form over one
-angle. The point of a circle that is nearest to P is where the ray from its centre meets it, so what
-is left of the distance to a surface is a minimum over that one angle.
+The factors level3, planar, leg 1, leg 2 and elevation depend on xC and zC alone. So each is zero on
+a curve of C1 in the plane y = 0, and P is on a circle of radius l7 about (xC + l2, 0, zC + 2 l6),
+parallel to xy. Each curve has a closed form over one angle. The nearest point of a circle to P lies
+on the ray from its centre. So the distance to a surface is a minimum over one angle.
 
-Curves consist of arcs, each over an interval of its angle in which it is real. Within an arc the
-angle is ``middle - half cos(t)``, t from 0 to pi, which makes the curve smooth at both ends.
+A curve consists of arcs, intervals of the angle in which it is real. Within an arc the angle is
+``middle - half cos(t)``, with t from 0 to pi, so that the curve is smooth at both ends.
 """
 
 from __future__ import annotations
@@ -24,19 +23,19 @@ from tpm_gym.kinematics.geometry import Geometry
 from tpm_gym.kinematics.modes import WorkingMode
 
 Point = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
-"""xC and zC, m, and p, q: it belongs to the working mode if p + q cos(beta) > 0."""
+"""xC and zC, m, and p, q: the point belongs to the working mode if p + q cos(beta) > 0."""
 Curve = Callable[[Geometry, WorkingMode, FloatArray, FloatArray, FloatArray], Point]
-"""From an angle and two signs, that name the branch of a curve."""
+"""Point of a curve, as a function of lengths, mode, angle, and two signs that name the branch."""
 
-_CELLS = 256  # of an arc
-_FINER = 4  # times as many chords measure how long a cell is
-_NODES, _ROUNDS = 9, 16  # each round keeps a quarter of a cell
-_GRID = 2048  # of a full turn, in which intervals are sought
-_BLOCK = 64
+_CELLS = 256  # cells of an arc
+_FINER = 4  # chords that measure the length of a cell
+_NODES, _ROUNDS = 9, 16  # each round keeps a quarter of the interval
+_GRID = 2048  # cells of a full turn in the search for intervals
+_BLOCK = 64  # points at a time
 
 
 def _level3(g: Geometry, mode: WorkingMode, t: FloatArray, up: FloatArray, _: FloatArray) -> Point:
-    """Circles about B3's, seen along y: rod 11 is parallel to link 7, seen along z."""
+    """Return points where rod 11 is parallel to link 7, seen along z: circles, seen along y."""
     cos, sin = np.cos(t), np.sin(t)
     rise = up * np.sqrt(max(g.l4**2 - g.l7**2, 0.0))
     x, z = g.l1 - 2 * g.l2 + g.l3 * cos, g.l3 * sin - g.l6 + rise
@@ -44,7 +43,7 @@ def _level3(g: Geometry, mode: WorkingMode, t: FloatArray, up: FloatArray, _: Fl
 
 
 def _rod_4(g: Geometry, theta_1: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """How far B1 is from the plane y = 0, and the square of how long rod 4 is in that plane."""
+    """Return y of B1, m, and the squared length of rod 4 projected on the plane y = 0, m^2."""
     y = g.l1 + g.l3 * np.cos(theta_1)
     return y, g.l4**2 - y * y
 
@@ -52,11 +51,13 @@ def _rod_4(g: Geometry, theta_1: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _tangent(
     g: Geometry, t: FloatArray, side: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Where the planar factor vanishes at theta_1, seen along y, with leg 2 moved until C2 is C1.
+    """Return the triangle of the planar factor at theta_1, seen along y, with leg 2 moved to C1.
+
+    ``side`` is -1 if rods 4 and 6 point in opposite directions.
 
     Returns:
-        B1 from A2, level, upwards and in all, and B1 from B2 along rod 4, which is less than zero.
-        ``side`` is -1 where rods 4 and 6 point against each other.
+        Vector from A2 to B1: level, upwards, and its length, m. Coordinate of B1 from B2 along
+        rod 4, less than zero, m.
     """
     level, up = g.l1 - 2 * g.l5 + 0 * t, g.l3 * np.sin(t)
     rod = side * np.sqrt(np.maximum(_rod_4(g, t)[1], 0.0))
@@ -66,7 +67,7 @@ def _tangent(
 def _planar(
     g: Geometry, mode: WorkingMode, t: FloatArray, side: FloatArray, bend: FloatArray
 ) -> Point:
-    """Over theta_1: both rods in one direction psi, which arm 2 then has to reach."""
+    """Return points where both rods have one direction psi, over theta_1, and arm 2 reaches."""
     level, up, apart, gap = _tangent(g, t, side)
     with np.errstate(divide="ignore", invalid="ignore"):
         cosine = (g.l3**2 - gap**2 - apart**2) / (2 * gap * apart)
@@ -79,13 +80,13 @@ def _planar(
 
 
 def _leg1(g: Geometry, mode: WorkingMode, t: FloatArray, up: FloatArray, _: FloatArray) -> Point:
-    """Over the rods' elevation from the plane of arm 1, in line with it."""
+    """Return points where leg 1 is stretched or folded, over the angle of the rods to arm 1."""
     square = (g.l3 + g.l4 * np.cos(t)) ** 2 - g.l1**2
     return g.l4 * np.sin(t), up * np.sqrt(np.maximum(square, 0.0)), 1.0 + 0 * t, 0.0 * t
 
 
 def _leg2(g: Geometry, mode: WorkingMode, t: FloatArray, far: FloatArray, _: FloatArray) -> Point:
-    """Circles about A2."""
+    """Return points where leg 2 is stretched or folded: circles about A2."""
     radius = np.abs(g.l4 + far * g.l3)
     x, z = radius * np.cos(t) + 2 * g.l5 - g.l1, radius * np.sin(t)
     return x, z, 1.0 + 0 * t, 0.0 * t
@@ -94,14 +95,14 @@ def _leg2(g: Geometry, mode: WorkingMode, t: FloatArray, far: FloatArray, _: Flo
 def _elevation(
     g: Geometry, mode: WorkingMode, t: FloatArray, side: FloatArray, _: FloatArray
 ) -> Point:
-    """Over theta_1: C1 as high as B1."""
+    """Return points where C1 is as high as B1, over theta_1."""
     y, square = _rod_4(g, t)
     x, sin = side * np.sqrt(np.maximum(square, 0.0)), np.sin(t)
     return x, g.l3 * sin, mode.leg1 * y * sin, 0.0 * t
 
 
 def _real(g: Geometry, factor: str, first: int) -> Callable[[FloatArray], FloatArray]:
-    """What is positive where a curve's branch is real, over its angle."""
+    """Return a function of the angle that is positive where a branch of a curve is real."""
     if factor == "leg1":
         return lambda t: (g.l3 + g.l4 * np.cos(t)) ** 2 - g.l1**2
     if factor == "elevation":
@@ -129,7 +130,7 @@ _CURVES: dict[str, tuple[Curve, tuple[int, ...]]] = {
 
 @dataclass(frozen=True)
 class _Arcs:
-    """All arcs (m,) of one factor: their signs, and their intervals of the angle, rad."""
+    """All m arcs of one factor: their signs (m,), and their intervals of the angle (m,), rad."""
 
     curve: Curve
     geometry: Geometry
@@ -140,14 +141,14 @@ class _Arcs:
     half: FloatArray
 
     def at(self, arc: IntArray, t: FloatArray) -> Point:
-        """Points at t (k, ...) of arcs (k,)."""
+        """Return points at t (k, ...) of arcs (k,)."""
         arc = arc.reshape(-1, *[1] * (t.ndim - 1))
         angle = self.middle[arc] - self.half[arc] * np.cos(t)
         signs = self.first[arc] + 0 * t, self.second[arc] + 0 * t
         return self.curve(self.geometry, self.mode, angle, *signs)
 
     def sampled(self) -> tuple[Point, FloatArray]:
-        """Points (m, cells + 1), and how long the curve is between them, (m, cells) m."""
+        """Return points (m, cells + 1), and the length of the curve between them, (m, cells) m."""
         arcs, t = np.arange(len(self.first)), np.linspace(0, np.pi, _FINER * _CELLS + 1)
         x, z, p, q = self.at(arcs, np.broadcast_to(t, (len(arcs), len(t))))
         chords = np.hypot(np.diff(x), np.diff(z)).reshape(len(arcs), _CELLS, _FINER)
@@ -169,7 +170,7 @@ def _arcs(geometry: Geometry, mode: WorkingMode, factor: str) -> tuple[_Arcs, Po
 
 
 def _intervals(real: Callable[[FloatArray], FloatArray]) -> list[tuple[float, float]]:
-    """Where a function of an angle is positive, in a turn; short ones are found by extrema."""
+    """Return the intervals of a turn in which a function is positive, short ones included."""
     t = np.linspace(0.0, 2 * np.pi, _GRID + 1)
     values = real(t)
     towards = np.abs(values)
@@ -191,7 +192,7 @@ def _intervals(real: Callable[[FloatArray], FloatArray]) -> list[tuple[float, fl
 def _zoom(
     function: Callable[[FloatArray], FloatArray], low: FloatArray, high: FloatArray
 ) -> FloatArray:
-    """Where a function of (n, nodes) is least between low and high (n,)."""
+    """Return the minimum of a function of (n, nodes) between low and high (n,)."""
     steps, rows = np.linspace(0, 1, _NODES), np.arange(len(low))
     found = low
     for _ in range(_ROUNDS):
@@ -206,21 +207,21 @@ def _zoom(
 def nearest(
     points: FloatArray, limit: FloatArray, mode: WorkingMode, geometry: Geometry
 ) -> tuple[FloatArray, FloatArray, IntArray]:
-    """The nearest point of all these surfaces on a working mode, if it is nearer than a limit.
+    """Find the nearest point of all these surfaces on a working mode, nearer than a limit.
 
-    Every cell of every arc is looked into that can hold something nearer than what is known, by the
-    distances of its ends and its length.
+    The search enters each cell of each arc that can hold a nearer point than the nearest so far, by
+    the distances of its ends and its length.
 
     Args:
         points: (n, 3) m, 0 <= y <= l7.
-        limit: (n,) m. Not more than the distance to the planes y = 0, |y| = l7 and to the edge of
-            leg 3's reach.
+        limit: (n,) m, at most the distance to the planes y = 0, |y| = l7 and to the boundary of
+            leg 3.
         mode: The working mode.
         geometry: Link lengths.
 
     Returns:
-        Distance (n,) m, foot (n, 3) m and factor (n,), an index of all; ``limit``, the point itself
-        and -1 where nothing is nearer.
+        Distance (n,) m, foot (n, 3) m and index of the factor (n,). Where nothing is nearer, these
+        are ``limit``, the point itself and -1.
     """
     distance, feet, factor = limit.copy(), points.copy(), np.full(len(points), -1)
     for start in range(0, len(points), _BLOCK):
@@ -238,12 +239,12 @@ def nearest(
 def _feet(
     points: FloatArray, limit: FloatArray, mode: WorkingMode, g: Geometry, name: str
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Row, distance and foot of what may be nearer than the limit on one factor's surface."""
+    """Return row, distance and foot of points of one surface that may be nearer than the limit."""
     arcs, (x, z, p, q), length = _arcs(g, mode, name)
-    link3 = points - [g.l2, 0, 2 * g.l6]  # C1, were link 7 of no length
+    link3 = points - [g.l2, 0, 2 * g.l6]  # C1 for a link 7 of length 0
 
     def offset(rows: FloatArray, x: FloatArray, z: FloatArray) -> tuple[FloatArray, ...]:
-        """Distance, and level from C1 to P in x and altogether."""
+        """Return the distance, and the level distance from C1 to P along x and in the plane xy."""
         across, side, up = (rows[..., axis] for axis in range(3))
         level = across - x
         radius = np.hypot(level, side)

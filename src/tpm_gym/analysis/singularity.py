@@ -1,15 +1,15 @@
-"""Singular configurations: which they are, of what kind, and how far away; batched.
+"""Singular configurations: their factors, their kind, and the distance to the nearest one.
 
-A configuration is singular where one of eight factors vanishes: the parallel ones are those of
-det A, the serial ones those of det B (section "Singularity analysis", Eqs. 16 and 17, corrected),
-and the last, the elevation z_C1 - z_B1 of rods 4, is that of the constraint which keeps link 3'
-from turning about y. The paper lacks it; with it the parallel ones are complete: the closures'
-determinant in xC, zC, beta and that turn is a product of the four. Everything is in the paper
-frame, in metres and radians.
+A configuration is singular where one of eight factors is zero. Three parallel factors make up
+det A and four serial factors make up det B (section "Singularity analysis", Eqs. 16 and 17,
+corrected). The eighth factor is the elevation z_C1 - z_B1 of rods 4: where it is zero, nothing
+keeps link 3' from turning about y, a constraint singularity that the paper lacks. The determinant
+of the closures in xC, zC, beta and this turn is a product of the elevation and the three parallel
+factors. Everything is in the paper frame, in metres and radians.
 
-All functions raise InputError for what is no array (..., 3) of numbers. Those that
-classify raise it also for entries that are not finite, UnreachableError if some entry does not
-exist on the branch, and ConfigurationError if the tolerance is not between 0 and 1.
+All functions take arrays (..., 3) of numbers and raise InputError for anything else. The functions
+that classify raise InputError for entries that are not finite too, UnreachableError if a row does
+not exist on the branch, and ConfigurationError if the tolerance is not between 0 and 1.
 """
 
 from dataclasses import dataclass
@@ -28,8 +28,7 @@ from tpm_gym.kinematics.jacobian import factors_at as factors_at
 from tpm_gym.kinematics.modes import DEFAULT_ASSEMBLY, ELBOWS_OUT, AssemblyMode, WorkingMode
 
 FACTORS = equations.Factors._fields
-"""Names of the factors, in the order of every axis of length 8 here: 3 parallel, 4 serial, 1 of a
-constraint."""
+"""Names of the factors, in the order of every axis of length 8: 3 parallel, 4 serial, elevation."""
 
 _SIN_BETA, _PLANAR, _COS_BETA, _LEG3 = (
     FACTORS.index(name) for name in ("sin_beta", "planar", "cos_beta", "leg3")
@@ -37,7 +36,7 @@ _SIN_BETA, _PLANAR, _COS_BETA, _LEG3 = (
 
 
 class SingularityType(IntFlag):
-    """The kinds of Gosselin and Angeles (1990), and constraint singularities; they add up."""
+    """Kinds of Gosselin and Angeles (1990), and constraint singularities, as flags."""
 
     NONE = 0
     SERIAL = 1
@@ -48,13 +47,13 @@ class SingularityType(IntFlag):
 
 @dataclass(frozen=True)
 class Classification:
-    """What :func:`classify` returns.
+    """Kind of singularity of each configuration, from :func:`classify`.
 
     Attributes:
         kind: (...,) values of :class:`SingularityType`.
-        vanishing: (..., 8) bool, which of :data:`FACTORS` are zero within the tolerance.
-        factors: (..., 8), the factors made dimensionless by :func:`dimensionless`.
-        tolerance: What "zero" means here.
+        vanishing: (..., 8) bool, true for :data:`FACTORS` that are zero within the tolerance.
+        factors: (..., 8), the factors, made dimensionless by :func:`dimensionless`.
+        tolerance: Largest absolute value that counts as zero.
     """
 
     kind: IntArray
@@ -65,13 +64,13 @@ class Classification:
 
 @dataclass(frozen=True)
 class NearestSingularity:
-    """What :func:`nearest_singularity` returns.
+    """Nearest singular position of each point, from :func:`nearest_singularity`.
 
     Attributes:
         distance: (...,) m; NaN where not valid.
-        point: (..., 3) m, a singular position of P at that distance; NaN where not valid.
-        factor: (...,) index in :data:`FACTORS` of what vanishes there; -1 where not valid.
-        valid: (...,) bool, whether the position is reachable on both branches.
+        point: (..., 3) m, singular position of P at this distance; NaN where not valid.
+        factor: (...,) index in :data:`FACTORS` of the factor that is zero; -1 where not valid.
+        valid: (...,) bool, true where the point is reachable on both branches.
     """
 
     distance: FloatArray
@@ -81,10 +80,10 @@ class NearestSingularity:
 
 
 def dimensionless(values: Factors, geometry: Geometry = PAPER) -> FloatArray:
-    """The factors (..., 8) over their natural sizes, so that one tolerance suits all.
+    """Divide the factors by lengths, so that one tolerance suits all; return (..., 8).
 
-    level3 and elevation over l4, planar over l4^2, legs over l3 l4; sin(beta) and cos(beta) as they
-    are.
+    level3 and elevation are divided by l4, planar by l4^2, and the legs by l3 l4. sin(beta) and
+    cos(beta) stay as they are.
     """
     l3, l4 = geometry.l3, geometry.l4
     sizes = np.array([1.0, l4, l4**2, 1.0, l3 * l4, l3 * l4, l3 * l4, l4])
@@ -101,11 +100,10 @@ def classify(
     geometry: Geometry = PAPER,
     tolerance: float = 1e-6,
 ) -> Classification:
-    """Tell what kind of singularity theta (..., 3) rad is in (section "Singularity analysis").
+    """Classify joint angles theta (..., 3) rad (section "Singularity analysis").
 
-    A factor made dimensionless counts as zero up to ``tolerance``. From joint angles, a factor that
-    merges two branches is known to the square root of rounding only, so less than 1e-7 makes no
-    sense here.
+    A dimensionless factor counts as zero up to ``tolerance``. Use 1e-7 or more: a factor that
+    merges two branches is computed from joint angles to the square root of rounding only.
     """
     return _classify(factors(theta, branch, geometry), geometry, tolerance)
 
@@ -116,12 +114,12 @@ def classify_at(
     geometry: Geometry = PAPER,
     tolerance: float = 1e-6,
 ) -> Classification:
-    """Tell what kind of singularity points (..., 3) m are in, on one working mode.
+    """Classify points (..., 3) m on one working mode.
 
-    A factor made dimensionless counts as zero up to ``tolerance``. A leg's factor grows as the
-    square root of the distance to its boundary: 1e-6 is reached 1e-12 m from it.
+    A dimensionless factor counts as zero up to ``tolerance``. The factor of a leg grows as the
+    square root of the distance to its boundary: 1e-12 m from the boundary it is 1e-6.
     """
-    inverse(position, branch, geometry)  # raises where it is not reachable, and says why
+    inverse(position, branch, geometry)  # raises UnreachableError with the reason
     return _classify(factors_at(position, branch, geometry), geometry, tolerance)
 
 
@@ -131,14 +129,13 @@ def nearest_singularity(
     assembly: AssemblyMode = DEFAULT_ASSEMBLY,
     geometry: Geometry = PAPER,
 ) -> NearestSingularity:
-    """Distance from points (..., 3) m to the nearest singular point, in Cartesian space.
+    """Find the nearest singular position of points (..., 3) m, in Cartesian space.
 
-    That is the radius of the largest ball about the point in which P can move without meeting a
-    singularity, of a constraint or not. The planes y = 0 (sin(beta) = 0) and |y| = l7
-    (cos(beta) = 0) are exact, and so is leg 3 (its boundary is a torus). The other surfaces are
-    curves that link 7 sweeps; wherever a curve can be nearer than what is known, the foot is sought
-    (:mod:`tpm_gym.analysis.sheets`). Points that are not finite, or not on both branches, are not
-    valid.
+    Its distance is the radius of the largest ball about the point in which P can move without a
+    singularity of any kind. The planes y = 0 (sin(beta) = 0) and |y| = l7 (cos(beta) = 0) are
+    exact, and so is the boundary of leg 3, a torus. The other surfaces are curves that link 7
+    sweeps. Their nearest points are found numerically (:mod:`tpm_gym.analysis.sheets`). Points that
+    are not finite, or not on both branches, are not valid.
     """
     points = np.array(position, dtype=np.float64)
     values = dimensionless(factors_at(points, branch, geometry), geometry)
@@ -148,7 +145,7 @@ def nearest_singularity(
     shape = valid.shape
     distance, feet = np.full(valid.size, np.nan), np.full((valid.size, 3), np.nan)
     factor, rows = np.full(valid.size, -1), valid.ravel()
-    mirror = np.array([1, assembly.sin_beta, 1])  # both halves give the same numbers
+    mirror = np.array([1, assembly.sin_beta, 1])  # the halves y > 0 and y < 0 are mirror images
     inside = points.reshape(-1, 3)[rows] * mirror
     edge, at_edge, which = _edges(inside, geometry)
     distance[rows], foot, found = sheets.nearest(inside, edge, branch, geometry)
@@ -171,7 +168,7 @@ def _classify(values: Factors, geometry: Geometry, tolerance: float) -> Classifi
 
 
 def _edges(points: FloatArray, geometry: Geometry) -> tuple[FloatArray, FloatArray, IntArray]:
-    """The nearest of the planes y = 0, y = l7 and the torus of leg 3: distance, foot, factor."""
+    """Return distance, foot and factor of the nearest of y = 0, y = l7 and the torus of leg 3."""
     centre = np.array([geometry.l1 - geometry.l2, 0.0, geometry.l6])
     offset = points - centre
     radius = np.hypot(offset[:, 0], offset[:, 2])
@@ -180,8 +177,8 @@ def _edges(points: FloatArray, geometry: Geometry) -> tuple[FloatArray, FloatArr
     spoke = np.stack([level, np.zeros_like(radius), offset[:, 2] / safe], axis=-1)
     distances, feet = [points[:, 1], geometry.l7 - points[:, 1]], [points * [1, 0, 1]]
     feet.append(feet[0] + [0, geometry.l7, 0])
-    # Rod 3 in the half plane of P about the axis of motor 3: stretched beyond the elbow on P's
-    # side (outer part of the torus), or folded over that on the far side (inner part).
+    # Rod 3 lies in the half plane of P about the axis of motor 3. It is stretched beyond the elbow
+    # on the side of P (outer part of the torus), or folded over the other elbow (inner part).
     for side in (1, -1):
         elbow = centre + side * geometry.l3 * spoke
         rod = points - elbow

@@ -1,13 +1,13 @@
-"""The singular surfaces as polynomials in x, y, z, as elimination leaves them (Figs. 4 and 5).
+"""Singular surfaces as polynomials in x, y, z, by elimination of the joint angles (Figs. 4 and 5).
 
-A factor of Eqs. (16) and (17) depends on the joint angles, so on the working mode. Where the angles
-are eliminated, one polynomial remains that vanishes on the sheets of all working modes. Those of
-level3, planar, legs 1 and 2 and the constraint are curves in (xC, zC) first, :data:`CURVES`; with
-xC = x - l2 - u and u^2 = l7^2 - y^2, a surface is the product of its curve at both signs of u:
-even in u, so a polynomial in x, y, z of twice the degree.
+A factor of Eqs. (16) and (17) depends on the joint angles, so on the working mode. After
+elimination of the angles, one polynomial remains that is zero on the sheets of all working modes.
+For level3, planar, legs 1 and 2 and the constraint this is first a curve in (xC, zC),
+:data:`CURVES`. Let xC = x - l2 - u and u^2 = l7^2 - y^2. The surface is the product of its curve at
+both signs of u. The product is even in u, so it is a polynomial in x, y, z of twice the degree.
 
-Everything here is sums and products of what is given: numbers, arrays, or symbols of sympy, which
-shows the coefficients. Lengths and coordinates share a unit.
+The functions only add and multiply, so they take numbers, arrays, or symbols of sympy, which shows
+the coefficients. Lengths and coordinates must have the same unit.
 """
 
 from typing import Any, Final
@@ -30,18 +30,21 @@ DEGREES: Final = {
 
 
 def _level3(x: Any, z: Any, g: Geometry) -> Any:
-    """Two circles: C3 is sqrt(l4^2 - l7^2) above or below B3, which is on the circle of arm 12."""
+    """Return the curve of level3, two circles.
+
+    C3 is sqrt(l4^2 - l7^2) above or below B3, which is on the circle of arm 12.
+    """
     a, b = x + 2 * g.l2 - g.l1, z + g.l6
     height2 = g.l4**2 - g.l7**2
     return (a**2 + b**2 + height2 - g.l3**2) ** 2 - 4 * height2 * b**2
 
 
 def _planar(x: Any, z: Any, g: Geometry) -> Any:
-    """Degree 16: two quadratics in 2 l3 sin(theta_1) = s have a root in common.
+    """Return the planar curve, of degree 16: two quadratics in s = 2 l3 sin(theta_1) share a root.
 
-    The first is cos^2 + sin^2 = 1, with 2 l1 l3 cos(theta_1) = n + z s from B1C1 = l4. The
-    second is B2 on the circle of arm 5, with B2C2 along the projection of B1C1 on y = 0, whose
-    length is the root of l4^2 - (l1 + l3 cos(theta_1))^2.
+    The first quadratic is cos^2 + sin^2 = 1, with 2 l1 l3 cos(theta_1) = n + z s from B1C1 = l4.
+    The second puts B2 on the circle of arm 5, with B2C2 along the projection of B1C1 on y = 0. The
+    length of this projection is the root of l4^2 - (l1 + l3 cos(theta_1))^2.
     """
     l1, l3, l4 = g.l1, g.l3, g.l4
     c2 = x - 2 * g.l5 + l1  # level, from A2
@@ -59,13 +62,13 @@ def _planar(x: Any, z: Any, g: Geometry) -> Any:
 
 
 def _leg(a: Any, b: Any, out: Any, g: Geometry) -> Any:
-    """4 times the square of the leg's factor, of C - A in and out of the plane of its arm."""
+    """Return 4 times the squared factor of a leg, from C - A: a, b in its plane, and out of it."""
     in_plane = a**2 + b**2
     return 4 * g.l3**2 * in_plane - (in_plane + out**2 + g.l3**2 - g.l4**2) ** 2
 
 
 def _constraint(x: Any, z: Any, g: Geometry) -> Any:
-    """z_C1 = z_B1, with cos(theta_1) from B1C1 = l4."""
+    """Return the curve z_C1 = z_B1, with cos(theta_1) from B1C1 = l4."""
     return (g.l1**2 + g.l3**2 - g.l4**2 + x**2 - z**2) ** 2 - 4 * g.l1**2 * (g.l3**2 - z**2)
 
 
@@ -80,14 +83,15 @@ CURVES: Final = {
 
 
 def polynomial(name: str, x: Any, y: Any, z: Any, geometry: Geometry = PAPER, u: Any = None) -> Any:
-    """The polynomial of one of :data:`DEGREES` at x, y, z of P.
+    """Compute the polynomial of a factor at x, y, z of P: numbers, arrays or symbols.
 
     Args:
-        name: Of the factor.
-        x: Number, array or symbol; so y and z.
+        name: Name of the factor, one of :data:`DEGREES`.
+        x: Coordinate of P.
+        y: Coordinate of P.
+        z: Coordinate of P.
         geometry: Lengths.
-        u: What has the square l7^2 - y^2, of either sign; by default that of numbers with
-            |y| <= l7, where the workspace ends.
+        u: Root of l7^2 - y^2, of either sign. The default computes it from numbers, |y| <= l7.
     """
     g = geometry
     if name == "sin_beta":

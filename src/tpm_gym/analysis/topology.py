@@ -1,20 +1,20 @@
 """Topology of the mechanism, and its mobility from the rank of its loop closures.
 
-Two counts of the degrees of freedom that share nothing but the joints' axes, in the paper frame:
+Two independent counts of the degrees of freedom start from the axes of the joints, in the paper
+frame:
 
-* :func:`analyse` follows the paper's section "Topological analysis": POC sets and Eqs. (1) to (5),
-  see :mod:`tpm_gym.analysis.poc`, on branches I, II, III and the pair R12, R13;
-* :func:`mobility` knows none of that theory: it takes the rank of the closure Jacobian of the
-  spanning tree and point closures that the simulator loads, with every rod and ball of the
-  parallelograms in it.
+* :func:`analyse` follows the paper's section "Topological analysis". It applies Eqs. (1) to (5) and
+  POC sets (:mod:`tpm_gym.analysis.poc`) to branches I, II, III and the pair R12, R13.
+* :func:`mobility` computes the rank of the closure Jacobian of the spanning tree and point closures
+  that the simulator loads, with all rods and balls of the parallelograms.
 
-Both are taken at one configuration, and agree at singularities too. If z_C1 = z_B1, both find 4,
-instantaneously: the parallelogram of branch I then contains the direction y, and link 3' can begin
-to turn about it. That constraint singularity is not among the factors of Eqs. (16) and (17), which
-take for granted that link 3' only translates.
+Both describe one configuration, and they agree at singularities too. If z_C1 = z_B1, both find 4
+instantaneous freedoms: the parallelogram of branch I then contains the direction y, and link 3' can
+begin to turn about y. Eqs. (16) and (17) have no factor for this constraint singularity, because
+they assume that link 3' only translates.
 
-Functions of joint angles raise InputError for what is not three finite numbers, and
-UnreachableError if the branch does not exist there.
+Functions of joint angles take three finite numbers and raise InputError for anything else. They
+raise UnreachableError if the branch does not exist there.
 """
 
 from collections.abc import Mapping
@@ -43,21 +43,21 @@ from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.mechanism.bodies import Mechanism, Place
 from tpm_gym.mechanism.tree import ACTUATED_JOINTS, build, joint_angles
 
-# Singular values up to the first fraction of the largest are zeros, from the second on they are
-# not, and in between the rank is in doubt. Rounding leaves zeros of some 1e-16.
+# Fractions of the largest singular value. Values up to the first one are zero, and values from the
+# second one are not. In between, the rank is uncertain. Rounding makes zeros of about 1e-16.
 _ZERO, _NOT_ZERO = 1e-11, 1e-7
 
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """The mechanism as the paper's topology section sees it, at one configuration.
+    """Mechanism as in the paper's topology section, at one configuration.
 
     Attributes:
-        branches: I, II (base to link 3') and III (base to platform 1).
+        branches: Branches I, II (base to link 3') and III (base to platform 1).
         wrist: R12 and R13, from link 3' to platform 1.
         link_3p: (3,) m, base point C1 of link 3'.
-        platform: (3,) m, base point E1 of platform 1: on the axis of R13, so that R12, R13
-            contribute no dependent element.
+        platform: (3,) m, base point E1 of platform 1. It is on the axis of R13, so that R12 and
+            R13 contribute no dependent element.
     """
 
     branches: tuple[Chain, Chain, Chain]
@@ -67,7 +67,7 @@ class Structure:
 
     @property
     def chains(self) -> tuple[Chain, Chain, Chain]:
-        """The three chains from the base to link 3': I, II, and III with the wrist reversed."""
+        """Chains from the base to link 3': I, II, and III with the wrist reversed."""
         first, second, third = self.branches
         return first, second, Chain("III, wrist", (*third.units, *self.wrist.units[::-1]))
 
@@ -75,7 +75,7 @@ class Structure:
 def describe(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> Structure:
-    """Axes and rods of :mod:`tpm_gym.mechanism.tree` at theta (3,) rad, named as in the paper."""
+    """Describe the mechanism at theta (3,) rad, with the names of the paper."""
     mechanism = build(geometry)
     places = mechanism.places(joint_angles(theta, branch, geometry))
     joints = {link.joint.name: link for link in mechanism.links if link.joint}
@@ -90,7 +90,7 @@ def describe(
         )
 
     def sides(near: str, far: str, other: str) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Short link, rod, and middle of the far short link of a parallelogram."""
+        """Return short link, rod, and middle of the far short link of a parallelogram."""
         foot = places[joints[near].name].origin
         return ends[far] - ends[other], ends[far] - foot, (ends[far] + ends[other]) / 2
 
@@ -110,12 +110,12 @@ def describe(
 
 @dataclass(frozen=True, eq=False)
 class Topology(ParallelMechanism):
-    """What :func:`analyse` finds; the paper's decomposition (I and II, then III) comes first.
+    """Topology from :func:`analyse`, the paper's decomposition (I and II, then III) first.
 
     Attributes:
-        sub_mechanism: M_Pa(1-2) of the first Eq. (4): POC set of link 3' under branches I and II.
-        hsoc_1: POC set of the platform under those and R12, R13.
-        hsoc_2: POC set of the platform under branch III.
+        sub_mechanism: M_Pa(1-2) of the first Eq. (4): POC set of link 3' on branches I and II.
+        hsoc_1: POC set of the platform on branches I and II with R12, R13.
+        hsoc_2: POC set of the platform on branch III.
     """
 
     sub_mechanism: POCSet
@@ -127,7 +127,7 @@ def analyse(structure: Structure) -> Topology:
     """Apply Eqs. (1) to (5) to the structure at its configuration."""
     first, second, third = structure.chains
     sub_mechanism = parallel([chain.poc(structure.link_3p) for chain in (first, second)])
-    # Where link 3' does not turn, its POC set is the same about any point.
+    # Link 3' does not turn, so its POC set is the same about any point.
     hsoc_1 = serial([sub_mechanism, structure.wrist.poc(structure.platform)])
     hsoc_2 = structure.branches[2].poc(structure.platform)
     return Topology(
@@ -141,15 +141,14 @@ def analyse(structure: Structure) -> Topology:
 
 @dataclass(frozen=True, eq=False)
 class Mobility:
-    """What :func:`mobility` finds.
+    """Degrees of freedom from the closure Jacobian, from :func:`mobility`.
 
     Attributes:
         dof: Freedoms that move the platform or a motor.
-        idle: Freedoms that move neither: end link 10 rolling about its own axis, R33.
+        idle: Freedoms that move neither: end link 10 rolls about its own axis, R33.
         rank: Rank of the closure Jacobian.
-        redundant: Number of its rows that depend on others.
-        smallest: Smallest singular value of the closure Jacobian that is not zero, as a fraction of
-            the largest: how far the rank is from being in doubt.
+        redundant: Number of dependent rows.
+        smallest: Smallest singular value that is not zero, as a fraction of the largest.
         platform: POC set of the platform: all directions in which the loops let it move.
     """
 
@@ -166,20 +165,24 @@ def mobility(
 ) -> Mobility:
     """Count freedoms by the numerical rank of the closure Jacobian, at theta (3,) rad.
 
-    Singular values up to 1e-11 of the largest count as zeros.
+    Singular values up to 1e-11 of the largest count as zero.
 
     Raises:
-        SingularityError: If the rank is in doubt, since a singular value is between 1e-11 and 1e-7
-            of the largest: very near to a constraint singularity, but not on it.
+        SingularityError: A singular value is between 1e-11 and 1e-7 of the largest, so that the
+            rank is uncertain. theta is then very close to a constraint singularity.
     """
     return mobility_at(joint_angles(theta, branch, geometry), geometry)
 
 
 def mobility_at(angles: Mapping[str, float], geometry: Geometry = PAPER) -> Mobility:
-    """The same in any posture: ``angles`` holds every joint that turns, by name, in rad.
+    """Count freedoms like :func:`mobility`, at any angles.
+
+    Args:
+        angles: Angle of each joint that turns, by its name, rad.
+        geometry: Lengths.
 
     Raises:
-        SingularityError: As :func:`mobility`.
+        SingularityError: The rank is uncertain.
     """
     mechanism = build(geometry)
     jacobian = closure_jacobian(mechanism, angles)
@@ -204,11 +207,15 @@ def mobility_at(angles: Mapping[str, float], geometry: Geometry = PAPER) -> Mobi
 
 
 def closure_jacobian(mechanism: Mechanism, angles: Mapping[str, float]) -> FloatArray:
-    """Derivative of the gaps of all closures by the joint angles of the spanning tree.
+    """Differentiate the gaps of all closures by the joint angles of the spanning tree.
 
-    (3 closures, joints) m/rad, in the paper frame: rows in the order of ``mechanism.closures``
-    (x, y, z of ``point_a`` - ``point_b``), columns in the order of ``mechanism.links``. ``angles``
-    holds every joint that turns, by name, in rad.
+    Args:
+        mechanism: Spanning tree and closures.
+        angles: Angle of each joint that turns, by its name, rad.
+
+    Returns:
+        (3 closures, joints) m/rad, in the paper frame. Rows are x, y, z of ``point_a - point_b`` in
+        the order of ``mechanism.closures``, columns are in the order of ``mechanism.links``.
     """
     places = mechanism.places(angles)
 
@@ -221,7 +228,7 @@ def closure_jacobian(mechanism: Mechanism, angles: Mapping[str, float]) -> Float
 
 
 def _rank(values: FloatArray) -> int:
-    """Numerical rank from singular values in descending order; SingularityError if in doubt."""
+    """Return the rank from singular values in descending order; SingularityError if uncertain."""
     rank = int((values > _ZERO * values[0]).sum())
     if values[rank - 1] < _NOT_ZERO * values[0]:
         raise SingularityError("a singular value of the loop closures", values[rank - 1])
@@ -229,16 +236,16 @@ def _rank(values: FloatArray) -> int:
 
 
 def _moving_joints(mechanism: Mechanism) -> list[str]:
-    """Names of the joints of the tree that turn, in the order of the links.
+    """Return the names of the joints of the tree that turn, in the order of the links.
 
-    The cup's slide, the one prismatic joint, belongs to the tool and not to the mechanism.
+    The one prismatic joint, the slide of the cup, is part of the tool and not of the mechanism.
     """
     joints = (link.joint for link in mechanism.links)
     return [joint.name for joint in joints if joint and joint.kind != "prismatic"]
 
 
 def _axis(mechanism: Mechanism, places: Mapping[str, Place], link: str) -> FloatArray:
-    """Axis of the joint that holds a link, in the paper frame; a joint does not turn its axis."""
+    """Return the axis of the joint that holds a link, in the paper frame."""
     joint = mechanism.link(link).joint
     axis: FloatArray = places[link].rotation @ np.asarray(joint.axis if joint else (0.0, 0.0, 0.0))
     return axis
@@ -247,7 +254,7 @@ def _axis(mechanism: Mechanism, places: Mapping[str, Place], link: str) -> Float
 def _rates(
     mechanism: Mechanism, places: Mapping[str, Place], link: str, point: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Velocity of a point of a link (3, n) m/rad, and its angular velocity (3, n), per joint."""
+    """Return velocity (3, n) m/rad of a point of a link, and angular velocity (3, n), per joint."""
     joints = _moving_joints(mechanism)
     linear, angular = np.zeros((3, len(joints))), np.zeros((3, len(joints)))
     while (joint := mechanism.link(link).joint) is not None:

@@ -8,13 +8,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from tyro.conf import OmitSubcommandPrefixes, Positional, subcommand
+from tyro.conf import Positional, subcommand
 
 from tpm_gym import TPMError
 from tpm_gym.learning.configuration import ResumeConfig, TrainingConfig
 from tpm_gym.learning.evaluation import EvaluationConfig, evaluate
-from tpm_gym.learning.report.records import Collect, Write, collect, write
-from tpm_gym.learning.study import StudyConfig, study
 from tpm_gym.learning.training import resume, train
 
 
@@ -32,22 +30,11 @@ class ExportConfig:
     """Load the .zip file, which can run any code."""
 
 
-@dataclass(frozen=True)
-class ReportConfig:
-    """Condense runs into records, or write the page of results from them."""
-
-    action: OmitSubcommandPrefixes[
-        Annotated[Collect, subcommand("collect")] | Annotated[Write, subcommand("write")]
-    ]
-
-
 Command = (
     Annotated[TrainingConfig, subcommand("train")]
     | Annotated[ResumeConfig, subcommand("resume")]
     | Annotated[EvaluationConfig, subcommand("evaluate")]
     | Annotated[ExportConfig, subcommand("export")]
-    | Annotated[StudyConfig, subcommand("study")]
-    | Annotated[ReportConfig, subcommand("report")]
 )
 
 
@@ -77,12 +64,6 @@ def _run(command: Any) -> signal.Signals | None:
             return resume(command)
         case EvaluationConfig():
             evaluate(command)
-        case StudyConfig():
-            study(command)
-        case ReportConfig(Collect() as action):
-            print(*collect(action), sep="\n")
-        case ReportConfig(Write() as action):
-            print(*write(action), sep="\n")
         case ExportConfig():
             from tpm_gym.learning.export import convert  # imported here, since it needs PyTorch
 

@@ -1,25 +1,26 @@
-"""What is kept of runs, one small file each, and the page that is written from these files.
+"""Records: one small file for each run, from which the page is written.
 
-``collect`` condenses every run in a folder (its config.json, evaluations.jsonl and the evaluations
-in ``tests/``, which a study has written there), and every bisection, which has tests alone.
-``write`` needs the records alone, so a fresh clone can do it. Runs that did not finish are kept.
+``collect`` condenses each run folder (config.json, evaluations.jsonl, the tests in ``tests/``) and
+each bisection, which has tests alone. Runs that did not finish are kept.
 """
 
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-from tpm_gym.learning import provenance
+from tpm_gym.learning.checkpoint import CheckpointStore
 from tpm_gym.learning.errors import ConfigError
-from tpm_gym.learning.report.page import Record, page
-from tpm_gym.learning.robustness import nominal
-from tpm_gym.learning.run_folder import CONFIG_FILE, TESTS, WHOLE, evaluations
+from tpm_gym.learning.provenance import write_json
+from tpm_gym.learning.run_folder import CHECKPOINTS, CONFIG_FILE, TESTS, WHOLE, evaluations
+
+from .bisection import nominal
+
+Record = dict[str, Any]
 
 RECORDS: Final = Path("docs", "results")
-PAGE: Final = Path("docs", "results.md")
 
-_KEPT: Final = (
+_OF_RUNS: Final = (
     "env",
     "algo",
     "recipe_file",
@@ -37,7 +38,7 @@ _KEPT: Final = (
     "machine",
     "command",
 )
-_KEPT_OF_BISECTIONS: Final = (
+_OF_BISECTIONS: Final = (
     "env",
     "policy",
     "episodes",
@@ -46,9 +47,8 @@ _KEPT_OF_BISECTIONS: Final = (
     "machine",
     "command",
 )
-_KEPT_OF_TESTS: Final = ("success_at_end", "git_commit")
 _CURVES: Final = ("success_at_end", "return", "unsafe_share")
-_NOT_KEPT: Final = ("records", "versions", "machine", "policy", "env")
+_NOT_OF_TESTS: Final = ("records", "versions", "machine", "policy", "env")
 
 
 @dataclass(frozen=True)
@@ -62,22 +62,12 @@ class Collect:
     """Folder of the records, a file for each run."""
 
 
-@dataclass(frozen=True)
-class Write:
-    """Write the page and its figures from the records."""
-
-    records: Path = RECORDS
-    """Folder of the records."""
-
-    page: Path = PAGE
-    """The page; figures go into images/ beside it."""
-
-
 def collect(config: Collect) -> list[Path]:
-    """Condense every run and bisection of a folder; return the files written, in order of names.
+    """Condense each run and bisection of a folder; return the new files in order of their names.
 
     Raises:
-        ConfigError: The folder holds none, or one that :func:`condense` refuses.
+        ConfigError: The folder holds no run, or one that :func:`condense` refuses, or a record
+            would replace a file that is no record.
     """
     runs = {path.parent for path in config.runs.glob(f"*/{CONFIG_FILE}")}
     bisections = {path.parent.parent for path in config.runs.glob(f"*/{TESTS}/{WHOLE}")} - runs
@@ -86,24 +76,34 @@ def collect(config: Collect) -> list[Path]:
     written = []
     for folder in sorted(runs | bisections):
         path = config.to / f"{folder.name}.json"
-        record = condense(folder) if folder in runs else condense_bisection(folder)
-        provenance.write_json(path, record)
+        if path.exists():
+            _read_record(path)
+        write_json(path, condense(folder) if folder in runs else condense_bisection(folder))
         written.append(path)
     return written
 
 
-def condense(run: Path) -> Record:
-    """Return what is kept of a run, finished or not.
+def read_records(folder: Path) -> list[Record]:
+    """Return the records of a folder in order of their names.
 
     Raises:
-        ConfigError: A file of it is damaged, or the run is of another machine or drive than its id
-            says, which a record has no place for.
+        ConfigError: A file is damaged, or is no record.
+    """
+    return [_read_record(path) for path in sorted(folder.glob(WHOLE))]
+
+
+def condense(run: Path) -> Record:
+    """Return the record of a run, finished or not.
+
+    Raises:
+        ConfigError: A file of the run is damaged, or the run has another machine or drive than its
+            id says: records have no place for these.
     """
     config = _read(run / CONFIG_FILE)
     other = dict(config["env_options"])
     engine = other.pop("engine", "pybullet")
     if other:
-        valid = "the page compares runs of the ids as they are; move this one elsewhere"
+        valid = "the page compares runs of the ids as they are; move this run elsewhere"
         raise ConfigError(f"--runs {run}: was made with {other}; {valid}")
     try:
         found = evaluations(run)
@@ -114,28 +114,30 @@ def condense(run: Path) -> Record:
     for name in _CURVES:
         if found and all(name in evaluation for evaluation in found):
             curves[name] = [round(evaluation[name]["mean"], 6) for evaluation in found]
-    files = sorted(run.glob(f"{TESTS}/{WHOLE}"))
-    # Without the episodes, and what the run says already
-    tests = {
-        path.stem: {name: value for name, value in _read(path).items() if name not in _NOT_KEPT}
-        for path in files
-    }
+    saved = CheckpointStore(run / CHECKPOINTS).steps()
     return {
         "run": run.name,
-        **{name: config.get(name) for name in _KEPT},
+        **{name: config.get(name) for name in _OF_RUNS},
         "engine": engine,
         "resumed": len(config.get("resumed", [])),
+        "reached": max([0, *steps, *saved]),
         "finished": bool(steps) and steps[-1] >= config["steps"],
         "evaluations": curves,
-        "tests": tests,
+        # The episodes are left out, and the entries that the run has itself.
+        "tests": {
+            path.stem: {
+                name: value for name, value in _read(path).items() if name not in _NOT_OF_TESTS
+            }
+            for path in sorted(run.glob(f"{TESTS}/{WHOLE}"))
+        },
     }
 
 
 def condense_bisection(folder: Path) -> Record:
-    """Return what is kept of the tests of one attribute, in order of its values.
+    """Return the record of a bisection, its tests in order of their values.
 
     Raises:
-        ConfigError: A file of it is damaged.
+        ConfigError: A file of the bisection is damaged.
     """
     tests = [_read(path) for path in folder.glob(f"{TESTS}/{WHOLE}")]
     try:
@@ -146,13 +148,13 @@ def condense_bisection(folder: Path) -> Record:
             "run": folder.name,
             "attribute": attribute,
             "engine": first["env_options"].get("engine", "pybullet"),
-            **{name: first[name] for name in _KEPT_OF_BISECTIONS},
+            **{name: first[name] for name in _OF_BISECTIONS},
             "tests": {
                 f"{test['randomisation'][attribute]:g}": {
-                    name: test[name] for name in _KEPT_OF_TESTS
+                    name: test[name] for name in ("success_at_end", "git_commit")
                 }
                 for test in tests
-                if test["episodes"] == first["episodes"]  # others are of before
+                if test["episodes"] == first["episodes"]  # others are from an earlier study
             },
         }
     except (KeyError, ValueError, AttributeError) as error:
@@ -169,16 +171,10 @@ def _read(path: Path) -> Record:
     return content
 
 
-def write(config: Write) -> list[Path]:
-    """Write the page and its figures; return the files written.
-
-    Raises:
-        ConfigError: A record is damaged.
-    """
-    from tpm_gym.learning.report.figures import draw  # here, since it imports matplotlib
-
-    records = [_read(path) for path in sorted(config.records.glob(WHOLE))]
-    figures = draw(records, config.page.parent / "images")
-    text = page(records, [figure.name for figure in figures])
-    provenance.write_whole(config.page, lambda part: part.write_text(text, encoding="utf-8"))
-    return [config.page, *figures]
+def _read_record(path: Path) -> Record:
+    record = _read(path)
+    needed = {"run", "env", "engine", "tests", "versions", "machine", "git_commit"}
+    needed |= {"episodes"} if "attribute" in record else {"evaluations", "finished", "recipe"}
+    if missing := sorted(needed - record.keys()):
+        raise ConfigError(f"{path} is no record: it lacks {', '.join(missing)}; move it elsewhere")
+    return record

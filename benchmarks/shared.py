@@ -1,17 +1,14 @@
-"""What the benchmarks share: a description of the machine, memory, quartiles, the figures' style.
-
-The scripts that train record versions and machine already, and the documentation's figures have
-their style; both are taken from there.
-"""
+"""Helpers of the benchmarks: description of the computer, memory, records, tables, quartiles."""
 
 from __future__ import annotations
 
 import ctypes
 import gc
+import json
 import os
 import platform
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,22 +18,14 @@ from numpy.typing import ArrayLike
 from tpm_gym.learning import provenance
 
 ROOT = Path(__file__).resolve().parents[1]
-__all__ = [
-    "describe",
-    "fill",
-    "give_back_free_memory",
-    "memory",
-    "open_files",
-    "processor_line",
-    "provenance",
-    "quartiles",
-]
 
 _PACKAGES = ("panda-gym", "gymnasium-robotics", "mujoco")
 
+# -- the computer ---------------------------------------------------------------------------------
+
 
 def describe(arguments: Sequence[str]) -> dict[str, Any]:
-    """What a speed depends on, and how to repeat it; no names of machines or folders.
+    """Describe the conditions of a measurement, without names of computers or folders.
 
     Args:
         arguments: The script and its arguments.
@@ -52,7 +41,7 @@ def describe(arguments: Sequence[str]) -> dict[str, Any]:
 
 
 def processor_line(description: dict[str, Any]) -> str:
-    """One line for tables and figures: processor, cores, Python, engine, load at the start."""
+    """Return processor, cores, Python, engine and load in one line, for tables and figures."""
     machine, versions = description["machine"], description["versions"]
     load = description["load_before"]
     busy = "" if load is None else f", load {load} at the start"
@@ -63,13 +52,13 @@ def processor_line(description: dict[str, Any]) -> str:
 
 
 def memory() -> tuple[float, str]:
-    """Memory of this process in MB (1e6 bytes), and what it is.
+    """Return the memory of this process, MB (1e6 bytes), and its kind.
 
-    Linux tells what is resident now. Elsewhere the standard library knows only the most that ever
-    was, which grows where the resident memory does, but never falls.
+    Linux has the resident memory. Elsewhere the standard library has its peak only, which grows
+    with the resident memory but never falls.
 
     Raises:
-        SystemExit: On a system where the standard library knows neither.
+        SystemExit: The standard library of this system has neither.
     """
     try:
         pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
@@ -85,10 +74,10 @@ def memory() -> tuple[float, str]:
 
 
 def give_back_free_memory() -> None:
-    """Collect garbage, and let the C library return what it holds free (glibc only).
+    """Collect garbage, and let the C library return free memory to the system (glibc only).
 
-    Without, the resident memory jumps by whatever hole a closed renderer happens to leave in the
-    heap, ten megabytes at a time, and says nothing about what is in use.
+    Otherwise a closed renderer leaves free memory in the heap, and the resident memory jumps by ten
+    megabytes without a change of the memory in use.
     """
     gc.collect()
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if os.name == "posix" else None
@@ -97,22 +86,45 @@ def give_back_free_memory() -> None:
 
 
 def open_files() -> int | None:
-    """Number of this process's open file descriptors; None where the system does not tell."""
+    """Return the number of open file descriptors; None if the system does not report it."""
     try:
         return len(os.listdir("/proc/self/fd"))
     except OSError:
         return None
 
 
+# -- records and pages ----------------------------------------------------------------------------
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """Return a record; an empty one if there is no file."""
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
+    """Yield the lines of a table in Markdown."""
+    yield "| " + " | ".join(head) + " |"
+    yield "|---" * len(head) + "|"
+    for row in rows:
+        yield "| " + " | ".join(row) + " |"
+
+
 def fill(page: Path, name: str, lines: Iterable[str]) -> None:
-    """Replace what stands in a page between ``<!-- name: begin -->`` and ``<!-- name: end -->``."""
+    """Replace the lines of a page between ``<!-- name: begin -->`` and ``<!-- name: end -->``."""
     begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
     before, rest = page.read_text(encoding="utf-8").split(begin)
     _, after = rest.split(end)
     page.write_text(before + "\n".join([begin, *lines, end]) + after, encoding="utf-8")
+    print("wrote", page.relative_to(ROOT))
 
 
 def quartiles(values: ArrayLike) -> tuple[float, float, float]:
-    """Lower quartile, median, upper quartile."""
+    """Return the lower quartile, the median and the upper quartile."""
     low, middle, high = np.percentile(np.asarray(values, dtype=np.float64), [25, 50, 75])
     return float(low), float(middle), float(high)
+
+
+def spread(values: Sequence[float], form: str) -> str:
+    """Format lower quartile, median and upper quartile as "median [lower, upper]"."""
+    low, middle, high = (form.format(value) for value in values)
+    return f"{middle} [{low}, {high}]"

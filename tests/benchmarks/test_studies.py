@@ -1,0 +1,713 @@
+"""Studies run what is left whatever dies on the way, and the page says what the runs did."""
+
+import itertools
+import json
+import os
+import shlex
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from paths import ROOT
+from processes import PYTHON, signalled
+from studies.__main__ import main
+from studies.bisection import ends, halving, nominal
+from studies.figures import draw, learning_curves, penalty, robustness
+from studies.page import PAGE, STUDIES, Write, command, page, settled, split, write
+from studies.plan import Bisection, Run, Study, plan_runs
+from studies.records import (
+    RECORDS,
+    Collect,
+    collect,
+    condense,
+    condense_bisection,
+    read_records,
+)
+from studies.running import execute, execute_there, run_all
+from trainings import PPO_RECIPE, SAC_RECIPE, assert_equal_runs, without_times
+
+import tpm_gym
+from tpm_gym.errors import ConfigurationError
+from tpm_gym.learning.checkpoint import CheckpointStore
+from tpm_gym.learning.errors import ConfigError
+from tpm_gym.learning.run_folder import claimed
+from tpm_gym.simulation.randomisation import LIMITS, Randomisation
+
+COMMAND = (PYTHON, "-m", "benchmarks.studies", "run")
+
+# -- the plan -------------------------------------------------------------------------------------
+
+
+def test_plans_have_every_recipe_and_seed(tmp_path: Path) -> None:
+    planned = plan_runs(Study("results", folder=tmp_path))
+    scratch = [run for run in planned if "--demonstrations 0" in " ".join(run.options)]
+    assert len(scratch) == 3 * 5  # pick-and-place with SAC
+    assert len(planned) == (5 + 2) * 5 + len(scratch)
+    weighted = plan_runs(Study("penalty", folder=tmp_path, engine="analytic"))
+    assert {run.env for run in weighted} == {env for env in tpm_gym.ENV_IDS if "Dense" in env}
+    assert len(weighted) == 4 * 2 * 5
+    assert all("--goals" in run.options for run in weighted)
+    longer = plan_runs(Study("penalty", folder=tmp_path, engine="analytic", steps=70_000))
+    assert all("--steps 70000" in " ".join(run.left()[0]) for run in longer)
+    bisections = plan_runs(Study("robustness", folder=tmp_path))
+    assert len(bisections) == 10 + 10 + 8  # without a puck there are no mass and friction of it
+    elsewhere = plan_runs(Study("results", folder=tmp_path, engine="analytic"))
+    runs = [*planned, *weighted, *longer, *bisections, *elsewhere]
+    assert len({run.folder for run in runs}) == len(runs)
+
+
+@pytest.mark.parametrize(
+    ("message", "plan", "options"),
+    [
+        ("--envs Nope: leaves no recipe of the plan; the default", "results", {"envs": ("Nope",)}),
+        ("--envs No: leaves no published", "robustness", {"envs": ["No"]}),
+        ("--steps 0", "results", {"steps": 0}),
+        ("engine = 'bullet'", "robustness", {"engine": "bullet"}),
+    ],
+)
+def test_plans_that_cannot_be_are_refused(message: str, plan: Any, options: Any) -> None:
+    with pytest.raises((ConfigError, ConfigurationError), match=message):
+        plan_runs(Study(plan, **options))
+
+
+def test_what_is_done_is_skipped_and_what_was_stopped_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--envs", "TPMReach-v0", "--algos", "sac", "--seeds", "1", "--episodes", "7"]
+    words = ["run", "--plan", "results", *words, "--folder", str(tmp_path), "--dry-run"]
+
+    def left() -> list[str]:
+        main(words)
+        return capsys.readouterr().out.split("\n")[:-1]
+
+    run = tmp_path / "TPMReach-v0-sac-pybullet-s0"
+    done = run / "tests" / "pybullet.json"
+    test = f"tpm-gym evaluate --policy {run} --env TPMReach-v0 --episodes 7"
+    test += f" --engine pybullet --json {done}"
+    first = "tpm-gym train --env TPMReach-v0 --algo sac --engine pybullet --test-episodes 0"
+    first += f" --seed 0 --run {run}"
+    assert left() == [first, test]
+    run.mkdir()
+    (run / "config.json").write_text('{"steps": 100}')
+    (run / "evaluations.jsonl").write_text('{"steps": 60}\n{"steps": 100, "wa')
+    assert left() == [f"tpm-gym resume {run}", test]
+    (run / "evaluations.jsonl").write_text('{"steps": 100}\n')
+    (run / "last.zip").write_text("")
+    assert left() == [test]
+    done.parent.mkdir()
+    done.write_text('{"episodes": 10}')
+    assert left() == [test]
+    done.write_text('{"episodes": 7}')
+    assert left() == [""]
+
+
+# -- running --------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Execute a run of the penalty plan, with a tiny recipe."""
+    folder = tmp_path_factory.mktemp("study")
+    study = Study("penalty", "analytic", ("TPMReachDense-v0",), seeds=1, episodes=4, folder=folder)
+    (planned, _) = plan_runs(replace(study, pybullet_episodes=3))
+    recipe = folder / "ppo.yml"
+    recipe.write_text(PPO_RECIPE.format(env=planned.env, envs=3), encoding="utf-8")
+    words = ("--recipe", str(recipe), "--steps", "240", "--eval-episodes", "2")
+    small = replace(planned, options=(*planned.options, *words))
+    assert execute(small) is None, small.folder.with_suffix(".log").read_text()
+    return small
+
+
+def test_a_run_is_tested_in_both_engines_and_its_record_says_what_its_files_say(run: Run) -> None:
+    assert run.left() == []
+    kept = condense(run.folder)
+    assert (kept["engine"], kept["penalty_weight"], kept["goals"]) == ("analytic", 0.0, "tempting")
+    assert (kept["finished"], kept["reached"]) == (True, 240)
+    lines = (run.folder / "evaluations.jsonl").read_text(encoding="utf-8").splitlines()
+    returns = [json.loads(line)["return"]["mean"] for line in lines]
+    assert kept["evaluations"]["return"] == pytest.approx(returns, abs=1e-6)
+    for engine, episodes in (("analytic", 4), ("pybullet", 3)):
+        test = json.loads((run.folder / "tests" / f"{engine}.json").read_text())
+        assert (test["episodes"], test["goals"]) == (episodes, "tempting")
+        # Whatever the weight in training, returns are comparable.
+        assert test["penalty_weight"] == 1.0
+        for name in ("success_at_end", "conditioning_min", "unsafe_share", "command"):
+            assert kept["tests"][engine][name] == test[name]
+        assert "records" not in kept["tests"][engine]
+    assert str(run.folder.parent) not in json.dumps(kept)
+
+
+@pytest.mark.parametrize("program", [list(sys.argv), ["another"]])
+def test_a_training_that_fails_is_told(
+    program: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", program)
+    failing = Run(tmp_path / "runs" / "b", "TPMReach-v0", "sac", ("--steps", "0"), ())
+    assert "failed with status 1" in (execute(failing) or "")
+    assert "--steps 0" in (tmp_path / "runs" / "b.log").read_text()
+    assert sys.argv == program
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no such locks")
+def test_a_training_that_outlives_its_node_is_waited_for(tmp_path: Path) -> None:
+    run = Run(tmp_path / "run", "TPMReach-v0", "sac", (), ())
+    run.folder.mkdir()
+    (run.folder / "config.json").write_text("{}")
+    with ExitStack() as other:
+        other.enter_context(claimed(run.folder))
+        threading.Timer(0.5, other.close).start()
+        assert "tpm-gym resume" in (execute(run) or "")
+    assert "another process" not in run.folder.with_suffix(".log").read_text()
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1:1", "nowhere"])
+def test_an_address_without_a_cluster_is_refused(address: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=f"--address {address}: no cluster answers"):
+        run_all([], Study("results", folder=tmp_path, address=address))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("missing", ["folder", "file"])
+def test_a_node_that_does_not_share_the_disk_is_told(missing: str, tmp_path: Path) -> None:
+    here = Path.cwd() if missing == "file" else tmp_path / "missing"
+    run = Run(tmp_path / "run", "TPMReach-v0", "sac", (), ())
+    assert "does not see" in (execute_there(run, here, tmp_path / "missing") or "")
+    assert list(tmp_path.iterdir()) == []
+
+
+def temporary() -> set[Path]:
+    return {*Path("/tmp").glob("tpm-*"), *Path("/tmp").glob("ray*"), *Path.home().glob(".ray/*")}
+
+
+@pytest.mark.slow
+def test_a_study_of_one_machine_runs_all_and_leaves_nothing_behind(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = temporary()
+    bisection = Bisection(tmp_path / "bisection", "TPMReach-v0", "latency", 2)
+    failing = Run(tmp_path / "failing", "TPMReach-v0", "sac", ("--steps", "0"), ())
+    assert run_all([failing, bisection], Study("results", folder=tmp_path)) == 1
+    printed = capsys.readouterr().out.splitlines()
+    assert f"{bisection.folder}: done" in printed
+    assert any(line.startswith(f"{failing.folder}: failed with status 1") for line in printed)
+    assert bisection.left() == []
+    names = ["bisection", "bisection.log", "failing.log"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == names
+    assert temporary() == before
+
+
+@pytest.mark.slow
+def test_nobody_else_can_reach_a_study_and_a_killed_one_leaves_nothing_behind(
+    tmp_path: Path,
+) -> None:
+    before = temporary()
+    words = ["--plan", "robustness", "--envs", "TPMReach-v0", "--folder", tmp_path, "--jobs", "1"]
+    driver = psutil.Popen([*COMMAND, *map(str, words)], cwd=ROOT)
+    try:
+        while not list(tmp_path.glob("*.log")):  # Ray works
+            assert driver.is_running()
+            time.sleep(0.1)
+        (folder,) = temporary() - before
+        processes = [driver, *driver.children(recursive=True)]
+        listening = {
+            connection.laddr.ip.removeprefix("::ffff:")
+            for process in processes
+            for connection in process.net_connections()
+            if connection.status == psutil.CONN_LISTEN
+        }
+        assert listening == {"127.0.0.1"}
+        assert folder.stat().st_mode & 0o777 == 0o700
+    finally:
+        driver.kill()
+        driver.wait()
+    latest = time.monotonic() + 60
+    while folder.exists():
+        assert time.monotonic() < latest
+        time.sleep(0.1)
+
+
+@pytest.mark.slow
+def test_ctrl_c_stops_a_study_with_checkpoints_saved(tmp_path: Path) -> None:
+    """As a terminal sends it: to the whole process group; a second signal would kill trainings."""
+    before = temporary()
+    words = ["--plan", "results", "--envs", "TPMReach-v0", "--algos", "sac", "--seeds", "2"]
+    words = [*COMMAND, *words, "--folder", str(tmp_path), "--jobs", "1"]
+    run = tmp_path / "TPMReach-v0-sac-pybullet-s0"
+    checkpoints = partial(run.glob, "checkpoints/0*")
+    status, output = signalled(words, lambda: list(checkpoints()), signal.SIGINT, cwd=ROOT)
+    assert status == 1, output
+    assert f"{run}: stopped: tpm-gym train --env TPMReach-v0" in output
+    assert "2 runs failed or were stopped" in output
+    log = run.with_suffix(".log").read_text(encoding="utf-8")
+    assert "stopped early by SIGINT, saved at step" in log
+    assert (run / "last.zip").is_file()
+    assert not (tmp_path / "TPMReach-v0-sac-pybullet-s1").exists()
+    assert temporary() == before
+
+
+@pytest.fixture
+def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """Two nodes of one CPU each."""
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    with tempfile.TemporaryDirectory(prefix="tpm-", dir="/tmp") as folder:
+        monkeypatch.setenv("RAY_TMPDIR", folder)
+        from ray.cluster_utils import Cluster
+
+        options = {"num_cpus": 1, "include_dashboard": False, "object_store_memory": 80 << 20}
+        found = Cluster(True, head_node_args=options)
+        found.add_node(**options)
+        yield found
+        found.shutdown()
+
+
+def raylet(node: Any) -> psutil.Process:
+    return psutil.Process(node.all_processes["raylet"][0].process.pid)
+
+
+def kill_worker(node: Any) -> None:
+    """Kill the process of a node that trains."""
+    children = raylet(node).children(recursive=True)
+    (worker,) = [child for child in children if child.name().startswith("ray::execute")]
+    worker.kill()
+
+
+def kill_node(node: Any) -> None:
+    """Kill all processes of a node at once, as a power cut does."""
+    for process in [*raylet(node).children(recursive=True), raylet(node)]:
+        process.kill()
+
+
+def small(folder: Path, seed: int) -> Run:
+    """A training of seconds, with a checkpoint every few moments."""
+    folder.mkdir(exist_ok=True)
+    recipe = folder / "sac.yml"
+    recipe.write_text(SAC_RECIPE.format(env="TPMReach-v0", train_freq=20), encoding="utf-8")
+    words = ["--recipe", str(recipe), "--seed", str(seed), "--steps", "2000"]
+    words += ["--eval-every", "1000", "--eval-episodes", "2", "--checkpoint-every", "50"]
+    test = ("pybullet", 2, ())
+    return Run(folder / f"run-s{seed}", "TPMReach-v0", "sac", tuple(words), (test,))
+
+
+def newest(run: Run) -> int:
+    """Step of the last checkpoint of a run."""
+    return max(CheckpointStore(run.folder / "checkpoints").steps(), default=-1)
+
+
+def lasting(run: Run) -> Any:
+    """The record of a run, without clocks, and without how often it went on."""
+    kept = without_times(condense(run.folder))
+    for test in kept["tests"].values():
+        del test["steps_per_second"]
+    return {name: value for name, value in kept.items() if name != "resumed"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kill", [kill_worker, kill_node])
+def test_a_death_midway_costs_what_came_after_the_last_checkpoint(
+    kill: Callable[[Any], None], cluster: Any, tmp_path: Path
+) -> None:
+    undisturbed = [small(tmp_path / "undisturbed", seed) for seed in range(2)]
+    for run in undisturbed:
+        assert execute(run) is None
+    runs = [small(tmp_path / "disturbed", seed) for seed in range(2)]
+    reached = []
+
+    def kill_midway() -> None:
+        while min(map(newest, runs)) < 100:
+            time.sleep(0.01)
+        (node,) = cluster.worker_nodes
+        kill(node)
+        reached.extend(map(newest, runs))
+
+    killer = threading.Thread(target=kill_midway)
+    killer.start()
+    assert run_all(runs, Study("results", folder=tmp_path, address=cluster.address)) == 0
+    killer.join()
+    assert max(reached) < 2000
+    resumed = [condense(run.folder)["resumed"] for run in runs]
+    assert sorted(resumed) == [0, 1]
+    hit = runs[resumed.index(1)]
+    from_step = json.loads((hit.folder / "config.json").read_text())["resumed"][0]["from_step"]
+    assert from_step == reached[resumed.index(1)]
+    for run, other in zip(runs, undisturbed, strict=True):
+        assert lasting(run) == lasting(other)
+        assert_equal_runs(run.folder, other.folder)
+
+
+# -- records --------------------------------------------------------------------------------------
+
+
+def test_a_run_that_broke_off_is_collected_as_far_as_it_was_saved(run: Run, tmp_path: Path) -> None:
+    config = json.loads((run.folder / "config.json").read_text())
+    early, late = (tmp_path / "runs" / name for name in ("early", "late"))
+    for folder in (early, late):
+        folder.mkdir(parents=True)
+        (folder / "config.json").write_text(json.dumps(config))
+    (early / "checkpoints").mkdir()
+    (early / "checkpoints" / "000000200.checkpoint").write_bytes(b"")
+    # The disk was full.
+    (late / "evaluations.jsonl").write_text('{"steps": 60, "wall_seconds": 1.0}\n{"steps": 70, "w')
+
+    def collected() -> list[Any]:
+        return [json.loads(p.read_text()) for p in collect(Collect(tmp_path / "runs", tmp_path))]
+
+    records = collected()
+    assert [record["run"] for record in records] == ["early", "late"]
+    assert [record["finished"] for record in records] == [False, False]
+    assert [record["reached"] for record in records] == [200, 60]
+    assert records == collected()
+    text = page([r | {"goals": "sampled", "penalty_weight": 1.0} for r in records], [])
+    assert "stopped after 200 of 240 steps" in text
+    assert "stopped after 60 of 240 steps" in text
+    (late / "evaluations.jsonl").write_text("{\n")
+    with pytest.raises(ConfigError, match="late: its evaluations are damaged"):
+        collected()
+    (early / "config.json").write_text(json.dumps({**config, "env_options": {"machine": "wide"}}))
+    with pytest.raises(ConfigError, match=r"early: was made with .*wide"):
+        collected()
+
+
+def test_files_of_others_are_not_replaced(run: Run, tmp_path: Path) -> None:
+    records, by_hand = tmp_path / "results", tmp_path / "results.md"
+    main(["collect", "--runs", str(run.folder.parent), "--to", str(records)])
+    by_hand.write_text("# Results\n\nMy own.\n")
+    with pytest.raises(SystemExit, match="was written by hand"):
+        main(["write", "--records", str(records), "--page", str(by_hand)])
+    assert by_hand.read_text() == "# Results\n\nMy own.\n"
+    assert not (tmp_path / "images").exists()
+    by_hand.unlink()
+    written = write(Write(records, by_hand))
+    assert [path.name for path in written] == ["results.md", "results_penalty.png"]
+    before = [path.read_bytes() for path in written]
+    main(["write", "--records", str(records), "--page", str(by_hand)])
+    assert [path.read_bytes() for path in written] == before
+    (record,) = records.iterdir()
+    record.write_text('{"mine": 1}')
+    with pytest.raises(ConfigError, match=r"json is no record: it lacks engine, env"):
+        collect(Collect(run.folder.parent, records))
+    assert record.read_text() == '{"mine": 1}'
+
+
+def test_a_process_that_is_killed_while_it_draws_leaves_no_file(tmp_path: Path) -> None:
+    drawing = (
+        "import os, sys\n"
+        "from pathlib import Path\n"
+        "from matplotlib.figure import Figure\n"
+        "from tpm_gym.learning.figure_style import save\n"
+        "class Killed(Figure):\n"
+        "    def savefig(self, *arguments, **options):\n"
+        "        super().savefig(*arguments, **options)\n"
+        "        os._exit(9)\n"
+        "save(Killed(), Path(sys.argv[1], 'figure.png'))\n"
+    )
+    assert subprocess.run([PYTHON, "-c", drawing, tmp_path], check=False).returncode == 9
+    assert os.listdir(tmp_path) == []
+
+
+# -- the page -------------------------------------------------------------------------------------
+
+EXAMPLE = json.loads((ROOT / RECORDS / "TPMReach-v0-sac-analytic-s0.json").read_text())
+DEMONSTRATED = EXAMPLE["recipe"] | {"demonstrations": {"episodes": 3}}
+
+
+def changed(seed: int, rate: float | None, **changes: Any) -> Any:
+    """Return a record with three evaluations and a success rate; None: it was stopped."""
+    new = json.loads(json.dumps(EXAMPLE)) | {"seed": seed, "run": f"run-s{seed}"}
+    new["evaluations"] = {"steps": [0, 60, 120], "wall_seconds": [0.0, 30.0, 60.0]}
+    new |= {"steps": 120, "engine": "pybullet"}
+    if rate is None:
+        return new | {"tests": {}, "finished": False} | changes
+    for test in new["tests"].values():
+        test["success_at_end"] = {"mean": rate, "low": rate - 0.01, "high": rate + 0.01}
+    new["evaluations"]["success_at_end"] = [0.0, rate, rate]
+    return new | changes
+
+
+def tempting(seed: int, weight: float, **changes: Any) -> Any:
+    record = changed(seed, 1.0, goals="tempting", penalty_weight=weight, **changes)
+    record["tests"]["pybullet"]["unsafe_share"] = {"mean": 0.4 - 0.3 * weight + 0.02 * seed}
+    return record
+
+
+def rows(text: str, *words: str) -> list[str]:
+    """Return the rows of tables that hold all words."""
+    return [
+        line for line in text.splitlines() if line[0:1] == "|" and all(w in line for w in words)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("successes", "index"),
+    [
+        ([0.0, 0.5, 0.95, 1.0], 2),
+        ([0.0, 1.0, 0.9, 0.95], 3),  # success that does not last does not count
+        ([1.0, 1.0], 0),
+        ([0.0, 1.0, 0.9], None),
+        ([], None),
+    ],
+)
+def test_success_has_settled_once_it_stays(successes: list[float], index: int | None) -> None:
+    assert settled(successes) == index
+
+
+def test_the_page_is_what_its_records_say() -> None:
+    text = (ROOT / PAGE).read_text(encoding="utf-8")
+    figures = [name for name in ("results_penalty.png", "results_robustness.png") if name in text]
+    assert page(read_records(ROOT / RECORDS), ["results_learning_curves.png", *figures]) == text
+
+
+def test_failures_are_counted_and_named() -> None:
+    text = page([changed(seed, rate) for seed, rate in enumerate([1.0, 0.99, 0.98, 0.2, None])], [])
+    (row,) = rows(text, "98.0% (100.0, 99.0, 98.0, 20.0, 0.0) |", "| 60 | 0.5 | 1.0 |")
+    assert len(rows(text, "not finished")) == 1
+    failures = text.split("### Failures")[1].split("##")[0]
+    assert "seed 3: success 20.0%" in failures
+    assert "seed 4: stopped after 120 of 120 steps" in failures
+    assert "seed 2" not in failures
+    text = page([changed(seed, rate) for seed, rate in enumerate([1.0, 0.5, 0.4, 0.2, None])], [])
+    (row,) = rows(text, "100.0, 50.0")
+    assert row.count("never") == 2
+
+
+@pytest.mark.parametrize(
+    ("other", "labels"),
+    [
+        ({"steps": 999}, ["SAC + HER, 120 steps", "SAC + HER, 999 steps"]),
+        (
+            {"engine": "mujoco"},
+            ["SAC + HER, PyBullet", "SAC + HER, mujoco"],
+        ),
+        ({"recipe": DEMONSTRATED}, ["SAC + HER", "SAC + HER, demonstrations"]),
+    ],
+)
+def test_runs_that_differ_are_told_apart_everywhere(other: Any, labels: list[str]) -> None:
+    runs = [changed(0, 0.5), changed(0, 0.6, **other)]
+    weighted = [tempting(s, w, **o) for s in range(2) for w in (0.0, 1.0) for o in ({}, other)]
+    text = page([*runs, *weighted], [])
+    for label in labels:
+        assert len(rows(text, f"| {label} | 0 |")) == 1  # of every run
+        assert f"{label}, seed 0: success" in text
+        assert f"{label}: 41.00% without the penalty, 11.000% with it: 4 times less." in text
+    curves = learning_curves(split(runs)[0])
+    assert [line.get_label() for line in curves.axes[0].lines[:2]] == labels
+    ticks = [t.get_text() for t in penalty(split(weighted)[1]).axes[0].get_xticklabels()]
+    assert len(set(ticks)) == 4
+
+
+def test_penalty_weights_get_a_table_of_their_own() -> None:
+    weighted = [tempting(seed, weight) for seed, weight in itertools.product(range(2), (0.0, 1.0))]
+    text = page([changed(0, 0.97), *weighted], [])
+    assert "tempting" not in text.split("## Does the penalty work?")[0].split("##")[1]
+    table = text.split("## Does the penalty work?")[1]
+    assert rows(table, "| 0 |", "41.0% (40.0% to 42.0%)")
+    assert rows(table, "| 1 |", "11.0% (10.0% to 12.0%)")
+
+
+def test_the_penalty_figure_has_a_dot_a_seed(tmp_path: Path) -> None:
+    records = [tempting(seed, weight) for seed in range(3) for weight in (0.0, 1.0)]
+    figure = penalty(split(records)[1])
+    dots = [line for line in figure.axes[0].lines if len(line.get_xdata()) == 3]
+    assert len(dots) == 4  # two metrics at two weights
+    assert [label.get_text() for label in figure.axes[0].get_xticklabels()] == ["0", "1"]
+    assert [path.name for path in draw(records, tmp_path)] == ["results_penalty.png"]
+
+
+def test_the_learning_curve_is_the_median_with_a_band() -> None:
+    figure = learning_curves(split([changed(s, r) for s, r in enumerate([0.2, 0.9, 1.0])])[0])
+    curve = figure.axes[0].lines[0]
+    assert list(curve.get_xdata()) == [0, 60, 120]
+    assert list(curve.get_ydata()) == [0.0, 0.9, 0.9]
+    band = figure.axes[0].collections[0].get_paths()[0].vertices
+    assert (band[:, 1].min(), band[band[:, 0] == 120, 1].max()) == (0.0, 1.0)
+    assert band[band[:, 0] == 120, 1].min() == 0.2
+
+
+def test_what_was_not_run_is_named() -> None:
+    assert page([], []).count(": all of it.") == len(STUDIES)
+    planned = [run.folder.name for run in plan_runs(STUDIES[0])]
+    text = page([changed(0, 1.0, run=name) for name in planned[2:]], [])
+    missing = text.split("## Not run yet")[1].split("##")[0]
+    assert f"`{command(STUDIES[0])}`: {planned[0].removesuffix('-s0')} (2).\n" in missing
+    every = [changed(0, 1.0, run=run.folder.name) for s in STUDIES for run in plan_runs(s)]
+    assert "Not run yet" not in page(every, [])
+
+
+def test_success_in_both_engines_and_what_was_demonstrated_are_told() -> None:
+    record = changed(0, 0.9, engine="analytic", recipe=DEMONSTRATED)
+    record["tests"]["analytic"] |= {
+        "episodes": 9,
+        "success_at_end": {"mean": 1, "low": 1, "high": 1},
+    }
+    other = changed(1, 0.8)
+    del other["tests"]["analytic"]
+    text = page([record, other], [])
+    assert rows(text, "SAC + HER, demonstrations |", "| 120 | 100.0% (100.0) | 90.0% (90.0) |")
+    assert rows(text, "SAC + HER | PyBullet | 120 | \N{EM DASH} | 80.0% (80.0) |")
+    assert "Test episodes of each seed: 9 (analytic engine), 200 (PyBullet)." in text
+
+
+# -- bisections -----------------------------------------------------------------------------------
+
+ENDS = [(attribute, end) for attribute in LIMITS for end in ends(attribute)]
+GRADUAL = [(attribute, end) for attribute, end in ENDS if attribute != "latency"]
+
+
+def bisected(attribute: str, end: float, success: Any) -> tuple[Any, dict[float, float]]:
+    """Bisect with every success asked for; return the result and all that were."""
+    found: dict[float, float] = {}
+    while (result := halving(attribute, end, found)).missing is not None:
+        assert result.missing not in found
+        found[result.missing] = success(result.missing)
+    return result, found
+
+
+def test_attributes_and_their_ends_are_those_of_randomisation() -> None:
+    assert set(LIMITS) == set(vars(Randomisation()))
+    assert Randomisation(**{name: nominal(name) for name in LIMITS}) == Randomisation()
+
+
+@given(which=st.sampled_from(GRADUAL), share=st.floats(0.001, 0.999), rate=st.floats(0.3, 1.0))
+def test_success_halves_where_the_bisection_says(
+    which: tuple[str, float], share: float, rate: float
+) -> None:
+    attribute, end = which
+    start = nominal(attribute)
+    edge = start + share * (end - start)
+
+    def success(value: float) -> float:
+        return rate if abs(value - start) < abs(edge - start) else 0.4 * rate
+
+    result, found = bisected(attribute, end, success)
+    assert success(result.before) > rate / 2 >= success(result.after)
+    assert len(found) <= 2 + 6
+    for value in found:
+        Randomisation(**{attribute: value})
+    way = np.abs([start, result.before, result.after, end])
+    way = np.log(way) if start else way
+    assert (way[2] - way[1]) / (way[3] - way[0]) == pytest.approx(1 / 64, rel=0.2)
+
+
+@pytest.mark.parametrize(("attribute", "end"), ENDS)
+def test_where_success_stays_two_tests_are_enough(attribute: str, end: float) -> None:
+    result, found = bisected(attribute, end, lambda value: 0.9 if value != end else 0.5)
+    assert (result.before, result.after) == (end, None)
+    assert set(found) == {nominal(attribute), end}
+
+
+@pytest.mark.parametrize("edge", range(1, 6))
+def test_a_latency_is_a_whole_number_of_steps(edge: int) -> None:
+    result, found = bisected("latency", 5.0, lambda steps: float(steps < edge))
+    assert (result.before, result.after) == (edge - 1, edge)
+    assert all(Randomisation(latency=steps).latency == steps for steps in found)
+
+
+def answer(bisection: Bisection, success: Any) -> int:
+    """Write the results of the evaluations that a bisection asks for; return their number."""
+    count = 0
+    while left := bisection.left():
+        (words,) = left
+        options = dict(zip(words[2::2], words[3::2], strict=True))
+        name, _, text = options["--randomisation"].partition("=")
+        assert name == bisection.attribute
+        servo = name in ("servo_stiffness", "joint_friction")
+        assert options.get("--drive", "ideal") == ("servo" if servo else "ideal")
+        assert options["--engine"] == bisection.engine
+        rate = success(float(text))
+        test = {
+            "env": bisection.env,
+            "policy": options["--policy"],
+            "episodes": bisection.episodes,
+            "randomisation": {name: float(text)},
+            "env_options": {"engine": bisection.engine},
+            "success_at_end": {"mean": rate, "low": rate, "high": rate},
+            "versions": {},
+            "git_commit": "0" * 40,
+            "machine": {},
+            "command": shlex.join(words),
+        }
+        path = Path(options["--json"])
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(test))
+        count += 1
+    return count
+
+
+def law(value: float) -> float:
+    """Success that halves at 1.5 and, below 1, at 0.8."""
+    return 1.0 if 0.8 < value < 1.5 else 0.1
+
+
+@pytest.fixture
+def bisections(tmp_path: Path) -> list[Any]:
+    """Records of two ids: success by one law for factors, and unchanged for errors."""
+    runs = tmp_path / "runs"
+    for env in ("TPMReach-v0", "TPMPickAndPlace-v0"):
+        for attribute in LIMITS:
+            bisection = Bisection(runs / f"{env}-{attribute}", env, attribute, 50)
+            factor = nominal(attribute) == 1.0
+            answer(bisection, law if factor else lambda value: 0.97)
+    assert len(collect(Collect(runs, tmp_path / "records"))) == 2 * len(LIMITS)
+    return read_records(tmp_path / "records")
+
+
+def test_what_was_tested_is_not_tested_again_unless_with_other_episodes(tmp_path: Path) -> None:
+    bisection = Bisection(tmp_path / "b", "TPMReach-v0", "link_mass", 50)
+    assert answer(bisection, law) == 1 + 7 + 7
+    assert bisection.left() == []
+    assert answer(replace(bisection, episodes=60), lambda value: 0.8) == 3
+    kept = condense_bisection(tmp_path / "b")
+    assert (kept["episodes"], set(kept["tests"])) == (60, {"0.5", "1", "16"})
+    (tmp_path / "b" / "tests" / "1.json").unlink()
+    with pytest.raises(ConfigError, match="no bisection"):
+        collect(Collect(tmp_path, tmp_path / "records"))
+
+
+def test_the_page_says_where_success_halves(bisections: list[Any]) -> None:
+    text = page(bisections, ["results_robustness.png"])
+    assert "images/results_robustness.png" in text
+    (row,) = rows(text, "| puck mass (factor) | 1 | 10 |")
+    (cell,) = {cell.strip() for cell in row.strip("|").split("|")[3:]}
+    low, high = map(float, cell.split(" to "))
+    assert low < 1.5 <= high < 1.05 * low
+    (row,) = rows(text, "| servo stiffness (factor, servo drives) | 1 | 0.01")
+    low, high = map(float, row.strip("|").split("|")[3].split(" to "))
+    assert high <= 0.8 < low < 1.1 * high
+    (row,) = rows(text, "| encoder bias (rad) | 0 | 0.001 |")
+    assert row.count("97.0% at 0.001") == 2
+    again = [record | {"engine": "analytic", "episodes": 70} for record in bisections]
+    both = page([*bisections, *again], [])
+    assert both.count("| puck mass") == 2 * text.count("| puck mass") > 0
+    assert "analytic engine, 70 episodes" in both
+    assert "PyBullet, 50 episodes" in both
+    del bisections[0]["tests"][list(bisections[0]["tests"])[-1]]
+    assert "not finished" in page(bisections, [])
+
+
+def test_the_figure_has_a_panel_an_attribute_and_a_line_an_id(
+    bisections: list[Any], tmp_path: Path
+) -> None:
+    figure = robustness(bisections)
+    panels = [axes for axes in figure.axes if axes.get_visible()]
+    assert [axes.get_title() for axes in panels] == [name.replace("_", " ") for name in LIMITS]
+    puck = panels[list(LIMITS).index("puck_mass")]
+    lines = [line for line in puck.lines if len(line.get_xdata()) > 2]
+    assert len(lines) == 2
+    for line in lines:
+        values, rates = line.get_xdata(), line.get_ydata()
+        assert list(values) == sorted(values)
+        assert list(rates) == [law(value) for value in values]
+    assert [path.name for path in draw(bisections, tmp_path)] == ["results_robustness.png"]
