@@ -242,7 +242,7 @@ def kill_beyond(run: Path, step: int, words: list[str]) -> None:
 
 
 def newest(run: Path) -> int:
-    return max((int(path.stem) for path in run.glob("checkpoints/*.checkpoint")), default=-1)
+    return max(CheckpointStore(run / "checkpoints").steps(), default=-1)
 
 
 def test_kill_9_costs_nothing(tmp_path: Path) -> None:

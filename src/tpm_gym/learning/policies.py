@@ -33,48 +33,48 @@ SCRIPTED: Final = ("expert", "random")
 
 @dataclass(frozen=True)
 class TrainedPolicy:
-    """Mean action of a trained algorithm."""
+    """Policy that acts with the mean action of a trained algorithm."""
 
     model: BaseAlgorithm | ExportedPolicy
 
-    def reset(self, observation: Observation, seed: int) -> None:
+    def reset(self, observation: Observation, seeds: Sequence[int]) -> None:
         """Do nothing: the policy has no memory."""
 
     def act(self, observation: Observation) -> Action:
-        """Return the deterministic action for ``observation``."""
+        """Return the deterministic actions for ``observation``."""
         action, _ = self.model.predict(observation, deterministic=True)
         return action
 
 
 @dataclass
 class RandomPolicy:
-    """Uniform random actions, from a generator that is seeded in every episode."""
+    """Policy that draws uniform actions, with a generator of its own for each episode."""
 
     space: Any
-    rng: np.random.Generator = field(default_factory=np.random.default_rng)
+    rngs: list[np.random.Generator] = field(default_factory=list)
 
-    def reset(self, observation: Observation, seed: int) -> None:
-        """Seed the generator with the seed of the episode."""
-        self.rng = np.random.default_rng(seed)
+    def reset(self, observation: Observation, seeds: Sequence[int]) -> None:
+        """Seed a generator for each episode with the episode's seed."""
+        self.rngs = [np.random.default_rng(seed) for seed in seeds]
 
     def act(self, observation: Observation) -> Action:
-        """Return an action that does not depend on ``observation``."""
-        drawn: Action = self.rng.uniform(self.space.low, self.space.high)
+        """Return actions that do not depend on ``observation``."""
+        drawn = np.array([rng.uniform(self.space.low, self.space.high) for rng in self.rngs])
         return drawn.astype(self.space.dtype)
 
 
 @dataclass(frozen=True)
 class ExpertPolicy:
-    """Scripted controller, which is deterministic."""
+    """Policy that acts with the scripted controller, which is deterministic."""
 
     expert: Expert
 
-    def reset(self, observation: Observation, seed: int) -> None:
-        """Plan the motion of the episode."""
+    def reset(self, observation: Observation, seeds: Sequence[int]) -> None:
+        """Plan the motion of the episodes."""
         self.expert.reset(observation)
 
     def act(self, observation: Observation) -> Action:
-        """Return the action of the controller."""
+        """Return the actions of the controller."""
         return self.expert.act(observation)
 
 
@@ -205,6 +205,7 @@ def load_model(spec: str, path: Path) -> BaseAlgorithm:
         raise refused(spec, f"algorithm {algorithm!r} is none of {NAMES}")
     _use_one_thread()
     # Acting needs no replay buffer, and a hindsight buffer would need an environment.
+    replaced: dict[str, Any]
     replaced = {"replay_buffer_class": None, "replay_buffer_kwargs": {}, "buffer_size": 1}
     try:
         kind = ALGORITHMS[algorithm].load_class()

@@ -163,7 +163,7 @@ def _stored_in(content: Content) -> dict[str, Any]:
 
 def _foreign(content: Content, error: Exception) -> CheckpointError:
     """Return the error of a checkpoint that is whole and was not written by this training."""
-    problem = f"cannot be restored ({type(error).__name__}: {error})"
+    problem = f"cannot be restored ({type(error).__name__}), and was not written by this training"
     anew = "start the run anew with --overwrite"
     return CheckpointError(f"the checkpoint of step {content.step:,} {problem}; {anew}")
 
