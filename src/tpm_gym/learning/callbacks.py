@@ -16,7 +16,7 @@ from tpm_gym.learning.checkpoint import CheckpointStore, Content
 from tpm_gym.learning.configuration import TrainingConfig
 from tpm_gym.learning.errors import CheckpointError
 from tpm_gym.learning.policies import TrainedPolicy
-from tpm_gym.learning.rollout import SELECTION_SEED, GoalEnv, run_batch, run_episodes, summarise
+from tpm_gym.learning.rollout import SELECTION_SEED, run_episodes, summarise
 from tpm_gym.learning.run_folder import EVALUATIONS_FILE
 from tpm_gym.learning.signals import SignalListener
 from tpm_gym.learning.training_state import capture
@@ -32,7 +32,7 @@ class PeriodicEvaluation(BaseCallback):
     alone. Each is appended to evaluations.jsonl, and the best policy so far is kept.
 
     Args:
-        env: A separate environment, so that evaluations do not disturb training.
+        envs: Separate environments, so that evaluations do not disturb training.
         console: Gets one line for each evaluation.
         keep: Called with the model whenever it is the best so far.
     """
@@ -40,13 +40,13 @@ class PeriodicEvaluation(BaseCallback):
     def __init__(
         self,
         config: TrainingConfig,
-        env: GoalEnv | TPMVectorEnv,
+        envs: TPMVectorEnv,
         console: Console,
         keep: Callable[[BaseAlgorithm], object],
     ) -> None:
         """Store the arguments."""
         super().__init__()
-        self._config, self._env = config, env
+        self._config, self._envs = config, envs
         self._console, self._keep = console, keep
         self.evaluations: list[dict[str, Any]] = []
         self._best: tuple[float, float] | None = None
@@ -77,10 +77,7 @@ class PeriodicEvaluation(BaseCallback):
     def _evaluate(self) -> None:
         policy = TrainedPolicy(self.model)
         episodes = self._config.eval_episodes
-        if isinstance(self._env, TPMVectorEnv):
-            records = run_batch(self._env, policy, episodes, SELECTION_SEED)
-        else:
-            records = run_episodes(self._env, policy, episodes, SELECTION_SEED)
+        records = run_episodes(self._envs, policy, episodes, SELECTION_SEED)
         metrics = summarise(records)
         self._record({name: estimate.as_dict() for name, estimate in metrics.items()})
         success = metrics["success_at_end"]

@@ -7,6 +7,7 @@ which can run any code when they are loaded. The archive needs ``trust_pickle``.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -18,7 +19,7 @@ from tpm_gym import TPMError
 from tpm_gym.learning.algorithms import ALGORITHMS, NAMES
 from tpm_gym.learning.errors import PolicyError
 from tpm_gym.learning.provenance import read_json
-from tpm_gym.learning.rollout import Action, GoalEnv, Observation, Policy
+from tpm_gym.learning.rollout import Action, Observation, Policy
 from tpm_gym.learning.run_folder import BEST_FILE, CONFIG_FILE, EXPORTED, LAST_FILE
 from tpm_gym.resources import POLICIES
 from tpm_gym.tasks.expert import Expert
@@ -26,6 +27,7 @@ from tpm_gym.tasks.expert import Expert
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
+    from tpm_gym.envs.vector import TPMVectorEnv
     from tpm_gym.policy import Policy as ExportedPolicy
 
 SCRIPTED: Final = ("expert", "random")
@@ -78,29 +80,30 @@ class ExpertPolicy:
         return self.expert.act(observation)
 
 
-def load_policy(spec: str, env: GoalEnv, *, trust_pickle: bool = False) -> Policy:
+def load_policy(spec: str, envs: TPMVectorEnv, *, trust_pickle: bool = False) -> Policy:
     """Return the policy that ``spec`` names.
 
     Args:
         spec: ``expert``, ``random``, an exported policy (either of its files, or their common
             name), the id of a published one, a .zip file of a training, or the folder of a run (its
             best policy).
+        envs: Environments that the policy acts in.
         trust_pickle: Whether a .zip file may be loaded, which can run any code.
 
     Raises:
-        PolicyError: There is no such policy, its files are damaged, it does not fit ``env``, or it
+        PolicyError: There is no such policy, its files are damaged, it does not fit ``envs``, or it
             is a .zip file and ``trust_pickle`` is not set.
     """
     if spec == "random":
-        return RandomPolicy(env.action_space)
+        return RandomPolicy(envs.single_action_space)
     if spec == "expert":
-        return ExpertPolicy(Expert(env))
+        return ExpertPolicy(Expert(envs))
     path = _policy_file(spec)
     if path.suffix not in EXPORTED:
         require_trust(spec, path, trust_pickle)
         model = load_model(spec, path)
         for kind in ("observation", "action"):
-            trained, given = (getattr(owner, f"{kind}_space") for owner in (model, env))
+            trained, given = getattr(model, f"{kind}_space"), getattr(envs, f"single_{kind}_space")
             if trained != given:
                 problem = f"was trained with {kind} space {trained}, the environment has {given}"
                 raise refused(spec, problem)
@@ -108,7 +111,7 @@ def load_policy(spec: str, env: GoalEnv, *, trust_pickle: bool = False) -> Polic
     _use_one_thread()
     try:
         policy = tpm_gym.load_policy(path)
-        policy.check(env)
+        policy.check(envs)
     except TPMError as error:
         raise refused(spec, str(error)) from error
     return TrainedPolicy(policy)

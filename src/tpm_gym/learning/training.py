@@ -40,7 +40,7 @@ from tpm_gym.learning.errors import (
     RunError,
 )
 from tpm_gym.learning.evaluation import EvaluationConfig, evaluate
-from tpm_gym.learning.rollout import BATCH, SELECTION_SEED, GoalEnv
+from tpm_gym.learning.rollout import BATCH, SELECTION_SEED
 from tpm_gym.learning.run_folder import CHECKPOINTS, CONFIG_FILE, CURVE_FILE, TESTS, is_finished
 
 if TYPE_CHECKING:
@@ -48,7 +48,6 @@ if TYPE_CHECKING:
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.vec_env import VecEnv
 
-    from tpm_gym.envs.vector import TPMVectorEnv
     from tpm_gym.learning.callbacks import PeriodicEvaluation
 
 
@@ -218,20 +217,16 @@ def _learn(
     with ExitStack() as stack:
         training_envs = make_training_envs(config)
         stack.callback(training_envs.close)
-        evaluation_env: GoalEnv | TPMVectorEnv
-        if config.in_batches:
-            count = min(config.eval_episodes, BATCH)
-            evaluation_env = make_envs(count=count, **_env_options(config))
-        else:
-            evaluation_env = make_env(**_env_options(config))
-        stack.callback(evaluation_env.close)
+        count = min(config.eval_episodes, BATCH) if config.in_batches else 1
+        evaluation_envs = make_envs(count=count, **_env_options(config))
+        stack.callback(evaluation_envs.close)
         stack.callback(bar.close)
         model = make_model(config, training_envs)
         logger = make_logger(config.run, None if content is None else content.step)
         stack.callback(logger.close)
         model.set_logger(logger)
         keep = partial(_keep, config, console, run_folder.BEST_FILE)
-        evaluation = PeriodicEvaluation(config, evaluation_env, console, keep)
+        evaluation = PeriodicEvaluation(config, evaluation_envs, console, keep)
         seconds = _restore(model, evaluation, content, console) if content else 0.0
         checkpointing = Checkpointing(config, store, evaluation, listener, console, seconds)
         # Checkpointing sets the clock that the callbacks after it read.

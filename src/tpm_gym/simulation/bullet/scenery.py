@@ -109,10 +109,7 @@ class Scenery:
         """Poses and velocities of the objects."""
         pose, velocity = pybullet.getBasePositionAndOrientation, pybullet.getBaseVelocity
         number = self._client.number
-        found: list[tuple[Pose, Twist]] = []
-        for body in self.bodies:
-            found.append((Pose(*pose(body, number)), Twist(*velocity(body, number))))
-        return found
+        return [(Pose(*pose(body, number)), Twist(*velocity(body, number))) for body in self.bodies]
 
     def alter(self, mass: float, friction: float) -> None:
         """Make the objects ``mass`` times as heavy and ``friction`` times as rough as nominal."""
