@@ -11,6 +11,7 @@ positions theta are in rad (m for a slide). Results are NaN in rows without a so
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -227,8 +228,8 @@ class Machine(ABC):
             UnreachableError: If one does not.
         """
         theta = self.inverse(position)
-        if (missing := np.isnan(theta[..., 0])).any():
-            raise self.unreachable(_first(position, missing))
+        if math.isnan(np.vdot(theta, theta)):  # faster than isnan().any()
+            raise self.unreachable(_first(position, np.isnan(theta[..., 0])))
         return theta
 
     def require_evaluate(self, theta: ArrayLike, built: FloatArray | None = None) -> Reading:
@@ -239,8 +240,8 @@ class Machine(ABC):
             SingularityError: If it is at a parallel singularity.
         """
         reading = self.evaluate(theta, built)
-        if (missing := np.isnan(reading.conditioning)).any():
-            raise self.unassembled(_first(theta, missing))
+        if math.isnan(np.vdot(reading.conditioning, reading.conditioning)):
+            raise self.unassembled(_first(theta, np.isnan(reading.conditioning)))
         return reading
 
     def require_within_stops(self, theta: ArrayLike) -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -59,30 +61,24 @@ class TPM(Machine):
     def inverse(self, position: ArrayLike, built: FloatArray | None = None) -> FloatArray:
         """See :class:`Machine`."""
         points = _rows(position)
-        theta = np.empty_like(points)
-        _loops().inverse(points.reshape(-1, 3), *self._of(built, points), theta.reshape(-1, 3))
+        theta = np.empty(points.shape)
+        _loops().inverse(_flat(points), *self._of(built, points), _flat(theta))
         return theta
 
     def forward(self, theta: ArrayLike, built: FloatArray | None = None) -> FloatArray:
         """See :class:`Machine`."""
         angles = _rows(theta)
-        position = np.empty_like(angles)
-        _loops().forward(angles.reshape(-1, 3), *self._of(built, angles), position.reshape(-1, 3))
+        position = np.empty(angles.shape)
+        _loops().forward(_flat(angles), *self._of(built, angles), _flat(position))
         return position
 
     def evaluate(self, theta: ArrayLike, built: FloatArray | None = None) -> Reading:
         """See :class:`Machine`."""
         angles = _rows(theta)
-        flat, shape = angles.reshape(-1, 3), angles.shape
-        found = _room(len(flat))
+        flat = _flat(angles)
+        found = Reading(*_room(len(flat)))
         _loops().evaluate(flat, *self._of(built, angles), *found)
-        position, jacobian, conditioning, working = found
-        return Reading(
-            position.reshape(shape),
-            jacobian.reshape(*shape, 3),
-            conditioning.reshape(shape[:-1]),
-            working.reshape(shape[:-1]),
-        )
+        return found if angles.ndim == 2 else Reading(*_shaped(found, angles))
 
     def mode_left(
         self, theta: ArrayLike, position: ArrayLike, built: FloatArray | None = None
@@ -91,13 +87,8 @@ class TPM(Machine):
         angles = _rows(theta)
         points = _rows(position, angles.shape)
         left = np.empty(angles.shape[:-1], dtype=np.int8)
-        _loops().mode_left(
-            angles.reshape(-1, 3),
-            points.reshape(-1, 3),
-            ASSEMBLY_LIMIT,
-            *self._of(built, angles),
-            left.reshape(-1),
-        )
+        of = self._of(built, angles)
+        _loops().mode_left(_flat(angles), _flat(points), ASSEMBLY_LIMIT, *of, left.reshape(-1))
         return left
 
     def same_side(self, position: ArrayLike) -> BoolArray:
@@ -190,15 +181,10 @@ class TPM(Machine):
     ) -> FloatArray:
         """See :class:`Machine`."""
         angles = _rows(theta)
-        shape = angles.shape
-        inputs = [angles, _rows(theta_dot, shape), _rows(theta_ddot, shape)]
-        inputs.append(np.empty((0, 3)) if force is None else _rows(force, shape))
-        torques = np.empty(shape)
-        _loops().torque(
-            *(rows.reshape(-1, 3) for rows in inputs),
-            *self._of(built, angles),
-            torques.reshape(-1, 3),
-        )
+        inputs = [angles, _rows(theta_dot, angles.shape), _rows(theta_ddot, angles.shape)]
+        inputs.append(np.empty((0, 3)) if force is None else _rows(force, angles.shape))
+        torques = np.empty(angles.shape)
+        _loops().torque(*map(_flat, inputs), *self._of(built, angles), _flat(torques))
         return torques
 
     def motion(
@@ -206,19 +192,12 @@ class TPM(Machine):
     ) -> Motion:
         """See :class:`Machine`."""
         angles = _rows(theta)
-        rates = _rows(theta_dot, angles.shape)
-        flat, shape = angles.reshape(-1, 3), angles.shape
+        rates, flat = _rows(theta_dot, angles.shape), _flat(angles)
         position, jacobian, _, working = _room(len(flat))
-        mass, bias = np.empty((len(flat), 9)), np.empty((len(flat), 3))
-        found = position, jacobian, working, mass, bias
-        _loops().motion(flat, rates.reshape(-1, 3), *self._of(built, angles), *found)
-        return Motion(
-            position.reshape(shape),
-            jacobian.reshape(*shape, 3),
-            working.reshape(shape[:-1]),
-            mass.reshape(*shape, 3),
-            bias.reshape(shape),
-        )
+        mass, bias = np.empty((len(flat), 3, 3)), np.empty((len(flat), 3))
+        found = Motion(position, jacobian, working, mass, bias)
+        _loops().motion(flat, _flat(rates), *self._of(built, angles), *found)
+        return found if angles.ndim == 2 else Motion(*_shaped(found, angles))
 
     @property
     def lengths(self) -> tuple[float, ...]:
@@ -248,11 +227,21 @@ def _rows(vectors: ArrayLike, shape: tuple[int, ...] | None = None) -> FloatArra
     return array
 
 
+def _flat(array: FloatArray) -> FloatArray:
+    """Return an array (..., 3) as (m, 3)."""
+    return array if array.ndim == 2 else array.reshape(-1, 3)
+
+
+def _shaped(arrays: Iterable[Any], like: FloatArray) -> Iterator[Any]:
+    """Return arrays (m, ...) in the leading shape of an array (..., 3)."""
+    return (array.reshape(like.shape[:-1] + array.shape[1:]) for array in arrays)
+
+
 def _room(count: int) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
     """Return arrays for positions, Jacobians, conditioning and modes."""
     return (
         np.empty((count, 3)),
-        np.empty((count, 9)),
+        np.empty((count, 3, 3)),
         np.empty(count),
         np.empty(count, dtype=np.bool_),
     )
