@@ -12,6 +12,6 @@ def simulation() -> Simulation:
 
 
 @pytest.fixture
-def with_puck() -> Simulation:
-    """The same with a puck."""
+def with_block() -> Simulation:
+    """The same with a block."""
     return Simulation(Scene(objects=(Block(),)))

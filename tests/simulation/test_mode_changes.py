@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from episodes import fingerprint, random_episode
 from states import apart
+from tpm_gym.envs.env import TPMEnv
 
 from tpm_gym.arrays import Vector
-from tpm_gym.envs.env import TPMEnv
 from tpm_gym.errors import ClosureError, EpisodeError, ModeChangeError, UnreachableError
 from tpm_gym.kinematics.geometry import PAPER
 from tpm_gym.mechanism import PAPER_TPM

@@ -43,7 +43,7 @@ def test_blocks_that_cannot_be_are_refused(name, value):
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        *(("objects", value) for value in ((Block(), Block()), (Block("goal"),), ("puck",), None)),
+        *(("objects", value) for value in ((Block(), Block()), (Block("goal"),), ("block",), None)),
         *(("markers", value) for value in (-1, 1.5, "one")),
         *(("marker_radius", value) for value in (0.0, np.nan, True)),
     ],
@@ -184,12 +184,12 @@ def test_spline_has_no_jump_in_velocity_and_bounded_acceleration():
 # -- objects, contacts, snapshots, pictures --------------------------------------------------------
 
 
-def test_the_puck_falls_with_g_and_comes_to_rest_on_the_table(with_puck):
-    with_puck.reset(THETA, {"object": (0.2, -0.02, 0.5)})
-    heights = [state.object_position[0, 2] for state in follow(with_puck, [HOME] * 40)]
+def test_the_block_falls_with_g_and_comes_to_rest_on_the_table(with_block):
+    with_block.reset(THETA, {"object": (0.2, -0.02, 0.5)})
+    heights = [state.object_position[0, 2] for state in follow(with_block, [HOME] * 40)]
     t = 0.04 * np.arange(1, 6)
     # Semi-implicit Euler falls g t dt / 2 further than the parabola.
-    fallen = 9.81 * (t**2 + t * with_puck.engine.physics.time_step) / 2
+    fallen = 9.81 * (t**2 + t * with_block.engine.physics.time_step) / 2
     np.testing.assert_allclose(0.5 - np.array(heights[:5]), fallen, atol=1e-5)
     assert heights[-1] == pytest.approx(0.015, abs=5e-4)
 
@@ -210,15 +210,15 @@ def test_objects_are_told_apart_by_name_and_keep_their_order():
 
 
 @pytest.mark.parametrize("drift", [0.0, 0.002])
-def test_a_reset_forgets_old_contacts(with_puck, drift):
+def test_a_reset_forgets_old_contacts(with_block, drift):
     outcomes = []
     for _ in range(2):
-        with_puck.reset(THETA, {"object": (HOME[0], -HOME[1], 0.015)})
-        # Down onto the puck, perhaps pushing it sideways: contacts of all kinds are on record.
+        with_block.reset(THETA, {"object": (HOME[0], -HOME[1], 0.015)})
+        # Down onto the block, perhaps pushing it sideways: contacts of all kinds are on record.
         down = [HOME + (drift * step, 0.0, min(0.1, 0.03 * step)) for step in range(12)]
-        state = follow(with_puck, down)[-1]
+        state = follow(with_block, down)[-1]
         outcomes.append(np.hstack([state.object_position, state.object_quaternion]))
-        follow(with_puck, [HOME] * 6)
+        follow(with_block, [HOME] * 6)
     assert np.array_equal(*outcomes)
 
 

@@ -14,7 +14,6 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from tpm_gym.envs.vector import TPMVectorEnv
 from tpm_gym.learning.checkpoint import CheckpointStore, Content
 from tpm_gym.learning.configuration import TrainingConfig
-from tpm_gym.learning.curve import draw_learning_curve
 from tpm_gym.learning.errors import CheckpointError
 from tpm_gym.learning.policies import TrainedPolicy
 from tpm_gym.learning.rollout import SELECTION_SEED, GoalEnv, run_batch, run_episodes, summarise

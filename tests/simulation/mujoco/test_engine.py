@@ -176,7 +176,7 @@ def test_servos_have_the_torque_of_their_motors_and_no_more(strength: float) -> 
 
 @pytest.mark.parametrize("direction", np.radians(np.arange(0, 360, 45)))
 @pytest.mark.parametrize("factor", [0.5, 1.0])
-def test_a_sliding_puck_is_slowed_by_mu_g_against_its_slip(
+def test_a_sliding_block_is_slowed_by_mu_g_against_its_slip(
     simulation: Simulation, direction: float, factor: float
 ) -> None:
     simulation.reset(THETA, {"object": (0.1, 0.1, 0.015)}, plant=Plant(friction=factor))
@@ -190,7 +190,7 @@ def test_a_sliding_puck_is_slowed_by_mu_g_against_its_slip(
 
 
 @pytest.mark.parametrize("spin", [10.0, 30.0])  # rad/s
-def test_a_spinning_puck_is_slowed_by_mu_n_at_its_corners_and_does_not_take_off(
+def test_a_spinning_block_is_slowed_by_mu_n_at_its_corners_and_does_not_take_off(
     simulation: Simulation, spin: float
 ) -> None:
     simulation.reset(THETA, {"object": (0.1, 0.1, 0.015)})
@@ -214,7 +214,7 @@ def test_a_spinning_puck_is_slowed_by_mu_n_at_its_corners_and_does_not_take_off(
 
 
 @pytest.mark.parametrize("direction", np.radians(np.arange(0, 360, 45)))
-def test_a_puck_that_slides_on_another_object_is_slowed_by_mu_n_against_its_slip(
+def test_a_block_that_slides_on_another_object_is_slowed_by_mu_n_against_its_slip(
     direction: float,
 ) -> None:
     base = Block(name="base", width=0.3, height=0.02, mass=5.0)
@@ -229,7 +229,9 @@ def test_a_puck_that_slides_on_another_object_is_slowed_by_mu_n_against_its_slip
 
 
 @pytest.mark.parametrize("overlap", [0.006, 0.010])  # m; with less it tips
-def test_a_struck_puck_slides_and_does_not_take_off(simulation: Simulation, overlap: float) -> None:
+def test_a_struck_block_slides_and_does_not_take_off(
+    simulation: Simulation, overlap: float
+) -> None:
     mount, half = PAPER_TPM.mount, Block().height / 2
     x, y, _ = mount.to_world(HOME)
     start = np.array([x, y, 2 * half - overlap + CUP.length])
@@ -240,7 +242,7 @@ def test_a_struck_puck_slides_and_does_not_take_off(simulation: Simulation, over
     assert max(state.object_position[0, 2] for state in states) < half + 0.001
 
 
-def test_a_resting_puck_neither_sinks_nor_moves(simulation: Simulation) -> None:
+def test_a_resting_block_neither_sinks_nor_moves(simulation: Simulation) -> None:
     simulation.reset(THETA, {"object": (0.05, -0.05, 0.015)})
     heights: list[float] = []
     objects = simulation.engine.objects

@@ -44,7 +44,7 @@ def middle(pixels: NDArray[Any]) -> NDArray[Any]:
 
 
 def red(image: NDArray[Any]) -> NDArray[Any]:
-    """The puck; the cup's red has less blue."""
+    """The block; the cup's red has less blue."""
     colour = np.moveaxis(image, -1, 0) / (image[..., 0] + 1)
     return (image[..., 0] > 100) & (colour[1] < 0.3) & (abs(colour[2] - 0.4) < 0.08)
 
