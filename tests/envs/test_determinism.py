@@ -29,7 +29,7 @@ from episodes import (
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from paths import SUPPORT
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
-from tpm_gym.envs.env import TPMEnv
+from tpm_gym import TPMEnv
 
 from tpm_gym.errors import ConfigurationError, EpisodeError, ModeChangeError
 from tpm_gym.tasks.expert import Expert

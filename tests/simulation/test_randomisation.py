@@ -10,9 +10,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import yaml
+from alone import Alone
 from episodes import EVERYTHING, OF_SERVOS, expert_episode, fingerprint, random_episode
 from shared import memory
-from tpm_gym.envs.env import TPMEnv
+from tpm_gym import TPMEnv
 
 from tpm_gym import kinematics
 from tpm_gym.arrays import FloatArray
@@ -21,7 +22,7 @@ from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.mechanism import PAPER_TPM
 from tpm_gym.mechanism.motor import TORQUE_MOTOR
 from tpm_gym.mechanism.mount import GRAVITY
-from tpm_gym.simulation import Block, Plant, Randomisation, Simulation, State
+from tpm_gym.simulation import Block, Plant, Randomisation, State
 from tpm_gym.simulation.randomisation import _RANGES, _SIZES, NOMINAL
 from tpm_gym.simulation.settings import settings_of
 
@@ -39,11 +40,11 @@ def of(value: Any) -> Randomisation:
 
 
 @pytest.fixture
-def simulation(with_block: Simulation) -> Simulation:
+def simulation(with_block: Alone) -> Alone:
     return with_block
 
 
-def rest(simulation: Simulation, plant: Plant, steps: int = 15) -> State:
+def rest(simulation: Alone, plant: Plant, steps: int = 15) -> State:
     """Hold still at home until everything has settled."""
     simulation.reset(THETA, ON_TABLE, plant=plant)
     for _ in range(steps):
@@ -182,7 +183,7 @@ def drawn_masses(seed: int) -> tuple[float, ...]:
 
 
 def test_each_link_gets_its_own_mass_and_inertia_and_a_reset_takes_them_back(
-    simulation: Simulation,
+    simulation: Alone,
 ) -> None:
     factors = drawn_masses(2)
     client, links = simulation.engine.client, PAPER_TPM.mechanism.links[1:]
@@ -199,7 +200,7 @@ def test_each_link_gets_its_own_mass_and_inertia_and_a_reset_takes_them_back(
 
 @pytest.mark.parametrize("factor", [0.1, 1.0, 10.0])
 def test_the_block_weighs_what_it_should_and_a_force_accelerates_it_accordingly(
-    simulation: Simulation, factor: float
+    simulation: Alone, factor: float
 ) -> None:
     mass = factor * Block().mass
     rest(simulation, Plant(block_mass=factor))
@@ -223,7 +224,7 @@ def test_the_block_weighs_what_it_should_and_a_force_accelerates_it_accordingly(
 
 
 @pytest.mark.parametrize("factor", [0.1, 0.5, 1.0, 1.5])  # beyond 2 it would topple
-def test_a_sliding_block_slows_down_by_mu_g(simulation: Simulation, factor: float) -> None:
+def test_a_sliding_block_slows_down_by_mu_g(simulation: Alone, factor: float) -> None:
     rest(simulation, Plant(friction=factor))
     client, (block,) = simulation.engine.client, simulation.engine.bodies
     client.resetBaseVelocity(block, (1.5, 0.0, 0.0), (0.0, 0.0, 0.0))
@@ -271,7 +272,7 @@ def test_noise_is_in_what_the_encoders_say_and_not_in_the_truth() -> None:
 
 
 def test_a_bias_moves_the_platform_by_minus_j_bias_and_the_encoders_do_not_know(
-    simulation: Simulation,
+    simulation: Alone,
 ) -> None:
     bias = tuple((2e-4 * np.sign(J[1])).tolist())  # the worst for y
     true = rest(simulation, NOMINAL)
@@ -288,7 +289,7 @@ def test_a_bias_moves_the_platform_by_minus_j_bias_and_the_encoders_do_not_know(
 
 
 def test_angles_that_cannot_be_assembled_leave_the_last_reading_in_place(
-    simulation: Simulation,
+    simulation: Alone,
 ) -> None:
     good = simulation.reset(THETA)
     impossible = (3.0, 3.0, 3.0)
@@ -342,7 +343,7 @@ def lengths(errors: FloatArray) -> Geometry:
 
 
 def test_with_other_lengths_the_truth_is_elsewhere_by_what_first_order_predicts(
-    simulation: Simulation,
+    simulation: Alone,
 ) -> None:
     plant = Plant(length_errors=ERRORS)
     started = simulation.reset(THETA, ON_TABLE, plant=plant)
@@ -383,7 +384,7 @@ def test_with_other_lengths_the_loops_stay_closed_at_full_speed_and_every_reset_
     assert len(seen) == 4
 
 
-def test_a_robot_built_anew_stands_in_the_same_world(simulation: Simulation) -> None:
+def test_a_robot_built_anew_stands_in_the_same_world(simulation: Alone) -> None:
     settings = simulation.engine.client.getPhysicsEngineParameters()
     falls = []
     for plant in (NOMINAL, Plant(length_errors=ERRORS), NOMINAL):

@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 
-from tpm_gym.envs.env import TPMEnv
+from tpm_gym.envs.single import TPMEnv
 from tpm_gym.envs.registration import env_ids
 from tpm_gym.envs.vector import TPMVectorEnv
 from tpm_gym.learning.errors import ConfigError

@@ -8,11 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from alone import Alone
 from inside_bullet import around_each_step
 
 from tpm_gym.mechanism import PAPER_TPM
 from tpm_gym.mechanism.cup import CUP
-from tpm_gym.simulation import Block, Plant, Scene, Simulation
+from tpm_gym.simulation import Block, Plant, Scene
 from tpm_gym.simulation.randomisation import NOMINAL
 
 G = 9.81
@@ -34,7 +35,7 @@ def unit(degrees):
 
 
 def start(*blocks, places=AWAY, plant=NOMINAL):
-    simulation = Simulation(Scene(objects=blocks))
+    simulation = Alone(Scene(objects=blocks))
     pairs = zip(blocks, places, strict=False)
     where = {block.name: (*place, block.height / 2) for block, place in pairs}
     simulation.reset(PAPER_TPM.inverse(level(0.05)), where, plant=plant)
@@ -62,7 +63,7 @@ def friction(simulation, other, link=-1, body=None):
 
 
 def place(simulation):
-    return np.array(simulation.engine.objects()[0][0].position)
+    return np.array(simulation.engine._scenery.read()[0][0].position)
 
 
 def table(simulation):
@@ -205,7 +206,7 @@ def test_what_spins_on_the_spot_turns_a_little_too_far(yaw, spin):
 
 @pytest.mark.parametrize(("degrees", "share"), [(0.0, 1.0), (22.5, 0.86), (45.0, 0.70)])
 def test_what_slides_on_another_object_feels_the_solvers_own_box(degrees, share):
-    simulation = Simulation(Scene(objects=(BLOCK, BASE)))
+    simulation = Alone(Scene(objects=(BLOCK, BASE)))
     where = {BLOCK.name: (*AWAY[0], BASE.height + BLOCK.height / 2), BASE.name: (*AWAY[0], 0.010)}
     simulation.reset(PAPER_TPM.inverse(level(0.05)), where)
     rest(simulation)

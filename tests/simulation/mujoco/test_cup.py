@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from alone import Alone
 from inside_mujoco import around_each_step, on_object, push
 from numpy.typing import ArrayLike
 
 from tpm_gym.arrays import FloatArray
 from tpm_gym.mechanism import PAPER_TPM
 from tpm_gym.mechanism.cup import CUP
-from tpm_gym.simulation import Block, Plant, Scene, Simulation, State
+from tpm_gym.simulation import Block, Plant, Scene, State
 from tpm_gym.simulation.mujoco.model import object_name
 
 PLACE = np.array([-0.04, 0.028])  # x, y of the block and of P, machine's frame
@@ -27,21 +28,21 @@ def level(height: float) -> FloatArray:
 
 def start(
     offset: ArrayLike = (0.0, 0.0), height: float = 0.10, plant: Plant | None = None
-) -> Simulation:
-    simulation = Simulation(Scene(objects=(Block(),)), engine="mujoco")
+) -> Alone:
+    simulation = Alone(Scene(objects=(Block(),)), engine="mujoco")
     x, y = np.array((1, -1)) * PLACE + offset
     theta = PAPER_TPM.inverse(tuple(level(height)))
     simulation.reset(theta, {"object": (x, y, 0.015)}, plant=plant or Plant())
     return simulation
 
 
-def go(simulation: Simulation, height: float, steps: int, vacuum: bool) -> State:
+def go(simulation: Alone, height: float, steps: int, vacuum: bool) -> State:
     for _ in range(steps):
         state = simulation.move(level(height), vacuum)
     return state
 
 
-def start_holding(**options: Any) -> Simulation:
+def start_holding(**options: Any) -> Alone:
     """The block is sealed to the cup at full vacuum, in the air and at rest."""
     simulation = start(height=0.05, **options)
     go(simulation, 0.0295, 6, vacuum=False)
@@ -53,13 +54,13 @@ def start_holding(**options: Any) -> Simulation:
     return simulation
 
 
-def slide(simulation: Simulation) -> float:
+def slide(simulation: Alone) -> float:
     engine: Any = simulation.engine
     position: float = engine.data.joint("cup_slide").qpos.item()
     return position
 
 
-def last(simulation: Simulation, read: Callable[[], Any], vacuum: bool) -> Any:
+def last(simulation: Alone, read: Callable[[], Any], vacuum: bool) -> Any:
     """What ``read`` says in the last time step of a control period in which the robot stays."""
     said: list[Any] = []
     with around_each_step(simulation, solved=lambda: said.append(read())):
@@ -146,7 +147,7 @@ def test_the_cup_yields_to_the_block_at_its_preload(speed: float, offset: Any) -
     engine: Any = simulation.engine
 
     def note() -> None:
-        height = engine.objects()[0][0].position[2]
+        height = engine._scenery.read()[0][0].position[2]
         rows.append((slide(simulation), height))
 
     with around_each_step(simulation, after=note):
