@@ -7,7 +7,7 @@
 Agreement: the actions of five motions are recorded once and replayed in each engine. The table has
 the largest loop gap, the largest distance of the platform from the forward kinematics of the
 encoders, differences of the torques from the other engine and from closed-form dynamics, and
-differences of the final position of the puck. Energy: share that is lost in a fall of 0.16 s with
+differences of the final position of the block. Energy: share that is lost in a fall of 0.16 s with
 the motors off. Cost: control steps of TPMPickAndPlace-v0 with random actions, in blocks that take
 turns.
 
@@ -58,7 +58,7 @@ def agreement(engines: Sequence[str], episodes: int) -> list[dict[str, Any]]:
 def _compare(trace: Trace, reference: Trace) -> dict[str, Any]:
     """Compare a motion in one engine with the first engine and with theory."""
     rms = float(np.sqrt((trace.torque**2).mean()))
-    apart = np.linalg.norm(trace.puck - reference.puck, axis=-1)
+    apart = np.linalg.norm(trace.block - reference.block, axis=-1)
     return {
         "gap_max": float(trace.gap.max()),
         "apart_max": float(trace.apart.max()),
@@ -66,8 +66,8 @@ def _compare(trace: Trace, reference: Trace) -> dict[str, Any]:
         "torque_peak": float(np.abs(trace.torque).max()),
         "off_engine": _off(trace.torque, reference.torque),
         "off_theory": _off(trace.torque, trace.theory) if trace.theory.size else None,
-        "puck_median": float(np.median(apart)) if apart.size else None,
-        "puck_max": float(apart.max()) if apart.size else None,
+        "block_median": float(np.median(apart)) if apart.size else None,
+        "block_max": float(apart.max()) if apart.size else None,
     }
 
 

@@ -5,7 +5,7 @@
     python benchmarks/bench_transfer.py --runs runs --episodes 200 --jobs 2
 
 The best policy of each run in ``--runs`` and the published policies are tested in each engine, with
-ideal and servo drives. Include runs of few steps (``--steps``), whose policies drop the puck, and
+ideal and servo drives. Include runs of few steps (``--steps``), whose policies drop the block, and
 of ``shoving.py``, because errors of contact would show in both.
 
 Results go to docs/records/transfer.json, and from there to docs/closed-form.md.

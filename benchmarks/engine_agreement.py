@@ -1,4 +1,4 @@
-"""Replay of the same actions in each engine: loops, platform, torques, puck, energy, and theory."""
+"""Replay of the same actions in each engine: loops, platform, torques, block, energy, and theory."""
 
 from __future__ import annotations
 
@@ -56,23 +56,23 @@ class Trace:
         torque: (n, 3) N m, in the last time step.
         theory: (n, 3) N m, from closed-form dynamics at the references of this time step; empty if
             the motion is not free.
-        puck: (episodes, 3) m, final position of the puck; empty without a puck.
+        block: (episodes, 3) m, final position of the block; empty without a block.
     """
 
     gap: FloatArray
     apart: FloatArray
     torque: FloatArray
     theory: FloatArray
-    puck: FloatArray
+    block: FloatArray
 
 
 def motions(episodes: int) -> list[Motion]:
-    """Return the five motions: three with nothing to touch, and two with the puck."""
+    """Return the five motions: three with nothing to touch, and two with the block."""
     return [
         Motion("expert, reaching", REACH, _recorded(REACH, episodes, _expert), free=True),
         Motion("random", REACH, _drawn(episodes, hold=1), free=True),
         Motion("fast", REACH, _drawn(episodes, hold=8), free=True),
-        Motion("expert, with the puck", PICK, _recorded(PICK, episodes, _expert), free=False),
+        Motion("expert, with the block", PICK, _recorded(PICK, episodes, _expert), free=False),
         Motion("pressing", PICK, _recorded(PICK, episodes, _press), free=False),
     ]
 
@@ -111,7 +111,7 @@ def _expert(env: Any, observation: dict[str, Any]) -> Iterator[NDArray[Any]]:
 
 
 def _press(env: Any, observation: dict[str, Any]) -> Iterator[NDArray[Any]]:
-    """Yield actions that press the puck with the spring of the cup and push it, without vacuum."""
+    """Yield actions that press the block with the spring of the cup and push it, without vacuum."""
     inner = env.unwrapped
     to_paper, block = inner.machine.mount.to_paper, inner.task.scene.objects[0]
     top = inner.state.object_position[0] + hanging(block)
@@ -126,7 +126,7 @@ def follow(motion: Motion, engine: str, drive: str = "ideal") -> Trace:
     """Replay a motion in an engine."""
     rows: list[tuple[FloatArray, ...]] = []
     theory: list[FloatArray] = []
-    pucks: list[FloatArray] = []
+    blocks: list[FloatArray] = []
     with closing(gym.make(motion.env_id, engine=engine, drive=drive)) as env:
         inner: Any = env.unwrapped
         for episode, actions in enumerate(motion.actions):
@@ -140,9 +140,9 @@ def follow(motion: Motion, engine: str, drive: str = "ideal") -> Trace:
                 rows.append((state.closure_error, apart, *state.torque))
                 if motion.free:
                     theory.append(torque_by_theory(inner, np.array(commands)))
-            pucks.extend(inner.state.object_position)
+            blocks.extend(inner.state.object_position)
     table = np.array(rows)
-    return Trace(table[:, 0], table[:, 1], table[:, 2:], np.array(theory), np.array(pucks))
+    return Trace(table[:, 0], table[:, 1], table[:, 2:], np.array(theory), np.array(blocks))
 
 
 def torque_by_theory(inner: Any, commands: FloatArray) -> FloatArray:

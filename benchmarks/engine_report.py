@@ -25,8 +25,8 @@ COLUMNS = {
     "peak (N m)": lambda row: f"{row['torque_peak']:.1f}",
     "off PyBullet's": lambda row: f"{100 * row['off_engine']:.2f}%",
     "off theory": lambda row: _share(row["off_theory"]),
-    "puck apart, median (mm)": lambda row: _length(row["puck_median"]),
-    "largest (mm)": lambda row: _length(row["puck_max"]),
+    "block apart, median (mm)": lambda row: _length(row["block_median"]),
+    "largest (mm)": lambda row: _length(row["block_max"]),
 }
 COLOURS = {
     ("pybullet", "ideal"): BLUE,

@@ -33,7 +33,7 @@ MOTOR = "setJointMotorControl2"
 CONTACT = ("createConstraint", "changeConstraint", "removeConstraint", "changeDynamics")
 
 _SAME = 1e-12
-"""Tolerance, rad or m. Bullet replays a puck at rest to 2e-18 m, not always to the last bit."""
+"""Tolerance, rad or m. Bullet replays a block at rest to 2e-18 m, not always to the last bit."""
 
 
 @dataclass

@@ -1,7 +1,7 @@
-r"""Task of pushing the puck, in which engines differ most, because the puck nearly tips over.
+r"""Task of pushing the block, in which engines differ most, because the block nearly tips over.
 
-The puck has to slide to a goal on the table, without vacuum. The cup stays at least 12 mm above the
-middle of the puck, so that a push nearly tips it. Policies also drag the puck by its upper edge.
+The block has to slide to a goal on the table, without vacuum. The cup stays at least 12 mm above the
+middle of the block, so that a push nearly tips it. Policies also drag the block by its upper edge.
 
     cd benchmarks
     python -m tpm_gym.learning train --algo ppo --engine analytic --env shoving:TPMShoveDense-v0 \
@@ -25,10 +25,10 @@ FAST = 0.15  # speed without a penalty, m/s
 
 
 class Shove(PickAndPlace):
-    """Slide the puck to a goal on the table.
+    """Slide the block to a goal on the table.
 
     Attributes:
-        haste: Penalty per control step, for each m/s of the puck's speed beyond FAST.
+        haste: Penalty per control step, for each m/s of the block's speed beyond FAST.
     """
 
     vacuum = False
@@ -39,7 +39,7 @@ class Shove(PickAndPlace):
         self, rngs: Sequence[np.random.Generator], chosen: Mapping[str, FloatArray]
     ) -> dict[str, FloatArray]:
         """Both on the table, APART to FARTHEST from each other."""
-        table, machine = self.on_table(self.puck), self.machine
+        table, machine = self.on_table(self.block), self.machine
         first = machine.sample(rngs, [table] * len(rngs))
         last = first.copy()
         rows = np.arange(len(rngs))
@@ -48,7 +48,7 @@ class Shove(PickAndPlace):
             last[rows] = machine.sample(own, [table] * len(own))
             way = rewards.distance(first, last)
             rows = np.flatnonzero((way < sampling.APART) | (way > FARTHEST))
-        offset, to_world = hanging(self.puck), machine.mount.to_world
+        offset, to_world = hanging(self.block), machine.mount.to_world
         drawn = {"object": to_world(first) - offset, "goal": to_world(last) - offset}
         return {**drawn, **sampling.repeated(chosen, len(rngs))}
 
@@ -57,11 +57,11 @@ class Shove(PickAndPlace):
         return sampling.first_of(self.sample_each([rng], chosen))
 
     def observed(self) -> tuple[Entry, ...]:
-        """Return entries of the robot and the puck, without whether the puck is held."""
+        """Return entries of the robot and the block, without whether the block is held."""
         return (*self.robot_entries(), *self.object_entries()[:-1])
 
     def shaping(self, state: State) -> dict[str, FloatArray]:
-        """Return minus the distance from the lip to the puck's middle, and the penalty on speed."""
+        """Return minus the distance from the lip to the block's middle, and the penalty on speed."""
         speed = np.linalg.norm(state.object_velocity[..., 0, :], axis=-1)
         away = rewards.distance(self.lip(state), state.object_position[..., 0, :])
         return {

@@ -12,7 +12,7 @@ from tpm_gym.simulation.randomisation import LIMITS, Randomisation
 
 SERVO_ATTRIBUTES: Final = ("servo_stiffness", "joint_friction")
 """Attributes that only servo drives have."""
-OBJECT_ATTRIBUTES: Final = ("puck_mass", "friction")
+OBJECT_ATTRIBUTES: Final = ("block_mass", "friction")
 """Attributes without effect in scenes without objects."""
 UNITS: Final = {
     "encoder_noise": "rad",

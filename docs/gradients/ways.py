@@ -1,4 +1,4 @@
-"""The way of a puck that takes the least torque, by gradients through the closed-form dynamics."""
+"""The way of a block that takes the least torque, by gradients through the closed-form dynamics."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tpm_gym.tasks.pick_and_place import CLEARANCE, PickAndPlace
 
 WELL = 0.005
 """About how far from its ends a way may be below the clearance, m."""
-PUCK = Block()
+BLOCK = Block()
 _SUBSTEPS = 10  # the engines' time steps in a control period
 _WEIGHTS = (1e-3, 1e-4, 1e-5)
 _RISE = 0.001  # over the expert's way, whose clearance is exact, m
@@ -34,14 +34,14 @@ _RISE = 0.001  # over the expert's way, whose clearance is exact, m
 
 @dataclass(frozen=True)
 class Carry:
-    """A puck to be carried from place to place on the table, from rest to rest.
+    """A block to be carried from place to place on the table, from rest to rest.
 
     A way is a row of commands for P (n, 3) m at the control's 25 Hz, as :meth:`Simulation.move`
     takes them: P follows their spline, and so is where it begins and ends.
 
     Attributes:
         machine: Which carries it.
-        first: Point P where the puck was taken, machine's frame, m.
+        first: Point P where the block was taken, machine's frame, m.
         last: Where it is put.
     """
 
@@ -51,8 +51,8 @@ class Carry:
 
     @cached_property
     def dynamics(self) -> Dynamics:
-        """Those of the machine with the puck."""
-        return replace(self.machine.dynamics, payload=PUCK.mass)
+        """Those of the machine with the block."""
+        return replace(self.machine.dynamics, payload=BLOCK.mass)
 
     def expert(self) -> Tensor:
         """The scripted expert's way: up, over, down, on straight lines at trapezoidal speed."""
@@ -122,17 +122,17 @@ class Carry:
         return full(found)
 
     def simulated(self, commands: Tensor) -> Tensor:
-        """The motors' torques (m - 3, 3) N m in PyBullet, with the puck in the cup.
+        """The motors' torques (m - 3, 3) N m in PyBullet, with the block in the cup.
 
         All time steps but the last two, in which it lands.
 
         Raises:
-            RuntimeError: If the cup does not hold the puck at the end.
+            RuntimeError: If the cup does not hold the block at the end.
         """
-        centre = self.machine.mount.to_world(self.first) - hanging(PUCK)
-        with closing(Simulation(Scene(objects=(PUCK,)), machine=self.machine)) as simulation:
+        centre = self.machine.mount.to_world(self.first) - hanging(BLOCK)
+        with closing(Simulation(Scene(objects=(BLOCK,)), machine=self.machine)) as simulation:
             theta, on = self.joints(commands).numpy(), np.array([True])
-            simulation.reset(np.array([0]), theta[0], {PUCK.name: centre[None]})
+            simulation.reset(np.array([0]), theta[0], {BLOCK.name: centre[None]})
             for _ in range(2 * SEAL_STEPS):
                 simulation.move(np.array([self.first]), on)
             torques = []
@@ -140,7 +140,7 @@ class Carry:
                 simulation.engine.advance(_TimeStep(joints), on)
                 torques.append(simulation.engine.read().torque[0])
             if simulation.engine.read().held[0] != 0:
-                raise RuntimeError("the puck was lost")
+                raise RuntimeError("the block was lost")
         return torch.tensor(np.array(torques))
 
 
@@ -170,7 +170,7 @@ def rms(torque: Tensor) -> Tensor:
 
 def draw(machine: TPM, count: int, seed: int = 0) -> list[Carry]:
     """Places as the task draws them: safe ones on the table, not too near to each other."""
-    rng, table = np.random.default_rng(seed), PickAndPlace(machine).on_table(PUCK)
+    rng, table = np.random.default_rng(seed), PickAndPlace(machine).on_table(BLOCK)
     carries = []
     for _ in range(count):
         first = machine.sample([rng], [table])[0]

@@ -25,7 +25,7 @@ PICK = "TPMPickAndPlace-v0"
 
 @pytest.fixture(scope="module")
 def taped():
-    """A tape of two episodes, in the first of which the puck is taken, and its actions."""
+    """A tape of two episodes, in the first of which the block is taken, and its actions."""
     env, actions = gym.make(PICK), np.zeros((60, 4), np.float32)
     observation, _ = env.reset(seed=0)
     expert = Expert(env)

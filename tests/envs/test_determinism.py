@@ -30,7 +30,7 @@ from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from paths import SUPPORT
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
-from tpm_gym.envs.env import TPMEnv
+from tpm_gym import TPMEnv
 from tpm_gym.errors import ConfigurationError, EpisodeError, ModeChangeError
 from tpm_gym.tasks.expert import Expert
 
@@ -93,7 +93,7 @@ def test_fresh_processes_give_the_same_and_go_on_with_what_was_pickled(tmp_path:
 
 
 def touching(env: gym.Env[Any, Any]) -> bool:
-    """Whether the cup touches the puck."""
+    """Whether the cup touches the block."""
     engine = env.unwrapped.simulation.engine
     return bool(engine.client.getContactPoints(engine.robot.tool[0], engine.bodies[0]))
 

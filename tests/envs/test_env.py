@@ -23,7 +23,7 @@ from tpm_gym.tasks import Entry, PickAndPlace, Reach, Task
 from tpm_gym.tasks.rewards import singularity_penalty
 from tpm_gym.tasks.sampling import APART
 
-PUCK = PickAndPlace.puck
+BLOCK = PickAndPlace.block
 
 
 @pytest.fixture
@@ -262,7 +262,7 @@ def test_the_penalty_grows_towards_the_singularity_and_follows_the_weight() -> N
 
 
 @pytest.mark.parametrize("x", [0.2, 0.6], ids=["on the table", "beside it"])
-def test_a_puck_that_is_pushed_off_is_lost(env: TPMEnv, x: float) -> None:
+def test_a_block_that_is_pushed_off_is_lost(env: TPMEnv, x: float) -> None:
     env.reset(seed=0)
     body, client = env.simulation.engine.bodies[0], env.simulation.engine.client
     client.resetBasePositionAndOrientation(body, (x, -0.03, 0.016), (0, 0, 0, 1))
@@ -280,7 +280,7 @@ def test_info_tells_the_machine_that_was_drawn() -> None:
     assert first == again
     plant = env.simulation.plant
     assert first == {**vars(plant), "latency": 1}
-    assert first["puck_mass"] != 1
+    assert first["block_mass"] != 1
     assert len(first["link_masses"]) == len(env.machine.mechanism.links) - 1
     assert "randomisation" not in env.step(np.zeros(4))[4]
     nominal = TPMEnv()
@@ -369,7 +369,7 @@ def test_the_datasheet_lists_the_entries_and_numbers_that_the_code_uses() -> Non
     )
     box = f"{x0:.4g} <= x <= {x1:.4g}, {y1:.4g} <= y <= {y0:.4g}, {z0:.4g} <= z <= {z1:.4g} m"
     assert box in text
-    size = (1e3 * PUCK.width, 1e3 * PUCK.height, 1e3 * PUCK.mass)
+    size = (1e3 * BLOCK.width, 1e3 * BLOCK.height, 1e3 * BLOCK.mass)
     assert "(square, {:.0f} mm wide, {:.0f} mm high, {:.0f} g)".format(*size) in text
     assert f"below {1e3 * Task.tolerance:.0f} mm" in text
     assert f"at least {1e3 * APART:.0f} mm" in text

@@ -6,11 +6,11 @@ from unittest.mock import patch
 
 import gymnasium as gym
 import pytest
+from tpm_gym.envs.registration import MAX_EPISODE_STEPS
 
 import tpm_gym
 from tpm_gym import TPMEnv, register_task
 from tpm_gym.envs import registration
-from tpm_gym.envs.registration import MAX_EPISODE_STEPS
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.tasks import PickAndPlace, Reach
 from tpm_gym.tasks.registry import TASKS

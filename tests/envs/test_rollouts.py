@@ -33,7 +33,7 @@ def marked(case: tuple[str, str]) -> Any:
 @pytest.mark.parametrize(("env_id", "name"), [marked(case) for case in cases()])
 def test_rollouts_are_those_on_record(env_id: str, name: str) -> None:
     found, recorded = play(env_id, name, Expert), RECORDED[f"{env_id} {name}"]
-    # A policy computes in single precision, and its puck may be about to slip or to tip.
+    # A policy computes in single precision, and its block may be about to slip or to tip.
     near = 1e-4 if name == "published" else 1e-9
     if found["sha256"] != recorded["sha256"]:
         for key in ("returns", "gaps"):

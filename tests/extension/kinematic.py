@@ -1,17 +1,17 @@
 """An engine without physics, in one file outside the package: joints jump, blocks stay put."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tpm_gym import Machine, register_engine
-from tpm_gym.arrays import Vector
+from tpm_gym.arrays import BoolArray, FloatArray, IntArray
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.cup import CUP, sealed
 from tpm_gym.simulation import Plant, Scene
-from tpm_gym.simulation.engine import Hold, Motors, Pose, Reference, Truth, Twist
+from tpm_gym.simulation.engine import Path, Pose, Readout, Twist
 from tpm_gym.simulation.randomisation import NOMINAL
 from tpm_gym.simulation.state import CONTROL_PERIOD
 from tpm_gym.simulation.vacuum import EMPTY, Load, hold_after
@@ -20,80 +20,74 @@ DOWN = (0.0, 0.0, -1.0)
 
 
 class KinematicEngine:
-    """Takes neither physics nor a window, so it names neither in its constructor."""
+    """One robot. It takes neither physics nor a window, so its constructor names neither."""
 
-    substeps = 1
+    time_step = CONTROL_PERIOD
 
-    def load(self, machine: Machine, scene: Scene) -> None:
-        self._machine, self._blocks = machine, scene.objects
+    def load(self, machine: Machine, scene: Scene, count: int) -> None:
+        self._machine, self._blocks, self._count = machine, scene.objects, count
 
-    def alter(self, plant: Plant) -> None:
-        if (plant.link_masses, plant.motor_strength) != ((), NOMINAL.motor_strength):
-            raise ConfigurationError("randomisation", plant, "one of lengths and encoders")
+    def alter(self, rows: IntArray, plants: Sequence[Plant]) -> None:
+        for plant in plants:
+            if (plant.link_masses, plant.motor_strength) != ((), NOMINAL.motor_strength):
+                raise ConfigurationError("randomisation", plant, "one of lengths and encoders")
 
-    def place(self, joints: Mapping[str, float], objects: Sequence[Pose]) -> None:
-        a, b, c = (joints[name] for name in self._machine.mechanism.actuated)
-        self._theta, self._rates, self._hold = (a, b, c), (0.0, 0.0, 0.0), EMPTY
-        self._poses = list(objects)
+    def place(self, rows: IntArray, theta: FloatArray, objects: FloatArray) -> None:
+        self._theta, self._rates, self._hold = theta.copy(), np.zeros_like(theta), EMPTY
+        self._objects = objects[0].copy()
 
-    def show_goal(self, markers: Sequence[Vector]) -> None:
-        pass
-
-    def advance(self, references: Sequence[Reference], vacuum: bool) -> None:
-        before, theta = self._position(), references[-1].theta
-        a, b, c = np.subtract(theta, self._theta) / CONTROL_PERIOD
-        self._theta, self._rates = theta, (a, b, c)
+    def advance(self, path: Path, vacuum: BoolArray) -> None:
+        before, theta = self._position(), path.joints(last=1)[:, -1]
+        self._rates, self._theta = (theta - self._theta) / self.time_step, theta
         now = self._position()
-        held = self._hold.which
-        if held >= 0:
-            x, y, z = np.add(self._poses[held].position, np.subtract(now, before))
-            self._poses[held] = Pose((x, y, z))
-        x, y, z = now
-        lip = (x, y, z - CUP.length)
+        if self._hold.which >= 0:
+            self._objects[self._hold.which, :3] += now - before
+        x, y, z = now.tolist()
         touched = [
             index
-            for index, (block, pose) in enumerate(zip(self._blocks, self._poses, strict=True))
-            if sealed(lip, DOWN, *pose, (block.width, block.height))
+            for index, (block, pose) in enumerate(zip(self._blocks, self._poses(), strict=True))
+            if sealed((x, y, z - CUP.length), DOWN, *pose, (block.width, block.height))
         ]
-        first = touched[0] if touched else -1
-        self._hold = hold_after(self._hold, CONTROL_PERIOD, vacuum, Load(), first)
+        first, on = touched[0] if touched else -1, bool(vacuum[0])
+        self._hold = hold_after(self._hold, self.time_step, on, Load(), first)
 
-    def motors(self) -> Motors:
-        return Motors(self._theta, self._rates, (0.0, 0.0, 0.0))
-
-    def truth(self) -> Truth:
-        return Truth(0.0, self._position(), 0.0)
-
-    def objects(self) -> list[tuple[Pose, Twist]]:
-        return [(pose, Twist()) for pose in self._poses]
-
-    def hold(self) -> Hold:
-        return self._hold
+    def read(self) -> Readout:
+        rows = (tuple(values[0].tolist()) for values in (self._theta, self._rates, 0 * self._rates))
+        x, y, z = self._position().tolist()
+        objects = [(pose, Twist()) for pose in self._poses()]
+        motors: Any = tuple(rows)
+        return Readout.of_one(self._machine, motors, (0.0, (x, y, z), 0.0), self._hold, objects)
 
     def save(self) -> Any:
-        return self._theta, self._rates, self._hold, tuple(self._poses)
+        return self._theta, self._rates, self._hold, self._objects.copy()
 
-    def restore(self, snapshot: Any) -> None:
-        self._theta, self._rates, self._hold, poses = snapshot
-        self._poses = list(poses)
+    def restore(self, saved: Any) -> None:
+        self._theta, self._rates, self._hold, objects = saved
+        self._objects = objects.copy()
+
+    def show_goal(self, markers: FloatArray) -> None:
+        pass
 
     def picture(self, width: int, height: int) -> NDArray[np.uint8]:
         """From above, a metre wide: the blocks."""
         image = np.full((height, width, 3), 255, np.uint8)
-        for block, pose in zip(self._blocks, self._poses, strict=True):
+        for block, (x, y, *_) in zip(self._blocks, self._objects.tolist(), strict=True):
             half = max(1, int(block.width * width / 2))
-            column, row = (int(width * at) for at in np.array(pose.position)[:2] * (1, -1))
-            row, column = max(0, height // 2 + row - half), max(0, width // 2 + column - half)
-            image[row : row + 2 * half, column : column + 2 * half] = 255 * np.array(
-                block.colour[:3]
-            )
+            row = max(0, height // 2 - int(width * y) - half)
+            column = max(0, width // 2 + int(width * x) - half)
+            colour = 255 * np.array(block.colour[:3])
+            image[row : row + 2 * half, column : column + 2 * half] = colour
         return image
 
     def close(self) -> None:
         pass
 
-    def _position(self) -> Vector:
-        return self._machine.mount.swap(self._machine.evaluate(self._theta).position)
+    def _poses(self) -> list[Pose]:
+        return [Pose.of(row) for row in self._objects.tolist()]
+
+    def _position(self) -> FloatArray:
+        """Point P (3,) m, world."""
+        return self._machine.mount.to_world(self._machine.evaluate(self._theta).position[0])
 
 
 register_engine("kinematic", KinematicEngine)

@@ -1,6 +1,7 @@
 """An engine that was written outside the package, and engines that are refused."""
 
 import pytest
+from alone import Alone
 from kinematic import KinematicEngine
 
 import tpm_gym
@@ -14,9 +15,7 @@ from tpm_gym.simulation import Engine, Servo
 )
 def test_an_option_that_it_does_not_take_is_refused_by_name(option, value):
     with pytest.raises(ConfigurationError, match=f"^{option} = .*'kinematic' has no such option"):
-        tpm_gym.simulation.Simulation(
-            tpm_gym.tasks.Reach.scene, engine="kinematic", **{option: value}
-        )
+        Alone(tpm_gym.tasks.Reach.scene, engine="kinematic", **{option: value})
 
 
 def test_what_it_cannot_randomise_it_refuses_by_name():

@@ -139,7 +139,7 @@ def test_what_is_no_environment_of_ours_is_refused(env_id: str, message: str) ->
 
 
 def test_a_class_that_derives_from_ours_is_accepted_however_it_is_registered() -> None:
-    from tpm_gym.envs.env import TPMEnv
+    from tpm_gym import TPMEnv
 
     class Mine(TPMEnv):
         pass

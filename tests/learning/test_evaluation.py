@@ -170,12 +170,12 @@ def test_contact_sheet_runs_until_nothing_moves(still: int, sheet: list[list[int
         ({"json": Path("/proc/o.json")}, ConfigError, "--json /proc/o.json: cannot be written"),
         ({"json": Path("/proc")}, ConfigError, "--json /proc: .*; choose another name"),
         ({"picture": Path("/proc/o.png")}, ConfigError, "--picture /proc/o.png: cannot be"),
-        ({"randomisation": ("puck_mass",)}, ConfigError, "--randomisation"),
-        ({"randomisation": ("puck_mass=heavy",)}, ConfigError, "--randomisation"),
+        ({"randomisation": ("block_mass",)}, ConfigError, "--randomisation"),
+        ({"randomisation": ("block_mass=heavy",)}, ConfigError, "--randomisation"),
         ({"randomisation": ("=1",)}, ConfigError, "--randomisation"),
         ({"randomisation": ("a=1:2:3",)}, ConfigError, "--randomisation"),
         ({"randomisation": ("a=1", "a=2")}, ConfigError, "--randomisation"),
-        ({"randomisation": ("puk_mass=2",)}, ConfigurationError, "puck_mass"),
+        ({"randomisation": ("puk_mass=2",)}, ConfigurationError, "block_mass"),
         ({"penalty_weight": -1.0}, ConfigurationError, "penalty_weight"),
         ({"env_options": EnvOptions(machine="narrow")}, ConfigurationError, "'paper', 'wide'"),
         ({"env_options": EnvOptions(engine="none")}, ConfigurationError, "'pybullet'"),
@@ -217,12 +217,12 @@ def test_the_environment_is_the_one_that_was_asked_for() -> None:
         env="TPMPickAndPlace-v0",
         goals="tempting",
         penalty_weight=0.25,
-        randomisation=("puck_mass=2",),
+        randomisation=("block_mass=2",),
         env_options=EnvOptions(engine="pybullet", drive="servo"),
     )
     env: Any = evaluation._make_env(config)
     assert env.unwrapped.task.penalty_weight == 0.25
-    assert env.unwrapped.randomisation.puck_mass == (2.0, 2.0)
+    assert env.unwrapped.randomisation.block_mass == (2.0, 2.0)
     assert env.unwrapped.drive == Servo()
     plain = gym.make("TPMPickAndPlace-v0")
     goals = [made.reset(seed=3)[0]["desired_goal"] for made in (env, plain)]

@@ -1,17 +1,18 @@
-"""The simulation that most tests here look at."""
+"""Simulations that most tests here look at: PyBullet's, of one robot."""
 
 import pytest
+from alone import Alone
 
-from tpm_gym.simulation import Block, Scene, Simulation
+from tpm_gym.simulation import Block, Scene
 
 
 @pytest.fixture
-def simulation() -> Simulation:
+def simulation() -> Alone:
     """The paper's machine over an empty table."""
-    return Simulation(Scene())
+    return Alone()
 
 
 @pytest.fixture
-def with_puck() -> Simulation:
-    """The same with a puck."""
-    return Simulation(Scene(objects=(Block(),)))
+def with_block() -> Alone:
+    """The same with a block."""
+    return Alone(Scene(objects=(Block(),)))

@@ -11,6 +11,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from alone import Alone
 from episodes import expert_episode, random_episode
 from gymnasium.envs.registration import EnvSpec
 from inside_bullet import around_each_step, push
@@ -22,7 +23,7 @@ from tpm_gym.errors import ConfigurationError, InputError
 from tpm_gym.mechanism import PAPER_TPM, TPM, Machine, tree
 from tpm_gym.mechanism.bodies import Joint
 from tpm_gym.mechanism.motor import TORQUE_MOTOR
-from tpm_gym.simulation import Plant, Scene, Servo, Simulation
+from tpm_gym.simulation import Plant, Scene, Servo
 from tpm_gym.simulation.drives import Reference, drive_of, limited
 from tpm_gym.simulation.state import CONTROL_PERIOD
 
@@ -33,8 +34,8 @@ HELD = Servo(feedforward="gravity")
 MOTOR = Joint("R11", "revolute", "base", REST, effort=100.0, speed=25.0, corner=15.0)
 
 
-def simulation_of(servo: Servo | None, machine: Machine = PAPER_TPM, **physics: Any) -> Simulation:
-    return Simulation(Scene(), machine=machine, drive=servo, physics=physics)
+def simulation_of(servo: Servo | None, machine: Machine = PAPER_TPM, **physics: Any) -> Alone:
+    return Alone(Scene(), machine=machine, drive=servo, physics=physics)
 
 
 def gravity(theta: Vector = THETA) -> FloatArray:
@@ -45,7 +46,7 @@ def mass_matrix(theta: Vector = THETA) -> FloatArray:
     return np.array([PAPER_TPM.torque(theta, REST, unit) for unit in np.eye(3)]) - gravity(theta)
 
 
-def watched(simulation: Simulation) -> list[tuple[Any, Vector]]:
+def watched(simulation: Alone) -> list[tuple[Any, Vector]]:
     """Of every time step from now on: motors at its end, and their rates at its beginning."""
     seen: list[tuple[Any, Vector]] = []
     before: list[Vector] = []

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from alone import Alone, motors
 from inside_bullet import around_each_step, push
 from machines import anywhere, each_machine, excursions
 from numpy.typing import ArrayLike
@@ -18,7 +19,7 @@ from tpm_gym.arrays import FloatArray, Vector
 from tpm_gym.mechanism import PAPER_TPM, Machine
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.motor import TORQUE_MOTOR
-from tpm_gym.simulation import Plant, Scene, Servo, Simulation
+from tpm_gym.simulation import Plant, Scene, Servo
 
 G = 9.81
 HOME = PAPER_TPM.home
@@ -77,22 +78,22 @@ def jacobian(machine: Machine, theta: Vector) -> FloatArray:
 # The engine
 
 
-def torques(simulation: Simulation) -> FloatArray:
-    return np.array(simulation.engine.motors().torque)
+def torques(simulation: Alone) -> FloatArray:
+    return np.array(motors(simulation).torque)
 
 
-def switch_motors_off(simulation: Simulation) -> None:
+def switch_motors_off(simulation: Alone) -> None:
     client, robot = simulation.engine.client, simulation.engine.robot
     for name in simulation.machine.mechanism.actuated:
         client.setJointMotorControl2(*robot.joints[name], client.VELOCITY_CONTROL, force=0)
 
 
-def settle(simulation: Simulation, point: ArrayLike, periods: int = 3) -> None:
+def settle(simulation: Alone, point: ArrayLike, periods: int = 3) -> None:
     for _ in range(periods):
         simulation.move(point)
 
 
-def total_energy(simulation: Simulation) -> tuple[float, float]:
+def total_energy(simulation: Alone) -> tuple[float, float]:
     """Kinetic and potential energy (J) from what the engine says of each link."""
     client, at = simulation.engine.client, simulation.engine.robot.links
     kinetic = potential = 0.0
@@ -114,7 +115,7 @@ def total_energy(simulation: Simulation) -> tuple[float, float]:
 @pytest.mark.parametrize(("low", "high"), [(1.0, 1.0), (0.5, 2.0)])
 def test_torques_at_rest_carry_the_links(machine: Machine, low: float, high: float) -> None:
     # Measured: 7e-9 of the largest of the three.
-    simulation, rng = Simulation(Scene(), machine=machine), np.random.default_rng(1)
+    simulation, rng = Alone(Scene(), machine=machine), np.random.default_rng(1)
     for point in anywhere(machine, 10):
         theta, factors = machine.inverse(point), rng.uniform(low, high, len(links(machine)))
         plant = Plant(link_masses=tuple(factors.tolist())) if high > low else Plant()
@@ -128,7 +129,7 @@ def test_torques_at_rest_carry_the_links(machine: Machine, low: float, high: flo
 @each_machine
 def test_a_force_on_the_platform_loads_the_motors_by_the_jacobian(machine: Machine) -> None:
     # Measured: 4e-7 of the largest of the three.
-    simulation, force = Simulation(Scene(), machine=machine), np.zeros(3)
+    simulation, force = Alone(Scene(), machine=machine), np.zeros(3)
     around_each_step(simulation, before=lambda: push(simulation, force))
     for point in anywhere(machine, 6, seed=2):
         theta = machine.inverse(point)
@@ -150,7 +151,7 @@ def test_a_force_on_the_platform_loads_the_motors_by_the_jacobian(machine: Machi
 @each_machine
 def test_released_it_accelerates_by_its_mass_matrix(machine: Machine) -> None:
     # Measured: 1e-5, and 3e-5 at y = 13 mm where M has rows 100 times as large as others.
-    simulation = Simulation(Scene(), machine=machine)
+    simulation = Alone(Scene(), machine=machine)
     switch_motors_off(simulation)
     for point in anywhere(machine, 6):
         theta = machine.inverse(point)
@@ -160,7 +161,7 @@ def test_released_it_accelerates_by_its_mass_matrix(machine: Machine) -> None:
             simulation.reset(theta)
             push(simulation, force)
             simulation.engine.client.stepSimulation()
-            rates = np.array(simulation.engine.motors().theta_dot)
+            rates = np.array(motors(simulation).theta_dot)
             time_step = simulation.engine.physics.time_step
             expected = np.linalg.solve(mass, j.T @ force - load) * time_step
             assert np.abs(rates - expected).max() < 1e-3 * np.abs(expected).max()
@@ -168,7 +169,7 @@ def test_released_it_accelerates_by_its_mass_matrix(machine: Machine) -> None:
 
 def lost_in_free_fall(point: Vector, time_step: float) -> float:
     """Energy lost in 0.2 s without motors, as a share of the kinetic energy gained."""
-    simulation = Simulation(Scene(), physics={"time_step": time_step})
+    simulation = Alone(Scene(), physics={"time_step": time_step})
     client, tool = simulation.engine.client, simulation.engine.robot.tool
     simulation.reset(PAPER_TPM.inverse(point))
     switch_motors_off(simulation)
@@ -193,7 +194,7 @@ def test_energy_is_conserved_up_to_the_integrator(point: Vector) -> None:
 
 def errors_of_velocity(time_step: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """At full speed: platform's speed, what J misses of its velocity, what differences miss."""
-    simulation = Simulation(Scene(), physics={"time_step": time_step})
+    simulation = Alone(Scene(), physics={"time_step": time_step})
     engine: Any = simulation.engine
     rows = []
 
@@ -204,7 +205,7 @@ def errors_of_velocity(time_step: float) -> tuple[FloatArray, FloatArray, FloatA
         )
         assert np.abs(state[7]).max() < 1e-4  # rad/s: it does not turn
         by_rates = PAPER_TPM.mount.rotate(jacobian(PAPER_TPM, theta) @ rates)
-        rows.append((by_rates, state[6], engine.truth().position))
+        rows.append((by_rates, state[6], engine.robot.truth()[1]))
 
     around_each_step(simulation, after=note)
     simulation.reset(THETA)
@@ -239,11 +240,11 @@ def test_the_platform_moves_as_joint_rates_and_jacobian_say() -> None:
 
 def errors_of_torque(machine: Machine, rate: int, commands: list[FloatArray]) -> float:
     """What the closed form misses of the torques along commands, as a share of them, by rms."""
-    simulation = Simulation(Scene(), machine=machine, physics={"time_step": 1 / rate})
+    simulation = Alone(Scene(), machine=machine, physics={"time_step": 1 / rate})
     simulation.reset(machine.inverse(tuple(commands[0])))
     settle(simulation, commands[0])
     rows: list[Any] = []
-    around_each_step(simulation, after=lambda: rows.append(simulation.engine.motors()))
+    around_each_step(simulation, after=lambda: rows.append(motors(simulation)))
     for command in commands:
         simulation.move(command)
     theta, rates, torque = np.swapaxes(rows, 0, 1)
@@ -277,7 +278,7 @@ def test_torques_of_a_motion_are_those_of_the_closed_form(machine: Machine) -> N
 @pytest.mark.parametrize("motor", [0, 1, 2])
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_a_motor_holds_its_effort_and_no_more(
-    simulation: Simulation, motor: int, sign: int, strength: Vector
+    simulation: Alone, motor: int, sign: int, strength: Vector
 ) -> None:
     effort = TORQUE_MOTOR.peak_torque * np.array(strength)
     j, load, force = jacobian(PAPER_TPM, THETA), weights(PAPER_TPM, THETA), np.zeros(3)
@@ -292,7 +293,7 @@ def test_a_motor_holds_its_effort_and_no_more(
         force[:] = np.linalg.solve(j.T, load - wanted)  # all on one motor, nothing on the others
         settle(simulation, HOME, 1)
         found = torques(simulation)
-        moved.append(abs(simulation.engine.motors().theta[motor] - THETA[motor]))
+        moved.append(abs(motors(simulation).theta[motor] - THETA[motor]))
         if share < 1:
             np.testing.assert_allclose(found, wanted, atol=1e-3)
         assert (np.abs(found) <= effort * (1 + 1e-9)).all()
@@ -303,7 +304,7 @@ def test_a_motor_holds_its_effort_and_no_more(
 @pytest.mark.parametrize("drive", [None, Servo()], ids=["ideal", "servo"])
 @pytest.mark.parametrize("engine", ["pybullet", "mujoco"])
 def test_motors_without_torque_let_the_arm_fall(engine: str, drive: Servo | None) -> None:
-    simulation = Simulation(Scene(), engine=engine, drive=drive)
+    simulation = Alone(Scene(), engine=engine, drive=drive)
     before = simulation.reset(THETA, plant=Plant(motor_strength=(0.0, 0.0, 0.0)))
     settle(simulation, HOME, 2)
     state = simulation.read()
@@ -311,7 +312,7 @@ def test_motors_without_torque_let_the_arm_fall(engine: str, drive: Servo | None
     assert before.platform_position[2] - state.platform_position[2] > 0.01
 
 
-def test_no_command_draws_more_than_the_motors_have(simulation: Simulation) -> None:
+def test_no_command_draws_more_than_the_motors_have(simulation: Alone) -> None:
     drawn: list[FloatArray] = []
     around_each_step(simulation, after=lambda: drawn.append(np.abs(torques(simulation))))
     simulation.reset(THETA)

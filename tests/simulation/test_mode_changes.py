@@ -6,15 +6,16 @@ from dataclasses import replace
 import inside_bullet
 import numpy as np
 import pytest
+from alone import Alone
 from episodes import fingerprint, random_episode
 from states import apart
 
+from tpm_gym import TPMEnv
 from tpm_gym.arrays import Vector
-from tpm_gym.envs.env import TPMEnv
 from tpm_gym.errors import ClosureError, EpisodeError, ModeChangeError, UnreachableError
 from tpm_gym.kinematics.geometry import PAPER
 from tpm_gym.mechanism import PAPER_TPM
-from tpm_gym.simulation import Simulation, State
+from tpm_gym.simulation import State
 
 HOME = PAPER_TPM.home
 THETA = PAPER_TPM.inverse(HOME)
@@ -43,7 +44,7 @@ def push(env: TPMEnv, force: Vector) -> Callable[[], None]:
 @pytest.mark.parametrize("step", [0.0005, 0.002, 0.005, 0.010])
 @pytest.mark.parametrize("x", [-0.20, -0.04, 0.10])
 def test_commands_through_the_plane_are_followed_until_the_step_that_reports_it(
-    simulation: Simulation, x: float, step: float
+    simulation: Alone, x: float, step: float
 ) -> None:
     # Far more than any action may ask for: 0.25 m/s along y.
     start = min(0.028, 20 * step)
@@ -65,7 +66,7 @@ def test_commands_through_the_plane_are_followed_until_the_step_that_reports_it(
 
 
 def test_once_reported_the_change_stays_reported_and_a_reset_forgets_it(
-    simulation: Simulation,
+    simulation: Alone,
 ) -> None:
     simulation.reset(THETA)
     for y in (0.018, 0.008, -0.002, -0.012):
@@ -116,7 +117,7 @@ def test_a_disturbance_through_the_plane_ends_the_episode_and_the_next_reset_rec
 
 
 def test_commands_towards_the_edge_are_followed_and_beyond_it_refused(
-    simulation: Simulation,
+    simulation: Alone,
 ) -> None:
     simulation.reset(THETA)
     ways = [0.030, 0.035, 0.040, 0.045, 0.048, 0.049, 0.0495, *[0.0499] * 5]

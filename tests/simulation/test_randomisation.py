@@ -10,18 +10,18 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import yaml
+from alone import Alone
 from episodes import EVERYTHING, OF_SERVOS, expert_episode, fingerprint, random_episode
 from shared import memory
 
-from tpm_gym import kinematics
+from tpm_gym import TPMEnv, kinematics
 from tpm_gym.arrays import FloatArray
-from tpm_gym.envs.env import TPMEnv
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.mechanism import PAPER_TPM
 from tpm_gym.mechanism.motor import TORQUE_MOTOR
 from tpm_gym.mechanism.mount import GRAVITY
-from tpm_gym.simulation import Block, Plant, Randomisation, Simulation, State
+from tpm_gym.simulation import Block, Plant, Randomisation, State
 from tpm_gym.simulation.randomisation import _RANGES, _SIZES, NOMINAL
 from tpm_gym.simulation.settings import settings_of
 
@@ -39,11 +39,11 @@ def of(value: Any) -> Randomisation:
 
 
 @pytest.fixture
-def simulation(with_puck: Simulation) -> Simulation:
-    return with_puck
+def simulation(with_block: Alone) -> Alone:
+    return with_block
 
 
-def rest(simulation: Simulation, plant: Plant, steps: int = 15) -> State:
+def rest(simulation: Alone, plant: Plant, steps: int = 15) -> State:
     """Hold still at home until everything has settled."""
     simulation.reset(THETA, ON_TABLE, plant=plant)
     for _ in range(steps):
@@ -102,9 +102,9 @@ def test_the_documentation_states_the_ranges() -> None:
         assert f"within {low:g} to {high:g}." in entries[name]
     for name, largest in _SIZES.items():
         assert re.search(rf"(at most|most) {largest:g}\.( |$)", entries[name])
-    puck = Block()
-    assert f"({1e3 * puck.mass:g} g)" in entries["puck_mass"]
-    assert f"({puck.friction:g} on the table)" in entries["friction"]
+    block = Block()
+    assert f"({1e3 * block.mass:g} g)" in entries["block_mass"]
+    assert f"({block.friction:g} on the table)" in entries["friction"]
     assert f"({TORQUE_MOTOR.peak_torque:g} N m)" in entries["motor_strength"]
 
 
@@ -116,10 +116,10 @@ def test_what_is_no_randomisation_is_refused_and_the_keys_are_named(value: Any) 
 
 
 def test_a_file_may_say_it_and_a_number_is_a_fixed_factor() -> None:
-    text = "{link_mass: [0.8, 1.2], puck_mass: 2, encoder_noise: 1.0e-4, latency: 1}"
-    expected = Randomisation(link_mass=(0.8, 1.2), puck_mass=2, encoder_noise=1e-4, latency=1)
+    text = "{link_mass: [0.8, 1.2], block_mass: 2, encoder_noise: 1.0e-4, latency: 1}"
+    expected = Randomisation(link_mass=(0.8, 1.2), block_mass=2, encoder_noise=1e-4, latency=1)
     assert of(yaml.safe_load(text)) == expected
-    assert expected.puck_mass == (2.0, 2.0)
+    assert expected.block_mass == (2.0, 2.0)
     assert of(expected) is expected
     assert of(None) == of({}) == Randomisation()
     assert Randomisation(link_mass=[0.8, 1.2]) == Randomisation(link_mass=(0.8, 1.2))
@@ -133,11 +133,11 @@ def test_nothing_is_drawn_for_what_is_not_random() -> None:
     rng = np.random.default_rng(0)
     before = rng.bit_generator.state
     assert Randomisation().draw(rng, PAPER_TPM) == NOMINAL
-    fixed = Randomisation(link_mass=2.0, puck_mass=3.0, motor_strength=0.5, latency=1)
+    fixed = Randomisation(link_mass=2.0, block_mass=3.0, motor_strength=0.5, latency=1)
     plant = fixed.draw(rng, PAPER_TPM)
     assert rng.bit_generator.state == before
     assert plant.link_masses == (2.0,) * LINKS
-    assert (plant.puck_mass, plant.friction, plant.motor_strength) == (3.0, 1.0, (0.5,) * 3)
+    assert (plant.block_mass, plant.friction, plant.motor_strength) == (3.0, 1.0, (0.5,) * 3)
 
 
 def numbers(plant: Plant) -> FloatArray:
@@ -149,7 +149,7 @@ def test_draws_fill_the_stated_ranges_and_are_independent() -> None:
     wide = Randomisation(**_RANGES, **sizes)
     rng = np.random.default_rng(1)
     draws = np.array([numbers(wide.draw(rng, PAPER_TPM)) for _ in range(3000)])
-    counts = {"link_mass": LINKS, "puck_mass": 1, "friction": 1, "motor_strength": 3}
+    counts = {"link_mass": LINKS, "block_mass": 1, "friction": 1, "motor_strength": 3}
     counts |= {"servo_stiffness": 3, "joint_friction": 3}
     ranges = [_RANGES[name] for name, count in counts.items() for _ in range(count)]
     for size, count in zip(sizes.values(), (3, 7), strict=True):
@@ -182,7 +182,7 @@ def drawn_masses(seed: int) -> tuple[float, ...]:
 
 
 def test_each_link_gets_its_own_mass_and_inertia_and_a_reset_takes_them_back(
-    simulation: Simulation,
+    simulation: Alone,
 ) -> None:
     factors = drawn_masses(2)
     client, links = simulation.engine.client, PAPER_TPM.mechanism.links[1:]
@@ -198,21 +198,21 @@ def test_each_link_gets_its_own_mass_and_inertia_and_a_reset_takes_them_back(
 
 
 @pytest.mark.parametrize("factor", [0.1, 1.0, 10.0])
-def test_the_puck_weighs_what_it_should_and_a_force_accelerates_it_accordingly(
-    simulation: Simulation, factor: float
+def test_the_block_weighs_what_it_should_and_a_force_accelerates_it_accordingly(
+    simulation: Alone, factor: float
 ) -> None:
     mass = factor * Block().mass
-    rest(simulation, Plant(puck_mass=factor))
-    client, (puck,) = simulation.engine.client, simulation.engine.bodies
-    weight = sum(contact[9] for contact in client.getContactPoints(puck))
+    rest(simulation, Plant(block_mass=factor))
+    client, (block,) = simulation.engine.client, simulation.engine.bodies
+    weight = sum(contact[9] for contact in client.getContactPoints(block))
     assert weight == pytest.approx(mass * GRAVITY, rel=1e-2)
-    simulation.reset(THETA, {"object": (0.05, -0.03, 0.3)}, plant=Plant(puck_mass=factor))
+    simulation.reset(THETA, {"object": (0.05, -0.03, 0.3)}, plant=Plant(block_mass=factor))
     force, steps = (0.3, 0.0, 2.0), 5
     for _ in range(steps):
-        centre = client.getBasePositionAndOrientation(puck)[0]
-        client.applyExternalForce(puck, -1, force, centre, client.WORLD_FRAME)
+        centre = client.getBasePositionAndOrientation(block)[0]
+        client.applyExternalForce(block, -1, force, centre, client.WORLD_FRAME)
         client.stepSimulation()
-    velocity = client.getBaseVelocity(puck)[0]
+    velocity = client.getBaseVelocity(block)[0]
     gained = (
         steps * simulation.engine.physics.time_step * (np.array(force) / mass - (0, 0, GRAVITY))
     )
@@ -223,10 +223,10 @@ def test_the_puck_weighs_what_it_should_and_a_force_accelerates_it_accordingly(
 
 
 @pytest.mark.parametrize("factor", [0.1, 0.5, 1.0, 1.5])  # beyond 2 it would topple
-def test_a_sliding_puck_slows_down_by_mu_g(simulation: Simulation, factor: float) -> None:
+def test_a_sliding_block_slows_down_by_mu_g(simulation: Alone, factor: float) -> None:
     rest(simulation, Plant(friction=factor))
-    client, (puck,) = simulation.engine.client, simulation.engine.bodies
-    client.resetBaseVelocity(puck, (1.5, 0.0, 0.0), (0.0, 0.0, 0.0))
+    client, (block,) = simulation.engine.client, simulation.engine.bodies
+    client.resetBaseVelocity(block, (1.5, 0.0, 0.0), (0.0, 0.0, 0.0))
     for _ in range(2):
         state = simulation.move(HOME)
     lost = factor * Block().friction * GRAVITY * 0.08
@@ -271,7 +271,7 @@ def test_noise_is_in_what_the_encoders_say_and_not_in_the_truth() -> None:
 
 
 def test_a_bias_moves_the_platform_by_minus_j_bias_and_the_encoders_do_not_know(
-    simulation: Simulation,
+    simulation: Alone,
 ) -> None:
     bias = tuple((2e-4 * np.sign(J[1])).tolist())  # the worst for y
     true = rest(simulation, NOMINAL)
@@ -288,7 +288,7 @@ def test_a_bias_moves_the_platform_by_minus_j_bias_and_the_encoders_do_not_know(
 
 
 def test_angles_that_cannot_be_assembled_leave_the_last_reading_in_place(
-    simulation: Simulation,
+    simulation: Alone,
 ) -> None:
     good = simulation.reset(THETA)
     impossible = (3.0, 3.0, 3.0)
@@ -342,7 +342,7 @@ def lengths(errors: FloatArray) -> Geometry:
 
 
 def test_with_other_lengths_the_truth_is_elsewhere_by_what_first_order_predicts(
-    simulation: Simulation,
+    simulation: Alone,
 ) -> None:
     plant = Plant(length_errors=ERRORS)
     started = simulation.reset(THETA, ON_TABLE, plant=plant)
@@ -383,7 +383,7 @@ def test_with_other_lengths_the_loops_stay_closed_at_full_speed_and_every_reset_
     assert len(seen) == 4
 
 
-def test_a_robot_built_anew_stands_in_the_same_world(simulation: Simulation) -> None:
+def test_a_robot_built_anew_stands_in_the_same_world(simulation: Alone) -> None:
     settings = simulation.engine.client.getPhysicsEngineParameters()
     falls = []
     for plant in (NOMINAL, Plant(length_errors=ERRORS), NOMINAL):

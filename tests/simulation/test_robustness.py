@@ -23,14 +23,14 @@ def bang_bang_mostly_down(rng, step, action):
 
 
 def hammering(rng, step, action):
-    if step < 12:  # until it is over the puck
+    if step < 12:  # until it is over the block
         return action
     vertical = (1, 1, 1, 1, -1, -1, 1, 1, 1, -1, 1, 1)[step // 2 % 12]
     return np.append(rng.choice([-1, 0, 1], 2) * (step % 2), (vertical, 0.0))
 
 
 HOSTILE = {
-    "hammering on the puck": hammering,
+    "hammering on the block": hammering,
     "straight down": lambda rng, step, action: DOWN,
     "grasped, then down": lambda rng, step, action: action if step < 14 else DOWN + SUCKING,
     "dropped, then down": lambda rng, step, action: action if step < 14 else DOWN,
@@ -55,7 +55,7 @@ def test_hostile_policies_do_not_lose_the_mechanism(env_id, policy, seeds):
     env = gym.make(env_id)
     expert = Expert(env)
     simulation = env.unwrapped.simulation
-    (puck,), time_step = simulation.scene.objects, simulation.engine.physics.time_step
+    (block,), time_step = simulation.scene.objects, simulation.engine.physics.time_step
     for seed in seeds:
         rng = np.random.default_rng(seed)
         observation, _ = env.reset(seed=seed)
@@ -68,10 +68,10 @@ def test_hostile_policies_do_not_lose_the_mechanism(env_id, policy, seeds):
             state = env.unwrapped.state
             assert not state.passed_singularity
             # Neither thrown about nor pressed through the table. A landing is noticed one time
-            # step late, so it goes as deep as the puck falls in one; but nothing may keep it there.
+            # step late, so it goes as deep as the block falls in one; but nothing may keep it there.
             height = state.object_position[0, 2]
             assert height < 0.4
-            depth = puck.height / 2 - height
+            depth = block.height / 2 - height
             assert depth < 1e-3 + time_step * (fall + GRAVITY * CONTROL_PERIOD)
             fall = max(fall, -state.object_velocity[0, 2])
             pressed = pressed + CONTROL_PERIOD if depth > 1e-3 else 0.0

@@ -17,7 +17,7 @@ Step = tuple[dict[str, Any], float, dict[str, Any]]
 
 EVERYTHING: dict[str, Any] = {
     "link_mass": (0.8, 1.25),
-    "puck_mass": (0.5, 2.0),
+    "block_mass": (0.5, 2.0),
     "friction": (0.5, 1.5),
     "motor_strength": (0.9, 1.1),
     "encoder_noise": 1e-4,

@@ -3,9 +3,8 @@
 from collections.abc import Callable
 from typing import Any
 
+from alone import Alone
 from numpy.typing import ArrayLike
-
-from tpm_gym.simulation import Simulation
 
 
 def nothing() -> None:
@@ -13,7 +12,7 @@ def nothing() -> None:
 
 
 def around_each_step(
-    simulation: Simulation,
+    simulation: Alone,
     before: Callable[[], None] = nothing,
     after: Callable[[], None] = nothing,
 ) -> Callable[[], None]:
@@ -33,10 +32,10 @@ def around_each_step(
     return end
 
 
-def push(simulation: Simulation, force: ArrayLike) -> None:
+def push(simulation: Alone, force: ArrayLike) -> None:
     """Apply a force (N, machine's frame) at point P of the platform in the next time step."""
     engine: Any = simulation.engine
     at = engine.robot.links[simulation.machine.mechanism.platform]
     world = simulation.machine.mount.rotate(force).tolist()
     client = engine.client
-    client.applyExternalForce(*at, world, engine.truth().position, client.WORLD_FRAME)
+    client.applyExternalForce(*at, world, engine.robot.truth()[1], client.WORLD_FRAME)

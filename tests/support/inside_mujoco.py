@@ -9,10 +9,10 @@ from unittest.mock import patch
 
 import mujoco
 import numpy as np
+from alone import Alone
 from numpy.typing import ArrayLike
 
 from tpm_gym.arrays import FloatArray
-from tpm_gym.simulation import Simulation
 from tpm_gym.simulation.mujoco.model import object_name
 
 
@@ -22,7 +22,7 @@ def nothing() -> None:
 
 @contextmanager
 def around_each_step(
-    simulation: Simulation,
+    simulation: Alone,
     before: Callable[[], None] = nothing,
     solved: Callable[[], None] = nothing,
     after: Callable[[], None] = nothing,
@@ -44,7 +44,7 @@ def around_each_step(
         yield
 
 
-def throw(simulation: Simulation, velocity: ArrayLike, spin: float = 0.0) -> None:
+def throw(simulation: Alone, velocity: ArrayLike, spin: float = 0.0) -> None:
     """Let the first object have a velocity, m/s, and turn about its axis, rad/s."""
     engine: Any = simulation.engine
     motion = engine.data.joint(object_name(0)).qvel
@@ -52,7 +52,7 @@ def throw(simulation: Simulation, velocity: ArrayLike, spin: float = 0.0) -> Non
     mujoco.mj_step1(engine.model, engine.data)  # what depends on it
 
 
-def push(simulation: Simulation, body: str, force: ArrayLike, offset: ArrayLike = 0.0) -> None:
+def push(simulation: Alone, body: str, force: ArrayLike, offset: ArrayLike = 0.0) -> None:
     """Let a force (N, world) act from now on, ``offset`` m from the body's centre of mass."""
     engine: Any = simulation.engine
     force = np.asarray(force, dtype=np.float64)
@@ -60,15 +60,15 @@ def push(simulation: Simulation, body: str, force: ArrayLike, offset: ArrayLike 
     engine.data.xfrc_applied[engine.model.body(body).id] = (*force, *torque)
 
 
-def at_point_p(simulation: Simulation) -> FloatArray:
+def at_point_p(simulation: Alone) -> FloatArray:
     """Where point P is from the platform's centre of mass, m, world."""
     engine: Any = simulation.engine
     body = engine.model.body(simulation.machine.mechanism.platform).id
-    offset: FloatArray = np.subtract(engine.truth().position, engine.data.xipos[body])
+    offset: FloatArray = np.subtract(engine.robot.truth()[1], engine.data.xipos[body])
     return offset
 
 
-def on_object(simulation: Simulation) -> FloatArray:
+def on_object(simulation: Alone) -> FloatArray:
     """Force of the contacts with the cup on the first object, N, world.
 
     Known where a time step is ``solved``.

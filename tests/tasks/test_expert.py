@@ -60,7 +60,7 @@ def test_on_the_table_it_lets_go_and_in_the_air_it_holds(env: Any) -> None:
         assert env.unwrapped.state.held == held
 
 
-def test_it_tries_again_when_the_puck_is_lost(env: Any) -> None:
+def test_it_tries_again_when_the_block_is_lost(env: Any) -> None:
     options = {"object": (-0.1, -0.03, 0.015), "goal": (0.0, -0.03, 0.1)}
     lost, successes = False, []
     for *_, info in expert_episode(env, 0, options=options):

@@ -21,8 +21,8 @@ from tpm_gym.tasks.rewards import distance
 from tpm_gym.tasks.sampling import APART, BAND, line_in_joints
 
 SAFE = PAPER_TPM.safe_conditioning
-PUCK = PickAndPlace.puck
-ON_TABLE = PUCK.height / 2
+BLOCK = PickAndPlace.block
+ON_TABLE = BLOCK.height / 2
 KINDS = [Reach, PickAndPlace]
 
 
@@ -37,7 +37,7 @@ def ends(
 ) -> tuple[FloatArray, FloatArray]:
     """Starts and goals of point P, machine's frame, each (count, 3); legal ones."""
     task, starts, aims = kind(machine, goals=goals), [], []
-    raised = (0.0, 0.0, CUP.length + PUCK.height / 2 if task.scene.objects else 0.0)
+    raised = (0.0, 0.0, CUP.length + BLOCK.height / 2 if task.scene.objects else 0.0)
     for seed in range(count):
         drawn = task.start(np.random.default_rng(seed), None)
         kind(machine).start(np.random.default_rng(seed), drawn)  # what is drawn may be chosen
@@ -60,7 +60,7 @@ def test_sampled_ends_are_safe_apart_and_spread(kind: type[Task], machine: Machi
     assert (np.ptp(goals, axis=0) > 0.8 * edges).all()
     if kind is PickAndPlace:  # half on the table, half in the air
         np.testing.assert_allclose(starts[:, 2], starts[0, 2], rtol=0, atol=1e-12)
-        height = machine.mount.to_world(goals)[:, 2] - CUP.length - PUCK.height
+        height = machine.mount.to_world(goals)[:, 2] - CUP.length - BLOCK.height
         on_table = np.isclose(height, 0.0)
         assert 0.4 < on_table.mean() < 0.6
         assert height[~on_table].min() > 0.02
@@ -87,7 +87,7 @@ def test_the_line_in_joints_leads_beyond_the_threshold_and_that_in_space_along_i
     starts, goals = ends(kind)
     unsafe = line_in_joints(PAPER_TPM, starts, goals) < SAFE  # (33, n)
     assert unsafe.any(axis=0).all()
-    # With a puck both ends are at the threshold, and most of the way lies beyond.
+    # With a block both ends are at the threshold, and most of the way lies beyond.
     assert unsafe.mean() > (0.6 if kind is PickAndPlace else 0.1)
     in_space = line_in_space(starts, goals)
     assert (in_space >= SAFE - 1e-9).all()

@@ -15,8 +15,8 @@ from tpm_gym.simulation.state import Block, Scene, State
 from tpm_gym.tasks import PickAndPlace, Reach, Task
 from tpm_gym.tasks.registry import make_task
 
-PUCK = PickAndPlace.puck
-HANGING = np.array([0.0, 0.0, CUP.length + PUCK.height / 2])  # P above the centre of a held puck
+BLOCK = PickAndPlace.block
+HANGING = np.array([0.0, 0.0, CUP.length + BLOCK.height / 2])  # P above the centre of a held block
 
 
 class TwoBlocks(PickAndPlace):
@@ -100,7 +100,7 @@ def test_the_observation_never_reads_the_platform_of_the_simulator(task: Task) -
     np.testing.assert_array_equal(task.achieved(other), task.achieved(state))
 
 
-def test_the_offset_to_the_puck_vanishes_when_the_cup_touches_it() -> None:
+def test_the_offset_to_the_block_vanishes_when_the_cup_touches_it() -> None:
     task = PickAndPlace(PAPER_TPM)
     upright = np.array([[0.0, 0.0, 1.0]])
     state = states(task, 3, object_axis=upright)
@@ -245,7 +245,7 @@ def test_what_is_out_of_reach_is_refused_with_the_range_that_is_enforced(name: s
             task.start(np.random.default_rng(0), {name: place})
         assert caught.value.leg == "box"
         assert caught.value.margin < 0
-        low, high = task.reach_of(PUCK)
+        low, high = task.reach_of(BLOCK)
         assert f"{name} must lie in {low.round(4).tolist()}" in str(caught.value)
         assert low[2] == 0.015
     for place in (low, high):

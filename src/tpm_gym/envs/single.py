@@ -69,7 +69,7 @@ class TPMEnv(gym.Env[Observation, Action]):
     ## Observation
 
     A dictionary. ``achieved_goal`` and ``desired_goal`` are (3,) m in the world frame: point P
-    (Reach) or the centre of the puck (PickAndPlace). ``observation``, 9 numbers (Reach) or 21,
+    (Reach) or the centre of the block (PickAndPlace). ``observation``, 9 numbers (Reach) or 21,
     holds what follows, each scaled to order one (``env.unwrapped.task.decode`` gives SI units):
 
     | entry | size | meaning |
@@ -95,17 +95,17 @@ class TPMEnv(gym.Env[Observation, Action]):
     | goal, sparse | 0 if the distance to the goal is below 10 mm, else -1 |
     | goal, dense | minus the distance in units of 0.1 m |
     | singularity | -penalty_weight x (1 - (c / 0.08)^4) where c = 1/cond(J) < 0.08, else 0 |
-    | approach | minus half the distance from cup to puck in units of 0.1 m |
+    | approach | minus half the distance from cup to block in units of 0.1 m |
 
     With an empty info, as SB3's HerReplayBuffer calls it, ``compute_reward`` gives the goal term
     alone; ``tpm_gym.learning.PenaltyHerReplayBuffer`` or ``copy_info_dict=True`` keep the others.
 
     ## Start
 
-    The arm at rest at home, the puck (square, 36 mm wide, 30 mm high, 50 g) flat on the table, the
-    goal at least 30 mm away from where the puck (or P) starts. Goals and objects are sampled where
+    The arm at rest at home, the block (square, 36 mm wide, 30 mm high, 50 g) flat on the table, the
+    goal at least 30 mm away from where the block (or P) starts. Goals and objects are sampled where
     1/cond(J) >= 0.08.
-    ``reset(options={"object": (x, y, z), "goal": (x, y, z)})`` chooses them instead; a puck that
+    ``reset(options={"object": (x, y, z), "goal": (x, y, z)})`` chooses them instead; a block that
     starts above the table falls.
 
     ## Info
@@ -140,7 +140,7 @@ class TPMEnv(gym.Env[Observation, Action]):
             :func:`tpm_gym.register_engine` knows.
         machine: ``"paper"`` (None too), ``"wide"``, a name that :func:`tpm_gym.register_machine`
             knows, or a :class:`~tpm_gym.Machine`; a spec that goes through JSON needs a name.
-        goals: ``"sampled"`` (None too), or ``"tempting"``: the goal, and where the puck starts, lie
+        goals: ``"sampled"`` (None too), or ``"tempting"``: the goal, and where the block starts, lie
             next to the singularity, which not every machine has near its goals.
         penalty_weight: Weight of the singularity penalty, None for 1; 0 switches it off.
         drive: How the motors follow their references. ``"ideal"`` (None too): exactly, with up to

@@ -77,8 +77,8 @@ class EvaluationConfig:
 
     randomisation: Annotated[tuple[str, ...], shown_default("nowhere", "KEY=VALUE ...")] = ()
     """Differences from the nominal machine: attributes of tpm_gym's Randomisation, each a number,
-    or for factors LOW:HIGH to draw from, for example encoder_noise=1e-4 puck_mass=0.5:2.
-    Attributes of the puck have no effect in a task without one."""
+    or for factors LOW:HIGH to draw from, for example encoder_noise=1e-4 block_mass=0.5:2.
+    Attributes of the block have no effect in a task without one."""
 
     json: Annotated[Path | None, unset(Path, "not written", "PATH")] = None
     """Write metrics, episodes and versions to this file."""

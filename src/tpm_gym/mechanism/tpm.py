@@ -255,7 +255,7 @@ PAPER_TPM = TPM(
     # The slab 0 < y < l7, less a margin to the parallel singularity y = 0 and to the edge y = l7.
     # Nearer to y = 0 the motors' torque no longer suffices to hold y when a random policy reverses
     # x or z at full speed: the platform is then thrown through the singularity. Farther from the
-    # base the cup would be pushed back farther than its stroke by a puck that lies askew.
+    # base the cup would be pushed back farther than its stroke by a block that lies askew.
     region=Region(low=(-0.24, 0.012, 0.66), high=(0.12, 0.046, 0.903)),
     goal_region=Region(low=(-0.20, 0.016, 0.70), high=(0.10, 0.042, 0.90)),
     home=(-0.04, 0.028, 0.80),

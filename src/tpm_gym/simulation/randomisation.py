@@ -23,7 +23,7 @@ Range = tuple[float, float]
 # What may be asked for: so far that trained policies fail, where something makes them.
 _RANGES: dict[str, Range] = {
     "link_mass": (0.5, 16.0),
-    "puck_mass": (0.1, 10.0),
+    "block_mass": (0.1, 10.0),
     "friction": (0.1, 3.0),
     "motor_strength": (0.05, 1.5),
     "servo_stiffness": (0.01, 4.0),
@@ -52,7 +52,7 @@ class Plant:
     Attributes:
         link_masses: Factors of mass and inertia, one for each moving link in the order of
             the machine's mechanism; empty if all are one.
-        puck_mass: Factor of the objects' mass.
+        block_mass: Factor of the objects' mass.
         friction: Factor of the friction between objects and table, and objects and cup.
         motor_strength: Factors of the three motors' largest torque.
         servo_stiffness: Factors of the three servo drives' stiffness.
@@ -62,7 +62,7 @@ class Plant:
     """
 
     link_masses: tuple[float, ...] = ()
-    puck_mass: float = 1.0
+    block_mass: float = 1.0
     friction: float = 1.0
     motor_strength: Vector = (1.0, 1.0, 1.0)
     servo_stiffness: Vector = (1.0, 1.0, 1.0)
@@ -96,7 +96,7 @@ class Randomisation:
     Attributes:
         link_mass: Factor of each moving link's mass and inertia, drawn for each link;
             within 0.5 to 16.
-        puck_mass: Factor of the objects' mass (50 g); within 0.1 to 10.
+        block_mass: Factor of the objects' mass (50 g); within 0.1 to 10.
         friction: Factor of the objects' friction (0.6 on the table); within 0.1 to 3.
         motor_strength: Factor of each motor's largest torque (100 N m); within 0.05 to 1.5.
         servo_stiffness: Factor of each drive's stiffness, its damping left as it is; within 0.01 to
@@ -121,7 +121,7 @@ class Randomisation:
     """
 
     link_mass: Range | float = (1.0, 1.0)
-    puck_mass: Range | float = (1.0, 1.0)
+    block_mass: Range | float = (1.0, 1.0)
     friction: Range | float = (1.0, 1.0)
     motor_strength: Range | float = (1.0, 1.0)
     servo_stiffness: Range | float = (1.0, 1.0)
@@ -153,7 +153,7 @@ class Randomisation:
         # What there was first is drawn first, so that seeds keep their meaning.
         plant = Plant(
             link_masses=self._numbers(rng, "link_mass", len(machine.mechanism.links) - 1),
-            puck_mass=self._numbers(rng, "puck_mass", 1)[0],
+            block_mass=self._numbers(rng, "block_mass", 1)[0],
             friction=self._numbers(rng, "friction", 1)[0],
             motor_strength=(one, two, three),
             encoder_bias=(biases[0], biases[1], biases[2]),

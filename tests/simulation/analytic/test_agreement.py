@@ -76,16 +76,16 @@ def test_with_free_hands_it_feels_and_sees_what_pybullet_does(
     ("policy", "median", "most"),
     [
         ("expert", 1e-5, 1e-3),  # 6e-7 and 7e-5 m
-        (PICK, 1e-3, 1e-2),  # 2e-5 m; it nudges the puck now and then: 5e-3
+        (PICK, 1e-3, 1e-2),  # 2e-5 m; it nudges the block now and then: 5e-3
     ],
 )
-def test_the_puck_goes_where_pybullet_takes_it(policy: str, median: float, most: float) -> None:
+def test_the_block_goes_where_pybullet_takes_it(policy: str, median: float, most: float) -> None:
     episodes = 6
     states, actions = played(PICK, policy, episodes)
     found = repeated(PICK, actions)
-    puck = column(states, episodes, "object_position")
+    block = column(states, episodes, "object_position")
     ours = np.stack([state.object_position for state, _ in found], axis=1)
-    apart = np.linalg.norm(ours - puck, axis=-1)
+    apart = np.linalg.norm(ours - block, axis=-1)
     assert np.median(apart) < median
     assert apart.max() < most
     held = column(states, episodes, "held")

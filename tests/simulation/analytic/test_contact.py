@@ -25,11 +25,11 @@ from tpm_gym.simulation.simulation import Simulation, spline_weights
 from tpm_gym.simulation.state import Block, Scene
 
 STEP, STEPS = 1 / 250, 10
-PUCK = Block()
+BLOCK = Block()
 ONE = np.arange(1)
-MIDDLE = np.array([0.3, -0.36, PUCK.height / 2])
-ON_TOP = MIDDLE + [0.0, 0.0, PUCK.height / 2 + CUP.length]
-"""Point P with the lip on a puck in the middle."""
+MIDDLE = np.array([0.3, -0.36, BLOCK.height / 2])
+ON_TOP = MIDDLE + [0.0, 0.0, BLOCK.height / 2 + CUP.length]
+"""Point P with the lip on a block in the middle."""
 
 
 class Run(NamedTuple):
@@ -60,10 +60,10 @@ def line(start: FloatArray, end: FloatArray, count: int, wait: int = 0) -> list[
     return [start + (end - start) * (i + 1) / count for i in range(count)] + [end] * wait
 
 
-def analytic(path: FloatArray, on: Sequence[bool], puck: FloatArray, batch: int = STEPS) -> Run:
+def analytic(path: FloatArray, on: Sequence[bool], block: FloatArray, batch: int = STEPS) -> Run:
     """Lead one cup along a path."""
-    contact = Contact([PUCK], 1, STEP, WIDE_TPM.table)
-    contact.place(ONE, puck[None, None])
+    contact = Contact([BLOCK], 1, STEP, WIDE_TPM.table)
+    contact.place(ONE, block[None, None])
     seen = []
     for k in range(0, len(path) - 2, batch):
         steps = np.ascontiguousarray(path[None, k : k + batch + 2])
@@ -76,10 +76,10 @@ def analytic(path: FloatArray, on: Sequence[bool], puck: FloatArray, batch: int 
 @cache
 def simulation() -> Simulation:
     """PyBullet, with room to move in all directions."""
-    return Simulation(Scene(objects=(PUCK,)), machine=WIDE_TPM)
+    return Simulation(Scene(objects=(BLOCK,)), machine=WIDE_TPM)
 
 
-def bullet(path: FloatArray, on: Sequence[bool], puck: FloatArray) -> tuple[FloatArray, Run]:
+def bullet(path: FloatArray, on: Sequence[bool], block: FloatArray) -> tuple[FloatArray, Run]:
     """The same in PyBullet; and where its platform has really been."""
     sim, mount = simulation(), WIDE_TPM.mount
 
@@ -87,7 +87,7 @@ def bullet(path: FloatArray, on: Sequence[bool], puck: FloatArray) -> tuple[Floa
         x, y, z = mount.to_paper(point).tolist()
         return WIDE_TPM.inverse((x, y, z))
 
-    sim.reset(theta(path[0]), {"object": puck})
+    sim.reset(theta(path[0]), {"object": block})
     seen, been = [], [path[0], path[1]]
     for k, point in enumerate(path[2:]):
         sim.engine.advance([Reference(theta(point))], on[k // STEPS])
@@ -98,10 +98,10 @@ def bullet(path: FloatArray, on: Sequence[bool], puck: FloatArray) -> tuple[Floa
     return np.array(been), Run(*(np.array(part) for part in zip(*seen, strict=True)))
 
 
-def compared(commands: list[FloatArray], on: list[bool], puck: FloatArray) -> tuple[Run, Run]:
+def compared(commands: list[FloatArray], on: list[bool], block: FloatArray) -> tuple[Run, Run]:
     """Ours, time step by time step, and PyBullet's."""
-    path, theirs = bullet(spline(commands), on, puck)
-    return analytic(path, on, puck, batch=1), theirs
+    path, theirs = bullet(spline(commands), on, block)
+    return analytic(path, on, block, batch=1), theirs
 
 
 # -- as PyBullet --------------------------------------------------------------------------------
@@ -213,15 +213,15 @@ def straight(height: FloatArray) -> FloatArray:
 
 
 def test_what_stands_alone_keeps_its_bits_and_what_falls_comes_to_rest() -> None:
-    pucks = Pucks(PUCK, 2, STEP)
-    pucks.place(ALL, np.array([[0.0, 0.0, 0.015], [0.1, 0.0, 0.2]]))
+    blocks = Blocks(BLOCK, 2, STEP)
+    blocks.place(ALL, np.array([[0.0, 0.0, 0.015], [0.1, 0.0, 0.2]]))
     path = np.zeros((STEPS + 2, 3, 2)) + np.array([0.0, 0.0, 0.5])[:, None]
     for _ in range(15):
-        pucks.advance(ALL, path, np.zeros(2, dtype=bool))
-    before = pucks.report()
+        blocks.advance(ALL, path, np.zeros(2, dtype=bool))
+    before = blocks.report()
     assert before["object_position"][:, 0, 2] == pytest.approx([0.015, 0.015], abs=2e-5)
-    pucks.advance(ALL, path, np.zeros(2, dtype=bool))
-    for name, value in pucks.report().items():
+    blocks.advance(ALL, path, np.zeros(2, dtype=bool))
+    for name, value in blocks.report().items():
         np.testing.assert_array_equal(value, before[name])
 
 
@@ -231,49 +231,49 @@ def test_what_is_pulled_harder_than_the_vacuum_can_comes_off(
 ) -> None:
     # 12 N on 50 g are 230.2 m/s^2 beside the weight
     times = STEP * np.arange(8)
-    path = straight(PUCK.height + np.concatenate([np.zeros(62), acceleration * times**2 / 2]))
+    path = straight(BLOCK.height + np.concatenate([np.zeros(62), acceleration * times**2 / 2]))
     ours = analytic(path, [True] * 7, MIDDLE, batch=1)
     assert (ours.held[-2:] == 0).all() == kept
     if kept:
-        total = PUCK.mass * (GRAVITY + acceleration)
+        total = BLOCK.mass * (GRAVITY + acceleration)
         assert ours.force[-1] == pytest.approx([0.0, 0.0, -total], rel=1e-3)
 
 
 def test_a_heavier_one_comes_off_and_a_smoother_one_slides_farther() -> None:
-    pucks = Pucks(PUCK, 3, STEP)
-    pucks.place(ALL, np.tile(MIDDLE, (3, 1)))
-    pucks.alter(ALL, np.array([1.0, 1.0, 30.0]), np.array([1.0, 0.5, 1.0]))
+    blocks = Blocks(BLOCK, 3, STEP)
+    blocks.place(ALL, np.tile(MIDDLE, (3, 1)))
+    blocks.alter(ALL, np.array([1.0, 1.0, 30.0]), np.array([1.0, 0.5, 1.0]))
     rising = np.minimum(np.maximum(np.arange(-92, 90), 0), 20) * 0.0002
     moving = np.maximum(np.arange(-132, 50), 0) * 0.4 * STEP
-    path = straight(PUCK.height + rising) + moving[:, None] * [1.0, 0.0, 0.0]
+    path = straight(BLOCK.height + rising) + moving[:, None] * [1.0, 0.0, 0.0]
     path = np.repeat(path[:, :, None], 3, axis=2)
     for k in range(180):
         if k == 148:
-            assert pucks.report()["held"].tolist() == [0, 0, -1]
-            dropped = pucks.report()["object_position"][:, 0, 0]
-        pucks.advance(ALL, path[k : k + 3], np.full(3, k < 148))
-    assert pucks.report()["held"].tolist() == [-1] * 3
+            assert blocks.report()["held"].tolist() == [0, 0, -1]
+            dropped = blocks.report()["object_position"][:, 0, 0]
+        blocks.advance(ALL, path[k : k + 3], np.full(3, k < 148))
+    assert blocks.report()["held"].tolist() == [-1] * 3
     still = path[-1:].repeat(3, axis=0) + np.array([0.0, 0.0, 0.2])[:, None]
     for _ in range(150):
-        pucks.advance(ALL, still, np.zeros(3, dtype=bool))
-    ways = pucks.report()["object_position"][:, 0, 0] - dropped
+        blocks.advance(ALL, still, np.zeros(3, dtype=bool))
+    ways = blocks.report()["object_position"][:, 0, 0] - dropped
     assert 0.005 < ways[0] < ways[1]
     assert ways[2] == 0.0
 
 
-def test_without_friction_the_platform_takes_what_the_puck_gains() -> None:
-    pucks = Pucks(PUCK, 1, STEP)
-    pucks.place(ALL, MIDDLE[None])
-    pucks.alter(ALL, np.ones(1), np.full(1, 1e-9))
+def test_without_friction_the_platform_takes_what_the_block_gains() -> None:
+    blocks = Blocks(BLOCK, 1, STEP)
+    blocks.place(ALL, MIDDLE[None])
+    blocks.alter(ALL, np.ones(1), np.full(1, 1e-9))
     start = ON_TOP + [-0.05, 0.005, -0.001]
     path = spline([start, *line(start, start + [0.08, 0.0, 0.0], 8)])
     gained = np.zeros(3)
     for k in range(len(path) - 2):
-        force = pucks.advance(ALL, path[k : k + 3, :, None], np.zeros(1, dtype=bool))
+        force = blocks.advance(ALL, path[k : k + 3, :, None], np.zeros(1, dtype=bool))
         gained -= STEP * force[0, :, 0]
-    velocity = pucks.report()["object_velocity"][0, 0]
+    velocity = blocks.report()["object_velocity"][0, 0]
     assert velocity[0] > 0.1
-    np.testing.assert_allclose(gained[:2], PUCK.mass * velocity[:2], rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(gained[:2], BLOCK.mass * velocity[:2], rtol=1e-6, atol=1e-9)
 
 
 def test_a_fast_low_shove_lays_it_on_its_side_where_the_cup_cannot_hold_it() -> None:
@@ -281,22 +281,22 @@ def test_a_fast_low_shove_lays_it_on_its_side_where_the_cup_cannot_hold_it() -> 
     commands = [start, *line(start, start + [0.08, 0.0, 0.0], 2, 14)]
     ours = analytic(spline(commands), [False] * 16, MIDDLE)
     assert ours.tilt[-1] == pytest.approx(math.pi / 2, abs=0.02)
-    assert ours.position[-1, 2] == pytest.approx(PUCK.width / 2, abs=2e-4)
+    assert ours.position[-1, 2] == pytest.approx(BLOCK.width / 2, abs=2e-4)
 
 
 def test_beyond_the_table_it_falls_to_the_floor() -> None:
-    pucks = Pucks(PUCK, 2, STEP, table=(0.3, 0.3))
-    pucks.place(ALL, np.array([[0.29, 0.0, 0.015], [0.31, 0.0, 0.015]]))
+    blocks = Blocks(BLOCK, 2, STEP, table=(0.3, 0.3))
+    blocks.place(ALL, np.array([[0.29, 0.0, 0.015], [0.31, 0.0, 0.015]]))
     path = np.zeros((STEPS + 2, 3, 2)) + np.array([0.0, 0.0, 0.5])[:, None]
     for _ in range(30):
-        pucks.advance(ALL, path, np.zeros(2, dtype=bool))
-    assert pucks.report()["object_position"][:, 0, 2] == pytest.approx([0.015, -0.485], abs=2e-5)
+        blocks.advance(ALL, path, np.zeros(2, dtype=bool))
+    assert blocks.report()["object_position"][:, 0, 2] == pytest.approx([0.015, -0.485], abs=2e-5)
 
 
 def test_without_objects_there_is_nothing_to_report() -> None:
-    pucks = Pucks(None, 3, STEP)
-    assert not pucks.advance(ALL, np.zeros((12, 3, 3)), np.ones(3, dtype=bool)).any()
-    report = pucks.report()
+    blocks = Blocks(None, 3, STEP)
+    assert not blocks.advance(ALL, np.zeros((12, 3, 3)), np.ones(3, dtype=bool)).any()
+    report = blocks.report()
     assert report["object_position"].shape == (3, 0, 3)
     assert report["object_quaternion"].shape == (3, 0, 4)
     assert report["held"].tolist() == [-1] * 3
@@ -307,20 +307,20 @@ def test_without_objects_there_is_nothing_to_report() -> None:
 
 
 def crowd(count: int, seed: int, periods: int = 8) -> tuple[FloatArray, FloatArray]:
-    """Pucks (n, 3), and ways (2 + k, 3, n) of P that pick, shove, tip, press and throw."""
+    """Blocks (n, 3), and ways (2 + k, 3, n) of P that pick, shove, tip, press and throw."""
     rng = np.random.default_rng(seed)
-    pucks = np.concatenate([rng.uniform(-0.02, 0.02, (count, 2)), np.full((count, 1), 0.015)], 1)
+    blocks = np.concatenate([rng.uniform(-0.02, 0.02, (count, 2)), np.full((count, 1), 0.015)], 1)
     stops = np.zeros((periods + 1, count, 3))
     stops[..., :2] = 0.5 * rng.uniform(-0.06, 0.06, (periods + 1, count, 2))
     stops[..., 2] = 0.067 + np.maximum(rng.uniform(-0.02, 0.03, (periods + 1, count)), 0.0)
     ways = [spline(list(stops[:, row])) for row in range(count)]
-    return pucks, np.stack(ways, axis=2)
+    return blocks, np.stack(ways, axis=2)
 
 
-def history(pucks: FloatArray, ways: FloatArray, on: FloatArray) -> list[FloatArray]:
+def history(blocks: FloatArray, ways: FloatArray, on: FloatArray) -> list[FloatArray]:
     """All that is reported, and all forces, after each control period."""
-    batch = Pucks(PUCK, len(pucks), STEP)
-    batch.place(ALL, pucks)
+    batch = Blocks(BLOCK, len(blocks), STEP)
+    batch.place(ALL, blocks)
     seen = []
     for period, k in enumerate(range(0, len(ways) - 2, STEPS)):
         seen.append(batch.advance(ALL, ways[k : k + STEPS + 2], on[period]).T)
@@ -338,7 +338,7 @@ def digest() -> str:
 
 def test_compiled_code_gives_the_bits_that_python_gives() -> None:
     script = (
-        "import sys; sys.path.insert(0, sys.argv[1]); import test_pucks as t; print(t.digest())"
+        "import sys; sys.path.insert(0, sys.argv[1]); import test_blocks as t; print(t.digest())"
     )
     plain = subprocess.run(
         [sys.executable, "-c", script, Path(__file__).parent],
@@ -352,9 +352,9 @@ def test_compiled_code_gives_the_bits_that_python_gives() -> None:
 
 def test_a_row_has_the_same_bits_alone_and_among_others() -> None:
     count = 1024
-    pucks, ways = crowd(count, seed=0)
+    blocks, ways = crowd(count, seed=0)
     on = np.random.default_rng(1).random((8, count)) < 0.6
-    everything = history(pucks, ways, on)
+    everything = history(blocks, ways, on)
     axis = everything[4]
     assert axis.shape == (count, 1, 3)
     tilted = np.concatenate([part[:, 0, 2] < 0.99 for part in everything[4::8]])
@@ -363,17 +363,17 @@ def test_a_row_has_the_same_bits_alone_and_among_others() -> None:
     # Those that have tilted, and some others
     worst = np.argsort(np.min([part[:, 0, 2] for part in everything[4::8]], axis=0))
     for rows in (worst[:1], worst[1:2], np.array([5]), worst[2:9], np.append(worst[:4], [9, 8, 7])):
-        few = history(pucks[rows], np.ascontiguousarray(ways[:, :, rows]), on[:, rows])
+        few = history(blocks[rows], np.ascontiguousarray(ways[:, :, rows]), on[:, rows])
         for part, whole in zip(few, everything, strict=True):
             np.testing.assert_array_equal(part, whole[rows])
 
 
 def test_rows_may_be_advanced_apart_and_go_on_from_what_was_saved() -> None:
-    pucks, ways = crowd(12, seed=3)
+    blocks, ways = crowd(12, seed=3)
     on = np.ones((8, 12), dtype=bool)
-    whole = history(pucks, ways, on)
-    batch, other = Pucks(PUCK, 12, STEP), Pucks(PUCK, 12, STEP)
-    batch.place(ALL, pucks)
+    whole = history(blocks, ways, on)
+    batch, other = Blocks(BLOCK, 12, STEP), Blocks(BLOCK, 12, STEP)
+    batch.place(ALL, blocks)
     odd, even = np.arange(1, 12, 2), np.arange(0, 12, 2)
     for period, k in enumerate(range(0, len(ways) - 2, STEPS)):
         steps = ways[k : k + STEPS + 2]

@@ -11,11 +11,6 @@ import pytest
 from episodes import EVERYTHING, OF_SERVOS, expert_episode
 from inside_bullet import around_each_step
 from machines import anywhere, each_machine
-
-from tpm_gym.arrays import FloatArray
-from tpm_gym.mechanism import PAPER_TPM, TPM
-from tpm_gym.mechanism.dynamics import Dynamics
-from tpm_gym.simulation import Block, Plant, Scene, Servo
 from tpm_gym.simulation.analytic.columns import Batch
 from tpm_gym.simulation.analytic.drives import (
     Drive,
@@ -27,6 +22,11 @@ from tpm_gym.simulation.analytic.drives import (
 from tpm_gym.simulation.analytic.motion import Course, march
 from tpm_gym.simulation.analytic.simulation import AnalyticSimulation
 from tpm_gym.simulation.analytic.single import SingleSimulation
+
+from tpm_gym.arrays import FloatArray
+from tpm_gym.mechanism import PAPER_TPM, TPM
+from tpm_gym.mechanism.dynamics import Dynamics
+from tpm_gym.simulation import Block, Plant, Scene, Servo
 from tpm_gym.simulation.drives import Reference, Servos, drive_of, references
 from tpm_gym.simulation.drives import limited as limited_alone
 from tpm_gym.simulation.randomisation import Randomisation

@@ -11,10 +11,11 @@ from typing import Any
 
 import pybullet
 import pytest
+from alone import Alone
 
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.mount import GRAVITY
-from tpm_gym.simulation import Scene, Simulation
+from tpm_gym.simulation import Scene
 from tpm_gym.simulation.bullet import client as client_module
 from tpm_gym.simulation.bullet.client import Client
 from tpm_gym.simulation.bullet.physics import REGULARISATION, Physics
@@ -137,10 +138,10 @@ def test_what_is_dropped_is_given_back() -> None:
     free = Client(Physics()).number
     kept = Client(Physics())
     assert kept.number == free
-    first = Simulation(Scene())
+    first = Alone(Scene())
     number = first.engine.client.number
     del first
-    assert Simulation(Scene()).engine.client.number == number
+    assert Alone(Scene()).engine.client.number == number
     kept.stepSimulation()
 
 
@@ -185,11 +186,11 @@ def test_where_no_file_can_be_written_the_error_says_so(
     free = Client(Physics()).number
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "missing"))
     with pytest.raises(ConfigurationError, match="folder that can be written to") as caught:
-        Simulation(Scene())
+        Alone(Scene())
     assert caught.value.name == "TMPDIR"
     assert Client(Physics()).number == free
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    Simulation(Scene())
+    Alone(Scene())
     assert not list(tmp_path.iterdir())  # nothing is left there
 
 

@@ -7,16 +7,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from alone import Alone
 from inside_mujoco import around_each_step, on_object, push
 from numpy.typing import ArrayLike
 
 from tpm_gym.arrays import FloatArray
 from tpm_gym.mechanism import PAPER_TPM
 from tpm_gym.mechanism.cup import CUP
-from tpm_gym.simulation import Block, Plant, Scene, Simulation, State
+from tpm_gym.simulation import Block, Plant, Scene, State
 from tpm_gym.simulation.mujoco.model import object_name
 
-PLACE = np.array([-0.04, 0.028])  # x, y of the puck and of P, machine's frame
+PLACE = np.array([-0.04, 0.028])  # x, y of the block and of P, machine's frame
 G = 9.81
 
 
@@ -27,22 +28,22 @@ def level(height: float) -> FloatArray:
 
 def start(
     offset: ArrayLike = (0.0, 0.0), height: float = 0.10, plant: Plant | None = None
-) -> Simulation:
-    simulation = Simulation(Scene(objects=(Block(),)), engine="mujoco")
+) -> Alone:
+    simulation = Alone(Scene(objects=(Block(),)), engine="mujoco")
     x, y = np.array((1, -1)) * PLACE + offset
     theta = PAPER_TPM.inverse(tuple(level(height)))
     simulation.reset(theta, {"object": (x, y, 0.015)}, plant=plant or Plant())
     return simulation
 
 
-def go(simulation: Simulation, height: float, steps: int, vacuum: bool) -> State:
+def go(simulation: Alone, height: float, steps: int, vacuum: bool) -> State:
     for _ in range(steps):
         state = simulation.move(level(height), vacuum)
     return state
 
 
-def start_holding(**options: Any) -> Simulation:
-    """The puck is sealed to the cup at full vacuum, in the air and at rest."""
+def start_holding(**options: Any) -> Alone:
+    """The block is sealed to the cup at full vacuum, in the air and at rest."""
     simulation = start(height=0.05, **options)
     go(simulation, 0.0295, 6, vacuum=False)
     go(simulation, 0.0295, 6, vacuum=True)
@@ -53,13 +54,13 @@ def start_holding(**options: Any) -> Simulation:
     return simulation
 
 
-def slide(simulation: Simulation) -> float:
+def slide(simulation: Alone) -> float:
     engine: Any = simulation.engine
     position: float = engine.data.joint("cup_slide").qpos.item()
     return position
 
 
-def last(simulation: Simulation, read: Callable[[], Any], vacuum: bool) -> Any:
+def last(simulation: Alone, read: Callable[[], Any], vacuum: bool) -> Any:
     """What ``read`` says in the last time step of a control period in which the robot stays."""
     said: list[Any] = []
     with around_each_step(simulation, solved=lambda: said.append(read())):
@@ -91,7 +92,7 @@ def test_what_was_pressed_is_sealed_without_penetration_and_does_not_jump() -> N
     assert lip - 0.030 == pytest.approx(0.02e-3, abs=5e-6)  # clear of the face
 
 
-def test_a_held_puck_at_rest_hangs_by_its_weight_alone() -> None:
+def test_a_held_block_at_rest_hangs_by_its_weight_alone() -> None:
     simulation = start_holding()
     engine: Any = simulation.engine
     tension, shear = last(simulation, engine._cup.load, vacuum=True)
@@ -102,7 +103,7 @@ def test_a_held_puck_at_rest_hangs_by_its_weight_alone() -> None:
     )  # the weld takes the contact's place
 
 
-def test_a_held_puck_stays_put_at_full_speed() -> None:
+def test_a_held_block_stays_put_at_full_speed() -> None:
     simulation = start_holding()
     state = simulation.read()
     grip, point = state.object_position - state.platform_position, level(0.07)
@@ -129,8 +130,8 @@ def test_it_is_pulled_off_at_twelve_newtons_in_any_direction(direction: Any) -> 
     assert newtons == pytest.approx(CUP.pull_off, rel=0.02)
 
 
-def test_too_heavy_a_puck_is_lost_when_it_is_jerked_up() -> None:
-    simulation = start(height=0.05, plant=Plant(puck_mass=10.0))
+def test_too_heavy_a_block_is_lost_when_it_is_jerked_up() -> None:
+    simulation = start(height=0.05, plant=Plant(block_mass=10.0))
     go(simulation, 0.0295, 8, vacuum=True)
     assert go(simulation, 0.031, 4, vacuum=True).held == 0
     state = simulation.read()
@@ -141,18 +142,18 @@ def test_too_heavy_a_puck_is_lost_when_it_is_jerked_up() -> None:
 
 @pytest.mark.parametrize("speed", [0.005, 0.03])  # m a control period; the second is full speed
 @pytest.mark.parametrize("offset", [(0.0, 0.0), (0.012, 0.012)])
-def test_the_cup_yields_to_the_puck_at_its_preload(speed: float, offset: Any) -> None:
+def test_the_cup_yields_to_the_block_at_its_preload(speed: float, offset: Any) -> None:
     simulation, rows = start(offset=offset, height=0.06), []
     engine: Any = simulation.engine
 
     def note() -> None:
-        height = engine.objects()[0][0].position[2]
+        height = engine._scenery.read()[0][0].position[2]
         rows.append((slide(simulation), height))
 
     with around_each_step(simulation, after=note):
         for height in np.arange(0.06, 0.012, -speed):
             simulation.move(level(height))
-        state = go(simulation, 0.012, 10, vacuum=False)  # 18 mm below the top of the puck
+        state = go(simulation, 0.012, 10, vacuum=False)  # 18 mm below the top of the block
     slides, heights = np.transpose(rows)
     assert slides.min() == pytest.approx(-0.018, abs=0.02e-3)
     assert slides[-1] == pytest.approx(-0.018, abs=0.01e-3)
@@ -189,7 +190,7 @@ def test_the_cup_comes_out_again_and_stays_out_in_free_motion() -> None:
     assert max(slides) < 1e-5
 
 
-def test_beyond_its_stroke_the_cup_stops_and_the_puck_holds() -> None:
+def test_beyond_its_stroke_the_cup_stops_and_the_block_holds() -> None:
     simulation = start(height=0.05)
     state = go(simulation, 0.006, 12, vacuum=False)  # 24 mm below the top, 4 mm beyond the stroke
     assert slide(simulation) == pytest.approx(-CUP.stroke, abs=0.5e-3)  # motors at their limit

@@ -11,6 +11,7 @@ from unittest.mock import patch
 import gymnasium as gym
 import numpy as np
 import pytest
+from alone import Alone, motors
 from episodes import expert_episode, fingerprint, random_episode
 from inside_mujoco import around_each_step, at_point_p, push, throw
 
@@ -19,7 +20,7 @@ from tpm_gym.arrays import Vector
 from tpm_gym.errors import ClosureError, ConfigurationError, MissingPackageError
 from tpm_gym.mechanism import PAPER_TPM
 from tpm_gym.mechanism.cup import CUP
-from tpm_gym.simulation import Block, Plant, Scene, Simulation
+from tpm_gym.simulation import Block, Plant, Scene
 from tpm_gym.simulation.engine import Reference
 from tpm_gym.simulation.mujoco.model import object_name
 
@@ -31,8 +32,8 @@ IDS = ["TPMReach-v0", "TPMReachJoints-v0", "TPMPickAndPlace-v0", "TPMPickAndPlac
 
 
 @pytest.fixture
-def simulation() -> Iterator[Simulation]:
-    simulation = Simulation(Scene(objects=(Block(),)), engine="mujoco")
+def simulation() -> Iterator[Alone]:
+    simulation = Alone(Scene(objects=(Block(),)), engine="mujoco")
     yield simulation
     simulation.close()
 
@@ -53,8 +54,8 @@ def test_under_random_actions_loops_are_closed_and_p_is_at_the_forward_kinematic
     gaps, misses, tilts = [], [], []
 
     def note() -> None:
-        theta = env.simulation.engine.motors().theta
-        gap, position, tilt = env.simulation.engine.truth()
+        theta = motors(env.simulation).theta
+        gap, position, tilt = env.simulation.engine.robot.truth()
         known = PAPER_TPM.mount.to_world(PAPER_TPM.forward(theta))
         gaps.append(gap)
         misses.append(np.linalg.norm(known - position))
@@ -66,14 +67,14 @@ def test_under_random_actions_loops_are_closed_and_p_is_at_the_forward_kinematic
             for _ in random_episode(env, seed):
                 pass
     env.close()
-    assert len(gaps) == 4 * 50 * env.simulation.engine.substeps
+    assert len(gaps) == 4 * 50 * env.simulation.engine.physics.substeps
     assert max(gaps) < 0.06e-3
     assert max(misses) < 0.10e-3
     assert max(tilts) < 2e-5
 
 
 def test_the_ideal_drive_is_where_it_shall_be_at_the_end_of_every_time_step(
-    simulation: Simulation,
+    simulation: Alone,
 ) -> None:
     simulation.reset(THETA)
     step = simulation.engine.physics.time_step  # type: ignore[attr-defined]
@@ -82,14 +83,14 @@ def test_the_ideal_drive_is_where_it_shall_be_at_the_end_of_every_time_step(
         point = np.add(HOME, share * np.array((-0.10, 0.010, 0.05)))
         theta = PAPER_TPM.inverse(tuple(point))
         simulation.engine.advance([Reference(theta)], False)
-        motors = simulation.engine.motors()
+        motors = motors(simulation)
         np.testing.assert_allclose(motors.theta, theta, atol=2e-6)
         rates = np.subtract(theta, before) / step
         np.testing.assert_allclose(motors.theta_dot, rates, atol=1e-3)
         before = theta
 
 
-def test_torques_at_rest_are_those_of_the_closed_form(simulation: Simulation) -> None:
+def test_torques_at_rest_are_those_of_the_closed_form(simulation: Alone) -> None:
     for point in (HOME, (0.05, 0.02, 0.70), (-0.2, 0.04, 0.88)):
         simulation.reset(PAPER_TPM.inverse(point))
         for _ in range(3):
@@ -100,14 +101,14 @@ def test_torques_at_rest_are_those_of_the_closed_form(simulation: Simulation) ->
 
 @pytest.mark.parametrize("drive", [None, tpm_gym.simulation.Servo()], ids=["ideal", "servo"])
 def test_no_references_are_no_time(drive: Any) -> None:
-    simulation = Simulation(Scene(), engine="mujoco", drive=drive)
+    simulation = Alone(Scene(), engine="mujoco", drive=drive)
     simulation.reset(THETA)
-    before = simulation.engine.motors()
+    before = motors(simulation)
     simulation.engine.advance([], False)
-    assert simulation.engine.motors() == before
+    assert motors(simulation) == before
 
 
-def test_link_masses_are_altered_and_taken_back(simulation: Simulation) -> None:
+def test_link_masses_are_altered_and_taken_back(simulation: Alone) -> None:
     found = []
     for factor in (1.0, 1.25, 1.0):
         factors = (factor,) * (len(PAPER_TPM.mechanism.links) - 1)
@@ -122,7 +123,7 @@ def test_link_masses_are_altered_and_taken_back(simulation: Simulation) -> None:
 @pytest.mark.parametrize("strength", [(1.0, 1.0, 1.0), (0.5, 0.75, 1.5)])
 @pytest.mark.parametrize("motor", [0, 1, 2])
 def test_a_motor_holds_its_effort_and_no_more(
-    simulation: Simulation, motor: int, strength: Vector
+    simulation: Alone, motor: int, strength: Vector
 ) -> None:
     """All of a force on the platform on one motor, nothing on the others."""
     effort = EFFORTS * strength
@@ -137,7 +138,7 @@ def test_a_motor_holds_its_effort_and_no_more(
         world = PAPER_TPM.mount.rotate(force)
         push(simulation, PAPER_TPM.mechanism.platform, world, at_point_p(simulation))
         state = simulation.move(HOME)
-        moved.append(abs(simulation.engine.motors().theta[motor] - THETA[motor]))
+        moved.append(abs(motors(simulation).theta[motor] - THETA[motor]))
         assert (np.abs(state.torque) <= effort * (1 + 1e-9)).all()
         if share < 1:
             np.testing.assert_allclose(state.torque, wanted, atol=0.05)
@@ -147,24 +148,24 @@ def test_a_motor_holds_its_effort_and_no_more(
 
 def test_friction_of_joints_holds_what_is_weaker() -> None:
     """A torque that carries the weight and 0.4 N m more moves no motor with 0.5 N m of friction."""
-    simulation = Simulation(Scene(), engine="mujoco", drive=tpm_gym.simulation.Servo())
+    simulation = Alone(Scene(), engine="mujoco", drive=tpm_gym.simulation.Servo())
     drifts = []
     torque = tuple(np.add(PAPER_TPM.torque(THETA, (0, 0, 0), (0, 0, 0)), 0.4))
     for friction in (0.0, 0.5):
         simulation.reset(THETA, plant=Plant(joint_friction=(friction,) * 3))
         with patch.object(simulation.engine._servos, "torque", lambda *_: torque):
             simulation.move(HOME)
-        drifts.append(np.abs(np.subtract(simulation.engine.motors().theta, THETA)))
+        drifts.append(np.abs(np.subtract(motors(simulation).theta, THETA)))
     assert (drifts[0] > 1e-4).all()
     assert (drifts[1] < 1e-6).all()
 
 
 @pytest.mark.parametrize("strength", [0.5, 1.0])
 def test_servos_have_the_torque_of_their_motors_and_no_more(strength: float) -> None:
-    simulation = Simulation(Scene(), engine="mujoco", drive=tpm_gym.simulation.Servo())
+    simulation = Alone(Scene(), engine="mujoco", drive=tpm_gym.simulation.Servo())
     simulation.reset(THETA, plant=Plant(motor_strength=(strength,) * 3))
     torques: list[Vector] = []
-    note = lambda: torques.append(simulation.engine.motors().torque)  # noqa: E731
+    note = lambda: torques.append(motors(simulation).torque)  # noqa: E731
     with around_each_step(simulation, after=note):
         for jump in (-0.1, 0.1, -0.1, 0.1):
             simulation.move(np.add(HOME, (0, 0, jump)))
@@ -176,8 +177,8 @@ def test_servos_have_the_torque_of_their_motors_and_no_more(strength: float) -> 
 
 @pytest.mark.parametrize("direction", np.radians(np.arange(0, 360, 45)))
 @pytest.mark.parametrize("factor", [0.5, 1.0])
-def test_a_sliding_puck_is_slowed_by_mu_g_against_its_slip(
-    simulation: Simulation, direction: float, factor: float
+def test_a_sliding_block_is_slowed_by_mu_g_against_its_slip(
+    simulation: Alone, direction: float, factor: float
 ) -> None:
     simulation.reset(THETA, {"object": (0.1, 0.1, 0.015)}, plant=Plant(friction=factor))
     along = np.array([np.cos(direction), np.sin(direction), 0.0])
@@ -190,8 +191,8 @@ def test_a_sliding_puck_is_slowed_by_mu_g_against_its_slip(
 
 
 @pytest.mark.parametrize("spin", [10.0, 30.0])  # rad/s
-def test_a_spinning_puck_is_slowed_by_mu_n_at_its_corners_and_does_not_take_off(
-    simulation: Simulation, spin: float
+def test_a_spinning_block_is_slowed_by_mu_n_at_its_corners_and_does_not_take_off(
+    simulation: Alone, spin: float
 ) -> None:
     simulation.reset(THETA, {"object": (0.1, 0.1, 0.015)})
     engine: Any = simulation.engine
@@ -199,7 +200,7 @@ def test_a_spinning_puck_is_slowed_by_mu_n_at_its_corners_and_does_not_take_off(
     throw(simulation, (0, 0, 0), spin)
 
     def note() -> None:
-        pose, twist = engine.objects()[0]
+        pose, twist = engine._scenery.read()[0]
         rows.append((pose.position[2], twist.angular_velocity[2]))
 
     with around_each_step(simulation, after=note):
@@ -214,11 +215,11 @@ def test_a_spinning_puck_is_slowed_by_mu_n_at_its_corners_and_does_not_take_off(
 
 
 @pytest.mark.parametrize("direction", np.radians(np.arange(0, 360, 45)))
-def test_a_puck_that_slides_on_another_object_is_slowed_by_mu_n_against_its_slip(
+def test_a_block_that_slides_on_another_object_is_slowed_by_mu_n_against_its_slip(
     direction: float,
 ) -> None:
     base = Block(name="base", width=0.3, height=0.02, mass=5.0)
-    simulation = Simulation(Scene(objects=(Block(), base)), engine="mujoco")
+    simulation = Alone(Scene(objects=(Block(), base)), engine="mujoco")
     simulation.reset(THETA, {"object": (0.25, 0.15, 0.035), "base": (0.25, 0.15, 0.01)})
     simulation.move(HOME)
     along = 0.6 * np.array([np.cos(direction), np.sin(direction), 0.0])
@@ -229,7 +230,7 @@ def test_a_puck_that_slides_on_another_object_is_slowed_by_mu_n_against_its_slip
 
 
 @pytest.mark.parametrize("overlap", [0.006, 0.010])  # m; with less it tips
-def test_a_struck_puck_slides_and_does_not_take_off(simulation: Simulation, overlap: float) -> None:
+def test_a_struck_block_slides_and_does_not_take_off(simulation: Alone, overlap: float) -> None:
     mount, half = PAPER_TPM.mount, Block().height / 2
     x, y, _ = mount.to_world(HOME)
     start = np.array([x, y, 2 * half - overlap + CUP.length])
@@ -240,7 +241,7 @@ def test_a_struck_puck_slides_and_does_not_take_off(simulation: Simulation, over
     assert max(state.object_position[0, 2] for state in states) < half + 0.001
 
 
-def test_a_resting_puck_neither_sinks_nor_moves(simulation: Simulation) -> None:
+def test_a_resting_block_neither_sinks_nor_moves(simulation: Alone) -> None:
     simulation.reset(THETA, {"object": (0.05, -0.05, 0.015)})
     heights: list[float] = []
     objects = simulation.engine.objects
@@ -255,7 +256,7 @@ def test_a_resting_puck_neither_sinks_nor_moves(simulation: Simulation) -> None:
 
 
 @pytest.mark.parametrize("height", np.arange(0.18, 0.22, 0.01))
-def test_what_falls_hardly_bounces(simulation: Simulation, height: float) -> None:
+def test_what_falls_hardly_bounces(simulation: Alone, height: float) -> None:
     simulation.reset(THETA, {"object": (0.2, 0.1, height)})
     heights = [simulation.move(HOME).object_position[0, 2] for _ in range(25)]
     assert heights[1] == pytest.approx(height - 9.81 / 2 * 0.08**2, abs=2e-3)
@@ -265,7 +266,7 @@ def test_what_falls_hardly_bounces(simulation: Simulation, height: float) -> Non
 
 
 def test_turning_is_told_in_the_world() -> None:
-    simulation = Simulation(Scene(objects=(Block(),)), engine="mujoco")
+    simulation = Alone(Scene(objects=(Block(),)), engine="mujoco")
     simulation.reset(THETA, {"object": (0.2, 0.1, 0.3)})
     engine: Any = simulation.engine
     joint = engine.data.joint(object_name(0))
@@ -318,7 +319,7 @@ def test_nothing_is_printed(capfd: pytest.CaptureFixture[str]) -> None:
 
 @pytest.mark.parametrize("newtons", [1e3, 1e8, float("nan")])
 def test_a_mechanism_torn_apart_is_a_typed_error_and_nothing_else(
-    simulation: Simulation,
+    simulation: Alone,
     newtons: float,
     capfd: pytest.CaptureFixture[str],
     tmp_path: Path,
@@ -340,7 +341,7 @@ def test_a_mechanism_torn_apart_is_a_typed_error_and_nothing_else(
 
 def test_a_window_is_refused_by_name() -> None:
     with pytest.raises(ConfigurationError, match="'mujoco' has no such option"):
-        Simulation(Scene(), engine="mujoco", gui=True)
+        Alone(Scene(), engine="mujoco", gui=True)
 
 
 def test_without_the_package_the_error_names_the_extra() -> None:
@@ -350,7 +351,7 @@ def test_without_the_package_the_error_names_the_extra() -> None:
         for name in ours:
             del sys.modules[name]
         with pytest.raises(MissingPackageError, match=r"tpm-gym\[mujoco\]"):
-            Simulation(Scene(), engine="mujoco")
+            Alone(Scene(), engine="mujoco")
 
 
 @pytest.mark.parametrize(
@@ -361,14 +362,14 @@ def test_without_the_package_the_error_names_the_extra() -> None:
 )
 def test_settings_that_cannot_work_are_refused_by_name(name: str, value: Any) -> None:
     with pytest.raises(ConfigurationError) as caught:
-        Simulation(Scene(), engine="mujoco", physics={name: value})
+        Alone(Scene(), engine="mujoco", physics={name: value})
     assert (caught.value.name, caught.value.value is value) == (name, True)
 
 
 @pytest.mark.parametrize(("time_step", "substeps"), [(0.04, 1), (0.001, 40), (1 / 225, 9)])
 def test_time_steps_fill_the_control_period(time_step: float, substeps: int) -> None:
-    simulation = Simulation(Scene(), engine="mujoco", physics={"time_step": time_step})
-    assert simulation.engine.substeps == substeps
+    simulation = Alone(Scene(), engine="mujoco", physics={"time_step": time_step})
+    assert simulation.engine.physics.substeps == substeps
     simulation.reset(THETA)
     before: Any = simulation.engine
     start = before.data.time

@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from alone import Alone
 from numpy.typing import NDArray
 
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism import PAPER_TPM
-from tpm_gym.simulation import Block, Scene, Simulation
+from tpm_gym.simulation import Block, Scene
 from tpm_gym.simulation.mujoco import pictures as module
 
 HOME = PAPER_TPM.home
@@ -23,14 +24,14 @@ WIDTH, HEIGHT = 320, 240
 
 
 @pytest.fixture
-def simulation() -> Iterator[Simulation]:
-    simulation = Simulation(Scene(objects=(Block(),)), engine="mujoco")
+def simulation() -> Iterator[Alone]:
+    simulation = Alone(Scene(objects=(Block(),)), engine="mujoco")
     simulation.reset(THETA, {"object": (0.1, -0.1, 0.015)})
     yield simulation
     simulation.close()
 
 
-def picture(simulation: Simulation) -> NDArray[Any]:
+def picture(simulation: Alone) -> NDArray[Any]:
     try:
         return simulation.render(WIDTH, HEIGHT).astype(int)
     except ConfigurationError:
@@ -44,7 +45,7 @@ def middle(pixels: NDArray[Any]) -> NDArray[Any]:
 
 
 def red(image: NDArray[Any]) -> NDArray[Any]:
-    """The puck; the cup's red has less blue."""
+    """The block; the cup's red has less blue."""
     colour = np.moveaxis(image, -1, 0) / (image[..., 0] + 1)
     return (image[..., 0] > 100) & (colour[1] < 0.3) & (abs(colour[2] - 0.4) < 0.08)
 
@@ -54,8 +55,8 @@ def green(image: NDArray[Any]) -> NDArray[Any]:
     return image[..., 1] - image[..., [0, 2]].max(axis=-1) > 40
 
 
-def test_pictures_are_those_of_the_other_engine(simulation: Simulation) -> None:
-    other = Simulation(Scene(objects=(Block(),)))
+def test_pictures_are_those_of_the_other_engine(simulation: Alone) -> None:
+    other = Alone(Scene(objects=(Block(),)))
     other.reset(THETA, {"object": (0.1, -0.1, 0.015)})
     goal = np.array([[-0.1, -0.03, 0.2]])
     for one in (simulation, other):
@@ -70,7 +71,7 @@ def test_pictures_are_those_of_the_other_engine(simulation: Simulation) -> None:
     assert (background == 255).all()
 
 
-def test_what_moves_is_drawn_elsewhere_before_the_next_time_step(simulation: Simulation) -> None:
+def test_what_moves_is_drawn_elsewhere_before_the_next_time_step(simulation: Alone) -> None:
     seen = []
     for x in (-0.1, 0.1):
         simulation.show_goal(np.array([[x, -0.03, 0.2]]))
@@ -84,7 +85,7 @@ def test_what_moves_is_drawn_elsewhere_before_the_next_time_step(simulation: Sim
     assert np.linalg.norm(middle(red(picture(simulation))) - before) > 10
 
 
-def test_a_picture_changes_nothing(simulation: Simulation) -> None:
+def test_a_picture_changes_nothing(simulation: Alone) -> None:
     ends = []
     for drawn in (False, True):
         simulation.reset(THETA, {"object": (0.1, -0.1, 0.015)})
@@ -96,7 +97,7 @@ def test_a_picture_changes_nothing(simulation: Simulation) -> None:
     assert ends[0] == ends[1]
 
 
-def test_sizes_may_change_and_a_closed_one_draws_again(simulation: Simulation) -> None:
+def test_sizes_may_change_and_a_closed_one_draws_again(simulation: Alone) -> None:
     picture(simulation)
     assert simulation.render(64, 48).shape == (48, 64, 3)
     simulation.close()
@@ -107,12 +108,12 @@ def test_sizes_may_change_and_a_closed_one_draws_again(simulation: Simulation) -
 @pytest.mark.parametrize("renderer", ["tiny", "", 1])
 def test_an_unknown_renderer_is_refused(renderer: Any) -> None:
     with pytest.raises(ConfigurationError, match="'egl' or 'osmesa' or 'glfw'") as caught:
-        Simulation(Scene(), engine="mujoco", renderer=renderer)
+        Alone(Scene(), engine="mujoco", renderer=renderer)
     assert (caught.value.name, caught.value.value) == ("renderer", renderer)
 
 
 def test_where_there_is_no_way_to_opengl_the_error_names_what_there_is(
-    simulation: Simulation, monkeypatch: pytest.MonkeyPatch
+    simulation: Alone, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def missing(name: str) -> Any:
         os.environ["PYOPENGL_PLATFORM"] = name

@@ -113,7 +113,7 @@ class AnalyticEngine:
         self._exact &= not (biases.any() or any(plant.length_errors for plant in plants))
         if self._drives is not None:
             self._drives.alter(rows, plants)
-        masses, friction = ([getattr(p, k) for p in plants] for k in ("puck_mass", "friction"))
+        masses, friction = ([getattr(p, k) for p in plants] for k in ("block_mass", "friction"))
         self._contact.alter(rows, np.array(masses), np.array(friction))
 
     def place(self, rows: IntArray, theta: FloatArray, objects: FloatArray) -> None:

@@ -113,7 +113,7 @@ class BulletEngine:
         if self._drives is not None:
             self._drives.alter(rows, plants)
             self.robot.rub(plant.joint_friction)
-        self._scenery.alter(plant.puck_mass, plant.friction)
+        self._scenery.alter(plant.block_mass, plant.friction)
         self._friction.alter(plant.friction)
 
     def place(self, rows: IntArray, theta: FloatArray, objects: FloatArray) -> None:

@@ -96,7 +96,7 @@ class MujocoEngine:
         self.robot.alter(plant)
         if self._drives is not None:
             self._drives.alter(rows, plants)
-        self._scenery.alter(plant.puck_mass, plant.friction)
+        self._scenery.alter(plant.block_mass, plant.friction)
         mujoco.mj_setConst(self.model, self.data)
 
     def place(self, rows: IntArray, theta: FloatArray, objects: FloatArray) -> None:
