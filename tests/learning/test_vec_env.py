@@ -14,7 +14,7 @@ import tpm_gym
 from tpm_gym.learning import AnalyticVecEnv, PenaltyHerReplayBuffer
 from tpm_gym.learning.environments import make_env, make_envs
 from tpm_gym.learning.policies import TrainedPolicy, load_policy
-from tpm_gym.learning.rollout import run_batch, run_episodes
+from tpm_gym.learning.rollout import run_episodes
 
 PICK = "TPMPickAndPlace-v0"
 

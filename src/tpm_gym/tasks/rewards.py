@@ -22,8 +22,7 @@ def distance(achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
 
 def sparse(gap: FloatArray, tolerance: float) -> FloatArray:
     """Return 0 where ``gap`` (m) is below ``tolerance`` (m), else -1, also where it is NaN."""
-    reward: FloatArray = (gap < tolerance) - 1.0
-    return reward
+    return np.where(gap < tolerance, 0.0, -1.0)
 
 
 def dense(gap: ArrayLike, unit: float = 0.1) -> FloatArray:
