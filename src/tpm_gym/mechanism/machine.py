@@ -42,6 +42,7 @@ MODES: Final = (None, "assembly", "working")
 """Names of the numbers of :meth:`Machine.mode_left`."""
 
 _ATTEMPTS = 1000
+_SAME_PLACE = 1e-6  # m; far below the distance between assembly modes at a safe conditioning
 
 
 class Reading(NamedTuple):
@@ -267,8 +268,14 @@ class Machine(ABC):
     # -- regions ----------------------------------------------------------------------------
 
     def conditioning_at(self, position: ArrayLike) -> FloatArray:
-        """Compute 1/cond(J) (...,) with P at ``position`` (..., 3) m; 0 where P cannot be."""
-        return self.conditioning(self.inverse(position))
+        """Compute 1/cond(J) (...,) with P at ``position`` (..., 3) m; 0 where P cannot be.
+
+        It is 0 too where the working mode reaches the position in another assembly mode.
+        """
+        found, _, conditioning, _ = self.evaluate(self.inverse(position))
+        there = np.abs(np.subtract(found, position)).max(axis=-1) < _SAME_PLACE
+        known: FloatArray = np.where(there, conditioning, 0.0)
+        return known
 
     def conditioning(self, theta: ArrayLike) -> FloatArray:
         """Compute 1/cond(J) (...,) at ``theta`` (..., 3); 0 where the machine cannot be assembled.

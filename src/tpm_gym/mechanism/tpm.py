@@ -96,13 +96,6 @@ class TPM(Machine):
         side: BoolArray = np.asarray(position)[..., 1] * self.assembly_mode.sin_beta > 0
         return side
 
-    def conditioning_at(self, position: ArrayLike) -> FloatArray:
-        """See :class:`Machine`."""
-        points = _rows(position)
-        found = np.empty(points.shape[:-1])
-        _loops().conditioning_at(points.reshape(-1, 3), *self._of(None, points), found.reshape(-1))
-        return found
-
     def unreachable(self, position: Vector) -> UnreachableError:
         """See :class:`Machine`."""
         return no_posture(position, self.working_mode, self.geometry)
