@@ -1,4 +1,4 @@
-"""The translational parallel mechanism as a machine: the paper's, one of practical depth, yours."""
+"""The translational parallel mechanism as a machine, with the paper's lengths or others."""
 
 from __future__ import annotations
 
@@ -29,21 +29,21 @@ from tpm_gym.mechanism.mount import Mount
 __all__ = ["ASSEMBLY_LIMIT", "PAPER_TPM", "TPM", "WIDE_TPM"]
 
 ASSEMBLY_LIMIT = 0.010
-"""Platform against forward kinematics: farther apart, the mechanism is assembled otherwise, m."""
+"""Largest distance between platform and forward kinematics in the same assembly mode, m."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TPM(Machine):
-    """The mechanism of the paper, with any lengths.
+    """Mechanism of the paper, with any lengths.
 
-    ``dataclasses.replace(PAPER_TPM, name=..., geometry=...)`` is one with lengths of yours. Where
-    they differ much, ``mount``, ``region``, ``goal_region``, ``home`` and ``step_limit`` have to
-    follow them, and so has ``table``.
+    For other lengths, use ``dataclasses.replace(PAPER_TPM, name=..., geometry=...)``. If they
+    differ much, change ``mount``, ``region``, ``goal_region``, ``home``, ``step_limit`` and
+    ``table`` too.
 
     Attributes:
         geometry: Link lengths.
-        working_mode: How its arms are bent.
-        assembly_mode: How link 3' and platform are assembled.
+        working_mode: Branch of the inverse kinematics: how the arms are bent.
+        assembly_mode: Branch of the forward kinematics: how link 3' and platform are assembled.
     """
 
     geometry: Geometry
@@ -95,13 +95,6 @@ class TPM(Machine):
         """See :class:`Machine`."""
         side: BoolArray = np.asarray(position)[..., 1] * self.assembly_mode.sin_beta > 0
         return side
-
-    def conditioning_at(self, position: ArrayLike) -> FloatArray:
-        """See :class:`Machine`."""
-        points = _rows(position)
-        found = np.empty(points.shape[:-1])
-        _loops().conditioning_at(points.reshape(-1, 3), *self._of(None, points), found.reshape(-1))
-        return found
 
     def unreachable(self, position: Vector) -> UnreachableError:
         """See :class:`Machine`."""
@@ -166,7 +159,7 @@ class TPM(Machine):
 
     @cached_property
     def dynamics(self) -> Dynamics:
-        """Torques, mass matrix and so on, as designed and with nothing in the cup."""
+        """Torques, mass matrix and energy of the nominal machine with an empty cup."""
         return Dynamics(
             geometry=self.geometry, branch=self.assembly_mode, free_fall=self.mount.free_fall
         )
@@ -205,7 +198,7 @@ class TPM(Machine):
         return self.geometry.lengths
 
     def with_lengths(self, lengths: tuple[float, ...]) -> TPM:
-        """The machine with these l1 to l7, m."""
+        """Return the machine with these l1 to l7, m."""
         return replace(self, geometry=Geometry(*lengths))
 
 
@@ -253,32 +246,32 @@ PAPER_TPM = TPM(
     # The cup touches the table at z = 0.93 m of the paper frame, well inside the reach.
     mount=Mount(height=0.97),
     # The slab 0 < y < l7, less a margin to the parallel singularity y = 0 and to the edge y = l7.
-    # Nearer to y = 0 the motors' torque no longer suffices to hold y when a random policy reverses
-    # x or z at full speed: the platform is then thrown through the singularity. Farther from the
-    # base the cup would be pushed back farther than its stroke by a block that lies askew.
+    # Nearer to y = 0, when a random policy reverses x or z at full speed, the motors' torque cannot
+    # hold y, and the platform passes the singularity. Farther from the base, a tilted block would
+    # push the cup back beyond its stroke.
     region=Region(low=(-0.24, 0.012, 0.66), high=(0.12, 0.046, 0.903)),
     goal_region=Region(low=(-0.20, 0.016, 0.70), high=(0.10, 0.042, 0.90)),
     home=(-0.04, 0.028, 0.80),
     step_limit=(0.030, 0.005, 0.030),
     joint_limit=0.08,
-    # There, a joint error of 1 mrad moves the platform by 3 mm at most; as y goes to zero, the one
-    # grows without bound and the other falls with y. A sixth of the region is below.
+    # At 0.08, a joint error of 1 mrad moves the platform by 3 mm at most. Towards y = 0, that
+    # motion grows without bound and the conditioning falls with y. A sixth of the region is below.
     safe_conditioning=0.08,
 )
-"""The paper's case study, upside down over a table."""
+"""Machine with the lengths of the paper's case study, upside down over a table."""
 
 WIDE_TPM = TPM(
     name="wide",
     geometry=WIDE,
     mount=Mount(height=0.95),
     # The largest box of WIDE whose conditioning is at least 0.1 (analysis.aspects), less a margin,
-    # and on towards y = 0, where the penalty begins.
+    # and extended towards y = 0, where the penalty begins.
     region=Region(low=(0.12, 0.10, 0.58), high=(0.48, 0.50, 0.883)),
     goal_region=Region(low=(0.14, 0.12, 0.62), high=(0.46, 0.48, 0.88)),
     home=(0.30, 0.36, 0.75),
     table=(0.65, 0.65),
 )
-"""The paper's lengths but for a link 7 of 0.6 m, for a workspace of practical depth in y."""
+"""Machine with the paper's lengths but a link 7 of 0.6 m, for a workspace deeper in y."""
 
 register_machine("paper", PAPER_TPM)
 register_machine("wide", WIDE_TPM)

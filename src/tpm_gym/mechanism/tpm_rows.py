@@ -258,32 +258,6 @@ def motion(
 
 
 @kept
-def conditioning_at(
-    position: FloatArray, built: FloatArray, machine: FloatArray, conditioning: FloatArray
-) -> None:
-    """Compute 1/cond(J) (m,) at P (m, 3); 0 where P cannot be in the machine's modes."""
-    signs = machine[2], machine[3], machine[4], machine[5]
-    planar, side = machine[0], machine[1]
-    own, given = np.empty((7, _BLOCK)), np.empty((3, _BLOCK))
-    each = len(position) // len(built)
-    for start in range(0, len(position), _BLOCK):
-        count = min(_BLOCK, len(position) - start)
-        _fill(built, start, count, each, own)
-        _read(position, start, count, given, 0)
-        for j in range(count):
-            g = _lengths(own, j)
-            x, y, z = _get(given, 0, j)
-            theta, real, link7, _ = equations.posture_at((x, y, z), signs, g, NS)
-            cos, sin = equations.arms(theta, g, NS)
-            there = equations.Assembly(x, y, z, link7[0], link7[1], link7[2], link7[3])
-            bars = equations.rods(cos, sin, there, g)
-            values = equations.factors(cos, sin, there, bars, g)
-            same = (values.planar * planar > 0.0) & (values.sin_beta * side > 0.0)
-            least = equations.conditioning(equations.velocity(bars, values), NS)
-            conditioning[start + j] = least if real & same & (least <= 1.0) else 0.0
-
-
-@kept
 def mode_left(
     theta: FloatArray,
     position: FloatArray,
