@@ -19,7 +19,7 @@ __all__ = ["Motor", "prepare", "solve", "still"]
 
 _SWEEPS, _CALM_SWEEPS = 20, 12
 _HASTE = 1.3  # factor of each step of a normal impulse; below 2 sweeps converge
-_STILL, _UNTURNED = 5e-4, 0.05  # m/s, rad/s: slower objects at rest stay there
+_STILL, _UNTURNED = 5e-4, 0.01  # m/s, rad/s: slower objects at rest stay there
 _TOLERANCE = 3e-4  # m/s; a sweep that changes less is the last one
 _RECOVERY = 0.1  # share of a penetration that is taken out
 _SLOP = 1e-5  # m, a penetration that stays

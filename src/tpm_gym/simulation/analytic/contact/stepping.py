@@ -31,7 +31,7 @@ from tpm_gym.simulation.stage import TABLE
 
 __all__ = ["advance"]
 
-_SLOW, _LAZY = 2e-3, 0.05  # m/s, rad/s: slower objects come to rest
+_SLOW, _LAZY = 5e-3, 0.3  # m/s, rad/s: slower objects may come to rest
 _NEARBY = 5e-4  # m
 _SETTLED = 1e-6  # m; the cup is back when it is nearer
 _STOPPED = 1e-3  # m/s
@@ -75,14 +75,24 @@ def advance(
 @compiled
 def _rests(objects: Records, cup: Record) -> bool:
     """Return whether nothing moves but the cup as a whole."""
-    return cup["held"] < 0 and cup["slide"] == 0 and _calm(objects)
+    return cup["held"] < 0 and cup["slide"] == 0 and _at_rest(objects)
 
 
 @compiled
-def _calm(objects: Records) -> bool:
+def _at_rest(objects: Records) -> bool:
     """Return whether all objects are at rest."""
     for index in range(len(objects)):
         if objects[index]["rest"] < AT_REST:
+            return False
+    return True
+
+
+@compiled
+def _slow(objects: Records) -> bool:
+    """Return whether all objects move so slowly that they may come to rest."""
+    for index in range(len(objects)):
+        velocity, spin = three(objects[index]["velocity"]), three(objects[index]["spin"])
+        if dot(velocity, velocity) > _SLOW**2 or dot(spin, spin) > _LAZY**2:
             return False
     return True
 
@@ -121,11 +131,11 @@ def _step(
     """Run a time step of a table; return the force on the platform, N."""
     held, step, contacts, rate = cup["held"], setting.step, work.contacts, cup["slide_rate"]
     start = three(objects[held]["position"]) if held >= 0 else _ZERO
-    parts, calm = setting.parts, held < 0 and _calm(objects)
+    parts, calm = setting.parts, held < 0 and _slow(objects)
     if calm:
-        # Mostly everything stays at rest; if not, the time step is computed again in parts
+        # Mostly everything stays where it is; if not, the time step is computed again in parts
         count, first = _collide(objects, cup, way.now, way.then, setting, work)
-        if first == 0 and cup["slide"] == 0:
+        if first == 0 and cup["slide"] == 0 and _at_rest(objects):
             if cup["vacuum"] > 0 or on:
                 breathe(objects, cup, way, on, _ZERO, setting)
             return _ZERO
@@ -178,8 +188,7 @@ def _step(
         velocity = moved[0] / step, moved[1] / step, moved[2] / step
         seal = seal_load(objects[held], velocity, touched, step)
         put(objects[held]["velocity"], velocity)
-    if not calm:
-        _settle(objects, held)
+    _settle(objects, work.bodies, held, calm)
     breathe(objects, cup, way, on, seal, setting)
     x, y, z = plus(lip_push, seal, -step)
     return x / step, y / step, (z - CUP_MASS * (cup["slide_rate"] - rate)) / step
@@ -193,7 +202,7 @@ def _collide(
     held, near = cup["held"], length(plus(point, last, -1.0)) + _NEARBY
     lip = lip_of(last, cup["slide"])
     first = collide_lip(objects, held, lip, near, setting, work.contacts)
-    if first == 0 and held < 0 and _calm(objects):
+    if first == 0 and held < 0 and _at_rest(objects):
         return 0, 0
     count = collide_objects(objects, held, setting, work.polygons, work.contacts, first)
     return count, first
@@ -265,12 +274,12 @@ def _clear(objects: Records, cup: Record, way: Way, setting: Setting) -> bool:
 
 
 @compiled
-def _settle(objects: Records, held: int) -> None:
-    """Stop objects that have hardly moved for some time steps."""
+def _settle(objects: Records, bodies: Records, held: int, calm: bool) -> None:
+    """Count time steps without motion, and stop what stays."""
+    stays = calm or still(bodies)
     for index in range(len(objects)):
         item = objects[index]
-        slow = length(three(item["velocity"])) < _SLOW and length(three(item["spin"])) < _LAZY
-        item["rest"] = item["rest"] + 1 if slow and index != held else 0
-        if item["rest"] >= AT_REST:
+        item["rest"] = AT_REST if calm else item["rest"] + 1 if stays and index != held else 0
+        if calm:
             put(item["velocity"], _ZERO)
             put(item["spin"], _ZERO)
