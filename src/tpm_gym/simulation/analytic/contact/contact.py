@@ -10,7 +10,6 @@ through the table; point P does not yield to contacts.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -31,7 +30,6 @@ from tpm_gym.simulation.state import Block
 
 __all__ = ["Contact", "Reading"]
 
-_PART = 1e-3  # s
 _ON_TABLE = 2e-5  # m
 
 
@@ -71,11 +69,10 @@ class Contact:
         """Put all objects in the middle of their tables, one on the other."""
         self._blocks, number = tuple(blocks), len(blocks)
         half = np.array([block.half for block in blocks]).reshape(number, 3)
-        parts = max(1, math.ceil(time_step / _PART - 1e-9))
-        self._setting = Setting(half, table, time_step, parts)
+        self._setting = Setting(half, table, time_step)
         self._objects = np.zeros((count, number), OBJECT)
         self._cups = np.zeros(count, CUP_STATE)
-        self._memory = np.zeros((count, slots(number), 3))
+        self._forces = np.zeros((count, slots(number), 3))
         self._work = work_for(number)
         everything = np.arange(count)
         self.alter(everything, np.ones(count), np.ones(count))
@@ -111,7 +108,7 @@ class Contact:
         empty = np.zeros((), CUP_STATE)
         empty["held"] = -1
         self._cups[rows] = empty
-        self._memory[rows] = 0.0
+        self._forces[rows] = 0.0
 
     def advance(self, rows: IntArray, path: FloatArray, vacuum_on: BoolArray) -> FloatArray:
         """Run K time steps.
@@ -128,7 +125,7 @@ class Contact:
         """
         force = np.zeros((len(rows), path.shape[1] - 2, 3))
         if self._blocks:
-            states = self._objects, self._cups, self._memory
+            states = self._objects, self._cups, self._forces
             advance(states, rows, path, vacuum_on, self._setting, self._work, force)
         return force
 
@@ -155,8 +152,8 @@ class Contact:
 
     def save(self, rows: Any) -> Any:
         """Return everything that the next time steps of some tables depend on."""
-        return self._objects[rows].copy(), self._cups[rows].copy(), self._memory[rows].copy()
+        return self._objects[rows].copy(), self._cups[rows].copy(), self._forces[rows].copy()
 
     def restore(self, rows: Any, saved: Any) -> None:
         """Continue from what :meth:`save` returned."""
-        self._objects[rows], self._cups[rows], self._memory[rows] = saved
+        self._objects[rows], self._cups[rows], self._forces[rows] = saved

@@ -100,13 +100,11 @@ class Setting(NamedTuple):
         half: Half edges of the objects, (k, 3) m.
         table: Half edges of the table along x and y, m.
         step: Time step, s.
-        parts: Number of equal parts in which a time step with contacts is computed.
     """
 
     half: FloatArray
     table: tuple[float, float]
     step: float
-    parts: int
 
 
 class Work(NamedTuple):
