@@ -49,7 +49,7 @@ class Moment:
 
     plants: tuple[Plant, ...]
     columns: dict[str, FloatArray]
-    objects: Any
+    pucks: FloatArray
 
 
 class AnalyticSimulation:
@@ -261,7 +261,7 @@ class AnalyticSimulation:
         rows = np.flatnonzero(late)
         if len(rows):
             if objects is not None:
-                self._contact.restore(rows, tuple(part[rows] for part in objects))
+                self._contact.restore(rows, objects[rows])
             drive = IdealDrives(self._effort[:, rows], self._step)
             angles = self._angles(self._spline(commands[..., rows]), rows)
             followed = [Reference(one) for one in angles.transpose(1, 0, 2)]
@@ -471,7 +471,7 @@ class AnalyticSimulation:
         self._become(np.arange(self.count)[rows], moment.plants)
         for name, values in moment.columns.items():
             getattr(self, name)[..., rows] = values
-        self._contact.restore(rows, moment.objects)
+        self._contact.restore(rows, moment.pucks)
 
     def _to_world(self, position: FloatArray) -> FloatArray:
         world: FloatArray = self._mount + position * _TURNED

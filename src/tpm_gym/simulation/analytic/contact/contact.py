@@ -89,7 +89,9 @@ class Contact:
         self._objects["mass"][rows] = mass_factor[:, None] * mass
         self._objects["friction"][rows] = friction_factor[:, None] * friction
 
-    def place(self, rows: Any, positions: FloatArray, quaternions: FloatArray | None = None) -> None:
+    def place(
+        self, rows: Any, positions: FloatArray, quaternions: FloatArray | None = None
+    ) -> None:
         """Let go, empty the cups, and put objects at rest.
 
         Args:
@@ -131,11 +133,8 @@ class Contact:
 
     def carried(self, rows: Any) -> FloatArray:
         """Return the masses that cups hold, (r,) kg."""
-        held = self._cups["held"][rows]
-        if not self._blocks:
-            return np.zeros(len(held))
-        mass = np.take_along_axis(self._objects["mass"][rows], held[:, None], axis=1)[:, 0]
-        carried: FloatArray = np.where(held >= 0, mass, 0.0)
+        held = self._cups["held"][rows, None] == np.arange(len(self._blocks))
+        carried: FloatArray = (held * self._objects["mass"][rows]).sum(axis=1)
         return carried
 
     def read(self) -> Reading:
@@ -146,14 +145,19 @@ class Contact:
             objects["quaternion"].copy(),
             objects["velocity"].copy(),
             objects["spin"].copy(),
-            cups["held"].copy(),
+            cups["held"].astype(np.int64),
             cups["vacuum"].copy(),
         )
 
-    def save(self, rows: Any) -> Any:
-        """Return everything that the next time steps of some tables depend on."""
-        return self._objects[rows].copy(), self._cups[rows].copy(), self._forces[rows].copy()
+    def save(self, rows: Any) -> FloatArray:
+        """Return everything that the next time steps of some tables depend on, (r, c)."""
+        parts = self._objects[rows], self._cups[rows], self._forces[rows]
+        return np.concatenate([p.view(np.float64).reshape(len(p), -1) for p in parts], axis=1)
 
-    def restore(self, rows: Any, saved: Any) -> None:
+    def restore(self, rows: Any, saved: FloatArray) -> None:
         """Continue from what :meth:`save` returned."""
-        self._objects[rows], self._cups[rows], self._forces[rows] = saved
+        parts, first = (self._objects, self._cups, self._forces), 0
+        for part in parts:
+            plain = part.view(np.float64).reshape(len(part), -1)
+            plain[rows] = saved[:, first : first + plain.shape[1]]
+            first += plain.shape[1]

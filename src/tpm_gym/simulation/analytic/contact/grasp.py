@@ -70,7 +70,7 @@ def breathe(
         seal: Force of the cup on the held object, N, world.
         setting: Constants.
     """
-    held, lip, touched = cup["held"], lip_of(way.then, cup["slide"]), -1
+    held, lip, touched = int(cup["held"]), lip_of(way.then, cup["slide"]), -1
     if on and held < 0:
         for index in range(len(objects)):
             if touched < 0 and _seals(objects[index], lip, index, setting):

@@ -39,7 +39,7 @@ OBJECT: Final = np.dtype(
         ("spin", "f8", 3),  # rad/s, world
         ("mass", "f8"),  # kg
         ("friction", "f8"),  # Coulomb coefficient
-        ("rest", "i8"),  # time steps in a row without motion; at rest from AT_REST on
+        ("rest", "f8"),  # time steps in a row without motion; at rest from AT_REST on
     ],
     align=True,
 )
@@ -50,7 +50,7 @@ CUP_STATE: Final = np.dtype(
         ("slide", "f8"),  # m, by which the cup is pushed back into its stem
         ("slide_rate", "f8"),  # m/s
         ("vacuum", "f8"),  # Pa
-        ("held", "i8"),  # index of the object; -1 for none
+        ("held", "f8"),  # index of the object; -1 for none
         ("grip", "f8", 3),  # m, from point P to the centre of the held object at slide 0
     ],
     align=True,
@@ -85,6 +85,7 @@ CONTACT: Final = np.dtype(
         ("reply", "f8", 3),  # (m/s)/(N s), change of the relative velocity by a normal impulse
         ("ease_n", "f8"),  # N s/(m/s), step of the normal impulse
         ("ease_t", "f8"),  # N s/(m/s), step of the friction
+        ("enough", "f8"),  # (N s)^2, square of a change of the impulse that does not count
     ],
     align=True,
 )

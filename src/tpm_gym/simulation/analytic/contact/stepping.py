@@ -115,7 +115,7 @@ def _step(
     work: Work,
 ) -> Vector:
     """Run a time step of a table; return the force on the platform, N."""
-    held, step, (bodies, contacts, polygons) = cup["held"], setting.step, work
+    held, step, (bodies, contacts, polygons) = int(cup["held"]), setting.step, work
     lip, near = lip_of(way.now, cup["slide"]), length(plus(way.then, way.now, -1.0)) + _NEARBY
     first = collide_lip(objects, held, lip, near, setting, contacts)
     if first == 0 and held < 0 and cup["slide"] == 0 and _at_rest(objects):

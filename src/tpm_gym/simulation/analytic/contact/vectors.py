@@ -8,7 +8,18 @@ from typing import Any
 from tpm_gym.arrays import Vector
 from tpm_gym.simulation.analytic.compiling import compiled
 
-__all__ = ["Frame", "axes", "clip", "cross", "dot", "length", "level_length", "plus", "put", "three"]
+__all__ = [
+    "Frame",
+    "axes",
+    "clip",
+    "cross",
+    "dot",
+    "length",
+    "level_length",
+    "plus",
+    "put",
+    "three",
+]
 
 Frame = tuple[Vector, Vector, Vector]
 """Unit vectors along a body's own axes, in the world frame."""
