@@ -135,10 +135,10 @@ def _run_episode(
 
 
 def run_batch(envs: TPMVectorEnv, policy: Policy, episodes: int, first_seed: int) -> list[Episode]:
-    """The same for many environments at a time, and a policy that takes batches.
+    """Run a policy that takes batches over many environments at a time; see :func:`run_episodes`.
 
     Args:
-        envs: As many as run at a time, with next-step autoreset; left open.
+        envs: Environments that run at a time, with next-step autoreset; left open.
 
     Raises:
         RolloutError: As for :func:`run_episodes`.
@@ -168,7 +168,7 @@ def _run_batch(envs: TPMVectorEnv, policy: Policy, first_seed: int, count: int) 
 
 
 def _measured(reward: Any, info: Mapping[str, Any], state: State) -> dict[str, Any]:
-    """What an episode is judged by, of one step, with the leading axes of the state."""
+    """Return the metrics of one step, with the leading axes of the state."""
     gap = state.fk_position - state.platform_position
     told = ("conditioning", "closure_error", "is_success", "singularity_penalty")
     return {
