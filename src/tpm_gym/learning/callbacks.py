@@ -9,10 +9,9 @@ from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from tpm_gym.envs.vector import TPMVectorEnv
-from tpm_gym.learning.checkpoint import CheckpointStore, Content
+from tpm_gym.learning.checkpoint import CheckpointStore
 from tpm_gym.learning.configuration import TrainingConfig
 from tpm_gym.learning.errors import CheckpointError
 from tpm_gym.learning.policies import TrainedPolicy
@@ -144,9 +143,6 @@ class Checkpointing(BaseCallback):
     A checkpoint that cannot be written is reported and tried again when the next one is due.
     Training continues meanwhile, and the earlier checkpoints stay.
 
-    A rollout of an on-policy algorithm is long, so a stop does not wait for its end. The state at
-    its beginning is kept in memory and saved, and resuming repeats the rollout.
-
     The first checkpoint is saved before anything else is done, so that no policy is without one.
 
     Args:
@@ -167,7 +163,6 @@ class Checkpointing(BaseCallback):
         super().__init__()
         self._config, self._store, self._evaluation = config, store, evaluation
         self._listener, self._console, self._seconds = listener, console, seconds
-        self._held: Content | None = None
         self._last_step: int | None = store.newest
         self._next_time = time.perf_counter() + _SHORTEST_INTERVAL
 
@@ -176,30 +171,21 @@ class Checkpointing(BaseCallback):
         self.model.start_time = int(time.time_ns() - self._seconds * 1e9)
         self.model._num_timesteps_at_start = 0
         if self._last_step is None:
-            self._save(self._capture(), time.perf_counter())
+            self._save()
 
     def _on_rollout_start(self) -> None:
-        started = time.perf_counter()
         stop = self._listener.received is not None
-        on_policy = isinstance(self.model, OnPolicyAlgorithm)
-        due = self._is_due()
-        if on_policy or due or stop:
-            content = self._capture()
-            self._held = content if on_policy else None
-            if due or stop:
-                self._save(content, started)
+        if stop or self._is_due():
+            self._save()
         if stop:
             raise StopTrainingError
 
     def _on_step(self) -> bool:
-        if self._listener.received is not None and self._held is not None:
-            self._save(self._held, time.perf_counter())
-            raise StopTrainingError
         return True
 
     def save_finished(self) -> None:
         """Save the end of the training."""
-        self._save(self._capture(finished=True), time.perf_counter())
+        self._save(finished=True)
 
     def _is_due(self) -> bool:
         if self._config.checkpoint_every is not None:
@@ -207,12 +193,11 @@ class Checkpointing(BaseCallback):
             return taken >= self._config.checkpoint_every
         return time.perf_counter() >= self._next_time
 
-    def _capture(self, finished: bool = False) -> Content:
+    def _save(self, finished: bool = False) -> None:
+        """Save a checkpoint, or report why not."""
+        started = time.perf_counter()
         extra = {"seconds": seconds_trained(self.model), "evaluation": self._evaluation.state()}
-        return capture(self.model, self._config.run, extra, finished)
-
-    def _save(self, content: Content, started: float) -> None:
-        """Save a state that was captured from the time ``started`` on, or report why not."""
+        content = capture(self.model, self._config.run, extra, finished)
         try:
             self._store.save(content)
         except CheckpointError as error:
