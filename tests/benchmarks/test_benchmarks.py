@@ -1,4 +1,4 @@
-"""The benchmarks run, and find what they are there to find: failures, growth, drift."""
+"""The benchmarks run, and find failures, growth and drift."""
 
 from pathlib import Path
 from types import BuiltinFunctionType
@@ -146,7 +146,7 @@ SHORT = ["--steps", "1200", "--every", "100", "--warm-up", "300"]
 
 
 def soaked(folder: Path, *options: str, **hooks: Any) -> tuple[int, dict[str, Any]]:
-    """Status and file of a short soak."""
+    """Return status and file of a short soak."""
     numbers = folder / "soak.json"
     return soak.main([*SHORT, "--json", str(numbers), *options], **hooks), read_strict(numbers)
 
@@ -251,7 +251,7 @@ def test_a_restored_state_that_goes_on_otherwise_is_found(monkeypatch):
 
 
 def samples(slope: float, noise: float) -> dict[str, Any]:
-    """A finished soak of a million steps whose gaps start at 10 um and grow by ``slope`` m."""
+    """Return a soak of a million steps with gaps that start at 10 um and grow by ``slope`` m."""
     rng = np.random.default_rng(0)
     steps = np.arange(5_000, 1_000_001, 5_000)
     gaps = 1e-5 + slope * steps / 1e6 + noise * rng.standard_normal(len(steps))
