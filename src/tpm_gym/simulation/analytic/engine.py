@@ -42,7 +42,6 @@ _WATCHFUL = 0.5
 _COLUMNS = (
     "_theta", "_rates", "_torque", "_position", "_before", "_force", "_mode_left", "_behind",
 )  # fmt: skip
-_CONTACT = ("objects", "cups", "impulses")
 
 
 class AnalyticEngine:
@@ -184,7 +183,7 @@ class AnalyticEngine:
         ):
             getattr(self, name)[rows] = values[rows]
         if saved is not None:
-            self._contact.restore(rows, tuple(part[rows] for part in saved))
+            self._contact.restore(rows, saved[rows])
         joints = np.ascontiguousarray(path.joints()[rows].swapaxes(0, 1))
         steps = IdealSteps(joints, self._effort[rows], self.time_step)
         self._march(rows, steps, vacuum)
@@ -289,7 +288,7 @@ class AnalyticEngine:
     def save(self) -> Any:
         """See the protocol; a dictionary of arrays by name."""
         saved = {name.lstrip("_"): getattr(self, name).copy() for name in _COLUMNS}
-        saved |= zip(_CONTACT, self._contact.save(self._rows), strict=True)
+        saved["objects"] = self._contact.save(self._rows)
         if self._drives is not None:
             saved["drives"] = self._drives.memory.copy()
         return saved
@@ -298,7 +297,7 @@ class AnalyticEngine:
         """See the protocol."""
         for name in _COLUMNS:
             setattr(self, name, saved[name.lstrip("_")].copy())
-        self._contact.restore(self._rows, tuple(saved[name] for name in _CONTACT))
+        self._contact.restore(self._rows, saved["objects"])
         if self._drives is not None:
             self._drives.memory[:] = saved["drives"]
 
