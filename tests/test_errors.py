@@ -13,6 +13,7 @@ from tpm_gym.errors import (
     ActionError,
     ClosureError,
     ConfigurationError,
+    ConformanceError,
     EpisodeError,
     GeometryError,
     InputError,
@@ -39,6 +40,7 @@ CASES: list[tuple[type[TPMError], tuple[Any, ...], type[Exception], str]] = [
         "'fly' is not possible; valid: 'r",
     ),
     (ResetOptionError, ("goal", 3, "a point"), ValueError, "goal = 3 is not possible; valid: a p"),
+    (ConformanceError, ("2 is 2", "it is 3"), AssertionError, "that 2 is 2; here, it is 3"),
     (EpisodeError, ("call reset() first",), RuntimeError, "call reset() first"),
     (
         UnreachableError,

@@ -140,6 +140,15 @@ class ModeChangeError(TPMError, RuntimeError):
 
 
 @dataclass(eq=False)
+class ConformanceError(TPMError, AssertionError):
+    """An environment breaks what all of them promise; see :mod:`tpm_gym.envs.testing`."""
+
+    template: ClassVar[str] = "environments promise that {promise}; here, {found}"
+    promise: str
+    found: str
+
+
+@dataclass(eq=False)
 class PolicyFileError(TPMError, ValueError):
     """The files of a policy are missing, damaged, or not what they have to be; nothing loaded."""
 

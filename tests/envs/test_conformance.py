@@ -6,11 +6,14 @@ from typing import Any
 import gantry  # noqa: F401  registers a machine
 import gymnasium as gym
 import kinematic  # noqa: F401  registers an engine
+import numpy as np
 import pytest
-from conformance import CHECKS, Make
 from episodes import EVERYTHING, OF_SERVOS
 
 import tpm_gym
+from tpm_gym.envs.testing import CHECKS, Make, check_env
+from tpm_gym.errors import ConformanceError
+from tpm_gym.tasks import Reach
 
 ENGINES = ["pybullet"]
 CASES: list[tuple[str, dict[str, Any]]] = [
@@ -46,3 +49,32 @@ def test_it_keeps_what_is_promised(
     check: Callable[[Make], None], env_id: str, options: dict[str, Any], engine: str
 ) -> None:
     check(lambda: gym.make(env_id, **{"engine": engine, **options}))
+
+
+class Unseeded(Reach):
+    """Draws from a generator of its own."""
+
+    rng = np.random.default_rng(0)
+
+    def sample(self, rngs: Any, chosen: Any) -> Any:
+        return super().sample([self.rng] * len(rngs), chosen)
+
+
+class Eager(Reach):
+    """Says that it succeeded always."""
+
+    def gap(self, achieved: Any, desired: Any) -> Any:
+        return 0.0 * super().gap(achieved, desired)
+
+    def goal_term(self, gap: Any) -> Any:
+        return super().goal_term(gap) - 1.0
+
+
+@pytest.mark.parametrize(
+    ("task", "promise"),
+    [(Unseeded, "equal seeds give equal goals"), (Eager, "the goal's term is 0")],
+)
+def test_what_does_not_keep_it_is_found(task: Any, promise: str) -> None:
+    with pytest.raises(ConformanceError, match=promise) as caught:
+        check_env(lambda: gym.make("TPMReach-v0", engine="kinematic", task=task))
+    assert caught.value.promise in str(caught.value)

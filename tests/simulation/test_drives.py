@@ -7,11 +7,12 @@ from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import asdict, replace
 from typing import Any
+from unittest.mock import patch
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from alone import Alone
+from alone import Alone, motors
 from episodes import expert_episode, random_episode
 from gymnasium.envs.registration import EnvSpec
 from inside_bullet import around_each_step, push
@@ -21,17 +22,17 @@ from tpm_gym import TPMEnv
 from tpm_gym.arrays import FloatArray, Vector
 from tpm_gym.errors import ConfigurationError, InputError
 from tpm_gym.mechanism import PAPER_TPM, TPM, Machine, tree
-from tpm_gym.mechanism.bodies import Joint
 from tpm_gym.mechanism.motor import TORQUE_MOTOR
 from tpm_gym.simulation import Plant, Scene, Servo
-from tpm_gym.simulation.drives import Reference, drive_of, limited
+from tpm_gym.simulation.compiled import limited
+from tpm_gym.simulation.drives import References, drive_of
+from tpm_gym.simulation.engine import Path
 from tpm_gym.simulation.state import CONTROL_PERIOD
 
 HOME = PAPER_TPM.home
 THETA = PAPER_TPM.inverse(HOME)
 REST = (0.0, 0.0, 0.0)
 HELD = Servo(feedforward="gravity")
-MOTOR = Joint("R11", "revolute", "base", REST, effort=100.0, speed=25.0, corner=15.0)
 
 
 def simulation_of(servo: Servo | None, machine: Machine = PAPER_TPM, **physics: Any) -> Alone:
@@ -50,13 +51,22 @@ def watched(simulation: Alone) -> list[tuple[Any, Vector]]:
     """Of every time step from now on: motors at its end, and their rates at its beginning."""
     seen: list[tuple[Any, Vector]] = []
     before: list[Vector] = []
-    motors = simulation.engine.motors
     around_each_step(
         simulation,
-        before=lambda: before.append(motors().theta_dot),
-        after=lambda: seen.append((motors(), before[-1])),
+        before=lambda: before.append(motors(simulation).theta_dot),
+        after=lambda: seen.append((motors(simulation), before[-1])),
     )
     return seen
+
+
+def hold(simulation: Alone, theta: FloatArray, torque: Vector = REST, periods: int = 1) -> None:
+    """Let the servos' references jump to theta and stay there for some control periods."""
+    engine: Any = simulation.engine
+    steps = engine.physics.substeps
+    constant = References(*(np.tile(v, (steps, 1, 1)) for v in (theta, np.zeros(3), torque)))
+    with patch.object(engine._drives, "references", lambda path: constant):
+        for _ in range(periods):
+            engine.advance(None, [False])
 
 
 # -- options ---------------------------------------------------------------------------------------
@@ -146,7 +156,7 @@ def test_any_load_turns_a_motor_by_torque_over_stiffness(machine: TPM, force: Ve
     around_each_step(simulation, before=lambda: push(simulation, force))
     for _ in range(25):
         state = simulation.move(machine.home)
-    rows = np.array(machine.evaluate(tuple(state.theta.tolist())).jacobian)
+    rows = machine.evaluate(state.theta).jacobian
     turned = HELD.stiffness * (state.theta - home)
     np.testing.assert_allclose(turned, rows.T @ force, rtol=0.02, atol=0.01)
 
@@ -171,10 +181,8 @@ def step_response(servo: Servo, substeps: int) -> tuple[FloatArray, FloatArray]:
     simulation.reset(THETA)
     for _ in range(10):
         start = np.array(simulation.move(HOME).theta)
-    seen, a, b, c = watched(simulation), *(start + jump).tolist()
-    hold = tuple(gravity().tolist())
-    for _ in range(3):
-        simulation.engine.advance([Reference((a, b, c), REST, hold)] * substeps, False)
+    seen = watched(simulation)
+    hold(simulation, start + jump, gravity(), periods=3)
     found = np.array([motors.theta for motors, _ in seen]) - start
     mass, x, v, expected = mass_matrix(), -jump, np.zeros(3), []
     stiff, damping = servo.stiffness * np.eye(3), servo.damping * np.eye(3)
@@ -214,12 +222,11 @@ def test_springs_and_dampers_give_nothing_that_was_not_put_in() -> None:
     simulation = simulation_of(servo)
     simulation.reset(THETA)
     seen = watched(simulation)
-    reference = Reference(PAPER_TPM.inverse((HOME[0] + 0.02, HOME[1], HOME[2] + 0.02)))
-    for _ in range(6):
-        simulation.engine.advance([reference] * 10, False)
+    goal = PAPER_TPM.inverse(np.add(HOME, (0.02, 0.0, 0.02)))
+    hold(simulation, goal, periods=6)
     motions = [(np.array(motors.theta), np.array(motors.theta_dot)) for motors, _ in seen]
     energies = [sum(dynamics.energy(*motion)) for motion in motions]
-    sprung = [servo.stiffness * np.sum((theta - reference.theta) ** 2) / 2 for theta, _ in motions]
+    sprung = [servo.stiffness * np.sum((theta - goal) ** 2) / 2 for theta, _ in motions]
     total = np.array(energies) + sprung
     assert total[0] - total[-1] > 0.1  # J
     assert np.diff(total).max() < 1e-3 * (total[0] - total[-1])
@@ -254,19 +261,17 @@ def test_torque_falls_from_the_corner_to_the_no_load_speed_and_brakes_in_full(
     speed: float, share: float, sign: int
 ) -> None:
     for effort in (100.0, 50.0):  # a weak motor's line starts lower
-        given = limited(sign * 1e3, sign * speed, effort, MOTOR)
+        line = effort, 15.0, 25.0  # N m, rad/s
+        given = limited(sign * 1e3, sign * speed, *line)
         assert given == pytest.approx(sign * share * effort)
-        assert limited(sign * 0.01, sign * speed, effort, MOTOR) == min(0.01, share * effort) * sign
+        assert limited(sign * 0.01, sign * speed, *line) == min(0.01, share * effort) * sign
 
 
 def over_the_line(seen: list[tuple[Any, Vector]], motor: Any, strength: float) -> list[float]:
     """By how much torque each motor was beyond its line in each time step, N m."""
-    line = Joint(
-        "R11", "revolute", "base", REST, speed=motor.no_load_speed, corner=motor.corner_speed
-    )
-    effort = strength * motor.peak_torque
+    line = strength * motor.peak_torque, motor.corner_speed, motor.no_load_speed
     return [
-        abs(torque - limited(torque, rate, effort, line))
+        abs(torque - limited(torque, rate, *line))
         for motors, rates in seen
         for torque, rate in zip(motors.torque, rates, strict=True)
     ]
@@ -342,9 +347,9 @@ def played(drive: Any, scripted: bool) -> Iterator[tuple[FloatArray, FloatArray]
         engine: Any = env.simulation.engine
         advance, wanted = engine.advance, []
 
-        def noted(references: list[Reference], vacuum: bool) -> None:
-            wanted.extend(reference.theta for reference in references)
-            advance(references, vacuum)
+        def noted(path: Path, vacuum: bool) -> None:
+            wanted.extend(path.joints()[0])
+            advance(path, vacuum)
 
         engine.advance = noted
         seen = watched(env.simulation)

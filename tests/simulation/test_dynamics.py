@@ -199,7 +199,7 @@ def errors_of_velocity(time_step: float) -> tuple[FloatArray, FloatArray, FloatA
     rows = []
 
     def note() -> None:
-        theta, rates, _ = engine.motors()
+        theta, rates, _ = motors(simulation)
         state = engine.client.getLinkState(
             *engine.robot.links["platform"], computeLinkVelocity=True
         )

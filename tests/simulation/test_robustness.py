@@ -67,8 +67,8 @@ def test_hostile_policies_do_not_lose_the_mechanism(env_id, policy, seeds):
             assert info["closure_error"] < 0.1e-3
             state = env.unwrapped.state
             assert not state.passed_singularity
-            # Neither thrown about nor pressed through the table. A landing is noticed one time
-            # step late, so it goes as deep as the block falls in one; but nothing may keep it there.
+            # Neither thrown about nor pressed through the table. A landing is noticed a time step
+            # late, so it goes as deep as the block falls in one; but nothing may keep it there.
             height = state.object_position[0, 2]
             assert height < 0.4
             depth = block.height / 2 - height

@@ -69,7 +69,9 @@ def motors(simulation: Any) -> Motors:
     """Read the motors of one robot, in the midst of a control period too."""
     engine = simulation.engine
     theta, rates, torque = map(np.array, engine.robot.motors())
-    return Motors(theta, rates, torque if engine._drives is None else engine._drives.memory[0, 0])
+    return Motors(
+        theta, rates, torque if engine._drives is None else engine._drives.memory[0, 0].copy()
+    )
 
 
 def jumping(theta: ArrayLike, steps: int = 1) -> Any:

@@ -1,8 +1,7 @@
 """Episodes to compare to the last bit. Fresh processes import this too, so it imports little."""
 
-import hashlib
 import pickle
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +9,10 @@ import gymnasium as gym
 import numpy as np
 
 import tpm_gym
+from tpm_gym.envs.testing import Step, bits, fingerprint, play, random_episode
 from tpm_gym.tasks.expert import Expert
 
-Step = tuple[dict[str, Any], float, dict[str, Any]]
-"""Observation, reward and info."""
+__all__ = ["bits", "fingerprint", "play", "random_episode"]  # for those who import them from here
 
 EVERYTHING: dict[str, Any] = {
     "link_mass": (0.8, 1.25),
@@ -43,52 +42,16 @@ def make(env_id: str, randomisation: dict[str, Any], **options: Any) -> gym.Env[
     return gym.make(f"tpm_gym:{env_id}", randomisation=randomisation, **options)
 
 
-def random_episode(env: gym.Env[Any, Any], seed: int, steps: int = 50) -> Iterator[Step]:
-    """Whole excursions, not jitter; the actions come from the seed too."""
-    rng = np.random.default_rng(seed)
-    observation, info = env.reset(seed=seed)
-    yield observation, 0.0, info
-    for _ in range(steps):
-        action = rng.choice([-1.0, 0.0, 1.0], env.action_space.shape)
-        observation, reward, _, _, info = env.step(action.astype(np.float32))
-        yield observation, float(reward), info
-
-
 def expert_episode(
     env: gym.Env[Any, Any], seed: int, steps: int = 50, options: dict[str, Any] | None = None
 ) -> Iterator[Step]:
     """The scripted controller's: it touches, holds and lets go."""
     observation, info = env.reset(seed=seed, options=options)
     expert = Expert(env)
-    expert.reset(observation)
     yield observation, 0.0, info
     for _ in range(steps):
         observation, reward, _, _, info = env.step(expert.act(observation))
         yield observation, float(reward), info
-
-
-def fingerprint(steps: Iterable[Step]) -> str:
-    """A hash of every bit of an episode."""
-    digest = hashlib.sha256()
-    for observation, reward, info in steps:
-        for array in observation.values():
-            digest.update(array.tobytes())
-        digest.update(repr((reward, info)).encode())
-    return digest.hexdigest()
-
-
-def bits(value: Any) -> Any:
-    """What two results are compared by."""
-    if isinstance(value, dict):
-        return {name: bits(entry) for name, entry in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [bits(entry) for entry in value]
-    return value.tobytes() if isinstance(value, np.ndarray) else value
-
-
-def play(env: gym.Env[Any, Any], actions: Iterable[Any]) -> list[Any]:
-    """What each step returns, and the whole state behind it."""
-    return [(bits(env.step(action)), bits(vars(env.unwrapped.state))) for action in actions]
 
 
 def all_fingerprints() -> list[str]:

@@ -140,8 +140,8 @@ class TPMEnv(gym.Env[Observation, Action]):
             :func:`tpm_gym.register_engine` knows.
         machine: ``"paper"`` (None too), ``"wide"``, a name that :func:`tpm_gym.register_machine`
             knows, or a :class:`~tpm_gym.Machine`; a spec that goes through JSON needs a name.
-        goals: ``"sampled"`` (None too), or ``"tempting"``: the goal, and where the block starts, lie
-            next to the singularity, which not every machine has near its goals.
+        goals: ``"sampled"`` (None too), or ``"tempting"``: the goal, and the start of the block,
+            lie next to the singularity, which not every machine has near its goals.
         penalty_weight: Weight of the singularity penalty, None for 1; 0 switches it off.
         drive: How the motors follow their references. ``"ideal"`` (None too): exactly, with up to
             100 N m at any speed. ``"servo"``, a :class:`~tpm_gym.simulation.Servo` or a mapping of
