@@ -331,7 +331,6 @@ class _Part:
         core = self.core
         own = core.rngs or [seeding.np_random(None)[0] for _ in range(core.count)]
         infos = self._begin(rows, [rngs[k] or own[k] for k in rows.tolist()], options)
-        core.rngs = core.rngs or own
         observation, _, told = core.report()
         return observation, {**_masked(told, rows, core.count), **infos}
 
