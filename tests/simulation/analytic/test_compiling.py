@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from tpm_gym.simulation.analytic import body, contact, shoving, tumbling
+from tpm_gym.simulation.analytic.contact import collision, grasp, solver, stepping, vectors
 from tpm_gym.simulation.analytic.compiling import SOURCES, source_files
 
 TEXT = """
@@ -43,7 +43,7 @@ def test_a_kept_function_is_compiled_again_when_any_source_has_changed(tmp_path:
 
 
 def test_all_that_contact_is_compiled_from_is_among_the_sources() -> None:
-    parts = [body, contact, shoving, tumbling]
+    parts = [collision, grasp, solver, stepping, vectors]
     compiled = [f for part in parts for f in vars(part).values() if hasattr(f, "py_func")]
     called = {name for f in compiled for name in f.py_func.__code__.co_names}
     used = [value for part in parts for name, value in vars(part).items() if name in called]
@@ -51,7 +51,7 @@ def test_all_that_contact_is_compiled_from_is_among_the_sources() -> None:
     origins |= {f.py_func.__code__.co_filename for f in compiled}
     assert any(origin.endswith("vacuum.py") for origin in origins)
     assert origins <= {str(file) for file in source_files()}
-    assert contact.advance.py_func.__defaults__ == (SOURCES,)
+    assert stepping.advance.py_func.__defaults__ == (SOURCES,)
 
 
 def test_where_nothing_can_be_kept_functions_are_compiled_all_the_same(tmp_path: Path) -> None:
