@@ -1,4 +1,4 @@
-"""Each row of docs/paper.md names tests that fail when what it says is computed wrongly.
+"""Each row of docs/paper.md names tests that fail if its statement is computed wrongly.
 
 Each of MUTATIONS breaks one expression of the package in memory, and the tests of its row must fail
 then. That takes minutes, so it is a slow test. The fast tests check that the table is complete.

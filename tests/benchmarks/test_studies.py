@@ -1,4 +1,4 @@
-"""Studies run what is left whatever dies on the way, and the page says what the runs did."""
+"""Studies survive deaths and stops, and the page of results agrees with the records."""
 
 import itertools
 import json
@@ -242,7 +242,7 @@ def test_nobody_else_can_reach_a_study_and_a_killed_one_leaves_nothing_behind(
 
 @pytest.mark.slow
 def test_ctrl_c_stops_a_study_with_checkpoints_saved(tmp_path: Path) -> None:
-    """As a terminal sends it: to the whole process group; a second signal would kill trainings."""
+    """A terminal sends SIGINT to the whole process group; a second signal would kill trainings."""
     before = temporary()
     words = ["--plan", "results", "--envs", "TPMReach-v0", "--algos", "sac", "--seeds", "2"]
     words = [*COMMAND, *words, "--folder", str(tmp_path), "--jobs", "1"]
@@ -261,7 +261,7 @@ def test_ctrl_c_stops_a_study_with_checkpoints_saved(tmp_path: Path) -> None:
 
 @pytest.fixture
 def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """Two nodes of one CPU each."""
+    """Start two nodes of one CPU each."""
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
     with tempfile.TemporaryDirectory(prefix="tpm-", dir="/tmp") as folder:
         monkeypatch.setenv("RAY_TMPDIR", folder)
@@ -292,7 +292,7 @@ def kill_node(node: Any) -> None:
 
 
 def small(folder: Path, seed: int) -> Run:
-    """A training of seconds, with a checkpoint every few moments."""
+    """Return a training of seconds, with many checkpoints."""
     folder.mkdir(exist_ok=True)
     recipe = folder / "sac.yml"
     recipe.write_text(SAC_RECIPE.format(env="TPMReach-v0", train_freq=20), encoding="utf-8")
@@ -303,12 +303,12 @@ def small(folder: Path, seed: int) -> Run:
 
 
 def newest(run: Run) -> int:
-    """Step of the last checkpoint of a run."""
+    """Return the step of the last checkpoint of a run."""
     return max(CheckpointStore(run.folder / "checkpoints").steps(), default=-1)
 
 
 def lasting(run: Run) -> Any:
-    """The record of a run, without clocks, and without how often it went on."""
+    """Return the record of a run without times and resumptions."""
     kept = without_times(condense(run.folder))
     for test in kept["tests"].values():
         del test["steps_per_second"]
