@@ -98,7 +98,7 @@ def run_episodes(
     """Run a policy for a number of episodes; the same arguments give the same records.
 
     Args:
-        env: Left open.
+        env: Environment, which is left open.
         first_seed: Episode i is reset with ``first_seed + i``.
         on_frame: Called after every reset and every step, for example to record a video.
         on_episode: Called after every episode, for example to move a progress bar.
