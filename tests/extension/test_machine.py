@@ -34,9 +34,8 @@ def test_dynamics_and_modes_of_rows_follow_from_its_bodies():
     for row, factor in enumerate((1.0, 2.0)):
         mass = np.broadcast_to(factor * np.diag(moved), (2, 3, 3))
         np.testing.assert_allclose(motion.mass[row], mass, rtol=1e-5, atol=1e-4)
-        np.testing.assert_allclose(
-            motion.bias[row] / factor, moved * [[0, 0, -9.81]] * 2, atol=1e-4
-        )
+        weight = np.broadcast_to(factor * moved * (0, 0, -9.81), (2, 3))
+        np.testing.assert_allclose(motion.bias[row], weight, atol=1e-4)
     np.testing.assert_array_equal(GANTRY.forward(theta), theta)
     assert not GANTRY.mode_left(theta, theta).any()
     assert GANTRY.same_side(theta).all()
