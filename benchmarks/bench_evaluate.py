@@ -21,7 +21,7 @@ from typing import Any
 import gymnasium as gym
 from shared import describe, processor_line, quartiles
 
-from tpm_gym.learning.policies import load_policy, trained_env
+from tpm_gym.learning.policies import load_policy, trained_in
 from tpm_gym.learning.rollout import TEST_SEED
 from tpm_gym.resources import POLICIES
 
@@ -82,9 +82,10 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--json", type=Path, help="write the measurements here as well")
     options = parser.parse_args(arguments)
     content = describe(sys.argv if arguments is None else ["bench_evaluate.py", *arguments])
-    env_id = trained_env(options.policy)
-    if env_id is None:
+    trained = trained_in(options.policy)
+    if trained is None:
         parser.error(f"--policy {options.policy}: give a trained policy")
+    env_id, _ = trained
     tape = record(env_id, options.policy, options.episodes)
     rows = []
     for _ in range(options.rounds):

@@ -43,7 +43,7 @@ __version__ = "0.1.0"
 
 
 def load_policy(path: str | Path) -> Policy:
-    """The same as :func:`tpm_gym.policy.load_policy`, which imports PyTorch."""
+    """Load a policy with :func:`tpm_gym.policy.load_policy`, which imports PyTorch."""
     from tpm_gym import policy
 
     return policy.load_policy(path)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from trainings import kill_at, make_config
 
-from tpm_gym.learning import TrainingConfig, callbacks
+from tpm_gym.learning import TrainingConfig, curve
 
 
 @pytest.fixture(autouse=True)
@@ -21,7 +21,7 @@ def _one_thread() -> None:
 @pytest.fixture
 def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Drawing takes longer than all the rest of the small trainings."""
-    monkeypatch.setattr(callbacks, "draw_learning_curve", lambda *args: None)
+    monkeypatch.setattr(curve, "draw_learning_curve", lambda *args: None)
 
 
 @pytest.fixture

@@ -1,6 +1,10 @@
 """What a user registers with Gymnasium is trained, resumed and evaluated like our own ids."""
 
 import json
+import os
+import shlex
+import shutil
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -8,12 +12,19 @@ from unittest.mock import patch
 
 import gymnasium as gym
 import pytest
-from trainings import SAC_RECIPE
+from processes import PYTHON, printed_by
+from trainings import SAC_RECIPE, interrupt_at, uninterrupted
 
+from tpm_gym.learning import TrainingConfig
 from tpm_gym.learning.command_line import main
+from tpm_gym.learning.configuration import complete
 from tpm_gym.learning.environments import check_env_id, make_env
 from tpm_gym.learning.errors import ConfigError
+from tpm_gym.policy.files import digest
+from tpm_gym.resources import POLICIES
 from tpm_gym.tasks.registry import TASKS
+
+pytestmark = pytest.mark.usefixtures("no_pictures")
 
 MODULE = """
 import tpm_gym
@@ -41,7 +52,6 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     return run_anew
 
 
-@pytest.mark.usefixtures("no_pictures")
 def test_an_id_of_a_users_module_is_trained_in_workers_resumed_and_evaluated(
     tmp_path: Path, run: Callable[..., None]
 ) -> None:
@@ -51,22 +61,66 @@ def test_an_id_of_a_users_module_is_trained_in_workers_resumed_and_evaluated(
     words += ["--steps", "120", "--eval-episodes", "1", "--machine", "mine"]
     run("train", *words)
     folder = "runs/TPMMine-v0-sac-s0"
-    run("resume", folder, "--steps", "160")
-    run(
-        "evaluate",
-        "--policy",
-        folder,
-        "expert",
-        "--machine",
-        "mine",
-        "--episodes",
-        "1",
-        "--json",
-        "out.json",
-    )
+    name = ("--env", "my_tasks:TPMMine-v0")
+    run("resume", folder, "--steps", "160", *name)
+    words = ["--policy", folder, "expert", "--episodes", "1", "--json", "out.json"]
+    run("evaluate", *words, *name)
     content = json.loads((tmp_path / "out.json").read_text())
     assert content["env"] == "my_tasks:TPMMine-v0"
+    assert content["env_options"]["machine"] == "mine"  # as in training
     assert [policy["records"][0]["length"] for policy in content["policies"]] == [20, 20]
+
+
+def test_no_file_decides_what_is_imported(
+    tmp_path: Path, run: Callable[..., None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    trace = tmp_path / "trace"
+    (tmp_path / "my_tasks.py").write_text(f"{MODULE}\nopen({str(trace)!r}, 'w').close()")
+    for suffix in (".json", ".safetensors"):
+        (tmp_path / f"best{suffix}").write_bytes((POLICIES / f"TPMReach-v0{suffix}").read_bytes())
+    content = json.loads((tmp_path / "best.json").read_text())
+    content["env"] = "my_tasks:TPMReach-v0"
+    (tmp_path / "best.json").write_text(json.dumps({**content, "sha256": digest(content)}))
+    shutil.copytree(uninterrupted("sac"), tmp_path / "a run")
+    stored = json.loads((tmp_path / "a run" / "config.json").read_text())
+    stored["env"] = content["env"]
+    (tmp_path / "a run" / "config.json").write_text(json.dumps(stored))
+    for name in ("best", "last"):
+        (tmp_path / "a run" / f"{name}.json").unlink()
+    commands = [
+        ["evaluate", "--episodes", "1", "--policy", "best.json"],
+        ["evaluate", "--episodes", "1", "--trust-pickle", "--policy", "a run"],
+        ["resume", "a run"],
+    ]
+    for words in commands:
+        with pytest.raises(SystemExit, match=r"'my_tasks'.*give --env my_tasks:TPMReach-v0"):
+            run(*words)
+        assert not trace.exists()
+    for words in commands:
+        run(*words, "--env", content["env"])
+        assert trace.exists()
+        trace.unlink()
+    assert "nothing to do" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match="--env TPMReach-v0: the run was trained in my_tasks:"):
+        run("resume", "a run", "--env", "TPMReach-v0")
+
+
+def test_a_stopped_run_says_how_its_module_is_found_again(
+    tmp_path: Path,
+    run: Callable[..., None],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "my_tasks.py").write_text(MODULE)
+    (tmp_path / "sac.yml").write_text(SAC_RECIPE.format(env="TPMMine-v0", train_freq=5))
+    interrupt_at(monkeypatch, 10, lambda: os.kill(os.getpid(), signal.SIGINT))
+    words = ["--env", "my_tasks:TPMMine-v0", "--recipe", "sac.yml", "--eval-episodes", "1"]
+    with pytest.raises(SystemExit):
+        run("train", *words, "--run", "a run")
+    _, _, command = capsys.readouterr().out.partition("continue with: ")
+    program, *words = shlex.split(command)
+    assert program == "python"
+    assert "to 300" in printed_by(PYTHON, *words, cwd=tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -81,7 +135,7 @@ def test_an_id_of_a_users_module_is_trained_in_workers_resumed_and_evaluated(
 )
 def test_what_is_no_environment_of_ours_is_refused(env_id: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        check_env_id(env_id)
+        complete(TrainingConfig(env=env_id))
 
 
 def test_a_class_that_derives_from_ours_is_accepted_however_it_is_registered() -> None:

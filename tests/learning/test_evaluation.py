@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from trainings import quiet, said
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.learning import EnvOptions, EvaluationConfig, evaluate, evaluation, film, provenance
 from tpm_gym.learning.errors import ConfigError, PolicyError
+from tpm_gym.policy.files import digest
 from tpm_gym.simulation import Servo
 
 METRICS = (
@@ -190,7 +192,9 @@ def test_conditions_are_recorded_and_the_defaults_are_the_nominal_machine(
 ) -> None:
     content, _ = written
     assert (content["goals"], content["penalty_weight"]) == ("sampled", 1.0)
-    assert content["randomisation"] == content["env_options"] == {}
+    assert content["randomisation"] == {}
+    nominal = {"machine": "paper", "engine": "pybullet", "drive": "ideal"}
+    assert content["env_options"] == nominal
     path = tmp_path / "other.json"
     words = ["--policy", "random", "--env", "TPMReach-v0", "--episodes", "1", "--json", str(path)]
     words += ["--randomisation", "encoder_noise=1e-4", "friction=0.5:1", "latency=1"]
@@ -203,19 +207,20 @@ def test_conditions_are_recorded_and_the_defaults_are_the_nominal_machine(
         "latency": 1,
     }
     assert (content["goals"], content["penalty_weight"]) == ("tempting", 0.5)
-    assert content["env_options"] == {"drive": "servo"}
+    assert content["env_options"] == {**nominal, "drive": "servo"}
     assert "--randomisation encoder_noise=1e-4 friction=0.5:1" in content["command"]
 
 
 def test_the_environment_is_the_one_that_was_asked_for() -> None:
     config = EvaluationConfig(
         policy=("random",),
+        env="TPMPickAndPlace-v0",
         goals="tempting",
         penalty_weight=0.25,
         randomisation=("puck_mass=2",),
         env_options=EnvOptions(engine="pybullet", drive="servo"),
     )
-    env: Any = evaluation._make_env("TPMPickAndPlace-v0", config)
+    env: Any = evaluation._make_env(config)
     assert env.unwrapped.task.penalty_weight == 0.25
     assert env.unwrapped.randomisation.puck_mass == (2.0, 2.0)
     assert env.unwrapped.drive == Servo()
@@ -240,7 +245,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     env.close()
     model.save(folder / "best.zip")
     export.save(model, folder / "best", env_id="TPMReach-v0", seed=0, recipe={})
-    config = {"algo": "ppo", "env": "TPMReach-v0", "seed": 0, "recipe": {}}
+    config = {"algo": "ppo", "env": "TPMReach-v0", "seed": 0, "recipe": {}, "env_options": {}}
     (folder / "config.json").write_text(json.dumps(config))
     return folder
 
@@ -248,6 +253,45 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def returns(policy: Path | str, **options: Any) -> list[float]:
     config = EvaluationConfig(policy=(str(policy),), episodes=1, **options)
     return [record.total_reward for record in evaluate(config, quiet())[0].records]
+
+
+def test_a_policy_is_evaluated_on_its_own_machine_and_drive_unless_others_are_given(
+    run: Path, tmp_path: Path
+) -> None:
+    for name in ("exported", "archive"):
+        shutil.copytree(run, tmp_path / name)
+        config = json.loads((run / "config.json").read_text())
+        config["env_options"] = {"machine": "wide", "drive": "servo", "engine": "analytic"}
+        (tmp_path / name / "config.json").write_text(json.dumps(config))
+    path = tmp_path / "exported" / "best.json"
+    content = json.loads(path.read_text()) | {"env_options": config["env_options"]}
+    path.write_text(json.dumps({**content, "sha256": digest(content)}))
+    (tmp_path / "archive" / "best.json").unlink()
+    for name in ("exported", "archive"):
+        for given, expected in (
+            (EnvOptions(), ("wide", "pybullet", "servo")),
+            (EnvOptions(machine="paper"), ("paper", "pybullet", "servo")),
+            (EnvOptions(engine="mujoco", drive="ideal"), ("wide", "mujoco", "ideal")),
+        ):
+            console, out = quiet(), tmp_path / "out.json"
+            config = EvaluationConfig(
+                (str(tmp_path / name),),
+                episodes=1,
+                env_options=given,
+                json=out,
+                trust_pickle=name == "archive",
+            )
+            evaluate(config, console)
+            names = dict(zip(("machine", "engine", "drive"), expected, strict=True))
+            assert read_strict(out)["env_options"] == names
+            heading = "machine {}, engine {}, drive {}".format(*expected)
+            assert heading in " ".join(said(console).split())
+    both = (str(tmp_path / "exported"), "TPMReach-v0")
+    with pytest.raises(ConfigError, match=r"in machine: wide \(.*\), paper \(TPMReach-v0\); .*--m"):
+        evaluate(EvaluationConfig(both, episodes=1), quiet())
+    evaluate(
+        EvaluationConfig(both, episodes=1, env_options=EnvOptions("paper", drive="ideal")), quiet()
+    )
 
 
 def test_an_exported_policy_goes_by_any_of_its_names(run: Path) -> None:

@@ -2,9 +2,7 @@
 
 import json
 import pickle
-import sys
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import gymnasium as gym
@@ -21,10 +19,9 @@ from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import tpm_gym
-from tpm_gym.learning import GoalGapExtractor, PenaltyHerReplayBuffer, export
+from tpm_gym.learning import GoalGapExtractor, export
 from tpm_gym.learning.command_line import main
 from tpm_gym.learning.errors import ConfigError, PolicyError
-from tpm_gym.learning.policies import load_model
 from tpm_gym.policy.files import read_description
 
 RECIPE = {"n_timesteps": 5000, "arguments": {"gamma": 0.95, "policy_kwargs": {"net_arch": [8]}}}
@@ -269,6 +266,7 @@ def run(tmp_path: Path, model: Any) -> Path:
         "env": "TPMPickAndPlace-v0",
         "seed": 5,
         "recipe": RECIPE,
+        "env_options": {"machine": "wide"},
         "versions": {"torch": "2.0.0", "tpm_gym": None},
     }
     (folder / "config.json").write_text(json.dumps(config))
@@ -285,7 +283,7 @@ def test_what_is_converted_says_what_the_run_says(
     expected, _ = model.predict(batch, deterministic=True)
     np.testing.assert_allclose(loaded.act(batch), expected, atol=1e-6)
     about = loaded.description
-    assert (about.seed, about.recipe) == (5, RECIPE)
+    assert (about.seed, about.recipe, about.env_options) == (5, RECIPE, {"machine": "wide"})
     assert about.versions == {"torch": "2.0.0", "tpm_gym": None}
 
 
@@ -352,40 +350,3 @@ def test_a_damaged_configuration_is_named(run: Path) -> None:
         main(["export", str(run / "best.zip"), str(run / "best"), "--trust-pickle"])
     with pytest.raises(ConfigError, match=r"not for a \.zip"):
         save(make(PPO, Blank(), net_arch=[4]), run / "best.zip")
-
-
-def test_archives_load_that_name_a_module_which_has_moved(
-    run: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Runs of before the package had the extractor and the buffer in modules of their own."""
-    names = {"features": GoalGapExtractor, "her": PenaltyHerReplayBuffer}
-    for name, kind in names.items():
-        module: Any = ModuleType(name)
-        setattr(module, kind.__name__, kind)
-        monkeypatch.setitem(sys.modules, name, module)
-        monkeypatch.setattr(kind, "__module__", name)
-    env: Any = Blank()
-    old = SAC(
-        "MultiInputPolicy",
-        env,
-        seed=0,
-        buffer_size=10,
-        replay_buffer_class=PenaltyHerReplayBuffer,
-        policy_kwargs={"net_arch": [8], **GOAL_GAP},
-    )
-    old.save(run / "last.zip")
-    monkeypatch.undo()
-    policy_kwargs = {
-        "net_arch": [8],
-        "features_extractor_class": "GoalGapExtractor",
-        "features_extractor_kwargs": {"unit": 0.07},
-    }
-    config = json.loads((run / "config.json").read_text())
-    recipe = {"arguments": {"policy_kwargs": policy_kwargs}}
-    (run / "config.json").write_text(json.dumps(config | {"recipe": recipe}))
-    batch = observations(env, 10)
-    expected, _ = old.predict(batch, deterministic=True)
-    actions, _ = load_model("last", run / "last.zip").predict(batch, deterministic=True)
-    np.testing.assert_array_equal(actions, expected)
-    main(["export", str(run / "last.zip"), str(run / "last"), "--trust-pickle"])
-    np.testing.assert_allclose(tpm_gym.load_policy(run / "last").act(batch), expected, atol=1e-6)

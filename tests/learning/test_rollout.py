@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 import tpm_gym  # noqa: F401  # registers the ids
 from tpm_gym.learning.errors import PolicyError, RolloutError
 from tpm_gym.learning.estimates import Estimate, bootstrap, wilson
-from tpm_gym.learning.policies import load_policy, trained_env
+from tpm_gym.learning.policies import load_policy, trained_in
 from tpm_gym.learning.rollout import (
     SELECTION_SEED,
     TEST_SEED,
@@ -220,4 +220,4 @@ def test_unknown_policies_say_what_there_is(reach: GoalEnv, tmp_path: Path) -> N
     (tmp_path / "config.json").write_text('{"algo": "sac"}')
     (tmp_path / "best.zip").touch()
     with pytest.raises(PolicyError, match="damaged"):
-        trained_env(str(tmp_path))
+        trained_in(str(tmp_path))

@@ -20,7 +20,8 @@ OURS = {"algo": "sac", "env": "TPMReach-v0", "training_seeds": [0, 0]}
 def run(tmp_path: Path) -> Path:
     """A run with files and folders."""
     folder = tmp_path / "run"
-    (folder / "checkpoints" / "000000050").mkdir(parents=True)
+    (folder / "checkpoints").mkdir(parents=True)
+    (folder / "checkpoints" / "000000050.checkpoint").write_text("")
     (folder / "tests").mkdir()
     (folder / "tests" / "nominal.json").write_text('{"env": 1, "episodes": 1, "command": ""}')
     (folder / "config.json").write_text(json.dumps(OURS))

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from trainings import (
@@ -18,15 +19,24 @@ from trainings import (
     interrupt_at,
     make_config,
     quiet,
+    read_checkpoint,
     said,
     uninterrupted,
 )
 
 import tpm_gym
-from tpm_gym.learning import ResumeConfig, TrainingConfig, callbacks, resume, train
+from tpm_gym.learning import (
+    EvaluationConfig,
+    ResumeConfig,
+    TrainingConfig,
+    callbacks,
+    evaluate,
+    resume,
+    train,
+)
 from tpm_gym.learning.callbacks import Checkpointing
 from tpm_gym.learning.checkpoint import CheckpointStore, Content
-from tpm_gym.learning.errors import ConfigError, RunError
+from tpm_gym.learning.errors import CheckpointError, ConfigError, PolicyError, RunError
 from tpm_gym.learning.run_folder import claimed
 from tpm_gym.learning.signals import SignalListener
 
@@ -61,13 +71,13 @@ def test_a_stopped_run_saves_and_goes_on(
     content = store.load(pytest.fail)
     assert content is not None
     saved = content.step
-    # PPO goes back to the beginning of its rollout of 40 steps, the others end theirs of 2 or 3.
-    assert saved == {"sac": step + 1, "tqc": 201, "ppo": 80}[case]
+    # At the end of a rollout, of 2, 3 or 40 steps
+    assert saved == {"sac": step + 1, "tqc": 201, "ppo": 120}[case]
     assert f"saved at step {saved}" in said(console)
     assert f"tpm-gym resume {tmp_path / 'run'}" in said(console)
     assert (tmp_path / "run" / "last.zip").is_file()
     taken = tpm_gym.load_policy(tmp_path / "run" / "last").description.steps
-    assert taken == (step if case == "ppo" else saved)
+    assert taken == saved
     assert resume(ResumeConfig(config.run), quiet()) is None
     assert_equal_runs(uninterrupted(case), tmp_path / "run")
 
@@ -100,6 +110,8 @@ def test_a_second_signal_leaves_at_once(number: signal.Signals) -> None:
     assert caught.value.code == 128 + number
 
 
+NO_SPACE = os.strerror(errno.ENOSPC)
+
 # -- full disks -----------------------------------------------------------------------------------
 
 
@@ -109,9 +121,10 @@ def test_training_goes_on_without_room_for_checkpoints(
     save = CheckpointStore.save
 
     def full(self: CheckpointStore, content: Content) -> None:
-        if 150 <= content.step < 300:
-            self._refuse(Path("x"), "No space left on device")
-        save(self, content)
+        with monkeypatch.context() as patched:
+            if 150 <= content.step < 300:
+                patched.setattr(os, "fsync", Mock(side_effect=OSError(errno.ENOSPC, NO_SPACE)))
+            save(self, content)
 
     monkeypatch.setattr(CheckpointStore, "save", full)
     config, console = make_config("sac", tmp_path), quiet()
@@ -220,6 +233,44 @@ def test_nothing_to_resume_is_an_error_that_says_so(tmp_path: Path) -> None:
         with pytest.raises(RunError, match="holds no run"):
             resume(ResumeConfig(tmp_path), quiet())
         assert (tmp_path / "config.json").read_text() == text
+
+
+def test_brackets_without_end_are_no_configuration(half: TrainingConfig) -> None:
+    (half.run / "config.json").write_text("[" * 100_000)
+    (half.run / "tests").mkdir()
+    (half.run / "tests" / "mine.json").write_text("[" * 100_000)
+    assert resume(ResumeConfig(half.run), quiet()) is None  # the checkpoint has the configuration
+    assert_equal_runs(uninterrupted("sac"), half.run)
+    (half.run / "config.json").write_text("[" * 100_000)
+    shutil.rmtree(half.run / "checkpoints")
+    with pytest.raises(RunError, match="holds no run"):
+        resume(ResumeConfig(half.run), quiet())
+    (half.run / "best.json").unlink()
+    with pytest.raises(PolicyError, match=r"config\.json is damaged: it is nested too deeply"):
+        evaluate(EvaluationConfig((str(half.run / "best.zip"),), trust_pickle=True), quiet())
+
+
+@pytest.mark.parametrize("name", ["evaluations.jsonl", "progress.csv"])
+def test_a_folder_in_the_place_of_a_file_is_named(half: TrainingConfig, name: str) -> None:
+    (half.run / name).unlink(missing_ok=True)
+    (half.run / name).mkdir()
+    with pytest.raises(RunError, match=rf"Is a directory; move .*{name} away, then continue from"):
+        resume(ResumeConfig(half.run), quiet())
+
+
+@pytest.mark.parametrize(
+    ("name", "data"),
+    [("state.json", b"{}"), ("state.json", b"[" * 100_000), ("torch.pt", b""), ("torch.pt", b"PK")],
+)
+def test_a_whole_checkpoint_of_another_author_is_named(
+    half: TrainingConfig, name: str, data: bytes
+) -> None:
+    shutil.rmtree(half.run / "checkpoints")
+    content = read_checkpoint(uninterrupted("sac"), 300)
+    changed = replace(content, step=150, finished=False, files={**content.files, name: data})
+    CheckpointStore(half.run / "checkpoints").save(changed)
+    with pytest.raises(CheckpointError, match=r"of step 150 cannot be restored .*--overwrite"):
+        resume(ResumeConfig(half.run), quiet())
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there are no such locks")

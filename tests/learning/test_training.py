@@ -1,5 +1,6 @@
 """Training repeats exactly, refuses what cannot work, and leaves a complete run folder."""
 
+import io
 import json
 import os
 import re
@@ -20,6 +21,8 @@ from trainings import (
     evaluations,
     make_config,
     quiet,
+    read_checkpoint,
+    said,
     table,
     uninterrupted,
 )
@@ -31,13 +34,14 @@ from tpm_gym.learning import (
     EvaluationConfig,
     ResumeConfig,
     TrainingConfig,
+    curve,
     evaluate,
     resume,
     train,
 )
 from tpm_gym.learning.algorithms import ALGORITHMS
-from tpm_gym.learning.configuration import complete, resumed
-from tpm_gym.learning.errors import ConfigError, RunError
+from tpm_gym.learning.configuration import complete
+from tpm_gym.learning.errors import ConfigError, DivergedError, RunError
 from tpm_gym.learning.policies import load_model, load_policy
 from tpm_gym.learning.recipes import read_recipe, read_recipes, recipe_file
 from tpm_gym.learning.rollout import SELECTION_SEED, run_episodes
@@ -60,6 +64,13 @@ def parameters(run: Path, name: str = "last.zip") -> dict[str, Any]:
     return SAC.load(run / name, custom_objects=unused).policy.state_dict()
 
 
+def parameters_at(run: Path, step: int) -> dict[str, Any]:
+    """Return the parameters in a checkpoint."""
+    data = read_checkpoint(run, step).files["torch.pt"]
+    found: dict[str, Any] = torch.load(io.BytesIO(data))["parameters"]["policy"]
+    return found
+
+
 def equal(first: dict[str, Any], second: dict[str, Any]) -> bool:
     return all(torch.equal(value, second[name]) for name, value in first.items())
 
@@ -73,10 +84,7 @@ def test_same_seed_same_policy_whatever_is_evaluated(run: Path, tmp_path: Path) 
 
 
 def test_learning_has_changed_the_policy(run: Path) -> None:
-    before, after = (
-        torch.load(run / "checkpoints" / step / "torch.pt")["parameters"]["policy"]
-        for step in ("000000000", "000000300")
-    )
+    before, after = (parameters_at(run, step) for step in (0, 300))
     assert not equal(before, after)
     assert equal(after, parameters(run))
 
@@ -86,6 +94,44 @@ def test_a_learning_rate_falls_to_zero_if_asked_to(run: Path) -> None:
     assert 0.0001 < rates[0] < 0.0002  # about half way
     assert rates == sorted(rates, reverse=True)
     assert 0 <= rates[-1] <= 0.0003 * 2 / 300  # an update takes two steps
+
+
+def test_steps_are_whole_rollouts_and_no_update_is_without_a_learning_rate(tmp_path: Path) -> None:
+    """With 100 steps there are three rollouts of 40; the rate falls by a third after each."""
+    config = make_config("ppo", tmp_path)
+    text = config.recipe_file.read_text().replace(
+        "n_epochs", "learning_rate: lin_0.003\n  n_epochs"
+    )
+    config.recipe_file.write_text(text)
+    console = quiet()
+    train(replace(config, steps=100), console)
+    assert "120 steps, in" in said(console)
+    assert "100 steps were asked for, and rounded up to whole rollouts of 40 steps" in said(console)
+    rows = [row["train/learning_rate"] for row in table(config.run)]
+    assert [float(rate) for rate in rows if rate] == pytest.approx([0.003, 0.002, 0.001])
+    assert json.loads((config.run / "config.json").read_text())["steps"] == 120
+    resume(ResumeConfig(config.run, steps=121), quiet())
+    assert evaluations(config.run)[-1]["steps"] == 160
+
+
+def test_a_training_that_diverges_says_so(tmp_path: Path) -> None:
+    config = make_config("ppo", tmp_path)
+    text = config.recipe_file.read_text().replace("n_epochs", "learning_rate: 1.0e+30\n  n_epochs")
+    config.recipe_file.write_text(text)
+    with pytest.raises(DivergedError, match=r"diverged before step \d+.*lower learning_rate in"):
+        train(config, quiet())
+
+
+def test_the_learning_curve_is_drawn_once_at_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[Any] = []
+    monkeypatch.setattr(curve, "draw_learning_curve", lambda *args: drawn.append(args))
+    config = make_config("ppo", tmp_path)
+    train(config, quiet())
+    ((path, _, points),) = drawn
+    assert path == config.run / "learning_curve.png"
+    assert [point["steps"] for point in points] == [0, 70, 140, 210, 280, 320]
 
 
 def test_config_records_the_whole_run(run: Path) -> None:
@@ -140,17 +186,9 @@ def test_what_is_chosen_reaches_every_environment_and_survives_resuming(
         assert (inner.machine, inner.drive) == (snug, Servo())
     again = json.loads((folder / "config.json").read_text(encoding="utf-8"))
     assert [again[name] for name in changed] == [content[name] for name in changed]
-    # The exported policy is one for the id itself.
-    results = evaluate(EvaluationConfig(policy=(str(folder),), episodes=1), quiet())
-    assert results[0].records[0].length == 50
-
-
-def test_runs_from_before_these_options_go_on_with_their_defaults(run: Path) -> None:
-    stored = json.loads((run / "config.json").read_text(encoding="utf-8"))
-    del stored["penalty_weight"], stored["goals"], stored["env_options"]
-    config = resumed(ResumeConfig(run), stored, 0)
-    assert (config.penalty_weight, config.goals) == (1.0, "sampled")
-    assert config.env_options.given() == {}
+    evaluate(EvaluationConfig(policy=(str(folder),), episodes=1), quiet())
+    inner = made[-1].unwrapped
+    assert (inner.machine, inner.drive) == (snug, Servo())
 
 
 @pytest.mark.parametrize(
@@ -158,6 +196,7 @@ def test_runs_from_before_these_options_go_on_with_their_defaults(run: Path) -> 
     [
         ("algo", "zzz"),
         ("goals", "zz"),
+        ("env_options", None),
         ("recipe", {}),
         ("recipe", 3),
         ("recipe.fred", 2),
@@ -188,12 +227,6 @@ def test_a_damaged_configuration_is_named_and_left_as_it_is(
     assert (tmp_path / "config.json").read_bytes() == before
 
 
-@pytest.mark.parametrize("option", [{"threads": 0}, {"eval_every": 0}, {"device": "zz"}], ids=str)
-def test_mistakes_are_named_where_there_is_nothing_to_do(run: Path, option: Any) -> None:
-    with pytest.raises(ConfigError, match=f"--{next(iter(option))[:4]}"):
-        resume(ResumeConfig(run, **option), quiet())
-
-
 def test_best_policy_is_the_one_evaluated_best(run: Path) -> None:
     scores = [
         (entry["success_at_end"]["mean"], entry["return"]["mean"]) for entry in evaluations(run)
@@ -209,13 +242,6 @@ def score(path: Path) -> tuple[float, float]:
     (record,) = run_episodes(env, policy, 1, SELECTION_SEED)
     env.close()
     return record.success_at_end, record.total_reward
-
-
-def test_logs_hold_training_and_evaluation(run: Path) -> None:
-    rows = table(run)
-    assert {"time/total_timesteps", "train/critic_loss", "rollout/ep_rew_mean"} <= set(rows[-1])
-    assert sum(row["eval/success_at_end"] != "" for row in rows) == 6
-    assert list(run.glob("events.out.tfevents.*"))
 
 
 def test_both_policies_are_exported_and_nothing_is_unpickled_for_it(run: Path) -> None:
@@ -242,9 +268,9 @@ def test_command_line_trains_ppo_in_parallel_and_stops_when_asked_to(
     folder = config.run
     words = ["--algo", "ppo", "--env", config.env, "--steps", "1000000", "--run", str(folder)]
     words += ["--recipe", str(config.recipe_file), "--checkpoint-every", "240"]
-    saved = folder / "checkpoints" / "000000240"
+    saved = folder / "checkpoints" / "000000240.checkpoint"
     command = [PYTHON, ROOT / "train" / "train.py", *words, "--eval-episodes", "1"]
-    returned, output = signalled(command, saved.is_dir, number)
+    returned, output = signalled(command, saved.is_file, number)
     assert returned == status, output
     assert "Traceback" not in output
     assert f"stopped early by {number.name}, saved at step" in output
@@ -270,6 +296,9 @@ PICK = {"env": "TPMPickAndPlace-v0", "recipe_file": recipe_file("sac")}
         ({"seed": SELECTION_SEED}, "held out"),
         ({"seed": SELECTION_SEED - 2, "envs": 3}, "held out"),
         ({"envs": 5}, "before the first episode ends"),
+        ({"envs": 1001}, r"--envs 1001 \(n_envs of the recipe, .*at most 1,000"),
+        ({"envs": 10**8, "env_options": EnvOptions(engine="analytic")}, "at most 1,000,000"),
+        ({"steps": 1}, r"--steps 1: one rollout takes 2 \(1 environments x train_freq\)"),
         ({**PICK, "steps": 20_000}, "more than the 20,000 of the demonst"),
         ({**PICK, "steps": 20_050, "envs": 3}, "the 20,100 of"),
         ({**PICK, "steps": 500, "demonstrations": 10}, "the 500 of"),
@@ -311,6 +340,39 @@ def test_a_buffer_that_cannot_be_is_one_line_before_anything_is_written(
     with pytest.raises(ConfigError, match="buffer_size") as caught:
         train(config, quiet())
     assert "\n" not in str(caught.value)
+    assert not config.run.exists()
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        ("batch_size: 20", "batch_size: 1", "batch_size: 1: advantages of one step cannot"),
+        ("n_steps: 40", "n_steps: 1", "n_steps: 1: advantages of one step cannot be normalised"),
+        (
+            "n_steps: 40",
+            "n_steps: 1000000000000",
+            r"takes 1,000,000,000,000 \(1 environments x n_s",
+        ),
+        ("n_steps: 40", "n_steps: 301", r"--steps 300: one rollout takes 301 .*fewer --envs"),
+        (
+            "300\n  n_envs: 1",
+            "1000000000000000\n  n_envs: 1\n  gamma: 0.9",
+            "n_steps 1000000000000:",
+        ),
+    ],
+)
+def test_rollouts_and_batches_that_cannot_work_are_named(
+    before: str, after: str, message: str, tmp_path: Path
+) -> None:
+    config = make_config("ppo", tmp_path)
+    text = config.recipe_file.read_text()
+    assert before in text
+    text = text.replace(before, after)
+    if "n_timesteps: 1000000000000000" in text:
+        text = text.replace("n_steps: 40", "n_steps: 1000000000000")
+    config.recipe_file.write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        train(config, quiet())
     assert not config.run.exists()
 
 
@@ -360,12 +422,18 @@ def test_recipes_in_closed_form_are_for_many_environments_and_every_id() -> None
 @pytest.mark.parametrize(
     ("before", "after", "key", "message"),
     [
+        ("[8],", "[1000000, 1000000],", "TPMReach-v0.policy_kwargs.net_arch", "from 1 to 4096"),
         ("gamma: 0.95", "gama: 0.95", "TPMReach-v0.gama", "valid keys: batch_size, buffer_size"),
         ("gamma: 0.95", "gamma: 1.5", "TPMReach-v0.gamma", "less than or equal to 1, not 1.5"),
         ("gamma: 0.95", "gamma: 9e-1", "TPMReach-v0.gamma", "write 0.9"),
         ("batch_size: 16", "batch_size: 16.0", "TPMReach-v0.batch_size", "a valid integer"),
         ("batch_size: 16", "batch_size: true", "TPMReach-v0.batch_size", "a valid integer"),
-        ("[8],", "'dict(net_arch=[8])',", "TPMReach-v0.policy_kwargs.net_arch", "list of positive"),
+        (
+            "[8],",
+            "'dict(net_arch=[8])',",
+            "TPMReach-v0.policy_kwargs.net_arch",
+            "a list of at most 20",
+        ),
         (
             "{net_arch: [8], features_extractor_class: GoalGapExtractor}",
             "dict(net_arch=8)",

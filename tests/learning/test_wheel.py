@@ -42,8 +42,8 @@ def test_a_training_is_killed_resumed_and_evaluated_beside_the_expert_and_a_publ
     program = installed / "tpm-gym"
     words = ["train", "--env", "TPMReach-v0", "--steps", "1500", "--eval-episodes", "2"]
     words += ["--checkpoint-every", "100"]
-    saved = tmp_path / "runs" / "TPMReach-v0-sac-s0" / "checkpoints" / "000001100"
-    signalled([program, *words], saved.is_dir, signal.SIGKILL, cwd=tmp_path, env=OUTSIDE)
+    saved = tmp_path / "runs" / "TPMReach-v0-sac-s0" / "checkpoints" / "000001100.checkpoint"
+    signalled([program, *words], saved.is_file, signal.SIGKILL, cwd=tmp_path, env=OUTSIDE)
     run_folder = Path("runs", "TPMReach-v0-sac-s0")
     assert "to 1,500" in printed_by(program, "resume", run_folder, cwd=tmp_path, env=OUTSIDE)
     words = ["--policy", str(run_folder), "expert", "TPMReach-v0"]

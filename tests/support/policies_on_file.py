@@ -26,6 +26,7 @@ def described(data: bytes, **changes: Any) -> dict[str, Any]:
         "format": "tpm_gym.policy",
         "version": 1,
         "env": "TPMReach-v0",
+        "env_options": {"machine": "wide"},
         "algorithm": "sac",
         "seed": 3,
         "steps": 5000,

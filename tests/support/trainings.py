@@ -4,6 +4,7 @@ import csv
 import functools
 import io
 import json
+import shutil
 import tempfile
 from collections.abc import Callable
 from dataclasses import replace
@@ -137,6 +138,16 @@ def kill_at(
 
 
 # -- comparing whole trainings --------------------------------------------------------------------
+
+
+def read_checkpoint(run: Path, step: int) -> Content:
+    """Return the checkpoint of a step, by way of a folder that holds no other."""
+    with tempfile.TemporaryDirectory() as folder:
+        store = CheckpointStore(Path(folder))
+        shutil.copy(CheckpointStore(run / "checkpoints").path(step), folder)
+        content = store.load(pytest.fail)
+    assert content is not None
+    return content
 
 
 def end_of(run: Path) -> Content:

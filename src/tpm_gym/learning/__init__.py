@@ -1,6 +1,6 @@
-"""What it takes to learn the tasks: hindsight, features, demonstrations, recipes, training.
+"""Training of policies: hindsight, features, demonstrations, recipes.
 
-Needs the extra ``train``. Importing this package imports neither PyTorch nor Stable-Baselines3; a
+Needs the extra ``train``. Importing this package imports neither PyTorch nor Stable-Baselines3. A
 name is imported when it is first used.
 """
 
@@ -41,7 +41,7 @@ __all__ = list(_MODULES)
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name from the module that has it (PEP 562).
+    """Import a public name from its module (PEP 562).
 
     Raises:
         MissingPackageError: A package of the extra ``train`` is not installed.

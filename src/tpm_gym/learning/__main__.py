@@ -1,10 +1,10 @@
-"""``python -m tpm_gym.learning`` is the command ``tpm-gym``."""
+"""Command ``tpm-gym``, also as ``python -m tpm_gym.learning``."""
 
 import sys
 
 
 def main() -> None:
-    """Run the command line, or say what it needs to be installed."""
+    """Run the command line, or name the missing package."""
     try:
         from tpm_gym.learning import command_line
     except ModuleNotFoundError as error:

@@ -1,7 +1,8 @@
-"""The algorithms: all that the code knows about one is its row in the table, and its recipes.
+"""Algorithms of Stable-Baselines3: a row of the table for each, and the entries of its recipes.
 
-A row and ``train/recipes/<name>.yml`` are what it takes to train, resume, evaluate, export and
-study with another algorithm of Stable-Baselines3; an argument that none had before is an entry.
+A row of ``ALGORITHMS`` and a file ``train/recipes/<name>.yml`` are enough to train, resume,
+evaluate and export with another algorithm. An argument that no algorithm had before is a row of
+``_ENTRIES``.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def _says(description: str) -> WrapValidator:
-    """Say what an entry has to be, where its types would say it in several messages."""
+    """Replace the several messages of a union by one."""
 
     def check(value: Any, validate: Callable[[Any], Any]) -> Any:
         try:
@@ -39,16 +40,18 @@ _POSITIVE: Final[Any] = Annotated[float, Field(gt=0)]
 _NOT_NEGATIVE: Final[Any] = Annotated[float, Field(ge=0)]
 _FRACTION: Final[Any] = Annotated[float, Field(gt=0, le=1)]
 _NUMBER: Final = r"(\d*\.\d*[1-9]\d*|\d*[1-9]\d*\.?\d*)(e-?\d+)?"  # positive, as text
+# The largest network that can be exported: see tpm_gym.policy.files.
+_LAYERS: Final[Any] = Annotated[list[Annotated[int, Field(gt=0, le=4096)]], Field(max_length=20)]
 
 _POLICY_ENTRIES: Final[Mapping[str, Any]] = {
     "net_arch": Annotated[
-        list[_COUNT] | dict[Literal["pi", "qf", "vf"], list[_COUNT]],
-        _says("a list of positive integers, or one for each of pi, qf, vf"),
+        _LAYERS | dict[Literal["pi", "qf", "vf"], _LAYERS],
+        _says("a list of at most 20 integers from 1 to 4096, or one for each of pi, qf, vf"),
     ],
     "log_std_init": float,
     "ortho_init": bool,
-    "n_critics": _COUNT,
-    "n_quantiles": _COUNT,
+    "n_critics": Annotated[int, Field(gt=0, le=100)],
+    "n_quantiles": Annotated[int, Field(gt=0, le=10_000)],
     "features_extractor_class": Literal["GoalGapExtractor"],
     "features_extractor_kwargs": _keys("Extractor", {"unit": _POSITIVE}, total=False),
 }
@@ -99,13 +102,13 @@ _DEMONSTRATIONS: Final[Any] = _keys(
 
 @dataclass(frozen=True)
 class Actor:
-    """Where a policy computes its mean action, as an export takes it.
+    """Parts of a policy that compute its mean action, as dotted names of attributes.
 
     Attributes:
-        features: Attribute of the policy, dotted: the features extractor.
-        hidden: The layers between; a sequence of modules.
-        last: The last layer.
-        output: What is done with its output: ``tanh`` or ``clip``.
+        features: Features extractor.
+        hidden: Sequence of the hidden layers.
+        last: Last layer.
+        output: Function of the last layer's output: ``tanh`` or ``clip``.
     """
 
     features: str
@@ -120,12 +123,7 @@ _CLIPPED: Final = Actor("pi_features_extractor", "mlp_extractor.policy_net", "ac
 
 @dataclass(frozen=True)
 class Algorithm:
-    """One algorithm.
-
-    Attributes:
-        path: Its class, as ``module:name``.
-        actor: What an export takes.
-    """
+    """Algorithm of Stable-Baselines3: its class as ``module:name``, and the parts to export."""
 
     path: str
     actor: Actor
@@ -135,8 +133,13 @@ class Algorithm:
         found: type[BaseAlgorithm] = pkgutil.resolve_name(self.path)
         return found
 
+    def argument(self, given: Mapping[str, Any], name: str) -> Any:
+        """Return an argument of the constructor, given or default; None if there is no such one."""
+        parameters = inspect.signature(self.load_class()).parameters
+        return given.get(name, parameters[name].default if name in parameters else None)
+
     def entries(self) -> Any:
-        """Return the type of a recipe: of the entries above, those that the constructors take."""
+        """Return the type of a recipe: the entries above that the constructors take."""
         kind: Any = self.load_class()
         arguments = inspect.signature(kind).parameters
         policy = inspect.signature(kind.policy_aliases["MultiInputPolicy"]).parameters

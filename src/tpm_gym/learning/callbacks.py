@@ -1,4 +1,4 @@
-"""What happens besides learning while a policy trains: evaluation, checkpoints, stopping."""
+"""Callbacks of a training: evaluations, checkpoints, and stopping."""
 
 import json
 import time
@@ -9,35 +9,30 @@ from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from tpm_gym.envs.vector import TPMVectorEnv
-from tpm_gym.learning.checkpoint import CheckpointStore, Content
+from tpm_gym.learning.checkpoint import CheckpointStore
 from tpm_gym.learning.configuration import TrainingConfig
-from tpm_gym.learning.curve import draw_learning_curve
 from tpm_gym.learning.errors import CheckpointError
-from tpm_gym.learning.estimates import Estimate
 from tpm_gym.learning.policies import TrainedPolicy
 from tpm_gym.learning.rollout import SELECTION_SEED, GoalEnv, run_batch, run_episodes, summarise
-from tpm_gym.learning.run_folder import CURVE_FILE, EVALUATIONS_FILE
+from tpm_gym.learning.run_folder import EVALUATIONS_FILE
 from tpm_gym.learning.signals import SignalListener
 from tpm_gym.learning.training_state import capture
 
-_DRAWING_INTERVAL: Final = 10.0  # s between drawings of the curve
 _SHORTEST_INTERVAL: Final = 30.0  # s between checkpoints
 _LARGEST_SHARE: Final = 0.02  # of the time may go into checkpoints
 
 
 class PeriodicEvaluation(BaseCallback):
-    """Evaluates the policy on held-out seeds before, during and after training.
+    """Evaluation of the policy on held-out seeds before, during and after training.
 
-    Every evaluation uses the same episodes, so the points of a learning curve differ by the policy
-    alone. Each is appended to evaluations.jsonl and, before long, drawn; the best policy so far is
-    kept.
+    All evaluations use the same episodes, so the points of a learning curve differ by the policy
+    alone. Each is appended to evaluations.jsonl, and the best policy so far is kept.
 
     Args:
-        env: An environment of its own, so that training is not disturbed.
-        console: Where one line per evaluation is printed.
+        env: A separate environment, so that evaluations do not disturb training.
+        console: Gets one line for each evaluation.
         keep: Called with the model whenever it is the best so far.
     """
 
@@ -48,41 +43,35 @@ class PeriodicEvaluation(BaseCallback):
         console: Console,
         keep: Callable[[BaseAlgorithm], object],
     ) -> None:
-        """Remember what to evaluate and where to put it."""
+        """Store the arguments."""
         super().__init__()
         self._config, self._env = config, env
         self._console, self._keep = console, keep
-        self._evaluations: list[dict[str, Any]] = []
+        self.evaluations: list[dict[str, Any]] = []
         self._best: tuple[float, float] | None = None
-        self._drawn = 0.0  # when the curve was
 
     def state(self) -> dict[str, Any]:
-        """Return what a checkpoint has to keep, as plain data."""
-        return {"evaluations": self._evaluations, "best": self._best}
+        """Return the state for a checkpoint, as plain data."""
+        return {"evaluations": self.evaluations, "best": self._best}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on after the evaluations that :meth:`state` returned."""
-        self._evaluations = list(state["evaluations"])
+        """Restore the state of :meth:`state`."""
+        self.evaluations = list(state["evaluations"])
         self._best = tuple(state["best"]) if state["best"] else None
 
     def _on_training_start(self) -> None:
-        if not self._evaluations:
+        if not self.evaluations:
             self._evaluate()
-        self._draw()  # of a resumed run, the curve loses what is done again
 
     def _on_step(self) -> bool:
-        due = self.num_timesteps - self._evaluations[-1]["steps"] >= self._config.eval_every
-        # The last evaluation waits for the last update, to be that of the policy which is saved.
+        due = self.num_timesteps - self.evaluations[-1]["steps"] >= self._config.eval_every
+        # The last evaluation waits for the last update, since that policy is saved.
         if due and self.num_timesteps < self._config.steps:
             self._evaluate()
-            # To draw takes longer than to evaluate in closed form.
-            if time.perf_counter() - self._drawn > _DRAWING_INTERVAL:
-                self._draw()
         return True
 
     def _on_training_end(self) -> None:
         self._evaluate()
-        self._draw()
 
     def _evaluate(self) -> None:
         policy = TrainedPolicy(self.model)
@@ -92,37 +81,13 @@ class PeriodicEvaluation(BaseCallback):
         else:
             records = run_episodes(self._env, policy, episodes, SELECTION_SEED)
         metrics = summarise(records)
-        self._record(metrics)
-        quality = (metrics["success_at_end"].mean, metrics["return"].mean)
+        self._record({name: estimate.as_dict() for name, estimate in metrics.items()})
+        success = metrics["success_at_end"]
+        quality = (success.mean, metrics["return"].mean)
         best = self._best is None or quality > self._best
         if best:
             self._best = quality
             self._keep(self.model)
-        self._print(metrics, best)
-
-    def _draw(self) -> None:
-        config = self._config
-        self._drawn = time.perf_counter()
-        draw_learning_curve(config.run / CURVE_FILE, config.title, self._evaluations)
-
-    def _record(self, metrics: Mapping[str, Estimate]) -> None:
-        """Append the metrics to evaluations.jsonl, progress.csv and TensorBoard."""
-        line: dict[str, Any] = {
-            "steps": self.num_timesteps,
-            "episodes": self._config.eval_episodes,
-            "first_seed": SELECTION_SEED,
-            "wall_seconds": round(seconds_trained(self.model), 3),
-        }
-        line.update({name: estimate.as_dict() for name, estimate in metrics.items()})
-        self._evaluations.append(line)
-        with (self._config.run / EVALUATIONS_FILE).open("a", encoding="utf-8") as file:
-            file.write(json.dumps(line, allow_nan=False) + "\n")
-        for name, estimate in metrics.items():
-            self.logger.record(f"eval/{name}", estimate.mean)
-        self.logger.dump(self.num_timesteps)
-
-    def _print(self, metrics: Mapping[str, Estimate], best: bool) -> None:
-        success = metrics["success_at_end"]
         self._console.print(
             f"{self.num_timesteps:>9,} steps   success {success.mean:6.1%} "
             f"[{success.low:.1%}, {success.high:.1%}]   return {metrics['return'].mean:7.2f}"
@@ -130,9 +95,25 @@ class PeriodicEvaluation(BaseCallback):
             markup=False,
         )
 
+    def _record(self, metrics: Mapping[str, Mapping[str, float]]) -> None:
+        """Append the metrics to evaluations.jsonl, progress.csv and TensorBoard."""
+        line: dict[str, Any] = {
+            "steps": self.num_timesteps,
+            "episodes": self._config.eval_episodes,
+            "first_seed": SELECTION_SEED,
+            "wall_seconds": round(seconds_trained(self.model), 3),
+            **metrics,
+        }
+        self.evaluations.append(line)
+        with (self._config.run / EVALUATIONS_FILE).open("a", encoding="utf-8") as file:
+            file.write(json.dumps(line, allow_nan=False) + "\n")
+        for name, estimate in metrics.items():
+            self.logger.record(f"eval/{name}", estimate["mean"])
+        self.logger.dump(self.num_timesteps)
+
 
 class ProgressBar(BaseCallback):
-    """Shows a progress bar on a terminal, and nothing anywhere else."""
+    """Progress bar on a terminal; nothing elsewhere."""
 
     def __init__(self, console: Console) -> None:
         """Lay out the bar without showing it."""
@@ -151,27 +132,24 @@ class ProgressBar(BaseCallback):
         return True
 
     def close(self) -> None:
-        """Leave the terminal as it was; safe to call at any time."""
+        """Restore the terminal; safe to call at any time."""
         self._progress.stop()
 
 
 class StopTrainingError(Exception):
-    """Leaves ``learn`` where the last checkpoint was taken; never seen by a user."""
+    """Exit from ``learn`` after the last checkpoint; users never see it."""
 
 
 class Checkpointing(BaseCallback):
-    """Saves checkpoints between rollouts, and one when the process is asked to stop.
+    """Checkpoints between rollouts, and one when the process is asked to stop.
 
-    A checkpoint that cannot be written is reported and tried again when the next one is due;
-    training goes on meanwhile, and the checkpoints before stay.
+    A checkpoint that cannot be written is reported and tried again when the next one is due.
+    Training continues meanwhile, and the earlier checkpoints stay.
 
-    A rollout of an on-policy algorithm is long, so a stop does not wait for its end: the state at
-    its beginning is kept in memory, saved, and the rollout is done again after resuming.
-
-    The first is saved before anything else is done, so that no policy is ever without one.
+    The first checkpoint is saved before anything else is done, so that no policy is without one.
 
     Args:
-        evaluation: Whose state is part of a checkpoint.
+        evaluation: Callback whose state is part of a checkpoint.
         seconds: Seconds that earlier processes have trained.
     """
 
@@ -184,11 +162,10 @@ class Checkpointing(BaseCallback):
         console: Console,
         seconds: float,
     ) -> None:
-        """Remember what to save, when and where."""
+        """Store the arguments."""
         super().__init__()
         self._config, self._store, self._evaluation = config, store, evaluation
         self._listener, self._console, self._seconds = listener, console, seconds
-        self._held: Content | None = None
         self._last_step: int | None = store.newest
         self._next_time = time.perf_counter() + _SHORTEST_INTERVAL
 
@@ -197,30 +174,21 @@ class Checkpointing(BaseCallback):
         self.model.start_time = int(time.time_ns() - self._seconds * 1e9)
         self.model._num_timesteps_at_start = 0
         if self._last_step is None:
-            self._save(self._capture(), time.perf_counter())
+            self._save()
 
     def _on_rollout_start(self) -> None:
-        started = time.perf_counter()
         stop = self._listener.received is not None
-        on_policy = isinstance(self.model, OnPolicyAlgorithm)
-        due = self._is_due()
-        if on_policy or due or stop:
-            content = self._capture()
-            self._held = content if on_policy else None
-            if due or stop:
-                self._save(content, started)
+        if stop or self._is_due():
+            self._save()
         if stop:
             raise StopTrainingError
 
     def _on_step(self) -> bool:
-        if self._listener.received is not None and self._held is not None:
-            self._save(self._held, time.perf_counter())
-            raise StopTrainingError
         return True
 
     def save_finished(self) -> None:
-        """Save the end of the training, after which there is nothing to resume."""
-        self._save(self._capture(finished=True), time.perf_counter())
+        """Save the end of the training."""
+        self._save(finished=True)
 
     def _is_due(self) -> bool:
         if self._config.checkpoint_every is not None:
@@ -228,12 +196,11 @@ class Checkpointing(BaseCallback):
             return taken >= self._config.checkpoint_every
         return time.perf_counter() >= self._next_time
 
-    def _capture(self, finished: bool = False) -> Content:
+    def _save(self, finished: bool = False) -> None:
+        """Save a checkpoint, or report why not."""
+        started = time.perf_counter()
         extra = {"seconds": seconds_trained(self.model), "evaluation": self._evaluation.state()}
-        return capture(self.model, self._config.run, extra, finished)
-
-    def _save(self, content: Content, started: float) -> None:
-        """Save what was captured from the time ``started`` on, or report why not."""
+        content = capture(self.model, self._config.run, extra, finished)
         try:
             self._store.save(content)
         except CheckpointError as error:
@@ -244,5 +211,5 @@ class Checkpointing(BaseCallback):
 
 
 def seconds_trained(model: BaseAlgorithm) -> float:
-    """Return how long the run has been training, in this process and those before it."""
+    """Return the time that a run has been training, in this process and earlier ones, in s."""
     return (time.time_ns() - model.start_time) / 1e9

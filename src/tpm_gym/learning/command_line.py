@@ -1,4 +1,4 @@
-"""The command ``tpm-gym``."""
+"""Command ``tpm-gym``."""
 
 import signal
 import sys
@@ -21,13 +21,13 @@ class ExportConfig:
     """Export a trained policy as safetensors and JSON, which load without trust."""
 
     model: Positional[Path]
-    """A .zip file of a training, in its run folder."""
+    """Archive (.zip) of a training, in its run folder."""
 
     out: Positional[Path]
-    """What the two new files have in common; an earlier policy is replaced, nothing else."""
+    """Common name of the two new files; an earlier policy is replaced, no other files."""
 
     trust_pickle: bool = False
-    """Load the .zip file, which can run any code that is in it."""
+    """Load the .zip file, which can run any code."""
 
 
 Command = (
@@ -41,7 +41,7 @@ Command = (
 def main(words: Sequence[str] | None = None) -> None:
     """Run a command line, by default that of the process, and exit with its status.
 
-    A command that a signal has stopped exits with 128 and its number, as shells do.
+    A command that a signal stops exits with 128 plus the number of the signal, as in shells.
     """
     about = "Train policies on the environments of tpm_gym, and evaluate them."
     command: Any = tyro.cli(Command, prog="tpm-gym", description=about, args=words)
@@ -56,7 +56,7 @@ def main(words: Sequence[str] | None = None) -> None:
 
 
 def _run(command: Any) -> signal.Signals | None:
-    """Run a command; return the signal that stopped it, if one did."""
+    """Run a command; return the signal that stopped it, if any."""
     match command:
         case TrainingConfig():
             return train(command)
@@ -65,7 +65,7 @@ def _run(command: Any) -> signal.Signals | None:
         case EvaluationConfig():
             evaluate(command)
         case ExportConfig():
-            from tpm_gym.learning.export import convert  # here, since it imports PyTorch
+            from tpm_gym.learning.export import convert  # imported here, since it needs PyTorch
 
             print(convert(command.model, command.out, trust_pickle=command.trust_pickle))
     return None

@@ -1,4 +1,4 @@
-"""What a training run is to do: the options of the command line, completed and checked."""
+"""Configuration of a training: the options of the command line, completed and checked."""
 
 import json
 import math
@@ -11,54 +11,59 @@ import tyro
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from tpm_gym.learning.algorithms import ALGORITHMS
-from tpm_gym.learning.environments import check_env_id
+from tpm_gym.learning.environments import check_env_id, import_module_of
 from tpm_gym.learning.errors import ConfigError, RunError
 from tpm_gym.learning.recipes import Recipe, check_recipes, read_recipe, recipe_file
 from tpm_gym.learning.rollout import SELECTION_SEED, TEST_SEED
 from tpm_gym.learning.run_folder import CONFIG_FILE
 
 UNSET: Final[Any] = None
-"""Of an option that :func:`complete` works out, or that leaves a resumed run as it is."""
+"""Value of an option that :func:`complete` computes, or that a resumed run keeps."""
+
+_MOST_PROCESSES: Final = 1000
 
 
 def unset(kind: Any, shown: str, metavar: str, name: str | None = None) -> Any:
-    """Describe an option of a type that is ``UNSET`` where it is not given.
+    """Describe an option of a type that is ``UNSET`` by default.
 
-    ``shown`` is what the help says that the default is, ``name`` what the command line calls it.
+    ``shown`` is the default in the help, ``name`` the name on the command line.
     """
     return shown_default(shown, metavar, constructor=kind | None, name=name)
 
 
 def shown_default(shown: str, metavar: str, **options: Any) -> Any:
-    """Describe an option whose default has to be put into words."""
+    """Describe an option whose default is put into words."""
     hint = f"(default: {shown})"
     return tyro.conf.arg(help_behavior_hint=hint, metavar=metavar, **options)
 
 
 @dataclass(frozen=True)
 class EnvOptions:
-    """What an environment is made with, by name; what is not given is as the id has it."""
+    """Options of an environment, by name; the id decides those that are not given."""
 
-    machine: Annotated[str, unset(str, "the id's own, mostly paper", "NAME")] = UNSET
-    """Machine: paper, wide, or one that the module of --env module:id registers. What a policy was
-    trained with is not known of it: evaluate asks again."""
+    machine: Annotated[str, unset(str, "the policy's in evaluate, else the id's", "NAME")] = UNSET
+    """Machine: paper, wide, or one that the module of --env module:id registers."""
 
-    engine: Annotated[str, unset(str, "the id's own, mostly pybullet", "NAME")] = UNSET
-    """Engine: pybullet, analytic (the closed form, many environments at a time), mujoco, or one
-    that the module of --env module:id registers."""
+    engine: Annotated[str, unset(str, "the id's, mostly pybullet", "NAME")] = UNSET
+    """Engine: pybullet, analytic (many environments at once), mujoco, or one that the module of
+    --env module:id registers."""
 
     drive: Annotated[
-        str, unset(Literal["ideal", "servo"], "the id's own, mostly ideal", "{ideal,servo}")
+        str,
+        unset(
+            Literal["ideal", "servo"], "the policy's in evaluate, else the id's", "{ideal,servo}"
+        ),
     ] = UNSET
-    """How the motors follow their references: exactly, or as torque motors with servo drives."""
+    """Drives of the motors: ideal ones follow their references exactly, servo drives are torque
+    motors."""
 
     @property
     def in_batches(self) -> bool:
-        """Whether many environments are computed at a time."""
+        """Whether one process steps many environments at once."""
         return self.engine == "analytic"
 
     def given(self) -> dict[str, Any]:
-        """Those that are given, as arguments of an environment."""
+        """Return the options that are given, as arguments of an environment."""
         return {name: value for name, value in vars(self).items() if value is not UNSET}
 
 
@@ -67,7 +72,7 @@ class TrainingConfig:
     """Train a policy, and leave everything about the run in one folder."""
 
     algo: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(ALGORITHMS) + "}")] = "sac"
-    """Algorithm. SAC and TQC use hindsight replay on sparse rewards; PPO wants a Dense id."""
+    """Algorithm. SAC and TQC use hindsight replay on sparse rewards; PPO needs a Dense id."""
 
     env: Annotated[str, tyro.conf.arg(metavar="ID")] = "TPMReach-v0"
     """Environment id, or module:id for one that a module of yours registers."""
@@ -76,16 +81,16 @@ class TrainingConfig:
     """Seed of the networks, the exploration and the first training environment."""
 
     steps: Annotated[int, unset(int, "as the recipe says", "INT")] = UNSET
-    """Environment steps, over all environments."""
+    """Environment steps, over all environments; rounded up to whole rollouts."""
 
     envs: Annotated[int, unset(int, "as the recipe says", "INT")] = UNSET
-    """Parallel environments; several are in processes of their own, in --engine analytic in one."""
+    """Parallel environments, each in its own process; in --engine analytic all in one."""
 
     recipe_file: Annotated[Path, unset(Path, "the shipped one of <algo>", "PATH", "recipe")] = UNSET
     """YAML file of hyperparameters by environment id."""
 
     recipe: tyro.conf.Suppress[Annotated[Recipe, unset(type(None), "", "")]] = UNSET
-    """The hyperparameters in it."""
+    """Hyperparameters in that file."""
 
     demonstrations: Annotated[int | None, unset(int, "as the recipe says", "INT")] = None
     """Episodes of the expert in the replay buffer before training starts; 0 trains from scratch."""
@@ -97,8 +102,8 @@ class TrainingConfig:
     """Weight of the singularity penalty in the reward; 0 switches it off."""
 
     goals: Literal["sampled", "tempting"] = "sampled"
-    """As the environment samples them, or goals that tempt towards the singularity; in training and
-    in its evaluations."""
+    """Goals of training and evaluations: as the environment samples them, or tempting towards the
+    singularity."""
 
     env_options: tyro.conf.OmitArgPrefixes[EnvOptions] = field(default_factory=EnvOptions)
 
@@ -111,11 +116,11 @@ class TrainingConfig:
     """Episodes per evaluation."""
 
     test_episodes: int = 100
-    """Episodes of the test in PyBullet with which a training in --engine analytic ends; 0: none."""
+    """Episodes of the test in PyBullet that ends a training in --engine analytic; 0 for none."""
 
     checkpoint_every: Annotated[int | None, unset(int, "by time", "INT")] = None
-    """Steps between checkpoints. By time means every half minute, or less often where that would
-    take more than 2% of the time."""
+    """Steps between checkpoints. By time: every 30 s, or less often if checkpoints would take more
+    than 2% of the time."""
 
     threads: int = 1
     """Threads of PyTorch. With one thread and one environment, or --engine analytic, a seed repeats
@@ -129,12 +134,27 @@ class TrainingConfig:
 
     @property
     def in_batches(self) -> bool:
-        """Whether many environments are computed at a time."""
+        """Whether one process steps many environments at once."""
         return self.env_options.in_batches
 
     @property
+    def rollout(self) -> int:
+        """Number of steps between two updates, over all environments."""
+        return self.envs * int(self.argument("train_freq") or self.argument("n_steps"))
+
+    def argument(self, name: str) -> Any:
+        """Return an argument of the algorithm: the recipe's or its default; None if it has none."""
+        return ALGORITHMS[self.algo].argument(self.recipe.arguments, name)
+
+    @property
+    def demonstrated(self) -> int:
+        """Number of steps of the demonstrations, over all environments."""
+        episodes = int(self.recipe.demonstrations.get("episodes", 0))
+        return -(-episodes // self.envs) * self.envs * _horizon(self.env)
+
+    @property
     def title(self) -> str:
-        """One line that names the run."""
+        """Name of the run in one line."""
         method = self.algo.upper() + (" + HER" if self.recipe.hindsight else "")
         return f"{self.env}   {method}, seed {self.seed}"
 
@@ -148,13 +168,17 @@ class TrainingConfig:
 
 @dataclass(frozen=True)
 class ResumeConfig:
-    """Go on with a run from its last checkpoint; what is not given here is as the run has it."""
+    """Continue a run from its last checkpoint; options that are not given stay as they are."""
 
     run: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="RUN")]]
     """Folder of the run."""
 
+    env: Annotated[str, unset(str, "the run's", "MODULE:ID")] = UNSET
+    """Environment id of the run; needed if it is module:id, since no file decides what is
+    imported."""
+
     steps: Annotated[int, unset(int, "the run's", "INT")] = UNSET
-    """Environment steps in all; may be raised."""
+    """Environment steps in all, rounded up to whole rollouts; may be raised."""
 
     eval_every: Annotated[int, unset(int, "the run's", "INT")] = UNSET
     """Steps between evaluations on held-out seeds."""
@@ -170,11 +194,8 @@ class ResumeConfig:
 
 
 def complete(config: TrainingConfig) -> TrainingConfig:
-    """Work out what was not given, and check all.
-
-    Raises:
-        ConfigError: An option, the recipe, or a combination of options is not valid.
-    """
+    """Compute the options that are not given, and check all."""
+    import_module_of(config.env)
     check_env_id(config.env)
     shipped = recipe_file(config.algo, config.env_options.engine)
     file = shipped if config.recipe_file is UNSET else config.recipe_file
@@ -183,22 +204,24 @@ def complete(config: TrainingConfig) -> TrainingConfig:
         recipe = _with_demonstrations(recipe, config)
     steps = recipe.n_timesteps if config.steps is UNSET else config.steps
     env = config.env.rpartition(":")[2]
-    worked_out: dict[str, Any] = {
+    computed: dict[str, Any] = {
         "steps": steps,
         "envs": recipe.n_envs,
         "recipe_file": file,
         "run": Path("runs", f"{env}-{config.algo}-s{config.seed}"),
-        "eval_every": max(1, steps // (20 if config.in_batches else 10)),
         "eval_episodes": 200 if config.in_batches else 20,
     }
-    missing = {name: v for name, v in worked_out.items() if getattr(config, name) is UNSET}
+    missing = {name: v for name, v in computed.items() if getattr(config, name) is UNSET}
     config = replace(config, recipe=recipe, **missing)
+    if config.eval_every is UNSET:  # more often, it would evaluate equal policies
+        often = steps // (20 if config.in_batches else 10)
+        config = replace(config, eval_every=max(config.rollout, often))
     _check(config)
-    return config
+    return _in_whole_rollouts(config, 0)
 
 
 def _with_demonstrations(recipe: Recipe, config: TrainingConfig) -> Recipe:
-    """The recipe with so many of them as the configuration says."""
+    """Return the recipe with the configured number of demonstrations."""
     check_least(config, 0, "demonstrations")
     count = config.demonstrations
     changed = {**recipe.demonstrations, "episodes": count} if count else {}
@@ -207,54 +230,53 @@ def _with_demonstrations(recipe: Recipe, config: TrainingConfig) -> Recipe:
     return recipe
 
 
+def _in_whole_rollouts(config: TrainingConfig, reached: int) -> TrainingConfig:
+    """Round the steps up to the end of a rollout; rollouts begin at step ``reached``.
+
+    Stable-Baselines3 would round as well, but let schedules end at the steps that were asked for.
+    """
+    start = max(reached, config.demonstrated)
+    rollouts = -(-(config.steps - start) // config.rollout)
+    return replace(config, steps=start + rollouts * config.rollout)
+
+
 def resumed(config: ResumeConfig, stored: Mapping[str, Any], reached: int) -> TrainingConfig:
-    """Return the configuration of a run, with what is to change in it.
+    """Return the configuration of a run with the changes to it.
 
     Args:
-        stored: The run's config.json.
+        stored: Content of the run's config.json.
         reached: Steps that the run has taken.
-
-    Raises:
-        ConfigError: An option is not valid.
-        RunError: ``stored`` is damaged.
     """
-    _require_whole(config.run, stored)
+    found = _stored(config.run, stored)
+    if config.env not in (UNSET, found.env):
+        raise ConfigError(f"--env {config.env}: the run was trained in {found.env}; give that")
+    if config.env is not UNSET:
+        import_module_of(config.env)
     changes = {name: value for name, value in vars(config).items() if value is not UNSET}
-    # A run of before an option was there had what is its default.
-    names = {entry.name for entry in fields(TrainingConfig)} & stored.keys()
-    objects = {
-        "recipe": Recipe(**stored["recipe"]),
-        "recipe_file": Path(stored["recipe_file"]),
-        "env_options": EnvOptions(**stored.get("env_options", {})),
-    }
-    found = TrainingConfig(**{**{name: stored[name] for name in names}, **objects, **changes})
+    found = replace(found, **changes)
     if found.steps < reached:
         raise ConfigError(f"--steps {found.steps}: the run has already taken {reached:,}")
     _check(found)
-    return found
+    return _in_whole_rollouts(found, reached)
 
 
-def _require_whole(run: Path, stored: Mapping[str, Any]) -> None:
-    """Refuse a stored configuration with entries that are missing or of other types."""
-    entries = {
-        field.name: stored.get(field.name)
-        for field in fields(TrainingConfig)
-        if field.name in stored or field.default is UNSET
-    }
-    text = json.dumps({CONFIG_FILE: {**entries, "run": run.name}})
-    strict = ConfigDict(strict=True, extra="forbid")
+def _stored(run: Path, stored: Mapping[str, Any]) -> TrainingConfig:
+    """Build the configuration of a run; refuse missing entries, and entries of other types."""
+    names = {entry.name for entry in fields(TrainingConfig)} - {"overwrite"}
+    text = json.dumps({CONFIG_FILE: {name: stored.get(name) for name in names}})
+    kind = TypeAdapter(dict[str, TrainingConfig], config=ConfigDict(strict=True, extra="forbid"))
     try:
-        TypeAdapter(dict[str, TrainingConfig], config=strict).validate_json(text)
+        found = kind.validate_json(text)[CONFIG_FILE]
         TypeAdapter(list[Any]).validate_python(stored.get("resumed", []))
-        recipe_file(stored["algo"])  # there is such an algorithm
-        entries = Recipe(**stored["recipe"]).entries()
-        check_recipes(CONFIG_FILE, {"recipe": entries}, stored["algo"])
+        recipe_file(found.algo)  # refuses an unknown algorithm
+        check_recipes(CONFIG_FILE, {"recipe": found.recipe.entries()}, found.algo)
     except ValidationError as error:
         first = error.errors()[0]
         problem = f"{'.'.join(map(str, first['loc']))}: {first['msg']}, not {first['input']!r:.100}"
         raise _damaged(run, problem) from error
-    except ConfigError as error:
+    except (AttributeError, ConfigError) as error:  # no recipe is None
         raise _damaged(run, str(error)) from error
+    return found
 
 
 def _damaged(run: Path, problem: str) -> RunError:
@@ -263,7 +285,7 @@ def _damaged(run: Path, problem: str) -> RunError:
 
 
 def check_least(config: Any, least: int, *names: str) -> None:
-    """Refuse, with a ConfigError, an option that is given and less than it may be."""
+    """Refuse, with a ConfigError, an option that is given and too small."""
     for name in names:
         value = getattr(config, name)
         if value is not UNSET and value < least:
@@ -274,6 +296,11 @@ def _check(config: TrainingConfig) -> None:
     counts = ("steps", "envs", "eval_every", "eval_episodes", "checkpoint_every", "threads")
     check_least(config, 1, *counts)
     check_least(config, 0, "test_episodes")
+    most = SELECTION_SEED if config.in_batches else _MOST_PROCESSES
+    if config.envs > most:
+        raise ConfigError(
+            f"--envs {config.envs} (n_envs of the recipe, if not given): must be at most {most:,}"
+        )
     highest = SELECTION_SEED - config.envs
     if not 0 <= config.seed <= highest:
         held_out = f"seeds from {SELECTION_SEED} up are held out"
@@ -284,45 +311,63 @@ def _check(config: TrainingConfig) -> None:
     if not 0 <= config.penalty_weight < math.inf:
         weight = config.penalty_weight
         raise ConfigError(f"--penalty-weight {weight}: must be a finite number, 0 or more")
-    _check_episodes(config)
+    _check_recipe(config)
     _check_device(config.device)
 
 
-def _check_episodes(config: TrainingConfig) -> None:
-    """Refuse to end before the demonstrations do, or to learn before an episode has ended.
+def _check_recipe(config: TrainingConfig) -> None:
+    """Refuse a recipe that cannot work with the numbers of steps and environments.
 
-    Demonstrations count as steps and teach nothing alone; hindsight would have nothing to draw.
+    Demonstrations count as steps and teach nothing alone. Hindsight draws from whole episodes, so
+    one must have ended before learning starts.
     """
-    horizon = check_env_id(config.env).max_episode_steps or 0
-    recipe, envs = config.recipe, config.envs
-    episodes = -(-int(recipe.demonstrations.get("episodes", 0)) // envs) * envs
-    if episodes and config.steps <= episodes * horizon:
+    envs, where = config.envs, f"--recipe {config.recipe_file}"
+    if config.steps <= config.demonstrated:
         raise ConfigError(
-            f"--steps {config.steps}: must be more than the {episodes * horizon:,} of the "
+            f"--steps {config.steps}: must be more than the {config.demonstrated:,} of the "
             "demonstrations; for a short trial give fewer --demonstrations"
         )
-    starts = int(recipe.arguments.get("learning_starts", 100))
-    if recipe.hindsight and starts < horizon * envs:
+    length = "train_freq" if config.argument("train_freq") else "n_steps"
+    if config.steps - config.demonstrated < config.rollout:
         raise ConfigError(
-            f"--recipe {config.recipe_file}: learning_starts: {starts} is before the first episode "
-            f"ends (step {horizon * envs} with {envs} environments); raise it, or use fewer --envs"
+            f"--steps {config.steps}: one rollout takes {config.rollout:,} ({envs} environments x "
+            f"{length}); give more steps, or fewer --envs"
         )
-    room = int(recipe.arguments.get("buffer_size", 1_000_000))
-    if recipe.hindsight and room < horizon * envs:
+    if config.argument("normalize_advantage"):
+        for name, size in ((length, config.rollout), ("batch_size", config.argument("batch_size"))):
+            if size < 2:
+                raise ConfigError(
+                    f"{where}: {name}: {size}: advantages of one step cannot be normalised; raise "
+                    "it, or set normalize_advantage: false"
+                )
+    if not config.recipe.hindsight:
+        return
+    episode = _horizon(config.env) * envs
+    if (starts := config.argument("learning_starts")) < episode:
         raise ConfigError(
-            f"--recipe {config.recipe_file}: buffer_size: {room} is less than the {horizon * envs} "
+            f"{where}: learning_starts: {starts} is before the first episode "
+            f"ends (step {episode} with {envs} environments); raise it, or use fewer --envs"
+        )
+    if (room := config.argument("buffer_size")) < episode:
+        raise ConfigError(
+            f"{where}: buffer_size: {room} is less than the {episode} "
             f"steps of an episode in each of {envs} environments; raise it, or use fewer --envs"
         )
 
 
+def _horizon(env_id: str) -> int:
+    """Return the number of steps after which an episode is truncated."""
+    return check_env_id(env_id).max_episode_steps or 0
+
+
 def _check_device(device: str) -> None:
-    """Refuse a device that PyTorch does not have here, before anything is deleted for the run."""
+    """Refuse a device that PyTorch does not have, before anything is deleted for the run."""
     import torch
 
     try:
         kind = torch.device(device).type
         if kind != "cuda":
-            torch.zeros(1, device=device).item()  # some hold no numbers
+            torch.zeros(1, device=device).item()  # the device meta holds no numbers
     except RuntimeError as error:
         raise ConfigError(f"--device {device}: is no device of PyTorch; try cpu") from error
     if kind == "cuda" and not torch.cuda.is_available():

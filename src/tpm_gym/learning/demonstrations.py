@@ -1,9 +1,9 @@
 """Episodes of the scripted expert in the replay buffer, before training starts.
 
-A sparse reward tells a policy nothing until it has picked up the object once by chance, which takes
-very long; with some demonstrations among its memories it learns within minutes (Nair et al. 2018).
-They are stored as whole episodes, so that hindsight can relabel them like any other, and counted as
-steps of the environment, so that no learning curve hides them.
+A sparse reward teaches a policy nothing until it has picked up the object by chance, which takes
+very long. With demonstrations in the replay buffer it learns within minutes (Nair et al. 2018).
+They are stored as whole episodes, so that hindsight can relabel them. They count as environment
+steps, so that no learning curve hides them.
 """
 
 from collections.abc import Sequence
@@ -23,21 +23,21 @@ _OF_VECTORS: Final = ("num_envs", "vectorization_mode", "autoreset_mode", "stagg
 
 
 class Demonstrations(BaseCallback):
-    """Fills the replay buffer with the expert's episodes when training starts.
+    """Callback that fills the replay buffer with the expert's episodes when training starts.
 
-    Every second episode is disturbed by normally distributed noise on the motion: from it a policy
-    learns what to do where the expert by itself never gets. The expert plans on as if nothing had
-    happened, so some of these episodes fail, and that is worth knowing too.
+    Every second episode has normally distributed noise on the motion, so that the policy learns in
+    states that the expert never reaches by itself. The expert does not plan again after the noise,
+    so some of these episodes fail.
 
     Attributes:
-        successes: Share of the episodes that ended in success, once they are played.
+        successes: Share of the episodes that ended in success; NaN before they are played.
     """
 
     def __init__(self, episodes: int, noise: float = 0.3, verbose: int = 0) -> None:
-        """Set the number of episodes (at least) and the noise.
+        """Set the number of episodes and the noise.
 
         Args:
-            episodes: How many; with n environments, rounded up to a multiple of n.
+            episodes: Number of episodes, rounded up to a multiple of the number of environments.
             noise: Standard deviation, in units of the largest action.
         """
         super().__init__(verbose)
@@ -49,7 +49,7 @@ class Demonstrations(BaseCallback):
         if not isinstance(model, OffPolicyAlgorithm) or model.replay_buffer is None:
             raise TypeError(f"{type(model).__name__} has no replay buffer to put episodes in")
         if model.num_timesteps > 0:
-            return  # a run that goes on has them already
+            return  # a resumed run has them already
         specs = self.training_env.get_attr("spec")
         envs = [make_env(spec.id, **_of_one(spec)) for spec in specs]
         rng = np.random.default_rng(model.seed)
@@ -69,7 +69,7 @@ class Demonstrations(BaseCallback):
         noise: NDArray[Any],
         rng: np.random.Generator,
     ) -> list[bool]:
-        """One episode in each environment, all of the same length; whether they succeeded."""
+        """Play an episode of equal length in each environment; return whether each succeeded."""
         experts = [Expert(env) for env in envs]
         seen = [env.reset(seed=int(rng.integers(1_000_000)))[0] for env in envs]
         for expert, observation in zip(experts, seen, strict=True):
@@ -101,11 +101,11 @@ class Demonstrations(BaseCallback):
 
 
 def _of_one(spec: EnvSpec) -> dict[str, Any]:
-    """The arguments of an environment, where it is one of a vector without those of the vector."""
+    """Return the arguments of a single environment, without those of a vector."""
     return {name: value for name, value in spec.kwargs.items() if name not in _OF_VECTORS}
 
 
 def _stack(observations: Sequence[Observation]) -> Observation:
-    """Observations of several environments as one, with a leading axis."""
+    """Stack the observations of several environments along a new first axis."""
     names = observations[0]
     return {name: np.stack([seen[name] for seen in observations]) for name in names}

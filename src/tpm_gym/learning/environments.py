@@ -1,7 +1,8 @@
-"""The one place where training, evaluation, demonstrations and films get their environments."""
+"""Environments of training, evaluation, demonstrations and films."""
 
 import importlib
 import signal
+import sys
 from typing import Any
 
 import gymnasium as gym
@@ -14,17 +15,12 @@ from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.rollout import GoalEnv
 
 
-def check_env_id(env_id: str) -> EnvSpec:
-    """Make sure that an id is that of an environment of tpm_gym, ours or registered by a user.
+def import_module_of(env_id: str) -> None:
+    """Import the module of an id ``module:id`` that the user has typed; do nothing for other ids.
 
-    Args:
-        env_id: A registered id, or ``module:id``, for which the module is imported first.
-
-    Raises:
-        ConfigError: The module cannot be imported, or the id is not registered, or is that of an
-            environment without goal, conditioning and loops to evaluate.
+    Ids from files must not come here: a module runs any code when it is imported.
     """
-    module, _, name = env_id.rpartition(":")
+    module = env_id.rpartition(":")[0]
     try:
         if module:
             importlib.import_module(module)
@@ -32,34 +28,42 @@ def check_env_id(env_id: str) -> EnvSpec:
         reason = f"{type(error).__name__}: {error}"
         where = "install it, or say python -m tpm_gym.learning in the folder that holds it"
         raise ConfigError(f"{env_id}: cannot import {module!r} ({reason}); {where}") from error
+
+
+def check_env_id(env_id: str) -> EnvSpec:
+    """Return the registration of an id of ours, or of ``module:id`` if the module is imported.
+
+    Nothing is imported.
+    """
+    module, _, name = env_id.rpartition(":")
+    if module and module not in sys.modules:
+        raise ConfigError(
+            f"{env_id} comes from a file and names the module {module!r}, which would run when it "
+            f"is imported; if you trust the module, give --env {env_id}"
+        )
     try:
         spec = gym.spec(name)
     except gym.error.Error as error:
         there = f"there are {', '.join(env_ids())}, and module:id for those that a module registers"
         raise ConfigError(f"unknown environment {env_id!r}; {there}") from error
-    if not _is_ours(spec):
-        raise ConfigError(f"{env_id} is no environment of tpm_gym; it makes {spec.entry_point}")
-    return spec
-
-
-def _is_ours(spec: EnvSpec) -> bool:
-    """Whether an id makes a ``TPMEnv``, or what derives from it."""
     entry: Any = spec.entry_point
     if isinstance(entry, str):
         try:
             entry = load_env_creator(entry)
         except (ImportError, AttributeError):
-            return False
-    return isinstance(entry, type) and issubclass(entry, TPMEnv)
+            entry = None
+    if not (isinstance(entry, type) and issubclass(entry, TPMEnv)):
+        raise ConfigError(f"{env_id} is no environment of tpm_gym; it makes {spec.entry_point}")
+    return spec
 
 
 def make_env(env: str | EnvSpec, *, in_worker: bool = False, **options: Any) -> GoalEnv:
     """Make an environment, with arguments such as ``goals`` and ``penalty_weight``.
 
     Args:
-        env: An id, or what Gymnasium has registered, which another process may not have.
-        in_worker: Whether this runs in a process of its own, which has to outlive the signal that
-            a terminal or a batch system sends to all processes, until the main one has saved.
+        env: An id, or its registration, which another process may not have.
+        in_worker: Whether this runs in a worker process. A terminal or a batch system signals all
+            processes, and a worker must outlive the signal until the main process has saved.
     """
     if in_worker:
         for number in (signal.SIGINT, signal.SIGTERM):
@@ -68,7 +72,7 @@ def make_env(env: str | EnvSpec, *, in_worker: bool = False, **options: Any) -> 
 
 
 def make_envs(env: str | EnvSpec, count: int, **options: Any) -> TPMVectorEnv:
-    """Make so many environments in closed form; options are as for :func:`make_env`."""
+    """Make a vector of environments for the analytic engine; options as for :func:`make_env`."""
     envs = gym.make_vec(env, num_envs=count, **options)
     assert isinstance(envs, TPMVectorEnv)
     return envs

@@ -1,27 +1,31 @@
-"""The errors of training and evaluation; all derive from :class:`tpm_gym.errors.TPMError`."""
+"""Errors of training and evaluation; all derive from :class:`tpm_gym.errors.TPMError`."""
 
 from tpm_gym.errors import TPMError
 
 
 class LearningError(TPMError):
-    """Root of the errors here."""
+    """Root of the errors of this package."""
 
 
 class ConfigError(LearningError, ValueError):
-    """An option, a recipe, or a combination of them is not valid."""
+    """Option, recipe, or combination of options that is not valid."""
 
 
 class RunError(LearningError):
-    """A run folder cannot be used as asked: it is taken, in use, not a run, or not writable."""
+    """Run folder that cannot be used: not empty, in use, no run, or not writable."""
 
 
 class CheckpointError(LearningError):
-    """A checkpoint is damaged, or cannot be written."""
+    """Checkpoint that is damaged or cannot be written."""
 
 
 class PolicyError(LearningError):
-    """A policy cannot be found, loaded, exported or used in the environment."""
+    """Policy that cannot be found, loaded, exported or used in the environment."""
 
 
 class RolloutError(LearningError):
-    """An episode delivered a value that no statistic can be made of."""
+    """Value of an episode that is not finite."""
+
+
+class DivergedError(LearningError, ArithmeticError):
+    """Training whose networks are no longer finite."""

@@ -1,15 +1,11 @@
-"""Means over episodes with 95% intervals; and the time a run takes to learn."""
+"""Means over episodes with 95% intervals."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from statistics import median
 from typing import Final
 
 import numpy as np
-
-LEARNED: Final = 0.95
-"""Success rate from which a policy counts as having learned its task."""
 
 _Z95: Final = 1.959963984540054  # 97.5% quantile of the standard normal distribution
 _SEED: Final = 0  # fixed: the same values always give the same interval
@@ -19,16 +15,16 @@ _BLOCK: Final = 100
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean over episodes with its 95% interval."""
+    """Mean over episodes with its 95% interval."""
 
     mean: float
     low: float
     high: float
     worst: float | None = None
-    """The worst value of any step of any episode, where the metric has one."""
+    """Worst value of all steps of all episodes, if the metric has one."""
 
     def as_dict(self) -> dict[str, float]:
-        """Return the estimate as plain data, without ``worst`` where there is none."""
+        """Return the estimate as plain data, without ``worst`` if there is none."""
         return {name: value for name, value in vars(self).items() if value is not None}
 
 
@@ -39,7 +35,7 @@ def wilson(outcomes: Sequence[bool]) -> Estimate:
     spread = _Z95**2 / n
     centre = (rate + spread / 2) / (1 + spread)
     half = _Z95 / (1 + spread) * math.sqrt(rate * (1 - rate) / n + spread / (4 * n))
-    # At rates of 0 and 1 one end equals the rate but for rounding, which must not exclude the rate.
+    # At rates of 0 and 1 one end equals the rate up to rounding, which must not exclude the rate.
     return Estimate(rate, max(0.0, min(rate, centre - half)), min(1.0, max(rate, centre + half)))
 
 
@@ -47,28 +43,12 @@ def bootstrap(values: Sequence[float], worst: float | None = None) -> Estimate:
     """Return a mean with its 95% percentile bootstrap interval (Efron 1979)."""
     sample = np.asarray(values, dtype=np.float64)  # (n,)
     rng = np.random.default_rng(_SEED)
-    # Not all resamples at once: with many values their matrix would not fit in memory.
+    # In blocks, since the matrix of all resamples of many values does not fit in memory.
     means = [
         sample[rng.integers(0, sample.size, (_BLOCK, sample.size))].mean(axis=1)
         for _ in range(_SAMPLES // _BLOCK)
     ]
     low, high = np.percentile(np.concatenate(means), [2.5, 97.5])
     mean = float(sample.mean())
-    # Equal values can differ from their mean by rounding; the interval must still hold the mean.
+    # Equal values can differ from their mean by rounding; the interval must contain the mean.
     return Estimate(mean, min(mean, float(low)), max(mean, float(high)), worst)
-
-
-def settled(successes: Sequence[float]) -> int | None:
-    """Index of the first evaluation from which success stays at ``LEARNED`` or above to the end.
-
-    None where the last evaluation is below, or there is none.
-    """
-    below = [index for index, success in enumerate(successes) if success < LEARNED - 1e-9]
-    first = below[-1] + 1 if below else 0
-    return first if first < len(successes) else None
-
-
-def median_time(times: Sequence[float | None]) -> float | None:
-    """Median over runs, where None is a run that never got there: later than any other."""
-    value = median(math.inf if time is None else time for time in times)
-    return value if math.isfinite(value) else None

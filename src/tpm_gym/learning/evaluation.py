@@ -1,10 +1,10 @@
-"""Evaluate policies over seeded episodes: a table, and optionally JSON, a video and a picture."""
+"""Evaluation of policies over seeded episodes: a table, JSON, a video and a picture."""
 
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,11 +16,11 @@ from rich.table import Table
 from tpm_gym.envs.vector import TPMVectorEnv
 from tpm_gym.learning import provenance
 from tpm_gym.learning.configuration import UNSET, EnvOptions, check_least, shown_default, unset
-from tpm_gym.learning.environments import check_env_id, make_env, make_envs
+from tpm_gym.learning.environments import check_env_id, import_module_of, make_env, make_envs
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.estimates import Estimate
 from tpm_gym.learning.film import write_contact_sheet, write_video
-from tpm_gym.learning.policies import TrainedPolicy, load_policy, trained_env
+from tpm_gym.learning.policies import TrainedPolicy, load_policy, trained_in
 from tpm_gym.learning.rollout import (
     BATCH,
     TEST_SEED,
@@ -32,7 +32,7 @@ from tpm_gym.learning.rollout import (
     summarise,
 )
 
-# Label, key, factor and format of each row of the table.
+# Label, key, factor, format and unit of each row of the table.
 _ROWS = (
     ("success at end", "success_at_end", 100.0, "{:.1f}", "%"),
     ("success once", "success_once", 100.0, "{:.1f}", "%"),
@@ -51,7 +51,8 @@ _ROWS = (
 class EvaluationConfig:
     """Evaluate policies over seeded episodes: a table, and optionally JSON, a video and a picture.
 
-    A .zip file of Stable-Baselines3 holds pickles, which can run any code: it is refused unless
+    Machine and drive are those that the policies were trained with, unless others are given.
+    A .zip file of Stable-Baselines3 holds pickles, which can run any code. It is refused unless
     --trust-pickle is given.
     """
 
@@ -69,7 +70,7 @@ class EvaluationConfig:
     """Seed of the first episode. The default is used neither in training nor to select policies."""
 
     goals: Literal["sampled", "tempting"] = "sampled"
-    """As the environment samples them, or goals that tempt towards the singularity."""
+    """Goals: as the environment samples them, or tempting towards the singularity."""
 
     penalty_weight: float = 1.0
     """Weight of the singularity penalty in the return."""
@@ -77,29 +78,30 @@ class EvaluationConfig:
     env_options: tyro.conf.OmitArgPrefixes[EnvOptions] = field(default_factory=EnvOptions)
 
     randomisation: Annotated[tuple[str, ...], shown_default("nowhere", "KEY=VALUE ...")] = ()
-    """Where the machine differs from the nominal one: attributes of tpm_gym's Randomisation, each
-    a number, or for factors LOW:HIGH to draw from, for example encoder_noise=1e-4 puck_mass=0.5:2.
-    Those about the puck change nothing where there is none."""
+    """Differences from the nominal machine: attributes of tpm_gym's Randomisation, each a number,
+    or for factors LOW:HIGH to draw from, for example encoder_noise=1e-4 puck_mass=0.5:2.
+    Attributes of the puck have no effect in a task without one."""
 
     json: Annotated[Path | None, unset(Path, "not written", "PATH")] = None
-    """Write metrics, episodes and versions here."""
+    """Write metrics, episodes and versions to this file."""
 
     video: Annotated[Path | None, unset(Path, "not written", "PATH")] = None
-    """Write an MP4 of the first episodes here; several policies get a file each."""
+    """Write an MP4 of the first episodes to this file; several policies get a file each."""
 
     video_episodes: int = 3
     """Episodes in a video."""
 
     picture: Annotated[Path | None, unset(Path, "not written", "PATH")] = None
-    """Write a PNG of six moments of the first episode here; several policies get a file each."""
+    """Write a PNG of six moments of the first episode to this file; several policies get a file
+    each."""
 
     trust_pickle: bool = False
-    """Load .zip files as well, which can run any code that is in them."""
+    """Load .zip files as well, which can run any code."""
 
 
 @dataclass(frozen=True)
 class Result:
-    """The evaluation of one policy, as it was named; the episodes took ``wall_seconds``."""
+    """Evaluation of one policy: its name, metrics, episodes and the time they took."""
 
     policy: str
     metrics: dict[str, Estimate]
@@ -119,29 +121,29 @@ class Result:
 
 
 def evaluate(config: EvaluationConfig, console: Console | None = None) -> list[Result]:
-    """Evaluate the policies of a configuration, in order, and write what it asks for.
+    """Evaluate the policies of a configuration, in order, and write the files it asks for.
 
     Args:
-        console: Where the table is printed; by default the standard output.
+        console: Gets the table; by default the standard output.
 
     Raises:
         LearningError: An option is not valid, or a policy cannot be used.
         ConfigurationError: The environment has no such option, or not with this value.
     """
-    # A file has no margin at which a table would have to be folded.
+    # Output to a file has no margin at which a table must be folded.
     console = console or Console(width=None if sys.stdout.isatty() else 200)
     _check(config)
-    env_id = _resolve_env(config)
-    with closing(_make_env(env_id, config)) as env:
-        # All are loaded before the first one runs: a mistyped name shows at once.
+    config = _complete(config)
+    with closing(_make_env(config)) as env:
+        # All are loaded before the first one runs, so that a mistyped name shows at once.
         policies = list(zip(config.policy, _load(config, env), strict=True))
         results = [_evaluate_one(env, *policy, config, console) for policy in policies]
-    console.print(_table(env_id, config, results))
+    console.print(_table(config, results))
     if config.json is not None:
-        provenance.write_json(config.json, _description(env_id, config, results))
+        provenance.write_json(config.json, _description(config, results))
         console.print(f"json: {config.json}", markup=False)
     if config.video is not None or config.picture is not None:
-        _film(env_id, config, console)
+        _film(config, console)
     return results
 
 
@@ -159,11 +161,12 @@ def _check(config: EvaluationConfig) -> None:
             provenance.require_writable(f"--{option}", path)
 
 
-def _resolve_env(config: EvaluationConfig) -> str:
-    """Return the environment id that was asked for, or that the policies were trained on."""
+def _complete(config: EvaluationConfig) -> EvaluationConfig:
+    """Take environment, machine and drive from the policies if they are not given."""
+    trained = {spec: found for spec in config.policy if (found := trained_in(spec)) is not None}
     env_id = config.env
     if env_id is UNSET:
-        ids = sorted({found for spec in config.policy if (found := trained_env(spec)) is not None})
+        ids = sorted({found for found, _ in trained.values()})
         if not ids:
             raise ConfigError("expert and random have no environment of their own: give --env ID")
         if len(ids) > 1:
@@ -171,13 +174,32 @@ def _resolve_env(config: EvaluationConfig) -> str:
                 f"policies were trained on {', '.join(ids)}: choose one with --env ID"
             )
         env_id = ids[0]
-    check_env_id(env_id)
-    return env_id
+    else:
+        import_module_of(env_id)
+    given, usual = config.env_options.given(), _conditions(env_id, {})
+    for name in ("machine", "drive"):
+        values = {spec: options.get(name, usual[name]) for spec, (_, options) in trained.items()}
+        if name in given or not values:
+            continue
+        if len(set(values.values())) > 1:
+            each = ", ".join(f"{value} ({spec})" for spec, value in values.items())
+            raise ConfigError(f"policies differ in {name}: {each}; choose one with --{name}")
+        if (value := next(iter(values.values()))) != usual[name]:
+            given[name] = value
+    return replace(config, env=env_id, env_options=EnvOptions(**given))
 
 
-def _make_env(env_id: str, config: EvaluationConfig, render_mode: str | None = None) -> GoalEnv:
+def _conditions(env_id: str, given: Mapping[str, Any]) -> dict[str, str]:
+    """Return the names of machine, engine and drive: those given, else those of the id."""
+    own = check_env_id(env_id).kwargs
+    usual = {"machine": "paper", "engine": "pybullet", "drive": "ideal"}
+    found = {name: given.get(name) or own.get(name) or value for name, value in usual.items()}
+    return {name: str(getattr(value, "name", value)) for name, value in found.items()}
+
+
+def _make_env(config: EvaluationConfig, render_mode: str | None = None) -> GoalEnv:
     return make_env(
-        env_id,
+        config.env,
         goals=config.goals,
         penalty_weight=config.penalty_weight,
         randomisation=parse_randomisation(config.randomisation),
@@ -187,18 +209,14 @@ def _make_env(env_id: str, config: EvaluationConfig, render_mode: str | None = N
 
 
 def _make_batch(env: GoalEnv, config: EvaluationConfig) -> TPMVectorEnv:
-    """As many environments like this one as are worth running at a time."""
+    """Make a vector of environments like this one."""
     assert env.spec is not None
     options = {k: v for k, v in env.spec.kwargs.items() if k != "render_mode"}
     return make_envs(env.spec.id, min(config.episodes, BATCH), **options)
 
 
 def parse_randomisation(entries: Sequence[str]) -> dict[str, Any]:
-    """Return words such as ``friction=0.5:1`` as a mapping; tpm_gym checks keys and values.
-
-    Raises:
-        ConfigError: A word has another form, or names something twice.
-    """
+    """Parse words such as ``friction=0.5:1`` into a mapping; environments check keys and values."""
     result: dict[str, Any] = {}
     for entry in entries:
         name, equals, text = entry.partition("=")
@@ -237,11 +255,13 @@ def _evaluate_one(
     return Result(spec, summarise(records), records, wall_seconds)
 
 
-def _table(env_id: str, config: EvaluationConfig, results: Sequence[Result]) -> Table:
+def _table(config: EvaluationConfig, results: Sequence[Result]) -> Table:
     """Lay the metrics out with a column per policy."""
-    last = config.seed + config.episodes - 1
+    conditions = _conditions(config.env, config.env_options.given())
+    where = ", ".join(f"{name} {value}" for name, value in conditions.items())
+    seeds = f"seeds {config.seed} to {config.seed + config.episodes - 1}"
     table = Table(
-        title=f"{env_id}: {config.episodes} episodes, seeds {config.seed} to {last}",
+        title=f"{config.env} ({where}): {config.episodes} episodes, {seeds}",
         caption="mean over episodes [95% interval]",
     )
     table.add_column("metric", no_wrap=True)
@@ -269,24 +289,22 @@ def _cell(estimate: Estimate, factor: float, form: str, unit: str) -> str:
     return f"{mean}{unit} \\[{low}, {high}]"
 
 
-def _description(
-    env_id: str, config: EvaluationConfig, results: Sequence[Result]
-) -> dict[str, Any]:
-    """Return what the JSON file records; a single policy has its metrics at the top level."""
+def _description(config: EvaluationConfig, results: Sequence[Result]) -> dict[str, Any]:
+    """Return the content of the JSON file; a single policy has its metrics at the top level."""
     if len(results) == 1:
         content = results[0].as_dict()
-        records = {"records": content.pop("records")}  # last: they are long
+        records = {"records": content.pop("records")}  # last, since they are long
     else:
         content = {"policies": [result.as_dict() for result in results]}
         records = {}
     return {
-        "env": env_id,
+        "env": config.env,
         "episodes": config.episodes,
         "seed": config.seed,
         "goals": config.goals,
         "penalty_weight": config.penalty_weight,
         "randomisation": parse_randomisation(config.randomisation),
-        "env_options": config.env_options.given(),
+        "env_options": _conditions(config.env, config.env_options.given()),
         **content,
         **provenance.origin(),
         **records,
@@ -294,7 +312,7 @@ def _description(
 
 
 def paths_per_policy(path: Path, policies: Sequence[str]) -> list[Path]:
-    """Return one file per policy, with the policy's name in it where there are several."""
+    """Return one path per policy; several policies have their names in them."""
     if len(policies) == 1:
         return [path]
     names = [Path(spec).stem for spec in policies]
@@ -303,9 +321,9 @@ def paths_per_policy(path: Path, policies: Sequence[str]) -> list[Path]:
     return [path.with_name(f"{path.stem}-{name}{path.suffix}") for name in names]
 
 
-def _film(env_id: str, config: EvaluationConfig, console: Console) -> None:
-    """Run the first episodes once more, with rendering, which would have slowed the metrics."""
-    with closing(_make_env(env_id, config, render_mode="rgb_array")) as env:
+def _film(config: EvaluationConfig, console: Console) -> None:
+    """Run the first episodes again with rendering, which would have slowed the evaluation."""
+    with closing(_make_env(config, render_mode="rgb_array")) as env:
         for i, policy in enumerate(_load(config, env)):
             if config.video is not None:
                 path = paths_per_policy(config.video, config.policy)[i]

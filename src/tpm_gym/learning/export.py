@@ -1,4 +1,4 @@
-"""Export a trained policy as safetensors and JSON, which load without trust.
+"""Export of a trained policy as safetensors and JSON, which load without trust.
 
 ``NAME.json`` holds network, spaces, environment, recipe, versions and SHA-256,
 ``NAME.safetensors`` the weights of the actor, for ``tpm_gym.load_policy`` and ``tpm-gym evaluate``.
@@ -31,7 +31,7 @@ from tpm_gym.learning.policies import load_model, refused, require_trust, run_co
 from tpm_gym.policy.files import FORMAT, VERSION, digest, files
 
 TOLERANCE: Final = 1e-6
-"""How far an exported action may be from the original; of half its range where that is over 1."""
+"""Largest difference of an exported action; relative to half its range if that is above 1."""
 _TRIALS: Final = 64
 _ACTIVATIONS: Final = {nn.ReLU: "relu", nn.Tanh: "tanh"}
 
@@ -43,21 +43,22 @@ def save(
     env_id: str,
     seed: int | None,
     recipe: Mapping[str, Any],
+    env_options: Mapping[str, str] | None = None,
     versions: Mapping[str, str | None] | None = None,
 ) -> Path:
     """Write the policy of a model as ``path``.safetensors and ``path``.json; return the latter.
 
-    The files are loaded again and their actions compared with the model's before they take their
-    names, so that what cannot be expressed is refused rather than changed.
+    The files are loaded again, and their actions compared with the model's, before they get their
+    names. A policy that the files cannot express is therefore refused, not changed.
 
     Args:
         model: SAC, TQC or PPO with a MultiInputPolicy.
-        path: What the files have in common; folders above are made, an earlier policy replaced.
-        versions: Versions it was trained with; by default those installed.
+        path: Common name of the files. Missing folders are made, an earlier policy is replaced.
+        env_options: Machine, engine and drive of the training, if they are not the id's.
+        versions: Versions at training; by default the installed ones.
 
     Raises:
-        PolicyError: The policy has something that the files cannot hold, or there are files of
-            these names that are no policy.
+        PolicyError: The files cannot hold the policy, or would replace files that are no policy.
         ConfigError: ``path`` ends in .zip.
     """
     _require_free(path)
@@ -68,10 +69,14 @@ def save(
         raise refused(name, f"{type(model).__name__} is none of {NAMES}")
     network, weights = _network(name, model, ALGORITHMS[algorithm].actor)
     data = safetensors_bytes(weights)
+    if not isinstance(model.observation_space, spaces.Dict):
+        raise refused(name, f"observations in {model.observation_space}, not in a Dict")
+    boxes = {key: _box(name, key, box) for key, box in model.observation_space.items()}
     content: dict[str, Any] = {
         "format": FORMAT,
         "version": VERSION,
         "env": env_id,
+        "env_options": dict(env_options or {}),
         "algorithm": algorithm,
         "seed": seed,
         "steps": model.num_timesteps,
@@ -79,7 +84,7 @@ def save(
         "versions": dict(provenance.versions() if versions is None else versions),
         "network": network,
         "action_space": _box(name, "actions", model.action_space),
-        "observation_space": _boxes(name, model.observation_space),
+        "observation_space": boxes,
         "weights": {"bytes": len(data), "sha256": sha256(data).hexdigest()},
     }
     content["sha256"] = digest(content)
@@ -87,48 +92,42 @@ def save(
 
 
 def save_archive(model: BaseAlgorithm, path: Path) -> None:
-    """Save a model as Stable-Baselines3 does, but so that an interruption leaves no half a file."""
-    file = io.BytesIO()  # PyTorch, writing to a disk that is full, would hide the reason
+    """Save a model as Stable-Baselines3 does, but so that readers never see a part of the file."""
+    file = io.BytesIO()  # writing to a full disk, PyTorch would hide the reason
     model.save(file)
     provenance.write_whole(path, lambda part: part.write_bytes(file.getvalue()))
 
 
 def remove(path: Path) -> None:
-    """Delete what :func:`save` wrote as ``path``, if it did."""
+    """Delete the files that :func:`save` wrote as ``path``, if it did."""
     json_file, weights_file = files(path)
     if _is_policy(json_file):
         weights_file.unlink(missing_ok=True)
-        json_file.unlink()  # last: it tells whose the other is
+        json_file.unlink()  # last, since it shows that both files are ours
 
 
 def _is_policy(json_file: Path) -> bool:
-    """Whether a file is there and the JSON of a policy, whole or not."""
+    """Return whether a file is the JSON of a policy, whole or damaged."""
     try:
-        content = json.loads(json_file.read_bytes())
+        content = provenance.read_json(json_file)
     except (OSError, ValueError):
         return False
     return isinstance(content, dict) and content.get("format") == FORMAT
 
 
 def _require_free(path: Path) -> None:
-    """Refuse a path that is no name for files, or whose files would replace what is no policy."""
+    """Refuse a path that ends in .zip, or whose files would replace files that are no policy."""
     if path.suffix == ".zip":
         raise ConfigError(f"OUT {path}: is a name for a .json and a .safetensors, not for a .zip")
     pair = files(path)
     taken = [str(file) for file in pair if os.path.lexists(file)]
     if taken and not _is_policy(pair[0]):
-        raise refused(
-            taken[0], "is no policy of tpm_gym, and would be replaced; choose another name"
-        )
+        problem = "is no policy of tpm_gym, and would be replaced; choose another name"
+        raise refused(taken[0], problem)
 
 
 def convert(archive: Path, path: Path, *, trust_pickle: bool) -> Path:
-    """Export ``best.zip`` or ``last.zip`` of a run as :func:`save` does; return the JSON file.
-
-    Raises:
-        PolicyError: It is not trusted, or cannot be loaded or exported, or ``path`` is taken.
-        ConfigError: There is no such file, or ``path`` ends in .zip or cannot be written to.
-    """
+    """Export ``best.zip`` or ``last.zip`` of a run with :func:`save`; return the JSON file."""
     if not archive.is_file():
         known = "is not a file" if archive.exists() else "there is no such file"
         raise ConfigError(f"MODEL {archive}: {known}; give best.zip or last.zip of a run")
@@ -143,6 +142,7 @@ def convert(archive: Path, path: Path, *, trust_pickle: bool) -> Path:
         env_id=config["env"],
         seed=config["seed"],
         recipe=config["recipe"],
+        env_options=config["env_options"],
         versions=config.get("versions"),
     )
 
@@ -150,7 +150,7 @@ def convert(archive: Path, path: Path, *, trust_pickle: bool) -> Path:
 def _network(
     name: str, model: BaseAlgorithm, actor: Actor
 ) -> tuple[dict[str, Any], dict[str, NDArray[np.float32]]]:
-    """Return the description and the weights of what computes the mean action."""
+    """Return the description and the weights of the layers of the mean action."""
     if getattr(model, "use_sde", False):
         raise refused(name, "state-dependent exploration (use_sde) cannot be exported")
     if model.get_vec_normalize_env() is not None:
@@ -179,19 +179,13 @@ def _network(
 
 
 def _features(name: str, extractor: nn.Module) -> dict[str, Any]:
-    """Describe what the first layer sees."""
+    """Describe the input of the first layer."""
     if type(extractor) is GoalGapExtractor:
         return {"kind": "goal_gap", "unit": extractor.unit}
     if type(extractor) is CombinedExtractor:
         return {"kind": "concatenate", "keys": list(extractor.extractors)}
     wanted = "CombinedExtractor or GoalGapExtractor"
     raise refused(name, f"features of {type(extractor).__name__}, not of {wanted}")
-
-
-def _boxes(name: str, space: spaces.Space[Any]) -> dict[str, Any]:
-    if not isinstance(space, spaces.Dict):
-        raise refused(name, f"observations in {space}, not in a Dict")
-    return {key: _box(name, key, box) for key, box in space.items()}
 
 
 def _box(name: str, what: str, space: spaces.Space[Any]) -> dict[str, Any]:
@@ -208,7 +202,7 @@ def _box(name: str, what: str, space: spaces.Space[Any]) -> dict[str, Any]:
 def _write(
     name: str, path: Path, content: Mapping[str, Any], data: bytes, model: BaseAlgorithm
 ) -> Path:
-    """Write both files, make sure that they are the policy, and give them their names."""
+    """Write both files under other names, verify them, and rename them."""
     json_file, weights_file = files(path)
     json_file.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=json_file.parent, prefix=".export-") as folder:
@@ -217,8 +211,8 @@ def _write(
         new_json.write_text(text, encoding="ascii")
         new_weights.write_bytes(data)
         _verify(name, model, new_json)
-        # In between, the sums tell a reader that the files do not belong together, and the first
-        # tells the next export that it may replace the second.
+        # Between the two renames, the sums show a reader that the files do not belong together.
+        # After a kill there, the JSON file allows the next export to replace both.
         new_json.replace(json_file)
         new_weights.replace(weights_file)
     return json_file
@@ -228,15 +222,13 @@ def _verify(name: str, model: BaseAlgorithm, written: Path) -> None:
     """Compare the actions of the written policy with those of the model."""
     rng = np.random.default_rng(0)
     boxes: Any = model.observation_space
-    batch = {
-        key: rng.uniform(box.low, box.high, (_TRIALS, *box.shape)).astype(box.dtype)
-        for key, box in boxes.items()
-    }
-    # PPO's last update has left its graph in the distribution, and graphs cannot be copied.
+    shapes = {key: (_TRIALS, *box.shape) for key, box in boxes.items()}
+    batch = {k: rng.uniform(b.low, b.high, shapes[k]).astype(b.dtype) for k, b in boxes.items()}
+    # PPO's last update leaves its graph in the distribution, and graphs cannot be copied.
     training = model.policy.training
     model.policy.predict(batch, deterministic=True)
     model.policy.set_training_mode(training)
-    # A copy on the CPU: a GPU rounds differently, and the model stays as it is.
+    # On the CPU, since a GPU rounds differently; on a copy, so that the model stays as it is.
     policy: Any = copy.deepcopy(model.policy).to("cpu")
     try:
         actions = load_policy(written).act(batch)

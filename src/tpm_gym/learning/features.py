@@ -1,4 +1,4 @@
-"""What the networks see of a goal."""
+"""Features of a goal for the networks."""
 
 import torch
 from gymnasium import spaces
@@ -6,20 +6,20 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
 
 class GoalGapExtractor(BaseFeaturesExtractor):
-    """Shows a policy how far it is from the goal, on the scale on which that matters.
+    """Features extractor that scales the distance to the goal.
 
-    Goals are in metres: achieved and desired differ by some centimetres, success by one, so a
-    network that is fed with both sees numbers near zero whose small difference decides everything.
-    The features are the observation, which is of order one, and (desired - achieved) / unit. The
-    achieved goal itself is in the observation already, in its own scale.
+    Achieved and desired goals are in metres and differ by some centimetres, and success depends on
+    one centimetre. A network would get numbers near zero whose small difference decides the result.
+    The features are therefore the observation, which is of order one, and (desired - achieved) /
+    unit. The achieved goal is part of the observation already, in its own scale.
     """
 
     def __init__(self, observation_space: spaces.Dict, unit: float = 0.05) -> None:
-        """Set the features up; there is nothing to learn here.
+        """Set the size of the features; the extractor has no parameters to learn.
 
         Args:
-            observation_space: Holds ``observation``, ``achieved_goal`` and ``desired_goal``.
-            unit: The distance that becomes 1, m.
+            observation_space: Space with ``observation``, ``achieved_goal`` and ``desired_goal``.
+            unit: Distance that becomes 1, m.
         """
         shown = ("observation", "desired_goal")
         size = sum(spaces.flatdim(observation_space[name]) for name in shown)

@@ -17,12 +17,12 @@ _COLUMNS: Final = 3
 
 
 def write_video(path: Path, env: GoalEnv, policy: Policy, episodes: int, first_seed: int) -> None:
-    """Write an MP4 of some episodes in one piece, at the speed of the robot."""
+    """Write an MP4 of consecutive episodes in real time; ``env`` renders ``rgb_array``."""
     import imageio.v2 as imageio
 
     def write(part: Path) -> None:
         fps = env.metadata["render_fps"]
-        # H.264 wants an even width and height, and no more than that.
+        # H.264 needs an even width and height.
         writer: Any = imageio.get_writer(part, fps=fps, macro_block_size=2)
         with writer as video:
             add: Any = video.append_data
@@ -32,10 +32,7 @@ def write_video(path: Path, env: GoalEnv, policy: Policy, episodes: int, first_s
 
 
 def write_contact_sheet(path: Path, env: GoalEnv, policy: Policy, seed: int) -> None:
-    """Write a PNG of one episode: six moments from first to last, row by row.
-
-    ``env`` renders ``rgb_array``.
-    """
+    """Write a PNG of six moments of one episode, row by row; ``env`` renders ``rgb_array``."""
     import imageio.v3 as imageio
 
     frames: list[Any] = []
@@ -45,18 +42,15 @@ def write_contact_sheet(path: Path, env: GoalEnv, policy: Policy, seed: int) -> 
 
 
 def contact_sheet(frames: Sequence[Frame]) -> Frame:
-    """Return evenly spaced frames, from the first until nothing moves any more, as one picture.
+    """Return evenly spaced frames, from the first to the end of the motion, as one picture.
 
-    It has the shape (2 * height, 3 * width, 3).
+    Its shape is (2 * height, 3 * width, 3).
     """
-    moving = [i for i, frame in enumerate(frames) if _differs(frame, frames[-1])]
-    last = min(moving[-1] + 1, len(frames) - 1) if moving else len(frames) - 1
+    # Two frames differ if more than the last millimetres of a motion lie between them.
+    differ = [bool((frame != frames[-1]).any(axis=-1).mean() > 1e-2) for frame in frames]
+    moving = np.flatnonzero(differ)
+    last = min(int(moving[-1]) + 1, len(frames) - 1) if moving.size else len(frames) - 1
     moments = np.linspace(0, last, _ROWS * _COLUMNS).round().astype(int)
     chosen = [frames[moment] for moment in moments]
     rows = [np.hstack(chosen[row * _COLUMNS : (row + 1) * _COLUMNS]) for row in range(_ROWS)]
     return np.vstack(rows)
-
-
-def _differs(frame: Frame, other: Frame) -> bool:
-    """Whether two frames differ by more than a robot's last millimetres."""
-    return bool((frame != other).any(axis=-1).mean() > 1e-2)

@@ -14,16 +14,15 @@ from tpm_gym.learning.errors import ConfigError
 class PenaltyHerReplayBuffer(HerReplayBuffer):
     """Hindsight experience replay for a reward of the form ``R(achieved, goal) - penalty``.
 
-    Stable-Baselines3 relabels with ``compute_reward(achieved, new_goal, {})``: an empty info, from
-    which no environment can tell how close to a singularity the robot was, so the penalty would
-    vanish from four samples out of five. The penalty does not depend on the goal, hence with the
-    stored reward r, the next achieved goal ag', the old goal g and the new goal g',
+    Stable-Baselines3 relabels with ``compute_reward(achieved, new_goal, {})``. The info is empty,
+    so the penalty would vanish from the four samples of five that are relabelled. The penalty does
+    not depend on the goal. With the stored reward r, the next achieved goal ag', the old goal g and
+    the new goal g', the reward for g' is therefore
 
         r' = r - R(ag', g) + R(ag', g')
 
-    is the reward the environment would have paid for g'. Only the task term R is evaluated, for the
-    whole batch at once, and no info dictionary is stored. (``copy_info_dict=True`` would keep the
-    penalty as well, at the price of a deep copy of every info of every batch.)
+    Only the task term R is computed, for the whole batch at once, and no info is stored.
+    (``copy_info_dict=True`` would also keep the penalty, but copies every info of every batch.)
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -45,9 +44,9 @@ class PenaltyHerReplayBuffer(HerReplayBuffer):
         env_indices: NDArray[np.int64],
         env: VecNormalize | None = None,
     ) -> DictReplayBufferSamples:
-        """Relabel as the parent does, then put the goal-independent part of the reward back."""
+        """Relabel as the parent does, then add the goal-independent part of the reward."""
         if env is not None and env.norm_reward:
-            # The parent has normalised R(ag', g') by then; a sum with raw rewards has no meaning.
+            # The parent has normalised R(ag', g'); a sum with raw rewards has no meaning.
             raise ConfigError(
                 "VecNormalize has norm_reward=True: relabelled rewards cannot be corrected after "
                 "normalisation; wrap the environment with VecNormalize(..., norm_reward=False)"
@@ -60,7 +59,7 @@ class PenaltyHerReplayBuffer(HerReplayBuffer):
     def _goal_independent_reward(
         self, batch_indices: NDArray[np.int64], env_indices: NDArray[np.int64]
     ) -> NDArray[np.float32]:
-        """Return r - R(ag', g) of stored transitions: minus the weighted penalty, (n,)."""
+        """Return r - R(ag', g) of stored transitions, the negative weighted penalty, (n,)."""
         if self.env is None:
             raise ConfigError(
                 "the buffer has no environment to compute rewards with; call set_env() after "
@@ -69,7 +68,7 @@ class PenaltyHerReplayBuffer(HerReplayBuffer):
         achieved = self.next_observations["achieved_goal"][batch_indices, env_indices]  # (n, 3) m
         desired = self.next_observations["desired_goal"][batch_indices, env_indices]  # (n, 3) m
         infos: list[dict[str, Any]] = [{} for _ in range(len(batch_indices))]
-        # One environment answers for all: they are identical (the parent does the same).
+        # All environments are identical, so one computes the rewards, as in the parent.
         task = self.env.env_method("compute_reward", achieved, desired, infos, indices=[0])[0]
         stored = self.rewards[batch_indices, env_indices]  # (n,)
         return np.asarray(stored - task, dtype=np.float32)

@@ -2,15 +2,14 @@
 
 A trained policy comes in two forms. Exported, as ``NAME.json`` and ``NAME.safetensors``, it is
 plain data and loads safely. As an archive of Stable-Baselines3, ``NAME.zip``, it holds pickles,
-which can run any code when they are loaded: that takes ``trust_pickle``.
+which can run any code when they are loaded. The archive needs ``trust_pickle``.
 """
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -18,7 +17,7 @@ import tpm_gym
 from tpm_gym import TPMError
 from tpm_gym.learning.algorithms import ALGORITHMS, NAMES
 from tpm_gym.learning.errors import PolicyError
-from tpm_gym.learning.recipes import with_classes
+from tpm_gym.learning.provenance import read_json
 from tpm_gym.learning.rollout import Action, GoalEnv, Observation, Policy
 from tpm_gym.learning.run_folder import BEST_FILE, CONFIG_FILE, EXPORTED, LAST_FILE
 from tpm_gym.resources import POLICIES
@@ -34,7 +33,7 @@ SCRIPTED: Final = ("expert", "random")
 
 @dataclass(frozen=True)
 class TrainedPolicy:
-    """Acts with the mean action of a trained algorithm."""
+    """Mean action of a trained algorithm."""
 
     model: BaseAlgorithm | ExportedPolicy
 
@@ -49,7 +48,7 @@ class TrainedPolicy:
 
 @dataclass
 class RandomPolicy:
-    """Draws actions uniformly, from a generator seeded anew in every episode."""
+    """Uniform random actions, from a generator that is seeded in every episode."""
 
     space: Any
     rng: np.random.Generator = field(default_factory=np.random.default_rng)
@@ -66,7 +65,7 @@ class RandomPolicy:
 
 @dataclass(frozen=True)
 class ExpertPolicy:
-    """Acts with the scripted controller, which is deterministic."""
+    """Scripted controller, which is deterministic."""
 
     expert: Expert
 
@@ -86,7 +85,7 @@ def load_policy(spec: str, env: GoalEnv, *, trust_pickle: bool = False) -> Polic
         spec: ``expert``, ``random``, an exported policy (either of its files, or their common
             name), the id of a published one, a .zip file of a training, or the folder of a run (its
             best policy).
-        trust_pickle: Whether a .zip file may be loaded, which can run any code that is in it.
+        trust_pickle: Whether a .zip file may be loaded, which can run any code.
 
     Raises:
         PolicyError: There is no such policy, its files are damaged, it does not fit ``env``, or it
@@ -100,7 +99,11 @@ def load_policy(spec: str, env: GoalEnv, *, trust_pickle: bool = False) -> Polic
     if path.suffix not in EXPORTED:
         require_trust(spec, path, trust_pickle)
         model = load_model(spec, path)
-        _check_spaces(spec, model, env)
+        for kind in ("observation", "action"):
+            trained, given = (getattr(owner, f"{kind}_space") for owner in (model, env))
+            if trained != given:
+                problem = f"was trained with {kind} space {trained}, the environment has {given}"
+                raise refused(spec, problem)
         return TrainedPolicy(model)
     _use_one_thread()
     try:
@@ -111,25 +114,25 @@ def load_policy(spec: str, env: GoalEnv, *, trust_pickle: bool = False) -> Polic
     return TrainedPolicy(policy)
 
 
-def trained_env(spec: str) -> str | None:
-    """Return the id of the environment a policy was trained on, None for a scripted one.
+def trained_in(spec: str) -> tuple[str, dict[str, str]] | None:
+    """Return the environment id and its options that a policy was trained with.
 
-    Nothing is unpickled.
-
-    Raises:
-        PolicyError: There is no such policy, or its run folder does not say.
+    Nothing is unpickled. A scripted policy has none.
     """
     if spec in SCRIPTED:
         return None
     path = _policy_file(spec)
     if path.suffix not in EXPORTED:
-        return str(run_config(spec, path)["env"])
+        config = run_config(spec, path)
+        options = {name: str(value) for name, value in config["env_options"].items()}
+        return config["env"], options
     from tpm_gym.policy.files import read_description
 
     try:
-        return read_description(path).env_id
+        description = read_description(path)
     except TPMError as error:
         raise refused(spec, str(error)) from error
+    return description.env_id, {str(k): value for k, value in description.env_options.items()}
 
 
 def refused(spec: str, problem: str) -> PolicyError:
@@ -138,7 +141,7 @@ def refused(spec: str, problem: str) -> PolicyError:
 
 
 def require_trust(spec: str, path: Path, trusted: bool) -> None:
-    """Refuse, with a PolicyError, a .zip file that nobody has vouched for."""
+    """Refuse, with a PolicyError, a .zip file that the user does not trust."""
     if not trusted:
         raise refused(
             spec,
@@ -156,8 +159,7 @@ def _policy_file(spec: str) -> Path:
     elif path.suffix in (".zip", *EXPORTED):
         candidates = [path]
     else:
-        files = [Path(spec + suffix) for suffix in EXPORTED]
-        candidates = [*files, POLICIES / f"{spec}.json"]
+        candidates = [*(Path(spec + suffix) for suffix in EXPORTED), POLICIES / f"{spec}.json"]
     for candidate in candidates:
         if candidate.is_file():
             return candidate
@@ -168,62 +170,45 @@ def _policy_file(spec: str) -> Path:
 
 
 def run_config(spec: str, path: Path) -> dict[str, Any]:
-    """Return the run's configuration, from beside or above a .zip file.
-
-    Raises:
-        PolicyError: There is none, or it lacks what a training writes.
-    """
-    folders = path.resolve().parents[:2]  # the run folder, or one inside it
-    for folder in folders:
+    """Return the run's configuration, from beside or above a .zip file."""
+    wanted = {"algo": str, "env": str, "seed": int, "recipe": dict, "env_options": dict}
+    for folder in path.resolve().parents[:2]:  # the run folder, or one inside it
         file = folder / CONFIG_FILE
         if not file.is_file():
             continue
         try:
-            content = json.loads(file.read_text(encoding="utf-8"))
-        except (ValueError, RecursionError) as error:
+            content = read_json(file)
+        except (OSError, ValueError) as error:
             raise refused(spec, f"{file} is damaged: {error}") from error
-        for key in ("algo", "env", "seed", "recipe"):
-            if not isinstance(content, dict) or key not in content:
-                raise refused(spec, f"{file} is damaged: no entry {key!r}")
-        return cast(dict[str, Any], content)
+        for key, kind in wanted.items():
+            if not isinstance(content, dict) or not isinstance(content.get(key), kind):
+                raise refused(spec, f"{file} is damaged: no entry {key!r} ({kind.__name__})")
+        found: dict[str, Any] = content
+        return found
     raise refused(
         spec, f"no {CONFIG_FILE} beside {path.name} or above it; keep the file in its run folder"
     )
 
 
 def _use_one_thread() -> None:
-    """Set PyTorch up for these networks, too small to share; one thread repeats exactly."""
-    import torch  # Imported here so that scripted policies do not pay for it.
+    """Let PyTorch use one thread: the networks are small, and one thread repeats exactly."""
+    import torch  # imported here, so that scripted policies need no PyTorch
 
     torch.set_num_threads(1)
 
 
 def load_model(spec: str, path: Path) -> BaseAlgorithm:
-    """Unpickle a saved algorithm for acting only; see ``require_trust``."""
+    """Unpickle a saved algorithm for acting only; see :func:`require_trust`."""
     config = run_config(spec, path)
     algorithm = config["algo"]
     if algorithm not in ALGORITHMS:
         raise refused(spec, f"algorithm {algorithm!r} is none of {NAMES}")
     _use_one_thread()
-    # Acting stores nothing: no room is needed, nor a hindsight buffer, which would ask for an
-    # environment.
+    # Acting needs no replay buffer, and a hindsight buffer would need an environment.
     replaced: dict[str, Any]
     replaced = {"replay_buffer_class": None, "replay_buffer_kwargs": {}, "buffer_size": 1}
     try:
-        arguments = config["recipe"].get("arguments", {})
-        if "features_extractor_class" in arguments.get("policy_kwargs", {}):
-            # The archive's pickle names the module that this class was in, and it may have moved.
-            replaced["policy_kwargs"] = with_classes(arguments)["policy_kwargs"]
         kind = ALGORITHMS[algorithm].load_class()
         return kind.load(path, device="cpu", custom_objects=replaced)
-    except Exception as error:  # A damaged archive or pickle can raise anything at all.
+    except Exception as error:  # a damaged archive or pickle can raise anything
         raise refused(spec, f"cannot be loaded as {algorithm}: {error}") from error
-
-
-def _check_spaces(spec: str, model: BaseAlgorithm, env: GoalEnv) -> None:
-    """Refuse a policy that was trained with other observations or actions."""
-    for kind in ("observation", "action"):
-        trained, given = (getattr(owner, f"{kind}_space") for owner in (model, env))
-        if trained != given:
-            problem = f"was trained with {kind} space {trained}, the environment has {given}"
-            raise refused(spec, problem)

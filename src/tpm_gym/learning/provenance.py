@@ -1,4 +1,4 @@
-"""What a result needs to be repeated: versions, commit, machine, command; and how it is written."""
+"""Provenance of a result (versions, commit, machine, command), and files that are written whole."""
 
 import json
 import os
@@ -28,7 +28,7 @@ _PACKAGES: Final = (
 
 
 def origin() -> dict[str, Any]:
-    """Return versions, commit, machine and command as plain data, by these names."""
+    """Return versions, commit, machine and command as plain data."""
     return {
         "versions": versions(),
         "git_commit": git_commit(),
@@ -38,12 +38,12 @@ def origin() -> dict[str, Any]:
 
 
 def versions() -> dict[str, str | None]:
-    """Return the versions of Python, tpm_gym and the packages below it; None where absent."""
+    """Return the versions of Python and the packages; None for a package that is not installed."""
     return {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES}
 
 
 def version(package: str) -> str | None:
-    """Return the version of an installed package, None where it is not installed."""
+    """Return the version of an installed package; None if it is not installed."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
@@ -51,9 +51,9 @@ def version(package: str) -> str | None:
 
 
 def git_commit() -> str | None:
-    """Return the commit of the checkout this file lies in, None outside one.
+    """Return the commit of the checkout that holds this file; None outside a checkout.
 
-    ``+modified`` is appended where tracked files differ from the commit.
+    ``+modified`` is appended if tracked files differ from the commit.
     """
     commit = _git("rev-parse", "HEAD")
     if commit is None:
@@ -62,46 +62,36 @@ def git_commit() -> str | None:
 
 
 def _git(*arguments: str) -> str | None:
-    """Return what a git command prints, None where it fails."""
+    """Return the output of a git command; None if the command fails."""
+    command = ["git", "-C", str(Path(__file__).parent), *arguments]
     try:
-        done = subprocess.run(
-            ["git", "-C", str(Path(__file__).parent), *arguments],
-            capture_output=True,
-            text=True,
-            check=True,
-        )
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return None
-    return done.stdout.strip()
 
 
 def machine() -> dict[str, Any]:
-    """Return what the speed of a run depends on, and nothing that names the machine."""
-    return {
-        "system": platform.system(),
-        "architecture": platform.machine(),
-        "processor": _processor(),
-        "cpu_count": os.cpu_count(),
-    }
-
-
-def _processor() -> str:
+    """Return the properties of the computer that decide its speed; nothing that identifies it."""
     try:
         # platform.processor() is empty or only the architecture on most Linux systems.
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
-        return platform.processor()
+        lines = []
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor()
+    return {
+        "system": platform.system(),
+        "architecture": platform.machine(),
+        "processor": names[0] if names else platform.processor(),
+        "cpu_count": os.cpu_count(),
+    }
 
 
 def command_line(arguments: Sequence[str] | None = None) -> str:
-    """Return a command that repeats this one, without folders outside the working directory."""
+    """Return a command that repeats this process, without folders outside the working directory."""
     program, *words = sys.argv if arguments is None else arguments
     # ``python -m tpm_gym.learning`` is the same command.
-    ours = Path(program).name == "tpm-gym" or Path(program) == Path(__file__).with_name(
-        "__main__.py"
-    )
+    main = Path(__file__).with_name("__main__.py")
+    ours = Path(program).name == "tpm-gym" or Path(program) == main
     first = ["tpm-gym"] if ours else ["python", _portable(program)]
     return shlex.join([*first, *map(_portable, words)])
 
@@ -112,18 +102,12 @@ def _portable(word: str) -> str:
     path = Path(value)
     if not path.is_absolute():
         return word
-    try:
-        return f"{option}{equals}{path.relative_to(Path.cwd())}"
-    except ValueError:
-        return f"{option}{equals}{path.name}"
+    inside = path.is_relative_to(Path.cwd())
+    return f"{option}{equals}{path.relative_to(Path.cwd()) if inside else path.name}"
 
 
 def require_writable(option: str, path: Path) -> None:
-    """Make the folder of a file that is to be written at the end of long work.
-
-    Raises:
-        ConfigError: It cannot be made or written to, or there is a folder in the file's place.
-    """
+    """Make the folder of a file that will be written later, and check that it can be written."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path.parent):
@@ -134,20 +118,24 @@ def require_writable(option: str, path: Path) -> None:
         raise ConfigError(f"{option} {path}: {problem}; choose another name")
 
 
-def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write strictly valid JSON as :func:`write_whole` does.
+def read_json(path: Path) -> Any:
+    """Read a JSON file."""
+    try:
+        return json.loads(path.read_bytes())
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
 
-    Raises:
-        ValueError: ``content`` holds NaN or an infinity, which JSON cannot express.
-    """
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write strictly valid JSON with :func:`write_whole`."""
     text = json.dumps(content, indent=2, allow_nan=False) + "\n"
     write_whole(path, lambda part: part.write_text(text, encoding="utf-8"))
 
 
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
-    """Write a file so that no reader ever sees half of it.
+    """Write a file under a temporary name and rename it, so that readers never see a part of it.
 
-    Folders above it are made. ``write`` is given a path beside ``path`` that ends as it does.
+    Missing parent folders are made. ``write`` gets a path in the same folder, with the same suffix.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{uuid.uuid4().hex}{path.suffix}")

@@ -1,13 +1,14 @@
-"""Hyperparameters by environment id, read from YAML in the style of rl-baselines3-zoo, and checked.
+"""Recipes: hyperparameters by environment id, read from YAML and checked.
 
-A recipe file has one mapping per environment id. Its entries are the arguments of the algorithm's
-constructor, plus ``n_timesteps``, ``n_envs`` and ``policy`` as in the zoo, and ``demonstrations``:
-episodes of the expert that are in the replay buffer before training starts. Values are plain YAML:
-where the zoo evaluates a string such as ``"dict(net_arch=[64, 64])"`` as Python, a mapping is
-written here (the zoo reads it as well), and nothing is ever evaluated.
+A file has one mapping for each environment id, in the style of rl-baselines3-zoo. Entries are the
+arguments of the algorithm's constructor, plus ``n_timesteps``, ``n_envs``, ``policy``, and
+``demonstrations``: episodes of the expert that are in the replay buffer before training starts.
+Values are plain YAML and nothing is evaluated. Where the zoo evaluates a string such as
+``"dict(net_arch=[64, 64])"``, a mapping is written here, which the zoo reads as well.
 """
 
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
@@ -23,13 +24,13 @@ from tpm_gym.simulation.engine import require_engine
 
 @dataclass(frozen=True)
 class Recipe:
-    """How one algorithm is trained on one environment, as plain data.
+    """Hyperparameters of one algorithm on one environment, as plain data.
 
     Attributes:
         n_timesteps: Number of environment steps, those of the demonstrations included.
         hindsight: Whether the replay buffer relabels goals.
         demonstrations: Arguments of :class:`~tpm_gym.learning.Demonstrations`; empty for none.
-        arguments: The other arguments of the algorithm's constructor.
+        arguments: Other arguments of the algorithm's constructor.
     """
 
     n_timesteps: int
@@ -40,7 +41,7 @@ class Recipe:
     arguments: Mapping[str, Any]
 
     def entries(self) -> dict[str, Any]:
-        """Return what a file has it as."""
+        """Return the recipe as it stands in a file."""
         optional = {
             "replay_buffer_class": "HerReplayBuffer" if self.hindsight else None,
             "demonstrations": self.demonstrations,
@@ -53,30 +54,46 @@ class Recipe:
             **self.arguments,
         }
 
-    def keywords(self) -> dict[str, Any]:
-        """Return the keyword arguments of the algorithm's constructor, with classes for names."""
+    def keywords(self, update: float = 0.0) -> dict[str, Any]:
+        """Return keyword arguments of the algorithm's constructor, with classes for names.
+
+        Args:
+            update: Share of the training that lies between two updates. A learning rate that falls
+                to zero reaches zero that much after the last update. With 0, as in
+                Stable-Baselines3, the last update has a rate of zero and teaches nothing.
+        """
         entries = {"policy": self.policy, **self.arguments}
         if self.hindsight:
             entries["replay_buffer_class"] = "HerReplayBuffer"
         rate = entries.get("learning_rate")
         if isinstance(rate, str):
-            from stable_baselines3.common.utils import LinearSchedule
-
-            entries["learning_rate"] = LinearSchedule(float(rate.removeprefix("lin_")), 0.0, 1.0)
+            entries["learning_rate"] = Falling(float(rate.removeprefix("lin_")), update)
         return with_classes(entries)
+
+
+@dataclass(frozen=True)
+class Falling:
+    """Learning rate that falls linearly to zero; see :meth:`Recipe.keywords`."""
+
+    start: float
+    update: float
+
+    def __call__(self, remaining: float) -> float:
+        """Return the rate of an update at whose end this share of the training remains."""
+        return self.start * max(0.0, min(1.0, remaining + self.update))
 
 
 def recipe(env_id: str, algorithm: str = "sac", engine: str | None = None) -> dict[str, Any]:
     """Return the shipped recipe of an environment as keyword arguments for Stable-Baselines3.
 
-    For example ``SAC(env=env, **recipe("TPMReach-v0"))``. What is no argument of the constructor is
-    left out: the number of steps and of environments, and the demonstrations.
+    For example ``SAC(env=env, **recipe("TPMReach-v0"))``. The numbers of steps and environments and
+    the demonstrations are left out: they are no arguments of the constructor.
 
     Args:
-        engine: What is trained in; ``"analytic"`` has recipes of its own.
+        engine: Engine to train in; ``"analytic"`` has recipes of its own.
 
     Raises:
-        ConfigError: There is none for this environment and algorithm.
+        ConfigError: There is no recipe for this environment and algorithm.
         ConfigurationError: There is no such engine.
     """
     if engine is not None:
@@ -85,11 +102,7 @@ def recipe(env_id: str, algorithm: str = "sac", engine: str | None = None) -> di
 
 
 def recipe_file(algorithm: str, engine: str | None = None) -> Path:
-    """Return the shipped recipes of an algorithm, for an engine if that has some of its own.
-
-    Raises:
-        ConfigError: There is no such algorithm.
-    """
+    """Return the shipped recipes of an algorithm, those for an engine if there are any."""
     if algorithm not in ALGORITHMS:
         raise ConfigError(f"algorithm {algorithm!r} is none of {NAMES}")
     own = RECIPES / f"{algorithm}-{engine}.yml"
@@ -97,7 +110,7 @@ def recipe_file(algorithm: str, engine: str | None = None) -> Path:
 
 
 def with_classes(entries: Mapping[str, Any]) -> dict[str, Any]:
-    """Return entries of a recipe with our classes in place of their names."""
+    """Return entries of a recipe with classes in place of their names."""
     found = dict(entries)
     if "replay_buffer_class" in found:
         from tpm_gym.learning.hindsight import PenaltyHerReplayBuffer
@@ -112,12 +125,7 @@ def with_classes(entries: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_recipe(path: Path, algorithm: str, env_id: str) -> Recipe:
-    """Read the recipe of an environment, ``id`` or ``module:id``, after checking the whole file.
-
-    Raises:
-        ConfigError: The file cannot be read, has no recipe for ``env_id``, or an entry anywhere in
-            it is unknown or has a value it cannot have.
-    """
+    """Read the recipe of an environment, ``id`` or ``module:id``, after checking the whole file."""
     recipes = read_recipes(path, algorithm)
     name = env_id.rpartition(":")[2]
     if name not in recipes:
@@ -141,23 +149,21 @@ def read_recipe(path: Path, algorithm: str, env_id: str) -> Recipe:
 
 
 def read_recipes(path: Path, algorithm: str) -> dict[str, dict[str, Any]]:
-    """Read and check all recipes of a file: environment id -> entries.
-
-    Raises:
-        ConfigError: The file cannot be read, or an entry anywhere in it is unknown or has a value
-            it cannot have.
-    """
-    recipes = _read_mapping(path)
-    check_recipes(str(path), recipes, algorithm)
-    return recipes
+    """Read and check all recipes of a file: environment id -> entries."""
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        raise ConfigError(f"{path}: is not YAML: {error}") from error
+    if not isinstance(content, dict):
+        raise ConfigError(f"{path}: must hold one mapping per environment id")
+    check_recipes(str(path), content, algorithm)
+    return content
 
 
 def check_recipes(source: str, recipes: Mapping[str, Any], algorithm: str) -> None:
-    """Check recipes, name -> entries.
-
-    Raises:
-        ConfigError: An entry is unknown or has a value it cannot have; ``source`` is where.
-    """
+    """Check recipes, name -> entries."""
     kind: Any = dict[str, ALGORITHMS[algorithm].entries()]  # type: ignore[misc]
     strict = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
     try:
@@ -170,23 +176,11 @@ def check_recipes(source: str, recipes: Mapping[str, Any], algorithm: str) -> No
             raise ConfigError(f"{where}: no effect without replay_buffer_class: HerReplayBuffer")
 
 
-def _read_mapping(path: Path) -> dict[str, Any]:
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: is not YAML: {error}") from error
-    if not isinstance(content, dict):
-        raise ConfigError(f"{path}: must hold one mapping per environment id")
-    return content
-
-
 def _explained(error: ValidationError, kind: Any) -> str:
-    """Name the first entry that is not valid, and what would be."""
+    """Return the first entry that is not valid, and valid ones."""
     first = error.errors()[0]
     names = [str(name) for name in first["loc"]]
-    entry = ".".join(names)
+    entry, value = ".".join(names), first["input"]
     if first["type"] == "extra_forbidden":
         valid: Any = get_args(kind)[1]
         for name in names[1:-1]:
@@ -195,16 +189,11 @@ def _explained(error: ValidationError, kind: Any) -> str:
     if first["type"] == "missing":
         return f"{entry}: is missing"
     needed = first["msg"].removeprefix("Value error, ").replace("Input should", "must", 1)
-    return f"{entry}: {needed}, not {first['input']!r}{_hint(first['input'])}"
-
-
-def _hint(value: object) -> str:
-    """Explain the one surprise of YAML that meets everybody who writes numbers."""
-    try:
-        number = float(value) if isinstance(value, str) else None
-    except ValueError:
-        return ""
-    return "" if number is None else f" (YAML takes {value} for text; write {number!r})"
+    hint = ""
+    if isinstance(value, str):
+        with suppress(ValueError):
+            hint = f" (YAML takes {value} for text; write {float(value)!r})"
+    return f"{entry}: {needed}, not {value!r:.100}{hint}"
 
 
 def _listed(names: Iterable[object]) -> str:

@@ -1,7 +1,7 @@
-"""Run a policy over seeded episodes, and condense what happened.
+"""Rollouts of a policy over seeded episodes, and their metrics.
 
-Seeds fall into three ranges that never meet, so no figure is taken on episodes that a policy has
-trained on or was selected by:
+Seeds fall into three disjoint ranges, so that no result comes from episodes that a policy was
+trained on or selected by:
 
 - below ``SELECTION_SEED``: training;
 - from ``SELECTION_SEED``: the periodic evaluations during training, which select ``best.zip``;
@@ -25,12 +25,11 @@ from tpm_gym.simulation.state import State
 
 if TYPE_CHECKING:
     from tpm_gym.envs.vector import TPMVectorEnv
-    from tpm_gym.learning.policies import TrainedPolicy
 
 SELECTION_SEED: Final = 1_000_000
 TEST_SEED: Final = 2_000_000
 BATCH: Final = 1000
-"""Environments that are evaluated at a time, where they can be."""
+"""Largest number of environments that are evaluated at once."""
 
 Observation: TypeAlias = dict[str, NDArray[Any]]
 Action: TypeAlias = NDArray[Any]
@@ -38,7 +37,7 @@ GoalEnv: TypeAlias = gym.Env[Observation, Action]
 
 
 class Policy(Protocol):
-    """What acts in an episode."""
+    """Policy that acts in episodes, one at a time or in batches."""
 
     def reset(self, observation: Observation, seed: int) -> None:
         """Prepare for an episode that starts with ``observation`` and was reset with ``seed``."""
@@ -49,7 +48,7 @@ class Policy(Protocol):
 
 @dataclass(frozen=True)
 class Episode:
-    """What one episode came to.
+    """Outcome of one episode.
 
     Attributes:
         success_at_end: Whether the last step was a success.
@@ -135,13 +134,11 @@ def _run_episode(
     return _record(seed, {name: np.array([step[name] for step in steps]) for name in steps[0]})
 
 
-def run_batch(
-    envs: TPMVectorEnv, policy: TrainedPolicy, episodes: int, first_seed: int
-) -> list[Episode]:
-    """The same for many environments at a time, and a policy that takes batches.
+def run_batch(envs: TPMVectorEnv, policy: Policy, episodes: int, first_seed: int) -> list[Episode]:
+    """Run a policy that takes batches over many environments at a time; see :func:`run_episodes`.
 
     Args:
-        envs: As many as run at a time, with next-step autoreset; left open.
+        envs: Environments that run at a time, with next-step autoreset; left open.
 
     Raises:
         RolloutError: As for :func:`run_episodes`.
@@ -153,9 +150,7 @@ def run_batch(
     return records
 
 
-def _run_batch(
-    envs: TPMVectorEnv, policy: TrainedPolicy, first_seed: int, count: int
-) -> list[Episode]:
+def _run_batch(envs: TPMVectorEnv, policy: Policy, first_seed: int, count: int) -> list[Episode]:
     observation, _ = envs.reset(seed=first_seed)
     steps: list[dict[str, Any]] = []
     lengths = np.zeros(envs.num_envs, dtype=np.int64)
@@ -173,7 +168,7 @@ def _run_batch(
 
 
 def _measured(reward: Any, info: Mapping[str, Any], state: State) -> dict[str, Any]:
-    """What an episode is judged by, of one step, with the leading axes of the state."""
+    """Return the metrics of one step, with the leading axes of the state."""
     gap = state.fk_position - state.platform_position
     told = ("conditioning", "closure_error", "is_success", "singularity_penalty")
     return {

@@ -1,24 +1,21 @@
-"""The folder of a run: what is in it, and who may write or delete there.
+"""Folder of a run: names of its files, and who may write or delete there.
 
-Nothing is ever deleted but files that a run writes, by name, and no policy unless it is asked for.
+Only files that a run writes are deleted, by name. A policy is deleted only if the user asks for it.
 """
-
-from __future__ import annotations
 
 import errno
 import json
 import os
+import shlex
 import sys
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
+from tpm_gym.learning.checkpoint import CheckpointStore
 from tpm_gym.learning.errors import RunError
-
-if TYPE_CHECKING:
-    from tpm_gym.learning.checkpoint import CheckpointStore
+from tpm_gym.learning.provenance import read_json
 
 CONFIG_FILE: Final = "config.json"
 EVALUATIONS_FILE: Final = "evaluations.jsonl"
@@ -30,7 +27,7 @@ BEST_FILE: Final = "best.zip"
 LAST_FILE: Final = "last.zip"
 EXPORTED: Final = (".json", ".safetensors")
 WHOLE: Final = "[!.]*.json"
-"""JSON files, without the hidden halves that a process leaves which was killed while it wrote."""
+"""Pattern of JSON files, without the hidden parts that a process leaves if it is killed."""
 
 RESTORED: Final = (
     CONFIG_FILE,
@@ -39,7 +36,7 @@ RESTORED: Final = (
     BEST_FILE,
     *(Path(BEST_FILE).with_suffix(suffix).name for suffix in EXPORTED),
 )
-"""Files that belong to a checkpoint: what is in them later is done again."""
+"""Files that a checkpoint holds. Resuming sets them back, and writes later entries again."""
 _POLICIES: Final = tuple(
     Path(file).with_suffix(suffix).name
     for file in (BEST_FILE, LAST_FILE)
@@ -47,19 +44,15 @@ _POLICIES: Final = tuple(
 )
 _EVENTS: Final = "events.out.tfevents.*"
 _FULL: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_DISK_ERRORS: Final = (*_FULL, errno.EIO, errno.EROFS, errno.EACCES, errno.EPERM)
+_READ_ONLY: Final = (errno.EIO, errno.EROFS, errno.EACCES, errno.EPERM)
+_IN_THE_WAY: Final = (errno.EISDIR, errno.ENOTDIR)
 
 
 def prepare(run: Path, overwrite: bool) -> None:
-    """Make the folder of a new run; with ``overwrite``, delete an earlier run, but no other files.
-
-    Raises:
-        RunError: There is something in it, what is to be deleted is no run, another process trains
-            in it, or it cannot be made.
-    """
+    """Make the folder of a new run; with ``overwrite``, delete an earlier run, no other files."""
     try:
         run.mkdir(parents=True, exist_ok=True)
-        # A process killed in its first moment leaves the hidden half of a file.
+        # A process that is killed in its first moment leaves a hidden part of a file.
         if any(not entry.name.startswith(".") for entry in run.iterdir()):
             _clear_earlier(run, overwrite)
     except FileExistsError as error:
@@ -69,11 +62,11 @@ def prepare(run: Path, overwrite: bool) -> None:
 
 
 def _clear_earlier(run: Path, overwrite: bool) -> None:
-    """Delete the earlier run in a folder, if that is what is there and what was asked for."""
+    """Delete the earlier run of a folder, if the folder holds one and the user asked for it."""
     if not overwrite:
         raise RunError(
             f"{run} is not an empty folder; choose another with --run, continue the earlier run "
-            f"with tpm-gym resume {run}, or replace it with --overwrite"
+            f"with {resume_command(run)}, or replace it with --overwrite"
         )
     if description(run) is None:
         raise RunError(
@@ -82,26 +75,36 @@ def _clear_earlier(run: Path, overwrite: bool) -> None:
         )
     with claimed(run):
         clear(run)
-        (run / CONFIG_FILE).unlink()  # last: a process killed half way can then do it again
+        (run / CONFIG_FILE).unlink()  # last, so that --overwrite works again after a kill
 
 
 def description(run: Path) -> dict[str, Any] | None:
-    """Return the configuration in the folder of a run; None where no training wrote one."""
+    """Return the configuration in the folder of a run; None if no training wrote one."""
     try:
-        stored = json.loads((run / CONFIG_FILE).read_bytes())
+        stored = read_json(run / CONFIG_FILE)
     except (OSError, ValueError):
         return None
-    # Other programs, too, have a config.json.
+    # Other programs have a config.json, too.
     ours = isinstance(stored, dict) and {"algo", "env", "training_seeds"} <= stored.keys()
     return stored if ours else None
 
 
-def evaluations(run: Path) -> list[dict[str, Any]]:
-    """Return the evaluations of a run, without one that a kill or a full disk has cut.
+def resume_command(run: Path) -> str:
+    """Return the command line that resumes a run.
 
-    Raises:
-        ValueError: A line is whole and no JSON.
+    The module of an id ``module:id`` is given again, since no file decides what is imported.
+    ``python -m`` finds it in the working folder.
     """
+    env = str((description(run) or {}).get("env", ""))
+    if ":" in env:
+        words = ["python", "-m", "tpm_gym.learning", "resume", str(run), "--env", env]
+    else:
+        words = ["tpm-gym", "resume", str(run)]
+    return shlex.join(words)
+
+
+def evaluations(run: Path) -> list[dict[str, Any]]:
+    """Return the evaluations of a run, without a last line that was cut off by a kill."""
     try:
         lines = (run / EVALUATIONS_FILE).read_text(encoding="utf-8").splitlines(keepends=True)
     except FileNotFoundError:
@@ -110,24 +113,22 @@ def evaluations(run: Path) -> list[dict[str, Any]]:
 
 
 def is_finished(run: Path) -> bool:
-    """Whether a training has gone to its end, and its last policy is there."""
+    """Return whether a training has taken all its steps and saved its last policy."""
     try:
-        wanted = int(json.loads((run / CONFIG_FILE).read_bytes())["steps"])
+        wanted = int(read_json(run / CONFIG_FILE)["steps"])
         found = evaluations(run)
+        return bool(found) and found[-1]["steps"] >= wanted and (run / LAST_FILE).is_file()
     except (OSError, ValueError, KeyError, TypeError):
         return False
-    return bool(found) and found[-1]["steps"] >= wanted and (run / LAST_FILE).is_file()
 
 
 def holds_policy(run: Path) -> bool:
-    """Whether there is a policy in the folder of a run."""
+    """Return whether the folder of a run holds a policy."""
     return any((run / name).exists() for name in _POLICIES)
 
 
 def clear(run: Path) -> None:
-    """Delete what a training has written to its folder, but its configuration."""
-    from tpm_gym.learning.checkpoint import CheckpointStore
-
+    """Delete the files of a training except its configuration."""
     CheckpointStore(run / CHECKPOINTS).clear()
     clear_tests(run)
     names = {*RESTORED, *_POLICIES, CURVE_FILE} - {CONFIG_FILE}
@@ -136,23 +137,19 @@ def clear(run: Path) -> None:
 
 
 def clear_tests(run: Path) -> None:
-    """Delete the evaluations of a run's policy, which will soon be another."""
+    """Delete the evaluations of a policy that is about to be replaced."""
     for path in (run / TESTS).glob(WHOLE):
         with suppress(ValueError):
-            content = json.loads(path.read_bytes())
+            content = read_json(path)
             if isinstance(content, dict) and {"env", "episodes", "command"} <= content.keys():
                 path.unlink()
-    with suppress(OSError):  # it is not there, or something else is in it
+    with suppress(OSError):  # absent, or it holds other files
         (run / TESTS).rmdir()
 
 
 @contextmanager
 def claimed(run: Path) -> Iterator[None]:
-    """Keep other processes out of a run; the system ends this however the process ends.
-
-    Raises:
-        RunError: Another process is in it.
-    """
+    """Lock a run; the system releases the lock however the process ends."""
     if sys.platform == "win32":
         yield
         return
@@ -175,37 +172,25 @@ def claimed(run: Path) -> Iterator[None]:
 
 @contextmanager
 def disk_errors_named(run: Path, store: CheckpointStore) -> Iterator[None]:
-    """Turn the errors of a full or broken disk into one that says how to go on.
+    """Replace errors of a full or broken disk by an error that tells how to continue.
 
-    Training without its logs would be of no use, so it ends; only a checkpoint may fail.
-
-    Raises:
-        RunError: The disk is full, broken or not to be written to.
+    A training without its logs is of no use, so it ends. Only a checkpoint may fail.
     """
-    before = threading.excepthook
-
-    def hook(failed: threading.ExceptHookArgs) -> None:
-        # TensorBoard's thread fails as well, and its traceback would bury the error's one line.
-        if not _is_disk_error(failed.exc_value):
-            before(failed)
-
-    threading.excepthook = hook
     try:
         yield
     except OSError as error:
-        if not _is_disk_error(error):
+        if error.errno in _FULL:
+            remedy = "make room"
+        elif error.errno in _READ_ONLY:
+            remedy = "make it writable"
+        elif error.errno in _IN_THE_WAY:
+            remedy = f"move {error.filename2 or error.filename} away"
+        else:
             raise
         go_on = (
             "start it anew with --overwrite"
             if store.newest is None
-            else f"continue from step {store.newest:,} with: tpm-gym resume {run}"
+            else f"continue from step {store.newest:,} with: {resume_command(run)}"
         )
         problem = error.strerror or error
-        remedy = "make room" if error.errno in _FULL else "make it writable"
         raise RunError(f"cannot write to {run}: {problem}; {remedy}, then {go_on}") from error
-    finally:
-        threading.excepthook = before
-
-
-def _is_disk_error(error: BaseException | None) -> bool:
-    return isinstance(error, OSError) and error.errno in _DISK_ERRORS

@@ -1,4 +1,4 @@
-"""Asked to stop: by Ctrl-C, or by the SIGTERM of a batch system."""
+"""Requests to stop: Ctrl-C, or the SIGTERM of a batch system."""
 
 import signal
 import sys
@@ -10,7 +10,7 @@ from types import FrameType
 
 @dataclass
 class SignalListener:
-    """Remembers that the process was asked to stop; a second signal ends it at once.
+    """Store of the first request to stop; the second request ends the process at once.
 
     An exception in the middle of an update could leave a half-updated network to save.
     """
@@ -19,7 +19,7 @@ class SignalListener:
 
     @contextmanager
     def listening(self) -> Iterator[None]:
-        """Take over SIGINT (Ctrl-C) and SIGTERM inside the context."""
+        """Handle SIGINT (Ctrl-C) and SIGTERM inside the context."""
         signals = (signal.SIGINT, signal.SIGTERM)
         before = {number: signal.signal(number, self._receive) for number in signals}
         try:

@@ -1,26 +1,27 @@
-"""Train a policy with Stable-Baselines3 and leave everything about the run in one folder.
+"""Training with Stable-Baselines3; everything about a run is in one folder.
 
 The run folder holds ``config.json`` (the full configuration, versions and seeds), ``progress.csv``
-and TensorBoard events, ``evaluations.jsonl`` and ``learning_curve.png``, ``checkpoints/``,
-``best.zip`` (the policy with the best periodic evaluation) and ``last.zip``, and both exported as
-safetensors. A run that was stopped or killed goes on from its last checkpoint. Ctrl-C saves a
-checkpoint and stops; a second one leaves at once.
+and TensorBoard events, ``evaluations.jsonl``, ``checkpoints/``, ``best.zip`` (the policy with the
+best periodic evaluation) and ``last.zip``, and both exported as safetensors. ``learning_curve.png``
+is drawn at the end or at a stop. A run that was stopped or killed continues from its last
+checkpoint. Ctrl-C saves a checkpoint and stops; a second Ctrl-C ends the process at once.
 """
 
 from __future__ import annotations
 
 import json
 import signal
+from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import asdict, fields, replace
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium.spaces import flatdim
 from rich.console import Console
 
+from tpm_gym.errors import TPMError
 from tpm_gym.learning import provenance, run_folder
 from tpm_gym.learning.algorithms import ALGORITHMS
 from tpm_gym.learning.checkpoint import CheckpointStore, Content
@@ -32,11 +33,16 @@ from tpm_gym.learning.configuration import (
     resumed,
 )
 from tpm_gym.learning.environments import check_env_id, make_env, make_envs
-from tpm_gym.learning.errors import ConfigError, PolicyError, RunError
-from tpm_gym.learning.estimates import Estimate
+from tpm_gym.learning.errors import (
+    CheckpointError,
+    ConfigError,
+    DivergedError,
+    PolicyError,
+    RunError,
+)
 from tpm_gym.learning.evaluation import EvaluationConfig, evaluate
 from tpm_gym.learning.rollout import BATCH, SELECTION_SEED, GoalEnv
-from tpm_gym.learning.run_folder import CHECKPOINTS, CONFIG_FILE, TESTS, is_finished
+from tpm_gym.learning.run_folder import CHECKPOINTS, CONFIG_FILE, CURVE_FILE, TESTS, is_finished
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -48,40 +54,45 @@ if TYPE_CHECKING:
 
 
 def train(config: TrainingConfig, console: Console | None = None) -> signal.Signals | None:
-    """Train as configured and leave the run folder; progress is shown on ``console``.
+    """Train a policy and write the run folder; progress is shown on ``console``.
 
     Returns:
-        None when training went to its end; the signal that stopped it (Ctrl-C or SIGTERM), with a
-        checkpoint saved.
+        None if training went to its end; the signal that stopped it (Ctrl-C or SIGTERM) if a
+        checkpoint was saved instead.
 
     Raises:
-        LearningError: The configuration is not valid, or the run folder is taken or not writable.
+        LearningError: The configuration is not valid, the run folder is not empty or not writable,
+            or the training diverged.
         ConfigurationError: There is no such environment.
     """
     console = console or Console()
-    config = complete(config)
+    asked, config = config.steps, complete(config)
+    asked = config.recipe.n_timesteps if asked is UNSET else asked
     with closing(make_env(**_env_options(config))) as env:  # refused before anything is deleted
         _require_room(config, flatdim(env.observation_space))
     run_folder.prepare(config.run, config.overwrite)
     store = CheckpointStore(config.run / CHECKPOINTS)
     with run_folder.disk_errors_named(config.run, store), run_folder.claimed(config.run):
         provenance.write_json(config.run / CONFIG_FILE, _description(config))
-        console.print(f"{config.title}, {config.steps:,} steps, in {config.run}", markup=False)
-        starts = int(config.recipe.arguments.get("learning_starts", 0))
+        _say(console, f"{config.title}, {config.steps:,} steps, in {config.run}")
+        if config.steps != asked:
+            whole = f"whole rollouts of {config.rollout:,} steps"
+            _say(console, f"note: {asked:,} steps were asked for, and rounded up to {whole}")
+        starts = config.argument("learning_starts") or 0
         if config.steps <= starts:
-            console.print(f"note: learning starts at step {starts:,}, so nothing will be learned")
-        return _learn_and_test(config, console, store, None)
+            _say(console, f"note: learning starts at step {starts:,}, so nothing will be learned")
+        return _learn_and_test(config, console, store)
 
 
 def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signals | None:
-    """Go on with a run from its last whole checkpoint.
+    """Continue a run from its last whole checkpoint; return as :func:`train` does.
 
-    One that was killed before its first checkpoint begins again; one that is finished stays as it
-    is, unless it is to take more steps. What is returned is as for :func:`train`.
+    A run that was killed before its first checkpoint begins again. A finished run stays as it is,
+    unless it is given more steps.
 
     Raises:
-        LearningError: There is no such run, no whole checkpoint to resume it from although there is
-            a policy that beginning again would replace, or a change is not valid.
+        LearningError: There is no such run, it holds a policy but no whole checkpoint, a change is
+            not valid, or the training diverged.
     """
     from tpm_gym.learning.training_state import restore_files
 
@@ -93,12 +104,12 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
     with run_folder.disk_errors_named(run, store), run_folder.claimed(run):
         stored = run_folder.description(run)
         if stored is not None and is_finished(run) and config.steps in (UNSET, stored["steps"]):
-            resumed(config, stored, 0)  # to check it
+            resumed(config, stored, 0)  # checks the options
             _say(console, f"nothing to do: {run} has finished its {stored['steps']:,} steps")
             return None
         content = store.load(lambda text: _say(console, f"warning: {text}"))
         if content:
-            stored = json.loads(content.files[CONFIG_FILE])
+            stored = _stored_in(content)
         elif stored is None:
             raise RunError(f"{run} holds no run of tpm_gym; start one with tpm-gym train")
         elif run_folder.holds_policy(run):
@@ -109,13 +120,16 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
         step = content.step if content else 0
         changed = resumed(config, stored, step)
         description = _description_resumed(changed, stored, step)
-        if content:
-            restore_files(run, content)
-        else:
-            run_folder.clear(run)
-        provenance.write_json(run / CONFIG_FILE, description)
-        _say(console, f"{changed.title}, from step {step:,} to {changed.steps:,}, in {run}")
-        return _learn_and_test(changed, console, store, content)
+
+        def begin() -> None:
+            if content:
+                restore_files(run, content)
+            else:
+                run_folder.clear(run)
+            provenance.write_json(run / CONFIG_FILE, description)
+            _say(console, f"{changed.title}, from step {step:,} to {changed.steps:,}, in {run}")
+
+        return _learn_and_test(changed, console, store, content, begin)
 
 
 def _say(console: Console, text: str) -> None:
@@ -135,7 +149,7 @@ def _description_resumed(
     config: TrainingConfig, stored: dict[str, Any], step: int
 ) -> dict[str, Any]:
     resumption = {"from_step": step, **provenance.origin()}
-    changeable = [field.name for field in fields(ResumeConfig) if field.name != "run"]
+    changeable = [entry.name for entry in fields(ResumeConfig) if entry.name != "run"]
     return {
         **stored,
         **{name: getattr(config, name) for name in changeable},
@@ -143,37 +157,61 @@ def _description_resumed(
     }
 
 
+def _stored_in(content: Content) -> dict[str, Any]:
+    """Return the configuration in a checkpoint."""
+    try:
+        return dict(json.loads(content.files[CONFIG_FILE]))
+    except (KeyError, ValueError, TypeError, RecursionError) as error:
+        raise _foreign(content, error) from error
+
+
+def _foreign(content: Content, error: Exception) -> CheckpointError:
+    """Return the error of a checkpoint that is whole and was not written by this training."""
+    problem = f"cannot be restored ({type(error).__name__}), and was not written by this training"
+    anew = "start the run anew with --overwrite"
+    return CheckpointError(f"the checkpoint of step {content.step:,} {problem}; {anew}")
+
+
 def _learn_and_test(
-    config: TrainingConfig, console: Console, store: CheckpointStore, content: Content | None
+    config: TrainingConfig,
+    console: Console,
+    store: CheckpointStore,
+    content: Content | None = None,
+    begin: Callable[[], object] = lambda: None,
 ) -> signal.Signals | None:
-    """Learn; then test what was learned in closed form in PyBullet too."""
-    stopped_by = _learn(config, console, store, content)
+    """Learn; then test a policy of the analytic engine there and in PyBullet.
+
+    Args:
+        content: Checkpoint to begin from.
+        begin: Called once the checkpoint is restored, since only then may files change.
+    """
+    stopped_by = _learn(config, console, store, content, begin)
     if stopped_by is None and config.in_batches and config.test_episodes:
-        rates = [_test(config, engine) for engine in ("analytic", "pybullet")]
-        told = ", ".join(f"{rate.mean:.1%} [{rate.low:.1%}, {rate.high:.1%}]" for rate in rates)
-        _say(console, f"success in closed form and in PyBullet, held-out episodes: {told}")
+        rates = []
+        for engine in ("analytic", "pybullet"):
+            test = EvaluationConfig(
+                policy=(str(config.run),),
+                env=config.env,
+                episodes=config.test_episodes,
+                goals=config.goals,
+                penalty_weight=config.penalty_weight,
+                env_options=replace(config.env_options, engine=engine),
+                json=config.run / TESTS / f"{engine}.json",
+            )
+            (result,) = evaluate(test, Console(quiet=True))
+            rate = result.metrics["success_at_end"]
+            rates.append(f"{rate.mean:.1%} [{rate.low:.1%}, {rate.high:.1%}]")
+        shown = ", ".join(rates)
+        _say(console, f"success in the analytic engine and PyBullet, held-out episodes: {shown}")
     return stopped_by
 
 
-def _test(config: TrainingConfig, engine: str) -> Estimate:
-    """Success of the best policy in an engine, of which the run keeps the test."""
-    (result,) = evaluate(
-        EvaluationConfig(
-            policy=(str(config.run),),
-            env=config.env,
-            episodes=config.test_episodes,
-            goals=config.goals,
-            penalty_weight=config.penalty_weight,
-            env_options=replace(config.env_options, engine=engine),
-            json=config.run / TESTS / f"{engine}.json",
-        ),
-        Console(quiet=True),
-    )
-    return result.metrics["success_at_end"]
-
-
 def _learn(
-    config: TrainingConfig, console: Console, store: CheckpointStore, content: Content | None
+    config: TrainingConfig,
+    console: Console,
+    store: CheckpointStore,
+    content: Content | None,
+    begin: Callable[[], object],
 ) -> signal.Signals | None:
     """Build everything, learn from the beginning or from a checkpoint, and save.
 
@@ -187,9 +225,11 @@ def _learn(
         ProgressBar,
         StopTrainingError,
     )
+    from tpm_gym.learning.curve import draw_learning_curve
     from tpm_gym.learning.demonstrations import Demonstrations
     from tpm_gym.learning.logger import make_logger
     from tpm_gym.learning.signals import SignalListener
+    from tpm_gym.learning.training_state import restore_log
 
     torch.set_num_threads(config.threads)
     bar, listener = ProgressBar(console), SignalListener()
@@ -205,14 +245,16 @@ def _learn(
         stack.callback(evaluation_env.close)
         stack.callback(bar.close)
         model = make_model(config, training_envs)
+        keep = partial(_keep, config, console, run_folder.BEST_FILE)
+        evaluation = PeriodicEvaluation(config, evaluation_env, console, keep)
+        log, seconds = _restore(model, evaluation, content) if content else ({}, 0.0)
+        begin()
         logger = make_logger(config.run, None if content is None else content.step)
         stack.callback(logger.close)
         model.set_logger(logger)
-        keep = partial(_keep, config, console, run_folder.BEST_FILE)
-        evaluation = PeriodicEvaluation(config, evaluation_env, console, keep)
-        seconds = _restore(model, evaluation, content, console) if content else 0.0
+        restore_log(logger, log)
         checkpointing = Checkpointing(config, store, evaluation, listener, console, seconds)
-        # Checkpointing sets the clock of those after it.
+        # Checkpointing sets the clock that the callbacks after it read.
         callbacks: list[BaseCallback] = [checkpointing, bar, evaluation]
         if config.recipe.demonstrations:
             callbacks.insert(1, Demonstrations(**config.recipe.demonstrations))
@@ -223,77 +265,92 @@ def _learn(
             model.learn(steps, callback=callbacks, reset_num_timesteps=content is None)
         except StopTrainingError:
             stopped_by = listener.received
+        except (TPMError, ValueError) as error:
+            # PyTorch refuses NaN in a distribution, environments refuse it in an action.
+            if all(bool(values.isfinite().all()) for values in model.policy.parameters()):
+                raise
+            raise DivergedError(
+                f"the training diverged before step {model.num_timesteps:,}: its networks are no "
+                f"longer finite; lower learning_rate in {config.recipe_file} and train again with "
+                "--overwrite"
+            ) from error
         _keep(config, console, run_folder.LAST_FILE, model)
         if stopped_by is None:
             checkpointing.save_finished()
-    _report(config.run, console, store, stopped_by)
+        draw_learning_curve(config.run / CURVE_FILE, config.title, evaluation.evaluations)
+    if stopped_by is None:
+        _say(console, f"finished: {config.run}")
+    else:
+        saved = "without a checkpoint"
+        if store.newest is not None:
+            command = run_folder.resume_command(config.run)
+            saved = f"saved at step {store.newest:,}; continue with: {command}"
+        _say(console, f"stopped early by {stopped_by.name}, {saved}")
     return stopped_by
 
 
 def _restore(
-    model: BaseAlgorithm, evaluation: PeriodicEvaluation, content: Content, console: Console
-) -> float:
-    """Put everything back to a checkpoint; return the seconds that the run had trained."""
+    model: BaseAlgorithm, evaluation: PeriodicEvaluation, content: Content
+) -> tuple[dict[str, Any], float]:
+    """Restore a checkpoint; return its log, and the seconds that the run had trained."""
     from tpm_gym.learning.training_state import restore
 
-    extra, notes = restore(model, content)
-    evaluation.restore(extra["evaluation"])
-    for note in notes:
-        _say(console, f"note: {note}; the run goes on, but not exactly as it would have")
-    return float(extra["seconds"])
+    try:
+        log, extra = restore(model, content)
+        evaluation.restore(extra["evaluation"])
+        return log, float(extra["seconds"])
+    except TPMError:
+        raise
+    except Exception as error:  # whatever PyTorch raises on a file that others have signed
+        raise _foreign(content, error) from error
 
 
 def _keep(config: TrainingConfig, console: Console, name: str, model: BaseAlgorithm) -> None:
-    """Export a policy to the run folder and save it; what is saved is complete."""
+    """Save a policy in the run folder, and export it."""
     from tpm_gym.learning.export import remove, save, save_archive
 
     archive = config.run / name
     path = archive.with_suffix("")
     try:
-        save(model, path, env_id=config.env, seed=config.seed, recipe=asdict(config.recipe))
+        save(
+            model,
+            path,
+            env_id=config.env,
+            seed=config.seed,
+            recipe=asdict(config.recipe),
+            env_options=config.env_options.given(),
+        )
     except PolicyError as error:
         remove(path)
         _say(console, f"warning: not exported: {error}")
     save_archive(model, archive)
 
 
-def _report(
-    run: Path, console: Console, store: CheckpointStore, received: signal.Signals | None
-) -> None:
-    """Say in one line how the training ended, and how it can go on."""
-    if received is None:
-        _say(console, f"finished: {run}")
-    elif store.newest is None:
-        _say(console, f"stopped early by {received.name}, without a checkpoint: {run}")
-    else:
-        where = f"saved at step {store.newest:,}; continue with: tpm-gym resume {run}"
-        _say(console, f"stopped early by {received.name}, {where}")
-
-
 def make_model(config: TrainingConfig, envs: VecEnv) -> BaseAlgorithm:
     """Build the algorithm of a completed configuration."""
     kind = ALGORITHMS[config.algo].load_class()
-    return kind(env=envs, seed=config.seed, device=config.device, **config.recipe.keywords())
+    keywords = config.recipe.keywords(config.rollout / config.steps)
+    return kind(env=envs, seed=config.seed, device=config.device, **keywords)
 
 
 def _require_room(config: TrainingConfig, numbers: int) -> None:
-    """Refuse a replay buffer for which there is no memory; a step has two observations in it.
+    """Refuse a buffer that does not fit in memory; a step holds two observations.
 
     Args:
-        numbers: In an observation.
+        numbers: Size of an observation.
     """
-    size = int(config.recipe.arguments.get("buffer_size", 0))
+    name = "buffer_size" if config.argument("buffer_size") else "n_steps"
+    size = config.argument("buffer_size") or config.rollout
     try:
         np.empty((size, 2, numbers), np.float32)
-    except (MemoryError, ValueError) as error:  # more than there are addresses is a ValueError
-        raise ConfigError(f"--recipe {config.recipe_file}: buffer_size {size}: {error}") from error
+    except (MemoryError, ValueError) as error:  # beyond all addresses it is a ValueError
+        raise ConfigError(f"--recipe {config.recipe_file}: {name} {size}: {error}") from error
 
 
 def make_training_envs(config: TrainingConfig) -> VecEnv:
     """Build the training environments.
 
-    Where there are several, those in closed form are computed at a time, others run in processes of
-    their own.
+    Several environments of the analytic engine are stepped together. Others run in processes.
     """
     from stable_baselines3.common.env_util import make_vec_env
     from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
@@ -319,8 +376,8 @@ def make_training_envs(config: TrainingConfig) -> VecEnv:
 
 
 def _env_options(config: TrainingConfig) -> dict[str, Any]:
-    """Which environment is trained and evaluated in, as arguments of :func:`make_env`."""
-    # A process of its own has to import the id's module, or may not have the bare id registered.
+    """Return the environment of training and evaluations, as arguments of :func:`make_env`."""
+    # A worker process must import the id's module, and may not have the id registered.
     spec = check_env_id(config.env)
     env = config.env if ":" in config.env else spec
     chosen = {"penalty_weight": config.penalty_weight, "goals": config.goals}

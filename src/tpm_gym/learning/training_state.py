@@ -1,19 +1,18 @@
-"""Taking down a training between two rollouts, and putting it back, to the last bit.
+"""State of a training between two rollouts, saved and restored bit by bit.
 
-Between two rollouts everything that the next steps depend on is at rest: the last transition is
-stored and the update it led to is done. A training that is put back there does what it would have
-done, with environments in this process or in others, on one thread of one kind of machine.
+Between two rollouts the last transition is stored and its update is done. A training that is
+restored there continues as if it had not been interrupted, with environments in this process or in
+others, on one thread of one kind of machine.
 
-Three things make a resumed hindsight training look untrained if they are missing: the count of
-steps (from zero, Stable-Baselines3 acts at random for another ``learning_starts`` steps), the
-optimisers, and the episode under way (its first half, joined to another episode in the replay
-buffer, teaches goals that were never reached). All three are restored here.
+A resumed hindsight training looks untrained if one of three things is missing, so all are restored:
+the count of steps (Stable-Baselines3 acts at random for the first ``learning_starts`` steps), the
+optimisers, and the unfinished episode (joined to another episode in the replay buffer, it teaches
+goals that were never reached).
 """
 
 import io
 import json
 import random
-import warnings
 from collections import deque
 from collections.abc import Mapping
 from functools import partial
@@ -26,11 +25,12 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import DictReplayBuffer
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.her import HerReplayBuffer
 
 from tpm_gym import TPMError
 from tpm_gym.learning.checkpoint import STATE, TENSORS, Content
+from tpm_gym.learning.errors import CheckpointError
 from tpm_gym.learning.provenance import versions, write_whole
 from tpm_gym.learning.rollout import Action, GoalEnv, Observation
 from tpm_gym.learning.run_folder import EXPORTED, LAST_FILE, RESTORED, clear_tests
@@ -42,12 +42,11 @@ _PER_ROW = ("actions", "rewards", "dones", "timeouts", "ep_start", "ep_length")
 
 
 class EpisodeRecorder(gym.Wrapper[Observation, Action, Observation, Action]):
-    """Remembers how the episode under way began and what was done in it.
+    """Record of the unfinished episode: its seed and its actions.
 
-    The engine keeps memories that cannot be read out, so a snapshot of its state would change what
-    follows, and checkpoints would change the training. Repeating the at most 50 steps of an episode
-    changes nothing, is exact, takes a tenth of a second, and brings the wrappers below along: their
-    counts of steps and sums of rewards.
+    PyBullet keeps state that cannot be read, so saving its state would change the training.
+    Repeating an episode of at most 50 steps is exact and takes a tenth of a second. It also
+    restores the wrappers below, with their counts of steps and sums of rewards.
     """
 
     def __init__(self, env: GoalEnv) -> None:
@@ -60,7 +59,7 @@ class EpisodeRecorder(gym.Wrapper[Observation, Action, Observation, Action]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode; training never uses ``options``, and they are not recorded."""
+        """Start an episode; ``options`` are not recorded, since training never uses them."""
         self._seed, self._actions = seed, []
         self._rng = dict(self.unwrapped.np_random.bit_generator.state)
         return self.env.reset(seed=seed, options=options)
@@ -71,14 +70,14 @@ class EpisodeRecorder(gym.Wrapper[Observation, Action, Observation, Action]):
         return self.env.step(action)
 
     def episode(self) -> dict[str, Any]:
-        """Return the episode under way as plain data."""
+        """Return the unfinished episode as plain data."""
         dtype = str(self._actions[0].dtype) if self._actions else ""
         return {"seed": self._seed, "rng": self._rng, "dtype": dtype, "actions": self._actions}
 
     def replay(self, episode: Mapping[str, Any]) -> Observation | None:
-        """Repeat an episode that :meth:`episode` returned; return its last observation.
+        """Repeat an episode from :meth:`episode`; return its last observation.
 
-        None where it could not be repeated, as may happen with another version of the physics.
+        None if it cannot be repeated, which may happen with another version of the physics.
         """
         self.unwrapped.np_random.bit_generator.state = episode["rng"]
         try:
@@ -93,14 +92,22 @@ class EpisodeRecorder(gym.Wrapper[Observation, Action, Observation, Action]):
 def capture(
     model: BaseAlgorithm, run: Path, extra: Mapping[str, Any], finished: bool = False
 ) -> Content:
-    """Take down a training, in environments of :class:`EpisodeRecorder`, between two rollouts.
+    """Return the state of a training between two rollouts.
 
-    The arrays are views of the replay buffer, the rest is copied.
+    Arrays of the replay buffer are views; everything else is copied.
+
+    Args:
+        model: Its environments are an ``AnalyticVecEnv`` or of :class:`EpisodeRecorder`.
+        extra: Plain data to keep with the state.
     """
     envs, observations = model.env, model._last_obs
     assert envs is not None
     assert isinstance(observations, dict)
-    episodes, columns = _episodes(envs)
+    episodes: Any
+    if isinstance(envs, AnalyticVecEnv):
+        episodes, columns = envs.state()
+    else:
+        episodes, columns = envs.env_method("episode"), {}
     state = {
         "counters": {name: getattr(model, name) for name in _COUNTERS},
         "statistics": [list(model.ep_info_buffer or ()), list(model.ep_success_buffer or ())],
@@ -123,9 +130,9 @@ def capture(
 
 
 def restore_files(run: Path, content: Content) -> None:
-    """Cut the files of a run back to the moment of a checkpoint.
+    """Set the files of a run back to a checkpoint.
 
-    Tests, and what was exported at the end, are deleted: the policy will soon be another.
+    Tests and the last exported policy are deleted, since the policy will change.
     """
     clear_tests(run)
     for suffix in EXPORTED:
@@ -138,15 +145,14 @@ def restore_files(run: Path, content: Content) -> None:
             (run / name).unlink(missing_ok=True)
 
 
-def restore(model: BaseAlgorithm, content: Content) -> tuple[dict[str, Any], list[str]]:
-    """Put a training back to the moment of a checkpoint; ``learn`` then goes on from there.
+def restore(model: BaseAlgorithm, content: Content) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Restore a training from a checkpoint, from which ``learn`` continues.
 
     Args:
-        model: An algorithm just built with the same arguments, with a logger.
+        model: New algorithm, built with the same arguments.
 
     Returns:
-        The plain data that was kept with it, and sentences about what keeps the continuation from
-        being exact; none if it is.
+        The state for :func:`restore_log`, and the ``extra`` of :func:`capture`.
     """
     state = json.loads(content.files[STATE])
     for name, value in state["counters"].items():
@@ -156,11 +162,10 @@ def restore(model: BaseAlgorithm, content: Content) -> tuple[dict[str, Any], lis
         deque(entries, maxlen=size) for entries in state["statistics"]
     )
     _restore_buffer(model, content.arrays)
-    notes = _version_notes(state["versions"]) + _restore_episodes(model, state, content.arrays)
-    _restore_log(model, state["log"])
+    _restore_episodes(model, state, content.arrays)
     tensors = _restore_tensors(model, content.files[TENSORS])
-    _restore_rng(model, state["rng"], tensors)  # last: what is above may draw
-    return state["extra"], notes
+    _restore_rng(model, state["rng"], tensors)  # last, since the lines above may draw
+    return state["log"], state["extra"]
 
 
 # -- networks and optimisers ------------------------------------------------------------------
@@ -181,7 +186,7 @@ def _tensors(model: BaseAlgorithm) -> bytes:
 
 
 def _restore_tensors(model: BaseAlgorithm, data: bytes) -> dict[str, Any]:
-    """Put networks and optimisers back; return the content of the file."""
+    """Restore networks and optimisers; return the content of the file."""
     content: dict[str, Any] = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     model.set_parameters(content["parameters"], exact_match=True)
     with torch.no_grad():
@@ -194,10 +199,10 @@ def _restore_tensors(model: BaseAlgorithm, data: bytes) -> dict[str, Any]:
 
 
 def _rng_state(model: BaseAlgorithm) -> dict[str, Any]:
-    """Return the states of the generators outside PyTorch; environments have theirs."""
+    """Return the states of the generators outside PyTorch and the environments."""
     return {
         "python": random.getstate(),
-        "numpy": np.random.get_state(legacy=False),  # noqa: NPY002  # what SB3 draws from
+        "numpy": np.random.get_state(legacy=False),  # noqa: NPY002  # SB3 draws from it
         "actions": model.action_space.np_random.bit_generator.state,
     }
 
@@ -216,7 +221,7 @@ def _restore_rng(model: BaseAlgorithm, state: Mapping[str, Any], tensors: dict[s
 
 
 def _buffer_arrays(model: BaseAlgorithm) -> dict[str, NDArray[Any]]:
-    """Return the place in the replay buffer, and views of its filled part; nothing without one."""
+    """Return the position in the replay buffer and views of its filled part, if there is one."""
     buffer = getattr(model, "replay_buffer", None)
     if not isinstance(buffer, DictReplayBuffer):
         return {}
@@ -231,7 +236,7 @@ def _buffer_arrays(model: BaseAlgorithm) -> dict[str, NDArray[Any]]:
 
 
 def _restore_buffer(model: BaseAlgorithm, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Fill an empty replay buffer as it was, the bookkeeping of its episodes included."""
+    """Fill an empty replay buffer, and restore its record of episodes."""
     buffer = getattr(model, "replay_buffer", None)
     if isinstance(buffer, DictReplayBuffer):
         position, full = arrays["buffer/place"].tolist()
@@ -245,71 +250,42 @@ def _restore_buffer(model: BaseAlgorithm, arrays: Mapping[str, NDArray[Any]]) ->
 
 def _restore_episodes(
     model: BaseAlgorithm, state: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
-) -> list[str]:
-    """Repeat the episodes under way; where that is not exact, end them and start others."""
+) -> None:
+    """Restore the unfinished episodes; refuse if they do not end in the same observations."""
     envs = model.env
     assert envs is not None
-    names = [name for name in arrays if name.startswith("last/")]
-    last = {name.removeprefix("last/"): arrays[name] for name in names}
+    last = _starting(arrays, "last/")
     if isinstance(envs, AnalyticVecEnv):
-        columns = {k.removeprefix("envs/"): v for k, v in arrays.items() if k.startswith("envs/")}
-        found = envs.restore(state["episodes"], columns)
-        exact = all(np.array_equal(found[key], rows) for key, rows in last.items())
+        found: Any = [envs.restore(state["episodes"], _starting(arrays, "envs/"))]
+        expected: Any = [last]
     else:
-        exact = all(
-            _is_repeated(envs, index, episode, last)
-            for index, episode in enumerate(state["episodes"])
-        )
-    if exact:
-        model._last_obs, model._last_episode_starts = last, arrays["episode_starts"]
-        return []
-    _start_afresh(model, envs)
-    return ["the episodes under way could not be repeated exactly, so new ones begin"]
+        rows = range(envs.num_envs)
+        found = [envs.env_method("replay", state["episodes"][i], indices=[i])[0] for i in rows]
+        expected = [{name: values[i] for name, values in last.items()} for i in rows]
+    for one, other in zip(found, expected, strict=True):
+        if one is None or any(not np.array_equal(one[name], other[name]) for name in other):
+            now, before = versions(), state["versions"]
+            changed = [f"{k} {before.get(k)} -> {now[k]}" for k in now if before.get(k) != now[k]]
+            raise CheckpointError(
+                "the unfinished episodes do not repeat: the physics have changed "
+                f"({', '.join(changed) or 'with equal versions'}); install the versions of "
+                "config.json again, or start the run anew with --overwrite"
+            )
+    model._last_obs, model._last_episode_starts = last, arrays["episode_starts"]
 
 
-def _episodes(envs: VecEnv) -> tuple[Any, dict[str, NDArray[Any]]]:
-    """The episodes under way, as plain data and arrays."""
-    if isinstance(envs, AnalyticVecEnv):
-        return envs.state()
-    return envs.env_method("episode"), {}
-
-
-def _is_repeated(envs: VecEnv, index: int, episode: Any, last: Mapping[str, NDArray[Any]]) -> bool:
-    """Repeat an episode; whether it comes to the same observation."""
-    (observation,) = envs.env_method("replay", episode, indices=[index])
-    return observation is not None and all(
-        np.array_equal(observation[key], rows[index]) for key, rows in last.items()
-    )
-
-
-def _start_afresh(model: BaseAlgorithm, envs: VecEnv) -> None:
-    """Start new episodes, and end those in the replay buffer where they were interrupted."""
-    envs._reset_seeds()  # of the run's first reset, which would begin its first episodes again
-    model._last_obs = envs.reset()  # type: ignore[assignment]
-    model._last_episode_starts = np.ones(envs.num_envs, dtype=bool)
-    buffer = getattr(model, "replay_buffer", None)
-    if isinstance(buffer, HerReplayBuffer):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # it warns of what is wanted here
-            buffer.truncate_last_trajectory()
-
-
-def _version_notes(before: Mapping[str, str | None]) -> list[str]:
-    """Say which versions have changed since."""
-    now = versions()
-    changed = [
-        f"{name} {before.get(name)} -> {now[name]}" for name in now if before.get(name) != now[name]
-    ]
-    return [f"versions have changed ({', '.join(changed)})"] if changed else []
+def _starting(arrays: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
+    """Return the arrays with a prefix, under their names without it."""
+    return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
 
 
 # -- log --------------------------------------------------------------------------------------
 
 
 def _pending_log(model: BaseAlgorithm) -> dict[str, Any]:
-    """Return what has been recorded and not yet been written to the log."""
+    """Return the values that are not yet written to the log."""
     logger = model.logger
-    # With their types: a float32 is printed with fewer digits.
+    # Types are kept, since a float32 is printed with fewer digits.
     types = {
         name: value.dtype.str
         for name, value in logger.name_to_value.items()
@@ -323,11 +299,10 @@ def _pending_log(model: BaseAlgorithm) -> dict[str, Any]:
     }
 
 
-def _restore_log(model: BaseAlgorithm, state: Mapping[str, Any]) -> None:
-    logger = model.logger
-    logger.name_to_value.update(state["values"])
-    for name, dtype in state["types"].items():
-        logger.name_to_value[name] = np.dtype(dtype).type(state["values"][name])
-    logger.name_to_count.update(state["counts"])
-    excluded = {name: tuple(formats) for name, formats in state["excluded"].items()}
-    logger.name_to_excluded.update(excluded)
+def restore_log(logger: Logger, state: Mapping[str, Any]) -> None:
+    """Restore the values that were not yet written to the log; an empty state has none."""
+    for name, value in state.get("values", {}).items():
+        dtype = state["types"].get(name)
+        logger.name_to_value[name] = np.dtype(dtype).type(value) if dtype else value
+        logger.name_to_excluded[name] = tuple(state["excluded"][name])
+    logger.name_to_count.update(state.get("counts", {}))

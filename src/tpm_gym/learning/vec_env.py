@@ -1,4 +1,4 @@
-"""Many environments in closed form, as Stable-Baselines3 steps them."""
+"""Vector environment of the analytic engine for Stable-Baselines3."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ from tpm_gym.simulation.randomisation import NOMINAL, Plant
 
 __all__ = ["AnalyticVecEnv"]
 
-_COLUMN = "column/"  # what names of the simulation's columns begin with in a state
+_COLUMN = "column/"  # prefix of the simulation's columns in a state
 _OWN = ("goals", "elapsed", "ended", "pending")
 
 
 class AnalyticVecEnv(VecEnv):
-    """A :class:`~tpm_gym.envs.vector.TPMVectorEnv` behind the interface of Stable-Baselines3.
+    """Adapter of a :class:`~tpm_gym.envs.vector.TPMVectorEnv` to Stable-Baselines3.
 
-    Infos hold what its algorithms read, and no more, since they want a dictionary for each
-    environment: where an episode has ended, ``terminal_observation``, ``TimeLimit.truncated``,
-    ``is_success`` and ``episode``; elsewhere nothing.
+    Infos hold only the entries that the algorithms read, since each environment has a dictionary of
+    its own: ``terminal_observation``, ``TimeLimit.truncated``, ``is_success`` and ``episode`` at
+    the end of an episode, and nothing otherwise.
 
     Args:
-        envs: With same-step autoreset: ``gym.make_vec(id, num_envs=256, engine="analytic",
-            autoreset_mode="SameStep", stagger=True)``.
+        envs: Environments with same-step autoreset: ``gym.make_vec(id, num_envs=256,
+            engine="analytic", autoreset_mode="SameStep", stagger=True)``.
 
     Raises:
-        ConfigurationError: If they are others, or have another autoreset.
+        ConfigurationError: ``envs`` are others, or have another autoreset.
     """
 
     def __init__(self, envs: TPMVectorEnv) -> None:
-        """Wrap them."""
+        """Wrap the environments."""
         if not isinstance(getattr(envs, "unwrapped", None), TPMVectorEnv):
             valid = "gym.make_vec(id, num_envs=..., engine='analytic', autoreset_mode='SameStep')"
             raise ConfigurationError("envs", envs, valid)
@@ -53,7 +53,7 @@ class AnalyticVecEnv(VecEnv):
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
     def reset(self) -> Observation:
-        """Start an episode in all environments, with the seeds that :meth:`seed` was given."""
+        """Start an episode in all environments, with the seeds of :meth:`seed`."""
         seeds = None if self._seeds[0] is None else self._seeds
         observation, _ = self.envs.reset(seed=seeds)
         self._reset_seeds()
@@ -61,11 +61,11 @@ class AnalyticVecEnv(VecEnv):
         return observation
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        """Remember the actions."""
+        """Store the actions."""
         self._actions = actions
 
     def step_wait(self) -> Any:
-        """Run a control step."""
+        """Run a control period."""
         observation, rewards, _, dones, told = self.envs.step(self._actions)
         self._returns += rewards
         self._lengths += 1
@@ -86,28 +86,28 @@ class AnalyticVecEnv(VecEnv):
         self.envs.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """An attribute of the vector environment, once for each index."""
+        """Return an attribute of the vector environment, once for each index."""
         return [getattr(self.envs, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Set an attribute of the vector environment, so of all."""
+        """Set an attribute of the vector environment."""
         del indices
         setattr(self.envs, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> Any:
-        """What a method of the vector environment returns, once for each index."""
+        """Call a method of the vector environment, once for each index."""
         method = getattr(self.envs, method_name)
         return [method(*args, **kwargs) for _ in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """No environment has a wrapper of its own."""
+        """Return False for each index, since no environment has a wrapper of its own."""
         del wrapper_class
         return [False for _ in self._get_indices(indices)]
 
     # -- checkpoints ----------------------------------------------------------------------------
 
     def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-        """Everything that the next steps depend on: plain data, and arrays by name."""
+        """Return the state on which the next steps depend: plain data, and arrays by name."""
         snapshot = self.envs.save_state()
         moment = snapshot.simulation
         plants = moment.plants if any(plant != NOMINAL for plant in moment.plants) else ()
@@ -118,7 +118,7 @@ class AnalyticVecEnv(VecEnv):
         return {"rngs": snapshot.rngs, "plants": [asdict(plant) for plant in plants]}, arrays
 
     def restore(self, plain: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Observation:
-        """Go back to what :meth:`state` returned; the observation at that moment."""
+        """Restore a state of :meth:`state`; return the observation at that moment."""
         plants = tuple(map(_plant, plain["plants"])) or (NOMINAL,) * self.num_envs
         columns = {
             name.removeprefix(_COLUMN): values
@@ -132,6 +132,6 @@ class AnalyticVecEnv(VecEnv):
 
 
 def _plant(entries: dict[str, Any]) -> Plant:
-    """From JSON, which has lists for tuples."""
+    """Build a plant from JSON, which has lists for tuples."""
     tuples: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in entries.items()}
     return Plant(**tuples)

@@ -1,11 +1,11 @@
-"""Our recipes for rl-baselines3-zoo.
+"""Recipes for rl-baselines3-zoo.
 
     python -m rl_zoo3.train --algo sac --env TPMReach-v0 \
         --gym-packages tpm_gym --conf-file tpm_gym.learning.zoo
 
-The zoo imports this module and takes the name ``hyperparams`` from it. One file of ours is for one
-algorithm, so the algorithm is read off the zoo's command line. Where the zoo would evaluate strings
-as Python, it gets the classes themselves.
+The zoo imports this module and reads ``hyperparams``. A recipe file is for one algorithm, so the
+algorithm is read from the zoo's command line. Entries that the zoo would evaluate as Python are
+given as classes.
 """
 
 import argparse
@@ -16,13 +16,13 @@ from tpm_gym.learning.recipes import read_recipes, recipe_file, with_classes
 
 
 def hyperparameters(algorithm: str) -> dict[str, dict[str, Any]]:
-    """The recipes of one algorithm, by environment id, as rl-baselines3-zoo wants them."""
+    """Return the recipes of one algorithm by environment id, in the zoo's form."""
     recipes = read_recipes(recipe_file(algorithm), algorithm)
     return {env_id: _translate(entries) for env_id, entries in recipes.items()}
 
 
 def _translate(entries: dict[str, Any]) -> dict[str, Any]:
-    """One recipe: classes for their names, a callback for the demonstrations."""
+    """Replace names by classes, and demonstrations by a callback."""
     translated = with_classes(entries)
     if "demonstrations" in translated:
         arguments = translated.pop("demonstrations")
@@ -32,7 +32,7 @@ def _translate(entries: dict[str, Any]) -> dict[str, Any]:
 
 
 def _algorithm(command_line: list[str]) -> str:
-    """The value of ``--algo``; the zoo's own default without it."""
+    """Return the value of ``--algo``, or the zoo's default."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--algo", default="ppo")
     return str(parser.parse_known_args(command_line)[0].algo)

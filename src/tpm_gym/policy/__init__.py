@@ -1,6 +1,6 @@
 """Trained policies without pickle: :func:`load_policy` and :class:`Policy`.
 
-PyTorch is imported when either is first asked for, not with this package.
+PyTorch is imported when either is first used, not with this package.
 """
 
 from typing import TYPE_CHECKING, Any

@@ -1,12 +1,12 @@
-"""A trained policy on disk: what its two files hold, and how they are read without trusting them.
+"""Files of a trained policy: their content, and how they are read without trust.
 
-``NAME.json`` says what the policy is: its network, spaces, environment and recipe, the versions it
-was trained with. ``NAME.safetensors`` holds the weights. Both are plain data: nothing in them is
-ever executed or unpickled, and nothing is allocated before its size has been checked.
+``NAME.json`` describes the policy: its network, spaces, environment, recipe and versions.
+``NAME.safetensors`` holds the weights. Both are plain data. Nothing in them is executed or
+unpickled, and files beyond a fixed size are not read.
 
-The JSON carries the SHA-256 of the weights and of its own entries. That detects damage and mix-ups
-of files. It does not detect an author of ill will, who can write new sums for new contents: such a
-policy can act badly, but it cannot run code.
+The JSON holds the SHA-256 of the weights and of its own entries, which shows damage and files that
+do not belong together. An attacker can write new sums for new content. Such a policy can act badly,
+but it cannot run code.
 """
 
 from __future__ import annotations
@@ -38,11 +38,9 @@ except ImportError as error:
 FORMAT: Final = "tpm_gym.policy"
 VERSION: Final = 1
 
-# At most, in bytes: the JSON file, that of the weights, and what stands before them in it
+# Largest sizes in bytes: the JSON file, the weights, and the header of their file
 MAX_JSON, MAX_WEIGHTS, MAX_HEADER = 1 << 20, 64 << 20, 16 << 10
-MAX_DEPTH: Final = 16  # of objects and lists inside each other
-MAX_UNITS: Final = 4096  # of a layer, or entries of an observation or action
-MAX_VALUE: Final = 1e38  # of a unit in the observation space; float32 overflows at 3.4e38
+MAX_UNITS: Final = 4096  # of a layer; also the largest size of an observation or action
 _GOAL_KEYS: Final = ("observation", "achieved_goal", "desired_goal")
 _Key = Annotated[str, Field(pattern="^[A-Za-z0-9_]{1,100}$")]
 _Package = Annotated[str, Field(pattern="^[A-Za-z0-9_.-]{1,100}$")]
@@ -51,18 +49,18 @@ _Count = Annotated[int, Field(ge=0, le=2**63)]
 _Size = Annotated[int, Field(ge=1, le=MAX_UNITS)]
 _Bound = Annotated[float, Field(ge=-1e30, le=1e30)]
 _Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
-# Not strict where JSON has lists and these are tuples
+# Not strict, since JSON has lists for tuples
 _Bounds = Annotated[tuple[_Bound, ...], Strict(False), Field(max_length=MAX_UNITS)]
 
 
 class _Entries(BaseModel):
-    """An object with exactly these keys, and values of exactly these types: true is no integer."""
+    """Object with exactly these keys and types; true is no integer."""
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class Box(_Entries):
-    """A bounded space of arrays; ``low`` and ``high`` are flat, by rows."""
+    """Bounded space of arrays; ``low`` and ``high`` are flat, by rows."""
 
     shape: Annotated[tuple[_Size, ...], Strict(False), Field(max_length=4)]
     dtype: Literal["float32", "float64"]
@@ -79,17 +77,17 @@ class Box(_Entries):
 
     @property
     def space(self) -> spaces.Box[Any]:
-        """The same for Gymnasium."""
+        """Space for Gymnasium."""
         dtype = np.dtype(self.dtype).type
         low, high = (np.array(flat, dtype).reshape(self.shape) for flat in (self.low, self.high))
         return spaces.Box(low, high, dtype=dtype)
 
 
 class Features(_Entries):
-    """What the first layer sees: all entries of the observation, or the gap to the goal.
+    """Input of the first layer.
 
-    Entries are joined in the order of ``keys``; or ``observation`` is with (``desired_goal`` -
-    ``achieved_goal``) / ``unit``, m.
+    ``concatenate``: the entries of the observation in the order of ``keys``. ``goal_gap``:
+    ``observation`` and (``desired_goal`` - ``achieved_goal``) / ``unit``, with ``unit`` in m.
     """
 
     kind: Literal["concatenate", "goal_gap"]
@@ -105,10 +103,10 @@ class Features(_Entries):
 
 
 class Network(_Entries):
-    """The layers from an observation to the mean action.
+    """Layers from an observation to the mean action.
 
-    The activation follows each hidden layer. What leaves the last one goes through tanh and is
-    stretched to the action space, or is clipped to it.
+    The activation follows each hidden layer. The output of the last layer goes through tanh and is
+    scaled to the action space, or is clipped to it.
     """
 
     features: Features
@@ -118,22 +116,24 @@ class Network(_Entries):
 
 
 class Weights(_Entries):
-    """What the file of weights has to be."""
+    """Size and sum of the file of weights."""
 
     bytes: Annotated[int, Field(ge=0, le=MAX_WEIGHTS)]
     sha256: _Sha256
 
 
 class Description(_Entries):
-    """Everything about a policy but its weights.
+    """Everything about a policy except its weights.
 
-    ``steps`` counts those of the environment it was trained in; ``seed`` is None where it is not
-    known, and so are the ``versions`` of packages that were absent.
+    ``env_options`` are machine, engine and drive of the training, where they differ from the id's.
+    ``steps`` counts environment steps of the training. ``seed`` is None if it is not known, a
+    version if the package was not installed.
     """
 
     format: Literal["tpm_gym.policy"]
     version: int = Field(ge=VERSION, le=VERSION)  # a Literal would take true for 1
     env_id: str = Field(alias="env", pattern="^[A-Za-z0-9_.:/-]{1,100}$")
+    env_options: dict[Literal["machine", "engine", "drive"], _Version] = {}
     algorithm: _Key
     seed: _Count | None
     steps: _Count
@@ -161,19 +161,19 @@ class Description(_Entries):
 
     @cached_property
     def observation_space(self) -> spaces.Dict:
-        """The observations it takes."""
+        """Space of the observations."""
         return spaces.Dict({key: box.space for key, box in self.observations.items()})
 
     @cached_property
     def action_space(self) -> spaces.Box[Any]:
-        """The actions it gives."""
+        """Space of the actions."""
         return self.actions.space
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shapes of the weights by name; each layer maps x to weight x + bias."""
+        """Shapes of the weights by name; a layer maps x to weight x + bias."""
         gap = self.network.features.kind == "goal_gap"
-        # The achieved goal only shows in the gap, which has the size of the desired goal.
+        # The achieved goal is only in the gap, which has the size of the desired goal.
         seen = (key for key in self.observations if not (gap and key == "achieved_goal"))
         inputs = sum(len(self.observations[key].low) for key in seen)
         sizes = [inputs, *self.network.hidden, len(self.actions.low)]
@@ -184,12 +184,7 @@ class Description(_Entries):
 
 
 def files(path: str | Path) -> tuple[Path, Path]:
-    """The JSON file and the file of weights; ``path`` is either, or what they have in common.
-
-    Raises:
-        InputError: It is no path.
-        PolicyFileError: It names a folder, or an archive of Stable-Baselines3.
-    """
+    """Return the JSON file and the file of weights; ``path`` is either, or their common name."""
     if not isinstance(path, str | Path) or not str(path):
         given = path if path == "" else type(path)
         raise InputError("path", given, "the str or Path of a policy, as in 'runs/reach/best.json'")
@@ -200,38 +195,33 @@ def files(path: str | Path) -> tuple[Path, Path]:
             "is an archive of Stable-Baselines3, which holds pickles: loading it can run any code",
             "if you trust it, convert it once: tpm-gym export MODEL.zip OUT --trust-pickle",
         )
-    if os.path.isdir(path):  # path.is_dir() raises where a name is too long
+    if os.path.isdir(path):  # path.is_dir() raises if a name is too long
         raise PolicyFileError(str(path), "is a folder", "name a policy in it, as in FOLDER/best")
     stem = path.with_suffix("") if path.suffix in (".json", ".safetensors") else path
     return Path(f"{stem}.json"), Path(f"{stem}.safetensors")
 
 
 def digest(content: Mapping[str, Any]) -> str:
-    """SHA-256, in hex, of the entries of a JSON file but ``sha256`` itself, however laid out."""
+    """Return the SHA-256, in hex, of all entries but ``sha256``; their layout does not matter."""
     entries = {name: value for name, value in content.items() if name != "sha256"}
     text = json.dumps(entries, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode("ascii")).hexdigest()
 
 
 def read_description(path: str | Path) -> Description:
-    """Read and check the JSON file of a policy, named as for :func:`files`.
-
-    Raises:
-        PolicyFileError: The file is missing, damaged, or an entry cannot be.
-    """
+    """Read the JSON file of a policy, named as for :func:`files`; refuse a damaged one."""
     file, _ = files(path)
     data = _read(file, MAX_JSON)
     try:
-        content = json.loads(data.decode("utf-8"), object_pairs_hook=_unique, parse_int=_short)
-        if _depth(content) > MAX_DEPTH:
-            raise ValueError("nested too deeply")
+        content = json.loads(data.decode("utf-8"))
         description = Description.model_validate(content)
         intact = description.sha256 == digest(content)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        place = _shown(".".join(map(str, first["loc"])) or "(all)")
-        value = "" if isinstance(first["input"], dict) else f", not {_shown(first['input'])}"
-        reason = f"describes no policy: entry {place}: {first['msg']}{value}"
+        place, given = ".".join(map(str, first["loc"])) or "(all)", first["input"]
+        # A deeply nested value cannot be printed.
+        value = "" if isinstance(given, dict | list) else f", not {_shown(given)}"
+        reason = f"describes no policy: entry {_shown(place)}: {first['msg']}{value}"
         raise _damaged(file, reason) from error
     except (ValueError, RecursionError) as error:
         raise _damaged(file, f"is no valid JSON ({error})") from error
@@ -241,20 +231,13 @@ def read_description(path: str | Path) -> Description:
 
 
 def read_weights(path: str | Path, description: Description) -> dict[str, NDArray[np.float32]]:
-    """Read and check the weights of a policy, named as for :func:`files`.
-
-    Returns:
-        The weights by name, as ``description.shapes`` have them; so small that no observation of
-        the observation space makes the network overflow.
-
-    Raises:
-        PolicyFileError: The file is missing, damaged, or does not fit the description.
-    """
+    """Read finite weights by name, of the shapes in ``description.shapes``; refuse others."""
     _, file = files(path)
     data = _read(file, description.weights.bytes)
     if hashlib.sha256(data).hexdigest() != description.weights.sha256:
-        said = f"of another policy, or damaged: {len(data)} of {description.weights.bytes} bytes"
-        raise _damaged(file, f"its SHA-256 is not that in the JSON file; it is {said}")
+        size = f"{len(data)} of {description.weights.bytes} bytes"
+        problem = f"it belongs to another policy, or is damaged: {size}"
+        raise _damaged(file, f"its SHA-256 is not that in the JSON file; {problem}")
     try:
         tensors = dict(safetensors.deserialize(data))  # type: ignore[no-untyped-call]
     except safetensors.SafetensorError as error:
@@ -268,27 +251,13 @@ def read_weights(path: str | Path, description: Description) -> dict[str, NDArra
         name: np.frombuffer(tensors[name]["data"], "<f4").reshape(shape).astype(np.float32)
         for name, shape in description.shapes.items()
     }
-    if not (largest := _largest(description, weights)) <= MAX_VALUE:  # also where it is NaN
-        raise _damaged(file, f"is not finite, or overflows: its network could reach {largest:.2g}")
+    if not all(np.isfinite(values).all() for values in weights.values()):
+        raise _damaged(file, "has a weight that is not finite")
     return weights
 
 
-def _largest(description: Description, weights: Mapping[str, NDArray[np.float32]]) -> float:
-    """What no sum in the network exceeds for observations of the space: all terms add up."""
-    boxes = description.observations.values()
-    entry = max(np.abs([box.low, box.high]).max() for box in boxes)
-    largest = 2 * entry / min(description.network.features.unit, 1.0)  # or of a gap of two entries
-    reach = np.full(weights["layers.0.weight"].shape[1], largest)
-    with np.errstate(over="ignore", invalid="ignore"):
-        for i in range(len(weights) // 2):
-            reach = np.abs(weights[f"layers.{i}.weight"]) @ reach
-            reach += np.abs(weights[f"layers.{i}.bias"])
-            largest = np.maximum(largest, reach.max())  # NaN, once there, stays
-    return float(largest)
-
-
 def published() -> list[str]:
-    """The ids of the environments with a published policy."""
+    """Return the ids of the environments with a published policy."""
     return sorted(file.stem for file in POLICIES.glob("*.safetensors"))
 
 
@@ -298,40 +267,21 @@ def _damaged(file: Path, reason: str) -> PolicyFileError:
 
 
 def _read(file: Path, limit: int) -> bytes:
-    """Return the content of a file, after a look at its size."""
+    """Return the content of a file that is not larger than ``limit`` bytes."""
     try:
-        if not file.is_file():  # a pipe, for one, would never end
+        if not file.is_file():  # reading a pipe would never end
             remedy = f"name a file, or a published policy: {', '.join(published())}"
             raise PolicyFileError(str(file), "there is no such file", remedy)
         with file.open("rb") as stream:
             if (size := os.fstat(stream.fileno()).st_size) > limit:
-                raise _damaged(file, f"is too large: {size} bytes, at most {limit} can be valid")
+                raise _damaged(file, f"is too large: {size} bytes, at most {limit} are valid")
             return stream.read(size)
     except OSError as error:
         reason = f"cannot be read: {error.strerror}"
         raise PolicyFileError(str(file), reason, "check its name and permissions") from error
 
 
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        raise ValueError("a key stands twice in one object")
-    return found
-
-
-def _short(digits: str) -> int:
-    if len(digits) > 20:  # the time to convert them grows with the square
-        raise ValueError(f"{_shown(digits)} is too large")
-    return int(digits)
-
-
-def _depth(value: Any) -> int:
-    if not isinstance(value, dict | list):
-        return 0
-    return 1 + max(map(_depth, value.values() if isinstance(value, dict) else value), default=0)
-
-
 def _shown(value: object) -> str:
-    """A value as a message can hold it: short, and without control characters."""
+    """Return a value for a message: short, and without control characters."""
     text = ascii(value)
     return text if len(text) <= 60 else f"{text[:60]}..."

@@ -1,4 +1,4 @@
-"""Trained policies at work: loaded from safetensors and JSON, run by PyTorch alone.
+"""Trained policies, loaded from safetensors and JSON and run by PyTorch alone.
 
 Loading needs neither Stable-Baselines3 nor trust: see :mod:`tpm_gym.policy.files`.
 """
@@ -32,14 +32,14 @@ def load_policy(path: str | Path) -> Policy:
     """Load an exported policy. Nothing in its files is executed or unpickled.
 
     Args:
-        path: ``NAME.json``, ``NAME.safetensors`` or ``NAME``, where both files have to be. Where
-            neither is there, also the id of an environment with a published policy, a str such as
+        path: ``NAME.json``, ``NAME.safetensors`` or ``NAME``; both files must exist. If neither
+            does, also the id of an environment with a published policy, a str such as
             ``"TPMPickAndPlace-v0"``.
 
     Raises:
-        InputError: It is neither a str nor a Path, or empty.
-        PolicyFileError: A file is missing, damaged, too large or not what it has to be, or the
-            path names an archive of Stable-Baselines3, which only unpickling could read.
+        InputError: ``path`` is neither a str nor a Path, or empty.
+        PolicyFileError: A file is missing, damaged, too large or not valid, or ``path`` is an
+            archive of Stable-Baselines3, which only unpickling could read.
         MissingPackageError: PyTorch, safetensors or pydantic is not installed.
     """
     pair = files(path)
@@ -50,13 +50,13 @@ def load_policy(path: str | Path) -> Policy:
 
 
 class Policy:
-    """The mean action of a trained policy.
+    """Mean action of a trained policy.
 
     Args:
-        weights: By name, of the shapes of ``description.shapes``.
+        weights: Arrays by name, of the shapes in ``description.shapes``.
 
     Attributes:
-        description: What the policy is: environment, algorithm, recipe, spaces, versions, network.
+        description: Environment, algorithm, recipe, spaces, versions and network.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class Policy:
         ]
 
     def act(self, observation: Mapping[str, Any]) -> NDArray[Any]:
-        """The action for an observation, or the actions for a batch of them.
+        """Return the action for an observation, or the actions for a batch of observations.
 
         Args:
             observation: Arrays of the shapes of the observation space, or all with one more axis
@@ -82,7 +82,7 @@ class Policy:
 
         Raises:
             InputError: An entry is missing, unknown, of the wrong shape or not of finite real
-                numbers, or so far outside the observation space that the network overflows.
+                numbers, or so large that the network overflows.
         """
         entries, batched = self._check_observation(observation)
         network, space = self.description.network, self.description.action_space
@@ -95,7 +95,7 @@ class Policy:
             actions: NDArray[Any] = (torch.tanh(x) if network.output == "tanh" else x).numpy()
         if not np.isfinite(x.numpy()).all():
             largest = max(float(values.abs().max()) for values in entries.values())
-            raise InputError("observation", largest, "near its space; the network overflows")
+            raise InputError("observation", largest, "smaller; the network overflows")
         actions = actions.reshape(-1, *space.shape)
         if network.output == "tanh":
             actions = space.low + 0.5 * (actions + 1.0) * (space.high - space.low)
@@ -111,30 +111,25 @@ class Policy:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[Any], None]:
-        """The same as ``act`` with the interface of Stable-Baselines3; there is no state.
-
-        Raises:
-            ConfigurationError: A random action was asked for; only the mean action is on file.
-            InputError: As for ``act``.
-        """
+        """Return the action of :meth:`act`, and no state, as Stable-Baselines3 does."""
         if not deterministic:
-            raise ConfigurationError(
-                "deterministic", deterministic, "True; an exported policy has no random actions"
-            )
+            valid = "True; an exported policy has no random actions"
+            raise ConfigurationError("deterministic", deterministic, valid)
         return self.act(observation), None
 
     def check(self, env: Any) -> None:
-        """Make sure that the policy fits an environment.
+        """Check that the policy fits an environment.
 
-        Spaces are compared, and between environments of tpm_gym whether actions are Cartesian or
-        joint increments, which spaces do not tell. What machine it was trained on is not on file.
+        Spaces are compared. So is the control of environments of tpm_gym, since actions that are
+        Cartesian increments and joint increments have equal spaces. The machine may be another:
+        ``description.env_options`` names that of the training.
 
         Args:
-            env: An environment of Gymnasium, wrapped or not, or a vector of Stable-Baselines3.
+            env: Environment of Gymnasium, wrapped or not, or a vector of Stable-Baselines3.
 
         Raises:
-            PolicyMismatchError: It has other observations or actions.
-            InputError: It is no environment.
+            PolicyMismatchError: The environment has other observations or actions.
+            InputError: ``env`` is no environment.
         """
         wanted = self.description
         if not hasattr(env, "observation_space") or not hasattr(env, "action_space"):
@@ -150,12 +145,12 @@ class Policy:
             raise PolicyMismatchError("control", own, found, wanted.env_id)
 
     def __repr__(self) -> str:
-        """Name the policy and its origin."""
+        """Return environment, algorithm and seed of the policy."""
         about = self.description
         return f"<Policy of {about.env_id}, {about.algorithm}, seed {about.seed}>"
 
     def _features(self, entries: Mapping[str, torch.Tensor]) -> torch.Tensor:
-        """What the first layer sees, (n, size)."""
+        """Return the input of the first layer, (n, size)."""
         features = self.description.network.features
         if features.kind == "concatenate":
             return torch.cat([entries[key] for key in features.keys], dim=1)
@@ -165,7 +160,7 @@ class Policy:
     def _check_observation(
         self, observation: Mapping[str, Any]
     ) -> tuple[dict[str, torch.Tensor], bool]:
-        """The entries as (n, size), and whether they came as a batch."""
+        """Return the entries as (n, size), and whether they are a batch."""
         boxes = self.description.observation_space
         if not isinstance(observation, Mapping) or set(observation) != set(boxes):
             given = list(observation) if isinstance(observation, Mapping) else type(observation)
@@ -191,10 +186,7 @@ class Policy:
 
 
 def _control(env: Any) -> str | None:
-    """How actions move the platform of an environment of tpm_gym, or of the first in a vector.
-
-    None where it does not say, as those of others.
-    """
+    """Return the name of an environment's control; None if it is not of tpm_gym."""
     control = getattr(getattr(env, "unwrapped", env), "control", None)
     if hasattr(env, "has_attr") and env.has_attr("control"):
         control = env.get_attr("control")[0]
