@@ -18,7 +18,8 @@ import numpy as np
 
 import tpm_gym  # noqa: F401 - the ids
 from tpm_gym.simulation import Servo
-from tpm_gym.simulation.drives import FEEDFORWARDS, Reference
+from tpm_gym.simulation.drives import FEEDFORWARDS
+from tpm_gym.simulation.engine import Path
 from tpm_gym.tasks import Expert
 
 FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
@@ -46,12 +47,12 @@ def play(env_id: str, engine: str, drive: Servo | None, scripted: bool, episodes
     """Play one episode for each seed from 0 up."""
     env: Any = gym.make(env_id, engine=engine, drive=drive)
     expert = Expert(env) if scripted else None
-    simulated, wanted = env.unwrapped.simulation.engine, [(0.0, 0.0, 0.0)]
+    simulated, wanted = env.unwrapped.simulation.engine, [np.zeros(3)]
     advance = simulated.advance
 
-    def noted(references: Sequence[Reference], *arguments: Any) -> None:
-        wanted[0] = references[-1].theta
-        advance(references, *arguments)
+    def noted(path: Path, *arguments: Any) -> None:
+        wanted[0] = path.joints(1)[0, 0]
+        advance(path, *arguments)
 
     simulated.advance = noted
     row = Row(0, 0, [], [])
@@ -67,9 +68,9 @@ def play(env_id: str, engine: str, drive: Servo | None, scripted: bool, episodes
                 action = expert.act(observation)
             observation, _, terminated, truncated, info = env.step(action)
             done = terminated or truncated
-            motors = simulated.motors()
-            row.errors.extend(np.abs(np.subtract(motors.theta, wanted[0])).tolist())
-            row.torques.extend(np.abs(motors.torque).tolist())
+            now = simulated.read()
+            row.errors.extend(np.abs(now.theta[0] - wanted[0]).tolist())
+            row.torques.extend(np.abs(now.torque[0]).tolist())
         passed = info["assembly_mode_changed"] or info["working_mode_changed"]
         row = row._replace(
             successes=row.successes + bool(info["is_success"]), singular=row.singular + bool(passed)

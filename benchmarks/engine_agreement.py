@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 import tpm_gym  # noqa: F401  (registers the environments)
 from tpm_gym.arrays import FloatArray
 from tpm_gym.mechanism import PAPER_TPM
+from tpm_gym.simulation.engine import spline_weights
 from tpm_gym.simulation.randomisation import Plant
-from tpm_gym.simulation.simulation import Simulation, spline_weights
+from tpm_gym.simulation.simulation import Simulation
 from tpm_gym.simulation.state import CONTROL_PERIOD, Scene
 from tpm_gym.tasks import Expert
 from tpm_gym.tasks.motion import hanging
@@ -153,10 +154,9 @@ def torque_by_theory(inner: Any, commands: FloatArray) -> FloatArray:
         inner: The environment.
         commands: The last three commands (3, 3) m, world.
     """
-    substeps = inner.simulation.engine.substeps
-    step, machine = CONTROL_PERIOD / substeps, inner.machine
-    points = spline_weights(substeps)[-3:] @ machine.mount.to_paper(commands)
-    before, at, after = (np.array(machine.inverse(tuple(point))) for point in points.tolist())
+    step, machine = inner.simulation.engine.time_step, inner.machine
+    points = spline_weights(round(CONTROL_PERIOD / step))[-3:] @ machine.mount.to_paper(commands)
+    before, at, after = machine.inverse(points)
     rate, next_rate = (at - before) / step, (after - at) / step
     torque: FloatArray = machine.dynamics.torque(at, rate, (next_rate - rate) / step)
     return torque
@@ -169,10 +169,11 @@ def energy_lost(engine: str) -> float:
     try:
         theta = machine.inverse(machine.home)
         plant = Plant(motor_strength=(0.0, 0.0, 0.0))
-        start = machine.dynamics.energy(np.array(theta), np.zeros(3))
-        simulation.reset(theta, plant=plant)
+        start = machine.dynamics.energy(theta, np.zeros(3))
+        simulation.reset(np.array([0]), theta, plants=[plant])
         for _ in range(FALL):
-            state = simulation.move(machine.home)
+            simulation.move(np.array([machine.home]), np.array([False]))
+        state = simulation.state().take(0)
     finally:
         simulation.close()
     end = machine.dynamics.energy(state.theta, state.theta_dot)

@@ -27,7 +27,8 @@ from tpm_gym.mechanism.tpm import ASSEMBLY_LIMIT
 from tpm_gym.simulation.bullet.client import Client, silence
 from tpm_gym.simulation.bullet.physics import REGULARISATION, Physics
 from tpm_gym.simulation.bullet.robot import Robot
-from tpm_gym.simulation.simulation import CLOSURE_LIMIT, spline_weights
+from tpm_gym.simulation.engine import spline_weights
+from tpm_gym.simulation.simulation import CLOSURE_LIMIT
 from tpm_gym.simulation.state import CONTROL_PERIOD
 from tpm_gym.tasks import Expert
 from tpm_gym.tasks.control import CartesianControl

@@ -213,5 +213,8 @@ class _Player:
 def _where(env: gym.Env[Any, Any], fresh: bool = False) -> FloatArray:
     """Return angles of the motors, P and objects as last reported, or as they are now."""
     unwrapped: Any = env.unwrapped
-    state = unwrapped.simulation.read() if fresh else unwrapped.state
+    if fresh:
+        now = unwrapped.simulation.engine.read()
+        return np.concatenate([now.theta[0], now.position[0], *now.object_position[0]])
+    state = unwrapped.state
     return np.concatenate([state.theta, state.platform_position, *state.object_position])

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from tpm_gym.learning.checkpoint import CheckpointStore
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.provenance import write_json
 from tpm_gym.learning.run_folder import CHECKPOINTS, CONFIG_FILE, TESTS, WHOLE, evaluations
@@ -113,13 +114,13 @@ def condense(run: Path) -> Record:
     for name in _CURVES:
         if found and all(name in evaluation for evaluation in found):
             curves[name] = [round(evaluation[name]["mean"], 6) for evaluation in found]
-    checkpoints = [path.name for path in run.glob(f"{CHECKPOINTS}/*")]
+    saved = CheckpointStore(run / CHECKPOINTS).steps()
     return {
         "run": run.name,
         **{name: config.get(name) for name in _OF_RUNS},
         "engine": engine,
         "resumed": len(config.get("resumed", [])),
-        "reached": max([0, *steps, *(int(name) for name in checkpoints if name.isdigit())]),
+        "reached": max([0, *steps, *saved]),
         "finished": bool(steps) and steps[-1] >= config["steps"],
         "evaluations": curves,
         # The episodes are left out, and the entries that the run has itself.

@@ -17,8 +17,7 @@ from tpm_gym.kinematics.workspace import conditioning_at
 from tpm_gym.mechanism import TPM
 from tpm_gym.mechanism.dynamics import Dynamics
 from tpm_gym.simulation import Block, Scene, Simulation
-from tpm_gym.simulation.drives import Reference
-from tpm_gym.simulation.simulation import spline_weights
+from tpm_gym.simulation.engine import Path, spline_weights
 from tpm_gym.simulation.state import CONTROL_PERIOD
 from tpm_gym.tasks import sampling
 from tpm_gym.tasks.control import CartesianControl
@@ -132,17 +131,29 @@ class Carry:
         """
         centre = self.machine.mount.to_world(self.first) - hanging(BLOCK)
         with closing(Simulation(Scene(objects=(BLOCK,)), machine=self.machine)) as simulation:
-            theta = self.joints(commands).tolist()
-            simulation.reset(theta[0], {BLOCK.name: centre})
+            theta, on = self.joints(commands).numpy(), np.array([True])
+            simulation.reset(np.array([0]), theta[0], {BLOCK.name: centre[None]})
             for _ in range(2 * SEAL_STEPS):
-                simulation.move(self.first, vacuum=True)
+                simulation.move(np.array([self.first]), on)
             torques = []
-            for a, b, c in theta[1:-2]:
-                simulation.engine.advance([Reference((a, b, c))], vacuum=True)
-                torques.append(simulation.engine.motors().torque)
-            if simulation.read().held != 0:
+            for joints in theta[1:-2]:
+                simulation.engine.advance(_TimeStep(joints), on)
+                torques.append(simulation.engine.read().torque[0])
+            if simulation.engine.read().held[0] != 0:
                 raise RuntimeError("the block was lost")
-        return torch.tensor(torques)
+        return torch.tensor(np.array(torques))
+
+
+class _TimeStep(Path):
+    """Path of one time step, by its joint positions (3,) rad."""
+
+    def __init__(self, theta: FloatArray) -> None:
+        """Store them."""
+        self._theta = theta
+
+    def joints(self, last: int = 0) -> FloatArray:
+        """Return them, (1, 1, 3)."""
+        return self._theta[None, None]
 
 
 def points(commands: Tensor) -> Tensor:

@@ -1,6 +1,6 @@
-"""Types of arrays, the one check of what users hand over as numbers, and rotations of vectors.
+"""Types of arrays, checks of numbers from users, and rotations of vectors.
 
-A check that takes an ``error`` raises it, made of name, value and what would be valid.
+A check that takes an ``error`` raises it with name, value and valid range.
 """
 
 import math
@@ -23,14 +23,14 @@ Quaternion = tuple[float, float, float, float]
 """x, y, z, w."""
 
 _Error = Callable[[str, Any, str], TPMError]
-_LONGEST = 200  # characters of a value that a message repeats
+_LONGEST = 200  # characters of a value in a message
 
 
 def numbers(name: str, value: ArrayLike, error: _Error = InputError) -> FloatArray:
-    """Real numbers of any shape, finite or not; not copied where they are such an array already.
+    """Return real numbers of any shape, finite or not; an array of floats is not copied.
 
-    Strings, dates, complex numbers and whatever else numpy would bend into floats are refused, and
-    so are masked arrays, whose mask would be ignored.
+    Strings, dates, complex numbers and other values that numpy would convert are refused, and so
+    are masked arrays, whose mask would be ignored.
     """
     if type(value) is np.ndarray and value.dtype.char in "df":  # the common case, fast
         return value if value.dtype.char == "d" else value.astype(np.float64)
@@ -50,7 +50,7 @@ def numbers(name: str, value: ArrayLike, error: _Error = InputError) -> FloatArr
 def finite(
     name: str, value: ArrayLike, shape: tuple[int, ...], error: _Error = InputError
 ) -> FloatArray:
-    """Finite numbers of exactly this shape."""
+    """Return finite numbers of exactly this shape."""
     array = numbers(name, value, error)
     # all() costs twice as much
     if array.shape != shape or np.count_nonzero(np.isfinite(array)) < array.size:
@@ -62,7 +62,7 @@ def finite(
 def floats(
     name: str, value: ArrayLike, count: int, error: _Error = InputError
 ) -> tuple[float, ...]:
-    """So many finite numbers, as plain floats."""
+    """Return ``count`` finite numbers as plain floats."""
     array = numbers(name, value, error)
     if array.shape == (count,):
         plain = tuple(array.tolist())
@@ -72,7 +72,7 @@ def floats(
 
 
 def vector(name: str, value: ArrayLike, error: _Error = InputError) -> Vector:
-    """Three finite numbers, as plain floats."""
+    """Return three finite numbers as plain floats."""
     if isinstance(value, tuple) and len(value) == 3:
         a, b, c = value  # the common case, fast
         if type(a) is type(b) is type(c) is float and math.isfinite(a + b + c):
@@ -86,20 +86,20 @@ def vector(name: str, value: ArrayLike, error: _Error = InputError) -> Vector:
 
 
 def is_number(value: Any) -> bool:
-    """Whether that is a finite real number, and no boolean."""
+    """Return whether a value is a finite real number, and no boolean."""
     with suppress(OverflowError):  # an integer beyond the range of floats
         return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
     return False
 
 
 def is_whole(value: Any, least: int) -> bool:
-    """Whether that is a whole number, and no boolean, of at least so much."""
+    """Return whether a value is a whole number of at least ``least``, and no boolean."""
     whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
     return whole and bool(value >= least)
 
 
 def points(name: str, value: ArrayLike) -> FloatArray:
-    """Points (..., 3), finite or not; a torch tensor stays one, on its device, in float64.
+    """Return points (..., 3), finite or not; a torch tensor stays one, on its device, in float64.
 
     Raises:
         InputError: If they are no real numbers or the last axis does not have length 3.
@@ -117,7 +117,7 @@ def points(name: str, value: ArrayLike) -> FloatArray:
 
 
 def finite_points(name: str, value: ArrayLike) -> FloatArray:
-    """Points (..., 3) as :func:`points` returns them, all finite.
+    """Return points (..., 3) as :func:`points` does, all finite.
 
     Raises:
         InputError: If they are no real numbers, not all finite, or not of that shape.
@@ -130,12 +130,12 @@ def finite_points(name: str, value: ArrayLike) -> FloatArray:
 
 
 def is_tensor(value: object) -> bool:
-    """Whether this is a tensor of torch, which is not imported to find out."""
+    """Return whether a value is a tensor; torch is not imported for it."""
     return isinstance(value, getattr(sys.modules.get("torch"), "Tensor", ()))
 
 
 def rotate(quaternion: Quaternion, vector: Vector) -> Vector:
-    """A vector turned by a unit quaternion; plain numbers, for speed."""
+    """Rotate a vector by a unit quaternion."""
     x, y, z, w = quaternion
     a, b, c = vector
     # v + w t + q x t, with t = 2 q x v
@@ -148,8 +148,8 @@ def rotate(quaternion: Quaternion, vector: Vector) -> Vector:
 
 
 def transform(origin: Vector, quaternion: Quaternion, point: Vector) -> Vector:
-    """A point of a frame in the frame's parent, m."""
-    # As rotate(), written out: an engine asks for nine points in each control step.
+    """Convert a point of a frame into the frame's parent, m."""
+    # rotate(), written out for speed: an engine converts nine points in each control step.
     u, v, w = origin
     x, y, z, r = quaternion
     a, b, c = point
@@ -162,15 +162,15 @@ def transform(origin: Vector, quaternion: Quaternion, point: Vector) -> Vector:
 
 
 def _holds_masked(value: Any) -> bool:
-    """Whether this is a masked array, or a sequence with one in it."""
+    """Return whether a value is a masked array, or a sequence that holds one."""
     items = {type(item) for item in value} if isinstance(value, (list, tuple)) else {type(value)}
     return any(issubclass(kind, np.ma.MaskedArray) for kind in items)
 
 
 def brief(value: Any) -> Any:
-    """What a message can repeat of a value: itself, or the beginning of a long one."""
+    """Return a value for a message, or the beginning of a long one."""
     try:
         text = repr(value)
-    except Exception as error:  # integers beyond 4300 digits, and whatever else users write
+    except Exception as error:  # integers beyond 4300 digits, and any other repr() that fails
         return f"{type(value).__name__} ({error})"
     return value if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."

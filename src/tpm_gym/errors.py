@@ -19,7 +19,7 @@ class TPMError(Exception):
     template: ClassVar[str] = ""
 
     def __str__(self) -> str:
-        """The message."""
+        """Return the message."""
         return self.template.format(**vars(self)) if self.template else super().__str__()
 
 
@@ -75,12 +75,12 @@ class UnreachableError(TPMError, ValueError):
     hint: str
 
     def __post_init__(self) -> None:
-        """Plain floats, whatever they came as."""
+        """Convert to plain floats."""
         self.point = tuple(float(value) for value in self.point)
         self.margin = float(self.margin)
 
     def __str__(self) -> str:
-        """The message."""
+        """Return the message."""
         shown = ", ".join(f"{value:.4g}" for value in self.point)
         return f"({shown}) cannot be reached: {self.leg} fails by {-self.margin:.4g} m; {self.hint}"
 

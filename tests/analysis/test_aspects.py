@@ -1,4 +1,4 @@
-"""Reachable sets, aspects and boxes are what brute force on the oracle's factors says they are."""
+"""Reachable sets, aspects and boxes agree with brute force on the factors of the oracle."""
 
 from dataclasses import replace
 from itertools import product
@@ -25,13 +25,13 @@ modes = st.sampled_from(WORKING_MODES)
 
 
 def signs(points: FloatArray, mode: WorkingMode, g: Geometry) -> FloatArray:
-    """Signs (..., 4) of parallel factors and elevation by the oracle; NaN where not reachable."""
+    """Return signs (..., 4) of parallel factors and elevation by the oracle, or NaN."""
     elevation = oracle.elevation_at(points, mode, g)[..., None]
     return np.sign(np.concatenate([oracle.factors_at(points, mode, g)[0], elevation], axis=-1))
 
 
 def of(aspect: Aspect) -> list[int]:
-    """The signs that an aspect claims, as ``signs`` has them."""
+    """Return the signs of an aspect, in the order of ``signs``."""
     return [aspect.assembly.sin_beta, aspect.level3, aspect.assembly.planar, aspect.elevation]
 
 
@@ -63,7 +63,7 @@ def test_volumes_are_those_of_monte_carlo_within_the_stated_error(mode: WorkingM
     volume, noise = box * inside.mean(), box * inside.std() / np.sqrt(len(draws))
     for cells in (coarse, fine):
         assert abs(cells.volume - volume) < cells.volume_error + 3 * noise
-    # and the statement is neither lax nor beyond first order
+    # The bound is not lax, and of first order.
     assert coarse.volume_error < 0.12 * coarse.volume
     assert 1.7 < coarse.volume_error / fine.volume_error < 2.3
 
@@ -90,7 +90,7 @@ VOLUMES = {  # dm^3 by the signs of level3, planar and elevation, in one half
 
 @pytest.mark.slow
 def test_elbows_out_has_sixteen_aspects() -> None:
-    """Eight in each half; the two thinnest need more than cells, and are measured in sections."""
+    """There are eight in each half. The two thinnest are measured in sections, not in cells."""
     found = aspects.aspects(shape=(200, 12, 260))
     assert len(found) == 16
     for side in (-1, 1):
@@ -112,7 +112,7 @@ def test_elbows_out_has_sixteen_aspects() -> None:
 def by_sections(
     signs: tuple[int, int, int], low: tuple[float, float], high: tuple[float, float]
 ) -> float:
-    """Volume of all points y > 0 with these signs, x and z between low and high, m^3."""
+    """Return the volume of points y > 0 with these signs and x, z between low and high, m^3."""
     step = 0.0005
     x, z = (np.arange(a, b, step) + step / 2 for a, b in zip(low, high, strict=True))
     angles, weights = np.polynomial.legendre.leggauss(5)
@@ -127,14 +127,14 @@ def by_sections(
 
 
 def has_signs(points: FloatArray, signs: tuple[int, int, int]) -> NDArray[np.bool_]:
-    """Whether level3, planar and elevation have these signs, elbows-out."""
+    """Return whether level3, planar and elevation have these signs, elbows-out."""
     values = singularity.factors_at(points)
     same = (np.sign(values.parallel[..., 1:]) == signs[:2]).all(axis=-1)
     return np.asarray(same & (np.sign(values.constraint) == signs[2]))
 
 
 def test_coarse_grids_miscount_the_sliver() -> None:
-    """0.148 dm^3 as sections measure it; docs/figures.md says what these cells make of it."""
+    """Sections measure 0.148 dm^3; docs/figures.md has the volumes of such cells."""
     corners = [np.arange(*ends, 0.01) for ends in ((-0.17, 0.23), (-0.46, -0.40))]
     y, found = (np.arange(16) + 0.5) * PAPER.l7 / 16, []
     for shift in product(np.linspace(0, 0.01, 10, endpoint=False), repeat=2):
@@ -259,7 +259,7 @@ def test_samples_are_uniform_over_the_aspect_itself(rank: int) -> None:
     points = aspects.sample(np.random.default_rng(2), aspect, count)
     assert points.shape == (count, 3)
     assert (signs(points, ELBOWS_OUT, PAPER) == of(aspect)).all()
-    # Planes through faces of a far finer grid part the samples as they part its cells
+    # Planes through faces of a much finer grid divide the samples like its cells.
     fine = aspects.aspects(shape=(96, 24, 144))[rank]
     assert of(fine) == of(aspect)
     centres = fine.cells.centres()
@@ -268,7 +268,7 @@ def test_samples_are_uniform_over_the_aspect_itself(rank: int) -> None:
     for axis in range(3):
         share = (centres[:, axis] < middle[axis]).mean()
         assert abs((points[:, axis] < middle[axis]).mean() - share) < 0.02
-    # Cells whose centres are outside take part, others are not filled to the brim
+    # Cells with a centre outside have samples too, and other cells are not full.
     corner = np.floor((points - aspect.cells.low) / aspect.cells.spacing).astype(int)
     own = aspect.cells.mask[tuple(corner.T)]
     assert 0.5 < own.mean() < 0.999
@@ -320,7 +320,7 @@ def test_mechanisms_that_reach_nothing_have_no_aspects() -> None:
 
 
 def largest(g: Geometry, shape: tuple[int, int, int]) -> aspects.Box:
-    """The largest box with conditioning 0.1, y > 0 (y < 0 mirrors it), over all aspects."""
+    """Return the largest box with conditioning 0.1 and y > 0 over all aspects."""
     boxes = []
     for aspect in aspects.aspects(geometry=g, shape=shape):
         if aspect.assembly.sin_beta > 0:

@@ -1,4 +1,4 @@
-"""Which motor moves what: the formulas are derivatives and inverses, and their zeros are exact."""
+"""The formulas of decoupling are derivatives and inverses, and their zeros are exact."""
 
 import re
 from typing import Any
@@ -31,7 +31,7 @@ from tpm_gym.mechanism import PAPER_TPM, WIDE_TPM, Machine
 
 
 def regular(branch: AssemblyMode, seed: int, g: Geometry) -> FloatArray:
-    """Angles away from all singularities."""
+    """Return angles away from all singularities."""
     theta = oracle.angles_on(branch, np.random.default_rng(seed), 60, g, clear=0.1)
     legs = jacobian.factors(theta, branch, g).serial / [1.0, *[g.l3 * g.l4] * 3]
     return theta[(np.abs(legs) > 0.05).all(axis=-1)]
@@ -81,7 +81,7 @@ def test_motor_3_moves_p_along_the_circle_of_link_7() -> None:
     column = jacobian.velocity(theta)[..., 2]
     tangent = oracle.vector(-np.sin(beta), np.cos(beta), 0.0)
     assert np.abs(np.cross(column, tangent)).max() < 1e-12
-    # and a motion along it is no concern of motors 1 and 2
+    # Motors 1 and 2 do not turn for a motion along the tangent.
     rates = (inverse_velocity(theta) @ tangent[..., None])[..., 0]
     assert np.abs(rates[:, :2]).max() < 1e-12
     assert np.abs(rates[:, 2]).min() > 0.05

@@ -33,7 +33,7 @@ def sample(name: str, count: int, seed: int) -> tuple[Tripod, FloatArray]:
 
 
 def gaps(tripod: Tripod, position: FloatArray, q: FloatArray) -> FloatArray:
-    """How far the rods are from their lengths, written out from the legs."""
+    """Return the errors of the rods' lengths, from the legs alone."""
     found = []
     for i, leg in enumerate(tripod.legs):
         turn, axis = q[..., i, None], np.array(leg.axis)
@@ -62,7 +62,7 @@ def test_the_solutions_close_differ_and_lead_back(name: str) -> None:
 
 @both
 def test_each_leg_has_two_solutions_and_no_more(name: str) -> None:
-    """So 8 in all, half of our 16: counted by changes of sign, once round or along the slider."""
+    """So there are 8 in all, half of our 16. Changes of sign along the motor count them."""
     tripod, points = sample(name, 100, 2)
     turns = np.linspace(-np.pi, np.pi, 1440, endpoint=False)[:, None]  # m of a slider
     for leg in range(3):
@@ -109,7 +109,7 @@ def test_the_orthoglide_is_isotropic_at_its_home() -> None:
 
 
 def freedoms(chains: list[Chain], point: FloatArray) -> tuple[int, int]:
-    """Dimension of the common twists of the chains, and of their rotations, by screw theory."""
+    """Return the dimensions of the chains' common twists and rotations, by screw theory."""
     missing = []
     for chain in chains:
         rows = []
@@ -153,7 +153,7 @@ def test_one_chain_is_no_parallel_mechanism() -> None:
 
 
 def as_delta(p: dict[str, FloatArray], row: int) -> Tripod:
-    """Our legs as a Delta's: the platform rigid, with C1, C2 and C3 where they are now."""
+    """Return our legs as those of a Delta: the platform is rigid, with C1, C2 and C3 in place."""
     axes = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, -1.0, 0.0))
     arms = ((0.0, PAPER.l3, 0.0), (PAPER.l3, 0.0, 0.0), (PAPER.l3, 0.0, 0.0))
     one, two, three = (
@@ -189,7 +189,7 @@ def test_the_platform_may_turn_where_the_planes_of_parallelograms_of_balls_share
     hinges = np.array([leg.hinge for leg in tripod.legs])
 
     def volume(points: FloatArray) -> FloatArray:
-        """Of the three planes' normals: 0 where they share a direction."""
+        """Return the volume of the normals of three planes, 0 if the planes share a direction."""
         rods = tripod.parallel(points, tripod.inverse_all(points)[:, 0])
         return np.linalg.det(np.cross(hinges, rods))
 

@@ -49,7 +49,7 @@ def test_stops_are_those_that_the_machine_enforces(machine: Machine) -> None:
 
 
 def slender(model: mujoco.MjModel) -> list[int]:
-    """Geoms of links at least twice as long as wide, but for the base's and the world's."""
+    """Return geoms at least twice as long as wide, without those of the base and the world."""
     found = []
     for index in range(model.ngeom):
         geom = model.geom(index)
@@ -133,7 +133,7 @@ def test_limits_leave_parts_of_sets_and_of_aspects() -> None:
 
 
 def test_the_figures_page_says_what_the_limits_leave() -> None:
-    """Of the elbows-out mode, and of its regions with z_C1 > z_B1, in per cent."""
+    """It has percentages of the elbows-out mode, and of its regions with z_C1 > z_B1."""
     text = " ".join((ROOT / "docs" / "figures.md").read_text(encoding="utf-8").split())
     said = re.search(r"stops leave (\d+)% of it.* and (\d+)% once no two links", text)
     dark = re.search(r"leave (\d+)% of the largest, (\d+)% of the other dark region", text)

@@ -1,4 +1,4 @@
-"""Both modes meet where they are said to, and the numbers of docs/operation-modes.md hold."""
+"""Both modes meet on the surface of the formula; the numbers of docs/operation-modes.md hold."""
 
 import re
 
@@ -27,7 +27,7 @@ PAGE = ROOT / "docs" / "operation-modes.md"
 
 
 def on_the_surface(side: int) -> tuple[FloatArray, FloatArray]:
-    """Points P of the surface on which both modes meet, and angles of postures there."""
+    """Return points P on which both modes meet, and angles of postures there."""
     theta_1, beta = np.meshgrid(np.linspace(0.4, 1.4, 11), np.linspace(0.3, 2.8, 7))
     points = rotated.transition(theta_1, beta, side)
     found = inverse_all(points)
@@ -99,7 +99,7 @@ def test_no_number_of_the_page_is_without_its_test() -> None:
 
 
 def said(name: str, *values: object) -> None:
-    """Print a row of the page's tables, and find it there."""
+    """Check that the page has a row."""
     row = " | ".join([f"| {name}", *map(str, values)]) + " |"
     print(row)
     assert row in PAGE.read_text(encoding="utf-8")
@@ -117,7 +117,7 @@ def shares(g: Geometry) -> tuple[str, str, str]:
 
 
 def volumes(machine: TPM) -> tuple[str, ...]:
-    """dm^3, by random points; and postures of one point, and tilts in the task region."""
+    """Return volumes, dm^3, by random points, postures of one point, tilts in the task region."""
     g, rng = machine.geometry, np.random.default_rng(1)
     reach = g.l3 + g.l4 + 0.4
     low, high = np.array([-reach, -g.l7, -reach]), np.array([reach, g.l7, reach])

@@ -1,4 +1,4 @@
-"""Every slip of the printed paper: its form fails to hold, ours holds. Named after the equations.
+"""For each misprint of the paper: its form does not hold, and ours does. Named by equation.
 
 docs/paper.md lists them in words. The printed forms exist nowhere but here; those of the section
 on topology are in test_paper_topology.py.
@@ -32,10 +32,10 @@ OPEN = 1e-4
 
 
 class Sample(SimpleNamespace):
-    """Random postures, as the oracle has them."""
+    """Random postures of the oracle."""
 
     def __getitem__(self, name: str) -> FloatArray:
-        """x, y, z of a point, (3, n)."""
+        """Return x, y, z of a point, (3, n)."""
         return np.asarray(self.p[name].T)
 
 
@@ -47,7 +47,7 @@ def sample() -> Sample:
 
 
 def gap(b: FloatArray, c: FloatArray) -> FloatArray:
-    """f_i = |BC|^2 - l4^2 in m^2."""
+    """Return f_i = |BC|^2 - l4^2 in m^2."""
     return np.asarray(((c - b) ** 2).sum(axis=-1) - l4**2)
 
 
@@ -72,7 +72,7 @@ def test_text_under_eq_7_y_b1_can_be_zero() -> None:
 
 
 def test_text_under_eq_7_a1_and_b1_vanish_together_at_any_l5_but_c1_only_at_l5_equal_l1() -> None:
-    """Where all three vanish the two circles of Eq. (6) are one, and link 3' moves freely."""
+    """If all three are zero, the circles of Eq. (6) coincide, and link 3' moves freely."""
     for half_short in (0.1, 0.2, l1):
         cos_2 = (l1 - 2 * half_short) / l3  # a1 = 0
         theta = [np.pi - np.arccos(cos_2), np.arccos(cos_2), 0.0]  # b1 = 0, y_B1 = 2 l5
@@ -105,7 +105,7 @@ def test_eq_8b_second_line_gives_x_c1_not_z_c1(sample: Sample) -> None:
 
 
 def test_forward_kinematics_prints_f1_equal_to_e1(sample: Sample) -> None:
-    """Then the section on inverse kinematics, applied to that P, does not find the posture."""
+    """With this P, the section on inverse kinematics does not find the posture."""
     printed_p = sample.p["E1"] + [l2, 0, 0]
     ours_p = sample.p["P"]
     for p, check in ((printed_p, assert_open), (ours_p, assert_closed)):
@@ -137,14 +137,14 @@ def test_forward_kinematics_prints_y_d3_minus_l6_as_z_of_c3(sample: Sample) -> N
 
 
 def half_angle(z: FloatArray, g: FloatArray, h: FloatArray) -> FloatArray:
-    """Eqs. (13) and (15): both signs, (2, n); NaN where not real."""
+    """Return Eqs. (13) and (15) for both signs, (2, n); NaN where not real."""
     with np.errstate(invalid="ignore", divide="ignore"):
         root = np.sqrt(4 * z**2 * l3**2 - g * h)
         return np.asarray(2 * np.arctan((2 * l3 * z + [[1], [-1]] * root) / g))
 
 
 def leg_gaps(sample: Sample, leg: int, angles: FloatArray) -> FloatArray:
-    """f_leg at other angles of that leg, in m^2."""
+    """Return f_leg at other angles of the leg, in m^2."""
     theta = np.repeat(sample.theta[None], 2, axis=0)
     theta[..., leg - 1] = angles
     arms = oracle.points(theta, sample.x_c, sample.z_c, sample.beta, PAPER)[f"B{leg}"]
@@ -154,7 +154,7 @@ def leg_gaps(sample: Sample, leg: int, angles: FloatArray) -> FloatArray:
 def assert_leg(
     sample: Sample, leg: int, printed: FloatArray, ours: FloatArray, among: Any = slice(None)
 ) -> None:
-    """Our angles close the leg and contain the true one; the printed ones do not."""
+    """Check that our angles close the leg and contain the true one, and the printed ones do not."""
     turned = np.abs(np.exp(1j * ours) - np.exp(1j * sample.theta[:, leg - 1])).min(axis=0)
     # Half angles lose digits near g = 0 and near a double root, so judge where they do not.
     good = np.isfinite(ours).all(axis=0) & (np.abs(np.cos(ours / 2)).min(axis=0) > 1e-2)
@@ -223,7 +223,7 @@ def test_number_of_inverse_solutions_is_2_2_2_2_not_4_4_2() -> None:
 
 
 def numeric_determinant(sample: Sample) -> FloatArray:
-    """det of d(f1, f2)/d(xC, zC), in m^2, by central differences (exact for squares)."""
+    """Return det of d(f1, f2)/d(xC, zC), m^2, by central differences (exact for squares)."""
     step = 1e-3
     columns = []
     for dx, dz in ((step, 0.0), (0.0, step)):
@@ -266,7 +266,7 @@ def test_eq_16_other_factors_are_as_printed_in_centimetres(sample: Sample) -> No
 
 
 def motor_derivative(sample: Sample, leg: int) -> FloatArray:
-    """d f_leg / d theta_leg in cm^2/rad, by differences of fourth order."""
+    """Return d f_leg / d theta_leg in cm^2/rad, by differences of fourth order."""
 
     def value(turn: float) -> FloatArray:
         return leg_gaps(sample, leg, sample.theta[:, leg - 1] + turn)[0]
@@ -295,7 +295,7 @@ def test_eq_17_theta_2_factor_lacks_x_c1(sample: Sample) -> None:
 
 
 def test_eq_17_theta_3_factor_lacks_l6(sample: Sample) -> None:
-    """Printed with z_C1 for z_C3 = z_C1 + l6, as if F1 were E1; Eq. (10) has it right."""
+    """It is printed with z_C1 in place of z_C3 = z_C1 + l6, as if F1 were E1; Eq. (10) is right."""
     s, c, cb = np.sin(sample.theta[:, 2]), np.cos(sample.theta[:, 2]), np.cos(sample.beta)
     x, z, truth = 100 * sample.x_c, 100 * sample.z_c, motor_derivative(sample, 3)
     printed = 350 * cb * s + 70 * x * s - 1120 * s - 70 * z * c

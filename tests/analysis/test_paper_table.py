@@ -1,4 +1,4 @@
-"""docs/paper.md covers every equation, and what it names (functions, tests, sections) exists."""
+"""docs/paper.md covers all equations, and all functions, tests and sections that it names exist."""
 
 import importlib
 import re
@@ -20,7 +20,7 @@ def names_of_tests(file: str) -> set[str]:
 
 
 def anchor(heading: str) -> str:
-    """As GitHub makes them."""
+    """Return an anchor as GitHub makes it."""
     return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
 
 

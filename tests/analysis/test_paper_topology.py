@@ -1,4 +1,4 @@
-"""Every slip of the paper's topology section: what is printed cannot be, what we compute is.
+"""For each misprint of the topology section: the printed form is impossible, and ours holds.
 
 Named after the equations; docs/paper.md lists them in words.
 """

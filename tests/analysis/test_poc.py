@@ -1,4 +1,4 @@
-"""POC sets are pairs of subspaces, and Eqs. 1 to 5 combine them as the paper says."""
+"""POC sets are pairs of subspaces, and Eqs. (1) to (5) combine them as in the paper."""
 
 import numpy as np
 import pytest
@@ -128,7 +128,7 @@ def test_three_parallel_revolutes_give_t2_r1(axis: tuple[float, ...], seed: int)
 
 
 def far_link_freedoms(short: FloatArray, rod: FloatArray) -> FloatArray:
-    """(k, 6): null space (v, omega) of two rods of fixed length at both ends of the far link."""
+    """Return the null space (v, omega), (k, 6), of two rods of fixed length at the far link."""
     rows = [np.concatenate([rod, np.cross(side * short / 2, rod)]) for side in (1, -1)]
     return np.asarray(np.linalg.svd(np.array(rows))[2][2:])
 

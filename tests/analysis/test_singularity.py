@@ -1,4 +1,4 @@
-"""Singularities are what the oracle's factors say, and as far away as brute force finds them."""
+"""Singularities agree with the oracle's factors, and their distances with brute force."""
 
 import numpy as np
 import oracle
@@ -28,7 +28,7 @@ SIDES = [AssemblyMode(planar, 1) for planar in (-1, 1)]
 
 
 def oracle_factors(points: FloatArray, mode: WorkingMode, g: Geometry) -> FloatArray:
-    """(..., 8) dimensionless factors by the oracle; NaN where not reachable."""
+    """Return dimensionless factors (..., 8) by the oracle; NaN where not reachable."""
     sizes = np.array([1, g.l4, g.l4**2, 1, g.l3 * g.l4, g.l3 * g.l4, g.l3 * g.l4, g.l4])
     elevation = oracle.elevation_at(points, mode, g)[..., None]
     return np.concatenate([*oracle.factors_at(points, mode, g), elevation], axis=-1) / sizes
@@ -42,7 +42,7 @@ def rays(count: int, seed: int) -> FloatArray:
 def ball_is_clear(
     point: FloatArray, radius: float, mode: WorkingMode, g: Geometry, count: int
 ) -> bool:
-    """Whether no sign changes within 0.999 of the radius; brute force along rays, by the oracle."""
+    """Return whether no sign changes within 0.999 of the radius, along rays, by the oracle."""
     steps = np.append(np.linspace(0.05, 0.95, 19), [0.99, 0.999])
     ball = point + radius * steps[:, None, None] * rays(count, 1)
     clear = np.sign(oracle_factors(ball, mode, g)) == np.sign(oracle_factors(point, mode, g))
@@ -115,7 +115,7 @@ def vanishing(found: singularity.Classification) -> list[str]:
 
 
 def edge_of_leg3(x: float, y: float, g: Geometry = PAPER) -> FloatArray:
-    """The lowest point above (x, y) that leg 3 reaches: folded."""
+    """Return the lowest point above (x, y) that leg 3 reaches, folded."""
     level = np.sqrt(g.l4**2 - y**2) - g.l3
     return np.array([x, y, g.l6 + np.sqrt(level**2 - (x + g.l2 - g.l1) ** 2)])
 
@@ -148,7 +148,7 @@ def test_the_kinds() -> None:
 
 
 def test_constraint_singularities_are_those_of_the_arm_that_levels_the_rods() -> None:
-    """Where z_C1 = z_B1, on half of the modes that reach the point; no other factor is small."""
+    """z_C1 = z_B1 on half of the modes that reach the point, and no other factor is small there."""
     cos1 = 0.6
     point = oracle.level_rod_4(np.arccos(cos1), beta=0.6)
     kinds = []
@@ -200,7 +200,7 @@ def compare(
 
 @pytest.mark.slow
 def test_distance_is_never_too_large() -> None:
-    """1,000 points and more of all modes, half of them beside the constraint's surface."""
+    """More than 1,000 points of all modes, half of them beside the constraint's surface."""
     rng = np.random.default_rng(6)
     some = oracle.reachable_points(rng, 1000, PAPER)
     theta_1, beta = rng.uniform(-np.pi, np.pi, 1000), rng.uniform(0.05, 3.0, 1000)

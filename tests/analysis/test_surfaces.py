@@ -22,7 +22,7 @@ ON_CIRCLE = [c1**2 + s1**2 - 1, c2**2 + s2**2 - 1, c3**2 + s3**2 - 1]
 
 
 def closures() -> list[Any]:
-    """B_iC_i = l4, in xC, zC and u."""
+    """Return the closures B_iC_i = l4 in xC, zC and u."""
     g = CM
     level_2, level_3 = x_c - 2 * g.l5 + g.l1 - g.l3 * c2, x_c + u + 2 * g.l2 - g.l1 - g.l3 * c3
     return [
@@ -90,7 +90,7 @@ def test_degrees_along_a_line_and_no_u_is_left(name: str) -> None:
 
 
 def sheet(name: str, mode: Any, g: Geometry, one: FloatArray, other: FloatArray) -> FloatArray:
-    """Points (n, 3) where a factor of a mode changes its sign between two points (m, 3)."""
+    """Return points (n, 3) where a factor changes its sign between two points (m, 3)."""
     index = {"level3": 1, "planar": 2}.get(name)
 
     def value(points: FloatArray) -> FloatArray:
@@ -112,7 +112,7 @@ def sheet(name: str, mode: Any, g: Geometry, one: FloatArray, other: FloatArray)
 
 
 def boundary(leg: int, g: Geometry, seed: int) -> FloatArray:
-    """Points (n, 3) where a leg is stretched or folded."""
+    """Return points (n, 3) where a leg is stretched or folded."""
     rng = np.random.default_rng(seed)
     beta, swing = rng.uniform(-np.pi, np.pi, (2, 300))
     out = rng.uniform(-1, 1, 300) * (0.4 * g.l4 if leg == 1 else g.l7)
@@ -130,7 +130,7 @@ def boundary(leg: int, g: Geometry, seed: int) -> FloatArray:
 
 
 def assert_zero(name: str, points: FloatArray, g: Geometry) -> None:
-    """Against what the polynomial is 1% of l4 beside it."""
+    """Check for zero, compared with the polynomial 1% of l4 away."""
     near = [
         np.abs(polynomial(name, *(points + 0.01 * g.l4 * step).T, g))
         for step in (*np.eye(3)[[0, 2]], *-np.eye(3)[[0, 2]])
@@ -161,7 +161,7 @@ def test_the_polynomials_vanish_where_a_leg_is_stretched_or_folded(leg: int, g: 
 
 @pytest.mark.parametrize(("name", "index"), [("level3", 1), ("planar", 2)])
 def test_every_real_zero_within_reach_is_singular_in_some_mode(name: str, index: int) -> None:
-    """Elimination adds nothing here: along lines in (xC, zC), by all roots of the polynomial."""
+    """Elimination adds no zeros: all roots of the polynomial along lines in (xC, zC) count."""
     t = np.cos(np.pi * (np.arange(40) + 0.5) / 40)
     rng, singular, checked = np.random.default_rng(6), 0, 0
     for _ in range(60):

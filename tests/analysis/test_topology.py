@@ -1,4 +1,4 @@
-"""Eqs. 1 to 5 give the paper's numbers, screw theory and the rank of the loops agree with them."""
+"""Eqs. (1) to (5) give the paper's numbers, and screw theory and the rank of the loops agree."""
 
 from dataclasses import replace
 
@@ -36,7 +36,7 @@ def same(a: Subspace, b: Subspace) -> bool:
 def configurations(
     seed: int, count: int, g: Geometry = PAPER, clear: float = 1e-2
 ) -> list[tuple[FloatArray, AssemblyMode]]:
-    """Random angles with an assembly mode, away from every singularity by ``clear`` (scaled)."""
+    """Return random angles with an assembly mode, ``clear`` (scaled) away from singularities."""
     rng = np.random.default_rng(seed)
     found = []
     for branch in ASSEMBLY_MODES:
@@ -178,7 +178,7 @@ def test_screw_theory_finds_the_same_sets() -> None:
 
 
 def joints_of_the_mechanism() -> list[str]:
-    """All but the cup's slide, which belongs to the tool."""
+    """Return all joints without the cup's slide, which is part of the tool."""
     joints = [link.joint.name for link in build().links if link.joint]
     return [name for name in joints if name != "cup_slide"]
 
@@ -222,7 +222,7 @@ def test_the_idle_freedom_is_end_link_10_about_its_own_axis() -> None:
 def on_constraint_singularity(
     theta_1: float, side: int, offset: float = 0.0
 ) -> list[tuple[FloatArray, AssemblyMode]]:
-    """Configurations with z_C1 = z_B1 + offset."""
+    """Return configurations with z_C1 = z_B1 + offset."""
     point = oracle.level_rod_4(theta_1, np.arcsin(0.6), side, offset)
     solutions = inverse_all(point)
     found = []

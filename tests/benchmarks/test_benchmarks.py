@@ -1,4 +1,4 @@
-"""The benchmarks run, and find what they are there to find: failures, growth, drift."""
+"""The benchmarks run, and find failures, growth and drift."""
 
 from pathlib import Path
 from types import BuiltinFunctionType
@@ -126,12 +126,6 @@ def test_a_peer_that_cannot_run_is_a_line_in_the_table(monkeypatch, capsys):
     assert "PandaReach-v3" in capsys.readouterr().out
 
 
-def test_an_environment_of_ours_that_cannot_run_ends_the_benchmark(monkeypatch):
-    monkeypatch.setattr(bench_speed.gym, "make", lambda env_id: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        bench_speed.main(["--contestants", "TPMReach-v0", "--rounds", "1", "--steps", "5"])
-
-
 def test_ratios_are_taken_within_a_round():
     def contestant(env_id, seconds):
         return bench_speed.Contestant(env_id, None, seconds, [0.0] * 3, [0] * 3)
@@ -145,11 +139,6 @@ def test_ratios_are_taken_within_a_round():
     assert found[bench_speed.BASELINE]["ratio_to_baseline"] == (1.0, 1.0, 1.0)
 
 
-def test_profile_names_where_the_time_goes(capsys):
-    bench_speed.main(["--profile", "--steps", "1"])
-    assert "(advance)" in capsys.readouterr().out
-
-
 # -- endurance ------------------------------------------------------------------------------------
 
 
@@ -157,7 +146,7 @@ SHORT = ["--steps", "1200", "--every", "100", "--warm-up", "300"]
 
 
 def soaked(folder: Path, *options: str, **hooks: Any) -> tuple[int, dict[str, Any]]:
-    """Status and file of a short soak."""
+    """Return status and file of a short soak."""
     numbers = folder / "soak.json"
     return soak.main([*SHORT, "--json", str(numbers), *options], **hooks), read_strict(numbers)
 
@@ -226,16 +215,6 @@ def test_replay_raises_what_the_visit_raised():
     assert soak.main(["--replay", "3"]) == 0
 
 
-def test_a_soak_that_only_fails_ends(capsys):
-    def make(env_id, **options):
-        raise RuntimeError("no environment")
-
-    assert soak.main(SHORT, make=make) == 1
-    output = capsys.readouterr()
-    assert f"{soak.MOST_FAILURES} exceptions" in output.out
-    assert "NOT FINISHED" in output.out
-
-
 class Growing(gym.Wrapper):
     """Keeps 200 kB a step."""
 
@@ -260,21 +239,6 @@ def test_memory_that_grows_is_found(tmp_path):
     assert verdict["nothing_raised"]
 
 
-def test_an_interrupted_soak_keeps_its_samples_and_does_not_pass(tmp_path, monkeypatch):
-    run_visit = soak.Soak.run_visit
-
-    def interrupted(self, number):
-        if self.steps > 500:
-            raise KeyboardInterrupt
-        run_visit(self, number)
-
-    monkeypatch.setattr(soak.Soak, "run_visit", interrupted)
-    status, content = soaked(tmp_path)
-    assert status == 1
-    assert len(content["samples"]) >= 4
-    assert not content["finished"]
-
-
 def test_a_restored_state_that_goes_on_otherwise_is_found(monkeypatch):
     env = gym.make("TPMReach-v0")
     env.reset(seed=0)
@@ -287,7 +251,7 @@ def test_a_restored_state_that_goes_on_otherwise_is_found(monkeypatch):
 
 
 def samples(slope: float, noise: float) -> dict[str, Any]:
-    """A finished soak of a million steps whose gaps start at 10 um and grow by ``slope`` m."""
+    """Return a soak of a million steps with gaps that start at 10 um and grow by ``slope`` m."""
     rng = np.random.default_rng(0)
     steps = np.arange(5_000, 1_000_001, 5_000)
     gaps = 1e-5 + slope * steps / 1e6 + noise * rng.standard_normal(len(steps))
@@ -331,14 +295,8 @@ def test_the_baseline_waits_for_the_warm_up_and_for_all_environments():
     assert verdict["memory_within_limit"]
     content["samples"][-1]["memory_mb"] = 110.5
     assert not soak_report.judge(content)["passed"]
-
-
-def test_too_few_samples_do_not_pass():
-    content = samples(0.0, 1e-8)
-    del content["samples"][11:]
-    verdict = soak_report.judge(content)
-    assert verdict["closure_drift"] is None
-    assert not verdict["passed"]
+    del content["samples"][11:]  # too few
+    assert not soak_report.judge(content)["passed"]
 
 
 def test_bench_drives_compares_all_drives():

@@ -42,6 +42,7 @@ from trainings import PPO_RECIPE, SAC_RECIPE, assert_equal_runs, without_times
 
 import tpm_gym
 from tpm_gym.errors import ConfigurationError
+from tpm_gym.learning.checkpoint import CheckpointStore
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.run_folder import claimed
 from tpm_gym.simulation.randomisation import LIMITS, Randomisation
@@ -303,8 +304,7 @@ def small(folder: Path, seed: int) -> Run:
 
 def newest(run: Run) -> int:
     """Step of the last checkpoint of a run."""
-    names = [path.name for path in run.folder.glob("checkpoints/*")]
-    return max((int(name) for name in names if name.isdigit()), default=-1)
+    return max(CheckpointStore(run.folder / "checkpoints").steps(), default=-1)
 
 
 def lasting(run: Run) -> Any:
@@ -357,7 +357,8 @@ def test_a_run_that_broke_off_is_collected_as_far_as_it_was_saved(run: Run, tmp_
     for folder in (early, late):
         folder.mkdir(parents=True)
         (folder / "config.json").write_text(json.dumps(config))
-    (early / "checkpoints" / "000000200").mkdir(parents=True)
+    (early / "checkpoints").mkdir()
+    (early / "checkpoints" / "000000200.checkpoint").write_bytes(b"")
     # The disk was full.
     (late / "evaluations.jsonl").write_text('{"steps": 60, "wall_seconds": 1.0}\n{"steps": 70, "w')
 

@@ -1,7 +1,7 @@
-"""The variants of the fidelity benchmark are the same mechanism, cut elsewhere.
+"""The variants of the fidelity benchmark are the same mechanism with other cuts.
 
-And the reason why the default is cut at the base too: Bullet's direct solver holds loops between
-multibodies, and loses them within one.
+The default is cut at the base too, because Bullet's direct solver holds loops between multibodies,
+and loses them within one.
 """
 
 import fidelity_lab
@@ -30,7 +30,7 @@ def postures(count: int) -> np.ndarray:
 
 @each
 def test_moving_any_passive_joint_opens_a_loop_unless_it_is_idle(variant: Variant) -> None:
-    """So the test below would see a wrong angle."""
+    """So the next test would find a wrong angle."""
     idle = {"Sa_roll", "Sb_roll", "cup_slide"}
     if variant.name in {"three legs", "one body", "rods 4 spherical", "rods 4 cut at arm"}:
         idle |= {"R33"}  # rolls end link 10 about the line through both of its balls
@@ -72,7 +72,7 @@ def test_masses_are_those_of_the_default_but_for_new_crosses(variant: Variant) -
 
 @each
 def test_links_have_no_products_of_inertia(variant: Variant) -> None:
-    """With them the engine would turn the frame in which the closures' pivots are given."""
+    """Products of inertia would make the engine turn the frame of the closures' pivots."""
     for link in variant.mechanism.links[1:]:
         off_diagonal = link.inertia - np.diag(np.diag(link.inertia))
         assert np.abs(off_diagonal).max() < 1e-12, link.name
@@ -116,7 +116,7 @@ def mean_gap(**settings: object) -> float:
 
 
 def test_the_gap_is_the_error_of_the_time_step_and_nothing_else() -> None:
-    """It goes with the square of the step over erp, and does not depend on the cut."""
+    """It is proportional to the squared time step over erp, and does not depend on the cut."""
     default = mean_gap(erp=0.8)
     assert default / mean_gap(erp=0.8, time_step=1 / 500) == pytest.approx(4, rel=0.1)
     assert mean_gap(erp=0.4) / default == pytest.approx(2, rel=0.1)
@@ -134,7 +134,7 @@ def test_the_matrix_solvers_lose_loops_within_one_multibody(solver: str) -> None
 
 
 def test_one_step_tells_the_wrong_matrix_from_the_right_one() -> None:
-    """Two algorithms on Bullet's matrix agree in a wrong answer; without the matrix it is right."""
+    """Two algorithms on Bullet's matrix agree on a wrong answer; without the matrix it is right."""
     point = np.array((-0.04, 0.028, 0.80))
 
     def left(variant: str, solver: str) -> float:
@@ -170,7 +170,7 @@ def test_iterations_per_decade_of_a_known_matrix() -> None:
 
 
 def test_torque_control_applies_what_is_fed_forward() -> None:
-    """With the torques that carry the weight alone it hardly moves; with less it falls."""
+    """With torques that balance gravity it hardly moves; with less it falls."""
     theta = inverse(np.array([-0.1, 0.03, 0.75]))
     torques = PAPER_TPM.dynamics.gravity(theta)
     speeds = []

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from processes import TPM_GYM, printed_by, signalled
 from stable_baselines3 import SAC
+from stable_baselines3.common.logger import Logger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from trainings import (
     Killed,
@@ -31,7 +32,7 @@ import tpm_gym
 from tpm_gym.learning import ResumeConfig, TrainingConfig, resume, train
 from tpm_gym.learning.checkpoint import CheckpointStore, Content
 from tpm_gym.learning.configuration import complete
-from tpm_gym.learning.logger import make_logger
+from tpm_gym.learning.errors import CheckpointError
 from tpm_gym.learning.training import make_model, make_training_envs
 from tpm_gym.learning.training_state import EpisodeRecorder, restore
 
@@ -167,26 +168,15 @@ def takes_another_course(self: EpisodeRecorder, episode: dict[str, Any]) -> Any:
     return REPLAY(self, {**episode, "actions": actions})
 
 
-def fails(self: EpisodeRecorder, episode: dict[str, Any]) -> Any:
-    return None
-
-
-@pytest.mark.parametrize("replay", [takes_another_course, fails])
-def test_an_episode_that_cannot_go_on_is_ended_and_not_joined_to_another(
+@pytest.mark.parametrize("replay", [takes_another_course, lambda self, episode: None])
+def test_episodes_are_whole_and_a_run_whose_episode_does_not_repeat_is_refused(
     replay: Callable[..., Any], killed: Kill, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert_whole_episodes(end_of(uninterrupted("sac")))
-    run, console = killed(140, checkpoint_every=130).run, quiet()
+    run = killed(140, checkpoint_every=130).run
     monkeypatch.setattr(EpisodeRecorder, "replay", replay)
-    resume(ResumeConfig(run, steps=220), console)
-    assert "could not be repeated exactly, so new ones begin" in said(console)
-    end = end_of(run)
-    assert_whole_episodes(end)
-    last = 129  # of the third episode, 100 to 129 is what there was
-    assert end.arrays["buffer/ep_length"][last, 0] == 30
-    assert end.arrays["buffer/timeouts"][last, 0] == 1
-    goals = end.arrays["buffer/observations/desired_goal"][:, 0]
-    assert not np.array_equal(goals[last + 1], goals[0])  # not the first episode over again
+    with pytest.raises(CheckpointError, match=r"do not repeat.*equal versions.*--overwrite"):
+        resume(ResumeConfig(run), quiet())
 
 
 def test_resuming_neither_acts_at_random_again_nor_runs_a_pickle(
@@ -206,18 +196,15 @@ def test_resuming_neither_acts_at_random_again_nor_runs_a_pickle(
     assert not random_actions
 
 
-def test_saving_changes_nothing_and_the_optimiser_moves_what_was_restored(
-    tmp_path: Path, killed: Kill
-) -> None:
+def test_the_optimiser_moves_what_was_restored(killed: Kill) -> None:
     """An optimiser that holds other tensors than the networks would train nothing."""
     config = complete(killed(260))
     content = CheckpointStore(config.run / "checkpoints").load(pytest.fail)
     assert content is not None
     envs = make_training_envs(config)
     model = make_model(config, envs)
-    (tmp_path / "log").mkdir()
-    model.set_logger(make_logger(tmp_path / "log"))
     restore(model, content)
+    model.set_logger(Logger(None, []))
     assert isinstance(model, SAC)
     before = {name: value.clone() for name, value in model.policy.state_dict().items()}
     entropy = model.log_ent_coef.item()
@@ -227,7 +214,6 @@ def test_saving_changes_nothing_and_the_optimiser_moves_what_was_restored(
     ]
     assert len(moved) == len(before)
     assert model.log_ent_coef.item() != entropy
-    model.logger.close()
     envs.close()
 
 
@@ -242,7 +228,7 @@ def kill_beyond(run: Path, step: int, words: list[str]) -> None:
 
 
 def newest(run: Path) -> int:
-    return max((int(path.stem) for path in run.glob("checkpoints/*.checkpoint")), default=-1)
+    return max(CheckpointStore(run / "checkpoints").steps(), default=-1)
 
 
 def test_kill_9_costs_nothing(tmp_path: Path) -> None:

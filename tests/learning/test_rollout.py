@@ -1,18 +1,20 @@
 """Episodes repeat exactly, records say what happened, and intervals cover what they promise."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import scipy.stats
 from numpy.typing import NDArray
 
-import tpm_gym  # noqa: F401  # registers the ids
+from tpm_gym.envs.vector import TPMVectorEnv
+from tpm_gym.learning.environments import make_envs
 from tpm_gym.learning.errors import PolicyError, RolloutError
 from tpm_gym.learning.estimates import Estimate, bootstrap, wilson
 from tpm_gym.learning.policies import load_policy, trained_in
@@ -20,33 +22,38 @@ from tpm_gym.learning.rollout import (
     SELECTION_SEED,
     TEST_SEED,
     Episode,
-    GoalEnv,
     run_episodes,
     summarise,
 )
 
+PICK = "TPMPickAndPlace-v0"
 
-class ScriptedEnv(gym.Env[dict[str, NDArray[Any]], NDArray[Any]]):
-    """Delivers the steps it was given, in every episode."""
+
+class Scripted:
+    """Vector of one environment that delivers the steps it was given, in every episode."""
+
+    num_envs = 1
 
     def __init__(self, steps: list[dict[str, Any]]) -> None:
         self.steps = steps
-        self.seeds: list[int | None] = []
+        self.seeds: list[int] = []
 
-    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int) -> tuple[Any, dict[str, Any]]:
         self.seeds.append(seed)
         self.index = 0
         return {}, {}
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        info = dict(self.steps[self.index])
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        info = {name: np.array([value]) for name, value in self.steps[self.index].items()}
         self.index += 1
-        truth = np.zeros(3)
-        observed = truth + [0.0, 0.0, info.pop("fk_error")]
+        truth, gap = np.zeros((1, 3)), info.pop("fk_error")
         self.state = SimpleNamespace(
-            fk_position=observed, platform_position=truth, torque=info.pop("torque")
+            fk_position=truth + [[0.0, 0.0, gap[0]]],
+            platform_position=truth,
+            torque=info.pop("torque"),
         )
-        return {}, info.pop("reward"), False, self.index == len(self.steps), info
+        done = np.array([self.index == len(self.steps)])
+        return {}, info.pop("reward"), np.array([False]), done, info
 
 
 class Idle:
@@ -55,11 +62,11 @@ class Idle:
     def __init__(self) -> None:
         self.seeds: list[int] = []
 
-    def reset(self, observation: Any, seed: int) -> None:
-        self.seeds.append(seed)
+    def reset(self, observation: Any, seeds: Sequence[int]) -> None:
+        self.seeds += seeds
 
     def act(self, observation: Any) -> NDArray[Any]:
-        return np.zeros(3)
+        return np.zeros((1, 3))
 
 
 def scripted_step(
@@ -77,14 +84,13 @@ def scripted_step(
 
 
 @pytest.fixture(scope="module")
-def reach() -> Iterator[GoalEnv]:
-    env = gym.make("TPMReach-v0")
-    yield env
-    env.close()
+def reach() -> Iterator[TPMVectorEnv]:
+    with closing(make_envs("TPMReach-v0", 1)) as envs:
+        yield envs
 
 
 def test_record_says_what_happened() -> None:
-    env = ScriptedEnv(
+    env = Scripted(
         [
             scripted_step(-1.0, False, 0.5, 1e-5),
             scripted_step(-0.5, True, 0.07, 7e-5),
@@ -107,27 +113,28 @@ def test_record_says_what_happened() -> None:
         torque_peak=6.0,
     )
     assert record.as_dict()["return"] == -1.75
-    (record,) = run_episodes(ScriptedEnv([scripted_step(success=True)]), Idle(), 1, first_seed=0)
+    (record,) = run_episodes(Scripted([scripted_step(success=True)]), Idle(), 1, first_seed=0)
     assert record.success_at_end
     assert record.success_once
 
 
 def test_seeds_count_up_for_environment_and_policy() -> None:
-    env, policy = ScriptedEnv([scripted_step()]), Idle()
+    env, policy = Scripted([scripted_step()]), Idle()
     records = run_episodes(env, policy, 3, first_seed=40)
     assert [record.seed for record in records] == env.seeds == policy.seeds == [40, 41, 42]
 
 
 def test_hooks_see_every_frame_and_episode() -> None:
-    frames, episodes = [], []
-    env = ScriptedEnv([scripted_step()] * 4)
+    frames: list[int] = []
+    episodes: list[int] = []
+    env = Scripted([scripted_step()] * 4)
     run_episodes(
         env,
         Idle(),
         2,
         0,
         on_frame=lambda: frames.append(env.index),
-        on_episode=lambda: episodes.append(len(frames)),
+        on_episodes=lambda count: episodes.append(count * len(frames)),
     )
     assert frames == [0, 1, 2, 3, 4] * 2
     assert episodes == [5, 10]
@@ -137,13 +144,28 @@ def test_hooks_see_every_frame_and_episode() -> None:
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_values_that_are_not_finite_raise(name: str, value: float) -> None:
     wrong = np.array([0.0, value, 0.0]) if name == "torque" else value
-    env = ScriptedEnv([scripted_step(), scripted_step() | {name: wrong}])
+    env = Scripted([scripted_step(), scripted_step() | {name: wrong}])
     with pytest.raises(RolloutError, match=f"seed 3, step 1: {name} is {value}"):
         run_episodes(env, Idle(), 1, first_seed=3)
 
 
+@pytest.mark.parametrize("spec", ["random", "expert", PICK])
+def test_batches_give_the_records_of_single_environments(spec: str) -> None:
+    """More episodes than environments; returns only to the rounding of the network's batches."""
+    options = {"engine": "analytic", "randomisation": {"latency": 1}}
+    records = []
+    for count in (1, 3):
+        with closing(make_envs(PICK, count, **options)) as envs:
+            records.append(run_episodes(envs, load_policy(spec, envs), 5, TEST_SEED))
+    for one, other in zip(*records, strict=True):
+        rounded = {name: 0.0 for name, value in vars(one).items() if isinstance(value, float)}
+        assert replace(one, **rounded) == replace(other, **rounded)
+        for name in rounded:
+            assert getattr(one, name) == pytest.approx(getattr(other, name), abs=1e-3), name
+
+
 @pytest.mark.parametrize("spec", ["random", "expert"])
-def test_same_seeds_same_records(reach: GoalEnv, spec: str) -> None:
+def test_same_seeds_same_records(reach: TPMVectorEnv, spec: str) -> None:
     policy = load_policy(spec, reach)
     records = run_episodes(reach, policy, 4, first_seed=100)
     assert run_episodes(reach, load_policy(spec, reach), 4, first_seed=100) == records
@@ -152,10 +174,10 @@ def test_same_seeds_same_records(reach: GoalEnv, spec: str) -> None:
     assert len({record.total_reward for record in records}) > 1 or spec == "random"
 
 
-def test_random_actions_fill_the_action_space(reach: GoalEnv) -> None:
+def test_random_actions_fill_the_action_space(reach: TPMVectorEnv) -> None:
     policy = load_policy("random", reach)
-    policy.reset({}, seed=0)
-    actions = np.array([policy.act({}) for _ in range(2000)])  # (2000, 3)
+    policy.reset({}, [0])
+    actions = np.concatenate([policy.act({}) for _ in range(2000)])  # (2000, 3)
     assert reach.action_space.contains(policy.act({}))
     np.testing.assert_allclose(actions.mean(axis=0), 0.0, atol=0.06)
     np.testing.assert_allclose(actions.var(axis=0), 1 / 3, rtol=0.08)
@@ -195,8 +217,8 @@ def test_bootstrap_of_equal_values_is_that_value() -> None:
 
 def test_summary_keeps_the_worst_of_all_episodes() -> None:
     steps = [scripted_step(gap=3e-5, conditioning=0.4), scripted_step(gap=9e-5, conditioning=0.2)]
-    records = run_episodes(ScriptedEnv(steps[:1]), Idle(), 3, 0)
-    records += run_episodes(ScriptedEnv(steps), Idle(), 1, 3)
+    records = run_episodes(Scripted(steps[:1]), Idle(), 3, 0)
+    records += run_episodes(Scripted(steps), Idle(), 1, 3)
     metrics = summarise(records)
     assert metrics["closure_error_max"].worst == 9e-5
     assert metrics["closure_error_max"].mean == pytest.approx((3 * 3e-5 + 9e-5) / 4)
@@ -212,7 +234,7 @@ def test_held_out_ranges_do_not_meet() -> None:
     assert 0 < SELECTION_SEED < TEST_SEED
 
 
-def test_unknown_policies_say_what_there_is(reach: GoalEnv, tmp_path: Path) -> None:
+def test_unknown_policies_say_what_there_is(reach: TPMVectorEnv, tmp_path: Path) -> None:
     with pytest.raises(PolicyError, match=r"expert, random, an exported policy"):
         load_policy("exprt", reach)
     with pytest.raises(PolicyError, match=r"best\.zip or .*last\.zip"):

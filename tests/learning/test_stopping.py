@@ -71,13 +71,13 @@ def test_a_stopped_run_saves_and_goes_on(
     content = store.load(pytest.fail)
     assert content is not None
     saved = content.step
-    # PPO goes back to the beginning of its rollout of 40 steps, the others end theirs of 2 or 3.
-    assert saved == {"sac": step + 1, "tqc": 201, "ppo": 80}[case]
+    # At the end of a rollout, of 2, 3 or 40 steps
+    assert saved == {"sac": step + 1, "tqc": 201, "ppo": 120}[case]
     assert f"saved at step {saved}" in said(console)
     assert f"tpm-gym resume {tmp_path / 'run'}" in said(console)
     assert (tmp_path / "run" / "last.zip").is_file()
     taken = tpm_gym.load_policy(tmp_path / "run" / "last").description.steps
-    assert taken == (step if case == "ppo" else saved)
+    assert taken == saved
     assert resume(ResumeConfig(config.run), quiet()) is None
     assert_equal_runs(uninterrupted(case), tmp_path / "run")
 

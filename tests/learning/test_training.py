@@ -5,6 +5,7 @@ import json
 import os
 import re
 import signal
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,7 @@ from tpm_gym.learning import (
 )
 from tpm_gym.learning.algorithms import ALGORITHMS
 from tpm_gym.learning.configuration import complete
+from tpm_gym.learning.environments import make_envs
 from tpm_gym.learning.errors import ConfigError, DivergedError, RunError
 from tpm_gym.learning.policies import load_model, load_policy
 from tpm_gym.learning.recipes import read_recipe, read_recipes, recipe_file
@@ -237,10 +239,9 @@ def test_best_policy_is_the_one_evaluated_best(run: Path) -> None:
 
 def score(path: Path) -> tuple[float, float]:
     """Return success and return of a saved policy over the episode that selects."""
-    env = gym.make("TPMReach-v0")
-    policy = load_policy(str(path), env, trust_pickle=True)
-    (record,) = run_episodes(env, policy, 1, SELECTION_SEED)
-    env.close()
+    with closing(make_envs("TPMReach-v0", 1)) as envs:
+        policy = load_policy(str(path), envs, trust_pickle=True)
+        (record,) = run_episodes(envs, policy, 1, SELECTION_SEED)
     return record.success_at_end, record.total_reward
 
 

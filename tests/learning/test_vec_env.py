@@ -1,7 +1,5 @@
 """Environments in closed form behind Stable-Baselines3, and policies evaluated in them."""
 
-from contextlib import closing
-from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -12,9 +10,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 import tpm_gym
 from tpm_gym.learning import AnalyticVecEnv, PenaltyHerReplayBuffer
-from tpm_gym.learning.environments import make_env, make_envs
-from tpm_gym.learning.policies import TrainedPolicy, load_policy
-from tpm_gym.learning.rollout import run_batch, run_episodes
+from tpm_gym.learning.environments import make_envs
 
 PICK = "TPMPickAndPlace-v0"
 
@@ -75,18 +71,3 @@ def test_ppo_and_hindsight_learn_in_it() -> None:
     sac.learn(300)
     assert sac.replay_buffer.size() > 60
     assert sac._n_updates > 0
-
-
-@pytest.mark.parametrize("weight", [0.0, 1.0])
-def test_a_policy_in_batches_is_judged_as_in_one_environment(weight: float) -> None:
-    """More episodes than environments; returns only to the rounding of the network's batches."""
-    options = {"engine": "analytic", "penalty_weight": weight, "randomisation": {"latency": 1}}
-    policy = TrainedPolicy(tpm_gym.load_policy(PICK))
-    with closing(make_env(PICK, **options)) as env:
-        alone = run_episodes(env, load_policy(PICK, env), 5, 2_000_000)
-    together = run_batch(make_envs(PICK, 3, **options), policy, 5, 2_000_000)
-    for one, other in zip(alone, together, strict=True):
-        rounded = {name: 0.0 for name, value in vars(one).items() if isinstance(value, float)}
-        assert replace(one, **rounded) == replace(other, **rounded)
-        for name in rounded:
-            assert getattr(one, name) == pytest.approx(getattr(other, name), abs=1e-3), name

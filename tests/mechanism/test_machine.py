@@ -24,7 +24,6 @@ from tpm_gym.mechanism import (
     PAPER_TPM,
     TPM,
     WIDE_TPM,
-    Machine,
     Mount,
     Region,
     find_machine,
@@ -64,11 +63,7 @@ def test_conditioning_is_0_where_p_cannot_be(machine: TPM) -> None:
     expected[0, 0] = 0.0
     points[0, 0, 2] = 3.0
     theta[0, 0] = (0.0, np.pi, -2.0)
-    for found in (
-        machine.conditioning_at(points),
-        machine.conditioning(theta),
-        Machine.conditioning_at(machine, points),  # for machines that have nothing faster
-    ):
+    for found in (machine.conditioning_at(points), machine.conditioning(theta)):
         np.testing.assert_allclose(found, expected, rtol=1e-9)
     np.testing.assert_array_equal(machine.is_safe(points), expected >= machine.safe_conditioning)
 

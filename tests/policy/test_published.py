@@ -1,14 +1,15 @@
 """The published policies load without trust, fit, and repeat their evaluations."""
 
 import json
+from contextlib import closing
 from typing import Any
 
-import gymnasium as gym
 import pytest
 from paths import ROOT
 
 import tpm_gym
 from tpm_gym.learning import policies
+from tpm_gym.learning.environments import make_envs
 from tpm_gym.learning.rollout import TEST_SEED, run_episodes
 from tpm_gym.resources import POLICIES
 
@@ -39,11 +40,10 @@ def test_the_evaluation_is_of_this_policy_on_held_out_episodes(name: str) -> Non
 
 @pytest.mark.parametrize("name", NAMES)
 def test_its_episodes_repeat(name: str) -> None:
-    env = gym.make(name)
-    policy = policies.load_policy(str(POLICIES / f"{name}.json"), env)
     content = evaluation(name)
-    records = run_episodes(env, policy, 5, content["seed"])
-    env.close()
+    with closing(make_envs(name, 1)) as envs:
+        policy = policies.load_policy(str(POLICIES / f"{name}.json"), envs)
+        records = run_episodes(envs, policy, 5, content["seed"])
     for found, published in zip(records, content["records"], strict=False):
         assert found.seed == published["seed"]
         assert found.success_at_end == published["success_at_end"]
@@ -56,10 +56,9 @@ def test_its_episodes_repeat(name: str) -> None:
 def test_its_motors_need_the_same_torque_in_both_engines(name: str) -> None:
     torques = []
     for engine in ("pybullet", "mujoco"):
-        env = gym.make(name, engine=engine)
-        policy = policies.load_policy(str(POLICIES / f"{name}.json"), env)
-        torques += [[r.torque_rms for r in run_episodes(env, policy, 40, TEST_SEED)]]
-        env.close()
+        with closing(make_envs(name, 1, engine=engine)) as envs:
+            policy = policies.load_policy(str(POLICIES / f"{name}.json"), envs)
+            torques += [[r.torque_rms for r in run_episodes(envs, policy, 40, TEST_SEED)]]
     pybullet, mujoco = (sum(one) for one in torques)
     assert mujoco == pytest.approx(pybullet, rel=0.02)
 

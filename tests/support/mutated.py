@@ -19,15 +19,16 @@ import tpm_gym  # noqa: F401
 def mutate(source: str, right: str, wrong: str) -> tuple[ast.Module, int]:
     """Replace an expression wherever it stands; return the module and the number of replacements.
 
-    Expressions are compared by their syntax trees, so that neither layout nor comments matter. The
-    names _1, _2, ... in ``right`` stand for any expression, and for the same one in ``wrong``.
+    Expressions are compared by their syntax trees, so that neither layout nor comments matter. In
+    ``right``, the names _1, _2, ... stand for any expression, and *_1, *_2, ... for any further
+    arguments. In ``wrong`` they stand for the same.
     """
     pattern, count = ast.parse(right, mode="eval").body, 0
 
     class Replace(ast.NodeTransformer):
         def generic_visit(self, node: ast.AST) -> ast.AST:
             nonlocal count
-            found: dict[str, ast.AST] = {}
+            found: dict[str, Any] = {}
             if not _equal(pattern, node, found):
                 return super().generic_visit(node)
             count += 1
@@ -38,18 +39,25 @@ def mutate(source: str, right: str, wrong: str) -> tuple[ast.Module, int]:
 
 
 class _Fill(ast.NodeTransformer):
-    def __init__(self, found: dict[str, ast.AST]) -> None:
+    def __init__(self, found: dict[str, Any]) -> None:
         self._found = found
 
     def visit_Name(self, node: ast.Name) -> ast.AST:
         return self._found.get(node.id, node)
 
+    def visit_Starred(self, node: ast.Starred) -> Any:
+        return self._found[ast.unparse(node)]
 
-def _equal(pattern: Any, node: Any, found: dict[str, ast.AST]) -> bool:
+
+def _equal(pattern: Any, node: Any, found: dict[str, Any]) -> bool:
     if isinstance(pattern, ast.Name) and re.fullmatch(r"_\d", pattern.id):
         found[pattern.id] = node
         return isinstance(node, ast.expr)
     if isinstance(pattern, list):
+        if pattern and isinstance(pattern[-1], ast.Starred):
+            *pattern, rest = pattern
+            found[ast.unparse(rest)] = node[len(pattern) :]
+            node = node[: len(pattern)]
         pairs = zip(pattern, node, strict=False)
         return len(pattern) == len(node) and all(_equal(*pair, found) for pair in pairs)
     if type(pattern) is not type(node):

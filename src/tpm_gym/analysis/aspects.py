@@ -164,17 +164,9 @@ def aspects(
         code = int(codes.flat[first[index]])
         if code >= 0 and counts[index] >= min_cells:
             sin_beta, level3, planar, elevation = (1 if code & bit else -1 for bit in _BITS)
-            found.append(
-                Aspect(
-                    branch=branch,
-                    assembly=AssemblyMode(planar=planar, sin_beta=sin_beta),
-                    level3=level3,
-                    elevation=elevation,
-                    geometry=geometry,
-                    limits=limits,
-                    cells=Cells(low, spacing, labels == names[index]),
-                )
-            )
+            assembly = AssemblyMode(planar=planar, sin_beta=sin_beta)
+            cells = Cells(low, spacing, labels == names[index])
+            found.append(Aspect(branch, assembly, level3, elevation, geometry, limits, cells))
     return tuple(found)
 
 
@@ -234,11 +226,8 @@ def largest_box(aspect: Aspect, threshold: float) -> Box:
         np.asarray(cells.low) + (np.asarray(corner) + 0.5) * cells.spacing for corner in corners
     )
     inside = tuple(slice(a, b + 1) for a, b in zip(first, last, strict=True))
-    return Box(
-        Region(low=tuple(low.tolist()), high=tuple(high.tolist())),
-        volume=float((high - low).prod()),
-        conditioning=float(conditioning[inside].min()),
-    )
+    region = Region(low=tuple(low.tolist()), high=tuple(high.tolist()))
+    return Box(region, float((high - low).prod()), float(conditioning[inside].min()))
 
 
 def _codes(

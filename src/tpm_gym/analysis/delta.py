@@ -16,13 +16,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tpm_gym.analysis.poc import (
-    Chain,
-    parallelogram_4r,
-    parallelogram_4s,
-    prismatic,
-    revolute,
-)
+from tpm_gym.analysis.poc import Chain, parallelogram_4r, parallelogram_4s, prismatic, revolute
 from tpm_gym.arrays import FloatArray, Vector, finite_points
 from tpm_gym.kinematics.geometry import PAPER
 
@@ -124,11 +118,8 @@ class Tripod:
             if balls:
                 units.append(parallelogram_4s("Pa(4S)", hinge, rod, end))
             else:
-                units += [
-                    revolute("R", hinge, elbow),
-                    parallelogram_4r("Pa(4R)", hinge, rod, end),
-                    revolute("R", hinge, end),
-                ]
+                middle = parallelogram_4r("Pa(4R)", hinge, rod, end)
+                units += [revolute("R", hinge, elbow), middle, revolute("R", hinge, end)]
             chains.append(Chain(f"leg {number}", tuple(units)))
         return chains
 
@@ -172,17 +163,9 @@ def delta(base: float, platform: float, arm: float, rod: float) -> Tripod:
     legs = []
     for turn in (0.0, 2 * math.pi / 3, 4 * math.pi / 3):
         x, y = math.cos(turn), math.sin(turn)
+        pivot, tip, bar = ((r * x, r * y, 0.0) for r in (base, platform, arm))
         axis = (y, -x, 0.0)  # positive angles turn the arm towards +z
-        legs.append(
-            Leg(
-                pivot=(base * x, base * y, 0.0),
-                axis=axis,
-                hinge=axis,
-                tip=(platform * x, platform * y, 0.0),
-                rod=rod,
-                arm=(arm * x, arm * y, 0.0),
-            )
-        )
+        legs.append(Leg(pivot, axis, axis, tip, rod, bar))
     return Tripod((legs[0], legs[1], legs[2]))
 
 

@@ -82,12 +82,12 @@ def describe(
     ends = {c.name: places[c.link_b].point(c.point_b) for c in mechanism.closures}
 
     def turning(*names: str) -> tuple[Unit, ...]:
-        return tuple(
-            revolute(
-                name, _axis(mechanism, places, link), places[link].origin, name in ACTUATED_JOINTS
-            )
-            for name, link in ((name, joints[name].name) for name in names)
-        )
+        found = []
+        for name in names:
+            link = joints[name].name
+            axis, origin = _axis(mechanism, places, link), places[link].origin
+            found.append(revolute(name, axis, origin, name in ACTUATED_JOINTS))
+        return tuple(found)
 
     def sides(near: str, far: str, other: str) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return short link, rod, and middle of the far short link of a parallelogram."""
@@ -130,13 +130,9 @@ def analyse(structure: Structure) -> Topology:
     # Link 3' does not turn, so its POC set is the same about any point.
     hsoc_1 = serial([sub_mechanism, structure.wrist.poc(structure.platform)])
     hsoc_2 = structure.branches[2].poc(structure.platform)
-    return Topology(
-        platform=parallel([hsoc_1, hsoc_2]),
-        decompositions=decompositions((first, second, third), structure.link_3p),
-        sub_mechanism=sub_mechanism,
-        hsoc_1=hsoc_1,
-        hsoc_2=hsoc_2,
-    )
+    platform = parallel([hsoc_1, hsoc_2])
+    found = decompositions((first, second, third), structure.link_3p)
+    return Topology(platform, found, sub_mechanism, hsoc_1, hsoc_2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,14 +192,9 @@ def mobility_at(angles: Mapping[str, float], geometry: Geometry = PAPER) -> Mobi
     motors = np.eye(len(joints))[[joints.index(name) for name in ACTUATED_JOINTS]]
     seen = np.linalg.svd(np.concatenate([linear, angular, motors]) @ free, compute_uv=False)
     dof = _rank(seen)
-    return Mobility(
-        dof=dof,
-        idle=free.shape[1] - dof,
-        rank=rank,
-        redundant=len(jacobian) - rank,
-        smallest=float(values[rank - 1] / values[0]),
-        platform=POCSet(Subspace.span((linear @ free).T), Subspace.span((angular @ free).T)),
-    )
+    platform = POCSet(Subspace.span((linear @ free).T), Subspace.span((angular @ free).T))
+    smallest = float(values[rank - 1] / values[0])
+    return Mobility(dof, free.shape[1] - dof, rank, len(jacobian) - rank, smallest, platform)
 
 
 def closure_jacobian(mechanism: Mechanism, angles: Mapping[str, float]) -> FloatArray:

@@ -157,7 +157,7 @@ class Core:
         plants = [NOMINAL] * len(rows)
         if self._altered:
             plants = [self.randomisation.draw(rng, self.machine) for rng in rngs]
-        self.rngs = self.rngs or [*rngs]
+        self.rngs = self.rngs or [np.random.default_rng() for _ in range(self.count)]
         for row, rng in zip(rows.tolist(), rngs, strict=True):
             self.rngs[row] = rng
         self.goals = self.goals.copy()

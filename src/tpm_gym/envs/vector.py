@@ -62,7 +62,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             ``reset(options={"reset_mask": ...})``).
         stagger: Whether the first episodes after a reset of all have different lengths, so that
             not all end at the same step. It makes on-policy batches more even.
-        render_mode: None; pictures are of single environments.
+        render_mode: None, or ``"rgb_array"`` of one environment.
         options: Other options of :class:`~tpm_gym.TPMEnv`.
 
     Raises:
@@ -81,7 +81,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         max_episode_steps: int | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         stagger: bool = False,
-        render_mode: None = None,
+        render_mode: str | None = None,
         **options: Any,
     ) -> None:
         """Check the options and start the simulations."""
@@ -93,13 +93,15 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             raise ConfigurationError("max_episode_steps", max_episode_steps, valid)
         if not isinstance(stagger, bool):
             raise ConfigurationError("stagger", stagger, "True or False")
-        if render_mode is not None:
-            valid = "None; gym.make(..., render_mode=...) draws a single environment"
+        at_most = most_robots(engine)
+        if render_mode is not None and (render_mode != "rgb_array" or num_envs != 1):
+            valid = "None, or 'rgb_array' of one environment"
             raise ConfigurationError("render_mode", render_mode, valid)
+        self.render_mode = render_mode
         self.num_envs = int(num_envs)
         self.autoreset_mode = _mode_of(autoreset_mode)
         self.metadata = {
-            "render_modes": [],
+            "render_modes": ["rgb_array"],
             "render_fps": round(1 / CONTROL_PERIOD),
             "autoreset_mode": self.autoreset_mode,
         }
@@ -107,7 +109,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         self._stagger = max_episode_steps if stagger else None
         self._parts: list[_Part] = []
         try:
-            for size in _sizes(self.num_envs, most_robots(engine), num_threads):
+            for size in _sizes(self.num_envs, at_most, num_threads):
                 core = Core(task, control, reward, count=size, engine=engine, **options)
                 self._parts.append(_Part(core, max_episode_steps, at_once))
         except BaseException:
@@ -232,6 +234,11 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         }
         return joined, _joined(infos, [part.core.count for part in self._parts])
 
+    def render(self) -> tuple[NDArray[np.uint8], ...]:
+        """Draw the one environment as (480, 640, 3) RGB."""
+        self._require_open()
+        return (self._parts[0].core.simulation.render(640, 480),)
+
     def close_extras(self, **kwargs: Any) -> None:
         """Close the simulations and the threads."""
         del kwargs
@@ -258,6 +265,11 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         if len(states) == 1:
             return State(**states[0])
         return State(**{k: np.concatenate([s[k] for s in states]) for k in states[0]})
+
+    @property
+    def kind(self) -> Mapping[str, Any]:
+        """Task and options, which must be equal where a snapshot is restored."""
+        return self._parts[0].core.kind
 
     @property
     def episode(self) -> IntArray:
@@ -321,7 +333,6 @@ class _Part:
         core = self.core
         own = core.rngs or [seeding.np_random(None)[0] for _ in range(core.count)]
         infos = self._begin(rows, [rngs[k] or own[k] for k in rows.tolist()], options)
-        core.rngs = core.rngs or own
         observation, _, told = core.report()
         return observation, {**_masked(told, rows, core.count), **infos}
 

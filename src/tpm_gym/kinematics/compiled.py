@@ -2,8 +2,9 @@
 
 The module itself is the namespace that compiled functions take. The functions have no branches and
 call no library, so that the compiler computes several rows at a time (SIMD), and so that results do
-not depend on a C library. They are accurate to two units in the last place. Their polynomials are
-minimax fits to 60 digits (by Remez's exchange); a test compares the functions with mpmath.
+not depend on a C library. They are accurate to two units in the last place, ``cos_third`` to four.
+Their polynomials are minimax fits (Remez's exchange, in 60 digits). A test compares the functions
+with mpmath.
 
 Importing this module lets compiled functions call those of :mod:`tpm_gym.kinematics.equations` too.
 """
@@ -45,12 +46,12 @@ _THIRD: Final = (
 
 
 def _six(c: tuple[float, ...], k: int, x: float) -> float:
-    """Polynomial of the six coefficients from the k-th on; a loop would not be unrolled."""
+    """Evaluate the six coefficients from the k-th on; a loop would not be unrolled."""
     return c[k] + x * (c[k + 1] + x * (c[k + 2] + x * (c[k + 3] + x * (c[k + 4] + x * c[k + 5]))))
 
 
 def _sin_cos(x: float) -> tuple[float, float, float]:
-    """Sine and cosine of x less whole quarter turns, and the number of these, 0 to 3."""
+    """Compute sine and cosine of x less whole quarter turns, and their number, 0 to 3."""
     whole = (x * (2.0 / math.pi) + _TO_WHOLE) - _TO_WHOLE
     whole = whole if abs(whole) <= _TURNS else math.nan
     r = ((x - whole * _HALF_PI[0]) - whole * _HALF_PI[1]) - whole * _HALF_PI[2]
@@ -61,21 +62,21 @@ def _sin_cos(x: float) -> tuple[float, float, float]:
 
 
 def cos(x: float) -> float:
-    """Cosine; NaN beyond a million radians."""
+    """Compute the cosine; NaN beyond a million radians."""
     sine, cosine, quarters = _sin_cos(x)
     value = sine if (quarters == 1.0) | (quarters == 3.0) else cosine
     return -value if (quarters == 1.0) | (quarters == 2.0) else value
 
 
 def sin(x: float) -> float:
-    """Sine; NaN beyond a million radians."""
+    """Compute the sine; NaN beyond a million radians."""
     sine, cosine, quarters = _sin_cos(x)
     value = cosine if (quarters == 1.0) | (quarters == 3.0) else sine
     return -value if quarters >= 2.0 else value
 
 
 def arctan2(y: float, x: float) -> float:
-    """Angle of (x, y) in (-pi, pi], rad; 0 at the origin."""
+    """Compute the angle of (x, y) in (-pi, pi], rad; 0 at the origin."""
     rise, run = abs(y), abs(x)
     steep = rise > run
     low, high = (run, rise) if steep else (rise, run)
@@ -91,35 +92,35 @@ def arctan2(y: float, x: float) -> float:
 
 
 def sqrt(x: float) -> float:
-    """Square root; NaN for negative numbers."""
+    """Compute the square root; NaN for negative numbers."""
     return math.sqrt(x)
 
 
 def root(x: float) -> float:
-    """Square root; 0 for negative numbers."""
+    """Compute the square root; 0 for negative numbers."""
     return math.sqrt(x if x > 0.0 else 0.0)
 
 
 def clip(x: float) -> float:
-    """Nearest number in [-1, 1]."""
+    """Return the nearest number in [-1, 1]."""
     least = -1.0 if x < -1.0 else x
     return 1.0 if least > 1.0 else least
 
 
 def cos_third(x: float) -> float:
-    """Cosine of a third of the arccosine of the clipped number."""
+    """Compute the cosine of a third of the arccosine of the clipped number."""
     s = math.sqrt(0.5 * (1.0 + clip(x)))
     s6 = (s * s * s) ** 2
     return 0.5 * (_six(_THIRD, 0, s) + s6 * (_six(_THIRD, 6, s) + s6 * _six(_THIRD, 12, s)))
 
 
 def maximum(x: float, least: float) -> float:
-    """Larger number."""
+    """Return the larger number."""
     return x if x > least else least
 
 
 def positive(angle: float) -> float:
-    """Angle in [0, 2 pi) of one in [-pi, pi]."""
+    """Convert an angle in [-pi, pi] to [0, 2 pi)."""
     return angle + 2 * math.pi if angle < 0.0 else angle
 
 

@@ -27,14 +27,14 @@ from tpm_gym.kinematics.modes import AssemblyMode, WorkingMode
 from tpm_gym.kinematics.namespaces import NUMPY, Namespace, Numbers
 
 ROUNDING = 64 * sys.float_info.epsilon
-"""Where two solutions merge, rounding alone can push a discriminant (always scaled to order one)
-below zero by a few units in the last place. Those are solutions, not misses."""
+"""Largest amount by which a discriminant (scaled to order one) counts as zero if it is below zero.
+Where two solutions merge, rounding alone can push it there. Those are solutions, not misses."""
 _REACH = 1.0 + ROUNDING
 SINGULAR = 1e-6
-"""A factor of det A below this cannot be told from zero: cos(beta) is known to about 1e-14, and
-where it is 1, sin(beta) to the square root of that only (y to 50 nm)."""
+"""A factor of det A below this counts as zero. cos(beta) is known to about 1e-14; so where it is 1,
+sin(beta) is known to the square root of that only (y to 50 nm)."""
 
-_TINY = sys.float_info.min  # no quotient is by less
+_TINY = sys.float_info.min  # the smallest divisor
 
 Triple = tuple[Numbers, Numbers, Numbers]
 
@@ -52,7 +52,7 @@ class Assembly(NamedTuple):
 
 
 class Factors(NamedTuple):
-    """The factors of det A (Eq. 16, corrected), of det B (Eq. 17, corrected), and one of neither.
+    """Factors of det A (Eq. 16, corrected) and of det B (Eq. 17, corrected), and the elevation.
 
     Attributes:
         level3: l1 + l3 c3 - xC - 2 l2, m.
@@ -83,11 +83,11 @@ def arms(theta: Triple, g: AnyLengths, ns: Namespace) -> tuple[Triple, Triple]:
 def assembly_at(
     cos: Triple, sin: Triple, planar: Numbers, side: Numbers, g: AnyLengths, ns: Namespace
 ) -> tuple[Assembly, Numbers, tuple[Numbers, Numbers, Numbers, Numbers, Numbers]]:
-    """Forward kinematics (Eqs. 6 to 11, corrected) for the signs of planar factor and sin(beta).
+    """Solve forward kinematics (Eqs. 6 to 11, corrected) for signs of planar factor and sin(beta).
 
     Eq. (6): C1 is on the circle about (0, z1) with radius^2 = l4^2 - y1^2 and on the circle about
-    (dx, z1 + dz) with radius l4. Of the two intersections, the one on the left of the line from the
-    first to the second centre has a positive planar factor.
+    (dx, z1 + dz) with radius l4. The intersection on the left of the line from the first to the
+    second centre has a positive planar factor, the other one a negative.
 
     Returns:
         The assembly; whether it is real; and, for the margins, whether xC and zC are and rod 11
@@ -132,7 +132,7 @@ def posture_at(
     tuple[Numbers, Numbers, Numbers, Numbers],
     tuple[Numbers, Numbers, Numbers, Numbers],
 ]:
-    """Inverse kinematics (Eqs. 12 to 15, corrected) for the signs of a working mode.
+    """Solve inverse kinematics (Eqs. 12 to 15, corrected) for the signs of a working mode.
 
     Returns:
         theta_1 and theta_3 in (-pi, pi], theta_2 in [0, 2 pi): arms 1 and 3 point inwards at pi,
@@ -181,7 +181,7 @@ def arm(
 
 
 def rods(cos: Triple, sin: Triple, found: Assembly, g: AnyLengths) -> tuple[Triple, Triple, Triple]:
-    """The vectors B_iC_i, m."""
+    """Compute the vectors B_iC_i, m."""
     x, y, _, x_c, z_c, _, _ = found
     return (
         (x_c, -g.l1 - cos[0], z_c - sin[0]),
@@ -197,7 +197,7 @@ def factors(
     bars: tuple[Triple, Triple, Triple],
     g: AnyLengths,
 ) -> Factors:
-    """What vanishes where the configuration is singular, from its arms and rods."""
+    """Compute the factors that are zero at singularities, from arms and rods."""
     (r1x, r1y, r1z), (r2x, _, r2z), (r3x, _, r3z) = bars
     # Arm 1 turns in the yz plane, arms 2 and 3 in the xz plane.
     return Factors(
@@ -220,7 +220,7 @@ def regular(values: Factors, g: AnyLengths) -> Numbers:
 
 
 def velocity(bars: tuple[Triple, Triple, Triple], values: Factors) -> tuple[Triple, Triple, Triple]:
-    """Rows of the velocity Jacobian J, v = J theta_dot, m/rad.
+    """Compute the rows of the velocity Jacobian J, v = J theta_dot, m/rad.
 
     The closures are solved for the rates of xC, zC and l7 beta, whose matrix has the determinant
     l7 sin(beta) level3 planar; J exists at the serial singularities too.
@@ -240,11 +240,11 @@ def velocity(bars: tuple[Triple, Triple, Triple], values: Factors) -> tuple[Trip
 
 
 def conditioning(rows: tuple[Triple, Triple, Triple], ns: Namespace) -> Numbers:
-    """Smallest over largest singular value, s3 / s1, of a matrix (3, 3).
+    """Compute smallest over largest singular value, s3 / s1, of a matrix (3, 3).
 
-    The cofactors have s1 s2 as their largest singular value, and |det| = s1 s2 s3; the smallest
-    one, as the root of the smallest eigenvalue of J J^T, would lose half of its digits. Where the
-    two largest nearly coincide, the result is good to 1e-9 only.
+    The matrix of cofactors has the largest singular value s1 s2, and |det| = s1 s2 s3. The root of
+    the smallest eigenvalue of J J^T would lose half of the digits of s3. Where s1 and s2 nearly
+    coincide, the result is accurate to 1e-9 only.
     """
     (a, b, c), (d, e, f), (g, h, i) = rows
     first = (e * i - f * h, f * g - d * i, d * h - e * g)
@@ -256,7 +256,7 @@ def conditioning(rows: tuple[Triple, Triple, Triple], ns: Namespace) -> Numbers:
 
 
 def _largest_singular_value(rows: tuple[Triple, Triple, Triple], ns: Namespace) -> Numbers:
-    """From the trigonometric roots of the characteristic polynomial of M M^T."""
+    """Compute it from the trigonometric roots of the characteristic polynomial of M M^T."""
     (a, b, c), (d, e, f), (g, h, i) = rows
     xx, yy, zz = a * a + b * b + c * c, d * d + e * e + f * f, g * g + h * h + i * i
     xy, xz, yz = a * d + b * e + c * f, a * g + b * h + c * i, d * g + e * h + f * i
@@ -273,7 +273,7 @@ def _largest_singular_value(rows: tuple[Triple, Triple, Triple], ns: Namespace) 
 
 
 def no_assembly(theta: Vector, branch: AssemblyMode, g: Geometry) -> UnreachableError:
-    """Which loop keeps a branch from being assembled at theta (3) rad, and by how much."""
+    """Explain which loop does not close on a branch at theta (3) rad, and by how much."""
     with np.errstate(all="ignore"):
         cos, sin = arms(tuple(map(np.float64, theta)), g, NUMPY)
         _, _, found = assembly_at(cos, sin, branch.planar, branch.sin_beta, g, NUMPY)
@@ -293,7 +293,7 @@ def no_assembly(theta: Vector, branch: AssemblyMode, g: Geometry) -> Unreachable
 
 
 def no_posture(point: Vector, branch: WorkingMode, g: Geometry) -> UnreachableError:
-    """Which part keeps a point (3) m from having a posture on a branch, and by how much."""
+    """Explain which leg does not reach a point (3) m on a branch, and by how much."""
     hint = f"choose a point of the workspace (branch {branch}; see tpm_gym.kinematics.workspace)"
     beyond = g.l7 - abs(point[1])
     if beyond < 0:
@@ -308,7 +308,7 @@ def no_posture(point: Vector, branch: WorkingMode, g: Geometry) -> UnreachableEr
 
 
 def _leg_margin(level: float, vertical: float, out: float, g: Geometry) -> float:
-    """How far the triangle of arm, rod (projected on the arm's plane) and pivot is from failing."""
+    """Return by how much the triangle of arm, rod (in the arm's plane) and pivot closes, m."""
     if abs(out) >= g.l4:
         return g.l4 - abs(out)
     in_plane, rod = math.hypot(level, vertical), math.sqrt(g.l4**2 - out**2)
@@ -316,7 +316,7 @@ def _leg_margin(level: float, vertical: float, out: float, g: Geometry) -> float
 
 
 def parallel_factors(values: tuple[Any, Any, Any], geometry: Geometry) -> dict[str, Any]:
-    """Names of the factors of det A, as errors have them -> values in units of l4."""
+    """Return the factors of det A in units of l4, by the names that errors show."""
     sin_beta, level3, planar = values
     return {
         "sin(beta)": sin_beta,

@@ -9,8 +9,8 @@ from tpm_gym.errors import GeometryError, InputError
 from tpm_gym.kinematics.namespaces import Numbers
 
 _CLOSE = 1e-4
-"""Of l1. Circles whose y_B1 is so small have radii that differ by less than 1e-10 of l1, and where
-they meet follows from angles with an error of rounding over that."""
+"""Share of l1 below which y_B1 counts as 0. The radii of the two circles then differ by less than
+1e-10 of l1, and rounding errors over that difference would spoil their intersections."""
 
 
 class Lengths(NamedTuple):
@@ -94,7 +94,7 @@ AnyLengths = Geometry | Lengths
 
 
 def require_geometry(geometry: object) -> None:
-    """Refuse, with an InputError, what are no lengths."""
+    """Raise InputError if the argument is no Geometry."""
     if not isinstance(geometry, Geometry):
         raise InputError("geometry", geometry, "a tpm_gym.Geometry")
 

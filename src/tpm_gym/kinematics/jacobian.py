@@ -50,7 +50,7 @@ class Factors:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What :func:`evaluate` returns.
+    """Result of :func:`evaluate`.
 
     Attributes:
         position: (..., 3) m, point P.
@@ -65,7 +65,7 @@ class Evaluation:
 
 @dataclass(frozen=True)
 class _Configuration:
-    """What all Jacobians are made of, as components."""
+    """Components from which all Jacobians are computed."""
 
     position: equations.Triple
     rods: tuple[equations.Triple, equations.Triple, equations.Triple]
@@ -79,7 +79,7 @@ _Columns = Callable[[_Configuration], list[Numbers]]
 def parallel(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> FloatArray:
-    """Parallel Jacobian A of A v = B theta_dot, (..., 3, 3) m.
+    """Compute the parallel Jacobian A of A v = B theta_dot, (..., 3, 3) m.
 
     Eliminating the passive angle beta through y = l7 sin(beta) gives dxC = dx + tan(beta) dy. Rows
     1 and 2 are multiplied by cos(beta), which keeps A finite at y = +-l7; so
@@ -98,7 +98,7 @@ def parallel(
 def serial(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> FloatArray:
-    """Serial Jacobian B of A v = B theta_dot, (..., 3, 3) m^2/rad, diagonal.
+    """Compute the serial Jacobian B of A v = B theta_dot, (..., 3, 3) m^2/rad, diagonal.
 
     With the row scaling of :func:`parallel`; so det B = cos(beta) times the product of the factors
     of Eq. (17).
@@ -114,7 +114,7 @@ def serial(
 def velocity(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> FloatArray:
-    """Velocity Jacobian J with v = J theta_dot, (..., 3, 3) m/rad.
+    """Compute the velocity Jacobian J with v = J theta_dot, (..., 3, 3) m/rad.
 
     J = A^-1 B wherever A can be inverted. It exists at the serial singularities too (where
     cos(beta) = 0 makes both A and B singular).
@@ -135,10 +135,10 @@ def velocity(
 def conditioning(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> FloatArray:
-    """Inverse condition number 1/cond(J), (...,) in [0, 1].
+    """Compute the inverse condition number 1/cond(J), (...,) in [0, 1].
 
-    It is 0 at a singularity up to rounding, where it exists too, and 1 where J is isotropic. The
-    three inputs share one unit and so do the three outputs, so it is meaningful without scaling.
+    It is 0 (up to rounding) at a singularity, and 1 where J is isotropic. The three inputs share
+    one unit and so do the three outputs; so it is meaningful without scaling.
     """
     return _from_angles(lambda c: [_conditioning(c)], theta, branch, geometry, _COLUMN)[0]
 
@@ -149,10 +149,10 @@ def conditioning_at(
     assembly: AssemblyMode = DEFAULT_ASSEMBLY,
     geometry: AnyLengths = PAPER,
 ) -> FloatArray:
-    """1/cond(J) at points, (...,); 0 where they are not reachable on both branches.
+    """Compute 1/cond(J) at points, (...,); 0 where they are not reachable on both branches.
 
-    It can be differentiated by the lengths too: with tensors in a
-    :class:`tpm_gym.kinematics.geometry.Lengths`, and tensors for points.
+    To differentiate by the lengths, pass points as a tensor and the lengths as tensors in a
+    :class:`tpm_gym.kinematics.geometry.Lengths`.
     """
 
     def columns(c: _Configuration) -> list[Numbers]:
@@ -166,7 +166,7 @@ def conditioning_at(
 def evaluate(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> Evaluation:
-    """Position, J and conditioning at once, for the price of one solution.
+    """Compute position, J and conditioning from one solution.
 
     Raises:
         SingularityError: If theta is a parallel singularity.
@@ -184,17 +184,16 @@ def evaluate(
 def factors(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> Factors:
-    """Closed-form factors of det A and det B (Eqs. 16 and 17, corrected)."""
+    """Compute the factors of det A and det B (Eqs. 16 and 17, corrected)."""
     return Factors(*_from_angles(lambda c: [*c.factors], theta, branch, geometry, *_FACTORS))
 
 
 def factors_at(
     position: ArrayLike, branch: WorkingMode = ELBOWS_OUT, geometry: AnyLengths = PAPER
 ) -> Factors:
-    """The factors at points instead of joint angles; NaN where not reachable on ``branch``.
+    """Compute the factors at points instead of angles; NaN where not reachable on ``branch``.
 
-    Unlike :func:`factors` it does not pass through the forward kinematics, so it keeps its accuracy
-    at the parallel singularities.
+    It does not use the forward kinematics, so it stays accurate at the parallel singularities.
     """
     columns = _from_points(lambda c: [*c.factors], position, branch, geometry, math.nan, *_FACTORS)
     return Factors(*columns)
@@ -207,7 +206,7 @@ def _from_angles(
     g: Geometry,
     *layouts: NDArray[np.intp],
 ) -> list[FloatArray]:
-    """What is computed of configurations at joint angles, which have to exist; see by_rows."""
+    """Lay out columns for configurations at joint angles, all of which have to exist."""
 
     def text(angles: equations.Triple, ns: Namespace) -> list[Numbers]:
         cos, sin = equations.arms(angles, g, ns)
@@ -231,7 +230,7 @@ def _from_points(
     missing: float,
     *layouts: NDArray[np.intp],
 ) -> list[FloatArray]:
-    """What is computed of configurations at points; ``missing`` where there is none."""
+    """Lay out columns for configurations at points; ``missing`` where there is none."""
 
     def text(point: equations.Triple, ns: Namespace) -> list[Numbers]:
         theta, real, link7, _ = equations.posture_at(point, branch.signs, g, ns)
@@ -259,13 +258,13 @@ def _velocity(c: _Configuration) -> list[Numbers]:
 
 
 def _conditioning(c: _Configuration) -> Numbers:
-    """0 where J does not exist: beside what grows there without bound, the rest is nothing."""
+    """Compute the conditioning, and 0 where J does not exist."""
     found = equations.conditioning(equations.velocity(c.rods, c.factors), c.ns)
     return c.ns.where(found <= 1.0, found, 0.0)
 
 
 def require_regular(values: FloatArray, geometry: Geometry) -> None:
-    """Raise if a factor of det A (..., 3) is zero somewhere, for the one that is nearest to it."""
+    """Raise SingularityError for the smallest factor of det A (..., 3) if it counts as zero."""
     nearest = []
     named = equations.parallel_factors((values[..., 0], values[..., 1], values[..., 2]), geometry)
     for name, value in named.items():

@@ -1,4 +1,4 @@
-"""Solution branches of the kinematics: their names, and what holds the solutions.
+"""Solution branches of the kinematics, and arrays of solutions on all branches.
 
 Branches are named by signs that change only at a singularity:
 
@@ -9,7 +9,6 @@ Branches are named by signs that change only at a singularity:
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import product
 
 from tpm_gym.arrays import BoolArray, FloatArray
@@ -23,11 +22,11 @@ class _Mode:
 
     @property
     def signs(self) -> tuple[int, ...]:
-        """Its signs, in their order."""
+        """Signs, in the order of the attributes."""
         raise NotImplementedError
 
     def __post_init__(self) -> None:
-        """Reject anything but signs; keep ints, as NumPy's numbers warn where plain ones raise."""
+        """Reject anything but signs; store them as ints."""
         signs = dict(vars(self))
         if any(sign not in (-1, 1) for sign in signs.values()):
             valid = "made of signs, each +1 or -1"
@@ -37,18 +36,18 @@ class _Mode:
 
     @property
     def index(self) -> int:
-        """Slot of this branch in the solutions on all branches."""
+        """Slot of this branch in arrays of all solutions."""
         return sum((sign + 1) // 2 << shift for shift, sign in enumerate(self.signs[::-1]))
 
 
 @dataclass(frozen=True)
 class AssemblyMode(_Mode):
-    """One of the 4 branches of the forward kinematics.
+    """Branch of the forward kinematics, one of 4.
 
     Attributes:
-        planar: Sign of the planar factor xC (zC - zB2) - (zC - zB1)(xC - 2 l5 - xB2) of Eq. (16):
-            on which side of the line through the two circle centres link 3' is assembled.
-        sin_beta: Sign of sin(beta), so of y: in which half the platform is assembled.
+        planar: Sign of the planar factor xC (zC - zB2) - (zC - zB1)(xC - 2 l5 - xB2) of Eq. (16).
+            It is the side of the line through the two circle centres on which link 3' is.
+        sin_beta: Sign of sin(beta), and so of y: the half in which the platform is assembled.
     """
 
     planar: int
@@ -62,13 +61,13 @@ class AssemblyMode(_Mode):
 
 @dataclass(frozen=True)
 class WorkingMode(_Mode):
-    """One of the 16 branches of the inverse kinematics.
+    """Branch of the inverse kinematics, one of 16.
 
     Attributes:
-        cos_beta: Sign of cos(beta): to which side of link 3' link 7 points.
-        leg1: Sign of B1C1 . dB1/dtheta_1, a factor of Eq. (17): which way the elbow is bent.
-        leg2: The same for leg 2.
-        leg3: The same for leg 3.
+        cos_beta: Sign of cos(beta): the side of link 3' to which link 7 points.
+        leg1: Sign of B1C1 . dB1/dtheta_1, a factor of Eq. (17): the way that elbow 1 is bent.
+        leg2: Sign of B2C2 . dB2/dtheta_2.
+        leg3: Sign of B3C3 . dB3/dtheta_3.
     """
 
     cos_beta: int
@@ -76,7 +75,7 @@ class WorkingMode(_Mode):
     leg2: int
     leg3: int
 
-    @cached_property  # asked eleven times in a control step
+    @property
     def signs(self) -> tuple[int, int, int, int]:
         """cos_beta, leg1, leg2, leg3."""
         return self.cos_beta, self.leg1, self.leg2, self.leg3
@@ -84,15 +83,15 @@ class WorkingMode(_Mode):
 
 @dataclass(frozen=True)
 class RotatedMode(_Mode):
-    """One of the 8 branches of the forward kinematics in the second operation mode.
+    """Branch of the forward kinematics in the second operation mode, one of 8.
 
     Attributes:
-        planar: Sign of the planar factor of :func:`tpm_gym.kinematics.rotated.factors`: on which
-            side rod 6 passes the point where rods 4a and 4b cross, as seen along y. (Where rods 4
-            are seen shorter than links 3, the half with the smaller factors.)
-        further: -1 for the assembly of link 3' with that sign, 1 for the other one of two: that
-            which is turned further, from 0 to 2 pi.
-        sin_beta: Sign of sin(beta), so of y.
+        planar: Sign of the planar factor of :func:`tpm_gym.kinematics.rotated.factors`: the side on
+            which rod 6 passes the point where rods 4a and 4b cross, as seen along y. (Where rods 4
+            appear shorter than links 3, the half with the smaller factors.)
+        further: Of the two assemblies of link 3' with that sign, -1 for the one that is turned
+            less and 1 for the one that is turned further, from 0 to 2 pi.
+        sin_beta: Sign of sin(beta), and so of y.
     """
 
     planar: int
@@ -116,10 +115,10 @@ WORKING_MODES = tuple(WorkingMode(*signs) for signs in product((-1, 1), repeat=4
 """All inverse branches, in the order of the slots of :func:`inverse_all`."""
 
 DEFAULT_ASSEMBLY = AssemblyMode(planar=-1, sin_beta=1)
-"""The assembly mode of the environments: platform on the far side of the base, y > 0."""
+"""Assembly mode of the environments: platform on the far side of the base, y > 0."""
 
 ELBOWS_OUT = WorkingMode(cos_beta=1, leg1=1, leg2=-1, leg3=1)
-"""The working mode of the environments: arms bent away from the centre, as a delta robot's."""
+"""Working mode of the environments: arms bent away from the centre, as a delta robot's."""
 
 
 @dataclass(frozen=True)
@@ -130,8 +129,8 @@ class ForwardSolutions:
         position: (..., 4, 3) m, point P in the paper frame; NaN where not real. Where beta is
             free, z alone is a number.
         beta: (..., 4) rad, passive angle of link 7 in (-pi, pi]; NaN where not real.
-        valid: (..., 4) bool, which branches are real.
-        geometry: The lengths they were solved for.
+        valid: (..., 4) bool, whether the branch is real.
+        geometry: Lengths of the mechanism.
     """
 
     position: FloatArray
@@ -141,9 +140,9 @@ class ForwardSolutions:
 
     @property
     def free(self) -> BoolArray:
-        """(..., 4) bool, where the mechanism closes for every beta, at a2 = b2 = 0 of Eq. (10).
+        """(..., 4) bool, whether the mechanism closes for every beta, at a2 = b2 = 0 of Eq. (10).
 
-        The platform can then run along a circle with all motors held, and no branch is valid.
+        The platform can then move along a circle with all motors held, and no branch is valid.
         """
         z = self.position[..., 2]
         found: BoolArray = (z == z) & ~self.valid
@@ -165,10 +164,10 @@ class InverseSolutions:
 
     Attributes:
         theta: (..., 16, 3) rad, NaN where not real. theta_1 and theta_3 are in (-pi, pi], theta_2
-            is in [0, 2 pi): each is cut where the arm points level towards the centre, so that
-            no posture of practical use lies on a cut.
+            is in [0, 2 pi). So each angle jumps where its arm points level towards the centre,
+            and no posture of practical use is near a jump.
         beta: (..., 16) rad, in (-pi, pi]; NaN where not real.
-        valid: (..., 16) bool, which branches are real.
+        valid: (..., 16) bool, whether the branch is real.
     """
 
     theta: FloatArray
@@ -180,16 +179,16 @@ class InverseSolutions:
 class PassiveAngles:
     """Absolute directions of the passive links, each of shape (...,), in rad.
 
-    A "swing" is an angle in the plane in which the leg's arm turns, measured like the arm's own
-    theta; a "tilt" is the elevation out of that plane.
+    A "swing" is an angle in the plane of the leg's arm, measured like the arm's theta. A "tilt" is
+    the elevation out of that plane.
 
     Attributes:
         beta: Link 7, from +x towards +y.
         rod4_swing: Rods of the 4S parallelogram (B1C1), in the yz plane, from +y towards +z.
-        rod4_tilt: The same rods, out of the yz plane towards +x.
+        rod4_tilt: Rods of the 4S parallelogram, out of the yz plane towards +x.
         rod6_swing: Rod 6 (B2C2), in the xz plane, from +x towards +z.
         rod11_swing: Rods of the second parallelogram (B3C3), in the xz plane, from +x towards +z.
-        rod11_tilt: The same rods, out of the xz plane towards +y.
+        rod11_tilt: Rods of the second parallelogram, out of the xz plane towards +y.
     """
 
     beta: FloatArray

@@ -19,7 +19,7 @@ Numbers = Any
 """A float, an array (...,) or a tensor (...,), as the functions of a namespace take them."""
 _One = Callable[[Any], Any]
 _TURN = 2 * math.pi
-_BLOCK = 4096  # rows of arrays computed at a time, so that what is between stays in the cache
+_BLOCK = 4096  # rows computed at a time, so that intermediate results stay in the cache
 
 
 @dataclass(frozen=True)
@@ -27,15 +27,15 @@ class Namespace:
     """Functions of one kind of numbers, elementwise.
 
     Attributes:
-        root: The square root; 0 for negative numbers.
-        clip: The nearest number in [-1, 1].
-        arccos: Of the clipped number.
-        arcsin: Of the clipped number.
+        root: Square root; 0 for negative numbers.
+        clip: Nearest number in [-1, 1].
+        arccos: Arccosine of the clipped number.
+        arcsin: Arcsine of the clipped number.
         cos_third: Cosine of a third of the arccosine of the clipped number.
         positive: Angle in [0, 2 pi) of one in [-pi, pi].
-        signs: Of a shape, as numbers like those that are given: -1 and 1.
-        stack: Components (...,), joined along a new last axis.
-        join: Points (..., 3), broadcast with each other, joined along their last axis.
+        signs: -1 and 1, in a given shape and as numbers like a given one.
+        stack: Join components (...,) along a new last axis.
+        join: Broadcast points (..., 3), and join them along their last axis.
     """
 
     cos: _One
@@ -56,7 +56,7 @@ class Namespace:
 
 
 def namespace_of(value: object) -> Namespace:
-    """The namespace for arrays like this one."""
+    """Return the namespace for arrays like the argument."""
     return _torch() if is_tensor(value) else NUMPY
 
 
@@ -81,11 +81,11 @@ NUMPY = Namespace(
 
 @cache
 def _torch() -> Namespace:
-    """For tensors.
+    """Return the namespace for tensors.
 
-    Where a derivative is infinite it is 0, or those of other branches would become NaN.
+    Infinite derivatives are set to 0, or derivatives of other branches would become NaN.
     """
-    import torch  # here, since whoever has no tensor may have no torch
+    import torch  # here, since torch is optional
 
     def like(x: Any, other: Any) -> Any:
         return torch.as_tensor(x, dtype=other.dtype, device=other.device)
@@ -127,12 +127,12 @@ def by_rows(
     points: FloatArray,
     *layouts: NDArray[np.intp],
 ) -> list[FloatArray]:
-    """Compute columns (n,) for points (..., k), and lay them out.
+    """Compute columns (n,) for points (..., k), and arrange them in results.
 
     Args:
-        text: From a tuple of the components (n,) to columns (n,).
-        points: An array, or a tensor.
-        layouts: Numbers of columns, in the shape of a result.
+        text: Function from a tuple of the components (n,) to columns (n,).
+        points: Array or tensor.
+        layouts: Indices of columns, in the shape of a result.
 
     Returns:
         For each layout, (..., *layout.shape).

@@ -1,12 +1,12 @@
 """Forward and inverse kinematics of points and batches, on all branches or on a named one.
 
-In the paper's frame, m and rad; branches are named, ordered and returned as
-:mod:`tpm_gym.kinematics.modes` has it. Torch tensors give tensors, on their device and in float64,
-that can be differentiated; where branches merge, the derivative is 0 instead of infinite.
+Frames are the paper's; units are m and rad. Branches are named and ordered in
+:mod:`tpm_gym.kinematics.modes`. Torch tensors give tensors, on their device and in float64, that
+can be differentiated. Where branches merge, the derivative is 0 instead of infinite.
 
-All functions raise InputError for what is no array (..., 3) of numbers. Entries that are not finite
-give invalid branches where all are solved; those on one named branch raise InputError for them, and
-UnreachableError if the branch does not exist for some entry.
+All functions raise InputError for inputs that are no array (..., 3) of numbers. For entries that
+are not finite, functions on all branches return invalid branches, and functions on one named branch
+raise InputError. The latter raise UnreachableError if the branch does not exist for some entry.
 """
 
 import math
@@ -70,7 +70,7 @@ def inverse_all(position: ArrayLike, geometry: Geometry = PAPER) -> InverseSolut
 def forward(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> FloatArray:
-    """Position of P (..., 3) m at theta (..., 3) rad, on one named branch.
+    """Compute the position of P (..., 3) m at theta (..., 3) rad, on one named branch.
 
     Both y and -y belong to the same angles: the default branch gives y > 0,
     ``AssemblyMode(-1, -1)`` its mirror image.
@@ -81,7 +81,7 @@ def forward(
 def inverse(
     position: ArrayLike, branch: WorkingMode = ELBOWS_OUT, geometry: Geometry = PAPER
 ) -> FloatArray:
-    """Actuated angles (..., 3) rad for P at position (..., 3) m, on one named branch.
+    """Compute actuated angles (..., 3) rad for P at position (..., 3) m, on one named branch.
 
     theta_1 and theta_3 are in (-pi, pi], theta_2 in [0, 2 pi).
     """
@@ -97,7 +97,7 @@ def inverse(
 def passive_angles(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> PassiveAngles:
-    """Directions of all passive links at theta (..., 3) rad, on one named branch."""
+    """Compute the directions of all passive links at theta (..., 3) rad, on one named branch."""
     angles = points("theta", theta)
     solutions, slot = _assembled(angles, branch, geometry), branch.index
     ns, beta, l4 = namespace_of(angles), solutions.beta[..., slot], geometry.l4
@@ -117,7 +117,7 @@ def passive_angles(
 
 
 def _assembled(theta: FloatArray, branch: AssemblyMode, geometry: Geometry) -> ForwardSolutions:
-    """All solutions, if those of ``branch`` exist."""
+    """Compute all solutions, where those of ``branch`` have to exist."""
     solutions = forward_all(finite_points("theta", theta), geometry)
     valid = solutions.valid[..., branch.index]
     if not valid.all():
@@ -127,7 +127,7 @@ def _assembled(theta: FloatArray, branch: AssemblyMode, geometry: Geometry) -> F
 
 
 def _assemblies(theta: equations.Triple, g: Geometry, ns: Namespace) -> list[Any]:
-    """Both planar signs; the other half is the mirror image."""
+    """Compute both planar signs; the other half is the mirror image."""
     cos, sin = equations.arms(theta, g, ns)
     planar = ns.signs(theta[0], (2, 1))
     found, real, (reached, *_) = equations.assembly_at(cos, sin, planar, 1.0, g, ns)
@@ -140,7 +140,7 @@ def _assemblies(theta: equations.Triple, g: Geometry, ns: Namespace) -> list[Any
 
 
 def _postures(point: equations.Triple, g: Geometry, ns: Namespace) -> list[Any]:
-    """Each leg by itself: two bends, for both signs of cos(beta)."""
+    """Compute two bends of each leg, for both signs of cos(beta)."""
     sides, bends = ns.signs(point[0], (2, 1)), ns.signs(point[0], (2, 1, 1))
     theta, real, (*_, sin_beta), _ = equations.posture_at(
         point, (sides, bends, bends, bends), g, ns

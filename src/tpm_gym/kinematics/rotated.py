@@ -31,13 +31,13 @@ from tpm_gym.kinematics.namespaces import NUMPY
 _Planar = NDArray[np.complex128]
 _Pair = tuple[FloatArray, FloatArray]
 _Four = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
-"""Slopes of two functions by two unknowns, in rows."""
+"""Derivatives of two functions by two unknowns, in rows."""
 
-_NEAR = 1e-5  # eigenvalues so far from the unit circle, or nearer, may be on it
+_NEAR = 1e-5  # largest distance from the unit circle at which an eigenvalue may be on it
 _MERGED = 1e-7  # of l4: eigenvalues that coincide are good to half of the digits
 _STEPS = 4  # of Newton's method, from eigenvalues good to half of the digits or better
-_FARTHEST = 0.01  # of its steps that still begin near a zero, rad or m
-_CLOSED = 1e-13  # of l4^2: what rounding leaves of a closure |rod|^2 - l4^2
+_FARTHEST = 0.01  # largest step that begins near a zero, rad or m
+_CLOSED = 1e-13  # largest rounding error of a closure |rod|^2 - l4^2, in l4^2
 
 
 @dataclass(frozen=True)
@@ -60,12 +60,12 @@ class RotatedPostures:
 
     @property
     def valid(self) -> BoolArray:
-        """(...,) bool, where there is one."""
+        """(...,) bool, whether there is a posture."""
         return ~np.isnan(self.beta)
 
     @property
     def orientation(self) -> FloatArray:
-        """(..., 3, 3), the rotation of link 3' and the platform: about y, by the tilt."""
+        """Rotation (..., 3, 3) of link 3' and the platform about y, by the tilt."""
         cos, sin, zero = np.cos(self.tilt), np.sin(self.tilt), 0 * self.tilt
         rows = [cos, zero, sin, zero, zero + 1, zero, -sin, zero, cos]
         matrices: FloatArray = np.stack(rows, axis=-1).reshape(*self.tilt.shape, 3, 3)
@@ -73,13 +73,13 @@ class RotatedPostures:
 
     @property
     def position(self) -> FloatArray:
-        """(..., 3) m, point P."""
+        """Point P, (..., 3) m."""
         g, (cos, sin) = self.geometry, (np.cos(self.beta), np.sin(self.beta))
         return self._moved([g.l7 * cos + g.l2, g.l7 * sin, 2 * g.l6])
 
     @property
     def ends(self) -> FloatArray:
-        """(..., 4, 3) m, the far ends of rods 4a, 4b and 6 on link 3', and C3."""
+        """Far ends of rods 4a, 4b and 6 on link 3', and C3, (..., 4, 3) m."""
         g, (cos, sin) = self.geometry, (np.cos(self.beta), np.sin(self.beta))
         on_link3 = [self._moved([along, 0.0, 0.0]) for along in (g.l5, -g.l5, -2 * g.l5)]
         c3 = self._moved([g.l7 * cos + 2 * g.l2, g.l7 * sin, g.l6])
@@ -87,14 +87,14 @@ class RotatedPostures:
 
     @property
     def rods(self) -> FloatArray:
-        """(..., 4, 3) m, along rods 4a, 4b and 6, and B3C3, which rods 11 are parallel to."""
+        """Vectors along rods 4a, 4b and 6, and B3C3 (parallel to rods 11), (..., 4, 3) m."""
         half = np.array([self.geometry.l5, 0.0, 0.0])
         b1, b2, b3 = np.moveaxis(_elbows(self.theta, self.geometry), -2, 0)
         feet: FloatArray = np.stack([b1 + half, b1 - half, b2, b3], axis=-2)
         return self.ends - feet
 
     def _moved(self, offset: Sequence[FloatArray | float]) -> FloatArray:
-        """C1 (..., 3) m, displaced by an offset in the frame of link 3', x, y and z in m."""
+        """Displace C1 by an offset x, y, z (m) in the frame of link 3', to (..., 3) m."""
         x, y, z = offset
         cos, sin = np.cos(self.tilt), np.sin(self.tilt)
         along, up = x * cos + z * sin, z * cos - x * sin
@@ -105,7 +105,7 @@ class RotatedPostures:
 
 @np.errstate(all="ignore")
 def forward_rotated(theta: ArrayLike, geometry: Geometry = PAPER) -> RotatedPostures:
-    """All assemblies with link 3' turned at actuated angles theta (..., 3) rad, as (..., 8).
+    """Solve all assemblies with link 3' turned at actuated angles theta (..., 3) rad, (..., 8).
 
     Link 3' depends on theta_1 and theta_2 alone: tan(phi / 2) is a root of a quartic, so that there
     are 4 postures of it at most, and 2 of link 7 for each. One slot for each branch of
@@ -133,7 +133,7 @@ def forward_rotated(theta: ArrayLike, geometry: Geometry = PAPER) -> RotatedPost
 
 @np.errstate(all="ignore")
 def inverse_rotated(position: ArrayLike, geometry: Geometry = PAPER) -> RotatedPostures:
-    """All postures with link 3' turned and point P at position (..., 3) m, as (..., 48).
+    """Solve all postures with link 3' turned and point P at position (..., 3) m, (..., 48).
 
     tan(phi / 2) is a root of a sextic for each sign of cos(beta); then arm 1 is known, and arms 2
     and 3 can be bent two ways. Slots: cos(beta) < 0, then > 0; six tilts, in order; legs 2 and 3,
@@ -171,7 +171,7 @@ def inverse_rotated(position: ArrayLike, geometry: Geometry = PAPER) -> RotatedP
 def transition(
     theta_1: ArrayLike, beta: ArrayLike, side: ArrayLike = -1, geometry: Geometry = PAPER
 ) -> FloatArray:
-    """Points P (..., 3) m of the surface on which both modes meet.
+    """Compute points P (..., 3) m of the surface on which both modes meet.
 
     Angles (...,) rad and ``side`` (...,), the sign of xC, broadcast. The surface is a curve of C1,
     on which rods 4a and 4b are level in x, swept by link 7. NaN where rods 4 do not reach y = 0;
@@ -189,7 +189,7 @@ def _dot(a: _Planar, b: _Planar) -> FloatArray:
 
 
 def _elbows(theta: FloatArray, g: Geometry) -> FloatArray:
-    """B1, B2, B3 as rows (..., 3, 3) m."""
+    """Compute B1, B2, B3 as rows (..., 3, 3) m."""
     one, two, three = np.moveaxis(theta, -1, 0)
     level, rise = equations.arms((one, two, three), g, NUMPY)
     zero = 0 * one
@@ -206,10 +206,11 @@ def _samples(count: int) -> FloatArray:
 
 
 def _zeros(values: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Zeros (..., 2 d) of trigonometric polynomials of degree d, and whether they may be real.
+    """Find zeros (..., 2 d) of trigonometric polynomials of degree d, and whether they may be real.
 
-    Of their values (..., 2 d + 1) at equal steps from 0 through a turn: eigenvalues w = exp(i phi)
-    of the companion matrix, in order of phi in (-pi, pi]. A real phi has w on the unit circle.
+    The polynomials are given by their values (..., 2 d + 1) at equal steps from 0 through a turn.
+    The zeros are eigenvalues w = exp(i phi) of the companion matrix, in order of phi in (-pi, pi].
+    If phi is real, w is on the unit circle.
     """
     degree = values.shape[-1] - 1
     coefficients = np.fft.fftshift(np.fft.fft(values), axes=-1)
@@ -227,9 +228,9 @@ def _zeros(values: FloatArray) -> tuple[FloatArray, BoolArray]:
 
 @np.errstate(all="ignore")
 def link3_rotated(theta: FloatArray, geometry: Geometry = PAPER) -> tuple[_Planar, FloatArray]:
-    """Point C1 (xC + i zC, m) and tilt (rad) in all postures of link 3' turned, (..., 4).
+    """Solve point C1 (xC + i zC, m) and tilt (rad) of link 3' turned, (..., 4).
 
-    They depend on theta_1 and theta_2 of theta (..., 3) rad alone. NaN where there are fewer; the
+    Both depend on theta_1 and theta_2 of theta (..., 3) rad alone. Missing solutions are NaN. The
     slots are those of :data:`.modes.ROTATED_MODES`, by pairs.
 
     Seen along y and from B1, C1 = rho n with n = exp(-i phi / 2), since B1C1 halves the angle. Then
@@ -242,7 +243,7 @@ def link3_rotated(theta: FloatArray, geometry: Geometry = PAPER) -> tuple[_Plana
     kappa = (b2 - b1)[..., 0, None] + 2 * g.l5 + 1j * (b2 - b1)[..., 2, None]
 
     def terms(tilt: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """rho^2, and p and q of 2 rho p = q."""
+        """Return rho^2, and p and q of 2 rho p = q."""
         n, u = np.exp(-0.5j * tilt), np.exp(-1j * tilt)
         rho2 = reach2 - (2 * g.l5 * n.imag) ** 2
         q = rho2 + abs(kappa + 2 * g.l5 * (u - 1)) ** 2 - g.l4**2
@@ -265,11 +266,11 @@ def link3_rotated(theta: FloatArray, geometry: Geometry = PAPER) -> tuple[_Plana
 
 
 def _leg1(p: _Planar, link7: _Planar, g: Geometry) -> tuple[FloatArray, FloatArray]:
-    """theta_1 and tilt, (..., 6), for P and P - C1 in the frame of link 3', seen along y.
+    """Solve theta_1 and tilt, (..., 6), for P and P - C1 in the frame of link 3', seen along y.
 
-    B1C1 halves the angle where l3 sin(theta_1) is what ``up`` says, and the rods close where
-    l3 cos(theta_1) is ``out``. Both squares add up to l3^2: times cos^2(phi / 2), a trigonometric
-    polynomial of degree 3.
+    B1C1 halves the angle where l3 sin(theta_1) equals ``up``, and the rods close where
+    l3 cos(theta_1) equals ``out``. The sum of both squares is l3^2. Times cos^2(phi / 2), that is a
+    trigonometric polynomial of degree 3.
     """
     p, link7 = p[..., None], link7[..., None]
 
@@ -308,7 +309,7 @@ def _refined(
     one: FloatArray,
     two: FloatArray,
 ) -> tuple[_Pair, _Pair, _Four]:
-    """Newton's method on two closures with two unknowns: the unknowns, the gaps, the slopes."""
+    """Refine two unknowns of two closures by Newton's method; return unknowns, gaps and slopes."""
     for _ in range(_STEPS):
         (e, f), (a, b, c, d) = closures(one, two)
         determinant = a * d - b * c
@@ -321,7 +322,7 @@ def _refined(
 def _closures(
     rho: FloatArray, tilt: FloatArray, kappa: _Planar, reach2: FloatArray, g: Geometry
 ) -> tuple[_Pair, _Four]:
-    """Closures of rods 4a and 4b, and of rod 6, m^2, and their slopes by rho and tilt."""
+    """Compute closures of rods 4a and 4b, and of rod 6, m^2, and their slopes by rho and tilt."""
     n, u = np.exp(-0.5j * tilt), np.exp(-1j * tilt)
     rod6 = rho * n - 2 * g.l5 * (u - 1) - kappa
     gaps = (
@@ -338,7 +339,7 @@ def _closures(
 
 
 def _in_slots(c1: _Planar, tilt: FloatArray, sign: FloatArray) -> tuple[_Planar, FloatArray]:
-    """Half of the real ones have a negative sign; those of one sign are in order of their turn."""
+    """Sort solutions into slots: half have a negative sign, then each half by its turn."""
     real = ~np.isnan(sign)
     count = real.sum(axis=-1, keepdims=True)
     half = count // 2
@@ -355,7 +356,7 @@ def _in_slots(c1: _Planar, tilt: FloatArray, sign: FloatArray) -> tuple[_Planar,
 def _link7(
     theta: FloatArray, link3: _Planar, tilt: FloatArray, g: Geometry
 ) -> tuple[FloatArray, BoolArray]:
-    """cos(beta), and whether rod 11 closes: Eqs. (9) and (10) in the frame of link 3'."""
+    """Solve cos(beta), and whether rod 11 closes: Eqs. (9) and (10) in the frame of link 3'."""
     b3 = _elbows(theta, g)[..., 2, :]
     to_c1 = (link3 - (b3[..., 0, None] + 1j * b3[..., 2, None])) * np.exp(1j * tilt)
     u, w = to_c1.real + 2 * g.l2, to_c1.imag + g.l6
@@ -366,7 +367,7 @@ def _link7(
 
 @np.errstate(all="ignore")
 def factors(postures: RotatedPostures) -> Factors:
-    """What vanishes where a rotated assembly is singular, in :class:`.jacobian.Factors`' order.
+    """Compute the factors that are zero where a rotated assembly is singular.
 
     * parallel (..., 3): sin(beta); level3 = l7 cos(beta) - B3C3 . u (m), with u along link 3';
       planar = B2C2 . dC2/dphi with motor 1 locked (m^2/rad), zero where the lines of rods 4a, 4b
@@ -399,16 +400,16 @@ def factors(postures: RotatedPostures) -> Factors:
 
 @np.errstate(all="ignore")
 def velocity(postures: RotatedPostures) -> FloatArray:
-    """Rates of P (m/rad) and of the tilt (rad/rad) per rate of each motor, (..., 4, 3).
+    """Compute rates of P (m/rad) and of the tilt (rad/rad) per rate of each motor, (..., 4, 3).
 
-    No rod changes its length: rods 4a, 4b and 6 give the twist of link 3', rod 11 the rate of link
-    7. At a parallel singularity, and where both modes meet, there are no finite rates.
+    Rods keep their lengths. So rods 4a, 4b and 6 give the twist of link 3', and rod 11 the rate of
+    link 7. At a parallel singularity, and where both modes meet, the rates are not finite.
     """
     g, rods, ends = postures.geometry, postures.rods, postures.ends
     rates = _elbow_rates(postures.theta, g)[..., [0, 0, 1, 2], :]
     pulls = np.sum(rods * rates, axis=-1)[..., None] * np.eye(3)[[0, 0, 1, 2]]
     c1, e_y = postures._moved([0.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
-    # What velocities of C1 along x and z, and a turn about y through it, do to each rod
+    # Rates of each rod for velocities of C1 along x and z, and for a turn about y through C1
     turns = np.sum(rods * np.cross(e_y, ends - c1[..., None, :]), axis=-1)
     moved = np.stack([rods[..., 0], rods[..., 2], turns], axis=-1)
     cos, sin = np.cos(postures.beta), np.sin(postures.beta)
@@ -425,14 +426,14 @@ def velocity(postures: RotatedPostures) -> FloatArray:
 
 
 def _elbow_rates(theta: FloatArray, g: Geometry) -> FloatArray:
-    """dB_i/dtheta_i as rows (..., 3, 3), m/rad."""
+    """Compute dB_i/dtheta_i as rows (..., 3, 3), m/rad."""
     pivots = np.array([[0.0, g.l1, 0.0], [-g.l1, 0.0, 0.0], [g.l1, 0.0, 0.0]])
     rates: FloatArray = _elbows(theta + np.pi / 2, g) - pivots
     return rates
 
 
 def _inverse(matrix: FloatArray) -> FloatArray:
-    """Of matrices (..., 3, 3); not finite where there is none."""
+    """Invert matrices (..., 3, 3); the result is not finite where there is no inverse."""
     one, two, three = np.moveaxis(matrix, -2, 0)
     adjugate = np.stack([np.cross(two, three), np.cross(three, one), np.cross(one, two)], axis=-1)
     inverted: FloatArray = adjugate / np.sum(one * adjugate[..., 0], axis=-1)[..., None, None]

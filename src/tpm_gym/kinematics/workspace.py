@@ -1,4 +1,4 @@
-"""Where the mechanism can go: regions, reachability, assembly modes and conditioning of points.
+"""Regions, and reachability, assembly modes and conditioning of points.
 
 Everything here is in the paper frame, in metres, on one working mode.
 """
@@ -43,27 +43,27 @@ class Region:
             raise ConfigurationError("low", self.low, f"at most high = {self.high} on every axis")
 
     def contains(self, points: ArrayLike) -> BoolArray:
-        """Whether points (..., 3) are inside, as (...,)."""
+        """Return whether points (..., 3) are inside, as (...,)."""
         array = np.asarray(points, dtype=np.float64)
         inside: BoolArray = np.all((array >= self.low) & (array <= self.high), axis=-1)
         return inside
 
     def project(self, points: ArrayLike) -> FloatArray:
-        """The points of the box that are nearest to points (..., 3)."""
+        """Return the nearest points of the box to points (..., 3)."""
         inside: FloatArray = np.minimum(np.maximum(points, self.low), self.high)
         return inside
 
     def nearest(self, point: Vector) -> Vector:
-        """The same for one point, in plain floats."""
+        """Return the nearest point of the box to one point, as floats."""
         (x, y, z), (a, b, c), (d, e, f) = point, self.low, self.high
         return min(max(x, a), d), min(max(y, b), e), min(max(z, c), f)
 
     def corners(self) -> Iterator[Vector]:
-        """The eight corners, m."""
+        """Yield the eight corners, m."""
         return product(*zip(self.low, self.high, strict=True))  # type: ignore[return-value]
 
     def margin(self, point: ArrayLike) -> float:
-        """Signed distance of one point (3,) to the nearest face; negative outside, m."""
+        """Compute the signed distance of a point (3,) to the nearest face, m; negative outside."""
         array = np.asarray(point, dtype=np.float64)
         return float(np.minimum(array - self.low, np.asarray(self.high) - array).min())
 
@@ -71,7 +71,7 @@ class Region:
 def reachable(
     position: ArrayLike, branch: WorkingMode = ELBOWS_OUT, geometry: Geometry = PAPER
 ) -> BoolArray:
-    """Whether points (..., 3) m have a posture on ``branch``, as (...,)."""
+    """Return whether points (..., 3) m have a posture on ``branch``, as (...,)."""
     valid: BoolArray = inverse_all(position, geometry).valid[..., branch.index]
     return valid
 
@@ -79,7 +79,7 @@ def reachable(
 def assembly_of(
     position: ArrayLike, branch: WorkingMode = ELBOWS_OUT, geometry: Geometry = PAPER
 ) -> IntArray:
-    """Slot in ASSEMBLY_MODES that the posture of ``branch`` at points (..., 3) belongs to.
+    """Find the slot in ASSEMBLY_MODES of the posture of ``branch`` at points (..., 3).
 
     Returns:
         (...,) slot, or -1 where the point is not reachable on ``branch``.

@@ -9,14 +9,13 @@ from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from tpm_gym.envs.vector import TPMVectorEnv
-from tpm_gym.learning.checkpoint import CheckpointStore, Content
+from tpm_gym.learning.checkpoint import CheckpointStore
 from tpm_gym.learning.configuration import TrainingConfig
 from tpm_gym.learning.errors import CheckpointError
 from tpm_gym.learning.policies import TrainedPolicy
-from tpm_gym.learning.rollout import SELECTION_SEED, GoalEnv, run_batch, run_episodes, summarise
+from tpm_gym.learning.rollout import SELECTION_SEED, run_episodes, summarise
 from tpm_gym.learning.run_folder import EVALUATIONS_FILE
 from tpm_gym.learning.signals import SignalListener
 from tpm_gym.learning.training_state import capture
@@ -32,7 +31,7 @@ class PeriodicEvaluation(BaseCallback):
     alone. Each is appended to evaluations.jsonl, and the best policy so far is kept.
 
     Args:
-        env: A separate environment, so that evaluations do not disturb training.
+        envs: Separate environments, so that evaluations do not disturb training.
         console: Gets one line for each evaluation.
         keep: Called with the model whenever it is the best so far.
     """
@@ -40,13 +39,13 @@ class PeriodicEvaluation(BaseCallback):
     def __init__(
         self,
         config: TrainingConfig,
-        env: GoalEnv | TPMVectorEnv,
+        envs: TPMVectorEnv,
         console: Console,
         keep: Callable[[BaseAlgorithm], object],
     ) -> None:
         """Store the arguments."""
         super().__init__()
-        self._config, self._env = config, env
+        self._config, self._envs = config, envs
         self._console, self._keep = console, keep
         self.evaluations: list[dict[str, Any]] = []
         self._best: tuple[float, float] | None = None
@@ -77,10 +76,7 @@ class PeriodicEvaluation(BaseCallback):
     def _evaluate(self) -> None:
         policy = TrainedPolicy(self.model)
         episodes = self._config.eval_episodes
-        if isinstance(self._env, TPMVectorEnv):
-            records = run_batch(self._env, policy, episodes, SELECTION_SEED)
-        else:
-            records = run_episodes(self._env, policy, episodes, SELECTION_SEED)
+        records = run_episodes(self._envs, policy, episodes, SELECTION_SEED)
         metrics = summarise(records)
         self._record({name: estimate.as_dict() for name, estimate in metrics.items()})
         success = metrics["success_at_end"]
@@ -147,9 +143,6 @@ class Checkpointing(BaseCallback):
     A checkpoint that cannot be written is reported and tried again when the next one is due.
     Training continues meanwhile, and the earlier checkpoints stay.
 
-    A rollout of an on-policy algorithm is long, so a stop does not wait for its end. The state at
-    its beginning is kept in memory and saved, and resuming repeats the rollout.
-
     The first checkpoint is saved before anything else is done, so that no policy is without one.
 
     Args:
@@ -170,7 +163,6 @@ class Checkpointing(BaseCallback):
         super().__init__()
         self._config, self._store, self._evaluation = config, store, evaluation
         self._listener, self._console, self._seconds = listener, console, seconds
-        self._held: Content | None = None
         self._last_step: int | None = store.newest
         self._next_time = time.perf_counter() + _SHORTEST_INTERVAL
 
@@ -179,30 +171,21 @@ class Checkpointing(BaseCallback):
         self.model.start_time = int(time.time_ns() - self._seconds * 1e9)
         self.model._num_timesteps_at_start = 0
         if self._last_step is None:
-            self._save(self._capture(), time.perf_counter())
+            self._save()
 
     def _on_rollout_start(self) -> None:
-        started = time.perf_counter()
         stop = self._listener.received is not None
-        on_policy = isinstance(self.model, OnPolicyAlgorithm)
-        due = self._is_due()
-        if on_policy or due or stop:
-            content = self._capture()
-            self._held = content if on_policy else None
-            if due or stop:
-                self._save(content, started)
+        if stop or self._is_due():
+            self._save()
         if stop:
             raise StopTrainingError
 
     def _on_step(self) -> bool:
-        if self._listener.received is not None and self._held is not None:
-            self._save(self._held, time.perf_counter())
-            raise StopTrainingError
         return True
 
     def save_finished(self) -> None:
         """Save the end of the training."""
-        self._save(self._capture(finished=True), time.perf_counter())
+        self._save(finished=True)
 
     def _is_due(self) -> bool:
         if self._config.checkpoint_every is not None:
@@ -210,12 +193,11 @@ class Checkpointing(BaseCallback):
             return taken >= self._config.checkpoint_every
         return time.perf_counter() >= self._next_time
 
-    def _capture(self, finished: bool = False) -> Content:
+    def _save(self, finished: bool = False) -> None:
+        """Save a checkpoint, or report why not."""
+        started = time.perf_counter()
         extra = {"seconds": seconds_trained(self.model), "evaluation": self._evaluation.state()}
-        return capture(self.model, self._config.run, extra, finished)
-
-    def _save(self, content: Content, started: float) -> None:
-        """Save a state that was captured from the time ``started`` on, or report why not."""
+        content = capture(self.model, self._config.run, extra, finished)
         try:
             self._store.save(content)
         except CheckpointError as error:

@@ -92,7 +92,7 @@ class CheckpointStore:
         Returns:
             The content; None if there are no checkpoints.
         """
-        steps = self._steps()
+        steps = self.steps()
         problems = []
         for step in reversed(steps):
             try:
@@ -119,7 +119,7 @@ class CheckpointStore:
             with suppress(OSError):  # the folder holds other files
                 self.folder.rmdir()
 
-    def _steps(self) -> list[int]:
+    def steps(self) -> list[int]:
         """Return the steps of all checkpoints in the folder, whole or damaged, oldest first."""
         if not self.folder.is_dir():
             return []

@@ -209,11 +209,13 @@ def complete(config: TrainingConfig) -> TrainingConfig:
         "envs": recipe.n_envs,
         "recipe_file": file,
         "run": Path("runs", f"{env}-{config.algo}-s{config.seed}"),
-        "eval_every": max(1, steps // (20 if config.in_batches else 10)),
         "eval_episodes": 200 if config.in_batches else 20,
     }
     missing = {name: v for name, v in computed.items() if getattr(config, name) is UNSET}
     config = replace(config, recipe=recipe, **missing)
+    if config.eval_every is UNSET:  # more often, it would evaluate equal policies
+        often = steps // (20 if config.in_batches else 10)
+        config = replace(config, eval_every=max(config.rollout, often))
     _check(config)
     return _in_whole_rollouts(config, 0)
 

@@ -1,7 +1,6 @@
 """Learning curve of a run, as a picture."""
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
 from tpm_gym.learning.figure_style import BLUE, GREEN, ORANGE, WIDTH, save, style
-from tpm_gym.learning.provenance import write_whole
 
 
 def draw_learning_curve(path: Path, title: str, evaluations: Sequence[Mapping[str, Any]]) -> None:
@@ -29,7 +27,7 @@ def draw_learning_curve(path: Path, title: str, evaluations: Sequence[Mapping[st
             # To the right, where the legend covers no data.
             axes.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
         figure.align_ylabels([upper, lower])
-        write_whole(path, partial(save, figure))
+        save(figure, path)
 
 
 def _draw_success(axes: Axes, evaluations: Sequence[Mapping[str, Any]]) -> None:

@@ -8,8 +8,8 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 
+from tpm_gym.envs.ids import env_ids
 from tpm_gym.envs.single import TPMEnv
-from tpm_gym.envs.registration import env_ids
 from tpm_gym.envs.vector import TPMVectorEnv
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.rollout import GoalEnv
@@ -72,7 +72,7 @@ def make_env(env: str | EnvSpec, *, in_worker: bool = False, **options: Any) -> 
 
 
 def make_envs(env: str | EnvSpec, count: int, **options: Any) -> TPMVectorEnv:
-    """Make a vector of environments for the analytic engine; options as for :func:`make_env`."""
+    """Make a vector of environments; options as for :func:`make_env`."""
     envs = gym.make_vec(env, num_envs=count, **options)
     assert isinstance(envs, TPMVectorEnv)
     return envs

@@ -1,15 +1,11 @@
-"""Means over episodes with 95% intervals, and the time that a run takes to learn."""
+"""Means over episodes with 95% intervals."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from statistics import median
 from typing import Final
 
 import numpy as np
-
-LEARNED: Final = 0.95
-"""Least success rate of a policy that has learned its task."""
 
 _Z95: Final = 1.959963984540054  # 97.5% quantile of the standard normal distribution
 _SEED: Final = 0  # fixed: the same values always give the same interval
@@ -56,19 +52,3 @@ def bootstrap(values: Sequence[float], worst: float | None = None) -> Estimate:
     mean = float(sample.mean())
     # Equal values can differ from their mean by rounding; the interval must contain the mean.
     return Estimate(mean, min(mean, float(low)), max(mean, float(high)), worst)
-
-
-def settled(successes: Sequence[float]) -> int | None:
-    """Return the first evaluation from which success stays at ``LEARNED`` or above.
-
-    None if the last evaluation is below, or there is none.
-    """
-    below = [index for index, success in enumerate(successes) if success < LEARNED - 1e-9]
-    first = below[-1] + 1 if below else 0
-    return first if first < len(successes) else None
-
-
-def median_time(times: Sequence[float | None]) -> float | None:
-    """Return the median over runs; None stands for a run that never learned, and is the latest."""
-    value = median(math.inf if time is None else time for time in times)
-    return value if math.isfinite(value) else None

@@ -16,18 +16,16 @@ from rich.table import Table
 from tpm_gym.envs.vector import TPMVectorEnv
 from tpm_gym.learning import provenance
 from tpm_gym.learning.configuration import UNSET, EnvOptions, check_least, shown_default, unset
-from tpm_gym.learning.environments import check_env_id, import_module_of, make_env, make_envs
+from tpm_gym.learning.environments import check_env_id, import_module_of, make_envs
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.estimates import Estimate
 from tpm_gym.learning.film import write_contact_sheet, write_video
-from tpm_gym.learning.policies import TrainedPolicy, load_policy, trained_in
+from tpm_gym.learning.policies import load_policy, trained_in
 from tpm_gym.learning.rollout import (
     BATCH,
     TEST_SEED,
     Episode,
-    GoalEnv,
     Policy,
-    run_batch,
     run_episodes,
     summarise,
 )
@@ -134,10 +132,11 @@ def evaluate(config: EvaluationConfig, console: Console | None = None) -> list[R
     console = console or Console(width=None if sys.stdout.isatty() else 200)
     _check(config)
     config = _complete(config)
-    with closing(_make_env(config)) as env:
+    count = min(config.episodes, BATCH) if config.env_options.in_batches else 1
+    with closing(_make_envs(config, count)) as envs:
         # All are loaded before the first one runs, so that a mistyped name shows at once.
-        policies = list(zip(config.policy, _load(config, env), strict=True))
-        results = [_evaluate_one(env, *policy, config, console) for policy in policies]
+        policies = list(zip(config.policy, _load(config, envs), strict=True))
+        results = [_evaluate_one(envs, *policy, config, console) for policy in policies]
     console.print(_table(config, results))
     if config.json is not None:
         provenance.write_json(config.json, _description(config, results))
@@ -197,22 +196,18 @@ def _conditions(env_id: str, given: Mapping[str, Any]) -> dict[str, str]:
     return {name: str(getattr(value, "name", value)) for name, value in found.items()}
 
 
-def _make_env(config: EvaluationConfig, render_mode: str | None = None) -> GoalEnv:
-    return make_env(
+def _make_envs(
+    config: EvaluationConfig, count: int, render_mode: str | None = None
+) -> TPMVectorEnv:
+    return make_envs(
         config.env,
+        count,
         goals=config.goals,
         penalty_weight=config.penalty_weight,
         randomisation=parse_randomisation(config.randomisation),
         render_mode=render_mode,
         **config.env_options.given(),
     )
-
-
-def _make_batch(env: GoalEnv, config: EvaluationConfig) -> TPMVectorEnv:
-    """Make a vector of environments like this one."""
-    assert env.spec is not None
-    options = {k: v for k, v in env.spec.kwargs.items() if k != "render_mode"}
-    return make_envs(env.spec.id, min(config.episodes, BATCH), **options)
 
 
 def parse_randomisation(entries: Sequence[str]) -> dict[str, Any]:
@@ -231,28 +226,26 @@ def parse_randomisation(entries: Sequence[str]) -> dict[str, Any]:
     return result
 
 
-def _load(config: EvaluationConfig, env: GoalEnv) -> list[Policy]:
+def _load(config: EvaluationConfig, envs: TPMVectorEnv) -> list[Policy]:
     trust = config.trust_pickle
-    return [load_policy(spec, env, trust_pickle=trust) for spec in config.policy]
+    return [load_policy(spec, envs, trust_pickle=trust) for spec in config.policy]
 
 
 def _evaluate_one(
-    env: GoalEnv, spec: str, policy: Policy, config: EvaluationConfig, console: Console
+    envs: TPMVectorEnv, spec: str, policy: Policy, config: EvaluationConfig, console: Console
 ) -> Result:
     """Run the episodes of one policy, with a progress bar on a terminal."""
-    hidden = not console.is_terminal
     start = time.perf_counter()
-    with Progress(console=console, disable=hidden) as bar:
+    with Progress(console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task(spec, total=config.episodes)
-        if config.env_options.in_batches and isinstance(policy, TrainedPolicy):
-            with closing(_make_batch(env, config)) as envs:
-                records = run_batch(envs, policy, config.episodes, config.seed)
-        else:
-            records = run_episodes(
-                env, policy, config.episodes, config.seed, on_episode=lambda: bar.advance(task)
-            )
-        wall_seconds = time.perf_counter() - start
-    return Result(spec, summarise(records), records, wall_seconds)
+        records = run_episodes(
+            envs,
+            policy,
+            config.episodes,
+            config.seed,
+            on_episodes=lambda count: bar.advance(task, count),
+        )
+    return Result(spec, summarise(records), records, time.perf_counter() - start)
 
 
 def _table(config: EvaluationConfig, results: Sequence[Result]) -> Table:
@@ -323,14 +316,14 @@ def paths_per_policy(path: Path, policies: Sequence[str]) -> list[Path]:
 
 def _film(config: EvaluationConfig, console: Console) -> None:
     """Run the first episodes again with rendering, which would have slowed the evaluation."""
-    with closing(_make_env(config, render_mode="rgb_array")) as env:
-        for i, policy in enumerate(_load(config, env)):
+    with closing(_make_envs(config, 1, "rgb_array")) as envs:
+        for i, policy in enumerate(_load(config, envs)):
             if config.video is not None:
                 path = paths_per_policy(config.video, config.policy)[i]
                 episodes = min(config.video_episodes, config.episodes)
-                write_video(path, env, policy, episodes, config.seed)
+                write_video(path, envs, policy, episodes, config.seed)
                 console.print(f"video: {path}", markup=False)
             if config.picture is not None:
                 path = paths_per_policy(config.picture, config.policy)[i]
-                write_contact_sheet(path, env, policy, config.seed)
+                write_contact_sheet(path, envs, policy, config.seed)
                 console.print(f"picture: {path}", markup=False)

@@ -1,5 +1,6 @@
 """Style of all figures: palette, fonts, and saving with equal bytes each time."""
 
+import io
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -7,6 +8,8 @@ from typing import Any
 
 import matplotlib
 from matplotlib.figure import Figure
+
+from tpm_gym.learning.provenance import write_whole
 
 DPI = 160
 WIDTH = 7.2  # inches: a paper's page, both columns
@@ -44,5 +47,11 @@ def style() -> Iterator[None]:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a PNG without the program and date, which would change its bytes."""
-    figure.savefig(path, dpi=DPI, metadata={"Software": None})
+    """Write a PNG without the program and date, which would change its bytes.
+
+    Drawing takes a second. It happens in memory, so that a process that is killed meanwhile leaves
+    no part of a file.
+    """
+    drawn = io.BytesIO()
+    figure.savefig(drawn, dpi=DPI, metadata={"Software": None})
+    write_whole(path, lambda part: part.write_bytes(drawn.getvalue()))

@@ -7,8 +7,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from tpm_gym.envs.vector import TPMVectorEnv
 from tpm_gym.learning.provenance import write_whole
-from tpm_gym.learning.rollout import GoalEnv, Policy, run_episodes
+from tpm_gym.learning.rollout import Policy, run_episodes
 
 Frame = NDArray[np.uint8]
 
@@ -16,27 +17,29 @@ _ROWS: Final = 2
 _COLUMNS: Final = 3
 
 
-def write_video(path: Path, env: GoalEnv, policy: Policy, episodes: int, first_seed: int) -> None:
-    """Write an MP4 of consecutive episodes in real time; ``env`` renders ``rgb_array``."""
+def write_video(
+    path: Path, envs: TPMVectorEnv, policy: Policy, episodes: int, first_seed: int
+) -> None:
+    """Write an MP4 of consecutive episodes in real time; ``envs`` renders ``rgb_array``."""
     import imageio.v2 as imageio
 
     def write(part: Path) -> None:
-        fps = env.metadata["render_fps"]
+        fps = envs.metadata["render_fps"]
         # H.264 needs an even width and height.
         writer: Any = imageio.get_writer(part, fps=fps, macro_block_size=2)
         with writer as video:
             add: Any = video.append_data
-            run_episodes(env, policy, episodes, first_seed, on_frame=lambda: add(env.render()))
+            run_episodes(envs, policy, episodes, first_seed, on_frame=lambda: add(envs.render()[0]))
 
     write_whole(path, write)
 
 
-def write_contact_sheet(path: Path, env: GoalEnv, policy: Policy, seed: int) -> None:
-    """Write a PNG of six moments of one episode, row by row; ``env`` renders ``rgb_array``."""
+def write_contact_sheet(path: Path, envs: TPMVectorEnv, policy: Policy, seed: int) -> None:
+    """Write a PNG of six moments of one episode, row by row; ``envs`` renders ``rgb_array``."""
     import imageio.v3 as imageio
 
     frames: list[Any] = []
-    run_episodes(env, policy, 1, seed, on_frame=lambda: frames.append(env.render()))
+    run_episodes(envs, policy, 1, seed, on_frame=lambda: frames.append(envs.render()[0]))
     sheet = contact_sheet(frames)
     write_whole(path, lambda part: imageio.imwrite(part, sheet))
 

@@ -7,6 +7,7 @@ which can run any code when they are loaded. The archive needs ``trust_pickle``.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -18,7 +19,7 @@ from tpm_gym import TPMError
 from tpm_gym.learning.algorithms import ALGORITHMS, NAMES
 from tpm_gym.learning.errors import PolicyError
 from tpm_gym.learning.provenance import read_json
-from tpm_gym.learning.rollout import Action, GoalEnv, Observation, Policy
+from tpm_gym.learning.rollout import Action, Observation, Policy
 from tpm_gym.learning.run_folder import BEST_FILE, CONFIG_FILE, EXPORTED, LAST_FILE
 from tpm_gym.resources import POLICIES
 from tpm_gym.tasks.expert import Expert
@@ -26,6 +27,7 @@ from tpm_gym.tasks.expert import Expert
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
+    from tpm_gym.envs.vector import TPMVectorEnv
     from tpm_gym.policy import Policy as ExportedPolicy
 
 SCRIPTED: Final = ("expert", "random")
@@ -33,74 +35,75 @@ SCRIPTED: Final = ("expert", "random")
 
 @dataclass(frozen=True)
 class TrainedPolicy:
-    """Mean action of a trained algorithm."""
+    """Policy that acts with the mean action of a trained algorithm."""
 
     model: BaseAlgorithm | ExportedPolicy
 
-    def reset(self, observation: Observation, seed: int) -> None:
+    def reset(self, observation: Observation, seeds: Sequence[int]) -> None:
         """Do nothing: the policy has no memory."""
 
     def act(self, observation: Observation) -> Action:
-        """Return the deterministic action for ``observation``."""
+        """Return the deterministic actions for ``observation``."""
         action, _ = self.model.predict(observation, deterministic=True)
         return action
 
 
 @dataclass
 class RandomPolicy:
-    """Uniform random actions, from a generator that is seeded in every episode."""
+    """Policy that draws uniform actions, with a generator of its own for each episode."""
 
     space: Any
-    rng: np.random.Generator = field(default_factory=np.random.default_rng)
+    rngs: list[np.random.Generator] = field(default_factory=list)
 
-    def reset(self, observation: Observation, seed: int) -> None:
-        """Seed the generator with the seed of the episode."""
-        self.rng = np.random.default_rng(seed)
+    def reset(self, observation: Observation, seeds: Sequence[int]) -> None:
+        """Seed a generator for each episode with the episode's seed."""
+        self.rngs = [np.random.default_rng(seed) for seed in seeds]
 
     def act(self, observation: Observation) -> Action:
-        """Return an action that does not depend on ``observation``."""
-        drawn: Action = self.rng.uniform(self.space.low, self.space.high)
+        """Return actions that do not depend on ``observation``."""
+        drawn = np.array([rng.uniform(self.space.low, self.space.high) for rng in self.rngs])
         return drawn.astype(self.space.dtype)
 
 
 @dataclass(frozen=True)
 class ExpertPolicy:
-    """Scripted controller, which is deterministic."""
+    """Policy that acts with the scripted controller, which is deterministic."""
 
     expert: Expert
 
-    def reset(self, observation: Observation, seed: int) -> None:
-        """Plan the motion of the episode."""
+    def reset(self, observation: Observation, seeds: Sequence[int]) -> None:
+        """Plan the motion of the episodes."""
         self.expert.reset(observation)
 
     def act(self, observation: Observation) -> Action:
-        """Return the action of the controller."""
+        """Return the actions of the controller."""
         return self.expert.act(observation)
 
 
-def load_policy(spec: str, env: GoalEnv, *, trust_pickle: bool = False) -> Policy:
+def load_policy(spec: str, envs: TPMVectorEnv, *, trust_pickle: bool = False) -> Policy:
     """Return the policy that ``spec`` names.
 
     Args:
         spec: ``expert``, ``random``, an exported policy (either of its files, or their common
             name), the id of a published one, a .zip file of a training, or the folder of a run (its
             best policy).
+        envs: Environments that the policy acts in.
         trust_pickle: Whether a .zip file may be loaded, which can run any code.
 
     Raises:
-        PolicyError: There is no such policy, its files are damaged, it does not fit ``env``, or it
+        PolicyError: There is no such policy, its files are damaged, it does not fit ``envs``, or it
             is a .zip file and ``trust_pickle`` is not set.
     """
     if spec == "random":
-        return RandomPolicy(env.action_space)
+        return RandomPolicy(envs.single_action_space)
     if spec == "expert":
-        return ExpertPolicy(Expert(env))
+        return ExpertPolicy(Expert(envs))
     path = _policy_file(spec)
     if path.suffix not in EXPORTED:
         require_trust(spec, path, trust_pickle)
         model = load_model(spec, path)
         for kind in ("observation", "action"):
-            trained, given = (getattr(owner, f"{kind}_space") for owner in (model, env))
+            trained, given = getattr(model, f"{kind}_space"), getattr(envs, f"single_{kind}_space")
             if trained != given:
                 problem = f"was trained with {kind} space {trained}, the environment has {given}"
                 raise refused(spec, problem)
@@ -108,7 +111,7 @@ def load_policy(spec: str, env: GoalEnv, *, trust_pickle: bool = False) -> Polic
     _use_one_thread()
     try:
         policy = tpm_gym.load_policy(path)
-        policy.check(env)
+        policy.check(envs)
     except TPMError as error:
         raise refused(spec, str(error)) from error
     return TrainedPolicy(policy)
@@ -205,6 +208,7 @@ def load_model(spec: str, path: Path) -> BaseAlgorithm:
         raise refused(spec, f"algorithm {algorithm!r} is none of {NAMES}")
     _use_one_thread()
     # Acting needs no replay buffer, and a hindsight buffer would need an environment.
+    replaced: dict[str, Any]
     replaced = {"replay_buffer_class": None, "replay_buffer_kwargs": {}, "buffer_size": 1}
     try:
         kind = ALGORITHMS[algorithm].load_class()

@@ -37,13 +37,13 @@ GoalEnv: TypeAlias = gym.Env[Observation, Action]
 
 
 class Policy(Protocol):
-    """Policy that acts in episodes, one at a time or in batches."""
+    """Policy that acts in n episodes at a time."""
 
-    def reset(self, observation: Observation, seed: int) -> None:
-        """Prepare for an episode that starts with ``observation`` and was reset with ``seed``."""
+    def reset(self, observation: Observation, seeds: Sequence[int]) -> None:
+        """Prepare for n episodes that start with ``observation`` and were reset with ``seeds``."""
 
     def act(self, observation: Observation) -> Action:
-        """Return the action for ``observation``."""
+        """Return the actions (n, ...) for ``observation``."""
 
 
 @dataclass(frozen=True)
@@ -87,71 +87,49 @@ class Episode:
 
 
 def run_episodes(
-    env: GoalEnv,
+    envs: TPMVectorEnv,
     policy: Policy,
     episodes: int,
     first_seed: int,
     *,
     on_frame: Callable[[], object] | None = None,
-    on_episode: Callable[[], object] | None = None,
+    on_episodes: Callable[[int], object] | None = None,
 ) -> list[Episode]:
     """Run a policy for a number of episodes; the same arguments give the same records.
 
     Args:
-        env: Left open.
+        envs: Environments with next-step autoreset, as many as run at a time; left open.
+        policy: Acts in all of them.
+        episodes: Number of episodes.
         first_seed: Episode i is reset with ``first_seed + i``.
         on_frame: Called after every reset and every step, for example to record a video.
-        on_episode: Called after every episode, for example to move a progress bar.
+        on_episodes: Called with the number of episodes that ended, to move a progress bar.
 
     Raises:
         RolloutError: A reward, a conditioning, a closure error, a distance of forward kinematics
             from the truth or a torque is not finite.
     """
     records = []
-    for seed in range(first_seed, first_seed + episodes):
-        records.append(_run_episode(env, policy, seed, on_frame))
-        if on_episode is not None:
-            on_episode()
-    return records
-
-
-def _run_episode(
-    env: GoalEnv, policy: Policy, seed: int, on_frame: Callable[[], object] | None
-) -> Episode:
-    observation, _ = env.reset(seed=seed)
-    policy.reset(observation, seed)
-    if on_frame is not None:
-        on_frame()
-    steps: list[dict[str, Any]] = []
-    inner: Any = env.unwrapped
-    done = False
-    while not done:
-        observation, reward, terminated, truncated, info = env.step(policy.act(observation))
-        done = terminated or truncated
-        steps.append(_measured(reward, info, inner.state))
-        if on_frame is not None:
-            on_frame()
-    return _record(seed, {name: np.array([step[name] for step in steps]) for name in steps[0]})
-
-
-def run_batch(envs: TPMVectorEnv, policy: Policy, episodes: int, first_seed: int) -> list[Episode]:
-    """The same for many environments at a time, and a policy that takes batches.
-
-    Args:
-        envs: As many as run at a time, with next-step autoreset; left open.
-
-    Raises:
-        RolloutError: As for :func:`run_episodes`.
-    """
-    records = []
     for first in range(first_seed, first_seed + episodes, envs.num_envs):
         count = min(envs.num_envs, first_seed + episodes - first)
-        records += _run_batch(envs, policy, first, count)
+        records += _run_together(envs, policy, first, count, on_frame)
+        if on_episodes is not None:
+            on_episodes(count)
     return records
 
 
-def _run_batch(envs: TPMVectorEnv, policy: Policy, first_seed: int, count: int) -> list[Episode]:
+def _run_together(
+    envs: TPMVectorEnv,
+    policy: Policy,
+    first_seed: int,
+    count: int,
+    on_frame: Callable[[], object] | None,
+) -> list[Episode]:
+    """Run an episode in each environment; return the records of the first ``count``."""
     observation, _ = envs.reset(seed=first_seed)
+    policy.reset(observation, range(first_seed, first_seed + envs.num_envs))
+    if on_frame is not None:
+        on_frame()
     steps: list[dict[str, Any]] = []
     lengths = np.zeros(envs.num_envs, dtype=np.int64)
     running = np.ones(envs.num_envs, dtype=np.bool_)
@@ -160,6 +138,8 @@ def _run_batch(envs: TPMVectorEnv, policy: Policy, first_seed: int, count: int) 
         steps.append(_measured(reward, info, envs.state))
         lengths += running
         running &= ~truncated
+        if on_frame is not None:
+            on_frame()
     table = {name: np.array([step[name] for step in steps]) for name in steps[0]}
     return [
         _record(first_seed + k, {name: values[: lengths[k], k] for name, values in table.items()})
@@ -168,7 +148,7 @@ def _run_batch(envs: TPMVectorEnv, policy: Policy, first_seed: int, count: int) 
 
 
 def _measured(reward: Any, info: Mapping[str, Any], state: State) -> dict[str, Any]:
-    """What an episode is judged by, of one step, with the leading axes of the state."""
+    """Return the values of one step that go into the records, each (n, ...)."""
     gap = state.fk_position - state.platform_position
     told = ("conditioning", "closure_error", "is_success", "singularity_penalty")
     return {

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import signal
+from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import asdict, fields, replace
 from functools import partial
@@ -40,7 +41,7 @@ from tpm_gym.learning.errors import (
     RunError,
 )
 from tpm_gym.learning.evaluation import EvaluationConfig, evaluate
-from tpm_gym.learning.rollout import BATCH, SELECTION_SEED, GoalEnv
+from tpm_gym.learning.rollout import BATCH, SELECTION_SEED
 from tpm_gym.learning.run_folder import CHECKPOINTS, CONFIG_FILE, CURVE_FILE, TESTS, is_finished
 
 if TYPE_CHECKING:
@@ -48,7 +49,6 @@ if TYPE_CHECKING:
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.vec_env import VecEnv
 
-    from tpm_gym.envs.vector import TPMVectorEnv
     from tpm_gym.learning.callbacks import PeriodicEvaluation
 
 
@@ -80,7 +80,7 @@ def train(config: TrainingConfig, console: Console | None = None) -> signal.Sign
         starts = config.argument("learning_starts") or 0
         if config.steps <= starts:
             _say(console, f"note: learning starts at step {starts:,}, so nothing will be learned")
-        return _learn_and_test(config, console, store, None)
+        return _learn_and_test(config, console, store)
 
 
 def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signals | None:
@@ -119,13 +119,16 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
         step = content.step if content else 0
         changed = resumed(config, stored, step)
         description = _description_resumed(changed, stored, step)
-        if content:
-            restore_files(run, content)
-        else:
-            run_folder.clear(run)
-        provenance.write_json(run / CONFIG_FILE, description)
-        _say(console, f"{changed.title}, from step {step:,} to {changed.steps:,}, in {run}")
-        return _learn_and_test(changed, console, store, content)
+
+        def begin() -> None:
+            if content:
+                restore_files(run, content)
+            else:
+                run_folder.clear(run)
+            provenance.write_json(run / CONFIG_FILE, description)
+            _say(console, f"{changed.title}, from step {step:,} to {changed.steps:,}, in {run}")
+
+        return _learn_and_test(changed, console, store, content, begin)
 
 
 def _say(console: Console, text: str) -> None:
@@ -163,16 +166,25 @@ def _stored_in(content: Content) -> dict[str, Any]:
 
 def _foreign(content: Content, error: Exception) -> CheckpointError:
     """Return the error of a checkpoint that is whole and was not written by this training."""
-    problem = f"cannot be restored ({type(error).__name__}: {error})"
+    problem = f"cannot be restored ({type(error).__name__}), and was not written by this training"
     anew = "start the run anew with --overwrite"
     return CheckpointError(f"the checkpoint of step {content.step:,} {problem}; {anew}")
 
 
 def _learn_and_test(
-    config: TrainingConfig, console: Console, store: CheckpointStore, content: Content | None
+    config: TrainingConfig,
+    console: Console,
+    store: CheckpointStore,
+    content: Content | None = None,
+    begin: Callable[[], object] = lambda: None,
 ) -> signal.Signals | None:
-    """Learn; then test a policy of the analytic engine there and in PyBullet."""
-    stopped_by = _learn(config, console, store, content)
+    """Learn; then test a policy of the analytic engine there and in PyBullet.
+
+    Args:
+        content: Checkpoint to begin from.
+        begin: Called once the checkpoint is restored, since only then may files change.
+    """
+    stopped_by = _learn(config, console, store, content, begin)
     if stopped_by is None and config.in_batches and config.test_episodes:
         rates = []
         for engine in ("analytic", "pybullet"):
@@ -194,7 +206,11 @@ def _learn_and_test(
 
 
 def _learn(
-    config: TrainingConfig, console: Console, store: CheckpointStore, content: Content | None
+    config: TrainingConfig,
+    console: Console,
+    store: CheckpointStore,
+    content: Content | None,
+    begin: Callable[[], object],
 ) -> signal.Signals | None:
     """Build everything, learn from the beginning or from a checkpoint, and save.
 
@@ -212,27 +228,26 @@ def _learn(
     from tpm_gym.learning.demonstrations import Demonstrations
     from tpm_gym.learning.logger import make_logger
     from tpm_gym.learning.signals import SignalListener
+    from tpm_gym.learning.training_state import restore_log
 
     torch.set_num_threads(config.threads)
     bar, listener = ProgressBar(console), SignalListener()
     with ExitStack() as stack:
         training_envs = make_training_envs(config)
         stack.callback(training_envs.close)
-        evaluation_env: GoalEnv | TPMVectorEnv
-        if config.in_batches:
-            count = min(config.eval_episodes, BATCH)
-            evaluation_env = make_envs(count=count, **_env_options(config))
-        else:
-            evaluation_env = make_env(**_env_options(config))
-        stack.callback(evaluation_env.close)
+        count = min(config.eval_episodes, BATCH) if config.in_batches else 1
+        evaluation_envs = make_envs(count=count, **_env_options(config))
+        stack.callback(evaluation_envs.close)
         stack.callback(bar.close)
         model = make_model(config, training_envs)
+        keep = partial(_keep, config, console, run_folder.BEST_FILE)
+        evaluation = PeriodicEvaluation(config, evaluation_envs, console, keep)
+        log, seconds = _restore(model, evaluation, content) if content else ({}, 0.0)
+        begin()
         logger = make_logger(config.run, None if content is None else content.step)
         stack.callback(logger.close)
         model.set_logger(logger)
-        keep = partial(_keep, config, console, run_folder.BEST_FILE)
-        evaluation = PeriodicEvaluation(config, evaluation_env, console, keep)
-        seconds = _restore(model, evaluation, content, console) if content else 0.0
+        restore_log(logger, log)
         checkpointing = Checkpointing(config, store, evaluation, listener, console, seconds)
         # Checkpointing sets the clock that the callbacks after it read.
         callbacks: list[BaseCallback] = [checkpointing, bar, evaluation]
@@ -270,20 +285,19 @@ def _learn(
 
 
 def _restore(
-    model: BaseAlgorithm, evaluation: PeriodicEvaluation, content: Content, console: Console
-) -> float:
-    """Restore everything from a checkpoint; return the seconds that the run had trained."""
+    model: BaseAlgorithm, evaluation: PeriodicEvaluation, content: Content
+) -> tuple[dict[str, Any], float]:
+    """Restore a checkpoint; return its log, and the seconds that the run had trained."""
     from tpm_gym.learning.training_state import restore
 
     try:
-        extra, notes = restore(model, content)
+        log, extra = restore(model, content)
         evaluation.restore(extra["evaluation"])
-        seconds = float(extra["seconds"])
+        return log, float(extra["seconds"])
+    except TPMError:
+        raise
     except Exception as error:  # whatever PyTorch raises on a file that others have signed
         raise _foreign(content, error) from error
-    for note in notes:
-        _say(console, f"note: {note}; the run continues, but not exactly as it would have")
-    return seconds
 
 
 def _keep(config: TrainingConfig, console: Console, name: str, model: BaseAlgorithm) -> None:

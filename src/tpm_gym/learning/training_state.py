@@ -13,7 +13,6 @@ goals that were never reached).
 import io
 import json
 import random
-import warnings
 from collections import deque
 from collections.abc import Mapping
 from functools import partial
@@ -26,11 +25,12 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import DictReplayBuffer
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.her import HerReplayBuffer
 
 from tpm_gym import TPMError
 from tpm_gym.learning.checkpoint import STATE, TENSORS, Content
+from tpm_gym.learning.errors import CheckpointError
 from tpm_gym.learning.provenance import versions, write_whole
 from tpm_gym.learning.rollout import Action, GoalEnv, Observation
 from tpm_gym.learning.run_folder import EXPORTED, LAST_FILE, RESTORED, clear_tests
@@ -145,14 +145,14 @@ def restore_files(run: Path, content: Content) -> None:
             (run / name).unlink(missing_ok=True)
 
 
-def restore(model: BaseAlgorithm, content: Content) -> tuple[dict[str, Any], list[str]]:
-    """Restore a training from a checkpoint; ``learn`` then continues from there.
+def restore(model: BaseAlgorithm, content: Content) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Restore a training from a checkpoint, from which ``learn`` continues.
 
     Args:
-        model: New algorithm, built with the same arguments, with a logger.
+        model: New algorithm, built with the same arguments.
 
     Returns:
-        The ``extra`` of :func:`capture`, and reasons why the continuation is not exact, if any.
+        The state for :func:`restore_log`, and the ``extra`` of :func:`capture`.
     """
     state = json.loads(content.files[STATE])
     for name, value in state["counters"].items():
@@ -162,11 +162,10 @@ def restore(model: BaseAlgorithm, content: Content) -> tuple[dict[str, Any], lis
         deque(entries, maxlen=size) for entries in state["statistics"]
     )
     _restore_buffer(model, content.arrays)
-    notes = _version_notes(state["versions"]) + _restore_episodes(model, state, content.arrays)
-    _restore_log(model, state["log"])
+    _restore_episodes(model, state, content.arrays)
     tensors = _restore_tensors(model, content.files[TENSORS])
     _restore_rng(model, state["rng"], tensors)  # last, since the lines above may draw
-    return state["extra"], notes
+    return state["log"], state["extra"]
 
 
 # -- networks and optimisers ------------------------------------------------------------------
@@ -251,55 +250,33 @@ def _restore_buffer(model: BaseAlgorithm, arrays: Mapping[str, NDArray[Any]]) ->
 
 def _restore_episodes(
     model: BaseAlgorithm, state: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
-) -> list[str]:
-    """Repeat the unfinished episodes; if that is not exact, end them and start new ones."""
+) -> None:
+    """Restore the unfinished episodes; refuse if they do not end in the same observations."""
     envs = model.env
     assert envs is not None
-    names = [name for name in arrays if name.startswith("last/")]
-    last = {name.removeprefix("last/"): arrays[name] for name in names}
+    last = _starting(arrays, "last/")
     if isinstance(envs, AnalyticVecEnv):
-        columns = {k.removeprefix("envs/"): v for k, v in arrays.items() if k.startswith("envs/")}
-        found = envs.restore(state["episodes"], columns)
-        exact = all(np.array_equal(found[key], rows) for key, rows in last.items())
+        found: Any = [envs.restore(state["episodes"], _starting(arrays, "envs/"))]
+        expected: Any = [last]
     else:
-        exact = all(
-            _is_repeated(envs, index, episode, last)
-            for index, episode in enumerate(state["episodes"])
-        )
-    if exact:
-        model._last_obs, model._last_episode_starts = last, arrays["episode_starts"]
-        return []
-    _start_afresh(model, envs)
-    return ["the unfinished episodes could not be repeated exactly, so new ones begin"]
+        rows = range(envs.num_envs)
+        found = [envs.env_method("replay", state["episodes"][i], indices=[i])[0] for i in rows]
+        expected = [{name: values[i] for name, values in last.items()} for i in rows]
+    for one, other in zip(found, expected, strict=True):
+        if one is None or any(not np.array_equal(one[name], other[name]) for name in other):
+            now, before = versions(), state["versions"]
+            changed = [f"{k} {before.get(k)} -> {now[k]}" for k in now if before.get(k) != now[k]]
+            raise CheckpointError(
+                "the unfinished episodes do not repeat: the physics have changed "
+                f"({', '.join(changed) or 'with equal versions'}); install the versions of "
+                "config.json again, or start the run anew with --overwrite"
+            )
+    model._last_obs, model._last_episode_starts = last, arrays["episode_starts"]
 
 
-def _is_repeated(envs: VecEnv, index: int, episode: Any, last: Mapping[str, NDArray[Any]]) -> bool:
-    """Repeat an episode; return whether it ends in the same observation."""
-    (observation,) = envs.env_method("replay", episode, indices=[index])
-    return observation is not None and all(
-        np.array_equal(observation[key], rows[index]) for key, rows in last.items()
-    )
-
-
-def _start_afresh(model: BaseAlgorithm, envs: VecEnv) -> None:
-    """Start new episodes, and end the unfinished ones in the replay buffer."""
-    envs._reset_seeds()  # otherwise the first episodes of the run would begin again
-    model._last_obs = envs.reset()  # type: ignore[assignment]
-    model._last_episode_starts = np.ones(envs.num_envs, dtype=bool)
-    buffer = getattr(model, "replay_buffer", None)
-    if isinstance(buffer, HerReplayBuffer):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # it warns of the cut, which is wanted here
-            buffer.truncate_last_trajectory()
-
-
-def _version_notes(before: Mapping[str, str | None]) -> list[str]:
-    """Return a sentence about the versions that have changed, if any."""
-    now = versions()
-    changed = [
-        f"{name} {before.get(name)} -> {now[name]}" for name in now if before.get(name) != now[name]
-    ]
-    return [f"versions have changed ({', '.join(changed)})"] if changed else []
+def _starting(arrays: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
+    """Return the arrays with a prefix, under their names without it."""
+    return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
 
 
 # -- log --------------------------------------------------------------------------------------
@@ -322,11 +299,10 @@ def _pending_log(model: BaseAlgorithm) -> dict[str, Any]:
     }
 
 
-def _restore_log(model: BaseAlgorithm, state: Mapping[str, Any]) -> None:
-    logger = model.logger
-    logger.name_to_value.update(state["values"])
-    for name, dtype in state["types"].items():
-        logger.name_to_value[name] = np.dtype(dtype).type(state["values"][name])
-    logger.name_to_count.update(state["counts"])
-    excluded = {name: tuple(formats) for name, formats in state["excluded"].items()}
-    logger.name_to_excluded.update(excluded)
+def restore_log(logger: Logger, state: Mapping[str, Any]) -> None:
+    """Restore the values that were not yet written to the log; an empty state has none."""
+    for name, value in state.get("values", {}).items():
+        dtype = state["types"].get(name)
+        logger.name_to_value[name] = np.dtype(dtype).type(value) if dtype else value
+        logger.name_to_excluded[name] = tuple(state["excluded"][name])
+    logger.name_to_count.update(state.get("counts", {}))

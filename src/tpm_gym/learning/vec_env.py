@@ -11,16 +11,16 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from tpm_gym.envs.vector import TPMVectorEnv, VectorSnapshot
+from tpm_gym.envs.core import EnvSnapshot
+from tpm_gym.envs.vector import TPMVectorEnv
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.learning.rollout import Observation
-from tpm_gym.simulation.analytic.simulation import Moment
 from tpm_gym.simulation.randomisation import NOMINAL, Plant
+from tpm_gym.simulation.simulation import Snapshot
 
 __all__ = ["AnalyticVecEnv"]
 
-_COLUMN = "column/"  # prefix of the simulation's columns in a state
-_OWN = ("goals", "elapsed", "ended", "pending")
+_ENVS, _SIMULATION, _ENGINE = "envs/", "simulation/", "engine/"  # prefixes of arrays in a state
 
 
 class AnalyticVecEnv(VecEnv):
@@ -108,27 +108,28 @@ class AnalyticVecEnv(VecEnv):
 
     def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """Return the state on which the next steps depend: plain data, and arrays by name."""
-        snapshot = self.envs.save_state()
-        moment = snapshot.simulation
-        plants = moment.plants if any(plant != NOMINAL for plant in moment.plants) else ()
+        (snapshot,) = self.envs.save_state()
+        simulation = snapshot.simulation
+        plants = simulation.plants if any(plant != NOMINAL for plant in simulation.plants) else ()
         arrays: dict[str, NDArray[Any]] = {"returns": self._returns, "lengths": self._lengths}
-        arrays |= {name: getattr(snapshot, name) for name in _OWN}
-        arrays |= {f"{_COLUMN}{name}": values for name, values in moment.columns.items()}
-        arrays["pucks"] = moment.pucks
+        for prefix, columns in (
+            (_ENVS, snapshot.columns),
+            (_SIMULATION, simulation.columns),
+            (_ENGINE, simulation.engine),
+        ):
+            arrays |= {f"{prefix}{name}": values for name, values in columns.items()}
         return {"rngs": snapshot.rngs, "plants": [asdict(plant) for plant in plants]}, arrays
 
     def restore(self, plain: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Observation:
         """Restore a state of :meth:`state`; return the observation at that moment."""
         plants = tuple(map(_plant, plain["plants"])) or (NOMINAL,) * self.num_envs
-        columns = {
-            name.removeprefix(_COLUMN): values
-            for name, values in arrays.items()
-            if name.startswith(_COLUMN)
-        }
-        moment = Moment(plants, columns, arrays["pucks"])
+        envs, simulation, engine = (
+            {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
+            for prefix in (_ENVS, _SIMULATION, _ENGINE)
+        )
         self._returns, self._lengths = arrays["returns"].copy(), arrays["lengths"].copy()
-        own = {name: arrays[name] for name in _OWN}
-        return self.envs.restore_state(VectorSnapshot(self.envs.kind, moment, plain["rngs"], **own))
+        moment = Snapshot(plants, simulation, engine)
+        return self.envs.restore_state([EnvSnapshot(self.envs.kind, moment, plain["rngs"], envs)])
 
 
 def _plant(entries: dict[str, Any]) -> Plant:

@@ -1,4 +1,4 @@
-"""What mechanisms are made of: solids, joints, links, loop closures, and the tree of them all.
+"""Solids, joints, links and loop closures, and the mechanism as a tree of them.
 
 Units: metres, radians, kilograms.
 """
@@ -29,7 +29,7 @@ class Solid:
         kind: ``"box"`` with full edge lengths, or ``"cylinder"`` along its own axis.
         size: Box: edges (x, y, z). Cylinder: (radius, length, 0). In m.
         centre: Position in the link's frame, m.
-        density: kg/m^3 of the material; zero for parts that are only drawn.
+        density: Density of the material, kg/m^3; zero for parts that are only drawn.
         bore: Box: edges of the hollow (0 for solid faces). Cylinder: (inner radius, length, 0).
         axis: Axis of a cylinder in the link's frame: ``"x"``, ``"y"`` or ``"z"``.
         colour: Name of a colour in :mod:`tpm_gym.mechanism.urdf`.
@@ -52,12 +52,12 @@ class Solid:
 
     @property
     def inertia(self) -> FloatArray:
-        """(3,) kg m^2, principal moments about the centre, along the link's axes."""
+        """Principal moments (3,) about the centre, along the link's axes, kg m^2."""
         return self._inertia(self.size) - self._inertia(self.bore)
 
     @property
     def half_extent(self) -> FloatArray:
-        """(3,) m, half edges of the box around the solid, along the link's axes."""
+        """Half edges (3,) of the box around the solid, along the link's axes, m."""
         if self.kind == "box":
             return np.asarray(self.size) / 2
         radius, length, _ = self.size
@@ -83,7 +83,7 @@ class Solid:
 
 @dataclass(frozen=True)
 class Joint:
-    """How a link hangs on its parent.
+    """Joint between a link and its parent.
 
     Attributes:
         name: Name of the joint; the paper's where it has one.
@@ -91,12 +91,12 @@ class Joint:
         parent: Name of the parent link.
         origin: Position of the joint in the parent's frame, m.
         axis: Axis in the joint's frame.
-        lower: Lower limit, rad or m (motors and slide; the others are bounded by the loops).
+        lower: Lower limit, rad or m (motors and slide; the loops bound the others).
         upper: Upper limit, rad or m.
         effort: Limit of torque or force, N m or N; zero for passive joints.
-        speed: Where the motor has no effort left, rad/s or m/s; zero for passive joints.
-        corner: Up to which speed the motor has its full effort, which from there on falls in a
-            straight line.
+        speed: Speed at which the motor has no effort left, rad/s or m/s; zero for passive joints.
+        corner: Highest speed with full effort, rad/s or m/s; from there to ``speed`` the effort
+            falls linearly.
     """
 
     name: str
@@ -112,7 +112,7 @@ class Joint:
 
     @property
     def unit(self) -> Literal["rad", "m"]:
-        """What its position is in."""
+        """Unit of the joint's position."""
         return "m" if self.kind == "prismatic" else "rad"
 
 
@@ -131,13 +131,13 @@ class Link:
 
     @property
     def centre_of_mass(self) -> FloatArray:
-        """(3,) m, in the link's frame."""
+        """Centre of mass (3,) in the link's frame, m."""
         weighted = sum(solid.mass * np.asarray(solid.centre) for solid in self.solids)
         return np.asarray(weighted) / self.mass
 
     @property
     def inertia(self) -> FloatArray:
-        """(3, 3) kg m^2 about the centre of mass, along the link's axes."""
+        """Inertia (3, 3) about the centre of mass, along the link's axes, kg m^2."""
         total = np.zeros((3, 3))
         for solid in self.solids:
             arm = np.asarray(solid.centre) - self.centre_of_mass
@@ -166,18 +166,18 @@ class Closure:
 
 
 class Place(NamedTuple):
-    """Where a link is.
+    """Position and orientation of a link in the base's frame.
 
     Attributes:
-        origin: (..., 3) m.
-        rotation: (..., 3, 3).
+        origin: Origin of the link's frame, (..., 3) m.
+        rotation: Rotation matrix (..., 3, 3).
     """
 
     origin: FloatArray
     rotation: FloatArray
 
     def point(self, point: ArrayLike) -> FloatArray:
-        """A point of the link's frame, as (..., 3) m."""
+        """Convert a point of the link's frame to the base's frame, (..., 3) m."""
         placed: FloatArray = self.origin + self.rotation @ np.asarray(point)
         return placed
 
@@ -210,7 +210,7 @@ class Mechanism:
         object.__setattr__(self, "_index", {link.name: i for i, link in enumerate(self.links)})
 
     def link(self, name: str) -> Link:
-        """The link of that name.
+        """Return the link of that name.
 
         Raises:
             KeyError: If there is none.
@@ -219,13 +219,13 @@ class Mechanism:
 
     @cached_property
     def motors(self) -> tuple[Joint, ...]:
-        """The motors' joints, in the order of :attr:`actuated`."""
+        """Joints of the motors, in the order of :attr:`actuated`."""
         joints = {link.joint.name: link.joint for link in self.links if link.joint}
         return tuple(joints[name] for name in self.actuated)
 
     @cached_property
     def stops(self) -> tuple[tuple[float, float], ...]:
-        """Lowest and highest positions of the motors, rad or m; infinite where one is endless."""
+        """Lowest and highest positions of the motors, rad or m; infinite for endless ones."""
         endless = (-math.inf, math.inf)
         return tuple(
             endless if motor.kind == "continuous" else (motor.lower, motor.upper)
@@ -233,7 +233,7 @@ class Mechanism:
         )
 
     def places(self, joints: Mapping[str, ArrayLike]) -> dict[str, Place]:
-        """Where all links are, in the base's frame.
+        """Compute positions and orientations of all links in the base's frame.
 
         Args:
             joints: Position (...,) of each joint by name, rad or m; slides may be left out.
@@ -255,7 +255,7 @@ class Mechanism:
         return found
 
     def legs(self) -> tuple[Mechanism, ...]:
-        """The spanning tree taken apart at the base: one tree for each arm and what hangs on it."""
+        """Split the spanning tree at the base: one tree for each arm and the links behind it."""
         arm: dict[str, str] = {}
         for link in self.links[1:]:
             joint = link.joint
@@ -270,7 +270,7 @@ class Mechanism:
 
 
 def _rotation(axis: Vector, angle: FloatArray) -> FloatArray:
-    """Rodrigues' formula, (..., 3, 3)."""
+    """Compute rotation matrices (..., 3, 3) by Rodrigues' formula."""
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     sin, cos = np.sin(angle)[..., None, None], np.cos(angle)[..., None, None]

@@ -1,6 +1,6 @@
-"""The vacuum cup below the platform: its size, its spring, and what it can hold.
+"""The vacuum cup below the platform: its size, its spring, and when it seals.
 
-Engines simulate it; :func:`sealed` says, for all of them, when it can hold an object.
+Engines simulate the cup; all of them use :func:`sealed`.
 """
 
 from __future__ import annotations
@@ -20,22 +20,23 @@ class VacuumCup(NamedTuple):
     """A cup on a spring-loaded plunger, a level compensator.
 
     Attributes:
-        length: From point P of the platform to the lip, m.
+        length: Distance from point P of the platform to the lip, m.
         radius: Radius of the lip, m.
-        bellows: Length of the part of that radius, m.
-        stroke: How far the cup slides back into its stem when it meets something, m.
-        preload: Force with which the spring keeps the cup out, N: more than the vacuum can hold.
-        vacuum: How far below the ambient's the ejector gets the pressure in the cup, Pa.
-        area: On which the vacuum acts, m^2: what lies within the lip.
-        evacuation_time: Time constant with which the vacuum builds up once the cup is sealed, s.
-            An ejector of 5 l/min empties a cup and hose of 1.6 cm^3 so.
-        venting_time: The same when air comes in, through the valve or below the lip, s.
-        least_vacuum: At which the lip comes off when the vacuum is off, Pa.
-        friction: Of the open lip, times an object's is the Coulomb coefficient between them.
-        seal_friction: Coulomb coefficient of the sealed lip: clean silicone on something smooth,
-            the best there is. Makers of cups reckon with 0.5 for dry metal, glass or wood.
+        bellows: Length of the part with the radius of the lip, m.
+        stroke: Distance by which the cup can slide back into its stem, m.
+        preload: Force with which the spring keeps the cup out, N. It exceeds ``pull_off``.
+        vacuum: Largest pressure difference to the ambient air, Pa.
+        area: Area within the lip, on which the vacuum acts, m^2.
+        evacuation_time: Time constant with which the vacuum builds up in a sealed cup, s. It is
+            that of an ejector of 5 l/min on a cup and hose of 1.6 cm^3.
+        venting_time: Time constant with which air comes in, through the valve or below the lip, s.
+        least_vacuum: Vacuum at which the lip comes off when the valve is closed, Pa.
+        friction: Friction of the open lip. Its product with the object's friction is the Coulomb
+            coefficient between them.
+        seal_friction: Coulomb coefficient of the sealed lip, for clean silicone on a smooth
+            surface. Makers of cups assume 0.5 for dry metal, glass or wood.
         seal_gap: Largest distance between lip and object at which the vacuum seals, m.
-        seal_tilt: Largest angle between the cup's axis and the object's that the lip follows, rad.
+        seal_tilt: Largest angle between the axes of cup and object at which the lip seals, rad.
     """
 
     length: float = 0.040
@@ -55,7 +56,7 @@ class VacuumCup(NamedTuple):
 
     @property
     def pull_off(self) -> float:
-        """Largest force that the whole vacuum holds, in any direction but up, N."""
+        """Largest force that the full vacuum holds, in any direction but up, N."""
         return self.vacuum * self.area
 
     @property
@@ -64,14 +65,14 @@ class VacuumCup(NamedTuple):
         return (0.0, 0.0, self.length)
 
     def stem(self, point_p: Vector) -> Solid:
-        """The tube below point P (m, in the platform's frame) in which the cup slides."""
+        """Build the tube below point P (m, platform's frame) in which the cup slides."""
         x, y, z = point_p
         half = (self.length - self.bellows) / 2
         size = (0.005, 2 * half, 0.0)
         return Solid("cylinder", size, (x, y, z + half), ALUMINIUM, colour="steel")
 
     def link(self, platform: str, point_p: Vector) -> Link:
-        """The cup as a link that slides in the platform of that name."""
+        """Build the cup as a link that slides in the platform of that name."""
         bellows = Solid(
             "cylinder",
             (self.radius, self.bellows, 0.0),
@@ -83,7 +84,7 @@ class VacuumCup(NamedTuple):
         plunger = Solid(
             "cylinder", (0.003, 0.04, 0.0), (0.0, 0.0, self.length - 0.02), STEEL, colour="steel"
         )
-        # The stop lies a millimetre beyond the rest position, or the engine would let them fight.
+        # The stop is 1 mm beyond the rest position; else stop and spring would act on each other.
         slide = Joint(
             "cup_slide",
             "prismatic",
@@ -98,7 +99,7 @@ class VacuumCup(NamedTuple):
 
 
 CUP = VacuumCup()
-"""The cup of all machines here."""
+"""Cup of all machines of this package."""
 
 
 def sealed(
@@ -109,7 +110,7 @@ def sealed(
     size: tuple[float, float],
     cup: VacuumCup = CUP,
 ) -> Any:
-    """Whether the whole lip lies on the top face of a square block.
+    """Return whether the whole lip lies on the top face of a square block.
 
     Arrays (n,) in place of numbers give an array (n,).
 
@@ -117,8 +118,8 @@ def sealed(
         lip: Centre of the lip, m, world.
         axis: Outward axis of the cup, world.
         position: Centre of the block, m, world.
-        quaternion: Its orientation (x, y, z, w).
-        size: Its width and height, m.
+        quaternion: Orientation (x, y, z, w) of the block.
+        size: Width and height of the block, m.
         cup: The cup.
     """
     qx, qy, qz, qw = quaternion

@@ -1,29 +1,29 @@
-"""The dynamics of the mechanism in closed form: no solver, no iteration.
+"""The dynamics of the mechanism in closed form, without solver or iteration.
 
     torque = M(theta) theta_ddot + C(theta, theta_dot) theta_dot + g(theta)
 
-Coupling degree zero means that every point is a formula, and so are its velocity and acceleration:
-the closures |B_iC_i| = l4, differentiated twice, give those of C1, then that of P, from those of
-B_i, each by one division (:func:`_resolve`). Bodies enter by sixteen constants of their motion
-(:mod:`tpm_gym.mechanism.inertia`):
+The coupling degree is zero, so every point has a formula, and so have its velocity and
+acceleration. The closures |B_iC_i| = l4, differentiated twice, give the accelerations of C1 and
+then of P from those of B_i, each by one division (:func:`_resolve`). Bodies enter by sixteen
+constants (:mod:`tpm_gym.mechanism.inertia`):
 
 * the arms turn about the motors' axes;
 * rods are bars between B_i and C_i, two coupled points each; rod 6 stays in its plane. Rods 4 and
-  11 hang on universal joints, by which they turn about their own axes as they swing: part of the
-  swing's inertia, with what swings with them, the crosses and end link 9;
+  11 hang on universal joints, so they turn about their own axes as they swing. The inertia of the
+  swing contains that, and the crosses and end link 9, which swing with them;
 * link 3' translates in the plane y = 0, as C1 does;
 * link 7 turns about z, a bar between C1 and P but for constant offsets;
 * platform, cup (its slide at rest), payload and end link 10 translate as P does. End link 10 can
-  roll about its own axis, on which both its balls lie. Nothing acts about that axis, so a roll
-  stays what it is and takes no torque: it is left out.
+  roll about its own axis, through both its balls. No torque acts about that axis, so the roll does
+  not change the motors' torques and is left out.
 
-Forces of inertia and weight at B_i, C1 and P go the way back: the forces in the rods that carry
-them, one division each (:func:`gather`), and by those to the motors. The mass matrix is that of the
-kinetic energy; C is the torque's part that is quadratic in the rates, polarised, which makes it
-that of Christoffel's symbols, so that M' - 2C is skew.
+Forces of inertia and weight at B_i, C1 and P give the forces in the rods, one division each, and
+these give the torques of the motors (:func:`gather`). The mass matrix is that of the kinetic
+energy. C is polarised from the part of the torque that is quadratic in the rates; so it is the
+matrix of Christoffel's symbols, and M' - 2C is skew.
 
-Everything is in SI units and the machine's (the paper's) frame, in which gravity points along +z:
-the base hangs upside down. The functions with a Pose compute with whatever their namespace does, as
+Units are SI. The frame is the machine's (the paper's), in which gravity points along +z, as the
+base hangs upside down. Functions with a Pose take floats, arrays or tensors, as those of
 :mod:`tpm_gym.kinematics.equations`.
 """
 
@@ -50,7 +50,7 @@ from tpm_gym.mechanism.inertia import Inertia, Swing, inertia_of
 from tpm_gym.mechanism.mount import GRAVITY
 
 SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
-"""Where a symmetric matrix has the numbers of its upper triangle, by rows."""
+"""Index of each entry of a symmetric matrix in its upper triangle, by rows."""
 
 _VECTOR = np.arange(3)
 _MATRIX = np.arange(9).reshape(3, 3)
@@ -60,23 +60,23 @@ _UNITS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 class Energy(NamedTuple):
-    """Energies, each of shape (...,), J; the potential one up to a constant of the machine."""
+    """Kinetic and potential energy (...,), J; the latter up to a constant of the machine."""
 
     kinetic: FloatArray
     potential: FloatArray
 
 
 class Pose(NamedTuple):
-    """A configuration, as the dynamics need it.
+    """Configuration of the mechanism.
 
     Attributes:
         cos: l3 cos(theta_i), m.
         sin: l3 sin(theta_i), m.
-        found: The assembly.
-        rods: B_iC_i, m.
-        factors: Those of the Jacobians' determinants.
-        k: sin(beta) times level3: the determinant of loop 2, m.
-        lengths: The geometry.
+        found: Assembly.
+        rods: Vectors B_iC_i, m.
+        factors: Factors of the Jacobians' determinants.
+        k: sin(beta) times level3, the determinant of loop 2, m.
+        lengths: Link lengths, m.
     """
 
     cos: Triple
@@ -92,12 +92,12 @@ class Velocities(NamedTuple):
     """First derivatives, m/s.
 
     Attributes:
-        link3: Of C1, along x and z.
-        platform: Of P.
+        link3: Velocity of C1, along x and z.
+        platform: Velocity of P.
         turn: l7 times the rate of beta.
-        rod1: Of C1 relative to B1.
-        rod2: Of C2 relative to B2, along x and z.
-        rod3: Of C3 relative to B3.
+        rod1: Velocity of C1 relative to B1.
+        rod2: Velocity of C2 relative to B2, along x and z.
+        rod3: Velocity of C3 relative to B3.
     """
 
     link3: tuple[Numbers, Numbers]
@@ -137,7 +137,7 @@ def pose_at(
 
 
 def torques(pose: Pose, rates: Triple, changes: Triple, gravity: Triple, m: Inertia) -> Triple:
-    """The motors' torques for rates (rad/s) and their changes (rad/s^2), in a gravity (m/s^2)."""
+    """Compute the torques for rates (rad/s), their changes (rad/s^2) and gravity (m/s^2)."""
     v = velocities(pose, rates)
     return carried(pose, v, changes, accelerations(pose, rates, changes, v), gravity, m)
 
@@ -145,9 +145,9 @@ def torques(pose: Pose, rates: Triple, changes: Triple, gravity: Triple, m: Iner
 def carried(
     pose: Pose, v: Velocities, changes: Triple, a: Accelerations, gravity: Triple, m: Inertia
 ) -> Triple:
-    """The motors' torques for velocities and accelerations of the points.
+    """Compute the motors' torques for velocities and accelerations of the points.
 
-    Weight is what inertia would be if all points accelerated by -gravity beside what they do.
+    Weight equals the inertial force of an additional acceleration by -gravity.
     """
     (c1, c2, c3), (s1, s2, s3), (r1, _, r3) = pose.cos, pose.sin, pose.rods
     (b1y, b1z), (b2x, b2z), (b3x, b3z), (cx, cz), (px, py, pz) = a
@@ -178,12 +178,12 @@ def carried(
 
 
 def masses(pose: Pose, j: tuple[Triple, Triple, Triple], m: Inertia) -> tuple[Numbers, ...]:
-    """The upper triangle of M, by rows: the kinetic energy of :func:`energies` by pairs of rates.
+    """Compute the upper triangle of M, by rows, from the kinetic energy of :func:`energies`.
 
     Args:
-        pose: The configuration.
+        pose: Configuration.
         j: Rows of the velocity Jacobian; motor 3 moves neither C1 nor the height of P.
-        m: The constants.
+        m: Constants of the bodies.
     """
     (c1, c2, c3), (s1, s2, s3), f = pose.cos, pose.sin, pose.factors
     (r1x, r1y, r1z), (_, _, r2z), (r3x, r3y, r3z) = pose.rods
@@ -216,7 +216,7 @@ def masses(pose: Pose, j: tuple[Triple, Triple, Triple], m: Inertia) -> tuple[Nu
 
 
 def energies(pose: Pose, rates: Triple, gravity: Triple, m: Inertia) -> tuple[Numbers, Numbers]:
-    """Kinetic and potential energy, J; the latter up to a constant."""
+    """Compute kinetic and potential energy, J; the latter up to a constant."""
     (c1, c2, c3), (s1, s2, s3), found = pose.cos, pose.sin, pose.found
     (r1x, r1y, r1z), _, (r3x, r3y, r3z) = pose.rods
     (u1, u2, u3), (k1, k2, k3), (j1, j2, j3) = rates, m.couples, m.motors
@@ -246,7 +246,7 @@ def energies(pose: Pose, rates: Triple, gravity: Triple, m: Inertia) -> tuple[Nu
 
 
 def velocities(pose: Pose, rates: Triple) -> Velocities:
-    """First derivatives of the closures."""
+    """Compute velocities from the first derivatives of the closures."""
     (c1, c2, c3), (s1, s2, s3), (u1, u2, u3), f = pose.cos, pose.sin, rates, pose.factors
     x, z, turn = _resolve(pose, f.leg1 * u1, f.leg2 * u2, f.leg3 * u3)
     px, py = x - f.sin_beta * turn, f.cos_beta * turn
@@ -261,7 +261,7 @@ def velocities(pose: Pose, rates: Triple) -> Velocities:
 
 
 def accelerations(pose: Pose, rates: Triple, changes: Triple, v: Velocities) -> Accelerations:
-    """Second derivatives of the closures."""
+    """Compute accelerations from the second derivatives of the closures."""
     (c1, c2, c3), (s1, s2, s3), f = pose.cos, pose.sin, pose.factors
     (_, r1y, r1z), (r2x, _, r2z), (r3x, r3y, r3z) = pose.rods
     (u1, u2, u3), (a1, a2, a3) = rates, changes
@@ -282,7 +282,10 @@ def accelerations(pose: Pose, rates: Triple, changes: Triple, v: Velocities) -> 
 
 
 def _resolve(pose: Pose, h1: Numbers, h2: Numbers, h3: Numbers) -> Triple:
-    """What C1 does along x and z, and P beside it along link 7's turn, of r_i . (what C_i does)."""
+    """Solve r_i . a_i = h_i for the motion of C1 along x and z, and of P along link 7's turn.
+
+    The a_i are velocities or accelerations of C_i.
+    """
     (r1x, _, r1z), (r2x, _, r2z), (r3x, _, r3z) = pose.rods
     planar = pose.factors.planar
     x, z = (r2z * h1 - r1z * h2) / planar, (r1x * h2 - r2x * h1) / planar
@@ -290,7 +293,7 @@ def _resolve(pose: Pose, h1: Numbers, h2: Numbers, h3: Numbers) -> Triple:
 
 
 def gather(pose: Pose, at_c: tuple[Numbers, Numbers], at_p: Triple) -> Triple:
-    """Torques that carry forces (N) at C1 (x, z) and at P: the transpose of what rates do."""
+    """Compute the torques that hold forces (N) at C1 (x, z) and at P, by the transposed rates."""
     (r1x, _, r1z), (r2x, _, r2z), (r3x, _, r3z) = pose.rods
     (cx, cz), (px, py, pz), f = at_c, at_p, pose.factors
     rod3 = (f.cos_beta * py - f.sin_beta * px) / pose.k  # its force, over l4
@@ -300,9 +303,10 @@ def gather(pose: Pose, at_c: tuple[Numbers, Numbers], at_p: Triple) -> Triple:
 
 
 def _swing(rod: Triple, rates: Triple, changes: tuple[Numbers, Numbers], m: Swing) -> Triple:
-    """Force at C, and against it at B, for the swing of a leg with its rod along (out, level, z).
+    """Compute the force at C, opposite to that at B, for the swing of a leg.
 
-    The swing is the angle of (level, z): Lagrange's equation of (fixed + spin out^2) rate^2 / 2.
+    The rod is along (out, level, z), and the swing is the angle of (level, z). The force follows
+    from Lagrange's equation of (fixed + spin out^2) rate^2 / 2.
     """
     (out, level, z), (out_rate, level_rate, z_rate), (level_change, z_change) = rod, rates, changes
     square = level * level + z * z
@@ -313,7 +317,7 @@ def _swing(rod: Triple, rates: Triple, changes: tuple[Numbers, Numbers], m: Swin
 
 
 def solve(matrix: tuple[Numbers, ...], right: Triple) -> Triple:
-    """Of a symmetric positive matrix, by its upper triangle: L D L^T."""
+    """Solve a linear system with a symmetric positive matrix, given by its upper triangle."""
     (a, b, c, d, e, f), (p, q, r) = matrix, right
     below, last = b / a, c / a
     second, rest = d - below * b, e - last * b
@@ -341,14 +345,14 @@ class Dynamics:
 
     Attributes:
         geometry: Link lengths.
-        branch: The assembly mode.
+        branch: Assembly mode.
         link_masses: Factors of mass and inertia, one for each moving link in the order of the
             mechanism's; empty if all are one.
-        payload: What the cup carries, kg.
+        payload: Mass that the cup carries, kg.
         free_fall: Acceleration of gravity in the machine's frame, m/s^2.
 
     Raises:
-        ConfigurationError: If a mass or gravity cannot be; where it is first used, if there is
+        ConfigurationError: If a mass or gravity is not possible, or at the first use, if there is
             another number of factors.
     """
 
@@ -359,7 +363,7 @@ class Dynamics:
     free_fall: Vector = (0.0, 0.0, GRAVITY)
 
     def __post_init__(self) -> None:
-        """Reject masses that cannot be."""
+        """Reject masses that are not possible."""
         if finite("payload", self.payload, (), ConfigurationError) < 0:
             raise ConfigurationError("payload", self.payload, "at least 0 kg")
         factors = numbers("link_masses", self.link_masses, ConfigurationError)
@@ -369,30 +373,30 @@ class Dynamics:
 
     @cached_property
     def inertia(self) -> Inertia:
-        """The constants."""
+        """Constants of the bodies."""
         mechanism = tree.build(self.geometry)
         return inertia_of(mechanism, self.geometry, self.link_masses, self.payload)
 
     def torque(self, theta: ArrayLike, theta_dot: ArrayLike, theta_ddot: ArrayLike) -> FloatArray:
-        """The motors' torques (..., 3) N m for a motion: M theta_ddot + C theta_dot + g."""
+        """Compute the motors' torques (..., 3) N m, M theta_ddot + C theta_dot + g."""
         states = {"theta": theta, "theta_dot": theta_dot, "theta_ddot": theta_ddot}
         return self._rows(self._torques, states, _VECTOR)[0]
 
     def gravity(self, theta: ArrayLike) -> FloatArray:
-        """The torques (..., 3) N m that carry the machine at rest."""
+        """Compute the torques (..., 3) N m that hold the machine at rest."""
         return self._rows(
             lambda pose: self._torques(pose, _REST, _REST), {"theta": theta}, _VECTOR
         )[0]
 
     def mass_matrix(self, theta: ArrayLike) -> FloatArray:
-        """The inertia that the motors feel, (..., 3, 3) kg m^2: symmetric and positive."""
+        """Compute the mass matrix M, (..., 3, 3) kg m^2, symmetric and positive."""
         return self._rows(self._masses, {"theta": theta}, SYMMETRIC)[0]
 
     def coriolis(self, theta: ArrayLike, theta_dot: ArrayLike) -> FloatArray:
-        """C (..., 3, 3) kg m^2/s, of Christoffel's symbols: M' - 2 C is skew."""
+        """Compute C (..., 3, 3) kg m^2/s from Christoffel's symbols, so that M' - 2 C is skew."""
 
         def columns(pose: Pose, rates: Triple) -> list[Numbers]:
-            # What is quadratic in the rates, q(u), has q(u + e) - q(u - e) = 4 C(u) e
+            # For the part q(u) of the torques that is quadratic, q(u + e) - q(u - e) = 4 C(u) e
             pairs = [
                 [torques(pose, moved, _REST, _REST, self.inertia) for moved in _both(rates, unit)]
                 for unit in _UNITS
@@ -402,7 +406,7 @@ class Dynamics:
         return self._rows(columns, {"theta": theta, "theta_dot": theta_dot}, _MATRIX)[0]
 
     def forward(self, theta: ArrayLike, theta_dot: ArrayLike, torque: ArrayLike) -> FloatArray:
-        """The accelerations (..., 3) rad/s^2 under the motors' torques (..., 3) N m."""
+        """Compute accelerations (..., 3) rad/s^2 under the motors' torques (..., 3) N m."""
 
         def columns(pose: Pose, rates: Triple, given: Triple) -> Triple:
             one, two, three = self._torques(pose, rates, _REST)
@@ -413,7 +417,7 @@ class Dynamics:
         return self._rows(columns, states, _VECTOR)[0]
 
     def energy(self, theta: ArrayLike, theta_dot: ArrayLike) -> Energy:
-        """Kinetic and potential energy, (...,) J."""
+        """Compute kinetic and potential energy, (...,) J."""
 
         def columns(pose: Pose, rates: Triple) -> tuple[Numbers, Numbers]:
             return energies(pose, rates, self.free_fall, self.inertia)
@@ -433,7 +437,7 @@ class Dynamics:
         states: Mapping[str, ArrayLike],
         *layouts: NDArray[np.intp],
     ) -> list[FloatArray]:
-        """What is computed of a pose and triples of numbers, for each row of the states."""
+        """Apply ``text`` to a pose and triples of numbers, for each row of the states."""
 
         def columns(values: tuple[Numbers, ...], ns: Namespace) -> list[Numbers]:
             theta, *rest = (values[i : i + 3] for i in range(0, len(values), 3))
@@ -452,7 +456,7 @@ class Dynamics:
 
 
 def _side_by_side(states: Mapping[str, ArrayLike]) -> FloatArray:
-    """Arrays (..., 3), broadcast with each other, in one (..., 3 n)."""
+    """Broadcast n arrays (..., 3) with each other, and join them to one (..., 3 n)."""
     arrays = [finite_points(name, state) for name, state in states.items()]
     like = next((array for array in arrays if is_tensor(array)), arrays[0])
     try:

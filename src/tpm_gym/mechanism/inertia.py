@@ -1,14 +1,14 @@
-"""What the closed-form dynamics need to know of the bodies: sixteen constants, from their data.
+"""Sixteen constants of the bodies for the closed-form dynamics.
 
-A rigid bar from B to C moves as two coupled points do: with its mass m, its centre at the share s
-of its length l, and its moment of inertia I across it,
+A rigid bar from B to C, with mass m, length l, its centre at the share s of its length, and moment
+of inertia I across it, has the kinetic energy of two coupled points:
 
     T = (a |vB|^2 + 2 b vB . vC + c |vC|^2) / 2,
     a = m (1 - s)^2 + I / l^2,  b = m s (1 - s) - I / l^2,  c = m s^2 + I / l^2.
 
-Arms (whose near end is fixed), rods and link 7 are such bars; what only translates is a mass at the
-point with which it moves. Left is what turns about itself: the crosses and end link 9 swing with
-their rods, and the rods 4 and 11 on them turn about their own axes too.
+Arms (with a fixed near end), rods and link 7 are such bars. A body that only translates is a mass
+at the point with which it moves. The crosses and end link 9 also swing with their rods, and rods 4
+and 11 also turn about their own axes.
 """
 
 from __future__ import annotations
@@ -28,12 +28,13 @@ _ROUNDING = 1e-9  # of a centre of mass, m; of two equal moments, relative
 
 
 class Swing(NamedTuple):
-    """What turns with a leg's swing, beside its rods' masses: T = (fixed + spin out^2) rate^2 / 2.
+    """Inertia of a leg's swing beside its rods' masses: T = (fixed + spin out^2) rate^2 / 2.
+
+    Here ``out`` is the component of BC along the swing's axis, m.
 
     Attributes:
         fixed: Moment of inertia about the axis of the swing, kg m^2.
-        spin: That of the rods about their own axes, over l4^2, kg; out is the component of BC along
-            the swing's axis, m.
+        spin: Moment of inertia of the rods about their own axes, over l4^2, kg.
     """
 
     fixed: Numbers
@@ -41,17 +42,17 @@ class Swing(NamedTuple):
 
 
 class Inertia(NamedTuple):
-    """The constants of the dynamics, numbers or arrays of one for each row.
+    """Constants of the dynamics.
 
     Attributes:
-        motors: For each leg, what moves with its motor alone, kg m^2: arm and near ends of rods.
-        weights: For each leg, kg: its mass where B_i is, less ``couples``.
-        couples: For each leg, kg: b of the bars B_iC_i.
+        motors: For each leg, inertia of arm and near ends of rods about the motor, kg m^2.
+        weights: For each leg, mass at B_i less ``couples``, kg.
+        couples: For each leg, b of the bars B_iC_i, kg.
         link3: Mass at C1, kg.
         link7: b of link 7, kg.
         platform: Mass at P, kg.
-        swing1: Of leg 1, about the axis x.
-        swing3: Of leg 3, about the axis y.
+        swing1: Swing of leg 1, about the axis x.
+        swing3: Swing of leg 3, about the axis y.
     """
 
     motors: tuple[Numbers, Numbers, Numbers]
@@ -87,19 +88,19 @@ def inertia_of(
     link_masses: Sequence[float] = (),
     payload: float = 0.0,
 ) -> Inertia:
-    """The constants of the mechanism of :func:`tpm_gym.mechanism.tree.build`.
+    """Compute the constants of a mechanism of :func:`tpm_gym.mechanism.tree.build`.
 
     Args:
-        mechanism: Its bodies.
-        geometry: Its lengths.
+        mechanism: Bodies of the mechanism.
+        geometry: Lengths of the mechanism.
         link_masses: Factors of mass and inertia, one for each link but the base; empty if all are
             one.
-        payload: What the cup carries, kg.
+        payload: Mass that the cup carries, kg.
 
     Raises:
-        ConfigurationError: If there is another number of factors, or a body is not where or what
-            the formulas take it for: a bar of which the centre is off its axis, a rod that is not
-            round, a link of another name.
+        ConfigurationError: If there is another number of factors, or if the formulas do not hold
+            for a body: the centre of a bar is off its axis, a rod is not round, or a link has
+            another name.
     """
     bodies = _Bodies(mechanism, link_masses)
     l3, l4, l7 = geometry.l3, geometry.l4, geometry.l7
@@ -138,7 +139,7 @@ def inertia_of(
 
 
 class _Bodies:
-    """The links, with their factors; remembers which were asked for."""
+    """Links with their factors; keeps the names of the links that were used."""
 
     def __init__(self, mechanism: Mechanism, factors: Sequence[float]) -> None:
         moving = mechanism.links[1:]
@@ -158,16 +159,16 @@ class _Bodies:
         return self._factors[name] * self._link(name).mass
 
     def moment(self, name: str, axis: int) -> float:
-        """About the axis through the centre of mass, kg m^2."""
+        """Return the moment of inertia about an axis through the centre of mass, kg m^2."""
         return self._factors[name] * float(self._link(name).inertia[axis, axis])
 
     def shaft(self, name: str, axis: int) -> tuple[float, float]:
-        """Mass, and moment about its own axis, of a body with its centre on it."""
+        """Return mass, and moment about its own axis, of a body with its centre on that axis."""
         self._require_on_axis(name, [k for k in (X, Y, Z) if k != axis])
         return self.mass(name), self.moment(name, axis)
 
     def bar(self, name: str, along: int, about: int, length: float) -> _Bar:
-        """A body on a line of its frame, which turns in a plane, about an axis across that line."""
+        """Compute the constants of a bar that turns in a plane, about an axis across the bar."""
         self._require_on_axis(name, [k for k in (X, Y, Z) if k not in (along, about)])
         share = float(self._link(name).centre_of_mass[along]) / length
         mass, turning = self.mass(name), self.moment(name, about) / length**2
@@ -178,7 +179,7 @@ class _Bodies:
         )
 
     def round_bar(self, name: str, along: int, length: float) -> _Bar:
-        """A bar that turns in space, so that it must be round."""
+        """Compute the constants of a bar that turns in space, and so must be round."""
         one, other = (k for k in (X, Y, Z) if k != along)
         self._require_on_axis(name, [one, other])
         moments = self._link(name).inertia

@@ -11,6 +11,7 @@ positions theta are in rad (m for a slide). Results are NaN in rows without a so
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -41,6 +42,7 @@ MODES: Final = (None, "assembly", "working")
 """Names of the numbers of :meth:`Machine.mode_left`."""
 
 _ATTEMPTS = 1000
+_SAME_PLACE = 1e-6  # m; far below the distance between assembly modes at a safe conditioning
 
 
 class Reading(NamedTuple):
@@ -79,25 +81,25 @@ class Motion(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Machine(ABC):
-    """A translational robot with three motors over a table.
+    """Translational robot with three motors over a table.
 
     Attributes:
-        name: What the machine is called in messages.
-        mount: Where its frame is in the world.
-        region: Where the environments let point P go, a box in the machine's frame, m.
-        goal_region: Where point P has to go to reach a goal, or an object on the table, in it; cut
-            by ``safe_conditioning`` when sampled.
-        home: Where point P is at the start of an episode, machine's frame, m.
+        name: Name of the machine in messages.
+        mount: Mount of the machine's frame in the world.
+        region: Box in which environments keep point P, machine's frame, m.
+        goal_region: Box of positions of P for goals, and for objects on the table. Sampling keeps
+            to the part with ``safe_conditioning``.
+        home: Position of P at the start of an episode, machine's frame, m.
         step_limit: Largest change of the command for P along x, y, z in one control step, m.
         joint_limit: Largest change of a joint's command in one control step, rad (m for a slide).
-        safe_conditioning: Conditioning 1/cond(J) from which on the machine counts as safe from
-            singularities; the penalty of the reward begins below it.
+        safe_conditioning: Smallest conditioning 1/cond(J) that counts as safe from singularities;
+            the penalty of the reward begins below it.
         table: Half edges of the table along x and y, m; its top is the world's z = 0.
 
     Raises:
-        ConfigurationError: If a value cannot be, home or the goals lie outside the region, or the
-            region reaches beyond a singularity, a motor's stop or, by more than the stroke of the
-            cup, the table.
+        ConfigurationError: If a value is not possible, if home or the goals lie outside the region,
+            or if the region reaches beyond a singularity, a motor's stop or (by more than the
+            cup's stroke) the table.
         UnreachableError: If a corner of the region cannot be reached.
     """
 
@@ -139,7 +141,7 @@ class Machine(ABC):
             raise ConfigurationError("mount", self.mount, valid)
 
     def _require_values(self) -> None:
-        """Refuse values of other types, and what is no finite number; arrays become tuples."""
+        """Refuse values of other types and numbers that are not finite; arrays become tuples."""
         for name, kind in (("mount", Mount), ("region", Region), ("goal_region", Region)):
             if not isinstance(getattr(self, name), kind):
                 raise ConfigurationError(name, getattr(self, name), f"a {kind.__name__}")
@@ -227,8 +229,8 @@ class Machine(ABC):
             UnreachableError: If one does not.
         """
         theta = self.inverse(position)
-        if (missing := np.isnan(theta[..., 0])).any():
-            raise self.unreachable(_first(position, missing))
+        if math.isnan(np.vdot(theta, theta)):  # faster than isnan().any()
+            raise self.unreachable(_first(position, np.isnan(theta[..., 0])))
         return theta
 
     def require_evaluate(self, theta: ArrayLike, built: FloatArray | None = None) -> Reading:
@@ -239,8 +241,8 @@ class Machine(ABC):
             SingularityError: If it is at a parallel singularity.
         """
         reading = self.evaluate(theta, built)
-        if (missing := np.isnan(reading.conditioning)).any():
-            raise self.unassembled(_first(theta, missing))
+        if math.isnan(np.vdot(reading.conditioning, reading.conditioning)):
+            raise self.unassembled(_first(theta, np.isnan(reading.conditioning)))
         return reading
 
     def require_within_stops(self, theta: ArrayLike) -> None:
@@ -277,8 +279,14 @@ class Machine(ABC):
     # -- regions ----------------------------------------------------------------------------
 
     def conditioning_at(self, position: ArrayLike) -> FloatArray:
-        """Compute 1/cond(J) (...,) with P at ``position`` (..., 3) m; 0 where P cannot be."""
-        return self.conditioning(self.inverse(position))
+        """Compute 1/cond(J) (...,) with P at ``position`` (..., 3) m; 0 where P cannot be.
+
+        It is 0 too where the working mode reaches the position in another assembly mode.
+        """
+        found, _, conditioning, _ = self.evaluate(self.inverse(position))
+        there = np.abs(np.subtract(found, position)).max(axis=-1) < _SAME_PLACE
+        known: FloatArray = np.where(there, conditioning, 0.0)
+        return known
 
     def conditioning(self, theta: ArrayLike) -> FloatArray:
         """Compute 1/cond(J) (...,) at ``theta`` (..., 3); 0 where the machine cannot be assembled.
@@ -320,14 +328,17 @@ class Machine(ABC):
     @cached_property
     @abstractmethod
     def mechanism(self) -> Mechanism:
-        """Links, joints and closures, for an engine to load."""
+        """Links, joints and closures, which engines load."""
 
     @abstractmethod
     def joint_positions(self, theta: Vector) -> dict[str, float]:
-        """Positions of all joints of :attr:`mechanism` at which its loops close, rad or m.
+        """Compute the positions of all joints of :attr:`mechanism` for those of the motors (3,).
+
+        Returns:
+            Name of the joint -> rad or m.
 
         Raises:
-            UnreachableError: If it cannot be assembled at theta.
+            UnreachableError: If the machine cannot be assembled at theta.
         """
 
     def torque(
@@ -407,7 +418,11 @@ class Machine(ABC):
         return np.array(link_masses or [1.0] * len(links))
 
     def occupied(self, position: ArrayLike) -> list[tuple[FloatArray, FloatArray]]:
-        """Boxes around platform and tool with P at ``position``: low and high corners, m, world."""
+        """Compute boxes around platform and tool: low and high corners, m, world.
+
+        Args:
+            position: Point P (3,) m, machine's frame.
+        """
         platform = np.asarray(position, dtype=np.float64) - self.mechanism.point_p
         boxes = []
         for name in (self.mechanism.platform, self.mechanism.tool):
@@ -430,10 +445,11 @@ _MACHINES: dict[str, Machine | Callable[[], Machine]] = {}
 
 
 def register_machine(name: str, machine: Machine | Callable[[], Machine]) -> None:
-    """Let environments be made with ``machine=name``; a callable is called when first asked for.
+    """Make a machine available as ``machine=name``; a callable is called at the first use.
 
     Raises:
-        ConfigurationError: If the name is none, or taken by another machine, or that is no machine.
+        ConfigurationError: If the name is empty or taken by another machine, or if the value is no
+            machine.
     """
     if not isinstance(name, str) or not name:
         raise ConfigurationError("name", name, "a name")
@@ -445,7 +461,7 @@ def register_machine(name: str, machine: Machine | Callable[[], Machine]) -> Non
 
 
 def find_machine(machine: Any) -> Machine:
-    """A machine by its name, or the machine itself.
+    """Return a machine by its name, or the machine itself.
 
     Raises:
         ConfigurationError: If there is none of that name, or it is no machine.

@@ -1,6 +1,6 @@
-"""MJCF, the language of MuJoCo: a Mechanism as its elements, and a file of the paper's robot.
+"""MJCF (the format of MuJoCo): elements of a Mechanism, and a file of the paper's robot.
 
-MuJoCo closes loops itself: each ball joint of a loop is an equality constraint between two sites.
+MuJoCo closes loops itself. Each ball joint of a loop is an equality constraint between two sites.
 Run ``python -m tpm_gym.mechanism.mjcf FOLDER`` to write the file.
 """
 
@@ -23,14 +23,14 @@ __all__ = ["MJCF_FILE", "SOLID", "STIFF", "mjcf_text", "robot", "site_names", "w
 MJCF_FILE = "tpm.xml"
 
 SOLID = "solid"
-"""Class of the geoms that collide; those of the other class are only drawn."""
+"""Class of geoms that collide; geoms of the other class are only drawn."""
 
 STIFF = "0.9999 0.9999 0.001 0.5 2"
-"""Impedance (solimp) of what must not yield: the largest that MuJoCo takes, whatever the gap."""
+"""Impedance (solimp) of rigid constraints: the largest that MuJoCo takes, for any gap."""
 
 # The file's time step (s), and its servos: N m/rad and N m s/rad.
 _TIME_STEP, _STIFFNESS, _DAMPING = 0.0005, 20000.0, 130.0
-_SPRING = 75.0  # N/m; soft, so that the cup feels its preload over all of its stroke
+_SPRING = 75.0  # N/m; soft, so that the force hardly changes over the cup's stroke
 
 _NOTES = """
   The robot of tpm_gym over its table. Generated from tpm_gym.mechanism; do not edit (make urdf).
@@ -50,15 +50,15 @@ _NOTES = """
 
 
 def robot(mechanism: Mechanism, mount: Mount, time_step: float) -> Element:
-    """A root element with links, joints and closures; neither motors nor anything around them.
+    """Build a root element with links, joints and closures, without motors or surroundings.
 
-    Bodies, joints and colours are called as the mechanism's links, joints and colours, closures as
-    their joints, and geoms that collide as their link.
+    Bodies, joints and colours have the names of the mechanism's links, joints and colours. Closures
+    have the names of their joints, and geoms that collide the name of their link.
 
     Args:
-        mechanism: The robot.
-        mount: Where it hangs.
-        time_step: s; the loops close within one.
+        mechanism: Robot.
+        mount: Mount of the robot.
+        time_step: Time step, s; the loops close within one.
     """
     root = Element("mujoco", model="tpm")
     SubElement(root, "compiler", angle="radian", autolimits="true")
@@ -91,12 +91,12 @@ def robot(mechanism: Mechanism, mount: Mount, time_step: float) -> Element:
 
 
 def site_names(closure: str) -> tuple[str, str]:
-    """What the two sites are called that a closure keeps together."""
+    """Return the names of the two sites that a closure connects."""
     return f"{closure}_a", f"{closure}_b"
 
 
 def mjcf_text(machine: Machine) -> str:
-    """A file that MuJoCo alone loads and moves, over a table, with servos as motors."""
+    """Write the robot over a table, with servos as motors, for use in MuJoCo alone."""
     mechanism = machine.mechanism
     root = robot(mechanism, machine.mount, _TIME_STEP)
     root.insert(0, Comment(_NOTES))
@@ -127,7 +127,7 @@ def mjcf_text(machine: Machine) -> str:
 
 
 def write(folder: Path, machine: Machine = PAPER_TPM) -> Path:
-    """Write the file into ``folder`` (created if missing), and say where it is."""
+    """Write the file into ``folder`` (created if missing), and return its path."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / MJCF_FILE
     path.write_text(mjcf_text(machine), encoding="utf-8", newline="\n")
@@ -135,7 +135,7 @@ def write(folder: Path, machine: Machine = PAPER_TPM) -> Path:
 
 
 def _body(world: Element, bodies: dict[str, Element], link: Link, mount: Mount) -> Element:
-    """A link on its parent; the base in the world."""
+    """Build a link on its parent, or the base in the world."""
     joint = link.joint
     if joint is None:
         x, y, z, w = mount.quaternion
@@ -192,7 +192,7 @@ def _geom(solid: Solid, link: str) -> Element:
 
 
 def _actuators(mechanism: Mechanism) -> Element:
-    """A servo for each motor: torque = stiffness (ctrl - theta) - damping theta_dot, limited."""
+    """Build a servo for each motor: torque = stiffness (ctrl - theta) - damping theta_dot."""
     actuators = Element("actuator")
     for motor in mechanism.motors:
         SubElement(
@@ -210,7 +210,7 @@ def _actuators(mechanism: Mechanism) -> Element:
 
 
 def _home(machine: Machine, joints: Iterable[str]) -> Element:
-    """A key frame with P at home, all ``joints`` at rest, and the motors told to stay."""
+    """Build a key frame with P at home, all ``joints`` at rest and the motors' targets there."""
     a, b, c = theta = machine.require_inverse(machine.home).tolist()
     at = machine.joint_positions((a, b, c))
     frames = Element("keyframe")

@@ -1,4 +1,4 @@
-"""How a robot hangs over the table: the one conversion between its own frame and the world."""
+"""Mount of the robot over the table: conversion between its frame and the world frame."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _HALF_TURN = np.array([1.0, -1.0, -1.0])
 
 @dataclass(frozen=True)
 class Mount:
-    """How the base hangs over the table: the one conversion between paper and world frame.
+    """Mount of the base over the table: conversion between paper and world frame.
 
     The base is mounted upside down, a half turn about x: world = (x, -y, height - z).
 
@@ -50,17 +50,17 @@ class Mount:
         return self.rotate(np.asarray(point, dtype=np.float64) - np.array([0.0, 0.0, self.height]))
 
     def rotate(self, vector: ArrayLike) -> FloatArray:
-        """Convert free vectors (..., 3), such as velocities; the half turn is its own inverse."""
+        """Convert free vectors (..., 3), such as velocities, in either direction."""
         turned: FloatArray = np.multiply(vector, _HALF_TURN, dtype=np.float64)
         return turned
 
     def swap(self, point: Vector) -> Vector:
-        """One point from either frame to the other, in plain floats: a half turn undoes itself."""
+        """Convert one point from either frame to the other, as floats."""
         x, y, z = point
         return x, -y, self.height - z
 
     def turn(self, vector: Vector) -> Vector:
-        """One free vector from either frame to the other, in plain floats."""
+        """Convert one free vector from either frame to the other, as floats."""
         x, y, z = vector
         return x, -y, -z
 
@@ -81,9 +81,6 @@ class Mount:
 
     @staticmethod
     def tilt(quaternion: Quaternion) -> float:
-        """Angle between an orientation in the world, (x, y, z, w), and the paper frame's, rad."""
+        """Compute the angle between an orientation (x, y, z, w) and the paper frame, rad."""
         _, y, z, w = quaternion
         return 2 * math.asin(min(1.0, math.hypot(y, z, w)))
-
-
-_HALF_TURN = np.array([1.0, -1.0, -1.0])

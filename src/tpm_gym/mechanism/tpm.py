@@ -1,10 +1,12 @@
-"""The translational parallel mechanism as a machine: the paper's, one of practical depth, yours."""
+"""The translational parallel mechanism as a machine, with the paper's lengths or others."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,21 +29,21 @@ from tpm_gym.mechanism.mount import Mount
 __all__ = ["ASSEMBLY_LIMIT", "PAPER_TPM", "TPM", "WIDE_TPM"]
 
 ASSEMBLY_LIMIT = 0.010
-"""Platform against forward kinematics: farther apart, the mechanism is assembled otherwise, m."""
+"""Largest distance between platform and forward kinematics in the same assembly mode, m."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TPM(Machine):
-    """The mechanism of the paper, with any lengths.
+    """Mechanism of the paper, with any lengths.
 
-    ``dataclasses.replace(PAPER_TPM, name=..., geometry=...)`` is one with lengths of yours. Where
-    they differ much, ``mount``, ``region``, ``goal_region``, ``home`` and ``step_limit`` have to
-    follow them, and so has ``table``.
+    For other lengths, use ``dataclasses.replace(PAPER_TPM, name=..., geometry=...)``. If they
+    differ much, change ``mount``, ``region``, ``goal_region``, ``home``, ``step_limit`` and
+    ``table`` too.
 
     Attributes:
         geometry: Link lengths.
-        working_mode: How its arms are bent.
-        assembly_mode: How link 3' and platform are assembled.
+        working_mode: Branch of the inverse kinematics: how the arms are bent.
+        assembly_mode: Branch of the forward kinematics: how link 3' and platform are assembled.
     """
 
     geometry: Geometry
@@ -59,30 +61,24 @@ class TPM(Machine):
     def inverse(self, position: ArrayLike, built: FloatArray | None = None) -> FloatArray:
         """See :class:`Machine`."""
         points = _rows(position)
-        theta = np.empty_like(points)
-        _loops().inverse(points.reshape(-1, 3), *self._of(built, points), theta.reshape(-1, 3))
+        theta = np.empty(points.shape)
+        _loops().inverse(_flat(points), *self._of(built, points), _flat(theta))
         return theta
 
     def forward(self, theta: ArrayLike, built: FloatArray | None = None) -> FloatArray:
         """See :class:`Machine`."""
         angles = _rows(theta)
-        position = np.empty_like(angles)
-        _loops().forward(angles.reshape(-1, 3), *self._of(built, angles), position.reshape(-1, 3))
+        position = np.empty(angles.shape)
+        _loops().forward(_flat(angles), *self._of(built, angles), _flat(position))
         return position
 
     def evaluate(self, theta: ArrayLike, built: FloatArray | None = None) -> Reading:
         """See :class:`Machine`."""
         angles = _rows(theta)
-        flat, shape = angles.reshape(-1, 3), angles.shape
-        found = _room(len(flat))
+        flat = _flat(angles)
+        found = Reading(*_room(len(flat)))
         _loops().evaluate(flat, *self._of(built, angles), *found)
-        position, jacobian, conditioning, working = found
-        return Reading(
-            position.reshape(shape),
-            jacobian.reshape(*shape, 3),
-            conditioning.reshape(shape[:-1]),
-            working.reshape(shape[:-1]),
-        )
+        return found if angles.ndim == 2 else Reading(*_shaped(found, angles))
 
     def mode_left(
         self, theta: ArrayLike, position: ArrayLike, built: FloatArray | None = None
@@ -91,26 +87,14 @@ class TPM(Machine):
         angles = _rows(theta)
         points = _rows(position, angles.shape)
         left = np.empty(angles.shape[:-1], dtype=np.int8)
-        _loops().mode_left(
-            angles.reshape(-1, 3),
-            points.reshape(-1, 3),
-            ASSEMBLY_LIMIT,
-            *self._of(built, angles),
-            left.reshape(-1),
-        )
+        of = self._of(built, angles)
+        _loops().mode_left(_flat(angles), _flat(points), ASSEMBLY_LIMIT, *of, left.reshape(-1))
         return left
 
     def same_side(self, position: ArrayLike) -> BoolArray:
         """See :class:`Machine`."""
         side: BoolArray = np.asarray(position)[..., 1] * self.assembly_mode.sin_beta > 0
         return side
-
-    def conditioning_at(self, position: ArrayLike) -> FloatArray:
-        """See :class:`Machine`."""
-        points = _rows(position)
-        found = np.empty(points.shape[:-1])
-        _loops().conditioning_at(points.reshape(-1, 3), *self._of(None, points), found.reshape(-1))
-        return found
 
     def unreachable(self, position: Vector) -> UnreachableError:
         """See :class:`Machine`."""
@@ -175,7 +159,7 @@ class TPM(Machine):
 
     @cached_property
     def dynamics(self) -> Dynamics:
-        """Torques, mass matrix and so on, as designed and with nothing in the cup."""
+        """Torques, mass matrix and energy of the nominal machine with an empty cup."""
         return Dynamics(
             geometry=self.geometry, branch=self.assembly_mode, free_fall=self.mount.free_fall
         )
@@ -190,15 +174,10 @@ class TPM(Machine):
     ) -> FloatArray:
         """See :class:`Machine`."""
         angles = _rows(theta)
-        shape = angles.shape
-        inputs = [angles, _rows(theta_dot, shape), _rows(theta_ddot, shape)]
-        inputs.append(np.empty((0, 3)) if force is None else _rows(force, shape))
-        torques = np.empty(shape)
-        _loops().torque(
-            *(rows.reshape(-1, 3) for rows in inputs),
-            *self._of(built, angles),
-            torques.reshape(-1, 3),
-        )
+        inputs = [angles, _rows(theta_dot, angles.shape), _rows(theta_ddot, angles.shape)]
+        inputs.append(np.empty((0, 3)) if force is None else _rows(force, angles.shape))
+        torques = np.empty(angles.shape)
+        _loops().torque(*map(_flat, inputs), *self._of(built, angles), _flat(torques))
         return torques
 
     def motion(
@@ -206,19 +185,12 @@ class TPM(Machine):
     ) -> Motion:
         """See :class:`Machine`."""
         angles = _rows(theta)
-        rates = _rows(theta_dot, angles.shape)
-        flat, shape = angles.reshape(-1, 3), angles.shape
+        rates, flat = _rows(theta_dot, angles.shape), _flat(angles)
         position, jacobian, _, working = _room(len(flat))
-        mass, bias = np.empty((len(flat), 9)), np.empty((len(flat), 3))
-        found = position, jacobian, working, mass, bias
-        _loops().motion(flat, rates.reshape(-1, 3), *self._of(built, angles), *found)
-        return Motion(
-            position.reshape(shape),
-            jacobian.reshape(*shape, 3),
-            working.reshape(shape[:-1]),
-            mass.reshape(*shape, 3),
-            bias.reshape(shape),
-        )
+        mass, bias = np.empty((len(flat), 3, 3)), np.empty((len(flat), 3))
+        found = Motion(position, jacobian, working, mass, bias)
+        _loops().motion(flat, _flat(rates), *self._of(built, angles), *found)
+        return found if angles.ndim == 2 else Motion(*_shaped(found, angles))
 
     @property
     def lengths(self) -> tuple[float, ...]:
@@ -226,7 +198,7 @@ class TPM(Machine):
         return self.geometry.lengths
 
     def with_lengths(self, lengths: tuple[float, ...]) -> TPM:
-        """The machine with these l1 to l7, m."""
+        """Return the machine with these l1 to l7, m."""
         return replace(self, geometry=Geometry(*lengths))
 
 
@@ -248,11 +220,21 @@ def _rows(vectors: ArrayLike, shape: tuple[int, ...] | None = None) -> FloatArra
     return array
 
 
+def _flat(array: FloatArray) -> FloatArray:
+    """Return an array (..., 3) as (m, 3)."""
+    return array if array.ndim == 2 else array.reshape(-1, 3)
+
+
+def _shaped(arrays: Iterable[Any], like: FloatArray) -> Iterator[Any]:
+    """Return arrays (m, ...) in the leading shape of an array (..., 3)."""
+    return (array.reshape(like.shape[:-1] + array.shape[1:]) for array in arrays)
+
+
 def _room(count: int) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
     """Return arrays for positions, Jacobians, conditioning and modes."""
     return (
         np.empty((count, 3)),
-        np.empty((count, 9)),
+        np.empty((count, 3, 3)),
         np.empty(count),
         np.empty(count, dtype=np.bool_),
     )
@@ -264,32 +246,32 @@ PAPER_TPM = TPM(
     # The cup touches the table at z = 0.93 m of the paper frame, well inside the reach.
     mount=Mount(height=0.97),
     # The slab 0 < y < l7, less a margin to the parallel singularity y = 0 and to the edge y = l7.
-    # Nearer to y = 0 the motors' torque no longer suffices to hold y when a random policy reverses
-    # x or z at full speed: the platform is then thrown through the singularity. Farther from the
-    # base the cup would be pushed back farther than its stroke by a block that lies askew.
+    # Nearer to y = 0, when a random policy reverses x or z at full speed, the motors' torque cannot
+    # hold y, and the platform passes the singularity. Farther from the base, a tilted block would
+    # push the cup back beyond its stroke.
     region=Region(low=(-0.24, 0.012, 0.66), high=(0.12, 0.046, 0.903)),
     goal_region=Region(low=(-0.20, 0.016, 0.70), high=(0.10, 0.042, 0.90)),
     home=(-0.04, 0.028, 0.80),
     step_limit=(0.030, 0.005, 0.030),
     joint_limit=0.08,
-    # There, a joint error of 1 mrad moves the platform by 3 mm at most; as y goes to zero, the one
-    # grows without bound and the other falls with y. A sixth of the region is below.
+    # At 0.08, a joint error of 1 mrad moves the platform by 3 mm at most. Towards y = 0, that
+    # motion grows without bound and the conditioning falls with y. A sixth of the region is below.
     safe_conditioning=0.08,
 )
-"""The paper's case study, upside down over a table."""
+"""Machine with the lengths of the paper's case study, upside down over a table."""
 
 WIDE_TPM = TPM(
     name="wide",
     geometry=WIDE,
     mount=Mount(height=0.95),
     # The largest box of WIDE whose conditioning is at least 0.1 (analysis.aspects), less a margin,
-    # and on towards y = 0, where the penalty begins.
+    # and extended towards y = 0, where the penalty begins.
     region=Region(low=(0.12, 0.10, 0.58), high=(0.48, 0.50, 0.883)),
     goal_region=Region(low=(0.14, 0.12, 0.62), high=(0.46, 0.48, 0.88)),
     home=(0.30, 0.36, 0.75),
     table=(0.65, 0.65),
 )
-"""The paper's lengths but for a link 7 of 0.6 m, for a workspace of practical depth in y."""
+"""Machine with the paper's lengths but a link 7 of 0.6 m, for a workspace deeper in y."""
 
 register_machine("paper", PAPER_TPM)
 register_machine("wide", WIDE_TPM)

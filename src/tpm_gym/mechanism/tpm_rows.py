@@ -41,20 +41,32 @@ _BLOCK = 64  # rows; their columns stay in the cache
 NS: Any = functions
 
 
-def _lengths(p: FloatArray) -> Lengths:
-    return Lengths(p[0], p[1], p[2], p[3], p[4], p[5], p[6])
+def _fill(built: FloatArray, start: int, count: int, each: int, own: FloatArray) -> None:
+    """Copy the parameters of the machines of rows from ``start`` on to as many columns as own has.
+
+    Where all rows are of one machine, the first block's columns serve all.
+    """
+    if start == 0 or len(built) > 1:
+        for j in range(count):
+            machine = (start + j) // each
+            for k in range(len(own)):
+                own[k, j] = built[machine, k]
 
 
-def _inertia(p: FloatArray) -> Inertia:
+def _lengths(own: FloatArray, j: int) -> Lengths:
+    return Lengths(own[0, j], own[1, j], own[2, j], own[3, j], own[4, j], own[5, j], own[6, j])
+
+
+def _inertia(own: FloatArray, j: int) -> Inertia:
     return Inertia(
-        (p[7], p[8], p[9]),
-        (p[10], p[11], p[12]),
-        (p[13], p[14], p[15]),
-        p[16],
-        p[17],
-        p[18],
-        Swing(p[19], p[20]),
-        Swing(p[21], p[22]),
+        _get(own, 7, j),
+        _get(own, 10, j),
+        _get(own, 13, j),
+        own[16, j],
+        own[17, j],
+        own[18, j],
+        Swing(own[19, j], own[20, j]),
+        Swing(own[21, j], own[22, j]),
     )
 
 
@@ -67,11 +79,11 @@ def _read(rows: FloatArray, start: int, count: int, columns: FloatArray, first: 
 
 
 def _write(columns: FloatArray, first: int, start: int, count: int, rows: FloatArray) -> None:
-    """Copy as many columns from ``first`` on to rows (count, ...)."""
-    width = rows.shape[1]
+    """Copy columns from ``first`` on to rows (m, 3) or (m, 3, 3)."""
+    flat = rows.reshape(len(rows), rows.size // max(1, len(rows)))
     for j in range(count):
-        for k in range(width):
-            rows[start + j, k] = columns[first + k, j]
+        for k in range(flat.shape[1]):
+            flat[start + j, k] = columns[first + k, j]
 
 
 def _put(columns: FloatArray, first: int, j: int, values: Triple, real: bool) -> None:
@@ -102,7 +114,7 @@ def _place(columns: FloatArray, j: int, pose: Pose, real: bool) -> tuple[Triple,
     return rows
 
 
-compilable(_lengths, _inertia, _read, _write, _put, _get, _pose, _place)
+compilable(_fill, _lengths, _inertia, _read, _write, _put, _get, _pose, _place)
 
 
 @kept
@@ -111,17 +123,17 @@ def inverse(
 ) -> None:
     """Compute joint positions (m, 3) for P at ``position`` (m, 3)."""
     signs = machine[2], machine[3], machine[4], machine[5]
-    given, found = np.empty((3, _BLOCK)), np.empty((3, _BLOCK))
+    own, given, found = np.empty((7, _BLOCK)), np.empty((3, _BLOCK)), np.empty((3, _BLOCK))
     each = len(position) // len(built)
-    for k in range(len(built)):
-        g = _lengths(built[k])
-        for start in range(k * each, (k + 1) * each, _BLOCK):
-            count = min(_BLOCK, (k + 1) * each - start)
-            _read(position, start, count, given, 0)
-            for j in range(count):
-                angles, real, _, _ = equations.posture_at(_get(given, 0, j), signs, g, NS)
-                _put(found, 0, j, angles, real)
-            _write(found, 0, start, count, theta)
+    for start in range(0, len(position), _BLOCK):
+        count = min(_BLOCK, len(position) - start)
+        _fill(built, start, count, each, own)
+        _read(position, start, count, given, 0)
+        for j in range(count):
+            g = _lengths(own, j)
+            angles, real, _, _ = equations.posture_at(_get(given, 0, j), signs, g, NS)
+            _put(found, 0, j, angles, real)
+        _write(found, 0, start, count, theta)
 
 
 @kept
@@ -130,19 +142,19 @@ def forward(
 ) -> None:
     """Compute P (m, 3) at joint positions (m, 3), in the modes of the machine."""
     planar, side, turned = machine[0], machine[1], machine[2]
-    given, found = np.empty((3, _BLOCK)), np.empty((3, _BLOCK))
+    own, given, found = np.empty((7, _BLOCK)), np.empty((3, _BLOCK)), np.empty((3, _BLOCK))
     each = len(theta) // len(built)
-    for k in range(len(built)):
-        g = _lengths(built[k])
-        for start in range(k * each, (k + 1) * each, _BLOCK):
-            count = min(_BLOCK, (k + 1) * each - start)
-            _read(theta, start, count, given, 0)
-            for j in range(count):
-                cos, sin = equations.arms(_get(given, 0, j), g, NS)
-                there, real, _ = equations.assembly_at(cos, sin, planar, side, g, NS)
-                working = there.cos_beta * turned > 0.0
-                _put(found, 0, j, (there.x, there.y, there.z), real & working)
-            _write(found, 0, start, count, position)
+    for start in range(0, len(theta), _BLOCK):
+        count = min(_BLOCK, len(theta) - start)
+        _fill(built, start, count, each, own)
+        _read(theta, start, count, given, 0)
+        for j in range(count):
+            g = _lengths(own, j)
+            cos, sin = equations.arms(_get(given, 0, j), g, NS)
+            there, real, _ = equations.assembly_at(cos, sin, planar, side, g, NS)
+            working = there.cos_beta * turned > 0.0
+            _put(found, 0, j, (there.x, there.y, there.z), real & working)
+        _write(found, 0, start, count, position)
 
 
 @kept
@@ -155,23 +167,23 @@ def evaluate(
     conditioning: FloatArray,
     working: BoolArray,
 ) -> None:
-    """Compute P (m, 3), J (m, 9), 1/cond(J) (m,) and whether in the working mode (m,)."""
+    """Compute P (m, 3), J (m, 3, 3), 1/cond(J) (m,) and whether in the working mode (m,)."""
     modes = machine[0], machine[1], machine[2]
-    given, found = np.empty((3, _BLOCK)), np.empty((14, _BLOCK))
+    own, given, found = np.empty((7, _BLOCK)), np.empty((3, _BLOCK)), np.empty((14, _BLOCK))
     each = len(theta) // len(built)
-    for k in range(len(built)):
-        g = _lengths(built[k])
-        for start in range(k * each, (k + 1) * each, _BLOCK):
-            count = min(_BLOCK, (k + 1) * each - start)
-            _read(theta, start, count, given, 0)
-            for j in range(count):
-                pose, real, found[13, j] = _pose(_get(given, 0, j), g, modes)
-                rows = _place(found, j, pose, real)
-                found[12, j] = equations.conditioning(rows, NS) if real else math.nan
-            _write(found, 0, start, count, position)
-            _write(found, 3, start, count, jacobian)
-            for j in range(count):
-                conditioning[start + j], working[start + j] = found[12, j], found[13, j] > 0.0
+    for start in range(0, len(theta), _BLOCK):
+        count = min(_BLOCK, len(theta) - start)
+        _fill(built, start, count, each, own)
+        _read(theta, start, count, given, 0)
+        for j in range(count):
+            g = _lengths(own, j)
+            pose, real, found[13, j] = _pose(_get(given, 0, j), g, modes)
+            rows = _place(found, j, pose, real)
+            found[12, j] = equations.conditioning(rows, NS) if real else math.nan
+        _write(found, 0, start, count, position)
+        _write(found, 3, start, count, jacobian)
+        for j in range(count):
+            conditioning[start + j], working[start + j] = found[12, j], found[13, j] > 0.0
 
 
 @kept
@@ -186,24 +198,24 @@ def torque(
 ) -> None:
     """Compute the motors' torques (m, 3) N m for a motion against forces on P (m, 3) N."""
     modes, fall = (machine[0], machine[1], machine[2]), (machine[6], machine[7], machine[8])
-    given, found = np.zeros((12, _BLOCK)), np.empty((3, _BLOCK))
+    own, given, found = np.empty((23, _BLOCK)), np.zeros((12, _BLOCK)), np.empty((3, _BLOCK))
     each = len(theta) // len(built)
-    for k in range(len(built)):
-        g, inertia = _lengths(built[k]), _inertia(built[k])
-        for start in range(k * each, (k + 1) * each, _BLOCK):
-            count = min(_BLOCK, (k + 1) * each - start)
-            _read(theta, start, count, given, 0)
-            _read(theta_dot, start, count, given, 3)
-            _read(theta_ddot, start, count, given, 6)
-            if len(force):
-                _read(force, start, count, given, 9)
-            for j in range(count):
-                pose, real, _ = _pose(_get(given, 0, j), g, modes)
-                rates, changes = _get(given, 3, j), _get(given, 6, j)
-                one, two, three = dynamics.torques(pose, rates, changes, fall, inertia)
-                a, b, c = dynamics.gather(pose, (0.0, 0.0), _get(given, 9, j))
-                _put(found, 0, j, (one - a, two - b, three - c), real)
-            _write(found, 0, start, count, torques)
+    for start in range(0, len(theta), _BLOCK):
+        count = min(_BLOCK, len(theta) - start)
+        _fill(built, start, count, each, own)
+        _read(theta, start, count, given, 0)
+        _read(theta_dot, start, count, given, 3)
+        _read(theta_ddot, start, count, given, 6)
+        if len(force):
+            _read(force, start, count, given, 9)
+        for j in range(count):
+            g, inertia = _lengths(own, j), _inertia(own, j)
+            pose, real, _ = _pose(_get(given, 0, j), g, modes)
+            rates, changes = _get(given, 3, j), _get(given, 6, j)
+            one, two, three = dynamics.torques(pose, rates, changes, fall, inertia)
+            a, b, c = dynamics.gather(pose, (0.0, 0.0), _get(given, 9, j))
+            _put(found, 0, j, (one - a, two - b, three - c), real)
+        _write(found, 0, start, count, torques)
 
 
 @kept
@@ -218,54 +230,31 @@ def motion(
     mass: FloatArray,
     bias: FloatArray,
 ) -> None:
-    """Compute P (m, 3), J (m, 9), the mode (m,), masses (m, 9) and bias (m, 3)."""
+    """Compute P (m, 3), J (m, 3, 3), the mode (m,), masses (m, 3, 3) and bias (m, 3)."""
     modes, fall = (machine[0], machine[1], machine[2]), (machine[6], machine[7], machine[8])
-    given, found = np.empty((6, _BLOCK)), np.empty((25, _BLOCK))
+    own, given, found = np.empty((23, _BLOCK)), np.empty((6, _BLOCK)), np.empty((25, _BLOCK))
     each = len(theta) // len(built)
-    for k in range(len(built)):
-        g, inertia = _lengths(built[k]), _inertia(built[k])
-        for start in range(k * each, (k + 1) * each, _BLOCK):
-            count = min(_BLOCK, (k + 1) * each - start)
-            _read(theta, start, count, given, 0)
-            _read(theta_dot, start, count, given, 3)
-            for j in range(count):
-                pose, real, found[24, j] = _pose(_get(given, 0, j), g, modes)
-                rows = _place(found, j, pose, real)
-                a, b, c, d, e, f = dynamics.masses(pose, rows, inertia)
-                _put(found, 12, j, (a, b, c), real)
-                _put(found, 15, j, (b, d, e), real)
-                _put(found, 18, j, (c, e, f), real)
-                load = dynamics.torques(pose, _get(given, 3, j), _NONE, fall, inertia)
-                _put(found, 21, j, load, real)
-            _write(found, 0, start, count, position)
-            _write(found, 3, start, count, jacobian)
-            _write(found, 12, start, count, mass)
-            _write(found, 21, start, count, bias)
-            for j in range(count):
-                working[start + j] = found[24, j] > 0.0
-
-
-@kept
-def conditioning_at(
-    position: FloatArray, built: FloatArray, machine: FloatArray, conditioning: FloatArray
-) -> None:
-    """Compute 1/cond(J) (m,) at P (m, 3); 0 where P cannot be in the machine's modes."""
-    signs = machine[2], machine[3], machine[4], machine[5]
-    planar, side, g = machine[0], machine[1], _lengths(built[0])
-    given = np.empty((3, _BLOCK))
-    for start in range(0, len(position), _BLOCK):
-        count = min(_BLOCK, len(position) - start)
-        _read(position, start, count, given, 0)
+    for start in range(0, len(theta), _BLOCK):
+        count = min(_BLOCK, len(theta) - start)
+        _fill(built, start, count, each, own)
+        _read(theta, start, count, given, 0)
+        _read(theta_dot, start, count, given, 3)
         for j in range(count):
-            x, y, z = _get(given, 0, j)
-            theta, real, link7, _ = equations.posture_at((x, y, z), signs, g, NS)
-            cos, sin = equations.arms(theta, g, NS)
-            there = equations.Assembly(x, y, z, link7[0], link7[1], link7[2], link7[3])
-            bars = equations.rods(cos, sin, there, g)
-            values = equations.factors(cos, sin, there, bars, g)
-            same = (values.planar * planar > 0.0) & (values.sin_beta * side > 0.0)
-            least = equations.conditioning(equations.velocity(bars, values), NS)
-            conditioning[start + j] = least if real & same & (least <= 1.0) else 0.0
+            g, inertia = _lengths(own, j), _inertia(own, j)
+            pose, real, found[24, j] = _pose(_get(given, 0, j), g, modes)
+            rows = _place(found, j, pose, real)
+            a, b, c, d, e, f = dynamics.masses(pose, rows, inertia)
+            _put(found, 12, j, (a, b, c), real)
+            _put(found, 15, j, (b, d, e), real)
+            _put(found, 18, j, (c, e, f), real)
+            load = dynamics.torques(pose, _get(given, 3, j), _NONE, fall, inertia)
+            _put(found, 21, j, load, real)
+        _write(found, 0, start, count, position)
+        _write(found, 3, start, count, jacobian)
+        _write(found, 12, start, count, mass)
+        _write(found, 21, start, count, bias)
+        for j in range(count):
+            working[start + j] = found[24, j] > 0.0
 
 
 @kept
@@ -279,18 +268,18 @@ def mode_left(
 ) -> None:
     """Find which mode (m,) int8 is left with P at ``position`` (m, 3): 1 assembly, 2 working."""
     planar, side, turned = machine[0], machine[1], machine[2]
-    given = np.empty((6, _BLOCK))
+    own, given = np.empty((7, _BLOCK)), np.empty((6, _BLOCK))
     each = len(theta) // len(built)
-    for k in range(len(built)):
-        g = _lengths(built[k])
-        for start in range(k * each, (k + 1) * each, _BLOCK):
-            count = min(_BLOCK, (k + 1) * each - start)
-            _read(theta, start, count, given, 0)
-            _read(position, start, count, given, 3)
-            for j in range(count):
-                cos, sin = equations.arms(_get(given, 0, j), g, NS)
-                there, real, _ = equations.assembly_at(cos, sin, planar, side, g, NS)
-                x, y, z = _get(given, 3, j)
-                off2 = (there.x - x) ** 2 + (there.y - y) ** 2 + (there.z - z) ** 2
-                kept = real & (y * side > 0.0) & (off2 <= limit * limit)
-                left[start + j] = (2 if there.cos_beta * turned <= 0.0 else 0) if kept else 1
+    for start in range(0, len(theta), _BLOCK):
+        count = min(_BLOCK, len(theta) - start)
+        _fill(built, start, count, each, own)
+        _read(theta, start, count, given, 0)
+        _read(position, start, count, given, 3)
+        for j in range(count):
+            g = _lengths(own, j)
+            cos, sin = equations.arms(_get(given, 0, j), g, NS)
+            there, real, _ = equations.assembly_at(cos, sin, planar, side, g, NS)
+            x, y, z = _get(given, 3, j)
+            off2 = (there.x - x) ** 2 + (there.y - y) ** 2 + (there.z - z) ** 2
+            kept = real & (y * side > 0.0) & (off2 <= limit * limit)
+            left[start + j] = (2 if there.cos_beta * turned <= 0.0 else 0) if kept else 1

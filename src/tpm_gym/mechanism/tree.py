@@ -1,4 +1,4 @@
-"""The mechanism as data: links, joints, inertias and loop closures, from a Geometry.
+"""The mechanism from a Geometry: links, joints, inertias and loop closures.
 
 A physics engine for trees needs the loops cut. The spanning tree here follows the paper's
 numbering of links (Fig. 1):
@@ -8,10 +8,10 @@ numbering of links (Fig. 1):
     base 0 - arm 12 - end link 9 - two rods 11                          (branch III)
 
 and four ball joints close it again: the far ends of rods 4 on link 3', the far ends of rods 11 on
-end link 10. A rod with a ball at both ends would spin idly about itself; rods 4 have a universal
-joint at the arm instead, which takes that idle freedom out. Rods 11 turn on the paper's revolutes
-R_e and R_f; R_g and R_h are closed as balls (cutting them as revolutes would add redundant rows),
-which leaves end link 10, a straight bar through both balls, free to roll about its own axis.
+end link 10. A rod with a ball at both ends could spin about its own axis. So rods 4 have a
+universal joint at the arm instead. Rods 11 turn on the paper's revolutes R_e and R_f. R_g and R_h
+are closed as balls, since revolutes would add redundant constraints. So end link 10, a straight bar
+through both balls, can roll about its own axis.
 
 All frames are parallel to the paper frame when all joints are at zero: arms and rods then point
 along +y (branch I) or +x (branches II, III). Units: metres, radians, kilograms.
@@ -44,18 +44,18 @@ __all__ = [
 ]
 
 ACTUATED_JOINTS = ("R11", "R21", "R31")
-"""The motors, in the order of theta_1, theta_2, theta_3."""
+"""Joints of the motors, in the order of theta_1, theta_2, theta_3."""
 
 CARBON_FIBRE = 1600.0  # kg/m^3
 
-# How far each arm may turn from pointing level outwards, towards the base and the platform.
+# Largest angles of an arm from level outwards, towards the base and towards the platform.
 ARM_RAISED, ARM_LOWERED = np.deg2rad(75.0), np.deg2rad(115.0)
 
 _ALONG: dict[str, int] = {"x": 0, "y": 1, "z": 2}
 
 
 def _vector(axis: str, value: float, centre: Vector = (0.0, 0.0, 0.0)) -> Vector:
-    """``centre`` displaced by ``value`` along ``axis``."""
+    """Displace ``centre`` by ``value`` along ``axis``."""
     moved = list(centre)
     moved[_ALONG[axis]] += value
     return (moved[0], moved[1], moved[2])
@@ -64,7 +64,7 @@ def _vector(axis: str, value: float, centre: Vector = (0.0, 0.0, 0.0)) -> Vector
 def _tube(
     axis: Literal["x", "y"], length: float, height: float, width: float, wall: float
 ) -> Solid:
-    """A rectangular aluminium tube from the link's origin along ``axis``."""
+    """Build a rectangular aluminium tube from the link's origin along ``axis``."""
     outer = (length, width, height) if axis == "x" else (width, length, height)
     inner = tuple(edge if i == _ALONG[axis] else edge - 2 * wall for i, edge in enumerate(outer))
     return Solid(
@@ -85,12 +85,12 @@ def _bar(
     colour: str = "steel",
     density: float = ALUMINIUM,
 ) -> Solid:
-    """A round solid bar of half length ``half`` about ``centre``."""
+    """Build a round solid bar of half length ``half`` about ``centre``."""
     return Solid("cylinder", (radius, 2 * half, 0.0), centre, density, axis=axis, colour=colour)
 
 
 def _rod(axis: Literal["x", "y"], length: float) -> tuple[Solid, ...]:
-    """A carbon-fibre tube, 16 mm by 1.5 mm, with a steel rod end at both ends."""
+    """Build a carbon-fibre tube, 16 mm by 1.5 mm, with a steel rod end at both ends."""
     tube = Solid(
         "cylinder",
         (0.008, length, 0.0),
@@ -107,7 +107,7 @@ def _rod(axis: Literal["x", "y"], length: float) -> tuple[Solid, ...]:
 
 
 def _motor(name: str, axis: Vector, origin: Vector, level: float, sense: int) -> Joint:
-    """A motor whose arm points level outwards at ``level`` and lowers in the ``sense`` of theta."""
+    """Build a motor. Its arm is level outwards at ``level``, and lowers in ``sense`` of theta."""
     lower, upper = sorted((level - sense * ARM_RAISED, level + sense * ARM_LOWERED))
     return Joint(
         name,
@@ -124,8 +124,8 @@ def _motor(name: str, axis: Vector, origin: Vector, level: float, sense: int) ->
 
 
 def _base(g: Geometry) -> Link:
-    """Base 0: a plate with a motor at each pivot. Its mass does not matter, it never moves."""
-    # So far up that the motors fit below it, and so small that it ends where the arms turn.
+    """Build base 0, a plate with a motor at each pivot; it never moves, so its mass is not used."""
+    # High enough that the motors fit below it, and small enough that the arms pass it.
     plate = Solid("cylinder", (g.l1, 0.02, 0.0), (0.0, 0.0, -0.105), ALUMINIUM, colour="white")
     pivots: tuple[tuple[Literal["x", "y"], Vector], ...] = (
         ("x", (0.0, g.l1, 0.0)),
@@ -143,7 +143,7 @@ def _base(g: Geometry) -> Link:
 
 
 def _arm(axis: Literal["x", "y"], across: Literal["x", "y"], g: Geometry) -> tuple[Solid, ...]:
-    """An actuated arm: the motor's shaft and rotor, rectangular tube, elbow bar across."""
+    """Build an actuated arm: motor's shaft and rotor, rectangular tube, elbow bar across."""
     shaft = _bar(across, TORQUE_MOTOR.reach, 0.022, density=STEEL)
     return (
         shaft,
@@ -154,7 +154,7 @@ def _arm(axis: Literal["x", "y"], across: Literal["x", "y"], g: Geometry) -> tup
 
 
 def _branch_1(g: Geometry) -> tuple[Link, ...]:
-    """Arm 2 with short link 3, and the two rods 4 of the 4S parallelogram."""
+    """Build arm 2 with short link 3, and the two rods 4 of the 4S parallelogram."""
     short_link = _bar("x", g.l5, 0.010, (0.0, g.l3, 0.0))
     arm = Link(
         "arm_2",
@@ -180,7 +180,7 @@ def _branch_1(g: Geometry) -> tuple[Link, ...]:
 
 
 def _branch_2(g: Geometry) -> tuple[Link, ...]:
-    """Arm 5, rod 6, link 3', link 7, platform 1, the cup that slides in it, end link 10."""
+    """Build arm 5, rod 6, link 3', link 7, platform 1, the cup that slides in it, end link 10."""
     minus_y = (0.0, -1.0, 0.0)
     link_3p = (
         Solid(
@@ -216,14 +216,14 @@ def _branch_2(g: Geometry) -> tuple[Link, ...]:
 
 
 def _platform(g: Geometry) -> tuple[Solid, ...]:
-    """Platform 1: a plate from F1 to D3 and the stem in which the cup slides."""
+    """Build platform 1: a plate from F1 to D3 and the stem in which the cup slides."""
     point_p = (g.l2, 0.0, g.l6)
     plate = Solid("box", (2 * g.l2 + 0.04, 0.045, 0.008), point_p, ALUMINIUM, colour="light")
     return plate, CUP.stem(point_p)
 
 
 def _branch_3(g: Geometry) -> tuple[Link, ...]:
-    """Arm 12, end link 9, and the two rods 11 of the second parallelogram."""
+    """Build arm 12, end link 9, and the two rods 11 of the second parallelogram."""
     minus_y, plus_z = (0.0, -1.0, 0.0), (0.0, 0.0, 1.0)
     arm = Link("arm_12", _arm("x", "y", g), _motor("R31", minus_y, (g.l1, 0.0, 0.0), 0.0, 1))
     end_link = Link(
@@ -245,8 +245,8 @@ def _branch_3(g: Geometry) -> tuple[Link, ...]:
 def build(geometry: Geometry = PAPER) -> Mechanism:
     """Build the mechanism for the given lengths.
 
-    Sections and materials do not scale with the lengths: they are those of a machine of the size
-    of the paper's case study.
+    Cross-sections and materials do not scale with the lengths. They fit a machine of the size of
+    the paper's case study.
     """
     g = geometry
     links = (
@@ -275,7 +275,7 @@ def build(geometry: Geometry = PAPER) -> Mechanism:
 def joint_angles(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> dict[str, float]:
-    """Angles of all joints of the spanning tree at which the loops close.
+    """Compute the angles of all joints of the spanning tree at which the loops close.
 
     Args:
         theta: (3,) rad, actuated angles.
@@ -296,7 +296,7 @@ def joint_angles(
 def joint_arrays(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> dict[str, FloatArray]:
-    """The same for theta (..., 3), each (...,)."""
+    """Compute the angles (...,) of all joints for theta (..., 3); see :func:`joint_angles`."""
     found = passive_angles(theta, branch, geometry)
     swings = found.rod4_swing, found.rod4_swing, found.rod6_swing, found.rod11_swing
     tilts = found.rod4_tilt, found.rod4_tilt, found.rod11_tilt
@@ -306,9 +306,9 @@ def joint_arrays(
 def rotated_joint_angles(
     theta: ArrayLike, branch: RotatedMode, geometry: Geometry = PAPER
 ) -> dict[str, float]:
-    """Angles of all joints of the spanning tree at which the loops close with link 3' turned.
+    """Compute the angles of all joints at which the loops close with link 3' turned.
 
-    As :func:`joint_angles`, but for the branch.
+    Arguments and result are those of :func:`joint_angles`, with a branch of the second mode.
 
     Raises:
         InputError: If theta has the wrong shape or is not finite, or if the branch does not exist
@@ -333,14 +333,14 @@ def _by_joint(
     beta: FloatArray,
     turn: FloatArray | float = 0.0,
 ) -> dict[str, FloatArray]:
-    """Absolute directions as joint angles: each less that of the parent, all in rad.
+    """Convert absolute directions to joint angles (less those of the parents), all in rad.
 
     Args:
-        theta: (..., 3), the motors.
-        swings: Of rods 4a, 4b, 6 and 11, as :class:`~tpm_gym.kinematics.PassiveAngles` has them.
-        tilts: Of rods 4a, 4b and 11.
-        beta: Of link 7.
-        turn: Of link 3' and the platform about y; joints turn about -y.
+        theta: Joint positions of the motors, (..., 3).
+        swings: Swings of rods 4a, 4b, 6 and 11; see :class:`~tpm_gym.kinematics.PassiveAngles`.
+        tilts: Tilts of rods 4a, 4b and 11.
+        beta: Direction of link 7.
+        turn: Turn of link 3' and the platform about y; joints turn about -y.
     """
     theta_1, theta_2, theta_3 = np.moveaxis(theta, -1, 0)
     swing_4a, swing_4b, swing_6, swing_11 = swings

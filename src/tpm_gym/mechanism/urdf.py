@@ -1,12 +1,11 @@
 """URDF text of a Mechanism, and the file of loop closures beside it.
 
-URDF knows trees only. The written one has a massless link at either end of each closure, and the
-file beside it pairs them in the extended-URDF convention of Gepetto's example-parallel-robots:
-``closed_loop`` lists pairs of frames, ``type`` says for each what coincides (``3d``: the origins, a
-ball joint), ``name_mot`` names the motors' joints. So Pinocchio closes the loops from the two files
-alone (its ``completeRobotLoader(folder, "tpm.urdf", "tpm.loops.yaml")`` reads them). Gravity is not
-in them: the base is the paper's, which hangs upside down over a table, so that things fall along
-+z.
+URDF describes trees only. Ours has a massless link at either end of each closure. The file beside
+it pairs these links in the extended-URDF convention of Gepetto's example-parallel-robots:
+``closed_loop`` lists pairs of frames, ``type`` gives the kind of each closure (``3d``: the origins
+coincide, as in a ball joint), and ``name_mot`` names the motors' joints. Pinocchio closes the loops
+from the two files alone, by ``completeRobotLoader(folder, "tpm.urdf", "tpm.loops.yaml")``. The
+files do not contain gravity. The base hangs upside down over a table, so objects fall along +z.
 
 Run ``python -m tpm_gym.mechanism.urdf FOLDER`` to write both files.
 """
@@ -67,7 +66,7 @@ _MOMENTS = {
 
 
 def urdf_text(mechanism: Mechanism, closure_frames: bool = False) -> str:
-    """The spanning tree as URDF, in the paper frame.
+    """Write the spanning tree as URDF, in the paper frame.
 
     Args:
         closure_frames: Whether to add the frames that :func:`loops_text` pairs.
@@ -93,7 +92,7 @@ def urdf_text(mechanism: Mechanism, closure_frames: bool = False) -> str:
 
 
 def loops_text(mechanism: Mechanism) -> str:
-    """The loop closures and the motors as YAML, for the URDF with its closure frames."""
+    """Write loop closures and motors as YAML, for the URDF with its closure frames."""
     names = [name for name, _, _ in _closure_frames(mechanism)]
     pairs = zip(names[::2], names[1::2], strict=True)
     lines = ["# Generated from tpm_gym.mechanism; do not edit (make urdf)."]
@@ -119,7 +118,7 @@ def write(folder: Path, mechanism: Mechanism | None = None) -> tuple[Path, Path]
 
 
 def numbers(values: Iterable[float]) -> str:
-    """Nine significant digits: a nanometre in a metre; never ``-0``."""
+    """Format numbers with nine significant digits (a nanometre in a metre), without ``-0``."""
     return " ".join(map(_number, values))
 
 
@@ -128,7 +127,7 @@ def _number(value: float) -> str:
 
 
 def _closure_frames(mechanism: Mechanism) -> list[tuple[str, str, Vector]]:
-    """Both sides of each closure in turn: name, link that it is on, place in that link's frame."""
+    """List both sides of each closure in turn: name, link, and place in the link's frame, m."""
     return [
         (f"closedloop_{closure.name}_{side}", link, point)
         for closure in mechanism.closures
@@ -140,7 +139,7 @@ def _closure_frames(mechanism: Mechanism) -> list[tuple[str, str, Vector]]:
 
 
 def _frame_elements(name: str, parent: str, point: Vector) -> tuple[Element, Element]:
-    """A massless link at ``point`` (m) of another, and the joint that fixes it there."""
+    """Build a massless link at ``point`` (m) of another, and the joint that fixes it there."""
     link = Element("link", name=name)
     inertial = ElementTree.SubElement(link, "inertial")  # without it, some loaders assume 1 kg
     ElementTree.SubElement(inertial, "mass", value="0")

@@ -125,7 +125,8 @@ class Policy:
         ``description.env_options`` names that of the training.
 
         Args:
-            env: Environment of Gymnasium, wrapped or not, or a vector of Stable-Baselines3.
+            env: Environment of Gymnasium, wrapped or not, or a vector of Gymnasium or of
+                Stable-Baselines3.
 
         Raises:
             PolicyMismatchError: The environment has other observations or actions.
@@ -135,7 +136,8 @@ class Policy:
         if not hasattr(env, "observation_space") or not hasattr(env, "action_space"):
             raise InputError("env", env, f"an environment, such as gym.make({wanted.env_id!r})")
         for kind in ("observation_space", "action_space"):
-            trained, given = getattr(wanted, kind), getattr(env, kind)
+            trained, given = getattr(wanted, kind), getattr(env, f"single_{kind}", None)
+            given = getattr(env, kind) if given is None else given
             if trained != given:
                 name = kind.replace("_", " ")
                 raise PolicyMismatchError(name, trained, given, wanted.env_id)

@@ -1,4 +1,4 @@
-"""What moves the robot: state, randomisation, the simulation and its engines."""
+"""Simulation of robots: state, randomisation, drives, engines."""
 
 from tpm_gym.simulation.drives import Servo
 from tpm_gym.simulation.engine import Engine, register_engine

@@ -1,4 +1,4 @@
-"""Whether a window can be opened here; engines that try without one may end the process."""
+"""Check for a display. An engine that opens a window without one may end the process."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ _kept: list[ctypes.c_void_p] = []  # a connection to the X server
 
 
 def has_display() -> bool:
-    """Whether there is a screen: on Linux, whether the X server of ``DISPLAY`` answers, with GLX.
+    """Return whether there is a display: on Linux, whether the X server of ``DISPLAY`` has GLX.
 
-    A server to which nobody is connected any more may start anew, and refuses whoever comes
-    meanwhile. So the first connection from here stays open: asking must not lead to that.
+    An X server without connections may restart, and refuses new ones meanwhile. So the first
+    connection stays open.
     """
     if not sys.platform.startswith("linux"):
         return True
@@ -24,7 +24,7 @@ def has_display() -> bool:
     try:
         x11 = ctypes.CDLL("libX11.so.6")
     except OSError:
-        return False  # what opens windows needs it as well
+        return False  # an engine's window needs the library too
     x11.XOpenDisplay.restype = ctypes.c_void_p
     display = ctypes.c_void_p(x11.XOpenDisplay(None))
     if not display:

@@ -48,8 +48,8 @@ class Servo:
     Attributes:
         stiffness: N m/rad.
         damping: N m s/rad.
-        feedforward: What the drives know of the nominal machine: ``"none"``, ``"gravity"`` (the
-            torques that carry it at rest), or ``"computed"`` (those of the whole motion).
+        feedforward: Torques of the nominal machine that are fed forward: ``"none"``, ``"gravity"``
+            (those at rest), or ``"computed"`` (those of the whole motion).
 
     Raises:
         ConfigurationError: If a value is out of range.
@@ -60,7 +60,7 @@ class Servo:
     feedforward: str = "computed"
 
     def __post_init__(self) -> None:
-        """Reject what is no servo."""
+        """Reject impossible values."""
         for name in ("stiffness", "damping"):
             value = getattr(self, name)
             if not is_number(value) or not value > 0:
@@ -71,10 +71,10 @@ class Servo:
 
 
 def drive_of(value: Any) -> Servo | None:
-    """The drive that a user names: ``"ideal"`` or None, ``"servo"``, a Servo or a mapping.
+    """Return the drive of an option: ``"ideal"`` or None, ``"servo"``, a Servo or a mapping.
 
     Raises:
-        ConfigurationError: If it is none of these, or a value is out of range.
+        ConfigurationError: If the option is another, or a value is out of range.
     """
     if value is None or value == "ideal":
         return None
@@ -92,7 +92,7 @@ def require_servo(
     servo_stiffness: Sequence[float] | float,
     joint_friction: Sequence[float] | float,
 ) -> None:
-    """Refuse what only a servo has, where the drive is ideal.
+    """Raise if an ideal drive is asked for what only a servo has.
 
     Raises:
         ConfigurationError: If a factor of the stiffness is not 1, or there is friction.
@@ -107,10 +107,10 @@ def require_servo(
 
 
 def drives_and_randomisation(drive: Any, randomisation: Any) -> tuple[Servo | None, Randomisation]:
-    """The drive and the randomisation that a user names, which fit each other.
+    """Return the drive and the randomisation of two options.
 
     Raises:
-        ConfigurationError: If one is none, or only a servo has what is to be randomised.
+        ConfigurationError: If one is not possible, or only a servo has what is randomised.
     """
     servo, drawn = drive_of(drive), settings_of(Randomisation, "randomisation", randomisation)
     require_servo(servo, drawn.servo_stiffness, drawn.joint_friction)

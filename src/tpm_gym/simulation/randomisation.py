@@ -20,7 +20,7 @@ __all__ = ["LIMITS", "NOMINAL", "Plant", "Randomisation"]
 
 Range = tuple[float, float]
 
-# What may be asked for: so far that trained policies fail, where something makes them.
+# The limits reach so far that trained policies fail.
 _RANGES: dict[str, Range] = {
     "link_mass": (0.5, 16.0),
     "block_mass": (0.1, 10.0),
@@ -29,8 +29,8 @@ _RANGES: dict[str, Range] = {
     "servo_stiffness": (0.01, 4.0),
     "joint_friction": (0.0, 100.0),
 }
-# With bias and lengths off by all of this at once, the arm at home still stands on its own side;
-# with twice as much, some machines have no assembly where the encoders say.
+# With the largest bias and length errors at once, the arm at home can still be assembled; with
+# twice as much, some machines have no assembly at the joint positions of the encoders.
 _SIZES: dict[str, float] = {
     "encoder_noise": 0.02,
     "encoder_bias": 1e-3,
@@ -42,7 +42,7 @@ LIMITS: dict[str, Range] = {
     **{name: (0.0, largest) for name, largest in _SIZES.items()},
     "latency": (0.0, _LATEST),
 }
-"""What each attribute of :class:`Randomisation` may be at the least and at the most."""
+"""Smallest and largest value of each attribute of :class:`Randomisation`."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ NOMINAL = Plant()
 
 @dataclass(frozen=True)
 class Randomisation:
-    """How far the machine may stray from the nominal one. Each episode draws uniformly.
+    """Largest differences from the nominal machine. Each episode draws uniformly.
 
     Ranges are given as (low, high), or as one number that is then fixed.
 
@@ -145,12 +145,12 @@ class Randomisation:
         object.__setattr__(self, "latency", int(self.latency))
 
     def draw(self, rng: np.random.Generator, machine: Machine) -> Plant:
-        """How the machine of one episode differs; ``rng`` is not touched where nothing does."""
+        """Draw the plant of one episode; ``rng`` is not used where nothing is randomised."""
         if self == _NOTHING:
             return NOMINAL
         one, two, three = self._numbers(rng, "motor_strength", 3)
         biases = _deviations(rng, self.encoder_bias, 3) or (0.0, 0.0, 0.0)
-        # What there was first is drawn first, so that seeds keep their meaning.
+        # New attributes are drawn last, so that seeds keep their meaning.
         plant = Plant(
             link_masses=self._numbers(rng, "link_mass", len(machine.mechanism.links) - 1),
             block_mass=self._numbers(rng, "block_mass", 1)[0],
@@ -164,7 +164,7 @@ class Randomisation:
         return replace(plant, servo_stiffness=(a, b, c), joint_friction=(d, e, f))
 
     def told(self, plant: Plant) -> dict[str, Any]:
-        """What ``info`` says of an episode: how its machine differs, and the latency."""
+        """Return the plant and the latency of an episode for ``info``."""
         return {**asdict(plant), "latency": self.latency}
 
     def _numbers(self, rng: np.random.Generator, name: str, count: int) -> tuple[float, ...]:
@@ -173,7 +173,7 @@ class Randomisation:
 
 
 def _pair(name: str, value: Any, low: float, high: float) -> Range:
-    """A number, or a pair of them, as a pair within the limits."""
+    """Return a number, or a pair of them, as a pair within the limits."""
     pair = (value, value) if is_number(value) else value
     sized = isinstance(pair, (tuple, list, np.ndarray)) and len(pair) == 2
     if sized and all(map(is_number, pair)):

@@ -14,14 +14,14 @@ __all__ = ["Numerics", "require_numerics", "settings_of"]
 
 T = TypeVar("T")
 
-_SHORTEST = 1e-6  # s; shorter time steps take for ever
+_SHORTEST = 1e-6  # s; with shorter time steps a control step takes minutes
 
 
 def settings_of(kind: type[T], name: str, value: Any) -> T:
-    """A dataclass of settings: ``value`` itself, made from a mapping, or for None the defaults.
+    """Return settings of a kind: ``value`` itself, a mapping as settings, or for None the defaults.
 
     Raises:
-        ConfigurationError: If it is anything else, has other keys, or a value is out of range.
+        ConfigurationError: If the value is another, has other keys, or is out of range.
     """
     if isinstance(value, kind):
         return value
@@ -52,11 +52,11 @@ class Numerics:
 def require_numerics(
     settings: Numerics, ranges: Mapping[str, tuple[Callable[[float], bool], str]]
 ) -> None:
-    """Reject time steps, iterations of a solver, and other numbers, that cannot work.
+    """Raise if a time step, a number of iterations or another number is not possible.
 
     Args:
-        settings: What has them as attributes; an engine without a solver has no ``iterations``.
-        ranges: Of the other numbers: whether a value fits, and what would.
+        settings: Settings of an engine; ``iterations`` are optional.
+        ranges: For each other number a check, and the range in words.
 
     Raises:
         ConfigurationError: If a value is out of range.

@@ -1,8 +1,8 @@
-"""The vacuum in the cup, the same law for all engines, a time step at a time.
+"""Vacuum law of the cup for one time step, the same for all engines.
 
-Air flows in and out as through a nozzle: the pressure approaches that of the ejector, or the
-ambient's, as an exponential. The seal bears a load as long as atmosphere and lip's friction do.
-What an engine has to say: the force between cup and object, and what the lip touches
+Air flows as through a nozzle: the pressure approaches that of the ejector, or the ambient pressure,
+exponentially. The seal holds as long as pressure and friction of the lip bear the load. An engine
+supplies the force between cup and object, and the object that the lip touches
 (:func:`tpm_gym.mechanism.cup.sealed`).
 """
 
@@ -16,15 +16,15 @@ from tpm_gym.mechanism.cup import CUP, VacuumCup
 __all__ = ["CLEARANCE", "EMPTY", "Hold", "Load", "hold_after", "holds", "pressure_after"]
 
 CLEARANCE = 2e-5
-"""Between the lip and the face that it has sealed on, m: else contact and seal would fight."""
+"""Gap between lip and sealed face, m, so that contact and seal do not fight."""
 
 
 class Hold(NamedTuple):
-    """What the cup holds.
+    """Held object and vacuum.
 
     Attributes:
-        which: Index of the object; -1 for none.
-        vacuum: How far the pressure in the cup is below the ambient's, Pa.
+        which: Index of the held object; -1 for none.
+        vacuum: Pressure in the cup below the ambient pressure, Pa.
     """
 
     which: int = -1
@@ -35,7 +35,7 @@ EMPTY = Hold()
 
 
 class Load(NamedTuple):
-    """The force between the cup and what it holds.
+    """Force between the cup and the held object.
 
     Attributes:
         tension: Along the cup's axis, N; negative where they are pressed together.
@@ -47,16 +47,16 @@ class Load(NamedTuple):
 
 
 def pressure_after(vacuum: float, time_step: float, pumped: bool, cup: VacuumCup = CUP) -> float:
-    """The vacuum (Pa) a time step (s) later; ``pumped`` where it is on and the lip is sealed."""
+    """Return the vacuum (Pa) a time step (s) later; ``pumped`` if it is on and the lip sealed."""
     final, time = (cup.vacuum, cup.evacuation_time) if pumped else (0.0, cup.venting_time)
     return final + (vacuum - final) * math.exp(-time_step / time)
 
 
 def holds(vacuum: Any, load: tuple[Any, Any], cup: VacuumCup = CUP) -> Any:
-    """Whether a seal bears a load (tension and shear, N) at that vacuum (Pa); arrays too.
+    """Return whether a seal bears a load (tension and shear, N) at a vacuum (Pa); arrays too.
 
-    Pull and shear count together, by the length of the force. What presses the lip on the object
-    is no pull, and lets the lip's friction bear some of the shear.
+    Pull and shear combine as the norm of the force. Pressure on the object is no pull, and lets
+    the lip's friction bear a part of the shear.
     """
     tension, shear = load
     pull = (tension > 0) * tension
@@ -69,15 +69,15 @@ def holds(vacuum: Any, load: tuple[Any, Any], cup: VacuumCup = CUP) -> Any:
 def hold_after(
     hold: Hold, time_step: float, on: bool, load: Load, touched: int, cup: VacuumCup = CUP
 ) -> Hold:
-    """What the cup holds after a time step.
+    """Return held object and vacuum after a time step.
 
     Args:
-        hold: What it held in that time step.
+        hold: Held object and vacuum in the time step.
         time_step: s.
         on: Whether the vacuum is on.
-        load: What the seal bore in that time step; of no meaning where nothing was held.
-        touched: Index of an object that the lip could seal on now; -1 for none. Looked at where
-            nothing was held. A cup that has lost an object seals anew when it is vented.
+        load: Load of the seal in the time step; ignored if nothing was held.
+        touched: Index of an object on which the lip could seal now; -1 for none. Ignored if an
+            object was held. A cup that has lost an object seals again after it is vented.
         cup: The cup.
     """
     if hold.which >= 0:

@@ -1,4 +1,4 @@
-"""What is to be done with the robot: scenes, goals, observations, rewards, experts."""
+"""Tasks: scenes, goals, observations, rewards, controls, experts."""
 
 from tpm_gym.tasks.expert import Expert
 from tpm_gym.tasks.motion import Motion, Move, hanging

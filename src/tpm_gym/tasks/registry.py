@@ -1,4 +1,4 @@
-"""Tasks by the names that options give them."""
+"""Tasks by their names in options."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TASKS: dict[str, type[Task]] = {}
 
 
 def option_name(name: str) -> str:
-    """``"PickAndPlace"`` as options write it: ``"pick_and_place"``.
+    """Convert ``"PickAndPlace"`` to the name in options, ``"pick_and_place"``.
 
     Raises:
         ConfigurationError: If it is no name in CamelCase.
@@ -27,16 +27,16 @@ def option_name(name: str) -> str:
 
 
 def make_task(task: Any, machine: str | Machine | None = None, **options: Any) -> Task:
-    """A task from its name or class, or the task itself.
+    """Make a task from its name or class, or return the task itself.
 
     Args:
         task: Name, class or task.
-        machine: None for the paper's.
-        options: Of :class:`Task`; those that are None keep their defaults.
+        machine: The machine; None for the paper's.
+        options: Options of :class:`Task`; None keeps a default.
 
     Raises:
         ConfigurationError: If there is no such task, an option is out of range, or options are
-            given with a task that is made already.
+            given with a finished task.
     """
     options = {"machine": machine, **options}
     given = {name: value for name, value in options.items() if value is not None}

@@ -1,1 +1,1 @@
-"""The closed form as an engine, for batches of machines."""
+"""The analytic engine."""

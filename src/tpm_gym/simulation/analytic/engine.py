@@ -28,6 +28,7 @@ from tpm_gym.simulation.analytic.forward_dynamics import (
     march,
 )
 from tpm_gym.simulation.analytic.physics import Physics
+from tpm_gym.simulation.analytic.steps import ways_in_world
 from tpm_gym.simulation.drives import Servo, ServoDrives
 from tpm_gym.simulation.engine import Engine, Path, Readout, make_engine
 from tpm_gym.simulation.randomisation import Plant
@@ -157,28 +158,21 @@ class AnalyticEngine:
             theta = joints[:, -self._tail :]
             late = self._behind | (self._mode_left != 0)
             late |= ~self._machine.same_side(points).all(axis=1)
-        push = np.zeros((self._count, self._steps, 3))
-        if objects:
-            push = self._touch(self._rows, points, vacuum)
-            before, at, now = points[:, -3], points[:, -2], points[:, -1]
-            carried = self._contact.carried(self._rows)[:, None]
-            force = push[:, -1] + carried * (now - 2 * at + before) / step**2
         start = self._theta, self._rates, self._position, self._before, self._force, self._torque
-        lead = self._lead(theta)
+        push = None
+        if objects:
+            ways = ways_in_world(self._before, self._position, points, self._turn, self._origin)
+            push = self._contact.advance(self._rows, ways, vacuum)
+            carried = self._contact.carried(self._rows)[:, None]
+            change = points[:, -1] - 2 * points[:, -2] + points[:, -3]
+            self._force = push[:, -1] * self._turn + carried * change / step**2
         self._before, self._position = points[:, -2].copy(), points[:, -1].copy()
         self._theta = theta[:, -1].copy()
         self._rates = (theta[:, -1] - theta[:, -2]) / step
-        if objects:
-            self._force = force
-        late |= self._find_torques(lead, theta, path, push)
+        late |= self._find_torques(start[0] - step * start[1], start[0], theta, path, push)
         rows = np.flatnonzero(late)
         if len(rows):
             self._repeat(rows, start, saved, path, vacuum)
-
-    def _lead(self, theta: FloatArray) -> FloatArray:
-        """Return joint positions (n, K + 2, 3) of the last two time steps and of all to come."""
-        earlier = self._theta - self.time_step * self._rates
-        return np.concatenate([earlier[:, None], self._theta[:, None], theta], axis=1)
 
     def _repeat(
         self, rows: IntArray, start: Any, saved: Any, path: Path, vacuum: BoolArray
@@ -220,50 +214,50 @@ class AnalyticEngine:
                 self.torques = np.zeros((self._steps, self._count, 3))
             self.torques[:, rows] = torques
 
-    def _touch(self, rows: IntArray, points: FloatArray, vacuum: BoolArray) -> FloatArray:
-        """Let objects and cups act along the way of P (r, K, 3) m; return forces (r, K, 3) N."""
-        ways = np.concatenate(
-            [self._before[rows, None], self._position[rows, None], points], axis=1
-        )
-        ways *= self._turn
-        ways += self._origin
-        push: FloatArray = self._contact.advance(rows, ways, vacuum) * self._turn
-        return push
-
     def _find_torques(
-        self, lead: FloatArray, theta: FloatArray, path: Path, push: FloatArray
+        self,
+        earlier: FloatArray,
+        start: FloatArray,
+        theta: FloatArray,
+        path: Path,
+        push: FloatArray | None,
     ) -> BoolArray:
         """Compute what motors apply, and return (n,) whether one would need too much.
 
         Args:
-            lead: (n, k + 2, 3) rad, joint positions of the last two time steps and of the tail.
-            theta: (n, k, 3) rad, of the tail alone.
+            earlier: (n, 3) rad, a time step before the control period.
+            start: (n, 3) rad, at its beginning.
+            theta: (n, k, 3) rad, at the ends of its last time steps.
             path: Of the control period.
-            push: (n, K, 3) N on P.
+            push: (n, K, 3) N on P, world; None without objects.
         """
-        everywhere = np.arange(self._count)
         if self.physics.torques == "none":
             self._torque = np.full_like(self._torque, np.nan)
             return np.zeros(self._count, dtype=np.bool_)
+        lead = earlier[:, None], start[:, None]
         if self.physics.torques == "every":
-            torques = self._torques(everywhere, lead, push)
+            torques = self._torques(self._rows, np.concatenate([*lead, theta], axis=1), push)
             self.torques, self._torque = torques.swapaxes(0, 1), torques[:, -1].copy()
             return _beyond(torques, self._effort)
-        last = self._torques(everywhere, theta, push[:, -1:])
+        last = self._torques(self._rows, theta, push)
         self._torque = last[:, 0].copy()
         over = _beyond(last, _WATCHFUL * self._effort)
         rows = np.flatnonzero(over)
         if len(rows):
-            full = np.concatenate([lead[rows, :2], path.joints()[rows]], axis=1)
-            over[rows] = _beyond(self._torques(rows, full, push[rows]), self._effort[rows])
+            whole = np.concatenate([*lead, path.joints()], axis=1)[rows]
+            torques = self._torques(rows, whole, None if push is None else push[rows])
+            over[rows] = _beyond(torques, self._effort[rows])
         return over
 
-    def _torques(self, rows: IntArray, theta: FloatArray, push: FloatArray) -> FloatArray:
-        """Compute the torques (r, m, 3) N m that take motors through theta (r, m + 2, 3) rad."""
+    def _torques(self, rows: IntArray, theta: FloatArray, push: FloatArray | None) -> FloatArray:
+        """Compute the torques (r, m, 3) N m that take motors through theta (r, m + 2, 3) rad.
+
+        The last m time steps of ``push`` (r, K, 3) N, world, act on P.
+        """
         rates = np.diff(theta, axis=1) / self.time_step
         changes = np.diff(rates, axis=1) / self.time_step
         built = None if self._built is None else self._built[rows]
-        against = push if self._scene.objects else None
+        against = None if push is None else push[:, -changes.shape[1] :] * self._turn
         torques: FloatArray = self._machine.torque(
             theta[:, 1:-1], rates[:, :-1], changes, against, built
         )

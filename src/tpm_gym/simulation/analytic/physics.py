@@ -1,4 +1,4 @@
-"""Numerical settings of the closed form."""
+"""Numerical settings of the analytic engine."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ class Physics(Numerics):
     """Numerical settings of the engine.
 
     Attributes:
-        time_step: s; a whole fraction of the control period, of which there are three or more.
-        torques: Of which time steps of a control period the motors' torques are computed, and
-            compared with what the motors have: ``"none"`` (then the State's are NaN, and ideal
-            motors never tire), ``"last"`` or ``"every"``. Wherever one is more than half of what
-            its motor has, every one is. Servo drives know theirs anyway.
+        time_step: s; a whole fraction of the control period, a third of it at most.
+        torques: Time steps of a control period for which the motors' torques are computed and
+            compared with the motors' effort: ``"none"`` (the State's torques are NaN, and ideal
+            motors have no limit), ``"last"`` or ``"every"``. Every time step is computed where the
+            last torque is more than half of a motor's effort. Servo drives always compute theirs.
 
     Raises:
         ConfigurationError: If a value is out of range.
@@ -31,7 +31,7 @@ class Physics(Numerics):
     torques: str = "last"
 
     def __post_init__(self) -> None:
-        """Reject settings that cannot work."""
+        """Reject impossible settings."""
         require_numerics(self, {})
         if self.substeps < 3:
             raise ConfigurationError("time_step", self.time_step, f"at most {CONTROL_PERIOD} s / 3")

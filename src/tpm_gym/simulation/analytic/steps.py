@@ -8,7 +8,7 @@ from tpm_gym.arrays import BoolArray, FloatArray
 from tpm_gym.compiling import compiled, kept
 from tpm_gym.simulation.compiled import inverted
 
-__all__ = ["driven_by_torque", "driven_ideally"]
+__all__ = ["driven_by_torque", "driven_ideally", "felt", "ways_in_world"]
 
 _CREEP = 2e-5  # m/s, at which friction gives way, instead of not at all
 _SIGNS = np.array([(i, j, k) for i in (0, 1, -1) for j in (0, 1, -1) for k in (0, 1, -1)], float)
@@ -193,3 +193,35 @@ def felt(
                 inertia[row, i, k] += level * (j[0, i] * j[0, k] + j[1, i] * j[1, k])
                 inertia[row, i, k] += carried[row] * (j[2, i] * j[2, k])
     return inertia, load
+
+
+@kept
+def ways_in_world(
+    before: FloatArray,
+    position: FloatArray,
+    points: FloatArray,
+    turn: FloatArray,
+    origin: FloatArray,
+) -> FloatArray:
+    """Join P before the last time step, now, and after each time step to come, in the world.
+
+    Args:
+        before: (n, 3) m, machine's frame, as all of them.
+        position: (n, 3) m.
+        points: (n, K, 3) m.
+        turn: (3,) factors of the machine's frame.
+        origin: (3,) m.
+
+    Returns:
+        (n, K + 2, 3) m.
+    """
+    count, steps = points.shape[:2]
+    ways = np.empty((count, steps + 2, 3))
+    for row in range(count):
+        for axis in range(3):
+            factor, start = turn[axis], origin[axis]
+            ways[row, 0, axis] = factor * before[row, axis] + start
+            ways[row, 1, axis] = factor * position[row, axis] + start
+            for k in range(steps):
+                ways[row, k + 2, axis] = factor * points[row, k, axis] + start
+    return ways

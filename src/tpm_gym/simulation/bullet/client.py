@@ -24,7 +24,7 @@ __all__ = ["Client", "silence"]
 
 _stdout_lock = threading.RLock()
 _live: set[int] = set()
-_most = 0  # clients since memory was given back
+_most = 0  # largest number of clients since memory was released
 
 
 class Client:
@@ -60,7 +60,7 @@ class Client:
             raise
 
     def __getattr__(self, name: str) -> Any:
-        """The engine's function of that name, bound to this client, or its constant."""
+        """Return PyBullet's function of that name, bound to this client, or its constant."""
         value = getattr(pybullet, name)
         if callable(value):
             value = partial(value, physicsClientId=self.number)
@@ -68,7 +68,7 @@ class Client:
         return value
 
     def configure(self, physics: Physics) -> None:
-        """Put all settings in force, as after a reset of the whole client."""
+        """Apply all settings, which a reset of the whole client clears."""
         self.setGravity(0.0, 0.0, -GRAVITY)
         self.setTimeStep(physics.time_step)
         self.setPhysicsEngineParameter(
@@ -78,7 +78,7 @@ class Client:
             deterministicOverlappingPairs=1,
         )
         if physics.solver == "direct":
-            with silence():  # it says so from C
+            with silence():  # PyBullet prints a line from C
                 self.setPhysicsEngineParameter(
                     constraintSolverType=pybullet.CONSTRAINT_SOLVER_LCP_DANTZIG
                 )
@@ -89,7 +89,7 @@ class Client:
         self._disconnect()
 
     def _load_renderer(self, renderer: str | None) -> int:
-        """The engine's number of the renderer; loads the EGL plugin if that was asked for."""
+        """Return PyBullet's number of the renderer, and load the EGL plugin where necessary."""
         if renderer in (None, "tiny"):
             return int(pybullet.ER_TINY_RENDERER)
         if renderer != "egl":
@@ -102,10 +102,10 @@ class Client:
 
 
 def _connect(gui: bool) -> int:
-    """A new client of PyBullet.
+    """Connect a new client of PyBullet.
 
     Raises:
-        ConfigurationError: If a window was asked for and none opened.
+        ConfigurationError: If a window is required and none opened.
     """
     if not gui:
         return int(pybullet.connect(pybullet.DIRECT))
@@ -120,7 +120,7 @@ def _connect(gui: bool) -> int:
 
 
 def _disconnect(number: int) -> None:
-    # The engine may have gone first, as when the interpreter ends or after a fork.
+    # PyBullet may be gone already, at the end of the interpreter or after a fork.
     with suppress(pybullet.error):
         pybullet.disconnect(number)
     _live.discard(number)
@@ -134,10 +134,10 @@ def _count(number: int) -> None:
 
 
 def _give_back() -> None:
-    """Return the memory of clients to the system where at least half of many have gone.
+    """Return memory to the system when at least half of many clients are closed.
 
-    glibc would keep all of it until the end. Milliseconds, so not at each client that goes: a robot
-    of other lengths takes a new one at each reset.
+    glibc would keep it until the end. It takes milliseconds, so it is not done for each client: a
+    robot with other lengths needs a new client at each reset.
     """
     global _most
     if _most >= 4 and len(_live) <= _most / 2:
@@ -148,9 +148,9 @@ def _give_back() -> None:
 
 @contextmanager
 def silence() -> Iterator[None]:
-    """Keep what is said, from C too, out of the user's output.
+    """Discard the standard output for a moment, that of C code too.
 
-    For a moment the whole process writes nowhere, so one thread does this at a time.
+    The whole process is silent meanwhile, so only one thread does this at a time.
     """
     with _stdout_lock, ExitStack() as stack:
         if os.name == "posix" and (ours := _duplicate(1)) is not None:
@@ -165,14 +165,14 @@ def silence() -> Iterator[None]:
 
 
 def _flush() -> None:
-    """Write out what Python and the C library still hold back."""
+    """Flush the buffers of Python and of the C library."""
     with suppress(AttributeError, ValueError, OSError):  # stdout may be None, or closed
         sys.stdout.flush()
     ctypes.CDLL(None).fflush(None)
 
 
 def _duplicate(descriptor: int) -> int | None:
-    """A copy of a file descriptor; None where it is closed, so that nothing can be said there."""
+    """Return a copy of a file descriptor; None if it is closed."""
     try:
         return os.dup(descriptor)
     except OSError:

@@ -1,4 +1,4 @@
-"""The vacuum cup in PyBullet: a rigid joint to what it holds, judged after every time step."""
+"""The vacuum cup in PyBullet: a fixed joint to the held object, checked after each time step."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from tpm_gym.simulation.vacuum import CLEARANCE, EMPTY, Hold, Load, hold_after
 __all__ = ["Cup", "Grip"]
 
 _WELD_FORCE = 1e4  # N; the weld itself never yields
-_FASTEST = 2.5  # m/s, of the lip towards an object; twice what the machines are commanded
+_FASTEST = 2.5  # m/s, of the lip towards an object; twice the fastest command
 _NOTHING = Load()
 
 
 class Grip(NamedTuple):
-    """What is held and how well, and its pose in the tool's inertial frame; None for nothing."""
+    """The held object with its vacuum, and its pose in the tool's inertial frame; None for none."""
 
     hold: Hold = EMPTY
     pose: Pose | None = None
@@ -34,21 +34,20 @@ _OPEN = Grip()
 
 
 class Cup:
-    """The cup on a robot's platform, and the objects of which it can hold one.
+    """The cup on a robot's platform, which can hold one of the objects.
 
-    Sealing keeps no penetration: the weld puts the lip on the object's face, a hair off it, so that
-    the engine's contact does not fight with the weld.
+    The weld puts the lip 20 um above the object's face, so that contact and weld do not fight.
 
     Args:
         client: The physics client.
-        robot: Whose platform carries the cup.
-        bodies: The objects' numbers in the client.
-        blocks: What they are.
+        robot: Robot with the cup.
+        bodies: Numbers of the objects in the client.
+        blocks: The objects.
         time_step: s.
 
     Attributes:
-        grip: What it holds.
-        first: In which time step of the control period the lip may first come to an object.
+        grip: The held object.
+        first: First time step of the control period in which the lip can touch an object.
     """
 
     def __init__(
@@ -71,7 +70,7 @@ class Cup:
         self.grip = Grip()
 
     def look(self, steps: int) -> list[int]:
-        """Before a control period of so many time steps: which objects the lip may come to."""
+        """Find the objects that the lip can touch within the next ``steps`` time steps."""
         self._near, self._wait, self.first, self._steps = [], 0, steps, steps
         if self._bodies:
             lip, number = self._robot.lip(), self._client.number
@@ -85,11 +84,11 @@ class Cup:
         return self._near
 
     def wakes(self, on: bool) -> int:
-        """After which time step of the control period :meth:`suck` first has anything to do."""
+        """Return the first time step of the control period that needs :meth:`suck`."""
         return 0 if self.grip != _OPEN else self.first if on else self._steps
 
     def suck(self, on: bool) -> None:
-        """After a time step: let the air in or out, hold on or drop, take what is touched."""
+        """Apply the vacuum law after a time step: change the pressure, take or drop an object."""
         hold, pose = self.grip
         load = _NOTHING if pose is None else self._load()
         touched = self._touched() if on and pose is None else -1
@@ -102,7 +101,7 @@ class Cup:
             self.take(Grip(new, None if new.which < 0 else self._seat(new.which)))
 
     def take(self, grip: Grip) -> None:
-        """Let go, and hold what ``grip`` says."""
+        """Drop the held object, and hold the one of ``grip``."""
         client, tool = self._client, self._robot.tool
         if self.grip.pose is not None:
             client.removeConstraint(self._weld)
@@ -115,16 +114,15 @@ class Cup:
             client.changeConstraint(self._weld, maxForce=_WELD_FORCE)
 
     def _load(self) -> Load:
-        """What the weld did to the object in the last time step.
+        """Return the force of the weld on the object in the last time step.
 
-        The engine gives its force along the axes of the world, and the cup's axis never leaves the
-        vertical.
+        PyBullet reports it along the world's axes. The cup's axis stays vertical.
         """
         x, y, z, *_ = self._client.getConstraintState(self._weld)
         return Load(-z, math.hypot(x, y))
 
     def _touched(self) -> int:
-        """The first of the objects nearby that the lip lies on; -1 for none."""
+        """Return the first near object on which the lip lies; -1 for none."""
         if self._wait > 0:
             self._wait -= 1
             return -1
@@ -142,7 +140,7 @@ class Cup:
         return -1
 
     def _seat(self, index: int) -> Pose:
-        """Where an object sits in the tool's inertial frame: as it is, but clear of the cup."""
+        """Return the pose of an object in the tool's inertial frame, 20 um clear of the cup."""
         client, (body, link) = self._client, self._robot.tool
         state = client.getLinkState(body, link, computeForwardKinematics=True)
         inverse = client.invertTransform(state[0], state[1])

@@ -1,16 +1,16 @@
-"""Coulomb's cone for the direct solver, whose friction is a box with axes of its own.
+"""Coulomb's friction cone for Bullet's direct solver, which has a friction box.
 
-The solver bounds the friction of a contact along two directions, each by mu N: at 45 degrees to
-them it is sqrt(2) too strong, and it does not point against the slip. On a level face the
-directions are the world's x and y, and the engine can scale them for each body. Scaled by the
-direction in which the contact slips, the box's corner lies on the cone, opposite to the slip;
-where it sticks, each bound is what the cone leaves beside the other force of the last time step,
-and where there was none the box lies inside the cone.
+The solver bounds the friction of a contact by mu N along each of two directions. At 45 degrees to
+them the friction is sqrt(2) times too strong, and it does not oppose the slip. On a level face the
+directions are the world's x and y, and Bullet can scale the bounds for each body. This module
+scales them by the direction of the slip, so that the corner of the box lies on the cone, opposite
+to the slip. Where a contact sticks, each bound is what the cone leaves beside the other force of
+the last time step. Where there was no force, the box lies inside the cone.
 
-What is left, measured (``tests/simulation/bullet/test_friction.py``, docs/fidelity.md): a direction
-lags a time step; the weaker bound never falls below :data:`_LEAST`; all points of a contact share
-the direction of its middle, so that a block which spins is braked too little; and contacts between
-objects, or with upright faces, keep the box.
+Remaining errors, measured in ``tests/simulation/bullet/test_friction.py``: a direction lags by one
+time step. The weaker bound never falls below :data:`_LEAST`. All points of a contact share the
+direction of its middle, so that a spinning block is braked too little. Contacts between objects,
+or with upright faces, keep the box.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ from tpm_gym.simulation.state import Block
 __all__ = ["Friction"]
 
 _LEAST = 0.02  # of the scales, so that no row of the solver vanishes
-_FAST = 1e-2  # m/s; beyond that it slips, whatever the last force was
-_SLIP = 1e-5  # m/s; below that the last force has the direction of the next
-_LITTLE = 1e-3  # of the cone, squared: below that the next force may have any direction
-_STICKS = 0.98  # of the cone, squared: below that it sticks, and what moves is the solver's noise
-_SAME = 0.01  # change of a scale that is not worth a call
+_FAST = 1e-2  # m/s; a faster contact slips, whatever the last force was
+_SLIP = 1e-5  # m/s; of a slower contact the next force has the last one's direction
+_LITTLE = 1e-3  # of the cone, squared; after a smaller force the next may have any direction
+_STICKS = 0.98  # of the cone, squared; with a smaller force it sticks, and motion is noise
+_SAME = 0.01  # smaller changes of a scale are not worth a call
 _UNKNOWN = (math.sqrt(0.5), math.sqrt(0.5))
 _BOX = (1.0, 1.0)  # the engine's own
 
 
 class _Face:
-    """A body's level face, on which objects slide, and how its friction is scaled now."""
+    """Level face of a body, on which objects slide, and the scales of its friction."""
 
     def __init__(self, body: int, link: int) -> None:
         self.body, self.link = body, link
@@ -52,10 +52,10 @@ class Friction:
 
     Args:
         client: The physics client.
-        robot: With the cup.
-        bodies: The objects' numbers in the client.
-        tables: That of each one's own table: bodies slide in different directions.
-        blocks: What the objects are.
+        robot: Robot with the cup.
+        bodies: Numbers of the objects in the client.
+        tables: Number of each object's own table: objects slide in different directions.
+        blocks: The objects.
     """
 
     def __init__(
@@ -77,37 +77,36 @@ class Friction:
         self._scale = partial(pybullet.changeDynamics, physicsClientId=number)
 
     def reset(self) -> None:
-        """As if nothing had ever slipped."""
+        """Start as if nothing had slipped."""
         for face in (self._cup, *(face for _, face, _ in self._bodies)):
             face.scales = _BOX  # so that it is set, whatever it is now
             self._set(face, _UNKNOWN)
 
     def alter(self, factor: float) -> None:
-        """All objects are ``factor`` times as rough as nominal."""
+        """Make all objects ``factor`` times as rough as nominal."""
         self._factor = factor
 
     def look(self, near: Sequence[int], first: int) -> int:
-        """Before a control period: from which of its time steps on to :meth:`turn`.
+        """Return the first time step of the next control period that needs :meth:`turn`.
 
-        From the beginning if an object moves, else from ``first``, when the cup comes to one of
-        those that are ``near``.
+        It is 0 if an object moves, else ``first``, when the cup can touch one of the ``near`` ones.
         """
         moving = [index for index in range(len(self._bodies)) if self._moves(index)]
         self._active = sorted({*moving, *near}) if moving else list(near)
-        # An object that is alone rests until the cup comes; others may push each other.
+        # A single object rests until the cup comes; several may push each other.
         alone = len(self._bodies) == 1
         self._resting = {index for index in near if alone and index not in moving}
         return 0 if moving else first
 
     def _moves(self, index: int) -> bool:
-        """Whether an object slides or falls; one that settles after it fell flat does not."""
+        """Return whether an object slides or falls; settling after a flat fall does not count."""
         body, table, _ = self._bodies[index]
         (x, y, z), _ = pybullet.getBaseVelocity(body, self._number)
         settles = table.scales is _UNKNOWN and math.hypot(x, y) <= _SLIP and abs(z) < _FAST
         return not settles and math.hypot(x, y, z) > _SLIP
 
     def turn(self, held: int) -> None:
-        """Before a time step: scale the friction of what may slip."""
+        """Scale the friction of objects that may slip, before a time step."""
         number, cup = self._number, self._cup
         for index in self._active:
             body, table, block = self._bodies[index]
@@ -130,9 +129,9 @@ class Friction:
                 )
 
     def _rests(self, index: int) -> bool:
-        """Whether an object still stands as it did at the last look, and nothing touches it.
+        """Return whether an object has not moved since the last look, and nothing touches it.
 
-        Then there is nothing to turn; to ask costs a third of what turning does.
+        Then nothing has to be turned. Asking costs a third of turning.
         """
         body, table, _ = self._bodies[index]
         if index not in self._resting or table.scales is not _UNKNOWN:
@@ -154,7 +153,7 @@ class Friction:
 
 
 def _scales(x: float, y: float, points: Sequence[Any], coefficient: float) -> tuple[float, float]:
-    """Bounds along the world's axes in units of mu N, for a slip (m/s) and the last time step."""
+    """Return bounds along the world's axes in units of mu N, for a slip (m/s)."""
     speed = math.hypot(x, y)
     if speed > _FAST:
         return _along(x, y)
@@ -167,13 +166,13 @@ def _scales(x: float, y: float, points: Sequence[Any], coefficient: float) -> tu
 
 
 def _along(x: float, y: float) -> tuple[float, float]:
-    """Where the cone's edge is in that direction."""
+    """Return the point of the cone's edge in a direction."""
     length = math.hypot(x, y)
     return max(abs(x) / length, _LEAST), max(abs(y) / length, _LEAST)
 
 
 def _used(points: Sequence[Any], coefficient: float) -> tuple[float, float]:
-    """Friction that these contacts bore, along the world's axes, in units of mu N."""
+    """Return the friction of some contacts, along the world's axes, in units of mu N."""
     along_x = along_y = normal = 0.0
     for point in points:
         force, first, (a, b, _), second, (c, d, _) = point[9:]

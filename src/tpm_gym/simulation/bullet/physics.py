@@ -11,9 +11,9 @@ __all__ = ["Physics"]
 
 SOLVERS = ("direct", "iterative")
 REGULARISATION = 1e-9
-"""Added to the constraints' compliance (CFM): loops that close twice over stay solvable."""
+"""Compliance of the constraints (CFM), so that redundant closures stay solvable."""
 MOTOR_GAIN = 1.0
-"""Share of the position error that a motor takes out in one time step, effort permitting."""
+"""Share of the position error that a motor removes in one time step."""
 
 
 @dataclass(frozen=True)
@@ -22,10 +22,10 @@ class Physics(Numerics):
 
     Attributes:
         time_step: s; a whole fraction of the control period.
-        solver: ``"direct"`` solves the constraints of a step exactly (Dantzig's pivoting);
+        solver: ``"direct"`` solves the constraints of a time step exactly (Dantzig's pivoting);
             ``"iterative"`` is Bullet's default, sequential impulses.
-        iterations: Of the iterative solver, a step; with 25 the mechanism is lost now and then.
-        erp: Share of a constraint's error that is taken out in one step, in (0, 1].
+        iterations: Iterations of the iterative solver in a time step; 25 lose a loop now and then.
+        erp: Share of a constraint's error that is removed in one time step, in (0, 1].
 
     Raises:
         ConfigurationError: If a value is out of range.
@@ -36,7 +36,7 @@ class Physics(Numerics):
     erp: float = 1.0
 
     def __post_init__(self) -> None:
-        """Reject settings that cannot work."""
+        """Reject impossible settings."""
         require_numerics(self, {"erp": (lambda value: 0 < value <= 1, "0 < erp <= 1")})
         if self.solver not in SOLVERS:
             raise ConfigurationError("solver", self.solver, " or ".join(map(repr, SOLVERS)))

@@ -1,9 +1,9 @@
-"""The robot inside a physics client: three legs, loop closures, motors, encoders, and the truth.
+"""The robot in PyBullet: legs, loop closures, motors, encoders, and the truth.
 
 Each leg of the spanning tree is a multibody of its own, so that every loop closure joins two
-different multibodies. That is not a matter of taste: where both ends lie in one multibody, Bullet's
-direct solvers go wrong and lose the loops at once; between multibodies they are exact
-(docs/fidelity.md). It also shortens every row of the constraint solver.
+different multibodies. Within one multibody, Bullet's direct solvers are wrong and lose the loops at
+once; between multibodies they are exact (docs/fidelity.md). It also shortens every row of the
+solver.
 """
 
 from __future__ import annotations
@@ -39,22 +39,22 @@ _CLOSURE_FORCE = 1e6  # N; the loops never yield
 
 
 class Robot:
-    """The mechanism as one multibody a leg, with closed loops.
+    """The mechanism as one multibody for each leg, with closed loops.
 
     Args:
         client: The physics client.
-        mechanism: What to load.
-        mount: Where the base hangs.
+        mechanism: The mechanism to load.
+        mount: Place of the base.
 
     Attributes:
         bodies: Numbers of the legs in the client.
-        joints: Where each joint is, by name.
-        links: Where each link but the base is, by name.
-        tool: Where the link with the vacuum cup is.
+        joints: Address of each joint, by name.
+        links: Address of each link but the base, by name.
+        tool: Address of the link with the vacuum cup.
     """
 
     def __init__(self, client: Client, mechanism: Mechanism, mount: Mount) -> None:
-        """Load the legs, take out what the engine adds on its own, close the loops."""
+        """Load the legs, remove PyBullet's own damping and motors, close the loops."""
         self._client, self._mechanism = client, mechanism
         self.joints: dict[str, Address] = {}
         self.links: dict[str, Address] = {}
@@ -97,12 +97,12 @@ class Robot:
         return body
 
     def _inertia(self, link: Address) -> tuple[float, Vector]:
-        """Mass and principal moments as loaded."""
+        """Return mass and principal moments as loaded."""
         info = self._client.getDynamicsInfo(*link)
         return info[0], info[2]
 
     def _close_loops(self) -> None:
-        """Close the loops; the engine wants pivots relative to the centres of mass."""
+        """Close the loops; PyBullet takes pivots relative to the centres of mass."""
         client = self._client
         watched = {self.links[self._mechanism.platform]}
         for closure in self._mechanism.closures:
@@ -119,7 +119,7 @@ class Robot:
             )
             client.changeConstraint(constraint, maxForce=_CLOSURE_FORCE)
             watched |= {link_a, link_b}
-        # One call of the engine a leg is cheaper than one a link.
+        # One call for each leg is cheaper than one for each link.
         order = sorted(watched)
         self._watched = {body: [link for of, link in order if of == body] for body, _ in order}
         at = {name: order.index(link) for name, link in self.links.items() if link in watched}
@@ -129,10 +129,10 @@ class Robot:
         ]
 
     def _pivot(self, name: str, point: Vector) -> NDArray[np.float64]:
-        """A link's point relative to its centre of mass, m.
+        """Return a link's point relative to its centre of mass, m.
 
         Raises:
-            ConfigurationError: If the link has products of inertia: the engine would turn its
+            ConfigurationError: If the link has products of inertia: PyBullet would turn its
                 inertial frame onto the principal axes, and the loop would not close there.
         """
         link = self._mechanism.link(name)
@@ -145,8 +145,8 @@ class Robot:
     def paint(self) -> None:
         """Give each link the colour of its largest solid.
 
-        The engine's OpenGL pictures know one colour a link and take that of the last solid; the
-        software renderer needs no help.
+        PyBullet's OpenGL pictures use one colour for a link, that of the last solid. The software
+        renderer is right without this.
         """
         for link in self._mechanism.links:
             largest = max(link.solids, key=lambda solid: float(np.prod(np.abs(solid.size[:2]))))
@@ -176,7 +176,7 @@ class Robot:
         self._effort = [effort * strength for effort, strength in pairs]
 
     def drive(self, theta: Vector) -> None:
-        """Let the motors go to ``theta`` rad within the next time step, effort permitting."""
+        """Let the motors go to ``theta`` rad within the next time step, within their effort."""
         # Target angle and rate, largest torque, gains, rate limit (none), client; as keywords they
         # cost half as much again, and a loop as much as one of the calls.
         turn, mode = pybullet.setJointMotorControl2, pybullet.POSITION_CONTROL
@@ -195,7 +195,7 @@ class Robot:
             turn(body, joint, mode, 0.0, 0.0, one, 0.0, 0.0, -1.0, number)
 
     def rub(self, friction: Vector) -> None:
-        """Let the motors' axes resist any motion with ``friction`` N m."""
+        """Set the Coulomb friction of the motors' axes, N m."""
         turn, mode = self._client.setJointMotorControl2, pybullet.VELOCITY_CONTROL
         for motor, one in zip(self._motors, friction, strict=True):
             turn(*motor, mode, targetVelocity=0.0, force=one)
@@ -208,12 +208,12 @@ class Robot:
         return (a[0], b[0], c[0]), (a[1], b[1], c[1]), (a[3], b[3], c[3])
 
     def joint_states(self) -> tuple[tuple[float, float], ...]:
-        """Angle and rate of every joint, passive ones too."""
+        """Return position and velocity of every joint, passive ones too."""
         states = (self._client.getJointState(*joint) for joint in self.joints.values())
         return tuple((state[0], state[1]) for state in states)
 
     def set_joint_states(self, states: tuple[tuple[float, float], ...]) -> None:
-        """Put every joint at an angle and rate that :meth:`joint_states` gave."""
+        """Restore the positions and velocities of :meth:`joint_states`."""
         for joint, (angle, rate) in zip(self.joints.values(), states, strict=True):
             self._client.resetJointState(*joint, angle, rate)
 
@@ -229,7 +229,7 @@ class Robot:
             x, y, z = transform(a[4], a[5], point_a)
             u, v, w = transform(b[4], b[5], point_b)
             gap = (x - u) ** 2 + (y - v) ** 2 + (z - w) ** 2
-            if gap > squared or gap != gap:  # what is nowhere stays so
+            if gap > squared or gap != gap:  # a NaN stays
                 squared = gap
         platform = states[self._platform]
         place = transform(platform[4], platform[5], self._mechanism.point_p)
@@ -248,7 +248,7 @@ class Robot:
 
 @contextmanager
 def _on_disk(text: str) -> Iterator[str]:
-    """The path of a file with this text: the engine reads robots from files alone.
+    """Yield the path of a file with this text: PyBullet reads robots from files only.
 
     Raises:
         ConfigurationError: If no temporary file can be written.

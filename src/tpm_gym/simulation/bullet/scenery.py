@@ -1,4 +1,4 @@
-"""What stands around the robot in PyBullet: table, floor, goal markers, objects, and the camera."""
+"""Everything around the robot in PyBullet: table, floor, goal markers, objects, camera."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ class Scenery:
 
     Args:
         client: The physics client.
-        scene: What to load.
+        scene: Objects and markers to load.
         table: Half edges of the table along x and y, m.
 
     Attributes:
         bodies: Numbers of the objects in the client, in the order of the scene.
-        tables: Numbers of their tables: one for each object, all in the same place. The first is
-            there without objects too, and the one that is drawn.
+        tables: Numbers of the tables. Each object has its own, all in the same place, because their
+            friction is scaled differently. The first exists without objects too, and is drawn.
     """
 
     def __init__(self, client: Client, scene: Scene, table: tuple[float, float]) -> None:
@@ -51,7 +51,7 @@ class Scenery:
                 client.setCollisionFilterPair(body, top, -1, -1, int(index == other))
 
     def _add_slab(self, slab: Slab, edges: tuple[float, float], drawn: bool = True) -> int:
-        """A static board with these half edges, m."""
+        """Add a static board with these half edges, m; return its number."""
         client, half = self._client, (*edges, slab.half_height)
         solid = client.createCollisionShape(client.GEOM_BOX, halfExtents=half)
         shape = -1
@@ -64,7 +64,7 @@ class Scenery:
             baseVisualShapeIndex=shape,
             basePosition=(0.0, 0.0, slab.top - slab.half_height),
         )
-        # The engine multiplies the friction of both bodies.
+        # PyBullet multiplies the friction of both bodies.
         client.changeDynamics(body, -1, lateralFriction=slab.friction)
         return body
 
@@ -93,7 +93,7 @@ class Scenery:
             self._client.resetBasePositionAndOrientation(marker, position, UPRIGHT)
 
     def place(self, placed: Sequence[tuple[Pose, Twist]]) -> None:
-        """Put the objects down with no memory of old contacts (the engine warm-starts them)."""
+        """Put the objects down, and clear old contacts, which would warm-start the solver."""
         for far, body in enumerate(self.bodies):
             self._client.resetBasePositionAndOrientation(body, (far, 0.0, 5.0), UPRIGHT)
         if self.bodies:
@@ -106,13 +106,10 @@ class Scenery:
             self._client.resetBaseVelocity(body, *twist)
 
     def read(self) -> list[tuple[Pose, Twist]]:
-        """Poses and velocities of the objects."""
+        """Return poses and velocities of the objects."""
         pose, velocity = pybullet.getBasePositionAndOrientation, pybullet.getBaseVelocity
         number = self._client.number
-        found: list[tuple[Pose, Twist]] = []
-        for body in self.bodies:
-            found.append((Pose(*pose(body, number)), Twist(*velocity(body, number))))
-        return found
+        return [(Pose(*pose(body, number)), Twist(*velocity(body, number))) for body in self.bodies]
 
     def alter(self, mass: float, friction: float) -> None:
         """Make the objects ``mass`` times as heavy and ``friction`` times as rough as nominal."""
@@ -127,7 +124,7 @@ class Scenery:
             )
 
     def aim_window(self) -> None:
-        """Point the camera of the engine's window like that of :meth:`picture`."""
+        """Point the window's camera like that of :meth:`picture`."""
         self._client.resetDebugVisualizerCamera(
             cameraDistance=0.7 * CAMERA.distance,  # the window's field of view is wider
             cameraYaw=CAMERA.yaw,
@@ -136,7 +133,7 @@ class Scenery:
         )
 
     def picture(self, width: int, height: int, renderer: int) -> NDArray[np.uint8]:
-        """The scene as (height, width, 3) RGB."""
+        """Draw the scene as (height, width, 3) RGB."""
         client = self._client
         view = client.computeViewMatrixFromYawPitchRoll(
             cameraTargetPosition=CAMERA.target,

@@ -1,4 +1,4 @@
-"""MuJoCo as an engine; the only package that imports it."""
+"""MuJoCo as an engine."""
 
 from tpm_gym.errors import MissingPackageError
 

@@ -1,4 +1,4 @@
-"""The vacuum cup in MuJoCo: what it takes is welded to it, with a look at the force each step."""
+"""The vacuum cup in MuJoCo: a weld to the held object, whose force is checked each time step."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ __all__ = ["Cup", "Grip"]
 
 _NO_LOAD = Load()
 _SOFTER = 0.5
-"""Share of its contacts' stiffness that what is held keeps.
+"""Factor of the contacts' stiffness of the held object.
 
-Pushed out of the table as fast as what is free, it would be thrown against the cup's spring, which
-then presses 3% less than in PyBullet, and so do the motors.
+With the whole stiffness, the table would throw it against the cup's spring. The spring would then
+press 3% less than in PyBullet, and the motors' torques would be as much smaller.
 """
 
 
 class Grip(NamedTuple):
-    """What the cup holds, and where that is in the tool's frame (of no meaning without)."""
+    """The held object with its vacuum, and its pose in the tool's frame if there is one."""
 
     hold: Hold = EMPTY
     pose: Pose = Pose((0.0, 0.0, 0.0))
 
 
 class Cup:
-    """The cup on a robot's platform, and the objects of which it can hold one.
+    """The cup on a robot's platform, which can hold one of the objects.
 
-    A weld takes the place of the contact: it keeps the lip a hair off the object's face and bears
-    pull, pressure and shear, so nothing else is between them, and its force is the seal's load.
+    A weld replaces the contact: it keeps the lip 20 um above the object's face and bears pull,
+    pressure and shear. So its force is the load of the seal.
 
     Attributes:
-        grip: What is held, and how.
+        grip: The held object.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class Cup:
         self.grip = Grip()
 
     def load(self) -> Load:
-        """What the seal bore; to be called after the second half of a time step."""
+        """Return the load of the seal, after the second half of a time step."""
         if self.grip.hold.which < 0:
             return _NO_LOAD
         row = self._row
@@ -77,7 +77,7 @@ class Cup:
         return Load(tension, shear)
 
     def breathe(self, on: bool, load: Load) -> bool:
-        """Let air in or out for a time step; whether an object was taken or dropped."""
+        """Apply the vacuum law of a time step; return whether an object was taken or dropped."""
         before, pose = self.grip
         if not on and before == EMPTY:
             return False
@@ -90,7 +90,7 @@ class Cup:
         return True
 
     def set(self, grip: Grip) -> None:
-        """Hold just what ``grip`` says."""
+        """Hold the object of ``grip``, and no other."""
         model, active = self._model, self._data.eq_active
         active[self._welds] = 0
         model.pair_solref[:, 0] = self._stiffness
@@ -103,7 +103,7 @@ class Cup:
             model.eq_data[weld, 3:10] = (x, y, z, qw, qx, qy, qz)
 
     def _touched(self) -> int:
-        """Index of the first object on whose face the lip lies; -1 for none."""
+        """Return the index of the first object on whose face the lip lies; -1 for none."""
         height = self._robot.tool_height()
         for index, (block, reach) in enumerate(zip(self._blocks, self._reach, strict=True)):
             if height - self._scenery.height(index) <= reach:  # else there is no need to look
@@ -114,7 +114,7 @@ class Cup:
         return -1
 
     def _sealed_pose(self, index: int) -> Pose:
-        """Where an object is in the tool's frame, but clear of the cup."""
+        """Return the pose of an object in the tool's frame, 20 um clear of the cup."""
         origin, turn = self._robot.tool()
         position, quaternion = self._scenery.pose(index)
         lip, _ = self._robot.cup()
@@ -132,12 +132,12 @@ def _inverse(quaternion: Quaternion) -> Quaternion:
 
 
 def _in_frame(origin: Vector, quaternion: Quaternion, point: Vector) -> Vector:
-    """A point of the world in a frame."""
+    """Convert a point of the world into a frame."""
     (x, y, z), (u, v, w) = point, origin
     return rotate(_inverse(quaternion), (x - u, y - v, z - w))
 
 
 def _wxyz(quaternion: Quaternion) -> tuple[float, float, float, float]:
-    """As the engine writes it."""
+    """Reorder a quaternion as MuJoCo writes it."""
     x, y, z, w = quaternion
     return w, x, y, z

@@ -16,7 +16,7 @@ from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.drives import Servo, ServoDrives, steering
 from tpm_gym.simulation.engine import Engine, Path, Pose, Readout
 from tpm_gym.simulation.mujoco.cup import Cup, Grip
-from tpm_gym.simulation.mujoco.model import compiled
+from tpm_gym.simulation.mujoco.model import compile_model
 from tpm_gym.simulation.mujoco.physics import Physics
 from tpm_gym.simulation.mujoco.pictures import Pictures
 from tpm_gym.simulation.mujoco.robot import Robot
@@ -32,7 +32,7 @@ _STATE = int(
     | mujoco.mjtState.mjSTATE_WARMSTART
     | mujoco.mjtState.mjSTATE_EQ_ACTIVE
 )
-"""What the next time steps depend on, besides the model."""
+"""Parts of MuJoCo's state that the next time steps depend on."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +46,8 @@ class _Saved:
 class MujocoEngine:
     """See :class:`~tpm_gym.simulation.engine.Engine`.
 
-    Between the calls, the first half of the next time step (positions, contacts, constraints) has
-    been computed, so that all that can be read belongs together.
+    Between calls, the first half of the next time step (positions, contacts, constraints) is
+    computed already, so that all values that can be read belong to the same moment.
 
     Args:
         renderer: ``"egl"``, ``"osmesa"`` or ``"glfw"``; None for that of the environment variable
@@ -80,7 +80,7 @@ class MujocoEngine:
 
     def _load(self, machine: Machine) -> None:
         self._machine = machine
-        self.model = compiled(machine, self._scene, self.physics)
+        self.model = compile_model(machine, self._scene, self.physics)
         self.data = mujoco.MjData(self.model)
         self._reset()
         self.robot = Robot(self.model, self.data, machine, ideal=self._servo is None)

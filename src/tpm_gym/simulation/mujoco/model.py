@@ -1,4 +1,4 @@
-"""What MuJoCo is given: robot, table, floor, objects, and who may touch whom, as one model."""
+"""MuJoCo's model of robot, table, floor and objects, with the pairs that may touch."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from tpm_gym.simulation.stage import (
 )
 from tpm_gym.simulation.state import Block, Scene
 
-__all__ = ["compiled", "grip_name", "marker_name", "object_name"]
+__all__ = ["compile_model", "grip_name", "marker_name", "object_name"]
 
 _RECOVERY = 0.1
-"""Share of a penetration that a contact takes out in one time step: what bounces least."""
-_MARGIN = 1e-6  # m; so that what is put down exactly on the table is in contact at once
+"""Share of a penetration that a contact removes in one time step; this value bounces least."""
+_MARGIN = 1e-6  # m, so that an object placed exactly on the table is in contact at once
 
-_OUT_OF_SIGHT = "0 0 -9"  # where markers are before they are shown; at 0 0 0 they could not move
+_OUT_OF_SIGHT = "0 0 -9"  # place of markers that are not shown; at 0 0 0 they could not move
 
 
-def compiled(machine: Machine, scene: Scene, physics: Physics) -> mujoco.MjModel:
-    """The model; equality constraints are the closures in their order, then a grip an object."""
+def compile_model(machine: Machine, scene: Scene, physics: Physics) -> mujoco.MjModel:
+    """Compile the model; equality constraints are the closures, then a grip for each object."""
     root = robot(machine.mechanism, machine.mount, physics.time_step)
     option = SubElement(
         root,
@@ -45,7 +45,7 @@ def compiled(machine: Machine, scene: Scene, physics: Physics) -> mujoco.MjModel
         iterations=str(physics.iterations),
         tolerance=repr(physics.tolerance),
     )
-    # Bad numbers shall stay, so that the caller sees a lost loop.
+    # Without a reset by MuJoCo, the caller sees a lost loop.
     SubElement(option, "flag", autoreset="disable")
     world, equality = root.find("worldbody"), root.find("equality")
     assert world is not None
@@ -67,22 +67,22 @@ def compiled(machine: Machine, scene: Scene, physics: Physics) -> mujoco.MjModel
 
 
 def object_name(index: int) -> str:
-    """Of an object's body, joint and geom."""
+    """Return the name of an object's body, joint and geom."""
     return f"object {index}"
 
 
 def grip_name(index: int) -> str:
-    """Of what fixes an object to the cup."""
+    """Return the name of the weld between an object and the cup."""
     return f"grip {index}"
 
 
 def marker_name(index: int) -> str:
-    """Of a site that shows a goal."""
+    """Return the name of a goal's site."""
     return f"marker {index}"
 
 
 def _light(root: Element, world: Element) -> None:
-    """As bright as in the other engine's pictures: no shadows, a white sky."""
+    """Add light as in PyBullet's pictures: no shadows, a white sky."""
     visual = SubElement(root, "visual")
     SubElement(visual, "headlight", ambient=".45 .45 .45", diffuse=".2 .2 .2", specular="0 0 0")
     SubElement(
@@ -103,7 +103,7 @@ def _light(root: Element, world: Element) -> None:
 
 
 def _surroundings(world: Element, machine: Machine, scene: Scene) -> None:
-    """Table, floor and markers."""
+    """Add table, floor and markers."""
     still = {"contype": "0", "conaffinity": "0"}  # pairs alone collide
     SubElement(
         world,
@@ -157,7 +157,7 @@ def _object(world: Element, index: int, block: Block) -> None:
 
 
 def _contacts(root: Element, scene: Scene, physics: Physics) -> Element:
-    """Who may touch whom: objects everything, the cup the table too; nothing else is near."""
+    """Return the pairs that may touch: objects with everything, and the cup with the table."""
     lips = [geom.attrib["name"] for geom in root.iter("geom") if geom.get("class") == SOLID]
     objects = [(object_name(index), block.friction) for index, block in enumerate(scene.objects)]
     table, floor = ("table", TABLE.friction), ("floor", FLOOR.friction)

@@ -15,8 +15,8 @@ class Physics(Numerics):
 
     Attributes:
         time_step: s; a whole fraction of the control period.
-        iterations: Most of the solver (Newton's method), a step.
-        tolerance: Of the solver: it ends where a step gains less, in units of MuJoCo's.
+        iterations: Largest number of iterations of the solver (Newton's method) in a time step.
+        tolerance: Improvement below which the solver stops, in MuJoCo's unit.
 
     Raises:
         ConfigurationError: If a value is out of range.
@@ -26,5 +26,5 @@ class Physics(Numerics):
     tolerance: float = 1e-10
 
     def __post_init__(self) -> None:
-        """Reject settings that cannot work."""
+        """Reject impossible settings."""
         require_numerics(self, {"tolerance": (lambda value: 0 <= value < 1, "0 <= tolerance < 1")})

@@ -1,4 +1,4 @@
-"""Pictures by MuJoCo: OpenGL without a window, where the machine has a way to it."""
+"""Pictures by MuJoCo, with OpenGL and without a window."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from tpm_gym.simulation.stage import CAMERA
 __all__ = ["RENDERERS", "Pictures"]
 
 RENDERERS = ("egl", "osmesa", "glfw")
-"""Ways to OpenGL, in the order in which they are tried: GPU, CPU, window system."""
+"""OpenGL backends, in the order in which they are tried: GPU, CPU, window system."""
 
 _open: weakref.WeakSet[Pictures] = weakref.WeakSet()
 
 
 class Pictures:
-    """What draws the scene; the way to OpenGL is opened with the first picture.
+    """Renderer of the scene; it opens OpenGL for the first picture.
 
     Args:
         renderer: One of :data:`RENDERERS`; None for that of the environment variable ``MUJOCO_GL``,
-            or else the first that works here.
+            or else the first that works.
 
     Raises:
         ConfigurationError: If there is no renderer of that name.
     """
 
     def __init__(self, renderer: str | None) -> None:
-        """Only remember."""
+        """Store the choice."""
         if renderer is not None and renderer not in RENDERERS:
             raise ConfigurationError("renderer", renderer, " or ".join(map(repr, RENDERERS)))
         self._renderer = renderer
@@ -47,10 +47,10 @@ class Pictures:
     def draw(
         self, model: mujoco.MjModel, data: mujoco.MjData, width: int, height: int
     ) -> NDArray[np.uint8]:
-        """The scene as (height, width, 3) RGB.
+        """Draw the scene as (height, width, 3) RGB.
 
         Raises:
-            ConfigurationError: If there is no way to OpenGL here.
+            ConfigurationError: If no OpenGL backend works.
         """
         if self._size != (width, height):
             self._open(model, width, height)
@@ -65,10 +65,10 @@ class Pictures:
         mujoco.mjr_render(place, scene, self._context)
         pixels = np.empty((height, width, 3), np.uint8)
         mujoco.mjr_readPixels(pixels, None, place, self._context)
-        return np.ascontiguousarray(pixels[::-1])  # OpenGL begins below
+        return np.ascontiguousarray(pixels[::-1])  # OpenGL's first row is the lowest
 
     def close(self) -> None:
-        """Give the way to OpenGL back; harmless the second time."""
+        """Release OpenGL; harmless the second time."""
         self._size = (0, 0)
         if self._context is not None:
             self._opengl.make_current()
@@ -78,7 +78,7 @@ class Pictures:
         self._opengl = self._context = None
 
     def _open(self, model: mujoco.MjModel, width: int, height: int) -> None:
-        """Make everything for pictures of that size."""
+        """Open OpenGL for pictures of that size."""
         self.close()
         self._opengl = _opengl(self._renderer, width, height)
         self._opengl.make_current()
@@ -87,7 +87,7 @@ class Pictures:
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
         self._size = (width, height)
-        if not _open:  # before OpenGL ends, or what is left speaks up at the end of the process
+        if not _open:  # before OpenGL ends: contexts that are left print at the end of the process
             atexit.register(_close_all)
         _open.add(self)
 
@@ -106,10 +106,10 @@ def _camera() -> mujoco.MjvCamera:
 
 
 def _opengl(renderer: str | None, width: int, height: int) -> Any:
-    """A way to OpenGL.
+    """Open an OpenGL context.
 
     Raises:
-        ConfigurationError: If there is none.
+        ConfigurationError: If no backend works.
     """
     asked = renderer or os.environ.get("MUJOCO_GL", "").lower()
     names = [asked] if asked in RENDERERS else RENDERERS
@@ -117,7 +117,7 @@ def _opengl(renderer: str | None, width: int, height: int) -> Any:
     context = next((one for one in found if one is not None), None)
     if context is None:
         valid = (
-            "one that works here: 'egl' takes a driver of a GPU or Mesa, 'osmesa' Mesa's library, "
+            "one that works here: 'egl' needs a driver of a GPU or Mesa, 'osmesa' Mesa's library, "
             "'glfw' a display; or render_mode=None; engine='pybullet' draws anywhere"
         )
         raise ConfigurationError("renderer", renderer, valid)
@@ -125,14 +125,14 @@ def _opengl(renderer: str | None, width: int, height: int) -> Any:
 
 
 def _context(name: str, width: int, height: int) -> Any:
-    """A context of that name; None where it cannot be had."""
+    """Open a context of that backend; None if it does not work."""
     if name == "glfw" and not has_display():
-        return None  # it would print, and may end the process
+        return None  # GLFW would print, and may end the process
     platform = os.environ.get("PYOPENGL_PLATFORM")
     try:
         return importlib.import_module(f"mujoco.{name}").GLContext(width, height)
-    except Exception:  # of the loader, the driver, or OpenGL's own
-        # The module has set it; with it, no other one would be imported.
+    except Exception:  # from the loader, the driver, or OpenGL
+        # The module has set the variable, which would keep the other backends from importing.
         os.environ.pop("PYOPENGL_PLATFORM", None)
         if platform is not None:
             os.environ["PYOPENGL_PLATFORM"] = platform

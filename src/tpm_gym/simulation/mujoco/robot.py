@@ -1,9 +1,10 @@
-"""The robot inside MuJoCo: motors, the cup's spring, encoders, and the truth.
+"""The robot in MuJoCo: motors, the cup's spring, encoders, and the truth.
 
-Motors that go exactly where they are told, as far as their effort lasts, are no servos but
-constraints: a rate to have at the end of the time step, with a limit of force. MuJoCo knows such a
-constraint, dry friction, whose rate is zero. The rows of friction are therefore given another rate
-where MuJoCo's own first half of a time step has set them up and before its second half solves them.
+Ideal motors reach their references exactly, as far as their effort allows. So they are constraints:
+a velocity at the end of the time step, with a limit of force. MuJoCo has such a constraint, dry
+friction, whose velocity is zero. This module changes the velocity of the friction rows after
+MuJoCo's first half of a time step, which sets them up, and before its second half, which solves
+them.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from tpm_gym.simulation.randomisation import NOMINAL, Plant
 
 __all__ = ["Robot"]
 
-_LEAST_EFFORT = 1e-9  # N m, of motors that have none, so that each has its row in the solver
+_LEAST_EFFORT = 1e-9  # N m, of motors without torque, so that each has its row in the solver
 
 
 class Robot:
@@ -32,7 +33,7 @@ class Robot:
     Args:
         model: The model.
         data: Its state.
-        machine: What was compiled into it.
+        machine: The machine of the model.
         ideal: Whether the motors have ideal drives; else they apply given torques.
 
     Attributes:
@@ -42,7 +43,7 @@ class Robot:
     def __init__(
         self, model: mujoco.MjModel, data: mujoco.MjData, machine: Machine, ideal: bool
     ) -> None:
-        """Look up where everything is."""
+        """Look up the addresses of everything."""
         self._model, self._data, self._ideal = model, data, ideal
         mechanism = machine.mechanism
         self._point_p, self._lip = mechanism.point_p, mechanism.lip
@@ -63,7 +64,7 @@ class Robot:
         self._spring = slide.effort
         pairs = [site_names(closure.name) for closure in mechanism.closures]
         self._sides = [[model.site(pair[side]).id for pair in pairs] for side in (0, 1)]
-        # Friction is as stiff as it can be, and stops in one time step.
+        # Friction is as stiff as possible, and stops a motion in one time step.
         step = model.opt.timestep
         model.dof_solimp[:] = [float(number) for number in STIFF.split()]
         model.dof_solref[:] = -1 / step**2, -1 / step
@@ -72,7 +73,7 @@ class Robot:
         self.alter(NOMINAL)
 
     def alter(self, plant: Plant) -> None:
-        """Make masses, motors and friction those of ``plant``."""
+        """Apply masses, motors and friction of ``plant``."""
         model, rate = self._model, 1 / self._model.opt.timestep
         factors = plant.link_masses or [1.0] * len(self._inertias)
         for (body, (mass, moments)), factor in zip(self._inertias.items(), factors, strict=True):
@@ -98,9 +99,9 @@ class Robot:
         self.torque = (0.0, 0.0, 0.0)
 
     def drive(self, theta: Vector) -> None:
-        """Let ideal motors go to ``theta`` within this time step, effort permitting.
+        """Let ideal motors go to ``theta`` within this time step, within their effort.
 
-        This and :meth:`apply` are to be called between the two halves of a time step.
+        Call this method or :meth:`apply` between the two halves of a time step.
         """
         self._pull((*theta, 0.0))
 
@@ -112,16 +113,16 @@ class Robot:
         self._pull((0.0,))
 
     def _pull(self, targets: Sequence[float]) -> None:
-        """Let what friction drives go to ``targets``, the last of which is the slide's."""
+        """Drive the motors and the cup's slide to ``targets``, the slide's last."""
         data, rate, position, speed = self._data, self._rate, self._position, self._speed
         wanted, first = data.efc_aref, data.ne
         for (row, at, dof, gain), target in zip(self._rows, targets, strict=True):
             wanted[first + row] = ((target - position(at)) * gain - speed(dof)) * rate
 
     def note_torque(self) -> None:
-        """Note what the motors apply; to be called after the second half of a time step."""
+        """Store the torques of the motors, after the second half of a time step."""
         if not self._ideal:
-            return  # known before
+            return  # apply() has stored them
         force, first = self._data.efc_force.item, self._data.ne
         (a, *_), (b, *_), (c, *_), _ = self._rows
         self.torque = force(first + a), force(first + b), force(first + c)
@@ -142,17 +143,17 @@ class Robot:
         return gap, transform(origin, turn, self._point_p), Mount.tilt(turn)
 
     def cup(self) -> tuple[Vector, Vector]:
-        """Centre of the cup's lip (m) and the cup's outward axis, world."""
+        """Return the centre of the cup's lip (m) and the cup's outward axis, world."""
         origin, turn = self._frame(self._tool)
         return transform(origin, turn, self._lip), rotate(turn, (0.0, 0.0, 1.0))
 
     def tool_height(self) -> float:
-        """Of the origin of the link with the cup above the table, m."""
+        """Return the height of the cup's link above the table, m."""
         height: float = self._height(self._tool, 2)
         return height
 
     def tool(self) -> tuple[Vector, Quaternion]:
-        """Origin (m) and orientation of the link with the cup, world."""
+        """Return origin (m) and orientation of the cup's link, world."""
         return self._frame(self._tool)
 
     def _frame(self, body: int) -> tuple[Vector, Quaternion]:

@@ -1,4 +1,4 @@
-"""What stands around the robot in MuJoCo: the objects and the goal markers."""
+"""Objects and goal markers in MuJoCo."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tpm_gym.simulation.state import Scene
 __all__ = ["Scenery"]
 
 _STILL = 1e-4  # m/s and rad/s
-_LOOKS = 5  # ahead, at most
+_LOOKS = 5  # iterations at most
 _ALIKE = 1e-3  # m/s
 
 
@@ -26,11 +26,11 @@ class Scenery:
     Args:
         model: The model.
         data: Its state.
-        scene: What was compiled into it.
+        scene: The scene of the model.
     """
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, scene: Scene) -> None:
-        """Look up where everything is."""
+        """Look up the addresses of everything."""
         self._model, self._data, self._blocks = model, data, scene.objects
         self._position, self._speed = data.qpos.item, data.qvel.item
         self._resting = 4 * len(scene.objects)  # contacts of objects that lie flat
@@ -48,12 +48,11 @@ class Scenery:
         self._markers = [model.site(marker_name(index)).id for index in range(scene.markers)]
 
     def keep_sliding(self) -> None:
-        """Let what slides slide, and not take off.
+        """Keep sliding objects from hopping; call between the two halves of a time step.
 
-        The engine's contacts are convex: where two bodies slide along each other it drives them
-        apart, at the coefficient of friction times the speed of the slip, and they would hop. The
-        normal's share of what is wanted is lowered by that much. To be called between the two
-        halves of a time step.
+        MuJoCo's contacts are convex: it drives two bodies that slide along each other apart, at the
+        coefficient of friction times the speed of the slip. The wanted acceleration along the
+        normal is lowered by as much.
         """
         data = self._data
         if not data.ncon or (data.ncon <= self._resting and not self._moves()):
@@ -64,29 +63,29 @@ class Scenery:
         wanted -= self._hop(slip)
         if not (self._model.geom_bodyid[data.contact.geom] > 0).all(axis=1).any():
             return
-        for _ in range(_LOOKS):  # What something strikes slides by the end of the time step only.
+        for _ in range(_LOOKS):  # An object that is struck slides only at the end of the time step.
             slip, known = self._slip(self._velocity_to_come()), slip
             if np.abs(slip - known).max() < _ALIKE:
                 break
             wanted[:] = before - self._hop(slip)
 
     def _rows(self) -> slice:
-        """Of the contacts among the constraints: three each, at the end."""
+        """Return the rows of the contacts among the constraints: three each, at the end."""
         return slice(self._data.nefc - 3 * self._data.ncon, None)
 
     def _slip(self, velocity: FloatArray) -> FloatArray:
-        """Speed of each contact's slip, m/s, of the constraints' velocities."""
+        """Return the speed of each contact's slip, m/s."""
         _, x, y = velocity[self._rows()].reshape(-1, 3).T
         speed: FloatArray = np.hypot(x, y)
         return speed
 
     def _hop(self, slip: FloatArray) -> FloatArray:
-        """Acceleration with which the engine drives apart what slips, m/s^2."""
+        """Return the acceleration with which MuJoCo drives sliding bodies apart, m/s^2."""
         hop: FloatArray = self._data.contact.friction[:, 0] * slip / self._model.opt.timestep
         return hop
 
     def _velocity_to_come(self) -> FloatArray:
-        """Velocities of the constraints after this time step, if it were done as it is."""
+        """Predict the velocities of the constraints after this time step."""
         model, data = self._model, self._data
         mujoco.mj_fwdActuation(model, data)
         mujoco.mj_fwdAcceleration(model, data)
@@ -96,7 +95,7 @@ class Scenery:
         return after
 
     def _moves(self) -> bool:
-        """Whether an object slides or spins faster than solver noise."""
+        """Return whether an object slides or spins faster than solver noise."""
         speed = self._speed
         return any(
             abs(speed(dof)) + abs(speed(dof + 1)) + abs(speed(dof + 2)) + abs(speed(dof + 5))
@@ -115,22 +114,22 @@ class Scenery:
             self._data.qpos[at : at + 7] = (*position, w, x, y, z)
 
     def read(self) -> list[tuple[Pose, Twist]]:
-        """Poses and velocities of the objects."""
+        """Return poses and velocities of the objects."""
         return [(self.pose(index), self._twist(index, dof)) for index, dof in enumerate(self._dof)]
 
     def height(self, index: int) -> float:
-        """Of an object's centre above the table, m."""
+        """Return the height of an object's centre above the table, m."""
         height: float = self._position(self._at[index] + 2)
         return height
 
     def pose(self, index: int) -> Pose:
-        """Pose of an object."""
+        """Return the pose of an object."""
         at = self._at[index]
         x, y, z, qw, qx, qy, qz = self._data.qpos[at : at + 7].tolist()
         return Pose((x, y, z), (qx, qy, qz, qw))
 
     def _twist(self, index: int, dof: int) -> Twist:
-        """Velocities of an object; the engine has the turning in the object's own frame."""
+        """Return the velocities of an object; MuJoCo has its spin in the object's frame."""
         u, v, w, a, b, c = self._data.qvel[dof : dof + 6].tolist()
         return Twist((u, v, w), rotate(self.pose(index).quaternion, (a, b, c)))
 

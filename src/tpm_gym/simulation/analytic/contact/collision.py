@@ -2,13 +2,14 @@
 
 Objects are boxes and the lip is an upright cylinder. The normal of two bodies is the direction in
 which they are farthest apart, or overlap least, among the normals of faces and the common normals
-of edges (separating axes). Contacts are found up to ``NEAR`` before they close, so that the solver
-can stop bodies at the surface instead of pushing them out again.
+of edges (separating axes). Contacts are found before they close, so that the solver can stop bodies
+at the surface instead of pushing them out again.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from tpm_gym.arrays import FloatArray, Vector
 from tpm_gym.mechanism.cup import CUP
@@ -37,27 +38,51 @@ from tpm_gym.simulation.stage import FLOOR, TABLE
 
 __all__ = ["collide_lip", "collide_objects"]
 
-_NEAR = 1.5e-3  # m
+_NEAR = 1.5e-3  # m, between objects, and between objects and table
 _FLAT = 1e-5  # m; an edge is preferred to a face where it separates by so much more
 _LITTLE = 1e-9
-_STEEP = 0.7
+_STEEP = 0.7  # vertical part of the normal of an upper face
 _ZERO: Vector = (0.0, 0.0, 0.0)
 _UP: Vector = (0.0, 0.0, 1.0)
 
-_Pair = tuple[tuple[int, int], float]
+_Place = tuple[int, int]
+"""Number of a contact, and its slot."""
+_Pair = tuple[_Place, float]
 """Bodies a and b, and the Coulomb coefficient between them."""
+
+
+class _Box(NamedTuple):
+    """An object: centre (m, world), axes, half edges (m)."""
+
+    middle: Vector
+    frame: Frame
+    half: Vector
+
+
+@compiled
+def _box(item: Record, half: FloatArray) -> _Box:
+    """Return the shape of an object."""
+    return _Box(three(item["position"]), axes(item["quaternion"]), three(half))
+
+
+@compiled
+def _extent(box: _Box, way: Vector) -> float:
+    """Return half the width of a box along a direction, m."""
+    (u, v, w), (p, q, r) = box.frame, box.half
+    return p * abs(dot(u, way)) + q * abs(dot(v, way)) + r * abs(dot(w, way))
+
+
+@compiled
+def _inner(box: _Box, a: float, b: float, c: float) -> Vector:
+    """Return the world vector of components along a box's axes."""
+    return plus(plus(plus(_ZERO, box.frame[0], a), box.frame[1], b), box.frame[2], c)
 
 
 @compiled
 def _add(
-    contacts: Records,
-    place: tuple[int, int],
-    pair: _Pair,
-    arms: tuple[Vector, Vector],
-    normal: Vector,
-    gap: float,
+    contacts: Records, place: _Place, pair: _Pair, arms: Frame, normal: Vector, gap: float
 ) -> int:
-    """Write a contact to its place (number, slot) and return the new number of contacts."""
+    """Write a contact and return the new number of contacts; of ``arms`` two count."""
     contact = contacts[place[0]]
     contact["slot"] = place[1]
     (contact["a"], contact["b"]), contact["friction"] = pair
@@ -75,21 +100,6 @@ def _body(index: int, held: int) -> int:
 
 
 @compiled
-def _extent(frame: Frame, half: FloatArray, way: Vector) -> float:
-    """Return half the width of a box along a direction, m."""
-    extent = 0.0
-    for k in range(3):
-        extent += half[k] * abs(dot(frame[k], way))
-    return extent
-
-
-@compiled
-def _corner(frame: Frame, a: float, b: float, c: float) -> Vector:
-    """Return the world vector of components along a box's axes."""
-    return plus(plus(plus(_ZERO, frame[0], a), frame[1], b), frame[2], c)
-
-
-@compiled
 def collide_objects(
     objects: Records,
     held: int,
@@ -98,7 +108,7 @@ def collide_objects(
     contacts: Records,
     count: int,
 ) -> int:
-    """Add contacts of objects with each other and with the table.
+    """Add contacts of objects with each other and with the table; return the number of contacts.
 
     Args:
         objects: (k,) the objects.
@@ -107,46 +117,43 @@ def collide_objects(
         polygons: (2, 12, 3) workspace.
         contacts: Receives the contacts.
         count: Number of contacts so far.
-
-    Returns:
-        The new number of contacts.
     """
     slot = len(objects) * (TABLE_SLOTS + LIP_SLOTS)
     for j in range(len(objects)):
+        two = _box(objects[j], setting.half[j])
         for i in range(j):
-            a, b, way = objects[i], objects[j], (i, j)
-            apart = length(plus(three(b["position"]), three(a["position"]), -1.0))
-            if apart < length(three(setting.half[i])) + length(three(setting.half[j])) + _NEAR:
-                pair = (_body(i, held), _body(j, held)), a["friction"] * b["friction"]
-                place = (count, slot)
-                count = _collide_boxes(a, b, way, setting.half, polygons, contacts, place, pair)
+            one = _box(objects[i], setting.half[i])
+            reach = length(one.half) + length(two.half) + _NEAR
+            if length(plus(two.middle, one.middle, -1.0)) < reach:
+                friction = objects[i]["friction"] * objects[j]["friction"]
+                pair = (_body(i, held), _body(j, held)), friction
+                count = _collide_boxes(one, two, polygons, contacts, (count, slot), pair)
             slot += PAIR_SLOTS
     for i in range(len(objects)):
-        count = _collide_table(objects[i], i, held, setting, contacts, count)
+        box, friction = _box(objects[i], setting.half[i]), objects[i]["friction"]
+        count = _collide_table(
+            box, setting, contacts, (count, TABLE_SLOTS * i), (_body(i, held), friction)
+        )
     return count
 
 
 @compiled
 def _collide_table(
-    item: Record, index: int, held: int, setting: Setting, contacts: Records, count: int
+    box: _Box, setting: Setting, contacts: Records, place: _Place, body: tuple[int, float]
 ) -> int:
     """Add the corners of an object that are near the table, or near the floor beside it."""
-    (x, y, z), half, (edge_x, edge_y) = three(item["position"]), setting.half[index], setting.table
-    top, rough = FLOOR.top, FLOOR.friction
-    if abs(x) <= edge_x and abs(y) <= edge_y:
-        top, rough = TABLE.top, TABLE.friction
-    frame, height = axes(item["quaternion"]), z - top
-    if height - _extent(frame, half, _UP) > _NEAR:
+    (x, y, z), (count, slot), (edge_x, edge_y) = box.middle, place, setting.table
+    over = abs(x) <= edge_x and abs(y) <= edge_y
+    height = z - (TABLE.top if over else FLOOR.top)
+    pair = (-1, body[0]), body[1] * (TABLE.friction if over else FLOOR.friction)
+    if height - _extent(box, _UP) > _NEAR:
         return count
-    pair = (-1, _body(index, held)), item["friction"] * rough
     for k in range(TABLE_SLOTS):
-        a = half[0] if k & 1 else -half[0]
-        b = half[1] if k & 2 else -half[1]
-        c = half[2] if k & 4 else -half[2]
-        gap = height + a * frame[0][2] + b * frame[1][2] + c * frame[2][2]
-        if gap < _NEAR:
-            arms = (_ZERO, _corner(frame, a, b, c))
-            count = _add(contacts, (count, TABLE_SLOTS * index + k), pair, arms, _UP, gap)
+        p, q, r = box.half
+        arm = _inner(box, p if k & 1 else -p, q if k & 2 else -q, r if k & 4 else -r)
+        if height + arm[2] < _NEAR:
+            arms = _ZERO, arm, _ZERO
+            count = _add(contacts, (count, slot + k), pair, arms, _UP, height + arm[2])
     return count
 
 
@@ -157,7 +164,7 @@ def _collide_table(
 def collide_lip(
     objects: Records, held: int, lip: Vector, near: float, setting: Setting, contacts: Records
 ) -> int:
-    """Find contacts of the lip with objects that it does not hold.
+    """Find contacts of the lip with objects that it does not hold; return their number.
 
     Args:
         objects: (k,) the objects.
@@ -166,182 +173,149 @@ def collide_lip(
         near: Distance up to which there is a contact, m.
         setting: Constants.
         contacts: Receives the contacts.
-
-    Returns:
-        Their number.
     """
     count = 0
-    for index in range(len(objects)):
-        half = setting.half[index]
-        x, y, z = plus(three(objects[index]["position"]), lip, -1.0)
-        reach = length(three(half)) + near
+    for i in range(len(objects)):
+        x, y, z = plus(three(objects[i]["position"]), lip, -1.0)
+        reach = length(three(setting.half[i])) + near
         over = level_length(x, y) < reach + CUP.radius and -reach < z < reach + CUP.bellows
-        if over and index != held:
-            place = (count, TABLE_SLOTS * len(objects) + LIP_SLOTS * index)
-            pair = (0, index + 1), CUP.friction * objects[index]["friction"]
-            count = _collide_cylinder(objects[index], half, lip, near, contacts, place, pair)
+        if over and i != held:
+            place = (count, TABLE_SLOTS * len(objects) + LIP_SLOTS * i)
+            pair = (0, i + 1), CUP.friction * objects[i]["friction"]
+            box = _box(objects[i], setting.half[i])
+            count = _collide_cylinder(box, lip, near, contacts, place, pair)
     return count
 
 
 @compiled
 def _collide_cylinder(
-    item: Record,
-    half: FloatArray,
-    lip: Vector,
-    near: float,
-    contacts: Records,
-    place: tuple[int, int],
-    pair: _Pair,
+    box: _Box, lip: Vector, near: float, contacts: Records, place: _Place, pair: _Pair
 ) -> int:
     """Add contacts of the lip with an object."""
-    middle, frame = three(item["position"]), axes(item["quaternion"])
-    away = plus(middle, (lip[0], lip[1], lip[2] + CUP.bellows / 2), -1.0)
+    away = plus(box.middle, (lip[0], lip[1], lip[2] + CUP.bellows / 2), -1.0)
     face, apart = -1, -math.inf
     for k in range(3):
-        u, v, w = frame[k]
+        u, v, w = box.frame[k]
         thick = CUP.radius * level_length(u, v) + CUP.bellows / 2 * abs(w)
-        gap = abs(dot(frame[k], away)) - half[k] - thick
+        gap = abs(dot(box.frame[k], away)) - box.half[k] - thick
         if gap > apart + _LITTLE:
             face, apart = k, gap
-    under = lip[2] - middle[2] - _extent(frame, half, _UP)
+    under = lip[2] - box.middle[2] - _extent(box, _UP)
     if under > apart + _FLAT:
         face, apart = 3, under  # the lip's own face
-    point = _nearest(middle, frame, half, lip)
+    point = _nearest(box, lip)
     x, y = point[0] - lip[0], point[1] - lip[1]
-    far = level_length(x, y)
-    radial = (x / max(far, _LITTLE), y / max(far, _LITTLE), 0.0)
-    beside = dot(radial, away) - _extent(frame, half, radial) - CUP.radius
+    far = max(level_length(x, y), _LITTLE)
+    radial = (x / far, y / far, 0.0)
+    beside = dot(radial, away) - _extent(box, radial) - CUP.radius
     if far > _LITTLE and beside > apart + _FLAT:
         face, apart = 4, beside  # the lip's side at an edge or corner
     if apart > near:
         return place[0]
     if face == 4:
-        arms = (_ZERO, plus(point, middle, -1.0))
+        arms = _ZERO, plus(point, box.middle, -1.0), _ZERO
         return _add(contacts, place, pair, arms, radial, apart)
     if face == 3:
-        return _press_edge(middle, frame, half, lip, contacts, place, pair)
-    normal = frame[face] if dot(frame[face], away) > 0 else plus(_ZERO, frame[face], -1.0)
+        return _press_edge(box, lip, contacts, place, pair)
+    normal = plus(_ZERO, box.frame[face], math.copysign(1.0, dot(box.frame[face], away)))
     if abs(normal[2]) > _STEEP:
-        return _press_face(middle, frame, half, lip, near, contacts, place, pair, face, normal)
-    return _push_face(middle, frame, half, lip, near, contacts, place, pair, face, normal)
+        return _press_face(box, (face, normal), lip, near, contacts, place, pair)
+    return _push_face(box, (face, normal), lip, near, contacts, place, pair)
 
 
 @compiled
-def _nearest(middle: Vector, frame: Frame, half: FloatArray, lip: Vector) -> Vector:
+def _nearest(box: _Box, lip: Vector) -> Vector:
     """Return the point of a box that is nearest to the axis of the lip, m, world."""
-    z = clip(middle[2], lip[2], lip[2] + CUP.bellows)
-    point = middle
+    point, (p, q, r) = box.middle, box.half
     for _ in range(3):
-        out, point = plus((lip[0], lip[1], z), middle, -1.0), middle
-        for k in range(3):
-            point = plus(point, frame[k], clip(dot(frame[k], out), -half[k], half[k]))
         z = clip(point[2], lip[2], lip[2] + CUP.bellows)
+        out = plus((lip[0], lip[1], z), box.middle, -1.0)
+        a, b, c = dot(box.frame[0], out), dot(box.frame[1], out), dot(box.frame[2], out)
+        point = plus(box.middle, _inner(box, clip(a, -p, p), clip(b, -q, q), clip(c, -r, r)))
     return point
 
 
 @compiled
-def _press_edge(
-    middle: Vector,
-    frame: Frame,
-    half: FloatArray,
-    lip: Vector,
-    contacts: Records,
-    place: tuple[int, int],
-    pair: _Pair,
-) -> int:
+def _press_edge(box: _Box, lip: Vector, contacts: Records, place: _Place, pair: _Pair) -> int:
     """Add the ends of a tilted object's uppermost edge below the lip."""
-    low, level = 0, math.inf
-    for k in range(3):
-        if abs(half[k] * frame[k][2]) < level:
-            low, level = k, abs(half[k] * frame[k][2])
-    ends = (
-        math.copysign(half[0], frame[0][2]),
-        math.copysign(half[1], frame[1][2]),
-        math.copysign(half[2], frame[2][2]),
-    )
-    top = _corner(frame, ends[0], ends[1], ends[2])
-    along = plus(_ZERO, frame[low], -2 * ends[low])
-    x, y = middle[0] + top[0] - lip[0], middle[1] + top[1] - lip[1]
+    (u, v, w), (p, q, r), low = box.frame, box.half, 0
+    for k in range(1, 3):
+        if box.half[k] * abs(box.frame[k][2]) < box.half[low] * abs(box.frame[low][2]):
+            low = k
+    ends = math.copysign(p, u[2]), math.copysign(q, v[2]), math.copysign(r, w[2])
+    top, along = _inner(box, *ends), plus(_ZERO, box.frame[low], -2 * ends[low])
+    x, y = box.middle[0] + top[0] - lip[0], box.middle[1] + top[1] - lip[1]
     # |(x, y) + t along| <= radius
     a, b = along[0] ** 2 + along[1] ** 2, x * along[0] + y * along[1]
     root = b * b - a * (x * x + y * y - CUP.radius**2)
-    if root < 0 or a < _LITTLE:
-        return place[0]
     count, slot = place
-    for sign in (-1.0, 1.0):
-        arm = plus(top, along, clip((-b + sign * math.sqrt(root)) / a, 0.0, 1.0))
-        gap = lip[2] - middle[2] - arm[2]
-        count = _add(contacts, (count, slot), pair, (_ZERO, arm), (0.0, 0.0, -1.0), gap)
-        slot += 1
+    if root > 0 and a > _LITTLE:
+        for k in range(2):
+            share = (-b + math.copysign(math.sqrt(root), k - 0.5)) / a
+            arm = plus(top, along, clip(share, 0.0, 1.0))
+            gap, arms = lip[2] - box.middle[2] - arm[2], (_ZERO, arm, _ZERO)
+            count = _add(contacts, (count, slot + k), pair, arms, (0.0, 0.0, -1.0), gap)
     return count
 
 
 @compiled
 def _press_face(
-    middle: Vector,
-    frame: Frame,
-    half: FloatArray,
+    box: _Box,
+    face: tuple[int, Vector],
     lip: Vector,
     near: float,
     contacts: Records,
-    place: tuple[int, int],
+    place: _Place,
     pair: _Pair,
-    face: int,
-    normal: Vector,
 ) -> int:
     """Add four points of the rim on an object's upper face, those outside moved to its edge."""
-    level = level_length(normal[0], normal[1])
-    first = (face + 1) % 3
-    u, v = frame[first][0], frame[first][1]
-    if level > 1e-4:
-        u, v = normal[0], normal[1]
-    size = level_length(u, v)
-    u, v = CUP.radius * u / size, CUP.radius * v / size
-    count, slot = place
+    (which, normal), (count, slot) = face, place
+    first, second = (which + 1) % 3, (which + 2) % 3
+    u, v = normal[0], normal[1]
+    if level_length(u, v) < 1e-4:
+        u, v = box.frame[first][0], box.frame[first][1]
+    size = level_length(u, v) / CUP.radius
+    u, v = u / size, v / size
     for a, b in ((u, v), (-u, -v), (-v, u), (v, -u)):
-        arm = plus((lip[0] + a, lip[1] + b, lip[2]), middle, -1.0)
-        for k in (first, (face + 2) % 3):
-            inside = dot(frame[k], arm)
-            arm = plus(arm, frame[k], clip(inside, -half[k], half[k]) - inside)
-        gap = -dot(normal, (arm[0], arm[1], lip[2] - middle[2])) - half[face]
+        arm = plus((lip[0] + a, lip[1] + b, lip[2]), box.middle, -1.0)
+        for k in (first, second):
+            inside = dot(box.frame[k], arm)
+            arm = plus(arm, box.frame[k], clip(inside, -box.half[k], box.half[k]) - inside)
+        gap = -dot(normal, (arm[0], arm[1], lip[2] - box.middle[2])) - box.half[which]
         if gap < near:
-            count = _add(contacts, (count, slot), pair, (_ZERO, arm), normal, gap)
+            arms = _ZERO, arm, _ZERO
+            count = _add(contacts, (count, slot), pair, arms, normal, gap)
         slot += 1
     return count
 
 
 @compiled
 def _push_face(
-    middle: Vector,
-    frame: Frame,
-    half: FloatArray,
+    box: _Box,
+    face: tuple[int, Vector],
     lip: Vector,
     near: float,
     contacts: Records,
-    place: tuple[int, int],
+    place: _Place,
     pair: _Pair,
-    face: int,
-    normal: Vector,
 ) -> int:
     """Add the ends of the line on which the lip's side meets a side of an object."""
-    size = level_length(normal[0], normal[1])
-    x = lip[0] + CUP.radius * normal[0] / size
-    y = lip[1] + CUP.radius * normal[1] / size
-    foot = plus((x, y, lip[2]), middle, -1.0)
+    (which, normal), (count, slot) = face, place
+    size = level_length(normal[0], normal[1]) / CUP.radius
+    foot = plus((lip[0] + normal[0] / size, lip[1] + normal[1] / size, lip[2]), box.middle, -1.0)
     low, high = 0.0, CUP.bellows
-    for k in ((face + 1) % 3, (face + 2) % 3):
-        rise, at = frame[k][2], dot(frame[k], foot)
+    for k in ((which + 1) % 3, (which + 2) % 3):
+        rise, at, half = box.frame[k][2], dot(box.frame[k], foot), box.half[k]
         if abs(rise) > 1e-6:
-            one, other = (-half[k] - at) / rise, (half[k] - at) / rise
+            one, other = (-half - at) / rise, (half - at) / rise
             low, high = max(low, min(one, other)), min(high, max(one, other))
     if low > high:
         low = high = clip(0.5 * (low + high), 0.0, CUP.bellows)
-    count, slot = place
     for k in range(2):
         arm = plus(foot, _UP, high if k else low)
-        gap = -dot(normal, arm) - half[face]
+        gap, arms = -dot(normal, arm) - box.half[which], (_ZERO, arm, _ZERO)
         if gap < near:
-            count = _add(contacts, (count, slot + k), pair, (_ZERO, arm), normal, gap)
+            count = _add(contacts, (count, slot + k), pair, arms, normal, gap)
     return count
 
 
@@ -350,124 +324,98 @@ def _push_face(
 
 @compiled
 def _collide_boxes(
-    one: Record,
-    two: Record,
-    index: tuple[int, int],
-    halves: FloatArray,
-    polygons: FloatArray,
-    contacts: Records,
-    place: tuple[int, int],
-    pair: _Pair,
+    one: _Box, two: _Box, polygons: FloatArray, contacts: Records, place: _Place, pair: _Pair
 ) -> int:
     """Add contacts of two objects."""
-    frames = axes(one["quaternion"]), axes(two["quaternion"])
-    away = plus(three(two["position"]), three(one["position"]), -1.0)
+    away = plus(two.middle, one.middle, -1.0)
     face, apart = 0, -math.inf
     for k in range(6):
-        way = frames[k // 3][k % 3]
-        gap = abs(dot(way, away)) - _widths(frames, halves, index, way)
+        way = one.frame[k] if k < 3 else two.frame[k - 3]
+        gap = abs(dot(way, away)) - _extent(one, way) - _extent(two, way)
         if gap > apart + _LITTLE:
             face, apart = k, gap
-    if apart > _NEAR:
-        return place[0]
-    best, edge = _ZERO, -1
+    normal, edge = _ZERO, -1
     for k in range(9):
-        way = cross(frames[0][k // 3], frames[1][k % 3])
+        way = cross(one.frame[k // 3], two.frame[k % 3])
         size = length(way)
         if size > 1e-3:
             way = plus(_ZERO, way, math.copysign(1 / size, dot(way, away)))
-            gap = dot(way, away) - _widths(frames, halves, index, way)
+            gap = dot(way, away) - _extent(one, way) - _extent(two, way)
             if gap > apart + _FLAT:
-                best, edge, apart = way, k, gap
+                normal, edge, apart = way, k, gap
     if apart > _NEAR:
         return place[0]
     if edge >= 0:
-        arms = _edges(frames, halves, index, away, best, edge)
-        return _add(contacts, place, pair, arms, best, apart)
-    return _clip_faces(frames, halves, index, away, face, polygons, contacts, place, pair)
+        arms = _cross_edges(one, two, normal, edge // 3, edge % 3)
+        return _add(contacts, place, pair, arms, normal, apart)
+    if face < 3:
+        return _clip_face(one, two, face, 1.0, polygons, contacts, place, pair)
+    return _clip_face(two, one, face - 3, -1.0, polygons, contacts, place, pair)
 
 
 @compiled
-def _widths(
-    frames: tuple[Frame, Frame], halves: FloatArray, index: tuple[int, int], way: Vector
-) -> float:
-    """Return half the widths of two boxes along a direction, in sum, m."""
-    return _extent(frames[0], halves[index[0]], way) + _extent(frames[1], halves[index[1]], way)
-
-
-@compiled
-def _edges(
-    frames: tuple[Frame, Frame],
-    halves: FloatArray,
-    index: tuple[int, int],
-    away: Vector,
-    normal: Vector,
-    edge: int,
-) -> tuple[Vector, Vector]:
-    """Return the arms to the point at which two edges cross, m."""
-    arms, ways = (_ZERO, _ZERO), (frames[0][edge // 3], frames[1][edge % 3])
-    a, b = _ZERO, _ZERO
+def _cross_edges(one: _Box, two: _Box, normal: Vector, i: int, j: int) -> Frame:
+    """Return the arms, m, to the point at which edges along axes i and j are nearest."""
+    a, b, (p, q) = one.middle, two.middle, (one.frame[i], two.frame[j])
     for k in range(3):
-        if k != edge // 3:
-            sign = math.copysign(halves[index[0], k], dot(frames[0][k], normal))
-            a = plus(a, frames[0][k], sign)
-        if k != edge % 3:
-            sign = math.copysign(halves[index[1], k], -dot(frames[1][k], normal))
-            b = plus(b, frames[1][k], sign)
-    between = plus(plus(away, b), a, -1.0)
-    u, v, w = dot(ways[0], ways[1]), dot(ways[0], between), dot(ways[1], between)
-    s = (v - u * w) / (1 - u * u)
-    arms = plus(a, ways[0], s), plus(b, ways[1], u * s - w)
-    return arms
+        if k != i:
+            sign = math.copysign(one.half[k], dot(one.frame[k], normal))
+            a = plus(a, one.frame[k], sign)
+        if k != j:
+            sign = math.copysign(two.half[k], dot(two.frame[k], normal))
+            b = plus(b, two.frame[k], -sign)
+    between = plus(b, a, -1.0)
+    u, v, w = dot(p, q), dot(p, between), dot(q, between)
+    share = (v - u * w) / (1 - u * u)
+    a, b = plus(a, p, share), plus(b, q, u * share - w)
+    return plus(a, one.middle, -1.0), plus(b, two.middle, -1.0), _ZERO
 
 
 @compiled
-def _clip_faces(
-    frames: tuple[Frame, Frame],
-    halves: FloatArray,
-    index: tuple[int, int],
-    away: Vector,
+def _clip_face(
+    plane: _Box,
+    other: _Box,
     face: int,
+    sign: float,
     polygons: FloatArray,
     contacts: Records,
-    place: tuple[int, int],
+    place: _Place,
     pair: _Pair,
 ) -> int:
-    """Add the corners of the overlap of two faces; ``face`` numbers the axes of both boxes."""
-    flip = face >= 3
-    # From the box with the face that is the plane to the other one
-    sign = -1.0 if flip else 1.0
-    plane, other = (frames[1], frames[0]) if flip else (frames[0], frames[1])
-    half = halves[index[1]] if flip else halves[index[0]]
-    size = halves[index[0]] if flip else halves[index[1]]
-    axis = face % 3
-    normal = plus(_ZERO, plane[axis], math.copysign(1.0, sign * dot(plane[axis], away)))
-    # The face of the other box that is most opposite to it
-    facing, most = 0, -1.0
-    for k in range(3):
-        if abs(dot(other[k], normal)) > most + _LITTLE:
-            facing, most = k, abs(dot(other[k], normal))
-    to = plus(_ZERO, away, sign)
+    """Add the corners of the overlap of a box's face and the face of another that is opposite.
+
+    Args:
+        plane: The box with the face.
+        other: The other box.
+        face: Number of the axis of ``plane`` that is normal to the face.
+        sign: 1 where ``plane`` is body a of the pair, -1 where it is body b.
+        polygons: (2, 12, 3) workspace.
+        contacts: Receives the contacts.
+        place: Of the first contact.
+        pair: Bodies and friction.
+    """
+    away, facing = plus(other.middle, plane.middle, -1.0), 0
+    normal = plus(_ZERO, plane.frame[face], math.copysign(1.0, dot(plane.frame[face], away)))
+    for k in range(1, 3):
+        most = abs(dot(other.frame[facing], normal)) + _LITTLE
+        facing = k if abs(dot(other.frame[k], normal)) > most else facing
     p, q = (facing + 1) % 3, (facing + 2) % 3
-    out = math.copysign(size[facing], -dot(other[facing], normal))
-    middle = plus(to, other[facing], out)
+    out = math.copysign(other.half[facing], -dot(other.frame[facing], normal))
     for k in range(4):
-        a = size[p] if k in (0, 3) else -size[p]
-        b = size[q] if k < 2 else -size[q]
-        put(polygons[0, k], plus(plus(middle, other[p], a), other[q], b))
-    number, at = 4, 0
+        point = plus(away, other.frame[facing], out)
+        point = plus(point, other.frame[p], other.half[p] if k in (0, 3) else -other.half[p])
+        put(polygons[0, k], plus(point, other.frame[q], other.half[q] if k < 2 else -other.half[q]))
+    number = 4
     for k in range(4):
-        axis_k = (axis + 1 + k // 2) % 3
-        side = plus(_ZERO, plane[axis_k], 1.0 if k % 2 else -1.0)
-        number = _cut(polygons[at], polygons[1 - at], number, side, half[axis_k])
-        at = 1 - at
+        axis = (face + 1 + k // 2) % 3
+        side = plus(_ZERO, plane.frame[axis], 1.0 if k % 2 else -1.0)
+        number = _cut(polygons[k % 2], polygons[1 - k % 2], number, side, plane.half[axis])
     count, slot = place
     for k in range(min(number, PAIR_SLOTS)):
-        point = three(polygons[at, k])
-        gap = dot(normal, point) - half[axis]
+        point = three(polygons[0, k])
+        gap, rest = dot(normal, point) - plane.half[face], plus(point, away, -1.0)
+        arms = (point, rest, _ZERO) if sign > 0 else (rest, point, _ZERO)
         if gap < _NEAR:
-            rest = plus(point, to, -1.0)
-            arms = (rest, point) if flip else (point, rest)
             count = _add(contacts, (count, slot + k), pair, arms, plus(_ZERO, normal, sign), gap)
     return count
 

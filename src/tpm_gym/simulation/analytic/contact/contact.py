@@ -10,7 +10,6 @@ through the table; point P does not yield to contacts.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -31,7 +30,6 @@ from tpm_gym.simulation.state import Block
 
 __all__ = ["Contact", "Reading"]
 
-_PART = 1e-3  # s
 _ON_TABLE = 2e-5  # m
 
 
@@ -71,11 +69,10 @@ class Contact:
         """Put all objects in the middle of their tables, one on the other."""
         self._blocks, number = tuple(blocks), len(blocks)
         half = np.array([block.half for block in blocks]).reshape(number, 3)
-        parts = max(1, math.ceil(time_step / _PART - 1e-9))
-        self._setting = Setting(half, table, time_step, parts)
+        self._setting = Setting(half, table, time_step)
         self._objects = np.zeros((count, number), OBJECT)
         self._cups = np.zeros(count, CUP_STATE)
-        self._memory = np.zeros((count, slots(number), 3))
+        self._forces = np.zeros((count, slots(number), 3))
         self._work = work_for(number)
         everything = np.arange(count)
         self.alter(everything, np.ones(count), np.ones(count))
@@ -113,7 +110,7 @@ class Contact:
         empty = np.zeros((), CUP_STATE)
         empty["held"] = -1
         self._cups[rows] = empty
-        self._memory[rows] = 0.0
+        self._forces[rows] = 0.0
 
     def advance(self, rows: IntArray, path: FloatArray, vacuum_on: BoolArray) -> FloatArray:
         """Run K time steps.
@@ -130,17 +127,14 @@ class Contact:
         """
         force = np.zeros((len(rows), path.shape[1] - 2, 3))
         if self._blocks:
-            states = self._objects, self._cups, self._memory
+            states = self._objects, self._cups, self._forces
             advance(states, rows, path, vacuum_on, self._setting, self._work, force)
         return force
 
     def carried(self, rows: Any) -> FloatArray:
         """Return the masses that cups hold, (r,) kg."""
-        held = self._cups["held"][rows]
-        if not self._blocks:
-            return np.zeros(len(held))
-        mass = np.take_along_axis(self._objects["mass"][rows], held[:, None], axis=1)[:, 0]
-        carried: FloatArray = np.where(held >= 0, mass, 0.0)
+        held = self._cups["held"][rows, None] == np.arange(len(self._blocks))
+        carried: FloatArray = (held * self._objects["mass"][rows]).sum(axis=1)
         return carried
 
     def read(self) -> Reading:
@@ -151,14 +145,19 @@ class Contact:
             objects["quaternion"].copy(),
             objects["velocity"].copy(),
             objects["spin"].copy(),
-            cups["held"].copy(),
+            cups["held"].astype(np.int64),
             cups["vacuum"].copy(),
         )
 
-    def save(self, rows: Any) -> Any:
-        """Return everything that the next time steps of some tables depend on."""
-        return self._objects[rows].copy(), self._cups[rows].copy(), self._memory[rows].copy()
+    def save(self, rows: Any) -> FloatArray:
+        """Return everything that the next time steps of some tables depend on, (r, c)."""
+        parts = self._objects[rows], self._cups[rows], self._forces[rows]
+        return np.concatenate([p.view(np.float64).reshape(len(p), -1) for p in parts], axis=1)
 
-    def restore(self, rows: Any, saved: Any) -> None:
+    def restore(self, rows: Any, saved: FloatArray) -> None:
         """Continue from what :meth:`save` returned."""
-        self._objects[rows], self._cups[rows], self._memory[rows] = saved
+        parts, first = (self._objects, self._cups, self._forces), 0
+        for part in parts:
+            plain = part.view(np.float64).reshape(len(part), -1)
+            plain[rows] = saved[:, first : first + plain.shape[1]]
+            first += plain.shape[1]

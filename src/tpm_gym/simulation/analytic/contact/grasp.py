@@ -12,7 +12,7 @@ from tpm_gym.simulation.analytic.contact.state import Record, Records, Setting
 from tpm_gym.simulation.analytic.contact.vectors import length, level_length, plus, put, three
 from tpm_gym.simulation.vacuum import CLEARANCE, Hold, Load, hold_after
 
-__all__ = ["CUP_MASS", "Way", "breathe", "lip_of", "seal_load"]
+__all__ = ["CUP_MASS", "Way", "breathe", "carry", "lip_of"]
 
 CUP_MASS = CUP.link("platform", (0.0, 0.0, 0.0)).mass
 _DOWN: Vector = (0.0, 0.0, -1.0)
@@ -34,22 +34,26 @@ def lip_of(point: Vector, slide: float) -> Vector:
 
 
 @compiled
-def seal_load(item: Record, velocity: Vector, touched: Vector, step: float) -> Vector:
-    """Return the mean force of the cup on the object that it holds, N, world.
+def carry(item: Record, cup: Record, point: Vector, touched: Vector, step: float) -> Vector:
+    """Move the held object with the cup; return the mean force of the cup on it, N, world.
 
     Args:
-        item: The object, with its velocity in the last time step.
-        velocity: In this time step, m/s.
-        touched: Impulse of table and other objects on it in this time step, N s.
+        item: The object.
+        cup: The cup, already moved.
+        point: Point P after the time step, m, world.
+        touched: Impulse of table and other objects on the object in the time step, N s.
         step: Time step, s.
     """
-    change = plus(velocity, three(item["velocity"]), -1.0)
-    mass = item["mass"]
-    return (
-        (mass * change[0] - touched[0]) / step,
-        (mass * change[1] - touched[1]) / step,
-        (mass * (change[2] + GRAVITY * step) - touched[2]) / step,
-    )
+    x, y, z = plus(point, three(cup["grip"]))
+    place = x, y, z + cup["slide"]
+    u, v, w = plus(place, three(item["position"]), -1.0)
+    velocity = u / step, v / step, w / step
+    x, y, z = plus(velocity, three(item["velocity"]), -1.0)
+    put(item["position"], place)
+    put(item["velocity"], velocity)
+    impulse = plus((x, y, z + GRAVITY * step), touched, -1 / item["mass"])
+    share = item["mass"] / step
+    return share * impulse[0], share * impulse[1], share * impulse[2]
 
 
 @compiled
@@ -66,7 +70,7 @@ def breathe(
         seal: Force of the cup on the held object, N, world.
         setting: Constants.
     """
-    held, lip, touched = cup["held"], lip_of(way.then, cup["slide"]), -1
+    held, lip, touched = int(cup["held"]), lip_of(way.then, cup["slide"]), -1
     if on and held < 0:
         for index in range(len(objects)):
             if touched < 0 and _seals(objects[index], lip, index, setting):

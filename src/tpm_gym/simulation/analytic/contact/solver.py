@@ -18,7 +18,7 @@ __all__ = ["Motor", "prepare", "solve", "still"]
 
 _SWEEPS, _CALM_SWEEPS = 20, 12
 _HASTE = 1.3  # factor of each step of a normal impulse; below 2 sweeps converge
-_STILL, _UNTURNED = 5e-4, 0.05  # m/s, rad/s: slower objects at rest stay there
+_STILL, _UNTURNED = 5e-4, 0.01  # m/s, rad/s: slower objects at rest stay there
 _TOLERANCE = 3e-4  # m/s; a sweep that changes less is the last one
 _RECOVERY = 0.1  # share of a penetration that is taken out
 _SLOP = 1e-5  # m, a penetration that stays
@@ -116,6 +116,7 @@ def prepare(
         own, gap = dot(normal, reply), contact["gap"]
         put(contact["reply"], reply)
         contact["ease_n"] = _HASTE / own
+        contact["enough"] = (_TOLERANCE / own) ** 2
         contact["ease_t"] = 1 / max(_TRACE * (trace - own), _LEAST)
         rises = min(_RECOVERY * max(-gap - _SLOP, 0.0) / step, _FASTEST)
         contact["speed"] = -gap / step if gap > 0 else rises
@@ -150,8 +151,8 @@ def _apply(contact: Record, bodies: Records, impulse: Vector) -> None:
 
 
 @compiled
-def _relax(contact: Record, bodies: Records) -> float:
-    """Solve one contact with all others as they are; return how far off it was, m/s."""
+def _relax(contact: Record, bodies: Records) -> bool:
+    """Solve one contact with all others as they are; return whether it was off by much."""
     speed = _speed(bodies[contact["b"]], three(contact["arm_b"]))
     if contact["a"] >= 0:
         own = _speed(bodies[contact["a"]], three(contact["arm_a"]))
@@ -160,7 +161,7 @@ def _relax(contact: Record, bodies: Records) -> float:
     lacks = contact["speed"] - dot(normal, speed)
     press = max(before + lacks * contact["ease_n"], 0.0)
     if press == 0 and before == 0:
-        return 0.0
+        return False
     contact["press"] = press
     speed = plus(speed, three(contact["reply"]), press - before)
     slip = plus(speed, normal, -dot(normal, speed))
@@ -170,7 +171,8 @@ def _relax(contact: Record, bodies: Records) -> float:
     change = plus(new, old, -1.0)
     put(contact["impulse"], new)
     _apply(contact, bodies, change)
-    return math.sqrt(dot(change, change)) / contact["ease_n"]
+    off: bool = dot(change, change) > contact["enough"]
+    return off
 
 
 @compiled
@@ -187,14 +189,14 @@ def solve(contacts: Records, count: int, bodies: Records, motor: Motor, calm: bo
     """
     spring, cup = 0.0, bodies[0]["velocity"]
     for sweep in range(_CALM_SWEEPS if calm else _SWEEPS):
-        off = 0.0
+        off = False
         wanted = spring + (motor.speed - cup[2]) * motor.mass
         wanted = clip(wanted, -motor.limit, motor.limit)
         cup[2] += (wanted - spring) / motor.mass
         spring = wanted
         for j in range(count):
-            off = max(off, _relax(contacts[j], bodies))
-        if off < _TOLERANCE or (calm and sweep > 0 and still(bodies)):
+            off |= _relax(contacts[j], bodies)
+        if not off or (calm and sweep > 0 and still(bodies)):
             return
 
 

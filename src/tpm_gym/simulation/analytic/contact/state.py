@@ -39,19 +39,21 @@ OBJECT: Final = np.dtype(
         ("spin", "f8", 3),  # rad/s, world
         ("mass", "f8"),  # kg
         ("friction", "f8"),  # Coulomb coefficient
-        ("rest", "i8"),  # time steps in a row without motion; at rest from AT_REST on
-    ]
+        ("rest", "f8"),  # time steps in a row without motion; at rest from AT_REST on
+    ],
+    align=True,
 )
-AT_REST: Final = 4
+AT_REST: Final = 2
 
 CUP_STATE: Final = np.dtype(
     [
         ("slide", "f8"),  # m, by which the cup is pushed back into its stem
         ("slide_rate", "f8"),  # m/s
         ("vacuum", "f8"),  # Pa
-        ("held", "i8"),  # index of the object; -1 for none
+        ("held", "f8"),  # index of the object; -1 for none
         ("grip", "f8", 3),  # m, from point P to the centre of the held object at slide 0
-    ]
+    ],
+    align=True,
 )
 
 BODY: Final = np.dtype(
@@ -62,7 +64,8 @@ BODY: Final = np.dtype(
         ("across", "f8"),  # 1/(kg m^2), inverse inertia about the level axes of the block
         ("along", "f8"),  # 1/(kg m^2), inverse inertia about its third axis
         ("axis", "f8", 3),  # the third axis, world
-    ]
+    ],
+    align=True,
 )
 """A body in the solver: 0 is the cup with what it holds, 1 + i is object i."""
 
@@ -82,7 +85,9 @@ CONTACT: Final = np.dtype(
         ("reply", "f8", 3),  # (m/s)/(N s), change of the relative velocity by a normal impulse
         ("ease_n", "f8"),  # N s/(m/s), step of the normal impulse
         ("ease_t", "f8"),  # N s/(m/s), step of the friction
-    ]
+        ("enough", "f8"),  # (N s)^2, square of a change of the impulse that does not count
+    ],
+    align=True,
 )
 
 TABLE_SLOTS, LIP_SLOTS, PAIR_SLOTS = 8, 4, 8
@@ -96,13 +101,11 @@ class Setting(NamedTuple):
         half: Half edges of the objects, (k, 3) m.
         table: Half edges of the table along x and y, m.
         step: Time step, s.
-        parts: Number of equal parts in which a time step with contacts is computed.
     """
 
     half: FloatArray
     table: tuple[float, float]
     step: float
-    parts: int
 
 
 class Work(NamedTuple):

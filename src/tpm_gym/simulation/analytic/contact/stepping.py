@@ -1,8 +1,6 @@
 """A time step of one table: contacts, impulses, motion, and the vacuum after it.
 
-Time steps in which something may touch are computed in parts of a millisecond, so that the result
-hardly depends on the time step. A table at rest that the lip does not come near costs one
-comparison in a control period.
+A table at rest that the lip does not come near costs one comparison in a control period.
 """
 
 from __future__ import annotations
@@ -14,7 +12,7 @@ from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.mount import GRAVITY
 from tpm_gym.simulation.analytic.compiling import SOURCES, compiled, kept
 from tpm_gym.simulation.analytic.contact.collision import collide_lip, collide_objects
-from tpm_gym.simulation.analytic.contact.grasp import CUP_MASS, Way, breathe, lip_of, seal_load
+from tpm_gym.simulation.analytic.contact.grasp import CUP_MASS, Way, breathe, carry, lip_of
 from tpm_gym.simulation.analytic.contact.solver import Motor, prepare, solve, still
 from tpm_gym.simulation.analytic.contact.state import AT_REST, Record, Records, Setting, Work
 from tpm_gym.simulation.analytic.contact.vectors import (
@@ -27,15 +25,13 @@ from tpm_gym.simulation.analytic.contact.vectors import (
     three,
 )
 from tpm_gym.simulation.engine import SPRING_GAIN
-from tpm_gym.simulation.stage import TABLE
 
 __all__ = ["advance"]
 
-_SLOW, _LAZY = 2e-3, 0.05  # m/s, rad/s: slower objects come to rest
-_NEARBY = 5e-4  # m
-_SETTLED = 1e-6  # m; the cup is back when it is nearer
-_STOPPED = 1e-3  # m/s
-_NEAR = 0.005  # m
+_SLOW, _LAZY = 5e-3, 0.3  # m/s, rad/s: slower objects may come to rest
+_SETTLED, _STOPPED = 1e-6, 1e-3  # m, m/s: the cup is back when it is nearer and slower
+_NEARBY = 5e-4  # m; contacts are found so much farther than the lip moves in a time step
+_BESIDE = 0.005  # m; an object at rest that the lip stays farther from is skipped
 _ZERO: Vector = (0.0, 0.0, 0.0)
 
 
@@ -47,39 +43,34 @@ def advance(
     on: BoolArray,
     setting: Setting,
     work: Work,
-    force: FloatArray,
+    push: FloatArray,
     sources: str = SOURCES,
 ) -> None:
     """Run K time steps of some tables.
 
     Args:
-        states: Objects (n, k), cups (n,) and impulses (n, slots, 3); changed.
+        states: Objects (n, k), cups (n,) and forces (n, slots, 3) N; changed.
         rows: (r,) which tables.
         path: (r, K + 2, 3) m, world, point P.
         on: (r,) whether the vacuum is on.
         setting: Constants.
         work: Workspace.
-        force: (r, K, 3) N, world, on the platform; written where it is not zero.
+        push: (r, K, 3) N, world, on the platform; written where it is not zero.
         sources: Key of the compiled function on disk.
     """
     for i in range(len(rows)):
         row, points = rows[i], path[i]
-        objects, cup, memory = states[0][row], states[1][row], states[2][row]
-        if _rests(objects, cup) and cup["vacuum"] == 0 and not _reached(objects, points, setting):
+        objects, cup, forces = states[0][row], states[1][row], states[2][row]
+        idle = cup["held"] < 0 and cup["slide"] == 0 and cup["vacuum"] == 0
+        if idle and _at_rest(objects) and not _reached(objects, points, setting):
             continue
         for k in range(len(points) - 2):
             way = Way(three(points[k]), three(points[k + 1]), three(points[k + 2]))
-            put(force[i, k], _step(objects, cup, memory, way, on[i], setting, work))
+            put(push[i, k], _step(objects, cup, forces, way, on[i], setting, work))
 
 
 @compiled
-def _rests(objects: Records, cup: Record) -> bool:
-    """Return whether nothing moves but the cup as a whole."""
-    return cup["held"] < 0 and cup["slide"] == 0 and _calm(objects)
-
-
-@compiled
-def _calm(objects: Records) -> bool:
+def _at_rest(objects: Records) -> bool:
     """Return whether all objects are at rest."""
     for index in range(len(objects)):
         if objects[index]["rest"] < AT_REST:
@@ -88,23 +79,28 @@ def _calm(objects: Records) -> bool:
 
 
 @compiled
+def _slow(objects: Records) -> bool:
+    """Return whether all objects move so slowly that they may come to rest."""
+    for index in range(len(objects)):
+        velocity, spin = three(objects[index]["velocity"]), three(objects[index]["spin"])
+        if dot(velocity, velocity) > _SLOW**2 or dot(spin, spin) > _LAZY**2:
+            return False
+    return True
+
+
+@compiled
 def _reached(objects: Records, points: FloatArray, setting: Setting) -> bool:
     """Return whether the lip may come to touch an object, by boxes around both."""
-    low, lowest, highest = math.inf, (math.inf, math.inf), (-math.inf, -math.inf)
+    lowest = math.inf
     for k in range(1, len(points)):
-        x, y, z = three(points[k])
-        low = min(low, z)
-        lowest = min(lowest[0], x), min(lowest[1], y)
-        highest = max(highest[0], x), max(highest[1], y)
+        lowest = min(lowest, points[k, 2])
     for index in range(len(objects)):
-        x, y, z = three(objects[index]["position"])
-        turn, half = objects[index]["quaternion"], setting.half[index]
-        size = length(three(half))
-        top = z + _NEAR + (half[2] if turn[0] == 0 and turn[1] == 0 else size)
-        near = size + CUP.radius + _NEAR
-        over = lowest[0] < x + near and highest[0] > x - near and low - CUP.length < top
-        if over and lowest[1] < y + near and highest[1] > y - near:
-            return True
+        (x, y, z), size = three(objects[index]["position"]), length(three(setting.half[index]))
+        if lowest - CUP.length < z + size + _BESIDE:
+            near = size + CUP.radius + _BESIDE
+            for k in range(1, len(points)):
+                if abs(points[k, 0] - x) < near and abs(points[k, 1] - y) < near:
+                    return True
     return False
 
 
@@ -112,133 +108,102 @@ def _reached(objects: Records, points: FloatArray, setting: Setting) -> bool:
 def _step(
     objects: Records,
     cup: Record,
-    memory: FloatArray,
+    forces: FloatArray,
     way: Way,
     on: bool,
     setting: Setting,
     work: Work,
 ) -> Vector:
     """Run a time step of a table; return the force on the platform, N."""
-    held, step, contacts, rate = cup["held"], setting.step, work.contacts, cup["slide_rate"]
-    start = three(objects[held]["position"]) if held >= 0 else _ZERO
-    parts, calm = setting.parts, held < 0 and _calm(objects)
-    if calm:
-        # Mostly everything stays at rest; if not, the time step is computed again in parts
-        count, first = _collide(objects, cup, way.now, way.then, setting, work)
-        if first == 0 and cup["slide"] == 0:
-            if cup["vacuum"] > 0 or on:
-                breathe(objects, cup, way, on, _ZERO, setting)
-            return _ZERO
-        parts = 1
-    elif held >= 0 and _clear(objects, cup, way, setting):
-        parts = 1
-    lip_push, touched, first = _ZERO, _ZERO, 0
-    speed = (way.now[2] - _point(way, -1 / parts)[2]) * parts / step + rate
-    number = 0
-    while number < parts:
-        part = step / parts
-        last, point = _point(way, number / parts), _point(way, (number + 1) / parts)
-        velocity = plus(point, last, -1.0)
-        velocity = velocity[0] / part, velocity[1] / part, velocity[2] / part
-        mass = CUP_MASS + (objects[held]["mass"] if held >= 0 else 0.0)
-        _fill(objects, (velocity[0], velocity[1], speed), mass, setting.half, part, work.bodies)
-        count, first = _collide(objects, cup, last, point, setting, work)
-        prepare(contacts, count, work.bodies, memory, part)
-        target = velocity[2] - SPRING_GAIN * cup["slide"] / part
-        solve(contacts, count, work.bodies, Motor(target, mass, CUP.preload * part), calm)
-        if calm and not still(work.bodies):
-            calm, parts = False, setting.parts
-            speed = (way.now[2] - _point(way, -1 / parts)[2]) * parts / step + rate
-            continue
-        memory[:] = 0.0
-        for j in range(count):
-            contact = contacts[j]
-            impulse = three(contact["impulse"])
-            put(memory[contact["slot"]], plus(_ZERO, impulse, 1 / part))
-            if j < first:
-                lip_push = plus(lip_push, impulse, -1.0)
-            elif contact["b"] == 0:
-                touched = plus(touched, impulse)
-            elif contact["a"] == 0:
-                touched = plus(touched, impulse, -1.0)
-        speed = work.bodies[0]["velocity"][2]
-        cup["slide_rate"] = speed - velocity[2]
-        cup["slide"] = max(cup["slide"] + part * cup["slide_rate"], 0.0)
-        if not calm:
-            _move(objects, held, work.bodies, part)
-        if held >= 0:
-            hung = plus(point, three(cup["grip"]))
-            put(objects[held]["position"], (hung[0], hung[1], hung[2] + cup["slide"]))
-        number += 1
+    held, step, (bodies, contacts, polygons) = int(cup["held"]), setting.step, work
+    lip, near = lip_of(way.now, cup["slide"]), length(plus(way.then, way.now, -1.0)) + _NEARBY
+    first = collide_lip(objects, held, lip, near, setting, contacts)
+    if first == 0 and held < 0 and cup["slide"] == 0 and _at_rest(objects):
+        if cup["vacuum"] > 0 or on:
+            breathe(objects, cup, way, on, _ZERO, setting)
+        return _ZERO
+    count = collide_objects(objects, held, setting, polygons, contacts, first)
+    mass = CUP_MASS + (objects[held]["mass"] if held >= 0 else 0.0)
+    _fill(objects, cup, way, mass, setting, bodies)
+    prepare(contacts, count, bodies, forces, step)
+    calm, rate, speed = held < 0 and _slow(objects), cup["slide_rate"], way.then[2] - way.now[2]
+    motor = Motor((speed - SPRING_GAIN * cup["slide"]) / step, mass, CUP.preload * step)
+    solve(contacts, count, bodies, motor, calm)
+    lip_push, touched = _read(contacts, count, first, forces, step)
+    cup["slide_rate"] = bodies[0]["velocity"][2] - speed / step
+    cup["slide"] = max(cup["slide"] + step * cup["slide_rate"], 0.0)
     if cup["slide"] < _SETTLED and abs(cup["slide_rate"]) < _STOPPED:
         cup["slide"] = cup["slide_rate"] = 0.0
     seal = _ZERO
     if held >= 0:
-        moved = plus(three(objects[held]["position"]), start, -1.0)
-        velocity = moved[0] / step, moved[1] / step, moved[2] / step
-        seal = seal_load(objects[held], velocity, touched, step)
-        put(objects[held]["velocity"], velocity)
-    if not calm:
-        _settle(objects, held)
+        seal = carry(objects[held], cup, way.then, touched, step)
+    _move(objects, bodies, held, calm and still(bodies), step)
     breathe(objects, cup, way, on, seal, setting)
     x, y, z = plus(lip_push, seal, -step)
     return x / step, y / step, (z - CUP_MASS * (cup["slide_rate"] - rate)) / step
 
 
 @compiled
-def _collide(
-    objects: Records, cup: Record, last: Vector, point: Vector, setting: Setting, work: Work
-) -> tuple[int, int]:
-    """Find all contacts as P moves; return their number and that of the lip's, which come first."""
-    held, near = cup["held"], length(plus(point, last, -1.0)) + _NEARBY
-    lip = lip_of(last, cup["slide"])
-    first = collide_lip(objects, held, lip, near, setting, work.contacts)
-    if first == 0 and held < 0 and _calm(objects):
-        return 0, 0
-    count = collide_objects(objects, held, setting, work.polygons, work.contacts, first)
-    return count, first
-
-
-@compiled
-def _point(way: Way, time: float) -> Vector:
-    """Return point P at a share of the time step, on the parabola through its three places."""
-    bend = plus(plus(way.then, way.now, -2.0), way.before)
-    half = plus(way.then, way.before, -1.0)
-    return plus(plus(way.now, half, 0.5 * time), bend, 0.5 * time * time)
-
-
-@compiled
 def _fill(
-    objects: Records, cup: Vector, mass: float, halves: FloatArray, step: float, bodies: Records
+    objects: Records, cup: Record, way: Way, mass: float, setting: Setting, bodies: Records
 ) -> None:
     """Set the solver's bodies to the velocities without contacts."""
-    body = bodies[0]
-    put(body["velocity"], (cup[0], cup[1], cup[2] - GRAVITY * step))
+    step, body = setting.step, bodies[0]
+    x, y, _ = plus(way.then, way.now, -1.0)
+    z = way.now[2] - way.before[2]
+    put(body["velocity"], (x / step, y / step, z / step + cup["slide_rate"] - GRAVITY * step))
     put(body["spin"], _ZERO)
     put(body["lightness"], (0.0, 0.0, 1 / mass))
     body["across"] = body["along"] = 0.0
     for index in range(len(objects)):
         item, body = objects[index], bodies[index + 1]
-        light, frame, (p, _, r) = 1 / item["mass"], axes(item["quaternion"]), three(halves[index])
+        light, third = 1 / item["mass"], axes(item["quaternion"])[2]
+        p, _, r = three(setting.half[index])
         body["across"], body["along"] = 3 * light / (p * p + r * r), 1.5 * light / (p * p)
-        put(body["velocity"], plus(three(item["velocity"]), (0.0, 0.0, -1.0), GRAVITY * step))
         put(body["lightness"], (light, light, light))
-        put(body["axis"], frame[2])
+        put(body["axis"], third)
+        put(body["velocity"], plus(three(item["velocity"]), (0.0, 0.0, -1.0), GRAVITY * step))
         spin = three(item["spin"])
-        gyroscopic = step * (body["across"] / body["along"] - 1) * dot(spin, frame[2])
-        put(body["spin"], plus(spin, cross(spin, frame[2]), -gyroscopic))
+        gyroscopic = step * (body["across"] / body["along"] - 1) * dot(spin, third)
+        put(body["spin"], plus(spin, cross(spin, third), -gyroscopic))
 
 
 @compiled
-def _move(objects: Records, held: int, bodies: Records, step: float) -> None:
-    """Move free objects at the velocities that the solver found."""
+def _read(
+    contacts: Records, count: int, first: int, forces: FloatArray, step: float
+) -> tuple[Vector, Vector]:
+    """Store all contact forces; return the impulses on the cup and on the held object, N s."""
+    cup, held = _ZERO, _ZERO
+    forces[:] = 0.0
+    for j in range(count):
+        contact = contacts[j]
+        impulse = three(contact["impulse"])
+        put(forces[contact["slot"]], (impulse[0] / step, impulse[1] / step, impulse[2] / step))
+        if j < first:
+            cup = plus(cup, impulse, -1.0)
+        elif contact["b"] == 0:
+            held = plus(held, impulse)
+        elif contact["a"] == 0:
+            held = plus(held, impulse, -1.0)
+    return cup, held
+
+
+@compiled
+def _move(objects: Records, bodies: Records, held: int, stays: bool, step: float) -> None:
+    """Move free objects at the velocities that the solver found, or leave them at rest."""
+    quiet = still(bodies)
     for index in range(len(objects)):
-        if index != held:
-            item, body = objects[index], bodies[index + 1]
+        item, body = objects[index], bodies[index + 1]
+        if index != held and stays:
+            put(item["velocity"], _ZERO)
+            put(item["spin"], _ZERO)
+            item["rest"] = AT_REST
+        elif index != held:
             velocity, (p, q, r) = three(body["velocity"]), three(body["spin"])
             put(item["position"], plus(three(item["position"]), velocity, step))
             put(item["velocity"], velocity)
             put(item["spin"], (p, q, r))
+            item["rest"] = item["rest"] + 1 if quiet else 0
             turn = item["quaternion"]
             x, y, z = 0.5 * step * p, 0.5 * step * q, 0.5 * step * r
             a, b, c, d = turn[0], turn[1], turn[2], turn[3]
@@ -246,33 +211,3 @@ def _move(objects: Records, held: int, bodies: Records, step: float) -> None:
             g, h = c + z * d + x * b - y * a, d - (x * a + y * b + z * c)
             size = math.sqrt((e * e + f * f) + (g * g + h * h))
             turn[0], turn[1], turn[2], turn[3] = e / size, f / size, g / size, h / size
-
-
-@compiled
-def _clear(objects: Records, cup: Record, way: Way, setting: Setting) -> bool:
-    """Return whether the held object is far from everything, and everything else at rest."""
-    held = cup["held"]
-    place, moved = three(objects[held]["position"]), length(plus(way.then, way.now, -1.0))
-    reach = length(three(setting.half[held])) + moved + _NEAR
-    if cup["slide"] > 0 or place[2] - TABLE.top < reach:
-        return False
-    for index in range(len(objects)):
-        if index != held:
-            away = length(plus(three(objects[index]["position"]), place, -1.0))
-            if objects[index]["rest"] < AT_REST or away < reach + length(
-                three(setting.half[index])
-            ):
-                return False
-    return True
-
-
-@compiled
-def _settle(objects: Records, held: int) -> None:
-    """Stop objects that have hardly moved for some time steps."""
-    for index in range(len(objects)):
-        item = objects[index]
-        slow = length(three(item["velocity"])) < _SLOW and length(three(item["spin"])) < _LAZY
-        item["rest"] = item["rest"] + 1 if slow and index != held else 0
-        if item["rest"] >= AT_REST:
-            put(item["velocity"], _ZERO)
-            put(item["spin"], _ZERO)
