@@ -72,7 +72,7 @@ class Eager(Reach):
 
 @pytest.mark.parametrize(
     ("task", "promise"),
-    [(Unseeded, "equal seeds give equal goals"), (Eager, "the goal's term is 0")],
+    [(Unseeded, "the checkers of Gymnasium"), (Eager, "the goal's term is 0")],
 )
 def test_what_does_not_keep_it_is_found(task: Any, promise: str) -> None:
     with pytest.raises(ConformanceError, match=promise) as caught:

@@ -6,11 +6,10 @@ from unittest.mock import patch
 
 import gymnasium as gym
 import pytest
-from tpm_gym.envs.registration import MAX_EPISODE_STEPS
 
 import tpm_gym
 from tpm_gym import TPMEnv, register_task
-from tpm_gym.envs import registration
+from tpm_gym.envs.ids import MAX_EPISODE_STEPS, env_ids
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.tasks import PickAndPlace, Reach
 from tpm_gym.tasks.registry import TASKS
@@ -106,6 +105,6 @@ def test_what_cannot_be_registered_is_refused_and_leaves_nothing(
 
 def test_other_ids_are_not_taken_for_ours(registries: None) -> None:
     gym.register("Elsewhere-v0", entry_point="elsewhere:Env")
-    assert "Elsewhere-v0" not in registration.env_ids()
+    assert "Elsewhere-v0" not in env_ids()
     with pytest.raises(AttributeError, match="ENV_IDX"):
         _ = tpm_gym.ENV_IDX

@@ -1,4 +1,4 @@
-"""Environments in closed form, many at a time: as Gymnasium wants them, and as one alone."""
+"""Vector environments: as Gymnasium wants them, and each row as the environment alone."""
 
 from collections.abc import Callable
 from typing import Any
@@ -6,10 +6,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from episodes import EVERYTHING
+from episodes import EVERYTHING, OF_SERVOS, bits
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-import tpm_gym
 from tpm_gym.envs.vector import TPMVectorEnv
 from tpm_gym.errors import (
     ActionError,
@@ -40,7 +39,7 @@ def assert_same(one: Any, other: Any) -> None:
         assert one.keys() == other.keys()
         for key in one:
             assert_same(one[key], other[key])
-    elif isinstance(one, np.ndarray) and one.dtype == object:
+    elif isinstance(one, (tuple, list)) or (isinstance(one, np.ndarray) and one.dtype == object):
         for pair in zip(one, other, strict=True):
             assert_same(*pair)
     else:
@@ -54,6 +53,8 @@ def assert_same(one: Any, other: Any) -> None:
         (REACH, {"randomisation": {"latency": 3}}),
         (PICK, {"randomisation": EVERYTHING}),
         (JOINTS, {"machine": "wide"}),
+        (JOINTS, {"drive": "servo", "randomisation": {**EVERYTHING, **OF_SERVOS}}),
+        (PICK, {"randomisation": {"link_mass": 2.0, "motor_strength": 0.5}}),
         ("TPMPickAndPlaceJoints-v0", {"randomisation": EVERYTHING, "goals": "tempting"}),
     ],
     ids=str,
@@ -106,13 +107,40 @@ def test_it_does_what_gymnasiums_vectors_of_single_environments_do(mode: str) ->
                     assert_same(one, other)
 
 
-def test_without_an_engine_it_stays_pybullet() -> None:
-    envs = gym.make_vec(REACH, num_envs=2)
-    assert isinstance(envs, SyncVectorEnv)
-    assert {env.unwrapped.simulation.engine.__class__.__name__ for env in envs.envs} == {
-        "BulletEngine"
-    }
-    assert [env.spec.id for env in envs.envs] == [REACH] * 2
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("drive", ["ideal", "servo"])
+def test_threads_change_no_bit(mode: str, drive: str) -> None:
+    options: Any = {"randomisation": EVERYTHING, "drive": drive, "max_episode_steps": 7}
+    runs = []
+    for threads in (1, 2, 3):
+        envs = make(PICK, 5, autoreset_mode=mode, num_threads=threads, **options)
+        found = [envs.reset(seed=1)]
+        for actions in actions_of(envs, 16):
+            found.append(envs.step(actions))
+            if mode == "Disabled" and found[-1][3].any():
+                found.append(envs.reset(options={"reset_mask": found[-1][3]}))
+        moment = envs.save_state()
+        found.append((envs.step(actions), bits(vars(envs.state)), envs.goal))
+        envs.restore_state(moment)
+        found.append((envs.step(actions), bits(vars(envs.state)), envs.goal))
+        runs.append(found)
+        envs.close()
+    for run in runs[1:]:
+        assert_same(run, runs[0])
+
+
+@pytest.mark.parametrize("engine", ["pybullet", "mujoco"])
+def test_other_engines_have_a_robot_for_each_environment(engine: str) -> None:
+    envs = gym.make_vec(REACH, num_envs=2, engine=engine)
+    assert isinstance(envs, TPMVectorEnv)
+    alone = gym.make(REACH, engine=engine)
+    observation, _ = envs.reset(seed=3)
+    assert_same({name: values[1] for name, values in observation.items()}, alone.reset(seed=4)[0])
+    for actions in actions_of(envs, 12):
+        observation, rewards, *_ = envs.step(actions)
+        one, reward, *_ = alone.step(actions[1])
+        assert_same({name: values[1] for name, values in observation.items()}, one)
+        assert reward == rewards[1]
     envs.close()
 
 
@@ -158,16 +186,19 @@ def test_resets_draw_what_those_of_one_environment_do_whatever_is_chosen_between
         observation, _ = envs.reset(seed=seed, options={"reset_mask": even, **options})
         wanted, _ = alone.reset(seed=None if seed is None else seed + 6, options=options)
         assert_same({name: values[6] for name, values in observation.items()}, wanted)
-        for _ in range(2):  # then all others draw ahead
-            envs.reset(options={"reset_mask": ~even})
+        envs.reset(options={"reset_mask": ~even})
 
 
 BAD: list[tuple[Callable[[TPMVectorEnv], Any], type[Exception], str]] = [
     (lambda envs: envs.step(np.zeros((5, 3))), ActionError, r"\(5, 4\)"),
     (lambda envs: envs.step(np.full((5, 4), np.nan)), ActionError, "finite"),
     *(
-        (lambda envs, seed=seed: envs.reset(seed=seed), InputError, "one seed, or 5")
-        for seed in ([1, 2], 1.5, "1")
+        (
+            lambda envs, seed=seed: envs.reset(seed=seed),
+            InputError,
+            "0 or more, or 5",
+        )
+        for seed in ([1, 2], 1.5, "1", -1, [1, 2, 3, 4, -4], "12345", [True] * 5)
     ),
     (lambda envs: envs.reset(options=[1]), ResetOptionError, "a dictionary"),
     (lambda envs: envs.reset(options={"reset_mask": [1, 0]}), ResetOptionError, "booleans"),
@@ -192,24 +223,21 @@ def test_misuse_is_refused(
 
 
 def test_options_are_refused_by_name() -> None:
-    stack = type("Two", (tpm_gym.tasks.PickAndPlace,), {})
-    stack.scene = tpm_gym.simulation.Scene(
-        objects=(tpm_gym.simulation.Block("object"), tpm_gym.simulation.Block("other"))
-    )
     for options, message in (
         ({"num_envs": 0}, "1 or more"),
         ({"max_episode_steps": 0}, "1 or more"),
         ({"stagger": "no"}, "True or False"),
-        ({"render_mode": "rgb_array"}, "pictures are of one"),
+        ({"render_mode": "rgb_array"}, "draws a single environment"),
         ({"autoreset_mode": "Never"}, "'NextStep', 'SameStep', 'Disabled'"),
         ({"physics": {"time_step": 0.02}}, "time_step"),
         ({"physics": {"time_step": 1e-12}}, "at least 1e-06 s"),
         ({"physics": {"torques": "all"}}, "'every'"),
         ({"machine": "round"}, "'paper', 'wide'"),
-        ({"task": stack}, "one object"),
+        ({"num_envs": 10**12}, "num_envs"),
+        ({"num_threads": 0}, "1 or more"),
     ):
         with pytest.raises(ConfigurationError, match=message):
-            TPMVectorEnv(**{"task": "reach", **options})
+            TPMVectorEnv(**{"task": "reach", "engine": "analytic", **options})
     with pytest.raises(EpisodeError, match="call reset"):
         make().step(np.zeros((5, 4)))
     envs = make(autoreset_mode="Disabled", max_episode_steps=1)
@@ -235,3 +263,18 @@ def test_a_reset_for_some_leaves_the_others_as_they_are() -> None:
         one, other = (each.step(actions)[0] for each in (envs, twin))
         for name, values in one.items():
             np.testing.assert_array_equal(values[others], other[name][others])
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"seed": [1, 2, 3, -4]}, {"seed": 5, "options": {"goal": "there"}}], ids=str
+)
+def test_a_refused_reset_seeds_nothing(wrong: Any) -> None:
+    found = []
+    for refused in (False, True):
+        envs = make(PICK, 4)
+        envs.reset(seed=np.array([7, 8, 9, 10]))
+        if refused:
+            with pytest.raises((InputError, ResetOptionError)):
+                envs.reset(**wrong)
+        found.append((envs.step(np.zeros((4, 4)))[0], envs.reset()[0], envs.reset(seed=7)[0]))
+    assert_same(*found)

@@ -13,7 +13,8 @@ from episodes import expert_episode
 import tpm_gym
 from tpm_gym import TPMEnv
 from tpm_gym.errors import ConfigurationError, EpisodeError, InputError
-from tpm_gym.tasks import Expert, Move, Reach
+from tpm_gym.simulation.bullet.cup import Grip
+from tpm_gym.tasks import Expert, Motion, Move, Reach
 
 PLACES = [{"machine": name} for name in ("paper", "wide", "gantry")] + [{"engine": "kinematic"}]
 SPARSE = [env_id for env_id in tpm_gym.ENV_IDS if "Dense" not in env_id]
@@ -65,7 +66,7 @@ def test_it_tries_again_when_the_block_is_lost(env: Any) -> None:
     lost, successes = False, []
     for *_, info in expert_episode(env, 0, options=options):
         if env.unwrapped.state.held == 0 and not lost:
-            env.unwrapped.simulation.engine.advance([], vacuum=False)
+            env.unwrapped.simulation.engine._cup.take(Grip())
             lost = True
         successes.append(info["is_success"])
     assert lost
@@ -78,12 +79,12 @@ def test_the_longest_paths_fit_into_an_episode(env: Any) -> None:
 
 def test_its_commands_start_and_stop_gently_and_respect_the_step_limit() -> None:
     env = gym.make("TPMReach-v0")
-    expert, machine = Expert(env), env.unwrapped.machine
-    rng = np.random.default_rng(0)
+    machine, rng = env.unwrapped.machine, np.random.default_rng(0)
+    motion = Motion(machine, env.unwrapped.control)
+    motion.seen = env.unwrapped.task.decode(env.reset(seed=0)[0]["observation"])
     for goal in rng.uniform(machine.goal_region.low, machine.goal_region.high, (100, 3)):
-        expert.reset(env.reset(seed=0)[0])
-        start = expert.command
-        points = np.array([start, *(move.point for move in expert.go([goal], vacuum=False))])
+        start = motion.command
+        points = np.array([start, *(move.point for move in motion.go([goal], vacuum=False))])
         steps = np.diff(points, axis=0)
         shares = np.linalg.norm(steps, axis=1)
         np.testing.assert_allclose(points[-1], goal, rtol=0, atol=1e-12)
@@ -103,30 +104,53 @@ def test_environments_of_others_are_refused() -> None:
             Expert(wrong)  # type: ignore[arg-type]
 
 
-def test_it_has_to_be_reset_for_each_episode(env: Any) -> None:
-    expert = Expert(env)
+def test_it_plans_anew_for_every_episode_and_goes_on_after_a_refused_reset(env: Any) -> None:
     observation, _ = env.reset(seed=0)
-    with pytest.raises(EpisodeError, match="reset"):
-        list(map(expert.act, [observation]))
-    expert.reset(observation)
+    expert, inner = Expert(env), env.unwrapped
     expert.act(observation)
-    observation, _ = env.reset(seed=1)
-    with pytest.raises(EpisodeError, match="reset"):
-        expert.act(observation)
-    expert.reset(observation)
-    assert env.action_space.contains(expert.act(observation))
-    # A reset that was refused ended nothing.
+    for seed in (1, 2):
+        observation, _ = env.reset(seed=seed)
+        for _ in range(5):
+            observation = env.step(expert.act(observation))[0]
     with pytest.raises(ConfigurationError):
-        env.unwrapped.reset(options={"gaol": 1})
-    expert.act(observation)
+        inner.reset(options={"gaol": 1})
+    action = expert.act(observation)
     # To go back is to begin anew: the plan has gone on meanwhile.
-    observation = env.unwrapped.restore_state(env.unwrapped.save_state())
-    with pytest.raises(EpisodeError, match="reset"):
-        expert.act(observation)
-    expert.reset(observation)
+    snapshot = inner.save_state()
+    again = inner.restore_state(snapshot)
+    fresh = Expert(env).act(again)
+    np.testing.assert_array_equal(expert.act(again), fresh)
+    assert not np.array_equal(action, fresh)
+    expert.reset(again)
+    np.testing.assert_array_equal(expert.act(again), fresh)
     env.close()
     with pytest.raises(EpisodeError, match="closed"):
         expert.act(observation)
+
+
+def test_before_the_first_episode_it_says_so(env: Any) -> None:
+    with pytest.raises(EpisodeError, match="reset"):
+        Expert(env).act({})
+
+
+@pytest.mark.parametrize("engine", ["analytic", "pybullet"])
+@pytest.mark.parametrize("randomisation", [{}, {"latency": 2}], ids=["prompt", "late"])
+def test_for_a_vector_it_does_what_it_does_for_each_environment(
+    engine: str, randomisation: dict[str, Any]
+) -> None:
+    options: Any = {"engine": engine, "randomisation": randomisation}
+    envs = gym.make_vec("TPMPickAndPlace-v0", num_envs=3, **options)
+    alone = gym.make("TPMPickAndPlace-v0", **options)
+    observation, _ = envs.reset(seed=4)
+    one, _ = alone.reset(seed=5)
+    many, single = Expert(envs), Expert(alone)
+    for _ in range(49):
+        actions = many.act(observation)
+        np.testing.assert_array_equal(actions[1], single.act(one))
+        observation, *_, infos = envs.step(actions)
+        one, *_ = alone.step(actions[1])
+    assert infos["is_success"].all()
+    envs.close()
 
 
 class Planned(Reach):
@@ -134,26 +158,37 @@ class Planned(Reach):
 
     moves = 2
 
-    def plan(self, expert: Expert) -> Iterator[Move]:
+    def plan(self, motion: Motion) -> Iterator[Any]:
         for _ in range(self.moves):
-            yield Move(np.array(expert.machine.home) + (0.01, 0.0, 0.0), False)
+            yield Move(np.array(motion.machine.home) + (0.01, 0.0, 0.0), False)
 
 
-def started(kind: type[Reach]) -> tuple[TPMEnv, Expert, Any]:
-    env = TPMEnv(kind)
-    return env, Expert(env), env.reset(seed=0)[0]
+class Bare(Planned):
+    """It yields tuples that are no moves."""
+
+    def plan(self, motion: Motion) -> Iterator[Any]:
+        yield from map(tuple, super().plan(motion))
 
 
-def test_the_last_move_of_a_plan_is_kept_and_plans_without_one_are_told() -> None:
-    env, expert, observation = started(Planned)
-    expert.reset(observation)
+def test_the_last_move_of_a_plan_is_kept() -> None:
+    env = TPMEnv(Planned)
+    expert, (observation, _) = Expert(env), env.reset(seed=0)
     for _ in range(6):
         observation = env.step(expert.act(observation))[0]
-    assert expert.command == pytest.approx(np.array(env.machine.home) + (0.01, 0, 0))
-    _, expert, observation = started(type("Never", (Planned,), {"moves": 0}))
-    expert.reset(observation)
-    with pytest.raises(EpisodeError, match="Never has no moves"):
-        expert.act(observation)
-    _, expert, observation = started(type("Unplanned", (Reach,), {"plan": tpm_gym.tasks.Task.plan}))
-    with pytest.raises(ConfigurationError, match="Unplanned"):
-        expert.reset(observation)
+    command = env.machine.mount.to_paper(env.state.command)
+    assert command == pytest.approx(np.array(env.machine.home) + (0.01, 0, 0))
+
+
+@pytest.mark.parametrize(
+    ("task", "error", "message"),
+    [
+        (type("Never", (Planned,), {"moves": 0}), EpisodeError, "Never has no moves"),
+        (type("Unplanned", (Reach,), {"plan": tpm_gym.tasks.Task.plan}), ConfigurationError, "Unp"),
+        (Bare, ConfigurationError, r"plan\(\) = .*an iterator of tpm_gym.tasks.Move"),
+    ],
+)
+def test_plans_that_cannot_be_followed_are_told(task: Any, error: Any, message: str) -> None:
+    env = TPMEnv(task)
+    observation, _ = env.reset(seed=0)
+    with pytest.raises(error, match=message):
+        Expert(env).act(observation)

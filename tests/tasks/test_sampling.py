@@ -36,16 +36,15 @@ def ends(
     kind: type[Task], machine: Machine = PAPER_TPM, goals: str = "tempting", count: int = 100
 ) -> tuple[FloatArray, FloatArray]:
     """Starts and goals of point P, machine's frame, each (count, 3); legal ones."""
-    task, starts, aims = kind(machine, goals=goals), [], []
+    task = kind(machine, goals=goals)
     raised = (0.0, 0.0, CUP.length + BLOCK.height / 2 if task.scene.objects else 0.0)
-    for seed in range(count):
-        drawn = task.start(np.random.default_rng(seed), None)
-        kind(machine).start(np.random.default_rng(seed), drawn)  # what is drawn may be chosen
-        home = task.machine.mount.to_world(task.machine.home)
-        starts.append(drawn.get("object", home - raised) + raised)
-        aims.append(drawn["goal"] + raised)
-    to_paper = task.machine.mount.to_paper
-    return to_paper(np.array(starts)), to_paper(np.array(aims))
+    drawn = task.start([np.random.default_rng(seed) for seed in range(count)])
+    for row in range(0, count, 10):  # what is drawn may be chosen
+        chosen = {name: places[row] for name, places in drawn.items()}
+        kind(machine).start([np.random.default_rng(0)], chosen)
+    home = np.tile(machine.mount.to_world(machine.home), (count, 1))
+    to_paper = machine.mount.to_paper
+    return to_paper(drawn.get("object", home - raised) + raised), to_paper(drawn["goal"] + raised)
 
 
 @each_machine
@@ -124,16 +123,16 @@ def test_nearly_half_of_what_reaches_a_tempting_goal_is_unsafe(kind: type[Task])
 
 
 def test_machines_on_which_nothing_can_be_drawn_are_told_instead_of_searched_for_ever() -> None:
-    rng = np.random.default_rng(0)
+    rngs = [np.random.default_rng(0)]
     with pytest.raises(ConfigurationError, match="'sampled': on 'wide'") as caught:
-        Reach(WIDE_TPM, goals="tempting").start(rng, None)
+        Reach(WIDE_TPM, goals="tempting").start(rngs)
     assert caught.value.name == "goals"
     home = PAPER_TPM.home
     with pytest.raises(ConfigurationError) as caught:
-        Reach(replace(PAPER_TPM, goal_region=Region(home, home))).start(rng, None)
+        Reach(replace(PAPER_TPM, goal_region=Region(home, home))).start(rngs)
     assert caught.value.name == "goal_region"
     with pytest.raises(ConfigurationError) as caught:
-        Reach(replace(PAPER_TPM, safe_conditioning=0.9)).start(rng, None)
+        Reach(replace(PAPER_TPM, safe_conditioning=0.9)).start(rngs)
     assert caught.value.name == "safe_conditioning"
 
 
@@ -149,7 +148,8 @@ def test_one_who_moves_the_joints_straight_to_the_goal_gets_into_the_unsafe_regi
         env.reset(seed=seed)
         met = []
         for _ in range(50):
-            action = inner.control.action(to_paper(inner.goal), to_paper(inner.state.command))
+            ends = to_paper(inner.goal)[None], to_paper(inner.state.command)[None]
+            action = inner.control.action(*ends)[0]
             met.append(env.step(action.astype(np.float32))[4]["conditioning"])
         careless.append(min(met))
     assert np.mean(careless) < SAFE - 0.002

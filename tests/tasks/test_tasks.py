@@ -8,6 +8,7 @@ import pytest
 from machines import each_machine
 from states import random_state
 
+from tpm_gym import TPMEnv, TPMVectorEnv
 from tpm_gym.errors import ConfigurationError, ResetOptionError, UnreachableError
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.tpm import PAPER_TPM, WIDE_TPM
@@ -28,12 +29,13 @@ class TwoBlocks(PickAndPlace):
     def observed(self) -> Any:
         return (*super().observed(), *self.object_entries(1))
 
-    def sample(self, rng: Any, chosen: Any) -> Any:
-        start = {"object": np.array([0.0, -0.03, 0.015]), "other": np.array([0.05, -0.03, 0.015])}
-        return {**start, "goal": np.tile([-0.05, -0.03, 0.1], 2), **chosen}
+    def sample(self, rngs: Any, chosen: Any) -> Any:
+        places = {"object": [0.0, -0.03, 0.015], "other": [0.05, -0.03, 0.015]}
+        places["goal"] = 2 * [-0.05, -0.03, 0.1]
+        return {name: np.tile(place, (len(rngs), 1)) for name, place in places.items()} | chosen
 
     def achieved(self, state: State) -> Any:
-        return np.concatenate([state.object_position[..., i, :] for i in (0, 1)], axis=-1)
+        return state.object_position.reshape(-1, 6)
 
 
 @pytest.fixture(params=[Reach, PickAndPlace, TwoBlocks])
@@ -42,15 +44,22 @@ def task(request: pytest.FixtureRequest) -> Task:
     return made
 
 
-def states(task: Task, seed: int = 0, shape: tuple[int, ...] = (), **values: Any) -> State:
-    return random_state(np.random.default_rng(seed), shape, len(task.scene.objects), **values)
+def states(task: Task, seed: int = 0, count: int = 1, **values: Any) -> State:
+    given = {
+        name: np.broadcast_to(value, (count, *np.shape(value))) for name, value in values.items()
+    }
+    return random_state(np.random.default_rng(seed), (count,), len(task.scene.objects), **given)
 
 
-def test_every_function_of_a_state_accepts_a_batch(task: Task) -> None:
-    passed = np.zeros((4, 2), dtype=bool)
-    passed[1, 1] = True
-    batch = states(task, shape=(4, 2), working_mode_changed=passed)
-    desired = np.random.default_rng(1).normal(size=(4, 2, task.goal_size))
+def rngs(*seeds: int) -> list[np.random.Generator]:
+    return [np.random.default_rng(seed) for seed in seeds or (0,)]
+
+
+def test_a_row_has_the_bits_that_it_has_alone(task: Task) -> None:
+    passed = np.zeros(8, dtype=bool)
+    passed[5] = True
+    batch = replace(states(task, count=8), working_mode_changed=passed)
+    desired = np.random.default_rng(1).normal(size=(8, task.goal_size))
 
     def results(state: State, goal: Any) -> dict[str, Any]:
         achieved, penalty = task.achieved(state), task.penalty(state)
@@ -67,15 +76,14 @@ def test_every_function_of_a_state_accepts_a_batch(task: Task) -> None:
         }
 
     batched = results(batch, desired)
-    assert batched["observed"].shape == (4, 2, task.observation_size)
-    for index in np.ndindex(4, 2):
-        one = State(**{name: np.asarray(value)[index] for name, value in vars(batch).items()})
-        for name, value in results(one, desired[index]).items():
-            np.testing.assert_array_equal(value, batched[name][index])
+    assert batched["observed"].shape == (8, task.observation_size)
+    for row in range(8):
+        for name, value in results(batch.take([row]), desired[row : row + 1]).items():
+            np.testing.assert_array_equal(value[0], batched[name][row])
 
 
 def test_decode_is_the_inverse_of_observe(task: Task) -> None:
-    state = states(task, 1, (5,))
+    state = states(task, 1, 5)
     decoded = task.decode(task.observe(state))
     expected = {
         "position": state.fk_position,
@@ -95,16 +103,15 @@ def test_decode_is_the_inverse_of_observe(task: Task) -> None:
 
 def test_the_observation_never_reads_the_platform_of_the_simulator(task: Task) -> None:
     state = states(task, 2)
-    other = replace(state, platform_position=np.ones(3), platform_tilt=9.0)
+    other = replace(state, platform_position=np.ones((1, 3)), platform_tilt=np.full(1, 9.0))
     np.testing.assert_array_equal(task.observe(other), task.observe(state))
     np.testing.assert_array_equal(task.achieved(other), task.achieved(state))
 
 
 def test_the_offset_to_the_block_vanishes_when_the_cup_touches_it() -> None:
     task = PickAndPlace(PAPER_TPM)
-    upright = np.array([[0.0, 0.0, 1.0]])
-    state = states(task, 3, object_axis=upright)
-    state = replace(state, object_position=(state.fk_position - HANGING)[None])
+    state = states(task, 3, object_axis=np.array([[0.0, 0.0, 1.0]]))
+    state = replace(state, object_position=(state.fk_position - HANGING)[:, None])
     decoded = task.decode(task.observe(state))
     np.testing.assert_allclose(decoded["object_offset"], 0.0, atol=1e-12)
     np.testing.assert_allclose(decoded["object_tilt"], 0.0, atol=1e-12)
@@ -125,9 +132,10 @@ def test_the_reward_has_the_documented_terms() -> None:
         upright = np.array([[0.0, 0.0, 1.0]] * len(task.scene.objects)).reshape(-1, 3)
         state = states(task, conditioning=0.04, object_axis=upright)
         below = state.fk_position - HANGING - (0.0, 0.0, 0.03)
-        state = replace(state, object_position=below[None])
-        gap, penalty = task.gap(np.zeros(3), goal), task.penalty(state)
-        assert task.reward_terms(state, gap, penalty) == pytest.approx(names)
+        state = replace(state, object_position=below[:, None])
+        gap, penalty = task.gap(np.zeros((1, 3)), goal), task.penalty(state)
+        found = {name: v.item() for name, v in task.reward_terms(state, gap, penalty).items()}
+        assert found == pytest.approx(names)
 
 
 @pytest.mark.parametrize("mode", ["assembly", "working"])
@@ -137,7 +145,7 @@ def test_a_mode_change_costs_the_whole_penalty(mode: str, conditioning: float) -
     state = states(task, conditioning=conditioning, **{f"{mode}_mode_changed": np.True_})
     penalty = task.penalty(state)
     assert penalty == 1
-    assert task.reward_terms(state, np.zeros(()), penalty)["singularity"] == -1
+    assert task.reward_terms(state, np.zeros(1), penalty)["singularity"] == -1
 
 
 def test_sparse_rewards_follow_success() -> None:
@@ -181,76 +189,56 @@ def test_an_object_that_is_nowhere_is_lost(axis: int) -> None:
     assert task.lost(states(task, object_position=place))
 
 
-@pytest.mark.parametrize("name", ["goal", "singularity"])
-def test_a_term_of_ones_own_cannot_replace_another(name: str) -> None:
-    class Replaced(Reach):
-        def shaping(self, state: State) -> Any:
-            return {name: np.zeros(np.shape(state.conditioning))}
-
-    task = Replaced(PAPER_TPM)
-    with pytest.raises(ConfigurationError, match="names other than goal, singularity") as caught:
-        task.reward_terms(states(task), np.ones(()), np.zeros(()))
-    assert (caught.value.name, caught.value.value) == ("shaping", name)
-
-
 # -- starts ----------------------------------------------------------------------------------------
 
 
 def test_starts_repeat_with_the_rng_and_take_what_is_chosen(task: Task) -> None:
-    first, again = (task.start(np.random.default_rng(7), None) for _ in range(2))
+    first, again = (task.start(rngs(7)) for _ in range(2))
     assert set(first) == {"goal", *(block.name for block in task.scene.objects)}
-    for name, place in first.items():
-        np.testing.assert_array_equal(again[name], place)
-        given = place.tolist()
-        chosen = task.start(np.random.default_rng(8), {name: given})
-        np.testing.assert_array_equal(chosen[name], place)
-    goal = first["goal"].copy()
+    for name, (place,) in first.items():
+        np.testing.assert_array_equal(again[name], [place])
+        chosen = task.start(rngs(8, 9), {name: place.tolist()})
+        np.testing.assert_array_equal(chosen[name], [place, place])
+    goal = first["goal"][0].copy()
     task.goals = "tempting"
-    tempted = task.start(np.random.default_rng(8), {"goal": goal})["goal"]
-    np.testing.assert_array_equal(tempted, goal)
+    np.testing.assert_array_equal(task.start(rngs(8), {"goal": goal})["goal"], first["goal"])
     task.goals = "sampled"
-    kept = task.start(np.random.default_rng(7), {"goal": goal})["goal"]
+    kept = task.start(rngs(7), {"goal": goal})["goal"]
     goal[:] = 0.0
     np.testing.assert_array_equal(kept, first["goal"])
 
 
 @each_machine
 def test_many_start_where_each_would(machine: Any) -> None:
-    class Raised(PickAndPlace):
-        def sample(self, rng: Any, chosen: Any) -> Any:
-            start = super().sample(rng, chosen)
-            return {**start, "goal": start["goal"] + (0.0, 0.0, 1e-3 * rng.random())}
-
-    for task in (Reach(machine), PickAndPlace(machine), Raised(machine)):
-        many = task.starts([np.random.default_rng(seed) for seed in range(60)], None)
-        each = [task.sample(np.random.default_rng(seed), {}) for seed in range(60)]
+    for task in (Reach(machine), PickAndPlace(machine)):
+        many = task.start(rngs(*range(60)))
+        each = [task.start(rngs(seed)) for seed in range(60)]
         for name, places in many.items():
-            np.testing.assert_array_equal(places, [start[name] for start in each])
+            np.testing.assert_array_equal(places, [start[name][0] for start in each])
 
 
 @pytest.mark.parametrize("options", [{"gaol": (0, 0, 0)}, [("goal", (0, 0, 0))], {3: 4}, "goal"])
 def test_unknown_options_are_refused_with_the_known_ones(task: Task, options: Any) -> None:
     with pytest.raises(ResetOptionError, match="'goal'") as caught:
-        task.start(np.random.default_rng(0), options)
+        task.start(rngs(), options)
     assert all(block.name in str(caught.value) for block in task.scene.objects)
     with pytest.raises(ResetOptionError):  # Reach has no object
-        Reach(PAPER_TPM).start(np.random.default_rng(0), {"object": (0.0, -0.03, 0.015)})
+        Reach(PAPER_TPM).start(rngs(), {"object": (0.0, -0.03, 0.015)})
 
 
 @pytest.mark.parametrize("name", ["goal", "object"])
 def test_what_is_out_of_reach_is_refused_with_the_range_that_is_enforced(name: str) -> None:
     task = PickAndPlace(PAPER_TPM)
+    low, high = task.reach_of(BLOCK)
     for place in ((0.0, -0.03, 0.0135), (0.0, -0.03, -0.3), (0.0, 0.2, 0.015), (1.0, -0.03, 0.1)):
         with pytest.raises(UnreachableError) as caught:
-            task.start(np.random.default_rng(0), {name: place})
+            task.start(rngs(), {name: place})
         assert caught.value.leg == "box"
         assert caught.value.margin < 0
-        low, high = task.reach_of(BLOCK)
         assert f"{name} must lie in {low.round(4).tolist()}" in str(caught.value)
         assert low[2] == 0.015
     for place in (low, high):
-        chosen = task.start(np.random.default_rng(0), {name: place})
-        np.testing.assert_array_equal(chosen[name], place)
+        np.testing.assert_array_equal(task.start(rngs(), {name: place})[name], [place])
 
 
 @each_machine
@@ -260,44 +248,86 @@ def test_an_object_does_not_start_inside_the_robot(machine: Any) -> None:
     touching = home - HANGING
     for place in (home, touching + (0, 0, 0.001), touching + (0.02, 0.0, 0.02)):
         with pytest.raises(ResetOptionError, match="clear of the robot at home") as caught:
-            task.start(np.random.default_rng(0), {"object": place, "goal": touching})
+            task.start(rngs(), {"object": place, "goal": touching})
         assert caught.value.name == "object"
     for place in (touching, home + (0.12, 0.0, 0.0)):
-        task.start(np.random.default_rng(0), {"object": place})
+        task.start(rngs(), {"object": place})
 
 
 def test_an_object_does_not_start_inside_another() -> None:
-    task, rng = TwoBlocks(PAPER_TPM), np.random.default_rng(0)
-    task.start(rng, {"object": (0.022, -0.03, 0.015)})  # they touch
+    task = TwoBlocks(PAPER_TPM)
+    task.start(rngs(), {"object": (0.022, -0.03, 0.015)})  # they touch
     for name, place in (("object", (0.023, -0.03, 0.02)), ("other", (0.01, -0.04, 0.04))):
         with pytest.raises(ResetOptionError, match="clear of") as caught:
-            task.start(rng, {name: place})
+            task.start(rngs(), {name: place})
         assert caught.value.name == name
+
+
+HOME = PAPER_TPM.mount.to_world(PAPER_TPM.home)
 
 
 @pytest.mark.parametrize(
     ("sampled", "message"),
     [
         ({"other": None}, r"sample\(\) = \['object', 'goal'\] .*object, other, goal"),
-        ({"obj": np.zeros(3)}, r"sample\(\) = .*'obj'"),
-        ({"goal": np.zeros(3)}, r"sample\(\)\['goal'\] = .*shape \(6,\)"),
-        ({"object": np.full(3, np.nan)}, r"sample\(\)\['object'\] = .*finite"),
-        ({"other": np.array([0.01, -0.03, 0.015])}, r"sample\(\)\['object'\] = .*clear of other"),
-        (
-            {"other": PAPER_TPM.mount.to_world(PAPER_TPM.home)},
-            r"sample\(\)\['other'\] = .*clear of the robot",
-        ),
+        ({"obj": np.zeros((2, 3))}, r"sample\(\) = .*'obj'"),
+        ({"goal": np.zeros((2, 3))}, r"sample\(\)\['goal'\] = (?s:.*)shape \(2, 6\)"),
+        ({"goal": np.zeros(6)}, r"sample\(\)\['goal'\] = (?s:.*)shape \(2, 6\)"),
+        ({"object": np.full((2, 3), np.nan)}, r"sample\(\)\['object'\] = (?s:.*)finite"),
+        ({"other": np.array([(0.01, -0.03, 0.015)] * 2)}, r"\['object'\] = .*clear of other"),
+        ({"other": np.array([(0.1, -0.03, 0.015), HOME])}, r"\['other'\] = .*clear of the robot"),
     ],
 )
 def test_a_task_that_samples_what_cannot_be_is_refused(sampled: Any, message: str) -> None:
     class Careless(TwoBlocks):
-        def sample(self, rng: Any, chosen: Any) -> Any:
-            start = {**super().sample(rng, chosen), **sampled}
+        def sample(self, rngs: Any, chosen: Any) -> Any:
+            start = {**super().sample(rngs, chosen), **sampled}
             return {name: place for name, place in start.items() if place is not None}
 
     with pytest.raises(ConfigurationError, match=message) as caught:
-        Careless(PAPER_TPM).start(np.random.default_rng(0), None)
+        Careless(PAPER_TPM).start(rngs(0, 1))
     assert not isinstance(caught.value, ResetOptionError)
+
+
+def test_a_sample_that_ignores_what_is_chosen_is_refused() -> None:
+    class Deaf(Reach):
+        def sample(self, rngs: Any, chosen: Any) -> Any:
+            return super().sample(rngs, {})
+
+    task = Deaf(PAPER_TPM)
+    task.start(rngs())
+    with pytest.raises(ConfigurationError, match=r"sample\(\)\['goal'\] = .*as the user chose it"):
+        task.start(rngs(), {"goal": (0.0, -0.03, 0.2)})
+
+
+# -- checked when an environment is made -----------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("method", "value", "blamed"),
+    [
+        ("achieved", lambda task, state: state.fk_position[:2], "achieved()"),
+        ("achieved", lambda task, state: state.fk_position[:, :2], "achieved()"),
+        ("achieved", lambda task, state: state.fk_position - state.torque.mean(0), "achieved()"),
+        ("observe", lambda task, state: Task.observe(task, state)[::-1], "observe()"),
+        ("gap", lambda task, one, other: np.linalg.norm(np.subtract(one, other)), "gap()"),
+        ("shaping", lambda task, state: "none", "shaping()"),
+        ("shaping", lambda task, state: {"goal": state.held * 0.0}, "shaping()"),
+        ("shaping", lambda task, state: {"singularity": state.held * 0.0}, "shaping()"),
+        ("shaping", lambda task, state: {"v": np.linalg.norm(state.fk_velocity)}, "shaping()['v']"),
+        ("shaping", lambda task, state: {"v": state.fk_velocity}, "shaping()['v']"),
+        ("shaping", lambda task, state: {"v": state.torque.max() - state.torque[:, 0]},
+         "shaping()['v']"),
+    ],
+)  # fmt: skip
+def test_a_method_that_mixes_robots_is_refused_by_name(
+    method: str, value: Any, blamed: str
+) -> None:
+    wrong = type("Wrong", (Reach,), {method: value})
+    for make in (TPMEnv, TPMVectorEnv):
+        with pytest.raises(ConfigurationError) as caught:
+            make(wrong)
+        assert caught.value.name == blamed
 
 
 # -- made by name, copied --------------------------------------------------------------------------

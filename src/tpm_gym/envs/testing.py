@@ -142,9 +142,14 @@ def passes_the_checkers_of_gymnasium_and_sb3(make: Make) -> None:
     """Run the checkers of other packages; Stable-Baselines3's where it is installed."""
     with closing(make()) as env, warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_by_gymnasium(env.unwrapped)
-        if find_spec("stable_baselines3") is not None:
-            importlib.import_module("stable_baselines3.common.env_checker").check_env(env.unwrapped)
+        try:
+            check_by_gymnasium(env.unwrapped)
+            if find_spec("stable_baselines3") is not None:
+                sb3 = importlib.import_module("stable_baselines3.common.env_checker")
+                sb3.check_env(env.unwrapped)
+        except AssertionError as error:
+            promise = "the checkers of Gymnasium and Stable-Baselines3 find nothing"
+            raise ConformanceError(promise, str(error)) from error
 
 
 def gives_observations_of_order_one_and_plain_infos(make: Make) -> None:

@@ -35,6 +35,8 @@ from tpm_gym.tasks.task import Task
 
 __all__ = ["TPMVectorEnv"]
 
+_MOST = 10**6  # environments of pick-and-place; they take some 10 GB
+
 Step = tuple[Observation, FloatArray, BoolArray, BoolArray, dict[str, Any]]
 
 
@@ -84,8 +86,8 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
     ) -> None:
         """Check the options and start the simulations."""
         for name, count in (("num_envs", num_envs), ("num_threads", num_threads)):
-            if not is_whole(count, 1):
-                raise ConfigurationError(name, count, "a whole number, 1 or more")
+            if not is_whole(count, 1) or count > _MOST:
+                raise ConfigurationError(name, count, f"a whole number, 1 or more, at most {_MOST}")
         if max_episode_steps is not None and not is_whole(max_episode_steps, 1):
             valid = "a whole number, 1 or more, or None for no limit"
             raise ConfigurationError("max_episode_steps", max_episode_steps, valid)

@@ -140,6 +140,9 @@ class Simulation:
         placed = self._places(len(rows), objects or {})
         self._become(rows, plants)
         self.engine.place(rows, true, placed)
+        # These arrays may be a machine's own.
+        self._position, self._jacobian = self._position.copy(), self._jacobian.copy()
+        self._conditioning = self._conditioning.copy()
         self._position[rows], self._jacobian[rows] = reading.position, reading.jacobian
         self._conditioning[rows] = reading.conditioning
         self._commands[rows] = reading.position
@@ -240,6 +243,7 @@ class Simulation:
             # Disturbed encoders may report joint positions at which no assembly exists. The last
             # reading that made sense stays, as a controller can do no better.
             lost = np.isnan(conditioning)
+            position, jacobian, conditioning = map(np.array, (position, jacobian, conditioning))
             position[lost], jacobian[lost] = self._position[rows][lost], self._jacobian[rows][lost]
             conditioning[lost] = self._conditioning[rows][lost]
         if isinstance(rows, slice):

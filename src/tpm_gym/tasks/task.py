@@ -34,6 +34,8 @@ __all__ = ["Entry", "Task"]
 Values = tuple[float, ...]
 
 _ZERO = (0.0, 0.0, 0.0)
+_EXAMPLES = 7
+"""States with which a task is checked; no other size is 7, so that axes cannot be confused."""
 _LIP = np.array(CUP.lip)
 
 
@@ -210,7 +212,7 @@ class Task(ABC):
         return rewards.distance(achieved, desired)
 
     def check(self) -> None:
-        """Compare the task's methods for two states at once with each state alone.
+        """Compare the task's methods for several states at once with states alone.
 
         A method that reduces over the robots (``np.linalg.norm(x)`` without ``axis=-1``), or takes
         rows for columns, gives wrong rewards in vector environments without an error.
@@ -218,37 +220,40 @@ class Task(ABC):
         Raises:
             ConfigurationError: If a method does not give what it has to, named by the method.
         """
-        both, goals = example_states(self.machine, self.scene), np.zeros((2, self.goal_size))
-        self._check_shapes(both)
-        for row in (0, 1):
-            alone, goal = both.take([row]), goals[row : row + 1]
+        several = example_states(self.machine, self.scene)
+        goals = np.zeros((_EXAMPLES, self.goal_size))
+        self._check_shapes(several)
+        for row in (0, _EXAMPLES - 1):
+            alone, goal = several.take([row]), goals[row : row + 1]
             for name, together, single in (
-                *_entries_of("achieved()", self.achieved(both), self.achieved(alone)),
-                *_entries_of("observe()", self.observe(both), self.observe(alone)),
-                *_entries_of("shaping()", self.shaping(both), self.shaping(alone)),
+                *_entries_of("achieved()", self.achieved(several), self.achieved(alone)),
+                *_entries_of("observe()", self.observe(several), self.observe(alone)),
+                *_entries_of("shaping()", self.shaping(several), self.shaping(alone)),
                 *_entries_of(
                     "gap()",
-                    self.gap(self.achieved(both), goals),
+                    self.gap(self.achieved(several), goals),
                     self.gap(self.achieved(alone), goal),
                 ),
             ):
-                if np.shape(together)[:1] != (2,) or not _equal(together[row], single):
+                if np.shape(together)[:1] != (_EXAMPLES,) or not _equal(together[row], single):
                     valid = "values (n, ...) for n robots, each from its own row; reduce by axis=-1"
-                    raise ConfigurationError(name, f"of shape {np.shape(together)} for 2", valid)
+                    raise ConfigurationError(
+                        name, f"of shape {np.shape(together)} for {_EXAMPLES}", valid
+                    )
 
     def _check_shapes(self, state: State) -> None:
-        """Refuse methods whose results have the wrong shape or type, for two states."""
+        """Refuse methods whose results have the wrong shape or type."""
         achieved = np.shape(self.achieved(state))
-        if achieved != (2, self.goal_size):
+        if achieved != (_EXAMPLES, self.goal_size):
             valid = f"of shape (n, {self.goal_size}), as goal_size says"
-            raise ConfigurationError("achieved()", f"of shape {achieved} for 2", valid)
+            raise ConfigurationError("achieved()", f"of shape {achieved} for {_EXAMPLES}", valid)
         shaping: object = self.shaping(state)
         if not isinstance(shaping, Mapping):
             raise ConfigurationError("shaping()", shaping, "a dictionary of terms; {} for none")
         for name, values in shaping.items():
             if name in ("goal", "singularity"):
                 raise ConfigurationError("shaping()", name, "names other than goal, singularity")
-            finite(f"shaping()[{name!r}]", values, (2,), ConfigurationError)
+            finite(f"shaping()[{name!r}]", values, (_EXAMPLES,), ConfigurationError)
 
     # -- start of an episode ----------------------------------------------------------------------
 
@@ -477,25 +482,26 @@ class Task(ABC):
 
 
 def example_states(machine: Machine, scene: Scene) -> State:
-    """Return two different states that a machine could be in, with a scene's objects."""
-    rng, objects = np.random.default_rng(0), len(scene.objects)
-    shape = (2, 3 + objects, 3)
+    """Return different states that a machine could be in, with a scene's objects."""
+    rng, objects, count = np.random.default_rng(0), len(scene.objects), _EXAMPLES
+    shape = (count, 3 + objects, 3)
     inside = machine.mount.to_world(rng.uniform(machine.region.low, machine.region.high, shape))
-    turn = rng.normal(size=(2, objects, 4)) * (0.1, 0.1, 1.0, 1.0)
+    turn = rng.normal(size=(count, objects, 4)) * (0.1, 0.1, 1.0, 1.0)
     turn /= np.linalg.norm(turn, axis=2, keepdims=True)
     x, y, z, w = np.moveaxis(turn, 2, 0)
     axis = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=2)
-    never = np.zeros(2, dtype=np.bool_)
+    never = np.zeros(count, dtype=np.bool_)
     return State(
-        theta=rng.normal(size=(2, 3)), theta_dot=rng.normal(size=(2, 3)),
-        torque=rng.normal(size=(2, 3)), fk_position=inside[:, 0],
-        fk_velocity=rng.normal(size=(2, 3)), conditioning=rng.uniform(0.05, 0.2, 2),
-        platform_position=inside[:, 1], platform_tilt=rng.random(2), closure_error=rng.random(2),
+        theta=rng.normal(size=(count, 3)), theta_dot=rng.normal(size=(count, 3)),
+        torque=rng.normal(size=(count, 3)), fk_position=inside[:, 0],
+        fk_velocity=rng.normal(size=(count, 3)), conditioning=rng.uniform(0.05, 0.2, count),
+        platform_position=inside[:, 1], platform_tilt=rng.random(count),
+        closure_error=rng.random(count),
         assembly_mode_changed=never, working_mode_changed=never, command=inside[:, 2],
-        held=np.array([-1, 0]), vacuum=rng.uniform(0.0, CUP.vacuum, 2),
+        held=np.arange(count) % 2 - 1, vacuum=rng.uniform(0.0, CUP.vacuum, count),
         object_position=inside[:, 3:], object_quaternion=turn, object_axis=axis,
-        object_velocity=rng.normal(size=(2, objects, 3)),
-        object_angular_velocity=rng.normal(size=(2, objects, 3)),
+        object_velocity=rng.normal(size=(count, objects, 3)),
+        object_angular_velocity=rng.normal(size=(count, objects, 3)),
     )  # fmt: skip
 
 
