@@ -1,7 +1,8 @@
 r"""Task of pushing the block, in which engines differ most, because the block nearly tips over.
 
-The block has to slide to a goal on the table, without vacuum. The cup stays at least 12 mm above the
-middle of the block, so that a push nearly tips it. Policies also drag the block by its upper edge.
+The block has to slide to a goal on the table, without vacuum. The cup stays at least 12 mm above
+the middle of the block, so that a push nearly tips it. Policies also drag the block by its upper
+edge.
 
     cd benchmarks
     python -m tpm_gym.learning train --algo ppo --engine analytic --env shoving:TPMShoveDense-v0 \
@@ -61,7 +62,7 @@ class Shove(PickAndPlace):
         return (*self.robot_entries(), *self.object_entries()[:-1])
 
     def shaping(self, state: State) -> dict[str, FloatArray]:
-        """Return minus the distance from the lip to the block's middle, and the penalty on speed."""
+        """Return minus the distance from lip to block, and the penalty on speed."""
         speed = np.linalg.norm(state.object_velocity[..., 0, :], axis=-1)
         away = rewards.distance(self.lip(state), state.object_position[..., 0, :])
         return {
