@@ -183,7 +183,7 @@ class AnalyticEngine:
         ):
             getattr(self, name)[rows] = values[rows]
         if saved is not None:
-            self._contact.restore(rows, tuple(part[rows] for part in saved))
+            self._contact.restore(rows, saved[rows])
         joints = np.ascontiguousarray(path.joints()[rows].swapaxes(0, 1))
         steps = IdealSteps(joints, self._effort[rows], self.time_step)
         self._march(rows, steps, vacuum)
