@@ -1,6 +1,6 @@
 """Stack: a task with two objects, in one file outside the package."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,23 +25,24 @@ class Stack(Task):
     tower = np.array([0.0, 0.0, (red.height + blue.height) / 2])
 
     def sample(
-        self, rng: np.random.Generator, chosen: Mapping[str, FloatArray]
+        self, rngs: Sequence[np.random.Generator], chosen: Mapping[str, FloatArray]
     ) -> dict[str, FloatArray]:
         """Blocks and goal stand on the table, apart from each other."""
-        mount, start = self.machine.mount, dict(chosen)
+        mount, count, start = self.machine.mount, len(rngs), dict(chosen)
         for name, block in (("red", self.red), ("blue", self.blue), ("goal", self.red)):
             if name not in chosen:
-                others = [place[:3] + hanging(block) for place in start.values()]
-                taken = mount.to_paper(np.reshape(others, (-1, 3)))
-                table = self.on_table(block)
-                point = sampling.apart_from(taken, rng, self.machine, table, APART)
-                place = mount.to_world(point) - hanging(block)
-                start[name] = np.r_[place, place + self.tower] if name == "goal" else place
+                others = [place[:, :3] + hanging(block) for place in start.values()]
+                taken = mount.to_paper(np.reshape(others, (-1, count, 3)).swapaxes(0, 1))
+                tables = [self.on_table(block)] * count
+                points = sampling.apart_from(taken, rngs, self.machine, tables, APART)
+                places = mount.to_world(points) - hanging(block)
+                goal = np.concatenate([places, places + self.tower], axis=1)
+                start[name] = goal if name == "goal" else places
         return start
 
     def achieved(self, state: State) -> FloatArray:
         """Middles of the two blocks."""
-        return state.object_position.reshape(*state.object_position.shape[:-2], 6)
+        return state.object_position.reshape(-1, 6)
 
     def gap(self, achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
         """That of the block that is farther from its place."""
@@ -54,7 +55,7 @@ class Stack(Task):
         if self.reward == "sparse":
             return {}
         tilt = np.linalg.norm(state.object_axis[..., :2], axis=-1).max(axis=-1)
-        return {"tilt": -tilt, "empty": -0.1 * (np.asarray(state.held) < 0)}
+        return {"tilt": -tilt, "empty": -0.1 * (state.held < 0)}
 
     def observed(self) -> tuple[Entry, ...]:
         """The robot, then each block."""

@@ -14,7 +14,8 @@ from tpm_gym.simulation import Engine, Servo
     [("physics", {"time_step": 0.01}), ("renderer", "egl"), ("gui", True), ("drive", Servo())],
 )
 def test_an_option_that_it_does_not_take_is_refused_by_name(option, value):
-    with pytest.raises(ConfigurationError, match=f"^{option} = .*'kinematic' has no such option"):
+    told = "render_mode" if option == "gui" else option
+    with pytest.raises(ConfigurationError, match=f"^{told} = .*'kinematic' (has no|opens no)"):
         Alone(tpm_gym.tasks.Reach.scene, engine="kinematic", **{option: value})
 
 
@@ -27,15 +28,14 @@ def test_what_it_cannot_randomise_it_refuses_by_name():
 class Derived(Engine):
     """Of the protocol, whose methods do nothing, and of no others."""
 
-    substeps = 1
+    time_step = 0.04
 
 
 @pytest.mark.parametrize(
     ("engine", "lacking"),
     [
         (type("NoSave", (KinematicEngine,), {"save": None}), ["save"]),
-        (type("NoSteps", (KinematicEngine,), {"substeps": None}), ["substeps"]),
-        (type("ZeroSteps", (KinematicEngine,), {"substeps": 0}), ["substeps"]),
+        (type("NoStep", (KinematicEngine,), {"time_step": None}), ["time_step"]),
         (Derived, ["load", "advance", "close"]),
     ],
 )
@@ -46,7 +46,7 @@ def test_an_engine_that_lacks_a_part_is_refused_by_name(engine, lacking):
         tpm_gym.TPMEnv(engine=name)
     for part in lacking:
         assert part in caught.value.valid
-    assert ("substeps" in caught.value.valid) == ("substeps" in lacking)
+    assert ("time_step" in caught.value.valid) == ("time_step" in lacking)
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ def test_what_is_no_engine_is_not_registered(name, engine, blamed):
 @pytest.mark.parametrize("place", ["nixmod:Engine", "kinematic:Engines"])
 def test_one_that_cannot_be_imported_is_refused_by_name(place):
     tpm_gym.register_engine(place, place)
-    said = f"engine = '{place}'.*of '{place}' Python says: .*(nixmod|Engines)"
+    said = f"engine = '{place}'.*for '{place}' Python says: .*(nixmod|Engines)"
     with pytest.raises(ConfigurationError, match=said):
         tpm_gym.TPMEnv(engine=place)
 
@@ -76,3 +76,24 @@ def test_names_are_taken_once():
         tpm_gym.register_engine("pybullet", KinematicEngine)
     with pytest.raises(ConfigurationError, match="'pybullet'"):
         tpm_gym.TPMEnv(engine="mujoco2000")
+
+
+def test_an_engine_of_several_robots_gets_several():
+    """Its number of robots says how many environments share one; the rest get another."""
+    counts = []
+
+    class Counted(KinematicEngine):
+        def load(self, machine, scene, count):
+            counts.append(count)
+            super().load(machine, scene, count)
+
+    tpm_gym.register_engine("counted", Counted, robots=1)
+    tpm_gym.TPMVectorEnv(engine="counted", num_envs=3).close()
+    assert counts == [1, 1, 1]
+    counts.clear()
+    tpm_gym.register_engine("counted", Counted, robots=2)
+    tpm_gym.TPMVectorEnv(engine="counted", num_envs=3).close()
+    assert counts == [2, 1]
+    for robots in (0, 1.5, "many"):
+        with pytest.raises(ConfigurationError, match="robots"):
+            tpm_gym.register_engine("counted", Counted, robots=robots)
