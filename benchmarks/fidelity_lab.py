@@ -283,7 +283,7 @@ def measure(rig: Rig, motion: Motion) -> Errors:
             rig.drive(target)
             rig.step()
             gap, position, tilt = rig.robot.truth()
-            rows.append((gap, tilt, *position, *rig.robot.motors().theta))
+            rows.append((gap, tilt, *position, *rig.robot.motors()[0]))
             wanted.append(point)
             if not gap <= CLOSURE_LIMIT:  # also true for NaN
                 return _evaluate(np.array(rows), np.array(wanted))

@@ -84,7 +84,7 @@ class Probe:
     def _measured_step(self, *arguments: Any, **options: Any) -> Any:
         result = self._step(*arguments, **options)
         gap, position, tilt = self._robot.truth()
-        self._rows[self._filled] = (gap, tilt, *position, *self._robot.motors().theta)
+        self._rows[self._filled] = (gap, tilt, *position, *self._robot.motors()[0])
         self._filled += 1
         self.steps += 1
         if self._filled == BUFFER:
