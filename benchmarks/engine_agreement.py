@@ -1,4 +1,4 @@
-"""Replay of the same actions in each engine: loops, platform, torques, block, energy, and theory."""
+"""Replay of the same actions in each engine: loops, platform, torques, block, energy, theory."""
 
 from __future__ import annotations
 

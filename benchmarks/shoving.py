@@ -1,7 +1,8 @@
 r"""Task of pushing the block, in which engines differ most, because the block nearly tips over.
 
-The block has to slide to a goal on the table, without vacuum. The cup stays at least 12 mm above the
-middle of the block, so that a push nearly tips it. Policies also drag the block by its upper edge.
+The block has to slide to a goal on the table, without vacuum. The cup stays at least 12 mm above
+the middle of the block, so that a push nearly tips it. Policies also drag the block by its upper
+edge.
 
     cd benchmarks
     python -m tpm_gym.learning train --algo ppo --engine analytic --env shoving:TPMShoveDense-v0 \
@@ -35,7 +36,7 @@ class Shove(PickAndPlace):
     samplings = ("sampled",)
     haste = 3.0
 
-    def sample_each(
+    def sample(
         self, rngs: Sequence[np.random.Generator], chosen: Mapping[str, FloatArray]
     ) -> dict[str, FloatArray]:
         """Both on the table, APART to FARTHEST from each other."""
@@ -50,20 +51,16 @@ class Shove(PickAndPlace):
             rows = np.flatnonzero((way < sampling.APART) | (way > FARTHEST))
         offset, to_world = hanging(self.block), machine.mount.to_world
         drawn = {"object": to_world(first) - offset, "goal": to_world(last) - offset}
-        return {**drawn, **sampling.repeated(chosen, len(rngs))}
-
-    def sample(self, rng: np.random.Generator, chosen: Mapping[str, FloatArray]) -> Any:
-        """See the base class."""
-        return sampling.first_of(self.sample_each([rng], chosen))
+        return {**drawn, **chosen}
 
     def observed(self) -> tuple[Entry, ...]:
         """Return entries of the robot and the block, without whether the block is held."""
         return (*self.robot_entries(), *self.object_entries()[:-1])
 
     def shaping(self, state: State) -> dict[str, FloatArray]:
-        """Return minus the distance from the lip to the block's middle, and the penalty on speed."""
-        speed = np.linalg.norm(state.object_velocity[..., 0, :], axis=-1)
-        away = rewards.distance(self.lip(state), state.object_position[..., 0, :])
+        """Return minus the distance from lip to block, and the penalty on speed."""
+        speed = np.linalg.norm(state.object_velocity[:, 0], axis=-1)
+        away = rewards.distance(self.lip(state), state.object_position[:, 0])
         return {
             "approach": 0.25 * rewards.dense(away),
             "haste": -self.haste * np.maximum(speed - FAST, 0.0),

@@ -147,7 +147,8 @@ class Soak:
             seed = int(rng.integers(2**31))
         elif kind == "options":
             unwrapped: Any = env.unwrapped
-            options = unwrapped.task.sample(rng, {})
+            starts = unwrapped.task.sample([rng], {})
+            options = {name: rows[0] for name, rows in starts.items()}
         observation: dict[str, Any] = env.reset(seed=seed, options=options)[0]
         return observation
 

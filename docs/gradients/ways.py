@@ -173,6 +173,7 @@ def draw(machine: TPM, count: int, seed: int = 0) -> list[Carry]:
     rng, table = np.random.default_rng(seed), PickAndPlace(machine).on_table(BLOCK)
     carries = []
     for _ in range(count):
-        first = machine.sample([rng], [table])[0]
-        carries.append(Carry(machine, first, sampling.apart_from(first, rng, machine, table)))
+        (first,) = machine.sample([rng], [table])
+        (last,) = sampling.apart_from(first, [rng], machine, [table])
+        carries.append(Carry(machine, first, last))
     return carries

@@ -1,4 +1,4 @@
-"""Studies run what is left whatever dies on the way, and the page says what the runs did."""
+"""Studies survive deaths and stops, and the page of results agrees with the records."""
 
 import itertools
 import json
@@ -64,7 +64,7 @@ def test_plans_have_every_recipe_and_seed(tmp_path: Path) -> None:
     longer = plan_runs(Study("penalty", folder=tmp_path, engine="analytic", steps=70_000))
     assert all("--steps 70000" in " ".join(run.left()[0]) for run in longer)
     bisections = plan_runs(Study("robustness", folder=tmp_path))
-    assert len(bisections) == 10 + 10 + 8  # without a block there are no mass and friction of it
+    assert len(bisections) == 10 + 10 + 8  # without a puck there are no mass and friction of it
     elsewhere = plan_runs(Study("results", folder=tmp_path, engine="analytic"))
     runs = [*planned, *weighted, *longer, *bisections, *elsewhere]
     assert len({run.folder for run in runs}) == len(runs)
@@ -242,7 +242,7 @@ def test_nobody_else_can_reach_a_study_and_a_killed_one_leaves_nothing_behind(
 
 @pytest.mark.slow
 def test_ctrl_c_stops_a_study_with_checkpoints_saved(tmp_path: Path) -> None:
-    """As a terminal sends it: to the whole process group; a second signal would kill trainings."""
+    """A terminal sends SIGINT to the whole process group; a second signal would kill trainings."""
     before = temporary()
     words = ["--plan", "results", "--envs", "TPMReach-v0", "--algos", "sac", "--seeds", "2"]
     words = [*COMMAND, *words, "--folder", str(tmp_path), "--jobs", "1"]
@@ -261,7 +261,7 @@ def test_ctrl_c_stops_a_study_with_checkpoints_saved(tmp_path: Path) -> None:
 
 @pytest.fixture
 def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """Two nodes of one CPU each."""
+    """Start two nodes of one CPU each."""
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
     with tempfile.TemporaryDirectory(prefix="tpm-", dir="/tmp") as folder:
         monkeypatch.setenv("RAY_TMPDIR", folder)
@@ -292,7 +292,7 @@ def kill_node(node: Any) -> None:
 
 
 def small(folder: Path, seed: int) -> Run:
-    """A training of seconds, with a checkpoint every few moments."""
+    """Return a training of seconds, with many checkpoints."""
     folder.mkdir(exist_ok=True)
     recipe = folder / "sac.yml"
     recipe.write_text(SAC_RECIPE.format(env="TPMReach-v0", train_freq=20), encoding="utf-8")
@@ -303,12 +303,12 @@ def small(folder: Path, seed: int) -> Run:
 
 
 def newest(run: Run) -> int:
-    """Step of the last checkpoint of a run."""
+    """Return the step of the last checkpoint of a run."""
     return max(CheckpointStore(run.folder / "checkpoints").steps(), default=-1)
 
 
 def lasting(run: Run) -> Any:
-    """The record of a run, without clocks, and without how often it went on."""
+    """Return the record of a run without times and resumptions."""
     kept = without_times(condense(run.folder))
     for test in kept["tests"].values():
         del test["steps_per_second"]
@@ -679,7 +679,7 @@ def test_what_was_tested_is_not_tested_again_unless_with_other_episodes(tmp_path
 def test_the_page_says_where_success_halves(bisections: list[Any]) -> None:
     text = page(bisections, ["results_robustness.png"])
     assert "images/results_robustness.png" in text
-    (row,) = rows(text, "| block mass (factor) | 1 | 10 |")
+    (row,) = rows(text, "| puck mass (factor) | 1 | 10 |")
     (cell,) = {cell.strip() for cell in row.strip("|").split("|")[3:]}
     low, high = map(float, cell.split(" to "))
     assert low < 1.5 <= high < 1.05 * low
@@ -690,7 +690,7 @@ def test_the_page_says_where_success_halves(bisections: list[Any]) -> None:
     assert row.count("97.0% at 0.001") == 2
     again = [record | {"engine": "analytic", "episodes": 70} for record in bisections]
     both = page([*bisections, *again], [])
-    assert both.count("| block mass") == 2 * text.count("| block mass") > 0
+    assert both.count("| puck mass") == 2 * text.count("| puck mass") > 0
     assert "analytic engine, 70 episodes" in both
     assert "PyBullet, 50 episodes" in both
     del bisections[0]["tests"][list(bisections[0]["tests"])[-1]]
@@ -703,8 +703,8 @@ def test_the_figure_has_a_panel_an_attribute_and_a_line_an_id(
     figure = robustness(bisections)
     panels = [axes for axes in figure.axes if axes.get_visible()]
     assert [axes.get_title() for axes in panels] == [name.replace("_", " ") for name in LIMITS]
-    block = panels[list(LIMITS).index("block_mass")]
-    lines = [line for line in block.lines if len(line.get_xdata()) > 2]
+    puck = panels[list(LIMITS).index("puck_mass")]
+    lines = [line for line in puck.lines if len(line.get_xdata()) > 2]
     assert len(lines) == 2
     for line in lines:
         values, rates = line.get_xdata(), line.get_ydata()

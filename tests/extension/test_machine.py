@@ -22,12 +22,24 @@ def test_it_goes_where_its_kinematics_say_whatever_is_asked(env_id):
         assert GANTRY.region.margin(GANTRY.mount.to_paper(state.fk_position)) > -1e-6
 
 
-def test_torques_follow_from_its_bodies():
+def test_dynamics_and_modes_of_rows_follow_from_its_bodies():
     bridge, trolley, ram, cup = (link.mass for link in GANTRY.mechanism.links[1:])
     moved = np.array([bridge + trolley + ram + cup, trolley + ram + cup, ram + cup])
-    change = np.array([3.0, -2.0, 5.0])
-    torque = GANTRY.torque(GANTRY.home, (0.3, 0.2, 0.1), tuple(change))
-    np.testing.assert_allclose(torque, moved * (change - (0, 0, 9.81)), rtol=1e-5)
+    theta, change, force = np.random.default_rng(0).uniform(-0.2, 0.2, (3, 2, 2, 3)) + GANTRY.home
+    torque = GANTRY.torque(theta, change, change, force)
+    expected = moved * (change - (0, 0, 9.81)) - force
+    np.testing.assert_allclose(torque, expected, rtol=1e-5, atol=1e-5)
+    built = np.array([GANTRY.built(), GANTRY.built(link_masses=(2.0,) * 4)])
+    motion = GANTRY.motion(theta, change, built)
+    for row, factor in enumerate((1.0, 2.0)):
+        mass = np.broadcast_to(factor * np.diag(moved), (2, 3, 3))
+        np.testing.assert_allclose(motion.mass[row], mass, rtol=1e-5, atol=1e-4)
+        weight = np.broadcast_to(factor * moved * (0, 0, -9.81), (2, 3))
+        np.testing.assert_allclose(motion.bias[row], weight, atol=1e-4)
+    np.testing.assert_array_equal(GANTRY.forward(theta), theta)
+    assert not GANTRY.mode_left(theta, theta).any()
+    assert GANTRY.same_side(theta).all()
+    assert GANTRY.is_safe(theta).all()
 
 
 @pytest.mark.parametrize("task", ["reach", "pick_and_place"])

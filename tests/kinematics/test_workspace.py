@@ -94,7 +94,6 @@ def test_projection_is_inside_idempotent_and_nearest(
         projected = region.project(point)
         assert region.contains(projected)
         np.testing.assert_array_equal(region.project(projected), projected)
-        np.testing.assert_array_equal(region.nearest(tuple(map(float, point))), projected)
         distance = np.linalg.norm(projected - point)
         competitor = np.clip(other, region.low, region.high)
         assert distance <= np.linalg.norm(competitor - point) + 1e-12

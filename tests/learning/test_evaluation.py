@@ -3,6 +3,7 @@
 import json
 import pickle
 import shutil
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -220,15 +221,11 @@ def test_the_environment_is_the_one_that_was_asked_for() -> None:
         randomisation=("block_mass=2",),
         env_options=EnvOptions(engine="pybullet", drive="servo"),
     )
-    env: Any = evaluation._make_env(config)
-    assert env.unwrapped.task.penalty_weight == 0.25
-    assert env.unwrapped.randomisation.block_mass == (2.0, 2.0)
-    assert env.unwrapped.drive == Servo()
-    plain = gym.make("TPMPickAndPlace-v0")
-    goals = [made.reset(seed=3)[0]["desired_goal"] for made in (env, plain)]
-    assert not np.array_equal(*goals)
-    env.close()
-    plain.close()
+    with closing(evaluation._make_envs(config, 1)) as envs:
+        assert envs.task.penalty_weight == 0.25
+        assert envs.randomisation.block_mass == (2.0, 2.0)
+        assert envs.drive == Servo()
+        assert envs.task.goals == "tempting"
 
 
 @pytest.fixture(scope="module")

@@ -5,8 +5,10 @@ import json
 import os
 import re
 import signal
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -160,14 +162,14 @@ def test_what_is_chosen_reaches_every_environment_and_survives_resuming(
 ) -> None:
     snug = replace(PAPER_TPM, name="snug", table=(0.4, 0.3))
     tpm_gym.register_machine("snug", snug)
-    made: list[gym.Env[Any, Any]] = []
-    make = gym.make
+    made: list[Any] = []
 
-    def remember(*args: Any, **options: Any) -> Any:
+    def remember(make: Callable[..., Any], *args: Any, **options: Any) -> Any:
         made.append(make(*args, **options))
         return made[-1]
 
-    monkeypatch.setattr(gym, "make", remember)
+    for name in ("make", "make_vec"):
+        monkeypatch.setattr(gym, name, partial(remember, getattr(gym, name)))
     options = EnvOptions(machine="snug", drive="servo")
     config = replace(make_config("sac", tmp_path), steps=110, penalty_weight=0.0, goals="tempting")
     config = replace(config, env_options=options)
@@ -182,7 +184,7 @@ def test_what_is_chosen_reaches_every_environment_and_survives_resuming(
     resume(ResumeConfig(folder, steps=170), quiet())
     assert len(made) == 6
     for env in made:
-        inner: Any = env.unwrapped
+        inner = env.unwrapped
         assert inner.task.penalty_weight == 0.0
         assert inner.task.goals == "tempting"
         assert (inner.machine, inner.drive) == (snug, Servo())

@@ -25,7 +25,7 @@ from tpm_gym.kinematics import (
     jacobian,
 )
 from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
-from tpm_gym.mechanism import PAPER_TPM, TPM
+from tpm_gym.mechanism import PAPER_TPM, TPM, tpm_rows
 
 GEOMETRIES = [PAPER, WIDE, Geometry(l1=0.31, l2=0.06, l3=0.36, l4=0.79, l5=0.11, l6=0.02, l7=0.07)]
 
@@ -173,6 +173,22 @@ def test_shapes_that_do_not_go_together_are_refused() -> None:
             PAPER_TPM.inverse(wrong)
     with pytest.raises(ValueError, match="shape"):
         PAPER_TPM.motion(np.zeros((2, 3)), np.zeros((3, 3)))
+
+
+def test_all_kinds_of_arrays_share_one_compiled_loop() -> None:
+    points, theta, rate = drawn(PAPER_TPM, (1,))
+    expected = PAPER_TPM.motion(theta, rate)
+    frozen = rate.copy()
+    frozen.flags.writeable = False
+    wide = np.zeros((1, 6))
+    wide[:, ::2] = rate
+    built = PAPER_TPM.built()[None]
+    built.flags.writeable = False
+    for other in (frozen, rate[0], rate.tolist(), wide[:, ::2], np.asfortranarray(rate)):
+        assert_equal(PAPER_TPM.motion(theta, other, built), expected)
+    PAPER_TPM.inverse(np.float32(points))
+    loops = [vars(tpm_rows)[name] for name in ("motion", "inverse")]
+    assert [len(loop.signatures) for loop in loops] == [1, 1]
 
 
 def test_numba_is_imported_when_a_machine_first_computes() -> None:

@@ -53,11 +53,6 @@ class Region:
         inside: FloatArray = np.minimum(np.maximum(points, self.low), self.high)
         return inside
 
-    def nearest(self, point: Vector) -> Vector:
-        """Return the nearest point of the box to one point, as floats."""
-        (x, y, z), (a, b, c), (d, e, f) = point, self.low, self.high
-        return min(max(x, a), d), min(max(y, b), e), min(max(z, c), f)
-
     def corners(self) -> Iterator[Vector]:
         """Yield the eight corners, m."""
         return product(*zip(self.low, self.high, strict=True))  # type: ignore[return-value]

@@ -18,7 +18,7 @@ from tpm_gym.envs.vector import TPMVectorEnv
 from tpm_gym.learning.environments import make_envs
 from tpm_gym.tasks.expert import Expert
 
-_OF_VECTORS: Final = ("num_envs", "vectorization_mode", "autoreset_mode", "stagger")
+_OTHER: Final = ("num_envs", "vectorization_mode", "autoreset_mode", "stagger", "render_mode")
 
 
 class Demonstrations(BaseCallback):
@@ -50,7 +50,7 @@ class Demonstrations(BaseCallback):
         if model.num_timesteps > 0:
             return  # a resumed run has them already
         count, spec = self.training_env.num_envs, self.training_env.get_attr("spec")[0]
-        options = {name: own for name, own in spec.kwargs.items() if name not in _OF_VECTORS}
+        options = {name: own for name, own in spec.kwargs.items() if name not in _OTHER}
         envs = make_envs(spec.id, count, autoreset_mode=AutoresetMode.DISABLED, **options)
         rng = np.random.default_rng(model.seed)
         outcomes: list[bool] = []

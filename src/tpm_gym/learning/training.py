@@ -4,7 +4,7 @@ The run folder holds ``config.json`` (the full configuration, versions and seeds
 and TensorBoard events, ``evaluations.jsonl``, ``checkpoints/``, ``best.zip`` (the policy with the
 best periodic evaluation) and ``last.zip``, and both exported as safetensors. ``learning_curve.png``
 is drawn at the end or at a stop. A run that was stopped or killed continues from its last
-checkpoint. Ctrl-C saves a checkpoint and stops; a second Ctrl-C ends the process at once.
+checkpoint. Ctrl-C stops at the end of a rollout, with a checkpoint; a second Ctrl-C stops at once.
 """
 
 from __future__ import annotations

@@ -54,16 +54,6 @@ class Mount:
         turned: FloatArray = np.multiply(vector, _HALF_TURN, dtype=np.float64)
         return turned
 
-    def swap(self, point: Vector) -> Vector:
-        """Convert one point from either frame to the other, as floats."""
-        x, y, z = point
-        return x, -y, self.height - z
-
-    def turn(self, vector: Vector) -> Vector:
-        """Convert one free vector from either frame to the other, as floats."""
-        x, y, z = vector
-        return x, -y, -z
-
     @cached_property
     def frame(self) -> tuple[FloatArray, FloatArray]:
         """Factors and origin (3,), so that world = factors * point + origin, and back."""
@@ -72,7 +62,7 @@ class Mount:
     @property
     def free_fall(self) -> Vector:
         """Acceleration of gravity in the paper frame, m/s^2."""
-        return self.turn((0.0, 0.0, -GRAVITY))
+        return (0.0, 0.0, GRAVITY)
 
     @property
     def quaternion(self) -> Quaternion:

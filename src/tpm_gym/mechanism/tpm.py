@@ -144,7 +144,7 @@ class TPM(Machine):
         if not count or rows % count or built.shape != (count, self._nominal.shape[1]):
             valid = f"parameters (b, {self._nominal.shape[1]}), with b a divisor of {rows} rows"
             raise InputError("built", built.shape, valid)
-        return np.ascontiguousarray(built, dtype=np.float64), self._constants
+        return _plain(built), self._constants
 
     # -- bodies -----------------------------------------------------------------------------
 
@@ -212,12 +212,18 @@ def _loops() -> ModuleType:
 
 def _rows(vectors: ArrayLike, shape: tuple[int, ...] | None = None) -> FloatArray:
     """Return vectors (..., 3) as a contiguous array, broadcast to ``shape``."""
-    array = np.ascontiguousarray(vectors, dtype=np.float64)
+    array = _plain(vectors)
     if shape is not None and array.shape != shape:
-        array = np.ascontiguousarray(np.broadcast_to(array, shape))
+        array = np.broadcast_to(array, shape).copy()
     if array.shape[-1] != 3:
         raise InputError("vectors", array.shape, "an array of shape (..., 3), by shape")
     return array
+
+
+def _plain(values: ArrayLike) -> FloatArray:
+    """Return values as the one kind of array for which the loops are compiled."""
+    array = np.ascontiguousarray(values, dtype=np.float64)
+    return array if array.flags.writeable else array.copy()
 
 
 def _flat(array: FloatArray) -> FloatArray:

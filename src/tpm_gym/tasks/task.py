@@ -123,7 +123,9 @@ class Task(ABC):
         self.entries = self.observed()
         self._centre = np.concatenate([entry.centre for entry in self.entries])
         self._scale = np.concatenate([entry.scale for entry in self.entries])
-        self._sources = [source for source, _ in groupby(entry.source for entry in self.entries)]
+        # Entries in a row that share a source read it once.
+        groups = groupby(self.entries, key=lambda entry: entry.source)
+        self._sources = [(source, _columns(list(entries))) for source, entries in groups]
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave the entries out: they hold functions, which cannot be pickled."""
@@ -432,7 +434,7 @@ class Task(ABC):
 
     def observe(self, state: State) -> FloatArray:
         """Return the observation vectors (n, k), each entry of order one."""
-        values = [source(state) for source in self._sources]
+        values = [source(state)[:, columns] for source, columns in self._sources]
         scaled: FloatArray = (np.concatenate(values, axis=1) - self._centre) / self._scale
         return scaled
 
@@ -515,6 +517,14 @@ def _entries_of(name: str, together: Any, single: Any) -> list[tuple[str, Any, A
 def _equal(row: Any, single: Any) -> bool:
     """Return whether a row is what the state alone gives, (1, ...)."""
     return np.shape(single) == (1, *np.shape(row)) and np.allclose(row, single[0], equal_nan=True)
+
+
+def _columns(entries: Sequence[Entry]) -> Any:
+    """Return an index of the columns of entries that share a source."""
+    if entries[0].columns is None:
+        return slice(None)
+    chosen = [k for entry in entries for k in range(*entry.columns or (0,))]
+    return slice(len(chosen)) if chosen == list(range(len(chosen))) else chosen
 
 
 def _measure_robot(state: State) -> FloatArray:

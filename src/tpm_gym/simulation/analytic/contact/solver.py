@@ -12,7 +12,7 @@ from typing import NamedTuple
 from tpm_gym.arrays import FloatArray, Vector
 from tpm_gym.simulation.analytic.compiling import compiled
 from tpm_gym.simulation.analytic.contact.state import Record, Records
-from tpm_gym.simulation.analytic.contact.vectors import clip, cross, dot, plus, put, three
+from tpm_gym.simulation.analytic.contact.vectors import cross, dot, plus, put, three
 
 __all__ = ["Motor", "prepare", "solve", "still"]
 
@@ -33,7 +33,7 @@ class Motor(NamedTuple):
     Attributes:
         speed: Vertical velocity of the cup that it aims at, m/s.
         mass: Of the cup and what it holds, kg.
-        limit: Largest impulse, N s.
+        limit: Largest impulse downwards, N s.
     """
 
     speed: float
@@ -191,7 +191,7 @@ def solve(contacts: Records, count: int, bodies: Records, motor: Motor, calm: bo
     for sweep in range(_CALM_SWEEPS if calm else _SWEEPS):
         off = False
         wanted = spring + (motor.speed - cup[2]) * motor.mass
-        wanted = clip(wanted, -motor.limit, motor.limit)
+        wanted = max(wanted, -motor.limit)  # upwards the cup is on its stop
         cup[2] += (wanted - spring) / motor.mass
         spring = wanted
         for j in range(count):
