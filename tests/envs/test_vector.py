@@ -227,13 +227,13 @@ def test_options_are_refused_by_name() -> None:
         ({"num_envs": 0}, "1 or more"),
         ({"max_episode_steps": 0}, "1 or more"),
         ({"stagger": "no"}, "True or False"),
-        ({"render_mode": "rgb_array"}, "draws a single environment"),
         ({"autoreset_mode": "Never"}, "'NextStep', 'SameStep', 'Disabled'"),
         ({"physics": {"time_step": 0.02}}, "time_step"),
         ({"physics": {"time_step": 1e-12}}, "at least 1e-06 s"),
         ({"physics": {"torques": "all"}}, "'every'"),
         ({"machine": "round"}, "'paper', 'wide'"),
         ({"num_envs": 10**12}, "num_envs"),
+        ({"num_envs": 2, "render_mode": "rgb_array"}, "render_mode"),
         ({"num_threads": 0}, "1 or more"),
     ):
         with pytest.raises(ConfigurationError, match=message):
