@@ -9,8 +9,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from tpm_gym.simulation.analytic.contact import collision, grasp, solver, stepping, vectors
 from tpm_gym.simulation.analytic.compiling import SOURCES, source_files
+from tpm_gym.simulation.analytic.contact import collision, grasp, solver, stepping, vectors
 
 TEXT = """
 import sys

@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray
-from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.batch import Readings
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.tpm import PAPER_TPM

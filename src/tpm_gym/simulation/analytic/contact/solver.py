@@ -10,7 +10,6 @@ import math
 from typing import NamedTuple
 
 from tpm_gym.arrays import FloatArray, Vector
-from tpm_gym.mechanism.cup import CUP
 from tpm_gym.simulation.analytic.compiling import compiled
 from tpm_gym.simulation.analytic.contact.state import Record, Records
 from tpm_gym.simulation.analytic.contact.vectors import cross, dot, plus, put, three
