@@ -156,7 +156,8 @@ def test_a_press_without_vacuum_moves_nothing() -> None:
     ours, theirs = compared(commands, [False] * len(commands))
     assert math.dist(ours.position[-1, 0], theirs.position[-1, 0]) < 2e-4
     lift = CUP.preload + CUP.link("platform", (0.0, 0.0, 0.0)).mass * GRAVITY
-    assert ours.force[-1] == pytest.approx([0.0, 0.0, lift], abs=0.3)
+    assert ours.force[-1, 2] == pytest.approx(lift, abs=0.01)
+    assert math.hypot(*ours.force[-1, :2]) < 1.01 * CUP.friction * BLOCK.friction * lift
 
 
 @pytest.mark.parametrize("way", [(1.0, 0.0, 0.0), (0.0, -1.0, 0.0)])
@@ -166,8 +167,8 @@ def test_a_lip_dragged_over_an_edge_tips_it_as_in_mujoco(way: Vector, depth: flo
     end = low + 0.05 * np.array(way)
     commands = [high, *line(high, low, 3, 2), *line(low, end, 4, 8)]
     ours, theirs = compared(commands, [False] * len(commands))
-    assert theirs.tilt[-1] > math.radians(70)  # it leans against the lip
-    assert ours.tilt[-1] == pytest.approx(theirs.tilt[-1], abs=0.12)
+    assert theirs.tilt[-1] > math.radians(60)  # it leans against the lip
+    assert ours.tilt[-1] == pytest.approx(theirs.tilt[-1], abs=0.2)
     assert math.dist(ours.position[-1, 0], theirs.position[-1, 0]) < 2e-3
 
 
