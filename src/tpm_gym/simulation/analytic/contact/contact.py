@@ -1,6 +1,6 @@
 """Objects on a table, the cup above them, and the vacuum between: many tables, each by itself.
 
-A time step (:mod:`.stepping`) finds contacts (:mod:`.collision`) and impulses (:mod:`.solver`), moves
+A time step (:mod:`.stepping`) finds contacts (:mod:`.collision`), solves them (:mod:`.solver`), moves
 the objects, and lets the vacuum take or drop one (:mod:`.grasp`).
 
 Left out: an object stands on the table as long as its centre is over it, and then falls past it;
@@ -17,7 +17,6 @@ import numpy as np
 
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray
 from tpm_gym.simulation.analytic.contact.state import (
-    AT_REST,
     CUP_STATE,
     OBJECT,
     Setting,
@@ -25,12 +24,9 @@ from tpm_gym.simulation.analytic.contact.state import (
     work_for,
 )
 from tpm_gym.simulation.analytic.contact.stepping import advance
-from tpm_gym.simulation.stage import TABLE
 from tpm_gym.simulation.state import Block
 
 __all__ = ["Contact", "Reading"]
-
-_ON_TABLE = 2e-5  # m
 
 
 class Reading(NamedTuple):
@@ -103,9 +99,7 @@ class Contact:
         objects["position"] = positions
         objects["quaternion"] = (0.0, 0.0, 0.0, 1.0) if quaternions is None else quaternions
         objects["velocity"] = objects["spin"] = 0.0
-        gap = np.abs(objects["position"][..., 2] - self._setting.half[:, 2] - TABLE.top)
-        stands = (gap < _ON_TABLE) & ~objects["quaternion"][..., :2].any(axis=-1)
-        objects["rest"] = np.where(stands.all(axis=-1, keepdims=True), AT_REST, 0)
+        objects["rest"] = 0.0
         self._objects[rows] = objects
         empty = np.zeros((), CUP_STATE)
         empty["held"] = -1

@@ -78,10 +78,10 @@ def advance(
 @compiled
 def _at_rest(objects: Records) -> bool:
     """Return whether all objects are at rest."""
+    resting = True
     for index in range(len(objects)):
-        if objects[index]["rest"] < AT_REST:
-            return False
-    return True
+        resting = resting and objects[index]["rest"] >= AT_REST
+    return resting
 
 
 @compiled

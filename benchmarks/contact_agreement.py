@@ -1,0 +1,202 @@
+"""Contact of the analytic engine against MuJoCo's and PyBullet's, and against itself.
+
+    python benchmarks/contact_agreement.py [--cases 100] [--episodes 1000]
+
+Two blocks are let go on each other, pushed over, pushed side by side, dragged and put down. Rest
+poses are compared with those of MuJoCo at 0.5 ms, and MuJoCo's own with those at 0.25 ms.
+
+The published policy acts on each engine's own observations with normal noise on its actions, at the
+default time step and at a quarter of it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Sequence
+from contextlib import closing
+from functools import partial
+from typing import NamedTuple
+
+import gymnasium as gym
+import numpy as np
+
+import tpm_gym
+from tpm_gym.arrays import FloatArray
+from tpm_gym.learning.rollout import TEST_SEED
+from tpm_gym.mechanism.cup import CUP
+from tpm_gym.mechanism.tpm import WIDE_TPM
+from tpm_gym.simulation.simulation import make_simulation
+from tpm_gym.simulation.state import Block, Scene
+
+BLOCKS = Block("lower"), Block("upper")
+WIDTH, HEIGHT = BLOCKS[0].width, BLOCKS[0].height
+MIDDLE = np.array([0.3, -0.36, 0.0])
+KINDS = ("rest", "over", "side", "drag", "put")
+NOISES = (0.0, 0.3, 0.8)
+TOPPLED = math.radians(45)
+PICK = "TPMPickAndPlace-v0"
+
+
+class Case(NamedTuple):
+    """Centres of two blocks (2, 3) m, commands (t, 3) m for point P, and the vacuum (t,)."""
+
+    places: FloatArray
+    commands: FloatArray
+    vacuum: Sequence[bool]
+
+
+class Outcome(NamedTuple):
+    """Centres (2, 3) m at the end, and the largest tilt (2,) rad of the blocks."""
+
+    places: FloatArray
+    tilt: FloatArray
+
+    @property
+    def toppled(self) -> bool:
+        """Whether a block has toppled."""
+        return bool((self.tilt > TOPPLED).any())
+
+
+def line(start: FloatArray, end: FloatArray, count: int) -> list[FloatArray]:
+    """Return points from one to another without the first."""
+    return [start + (end - start) * (k + 1) / count for k in range(count)]
+
+
+def draw(kind: str, rng: np.random.Generator) -> Case:
+    """Draw a case of a kind."""
+    draw_one, turn = rng.uniform, rng.uniform(0.0, 2 * math.pi)
+    if kind == "side":
+        turn = 0.5 * math.pi * rng.integers(4)
+    way = np.array([math.cos(turn), math.sin(turn), 0.0])
+    side, up = np.array([-way[1], way[0], 0.0]), np.array([0.0, 0.0, 1.0])
+    off = rng.uniform(0.0, 2 * math.pi)
+    offset = np.array([math.cos(off), math.sin(off), 0.0])
+    lower, count = MIDDLE + 0.5 * HEIGHT * up, int(rng.integers(4, 16))
+    lip = MIDDLE + CUP.length * up  # point P with the lip on the table
+    if kind == "rest":
+        commands = [lip + 0.1 * up] * 18
+        return Case(
+            np.array([lower, lower + HEIGHT * up + draw_one(0.0, 0.024) * offset]),
+            np.array(commands),
+            [False] * 18,
+        )
+    if kind in ("over", "side"):
+        if kind == "over":
+            upper = lower + HEIGHT * up + draw_one(0.0, 0.012) * offset
+            height, end = draw_one(HEIGHT + 0.002, 2 * HEIGHT - 0.002), draw_one(-0.024, 0.01)
+        else:
+            upper = lower + draw_one(WIDTH, WIDTH + 0.01) * way + draw_one(-0.015, 0.015) * side
+            height, end = HEIGHT - draw_one(0.0005, 0.0029), draw_one(-0.005, 0.03)
+        start = lip - 0.045 * way + draw_one(-0.014, 0.014) * side + height * up
+        stop = start + (end + 0.045) * way
+        commands = [start] * 2 + line(start, stop, count) + [stop] * 2 + line(stop, start, 6)
+        commands += [start] * 10
+        return Case(np.array([lower, upper]), np.array(commands), [False] * len(commands))
+    if kind == "drag":
+        upper = lower + HEIGHT * up + draw_one(0.0, 0.01) * offset
+        top = lip + upper - lower + draw_one(-0.006, 0.006) * way
+        top = top + (HEIGHT - draw_one(0.0, 0.002)) * up
+        stop = top + draw_one(0.01, 0.05) * way
+        commands = [top + 0.03 * up, *line(top + 0.03 * up, top, 3), *[top] * 3]
+        commands += [*line(top, stop, count), *[stop] * 2]
+        on = len(commands)
+        commands += [*[stop] * 2, *line(stop, stop + 0.03 * up, 4), *[stop + 0.03 * up] * 8]
+    else:
+        upper = lower + 0.08 * way
+        top = lip + 0.08 * way + (HEIGHT - 0.0005) * up
+        over = lip + draw_one(0.0, 0.026) * offset + (2 * HEIGHT + 0.02) * up
+        down = over - draw_one(0.019, 0.022) * up
+        commands = [top + 0.05 * up, *line(top + 0.05 * up, top, 4), *[top] * 3]
+        commands += [*line(top, top + 0.05 * up, 4), *line(top + 0.05 * up, over, 8), over]
+        commands += [*line(over, down, 5), *[down] * 2]
+        on = len(commands)
+        commands += [*[down] * 2, *line(down, down + 0.04 * up, 4), *[down + 0.04 * up] * 10]
+    vacuum = [True] * on + [False] * (len(commands) - on)
+    return Case(np.array([lower, upper]), np.array(commands), vacuum)
+
+
+def cases(count: int) -> list[Case]:
+    """Draw cases, all kinds in turn."""
+    kinds = [KINDS[k % len(KINDS)] for k in range(count)]
+    return [draw(kind, np.random.default_rng([3, k])) for k, kind in enumerate(kinds)]
+
+
+def play(some: Sequence[Case], engine: str, time_step: float) -> list[Outcome]:
+    """Run cases in an engine."""
+    scene, mount, outcomes = Scene(objects=BLOCKS), WIDE_TPM.mount, []
+    physics = {"time_step": time_step}
+    with closing(make_simulation(scene, engine=engine, machine=WIDE_TPM, physics=physics)) as sim:
+        for places, commands, vacuum in some:
+            points = [tuple(mount.to_paper(command).tolist()) for command in commands]
+            start = {block.name: place for block, place in zip(BLOCKS, places, strict=True)}
+            state, tilt = sim.reset(WIDE_TPM.inverse(points[0]), start), np.zeros(2)
+            for point, on in zip(points[1:], vacuum[1:], strict=True):
+                state = sim.move(point, on)
+                tilt = np.maximum(tilt, np.arccos(np.clip(state.object_axis[:, 2], -1.0, 1.0)))
+            outcomes.append(Outcome(np.array(state.object_position), tilt))
+    return outcomes
+
+
+def agreement(ours: Sequence[Outcome], theirs: Sequence[Outcome]) -> dict[str, float]:
+    """Compare outcomes.
+
+    Returns:
+        ``toppled``, share of cases that topple in both or in neither; of those that topple in
+        neither ``standing``, their number, ``near``, the share within 2 mm, and ``median``, m.
+    """
+    pairs = list(zip(ours, theirs, strict=True))
+    standing = [(a, b) for a, b in pairs if not (a.toppled or b.toppled)]
+    apart = np.array([np.linalg.norm(a.places - b.places, axis=1).max() for a, b in standing])
+    return {
+        "toppled": float(np.mean([a.toppled == b.toppled for a, b in pairs])),
+        "standing": len(standing),
+        "near": float((apart < 0.002).mean()),
+        "median": float(np.median(apart)),
+    }
+
+
+def success(engine: str, time_step: float, noise: float, episodes: int) -> float:
+    """Return the share of successes of the published policy with noise on its actions."""
+    make = partial(gym.make_vec, PICK, engine=engine, physics={"time_step": time_step})
+    policy, ended = tpm_gym.load_policy(PICK), []
+    batch = episodes if engine == "analytic" else 1
+    with closing(make(num_envs=batch)) as envs:
+        for first in range(TEST_SEED, TEST_SEED + episodes, batch):
+            seeds = [first + k for k in range(batch)]
+            rngs = [np.random.default_rng(seed) for seed in seeds]
+            observation, _ = envs.reset(seed=seeds)
+            for _ in range(50):
+                action = np.array(policy.act(observation))
+                action += [rng.normal(0.0, noise, action.shape[1]) for rng in rngs]
+                action = np.clip(action, -1.0, 1.0).astype(np.float32)
+                observation, *_, infos = envs.step(action)
+            ended.extend(infos["is_success"])
+    return float(np.mean(ended))
+
+
+def main() -> None:
+    """Parse the options, run and print."""
+    parser = argparse.ArgumentParser(description="Contact of the analytic engine against others.")
+    parser.add_argument("--cases", type=int, default=100, help="with two blocks")
+    parser.add_argument("--episodes", type=int, default=1000, help="of each row of success")
+    options = parser.parse_args()
+    if options.cases:
+        some = cases(options.cases)
+        reference = play(some, "mujoco", 0.0005)
+        for engine, step in (
+            ("mujoco", 0.00025),
+            ("pybullet", 0.001),
+            ("analytic", 0.004),
+            ("analytic", 0.001),
+        ):
+            print(engine, step, agreement(play(some, engine, step), reference))
+    if options.episodes:
+        for engine in ("analytic", "mujoco", "pybullet"):
+            for step in (0.004, 0.001):
+                found = [success(engine, step, noise, options.episodes) for noise in NOISES]
+                print(engine, step, dict(zip(NOISES, found, strict=True)))
+
+
+if __name__ == "__main__":
+    main()
