@@ -37,13 +37,13 @@ _ROW = np.array([0])
 
 
 class TPMEnv(gym.Env[Observation, Action]):
-    """A 3-translational parallel mechanism over a table.
+    """Environment of a 3-translational parallel mechanism over a table.
 
     ## Ids
 
     ``TPM{Reach,PickAndPlace}{,Joints}{,Dense}-v0``: Cartesian or joint increments, sparse or dense
-    reward. Control at 25 Hz, episodes of 50 steps, truncation only. Numbers below are those of the
-    paper's machine.
+    reward. Control steps of 40 ms, episodes of 50 steps, truncation only. The numbers below are of
+    the paper's machine.
 
     ## Frames
 
@@ -53,7 +53,7 @@ class TPMEnv(gym.Env[Observation, Action]):
 
     ## Action
 
-    Box of [-1, 1]; values beyond are clipped.
+    Box of [-1, 1]; other values are clipped.
 
     | entries | meaning |
     | --- | --- |
@@ -61,16 +61,16 @@ class TPMEnv(gym.Env[Observation, Action]):
     | 0 to 2, joints | increment of theta_1 to theta_3: at most 0.08 rad, P at most as above |
     | 3 (PickAndPlace) | above 0: vacuum on |
 
-    Commands accumulate, are projected into the task region, and are followed along a B-spline. The
+    Commands accumulate and are projected into the task region; P follows them along a B-spline. The
     region is -0.24 <= x <= 0.12, -0.046 <= y <= -0.012, 0.067 <= z <= 0.31 m for P, world. Small
-    turns of the joints move P far along y, so the limit for P slows most random joint actions down
-    to a tenth, all three joints together.
+    turns of the joints move P far along y. Therefore the limit for P slows most random joint
+    actions down to a tenth, all three joints together.
 
     ## Observation
 
     A dictionary. ``achieved_goal`` and ``desired_goal`` are (3,) m in the world frame: point P
     (Reach) or the centre of the block (PickAndPlace). ``observation``, 9 numbers (Reach) or 21,
-    holds what follows, each scaled to order one (``env.unwrapped.task.decode`` gives SI units):
+    has these entries, each scaled to order one (``env.unwrapped.task.decode`` gives SI units):
 
     | entry | size | meaning |
     | --- | --- | --- |
@@ -83,8 +83,8 @@ class TPMEnv(gym.Env[Observation, Action]):
     | object_tilt | 2 | x and y of the object's axis |
     | object_held | 1 | share of the vacuum that holds the object, by a gauge |
 
-    The object's entries exist in PickAndPlace only. The robot's come from the three encoders alone,
-    never from the simulator's platform.
+    Entries of the object exist in PickAndPlace only. Those of the robot come from the three encoders
+    alone, never from the simulated platform.
 
     ## Reward
 
@@ -97,14 +97,14 @@ class TPMEnv(gym.Env[Observation, Action]):
     | singularity | -penalty_weight x (1 - (c / 0.08)^4) where c = 1/cond(J) < 0.08, else 0 |
     | approach | minus half the distance from cup to block in units of 0.1 m |
 
-    With an empty info, as SB3's HerReplayBuffer calls it, ``compute_reward`` gives the goal term
-    alone; ``tpm_gym.learning.PenaltyHerReplayBuffer`` or ``copy_info_dict=True`` keep the others.
+    SB3's HerReplayBuffer calls ``compute_reward`` with an empty info, which gives the goal term
+    alone. ``tpm_gym.learning.PenaltyHerReplayBuffer`` and ``copy_info_dict=True`` keep the others.
 
     ## Start
 
-    The arm at rest at home, the block (square, 36 mm wide, 30 mm high, 50 g) flat on the table, the
-    goal at least 30 mm away from where the block (or P) starts. Goals and objects are sampled where
-    1/cond(J) >= 0.08.
+    The arm is at rest at home, and the block (square, 36 mm wide, 30 mm high, 50 g) flat on the
+    table. The goal is at least 30 mm away from the start of the block (or of P). Goals and objects
+    are sampled where 1/cond(J) >= 0.08.
     ``reset(options={"object": (x, y, z), "goal": (x, y, z)})`` chooses them instead; a block that
     starts above the table falls.
 
@@ -113,57 +113,56 @@ class TPMEnv(gym.Env[Observation, Action]):
     | key | meaning |
     | --- | --- |
     | ``is_success`` | whether the goal is achieved |
-    | ``closure_error`` | largest gap of the simulated loops, m; 0 in closed form, by construction |
-    | ``vacuum`` | how far the pressure in the cup is below the ambient's, Pa |
+    | ``closure_error`` | largest gap of the simulated loops, m; always 0 in the analytic engine |
+    | ``vacuum`` | pressure in the cup below the ambient pressure, Pa |
     | ``conditioning`` | 1/cond(J) by the encoders |
-    | ``singularity_penalty`` | before weighting, 0 to 1 |
+    | ``singularity_penalty`` | penalty before weighting, 0 to 1 |
     | ``assembly_mode_changed`` | whether the platform passed y = 0, a parallel singularity |
-    | ``working_mode_changed`` | whether it passed y = l7, a serial one |
-    | ``object_lost`` | whether an object is off the table or where the robot cannot get to |
+    | ``working_mode_changed`` | whether it passed y = l7, a serial singularity |
+    | ``object_lost`` | whether an object is off the table or out of reach |
     | ``reward_terms`` | the terms above by name; they sum to the reward |
-    | ``randomisation`` | in a reset's, with that option: what differs in the episode |
+    | ``randomisation`` | after a reset with that option: the episode's plant |
 
     An environment that is made as ``TPMEnv(...)`` has no time limit; ``gym.make`` adds it.
 
-    Past a parallel singularity the encoders no longer tell where the platform is. No action of the
-    nominal robot with ideal drives leads past one; if it happens, the penalty is 1 and the episode
-    truncated.
+    Past a parallel singularity the encoders no longer determine the platform's position. Then the
+    penalty is 1 and the episode is truncated. No action of the nominal robot with ideal drives
+    leads past one.
 
     Args:
         task: Name of a task (``"reach"``, ``"pick_and_place"``, or one that
-            :func:`tpm_gym.register_task` knows), a :class:`~tpm_gym.tasks.Task` class, or a task; a
-            task that is made has its own machine, reward, goals and penalty weight, and takes none.
+            :func:`tpm_gym.register_task` knows), a :class:`~tpm_gym.tasks.Task` class, or a task,
+            which keeps its own machine, reward, goals and penalty weight.
         control: ``"cartesian"`` or ``"joints"``.
         reward: ``"sparse"`` (None too) or ``"dense"``.
-        engine: ``"pybullet"``, ``"analytic"`` (the closed form), ``"mujoco"`` (with the extra of
-            that name; neither of these two opens a window), or a name that
-            :func:`tpm_gym.register_engine` knows.
+        engine: ``"pybullet"``, ``"analytic"``, ``"mujoco"`` (with the extra of that name), or a name
+            that :func:`tpm_gym.register_engine` knows. Only PyBullet opens a window.
         machine: ``"paper"`` (None too), ``"wide"``, a name that :func:`tpm_gym.register_machine`
             knows, or a :class:`~tpm_gym.Machine`; a spec that goes through JSON needs a name.
-        goals: ``"sampled"`` (None too), or ``"tempting"``: the goal, and the start of the block,
-            lie next to the singularity, which not every machine has near its goals.
+        goals: ``"sampled"`` (None too), or ``"tempting"``: goal and start of the block lie next to
+            the singularity, for machines whose goals are near one.
         penalty_weight: Weight of the singularity penalty, None for 1; 0 switches it off.
-        drive: How the motors follow their references. ``"ideal"`` (None too): exactly, with up to
+        drive: Drive of the motors. ``"ideal"`` (None too) follows references exactly, with up to
             100 N m at any speed. ``"servo"``, a :class:`~tpm_gym.simulation.Servo` or a mapping of
-            its attributes: with 7500 N m/rad, 60 N m s/rad, the torques of the nominal motion fed
-            forward, and 100 N m up to 18.75 rad/s, which fall to none at 25 rad/s.
-        randomisation: What differs from the nominal machine, drawn anew for each episode: a
-            :class:`~tpm_gym.simulation.Randomisation` or a mapping of its attributes. Where
-            disturbed encoders report angles that cannot be assembled, position and velocity keep
-            their last values.
-        physics: Numerical settings of the engine, or a mapping of them: for all of them
-            ``time_step``, s; more in ``tpm_gym.simulation.{bullet,mujoco,analytic}.physics``.
+            its attributes has 7500 N m/rad, 60 N m s/rad, the torques of the nominal motion fed
+            forward, and 100 N m up to 18.75 rad/s, which fall to zero at 25 rad/s.
+        randomisation: Differences from the nominal machine, drawn for each episode: a
+            :class:`~tpm_gym.simulation.Randomisation` or a mapping of its attributes. Position and
+            velocity keep their last values while disturbed encoders report joint positions that
+            cannot be assembled.
+        physics: Numerical settings of the engine, or a mapping of them. All have ``time_step``, s;
+            the others are in ``tpm_gym.simulation.{bullet,mujoco,analytic}.physics``.
         render_mode: None, ``"rgb_array"`` or ``"human"``.
-        renderer: What draws pictures; for PyBullet ``"tiny"`` (any machine) or ``"egl"`` (GPU),
-            for MuJoCo ``"egl"``, ``"osmesa"`` or ``"glfw"``; None for what works.
-        width: Of rendered pictures, pixels.
-        height: Of rendered pictures, pixels.
+        renderer: Renderer of pictures; for PyBullet ``"tiny"`` (any machine) or ``"egl"`` (GPU),
+            for MuJoCo ``"egl"``, ``"osmesa"`` or ``"glfw"``; None for the first that works.
+        width: Width of pictures, pixels.
+        height: Height of pictures, pixels.
 
     Raises:
         ConfigurationError: If an option is out of range.
         MissingPackageError: If the engine's package is not installed.
 
-    An environment keeps some 29 MB, 28 of them PyBullet's client, until it is closed or dropped.
+    An environment keeps some 29 MB, 28 of them PyBullet's client, until it is closed or garbage-collected.
 
     ## Version history
 
