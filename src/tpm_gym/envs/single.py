@@ -83,7 +83,7 @@ class TPMEnv(gym.Env[Observation, Action]):
     | object_tilt | 2 | x and y of the object's axis |
     | object_held | 1 | share of the vacuum that holds the object, by a gauge |
 
-    Entries of the object exist in PickAndPlace only. Those of the robot come from the three encoders
+    Entries of the object exist in PickAndPlace only. Those of the robot come from the encoders
     alone, never from the simulated platform.
 
     ## Reward
@@ -135,8 +135,8 @@ class TPMEnv(gym.Env[Observation, Action]):
             which keeps its own machine, reward, goals and penalty weight.
         control: ``"cartesian"`` or ``"joints"``.
         reward: ``"sparse"`` (None too) or ``"dense"``.
-        engine: ``"pybullet"``, ``"analytic"``, ``"mujoco"`` (with the extra of that name), or a name
-            that :func:`tpm_gym.register_engine` knows. Only PyBullet opens a window.
+        engine: ``"pybullet"``, ``"analytic"``, ``"mujoco"`` (with the extra of that name), or a
+            name that :func:`tpm_gym.register_engine` knows. Only PyBullet opens a window.
         machine: ``"paper"`` (None too), ``"wide"``, a name that :func:`tpm_gym.register_machine`
             knows, or a :class:`~tpm_gym.Machine`; a spec that goes through JSON needs a name.
         goals: ``"sampled"`` (None too), or ``"tempting"``: goal and start of the block lie next to
@@ -162,7 +162,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         ConfigurationError: If an option is out of range.
         MissingPackageError: If the engine's package is not installed.
 
-    An environment keeps some 29 MB, 28 of them PyBullet's client, until it is closed or garbage-collected.
+    An environment keeps some 29 MB, 28 of them PyBullet's client, until it is closed or deleted.
 
     ## Version history
 
