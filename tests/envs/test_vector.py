@@ -192,10 +192,6 @@ def test_misuse_is_refused(
 
 
 def test_options_are_refused_by_name() -> None:
-    stack = type("Two", (tpm_gym.tasks.PickAndPlace,), {})
-    stack.scene = tpm_gym.simulation.Scene(
-        objects=(tpm_gym.simulation.Block("object"), tpm_gym.simulation.Block("other"))
-    )
     for options, message in (
         ({"num_envs": 0}, "1 or more"),
         ({"max_episode_steps": 0}, "1 or more"),
@@ -206,7 +202,6 @@ def test_options_are_refused_by_name() -> None:
         ({"physics": {"time_step": 1e-12}}, "at least 1e-06 s"),
         ({"physics": {"torques": "all"}}, "'every'"),
         ({"machine": "round"}, "'paper', 'wide'"),
-        ({"task": stack}, "one object"),
     ):
         with pytest.raises(ConfigurationError, match=message):
             TPMVectorEnv(**{"task": "reach", **options})

@@ -55,7 +55,7 @@ class AnalyticSimulation:
     """So many robots, each over a table of its own, all at the same time step.
 
     Args:
-        scene: What stands on each table besides the robot: one object at most.
+        scene: What stands on each table besides the robot.
         count: How many.
         machine: The nominal machine, which has a :meth:`~tpm_gym.Machine.batch`.
         physics: A :class:`Physics`, or a mapping of its attributes.

@@ -80,10 +80,11 @@ def _push(body: Record, arm: Vector, impulse: Vector, sign: float) -> None:
     velocity[0] += sign * light[0] * impulse[0]
     velocity[1] += sign * light[1] * impulse[1]
     velocity[2] += sign * light[2] * impulse[2]
-    turn = _turned(body, cross(arm, impulse))
-    spin[0] += sign * turn[0]
-    spin[1] += sign * turn[1]
-    spin[2] += sign * turn[2]
+    if body["across"] > 0:  # the cup does not turn
+        turn = _turned(body, cross(arm, impulse))
+        spin[0] += sign * turn[0]
+        spin[1] += sign * turn[1]
+        spin[2] += sign * turn[2]
 
 
 @compiled
