@@ -9,7 +9,6 @@ import pytest
 from episodes import EVERYTHING
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-import tpm_gym
 from tpm_gym.envs.vector import TPMVectorEnv
 from tpm_gym.errors import (
     ActionError,

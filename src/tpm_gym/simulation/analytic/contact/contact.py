@@ -1,7 +1,7 @@
 """Objects on a table, the cup above them, and the vacuum between: many tables, each by itself.
 
-A time step (:mod:`.stepping`) finds contacts (:mod:`.collision`), solves them (:mod:`.solver`), moves
-the objects, and lets the vacuum take or drop one (:mod:`.grasp`).
+A time step (:mod:`.stepping`) finds contacts (:mod:`.collision`), solves them (:mod:`.solver`),
+moves the objects, and lets the vacuum take or drop one (:mod:`.grasp`).
 
 Left out: an object stands on the table as long as its centre is over it, and then falls past it;
 the stem and the platform pass through objects; the cup's spring has no end stop; the lip passes

@@ -16,7 +16,7 @@ from tpm_gym.simulation.analytic.contact.vectors import cross, dot, plus, put, t
 
 __all__ = ["Motor", "prepare", "solve", "still"]
 
-_SWEEPS, _CALM_SWEEPS = 20, 12
+_SWEEPS = 12
 _HASTE = 1.3  # factor of each step of a normal impulse; below 2 sweeps converge
 _STILL, _UNTURNED = 5e-4, 0.01  # m/s, rad/s: slower objects at rest stay there
 _TOLERANCE = 3e-4  # m/s; a sweep that changes less is the last one
@@ -189,7 +189,7 @@ def solve(contacts: Records, count: int, bodies: Records, motor: Motor, calm: bo
             forces have been found then.
     """
     spring, cup = 0.0, bodies[0]["velocity"]
-    for sweep in range(_CALM_SWEEPS if calm else _SWEEPS):
+    for sweep in range(_SWEEPS):
         off = False
         wanted = spring + (motor.speed - cup[2]) * motor.mass
         wanted = max(wanted, -motor.limit)  # upwards the cup is on its stop
