@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from contact_agreement import agreement, cases, play, success
 
 from tpm_gym.arrays import FloatArray
 from tpm_gym.learning.policies import load_policy
@@ -90,3 +91,19 @@ def test_the_block_goes_where_pybullet_takes_it(policy: str, median: float, most
     assert apart.max() < most
     held = column(states, episodes, "held")
     assert (np.stack([state.held for state, _ in found], axis=1) == held).mean() > 0.99
+
+
+@pytest.mark.slow
+def test_two_blocks_end_where_they_do_in_mujoco() -> None:
+    some = cases(40)
+    found = agreement(play(some, "analytic", 1 / 250), play(some, "mujoco", 1 / 2000))
+    assert found["toppled"] >= 0.9
+    assert found["near"] >= 0.9  # 1.0 of 100
+    assert found["standing"] > 20
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", [0.0, 0.3, 0.8])
+def test_success_hardly_depends_on_the_time_step(noise: float) -> None:
+    once, finer = (success("analytic", step, noise, 1000) for step in (1 / 250, 1 / 1000))
+    assert once == pytest.approx(finer, abs=0.04)  # 0.015 apart; 0.018 is the standard error

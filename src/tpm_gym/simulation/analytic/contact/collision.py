@@ -12,8 +12,8 @@ import math
 from typing import NamedTuple
 
 from tpm_gym.arrays import FloatArray, Vector
+from tpm_gym.compiling import compiled
 from tpm_gym.mechanism.cup import CUP
-from tpm_gym.simulation.analytic.compiling import compiled
 from tpm_gym.simulation.analytic.contact.state import (
     LIP_SLOTS,
     PAIR_SLOTS,
@@ -192,6 +192,9 @@ def _collide_cylinder(
     box: _Box, lip: Vector, near: float, contacts: Records, place: _Place, pair: _Pair
 ) -> int:
     """Add contacts of the lip with an object."""
+    under = lip[2] - box.middle[2] - _extent(box, _UP)
+    if under > near:
+        return place[0]
     away = plus(box.middle, (lip[0], lip[1], lip[2] + CUP.bellows / 2), -1.0)
     face, apart = -1, -math.inf
     for k in range(3):
@@ -200,7 +203,6 @@ def _collide_cylinder(
         gap = abs(dot(box.frame[k], away)) - box.half[k] - thick
         if gap > apart + _LITTLE:
             face, apart = k, gap
-    under = lip[2] - box.middle[2] - _extent(box, _UP)
     if under > apart + _FLAT:
         face, apart = 3, under  # the lip's own face
     point = _nearest(box, lip)

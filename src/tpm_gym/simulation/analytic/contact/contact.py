@@ -1,7 +1,7 @@
 """Objects on a table, the cup above them, and the vacuum between: many tables, each by itself.
 
-A time step (:mod:`.stepping`) finds contacts (:mod:`.collision`), solves them (:mod:`.solver`), moves
-the objects, and lets the vacuum take or drop one (:mod:`.grasp`).
+A time step (:mod:`.stepping`) finds contacts (:mod:`.collision`), solves them (:mod:`.solver`),
+moves the objects, and lets the vacuum take or drop one (:mod:`.grasp`).
 
 Left out: an object stands on the table as long as its centre is over it, and then falls past it;
 the stem and the platform pass through objects; the cup's spring has no end stop; the lip passes
@@ -69,7 +69,6 @@ class Contact:
         self._objects = np.zeros((count, number), OBJECT)
         self._cups = np.zeros(count, CUP_STATE)
         self._forces = np.zeros((count, slots(number), 3))
-        self._work = work_for(number)
         everything = np.arange(count)
         self.alter(everything, np.ones(count), np.ones(count))
         middle = np.zeros((count, number, 3))
@@ -122,7 +121,9 @@ class Contact:
         force = np.zeros((len(rows), path.shape[1] - 2, 3))
         if self._blocks:
             states = self._objects, self._cups, self._forces
-            advance(states, rows, path, vacuum_on, self._setting, self._work, force)
+            # Threads may advance different rows at the same time, so each call has its own
+            work = work_for(len(self._blocks))
+            advance(states, rows, path, vacuum_on, self._setting, work, force)
         return force
 
     def carried(self, rows: Any) -> FloatArray:

@@ -4,15 +4,24 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from tpm_gym.arrays import Vector
+from tpm_gym.arrays import Vector, rotate
+from tpm_gym.compiling import compilable, compiled
 from tpm_gym.mechanism.cup import CUP, sealed
 from tpm_gym.mechanism.mount import GRAVITY
-from tpm_gym.simulation.analytic.compiling import compiled
 from tpm_gym.simulation.analytic.contact.state import Record, Records, Setting
 from tpm_gym.simulation.analytic.contact.vectors import length, level_length, plus, put, three
-from tpm_gym.simulation.vacuum import CLEARANCE, Hold, Load, hold_after
+from tpm_gym.simulation.vacuum import (
+    CLEARANCE,
+    Hold,
+    Load,
+    hold_after,
+    holds,
+    pressure_after,
+)
 
 __all__ = ["CUP_MASS", "Way", "breathe", "carry", "lip_of"]
+
+compilable(rotate, sealed, pressure_after, holds, hold_after)
 
 CUP_MASS = CUP.link("platform", (0.0, 0.0, 0.0)).mass
 _DOWN: Vector = (0.0, 0.0, -1.0)

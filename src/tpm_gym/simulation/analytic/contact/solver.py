@@ -10,13 +10,13 @@ import math
 from typing import NamedTuple
 
 from tpm_gym.arrays import FloatArray, Vector
-from tpm_gym.simulation.analytic.compiling import compiled
+from tpm_gym.compiling import compiled
 from tpm_gym.simulation.analytic.contact.state import Record, Records
 from tpm_gym.simulation.analytic.contact.vectors import cross, dot, plus, put, three
 
 __all__ = ["Motor", "prepare", "solve", "still"]
 
-_SWEEPS, _CALM_SWEEPS = 20, 12
+_SWEEPS = 12
 _HASTE = 1.3  # factor of each step of a normal impulse; below 2 sweeps converge
 _STILL, _UNTURNED = 5e-4, 0.01  # m/s, rad/s: slower objects at rest stay there
 _TOLERANCE = 3e-4  # m/s; a sweep that changes less is the last one
@@ -80,10 +80,11 @@ def _push(body: Record, arm: Vector, impulse: Vector, sign: float) -> None:
     velocity[0] += sign * light[0] * impulse[0]
     velocity[1] += sign * light[1] * impulse[1]
     velocity[2] += sign * light[2] * impulse[2]
-    turn = _turned(body, cross(arm, impulse))
-    spin[0] += sign * turn[0]
-    spin[1] += sign * turn[1]
-    spin[2] += sign * turn[2]
+    if body["across"] > 0:  # the cup does not turn
+        turn = _turned(body, cross(arm, impulse))
+        spin[0] += sign * turn[0]
+        spin[1] += sign * turn[1]
+        spin[2] += sign * turn[2]
 
 
 @compiled
@@ -188,7 +189,7 @@ def solve(contacts: Records, count: int, bodies: Records, motor: Motor, calm: bo
             forces have been found then.
     """
     spring, cup = 0.0, bodies[0]["velocity"]
-    for sweep in range(_CALM_SWEEPS if calm else _SWEEPS):
+    for sweep in range(_SWEEPS):
         off = False
         wanted = spring + (motor.speed - cup[2]) * motor.mass
         wanted = max(wanted, -motor.limit)  # upwards the cup is on its stop

@@ -8,9 +8,9 @@ from __future__ import annotations
 import math
 
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector
+from tpm_gym.compiling import compiled, kept
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.mount import GRAVITY
-from tpm_gym.simulation.analytic.compiling import SOURCES, compiled, kept
 from tpm_gym.simulation.analytic.contact.collision import collide_lip, collide_objects
 from tpm_gym.simulation.analytic.contact.grasp import CUP_MASS, Way, breathe, carry, lip_of
 from tpm_gym.simulation.analytic.contact.solver import Motor, prepare, solve, still
@@ -50,7 +50,6 @@ def advance(
     setting: Setting,
     work: Work,
     push: FloatArray,
-    sources: str = SOURCES,
 ) -> None:
     """Run K time steps of some tables.
 
@@ -62,7 +61,6 @@ def advance(
         setting: Constants.
         work: Workspace.
         push: (r, K, 3) N, world, on the platform; written where it is not zero.
-        sources: Key of the compiled function on disk.
     """
     for i in range(len(rows)):
         row, points = rows[i], path[i]

@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from tpm_gym.arrays import Vector
-from tpm_gym.simulation.analytic.compiling import compiled
+from tpm_gym.compiling import compiled
 
 __all__ = [
     "Frame",
