@@ -26,7 +26,7 @@ from tpm_gym.arrays import FloatArray
 from tpm_gym.learning.rollout import TEST_SEED
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.tpm import WIDE_TPM
-from tpm_gym.simulation.simulation import make_simulation
+from tpm_gym.simulation.simulation import Simulation
 from tpm_gym.simulation.state import Block, Scene
 
 BLOCKS = Block("lower"), Block("upper")
@@ -126,15 +126,16 @@ def play(some: Sequence[Case], engine: str, time_step: float) -> list[Outcome]:
     """Run cases in an engine."""
     scene, mount, outcomes = Scene(objects=BLOCKS), WIDE_TPM.mount, []
     physics = {"time_step": time_step}
-    with closing(make_simulation(scene, engine=engine, machine=WIDE_TPM, physics=physics)) as sim:
+    with closing(Simulation(scene, engine=engine, machine=WIDE_TPM, physics=physics)) as sim:
         for places, commands, vacuum in some:
-            points = [tuple(mount.to_paper(command).tolist()) for command in commands]
-            start = {block.name: place for block, place in zip(BLOCKS, places, strict=True)}
-            state, tilt = sim.reset(WIDE_TPM.inverse(points[0]), start), np.zeros(2)
+            points, tilt = mount.to_paper(commands), np.zeros(2)
+            start = {block.name: place[None] for block, place in zip(BLOCKS, places, strict=True)}
+            sim.reset(np.array([0]), WIDE_TPM.inverse(points[0]), start)
             for point, on in zip(points[1:], vacuum[1:], strict=True):
-                state = sim.move(point, on)
-                tilt = np.maximum(tilt, np.arccos(np.clip(state.object_axis[:, 2], -1.0, 1.0)))
-            outcomes.append(Outcome(np.array(state.object_position), tilt))
+                sim.move(point[None], np.array([on]))
+                axis = sim.state().object_axis[0]
+                tilt = np.maximum(tilt, np.arccos(np.clip(axis[:, 2], -1.0, 1.0)))
+            outcomes.append(Outcome(sim.state().object_position[0], tilt))
     return outcomes
 
 

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
+from tpm_gym.compiling import compilable, compiled
 from tpm_gym.mechanism.cup import CUP
-from tpm_gym.simulation.analytic.compiling import compiled
 from tpm_gym.simulation.vacuum import (
     EMPTY,
     Hold,
@@ -18,6 +18,7 @@ from tpm_gym.simulation.vacuum import (
     pressure_after,
 )
 
+compilable(hold_after, holds, pressure_after)
 STEP = 1 / 250
 FULL = Hold(0, CUP.vacuum)
 NOTHING = Load()

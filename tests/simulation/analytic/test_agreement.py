@@ -20,15 +20,15 @@ REACH, PICK = "TPMReach-v0", "TPMPickAndPlace-v0"
 def played(env_id: str, policy: str, episodes: int, **options: Any) -> tuple[Any, FloatArray]:
     """States of all steps in PyBullet, and the actions (episodes, steps, size)."""
     states, taken = [], []
-    with closing(gym.make(env_id, **options)) as env:
-        acting, inner = load_policy(policy, env), env.unwrapped
+    with closing(gym.make_vec(env_id, num_envs=1, **options)) as env:
+        acting = load_policy(policy, env)
         for seed in range(episodes):
             observation, _ = env.reset(seed=seed)
-            acting.reset(observation, seed)
+            acting.reset(observation, [seed])
             for _ in range(50):
                 taken.append(acting.act(observation))
                 observation, *_ = env.step(taken[-1])
-                states.append((inner.state, observation["observation"]))
+                states.append((env.state.take(0), observation["observation"][0]))
     return states, np.array(taken).reshape(episodes, 50, -1)
 
 

@@ -10,18 +10,20 @@ import sys
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
 import pytest
+from alone import Alone
+from numpy.typing import ArrayLike
 
 from tpm_gym.arrays import FloatArray, Vector
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.mount import GRAVITY
 from tpm_gym.mechanism.tpm import WIDE_TPM
 from tpm_gym.simulation.analytic.contact import Contact, Reading
-from tpm_gym.simulation.drives import Reference
-from tpm_gym.simulation.simulation import Simulation, spline_weights
+from tpm_gym.simulation.engine import spline_weights
 from tpm_gym.simulation.state import Block, Scene
 
 STEP, STEPS = 1 / 250, 10
@@ -86,19 +88,18 @@ def wait(contact: Contact, steps: int) -> Run:
 
 
 @cache
-def simulation() -> Simulation:
+def simulation() -> Alone:
     """MuJoCo at 1 ms, with room to move in all directions."""
     scene, physics = Scene(objects=(BLOCK,)), {"time_step": STEP / 4}
-    return Simulation(scene, engine="mujoco", machine=WIDE_TPM, physics=physics)
+    return Alone(scene, engine="mujoco", machine=WIDE_TPM, physics=physics)
 
 
 def compared(commands: list[FloatArray], on: list[bool]) -> tuple[Run, Run]:
     """One block under a cup that is led by commands: ours, and MuJoCo's."""
     sim, mount = simulation(), WIDE_TPM.mount
 
-    def theta(point: FloatArray) -> Vector:
-        x, y, z = mount.to_paper(point).tolist()
-        return WIDE_TPM.inverse((x, y, z))
+    def theta(points: ArrayLike) -> FloatArray:
+        return WIDE_TPM.inverse(mount.to_paper(points))
 
     path, switched = spline(commands), np.repeat(on[: len(commands) - 1], STEPS)
     sim.reset(theta(path[0]), {"object": MIDDLE})
@@ -106,10 +107,11 @@ def compared(commands: list[FloatArray], on: list[bool]) -> tuple[Run, Run]:
     for k, vacuum in enumerate(switched):
         now, then = path[k + 1], path[k + 2]
         way = [now + (then - now) * part / 4 for part in range(1, 5)]
-        sim.engine.advance([Reference(theta(point)) for point in way], bool(vacuum))
-        (((place, turn), _),) = sim.engine.objects()
-        tilt = 2 * math.asin(min(1.0, math.hypot(*turn[:2])))
-        seen.append(([place], [tilt], sim.engine.hold().which, np.zeros(3)))
+        joints = theta(way)[None]
+        sim.engine.advance(SimpleNamespace(joints=lambda joints=joints: joints), [bool(vacuum)])
+        ends = sim.engine.read()
+        tilt = 2 * math.asin(min(1.0, math.hypot(*ends.object_quaternion[0, 0, :2])))
+        seen.append((ends.object_position[0], [tilt], ends.held[0], np.zeros(3)))
     theirs = Run(*(np.array(part) for part in zip(*seen, strict=True)))
     return lead(table([MIDDLE]), path, switched), theirs
 
@@ -368,11 +370,10 @@ def digest() -> str:
 
 
 def test_compiled_code_gives_the_bits_that_python_gives() -> None:
-    script = (
-        "import sys; sys.path.insert(0, sys.argv[1]); import test_contact as t; print(t.digest())"
-    )
+    here = Path(__file__).parent
+    script = "import sys; sys.path[:0] = sys.argv[1:]; import test_contact as t; print(t.digest())"
     plain = subprocess.run(
-        [sys.executable, "-c", script, Path(__file__).parent],
+        [sys.executable, "-c", script, here, here.parents[1] / "support"],
         env=os.environ | {"NUMBA_DISABLE_JIT": "1"},
         check=True,
         capture_output=True,
