@@ -99,11 +99,12 @@ def spline_points(commands: FloatArray, weights: FloatArray) -> FloatArray:
     """Compute points (n, k, 3) along splines, from commands (n, 3, 3) and weights (k, 3)."""
     points = np.empty((len(commands), len(weights), 3))
     for row in range(len(commands)):
-        one, two, three = commands[row]
-        for k in range(len(weights)):
-            u, v, w = weights[k]
-            for axis in range(3):
-                points[row, k, axis] = u * one[axis] + v * two[axis] + w * three[axis]
+        for axis in range(3):
+            one, two, three = commands[row, 0, axis], commands[row, 1, axis], commands[row, 2, axis]
+            for k in range(len(weights)):
+                points[row, k, axis] = (
+                    weights[k, 0] * one + weights[k, 1] * two + weights[k, 2] * three
+                )
     return points
 
 

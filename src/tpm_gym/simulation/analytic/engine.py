@@ -147,7 +147,6 @@ class AnalyticEngine:
         of which one cannot.
         """
         objects, step = bool(self._scene.objects), self.time_step
-        saved = self._contact.save(self._rows) if objects else None
         if self._exact:
             theta = path.joints(self._tail)
             points = path.points(self._steps if objects else 2)
@@ -159,6 +158,9 @@ class AnalyticEngine:
             late = self._behind | (self._mode_left != 0)
             late |= ~self._machine.same_side(points).all(axis=1)
         start = self._theta, self._rates, self._position, self._before, self._force, self._torque
+        # Without torques, it is known already which machines are computed again.
+        again = objects and (self.physics.torques != "none" or late.any())
+        saved = self._contact.copy() if again else None
         push = None
         if objects:
             ways = ways_in_world(self._before, self._position, points, self._turn, self._origin)
@@ -183,7 +185,7 @@ class AnalyticEngine:
         ):
             getattr(self, name)[rows] = values[rows]
         if saved is not None:
-            self._contact.restore(rows, saved[rows])
+            self._contact.repeat(rows, saved)
         joints = np.ascontiguousarray(path.joints()[rows].swapaxes(0, 1))
         steps = IdealSteps(joints, self._effort[rows], self.time_step)
         self._march(rows, steps, vacuum)
@@ -193,9 +195,16 @@ class AnalyticEngine:
         """Run a control period of some machines by forward dynamics."""
         on = vacuum[rows]
 
-        def touch(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-            push = self._contact.advance(rows, points * self._turn + self._origin, on)[:, -1]
+        def touch(
+            before: FloatArray, now: FloatArray, then: FloatArray
+        ) -> tuple[FloatArray, FloatArray]:
+            if not self._scene.objects:
+                return nothing
+            way = ways_in_world(before, now, then[:, None], self._turn, self._origin)
+            push = self._contact.advance(rows, way, on)[:, 0]
             return push * self._turn, self._contact.carried(rows)
+
+        nothing = np.zeros((len(rows), 3)), np.zeros(len(rows))
 
         course = Course(
             self._theta[rows], self._rates[rows], self._torque[rows], self._position[rows],

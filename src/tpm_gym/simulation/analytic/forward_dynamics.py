@@ -10,8 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tpm_gym.arrays import BoolArray, FloatArray
-from tpm_gym.mechanism.machine import Machine, Motion
-from tpm_gym.simulation.analytic.steps import driven_by_torque, driven_ideally, felt
+from tpm_gym.mechanism.machine import Machine
+from tpm_gym.simulation.analytic.steps import (
+    driven_by_torque,
+    driven_ideally,
+    felt,
+    modes_left,
+    moved,
+)
 from tpm_gym.simulation.drives import References, ServoDrives
 
 __all__ = ["Course", "IdealSteps", "ServoSteps", "Steps", "march"]
@@ -105,9 +111,9 @@ class ServoSteps:
         return rates, torque
 
 
-Touch = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
-"""From P (r, 3, 3) m a time step ago, now and at the end of the time step to the force (r, 3) N on
-P and the mass (r,) kg that moves with it."""
+Touch = Callable[[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+"""From P (r, 3) m a time step ago, now and at the end of the time step to the force (r, 3) N on P
+and the mass (r,) kg that moves with it."""
 
 
 def march(
@@ -141,40 +147,21 @@ def march(
         travel = course.position - course.before
         mass, load = felt(at.mass, at.bias, at.jacobian, course.force, course.carried, travel, step)
         rates, torque = steps.move(index, course, mass, load)
-        theta = course.theta + step * rates
-        expected = course.position + step * _along(at.jacobian, rates)
-        gain = _along(at.jacobian, rates - course.rates) / step
+        theta, expected, drifting, gain = moved(
+            course.theta, course.rates, rates, course.position, course.before, at.jacobian, step
+        )
         at = machine.motion(theta, rates, built)
-        side = machine.same_side(expected) & machine.same_side(course.position + travel)
-        mode_left = _mode_left(at, side, course.mode_left)
+        side = machine.same_side(expected) & machine.same_side(drifting)
+        mode_left, anywhere = modes_left(at.position, side, at.working, course.mode_left)
         new = theta, rates, torque, at.position, gain
-        if mode_left.any():
+        if anywhere:
             gone = (mode_left != 0)[:, None]
             old = course.theta, course.rates, course.torque, course.position, np.zeros_like(gain)
             new = tuple(np.where(gone, *pair) for pair in zip(old, new, strict=True))  # type: ignore[assignment]
             at = machine.motion(new[0], new[1], built)
-        push, carried = touch(np.stack([course.before, course.position, new[3]], axis=1))
+        push, carried = touch(course.before, course.position, new[3])
         course.before, course.mode_left, course.carried = course.position, mode_left, carried
         course.theta, course.rates, course.torque, course.position, gain = new
         course.force = push + carried[:, None] * gain
         torques[index] = course.torque
     return torques
-
-
-def _along(jacobian: FloatArray, rates: FloatArray) -> FloatArray:
-    """Return J theta_dot, (r, 3)."""
-    a, b, c = rates.T[..., None]
-    along: FloatArray = jacobian[:, :, 0] * a + jacobian[:, :, 1] * b + jacobian[:, :, 2] * c
-    return along
-
-
-def _mode_left(at: Motion, side: BoolArray, before: NDArray[np.int8]) -> NDArray[np.int8]:
-    """Return which mode each machine has left, (r,).
-
-    Beyond a parallel singularity the joints turn back, so that the positions of the mirrored
-    assembly exist too. Only ``side`` (r,) tells them apart: whether P was about to stay on its
-    side, by the joint velocities and by its own velocity.
-    """
-    finite = np.isfinite(at.position).all(axis=1) & np.isfinite(at.mass).all(axis=(1, 2))
-    found = np.where(~finite | ~side, 1, np.where(at.working, 0, 2)).astype(np.int8)
-    return np.where(before, before, found)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tpm_gym.arrays import BoolArray, FloatArray
 from tpm_gym.compiling import compiled, kept
 from tpm_gym.simulation.compiled import inverted
 
-__all__ = ["driven_by_torque", "driven_ideally", "felt", "ways_in_world"]
+__all__ = ["driven_by_torque", "driven_ideally", "felt", "modes_left", "moved", "ways_in_world"]
 
 _CREEP = 2e-5  # m/s, at which friction gives way, instead of not at all
 _SIGNS = np.array([(i, j, k) for i in (0, 1, -1) for j in (0, 1, -1) for k in (0, 1, -1)], float)
@@ -81,14 +82,96 @@ def driven_by_torque(
         step: s.
         new_rates: (r, 3) rad/s, at the end of the time step; written.
     """
-    impulse, limit = np.empty(3), np.empty(3)
+    impulse, limit, inverse = np.empty(3), np.empty(3), np.empty((3, 3))
     for row in range(len(rates)):
+        free = True
         for i in range(3):
             impulse[i] = step * (torque[row, i] - load[row, i])
             for k in range(3):
                 impulse[i] += mass[row, i, k] * rates[row, k]
             limit[i] = step * friction[row, i]
-        resisted(mass[row], impulse, limit, new_rates[row])
+            free = free and limit[i] == 0
+        if not free:
+            resisted(mass[row], impulse, limit, new_rates[row])
+            continue
+        inverted(
+            mass[row, 0, 0], mass[row, 0, 1], mass[row, 0, 2],
+            mass[row, 1, 1], mass[row, 1, 2], mass[row, 2, 2], inverse,
+        )  # fmt: skip
+        for i in range(3):
+            new_rates[row, i] = (
+                inverse[i, 0] * impulse[0] + inverse[i, 1] * impulse[1] + inverse[i, 2] * impulse[2]
+            )
+
+
+@kept
+def moved(
+    theta: FloatArray,
+    rates: FloatArray,
+    new_rates: FloatArray,
+    position: FloatArray,
+    before: FloatArray,
+    jacobian: FloatArray,
+    step: float,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Integrate joint positions, and predict where P goes; all (r, 3).
+
+    Args:
+        theta: rad, at the beginning of the time step.
+        rates: rad/s, at its beginning.
+        new_rates: rad/s, at its end.
+        position: m, point P at its beginning.
+        before: m, point P a time step earlier.
+        jacobian: (r, 3, 3) m/rad, at its beginning.
+        step: s.
+
+    Returns:
+        Joint positions at the end; P by the joint velocities, and by its own velocity; the
+        acceleration of P by the change of the joint velocities, m/s^2.
+    """
+    new_theta, expected, drifting, gain = (
+        np.empty_like(theta), np.empty_like(theta), np.empty_like(theta), np.empty_like(theta),
+    )  # fmt: skip
+    for row in range(len(theta)):
+        for i in range(3):
+            new_theta[row, i] = theta[row, i] + step * new_rates[row, i]
+            drifting[row, i] = 2 * position[row, i] - before[row, i]
+            speed = change = 0.0
+            for k in range(3):
+                speed += jacobian[row, i, k] * new_rates[row, k]
+                change += jacobian[row, i, k] * (new_rates[row, k] - rates[row, k])
+            expected[row, i] = position[row, i] + step * speed
+            gain[row, i] = change / step
+    return new_theta, expected, drifting, gain
+
+
+@kept
+def modes_left(
+    position: FloatArray,
+    side: BoolArray,
+    working: BoolArray,
+    before: NDArray[np.int8],
+) -> tuple[NDArray[np.int8], bool]:
+    """Find which mode each machine has left, (r,), and whether any has.
+
+    Beyond a parallel singularity the joints turn back, so that the positions of the mirrored
+    assembly exist too. Only ``side`` tells them apart.
+
+    Args:
+        position: (r, 3) m, by forward kinematics; NaN where there is none.
+        side: (r,) whether P was about to stay on its side, by the joint velocities and by its own.
+        working: (r,) whether the machine is in its working mode.
+        before: (r,) mode that was left earlier.
+    """
+    left, anywhere = before.copy(), False
+    for row in range(len(left)):
+        if left[row] == 0:
+            if not side[row] or np.isnan(position[row, 0]):
+                left[row] = 1
+            elif not working[row]:
+                left[row] = 2
+        anywhere |= left[row] != 0
+    return left, anywhere
 
 
 @compiled

@@ -144,6 +144,15 @@ class Contact:
             cups["vacuum"].copy(),
         )
 
+    def copy(self) -> tuple[Any, ...]:
+        """Return copies of the records of all tables; several times as fast as :meth:`save`."""
+        return self._objects.copy(), self._cups.copy(), self._forces.copy()
+
+    def repeat(self, rows: IntArray, copies: tuple[Any, ...]) -> None:
+        """Put some tables back to copies of :meth:`copy`."""
+        for own, earlier in zip((self._objects, self._cups, self._forces), copies, strict=True):
+            own[rows] = earlier[rows]
+
     def save(self, rows: Any) -> FloatArray:
         """Return everything that the next time steps of some tables depend on, (r, c)."""
         parts = self._objects[rows], self._cups[rows], self._forces[rows]
