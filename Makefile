@@ -66,7 +66,7 @@ results: $(INSTALLED) ## rewrite docs/results.md and its figures from the record
 bench-kinematics: $(INSTALLED) ## speed of the kinematics against a floor and a general solver
 	$(RUN) benchmarks/bench_kinematics.py
 
-bench-fidelity: $(INSTALLED) ## loop gaps, FK error and tilt against cost; see docs/fidelity.md
+bench-fidelity: $(INSTALLED) ## loop gaps, FK error and tilt against cost; see docs/loops.md
 	$(RUN) benchmarks/bench_fidelity.py
 
 bench-evaluate: $(INSTALLED) ## what tpm-gym evaluate costs beyond the stepping
