@@ -75,7 +75,7 @@ bench-evaluate: $(INSTALLED) ## what tpm-gym evaluate costs beyond the stepping
 bench-engines: $(INSTALLED) ## both engines and theory on the same commands; policies over engines and drives
 	$(RUN) benchmarks/bench_engines.py --jobs 2
 
-bench-engine: $(INSTALLED) ## the closed form as an engine: speed and agreement, beside PyBullet and panda-gym
+bench-engine: $(INSTALLED) ## the analytic engine: speed and agreement, beside PyBullet and panda-gym
 	$(RUN) -m pip install -c constraints.txt -e ".[bench]"
 	$(RUN) benchmarks/bench_engine.py
 
