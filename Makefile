@@ -66,7 +66,7 @@ results: $(INSTALLED) ## rewrite docs/results.md and its figures from the record
 bench-kinematics: $(INSTALLED) ## speed of the kinematics against a floor and a general solver
 	$(RUN) benchmarks/bench_kinematics.py
 
-bench-fidelity: $(INSTALLED) ## loop gaps, FK error and tilt against cost; see docs/fidelity.md
+bench-fidelity: $(INSTALLED) ## loop gaps, FK error and tilt against cost; see docs/loops.md
 	$(RUN) benchmarks/bench_fidelity.py
 
 bench-evaluate: $(INSTALLED) ## what tpm-gym evaluate costs beyond the stepping
@@ -75,7 +75,7 @@ bench-evaluate: $(INSTALLED) ## what tpm-gym evaluate costs beyond the stepping
 bench-engines: $(INSTALLED) ## both engines and theory on the same commands; policies over engines and drives
 	$(RUN) benchmarks/bench_engines.py --jobs 2
 
-bench-engine: $(INSTALLED) ## the closed form as an engine: speed and agreement, beside PyBullet and panda-gym
+bench-engine: $(INSTALLED) ## the analytic engine: speed and agreement, beside PyBullet and panda-gym
 	$(RUN) -m pip install -c constraints.txt -e ".[bench]"
 	$(RUN) benchmarks/bench_engine.py
 

@@ -15,7 +15,7 @@ The table has the share of episodes with the same success at the end. Policies a
 the published ones, with and without noise, which makes them drop, throw and shove. The same
 policies also act on the observations of each engine.
 
-Results go to docs/records/closed_form.json, and from there to docs/closed-form.md and
+Results go to docs/records/closed_form.json, and from there to docs/speed.md and
 docs/images/closed_form.png.
 """
 

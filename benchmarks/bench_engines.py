@@ -14,7 +14,7 @@ turns.
 Matrix: success of the expert and of the published policies in each engine with each drive, with and
 without noise on their actions, which makes them drop, throw and shove.
 
-Results go to docs/records/engines.json, and from there to docs/fidelity.md and
+Results go to docs/records/engines.json, and from there to docs/engines.md and
 docs/images/engines.png.
 """
 

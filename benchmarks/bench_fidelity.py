@@ -10,7 +10,7 @@ random Cartesian actions. Expert: commands of the scripted expert in TPMPickAndP
 speed with sudden changes of direction, and sweeps of 1.5 Hz over the whole region, more than twice
 as fast as the environments allow.
 
-Results go to stdout, runs/fidelity.json, docs/images/fidelity.png and docs/fidelity.md.
+Results go to stdout, runs/fidelity.json, docs/images/fidelity.png and docs/loops-sweep.md.
 ``--long N`` runs the default alone in the real environment, for N time steps of each motion.
 """
 

@@ -8,7 +8,7 @@ The best policy of each run in ``--runs`` and the published policies are tested 
 ideal and servo drives. Include runs of few steps (``--steps``), whose policies drop the block, and
 of ``shoving.py``, because errors of contact would show in both.
 
-Results go to docs/records/transfer.json, and from there to docs/closed-form.md.
+Results go to docs/records/transfer.json, and from there to docs/transfer.md.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from tpm_gym.learning.policies import TrainedPolicy, load_policy
 from tpm_gym.learning.rollout import TEST_SEED, run_batch, run_episodes
 
 RECORD = ROOT / "docs" / "records" / "transfer.json"
-PAGE = ROOT / "docs" / "closed-form.md"
+PAGE = ROOT / "docs" / "transfer.md"
 ENGINES = ("analytic", "pybullet", "mujoco")
 PUBLISHED = ("TPMPickAndPlace-v0", "TPMPickAndPlaceJoints-v0")
 

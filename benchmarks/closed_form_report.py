@@ -1,4 +1,4 @@
-"""Tables and picture of bench_engine.py, in docs/closed-form.md."""
+"""Tables and picture of bench_engine.py, in docs/speed.md."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tpm_gym.learning.figure_style import BLUE, GREEN, ORANGE, VERMILLION
 
 RECORD = ROOT / "docs" / "records" / "closed_form.json"
 PICTURE = ROOT / "docs" / "images" / "closed_form.png"
-PAGE = ROOT / "docs" / "closed-form.md"
+PAGE = ROOT / "docs" / "speed.md"
 PICK = "TPMPickAndPlace-v0"
 COLOURS = {"expert": BLUE, "random": VERMILLION}
 

@@ -1,4 +1,4 @@
-"""Tables and picture of bench_engines.py, in docs/fidelity.md."""
+"""Tables and picture of bench_engines.py, in docs/engines.md."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tpm_gym.learning.figure_style import BLUE, ORANGE, PURPLE, SKY, VERMILLION
 
 RECORD = ROOT / "docs" / "records" / "engines.json"
 PICTURE = ROOT / "docs" / "images" / "engines.png"
-PAGE = ROOT / "docs" / "fidelity.md"
+PAGE = ROOT / "docs" / "engines.md"
 
 MM = 1e3
 COLUMNS = {

@@ -1,4 +1,4 @@
-"""Table, JSON and picture of the fidelity sweep, in docs/fidelity.md."""
+"""Table, JSON and picture of the fidelity sweep, in docs/loops-sweep.md."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tpm_gym.learning.figure_style import BLACK, BLUE, GREEN, ORANGE, PURPLE, SK
 
 JSON = ROOT / "runs" / "fidelity.json"
 PICTURE = ROOT / "docs" / "images" / "fidelity.png"
-PAGE = ROOT / "docs" / "fidelity.md"
+PAGE = ROOT / "docs" / "loops-sweep.md"
 
 MM = 1e3
 UNITS = {"gap": MM, "fk": MM, "fk_near": MM, "tilt": float(np.rad2deg(1.0)), "tracking": MM}
@@ -93,7 +93,7 @@ def read_json(path: Path = JSON) -> tuple[list[Result], dict[str, Any]]:
 
 
 def write_page(results: Sequence[Result], machine: str) -> None:
-    """Write the table to docs/fidelity.md."""
+    """Write the table to docs/loops-sweep.md."""
     rows = [
         [f"**{cell}**" for cell in cells(result)]
         if result.config.family == "default"

@@ -14,6 +14,7 @@ from tpm_gym.learning.recipes import read_recipe
 from tpm_gym.tasks.registry import TASKS
 
 PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
+PAGES = ["README.md", "CONTRIBUTING.md", *(f"docs/{p.name}" for p in (ROOT / "docs").glob("*.md"))]
 BLOCKS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 
 
@@ -43,11 +44,11 @@ def test_the_table_counts_lines_as_they_are():
         assert int(lines) == pytest.approx(found, abs=5), name
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/extending.md", "CONTRIBUTING.md"])
+@pytest.mark.parametrize("page", PAGES)
 def test_links_lead_to_files_and_headings(page):
     text = (ROOT / page).read_text(encoding="utf-8")
-    for path, heading in re.findall(r"\]\((?!http)([^)#]+)#?([^)]*)", text):
-        place = (ROOT / page).parent / path
+    for path, heading in re.findall(r"\]\((?!http)([^)#]*)#?([^)]*)", text):
+        place = (ROOT / page).parent / path if path else ROOT / page
         assert place.exists(), path
         if heading:
             titles = re.findall(r"^##+ (.*)$", place.read_text(encoding="utf-8"), re.MULTILINE)
