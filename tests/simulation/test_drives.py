@@ -245,7 +245,7 @@ def test_the_datasheet_tells_the_defaults() -> None:
     text = " ".join((TPMEnv.__doc__ or "").split())
     assert f"{Servo().stiffness:g} N m/rad, {Servo().damping:g} N m s/rad" in text
     assert f"{TORQUE_MOTOR.peak_torque:g} N m up to {TORQUE_MOTOR.corner_speed:g} rad/s" in text
-    assert f"none at {TORQUE_MOTOR.no_load_speed:g} rad/s" in text
+    assert f"zero at {TORQUE_MOTOR.no_load_speed:g} rad/s" in text
 
 
 # -- limits ----------------------------------------------------------------------------------------

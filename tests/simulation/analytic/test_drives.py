@@ -34,8 +34,10 @@ def rms(values: Any) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def untouched(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    return np.zeros_like(points[:, 0]), np.zeros(len(points))
+def untouched(
+    before: FloatArray, now: FloatArray, then: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    return np.zeros_like(now), np.zeros(len(now))
 
 
 def at_rest(theta: FloatArray, carried: float = 0.0) -> Course:
@@ -81,7 +83,10 @@ def energy_gained(time_step: float, payload: float) -> FloatArray:
     fall = np.array(PAPER_TPM.mount.free_fall)
     weight, carried = np.tile(payload * fall, (2, 1)), np.full(2, payload)
 
-    def touch(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def touch(
+        before: FloatArray, now: FloatArray, then: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        points = np.stack([before, now, then], axis=1)
         before, at, now = points.swapaxes(0, 1)
         return weight - payload * (now - 2 * at + before) / time_step**2, carried
 

@@ -1,5 +1,6 @@
 """The client of the physics engine: private, quiet, given back; and what it makes of windows."""
 
+import gc
 import os
 import shutil
 import subprocess
@@ -42,6 +43,7 @@ def in_a_process(script: str, **variables: str) -> tuple[str, str]:
 
 @pytest.fixture
 def client() -> Iterator[Client]:
+    gc.collect()  # clients that earlier tests left
     client = Client(Physics())
     yield client
     client.close()
@@ -135,6 +137,7 @@ def test_closed_means_closed_and_twice_is_harmless(client: Client) -> None:
 
 
 def test_what_is_dropped_is_given_back() -> None:
+    gc.collect()  # clients that earlier tests left
     free = Client(Physics()).number
     kept = Client(Physics())
     assert kept.number == free
