@@ -16,7 +16,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	$(RUN) -m pip install -c constraints.txt -e ".[train,test]"
 	touch $@
 
-demo: $(INSTALLED) ## train pick-and-place in closed form, test it in PyBullet, film it; see runs/demo/
+demo: $(INSTALLED) ## train pick-and-place in the analytic engine, test it in PyBullet, film it; see runs/demo/
 	$(VENV)/bin/tpm-gym train --algo ppo --engine analytic --env TPMPickAndPlaceDense-v0 --seed 0 --test-episodes 0 \
 		--run runs/demo/pick_and_place --overwrite
 	cp runs/demo/pick_and_place/learning_curve.png runs/demo/learning_curve.png
@@ -84,10 +84,10 @@ bench-transfer: $(INSTALLED) ## policies trained in one engine (the runs in runs
 
 bench-speed: $(INSTALLED) ## steps per second beside panda-gym and Gymnasium-Robotics
 	$(RUN) -m pip install -c constraints.txt -e ".[bench]"
-	$(RUN) benchmarks/bench_speed.py --json runs/speed.json --plot docs/images/speed.png
+	$(RUN) benchmarks/bench_speed.py --json runs/speed.json --plot runs/speed.png
 
 soak: $(INSTALLED) ## a million steps over all ids in PyBullet, and in MuJoCo: memory, loop gaps, speed; an hour
-	$(RUN) benchmarks/soak.py --json runs/soak.json --plot docs/images/soak.png
+	$(RUN) benchmarks/soak.py --json runs/soak.json --plot runs/soak.png
 	$(RUN) benchmarks/soak.py --engine mujoco --json runs/soak_mujoco.json --plot runs/soak_mujoco.png
 
 clean: ## remove the environment and everything generated

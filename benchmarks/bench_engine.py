@@ -15,8 +15,8 @@ The table has the share of episodes with the same success at the end. Policies a
 the published ones, with and without noise, which makes them drop, throw and shove. The same
 policies also act on the observations of each engine.
 
-Results go to docs/records/closed_form.json, and from there to docs/speed.md and
-docs/images/closed_form.png.
+Results go to docs/records/analytic.json, and from there to docs/speed.md and
+docs/images/analytic.png.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from collections.abc import Callable, Sequence
 from contextlib import closing
 from typing import Any
 
-import closed_form_report
+import analytic_report
 import gymnasium as gym
 import numpy as np
 import shared
@@ -229,7 +229,7 @@ def main() -> None:
     parser.add_argument("--redraw", action="store_true", help="picture and page from the record")
     options = parser.parse_args()
     if options.redraw:
-        closed_form_report.publish()
+        analytic_report.publish()
         return
     torch.set_num_threads(1)
     quick = options.quick
@@ -245,10 +245,10 @@ def main() -> None:
     record = {
         name: {"machine": shared.describe(sys.argv), "rows": parts[name]()} for name in chosen
     }
-    print("\n".join(closed_form_report.lines(record)))
+    print("\n".join(analytic_report.lines(record)))
     if not quick:
-        closed_form_report.write(record)
-        closed_form_report.publish()
+        analytic_report.write(record)
+        analytic_report.publish()
 
 
 if __name__ == "__main__":

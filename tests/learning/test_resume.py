@@ -54,8 +54,8 @@ Kill = Callable[..., TrainingConfig]
         ("ppo", 241),
         *[pytest.param("ppo", step, marks=pytest.mark.slow) for step in (39, 95)],
         ("ppo in processes", 201),
-        ("ppo in closed form", 251),
-        ("sac in closed form", 251),
+        ("ppo in the analytic engine", 251),
+        ("sac in the analytic engine", 251),
     ],
 )
 def test_a_killed_run_ends_as_if_nothing_had_happened(case: str, step: int, killed: Kill) -> None:

@@ -410,7 +410,7 @@ def test_shipped_recipes_are_arguments_of_the_algorithm_and_relabel_sparse_rewar
     envs.close()
 
 
-def test_recipes_in_closed_form_are_for_many_environments_and_every_id() -> None:
+def test_recipes_of_the_analytic_engine_are_for_many_environments_and_every_id() -> None:
     options = EnvOptions(engine="analytic")
     found = set()
     for algorithm in ALGORITHMS:

@@ -1,4 +1,4 @@
-"""Environments in closed form behind Stable-Baselines3, and policies evaluated in them."""
+"""Environments of the analytic engine behind Stable-Baselines3, and policies evaluated in them."""
 
 from typing import Any
 

@@ -95,7 +95,7 @@ def compiled_after(hold: Hold, on: bool, load: Load, touched: int) -> Hold:
 
 
 def test_many_cups_at_once_obey_the_same_law() -> None:
-    """Those in closed form: there it is compiled."""
+    """Those of the analytic engine: there it is compiled."""
     rng = np.random.default_rng(0)
     held, on, touched = rng.random((3, 500)) < 0.5
     vacuum = CUP.vacuum * rng.random(500) ** 4

@@ -58,8 +58,8 @@ CASES = {
     ),
     "ppo": ("ppo", REACH, PPO_RECIPE.format(env=REACH, envs=1)),
     "ppo in processes": ("ppo", REACH, PPO_RECIPE.format(env=REACH, envs=2)),
-    "ppo in closed form": ("ppo", PICK, PPO_RECIPE.format(env=PICK, envs=3)),
-    "sac in closed form": (
+    "ppo in the analytic engine": ("ppo", PICK, PPO_RECIPE.format(env=PICK, envs=3)),
+    "sac in the analytic engine": (
         "sac",
         "TPMPickAndPlace-v0",
         SAC_RECIPE.format(env="TPMPickAndPlace-v0", train_freq=2)
@@ -95,7 +95,7 @@ def make_config(case: str, folder: Path) -> TrainingConfig:
         eval_episodes=1,
         eval_every=70,
         checkpoint_every=50,
-        env_options=EnvOptions(engine="analytic") if "closed form" in case else EnvOptions(),
+        env_options=EnvOptions(engine="analytic") if "analytic" in case else EnvOptions(),
         test_episodes=2,
     )
 

@@ -1,4 +1,4 @@
-"""The closed form against PyBullet: the same seeds and actions, whole episodes.
+"""The analytic engine against PyBullet: the same seeds and actions, whole episodes.
 
 In comments: what was measured, over 20 episodes (benchmarks/bench_engine.py has more).
 """
@@ -33,7 +33,7 @@ def played(env_id: str, policy: str, episodes: int, **options: Any) -> tuple[Any
 
 
 def repeated(env_id: str, actions: FloatArray, **options: Any) -> Any:
-    """States of all steps in closed form, one environment an episode."""
+    """States of all steps in the analytic engine, one environment an episode."""
     envs = gym.make_vec(env_id, num_envs=len(actions), engine="analytic", **options)
     envs.reset(seed=0)
     found = []

@@ -13,8 +13,8 @@ from shared import ROOT, fill, processor_line, provenance, quartiles, read_recor
 from tpm_gym.learning import figure_style as style
 from tpm_gym.learning.figure_style import BLUE, GREEN, ORANGE, VERMILLION
 
-RECORD = ROOT / "docs" / "records" / "closed_form.json"
-PICTURE = ROOT / "docs" / "images" / "closed_form.png"
+RECORD = ROOT / "docs" / "records" / "analytic.json"
+PICTURE = ROOT / "docs" / "images" / "analytic.png"
 PAGE = ROOT / "docs" / "speed.md"
 PICK = "TPMPickAndPlace-v0"
 COLOURS = {"expert": BLUE, "random": VERMILLION}
@@ -28,7 +28,7 @@ def write(record: dict[str, Any]) -> None:
 def publish() -> None:
     """Fill the page and draw the picture from the record."""
     record = read_record(RECORD)
-    fill(PAGE, "closed form", lines(record))
+    fill(PAGE, "analytic", lines(record))
     if {"speed", "torques"} <= record.keys():
         draw(record)
 
@@ -59,7 +59,7 @@ def _engine(name: str) -> str:
     _, *rest = name.split(", ")
     if len(rest) < 3:
         return rest[0] if rest else "its own"
-    return f"closed form, {int(rest[2]):,} at a time, torques: {rest[1]}"
+    return f"analytic, {int(rest[2]):,} environments, torques: {rest[1]}"
 
 
 def _times(row: dict[str, Any]) -> str:
@@ -92,7 +92,7 @@ def _torques(rows: list[dict[str, Any]]) -> Iterator[str]:
 
 def _success(rows: list[dict[str, Any]]) -> Iterator[str]:
     yield from table(
-        ["id", "policy", "episodes", "PyBullet", "closed form", "equal, same actions"],
+        ["id", "policy", "episodes", "PyBullet", "analytic", "same end after the same actions"],
         [
             [
                 row["env_id"],
@@ -133,7 +133,7 @@ def _draw_speed(axes: Axes, rates: dict[str, Any]) -> None:
     counts = sorted(int(name.removeprefix(form)) for name in rates if name.startswith(form))
     spread = np.array([quartiles(rates[f"{form}{count}"]["rates"]) for count in counts])
     axes.fill_between(counts, spread[:, 0], spread[:, 2], color=BLUE, alpha=0.25, linewidth=0)
-    axes.plot(counts, spread[:, 1], "o-", color=BLUE, markersize=3, label="closed form")
+    axes.plot(counts, spread[:, 1], "o-", color=BLUE, markersize=3, label="analytic")
     for name, label, colour in (
         (f"{PICK}, pybullet", "PyBullet", VERMILLION),
         ("PandaPickAndPlace-v3", "PandaPickAndPlace-v3", GREEN),
