@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import importlib
+import logging
 import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -103,10 +105,27 @@ def test_processes_that_start_together_are_all_right(folder: Path) -> None:
     assert called() == (3.0, 1)
 
 
+class Elapsed:
+    """A timer whose time is over as soon as it starts."""
+
+    daemon = False
+
+    def __init__(self, interval: float, function: Callable[[], None]) -> None:
+        assert interval == compiling.PATIENCE
+        self.start = function
+
+    def cancel(self) -> None:
+        """Do nothing: it is too late."""
+
+
 def test_a_long_wait_is_announced_once(
     folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(compiling, "PATIENCE", 0.0)
+    # Neither other threads' turns nor loggers that libraries have changed decide what is seen.
+    logger = logging.Logger("own")
+    logger.addHandler(caplog.handler)
+    monkeypatch.setattr(compiling, "_LOGGER", logger)
+    monkeypatch.setattr(compiling.threading, "Timer", Elapsed)
     monkeypatch.setattr(compiling._Cache, "_announced", False)
     called()
     (folder / "own/scale.py").write_text("SCALE = 4.0\n")
