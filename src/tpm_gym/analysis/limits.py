@@ -29,7 +29,7 @@ _BLOCK = 4096
 
 
 class Capsule(NamedTuple):
-    """All points within ``radius`` of a line segment, m, in the frame of a link."""
+    """Points within ``radius`` of a line segment, m, in the frame of a link."""
 
     link: str
     start: FloatArray

@@ -130,7 +130,7 @@ _CURVES: dict[str, tuple[Curve, tuple[int, ...]]] = {
 
 @dataclass(frozen=True)
 class _Arcs:
-    """All m arcs of one factor: their signs (m,), and their intervals of the angle (m,), rad."""
+    """Arcs of one factor, m in number: signs (m,), and intervals of the angle (m,), rad."""
 
     curve: Curve
     geometry: Geometry

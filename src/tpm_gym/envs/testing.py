@@ -452,4 +452,4 @@ CHECKS: tuple[Callable[[Make], None], ...] = (
     survives_json,
     is_solved_by_its_expert,
 )
-"""All checks, in order."""
+"""Checks of this suite, in order."""

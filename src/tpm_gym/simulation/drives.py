@@ -118,7 +118,7 @@ def drives_and_randomisation(drive: Any, randomisation: Any) -> tuple[Servo | No
 
 
 class References(NamedTuple):
-    """What servo drives follow in the K time steps of a control period, for n robots.
+    """References of servo drives in the K time steps of a control period, for n robots.
 
     Attributes:
         theta: (K, n, 3) rad (m for a slide), at the end of each time step.

@@ -213,7 +213,7 @@ class Simulation:
 
     @property
     def commands(self) -> FloatArray:
-        """Where point P is commanded to go, (n, 3) m, machine's frame."""
+        """Commanded positions of point P, (n, 3) m, machine's frame."""
         return self._commands[:, 1]
 
     @property

@@ -37,7 +37,7 @@ class Move(NamedTuple):
 
 
 class Motion:
-    """What a plan sees of its robot, and ways with trapezoidal speed.
+    """View of a robot for a plan, and ways with trapezoidal speed.
 
     Attributes:
         machine: The machine that moves.

@@ -25,7 +25,7 @@ __all__ = ["Course", "IdealSteps", "ServoSteps", "Steps", "march"]
 
 @dataclass
 class Course:
-    """Where r machines are at the end of a time step; machine's frame.
+    """States of r machines at the end of a time step; machine's frame.
 
     Attributes:
         theta: (r, 3) rad.
@@ -112,7 +112,7 @@ class ServoSteps:
 
 
 Touch = Callable[[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
-"""From P (r, 3) m a time step ago, now and at the end of the time step to the force (r, 3) N on P
+"""Function of P (r, 3) m a time step ago, now and at its end; returns the force (r, 3) N on P
 and the mass (r,) kg that moves with it."""
 
 
