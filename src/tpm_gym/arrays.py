@@ -59,18 +59,6 @@ def finite(
     return array
 
 
-def floats(
-    name: str, value: ArrayLike, count: int, error: _Error = InputError
-) -> tuple[float, ...]:
-    """Return ``count`` finite numbers as plain floats."""
-    array = numbers(name, value, error)
-    if array.shape == (count,):
-        plain = tuple(array.tolist())
-        if all(map(math.isfinite, plain)):
-            return plain
-    raise error(name, brief(value), f"finite numbers of shape ({count},)")
-
-
 def vector(name: str, value: ArrayLike, error: _Error = InputError) -> Vector:
     """Return three finite numbers as plain floats."""
     if isinstance(value, tuple) and len(value) == 3:
@@ -144,20 +132,6 @@ def rotate(quaternion: Quaternion, vector: Vector) -> Vector:
         a + w * s + y * u - z * t,
         b + w * t + z * s - x * u,
         c + w * u + x * t - y * s,
-    )
-
-
-def transform(origin: Vector, quaternion: Quaternion, point: Vector) -> Vector:
-    """Convert a point of a frame into the frame's parent, m."""
-    # rotate(), written out for speed: an engine converts nine points in each control step.
-    u, v, w = origin
-    x, y, z, r = quaternion
-    a, b, c = point
-    s, t, p = 2 * (y * c - z * b), 2 * (z * a - x * c), 2 * (x * b - y * a)
-    return (
-        u + (a + r * s + y * p - z * t),
-        v + (b + r * t + z * s - x * p),
-        w + (c + r * p + x * t - y * s),
     )
 
 

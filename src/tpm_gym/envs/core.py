@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, is_dataclass
+from functools import cache
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,7 @@ from tpm_gym.simulation.drives import Servo, drives_and_randomisation
 from tpm_gym.simulation.randomisation import NOMINAL, Randomisation
 from tpm_gym.simulation.simulation import Simulation, Snapshot
 from tpm_gym.simulation.state import State
+from tpm_gym.tasks import checking
 from tpm_gym.tasks.control import make_control
 from tpm_gym.tasks.registry import make_task
 from tpm_gym.tasks.task import Task
@@ -92,7 +95,7 @@ class Core:
         self.task = make_task(
             task, machine=machine, reward=reward, goals=goals, penalty_weight=penalty_weight
         )
-        self.task.check()
+        checking.check(self.task)
         self.machine = self.task.machine
         self.control = make_control(control, self.machine)
         self.drive, self.randomisation = drives_and_randomisation(drive, randomisation)
@@ -221,8 +224,8 @@ class Core:
         Raises:
             EpisodeError: If no episode is running.
         """
-        self.require_open()
         if self._state is None:
+            self.require_open()
             raise EpisodeError("no episode is running; call reset() first")
         return self._state
 
@@ -328,20 +331,17 @@ def report(task: Task, state: State, goals: FloatArray) -> Report:
     Raises:
         ConfigurationError: If the task makes something of the state that is not finite.
     """
-    observation = {
-        "observation": _clipped(task.observe(state), OBSERVATION_BOUND),
-        "achieved_goal": _clipped(task.achieved(state), GOAL_BOUND),
-        "desired_goal": goals.astype(np.float32),
-    }
-    achieved = observation["achieved_goal"]
-    gap, penalty = task.gap(achieved, observation["desired_goal"]), task.penalty(state)
+    found = np.ascontiguousarray(task.achieved(state))
+    observed, achieved, desired, sound = _loops().bounded(
+        task.observe(state), OBSERVATION_BOUND, found, GOAL_BOUND, goals
+    )
+    gap, penalty = task.gap(achieved, desired), task.penalty(state)
     terms = task.reward_terms(state, gap, penalty)
     reward = terms["goal"] + _goal_free(terms)
-    squares = np.vdot(reward, reward) + np.vdot(achieved, achieved)
-    if not math.isfinite(squares + np.vdot(observation["observation"], observation["observation"])):
+    if not (sound and math.isfinite(np.vdot(reward, reward))):
         raise _not_finite(task, state, achieved, terms)
     return (
-        observation,
+        {"observation": observed, "achieved_goal": achieved, "desired_goal": desired},
         reward,
         {
             "is_success": task.success(gap),
@@ -357,8 +357,12 @@ def report(task: Task, state: State, goals: FloatArray) -> Report:
     )
 
 
-def _clipped(values: FloatArray, bound: float) -> NDArray[np.float32]:
-    return np.minimum(np.maximum(values, -bound), bound).astype(np.float32, order="C")
+@cache
+def _loops() -> ModuleType:
+    """Import the compiled loops, and with them Numba."""
+    from tpm_gym.simulation import compiled
+
+    return compiled
 
 
 def _goal_free(terms: Mapping[str, Any]) -> Any:

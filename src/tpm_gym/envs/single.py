@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium.utils import seeding
 from numpy.typing import ArrayLike, NDArray
 
-from tpm_gym.arrays import FloatArray, floats, is_whole
+from tpm_gym.arrays import FloatArray, finite, is_whole
 from tpm_gym.envs.core import (
     Core,
     EnvSnapshot,
@@ -221,6 +221,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         self.randomisation = self._core.randomisation
         self.observation_space = observation_space(self.task)
         self.action_space = action_space(self.task)
+        self._action = (self.task.action_size,)
         self._shown = 0.0  # when the last frame was due, s of the performance counter
 
     # -- the Gymnasium interface ----------------------------------------------------------------
@@ -267,11 +268,13 @@ class TPMEnv(gym.Env[Observation, Action]):
             ConfigurationError: If the task makes something of the state that is not finite.
         """
         core = self._core
-        asked = np.array(floats("action", action, self.task.action_size, ActionError))
+        plain = type(action) is np.ndarray and action.dtype.char in "df"  # as usual
+        if not plain or action.shape != self._action or not np.isfinite(action).all():
+            action = finite("action", action, self._action, ActionError)
         state = core.state
-        if state.passed_singularity[0]:
+        if state.assembly_mode_changed[0] or state.working_mode_changed[0]:
             raise ModeChangeError("assembly" if state.assembly_mode_changed[0] else "working")
-        core.step(asked[None], _ROW)
+        core.step(action.astype(np.float64)[None], _ROW)
         observation, reward, info = _row(*core.report())
         truncated = info["assembly_mode_changed"] or info["working_mode_changed"]
         if self.render_mode == "human":

@@ -59,6 +59,11 @@ class Mount:
         """Factors and origin (3,), so that world = factors * point + origin, and back."""
         return _HALF_TURN, np.array([0.0, 0.0, self.height])
 
+    @cached_property
+    def plain_frame(self) -> tuple[Vector, Vector]:
+        """:attr:`frame` in plain floats."""
+        return (1.0, -1.0, -1.0), (0.0, 0.0, self.height)
+
     @property
     def free_fall(self) -> Vector:
         """Acceleration of gravity in the paper frame, m/s^2."""

@@ -62,33 +62,41 @@ class TPM(Machine):
         """See :class:`Machine`."""
         points = _rows(position)
         theta = np.empty(points.shape)
-        _loops().inverse(_flat(points), *self._of(built, points), _flat(theta))
+        of = self._own if built is None else self._others(built, points)
+        _loops().inverse(points.reshape(-1, 3), *of, theta.reshape(-1, 3))
         return theta
 
     def forward(self, theta: ArrayLike, built: FloatArray | None = None) -> FloatArray:
         """See :class:`Machine`."""
         angles = _rows(theta)
         position = np.empty(angles.shape)
-        _loops().forward(_flat(angles), *self._of(built, angles), _flat(position))
+        of = self._own if built is None else self._others(built, angles)
+        _loops().forward(angles.reshape(-1, 3), *of, position.reshape(-1, 3))
         return position
 
     def evaluate(self, theta: ArrayLike, built: FloatArray | None = None) -> Reading:
         """See :class:`Machine`."""
         angles = _rows(theta)
-        flat = _flat(angles)
-        found = Reading(*_room(len(flat)))
-        _loops().evaluate(flat, *self._of(built, angles), *found)
+        flat, empty = angles.reshape(-1, 3), np.empty
+        of = self._own if built is None else self._others(built, angles)
+        count = len(flat)
+        position, jacobian = empty((count, 3)), empty((count, 3, 3))
+        found = Reading(position, jacobian, empty(count), empty(count, np.bool_))
+        _loops().evaluate(flat, *of, *found)
         return found if angles.ndim == 2 else Reading(*_shaped(found, angles))
 
     def mode_left(
         self, theta: ArrayLike, position: ArrayLike, built: FloatArray | None = None
     ) -> NDArray[np.int8]:
         """See :class:`Machine`."""
-        angles = _rows(theta)
-        points = _rows(position, angles.shape)
-        left = np.empty(angles.shape[:-1], dtype=np.int8)
-        of = self._of(built, angles)
-        _loops().mode_left(_flat(angles), _flat(points), ASSEMBLY_LIMIT, *of, left.reshape(-1))
+        angles, points = _rows(theta), _rows(position)
+        if points.shape != angles.shape:
+            raise InputError("position", points.shape, f"of shape {angles.shape}, like theta")
+        left = np.empty(angles.shape[:-1], np.int8)
+        of = self._own if built is None else self._others(built, angles)
+        _loops().mode_left(
+            angles.reshape(-1, 3), points.reshape(-1, 3), ASSEMBLY_LIMIT, *of, left.reshape(-1)
+        )
         return left
 
     def same_side(self, position: ArrayLike) -> BoolArray:
@@ -136,15 +144,18 @@ class TPM(Machine):
         signs = *self.assembly_mode.signs, *self.working_mode.signs
         return np.array([*signs, *self.mount.free_fall])
 
-    def _of(self, built: FloatArray | None, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the parameters of the machines and the constants that they share."""
-        if built is None:
-            return self._nominal, self._constants
+    @cached_property
+    def _own(self) -> tuple[FloatArray, FloatArray]:
+        """The parameters of the nominal machine, and the constants."""
+        return self._nominal, self._constants
+
+    def _others(self, built: FloatArray, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the parameters of other machines, and the constants that they share."""
         rows, count = inputs.size // 3, len(built)
-        if not count or rows % count or built.shape != (count, self._nominal.shape[1]):
-            valid = f"parameters (b, {self._nominal.shape[1]}), with b a divisor of {rows} rows"
+        if not count or rows % count:
+            valid = f"parameters of b machines, with b a divisor of {rows} rows"
             raise InputError("built", built.shape, valid)
-        return _plain(built), self._constants
+        return _rows(built, self._nominal.shape[1]), self._constants
 
     # -- bodies -----------------------------------------------------------------------------
 
@@ -174,10 +185,14 @@ class TPM(Machine):
     ) -> FloatArray:
         """See :class:`Machine`."""
         angles = _rows(theta)
-        inputs = [angles, _rows(theta_dot, angles.shape), _rows(theta_ddot, angles.shape)]
-        inputs.append(np.empty((0, 3)) if force is None else _rows(force, angles.shape))
+        others = (theta_dot, theta_ddot, *(() if force is None else (force,)))
+        inputs = [angles, *(_rows(np.broadcast_to(values, angles.shape)) for values in others)]
+        if force is None:
+            inputs.append(np.empty((0, 3)))
         torques = np.empty(angles.shape)
-        _loops().torque(*map(_flat, inputs), *self._of(built, angles), _flat(torques))
+        of = self._own if built is None else self._others(built, angles)
+        flat = (values.reshape(-1, 3) for values in inputs)
+        _loops().torque(*flat, *of, torques.reshape(-1, 3))
         return torques
 
     def motion(
@@ -185,11 +200,13 @@ class TPM(Machine):
     ) -> Motion:
         """See :class:`Machine`."""
         angles = _rows(theta)
-        rates, flat = _rows(theta_dot, angles.shape), _flat(angles)
-        position, jacobian, _, working = _room(len(flat))
-        mass, bias = np.empty((len(flat), 3, 3)), np.empty((len(flat), 3))
-        found = Motion(position, jacobian, working, mass, bias)
-        _loops().motion(flat, _flat(rates), *self._of(built, angles), *found)
+        rates = _rows(np.broadcast_to(theta_dot, angles.shape))
+        flat, empty = angles.reshape(-1, 3), np.empty
+        of = self._own if built is None else self._others(built, angles)
+        count = len(flat)
+        place = empty((count, 3)), empty((count, 3, 3)), empty(count, np.bool_)
+        found = Motion(*place, empty((count, 3, 3)), empty((count, 3)))
+        _loops().motion(flat, rates.reshape(-1, 3), *of, *found)
         return found if angles.ndim == 2 else Motion(*_shaped(found, angles))
 
     @property
@@ -210,40 +227,17 @@ def _loops() -> ModuleType:
     return tpm_rows
 
 
-def _rows(vectors: ArrayLike, shape: tuple[int, ...] | None = None) -> FloatArray:
-    """Return vectors (..., 3) as a contiguous array, broadcast to ``shape``."""
-    array = _plain(vectors)
-    if shape is not None and array.shape != shape:
-        array = np.broadcast_to(array, shape).copy()
-    if array.shape[-1] != 3:
-        raise InputError("vectors", array.shape, "an array of shape (..., 3), by shape")
-    return array
-
-
-def _plain(values: ArrayLike) -> FloatArray:
-    """Return values as the one kind of array for which the loops are compiled."""
-    array = np.ascontiguousarray(values, dtype=np.float64)
+def _rows(values: ArrayLike, length: int = 3) -> FloatArray:
+    """Return vectors (..., length) as the one kind of array for which the loops are compiled."""
+    array = np.ascontiguousarray(values, np.float64)
+    if array.shape[-1] != length:
+        raise InputError("vectors", array.shape, f"an array of shape (..., {length}), by shape")
     return array if array.flags.writeable else array.copy()
-
-
-def _flat(array: FloatArray) -> FloatArray:
-    """Return an array (..., 3) as (m, 3)."""
-    return array if array.ndim == 2 else array.reshape(-1, 3)
 
 
 def _shaped(arrays: Iterable[Any], like: FloatArray) -> Iterator[Any]:
     """Return arrays (m, ...) in the leading shape of an array (..., 3)."""
     return (array.reshape(like.shape[:-1] + array.shape[1:]) for array in arrays)
-
-
-def _room(count: int) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-    """Return arrays for positions, Jacobians, conditioning and modes."""
-    return (
-        np.empty((count, 3)),
-        np.empty((count, 3, 3)),
-        np.empty(count),
-        np.empty(count, dtype=np.bool_),
-    )
 
 
 PAPER_TPM = TPM(

@@ -5,17 +5,19 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tpm_gym.arrays import FloatArray
+from tpm_gym.arrays import FloatArray, IntArray
 from tpm_gym.compiling import compiled, kept
 
 __all__ = [
     "all_within",
+    "bounded",
     "braced_inverse",
     "in_world",
     "inverted",
     "limited",
     "servo_torques",
     "spline_points",
+    "truth",
     "unusual",
 ]
 
@@ -49,6 +51,25 @@ def unusual(
     for row in range(len(conditioning)):
         senseless |= np.isnan(conditioning[row])
     return opened, left, senseless
+
+
+@kept
+def bounded(
+    observed: FloatArray, bound: float, achieved: FloatArray, goal_bound: float, goals: FloatArray
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], bool]:
+    """Clip observations and goals (n, ...), convert all to float32, and tell whether any is NaN."""
+    first = np.empty(observed.shape, np.float32)
+    second, third = np.empty(achieved.shape, np.float32), np.empty(goals.shape, np.float32)
+    sound = True
+    for row in range(len(observed)):
+        for k in range(observed.shape[1]):
+            first[row, k] = min(max(observed[row, k], -bound), bound)
+            sound &= observed[row, k] == observed[row, k]
+        for k in range(achieved.shape[1]):
+            second[row, k] = min(max(achieved[row, k], -goal_bound), goal_bound)
+            sound &= achieved[row, k] == achieved[row, k]
+            third[row, k] = goals[row, k]
+    return first, second, third, sound
 
 
 @kept
@@ -92,6 +113,45 @@ def in_world(
             axes[row, item, 1] = 2 * (y * z - w * x)
             axes[row, item, 2] = 1 - 2 * (x * x + y * y)
     return place, speed, wanted, axes
+
+
+@kept
+def truth(
+    frames: FloatArray, sides: IntArray, pivots: FloatArray, platform: int, point: FloatArray
+) -> tuple[float, float, float, float, float]:
+    """Compute the largest gap of the loops (m), P (m) and the platform's tilt (rad).
+
+    Args:
+        frames: (7 m,) origin (m) and orientation (x, y, z, w) of each of m links, world.
+        sides: (p, 2) links of each closure.
+        pivots: (p, 2, 3) m, the closure's points in their frames.
+        platform: Link of the platform.
+        point: (3,) m, point P in its frame.
+    """
+    squared = 0.0
+    for row in range(len(sides)):
+        x, y, z = _placed(frames[7 * sides[row, 0] :], pivots[row, 0])
+        u, v, w = _placed(frames[7 * sides[row, 1] :], pivots[row, 1])
+        gap = (x - u) ** 2 + (y - v) ** 2 + (z - w) ** 2
+        if gap > squared or gap != gap:  # a NaN stays
+            squared = gap
+    own = frames[7 * platform :]
+    x, y, z = _placed(own, point)
+    sine = np.sqrt(own[4] * own[4] + own[5] * own[5] + own[6] * own[6])
+    return np.sqrt(squared), x, y, z, 2 * np.arcsin(min(1.0, sine))
+
+
+@compiled
+def _placed(frame: FloatArray, point: FloatArray) -> tuple[float, float, float]:
+    """Convert a point of a frame into the world, m."""
+    x, y, z, r = frame[3], frame[4], frame[5], frame[6]
+    a, b, c = point
+    s, t, p = 2 * (y * c - z * b), 2 * (z * a - x * c), 2 * (x * b - y * a)
+    return (
+        frame[0] + (a + r * s + y * p - z * t),
+        frame[1] + (b + r * t + z * s - x * p),
+        frame[2] + (c + r * p + x * t - y * s),
+    )
 
 
 @kept

@@ -7,13 +7,13 @@ feed-forward, and a motor with a torque-speed line.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from tpm_gym.arrays import FloatArray, IntArray, Vector, is_number
+from tpm_gym.arrays import FloatArray, IntArray, is_number
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.randomisation import NOMINAL, Plant, Randomisation
@@ -29,7 +29,6 @@ __all__ = [
     "drive_of",
     "drives_and_randomisation",
     "require_servo",
-    "steering",
 ]
 
 FEEDFORWARDS = ("none", "gravity", "computed")
@@ -257,33 +256,3 @@ class ServoDrives:
         )  # fmt: skip
         torque: FloatArray = self.memory[0]
         return torque
-
-
-class Driven(Protocol):
-    """The robot of an engine that simulates one, with three motors."""
-
-    def motors(self) -> tuple[Vector, Vector, Vector]:
-        """Return joint positions (rad), velocities (rad/s) and torques (N m)."""
-
-    def drive(self, theta: Vector) -> None:
-        """Let ideal motors go to ``theta`` rad in the next time step."""
-
-    def apply(self, torque: Vector) -> None:
-        """Let the motors apply ``torque`` N m in the next time step."""
-
-
-def steering(
-    drives: ServoDrives | None, path: Path, robot: Driven
-) -> tuple[Sequence[Any], Callable[[Any], None]]:
-    """Return a target for each time step of a path, and the function that drives a robot to it."""
-    if drives is None:
-        return path.joints()[0].tolist(), robot.drive
-    references = drives.references(path)
-    drives.begin(references.theta[0])
-
-    def drive(index: int) -> None:
-        theta, rates, _ = robot.motors()
-        torque = drives.torque(references, index, np.array([theta]), np.array([rates]))
-        robot.apply(torque[0].tolist())
-
-    return range(len(references.theta)), drive

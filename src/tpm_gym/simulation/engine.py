@@ -10,6 +10,8 @@ from __future__ import annotations
 import importlib
 import inspect
 from collections.abc import Callable, Collection, Sequence
+from functools import cache
+from types import ModuleType
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -18,7 +20,7 @@ from numpy.typing import NDArray
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Quaternion, Vector, is_whole
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.machine import Machine
-from tpm_gym.simulation.drives import Servo
+from tpm_gym.simulation.drives import Servo, ServoDrives
 from tpm_gym.simulation.randomisation import Plant
 from tpm_gym.simulation.state import Scene
 from tpm_gym.simulation.vacuum import Hold
@@ -34,11 +36,27 @@ __all__ = [
     "register_engine",
     "require_engine",
     "spline_weights",
+    "steering",
+    "transform",
 ]
 
 UPRIGHT: Quaternion = (0.0, 0.0, 0.0, 1.0)
 SPRING_GAIN = 0.2
 """Share of its way back that the cup's spring takes in one time step."""
+
+
+def transform(origin: Vector, quaternion: Quaternion, point: Vector) -> Vector:
+    """Convert a point of a frame into the frame's parent, m."""
+    # rotate(), written out for speed.
+    u, v, w = origin
+    x, y, z, r = quaternion
+    a, b, c = point
+    s, t, p = 2 * (y * c - z * b), 2 * (z * a - x * c), 2 * (x * b - y * a)
+    return (
+        u + (a + r * s + y * p - z * t),
+        v + (b + r * t + z * s - x * p),
+        w + (c + r * p + x * t - y * s),
+    )
 
 
 class Pose(NamedTuple):
@@ -113,15 +131,16 @@ class Readout(NamedTuple):
             hold: What the cup holds.
             objects: Poses and velocities.
         """
-        (theta, rates, torque), (gap, place, tilt) = motors, truth
-        numbers = [*theta, *rates, *torque, *place, tilt, gap, hold.vacuum]
+        (theta, rates, torque), (gap, (x, y, z), tilt) = motors, truth
+        (a, b, c), (u, v, w) = machine.mount.plain_frame
+        own = a * (x - u), b * (y - v), c * (z - w)
+        numbers = [*theta, *rates, *torque, x, y, z, tilt, gap, hold.vacuum, *own]
         for (where, orientation), (velocity, spin) in objects:
             numbers += (*where, *orientation, *velocity, *spin)
         # One array for all numbers costs half of an array for each entry.
         row = np.array([numbers])
-        table = row[:, 15:].reshape(1, -1, 13)
-        turn, origin = machine.mount.frame
-        left = machine.mode_left(row[:, 0:3], (row[:, 9:12] - origin) * turn)
+        table = row[:, 18:].reshape(1, -1, 13)
+        left = machine.mode_left(row[:, 0:3], row[:, 15:18])
         return cls(
             row[:, 0:3], row[:, 3:6], row[:, 6:9], row[:, 9:12],
             row[:, 12], row[:, 13], left, np.array([hold.which]), row[:, 14],
@@ -167,9 +186,8 @@ class Path:
 
     def points(self, last: int = 0) -> FloatArray:
         """Return point P (n, k, 3) m at the ends of the last k time steps; 0 for all of them."""
-        from tpm_gym.simulation import compiled  # imports Numba
-
-        return compiled.spline_points(self._commands, self._weights[-last:])
+        points: FloatArray = _loops().spline_points(self._commands, self._weights[-last:])
+        return points
 
     def joints(self, last: int = 0) -> FloatArray:
         """Return true joint positions (n, k, 3) rad at the ends of the last k time steps.
@@ -178,11 +196,10 @@ class Path:
             JointLimitError: If a motor would be beyond a stop.
             UnreachableError: If a point is out of reach.
         """
-        from tpm_gym.simulation import compiled  # imports Numba
-
-        points = compiled.spline_points(self._commands, self._weights[-last:])
+        loops = _loops()
+        points = loops.spline_points(self._commands, self._weights[-last:])
         theta = self.machine.inverse(points)
-        if not compiled.all_within(theta.reshape(-1, 3), *self.machine.stops):  # NaN is not
+        if not loops.all_within(theta.reshape(-1, 3), *self.machine.stops):  # NaN is not
             theta = self.machine.reach(points)
         return theta if self._bias is None else self.true(theta)
 
@@ -191,6 +208,44 @@ class Path:
         if self._bias is None:
             return theta
         return theta - self._bias.reshape(-1, *(1,) * (theta.ndim - 2), 3)
+
+
+@cache
+def _loops() -> ModuleType:
+    """Import the compiled loops, and with them Numba."""
+    from tpm_gym.simulation import compiled
+
+    return compiled
+
+
+class Driven(Protocol):
+    """Robot of an engine that simulates one, with three motors."""
+
+    def motors(self) -> tuple[Vector, Vector, Vector]:
+        """Return joint positions (rad), velocities (rad/s) and torques (N m)."""
+
+    def drive(self, theta: Vector) -> None:
+        """Let ideal motors go to ``theta`` rad in the next time step."""
+
+    def apply(self, torque: Vector) -> None:
+        """Let the motors apply ``torque`` N m in the next time step."""
+
+
+def steering(
+    drives: ServoDrives | None, path: Path, robot: Driven
+) -> tuple[Sequence[Any], Callable[[Any], None]]:
+    """Return a target for each time step of a path, and the function that drives a robot to it."""
+    if drives is None:
+        return path.joints()[0].tolist(), robot.drive
+    references = drives.references(path)
+    drives.begin(references.theta[0])
+
+    def drive(index: int) -> None:
+        theta, rates, _ = robot.motors()
+        torque = drives.torque(references, index, np.array([theta]), np.array([rates]))
+        robot.apply(torque[0].tolist())
+
+    return range(len(references.theta)), drive
 
 
 class Engine(Protocol):

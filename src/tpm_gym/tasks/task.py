@@ -26,17 +26,28 @@ from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.state import CONTROL_PERIOD, Block, Scene, State
-from tpm_gym.tasks import rewards
 from tpm_gym.tasks.motion import Motion, Move, hanging
 
-__all__ = ["Entry", "Task"]
+__all__ = ["Entry", "Task", "dense", "distance"]
 
 Values = tuple[float, ...]
 
 _ZERO = (0.0, 0.0, 0.0)
-_EXAMPLES = 7
-"""States with which a task is checked; no other size is 7, so that axes cannot be confused."""
 _LIP = np.array(CUP.lip)
+
+
+def distance(one: ArrayLike, other: ArrayLike) -> FloatArray:
+    """Return the Euclidean distance (...,) m of points (..., k) m."""
+    gap: Any = np.subtract(one, other, dtype=np.float64)
+    parts = [*(gap * gap).T]
+    result: FloatArray = np.sqrt(sum(parts[1:], parts[0])).T  # numpy's sum costs several times more
+    return result
+
+
+def dense(gap: ArrayLike, unit: float = 0.1) -> FloatArray:
+    """Return minus ``gap`` (m) in units of ``unit`` (m), so that a typical error costs about 1."""
+    reward: FloatArray = np.asarray(gap, dtype=np.float64) / -unit
+    return reward
 
 
 @dataclass(frozen=True)
@@ -192,17 +203,24 @@ class Task(ABC):
         return {"goal": goal, "singularity": singularity, **self.shaping(state)}
 
     def goal_term(self, gap: FloatArray) -> FloatArray:
-        """Return the one term that depends on the goal, (...,), for a gap (...,) m."""
+        """Return the one term that depends on the goal, (...,), for a gap (...,) m; NaN fails."""
         if self.reward == "sparse":
-            return rewards.sparse(gap, self.tolerance)
-        return rewards.dense(gap)
+            return np.where(gap < self.tolerance, 0.0, -1.0)
+        return dense(gap)
 
     def penalty(self, state: State) -> FloatArray:
-        """Return the singularity penalty before weighting, (n,) in [0, 1]; 1 past a singularity."""
+        """Return the singularity penalty before weighting, (n,) in [0, 1]; 1 past a singularity.
+
+        It is 1 - (conditioning / safe_conditioning)^4, and 0 where the conditioning is safe: smooth
+        down to the threshold, and steepest there, so that crossing the threshold has a price.
+        Trained policies ignored a cubic step, which is flat at both ends: SAC on goals next to the
+        threshold, joint increments, spent 24% of the time below it without a penalty, 19% with the
+        cubic step, 1% with this.
+        """
         passed = state.assembly_mode_changed | state.working_mode_changed
-        return rewards.singularity_penalty(
-            state.conditioning * ~passed, self.machine.safe_conditioning
-        )
+        share = state.conditioning / self.machine.safe_conditioning
+        squared = share * share
+        return np.maximum(1.0 - squared * squared, passed)
 
     def success(self, gap: FloatArray) -> BoolArray:
         """Return whether the goal is achieved, (...,), for a gap (...,) m."""
@@ -211,51 +229,7 @@ class Task(ABC):
 
     def gap(self, achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
         """Return the distance to the goal, (...,) m, on which reward and success depend."""
-        return rewards.distance(achieved, desired)
-
-    def check(self) -> None:
-        """Compare the task's methods for several states at once with states alone.
-
-        A method that reduces over the robots (``np.linalg.norm(x)`` without ``axis=-1``), or takes
-        rows for columns, gives wrong rewards in vector environments without an error.
-
-        Raises:
-            ConfigurationError: If a method does not give what it has to, named by the method.
-        """
-        several = example_states(self.machine, self.scene)
-        goals = np.zeros((_EXAMPLES, self.goal_size))
-        self._check_shapes(several)
-        for row in (0, _EXAMPLES - 1):
-            alone, goal = several.take([row]), goals[row : row + 1]
-            for name, together, single in (
-                *_entries_of("achieved()", self.achieved(several), self.achieved(alone)),
-                *_entries_of("observe()", self.observe(several), self.observe(alone)),
-                *_entries_of("shaping()", self.shaping(several), self.shaping(alone)),
-                *_entries_of(
-                    "gap()",
-                    self.gap(self.achieved(several), goals),
-                    self.gap(self.achieved(alone), goal),
-                ),
-            ):
-                if np.shape(together)[:1] != (_EXAMPLES,) or not _equal(together[row], single):
-                    valid = "values (n, ...) for n robots, each from its own row; reduce by axis=-1"
-                    raise ConfigurationError(
-                        name, f"of shape {np.shape(together)} for {_EXAMPLES}", valid
-                    )
-
-    def _check_shapes(self, state: State) -> None:
-        """Refuse methods whose results have the wrong shape or type."""
-        achieved = np.shape(self.achieved(state))
-        if achieved != (_EXAMPLES, self.goal_size):
-            valid = f"of shape (n, {self.goal_size}), as goal_size says"
-            raise ConfigurationError("achieved()", f"of shape {achieved} for {_EXAMPLES}", valid)
-        shaping: object = self.shaping(state)
-        if not isinstance(shaping, Mapping):
-            raise ConfigurationError("shaping()", shaping, "a dictionary of terms; {} for none")
-        for name, values in shaping.items():
-            if name in ("goal", "singularity"):
-                raise ConfigurationError("shaping()", name, "names other than goal, singularity")
-            finite(f"shaping()[{name!r}]", values, (_EXAMPLES,), ConfigurationError)
+        return distance(achieved, desired)
 
     # -- start of an episode ----------------------------------------------------------------------
 
@@ -402,13 +376,12 @@ class Task(ABC):
 
     def _measure_object(self, index: int, state: State) -> FloatArray:
         """Return centre, offset, velocity, tilt and hold (n, 12) of one object."""
-        values = np.empty((len(state.held), 12))
-        values[:, :3] = state.object_position[:, index]
-        values[:, 3:6] = self.top(state, index) - self.lip(state)
-        values[:, 6:9] = state.object_velocity[:, index]
-        values[:, 9:11] = state.object_axis[:, index, :2]
-        values[:, 11] = (state.held == index) * (state.vacuum / CUP.vacuum)
-        return values
+        place, axis = state.object_position[:, index], state.object_axis[:, index]
+        half = self.scene.objects[index].height / 2
+        offset = place + axis * half - (state.fk_position - _LIP)  # from lip to top
+        held = (state.held == index) * (state.vacuum / CUP.vacuum)
+        parts = place, offset, state.object_velocity[:, index], axis[:, :2], held[:, None]
+        return np.concatenate(parts, axis=1)
 
     def _scales(self) -> tuple[Values, Values, Values, Values]:
         """Return centre and extent of the region (m, world), full speed (m/s), largest step (m)."""
@@ -434,7 +407,9 @@ class Task(ABC):
 
     def observe(self, state: State) -> FloatArray:
         """Return the observation vectors (n, k), each entry of order one."""
-        values = [source(state)[:, columns] for source, columns in self._sources]
+        values = []
+        for source, columns in self._sources:  # a comprehension would be a call
+            values.append(source(state)[:, columns])
         scaled: FloatArray = (np.concatenate(values, axis=1) - self._centre) / self._scale
         return scaled
 
@@ -477,46 +452,11 @@ class Task(ABC):
         if not self.scene.objects:
             return np.zeros(len(state.object_position), dtype=np.bool_)
         low, high = self._within
-        # So written, an object whose position is NaN is lost.
-        within = (state.object_position >= low) & (state.object_position <= high)
-        lost: BoolArray = np.logical_not(within.all(axis=(1, 2)))
+        # An object whose position is NaN is lost too: NaN differs from itself.
+        places = state.object_position
+        outside = np.minimum(np.maximum(places, low), high) != places
+        lost: BoolArray = np.logical_or.reduce(outside, axis=(1, 2))
         return lost
-
-
-def example_states(machine: Machine, scene: Scene) -> State:
-    """Return different states that a machine could be in, with a scene's objects."""
-    rng, objects, count = np.random.default_rng(0), len(scene.objects), _EXAMPLES
-    shape = (count, 3 + objects, 3)
-    inside = machine.mount.to_world(rng.uniform(machine.region.low, machine.region.high, shape))
-    turn = rng.normal(size=(count, objects, 4)) * (0.1, 0.1, 1.0, 1.0)
-    turn /= np.linalg.norm(turn, axis=2, keepdims=True)
-    x, y, z, w = np.moveaxis(turn, 2, 0)
-    axis = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=2)
-    never = np.zeros(count, dtype=np.bool_)
-    return State(
-        theta=rng.normal(size=(count, 3)), theta_dot=rng.normal(size=(count, 3)),
-        torque=rng.normal(size=(count, 3)), fk_position=inside[:, 0],
-        fk_velocity=rng.normal(size=(count, 3)), conditioning=rng.uniform(0.05, 0.2, count),
-        platform_position=inside[:, 1], platform_tilt=rng.random(count),
-        closure_error=rng.random(count),
-        assembly_mode_changed=never, working_mode_changed=never, command=inside[:, 2],
-        held=np.arange(count) % 2 - 1, vacuum=rng.uniform(0.0, CUP.vacuum, count),
-        object_position=inside[:, 3:], object_quaternion=turn, object_axis=axis,
-        object_velocity=rng.normal(size=(count, objects, 3)),
-        object_angular_velocity=rng.normal(size=(count, objects, 3)),
-    )  # fmt: skip
-
-
-def _entries_of(name: str, together: Any, single: Any) -> list[tuple[str, Any, Any]]:
-    """Pair the results of a method for two states with those for one, by entry."""
-    if isinstance(together, Mapping):
-        return [(f"{name}[{key!r}]", together[key], single.get(key)) for key in together]
-    return [(name, together, single)]
-
-
-def _equal(row: Any, single: Any) -> bool:
-    """Return whether a row is what the state alone gives, (1, ...)."""
-    return np.shape(single) == (1, *np.shape(row)) and np.allclose(row, single[0], equal_nan=True)
 
 
 def _columns(entries: Sequence[Entry]) -> Any:

@@ -48,6 +48,7 @@ class Cup:
     Attributes:
         grip: The held object.
         first: First time step of the control period in which the lip can touch an object.
+        sucks: First time step that needs :meth:`suck`.
     """
 
     def __init__(
@@ -66,10 +67,10 @@ class Cup:
         self._near: list[int] = []
         self._fastest = _FASTEST * time_step  # m in a time step
         self._wait = 0  # time steps in which the lip cannot come to an object
-        self.first = self._steps = 0
+        self.first = self.sucks = self._steps = 0
         self.grip = Grip()
 
-    def look(self, steps: int) -> list[int]:
+    def look(self, steps: int, on: bool) -> list[int]:
         """Find the objects that the lip can touch within the next ``steps`` time steps."""
         self._near, self._wait, self.first, self._steps = [], 0, steps, steps
         if self._bodies:
@@ -81,11 +82,8 @@ class Cup:
                 if wait < steps:
                     self._near.append(index)
                     self.first = min(self.first, wait)
+        self.sucks = 0 if self.grip != _OPEN else self.first if on else steps
         return self._near
-
-    def wakes(self, on: bool) -> int:
-        """Return the first time step of the control period that needs :meth:`suck`."""
-        return 0 if self.grip != _OPEN else self.first if on else self._steps
 
     def suck(self, on: bool) -> None:
         """Apply the vacuum law after a time step: change the pressure, take or drop an object."""

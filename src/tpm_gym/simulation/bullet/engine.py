@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pybullet
 from numpy.typing import NDArray
 
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector
@@ -18,8 +19,8 @@ from tpm_gym.simulation.bullet.friction import Friction
 from tpm_gym.simulation.bullet.physics import Physics
 from tpm_gym.simulation.bullet.robot import Robot
 from tpm_gym.simulation.bullet.scenery import Scenery
-from tpm_gym.simulation.drives import Servo, ServoDrives, steering
-from tpm_gym.simulation.engine import Engine, Path, Pose, Readout, Twist
+from tpm_gym.simulation.drives import Servo, ServoDrives
+from tpm_gym.simulation.engine import Engine, Path, Pose, Readout, Twist, steering
 from tpm_gym.simulation.randomisation import NOMINAL, Plant
 from tpm_gym.simulation.settings import settings_of
 from tpm_gym.simulation.state import Scene
@@ -130,8 +131,8 @@ class BulletEngine:
         """See the protocol."""
         cup, friction, step, on = self._cup, self._friction, self.client.stepSimulation, vacuum[0]
         targets, drive = steering(self._drives, path, self.robot)
-        near = cup.look(len(targets))
-        turns, sucks = friction.look(near, cup.first), cup.wakes(on)
+        turns = friction.look(cup.look(len(targets), on), cup.first)
+        sucks = cup.sucks
         for index, target in enumerate(targets):
             if index >= turns:
                 friction.turn(cup.grip.hold.which)
@@ -143,9 +144,14 @@ class BulletEngine:
 
     def read(self) -> Readout:
         """See the protocol."""
-        robot = self.robot
-        objects, hold = self._scenery.read(), self._cup.grip.hold
-        return Readout.of_one(self._machine, self._motors(), robot.truth(), hold, objects)
+        truth, hold = self.robot.truth(), self._cup.grip.hold
+        return Readout.of_one(self._machine, self._motors(), truth, hold, self._objects())
+
+    def _objects(self) -> list[tuple[Pose, Twist]]:
+        """Return poses and velocities of the objects."""
+        pose, twist = pybullet.getBasePositionAndOrientation, pybullet.getBaseVelocity
+        number = self.client.number
+        return [(pose(body, number), twist(body, number)) for body in self.bodies]
 
     def _motors(self) -> tuple[Vector, Vector, Vector]:
         """Return joint positions, velocities and torques of the motors."""
@@ -167,7 +173,7 @@ class BulletEngine:
             self.robot.joint_states(),
             self._motors()[2],
             None if self._drives is None else self._drives.memory.copy(),
-            self._scenery.read(),
+            self._objects(),
             self._cup.grip,
         )
 

@@ -95,7 +95,7 @@ class Friction:
         self._active = sorted({*moving, *near}) if moving else list(near)
         # A single object rests until the cup comes; several may push each other.
         alone = len(self._bodies) == 1
-        self._resting = {index for index in near if alone and index not in moving}
+        self._resting = set(near).difference(moving) if alone else set()
         return 0 if moving else first
 
     def _moves(self, index: int) -> bool:

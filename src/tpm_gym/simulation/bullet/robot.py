@@ -8,19 +8,17 @@ solver.
 
 from __future__ import annotations
 
-import math
 import os
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pybullet
 from numpy.typing import NDArray
 
-from tpm_gym.arrays import Vector, rotate, transform
+from tpm_gym.arrays import Vector, rotate
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism import urdf
 from tpm_gym.mechanism.bodies import Mechanism
@@ -28,7 +26,7 @@ from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.mount import Mount
 from tpm_gym.simulation.bullet.client import Client
 from tpm_gym.simulation.bullet.physics import MOTOR_GAIN
-from tpm_gym.simulation.engine import SPRING_GAIN
+from tpm_gym.simulation.engine import SPRING_GAIN, transform
 
 __all__ = ["Robot"]
 
@@ -55,6 +53,9 @@ class Robot:
 
     def __init__(self, client: Client, mechanism: Mechanism, mount: Mount) -> None:
         """Load the legs, remove PyBullet's own damping and motors, close the loops."""
+        from tpm_gym.simulation import compiled  # imports Numba
+
+        self._truth = compiled.truth
         self._client, self._mechanism = client, mechanism
         self.joints: dict[str, Address] = {}
         self.links: dict[str, Address] = {}
@@ -124,9 +125,10 @@ class Robot:
         self._watched = {body: [link for of, link in order if of == body] for body, _ in order}
         at = {name: order.index(link) for name, link in self.links.items() if link in watched}
         self._platform = at[self._mechanism.platform]
-        self._pairs = [
-            (at[c.link_a], c.point_a, at[c.link_b], c.point_b) for c in self._mechanism.closures
-        ]
+        closures = self._mechanism.closures
+        self._sides = np.array([(at[c.link_a], at[c.link_b]) for c in closures]).reshape(-1, 2)
+        self._point_p = np.array(self._mechanism.point_p)
+        self._pivots = np.array([(c.point_a, c.point_b) for c in closures]).reshape(-1, 2, 3)
 
     def _pivot(self, name: str, point: Vector) -> NDArray[np.float64]:
         """Return a link's point relative to its centre of mass, m.
@@ -220,20 +222,14 @@ class Robot:
     def truth(self) -> tuple[float, Vector, float]:
         """Return the largest loop gap (m), point P (m, world) and the platform's tilt (rad)."""
         number = self._client.number
-        states: list[Any] = []
+        frames: list[float] = []
         for body, links in self._watched.items():
-            states += pybullet.getLinkStates(body, links, 0, 1, number)
-        squared = 0.0
-        for at_a, point_a, at_b, point_b in self._pairs:
-            a, b = states[at_a], states[at_b]
-            x, y, z = transform(a[4], a[5], point_a)
-            u, v, w = transform(b[4], b[5], point_b)
-            gap = (x - u) ** 2 + (y - v) ** 2 + (z - w) ** 2
-            if gap > squared or gap != gap:  # a NaN stays
-                squared = gap
-        platform = states[self._platform]
-        place = transform(platform[4], platform[5], self._mechanism.point_p)
-        return math.sqrt(squared), place, Mount.tilt(platform[5])
+            for state in pybullet.getLinkStates(body, links, 0, 1, number):
+                frames += (*state[4], *state[5])
+        gap, x, y, z, tilt = self._truth(
+            np.array(frames), self._sides, self._pivots, self._platform, self._point_p
+        )
+        return gap, (x, y, z), tilt
 
     def lip(self) -> Vector:
         """Return the centre of the cup's lip, m, world."""

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import pybullet
 from numpy.typing import NDArray
 
 from tpm_gym.arrays import Vector
@@ -104,12 +103,6 @@ class Scenery:
             self._client.performCollisionDetection()
         for body, (_, twist) in zip(self.bodies, placed, strict=True):
             self._client.resetBaseVelocity(body, *twist)
-
-    def read(self) -> list[tuple[Pose, Twist]]:
-        """Return poses and velocities of the objects."""
-        pose, velocity = pybullet.getBasePositionAndOrientation, pybullet.getBaseVelocity
-        number = self._client.number
-        return [(Pose(*pose(body, number)), Twist(*velocity(body, number))) for body in self.bodies]
 
     def alter(self, mass: float, friction: float) -> None:
         """Make the objects ``mass`` times as heavy and ``friction`` times as rough as nominal."""

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.machine import Machine
-from tpm_gym.simulation.drives import Servo, ServoDrives, steering
-from tpm_gym.simulation.engine import Engine, Path, Pose, Readout
+from tpm_gym.simulation.drives import Servo, ServoDrives
+from tpm_gym.simulation.engine import Engine, Path, Pose, Readout, steering
 from tpm_gym.simulation.mujoco.cup import Cup, Grip
 from tpm_gym.simulation.mujoco.model import compile_model
 from tpm_gym.simulation.mujoco.physics import Physics

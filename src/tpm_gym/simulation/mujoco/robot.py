@@ -15,11 +15,11 @@ from collections.abc import Mapping, Sequence
 import mujoco
 import numpy as np
 
-from tpm_gym.arrays import Quaternion, Vector, rotate, transform
+from tpm_gym.arrays import Quaternion, Vector, rotate
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.mjcf import STIFF, site_names
 from tpm_gym.mechanism.mount import Mount
-from tpm_gym.simulation.engine import SPRING_GAIN
+from tpm_gym.simulation.engine import SPRING_GAIN, transform
 from tpm_gym.simulation.randomisation import NOMINAL, Plant
 
 __all__ = ["Robot"]

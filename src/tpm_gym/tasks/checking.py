@@ -1,0 +1,96 @@
+"""Check of a task: its methods for several states at once against the states alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from tpm_gym.arrays import finite
+from tpm_gym.errors import ConfigurationError
+from tpm_gym.mechanism.cup import CUP
+from tpm_gym.mechanism.machine import Machine
+from tpm_gym.simulation.state import Scene, State
+from tpm_gym.tasks.task import Task
+
+__all__ = ["check"]
+
+_EXAMPLES = 7
+"""States with which a task is checked; no other size is 7, so that axes cannot be confused."""
+
+
+def check(task: Task) -> None:
+    """Compare a task's methods for several states at once with the states alone.
+
+    A method that reduces over the robots (``np.linalg.norm(x)`` without ``axis=-1``), or takes
+    rows for columns, gives wrong rewards in vector environments without an error.
+
+    Raises:
+        ConfigurationError: If a method does not give what it has to, named by the method.
+    """
+    several = _example_states(task.machine, task.scene)
+    _check_shapes(task, several)
+    together = _results(task, several)
+    for row in (0, _EXAMPLES - 1):
+        alone = _results(task, several.take([row]))
+        for name, values in together.items():
+            if np.shape(values)[:1] != (_EXAMPLES,) or not _equal(values[row], alone.get(name)):
+                valid = "values (n, ...) for n robots, each from its own row; reduce by axis=-1"
+                shape = f"of shape {np.shape(values)} for {_EXAMPLES}"
+                raise ConfigurationError(name, shape, valid)
+
+
+def _results(task: Task, state: State) -> dict[str, Any]:
+    """Call every method of a task that reads a state; return the results by name."""
+    achieved = task.achieved(state)
+    return {
+        "achieved()": achieved,
+        "observe()": task.observe(state),
+        **{f"shaping()[{name!r}]": values for name, values in task.shaping(state).items()},
+        "gap()": task.gap(achieved, np.zeros((len(state.held), task.goal_size))),
+    }
+
+
+def _check_shapes(task: Task, state: State) -> None:
+    """Refuse methods whose results have the wrong shape or type."""
+    achieved = np.shape(task.achieved(state))
+    if achieved != (_EXAMPLES, task.goal_size):
+        valid = f"of shape (n, {task.goal_size}), as goal_size says"
+        raise ConfigurationError("achieved()", f"of shape {achieved} for {_EXAMPLES}", valid)
+    shaping: object = task.shaping(state)
+    if not isinstance(shaping, Mapping):
+        raise ConfigurationError("shaping()", shaping, "a dictionary of terms; {} for none")
+    for name, values in shaping.items():
+        if name in ("goal", "singularity"):
+            raise ConfigurationError("shaping()", name, "names other than goal, singularity")
+        finite(f"shaping()[{name!r}]", values, (_EXAMPLES,), ConfigurationError)
+
+
+def _equal(row: Any, single: Any) -> bool:
+    """Return whether a row is what the state alone gives, (1, ...)."""
+    return np.shape(single) == (1, *np.shape(row)) and np.allclose(row, single[0], equal_nan=True)
+
+
+def _example_states(machine: Machine, scene: Scene) -> State:
+    """Return different states that a machine could be in, with a scene's objects."""
+    rng, objects, count = np.random.default_rng(0), len(scene.objects), _EXAMPLES
+    shape = (count, 3 + objects, 3)
+    inside = machine.mount.to_world(rng.uniform(machine.region.low, machine.region.high, shape))
+    turn = rng.normal(size=(count, objects, 4)) * (0.1, 0.1, 1.0, 1.0)
+    turn /= np.linalg.norm(turn, axis=2, keepdims=True)
+    x, y, z, w = np.moveaxis(turn, 2, 0)
+    axis = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=2)
+    never = np.zeros(count, dtype=np.bool_)
+    return State(
+        theta=rng.normal(size=(count, 3)), theta_dot=rng.normal(size=(count, 3)),
+        torque=rng.normal(size=(count, 3)), fk_position=inside[:, 0],
+        fk_velocity=rng.normal(size=(count, 3)), conditioning=rng.uniform(0.05, 0.2, count),
+        platform_position=inside[:, 1], platform_tilt=rng.random(count),
+        closure_error=rng.random(count),
+        assembly_mode_changed=never, working_mode_changed=never, command=inside[:, 2],
+        held=np.arange(count) % 2 - 1, vacuum=rng.uniform(0.0, CUP.vacuum, count),
+        object_position=inside[:, 3:], object_quaternion=turn, object_axis=axis,
+        object_velocity=rng.normal(size=(count, objects, 3)),
+        object_angular_velocity=rng.normal(size=(count, objects, 3)),
+    )  # fmt: skip
