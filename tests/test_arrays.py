@@ -10,15 +10,14 @@ import torch
 from tpm_gym.arrays import (
     finite,
     finite_points,
-    floats,
     numbers,
     points,
     rotate,
-    transform,
     vector,
 )
 from tpm_gym.envs.vector import TPMVectorEnv
 from tpm_gym.errors import ConfigurationError, InputError, ResetOptionError
+from tpm_gym.simulation.engine import transform
 
 NO_NUMBERS = {
     "beyond the range of floats": [10**400, 0, 0],
@@ -97,16 +96,6 @@ def test_tuples_are_looked_at_as_closely(bad: Any) -> None:
     with pytest.raises(InputError):
         vector("goal", bad)
     assert vector("goal", (1e308, 1e308, 1e308)) == (1e308,) * 3
-
-
-@pytest.mark.parametrize("value", [(1.0, 2.0), [1, 2], np.array([1.0, 2.0], dtype=np.float32)])
-def test_so_many_numbers_become_plain_floats(value: Any) -> None:
-    found = floats("action", value, 2)
-    assert found == (1.0, 2.0)
-    assert {type(v) for v in found} == {float}
-    for bad in ([1.0], [[1.0, 2.0]], [1.0, np.nan], [np.inf, 0.0], "12", None):
-        with pytest.raises(InputError, match=r"numbers .* shape|finite numbers of shape \(2,\)"):
-            floats("action", bad, 2)
 
 
 def test_integers_that_only_floats_can_hold_are_numbers() -> None:

@@ -21,8 +21,8 @@ from tpm_gym.simulation import Plant
 from tpm_gym.simulation.bullet.physics import Physics
 from tpm_gym.simulation.state import State
 from tpm_gym.tasks import Entry, PickAndPlace, Reach, Task
-from tpm_gym.tasks.rewards import singularity_penalty
 from tpm_gym.tasks.sampling import APART
+from tpm_gym.tasks.task import singularity_penalty
 
 BLOCK = PickAndPlace.block
 

@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from tpm_gym.tasks.rewards import dense, distance, singularity_penalty, sparse
+from tpm_gym.mechanism.tpm import PAPER_TPM
+from tpm_gym.tasks import Reach, dense, distance
+from tpm_gym.tasks.task import singularity_penalty
 
 SAFE = 0.08
 
@@ -44,8 +46,9 @@ def test_one_pair_is_as_far_apart_as_in_a_batch_to_the_last_bit() -> None:
 
 def test_sparse_is_zero_strictly_within_the_tolerance_and_minus_one_elsewhere() -> None:
     gaps = np.array([0.0, 0.0099, 0.01, 0.0101, 3.0, np.nan])
-    np.testing.assert_array_equal(sparse(gaps, 0.01), [0, 0, -1, -1, -1, -1])
-    assert sparse(gaps, 0.01).dtype == np.float64
+    found = Reach(PAPER_TPM).goal_term(gaps)
+    np.testing.assert_array_equal(found, [0, 0, -1, -1, -1, -1])
+    assert found.dtype == np.float64
 
 
 def test_dense_is_minus_the_gap_in_units() -> None:

@@ -17,8 +17,8 @@ from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.tpm import PAPER_TPM, WIDE_TPM
 from tpm_gym.tasks import PickAndPlace, Reach, Task
-from tpm_gym.tasks.rewards import distance
 from tpm_gym.tasks.sampling import APART, BAND, line_in_joints
+from tpm_gym.tasks.task import distance
 
 SAFE = PAPER_TPM.safe_conditioning
 BLOCK = PickAndPlace.block

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, is_dataclass
-from functools import cache
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -203,7 +201,31 @@ class Core:
         self._state = state
         if rows is not None:
             state, goals = state.take(rows), goals[rows]
-        return report(self.task, state, goals)
+        task = self.task
+        found = np.ascontiguousarray(task.achieved(state))
+        observed, achieved, desired, sound = self.simulation.loops.bounded(
+            task.observe(state), OBSERVATION_BOUND, found, GOAL_BOUND, goals
+        )
+        gap, penalty = task.gap(achieved, desired), task.penalty(state)
+        terms = task.reward_terms(state, gap, penalty)
+        reward = terms["goal"] + _goal_free(terms)
+        if not (sound and math.isfinite(np.vdot(reward, reward))):
+            raise _not_finite(task, state, achieved, terms)
+        return (
+            {"observation": observed, "achieved_goal": achieved, "desired_goal": desired},
+            reward,
+            {
+                "is_success": task.success(gap),
+                "closure_error": state.closure_error,
+                "vacuum": state.vacuum,
+                "conditioning": state.conditioning,
+                "singularity_penalty": penalty,
+                "assembly_mode_changed": state.assembly_mode_changed,
+                "working_mode_changed": state.working_mode_changed,
+                "object_lost": task.lost(state),
+                "reward_terms": terms,
+            },
+        )
 
     def _noise(self, rows: IntArray) -> FloatArray:
         """Draw the errors (n, 3) rad of one reading of the encoders, for some environments."""
@@ -323,46 +345,6 @@ def action_space(task: Task) -> spaces.Box:
 
 def _box(bound: float, length: int) -> spaces.Box:
     return spaces.Box(-bound, bound, (length,), np.float32)
-
-
-def report(task: Task, state: State, goals: FloatArray) -> Report:
-    """Build observation, reward and info from a state.
-
-    Raises:
-        ConfigurationError: If the task makes something of the state that is not finite.
-    """
-    found = np.ascontiguousarray(task.achieved(state))
-    observed, achieved, desired, sound = _loops().bounded(
-        task.observe(state), OBSERVATION_BOUND, found, GOAL_BOUND, goals
-    )
-    gap, penalty = task.gap(achieved, desired), task.penalty(state)
-    terms = task.reward_terms(state, gap, penalty)
-    reward = terms["goal"] + _goal_free(terms)
-    if not (sound and math.isfinite(np.vdot(reward, reward))):
-        raise _not_finite(task, state, achieved, terms)
-    return (
-        {"observation": observed, "achieved_goal": achieved, "desired_goal": desired},
-        reward,
-        {
-            "is_success": task.success(gap),
-            "closure_error": state.closure_error,
-            "vacuum": state.vacuum,
-            "conditioning": state.conditioning,
-            "singularity_penalty": penalty,
-            "assembly_mode_changed": state.assembly_mode_changed,
-            "working_mode_changed": state.working_mode_changed,
-            "object_lost": task.lost(state),
-            "reward_terms": terms,
-        },
-    )
-
-
-@cache
-def _loops() -> ModuleType:
-    """Import the compiled loops, and with them Numba."""
-    from tpm_gym.simulation import compiled
-
-    return compiled
 
 
 def _goal_free(terms: Mapping[str, Any]) -> Any:

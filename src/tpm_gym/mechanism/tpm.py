@@ -155,7 +155,7 @@ class TPM(Machine):
         if not count or rows % count:
             valid = f"parameters of b machines, with b a divisor of {rows} rows"
             raise InputError("built", built.shape, valid)
-        return _rows(built, self._nominal.shape[1]), self._constants
+        return _rows(built, self._nominal.shape[1], "built"), self._constants
 
     # -- bodies -----------------------------------------------------------------------------
 
@@ -227,11 +227,11 @@ def _loops() -> ModuleType:
     return tpm_rows
 
 
-def _rows(values: ArrayLike, length: int = 3) -> FloatArray:
+def _rows(values: ArrayLike, length: int = 3, name: str = "vectors") -> FloatArray:
     """Return vectors (..., length) as the one kind of array for which the loops are compiled."""
     array = np.ascontiguousarray(values, np.float64)
     if array.shape[-1] != length:
-        raise InputError("vectors", array.shape, f"an array of shape (..., {length}), by shape")
+        raise InputError(name, array.shape, f"an array of shape (..., {length}), by shape")
     return array if array.flags.writeable else array.copy()
 
 

@@ -57,6 +57,9 @@ class Simulation:
         gui: Whether to open a window.
         renderer: Renderer of pictures; None for the engine's default.
 
+    Attributes:
+        loops: The compiled loops, :mod:`tpm_gym.simulation.compiled`.
+
     Raises:
         ConfigurationError: If an option is out of range, or the engine cannot serve it.
     """
@@ -76,7 +79,7 @@ class Simulation:
         """Start the engine and load the machines."""
         from tpm_gym.simulation import compiled  # imports Numba
 
-        self._loops = compiled
+        self.loops = compiled
         self.scene, self.machine, self.count, self.drive = scene, machine, count, drive
         self.engine: Engine = make_engine(
             engine, gui=gui, renderer=renderer, physics=physics, drive=drive
@@ -192,7 +195,7 @@ class Simulation:
             JointLimitError: If a motor would be beyond a stop; nothing has moved then.
             ClosureError: If a loop opened.
         """
-        if not self._loops.all_within(commands, *self._region):
+        if not self.loops.all_within(commands, *self._region):
             self.machine.reach(commands)  # the spline ends before the command does
         path = Path(
             self.machine,
@@ -232,7 +235,7 @@ class Simulation:
         if self._disturbed:
             theta = theta + self._bias[rows] + self._noise[rows, 1]
         position, jacobian, conditioning, _ = self.machine.evaluate(theta)
-        opened, left, senseless = self._loops.unusual(
+        opened, left, senseless = self.loops.unusual(
             now.gap, CLOSURE_LIMIT, now.mode_left, conditioning
         )
         if opened:
@@ -260,7 +263,7 @@ class Simulation:
             before, last = self._noise[:, 0], self._noise[:, 1]
             theta = theta + self._bias + last
             rates = rates + (last - before) / CONTROL_PERIOD
-        place, velocity, command, axis = self._loops.in_world(
+        place, velocity, command, axis = self.loops.in_world(
             self._position, self._jacobian, rates, self._commands,
             np.ascontiguousarray(now.object_quaternion), turn, origin,
         )  # fmt: skip

@@ -4,6 +4,17 @@ from tpm_gym.tasks.expert import Expert
 from tpm_gym.tasks.motion import Motion, Move, hanging
 from tpm_gym.tasks.pick_and_place import PickAndPlace
 from tpm_gym.tasks.reach import Reach
-from tpm_gym.tasks.task import Entry, Task
+from tpm_gym.tasks.task import Entry, Task, dense, distance
 
-__all__ = ["Entry", "Expert", "Motion", "Move", "PickAndPlace", "Reach", "Task", "hanging"]
+__all__ = [
+    "Entry",
+    "Expert",
+    "Motion",
+    "Move",
+    "PickAndPlace",
+    "Reach",
+    "Task",
+    "dense",
+    "distance",
+    "hanging",
+]

@@ -28,7 +28,7 @@ from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.state import CONTROL_PERIOD, Block, Scene, State
 from tpm_gym.tasks.motion import Motion, Move, hanging
 
-__all__ = ["Entry", "Task", "dense", "distance"]
+__all__ = ["Entry", "Task", "dense", "distance", "singularity_penalty"]
 
 Values = tuple[float, ...]
 
@@ -48,6 +48,19 @@ def dense(gap: ArrayLike, unit: float = 0.1) -> FloatArray:
     """Return minus ``gap`` (m) in units of ``unit`` (m), so that a typical error costs about 1."""
     reward: FloatArray = np.asarray(gap, dtype=np.float64) / -unit
     return reward
+
+
+def singularity_penalty(conditioning: ArrayLike, safe: float) -> FloatArray:
+    """Return 1 - (conditioning / safe)^4, and 0 where conditioning >= safe, (...,) in [0, 1].
+
+    The penalty is 1 at a singularity, smooth down to the threshold, and steepest there, so that
+    crossing the threshold has a price. Trained policies ignored a cubic step, which is flat at both
+    ends: SAC on goals next to the threshold, joint increments, spent 24% of the time below it
+    without a penalty, 19% with the cubic step, 1% with this.
+    """
+    share: Any = np.divide(conditioning, safe)
+    squared = share * share
+    return np.maximum(1.0 - squared * squared, 0.0)
 
 
 @dataclass(frozen=True)
@@ -209,18 +222,10 @@ class Task(ABC):
         return dense(gap)
 
     def penalty(self, state: State) -> FloatArray:
-        """Return the singularity penalty before weighting, (n,) in [0, 1]; 1 past a singularity.
-
-        It is 1 - (conditioning / safe_conditioning)^4, and 0 where the conditioning is safe: smooth
-        down to the threshold, and steepest there, so that crossing the threshold has a price.
-        Trained policies ignored a cubic step, which is flat at both ends: SAC on goals next to the
-        threshold, joint increments, spent 24% of the time below it without a penalty, 19% with the
-        cubic step, 1% with this.
-        """
+        """Return the singularity penalty before weighting, (n,) in [0, 1]; 1 past a singularity."""
         passed = state.assembly_mode_changed | state.working_mode_changed
-        share = state.conditioning / self.machine.safe_conditioning
-        squared = share * share
-        return np.maximum(1.0 - squared * squared, passed)
+        near = singularity_penalty(state.conditioning, self.machine.safe_conditioning)
+        return np.maximum(near, passed)
 
     def success(self, gap: FloatArray) -> BoolArray:
         """Return whether the goal is achieved, (...,), for a gap (...,) m."""

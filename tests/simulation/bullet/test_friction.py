@@ -63,7 +63,7 @@ def friction(simulation, other, link=-1, body=None):
 
 
 def place(simulation):
-    return np.array(simulation.engine._scenery.read()[0][0].position)
+    return simulation.engine.read().object_position[0, 0]
 
 
 def table(simulation):

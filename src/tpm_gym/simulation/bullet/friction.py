@@ -91,19 +91,18 @@ class Friction:
 
         It is 0 if an object moves, else ``first``, when the cup can touch one of the ``near`` ones.
         """
-        moving = [index for index in range(len(self._bodies)) if self._moves(index)]
+        moving = []
+        for index, (body, table, _) in enumerate(self._bodies):
+            (x, y, z), _ = pybullet.getBaseVelocity(body, self._number)
+            # Settling after a flat fall does not count.
+            settles = table.scales is _UNKNOWN and math.hypot(x, y) <= _SLIP and abs(z) < _FAST
+            if not settles and math.hypot(x, y, z) > _SLIP:
+                moving.append(index)
         self._active = sorted({*moving, *near}) if moving else list(near)
         # A single object rests until the cup comes; several may push each other.
         alone = len(self._bodies) == 1
         self._resting = set(near).difference(moving) if alone else set()
         return 0 if moving else first
-
-    def _moves(self, index: int) -> bool:
-        """Return whether an object slides or falls; settling after a flat fall does not count."""
-        body, table, _ = self._bodies[index]
-        (x, y, z), _ = pybullet.getBaseVelocity(body, self._number)
-        settles = table.scales is _UNKNOWN and math.hypot(x, y) <= _SLIP and abs(z) < _FAST
-        return not settles and math.hypot(x, y, z) > _SLIP
 
     def turn(self, held: int) -> None:
         """Scale the friction of objects that may slip, before a time step."""
