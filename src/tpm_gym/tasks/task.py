@@ -60,7 +60,8 @@ def singularity_penalty(conditioning: ArrayLike, safe: float) -> FloatArray:
     """
     share: Any = np.divide(conditioning, safe)
     squared = share * share
-    return np.maximum(1.0 - squared * squared, 0.0)
+    penalty: FloatArray = np.maximum(1.0 - squared * squared, 0.0)
+    return penalty
 
 
 @dataclass(frozen=True)
