@@ -1,19 +1,29 @@
 """The reward terms: exact at their ends, steep where it matters, the same alone or in a batch."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
+from tpm_gym.arrays import FloatArray
 from tpm_gym.mechanism.tpm import PAPER_TPM
+from tpm_gym.simulation import compiled
 from tpm_gym.tasks import Reach, dense, distance
-from tpm_gym.tasks.task import singularity_penalty
 
 SAFE = 0.08
+
+
+def singularity_penalty(conditioning: Any, safe: float, passed: bool = False) -> FloatArray:
+    c = np.atleast_1d(np.asarray(conditioning, dtype=float))
+    never = np.zeros(c.shape, dtype=bool)
+    return compiled.singularity_penalty(c, safe, never, never | passed)
 
 
 def test_penalty_is_zero_where_it_is_safe_and_one_at_a_singularity() -> None:
     safe = np.linspace(SAFE, 1, 50)
     np.testing.assert_array_equal(singularity_penalty(safe, SAFE), 0)
     assert singularity_penalty(0.0, SAFE) == 1
+    assert singularity_penalty(1.0, SAFE, passed=True) == 1
     assert singularity_penalty(SAFE / 2, SAFE) == pytest.approx(15 / 16)
     assert singularity_penalty(np.nextafter(SAFE, 0) - 1e-6, SAFE) > 0
 

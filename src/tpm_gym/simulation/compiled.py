@@ -5,17 +5,21 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tpm_gym.arrays import FloatArray, IntArray
+from tpm_gym.arrays import BoolArray, FloatArray, IntArray
 from tpm_gym.compiling import compiled, kept
 
 __all__ = [
     "all_within",
+    "any_outside",
     "bounded",
     "braced_inverse",
     "in_world",
     "inverted",
     "limited",
+    "measured_object",
+    "measured_robot",
     "servo_torques",
+    "singularity_penalty",
     "spline_points",
     "truth",
     "unusual",
@@ -88,7 +92,7 @@ def in_world(
         position: (n, 3) m, machine's frame.
         jacobian: (n, 3, 3) m/rad.
         theta_dot: (n, 3) rad/s.
-        commands: (n, 2, 3) m, machine's frame; the second one is converted.
+        commands: (n, 3, 3) m, machine's frame; the second one is converted.
         quaternion: (n, k, 4) orientations of objects in the world.
         turn: (3,) factors of the machine's frame.
         origin: (3,) m.
@@ -113,6 +117,86 @@ def in_world(
             axes[row, item, 1] = 2 * (y * z - w * x)
             axes[row, item, 2] = 1 - 2 * (x * x + y * y)
     return place, speed, wanted, axes
+
+
+@kept
+def measured_robot(position: FloatArray, velocity: FloatArray, command: FloatArray) -> FloatArray:
+    """Return position, velocity, and command minus position (n, 9), from (n, 3) each."""
+    values = np.empty((len(position), 9))
+    for row in range(len(position)):
+        for i in range(3):
+            values[row, i] = position[row, i]
+            values[row, 3 + i] = velocity[row, i]
+            values[row, 6 + i] = command[row, i] - position[row, i]
+    return values
+
+
+@kept
+def measured_object(
+    index: int,
+    places: FloatArray,
+    axes: FloatArray,
+    velocities: FloatArray,
+    lips: FloatArray,
+    half: float,
+    held: IntArray,
+    share: FloatArray,
+) -> FloatArray:
+    """Return centre, offset, velocity, tilt and hold (n, 12) of one of k objects.
+
+    Args:
+        index: Number of the object.
+        places: (n, k, 3) m, centres of the objects.
+        axes: (n, k, 3), their own z axes.
+        velocities: (n, k, 3) m/s.
+        lips: (n, 3) m, centres of the cups' lips.
+        half: Half the object's height, m.
+        held: (n,) index of the object in the cup.
+        share: (n,) vacuum, as a share of the largest.
+    """
+    values = np.empty((len(places), 12))
+    for row in range(len(places)):
+        for i in range(3):
+            place, axis = places[row, index, i], axes[row, index, i]
+            values[row, i] = place
+            values[row, 3 + i] = place + axis * half - lips[row, i]
+            values[row, 6 + i] = velocities[row, index, i]
+        values[row, 9], values[row, 10] = axes[row, index, 0], axes[row, index, 1]
+        values[row, 11] = share[row] if held[row] == index else 0.0
+    return values
+
+
+@kept
+def any_outside(places: FloatArray, low: FloatArray, high: FloatArray) -> BoolArray:
+    """Return whether any place (n, k, 3) is not between low and high (k, 3), (n,); NaN is not."""
+    found = np.zeros(len(places), np.bool_)
+    for row in range(len(places)):
+        for item in range(places.shape[1]):
+            for axis in range(3):
+                if not low[item, axis] <= places[row, item, axis] <= high[item, axis]:
+                    found[row] = True
+    return found
+
+
+@kept
+def singularity_penalty(
+    conditioning: FloatArray, safe: float, assembly: BoolArray, working: BoolArray
+) -> FloatArray:
+    """Compute the penalty (n,) of :meth:`tpm_gym.tasks.Task.penalty`.
+
+    Args:
+        conditioning: (n,).
+        safe: Conditioning from which on the penalty is zero.
+        assembly: (n,) whether a parallel singularity was passed.
+        working: (n,) whether a serial singularity was passed.
+    """
+    penalty = np.empty(len(conditioning))
+    for row in range(len(conditioning)):
+        share = conditioning[row] / safe
+        squared = share * share
+        passed = assembly[row] or working[row]
+        penalty[row] = 1.0 if passed else max(1.0 - squared * squared, 0.0)
+    return penalty
 
 
 @kept

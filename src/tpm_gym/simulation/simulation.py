@@ -93,7 +93,8 @@ class Simulation:
         self._weights = spline_weights(round(CONTROL_PERIOD / self.engine.time_step))
         self._frame = machine.mount.frame
         self._region = np.array(machine.region.low), np.array(machine.region.high)
-        self._commands = np.zeros((count, 2, 3))  # the last two, machine's frame, m
+        # The last two and the next one, machine's frame, m
+        self._commands = np.zeros((count, 3, 3))
         self._noise = np.zeros((count, 2, 3))  # of the last two readings of the encoders, rad
         self._bias = np.zeros((count, 3))  # of the encoders, rad
         self._disturbed = False  # whether any encoder has bias or noise
@@ -197,15 +198,10 @@ class Simulation:
         """
         if not self.loops.all_within(commands, *self._region):
             self.machine.reach(commands)  # the spline ends before the command does
-        path = Path(
-            self.machine,
-            np.concatenate([self._commands, commands[:, None]], axis=1),
-            self._weights,
-            self._bias if self._disturbed else None,
-        )
-        self.engine.advance(path, vacuum)
-        self._commands[:, 0] = self._commands[:, 1]
-        self._commands[:, 1] = commands
+        self._commands[:, 2] = commands
+        bias = self._bias if self._disturbed else None
+        self.engine.advance(Path(self.machine, self._commands, self._weights, bias), vacuum)
+        self._commands[:, :2] = self._commands[:, 1:]
         if self._disturbed or noise is not None:
             self._noise[:, 0] = self._noise[:, 1]
             self._noise[:, 1] = 0.0 if noise is None else noise

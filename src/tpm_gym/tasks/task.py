@@ -13,8 +13,9 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from itertools import cycle, groupby
+from types import ModuleType
 from typing import Any, ClassVar
 
 import numpy as np
@@ -28,7 +29,7 @@ from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.state import CONTROL_PERIOD, Block, Scene, State
 from tpm_gym.tasks.motion import Motion, Move, hanging
 
-__all__ = ["Entry", "Task", "dense", "distance", "singularity_penalty"]
+__all__ = ["Entry", "Task", "dense", "distance"]
 
 Values = tuple[float, ...]
 
@@ -48,20 +49,6 @@ def dense(gap: ArrayLike, unit: float = 0.1) -> FloatArray:
     """Return minus ``gap`` (m) in units of ``unit`` (m), so that a typical error costs about 1."""
     reward: FloatArray = np.asarray(gap, dtype=np.float64) / -unit
     return reward
-
-
-def singularity_penalty(conditioning: ArrayLike, safe: float) -> FloatArray:
-    """Return 1 - (conditioning / safe)^4, and 0 where conditioning >= safe, (...,) in [0, 1].
-
-    The penalty is 1 at a singularity, smooth down to the threshold, and steepest there, so that
-    crossing the threshold has a price. Trained policies ignored a cubic step, which is flat at both
-    ends: SAC on goals next to the threshold, joint increments, spent 24% of the time below it
-    without a penalty, 19% with the cubic step, 1% with this.
-    """
-    share: Any = np.divide(conditioning, safe)
-    squared = share * share
-    penalty: FloatArray = np.maximum(1.0 - squared * squared, 0.0)
-    return penalty
 
 
 @dataclass(frozen=True)
@@ -223,10 +210,21 @@ class Task(ABC):
         return dense(gap)
 
     def penalty(self, state: State) -> FloatArray:
-        """Return the singularity penalty before weighting, (n,) in [0, 1]; 1 past a singularity."""
-        passed = state.assembly_mode_changed | state.working_mode_changed
-        near = singularity_penalty(state.conditioning, self.machine.safe_conditioning)
-        return np.maximum(near, passed)
+        """Return the singularity penalty before weighting, (n,) in [0, 1].
+
+        It is 1 - (c / safe)^4 for a conditioning c below the machine's ``safe_conditioning``, else
+        0, and 1 past a singularity. It is smooth down to the threshold, and steepest there, so that
+        crossing the threshold has a price. Trained policies ignored a cubic step, which is flat at
+        both ends: SAC on goals next to the threshold, joint increments, spent 24% of the time below
+        it without a penalty, 19% with the cubic step, 1% with this.
+        """
+        values: FloatArray = _loops().singularity_penalty(
+            state.conditioning,
+            self.machine.safe_conditioning,
+            state.assembly_mode_changed,
+            state.working_mode_changed,
+        )
+        return values
 
     def success(self, gap: FloatArray) -> BoolArray:
         """Return whether the goal is achieved, (...,), for a gap (...,) m."""
@@ -382,12 +380,12 @@ class Task(ABC):
 
     def _measure_object(self, index: int, state: State) -> FloatArray:
         """Return centre, offset, velocity, tilt and hold (n, 12) of one object."""
-        place, axis = state.object_position[:, index], state.object_axis[:, index]
-        half = self.scene.objects[index].height / 2
-        offset = place + axis * half - (state.fk_position - _LIP)  # from lip to top
-        held = (state.held == index) * (state.vacuum / CUP.vacuum)
-        parts = place, offset, state.object_velocity[:, index], axis[:, :2], held[:, None]
-        return np.concatenate(parts, axis=1)
+        plain, half = np.ascontiguousarray, self.scene.objects[index].height / 2
+        values: FloatArray = _loops().measured_object(
+            index, plain(state.object_position), state.object_axis, plain(state.object_velocity),
+            state.fk_position - _LIP, half, state.held, state.vacuum / CUP.vacuum,
+        )  # fmt: skip
+        return values
 
     def _scales(self) -> tuple[Values, Values, Values, Values]:
         """Return centre and extent of the region (m, world), full speed (m/s), largest step (m)."""
@@ -455,13 +453,8 @@ class Task(ABC):
 
     def lost(self, state: State) -> BoolArray:
         """Return whether an object is off the table or out of the robot's reach, (n,)."""
-        if not self.scene.objects:
-            return np.zeros(len(state.object_position), dtype=np.bool_)
-        low, high = self._within
-        # An object whose position is NaN is lost too: NaN differs from itself.
-        places = state.object_position
-        outside = np.minimum(np.maximum(places, low), high) != places
-        lost: BoolArray = np.logical_or.reduce(outside, axis=(1, 2))
+        places = np.ascontiguousarray(state.object_position)
+        lost: BoolArray = _loops().any_outside(places, *self._within)
         return lost
 
 
@@ -475,8 +468,18 @@ def _columns(entries: Sequence[Entry]) -> Any:
 
 def _measure_robot(state: State) -> FloatArray:
     """Return position, velocity and command (n, 9) of the robot."""
-    position = state.fk_position
-    return np.concatenate([position, state.fk_velocity, state.command - position], axis=1)
+    values: FloatArray = _loops().measured_robot(
+        state.fk_position, state.fk_velocity, state.command
+    )
+    return values
+
+
+@cache
+def _loops() -> ModuleType:
+    """Import the compiled loops, and with them Numba."""
+    from tpm_gym.simulation import compiled
+
+    return compiled
 
 
 def _range(low: ArrayLike, high: ArrayLike) -> str:
