@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 import tpm_gym
 from tpm_gym.arrays import FloatArray
 from tpm_gym.simulation import Block, Scene, State
-from tpm_gym.tasks import Entry, Motion, Move, Task, distance, hanging, sampling
+from tpm_gym.tasks import Entry, Motion, Move, Task, hanging, sampling
 
 CLEARANCE = 0.045  # m; a block that is carried passes over one that stands
 APART = 0.060  # m between the middles of what stands on the table
@@ -47,7 +47,7 @@ class Stack(Task):
     def gap(self, achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
         """That of the block that is farther from its place."""
         ends = (np.reshape(goal, (*np.shape(goal)[:-1], 2, 3)) for goal in (achieved, desired))
-        largest: FloatArray = distance(*ends).max(axis=-1)
+        largest: FloatArray = super().gap(*ends).max(axis=-1)
         return largest
 
     def shaping(self, state: State) -> dict[str, FloatArray]:

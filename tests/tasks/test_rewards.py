@@ -8,9 +8,10 @@ import pytest
 from tpm_gym.arrays import FloatArray
 from tpm_gym.mechanism.tpm import PAPER_TPM
 from tpm_gym.simulation import compiled
-from tpm_gym.tasks import Reach, dense, distance
+from tpm_gym.tasks import Reach, dense
 
 SAFE = 0.08
+distance = Reach(PAPER_TPM).gap
 
 
 def singularity_penalty(conditioning: Any, safe: float, passed: bool = False) -> FloatArray:

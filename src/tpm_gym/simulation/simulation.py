@@ -59,6 +59,7 @@ class Simulation:
 
     Attributes:
         loops: The compiled loops, :mod:`tpm_gym.simulation.compiled`.
+        commands: (n, 3) m, commanded positions of point P, machine's frame.
 
     Raises:
         ConfigurationError: If an option is out of range, or the engine cannot serve it.
@@ -95,6 +96,7 @@ class Simulation:
         self._region = np.array(machine.region.low), np.array(machine.region.high)
         # The last two and the next one, machine's frame, m
         self._commands = np.zeros((count, 3, 3))
+        self.commands = self._commands[:, 1]
         self._noise = np.zeros((count, 2, 3))  # of the last two readings of the encoders, rad
         self._bias = np.zeros((count, 3))  # of the encoders, rad
         self._disturbed = False  # whether any encoder has bias or noise
@@ -211,11 +213,6 @@ class Simulation:
     # -- reading ----------------------------------------------------------------------------
 
     @property
-    def commands(self) -> FloatArray:
-        """Commanded positions of point P, (n, 3) m, machine's frame."""
-        return self._commands[:, 1]
-
-    @property
     def mode_left(self) -> NDArray[np.int8]:
         """(n,) mode that each machine left in this episode: 0 none, 1 assembly, 2 working."""
         return self._mode_left
@@ -304,6 +301,7 @@ class Simulation:
         self.engine.restore(snapshot.engine)
         for name, values in snapshot.columns.items():
             setattr(self, f"_{name}", values.copy())
+        self.commands = self._commands[:, 1]
         self._disturbed = bool(self._bias.any() or self._noise.any())
         self._readout = self.engine.read()
 

@@ -4,7 +4,7 @@ from tpm_gym.tasks.expert import Expert
 from tpm_gym.tasks.motion import Motion, Move, hanging
 from tpm_gym.tasks.pick_and_place import PickAndPlace
 from tpm_gym.tasks.reach import Reach
-from tpm_gym.tasks.task import Entry, Task, dense, distance
+from tpm_gym.tasks.task import Entry, Task, dense
 
 __all__ = [
     "Entry",
@@ -15,6 +15,5 @@ __all__ = [
     "Reach",
     "Task",
     "dense",
-    "distance",
     "hanging",
 ]

@@ -12,7 +12,7 @@ from tpm_gym.kinematics.workspace import Region
 from tpm_gym.simulation.state import Block, Scene, State
 from tpm_gym.tasks import sampling
 from tpm_gym.tasks.motion import Motion, Move, hanging
-from tpm_gym.tasks.task import Entry, Task, dense, distance
+from tpm_gym.tasks.task import Entry, Task, dense
 
 __all__ = ["PickAndPlace"]
 
@@ -78,7 +78,7 @@ class PickAndPlace(Task):
         """Return minus half the distance from cup to block, for a dense reward only."""
         if self.reward == "sparse":
             return {}
-        return {"approach": 0.5 * dense(distance(self.lip(state), self.top(state)))}
+        return {"approach": 0.5 * dense(self.gap(self.lip(state), self.top(state)))}
 
     # -- the expert -------------------------------------------------------------------------------
 

@@ -23,7 +23,6 @@ from tpm_gym.arrays import FloatArray, Vector
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism.machine import Machine
-from tpm_gym.tasks.task import distance
 
 __all__ = [
     "APART",
@@ -64,7 +63,7 @@ def apart_from(
     """
     points = machine.sample(rngs, regions)
     for _ in range(_ATTEMPTS):
-        near = distance(points[:, None], others) < apart
+        near = np.linalg.norm(np.subtract(points[:, None], others), axis=-1) < apart
         rows = np.flatnonzero(near.any(axis=1)).tolist()
         if not rows:
             return points
@@ -109,7 +108,7 @@ def _tempting(
             else np.tile(start, (len(goals), 1))
         )
         for first, last in zip(starts, goals, strict=False):
-            apart = distance(first, last) >= APART
+            apart = np.linalg.norm(first - last, axis=-1) >= APART
             if apart and (line_in_joints(machine, first, last) < machine.safe_conditioning).any():
                 return first, last
     valid = f"'sampled': on {machine.name!r} no straight line in the joints nears the singularity"

@@ -29,20 +29,12 @@ from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.state import CONTROL_PERIOD, Block, Scene, State
 from tpm_gym.tasks.motion import Motion, Move, hanging
 
-__all__ = ["Entry", "Task", "dense", "distance"]
+__all__ = ["Entry", "Task", "dense"]
 
 Values = tuple[float, ...]
 
 _ZERO = (0.0, 0.0, 0.0)
 _LIP = np.array(CUP.lip)
-
-
-def distance(one: ArrayLike, other: ArrayLike) -> FloatArray:
-    """Return the Euclidean distance (...,) m of points (..., k) m."""
-    gap: Any = np.subtract(one, other, dtype=np.float64)
-    parts = [*(gap * gap).T]
-    result: FloatArray = np.sqrt(sum(parts[1:], parts[0])).T  # numpy's sum costs several times more
-    return result
 
 
 def dense(gap: ArrayLike, unit: float = 0.1) -> FloatArray:
@@ -232,8 +224,11 @@ class Task(ABC):
         return near
 
     def gap(self, achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
-        """Return the distance to the goal, (...,) m, on which reward and success depend."""
-        return distance(achieved, desired)
+        """Return the Euclidean distance to the goal, (...,) m: reward and success depend on it."""
+        gap: Any = np.subtract(achieved, desired, dtype=np.float64)
+        parts = [*(gap * gap).T]
+        distance: FloatArray = np.sqrt(sum(parts[1:], parts[0])).T  # numpy's sum costs more
+        return distance
 
     # -- start of an episode ----------------------------------------------------------------------
 

@@ -150,8 +150,9 @@ class BulletEngine:
     def _objects(self) -> list[tuple[Pose, Twist]]:
         """Return poses and velocities of the objects."""
         pose, twist = pybullet.getBasePositionAndOrientation, pybullet.getBaseVelocity
-        number = self.client.number
-        return [(pose(body, number), twist(body, number)) for body in self.bodies]
+        numbers = [self.client.number] * len(self.bodies)
+        poses, twists = map(pose, self.bodies, numbers), map(twist, self.bodies, numbers)
+        return list(zip(poses, twists, strict=True))
 
     def _motors(self) -> tuple[Vector, Vector, Vector]:
         """Return joint positions, velocities and torques of the motors."""
