@@ -84,11 +84,11 @@ def _example_states(machine: Machine, scene: Scene) -> State:
     never = np.zeros(count, dtype=np.bool_)
     return State(
         theta=rng.normal(size=(count, 3)), theta_dot=rng.normal(size=(count, 3)),
-        torque=rng.normal(size=(count, 3)), fk_position=inside[:, 0],
+        torque=rng.normal(size=(count, 3)), fk_position=inside[:, 0].copy(),
         fk_velocity=rng.normal(size=(count, 3)), conditioning=rng.uniform(0.05, 0.2, count),
         platform_position=inside[:, 1], platform_tilt=rng.random(count),
         closure_error=rng.random(count),
-        assembly_mode_changed=never, working_mode_changed=never, command=inside[:, 2],
+        assembly_mode_changed=never, working_mode_changed=never, command=inside[:, 2].copy(),
         held=np.arange(count) % 2 - 1, vacuum=rng.uniform(0.0, CUP.vacuum, count),
         object_position=inside[:, 3:], object_quaternion=turn, object_axis=axis,
         object_velocity=rng.normal(size=(count, objects, 3)),
