@@ -177,7 +177,8 @@ class MissingPackageError(TPMError, ImportError):
     """An optional package is needed for this and is not installed; ``extra`` installs it."""
 
     template: ClassVar[str] = (
-        "this needs {package}, which cannot be imported; pip install 'tpm-gym[{extra}]'"
+        "this needs {package}, which cannot be imported; pip install 'tpm-gym[{extra}]'{hint}"
     )
     package: str
     extra: str
+    hint: str = ""

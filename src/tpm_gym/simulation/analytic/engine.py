@@ -12,6 +12,7 @@ The loops' gap and the platform's tilt are always 0 here; use another engine to 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -318,7 +319,8 @@ class AnalyticEngine:
         """See the protocol."""
         first = np.zeros(1, dtype=np.int64)
         if self._artist is None:
-            self._artist = make_engine("pybullet", renderer=self._renderer)
+            drawn = "pybullet" if find_spec("pybullet") else "mujoco"
+            self._artist = make_engine(drawn, renderer=self._renderer)
             self._artist.load(self._machine, self._scene, 1)
         theta = self._machine.require_inverse(self._position[:1])
         now = self._contact.read()
