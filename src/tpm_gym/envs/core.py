@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
-from tpm_gym.arrays import BoolArray, FloatArray, IntArray, numbers
+from tpm_gym.arrays import FloatArray, IntArray, numbers
 from tpm_gym.errors import ConfigurationError, EpisodeError, InputError
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.drives import Servo, drives_and_randomisation
@@ -404,9 +404,3 @@ def _require_goals(size: int, achieved: ArrayLike, desired: ArrayLike) -> None:
     if not fit:
         valid = f"of shapes (..., {size}) that go together, by shape"
         raise InputError("achieved_goal, desired_goal", shapes, valid)
-
-
-def truncated(info: Mapping[str, Any]) -> BoolArray:
-    """Return (n,) whether episodes end because the mechanism passed a singularity."""
-    ended: BoolArray = info["assembly_mode_changed"] | info["working_mode_changed"]
-    return ended

@@ -20,7 +20,6 @@ from tpm_gym.envs.core import (
     action_space,
     compute_reward,
     observation_space,
-    truncated,
 )
 from tpm_gym.errors import (
     ActionError,
@@ -123,6 +122,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         self.drive, self.randomisation = first.drive, first.randomisation
         self.single_observation_space = observation_space(self.task)
         self.single_action_space = action_space(self.task)
+        self._shape = self.num_envs, self.task.action_size
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
@@ -200,17 +200,25 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             ActionError: If the actions have the wrong shape or are not finite.
             EpisodeError: Before reset, after close, or where an episode ended and is not reset.
         """
-        self._require_open()
-        shape = (self.num_envs, self.task.action_size)
-        values = finite("actions", actions, shape, ActionError)
+        plain = type(actions) is np.ndarray and actions.dtype.char in "df"  # as usual
+        shape = self._shape
+        if not plain or actions.shape != shape or not np.isfinite(actions).all():
+            actions = finite("actions", actions, shape, ActionError)
         self._require_running()
-        *found, infos = zip(*self._each(lambda part, rows: part.step(values[rows])), strict=True)
-        observation, told = self._merged(zip(found[0], infos, strict=True))
-        reward, ended = (np.concatenate(parts) for parts in found[1:])
+        values = actions.astype(np.float64)
+        if len(self._parts) == 1:
+            observation, reward, ended, told = self._parts[0].step(values)
+        else:
+            found = self._each(lambda part, rows: part.step(values[rows]))
+            observations, rewards, ends, infos = zip(*found, strict=True)
+            observation, told = self._merged(zip(observations, infos, strict=True))
+            reward, ended = np.concatenate(rewards), np.concatenate(ends)
         return observation, reward, np.zeros_like(ended), ended, told
 
     def _require_running(self) -> None:
-        """Raise if an environment needs a reset by the user."""
+        """Raise if the environments are closed, or one needs a reset by the user."""
+        if self.closed:
+            self._require_open()
         if self.autoreset_mode == AutoresetMode.NEXT_STEP and self._parts[0].core.rngs:
             return
         ended = np.flatnonzero(np.concatenate([part.ended for part in self._parts]))
@@ -332,7 +340,9 @@ class _Part:
         """Start episodes in some environments, with new generators where some are given."""
         core = self.core
         own = core.rngs or [seeding.np_random(None)[0] for _ in range(core.count)]
-        infos = self._begin(rows, [rngs[k] or own[k] for k in rows.tolist()], options)
+        infos = {}
+        if len(rows):
+            infos = self._begin(rows, [rngs[k] or own[k] for k in rows.tolist()], options)
         observation, _, told = core.report()
         return observation, {**_masked(told, rows, core.count), **infos}
 
@@ -340,8 +350,6 @@ class _Part:
         self, rows: IntArray, rngs: Sequence[np.random.Generator], options: Any = None
     ) -> dict[str, Any]:
         """Start episodes in some environments; return what infos say of their randomisation."""
-        if not len(rows):
-            return {}
         drawn = self.core.reset(rows, rngs, options)
         self.elapsed[rows] = 0
         self.ended[rows] = False
@@ -359,9 +367,11 @@ class _Part:
         renewed = np.flatnonzero(self.ended)
         core.step(actions, np.flatnonzero(~self.ended))
         self.elapsed += 1
-        infos = self._begin(renewed, [core.rngs[row] for row in renewed.tolist()])
+        infos = {}
+        if len(renewed):
+            infos = self._begin(renewed, [core.rngs[row] for row in renewed.tolist()])
         observation, reward, told = core.report()
-        ended = truncated(told)
+        ended = told["assembly_mode_changed"] | told["working_mode_changed"]
         if self._limit is not None:
             ended = ended | (self.elapsed >= self._limit)
         reward[renewed] = 0.0
