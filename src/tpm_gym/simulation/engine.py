@@ -31,6 +31,7 @@ __all__ = [
     "Pose",
     "Readout",
     "Twist",
+    "drives_of_one",
     "make_engine",
     "most_robots",
     "register_engine",
@@ -216,6 +217,19 @@ def _loops() -> ModuleType:
     from tpm_gym.simulation import compiled
 
     return compiled
+
+
+def drives_of_one(
+    servo: Servo | None, machine: Machine, count: int, time_step: float
+) -> ServoDrives | None:
+    """Return the drives of an engine that simulates one robot; None for ideal ones.
+
+    Raises:
+        ConfigurationError: If there is not one robot, or a motor has no torque-speed line.
+    """
+    if count != 1:
+        raise ConfigurationError("count", count, "1: this engine simulates one robot")
+    return None if servo is None else ServoDrives(servo, machine, 1, time_step)
 
 
 class Driven(Protocol):

@@ -173,7 +173,12 @@ class Simulation:
 
     def _become(self, rows: IntArray, plants: Sequence[Plant]) -> None:
         """Alter the machines whose plant changes."""
-        changed = [k for k, row in enumerate(rows.tolist()) if self._plants[row] != plants[k]]
+        before = [self._plants[row] for row in rows.tolist()]
+        changed = [
+            k
+            for k, (old, new) in enumerate(zip(before, plants, strict=True))
+            if old is not new and old != new
+        ]
         if changed:
             self.engine.alter(rows[changed], [plants[k] for k in changed])
         for k in changed:

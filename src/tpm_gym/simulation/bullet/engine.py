@@ -11,7 +11,6 @@ import pybullet
 from numpy.typing import NDArray
 
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector
-from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.bullet.client import Client
 from tpm_gym.simulation.bullet.cup import Cup, Grip
@@ -20,7 +19,7 @@ from tpm_gym.simulation.bullet.physics import Physics
 from tpm_gym.simulation.bullet.robot import Robot
 from tpm_gym.simulation.bullet.scenery import Scenery
 from tpm_gym.simulation.drives import Servo, ServoDrives
-from tpm_gym.simulation.engine import Engine, Path, Pose, Readout, Twist, steering
+from tpm_gym.simulation.engine import Engine, Path, Pose, Readout, Twist, drives_of_one, steering
 from tpm_gym.simulation.randomisation import NOMINAL, Plant
 from tpm_gym.simulation.settings import settings_of
 from tpm_gym.simulation.state import Scene
@@ -71,11 +70,8 @@ class BulletEngine:
 
     def load(self, machine: Machine, scene: Scene, count: int) -> None:
         """See the protocol."""
-        if count != 1:
-            raise ConfigurationError("count", count, "1: PyBullet simulates one robot in an engine")
+        self._drives = drives_of_one(self._servo, machine, count, self.time_step)
         self._nominal, self._scene, self._plant = machine, scene, NOMINAL
-        if self._servo is not None:
-            self._drives = ServoDrives(self._servo, machine, 1, self.time_step)
         self._load(machine)
 
     def _load(self, machine: Machine) -> None:

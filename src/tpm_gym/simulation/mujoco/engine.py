@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector
-from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.drives import Servo, ServoDrives
-from tpm_gym.simulation.engine import Engine, Path, Pose, Readout, steering
+from tpm_gym.simulation.engine import Engine, Path, Pose, Readout, drives_of_one, steering
 from tpm_gym.simulation.mujoco.cup import Cup, Grip
 from tpm_gym.simulation.mujoco.model import compile_model
 from tpm_gym.simulation.mujoco.physics import Physics
@@ -71,11 +70,8 @@ class MujocoEngine:
 
     def load(self, machine: Machine, scene: Scene, count: int) -> None:
         """See the protocol."""
-        if count != 1:
-            raise ConfigurationError("count", count, "1: MuJoCo simulates one robot in an engine")
+        self._drives = drives_of_one(self._servo, machine, count, self.time_step)
         self._nominal, self._scene, self._plant = machine, scene, NOMINAL
-        if self._servo is not None:
-            self._drives = ServoDrives(self._servo, machine, 1, self.time_step)
         self._load(machine)
 
     def _load(self, machine: Machine) -> None:
