@@ -384,13 +384,13 @@ def _row(
     observation: Observation, reward: FloatArray, info: Mapping[str, Any]
 ) -> tuple[Observation, float, dict[str, Any]]:
     """Take the one row of a report, in Python's own numbers."""
-    told: dict[str, Any] = {}
+    plain: dict[str, Any] = {}
     for name, value in info.items():
         if name != "reward_terms":
-            told[name] = value.item()
-    told["reward_terms"] = terms = {}
+            plain[name] = value.item()
+    plain["reward_terms"] = terms = {}
     for name, value in info["reward_terms"].items():
         terms[name] = float(value.item())
     for name, value in observation.items():
         observation[name] = value[0]
-    return observation, reward.item(), told
+    return observation, reward.item(), plain

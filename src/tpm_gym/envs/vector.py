@@ -207,13 +207,13 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         self._require_running()
         values = actions.astype(np.float64)
         if len(self._parts) == 1:
-            observation, reward, ended, told = self._parts[0].step(values)
+            observation, reward, ended, info = self._parts[0].step(values)
         else:
             found = self._each(lambda part, rows: part.step(values[rows]))
             observations, rewards, ends, infos = zip(*found, strict=True)
-            observation, told = self._merged(zip(observations, infos, strict=True))
+            observation, info = self._merged(zip(observations, infos, strict=True))
             reward, ended = np.concatenate(rewards), np.concatenate(ends)
-        return observation, reward, np.zeros_like(ended), ended, told
+        return observation, reward, np.zeros_like(ended), ended, info
 
     def _require_running(self) -> None:
         """Raise if the environments are closed, or one needs a reset by the user."""
@@ -343,8 +343,8 @@ class _Part:
         infos = {}
         if len(rows):
             infos = self._begin(rows, [rngs[k] or own[k] for k in rows.tolist()], options)
-        observation, _, told = core.report()
-        return observation, {**_masked(told, rows, core.count), **infos}
+        observation, _, info = core.report()
+        return observation, {**_masked(info, rows, core.count), **infos}
 
     def _begin(
         self, rows: IntArray, rngs: Sequence[np.random.Generator], options: Any = None
@@ -370,15 +370,15 @@ class _Part:
         infos = {}
         if len(renewed):
             infos = self._begin(renewed, [core.rngs[row] for row in renewed.tolist()])
-        observation, reward, told = core.report()
-        ended = told["assembly_mode_changed"] | told["working_mode_changed"]
+        observation, reward, info = core.report()
+        ended = info["assembly_mode_changed"] | info["working_mode_changed"]
         if self._limit is not None:
             ended = ended | (self.elapsed >= self._limit)
         reward[renewed] = 0.0
         self.ended = ended.copy()
-        infos = {**_masked(told, None, core.count), **infos}
+        infos = {**_masked(info, None, core.count), **infos}
         if self._at_once and ended.any():
-            infos = self._begin_anew(observation, told)
+            infos = self._begin_anew(observation, info)
         return observation, reward, ended, infos
 
     def _begin_anew(self, observation: Observation, last: Mapping[str, Any]) -> dict[str, Any]:
@@ -422,14 +422,14 @@ def _mode_of(value: AutoresetMode | str) -> AutoresetMode:
         raise ConfigurationError("autoreset_mode", value, valid) from error
 
 
-def _masked(told: Mapping[str, Any], rows: IntArray | None, count: int) -> dict[str, Any]:
+def _masked(info: Mapping[str, Any], rows: IntArray | None, count: int) -> dict[str, Any]:
     """Put a mask beside each entry (n,), which is true in ``rows``, or everywhere."""
     mask = np.ones(count, dtype=np.bool_)
     if rows is not None:
         mask[:] = False
         mask[rows] = True
     infos: dict[str, Any] = {}
-    for name, value in told.items():
+    for name, value in info.items():
         nested = isinstance(value, Mapping)
         infos[name] = _masked(value, rows, count) if nested else value
         infos[f"_{name}"] = mask
@@ -448,9 +448,9 @@ def _updated(last: Mapping[str, Any], first: Mapping[str, Any], rows: IntArray) 
     return result
 
 
-def _add(infos: dict[str, Any], told: Mapping[str, Any], row: int, count: int) -> None:
-    """Enter what is told of one environment, as Gymnasium's vector environments do."""
-    for name, value in told.items():
+def _add(infos: dict[str, Any], info: Mapping[str, Any], row: int, count: int) -> None:
+    """Add the info of one environment, in the form of Gymnasium's vector environments."""
+    for name, value in info.items():
         if isinstance(value, Mapping):
             _add(infos.setdefault(name, {}), value, row, count)
         else:

@@ -61,7 +61,7 @@ def unusual(
 def bounded(
     observed: FloatArray, bound: float, achieved: FloatArray, goal_bound: float, goals: FloatArray
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], bool]:
-    """Clip observations and goals (n, ...), convert all to float32, and tell whether any is NaN."""
+    """Clip observations and achieved goals, convert all to float32; False last if one is NaN."""
     first = np.empty(observed.shape, np.float32)
     second, third = np.empty(achieved.shape, np.float32), np.empty(goals.shape, np.float32)
     sound = True

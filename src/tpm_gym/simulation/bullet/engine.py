@@ -109,7 +109,7 @@ class BulletEngine:
         self.robot.alter(plant.link_masses, plant.motor_strength)
         if self._drives is not None:
             self._drives.alter(rows, plants)
-            self.robot.rub(plant.joint_friction)
+            self.robot.set_friction(plant.joint_friction)
         self._scenery.alter(plant.block_mass, plant.friction)
         self._friction.alter(plant.friction)
 

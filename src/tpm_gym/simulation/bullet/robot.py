@@ -196,7 +196,7 @@ class Robot:
         for (body, joint), one in zip(self._motors, torque, strict=True):
             turn(body, joint, mode, 0.0, 0.0, one, 0.0, 0.0, -1.0, number)
 
-    def rub(self, friction: Vector) -> None:
+    def set_friction(self, friction: Vector) -> None:
         """Set the Coulomb friction of the motors' axes, N m."""
         turn, mode = self._client.setJointMotorControl2, pybullet.VELOCITY_CONTROL
         for motor, one in zip(self._motors, friction, strict=True):
