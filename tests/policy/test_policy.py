@@ -254,7 +254,7 @@ def test_what_is_no_policy_is_named(tmp_path: Path) -> None:
         with pytest.raises(PolicyFileError, match=message):
             load_policy(tmp_path / name)
     (tmp_path / "other.json").write_text('{"algo": "sac"}')
-    with pytest.raises(PolicyFileError, match="describes no policy: entry 'format'"):
+    with pytest.raises(PolicyFileError, match="is not a policy file: format: Field"):
         load_policy(tmp_path / "other.json")
     path.with_suffix(".safetensors").unlink()
     with pytest.raises(PolicyFileError, match=r"p\.safetensors: there is no such file") as caught:
