@@ -1,6 +1,5 @@
 """Studies survive deaths and stops, and the page of results agrees with the records."""
 
-import itertools
 import json
 import os
 import shlex
@@ -26,8 +25,8 @@ from paths import ROOT
 from processes import PYTHON, signalled
 from studies.__main__ import main
 from studies.bisection import ends, halving, nominal
-from studies.figures import draw, learning_curves, penalty, robustness
-from studies.page import PAGE, STUDIES, Write, command, page, settled, split, write
+from studies.figures import learning_curves, penalty
+from studies.page import PAGE, STUDIES, Write, command, page, split, write
 from studies.plan import Bisection, Run, Study, plan_runs
 from studies.records import (
     RECORDS,
@@ -37,7 +36,7 @@ from studies.records import (
     condense_bisection,
     read_records,
 )
-from studies.running import execute, execute_there, run_all
+from studies.running import execute, run_all
 from trainings import PPO_RECIPE, SAC_RECIPE, assert_equal_runs, without_times
 
 import tpm_gym
@@ -178,14 +177,6 @@ def test_a_training_that_outlives_its_node_is_waited_for(tmp_path: Path) -> None
 def test_an_address_without_a_cluster_is_refused(address: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=f"--address {address}: no cluster answers"):
         run_all([], Study("results", folder=tmp_path, address=address))
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("missing", ["folder", "file"])
-def test_a_node_that_does_not_share_the_disk_is_told(missing: str, tmp_path: Path) -> None:
-    here = Path.cwd() if missing == "file" else tmp_path / "missing"
-    run = Run(tmp_path / "run", "TPMReach-v0", "sac", (), ())
-    assert "does not see" in (execute_there(run, here, tmp_path / "missing") or "")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -450,20 +441,6 @@ def rows(text: str, *words: str) -> list[str]:
     ]
 
 
-@pytest.mark.parametrize(
-    ("successes", "index"),
-    [
-        ([0.0, 0.5, 0.95, 1.0], 2),
-        ([0.0, 1.0, 0.9, 0.95], 3),  # success that does not last does not count
-        ([1.0, 1.0], 0),
-        ([0.0, 1.0, 0.9], None),
-        ([], None),
-    ],
-)
-def test_success_has_settled_once_it_stays(successes: list[float], index: int | None) -> None:
-    assert settled(successes) == index
-
-
 def test_the_page_is_what_its_records_say() -> None:
     text = (ROOT / PAGE).read_text(encoding="utf-8")
     figures = [name for name in ("results_penalty.png", "results_robustness.png") if name in text]
@@ -508,34 +485,6 @@ def test_runs_that_differ_are_told_apart_everywhere(other: Any, labels: list[str
     assert len(set(ticks)) == 4
 
 
-def test_penalty_weights_get_a_table_of_their_own() -> None:
-    weighted = [tempting(seed, weight) for seed, weight in itertools.product(range(2), (0.0, 1.0))]
-    text = page([changed(0, 0.97), *weighted], [])
-    assert "tempting" not in text.split("## Does the penalty work?")[0].split("##")[1]
-    table = text.split("## Does the penalty work?")[1]
-    assert rows(table, "| 0 |", "41.0% (40.0% to 42.0%)")
-    assert rows(table, "| 1 |", "11.0% (10.0% to 12.0%)")
-
-
-def test_the_penalty_figure_has_a_dot_a_seed(tmp_path: Path) -> None:
-    records = [tempting(seed, weight) for seed in range(3) for weight in (0.0, 1.0)]
-    figure = penalty(split(records)[1])
-    dots = [line for line in figure.axes[0].lines if len(line.get_xdata()) == 3]
-    assert len(dots) == 4  # two metrics at two weights
-    assert [label.get_text() for label in figure.axes[0].get_xticklabels()] == ["0", "1"]
-    assert [path.name for path in draw(records, tmp_path)] == ["results_penalty.png"]
-
-
-def test_the_learning_curve_is_the_median_with_a_band() -> None:
-    figure = learning_curves(split([changed(s, r) for s, r in enumerate([0.2, 0.9, 1.0])])[0])
-    curve = figure.axes[0].lines[0]
-    assert list(curve.get_xdata()) == [0, 60, 120]
-    assert list(curve.get_ydata()) == [0.0, 0.9, 0.9]
-    band = figure.axes[0].collections[0].get_paths()[0].vertices
-    assert (band[:, 1].min(), band[band[:, 0] == 120, 1].max()) == (0.0, 1.0)
-    assert band[band[:, 0] == 120, 1].min() == 0.2
-
-
 def test_what_was_not_run_is_named() -> None:
     assert page([], []).count(": all of it.") == len(STUDIES)
     planned = [run.folder.name for run in plan_runs(STUDIES[0])]
@@ -544,20 +493,6 @@ def test_what_was_not_run_is_named() -> None:
     assert f"`{command(STUDIES[0])}`: {planned[0].removesuffix('-s0')} (2).\n" in missing
     every = [changed(0, 1.0, run=run.folder.name) for s in STUDIES for run in plan_runs(s)]
     assert "Not run yet" not in page(every, [])
-
-
-def test_success_in_both_engines_and_what_was_demonstrated_are_told() -> None:
-    record = changed(0, 0.9, engine="analytic", recipe=DEMONSTRATED)
-    record["tests"]["analytic"] |= {
-        "episodes": 9,
-        "success_at_end": {"mean": 1, "low": 1, "high": 1},
-    }
-    other = changed(1, 0.8)
-    del other["tests"]["analytic"]
-    text = page([record, other], [])
-    assert rows(text, "SAC + HER, demonstrations |", "| 120 | 100.0% (100.0) | 90.0% (90.0) |")
-    assert rows(text, "SAC + HER | PyBullet | 120 | \N{EM DASH} | 80.0% (80.0) |")
-    assert "Test episodes of each seed: 9 (analytic engine), 200 (PyBullet)." in text
 
 
 # -- bisections -----------------------------------------------------------------------------------
@@ -573,11 +508,6 @@ def bisected(attribute: str, end: float, success: Any) -> tuple[Any, dict[float,
         assert result.missing not in found
         found[result.missing] = success(result.missing)
     return result, found
-
-
-def test_attributes_and_their_ends_are_those_of_randomisation() -> None:
-    assert set(LIMITS) == set(vars(Randomisation()))
-    assert Randomisation(**{name: nominal(name) for name in LIMITS}) == Randomisation()
 
 
 @given(which=st.sampled_from(GRADUAL), share=st.floats(0.001, 0.999), rate=st.floats(0.3, 1.0))
@@ -599,20 +529,6 @@ def test_success_halves_where_the_bisection_says(
     way = np.abs([start, result.before, result.after, end])
     way = np.log(way) if start else way
     assert (way[2] - way[1]) / (way[3] - way[0]) == pytest.approx(1 / 64, rel=0.2)
-
-
-@pytest.mark.parametrize(("attribute", "end"), ENDS)
-def test_where_success_stays_two_tests_are_enough(attribute: str, end: float) -> None:
-    result, found = bisected(attribute, end, lambda value: 0.9 if value != end else 0.5)
-    assert (result.before, result.after) == (end, None)
-    assert set(found) == {nominal(attribute), end}
-
-
-@pytest.mark.parametrize("edge", range(1, 6))
-def test_a_latency_is_a_whole_number_of_steps(edge: int) -> None:
-    result, found = bisected("latency", 5.0, lambda steps: float(steps < edge))
-    assert (result.before, result.after) == (edge - 1, edge)
-    assert all(Randomisation(latency=steps).latency == steps for steps in found)
 
 
 def answer(bisection: Bisection, success: Any) -> int:
@@ -695,19 +611,3 @@ def test_the_page_says_where_success_halves(bisections: list[Any]) -> None:
     assert "PyBullet, 50 episodes" in both
     del bisections[0]["tests"][list(bisections[0]["tests"])[-1]]
     assert "not finished" in page(bisections, [])
-
-
-def test_the_figure_has_a_panel_an_attribute_and_a_line_an_id(
-    bisections: list[Any], tmp_path: Path
-) -> None:
-    figure = robustness(bisections)
-    panels = [axes for axes in figure.axes if axes.get_visible()]
-    assert [axes.get_title() for axes in panels] == [name.replace("_", " ") for name in LIMITS]
-    block = panels[list(LIMITS).index("block_mass")]
-    lines = [line for line in block.lines if len(line.get_xdata()) > 2]
-    assert len(lines) == 2
-    for line in lines:
-        values, rates = line.get_xdata(), line.get_ydata()
-        assert list(values) == sorted(values)
-        assert list(rates) == [law(value) for value in values]
-    assert [path.name for path in draw(bisections, tmp_path)] == ["results_robustness.png"]

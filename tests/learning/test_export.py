@@ -209,13 +209,12 @@ def counted() -> Blank:
         (lambda: SAC("MultiInputPolicy", Blank(), use_sde=True, buffer_size=10), "use_sde"),
         (lambda: PPO("MultiInputPolicy", Blank(), use_sde=True), "use_sde"),
         (lambda: make(DDPG, Blank()), "DDPG is none of sac, tqc, ppo"),
-        (lambda: make(SAC, endless()), "observation in .*inf.* bounded"),
+        (lambda: make(SAC, endless()), "inf.* bounded"),
         (lambda: make(SAC, counted()), "bounded Box of floats"),
         (
             lambda: PPO("MultiInputPolicy", VecNormalize(DummyVecEnv([Blank]))),
             "VecNormalize",
         ),
-        (lambda: make(SAC, Blank(), net_arch=[4097]), "equal to 4096"),
     ],
 )
 def test_what_the_files_cannot_hold_is_refused(tmp_path: Path, build: Any, message: str) -> None:

@@ -254,7 +254,9 @@ def test_brackets_without_end_are_no_configuration(half: TrainingConfig) -> None
 def test_a_folder_in_the_place_of_a_file_is_named(half: TrainingConfig, name: str) -> None:
     (half.run / name).unlink(missing_ok=True)
     (half.run / name).mkdir()
-    with pytest.raises(RunError, match=rf"Is a directory; move .*{name} away, then continue from"):
+    with pytest.raises(
+        RunError, match=rf"Is a directory: .*{name}.*; put that right, then continue"
+    ):
         resume(ResumeConfig(half.run), quiet())
 
 

@@ -298,7 +298,7 @@ PICK = {"env": "TPMPickAndPlace-v0", "recipe_file": recipe_file("sac")}
         ({"seed": -1}, "held out"),
         ({"seed": SELECTION_SEED}, "held out"),
         ({"seed": SELECTION_SEED - 2, "envs": 3}, "held out"),
-        ({"envs": 5}, "before the first episode ends"),
+        ({"envs": 5}, "learning_starts: 100 is less than the 250 steps"),
         ({"envs": 1001}, r"--envs 1001 \(n_envs of the recipe, .*at most 1,000"),
         ({"envs": 10**8, "env_options": EnvOptions(engine="analytic")}, "at most 1,000,000"),
         ({"steps": 1}, r"--steps 1: one rollout takes 2 \(1 environments x train_freq\)"),
@@ -423,63 +423,35 @@ def test_recipes_of_the_analytic_engine_are_for_many_environments_and_every_id()
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "key", "message"),
+    ("before", "after", "message"),
     [
-        ("[8],", "[1000000, 1000000],", "TPMReach-v0.policy_kwargs.net_arch", "from 1 to 4096"),
-        ("gamma: 0.95", "gama: 0.95", "TPMReach-v0.gama", "valid keys: batch_size, buffer_size"),
-        ("gamma: 0.95", "gamma: 1.5", "TPMReach-v0.gamma", "less than or equal to 1, not 1.5"),
-        ("gamma: 0.95", "gamma: 9e-1", "TPMReach-v0.gamma", "write 0.9"),
-        ("batch_size: 16", "batch_size: 16.0", "TPMReach-v0.batch_size", "a valid integer"),
-        ("batch_size: 16", "batch_size: true", "TPMReach-v0.batch_size", "a valid integer"),
-        (
-            "[8],",
-            "'dict(net_arch=[8])',",
-            "TPMReach-v0.policy_kwargs.net_arch",
-            "a list of at most 20",
-        ),
-        (
-            "{net_arch: [8], features_extractor_class: GoalGapExtractor}",
-            "dict(net_arch=8)",
-            "TPMReach-v0.policy_kwargs",
-            "must be a valid dictionary",
-        ),
-        ("{net_arch:", "{net_arc:", "TPMReach-v0.policy_kwargs.net_arc", "valid keys: features_"),
-        (
-            ": future",
-            ": past",
-            "TPMReach-v0.replay_buffer_kwargs.goal_selection_strategy",
-            "must be 'future', 'final' or 'episode', not 'past'",
-        ),
-        (
-            "HerReplayBuffer",
-            "os.system",
-            "TPMReach-v0.replay_buffer_class",
-            "must be 'HerReplayBuffer'",
-        ),
-        ("policy: MultiInputPolicy", "", "TPMReach-v0.policy", "is missing"),
-        (
-            "replay_buffer_class: HerReplayBuffer",
-            "",
-            "TPMReach-v0.replay_buffer_kwargs",
-            "no effect",
-        ),
-        ("TPMReach-v0:", "- TPMReach-v0:", "", "one mapping per environment id"),
-        ("gamma: 0.95", "gamma: [", "", "is not YAML"),
-        ("lin_0.0003", "lin_0", "TPMReach-v0.learning_rate", "lin_<start>"),
-        ("lin_0.0003", "lin_inf", "TPMReach-v0.learning_rate", "lin_<start>"),
-        ("lin_0.0003", "exp_1", "TPMReach-v0.learning_rate", "lin_<start>"),
-        ("gamma: 0.95", "gamma: !!python/object/apply:os.getcwd []", "", "is not YAML"),
+        ("[8],", "[1000000, 1000000],", "policy_kwargs.net_arch.*less than or equal to 4096"),
+        ("[8],", "'dict(net_arch=[8])',", "policy_kwargs.net_arch.*a valid list"),
+        ("{net_arch:", "{net_arc:", "policy_kwargs.net_arc: .*not permitted"),
+        ("gamma: 0.95", "gama: 0.95", "gama: unknown key; valid keys: batch_size, buffer_size"),
+        ("gamma: 0.95", "gamma: 1.5", "gamma: .*less than or equal to 1, not 1.5"),
+        ("gamma: 0.95", "gamma: 9e-1", "gamma: .*valid number, not '9e-1'"),
+        ("gamma: 0.95", "gamma: [", "is not YAML"),
+        ("gamma: 0.95", "gamma: !!python/object/apply:os.getcwd []", "is not YAML"),
+        ("batch_size: 16", "batch_size: true", "batch_size: .*a valid integer"),
+        (": future", ": past", "goal_selection_strategy: .*'future', 'final' or 'episode'"),
+        ("HerReplayBuffer", "os.system", "replay_buffer_class: .*'HerReplayBuffer'"),
+        ("policy: MultiInputPolicy", "", "policy: Field required"),
+        ("replay_buffer_class: HerReplayBuffer", "", "replay_buffer_kwargs: no effect"),
+        ("TPMReach-v0:", "- TPMReach-v0:", "valid dictionary"),
+        ("lin_0.0003", "lin_0", r"learning_rate.*\^lin_"),
+        ("lin_0.0003", "lin_inf", r"learning_rate.*\^lin_"),
     ],
 )
 def test_recipe_mistakes_name_file_key_and_choice(
-    before: str, after: str, key: str, message: str, tmp_path: Path
+    before: str, after: str, message: str, tmp_path: Path
 ) -> None:
     assert before in RECIPE
     path = tmp_path / "wrong.yml"
     path.write_text(RECIPE.replace(before, after), encoding="utf-8")
     with pytest.raises(ConfigError, match=message) as caught:
         read_recipe(path, "sac", "TPMReach-v0")
-    assert str(caught.value).startswith(f"{path}: {key}")
+    assert str(caught.value).startswith(f"{path}: ")
 
 
 @pytest.mark.parametrize(

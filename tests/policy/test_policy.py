@@ -3,7 +3,6 @@
 import copy
 import json
 import os
-import tempfile
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -16,8 +15,6 @@ import pytest
 import safetensors.numpy
 import torch
 from gymnasium import spaces
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from policies_on_file import (
     DATA,
     WEIGHTS,
@@ -144,36 +141,6 @@ def test_observations_that_do_not_fit_are_named(
 # -- numbers that float32 cannot hold --------------------------------------------------------------
 
 
-@settings(max_examples=200, deadline=None)
-@given(
-    scale=st.floats(0, 38),
-    output=st.sampled_from(["tanh", "clip"]),
-    activation=st.sampled_from(["relu", "tanh"]),
-    seed=st.integers(0, 100),
-)
-def test_weights_of_any_size_give_finite_actions_or_a_refusal(
-    scale: float, output: str, activation: str, seed: int
-) -> None:
-    rng = np.random.default_rng(seed)
-    weights = {
-        name: rng.choice([-1, 1], values.shape) * np.float32(10 ** rng.uniform(-scale, scale))
-        for name, values in WEIGHTS.items()
-    }
-    data = safetensors.numpy.save({n: v.astype(np.float32) for n, v in weights.items()})
-    content = described(data)
-    content["network"] |= {"output": output, "activation": activation}
-    with tempfile.TemporaryDirectory() as folder:
-        policy = load_policy(write(Path(folder), content, data))
-    boxes = policy.description.observation_space
-    corner = {key: rng.choice([-1, 1], box.shape) * box.high for key, box in boxes.items()}
-    try:
-        actions = policy.act(corner)
-    except InputError as error:
-        actions, message = np.zeros(2), str(error)
-        assert "the network overflows" in message
-    assert np.isfinite(actions).all()
-
-
 def test_what_overflows_far_outside_the_observation_space_is_named(policy: Policy) -> None:
     far = {key: np.full(values[0].shape, 3e38) for key, values in observations(1).items()}
     for sign in (-1, 1):
@@ -224,10 +191,6 @@ def test_what_is_no_environment_is_refused(policy: Policy) -> None:
     for thing in (None, "TPMReach-v0"):
         with pytest.raises(InputError, match=r"an environment, such as gym.make\('TPMReach-v0'\)"):
             policy.check(thing)
-
-
-def test_a_policy_names_itself(policy: Policy) -> None:
-    assert repr(policy) == "<Policy of TPMReach-v0, sac, seed 3>"
 
 
 # -- names -----------------------------------------------------------------------------------------

@@ -48,16 +48,6 @@ class PeriodicEvaluation(BaseCallback):
         self._config, self._envs = config, envs
         self._console, self._keep = console, keep
         self.evaluations: list[dict[str, Any]] = []
-        self._best: tuple[float, float] | None = None
-
-    def state(self) -> dict[str, Any]:
-        """Return the state for a checkpoint, as plain data."""
-        return {"evaluations": self.evaluations, "best": self._best}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Restore the state of :meth:`state`."""
-        self.evaluations = list(state["evaluations"])
-        self._best = tuple(state["best"]) if state["best"] else None
 
     def _on_training_start(self) -> None:
         if not self.evaluations:
@@ -74,17 +64,14 @@ class PeriodicEvaluation(BaseCallback):
         self._evaluate()
 
     def _evaluate(self) -> None:
-        policy = TrainedPolicy(self.model)
-        episodes = self._config.eval_episodes
-        records = run_episodes(self._envs, policy, episodes, SELECTION_SEED)
-        metrics = summarise(records)
+        policy, episodes = TrainedPolicy(self.model), self._config.eval_episodes
+        metrics = summarise(run_episodes(self._envs, policy, episodes, SELECTION_SEED))
+        earlier = max(map(_quality, self.evaluations), default=None)
         self._record({name: estimate.as_dict() for name, estimate in metrics.items()})
-        success = metrics["success_at_end"]
-        quality = (success.mean, metrics["return"].mean)
-        best = self._best is None or quality > self._best
+        best = earlier is None or _quality(self.evaluations[-1]) > earlier
         if best:
-            self._best = quality
             self._keep(self.model)
+        success = metrics["success_at_end"]
         self._console.print(
             f"{self.num_timesteps:>9,} steps   success {success.mean:6.1%} "
             f"[{success.low:.1%}, {success.high:.1%}]   return {metrics['return'].mean:7.2f}"
@@ -107,6 +94,10 @@ class PeriodicEvaluation(BaseCallback):
         for name, estimate in metrics.items():
             self.logger.record(f"eval/{name}", estimate["mean"])
         self.logger.dump(self.num_timesteps)
+
+
+def _quality(evaluation: Mapping[str, Any]) -> tuple[float, float]:
+    return evaluation["success_at_end"]["mean"], evaluation["return"]["mean"]
 
 
 class ProgressBar(BaseCallback):
@@ -140,13 +131,11 @@ class StopTrainingError(Exception):
 class Checkpointing(BaseCallback):
     """Checkpoints between rollouts, and one when the process is asked to stop.
 
-    A checkpoint that cannot be written is reported and tried again when the next one is due.
-    Training continues meanwhile, and the earlier checkpoints stay.
-
-    The first checkpoint is saved before anything else is done, so that no policy is without one.
+    A checkpoint that cannot be written is reported and tried again when the next one is due. The
+    first is saved before anything else is done, so that no policy is without one.
 
     Args:
-        evaluation: Callback whose state is part of a checkpoint.
+        evaluation: Callback whose evaluations are part of a checkpoint.
         seconds: Seconds that earlier processes have trained.
     """
 
@@ -171,21 +160,17 @@ class Checkpointing(BaseCallback):
         self.model.start_time = int(time.time_ns() - self._seconds * 1e9)
         self.model._num_timesteps_at_start = 0
         if self._last_step is None:
-            self._save()
+            self.save()
 
     def _on_rollout_start(self) -> None:
         stop = self._listener.received is not None
         if stop or self._is_due():
-            self._save()
+            self.save()
         if stop:
             raise StopTrainingError
 
     def _on_step(self) -> bool:
         return True
-
-    def save_finished(self) -> None:
-        """Save the end of the training."""
-        self._save(finished=True)
 
     def _is_due(self) -> bool:
         if self._config.checkpoint_every is not None:
@@ -193,10 +178,11 @@ class Checkpointing(BaseCallback):
             return taken >= self._config.checkpoint_every
         return time.perf_counter() >= self._next_time
 
-    def _save(self, finished: bool = False) -> None:
+    def save(self, finished: bool = False) -> None:
         """Save a checkpoint, or report why not."""
         started = time.perf_counter()
-        extra = {"seconds": seconds_trained(self.model), "evaluation": self._evaluation.state()}
+        evaluations = self._evaluation.evaluations
+        extra = {"seconds": seconds_trained(self.model), "evaluations": evaluations}
         content = capture(self.model, self._config.run, extra, finished)
         try:
             self._store.save(content)

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from tpm_gym.learning.errors import CheckpointError
 
-FORMAT: Final = 2
+FORMAT: Final = 3
 KEPT: Final = 2  # checkpoints; the second is used if the first turns out to be damaged
 STATE: Final = "state.json"
 TENSORS: Final = "torch.pt"
@@ -34,10 +34,7 @@ _SUM: Final = hashlib.sha256().digest_size  # bytes
 
 @dataclass(frozen=True)
 class Content:
-    """Content of a checkpoint: small files and large arrays, both by name.
-
-    Arrays may be views of memory that training writes to.
-    """
+    """Content of a checkpoint: small files and large arrays, both by name."""
 
     step: int
     finished: bool
@@ -58,7 +55,7 @@ class CheckpointStore:
         return self._whole[-1] if self._whole else None
 
     def path(self, step: int) -> Path:
-        """Return the file of the checkpoint of a step."""
+        """Return the file of a step's checkpoint."""
         return self.folder / f"{step:09d}.checkpoint"
 
     def save(self, content: Content) -> None:
@@ -74,8 +71,7 @@ class CheckpointStore:
             _flush_folder(self.folder)
         except OSError as error:
             earlier = f"that of step {self.newest:,} stays" if self._whole else "there is none yet"
-            problem = f"{error.strerror or error}; {earlier}"
-            raise CheckpointError(f"cannot write checkpoint {target}: {problem}") from error
+            raise CheckpointError(f"cannot write {target}: {error.strerror}; {earlier}") from error
         finally:
             with suppress(OSError):
                 part.unlink(missing_ok=True)
@@ -93,23 +89,19 @@ class CheckpointStore:
             The content; None if there are no checkpoints.
         """
         steps = self.steps()
-        problems = []
         for step in reversed(steps):
             try:
                 content = _read(self.path(step))
-            except CheckpointError as error:
-                problems.append(str(error))
+            except Exception as error:  # whatever NumPy raises on a file that others have signed
+                warn(f"damaged checkpoint: {self.path(step)} ({error}); trying the one before")
                 continue
-            for problem in problems:
-                warn(f"{problem}; using the checkpoint of step {step:,} instead")
             # A damaged checkpoint is deleted once a new one can take its place.
             self._whole = [earlier for earlier in steps if earlier <= step][-KEPT:]
             return content
-        if not problems:
-            return None
-        listed = "".join(f"\n  {problem}" for problem in problems)
-        anew = "start the run anew with --overwrite"
-        raise CheckpointError(f"no checkpoint in {self.folder} is whole; {anew}:{listed}")
+        if steps:
+            anew = "start the run anew with --overwrite"
+            raise CheckpointError(f"no checkpoint in {self.folder} is whole; {anew}")
+        return None
 
     def clear(self) -> None:
         """Delete all checkpoints, and no other file of their folder."""
@@ -152,32 +144,22 @@ def _write(path: Path, content: Content) -> None:
 
 def _read(path: Path) -> Content:
     """Read a checkpoint after comparing every byte of it with its sum."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise _damaged(path, f"cannot be read: {error.strerror}") from error
+    data = path.read_bytes()
     if hashlib.sha256(memoryview(data)[_SUM:]).digest() != data[:_SUM]:
-        raise _damaged(path, "differs from what was written (SHA-256)")
+        raise ValueError("its SHA-256 differs from what was written")
     stream = io.BytesIO(data)
     stream.seek(_SUM)
-    try:
-        with np.load(stream, allow_pickle=False) as loaded:
-            entries = {name: loaded[name] for name in loaded.files}
-        version, step, finished = entries.pop("head").tolist()
-    except Exception as error:  # whatever NumPy raises on a file that others have signed
-        raise _damaged(path, f"holds no checkpoint ({error})") from error
+    with np.load(stream, allow_pickle=False) as loaded:
+        entries = {name: loaded[name] for name in loaded.files}
+    version, step, finished = entries.pop("head").tolist()
     if version != FORMAT:
-        raise _damaged(path, f"has format {version}, this version of tpm_gym reads {FORMAT}")
+        raise ValueError(f"format {version}, this version of tpm_gym reads {FORMAT}")
     parts: dict[str, dict[str, NDArray[Any]]] = {"files": {}, "arrays": {}}
     for name, array in entries.items():
         kind, _, inner = name.partition("/")
-        parts.get(kind, {})[inner] = array
+        parts[kind][inner] = array
     files = {name: array.tobytes() for name, array in parts["files"].items()}
     return Content(step, bool(finished), files, parts["arrays"])
-
-
-def _damaged(path: Path, problem: str) -> CheckpointError:
-    return CheckpointError(f"damaged checkpoint: {path} {problem}")
 
 
 def _flush_folder(folder: Path) -> None:

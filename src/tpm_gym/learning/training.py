@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import json
 import signal
-from collections.abc import Callable
-from contextlib import ExitStack, closing
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict, fields, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -25,13 +25,7 @@ from tpm_gym.errors import TPMError
 from tpm_gym.learning import provenance, run_folder
 from tpm_gym.learning.algorithms import ALGORITHMS
 from tpm_gym.learning.checkpoint import CheckpointStore, Content
-from tpm_gym.learning.configuration import (
-    UNSET,
-    ResumeConfig,
-    TrainingConfig,
-    complete,
-    resumed,
-)
+from tpm_gym.learning.configuration import UNSET, ResumeConfig, TrainingConfig, complete, resumed
 from tpm_gym.learning.environments import check_env_id, make_env, make_envs
 from tpm_gym.learning.errors import (
     CheckpointError,
@@ -48,8 +42,6 @@ if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.vec_env import VecEnv
-
-    from tpm_gym.learning.callbacks import PeriodicEvaluation
 
 
 def train(config: TrainingConfig, console: Console | None = None) -> signal.Signals | None:
@@ -70,17 +62,21 @@ def train(config: TrainingConfig, console: Console | None = None) -> signal.Sign
     with closing(make_env(**_env_options(config))) as env:  # refused before anything is deleted
         _require_room(config, flatdim(env.observation_space))
     run_folder.prepare(config.run, config.overwrite)
+    if config.steps != asked:
+        whole = f"whole rollouts of {config.rollout:,} steps"
+        _say(console, f"note: {asked:,} steps were asked for, and rounded up to {whole}")
+    starts = config.argument("learning_starts") or 0
+    if config.steps <= starts:
+        _say(console, f"note: learning starts at step {starts:,}, so nothing will be learned")
+    description = {
+        **config.record(),
+        "training_seeds": [config.seed, config.seed + config.envs - 1],
+        "evaluation_seeds": [SELECTION_SEED, SELECTION_SEED + config.eval_episodes - 1],
+        **provenance.origin(),
+    }
     store = CheckpointStore(config.run / CHECKPOINTS)
     with run_folder.disk_errors_named(config.run, store), run_folder.claimed(config.run):
-        provenance.write_json(config.run / CONFIG_FILE, _description(config))
-        _say(console, f"{config.title}, {config.steps:,} steps, in {config.run}")
-        if config.steps != asked:
-            whole = f"whole rollouts of {config.rollout:,} steps"
-            _say(console, f"note: {asked:,} steps were asked for, and rounded up to {whole}")
-        starts = config.argument("learning_starts") or 0
-        if config.steps <= starts:
-            _say(console, f"note: learning starts at step {starts:,}, so nothing will be learned")
-        return _learn_and_test(config, console, store)
+        return _learn_and_test(config, console, store, description, None)
 
 
 def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signals | None:
@@ -93,8 +89,6 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
         LearningError: There is no such run, it holds a policy but no whole checkpoint, a change is
             not valid, or the training diverged.
     """
-    from tpm_gym.learning.training_state import restore_files
-
     console = console or Console()
     run = config.run
     store = CheckpointStore(run / CHECKPOINTS)
@@ -108,7 +102,8 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
             return None
         content = store.load(lambda text: _say(console, f"warning: {text}"))
         if content:
-            stored = _stored_in(content)
+            with _foreign_files_named(content):
+                stored = dict(json.loads(content.files[CONFIG_FILE]))
         elif stored is None:
             raise RunError(f"{run} holds no run of tpm_gym; start one with tpm-gym train")
         elif run_folder.holds_policy(run):
@@ -118,73 +113,49 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
             )
         step = content.step if content else 0
         changed = resumed(config, stored, step)
-        description = _description_resumed(changed, stored, step)
-
-        def begin() -> None:
-            if content:
-                restore_files(run, content)
-            else:
-                run_folder.clear(run)
-            provenance.write_json(run / CONFIG_FILE, description)
-            _say(console, f"{changed.title}, from step {step:,} to {changed.steps:,}, in {run}")
-
-        return _learn_and_test(changed, console, store, content, begin)
+        resumption = {"from_step": step, **provenance.origin()}
+        changeable = [entry.name for entry in fields(ResumeConfig) if entry.name != "run"]
+        description = {
+            **stored,
+            **{name: getattr(changed, name) for name in changeable},
+            "resumed": [*stored.get("resumed", []), resumption],
+        }
+        return _learn_and_test(changed, console, store, description, content)
 
 
 def _say(console: Console, text: str) -> None:
     console.print(text, markup=False, soft_wrap=True)
 
 
-def _description(config: TrainingConfig) -> dict[str, Any]:
-    return {
-        **config.record(),
-        "training_seeds": [config.seed, config.seed + config.envs - 1],
-        "evaluation_seeds": [SELECTION_SEED, SELECTION_SEED + config.eval_episodes - 1],
-        **provenance.origin(),
-    }
-
-
-def _description_resumed(
-    config: TrainingConfig, stored: dict[str, Any], step: int
-) -> dict[str, Any]:
-    resumption = {"from_step": step, **provenance.origin()}
-    changeable = [entry.name for entry in fields(ResumeConfig) if entry.name != "run"]
-    return {
-        **stored,
-        **{name: getattr(config, name) for name in changeable},
-        "resumed": [*stored.get("resumed", []), resumption],
-    }
-
-
-def _stored_in(content: Content) -> dict[str, Any]:
-    """Return the configuration in a checkpoint."""
+@contextmanager
+def _foreign_files_named(content: Content) -> Iterator[None]:
+    """Name a checkpoint that is whole and was not written by this training."""
     try:
-        return dict(json.loads(content.files[CONFIG_FILE]))
-    except (KeyError, ValueError, TypeError, RecursionError) as error:
-        raise _foreign(content, error) from error
-
-
-def _foreign(content: Content, error: Exception) -> CheckpointError:
-    """Return the error of a checkpoint that is whole and was not written by this training."""
-    problem = f"cannot be restored ({type(error).__name__}), and was not written by this training"
-    anew = "start the run anew with --overwrite"
-    return CheckpointError(f"the checkpoint of step {content.step:,} {problem}; {anew}")
+        yield
+    except TPMError:
+        raise
+    except Exception as error:  # whatever PyTorch raises on a file that others have signed
+        raise CheckpointError(
+            f"the checkpoint of step {content.step:,} cannot be restored "
+            f"({type(error).__name__}), and was not written by this training; start the run anew "
+            "with --overwrite"
+        ) from error
 
 
 def _learn_and_test(
     config: TrainingConfig,
     console: Console,
     store: CheckpointStore,
-    content: Content | None = None,
-    begin: Callable[[], object] = lambda: None,
+    description: Mapping[str, Any],
+    content: Content | None,
 ) -> signal.Signals | None:
     """Learn; then test a policy of the analytic engine there and in PyBullet.
 
     Args:
+        description: Content of config.json.
         content: Checkpoint to begin from.
-        begin: Called once the checkpoint is restored, since only then may files change.
     """
-    stopped_by = _learn(config, console, store, content, begin)
+    stopped_by = _learn(config, console, store, description, content)
     if stopped_by is None and config.in_batches and config.test_episodes:
         rates = []
         for engine in ("analytic", "pybullet"):
@@ -209,8 +180,8 @@ def _learn(
     config: TrainingConfig,
     console: Console,
     store: CheckpointStore,
+    description: Mapping[str, Any],
     content: Content | None,
-    begin: Callable[[], object],
 ) -> signal.Signals | None:
     """Build everything, learn from the beginning or from a checkpoint, and save.
 
@@ -228,7 +199,7 @@ def _learn(
     from tpm_gym.learning.demonstrations import Demonstrations
     from tpm_gym.learning.logger import make_logger
     from tpm_gym.learning.signals import SignalListener
-    from tpm_gym.learning.training_state import restore_log
+    from tpm_gym.learning.training_state import restore, restore_files, restore_log
 
     torch.set_num_threads(config.threads)
     bar, listener = ProgressBar(console), SignalListener()
@@ -242,9 +213,21 @@ def _learn(
         model = make_model(config, training_envs)
         keep = partial(_keep, config, console, run_folder.BEST_FILE)
         evaluation = PeriodicEvaluation(config, evaluation_envs, console, keep)
-        log, seconds = _restore(model, evaluation, content) if content else ({}, 0.0)
-        begin()
-        logger = make_logger(config.run, None if content is None else content.step)
+        log: dict[str, Any] = {}
+        seconds, step = 0.0, 0
+        # Files change only once the checkpoint is restored.
+        if content:
+            with _foreign_files_named(content):
+                log, extra = restore(model, content)
+                evaluation.evaluations, seconds = extra["evaluations"], float(extra["seconds"])
+            step = content.step
+            restore_files(config.run, content)
+        else:
+            run_folder.clear(config.run)
+        provenance.write_json(config.run / CONFIG_FILE, description)
+        way = f"from step {step:,} to {config.steps:,}" if "resumed" in description else ""
+        _say(console, f"{config.title}, {way or f'{config.steps:,} steps'}, in {config.run}")
+        logger = make_logger(config.run, step if content else None)
         stack.callback(logger.close)
         model.set_logger(logger)
         restore_log(logger, log)
@@ -271,8 +254,8 @@ def _learn(
             ) from error
         _keep(config, console, run_folder.LAST_FILE, model)
         if stopped_by is None:
-            checkpointing.save_finished()
-        draw_learning_curve(config.run / CURVE_FILE, config.title, evaluation.evaluations)
+            checkpointing.save(finished=True)
+    draw_learning_curve(config.run / CURVE_FILE, config.title, evaluation.evaluations)
     if stopped_by is None:
         _say(console, f"finished: {config.run}")
     else:
@@ -284,37 +267,15 @@ def _learn(
     return stopped_by
 
 
-def _restore(
-    model: BaseAlgorithm, evaluation: PeriodicEvaluation, content: Content
-) -> tuple[dict[str, Any], float]:
-    """Restore a checkpoint; return its log, and the seconds that the run had trained."""
-    from tpm_gym.learning.training_state import restore
-
-    try:
-        log, extra = restore(model, content)
-        evaluation.restore(extra["evaluation"])
-        return log, float(extra["seconds"])
-    except TPMError:
-        raise
-    except Exception as error:  # whatever PyTorch raises on a file that others have signed
-        raise _foreign(content, error) from error
-
-
 def _keep(config: TrainingConfig, console: Console, name: str, model: BaseAlgorithm) -> None:
     """Save a policy in the run folder, and export it."""
     from tpm_gym.learning.export import remove, save, save_archive
 
     archive = config.run / name
     path = archive.with_suffix("")
+    recipe, options = asdict(config.recipe), config.env_options.given()
     try:
-        save(
-            model,
-            path,
-            env_id=config.env,
-            seed=config.seed,
-            recipe=asdict(config.recipe),
-            env_options=config.env_options.given(),
-        )
+        save(model, path, env_id=config.env, seed=config.seed, recipe=recipe, env_options=options)
     except PolicyError as error:
         remove(path)
         _say(console, f"warning: not exported: {error}")
