@@ -27,12 +27,10 @@ _LARGEST_SHARE: Final = 0.02  # of the time may go into checkpoints
 class PeriodicEvaluation(BaseCallback):
     """Evaluation of the policy on held-out seeds before, during and after training.
 
-    All evaluations use the same episodes, so the points of a learning curve differ by the policy
-    alone. Each is appended to evaluations.jsonl, and the best policy so far is kept.
+    All evaluations use the same episodes. Each is appended to evaluations.jsonl.
 
     Args:
         envs: Separate environments, so that evaluations do not disturb training.
-        console: Gets one line for each evaluation.
         keep: Called with the model whenever it is the best so far.
     """
 
@@ -132,11 +130,8 @@ class Checkpointing(BaseCallback):
     """Checkpoints between rollouts, and one when the process is asked to stop.
 
     A checkpoint that cannot be written is reported and tried again when the next one is due. The
-    first is saved before anything else is done, so that no policy is without one.
-
-    Args:
-        evaluation: Callback whose evaluations are part of a checkpoint.
-        seconds: Seconds that earlier processes have trained.
+    first is saved before anything else is done, so that no policy is without one. ``seconds`` is
+    the time that earlier processes have trained.
     """
 
     def __init__(

@@ -1,10 +1,8 @@
 """Checkpoints on disk: each is one file that is whole or absent, and that shows any damage.
 
 A checkpoint is ``checkpoints/<step>.checkpoint``: a SHA-256, and the NumPy archive that it is the
-sum of. The file is written under another name, flushed to the disk and renamed. A process that is
-killed at any moment therefore leaves the earlier checkpoints untouched.
-
-Nothing is unpickled. Arrays are loaded without pickles. Small files (JSON, and tensors for
+sum of. The file is written under another name, flushed to the disk and renamed, so a kill leaves
+the earlier checkpoints untouched. Nothing is unpickled. Small files (JSON, and tensors for
 ``torch.load(weights_only=True)``) are stored as arrays of bytes.
 """
 
@@ -80,13 +78,9 @@ class CheckpointStore:
         self._tidy()
 
     def load(self, warn: Callable[[str], object]) -> Content | None:
-        """Read the newest checkpoint that is whole.
+        """Read the newest checkpoint that is whole; return None if there are no checkpoints.
 
-        Args:
-            warn: Called with a sentence for each newer checkpoint that is damaged.
-
-        Returns:
-            The content; None if there are no checkpoints.
+        ``warn`` is called with a sentence for each newer checkpoint that is damaged.
         """
         steps = self.steps()
         for step in reversed(steps):
@@ -164,10 +158,9 @@ def _read(path: Path) -> Content:
 
 def _flush_folder(folder: Path) -> None:
     """Wait until the disk has the names in a folder; Windows has no such call."""
-    if os.name != "posix":
-        return
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+    if os.name == "posix":
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)

@@ -127,11 +127,6 @@ class TrainingConfig:
     """Replace an earlier run in the same folder."""
 
     @property
-    def in_batches(self) -> bool:
-        """Whether one process steps many environments at once."""
-        return self.env_options.in_batches
-
-    @property
     def rollout(self) -> int:
         """Number of steps between two updates, over all environments."""
         return self.envs * int(self.argument("train_freq") or self.argument("n_steps"))
@@ -141,10 +136,15 @@ class TrainingConfig:
         return ALGORITHMS[self.algo].argument(self.recipe.arguments, name)
 
     @property
+    def horizon(self) -> int:
+        """Number of steps after which an episode is truncated, over all environments."""
+        return self.envs * (check_env_id(self.env).max_episode_steps or 0)
+
+    @property
     def demonstrated(self) -> int:
         """Number of steps of the demonstrations, over all environments."""
         episodes = int(self.recipe.demonstrations.get("episodes", 0))
-        return -(-episodes // self.envs) * self.envs * _horizon(self.env)
+        return -(-episodes // self.envs) * self.horizon
 
     @property
     def title(self) -> str:
@@ -207,34 +207,26 @@ def complete(config: TrainingConfig) -> TrainingConfig:
         "envs": recipe.n_envs,
         "recipe_file": file,
         "run": Path("runs", f"{env}-{config.algo}-s{config.seed}"),
-        "eval_episodes": 200 if config.in_batches else 20,
+        "eval_episodes": 200 if config.env_options.in_batches else 20,
     }
     missing = {name: v for name, v in computed.items() if getattr(config, name) is UNSET}
     config = replace(config, recipe=recipe, **missing)
     if config.eval_every is UNSET:  # more often, it would evaluate equal policies
-        often = steps // (20 if config.in_batches else 10)
+        often = steps // (20 if config.env_options.in_batches else 10)
         config = replace(config, eval_every=max(config.rollout, often))
     _check(config)
     return _in_whole_rollouts(config, 0)
 
 
 def _in_whole_rollouts(config: TrainingConfig, reached: int) -> TrainingConfig:
-    """Round the steps up to the end of a rollout; rollouts begin at step ``reached``.
-
-    Stable-Baselines3 would round as well, but let schedules end at the steps that were asked for.
-    """
+    """Round the steps up as Stable-Baselines3 does, so that schedules end with the last rollout."""
     start = max(reached, config.demonstrated)
     rollouts = -(-(config.steps - start) // config.rollout)
     return replace(config, steps=start + rollouts * config.rollout)
 
 
 def resumed(config: ResumeConfig, stored: Mapping[str, Any], reached: int) -> TrainingConfig:
-    """Return the configuration of a run with the changes to it.
-
-    Args:
-        stored: Content of the run's config.json.
-        reached: Steps that the run has taken.
-    """
+    """Change the configuration ``stored`` of a run that has ``reached`` a step."""
     found = _stored(config.run, stored)
     if config.env not in (UNSET, found.env):
         raise ConfigError(f"--env {config.env}: the run was trained in {found.env}; give that")
@@ -289,7 +281,7 @@ def _check(config: TrainingConfig) -> None:
     check_least(config, 0, "test_episodes")
     envs, seed, most = config.envs, config.seed, TEST_SEED - SELECTION_SEED
     _refuse(config.eval_episodes > most, f"--eval-episodes: must be at most {most}")
-    most = SELECTION_SEED if config.in_batches else _MOST_PROCESSES
+    most = SELECTION_SEED if config.env_options.in_batches else _MOST_PROCESSES
     problem = f"--envs {envs} (n_envs of the recipe, if not given): must be at most {most:,}"
     _refuse(envs > most, problem)
     most = SELECTION_SEED - envs
@@ -303,11 +295,7 @@ def _check(config: TrainingConfig) -> None:
 
 
 def _check_recipe(config: TrainingConfig) -> None:
-    """Refuse a recipe that cannot work with the numbers of steps and environments.
-
-    Demonstrations count as steps and teach nothing alone. Hindsight draws from whole episodes, so
-    one must have ended before learning starts.
-    """
+    """Refuse a recipe that cannot work with the numbers of steps and environments."""
     shown, envs, where = f"--steps {config.steps}", config.envs, f"--recipe {config.recipe_file}"
     _refuse(
         config.steps <= config.demonstrated,
@@ -327,19 +315,13 @@ def _check_recipe(config: TrainingConfig) -> None:
             f"{where}: {min(sizes, key=sizes.__getitem__)}: 1: advantages of one step cannot be "
             "normalised; raise it, or set normalize_advantage: false",
         )
-    if config.recipe.hindsight:
-        episode = _horizon(config.env) * envs
+    if config.recipe.hindsight:  # it draws from whole episodes
         for name in ("learning_starts", "buffer_size"):
             _refuse(
-                config.argument(name) < episode,
-                f"{where}: {name}: {config.argument(name)} is less than the {episode} steps of an "
-                f"episode in each of {envs} environments; raise it, or use fewer --envs",
+                config.argument(name) < config.horizon,
+                f"{where}: {name}: {config.argument(name)} is less than the {config.horizon} steps "
+                f"of an episode in each of {envs} environments; raise it, or use fewer --envs",
             )
-
-
-def _horizon(env_id: str) -> int:
-    """Return the number of steps after which an episode is truncated."""
-    return check_env_id(env_id).max_episode_steps or 0
 
 
 def _check_device(device: str) -> None:

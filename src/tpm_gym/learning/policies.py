@@ -64,19 +64,12 @@ class RandomPolicy:
         return drawn.astype(self.space.dtype)
 
 
-@dataclass(frozen=True)
-class ExpertPolicy:
+class ExpertPolicy(Expert):
     """Policy that acts with the scripted controller, which is deterministic."""
 
-    expert: Expert
-
-    def reset(self, observation: Observation, seeds: Sequence[int]) -> None:
+    def reset(self, observation: Observation, seeds: Sequence[int] = ()) -> None:
         """Plan the motion of the episodes."""
-        self.expert.reset(observation)
-
-    def act(self, observation: Observation) -> Action:
-        """Return the actions of the controller."""
-        return self.expert.act(observation)
+        super().reset(observation)
 
 
 def load_policy(spec: str, envs: TPMVectorEnv, *, trust_pickle: bool = False) -> Policy:
@@ -95,7 +88,7 @@ def load_policy(spec: str, envs: TPMVectorEnv, *, trust_pickle: bool = False) ->
     if spec == "random":
         return RandomPolicy(envs.single_action_space)
     if spec == "expert":
-        return ExpertPolicy(Expert(envs))
+        return ExpertPolicy(envs)
     path = _policy_file(spec)
     import torch  # here, so that scripted policies need no PyTorch
 
@@ -148,7 +141,7 @@ def require_trust(spec: str, path: Path, trusted: bool) -> None:
         raise refused(
             spec,
             f"{path} holds pickles, and loading it can run any code; if you trust where it comes "
-            "from, give --trust-pickle, or convert it once and share that instead: "
+            "from, give --trust-pickle, or convert it once: "
             f"tpm-gym export {path} {path.with_suffix('')} --trust-pickle",
         )
 
@@ -175,21 +168,21 @@ def _policy_file(spec: str) -> Path:
 def run_config(spec: str, path: Path) -> dict[str, Any]:
     """Return the run's configuration, from beside or above a .zip file."""
     wanted = {"algo": str, "env": str, "seed": int, "recipe": dict, "env_options": dict}
-    for folder in path.resolve().parents[:2]:  # the run folder, or one inside it
-        file = folder / CONFIG_FILE
-        if not file.is_file():
-            continue
-        try:
-            content = read_json(file)
-        except (OSError, ValueError) as error:
-            raise refused(spec, f"{file} is damaged: {error}") from error
-        found: dict[str, Any] = content if isinstance(content, dict) else {}
-        for key, kind in wanted.items():
-            if not isinstance(found.get(key), kind):
-                raise refused(spec, f"{file} is damaged: no entry {key!r} ({kind.__name__})")
-        return found
-    problem = f"no {CONFIG_FILE} beside {path.name} or above it; keep the file in its run folder"
-    raise refused(spec, problem)
+    files = [folder / CONFIG_FILE for folder in path.resolve().parents[:2]]
+    file = next(filter(Path.is_file, files), None)
+    if file is None:
+        problem = (
+            f"no {CONFIG_FILE} beside {path.name} or above it; keep the file in its run folder"
+        )
+        raise refused(spec, problem)
+    try:
+        content: dict[str, Any] = dict(read_json(file))
+        wrong = [key for key, kind in wanted.items() if not isinstance(content.get(key), kind)]
+    except (OSError, ValueError, TypeError) as error:
+        raise refused(spec, f"{file} is damaged: {error}") from error
+    if wrong:
+        raise refused(spec, f"{file} is damaged: no entry {wrong[0]!r}")
+    return content
 
 
 def load_model(spec: str, path: Path) -> BaseAlgorithm:

@@ -2,9 +2,9 @@
 
 The run folder holds ``config.json`` (the full configuration, versions and seeds), ``progress.csv``
 and TensorBoard events, ``evaluations.jsonl``, ``checkpoints/``, ``best.zip`` (the policy with the
-best periodic evaluation) and ``last.zip``, and both exported as safetensors. ``learning_curve.png``
-is drawn at the end or at a stop. A run that was stopped or killed continues from its last
-checkpoint. Ctrl-C stops at the end of a rollout, with a checkpoint; a second Ctrl-C stops at once.
+best periodic evaluation) and ``last.zip``, both exported as safetensors, and at the end
+``learning_curve.png``. Ctrl-C stops at the end of a rollout, with a checkpoint; a second Ctrl-C
+stops at once.
 """
 
 from __future__ import annotations
@@ -149,14 +149,9 @@ def _learn_and_test(
     description: Mapping[str, Any],
     content: Content | None,
 ) -> signal.Signals | None:
-    """Learn; then test a policy of the analytic engine there and in PyBullet.
-
-    Args:
-        description: Content of config.json.
-        content: Checkpoint to begin from.
-    """
+    """Learn; then test a policy of the analytic engine there and in PyBullet."""
     stopped_by = _learn(config, console, store, description, content)
-    if stopped_by is None and config.in_batches and config.test_episodes:
+    if stopped_by is None and config.env_options.in_batches and config.test_episodes:
         rates = []
         for engine in ("analytic", "pybullet"):
             test = EvaluationConfig(
@@ -185,7 +180,7 @@ def _learn(
 ) -> signal.Signals | None:
     """Build everything, learn from the beginning or from a checkpoint, and save.
 
-    A signal that came too late to stop the training is not returned.
+    Return the signal that stopped it; one that came too late is not returned.
     """
     import torch
 
@@ -206,7 +201,7 @@ def _learn(
     with ExitStack() as stack:
         training_envs = make_training_envs(config)
         stack.callback(training_envs.close)
-        count = min(config.eval_episodes, BATCH) if config.in_batches else 1
+        count = min(config.eval_episodes, BATCH) if config.env_options.in_batches else 1
         evaluation_envs = make_envs(count=count, **_env_options(config))
         stack.callback(evaluation_envs.close)
         stack.callback(bar.close)
@@ -256,14 +251,11 @@ def _learn(
         if stopped_by is None:
             checkpointing.save(finished=True)
     draw_learning_curve(config.run / CURVE_FILE, config.title, evaluation.evaluations)
-    if stopped_by is None:
-        _say(console, f"finished: {config.run}")
-    else:
-        saved = "without a checkpoint"
-        if store.newest is not None:
-            command = run_folder.resume_command(config.run)
-            saved = f"saved at step {store.newest:,}; continue with: {command}"
-        _say(console, f"stopped early by {stopped_by.name}, {saved}")
+    command, saved = run_folder.resume_command(config.run), "without a checkpoint"
+    if store.newest is not None:
+        saved = f"saved at step {store.newest:,}; continue with: {command}"
+    stopped = f"stopped early by {stopped_by.name}, {saved}" if stopped_by else ""
+    _say(console, stopped or f"finished: {config.run}")
     return stopped_by
 
 
@@ -290,11 +282,7 @@ def make_model(config: TrainingConfig, envs: VecEnv) -> BaseAlgorithm:
 
 
 def _require_room(config: TrainingConfig, numbers: int) -> None:
-    """Refuse a buffer that does not fit in memory; a step holds two observations.
-
-    Args:
-        numbers: Size of an observation.
-    """
+    """Refuse a buffer that does not fit in memory; a step holds two observations."""
     name = "buffer_size" if config.argument("buffer_size") else "n_steps"
     size = config.argument("buffer_size") or config.rollout
     try:
@@ -304,10 +292,7 @@ def _require_room(config: TrainingConfig, numbers: int) -> None:
 
 
 def make_training_envs(config: TrainingConfig) -> VecEnv:
-    """Build the training environments.
-
-    Several environments of the analytic engine are stepped together. Others run in processes.
-    """
+    """Build the training environments: in processes, or together in the analytic engine."""
     from stable_baselines3.common.env_util import make_vec_env
     from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
@@ -315,7 +300,7 @@ def make_training_envs(config: TrainingConfig) -> VecEnv:
     from tpm_gym.learning.vec_env import AnalyticVecEnv
 
     several = config.envs > 1
-    if several and config.in_batches:
+    if several and config.env_options.in_batches:
         # Episodes that end one by one make the batches of an on-policy algorithm even.
         options = {**_env_options(config), "autoreset_mode": "SameStep", "stagger": True}
         envs = AnalyticVecEnv(make_envs(count=config.envs, **options))
@@ -334,7 +319,6 @@ def make_training_envs(config: TrainingConfig) -> VecEnv:
 def _env_options(config: TrainingConfig) -> dict[str, Any]:
     """Return the environment of training and evaluations, as arguments of :func:`make_env`."""
     # A worker process must import the id's module, and may not have the id registered.
-    spec = check_env_id(config.env)
-    env = config.env if ":" in config.env else spec
+    env = config.env if ":" in config.env else check_env_id(config.env)
     chosen = {"penalty_weight": config.penalty_weight, "goals": config.goals}
     return {"env": env, **chosen, **config.env_options.given()}

@@ -129,10 +129,7 @@ def restore_files(run: Path, content: Content) -> None:
 
 
 def restore(model: BaseAlgorithm, content: Content) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Restore a training from a checkpoint, from which ``learn`` continues.
-
-    Args:
-        model: New algorithm, built with the same arguments.
+    """Restore a training in a new algorithm, built with the same arguments.
 
     Returns:
         The state for :func:`restore_log`, and the ``extra`` of :func:`capture`.

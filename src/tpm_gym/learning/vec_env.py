@@ -34,17 +34,15 @@ class AnalyticVecEnv(VecEnv):
             engine="analytic", autoreset_mode="SameStep", stagger=True)``.
 
     Raises:
-        ConfigurationError: ``envs`` are others, or have another autoreset.
+        ConfigurationError: ``envs`` are others.
     """
 
     def __init__(self, envs: TPMVectorEnv) -> None:
         """Wrap the environments."""
-        if not isinstance(getattr(envs, "unwrapped", None), TPMVectorEnv):
+        ours = isinstance(getattr(envs, "unwrapped", None), TPMVectorEnv)
+        if not ours or envs.autoreset_mode != AutoresetMode.SAME_STEP:
             valid = "gym.make_vec(id, num_envs=..., engine='analytic', autoreset_mode='SameStep')"
             raise ConfigurationError("envs", envs, valid)
-        if envs.autoreset_mode != AutoresetMode.SAME_STEP:
-            valid = f"{AutoresetMode.SAME_STEP.value!r} for Stable-Baselines3"
-            raise ConfigurationError("autoreset_mode", envs.autoreset_mode.value, valid)
         self.envs = envs
         self._actions: NDArray[Any] = np.zeros(0)
         self._returns = np.zeros(envs.num_envs)
