@@ -45,27 +45,22 @@ def main(words: Sequence[str] | None = None) -> None:
     """
     about = "Train policies on the environments of tpm_gym, and evaluate them."
     command: Any = tyro.cli(Command, prog="tpm-gym", description=about, args=words)
+    stopped_by = None
     try:
-        stopped_by = _run(command)
+        match command:
+            case TrainingConfig():
+                stopped_by = train(command)
+            case ResumeConfig():
+                stopped_by = resume(command)
+            case EvaluationConfig():
+                evaluate(command)
+            case ExportConfig():
+                from tpm_gym.learning.export import convert  # imported here: it needs PyTorch
+
+                print(convert(command.model, command.out, trust_pickle=command.trust_pickle))
     except TPMError as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
         stopped_by = signal.SIGINT
     if stopped_by is not None:
         sys.exit(128 + stopped_by)
-
-
-def _run(command: Any) -> signal.Signals | None:
-    """Run a command; return the signal that stopped it, if any."""
-    match command:
-        case TrainingConfig():
-            return train(command)
-        case ResumeConfig():
-            return resume(command)
-        case EvaluationConfig():
-            evaluate(command)
-        case ExportConfig():
-            from tpm_gym.learning.export import convert  # imported here, since it needs PyTorch
-
-            print(convert(command.model, command.out, trust_pickle=command.trust_pickle))
-    return None

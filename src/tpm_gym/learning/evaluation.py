@@ -113,8 +113,7 @@ class Result:
 def evaluate(config: EvaluationConfig, console: Console | None = None) -> list[Result]:
     """Evaluate the policies of a configuration, in order, and write the files it asks for.
 
-    Args:
-        console: Gets the table; by default the standard output.
+    The table is printed on ``console``, by default the standard output.
 
     Raises:
         LearningError: An option is not valid, or a policy cannot be used.
@@ -141,12 +140,10 @@ def evaluate(config: EvaluationConfig, console: Console | None = None) -> list[R
 def _check(config: EvaluationConfig) -> None:
     check_least(config, 1, "episodes", "video_episodes")
     check_least(config, 0, "seed")
-    for option, suffix in (("video", ".mp4"), ("picture", ".png")):
-        path = getattr(config, option)
-        if path is not None and path.suffix != suffix:
-            raise ConfigError(f"--{option} {path}: must end in {suffix}")
-    for option in ("json", "video", "picture"):
+    for option, suffix in {"json": "", "video": ".mp4", "picture": ".png"}.items():
         if (path := getattr(config, option)) is not None:
+            if not path.name.endswith(suffix):
+                raise ConfigError(f"--{option} {path}: must end in {suffix}")
             provenance.require_writable(f"--{option}", path)
 
 
@@ -190,15 +187,10 @@ def _conditions(env_id: str, given: Mapping[str, Any]) -> dict[str, str]:
 def _make_envs(
     config: EvaluationConfig, count: int, render_mode: str | None = None
 ) -> TPMVectorEnv:
-    return make_envs(
-        config.env,
-        count,
-        goals=config.goals,
-        penalty_weight=config.penalty_weight,
-        randomisation=parse_randomisation(config.randomisation),
-        render_mode=render_mode,
-        **config.env_options.given(),
-    )
+    options: dict[str, Any] = {name: getattr(config, name) for name in ("goals", "penalty_weight")}
+    options["randomisation"] = parse_randomisation(config.randomisation)
+    options |= config.env_options.given()
+    return make_envs(config.env, count, render_mode=render_mode, **options)
 
 
 def parse_randomisation(entries: Sequence[str]) -> dict[str, Any]:
@@ -218,8 +210,7 @@ def parse_randomisation(entries: Sequence[str]) -> dict[str, Any]:
 
 
 def _load(config: EvaluationConfig, envs: TPMVectorEnv) -> list[Policy]:
-    trust = config.trust_pickle
-    return [load_policy(spec, envs, trust_pickle=trust) for spec in config.policy]
+    return [load_policy(spec, envs, trust_pickle=config.trust_pickle) for spec in config.policy]
 
 
 def _evaluate_one(
@@ -268,12 +259,9 @@ def _description(config: EvaluationConfig, results: Sequence[Result]) -> dict[st
     policies = [result.as_dict() for result in results]
     content = policies[0] if len(policies) == 1 else {"policies": policies}
     records = {name: content.pop(name) for name in ("records",) if name in content}  # long, so last
+    recorded = ("env", "episodes", "seed", "goals", "penalty_weight")
     return {
-        "env": config.env,
-        "episodes": config.episodes,
-        "seed": config.seed,
-        "goals": config.goals,
-        "penalty_weight": config.penalty_weight,
+        **{name: getattr(config, name) for name in recorded},
         "randomisation": parse_randomisation(config.randomisation),
         "env_options": _conditions(config.env, config.env_options.given()),
         **content,

@@ -9,6 +9,7 @@ import sys
 import tempfile
 import uuid
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Final
@@ -60,16 +61,14 @@ def git_commit() -> str | None:
 
 def machine() -> dict[str, Any]:
     """Return the properties of the computer that decide its speed; nothing that identifies it."""
-    try:
-        # platform.processor() is empty or only the architecture on most Linux systems.
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        lines = []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    processor = platform.processor()
+    with suppress(OSError, IndexError):  # on most Linux systems the above is empty
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
+        processor = text.split("model name", 1)[1].splitlines()[0].lstrip("\t: ")
     return {
         "system": platform.system(),
         "architecture": platform.machine(),
-        "processor": names[0] if names else platform.processor(),
+        "processor": processor,
         "cpu_count": os.cpu_count(),
     }
 

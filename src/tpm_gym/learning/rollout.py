@@ -1,11 +1,8 @@
 """Rollouts of a policy over seeded episodes, and their metrics.
 
-Seeds fall into three disjoint ranges, so that no result comes from episodes that a policy was
-trained on or selected by:
-
-- below ``SELECTION_SEED``: training;
-- from ``SELECTION_SEED``: the periodic evaluations during training, which select ``best.zip``;
-- from ``TEST_SEED``: ``tpm-gym evaluate``.
+Seeds of training lie below ``SELECTION_SEED``, those of the periodic evaluations that select
+``best.zip`` from there up, and those of ``tpm-gym evaluate`` from ``TEST_SEED`` up. So no result
+comes from episodes that a policy was trained on or selected by.
 """
 
 from __future__ import annotations
@@ -91,7 +88,7 @@ def run_episodes(
     on_frame: Callable[[], object] | None = None,
     on_episodes: Callable[[int], object] | None = None,
 ) -> list[Episode]:
-    """Run a policy for a number of episodes; the same arguments give the same records.
+    """Run a policy for a number of episodes; equal arguments give equal records.
 
     Args:
         envs: Environments with next-step autoreset, as many as run at a time; left open.
@@ -148,22 +145,22 @@ def _record(seed: int, steps: Mapping[str, NDArray[Any]]) -> Episode:
     """Condense an episode from its steps' values (n, ...)."""
     for name, values in steps.items():
         if not np.isfinite(values).all():
-            # A NaN would pass through min and max unseen, depending on where it stands.
             place = tuple(np.argwhere(~np.isfinite(values))[0].tolist())
             where = f"episode with seed {seed}, step {place[0]}"
             raise RolloutError(f"{where}: {name} is {values[place]}, expected a finite number")
     conditioning, successes = steps["conditioning"].tolist(), steps["is_success"].tolist()
     torques: list[float] = steps["torque"].ravel().tolist()
+    length = len(successes)
     return Episode(
         seed=seed,
         success_at_end=successes[-1],
         success_once=any(successes),
         total_reward=math.fsum(steps["reward"].tolist()),
         conditioning_min=min(conditioning),
-        conditioning_mean=math.fsum(conditioning) / len(conditioning),
+        conditioning_mean=math.fsum(conditioning) / length,
         closure_error_max=float(steps["closure_error"].max()),
-        length=len(successes),
-        unsafe_share=int((steps["singularity_penalty"] > 0).sum()) / len(successes),
+        length=length,
+        unsafe_share=int((steps["singularity_penalty"] > 0).sum()) / length,
         fk_error_max=float(steps["fk_error"].max()),
         torque_rms=math.hypot(*torques) / math.sqrt(len(torques)),
         torque_peak=max(map(abs, torques)),

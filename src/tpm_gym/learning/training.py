@@ -192,9 +192,8 @@ def _learn(
     )
     from tpm_gym.learning.curve import draw_learning_curve
     from tpm_gym.learning.demonstrations import Demonstrations
-    from tpm_gym.learning.logger import make_logger
     from tpm_gym.learning.signals import SignalListener
-    from tpm_gym.learning.training_state import restore, restore_files, restore_log
+    from tpm_gym.learning.training_state import make_logger, restore, restore_files, restore_log
 
     torch.set_num_threads(config.threads)
     bar, listener = ProgressBar(console), SignalListener()

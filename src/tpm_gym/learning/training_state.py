@@ -22,15 +22,19 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import DictReplayBuffer
-from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.logger import CSVOutputFormat, Logger, TensorBoardOutputFormat
 from stable_baselines3.her import HerReplayBuffer
+from tensorboard.compat.proto.event_pb2 import (  # type: ignore[import-untyped]
+    Event,
+    SessionLog,
+)
 
 from tpm_gym import TPMError
 from tpm_gym.learning.checkpoint import STATE, TENSORS, Content
 from tpm_gym.learning.errors import CheckpointError
 from tpm_gym.learning.provenance import versions, write_whole
 from tpm_gym.learning.rollout import Action, GoalEnv, Observation
-from tpm_gym.learning.run_folder import LAST, LAST_FILE, RESTORED, clear_tests
+from tpm_gym.learning.run_folder import LAST, LAST_FILE, PROGRESS_FILE, RESTORED, clear_tests
 from tpm_gym.learning.vec_env import AnalyticVecEnv, starting
 
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining")
@@ -258,3 +262,20 @@ def restore_log(logger: Logger, state: Mapping[str, Any]) -> None:
         logger.name_to_value[name] = np.dtype(dtype).type(value) if dtype else value
         logger.name_to_excluded[name] = tuple(state["excluded"][name])
     logger.name_to_count.update(state.get("counts", {}))
+
+
+def make_logger(run: Path, resumed_at: int | None = None) -> Logger:
+    """Open the log of a run; ``resumed_at`` is the step to which progress.csv was set back."""
+    path = run / PROGRESS_FILE
+    before = "" if resumed_at is None or not path.is_file() else path.read_text(encoding="utf-8")
+    table = CSVOutputFormat(str(path))  # empties the file
+    table.file.write(before)
+    table.file.flush()
+    table.keys = before.split("\n", 1)[0].split(",") if before else []
+    events = TensorBoardOutputFormat(str(run))
+    if resumed_at is not None:
+        # TensorBoard then hides events that an earlier process logged after this step.
+        start = Event(step=resumed_at + 1, session_log=SessionLog(status=SessionLog.START))
+        writer: Any = events.writer
+        writer._get_file_writer().add_event(start)
+    return Logger(str(run), [table, events])
