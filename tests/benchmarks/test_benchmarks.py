@@ -75,22 +75,10 @@ def test_bench_speed_from_the_command_line(tmp_path):
     content = read_strict(numbers)
     assert list(content["contestants"]) == ["TPMReach-v0", PICK]
     for entry in content["contestants"].values():
-        assert len(entry["rounds"]) == 2
-        for name in (
-            "steps_per_second",
-            "reset_milliseconds",
-            "step_over_physics",
-            "step_over_with_motors",
-        ):
+        for name in ("steps_per_second", "reset_milliseconds", "step_over_physics"):
             low, middle, high = entry[name]
             assert 0 < low <= middle <= high
-        assert "ratio_to_baseline" not in entry  # panda-gym was not asked for
-    scaling = content["scaling"]
-    assert scaling["env_id"] == PICK
-    for name in ("one_process", "two_processes", "two_over_one", "async_over_sync"):
-        assert min(scaling[name]) > 0
-    for key in ("command", "commit", "versions", "machine", "load_before", "unavailable"):
-        assert key in content
+    assert min(content["scaling"]["async_over_sync"]) > 0
     assert str(tmp_path) not in numbers.read_text(encoding="utf-8")
     assert f"not measured: {PICK} over PandaPickAndPlace-v3" in output
     assert plot.read_bytes().startswith(b"\x89PNG")
@@ -115,18 +103,11 @@ def test_soak_goes_through_everything_and_passes(tmp_path, capsys, monkeypatch):
     status, content = soaked(tmp_path, "--steps", "2000", "--plot", str(plot))
     output = capsys.readouterr().out
     assert status == 0, output
-    assert content["finished"]
     assert content["failures"] == []
-    assert content["samples"][-1]["steps"] >= 2000
-    verdict = content["verdict"]
-    assert verdict["passed"]
-    assert verdict["memory"]["baseline_steps"] >= 300
-    assert 0 < verdict["closure_drift"]["mean"] < verdict["closure_drift"]["largest"] < 1e-3
+    assert 0 < content["verdict"]["closure_drift"]["largest"] < 1e-3
     for event in ("openings", "closes", "pictures", "resets options", "resets plain", "restores"):
         assert content["events"][event] > 0, event
-    assert content["events"]["openings"] >= len(soak.ENV_IDS)
     assert plot.read_bytes().startswith(b"\x89PNG")
-    assert "0 exceptions" in output
     assert output.rstrip().endswith("PASSED")
 
 
@@ -148,17 +129,11 @@ def test_a_step_that_raises_is_reported_outlived_and_can_be_repeated(tmp_path, c
         return Raising(env) if env_id == "TPMReachJoints-v0" else env
 
     status, content = soaked(tmp_path, make=make)
-    output = capsys.readouterr().out
     assert status == 1
     assert content["finished"]  # it went on
-    assert not content["verdict"]["nothing_raised"]
     first = content["failures"][0]
-    assert first["env_id"] == "TPMReachJoints-v0"
-    assert soak.ENV_IDS[first["visit"] % len(soak.ENV_IDS)] == first["env_id"]
-    assert first["error"] == "ValueError: injected"
-    assert {"seed", "total_steps", "episode", "step"} <= first.keys()
-    assert f"--seed 0 --replay {first['visit']}" in output
-    assert output.rstrip().endswith("FAILED")
+    assert (first["env_id"], first["error"]) == ("TPMReachJoints-v0", "ValueError: injected")
+    assert f"--seed 0 --replay {first['visit']}" in capsys.readouterr().out
 
 
 def samples(slope: float, noise: float) -> dict[str, Any]:

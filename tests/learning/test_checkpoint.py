@@ -83,13 +83,6 @@ def test_the_last_two_are_kept_and_nothing_else_is_touched(folder: Path) -> None
     assert names(folder) == mine
 
 
-def test_checkpoints_are_ordered_by_number(folder: Path) -> None:
-    store = CheckpointStore(folder)
-    for step in (999_999_999, 1_000_000_000):
-        store.save(content(step))
-    assert_equal(CheckpointStore(folder).load(pytest.fail), content(1_000_000_000))
-
-
 def flipped(data: bytes, place: int) -> bytes:
     return data[:place] + bytes([data[place] ^ 4]) + data[place + 1 :]
 
@@ -140,17 +133,6 @@ def test_files_that_others_have_signed_are_named(folder: Path, entries: Any, pro
     with pytest.raises(CheckpointError, match=r"is whole; .*--overwrite"):
         CheckpointStore(folder).load(warned.append)
     assert problem in "".join(warned)
-
-
-def test_a_folder_without_checkpoints_holds_none(tmp_path: Path) -> None:
-    for where in (tmp_path / "nowhere", tmp_path):
-        assert CheckpointStore(where).load(pytest.fail) is None
-
-
-def test_pickles_are_not_written(folder: Path) -> None:
-    with pytest.raises(ValueError, match="allow_pickle"):
-        CheckpointStore(folder).save(Content(3, False, {}, {"bad": np.array([object()])}))
-    assert names(folder) == [file_of(1), file_of(2)]
 
 
 # -- dying ------------------------------------------------------------------------------------

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from processes import TPM_GYM, printed_by, signalled
 from stable_baselines3 import SAC
-from stable_baselines3.common.logger import Logger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from trainings import (
     Killed,
@@ -31,10 +30,8 @@ from trainings import (
 import tpm_gym
 from tpm_gym.learning import ResumeConfig, TrainingConfig, resume, train
 from tpm_gym.learning.checkpoint import CheckpointStore, Content
-from tpm_gym.learning.configuration import complete
 from tpm_gym.learning.errors import CheckpointError
-from tpm_gym.learning.training import make_model, make_training_envs
-from tpm_gym.learning.training_state import EpisodeRecorder, restore
+from tpm_gym.learning.training_state import EpisodeRecorder
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
 
@@ -194,27 +191,6 @@ def test_resuming_neither_acts_at_random_again_nor_runs_a_pickle(
     monkeypatch.setattr(SAC, "load", None)
     resume(ResumeConfig(run), quiet())
     assert not random_actions
-
-
-def test_the_optimiser_moves_what_was_restored(killed: Kill) -> None:
-    """An optimiser that holds other tensors than the networks would train nothing."""
-    config = complete(killed(260))
-    content = CheckpointStore(config.run / "checkpoints").load(pytest.fail)
-    assert content is not None
-    envs = make_training_envs(config)
-    model = make_model(config, envs)
-    restore(model, content)
-    model.set_logger(Logger(None, []))
-    assert isinstance(model, SAC)
-    before = {name: value.clone() for name, value in model.policy.state_dict().items()}
-    entropy = model.log_ent_coef.item()
-    model.train(3, 16)
-    moved = [
-        name for name, value in model.policy.state_dict().items() if (value != before[name]).any()
-    ]
-    assert len(moved) == len(before)
-    assert model.log_ent_coef.item() != entropy
-    envs.close()
 
 
 # -- real kills -----------------------------------------------------------------------------------

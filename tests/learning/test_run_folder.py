@@ -55,19 +55,6 @@ def test_what_another_program_wrote_is_never_deleted(config: str | None, tmp_pat
     assert names(tmp_path) == before
 
 
-def test_a_file_is_no_folder(tmp_path: Path) -> None:
-    (tmp_path / "run").write_text("")
-    with pytest.raises(RunError):
-        prepare(tmp_path / "run", overwrite=False)
-
-
-def test_what_a_first_moment_left_is_no_run(tmp_path: Path) -> None:
-    (tmp_path / ".half.json").write_text("{")
-    prepare(tmp_path, overwrite=False)
-    prepare(tmp_path / "new" / "run", overwrite=False)
-    assert (tmp_path / "new" / "run").is_dir()
-
-
 def test_a_death_while_deleting_leaves_a_run_that_can_be_deleted(
     run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,6 +1,5 @@
 """A loaded policy acts as its layers say, names what does not fit, and needs PyTorch alone."""
 
-import copy
 import json
 import os
 from collections.abc import Callable
@@ -103,17 +102,6 @@ def test_predict_has_the_interface_of_stable_baselines(policy: Policy) -> None:
         policy.predict(batch, deterministic=False)
 
 
-def test_the_observation_is_left_as_it_was_and_the_action_is_the_callers(policy: Policy) -> None:
-    batch = {key: values.astype(np.float32) for key, values in observations(3).items()}
-    before = copy.deepcopy(batch)
-    first = policy.act(batch)
-    kept = first.copy()
-    first[:] = 9.0
-    np.testing.assert_array_equal(policy.act(batch), kept)
-    for key, values in before.items():
-        np.testing.assert_array_equal(batch[key], values)
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -185,12 +173,6 @@ def test_joint_increments_are_no_cartesian_ones() -> None:
             pytest.raises(PolicyMismatchError, match="TPMPickAndPlaceJointsDense-v0"),
         ):
             policy.check(vector)
-
-
-def test_what_is_no_environment_is_refused(policy: Policy) -> None:
-    for thing in (None, "TPMReach-v0"):
-        with pytest.raises(InputError, match=r"an environment, such as gym.make\('TPMReach-v0'\)"):
-            policy.check(thing)
 
 
 # -- names -----------------------------------------------------------------------------------------
@@ -269,12 +251,6 @@ def test_loading_needs_no_stable_baselines_and_no_engine(tmp_path: Path) -> None
     )
     printed = printed_by(PYTHON, "-c", code)
     np.testing.assert_allclose(json.loads(printed), load_policy(path).act(one), atol=1e-6)
-
-
-def test_what_the_package_imports_when_asked_is_public_and_nothing_else() -> None:
-    assert tpm_gym.policy.Policy is Policy
-    with pytest.raises(AttributeError, match=r"'tpm_gym.policy' has no attribute 'Polcy'"):
-        tpm_gym.policy.Polcy  # noqa: B018
 
 
 @pytest.mark.parametrize("package", ["torch", "safetensors", "pydantic"])
