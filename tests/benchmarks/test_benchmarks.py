@@ -1,67 +1,17 @@
 """The benchmarks run, and find failures, growth and drift."""
 
 from pathlib import Path
-from types import BuiltinFunctionType
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import pybullet
 import pytest
-import raw_physics
 import soak
 import soak_report
 from paths import ROOT, read_strict
 from processes import PYTHON, printed_by
-from raw_physics import STEP, Recorder, record, recording, replay
-
-from tpm_gym.tasks import Expert
 
 PICK = "TPMPickAndPlace-v0"
-
-
-@pytest.fixture(scope="module")
-def taped():
-    """A tape of two episodes, in the first of which the block is taken, and its actions."""
-    env, actions = gym.make(PICK), np.zeros((60, 4), np.float32)
-    observation, _ = env.reset(seed=0)
-    expert = Expert(env)
-    expert.reset(observation)
-    for action in actions[:50]:
-        action[:] = expert.act(observation)
-        observation, *_ = env.step(action)
-    recorder = Recorder()
-    with recording(recorder):
-        env = gym.make(PICK)
-        tape = record(env, recorder, actions, seed=0)
-    env.close()
-    assert isinstance(pybullet.stepSimulation, BuiltinFunctionType)  # the engine's own again
-    return tape, actions
-
-
-def test_a_tape_holds_the_time_steps_the_grasp_and_the_reset(taped):
-    tape, actions = taped
-    names = [[call.name for call in calls] for calls in tape.steps]
-    assert len(names) == len(actions) == 60
-    assert all(step.count(STEP) == 10 for step in names)
-    assert any("createConstraint" in step for step in names)
-    assert tape.resets == {49}
-
-
-def test_the_same_calls_do_the_same_physics_and_leave_nothing_behind(taped):
-    tape, actions = taped
-    names = [{call.name for call in calls} for calls in tape.steps]
-    grasp = next(i for i, found in enumerate(names) if "createConstraint" in found)
-    holding = raw_physics.Tape(tape.steps[: grasp + 3], set(), tape.ends)
-    env = gym.make(PICK)
-    for block in (holding, tape):  # replay itself compares every step with the tape
-        floor = replay(env, block, seed=0)
-        assert 0 < floor.physics < floor.with_motors
-    env.reset(seed=0)
-    for action, end in zip(actions[:50], tape.ends, strict=False):
-        env.step(action)
-        np.testing.assert_array_equal(raw_physics._where(env), end)
-    env.close()
 
 
 # -- speed ----------------------------------------------------------------------------------------

@@ -2,14 +2,11 @@
 
 import json
 import os
-import shlex
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -26,22 +23,20 @@ from processes import PYTHON, signalled
 from studies.__main__ import main
 from studies.bisection import ends, halving, nominal
 from studies.figures import learning_curves, penalty
-from studies.page import PAGE, STUDIES, Write, command, page, split, write
+from studies.page import PAGE, Write, page, split, write
 from studies.plan import Bisection, Run, Study, plan_runs
 from studies.records import (
     RECORDS,
     Collect,
     collect,
     condense,
-    condense_bisection,
     read_records,
 )
 from studies.running import execute, run_all
-from trainings import PPO_RECIPE, SAC_RECIPE, assert_equal_runs, without_times
+from trainings import PPO_RECIPE
 
 import tpm_gym
 from tpm_gym.errors import ConfigurationError
-from tpm_gym.learning.checkpoint import CheckpointStore
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.run_folder import claimed
 from tpm_gym.simulation.randomisation import LIMITS, Randomisation
@@ -250,95 +245,6 @@ def test_ctrl_c_stops_a_study_with_checkpoints_saved(tmp_path: Path) -> None:
     assert temporary() == before
 
 
-@pytest.fixture
-def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """Start two nodes of one CPU each."""
-    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-    with tempfile.TemporaryDirectory(prefix="tpm-", dir="/tmp") as folder:
-        monkeypatch.setenv("RAY_TMPDIR", folder)
-        from ray.cluster_utils import Cluster
-
-        options = {"num_cpus": 1, "include_dashboard": False, "object_store_memory": 80 << 20}
-        found = Cluster(True, head_node_args=options)
-        found.add_node(**options)
-        yield found
-        found.shutdown()
-
-
-def raylet(node: Any) -> psutil.Process:
-    return psutil.Process(node.all_processes["raylet"][0].process.pid)
-
-
-def kill_worker(node: Any) -> None:
-    """Kill the process of a node that trains."""
-    children = raylet(node).children(recursive=True)
-    (worker,) = [child for child in children if child.name().startswith("ray::execute")]
-    worker.kill()
-
-
-def kill_node(node: Any) -> None:
-    """Kill all processes of a node at once, as a power cut does."""
-    for process in [*raylet(node).children(recursive=True), raylet(node)]:
-        process.kill()
-
-
-def small(folder: Path, seed: int) -> Run:
-    """Return a training of seconds, with many checkpoints."""
-    folder.mkdir(exist_ok=True)
-    recipe = folder / "sac.yml"
-    recipe.write_text(SAC_RECIPE.format(env="TPMReach-v0", train_freq=20), encoding="utf-8")
-    words = ["--recipe", str(recipe), "--seed", str(seed), "--steps", "2000"]
-    words += ["--eval-every", "1000", "--eval-episodes", "2", "--checkpoint-every", "50"]
-    test = ("pybullet", 2, ())
-    return Run(folder / f"run-s{seed}", "TPMReach-v0", "sac", tuple(words), (test,))
-
-
-def newest(run: Run) -> int:
-    """Return the step of the last checkpoint of a run."""
-    return max(CheckpointStore(run.folder / "checkpoints").steps(), default=-1)
-
-
-def lasting(run: Run) -> Any:
-    """Return the record of a run without times and resumptions."""
-    kept = without_times(condense(run.folder))
-    for test in kept["tests"].values():
-        del test["steps_per_second"]
-    return {name: value for name, value in kept.items() if name != "resumed"}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kill", [kill_worker, kill_node])
-def test_a_death_midway_costs_what_came_after_the_last_checkpoint(
-    kill: Callable[[Any], None], cluster: Any, tmp_path: Path
-) -> None:
-    undisturbed = [small(tmp_path / "undisturbed", seed) for seed in range(2)]
-    for run in undisturbed:
-        assert execute(run) is None
-    runs = [small(tmp_path / "disturbed", seed) for seed in range(2)]
-    reached = []
-
-    def kill_midway() -> None:
-        while min(map(newest, runs)) < 100:
-            time.sleep(0.01)
-        (node,) = cluster.worker_nodes
-        kill(node)
-        reached.extend(map(newest, runs))
-
-    killer = threading.Thread(target=kill_midway)
-    killer.start()
-    assert run_all(runs, Study("results", folder=tmp_path, address=cluster.address)) == 0
-    killer.join()
-    assert max(reached) < 2000
-    resumed = [condense(run.folder)["resumed"] for run in runs]
-    assert sorted(resumed) == [0, 1]
-    hit = runs[resumed.index(1)]
-    from_step = json.loads((hit.folder / "config.json").read_text())["resumed"][0]["from_step"]
-    assert from_step == reached[resumed.index(1)]
-    for run, other in zip(runs, undisturbed, strict=True):
-        assert lasting(run) == lasting(other)
-        assert_equal_runs(run.folder, other.folder)
-
-
 # -- records --------------------------------------------------------------------------------------
 
 
@@ -447,19 +353,6 @@ def test_the_page_is_what_its_records_say() -> None:
     assert page(read_records(ROOT / RECORDS), ["results_learning_curves.png", *figures]) == text
 
 
-def test_failures_are_counted_and_named() -> None:
-    text = page([changed(seed, rate) for seed, rate in enumerate([1.0, 0.99, 0.98, 0.2, None])], [])
-    (row,) = rows(text, "98.0% (100.0, 99.0, 98.0, 20.0, 0.0) |", "| 60 | 0.5 | 1.0 |")
-    assert len(rows(text, "not finished")) == 1
-    failures = text.split("### Failures")[1].split("##")[0]
-    assert "seed 3: success 20.0%" in failures
-    assert "seed 4: stopped after 120 of 120 steps" in failures
-    assert "seed 2" not in failures
-    text = page([changed(seed, rate) for seed, rate in enumerate([1.0, 0.5, 0.4, 0.2, None])], [])
-    (row,) = rows(text, "100.0, 50.0")
-    assert row.count("never") == 2
-
-
 @pytest.mark.parametrize(
     ("other", "labels"),
     [
@@ -483,16 +376,6 @@ def test_runs_that_differ_are_told_apart_everywhere(other: Any, labels: list[str
     assert [line.get_label() for line in curves.axes[0].lines[:2]] == labels
     ticks = [t.get_text() for t in penalty(split(weighted)[1]).axes[0].get_xticklabels()]
     assert len(set(ticks)) == 4
-
-
-def test_what_was_not_run_is_named() -> None:
-    assert page([], []).count(": all of it.") == len(STUDIES)
-    planned = [run.folder.name for run in plan_runs(STUDIES[0])]
-    text = page([changed(0, 1.0, run=name) for name in planned[2:]], [])
-    missing = text.split("## Not run yet")[1].split("##")[0]
-    assert f"`{command(STUDIES[0])}`: {planned[0].removesuffix('-s0')} (2).\n" in missing
-    every = [changed(0, 1.0, run=run.folder.name) for s in STUDIES for run in plan_runs(s)]
-    assert "Not run yet" not in page(every, [])
 
 
 # -- bisections -----------------------------------------------------------------------------------
@@ -529,85 +412,3 @@ def test_success_halves_where_the_bisection_says(
     way = np.abs([start, result.before, result.after, end])
     way = np.log(way) if start else way
     assert (way[2] - way[1]) / (way[3] - way[0]) == pytest.approx(1 / 64, rel=0.2)
-
-
-def answer(bisection: Bisection, success: Any) -> int:
-    """Write the results of the evaluations that a bisection asks for; return their number."""
-    count = 0
-    while left := bisection.left():
-        (words,) = left
-        options = dict(zip(words[2::2], words[3::2], strict=True))
-        name, _, text = options["--randomisation"].partition("=")
-        assert name == bisection.attribute
-        servo = name in ("servo_stiffness", "joint_friction")
-        assert options.get("--drive", "ideal") == ("servo" if servo else "ideal")
-        assert options["--engine"] == bisection.engine
-        rate = success(float(text))
-        test = {
-            "env": bisection.env,
-            "policy": options["--policy"],
-            "episodes": bisection.episodes,
-            "randomisation": {name: float(text)},
-            "env_options": {"engine": bisection.engine},
-            "success_at_end": {"mean": rate, "low": rate, "high": rate},
-            "versions": {},
-            "git_commit": "0" * 40,
-            "machine": {},
-            "command": shlex.join(words),
-        }
-        path = Path(options["--json"])
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(test))
-        count += 1
-    return count
-
-
-def law(value: float) -> float:
-    """Success that halves at 1.5 and, below 1, at 0.8."""
-    return 1.0 if 0.8 < value < 1.5 else 0.1
-
-
-@pytest.fixture
-def bisections(tmp_path: Path) -> list[Any]:
-    """Records of two ids: success by one law for factors, and unchanged for errors."""
-    runs = tmp_path / "runs"
-    for env in ("TPMReach-v0", "TPMPickAndPlace-v0"):
-        for attribute in LIMITS:
-            bisection = Bisection(runs / f"{env}-{attribute}", env, attribute, 50)
-            factor = nominal(attribute) == 1.0
-            answer(bisection, law if factor else lambda value: 0.97)
-    assert len(collect(Collect(runs, tmp_path / "records"))) == 2 * len(LIMITS)
-    return read_records(tmp_path / "records")
-
-
-def test_what_was_tested_is_not_tested_again_unless_with_other_episodes(tmp_path: Path) -> None:
-    bisection = Bisection(tmp_path / "b", "TPMReach-v0", "link_mass", 50)
-    assert answer(bisection, law) == 1 + 7 + 7
-    assert bisection.left() == []
-    assert answer(replace(bisection, episodes=60), lambda value: 0.8) == 3
-    kept = condense_bisection(tmp_path / "b")
-    assert (kept["episodes"], set(kept["tests"])) == (60, {"0.5", "1", "16"})
-    (tmp_path / "b" / "tests" / "1.json").unlink()
-    with pytest.raises(ConfigError, match="no bisection"):
-        collect(Collect(tmp_path, tmp_path / "records"))
-
-
-def test_the_page_says_where_success_halves(bisections: list[Any]) -> None:
-    text = page(bisections, ["results_robustness.png"])
-    assert "images/results_robustness.png" in text
-    (row,) = rows(text, "| block mass (factor) | 1 | 10 |")
-    (cell,) = {cell.strip() for cell in row.strip("|").split("|")[3:]}
-    low, high = map(float, cell.split(" to "))
-    assert low < 1.5 <= high < 1.05 * low
-    (row,) = rows(text, "| servo stiffness (factor, servo drives) | 1 | 0.01")
-    low, high = map(float, row.strip("|").split("|")[3].split(" to "))
-    assert high <= 0.8 < low < 1.1 * high
-    (row,) = rows(text, "| encoder bias (rad) | 0 | 0.001 |")
-    assert row.count("97.0% at 0.001") == 2
-    again = [record | {"engine": "analytic", "episodes": 70} for record in bisections]
-    both = page([*bisections, *again], [])
-    assert both.count("| block mass") == 2 * text.count("| block mass") > 0
-    assert "analytic engine, 70 episodes" in both
-    assert "PyBullet, 50 episodes" in both
-    del bisections[0]["tests"][list(bisections[0]["tests"])[-1]]
-    assert "not finished" in page(bisections, [])

@@ -1,6 +1,5 @@
 """A whole checkpoint is left by a death at any moment, and damage anywhere is noticed."""
 
-import errno
 import hashlib
 import io
 import json
@@ -12,7 +11,6 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -222,21 +220,3 @@ def test_a_write_that_fails_half_way_leaves_the_others_whole(folder: Path, limit
     assert in_child(lambda: save_with_limit(folder, limit)) == 0
     assert names(folder) == [file_of(1), file_of(2)]
     assert_equal(CheckpointStore(folder).load(pytest.fail), content(2))
-
-
-@pytest.mark.parametrize(
-    ("problem", "raised"),
-    [(OSError(errno.ENOSPC, "full"), CheckpointError), (KeyboardInterrupt(), KeyboardInterrupt)],
-)
-def test_a_flush_that_fails_is_named_and_the_part_removed(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, problem: BaseException, raised: Any
-) -> None:
-    store = CheckpointStore(folder)
-    store.load(pytest.fail)
-    with monkeypatch.context() as patched:
-        patched.setattr(os, "fsync", Mock(side_effect=problem))
-        with pytest.raises(raised, match="full; that of step 2 stays" if str(problem) else None):
-            store.save(content(3))
-    assert names(folder) == [file_of(1), file_of(2)]
-    store.save(content(3))
-    assert_equal(CheckpointStore(folder).load(pytest.fail), content(3))

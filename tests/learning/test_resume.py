@@ -2,7 +2,6 @@
 
 import json
 import os
-import random
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from processes import TPM_GYM, printed_by, signalled
+from processes import TPM_GYM, signalled
 from stable_baselines3 import SAC
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from trainings import (
@@ -216,18 +215,3 @@ def test_kill_9_costs_nothing(tmp_path: Path) -> None:
     assert newest(run) < 300
     assert resume(ResumeConfig(run, checkpoint_every=1000), quiet()) is None
     assert_equal_runs(uninterrupted("sac"), run)
-
-
-@pytest.mark.slow
-def test_ten_kills_at_random_moments_change_nothing(tmp_path: Path) -> None:
-    words = ["train", "--eval-episodes", "5", "--checkpoint-every", "100", "--run"]
-    whole, killed = tmp_path / "whole", tmp_path / "killed"
-    printed_by(*TPM_GYM, *words, str(whole))
-    words.append(str(killed))
-    for step in sorted(random.Random(0).sample(range(4500), 10)):  # of 5000
-        kill_beyond(killed, step, words)
-        words = ["resume", str(killed)]
-    printed_by(*TPM_GYM, *words)
-    resumptions = json.loads((killed / "config.json").read_text())["resumed"]
-    assert len(resumptions) > 5  # those between the same two checkpoints count once
-    assert_equal_runs(whole, killed)

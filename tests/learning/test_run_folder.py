@@ -9,9 +9,8 @@ import pytest
 from trainings import Killed
 
 from tpm_gym.learning import TrainingConfig, train
-from tpm_gym.learning.checkpoint import CheckpointStore
 from tpm_gym.learning.errors import RunError
-from tpm_gym.learning.run_folder import description, disk_errors_named, prepare
+from tpm_gym.learning.run_folder import description, prepare
 
 OURS = {"algo": "sac", "env": "TPMReach-v0", "training_seeds": [0, 0]}
 
@@ -101,9 +100,3 @@ def test_a_folder_that_cannot_be_made_is_one_line(
     with pytest.raises(RunError, match=f"{os.strerror(number)}; choose another --run") as caught:
         train(TrainingConfig(run=tmp_path / "run"))
     assert "\n" not in str(caught.value)
-
-
-def test_errors_of_the_disk_say_how_to_continue(run: Path) -> None:
-    store = CheckpointStore(run / "checkpoints")
-    with pytest.raises(RunError, match=r"No space left.*--over"), disk_errors_named(run, store):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

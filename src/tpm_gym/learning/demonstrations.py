@@ -26,15 +26,14 @@ class Demonstrations(BaseCallback):
     Every second episode has normally distributed noise on the motion, so that the policy learns in
     states that the expert never reaches by itself; some of these episodes fail.
 
-    Attributes:
-        successes: Share of the episodes that ended in success; NaN before they are played.
+    ``successes`` is the share of the episodes that ended in success, NaN before they are played.
     """
 
     def __init__(self, episodes: int, noise: float = 0.3, verbose: int = 0) -> None:
         """Set the number of episodes and the noise.
 
         Args:
-            episodes: Number of episodes, rounded up to a multiple of the number of environments.
+            episodes: Rounded up to a multiple of the number of environments.
             noise: Standard deviation, in units of the largest action.
         """
         super().__init__(verbose)
