@@ -1,13 +1,10 @@
-"""The benchmarks run, and find failures, growth and drift."""
+"""The benchmarks of speed and endurance run, and find failures."""
 
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
-import pytest
 import soak
-import soak_report
 from paths import ROOT, read_strict
 from processes import PYTHON, printed_by
 
@@ -84,38 +81,3 @@ def test_a_step_that_raises_is_reported_outlived_and_can_be_repeated(tmp_path, c
     first = content["failures"][0]
     assert (first["env_id"], first["error"]) == ("TPMReachJoints-v0", "ValueError: injected")
     assert f"--seed 0 --replay {first['visit']}" in capsys.readouterr().out
-
-
-def samples(slope: float, noise: float) -> dict[str, Any]:
-    """Return a soak of a million steps with gaps that start at 10 um and grow by ``slope`` m."""
-    rng = np.random.default_rng(0)
-    steps = np.arange(5_000, 1_000_001, 5_000)
-    gaps = 1e-5 + slope * steps / 1e6 + noise * rng.standard_normal(len(steps))
-    return {
-        "finished": True, "failures": [], "warm_up": 50_000, "limit_mb": 10.0,
-        "samples": [
-            {"steps": int(s), "memory_mb": 100.0, "all_opened": True, "closure_mean": float(g),
-             "closure_max": float(2 * g), "steps_per_second": 500.0}
-            for s, g in zip(steps, gaps, strict=True)
-        ],
-    }  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("slope", "noise", "drifts"),
-    [
-        (0.0, 1e-8, False),
-        (2e-6, 1e-8, True),
-        (-2e-6, 1e-8, False),
-        (5e-8, 1e-8, False),  # half a percent
-        (6e-6, 1e-5, False),  # within three standard errors
-    ],
-)
-def test_drift_is_a_slope_beyond_its_error_and_beyond_a_percent(slope, noise, drifts):
-    verdict = soak_report.judge(samples(slope, noise))
-    drift = verdict["closure_drift"]
-    assert drift["found"] == drifts
-    assert verdict["passed"] == (not drifts)
-    assert abs(drift["slope"] - slope) < 4 * drift["standard_error"]
-    # Least squares of 191 points spread evenly over 0.95 million steps.
-    assert drift["standard_error"] == pytest.approx(noise / (0.95 * np.sqrt(191 / 12)), rel=0.2)

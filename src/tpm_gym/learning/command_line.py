@@ -13,7 +13,6 @@ from tyro.conf import Positional, subcommand
 from tpm_gym import TPMError
 from tpm_gym.learning.configuration import ResumeConfig, TrainingConfig
 from tpm_gym.learning.evaluation import EvaluationConfig, evaluate
-from tpm_gym.learning.training import resume, train
 
 
 @dataclass(frozen=True)
@@ -47,17 +46,18 @@ def main(words: Sequence[str] | None = None) -> None:
     command: Any = tyro.cli(Command, prog="tpm-gym", description=about, args=words)
     stopped_by = None
     try:
+        if isinstance(command, EvaluationConfig):
+            evaluate(command)
+            return
+        from tpm_gym.learning import export, training  # imported here, since they need PyTorch
+
         match command:
             case TrainingConfig():
-                stopped_by = train(command)
+                stopped_by = training.train(command)
             case ResumeConfig():
-                stopped_by = resume(command)
-            case EvaluationConfig():
-                evaluate(command)
+                stopped_by = training.resume(command)
             case ExportConfig():
-                from tpm_gym.learning.export import convert  # imported here: it needs PyTorch
-
-                print(convert(command.model, command.out, trust_pickle=command.trust_pickle))
+                print(export.convert(command.model, command.out, trust_pickle=command.trust_pickle))
     except TPMError as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:

@@ -54,8 +54,7 @@ class PenaltyHerReplayBuffer(HerReplayBuffer):
         self, batch_indices: NDArray[np.int64], env_indices: NDArray[np.int64]
     ) -> NDArray[np.float32]:
         """Return r - R(ag', g) of stored transitions, the negative weighted penalty, (n,)."""
-        if self.env is None:
-            raise ConfigError("the buffer has no environment; call set_env() after loading it")
+        assert self.env is not None  # as in the parent
         achieved = self.next_observations["achieved_goal"][batch_indices, env_indices]  # (n, 3) m
         desired = self.next_observations["desired_goal"][batch_indices, env_indices]  # (n, 3) m
         infos: list[dict[str, Any]] = [{} for _ in range(len(batch_indices))]

@@ -7,25 +7,29 @@ best periodic evaluation) and ``last.zip``, both exported as safetensors, and at
 stops at once.
 """
 
-from __future__ import annotations
-
 import json
 import signal
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict, fields, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import torch
 from gymnasium.spaces import flatdim
 from rich.console import Console
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from tpm_gym.errors import TPMError
-from tpm_gym.learning import provenance, run_folder
+from tpm_gym.learning import callbacks, curve, export, provenance, run_folder, training_state
 from tpm_gym.learning.algorithms import ALGORITHMS
 from tpm_gym.learning.checkpoint import CheckpointStore, Content
 from tpm_gym.learning.configuration import UNSET, ResumeConfig, TrainingConfig, complete, resumed
+from tpm_gym.learning.demonstrations import Demonstrations
 from tpm_gym.learning.environments import check_env_id, make_env, make_envs
 from tpm_gym.learning.errors import (
     CheckpointError,
@@ -37,11 +41,8 @@ from tpm_gym.learning.errors import (
 from tpm_gym.learning.evaluation import EvaluationConfig, evaluate
 from tpm_gym.learning.rollout import BATCH, SELECTION_SEED
 from tpm_gym.learning.run_folder import CHECKPOINTS, CONFIG_FILE, CURVE_FILE, TESTS, is_finished
-
-if TYPE_CHECKING:
-    from stable_baselines3.common.base_class import BaseAlgorithm
-    from stable_baselines3.common.callbacks import BaseCallback
-    from stable_baselines3.common.vec_env import VecEnv
+from tpm_gym.learning.signals import SignalListener
+from tpm_gym.learning.vec_env import AnalyticVecEnv
 
 
 def train(config: TrainingConfig, console: Console | None = None) -> signal.Signals | None:
@@ -182,21 +183,8 @@ def _learn(
 
     Return the signal that stopped it; one that came too late is not returned.
     """
-    import torch
-
-    from tpm_gym.learning.callbacks import (
-        Checkpointing,
-        PeriodicEvaluation,
-        ProgressBar,
-        StopTrainingError,
-    )
-    from tpm_gym.learning.curve import draw_learning_curve
-    from tpm_gym.learning.demonstrations import Demonstrations
-    from tpm_gym.learning.signals import SignalListener
-    from tpm_gym.learning.training_state import make_logger, restore, restore_files, restore_log
-
     torch.set_num_threads(config.threads)
-    bar, listener = ProgressBar(console), SignalListener()
+    bar, listener = callbacks.ProgressBar(console), SignalListener()
     with ExitStack() as stack:
         training_envs = make_training_envs(config)
         stack.callback(training_envs.close)
@@ -206,36 +194,38 @@ def _learn(
         stack.callback(bar.close)
         model = make_model(config, training_envs)
         keep = partial(_keep, config, console, run_folder.BEST_FILE)
-        evaluation = PeriodicEvaluation(config, evaluation_envs, console, keep)
+        evaluation = callbacks.PeriodicEvaluation(config, evaluation_envs, console, keep)
         log: dict[str, Any] = {}
         seconds, step = 0.0, 0
         # Files change only once the checkpoint is restored.
         if content:
             with _foreign_files_named(content):
-                log, extra = restore(model, content)
+                log, extra = training_state.restore(model, content)
                 evaluation.evaluations, seconds = extra["evaluations"], float(extra["seconds"])
             step = content.step
-            restore_files(config.run, content)
+            training_state.restore_files(config.run, content)
         else:
             run_folder.clear(config.run)
         provenance.write_json(config.run / CONFIG_FILE, description)
         way = f"from step {step:,} to {config.steps:,}" if "resumed" in description else ""
         _say(console, f"{config.title}, {way or f'{config.steps:,} steps'}, in {config.run}")
-        logger = make_logger(config.run, step if content else None)
+        logger = training_state.make_logger(config.run, step if content else None)
         stack.callback(logger.close)
         model.set_logger(logger)
-        restore_log(logger, log)
-        checkpointing = Checkpointing(config, store, evaluation, listener, console, seconds)
+        training_state.restore_log(logger, log)
+        checkpointing = callbacks.Checkpointing(
+            config, store, evaluation, listener, console, seconds
+        )
         # Checkpointing sets the clock that the callbacks after it read.
-        callbacks: list[BaseCallback] = [checkpointing, bar, evaluation]
+        called: list[BaseCallback] = [checkpointing, bar, evaluation]
         if config.recipe.demonstrations:
-            callbacks.insert(1, Demonstrations(**config.recipe.demonstrations))
+            called.insert(1, Demonstrations(**config.recipe.demonstrations))
         stack.enter_context(listener.listening())
         stopped_by = None
         try:
             steps = config.steps - model.num_timesteps
-            model.learn(steps, callback=callbacks, reset_num_timesteps=content is None)
-        except StopTrainingError:
+            model.learn(steps, callback=called, reset_num_timesteps=content is None)
+        except callbacks.StopTrainingError:
             stopped_by = listener.received
         except (TPMError, ValueError) as error:
             # PyTorch refuses NaN in a distribution, environments refuse it in an action.
@@ -249,7 +239,7 @@ def _learn(
         _keep(config, console, run_folder.LAST_FILE, model)
         if stopped_by is None:
             checkpointing.save(finished=True)
-    draw_learning_curve(config.run / CURVE_FILE, config.title, evaluation.evaluations)
+    curve.draw_learning_curve(config.run / CURVE_FILE, config.title, evaluation.evaluations)
     command, saved = run_folder.resume_command(config.run), "without a checkpoint"
     if store.newest is not None:
         saved = f"saved at step {store.newest:,}; continue with: {command}"
@@ -260,17 +250,17 @@ def _learn(
 
 def _keep(config: TrainingConfig, console: Console, name: str, model: BaseAlgorithm) -> None:
     """Save a policy in the run folder, and export it."""
-    from tpm_gym.learning.export import remove, save, save_archive
-
     archive = config.run / name
     path = archive.with_suffix("")
     recipe, options = asdict(config.recipe), config.env_options.given()
     try:
-        save(model, path, env_id=config.env, seed=config.seed, recipe=recipe, env_options=options)
+        export.save(
+            model, path, env_id=config.env, seed=config.seed, recipe=recipe, env_options=options
+        )
     except PolicyError as error:
-        remove(path)
+        export.remove(path)
         _say(console, f"warning: not exported: {error}")
-    save_archive(model, archive)
+    export.save_archive(model, archive)
 
 
 def make_model(config: TrainingConfig, envs: VecEnv) -> BaseAlgorithm:
@@ -292,12 +282,6 @@ def _require_room(config: TrainingConfig, numbers: int) -> None:
 
 def make_training_envs(config: TrainingConfig) -> VecEnv:
     """Build the training environments: in processes, or together in the analytic engine."""
-    from stable_baselines3.common.env_util import make_vec_env
-    from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
-
-    from tpm_gym.learning.training_state import EpisodeRecorder
-    from tpm_gym.learning.vec_env import AnalyticVecEnv
-
     several = config.envs > 1
     if several and config.env_options.in_batches:
         # Episodes that end one by one make the batches of an on-policy algorithm even.
@@ -309,7 +293,7 @@ def make_training_envs(config: TrainingConfig) -> VecEnv:
         make_env,
         n_envs=config.envs,
         seed=config.seed,
-        wrapper_class=EpisodeRecorder,
+        wrapper_class=training_state.EpisodeRecorder,
         env_kwargs={**_env_options(config), "in_worker": several},
         vec_env_cls=SubprocVecEnv if several else DummyVecEnv,
     )

@@ -1,12 +1,12 @@
 """Files of a trained policy: their content, and how they are read without trust.
 
 ``NAME.json`` describes the policy: its network, spaces, environment, recipe and versions.
-``NAME.safetensors`` holds the weights. Both are plain data. Nothing in them is executed or
-unpickled, and files beyond a fixed size are not read.
+``NAME.safetensors`` holds the weights. Both are plain data, of a limited size, and nothing in them
+is executed or unpickled.
 
 The JSON holds the SHA-256 of the weights and of its own entries, which shows damage and files that
-do not belong together. An attacker can write new sums for new content. Such a policy can act badly,
-but it cannot run code.
+do not belong together. An attacker can write new sums: such a policy can act badly, but it cannot
+run code.
 """
 
 from __future__ import annotations
@@ -111,8 +111,7 @@ class Description(_Entries):
     """Everything about a policy except its weights.
 
     ``env_options`` are machine, engine and drive of the training, where they differ from the id's.
-    ``steps`` counts environment steps of the training. ``seed`` is None if it is not known, a
-    version if the package was not installed.
+    ``seed`` is None if it is not known, a version if the package was not installed.
     """
 
     format: Literal["tpm_gym.policy"]
@@ -152,11 +151,10 @@ class Description(_Entries):
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Shapes of the weights by name; a layer maps x to weight x + bias."""
-        gap = self.network.features.kind == "goal_gap"
-        # The achieved goal is only in the gap, which has the size of the desired goal.
-        seen = (key for key in self.observations if not (gap and key == "achieved_goal"))
-        inputs = sum(len(self.observations[key].low) for key in seen)
-        sizes = [inputs, *self.network.hidden, len(self.actions.low)]
+        lengths = {key: len(box.low) for key, box in self.observations.items()}
+        if self.network.features.kind == "goal_gap":
+            del lengths["achieved_goal"]  # only in the gap, which has the size of the desired goal
+        sizes = [sum(lengths.values()), *self.network.hidden, len(self.actions.low)]
         found: dict[str, tuple[int, ...]] = {}
         for i, (before, after) in enumerate(itertools.pairwise(sizes)):
             found |= {f"layers.{i}.weight": (after, before), f"layers.{i}.bias": (after,)}
@@ -230,8 +228,8 @@ def published() -> list[str]:
 
 def _refused(file: Path, cause: str) -> PolicyFileError:
     """Return an error; the cause may quote the file, so it is cut and made printable."""
-    remedy = "get an intact copy of both files, export the policy again, or update tpm_gym"
     reason = f"is not a policy file: {cause[:200].encode('unicode_escape').decode()}"
+    remedy = "get an intact copy of both files, export the policy again, or update tpm_gym"
     return PolicyFileError(str(file), reason, remedy)
 
 

@@ -159,8 +159,8 @@ class Policy:
     ) -> tuple[dict[str, torch.Tensor], bool]:
         """Return the entries as (n, size), and whether they are a batch."""
         boxes = self.description.observation_space
-        if not isinstance(observation, Mapping) or set(observation) != set(boxes):
-            given = list(observation) if isinstance(observation, Mapping) else type(observation)
+        given = list(observation) if isinstance(observation, Mapping) else type(observation)
+        if not isinstance(given, list) or set(given) != set(boxes):
             raise InputError("observation", given, f"a mapping with the keys {', '.join(boxes)}")
         entries: dict[str, torch.Tensor] = {}
         leading = set()
