@@ -11,7 +11,7 @@ import inspect
 import pkgutil
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple
 
 from pydantic import Field
 from typing_extensions import Required, TypedDict
@@ -71,21 +71,13 @@ _DEMONSTRATIONS: Final[Any] = _keys(
 )
 
 
-@dataclass(frozen=True)
-class Actor:
-    """Parts of a policy that compute its mean action, as dotted names of attributes.
+class Actor(NamedTuple):
+    """Parts of a policy that compute its mean action, as dotted names of attributes."""
 
-    Attributes:
-        features: Features extractor.
-        hidden: Sequence of the hidden layers.
-        last: Last layer.
-        output: Function of the last layer's output: ``tanh`` or ``clip``.
-    """
-
-    features: str
-    hidden: str
-    last: str
-    output: str
+    features: str  # extractor
+    hidden: str  # sequence of the hidden layers
+    last: str  # layer
+    output: str  # function of the last layer's output: tanh or clip
 
 
 _SQUASHED: Final = Actor("actor.features_extractor", "actor.latent_pi", "actor.mu", "tanh")

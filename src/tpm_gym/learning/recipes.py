@@ -9,6 +9,7 @@ Values are plain YAML and nothing is evaluated. Where the zoo evaluates a string
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -44,8 +45,9 @@ class Recipe:
         found = {"n_timesteps": self.n_timesteps, "n_envs": self.n_envs, "policy": self.policy}
         if self.hindsight:
             found["replay_buffer_class"] = "HerReplayBuffer"
-        shown = {"demonstrations": self.demonstrations} if self.demonstrations else {}
-        return {**found, **shown, **self.arguments}
+        if self.demonstrations:
+            found["demonstrations"] = self.demonstrations
+        return {**found, **self.arguments}
 
     def keywords(self, update: float = 0.0) -> dict[str, Any]:
         """Return keyword arguments of the algorithm's constructor, with classes for names.
@@ -60,20 +62,13 @@ class Recipe:
             entries.pop(name, None)
         rate = entries.get("learning_rate")
         if isinstance(rate, str):
-            entries["learning_rate"] = Falling(float(rate.removeprefix("lin_")), update)
+            entries["learning_rate"] = partial(_falling, float(rate.removeprefix("lin_")), update)
         return with_classes(entries)
 
 
-@dataclass(frozen=True)
-class Falling:
-    """Learning rate that falls linearly to zero; see :meth:`Recipe.keywords`."""
-
-    start: float
-    update: float
-
-    def __call__(self, remaining: float) -> float:
-        """Return the rate of an update at whose end this share of the training remains."""
-        return self.start * max(0.0, min(1.0, remaining + self.update))
+def _falling(start: float, update: float, remaining: float) -> float:
+    """Return the rate of an update at whose end the share ``remaining`` of the training is left."""
+    return start * max(0.0, min(1.0, remaining + update))
 
 
 def recipe(env_id: str, algorithm: str = "sac", engine: str | None = None) -> dict[str, Any]:
