@@ -144,7 +144,7 @@ def _compared(policy: str, rate: int, episodes: int) -> dict[str, float]:
         for seed in range(TEST_SEED, TEST_SEED + episodes):
             observation, _ = env.reset(seed=seed)
             other.reset(seed=seed)
-            acting.reset(observation, seed)
+            acting.reset(observation, [seed])
             for _ in range(STEPS):
                 action = acting.act(observation)
                 for each, rows in zip((env, other), seen, strict=True):
@@ -197,7 +197,7 @@ def _run(
         acting = Trembling(load_policy(policy, env), noise)
         for seed in range(TEST_SEED, TEST_SEED + episodes):
             observation, _ = env.reset(seed=seed)
-            acting.reset(observation, seed)
+            acting.reset(observation, [seed])
             actions = []
             for _ in range(STEPS):
                 actions.append(acting.act(observation))
@@ -212,11 +212,11 @@ def evaluation() -> float:
     import tpm_gym
     from tpm_gym.learning.environments import make_envs
     from tpm_gym.learning.policies import TrainedPolicy
-    from tpm_gym.learning.rollout import run_batch, summarise
+    from tpm_gym.learning.rollout import run_episodes, summarise
 
     envs, policy = make_envs(PICK, 1000, engine="analytic"), tpm_gym.load_policy(PICK)
     start = time.perf_counter()
-    summarise(run_batch(envs, TrainedPolicy(policy), 1000, TEST_SEED))
+    summarise(run_episodes(envs, TrainedPolicy(policy), 1000, TEST_SEED))
     return time.perf_counter() - start
 
 

@@ -36,7 +36,7 @@ def record(env_id: str, policy_name: str, episodes: int) -> list[Episode]:
     tape: list[Episode] = []
     for seed in range(TEST_SEED, TEST_SEED + episodes):
         observation, _ = env.reset(seed=seed)
-        policy.reset(observation, seed)
+        policy.reset(observation, [seed])
         actions: Episode = []
         done = False
         while not done:

@@ -27,10 +27,10 @@ import numpy as np
 from engine_matrix import DRIVES
 from shared import ROOT, describe, fill, provenance, table
 
-from tpm_gym.learning.environments import make_env, make_envs
+from tpm_gym.learning.environments import make_envs
 from tpm_gym.learning.estimates import wilson
-from tpm_gym.learning.policies import TrainedPolicy, load_policy
-from tpm_gym.learning.rollout import TEST_SEED, run_batch, run_episodes
+from tpm_gym.learning.policies import load_policy
+from tpm_gym.learning.rollout import TEST_SEED, run_episodes
 
 RECORD = ROOT / "docs" / "records" / "transfer.json"
 PAGE = ROOT / "docs" / "transfer.md"
@@ -80,13 +80,9 @@ def _kind(config: dict[str, Any]) -> str:
 def run(cell: Cell) -> dict[str, Any]:
     """Evaluate one cell on the seeds of ``tpm-gym evaluate``."""
     options = {"engine": cell.engine, "drive": cell.drive}
-    with closing(make_env(cell.env_id, **options)) as env:
-        policy = load_policy(cell.policy, env)
-        if cell.engine == "analytic" and isinstance(policy, TrainedPolicy):
-            envs = make_envs(cell.env_id, cell.episodes, **options)
-            found = run_batch(envs, policy, cell.episodes, TEST_SEED)
-        else:
-            found = run_episodes(env, policy, cell.episodes, TEST_SEED)
+    count = cell.episodes if cell.engine == "analytic" else 1
+    with closing(make_envs(cell.env_id, count, **options)) as envs:
+        found = run_episodes(envs, load_policy(cell.policy, envs), cell.episodes, TEST_SEED)
     marks = "".join("01"[episode.success_at_end] for episode in found)
     return {**vars(cell), "successes": marks}
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from tpm_gym.learning.environments import make_env
+from tpm_gym.learning.environments import make_envs
 from tpm_gym.learning.policies import load_policy
 from tpm_gym.learning.rollout import (
     TEST_SEED,
@@ -49,10 +49,10 @@ class Trembling:
     noise: float
     rng: np.random.Generator = field(default_factory=np.random.default_rng)
 
-    def reset(self, observation: Observation, seed: int) -> None:
-        """Reset the policy, and seed the noise."""
-        self.rng = np.random.default_rng(seed)
-        self.policy.reset(observation, seed)
+    def reset(self, observation: Observation, seeds: Sequence[int]) -> None:
+        """Reset the policy, and seed the noise with the first seed."""
+        self.rng = np.random.default_rng(seeds[0])
+        self.policy.reset(observation, seeds)
 
     def act(self, observation: Observation) -> Action:
         """Return the action of the policy, with noise."""
@@ -81,10 +81,10 @@ def run_all(todo: list[Cell], jobs: int) -> Iterator[dict[str, Any]]:
 def run(cell: Cell) -> dict[str, Any]:
     """Evaluate one cell on the seeds of ``tpm-gym evaluate``."""
     start = time.perf_counter()
-    with closing(make_env(cell.env_id, engine=cell.engine, drive=cell.drive)) as env:
-        policy = load_policy(cell.policy, env)
+    with closing(make_envs(cell.env_id, 1, engine=cell.engine, drive=cell.drive)) as envs:
+        policy = load_policy(cell.policy, envs)
         trembling = Trembling(policy, cell.noise) if cell.noise else policy
-        episodes = run_episodes(env, trembling, cell.episodes, TEST_SEED)
+        episodes = run_episodes(envs, trembling, cell.episodes, TEST_SEED)
     metrics = summarise(episodes)
     return {
         **vars(cell),

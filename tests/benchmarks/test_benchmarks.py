@@ -1,80 +1,14 @@
-"""The benchmarks run, and find failures, growth and drift."""
+"""The benchmarks of speed and endurance run, and find failures."""
 
 from pathlib import Path
-from types import BuiltinFunctionType
 from typing import Any
 
-import bench_drives
-import bench_speed
 import gymnasium as gym
-import numpy as np
-import pybullet
-import pytest
-import raw_physics
 import soak
-import soak_report
 from paths import ROOT, read_strict
 from processes import PYTHON, printed_by
-from raw_physics import STEP, Recorder, record, recording, replay
-
-from tpm_gym.simulation import Servo
-from tpm_gym.tasks import Expert
 
 PICK = "TPMPickAndPlace-v0"
-
-
-@pytest.fixture(scope="module")
-def taped():
-    """A tape of two episodes, in the first of which the block is taken, and its actions."""
-    env, actions = gym.make(PICK), np.zeros((60, 4), np.float32)
-    observation, _ = env.reset(seed=0)
-    expert = Expert(env)
-    expert.reset(observation)
-    for action in actions[:50]:
-        action[:] = expert.act(observation)
-        observation, *_ = env.step(action)
-    recorder = Recorder()
-    with recording(recorder):
-        env = gym.make(PICK)
-        tape = record(env, recorder, actions, seed=0)
-    env.close()
-    assert isinstance(pybullet.stepSimulation, BuiltinFunctionType)  # the engine's own again
-    return tape, actions
-
-
-def test_a_tape_holds_the_time_steps_the_grasp_and_the_reset(taped):
-    tape, actions = taped
-    names = [[call.name for call in calls] for calls in tape.steps]
-    assert len(names) == len(actions) == 60
-    assert all(step.count(STEP) == 10 for step in names)
-    assert any("createConstraint" in step for step in names)
-    assert tape.resets == {49}
-
-
-def test_the_same_calls_do_the_same_physics_and_leave_nothing_behind(taped):
-    tape, actions = taped
-    names = [{call.name for call in calls} for calls in tape.steps]
-    grasp = next(i for i, found in enumerate(names) if "createConstraint" in found)
-    holding = raw_physics.Tape(tape.steps[: grasp + 3], set(), tape.ends)
-    env = gym.make(PICK)
-    for block in (holding, tape):  # replay itself compares every step with the tape
-        floor = replay(env, block, seed=0)
-        assert 0 < floor.physics < floor.with_motors
-    env.reset(seed=0)
-    for action, end in zip(actions[:50], tape.ends, strict=False):
-        env.step(action)
-        np.testing.assert_array_equal(raw_physics._where(env), end)
-    env.close()
-
-
-def test_calls_that_are_missing_from_the_tape_are_noticed(taped):
-    tape, _ = taped
-    broken = raw_physics.Tape(list(tape.steps), tape.resets, tape.ends)
-    broken.steps[3] = [call for call in broken.steps[3] if call.name == STEP][:-1]
-    env = gym.make(PICK)
-    with pytest.raises(RuntimeError, match="differ from the recorded ones at step 3"):
-        replay(env, broken, seed=0)
-    env.close()
 
 
 # -- speed ----------------------------------------------------------------------------------------
@@ -88,55 +22,13 @@ def test_bench_speed_from_the_command_line(tmp_path):
     content = read_strict(numbers)
     assert list(content["contestants"]) == ["TPMReach-v0", PICK]
     for entry in content["contestants"].values():
-        assert len(entry["rounds"]) == 2
-        for name in (
-            "steps_per_second",
-            "reset_milliseconds",
-            "step_over_physics",
-            "step_over_with_motors",
-        ):
+        for name in ("steps_per_second", "reset_milliseconds", "step_over_physics"):
             low, middle, high = entry[name]
             assert 0 < low <= middle <= high
-        assert "ratio_to_baseline" not in entry  # panda-gym was not asked for
-    scaling = content["scaling"]
-    assert scaling["env_id"] == PICK
-    for name in ("one_process", "two_processes", "two_over_one", "async_over_sync"):
-        assert min(scaling[name]) > 0
-    for key in ("command", "commit", "versions", "machine", "load_before", "unavailable"):
-        assert key in content
+    assert min(content["scaling"]["async_over_sync"]) > 0
     assert str(tmp_path) not in numbers.read_text(encoding="utf-8")
     assert f"not measured: {PICK} over PandaPickAndPlace-v3" in output
     assert plot.read_bytes().startswith(b"\x89PNG")
-
-
-def test_a_peer_that_cannot_run_is_a_line_in_the_table(monkeypatch, capsys):
-    def broken(name):
-        print("chatter of a peer")
-        raise ModuleNotFoundError(f"No module named {name!r}")
-
-    monkeypatch.setattr(bench_speed, "import_module", broken)
-    content = bench_speed.main(
-        ["--contestants", "PandaReach-v3", "TPMReach-v0", "--rounds", "1", "--steps", "5"]
-        + ["--scaling-steps", "0"]
-    )
-    assert content["unavailable"] == {
-        "PandaReach-v3": "ModuleNotFoundError: No module named 'panda_gym'"
-    }
-    assert list(content["contestants"]) == ["TPMReach-v0"]
-    assert "PandaReach-v3" in capsys.readouterr().out
-
-
-def test_ratios_are_taken_within_a_round():
-    def contestant(env_id, seconds):
-        return bench_speed.Contestant(env_id, None, seconds, [0.0] * 3, [0] * 3)
-
-    ours = contestant(PICK, [1.0, 2.0, 4.0])
-    panda = contestant(bench_speed.BASELINE, [4.0, 2.0, 12.0])
-    found = bench_speed.summary([ours, panda], steps=100)
-    # Of 4, 1 and 3; the medians' ratio is 2.
-    assert found[PICK]["ratio_to_baseline"] == (2.0, 3.0, 3.5)
-    assert found[PICK]["steps_per_second"] == (37.5, 50.0, 75.0)
-    assert found[bench_speed.BASELINE]["ratio_to_baseline"] == (1.0, 1.0, 1.0)
 
 
 # -- endurance ------------------------------------------------------------------------------------
@@ -158,18 +50,11 @@ def test_soak_goes_through_everything_and_passes(tmp_path, capsys, monkeypatch):
     status, content = soaked(tmp_path, "--steps", "2000", "--plot", str(plot))
     output = capsys.readouterr().out
     assert status == 0, output
-    assert content["finished"]
     assert content["failures"] == []
-    assert content["samples"][-1]["steps"] >= 2000
-    verdict = content["verdict"]
-    assert verdict["passed"]
-    assert verdict["memory"]["baseline_steps"] >= 300
-    assert 0 < verdict["closure_drift"]["mean"] < verdict["closure_drift"]["largest"] < 1e-3
+    assert 0 < content["verdict"]["closure_drift"]["largest"] < 1e-3
     for event in ("openings", "closes", "pictures", "resets options", "resets plain", "restores"):
         assert content["events"][event] > 0, event
-    assert content["events"]["openings"] >= len(soak.ENV_IDS)
     assert plot.read_bytes().startswith(b"\x89PNG")
-    assert "0 exceptions" in output
     assert output.rstrip().endswith("PASSED")
 
 
@@ -191,123 +76,8 @@ def test_a_step_that_raises_is_reported_outlived_and_can_be_repeated(tmp_path, c
         return Raising(env) if env_id == "TPMReachJoints-v0" else env
 
     status, content = soaked(tmp_path, make=make)
-    output = capsys.readouterr().out
     assert status == 1
     assert content["finished"]  # it went on
-    assert not content["verdict"]["nothing_raised"]
     first = content["failures"][0]
-    assert first["env_id"] == "TPMReachJoints-v0"
-    assert soak.ENV_IDS[first["visit"] % len(soak.ENV_IDS)] == first["env_id"]
-    assert first["error"] == "ValueError: injected"
-    assert {"seed", "total_steps", "episode", "step"} <= first.keys()
-    assert f"--seed 0 --replay {first['visit']}" in output
-    assert output.rstrip().endswith("FAILED")
-
-
-def test_replay_raises_what_the_visit_raised():
-    def make(env_id, **options):
-        env = gym.make(env_id, **options)
-        env.reset = None  # whatever the visit does first
-        return env
-
-    with pytest.raises(TypeError):
-        soak.main(["--replay", "3"], make=make)
-    assert soak.main(["--replay", "3"]) == 0
-
-
-class Growing(gym.Wrapper):
-    """Keeps 200 kB a step."""
-
-    kept: list[np.ndarray] = []  # noqa: RUF012
-
-    def step(self, action):
-        self.kept.append(np.ones(25_000))
-        return super().step(action)
-
-
-def test_memory_that_grows_is_found(tmp_path):
-    try:
-        status, content = soaked(
-            tmp_path, make=lambda env_id, **options: Growing(gym.make(env_id, **options))
-        )
-    finally:
-        Growing.kept.clear()
-    verdict = content["verdict"]
-    assert status == 1
-    assert not verdict["memory_within_limit"]
-    assert verdict["memory"]["growth_mb"] > 30
-    assert verdict["nothing_raised"]
-
-
-def test_a_restored_state_that_goes_on_otherwise_is_found(monkeypatch):
-    env = gym.make("TPMReach-v0")
-    env.reset(seed=0)
-    endurance = soak.Soak(0)
-    assert not endurance._check_restore(env, np.random.default_rng(0))
-    monkeypatch.setattr(env.unwrapped, "restore_state", lambda snapshot: None)
-    with pytest.raises(RuntimeError, match="restored state differs"):
-        endurance._check_restore(env, np.random.default_rng(0))
-    env.close()
-
-
-def samples(slope: float, noise: float) -> dict[str, Any]:
-    """Return a soak of a million steps with gaps that start at 10 um and grow by ``slope`` m."""
-    rng = np.random.default_rng(0)
-    steps = np.arange(5_000, 1_000_001, 5_000)
-    gaps = 1e-5 + slope * steps / 1e6 + noise * rng.standard_normal(len(steps))
-    return {
-        "finished": True, "failures": [], "warm_up": 50_000, "limit_mb": 10.0,
-        "samples": [
-            {"steps": int(s), "memory_mb": 100.0, "all_opened": True, "closure_mean": float(g),
-             "closure_max": float(2 * g), "steps_per_second": 500.0}
-            for s, g in zip(steps, gaps, strict=True)
-        ],
-    }  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("slope", "noise", "drifts"),
-    [
-        (0.0, 1e-8, False),
-        (2e-6, 1e-8, True),
-        (-2e-6, 1e-8, False),
-        (5e-8, 1e-8, False),  # half a percent
-        (6e-6, 1e-5, False),  # within three standard errors
-    ],
-)
-def test_drift_is_a_slope_beyond_its_error_and_beyond_a_percent(slope, noise, drifts):
-    verdict = soak_report.judge(samples(slope, noise))
-    drift = verdict["closure_drift"]
-    assert drift["found"] == drifts
-    assert verdict["passed"] == (not drifts)
-    assert abs(drift["slope"] - slope) < 4 * drift["standard_error"]
-    # Least squares of 191 points spread evenly over 0.95 million steps.
-    assert drift["standard_error"] == pytest.approx(noise / (0.95 * np.sqrt(191 / 12)), rel=0.2)
-
-
-def test_the_baseline_waits_for_the_warm_up_and_for_all_environments():
-    content = samples(0.0, 1e-8)
-    for sample in content["samples"]:
-        sample["all_opened"] = sample["steps"] > 70_000
-        sample["memory_mb"] = 50.0 if sample["steps"] < 75_000 else 100.0
-    verdict = soak_report.judge(content)
-    assert verdict["memory"]["baseline_steps"] == 75_000
-    assert verdict["memory_within_limit"]
-    content["samples"][-1]["memory_mb"] = 110.5
-    assert not soak_report.judge(content)["passed"]
-    del content["samples"][11:]  # too few
-    assert not soak_report.judge(content)["passed"]
-
-
-def test_bench_drives_compares_all_drives():
-    names = [name for name, _ in bench_drives.drives()]
-    assert len(names) == len(set(names)) == 16
-    found = [
-        bench_drives.play("TPMReach-v0", "pybullet", drive, scripted=True, episodes=1)
-        for drive in (None, Servo())
-    ]
-    assert [row.successes for row in found] == [1, 1]
-    assert [row.singular for row in found] == [0, 0]
-    assert max(found[0].errors) < 1e-8 < 1e-6 < max(found[1].errors) < 1e-3
-    assert 3 < max(found[0].torques) < 12
-    assert bench_drives.line("one", found[1]).startswith("| one | 1 | 0 | 0.0")
+    assert (first["env_id"], first["error"]) == ("TPMReachJoints-v0", "ValueError: injected")
+    assert f"--seed 0 --replay {first['visit']}" in capsys.readouterr().out

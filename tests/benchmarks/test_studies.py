@@ -1,16 +1,12 @@
 """Studies survive deaths and stops, and the page of results agrees with the records."""
 
-import itertools
 import json
 import os
-import shlex
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -26,23 +22,21 @@ from paths import ROOT
 from processes import PYTHON, signalled
 from studies.__main__ import main
 from studies.bisection import ends, halving, nominal
-from studies.figures import draw, learning_curves, penalty, robustness
-from studies.page import PAGE, STUDIES, Write, command, page, settled, split, write
+from studies.figures import learning_curves, penalty
+from studies.page import PAGE, Write, page, split, write
 from studies.plan import Bisection, Run, Study, plan_runs
 from studies.records import (
     RECORDS,
     Collect,
     collect,
     condense,
-    condense_bisection,
     read_records,
 )
-from studies.running import execute, execute_there, run_all
-from trainings import PPO_RECIPE, SAC_RECIPE, assert_equal_runs, without_times
+from studies.running import execute, run_all
+from trainings import PPO_RECIPE
 
 import tpm_gym
 from tpm_gym.errors import ConfigurationError
-from tpm_gym.learning.checkpoint import CheckpointStore
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.run_folder import claimed
 from tpm_gym.simulation.randomisation import LIMITS, Randomisation
@@ -181,14 +175,6 @@ def test_an_address_without_a_cluster_is_refused(address: str, tmp_path: Path) -
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("missing", ["folder", "file"])
-def test_a_node_that_does_not_share_the_disk_is_told(missing: str, tmp_path: Path) -> None:
-    here = Path.cwd() if missing == "file" else tmp_path / "missing"
-    run = Run(tmp_path / "run", "TPMReach-v0", "sac", (), ())
-    assert "does not see" in (execute_there(run, here, tmp_path / "missing") or "")
-    assert list(tmp_path.iterdir()) == []
-
-
 def temporary() -> set[Path]:
     return {*Path("/tmp").glob("tpm-*"), *Path("/tmp").glob("ray*"), *Path.home().glob(".ray/*")}
 
@@ -257,95 +243,6 @@ def test_ctrl_c_stops_a_study_with_checkpoints_saved(tmp_path: Path) -> None:
     assert (run / "last.zip").is_file()
     assert not (tmp_path / "TPMReach-v0-sac-pybullet-s1").exists()
     assert temporary() == before
-
-
-@pytest.fixture
-def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """Start two nodes of one CPU each."""
-    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-    with tempfile.TemporaryDirectory(prefix="tpm-", dir="/tmp") as folder:
-        monkeypatch.setenv("RAY_TMPDIR", folder)
-        from ray.cluster_utils import Cluster
-
-        options = {"num_cpus": 1, "include_dashboard": False, "object_store_memory": 80 << 20}
-        found = Cluster(True, head_node_args=options)
-        found.add_node(**options)
-        yield found
-        found.shutdown()
-
-
-def raylet(node: Any) -> psutil.Process:
-    return psutil.Process(node.all_processes["raylet"][0].process.pid)
-
-
-def kill_worker(node: Any) -> None:
-    """Kill the process of a node that trains."""
-    children = raylet(node).children(recursive=True)
-    (worker,) = [child for child in children if child.name().startswith("ray::execute")]
-    worker.kill()
-
-
-def kill_node(node: Any) -> None:
-    """Kill all processes of a node at once, as a power cut does."""
-    for process in [*raylet(node).children(recursive=True), raylet(node)]:
-        process.kill()
-
-
-def small(folder: Path, seed: int) -> Run:
-    """Return a training of seconds, with many checkpoints."""
-    folder.mkdir(exist_ok=True)
-    recipe = folder / "sac.yml"
-    recipe.write_text(SAC_RECIPE.format(env="TPMReach-v0", train_freq=20), encoding="utf-8")
-    words = ["--recipe", str(recipe), "--seed", str(seed), "--steps", "2000"]
-    words += ["--eval-every", "1000", "--eval-episodes", "2", "--checkpoint-every", "50"]
-    test = ("pybullet", 2, ())
-    return Run(folder / f"run-s{seed}", "TPMReach-v0", "sac", tuple(words), (test,))
-
-
-def newest(run: Run) -> int:
-    """Return the step of the last checkpoint of a run."""
-    return max(CheckpointStore(run.folder / "checkpoints").steps(), default=-1)
-
-
-def lasting(run: Run) -> Any:
-    """Return the record of a run without times and resumptions."""
-    kept = without_times(condense(run.folder))
-    for test in kept["tests"].values():
-        del test["steps_per_second"]
-    return {name: value for name, value in kept.items() if name != "resumed"}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kill", [kill_worker, kill_node])
-def test_a_death_midway_costs_what_came_after_the_last_checkpoint(
-    kill: Callable[[Any], None], cluster: Any, tmp_path: Path
-) -> None:
-    undisturbed = [small(tmp_path / "undisturbed", seed) for seed in range(2)]
-    for run in undisturbed:
-        assert execute(run) is None
-    runs = [small(tmp_path / "disturbed", seed) for seed in range(2)]
-    reached = []
-
-    def kill_midway() -> None:
-        while min(map(newest, runs)) < 100:
-            time.sleep(0.01)
-        (node,) = cluster.worker_nodes
-        kill(node)
-        reached.extend(map(newest, runs))
-
-    killer = threading.Thread(target=kill_midway)
-    killer.start()
-    assert run_all(runs, Study("results", folder=tmp_path, address=cluster.address)) == 0
-    killer.join()
-    assert max(reached) < 2000
-    resumed = [condense(run.folder)["resumed"] for run in runs]
-    assert sorted(resumed) == [0, 1]
-    hit = runs[resumed.index(1)]
-    from_step = json.loads((hit.folder / "config.json").read_text())["resumed"][0]["from_step"]
-    assert from_step == reached[resumed.index(1)]
-    for run, other in zip(runs, undisturbed, strict=True):
-        assert lasting(run) == lasting(other)
-        assert_equal_runs(run.folder, other.folder)
 
 
 # -- records --------------------------------------------------------------------------------------
@@ -450,37 +347,10 @@ def rows(text: str, *words: str) -> list[str]:
     ]
 
 
-@pytest.mark.parametrize(
-    ("successes", "index"),
-    [
-        ([0.0, 0.5, 0.95, 1.0], 2),
-        ([0.0, 1.0, 0.9, 0.95], 3),  # success that does not last does not count
-        ([1.0, 1.0], 0),
-        ([0.0, 1.0, 0.9], None),
-        ([], None),
-    ],
-)
-def test_success_has_settled_once_it_stays(successes: list[float], index: int | None) -> None:
-    assert settled(successes) == index
-
-
 def test_the_page_is_what_its_records_say() -> None:
     text = (ROOT / PAGE).read_text(encoding="utf-8")
     figures = [name for name in ("results_penalty.png", "results_robustness.png") if name in text]
     assert page(read_records(ROOT / RECORDS), ["results_learning_curves.png", *figures]) == text
-
-
-def test_failures_are_counted_and_named() -> None:
-    text = page([changed(seed, rate) for seed, rate in enumerate([1.0, 0.99, 0.98, 0.2, None])], [])
-    (row,) = rows(text, "98.0% (100.0, 99.0, 98.0, 20.0, 0.0) |", "| 60 | 0.5 | 1.0 |")
-    assert len(rows(text, "not finished")) == 1
-    failures = text.split("### Failures")[1].split("##")[0]
-    assert "seed 3: success 20.0%" in failures
-    assert "seed 4: stopped after 120 of 120 steps" in failures
-    assert "seed 2" not in failures
-    text = page([changed(seed, rate) for seed, rate in enumerate([1.0, 0.5, 0.4, 0.2, None])], [])
-    (row,) = rows(text, "100.0, 50.0")
-    assert row.count("never") == 2
 
 
 @pytest.mark.parametrize(
@@ -508,58 +378,6 @@ def test_runs_that_differ_are_told_apart_everywhere(other: Any, labels: list[str
     assert len(set(ticks)) == 4
 
 
-def test_penalty_weights_get_a_table_of_their_own() -> None:
-    weighted = [tempting(seed, weight) for seed, weight in itertools.product(range(2), (0.0, 1.0))]
-    text = page([changed(0, 0.97), *weighted], [])
-    assert "tempting" not in text.split("## Does the penalty work?")[0].split("##")[1]
-    table = text.split("## Does the penalty work?")[1]
-    assert rows(table, "| 0 |", "41.0% (40.0% to 42.0%)")
-    assert rows(table, "| 1 |", "11.0% (10.0% to 12.0%)")
-
-
-def test_the_penalty_figure_has_a_dot_a_seed(tmp_path: Path) -> None:
-    records = [tempting(seed, weight) for seed in range(3) for weight in (0.0, 1.0)]
-    figure = penalty(split(records)[1])
-    dots = [line for line in figure.axes[0].lines if len(line.get_xdata()) == 3]
-    assert len(dots) == 4  # two metrics at two weights
-    assert [label.get_text() for label in figure.axes[0].get_xticklabels()] == ["0", "1"]
-    assert [path.name for path in draw(records, tmp_path)] == ["results_penalty.png"]
-
-
-def test_the_learning_curve_is_the_median_with_a_band() -> None:
-    figure = learning_curves(split([changed(s, r) for s, r in enumerate([0.2, 0.9, 1.0])])[0])
-    curve = figure.axes[0].lines[0]
-    assert list(curve.get_xdata()) == [0, 60, 120]
-    assert list(curve.get_ydata()) == [0.0, 0.9, 0.9]
-    band = figure.axes[0].collections[0].get_paths()[0].vertices
-    assert (band[:, 1].min(), band[band[:, 0] == 120, 1].max()) == (0.0, 1.0)
-    assert band[band[:, 0] == 120, 1].min() == 0.2
-
-
-def test_what_was_not_run_is_named() -> None:
-    assert page([], []).count(": all of it.") == len(STUDIES)
-    planned = [run.folder.name for run in plan_runs(STUDIES[0])]
-    text = page([changed(0, 1.0, run=name) for name in planned[2:]], [])
-    missing = text.split("## Not run yet")[1].split("##")[0]
-    assert f"`{command(STUDIES[0])}`: {planned[0].removesuffix('-s0')} (2).\n" in missing
-    every = [changed(0, 1.0, run=run.folder.name) for s in STUDIES for run in plan_runs(s)]
-    assert "Not run yet" not in page(every, [])
-
-
-def test_success_in_both_engines_and_what_was_demonstrated_are_told() -> None:
-    record = changed(0, 0.9, engine="analytic", recipe=DEMONSTRATED)
-    record["tests"]["analytic"] |= {
-        "episodes": 9,
-        "success_at_end": {"mean": 1, "low": 1, "high": 1},
-    }
-    other = changed(1, 0.8)
-    del other["tests"]["analytic"]
-    text = page([record, other], [])
-    assert rows(text, "SAC + HER, demonstrations |", "| 120 | 100.0% (100.0) | 90.0% (90.0) |")
-    assert rows(text, "SAC + HER | PyBullet | 120 | \N{EM DASH} | 80.0% (80.0) |")
-    assert "Test episodes of each seed: 9 (analytic engine), 200 (PyBullet)." in text
-
-
 # -- bisections -----------------------------------------------------------------------------------
 
 ENDS = [(attribute, end) for attribute in LIMITS for end in ends(attribute)]
@@ -573,11 +391,6 @@ def bisected(attribute: str, end: float, success: Any) -> tuple[Any, dict[float,
         assert result.missing not in found
         found[result.missing] = success(result.missing)
     return result, found
-
-
-def test_attributes_and_their_ends_are_those_of_randomisation() -> None:
-    assert set(LIMITS) == set(vars(Randomisation()))
-    assert Randomisation(**{name: nominal(name) for name in LIMITS}) == Randomisation()
 
 
 @given(which=st.sampled_from(GRADUAL), share=st.floats(0.001, 0.999), rate=st.floats(0.3, 1.0))
@@ -599,115 +412,3 @@ def test_success_halves_where_the_bisection_says(
     way = np.abs([start, result.before, result.after, end])
     way = np.log(way) if start else way
     assert (way[2] - way[1]) / (way[3] - way[0]) == pytest.approx(1 / 64, rel=0.2)
-
-
-@pytest.mark.parametrize(("attribute", "end"), ENDS)
-def test_where_success_stays_two_tests_are_enough(attribute: str, end: float) -> None:
-    result, found = bisected(attribute, end, lambda value: 0.9 if value != end else 0.5)
-    assert (result.before, result.after) == (end, None)
-    assert set(found) == {nominal(attribute), end}
-
-
-@pytest.mark.parametrize("edge", range(1, 6))
-def test_a_latency_is_a_whole_number_of_steps(edge: int) -> None:
-    result, found = bisected("latency", 5.0, lambda steps: float(steps < edge))
-    assert (result.before, result.after) == (edge - 1, edge)
-    assert all(Randomisation(latency=steps).latency == steps for steps in found)
-
-
-def answer(bisection: Bisection, success: Any) -> int:
-    """Write the results of the evaluations that a bisection asks for; return their number."""
-    count = 0
-    while left := bisection.left():
-        (words,) = left
-        options = dict(zip(words[2::2], words[3::2], strict=True))
-        name, _, text = options["--randomisation"].partition("=")
-        assert name == bisection.attribute
-        servo = name in ("servo_stiffness", "joint_friction")
-        assert options.get("--drive", "ideal") == ("servo" if servo else "ideal")
-        assert options["--engine"] == bisection.engine
-        rate = success(float(text))
-        test = {
-            "env": bisection.env,
-            "policy": options["--policy"],
-            "episodes": bisection.episodes,
-            "randomisation": {name: float(text)},
-            "env_options": {"engine": bisection.engine},
-            "success_at_end": {"mean": rate, "low": rate, "high": rate},
-            "versions": {},
-            "git_commit": "0" * 40,
-            "machine": {},
-            "command": shlex.join(words),
-        }
-        path = Path(options["--json"])
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(test))
-        count += 1
-    return count
-
-
-def law(value: float) -> float:
-    """Success that halves at 1.5 and, below 1, at 0.8."""
-    return 1.0 if 0.8 < value < 1.5 else 0.1
-
-
-@pytest.fixture
-def bisections(tmp_path: Path) -> list[Any]:
-    """Records of two ids: success by one law for factors, and unchanged for errors."""
-    runs = tmp_path / "runs"
-    for env in ("TPMReach-v0", "TPMPickAndPlace-v0"):
-        for attribute in LIMITS:
-            bisection = Bisection(runs / f"{env}-{attribute}", env, attribute, 50)
-            factor = nominal(attribute) == 1.0
-            answer(bisection, law if factor else lambda value: 0.97)
-    assert len(collect(Collect(runs, tmp_path / "records"))) == 2 * len(LIMITS)
-    return read_records(tmp_path / "records")
-
-
-def test_what_was_tested_is_not_tested_again_unless_with_other_episodes(tmp_path: Path) -> None:
-    bisection = Bisection(tmp_path / "b", "TPMReach-v0", "link_mass", 50)
-    assert answer(bisection, law) == 1 + 7 + 7
-    assert bisection.left() == []
-    assert answer(replace(bisection, episodes=60), lambda value: 0.8) == 3
-    kept = condense_bisection(tmp_path / "b")
-    assert (kept["episodes"], set(kept["tests"])) == (60, {"0.5", "1", "16"})
-    (tmp_path / "b" / "tests" / "1.json").unlink()
-    with pytest.raises(ConfigError, match="no bisection"):
-        collect(Collect(tmp_path, tmp_path / "records"))
-
-
-def test_the_page_says_where_success_halves(bisections: list[Any]) -> None:
-    text = page(bisections, ["results_robustness.png"])
-    assert "images/results_robustness.png" in text
-    (row,) = rows(text, "| block mass (factor) | 1 | 10 |")
-    (cell,) = {cell.strip() for cell in row.strip("|").split("|")[3:]}
-    low, high = map(float, cell.split(" to "))
-    assert low < 1.5 <= high < 1.05 * low
-    (row,) = rows(text, "| servo stiffness (factor, servo drives) | 1 | 0.01")
-    low, high = map(float, row.strip("|").split("|")[3].split(" to "))
-    assert high <= 0.8 < low < 1.1 * high
-    (row,) = rows(text, "| encoder bias (rad) | 0 | 0.001 |")
-    assert row.count("97.0% at 0.001") == 2
-    again = [record | {"engine": "analytic", "episodes": 70} for record in bisections]
-    both = page([*bisections, *again], [])
-    assert both.count("| block mass") == 2 * text.count("| block mass") > 0
-    assert "analytic engine, 70 episodes" in both
-    assert "PyBullet, 50 episodes" in both
-    del bisections[0]["tests"][list(bisections[0]["tests"])[-1]]
-    assert "not finished" in page(bisections, [])
-
-
-def test_the_figure_has_a_panel_an_attribute_and_a_line_an_id(
-    bisections: list[Any], tmp_path: Path
-) -> None:
-    figure = robustness(bisections)
-    panels = [axes for axes in figure.axes if axes.get_visible()]
-    assert [axes.get_title() for axes in panels] == [name.replace("_", " ") for name in LIMITS]
-    block = panels[list(LIMITS).index("block_mass")]
-    lines = [line for line in block.lines if len(line.get_xdata()) > 2]
-    assert len(lines) == 2
-    for line in lines:
-        values, rates = line.get_xdata(), line.get_ydata()
-        assert list(values) == sorted(values)
-        assert list(rates) == [law(value) for value in values]
-    assert [path.name for path in draw(bisections, tmp_path)] == ["results_robustness.png"]

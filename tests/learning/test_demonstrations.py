@@ -30,14 +30,6 @@ def filled(envs: int = 1, **options: Any) -> tuple[SAC, Demonstrations]:
     return model, callback
 
 
-def test_they_are_counted_and_succeed_where_nothing_disturbs_them() -> None:
-    model, callback = filled(episodes=4, noise=0.0)
-    assert callback.successes == 1.0
-    assert model.num_timesteps == 4 * HORIZON
-    assert model.replay_buffer is not None
-    assert model.replay_buffer.size() == 4 * HORIZON
-
-
 def test_the_buffer_holds_what_the_environment_would_do_again() -> None:
     model, _ = filled(episodes=2, noise=0.3)
     buffer: Any = model.replay_buffer
@@ -72,15 +64,6 @@ def test_every_second_episode_is_disturbed_and_the_vacuum_never() -> None:
     assert np.array_equal(before[:HORIZON], after[:HORIZON])
     assert not np.array_equal(before[HORIZON:], after[HORIZON:])
     assert set(after[:, 3]) == {-1.0, 1.0}
-
-
-def test_several_environments_play_side_by_side() -> None:
-    model, _ = filled(envs=2, episodes=3, noise=0.0)
-    buffer: Any = model.replay_buffer
-    assert model.num_timesteps == 4 * HORIZON  # rounded up to whole rounds
-    assert buffer.pos == 2 * HORIZON
-    first, second = buffer.observations["desired_goal"][0]
-    assert not np.array_equal(first, second)
 
 
 def test_they_are_not_played_again_when_a_run_goes_on() -> None:

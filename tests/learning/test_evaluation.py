@@ -3,7 +3,6 @@
 import json
 import pickle
 import shutil
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +15,9 @@ from processes import PYTHON, TPM_GYM, error_of, printed_by
 from trainings import quiet, said
 
 from tpm_gym.errors import ConfigurationError
-from tpm_gym.learning import EnvOptions, EvaluationConfig, evaluate, evaluation, film, provenance
+from tpm_gym.learning import EnvOptions, EvaluationConfig, evaluate, evaluation, provenance
 from tpm_gym.learning.errors import ConfigError, PolicyError
 from tpm_gym.policy.files import digest
-from tpm_gym.simulation import Servo
 
 METRICS = (
     "success_at_end",
@@ -42,32 +40,20 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], s
     return read_strict(path), output
 
 
-def test_one_policy_has_its_metrics_at_the_top(written: tuple[dict[str, Any], str]) -> None:
-    content, _ = written
-    for name in METRICS:
-        estimate = content[name]
-        assert estimate["low"] <= estimate["mean"] <= estimate["high"], name
-    assert content["policy"] == "expert"
-    assert (content["env"], content["episodes"], content["seed"]) == ("TPMReach-v0", 4, 7)
-    assert content["wall_seconds"] > 0
-    assert content["closure_error_max"]["worst"] >= content["closure_error_max"]["mean"]
-
-
-def test_records_agree_with_the_metrics(written: tuple[dict[str, Any], str]) -> None:
+def test_one_policy_has_its_metrics_at_the_top_and_its_records(
+    written: tuple[dict[str, Any], str],
+) -> None:
     content, _ = written
     records = content["records"]
     assert [record["seed"] for record in records] == [7, 8, 9, 10]
     for name in METRICS:
-        mean = sum(record[name] for record in records) / 4
-        assert content[name]["mean"] == pytest.approx(mean), name
-    steps = sum(record["length"] for record in records)
-    assert content["steps_per_second"] == pytest.approx(steps / content["wall_seconds"])
-
-
-def test_json_says_how_to_repeat_it(written: tuple[dict[str, Any], str]) -> None:
-    content, _ = written
+        estimate = content[name]
+        assert estimate["low"] <= estimate["mean"] <= estimate["high"], name
+        assert estimate["mean"] == pytest.approx(sum(r[name] for r in records) / 4), name
+    assert content["policy"] == "expert"
+    assert (content["env"], content["episodes"], content["seed"]) == ("TPMReach-v0", 4, 7)
+    assert content["closure_error_max"]["worst"] >= content["closure_error_max"]["mean"]
     assert content["versions"] == provenance.versions()
-    assert {"numpy", "torch", "pybullet", "stable-baselines3"} <= set(content["versions"])
     assert "git_commit" in content
     words = "tpm-gym evaluate --policy expert --env TPMReach-v0 --episodes 4 --seed 7"
     assert content["command"].startswith(words)
@@ -79,23 +65,6 @@ def test_table_shows_means_and_intervals(written: tuple[dict[str, Any], str]) ->
     _, output = written
     for shown in ("success at end", "expert", "[51.0, 100.0]"):  # Wilson interval of 4 of 4
         assert shown in output
-
-
-def test_several_policies_share_a_table_and_a_file(tmp_path: Path) -> None:
-    path = tmp_path / "both.json"
-    config = EvaluationConfig(
-        policy=("random", "expert"), env="TPMReach-v0", episodes=2, json=path, seed=3
-    )
-    console = quiet()
-    results = evaluate(config, console)
-    content = read_strict(path)
-    assert [entry["policy"] for entry in content["policies"]] == ["random", "expert"]
-    assert content["policies"][1]["return"]["mean"] == results[1].metrics["return"].mean
-    assert "return" not in content
-    assert content["seed"] == 3
-    header = said(console).splitlines()[2]
-    assert "random" in header
-    assert "expert" in header
 
 
 # imageio-ffmpeg leaves a pipe to the collector where ffmpeg ends before its reader is closed.
@@ -143,26 +112,14 @@ def test_picture_shows_six_moments_of_the_first_episode(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("still", "sheet"),
-    [(50, [[0, 10, 20], [30, 40, 50]]), (10, [[0, 2, 4], [6, 8, 10]]), (0, [[0, 0, 0]] * 2)],
-)
-def test_contact_sheet_runs_until_nothing_moves(still: int, sheet: list[list[int]]) -> None:
-    frames = [np.full((1, 1, 3), min(value, still), np.uint8) for value in range(51)]
-    assert film.contact_sheet(frames)[..., 0].tolist() == sheet
-    assert film.contact_sheet(frames[:1]).shape == (2, 3, 3)
-
-
-@pytest.mark.parametrize(
     ("options", "error", "message"),
     [
         ({"episodes": 0}, ConfigError, "at least 1"),
-        ({"video_episodes": 0}, ConfigError, "at least 1"),
-        ({"seed": -1}, ConfigError, "at least 0"),
         ({"env": None}, ConfigError, "^expert and random have no .*: give --env ID$"),
         (
             {"env": None, "policy": ("TPMReach-v0", "TPMPickAndPlace-v0")},
             ConfigError,
-            "on TPMPickAndPlace-v0, TPMReach-v0: choose one with --env",
+            "differ in env: TPMReach-v0 .*, TPMPickAndPlace-v0 .*; choose one with --env",
         ),
         ({"env": "TPMRech-v0"}, ConfigError, "TPMReach-v0"),
         ({"policy": ("expert", "gone.zip")}, PolicyError, "no file gone.zip"),
@@ -170,16 +127,12 @@ def test_contact_sheet_runs_until_nothing_moves(still: int, sheet: list[list[int
         ({"picture": Path("still")}, ConfigError, "--picture"),
         ({"json": Path("/proc/o.json")}, ConfigError, "--json /proc/o.json: cannot be written"),
         ({"json": Path("/proc")}, ConfigError, "--json /proc: .*; choose another name"),
-        ({"picture": Path("/proc/o.png")}, ConfigError, "--picture /proc/o.png: cannot be"),
         ({"randomisation": ("block_mass",)}, ConfigError, "--randomisation"),
-        ({"randomisation": ("block_mass=heavy",)}, ConfigError, "--randomisation"),
-        ({"randomisation": ("=1",)}, ConfigError, "--randomisation"),
         ({"randomisation": ("a=1:2:3",)}, ConfigError, "--randomisation"),
         ({"randomisation": ("a=1", "a=2")}, ConfigError, "--randomisation"),
         ({"randomisation": ("puk_mass=2",)}, ConfigurationError, "block_mass"),
         ({"penalty_weight": -1.0}, ConfigurationError, "penalty_weight"),
         ({"env_options": EnvOptions(machine="narrow")}, ConfigurationError, "'paper', 'wide'"),
-        ({"env_options": EnvOptions(engine="none")}, ConfigurationError, "'pybullet'"),
     ],
 )
 def test_mistakes_are_named(options: dict[str, Any], error: type[Exception], message: str) -> None:
@@ -210,22 +163,6 @@ def test_conditions_are_recorded_and_the_defaults_are_the_nominal_machine(
     assert (content["goals"], content["penalty_weight"]) == ("tempting", 0.5)
     assert content["env_options"] == {**nominal, "drive": "servo"}
     assert "--randomisation encoder_noise=1e-4 friction=0.5:1" in content["command"]
-
-
-def test_the_environment_is_the_one_that_was_asked_for() -> None:
-    config = EvaluationConfig(
-        policy=("random",),
-        env="TPMPickAndPlace-v0",
-        goals="tempting",
-        penalty_weight=0.25,
-        randomisation=("block_mass=2",),
-        env_options=EnvOptions(engine="pybullet", drive="servo"),
-    )
-    with closing(evaluation._make_envs(config, 1)) as envs:
-        assert envs.task.penalty_weight == 0.25
-        assert envs.randomisation.block_mass == (2.0, 2.0)
-        assert envs.drive == Servo()
-        assert envs.task.goals == "tempting"
 
 
 @pytest.fixture(scope="module")
@@ -325,7 +262,7 @@ def test_an_exported_policy_that_is_of_another_task_or_damaged_is_refused(
         returns(run / "best.json", env="TPMPickAndPlace-v0")
     (tmp_path / "best.json").write_bytes((run / "best.json").read_bytes())
     (tmp_path / "best.safetensors").write_bytes(b"")
-    with pytest.raises(PolicyError, match=r"damaged: 0 of \d+ bytes"):
+    with pytest.raises(PolicyError, match=r"is not a policy file: .* \(0 of \d+ bytes\)"):
         returns(tmp_path)
 
 

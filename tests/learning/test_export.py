@@ -14,14 +14,13 @@ from processes import TPM_GYM, error_of
 from sb3_contrib import TQC
 from stable_baselines3 import DDPG, PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import tpm_gym
 from tpm_gym.learning import GoalGapExtractor, export
 from tpm_gym.learning.command_line import main
-from tpm_gym.learning.errors import ConfigError, PolicyError
+from tpm_gym.learning.errors import PolicyError
 from tpm_gym.policy.files import read_description
 
 RECIPE = {"n_timesteps": 5000, "arguments": {"gamma": 0.95, "policy_kwargs": {"net_arch": [8]}}}
@@ -160,14 +159,6 @@ def test_the_description_is_that_of_the_model(tmp_path: Path, model: Any) -> Non
     assert str(Path.home()) not in text
 
 
-def test_the_same_model_gives_the_same_files(tmp_path: Path, model: Any) -> None:
-    for name in ("a", "b"):
-        save(model, tmp_path / name)
-    for suffix in (".json", ".safetensors"):
-        first, second = ((tmp_path / f"{name}{suffix}").read_bytes() for name in ("a", "b"))
-        assert first == second
-
-
 def test_exporting_leaves_the_model_as_it_was(tmp_path: Path, model: Any) -> None:
     model.policy.set_training_mode(True)
     weights = {name: value.clone() for name, value in model.policy.state_dict().items()}
@@ -177,12 +168,6 @@ def test_exporting_leaves_the_model_as_it_was(tmp_path: Path, model: Any) -> Non
     assert torch.equal(torch.get_rng_state(), random)
     for name, value in model.policy.state_dict().items():
         assert torch.equal(value, weights[name])
-
-
-def test_stable_baselines_evaluates_an_exported_policy(tmp_path: Path, model: Any) -> None:
-    loaded: Any = tpm_gym.load_policy(save(model, tmp_path / "p"))
-    mean, _ = evaluate_policy(loaded, DummyVecEnv([Blank]), n_eval_episodes=2, warn=False)
-    assert mean == 0.0
 
 
 class Halved(CombinedExtractor):
@@ -209,13 +194,12 @@ def counted() -> Blank:
         (lambda: SAC("MultiInputPolicy", Blank(), use_sde=True, buffer_size=10), "use_sde"),
         (lambda: PPO("MultiInputPolicy", Blank(), use_sde=True), "use_sde"),
         (lambda: make(DDPG, Blank()), "DDPG is none of sac, tqc, ppo"),
-        (lambda: make(SAC, endless()), "observation in .*inf.* bounded"),
+        (lambda: make(SAC, endless()), "inf.* bounded"),
         (lambda: make(SAC, counted()), "bounded Box of floats"),
         (
             lambda: PPO("MultiInputPolicy", VecNormalize(DummyVecEnv([Blank]))),
             "VecNormalize",
         ),
-        (lambda: make(SAC, Blank(), net_arch=[4097]), "equal to 4096"),
     ],
 )
 def test_what_the_files_cannot_hold_is_refused(tmp_path: Path, build: Any, message: str) -> None:
@@ -315,9 +299,7 @@ class Trace:
         (["best.zip", "out.zip"], "not for a .zip"),
         (["broken.zip", "out"], "cannot be loaded as sac"),
         (["elsewhere/best.zip", "out"], "no config.json"),
-        (["none.zip", "/proc/out"], "no such file"),
         (["best.zip", "/proc/out"], "OUT /proc/out: cannot be written"),
-        (["best.zip", "best.zip/out"], "cannot be written: .*; choose another name"),
     ],
 )
 def test_mistakes_on_the_command_line_are_one_line(
@@ -342,11 +324,3 @@ def test_files_that_are_no_policy_are_neither_replaced_nor_removed(run: Path) ->
             main(["export", str(run / "best.zip"), str(run / out), "--trust-pickle"])
         export.remove(run / out)
     assert {file: file.read_bytes() for file in run.iterdir()} == before
-
-
-def test_a_damaged_configuration_is_named(run: Path) -> None:
-    (run / "config.json").write_text('{"algo": "sac"}')
-    with pytest.raises(SystemExit, match=r"config\.json is damaged: no entry 'env'"):
-        main(["export", str(run / "best.zip"), str(run / "best"), "--trust-pickle"])
-    with pytest.raises(ConfigError, match=r"not for a \.zip"):
-        save(make(PPO, Blank(), net_arch=[4]), run / "best.zip")

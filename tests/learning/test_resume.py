@@ -2,7 +2,6 @@
 
 import json
 import os
-import random
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -11,9 +10,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from processes import TPM_GYM, printed_by, signalled
+from processes import TPM_GYM, signalled
 from stable_baselines3 import SAC
-from stable_baselines3.common.logger import Logger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from trainings import (
     Killed,
@@ -31,10 +29,8 @@ from trainings import (
 import tpm_gym
 from tpm_gym.learning import ResumeConfig, TrainingConfig, resume, train
 from tpm_gym.learning.checkpoint import CheckpointStore, Content
-from tpm_gym.learning.configuration import complete
 from tpm_gym.learning.errors import CheckpointError
-from tpm_gym.learning.training import make_model, make_training_envs
-from tpm_gym.learning.training_state import EpisodeRecorder, restore
+from tpm_gym.learning.training_state import EpisodeRecorder
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
 
@@ -196,27 +192,6 @@ def test_resuming_neither_acts_at_random_again_nor_runs_a_pickle(
     assert not random_actions
 
 
-def test_the_optimiser_moves_what_was_restored(killed: Kill) -> None:
-    """An optimiser that holds other tensors than the networks would train nothing."""
-    config = complete(killed(260))
-    content = CheckpointStore(config.run / "checkpoints").load(pytest.fail)
-    assert content is not None
-    envs = make_training_envs(config)
-    model = make_model(config, envs)
-    restore(model, content)
-    model.set_logger(Logger(None, []))
-    assert isinstance(model, SAC)
-    before = {name: value.clone() for name, value in model.policy.state_dict().items()}
-    entropy = model.log_ent_coef.item()
-    model.train(3, 16)
-    moved = [
-        name for name, value in model.policy.state_dict().items() if (value != before[name]).any()
-    ]
-    assert len(moved) == len(before)
-    assert model.log_ent_coef.item() != entropy
-    envs.close()
-
-
 # -- real kills -----------------------------------------------------------------------------------
 
 
@@ -240,18 +215,3 @@ def test_kill_9_costs_nothing(tmp_path: Path) -> None:
     assert newest(run) < 300
     assert resume(ResumeConfig(run, checkpoint_every=1000), quiet()) is None
     assert_equal_runs(uninterrupted("sac"), run)
-
-
-@pytest.mark.slow
-def test_ten_kills_at_random_moments_change_nothing(tmp_path: Path) -> None:
-    words = ["train", "--eval-episodes", "5", "--checkpoint-every", "100", "--run"]
-    whole, killed = tmp_path / "whole", tmp_path / "killed"
-    printed_by(*TPM_GYM, *words, str(whole))
-    words.append(str(killed))
-    for step in sorted(random.Random(0).sample(range(4500), 10)):  # of 5000
-        kill_beyond(killed, step, words)
-        words = ["resume", str(killed)]
-    printed_by(*TPM_GYM, *words)
-    resumptions = json.loads((killed / "config.json").read_text())["resumed"]
-    assert len(resumptions) > 5  # those between the same two checkpoints count once
-    assert_equal_runs(whole, killed)

@@ -9,9 +9,8 @@ import pytest
 from trainings import Killed
 
 from tpm_gym.learning import TrainingConfig, train
-from tpm_gym.learning.checkpoint import CheckpointStore
 from tpm_gym.learning.errors import RunError
-from tpm_gym.learning.run_folder import description, disk_errors_named, prepare
+from tpm_gym.learning.run_folder import description, prepare
 
 OURS = {"algo": "sac", "env": "TPMReach-v0", "training_seeds": [0, 0]}
 
@@ -53,19 +52,6 @@ def test_what_another_program_wrote_is_never_deleted(config: str | None, tmp_pat
     with pytest.raises(RunError, match=r"config\.json of a training"):
         prepare(tmp_path, overwrite=True)
     assert names(tmp_path) == before
-
-
-def test_a_file_is_no_folder(tmp_path: Path) -> None:
-    (tmp_path / "run").write_text("")
-    with pytest.raises(RunError):
-        prepare(tmp_path / "run", overwrite=False)
-
-
-def test_what_a_first_moment_left_is_no_run(tmp_path: Path) -> None:
-    (tmp_path / ".half.json").write_text("{")
-    prepare(tmp_path, overwrite=False)
-    prepare(tmp_path / "new" / "run", overwrite=False)
-    assert (tmp_path / "new" / "run").is_dir()
 
 
 def test_a_death_while_deleting_leaves_a_run_that_can_be_deleted(
@@ -114,13 +100,3 @@ def test_a_folder_that_cannot_be_made_is_one_line(
     with pytest.raises(RunError, match=f"{os.strerror(number)}; choose another --run") as caught:
         train(TrainingConfig(run=tmp_path / "run"))
     assert "\n" not in str(caught.value)
-
-
-def test_only_errors_of_the_disk_are_renamed(run: Path) -> None:
-    store = CheckpointStore(run / "checkpoints")
-    with pytest.raises(RunError, match=r"No space left.*make room"), disk_errors_named(run, store):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    with pytest.raises(RunError, match="make it writable"), disk_errors_named(run, store):
-        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
-    with pytest.raises(FileNotFoundError), disk_errors_named(run, store):
-        raise FileNotFoundError(errno.ENOENT, "gone")

@@ -3,7 +3,6 @@
 import io
 import json
 import os
-import re
 import signal
 from collections.abc import Callable
 from contextlib import closing
@@ -37,7 +36,6 @@ from tpm_gym.learning import (
     EvaluationConfig,
     ResumeConfig,
     TrainingConfig,
-    curve,
     evaluate,
     resume,
     train,
@@ -87,12 +85,6 @@ def test_same_seed_same_policy_whatever_is_evaluated(run: Path, tmp_path: Path) 
     assert not equal(parameters(run), parameters(tmp_path / "other"))
 
 
-def test_learning_has_changed_the_policy(run: Path) -> None:
-    before, after = (parameters_at(run, step) for step in (0, 300))
-    assert not equal(before, after)
-    assert equal(after, parameters(run))
-
-
 def test_a_learning_rate_falls_to_zero_if_asked_to(run: Path) -> None:
     rates = [float(row["train/learning_rate"]) for row in table(run) if row["train/learning_rate"]]
     assert 0.0001 < rates[0] < 0.0002  # about half way
@@ -126,33 +118,18 @@ def test_a_training_that_diverges_says_so(tmp_path: Path) -> None:
         train(config, quiet())
 
 
-def test_the_learning_curve_is_drawn_once_at_the_end(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    drawn: list[Any] = []
-    monkeypatch.setattr(curve, "draw_learning_curve", lambda *args: drawn.append(args))
-    config = make_config("ppo", tmp_path)
-    train(config, quiet())
-    ((path, _, points),) = drawn
-    assert path == config.run / "learning_curve.png"
-    assert [point["steps"] for point in points] == [0, 70, 140, 210, 280, 320]
-
-
 def test_config_records_the_whole_run(run: Path) -> None:
     text = (run / "config.json").read_text(encoding="utf-8")
     content = json.loads(text)
     assert (content["algo"], content["env"], content["seed"]) == ("sac", "TPMReach-v0", 0)
-    assert (content["steps"], content["envs"], content["threads"]) == (300, 1, 1)
-    assert (content["eval_every"], content["eval_episodes"]) == (70, 1)
+    assert (content["steps"], content["eval_every"], content["eval_episodes"]) == (300, 70, 1)
     assert content["recipe"]["hindsight"] is True
     assert content["recipe"]["arguments"]["gamma"] == 0.95
-    assert content["recipe"]["arguments"]["policy_kwargs"]["net_arch"] == [8]
     assert content["training_seeds"] == [0, 0]
     assert content["evaluation_seeds"] == [SELECTION_SEED, SELECTION_SEED]
     assert content["versions"]["stable-baselines3"]
     assert content["machine"]["cpu_count"] == os.cpu_count()
     assert "git_commit" in content
-    assert content["command"].startswith("python ")
     # Nothing about the machine it ran on beyond its kind; the recipe was in the folder above.
     assert str(run.parent) not in text
 
@@ -201,20 +178,12 @@ def test_what_is_chosen_reaches_every_environment_and_survives_resuming(
         ("algo", "zzz"),
         ("goals", "zz"),
         ("env_options", None),
-        ("recipe", {}),
         ("recipe", 3),
         ("recipe.fred", 2),
-        ("env_options.fred", 2),
-        ("recipe_file", None),
         ("steps", "abc"),
-        ("envs", "1"),
-        ("penalty_weight", [1.0]),
         ("resumed", 3),
         ("recipe.arguments", {"batch_size": -3}),
-        ("recipe.arguments", {"gamma": "0.95"}),
         ("recipe.arguments", {"train_fred": 2}),
-        ("recipe.policy", "MlpPolicy"),
-        ("recipe.demonstrations", {"episodes": 0}),
     ],
 )
 def test_a_damaged_configuration_is_named_and_left_as_it_is(
@@ -290,15 +259,10 @@ PICK = {"env": "TPMPickAndPlace-v0", "recipe_file": recipe_file("sac")}
     [
         ({"algo": "dqn"}, "'dqn' is none of sac, tqc, ppo"),
         ({"steps": 0}, "--steps 0: must be at least 1"),
-        ({"envs": 0}, "--envs 0"),
-        ({"eval_every": 0}, "--eval-every 0"),
-        ({"eval_episodes": 0}, "--eval-episodes 0"),
         ({"penalty_weight": -0.1}, "--penalty-weight -0.1"),
         ({"penalty_weight": float("nan")}, "--penalty-weight nan"),
-        ({"seed": -1}, "held out"),
-        ({"seed": SELECTION_SEED}, "held out"),
         ({"seed": SELECTION_SEED - 2, "envs": 3}, "held out"),
-        ({"envs": 5}, "before the first episode ends"),
+        ({"envs": 5}, "learning_starts: 100 is less than the 250 steps"),
         ({"envs": 1001}, r"--envs 1001 \(n_envs of the recipe, .*at most 1,000"),
         ({"envs": 10**8, "env_options": EnvOptions(engine="analytic")}, "at most 1,000,000"),
         ({"steps": 1}, r"--steps 1: one rollout takes 2 \(1 environments x train_freq\)"),
@@ -330,52 +294,37 @@ def test_demonstrations_are_as_many_as_asked_for(tmp_path: Path) -> None:
         complete(replace(make_config("ppo", tmp_path), demonstrations=1))
 
 
-@pytest.mark.parametrize("size", [49, 10**12, 10**30])
-def test_a_buffer_that_cannot_be_is_one_line_before_anything_is_written(
-    size: int, tmp_path: Path
-) -> None:
-    config = make_config("sac", tmp_path)
-    text, found = re.subn(
-        r"buffer_size: *\d+", f"buffer_size: {size}", config.recipe_file.read_text()
-    )
-    assert found == 1
-    config.recipe_file.write_text(text)
-    with pytest.raises(ConfigError, match="buffer_size") as caught:
-        train(config, quiet())
-    assert "\n" not in str(caught.value)
-    assert not config.run.exists()
-
-
 @pytest.mark.parametrize(
-    ("before", "after", "message"),
+    ("case", "before", "after", "message"),
     [
-        ("batch_size: 20", "batch_size: 1", "batch_size: 1: advantages of one step cannot"),
-        ("n_steps: 40", "n_steps: 1", "n_steps: 1: advantages of one step cannot be normalised"),
+        *(
+            ("sac", "buffer_size: 230", f"buffer_size: {size}", "buffer_size")
+            for size in (49, 10**12, 10**30)
+        ),
+        ("ppo", "batch_size: 20", "batch_size: 1", "batch_size: 1: advantages of one step cannot"),
+        ("ppo", "n_steps: 40", "n_steps: 1", "n_steps: 1: advantages of one step cannot"),
+        ("ppo", "n_steps: 40", "n_steps: 301", "--steps 300: one rollout takes 301 .*--envs"),
         (
+            "ppo",
             "n_steps: 40",
-            "n_steps: 1000000000000",
+            f"n_steps: {10**12}",
             r"takes 1,000,000,000,000 \(1 environments x n_s",
         ),
-        ("n_steps: 40", "n_steps: 301", r"--steps 300: one rollout takes 301 .*fewer --envs"),
-        (
-            "300\n  n_envs: 1",
-            "1000000000000000\n  n_envs: 1\n  gamma: 0.9",
-            "n_steps 1000000000000:",
-        ),
+        ("ppo", "n_steps: 40", f"n_steps: {10**12}\n  n_timesteps: {10**15}", f"n_steps {10**12}:"),
     ],
 )
-def test_rollouts_and_batches_that_cannot_work_are_named(
-    before: str, after: str, message: str, tmp_path: Path
+def test_sizes_that_cannot_be_are_one_line_before_anything_is_written(
+    case: str, before: str, after: str, message: str, tmp_path: Path
 ) -> None:
-    config = make_config("ppo", tmp_path)
+    config = make_config(case, tmp_path)
     text = config.recipe_file.read_text()
     assert before in text
-    text = text.replace(before, after)
-    if "n_timesteps: 1000000000000000" in text:
-        text = text.replace("n_steps: 40", "n_steps: 1000000000000")
-    config.recipe_file.write_text(text)
-    with pytest.raises(ConfigError, match=message):
+    if "n_timesteps" in after:
+        text = text.replace("  n_timesteps: 300\n", "")
+    config.recipe_file.write_text(text.replace(before, after))
+    with pytest.raises(ConfigError, match=message) as caught:
         train(config, quiet())
+    assert "\n" not in str(caught.value)
     assert not config.run.exists()
 
 
@@ -384,12 +333,6 @@ SHIPPED = [
     for algorithm in ALGORITHMS
     for env_id in read_recipes(recipe_file(algorithm), algorithm)
 ]
-
-
-def test_every_sparse_id_has_two_shipped_recipes() -> None:
-    sparse = {env_id for env_id in tpm_gym.ENV_IDS if "Dense" not in env_id}
-    for algorithm in ("sac", "tqc"):
-        assert sparse <= {env_id for of, env_id in SHIPPED if of == algorithm}
 
 
 @pytest.mark.parametrize(("algorithm", "env_id"), SHIPPED)
@@ -423,76 +366,32 @@ def test_recipes_of_the_analytic_engine_are_for_many_environments_and_every_id()
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "key", "message"),
+    ("before", "after", "message"),
     [
-        ("[8],", "[1000000, 1000000],", "TPMReach-v0.policy_kwargs.net_arch", "from 1 to 4096"),
-        ("gamma: 0.95", "gama: 0.95", "TPMReach-v0.gama", "valid keys: batch_size, buffer_size"),
-        ("gamma: 0.95", "gamma: 1.5", "TPMReach-v0.gamma", "less than or equal to 1, not 1.5"),
-        ("gamma: 0.95", "gamma: 9e-1", "TPMReach-v0.gamma", "write 0.9"),
-        ("batch_size: 16", "batch_size: 16.0", "TPMReach-v0.batch_size", "a valid integer"),
-        ("batch_size: 16", "batch_size: true", "TPMReach-v0.batch_size", "a valid integer"),
-        (
-            "[8],",
-            "'dict(net_arch=[8])',",
-            "TPMReach-v0.policy_kwargs.net_arch",
-            "a list of at most 20",
-        ),
-        (
-            "{net_arch: [8], features_extractor_class: GoalGapExtractor}",
-            "dict(net_arch=8)",
-            "TPMReach-v0.policy_kwargs",
-            "must be a valid dictionary",
-        ),
-        ("{net_arch:", "{net_arc:", "TPMReach-v0.policy_kwargs.net_arc", "valid keys: features_"),
-        (
-            ": future",
-            ": past",
-            "TPMReach-v0.replay_buffer_kwargs.goal_selection_strategy",
-            "must be 'future', 'final' or 'episode', not 'past'",
-        ),
-        (
-            "HerReplayBuffer",
-            "os.system",
-            "TPMReach-v0.replay_buffer_class",
-            "must be 'HerReplayBuffer'",
-        ),
-        ("policy: MultiInputPolicy", "", "TPMReach-v0.policy", "is missing"),
-        (
-            "replay_buffer_class: HerReplayBuffer",
-            "",
-            "TPMReach-v0.replay_buffer_kwargs",
-            "no effect",
-        ),
-        ("TPMReach-v0:", "- TPMReach-v0:", "", "one mapping per environment id"),
-        ("gamma: 0.95", "gamma: [", "", "is not YAML"),
-        ("lin_0.0003", "lin_0", "TPMReach-v0.learning_rate", "lin_<start>"),
-        ("lin_0.0003", "lin_inf", "TPMReach-v0.learning_rate", "lin_<start>"),
-        ("lin_0.0003", "exp_1", "TPMReach-v0.learning_rate", "lin_<start>"),
-        ("gamma: 0.95", "gamma: !!python/object/apply:os.getcwd []", "", "is not YAML"),
+        ("[8],", "[1000000, 1000000],", "policy_kwargs.net_arch.*less than or equal to 4096"),
+        ("[8],", "'dict(net_arch=[8])',", "policy_kwargs.net_arch.*a valid list"),
+        ("{net_arch:", "{net_arc:", "policy_kwargs.net_arc: .*not permitted"),
+        ("gamma: 0.95", "gama: 0.95", "gama: unknown key; valid keys: batch_size, buffer_size"),
+        ("gamma: 0.95", "gamma: 1.5", "gamma: .*less than or equal to 1, not 1.5"),
+        ("gamma: 0.95", "gamma: 9e-1", "gamma: .*valid number, not '9e-1'"),
+        ("gamma: 0.95", "gamma: [", "is not YAML"),
+        ("gamma: 0.95", "gamma: !!python/object/apply:os.getcwd []", "is not YAML"),
+        ("batch_size: 16", "batch_size: true", "batch_size: .*a valid integer"),
+        (": future", ": past", "goal_selection_strategy: .*'future', 'final' or 'episode'"),
+        ("HerReplayBuffer", "os.system", "replay_buffer_class: .*'HerReplayBuffer'"),
+        ("policy: MultiInputPolicy", "", "policy: Field required"),
+        ("replay_buffer_class: HerReplayBuffer", "", "replay_buffer_kwargs: no effect"),
+        ("TPMReach-v0:", "- TPMReach-v0:", "valid dictionary"),
+        ("lin_0.0003", "lin_0", r"learning_rate.*\^lin_"),
+        ("lin_0.0003", "lin_inf", r"learning_rate.*\^lin_"),
     ],
 )
 def test_recipe_mistakes_name_file_key_and_choice(
-    before: str, after: str, key: str, message: str, tmp_path: Path
+    before: str, after: str, message: str, tmp_path: Path
 ) -> None:
     assert before in RECIPE
     path = tmp_path / "wrong.yml"
     path.write_text(RECIPE.replace(before, after), encoding="utf-8")
     with pytest.raises(ConfigError, match=message) as caught:
         read_recipe(path, "sac", "TPMReach-v0")
-    assert str(caught.value).startswith(f"{path}: {key}")
-
-
-@pytest.mark.parametrize(
-    "device", ["abacus", "cuda" if not torch.cuda.is_available() else "cuda:99x"]
-)
-def test_a_missing_device_is_refused_before_an_earlier_run_is_deleted(
-    tmp_path: Path, device: str
-) -> None:
-    (tmp_path / "config.json").write_text("{}")
-    (tmp_path / "last.zip").write_text("precious")
-    config = TrainingConfig(
-        env="TPMReach-v0", run=tmp_path, overwrite=True, device=device, steps=2000
-    )
-    with pytest.raises(ConfigError, match="--device"):
-        train(config)
-    assert (tmp_path / "last.zip").read_text() == "precious"
+    assert str(caught.value).startswith(f"{path}: ")

@@ -9,7 +9,7 @@ from processes import PYTHON, printed_by
 import tpm_gym
 from tpm_gym.learning.features import GoalGapExtractor
 from tpm_gym.learning.hindsight import PenaltyHerReplayBuffer
-from tpm_gym.learning.zoo import _algorithm, hyperparameters
+from tpm_gym.learning.zoo import hyperparameters
 from tpm_gym.resources import RECIPES
 
 
@@ -27,12 +27,6 @@ def test_every_recipe_is_handed_over_with_classes_for_their_names(algorithm: str
             assert entries["replay_buffer_class"] is PenaltyHerReplayBuffer
         if "features_extractor_class" in source.get("policy_kwargs", {}):
             assert entries["policy_kwargs"]["features_extractor_class"] is GoalGapExtractor
-
-
-@pytest.mark.parametrize("words", [["--algo", "tqc"], ["--algo=tqc"]])
-def test_the_algorithm_is_that_of_the_command_line(words: list[str]) -> None:
-    assert _algorithm(["train.py", "--env", "TPMReach-v0", *words, "-n", "200"]) == "tqc"
-    assert _algorithm(["train.py"]) == "ppo"
 
 
 @pytest.mark.parametrize(

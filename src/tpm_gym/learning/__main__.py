@@ -7,11 +7,12 @@ def main() -> None:
     """Run the command line, or name the missing package."""
     try:
         from tpm_gym.learning import command_line
+
+        command_line.main()
     except ModuleNotFoundError as error:
         from tpm_gym.errors import MissingPackageError
 
         sys.exit(f"error: {MissingPackageError(str(error.name), 'train')}")
-    command_line.main()
 
 
 if __name__ == "__main__":

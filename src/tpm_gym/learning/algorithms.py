@@ -9,28 +9,15 @@ from __future__ import annotations
 
 import inspect
 import pkgutil
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple
 
-from pydantic import Field, ValidationError, WrapValidator
+from pydantic import Field
 from typing_extensions import Required, TypedDict
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
-
-
-def _says(description: str) -> WrapValidator:
-    """Replace the several messages of a union by one."""
-
-    def check(value: Any, validate: Callable[[Any], Any]) -> Any:
-        try:
-            return validate(value)
-        except ValidationError as error:
-            raise ValueError(f"must be {description}") from error
-
-    return WrapValidator(check)
-
 
 _keys: Any = TypedDict  # made from tables, which no type checker follows
 
@@ -40,14 +27,10 @@ _POSITIVE: Final[Any] = Annotated[float, Field(gt=0)]
 _NOT_NEGATIVE: Final[Any] = Annotated[float, Field(ge=0)]
 _FRACTION: Final[Any] = Annotated[float, Field(gt=0, le=1)]
 _NUMBER: Final = r"(\d*\.\d*[1-9]\d*|\d*[1-9]\d*\.?\d*)(e-?\d+)?"  # positive, as text
-# The largest network that can be exported: see tpm_gym.policy.files.
 _LAYERS: Final[Any] = Annotated[list[Annotated[int, Field(gt=0, le=4096)]], Field(max_length=20)]
 
 _POLICY_ENTRIES: Final[Mapping[str, Any]] = {
-    "net_arch": Annotated[
-        _LAYERS | dict[Literal["pi", "qf", "vf"], _LAYERS],
-        _says("a list of at most 20 integers from 1 to 4096, or one for each of pi, qf, vf"),
-    ],
+    "net_arch": _LAYERS | dict[Literal["pi", "qf", "vf"], _LAYERS],
     "log_std_init": float,
     "ortho_init": bool,
     "n_critics": Annotated[int, Field(gt=0, le=100)],
@@ -55,22 +38,20 @@ _POLICY_ENTRIES: Final[Mapping[str, Any]] = {
     "features_extractor_class": Literal["GoalGapExtractor"],
     "features_extractor_kwargs": _keys("Extractor", {"unit": _POSITIVE}, total=False),
 }
+_STRATEGY: Final[Any] = Literal["future", "final", "episode"]
+_HINDSIGHT: Final = {"n_sampled_goal": _COUNT, "goal_selection_strategy": _STRATEGY}
 _ENTRIES: Final[Mapping[str, Any]] = {
-    "learning_rate": Annotated[
-        _POSITIVE | Annotated[str, Field(pattern=f"^lin_{_NUMBER}$")],
-        _says("a positive number, or lin_<start> to fall linearly to zero"),
-    ],
+    # lin_<start> falls linearly to zero
+    "learning_rate": _POSITIVE | Annotated[str, Field(pattern=f"^lin_{_NUMBER}$")],
     "gamma": _FRACTION,
     "batch_size": _COUNT,
     "buffer_size": _COUNT,
     "learning_starts": _NATURAL,
     "tau": _FRACTION,
     "train_freq": _COUNT,
-    "gradient_steps": Annotated[
-        _COUNT | Literal[-1], _says("a positive integer, or -1 for as many as steps were taken")
-    ],
+    "gradient_steps": _COUNT | Literal[-1],  # -1: as many as steps were taken
     "ent_coef": _NOT_NEGATIVE,
-    "target_entropy": Annotated[float | Literal["auto"], _says("auto or a number")],
+    "target_entropy": float | Literal["auto"],
     "target_update_interval": _COUNT,
     "top_quantiles_to_drop_per_net": _NATURAL,
     "n_steps": _COUNT,
@@ -82,39 +63,21 @@ _ENTRIES: Final[Mapping[str, Any]] = {
     "normalize_advantage": bool,
     "target_kl": _POSITIVE,
     "replay_buffer_class": Literal["HerReplayBuffer"],
-    "replay_buffer_kwargs": _keys(
-        "Hindsight",
-        {
-            "n_sampled_goal": _COUNT,
-            "goal_selection_strategy": Literal["future", "final", "episode"],
-        },
-        total=False,
-    ),
+    "replay_buffer_kwargs": _keys("Hindsight", _HINDSIGHT, total=False),
 }
-_LEARNED_ENTROPY: Final[Any] = Annotated[
-    _NOT_NEGATIVE | Annotated[str, Field(pattern=f"^auto(_{_NUMBER})?$")],
-    _says("auto, auto_<start>, or a number of at least 0"),
-]
+_LEARNED_ENTROPY: Final[Any] = _NOT_NEGATIVE | Annotated[str, Field(pattern=f"^auto(_{_NUMBER})?$")]
 _DEMONSTRATIONS: Final[Any] = _keys(
     "Demonstrations", {"episodes": Required[_COUNT], "noise": _NOT_NEGATIVE}, total=False
 )
 
 
-@dataclass(frozen=True)
-class Actor:
-    """Parts of a policy that compute its mean action, as dotted names of attributes.
+class Actor(NamedTuple):
+    """Parts of a policy that compute its mean action, as dotted names of attributes."""
 
-    Attributes:
-        features: Features extractor.
-        hidden: Sequence of the hidden layers.
-        last: Last layer.
-        output: Function of the last layer's output: ``tanh`` or ``clip``.
-    """
-
-    features: str
-    hidden: str
-    last: str
-    output: str
+    features: str  # extractor
+    hidden: str  # sequence of the hidden layers
+    last: str  # layer
+    output: str  # function of the last layer's output: tanh or clip
 
 
 _SQUASHED: Final = Actor("actor.features_extractor", "actor.latent_pi", "actor.mu", "tanh")

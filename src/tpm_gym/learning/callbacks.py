@@ -3,6 +3,7 @@
 import json
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 from rich.console import Console
@@ -24,49 +25,34 @@ _SHORTEST_INTERVAL: Final = 30.0  # s between checkpoints
 _LARGEST_SHARE: Final = 0.02  # of the time may go into checkpoints
 
 
+@dataclass(eq=False)
 class PeriodicEvaluation(BaseCallback):
     """Evaluation of the policy on held-out seeds before, during and after training.
 
-    All evaluations use the same episodes, so the points of a learning curve differ by the policy
-    alone. Each is appended to evaluations.jsonl, and the best policy so far is kept.
+    All evaluations use the same episodes. Each is appended to evaluations.jsonl.
 
-    Args:
-        envs: Separate environments, so that evaluations do not disturb training.
-        console: Gets one line for each evaluation.
-        keep: Called with the model whenever it is the best so far.
+    ``envs`` are separate, so that evaluations do not disturb training. ``keep`` is called with the
+    model whenever it is the best so far.
     """
 
-    def __init__(
-        self,
-        config: TrainingConfig,
-        envs: TPMVectorEnv,
-        console: Console,
-        keep: Callable[[BaseAlgorithm], object],
-    ) -> None:
-        """Store the arguments."""
+    config: TrainingConfig
+    envs: TPMVectorEnv
+    console: Console
+    keep: Callable[[BaseAlgorithm], object]
+    evaluations: list[dict[str, Any]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        """Initialise the callback."""
         super().__init__()
-        self._config, self._envs = config, envs
-        self._console, self._keep = console, keep
-        self.evaluations: list[dict[str, Any]] = []
-        self._best: tuple[float, float] | None = None
-
-    def state(self) -> dict[str, Any]:
-        """Return the state for a checkpoint, as plain data."""
-        return {"evaluations": self.evaluations, "best": self._best}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Restore the state of :meth:`state`."""
-        self.evaluations = list(state["evaluations"])
-        self._best = tuple(state["best"]) if state["best"] else None
 
     def _on_training_start(self) -> None:
         if not self.evaluations:
             self._evaluate()
 
     def _on_step(self) -> bool:
-        due = self.num_timesteps - self.evaluations[-1]["steps"] >= self._config.eval_every
+        due = self.num_timesteps - self.evaluations[-1]["steps"] >= self.config.eval_every
         # The last evaluation waits for the last update, since that policy is saved.
-        if due and self.num_timesteps < self._config.steps:
+        if due and self.num_timesteps < self.config.steps:
             self._evaluate()
         return True
 
@@ -74,18 +60,15 @@ class PeriodicEvaluation(BaseCallback):
         self._evaluate()
 
     def _evaluate(self) -> None:
-        policy = TrainedPolicy(self.model)
-        episodes = self._config.eval_episodes
-        records = run_episodes(self._envs, policy, episodes, SELECTION_SEED)
-        metrics = summarise(records)
+        policy, episodes = TrainedPolicy(self.model), self.config.eval_episodes
+        metrics = summarise(run_episodes(self.envs, policy, episodes, SELECTION_SEED))
+        earlier = max(map(_quality, self.evaluations), default=None)
         self._record({name: estimate.as_dict() for name, estimate in metrics.items()})
-        success = metrics["success_at_end"]
-        quality = (success.mean, metrics["return"].mean)
-        best = self._best is None or quality > self._best
+        best = earlier is None or _quality(self.evaluations[-1]) > earlier
         if best:
-            self._best = quality
-            self._keep(self.model)
-        self._console.print(
+            self.keep(self.model)
+        success = metrics["success_at_end"]
+        self.console.print(
             f"{self.num_timesteps:>9,} steps   success {success.mean:6.1%} "
             f"[{success.low:.1%}, {success.high:.1%}]   return {metrics['return'].mean:7.2f}"
             f"{'   best' if best else ''}",
@@ -96,17 +79,21 @@ class PeriodicEvaluation(BaseCallback):
         """Append the metrics to evaluations.jsonl, progress.csv and TensorBoard."""
         line: dict[str, Any] = {
             "steps": self.num_timesteps,
-            "episodes": self._config.eval_episodes,
+            "episodes": self.config.eval_episodes,
             "first_seed": SELECTION_SEED,
             "wall_seconds": round(seconds_trained(self.model), 3),
             **metrics,
         }
         self.evaluations.append(line)
-        with (self._config.run / EVALUATIONS_FILE).open("a", encoding="utf-8") as file:
+        with (self.config.run / EVALUATIONS_FILE).open("a", encoding="utf-8") as file:
             file.write(json.dumps(line, allow_nan=False) + "\n")
         for name, estimate in metrics.items():
             self.logger.record(f"eval/{name}", estimate["mean"])
         self.logger.dump(self.num_timesteps)
+
+
+def _quality(evaluation: Mapping[str, Any]) -> tuple[float, float]:
+    return evaluation["success_at_end"]["mean"], evaluation["return"]["mean"]
 
 
 class ProgressBar(BaseCallback):
@@ -137,71 +124,61 @@ class StopTrainingError(Exception):
     """Exit from ``learn`` after the last checkpoint; users never see it."""
 
 
+@dataclass(eq=False)
 class Checkpointing(BaseCallback):
     """Checkpoints between rollouts, and one when the process is asked to stop.
 
-    A checkpoint that cannot be written is reported and tried again when the next one is due.
-    Training continues meanwhile, and the earlier checkpoints stay.
-
-    The first checkpoint is saved before anything else is done, so that no policy is without one.
-
-    Args:
-        evaluation: Callback whose state is part of a checkpoint.
-        seconds: Seconds that earlier processes have trained.
+    A checkpoint that cannot be written is reported and tried again when the next one is due. The
+    first is saved before anything else is done, so that no policy is without one. ``seconds`` is
+    the time that earlier processes have trained.
     """
 
-    def __init__(
-        self,
-        config: TrainingConfig,
-        store: CheckpointStore,
-        evaluation: PeriodicEvaluation,
-        listener: SignalListener,
-        console: Console,
-        seconds: float,
-    ) -> None:
-        """Store the arguments."""
+    config: TrainingConfig
+    store: CheckpointStore
+    evaluation: PeriodicEvaluation
+    listener: SignalListener
+    console: Console
+    seconds: float
+
+    def __post_init__(self) -> None:
+        """Initialise the callback."""
         super().__init__()
-        self._config, self._store, self._evaluation = config, store, evaluation
-        self._listener, self._console, self._seconds = listener, console, seconds
-        self._last_step: int | None = store.newest
+        self._last_step: int | None = self.store.newest
         self._next_time = time.perf_counter() + _SHORTEST_INTERVAL
 
     def _on_training_start(self) -> None:
         # Times and speeds in the logs count from the beginning of the run.
-        self.model.start_time = int(time.time_ns() - self._seconds * 1e9)
+        self.model.start_time = int(time.time_ns() - self.seconds * 1e9)
         self.model._num_timesteps_at_start = 0
         if self._last_step is None:
-            self._save()
+            self.save()
 
     def _on_rollout_start(self) -> None:
-        stop = self._listener.received is not None
+        stop = self.listener.received is not None
         if stop or self._is_due():
-            self._save()
+            self.save()
         if stop:
             raise StopTrainingError
 
     def _on_step(self) -> bool:
         return True
 
-    def save_finished(self) -> None:
-        """Save the end of the training."""
-        self._save(finished=True)
-
     def _is_due(self) -> bool:
-        if self._config.checkpoint_every is not None:
+        if self.config.checkpoint_every is not None:
             taken = self.model.num_timesteps - (self._last_step or 0)
-            return taken >= self._config.checkpoint_every
+            return taken >= self.config.checkpoint_every
         return time.perf_counter() >= self._next_time
 
-    def _save(self, finished: bool = False) -> None:
+    def save(self, finished: bool = False) -> None:
         """Save a checkpoint, or report why not."""
         started = time.perf_counter()
-        extra = {"seconds": seconds_trained(self.model), "evaluation": self._evaluation.state()}
-        content = capture(self.model, self._config.run, extra, finished)
+        evaluations = self.evaluation.evaluations
+        extra = {"seconds": seconds_trained(self.model), "evaluations": evaluations}
+        content = capture(self.model, self.config.run, extra, finished)
         try:
-            self._store.save(content)
+            self.store.save(content)
         except CheckpointError as error:
-            self._console.print(f"warning: {error}", markup=False, soft_wrap=True)
+            self.console.print(f"warning: {error}", markup=False, soft_wrap=True)
         now = time.perf_counter()
         self._next_time = now + max(_SHORTEST_INTERVAL, (now - started) / _LARGEST_SHARE)
         self._last_step = content.step

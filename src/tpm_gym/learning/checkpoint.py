@@ -1,10 +1,8 @@
 """Checkpoints on disk: each is one file that is whole or absent, and that shows any damage.
 
 A checkpoint is ``checkpoints/<step>.checkpoint``: a SHA-256, and the NumPy archive that it is the
-sum of. The file is written under another name, flushed to the disk and renamed. A process that is
-killed at any moment therefore leaves the earlier checkpoints untouched.
-
-Nothing is unpickled. Arrays are loaded without pickles. Small files (JSON, and tensors for
+sum of. The file is written under another name, flushed to the disk and renamed, so a kill leaves
+the earlier checkpoints untouched. Nothing is unpickled. Small files (JSON, and tensors for
 ``torch.load(weights_only=True)``) are stored as arrays of bytes.
 """
 
@@ -23,7 +21,7 @@ from numpy.typing import NDArray
 
 from tpm_gym.learning.errors import CheckpointError
 
-FORMAT: Final = 2
+FORMAT: Final = 3
 KEPT: Final = 2  # checkpoints; the second is used if the first turns out to be damaged
 STATE: Final = "state.json"
 TENSORS: Final = "torch.pt"
@@ -34,10 +32,7 @@ _SUM: Final = hashlib.sha256().digest_size  # bytes
 
 @dataclass(frozen=True)
 class Content:
-    """Content of a checkpoint: small files and large arrays, both by name.
-
-    Arrays may be views of memory that training writes to.
-    """
+    """Content of a checkpoint: small files and large arrays, both by name."""
 
     step: int
     finished: bool
@@ -58,7 +53,7 @@ class CheckpointStore:
         return self._whole[-1] if self._whole else None
 
     def path(self, step: int) -> Path:
-        """Return the file of the checkpoint of a step."""
+        """Return the file of a step's checkpoint."""
         return self.folder / f"{step:09d}.checkpoint"
 
     def save(self, content: Content) -> None:
@@ -74,8 +69,7 @@ class CheckpointStore:
             _flush_folder(self.folder)
         except OSError as error:
             earlier = f"that of step {self.newest:,} stays" if self._whole else "there is none yet"
-            problem = f"{error.strerror or error}; {earlier}"
-            raise CheckpointError(f"cannot write checkpoint {target}: {problem}") from error
+            raise CheckpointError(f"cannot write {target}: {error.strerror}; {earlier}") from error
         finally:
             with suppress(OSError):
                 part.unlink(missing_ok=True)
@@ -84,32 +78,24 @@ class CheckpointStore:
         self._tidy()
 
     def load(self, warn: Callable[[str], object]) -> Content | None:
-        """Read the newest checkpoint that is whole.
+        """Read the newest checkpoint that is whole; return None if there are no checkpoints.
 
-        Args:
-            warn: Called with a sentence for each newer checkpoint that is damaged.
-
-        Returns:
-            The content; None if there are no checkpoints.
+        ``warn`` is called with a sentence for each newer checkpoint that is damaged.
         """
         steps = self.steps()
-        problems = []
         for step in reversed(steps):
             try:
                 content = _read(self.path(step))
-            except CheckpointError as error:
-                problems.append(str(error))
+            except Exception as error:  # whatever NumPy raises on a file that others have signed
+                warn(f"damaged checkpoint: {self.path(step)} ({error}); trying the one before")
                 continue
-            for problem in problems:
-                warn(f"{problem}; using the checkpoint of step {step:,} instead")
             # A damaged checkpoint is deleted once a new one can take its place.
             self._whole = [earlier for earlier in steps if earlier <= step][-KEPT:]
             return content
-        if not problems:
-            return None
-        listed = "".join(f"\n  {problem}" for problem in problems)
-        anew = "start the run anew with --overwrite"
-        raise CheckpointError(f"no checkpoint in {self.folder} is whole; {anew}:{listed}")
+        if steps:
+            anew = "start the run anew with --overwrite"
+            raise CheckpointError(f"no checkpoint in {self.folder} is whole; {anew}")
+        return None
 
     def clear(self) -> None:
         """Delete all checkpoints, and no other file of their folder."""
@@ -152,40 +138,29 @@ def _write(path: Path, content: Content) -> None:
 
 def _read(path: Path) -> Content:
     """Read a checkpoint after comparing every byte of it with its sum."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise _damaged(path, f"cannot be read: {error.strerror}") from error
+    data = path.read_bytes()
     if hashlib.sha256(memoryview(data)[_SUM:]).digest() != data[:_SUM]:
-        raise _damaged(path, "differs from what was written (SHA-256)")
+        raise ValueError("its SHA-256 differs from what was written")
     stream = io.BytesIO(data)
     stream.seek(_SUM)
-    try:
-        with np.load(stream, allow_pickle=False) as loaded:
-            entries = {name: loaded[name] for name in loaded.files}
-        version, step, finished = entries.pop("head").tolist()
-    except Exception as error:  # whatever NumPy raises on a file that others have signed
-        raise _damaged(path, f"holds no checkpoint ({error})") from error
+    with np.load(stream, allow_pickle=False) as loaded:
+        entries = {name: loaded[name] for name in loaded.files}
+    version, step, finished = entries.pop("head").tolist()
     if version != FORMAT:
-        raise _damaged(path, f"has format {version}, this version of tpm_gym reads {FORMAT}")
+        raise ValueError(f"format {version}, this version of tpm_gym reads {FORMAT}")
     parts: dict[str, dict[str, NDArray[Any]]] = {"files": {}, "arrays": {}}
     for name, array in entries.items():
         kind, _, inner = name.partition("/")
-        parts.get(kind, {})[inner] = array
+        parts[kind][inner] = array
     files = {name: array.tobytes() for name, array in parts["files"].items()}
     return Content(step, bool(finished), files, parts["arrays"])
 
 
-def _damaged(path: Path, problem: str) -> CheckpointError:
-    return CheckpointError(f"damaged checkpoint: {path} {problem}")
-
-
 def _flush_folder(folder: Path) -> None:
     """Wait until the disk has the names in a folder; Windows has no such call."""
-    if os.name != "posix":
-        return
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+    if os.name == "posix":
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)

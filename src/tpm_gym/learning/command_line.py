@@ -13,7 +13,6 @@ from tyro.conf import Positional, subcommand
 from tpm_gym import TPMError
 from tpm_gym.learning.configuration import ResumeConfig, TrainingConfig
 from tpm_gym.learning.evaluation import EvaluationConfig, evaluate
-from tpm_gym.learning.training import resume, train
 
 
 @dataclass(frozen=True)
@@ -45,27 +44,23 @@ def main(words: Sequence[str] | None = None) -> None:
     """
     about = "Train policies on the environments of tpm_gym, and evaluate them."
     command: Any = tyro.cli(Command, prog="tpm-gym", description=about, args=words)
+    stopped_by = None
     try:
-        stopped_by = _run(command)
+        if isinstance(command, EvaluationConfig):
+            evaluate(command)
+            return
+        from tpm_gym.learning import export, training  # imported here, since they need PyTorch
+
+        match command:
+            case TrainingConfig():
+                stopped_by = training.train(command)
+            case ResumeConfig():
+                stopped_by = training.resume(command)
+            case ExportConfig():
+                print(export.convert(command.model, command.out, trust_pickle=command.trust_pickle))
     except TPMError as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
         stopped_by = signal.SIGINT
     if stopped_by is not None:
         sys.exit(128 + stopped_by)
-
-
-def _run(command: Any) -> signal.Signals | None:
-    """Run a command; return the signal that stopped it, if any."""
-    match command:
-        case TrainingConfig():
-            return train(command)
-        case ResumeConfig():
-            return resume(command)
-        case EvaluationConfig():
-            evaluate(command)
-        case ExportConfig():
-            from tpm_gym.learning.export import convert  # imported here, since it needs PyTorch
-
-            print(convert(command.model, command.out, trust_pickle=command.trust_pickle))
-    return None

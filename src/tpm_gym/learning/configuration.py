@@ -24,17 +24,11 @@ _MOST_PROCESSES: Final = 1000
 
 
 def unset(kind: Any, shown: str, metavar: str, name: str | None = None) -> Any:
-    """Describe an option of a type that is ``UNSET`` by default.
-
-    ``shown`` is the default in the help, ``name`` the name on the command line.
-    """
-    return shown_default(shown, metavar, constructor=kind | None, name=name)
-
-
-def shown_default(shown: str, metavar: str, **options: Any) -> Any:
-    """Describe an option whose default is put into words."""
+    """Describe an option that is ``UNSET`` by default; ``shown`` is the default in the help."""
     hint = f"(default: {shown})"
-    return tyro.conf.arg(help_behavior_hint=hint, metavar=metavar, **options)
+    return tyro.conf.arg(
+        help_behavior_hint=hint, metavar=metavar, constructor=kind | None, name=name
+    )
 
 
 @dataclass(frozen=True)
@@ -133,11 +127,6 @@ class TrainingConfig:
     """Replace an earlier run in the same folder."""
 
     @property
-    def in_batches(self) -> bool:
-        """Whether one process steps many environments at once."""
-        return self.env_options.in_batches
-
-    @property
     def rollout(self) -> int:
         """Number of steps between two updates, over all environments."""
         return self.envs * int(self.argument("train_freq") or self.argument("n_steps"))
@@ -147,10 +136,15 @@ class TrainingConfig:
         return ALGORITHMS[self.algo].argument(self.recipe.arguments, name)
 
     @property
+    def horizon(self) -> int:
+        """Number of steps after which an episode is truncated, over all environments."""
+        return self.envs * (check_env_id(self.env).max_episode_steps or 0)
+
+    @property
     def demonstrated(self) -> int:
         """Number of steps of the demonstrations, over all environments."""
         episodes = int(self.recipe.demonstrations.get("episodes", 0))
-        return -(-episodes // self.envs) * self.envs * _horizon(self.env)
+        return -(-episodes // self.envs) * self.horizon
 
     @property
     def title(self) -> str:
@@ -201,7 +195,11 @@ def complete(config: TrainingConfig) -> TrainingConfig:
     file = shipped if config.recipe_file is UNSET else config.recipe_file
     recipe = read_recipe(file, config.algo, config.env)
     if config.demonstrations is not UNSET:
-        recipe = _with_demonstrations(recipe, config)
+        check_least(config, 0, "demonstrations")
+        count = config.demonstrations
+        changed = {**recipe.demonstrations, "episodes": count} if count else {}
+        recipe = replace(recipe, demonstrations=changed)
+        check_recipes(f"--demonstrations {count}", {config.algo: recipe.entries()}, config.algo)
     steps = recipe.n_timesteps if config.steps is UNSET else config.steps
     env = config.env.rpartition(":")[2]
     computed: dict[str, Any] = {
@@ -209,44 +207,26 @@ def complete(config: TrainingConfig) -> TrainingConfig:
         "envs": recipe.n_envs,
         "recipe_file": file,
         "run": Path("runs", f"{env}-{config.algo}-s{config.seed}"),
-        "eval_episodes": 200 if config.in_batches else 20,
+        "eval_episodes": 200 if config.env_options.in_batches else 20,
     }
     missing = {name: v for name, v in computed.items() if getattr(config, name) is UNSET}
     config = replace(config, recipe=recipe, **missing)
     if config.eval_every is UNSET:  # more often, it would evaluate equal policies
-        often = steps // (20 if config.in_batches else 10)
+        often = steps // (20 if config.env_options.in_batches else 10)
         config = replace(config, eval_every=max(config.rollout, often))
     _check(config)
     return _in_whole_rollouts(config, 0)
 
 
-def _with_demonstrations(recipe: Recipe, config: TrainingConfig) -> Recipe:
-    """Return the recipe with the configured number of demonstrations."""
-    check_least(config, 0, "demonstrations")
-    count = config.demonstrations
-    changed = {**recipe.demonstrations, "episodes": count} if count else {}
-    recipe = replace(recipe, demonstrations=changed)
-    check_recipes(f"--demonstrations {count}", {config.algo: recipe.entries()}, config.algo)
-    return recipe
-
-
 def _in_whole_rollouts(config: TrainingConfig, reached: int) -> TrainingConfig:
-    """Round the steps up to the end of a rollout; rollouts begin at step ``reached``.
-
-    Stable-Baselines3 would round as well, but let schedules end at the steps that were asked for.
-    """
+    """Round the steps up as Stable-Baselines3 does, so that schedules end with the last rollout."""
     start = max(reached, config.demonstrated)
     rollouts = -(-(config.steps - start) // config.rollout)
     return replace(config, steps=start + rollouts * config.rollout)
 
 
 def resumed(config: ResumeConfig, stored: Mapping[str, Any], reached: int) -> TrainingConfig:
-    """Return the configuration of a run with the changes to it.
-
-    Args:
-        stored: Content of the run's config.json.
-        reached: Steps that the run has taken.
-    """
+    """Change the configuration ``stored`` of a run that has ``reached`` a step."""
     found = _stored(config.run, stored)
     if config.env not in (UNSET, found.env):
         raise ConfigError(f"--env {config.env}: the run was trained in {found.env}; give that")
@@ -270,18 +250,16 @@ def _stored(run: Path, stored: Mapping[str, Any]) -> TrainingConfig:
         TypeAdapter(list[Any]).validate_python(stored.get("resumed", []))
         recipe_file(found.algo)  # refuses an unknown algorithm
         check_recipes(CONFIG_FILE, {"recipe": found.recipe.entries()}, found.algo)
-    except ValidationError as error:
-        first = error.errors()[0]
-        problem = f"{'.'.join(map(str, first['loc']))}: {first['msg']}, not {first['input']!r:.100}"
-        raise _damaged(run, problem) from error
-    except (AttributeError, ConfigError) as error:  # no recipe is None
-        raise _damaged(run, str(error)) from error
+    except (ValidationError, AttributeError, ConfigError) as error:  # a recipe of null
+        problem = str(error)
+        if isinstance(error, ValidationError):
+            first = error.errors()[0]
+            problem = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+        raise RunError(
+            f"the configuration of {run} is damaged: {problem}; start the run anew with tpm-gym "
+            "train --overwrite"
+        ) from error
     return found
-
-
-def _damaged(run: Path, problem: str) -> RunError:
-    anew = "start the run anew with tpm-gym train --overwrite"
-    return RunError(f"the configuration of {run} is damaged: {problem}; {anew}")
 
 
 def check_least(config: Any, least: int, *names: str) -> None:
@@ -292,72 +270,58 @@ def check_least(config: Any, least: int, *names: str) -> None:
             raise ConfigError(f"--{name.replace('_', '-')} {value}: must be at least {least}")
 
 
+def _refuse(wrong: bool, problem: str) -> None:
+    if wrong:
+        raise ConfigError(problem)
+
+
 def _check(config: TrainingConfig) -> None:
     counts = ("steps", "envs", "eval_every", "eval_episodes", "checkpoint_every", "threads")
     check_least(config, 1, *counts)
     check_least(config, 0, "test_episodes")
-    most = SELECTION_SEED if config.in_batches else _MOST_PROCESSES
-    if config.envs > most:
-        raise ConfigError(
-            f"--envs {config.envs} (n_envs of the recipe, if not given): must be at most {most:,}"
-        )
-    highest = SELECTION_SEED - config.envs
-    if not 0 <= config.seed <= highest:
-        held_out = f"seeds from {SELECTION_SEED} up are held out"
-        raise ConfigError(f"--seed {config.seed}: must lie in 0 ... {highest}: {held_out}")
-    most = TEST_SEED - SELECTION_SEED
-    if config.eval_episodes > most:
-        raise ConfigError(f"--eval-episodes {config.eval_episodes}: must be at most {most}")
-    if not 0 <= config.penalty_weight < math.inf:
-        weight = config.penalty_weight
-        raise ConfigError(f"--penalty-weight {weight}: must be a finite number, 0 or more")
+    envs, seed, most = config.envs, config.seed, TEST_SEED - SELECTION_SEED
+    _refuse(config.eval_episodes > most, f"--eval-episodes: must be at most {most}")
+    most = SELECTION_SEED if config.env_options.in_batches else _MOST_PROCESSES
+    problem = f"--envs {envs} (n_envs of the recipe, if not given): must be at most {most:,}"
+    _refuse(envs > most, problem)
+    most = SELECTION_SEED - envs
+    problem = f"must lie in 0 ... {most}: seeds from {SELECTION_SEED} up are held out"
+    _refuse(not 0 <= seed <= most, f"--seed {seed}: {problem}")
+    weight = config.penalty_weight
+    problem = f"--penalty-weight {weight}: must be a finite number, 0 or more"
+    _refuse(not 0 <= weight < math.inf, problem)
     _check_recipe(config)
     _check_device(config.device)
 
 
 def _check_recipe(config: TrainingConfig) -> None:
-    """Refuse a recipe that cannot work with the numbers of steps and environments.
-
-    Demonstrations count as steps and teach nothing alone. Hindsight draws from whole episodes, so
-    one must have ended before learning starts.
-    """
-    envs, where = config.envs, f"--recipe {config.recipe_file}"
-    if config.steps <= config.demonstrated:
-        raise ConfigError(
-            f"--steps {config.steps}: must be more than the {config.demonstrated:,} of the "
-            "demonstrations; for a short trial give fewer --demonstrations"
-        )
+    """Refuse a recipe that cannot work with the numbers of steps and environments."""
+    shown, envs, where = f"--steps {config.steps}", config.envs, f"--recipe {config.recipe_file}"
+    _refuse(
+        config.steps <= config.demonstrated,
+        f"{shown}: must be more than the {config.demonstrated:,} of the demonstrations; for a "
+        "short trial give fewer --demonstrations",
+    )
     length = "train_freq" if config.argument("train_freq") else "n_steps"
-    if config.steps - config.demonstrated < config.rollout:
-        raise ConfigError(
-            f"--steps {config.steps}: one rollout takes {config.rollout:,} ({envs} environments x "
-            f"{length}); give more steps, or fewer --envs"
-        )
+    _refuse(
+        config.steps - config.demonstrated < config.rollout,
+        f"{shown}: one rollout takes {config.rollout:,} ({envs} environments x {length}); give "
+        "more steps, or fewer --envs",
+    )
     if config.argument("normalize_advantage"):
-        for name, size in ((length, config.rollout), ("batch_size", config.argument("batch_size"))):
-            if size < 2:
-                raise ConfigError(
-                    f"{where}: {name}: {size}: advantages of one step cannot be normalised; raise "
-                    "it, or set normalize_advantage: false"
-                )
-    if not config.recipe.hindsight:
-        return
-    episode = _horizon(config.env) * envs
-    if (starts := config.argument("learning_starts")) < episode:
-        raise ConfigError(
-            f"{where}: learning_starts: {starts} is before the first episode "
-            f"ends (step {episode} with {envs} environments); raise it, or use fewer --envs"
+        sizes = {length: config.rollout, "batch_size": config.argument("batch_size")}
+        _refuse(
+            min(sizes.values()) < 2,
+            f"{where}: {min(sizes, key=sizes.__getitem__)}: 1: advantages of one step cannot be "
+            "normalised; raise it, or set normalize_advantage: false",
         )
-    if (room := config.argument("buffer_size")) < episode:
-        raise ConfigError(
-            f"{where}: buffer_size: {room} is less than the {episode} "
-            f"steps of an episode in each of {envs} environments; raise it, or use fewer --envs"
-        )
-
-
-def _horizon(env_id: str) -> int:
-    """Return the number of steps after which an episode is truncated."""
-    return check_env_id(env_id).max_episode_steps or 0
+    if config.recipe.hindsight:  # it draws from whole episodes
+        for name in ("learning_starts", "buffer_size"):
+            _refuse(
+                config.argument(name) < config.horizon,
+                f"{where}: {name}: {config.argument(name)} is less than the {config.horizon} steps "
+                f"of an episode in each of {envs} environments; raise it, or use fewer --envs",
+            )
 
 
 def _check_device(device: str) -> None:
@@ -365,10 +329,7 @@ def _check_device(device: str) -> None:
     import torch
 
     try:
-        kind = torch.device(device).type
-        if kind != "cuda":
-            torch.zeros(1, device=device).item()  # the device meta holds no numbers
-    except RuntimeError as error:
-        raise ConfigError(f"--device {device}: is no device of PyTorch; try cpu") from error
-    if kind == "cuda" and not torch.cuda.is_available():
-        raise ConfigError(f"--device {device}: PyTorch finds no GPU here; use cpu")
+        torch.zeros(1, device=device).item()  # the device meta holds no numbers
+    except (RuntimeError, AssertionError) as error:  # AssertionError: PyTorch without CUDA
+        problem = str(error).partition("\n")[0]
+        raise ConfigError(f"--device {device}: {problem}; try cpu") from error

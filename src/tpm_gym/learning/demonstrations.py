@@ -1,12 +1,11 @@
 """Episodes of the scripted expert in the replay buffer, before training starts.
 
-A sparse reward teaches a policy nothing until it has picked up the object by chance, which takes
-very long. With demonstrations in the replay buffer it learns within minutes (Nair et al. 2018).
-They are stored as whole episodes, so that hindsight can relabel them. They count as environment
-steps, so that no learning curve hides them.
+With demonstrations in the replay buffer, pick-and-place learns from a sparse reward within minutes
+(Nair et al. 2018). They are stored as whole episodes, so that hindsight can relabel them, and count
+as environment steps, so that no learning curve hides them.
 """
 
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
@@ -25,18 +24,16 @@ class Demonstrations(BaseCallback):
     """Callback that fills the replay buffer with the expert's episodes when training starts.
 
     Every second episode has normally distributed noise on the motion, so that the policy learns in
-    states that the expert never reaches by itself. The expert does not plan again after the noise,
-    so some of these episodes fail.
+    states that the expert never reaches by itself; some of these episodes fail.
 
-    Attributes:
-        successes: Share of the episodes that ended in success; NaN before they are played.
+    ``successes`` is the share of the episodes that ended in success, NaN before they are played.
     """
 
     def __init__(self, episodes: int, noise: float = 0.3, verbose: int = 0) -> None:
         """Set the number of episodes and the noise.
 
         Args:
-            episodes: Number of episodes, rounded up to a multiple of the number of environments.
+            episodes: Rounded up to a multiple of the number of environments.
             noise: Standard deviation, in units of the largest action.
         """
         super().__init__(verbose)
@@ -69,7 +66,7 @@ class Demonstrations(BaseCallback):
         rng: np.random.Generator,
     ) -> list[bool]:
         """Play an episode of equal length in each environment; return whether each succeeded."""
-        expert, count = Expert(envs), envs.num_envs
+        expert, count, buffer = Expert(envs), envs.num_envs, cast(Any, model.replay_buffer)
         seen, _ = envs.reset(seed=rng.integers(1_000_000, size=count).tolist())
         while True:
             actions = expert.act(seen)
@@ -77,21 +74,11 @@ class Demonstrations(BaseCallback):
             actions = np.clip(actions, -1, 1).astype(np.float32)
             after, rewards, _, ended, told = envs.step(actions)
             infos = [
-                {
-                    "reward_terms": {k: v[row] for k, v in told["reward_terms"].items()},
-                    "TimeLimit.truncated": bool(ended[row]),
-                }
+                {"reward_terms": {k: v[row] for k, v in told["reward_terms"].items()}}
+                | {"TimeLimit.truncated": bool(ended[row])}
                 for row in range(count)
             ]
-            assert model.replay_buffer is not None
-            model.replay_buffer.add(
-                seen,  # type: ignore[arg-type]  # a dict, as HER's buffer wants it
-                after,  # type: ignore[arg-type]
-                actions,
-                rewards,
-                ended,
-                infos,
-            )
+            buffer.add(seen, after, actions, rewards, ended, infos)
             model.num_timesteps += count
             seen = after
             if ended.all():

@@ -3,6 +3,7 @@
 import importlib
 import signal
 import sys
+from contextlib import suppress
 from typing import Any
 
 import gymnasium as gym
@@ -31,10 +32,7 @@ def import_module_of(env_id: str) -> None:
 
 
 def check_env_id(env_id: str) -> EnvSpec:
-    """Return the registration of an id of ours, or of ``module:id`` if the module is imported.
-
-    Nothing is imported.
-    """
+    """Return the registration of an id of ours; a module of ``module:id`` is not imported."""
     module, _, name = env_id.rpartition(":")
     if module and module not in sys.modules:
         raise ConfigError(
@@ -48,10 +46,8 @@ def check_env_id(env_id: str) -> EnvSpec:
         raise ConfigError(f"unknown environment {env_id!r}; {there}") from error
     entry: Any = spec.entry_point
     if isinstance(entry, str):
-        try:
+        with suppress(ImportError, AttributeError):
             entry = load_env_creator(entry)
-        except (ImportError, AttributeError):
-            entry = None
     if not (isinstance(entry, type) and issubclass(entry, TPMEnv)):
         raise ConfigError(f"{env_id} is no environment of tpm_gym; it makes {spec.entry_point}")
     return spec

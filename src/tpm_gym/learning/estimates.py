@@ -35,7 +35,7 @@ def wilson(outcomes: Sequence[bool]) -> Estimate:
     spread = _Z95**2 / n
     centre = (rate + spread / 2) / (1 + spread)
     half = _Z95 / (1 + spread) * math.sqrt(rate * (1 - rate) / n + spread / (4 * n))
-    # At rates of 0 and 1 one end equals the rate up to rounding, which must not exclude the rate.
+    # Rounding must not exclude rates of 0 and 1.
     return Estimate(rate, max(0.0, min(rate, centre - half)), min(1.0, max(rate, centre + half)))
 
 

@@ -5,6 +5,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,20 +16,13 @@ from rich.table import Table
 
 from tpm_gym.envs.vector import TPMVectorEnv
 from tpm_gym.learning import provenance
-from tpm_gym.learning.configuration import UNSET, EnvOptions, check_least, shown_default, unset
+from tpm_gym.learning.configuration import UNSET, EnvOptions, check_least, unset
 from tpm_gym.learning.environments import check_env_id, import_module_of, make_envs
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.estimates import Estimate
 from tpm_gym.learning.film import write_contact_sheet, write_video
 from tpm_gym.learning.policies import load_policy, trained_in
-from tpm_gym.learning.rollout import (
-    BATCH,
-    TEST_SEED,
-    Episode,
-    Policy,
-    run_episodes,
-    summarise,
-)
+from tpm_gym.learning.rollout import BATCH, TEST_SEED, Episode, Policy, run_episodes, summarise
 
 # Label, key, factor, format and unit of each row of the table.
 _ROWS = (
@@ -50,8 +44,6 @@ class EvaluationConfig:
     """Evaluate policies over seeded episodes: a table, and optionally JSON, a video and a picture.
 
     Machine and drive are those that the policies were trained with, unless others are given.
-    A .zip file of Stable-Baselines3 holds pickles, which can run any code. It is refused unless
-    --trust-pickle is given.
     """
 
     policy: Annotated[tuple[str, ...], tyro.conf.arg(metavar="POLICY ...")]
@@ -75,7 +67,7 @@ class EvaluationConfig:
 
     env_options: tyro.conf.OmitArgPrefixes[EnvOptions] = field(default_factory=EnvOptions)
 
-    randomisation: Annotated[tuple[str, ...], shown_default("nowhere", "KEY=VALUE ...")] = ()
+    randomisation: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=VALUE ...")] = ()
     """Differences from the nominal machine: attributes of tpm_gym's Randomisation, each a number,
     or for factors LOW:HIGH to draw from, for example encoder_noise=1e-4 block_mass=0.5:2.
     Attributes of the block have no effect in a task without one."""
@@ -94,7 +86,7 @@ class EvaluationConfig:
     each."""
 
     trust_pickle: bool = False
-    """Load .zip files as well, which can run any code."""
+    """Load .zip files of Stable-Baselines3 as well: they hold pickles, which can run any code."""
 
 
 @dataclass(frozen=True)
@@ -121,8 +113,7 @@ class Result:
 def evaluate(config: EvaluationConfig, console: Console | None = None) -> list[Result]:
     """Evaluate the policies of a configuration, in order, and write the files it asks for.
 
-    Args:
-        console: Gets the table; by default the standard output.
+    The table is printed on ``console``, by default the standard output.
 
     Raises:
         LearningError: An option is not valid, or a policy cannot be used.
@@ -149,49 +140,46 @@ def evaluate(config: EvaluationConfig, console: Console | None = None) -> list[R
 def _check(config: EvaluationConfig) -> None:
     check_least(config, 1, "episodes", "video_episodes")
     check_least(config, 0, "seed")
-    if not config.policy:
-        raise ConfigError("--policy: name at least one policy")
-    for option, suffix in (("video", ".mp4"), ("picture", ".png")):
-        path = getattr(config, option)
-        if path is not None and path.suffix != suffix:
-            raise ConfigError(f"--{option} {path}: must end in {suffix}")
-    for option in ("json", "video", "picture"):
+    for option, suffix in {"json": "", "video": ".mp4", "picture": ".png"}.items():
         if (path := getattr(config, option)) is not None:
+            if not path.name.endswith(suffix):
+                raise ConfigError(f"--{option} {path}: must end in {suffix}")
             provenance.require_writable(f"--{option}", path)
 
 
 def _complete(config: EvaluationConfig) -> EvaluationConfig:
     """Take environment, machine and drive from the policies if they are not given."""
     trained = {spec: found for spec in config.policy if (found := trained_in(spec)) is not None}
-    env_id = config.env
-    if env_id is UNSET:
-        ids = sorted({found for found, _ in trained.values()})
-        if not ids:
+    if config.env is UNSET:
+        if not trained:
             raise ConfigError("expert and random have no environment of their own: give --env ID")
-        if len(ids) > 1:
-            raise ConfigError(
-                f"policies were trained on {', '.join(ids)}: choose one with --env ID"
-            )
-        env_id = ids[0]
+        env_id = _common("env", {spec: env for spec, (env, _) in trained.items()})
     else:
+        env_id = config.env
         import_module_of(env_id)
     given, usual = config.env_options.given(), _conditions(env_id, {})
     for name in ("machine", "drive"):
-        values = {spec: options.get(name, usual[name]) for spec, (_, options) in trained.items()}
-        if name in given or not values:
+        if name in given:
             continue
-        if len(set(values.values())) > 1:
-            each = ", ".join(f"{value} ({spec})" for spec, value in values.items())
-            raise ConfigError(f"policies differ in {name}: {each}; choose one with --{name}")
-        if (value := next(iter(values.values()))) != usual[name]:
+        values = {spec: options.get(name, usual[name]) for spec, (_, options) in trained.items()}
+        if values and (value := _common(name, values)) != usual[name]:
             given[name] = value
     return replace(config, env=env_id, env_options=EnvOptions(**given))
 
 
+def _common(option: str, values: Mapping[str, str]) -> str:
+    """Return the value that all policies have."""
+    found = set(values.values())
+    if len(found) > 1:
+        each = ", ".join(f"{value} ({spec})" for spec, value in values.items())
+        raise ConfigError(f"policies differ in {option}: {each}; choose one with --{option}")
+    return found.pop()
+
+
 def _conditions(env_id: str, given: Mapping[str, Any]) -> dict[str, str]:
     """Return the names of machine, engine and drive: those given, else those of the id."""
-    own = check_env_id(env_id).kwargs
     usual = {"machine": "paper", "engine": "pybullet", "drive": "ideal"}
+    own = check_env_id(env_id).kwargs
     found = {name: given.get(name) or own.get(name) or value for name, value in usual.items()}
     return {name: str(getattr(value, "name", value)) for name, value in found.items()}
 
@@ -199,27 +187,22 @@ def _conditions(env_id: str, given: Mapping[str, Any]) -> dict[str, str]:
 def _make_envs(
     config: EvaluationConfig, count: int, render_mode: str | None = None
 ) -> TPMVectorEnv:
-    return make_envs(
-        config.env,
-        count,
-        goals=config.goals,
-        penalty_weight=config.penalty_weight,
-        randomisation=parse_randomisation(config.randomisation),
-        render_mode=render_mode,
-        **config.env_options.given(),
-    )
+    options: dict[str, Any] = {name: getattr(config, name) for name in ("goals", "penalty_weight")}
+    options["randomisation"] = parse_randomisation(config.randomisation)
+    options |= config.env_options.given()
+    return make_envs(config.env, count, render_mode=render_mode, **options)
 
 
 def parse_randomisation(entries: Sequence[str]) -> dict[str, Any]:
     """Parse words such as ``friction=0.5:1`` into a mapping; environments check keys and values."""
     result: dict[str, Any] = {}
     for entry in entries:
-        name, equals, text = entry.partition("=")
+        name, _, text = entry.partition("=")
         try:
             numbers = [int(n) if n.isdecimal() else float(n) for n in text.split(":")]
         except ValueError:
             numbers = []
-        if not (name and equals and 1 <= len(numbers) <= 2) or name in result:
+        if not name or name in result or len(numbers) not in (1, 2):
             valid = "must be KEY=NUMBER or KEY=LOW:HIGH, each key once"
             raise ConfigError(f"--randomisation {entry}: {valid}")
         result[name] = numbers[0] if len(numbers) == 1 else (numbers[0], numbers[1])
@@ -227,8 +210,7 @@ def parse_randomisation(entries: Sequence[str]) -> dict[str, Any]:
 
 
 def _load(config: EvaluationConfig, envs: TPMVectorEnv) -> list[Policy]:
-    trust = config.trust_pickle
-    return [load_policy(spec, envs, trust_pickle=trust) for spec in config.policy]
+    return [load_policy(spec, envs, trust_pickle=config.trust_pickle) for spec in config.policy]
 
 
 def _evaluate_one(
@@ -238,13 +220,8 @@ def _evaluate_one(
     start = time.perf_counter()
     with Progress(console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task(spec, total=config.episodes)
-        records = run_episodes(
-            envs,
-            policy,
-            config.episodes,
-            config.seed,
-            on_episodes=lambda count: bar.advance(task, count),
-        )
+        advance = partial(bar.advance, task)
+        records = run_episodes(envs, policy, config.episodes, config.seed, on_episodes=advance)
     return Result(spec, summarise(records), records, time.perf_counter() - start)
 
 
@@ -261,41 +238,30 @@ def _table(config: EvaluationConfig, results: Sequence[Result]) -> Table:
     for result in results:
         table.add_column(result.policy, justify="right", overflow="fold")
     for label, name, factor, form, unit in _ROWS:
-        cells = [_cell(result.metrics[name], factor, form, unit) for result in results]
+        show = partial(_shown, form, factor)
+        found = [result.metrics[name] for result in results]
+        cells = [f"{show(e.mean)}{unit} \\[{show(e.low)}, {show(e.high)}]" for e in found]
         table.add_row(label, *cells)
-        worst = [result.metrics[name].worst for result in results]
-        if any(value is not None for value in worst):
-            table.add_row(
-                "  worst of all steps",
-                *(form.format((value or 0.0) * factor) + unit for value in worst),
-                style="dim",
-            )
+        worst = [show(estimate.worst) + unit for estimate in found if estimate.worst is not None]
+        if worst:
+            table.add_row("  worst of all steps", *worst, style="dim")
     rates = [f"{result.as_dict()['steps_per_second']:.0f}" for result in results]
     table.add_row("steps per second", *rates)
     return table
 
 
-def _cell(estimate: Estimate, factor: float, form: str, unit: str) -> str:
-    mean, low, high = (
-        form.format(value * factor) for value in (estimate.mean, estimate.low, estimate.high)
-    )
-    return f"{mean}{unit} \\[{low}, {high}]"
+def _shown(form: str, factor: float, value: float) -> str:
+    return form.format(value * factor)
 
 
 def _description(config: EvaluationConfig, results: Sequence[Result]) -> dict[str, Any]:
     """Return the content of the JSON file; a single policy has its metrics at the top level."""
-    if len(results) == 1:
-        content = results[0].as_dict()
-        records = {"records": content.pop("records")}  # last, since they are long
-    else:
-        content = {"policies": [result.as_dict() for result in results]}
-        records = {}
+    policies = [result.as_dict() for result in results]
+    content = policies[0] if len(policies) == 1 else {"policies": policies}
+    records = {name: content.pop(name) for name in ("records",) if name in content}  # long, so last
+    recorded = ("env", "episodes", "seed", "goals", "penalty_weight")
     return {
-        "env": config.env,
-        "episodes": config.episodes,
-        "seed": config.seed,
-        "goals": config.goals,
-        "penalty_weight": config.penalty_weight,
+        **{name: getattr(config, name) for name in recorded},
         "randomisation": parse_randomisation(config.randomisation),
         "env_options": _conditions(config.env, config.env_options.given()),
         **content,
@@ -316,11 +282,11 @@ def paths_per_policy(path: Path, policies: Sequence[str]) -> list[Path]:
 
 def _film(config: EvaluationConfig, console: Console) -> None:
     """Run the first episodes again with rendering, which would have slowed the evaluation."""
+    episodes = min(config.video_episodes, config.episodes)
     with closing(_make_envs(config, 1, "rgb_array")) as envs:
         for i, policy in enumerate(_load(config, envs)):
             if config.video is not None:
                 path = paths_per_policy(config.video, config.policy)[i]
-                episodes = min(config.video_episodes, config.episodes)
                 write_video(path, envs, policy, episodes, config.seed)
                 console.print(f"video: {path}", markup=False)
             if config.picture is not None:

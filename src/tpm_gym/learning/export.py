@@ -1,8 +1,4 @@
-"""Export of a trained policy as safetensors and JSON, which load without trust.
-
-``NAME.json`` holds network, spaces, environment, recipe, versions and SHA-256,
-``NAME.safetensors`` the weights of the actor, for ``tpm_gym.load_policy`` and ``tpm-gym evaluate``.
-"""
+"""Export of a trained policy as safetensors and JSON, which load without trust."""
 
 import copy
 import io
@@ -62,33 +58,37 @@ def save(
         ConfigError: ``path`` ends in .zip.
     """
     _require_free(path)
-    name = str(path)
-    known = (a for a, row in ALGORITHMS.items() if type(model) is row.load_class())
-    algorithm = next(known, None)
-    if algorithm is None:
-        raise refused(name, f"{type(model).__name__} is none of {NAMES}")
-    network, weights = _network(name, model, ALGORITHMS[algorithm].actor)
-    data = safetensors_bytes(weights)
-    if not isinstance(model.observation_space, spaces.Dict):
-        raise refused(name, f"observations in {model.observation_space}, not in a Dict")
-    boxes = {key: _box(name, key, box) for key, box in model.observation_space.items()}
-    content: dict[str, Any] = {
-        "format": FORMAT,
-        "version": VERSION,
-        "env": env_id,
-        "env_options": dict(env_options or {}),
-        "algorithm": algorithm,
-        "seed": seed,
-        "steps": model.num_timesteps,
-        "recipe": dict(recipe),
-        "versions": dict(provenance.versions() if versions is None else versions),
-        "network": network,
-        "action_space": _box(name, "actions", model.action_space),
-        "observation_space": boxes,
-        "weights": {"bytes": len(data), "sha256": sha256(data).hexdigest()},
-    }
-    content["sha256"] = digest(content)
-    return _write(name, path, content, data, model)
+    try:
+        known = (name for name, row in ALGORITHMS.items() if type(model) is row.load_class())
+        if (algorithm := next(known, None)) is None:
+            raise _UnfitError(f"{type(model).__name__} is none of {NAMES}")
+        if not isinstance(model.observation_space, spaces.Dict):
+            raise _UnfitError(f"observations in {model.observation_space}, not in a Dict")
+        network, weights = _network(model, ALGORITHMS[algorithm].actor)
+        data = safetensors_bytes(weights)
+        content: dict[str, Any] = {
+            "format": FORMAT,
+            "version": VERSION,
+            "env": env_id,
+            "env_options": dict(env_options or {}),
+            "algorithm": algorithm,
+            "seed": seed,
+            "steps": model.num_timesteps,
+            "recipe": dict(recipe),
+            "versions": dict(provenance.versions() if versions is None else versions),
+            "network": network,
+            "action_space": _box(model.action_space),
+            "observation_space": {k: _box(box) for k, box in model.observation_space.items()},
+            "weights": {"bytes": len(data), "sha256": sha256(data).hexdigest()},
+        }
+        content["sha256"] = digest(content)
+        return _write(path, content, data, model)
+    except (_UnfitError, TPMError) as error:
+        raise refused(str(path), f"cannot be exported: {error}") from error
+
+
+class _UnfitError(Exception):
+    """A policy cannot be written to files."""
 
 
 def save_archive(model: BaseAlgorithm, path: Path) -> None:
@@ -122,75 +122,68 @@ def _require_free(path: Path) -> None:
     pair = files(path)
     taken = [str(file) for file in pair if os.path.lexists(file)]
     if taken and not _is_policy(pair[0]):
-        problem = "is no policy of tpm_gym, and would be replaced; choose another name"
-        raise refused(taken[0], problem)
+        raise refused(
+            taken[0], "is no policy of tpm_gym, and would be replaced; choose another name"
+        )
 
 
 def convert(archive: Path, path: Path, *, trust_pickle: bool) -> Path:
     """Export ``best.zip`` or ``last.zip`` of a run with :func:`save`; return the JSON file."""
     if not archive.is_file():
-        known = "is not a file" if archive.exists() else "there is no such file"
-        raise ConfigError(f"MODEL {archive}: {known}; give best.zip or last.zip of a run")
+        raise ConfigError(f"MODEL {archive}: no such file; give best.zip or last.zip of a run")
     _require_free(path)
     provenance.require_writable("OUT", path)
     name = str(archive)
     require_trust(name, archive, trust_pickle)
     config = run_config(name, archive)
-    return save(
-        load_model(name, archive),
-        path,
-        env_id=config["env"],
-        seed=config["seed"],
-        recipe=config["recipe"],
-        env_options=config["env_options"],
-        versions=config.get("versions"),
-    )
+    about = {key: config[key] for key in ("seed", "recipe", "env_options")}
+    model = load_model(name, archive)
+    return save(model, path, env_id=config["env"], versions=config.get("versions"), **about)
 
 
 def _network(
-    name: str, model: BaseAlgorithm, actor: Actor
+    model: BaseAlgorithm, actor: Actor
 ) -> tuple[dict[str, Any], dict[str, NDArray[np.float32]]]:
     """Return the description and the weights of the layers of the mean action."""
     if getattr(model, "use_sde", False):
-        raise refused(name, "state-dependent exploration (use_sde) cannot be exported")
+        raise _UnfitError("state-dependent exploration (use_sde)")
     if model.get_vec_normalize_env() is not None:
-        raise refused(name, "normalised observations (VecNormalize) cannot be exported")
+        raise _UnfitError("normalised observations (VecNormalize)")
     part = model.policy.get_submodule
     hidden: Any = part(actor.hidden)
     modules = [*hidden, part(actor.last)]  # linear, activation, linear, ..., linear
-    linear, between = modules[::2], modules[1::2]
-    kinds = {_ACTIVATIONS.get(type(module)) for module in between} or {"relu"}
-    if any(type(m) is not nn.Linear or m.bias is None for m in linear) or len(kinds - {None}) != 1:
-        raise refused(name, f"only linear layers with ReLU or Tanh can be exported: {modules}")
-    weights: dict[str, NDArray[np.float32]] = {}
-    for i, module in enumerate(linear):
-        for tensor in ("weight", "bias"):
-            values = getattr(module, tensor).detach().cpu().numpy().astype(np.float32)
-            if not np.isfinite(values).all():
-                raise refused(name, "its weights are not finite: the training diverged")
-            weights[f"layers.{i}.{tensor}"] = values
+    linear: Any = modules[::2]
+    kinds = {_ACTIVATIONS.get(type(module)) for module in modules[1::2]} or {"relu"}
+    if {type(module) for module in linear} != {nn.Linear} or len(kinds) > 1 or None in kinds:
+        raise _UnfitError(f"only linear layers with ReLU or Tanh can be: {modules}")
+    weights = {
+        f"layers.{i}.{tensor}": values.detach().cpu().numpy().astype(np.float32)
+        for i, module in enumerate(linear)
+        for tensor, values in module.named_parameters()
+    }
+    if not all(np.isfinite(values).all() for values in weights.values()):
+        raise _UnfitError("its weights are not finite: the training diverged")
     description = {
-        "features": _features(name, part(actor.features)),
+        "features": _features(part(actor.features)),
         "hidden": [module.out_features for module in linear[:-1]],
-        "activation": next(iter(kinds - {None})),
+        "activation": kinds.pop(),
         "output": actor.output,
     }
     return description, weights
 
 
-def _features(name: str, extractor: nn.Module) -> dict[str, Any]:
+def _features(extractor: nn.Module) -> dict[str, Any]:
     """Describe the input of the first layer."""
     if type(extractor) is GoalGapExtractor:
         return {"kind": "goal_gap", "unit": extractor.unit}
     if type(extractor) is CombinedExtractor:
         return {"kind": "concatenate", "keys": list(extractor.extractors)}
-    wanted = "CombinedExtractor or GoalGapExtractor"
-    raise refused(name, f"features of {type(extractor).__name__}, not of {wanted}")
+    raise _UnfitError(f"features of {type(extractor).__name__}")
 
 
-def _box(name: str, what: str, space: spaces.Space[Any]) -> dict[str, Any]:
+def _box(space: spaces.Space[Any]) -> dict[str, Any]:
     if not isinstance(space, spaces.Box) or not space.is_bounded() or space.dtype.kind != "f":
-        raise refused(name, f"{what} in {space}, not in a bounded Box of floats")
+        raise _UnfitError(f"{space} is no bounded Box of floats")
     return {
         "shape": list(space.shape),
         "dtype": space.dtype.name,
@@ -199,9 +192,7 @@ def _box(name: str, what: str, space: spaces.Space[Any]) -> dict[str, Any]:
     }
 
 
-def _write(
-    name: str, path: Path, content: Mapping[str, Any], data: bytes, model: BaseAlgorithm
-) -> Path:
+def _write(path: Path, content: Mapping[str, Any], data: bytes, model: BaseAlgorithm) -> Path:
     """Write both files under other names, verify them, and rename them."""
     json_file, weights_file = files(path)
     json_file.parent.mkdir(parents=True, exist_ok=True)
@@ -210,7 +201,7 @@ def _write(
         text = json.dumps(content, indent=1, allow_nan=False) + "\n"
         new_json.write_text(text, encoding="ascii")
         new_weights.write_bytes(data)
-        _verify(name, model, new_json)
+        _verify(model, new_json)
         # Between the two renames, the sums show a reader that the files do not belong together.
         # After a kill there, the JSON file allows the next export to replace both.
         new_json.replace(json_file)
@@ -218,7 +209,7 @@ def _write(
     return json_file
 
 
-def _verify(name: str, model: BaseAlgorithm, written: Path) -> None:
+def _verify(model: BaseAlgorithm, written: Path) -> None:
     """Compare the actions of the written policy with those of the model."""
     rng = np.random.default_rng(0)
     boxes: Any = model.observation_space
@@ -230,13 +221,9 @@ def _verify(name: str, model: BaseAlgorithm, written: Path) -> None:
     model.policy.set_training_mode(training)
     # On the CPU, since a GPU rounds differently; on a copy, so that the model stays as it is.
     policy: Any = copy.deepcopy(model.policy).to("cpu")
-    try:
-        actions = load_policy(written).act(batch)
-    except TPMError as error:
-        raise refused(name, f"cannot be exported: {error}") from error
     space: Any = model.action_space
     expected, _ = policy.predict(batch, deterministic=True)
     scale = np.maximum(1.0, (space.high - space.low) / 2)
-    off = float(np.max(np.abs(actions - expected) / scale))
+    off = float(np.max(np.abs(load_policy(written).act(batch) - expected) / scale))
     if not off <= TOLERANCE:
-        raise refused(name, f"cannot be exported: its actions would be off by {off:.2g}")
+        raise _UnfitError(f"its actions would be off by {off:.2g}")

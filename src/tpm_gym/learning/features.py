@@ -8,10 +8,9 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 class GoalGapExtractor(BaseFeaturesExtractor):
     """Features extractor that scales the distance to the goal.
 
-    Achieved and desired goals are in metres and differ by some centimetres, and success depends on
-    one centimetre. A network would get numbers near zero whose small difference decides the result.
-    The features are therefore the observation, which is of order one, and (desired - achieved) /
-    unit. The achieved goal is part of the observation already, in its own scale.
+    Goals are in metres, and success depends on one centimetre. The features are therefore the
+    observation, which is of order one, and (desired - achieved) / unit. The achieved goal is part
+    of the observation already.
     """
 
     def __init__(self, observation_space: spaces.Dict, unit: float = 0.05) -> None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +13,7 @@ from tpm_gym.learning.rollout import Policy, run_episodes
 
 Frame = NDArray[np.uint8]
 
-_ROWS: Final = 2
-_COLUMNS: Final = 3
+_ROWS, _COLUMNS = 2, 3
 
 
 def write_video(
@@ -24,11 +23,11 @@ def write_video(
     import imageio.v2 as imageio
 
     def write(part: Path) -> None:
-        fps = envs.metadata["render_fps"]
         # H.264 needs an even width and height.
-        writer: Any = imageio.get_writer(part, fps=fps, macro_block_size=2)
+        options = {"fps": envs.metadata["render_fps"], "macro_block_size": 2}
+        writer: Any = imageio.get_writer(part, **options)
         with writer as video:
-            add: Any = video.append_data
+            add = video.append_data
             run_episodes(envs, policy, episodes, first_seed, on_frame=lambda: add(envs.render()[0]))
 
     write_whole(path, write)
@@ -45,14 +44,10 @@ def write_contact_sheet(path: Path, envs: TPMVectorEnv, policy: Policy, seed: in
 
 
 def contact_sheet(frames: Sequence[Frame]) -> Frame:
-    """Return evenly spaced frames, from the first to the end of the motion, as one picture.
-
-    Its shape is (2 * height, 3 * width, 3).
-    """
+    """Return evenly spaced frames, up to the end of the motion, as (2 * height, 3 * width, 3)."""
     # Two frames differ if more than the last millimetres of a motion lie between them.
-    differ = [bool((frame != frames[-1]).any(axis=-1).mean() > 1e-2) for frame in frames]
-    moving = np.flatnonzero(differ)
-    last = min(int(moving[-1]) + 1, len(frames) - 1) if moving.size else len(frames) - 1
+    differ = [(frame != frames[-1]).any(axis=-1).mean() > 1e-2 for frame in frames]
+    last = max(np.flatnonzero(differ), default=len(frames) - 2) + 1
     moments = np.linspace(0, last, _ROWS * _COLUMNS).round().astype(int)
     chosen = [frames[moment] for moment in moments]
     rows = [np.hstack(chosen[row * _COLUMNS : (row + 1) * _COLUMNS]) for row in range(_ROWS)]

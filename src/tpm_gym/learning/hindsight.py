@@ -15,14 +15,11 @@ class PenaltyHerReplayBuffer(HerReplayBuffer):
     """Hindsight experience replay for a reward of the form ``R(achieved, goal) - penalty``.
 
     Stable-Baselines3 relabels with ``compute_reward(achieved, new_goal, {})``. The info is empty,
-    so the penalty would vanish from the four samples of five that are relabelled. The penalty does
-    not depend on the goal. With the stored reward r, the next achieved goal ag', the old goal g and
-    the new goal g', the reward for g' is therefore
+    so the penalty would vanish from the four samples of five that are relabelled. It does not
+    depend on the goal. With the stored reward r, the next achieved goal ag', the old goal g and the
+    new goal g', the reward for g' is therefore
 
         r' = r - R(ag', g) + R(ag', g')
-
-    Only the task term R is computed, for the whole batch at once, and no info is stored.
-    (``copy_info_dict=True`` would also keep the penalty, but copies every info of every batch.)
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -34,8 +31,7 @@ class PenaltyHerReplayBuffer(HerReplayBuffer):
         super().__init__(*args, **kwargs)
         if self.copy_info_dict:
             raise ConfigError(
-                "copy_info_dict=True: the stored infos already carry the penalty and it would be "
-                "counted twice; leave copy_info_dict off, or use HerReplayBuffer"
+                "copy_info_dict=True: the penalty would be counted twice; leave it off"
             )
 
     def _get_virtual_samples(
@@ -47,10 +43,8 @@ class PenaltyHerReplayBuffer(HerReplayBuffer):
         """Relabel as the parent does, then add the goal-independent part of the reward."""
         if env is not None and env.norm_reward:
             # The parent has normalised R(ag', g'); a sum with raw rewards has no meaning.
-            raise ConfigError(
-                "VecNormalize has norm_reward=True: relabelled rewards cannot be corrected after "
-                "normalisation; wrap the environment with VecNormalize(..., norm_reward=False)"
-            )
+            problem = "relabelled rewards cannot be corrected after normalisation"
+            raise ConfigError(f"VecNormalize: {problem}; give it norm_reward=False")
         samples = super()._get_virtual_samples(batch_indices, env_indices, env)
         kept = self._goal_independent_reward(batch_indices, env_indices)  # (n,)
         rewards = samples.rewards + self.to_torch(kept.reshape(-1, 1))  # (n, 1)
@@ -60,11 +54,7 @@ class PenaltyHerReplayBuffer(HerReplayBuffer):
         self, batch_indices: NDArray[np.int64], env_indices: NDArray[np.int64]
     ) -> NDArray[np.float32]:
         """Return r - R(ag', g) of stored transitions, the negative weighted penalty, (n,)."""
-        if self.env is None:
-            raise ConfigError(
-                "the buffer has no environment to compute rewards with; call set_env() after "
-                "loading it"
-            )
+        assert self.env is not None  # as in the parent
         achieved = self.next_observations["achieved_goal"][batch_indices, env_indices]  # (n, 3) m
         desired = self.next_observations["desired_goal"][batch_indices, env_indices]  # (n, 3) m
         infos: list[dict[str, Any]] = [{} for _ in range(len(batch_indices))]

@@ -1,8 +1,7 @@
 """Policies by name: the scripted expert, uniform random actions, or a trained policy on file.
 
-A trained policy comes in two forms. Exported, as ``NAME.json`` and ``NAME.safetensors``, it is
-plain data and loads safely. As an archive of Stable-Baselines3, ``NAME.zip``, it holds pickles,
-which can run any code when they are loaded. The archive needs ``trust_pickle``.
+An exported policy is plain data and loads safely. An archive of Stable-Baselines3 (.zip) holds
+pickles, which can run any code when they are loaded, and needs ``trust_pickle``.
 """
 
 from __future__ import annotations
@@ -65,30 +64,22 @@ class RandomPolicy:
         return drawn.astype(self.space.dtype)
 
 
-@dataclass(frozen=True)
-class ExpertPolicy:
+class ExpertPolicy(Expert):
     """Policy that acts with the scripted controller, which is deterministic."""
 
-    expert: Expert
-
-    def reset(self, observation: Observation, seeds: Sequence[int]) -> None:
+    def reset(self, observation: Observation, seeds: Sequence[int] = ()) -> None:
         """Plan the motion of the episodes."""
-        self.expert.reset(observation)
-
-    def act(self, observation: Observation) -> Action:
-        """Return the actions of the controller."""
-        return self.expert.act(observation)
+        super().reset(observation)
 
 
 def load_policy(spec: str, envs: TPMVectorEnv, *, trust_pickle: bool = False) -> Policy:
-    """Return the policy that ``spec`` names.
+    """Return a policy that acts in ``envs``.
 
     Args:
         spec: ``expert``, ``random``, an exported policy (either of its files, or their common
             name), the id of a published one, a .zip file of a training, or the folder of a run (its
             best policy).
-        envs: Environments that the policy acts in.
-        trust_pickle: Whether a .zip file may be loaded, which can run any code.
+        trust_pickle: Whether a .zip file may be loaded.
 
     Raises:
         PolicyError: There is no such policy, its files are damaged, it does not fit ``envs``, or it
@@ -97,8 +88,11 @@ def load_policy(spec: str, envs: TPMVectorEnv, *, trust_pickle: bool = False) ->
     if spec == "random":
         return RandomPolicy(envs.single_action_space)
     if spec == "expert":
-        return ExpertPolicy(Expert(envs))
+        return ExpertPolicy(envs)
     path = _policy_file(spec)
+    import torch  # here, so that scripted policies need no PyTorch
+
+    torch.set_num_threads(1)  # the networks are small, and one thread repeats exactly
     if path.suffix not in EXPORTED:
         require_trust(spec, path, trust_pickle)
         model = load_model(spec, path)
@@ -108,7 +102,6 @@ def load_policy(spec: str, envs: TPMVectorEnv, *, trust_pickle: bool = False) ->
                 problem = f"was trained with {kind} space {trained}, the environment has {given}"
                 raise refused(spec, problem)
         return TrainedPolicy(model)
-    _use_one_thread()
     try:
         policy = tpm_gym.load_policy(path)
         policy.check(envs)
@@ -118,17 +111,16 @@ def load_policy(spec: str, envs: TPMVectorEnv, *, trust_pickle: bool = False) ->
 
 
 def trained_in(spec: str) -> tuple[str, dict[str, str]] | None:
-    """Return the environment id and its options that a policy was trained with.
+    """Return the environment id and its options that a policy was trained with, if any.
 
-    Nothing is unpickled. A scripted policy has none.
+    Nothing is unpickled.
     """
     if spec in SCRIPTED:
         return None
     path = _policy_file(spec)
     if path.suffix not in EXPORTED:
         config = run_config(spec, path)
-        options = {name: str(value) for name, value in config["env_options"].items()}
-        return config["env"], options
+        return config["env"], config["env_options"]
     from tpm_gym.policy.files import read_description
 
     try:
@@ -149,7 +141,7 @@ def require_trust(spec: str, path: Path, trusted: bool) -> None:
         raise refused(
             spec,
             f"{path} holds pickles, and loading it can run any code; if you trust where it comes "
-            "from, give --trust-pickle, or convert it once and share that instead: "
+            "from, give --trust-pickle, or convert it once: "
             f"tpm-gym export {path} {path.with_suffix('')} --trust-pickle",
         )
 
@@ -166,38 +158,31 @@ def _policy_file(spec: str) -> Path:
     for candidate in candidates:
         if candidate.is_file():
             return candidate
-    looked_for = " or ".join(str(candidate) for candidate in candidates)
-    known = f"{', '.join(SCRIPTED)}, an exported policy (.json), the id of a published one"
-    archives = "a .zip of a training, or the folder of a run"
-    raise refused(spec, f"no file {looked_for}; expected {known}, {archives}")
+    raise refused(
+        spec,
+        f"no file {' or '.join(map(str, candidates))}; expected {', '.join(SCRIPTED)}, an exported "
+        "policy (.json), the id of a published one, a .zip of a training, or the folder of a run",
+    )
 
 
 def run_config(spec: str, path: Path) -> dict[str, Any]:
     """Return the run's configuration, from beside or above a .zip file."""
     wanted = {"algo": str, "env": str, "seed": int, "recipe": dict, "env_options": dict}
-    for folder in path.resolve().parents[:2]:  # the run folder, or one inside it
-        file = folder / CONFIG_FILE
-        if not file.is_file():
-            continue
-        try:
-            content = read_json(file)
-        except (OSError, ValueError) as error:
-            raise refused(spec, f"{file} is damaged: {error}") from error
-        for key, kind in wanted.items():
-            if not isinstance(content, dict) or not isinstance(content.get(key), kind):
-                raise refused(spec, f"{file} is damaged: no entry {key!r} ({kind.__name__})")
-        found: dict[str, Any] = content
-        return found
-    raise refused(
-        spec, f"no {CONFIG_FILE} beside {path.name} or above it; keep the file in its run folder"
-    )
-
-
-def _use_one_thread() -> None:
-    """Let PyTorch use one thread: the networks are small, and one thread repeats exactly."""
-    import torch  # imported here, so that scripted policies need no PyTorch
-
-    torch.set_num_threads(1)
+    files = [folder / CONFIG_FILE for folder in path.resolve().parents[:2]]
+    file = next(filter(Path.is_file, files), None)
+    if file is None:
+        problem = (
+            f"no {CONFIG_FILE} beside {path.name} or above it; keep the file in its run folder"
+        )
+        raise refused(spec, problem)
+    try:
+        content: dict[str, Any] = dict(read_json(file))
+        wrong = [key for key, kind in wanted.items() if not isinstance(content.get(key), kind)]
+    except (OSError, ValueError, TypeError) as error:
+        raise refused(spec, f"{file} is damaged: {error}") from error
+    if wrong:
+        raise refused(spec, f"{file} is damaged: no entry {wrong[0]!r}")
+    return content
 
 
 def load_model(spec: str, path: Path) -> BaseAlgorithm:
@@ -206,12 +191,14 @@ def load_model(spec: str, path: Path) -> BaseAlgorithm:
     algorithm = config["algo"]
     if algorithm not in ALGORITHMS:
         raise refused(spec, f"algorithm {algorithm!r} is none of {NAMES}")
-    _use_one_thread()
     # Acting needs no replay buffer, and a hindsight buffer would need an environment.
-    replaced: dict[str, Any]
-    replaced = {"replay_buffer_class": None, "replay_buffer_kwargs": {}, "buffer_size": 1}
+    unused: dict[str, Any] = {
+        "replay_buffer_class": None,
+        "replay_buffer_kwargs": {},
+        "buffer_size": 1,
+    }
     try:
         kind = ALGORITHMS[algorithm].load_class()
-        return kind.load(path, device="cpu", custom_objects=replaced)
+        return kind.load(path, device="cpu", custom_objects=unused)
     except Exception as error:  # a damaged archive or pickle can raise anything
         raise refused(spec, f"cannot be loaded as {algorithm}: {error}") from error

@@ -9,6 +9,7 @@ import sys
 import tempfile
 import uuid
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Final
@@ -16,14 +17,8 @@ from typing import Any, Final
 from tpm_gym.learning.errors import ConfigError
 
 _PACKAGES: Final = (
-    "numpy",
-    "numba",
-    "torch",
-    "gymnasium",
-    "pybullet",
-    "stable-baselines3",
-    "sb3-contrib",
-    "tpm_gym",
+    *("numpy", "numba", "torch", "gymnasium", "pybullet"),
+    *("stable-baselines3", "sb3-contrib", "tpm_gym"),
 )
 
 
@@ -55,33 +50,25 @@ def git_commit() -> str | None:
 
     ``+modified`` is appended if tracked files differ from the commit.
     """
-    commit = _git("rev-parse", "HEAD")
-    if commit is None:
-        return None
-    return f"{commit}+modified" if _git("status", "--porcelain", "--untracked-files=no") else commit
-
-
-def _git(*arguments: str) -> str | None:
-    """Return the output of a git command; None if the command fails."""
-    command = ["git", "-C", str(Path(__file__).parent), *arguments]
+    git = ["git", "-C", str(Path(__file__).parent)]
+    words = ["describe", "--always", "--abbrev=40", "--match=", "--dirty=+modified"]
     try:
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+        found = subprocess.run([*git, *words], capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):
         return None
+    return found.stdout.strip()
 
 
 def machine() -> dict[str, Any]:
     """Return the properties of the computer that decide its speed; nothing that identifies it."""
-    try:
-        # platform.processor() is empty or only the architecture on most Linux systems.
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        lines = []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    processor = platform.processor()
+    with suppress(OSError, IndexError):  # on most Linux systems the above is empty
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
+        processor = text.split("model name", 1)[1].splitlines()[0].lstrip("\t: ")
     return {
         "system": platform.system(),
         "architecture": platform.machine(),
-        "processor": names[0] if names else platform.processor(),
+        "processor": processor,
         "cpu_count": os.cpu_count(),
     }
 
@@ -90,8 +77,7 @@ def command_line(arguments: Sequence[str] | None = None) -> str:
     """Return a command that repeats this process, without folders outside the working directory."""
     program, *words = sys.argv if arguments is None else arguments
     # ``python -m tpm_gym.learning`` is the same command.
-    main = Path(__file__).with_name("__main__.py")
-    ours = Path(program).name == "tpm-gym" or Path(program) == main
+    ours = Path(program).name == "tpm-gym" or Path(program) == Path(__file__).parent / "__main__.py"
     first = ["tpm-gym"] if ours else ["python", _portable(program)]
     return shlex.join([*first, *map(_portable, words)])
 
@@ -119,7 +105,7 @@ def require_writable(option: str, path: Path) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file."""
+    """Read a JSON file; raise a ValueError if it is damaged."""
     try:
         return json.loads(path.read_bytes())
     except RecursionError as error:

@@ -7,11 +7,11 @@ Values are plain YAML and nothing is evaluated. Where the zoo evaluates a string
 ``"dict(net_arch=[64, 64])"``, a mapping is written here, which the zoo reads as well.
 """
 
-from collections.abc import Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any, get_type_hints
 
 import yaml
 from pydantic import ConfigDict, TypeAdapter, ValidationError
@@ -42,17 +42,12 @@ class Recipe:
 
     def entries(self) -> dict[str, Any]:
         """Return the recipe as it stands in a file."""
-        optional = {
-            "replay_buffer_class": "HerReplayBuffer" if self.hindsight else None,
-            "demonstrations": self.demonstrations,
-        }
-        return {
-            "n_timesteps": self.n_timesteps,
-            "n_envs": self.n_envs,
-            "policy": self.policy,
-            **{name: value for name, value in optional.items() if value},
-            **self.arguments,
-        }
+        found = {"n_timesteps": self.n_timesteps, "n_envs": self.n_envs, "policy": self.policy}
+        if self.hindsight:
+            found["replay_buffer_class"] = "HerReplayBuffer"
+        if self.demonstrations:
+            found["demonstrations"] = self.demonstrations
+        return {**found, **self.arguments}
 
     def keywords(self, update: float = 0.0) -> dict[str, Any]:
         """Return keyword arguments of the algorithm's constructor, with classes for names.
@@ -62,25 +57,18 @@ class Recipe:
                 to zero reaches zero that much after the last update. With 0, as in
                 Stable-Baselines3, the last update has a rate of zero and teaches nothing.
         """
-        entries = {"policy": self.policy, **self.arguments}
-        if self.hindsight:
-            entries["replay_buffer_class"] = "HerReplayBuffer"
+        entries = self.entries()
+        for name in ("n_timesteps", "n_envs", "demonstrations"):
+            entries.pop(name, None)
         rate = entries.get("learning_rate")
         if isinstance(rate, str):
-            entries["learning_rate"] = Falling(float(rate.removeprefix("lin_")), update)
+            entries["learning_rate"] = partial(_falling, float(rate.removeprefix("lin_")), update)
         return with_classes(entries)
 
 
-@dataclass(frozen=True)
-class Falling:
-    """Learning rate that falls linearly to zero; see :meth:`Recipe.keywords`."""
-
-    start: float
-    update: float
-
-    def __call__(self, remaining: float) -> float:
-        """Return the rate of an update at whose end this share of the training remains."""
-        return self.start * max(0.0, min(1.0, remaining + self.update))
+def _falling(start: float, update: float, remaining: float) -> float:
+    """Return the rate of an update at whose end the share ``remaining`` of the training is left."""
+    return start * max(0.0, min(1.0, remaining + update))
 
 
 def recipe(env_id: str, algorithm: str = "sac", engine: str | None = None) -> dict[str, Any]:
@@ -134,7 +122,7 @@ def read_recipe(path: Path, algorithm: str, env_id: str) -> Recipe:
             for file in RECIPES.glob(f"{algorithm}-*.yml")
             if name in read_recipes(file, algorithm)
         ]
-        there = f"there are {_listed(recipes)}{''.join(elsewhere)}"
+        there = f"there are {', '.join(recipes)}{''.join(elsewhere)}"
         own = "a file of yours with one is --recipe FILE"
         raise ConfigError(f"{path}: no recipe for {name}; {there}; {own}")
     arguments = dict(recipes[name])
@@ -156,45 +144,29 @@ def read_recipes(path: Path, algorithm: str) -> dict[str, dict[str, Any]]:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         raise ConfigError(f"{path}: is not YAML: {error}") from error
-    if not isinstance(content, dict):
-        raise ConfigError(f"{path}: must hold one mapping per environment id")
     check_recipes(str(path), content, algorithm)
-    return content
+    found: dict[str, dict[str, Any]] = content
+    return found
 
 
-def check_recipes(source: str, recipes: Mapping[str, Any], algorithm: str) -> None:
+def check_recipes(source: str, recipes: Any, algorithm: str) -> None:
     """Check recipes, name -> entries."""
-    kind: Any = dict[str, ALGORITHMS[algorithm].entries()]  # type: ignore[misc]
+    entries = ALGORITHMS[algorithm].entries()
+    kind: Any = dict[str, entries]  # type: ignore[valid-type]
     strict = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
     try:
         TypeAdapter(kind, config=strict).validate_python(recipes)
     except ValidationError as error:
-        raise ConfigError(f"{source}: {_explained(error, kind)}") from error
-    for name, entries in recipes.items():
-        if "replay_buffer_kwargs" in entries and "replay_buffer_class" not in entries:
+        first = error.errors()[0]
+        # A value of several types has an error for each.
+        place = first["loc"][:2]
+        problems = [e["msg"] for e in error.errors() if e["loc"][:2] == place]
+        problem = " or ".join(dict.fromkeys(problems))
+        if first["type"] == "extra_forbidden" and len(first["loc"]) == 2:
+            problem = f"unknown key; valid keys: {', '.join(sorted(get_type_hints(entries)))}"
+        where = ".".join(map(str, first["loc"]))
+        raise ConfigError(f"{source}: {where}: {problem}, not {first['input']!r:.100}") from error
+    for name, recipe in recipes.items():
+        if "replay_buffer_kwargs" in recipe and "replay_buffer_class" not in recipe:
             where = f"{source}: {name}.replay_buffer_kwargs"
             raise ConfigError(f"{where}: no effect without replay_buffer_class: HerReplayBuffer")
-
-
-def _explained(error: ValidationError, kind: Any) -> str:
-    """Return the first entry that is not valid, and valid ones."""
-    first = error.errors()[0]
-    names = [str(name) for name in first["loc"]]
-    entry, value = ".".join(names), first["input"]
-    if first["type"] == "extra_forbidden":
-        valid: Any = get_args(kind)[1]
-        for name in names[1:-1]:
-            valid = get_type_hints(valid)[name]
-        return f"{entry}: unknown key; valid keys: {_listed(get_type_hints(valid))}"
-    if first["type"] == "missing":
-        return f"{entry}: is missing"
-    needed = first["msg"].removeprefix("Value error, ").replace("Input should", "must", 1)
-    hint = ""
-    if isinstance(value, str):
-        with suppress(ValueError):
-            hint = f" (YAML takes {value} for text; write {float(value)!r})"
-    return f"{entry}: {needed}, not {value!r:.100}{hint}"
-
-
-def _listed(names: Iterable[object]) -> str:
-    return ", ".join(sorted(map(str, names)))

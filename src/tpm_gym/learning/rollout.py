@@ -1,11 +1,8 @@
 """Rollouts of a policy over seeded episodes, and their metrics.
 
-Seeds fall into three disjoint ranges, so that no result comes from episodes that a policy was
-trained on or selected by:
-
-- below ``SELECTION_SEED``: training;
-- from ``SELECTION_SEED``: the periodic evaluations during training, which select ``best.zip``;
-- from ``TEST_SEED``: ``tpm-gym evaluate``.
+Seeds of training lie below ``SELECTION_SEED``, those of the periodic evaluations that select
+``best.zip`` from there up, and those of ``tpm-gym evaluate`` from ``TEST_SEED`` up. So no result
+comes from episodes that a policy was trained on or selected by.
 """
 
 from __future__ import annotations
@@ -21,13 +18,13 @@ from numpy.typing import NDArray
 
 from tpm_gym.learning.errors import RolloutError
 from tpm_gym.learning.estimates import Estimate, bootstrap, wilson
-from tpm_gym.simulation.state import State
 
 if TYPE_CHECKING:
     from tpm_gym.envs.vector import TPMVectorEnv
 
 SELECTION_SEED: Final = 1_000_000
 TEST_SEED: Final = 2_000_000
+_TOLD: Final = ("conditioning", "closure_error", "is_success", "singularity_penalty")
 BATCH: Final = 1000
 """Largest number of environments that are evaluated at once."""
 
@@ -51,17 +48,13 @@ class Episode:
     """Outcome of one episode.
 
     Attributes:
-        success_at_end: Whether the last step was a success.
         total_reward: Undiscounted sum of rewards, the return.
         conditioning_min: Smallest 1/cond(J) of all steps, in [0, 1].
-        conditioning_mean: Mean 1/cond(J) over the steps.
         closure_error_max: Largest loop gap of all steps, m.
-        unsafe_share: Share of the steps with a singularity penalty, so below the machine's
-            safe conditioning.
+        unsafe_share: Share of the steps below the machine's safe conditioning.
         fk_error_max: Largest distance of the observed point P (forward kinematics of the encoders)
-            from that of the simulated platform, m.
-        torque_rms: Root mean square of the motors' torques at the ends of the steps, over steps and
-            motors, N m.
+            from the simulated one, m.
+        torque_rms: Root mean square of the motors' torques at the ends of the steps, N m.
         torque_peak: Largest of these torques, N m.
     """
 
@@ -95,19 +88,16 @@ def run_episodes(
     on_frame: Callable[[], object] | None = None,
     on_episodes: Callable[[int], object] | None = None,
 ) -> list[Episode]:
-    """Run a policy for a number of episodes; the same arguments give the same records.
+    """Run a policy for a number of episodes; equal arguments give equal records.
 
     Args:
         envs: Environments with next-step autoreset, as many as run at a time; left open.
-        policy: Acts in all of them.
-        episodes: Number of episodes.
         first_seed: Episode i is reset with ``first_seed + i``.
         on_frame: Called after every reset and every step, for example to record a video.
         on_episodes: Called with the number of episodes that ended, to move a progress bar.
 
     Raises:
-        RolloutError: A reward, a conditioning, a closure error, a distance of forward kinematics
-            from the truth or a torque is not finite.
+        RolloutError: A value of a record is not finite.
     """
     records = []
     for first in range(first_seed, first_seed + episodes, envs.num_envs):
@@ -135,7 +125,11 @@ def _run_together(
     running = np.ones(envs.num_envs, dtype=np.bool_)
     while running[:count].any():
         observation, reward, _, truncated, info = envs.step(policy.act(observation))
-        steps.append(_measured(reward, info, envs.state))
+        state = envs.state
+        gap = state.fk_position - state.platform_position
+        told = {name: info[name] for name in _TOLD}
+        told["fk_error"] = np.sqrt((gap * gap).sum(axis=-1))
+        steps.append({"reward": reward, "torque": state.torque, **told})
         lengths += running
         running &= ~truncated
         if on_frame is not None:
@@ -147,50 +141,35 @@ def _run_together(
     ]
 
 
-def _measured(reward: Any, info: Mapping[str, Any], state: State) -> dict[str, Any]:
-    """Return the values of one step that go into the records, each (n, ...)."""
-    gap = state.fk_position - state.platform_position
-    told = ("conditioning", "closure_error", "is_success", "singularity_penalty")
-    return {
-        "reward": reward,
-        **{name: info[name] for name in told},
-        "fk_error": np.sqrt((gap * gap).sum(axis=-1)),
-        "torque": state.torque,
-    }
-
-
 def _record(seed: int, steps: Mapping[str, NDArray[Any]]) -> Episode:
     """Condense an episode from its steps' values (n, ...)."""
     for name, values in steps.items():
         if not np.isfinite(values).all():
-            # A NaN would pass through min and max unseen, depending on where it stands.
             place = tuple(np.argwhere(~np.isfinite(values))[0].tolist())
             where = f"episode with seed {seed}, step {place[0]}"
             raise RolloutError(f"{where}: {name} is {values[place]}, expected a finite number")
     conditioning, successes = steps["conditioning"].tolist(), steps["is_success"].tolist()
     torques: list[float] = steps["torque"].ravel().tolist()
+    length = len(successes)
     return Episode(
         seed=seed,
         success_at_end=successes[-1],
         success_once=any(successes),
         total_reward=math.fsum(steps["reward"].tolist()),
         conditioning_min=min(conditioning),
-        conditioning_mean=math.fsum(conditioning) / len(conditioning),
+        conditioning_mean=math.fsum(conditioning) / length,
         closure_error_max=float(steps["closure_error"].max()),
-        length=len(successes),
-        unsafe_share=int((steps["singularity_penalty"] > 0).sum()) / len(successes),
+        length=length,
+        unsafe_share=int((steps["singularity_penalty"] > 0).sum()) / length,
         fk_error_max=float(steps["fk_error"].max()),
         torque_rms=math.hypot(*torques) / math.sqrt(len(torques)),
         torque_peak=max(map(abs, torques)),
     )
 
 
-WORST: Final = {
+_WORST: Final[Mapping[str, Any]] = {
     "conditioning_min": min,
-    "closure_error_max": max,
-    "fk_error_max": max,
-    "torque_rms": max,
-    "torque_peak": max,
+    **dict.fromkeys(("closure_error_max", "fk_error_max", "torque_rms", "torque_peak"), max),
 }
 
 
@@ -198,14 +177,12 @@ def summarise(records: Sequence[Episode]) -> dict[str, Estimate]:
     """Return the metrics of an evaluation by name, each with its 95% interval over episodes.
 
     Success rates have Wilson intervals, which stay honest at 0 and 1; the others have percentile
-    bootstrap intervals, and those that are the extreme of an episode the worst of all episodes.
+    bootstrap intervals, and extremes of an episode the worst of all episodes.
     """
     rows = [record.as_dict() for record in records]
-    names = [name for name in rows[0] if name not in ("seed", "length")]
-    values = {name: [row[name] for row in rows] for name in names}
-    return {
-        name: wilson(column)
-        if name.startswith("success")
-        else bootstrap(column, worst=WORST[name](column) if name in WORST else None)
-        for name, column in values.items()
-    }
+    found = {}
+    for name in (name for name in rows[0] if name not in ("seed", "length")):
+        column = [row[name] for row in rows]
+        worst = _WORST[name](column) if name in _WORST else None
+        found[name] = wilson(column) if name.startswith("success") else bootstrap(column, worst)
+    return found

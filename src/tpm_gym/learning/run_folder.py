@@ -3,7 +3,6 @@
 Only files that a run writes are deleted, by name. A policy is deleted only if the user asks for it.
 """
 
-import errno
 import json
 import os
 import shlex
@@ -29,23 +28,10 @@ EXPORTED: Final = (".json", ".safetensors")
 WHOLE: Final = "[!.]*.json"
 """Pattern of JSON files, without the hidden parts that a process leaves if it is killed."""
 
-RESTORED: Final = (
-    CONFIG_FILE,
-    PROGRESS_FILE,
-    EVALUATIONS_FILE,
-    BEST_FILE,
-    *(Path(BEST_FILE).with_suffix(suffix).name for suffix in EXPORTED),
-)
+_BEST: Final = (BEST_FILE, "best.json", "best.safetensors")
+LAST: Final = (LAST_FILE, "last.json", "last.safetensors")
+RESTORED: Final = (CONFIG_FILE, PROGRESS_FILE, EVALUATIONS_FILE, *_BEST)
 """Files that a checkpoint holds. Resuming sets them back, and writes later entries again."""
-_POLICIES: Final = tuple(
-    Path(file).with_suffix(suffix).name
-    for file in (BEST_FILE, LAST_FILE)
-    for suffix in (".zip", *EXPORTED)
-)
-_EVENTS: Final = "events.out.tfevents.*"
-_FULL: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_READ_ONLY: Final = (errno.EIO, errno.EROFS, errno.EACCES, errno.EPERM)
-_IN_THE_WAY: Final = (errno.EISDIR, errno.ENOTDIR)
 
 
 def prepare(run: Path, overwrite: bool) -> None:
@@ -53,16 +39,10 @@ def prepare(run: Path, overwrite: bool) -> None:
     try:
         run.mkdir(parents=True, exist_ok=True)
         # A process that is killed in its first moment leaves a hidden part of a file.
-        if any(not entry.name.startswith(".") for entry in run.iterdir()):
-            _clear_earlier(run, overwrite)
-    except FileExistsError as error:
-        raise RunError(f"{run} is not a folder; choose another with --run") from error
+        if all(entry.name.startswith(".") for entry in run.iterdir()):
+            return
     except OSError as error:
         raise RunError(f"cannot write to {run}: {error.strerror}; choose another --run") from error
-
-
-def _clear_earlier(run: Path, overwrite: bool) -> None:
-    """Delete the earlier run of a folder, if the folder holds one and the user asked for it."""
     if not overwrite:
         raise RunError(
             f"{run} is not an empty folder; choose another with --run, continue the earlier run "
@@ -97,10 +77,8 @@ def resume_command(run: Path) -> str:
     """
     env = str((description(run) or {}).get("env", ""))
     if ":" in env:
-        words = ["python", "-m", "tpm_gym.learning", "resume", str(run), "--env", env]
-    else:
-        words = ["tpm-gym", "resume", str(run)]
-    return shlex.join(words)
+        return f"python -m tpm_gym.learning resume {shlex.join([str(run), '--env', env])}"
+    return f"tpm-gym resume {shlex.quote(str(run))}"
 
 
 def evaluations(run: Path) -> list[dict[str, Any]]:
@@ -124,15 +102,15 @@ def is_finished(run: Path) -> bool:
 
 def holds_policy(run: Path) -> bool:
     """Return whether the folder of a run holds a policy."""
-    return any((run / name).exists() for name in _POLICIES)
+    return any((run / name).exists() for name in (*_BEST, *LAST))
 
 
 def clear(run: Path) -> None:
     """Delete the files of a training except its configuration."""
     CheckpointStore(run / CHECKPOINTS).clear()
     clear_tests(run)
-    names = {*RESTORED, *_POLICIES, CURVE_FILE} - {CONFIG_FILE}
-    for path in [*(run / name for name in names), *run.glob(_EVENTS)]:
+    names = {*RESTORED, *LAST, CURVE_FILE} - {CONFIG_FILE}
+    for path in [*(run / name for name in names), *run.glob("events.out.tfevents.*")]:
         path.unlink(missing_ok=True)
 
 
@@ -157,14 +135,13 @@ def claimed(run: Path) -> Iterator[None]:
 
     handle = os.open(run, os.O_RDONLY)
     try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise RunError(
-                f"another process is training in {run}; stop it first, or choose another run"
-            ) from error
-        except OSError:
-            pass  # a file system without locks
+        with suppress(OSError):  # a file system without locks
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise RunError(
+                    f"another process is training in {run}; stop it first, or choose another run"
+                ) from error
         yield
     finally:
         os.close(handle)
@@ -172,25 +149,16 @@ def claimed(run: Path) -> Iterator[None]:
 
 @contextmanager
 def disk_errors_named(run: Path, store: CheckpointStore) -> Iterator[None]:
-    """Replace errors of a full or broken disk by an error that tells how to continue.
+    """Replace errors of a full or broken disk by an error that says how to continue.
 
     A training without its logs is of no use, so it ends. Only a checkpoint may fail.
     """
     try:
         yield
     except OSError as error:
-        if error.errno in _FULL:
-            remedy = "make room"
-        elif error.errno in _READ_ONLY:
-            remedy = "make it writable"
-        elif error.errno in _IN_THE_WAY:
-            remedy = f"move {error.filename2 or error.filename} away"
-        else:
-            raise
         go_on = (
             "start it anew with --overwrite"
             if store.newest is None
             else f"continue from step {store.newest:,} with: {resume_command(run)}"
         )
-        problem = error.strerror or error
-        raise RunError(f"cannot write to {run}: {problem}; {remedy}, then {go_on}") from error
+        raise RunError(f"cannot write to {run}: {error}; put that right, then {go_on}") from error

@@ -2,36 +2,34 @@
 
 The run folder holds ``config.json`` (the full configuration, versions and seeds), ``progress.csv``
 and TensorBoard events, ``evaluations.jsonl``, ``checkpoints/``, ``best.zip`` (the policy with the
-best periodic evaluation) and ``last.zip``, and both exported as safetensors. ``learning_curve.png``
-is drawn at the end or at a stop. A run that was stopped or killed continues from its last
-checkpoint. Ctrl-C stops at the end of a rollout, with a checkpoint; a second Ctrl-C stops at once.
+best periodic evaluation) and ``last.zip``, both exported as safetensors, and at the end
+``learning_curve.png``. Ctrl-C stops at the end of a rollout, with a checkpoint; a second Ctrl-C
+stops at once.
 """
-
-from __future__ import annotations
 
 import json
 import signal
-from collections.abc import Callable
-from contextlib import ExitStack, closing
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict, fields, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import torch
 from gymnasium.spaces import flatdim
 from rich.console import Console
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from tpm_gym.errors import TPMError
-from tpm_gym.learning import provenance, run_folder
+from tpm_gym.learning import callbacks, curve, export, provenance, run_folder, training_state
 from tpm_gym.learning.algorithms import ALGORITHMS
 from tpm_gym.learning.checkpoint import CheckpointStore, Content
-from tpm_gym.learning.configuration import (
-    UNSET,
-    ResumeConfig,
-    TrainingConfig,
-    complete,
-    resumed,
-)
+from tpm_gym.learning.configuration import UNSET, ResumeConfig, TrainingConfig, complete, resumed
+from tpm_gym.learning.demonstrations import Demonstrations
 from tpm_gym.learning.environments import check_env_id, make_env, make_envs
 from tpm_gym.learning.errors import (
     CheckpointError,
@@ -43,13 +41,8 @@ from tpm_gym.learning.errors import (
 from tpm_gym.learning.evaluation import EvaluationConfig, evaluate
 from tpm_gym.learning.rollout import BATCH, SELECTION_SEED
 from tpm_gym.learning.run_folder import CHECKPOINTS, CONFIG_FILE, CURVE_FILE, TESTS, is_finished
-
-if TYPE_CHECKING:
-    from stable_baselines3.common.base_class import BaseAlgorithm
-    from stable_baselines3.common.callbacks import BaseCallback
-    from stable_baselines3.common.vec_env import VecEnv
-
-    from tpm_gym.learning.callbacks import PeriodicEvaluation
+from tpm_gym.learning.signals import SignalListener
+from tpm_gym.learning.vec_env import AnalyticVecEnv
 
 
 def train(config: TrainingConfig, console: Console | None = None) -> signal.Signals | None:
@@ -70,17 +63,21 @@ def train(config: TrainingConfig, console: Console | None = None) -> signal.Sign
     with closing(make_env(**_env_options(config))) as env:  # refused before anything is deleted
         _require_room(config, flatdim(env.observation_space))
     run_folder.prepare(config.run, config.overwrite)
+    if config.steps != asked:
+        whole = f"whole rollouts of {config.rollout:,} steps"
+        _say(console, f"note: {asked:,} steps were asked for, and rounded up to {whole}")
+    starts = config.argument("learning_starts") or 0
+    if config.steps <= starts:
+        _say(console, f"note: learning starts at step {starts:,}, so nothing will be learned")
+    description = {
+        **config.record(),
+        "training_seeds": [config.seed, config.seed + config.envs - 1],
+        "evaluation_seeds": [SELECTION_SEED, SELECTION_SEED + config.eval_episodes - 1],
+        **provenance.origin(),
+    }
     store = CheckpointStore(config.run / CHECKPOINTS)
     with run_folder.disk_errors_named(config.run, store), run_folder.claimed(config.run):
-        provenance.write_json(config.run / CONFIG_FILE, _description(config))
-        _say(console, f"{config.title}, {config.steps:,} steps, in {config.run}")
-        if config.steps != asked:
-            whole = f"whole rollouts of {config.rollout:,} steps"
-            _say(console, f"note: {asked:,} steps were asked for, and rounded up to {whole}")
-        starts = config.argument("learning_starts") or 0
-        if config.steps <= starts:
-            _say(console, f"note: learning starts at step {starts:,}, so nothing will be learned")
-        return _learn_and_test(config, console, store)
+        return _learn_and_test(config, console, store, description, None)
 
 
 def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signals | None:
@@ -93,8 +90,6 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
         LearningError: There is no such run, it holds a policy but no whole checkpoint, a change is
             not valid, or the training diverged.
     """
-    from tpm_gym.learning.training_state import restore_files
-
     console = console or Console()
     run = config.run
     store = CheckpointStore(run / CHECKPOINTS)
@@ -108,7 +103,8 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
             return None
         content = store.load(lambda text: _say(console, f"warning: {text}"))
         if content:
-            stored = _stored_in(content)
+            with _foreign_files_named(content):
+                stored = dict(json.loads(content.files[CONFIG_FILE]))
         elif stored is None:
             raise RunError(f"{run} holds no run of tpm_gym; start one with tpm-gym train")
         elif run_folder.holds_policy(run):
@@ -118,74 +114,45 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
             )
         step = content.step if content else 0
         changed = resumed(config, stored, step)
-        description = _description_resumed(changed, stored, step)
-
-        def begin() -> None:
-            if content:
-                restore_files(run, content)
-            else:
-                run_folder.clear(run)
-            provenance.write_json(run / CONFIG_FILE, description)
-            _say(console, f"{changed.title}, from step {step:,} to {changed.steps:,}, in {run}")
-
-        return _learn_and_test(changed, console, store, content, begin)
+        resumption = {"from_step": step, **provenance.origin()}
+        changeable = [entry.name for entry in fields(ResumeConfig) if entry.name != "run"]
+        description = {
+            **stored,
+            **{name: getattr(changed, name) for name in changeable},
+            "resumed": [*stored.get("resumed", []), resumption],
+        }
+        return _learn_and_test(changed, console, store, description, content)
 
 
 def _say(console: Console, text: str) -> None:
     console.print(text, markup=False, soft_wrap=True)
 
 
-def _description(config: TrainingConfig) -> dict[str, Any]:
-    return {
-        **config.record(),
-        "training_seeds": [config.seed, config.seed + config.envs - 1],
-        "evaluation_seeds": [SELECTION_SEED, SELECTION_SEED + config.eval_episodes - 1],
-        **provenance.origin(),
-    }
-
-
-def _description_resumed(
-    config: TrainingConfig, stored: dict[str, Any], step: int
-) -> dict[str, Any]:
-    resumption = {"from_step": step, **provenance.origin()}
-    changeable = [entry.name for entry in fields(ResumeConfig) if entry.name != "run"]
-    return {
-        **stored,
-        **{name: getattr(config, name) for name in changeable},
-        "resumed": [*stored.get("resumed", []), resumption],
-    }
-
-
-def _stored_in(content: Content) -> dict[str, Any]:
-    """Return the configuration in a checkpoint."""
+@contextmanager
+def _foreign_files_named(content: Content) -> Iterator[None]:
+    """Name a checkpoint that is whole and was not written by this training."""
     try:
-        return dict(json.loads(content.files[CONFIG_FILE]))
-    except (KeyError, ValueError, TypeError, RecursionError) as error:
-        raise _foreign(content, error) from error
-
-
-def _foreign(content: Content, error: Exception) -> CheckpointError:
-    """Return the error of a checkpoint that is whole and was not written by this training."""
-    problem = f"cannot be restored ({type(error).__name__}), and was not written by this training"
-    anew = "start the run anew with --overwrite"
-    return CheckpointError(f"the checkpoint of step {content.step:,} {problem}; {anew}")
+        yield
+    except TPMError:
+        raise
+    except Exception as error:  # whatever PyTorch raises on a file that others have signed
+        raise CheckpointError(
+            f"the checkpoint of step {content.step:,} cannot be restored "
+            f"({type(error).__name__}), and was not written by this training; start the run anew "
+            "with --overwrite"
+        ) from error
 
 
 def _learn_and_test(
     config: TrainingConfig,
     console: Console,
     store: CheckpointStore,
-    content: Content | None = None,
-    begin: Callable[[], object] = lambda: None,
+    description: Mapping[str, Any],
+    content: Content | None,
 ) -> signal.Signals | None:
-    """Learn; then test a policy of the analytic engine there and in PyBullet.
-
-    Args:
-        content: Checkpoint to begin from.
-        begin: Called once the checkpoint is restored, since only then may files change.
-    """
-    stopped_by = _learn(config, console, store, content, begin)
-    if stopped_by is None and config.in_batches and config.test_episodes:
+    """Learn; then test a policy of the analytic engine there and in PyBullet."""
+    stopped_by = _learn(config, console, store, description, content)
+    if stopped_by is None and config.env_options.in_batches and config.test_episodes:
         rates = []
         for engine in ("analytic", "pybullet"):
             test = EvaluationConfig(
@@ -209,56 +176,56 @@ def _learn(
     config: TrainingConfig,
     console: Console,
     store: CheckpointStore,
+    description: Mapping[str, Any],
     content: Content | None,
-    begin: Callable[[], object],
 ) -> signal.Signals | None:
     """Build everything, learn from the beginning or from a checkpoint, and save.
 
-    A signal that came too late to stop the training is not returned.
+    Return the signal that stopped it; one that came too late is not returned.
     """
-    import torch
-
-    from tpm_gym.learning.callbacks import (
-        Checkpointing,
-        PeriodicEvaluation,
-        ProgressBar,
-        StopTrainingError,
-    )
-    from tpm_gym.learning.curve import draw_learning_curve
-    from tpm_gym.learning.demonstrations import Demonstrations
-    from tpm_gym.learning.logger import make_logger
-    from tpm_gym.learning.signals import SignalListener
-    from tpm_gym.learning.training_state import restore_log
-
     torch.set_num_threads(config.threads)
-    bar, listener = ProgressBar(console), SignalListener()
+    bar, listener = callbacks.ProgressBar(console), SignalListener()
     with ExitStack() as stack:
         training_envs = make_training_envs(config)
         stack.callback(training_envs.close)
-        count = min(config.eval_episodes, BATCH) if config.in_batches else 1
+        count = min(config.eval_episodes, BATCH) if config.env_options.in_batches else 1
         evaluation_envs = make_envs(count=count, **_env_options(config))
         stack.callback(evaluation_envs.close)
         stack.callback(bar.close)
         model = make_model(config, training_envs)
         keep = partial(_keep, config, console, run_folder.BEST_FILE)
-        evaluation = PeriodicEvaluation(config, evaluation_envs, console, keep)
-        log, seconds = _restore(model, evaluation, content) if content else ({}, 0.0)
-        begin()
-        logger = make_logger(config.run, None if content is None else content.step)
+        evaluation = callbacks.PeriodicEvaluation(config, evaluation_envs, console, keep)
+        log: dict[str, Any] = {}
+        seconds, step = 0.0, 0
+        # Files change only once the checkpoint is restored.
+        if content:
+            with _foreign_files_named(content):
+                log, extra = training_state.restore(model, content)
+                evaluation.evaluations, seconds = extra["evaluations"], float(extra["seconds"])
+            step = content.step
+            training_state.restore_files(config.run, content)
+        else:
+            run_folder.clear(config.run)
+        provenance.write_json(config.run / CONFIG_FILE, description)
+        way = f"from step {step:,} to {config.steps:,}" if "resumed" in description else ""
+        _say(console, f"{config.title}, {way or f'{config.steps:,} steps'}, in {config.run}")
+        logger = training_state.make_logger(config.run, step if content else None)
         stack.callback(logger.close)
         model.set_logger(logger)
-        restore_log(logger, log)
-        checkpointing = Checkpointing(config, store, evaluation, listener, console, seconds)
+        training_state.restore_log(logger, log)
+        checkpointing = callbacks.Checkpointing(
+            config, store, evaluation, listener, console, seconds
+        )
         # Checkpointing sets the clock that the callbacks after it read.
-        callbacks: list[BaseCallback] = [checkpointing, bar, evaluation]
+        called: list[BaseCallback] = [checkpointing, bar, evaluation]
         if config.recipe.demonstrations:
-            callbacks.insert(1, Demonstrations(**config.recipe.demonstrations))
+            called.insert(1, Demonstrations(**config.recipe.demonstrations))
         stack.enter_context(listener.listening())
         stopped_by = None
         try:
             steps = config.steps - model.num_timesteps
-            model.learn(steps, callback=callbacks, reset_num_timesteps=content is None)
-        except StopTrainingError:
+            model.learn(steps, callback=called, reset_num_timesteps=content is None)
+        except callbacks.StopTrainingError:
             stopped_by = listener.received
         except (TPMError, ValueError) as error:
             # PyTorch refuses NaN in a distribution, environments refuse it in an action.
@@ -271,54 +238,29 @@ def _learn(
             ) from error
         _keep(config, console, run_folder.LAST_FILE, model)
         if stopped_by is None:
-            checkpointing.save_finished()
-        draw_learning_curve(config.run / CURVE_FILE, config.title, evaluation.evaluations)
-    if stopped_by is None:
-        _say(console, f"finished: {config.run}")
-    else:
-        saved = "without a checkpoint"
-        if store.newest is not None:
-            command = run_folder.resume_command(config.run)
-            saved = f"saved at step {store.newest:,}; continue with: {command}"
-        _say(console, f"stopped early by {stopped_by.name}, {saved}")
+            checkpointing.save(finished=True)
+    curve.draw_learning_curve(config.run / CURVE_FILE, config.title, evaluation.evaluations)
+    command, saved = run_folder.resume_command(config.run), "without a checkpoint"
+    if store.newest is not None:
+        saved = f"saved at step {store.newest:,}; continue with: {command}"
+    stopped = f"stopped early by {stopped_by.name}, {saved}" if stopped_by else ""
+    _say(console, stopped or f"finished: {config.run}")
     return stopped_by
-
-
-def _restore(
-    model: BaseAlgorithm, evaluation: PeriodicEvaluation, content: Content
-) -> tuple[dict[str, Any], float]:
-    """Restore a checkpoint; return its log, and the seconds that the run had trained."""
-    from tpm_gym.learning.training_state import restore
-
-    try:
-        log, extra = restore(model, content)
-        evaluation.restore(extra["evaluation"])
-        return log, float(extra["seconds"])
-    except TPMError:
-        raise
-    except Exception as error:  # whatever PyTorch raises on a file that others have signed
-        raise _foreign(content, error) from error
 
 
 def _keep(config: TrainingConfig, console: Console, name: str, model: BaseAlgorithm) -> None:
     """Save a policy in the run folder, and export it."""
-    from tpm_gym.learning.export import remove, save, save_archive
-
     archive = config.run / name
     path = archive.with_suffix("")
+    recipe, options = asdict(config.recipe), config.env_options.given()
     try:
-        save(
-            model,
-            path,
-            env_id=config.env,
-            seed=config.seed,
-            recipe=asdict(config.recipe),
-            env_options=config.env_options.given(),
+        export.save(
+            model, path, env_id=config.env, seed=config.seed, recipe=recipe, env_options=options
         )
     except PolicyError as error:
-        remove(path)
+        export.remove(path)
         _say(console, f"warning: not exported: {error}")
-    save_archive(model, archive)
+    export.save_archive(model, archive)
 
 
 def make_model(config: TrainingConfig, envs: VecEnv) -> BaseAlgorithm:
@@ -329,11 +271,7 @@ def make_model(config: TrainingConfig, envs: VecEnv) -> BaseAlgorithm:
 
 
 def _require_room(config: TrainingConfig, numbers: int) -> None:
-    """Refuse a buffer that does not fit in memory; a step holds two observations.
-
-    Args:
-        numbers: Size of an observation.
-    """
+    """Refuse a buffer that does not fit in memory; a step holds two observations."""
     name = "buffer_size" if config.argument("buffer_size") else "n_steps"
     size = config.argument("buffer_size") or config.rollout
     try:
@@ -343,18 +281,9 @@ def _require_room(config: TrainingConfig, numbers: int) -> None:
 
 
 def make_training_envs(config: TrainingConfig) -> VecEnv:
-    """Build the training environments.
-
-    Several environments of the analytic engine are stepped together. Others run in processes.
-    """
-    from stable_baselines3.common.env_util import make_vec_env
-    from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
-
-    from tpm_gym.learning.training_state import EpisodeRecorder
-    from tpm_gym.learning.vec_env import AnalyticVecEnv
-
+    """Build the training environments: in processes, or together in the analytic engine."""
     several = config.envs > 1
-    if several and config.in_batches:
+    if several and config.env_options.in_batches:
         # Episodes that end one by one make the batches of an on-policy algorithm even.
         options = {**_env_options(config), "autoreset_mode": "SameStep", "stagger": True}
         envs = AnalyticVecEnv(make_envs(count=config.envs, **options))
@@ -364,7 +293,7 @@ def make_training_envs(config: TrainingConfig) -> VecEnv:
         make_env,
         n_envs=config.envs,
         seed=config.seed,
-        wrapper_class=EpisodeRecorder,
+        wrapper_class=training_state.EpisodeRecorder,
         env_kwargs={**_env_options(config), "in_worker": several},
         vec_env_cls=SubprocVecEnv if several else DummyVecEnv,
     )
@@ -373,7 +302,6 @@ def make_training_envs(config: TrainingConfig) -> VecEnv:
 def _env_options(config: TrainingConfig) -> dict[str, Any]:
     """Return the environment of training and evaluations, as arguments of :func:`make_env`."""
     # A worker process must import the id's module, and may not have the id registered.
-    spec = check_env_id(config.env)
-    env = config.env if ":" in config.env else spec
+    env = config.env if ":" in config.env else check_env_id(config.env)
     chosen = {"penalty_weight": config.penalty_weight, "goals": config.goals}
     return {"env": env, **chosen, **config.env_options.given()}

@@ -1,12 +1,9 @@
 """State of a training between two rollouts, saved and restored bit by bit.
 
-Between two rollouts the last transition is stored and its update is done. A training that is
-restored there continues as if it had not been interrupted, with environments in this process or in
-others, on one thread of one kind of machine.
-
-A resumed hindsight training looks untrained if one of three things is missing, so all are restored:
-the count of steps (Stable-Baselines3 acts at random for the first ``learning_starts`` steps), the
-optimisers, and the unfinished episode (joined to another episode in the replay buffer, it teaches
+A training that is restored there continues as if it had not been interrupted, on one thread of one
+kind of machine. A resumed hindsight training looks untrained if one of three things is missing: the
+count of steps (Stable-Baselines3 acts at random for the first ``learning_starts`` steps), the
+optimisers, or the unfinished episode (joined to another episode in the replay buffer, it teaches
 goals that were never reached).
 """
 
@@ -25,16 +22,20 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import DictReplayBuffer
-from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.logger import CSVOutputFormat, Logger, TensorBoardOutputFormat
 from stable_baselines3.her import HerReplayBuffer
+from tensorboard.compat.proto.event_pb2 import (  # type: ignore[import-untyped]
+    Event,
+    SessionLog,
+)
 
 from tpm_gym import TPMError
 from tpm_gym.learning.checkpoint import STATE, TENSORS, Content
 from tpm_gym.learning.errors import CheckpointError
 from tpm_gym.learning.provenance import versions, write_whole
 from tpm_gym.learning.rollout import Action, GoalEnv, Observation
-from tpm_gym.learning.run_folder import EXPORTED, LAST_FILE, RESTORED, clear_tests
-from tpm_gym.learning.vec_env import AnalyticVecEnv
+from tpm_gym.learning.run_folder import LAST, LAST_FILE, PROGRESS_FILE, RESTORED, clear_tests
+from tpm_gym.learning.vec_env import AnalyticVecEnv, starting
 
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining")
 _PER_KEY = ("observations", "next_observations")
@@ -44,9 +45,8 @@ _PER_ROW = ("actions", "rewards", "dones", "timeouts", "ep_start", "ep_length")
 class EpisodeRecorder(gym.Wrapper[Observation, Action, Observation, Action]):
     """Record of the unfinished episode: its seed and its actions.
 
-    PyBullet keeps state that cannot be read, so saving its state would change the training.
-    Repeating an episode of at most 50 steps is exact and takes a tenth of a second. It also
-    restores the wrappers below, with their counts of steps and sums of rewards.
+    PyBullet keeps state that cannot be read. Repeating an episode is exact, takes a tenth of a
+    second, and also restores the wrappers below.
     """
 
     def __init__(self, env: GoalEnv) -> None:
@@ -59,7 +59,7 @@ class EpisodeRecorder(gym.Wrapper[Observation, Action, Observation, Action]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode; ``options`` are not recorded, since training never uses them."""
+        """Start an episode."""
         self._seed, self._actions = seed, []
         self._rng = dict(self.unwrapped.np_random.bit_generator.state)
         return self.env.reset(seed=seed, options=options)
@@ -75,10 +75,7 @@ class EpisodeRecorder(gym.Wrapper[Observation, Action, Observation, Action]):
         return {"seed": self._seed, "rng": self._rng, "dtype": dtype, "actions": self._actions}
 
     def replay(self, episode: Mapping[str, Any]) -> Observation | None:
-        """Repeat an episode from :meth:`episode`; return its last observation.
-
-        None if it cannot be repeated, which may happen with another version of the physics.
-        """
+        """Repeat an episode; return its last observation, None if the physics refuse it."""
         self.unwrapped.np_random.bit_generator.state = episode["rng"]
         try:
             observation, _ = self.reset(seed=episode["seed"])
@@ -92,18 +89,14 @@ class EpisodeRecorder(gym.Wrapper[Observation, Action, Observation, Action]):
 def capture(
     model: BaseAlgorithm, run: Path, extra: Mapping[str, Any], finished: bool = False
 ) -> Content:
-    """Return the state of a training between two rollouts.
-
-    Arrays of the replay buffer are views; everything else is copied.
+    """Return the state of a training between two rollouts; arrays of the buffer are views.
 
     Args:
         model: Its environments are an ``AnalyticVecEnv`` or of :class:`EpisodeRecorder`.
         extra: Plain data to keep with the state.
     """
-    envs, observations = model.env, model._last_obs
-    assert envs is not None
-    assert isinstance(observations, dict)
-    episodes: Any
+    envs: Any = model.env
+    observations: Any = model._last_obs
     if isinstance(envs, AnalyticVecEnv):
         episodes, columns = envs.state()
     else:
@@ -130,26 +123,17 @@ def capture(
 
 
 def restore_files(run: Path, content: Content) -> None:
-    """Set the files of a run back to a checkpoint.
-
-    Tests and the last exported policy are deleted, since the policy will change.
-    """
+    """Set the files of a run back to a checkpoint; delete what is of a later policy."""
     clear_tests(run)
-    for suffix in EXPORTED:
-        (run / LAST_FILE).with_suffix(suffix).unlink(missing_ok=True)
-    for name in RESTORED:
+    for name in {*RESTORED, *LAST} - {LAST_FILE}:
         if name in content.files:
-            data = content.files[name]
-            write_whole(run / name, partial(Path.write_bytes, data=data))
+            write_whole(run / name, partial(Path.write_bytes, data=content.files[name]))
         else:
             (run / name).unlink(missing_ok=True)
 
 
 def restore(model: BaseAlgorithm, content: Content) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Restore a training from a checkpoint, from which ``learn`` continues.
-
-    Args:
-        model: New algorithm, built with the same arguments.
+    """Restore a training in a new algorithm, built with the same arguments.
 
     Returns:
         The state for :func:`restore_log`, and the ``extra`` of :func:`capture`.
@@ -163,12 +147,10 @@ def restore(model: BaseAlgorithm, content: Content) -> tuple[dict[str, Any], dic
     )
     _restore_buffer(model, content.arrays)
     _restore_episodes(model, state, content.arrays)
-    tensors = _restore_tensors(model, content.files[TENSORS])
-    _restore_rng(model, state["rng"], tensors)  # last, since the lines above may draw
+    # The generators last, since the lines above may draw
+    _restore_tensors(model, content.files[TENSORS])
+    _restore_rng(model, state["rng"])
     return state["log"], state["extra"]
-
-
-# -- networks and optimisers ------------------------------------------------------------------
 
 
 def _tensors(model: BaseAlgorithm) -> bytes:
@@ -185,17 +167,15 @@ def _tensors(model: BaseAlgorithm) -> bytes:
     return file.getvalue()
 
 
-def _restore_tensors(model: BaseAlgorithm, data: bytes) -> dict[str, Any]:
-    """Restore networks and optimisers; return the content of the file."""
+def _restore_tensors(model: BaseAlgorithm, data: bytes) -> None:
     content: dict[str, Any] = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     model.set_parameters(content["parameters"], exact_match=True)
     with torch.no_grad():
         for name, value in content["variables"].items():
             getattr(model, name).copy_(value)  # in place: the optimiser holds this very tensor
-    return content
-
-
-# -- random numbers ---------------------------------------------------------------------------
+    torch.set_rng_state(content["rng"])
+    if model.device.type == "cuda" and len(content["cuda_rng"]) == torch.cuda.device_count():
+        torch.cuda.set_rng_state_all(content["cuda_rng"])
 
 
 def _rng_state(model: BaseAlgorithm) -> dict[str, Any]:
@@ -207,17 +187,11 @@ def _rng_state(model: BaseAlgorithm) -> dict[str, Any]:
     }
 
 
-def _restore_rng(model: BaseAlgorithm, state: Mapping[str, Any], tensors: dict[str, Any]) -> None:
+def _restore_rng(model: BaseAlgorithm, state: Mapping[str, Any]) -> None:
     version, internal, gauss = state["python"]
     random.setstate((version, tuple(internal), gauss))
     np.random.set_state(state["numpy"])  # noqa: NPY002
     model.action_space.np_random.bit_generator.state = state["actions"]
-    torch.set_rng_state(tensors["rng"])
-    if model.device.type == "cuda" and len(tensors["cuda_rng"]) == torch.cuda.device_count():
-        torch.cuda.set_rng_state_all(tensors["cuda_rng"])
-
-
-# -- replay buffer ----------------------------------------------------------------------------
 
 
 def _buffer_arrays(model: BaseAlgorithm) -> dict[str, NDArray[Any]]:
@@ -245,55 +219,37 @@ def _restore_buffer(model: BaseAlgorithm, arrays: Mapping[str, NDArray[Any]]) ->
         view[:] = arrays[f"buffer/{name}"]
 
 
-# -- environments -----------------------------------------------------------------------------
-
-
 def _restore_episodes(
     model: BaseAlgorithm, state: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
 ) -> None:
     """Restore the unfinished episodes; refuse if they do not end in the same observations."""
-    envs = model.env
-    assert envs is not None
-    last = _starting(arrays, "last/")
+    envs: Any = model.env
+    last = starting(arrays, "last/")
     if isinstance(envs, AnalyticVecEnv):
-        found: Any = [envs.restore(state["episodes"], _starting(arrays, "envs/"))]
-        expected: Any = [last]
+        found = envs.restore(state["episodes"], starting(arrays, "envs/"))
     else:
-        rows = range(envs.num_envs)
-        found = [envs.env_method("replay", state["episodes"][i], indices=[i])[0] for i in rows]
-        expected = [{name: values[i] for name, values in last.items()} for i in rows]
-    for one, other in zip(found, expected, strict=True):
-        if one is None or any(not np.array_equal(one[name], other[name]) for name in other):
-            now, before = versions(), state["versions"]
-            changed = [f"{k} {before.get(k)} -> {now[k]}" for k in now if before.get(k) != now[k]]
-            raise CheckpointError(
-                "the unfinished episodes do not repeat: the physics have changed "
-                f"({', '.join(changed) or 'with equal versions'}); install the versions of "
-                "config.json again, or start the run anew with --overwrite"
-            )
+        each = enumerate(state["episodes"])
+        rows = [envs.env_method("replay", episode, indices=[i])[0] for i, episode in each]
+        found = {name: np.array([row[name] for row in rows]) for name in last if None not in rows}
+    if not all(np.array_equal(found.get(name, ()), values) for name, values in last.items()):
+        now, before = versions(), state["versions"]
+        changed = [f"{k} {before.get(k)} -> {now[k]}" for k in now if before.get(k) != now[k]]
+        raise CheckpointError(
+            "the unfinished episodes do not repeat: the physics have changed "
+            f"({', '.join(changed) or 'with equal versions'}); install the versions of "
+            "config.json again, or start the run anew with --overwrite"
+        )
     model._last_obs, model._last_episode_starts = last, arrays["episode_starts"]
-
-
-def _starting(arrays: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
-    """Return the arrays with a prefix, under their names without it."""
-    return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
-
-
-# -- log --------------------------------------------------------------------------------------
 
 
 def _pending_log(model: BaseAlgorithm) -> dict[str, Any]:
     """Return the values that are not yet written to the log."""
     logger = model.logger
-    # Types are kept, since a float32 is printed with fewer digits.
-    types = {
-        name: value.dtype.str
-        for name, value in logger.name_to_value.items()
-        if isinstance(value, np.generic)
-    }
+    values = dict(logger.name_to_value)
     return {
-        "values": dict(logger.name_to_value),
-        "types": types,
+        "values": values,
+        # A float32 is printed with fewer digits.
+        "types": {k: v.dtype.str for k, v in values.items() if isinstance(v, np.generic)},
         "counts": dict(logger.name_to_count),
         "excluded": dict(logger.name_to_excluded),
     }
@@ -306,3 +262,20 @@ def restore_log(logger: Logger, state: Mapping[str, Any]) -> None:
         logger.name_to_value[name] = np.dtype(dtype).type(value) if dtype else value
         logger.name_to_excluded[name] = tuple(state["excluded"][name])
     logger.name_to_count.update(state.get("counts", {}))
+
+
+def make_logger(run: Path, resumed_at: int | None = None) -> Logger:
+    """Open the log of a run; ``resumed_at`` is the step to which progress.csv was set back."""
+    path = run / PROGRESS_FILE
+    before = "" if resumed_at is None or not path.is_file() else path.read_text(encoding="utf-8")
+    table = CSVOutputFormat(str(path))  # empties the file
+    table.file.write(before)
+    table.file.flush()
+    table.keys = before.split("\n", 1)[0].split(",") if before else []
+    events = TensorBoardOutputFormat(str(run))
+    if resumed_at is not None:
+        # TensorBoard then hides events that an earlier process logged after this step.
+        start = Event(step=resumed_at + 1, session_log=SessionLog(status=SessionLog.START))
+        writer: Any = events.writer
+        writer._get_file_writer().add_event(start)
+    return Logger(str(run), [table, events])

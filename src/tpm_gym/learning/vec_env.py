@@ -26,26 +26,23 @@ _ENVS, _SIMULATION, _ENGINE = "envs/", "simulation/", "engine/"  # prefixes of a
 class AnalyticVecEnv(VecEnv):
     """Adapter of a :class:`~tpm_gym.envs.vector.TPMVectorEnv` to Stable-Baselines3.
 
-    Infos hold only the entries that the algorithms read, since each environment has a dictionary of
-    its own: ``terminal_observation``, ``TimeLimit.truncated``, ``is_success`` and ``episode`` at
-    the end of an episode, and nothing otherwise.
+    At the end of an episode, infos hold ``terminal_observation``, ``TimeLimit.truncated``,
+    ``is_success`` and ``episode``, which the algorithms read; otherwise nothing.
 
     Args:
         envs: Environments with same-step autoreset: ``gym.make_vec(id, num_envs=256,
             engine="analytic", autoreset_mode="SameStep", stagger=True)``.
 
     Raises:
-        ConfigurationError: ``envs`` are others, or have another autoreset.
+        ConfigurationError: ``envs`` are others.
     """
 
     def __init__(self, envs: TPMVectorEnv) -> None:
         """Wrap the environments."""
-        if not isinstance(getattr(envs, "unwrapped", None), TPMVectorEnv):
+        ours = isinstance(getattr(envs, "unwrapped", None), TPMVectorEnv)
+        if not ours or envs.autoreset_mode != AutoresetMode.SAME_STEP:
             valid = "gym.make_vec(id, num_envs=..., engine='analytic', autoreset_mode='SameStep')"
             raise ConfigurationError("envs", envs, valid)
-        if envs.autoreset_mode != AutoresetMode.SAME_STEP:
-            valid = f"{AutoresetMode.SAME_STEP.value!r} for Stable-Baselines3"
-            raise ConfigurationError("autoreset_mode", envs.autoreset_mode.value, valid)
         self.envs = envs
         self._actions: NDArray[Any] = np.zeros(0)
         self._returns = np.zeros(envs.num_envs)
@@ -91,7 +88,6 @@ class AnalyticVecEnv(VecEnv):
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Set an attribute of the vector environment."""
-        del indices
         setattr(self.envs, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> Any:
@@ -101,7 +97,6 @@ class AnalyticVecEnv(VecEnv):
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
         """Return False for each index, since no environment has a wrapper of its own."""
-        del wrapper_class
         return [False for _ in self._get_indices(indices)]
 
     # -- checkpoints ----------------------------------------------------------------------------
@@ -112,24 +107,23 @@ class AnalyticVecEnv(VecEnv):
         simulation = snapshot.simulation
         plants = simulation.plants if any(plant != NOMINAL for plant in simulation.plants) else ()
         arrays: dict[str, NDArray[Any]] = {"returns": self._returns, "lengths": self._lengths}
-        for prefix, columns in (
-            (_ENVS, snapshot.columns),
-            (_SIMULATION, simulation.columns),
-            (_ENGINE, simulation.engine),
-        ):
-            arrays |= {f"{prefix}{name}": values for name, values in columns.items()}
+        columns = {_ENVS: snapshot.columns, _SIMULATION: simulation.columns}
+        for prefix, group in {**columns, _ENGINE: simulation.engine}.items():
+            arrays |= {f"{prefix}{name}": values for name, values in group.items()}
         return {"rngs": snapshot.rngs, "plants": [asdict(plant) for plant in plants]}, arrays
 
     def restore(self, plain: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Observation:
         """Restore a state of :meth:`state`; return the observation at that moment."""
         plants = tuple(map(_plant, plain["plants"])) or (NOMINAL,) * self.num_envs
-        envs, simulation, engine = (
-            {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
-            for prefix in (_ENVS, _SIMULATION, _ENGINE)
-        )
+        envs, simulation, engine = (starting(arrays, p) for p in (_ENVS, _SIMULATION, _ENGINE))
         self._returns, self._lengths = arrays["returns"].copy(), arrays["lengths"].copy()
         moment = Snapshot(plants, simulation, engine)
         return self.envs.restore_state([EnvSnapshot(self.envs.kind, moment, plain["rngs"], envs)])
+
+
+def starting(arrays: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
+    """Return the arrays with a prefix, under their names without it."""
+    return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
 
 
 def _plant(entries: dict[str, Any]) -> Plant:

@@ -3,9 +3,8 @@
     python -m rl_zoo3.train --algo sac --env TPMReach-v0 \
         --gym-packages tpm_gym --conf-file tpm_gym.learning.zoo
 
-The zoo imports this module and reads ``hyperparams``. A recipe file is for one algorithm, so the
-algorithm is read from the zoo's command line. Entries that the zoo would evaluate as Python are
-given as classes.
+The zoo imports this module and reads ``hyperparams``. A recipe file is for one algorithm, which is
+read from the zoo's command line.
 """
 
 import argparse

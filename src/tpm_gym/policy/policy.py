@@ -1,7 +1,4 @@
-"""Trained policies, loaded from safetensors and JSON and run by PyTorch alone.
-
-Loading needs neither Stable-Baselines3 nor trust: see :mod:`tpm_gym.policy.files`.
-"""
+"""Trained policies, loaded from safetensors and JSON and run by PyTorch alone."""
 
 from __future__ import annotations
 
@@ -38,8 +35,8 @@ def load_policy(path: str | Path) -> Policy:
 
     Raises:
         InputError: ``path`` is neither a str nor a Path, or empty.
-        PolicyFileError: A file is missing, damaged, too large or not valid, or ``path`` is an
-            archive of Stable-Baselines3, which only unpickling could read.
+        PolicyFileError: A file is missing or no policy file, or ``path`` is an archive of
+            Stable-Baselines3, which only unpickling could read.
         MissingPackageError: PyTorch, safetensors or pydantic is not installed.
     """
     pair = files(path)
@@ -81,8 +78,8 @@ class Policy:
             The action, in the shape, dtype and bounds of the action space; (n, ...) for a batch.
 
         Raises:
-            InputError: An entry is missing, unknown, of the wrong shape or not of finite real
-                numbers, or so large that the network overflows.
+            InputError: An entry is missing, unknown, of the wrong shape, not finite, or so large
+                that the network overflows.
         """
         entries, batched = self._check_observation(observation)
         network, space = self.description.network, self.description.action_space
@@ -92,11 +89,11 @@ class Policy:
                 x = torch.nn.functional.linear(x, weight, bias)
                 x = _ACTIVATIONS[network.activation](x)
             x = torch.nn.functional.linear(x, *self._layers[-1])
-            actions: NDArray[Any] = (torch.tanh(x) if network.output == "tanh" else x).numpy()
-        if not np.isfinite(x.numpy()).all():
-            largest = max(float(values.abs().max()) for values in entries.values())
-            raise InputError("observation", largest, "smaller; the network overflows")
-        actions = actions.reshape(-1, *space.shape)
+            if not x.isfinite().all():
+                largest = max(float(values.abs().max()) for values in entries.values())
+                raise InputError("observation", largest, "smaller; the network overflows")
+            x = (torch.tanh(x) if network.output == "tanh" else x).reshape(-1, *space.shape)
+            actions: NDArray[Any] = x.numpy()
         if network.output == "tanh":
             actions = space.low + 0.5 * (actions + 1.0) * (space.high - space.low)
         else:
@@ -120,9 +117,8 @@ class Policy:
     def check(self, env: Any) -> None:
         """Check that the policy fits an environment.
 
-        Spaces are compared. So is the control of environments of tpm_gym, since actions that are
-        Cartesian increments and joint increments have equal spaces. The machine may be another:
-        ``description.env_options`` names that of the training.
+        Spaces are compared. So is the control of environments of tpm_gym, since Cartesian
+        increments and joint increments have equal spaces. The machine may be another.
 
         Args:
             env: Environment of Gymnasium, wrapped or not, or a vector of Gymnasium or of
@@ -139,8 +135,7 @@ class Policy:
             trained, given = getattr(wanted, kind), getattr(env, f"single_{kind}", None)
             given = getattr(env, kind) if given is None else given
             if trained != given:
-                name = kind.replace("_", " ")
-                raise PolicyMismatchError(name, trained, given, wanted.env_id)
+                raise PolicyMismatchError(kind.replace("_", " "), trained, given, wanted.env_id)
         spec = gym.registry.get(wanted.env_id)
         own, found = spec.kwargs.get("control") if spec else None, _control(env)
         if own and found and own != found:
@@ -164,11 +159,11 @@ class Policy:
     ) -> tuple[dict[str, torch.Tensor], bool]:
         """Return the entries as (n, size), and whether they are a batch."""
         boxes = self.description.observation_space
-        if not isinstance(observation, Mapping) or set(observation) != set(boxes):
-            given = list(observation) if isinstance(observation, Mapping) else type(observation)
+        given = list(observation) if isinstance(observation, Mapping) else type(observation)
+        if not isinstance(given, list) or set(given) != set(boxes):
             raise InputError("observation", given, f"a mapping with the keys {', '.join(boxes)}")
         entries: dict[str, torch.Tensor] = {}
-        leading: set[tuple[int, ...]] = set()
+        leading = set()
         for name, box in boxes.items():
             shape = box.shape or ()
             values = numbers(name, observation[name])
