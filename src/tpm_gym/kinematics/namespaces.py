@@ -127,15 +127,10 @@ def by_rows(
     points: FloatArray,
     *layouts: NDArray[np.intp],
 ) -> list[FloatArray]:
-    """Compute columns (n,) for points (..., k), and arrange them in results.
-
-    Args:
-        text: Function from a tuple of the components (n,) to columns (n,).
-        points: Array or tensor.
-        layouts: Indices of columns, in the shape of a result.
+    """Compute columns (n,) from the components (n,) of points (..., k), and arrange them.
 
     Returns:
-        For each layout, (..., *layout.shape).
+        For each layout, (..., *layout.shape): the columns with the indices in the layout.
     """
     ns, shape = namespace_of(points), points.shape[:-1]
     flat = points.reshape(-1, points.shape[-1])

@@ -122,7 +122,7 @@ class Accelerations(NamedTuple):
 
 
 def pose_at(
-    theta: Triple, signs: tuple[Numbers, Numbers], g: AnyLengths, ns: Namespace
+    theta: Triple, signs: tuple[Numbers, ...], g: AnyLengths, ns: Namespace
 ) -> tuple[Pose, Numbers]:
     """Assemble the mechanism at joint angles, for the signs of an assembly mode.
 
