@@ -239,7 +239,7 @@ def test_velocity_is_the_derivative_and_its_determinant_is_the_factors(
             still = np.abs(slope).max(axis=-1) < 1e3  # slots that were renumbered jump
             assert still.mean() > 0.99
             scale = np.maximum(1.0, np.abs(rows[far]))
-            assert (np.abs(rows[far] - slope) / scale)[still].max() < 1e-4
+            assert (np.abs(rows[far] - slope) / scale)[still].max() < 1e-3
     assert (j[far][:, 3, 2] == 0).all()  # motor 3 does not turn link 3'
     products = factors.serial[far].prod(axis=-1), factors.parallel[far].prod(axis=-1)
     determinant = np.linalg.det(j[far][:, :3])
