@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, NamedTuple
 
@@ -203,11 +203,10 @@ class Mechanism:
     tool: str
     lip: Vector
     actuated: tuple[str, ...]
-    _index: dict[str, int] = field(init=False, repr=False, compare=False)
 
-    def __post_init__(self) -> None:
-        """Index the links by name."""
-        object.__setattr__(self, "_index", {link.name: i for i, link in enumerate(self.links)})
+    @cached_property
+    def _by_name(self) -> dict[str, Link]:
+        return {link.name: link for link in self.links}
 
     def link(self, name: str) -> Link:
         """Return the link of that name.
@@ -215,7 +214,7 @@ class Mechanism:
         Raises:
             KeyError: If there is none.
         """
-        return self.links[self._index[name]]
+        return self._by_name[name]
 
     @cached_property
     def motors(self) -> tuple[Joint, ...]:
@@ -261,10 +260,9 @@ class Mechanism:
             joint = link.joint
             assert joint is not None
             arm[link.name] = arm.get(joint.parent, link.name)
+        base, *moving = self.links
         return tuple(
-            replace(
-                self, links=(self.links[0], *(k for k in self.links[1:] if arm[k.name] == name))
-            )
+            replace(self, links=(base, *(link for link in moving if arm[link.name] == name)))
             for name in dict.fromkeys(arm.values())
         )
 
