@@ -58,11 +58,3 @@ def test_the_arm_turns_between_the_halves_of_its_motor(machine: TPM) -> None:
             along = np.flatnonzero(link.joint.axis)[0]
             (tube,) = (solid for solid in link.solids if solid.kind == "box")
             assert tube.half_extent[along] < TORQUE_MOTOR.clearance
-
-
-def test_the_line_is_that_of_a_winding() -> None:
-    # At the corner the voltage of the no-load speed is just used up: by speed and by resistance.
-    constant, speed = TORQUE_MOTOR.motor_constant, TORQUE_MOTOR.no_load_speed
-    at_corner = constant**2 * (speed - TORQUE_MOTOR.corner_speed)
-    assert at_corner == pytest.approx(TORQUE_MOTOR.peak_torque)
-    assert 0 < TORQUE_MOTOR.corner_speed < speed

@@ -109,23 +109,20 @@ def assert_same_solid(element: ElementTree.Element, solid: Any) -> None:
 
 
 def test_solids_are_drawn_as_they_are_and_collide_where_they_should(mechanism: Mechanism) -> None:
-    materials = set()
-    for element, link in zip(parsed(mechanism).findall("link"), mechanism.links, strict=True):
+    root, used = parsed(mechanism), set()
+    for element, link in zip(root.findall("link"), mechanism.links, strict=True):
         for visual, solid in zip(element.findall("visual"), link.solids, strict=True):
             assert_same_solid(visual, solid)
             material = child(visual, "material").get("name")
             assert material == solid.colour
-            materials.add(material)
+            used.add(material)
         colliding = [solid for solid in link.solids if solid.collides]
         for collision, solid in zip(element.findall("collision"), colliding, strict=True):
             assert_same_solid(collision, solid)
-    assert materials <= set(COLOURS)
-
-
-def test_materials_are_the_colours(mechanism: Mechanism) -> None:
+    assert used <= set(COLOURS)
     found = {
         material.get("name"): tuple(numbers(child(material, "color").get("rgba")))
-        for material in parsed(mechanism).findall("material")
+        for material in root.findall("material")
     }
     assert found == COLOURS
 
