@@ -106,10 +106,9 @@ class RotatedPostures:
 def forward_rotated(theta: ArrayLike, geometry: Geometry = PAPER) -> RotatedPostures:
     """Solve all assemblies with link 3' turned at actuated angles theta (..., 3) rad, (..., 8).
 
-    Link 3' depends on theta_1 and theta_2 alone: tan(phi / 2) is a root of a quartic, so that there
-    are 4 postures of it at most, and 2 of link 7 for each. One slot for each branch of
-    :data:`.modes.ROTATED_MODES`. Where both modes meet (phi = 0) the assembly is returned, too.
-    Entries that are not finite give none.
+    Link 3' depends on theta_1 and theta_2 alone and has 4 postures at most; link 7 has 2 for each.
+    The slots are those of :data:`.modes.ROTATED_MODES`. Where both modes meet (phi = 0), the
+    assembly is returned too. Entries that are not finite give none.
 
     Raises:
         InputError: If theta is no array (..., 3) of numbers.
@@ -134,9 +133,8 @@ def forward_rotated(theta: ArrayLike, geometry: Geometry = PAPER) -> RotatedPost
 def inverse_rotated(position: ArrayLike, geometry: Geometry = PAPER) -> RotatedPostures:
     """Solve all postures with link 3' turned and point P at position (..., 3) m, (..., 48).
 
-    tan(phi / 2) is a root of a sextic for each sign of cos(beta); then arm 1 is known, and arms 2
-    and 3 can be bent two ways. Slots: cos(beta) < 0, then > 0; six tilts, in order; legs 2 and 3,
-    each with B_iC_i . dB_i/dtheta_i < 0, then > 0. Entries that are not finite give none.
+    Slots: cos(beta) < 0, then > 0; six tilts, in order; legs 2 and 3, each with
+    B_iC_i . dB_i/dtheta_i < 0, then > 0. Entries that are not finite give none.
 
     Raises:
         InputError: If position is no array (..., 3) of numbers.
@@ -191,13 +189,10 @@ def _elbows(theta: FloatArray, g: Geometry) -> FloatArray:
     """Compute B1, B2, B3 as rows (..., 3, 3) m."""
     one, two, three = np.moveaxis(theta, -1, 0)
     level, rise = equations.arms((one, two, three), g, NUMPY)
-    zero = 0 * one
-    elbows = [
-        np.stack([zero, g.l1 + level[0], rise[0]], axis=-1),
-        np.stack([level[1] - g.l1, zero, rise[1]], axis=-1),
-        np.stack([level[2] + g.l1, zero, rise[2]], axis=-1),
-    ]
-    return np.stack(elbows, axis=-2)
+    first = 0 * one, g.l1 + level[0], rise[0]
+    second, third = (level[1] - g.l1, 0 * one, rise[1]), (level[2] + g.l1, 0 * one, rise[2])
+    elbows: FloatArray = np.stack([*first, *second, *third], axis=-1)
+    return elbows.reshape(*theta.shape, 3)
 
 
 def _zeros(values: FloatArray) -> tuple[FloatArray, BoolArray]:
@@ -223,10 +218,9 @@ def _zeros(values: FloatArray) -> tuple[FloatArray, BoolArray]:
 
 @np.errstate(all="ignore")
 def link3_rotated(theta: FloatArray, geometry: Geometry = PAPER) -> tuple[_Planar, FloatArray]:
-    """Solve point C1 (xC + i zC, m) and tilt (rad) of link 3' turned, (..., 4).
+    """Solve point C1 (xC + i zC, m) and tilt (rad) of link 3' turned at theta (..., 3), (..., 4).
 
-    Both depend on theta_1 and theta_2 of theta (..., 3) rad alone. Missing solutions are NaN. The
-    slots are those of :data:`.modes.ROTATED_MODES`, by pairs.
+    Missing solutions are NaN. The slots are those of :data:`.modes.ROTATED_MODES`, by pairs.
 
     Seen along y and from B1, C1 = rho n with n = exp(-i phi / 2), since B1C1 halves the angle. Then
     the closures of rods 4a and 4b are one, and that of rod 6 is linear in rho. Squared, it is a

@@ -208,6 +208,10 @@ class Mechanism:
     def _by_name(self) -> dict[str, Link]:
         return {link.name: link for link in self.links}
 
+    @cached_property
+    def _held(self) -> list[tuple[Link, Joint]]:
+        return [(link, link.joint) for link in self.links if link.joint]
+
     def link(self, name: str) -> Link:
         """Return the link of that name.
 
@@ -219,7 +223,7 @@ class Mechanism:
     @cached_property
     def motors(self) -> tuple[Joint, ...]:
         """Joints of the motors, in the order of :attr:`actuated`."""
-        joints = {link.joint.name: link.joint for link in self.links if link.joint}
+        joints = {joint.name: joint for _, joint in self._held}
         return tuple(joints[name] for name in self.actuated)
 
     @cached_property
@@ -240,9 +244,7 @@ class Mechanism:
         shape = np.shape(next(iter(joints.values())))
         identity = np.broadcast_to(np.eye(3), (*shape, 3, 3))
         found = {self.links[0].name: Place(np.zeros((*shape, 3)), identity)}
-        for link in self.links[1:]:
-            joint = link.joint
-            assert joint is not None
+        for link, joint in self._held:
             parent = found[joint.parent]
             origin, rotation = parent.point(joint.origin), parent.rotation
             if joint.kind == "prismatic":
@@ -256,9 +258,7 @@ class Mechanism:
     def legs(self) -> tuple[Mechanism, ...]:
         """Split the spanning tree at the base: one tree for each arm and the links behind it."""
         arm: dict[str, str] = {}
-        for link in self.links[1:]:
-            joint = link.joint
-            assert joint is not None
+        for link, joint in self._held:
             arm[link.name] = arm.get(joint.parent, link.name)
         base, *moving = self.links
         return tuple(

@@ -132,7 +132,7 @@ class Machine(ABC):
             raise ConfigurationError("mount", self.mount, valid)
 
     def _require_values(self) -> None:
-        """Refuse values of other types and numbers that are not finite; arrays become tuples."""
+        """Reject other types and numbers that are not finite; convert arrays to tuples."""
         for name, kind in (("mount", Mount), ("region", Region), ("goal_region", Region)):
             if not isinstance(getattr(self, name), kind):
                 raise ConfigurationError(name, getattr(self, name), f"a {kind.__name__}")
@@ -144,7 +144,7 @@ class Machine(ABC):
         object.__setattr__(self, "table", tuple(table.tolist()))
 
     def _require_usable(self, name: str, points: list[Vector]) -> None:
-        """Refuse the option of that name if P cannot be worked with at ``points``."""
+        """Reject the attribute ``name`` if a point is out of reach or beyond a limit."""
         try:
             theta, left = self._postures(np.array(points))
         except UnreachableError as error:
