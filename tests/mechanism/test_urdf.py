@@ -46,23 +46,6 @@ def test_regenerating_gives_the_shipped_files_byte_for_byte(tmp_path: Path) -> N
     assert texts == [urdf_text(build(OTHER), closure_frames=True), loops_text(build(OTHER))]
 
 
-def test_inertials_are_those_of_the_links(mechanism: Mechanism) -> None:
-    root = parsed(mechanism)
-    names = [element.get("name") for element in root.findall("link")]
-    assert names == [link.name for link in mechanism.links]
-    for element, link in zip(root.findall("link"), mechanism.links, strict=True):
-        inertial = child(element, "inertial")
-        origin = child(inertial, "origin")
-        assert numbers(origin.get("xyz")) == pytest.approx(link.centre_of_mass.tolist(), **DIGITS)
-        assert numbers(origin.get("rpy")) == [0, 0, 0]
-        assert numbers(child(inertial, "mass").get("value")) == pytest.approx([link.mass], **DIGITS)
-        inertia = child(inertial, "inertia")
-        for i, a in enumerate("xyz"):
-            for j, b in enumerate("xyz"[i:], start=i):
-                found = numbers(inertia.get(f"i{a}{b}"))
-                assert found == pytest.approx([link.inertia[i, j]], **DIGITS)
-
-
 def test_joints_are_those_of_the_tree(mechanism: Mechanism) -> None:
     elements = {e.get("name"): e for e in parsed(mechanism).findall("joint")}
     held = [link for link in mechanism.links if link.joint]

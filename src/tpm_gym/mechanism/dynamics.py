@@ -79,15 +79,9 @@ class Pose(NamedTuple):
 
 
 class Velocities(NamedTuple):
-    """First derivatives, m/s.
+    """First derivatives, m/s: of C1 along x and z, of P, l7 times the rate of beta, and of B_iC_i.
 
-    Attributes:
-        link3: Velocity of C1, along x and z.
-        platform: Velocity of P.
-        turn: l7 times the rate of beta.
-        rod1: Velocity of C1 relative to B1.
-        rod2: Velocity of C2 relative to B2, along x and z.
-        rod3: Velocity of C3 relative to B3.
+    That of B2C2 is along x and z.
     """
 
     link3: tuple[Numbers, Numbers]
