@@ -39,7 +39,7 @@ def test_dynamics_and_modes_of_rows_follow_from_its_bodies():
     np.testing.assert_array_equal(GANTRY.forward(theta), theta)
     assert not GANTRY.mode_left(theta, theta).any()
     assert GANTRY.same_side(theta).all()
-    assert GANTRY.is_safe(theta).all()
+    assert (GANTRY.conditioning_at(theta) == 1.0).all()
 
 
 @pytest.mark.parametrize("task", ["reach", "pick_and_place"])

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import oracle
 import pytest
+from assemblies import assemblies
 from examples import examples
 from hypothesis import strategies as st
 from roots import Equation, Rows, circle_roots, unit, unmatched
@@ -77,30 +78,8 @@ def test_any_geometry_closes(g: Geometry, seed: int) -> None:
 
 
 def numeric_forward(theta: FloatArray, g: Geometry) -> list[FloatArray]:
-    """Positions (k, 3) of all assemblies of each theta, by sampling the closure equations."""
-    c, s = g.l3 * np.cos(theta.T), g.l3 * np.sin(theta.T)
-
-    # |B2C2| = l4 by going round B2 with rod 6; then |B1C1| = l4 is one equation for its direction.
-    def c1(row: Rows, phi: FloatArray) -> tuple[FloatArray, FloatArray]:
-        x2, z2 = -g.l1 + c[1][row], s[1][row]
-        return x2 + g.l4 * np.cos(phi) + 2 * g.l5, z2 + g.l4 * np.sin(phi)
-
-    def loop1(row: Rows, phi: FloatArray) -> FloatArray:
-        x_c, z_c = c1(row, phi)
-        return x_c**2 + (g.l1 + c[0][row]) ** 2 + (z_c - s[0][row]) ** 2 - g.l4**2
-
-    row, phi = circle_roots(loop1, len(theta))
-    x_c, z_c = c1(row, phi)
-
-    def loop2(index: Rows, beta: FloatArray) -> FloatArray:
-        x = x_c[index] + g.l7 * np.cos(beta) + 2 * g.l2 - g.l1 - c[2][row][index]
-        z = z_c[index] + g.l6 - s[2][row][index]
-        return x**2 + (g.l7 * np.sin(beta)) ** 2 + z**2 - g.l4**2
-
-    index, beta = circle_roots(loop2, len(row))
-    x = x_c[index] + g.l7 * np.cos(beta) + g.l2
-    p = oracle.vector(x, g.l7 * np.sin(beta), z_c[index] + 2 * g.l6)
-    return [p[row[index] == i] for i in range(len(theta))]
+    """Positions (k, 3) of all assemblies of each theta, with link 3' level."""
+    return [found[:, :3] for found in assemblies(theta, g, (False,))]
 
 
 def numeric_inverse(points: FloatArray, g: Geometry) -> list[FloatArray]:

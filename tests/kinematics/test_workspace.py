@@ -90,6 +90,8 @@ def test_conditioning_is_zero_where_a_branch_does_not_exist() -> None:
 def test_projection_is_inside_idempotent_and_nearest(
     point: tuple[float, ...], other: tuple[float, ...]
 ) -> None:
+    assert BOX.contains([[point, other]]).tolist() == [[BOX.contains(point), BOX.contains(other)]]
+    assert BOX.project([[point, other]]).shape == (1, 2, 3)
     for region in (TASK_REGION, BOX):
         projected = region.project(point)
         assert region.contains(projected)
@@ -115,12 +117,6 @@ def test_margin_is_negative_outside_and_the_distance_to_the_faces_inside(
         assert abs(margin) in gaps
         if margin >= 0:
             assert margin == min(gaps)
-
-
-def test_regions_accept_batches() -> None:
-    points = np.random.default_rng(2).uniform(-2, 2, (4, 5, 3))
-    assert BOX.contains(points).shape == (4, 5)
-    assert BOX.project(points).shape == (4, 5, 3)
 
 
 @pytest.mark.parametrize("low", [(0.1, 0, 0), (0, 0.1, 0), (0, 0, 0.1), (float("nan"), 0, 0)])

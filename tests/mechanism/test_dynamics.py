@@ -1,7 +1,7 @@
 """The closed-form dynamics are those of the bodies, and of mechanics.
 
 Independent of the formulas: the tree of links walked joint by joint (support/motion.py), virtual
-work by differences (Machine.torque), and Pinocchio on the URDF.
+work by differences (Machine.torque), and Pinocchio on the URDF (test_pinocchio.py).
 """
 
 from __future__ import annotations
@@ -17,18 +17,17 @@ import pytest
 import torch
 from examples import examples
 from machines import anywhere, each_machine
-from motion import IDLE, Bodies
+from motion import Bodies
 
-from tpm_gym.arrays import FloatArray
+from tpm_gym.arrays import FloatArray, Vector
 from tpm_gym.errors import ConfigurationError, InputError, SingularityError, UnreachableError
 from tpm_gym.kinematics import ASSEMBLY_MODES, AssemblyMode, forward_all, inverse_all, jacobian
 from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
 from tpm_gym.mechanism import PAPER_TPM, TPM, Machine
-from tpm_gym.mechanism.bodies import Closure, Mechanism, Solid
+from tpm_gym.mechanism.bodies import Mechanism, Solid
 from tpm_gym.mechanism.dynamics import Dynamics
 from tpm_gym.mechanism.inertia import inertia_of
-from tpm_gym.mechanism.tree import ACTUATED_JOINTS, build, joint_angles
-from tpm_gym.mechanism.urdf import urdf_text
+from tpm_gym.mechanism.tree import build
 
 LINKS = len(build().links) - 1
 HOME = np.array(PAPER_TPM.inverse(PAPER_TPM.home))
@@ -100,49 +99,41 @@ def test_torques_are_those_of_virtual_work_by_differences(machine: TPM) -> None:
     assert close(machine.torque(*one), Machine.torque(machine, *one), 1e-5)
 
 
-def test_a_change_of_a_body_is_felt() -> None:
-    rotor = Solid("cylinder", (0.05, 0.03, 0.0), (0.0, 0.0, 0.0), 7850.0, axis="x")
+def with_solid(name: str, solid: Solid) -> Mechanism:
+    """The paper's mechanism with a solid more on the link of that name."""
     mechanism = build()
     links = [
-        replace(link, solids=(*link.solids, rotor)) if link.name == "arm_2" else link
+        replace(link, solids=(*link.solids, solid)) if link.name == name else link
         for link in mechanism.links
     ]
-    before = inertia_of(mechanism, PAPER)
-    after = inertia_of(replace(mechanism, links=tuple(links)), PAPER)
+    return replace(mechanism, links=tuple(links))
+
+
+def test_a_change_of_a_body_is_felt() -> None:
+    rotor = Solid("cylinder", (0.05, 0.03, 0.0), (0.0, 0.0, 0.0), 7850.0, axis="x")
+    before = inertia_of(build(), PAPER)
+    after = inertia_of(with_solid("arm_2", rotor), PAPER)
     added = np.subtract(after.motors, before.motors)
     np.testing.assert_allclose(added, [rotor.inertia[0], 0, 0], atol=1e-15)
     np.testing.assert_allclose(after.weights, before.weights, atol=1e-15)
 
 
 @pytest.mark.parametrize(
-    ("name", "wanted", "solid"),
+    ("name", "wanted", "size", "centre"),
     [
-        ("arm_5", "on its axis", Solid("box", (0.1, 0.1, 0.1), (0.1, 0.0, 0.02), 2700.0)),
-        ("rod_4a", "equal moments", Solid("box", (0.02, 0.1, 0.01), (0.0, 0.4, 0.0), 2700.0)),
-        (
-            "rod_11b",
-            "on its axis",
-            Solid("cylinder", (0.01, 0.1, 0.0), (0.4, 0.01, 0.0), 2700.0, axis="x"),
-        ),
-        (
-            "rod_6",
-            "on its axis",
-            Solid("cylinder", (0.01, 0.1, 0.0), (0.4, 0.0, 0.01), 2700.0, axis="x"),
-        ),
-        ("link_7", "on its axis", Solid("box", (0.01, 0.01, 0.01), (0.0, 0.02, 0.0), 2700.0)),
-        ("end_link_9", "on its axis", Solid("box", (0.01, 0.01, 0.01), (0.02, 0.0, 0.0), 2700.0)),
+        ("arm_5", "on its axis", (0.1, 0.1, 0.1), (0.1, 0.0, 0.02)),
+        ("rod_4a", "equal moments", (0.02, 0.1, 0.01), (0.0, 0.4, 0.0)),
+        ("rod_11b", "on its axis", (0.1, 0.01, 0.01), (0.4, 0.01, 0.0)),
+        ("rod_6", "on its axis", (0.1, 0.01, 0.01), (0.4, 0.0, 0.01)),
+        ("link_7", "on its axis", (0.01, 0.01, 0.01), (0.0, 0.02, 0.0)),
+        ("end_link_9", "on its axis", (0.01, 0.01, 0.01), (0.02, 0.0, 0.0)),
     ],
 )
 def test_bodies_for_which_the_formulas_do_not_hold_are_refused(
-    name: str, wanted: str, solid: Solid
+    name: str, wanted: str, size: Vector, centre: Vector
 ) -> None:
-    mechanism = build()
-    links = [
-        replace(link, solids=(*link.solids, solid)) if link.name == name else link
-        for link in mechanism.links
-    ]
     with pytest.raises(ConfigurationError, match=f"{name}.*{wanted}"):
-        inertia_of(replace(mechanism, links=tuple(links)), PAPER)
+        inertia_of(with_solid(name, Solid("box", size, centre, 2700.0)), PAPER)
 
 
 def test_links_and_factors_that_are_not_the_mechanisms_are_refused() -> None:
@@ -254,79 +245,6 @@ def test_free_motion_keeps_its_energy_to_the_order_of_the_integrator(machine: TP
     assert errors[-1] < 1e-8  # measured: 8e-10
     for coarse, fine in itertools.pairwise(errors):
         assert coarse / fine == pytest.approx(16, rel=0.1)
-
-
-# Another library
-
-
-def loaded_by_pinocchio(mechanism: Mechanism) -> tuple[Any, Callable[..., tuple[Any, Any]]]:
-    """The tree from its URDF, and a function of (data, q, v, a): the closures' Jacobian (12, nv)
-    and by how much the accelerations of their two sides differ (12,).
-    """
-    pin = pytest.importorskip("pinocchio")
-    model = pin.buildModelFromXML(urdf_text(mechanism))
-
-    def frame(link: str, point: tuple[float, ...]) -> int:
-        at = model.frames[model.getFrameId(link)]
-        place = at.placement * pin.SE3(np.eye(3), np.array(point))
-        name = f"{link} {point}"
-        return int(model.addFrame(pin.Frame(name, at.parentJoint, 0, place, pin.OP_FRAME)))
-
-    def pair(closure: Closure) -> tuple[int, int]:
-        return frame(closure.link_a, closure.point_a), frame(closure.link_b, closure.point_b)
-
-    pairs = [pair(closure) for closure in mechanism.closures]
-    axes = pin.LOCAL_WORLD_ALIGNED
-
-    def gaps(data: Any, *state: FloatArray) -> tuple[FloatArray, FloatArray]:
-        pin.forwardKinematics(model, data, *state)
-        pin.computeJointJacobians(model, data, state[0])
-        pin.updateFramePlacements(model, data)
-
-        def columns(at: int) -> FloatArray:
-            return np.array(pin.getFrameJacobian(model, data, at, axes)[:3])
-
-        def acceleration(at: int) -> FloatArray:
-            return np.array(pin.getFrameClassicalAcceleration(model, data, at, axes).linear)
-
-        return (
-            np.concatenate([columns(one) - columns(other) for one, other in pairs]),
-            np.concatenate([acceleration(one) - acceleration(other) for one, other in pairs]),
-        )
-
-    return model, gaps
-
-
-@each_machine
-@pytest.mark.parametrize("roll", [0.0, 30.0])
-def test_torques_are_those_of_pinocchio_on_the_urdf(machine: TPM, roll: float) -> None:
-    # Inverse dynamics of the open tree, less the forces in the closures: what is left is the
-    # motors'. End link 10 rolls as it likes. Measured: 2e-9 of the largest, the digits of the URDF.
-    pin = pytest.importorskip("pinocchio")
-    model, gaps = loaded_by_pinocchio(machine.mechanism)
-    model.gravity.linear = np.array(machine.mount.free_fall)
-    data = model.createData()
-    names = [name for name in model.names if name != "universe"]
-    at = [model.joints[model.getJointId(name)].idx_v for name in ACTUATED_JOINTS]
-    idle = [model.joints[model.getJointId(name)].idx_v for name in (IDLE, "cup_slide")]
-    passive = [k for k in range(model.nv) if k not in at + idle]
-    for theta, rate, change in zip(*drawn(machine, 10), strict=True):
-        angles = joint_angles(theta, machine.assembly_mode, machine.geometry)
-        v = np.zeros(model.nv)
-        v[[model.joints[model.getJointId(name)].idx_v for name in names]] = [
-            angles[name] for name in names
-        ]
-        q = pin.integrate(model, pin.neutral(model), v)
-        v, a = np.zeros(model.nv), np.zeros(model.nv)
-        v[at], v[idle[0]], a[at] = rate, roll, change
-        columns, _ = gaps(data, q, v, a)
-        v[passive] = np.linalg.lstsq(columns[:, passive], -columns @ v)[0]
-        a[passive] = np.linalg.lstsq(columns[:, passive], -gaps(data, q, v, a)[1])[0]
-        efforts = pin.rnea(model, data, q, v, a)
-        forces = np.linalg.lstsq(columns[:, passive].T, efforts[passive])[0]
-        expected = (efforts - columns.T @ forces)[at]
-        found = machine.torque(theta, rate, change)
-        assert close(found, expected, 1e-8)
 
 
 # Points, batches and tensors

@@ -38,7 +38,7 @@ def test_the_rotor_fits_into_the_housing_round_the_shaft() -> None:
 
 
 @each_machine
-def test_the_rotor_is_part_of_every_arm(machine: TPM) -> None:
+def test_the_rotor_is_part_of_every_arm_which_turns_between_its_halves(machine: TPM) -> None:
     for link in machine.mechanism.links:
         if link.joint is None or link.joint.name not in ACTUATED_JOINTS:
             continue
@@ -49,20 +49,5 @@ def test_the_rotor_is_part_of_every_arm(machine: TPM) -> None:
         )
         for ring in rings:  # about the pivot, where the link's origin is
             assert np.flatnonzero(ring.centre).tolist() == [along]
-
-
-@each_machine
-def test_the_arm_turns_between_the_halves_of_its_motor(machine: TPM) -> None:
-    for link in machine.mechanism.links:
-        if link.joint is not None and link.joint.name in ACTUATED_JOINTS:
-            along = np.flatnonzero(link.joint.axis)[0]
-            (tube,) = (solid for solid in link.solids if solid.kind == "box")
-            assert tube.half_extent[along] < TORQUE_MOTOR.clearance
-
-
-def test_the_line_is_that_of_a_winding() -> None:
-    # At the corner the voltage of the no-load speed is just used up: by speed and by resistance.
-    constant, speed = TORQUE_MOTOR.motor_constant, TORQUE_MOTOR.no_load_speed
-    at_corner = constant**2 * (speed - TORQUE_MOTOR.corner_speed)
-    assert at_corner == pytest.approx(TORQUE_MOTOR.peak_torque)
-    assert 0 < TORQUE_MOTOR.corner_speed < speed
+        (tube,) = (solid for solid in link.solids if solid.kind == "box")
+        assert tube.half_extent[along] < TORQUE_MOTOR.clearance

@@ -148,7 +148,7 @@ def _configuration(
     jacobian.velocity(theta, branch, geometry)  # raises with the reason if J does not exist
     a, b, c = np.moveaxis(finite_points("theta", theta), -1, 0)
     cos, sin = equations.arms((a, b, c), geometry, NUMPY)
-    found = equations.assembly_at(cos, sin, *branch.signs, geometry, NUMPY)[0]
+    found = equations.assembly_at(cos, sin, branch.planar, branch.sin_beta, geometry, NUMPY)[0]
     bars = equations.rods(cos, sin, found, geometry)
     return bars, equations.factors(cos, sin, found, bars, geometry)
 

@@ -6,17 +6,16 @@ problems reduce to intersecting circles. We solve those intersections as vectors
 ``a cos + b sin = c``, not with the paper's half-angle forms (Eqs. 13 and 15), which break where
 ``g_i = 0`` or ``theta_i = pi``.
 
-The functions compute with the numbers of their namespace ``ns``: arrays and tensors (see
-:mod:`tpm_gym.kinematics.namespaces`), or floats in compiled code (see
-:mod:`tpm_gym.kinematics.compiled`). Components (x, y, z or theta_1 to theta_3) are separate floats,
-arrays or tensors (...,). Signs of branches may be arrays that broadcast with them. The functions
-check and raise nothing. Beside a solution they return whether it is real, and the lengths from
-which the errors of the last part explain why it is not.
+The functions compute with the numbers of their namespace ``ns``: arrays and tensors
+(:mod:`tpm_gym.kinematics.namespaces`), or floats in compiled code
+(:mod:`tpm_gym.kinematics.compiled`). Components (x, y, z or theta_1 to theta_3) are separate
+numbers (...,), and signs of branches broadcast with them. The functions check and raise nothing.
+Beside a solution they return whether it is real, and the lengths that explain why it is not.
 """
 
 import math
 import sys
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -37,6 +36,7 @@ sin(beta) is known to the square root of that only (y to 50 nm)."""
 _TINY = sys.float_info.min  # the smallest divisor
 
 Triple = tuple[Numbers, Numbers, Numbers]
+_Four = tuple[Numbers, Numbers, Numbers, Numbers]
 
 
 class Assembly(NamedTuple):
@@ -122,16 +122,8 @@ def assembly_at(
 
 
 def posture_at(
-    point: Triple,
-    signs: tuple[Numbers, Numbers, Numbers, Numbers],
-    g: AnyLengths,
-    ns: Namespace,
-) -> tuple[
-    Triple,
-    Numbers,
-    tuple[Numbers, Numbers, Numbers, Numbers],
-    tuple[Numbers, Numbers, Numbers, Numbers],
-]:
+    point: Triple, signs: tuple[Numbers, ...], g: AnyLengths, ns: Namespace
+) -> tuple[Triple, Numbers, _Four, _Four]:
     """Solve inverse kinematics (Eqs. 12 to 15, corrected) for the signs of a working mode.
 
     Returns:
@@ -161,11 +153,12 @@ def arm(
     """Compute the arm's angle in (-pi, pi] from |C - A - l3 e(theta)| = l4.
 
     Args:
-        a: How far C is from A, level in the arm's plane, m.
-        b: The same, vertical, m.
-        out: The same, out of the arm's plane, m.
-        bend: Sign of BC . dB/dtheta = l3 (b cos(theta) - a sin(theta)), which tells the two
-            solutions apart.
+        a: Distance of C from A, level in the arm's plane, m.
+        b: Vertical distance, m.
+        out: Distance out of the arm's plane, m.
+        bend: Sign of BC . dB/dtheta = l3 (b cos(theta) - a sin(theta)); names one of two solutions.
+        g: Lengths.
+        ns: Namespace.
 
     Returns:
         The angle, and whether the leg reaches.
@@ -313,13 +306,3 @@ def _leg_margin(level: float, vertical: float, out: float, g: Geometry) -> float
         return g.l4 - abs(out)
     in_plane, rod = math.hypot(level, vertical), math.sqrt(g.l4**2 - out**2)
     return min(g.l3 + rod - in_plane, in_plane - abs(g.l3 - rod))
-
-
-def parallel_factors(values: tuple[Any, Any, Any], geometry: Geometry) -> dict[str, Any]:
-    """Return the factors of det A in units of l4, by the names that errors show."""
-    sin_beta, level3, planar = values
-    return {
-        "sin(beta)": sin_beta,
-        "(l1 + l3 cos(theta_3) - xC - 2 l2) / l4": level3 / geometry.l4,
-        "planar factor / l4^2": planar / geometry.l4**2,
-    }

@@ -1,10 +1,9 @@
 """The seven lengths that define the mechanism, validated."""
 
-import math
 from dataclasses import dataclass, fields
-from numbers import Real
 from typing import NamedTuple
 
+from tpm_gym.arrays import is_number
 from tpm_gym.errors import GeometryError, InputError
 from tpm_gym.kinematics.namespaces import Numbers
 
@@ -27,7 +26,7 @@ class Lengths(NamedTuple):
 
 @dataclass(frozen=True)
 class Geometry:
-    """Link lengths of the mechanism in metres, named as in the paper ("Establishment of ...").
+    """Link lengths of the mechanism in metres, named as in the paper.
 
     Attributes:
         l1: Half side of the base: distance from O to each actuated pivot A_i.
@@ -39,8 +38,8 @@ class Geometry:
         l7: Link 7, D_1E_1; the workspace reaches y = -l7 to l7.
 
     Raises:
-        GeometryError: If a length is zero, negative or not finite, or if the combination
-            degenerates (see ``__post_init__``).
+        GeometryError: If a length is no finite positive number (l6 may be 0), if rods 4 cannot
+            reach the plane of link 3', or if the circles of Eq. (6) can coincide.
     """
 
     l1: float
@@ -54,7 +53,11 @@ class Geometry:
     def __post_init__(self) -> None:
         """Reject lengths that make no mechanism."""
         for field in fields(self):
-            self._check_length(field.name)
+            name, value = field.name, getattr(self, field.name)
+            if not is_number(value) or value < 0 or (value == 0 and name != "l6"):
+                least = "not negative" if name == "l6" else "positive"
+                raise GeometryError(name, value, f"it must be a finite number, {least}")
+            object.__setattr__(self, name, float(value))
         l1, l5 = self.l1, self.l5
         close = _CLOSE * l1
         if self.l3 > l1 - close and min(l5, abs(l5 - l1)) < close:
@@ -63,31 +66,14 @@ class Geometry:
             raise GeometryError(
                 "l5", l5, f"it must differ from 0 and from l1 = {l1} m by {close:.3g} m or more"
             )
-        if self.l4 <= self.l1 - self.l3:
-            raise GeometryError(
-                "l4",
-                self.l4,
-                f"it must exceed l1 - l3 = {self.l1 - self.l3} m, or rod 4 never reaches y = 0",
-            )
+        if self.l4 <= l1 - self.l3:
+            least = f"it must exceed l1 - l3 = {l1 - self.l3} m, or rod 4 never reaches y = 0"
+            raise GeometryError("l4", self.l4, least)
 
     @property
     def lengths(self) -> Lengths:
         """l1 to l7, m."""
         return Lengths(*vars(self).values())
-
-    def _check_length(self, name: str) -> None:
-        value = getattr(self, name)
-        if isinstance(value, bool) or not isinstance(value, Real):
-            raise GeometryError(name, value, "it must be a number")
-        try:
-            value = float(value)
-        except OverflowError:
-            raise GeometryError(name, value, "it must be finite") from None
-        object.__setattr__(self, name, value)
-        if not math.isfinite(value):
-            raise GeometryError(name, value, "it must be finite")
-        if value < 0.0 or (value == 0.0 and name != "l6"):
-            raise GeometryError(name, value, "it must be positive")
 
 
 AnyLengths = Geometry | Lengths
@@ -105,9 +91,7 @@ PAPER = Geometry(l1=0.300, l2=0.070, l3=0.350, l4=0.800, l5=0.100, l6=0.010, l7=
 WIDE = Geometry(l1=0.300, l2=0.070, l3=0.350, l4=0.800, l5=0.100, l6=0.010, l7=0.600)
 """The paper's lengths but for l7, for a workspace of practical depth in y.
 
-Of l7 = 0.1, 0.2 ... 0.9 m it is the one with the largest axis-aligned box, elbows out, in which the
-conditioning is at least 0.1 (:func:`tpm_gym.analysis.aspects.largest_box`; a slow test recomputes
-it on two grids): about 45 litres and 0.3 m deep in y, against 3 litres and 0.02 m of PAPER. A
-longer link 7 deepens the box, but beyond this it costs more in height than it gains. The maximum is
-flat: 0.65 m is as good within the grids' few per cent.
+Of l7 = 0.1, 0.2 ... 0.9 m, 0.6 m has the largest axis-aligned box, elbows out, in which the
+conditioning is at least 0.1 (:func:`tpm_gym.analysis.aspects.largest_box`): about 45 litres and
+0.3 m deep in y, against 3 litres and 0.02 m of PAPER.
 """

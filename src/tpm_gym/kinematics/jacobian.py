@@ -5,13 +5,14 @@ A v = B theta_dot (section "Singularity analysis"). Configurations are given by 
 ``theta`` (..., 3) in rad and the assembly mode, or by points ``position`` (..., 3) in m and the
 working mode. Torch tensors give tensors, as in :mod:`tpm_gym.kinematics.position`.
 
-All functions raise InputError for what is no array (..., 3) of numbers; from angles, they raise it
-also if theta is not finite, and UnreachableError if the branch does not exist at some theta.
+All functions raise InputError for inputs that are no array (..., 3) of numbers. Functions of angles
+raise it also if theta is not finite, and UnreachableError if the branch does not exist somewhere.
 """
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -63,10 +64,7 @@ class Evaluation:
     conditioning: FloatArray
 
 
-@dataclass(frozen=True)
-class _Configuration:
-    """Components from which all Jacobians are computed."""
-
+class _Configuration(NamedTuple):
     position: equations.Triple
     rods: tuple[equations.Triple, equations.Triple, equations.Triple]
     factors: equations.Factors
@@ -135,11 +133,7 @@ def velocity(
 def conditioning(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> FloatArray:
-    """Compute the inverse condition number 1/cond(J), (...,) in [0, 1].
-
-    It is 0 (up to rounding) at a singularity, and 1 where J is isotropic. The three inputs share
-    one unit and so do the three outputs; so it is meaningful without scaling.
-    """
+    """Compute 1/cond(J), (...,): 0 at a singularity (up to rounding), 1 where J is isotropic."""
     return _from_angles(lambda c: [_conditioning(c)], theta, branch, geometry, _COLUMN)[0]
 
 
@@ -191,10 +185,7 @@ def factors(
 def factors_at(
     position: ArrayLike, branch: WorkingMode = ELBOWS_OUT, geometry: AnyLengths = PAPER
 ) -> Factors:
-    """Compute the factors at points instead of angles; NaN where not reachable on ``branch``.
-
-    It does not use the forward kinematics, so it stays accurate at the parallel singularities.
-    """
+    """Compute the factors at points, accurately at singularities too; NaN where out of reach."""
     columns = _from_points(lambda c: [*c.factors], position, branch, geometry, math.nan, *_FACTORS)
     return Factors(*columns)
 
@@ -206,7 +197,7 @@ def _from_angles(
     g: Geometry,
     *layouts: NDArray[np.intp],
 ) -> list[FloatArray]:
-    """Lay out columns for configurations at joint angles, all of which have to exist."""
+    """Lay out columns for configurations at joint angles."""
 
     def text(angles: equations.Triple, ns: Namespace) -> list[Numbers]:
         cos, sin = equations.arms(angles, g, ns)
@@ -265,13 +256,11 @@ def _conditioning(c: _Configuration) -> Numbers:
 
 def require_regular(values: FloatArray, geometry: Geometry) -> None:
     """Raise SingularityError for the smallest factor of det A (..., 3) if it counts as zero."""
-    nearest = []
-    named = equations.parallel_factors((values[..., 0], values[..., 1], values[..., 2]), geometry)
-    for name, value in named.items():
-        flat = value.reshape(-1)
-        if len(flat):
-            smallest = flat[abs(flat).argmin()].item()
-            nearest.append((abs(smallest), smallest, name))
-    if nearest and min(nearest)[0] < equations.SINGULAR:
-        _, smallest, name = min(nearest)
-        raise SingularityError(name, smallest)
+    l4 = geometry.l4
+    names = "sin(beta)", "(l1 + l3 cos(theta_3) - xC - 2 l2) / l4", "planar factor / l4^2"
+    scaled = [values[..., i].reshape(-1) / (1.0, l4, l4**2)[i] for i in range(3)]
+    if len(scaled[0]):
+        least = [some[abs(some).argmin()].item() for some in scaled]
+        smallest, name = min(zip(least, names, strict=True), key=lambda pair: abs(pair[0]))
+        if abs(smallest) < equations.SINGULAR:
+            raise SingularityError(name, smallest)

@@ -20,19 +20,17 @@ from tpm_gym.kinematics.namespaces import namespace_of
 class _Mode:
     """A branch, named by its signs."""
 
+    def __post_init__(self) -> None:
+        """Reject anything but signs; store them as ints."""
+        if any(sign not in (-1, 1) for sign in self.signs):
+            raise InputError(type(self).__name__, self.signs, "made of signs, each +1 or -1")
+        for name, sign in list(vars(self).items()):
+            object.__setattr__(self, name, int(sign))
+
     @property
     def signs(self) -> tuple[int, ...]:
         """Signs, in the order of the attributes."""
-        raise NotImplementedError
-
-    def __post_init__(self) -> None:
-        """Reject anything but signs; store them as ints."""
-        signs = dict(vars(self))
-        if any(sign not in (-1, 1) for sign in signs.values()):
-            valid = "made of signs, each +1 or -1"
-            raise InputError(type(self).__name__, tuple(signs.values()), valid)
-        for name, sign in signs.items():
-            object.__setattr__(self, name, int(sign))
+        return tuple(vars(self).values())
 
     @property
     def index(self) -> int:
@@ -53,11 +51,6 @@ class AssemblyMode(_Mode):
     planar: int
     sin_beta: int
 
-    @property
-    def signs(self) -> tuple[int, int]:
-        """planar, sin_beta."""
-        return self.planar, self.sin_beta
-
 
 @dataclass(frozen=True)
 class WorkingMode(_Mode):
@@ -75,11 +68,6 @@ class WorkingMode(_Mode):
     leg2: int
     leg3: int
 
-    @property
-    def signs(self) -> tuple[int, int, int, int]:
-        """cos_beta, leg1, leg2, leg3."""
-        return self.cos_beta, self.leg1, self.leg2, self.leg3
-
 
 @dataclass(frozen=True)
 class RotatedMode(_Mode):
@@ -87,21 +75,16 @@ class RotatedMode(_Mode):
 
     Attributes:
         planar: Sign of the planar factor of :func:`tpm_gym.kinematics.rotated.factors`: the side on
-            which rod 6 passes the point where rods 4a and 4b cross, as seen along y. (Where rods 4
-            appear shorter than links 3, the half with the smaller factors.)
-        further: Of the two assemblies of link 3' with that sign, -1 for the one that is turned
-            less and 1 for the one that is turned further, from 0 to 2 pi.
+            which rod 6 passes the point where rods 4a and 4b cross, as seen along y. Where rods 4
+            appear shorter than links 3, -1 is the half with the smaller factors.
+        further: Of the two assemblies of link 3' with that sign, -1 for the smaller tilt and 1 for
+            the larger one, from 0 to 2 pi.
         sin_beta: Sign of sin(beta), and so of y.
     """
 
     planar: int
     further: int
     sin_beta: int
-
-    @property
-    def signs(self) -> tuple[int, int, int]:
-        """planar, further, sin_beta."""
-        return self.planar, self.further, self.sin_beta
 
 
 ASSEMBLY_MODES = tuple(AssemblyMode(*signs) for signs in product((-1, 1), repeat=2))

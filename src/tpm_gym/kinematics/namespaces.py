@@ -60,16 +60,20 @@ def namespace_of(value: object) -> Namespace:
     return _torch() if is_tensor(value) else NUMPY
 
 
+def _clip(x: Any) -> Any:
+    return np.minimum(np.maximum(x, -1.0), 1.0)
+
+
 NUMPY = Namespace(
     cos=np.cos,
     sin=np.sin,
     arctan2=np.arctan2,
     sqrt=np.sqrt,
     root=lambda x: np.sqrt(np.maximum(x, 0.0)),
-    clip=lambda x: np.minimum(np.maximum(x, -1.0), 1.0),
-    arccos=lambda x: np.arccos(np.minimum(np.maximum(x, -1.0), 1.0)),
-    arcsin=lambda x: np.arcsin(np.clip(x, -1.0, 1.0)),
-    cos_third=lambda x: np.cos(np.arccos(np.minimum(np.maximum(x, -1.0), 1.0)) / 3.0),
+    clip=_clip,
+    arccos=lambda x: np.arccos(_clip(x)),
+    arcsin=lambda x: np.arcsin(_clip(x)),
+    cos_third=lambda x: np.cos(np.arccos(_clip(x)) / 3.0),
     maximum=np.maximum,
     where=np.where,
     positive=lambda x: np.where(x < 0, x + _TURN, x),
@@ -127,15 +131,10 @@ def by_rows(
     points: FloatArray,
     *layouts: NDArray[np.intp],
 ) -> list[FloatArray]:
-    """Compute columns (n,) for points (..., k), and arrange them in results.
-
-    Args:
-        text: Function from a tuple of the components (n,) to columns (n,).
-        points: Array or tensor.
-        layouts: Indices of columns, in the shape of a result.
+    """Compute columns (n,) from the components (n,) of points (..., k), and arrange them.
 
     Returns:
-        For each layout, (..., *layout.shape).
+        For each layout, (..., *layout.shape): the columns with the indices in the layout.
     """
     ns, shape = namespace_of(points), points.shape[:-1]
     flat = points.reshape(-1, points.shape[-1])

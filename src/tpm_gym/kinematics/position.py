@@ -4,9 +4,9 @@ Frames are the paper's; units are m and rad. Branches are named and ordered in
 :mod:`tpm_gym.kinematics.modes`. Torch tensors give tensors, on their device and in float64, that
 can be differentiated. Where branches merge, the derivative is 0 instead of infinite.
 
-All functions raise InputError for inputs that are no array (..., 3) of numbers. For entries that
-are not finite, functions on all branches return invalid branches, and functions on one named branch
-raise InputError. The latter raise UnreachableError if the branch does not exist for some entry.
+All functions raise InputError for inputs that are no array (..., 3) of numbers. Functions on all
+branches return invalid branches for entries that are not finite. Functions on one branch raise
+InputError for them, and UnreachableError if the branch does not exist for some entry.
 """
 
 import math
@@ -72,8 +72,7 @@ def forward(
 ) -> FloatArray:
     """Compute the position of P (..., 3) m at theta (..., 3) rad, on one named branch.
 
-    Both y and -y belong to the same angles: the default branch gives y > 0,
-    ``AssemblyMode(-1, -1)`` its mirror image.
+    The default branch gives y > 0; ``AssemblyMode(-1, -1)`` gives its mirror image.
     """
     return _assembled(points("theta", theta), branch, geometry).position[..., branch.index, :]
 
@@ -81,10 +80,7 @@ def forward(
 def inverse(
     position: ArrayLike, branch: WorkingMode = ELBOWS_OUT, geometry: Geometry = PAPER
 ) -> FloatArray:
-    """Compute actuated angles (..., 3) rad for P at position (..., 3) m, on one named branch.
-
-    theta_1 and theta_3 are in (-pi, pi], theta_2 in [0, 2 pi).
-    """
+    """Compute angles (..., 3) rad, in the ranges of :class:`.InverseSolutions`, on one branch."""
     places = points("position", position)
     solutions = inverse_all(finite_points("position", places), geometry)
     valid = solutions.valid[..., branch.index]

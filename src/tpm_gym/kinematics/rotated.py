@@ -1,10 +1,10 @@
 """The second operation mode: link 3' and the platform turned about y, in closed form.
 
-The two rods of branch I keep one distance each. Seen along y they are opposite sides of a four-bar
-linkage whose other two sides, links 3 and 3', are equal too: a parallelogram, in which link 3' only
-translates, as the paper has it; or an antiparallelogram, in which it is turned. Then B1C1, seen
-along y, halves the angle between links 3 and 3'. Nothing else changes: branch II lets link 3' turn
-about y, and branch III turns the platform with it.
+Seen along y, both rods of branch I are opposite sides of a four-bar linkage whose other two sides,
+links 3 and 3', are equal too. It is a parallelogram, in which link 3' only translates, as in the
+paper; or an antiparallelogram, in which link 3' is turned. Then B1C1, seen along y, halves the
+angle between links 3 and 3'. Branch II lets link 3' turn about y, and branch III turns the platform
+with it.
 
 Both modes meet where z_C1 = z_B1, the constraint singularity: seen along y all four sides of the
 linkage then lie on one line, and it can leave that posture either way.
@@ -30,8 +30,7 @@ from tpm_gym.kinematics.namespaces import NUMPY
 
 _Planar = NDArray[np.complex128]
 _Pair = tuple[FloatArray, FloatArray]
-_Four = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
-"""Derivatives of two functions by two unknowns, in rows."""
+_Four = tuple[FloatArray, FloatArray, FloatArray, FloatArray]  # two derivatives of two functions
 
 _NEAR = 1e-5  # largest distance from the unit circle at which an eigenvalue may be on it
 _MERGED = 1e-7  # of l4: eigenvalues that coincide are good to half of the digits
@@ -107,10 +106,9 @@ class RotatedPostures:
 def forward_rotated(theta: ArrayLike, geometry: Geometry = PAPER) -> RotatedPostures:
     """Solve all assemblies with link 3' turned at actuated angles theta (..., 3) rad, (..., 8).
 
-    Link 3' depends on theta_1 and theta_2 alone: tan(phi / 2) is a root of a quartic, so that there
-    are 4 postures of it at most, and 2 of link 7 for each. One slot for each branch of
-    :data:`.modes.ROTATED_MODES`. Where both modes meet (phi = 0) the assembly is returned, too.
-    Entries that are not finite give none.
+    Link 3' depends on theta_1 and theta_2 alone and has 4 postures at most; link 7 has 2 for each.
+    The slots are those of :data:`.modes.ROTATED_MODES`. Where both modes meet (phi = 0), the
+    assembly is returned too. Entries that are not finite give none.
 
     Raises:
         InputError: If theta is no array (..., 3) of numbers.
@@ -135,9 +133,8 @@ def forward_rotated(theta: ArrayLike, geometry: Geometry = PAPER) -> RotatedPost
 def inverse_rotated(position: ArrayLike, geometry: Geometry = PAPER) -> RotatedPostures:
     """Solve all postures with link 3' turned and point P at position (..., 3) m, (..., 48).
 
-    tan(phi / 2) is a root of a sextic for each sign of cos(beta); then arm 1 is known, and arms 2
-    and 3 can be bent two ways. Slots: cos(beta) < 0, then > 0; six tilts, in order; legs 2 and 3,
-    each with B_iC_i . dB_i/dtheta_i < 0, then > 0. Entries that are not finite give none.
+    Slots: cos(beta) < 0, then > 0; six tilts, in order; legs 2 and 3, each with
+    B_iC_i . dB_i/dtheta_i < 0, then > 0. Entries that are not finite give none.
 
     Raises:
         InputError: If position is no array (..., 3) of numbers.
@@ -192,17 +189,10 @@ def _elbows(theta: FloatArray, g: Geometry) -> FloatArray:
     """Compute B1, B2, B3 as rows (..., 3, 3) m."""
     one, two, three = np.moveaxis(theta, -1, 0)
     level, rise = equations.arms((one, two, three), g, NUMPY)
-    zero = 0 * one
-    elbows = [
-        np.stack([zero, g.l1 + level[0], rise[0]], axis=-1),
-        np.stack([level[1] - g.l1, zero, rise[1]], axis=-1),
-        np.stack([level[2] + g.l1, zero, rise[2]], axis=-1),
-    ]
-    return np.stack(elbows, axis=-2)
-
-
-def _samples(count: int) -> FloatArray:
-    return np.linspace(0.0, 2 * np.pi, count, endpoint=False)
+    first = 0 * one, g.l1 + level[0], rise[0]
+    second, third = (level[1] - g.l1, 0 * one, rise[1]), (level[2] + g.l1, 0 * one, rise[2])
+    elbows: FloatArray = np.stack([*first, *second, *third], axis=-1)
+    return elbows.reshape(*theta.shape, 3)
 
 
 def _zeros(values: FloatArray) -> tuple[FloatArray, BoolArray]:
@@ -228,10 +218,9 @@ def _zeros(values: FloatArray) -> tuple[FloatArray, BoolArray]:
 
 @np.errstate(all="ignore")
 def link3_rotated(theta: FloatArray, geometry: Geometry = PAPER) -> tuple[_Planar, FloatArray]:
-    """Solve point C1 (xC + i zC, m) and tilt (rad) of link 3' turned, (..., 4).
+    """Solve point C1 (xC + i zC, m) and tilt (rad) of link 3' turned at theta (..., 3), (..., 4).
 
-    Both depend on theta_1 and theta_2 of theta (..., 3) rad alone. Missing solutions are NaN. The
-    slots are those of :data:`.modes.ROTATED_MODES`, by pairs.
+    Missing solutions are NaN. The slots are those of :data:`.modes.ROTATED_MODES`, by pairs.
 
     Seen along y and from B1, C1 = rho n with n = exp(-i phi / 2), since B1C1 halves the angle. Then
     the closures of rods 4a and 4b are one, and that of rod 6 is linear in rho. Squared, it is a
@@ -249,14 +238,20 @@ def link3_rotated(theta: FloatArray, geometry: Geometry = PAPER) -> tuple[_Plana
         q = rho2 + abs(kappa + 2 * g.l5 * (u - 1)) ** 2 - g.l4**2
         return rho2, _dot(kappa, n), q
 
-    rho2, p, q = terms(_samples(5))
+    def closures(rho: FloatArray, tilt: FloatArray) -> tuple[_Pair, _Four]:
+        """Return closures of rods 4a and 4b, and of rod 6, m^2; and their slopes."""
+        n, u = np.exp(-0.5j * tilt), np.exp(-1j * tilt)
+        rod6 = rho * n - 2 * g.l5 * (u - 1) - kappa
+        gaps = rho**2 + (2 * g.l5 * n.imag) ** 2 - reach2, abs(rod6) ** 2 - g.l4**2
+        bend = 2 * _dot(rod6, 2j * g.l5 * u - 0.5j * rho * n)
+        return gaps, (2 * rho, 2 * g.l5**2 * np.sin(tilt), 2 * _dot(rod6, n), bend)
+
+    rho2, p, q = terms(np.linspace(0.0, 2 * np.pi, 5, endpoint=False))
     tilt, near = _zeros(4 * rho2 * p**2 - q**2)
     rho2, p, q = terms(tilt)
     # Where p = q = 0, rho has both signs, and two neighbouring zeros are one.
     rho = np.where(abs(p) < _MERGED * g.l4, [1, -1, 1, -1], np.sign(p * q)) * NUMPY.root(rho2)
-    (rho, tilt), gaps, slopes = _refined(
-        lambda rho, tilt: _closures(rho, tilt, kappa, reach2, g), rho, tilt
-    )
+    (rho, tilt), gaps, slopes = _refined(closures, rho, tilt)
     # Along the curve rho(phi) the closure of rod 6 changes its sign at every zero.
     a, b, c, d = slopes
     sign = (a * d - b * c) * rho
@@ -294,8 +289,9 @@ def _leg1(p: _Planar, link7: _Planar, g: Geometry) -> tuple[FloatArray, FloatArr
         )
         return gaps, slopes
 
-    up, out = terms(_samples(7))
-    tilt, near = _zeros((up**2 + out**2 - g.l3**2) * np.cos(_samples(7) / 2) ** 2)
+    samples = np.linspace(0.0, 2 * np.pi, 7, endpoint=False)
+    up, out = terms(samples)
+    tilt, near = _zeros((up**2 + out**2 - g.l3**2) * np.cos(samples / 2) ** 2)
     up, out = terms(tilt)
     (theta_1, tilt), gaps, _ = _refined(closures, np.arctan2(up, out), tilt)
     real = near & (abs(gaps[0]) < _CLOSED * g.l4) & (abs(gaps[1]) < _CLOSED * g.l4**2)
@@ -317,25 +313,6 @@ def _refined(
         small = abs(first) + abs(second) < _FARTHEST  # not where there is nothing to find
         one, two = one - np.where(small, first, 0.0), two - np.where(small, second, 0.0)
     return ((one, two), *closures(one, two))
-
-
-def _closures(
-    rho: FloatArray, tilt: FloatArray, kappa: _Planar, reach2: FloatArray, g: Geometry
-) -> tuple[_Pair, _Four]:
-    """Compute closures of rods 4a and 4b, and of rod 6, m^2, and their slopes by rho and tilt."""
-    n, u = np.exp(-0.5j * tilt), np.exp(-1j * tilt)
-    rod6 = rho * n - 2 * g.l5 * (u - 1) - kappa
-    gaps = (
-        rho**2 + (2 * g.l5 * n.imag) ** 2 - reach2,
-        abs(rod6) ** 2 - g.l4**2,
-    )
-    slopes = (
-        2 * rho,
-        2 * g.l5**2 * np.sin(tilt),
-        2 * _dot(rod6, n),
-        2 * _dot(rod6, 2j * g.l5 * u - 0.5j * rho * n),
-    )
-    return gaps, slopes
 
 
 def _in_slots(c1: _Planar, tilt: FloatArray, sign: FloatArray) -> tuple[_Planar, FloatArray]:

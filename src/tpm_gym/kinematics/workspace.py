@@ -39,7 +39,7 @@ class Region:
         """Reject empty boxes; arrays become tuples."""
         for name in ("low", "high"):
             object.__setattr__(self, name, vector(name, getattr(self, name), ConfigurationError))
-        if not np.all(np.asarray(self.low) <= np.asarray(self.high)):
+        if not all(low <= high for low, high in zip(self.low, self.high, strict=True)):
             raise ConfigurationError("low", self.low, f"at most high = {self.high} on every axis")
 
     def contains(self, points: ArrayLike) -> BoolArray:

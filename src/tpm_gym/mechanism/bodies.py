@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, NamedTuple
 
@@ -203,11 +203,14 @@ class Mechanism:
     tool: str
     lip: Vector
     actuated: tuple[str, ...]
-    _index: dict[str, int] = field(init=False, repr=False, compare=False)
 
-    def __post_init__(self) -> None:
-        """Index the links by name."""
-        object.__setattr__(self, "_index", {link.name: i for i, link in enumerate(self.links)})
+    @cached_property
+    def _by_name(self) -> dict[str, Link]:
+        return {link.name: link for link in self.links}
+
+    @cached_property
+    def _held(self) -> list[tuple[Link, Joint]]:
+        return [(link, link.joint) for link in self.links if link.joint]
 
     def link(self, name: str) -> Link:
         """Return the link of that name.
@@ -215,12 +218,12 @@ class Mechanism:
         Raises:
             KeyError: If there is none.
         """
-        return self.links[self._index[name]]
+        return self._by_name[name]
 
     @cached_property
     def motors(self) -> tuple[Joint, ...]:
         """Joints of the motors, in the order of :attr:`actuated`."""
-        joints = {link.joint.name: link.joint for link in self.links if link.joint}
+        joints = {joint.name: joint for _, joint in self._held}
         return tuple(joints[name] for name in self.actuated)
 
     @cached_property
@@ -241,9 +244,7 @@ class Mechanism:
         shape = np.shape(next(iter(joints.values())))
         identity = np.broadcast_to(np.eye(3), (*shape, 3, 3))
         found = {self.links[0].name: Place(np.zeros((*shape, 3)), identity)}
-        for link in self.links[1:]:
-            joint = link.joint
-            assert joint is not None
+        for link, joint in self._held:
             parent = found[joint.parent]
             origin, rotation = parent.point(joint.origin), parent.rotation
             if joint.kind == "prismatic":
@@ -257,14 +258,11 @@ class Mechanism:
     def legs(self) -> tuple[Mechanism, ...]:
         """Split the spanning tree at the base: one tree for each arm and the links behind it."""
         arm: dict[str, str] = {}
-        for link in self.links[1:]:
-            joint = link.joint
-            assert joint is not None
+        for link, joint in self._held:
             arm[link.name] = arm.get(joint.parent, link.name)
+        base, *moving = self.links
         return tuple(
-            replace(
-                self, links=(self.links[0], *(k for k in self.links[1:] if arm[k.name] == name))
-            )
+            replace(self, links=(base, *(link for link in moving if arm[link.name] == name)))
             for name in dict.fromkeys(arm.values())
         )
 

@@ -6,6 +6,7 @@ Engines simulate the cup; all of them use :func:`sealed`.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 from tpm_gym.arrays import Vector, rotate
@@ -73,28 +74,13 @@ class VacuumCup(NamedTuple):
 
     def link(self, platform: str, point_p: Vector) -> Link:
         """Build the cup as a link that slides in the platform of that name."""
-        bellows = Solid(
-            "cylinder",
-            (self.radius, self.bellows, 0.0),
-            (0.0, 0.0, self.length - self.bellows / 2),
-            _SILICONE,
-            colour="red",
-            collides=True,
-        )
-        plunger = Solid(
-            "cylinder", (0.003, 0.04, 0.0), (0.0, 0.0, self.length - 0.02), STEEL, colour="steel"
-        )
+        size, middle = (self.radius, self.bellows, 0.0), (0.0, 0.0, self.length - self.bellows / 2)
+        bellows = Solid("cylinder", size, middle, _SILICONE, colour="red", collides=True)
+        size, middle = (0.003, 0.04, 0.0), (0.0, 0.0, self.length - 0.02)
+        plunger = Solid("cylinder", size, middle, STEEL, colour="steel")
         # The stop is 1 mm beyond the rest position; else stop and spring would act on each other.
-        slide = Joint(
-            "cup_slide",
-            "prismatic",
-            platform,
-            point_p,
-            lower=-self.stroke,
-            upper=0.001,
-            effort=self.preload,
-            speed=1.0,
-        )
+        slide = Joint("cup_slide", "prismatic", platform, point_p, lower=-self.stroke, upper=0.001)
+        slide = replace(slide, effort=self.preload, speed=1.0)
         return Link("cup", (bellows, plunger), slide)
 
 
@@ -112,12 +98,12 @@ def sealed(
 ) -> Any:
     """Return whether the whole lip lies on the top face of a square block.
 
-    Arrays (n,) in place of numbers give an array (n,).
+    Arrays (n,) in place of numbers give an array (n,). Vectors are in the world frame.
 
     Args:
-        lip: Centre of the lip, m, world.
-        axis: Outward axis of the cup, world.
-        position: Centre of the block, m, world.
+        lip: Centre of the lip, m.
+        axis: Outward axis of the cup.
+        position: Centre of the block, m.
         quaternion: Orientation (x, y, z, w) of the block.
         size: Width and height of the block, m.
         cup: The cup.

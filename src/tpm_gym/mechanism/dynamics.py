@@ -4,27 +4,20 @@
 
 The coupling degree is zero, so every point has a formula, and so have its velocity and
 acceleration. The closures |B_iC_i| = l4, differentiated twice, give the accelerations of C1 and
-then of P from those of B_i, each by one division (:func:`_resolve`). Bodies enter by sixteen
-constants (:mod:`tpm_gym.mechanism.inertia`):
+then of P from those of B_i, each by one division (:func:`_resolve`). Forces of inertia and weight
+at B_i, C1 and P give the forces in the rods, one division each, and these give the torques of the
+motors (:func:`gather`). Bodies enter by sixteen constants (:mod:`tpm_gym.mechanism.inertia`):
 
 * the arms turn about the motors' axes;
-* rods are bars between B_i and C_i, two coupled points each; rod 6 stays in its plane. Rods 4 and
-  11 hang on universal joints, so they turn about their own axes as they swing. The inertia of the
-  swing contains that, and the crosses and end link 9, which swing with them;
+* rods are bars between B_i and C_i, two coupled points each. Rods 4 and 11 turn about their own
+  axes as they swing; the inertia of the swing contains that, the crosses and end link 9;
 * link 3' translates in the plane y = 0, as C1 does;
 * link 7 turns about z, a bar between C1 and P but for constant offsets;
 * platform, cup (its slide at rest), payload and end link 10 translate as P does. End link 10 can
-  roll about its own axis, through both its balls. No torque acts about that axis, so the roll does
-  not change the motors' torques and is left out.
+  roll about its own axis, which does not change the motors' torques and is left out.
 
-Forces of inertia and weight at B_i, C1 and P give the forces in the rods, one division each, and
-these give the torques of the motors (:func:`gather`). The mass matrix is that of the kinetic
-energy. C is polarised from the part of the torque that is quadratic in the rates; so it is the
-matrix of Christoffel's symbols, and M' - 2C is skew.
-
-Units are SI. The frame is the machine's (the paper's), in which gravity points along +z, as the
-base hangs upside down. Functions with a Pose take floats, arrays or tensors, as those of
-:mod:`tpm_gym.kinematics.equations`.
+Units are SI. In the paper frame, gravity points along +z, as the base hangs upside down. Functions
+with a Pose take the numbers of :mod:`tpm_gym.kinematics.equations`.
 """
 
 from __future__ import annotations
@@ -32,7 +25,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -49,14 +42,11 @@ from tpm_gym.mechanism import tree
 from tpm_gym.mechanism.inertia import Inertia, Swing, inertia_of
 from tpm_gym.mechanism.mount import GRAVITY
 
-SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
-"""Index of each entry of a symmetric matrix in its upper triangle, by rows."""
-
+_SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # places in the upper triangle, by rows
 _VECTOR = np.arange(3)
 _MATRIX = np.arange(9).reshape(3, 3)
 _CHECKS = 4  # columns before the results: whether it is not assembled, and the factors of det A
 _REST = (0.0, 0.0, 0.0)
-_UNITS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 class Energy(NamedTuple):
@@ -89,15 +79,9 @@ class Pose(NamedTuple):
 
 
 class Velocities(NamedTuple):
-    """First derivatives, m/s.
+    """First derivatives, m/s: of C1 along x and z, of P, l7 times the rate of beta, and of B_iC_i.
 
-    Attributes:
-        link3: Velocity of C1, along x and z.
-        platform: Velocity of P.
-        turn: l7 times the rate of beta.
-        rod1: Velocity of C1 relative to B1.
-        rod2: Velocity of C2 relative to B2, along x and z.
-        rod3: Velocity of C3 relative to B3.
+    That of B2C2 is along x and z.
     """
 
     link3: tuple[Numbers, Numbers]
@@ -122,7 +106,7 @@ class Accelerations(NamedTuple):
 
 
 def pose_at(
-    theta: Triple, signs: tuple[Numbers, Numbers], g: AnyLengths, ns: Namespace
+    theta: Triple, signs: tuple[Numbers, ...], g: AnyLengths, ns: Namespace
 ) -> tuple[Pose, Numbers]:
     """Assemble the mechanism at joint angles, for the signs of an assembly mode.
 
@@ -340,8 +324,7 @@ class Dynamics:
     with each other; torch tensors among them give tensors, in float64, that can be differentiated.
 
     All methods raise InputError for what is no array (..., 3) of finite numbers, UnreachableError
-    if the branch does not exist at some theta, and SingularityError if one is a parallel
-    singularity, where torques have no bound.
+    if the branch does not exist at some theta, and SingularityError at a parallel singularity.
 
     Attributes:
         geometry: Link lengths.
@@ -352,8 +335,8 @@ class Dynamics:
         free_fall: Acceleration of gravity in the machine's frame, m/s^2.
 
     Raises:
-        ConfigurationError: If a mass or gravity is not possible, or at the first use, if there is
-            another number of factors.
+        ConfigurationError: If a mass or gravity is not possible, or, at the first use, if the
+            number of factors is another one.
     """
 
     geometry: Geometry = PAPER
@@ -384,23 +367,23 @@ class Dynamics:
 
     def gravity(self, theta: ArrayLike) -> FloatArray:
         """Compute the torques (..., 3) N m that hold the machine at rest."""
-        return self._rows(
-            lambda pose: self._torques(pose, _REST, _REST), {"theta": theta}, _VECTOR
-        )[0]
+        rest = partial(self._torques, rates=_REST, changes=_REST)
+        return self._rows(rest, {"theta": theta}, _VECTOR)[0]
 
     def mass_matrix(self, theta: ArrayLike) -> FloatArray:
         """Compute the mass matrix M, (..., 3, 3) kg m^2, symmetric and positive."""
-        return self._rows(self._masses, {"theta": theta}, SYMMETRIC)[0]
+        return self._rows(self._masses, {"theta": theta}, _SYMMETRIC)[0]
 
     def coriolis(self, theta: ArrayLike, theta_dot: ArrayLike) -> FloatArray:
         """Compute C (..., 3, 3) kg m^2/s from Christoffel's symbols, so that M' - 2 C is skew."""
 
         def columns(pose: Pose, rates: Triple) -> list[Numbers]:
+            def quadratic(sign: float, k: int) -> Triple:
+                a, b, c = (u + sign * (i == k) for i, u in enumerate(rates))
+                return torques(pose, (a, b, c), _REST, _REST, self.inertia)
+
             # For the part q(u) of the torques that is quadratic, q(u + e) - q(u - e) = 4 C(u) e
-            pairs = [
-                [torques(pose, moved, _REST, _REST, self.inertia) for moved in _both(rates, unit)]
-                for unit in _UNITS
-            ]
+            pairs = [(quadratic(1.0, k), quadratic(-1.0, k)) for k in range(3)]
             return [(up[row] - down[row]) / 4 for row in range(3) for up, down in pairs]
 
         return self._rows(columns, {"theta": theta, "theta_dot": theta_dot}, _MATRIX)[0]
@@ -466,8 +449,3 @@ def _side_by_side(states: Mapping[str, ArrayLike]) -> FloatArray:
         valid = "of shapes (..., 3) that go together, by shape"
         raise InputError(", ".join(states), shapes, valid) from error
     return table
-
-
-def _both(rates: Triple, unit: Vector) -> tuple[Triple, Triple]:
-    (u, v, w), (a, b, c) = rates, unit
-    return (u + a, v + b, w + c), (u - a, v - b, w - c)

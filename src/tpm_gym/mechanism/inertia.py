@@ -13,7 +13,7 @@ and 11 also turn about their own axes.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -93,22 +93,17 @@ def inertia_of(
     Args:
         mechanism: Bodies of the mechanism.
         geometry: Lengths of the mechanism.
-        link_masses: Factors of mass and inertia, one for each link but the base; empty if all are
-            one.
+        link_masses: Factors of mass and inertia, one for each moving link; empty if all are one.
         payload: Mass that the cup carries, kg.
 
     Raises:
         ConfigurationError: If there is another number of factors, or if the formulas do not hold
-            for a body: the centre of a bar is off its axis, a rod is not round, or a link has
-            another name.
+            for a body.
     """
     bodies = _Bodies(mechanism, link_masses)
     l3, l4, l7 = geometry.l3, geometry.l4, geometry.l7
-    arms = [
-        bodies.bar("arm_2", Y, X, l3),
-        bodies.bar("arm_5", X, Y, l3),
-        bodies.bar("arm_12", X, Y, l3),
-    ]
+    turning = ("arm_2", Y, X), ("arm_5", X, Y), ("arm_12", X, Y)
+    arms = [bodies.bar(*arm, l3) for arm in turning]
     rods = [
         bodies.round_bar("rod_4a", Y, l4) + bodies.round_bar("rod_4b", Y, l4),
         bodies.bar("rod_6", X, Y, l4),
@@ -125,16 +120,18 @@ def inertia_of(
     )
     legs = list(zip(arms, rods, elbows, strict=True))
     found = Inertia(
-        motors=_three([(arm.far + rod.near + elbow) * l3**2 for arm, rod, elbow in legs]),
-        weights=_three([arm.couple + arm.far + rod.near + elbow for arm, rod, elbow in legs]),
-        couples=_three([rod.couple for rod in rods]),
+        motors=_three((arm.far + rod.near + elbow) * l3**2 for arm, rod, elbow in legs),
+        weights=_three(arm.couple + arm.far + rod.near + elbow for arm, rod, elbow in legs),
+        couples=_three(rod.couple for rod in rods),
         link3=bodies.mass("link_3p") + rods[0].far + rods[1].far + link7.near,
         link7=link7.couple,
         platform=translating + rods[2].far + link7.far + payload,
         swing1=Swing(crosses[0][1] + crosses[1][1], spin4),
         swing3=Swing(end9[1], spin11),
     )
-    bodies.require_all_known()
+    left = [k.name for k in mechanism.links[1:] if k.mass and k.name not in bodies.known]
+    if left:
+        raise ConfigurationError("mechanism", left, "the links of mechanism.tree.build alone")
     return found
 
 
@@ -148,12 +145,7 @@ class _Bodies:
             raise ConfigurationError("link_masses", tuple(factors), valid)
         self._links = {link.name: link for link in moving}
         self._factors = dict(zip(self._links, factors or [1.0] * len(moving), strict=True))
-        self._known: set[str] = set()
-
-    def require_all_known(self) -> None:
-        left = [name for name, k in self._links.items() if k.mass and name not in self._known]
-        if left:
-            raise ConfigurationError("mechanism", left, "the links of mechanism.tree.build alone")
+        self.known: set[str] = set()
 
     def mass(self, name: str) -> float:
         return self._factors[name] * self._link(name).mass
@@ -195,10 +187,10 @@ class _Bodies:
             raise ConfigurationError("mechanism", name, valid)
 
     def _link(self, name: str) -> Link:
-        self._known.add(name)
+        self.known.add(name)
         return self._links[name]
 
 
-def _three(values: list[float]) -> tuple[float, float, float]:
+def _three(values: Iterable[float]) -> tuple[float, float, float]:
     one, two, three = values
     return one, two, three

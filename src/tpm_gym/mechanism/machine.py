@@ -1,8 +1,7 @@
 """Robots that environments are built for: translational, with closed-form kinematics, as values.
 
-A :class:`Machine` answers what any such robot can: forward and inverse kinematics, the Jacobian,
-its modes, its dynamics, where it may go, and the bodies to load. So another robot (a Delta, a
-gantry) stands under the same tasks.
+A :class:`Machine` has forward and inverse kinematics, the Jacobian, modes, dynamics, regions, and
+the bodies to load. So other robots (a Delta, a gantry) serve the same tasks.
 
 Arrays have one robot a row and (x, y, z) or the three joints last, (..., 3), in SI units and the
 machine's own frame, which its :class:`~tpm_gym.mechanism.mount.Mount` places in the world. Joint
@@ -64,10 +63,9 @@ class Reading(NamedTuple):
 class Motion(NamedTuple):
     """Position, Jacobian and equation of motion: torque = mass theta_ddot + bias.
 
+    The first three attributes are those of :class:`Reading`.
+
     Attributes:
-        position: See :class:`Reading`.
-        jacobian: See :class:`Reading`.
-        working: See :class:`Reading`.
         mass: Inertia that the motors feel, (..., 3, 3) kg m^2.
         bias: Torque that weight and rates take, (..., 3) N m.
     """
@@ -116,20 +114,13 @@ class Machine(ABC):
     def __post_init__(self) -> None:
         """Reject machines on which no episode could run."""
         self._require_values()
-        for name, point in (
-            ("home", self.home),
-            ("goal_region", self.goal_region.low),
-            ("goal_region", self.goal_region.high),
-        ):
+        goals = self.goal_region
+        inside = ("home", self.home), ("goal_region", goals.low), ("goal_region", goals.high)
+        for name, point in inside:
             if not self.region.contains(point):
                 raise ConfigurationError(name, point, f"inside the region, {self.region}")
-        limits = {
-            "step_limit": self.step_limit,
-            "joint_limit": (self.joint_limit,),
-            "table": self.table,
-        }
-        for name, values in limits.items():
-            if not min(values) > 0:
+        for name in ("step_limit", "joint_limit", "table"):
+            if not np.min(getattr(self, name)) > 0:
                 raise ConfigurationError(name, getattr(self, name), "positive")
         if not 0 < self.safe_conditioning <= 1:  # the penalty is in units of it
             raise ConfigurationError("safe_conditioning", self.safe_conditioning, "in (0, 1]")
@@ -141,7 +132,7 @@ class Machine(ABC):
             raise ConfigurationError("mount", self.mount, valid)
 
     def _require_values(self) -> None:
-        """Refuse values of other types and numbers that are not finite; arrays become tuples."""
+        """Reject other types and numbers that are not finite; convert arrays to tuples."""
         for name, kind in (("mount", Mount), ("region", Region), ("goal_region", Region)):
             if not isinstance(getattr(self, name), kind):
                 raise ConfigurationError(name, getattr(self, name), f"a {kind.__name__}")
@@ -153,7 +144,7 @@ class Machine(ABC):
         object.__setattr__(self, "table", tuple(table.tolist()))
 
     def _require_usable(self, name: str, points: list[Vector]) -> None:
-        """Refuse the option of that name if P cannot be worked with at ``points``."""
+        """Reject the attribute ``name`` if a point is out of reach or beyond a limit."""
         try:
             theta, left = self._postures(np.array(points))
         except UnreachableError as error:
@@ -289,25 +280,15 @@ class Machine(ABC):
         return known
 
     def conditioning(self, theta: ArrayLike) -> FloatArray:
-        """Compute 1/cond(J) (...,) at ``theta`` (..., 3); 0 where the machine cannot be assembled.
-
-        It is 0 at a parallel singularity too.
-        """
+        """Compute 1/cond(J) (...,) at ``theta`` (..., 3); 0 where :meth:`evaluate` returns NaN."""
         found = self.evaluate(theta).conditioning
         known: FloatArray = np.where(np.isnan(found), 0.0, found)
         return known
 
-    def is_safe(self, position: ArrayLike) -> BoolArray:
-        """Return whether P can be at ``position`` (..., 3) with :attr:`safe_conditioning`."""
-        return np.asarray(self.conditioning_at(position) >= self.safe_conditioning)
-
     def sample(self, rngs: Sequence[np.random.Generator], regions: Sequence[Region]) -> FloatArray:
-        """Draw a point (3,) m for each of r generators, uniform over the safe part of its region.
+        """Draw a point (r, 3) m for each of r generators, uniform over the safe part of its region.
 
         Each generator draws for its own row only: a row has the same values alone and among many.
-
-        Returns:
-            (r, 3) m.
 
         Raises:
             ConfigurationError: If no draw for a region was safe.
@@ -317,7 +298,7 @@ class Machine(ABC):
         for _ in range(_ATTEMPTS):
             drawn = np.array([rngs[row].random(3) for row in rows.tolist()])
             points[rows] = low[rows] + (high[rows] - low[rows]) * drawn
-            rows = rows[~self.is_safe(points[rows])]
+            rows = rows[self.conditioning_at(points[rows]) < self.safe_conditioning]
             if not len(rows):
                 return points
         valid = f"a value that some point of {regions[rows[0]]} reaches"
@@ -358,7 +339,7 @@ class Machine(ABC):
             theta_dot: Joint velocities (..., 3) per s.
             theta_ddot: Joint accelerations (..., 3) per s^2.
             force: Force on P (..., 3) N that the motors hold against; None for none.
-            built: See :meth:`inverse`.
+            built: Parameters of the machines, as for :meth:`inverse`.
         """
         motion = np.stack(np.broadcast_arrays(theta, theta_dot, theta_ddot), axis=-2, dtype=float)
         rows = motion.reshape(-1, 3, 3)

@@ -9,14 +9,14 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterable
 from pathlib import Path
-from xml.etree.ElementTree import Comment, Element, SubElement, indent, tostring
+from xml.etree.ElementTree import Comment, Element, indent, tostring
 
-from tpm_gym.mechanism.bodies import Joint, Link, Mechanism, Solid
+from tpm_gym.mechanism.bodies import Link, Mechanism, Solid
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.mount import Mount
 from tpm_gym.mechanism.tpm import PAPER_TPM
-from tpm_gym.mechanism.urdf import COLOURS, numbers
+from tpm_gym.mechanism.urdf import COLOURS, add, numbers
 
 __all__ = ["MJCF_FILE", "SOLID", "STIFF", "mjcf_text", "robot", "site_names", "write"]
 
@@ -61,32 +61,27 @@ def robot(mechanism: Mechanism, mount: Mount, time_step: float) -> Element:
         time_step: Time step, s; the loops close within one.
     """
     root = Element("mujoco", model="tpm")
-    SubElement(root, "compiler", angle="radian", autolimits="true")
-    defaults = SubElement(root, "default")
+    add(root, "compiler", angle="radian", autolimits="true")
+    defaults = add(root, "default")
     # Within two time steps, critically damped: the shortest that MuJoCo allows.
-    SubElement(defaults, "joint", solreflimit=numbers((2 * time_step, 1.0)), solimplimit=STIFF)
-    SubElement(
-        defaults,
-        "equality",
-        solref=numbers((-1 / time_step**2, -1 / time_step)),
-        solimp=STIFF,
-    )
-    drawn = SubElement(defaults, "default", {"class": "drawn"})
-    SubElement(drawn, "geom", contype="0", conaffinity="0", group="1")
-    SubElement(SubElement(defaults, "default", {"class": SOLID}), "geom", group="1")
-    asset = SubElement(root, "asset")
+    add(defaults, "joint", solreflimit=(2 * time_step, 1.0), solimplimit=STIFF)
+    add(defaults, "equality", solref=(-1 / time_step**2, -1 / time_step), solimp=STIFF)
+    drawn = add(defaults, "default", **{"class": "drawn"})
+    add(drawn, "geom", contype="0", conaffinity="0", group="1")
+    add(add(defaults, "default", **{"class": SOLID}), "geom", group="1")
+    asset = add(root, "asset")
     for name, rgba in COLOURS.items():
-        SubElement(asset, "material", name=name, rgba=numbers(rgba))
-    world = SubElement(root, "worldbody")
+        add(asset, "material", name=name, rgba=rgba)
+    world = add(root, "worldbody")
     bodies: dict[str, Element] = {}
     for link in mechanism.links:
-        bodies[link.name] = _body(world, bodies, link, mount)
-    equality = SubElement(root, "equality")
+        bodies[link.name] = _add_body(world, bodies, link, mount)
+    equality = add(root, "equality")
     for closure in mechanism.closures:
         site_a, site_b = site_names(closure.name)
-        SubElement(bodies[closure.link_a], "site", name=site_a, pos=numbers(closure.point_a))
-        SubElement(bodies[closure.link_b], "site", name=site_b, pos=numbers(closure.point_b))
-        SubElement(equality, "connect", name=closure.name, site1=site_a, site2=site_b)
+        add(bodies[closure.link_a], "site", name=site_a, pos=closure.point_a)
+        add(bodies[closure.link_b], "site", name=site_b, pos=closure.point_b)
+        add(equality, "connect", name=closure.name, site1=site_a, site2=site_b)
     return root
 
 
@@ -100,28 +95,21 @@ def mjcf_text(machine: Machine) -> str:
     mechanism = machine.mechanism
     root = robot(mechanism, machine.mount, _TIME_STEP)
     root.insert(0, Comment(_NOTES))
-    SubElement(
-        root,
-        "option",
-        timestep=numbers([_TIME_STEP]),
-        integrator="Euler",
-        solver="Newton",
-        cone="elliptic",
-        tolerance="1e-15",
-    )
+    solver = {"integrator": "Euler", "solver": "Newton", "cone": "elliptic", "tolerance": "1e-15"}
+    add(root, "option", timestep=_TIME_STEP, **solver)
     world = root.find("worldbody")
     assert world is not None
-    SubElement(world, "light", directional="true", pos="0 0 3", dir="-1 1.2 -2.5")
-    size = numbers((*machine.table, 0.1))
-    SubElement(world, "geom", name="table", type="plane", size=size, material="grey")
+    add(world, "light", directional="true", pos="0 0 3", dir="-1 1.2 -2.5")
+    add(world, "geom", name="table", type="plane", size=(*machine.table, 0.1), material="grey")
+    joints = {joint.attrib["name"]: joint for joint in world.iter("joint")}
     tool = mechanism.link(mechanism.tool).joint
-    for joint in world.iter("joint"):
-        if tool is not None and joint.get("name") == tool.name:
-            joint.set("range", numbers((tool.lower, 0.0)))  # the spring keeps it on this stop
-            joint.set("stiffness", numbers([_SPRING]))
-            joint.set("springref", numbers([CUP.preload / _SPRING]))
-    root.append(_actuators(mechanism))
-    root.append(_home(machine, [joint.attrib["name"] for joint in world.iter("joint")]))
+    if tool is not None:
+        joint = joints[tool.name]
+        joint.set("range", numbers((tool.lower, 0.0)))  # the spring keeps it on this stop
+        joint.set("stiffness", numbers([_SPRING]))
+        joint.set("springref", numbers([CUP.preload / _SPRING]))
+    _add_servos(root, mechanism)
+    _add_home(root, machine, joints)
     indent(root)
     return '<?xml version="1.0"?>\n' + tostring(root, encoding="unicode") + "\n"
 
@@ -134,49 +122,34 @@ def write(folder: Path, machine: Machine = PAPER_TPM) -> Path:
     return path
 
 
-def _body(world: Element, bodies: dict[str, Element], link: Link, mount: Mount) -> Element:
-    """Build a link on its parent, or the base in the world."""
+def _add_body(world: Element, bodies: dict[str, Element], link: Link, mount: Mount) -> Element:
+    """Add a link to its parent, or the base to the world."""
     joint = link.joint
     if joint is None:
         x, y, z, w = mount.quaternion
-        origin = numbers(mount.to_world((0.0, 0.0, 0.0)))
-        turn = numbers((w, x, y, z))
-        body = SubElement(world, "body", name=link.name, pos=origin, quat=turn)
+        origin = mount.to_world((0.0, 0.0, 0.0))
+        body = add(world, "body", name=link.name, pos=origin, quat=(w, x, y, z))
     else:
-        body = SubElement(bodies[joint.parent], "body", name=link.name, pos=numbers(joint.origin))
-        inertia = link.inertia
-        moments = [inertia[at] for at in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
-        SubElement(
-            body,
-            "inertial",
-            pos=numbers(link.centre_of_mass),
-            mass=numbers([link.mass]),
-            fullinertia=numbers(moments),
-        )
-        body.append(_joint(joint))
+        body = add(bodies[joint.parent], "body", name=link.name, pos=joint.origin)
+        moments = [link.inertia[at] for at in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
+        centre = link.centre_of_mass
+        add(body, "inertial", pos=centre, mass=link.mass, fullinertia=moments)
+        kind = "slide" if joint.kind == "prismatic" else "hinge"
+        element = add(body, "joint", name=joint.name, type=kind, axis=joint.axis)
+        if joint.kind != "continuous":
+            element.set("range", numbers((joint.lower, joint.upper)))
     for solid in link.solids:
-        body.append(_geom(solid, link.name))
+        _add_geom(body, solid, link.name)
     return body
 
 
-def _joint(joint: Joint) -> Element:
-    kind = "slide" if joint.kind == "prismatic" else "hinge"
-    element = Element("joint", name=joint.name, type=kind, axis=numbers(joint.axis))
-    if joint.kind != "continuous":
-        element.set("range", numbers((joint.lower, joint.upper)))
-    return element
-
-
 # Quaternions (w, x, y, z) that turn a cylinder along z onto the named axis.
-_TURN = {
-    "x": (0.5**0.5, 0.0, 0.5**0.5, 0.0),
-    "y": (0.5**0.5, 0.5**0.5, 0.0, 0.0),
-    "z": (1.0, 0.0, 0.0, 0.0),
-}
+_TURN = {"x": (0.5**0.5, 0.0, 0.5**0.5, 0.0), "y": (0.5**0.5, 0.5**0.5, 0.0, 0.0)}
 
 
-def _geom(solid: Solid, link: str) -> Element:
-    element = Element("geom", {"class": SOLID if solid.collides else "drawn"}, type=solid.kind)
+def _add_geom(body: Element, solid: Solid, link: str) -> None:
+    kind = SOLID if solid.collides else "drawn"
+    element = add(body, "geom", **{"class": kind}, type=solid.kind)
     if solid.collides:
         element.set("name", link)
     x, y, z = solid.size
@@ -188,35 +161,31 @@ def _geom(solid: Solid, link: str) -> Element:
             element.set("quat", numbers(_TURN[solid.axis]))
     element.set("pos", numbers(solid.centre))
     element.set("material", solid.colour)
-    return element
 
 
-def _actuators(mechanism: Mechanism) -> Element:
-    """Build a servo for each motor: torque = stiffness (ctrl - theta) - damping theta_dot."""
-    actuators = Element("actuator")
+def _add_servos(root: Element, mechanism: Mechanism) -> None:
+    """Add a servo for each motor: torque = stiffness (ctrl - theta) - damping theta_dot."""
+    actuators = add(root, "actuator")
     for motor in mechanism.motors:
-        SubElement(
+        add(
             actuators,
             "general",
             name=motor.name,
             joint=motor.name,
             biastype="affine",
-            gainprm=numbers([_STIFFNESS]),
-            biasprm=numbers((0.0, -_STIFFNESS, -_DAMPING)),
-            ctrlrange=numbers((motor.lower, motor.upper)),
-            forcerange=numbers((-motor.effort, motor.effort)),
+            gainprm=_STIFFNESS,
+            biasprm=(0.0, -_STIFFNESS, -_DAMPING),
+            ctrlrange=(motor.lower, motor.upper),
+            forcerange=(-motor.effort, motor.effort),
         )
-    return actuators
 
 
-def _home(machine: Machine, joints: Iterable[str]) -> Element:
-    """Build a key frame with P at home, all ``joints`` at rest and the motors' targets there."""
+def _add_home(root: Element, machine: Machine, joints: Iterable[str]) -> None:
+    """Add a key frame with P at home, all ``joints`` at rest and the motors' targets there."""
     a, b, c = theta = machine.require_inverse(machine.home).tolist()
     at = machine.joint_positions((a, b, c))
-    frames = Element("keyframe")
-    qpos = numbers(at[name] for name in joints)
-    SubElement(frames, "key", name="home", qpos=qpos, ctrl=numbers(theta))
-    return frames
+    frames = add(root, "keyframe")
+    add(frames, "key", name="home", qpos=[at[name] for name in joints], ctrl=theta)
 
 
 def main() -> None:

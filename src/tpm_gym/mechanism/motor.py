@@ -78,24 +78,22 @@ class Motor:
         """Distance from the middle to the far end of each housing, m."""
         return self.clearance + self.length / 2 + 2 * self.end_turns
 
-    def rotor(self, axis: Axis) -> tuple[Solid, Solid]:
+    def rotor(self, axis: Axis) -> list[Solid]:
         """Build the rings along ``axis`` about the origin, all of steel (magnets weigh as much)."""
         size = (self.gap_radius, self.length / 2, 0.0)
         bore = (self.gap_radius - self.ring, self.length / 2, 0.0)
-        first, second = (
+        return [
             Solid("cylinder", size, at, STEEL, bore=bore, axis=axis, colour="steel")
             for at in self.halves(axis)
-        )
-        return first, second
+        ]
 
-    def stator(self, axis: Axis, centre: Vector) -> tuple[Solid, Solid]:
+    def stator(self, axis: Axis, centre: Vector) -> list[Solid]:
         """Build the housings along ``axis`` about ``centre``; the shaft ends in front of them."""
         size = (self.stator_radius, self.reach - self.clearance - 2 * _FACE, 0.0)
-        first, second = (
+        return [
             Solid("cylinder", size, at, ALUMINIUM, axis=axis, colour="dark")
             for at in self.halves(axis, centre)
-        )
-        return first, second
+        ]
 
     def halves(self, axis: Axis, centre: Vector = (0.0, 0.0, 0.0)) -> tuple[Vector, Vector]:
         """Return the middles of both halves, m."""

@@ -22,7 +22,7 @@ _HALF_TURN = np.array([1.0, -1.0, -1.0])
 
 @dataclass(frozen=True)
 class Mount:
-    """Mount of the base over the table: conversion between paper and world frame.
+    """Mount of the base over the table.
 
     The base is mounted upside down, a half turn about x: world = (x, -y, height - z).
 
@@ -30,13 +30,13 @@ class Mount:
         height: Height of the base plane above the table top (world z = 0), m.
 
     Raises:
-        ConfigurationError: If it is no number from -100 to 100.
+        ConfigurationError: If the height is no number from -100 to 100.
     """
 
     height: float
 
     def __post_init__(self) -> None:
-        """Reject heights at which coordinates would lose their digits."""
+        """Reject heights that cost coordinates their digits."""
         if not abs(finite("height", self.height, (), ConfigurationError)) <= 100:
             raise ConfigurationError("height", self.height, "at most 100 m")
 

@@ -20,6 +20,7 @@ along +y (branch I) or +x (branches II, III). Units: metres, radians, kilograms.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -35,14 +36,6 @@ from tpm_gym.mechanism.bodies import ALUMINIUM, STEEL, Closure, Joint, Link, Mec
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.motor import TORQUE_MOTOR
 
-__all__ = [
-    "ACTUATED_JOINTS",
-    "build",
-    "joint_angles",
-    "joint_arrays",
-    "rotated_joint_angles",
-]
-
 ACTUATED_JOINTS = ("R11", "R21", "R31")
 """Joints of the motors, in the order of theta_1, theta_2, theta_3."""
 
@@ -51,14 +44,11 @@ CARBON_FIBRE = 1600.0  # kg/m^3
 # Largest angles of an arm from level outwards, towards the base and towards the platform.
 ARM_RAISED, ARM_LOWERED = np.deg2rad(75.0), np.deg2rad(115.0)
 
-_ALONG: dict[str, int] = {"x": 0, "y": 1, "z": 2}
-
 
 def _vector(axis: str, value: float, centre: Vector = (0.0, 0.0, 0.0)) -> Vector:
     """Displace ``centre`` by ``value`` along ``axis``."""
-    moved = list(centre)
-    moved[_ALONG[axis]] += value
-    return (moved[0], moved[1], moved[2])
+    x, y, z = (c + value if name == axis else c for name, c in zip("xyz", centre, strict=True))
+    return x, y, z
 
 
 def _tube(
@@ -66,15 +56,9 @@ def _tube(
 ) -> Solid:
     """Build a rectangular aluminium tube from the link's origin along ``axis``."""
     outer = (length, width, height) if axis == "x" else (width, length, height)
-    inner = tuple(edge if i == _ALONG[axis] else edge - 2 * wall for i, edge in enumerate(outer))
-    return Solid(
-        "box",
-        outer,
-        _vector(axis, length / 2),
-        ALUMINIUM,
-        bore=(inner[0], inner[1], inner[2]),
-        colour="orange",
-    )
+    inner, low = width - 2 * wall, height - 2 * wall
+    bore = (length, inner, low) if axis == "x" else (inner, length, low)
+    return Solid("box", outer, _vector(axis, length / 2), ALUMINIUM, bore=bore, colour="orange")
 
 
 def _bar(
@@ -91,36 +75,18 @@ def _bar(
 
 def _rod(axis: Literal["x", "y"], length: float) -> tuple[Solid, ...]:
     """Build a carbon-fibre tube, 16 mm by 1.5 mm, with a steel rod end at both ends."""
-    tube = Solid(
-        "cylinder",
-        (0.008, length, 0.0),
-        _vector(axis, length / 2),
-        CARBON_FIBRE,
-        bore=(0.0065, length, 0.0),
-        axis=axis,
-        colour="carbon",
-    )
-    ends = tuple(
+    tube = _bar(axis, length / 2, 0.008, _vector(axis, length / 2), "carbon", CARBON_FIBRE)
+    ends = (
         _bar(axis, 0.008, 0.009, _vector(axis, at), density=STEEL) for at in (0.008, length - 0.008)
     )
-    return (tube, *ends)
+    return (replace(tube, bore=(0.0065, length, 0.0)), *ends)
 
 
 def _motor(name: str, axis: Vector, origin: Vector, level: float, sense: int) -> Joint:
     """Build a motor. Its arm is level outwards at ``level``, and lowers in ``sense`` of theta."""
     lower, upper = sorted((level - sense * ARM_RAISED, level + sense * ARM_LOWERED))
-    return Joint(
-        name,
-        "revolute",
-        "base",
-        origin,
-        axis,
-        lower,
-        upper,
-        effort=TORQUE_MOTOR.peak_torque,
-        speed=TORQUE_MOTOR.no_load_speed,
-        corner=TORQUE_MOTOR.corner_speed,
-    )
+    line = TORQUE_MOTOR.peak_torque, TORQUE_MOTOR.no_load_speed, TORQUE_MOTOR.corner_speed
+    return Joint(name, "revolute", "base", origin, axis, lower, upper, *line)
 
 
 def _base(g: Geometry) -> Link:
@@ -163,34 +129,22 @@ def _branch_1(g: Geometry) -> tuple[Link, ...]:
     )
     links = [arm]
     for suffix, ball, side in (("a", "Sa", 1), ("b", "Sb", -1)):
-        cross = Link(
-            f"cross_4{suffix}",
-            (_bar("z", 0.010, 0.009, density=STEEL),),
-            Joint(
-                f"{ball}_swing", "continuous", "arm_2", (side * g.l5, g.l3, 0.0), (1.0, 0.0, 0.0)
-            ),
-        )
-        rod = Link(
-            f"rod_4{suffix}",
-            _rod("y", g.l4),
-            Joint(f"{ball}_tilt", "continuous", cross.name, (0.0, 0.0, 0.0), (0.0, 0.0, -1.0)),
-        )
-        links += [cross, rod]
+        origin, cross = (side * g.l5, g.l3, 0.0), f"cross_4{suffix}"
+        swing = Joint(f"{ball}_swing", "continuous", "arm_2", origin, (1.0, 0.0, 0.0))
+        tilt = Joint(f"{ball}_tilt", "continuous", cross, (0.0, 0.0, 0.0), (0.0, 0.0, -1.0))
+        links.append(Link(cross, (_bar("z", 0.010, 0.009, density=STEEL),), swing))
+        links.append(Link(f"rod_4{suffix}", _rod("y", g.l4), tilt))
     return tuple(links)
 
 
 def _branch_2(g: Geometry) -> tuple[Link, ...]:
     """Build arm 5, rod 6, link 3', link 7, platform 1, the cup that slides in it, end link 10."""
-    minus_y = (0.0, -1.0, 0.0)
+    minus_y, point_p = (0.0, -1.0, 0.0), (g.l2, 0.0, g.l6)
+    # From F1 to D3
+    plate = Solid("box", (2 * g.l2 + 0.04, 0.045, 0.008), point_p, ALUMINIUM, colour="light")
+    tube, bore = (3 * g.l5, 0.025, 0.018), (3 * g.l5, 0.019, 0.012)
     link_3p = (
-        Solid(
-            "box",
-            (3 * g.l5, 0.025, 0.018),
-            (1.5 * g.l5, 0.0, 0.0),
-            ALUMINIUM,
-            bore=(3 * g.l5, 0.019, 0.012),
-            colour="blue",
-        ),
+        Solid("box", tube, (1.5 * g.l5, 0.0, 0.0), ALUMINIUM, bore=bore, colour="blue"),
         _bar("y", 0.016, 0.011, density=STEEL),
     )
     link_7 = (
@@ -205,21 +159,18 @@ def _branch_2(g: Geometry) -> tuple[Link, ...]:
         ),
         Link("link_3p", link_3p, Joint("R23", "continuous", "rod_6", (g.l4, 0.0, 0.0), minus_y)),
         Link("link_7", link_7, Joint("R12", "continuous", "link_3p", (2 * g.l5, 0.0, g.l6))),
-        Link("platform", _platform(g), Joint("R13", "continuous", "link_7", (g.l7, 0.0, 0.0))),
-        CUP.link("platform", (g.l2, 0.0, g.l6)),
+        Link(
+            "platform",
+            (plate, CUP.stem(point_p)),
+            Joint("R13", "continuous", "link_7", (g.l7, 0.0, 0.0)),
+        ),
+        CUP.link("platform", point_p),
         Link(
             "end_link_10",
             (_bar("y", g.l5 + 0.01, 0.007),),
             Joint("R33", "continuous", "platform", (2 * g.l2, 0.0, 0.0), minus_y),
         ),
     )
-
-
-def _platform(g: Geometry) -> tuple[Solid, ...]:
-    """Build platform 1: a plate from F1 to D3 and the stem in which the cup slides."""
-    point_p = (g.l2, 0.0, g.l6)
-    plate = Solid("box", (2 * g.l2 + 0.04, 0.045, 0.008), point_p, ALUMINIUM, colour="light")
-    return plate, CUP.stem(point_p)
 
 
 def _branch_3(g: Geometry) -> tuple[Link, ...]:
@@ -249,12 +200,7 @@ def build(geometry: Geometry = PAPER) -> Mechanism:
     the paper's case study.
     """
     g = geometry
-    links = (
-        _base(g),
-        *_branch_1(g),
-        *_branch_2(g),
-        *_branch_3(g),
-    )
+    links = (_base(g), *_branch_1(g), *_branch_2(g), *_branch_3(g))
     closures = (
         Closure("Sc", "rod_4a", (0.0, g.l4, 0.0), "link_3p", (3 * g.l5, 0.0, 0.0)),
         Closure("Sd", "rod_4b", (0.0, g.l4, 0.0), "link_3p", (g.l5, 0.0, 0.0)),
@@ -275,18 +221,12 @@ def build(geometry: Geometry = PAPER) -> Mechanism:
 def joint_angles(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> dict[str, float]:
-    """Compute the angles of all joints of the spanning tree at which the loops close.
+    """Compute the angles of all joints of :func:`build` at which the loops close, rad, by name.
 
-    Args:
-        theta: (3,) rad, actuated angles.
-        branch: The assembly mode.
-        geometry: Link lengths.
-
-    Returns:
-        Joint name -> rad (m for the cup's slide), for every joint of :func:`build` that moves.
+    The cup's slide, m, is at rest.
 
     Raises:
-        InputError: If theta has the wrong shape or is not finite.
+        InputError: If theta (3,) rad has the wrong shape or is not finite.
         UnreachableError: If the branch does not exist at theta.
     """
     angles = joint_arrays(theta, branch, geometry)
@@ -306,9 +246,7 @@ def joint_arrays(
 def rotated_joint_angles(
     theta: ArrayLike, branch: RotatedMode, geometry: Geometry = PAPER
 ) -> dict[str, float]:
-    """Compute the angles of all joints at which the loops close with link 3' turned.
-
-    Arguments and result are those of :func:`joint_angles`, with a branch of the second mode.
+    """Compute the angles of all joints with link 3' turned, rad, on a branch of the second mode.
 
     Raises:
         InputError: If theta has the wrong shape or is not finite, or if the branch does not exist
@@ -335,12 +273,8 @@ def _by_joint(
 ) -> dict[str, FloatArray]:
     """Convert absolute directions to joint angles (less those of the parents), all in rad.
 
-    Args:
-        theta: Joint positions of the motors, (..., 3).
-        swings: Swings of rods 4a, 4b, 6 and 11; see :class:`~tpm_gym.kinematics.PassiveAngles`.
-        tilts: Tilts of rods 4a, 4b and 11.
-        beta: Direction of link 7.
-        turn: Turn of link 3' and the platform about y; joints turn about -y.
+    Swings are those of rods 4a, 4b, 6 and 11; tilts those of rods 4a, 4b and 11. ``turn`` is the
+    turn of link 3' and the platform about y; joints turn about -y.
     """
     theta_1, theta_2, theta_3 = np.moveaxis(theta, -1, 0)
     swing_4a, swing_4b, swing_6, swing_11 = swings

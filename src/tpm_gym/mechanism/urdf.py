@@ -13,16 +13,16 @@ Run ``python -m tpm_gym.mechanism.urdf FOLDER`` to write both files.
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Iterable
 from pathlib import Path
-from xml.etree import ElementTree
-from xml.etree.ElementTree import Element
+from xml.etree.ElementTree import Comment, Element, SubElement, indent, tostring
 
 from tpm_gym.arrays import Vector
-from tpm_gym.mechanism.bodies import Link, Mechanism, Solid
+from tpm_gym.mechanism.bodies import Joint, Link, Mechanism, Solid
 from tpm_gym.mechanism.tree import build
 
-__all__ = ["COLOURS", "LOOPS_FILE", "URDF_FILE", "loops_text", "numbers", "urdf_text", "write"]
+__all__ = ["COLOURS", "LOOPS_FILE", "URDF_FILE", "add", "loops_text", "numbers", "urdf_text"]
 
 URDF_FILE, LOOPS_FILE = "tpm.urdf", "tpm.loops.yaml"
 
@@ -49,46 +49,47 @@ COLOURS = {
 }
 
 # Roll, pitch, yaw that turn a URDF cylinder (along z) onto the named axis.
-_AXIS_RPY = {
-    "x": (0.0, 1.5707963267948966, 0.0),
-    "y": (1.5707963267948966, 0.0, 0.0),
-    "z": (0.0, 0.0, 0.0),
-}
+_AXIS_RPY = {"x": (0.0, math.pi / 2, 0.0), "y": (math.pi / 2, 0.0, 0.0), "z": (0.0, 0.0, 0.0)}
 
-_MOMENTS = {
-    "ixx": (0, 0),
-    "ixy": (0, 1),
-    "ixz": (0, 2),
-    "iyy": (1, 1),
-    "iyz": (1, 2),
-    "izz": (2, 2),
-}
+_LEVEL = (0.0, 0.0, 0.0)
+_MOMENTS = {f"i{'xyz'[i]}{'xyz'[j]}": (i, j) for i in range(3) for j in range(i, 3)}
 
 
 def urdf_text(mechanism: Mechanism, closure_frames: bool = False) -> str:
     """Write the spanning tree as URDF, in the paper frame.
 
     Args:
+        mechanism: Links, joints and closures.
         closure_frames: Whether to add the frames that :func:`loops_text` pairs.
     """
     root = Element("robot", name="tpm")
-    root.append(ElementTree.Comment(" Generated from tpm_gym.mechanism; do not edit (make urdf). "))
-    root.append(ElementTree.Comment(" z points down: where the robot hangs, gravity is along +z. "))
+    root.append(Comment(" Generated from tpm_gym.mechanism; do not edit (make urdf). "))
+    root.append(Comment(" z points down: where the robot hangs, gravity is along +z. "))
     if closure_frames:
-        root.append(ElementTree.Comment(_CLOSING))
+        root.append(Comment(_CLOSING))
     for name, rgba in COLOURS.items():
-        material = ElementTree.SubElement(root, "material", name=name)
-        ElementTree.SubElement(material, "color", rgba=numbers(rgba))
+        add(add(root, "material", name=name), "color", rgba=rgba)
     for link in mechanism.links:
-        root.append(_link_element(link))
+        _add_link(root, link)
     for link in mechanism.links:
         if link.joint is not None:
-            root.append(_joint_element(link))
+            _add_joint(root, link.joint, link.name)
     if closure_frames:
         for name, parent, point in _closure_frames(mechanism):
-            root.extend(_frame_elements(name, parent, point))
-    ElementTree.indent(root)
-    return '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
+            _add_frame(root, name, parent, point)
+    indent(root)
+    return '<?xml version="1.0"?>\n' + tostring(root, encoding="unicode") + "\n"
+
+
+def add(parent: Element, tag: str, **values: str | float | Iterable[float]) -> Element:
+    """Add an element, with text, a number or numbers as the values of its attributes."""
+    return SubElement(parent, tag, {name: _text(value) for name, value in values.items()})
+
+
+def _text(value: str | float | Iterable[float]) -> str:
+    if isinstance(value, str):
+        return value
+    return numbers(value if isinstance(value, Iterable) else (value,))
 
 
 def loops_text(mechanism: Mechanism) -> str:
@@ -119,11 +120,7 @@ def write(folder: Path, mechanism: Mechanism | None = None) -> tuple[Path, Path]
 
 def numbers(values: Iterable[float]) -> str:
     """Format numbers with nine significant digits (a nanometre in a metre), without ``-0``."""
-    return " ".join(map(_number, values))
-
-
-def _number(value: float) -> str:
-    return f"{float(value) + 0.0:.9g}" if abs(value) > 1e-15 else "0"
+    return " ".join(f"{float(v) + 0.0:.9g}" if abs(v) > 1e-15 else "0" for v in values)
 
 
 def _closure_frames(mechanism: Mechanism) -> list[tuple[str, str, Vector]]:
@@ -138,69 +135,50 @@ def _closure_frames(mechanism: Mechanism) -> list[tuple[str, str, Vector]]:
     ]
 
 
-def _frame_elements(name: str, parent: str, point: Vector) -> tuple[Element, Element]:
-    """Build a massless link at ``point`` (m) of another, and the joint that fixes it there."""
-    link = Element("link", name=name)
-    inertial = ElementTree.SubElement(link, "inertial")  # without it, some loaders assume 1 kg
-    ElementTree.SubElement(inertial, "mass", value="0")
-    ElementTree.SubElement(inertial, "inertia", dict.fromkeys(_MOMENTS, "0"))
-    joint = Element("joint", name=f"{name}_frame", type="fixed")
-    ElementTree.SubElement(joint, "parent", link=parent)
-    ElementTree.SubElement(joint, "child", link=name)
-    ElementTree.SubElement(joint, "origin", xyz=numbers(point), rpy="0 0 0")
-    return link, joint
+def _add_frame(root: Element, name: str, parent: str, point: Vector) -> None:
+    """Add a massless link at ``point`` (m) of another, and the joint that fixes it there."""
+    inertial = add(add(root, "link", name=name), "inertial")  # else some loaders assume 1 kg
+    add(inertial, "mass", value=0)
+    add(inertial, "inertia", **dict.fromkeys(_MOMENTS, 0))
+    joint = add(root, "joint", name=f"{name}_frame", type="fixed")
+    add(joint, "parent", link=parent)
+    add(joint, "child", link=name)
+    add(joint, "origin", xyz=point, rpy=_LEVEL)
 
 
-def _link_element(link: Link) -> Element:
-    element = Element("link", name=link.name)
-    inertial = ElementTree.SubElement(element, "inertial")
-    ElementTree.SubElement(inertial, "origin", xyz=numbers(link.centre_of_mass), rpy="0 0 0")
-    ElementTree.SubElement(inertial, "mass", value=_number(link.mass))
-    moments = link.inertia
-    ElementTree.SubElement(
-        inertial, "inertia", {name: _number(moments[at]) for name, at in _MOMENTS.items()}
-    )
+def _add_link(root: Element, link: Link) -> None:
+    element = add(root, "link", name=link.name)
+    inertial, moments = add(element, "inertial"), link.inertia
+    add(inertial, "origin", xyz=link.centre_of_mass, rpy=_LEVEL)
+    add(inertial, "mass", value=link.mass)
+    add(inertial, "inertia", **{name: moments[at] for name, at in _MOMENTS.items()})
     for solid in link.solids:
-        element.append(_solid_element("visual", solid))
+        add(_add_solid(element, "visual", solid), "material", name=solid.colour)
         if solid.collides:
-            element.append(_solid_element("collision", solid))
-    return element
+            _add_solid(element, "collision", solid)
 
 
-def _solid_element(tag: str, solid: Solid) -> Element:
-    element = Element(tag)
-    rpy = _AXIS_RPY[solid.axis] if solid.kind == "cylinder" else (0.0, 0.0, 0.0)
-    ElementTree.SubElement(element, "origin", xyz=numbers(solid.centre), rpy=numbers(rpy))
-    shape = ElementTree.SubElement(element, "geometry")
+def _add_solid(link: Element, tag: str, solid: Solid) -> Element:
+    element = add(link, tag)
+    rpy = _AXIS_RPY[solid.axis] if solid.kind == "cylinder" else _LEVEL
+    add(element, "origin", xyz=solid.centre, rpy=rpy)
+    shape = add(element, "geometry")
     if solid.kind == "box":
-        ElementTree.SubElement(shape, "box", size=numbers(solid.size))
+        add(shape, "box", size=solid.size)
     else:
-        radius, length, _ = solid.size
-        ElementTree.SubElement(shape, "cylinder", radius=_number(radius), length=_number(length))
-    if tag == "visual":
-        ElementTree.SubElement(element, "material", name=solid.colour)
+        add(shape, "cylinder", radius=solid.size[0], length=solid.size[1])
     return element
 
 
-def _joint_element(link: Link) -> Element:
-    joint = link.joint
-    if joint is None:
-        raise TypeError(f"the base {link.name!r} has no joint")
-    element = Element("joint", name=joint.name, type=joint.kind)
-    ElementTree.SubElement(element, "parent", link=joint.parent)
-    ElementTree.SubElement(element, "child", link=link.name)
-    ElementTree.SubElement(element, "origin", xyz=numbers(joint.origin), rpy="0 0 0")
-    ElementTree.SubElement(element, "axis", xyz=numbers(joint.axis))
+def _add_joint(root: Element, joint: Joint, link: str) -> None:
+    element = add(root, "joint", name=joint.name, type=joint.kind)
+    add(element, "parent", link=joint.parent)
+    add(element, "child", link=link)
+    add(element, "origin", xyz=joint.origin, rpy=_LEVEL)
+    add(element, "axis", xyz=joint.axis)
     if joint.kind != "continuous":
-        ElementTree.SubElement(
-            element,
-            "limit",
-            lower=_number(joint.lower),
-            upper=_number(joint.upper),
-            effort=_number(joint.effort),
-            velocity=_number(joint.speed),
-        )
-    return element
+        limits = {"lower": joint.lower, "upper": joint.upper}
+        add(element, "limit", **limits, effort=joint.effort, velocity=joint.speed)
 
 
 def main() -> None:

@@ -34,13 +34,13 @@ def torque(
     """Compute the motors' torques (3,) N m (N for a slide) for a motion.
 
     Args:
-        mechanism: The bodies.
-        joint_positions: Returns the positions of all joints for those of the motors.
+        mechanism: Bodies.
+        joint_positions: Function from the motors' positions to those of all joints.
         free_fall: Acceleration of gravity in the machine's frame, m/s^2.
         link_masses: Factors of mass and inertia of the moving links.
-        theta: Positions of the motors (3,), rad or m.
-        theta_dot: Velocities of the motors (3,), per s.
-        theta_ddot: Accelerations of the motors (3,), per s^2.
+        theta: Positions of the motors (3,), rad or m; and their derivatives by time.
+        theta_dot: Velocities (3,).
+        theta_ddot: Accelerations (3,).
     """
 
     def frames(motors: FloatArray) -> FloatArray:
