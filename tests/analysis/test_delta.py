@@ -8,7 +8,7 @@ import pytest
 from paths import ROOT
 
 from tpm_gym.analysis.decoupling import motors, over
-from tpm_gym.analysis.delta import DELTA, ORTHOGLIDE, Leg, Tripod
+from delta import DELTA, ORTHOGLIDE, Leg, Tripod
 from tpm_gym.analysis.poc import Chain, analyse
 from tpm_gym.analysis.topology import analyse as analyse_ours
 from tpm_gym.analysis.topology import describe

@@ -1,8 +1,6 @@
-"""Limits that closed-form kinematics does not have: stops of the motors, and collisions of links.
+"""Limits for :mod:`tpm_gym.analysis.aspects`: stops of the motors, and collisions of links.
 
-A limit says for each point that a working mode reaches whether the machine can be there. The
-functions of :mod:`tpm_gym.analysis.aspects` take any number of ``limits``. Bodies come from
-:mod:`tpm_gym.mechanism.tree`; their cross sections do not scale with the lengths.
+The cross sections of bodies do not scale with the lengths.
 """
 
 from __future__ import annotations
@@ -41,7 +39,7 @@ def within_stops(points: FloatArray, branch: WorkingMode, geometry: Geometry) ->
     """Return whether all motors are between their stops, (n,)."""
     theta = inverse(points, branch, geometry)
     motors = tree.build(geometry).motors
-    low, high = ([getattr(motor, end) for motor in motors] for end in ("lower", "upper"))
+    low, high = zip(*((motor.lower, motor.upper) for motor in motors), strict=True)
     return np.asarray(((theta >= low) & (theta <= high)).all(axis=-1))
 
 
@@ -97,18 +95,14 @@ def capsules(link: Link) -> Iterator[Capsule]:
 
 
 def _unjoined(mechanism: Mechanism) -> set[frozenset[str]]:
-    """Return the pairs of links without a common joint.
-
-    The cross of a universal joint counts as part of its rod.
-    """
+    """Return the pairs of links without a common joint; a universal joint's cross is its rod."""
     whole = {link.name: link.name for link in mechanism.links}
-    joints = [link.joint for link in mechanism.links]
-    for link, joint in zip(mechanism.links, joints, strict=True):
-        if joint is not None and joint.kind != "prismatic" and not any(joint.origin):
-            whole[joint.parent] = link.name
-    joined = [(link.name, joint.parent) for link, joint in zip(mechanism.links, joints, strict=True)
-              if joint is not None]  # fmt: skip
-    joined += [(closure.link_a, closure.link_b) for closure in mechanism.closures]
+    joined = [(closure.link_a, closure.link_b) for closure in mechanism.closures]
+    for link in mechanism.links:
+        if (joint := link.joint) is not None:
+            joined.append((link.name, joint.parent))
+            if joint.kind != "prismatic" and not any(joint.origin):
+                whole[joint.parent] = link.name
     near = {frozenset((whole[one], whole[other])) for one, other in joined}
     every = {frozenset(pair) for pair in product(whole.values(), repeat=2)}
     return {pair for pair in every - near if len(pair) == 2}
