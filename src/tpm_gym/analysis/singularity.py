@@ -83,8 +83,9 @@ def dimensionless(values: Factors, geometry: Geometry = PAPER) -> FloatArray:
     """
     l3, l4 = geometry.l3, geometry.l4
     elevation = np.asarray(values.constraint)[..., None]
-    scaled: FloatArray = np.concatenate([values.parallel, values.serial, elevation], axis=-1)
-    return scaled / np.array([1.0, l4, l4**2, 1.0, l3 * l4, l3 * l4, l3 * l4, l4])
+    sizes = np.array([1.0, l4, l4**2, 1.0, l3 * l4, l3 * l4, l3 * l4, l4])
+    both: FloatArray = np.concatenate([values.parallel, values.serial, elevation], axis=-1) / sizes
+    return both
 
 
 def classify(
