@@ -72,7 +72,7 @@ MUTATIONS = [
     Mutation("(17)", EQUATIONS, "r2z * cos[1] - r2x * sin[1]", "r2z * cos[1] - r1x * sin[1]"),
     Mutation("(17)", JACOBIAN, "f.cos_beta * f.leg1", "f.leg1"),
     # What the text claims
-    Mutation("M_HSOC1", TOPOLOGY, "parallel([hsoc_1, hsoc_2])", "hsoc_1"),
+    Mutation("M_HSOC1", TOPOLOGY, "poc.parallel([hsoc_1, hsoc_2])", "hsoc_1"),
     Mutation("xi_L1", POC, "chains[: j + 1]", "chains[:j]"),
     Mutation("xi_L2", POC, "(parallel(previous) | added).dim", "6"),
     Mutation("v = m - n + 1", POC, "range(1, len(order))", "(1,)"),

@@ -95,13 +95,7 @@ class Aspect:
 
 @dataclass(frozen=True)
 class Box:
-    """Axis-aligned box of good conditioning, from :func:`largest_box`.
-
-    Attributes:
-        region: The box; its corners are centres of cells.
-        volume: Volume, m^3.
-        conditioning: Smallest 1/cond(J) at the centres of cells in the box.
-    """
+    """Box of :func:`largest_box`: volume in m^3, and least 1/cond(J) at centres of its cells."""
 
     region: Region
     volume: float
@@ -166,8 +160,8 @@ def aspects(
 def sample(rng: np.random.Generator, aspect: Aspect, count: int) -> FloatArray:
     """Sample points (count, 3) m, uniform over an aspect, not only over its cells.
 
-    The boundary is exact, with two exceptions: parts of the aspect more than a cell away from its
-    cells are missing, and another region with the same signs less than a cell away is included.
+    Parts of the aspect more than a cell away from its cells are missing, and another region with
+    the same signs less than a cell away is included. Elsewhere the boundary is exact.
 
     Raises:
         ConfigurationError: count is negative, or the aspect has no cells.

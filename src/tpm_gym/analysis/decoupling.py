@@ -62,11 +62,9 @@ def inverse_link_velocity(
     """
     (r1, r2, r3), f = _configuration(theta, branch, geometry)
     turns = 0 * f.planar, 0 * f.planar, f.sin_beta * f.level3
-    rows = [
-        np.stack([rod[0], rod[2], turn], axis=-1)
-        for rod, turn in zip((r1, r2, r3), turns, strict=True)
-    ]
-    return _over_legs(np.stack(rows, axis=-2), np.stack([f.leg1, f.leg2, f.leg3], -1), geometry)
+    columns = (r1[0], r2[0], r3[0]), (r1[2], r2[2], r3[2]), turns
+    rows = np.stack([np.stack(column, axis=-1) for column in columns], axis=-1)
+    return _over_legs(rows, np.stack([f.leg1, f.leg2, f.leg3], axis=-1), geometry)
 
 
 def inverse_velocity(

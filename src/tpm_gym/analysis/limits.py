@@ -23,7 +23,6 @@ Limit = Callable[[FloatArray, WorkingMode, Geometry], BoolArray]
 """Function of points (n, 3) m that a working mode reaches; it returns (n,), true if allowed."""
 
 _SLENDER = 2.0  # least ratio of length to width of a solid that counts
-_BLOCK = 4096
 
 
 class Capsule(NamedTuple):
@@ -51,8 +50,7 @@ def clear_of_links(points: FloatArray, branch: WorkingMode, geometry: Geometry) 
 def clearance(points: FloatArray, branch: WorkingMode, geometry: Geometry) -> FloatArray:
     """Compute the smallest distance between two links, (n,) m; negative where links overlap.
 
-    Pairs of links with a common joint do not count. Compact solids (hubs, motors, base) do not
-    count either.
+    Links with a common joint and compact solids (hubs, motors, base) do not count.
     """
     mechanism = tree.build(geometry)
     parts = [part for link in mechanism.links for part in capsules(link)]
@@ -63,15 +61,12 @@ def clearance(points: FloatArray, branch: WorkingMode, geometry: Geometry) -> Fl
     slots = assembly_of(points, branch, geometry)
     theta = inverse(points, branch, geometry)
     for mode in ASSEMBLY_MODES:
-        here = np.flatnonzero(slots == mode.index)
-        for start in range(0, len(here), _BLOCK):
-            rows = here[start : start + _BLOCK]
-            joints = tree.joint_arrays(theta[rows], mode, geometry)
-            places = mechanism.places(joints)
-            ends = [tuple(map(places[part.link].point, part[1:3])) for part in parts]
-            for i, j in pairs:
-                gap = _between(*ends[i], *ends[j]) - parts[i].radius - parts[j].radius
-                result[rows] = np.minimum(result[rows], gap)
+        rows = np.flatnonzero(slots == mode.index)
+        places = mechanism.places(tree.joint_arrays(theta[rows], mode, geometry))
+        ends = [tuple(map(places[part.link].point, part[1:3])) for part in parts]
+        for i, j in pairs:
+            gap = _between(*ends[i], *ends[j]) - parts[i].radius - parts[j].radius
+            result[rows] = np.minimum(result[rows], gap)
     return result
 
 

@@ -145,14 +145,8 @@ def prismatic(name: str, axis: FloatArray, point: FloatArray, actuated: bool = F
 def parallelogram_4s(name: str, short: FloatArray, rod: FloatArray, point: FloatArray) -> Unit:
     """Return a parallelogram of four spherical pairs, the paper's P^(4S) P^(4S) R^(4S) R^(4S).
 
-    Each rod keeps one distance and spins idly about itself. So the far short link cannot translate
-    along the rods, nor rotate about the normal of the parallelogram.
-
-    Args:
-        name: Name in the paper.
-        short: (3,) direction of the short links.
-        rod: (3,) direction of the rods.
-        point: (3,) m, middle of the far short link.
+    The far short link, with its middle at ``point`` (3,) m, can neither translate along the rods
+    nor rotate about the normal of the directions ``short`` (3,) of the links and ``rod`` (3,).
     """
     normal = np.cross(short, rod)
     translations = np.stack([normal, np.cross(rod, normal)])
@@ -242,10 +236,9 @@ def coupling_degrees(decompositions: Sequence[Sequence[int]]) -> tuple[float, ..
 
 @dataclass(frozen=True)
 class Loop:
-    """Independent loop, closed by one single open chain (SOC).
+    """Independent loop, closed by one single open chain (SOC) of the named chains.
 
     Attributes:
-        chains: Names of the chains of the SOC.
         freedoms: Sum of f_i over the SOC.
         actuated: Number of motors, I_j.
         equations: Number of independent equations, xi_Lj.
@@ -312,8 +305,7 @@ def analyse(chains: Sequence[Chain], point: ArrayLike) -> ParallelMechanism:
 
 def decompositions(chains: Sequence[Chain], point: ArrayLike) -> tuple[tuple[Loop, ...], ...]:
     """Return the independent loops for each order of the chains, about ``point`` (3,) m."""
-    held = [(chain, chain.poc(point)) for chain in chains]
-    return tuple(_loops(order) for order in permutations(held))
+    return tuple(_loops(order) for order in permutations([(c, c.poc(point)) for c in chains]))
 
 
 def _loops(order: tuple[tuple[Chain, POCSet], ...]) -> tuple[Loop, ...]:

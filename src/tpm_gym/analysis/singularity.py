@@ -28,8 +28,8 @@ from tpm_gym.kinematics.modes import DEFAULT_ASSEMBLY, ELBOWS_OUT, AssemblyMode,
 FACTORS = equations.Factors._fields
 """Names of the factors, in the order of every axis of length 8: 3 parallel, 4 serial, elevation."""
 
-_SIN_BETA, _PLANAR, _COS_BETA, _LEG3 = (
-    FACTORS.index(name) for name in ("sin_beta", "planar", "cos_beta", "leg3")
+_SIN_BETA, _PLANAR, _COS_BETA, _LEG3 = map(
+    FACTORS.index, ("sin_beta", "planar", "cos_beta", "leg3")
 )
 
 
@@ -61,12 +61,12 @@ class Classification:
 
 @dataclass(frozen=True)
 class NearestSingularity:
-    """Nearest singular position of each point, from :func:`nearest_singularity`.
+    """Nearest singular position of each point; NaN (-1 for factor) where not valid.
 
     Attributes:
-        distance: (...,) m; NaN where not valid.
-        point: (..., 3) m, singular position of P at this distance; NaN where not valid.
-        factor: (...,) index in :data:`FACTORS` of the factor that is zero; -1 where not valid.
+        distance: (...,) m.
+        point: (..., 3) m, singular position of P at this distance.
+        factor: (...,) index in :data:`FACTORS` of the factor that is zero.
         valid: (...,) bool, true where the point is reachable on both branches.
     """
 
@@ -110,8 +110,8 @@ def classify_at(
 ) -> Classification:
     """Classify points (..., 3) m on one working mode.
 
-    A dimensionless factor counts as zero up to ``tolerance``. The factor of a leg grows as the
-    square root of the distance to its boundary: 1e-12 m from the boundary it is 1e-6.
+    The factor of a leg grows as the square root of the distance to its boundary: 1e-12 m from the
+    boundary it is 1e-6.
     """
     inverse(position, branch, geometry)  # raises UnreachableError with the reason
     return _classify(factors_at(position, branch, geometry), geometry, tolerance)

@@ -18,19 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tpm_gym.analysis.poc import (
-    Chain,
-    ParallelMechanism,
-    POCSet,
-    Subspace,
-    Unit,
-    decompositions,
-    parallel,
-    parallelogram_4r,
-    parallelogram_4s,
-    revolute,
-    serial,
-)
+from tpm_gym.analysis import poc
+from tpm_gym.analysis.poc import Chain, POCSet, Subspace, Unit
 from tpm_gym.arrays import FloatArray, Vector
 from tpm_gym.errors import SingularityError
 from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode
@@ -78,7 +67,9 @@ def describe(
     def turning(*names: str) -> tuple[Unit, ...]:
         held = [(name, joints[name]) for name in names]
         return tuple(
-            revolute(name, _axis(places, link), places[link.name].origin, name in ACTUATED_JOINTS)
+            poc.revolute(
+                name, _axis(places, link), places[link.name].origin, name in ACTUATED_JOINTS
+            )
             for name, link in held
         )
 
@@ -87,8 +78,8 @@ def describe(
         foot = places[joints[near].name].origin
         return ends[far] - ends[other], ends[far] - foot, (ends[far] + ends[other]) / 2
 
-    four_s = parallelogram_4s("Pa(4S)", *sides("Sa_swing", "Sc", "Sd"))
-    four_r = parallelogram_4r("Pa(4R)", *sides("Re", "Rg", "Rh"))
+    four_s = poc.parallelogram_4s("Pa(4S)", *sides("Sa_swing", "Sc", "Sd"))
+    four_r = poc.parallelogram_4r("Pa(4R)", *sides("Re", "Rg", "Rh"))
     return Structure(
         branches=(
             Chain("I", (*turning("R11"), four_s)),
@@ -102,7 +93,7 @@ def describe(
 
 
 @dataclass(frozen=True, eq=False)
-class Topology(ParallelMechanism):
+class Topology(poc.ParallelMechanism):
     """Topology from :func:`analyse`, the paper's decomposition (I and II, then III) first.
 
     Attributes:
@@ -118,12 +109,12 @@ class Topology(ParallelMechanism):
 def analyse(structure: Structure) -> Topology:
     """Apply Eqs. (1) to (5) to the structure at its configuration."""
     first, second, third = structure.chains
-    sub_mechanism = parallel([chain.poc(structure.link_3p) for chain in (first, second)])
+    sub_mechanism = poc.parallel([chain.poc(structure.link_3p) for chain in (first, second)])
     # Link 3' does not turn, so its POC set is the same about any point.
-    hsoc_1 = serial([sub_mechanism, structure.wrist.poc(structure.platform)])
+    hsoc_1 = poc.serial([sub_mechanism, structure.wrist.poc(structure.platform)])
     hsoc_2 = structure.branches[2].poc(structure.platform)
-    platform = parallel([hsoc_1, hsoc_2])
-    found = decompositions((first, second, third), structure.link_3p)
+    platform = poc.parallel([hsoc_1, hsoc_2])
+    found = poc.decompositions((first, second, third), structure.link_3p)
     return Topology(platform, found, sub_mechanism, hsoc_1, hsoc_2)
 
 
