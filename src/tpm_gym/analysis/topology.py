@@ -65,13 +65,11 @@ def describe(
     ends = {c.name: places[c.link_b].point(c.point_b) for c in mechanism.closures}
 
     def turning(*names: str) -> tuple[Unit, ...]:
-        held = [(name, joints[name]) for name in names]
-        return tuple(
-            poc.revolute(
-                name, _axis(places, link), places[link.name].origin, name in ACTUATED_JOINTS
-            )
-            for name, link in held
-        )
+        found = []
+        for name in names:
+            axis, origin = _axis(places, joints[name]), places[joints[name].name].origin
+            found.append(poc.revolute(name, axis, origin, name in ACTUATED_JOINTS))
+        return tuple(found)
 
     def sides(near: str, far: str, other: str) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return short link, rod, and middle of the far short link of a parallelogram."""
