@@ -1,4 +1,4 @@
-"""The Delta and the Orthoglide: solutions, counts, and singularities beside those of ours."""
+"""Solutions, counts and singularities of the Delta and the Orthoglide of docs/delta.py."""
 
 import re
 

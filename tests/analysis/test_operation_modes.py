@@ -1,4 +1,4 @@
-"""Both modes meet on the surface of the formula; the numbers of docs/operation-modes.md hold."""
+"""Both modes meet on the computed surface, and the numbers of docs/operation-modes.md hold."""
 
 import numpy as np
 import oracle

@@ -1,4 +1,4 @@
-"""The data behind the figures of docs/: zero sets, surfaces, skeletons, volumes; one is drawn."""
+"""Data of the figures of docs/: zero sets, surfaces, skeletons, volumes. One figure is drawn."""
 
 import numpy as np
 import pytest
