@@ -1,4 +1,4 @@
-"""Improve lengths and ways by gradients, and draw what came of it; see docs/gradients.md.
+"""Improve lengths and motions by gradients, and draw the results of docs/gradients.md.
 
     make gradients
 
@@ -27,7 +27,7 @@ STARTS, CARRIES = 6, 6
 
 
 def designs() -> tuple[dict[str, Design], list[float]]:
-    """Boxes of the paper's lengths, of WIDE, and the best of all searches; the volumes of those."""
+    """Return boxes of the paper's lengths, of WIDE and of the best search; and all volumes."""
     rng = np.random.default_rng(0)
     found = [largest_box(random_lengths(rng), free=True) for _ in range(STARTS)]
     best = max(found, key=lambda design: design.volume)
@@ -36,7 +36,7 @@ def designs() -> tuple[dict[str, Design], list[float]]:
 
 
 def carried(carry: ways.Carry) -> dict[str, Any]:
-    """The expert's way and the best: torques in closed form and in PyBullet, N m."""
+    """Return the torques of the expert's and the best motion, closed-form and in PyBullet, N m."""
     found = carry.least_torque()
     row: dict[str, Any] = {"machine": carry.machine.name, "commands": found.tolist()}
     for name, commands in (("expert", carry.expert()), ("found", found)):
@@ -51,7 +51,7 @@ def carried(carry: ways.Carry) -> dict[str, Any]:
 
 
 def report(record: dict[str, Any]) -> str:
-    """The tables of docs/gradients.md."""
+    """Return the tables of docs/gradients.md."""
     lines = [
         "| lengths (mm) | l1 | l2 | l3 | l4 | l5 | l6 | l7 | box (mm) | litres |",
         "| --- " * 10 + "|",
@@ -80,7 +80,7 @@ def report(record: dict[str, Any]) -> str:
 
 
 def less_heat(row: dict[str, Any], kind: str) -> float:
-    """The saved share of the expert's heat in the windings, which goes with torque squared."""
+    """Return the share of the expert's heat that is saved; heat goes with torque squared."""
     return float(1 - (row["found"][kind] / row["expert"][kind]) ** 2)
 
 

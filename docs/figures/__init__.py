@@ -1,1 +1,1 @@
-"""The figures of docs/figures.md: data (zero_sets, mechanism) and drawings, one module a kind."""
+"""Figures of docs/figures.md: data (zero_sets, skeleton) and drawings, one module for each kind."""

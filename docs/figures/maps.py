@@ -33,7 +33,7 @@ _TICKS = (0.0, 0.02, 0.05, _SAFE, 0.15, 0.25, 0.35, 0.5)
 
 
 def conditioning_figure() -> Figure:
-    """1/cond(J) in x-z sections, and along y."""
+    """Draw 1/cond(J) in x-z sections, and along y."""
     figure = Figure(figsize=(style.WIDTH, 6.6))
     heading(figure, "Conditioning 1/cond(J)", f"elbows-out mode ({mode_name(ELBOWS_OUT)})")
     grid_x, grid_z = np.meshgrid(_X, _Z)
@@ -67,7 +67,7 @@ def conditioning_figure() -> Figure:
 
 
 def _along_y(axes: Axes) -> None:
-    """Conditioning against y at three points of the task region."""
+    """Draw the conditioning against y at three points of the task region."""
     y = np.linspace(0.0, PAPER.l7, 201)
     for (x, z), colour, dash in PROBES:
         points = np.stack([np.full_like(y, x), y, np.full_like(y, z)], axis=-1)
@@ -107,7 +107,7 @@ def _conditioning_legend(figure: Figure) -> None:
 
 
 def volume(cos_beta_sign: int, step: float = 0.005, slices: int = 32) -> float:
-    """Volume of the reachable set in m^3, from the midpoint rule on a grid."""
+    """Compute the volume of the reachable set in m^3, by the midpoint rule on a grid."""
     x, z = np.arange(-1.2, 1.2, step) + step / 2, np.arange(-1.3, 1.3, step) + step / 2
     # Where |y| nears l7 the set moves fastest with y: sum over the angle of link 7 instead.
     angle = (np.arange(slices) + 0.5) / slices * np.pi / 2
@@ -123,7 +123,7 @@ def volume(cos_beta_sign: int, step: float = 0.005, slices: int = 32) -> float:
 
 
 def workspace_figure() -> Figure:
-    """The two reachable sets, in sections and by volume."""
+    """Draw the two reachable sets, in sections and by volume."""
     figure = Figure(figsize=(style.WIDTH, 4.75))
     heading(figure, "Reachable set of point P", "all 16 working modes", 0.975, 0.93)
     x, z = np.linspace(-0.95, 1.06, 403), np.linspace(-1.18, 1.22, 481)
@@ -148,7 +148,7 @@ def workspace_figure() -> Figure:
 
 
 def _compare(axes: Axes, section: Section, x: FloatArray, other: FloatArray) -> None:
-    """Shade what only one kind of mode reaches, and what both do."""
+    """Shade the parts that one kind of mode reaches, and those that both reach."""
     points = section.points(np.stack(np.meshgrid(x, other), axis=-1))
     plus, minus = reach_margin(points, 1), reach_margin(points, -1)
     xy = x * MM, other * MM

@@ -1,4 +1,4 @@
-"""The two operation modes: how they look, where they meet, and what the rotated one reaches."""
+"""Figure of the two operation modes: postures, the surface where they meet, and the workspace."""
 
 from __future__ import annotations
 
@@ -33,21 +33,21 @@ _HALO = withStroke(linewidth=2.5, foreground="white")  # names stay readable whe
 
 
 def level_posture(theta: FloatArray) -> RotatedPostures:
-    """The environments' assembly at theta (3,) rad, as a posture whose tilt is 0."""
+    """Return the environments' assembly at theta (3,) rad, as a posture whose tilt is 0."""
     found, slot = forward_all(theta), DEFAULT_ASSEMBLY.index
     beta = np.asarray(found.beta[slot])
     return RotatedPostures(theta, found.link3[slot], np.zeros(()), beta, PAPER)
 
 
 def turned_posture(theta: FloatArray) -> RotatedPostures:
-    """The first assembly with link 3' turned and y > 0 at theta (3,) rad."""
+    """Return the first assembly with link 3' turned and y > 0 at theta (3,) rad."""
     found = forward_rotated(theta)
     slot = int(np.flatnonzero(found.valid & (found.beta > 0))[0])
     return RotatedPostures(theta, found.link3[slot], found.tilt[slot], found.beta[slot], PAPER)
 
 
 def meeting_posture(theta_1: float, beta: float) -> RotatedPostures:
-    """One on the surface where both modes meet, arm 5 bent outwards."""
+    """Return a posture that belongs to both modes, with arm 5 bent outwards."""
     point = transition(theta_1, beta)
     found = inverse_all(point)
     apart = np.abs(found.theta[:, 0] - theta_1) + np.abs(found.beta - beta)
@@ -57,7 +57,7 @@ def meeting_posture(theta_1: float, beta: float) -> RotatedPostures:
 
 
 def operation_modes_figure() -> Figure:
-    """Three postures; tilts along a path; all of joint space; a section of the workspace."""
+    """Draw three postures, tilts along a path, the joint space and a section of the workspace."""
     figure = Figure(figsize=(style.WIDTH, 8.3))
     heading(figure, "Two operation modes", "z points down, as the robot hangs", 0.988, 0.962)
     drawn = (
@@ -77,7 +77,7 @@ def operation_modes_figure() -> Figure:
 
 
 def _draw(axes: Axes, posture: RotatedPostures) -> None:
-    """A posture seen along y, the base at the top."""
+    """Draw a posture seen along y, with the base at the top."""
     g, half = PAPER, np.array([PAPER.l5, 0.0, 0.0])
     rods, ends = posture.rods, posture.ends
     feet = ends - rods
@@ -130,7 +130,7 @@ def _legend(figure: Figure) -> None:
 
 
 def _along_path(axes: Axes) -> None:
-    """Tilts of link 3' against theta_2, theta_1 as in the postures."""
+    """Draw the tilts of link 3' against theta_2, with theta_1 of the postures."""
     theta_2 = np.linspace(0.0, 2 * np.pi, 2881)
     theta = np.stack(np.broadcast_arrays(THETA[0], theta_2, THETA[2]), axis=-1)
     degrees, turned = np.degrees(theta_2), np.degrees(link3_rotated(theta)[1])
@@ -158,7 +158,7 @@ def _along_path(axes: Axes) -> None:
 
 
 def meeting_terms(theta_1: FloatArray, theta_2: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Zero where both modes meet; and not negative where the circles of Eq. (6) do (m^4)."""
+    """Return two terms, m^4: 0 where both modes meet; >= 0 where the circles of Eq. (6) meet."""
     g = PAPER
     y_b, z_b = g.l1 + g.l3 * np.cos(theta_1), g.l3 * np.sin(theta_1)
     level, rise = g.l3 * np.cos(theta_2) - g.l1 + 2 * g.l5, g.l3 * np.sin(theta_2) - z_b
@@ -168,7 +168,7 @@ def meeting_terms(theta_1: FloatArray, theta_2: FloatArray) -> tuple[FloatArray,
 
 
 def _joint_space(axes: Axes) -> None:
-    """How many tilted postures link 3' has, everywhere, and where both modes meet."""
+    """Draw the number of tilts of link 3' over joint space, and the curve where both modes meet."""
     one, two = np.linspace(-np.pi, np.pi, 361), np.linspace(0.0, 2 * np.pi, 361)
     grid = np.meshgrid(one, two)
     theta = np.stack([*grid, np.zeros_like(grid[0])], axis=-1)
@@ -204,7 +204,7 @@ _COUNTS = ("#FFFFFF", "#DDDDDD", "#F0B44C")
 
 
 def _section(figure: Figure, axes: Axes) -> None:
-    """The smallest tilt with which the rotated mode reaches a point, and the meeting surface."""
+    """Draw the least tilt with which the rotated mode reaches a point, and the meeting surface."""
     x, z = np.linspace(-0.86, 1.0, 249), np.linspace(-1.16, 1.16, 311)
     points = Section("y", HEIGHT).points(np.stack(np.meshgrid(x, z), axis=-1))
     tilt = np.abs(inverse_rotated(points).tilt)

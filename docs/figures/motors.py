@@ -1,4 +1,4 @@
-"""Which motor moves what: each motor turned alone, and its share in every coordinate."""
+"""Figure of each motor turned alone, and its share in every coordinate."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _ROWS = ("$x_C$", "$z_C$", "β", "x", "y", "z")
 
 
 def turned(motor: int) -> Skeleton:
-    """The posture of the labelled figure with one motor turned."""
+    """Return the posture of the labelled figure with one motor turned."""
     theta = skeleton(POINT, ELBOWS_OUT, DRAWN).theta
     position = forward(theta + TURNS[motor], _ASSEMBLY, DRAWN)
     return skeleton(position, ELBOWS_OUT, DRAWN)
 
 
 def table() -> tuple[FloatArray, FloatArray]:
-    """Shares (6, 3) and numbers of motors (6,) of all coordinates, means over the task region."""
+    """Compute mean shares (6, 3) and numbers of motors (6,) over the task region."""
     index = over(PAPER_TPM.region)
     low, high = np.array(PAPER_TPM.region.low), np.array(PAPER_TPM.region.high)
     cells = np.stack(np.meshgrid(*[np.arange(9)] * 3), axis=-1).reshape(-1, 3)
@@ -42,7 +42,7 @@ def table() -> tuple[FloatArray, FloatArray]:
 
 
 def motors_figure() -> Figure:
-    """A column a motor: what it moves, and how much of each coordinate."""
+    """Draw a column for each motor: the links that it moves, and its shares."""
     figure = Figure(figsize=(style.WIDTH, 5.0))
     at = {"ha": "center", "va": "top"}
     figure.text(0.5, 0.985, "Which motor moves what", fontsize=11, weight="bold", **at)
@@ -80,7 +80,7 @@ def _posture(axes: Axes, motor: int) -> None:
 
 
 def _table(axes: Axes, values: FloatArray, counts: FloatArray) -> None:
-    """Numbers on shades: a row a coordinate; structural zeros are left white."""
+    """Draw the shares as numbers on shades; structural zeros are white."""
     axes.imshow(np.ma.masked_equal(values, 0.0), cmap="Blues", vmin=0.0, vmax=1.4, aspect="auto")
     for (row, motor), value in np.ndenumerate(values):
         text = f"{100 * value:.0f}%" if value else "nothing"

@@ -1,4 +1,4 @@
-"""The points, lengths and angles of the paper, labelled: its Figs. 2 and 3 in one."""
+"""Figure of the points, lengths and angles of the paper: its Figs. 2 and 3 in one."""
 
 from __future__ import annotations
 
@@ -70,17 +70,17 @@ _PLAN_LENGTHS: dict[str, tuple[str, Offset]] = {
 
 
 def project(points: FloatArray) -> FloatArray:
-    """Points (..., 3) m as (..., 2) m, z up; leg 1 is at the back."""
+    """Project points (..., 3) m to (..., 2) m, z up, with leg 1 at the back."""
     return seen_from(_AZIMUTH, points)
 
 
 def from_above(points: FloatArray) -> FloatArray:
-    """The coordinates x, y of points (..., 3) m."""
+    """Return the coordinates x, y of points (..., 3) m."""
     return points[..., :2]
 
 
 def parameters_figure() -> Figure:
-    """One posture in space and from above, with every name of the section on positions."""
+    """Draw one posture in space and from above, with every name of the section on positions."""
     figure = Figure(figsize=(style.WIDTH, 4.9))
     at = {"ha": "center", "va": "top"}
     figure.text(0.5, 0.985, "Points, lengths and angles", fontsize=11, weight="bold", **at)
@@ -114,7 +114,7 @@ def _space(axes: Axes, s: Skeleton) -> None:
 
 
 def _plan(axes: Axes, s: Skeleton) -> None:
-    """Link 3', link 7 and the platform; the rods are cut off."""
+    """Draw link 3', link 7 and the platform; the rods are cut off."""
     _links(axes, s, from_above, arms=False)
     _angle(axes, from_above, s.d1, (X, Y), _beta(s), r"$\beta$", 0.09)
     _name_joints(axes, s, from_above, _PLAN)
@@ -194,7 +194,7 @@ def _angle(
     name: str,
     size: float,
 ) -> None:
-    """An arc (m) in a plane, from its first direction towards its second, and where it starts."""
+    """Return an arc (m) in a plane, from its first direction towards its second, and its start."""
     start, turn = plane
     t = np.linspace(0.0, angle, 60)[:, None]
     arc = vertex + size * (np.cos(t) * start + np.sin(t) * turn)

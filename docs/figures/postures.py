@@ -1,4 +1,4 @@
-"""The 16 inverse postures of one point, drawn as mechanisms."""
+"""Figure of the 16 inverse postures of one point."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ STROKES: dict[str, tuple[str, float]] = {
 
 
 def project(points: FloatArray) -> FloatArray:
-    """Points (..., 3) m as (..., 2) m, hanging: paper z points down.
+    """Project points (..., 3) m to (..., 2) m, hanging: z of the paper points down.
 
     The eye is on the side of leg 1, a little to the right of it.
     """
@@ -46,7 +46,7 @@ def project(points: FloatArray) -> FloatArray:
 
 
 def postures_figure() -> Figure:
-    """All working modes of one point: a row a bend of leg 1, a column the bends of legs 2 and 3."""
+    """Draw all working modes of one point: rows by leg 1, columns by legs 2 and 3."""
     figure = Figure(figsize=(style.WIDTH, 8.5))
     x, y, z = (f"{value * MM:.0f}".replace("-", "\N{MINUS SIGN}") for value in POINT)
     what = f"P at x = {x}, y = {y}, z = {z} mm; z points down"
@@ -66,7 +66,7 @@ def postures_figure() -> Figure:
 
 
 def _draw_posture(axes: Axes, mode: WorkingMode) -> None:
-    """One small multiple; a heavy frame where all elbows point outwards."""
+    """Draw one posture; the frame is heavy if all elbows point outwards."""
     posture = skeleton(POINT, mode)
     pivots = project(posture.a) * MM
     base = pivots[[1, 0, 2, 1]]
@@ -94,7 +94,7 @@ def _draw_posture(axes: Axes, mode: WorkingMode) -> None:
 
 
 def _draw_plan(axes: Axes, cos_beta: int) -> None:
-    """Link 3', link 7 and the platform along z, where the two signs of cos(beta) differ."""
+    """Draw link 3', link 7 and the platform along z, where the two signs of cos(beta) differ."""
     posture = skeleton(POINT, WorkingMode(cos_beta, 1, -1, 1))
     links = posture.links()
     for name in ("link 3'", "link 7", "platform"):
@@ -112,7 +112,7 @@ def _draw_plan(axes: Axes, cos_beta: int) -> None:
 
 
 def legend(figure: Figure) -> None:
-    """Names of the colours, below everything."""
+    """Draw the legend of the colours at the bottom."""
     names = (
         ("leg 1: arm 2, link 3, rods 4", _LEG1),
         ("leg 2: arm 5, rod 6", _LEG2),

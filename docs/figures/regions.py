@@ -1,4 +1,4 @@
-"""The aspects: regions of the elbows-out mode that no singularity divides."""
+"""Figure of the aspects: regions of the elbows-out mode that no singularity divides."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _Y = np.linspace(-PAPER.l7, PAPER.l7, 160)  # an even number: y = 0 itself is no
 
 
 def aspects_figure() -> Figure:
-    """Sections of all aspects, with their volumes."""
+    """Draw sections of all aspects, with their volumes."""
     found = aspects(ELBOWS_OUT, shape=SHAPE)
     figure = Figure(figsize=(style.WIDTH, 4.9))
     what = f"elbows-out mode ({mode_name(ELBOWS_OUT)})"
@@ -58,14 +58,14 @@ def aspects_figure() -> Figure:
 
 
 def colour(signs: Signs) -> FloatArray:
-    """The colour of an aspect by its signs of level3, planar and elevation."""
+    """Return the colour of an aspect by its signs of level3, planar and elevation."""
     strength = 0.90 if signs[2] > 0 else 0.45
     mixed: FloatArray = 1 - strength * (1 - np.asarray(to_rgb(COLOURS[signs[:2]])))
     return mixed
 
 
 def signs_of(aspect: Aspect) -> Signs:
-    """Its signs of level3, planar and elevation."""
+    """Return the signs of level3, planar and elevation of an aspect."""
     return aspect.level3, aspect.assembly.planar, aspect.elevation
 
 
@@ -94,7 +94,7 @@ def _section(axes: Axes, section: Section, x: FloatArray = _X, other: FloatArray
 
 
 def _stop_margin(points: FloatArray) -> FloatArray:
-    """How far the motor that is nearest to a stop is from it, rad; negative beyond."""
+    """Compute the least distance of a motor to its stops, rad; negative beyond a stop."""
     theta = inverse_all(points).theta[..., ELBOWS_OUT.index, :]
     motors = PAPER_TPM.mechanism.motors
     low, high = ([getattr(motor, end) for motor in motors] for end in ("lower", "upper"))
@@ -103,7 +103,7 @@ def _stop_margin(points: FloatArray) -> FloatArray:
 
 
 def _smallest(axes: Axes) -> None:
-    """The smallest aspect, too small to be seen in the other sections."""
+    """Draw the smallest aspect, which is too small for the other sections."""
     x, z = np.linspace(-0.13, 0.33, 231), np.linspace(-0.470, -0.400, 141)
     _section(axes, Section("y", 0.025), x, z)
     axes.set(xlim=(x[0] * MM, x[-1] * MM), ylim=(z[0] * MM, z[-1] * MM), xticks=[0, 200])
@@ -140,7 +140,7 @@ def _legend(figure: Figure, found: tuple[Aspect, ...]) -> None:
 
 
 def _allowed(aspect: Aspect) -> FloatArray:
-    """Volume of an aspect, within the motors' stops, and where also no links touch, dm^3."""
+    """Compute volumes of an aspect, dm^3: all, within the motors' stops, and clear of links too."""
     centres = aspect.cells.centres()
     stops = within_stops(centres, ELBOWS_OUT, PAPER)
     clear = clear_of_links(centres[stops], ELBOWS_OUT, PAPER)

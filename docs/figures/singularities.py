@@ -83,7 +83,7 @@ _INSIDE = (1.0, 1.0 - 1e-9, 1.0)  # a surface that ends at y = +-l7 ends just in
 
 
 def parallel_figure() -> Figure:
-    """The paper's Fig. 4: where det A = 0, a colour a factor of Eq. (16), and the constraint's."""
+    """Draw the paper's Fig. 4: the zeros of the factors of Eq. (16) and of the constraint."""
     figure, space, sections, plans = _layout("Parallel and constraint singularities")
     _draw_parallel(space)
     _legend(figure, PARALLEL)
@@ -110,7 +110,7 @@ def parallel_figure() -> Figure:
 
 
 def serial_figure() -> Figure:
-    """The paper's Fig. 5: where det B = 0, one colour a factor of Eq. (17)."""
+    """Draw the paper's Fig. 5: the zeros of the factors of Eq. (17)."""
     figure, space, sections, plans = _layout("Serial singularities, det B = 0")
     _draw_serial(space)
     _legend(figure, SERIAL)
@@ -136,7 +136,7 @@ def serial_figure() -> Figure:
 
 
 def _draw_parallel(space: Axes3D) -> None:
-    """The plane y = 0, and the three other factors swept along y behind and in front of it."""
+    """Draw the plane y = 0, and the other factors swept along y behind and in front of it."""
     plane = Surface(surfaces.plate(0.0, _SIGN, _X, _Z), PARALLEL[0][0], 0.30)
     behind: list[Surface] = []
     front: list[Surface] = []
@@ -159,7 +159,7 @@ def _draw_parallel(space: Axes3D) -> None:
 
 
 def _draw_serial(space: Axes3D) -> None:
-    """The planes y = +-l7, and between them the edges of the legs' reach."""
+    """Draw the planes y = +-l7, and between them the edges of the legs' reach."""
     far, near = (
         Surface(surfaces.plate(y, _SIGN, _X, _Z), SERIAL[0][0], alpha)
         for y, alpha in ((PAPER.l7, 0.35), (-PAPER.l7, 0.18))
@@ -183,7 +183,7 @@ def _draw_serial(space: Axes3D) -> None:
 
 
 def _layout(title: str) -> tuple[Figure, Axes3D, list[Axes], list[Axes]]:
-    """Space on top, four x-z sections below it, three x-y sections at the bottom."""
+    """Build axes: space on top, four x-z sections below it, three x-y sections at the bottom."""
     figure = Figure(figsize=(style.WIDTH, 8.7))
     what = f"elbows-out working mode ({mode_name(ELBOWS_OUT)})"
     heading(figure, title, what, 0.982, 0.957)
@@ -217,7 +217,7 @@ def _lines(axes: Axes, lines: Sequence[FloatArray], colour: str, width: float = 
 
 
 def _all_modes(axes: Axes, section: Section) -> None:
-    """The union over all working modes: what elimination of the joint angles leaves."""
+    """Draw the union over all working modes, as elimination of the joint angles gives it."""
     for sign in (-1, 1):
         _reached(axes, section, None, sign)
     fine = np.linspace(_X[0], _X[-1], 400), np.linspace(_Z[0], _Z[-1], 480)
@@ -235,7 +235,7 @@ def _all_modes(axes: Axes, section: Section) -> None:
 def _finish_section(
     axes: Axes, section: Section, title: str, first: bool, ours: bool = True
 ) -> None:
-    """Axes of a section; the task region only where it is cut, and on the environments' mode."""
+    """Set up the axes of a section, with the task region if the section cuts it."""
     vertical = "z" if section.fixed == "y" else "y"
     section_axes(axes, title, "x", vertical)
     row = 1 if section.fixed == "y" else 2

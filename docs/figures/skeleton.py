@@ -1,4 +1,4 @@
-"""The mechanism in one posture, as points and straight links: what the figures draw."""
+"""The mechanism in one posture, as points and straight links for drawing."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Skeleton:
     geometry: Geometry
 
     def links(self) -> dict[str, tuple[FloatArray, FloatArray, float]]:
-        """Name -> both ends (..., 3) m and the length in m that the geometry gives it."""
+        """Return name -> both ends (..., 3) m and the length of the link in the geometry, m."""
         g = self.geometry
         ux, uy = np.array([g.l5, 0.0, 0.0]), np.array([0.0, g.l5, 0.0])
         (b1, b2, b3), (c1, c2, c3) = np.moveaxis(self.b, -2, 0), np.moveaxis(self.c, -2, 0)
@@ -64,7 +64,7 @@ class Skeleton:
 
 
 def skeleton(position: FloatArray, mode: WorkingMode, geometry: Geometry = PAPER) -> Skeleton:
-    """The mechanism with point P at ``position`` (..., 3) m on one working mode."""
+    """Return the mechanism with point P at ``position`` (..., 3) m on one working mode."""
     g = geometry
     solutions = inverse_all(position, g)
     theta = solutions.theta[..., mode.index, :]
@@ -90,7 +90,7 @@ def skeleton(position: FloatArray, mode: WorkingMode, geometry: Geometry = PAPER
 
 
 def seen_from(azimuth: float, points: FloatArray) -> FloatArray:
-    """Parallel projection of points (..., 3) m to (..., 2) m, from an eye (rad) above the level."""
+    """Project points (..., 3) m to (..., 2) m, from an eye at an angle (rad) above the horizon."""
     sin_a, cos_a = np.sin(azimuth), np.cos(azimuth)
     sin_e, cos_e = np.sin(_ELEVATION), np.cos(_ELEVATION)
     right = np.array([-sin_a, cos_a, 0.0])

@@ -43,12 +43,12 @@ class Surface:
 
 
 def levels(count: int = 25) -> FloatArray:
-    """Values of y over the workspace, dense towards y = +-l7 where the half circle is steep."""
+    """Return values of y, dense towards y = +-l7 where the half circle is steep."""
     return PAPER.l7 * np.sin(np.linspace(-np.pi / 2, np.pi / 2, count))
 
 
 def sweep(line: FloatArray, y0: float, y: FloatArray, cos_beta_sign: int) -> FloatArray:
-    """A line (n, 2) of (x, z) at ``y0``, moved to each y at constant (xC, zC).
+    """Move a line (n, 2) of (x, z) at ``y0`` to each y at constant (xC, zC).
 
     Returns:
         (len(y), n, 3) m.
@@ -62,7 +62,7 @@ def sweep(line: FloatArray, y0: float, y: FloatArray, cos_beta_sign: int) -> Flo
 
 
 def sweep_leg3(line: FloatArray, y0: float, y: FloatArray) -> FloatArray:
-    """An edge (n, 2) of leg 3's reach at ``y0``, moved to each y: a circle about A3, seen by P.
+    """Move an edge (n, 2) of leg 3's reach at ``y0`` to each y: P is on a circle about A3.
 
     Its radius is sqrt(l4^2 - y^2) +- l3, the projected rod and the arm in one line.
     """
@@ -77,7 +77,7 @@ def sweep_leg3(line: FloatArray, y0: float, y: FloatArray) -> FloatArray:
 
 
 def trimmed(mesh: FloatArray, keep: Callable[[FloatArray], BoolArray]) -> FloatArray:
-    """The cells (k, 4, 3) of a mesh (m, n, 3) where ``keep``; cells on its edge are cut finer."""
+    """Return cells (k, 4, 3) of a mesh (m, n, 3) where ``keep``; cells on its edge are divided."""
     inside = keep(mesh)
     count = sum(
         inside[i : len(mesh) - 1 + i, j : mesh.shape[1] - 1 + j] for i in (0, 1) for j in (0, 1)
@@ -101,7 +101,7 @@ def _cells(mesh: FloatArray) -> FloatArray:
 
 
 def plate(y: float, cos_beta_sign: int, x: FloatArray, z: FloatArray) -> list[FloatArray]:
-    """The reachable set at one y, cut in quarters: polygons (n, 3) around the hole in it."""
+    """Return the reachable set at one y in quarters: polygons (n, 3) around the hole in it."""
     grid_x, grid_z = np.meshgrid(x, z)
     margin = reach_margin(np.stack([grid_x, np.full_like(grid_x, y), grid_z], -1), cos_beta_sign)
     generator = contourpy.contour_generator(
@@ -134,13 +134,13 @@ def draw(axes: Axes3D, layers: Sequence[Sequence[Surface]]) -> None:
 
 
 def halves(polygons: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Cells behind and in front of the plane y = 0, as :func:`frame` looks at it."""
+    """Return the cells behind and in front of the plane y = 0, in the view of :func:`frame`."""
     behind = polygons[..., 1].mean(axis=1) > 0
     return polygons[behind], polygons[~behind]
 
 
 def _shaded(colour: str, polygon: FloatArray) -> FloatArray:
-    """The colour, darker where the polygon is turned away from the light; both sides are lit."""
+    """Shade the colour: darker where the polygon is turned away from the light."""
     drawn = polygon * (1.0, STRETCH, 1.0)
     normal = np.cross(drawn[1] - drawn[0], drawn[-1] - drawn[0])
     length = np.linalg.norm(normal)
@@ -149,7 +149,7 @@ def _shaded(colour: str, polygon: FloatArray) -> FloatArray:
 
 
 def frame(axes: Axes3D, x: tuple[float, float], z: tuple[float, float]) -> None:
-    """Limits (mm), labels and view of a picture of the workspace in space."""
+    """Set limits (mm), labels and view of a picture in space."""
     axes.set(xlim=x, ylim=(-50, 50), zlim=z)
     axes.set_box_aspect((x[1] - x[0], 100 * STRETCH, z[1] - z[0]), zoom=1.1)
     axes.view_init(elev=16, azim=-54)

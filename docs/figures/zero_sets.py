@@ -1,4 +1,4 @@
-"""Where a factor of det A or det B vanishes in Cartesian space, on one working mode.
+"""Zero sets of the factors of det A and det B in Cartesian space, on one working mode.
 
 Fields are sampled on a grid through the inverse kinematics and contoured at zero, then every point
 found is moved along its grid edge until the factor vanishes. The factors of det A and that of the
@@ -38,7 +38,7 @@ class Section:
     at: float
 
     def points(self, plane: FloatArray) -> FloatArray:
-        """Points (..., 3) m in the paper frame of section coordinates (..., 2) m."""
+        """Return points (..., 3) m in the paper frame from section coordinates (..., 2) m."""
         x, other = plane[..., 0], plane[..., 1]
         fixed = np.full_like(x, self.at)
         yz = (fixed, other) if self.fixed == "y" else (other, fixed)
@@ -48,7 +48,7 @@ class Section:
 def serial_squares(
     points: FloatArray, cos_beta_sign: int, geometry: Geometry = PAPER
 ) -> FloatArray:
-    """Squares of the four factors of det B, going on as negative numbers beyond the workspace.
+    """Compute squares of the four factors of det B, continued as negative numbers out of reach.
 
     With C_i - A_i = (a, b) in the arm's plane and ``out`` out of it, the closure of leg i is
     a cos + b sin = c, so its factor l3 (b cos - a sin) has the square l3^2 (a^2 + b^2 - c^2).
@@ -80,14 +80,14 @@ def serial_squares(
 
 
 def reach_margin(points: FloatArray, cos_beta_sign: int, geometry: Geometry = PAPER) -> FloatArray:
-    """Positive where all legs reach points (..., 3) m with |y| <= l7, zero on the edge; no unit."""
+    """Compute a dimensionless margin: positive where all legs reach points (..., 3) m."""
     squares = serial_squares(points, cos_beta_sign, geometry)[..., 1:]
     margin: FloatArray = squares.min(axis=-1) / (geometry.l3 * geometry.l4) ** 2
     return margin
 
 
 def zero_lines(field: Field, u: FloatArray, v: FloatArray) -> list[FloatArray]:
-    """Lines (n, 2) on which ``field`` changes sign, over the grid u (m,) by v (k,).
+    """Find lines (n, 2) on which ``field`` changes sign, over the grid u (m,) by v (k,).
 
     Args:
         field: Values (...,) at section coordinates (..., 2); NaN where it does not exist.
@@ -125,7 +125,7 @@ def _bisect(field: Field, points: FloatArray, u: FloatArray, v: FloatArray) -> F
 
 
 def clip(lines: list[FloatArray], keep: Callable[[FloatArray], BoolArray]) -> list[FloatArray]:
-    """The pieces of lines (n, 2) whose points satisfy ``keep``, each of two points at least."""
+    """Return the pieces of lines (n, 2) whose points satisfy ``keep``, of two points or more."""
     pieces = []
     for line in lines:
         cuts = np.flatnonzero(np.diff(keep(line).astype(int))) + 1
@@ -136,7 +136,7 @@ def clip(lines: list[FloatArray], keep: Callable[[FloatArray], BoolArray]) -> li
 def parallel_lines(
     index: int, mode: WorkingMode, section: Section, u: FloatArray, v: FloatArray
 ) -> list[FloatArray]:
-    """Zero lines of a factor in a section, for the paper's lengths: of det A, or the constraint's.
+    """Find zero lines of a factor of det A, or of the constraint, for the paper's lengths.
 
     ``index`` is that of :func:`sheets`.
     """
@@ -144,7 +144,7 @@ def parallel_lines(
 
 
 def sheets(points: FloatArray, mode: WorkingMode) -> FloatArray:
-    """What changes its sign inside the workspace (..., 4): the factors of det A, and elevation."""
+    """Return the factors that change sign inside the workspace, (..., 4): det A and elevation."""
     found = factors_at(points, mode)
     return np.concatenate([found.parallel, found.constraint[..., None]], axis=-1)
 
@@ -157,7 +157,7 @@ def serial_lines(
     v: FloatArray,
     clipped: bool = True,
 ) -> list[FloatArray]:
-    """Zero lines of factor ``index`` (0 to 3) of det B in a section, for the paper's lengths.
+    """Find zero lines of factor ``index`` (0 to 3) of det B in a section, for the paper's lengths.
 
     Clipped to where the other factors are real, they are edges of the reachable set.
     """

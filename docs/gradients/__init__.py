@@ -1,1 +1,1 @@
-"""The studies of docs/gradients.md: lengths and ways, improved by the closed form's gradients."""
+"""Studies of docs/gradients.md: lengths and motions, improved by closed-form gradients."""

@@ -1,4 +1,4 @@
-"""Minimising by gradients without ever leaving what is allowed."""
+"""Minimisation by gradients within limits, by an interior-point method."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Function = Callable[[Tensor], Tensor]
 
 
 def minimise(aim: Function, limits: Function, start: Tensor, weights: tuple[float, ...]) -> Tensor:
-    """The point (n,) near ``start`` at which ``aim`` is least while ``limits`` are positive.
+    """Find the point (n,) near ``start`` at which ``aim`` is least while ``limits`` are positive.
 
     An interior-point method: aim - weight * sum(log(limits)), whose gradients are torch's, by BFGS,
     for one of the weights after the other. All points on its way keep the limits, so that functions
@@ -39,7 +39,7 @@ def minimise(aim: Function, limits: Function, start: Tensor, weights: tuple[floa
 
 
 def _bfgs(function: Function, point: Tensor) -> Tensor:
-    """A minimum, with Armijo's rule; a step to where the function is infinite is halved."""
+    """Find a minimum, with Armijo's rule; a step to an infinite value is halved."""
     value, slope = _with_gradient(function, point)
     eye = torch.eye(len(point), dtype=point.dtype)
     inverse = 1e-3 * eye / slope.norm()  # of the Hessian: a first step that is small

@@ -1,4 +1,4 @@
-"""The figure of docs/gradients.md: three machines with their boxes; a way beside the expert's."""
+"""Figure of docs/gradients.md: three machines with boxes; a motion beside the expert's."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tpm_gym.simulation.state import CONTROL_PERIOD
 
 
 def figure(designs: dict[str, Design], carry: Carry, expert: Tensor, found: Tensor) -> Figure:
-    """Boxes above, to one scale; a way below: from the side, from above, and its torques."""
+    """Draw boxes above, to one scale, and a motion below, with its torques."""
     drawn = Figure(figsize=(style.WIDTH, 4.6))
     for column, (name, design) in enumerate(designs.items()):
         axes = drawn.add_axes((0.01 + 0.33 * column, 0.45, 0.32, 0.48))
@@ -49,7 +49,7 @@ def figure(designs: dict[str, Design], carry: Carry, expert: Tensor, found: Tens
 
 
 def _machine(axes: Axes, design: Design) -> None:
-    """The mechanism at the middle of its box, with the footprint of base and arms."""
+    """Draw the mechanism at the middle of its box, with the footprint of base and arms."""
     low, high = np.array(design.box.low), np.array(design.box.high)
     posture = skeleton((low + high) / 2, ELBOWS_OUT, design.geometry)
     axes.fill(*(project(posture.a)[[1, 0, 2]].T * MM), facecolor="0.9", edgecolor="0.6", lw=0.6)

@@ -1,4 +1,4 @@
-"""Lengths for the largest box of good conditioning, by gradients through the closed form."""
+"""Lengths for the largest box of good conditioning, by closed-form gradients."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from tpm_gym.kinematics.workspace import Region, conditioning_at
 from tpm_gym.mechanism.motor import TORQUE_MOTOR
 
 THRESHOLD = 0.1
-"""What the conditioning shall be at least, all over the box."""
+"""Least conditioning in the box."""
 FOOTPRINT = PAPER.l1 + PAPER.l3
 """Half side of the square around the base in which all joints stay, m: that of the paper's arms."""
 ELEVATION = 0.1
-"""Of C1 beyond B1 at least, m: at 0 the platform may begin to tilt (the constraint singularity)."""
+"""Least z_C1 - z_B1, m: at 0 (constraint singularity) the platform may begin to tilt."""
 REACH = PAPER.l3 + PAPER.l4
-"""Of a stretched leg at most, m: that of the paper's."""
+"""Largest length of a stretched leg, m, as in the paper."""
 LEAST = Lengths(
     # Nearer to the middle, the motors of arms 2, 5 and 12 would overlap.
     l1=TORQUE_MOTOR.reach + TORQUE_MOTOR.stator_radius,
@@ -34,7 +34,7 @@ LEAST = Lengths(
     l4=0.0,
     l7=0.0,
 )
-"""Lengths are longer, but for l6, which stays what it is."""
+"""Least lengths; l6 is fixed."""
 
 _NODES = (6, 5, 6)  # of the box, where the search looks; the tests look at 41 x 41 x 41
 _WEIGHTS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5)
@@ -50,18 +50,18 @@ class Design(NamedTuple):
 
     @property
     def volume(self) -> float:
-        """Of the box, m^3."""
+        """Volume of the box, m^3."""
         return float(np.subtract(self.box.high, self.box.low).prod())
 
 
 def nodes(counts: tuple[int, int, int]) -> Tensor:
-    """A grid over the unit cube with its faces, (n, 3)."""
+    """Return a grid over the unit cube with its faces, (n, 3)."""
     axes = [torch.linspace(0.0, 1.0, count, dtype=torch.float64) for count in counts]
     return torch.cartesian_prod(*axes)
 
 
 def room(design: Tensor) -> Tensor:
-    """What is left of all limits of a box: positive where it is allowed.
+    """Compute the margins to all limits of a box: positive where it is allowed.
 
     Args:
         design: (13,) m: l1 to l7, the box's smallest x, y, z, and its largest.
@@ -79,7 +79,7 @@ def room(design: Tensor) -> Tensor:
 
 
 def room_of_lengths(design: Tensor) -> Tensor:
-    """What is left of the limits of the lengths themselves."""
+    """Compute the margins to the limits of the lengths."""
     l1, _, l3, l4, *_ = design
     least = torch.tensor([*vars(LEAST).values()], dtype=torch.float64)
     spare = (design[:7] - least)[_FREE[:6]]
@@ -87,7 +87,7 @@ def room_of_lengths(design: Tensor) -> Tensor:
 
 
 def largest_box(geometry: Geometry, free: bool = False) -> Design:
-    """The largest box for these lengths; or, if they are ``free``, from them on, for any.
+    """Find the largest box for these lengths, or for any lengths, starting there, if ``free``.
 
     Raises:
         ValueError: If no small box is allowed to begin with.
@@ -110,7 +110,7 @@ def largest_box(geometry: Geometry, free: bool = False) -> Design:
 
 
 def _small_box(geometry: Geometry) -> Tensor:
-    """A box of a fiftieth of l7 about the best-conditioned of many points that allow one."""
+    """Return a box of a fiftieth of l7 about the best-conditioned of many points that allow one."""
     rng, l7 = np.random.default_rng(0), geometry.l7
     points = rng.uniform((-FOOTPRINT, 0.0, 0.0), (FOOTPRINT, l7, REACH), (20_000, 3))
     lengths = [*vars(geometry).values()]
@@ -123,7 +123,7 @@ def _small_box(geometry: Geometry) -> Tensor:
 
 
 def random_lengths(rng: np.random.Generator) -> Geometry:
-    """Lengths within the limits, from which a search can start."""
+    """Sample lengths within the limits, from which a search can start."""
     while True:
         low, high = (0.18, 0.07, 0.1, 0.3, 0.1, 0.01, 0.05), (0.5, 0.15, 0.5, 1.0, 0.2, 0.01, 0.8)
         drawn = torch.tensor(rng.uniform(low, high))

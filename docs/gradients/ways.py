@@ -1,4 +1,4 @@
-"""The way of a block that takes the least torque, by gradients through the closed-form dynamics."""
+"""Motion of a block that takes the least torque, by gradients of closed-form dynamics."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tpm_gym.tasks.motion import SEAL_STEPS, Motion, hanging
 from tpm_gym.tasks.pick_and_place import CLEARANCE, PickAndPlace
 
 WELL = 0.005
-"""About how far from its ends a way may be below the clearance, m."""
+"""Approximate distance to the ends within which a motion may be below the clearance, m."""
 BLOCK = Block()
 _SUBSTEPS = 10  # the engines' time steps in a control period
 _WEIGHTS = (1e-3, 1e-4, 1e-5)
@@ -34,7 +34,7 @@ _RISE = 0.001  # over the expert's way, whose clearance is exact, m
 
 @dataclass(frozen=True)
 class Carry:
-    """A block to be carried from place to place on the table, from rest to rest.
+    """Task of carrying a block from place to place on the table, from rest to rest.
 
     A way is a row of commands for P (n, 3) m at the control's 25 Hz, as :meth:`Simulation.move`
     takes them: P follows their spline, and so is where it begins and ends.
@@ -51,11 +51,11 @@ class Carry:
 
     @cached_property
     def dynamics(self) -> Dynamics:
-        """Those of the machine with the block."""
+        """Dynamics of the machine with the block."""
         return replace(self.machine.dynamics, payload=BLOCK.mass)
 
     def expert(self) -> Tensor:
-        """The scripted expert's way: up, over, down, on straight lines at trapezoidal speed."""
+        """Return the scripted expert's motion: straight up, over, down at trapezoidal speed."""
         machine, up = self.machine, np.array([0.0, 0.0, -CLEARANCE])
         motion, commands = Motion(machine, CartesianControl(machine)), [self.first, self.first]
         motion.seen = {"position": machine.mount.to_world(self.first), "command": np.zeros(3)}
@@ -65,18 +65,18 @@ class Carry:
         return torch.tensor(np.array([*commands, self.last]))
 
     def joints(self, commands: Tensor) -> Tensor:
-        """Joint angles at the time steps of the engines, with both ends, (m, 3) rad."""
+        """Compute joint angles at the time steps of the engines, with both ends, (m, 3) rad."""
         return inverse(points(commands), self.machine.working_mode, self.machine.geometry)
 
     def torque(self, commands: Tensor) -> Tensor:
-        """The motors' torques (m - 2, 3) N m, at the time steps between."""
+        """Compute the motors' torques (m - 2, 3) N m, at the time steps between."""
         theta, period = self.joints(commands), CONTROL_PERIOD / _SUBSTEPS
         rate = (theta[2:] - theta[:-2]) / (2 * period)
         change = (theta[2:] - 2 * theta[1:-1] + theta[:-2]) / period**2
         return self.dynamics.torque(theta[1:-1], rate, change)
 
     def room(self, commands: Tensor) -> Tensor:
-        """What is left of all limits, each in units of its own: positive where it is allowed.
+        """Compute the margins to all limits, each in its own unit: positive where allowed.
 
         The machine's region and step limit, its safe conditioning, and the expert's clearance over
         the table, but for a well around either end.
@@ -105,7 +105,7 @@ class Carry:
         )
 
     def least_torque(self) -> Tensor:
-        """The way of as many commands as the expert's whose torque RMS is least."""
+        """Find the motion with the least RMS torque and as many commands as the expert's."""
         start = self.expert()
         start[3:-3, 2] -= _RISE
         step = torch.tensor(self.machine.step_limit)
@@ -122,7 +122,7 @@ class Carry:
         return full(found)
 
     def simulated(self, commands: Tensor) -> Tensor:
-        """The motors' torques (m - 3, 3) N m in PyBullet, with the block in the cup.
+        """Measure the motors' torques (m - 3, 3) N m in PyBullet, with the block in the cup.
 
         All time steps but the last two, in which it lands.
 
@@ -157,19 +157,19 @@ class _TimeStep(Path):
 
 
 def points(commands: Tensor) -> Tensor:
-    """Where P is at the start and after each time step, (10 (n - 2) + 1, 3) m."""
+    """Return P at the start and after each time step, (10 (n - 2) + 1, 3) m."""
     weights = torch.tensor(spline_weights(_SUBSTEPS))
     inner = torch.einsum("sw,kcw->ksc", weights, commands.unfold(0, 3, 1)).reshape(-1, 3)
     return torch.cat([commands[:1], inner])
 
 
 def rms(torque: Tensor) -> Tensor:
-    """Over time and motors."""
+    """Compute the RMS over time and motors."""
     return (torque**2).mean().sqrt()
 
 
 def draw(machine: TPM, count: int, seed: int = 0) -> list[Carry]:
-    """Places as the task draws them: safe ones on the table, not too near to each other."""
+    """Sample places as the task does: safe ones on the table, not too near to each other."""
     rng, table = np.random.default_rng(seed), PickAndPlace(machine).on_table(BLOCK)
     carries = []
     for _ in range(count):

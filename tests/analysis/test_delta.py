@@ -1,14 +1,15 @@
-"""The Delta and the Orthoglide: solutions, counts, and singularities beside those of ours."""
+"""Solutions, counts and singularities of the Delta and the Orthoglide of docs/delta.py."""
 
 import re
 
 import numpy as np
 import oracle
 import pytest
+from delta import DELTA, ORTHOGLIDE, Leg, Tripod
 from paths import ROOT
+from screws import common, projector, twists
 
 from tpm_gym.analysis.decoupling import motors, over
-from tpm_gym.analysis.delta import DELTA, ORTHOGLIDE, Leg, Tripod
 from tpm_gym.analysis.poc import Chain, analyse
 from tpm_gym.analysis.topology import analyse as analyse_ours
 from tpm_gym.analysis.topology import describe
@@ -74,14 +75,6 @@ def test_each_leg_has_two_solutions_and_no_more(name: str) -> None:
     assert inverse_all([-0.04, 0.028, 0.80]).valid.all()
 
 
-def test_out_of_reach_is_nan() -> None:
-    assert np.isnan(DELTA.inverse_all([0, 0, 2.0])).all()
-    assert np.isnan(ORTHOGLIDE.inverse_all([0, 0, 2.0])).any(axis=-1).all()
-    assert np.isnan(ORTHOGLIDE.forward_all([9.0, 0, 0])).all()
-    with pytest.raises(InputError):
-        DELTA.inverse_all([np.nan, 0, 0])
-
-
 @both
 def test_velocity_is_the_derivative_of_the_forward_kinematics(name: str) -> None:
     tripod, points = sample(name, 50, 3)
@@ -110,17 +103,8 @@ def test_the_orthoglide_is_isotropic_at_its_home() -> None:
 
 def freedoms(chains: list[Chain], point: FloatArray) -> tuple[int, int]:
     """Return the dimensions of the chains' common twists and rotations, by screw theory."""
-    missing = []
-    for chain in chains:
-        rows = []
-        for unit in chain.units:
-            rows += [np.concatenate([t, np.zeros(3)]) for t in unit.translations]
-            rows += [np.concatenate([np.cross(s, point - unit.point), s]) for s in unit.rotations]
-        _, values, right = np.linalg.svd(np.array(rows))
-        missing.append(right[int((values > 1e-9).sum()) :])
-    _, values, right = np.linalg.svd(np.concatenate(missing))
-    free = right[int((values > 1e-9).sum()) :]
-    return len(free), int((np.linalg.svd(free[:, 3:], compute_uv=False) > 1e-9).sum())
+    shared = common(*(projector(twists(chain, point)) for chain in chains))
+    return round(np.trace(shared)), int(np.linalg.matrix_rank(shared[:, 3:], tol=1e-9))
 
 
 @both

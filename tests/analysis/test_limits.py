@@ -1,4 +1,4 @@
-"""Limits forbid what the machine refuses, and links touch where MuJoCo's bodies do."""
+"""Stops agree with the machine's, and distances of links with MuJoCo's bodies."""
 
 import re
 from itertools import combinations
@@ -63,7 +63,7 @@ def slender(model: mujoco.MjModel) -> list[int]:
 
 
 def nearest_geoms(machine: Machine, points: FloatArray, mode: int) -> list[float]:
-    """The least distance of MuJoCo's bodies that no joint joins, one posture after another, m."""
+    """Return the least distance of MuJoCo's unjoined bodies in each posture, m."""
     g = PAPER if machine is PAPER_TPM else WIDE
     model = mujoco.MjModel.from_xml_string(mjcf_text(machine))
     data = mujoco.MjData(model)

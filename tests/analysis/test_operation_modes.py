@@ -1,6 +1,4 @@
-"""Both modes meet on the surface of the formula; the numbers of docs/operation-modes.md hold."""
-
-import re
+"""Both modes meet on the computed surface, and the numbers of docs/operation-modes.md hold."""
 
 import numpy as np
 import oracle
@@ -91,11 +89,6 @@ def test_mobility_by_rank_is_3_and_the_tilt_no_freedom_of_its_own() -> None:
                 np.testing.assert_allclose(np.abs(turned), [0, 1, 0], atol=1e-9)
                 counted += 1
     assert counted > 30
-
-
-def test_no_number_of_the_page_is_without_its_test() -> None:
-    text = PAGE.read_text(encoding="utf-8")
-    assert re.search(r"pytest -m slow -s tests/analysis/test_operation_modes.py", text)
 
 
 def said(name: str, *values: object) -> None:

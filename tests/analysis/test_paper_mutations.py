@@ -5,6 +5,8 @@ then. That takes minutes, so it is a slow test. The fast tests check that the ta
 """
 
 import ast
+import importlib
+import inspect
 import json
 import os
 import re
@@ -20,14 +22,7 @@ TEXT = (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
 
 
 class Mutation(NamedTuple):
-    """One wrong expression.
-
-    Attributes:
-        row: Begin of the first cell of a row of the page.
-        module: Module of the package.
-        right: Expression that stands there once; _1, _2, ... stand for any expression.
-        wrong: Expression in its place.
-    """
+    """Wrong expression for a row of the page, named by the begin of its first cell."""
 
     row: str
     module: str
@@ -35,9 +30,9 @@ class Mutation(NamedTuple):
     wrong: str
 
 
-POC, TOPOLOGY = "analysis.poc", "analysis.topology"
-EQUATIONS, JACOBIAN = "kinematics.equations", "kinematics.jacobian"
-POSITION, DELTA = "kinematics.position", "analysis.delta"
+POC, TOPOLOGY = "tpm_gym.analysis.poc", "tpm_gym.analysis.topology"
+EQUATIONS, JACOBIAN = "tpm_gym.kinematics.equations", "tpm_gym.kinematics.jacobian"
+POSITION, DELTA = "tpm_gym.kinematics.position", "delta"
 
 MUTATIONS = [
     Mutation("(1)", POC, "reduce(POCSet.__or__, sets)", "reduce(POCSet.__and__, sets)"),
@@ -77,7 +72,7 @@ MUTATIONS = [
     Mutation("(17)", EQUATIONS, "r2z * cos[1] - r2x * sin[1]", "r2z * cos[1] - r1x * sin[1]"),
     Mutation("(17)", JACOBIAN, "f.cos_beta * f.leg1", "f.leg1"),
     # What the text claims
-    Mutation("M_HSOC1", TOPOLOGY, "parallel([hsoc_1, hsoc_2])", "hsoc_1"),
+    Mutation("M_HSOC1", TOPOLOGY, "poc.parallel([hsoc_1, hsoc_2])", "hsoc_1"),
     Mutation("xi_L1", POC, "chains[: j + 1]", "chains[:j]"),
     Mutation("xi_L2", POC, "(parallel(previous) | added).dim", "6"),
     Mutation("v = m - n + 1", POC, "range(1, len(order))", "(1,)"),
@@ -127,8 +122,7 @@ def test_every_row_has_a_mutation_and_every_mutation_a_row() -> None:
 
 @pytest.mark.parametrize("mutation", MUTATIONS, ids=lambda m: f"{m.row}: {m.wrong}")
 def test_what_is_replaced_stands_there_once(mutation: Mutation) -> None:
-    path = ROOT / "src" / "tpm_gym" / f"{mutation.module.replace('.', '/')}.py"
-    source = path.read_text(encoding="utf-8")
+    source = inspect.getsource(importlib.import_module(mutation.module))
     broken, count = mutate(source, mutation.right, mutation.wrong)
     assert count == 1
     assert ast.dump(broken) != ast.dump(ast.parse(source))
@@ -138,8 +132,8 @@ def test_what_is_replaced_stands_there_once(mutation: Mutation) -> None:
 @pytest.mark.parametrize("mutation", MUTATIONS, ids=lambda m: f"{m.row}: {m.wrong}")
 def test_the_row_s_tests_see_the_mutation(mutation: Mutation) -> None:
     tests = next(named for label, named in ROWS.items() if label.startswith(mutation.row))
-    change = [f"tpm_gym.{mutation.module}", mutation.right, mutation.wrong]
-    path = os.pathsep.join([str(ROOT / "tests" / "support"), str(ROOT / "src")])
+    change = [mutation.module, mutation.right, mutation.wrong]
+    path = os.pathsep.join(str(ROOT / part) for part in ("tests/support", "src", "docs"))
     result = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-x", "-p", "mutated", *tests],
         cwd=ROOT,

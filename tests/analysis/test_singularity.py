@@ -198,39 +198,10 @@ def compare(
         assert ball_is_clear(some[index], float(found.distance[index]), mode, g, count)
 
 
-@pytest.mark.slow
-def test_distance_is_never_too_large() -> None:
-    """More than 1,000 points of all modes, half of them beside the constraint's surface."""
-    rng = np.random.default_rng(6)
-    some = oracle.reachable_points(rng, 1000, PAPER)
-    theta_1, beta = rng.uniform(-np.pi, np.pi, 1000), rng.uniform(0.05, 3.0, 1000)
-    level = zip(theta_1, beta, rng.choice([-1, 1], 1000), rng.normal(0, 0.01, 1000), strict=True)
-    beside = np.stack([oracle.level_rod_4(*row) for row in level])
-    points, factors, checked = np.concatenate([some, beside]), set(), 0
-    modes = rng.permutation(np.arange(2000) % 16)
-    for mode in WORKING_MODES:
-        for assembly in ASSEMBLY_MODES:
-            mine = points[modes == mode.index]
-            found = nearest_singularity(mine, mode, assembly)
-            for point, distance in zip(mine[found.valid], found.distance[found.valid], strict=True):
-                assert ball_is_clear(point, float(distance), mode, PAPER, 2000)
-            factors |= set(found.factor[found.valid].tolist())
-            checked += found.valid.sum()
-    assert checked > 1000  # the others are not reached on their mode
-    assert factors == set(range(8))
-
-
 @examples(4, oracle.geometries(), oracle.seeds(), st.sampled_from(WORKING_MODES))
 def test_distance_for_any_geometry(g: Geometry, seed: int, mode: WorkingMode) -> None:
     for assembly in SIDES:
         compare(mode, assembly, g, points=5, count=200, seed=seed)
-
-
-@pytest.mark.slow
-@examples(60, oracle.geometries(), oracle.seeds(), st.sampled_from(WORKING_MODES))
-def test_distance_for_many_geometries(g: Geometry, seed: int, mode: WorkingMode) -> None:
-    for assembly in SIDES:
-        compare(mode, assembly, g, points=20, count=2000, seed=seed)
 
 
 @examples(4, oracle.geometries(), oracle.seeds(), st.floats(0.1, 10))

@@ -7,9 +7,10 @@ import oracle
 import pytest
 from examples import examples
 from hypothesis import example
+from screws import common, projector, twists
 from walk import gaps
 
-from tpm_gym.analysis.poc import Chain, POCSet, Subspace, degrees_of_freedom
+from tpm_gym.analysis.poc import POCSet, Subspace, degrees_of_freedom
 from tpm_gym.analysis.singularity import dimensionless
 from tpm_gym.analysis.topology import Structure, analyse, closure_jacobian, describe, mobility
 from tpm_gym.arrays import FloatArray
@@ -125,25 +126,6 @@ def test_every_decomposition_has_the_same_freedoms_and_the_paper_s_couples_least
 
 
 # Screw theory: twists (velocity of the base point, angular velocity), no columns taken apart
-
-
-def twists(chain: Chain, base_point: FloatArray) -> FloatArray:
-    rows = []
-    for unit in chain.units:
-        rows += [np.concatenate([t, np.zeros(3)]) for t in unit.translations]
-        rows += [np.concatenate([np.cross(s, base_point - unit.point), s]) for s in unit.rotations]
-    return np.array(rows)
-
-
-def projector(rows: FloatArray) -> FloatArray:
-    _, values, right = np.linalg.svd(rows)
-    basis = right[: int((values > 1e-9).sum())]
-    return np.asarray(basis.T @ basis)
-
-
-def common(*projectors: FloatArray) -> FloatArray:
-    eye = np.eye(6)
-    return np.asarray(eye - projector(np.concatenate([eye - p for p in projectors])))
 
 
 def as_projector(poc: POCSet) -> FloatArray:

@@ -1,4 +1,4 @@
-"""The data behind the figures of docs/: zero sets, surfaces, skeletons, volumes; one is drawn."""
+"""Data of the figures of docs/: zero sets, surfaces, skeletons, volumes. One figure is drawn."""
 
 import numpy as np
 import pytest
@@ -28,13 +28,11 @@ from figures import (  # noqa: E402
 from figures.skeleton import skeleton  # noqa: E402
 from figures.zero_sets import (  # noqa: E402
     Section,
-    clip,
     parallel_lines,
     reach_margin,
     serial_lines,
     serial_squares,
     sheets,
-    zero_lines,
 )
 
 X, Z = np.linspace(-0.92, 1.06, 100), np.linspace(-1.18, 1.22, 121)
@@ -95,17 +93,6 @@ def test_serial_lines_are_the_edge_of_the_reach(index, sign):
     assert (around.any(axis=1) & ~around.all(axis=1))[~ends].all()
 
 
-def test_zero_lines_of_a_circle_are_exact_and_clip_cuts_them():
-    nodes = np.linspace(-1.5, 1.5, 40)
-    lines = zero_lines(lambda p: 1 - (p**2).sum(axis=-1), nodes, nodes)
-    radius = np.hypot(*np.concatenate(lines).T)
-    np.testing.assert_allclose(radius, 1.0, atol=1e-14)
-    pieces = clip(lines, lambda p: p[..., 0] > 0.3)
-    assert pieces
-    assert all((piece[:, 0] > 0.3).all() for piece in pieces)
-    assert zero_lines(lambda p: 1 + p[..., 0] ** 2, nodes, nodes) == []
-
-
 def test_swept_surfaces_stay_singular():
     """The curves of all factors but the first at one y, swept at constant (xC, zC), stay zeros."""
     y0, y = 0.025, surfaces.levels(9)[1:-1]
@@ -142,20 +129,6 @@ def test_drawn_links_have_the_lengths_of_the_geometry(geometry):
         for name, (start, end, length) in links.items():
             assert np.linalg.norm(end - start) == pytest.approx(length, abs=1e-14), name
     assert set(postures.STROKES) <= set(links)
-
-
-def test_postures_are_distinct_in_the_drawing():
-    drawn = []
-    for mode in WORKING_MODES:
-        s = skeleton(postures.POINT, mode)
-        drawn.append(postures.project(np.concatenate([s.b, s.c])).ravel())
-    gaps = np.linalg.norm(np.array(drawn)[:, None] - np.array(drawn), axis=-1)
-    assert gaps[~np.eye(16, dtype=bool)].min() > 0.05  # m, of 1.2
-
-
-def test_projection_keeps_scale():
-    """Three orthogonal unit vectors have squared lengths that sum to 2 in a parallel projection."""
-    assert (postures.project(np.eye(3)) ** 2).sum() == pytest.approx(2.0)
 
 
 @pytest.mark.parametrize("sign", [-1, 1])

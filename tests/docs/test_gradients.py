@@ -1,6 +1,6 @@
-"""What gradients found: they are those of differences, limits are kept, the gains are there.
+"""Gradients agree with differences; the recorded lengths and motions keep all limits and gain.
 
-What is slow, the searches themselves, is taken from their record, and one of each is repeated.
+The searches are slow, so their record is tested, and one search of each kind is repeated.
 """
 
 import json

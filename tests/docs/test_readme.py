@@ -1,4 +1,4 @@
-"""What the README shows has to run, and its commands have to exist."""
+"""The code of the README runs, and its commands exist."""
 
 import re
 import subprocess

@@ -1,1 +1,1 @@
-"""Singularities, aspects, topology, decoupling, and a Delta; environments do not need this."""
+"""Singularities, aspects, topology and decoupling; environments do not need this."""

@@ -1,12 +1,10 @@
 """The reachable set of a working mode, and its aspects: maximal regions free of singularities.
 
 The platform can move between two points of one aspect (Wenger and Chablat) without a singularity,
-and not between two aspects of one working mode. All sets are in Cartesian space, in the paper
-frame, in metres. A set is a grid of cells. The singular planes y = 0 and |y| = l7 are faces of
-cells, so that only curved surfaces run through cells.
-
-All factors of :mod:`tpm_gym.analysis.singularity` count, the elevation included. Stops of motors
-and collisions of links count only if ``limits`` say so, see :mod:`tpm_gym.analysis.limits`.
+and not between two aspects of one working mode. Sets are grids of cells in the paper frame, in
+metres. The singular planes y = 0 and |y| = l7 are faces of cells, so that only curved surfaces run
+through cells. All factors of :mod:`tpm_gym.analysis.singularity` count. Stops of motors and
+collisions of links count only with ``limits`` (:mod:`tpm_gym.analysis.limits`).
 """
 
 import math
@@ -36,8 +34,7 @@ class Cells:
     Attributes:
         low: Corner of the grid with the smallest x, y, z, m.
         spacing: Edges of a cell, m.
-        mask: (nx, ny, nz) bool, true for cells of the set. The plane y = 0 runs between the cells
-            ny / 2 - 1 and ny / 2.
+        mask: (nx, ny, nz) bool, true for cells of the set; y = 0 is in the middle of the grid.
     """
 
     low: Vector
@@ -54,8 +51,7 @@ class Cells:
         """Bound of the error of the volume, m^3: half of all cells along the curved boundary.
 
         It is proportional to the spacing. The error itself is mostly far smaller, because cells
-        that count too much and too little cancel. The planes y = 0 and |y| = l7 are faces of cells
-        and add no error.
+        that count too much and too little cancel.
         """
         halves = np.array_split(np.pad(self.mask, ((1, 1), (0, 0), (1, 1))), 2, axis=1)
         inside = sum((half & _grown(~half, corners=False)).sum() for half in halves)
@@ -79,14 +75,13 @@ class ReachableSet:
 
 @dataclass(frozen=True)
 class Aspect:
-    """Connected region of one working mode without singularities.
+    """Connected region of one working mode without singularities, within all limits.
 
     Attributes:
         branch: Working mode: the signs of the serial factors.
         assembly: Assembly mode: the signs of sin(beta) and the planar factor.
-        level3: Sign of the third parallel factor, l1 + l3 c3 - xC - 2 l2.
+        level3: Sign of the parallel factor l1 + l3 c3 - xC - 2 l2.
         elevation: Sign of the constraint's factor, z_C1 - z_B1.
-        limits: Limits that the whole region respects.
     """
 
     branch: WorkingMode
@@ -100,13 +95,7 @@ class Aspect:
 
 @dataclass(frozen=True)
 class Box:
-    """Axis-aligned box of good conditioning, from :func:`largest_box`.
-
-    Attributes:
-        region: The box; its corners are centres of cells.
-        volume: Volume, m^3.
-        conditioning: Smallest 1/cond(J) at the centres of cells in the box.
-    """
+    """Box of :func:`largest_box`: volume in m^3, and least 1/cond(J) at centres of its cells."""
 
     region: Region
     volume: float
@@ -119,15 +108,14 @@ def reachable_set(
     shape: Shape = DEFAULT_SHAPE,
     limits: tuple[Limit, ...] = (),
 ) -> ReachableSet:
-    """Find the points that have a posture on ``branch``.
+    """Find the points that have a posture on ``branch`` and respect all ``limits``.
 
     Args:
         branch: Working mode.
         geometry: Lengths.
         shape: Numbers of cells along x, y, z: at least 2 each, and even along y. The grid holds
             every point that the rods reach.
-        limits: Limits that the posture must respect, such as
-            :func:`~tpm_gym.analysis.limits.within_stops`.
+        limits: For example :func:`~tpm_gym.analysis.limits.within_stops`.
 
     Raises:
         ConfigurationError: The shape is not possible.
@@ -147,9 +135,8 @@ def aspects(
 
     Two cells belong to one aspect if they share a face and all factors have the same signs at their
     centres. So a neck narrower than a cell divides an aspect, and a singular wall thinner than a
-    cell may be missed: compare two grids. Regions of fewer than ``min_cells`` cells, which are
-    fragments along curved boundaries, are left out. Forbidden points of ``limits`` divide aspects
-    too.
+    cell may be missed: compare two grids. Points that ``limits`` forbid divide aspects too. Regions
+    of fewer than ``min_cells`` cells, fragments along curved boundaries, are left out.
 
     Raises:
         ConfigurationError: The shape is not possible, or min_cells is not positive.
@@ -173,10 +160,8 @@ def aspects(
 def sample(rng: np.random.Generator, aspect: Aspect, count: int) -> FloatArray:
     """Sample points (count, 3) m, uniform over an aspect, not only over its cells.
 
-    Points are sampled in the cells of the aspect and their neighbours, and kept if their factors
-    have the signs of the aspect. So the boundary is exact, with two exceptions: parts of the aspect
-    more than a cell away from its cells are missing, and another region with the same signs less
-    than a cell away is included.
+    Parts of the aspect more than a cell away from its cells are missing, and another region with
+    the same signs less than a cell away is included. Elsewhere the boundary is exact.
 
     Raises:
         ConfigurationError: count is negative, or the aspect has no cells.
@@ -187,15 +172,13 @@ def sample(rng: np.random.Generator, aspect: Aspect, count: int) -> FloatArray:
     if not cells.mask.any():
         raise ConfigurationError("aspect", "without cells", "an aspect that aspects() returned")
     candidates = np.argwhere(_grown(cells.mask))
-    assembly = aspect.assembly
-    signs = assembly.sin_beta, aspect.level3, assembly.planar, aspect.elevation
-    code = sum(bit for sign, bit in zip(signs, _BITS, strict=True) if sign > 0)
+    where = aspect.branch, aspect.geometry, aspect.limits
+    code = _signs(cells.centres()[0], *where)
     points = np.empty((0, 3))
     while len(points) < count:
         corner = candidates[rng.integers(len(candidates), size=count)]
         draws = np.asarray(cells.low) + (corner + rng.random((count, 3))) * cells.spacing
-        kept = _signs(draws, aspect.branch, aspect.geometry, aspect.limits) == code
-        points = np.concatenate([points, draws[kept]])
+        points = np.concatenate([points, draws[_signs(draws, *where) == code]])
     return points[:count]
 
 
@@ -203,9 +186,8 @@ def largest_box(aspect: Aspect, threshold: float) -> Box:
     """Find the largest axis-aligned box in an aspect with 1/cond(J) >= threshold.
 
     The result is exact on the grid, whose nodes are the centres of cells: no larger box has nodes
-    as corners, all nodes in the aspect, and 1/cond(J) >= threshold at all nodes. Faces of the box
-    run through nodes. The conditioning between nodes is not checked; it varies little from node to
-    node.
+    as corners, all nodes in the aspect, and 1/cond(J) >= threshold at all nodes. The conditioning
+    between nodes is not checked; it varies little from node to node.
 
     Raises:
         ConfigurationError: The threshold is not between 0 and 1, or no box of at least two nodes
@@ -221,11 +203,8 @@ def largest_box(aspect: Aspect, threshold: float) -> Box:
     corners = _largest_block(conditioning >= threshold)
     if corners is None:
         raise ConfigurationError("threshold", threshold, "a value that a box of this aspect meets")
-    first, last = corners
-    low, high = (
-        np.asarray(cells.low) + (np.asarray(corner) + 0.5) * cells.spacing for corner in corners
-    )
-    inside = tuple(slice(a, b + 1) for a, b in zip(first, last, strict=True))
+    low, high = np.asarray(cells.low) + (np.array(corners) + 0.5) * cells.spacing
+    inside = tuple(slice(a, b + 1) for a, b in zip(*corners, strict=True))
     region = Region(low=tuple(low.tolist()), high=tuple(high.tolist()))
     return Box(region, float((high - low).prod()), float(conditioning[inside].min()))
 
@@ -256,35 +235,26 @@ def _signs(
     """Return the signs of sin(beta), level3, planar, elevation as bits; -1 where P cannot be."""
     found = factors_at(points, branch, geometry)
     values = np.concatenate([found.parallel, found.constraint[..., None]], axis=-1)
-    codes: IntArray = np.where(
-        np.isnan(values[..., 0]), -1, ((values > 0) * np.array(_BITS)).sum(axis=-1)
-    )
+    codes: IntArray = np.where(np.isnan(values[..., 0]), -1, (values > 0) @ _BITS)
     for limit in limits:
         kept = codes >= 0
         codes[kept] = np.where(limit(points[kept], branch, geometry), codes[kept], -1)
     return codes
 
 
-def _neighbours(shape: tuple[int, ...]) -> list[tuple[tuple[slice, ...], tuple[slice, ...]]]:
-    """Return a pair of views for each axis of a grid, whose entries share a face."""
-    pairs = []
-    for axis in range(len(shape)):
-        before, after = [slice(None)] * len(shape), [slice(None)] * len(shape)
-        before[axis], after[axis] = slice(None, -1), slice(1, None)
-        pairs.append((tuple(before), tuple(after)))
-    return pairs
+_NEIGHBOURS = [
+    tuple((slice(None),) * axis + (part,) for part in (slice(None, -1), slice(1, None)))
+    for axis in range(3)
+]  # for each axis, two views of a grid whose entries share a face
 
 
 def _components(codes: IntArray) -> IntArray:
     """Label the connected sets of equal codes, by union-find on all faces at once."""
     parent = np.arange(codes.size)
     index = parent.reshape(codes.shape)
-    first, second = [], []
-    for before, after in _neighbours(codes.shape):
-        joined = codes[before] == codes[after]
-        first.append(index[before][joined])
-        second.append(index[after][joined])
-    one, other = np.concatenate(first), np.concatenate(second)
+    joined = [(a, b, codes[a] == codes[b]) for a, b in _NEIGHBOURS]
+    one = np.concatenate([index[before][same] for before, _, same in joined])
+    other = np.concatenate([index[after][same] for _, after, same in joined])
     while True:
         roots = parent[one], parent[other]
         if (roots[0] == roots[1]).all():
@@ -299,7 +269,7 @@ def _components(codes: IntArray) -> IntArray:
 def _grown(mask: BoolArray, corners: bool = True) -> BoolArray:
     """Return the cells of a set and those that touch them at a face, or even at a corner."""
     grown: BoolArray = mask.copy()
-    for before, after in _neighbours(mask.shape):
+    for before, after in _NEIGHBOURS:
         reached = grown.copy() if corners else mask
         grown[before] |= reached[after]
         grown[after] |= reached[before]
@@ -307,11 +277,8 @@ def _grown(mask: BoolArray, corners: bool = True) -> BoolArray:
 
 
 def _largest_block(mask: BoolArray) -> tuple[Shape, Shape] | None:
-    """Return the first and last node of the largest all-true block, by (nx - 1)(ny - 1)(nz - 1).
-
-    The search takes each range of y, each width in x, and in the columns that are true over both
-    the longest run along z. It returns None if no block has a volume.
-    """
+    """Return the first and last node of the largest all-true block; None if none has a volume."""
+    # For each range of y and each width in x: the longest run along z of columns true over both.
     nx, ny, nz = mask.shape
     count = np.cumsum(np.pad(mask, ((0, 0), (1, 0), (0, 0))), axis=1)
     position = np.arange(nz)

@@ -8,12 +8,8 @@ motor i, and k = sin(beta) level3. The differentiated closures are
     leg_3 w_3 = r_3x xC' + r_3z zC' + k l7 beta'
 
 Only motors 1 and 2 move link 3'. Motor 3 turns link 7 and moves nothing else, so it moves P along
-(-sin(beta), cos(beta), 0). In xC, zC and beta, the velocity Jacobian and its inverse are zero in
-the same two entries (:data:`LINKS`). In x, y and z, the velocity Jacobian has one zero, in the row
-of z (:data:`PLATFORM`), and its inverse has none.
-
-:func:`shares` and :func:`motors` take the velocity Jacobian of any mechanism whose motors have the
-same unit. Functions of joint angles raise like :func:`tpm_gym.kinematics.jacobian.velocity`.
+(-sin(beta), cos(beta), 0). Functions of joint angles raise like
+:func:`tpm_gym.kinematics.jacobian.velocity`.
 """
 
 from dataclasses import dataclass
@@ -38,12 +34,7 @@ LINKS = np.array([[True, True, False], [True, True, False], [True, True, True]])
 
 @dataclass(frozen=True, eq=False)
 class Index:
-    """Means over a region, from :func:`over`.
-
-    Attributes:
-        shares: (3, 3), mean of :func:`shares`.
-        motors: (3,), mean of :func:`motors`.
-    """
+    """Means of :func:`shares` (3, 3) and :func:`motors` (3,) over a region, from :func:`over`."""
 
     shares: FloatArray
     motors: FloatArray
@@ -67,16 +58,13 @@ def inverse_link_velocity(
 ) -> FloatArray:
     """Compute d(theta) / d(xC, zC, l7 beta), (..., 3, 3) rad/m, at theta (..., 3) rad.
 
-    Raises:
-        SingularityError: A leg is stretched or folded, or J does not exist.
+    Raises SingularityError if a leg is stretched or folded.
     """
     (r1, r2, r3), f = _configuration(theta, branch, geometry)
     turns = 0 * f.planar, 0 * f.planar, f.sin_beta * f.level3
-    rows = [
-        np.stack([rod[0], rod[2], turn], axis=-1)
-        for rod, turn in zip((r1, r2, r3), turns, strict=True)
-    ]
-    return _over_legs(np.stack(rows, axis=-2), np.stack([f.leg1, f.leg2, f.leg3], -1), geometry)
+    columns = (r1[0], r2[0], r3[0]), (r1[2], r2[2], r3[2]), turns
+    rows = np.stack([np.stack(column, axis=-1) for column in columns], axis=-1)
+    return _over_legs(rows, np.stack([f.leg1, f.leg2, f.leg3], axis=-1), geometry)
 
 
 def inverse_velocity(
@@ -84,8 +72,7 @@ def inverse_velocity(
 ) -> FloatArray:
     """Compute J^-1 = B^-1 A = d(theta) / d(x, y, z), (..., 3, 3) rad/m, at theta (..., 3) rad.
 
-    Raises:
-        SingularityError: theta is a serial singularity, or J does not exist.
+    Raises SingularityError at a serial singularity.
     """
     a = jacobian.parallel(theta, branch, geometry)
     b = np.diagonal(jacobian.serial(theta, branch, geometry), axis1=-2, axis2=-1)
@@ -95,9 +82,10 @@ def inverse_velocity(
 def shares(velocity: ArrayLike) -> FloatArray:
     """Compute the share of each motor in the motion of each coordinate, (..., 3, 3), in [0, 1].
 
-    The share is J_ij^2 / sum_j J_ij^2 of a velocity Jacobian (..., 3, 3). If the speeds of the
-    motors are independent and equally large, it is the part of the variance of coordinate i that
-    motor j causes. Rows add up to 1. The row of a coordinate that cannot move is NaN.
+    The share is J_ij^2 / sum_j J_ij^2 of the velocity Jacobian (..., 3, 3) of any mechanism whose
+    motors have the same unit. If the speeds of the motors are independent and equally large, it is
+    the part of the variance of coordinate i that motor j causes. Rows add up to 1. The row of a
+    coordinate that cannot move is NaN.
     """
     squares = finite_points("velocity", velocity) ** 2
     with np.errstate(invalid="ignore"):
@@ -106,10 +94,9 @@ def shares(velocity: ArrayLike) -> FloatArray:
 
 
 def motors(velocity: ArrayLike) -> FloatArray:
-    """Compute how many motors move each coordinate, (..., 3), in [1, 3]: 1 / sum_j shares_ij^2.
+    """Compute how many motors move each coordinate, (..., 3): 1 / sum_j shares_ij^2.
 
-    The number is 1 if one motor alone moves the coordinate, as in a Cartesian robot, and 3 if all
-    motors have equal shares.
+    The number is 1 if one motor alone moves the coordinate, and 3 if all have equal shares.
     """
     count: FloatArray = 1 / (shares(velocity) ** 2).sum(axis=-1)
     return count
@@ -124,10 +111,8 @@ def over(
 ) -> Index:
     """Average shares and numbers of motors over a grid of ``shape`` in a region, for x, y, z of P.
 
-    Raises:
-        UnreachableError: A point is not reachable on ``branch``.
-        SingularityError: A point is singular.
-        ConfigurationError: A point is in another assembly mode.
+    Raises UnreachableError, SingularityError, or ConfigurationError where a point is in another
+    assembly mode.
     """
     low, high = np.array(region.low), np.array(region.high)
     cells = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1).reshape(-1, 3)

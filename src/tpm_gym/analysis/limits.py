@@ -1,8 +1,6 @@
-"""Limits that closed-form kinematics does not have: stops of the motors, and collisions of links.
+"""Limits for :mod:`tpm_gym.analysis.aspects`: stops of the motors, and collisions of links.
 
-A limit says for each point that a working mode reaches whether the machine can be there. The
-functions of :mod:`tpm_gym.analysis.aspects` take any number of ``limits``. Bodies come from
-:mod:`tpm_gym.mechanism.tree`; their cross sections do not scale with the lengths.
+The cross sections of bodies do not scale with the lengths.
 """
 
 from __future__ import annotations
@@ -25,7 +23,6 @@ Limit = Callable[[FloatArray, WorkingMode, Geometry], BoolArray]
 """Function of points (n, 3) m that a working mode reaches; it returns (n,), true if allowed."""
 
 _SLENDER = 2.0  # least ratio of length to width of a solid that counts
-_BLOCK = 4096
 
 
 class Capsule(NamedTuple):
@@ -41,7 +38,7 @@ def within_stops(points: FloatArray, branch: WorkingMode, geometry: Geometry) ->
     """Return whether all motors are between their stops, (n,)."""
     theta = inverse(points, branch, geometry)
     motors = tree.build(geometry).motors
-    low, high = ([getattr(motor, end) for motor in motors] for end in ("lower", "upper"))
+    low, high = zip(*((motor.lower, motor.upper) for motor in motors), strict=True)
     return np.asarray(((theta >= low) & (theta <= high)).all(axis=-1))
 
 
@@ -53,8 +50,7 @@ def clear_of_links(points: FloatArray, branch: WorkingMode, geometry: Geometry) 
 def clearance(points: FloatArray, branch: WorkingMode, geometry: Geometry) -> FloatArray:
     """Compute the smallest distance between two links, (n,) m; negative where links overlap.
 
-    Pairs of links with a common joint do not count. Compact solids (hubs, motors, base) do not
-    count either.
+    Links with a common joint and compact solids (hubs, motors, base) do not count.
     """
     mechanism = tree.build(geometry)
     parts = [part for link in mechanism.links for part in capsules(link)]
@@ -65,15 +61,12 @@ def clearance(points: FloatArray, branch: WorkingMode, geometry: Geometry) -> Fl
     slots = assembly_of(points, branch, geometry)
     theta = inverse(points, branch, geometry)
     for mode in ASSEMBLY_MODES:
-        here = np.flatnonzero(slots == mode.index)
-        for start in range(0, len(here), _BLOCK):
-            rows = here[start : start + _BLOCK]
-            joints = tree.joint_arrays(theta[rows], mode, geometry)
-            places = mechanism.places(joints)
-            ends = [tuple(map(places[part.link].point, part[1:3])) for part in parts]
-            for i, j in pairs:
-                gap = _between(*ends[i], *ends[j]) - parts[i].radius - parts[j].radius
-                result[rows] = np.minimum(result[rows], gap)
+        rows = np.flatnonzero(slots == mode.index)
+        places = mechanism.places(tree.joint_arrays(theta[rows], mode, geometry))
+        ends = [tuple(map(places[part.link].point, part[1:3])) for part in parts]
+        for i, j in pairs:
+            gap = _between(*ends[i], *ends[j]) - parts[i].radius - parts[j].radius
+            result[rows] = np.minimum(result[rows], gap)
     return result
 
 
@@ -97,18 +90,14 @@ def capsules(link: Link) -> Iterator[Capsule]:
 
 
 def _unjoined(mechanism: Mechanism) -> set[frozenset[str]]:
-    """Return the pairs of links without a common joint.
-
-    The cross of a universal joint counts as part of its rod.
-    """
+    """Return the pairs of links without a common joint; a universal joint's cross is its rod."""
     whole = {link.name: link.name for link in mechanism.links}
-    joints = [link.joint for link in mechanism.links]
-    for link, joint in zip(mechanism.links, joints, strict=True):
-        if joint is not None and joint.kind != "prismatic" and not any(joint.origin):
-            whole[joint.parent] = link.name
-    joined = [(link.name, joint.parent) for link, joint in zip(mechanism.links, joints, strict=True)
-              if joint is not None]  # fmt: skip
-    joined += [(closure.link_a, closure.link_b) for closure in mechanism.closures]
+    joined = [(closure.link_a, closure.link_b) for closure in mechanism.closures]
+    for link in mechanism.links:
+        if (joint := link.joint) is not None:
+            joined.append((link.name, joint.parent))
+            if joint.kind != "prismatic" and not any(joint.origin):
+                whole[joint.parent] = link.name
     near = {frozenset((whole[one], whole[other])) for one, other in joined}
     every = {frozenset(pair) for pair in product(whole.values(), repeat=2)}
     return {pair for pair in every - near if len(pair) == 2}

@@ -3,19 +3,14 @@
 A POC set is a pair of subspaces of R^3 for the motion of a link relative to the base: the span of
 its directions of translation, and the span of its axes of rotation. Union is the span of both,
 intersection the common subspace, separately for translations and rotations, as in the columns
-[t; r] of the paper. dim is the sum of the two ranks. Let o' be the base point of the end link of a
-chain. A revolute joint with axis s through a point p contributes r(|| s), and the translation t
-along s x (o' - p) unless the axis passes through o'. So three parallel revolutes contribute
-t^2(perpendicular to s), r^1(|| s).
+[t; r] of the paper. A revolute joint with axis s through a point p contributes r(|| s). It also
+contributes t along s x (o' - p), unless the axis passes through the base point o' of the end link.
 
-The paper's notation is simplified in two ways. A subspace holds all its directions, so there are no
-symbols for them (perpendicular, parallel, in the plane of). There are no braces around dependent
-elements either: choose the base point so that no element is dependent. (The paper writes t^2 r^1
-for R12, R13 alone, three elements of two revolutes; about a base point on one of the two axes the
-set is t^1 r^1.) Treating translations and rotations separately is exact for a chain that translates
-and rotates independently. All chains of this mechanism do, and a test compares them with screw
-theory. Directions are those at one configuration. Dimensions can change at a singularity;
-elsewhere they are the full-cycle values of the paper.
+Unlike the paper's notation, there are no symbols for directions, because a subspace holds them, and
+no braces around dependent elements: choose the base point so that no element is dependent. The sets
+are exact for chains that translate and rotate independently, as all chains of this mechanism do.
+They describe one configuration. Dimensions can change at a singularity; elsewhere they are the
+full-cycle values of the paper.
 """
 
 from __future__ import annotations
@@ -38,11 +33,7 @@ _SAME = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Subspace:
-    """Subspace of R^3.
-
-    Attributes:
-        basis: (k, 3), orthonormal rows; k is the dimension.
-    """
+    """Subspace of R^3 with an orthonormal ``basis`` (dimension, 3)."""
 
     basis: FloatArray
 
@@ -89,12 +80,7 @@ class Subspace:
 
 @dataclass(frozen=True, eq=False)
 class POCSet:
-    """Position and orientation characteristics of a link, the column [t; r] of the paper.
-
-    Attributes:
-        translations: Directions of translation of the base point.
-        rotations: Axes of rotation.
-    """
+    """Directions of translation and axes of rotation of a link, the column [t; r] of the paper."""
 
     translations: Subspace
     rotations: Subspace
@@ -126,7 +112,6 @@ class Unit:
         point: (3,) m, common point of all axes of rotation.
         translations: (n, 3) directions in which this point can move.
         rotations: (n, 3) axes.
-        actuated: Whether a motor drives the joint.
     """
 
     name: str
@@ -160,14 +145,8 @@ def prismatic(name: str, axis: FloatArray, point: FloatArray, actuated: bool = F
 def parallelogram_4s(name: str, short: FloatArray, rod: FloatArray, point: FloatArray) -> Unit:
     """Return a parallelogram of four spherical pairs, the paper's P^(4S) P^(4S) R^(4S) R^(4S).
 
-    Each rod keeps one distance and spins idly about itself. So the far short link cannot translate
-    along the rods, nor rotate about the normal of the parallelogram.
-
-    Args:
-        name: Name in the paper.
-        short: (3,) direction of the short links.
-        rod: (3,) direction of the rods.
-        point: (3,) m, middle of the far short link.
+    The far short link, with its middle at ``point`` (3,) m, can neither translate along the rods
+    nor rotate about the normal of the directions ``short`` (3,) of the links and ``rod`` (3,).
     """
     normal = np.cross(short, rod)
     translations = np.stack([normal, np.cross(rod, normal)])
@@ -175,14 +154,12 @@ def parallelogram_4s(name: str, short: FloatArray, rod: FloatArray, point: Float
 
 
 def parallelogram_4r(name: str, short: FloatArray, rod: FloatArray, point: FloatArray) -> Unit:
-    """Return a parallelogram of four revolutes, P^(4R).
+    """Return a parallelogram of four revolutes, P^(4R), from the same arguments.
 
     It translates in its plane, across the rods. The paper writes t^1(|| R32), the direction of the
-    short links; this is exact only if the rods are perpendicular to them. Arguments are as in
-    :func:`parallelogram_4s`.
+    short links; this is exact only if the rods are perpendicular to them.
     """
-    normal = np.cross(short, rod)
-    return Unit(name, point, np.cross(rod, normal)[None], np.empty((0, 3)))
+    return Unit(name, point, np.cross(rod, np.cross(short, rod))[None], np.empty((0, 3)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,22 +185,14 @@ class Chain:
 
 
 def serial(sets: Sequence[POCSet]) -> POCSet:
-    """Return the POC set of a serial chain: the union of the sets of its joints, Eq. (1).
-
-    Raises:
-        InputError: There is no set.
-    """
+    """Return the POC set of a serial chain: the union of one set or more, Eq. (1)."""
     if not sets:
         raise InputError("sets", sets, "at least one POC set")
     return reduce(POCSet.__or__, sets)
 
 
 def parallel(sets: Sequence[POCSet]) -> POCSet:
-    """Return the POC set of a link that several chains hold: their intersection, Eq. (2).
-
-    Raises:
-        InputError: There is no set.
-    """
+    """Return the POC set of a link on one chain or more: their intersection, Eq. (2)."""
     if not sets:
         raise InputError("sets", sets, "at least one POC set")
     return reduce(POCSet.__and__, sets)
@@ -245,13 +214,10 @@ def constraint_degree(freedoms: int, actuated: int, equations: int) -> int:
 
 
 def coupling_degrees(decompositions: Sequence[Sequence[int]]) -> tuple[float, ...]:
-    """Return kappa of each Assur kinematic chain (AKC), Eq. (5).
+    """Return kappa of each Assur kinematic chain (AKC), Eq. (5), from Delta_j by decomposition.
 
     The decomposition with the smallest sum of |Delta_j| counts. An AKC ends where its constraint
     degrees add up to zero.
-
-    Args:
-        decompositions: Delta_j of each decomposition.
 
     Raises:
         InputError: The constraint degrees of the decomposition do not add up to zero.
@@ -270,10 +236,9 @@ def coupling_degrees(decompositions: Sequence[Sequence[int]]) -> tuple[float, ..
 
 @dataclass(frozen=True)
 class Loop:
-    """Independent loop, closed by one single open chain (SOC).
+    """Independent loop, closed by one single open chain (SOC) of the named chains.
 
     Attributes:
-        chains: Names of the chains of the SOC.
         freedoms: Sum of f_i over the SOC.
         actuated: Number of motors, I_j.
         equations: Number of independent equations, xi_Lj.
@@ -312,8 +277,7 @@ class ParallelMechanism:
         """Coupling degree kappa of each Assur kinematic chain, Eq. (5).
 
         Raises:
-            InputError: The constraint degrees do not add up to zero, because the numbers of motors
-                and freedoms differ, as at a constraint singularity.
+            InputError: The numbers of motors and freedoms differ, as at a constraint singularity.
         """
         return coupling_degrees([[x.constraint for x in loops] for loops in self.decompositions])
 
@@ -341,8 +305,7 @@ def analyse(chains: Sequence[Chain], point: ArrayLike) -> ParallelMechanism:
 
 def decompositions(chains: Sequence[Chain], point: ArrayLike) -> tuple[tuple[Loop, ...], ...]:
     """Return the independent loops for each order of the chains, about ``point`` (3,) m."""
-    held = [(chain, chain.poc(point)) for chain in chains]
-    return tuple(_loops(order) for order in permutations(held))
+    return tuple(_loops(order) for order in permutations([(c, c.poc(point)) for c in chains]))
 
 
 def _loops(order: tuple[tuple[Chain, POCSet], ...]) -> tuple[Loop, ...]:
@@ -351,12 +314,9 @@ def _loops(order: tuple[tuple[Chain, POCSet], ...]) -> tuple[Loop, ...]:
     loops = []
     for j in range(1, len(order)):
         added = chains[: j + 1] if j == 1 else chains[j : j + 1]
-        loops.append(
-            Loop(
-                chains=tuple(chain.name for chain in added),
-                freedoms=sum(chain.freedoms for chain in added),
-                actuated=sum(chain.actuated for chain in added),
-                equations=independent_equations(sets[:j], sets[j]),
-            )
+        names = tuple(chain.name for chain in added)
+        freedoms, actuated = (
+            sum(getattr(c, key) for c in added) for key in ("freedoms", "actuated")
         )
+        loops.append(Loop(names, freedoms, actuated, independent_equations(sets[:j], sets[j])))
     return tuple(loops)

@@ -2,18 +2,15 @@
 
 The factors level3, planar, leg 1, leg 2 and elevation depend on xC and zC alone. So each is zero on
 a curve of C1 in the plane y = 0, and P is on a circle of radius l7 about (xC + l2, 0, zC + 2 l6),
-parallel to xy. Each curve has a closed form over one angle. The nearest point of a circle to P lies
-on the ray from its centre. So the distance to a surface is a minimum over one angle.
-
-A curve consists of arcs, intervals of the angle in which it is real. Within an arc the angle is
-``middle - half cos(t)``, with t from 0 to pi, so that the curve is smooth at both ends.
+parallel to xy. Each curve has a closed form over one angle, so the distance to a surface is a
+minimum over one angle. A curve consists of arcs, intervals of the angle in which it is real.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -28,7 +25,7 @@ Curve = Callable[[Geometry, WorkingMode, FloatArray, FloatArray, FloatArray], Po
 """Point of a curve, as a function of lengths, mode, angle, and two signs that name the branch."""
 
 _CELLS = 256  # cells of an arc
-_FINER = 4  # chords that measure the length of a cell
+_FINE = 4 * _CELLS  # chords that measure the length of an arc
 _NODES, _ROUNDS = 9, 16  # each round keeps a quarter of the interval
 _GRID = 2048  # cells of a full turn in the search for intervals
 _BLOCK = 64  # points at a time
@@ -51,14 +48,9 @@ def _rod_4(g: Geometry, theta_1: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _tangent(
     g: Geometry, t: FloatArray, side: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the triangle of the planar factor at theta_1, seen along y, with leg 2 moved to C1.
-
-    ``side`` is -1 if rods 4 and 6 point in opposite directions.
-
-    Returns:
-        Vector from A2 to B1: level, upwards, and its length, m. Coordinate of B1 from B2 along
-        rod 4, less than zero, m.
-    """
+    """Return the triangle of the planar factor at theta_1, seen along y, with leg 2 moved to C1."""
+    # A2B1: level, upwards, and its length; and the coordinate of B1 from B2 along rod 4, below 0.
+    # side is -1 if rods 4 and 6 point in opposite directions.
     level, up = g.l1 - 2 * g.l5 + 0 * t, g.l3 * np.sin(t)
     rod = side * np.sqrt(np.maximum(_rod_4(g, t)[1], 0.0))
     return level, up, np.hypot(level, up), rod - g.l4
@@ -101,30 +93,25 @@ def _elevation(
     return x, g.l3 * sin, mode.leg1 * y * sin, 0.0 * t
 
 
-def _real(g: Geometry, factor: str, first: int) -> Callable[[FloatArray], FloatArray]:
-    """Return a function of the angle that is positive where a branch of a curve is real."""
+def _real(g: Geometry, factor: str, first: int, t: FloatArray) -> FloatArray:
+    """Return values that are positive where a branch of a curve is real at the angle t."""
     if factor == "leg1":
-        return lambda t: (g.l3 + g.l4 * np.cos(t)) ** 2 - g.l1**2
+        return (g.l3 + g.l4 * np.cos(t)) ** 2 - g.l1**2
     if factor == "elevation":
-        return lambda t: _rod_4(g, t)[1]
+        return _rod_4(g, t)[1]
     if factor == "planar":
-
-        def triangle(t: FloatArray) -> FloatArray:
-            _, _, apart, gap = _tangent(g, t, np.asarray(first))
-            reach = np.minimum(g.l3 - np.abs(apart + gap), apart - gap - g.l3)
-            return np.minimum(_rod_4(g, t)[1] / g.l4, reach)
-
-        return triangle
-    exists = -1.0 if factor == "level3" and g.l4 <= g.l7 else 1.0
-    return lambda t: np.full_like(t, exists)
+        _, _, apart, gap = _tangent(g, t, np.asarray(first))
+        reach = np.minimum(g.l3 - np.abs(apart + gap), apart - gap - g.l3)
+        return np.minimum(_rod_4(g, t)[1] / g.l4, reach)
+    return np.full_like(t, -1.0 if factor == "level3" and g.l4 <= g.l7 else 1.0)
 
 
-_CURVES: dict[str, tuple[Curve, tuple[int, ...]]] = {
-    "level3": (_level3, (1,)),
-    "planar": (_planar, (-1, 1)),
-    "leg1": (_leg1, (1,)),
-    "leg2": (_leg2, (1,)),
-    "elevation": (_elevation, (1,)),
+_CURVES: dict[str, Curve] = {
+    "level3": _level3,
+    "planar": _planar,
+    "leg1": _leg1,
+    "leg2": _leg2,
+    "elevation": _elevation,
 }
 
 
@@ -143,30 +130,27 @@ class _Arcs:
     def at(self, arc: IntArray, t: FloatArray) -> Point:
         """Return points at t (k, ...) of arcs (k,)."""
         arc = arc.reshape(-1, *[1] * (t.ndim - 1))
+        # t runs from 0 to pi, so that the curve is smooth at both ends.
         angle = self.middle[arc] - self.half[arc] * np.cos(t)
         signs = self.first[arc] + 0 * t, self.second[arc] + 0 * t
         return self.curve(self.geometry, self.mode, angle, *signs)
 
-    def sampled(self) -> tuple[Point, FloatArray]:
-        """Return points (m, cells + 1), and the length of the curve between them, (m, cells) m."""
-        arcs, t = np.arange(len(self.first)), np.linspace(0, np.pi, _FINER * _CELLS + 1)
-        x, z, p, q = self.at(arcs, np.broadcast_to(t, (len(arcs), len(t))))
-        chords = np.hypot(np.diff(x), np.diff(z)).reshape(len(arcs), _CELLS, _FINER)
-        return (x[:, ::_FINER], z[:, ::_FINER], p[:, ::_FINER], q[:, ::_FINER]), chords.sum(-1)
-
 
 @lru_cache(maxsize=64)
 def _arcs(geometry: Geometry, mode: WorkingMode, factor: str) -> tuple[_Arcs, Point, FloatArray]:
-    curve, seconds = _CURVES[factor]
+    """Return arcs, points (m, cells + 1), and lengths of the curve between them, (m, cells) m."""
     rows = [
         (first, second, (low + high) / 2, (high - low) / 2)
         for first in (-1, 1)
-        for low, high in _intervals(_real(geometry, factor, first))
-        for second in seconds
+        for low, high in _intervals(partial(_real, geometry, factor, first))
+        for second in ((-1, 1) if factor == "planar" else (1,))
     ]
     table = np.array(rows, dtype=np.float64).reshape(-1, 4).T
-    arcs = _Arcs(curve, geometry, mode, *table)
-    return arcs, *arcs.sampled()
+    arcs, t = _Arcs(_CURVES[factor], geometry, mode, *table), np.linspace(0, np.pi, _FINE + 1)
+    points = arcs.at(np.arange(len(rows)), np.broadcast_to(t, (len(rows), len(t))))
+    chords = np.hypot(*np.diff(points[:2])).reshape(len(rows), _CELLS, -1)
+    x, z, p, q = (part[:, :: _FINE // _CELLS] for part in points)
+    return arcs, (x, z, p, q), chords.sum(-1)
 
 
 def _intervals(real: Callable[[FloatArray], FloatArray]) -> list[tuple[float, float]]:
@@ -209,9 +193,6 @@ def nearest(
 ) -> tuple[FloatArray, FloatArray, IntArray]:
     """Find the nearest point of all these surfaces on a working mode, nearer than a limit.
 
-    The search enters each cell of each arc that can hold a nearer point than the nearest so far, by
-    the distances of its ends and its length.
-
     Args:
         points: (n, 3) m, 0 <= y <= l7.
         limit: (n,) m, at most the distance to the planes y = 0, |y| = l7 and to the boundary of
@@ -245,11 +226,11 @@ def _feet(
 
     def offset(rows: FloatArray, x: FloatArray, z: FloatArray) -> tuple[FloatArray, ...]:
         """Return the distance, and the level distance from C1 to P along x and in the plane xy."""
-        across, side, up = (rows[..., axis] for axis in range(3))
-        level = across - x
-        radius = np.hypot(level, side)
-        return np.hypot(radius - g.l7, up - z), level, radius
+        level = rows[..., 0] - x
+        radius = np.hypot(level, rows[..., 1])
+        return np.hypot(radius - g.l7, rows[..., 2] - z), level, radius
 
+    # Enter each cell that can hold a nearer point than the nearest so far, by its ends and length.
     ends, level, radius = offset(link3[:, None, None], x, z)
     ours = (p * radius + q * level > 0) & (mode.cos_beta * level > 0)
     known = np.minimum(limit, np.where(ours, ends, np.inf).min(axis=(1, 2), initial=np.inf))
@@ -258,11 +239,7 @@ def _feet(
     here, step = link3[row][:, None], np.pi / _CELLS
     low = cell.astype(np.float64) * step
 
-    def apart(t: FloatArray) -> FloatArray:
-        x, z, _, _ = arcs.at(arc, t)
-        return offset(here, x, z)[0]
-
-    t = _zoom(apart, low, low + step)
+    t = _zoom(lambda t: offset(here, *arcs.at(arc, t)[:2])[0], low, low + step)
     x, z, p, q = arcs.at(arc, t)
     _, level, radius = offset(link3[row], x, z)
     real = (p * radius + q * level > 0) & (mode.cos_beta * level > 0)

@@ -1,11 +1,9 @@
 """Singular configurations: their factors, their kind, and the distance to the nearest one.
 
 A configuration is singular where one of eight factors is zero. Three parallel factors make up
-det A and four serial factors make up det B (section "Singularity analysis", Eqs. 16 and 17,
-corrected). The eighth factor is the elevation z_C1 - z_B1 of rods 4: where it is zero, nothing
-keeps link 3' from turning about y, a constraint singularity that the paper lacks. The determinant
-of the closures in xC, zC, beta and this turn is a product of the elevation and the three parallel
-factors. Everything is in the paper frame, in metres and radians.
+det A and four serial factors make up det B (Eqs. 16 and 17, corrected). The eighth factor is the
+elevation z_C1 - z_B1 of rods 4: where it is zero, nothing keeps link 3' from turning about y, a
+constraint singularity that the paper lacks. Everything is in the paper frame, in m and rad.
 
 All functions take arrays (..., 3) of numbers and raise InputError for anything else. The functions
 that classify raise InputError for entries that are not finite too, UnreachableError if a row does
@@ -30,8 +28,8 @@ from tpm_gym.kinematics.modes import DEFAULT_ASSEMBLY, ELBOWS_OUT, AssemblyMode,
 FACTORS = equations.Factors._fields
 """Names of the factors, in the order of every axis of length 8: 3 parallel, 4 serial, elevation."""
 
-_SIN_BETA, _PLANAR, _COS_BETA, _LEG3 = (
-    FACTORS.index(name) for name in ("sin_beta", "planar", "cos_beta", "leg3")
+_SIN_BETA, _PLANAR, _COS_BETA, _LEG3 = map(
+    FACTORS.index, ("sin_beta", "planar", "cos_beta", "leg3")
 )
 
 
@@ -51,9 +49,8 @@ class Classification:
 
     Attributes:
         kind: (...,) values of :class:`SingularityType`.
-        vanishing: (..., 8) bool, true for :data:`FACTORS` that are zero within the tolerance.
-        factors: (..., 8), the factors, made dimensionless by :func:`dimensionless`.
-        tolerance: Largest absolute value that counts as zero.
+        vanishing: (..., 8) bool, true for :data:`FACTORS` up to the ``tolerance``.
+        factors: (..., 8), the factors from :func:`dimensionless`.
     """
 
     kind: IntArray
@@ -64,12 +61,12 @@ class Classification:
 
 @dataclass(frozen=True)
 class NearestSingularity:
-    """Nearest singular position of each point, from :func:`nearest_singularity`.
+    """Nearest singular position of each point; NaN (-1 for factor) where not valid.
 
     Attributes:
-        distance: (...,) m; NaN where not valid.
-        point: (..., 3) m, singular position of P at this distance; NaN where not valid.
-        factor: (...,) index in :data:`FACTORS` of the factor that is zero; -1 where not valid.
+        distance: (...,) m.
+        point: (..., 3) m, singular position of P at this distance.
+        factor: (...,) index in :data:`FACTORS` of the factor that is zero.
         valid: (...,) bool, true where the point is reachable on both branches.
     """
 
@@ -82,16 +79,13 @@ class NearestSingularity:
 def dimensionless(values: Factors, geometry: Geometry = PAPER) -> FloatArray:
     """Divide the factors by lengths, so that one tolerance suits all; return (..., 8).
 
-    level3 and elevation are divided by l4, planar by l4^2, and the legs by l3 l4. sin(beta) and
-    cos(beta) stay as they are.
+    level3 and elevation are divided by l4, planar by l4^2, and the legs by l3 l4.
     """
     l3, l4 = geometry.l3, geometry.l4
-    sizes = np.array([1.0, l4, l4**2, 1.0, l3 * l4, l3 * l4, l3 * l4, l4])
     elevation = np.asarray(values.constraint)[..., None]
-    scaled: FloatArray = (
-        np.concatenate([values.parallel, values.serial, elevation], axis=-1) / sizes
-    )
-    return scaled
+    sizes = np.array([1.0, l4, l4**2, 1.0, l3 * l4, l3 * l4, l3 * l4, l4])
+    both: FloatArray = np.concatenate([values.parallel, values.serial, elevation], axis=-1) / sizes
+    return both
 
 
 def classify(
@@ -116,8 +110,8 @@ def classify_at(
 ) -> Classification:
     """Classify points (..., 3) m on one working mode.
 
-    A dimensionless factor counts as zero up to ``tolerance``. The factor of a leg grows as the
-    square root of the distance to its boundary: 1e-12 m from the boundary it is 1e-6.
+    The factor of a leg grows as the square root of the distance to its boundary: 1e-12 m from the
+    boundary it is 1e-6.
     """
     inverse(position, branch, geometry)  # raises UnreachableError with the reason
     return _classify(factors_at(position, branch, geometry), geometry, tolerance)
@@ -132,10 +126,9 @@ def nearest_singularity(
     """Find the nearest singular position of points (..., 3) m, in Cartesian space.
 
     Its distance is the radius of the largest ball about the point in which P can move without a
-    singularity of any kind. The planes y = 0 (sin(beta) = 0) and |y| = l7 (cos(beta) = 0) are
-    exact, and so is the boundary of leg 3, a torus. The other surfaces are curves that link 7
-    sweeps. Their nearest points are found numerically (:mod:`tpm_gym.analysis.sheets`). Points that
-    are not finite, or not on both branches, are not valid.
+    singularity of any kind. Distances to the planes y = 0 and |y| = l7 and to the boundary of leg 3
+    are exact, the others numerical. Points that are not finite, or not on both branches, are not
+    valid.
     """
     points = np.array(position, dtype=np.float64)
     values = dimensionless(factors_at(points, branch, geometry), geometry)

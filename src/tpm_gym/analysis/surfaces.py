@@ -1,13 +1,12 @@
 """Singular surfaces as polynomials in x, y, z, by elimination of the joint angles (Figs. 4 and 5).
 
-A factor of Eqs. (16) and (17) depends on the joint angles, so on the working mode. After
-elimination of the angles, one polynomial remains that is zero on the sheets of all working modes.
-For level3, planar, legs 1 and 2 and the constraint this is first a curve in (xC, zC),
+After elimination of the angles, one polynomial remains that is zero on the sheets of all working
+modes. For level3, planar, legs 1 and 2 and the constraint this is first a curve in (xC, zC),
 :data:`CURVES`. Let xC = x - l2 - u and u^2 = l7^2 - y^2. The surface is the product of its curve at
 both signs of u. The product is even in u, so it is a polynomial in x, y, z of twice the degree.
 
-The functions only add and multiply, so they take numbers, arrays, or symbols of sympy, which shows
-the coefficients. Lengths and coordinates must have the same unit.
+The functions take numbers, arrays, or symbols of sympy. Lengths and coordinates must have the same
+unit.
 """
 
 from typing import Any, Final
@@ -30,22 +29,16 @@ DEGREES: Final = {
 
 
 def _level3(x: Any, z: Any, g: Geometry) -> Any:
-    """Return the curve of level3, two circles.
-
-    C3 is sqrt(l4^2 - l7^2) above or below B3, which is on the circle of arm 12.
-    """
+    """Return the curve of level3, two circles: C3 is sqrt(l4^2 - l7^2) above or below B3."""
     a, b = x + 2 * g.l2 - g.l1, z + g.l6
     height2 = g.l4**2 - g.l7**2
     return (a**2 + b**2 + height2 - g.l3**2) ** 2 - 4 * height2 * b**2
 
 
 def _planar(x: Any, z: Any, g: Geometry) -> Any:
-    """Return the planar curve, of degree 16: two quadratics in s = 2 l3 sin(theta_1) share a root.
-
-    The first quadratic is cos^2 + sin^2 = 1, with 2 l1 l3 cos(theta_1) = n + z s from B1C1 = l4.
-    The second puts B2 on the circle of arm 5, with B2C2 along the projection of B1C1 on y = 0. The
-    length of this projection is the root of l4^2 - (l1 + l3 cos(theta_1))^2.
-    """
+    """Return the planar curve: two quadratics in s = 2 l3 sin(theta_1) share a root."""
+    # The first quadratic is cos^2 + sin^2 = 1, with 2 l1 l3 cos(theta_1) = n + z s from B1C1 = l4.
+    # The second puts B2 on the circle of arm 5, with B2C2 along B1C1, projected on y = 0.
     l1, l3, l4 = g.l1, g.l3, g.l4
     c2 = x - 2 * g.l5 + l1  # level, from A2
     n = l4**2 - l1**2 - l3**2 - x**2 - z**2
@@ -83,15 +76,9 @@ CURVES: Final = {
 
 
 def polynomial(name: str, x: Any, y: Any, z: Any, geometry: Geometry = PAPER, u: Any = None) -> Any:
-    """Compute the polynomial of a factor at x, y, z of P: numbers, arrays or symbols.
+    """Compute the polynomial of the factor ``name`` of :data:`DEGREES` at x, y, z of P.
 
-    Args:
-        name: Name of the factor, one of :data:`DEGREES`.
-        x: Coordinate of P.
-        y: Coordinate of P.
-        z: Coordinate of P.
-        geometry: Lengths.
-        u: Root of l7^2 - y^2, of either sign. The default computes it from numbers, |y| <= l7.
+    ``u`` is a root of l7^2 - y^2. The default computes it from numbers, |y| <= l7.
     """
     g = geometry
     if name == "sin_beta":

@@ -1,20 +1,15 @@
 """Topology of the mechanism, and its mobility from the rank of its loop closures.
 
-Two independent counts of the degrees of freedom start from the axes of the joints, in the paper
-frame:
+Two independent counts of the degrees of freedom start from the axes of the joints:
 
-* :func:`analyse` follows the paper's section "Topological analysis". It applies Eqs. (1) to (5) and
-  POC sets (:mod:`tpm_gym.analysis.poc`) to branches I, II, III and the pair R12, R13.
+* :func:`analyse` applies Eqs. (1) to (5) to branches I, II, III and the pair R12, R13.
 * :func:`mobility` computes the rank of the closure Jacobian of the spanning tree and point closures
   that the simulator loads, with all rods and balls of the parallelograms.
 
-Both describe one configuration, and they agree at singularities too. If z_C1 = z_B1, both find 4
-instantaneous freedoms: the parallelogram of branch I then contains the direction y, and link 3' can
-begin to turn about y. Eqs. (16) and (17) have no factor for this constraint singularity, because
-they assume that link 3' only translates.
-
-Functions of joint angles take three finite numbers and raise InputError for anything else. They
-raise UnreachableError if the branch does not exist there.
+Both agree at singularities too. If z_C1 = z_B1, both find 4 instantaneous freedoms, because link 3'
+can begin to turn about y. Vectors are in the paper frame. Functions of joint angles take three
+finite numbers and raise InputError for anything else. They raise UnreachableError if the branch
+does not exist there.
 """
 
 from collections.abc import Mapping
@@ -23,28 +18,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tpm_gym.analysis.poc import (
-    Chain,
-    ParallelMechanism,
-    POCSet,
-    Subspace,
-    Unit,
-    decompositions,
-    parallel,
-    parallelogram_4r,
-    parallelogram_4s,
-    revolute,
-    serial,
-)
+from tpm_gym.analysis import poc
+from tpm_gym.analysis.poc import Chain, POCSet, Subspace, Unit
 from tpm_gym.arrays import FloatArray, Vector
 from tpm_gym.errors import SingularityError
 from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode
 from tpm_gym.kinematics.geometry import PAPER, Geometry
-from tpm_gym.mechanism.bodies import Mechanism, Place
+from tpm_gym.mechanism.bodies import Link, Mechanism, Place
 from tpm_gym.mechanism.tree import ACTUATED_JOINTS, build, joint_angles
 
-# Fractions of the largest singular value. Values up to the first one are zero, and values from the
-# second one are not. In between, the rank is uncertain. Rounding makes zeros of about 1e-16.
+# Fractions of the largest singular value: zero up to the first, not zero from the second, and
+# uncertain in between. Rounding makes zeros of about 1e-16.
 _ZERO, _NOT_ZERO = 1e-11, 1e-7
 
 
@@ -56,8 +40,7 @@ class Structure:
         branches: Branches I, II (base to link 3') and III (base to platform 1).
         wrist: R12 and R13, from link 3' to platform 1.
         link_3p: (3,) m, base point C1 of link 3'.
-        platform: (3,) m, base point E1 of platform 1. It is on the axis of R13, so that R12 and
-            R13 contribute no dependent element.
+        platform: (3,) m, base point E1 of platform 1, on the axis of R13: no element is dependent.
     """
 
     branches: tuple[Chain, Chain, Chain]
@@ -84,9 +67,8 @@ def describe(
     def turning(*names: str) -> tuple[Unit, ...]:
         found = []
         for name in names:
-            link = joints[name].name
-            axis, origin = _axis(mechanism, places, link), places[link].origin
-            found.append(revolute(name, axis, origin, name in ACTUATED_JOINTS))
+            axis, origin = _axis(places, joints[name]), places[joints[name].name].origin
+            found.append(poc.revolute(name, axis, origin, name in ACTUATED_JOINTS))
         return tuple(found)
 
     def sides(near: str, far: str, other: str) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -94,8 +76,8 @@ def describe(
         foot = places[joints[near].name].origin
         return ends[far] - ends[other], ends[far] - foot, (ends[far] + ends[other]) / 2
 
-    four_s = parallelogram_4s("Pa(4S)", *sides("Sa_swing", "Sc", "Sd"))
-    four_r = parallelogram_4r("Pa(4R)", *sides("Re", "Rg", "Rh"))
+    four_s = poc.parallelogram_4s("Pa(4S)", *sides("Sa_swing", "Sc", "Sd"))
+    four_r = poc.parallelogram_4r("Pa(4R)", *sides("Re", "Rg", "Rh"))
     return Structure(
         branches=(
             Chain("I", (*turning("R11"), four_s)),
@@ -109,13 +91,12 @@ def describe(
 
 
 @dataclass(frozen=True, eq=False)
-class Topology(ParallelMechanism):
+class Topology(poc.ParallelMechanism):
     """Topology from :func:`analyse`, the paper's decomposition (I and II, then III) first.
 
     Attributes:
         sub_mechanism: M_Pa(1-2) of the first Eq. (4): POC set of link 3' on branches I and II.
-        hsoc_1: POC set of the platform on branches I and II with R12, R13.
-        hsoc_2: POC set of the platform on branch III.
+        hsoc_1: POC set of the platform on branches I, II with R12, R13; ``hsoc_2``: on III.
     """
 
     sub_mechanism: POCSet
@@ -126,18 +107,18 @@ class Topology(ParallelMechanism):
 def analyse(structure: Structure) -> Topology:
     """Apply Eqs. (1) to (5) to the structure at its configuration."""
     first, second, third = structure.chains
-    sub_mechanism = parallel([chain.poc(structure.link_3p) for chain in (first, second)])
+    sub_mechanism = poc.parallel([chain.poc(structure.link_3p) for chain in (first, second)])
     # Link 3' does not turn, so its POC set is the same about any point.
-    hsoc_1 = serial([sub_mechanism, structure.wrist.poc(structure.platform)])
+    hsoc_1 = poc.serial([sub_mechanism, structure.wrist.poc(structure.platform)])
     hsoc_2 = structure.branches[2].poc(structure.platform)
-    platform = parallel([hsoc_1, hsoc_2])
-    found = decompositions((first, second, third), structure.link_3p)
+    platform = poc.parallel([hsoc_1, hsoc_2])
+    found = poc.decompositions((first, second, third), structure.link_3p)
     return Topology(platform, found, sub_mechanism, hsoc_1, hsoc_2)
 
 
 @dataclass(frozen=True, eq=False)
 class Mobility:
-    """Degrees of freedom from the closure Jacobian, from :func:`mobility`.
+    """Degrees of freedom from the closure Jacobian.
 
     Attributes:
         dof: Freedoms that move the platform or a motor.
@@ -161,34 +142,23 @@ def mobility(
 ) -> Mobility:
     """Count freedoms by the numerical rank of the closure Jacobian, at theta (3,) rad.
 
-    Singular values up to 1e-11 of the largest count as zero.
-
     Raises:
-        SingularityError: A singular value is between 1e-11 and 1e-7 of the largest, so that the
-            rank is uncertain. theta is then very close to a constraint singularity.
+        SingularityError: theta is so close to a constraint singularity that the rank is uncertain:
+            a singular value is between 1e-11 and 1e-7 of the largest.
     """
     return mobility_at(joint_angles(theta, branch, geometry), geometry)
 
 
 def mobility_at(angles: Mapping[str, float], geometry: Geometry = PAPER) -> Mobility:
-    """Count freedoms like :func:`mobility`, at any angles.
-
-    Args:
-        angles: Angle of each joint that turns, by its name, rad.
-        geometry: Lengths.
-
-    Raises:
-        SingularityError: The rank is uncertain.
-    """
+    """Count freedoms like :func:`mobility`, from the angle of each joint that turns, rad."""
     mechanism = build(geometry)
     jacobian = closure_jacobian(mechanism, angles)
     _, values, right = np.linalg.svd(jacobian)
     rank = _rank(values)
     free = right[rank:].T  # columns: joint rates that keep the loops closed
     places = mechanism.places(angles)
-    point = places[mechanism.platform].point(mechanism.point_p)
     joints = _moving_joints(mechanism)
-    linear, angular = _rates(mechanism, places, mechanism.platform, point)
+    linear, angular = _rates(mechanism, places, mechanism.platform, mechanism.point_p)
     motors = np.eye(len(joints))[[joints.index(name) for name in ACTUATED_JOINTS]]
     seen = np.linalg.svd(np.concatenate([linear, angular, motors]) @ free, compute_uv=False)
     dof = _rank(seen)
@@ -198,23 +168,19 @@ def mobility_at(angles: Mapping[str, float], geometry: Geometry = PAPER) -> Mobi
 
 
 def closure_jacobian(mechanism: Mechanism, angles: Mapping[str, float]) -> FloatArray:
-    """Differentiate the gaps of all closures by the joint angles of the spanning tree.
-
-    Args:
-        mechanism: Spanning tree and closures.
-        angles: Angle of each joint that turns, by its name, rad.
+    """Differentiate the gaps of all closures by the joint angles of the spanning tree, rad.
 
     Returns:
-        (3 closures, joints) m/rad, in the paper frame. Rows are x, y, z of ``point_a - point_b`` in
-        the order of ``mechanism.closures``, columns are in the order of ``mechanism.links``.
+        (3 closures, joints) m/rad. Rows are x, y, z of ``point_a - point_b`` in the order of
+        ``mechanism.closures``, columns are in the order of ``mechanism.links``.
     """
     places = mechanism.places(angles)
-
-    def velocity(link: str, point: Vector) -> FloatArray:
-        return _rates(mechanism, places, link, places[link].point(point))[0]
-
     return np.concatenate(
-        [velocity(c.link_a, c.point_a) - velocity(c.link_b, c.point_b) for c in mechanism.closures]
+        [
+            _rates(mechanism, places, closure.link_a, closure.point_a)[0]
+            - _rates(mechanism, places, closure.link_b, closure.point_b)[0]
+            for closure in mechanism.closures
+        ]
     )
 
 
@@ -227,31 +193,28 @@ def _rank(values: FloatArray) -> int:
 
 
 def _moving_joints(mechanism: Mechanism) -> list[str]:
-    """Return the names of the joints of the tree that turn, in the order of the links.
-
-    The one prismatic joint, the slide of the cup, is part of the tool and not of the mechanism.
-    """
+    """Return the names of the joints that turn. The slide of the cup belongs to the tool."""
     joints = (link.joint for link in mechanism.links)
     return [joint.name for joint in joints if joint and joint.kind != "prismatic"]
 
 
-def _axis(mechanism: Mechanism, places: Mapping[str, Place], link: str) -> FloatArray:
+def _axis(places: Mapping[str, Place], link: Link) -> FloatArray:
     """Return the axis of the joint that holds a link, in the paper frame."""
-    joint = mechanism.link(link).joint
-    axis: FloatArray = places[link].rotation @ np.asarray(joint.axis if joint else (0.0, 0.0, 0.0))
+    assert link.joint is not None
+    axis: FloatArray = places[link.name].rotation @ np.asarray(link.joint.axis)
     return axis
 
 
 def _rates(
-    mechanism: Mechanism, places: Mapping[str, Place], link: str, point: FloatArray
+    mechanism: Mechanism, places: Mapping[str, Place], name: str, offset: Vector
 ) -> tuple[FloatArray, FloatArray]:
     """Return velocity (3, n) m/rad of a point of a link, and angular velocity (3, n), per joint."""
-    joints = _moving_joints(mechanism)
+    joints, point = _moving_joints(mechanism), places[name].point(offset)
     linear, angular = np.zeros((3, len(joints))), np.zeros((3, len(joints)))
-    while (joint := mechanism.link(link).joint) is not None:
+    while (joint := (link := mechanism.link(name)).joint) is not None:
         if joint.kind != "prismatic":
-            column, axis = joints.index(joint.name), _axis(mechanism, places, link)
+            column, axis = joints.index(joint.name), _axis(places, link)
             angular[:, column] = axis
-            linear[:, column] = np.cross(axis, point - places[link].origin)
-        link = joint.parent
+            linear[:, column] = np.cross(axis, point - places[name].origin)
+        name = joint.parent
     return linear, angular

@@ -1,4 +1,4 @@
-"""Delta and Orthoglide, for comparison with the paper's mechanism.
+"""Delta and Orthoglide, for the comparison in docs/mechanisms.md.
 
 Three legs hold the platform. Each has a motor, which turns an arm or moves a slider, and a
 parallelogram, which keeps the platform from turning. So the closures are |B_iC_i| = l_i, as in
