@@ -159,9 +159,8 @@ def gives_observations_of_order_one_and_plain_infos(make: Make) -> None:
         for index, (observation, reward, info) in enumerate(random_episode(env, 1)):
             inside = env.observation_space.contains(observation)
             _require("observations are in the space", inside, str(observation))
-            if index == 0:
-                info.pop("randomisation", None)
-            kinds = {name: type(value) for name, value in info.items()}
+            # Wrappers add entries; rl_zoo3 even patches Gymnasium's own TimeLimit.
+            kinds = {name: type(info.get(name)) for name in _INFO}
             _require(f"info has the types {_INFO}", kinds == _INFO, str(kinds))
             terms = info["reward_terms"]
             plain = all(type(term) is float for term in terms.values())
