@@ -153,6 +153,7 @@ class ServoDrives:
         memory: (2, n, 3), the torques (N m) of the last time step and the joint velocities (rad/s)
             at its beginning.
         friction: (n, 3) N m, Coulomb friction of the motors' axes.
+        law: Parameters of :func:`tpm_gym.simulation.compiled.servo_torques`, from :meth:`begin`.
 
     Raises:
         ConfigurationError: If a motor of the machine has no torque-speed line.
@@ -231,13 +232,15 @@ class ServoDrives:
         """Compute the inertia at ``theta`` (n, 3) rad, for a control period."""
         still = np.zeros_like(theta)
         mass = self._machine.motion(theta, still, self._built).mass
-        lost = np.isnan(mass).any(axis=(1, 2))
+        lost = np.isnan(mass[:, 0, 0])
         if lost.any():  # a machine of other lengths cannot be there
             home = np.tile(self._home, (int(lost.sum()), 1))
             built = None if self._built is None else self._built[lost]
             mass[lost] = self._machine.motion(home, 0.0 * home, built).mass
-        self._mass = self._lightest * mass
-        self._inverse = self._braced(self._mass, self._stiffness, self._servo.damping, self._step)
+        mass *= self._lightest
+        stiffness, damping = self._stiffness, self._servo.damping
+        inverse = self._braced(mass, stiffness, damping, self._step)
+        self.law = stiffness, damping, mass, inverse, self._effort, self._line
 
     def torque(
         self, references: References, index: int, theta: FloatArray, theta_dot: FloatArray
@@ -251,10 +254,8 @@ class ServoDrives:
             theta_dot: (n, 3) rad/s.
         """
         self._step_law(
-            references.theta[index], references.theta_dot[index], references.torque[index],
-            theta, theta_dot, self._stiffness, self._servo.damping, self._mass, self._inverse,
-            self._effort, self._line, self._step, self.memory,
-        )  # fmt: skip
+            index, tuple(references), self.law, theta, theta_dot, self._step, self.memory
+        )
         torque: FloatArray = self.memory[0]
         return torque
 

@@ -22,7 +22,7 @@ from tpm_gym.simulation.analytic.contact.state import (
     Records,
     Setting,
 )
-from tpm_gym.simulation.analytic.contact.vectors import (
+from tpm_gym.simulation.vectors import (
     Frame,
     axes,
     clip,
