@@ -201,47 +201,34 @@ def resisted(mass: FloatArray, impulse: FloatArray, limit: FloatArray, rates: Fl
         limit: (3,) N m s, zero or more.
         rates: (3,) rad/s; written.
     """
-    signs, best = np.zeros(3), np.inf
-    _solved(mass, impulse, limit, signs, np.ones(3), rates)
-    if limit[0] == 0 and limit[1] == 0 and limit[2] == 0:
-        return
-    tried = np.empty(3)
-    signs[:] = np.sign(rates)
-    _solved(mass, impulse, limit, signs, np.ones(3), tried)
-    if tried[0] * signs[0] > 0 and tried[1] * signs[1] > 0 and tried[2] * signs[2] > 0:
-        rates[:] = tried
-        return
-    for choice in range(27):  # all ways in which three rates are zero or have a sign
-        signs[:] = _SIGNS[choice]
-        _solved(mass, impulse, limit, signs, np.abs(signs), tried)
-        cost = 0.0
-        for i in range(3):
-            share = 0.0
-            for k in range(3):
-                share += mass[i, k] * tried[k]
-            cost += tried[i] * (share / 2 - impulse[i]) + limit[i] * abs(tried[i])
-        if cost < best:
-            best = cost
-            rates[:] = tried
+    everything, still = (1.0, 1.0, 1.0), limit[0] == 0 and limit[1] == 0 and limit[2] == 0
+    best, found = np.inf, _solved(mass, impulse, limit, (0.0, 0.0, 0.0), everything)
+    if not still:
+        signs = np.sign(found[0]), np.sign(found[1]), np.sign(found[2])
+        found = _solved(mass, impulse, limit, signs, everything)
+        if not (found[0] * signs[0] > 0 and found[1] * signs[1] > 0 and found[2] * signs[2] > 0):
+            for choice in range(27):  # all ways in which three rates are zero or have a sign
+                signs = row_of(_SIGNS, choice)
+                moving = abs(signs[0]), abs(signs[1]), abs(signs[2])
+                tried, cost = _solved(mass, impulse, limit, signs, moving), 0.0
+                for i in range(3):
+                    share = mass[i, 0] * tried[0] + mass[i, 1] * tried[1] + mass[i, 2] * tried[2]
+                    cost += tried[i] * (share / 2 - impulse[i]) + limit[i] * abs(tried[i])
+                if cost < best:
+                    best, found = cost, tried
+    put(rates, found)
 
 
 @compiled
 def _solved(
-    mass: FloatArray,
-    impulse: FloatArray,
-    limit: FloatArray,
-    signs: FloatArray,
-    moving: FloatArray,
-    rates: FloatArray,
-) -> None:
+    mass: FloatArray, impulse: FloatArray, limit: FloatArray, signs: Vector, moving: Vector
+) -> Vector:
     """Solve mass u = impulse - limit signs for what moves (1); the rest (0) has u = 0."""
-    inverse = np.empty((3, 3))
+    inverse = np.empty((1, 3, 3))
     m0, m1, m2 = moving
     inverted(
         mass[0, 0] * m0 + 1 - m0, mass[0, 1] * m0 * m1, mass[0, 2] * m0 * m2,
-        mass[1, 1] * m1 + 1 - m1, mass[1, 2] * m1 * m2, mass[2, 2] * m2 + 1 - m2, inverse,
+        mass[1, 1] * m1 + 1 - m1, mass[1, 2] * m1 * m2, mass[2, 2] * m2 + 1 - m2, inverse[0],
     )  # fmt: skip
-    for i in range(3):
-        rates[i] = 0.0
-        for k in range(3):
-            rates[i] += inverse[i, k] * moving[k] * (impulse[k] - limit[k] * signs[k])
+    x, y, z = plus(three(impulse), (limit[0] * signs[0], limit[1] * signs[1], limit[2] * signs[2]), -1.0)
+    return onto((0.0, 0.0, 0.0), inverse, 0, (m0 * x, m1 * y, m2 * z))
