@@ -143,7 +143,5 @@ def march(
             at = machine.motion(theta, rates, built)
         force, carried = touch(course.before, course.position, position)
         force += np.multiply(gain, carried[:, None], out=gain)
-        course = Course(
-            theta, rates, torque, position, course.position, force, carried, mode_left
-        )
+        course = Course(theta, rates, torque, position, course.position, force, carried, mode_left)
     return course, torques

@@ -230,5 +230,7 @@ def _solved(
         mass[0, 0] * m0 + 1 - m0, mass[0, 1] * m0 * m1, mass[0, 2] * m0 * m2,
         mass[1, 1] * m1 + 1 - m1, mass[1, 2] * m1 * m2, mass[2, 2] * m2 + 1 - m2, inverse[0],
     )  # fmt: skip
-    x, y, z = plus(three(impulse), (limit[0] * signs[0], limit[1] * signs[1], limit[2] * signs[2]), -1.0)
+    x, y, z = plus(
+        three(impulse), (limit[0] * signs[0], limit[1] * signs[1], limit[2] * signs[2]), -1.0
+    )
     return onto((0.0, 0.0, 0.0), inverse, 0, (m0 * x, m1 * y, m2 * z))

@@ -22,6 +22,7 @@ from tpm_gym.simulation.analytic.contact.state import (
     Records,
     Setting,
 )
+from tpm_gym.simulation.stage import FLOOR, TABLE
 from tpm_gym.simulation.vectors import (
     Frame,
     axes,
@@ -34,7 +35,6 @@ from tpm_gym.simulation.vectors import (
     put,
     three,
 )
-from tpm_gym.simulation.stage import FLOOR, TABLE
 
 __all__ = ["collide_lip", "collide_objects"]
 
@@ -294,7 +294,7 @@ def _touch_face(
                 inside -= clip(inside, -box.half[axis], box.half[axis])
                 arm = plus(arm, box.frame[axis], -inside)
             gap = -dot(normal, (arm[0], arm[1], lip[2] - box.middle[2])) - box.half[which]
-            u, v = (-v, u) if k == 1 else (-u, -v)
+            u, v = (v, -u) if k == 1 else (-u, -v)
         else:
             low, high = _overlap(box, first, second, arm)
             arm = plus(arm, _UP, high if k else low)

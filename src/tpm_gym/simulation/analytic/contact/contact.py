@@ -131,9 +131,7 @@ class Contact:
             states = self._objects, self._cups, self._forces
             # Threads may advance different rows at the same time, so each call has its own
             work = work_for(len(self._blocks))
-            advance(
-                states, rows, path, self._frame, vacuum_on, self._setting, work, force, carried
-            )
+            advance(states, rows, path, self._frame, vacuum_on, self._setting, work, force, carried)
         return force, carried
 
     def carried(self, rows: Any) -> FloatArray:

@@ -17,6 +17,7 @@ from tpm_gym.simulation.analytic.contact.collision import collide_lip, collide_o
 from tpm_gym.simulation.analytic.contact.grasp import CUP_MASS, Way, breathe, carry, lip_of
 from tpm_gym.simulation.analytic.contact.solver import Motor, prepare, solve, still
 from tpm_gym.simulation.analytic.contact.state import AT_REST, Record, Records, Setting, Work
+from tpm_gym.simulation.engine import SPRING_GAIN
 from tpm_gym.simulation.vectors import (
     axes,
     cross,
@@ -28,7 +29,6 @@ from tpm_gym.simulation.vectors import (
     row_of,
     three,
 )
-from tpm_gym.simulation.engine import SPRING_GAIN
 
 __all__ = ["advance"]
 
