@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from tpm_gym.arrays import FloatArray
 from tpm_gym.compiling import compilable, compiled, kept
+from tpm_gym.simulation.drives import References
 from tpm_gym.simulation.vectors import onto, plus, row_of
 
 __all__ = [
@@ -142,7 +143,7 @@ def inverted(
 @kept
 def servo_torques(
     index: int,
-    references: tuple[FloatArray, FloatArray, FloatArray],
+    references: References,
     law: tuple[FloatArray, float, FloatArray, FloatArray, FloatArray, FloatArray],
     theta: FloatArray,
     theta_dot: FloatArray,
@@ -169,7 +170,7 @@ def servo_torques(
 def servo_torque(
     row: int,
     index: int,
-    references: tuple[FloatArray, FloatArray, FloatArray],
+    references: References,
     law: tuple[FloatArray, float, FloatArray, FloatArray, FloatArray, FloatArray],
     theta: FloatArray,
     theta_dot: FloatArray,

@@ -253,9 +253,7 @@ class ServoDrives:
             theta: (n, 3) rad, at the beginning of the time step.
             theta_dot: (n, 3) rad/s.
         """
-        self._step_law(
-            index, tuple(references), self.law, theta, theta_dot, self._step, self.memory
-        )
+        self._step_law(index, references, self.law, theta, theta_dot, self._step, self.memory)
         torque: FloatArray = self.memory[0]
         return torque
 

@@ -167,8 +167,10 @@ class AnalyticEngine:
         if objects:
             way = self._before, self._position, points
             push, self._carried = self._contact.advance(self._rows, way, vacuum)
-            change = points[:, -1] - 2 * points[:, -2] + points[:, -3]
-            self._force = push[:, -1] + self._carried[:, None] * change / step**2
+            self._force = push[:, -1].copy()
+            if self._carried.any():
+                change = points[:, -1] - 2 * points[:, -2] + points[:, -3]
+                self._force += self._carried[:, None] * change / step**2
         self._before, self._position = points[:, -2].copy(), points[:, -1].copy()
         self._theta = theta[:, -1].copy()
         self._rates = (theta[:, -1] - theta[:, -2]) / step

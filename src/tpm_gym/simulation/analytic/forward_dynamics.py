@@ -73,7 +73,7 @@ class IdealSteps:
     @property
     def behind(self) -> BoolArray:
         """See the class."""
-        behind: BoolArray = self._behind.any(axis=0)
+        behind: BoolArray = self._behind[0] | self._behind[1]
         return behind
 
 
@@ -82,7 +82,7 @@ class ServoSteps:
 
     def __init__(self, drives: ServoDrives, references: References, step: float) -> None:
         """Compute the inertia for the control period."""
-        self._drives, self._references, self._step = drives, tuple(references), step
+        self._drives, self._references, self._step = drives, references, step
         drives.begin(references.theta[0])
 
     def move(self, index: int, course: Course, at: Motion, new: tuple[FloatArray, ...]) -> None:
@@ -137,7 +137,7 @@ def march(
         position = at.position
         if anywhere:
             gone, position = mode_left != 0, position.copy()
-            for new, old in zip((theta, rates, torque, position), course, strict=False):
+            for new, old in zip((theta, rates, torque, position), course[:4], strict=True):
                 new[gone] = old[gone]
             gain[gone] = 0.0
             at = machine.motion(theta, rates, built)

@@ -5,12 +5,16 @@ Each machine is computed by itself, so that it has the same bits alone and among
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from tpm_gym.arrays import BoolArray, FloatArray, Vector
 from tpm_gym.compiling import compilable, compiled, kept
+from tpm_gym.mechanism.machine import Motion
 from tpm_gym.simulation.compiled import inverted, servo_torque
+from tpm_gym.simulation.drives import References
 from tpm_gym.simulation.vectors import onto, plus, put, put_row, row_of, three
 
 __all__ = ["ideal_step", "modes_left", "resisted", "servo_step"]
@@ -18,10 +22,8 @@ __all__ = ["ideal_step", "modes_left", "resisted", "servo_step"]
 _CREEP = 2e-5  # m/s, at which friction gives way, instead of not at all
 _SIGNS = np.array([(i, j, k) for i in (0, 1, -1) for j in (0, 1, -1) for k in (0, 1, -1)], float)
 
-_Course = tuple[FloatArray, ...]
+_Course = tuple[Any, ...]
 """theta to carried of :class:`tpm_gym.simulation.analytic.forward_dynamics.Course`."""
-_Motion = tuple[FloatArray, ...]
-"""See :class:`tpm_gym.mechanism.machine.Motion`."""
 _New = tuple[FloatArray, ...]
 """Results at the end of a time step, each (r, 3): theta; rates; torque; P (2, r, 3) by the joint
 velocities and by its own; acceleration of P by the change of the joint velocities, m/s^2."""
@@ -33,7 +35,7 @@ def ideal_step(
     references: FloatArray,
     effort: FloatArray,
     course: _Course,
-    at: _Motion,
+    at: Motion,
     step: float,
     new: _New,
     behind: BoolArray,
@@ -72,11 +74,11 @@ def ideal_step(
 @kept
 def servo_step(
     index: int,
-    references: tuple[FloatArray, FloatArray, FloatArray],
+    references: References,
     law: tuple[FloatArray, float, FloatArray, FloatArray, FloatArray, FloatArray],
     friction: FloatArray,
     course: _Course,
-    at: _Motion,
+    at: Motion,
     step: float,
     new: _New,
     memory: FloatArray,
@@ -115,7 +117,7 @@ def servo_step(
 
 
 def _feel(
-    row: int, course: _Course, at: _Motion, step: float, mass: FloatArray, load: FloatArray
+    row: int, course: _Course, at: Motion, step: float, mass: FloatArray, load: FloatArray
 ) -> None:
     """Compute the inertia (1, 3, 3) and load (3,) that motors feel, with objects on P.
 
@@ -146,7 +148,7 @@ def _feel(
 
 
 def _integrate(
-    row: int, rates: Vector, course: _Course, at: _Motion, step: float, new: _New
+    row: int, rates: Vector, course: _Course, at: Motion, step: float, new: _New
 ) -> None:
     """Integrate joint positions, and predict where P goes."""
     zero, position = (0.0, 0.0, 0.0), row_of(course[3], row)
@@ -173,7 +175,8 @@ def modes_left(
 
     Args:
         position: (r, 3) m, by forward kinematics; NaN where there is none.
-        side: (2, r) whether P was about to stay on its side, by the joint velocities and by its own.
+        side: (2, r) whether P was about to stay on its side, by the joint velocities and by its
+            own.
         working: (r,) whether the machine is in its working mode.
         before: (r,) mode that was left earlier.
     """
@@ -230,7 +233,6 @@ def _solved(
         mass[0, 0] * m0 + 1 - m0, mass[0, 1] * m0 * m1, mass[0, 2] * m0 * m2,
         mass[1, 1] * m1 + 1 - m1, mass[1, 2] * m1 * m2, mass[2, 2] * m2 + 1 - m2, inverse[0],
     )  # fmt: skip
-    x, y, z = plus(
-        three(impulse), (limit[0] * signs[0], limit[1] * signs[1], limit[2] * signs[2]), -1.0
-    )
+    resistance = limit[0] * signs[0], limit[1] * signs[1], limit[2] * signs[2]
+    x, y, z = plus(three(impulse), resistance, -1.0)
     return onto((0.0, 0.0, 0.0), inverse, 0, (m0 * x, m1 * y, m2 * z))
