@@ -12,6 +12,7 @@ from tpm_gym.simulation.vectors import onto, plus, row_of
 
 __all__ = [
     "all_within",
+    "along",
     "braced_inverse",
     "in_world",
     "inverted",
@@ -109,6 +110,30 @@ def spline_points(commands: FloatArray, weights: FloatArray) -> FloatArray:
                     weights[k, 0] * one + weights[k, 1] * two + weights[k, 2] * three
                 )
     return points
+
+
+@kept
+def along(
+    theta: FloatArray, true: FloatArray, torques: FloatArray, step: float, references: References
+) -> None:
+    """Write the references of a control period of K time steps.
+
+    Args:
+        theta: (n, K + 1, 3) rad, from the beginning of the control period on, by the encoders.
+        true: (n, K + 1, 3) rad, true joint positions.
+        torques: (2, n, 3) N m, fed forward in the first and the last time step.
+        step: s.
+        references: Written.
+    """
+    steps = len(references.theta)
+    for k in range(steps):
+        for row in range(len(theta)):
+            for i in range(3):
+                first, last = torques[0, row, i], torques[1, row, i]
+                slope = (last - first) / max(steps - 1, 1)
+                references.theta[k, row, i] = true[row, k + 1, i]
+                references.theta_dot[k, row, i] = (theta[row, k + 1, i] - theta[row, k, i]) / step
+                references.torque[k, row, i] = first + k * slope if k < steps - 1 else last
 
 
 @kept

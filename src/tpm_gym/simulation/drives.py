@@ -209,24 +209,25 @@ class ServoDrives:
         The feed-forward is computed for the first and the last time step and interpolated: within a
         control period it differs little from a straight line.
         """
+        from tpm_gym.simulation import compiled  # imports Numba
+
         machine, step = path.machine, self._step
-        points = np.concatenate([path.start[:, None], path.points()], axis=1)
-        theta = machine.reach(points)  # (n, K + 1, 3)
-        rates = np.diff(theta, axis=1) / step
-        torque = np.zeros((rates.shape[1], len(theta), 3))
+        theta = machine.reach(np.concatenate([path.start[:, None], path.points()], axis=1))
+        steps = theta.shape[1] - 1
+        references = References(*np.empty((3, steps, len(theta), 3)))
+        torques = np.zeros((2, len(theta), 3))
         if self._servo.feedforward != "none":
             moving = float(self._servo.feedforward == "computed")
-            # Across a border of control periods the acceleration jumps to that of the new one.
-            changes = np.diff(rates, axis=1) / step if rates.shape[1] > 1 else 0.0 * rates
-            first = machine.torque(theta[:, 0], moving * rates[:, 0], moving * changes[:, 0])
-            last = machine.torque(theta[:, -2], moving * rates[:, -1], moving * changes[:, -1])
-            torque = np.linspace(first, last, len(torque))
-        true = path.true(theta[:, 1:])
-        return References(
-            np.ascontiguousarray(true.swapaxes(0, 1)),
-            np.ascontiguousarray(rates.swapaxes(0, 1)),
-            torque,
-        )
+            for k, start in enumerate((0, steps - 1)):
+                rates = (theta[:, start + 1] - theta[:, start]) / step
+                changes = np.zeros_like(rates)
+                if steps > 1:
+                    # Across a border of control periods the acceleration jumps to the new one's.
+                    here = theta[:, start : start + 3] if k == 0 else theta[:, -3:]
+                    changes = np.diff(np.diff(here, axis=1) / step, axis=1)[:, 0] / step
+                torques[k] = machine.torque(theta[:, start], moving * rates, moving * changes)
+        compiled.along(theta, path.true(theta), torques, step, references)
+        return references
 
     def begin(self, theta: FloatArray) -> None:
         """Compute the inertia at ``theta`` (n, 3) rad, for a control period."""

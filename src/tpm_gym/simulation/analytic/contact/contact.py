@@ -134,12 +134,6 @@ class Contact:
             advance(states, rows, path, self._frame, vacuum_on, self._setting, work, force, carried)
         return force, carried
 
-    def carried(self, rows: Any) -> FloatArray:
-        """Return the masses that cups hold, (r,) kg."""
-        held = self._cups["held"][rows, None] == np.arange(len(self._blocks))
-        carried: FloatArray = (held * self._objects["mass"][rows]).sum(axis=1)
-        return carried
-
     def read(self) -> Reading:
         """Return copies of the state of all tables."""
         objects, cups = self._objects, self._cups
