@@ -30,7 +30,12 @@ compilable(law.law)
 
 @kept
 def apply(x: float) -> float:
+    return below(x)
+
+def below(x: float) -> float:
     return law.law(x)
+
+compilable(below)
 """,
 }
 

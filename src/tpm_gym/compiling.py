@@ -60,14 +60,12 @@ class _Cache:
 
     def __init__(self, function: Callable[..., Any]) -> None:
         """Find a folder that can be written."""
+        self._function = function
         self._label = f"{function.__module__}.{function.__qualname__}"
         try:
             self._disk = _CACHING.FunctionCache(function)
         except (RuntimeError, OSError):
             self._disk = _CACHING.NullCache()
-            return
-        # Numba's own stamp covers the function's own file only.
-        self._disk._cache_file._source_stamp = stamp(function)
 
     @property
     def cache_path(self) -> str | None:
@@ -77,6 +75,10 @@ class _Cache:
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Load the machine code of a signature; None if it has to be compiled."""
         found = None
+        if not isinstance(self._disk, _CACHING.NullCache):
+            # Numba's own stamp covers the function's own file only. It is computed here, because
+            # functions that are defined below a decorated one are unknown to the decorator.
+            self._disk._cache_file._source_stamp = stamp(self._function)
         try:
             found = self._disk.load_overload(sig, target_context)
         except Exception:  # damaged: unpickling raises almost anything

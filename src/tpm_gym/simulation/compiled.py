@@ -6,10 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray
-from tpm_gym.compiling import compiled, kept
+from tpm_gym.compiling import compilable, compiled, kept
+from tpm_gym.simulation.drives import References
+from tpm_gym.simulation.vectors import onto, plus, row_of
 
 __all__ = [
     "all_within",
+    "along",
     "any_outside",
     "bounded",
     "braced_inverse",
@@ -18,6 +21,7 @@ __all__ = [
     "limited",
     "measured_object",
     "measured_robot",
+    "servo_torque",
     "servo_torques",
     "singularity_penalty",
     "spline_points",
@@ -253,6 +257,30 @@ def spline_points(commands: FloatArray, weights: FloatArray) -> FloatArray:
 
 
 @kept
+def along(
+    theta: FloatArray, true: FloatArray, torques: FloatArray, step: float, references: References
+) -> None:
+    """Write the references of a control period of K time steps.
+
+    Args:
+        theta: (n, K + 1, 3) rad, from the beginning of the control period on, by the encoders.
+        true: (n, K + 1, 3) rad, true joint positions.
+        torques: (2, n, 3) N m, fed forward in the first and the last time step.
+        step: s.
+        references: Written.
+    """
+    steps = len(references.theta)
+    for k in range(steps):
+        for row in range(len(theta)):
+            for i in range(3):
+                first, last = torques[0, row, i], torques[1, row, i]
+                slope = (last - first) / max(steps - 1, 1)
+                references.theta[k, row, i] = true[row, k + 1, i]
+                references.theta_dot[k, row, i] = (theta[row, k + 1, i] - theta[row, k, i]) / step
+                references.torque[k, row, i] = first + k * slope if k < steps - 1 else last
+
+
+@kept
 def braced_inverse(
     mass: FloatArray, stiffness: FloatArray, damping: float, step: float
 ) -> FloatArray:
@@ -283,59 +311,60 @@ def inverted(
 
 @kept
 def servo_torques(
-    reference: FloatArray,
-    reference_dot: FloatArray,
-    forward: FloatArray,
+    index: int,
+    references: References,
+    law: tuple[FloatArray, float, FloatArray, FloatArray, FloatArray, FloatArray],
     theta: FloatArray,
     theta_dot: FloatArray,
-    stiffness: FloatArray,
-    damping: float,
-    mass: FloatArray,
-    inverse: FloatArray,
-    effort: FloatArray,
-    line: FloatArray,
     step: float,
     memory: FloatArray,
 ) -> None:
     """Apply the law of :class:`tpm_gym.simulation.drives.ServoDrives` in one time step.
 
     Args:
-        reference: (n, 3) rad, at the end of the time step.
-        reference_dot: (n, 3) rad/s.
-        forward: (n, 3) N m, fed forward.
+        index: Number of the time step.
+        references: See :class:`tpm_gym.simulation.drives.References`.
+        law: Stiffness (n, 3) N m/rad, damping (N m s/rad), inertia (n, 3, 3) kg m^2 that the drives
+            reckon with, its :func:`braced_inverse`, largest torques (n, 3) N m, and corner and
+            no-load speed of each motor (3, 2) rad/s.
         theta: (n, 3) rad, at the beginning of the time step.
         theta_dot: (n, 3) rad/s.
-        stiffness: (n, 3) N m/rad.
-        damping: N m s/rad.
-        mass: (n, 3, 3) kg m^2, the inertia that the drives reckon with.
-        inverse: (n, 3, 3), of mass + step (step stiffness + damping).
-        effort: (n, 3) N m, largest torques.
-        line: (3, 2) rad/s, corner and no-load speed of each motor.
         step: s.
         memory: (2, n, 3) torques and joint velocities of the last time step; overwritten.
     """
-    load, wanted, change = np.empty(3), np.empty(3), np.empty(3)
     for row in range(len(theta)):
-        for i in range(3):
-            load[i] = memory[0, row, i]
-            for k in range(3):
-                acceleration = (theta_dot[row, k] - memory[1, row, k]) / step
-                load[i] -= mass[row, i, k] * acceleration
-        for i in range(3):
-            rate = theta_dot[row, i]
-            behind = reference[row, i] - theta[row, i] - step * rate
-            slower = reference_dot[row, i] - rate
-            wanted[i] = stiffness[row, i] * behind + damping * slower + forward[row, i] - load[i]
-        for i in range(3):
-            change[i] = 0.0
-            for k in range(3):
-                change[i] += inverse[row, i, k] * wanted[k]
-        for i in range(3):
-            torque, rate = load[i], theta_dot[row, i]
-            for k in range(3):
-                torque += mass[row, i, k] * change[k]
-            memory[0, row, i] = limited(torque, rate, effort[row, i], line[i, 0], line[i, 1])
-            memory[1, row, i] = rate
+        servo_torque(row, index, references, law, theta, theta_dot, step, memory)
+
+
+def servo_torque(
+    row: int,
+    index: int,
+    references: References,
+    law: tuple[FloatArray, float, FloatArray, FloatArray, FloatArray, FloatArray],
+    theta: FloatArray,
+    theta_dot: FloatArray,
+    step: float,
+    memory: FloatArray,
+) -> None:
+    """Apply the law of the servo drives to one row."""
+    stiffness, damping, mass, inverse, effort, line = law
+    rates, last = row_of(theta_dot, row), row_of(memory[0], row)
+    x, y, z = plus(rates, row_of(memory[1], row), -1.0)
+    load = onto(last, mass, row, (x / step, y / step, z / step), -1.0)
+    for i in range(3):
+        behind = references[0][index, row, i] - theta[row, i] - step * rates[i]
+        slower = references[1][index, row, i] - rates[i]
+        wanted = stiffness[row, i] * behind + damping * slower + references[2][index, row, i]
+        memory[1, row, i] = wanted - load[i]
+    change = onto((0.0, 0.0, 0.0), inverse, row, row_of(memory[1], row))
+    needed = onto(load, mass, row, change)
+    for i in range(3):
+        corner, speed = line[i, 0], line[i, 1]
+        torque = limited(needed[i], rates[i], effort[row, i], corner, speed)
+        memory[0, row, i], memory[1, row, i] = torque, rates[i]
+
+
+compilable(servo_torque)
 
 
 @compiled

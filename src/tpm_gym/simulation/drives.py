@@ -152,6 +152,7 @@ class ServoDrives:
         memory: (2, n, 3), the torques (N m) of the last time step and the joint velocities (rad/s)
             at its beginning.
         friction: (n, 3) N m, Coulomb friction of the motors' axes.
+        law: Parameters of :func:`tpm_gym.simulation.compiled.servo_torques`, from :meth:`begin`.
 
     Raises:
         ConfigurationError: If a motor of the machine has no torque-speed line.
@@ -207,36 +208,39 @@ class ServoDrives:
         The feed-forward is computed for the first and the last time step and interpolated: within a
         control period it differs little from a straight line.
         """
+        from tpm_gym.simulation import compiled  # imports Numba
+
         machine, step = path.machine, self._step
-        points = np.concatenate([path.start[:, None], path.points()], axis=1)
-        theta = machine.reach(points)  # (n, K + 1, 3)
-        rates = np.diff(theta, axis=1) / step
-        torque = np.zeros((rates.shape[1], len(theta), 3))
+        theta = machine.reach(np.concatenate([path.start[:, None], path.points()], axis=1))
+        steps = theta.shape[1] - 1
+        references = References(*np.empty((3, steps, len(theta), 3)))
+        torques = np.zeros((2, len(theta), 3))
         if self._servo.feedforward != "none":
             moving = float(self._servo.feedforward == "computed")
-            # Across a border of control periods the acceleration jumps to that of the new one.
-            changes = np.diff(rates, axis=1) / step if rates.shape[1] > 1 else 0.0 * rates
-            first = machine.torque(theta[:, 0], moving * rates[:, 0], moving * changes[:, 0])
-            last = machine.torque(theta[:, -2], moving * rates[:, -1], moving * changes[:, -1])
-            torque = np.linspace(first, last, len(torque))
-        true = path.true(theta[:, 1:])
-        return References(
-            np.ascontiguousarray(true.swapaxes(0, 1)),
-            np.ascontiguousarray(rates.swapaxes(0, 1)),
-            torque,
-        )
+            for k, start in enumerate((0, steps - 1)):
+                rates = (theta[:, start + 1] - theta[:, start]) / step
+                changes = np.zeros_like(rates)
+                if steps > 1:
+                    # Across a border of control periods the acceleration jumps to the new one's.
+                    here = theta[:, start : start + 3] if k == 0 else theta[:, -3:]
+                    changes = np.diff(np.diff(here, axis=1) / step, axis=1)[:, 0] / step
+                torques[k] = machine.torque(theta[:, start], moving * rates, moving * changes)
+        compiled.along(theta, path.true(theta), torques, step, references)
+        return references
 
     def begin(self, theta: FloatArray) -> None:
         """Compute the inertia at ``theta`` (n, 3) rad, for a control period."""
         still = np.zeros_like(theta)
         mass = self._machine.motion(theta, still, self._built).mass
-        lost = np.isnan(mass).any(axis=(1, 2))
+        lost = np.isnan(mass[:, 0, 0])
         if lost.any():  # a machine of other lengths cannot be there
             home = np.tile(self._home, (int(lost.sum()), 1))
             built = None if self._built is None else self._built[lost]
             mass[lost] = self._machine.motion(home, 0.0 * home, built).mass
-        self._mass = self._lightest * mass
-        self._inverse = self._braced(self._mass, self._stiffness, self._servo.damping, self._step)
+        mass *= self._lightest
+        stiffness, damping = self._stiffness, self._servo.damping
+        inverse = self._braced(mass, stiffness, damping, self._step)
+        self.law = stiffness, damping, mass, inverse, self._effort, self._line
 
     def torque(
         self, references: References, index: int, theta: FloatArray, theta_dot: FloatArray
@@ -249,10 +253,6 @@ class ServoDrives:
             theta: (n, 3) rad, at the beginning of the time step.
             theta_dot: (n, 3) rad/s.
         """
-        self._step_law(
-            references.theta[index], references.theta_dot[index], references.torque[index],
-            theta, theta_dot, self._stiffness, self._servo.damping, self._mass, self._inverse,
-            self._effort, self._line, self._step, self.memory,
-        )  # fmt: skip
+        self._step_law(index, references, self.law, theta, theta_dot, self._step, self.memory)
         torque: FloatArray = self.memory[0]
         return torque

@@ -17,7 +17,7 @@ from tpm_gym.mechanism import PAPER_TPM
 from tpm_gym.mechanism.dynamics import Dynamics
 from tpm_gym.simulation import Plant, Scene, Servo, Simulation
 from tpm_gym.simulation.analytic.forward_dynamics import Course, IdealSteps, ServoSteps, march
-from tpm_gym.simulation.analytic.steps import driven_by_torque, resisted
+from tpm_gym.simulation.analytic.steps import resisted
 from tpm_gym.simulation.drives import References, ServoDrives, drive_of
 from tpm_gym.simulation.randomisation import Randomisation
 
@@ -41,11 +41,9 @@ def untouched(
 
 
 def at_rest(theta: FloatArray, carried: float = 0.0) -> Course:
-    position = PAPER_TPM.forward(theta)
-    course = Course(*np.zeros((3, len(theta), 3)), position, position, np.zeros_like(theta),
-                    np.full(len(theta), carried), np.zeros(len(theta), dtype=np.int8))  # fmt: skip
-    course.theta = theta
-    return course
+    rates, torque, force = np.zeros((3, len(theta), 3))
+    position, nothing = PAPER_TPM.forward(theta), np.zeros(len(theta), dtype=np.int8)
+    return Course(theta, rates, torque, position, position, force, nothing + carried, nothing)
 
 
 def test_resistance_is_coulombs_in_every_one_of_the_27_cases() -> None:
@@ -65,18 +63,6 @@ def test_resistance_is_coulombs_in_every_one_of_the_27_cases() -> None:
 # -- motion ----------------------------------------------------------------------------------------
 
 
-class Slack:
-    """Motors without any torque: the machine swings freely."""
-
-    def __init__(self, time_step: float) -> None:
-        self._step = time_step
-
-    def move(self, index: int, course: Course, mass: Any, load: Any) -> Any:
-        torque, rates = np.zeros_like(load), np.empty_like(load)
-        driven_by_torque(torque, torque, course.rates, mass, load, self._step, rates)
-        return rates, torque
-
-
 def energy_gained(time_step: float, payload: float) -> FloatArray:
     """By machines that swing freely for 80 ms, (r,) J."""
     theta = PAPER_TPM.inverse([(-0.1, 0.03, 0.75), (0.0, 0.035, 0.7)])
@@ -93,9 +79,10 @@ def energy_gained(time_step: float, payload: float) -> FloatArray:
     def energy(course: Course) -> tuple[FloatArray, FloatArray]:
         return kinetic_and_potential(course.theta, course.rates, payload)
 
-    course, start = at_rest(theta, payload), at_rest(theta)
-    course.force = weight
-    march(PAPER_TPM, None, Slack(time_step), round(0.08 / time_step), course, time_step, touch)
+    start, count = at_rest(theta), round(0.08 / time_step)
+    course = at_rest(theta, payload)._replace(force=weight)
+    slack = IdealSteps(np.zeros((count, 2, 3)), np.zeros((2, 3)), time_step)
+    course, _ = march(PAPER_TPM, None, slack, count, course, time_step, touch)
     kinetic, _ = after = energy(course)
     assert (kinetic > 0.05).all()
     return sum(after) - sum(energy(start))
@@ -120,7 +107,7 @@ def test_springs_and_dampers_give_nothing_that_was_not_put_in() -> None:
     drives.rest(np.array([0]), theta)
     steps = ServoSteps(drives, References(goal[None], 0 * goal[None], 0 * goal[None]), STEP)
     for _ in range(60):
-        march(PAPER_TPM, None, steps, 1, course, STEP, untouched)
+        course, _ = march(PAPER_TPM, None, steps, 1, course, STEP, untouched)
         sprung = law.stiffness * np.sum((course.theta - goal) ** 2) / 2
         totals.append(sum(kinetic_and_potential(course.theta, course.rates))[0] + sprung)
     assert totals[0] - totals[-1] > 0.1  # J
@@ -130,10 +117,9 @@ def test_springs_and_dampers_give_nothing_that_was_not_put_in() -> None:
 def test_motors_with_torque_to_spare_are_where_they_shall_be() -> None:
     # So forward dynamics give what inverse dynamics give.
     theta = PAPER_TPM.inverse(np.linspace(HOME, HOME + (0.03, 0.01, -0.03), 14))[:, None]
-    course = at_rest(theta[1])
-    course.rates = (theta[1] - theta[0]) / STEP
+    course = at_rest(theta[1])._replace(rates=(theta[1] - theta[0]) / STEP)
     steps = IdealSteps(theta[2:], np.full((1, 3), 1e6), STEP)
-    torques = march(PAPER_TPM, None, steps, 12, course, STEP, untouched)
+    course, torques = march(PAPER_TPM, None, steps, 12, course, STEP, untouched)
     rates = np.diff(theta, axis=0) / STEP
     expected = PAPER_TPM.torque(theta[1:-1], rates[:-1], np.diff(rates, axis=0) / STEP)
     np.testing.assert_allclose(torques, expected, atol=1e-8)

@@ -29,7 +29,6 @@ from tpm_gym.simulation.analytic.forward_dynamics import (
     march,
 )
 from tpm_gym.simulation.analytic.physics import Physics
-from tpm_gym.simulation.analytic.steps import ways_in_world
 from tpm_gym.simulation.drives import Servo, ServoDrives
 from tpm_gym.simulation.engine import Engine, Path, Readout, make_engine
 from tpm_gym.simulation.randomisation import Plant
@@ -40,9 +39,8 @@ __all__ = ["AnalyticEngine"]
 
 _WATCHFUL = 0.5
 """Share of a motor's effort above which the torques of every time step are computed."""
-_COLUMNS = (
-    "_theta", "_rates", "_torque", "_position", "_before", "_force", "_mode_left", "_behind",
-)  # fmt: skip
+_COURSE = tuple(f"_{name}" for name in Course._fields)
+_COLUMNS = (*_COURSE, "_behind")
 
 
 class AnalyticEngine:
@@ -87,7 +85,9 @@ class AnalyticEngine:
         self._nominal_effort = np.array([motor.effort for motor in machine.mechanism.motors])
         self._effort = np.tile(self._nominal_effort, (count, 1))
         self._bias = np.zeros((count, 3))
-        self._contact = Contact(scene.objects, count, self.time_step, machine.table)
+        self._contact = Contact(
+            scene.objects, count, self.time_step, machine.table, machine.mount.frame
+        )
         self._drives = (
             None
             if self._servo is None
@@ -98,6 +98,7 @@ class AnalyticEngine:
         self._position = np.tile(machine.home, (count, 1))
         self._before = self._position.copy()
         self._rates, self._torque, self._force = np.zeros((3, count, 3))
+        self._carried = np.zeros(count)  # kg
         self._mode_left = np.zeros(count, dtype=np.int8)
         self._behind = np.zeros(count, dtype=np.bool_)  # whether ideal motors lacked torque
 
@@ -125,6 +126,7 @@ class AnalyticEngine:
         self._position[rows] = self._machine.evaluate(theta, built).position
         self._before[rows] = self._position[rows]
         self._rates[rows] = self._torque[rows] = self._force[rows] = 0.0
+        self._carried[rows] = 0.0
         self._mode_left[rows], self._behind[rows] = 0, False
         if self._drives is not None:
             self._drives.rest(rows, theta)
@@ -158,21 +160,22 @@ class AnalyticEngine:
             theta = joints[:, -self._tail :]
             late = self._behind | (self._mode_left != 0)
             late |= ~self._machine.same_side(points).all(axis=1)
-        start = self._theta, self._rates, self._position, self._before, self._force, self._torque
+        start = {name: getattr(self, name) for name in _COURSE}
         # Without torques, it is known already which machines are computed again.
         again = objects and (self.physics.torques != "none" or late.any())
         saved = self._contact.copy() if again else None
         push = None
         if objects:
-            ways = ways_in_world(self._before, self._position, points, self._turn, self._origin)
-            push = self._contact.advance(self._rows, ways, vacuum)
-            carried = self._contact.carried(self._rows)[:, None]
-            change = points[:, -1] - 2 * points[:, -2] + points[:, -3]
-            self._force = push[:, -1] * self._turn + carried * change / step**2
+            way = self._before, self._position, points
+            push, self._carried = self._contact.advance(self._rows, way, vacuum)
+            self._force = push[:, -1].copy()
+            if self._carried.any():
+                change = points[:, -1] - 2 * points[:, -2] + points[:, -3]
+                self._force += self._carried[:, None] * change / step**2
         self._before, self._position = points[:, -2].copy(), points[:, -1].copy()
         self._theta = theta[:, -1].copy()
         self._rates = (theta[:, -1] - theta[:, -2]) / step
-        late |= self._find_torques(start[0] - step * start[1], start[0], theta, path, push)
+        late |= self._find_torques(start["_theta"], start["_rates"], theta, path, push)
         rows = np.flatnonzero(late)
         if len(rows):
             self._repeat(rows, start, saved, path, vacuum)
@@ -181,9 +184,7 @@ class AnalyticEngine:
         self, rows: IntArray, start: Any, saved: Any, path: Path, vacuum: BoolArray
     ) -> None:
         """Run the control period of some machines again, by forward dynamics."""
-        for name, values in zip(
-            ("_theta", "_rates", "_position", "_before", "_force", "_torque"), start, strict=True
-        ):
+        for name, values in start.items():
             getattr(self, name)[rows] = values[rows]
         if saved is not None:
             self._contact.repeat(rows, saved)
@@ -199,26 +200,16 @@ class AnalyticEngine:
         def touch(
             before: FloatArray, now: FloatArray, then: FloatArray
         ) -> tuple[FloatArray, FloatArray]:
-            if not self._scene.objects:
-                return nothing
-            way = ways_in_world(before, now, then[:, None], self._turn, self._origin)
-            push = self._contact.advance(rows, way, on)[:, 0]
-            return push * self._turn, self._contact.carried(rows)
+            push, carried = self._contact.advance(rows, (before, now, then[:, None]), on)
+            return push[:, 0], carried
 
-        nothing = np.zeros((len(rows), 3)), np.zeros(len(rows))
-
-        course = Course(
-            self._theta[rows], self._rates[rows], self._torque[rows], self._position[rows],
-            self._before[rows], self._force[rows], self._contact.carried(rows),
-            self._mode_left[rows],
-        )  # fmt: skip
+        course = Course(*(getattr(self, name)[rows] for name in _COURSE))
         built = None if self._built is None else self._built[rows]
-        torques = march(self._machine, built, steps, self._steps, course, self.time_step, touch)
-        self._theta[rows], self._rates[rows], self._torque[rows] = (
-            course.theta, course.rates, course.torque,
-        )  # fmt: skip
-        self._position[rows], self._before[rows] = course.position, course.before
-        self._force[rows], self._mode_left[rows] = course.force, course.mode_left
+        course, torques = march(
+            self._machine, built, steps, self._steps, course, self.time_step, touch
+        )
+        for name, values in zip(_COURSE, course, strict=True):
+            getattr(self, name)[rows] = values
         if self.physics.torques == "every":
             if self.torques is None:
                 self.torques = np.zeros((self._steps, self._count, 3))
@@ -226,8 +217,8 @@ class AnalyticEngine:
 
     def _find_torques(
         self,
-        earlier: FloatArray,
         start: FloatArray,
+        rates: FloatArray,
         theta: FloatArray,
         path: Path,
         push: FloatArray | None,
@@ -235,16 +226,16 @@ class AnalyticEngine:
         """Compute what motors apply, and return (n,) whether one would need too much.
 
         Args:
-            earlier: (n, 3) rad, a time step before the control period.
-            start: (n, 3) rad, at its beginning.
+            start: (n, 3) rad, at the beginning of the control period.
+            rates: (n, 3) rad/s, there.
             theta: (n, k, 3) rad, at the ends of its last time steps.
             path: Of the control period.
-            push: (n, K, 3) N on P, world; None without objects.
+            push: (n, K, 3) N on P; None without objects.
         """
         if self.physics.torques == "none":
             self._torque = np.full_like(self._torque, np.nan)
             return np.zeros(self._count, dtype=np.bool_)
-        lead = earlier[:, None], start[:, None]
+        lead = (start - self.time_step * rates)[:, None], start[:, None]
         if self.physics.torques == "every":
             torques = self._torques(self._rows, np.concatenate([*lead, theta], axis=1), push)
             self.torques, self._torque = torques.swapaxes(0, 1), torques[:, -1].copy()
@@ -262,12 +253,12 @@ class AnalyticEngine:
     def _torques(self, rows: IntArray, theta: FloatArray, push: FloatArray | None) -> FloatArray:
         """Compute the torques (r, m, 3) N m that take motors through theta (r, m + 2, 3) rad.
 
-        The last m time steps of ``push`` (r, K, 3) N, world, act on P.
+        The last m time steps of ``push`` (r, K, 3) N act on P.
         """
         rates = np.diff(theta, axis=1) / self.time_step
         changes = np.diff(rates, axis=1) / self.time_step
         built = None if self._built is None else self._built[rows]
-        against = None if push is None else push[:, -changes.shape[1] :] * self._turn
+        against = None if push is None else push[:, -changes.shape[1] :]
         torques: FloatArray = self._machine.torque(
             theta[:, 1:-1], rates[:, :-1], changes, against, built
         )

@@ -3,28 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tpm_gym.arrays import BoolArray, FloatArray
-from tpm_gym.mechanism.machine import Machine
-from tpm_gym.simulation.analytic.steps import (
-    driven_by_torque,
-    driven_ideally,
-    felt,
-    modes_left,
-    moved,
-)
+from tpm_gym.mechanism.machine import Machine, Motion
+from tpm_gym.simulation.analytic.steps import ideal_step, modes_left, servo_step
 from tpm_gym.simulation.drives import References, ServoDrives
 
 __all__ = ["Course", "IdealSteps", "ServoSteps", "Steps", "march"]
 
 
-@dataclass
-class Course:
+class Course(NamedTuple):
     """States of r machines at the end of a time step; machine's frame.
 
     Attributes:
@@ -51,10 +43,8 @@ class Course:
 class Steps(Protocol):
     """Drives of r machines over a control period."""
 
-    def move(
-        self, index: int, course: Course, mass: FloatArray, load: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return joint velocities (r, 3) at the end of a time step, and torques (r, 3)."""
+    def move(self, index: int, course: Course, at: Motion, new: tuple[FloatArray, ...]) -> None:
+        """Run a time step; see :func:`tpm_gym.simulation.analytic.steps.servo_step`."""
 
 
 class IdealSteps:
@@ -74,17 +64,11 @@ class IdealSteps:
         self._references, self._effort, self._step = references, effort, step
         self._behind = np.zeros((2, len(effort)), dtype=np.bool_)
 
-    def move(
-        self, index: int, course: Course, mass: FloatArray, load: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def move(self, index: int, course: Course, at: Motion, new: tuple[FloatArray, ...]) -> None:
         """See the protocol."""
-        rates, torque = np.empty((2, *load.shape))
-        self._behind[0] = self._behind[1]
-        driven_ideally(
-            self._references[index], self._effort, course.theta, course.rates, mass, load,
-            self._step, rates, torque, self._behind[1],
-        )  # fmt: skip
-        return rates, torque
+        ideal_step(
+            index, self._references, self._effort, course[:-1], at, self._step, new, self._behind
+        )
 
     @property
     def behind(self) -> BoolArray:
@@ -101,14 +85,13 @@ class ServoSteps:
         self._drives, self._references, self._step = drives, references, step
         drives.begin(references.theta[0])
 
-    def move(
-        self, index: int, course: Course, mass: FloatArray, load: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def move(self, index: int, course: Course, at: Motion, new: tuple[FloatArray, ...]) -> None:
         """See the protocol."""
-        torque = self._drives.torque(self._references, index, course.theta, course.rates).copy()
-        rates = np.empty_like(torque)
-        driven_by_torque(torque, self._drives.friction, course.rates, mass, load, self._step, rates)
-        return rates, torque
+        drives = self._drives
+        servo_step(
+            index, self._references, drives.law, drives.friction, course[:-1], at, self._step, new,
+            drives.memory,
+        )  # fmt: skip
 
 
 Touch = Callable[[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
@@ -124,7 +107,7 @@ def march(
     course: Course,
     step: float,
     touch: Touch,
-) -> FloatArray:
+) -> tuple[Course, FloatArray]:
     """Run ``count`` time steps of some machines by forward dynamics.
 
     A machine that leaves its modes stays where it was before.
@@ -134,34 +117,31 @@ def march(
         built: (r, k) parameters of the true machines; None for nominal ones.
         steps: The drives.
         count: K.
-        course: Where the machines are; advanced.
+        course: Where the machines are.
         step: s.
         touch: Lets objects and cups act.
 
     Returns:
-        Torques (K, r, 3) N m.
+        Where the machines are then, and the torques (K, r, 3) N m.
     """
     torques = np.empty((count, *course.theta.shape))
     at = machine.motion(course.theta, course.rates, built)
     for index in range(count):
-        travel = course.position - course.before
-        mass, load = felt(at.mass, at.bias, at.jacobian, course.force, course.carried, travel, step)
-        rates, torque = steps.move(index, course, mass, load)
-        theta, expected, drifting, gain = moved(
-            course.theta, course.rates, rates, course.position, course.before, at.jacobian, step
-        )
+        theta, rates, gain = np.empty((3, *course.theta.shape))
+        torque, ahead = torques[index], np.empty((2, *theta.shape))
+        steps.move(index, course, at, (theta, rates, torque, ahead, gain))
         at = machine.motion(theta, rates, built)
-        side = machine.same_side(expected) & machine.same_side(drifting)
-        mode_left, anywhere = modes_left(at.position, side, at.working, course.mode_left)
-        new = theta, rates, torque, at.position, gain
+        mode_left, anywhere = modes_left(
+            at.position, machine.same_side(ahead), at.working, course.mode_left
+        )
+        position = at.position
         if anywhere:
-            gone = (mode_left != 0)[:, None]
-            old = course.theta, course.rates, course.torque, course.position, np.zeros_like(gain)
-            new = tuple(np.where(gone, *pair) for pair in zip(old, new, strict=True))  # type: ignore[assignment]
-            at = machine.motion(new[0], new[1], built)
-        push, carried = touch(course.before, course.position, new[3])
-        course.before, course.mode_left, course.carried = course.position, mode_left, carried
-        course.theta, course.rates, course.torque, course.position, gain = new
-        course.force = push + carried[:, None] * gain
-        torques[index] = course.torque
-    return torques
+            gone, position = mode_left != 0, position.copy()
+            for new, old in zip((theta, rates, torque, position), course[:4], strict=True):
+                new[gone] = old[gone]
+            gain[gone] = 0.0
+            at = machine.motion(theta, rates, built)
+        force, carried = touch(course.before, course.position, position)
+        force += np.multiply(gain, carried[:, None], out=gain)
+        course = Course(theta, rates, torque, position, course.position, force, carried, mode_left)
+    return course, torques

@@ -1,156 +1,172 @@
-"""Compiled time steps of forward dynamics, for many machines."""
+"""Compiled time steps of forward dynamics, for many machines.
+
+Each machine is computed by itself, so that it has the same bits alone and among thousands.
+"""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tpm_gym.arrays import BoolArray, FloatArray
-from tpm_gym.compiling import compiled, kept
-from tpm_gym.simulation.compiled import inverted
+from tpm_gym.arrays import BoolArray, FloatArray, Vector
+from tpm_gym.compiling import compilable, compiled, kept
+from tpm_gym.mechanism.machine import Motion
+from tpm_gym.simulation.compiled import inverted, servo_torque
+from tpm_gym.simulation.drives import References
+from tpm_gym.simulation.vectors import onto, plus, put, put_row, row_of, three
 
-__all__ = ["driven_by_torque", "driven_ideally", "felt", "modes_left", "moved", "ways_in_world"]
+__all__ = ["ideal_step", "modes_left", "resisted", "servo_step"]
 
 _CREEP = 2e-5  # m/s, at which friction gives way, instead of not at all
 _SIGNS = np.array([(i, j, k) for i in (0, 1, -1) for j in (0, 1, -1) for k in (0, 1, -1)], float)
 
+_Course = tuple[Any, ...]
+"""theta to carried of :class:`tpm_gym.simulation.analytic.forward_dynamics.Course`."""
+_New = tuple[FloatArray, ...]
+"""Results at the end of a time step, each (r, 3): theta; rates; torque; P (2, r, 3) by the joint
+velocities and by its own; acceleration of P by the change of the joint velocities, m/s^2."""
+
 
 @kept
-def driven_ideally(
-    reference: FloatArray,
+def ideal_step(
+    index: int,
+    references: FloatArray,
     effort: FloatArray,
-    theta: FloatArray,
-    rates: FloatArray,
-    mass: FloatArray,
-    load: FloatArray,
+    course: _Course,
+    at: Motion,
     step: float,
-    new_rates: FloatArray,
-    torque: FloatArray,
+    new: _New,
     behind: BoolArray,
 ) -> None:
     """Run a time step of ideal drives, which remove their error as far as their effort allows.
 
     Args:
-        reference: (r, 3) rad, at the end of the time step.
+        index: Number of the time step.
+        references: (K, r, 3) rad, at the ends of the time steps.
         effort: (r, 3) N m, largest torques.
-        theta: (r, 3) rad.
-        rates: (r, 3) rad/s.
-        mass: (r, 3, 3) kg m^2; mass theta_ddot = torque - load.
-        load: (r, 3) N m.
+        course: Where the machines are.
+        at: Their motion there.
         step: s.
-        new_rates: (r, 3) rad/s, at the end of the time step; written.
-        torque: (r, 3) N m; written.
-        behind: (r,) whether a motor was at its limit; written.
+        new: Written.
+        behind: (2, r) whether a motor was at its limit in the last time step and in this; written.
     """
     goal, impulse, limit, short = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    mass, load = np.empty((1, 3, 3)), np.empty(3)
+    theta, rates = course[0], course[1]
     for row in range(len(theta)):
+        _feel(row, course, at, step, mass, load)
         for i in range(3):
-            goal[i] = (reference[row, i] - theta[row, i]) / step
-        for i in range(3):
-            impulse[i] = -step * load[row, i]
-            for k in range(3):
-                impulse[i] += mass[row, i, k] * (rates[row, k] - goal[k])
+            goal[i] = (references[index, row, i] - theta[row, i]) / step
             limit[i] = step * effort[row, i]
-        resisted(mass[row], impulse, limit, short)
-        behind[row] = short[0] != 0 or short[1] != 0 or short[2] != 0
-        for i in range(3):
-            new_rates[row, i] = goal[i] + short[i]
-            needed = -impulse[i]
-            for k in range(3):
-                needed += mass[row, i, k] * short[k]
-            torque[row, i] = needed / step
+        fast = plus(row_of(rates, row), three(goal), -1.0)
+        put(impulse, onto((-step * load[0], -step * load[1], -step * load[2]), mass, 0, fast))
+        resisted(mass[0], impulse, limit, short)
+        behind[0, row] = behind[1, row]
+        behind[1, row] = short[0] != 0 or short[1] != 0 or short[2] != 0
+        x, y, z = three(impulse)
+        needed = onto((-x, -y, -z), mass, 0, three(short))
+        put_row(new[2], row, (needed[0] / step, needed[1] / step, needed[2] / step))
+        _integrate(row, plus(three(goal), three(short)), course, at, step, new)
 
 
 @kept
-def driven_by_torque(
-    torque: FloatArray,
+def servo_step(
+    index: int,
+    references: References,
+    law: tuple[FloatArray, float, FloatArray, FloatArray, FloatArray, FloatArray],
     friction: FloatArray,
-    rates: FloatArray,
-    mass: FloatArray,
-    load: FloatArray,
+    course: _Course,
+    at: Motion,
     step: float,
-    new_rates: FloatArray,
+    new: _New,
+    memory: FloatArray,
 ) -> None:
-    """Run a time step of motors that apply a torque against Coulomb friction.
+    """Run a time step of servo drives against Coulomb friction.
 
     Args:
-        torque: (r, 3) N m.
+        index: Number of the time step.
+        references: See :class:`tpm_gym.simulation.drives.References`.
+        law: See :func:`tpm_gym.simulation.compiled.servo_torques`.
         friction: (r, 3) N m, on the motors' axes.
-        rates: (r, 3) rad/s.
-        mass: (r, 3, 3) kg m^2; mass theta_ddot = torque - load - friction.
-        load: (r, 3) N m.
+        course: Where the machines are.
+        at: Their motion there.
         step: s.
-        new_rates: (r, 3) rad/s, at the end of the time step; written.
+        new: Written.
+        memory: Of the law; overwritten.
     """
-    impulse, limit, inverse = np.empty(3), np.empty(3), np.empty((3, 3))
-    for row in range(len(rates)):
-        free = True
-        for i in range(3):
-            impulse[i] = step * (torque[row, i] - load[row, i])
-            for k in range(3):
-                impulse[i] += mass[row, i, k] * rates[row, k]
-            limit[i] = step * friction[row, i]
-            free = free and limit[i] == 0
-        if not free:
-            resisted(mass[row], impulse, limit, new_rates[row])
-            continue
-        inverted(
-            mass[row, 0, 0], mass[row, 0, 1], mass[row, 0, 2],
-            mass[row, 1, 1], mass[row, 1, 2], mass[row, 2, 2], inverse,
-        )  # fmt: skip
-        for i in range(3):
-            new_rates[row, i] = (
-                inverse[i, 0] * impulse[0] + inverse[i, 1] * impulse[1] + inverse[i, 2] * impulse[2]
-            )
-
-
-@kept
-def moved(
-    theta: FloatArray,
-    rates: FloatArray,
-    new_rates: FloatArray,
-    position: FloatArray,
-    before: FloatArray,
-    jacobian: FloatArray,
-    step: float,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Integrate joint positions, and predict where P goes; all (r, 3).
-
-    Args:
-        theta: rad, at the beginning of the time step.
-        rates: rad/s, at its beginning.
-        new_rates: rad/s, at its end.
-        position: m, point P at its beginning.
-        before: m, point P a time step earlier.
-        jacobian: (r, 3, 3) m/rad, at its beginning.
-        step: s.
-
-    Returns:
-        Joint positions at the end; P by the joint velocities, and by its own velocity; the
-        acceleration of P by the change of the joint velocities, m/s^2.
-    """
-    new_theta, expected, drifting, gain = (
-        np.empty_like(theta), np.empty_like(theta), np.empty_like(theta), np.empty_like(theta),
-    )  # fmt: skip
+    impulse, limit, found = np.empty(3), np.empty(3), np.empty(3)
+    mass, load, inverse = np.empty((1, 3, 3)), np.empty(3), np.empty((1, 3, 3))
+    theta, rates = course[0], course[1]
     for row in range(len(theta)):
+        _feel(row, course, at, step, mass, load)
+        servo_torque(row, index, references, law, theta, rates, step, memory)
+        x, y, z = plus(row_of(memory[0], row), three(load), -1.0)
+        put_row(new[2], row, row_of(memory[0], row))
+        put(impulse, onto((step * x, step * y, step * z), mass, 0, row_of(rates, row)))
         for i in range(3):
-            new_theta[row, i] = theta[row, i] + step * new_rates[row, i]
-            drifting[row, i] = 2 * position[row, i] - before[row, i]
-            speed = change = 0.0
-            for k in range(3):
-                speed += jacobian[row, i, k] * new_rates[row, k]
-                change += jacobian[row, i, k] * (new_rates[row, k] - rates[row, k])
-            expected[row, i] = position[row, i] + step * speed
-            gain[row, i] = change / step
-    return new_theta, expected, drifting, gain
+            limit[i] = step * friction[row, i]
+        if limit[0] == 0 and limit[1] == 0 and limit[2] == 0:
+            m = mass[0]
+            inverted(m[0, 0], m[0, 1], m[0, 2], m[1, 1], m[1, 2], m[2, 2], inverse[0])
+            put(found, onto((0.0, 0.0, 0.0), inverse, 0, three(impulse)))
+        else:
+            resisted(mass[0], impulse, limit, found)
+        _integrate(row, three(found), course, at, step, new)
+
+
+def _feel(
+    row: int, course: _Course, at: Motion, step: float, mass: FloatArray, load: FloatArray
+) -> None:
+    """Compute the inertia (1, 3, 3) and load (3,) that motors feel, with objects on P.
+
+    The level part of a force that opposes the motion is friction. It is taken as proportional to
+    the velocity at the end of the time step: taken from the beginning, friction would overshoot
+    what it stops, and push it to and fro.
+    """
+    for i in range(3):
+        load[i] = at[4][row, i]
+        for k in range(3):
+            mass[0, i, k] = at[3][row, i, k]
+    (x, y, z), carried = row_of(course[5], row), course[6][row]
+    if x == 0 and y == 0 and z == 0 and carried == 0:
+        return
+    u, v, _ = plus(row_of(course[3], row), row_of(course[4], row), -1.0)
+    u, v = u / step, v / step
+    speed = np.sqrt(u * u + v * v)
+    slow = max(speed, _CREEP)
+    opposing = max(-(x * u + y * v), 0.0)
+    share = speed / slow if opposing > 0 else 1.0
+    level = carried + step * opposing / (max(speed, 1e-12) * slow)
+    j = at[1]
+    for i in range(3):
+        load[i] -= share * (j[row, 0, i] * x + j[row, 1, i] * y) + j[row, 2, i] * z
+        for k in range(3):
+            mass[0, i, k] += level * (j[row, 0, i] * j[row, 0, k] + j[row, 1, i] * j[row, 1, k])
+            mass[0, i, k] += carried * (j[row, 2, i] * j[row, 2, k])
+
+
+def _integrate(
+    row: int, rates: Vector, course: _Course, at: Motion, step: float, new: _New
+) -> None:
+    """Integrate joint positions, and predict where P goes."""
+    zero, position = (0.0, 0.0, 0.0), row_of(course[3], row)
+    put_row(new[0], row, plus(row_of(course[0], row), rates, step))
+    put_row(new[1], row, rates)
+    put_row(new[3][0], row, plus(position, onto(zero, at[1], row, rates), step))
+    x, y, z = row_of(course[4], row)
+    put_row(new[3][1], row, plus((-x, -y, -z), position, 2.0))
+    x, y, z = onto(zero, at[1], row, plus(rates, row_of(course[1], row), -1.0))
+    put_row(new[4], row, (x / step, y / step, z / step))
+
+
+compilable(_feel, _integrate)
 
 
 @kept
 def modes_left(
-    position: FloatArray,
-    side: BoolArray,
-    working: BoolArray,
-    before: NDArray[np.int8],
+    position: FloatArray, side: BoolArray, working: BoolArray, before: NDArray[np.int8]
 ) -> tuple[NDArray[np.int8], bool]:
     """Find which mode each machine has left, (r,), and whether any has.
 
@@ -159,14 +175,15 @@ def modes_left(
 
     Args:
         position: (r, 3) m, by forward kinematics; NaN where there is none.
-        side: (r,) whether P was about to stay on its side, by the joint velocities and by its own.
+        side: (2, r) whether P was about to stay on its side, by the joint velocities and by its
+            own.
         working: (r,) whether the machine is in its working mode.
         before: (r,) mode that was left earlier.
     """
     left, anywhere = before.copy(), False
     for row in range(len(left)):
         if left[row] == 0:
-            if not side[row] or np.isnan(position[row, 0]):
+            if not (side[0, row] and side[1, row]) or np.isnan(position[row, 0]):
                 left[row] = 1
             elif not working[row]:
                 left[row] = 2
@@ -187,124 +204,35 @@ def resisted(mass: FloatArray, impulse: FloatArray, limit: FloatArray, rates: Fl
         limit: (3,) N m s, zero or more.
         rates: (3,) rad/s; written.
     """
-    signs, best = np.zeros(3), np.inf
-    _solved(mass, impulse, limit, signs, np.ones(3), rates)
-    if limit[0] == 0 and limit[1] == 0 and limit[2] == 0:
-        return
-    tried = np.empty(3)
-    signs[:] = np.sign(rates)
-    _solved(mass, impulse, limit, signs, np.ones(3), tried)
-    if tried[0] * signs[0] > 0 and tried[1] * signs[1] > 0 and tried[2] * signs[2] > 0:
-        rates[:] = tried
-        return
-    for choice in range(27):  # all ways in which three rates are zero or have a sign
-        signs[:] = _SIGNS[choice]
-        _solved(mass, impulse, limit, signs, np.abs(signs), tried)
-        cost = 0.0
-        for i in range(3):
-            share = 0.0
-            for k in range(3):
-                share += mass[i, k] * tried[k]
-            cost += tried[i] * (share / 2 - impulse[i]) + limit[i] * abs(tried[i])
-        if cost < best:
-            best = cost
-            rates[:] = tried
+    everything, still = (1.0, 1.0, 1.0), limit[0] == 0 and limit[1] == 0 and limit[2] == 0
+    best, found = np.inf, _solved(mass, impulse, limit, (0.0, 0.0, 0.0), everything)
+    if not still:
+        signs = np.sign(found[0]), np.sign(found[1]), np.sign(found[2])
+        found = _solved(mass, impulse, limit, signs, everything)
+        if not (found[0] * signs[0] > 0 and found[1] * signs[1] > 0 and found[2] * signs[2] > 0):
+            for choice in range(27):  # all ways in which three rates are zero or have a sign
+                signs = row_of(_SIGNS, choice)
+                moving = abs(signs[0]), abs(signs[1]), abs(signs[2])
+                tried, cost = _solved(mass, impulse, limit, signs, moving), 0.0
+                for i in range(3):
+                    share = mass[i, 0] * tried[0] + mass[i, 1] * tried[1] + mass[i, 2] * tried[2]
+                    cost += tried[i] * (share / 2 - impulse[i]) + limit[i] * abs(tried[i])
+                if cost < best:
+                    best, found = cost, tried
+    put(rates, found)
 
 
 @compiled
 def _solved(
-    mass: FloatArray,
-    impulse: FloatArray,
-    limit: FloatArray,
-    signs: FloatArray,
-    moving: FloatArray,
-    rates: FloatArray,
-) -> None:
+    mass: FloatArray, impulse: FloatArray, limit: FloatArray, signs: Vector, moving: Vector
+) -> Vector:
     """Solve mass u = impulse - limit signs for what moves (1); the rest (0) has u = 0."""
-    inverse = np.empty((3, 3))
+    inverse = np.empty((1, 3, 3))
     m0, m1, m2 = moving
     inverted(
         mass[0, 0] * m0 + 1 - m0, mass[0, 1] * m0 * m1, mass[0, 2] * m0 * m2,
-        mass[1, 1] * m1 + 1 - m1, mass[1, 2] * m1 * m2, mass[2, 2] * m2 + 1 - m2, inverse,
+        mass[1, 1] * m1 + 1 - m1, mass[1, 2] * m1 * m2, mass[2, 2] * m2 + 1 - m2, inverse[0],
     )  # fmt: skip
-    for i in range(3):
-        rates[i] = 0.0
-        for k in range(3):
-            rates[i] += inverse[i, k] * moving[k] * (impulse[k] - limit[k] * signs[k])
-
-
-@kept
-def felt(
-    mass: FloatArray,
-    bias: FloatArray,
-    jacobian: FloatArray,
-    force: FloatArray,
-    carried: FloatArray,
-    travel: FloatArray,
-    step: float,
-) -> tuple[FloatArray, FloatArray]:
-    """Compute the inertia (r, 3, 3) and load (r, 3) that motors feel, with objects on P.
-
-    The level part of a force that opposes the motion is friction. It is taken as proportional to
-    the velocity at the end of the time step: taken from the beginning, friction would overshoot
-    what it stops, and push it to and fro.
-
-    Args:
-        mass: (r, 3, 3) kg m^2, of the machine alone.
-        bias: (r, 3) N m, of the machine alone.
-        jacobian: (r, 3, 3) m/rad.
-        force: (r, 3) N on P, in the last time step, machine's frame.
-        carried: (r,) kg, moving with P.
-        travel: (r, 3) m, of P in the last time step.
-        step: s.
-    """
-    inertia, load = mass.copy(), bias.copy()
-    for row in range(len(mass)):
-        x, y, z = force[row]
-        if x == 0 and y == 0 and z == 0 and carried[row] == 0:
-            continue
-        u, v = travel[row, 0] / step, travel[row, 1] / step
-        speed = np.sqrt(u * u + v * v)
-        slow = max(speed, _CREEP)
-        opposing = max(-(x * u + y * v), 0.0)
-        share = speed / slow if opposing > 0 else 1.0
-        level = carried[row] + step * opposing / (max(speed, 1e-12) * slow)
-        j = jacobian[row]
-        for i in range(3):
-            load[row, i] -= share * (j[0, i] * x + j[1, i] * y) + j[2, i] * z
-            for k in range(3):
-                inertia[row, i, k] += level * (j[0, i] * j[0, k] + j[1, i] * j[1, k])
-                inertia[row, i, k] += carried[row] * (j[2, i] * j[2, k])
-    return inertia, load
-
-
-@kept
-def ways_in_world(
-    before: FloatArray,
-    position: FloatArray,
-    points: FloatArray,
-    turn: FloatArray,
-    origin: FloatArray,
-) -> FloatArray:
-    """Join P before the last time step, now, and after each time step to come, in the world.
-
-    Args:
-        before: (n, 3) m, machine's frame, as all of them.
-        position: (n, 3) m.
-        points: (n, K, 3) m.
-        turn: (3,) factors of the machine's frame.
-        origin: (3,) m.
-
-    Returns:
-        (n, K + 2, 3) m.
-    """
-    count, steps = points.shape[:2]
-    ways = np.empty((count, steps + 2, 3))
-    for row in range(count):
-        for axis in range(3):
-            factor, start = turn[axis], origin[axis]
-            ways[row, 0, axis] = factor * before[row, axis] + start
-            ways[row, 1, axis] = factor * position[row, axis] + start
-            for k in range(steps):
-                ways[row, k + 2, axis] = factor * points[row, k, axis] + start
-    return ways
+    resistance = limit[0] * signs[0], limit[1] * signs[1], limit[2] * signs[2]
+    x, y, z = plus(three(impulse), resistance, -1.0)
+    return onto((0.0, 0.0, 0.0), inverse, 0, (m0 * x, m1 * y, m2 * z))

@@ -22,7 +22,8 @@ from tpm_gym.simulation.analytic.contact.state import (
     Records,
     Setting,
 )
-from tpm_gym.simulation.analytic.contact.vectors import (
+from tpm_gym.simulation.stage import FLOOR, TABLE
+from tpm_gym.simulation.vectors import (
     Frame,
     axes,
     clip,
@@ -34,7 +35,6 @@ from tpm_gym.simulation.analytic.contact.vectors import (
     put,
     three,
 )
-from tpm_gym.simulation.stage import FLOOR, TABLE
 
 __all__ = ["collide_lip", "collide_objects"]
 
@@ -57,6 +57,12 @@ class _Box(NamedTuple):
     middle: Vector
     frame: Frame
     half: Vector
+
+
+@compiled
+def _two(a: int, b: int) -> tuple[int, int]:
+    """Return a pair, with the type of variables even of constants: Numba compiles for each type."""
+    return 1 * a, 1 * b
 
 
 @compiled
@@ -126,7 +132,7 @@ def collide_objects(
             reach = length(one.half) + length(two.half) + _NEAR
             if length(plus(two.middle, one.middle, -1.0)) < reach:
                 friction = objects[i]["friction"] * objects[j]["friction"]
-                pair = (_body(i, held), _body(j, held)), friction
+                pair = _two(_body(i, held), _body(j, held)), friction
                 count = _collide_boxes(one, two, polygons, contacts, (count, slot), pair)
             slot += PAIR_SLOTS
     for i in range(len(objects)):
@@ -145,7 +151,7 @@ def _collide_table(
     (x, y, z), (count, slot), (edge_x, edge_y) = box.middle, place, setting.table
     over = abs(x) <= edge_x and abs(y) <= edge_y
     height = z - (TABLE.top if over else FLOOR.top)
-    pair = (-1, body[0]), body[1] * (TABLE.friction if over else FLOOR.friction)
+    pair = _two(-1, body[0]), body[1] * (TABLE.friction if over else FLOOR.friction)
     if height - _extent(box, _UP) > _NEAR:
         return count
     for k in range(TABLE_SLOTS):
@@ -180,8 +186,8 @@ def collide_lip(
         reach = length(three(setting.half[i])) + near
         over = level_length(x, y) < reach + CUP.radius and -reach < z < reach + CUP.bellows
         if over and i != held:
-            place = (count, TABLE_SLOTS * len(objects) + LIP_SLOTS * i)
-            pair = (0, i + 1), CUP.friction * objects[i]["friction"]
+            place = _two(count, TABLE_SLOTS * len(objects) + LIP_SLOTS * i)
+            pair = _two(0, i + 1), CUP.friction * objects[i]["friction"]
             box = _box(objects[i], setting.half[i])
             count = _collide_cylinder(box, lip, near, contacts, place, pair)
     return count
@@ -220,9 +226,7 @@ def _collide_cylinder(
     if face == 3:
         return _press_edge(box, lip, contacts, place, pair)
     normal = plus(_ZERO, box.frame[face], math.copysign(1.0, dot(box.frame[face], away)))
-    if abs(normal[2]) > _STEEP:
-        return _press_face(box, (face, normal), lip, near, contacts, place, pair)
-    return _push_face(box, (face, normal), lip, near, contacts, place, pair)
+    return _touch_face(box, (face, normal), lip, near, contacts, place, pair)
 
 
 @compiled
@@ -261,7 +265,7 @@ def _press_edge(box: _Box, lip: Vector, contacts: Records, place: _Place, pair: 
 
 
 @compiled
-def _press_face(
+def _touch_face(
     box: _Box,
     face: tuple[int, Vector],
     lip: Vector,
@@ -270,55 +274,48 @@ def _press_face(
     place: _Place,
     pair: _Pair,
 ) -> int:
-    """Add four points of the rim on an object's upper face, those outside moved to its edge."""
+    """Add points at which the lip meets a face of an object.
+
+    On an upper face they are four points of the rim, those outside moved to the face's edge; on a
+    side, the ends of the line on which the lip's own side meets it.
+    """
     (which, normal), (count, slot) = face, place
-    first, second = (which + 1) % 3, (which + 2) % 3
+    first, second, steep = (which + 1) % 3, (which + 2) % 3, abs(normal[2]) > _STEEP
     u, v = normal[0], normal[1]
-    if level_length(u, v) < 1e-4:
+    if steep and level_length(u, v) < 1e-4:
         u, v = box.frame[first][0], box.frame[first][1]
     size = level_length(u, v) / CUP.radius
     u, v = u / size, v / size
-    for a, b in ((u, v), (-u, -v), (-v, u), (v, -u)):
-        arm = plus((lip[0] + a, lip[1] + b, lip[2]), box.middle, -1.0)
-        for k in (first, second):
-            inside = dot(box.frame[k], arm)
-            arm = plus(arm, box.frame[k], clip(inside, -box.half[k], box.half[k]) - inside)
-        gap = -dot(normal, (arm[0], arm[1], lip[2] - box.middle[2])) - box.half[which]
+    for k in range(4 if steep else 2):
+        arm = plus((lip[0] + u, lip[1] + v, lip[2]), box.middle, -1.0)
+        if steep:
+            for axis in (first, second):
+                inside = dot(box.frame[axis], arm)
+                inside -= clip(inside, -box.half[axis], box.half[axis])
+                arm = plus(arm, box.frame[axis], -inside)
+            gap = -dot(normal, (arm[0], arm[1], lip[2] - box.middle[2])) - box.half[which]
+            u, v = (v, -u) if k == 1 else (-u, -v)
+        else:
+            low, high = _overlap(box, first, second, arm)
+            arm = plus(arm, _UP, high if k else low)
+            gap = -dot(normal, arm) - box.half[which]
         if gap < near:
-            arms = _ZERO, arm, _ZERO
-            count = _add(contacts, (count, slot), pair, arms, normal, gap)
-        slot += 1
+            count = _add(contacts, _two(count, slot + k), pair, (_ZERO, arm, _ZERO), normal, gap)
     return count
 
 
 @compiled
-def _push_face(
-    box: _Box,
-    face: tuple[int, Vector],
-    lip: Vector,
-    near: float,
-    contacts: Records,
-    place: _Place,
-    pair: _Pair,
-) -> int:
-    """Add the ends of the line on which the lip's side meets a side of an object."""
-    (which, normal), (count, slot) = face, place
-    size = level_length(normal[0], normal[1]) / CUP.radius
-    foot = plus((lip[0] + normal[0] / size, lip[1] + normal[1] / size, lip[2]), box.middle, -1.0)
+def _overlap(box: _Box, first: int, second: int, foot: Vector) -> tuple[float, float]:
+    """Return the lowest and highest point above a foot that is on a side face and on the lip, m."""
     low, high = 0.0, CUP.bellows
-    for k in ((which + 1) % 3, (which + 2) % 3):
+    for k in (first, second):
         rise, at, half = box.frame[k][2], dot(box.frame[k], foot), box.half[k]
         if abs(rise) > 1e-6:
             one, other = (-half - at) / rise, (half - at) / rise
             low, high = max(low, min(one, other)), min(high, max(one, other))
     if low > high:
         low = high = clip(0.5 * (low + high), 0.0, CUP.bellows)
-    for k in range(2):
-        arm = plus(foot, _UP, high if k else low)
-        gap, arms = -dot(normal, arm) - box.half[which], (_ZERO, arm, _ZERO)
-        if gap < near:
-            count = _add(contacts, (count, slot + k), pair, arms, normal, gap)
-    return count
+    return low, high
 
 
 # -- two objects ----------------------------------------------------------------------------------
@@ -350,9 +347,8 @@ def _collide_boxes(
     if edge >= 0:
         arms = _cross_edges(one, two, normal, edge // 3, edge % 3)
         return _add(contacts, place, pair, arms, normal, apart)
-    if face < 3:
-        return _clip_face(one, two, face, 1.0, polygons, contacts, place, pair)
-    return _clip_face(two, one, face - 3, -1.0, polygons, contacts, place, pair)
+    plane, other, sign = (one, two, 1.0) if face < 3 else (two, one, -1.0)
+    return _clip_face(plane, other, face % 3, sign, polygons, contacts, place, pair)
 
 
 @compiled

@@ -57,15 +57,21 @@ class Contact:
         count: n.
         time_step: s.
         table: Half edges of the tables along x and y, m.
+        frame: Factors (3,) and origin (3,) m of the machine's frame.
     """
 
     def __init__(
-        self, blocks: Sequence[Block], count: int, time_step: float, table: tuple[float, float]
+        self,
+        blocks: Sequence[Block],
+        count: int,
+        time_step: float,
+        table: tuple[float, float],
+        frame: tuple[FloatArray, FloatArray],
     ) -> None:
         """Put all objects in the middle of their tables, one on the other."""
         self._blocks, number = tuple(blocks), len(blocks)
         half = np.array([block.half for block in blocks]).reshape(number, 3)
-        self._setting = Setting(half, table, time_step)
+        self._setting, self._frame = Setting(half, table, time_step), frame
         self._objects = np.zeros((count, number), OBJECT)
         self._cups = np.zeros(count, CUP_STATE)
         self._forces = np.zeros((count, slots(number), 3))
@@ -105,32 +111,28 @@ class Contact:
         self._cups[rows] = empty
         self._forces[rows] = 0.0
 
-    def advance(self, rows: IntArray, path: FloatArray, vacuum_on: BoolArray) -> FloatArray:
+    def advance(
+        self, rows: IntArray, path: tuple[FloatArray, FloatArray, FloatArray], vacuum_on: BoolArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Run K time steps.
 
         Args:
             rows: (r,) which tables.
-            path: (r, K + 2, 3) m, world: point P before the last time step, now, and after each
-                time step to come; contiguous.
+            path: Point P, m, machine's frame: before the last time step (r, 3), now (r, 3), and
+                after each time step to come (r, K, 3); contiguous.
             vacuum_on: (r,) whether the vacuum is on.
 
         Returns:
-            (r, K, 3) N, world: force of cup and objects on the platform in each time step, beside
-            weight and inertia of the cup at rest in it.
+            (r, K, 3) N, machine's frame: force of cup and objects on the platform in each time
+            step, beside weight and inertia of the cup at rest in it. (r,) kg: what the cups hold.
         """
-        force = np.zeros((len(rows), path.shape[1] - 2, 3))
+        force, carried = np.zeros(path[2].shape), np.zeros(len(rows))
         if self._blocks:
             states = self._objects, self._cups, self._forces
             # Threads may advance different rows at the same time, so each call has its own
             work = work_for(len(self._blocks))
-            advance(states, rows, path, vacuum_on, self._setting, work, force)
-        return force
-
-    def carried(self, rows: Any) -> FloatArray:
-        """Return the masses that cups hold, (r,) kg."""
-        held = self._cups["held"][rows, None] == np.arange(len(self._blocks))
-        carried: FloatArray = (held * self._objects["mass"][rows]).sum(axis=1)
-        return carried
+            advance(states, rows, path, self._frame, vacuum_on, self._setting, work, force, carried)
+        return force, carried
 
     def read(self) -> Reading:
         """Return copies of the state of all tables."""

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from tpm_gym.arrays import FloatArray, Vector
 from tpm_gym.compiling import compiled
 from tpm_gym.simulation.analytic.contact.state import Record, Records
-from tpm_gym.simulation.analytic.contact.vectors import cross, dot, plus, put, three
+from tpm_gym.simulation.vectors import cross, dot, plus, put, three
 
 __all__ = ["Motor", "prepare", "solve", "still"]
 

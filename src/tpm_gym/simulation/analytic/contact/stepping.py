@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector
 from tpm_gym.compiling import compiled, kept
 from tpm_gym.mechanism.cup import CUP
@@ -15,16 +17,18 @@ from tpm_gym.simulation.analytic.contact.collision import collide_lip, collide_o
 from tpm_gym.simulation.analytic.contact.grasp import CUP_MASS, Way, breathe, carry, lip_of
 from tpm_gym.simulation.analytic.contact.solver import Motor, prepare, solve, still
 from tpm_gym.simulation.analytic.contact.state import AT_REST, Record, Records, Setting, Work
-from tpm_gym.simulation.analytic.contact.vectors import (
+from tpm_gym.simulation.engine import SPRING_GAIN
+from tpm_gym.simulation.vectors import (
     axes,
     cross,
     dot,
     length,
     plus,
     put,
+    put_row,
+    row_of,
     three,
 )
-from tpm_gym.simulation.engine import SPRING_GAIN
 
 __all__ = ["advance"]
 
@@ -45,32 +49,62 @@ _ZERO: Vector = (0.0, 0.0, 0.0)
 def advance(
     states: tuple[Records, Records, FloatArray],
     rows: IntArray,
-    path: FloatArray,
+    path: tuple[FloatArray, FloatArray, FloatArray],
+    frame: tuple[FloatArray, FloatArray],
     on: BoolArray,
     setting: Setting,
     work: Work,
     push: FloatArray,
+    carried: FloatArray,
 ) -> None:
     """Run K time steps of some tables.
 
     Args:
         states: Objects (n, k), cups (n,) and forces (n, slots, 3) N; changed.
         rows: (r,) which tables.
-        path: (r, K + 2, 3) m, world, point P.
+        path: Point P, m, machine's frame: before the last time step (r, 3), now (r, 3), and after
+            each time step to come (r, K, 3).
+        frame: Factors (3,) and origin (3,) m of the machine's frame.
         on: (r,) whether the vacuum is on.
         setting: Constants.
         work: Workspace.
-        push: (r, K, 3) N, world, on the platform; written where it is not zero.
+        push: (r, K, 3) N, machine's frame, on the platform; written where it is not zero.
+        carried: (r,) kg, masses that the cups hold at the end; written likewise.
     """
+    turn, origin = three(frame[0]), three(frame[1])
+    points = np.empty((push.shape[1] + 2, 3))
     for i in range(len(rows)):
-        row, points = rows[i], path[i]
-        objects, cup, forces = states[0][row], states[1][row], states[2][row]
+        row = rows[i]
+        cup = states[1][row]
+        put_row(points, 0, _placed(row_of(path[0], i), turn, origin))
+        put_row(points, 1, _placed(row_of(path[1], i), turn, origin))
+        for k in range(2, len(points)):
+            point = path[2][i, k - 2, 0], path[2][i, k - 2, 1], path[2][i, k - 2, 2]
+            put_row(points, k, _placed(point, turn, origin))
         idle = cup["held"] < 0 and cup["slide"] == 0 and cup["vacuum"] == 0
-        if idle and _at_rest(objects) and not _reached(objects, points, setting):
+        # Views of arrays cost more than all comparisons here.
+        for index in range(states[0].shape[1]):
+            idle = idle and states[0][row, index]["rest"] >= AT_REST
+        if idle and not _reached(states[0], row, points, setting):
             continue
+        objects, forces = states[0][row], states[2][row]
         for k in range(len(points) - 2):
-            way = Way(three(points[k]), three(points[k + 1]), three(points[k + 2]))
-            put(push[i, k], _step(objects, cup, forces, way, on[i], setting, work))
+            way = Way(row_of(points, k), row_of(points, k + 1), row_of(points, k + 2))
+            force = _step(objects, cup, forces, way, on[i], setting, work)
+            put(push[i, k], _placed(force, turn, _ZERO))
+        held = int(cup["held"])
+        if held >= 0:
+            carried[i] = objects[held]["mass"]
+
+
+@compiled
+def _placed(point: Vector, turn: Vector, origin: Vector) -> Vector:
+    """Convert a point of the machine's frame into the world, or a direction back."""
+    return (
+        turn[0] * point[0] + origin[0],
+        turn[1] * point[1] + origin[1],
+        turn[2] * point[2] + origin[2],
+    )
 
 
 @compiled
@@ -93,13 +127,13 @@ def _slow(objects: Records) -> bool:
 
 
 @compiled
-def _reached(objects: Records, points: FloatArray, setting: Setting) -> bool:
+def _reached(tables: Records, row: int, points: FloatArray, setting: Setting) -> bool:
     """Return whether the lip may come to touch an object, by boxes around both."""
     lowest = math.inf
     for k in range(1, len(points)):
         lowest = min(lowest, points[k, 2])
-    for index in range(len(objects)):
-        (x, y, z), size = three(objects[index]["position"]), length(three(setting.half[index]))
+    for index in range(tables.shape[1]):
+        (x, y, z), size = three(tables[row, index]["position"]), length(row_of(setting.half, index))
         if lowest - CUP.length < z + size + _BESIDE:
             near = size + CUP.radius + _BESIDE
             for k in range(1, len(points)):

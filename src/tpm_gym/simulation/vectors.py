@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from tpm_gym.arrays import Vector
-from tpm_gym.compiling import compiled
+from tpm_gym.compiling import compilable, compiled
 
 __all__ = [
     "Frame",
@@ -16,8 +16,11 @@ __all__ = [
     "dot",
     "length",
     "level_length",
+    "onto",
     "plus",
     "put",
+    "put_row",
+    "row_of",
     "three",
 ]
 
@@ -53,6 +56,30 @@ def dot(a: Vector, b: Vector) -> float:
 def cross(a: Vector, b: Vector) -> Vector:
     """Return the vector product."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def onto(start: Vector, matrices: Any, row: int, a: Vector, sign: float = 1.0) -> Vector:
+    """Return start + sign matrix a, added from left to right; matrices (n, 3, 3)."""
+    x, y, z = a[0] * sign, a[1] * sign, a[2] * sign
+    m = matrices
+    return (
+        start[0] + m[row, 0, 0] * x + m[row, 0, 1] * y + m[row, 0, 2] * z,
+        start[1] + m[row, 1, 0] * x + m[row, 1, 1] * y + m[row, 1, 2] * z,
+        start[2] + m[row, 2, 0] * x + m[row, 2, 1] * y + m[row, 2, 2] * z,
+    )
+
+
+def row_of(values: Any, row: int) -> Vector:
+    """Return a row of an array (n, 3); faster than :func:`three` of a view."""
+    return values[row, 0], values[row, 1], values[row, 2]
+
+
+def put_row(values: Any, row: int, vector: Vector) -> None:
+    """Write a vector into a row of an array (n, 3)."""
+    values[row, 0], values[row, 1], values[row, 2] = vector
+
+
+compilable(onto, row_of, put_row)
 
 
 @compiled
