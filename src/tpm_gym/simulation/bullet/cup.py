@@ -20,7 +20,6 @@ __all__ = ["Cup", "Grip"]
 
 _WELD_FORCE = 1e4  # N; the weld itself never yields
 _FASTEST = 2.5  # m/s, of the lip towards an object; twice the fastest command
-_NOTHING = Load()
 
 
 class Grip(NamedTuple):
@@ -28,9 +27,6 @@ class Grip(NamedTuple):
 
     hold: Hold = EMPTY
     pose: Pose | None = None
-
-
-_OPEN = Grip()
 
 
 class Cup:
@@ -82,13 +78,13 @@ class Cup:
                 if wait < steps:
                     self._near.append(index)
                     self.first = min(self.first, wait)
-        self.sucks = 0 if self.grip != _OPEN else self.first if on else steps
+        self.sucks = 0 if self.grip != Grip() else self.first if on else steps
         return self._near
 
     def suck(self, on: bool) -> None:
         """Apply the vacuum law after a time step: change the pressure, take or drop an object."""
         hold, pose = self.grip
-        load = _NOTHING if pose is None else self._load()
+        load = Load() if pose is None else self._load()
         touched = self._touched() if on and pose is None else -1
         if touched < 0 and hold == EMPTY:
             return

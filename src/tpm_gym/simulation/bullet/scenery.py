@@ -51,40 +51,29 @@ class Scenery:
 
     def _add_slab(self, slab: Slab, edges: tuple[float, float], drawn: bool = True) -> int:
         """Add a static board with these half edges, m; return its number."""
-        client, half = self._client, (*edges, slab.half_height)
-        solid = client.createCollisionShape(client.GEOM_BOX, halfExtents=half)
-        shape = -1
-        if drawn:
-            shape = client.createVisualShape(
-                client.GEOM_BOX, halfExtents=half, rgbaColor=slab.colour
-            )
-        body: int = client.createMultiBody(
-            baseCollisionShapeIndex=solid,
-            baseVisualShapeIndex=shape,
-            basePosition=(0.0, 0.0, slab.top - slab.half_height),
-        )
+        height = slab.top - slab.half_height
+        body = self._add_box((*edges, slab.half_height), height, slab.colour if drawn else None)
         # PyBullet multiplies the friction of both bodies.
-        client.changeDynamics(body, -1, lateralFriction=slab.friction)
+        self._client.changeDynamics(body, -1, lateralFriction=slab.friction)
         return body
 
     def _add_block(self, block: Block) -> int:
-        client, half = self._client, block.half
-        solid = client.createCollisionShape(client.GEOM_BOX, halfExtents=half)
-        drawn = client.createVisualShape(client.GEOM_BOX, halfExtents=half, rgbaColor=block.colour)
-        body: int = client.createMultiBody(
-            baseMass=block.mass,
-            baseCollisionShapeIndex=solid,
-            baseVisualShapeIndex=drawn,
-            basePosition=(0.0, 0.0, block.height / 2),
-        )
-        client.changeDynamics(
-            body,
-            -1,
-            lateralFriction=block.friction,
-            linearDamping=0.0,
-            angularDamping=0.0,
+        body = self._add_box(block.half, block.height / 2, block.colour, block.mass)
+        self._client.changeDynamics(
+            body, -1, lateralFriction=block.friction, linearDamping=0.0, angularDamping=0.0
         )
         return body
+
+    def _add_box(
+        self, half: Vector, height: float, colour: Sequence[float] | None, mass: float = 0.0
+    ) -> int:
+        """Add a box above the origin; without mass it is static, without colour not drawn."""
+        client, shape = self._client, -1
+        solid = client.createCollisionShape(client.GEOM_BOX, halfExtents=half)
+        if colour is not None:
+            shape = client.createVisualShape(client.GEOM_BOX, halfExtents=half, rgbaColor=colour)
+        place = (0.0, 0.0, height)
+        return int(client.createMultiBody(mass, solid, shape, basePosition=place))
 
     def move_markers(self, positions: Sequence[Vector]) -> None:
         """Show the goal at these points, m, world."""
@@ -108,12 +97,9 @@ class Scenery:
         """Make the objects ``mass`` times as heavy and ``friction`` times as rough as nominal."""
         for body, nominal in zip(self.bodies, self._blocks, strict=True):
             block = replace(nominal, mass=mass * nominal.mass, friction=friction * nominal.friction)
+            moments, rough = block.inertia, block.friction
             self._client.changeDynamics(
-                body,
-                -1,
-                mass=block.mass,
-                localInertiaDiagonal=block.inertia,
-                lateralFriction=block.friction,
+                body, -1, mass=block.mass, localInertiaDiagonal=moments, lateralFriction=rough
             )
 
     def aim_window(self) -> None:

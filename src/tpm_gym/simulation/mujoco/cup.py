@@ -19,7 +19,6 @@ from tpm_gym.simulation.vacuum import CLEARANCE, EMPTY, Hold, Load, hold_after
 
 __all__ = ["Cup", "Grip"]
 
-_NO_LOAD = Load()
 _SOFTER = 0.5
 """Factor of the contacts' stiffness of the held object.
 
@@ -68,7 +67,7 @@ class Cup:
     def load(self) -> Load:
         """Return the load of the seal, after the second half of a time step."""
         if self.grip.hold.which < 0:
-            return _NO_LOAD
+            return Load()
         row = self._row
         x, y, z = self._data.efc_force[row : row + 3].tolist()
         _, (a, b, c) = self._robot.cup()
@@ -121,7 +120,7 @@ class Cup:
         gap = _in_frame(position, quaternion, lip)[2] - self._blocks[index].height / 2
         x, y, z = _in_frame(origin, turn, position)
         relative = np.empty(4)
-        mujoco.mju_mulQuat(relative, _wxyz(_inverse(turn)), _wxyz(quaternion))
+        mujoco.mju_mulQuat(relative, np.roll(_inverse(turn), 1), np.roll(quaternion, 1))
         qw, qx, qy, qz = relative.tolist()
         return Pose((x, y, z + max(0.0, CLEARANCE - gap)), (qx, qy, qz, qw))
 
@@ -135,9 +134,3 @@ def _in_frame(origin: Vector, quaternion: Quaternion, point: Vector) -> Vector:
     """Convert a point of the world into a frame."""
     (x, y, z), (u, v, w) = point, origin
     return rotate(_inverse(quaternion), (x - u, y - v, z - w))
-
-
-def _wxyz(quaternion: Quaternion) -> tuple[float, float, float, float]:
-    """Reorder a quaternion as MuJoCo writes it."""
-    x, y, z, w = quaternion
-    return w, x, y, z

@@ -13,13 +13,7 @@ from tpm_gym.mechanism.mjcf import SOLID, STIFF, robot
 from tpm_gym.mechanism.mount import GRAVITY
 from tpm_gym.mechanism.urdf import numbers
 from tpm_gym.simulation.mujoco.physics import Physics
-from tpm_gym.simulation.stage import (
-    FLOOR,
-    FLOOR_EDGE,
-    LIGHT,
-    MARKER_COLOUR,
-    TABLE,
-)
+from tpm_gym.simulation.stage import FLOOR, FLOOR_EDGE, LIGHT, MARKER_COLOUR, TABLE
 from tpm_gym.simulation.state import Block, Scene
 
 __all__ = ["compile_model", "grip_name", "marker_name", "object_name"]
@@ -28,6 +22,7 @@ _RECOVERY = 0.1
 """Share of a penetration that a contact removes in one time step; this value bounces least."""
 _MARGIN = 1e-6  # m, so that an object placed exactly on the table is in contact at once
 
+_NO_CONTACT = {"contype": "0", "conaffinity": "0"}  # pairs alone collide
 _OUT_OF_SIGHT = "0 0 -9"  # place of markers that are not shown; at 0 0 0 they could not move
 
 
@@ -54,14 +49,8 @@ def compile_model(machine: Machine, scene: Scene, physics: Physics) -> mujoco.Mj
     _surroundings(world, machine, scene)
     for index, block in enumerate(scene.objects):
         _object(world, index, block)
-        SubElement(
-            equality,
-            "weld",
-            name=grip_name(index),
-            body1=machine.mechanism.tool,
-            body2=object_name(index),
-            active="false",
-        )
+        ends = {"body1": machine.mechanism.tool, "body2": object_name(index)}
+        SubElement(equality, "weld", ends, name=grip_name(index), active="false")
     root.append(_contacts(root, scene, physics))
     return mujoco.MjModel.from_xml_string(tostring(root, encoding="unicode"))
 
@@ -104,11 +93,10 @@ def _light(root: Element, world: Element) -> None:
 
 def _surroundings(world: Element, machine: Machine, scene: Scene) -> None:
     """Add table, floor and markers."""
-    still = {"contype": "0", "conaffinity": "0"}  # pairs alone collide
     SubElement(
         world,
         "geom",
-        still,
+        _NO_CONTACT,
         name="table",
         type="box",
         size=numbers((*machine.table, TABLE.half_height)),
@@ -118,7 +106,7 @@ def _surroundings(world: Element, machine: Machine, scene: Scene) -> None:
     SubElement(
         world,
         "geom",
-        still,
+        _NO_CONTACT,
         name="floor",
         type="plane",
         size=numbers((FLOOR_EDGE, FLOOR_EDGE, 1.0)),
@@ -126,34 +114,19 @@ def _surroundings(world: Element, machine: Machine, scene: Scene) -> None:
         rgba=numbers(FLOOR.colour),
     )
     for index in range(scene.markers):
-        size = numbers([scene.marker_radius])
-        rgba = numbers(MARKER_COLOUR)
-        site = SubElement(world, "site", name=marker_name(index), type="sphere", size=size)
-        site.set("rgba", rgba)
-        site.set("pos", _OUT_OF_SIGHT)
+        looks = {"size": numbers([scene.marker_radius]), "rgba": numbers(MARKER_COLOUR)}
+        name = marker_name(index)
+        SubElement(world, "site", looks, name=name, type="sphere", pos=_OUT_OF_SIGHT)
 
 
 def _object(world: Element, index: int, block: Block) -> None:
     name = object_name(index)
     body = SubElement(world, "body", name=name)
     SubElement(body, "freejoint", name=name)
-    SubElement(
-        body,
-        "inertial",
-        pos="0 0 0",
-        mass=numbers([block.mass]),
-        diaginertia=numbers(block.inertia),
-    )
-    SubElement(
-        body,
-        "geom",
-        name=name,
-        type="box",
-        size=numbers(block.half),
-        rgba=numbers(block.colour),
-        contype="0",
-        conaffinity="0",
-    )
+    mass, moments = numbers([block.mass]), numbers(block.inertia)
+    SubElement(body, "inertial", pos="0 0 0", mass=mass, diaginertia=moments)
+    size, rgba = numbers(block.half), numbers(block.colour)
+    SubElement(body, "geom", _NO_CONTACT, name=name, type="box", size=size, rgba=rgba)
 
 
 def _contacts(root: Element, scene: Scene, physics: Physics) -> Element:

@@ -66,6 +66,7 @@ class Robot:
         self._sides = [[model.site(pair[side]).id for pair in pairs] for side in (0, 1)]
         # Friction is as stiff as possible, and stops a motion in one time step.
         step = model.opt.timestep
+        self._rate = 1 / step
         model.dof_solimp[:] = [float(number) for number in STIFF.split()]
         model.dof_solref[:] = -1 / step**2, -1 / step
         self._position, self._speed, self._height = data.qpos.item, data.qvel.item, data.xpos.item
@@ -74,7 +75,7 @@ class Robot:
 
     def alter(self, plant: Plant) -> None:
         """Apply masses, motors and friction of ``plant``."""
-        model, rate = self._model, 1 / self._model.opt.timestep
+        model, rate = self._model, self._rate
         factors = plant.link_masses or [1.0] * len(self._inertias)
         for (body, (mass, moments)), factor in zip(self._inertias.items(), factors, strict=True):
             model.body_mass[body] = factor * mass
@@ -82,15 +83,13 @@ class Robot:
         pairs = zip(self._efforts, plant.motor_strength, strict=True)
         limits = [max(effort * strength, _LEAST_EFFORT) for effort, strength in pairs]
         losses = limits if self._ideal else plant.joint_friction
-        for (_, dof), loss in zip(
-            (*self._motors, self._slide), (*losses, self._spring), strict=True
-        ):
+        joints = (*self._motors, self._slide)
+        for (_, dof), loss in zip(joints, (*losses, self._spring), strict=True):
             model.dof_frictionloss[dof] = loss
         driven = [(*motor, rate) for motor in self._motors] if self._ideal else []
         driven.append((*self._slide, SPRING_GAIN * rate))
         rough = np.flatnonzero(model.dof_frictionloss).tolist()  # each has a row, in this order
         self._rows = [(rough.index(dof), at, dof, gain) for at, dof, gain in driven]
-        self._rate = rate
 
     def place(self, joints: Mapping[str, float]) -> None:
         """Put every joint at its position (rad, m)."""
