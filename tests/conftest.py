@@ -1,10 +1,16 @@
 """Tests of an engine are skipped where its package is not installed."""
 
 from collections.abc import Generator
+from importlib.util import find_spec
 
 import pytest
 
 from tpm_gym.errors import MissingPackageError
+
+# These import PyBullet at their top.
+collect_ignore_glob = (
+    [] if find_spec("pybullet") else ["simulation/bullet/*", "benchmarks/test_variants.py"]
+)
 
 
 @pytest.hookimpl(wrapper=True)
@@ -27,3 +33,9 @@ def pytest_runtest_setup() -> Generator[None, None, None]:
         if error.package == "pybullet":
             pytest.skip(str(error))
         raise
+
+
+@pytest.fixture(scope="session")
+def needs_pybullet() -> None:
+    """Skip a test that uses PyBullet in another process."""
+    pytest.importorskip("pybullet")

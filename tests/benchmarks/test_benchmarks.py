@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import pytest
 import soak
 from paths import ROOT, read_strict
 from processes import PYTHON, printed_by
@@ -14,6 +15,7 @@ PICK = "TPMPickAndPlace-v0"
 # -- speed ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("needs_pybullet")
 def test_bench_speed_from_the_command_line(tmp_path):
     numbers, plot = tmp_path / "deep" / "speed.json", tmp_path / "speed.png"
     command = f"""--contestants TPMReach-v0 {PICK} --rounds 2 --steps 60 --scaling-steps 10
@@ -43,6 +45,7 @@ def soaked(folder: Path, *options: str, **hooks: Any) -> tuple[int, dict[str, An
     return soak.main([*SHORT, "--json", str(numbers), *options], **hooks), read_strict(numbers)
 
 
+@pytest.mark.usefixtures("needs_pybullet")
 def test_soak_goes_through_everything_and_passes(tmp_path, capsys, monkeypatch):
     for share in ("REOPEN", "RENDER", "SAVE"):
         monkeypatch.setattr(soak, share, 0.6)  # so that a short one sees all of it
@@ -70,6 +73,7 @@ class Raising(gym.Wrapper):
         return super().step(action)
 
 
+@pytest.mark.usefixtures("needs_pybullet")
 def test_a_step_that_raises_is_reported_outlived_and_can_be_repeated(tmp_path, capsys):
     def make(env_id, **options):
         env = gym.make(env_id, **options)

@@ -113,7 +113,7 @@ def test_what_is_done_is_skipped_and_what_was_stopped_goes_on(
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+def run(needs_pybullet: None, tmp_path_factory: pytest.TempPathFactory) -> Run:
     """Execute a run of the penalty plan, with a tiny recipe."""
     folder = tmp_path_factory.mktemp("study")
     study = Study("penalty", "analytic", ("TPMReachDense-v0",), seeds=1, episodes=4, folder=folder)

@@ -170,6 +170,7 @@ def single_rows(
         yield row
 
 
+@pytest.mark.usefixtures("needs_pybullet")
 @pytest.mark.parametrize(
     ("vectorise", "env_id", "randomisation"), VECTORS.values(), ids=VECTORS.keys()
 )

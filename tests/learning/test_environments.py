@@ -52,6 +52,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     return run_anew
 
 
+@pytest.mark.usefixtures("needs_pybullet")
 def test_an_id_of_a_users_module_is_trained_in_workers_resumed_and_evaluated(
     tmp_path: Path, run: Callable[..., None]
 ) -> None:
@@ -105,6 +106,7 @@ def test_no_file_decides_what_is_imported(
         run("resume", "a run", "--env", "TPMReach-v0")
 
 
+@pytest.mark.usefixtures("needs_pybullet")
 def test_a_stopped_run_says_how_its_module_is_found_again(
     tmp_path: Path,
     run: Callable[..., None],

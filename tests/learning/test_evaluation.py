@@ -32,7 +32,9 @@ METRICS = (
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], str]:
+def written(
+    needs_pybullet: None, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[dict[str, Any], str]:
     """Return the JSON and the output of the command line, run on one policy."""
     path = tmp_path_factory.mktemp("evaluate") / "deep" / "er" / "expert.json"
     options = f"--policy expert --env TPMReach-v0 --episodes 4 --seed 7 --json {path}".split()

@@ -206,6 +206,7 @@ def newest(run: Path) -> int:
     return max(CheckpointStore(run / "checkpoints").steps(), default=-1)
 
 
+@pytest.mark.usefixtures("needs_pybullet")
 def test_kill_9_costs_nothing(tmp_path: Path) -> None:
     config = make_config("sac", tmp_path)
     run = tmp_path / "run"

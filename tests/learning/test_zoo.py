@@ -29,6 +29,7 @@ def test_every_recipe_is_handed_over_with_classes_for_their_names(algorithm: str
             assert entries["policy_kwargs"]["features_extractor_class"] is GoalGapExtractor
 
 
+@pytest.mark.usefixtures("needs_pybullet")
 @pytest.mark.parametrize(
     ("algorithm", "env_id", "steps"),
     [("sac", "TPMReach-v0", 1020), ("ppo", "TPMReachDense-v0", 1)],

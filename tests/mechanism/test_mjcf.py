@@ -8,6 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from paths import ROOT
 
 from tpm_gym.mechanism import PAPER_TPM, WIDE_TPM, Machine
 from tpm_gym.mechanism.cup import CUP
@@ -153,3 +154,13 @@ def test_the_cup_yields_at_its_preload() -> None:
             positions.append(slide.qpos.item())
         # 75 N/m: 5% more than the preload takes it in by 10 mm, about which it swings.
         assert np.mean(positions) == pytest.approx(expected, abs=1e-3)
+
+
+def test_the_scene_shows_the_robot_and_touches_nothing() -> None:
+    model = mujoco.MjModel.from_xml_path(str(FOLDER / "scene.xml"))
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    mujoco.mj_step(model, data, nstep=400)
+    assert data.ncon == 0
+    assert np.abs(data.qvel).max() < 0.02
+    assert (FOLDER / "LICENSE").read_bytes() == (ROOT / "LICENSE").read_bytes()

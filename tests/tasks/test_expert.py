@@ -13,7 +13,6 @@ from episodes import expert_episode
 import tpm_gym
 from tpm_gym import TPMEnv
 from tpm_gym.errors import ConfigurationError, EpisodeError, InputError
-from tpm_gym.simulation.bullet.cup import Grip
 from tpm_gym.tasks import Expert, Motion, Move, Reach
 
 PLACES = [{"machine": name} for name in ("paper", "wide", "gantry")] + [{"engine": "kinematic"}]
@@ -62,6 +61,8 @@ def test_on_the_table_it_lets_go_and_in_the_air_it_holds(env: Any) -> None:
 
 
 def test_it_tries_again_when_the_block_is_lost(env: Any) -> None:
+    from tpm_gym.simulation.bullet.cup import Grip
+
     options = {"object": (-0.1, -0.03, 0.015), "goal": (0.0, -0.03, 0.1)}
     lost, successes = False, []
     for *_, info in expert_episode(env, 0, options=options):

@@ -1,0 +1,55 @@
+"""Tests with all supported versions of Python and of the dependencies.
+
+`nox` runs all sessions, `nox -s newest-3.12` one, `nox -s newest-3.12 -- tests/kinematics` a part of the tests.
+Set ``UV_TORCH_BACKEND=cpu`` to install a CPU build of PyTorch; pip's default on Linux includes CUDA.
+"""
+
+from __future__ import annotations
+
+import nox
+
+nox.needs_version = ">=2024.4"
+nox.options.default_venv_backend = "uv"
+nox.options.error_on_missing_interpreters = False
+
+PYTHONS = ["3.10", "3.11", "3.12", "3.13", "3.14"]
+
+
+@nox.session(python=PYTHONS)
+def newest(session: nox.Session) -> None:
+    """Run the fast tests with the newest versions that pyproject.toml admits."""
+    session.install("--upgrade", ".[test]")
+    _test(session)
+
+
+@nox.session(python=PYTHONS[0])
+def lowest(session: nox.Session) -> None:
+    """Run the fast tests with the lowest versions that pyproject.toml admits."""
+    session.install("--resolution", "lowest-direct", ".[test]")
+    _test(session)
+
+
+@nox.session(python="3.11")
+def pinned(session: nox.Session) -> None:
+    """Install what constraints.txt pins, and check that it pins everything."""
+    session.install("-c", "constraints.txt", ".[train,test,policy,bench,studies,docs,view]", "build")
+    installed = session.run("uv", "pip", "freeze", silent=True, external=True)
+    pins = {line.split("==")[0] for line in open("constraints.txt") if "==" in line}
+    loose = {line.split("==")[0] for line in str(installed).splitlines() if "==" in line} - pins
+    if loose:
+        session.error(f"constraints.txt does not pin {', '.join(sorted(loose))}")
+
+
+@nox.session(python="3.11")
+def package(session: nox.Session) -> None:
+    """Build wheel and sdist, and check their metadata and contents."""
+    session.install("build", "twine", "check-wheel-contents")
+    folder = session.create_tmp()
+    session.run("python", "-m", "build", "--outdir", folder, ".")
+    session.run("bash", "-c", f"twine check --strict {folder}/*", external=True)
+    session.run("bash", "-c", f"check-wheel-contents {folder}/*.whl", external=True)
+
+
+def _test(session: nox.Session) -> None:
+    session.run("uv", "pip", "freeze", external=True)
+    session.run("pytest", "-q", "-n", "logical", "--maxprocesses", "8", *session.posargs)
