@@ -20,13 +20,16 @@ class ExportConfig:
     """Export a trained policy as safetensors and JSON, which load without trust."""
 
     model: Positional[Path]
-    """Archive (.zip) of a training, in its run folder."""
+    """Archive (.zip) of a training in its run folder, or an exported policy (.json)."""
 
     out: Positional[Path]
     """Common name of the two new files; an earlier policy is replaced, no other files."""
 
     trust_pickle: bool = False
     """Load the .zip file, which can run any code."""
+
+    evaluation: Path | None = None
+    """Results of `tpm-gym evaluate --json`; also write a model card for the Hugging Face Hub."""
 
 
 Command = (
@@ -49,7 +52,8 @@ def main(words: Sequence[str] | None = None) -> None:
         if isinstance(command, EvaluationConfig):
             evaluate(command)
             return
-        from tpm_gym.learning import export, training  # imported here, since they need PyTorch
+        # Imported here, since they need PyTorch.
+        from tpm_gym.learning import export, model_card, training
 
         match command:
             case TrainingConfig():
@@ -57,7 +61,12 @@ def main(words: Sequence[str] | None = None) -> None:
             case ResumeConfig():
                 stopped_by = training.resume(command)
             case ExportConfig():
-                print(export.convert(command.model, command.out, trust_pickle=command.trust_pickle))
+                policy = export.convert(
+                    command.model, command.out, trust_pickle=command.trust_pickle
+                )
+                print(policy)
+                if command.evaluation is not None:
+                    print(model_card.write(policy, command.evaluation))
     except TPMError as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:

@@ -4,8 +4,10 @@ import copy
 import io
 import json
 import os
+import shutil
 import tempfile
 from collections.abc import Mapping
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, Final
@@ -128,12 +130,21 @@ def _require_free(path: Path) -> None:
 
 
 def convert(archive: Path, path: Path, *, trust_pickle: bool) -> Path:
-    """Export ``best.zip`` or ``last.zip`` of a run with :func:`save`; return the JSON file."""
+    """Export ``best.zip`` or ``last.zip`` of a run with :func:`save`, or copy an exported policy.
+
+    Returns:
+        The JSON file.
+    """
     if not archive.is_file():
         raise ConfigError(f"MODEL {archive}: no such file; give best.zip or last.zip of a run")
     _require_free(path)
     provenance.require_writable("OUT", path)
     name = str(archive)
+    if archive.suffix == ".json":
+        load_policy(archive)  # raises for a damaged policy
+        for old, new in zip(files(archive.with_suffix("")), files(path), strict=True):
+            provenance.write_whole(new, partial(shutil.copyfile, old))
+        return files(path)[0]
     require_trust(name, archive, trust_pickle)
     config = run_config(name, archive)
     about = {key: config[key] for key in ("seed", "recipe", "env_options")}

@@ -1,0 +1,116 @@
+"""Model cards of exported policies, for the Hugging Face Hub."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from tpm_gym.learning import provenance
+from tpm_gym.learning.errors import ConfigError
+
+_TEXT = """---
+{front}---
+
+# {algorithm} on {env}
+
+Policy of [tpm_gym]({home}), trained for {steps:,} steps with {algorithm} (seed {seed}).
+The layers have {hidden} units. The files are safetensors and JSON, and load without pickle.
+
+```python
+import gymnasium as gym
+import tpm_gym
+
+env = gym.make("{env}"{options})
+policy = tpm_gym.load_policy("{name}.json")
+observation, info = env.reset(seed=0)
+action = policy.act(observation)
+```
+
+{episodes:,} episodes with seeds from {first} on, mean and 95% interval:
+
+| quantity | mean | low | high |
+| --- | --- | --- | --- |
+{rows}
+
+Command: `{command}`. Versions: {versions}.
+"""
+_HOME = "https://pypi.org/project/tpm-gym/"
+_ROWS = {
+    "success_at_end": "success at the end",
+    "return": "return",
+    "unsafe_share": "fraction of the time below safe conditioning",
+    "torque_rms": "torque, RMS, N m",
+}
+
+
+def write(policy: Path, evaluation: Path) -> Path:
+    """Write the model card of a policy beside its files; return the path of the card.
+
+    Args:
+        policy: JSON file of an exported policy.
+        evaluation: JSON file of ``tpm-gym evaluate --json`` with one policy.
+
+    Raises:
+        ConfigError: ``evaluation`` is no such file, or belongs to another id.
+    """
+    content = provenance.read_json(policy)
+    tested = _read(evaluation)
+    if tested["env"] != content["env"]:
+        raise ConfigError(
+            f"--evaluation {evaluation}: is of {tested['env']}, the policy is of {content['env']}"
+        )
+    card = policy.with_suffix(".md")
+    provenance.write_whole(card, lambda part: part.write_text(_text(card.stem, content, tested)))
+    return card
+
+
+def _read(evaluation: Path) -> dict[str, Any]:
+    try:
+        tested: Any = provenance.read_json(evaluation)
+        needed = {"env", "episodes", "seed", "command", "versions", *_ROWS}
+        if isinstance(tested, dict) and needed <= tested.keys():
+            return tested
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"--evaluation {evaluation}: {error}") from error
+    way = "`tpm-gym evaluate --policy POLICY --json FILE`, with one policy"
+    raise ConfigError(f"--evaluation {evaluation}: is no result of {way}")
+
+
+def _text(name: str, content: Mapping[str, Any], tested: Mapping[str, Any]) -> str:
+    success = tested["success_at_end"]
+    task = {"type": "reinforcement-learning", "name": "reinforcement-learning"}
+    metric = {"type": "success_rate", "value": success["mean"], "name": "success at the end"}
+    result = {
+        "task": task,
+        "dataset": {"name": content["env"], "type": content["env"]},
+        "metrics": [metric],
+    }
+    front = {
+        "library_name": "tpm_gym",
+        "license": "mit",
+        "tags": ["reinforcement-learning", "gymnasium", "parallel-robot", content["algorithm"]],
+        "model-index": [{"name": name, "results": [result]}],
+    }
+    rows = (
+        f"| {label} | " + " | ".join(f"{tested[key][end]:.4g}" for end in ("mean", "low", "high"))
+        for key, label in _ROWS.items()
+    )
+    options = content.get("env_options", {})
+    return _TEXT.format(
+        front=yaml.safe_dump(front, sort_keys=False),
+        home=_HOME,
+        algorithm=content["algorithm"].upper(),
+        env=content["env"],
+        steps=content["steps"],
+        seed=content["seed"],
+        hidden=" and ".join(str(width) for width in content["network"]["hidden"]),
+        options="".join(f", {key}={json.dumps(value)}" for key, value in options.items()),
+        name=name,
+        episodes=tested["episodes"],
+        first=tested["seed"],
+        rows=" |\n".join(rows) + " |",
+        command=tested["command"],
+        versions=", ".join(f"{key} {value}" for key, value in tested["versions"].items()),
+    )

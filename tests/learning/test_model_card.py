@@ -1,0 +1,51 @@
+"""Model cards say what the files say, and the Hub's own library reads them."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from huggingface_hub import ModelCard
+from paths import ROOT
+
+from tpm_gym.learning.command_line import main
+
+POLICIES = ROOT / "train" / "policies"
+NAME = "TPMReach-v0"
+RESULTS = POLICIES / f"{NAME}.evaluation.json"
+
+
+def export(out: Path, evaluation: Path) -> None:
+    main(["export", str(POLICIES / f"{NAME}.json"), str(out), "--evaluation", str(evaluation)])
+
+
+@pytest.mark.usefixtures("needs_pybullet")
+def test_a_published_policy_gets_a_card_whose_lines_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    export(tmp_path / "reach", RESULTS)
+    for suffix in (".json", ".safetensors"):
+        copied = (tmp_path / f"reach{suffix}").read_bytes()
+        assert copied == (POLICIES / f"{NAME}{suffix}").read_bytes()
+    card = ModelCard.load(tmp_path / "reach.md")
+    (result,) = card.data.eval_results
+    success = json.loads(RESULTS.read_text())["success_at_end"]
+    assert (result.dataset_name, result.metric_value) == (NAME, success["mean"])
+    (script,) = re.findall(r"```python\n(.*?)```", card.text, re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    exec(script, {})
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [("[", "Expecting value"), ("{}", "is no result of"), (None, "the policy is of TPMReach-v0")],
+)
+def test_results_of_something_else_are_rejected(
+    content: str | None, message: str, tmp_path: Path
+) -> None:
+    evaluation = tmp_path / "evaluation.json"
+    other = (POLICIES / "TPMPickAndPlace-v0.evaluation.json").read_text()
+    evaluation.write_text(other if content is None else content)
+    with pytest.raises(SystemExit, match=message):
+        export(tmp_path / "reach", evaluation)
+    assert not (tmp_path / "reach.md").exists()
