@@ -1,10 +1,13 @@
 """Tests with all supported versions of Python and of the dependencies.
 
-`nox` runs all sessions, `nox -s newest-3.12` one, `nox -s newest-3.12 -- tests/kinematics` a part of the tests.
-Set ``UV_TORCH_BACKEND=cpu`` to install a CPU build of PyTorch; pip's default on Linux includes CUDA.
+``nox`` runs all sessions, ``nox -s newest-3.12`` one of them, and
+``nox -s newest-3.12 -- tests/kinematics`` a part of its tests. Set ``UV_TORCH_BACKEND=cpu`` to
+install a CPU build of PyTorch: pip's default on Linux includes CUDA.
 """
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import nox
 
@@ -32,11 +35,10 @@ def lowest(session: nox.Session) -> None:
 @nox.session(python="3.11")
 def pinned(session: nox.Session) -> None:
     """Install what constraints.txt pins, and check that it pins everything."""
-    session.install("-c", "constraints.txt", ".[train,test,policy,bench,studies,docs,view]", "build")
-    installed = session.run("uv", "pip", "freeze", silent=True, external=True)
-    pins = {line.split("==")[0] for line in open("constraints.txt") if "==" in line}
-    loose = {line.split("==")[0] for line in str(installed).splitlines() if "==" in line} - pins
-    if loose:
+    extras = ".[train,test,policy,bench,studies,docs,view]"
+    session.install("-c", "constraints.txt", extras, "build")
+    installed = str(session.run("uv", "pip", "freeze", silent=True, external=True))
+    if loose := _pinned(installed) - _pinned(Path("constraints.txt").read_text()):
         session.error(f"constraints.txt does not pin {', '.join(sorted(loose))}")
 
 
@@ -53,3 +55,7 @@ def package(session: nox.Session) -> None:
 def _test(session: nox.Session) -> None:
     session.run("uv", "pip", "freeze", external=True)
     session.run("pytest", "-q", "-n", "logical", "--maxprocesses", "8", *session.posargs)
+
+
+def _pinned(text: str) -> set[str]:
+    return {line.split("==")[0].lower() for line in text.splitlines() if "==" in line}
