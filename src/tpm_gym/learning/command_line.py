@@ -11,7 +11,7 @@ import tyro
 from tyro.conf import Positional, subcommand
 
 from tpm_gym import TPMError
-from tpm_gym.learning.configuration import ResumeConfig, TrainingConfig
+from tpm_gym.learning.configuration import ResumeConfig, TrainingConfig, TuneConfig
 from tpm_gym.learning.evaluation import EvaluationConfig, evaluate
 
 
@@ -37,6 +37,7 @@ Command = (
     | Annotated[ResumeConfig, subcommand("resume")]
     | Annotated[EvaluationConfig, subcommand("evaluate")]
     | Annotated[ExportConfig, subcommand("export")]
+    | Annotated[TuneConfig, subcommand("tune")]
 )
 
 
@@ -53,13 +54,15 @@ def main(words: Sequence[str] | None = None) -> None:
             evaluate(command)
             return
         # Imported here, since they need PyTorch.
-        from tpm_gym.learning import export, model_card, training
+        from tpm_gym.learning import export, model_card, training, tune
 
         match command:
             case TrainingConfig():
                 stopped_by = training.train(command)
             case ResumeConfig():
                 stopped_by = training.resume(command)
+            case TuneConfig():
+                print(tune.tune(command))
             case ExportConfig():
                 policy = export.convert(
                     command.model, command.out, trust_pickle=command.trust_pickle

@@ -187,6 +187,34 @@ class ResumeConfig:
     """Device of PyTorch."""
 
 
+@dataclass(frozen=True)
+class TuneConfig:
+    """Search for a recipe: many trainings with varied hyperparameters, several at a time."""
+
+    algo: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(ALGORITHMS) + "}")] = "ppo"
+    """Algorithm."""
+
+    env: Annotated[str, tyro.conf.arg(metavar="ID")] = "TPMReachDense-v0"
+    """Environment id, or module:id for one that a module of yours registers."""
+
+    trials: int = 30
+    """Number of trainings."""
+
+    steps: Annotated[int, unset(int, "as the recipe says", "INT")] = UNSET
+    """Environment steps of each training."""
+
+    jobs: Annotated[int, unset(int, "one for each core", "INT")] = UNSET
+    """Trainings at a time, on this machine or on the Ray cluster that RAY_ADDRESS names."""
+
+    seed: int = 0
+    """Seed of the search; training i has this seed + i."""
+
+    folder: Annotated[Path, unset(Path, "runs/tune-<env>-<algo>", "FOLDER")] = UNSET
+    """Folder of the runs and of the best recipe; must not exist."""
+
+    env_options: tyro.conf.OmitArgPrefixes[EnvOptions] = field(default_factory=EnvOptions)
+
+
 def complete(config: TrainingConfig) -> TrainingConfig:
     """Compute the options that are not given, and check all."""
     import_module_of(config.env)

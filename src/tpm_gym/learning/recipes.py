@@ -7,6 +7,7 @@ Values are plain YAML and nothing is evaluated. Where the zoo evaluates a string
 ``"dict(net_arch=[64, 64])"``, a mapping is written here, which the zoo reads as well.
 """
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -31,6 +32,7 @@ class Recipe:
         hindsight: Whether the replay buffer relabels goals.
         demonstrations: Arguments of :class:`~tpm_gym.learning.Demonstrations`; empty for none.
         arguments: Other arguments of the algorithm's constructor.
+        written_for: Id that the recipe stands for in its file.
     """
 
     n_timesteps: int
@@ -39,6 +41,7 @@ class Recipe:
     hindsight: bool
     demonstrations: Mapping[str, Any]
     arguments: Mapping[str, Any]
+    written_for: str = ""
 
     def entries(self) -> dict[str, Any]:
         """Return the recipe as it stands in a file."""
@@ -113,9 +116,16 @@ def with_classes(entries: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_recipe(path: Path, algorithm: str, env_id: str) -> Recipe:
-    """Read the recipe of an environment, ``id`` or ``module:id``, after checking the whole file."""
+    """Read the recipe of an environment, ``id`` or ``module:id``, after checking the whole file.
+
+    A ``module:id`` without a recipe gets pick-and-place's, without its demonstrations.
+    """
     recipes = read_recipes(path, algorithm)
-    name = env_id.rpartition(":")[2]
+    module, _, name = env_id.rpartition(":")
+    known = "TPMPickAndPlace" + "".join(re.findall(r"(?:Joints)?(?:Dense)?-v", name)[-1:]) + "0"
+    if module and name not in recipes and known in recipes:
+        name = known
+        recipes[name].pop("demonstrations", None)
     if name not in recipes:
         elsewhere = [
             f"; --engine {file.stem.partition('-')[2]} has one"
@@ -133,6 +143,7 @@ def read_recipe(path: Path, algorithm: str, env_id: str) -> Recipe:
         hindsight=arguments.pop("replay_buffer_class", None) is not None,
         demonstrations=arguments.pop("demonstrations", {}),
         arguments=arguments,
+        written_for=name,
     )
 
 

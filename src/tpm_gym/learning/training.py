@@ -66,6 +66,9 @@ def train(config: TrainingConfig, console: Console | None = None) -> signal.Sign
     if config.steps != asked:
         whole = f"whole rollouts of {config.rollout:,} steps"
         _say(console, f"note: {asked:,} steps were asked for, and rounded up to {whole}")
+    if config.recipe.written_for != config.env.rpartition(":")[2]:
+        other = config.recipe.written_for
+        _say(console, f"note: the recipe is that of {other}; give your own with --recipe FILE")
     starts = config.argument("learning_starts") or 0
     if config.steps <= starts:
         _say(console, f"note: learning starts at step {starts:,}, so nothing will be learned")

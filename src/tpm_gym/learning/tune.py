@@ -1,0 +1,148 @@
+"""Search for hyperparameters: Optuna proposes, Ray Tune runs trainings in parallel.
+
+Each trial trains a variant of the environment's recipe, in a run folder of its own. Its score is
+the mean success of the last three evaluations, plus a thousandth of their return, so that the
+return decides between equal successes.
+"""
+
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from statistics import fmean
+from typing import Any, Final
+
+import yaml
+
+from tpm_gym.errors import MissingPackageError
+from tpm_gym.learning import provenance
+from tpm_gym.learning.algorithms import ALGORITHMS
+from tpm_gym.learning.configuration import TrainingConfig, TuneConfig, check_least, complete
+from tpm_gym.learning.errors import ConfigError
+from tpm_gym.learning.run_folder import evaluations
+
+RECIPE_FILE: Final = "recipe.yml"
+"""File of the best recipe in the folder of a search; give it to ``train --recipe``."""
+
+_SPACE: Final[Mapping[str, Sequence[float]]] = {
+    "learning_rate": (0.0003, 0.0006, 0.001, 0.002, 0.003),
+    "gamma": (0.9, 0.95, 0.98),
+    "batch_size": (128, 256, 512, 1024),
+    "tau": (0.005, 0.02, 0.05),
+    "n_epochs": (4, 8, 12),
+    "gae_lambda": (0.8, 0.9, 0.95),
+    "clip_range": (0.1, 0.2, 0.3),
+    "max_grad_norm": (0.5, 2.0, 5.0),
+    "policy_kwargs.log_std_init": (-1.5, -1.0, -0.5, 0.0),
+}
+"""Values to choose from, by entry of the recipe; an algorithm uses those that it has.
+
+A learning rate of the recipe that falls to zero falls in the variants too.
+"""
+
+
+def tune(config: TuneConfig) -> Path:
+    """Run a search and write the best recipe; Ray Tune prints a table while it runs.
+
+    Returns:
+        The recipe file.
+
+    Raises:
+        ConfigError: An option is not valid, the folder exists, or no training ended.
+        MissingPackageError: Ray Tune or Optuna is missing.
+    """
+    check_least(config, 1, "trials", "jobs", "steps")
+    check_least(config, 0, "seed")
+    name = config.env.rpartition(":")[2]
+    folder = config.folder or Path("runs", f"tune-{name}-{config.algo}")
+    if folder.exists():
+        raise ConfigError(f"--folder {folder}: exists; give another")
+    base = complete(
+        TrainingConfig(
+            algo=config.algo,
+            env=config.env,
+            steps=config.steps,
+            env_options=config.env_options,
+            test_episodes=0,
+        )
+    )
+    provenance.require_writable("--folder", folder)
+    best = _search(config, base, folder.resolve())
+    recipe = folder / RECIPE_FILE
+    text = yaml.safe_dump({name: _entries(base, best)}, sort_keys=False)
+    provenance.write_whole(recipe, lambda part: part.write_text(text, encoding="utf-8"))
+    return recipe
+
+
+def _search(config: TuneConfig, base: TrainingConfig, folder: Path) -> Mapping[str, Any]:
+    """Return the changes of the best trial."""
+    try:
+        import ray
+        from optuna.samplers import TPESampler
+        from ray import tune as ray_tune
+        from ray.tune.search.optuna import OptunaSearch
+    except ImportError as error:
+        raise MissingPackageError("ray[tune] and optuna", "cluster") from error
+
+    here = Path.cwd()  # Ray Tune works in folders of its own
+
+    def trainable(changes: dict[str, Any]) -> None:
+        ray_tune.report({"score": _train(base, changes, folder, config.seed, here)})
+
+    if not ray.is_initialized():
+        ray.init(num_cpus=config.jobs, include_dashboard=False, log_to_driver=False)
+    sampler, space = TPESampler(seed=config.seed), partial(_suggest, config.algo)
+    search = OptunaSearch(space, metric="score", mode="max", sampler=sampler)
+    settings = ray_tune.TuneConfig(
+        search_alg=search, num_samples=config.trials, max_concurrent_trials=config.jobs
+    )
+    storage = ray_tune.RunConfig(name="ray", storage_path=str(folder), verbose=1)
+    results: Any = ray_tune.Tuner(trainable, tune_config=settings, run_config=storage).fit()
+    if not (ended := [result for result in results if result.error is None]):
+        raise ConfigError(f"--folder {folder}: no training ended; read {folder}/000.log")
+    best: Mapping[str, Any] = max(ended, key=lambda result: result.metrics["score"]).config
+    return best
+
+
+def _suggest(algorithm: str, trial: Any) -> dict[str, Any]:
+    """Let a trial of Optuna choose values; return what is not chosen."""
+    known = ALGORITHMS[algorithm].entries().__annotations__
+    for name, values in _SPACE.items():
+        entries = known["policy_kwargs"].__annotations__ if "." in name else known
+        if name.rpartition(".")[2] in entries:
+            trial.suggest_categorical(name, values)
+    return {"trial": trial.number}
+
+
+def _train(
+    base: TrainingConfig, changes: Mapping[str, Any], folder: Path, seed: int, here: Path
+) -> float:
+    """Train a variant of the recipe in the folder ``here``, and return its score."""
+    number = changes["trial"]
+    run, recipe, log = (folder / f"{number:03d}{end}" for end in ("", ".yml", ".log"))
+    name = base.env.rpartition(":")[2]
+    recipe.write_text(yaml.safe_dump({name: _entries(base, changes)}), encoding="utf-8")
+    options = {"algo": base.algo, "env": base.env, "steps": base.steps, "seed": seed + number}
+    options |= {"recipe": recipe, "run": run, "test-episodes": 0, **base.env_options.given()}
+    words = [word for key, value in options.items() for word in (f"--{key}", str(value))]
+    # In a process of its own: Ray Tune calls this in a thread, which cannot receive signals.
+    with log.open("w", encoding="utf-8") as file:
+        command = [sys.executable, "-m", "tpm_gym.learning", "train", *words]
+        subprocess.run(command, stdout=file, stderr=file, cwd=here, check=True)
+    last = evaluations(run)[-3:]
+    return fmean(e["success_at_end"]["mean"] + e["return"]["mean"] / 1000 for e in last)
+
+
+def _entries(base: TrainingConfig, changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entries of the recipe with the changes of a trial."""
+    entries = {**base.recipe.entries(), "n_timesteps": base.steps}
+    policy = dict(entries.pop("policy_kwargs", {}))
+    for name, value in changes.items():
+        if name.startswith("policy_kwargs."):
+            policy[name.partition(".")[2]] = value
+        elif name == "learning_rate" and isinstance(entries.get(name), str):
+            entries[name] = f"lin_{value}"
+        elif name != "trial":
+            entries[name] = value
+    return {**entries, "policy_kwargs": policy}

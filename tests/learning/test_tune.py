@@ -1,0 +1,64 @@
+"""Searches with the real Optuna and Ray Tune."""
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+from tpm_gym.learning.command_line import main
+from tpm_gym.learning.configuration import EnvOptions, TrainingConfig, complete
+from tpm_gym.learning.run_folder import evaluations
+
+ANALYTIC = EnvOptions(engine="analytic")
+
+
+@pytest.mark.slow
+def test_the_best_of_a_search_is_a_recipe_that_trains(tmp_path: Path) -> None:
+    folder = tmp_path / "tuned"
+    words = "tune --env TPMReachDense-v0 --engine analytic --trials 3 --steps 8192 --jobs 2"
+    main([*words.split(), "--folder", str(folder)])
+    score = {}
+    for number in range(3):
+        recipe = yaml.safe_load((folder / f"{number:03d}.yml").read_text())
+        last = evaluations(folder / f"{number:03d}")[-3:]
+        success = sum(e["success_at_end"]["mean"] for e in last) / len(last)
+        returned = sum(e["return"]["mean"] for e in last) / len(last)
+        score[success + returned / 1000] = recipe
+        assert json.loads((folder / f"{number:03d}/config.json").read_text())["seed"] == number
+    assert len({str(recipe) for recipe in score.values()}) == 3
+    assert yaml.safe_load((folder / "recipe.yml").read_text()) == score[max(score)]
+    complete(TrainingConfig("ppo", "TPMReachDense-v0", recipe_file=folder / "recipe.yml"))
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--trials", "0"], "--trials 0: must be at least 1"),
+        (["--folder", "."], "exists; give another"),
+        (["--env", "TPMReach-v0"], "no recipe for TPMReach-v0"),
+    ],
+)
+def test_mistakes_are_named_before_ray_starts(words: list[str], message: str) -> None:
+    with pytest.raises(SystemExit, match=message):
+        main(["tune", *words])
+
+
+def test_a_task_of_the_users_gets_the_recipe_of_pick_and_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "hovering.py").write_text(
+        "import tpm_gym\nfrom tpm_gym.tasks import Reach\n\n\nclass Hover(Reach):\n    pass\n\n\n"
+        "tpm_gym.register_task('Hover', Hover)\n"
+    )
+    for algorithm, suffix, like in (
+        ("ppo", "Dense-v0", "TPMPickAndPlaceDense-v0"),
+        ("ppo", "JointsDense-v0", "TPMPickAndPlaceJointsDense-v0"),
+        ("sac", "-v0", "TPMPickAndPlace-v0"),
+    ):
+        options = ANALYTIC if algorithm == "ppo" else EnvOptions()
+        config = TrainingConfig(algorithm, f"hovering:TPMHover{suffix}", env_options=options)
+        recipe = complete(config).recipe
+        assert recipe.written_for == like
+        assert not recipe.demonstrations
