@@ -31,11 +31,7 @@ _RANGES: dict[str, Range] = {
 }
 # With the largest bias and length errors at once, the arm at home can still be assembled; with
 # twice as much, some machines have no assembly at the joint positions of the encoders.
-_SIZES: dict[str, float] = {
-    "encoder_noise": 0.02,
-    "encoder_bias": 1e-3,
-    "length_error": 1e-3,
-}
+_SIZES: dict[str, float] = {"encoder_noise": 0.02, "encoder_bias": 1e-3, "length_error": 1e-3}
 _LATEST = 5  # control steps
 LIMITS: dict[str, Range] = {
     **_RANGES,

@@ -16,13 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray
-from tpm_gym.simulation.analytic.contact.state import (
-    CUP_STATE,
-    OBJECT,
-    Setting,
-    slots,
-    work_for,
-)
+from tpm_gym.simulation.analytic.contact.state import CUP_STATE, OBJECT, Setting, slots, work_for
 from tpm_gym.simulation.analytic.contact.stepping import advance
 from tpm_gym.simulation.state import Block
 

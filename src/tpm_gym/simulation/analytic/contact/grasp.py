@@ -9,14 +9,7 @@ from tpm_gym.compiling import compilable, compiled
 from tpm_gym.mechanism.cup import CUP, sealed
 from tpm_gym.mechanism.mount import GRAVITY
 from tpm_gym.simulation.analytic.contact.state import Record, Records, Setting
-from tpm_gym.simulation.vacuum import (
-    CLEARANCE,
-    Hold,
-    Load,
-    hold_after,
-    holds,
-    pressure_after,
-)
+from tpm_gym.simulation.vacuum import CLEARANCE, Hold, Load, hold_after, holds, pressure_after
 from tpm_gym.simulation.vectors import length, level_length, plus, put, three
 
 __all__ = ["CUP_MASS", "Way", "breathe", "carry", "lip_of"]

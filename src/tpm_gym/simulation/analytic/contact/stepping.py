@@ -18,17 +18,7 @@ from tpm_gym.simulation.analytic.contact.grasp import CUP_MASS, Way, breathe, ca
 from tpm_gym.simulation.analytic.contact.solver import Motor, prepare, solve, still
 from tpm_gym.simulation.analytic.contact.state import AT_REST, Record, Records, Setting, Work
 from tpm_gym.simulation.engine import SPRING_GAIN
-from tpm_gym.simulation.vectors import (
-    axes,
-    cross,
-    dot,
-    length,
-    plus,
-    put,
-    put_row,
-    row_of,
-    three,
-)
+from tpm_gym.simulation.vectors import axes, cross, dot, length, plus, put, put_row, row_of, three
 
 __all__ = ["advance"]
 
