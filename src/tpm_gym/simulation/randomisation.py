@@ -98,8 +98,8 @@ class Randomisation:
             Requires ``drive="servo"``.
         joint_friction: Coulomb friction on each motor's axis, N m; within 0 to 100. Requires
             ``drive="servo"``.
-        encoder_noise: Standard deviation of each encoder reading, rad; at most 0.02. Joint
-            velocities have noise too: the difference of two readings, over the control period.
+        encoder_noise: Standard deviation of each encoder reading, rad; at most 0.02. The noise of
+            a joint velocity is the difference of two such values, divided by the control period.
         encoder_bias: Largest bias of each encoder, rad; at most 0.001. The drive follows the
             encoder, so the true joint position has the opposite error.
         latency: Delay of the actions in control steps, at most 5.

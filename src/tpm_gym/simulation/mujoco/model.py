@@ -1,4 +1,4 @@
-"""MuJoCo's model of robot, table, floor and objects, with the pairs that may touch."""
+"""MuJoCo model of robot, table, floor and objects, with the pairs of geoms that can collide."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from tpm_gym.simulation.state import Block, Scene
 __all__ = ["compile_model", "grip_name", "marker_name", "object_name"]
 
 _RECOVERY = 0.1
-"""Share of a penetration that a contact removes in one time step; this value bounces least."""
-_MARGIN = 1e-6  # m, so that an object placed exactly on the table is in contact at once
+"""Fraction of a penetration that a contact removes per time step; 0.1 causes the least bouncing."""
+_MARGIN = 1e-6  # m; so an object placed exactly on the table has contact in the first time step
 
-_NO_CONTACT = {"contype": "0", "conaffinity": "0"}  # pairs alone collide
-_OUT_OF_SIGHT = "0 0 -9"  # place of markers that are not shown; at 0 0 0 they could not move
+_NO_CONTACT = {"contype": "0", "conaffinity": "0"}  # only the listed pairs collide
+_OUT_OF_SIGHT = "0 0 -9"  # first position of the markers; at 0 0 0 they could not be moved
 
 
 def compile_model(machine: Machine, scene: Scene, physics: Physics) -> mujoco.MjModel:
-    """Compile the model; equality constraints are the closures, then a grip for each object."""
+    """Compile the model. Its equality constraints are the closures, then one weld per object."""
     root = robot(machine.mechanism, machine.mount, physics.time_step)
     option = SubElement(
         root,
@@ -40,7 +40,7 @@ def compile_model(machine: Machine, scene: Scene, physics: Physics) -> mujoco.Mj
         iterations=str(physics.iterations),
         tolerance=repr(physics.tolerance),
     )
-    # Without a reset by MuJoCo, the caller sees a lost loop.
+    # MuJoCo would reset an unstable simulation. The caller must see the open loop instead.
     SubElement(option, "flag", autoreset="disable")
     world, equality = root.find("worldbody"), root.find("equality")
     assert world is not None
@@ -56,7 +56,7 @@ def compile_model(machine: Machine, scene: Scene, physics: Physics) -> mujoco.Mj
 
 
 def object_name(index: int) -> str:
-    """Return the name of an object's body, joint and geom."""
+    """Return the common name of an object's body, joint and geom."""
     return f"object {index}"
 
 
@@ -66,12 +66,12 @@ def grip_name(index: int) -> str:
 
 
 def marker_name(index: int) -> str:
-    """Return the name of a goal's site."""
+    """Return the name of a goal marker's site."""
     return f"marker {index}"
 
 
 def _light(root: Element, world: Element) -> None:
-    """Add light as in PyBullet's pictures: no shadows, a white sky."""
+    """Add light without shadows and a white sky, as in PyBullet's pictures."""
     visual = SubElement(root, "visual")
     SubElement(visual, "headlight", ambient=".45 .45 .45", diffuse=".2 .2 .2", specular="0 0 0")
     SubElement(
@@ -130,7 +130,7 @@ def _object(world: Element, index: int, block: Block) -> None:
 
 
 def _contacts(root: Element, scene: Scene, physics: Physics) -> Element:
-    """Return the pairs that may touch: objects with everything, and the cup with the table."""
+    """Return the pairs that can collide: objects with everything, and the cup with the table."""
     lips = [geom.attrib["name"] for geom in root.iter("geom") if geom.get("class") == SOLID]
     objects = [(object_name(index), block.friction) for index, block in enumerate(scene.objects)]
     table, floor = ("table", TABLE.friction), ("floor", FLOOR.friction)
