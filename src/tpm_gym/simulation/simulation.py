@@ -106,8 +106,6 @@ class Simulation:
         self._mode_left = np.zeros(count, dtype=np.int8)
         self._readout: Readout
 
-    # -- running ----------------------------------------------------------------------------
-
     def reset(
         self,
         rows: IntArray,
@@ -216,19 +214,13 @@ class Simulation:
             self._disturbed = bool(self._bias.any() or self._noise.any())
         self._read(slice(None))
 
-    # -- reading ----------------------------------------------------------------------------
-
     @property
     def mode_left(self) -> NDArray[np.int8]:
         """Mode that each robot left in this episode, (n,): 0 none, 1 assembly, 2 working."""
         return self._mode_left
 
     def _read(self, rows: IntArray | slice) -> None:
-        """Read the engine, and compute the forward kinematics of some robots.
-
-        Raises:
-            ClosureError: If a gap at a loop closure is larger than ``CLOSURE_LIMIT``.
-        """
+        """Read the engine, check the loop gaps, and compute the forward kinematics of ``rows``."""
         now = self._readout = self.engine.read()
         theta = now.theta[rows]
         if self._disturbed:
@@ -287,8 +279,6 @@ class Simulation:
             object_velocity=now.object_velocity,
             object_angular_velocity=now.object_angular_velocity,
         )
-
-    # -- state, pictures, end ---------------------------------------------------------------
 
     def save(self) -> Snapshot:
         """Return a snapshot, and restart from the snapshot.

@@ -80,7 +80,7 @@ def hold_after(
         load: Load of the seal in the time step; ignored if no object was held.
         touched: Index of an object on which the lip can seal now; -1 for none. Ignored if an
             object was held.
-        cup: The cup.
+        cup: Parameters of the cup.
     """
     if hold.which >= 0:
         vacuum = pressure_after(hold.vacuum, time_step, on, cup)

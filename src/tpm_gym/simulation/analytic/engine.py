@@ -133,8 +133,6 @@ class AnalyticEngine:
             self._drives.rest(rows, theta)
         self._contact.place(rows, objects[..., :3], objects[..., 3:])
 
-    # -- a control period -------------------------------------------------------------------
-
     def advance(self, path: Path, vacuum: BoolArray) -> None:
         """Implement :meth:`Engine.advance`."""
         self.torques = None
@@ -264,8 +262,6 @@ class AnalyticEngine:
             theta[:, 1:-1], rates[:, :-1], changes, against, built
         )
         return torques
-
-    # -- reading, saving, pictures ----------------------------------------------------------
 
     def read(self) -> Readout:
         """Implement :meth:`Engine.read`."""

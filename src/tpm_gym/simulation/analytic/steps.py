@@ -86,16 +86,11 @@ def servo_step(
 ) -> None:
     """Compute a time step of servo drives with Coulomb friction on the motors' axes.
 
+    The arguments index, course, at, step and new are explained in :func:`ideal_step`; references,
+    law and memory in :func:`tpm_gym.simulation.compiled.servo_torques`.
+
     Args:
-        index: Index of the time step in the control period.
-        references: References of the control period.
-        law: Parameters of :func:`tpm_gym.simulation.compiled.servo_torques`.
         friction: (r, 3) N m, Coulomb friction on the motors' axes.
-        course: State of the robots at the beginning of the time step.
-        at: Kinematics and dynamics at the beginning of the time step.
-        step: Time step, s.
-        new: Output.
-        memory: Memory of the servo law; overwritten.
     """
     impulse, limit, found = np.empty(3), np.empty(3), np.empty(3)
     mass, load, inverse = np.empty((1, 3, 3)), np.empty(3), np.empty((1, 3, 3))

@@ -54,8 +54,8 @@ class Friction:
         client: Physics client.
         robot: Robot with the cup.
         bodies: Body ids of the objects.
-        tables: Body id of the table of each object. Objects slide in different directions, so each
-            object has its own table.
+        tables: Body ids of the tables, one per object, because objects slide in different
+            directions.
         blocks: Objects of the scene.
     """
 

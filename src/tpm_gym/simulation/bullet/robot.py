@@ -39,11 +39,6 @@ _CLOSURE_FORCE = 1e6  # N; so large that no load opens a loop
 class Robot:
     """Robot with one multibody per leg and closed loops.
 
-    Args:
-        client: Physics client.
-        mechanism: Mechanism to load.
-        mount: Position and orientation of the base in the world.
-
     Attributes:
         bodies: Body ids of the legs.
         joints: Address of each joint, by name.
@@ -120,13 +115,10 @@ class Robot:
         self._pivots = np.array([(c.point_a, c.point_b) for c in closures]).reshape(-1, 2, 3)
 
     def _pivot(self, name: str, point: Vector) -> NDArray[np.float64]:
-        """Convert a point of a link's frame to a point relative to the link's centre of mass, m.
-
-        Raises:
-            ConfigurationError: If the link has products of inertia. PyBullet would rotate the
-                inertial frame to the principal axes, and the closure would be at a wrong point.
-        """
+        """Convert a point of a link's frame to a point relative to the link's centre of mass, m."""
         link = self._mechanism.link(name)
+        # With products of inertia, PyBullet would rotate the inertial frame to the principal axes,
+        # and the closure would be at a wrong point.
         if not np.allclose(link.inertia, np.diag(np.diag(link.inertia)), rtol=0.0, atol=1e-12):
             valid = "links whose principal axes of inertia are the axes of their frame"
             raise ConfigurationError("mechanism", name, valid)
@@ -229,11 +221,7 @@ class Robot:
 
 @contextmanager
 def _on_disk(text: str) -> Iterator[str]:
-    """Write a temporary file and yield its path. PyBullet loads robots only from files.
-
-    Raises:
-        ConfigurationError: If no temporary file can be written.
-    """
+    """Write a temporary file and yield its path. PyBullet loads robots only from files."""
     try:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder, "robot.urdf")

@@ -23,7 +23,7 @@ class Scenery:
     Args:
         client: Physics client.
         scene: Objects and markers to load.
-        table: Half edge lengths of the table along x and y, m.
+        table: Half edge lengths of the tables along x and y, m.
 
     Attributes:
         bodies: Body ids of the objects, in the order of the scene.

@@ -106,11 +106,7 @@ def _camera() -> mujoco.MjvCamera:
 
 
 def _opengl(renderer: str | None, width: int, height: int) -> Any:
-    """Open an OpenGL context.
-
-    Raises:
-        ConfigurationError: If no backend works.
-    """
+    """Open an OpenGL context with ``renderer``, or else with the first backend that works."""
     asked = renderer or os.environ.get("MUJOCO_GL", "").lower()
     names = [asked] if asked in RENDERERS else RENDERERS
     found = (_context(name, width, height) for name in names)

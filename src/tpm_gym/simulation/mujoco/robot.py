@@ -33,7 +33,7 @@ class Robot:
     Args:
         model: Compiled model.
         data: State of the model.
-        machine: True machine that was compiled into the model.
+        machine: True machine of the model.
         ideal: Whether the motors have ideal drives; else they apply given torques.
 
     Attributes:

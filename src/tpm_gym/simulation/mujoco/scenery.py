@@ -21,13 +21,7 @@ _CONVERGED = 1e-3  # m/s; largest change of the slip in the last prediction
 
 
 class Scenery:
-    """Objects and goal markers of a MuJoCo model.
-
-    Args:
-        model: Compiled model.
-        data: State of the model.
-        scene: Scene that was compiled into the model.
-    """
+    """Objects and goal markers of a MuJoCo model."""
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, scene: Scene) -> None:
         """Look up the addresses of objects and markers in the model."""

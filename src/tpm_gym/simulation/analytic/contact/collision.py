@@ -120,9 +120,9 @@ def collide_objects(
         objects: (k,) objects.
         held: Index of the held object; -1 for none.
         setting: Constants of the simulation.
-        polygons: (2, 12, 3) workspace.
+        polygons: (2, 12, 3) m, workspace.
         contacts: Output.
-        count: Number of contacts in ``contacts`` at the call.
+        count: Number of contacts at the call.
     """
     slot = len(objects) * (TABLE_SLOTS + LIP_SLOTS)
     for j in range(len(objects)):
@@ -382,15 +382,8 @@ def _clip_face(
 ) -> int:
     """Add the corners of the overlap of a box's face and the opposite face of another box.
 
-    Args:
-        plane: Box with the face.
-        other: Other box.
-        face: Index of the axis of ``plane`` that is normal to the face.
-        sign: 1 if ``plane`` is body a of the pair, -1 if it is body b.
-        polygons: (2, 12, 3) workspace.
-        contacts: Output.
-        place: Index and slot of the first contact.
-        pair: Bodies and friction.
+    The normal of the face is axis ``face`` of ``plane``. ``sign`` is 1 if ``plane`` is body a of
+    the pair, and -1 if it is body b.
     """
     away, facing = plus(other.middle, plane.middle, -1.0), 0
     normal = plus(_ZERO, plane.frame[face], math.copysign(1.0, dot(plane.frame[face], away)))

@@ -67,7 +67,7 @@ def breathe(
     Args:
         objects: (k,) objects; changed.
         cup: Cup; changed.
-        way: Point P.
+        way: Motion of point P.
         on: Whether the vacuum is on.
         seal: Force of the cup on the held object, N, world.
         setting: Constants of the simulation.

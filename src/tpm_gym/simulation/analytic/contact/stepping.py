@@ -49,15 +49,10 @@ def advance(
 ) -> None:
     """Simulate K time steps on some tables.
 
+    The arguments rows, path, frame and on are explained in :class:`.contact.Contact`.
+
     Args:
         states: Objects (n, k), cups (n,) and forces (n, slots, 3) N; changed.
-        rows: (r,) indices of the tables.
-        path: Point P, m, machine's frame: before the last time step (r, 3), now (r, 3), and after
-            each of the K time steps (r, K, 3).
-        frame: Factors (3,) and origin (3,) m that convert the machine's frame to the world frame.
-        on: (r,) whether the vacuum is on.
-        setting: Constants of the simulation.
-        work: Workspace of the solver.
         push: (r, K, 3) N, force on the platform, machine's frame; output, initially zero.
         carried: (r,) kg, masses of the held objects at the end; output, initially zero.
     """
