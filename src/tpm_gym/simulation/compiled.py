@@ -65,7 +65,11 @@ def unusual(
 def bounded(
     observed: FloatArray, bound: float, achieved: FloatArray, goal_bound: float, goals: FloatArray
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], bool]:
-    """Clip observations and achieved goals; convert all to float32; last, return if none is NaN."""
+    """Clip observations and achieved goals to +-bounds, and convert them and goals to float32.
+
+    Returns:
+        The three arrays in float32, and whether observations and achieved goals have no NaN.
+    """
     first = np.empty(observed.shape, np.float32)
     second, third = np.empty(achieved.shape, np.float32), np.empty(goals.shape, np.float32)
     sound = True
@@ -145,7 +149,7 @@ def measured_object(
     held: IntArray,
     share: FloatArray,
 ) -> FloatArray:
-    """Return an object's centre, top minus lip, velocity, x and y of its z axis, and hold (n, 12).
+    """Return centre, top minus lip, velocity, x and y of the z axis, and hold of an object (n, 12).
 
     Args:
         index: Index of the object.
@@ -155,7 +159,7 @@ def measured_object(
         lips: (n, 3) m, centres of the cups' lips.
         half: Half height of the object, m.
         held: (n,) index of the object in the cup; -1 for none.
-        share: (n,) vacuum as a fraction of the largest vacuum; the hold of the held object.
+        share: (n,) vacuum as a fraction of the largest vacuum; the entry "hold" if held, else 0.
     """
     values = np.empty((len(places), 12))
     for row in range(len(places)):
@@ -286,11 +290,9 @@ def braced_inverse(
     """Return the inverse (n, 3, 3) of mass + step (step stiffness + damping) for each row."""
     inverse = np.empty_like(mass)
     for row in range(len(mass)):
-        a, d, f = (
-            mass[row, 0, 0] + step * (step * stiffness[row, 0] + damping),
-            mass[row, 1, 1] + step * (step * stiffness[row, 1] + damping),
-            mass[row, 2, 2] + step * (step * stiffness[row, 2] + damping),
-        )
+        a = mass[row, 0, 0] + step * (step * stiffness[row, 0] + damping)
+        d = mass[row, 1, 1] + step * (step * stiffness[row, 1] + damping)
+        f = mass[row, 2, 2] + step * (step * stiffness[row, 2] + damping)
         inverted(a, mass[row, 0, 1], mass[row, 0, 2], d, mass[row, 1, 2], f, inverse[row])
     return inverse
 

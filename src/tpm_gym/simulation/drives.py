@@ -188,9 +188,8 @@ class ServoDrives:
             self._built = np.tile(self._machine.built(), (len(self.friction), 1))
         if self._built is not None:
             self._built[rows] = [self._machine.built(own) for own in lengths]
-        self._stiffness[rows] = self._servo.stiffness * np.array(
-            [p.servo_stiffness for p in plants]
-        )
+        factors = np.array([p.servo_stiffness for p in plants])
+        self._stiffness[rows] = self._servo.stiffness * factors
         self._effort[rows] = self._nominal_effort * np.array([p.motor_strength for p in plants])
         self.friction[rows] = [p.joint_friction for p in plants]
         # Too large an inertia makes the law unstable. So M is scaled by the smallest link factor,

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from types import ModuleType
 from typing import Any, NamedTuple, Protocol
@@ -354,13 +354,13 @@ def _path(engine: str | Factory) -> str:
     return f"{engine.__module__}:{getattr(engine, '__qualname__', engine)}"
 
 
-def require_engine(name: Any, among: Collection[str] = ()) -> None:
+def require_engine(name: Any) -> None:
     """Check the name of an engine.
 
     Raises:
-        ConfigurationError: If ``name`` is not in ``among`` (default: all registered engines).
+        ConfigurationError: If no engine is registered with this name.
     """
-    if not isinstance(name, str) or name not in (among or _ENGINES):
+    if not isinstance(name, str) or name not in _ENGINES:
         raise ConfigurationError("engine", name, ", ".join(map(repr, _ENGINES)))
 
 
@@ -412,6 +412,6 @@ _PARTS = [name for name in (*Engine.__annotations__, *vars(Engine)) if not name.
 
 
 def _has(engine: Engine, part: str) -> bool:
-    """Return whether an engine defines an attribute itself: the protocol's methods do nothing."""
+    """Return whether an engine has an attribute that it does not inherit from the protocol."""
     own = getattr(engine, part, None)
     return own is not None and getattr(own, "__func__", None) is not vars(Engine).get(part, own)

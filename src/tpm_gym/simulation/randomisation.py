@@ -49,7 +49,7 @@ class Plant:
         link_masses: Factor of mass and inertia for each moving link, in the order of the
             machine's mechanism; empty if all factors are 1.
         block_mass: Factor of the objects' masses.
-        friction: Factor of the objects' friction, on the table and in the cup.
+        friction: Factor of the objects' friction coefficients, against table and cup.
         motor_strength: Factor of the largest torque of each motor.
         servo_stiffness: Factor of the stiffness of each servo drive.
         joint_friction: Coulomb friction on the axis of each motor, N m.
@@ -107,10 +107,9 @@ class Randomisation:
             rebuild the robot at each reset, which makes a reset several times slower. PyBullet
             leaks about 13 kB of memory per rebuild.
 
-    With other plants than the nominal one, actions at full speed towards the corner near y = 0 can
-    move the platform through the singularity. The State reports it. It happens a few times in 100
-    episodes of random actions with length errors of 1 mm, more often with heavy links and weak
-    motors.
+    If the plant is not nominal, actions at full speed towards the corner near y = 0 can move the
+    platform through the singularity. The State reports this. With random actions and length errors
+    of 1 mm it happens in a few of 100 episodes; heavy links and weak motors make it more frequent.
 
     Raises:
         ConfigurationError: If a value is out of range.

@@ -67,7 +67,7 @@ def require_numerics(
     step, count = settings.time_step, getattr(settings, "iterations", 1)
     steps = CONTROL_PERIOD / step if step > 0 else 0.0
     if step < _SHORTEST or round(steps) < 1 or abs(steps - round(steps)) >= 1e-6:
-        valid = f"{CONTROL_PERIOD} s (the control period) / 1, 2, 3, ...; at least {_SHORTEST} s"
+        valid = f"{CONTROL_PERIOD} s (control period) divided by an integer; at least {_SHORTEST} s"
         raise ConfigurationError("time_step", step, valid)
     if not is_whole(count, 1):
         raise ConfigurationError("iterations", count, "a whole number, 1 or more")

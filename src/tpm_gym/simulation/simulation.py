@@ -1,4 +1,4 @@
-"""Simulation of n robots: encoder errors, modes and the State, computed alike for all engines."""
+"""Simulation of n robots with any engine: encoder errors, modes and the State."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ class Simulation:
 
         Args:
             rows: (r,) robots to place.
-            theta: (3,) rad, joint positions that the encoders shall report without noise.
+            theta: (3,) rad, joint positions as the encoders report them without noise.
             objects: Centres (r, 3) m, world, of objects by name. Objects without an entry are
                 placed in the middle of the table.
             plants: Plant of each of the r robots; None for nominal robots.

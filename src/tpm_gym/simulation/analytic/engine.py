@@ -70,7 +70,7 @@ class AnalyticEngine:
         self.time_step = self.physics.time_step
         self._servo, self._renderer = drive, renderer
         self._steps = self.physics.substeps
-        # Number of time steps, up to the last one, whose joint positions are needed
+        # Number of time steps at the end of a control period whose joint positions are needed
         self._tail = {"none": 2, "last": 3, "every": self._steps}[self.physics.torques]
         self._artist: Engine | None = None
         self._markers: FloatArray | None = None
@@ -86,14 +86,9 @@ class AnalyticEngine:
         self._nominal_effort = np.array([motor.effort for motor in machine.mechanism.motors])
         self._effort = np.tile(self._nominal_effort, (count, 1))
         self._bias = np.zeros((count, 3))
-        self._contact = Contact(
-            scene.objects, count, self.time_step, machine.table, machine.mount.frame
-        )
-        self._drives = (
-            None
-            if self._servo is None
-            else ServoDrives(self._servo, machine, count, self.time_step)
-        )
+        servo, step = self._servo, self.time_step
+        self._contact = Contact(scene.objects, count, step, machine.table, machine.mount.frame)
+        self._drives = None if servo is None else ServoDrives(servo, machine, count, step)
         home = machine.require_inverse(np.array(machine.home))
         self._theta = np.tile(home, (count, 1))
         self._position = np.tile(machine.home, (count, 1))
@@ -160,7 +155,7 @@ class AnalyticEngine:
             late = self._behind | (self._mode_left != 0)
             late |= ~self._machine.same_side(points).all(axis=1)
         start = {name: getattr(self, name) for name in _COURSE}
-        # With torques "none", ``late`` already has all robots that are computed again.
+        # Save objects that may be computed again. With torques "none", ``late`` is complete here.
         again = objects and (self.physics.torques != "none" or late.any())
         saved = self._contact.copy() if again else None
         push = None

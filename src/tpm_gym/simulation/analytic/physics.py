@@ -18,7 +18,7 @@ class Physics(Numerics):
     """Numerical settings of the analytic engine.
 
     Attributes:
-        time_step: Time step, s; the control period must be an integer multiple of it, 3 or more.
+        time_step: Time step, s; the control period must be an integer multiple of it, at least 3.
         torques: Time steps in which the torques of ideal motors are computed and compared with
             their largest torques: ``"none"`` (torques in the State are NaN and have no limit),
             ``"last"`` of a control period, or ``"every"``. With ``"last"``, all time steps are

@@ -95,7 +95,7 @@ class Client:
             raise ConfigurationError("renderer", renderer, "'tiny' or 'egl'")
         spec = importlib.util.find_spec("eglRenderer")
         if spec is None or self.loadPlugin(spec.origin, "_eglRendererPlugin") < 0:
-            valid = "'tiny': this machine has no EGL renderer"
+            valid = "'tiny': this computer has no EGL renderer"
             raise ConfigurationError("renderer", renderer, valid)
         return int(pybullet.ER_BULLET_HARDWARE_OPENGL)
 

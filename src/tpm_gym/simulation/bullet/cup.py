@@ -1,4 +1,4 @@
-"""Vacuum cup in PyBullet: a fixed joint (weld) to the held object, with a limited force."""
+"""Vacuum cup in PyBullet: a fixed joint (weld) holds an object until the vacuum law releases it."""
 
 from __future__ import annotations
 

@@ -146,11 +146,8 @@ class Robot:
         """Scale the nominal masses of the moving links (empty: all 1) and the motors' torques."""
         factors = mass_factors or [1.0] * len(self._inertias)
         for (link, (mass, moments)), factor in zip(self._inertias.items(), factors, strict=True):
-            self._client.changeDynamics(
-                *link,
-                mass=factor * mass,
-                localInertiaDiagonal=[factor * moment for moment in moments],
-            )
+            inertia = [factor * moment for moment in moments]
+            self._client.changeDynamics(*link, mass=factor * mass, localInertiaDiagonal=inertia)
         pairs = zip(self._nominal_effort, motor_strength, strict=True)
         self._effort = [effort * strength for effort, strength in pairs]
 

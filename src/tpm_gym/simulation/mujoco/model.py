@@ -74,16 +74,9 @@ def _light(root: Element, world: Element) -> None:
     """Add light without shadows and a white sky, as in PyBullet's pictures."""
     visual = SubElement(root, "visual")
     SubElement(visual, "headlight", ambient=".45 .45 .45", diffuse=".2 .2 .2", specular="0 0 0")
-    SubElement(
-        world,
-        "light",
-        directional="true",
-        castshadow="false",
-        pos=numbers(LIGHT),
-        dir=numbers(-part for part in LIGHT),
-        diffuse=".5 .5 .5",
-        specular=".1 .1 .1",
-    )
+    rays = {"pos": numbers(LIGHT), "dir": numbers(-part for part in LIGHT)}
+    colours = {"diffuse": ".5 .5 .5", "specular": ".1 .1 .1"}
+    SubElement(world, "light", rays | colours, directional="true", castshadow="false")
     asset = root.find("asset")
     assert asset is not None
     SubElement(
@@ -93,26 +86,12 @@ def _light(root: Element, world: Element) -> None:
 
 def _surroundings(world: Element, machine: Machine, scene: Scene) -> None:
     """Add table, floor and markers."""
-    SubElement(
-        world,
-        "geom",
-        _NO_CONTACT,
-        name="table",
-        type="box",
-        size=numbers((*machine.table, TABLE.half_height)),
-        pos=numbers((0.0, 0.0, TABLE.top - TABLE.half_height)),
-        rgba=numbers(TABLE.colour),
-    )
-    SubElement(
-        world,
-        "geom",
-        _NO_CONTACT,
-        name="floor",
-        type="plane",
-        size=numbers((FLOOR_EDGE, FLOOR_EDGE, 1.0)),
-        pos=numbers((0.0, 0.0, FLOOR.top)),
-        rgba=numbers(FLOOR.colour),
-    )
+    size, pos = (*machine.table, TABLE.half_height), (0.0, 0.0, TABLE.top - TABLE.half_height)
+    table = {"size": numbers(size), "pos": numbers(pos), "rgba": numbers(TABLE.colour)}
+    SubElement(world, "geom", _NO_CONTACT | table, name="table", type="box")
+    size, pos = (FLOOR_EDGE, FLOOR_EDGE, 1.0), (0.0, 0.0, FLOOR.top)
+    floor = {"size": numbers(size), "pos": numbers(pos), "rgba": numbers(FLOOR.colour)}
+    SubElement(world, "geom", _NO_CONTACT | floor, name="floor", type="plane")
     for index in range(scene.markers):
         looks = {"size": numbers([scene.marker_radius]), "rgba": numbers(MARKER_COLOUR)}
         name = marker_name(index)

@@ -3,7 +3,7 @@
 A time step (:mod:`.stepping`) finds contacts (:mod:`.collision`), computes their impulses
 (:mod:`.solver`), moves the objects, and applies the vacuum law (:mod:`.grasp`).
 
-Simplifications: The table supports an object as long as the object's centre is over the table.
+Simplifications: The table supports an object only while the object's centre is over the table.
 Stem and platform do not collide with objects. The lip does not collide with the table. The cup's
 spring has no end stop. Within a time step, contacts do not move point P.
 """
@@ -77,12 +77,9 @@ class Contact:
 
     def alter(self, rows: Any, mass_factor: FloatArray, friction_factor: FloatArray) -> None:
         """Scale nominal masses and friction coefficients on tables ``rows`` by factors (r,)."""
-        mass, friction = (
-            np.array([getattr(block, name) for block in self._blocks])
-            for name in ("mass", "friction")
-        )
-        self._objects["mass"][rows] = mass_factor[:, None] * mass
-        self._objects["friction"][rows] = friction_factor[:, None] * friction
+        for name, factor in (("mass", mass_factor), ("friction", friction_factor)):
+            nominal = np.array([getattr(block, name) for block in self._blocks])
+            self._objects[name][rows] = factor[:, None] * nominal
 
     def place(
         self, rows: Any, positions: FloatArray, quaternions: FloatArray | None = None
