@@ -1,4 +1,4 @@
-"""Compiled loops over robots that all engines share. Importing this module imports Numba."""
+"""Compiled loops over robots, used with all engines. Importing this module imports Numba."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ __all__ = [
 
 @kept
 def all_within(points: FloatArray, low: FloatArray, high: FloatArray) -> bool:
-    """Return whether all points (m, 3) are in the box between low and high (3,); NaN is not."""
+    """Return whether all points (m, 3) lie in the box low (3,) to high (3,); NaN is outside."""
     for row in range(len(points)):
         for axis in range(3):
             if not low[axis] <= points[row, axis] <= high[axis]:
@@ -44,28 +44,32 @@ def all_within(points: FloatArray, low: FloatArray, high: FloatArray) -> bool:
 def unusual(
     gap: FloatArray, limit: float, mode_left: NDArray[np.int8], conditioning: FloatArray
 ) -> tuple[bool, bool, bool]:
-    """Return whether a loop is open, a mode was left, and a reading makes no sense, in any row.
+    """Return whether any loop is open, any mode was left, and any reading is invalid.
 
     Args:
-        gap: (n,) m; NaN counts as open.
-        limit: m.
-        mode_left: (n,).
-        conditioning: (r,); NaN makes no sense.
+        gap: (n,) m, largest gap of each robot; open if larger than ``limit``, or NaN.
+        limit: Largest allowed gap, m.
+        mode_left: (n,) mode that each robot left; 0 for none.
+        conditioning: (r,) conditioning of each reading; invalid if NaN.
     """
-    opened = left = senseless = False
+    opened = left = invalid = False
     for row in range(len(gap)):
         opened |= not gap[row] <= limit
         left |= mode_left[row] != 0
     for row in range(len(conditioning)):
-        senseless |= np.isnan(conditioning[row])
-    return opened, left, senseless
+        invalid |= np.isnan(conditioning[row])
+    return opened, left, invalid
 
 
 @kept
 def bounded(
     observed: FloatArray, bound: float, achieved: FloatArray, goal_bound: float, goals: FloatArray
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], bool]:
-    """Clip observations and achieved goals, convert all to float32; False last if one is NaN."""
+    """Clip observations and achieved goals to +-bounds, and convert them and goals to float32.
+
+    Returns:
+        The three arrays in float32, and whether observations and achieved goals have no NaN.
+    """
     first = np.empty(observed.shape, np.float32)
     second, third = np.empty(achieved.shape, np.float32), np.empty(goals.shape, np.float32)
     sound = True
@@ -90,23 +94,22 @@ def in_world(
     turn: FloatArray,
     origin: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Compute P, velocity of P and command (n, 3) in the world, and objects' z axes (n, k, 3).
+    """Convert P, its velocity and its command to the world frame; compute the objects' z axes.
 
     Args:
-        position: (n, 3) m, machine's frame.
+        position: (n, 3) m, point P, machine's frame.
         jacobian: (n, 3, 3) m/rad.
         theta_dot: (n, 3) rad/s.
-        commands: (n, 3, 3) m, machine's frame; the second one is converted.
-        quaternion: (n, k, 4) orientations of objects in the world.
-        turn: (3,) factors of the machine's frame.
-        origin: (3,) m.
+        commands: (n, 3, 3) m, machine's frame; commands[:, 1] is converted.
+        quaternion: (n, k, 4), orientations of the objects, world.
+        turn: (3,) factors (1 or -1) of the machine's axes in the world frame.
+        origin: (3,) m, origin of the machine's frame in the world frame.
+
+    Returns:
+        P (n, 3) m, velocity of P (n, 3) m/s, command (n, 3) m, z axes (n, k, 3); world frame.
     """
-    place, speed, wanted = (
-        np.empty_like(position),
-        np.empty_like(position),
-        np.empty_like(position),
-    )
-    axes = np.empty((quaternion.shape[0], quaternion.shape[1], 3))
+    place, speed = np.empty_like(position), np.empty_like(position)
+    wanted, axes = np.empty_like(position), np.empty((*quaternion.shape[:2], 3))
     for row in range(len(position)):
         for i in range(3):
             place[row, i] = turn[i] * position[row, i] + origin[i]
@@ -125,7 +128,7 @@ def in_world(
 
 @kept
 def measured_robot(position: FloatArray, velocity: FloatArray, command: FloatArray) -> FloatArray:
-    """Return position, velocity, and command minus position (n, 9), from (n, 3) each."""
+    """Return position, velocity, and command minus position as (n, 9); arguments are (n, 3)."""
     values = np.empty((len(position), 9))
     for row in range(len(position)):
         for i in range(3):
@@ -146,17 +149,17 @@ def measured_object(
     held: IntArray,
     share: FloatArray,
 ) -> FloatArray:
-    """Return centre, offset, velocity, tilt and hold (n, 12) of one of k objects.
+    """Return centre, top minus lip, velocity, x and y of the z axis, and hold of an object (n, 12).
 
     Args:
-        index: Number of the object.
+        index: Index of the object.
         places: (n, k, 3) m, centres of the objects.
-        axes: (n, k, 3), their own z axes.
+        axes: (n, k, 3), z axes of the objects.
         velocities: (n, k, 3) m/s.
         lips: (n, 3) m, centres of the cups' lips.
-        half: Half the object's height, m.
-        held: (n,) index of the object in the cup.
-        share: (n,) vacuum, as a share of the largest.
+        half: Half height of the object, m.
+        held: (n,) index of the object in the cup; -1 for none.
+        share: (n,) vacuum as a fraction of the largest vacuum; the entry "hold" if held, else 0.
     """
     values = np.empty((len(places), 12))
     for row in range(len(places)):
@@ -172,7 +175,7 @@ def measured_object(
 
 @kept
 def any_outside(places: FloatArray, low: FloatArray, high: FloatArray) -> BoolArray:
-    """Return whether any place (n, k, 3) is not between low and high (k, 3), (n,); NaN is not."""
+    """Return (n,) whether any place (n, k, 3) is outside low to high (k, 3); NaN is outside."""
     found = np.zeros(len(places), np.bool_)
     for row in range(len(places)):
         for item in range(places.shape[1]):
@@ -189,15 +192,15 @@ def singularity_penalty(
     """Compute the penalty (n,) of :meth:`tpm_gym.tasks.Task.penalty`.
 
     Args:
-        conditioning: (n,).
-        safe: Conditioning from which on the penalty is zero.
+        conditioning: (n,) conditioning of each robot.
+        safe: Smallest conditioning without penalty.
         assembly: (n,) whether a parallel singularity was passed.
         working: (n,) whether a serial singularity was passed.
     """
     penalty = np.empty(len(conditioning))
     for row in range(len(conditioning)):
-        share = conditioning[row] / safe
-        squared = share * share
+        ratio = conditioning[row] / safe
+        squared = ratio * ratio
         passed = assembly[row] or working[row]
         penalty[row] = 1.0 if passed else max(1.0 - squared * squared, 0.0)
     return penalty
@@ -207,21 +210,21 @@ def singularity_penalty(
 def truth(
     frames: FloatArray, sides: IntArray, pivots: FloatArray, platform: int, point: FloatArray
 ) -> tuple[float, float, float, float, float]:
-    """Compute the largest gap of the loops (m), P (m) and the platform's tilt (rad).
+    """Compute the largest loop gap (m), x, y, z of P (m, world) and the platform's tilt (rad).
 
     Args:
-        frames: (7 m,) origin (m) and orientation (x, y, z, w) of each of m links, world.
-        sides: (p, 2) links of each closure.
-        pivots: (p, 2, 3) m, the closure's points in their frames.
-        platform: Link of the platform.
-        point: (3,) m, point P in its frame.
+        frames: (7 l,) origin (m) and orientation (x, y, z, w) of each of l links, world.
+        sides: (c, 2) indices of the two links of each closure.
+        pivots: (c, 2, 3) m, points of each closure, in the frames of its links.
+        platform: Index of the platform's link.
+        point: (3,) m, point P in the platform's frame.
     """
     squared = 0.0
     for row in range(len(sides)):
         x, y, z = _placed(frames[7 * sides[row, 0] :], pivots[row, 0])
         u, v, w = _placed(frames[7 * sides[row, 1] :], pivots[row, 1])
         gap = (x - u) ** 2 + (y - v) ** 2 + (z - w) ** 2
-        if gap > squared or gap != gap:  # a NaN stays
+        if gap > squared or gap != gap:  # after a NaN, the result stays NaN
             squared = gap
     own = frames[7 * platform :]
     x, y, z = _placed(own, point)
@@ -231,7 +234,7 @@ def truth(
 
 @compiled
 def _placed(frame: FloatArray, point: FloatArray) -> tuple[float, float, float]:
-    """Convert a point of a frame into the world, m."""
+    """Convert a point (m) from a frame (origin, orientation) to the world frame."""
     x, y, z, r = frame[3], frame[4], frame[5], frame[6]
     a, b, c = point
     s, t, p = 2 * (y * c - z * b), 2 * (z * a - x * c), 2 * (x * b - y * a)
@@ -244,7 +247,7 @@ def _placed(frame: FloatArray, point: FloatArray) -> tuple[float, float, float]:
 
 @kept
 def spline_points(commands: FloatArray, weights: FloatArray) -> FloatArray:
-    """Compute points (n, k, 3) along splines, from commands (n, 3, 3) and weights (k, 3)."""
+    """Compute points (n, k, 3) on splines from commands (n, 3, 3) and weights (k, 3)."""
     points = np.empty((len(commands), len(weights), 3))
     for row in range(len(commands)):
         for axis in range(3):
@@ -263,11 +266,11 @@ def along(
     """Write the references of a control period of K time steps.
 
     Args:
-        theta: (n, K + 1, 3) rad, from the beginning of the control period on, by the encoders.
-        true: (n, K + 1, 3) rad, true joint positions.
-        torques: (2, n, 3) N m, fed forward in the first and the last time step.
-        step: s.
-        references: Written.
+        theta: (n, K + 1, 3) rad, encoder readings from the beginning to the end of the period.
+        true: (n, K + 1, 3) rad, true joint positions at the same times.
+        torques: (2, n, 3) N m, feed-forward torques in the first and the last time step.
+        step: Time step, s.
+        references: Output.
     """
     steps = len(references.theta)
     for k in range(steps):
@@ -284,14 +287,12 @@ def along(
 def braced_inverse(
     mass: FloatArray, stiffness: FloatArray, damping: float, step: float
 ) -> FloatArray:
-    """Invert mass + step (step stiffness + damping), row by row (n, 3, 3)."""
+    """Return the inverse (n, 3, 3) of mass + step (step stiffness + damping) for each row."""
     inverse = np.empty_like(mass)
     for row in range(len(mass)):
-        a, d, f = (
-            mass[row, 0, 0] + step * (step * stiffness[row, 0] + damping),
-            mass[row, 1, 1] + step * (step * stiffness[row, 1] + damping),
-            mass[row, 2, 2] + step * (step * stiffness[row, 2] + damping),
-        )
+        a = mass[row, 0, 0] + step * (step * stiffness[row, 0] + damping)
+        d = mass[row, 1, 1] + step * (step * stiffness[row, 1] + damping)
+        f = mass[row, 2, 2] + step * (step * stiffness[row, 2] + damping)
         inverted(a, mass[row, 0, 1], mass[row, 0, 2], d, mass[row, 1, 2], f, inverse[row])
     return inverse
 
@@ -300,7 +301,7 @@ def braced_inverse(
 def inverted(
     a: float, b: float, c: float, d: float, e: float, f: float, inverse: FloatArray
 ) -> None:
-    """Invert a symmetric matrix, given by its upper triangle, into ``inverse`` (3, 3)."""
+    """Invert the symmetric matrix ((a, b, c), (b, d, e), (c, e, f)) into ``inverse`` (3, 3)."""
     p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
     determinant = a * p + b * q + c * r
     inverse[0, 0], inverse[0, 1], inverse[0, 2] = p / determinant, q / determinant, r / determinant
@@ -322,14 +323,14 @@ def servo_torques(
     """Apply the law of :class:`tpm_gym.simulation.drives.ServoDrives` in one time step.
 
     Args:
-        index: Number of the time step.
-        references: See :class:`tpm_gym.simulation.drives.References`.
-        law: Stiffness (n, 3) N m/rad, damping (N m s/rad), inertia (n, 3, 3) kg m^2 that the drives
-            reckon with, its :func:`braced_inverse`, largest torques (n, 3) N m, and corner and
-            no-load speed of each motor (3, 2) rad/s.
+        index: Index of the time step in the control period.
+        references: References of the control period.
+        law: Stiffness (n, 3) N m/rad, damping (N m s/rad), inertia (n, 3, 3) kg m^2 that the law
+            assumes, :func:`braced_inverse` of the inertia, largest torques (n, 3) N m, and corner
+            and no-load speed of each motor (3, 2) rad/s.
         theta: (n, 3) rad, at the beginning of the time step.
-        theta_dot: (n, 3) rad/s.
-        step: s.
+        theta_dot: (n, 3) rad/s, at the beginning of the time step.
+        step: Time step, s.
         memory: (2, n, 3) torques and joint velocities of the last time step; overwritten.
     """
     for row in range(len(theta)):
@@ -346,7 +347,7 @@ def servo_torque(
     step: float,
     memory: FloatArray,
 ) -> None:
-    """Apply the law of the servo drives to one row."""
+    """Apply the law of the servo drives to one row; arguments as in :func:`servo_torques`."""
     stiffness, damping, mass, inverse, effort, line = law
     rates, last = row_of(theta_dot, row), row_of(memory[0], row)
     x, y, z = plus(rates, row_of(memory[1], row), -1.0)
@@ -369,11 +370,10 @@ compilable(servo_torque)
 
 @compiled
 def limited(torque: float, rate: float, effort: float, corner: float, speed: float) -> float:
-    """Limit a torque (N m) to what the motor has at its rate (rad/s).
+    """Clip a torque (N m) to the largest torque at the joint velocity ``rate`` (rad/s).
 
-    Up to the corner speed the limit is ``effort``. Above it, it falls in a straight line to zero at
-    the no-load ``speed`` for a motor that drives; for one that brakes it stays, because the voltage
-    helps.
+    Up to the speed ``corner`` the limit is ``effort``. For a driving motor, the limit then falls
+    linearly to zero at the no-load ``speed``. For a braking motor, the limit stays ``effort``.
     """
     driving = effort * min(1.0, max(0.0, (speed - abs(rate)) / (speed - corner)))
     high = driving if rate > 0 else effort

@@ -1,4 +1,4 @@
-"""Check for a display. An engine that opens a window without one may end the process."""
+"""Check for a display. Without a display, an engine that opens a window may end the process."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import sys
 
 __all__ = ["has_display"]
 
-_kept: list[ctypes.c_void_p] = []  # a connection to the X server
+_kept: list[ctypes.c_void_p] = []  # the first connection to the X server
 
 
 def has_display() -> bool:
-    """Return whether there is a display: on Linux, whether the X server of ``DISPLAY`` has GLX.
+    """Return whether a window can open: on Linux, whether the X server of ``DISPLAY`` has GLX.
 
-    An X server without connections may restart, and refuses new ones meanwhile. So the first
-    connection stays open.
+    An X server without connections may restart, and rejects new connections during the restart.
+    So the first connection stays open.
     """
     if not sys.platform.startswith("linux"):
         return True
@@ -24,13 +24,13 @@ def has_display() -> bool:
     try:
         x11 = ctypes.CDLL("libX11.so.6")
     except OSError:
-        return False  # an engine's window needs the library too
+        return False  # the window of an engine needs this library too
     x11.XOpenDisplay.restype = ctypes.c_void_p
     display = ctypes.c_void_p(x11.XOpenDisplay(None))
     if not display:
         return False
-    numbers = [ctypes.byref(ctypes.c_int()) for _ in range(3)]  # of the extension, not needed
-    found = bool(x11.XQueryExtension(display, b"GLX", *numbers))
+    outputs = [ctypes.byref(ctypes.c_int()) for _ in range(3)]  # required arguments; not read
+    found = bool(x11.XQueryExtension(display, b"GLX", *outputs))
     if _kept:
         x11.XCloseDisplay(display)
     else:

@@ -1,8 +1,8 @@
 """Drives of the motors.
 
-Each engine has its own ideal drive (``None`` here): the motor reaches its reference within a time
-step, as far as its effort allows. A :class:`Servo` is the drive of a real axis: stiffness, damping,
-feed-forward, and a motor with a torque-speed line.
+With ideal drives (``None`` here), each motor reaches its reference within a time step, as far as
+its largest torque allows; every engine implements ideal drives itself. A :class:`Servo` models the
+drive of a real axis: stiffness, damping, feed-forward, and a motor with a torque-speed line.
 """
 
 from __future__ import annotations
@@ -36,19 +36,21 @@ FEEDFORWARDS = ("none", "gravity", "computed")
 
 @dataclass(frozen=True)
 class Servo:
-    """A servo drive on each motor's axis.
+    """Servo drive on each motor's axis.
 
-    The torque is stiffness x (reference - angle) + damping x (its rate - rate) + feed-forward, and
-    not more than the motor has at its speed. The defaults are a good direct drive's: a bandwidth f
-    of 40 Hz, critically damped, on I = 0.12 kg m^2, the lightest motion that the paper's machine
-    has, I (2 pi f)^2 and 2 I (2 pi f), rounded. Motions along y, next to the singularity, are up to
-    150 times as heavy, and that much slower and less damped.
+    torque = stiffness (theta_ref - theta) + damping (theta_dot_ref - theta_dot) + feed-forward,
+    clipped to the motor's torque-speed line.
+
+    The defaults model a good direct drive: bandwidth f = 40 Hz, critically damped, at the inertia
+    I = 0.12 kg m^2. The stiffness is I (2 pi f)^2 and the damping 2 I (2 pi f), rounded. I is the
+    smallest inertia of the paper's machine in any direction of motion. Along y, next to the
+    singularity, the inertia is up to 150 times larger, so motions are slower and less damped.
 
     Attributes:
-        stiffness: N m/rad.
-        damping: N m s/rad.
+        stiffness: Stiffness, N m/rad.
+        damping: Damping, N m s/rad.
         feedforward: Torques of the nominal machine that are fed forward: ``"none"``, ``"gravity"``
-            (those at rest), or ``"computed"`` (those of the whole motion).
+            (torques at rest), or ``"computed"`` (torques of the whole motion).
 
     Raises:
         ConfigurationError: If a value is out of range.
@@ -59,7 +61,7 @@ class Servo:
     feedforward: str = "computed"
 
     def __post_init__(self) -> None:
-        """Reject impossible values."""
+        """Check the values."""
         for name in ("stiffness", "damping"):
             value = getattr(self, name)
             if not is_number(value) or not value > 0:
@@ -70,10 +72,10 @@ class Servo:
 
 
 def drive_of(value: Any) -> Servo | None:
-    """Return the drive of an option: ``"ideal"`` or None, ``"servo"``, a Servo or a mapping.
+    """Convert ``"ideal"``, None, ``"servo"``, a Servo or a mapping into a drive.
 
     Raises:
-        ConfigurationError: If the option is another, or a value is out of range.
+        ConfigurationError: If ``value`` is none of these, or an attribute is out of range.
     """
     if value is None or value == "ideal":
         return None
@@ -91,25 +93,25 @@ def require_servo(
     servo_stiffness: Sequence[float] | float,
     joint_friction: Sequence[float] | float,
 ) -> None:
-    """Raise if an ideal drive is asked for what only a servo has.
+    """Check that stiffness factors and joint friction are neutral if the drives are ideal.
 
     Raises:
-        ConfigurationError: If a factor of the stiffness is not 1, or there is friction.
+        ConfigurationError: If the drives are ideal and a factor is not 1 or a friction is not 0.
     """
     if drive is not None:
         return
     asked = (("servo_stiffness", servo_stiffness, 1), ("joint_friction", joint_friction, 0))
     for name, values, neutral in asked:
         if np.any(np.not_equal(values, neutral)):
-            valid = f"{neutral}, or drive='servo': ideal drives have neither"
+            valid = f"{neutral}, or set drive='servo': ideal drives have no {name}"
             raise ConfigurationError(name, values, valid)
 
 
 def drives_and_randomisation(drive: Any, randomisation: Any) -> tuple[Servo | None, Randomisation]:
-    """Return the drive and the randomisation of two options.
+    """Convert the options ``drive`` and ``randomisation``.
 
     Raises:
-        ConfigurationError: If one is not possible, or only a servo has what is randomised.
+        ConfigurationError: If an option is invalid, or the randomisation requires a servo drive.
     """
     servo, drawn = drive_of(drive), settings_of(Randomisation, "randomisation", randomisation)
     require_servo(servo, drawn.servo_stiffness, drawn.joint_friction)
@@ -120,9 +122,9 @@ class References(NamedTuple):
     """References of servo drives in the K time steps of a control period, for n robots.
 
     Attributes:
-        theta: (K, n, 3) rad (m for a slide), at the end of each time step.
-        theta_dot: (K, n, 3) rad/s.
-        torque: (K, n, 3) N m, fed forward in each time step.
+        theta: (K, n, 3) rad (m for a slide), true joint positions at the end of each time step.
+        theta_dot: (K, n, 3) rad/s, mean joint velocities in each time step.
+        torque: (K, n, 3) N m, feed-forward torques in each time step.
     """
 
     theta: FloatArray
@@ -131,26 +133,25 @@ class References(NamedTuple):
 
 
 class ServoDrives:
-    """Servo drives of n machines, in an engine of fixed time steps.
+    """Servo drives of n robots, in an engine with a fixed time step.
 
-    A real amplifier closes its loops some ten thousand times a second, an engine a few hundred
-    times. Computed from the joint positions at the beginning of each time step, the law would
-    explode at the stiffness of a real axis. It is therefore taken at the end of the time step
-    (backward Euler), which is stable at any stiffness. The acceleration until then follows from the
-    machine's inertia M and from the load. The load is the last time step's torque minus M times
-    its acceleration. So the static stiffness is the stated one against any force, and motion is
-    that of a spring and a damper under backward Euler, which damps ``stiffness`` x ``time_step``
-    more than the stated damping.
+    A real amplifier updates the torque about 10,000 times per second, an engine a few hundred
+    times. At this rate, the servo law with the joint positions at the beginning of a time step is
+    unstable at the stiffness of a real axis. So the law uses the predicted joint positions at the
+    end of the time step (backward Euler), which is stable at any stiffness. The prediction uses the
+    inertia M and the load: the last time step's torque minus M times the last acceleration. The
+    static stiffness equals ``stiffness`` under any load. The damping is larger than ``damping`` by
+    ``stiffness`` x ``time_step``.
 
     Args:
-        servo: The law.
-        machine: The nominal machine.
-        count: Number of machines, n.
-        time_step: s.
+        servo: Parameters of the servo law.
+        machine: Nominal machine.
+        count: Number of robots, n.
+        time_step: Time step of the engine, s.
 
     Attributes:
-        memory: (2, n, 3), the torques (N m) of the last time step and the joint velocities (rad/s)
-            at its beginning.
+        memory: (2, n, 3), torques (N m) in the last time step, and joint velocities (rad/s) at its
+            beginning.
         friction: (n, 3) N m, Coulomb friction of the motors' axes.
         law: Parameters of :func:`tpm_gym.simulation.compiled.servo_torques`, from :meth:`begin`.
 
@@ -159,7 +160,7 @@ class ServoDrives:
     """
 
     def __init__(self, servo: Servo, machine: Machine, count: int, time_step: float) -> None:
-        """Start as the nominal drives, with the machines at rest at home."""
+        """Initialise the drives with nominal plants, at rest at home."""
         from tpm_gym.simulation import compiled  # imports Numba
 
         self._step_law, self._braced = compiled.servo_torques, compiled.braced_inverse
@@ -172,7 +173,7 @@ class ServoDrives:
         self._line = np.array([(motor.corner, motor.speed) for motor in motors])
         self._nominal_effort = np.array([motor.effort for motor in motors])
         self._home = machine.require_inverse(np.array(machine.home))
-        self._built: FloatArray | None = None  # parameters of machines with other lengths
+        self._built: FloatArray | None = None  # machine parameters; None if all are nominal
         self._stiffness, self._effort, self.friction = np.zeros((3, count, 3))
         self._lightest = np.ones((count, 1, 1))
         self.memory = np.zeros((2, count, 3))
@@ -181,32 +182,31 @@ class ServoDrives:
         self.rest(rows, np.tile(self._home, (count, 1)))
 
     def alter(self, rows: IntArray, plants: Sequence[Plant]) -> None:
-        """Become the drives of some plants."""
+        """Apply plants to the drives of ``rows``."""
         lengths = [plant.lengths_of(self._machine) for plant in plants]
         if self._built is None and any(lengths):
             self._built = np.tile(self._machine.built(), (len(self.friction), 1))
         if self._built is not None:
             self._built[rows] = [self._machine.built(own) for own in lengths]
-        self._stiffness[rows] = self._servo.stiffness * np.array(
-            [p.servo_stiffness for p in plants]
-        )
+        factors = np.array([p.servo_stiffness for p in plants])
+        self._stiffness[rows] = self._servo.stiffness * factors
         self._effort[rows] = self._nominal_effort * np.array([p.motor_strength for p in plants])
         self.friction[rows] = [p.joint_friction for p in plants]
-        # Too large an inertia would be unstable. M with each link's own factor lies between those
-        # with the smallest and the largest factor for all links.
+        # Too large an inertia makes the law unstable. So M is scaled by the smallest link factor,
+        # which gives a lower bound of the true inertia.
         self._lightest[rows, 0, 0] = [min(p.link_masses, default=1.0) for p in plants]
 
     def rest(self, rows: IntArray, theta: FloatArray) -> None:
-        """Start at rest at ``theta`` (r, 3) rad, with the torques that carry the machines."""
+        """Reset drives to rest at ``theta`` (r, 3) rad, with the torques that carry the weight."""
         built = None if self._built is None else self._built[rows]
         self.memory[0, rows] = self._machine.motion(theta, np.zeros_like(theta), built).bias
         self.memory[1, rows] = 0.0
 
     def references(self, path: Path) -> References:
-        """Compute references along a path, and the feed-forward of the nominal machine.
+        """Compute references along a path, and the feed-forward torques of the nominal machine.
 
-        The feed-forward is computed for the first and the last time step and interpolated: within a
-        control period it differs little from a straight line.
+        The feed-forward is computed for the first and the last time step and interpolated linearly,
+        because it is almost linear within a control period.
         """
         from tpm_gym.simulation import compiled  # imports Numba
 
@@ -221,7 +221,8 @@ class ServoDrives:
                 rates = (theta[:, start + 1] - theta[:, start]) / step
                 changes = np.zeros_like(rates)
                 if steps > 1:
-                    # Across a border of control periods the acceleration jumps to the new one's.
+                    # The acceleration jumps between control periods, so the difference uses only
+                    # joint positions of this control period.
                     here = theta[:, start : start + 3] if k == 0 else theta[:, -3:]
                     changes = np.diff(np.diff(here, axis=1) / step, axis=1)[:, 0] / step
                 torques[k] = machine.torque(theta[:, start], moving * rates, moving * changes)
@@ -229,11 +230,11 @@ class ServoDrives:
         return references
 
     def begin(self, theta: FloatArray) -> None:
-        """Compute the inertia at ``theta`` (n, 3) rad, for a control period."""
+        """Set ``law`` for a control period, with the inertia at ``theta`` (n, 3) rad."""
         still = np.zeros_like(theta)
         mass = self._machine.motion(theta, still, self._built).mass
         lost = np.isnan(mass[:, 0, 0])
-        if lost.any():  # a machine of other lengths cannot be there
+        if lost.any():  # a machine with length errors may have no assembly at theta
             home = np.tile(self._home, (int(lost.sum()), 1))
             built = None if self._built is None else self._built[lost]
             mass[lost] = self._machine.motion(home, 0.0 * home, built).mass
@@ -245,13 +246,13 @@ class ServoDrives:
     def torque(
         self, references: References, index: int, theta: FloatArray, theta_dot: FloatArray
     ) -> FloatArray:
-        """Compute what the motors apply in a time step, (n, 3) N m.
+        """Compute the torques (n, 3) N m that the motors apply in a time step.
 
         Args:
-            references: For the control period.
-            index: Number of the time step in it.
-            theta: (n, 3) rad, at the beginning of the time step.
-            theta_dot: (n, 3) rad/s.
+            references: References of the control period.
+            index: Index of the time step in the control period.
+            theta: (n, 3) rad, joint positions at the beginning of the time step.
+            theta_dot: (n, 3) rad/s, joint velocities at the beginning of the time step.
         """
         self._step_law(index, references, self.law, theta, theta_dot, self._step, self.memory)
         torque: FloatArray = self.memory[0]

@@ -1,15 +1,15 @@
-"""The interface of engines, and the engines by name.
+"""Interface of engines, and the registry of engines by name.
 
-An engine moves n machines over n tables, and knows a machine, a scene and a drive; never a goal, a
-reward or Gymnasium. Paths, encoder errors, modes and the State are the same for all engines and
-are in :mod:`tpm_gym.simulation.simulation`.
+An engine simulates n robots, each over its own table. Engines know machine, scene and drive, but
+no goals, rewards or Gymnasium. Encoder errors, modes and the State are computed for all engines in
+:mod:`tpm_gym.simulation.simulation`.
 """
 
 from __future__ import annotations
 
 import importlib
 import inspect
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from types import ModuleType
 from typing import Any, NamedTuple, Protocol
@@ -43,12 +43,12 @@ __all__ = [
 
 UPRIGHT: Quaternion = (0.0, 0.0, 0.0, 1.0)
 SPRING_GAIN = 0.2
-"""Share of its way back that the cup's spring takes in one time step."""
+"""Fraction of its displacement that the cup's spring removes in one time step."""
 
 
 def transform(origin: Vector, quaternion: Quaternion, point: Vector) -> Vector:
-    """Convert a point of a frame into the frame's parent, m."""
-    # rotate(), written out for speed.
+    """Convert a point (m) from a frame with this origin (m) and orientation to its parent frame."""
+    # This equals origin + rotate(quaternion, point), written out for speed.
     u, v, w = origin
     x, y, z, r = quaternion
     a, b, c = point
@@ -61,41 +61,40 @@ def transform(origin: Vector, quaternion: Quaternion, point: Vector) -> Vector:
 
 
 class Pose(NamedTuple):
-    """Position (m) and orientation (x, y, z, w)."""
+    """Position (m) and orientation quaternion (x, y, z, w)."""
 
     position: Vector
     quaternion: Quaternion = UPRIGHT
 
     @classmethod
     def of(cls, numbers: Sequence[float]) -> Pose:
-        """Make a pose of seven numbers."""
-        x, y, z, *turn = numbers
-        a, b, c, d = turn
+        """Create a pose from position (m) and quaternion (x, y, z, w) in one sequence."""
+        x, y, z, a, b, c, d = numbers
         return cls((x, y, z), (a, b, c, d))
 
 
 class Twist(NamedTuple):
-    """Velocity (m/s) and angular velocity (rad/s)."""
+    """Linear velocity (m/s) and angular velocity (rad/s)."""
 
     velocity: Vector = (0.0, 0.0, 0.0)
     angular_velocity: Vector = (0.0, 0.0, 0.0)
 
 
 class Readout(NamedTuple):
-    """Everything that an engine reports of n robots and k objects on each table; world frame.
+    """Readings of an engine for n robots with k objects on each table; world frame.
 
     Attributes:
         theta: (n, 3) rad (m for a slide), true joint positions.
-        theta_dot: (n, 3) rad/s.
-        torque: (n, 3) N m, in the last time step.
+        theta_dot: (n, 3) rad/s, true joint velocities.
+        torque: (n, 3) N m, torques of the motors in the last time step.
         position: (n, 3) m, point P of the platform.
-        tilt: (n,) rad, rotation of the platform.
-        gap: (n,) m, largest gap of the loops.
-        mode_left: (n,) mode that the machine left, as :meth:`tpm_gym.Machine.mode_left` codes it.
+        tilt: (n,) rad, rotation angle of the platform.
+        gap: (n,) m, largest gap at a loop closure.
+        mode_left: (n,) mode that the robot left, coded as in :meth:`tpm_gym.Machine.mode_left`.
         held: (n,) index of the object in the cup; -1 for none.
         vacuum: (n,) Pa below the ambient pressure.
-        object_position: (n, k, 3) m.
-        object_quaternion: (n, k, 4), (x, y, z, w).
+        object_position: (n, k, 3) m, centres of the objects.
+        object_quaternion: (n, k, 4), orientations (x, y, z, w) of the objects.
         object_velocity: (n, k, 3) m/s.
         object_angular_velocity: (n, k, 3) rad/s.
     """
@@ -123,14 +122,14 @@ class Readout(NamedTuple):
         hold: Hold,
         objects: Sequence[tuple[Pose, Twist]],
     ) -> Readout:
-        """Make the readout of one robot from plain floats.
+        """Create the readout of one robot from floats.
 
         Args:
-            machine: The true machine, whose modes are checked.
+            machine: True machine of the robot; it determines the mode that was left.
             motors: Joint positions (rad), velocities (rad/s) and torques (N m).
-            truth: Largest gap (m), point P (m) and tilt (rad).
-            hold: What the cup holds.
-            objects: Poses and velocities.
+            truth: Largest loop gap (m), point P (m, world) and tilt (rad).
+            hold: Held object and vacuum.
+            objects: Pose and velocities of each object.
         """
         (theta, rates, torque), (gap, (x, y, z), tilt) = motors, truth
         (a, b, c), (u, v, w) = machine.mount.plain_frame
@@ -138,7 +137,7 @@ class Readout(NamedTuple):
         numbers = [*theta, *rates, *torque, x, y, z, tilt, gap, hold.vacuum, *own]
         for (where, orientation), (velocity, spin) in objects:
             numbers += (*where, *orientation, *velocity, *spin)
-        # One array for all numbers costs half of an array for each entry.
+        # Slicing one array takes half the time of creating one array per attribute.
         row = np.array([numbers])
         table = row[:, 18:].reshape(1, -1, 13)
         left = machine.mode_left(row[:, 0:3], row[:, 15:18])
@@ -150,7 +149,7 @@ class Readout(NamedTuple):
 
 
 def spline_weights(steps: int) -> FloatArray:
-    """Return the weights (steps, 3) of the last three commands along the quadratic B-spline."""
+    """Return weights (steps, 3) of three commands, oldest first, for a quadratic B-spline."""
     s = np.arange(1, steps + 1) / steps
     return np.stack([(1 - s) ** 2, 1 + 2 * s - 2 * s**2, s**2], axis=1) / 2
 
@@ -159,14 +158,14 @@ class Path:
     """Path of point P of n robots in a control period: a quadratic B-spline through the commands.
 
     The spline lags the commands by half a period, stays in their convex hull, and keeps the
-    accelerations finite. It is a curve of point P, not of the joints: near a singularity, a
-    straight line between two postures would wander by centimetres.
+    accelerations finite. Point P is interpolated, not the joint positions: near a singularity,
+    interpolated joint positions would move P away from the line by centimetres.
 
     Args:
-        machine: The nominal machine, whose inverse kinematics the control believes in.
+        machine: Nominal machine, used for the inverse kinematics.
         commands: (n, 3, 3) m, machine's frame: the last three commands, oldest first.
-        weights: (K, 3), of :func:`spline_weights`.
-        bias: (n, 3) rad, what the encoders report minus the truth; None for none.
+        weights: (K, 3), from :func:`spline_weights`.
+        bias: (n, 3) rad, encoder reading minus true joint position; None for zero.
     """
 
     def __init__(
@@ -176,17 +175,17 @@ class Path:
         weights: FloatArray,
         bias: FloatArray | None = None,
     ) -> None:
-        """Compute nothing yet."""
+        """Store the arguments."""
         self.machine, self._commands, self._weights, self._bias = machine, commands, weights, bias
 
     @property
     def start(self) -> FloatArray:
-        """(n, 3) m, point P at the beginning of the period."""
+        """Point P at the beginning of the period, (n, 3) m."""
         start: FloatArray = (self._commands[:, 0] + self._commands[:, 1]) / 2
         return start
 
     def points(self, last: int = 0) -> FloatArray:
-        """Return point P (n, k, 3) m at the ends of the last k time steps; 0 for all of them."""
+        """Return point P (n, k, 3) m at the ends of the last k time steps (0: all time steps)."""
         points: FloatArray = _loops().spline_points(self._commands, self._weights[-last:])
         return points
 
@@ -197,15 +196,15 @@ class Path:
             JointLimitError: If a motor would be beyond a stop.
             UnreachableError: If a point is out of reach.
         """
-        loops = _loops()
-        points = loops.spline_points(self._commands, self._weights[-last:])
+        points = self.points(last)
         theta = self.machine.inverse(points)
-        if not loops.all_within(theta.reshape(-1, 3), *self.machine.stops):  # NaN is not
+        # all_within() is also False for NaN, and reach() then raises the error.
+        if not _loops().all_within(theta.reshape(-1, 3), *self.machine.stops):
             theta = self.machine.reach(points)
         return theta if self._bias is None else self.true(theta)
 
     def true(self, theta: FloatArray) -> FloatArray:
-        """Convert joint positions (n, ..., 3) by the encoders into true ones."""
+        """Convert encoder readings (n, ..., 3) rad into true joint positions."""
         if self._bias is None:
             return theta
         return theta - self._bias.reshape(-1, *(1,) * (theta.ndim - 2), 3)
@@ -213,8 +212,7 @@ class Path:
 
 @cache
 def _loops() -> ModuleType:
-    """Import the compiled loops, and with them Numba."""
-    from tpm_gym.simulation import compiled
+    from tpm_gym.simulation import compiled  # imports Numba
 
     return compiled
 
@@ -222,10 +220,10 @@ def _loops() -> ModuleType:
 def drives_of_one(
     servo: Servo | None, machine: Machine, count: int, time_step: float
 ) -> ServoDrives | None:
-    """Return the drives of an engine that simulates one robot; None for ideal ones.
+    """Return the drives of an engine that simulates one robot; None for ideal drives.
 
     Raises:
-        ConfigurationError: If there is not one robot, or a motor has no torque-speed line.
+        ConfigurationError: If ``count`` is not 1, or a motor has no torque-speed line.
     """
     if count != 1:
         raise ConfigurationError("count", count, "1: this engine simulates one robot")
@@ -233,22 +231,22 @@ def drives_of_one(
 
 
 class Driven(Protocol):
-    """Robot of an engine that simulates one, with three motors."""
+    """Robot with three motors, in an engine that simulates one robot."""
 
     def motors(self) -> tuple[Vector, Vector, Vector]:
         """Return joint positions (rad), velocities (rad/s) and torques (N m)."""
 
     def drive(self, theta: Vector) -> None:
-        """Let ideal motors go to ``theta`` rad in the next time step."""
+        """Set the joint positions (rad) that ideal motors reach in the next time step."""
 
     def apply(self, torque: Vector) -> None:
-        """Let the motors apply ``torque`` N m in the next time step."""
+        """Set the torques (N m) that the motors apply in the next time step."""
 
 
 def steering(
     drives: ServoDrives | None, path: Path, robot: Driven
 ) -> tuple[Sequence[Any], Callable[[Any], None]]:
-    """Return a target for each time step of a path, and the function that drives a robot to it."""
+    """Return a target for each time step, and the function that drives the robot to a target."""
     if drives is None:
         return path.joints()[0].tolist(), robot.drive
     references = drives.references(path)
@@ -263,59 +261,58 @@ def steering(
 
 
 class Engine(Protocol):
-    """n machines, each over a table of its own. Rows first, SI units, world frame.
+    """Simulator of n robots, each over its own table. SI units, world frame, rows first.
 
-    ``load`` comes first, then ``place``. An engine refuses what it cannot do with a
-    :class:`~tpm_gym.errors.ConfigurationError` that names the option.
+    Call ``load`` first, then ``place``. An engine raises
+    :class:`~tpm_gym.errors.ConfigurationError` for every option that it does not support.
 
     Attributes:
-        time_step: s; a whole fraction of the control period.
+        time_step: Time step, s; the control period must be an integer multiple of it.
     """
 
     time_step: float
 
     def load(self, machine: Machine, scene: Scene, count: int) -> None:
-        """Load ``count`` machines as designed, each with this scene."""
+        """Load ``count`` nominal robots, each with a copy of the scene."""
 
     def alter(self, rows: IntArray, plants: Sequence[Plant]) -> None:
-        """Turn some machines into those of their plants, masses, motors and lengths."""
+        """Apply plants (masses, motors, friction, lengths) to the robots of ``rows``."""
 
     def place(self, rows: IntArray, theta: FloatArray, objects: FloatArray) -> None:
-        """Open the cups, and put joints and objects in their places, at rest.
+        """Place robots and objects at rest, with nothing in the cups.
 
         Args:
-            rows: (r,) machines to place.
+            rows: (r,) robots to place.
             theta: (r, 3) rad (m for a slide), true joint positions.
-            objects: (r, k, 7) centres (m) and orientations (x, y, z, w).
+            objects: (r, k, 7) centres (m) and orientations (x, y, z, w) of the objects.
         """
 
     def advance(self, path: Path, vacuum: BoolArray) -> None:
-        """Run a control period along ``path``, with the vacuum on or off (n,)."""
+        """Simulate one control period along ``path``; ``vacuum`` (n,) is True where it is on."""
 
     def read(self) -> Readout:
-        """Read everything; the arrays belong to the caller."""
+        """Return the readings of all robots; the caller may change the arrays."""
 
     def save(self) -> Any:
-        """Return everything that the next steps depend on, as plain data or arrays.
+        """Return all state that the next steps depend on, as plain data or arrays.
 
-        Leave out what cannot be read, such as impulses of old contacts; ``restore`` clears it.
+        Omit state that cannot be read, such as impulses of old contacts; ``restore`` clears it.
         """
 
     def restore(self, saved: Any) -> None:
-        """Continue from what ``save`` returned, for as many machines, altered alike."""
+        """Continue from the result of ``save``; number of robots and plants must be equal."""
 
     def show_goal(self, markers: FloatArray) -> None:
-        """Move the goal markers of the first robot to (k, 3) m."""
+        """Move the goal markers of the first robot to ``markers`` (k, 3) m."""
 
     def picture(self, width: int, height: int) -> NDArray[np.uint8]:
-        """Draw the first robot and its scene as (height, width, 3) RGB."""
+        """Draw the first robot and its scene as an RGB image (height, width, 3)."""
 
     def close(self) -> None:
-        """Release everything; harmless the second time."""
+        """Release all resources; a second call does nothing."""
 
 
 Factory = Callable[..., Engine]
-
 
 _ENGINES: dict[str, str | Factory] = {
     "pybullet": "tpm_gym.simulation.bullet.engine:BulletEngine",
@@ -326,18 +323,18 @@ _MOST: dict[str, int | None] = {"analytic": None}
 
 
 def register_engine(name: str, engine: str | Factory, *, robots: int | None = 1) -> None:
-    """Register an engine, so that environments can be made with ``engine=name``.
+    """Register an engine, so that environments can be created with ``engine=name``.
 
     Args:
-        name: Its name.
-        engine: Callable that makes the engine. It takes those of the keywords ``gui`` (open a
-            window), ``renderer``, ``physics`` (numerical settings) and ``drive`` (a
-            :class:`~tpm_gym.simulation.Servo` on each motor instead of ideal drives) that the
-            engine can serve. Or ``"module:attribute"``, imported when first used.
-        robots: Largest number of robots in one engine; None for any number.
+        name: Name of the engine.
+        engine: Callable that creates the engine, or ``"module:attribute"``, which is imported at
+            the first use. The callable may have the keywords ``gui`` (open a window),
+            ``renderer``, ``physics`` (numerical settings) and ``drive`` (a
+            :class:`~tpm_gym.simulation.Servo`). Leave out the keywords that it does not support.
+        robots: Largest number of robots in one engine; None for no limit.
 
     Raises:
-        ConfigurationError: If an argument is not possible, or another engine has the name.
+        ConfigurationError: If an argument is invalid, or another engine has this name.
     """
     if not isinstance(name, str) or not name:
         raise ConfigurationError("name", name, "a name")
@@ -351,24 +348,24 @@ def register_engine(name: str, engine: str | Factory, *, robots: int | None = 1)
 
 
 def _path(engine: str | Factory) -> str:
-    """Return where an engine is defined: from there it may be registered again."""
+    """Return "module:attribute" of an engine; an equal path may be registered again."""
     if isinstance(engine, str):
         return engine
     return f"{engine.__module__}:{getattr(engine, '__qualname__', engine)}"
 
 
-def require_engine(name: Any, among: Collection[str] = ()) -> None:
-    """Raise if no engine has this name.
+def require_engine(name: Any) -> None:
+    """Check the name of an engine.
 
     Raises:
-        ConfigurationError: If there is none of that name, or it is not ``among`` those.
+        ConfigurationError: If no engine is registered with this name.
     """
-    if not isinstance(name, str) or name not in (among or _ENGINES):
+    if not isinstance(name, str) or name not in _ENGINES:
         raise ConfigurationError("engine", name, ", ".join(map(repr, _ENGINES)))
 
 
 def most_robots(name: str) -> int | None:
-    """Return the largest number of robots in one engine; None for any number."""
+    """Return the largest number of robots in one engine; None for no limit."""
     require_engine(name)
     return _MOST.get(name, 1)
 
@@ -381,10 +378,10 @@ def make_engine(
     physics: Any = None,
     drive: Servo | None = None,
 ) -> Engine:
-    """Make the engine of that name.
+    """Create the engine with this name.
 
     Raises:
-        ConfigurationError: If there is none, or the engine cannot serve an option.
+        ConfigurationError: If no engine has this name, or the engine does not support an option.
     """
     require_engine(name)
     factory = _ENGINES[name]
@@ -395,17 +392,12 @@ def make_engine(
         except (ModuleNotFoundError, AttributeError) as error:
             valid = f"an engine that can be imported; for {factory!r} Python says: {error}"
             raise ConfigurationError("engine", name, valid) from error
-    options: dict[str, Any] = {
-        "gui": gui or None,
-        "renderer": renderer,
-        "physics": physics,
-        "drive": drive,
-    }
+    options = {"gui": gui or None, "renderer": renderer, "physics": physics, "drive": drive}
     asked = {option: value for option, value in options.items() if value is not None}
     known = inspect.signature(factory).parameters
     if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in known.values()):
         for option in asked.keys() - known.keys():
-            if option == "gui":  # users ask for it by the name of the environment's option
+            if option == "gui":  # The environment's option has another name: render_mode.
                 valid = f"None or 'rgb_array': the engine {name!r} opens no window"
                 raise ConfigurationError("render_mode", "human", valid)
             valid = f"left out: the engine {name!r} has no such option"
@@ -420,6 +412,6 @@ _PARTS = [name for name in (*Engine.__annotations__, *vars(Engine)) if not name.
 
 
 def _has(engine: Engine, part: str) -> bool:
-    """Return whether an engine defines a part itself; the protocol's methods do nothing."""
+    """Return whether an engine has an attribute that it does not inherit from the protocol."""
     own = getattr(engine, part, None)
     return own is not None and getattr(own, "__func__", None) is not vars(Engine).get(part, own)

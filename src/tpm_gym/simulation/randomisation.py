@@ -1,8 +1,8 @@
-"""Where the machine of an episode differs from the nominal one: domain randomisation.
+"""Domain randomisation: differences between the robot of an episode and the nominal machine.
 
-A :class:`Randomisation` says how far each quantity may stray; its :meth:`~Randomisation.draw` gives
-the :class:`Plant` of one episode. The controller, the forward kinematics of the observation and the
-expert keep believing in the nominal machine, as on a real robot.
+A :class:`Randomisation` defines ranges, and :meth:`Randomisation.draw` draws the :class:`Plant` of
+one episode. The controller, the forward kinematics of the observation and the expert use the
+nominal machine, as on a real robot.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ __all__ = ["LIMITS", "NOMINAL", "Plant", "Randomisation"]
 
 Range = tuple[float, float]
 
-# The limits reach so far that trained policies fail.
+# The limits are so wide that trained policies fail within them.
 _RANGES: dict[str, Range] = {
     "link_mass": (0.5, 16.0),
     "block_mass": (0.1, 10.0),
@@ -29,13 +29,9 @@ _RANGES: dict[str, Range] = {
     "servo_stiffness": (0.01, 4.0),
     "joint_friction": (0.0, 100.0),
 }
-# With the largest bias and length errors at once, the arm at home can still be assembled; with
-# twice as much, some machines have no assembly at the joint positions of the encoders.
-_SIZES: dict[str, float] = {
-    "encoder_noise": 0.02,
-    "encoder_bias": 1e-3,
-    "length_error": 1e-3,
-}
+# With the largest bias and length errors together, every robot can be assembled at home. With
+# twice these errors, some robots have no assembly at the joint positions of the encoders.
+_SIZES: dict[str, float] = {"encoder_noise": 0.02, "encoder_bias": 1e-3, "length_error": 1e-3}
 _LATEST = 5  # control steps
 LIMITS: dict[str, Range] = {
     **_RANGES,
@@ -47,18 +43,18 @@ LIMITS: dict[str, Range] = {
 
 @dataclass(frozen=True)
 class Plant:
-    """The machine of one episode, as multiples of the nominal one and deviations from it.
+    """True robot of one episode, as factors of the nominal machine and deviations from it.
 
     Attributes:
-        link_masses: Factors of mass and inertia, one for each moving link in the order of
-            the machine's mechanism; empty if all are one.
-        block_mass: Factor of the objects' mass.
-        friction: Factor of the friction between objects and table, and objects and cup.
-        motor_strength: Factors of the three motors' largest torque.
-        servo_stiffness: Factors of the three servo drives' stiffness.
-        joint_friction: Coulomb friction on the three motors' axes, N m.
-        encoder_bias: What the encoders report minus what is true, rad.
-        length_errors: True minus nominal lengths (l1 to l7), m; empty if all are zero.
+        link_masses: Factor of mass and inertia for each moving link, in the order of the
+            machine's mechanism; empty if all factors are 1.
+        block_mass: Factor of the objects' masses.
+        friction: Factor of the objects' friction coefficients, against table and cup.
+        motor_strength: Factor of the largest torque of each motor.
+        servo_stiffness: Factor of the stiffness of each servo drive.
+        joint_friction: Coulomb friction on the axis of each motor, N m.
+        encoder_bias: Encoder reading minus true joint position of each motor, rad.
+        length_errors: True minus nominal lengths (l1 to l7), m; empty if all errors are zero.
     """
 
     link_masses: tuple[float, ...] = ()
@@ -71,50 +67,49 @@ class Plant:
     length_errors: tuple[float, ...] = ()
 
     def lengths_of(self, nominal: Machine) -> tuple[float, ...]:
-        """Return the true lengths, m; empty for nominal ones."""
+        """Return the true lengths, m; empty if all lengths are nominal."""
         if not self.length_errors:
             return ()
         lengths = zip(nominal.lengths, self.length_errors, strict=True)
         return tuple(length + error for length, error in lengths)
 
     def of(self, nominal: Machine) -> Machine:
-        """Return the true machine."""
+        """Return the machine with the true lengths."""
         lengths = self.lengths_of(nominal)
         return nominal.with_lengths(lengths) if lengths else nominal
 
 
 NOMINAL = Plant()
-"""The machine as designed."""
+"""Plant without differences from the nominal machine."""
 
 
 @dataclass(frozen=True)
 class Randomisation:
-    """Largest differences from the nominal machine. Each episode draws uniformly.
+    """Ranges from which the plant of each episode is drawn uniformly.
 
-    Ranges are given as (low, high), or as one number that is then fixed.
+    A range is (low, high), or one number for a fixed value.
 
     Attributes:
-        link_mass: Factor of each moving link's mass and inertia, drawn for each link;
-            within 0.5 to 16.
-        block_mass: Factor of the objects' mass (50 g); within 0.1 to 10.
+        link_mass: Factor of mass and inertia, drawn for each moving link; within 0.5 to 16.
+        block_mass: Factor of the objects' masses (50 g); within 0.1 to 10.
         friction: Factor of the objects' friction (0.6 on the table); within 0.1 to 3.
         motor_strength: Factor of each motor's largest torque (100 N m); within 0.05 to 1.5.
-        servo_stiffness: Factor of each drive's stiffness, its damping left as it is; within 0.01 to
-            4. With ``drive="servo"`` only.
-        joint_friction: Coulomb friction on each motor's axis, N m; within 0 to 100. With
-            ``drive="servo"`` only.
-        encoder_noise: Standard deviation of each reading of an encoder, rad; at most 0.02.
-            The rates are differences of readings over a control period, and as noisy.
-        encoder_bias: Each encoder is off by up to this, rad; at most 0.001. Its motor goes where
-            the encoder says, so the arm is off too.
-        latency: Control steps by which actions come late, at most 5.
-        length_error: Each of l1 to l7 is off by up to this, m; at most 0.001. The robot is then
-            built anew at each reset, which takes several times as long, and of which Bullet keeps
-            some 13 kB of memory.
+        servo_stiffness: Factor of each drive's stiffness, at nominal damping; within 0.01 to 4.
+            Requires ``drive="servo"``.
+        joint_friction: Coulomb friction on each motor's axis, N m; within 0 to 100. Requires
+            ``drive="servo"``.
+        encoder_noise: Standard deviation of each encoder reading, rad; at most 0.02. The noise of
+            a joint velocity is the difference of two such values, divided by the control period.
+        encoder_bias: Largest bias of each encoder, rad; at most 0.001. The drive follows the
+            encoder, so the true joint position has the opposite error.
+        latency: Delay of the actions in control steps, at most 5.
+        length_error: Largest error of each of l1 to l7, m; at most 0.001. PyBullet and MuJoCo then
+            rebuild the robot at each reset, which makes a reset several times slower. PyBullet
+            leaks about 13 kB of memory per rebuild.
 
-    Away from the nominal machine, actions at full speed into the corner next to y = 0 can throw the
-    platform through the singularity, which is reported as ever: a few times in 100 episodes of
-    random actions with lengths off by 1 mm, more with heavy links on weak motors.
+    If the plant is not nominal, actions at full speed towards the corner near y = 0 can move the
+    platform through the singularity. The State reports this. With random actions and length errors
+    of 1 mm it happens in a few of 100 episodes; heavy links and weak motors make it more frequent.
 
     Raises:
         ConfigurationError: If a value is out of range.
@@ -132,7 +127,7 @@ class Randomisation:
     length_error: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the values; make pairs of single numbers."""
+        """Check the values, and convert single numbers to pairs."""
         for name, (low, high) in _RANGES.items():
             object.__setattr__(self, name, _pair(name, getattr(self, name), low, high))
         for name, largest in _SIZES.items():
@@ -145,12 +140,12 @@ class Randomisation:
         object.__setattr__(self, "latency", int(self.latency))
 
     def draw(self, rng: np.random.Generator, machine: Machine) -> Plant:
-        """Draw the plant of one episode; ``rng`` is not used where nothing is randomised."""
+        """Draw the plant of one episode; attributes that are not randomised do not use ``rng``."""
         if self == _NOTHING:
             return NOMINAL
         one, two, three = self._numbers(rng, "motor_strength", 3)
         biases = _deviations(rng, self.encoder_bias, 3) or (0.0, 0.0, 0.0)
-        # New attributes are drawn last, so that seeds keep their meaning.
+        # New attributes are drawn last, so that equal seeds still draw equal values of the others.
         plant = Plant(
             link_masses=self._numbers(rng, "link_mass", len(machine.mechanism.links) - 1),
             block_mass=self._numbers(rng, "block_mass", 1)[0],
@@ -164,7 +159,7 @@ class Randomisation:
         return replace(plant, servo_stiffness=(a, b, c), joint_friction=(d, e, f))
 
     def told(self, plant: Plant) -> dict[str, Any]:
-        """Return the plant and the latency of an episode for ``info``."""
+        """Return the plant and the latency of an episode as entries of ``info``."""
         return {**asdict(plant), "latency": self.latency}
 
     def _numbers(self, rng: np.random.Generator, name: str, count: int) -> tuple[float, ...]:
@@ -173,7 +168,7 @@ class Randomisation:
 
 
 def _pair(name: str, value: Any, low: float, high: float) -> Range:
-    """Return a number, or a pair of them, as a pair within the limits."""
+    """Convert a number or a pair of numbers to a pair within the limits."""
     pair = (value, value) if is_number(value) else value
     sized = isinstance(pair, (tuple, list, np.ndarray)) and len(pair) == 2
     if sized and all(map(is_number, pair)):

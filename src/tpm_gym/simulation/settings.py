@@ -1,4 +1,4 @@
-"""Settings that users give as a value or, as configuration files have it, as a mapping."""
+"""Numerical settings that all engines share, and their conversion from mappings."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ __all__ = ["Numerics", "require_numerics", "settings_of"]
 
 T = TypeVar("T")
 
-_SHORTEST = 1e-6  # s; with shorter time steps a control step takes minutes
+_SHORTEST = 1e-6  # s; a control step with a shorter time step would take minutes
 
 
 def settings_of(kind: type[T], name: str, value: Any) -> T:
-    """Return settings of a kind: ``value`` itself, a mapping as settings, or for None the defaults.
+    """Convert a ``kind``, a mapping of its fields, or None (the defaults) into a ``kind``.
 
     Raises:
-        ConfigurationError: If the value is another, has other keys, or is out of range.
+        ConfigurationError: If ``value`` is none of these, has unknown keys, or is out of range.
     """
     if isinstance(value, kind):
         return value
@@ -35,28 +35,28 @@ def settings_of(kind: type[T], name: str, value: Any) -> T:
 
 @dataclass(frozen=True)
 class Numerics:
-    """Settings that every engine has.
+    """Numerical settings of all engines.
 
     Attributes:
-        time_step: s; a whole fraction of the control period.
+        time_step: Time step, s; the control period must be an integer multiple of it.
     """
 
     time_step: float = 1 / 250
 
     @property
     def substeps(self) -> int:
-        """Time steps in a control period."""
+        """Number of time steps in a control period."""
         return round(CONTROL_PERIOD / self.time_step)
 
 
 def require_numerics(
     settings: Numerics, ranges: Mapping[str, tuple[Callable[[float], bool], str]]
 ) -> None:
-    """Raise if a time step, a number of iterations or another number is not possible.
+    """Check the time step, the number of iterations (if any), and further settings.
 
     Args:
-        settings: Settings of an engine; ``iterations`` are optional.
-        ranges: For each other number a check, and the range in words.
+        settings: Settings of an engine.
+        ranges: Check and description of the valid range, for each further setting.
 
     Raises:
         ConfigurationError: If a value is out of range.
@@ -67,9 +67,7 @@ def require_numerics(
     step, count = settings.time_step, getattr(settings, "iterations", 1)
     steps = CONTROL_PERIOD / step if step > 0 else 0.0
     if step < _SHORTEST or round(steps) < 1 or abs(steps - round(steps)) >= 1e-6:
-        valid = (
-            f"a whole fraction of the control period, {CONTROL_PERIOD} s; at least {_SHORTEST} s"
-        )
+        valid = f"{CONTROL_PERIOD} s (control period) divided by an integer; at least {_SHORTEST} s"
         raise ConfigurationError("time_step", step, valid)
     if not is_whole(count, 1):
         raise ConfigurationError("iterations", count, "a whole number, 1 or more")

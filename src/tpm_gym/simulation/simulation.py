@@ -1,4 +1,4 @@
-"""The simulation of n robots: paths, encoders, modes and the State, the same for all engines."""
+"""Simulation of n robots with any engine: encoder errors, modes and the State."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from tpm_gym.simulation.state import CONTROL_PERIOD, Scene, State
 __all__ = ["Simulation", "Snapshot"]
 
 CLOSURE_LIMIT = 0.005
-"""Largest gap of a loop, m; a loop that is open further is lost."""
+"""Largest allowed gap at a loop closure, m."""
 
 _COLUMNS = ("commands", "noise", "position", "jacobian", "conditioning", "mode_left", "bias")
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Everything that the next steps of a :class:`Simulation` depend on.
+    """Saved state of a :class:`Simulation`, which determines all next steps.
 
     Attributes:
-        plants: The n plants of the episodes.
-        columns: Arrays (n, ...) by name.
-        engine: The engine's own part.
+        plants: Plant of each of the n robots.
+        columns: Arrays (n, ...) of the simulation, by name.
+        engine: Saved state of the engine, from :meth:`Engine.save`.
     """
 
     plants: tuple[Plant, ...]
@@ -42,27 +42,27 @@ class Snapshot:
 
 
 class Simulation:
-    """n robots in one engine, each over a table of its own.
+    """n robots in one engine, each over its own table.
 
-    Control and forward kinematics use the nominal ``machine``; the true machine of each row is
-    that of its :class:`~tpm_gym.simulation.Plant`.
+    Control and forward kinematics use the nominal ``machine``. The engine simulates the true
+    machine of each robot, which its :class:`~tpm_gym.simulation.Plant` defines.
 
     Args:
         scene: Objects on each table.
-        machine: The nominal machine.
+        machine: Nominal machine.
         engine: Name of the engine.
         count: Number of robots, n.
-        physics: The engine's numerical settings; None for its defaults.
+        physics: Numerical settings of the engine; None for the engine's defaults.
         drive: Servo drives of the motors; None for ideal drives.
         gui: Whether to open a window.
-        renderer: Renderer of pictures; None for the engine's default.
+        renderer: Renderer of the pictures; None for the engine's default.
 
     Attributes:
-        loops: The compiled loops, :mod:`tpm_gym.simulation.compiled`.
+        loops: Compiled functions, :mod:`tpm_gym.simulation.compiled`.
         commands: (n, 3) m, commanded positions of point P, machine's frame.
 
     Raises:
-        ConfigurationError: If an option is out of range, or the engine cannot serve it.
+        ConfigurationError: If an option is out of range, or the engine does not support it.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class Simulation:
         gui: bool = False,
         renderer: str | None = None,
     ) -> None:
-        """Start the engine and load the machines."""
+        """Create the engine and load the robots."""
         from tpm_gym.simulation import compiled  # imports Numba
 
         self.loops = compiled
@@ -94,19 +94,17 @@ class Simulation:
         self._weights = spline_weights(round(CONTROL_PERIOD / self.engine.time_step))
         self._frame = machine.mount.frame
         self._region = np.array(machine.region.low), np.array(machine.region.high)
-        # The last two and the next one, machine's frame, m
+        # The last two commands and the next command, machine's frame, m
         self._commands = np.zeros((count, 3, 3))
         self.commands = self._commands[:, 1]
-        self._noise = np.zeros((count, 2, 3))  # of the last two readings of the encoders, rad
-        self._bias = np.zeros((count, 3))  # of the encoders, rad
+        self._noise = np.zeros((count, 2, 3))  # noise of the last two encoder readings, rad
+        self._bias = np.zeros((count, 3))  # encoder bias, rad
         self._disturbed = False  # whether any encoder has bias or noise
-        self._position = np.zeros((count, 3))  # by forward kinematics, machine's frame, m
+        self._position = np.zeros((count, 3))  # P by forward kinematics, machine's frame, m
         self._jacobian = np.zeros((count, 3, 3))
         self._conditioning = np.zeros(count)
         self._mode_left = np.zeros(count, dtype=np.int8)
         self._readout: Readout
-
-    # -- running ----------------------------------------------------------------------------
 
     def reset(
         self,
@@ -116,21 +114,21 @@ class Simulation:
         plants: Sequence[Plant] | None = None,
         noise: FloatArray | None = None,
     ) -> None:
-        """Place some robots at rest: arms at ``theta``, loops closed, objects upright.
+        """Place robots at rest at ``theta``, with closed loops and upright objects.
 
         Args:
             rows: (r,) robots to place.
-            theta: (3,) rad, by the encoders.
-            objects: Centres (r, 3) m, world, of the scene's objects by name. Objects without an
-                entry stand in the middle of the table.
-            plants: The r true machines; None for nominal ones.
-            noise: (r, 3) rad, of the first reading of the encoders; None for none.
+            theta: (3,) rad, joint positions as the encoders report them without noise.
+            objects: Centres (r, 3) m, world, of objects by name. Objects without an entry are
+                placed in the middle of the table.
+            plants: Plant of each of the r robots; None for nominal robots.
+            noise: (r, 3) rad, noise of the first encoder reading; None for zero.
 
         Raises:
-            ConfigurationError: If a plant has what only a servo drive can serve.
+            ConfigurationError: If a plant needs servo drives, but the drives are ideal.
             InputError: If theta or a position is not three finite numbers.
-            UnreachableError: If a mechanism cannot be assembled at theta; nothing has moved then.
-            JointLimitError: If a motor is beyond a stop at theta; nothing has moved then.
+            UnreachableError: If a robot cannot be assembled at theta; no robot has moved then.
+            JointLimitError: If a motor is beyond a stop at theta; no robot has moved then.
         """
         plants = [NOMINAL] * len(rows) if plants is None else plants
         for plant in plants:
@@ -146,7 +144,7 @@ class Simulation:
         placed = self._places(len(rows), objects or {})
         self._become(rows, plants)
         self.engine.place(rows, true, placed)
-        # These arrays may be a machine's own.
+        # The machine may own these arrays, so they are copied before they are changed.
         self._position, self._jacobian = self._position.copy(), self._jacobian.copy()
         self._conditioning = self._conditioning.copy()
         self._position[rows], self._jacobian[rows] = reading.position, reading.jacobian
@@ -158,11 +156,11 @@ class Simulation:
         self._read(rows)
 
     def _built(self, plants: Sequence[Plant]) -> FloatArray:
-        """Return the parameters (r, k) of plants by their lengths."""
+        """Return the machine parameters (r, k) for the true lengths of the plants."""
         return np.array([self.machine.built(plant.lengths_of(self.machine)) for plant in plants])
 
     def _places(self, count: int, objects: Mapping[str, ArrayLike]) -> FloatArray:
-        """Return upright poses (r, k, 7) of the scene's objects, in its order."""
+        """Return upright poses (r, k, 7) of the objects, in the order of the scene."""
         places = np.zeros((count, len(self.scene.objects), 7))
         places[..., 6] = 1.0
         for index, block in enumerate(self.scene.objects):
@@ -172,7 +170,7 @@ class Simulation:
         return places
 
     def _become(self, rows: IntArray, plants: Sequence[Plant]) -> None:
-        """Alter the machines whose plant changes."""
+        """Apply the plants that differ from the present plants of the robots."""
         before = [self._plants[row] for row in rows.tolist()]
         changed = [
             k
@@ -191,20 +189,21 @@ class Simulation:
     def move(
         self, commands: FloatArray, vacuum: BoolArray, noise: FloatArray | None = None
     ) -> None:
-        """Command point P and run one control period.
+        """Command point P and simulate one control period.
 
         Args:
             commands: (n, 3) m, machine's frame; the caller projects them into the region.
-            vacuum: (n,) whether the cups suck.
-            noise: (n, 3) rad, of the encoders' reading at the end; None for none.
+            vacuum: (n,) whether the vacuum is on.
+            noise: (n, 3) rad, noise of the encoder reading at the end; None for zero.
 
         Raises:
-            UnreachableError: If a command is out of reach; nothing has moved then.
-            JointLimitError: If a motor would be beyond a stop; nothing has moved then.
+            UnreachableError: If a command is out of reach; no robot has moved then.
+            JointLimitError: If a motor would be beyond a stop; no robot has moved then.
             ClosureError: If a loop opened.
         """
         if not self.loops.all_within(commands, *self._region):
-            self.machine.reach(commands)  # the spline ends before the command does
+            # The spline ends before the command, so that the path may not raise the error.
+            self.machine.reach(commands)
         self._commands[:, 2] = commands
         bias = self._bias if self._disturbed else None
         self.engine.advance(Path(self.machine, self._commands, self._weights, bias), vacuum)
@@ -215,19 +214,13 @@ class Simulation:
             self._disturbed = bool(self._bias.any() or self._noise.any())
         self._read(slice(None))
 
-    # -- reading ----------------------------------------------------------------------------
-
     @property
     def mode_left(self) -> NDArray[np.int8]:
-        """(n,) mode that each machine left in this episode: 0 none, 1 assembly, 2 working."""
+        """Mode that each robot left in this episode, (n,): 0 none, 1 assembly, 2 working."""
         return self._mode_left
 
     def _read(self, rows: IntArray | slice) -> None:
-        """Read the engine, and compute the forward kinematics of some robots.
-
-        Raises:
-            ClosureError: If a loop is open.
-        """
+        """Read the engine, check the loop gaps, and compute the forward kinematics of ``rows``."""
         now = self._readout = self.engine.read()
         theta = now.theta[rows]
         if self._disturbed:
@@ -241,8 +234,8 @@ class Simulation:
         if left:
             self._mode_left = np.where(self._mode_left, self._mode_left, now.mode_left)
         if senseless:
-            # Disturbed encoders may report joint positions at which no assembly exists. The last
-            # reading that made sense stays, as a controller can do no better.
+            # With bias and noise, the encoders may report joint positions at which no assembly
+            # exists. Then the last valid result is kept, as a real controller would do.
             lost = np.isnan(conditioning)
             position, jacobian, conditioning = map(np.array, (position, jacobian, conditioning))
             position[lost], jacobian[lost] = self._position[rows][lost], self._jacobian[rows][lost]
@@ -287,13 +280,11 @@ class Simulation:
             object_angular_velocity=now.object_angular_velocity,
         )
 
-    # -- state, pictures, end ---------------------------------------------------------------
-
     def save(self) -> Snapshot:
-        """Return everything that the physics depend on, and continue from exactly that.
+        """Return a snapshot, and restart from the snapshot.
 
-        Engines keep what cannot be read, such as impulses of old contacts. It is cleared here as
-        it is by :meth:`restore`, so that continuing and restoring give equal results.
+        Engines have state that cannot be read, such as impulses of old contacts. The restart
+        clears this state, so that continuing and :meth:`restore` give equal results.
         """
         columns = {name: getattr(self, f"_{name}").copy() for name in _COLUMNS}
         snapshot = Snapshot(tuple(self._plants), columns, self.engine.save())
@@ -301,7 +292,7 @@ class Simulation:
         return snapshot
 
     def restore(self, snapshot: Snapshot) -> None:
-        """Continue from a snapshot of this simulation or of an equal one."""
+        """Continue from a snapshot of this simulation, or of one with equal arguments."""
         self._become(np.arange(self.count), snapshot.plants)
         self.engine.restore(snapshot.engine)
         for name, values in snapshot.columns.items():
@@ -311,9 +302,9 @@ class Simulation:
         self._readout = self.engine.read()
 
     def render(self, width: int, height: int) -> NDArray[np.uint8]:
-        """Draw the first robot and its scene as (height, width, 3) RGB."""
+        """Draw the first robot and its scene as an RGB image (height, width, 3)."""
         return self.engine.picture(width, height)
 
     def close(self) -> None:
-        """Close the engine; harmless the second time."""
+        """Close the engine; a second call does nothing."""
         self.engine.close()

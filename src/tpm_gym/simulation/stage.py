@@ -1,4 +1,4 @@
-"""Table, floor, camera and light, the same in all engines. World frame."""
+"""Table, floor, camera and light of all engines; world frame."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ Colour = tuple[float, float, float, float]
 
 
 class Slab(NamedTuple):
-    """Static board.
+    """Static horizontal board.
 
     Attributes:
-        top: Height of its upper face, m.
-        half_height: m.
-        friction: Coulomb coefficient; a contact has the product of both sides.
-        colour: Red, green, blue, opacity.
+        top: Height of the upper face, m.
+        half_height: Half the thickness, m.
+        friction: Coulomb coefficient; a contact uses the product of both bodies' coefficients.
+        colour: Red, green, blue and opacity, each from 0 to 1.
     """
 
     top: float
@@ -28,14 +28,14 @@ class Slab(NamedTuple):
 
 
 TABLE: Final = Slab(0.0, 0.02, 1.0, (0.86, 0.84, 0.80, 1.0))
-"""Table; its length and width are those of the machine."""
+"""Table; the machine defines its length and width."""
 
 FLOOR: Final = Slab(-0.5, 0.02, 0.5, (0.70, 0.72, 0.75, 1.0))
 FLOOR_EDGE: Final = 2.0
-"""Half edge of the floor, m."""
+"""Half edge length of the floor, m."""
 
 MARKER_COLOUR: Final[Colour] = (0.1, 0.8, 0.2, 0.6)
-"""Colour of the spheres that show a goal."""
+"""Colour of the goal markers."""
 
 
 class Camera(NamedTuple):
@@ -44,9 +44,9 @@ class Camera(NamedTuple):
     Attributes:
         target: Point in the middle of the picture, m.
         distance: Distance from the target, m.
-        yaw: Turn about the vertical, degrees; at 0 the camera looks along +y.
+        yaw: Rotation about the vertical, degrees; at 0 the camera looks along +y.
         pitch: Angle above the horizon, degrees; negative to look down.
-        opening: Angle between the picture's lower and upper edge, degrees.
+        opening: Vertical field of view, degrees.
     """
 
     target: Vector
@@ -58,4 +58,4 @@ class Camera(NamedTuple):
 
 CAMERA: Final = Camera((-0.01, 0.0, 0.47), 1.85, 32.0, -13.0, 42.0)
 LIGHT: Final[Vector] = (1.0, -1.2, 2.5)
-"""Direction from which the light comes."""
+"""Direction from the scene to the light."""

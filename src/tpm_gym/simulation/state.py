@@ -1,4 +1,4 @@
-"""Plain data that passes between engines, simulation and tasks."""
+"""Data classes that engines, simulation and tasks exchange."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ CONTROL_PERIOD = 1 / 25
 
 @dataclass(frozen=True)
 class Block:
-    """A square block, the object of a task.
+    """Box with a square base, the object of a task.
 
-    Blocks are square because engines find all four corners of a contact between boxes at once. A
-    cylinder rests on one to three points and is pressed through the table beside them.
+    Engines compute all four corner contacts of a box in one time step. A cylinder would get only
+    one to three contact points, and its rim would sink into the table beside them.
 
     Attributes:
-        name: Name in ``reset(options=...)``; unique in its scene.
-        width: Edge of the square, m.
-        height: m.
-        mass: kg.
+        name: Key in ``reset(options=...)``; unique in its scene.
+        width: Edge length of the base, m.
+        height: Height, m.
+        mass: Mass, kg.
         friction: Coulomb coefficient against the table.
-        colour: Red, green, blue, opacity, each from 0 to 1.
+        colour: Red, green, blue and opacity, each from 0 to 1.
 
     Raises:
-        ConfigurationError: If a value cannot be.
+        ConfigurationError: If a value is out of range.
     """
 
     name: str = "object"
@@ -42,7 +42,7 @@ class Block:
     colour: tuple[float, float, float, float] = (0.83, 0.18, 0.33, 1.0)
 
     def __post_init__(self) -> None:
-        """Reject impossible values."""
+        """Check the values."""
         if not isinstance(self.name, str) or not self.name:
             raise ConfigurationError("name", self.name, "a name")
         for name in ("width", "height", "mass", "friction"):
@@ -53,17 +53,17 @@ class Block:
 
     @property
     def half(self) -> Vector:
-        """Half edges, m."""
+        """Half edge lengths along x, y and z, m."""
         return self.width / 2, self.width / 2, self.height / 2
 
     @property
     def radius(self) -> float:
-        """Distance of the corners from the centre, m."""
+        """Distance from the centre to a corner, m."""
         return math.hypot(self.width, self.width, self.height) / 2
 
     @property
     def inertia(self) -> Vector:
-        """Principal moments about the centre, kg m^2."""
+        """Principal moments of inertia about the centre, kg m^2."""
         level = self.mass * (self.width**2 + self.height**2) / 12
         return level, level, self.mass * self.width**2 / 6
 
@@ -73,12 +73,12 @@ class Scene:
     """Objects and goal markers that a task adds to robot and table.
 
     Attributes:
-        objects: Any number of blocks.
-        markers: Number of points that a goal shows, as translucent spheres.
-        marker_radius: Radius of the spheres, m.
+        objects: The blocks, any number.
+        markers: Number of goal markers, drawn as translucent spheres.
+        marker_radius: Radius of the markers, m.
 
     Raises:
-        ConfigurationError: If a value cannot be.
+        ConfigurationError: If a value is out of range, or two objects have equal names.
     """
 
     objects: tuple[Block, ...] = ()
@@ -86,45 +86,44 @@ class Scene:
     marker_radius: float = 0.010
 
     def __post_init__(self) -> None:
-        """Reject impossible values."""
-        # By their names reset's options tell them apart.
+        """Check the values."""
+        # The options of reset() use these names as keys, next to "goal", so they must be unique.
         blocks = isinstance(self.objects, tuple) and all(isinstance(b, Block) for b in self.objects)
         if not blocks or len({"goal", *(b.name for b in self.objects)}) <= len(self.objects):
-            valid = "a tuple of blocks, each with a name of its own that is not 'goal'"
+            valid = "a tuple of blocks, each with a name of its own, other than 'goal'"
             raise ConfigurationError("objects", self.objects, valid)
         if not is_whole(self.markers, 0):
             raise ConfigurationError("markers", self.markers, "a whole number, 0 or more")
         _require_positive("marker_radius", self.marker_radius)
 
 
-@dataclass(eq=False)  # frozen, it would take three times as long to make
+@dataclass(eq=False)  # not frozen: a frozen dataclass takes three times as long to create
 class State:
     """State of n robots at the end of a control step; world frame.
 
-    Every attribute has a leading axis of n rows, one for each robot. :meth:`take` gives some
-    robots, or one without that axis.
+    Row i of every attribute belongs to robot i.
 
     Attributes:
-        theta: (n, 3) rad (m for a slide), joint positions by the encoders, with their errors.
-        theta_dot: (n, 3) rad/s, joint velocities by the encoders.
+        theta: (n, 3) rad (m for a slide), joint positions as the encoders report them.
+        theta_dot: (n, 3) rad/s, joint velocities as the encoders report them.
         torque: (n, 3) N m, torques of the motors in the last time step; zero after a reset.
         fk_position: (n, 3) m, point P by forward kinematics of ``theta``.
-        fk_velocity: (n, 3) m/s, J(theta) theta_dot.
+        fk_velocity: (n, 3) m/s, velocity of P: J(theta) theta_dot.
         conditioning: (n,) 1/cond(J) at ``theta``, in [0, 1].
-        platform_position: (n, 3) m, point P of the simulated platform, which a real robot does not
-            know. Never part of an observation.
-        platform_tilt: (n,) rad, rotation of the simulated platform; zero by design.
-        closure_error: (n,) m, largest gap of the simulated loops.
+        platform_position: (n, 3) m, true point P of the simulated platform. Observations must not
+            use this attribute, because a real robot cannot measure it.
+        platform_tilt: (n,) rad, rotation angle of the simulated platform; zero by design.
+        closure_error: (n,) m, largest gap at a loop closure.
         assembly_mode_changed: (n,) whether the robot passed a parallel singularity in this episode.
         working_mode_changed: (n,) whether the robot passed a serial singularity in this episode.
-        command: (n, 3) m, where point P is commanded to go.
+        command: (n, 3) m, commanded position of point P.
         held: (n,) index of the object in the vacuum cup; -1 for none.
         vacuum: (n,) Pa, pressure in the cup below the ambient pressure.
         object_position: (n, k, 3) m, centres of the scene's objects.
-        object_quaternion: (n, k, 4), their orientations (x, y, z, w).
-        object_axis: (n, k, 3) unit vectors, the objects' own z axes.
-        object_velocity: (n, k, 3) m/s.
-        object_angular_velocity: (n, k, 3) rad/s.
+        object_quaternion: (n, k, 4), orientations (x, y, z, w) of the objects.
+        object_axis: (n, k, 3), z axes of the objects' frames (unit vectors).
+        object_velocity: (n, k, 3) m/s, velocities of the objects' centres.
+        object_angular_velocity: (n, k, 3) rad/s, angular velocities of the objects.
     """
 
     theta: FloatArray
@@ -148,12 +147,12 @@ class State:
     object_angular_velocity: FloatArray
 
     def take(self, rows: Any) -> State:
-        """Return the state of some robots, or with an integer the state of one, without n."""
+        """Return the State of some rows; for an integer, of one robot without the axis n."""
         return State(**{name: values[rows] for name, values in vars(self).items()})
 
     @property
     def passed_singularity(self) -> BoolArray:
-        """(n,) whether the robot left one of its modes in this episode."""
+        """Whether each robot left its assembly or working mode in this episode, (n,)."""
         return self.assembly_mode_changed | self.working_mode_changed
 
 

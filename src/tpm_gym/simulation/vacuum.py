@@ -1,9 +1,9 @@
-"""Vacuum law of the cup for one time step, the same for all engines.
+"""Vacuum law of the cup for one time step, used by all engines.
 
-Air flows as through a nozzle: the pressure approaches that of the ejector, or the ambient pressure,
-exponentially. The seal holds as long as pressure and friction of the lip bear the load. An engine
-supplies the force between cup and object, and the object that the lip touches
-(:func:`tpm_gym.mechanism.cup.sealed`).
+The pressure in the cup approaches the ejector's pressure (vacuum on) or the ambient pressure
+(vacuum off) exponentially. The object is lost when the load exceeds the force that vacuum and lip
+friction can transmit. The engine computes the load, and finds the object that the lip touches with
+:func:`tpm_gym.mechanism.cup.sealed`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from tpm_gym.mechanism.cup import CUP, VacuumCup
 __all__ = ["CLEARANCE", "EMPTY", "Hold", "Load", "hold_after", "holds", "pressure_after"]
 
 CLEARANCE = 2e-5
-"""Gap between lip and sealed face, m, so that contact and seal do not fight."""
+"""Gap between lip and held object, m. Without a gap, their contact would act against the weld."""
 
 
 class Hold(NamedTuple):
@@ -38,8 +38,8 @@ class Load(NamedTuple):
     """Force between the cup and the held object.
 
     Attributes:
-        tension: Along the cup's axis, N; negative where they are pressed together.
-        shear: Length of the part across it, N.
+        tension: Force along the cup's axis, N; negative if cup and object are pressed together.
+        shear: Norm of the force perpendicular to the cup's axis, N.
     """
 
     tension: float = 0.0
@@ -47,16 +47,16 @@ class Load(NamedTuple):
 
 
 def pressure_after(vacuum: float, time_step: float, pumped: bool, cup: VacuumCup = CUP) -> float:
-    """Return the vacuum (Pa) a time step (s) later; ``pumped`` if it is on and the lip sealed."""
+    """Compute the vacuum (Pa) after a time step (s); ``pumped``: vacuum is on and lip is sealed."""
     final, time = (cup.vacuum, cup.evacuation_time) if pumped else (0.0, cup.venting_time)
     return final + (vacuum - final) * math.exp(-time_step / time)
 
 
 def holds(vacuum: Any, load: tuple[Any, Any], cup: VacuumCup = CUP) -> Any:
-    """Return whether a seal bears a load (tension and shear, N) at a vacuum (Pa); arrays too.
+    """Return whether a vacuum (Pa) can carry a load (tension and shear, N); floats or arrays.
 
-    Pull and shear combine as the norm of the force. Pressure on the object is no pull, and lets
-    the lip's friction bear a part of the shear.
+    The norm of pull and shear must not exceed vacuum times area. Where cup and object are pressed
+    together, the pull is zero, and lip friction reduces the shear.
     """
     tension, shear = load
     pull = (tension > 0) * tension
@@ -69,16 +69,18 @@ def holds(vacuum: Any, load: tuple[Any, Any], cup: VacuumCup = CUP) -> Any:
 def hold_after(
     hold: Hold, time_step: float, on: bool, load: Load, touched: int, cup: VacuumCup = CUP
 ) -> Hold:
-    """Return held object and vacuum after a time step.
+    """Compute held object and vacuum after a time step.
+
+    A cup that has lost an object can hold one again after it is vented.
 
     Args:
         hold: Held object and vacuum in the time step.
-        time_step: s.
+        time_step: Time step, s.
         on: Whether the vacuum is on.
-        load: Load of the seal in the time step; ignored if nothing was held.
-        touched: Index of an object on which the lip could seal now; -1 for none. Ignored if an
-            object was held. A cup that has lost an object seals again after it is vented.
-        cup: The cup.
+        load: Load of the seal in the time step; ignored if no object was held.
+        touched: Index of an object on which the lip can seal now; -1 for none. Ignored if an
+            object was held.
+        cup: Parameters of the cup.
     """
     if hold.which >= 0:
         vacuum = pressure_after(hold.vacuum, time_step, on, cup)

@@ -1,4 +1,4 @@
-"""Algebra of three-vectors as tuples, for compiled functions."""
+"""Vector algebra on tuples of three floats, for compiled functions."""
 
 from __future__ import annotations
 
@@ -25,24 +25,24 @@ __all__ = [
 ]
 
 Frame = tuple[Vector, Vector, Vector]
-"""Unit vectors along a body's own axes, in the world frame."""
+"""Axes of a body: three unit vectors, world frame."""
 
 
 @compiled
 def three(values: Any) -> Vector:
-    """Return the first three numbers of an array."""
+    """Return the first three elements of an array."""
     return values[0], values[1], values[2]
 
 
 @compiled
 def put(values: Any, vector: Vector) -> None:
-    """Write a vector into the first three numbers of an array."""
+    """Write a vector into the first three elements of an array."""
     values[0], values[1], values[2] = vector
 
 
 @compiled
 def plus(a: Vector, b: Vector, times: float = 1.0) -> Vector:
-    """Return a + times b."""
+    """Return a + times * b."""
     return a[0] + times * b[0], a[1] + times * b[1], a[2] + times * b[2]
 
 
@@ -59,7 +59,7 @@ def cross(a: Vector, b: Vector) -> Vector:
 
 
 def onto(start: Vector, matrices: Any, row: int, a: Vector, sign: float = 1.0) -> Vector:
-    """Return start + sign matrix a, added from left to right; matrices (n, 3, 3)."""
+    """Return start + sign * matrices[row] a, summed from left to right; matrices is (n, 3, 3)."""
     x, y, z = a[0] * sign, a[1] * sign, a[2] * sign
     m = matrices
     return (
@@ -70,7 +70,7 @@ def onto(start: Vector, matrices: Any, row: int, a: Vector, sign: float = 1.0) -
 
 
 def row_of(values: Any, row: int) -> Vector:
-    """Return a row of an array (n, 3); faster than :func:`three` of a view."""
+    """Return a row of an array (n, 3); faster than :func:`three` with a view."""
     return values[row, 0], values[row, 1], values[row, 2]
 
 
@@ -90,9 +90,9 @@ def length(a: Vector) -> float:
 
 @compiled
 def level_length(x: float, y: float) -> float:
-    """Return the length of a horizontal vector.
+    """Return the length of a horizontal vector, with equal bits on all platforms.
 
-    ``math.hypot`` differs in its last bit between platforms; this does not.
+    ``math.hypot`` may differ in the last bit between platforms.
     """
     return math.sqrt(x * x + y * y)
 
@@ -105,7 +105,7 @@ def clip(value: float, low: float, high: float) -> float:
 
 @compiled
 def axes(quaternion: Any) -> Frame:
-    """Return the axes of a body with an orientation (x, y, z, w)."""
+    """Return the axes of a body from its orientation quaternion (x, y, z, w)."""
     x, y, z, w = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
     return (
         (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),

@@ -1,12 +1,12 @@
-"""The analytic engine: many machines, computed in closed form.
+"""Analytic engine: simulates many robots with closed-form kinematics and dynamics.
 
-Coupling degree zero makes every quantity a formula of where point P is. With ideal drives P is on
-its spline, so a control period is one evaluation of inverse kinematics, Jacobian and dynamics,
-whatever the time step. Joint positions and velocities are differences over time steps, as those of
-other engines are, and so are torques. Servo drives, and ideal drives whose effort would be
-exceeded, take forward dynamics instead, time step by time step.
+The mechanism has coupling degree zero, so every quantity is a closed-form function of point P. With
+ideal drives, P follows its spline. Then one evaluation of inverse kinematics, Jacobian and dynamics
+computes the whole control period, at any time step. Joint velocities and accelerations are
+differences over time steps, as in the other engines. Servo drives, and ideal drives that would
+exceed a motor's largest torque, are simulated by forward dynamics, one time step after another.
 
-The loops' gap and the platform's tilt are always 0 here; use another engine to measure them.
+The readings ``gap`` and ``tilt`` are always 0; use another engine to measure them.
 """
 
 from __future__ import annotations
@@ -37,25 +37,26 @@ from tpm_gym.simulation.state import Scene
 
 __all__ = ["AnalyticEngine"]
 
-_WATCHFUL = 0.5
-"""Share of a motor's effort above which the torques of every time step are computed."""
+_CHECK_ABOVE = 0.5
+"""Fraction of a motor's largest torque above which the torques of all time steps are computed."""
 _COURSE = tuple(f"_{name}" for name in Course._fields)
 _COLUMNS = (*_COURSE, "_behind")
 
 
 class AnalyticEngine:
-    """See :class:`~tpm_gym.simulation.engine.Engine`; any number of robots.
+    """Engine that simulates any number of robots.
 
-    PyBullet draws the pictures; it is started for the first one.
+    Another engine draws the pictures: PyBullet, or MuJoCo if PyBullet is not installed. It is
+    created for the first picture.
 
     Args:
-        renderer: PyBullet's renderer.
-        physics: A :class:`Physics`, or a mapping of its attributes.
-        drive: The motors' servo drives; None for ideal ones.
+        renderer: Renderer of the engine that draws the pictures.
+        physics: A :class:`Physics` or a mapping of its attributes.
+        drive: Servo drives of the motors; None for ideal drives.
 
     Attributes:
-        torques: (K, n, 3) N m, of all time steps of the last control period, where ``physics`` asks
-            for ``"every"``; else None.
+        torques: (K, n, 3) N m, torques in all time steps of the last control period; None unless
+            ``physics.torques`` is ``"every"``.
 
     Raises:
         ConfigurationError: If an option is out of range.
@@ -69,30 +70,25 @@ class AnalyticEngine:
         self.time_step = self.physics.time_step
         self._servo, self._renderer = drive, renderer
         self._steps = self.physics.substeps
-        # Number of last time steps of which joint positions are needed.
+        # Number of time steps at the end of a control period whose joint positions are needed
         self._tail = {"none": 2, "last": 3, "every": self._steps}[self.physics.torques]
         self._artist: Engine | None = None
         self._markers: FloatArray | None = None
         self.torques: FloatArray | None = None
 
     def load(self, machine: Machine, scene: Scene, count: int) -> None:
-        """See the protocol."""
+        """Implement :meth:`Engine.load`."""
         self._machine, self._scene, self._count = machine, scene, count
         self._rows = np.arange(count)
         self._turn, self._origin = machine.mount.frame
         self._built: FloatArray | None = None
-        self._exact = True  # whether encoders and lengths are exact, so that P is on its spline
+        self._exact = True  # whether bias and length errors are 0, so that P is on its spline
         self._nominal_effort = np.array([motor.effort for motor in machine.mechanism.motors])
         self._effort = np.tile(self._nominal_effort, (count, 1))
         self._bias = np.zeros((count, 3))
-        self._contact = Contact(
-            scene.objects, count, self.time_step, machine.table, machine.mount.frame
-        )
-        self._drives = (
-            None
-            if self._servo is None
-            else ServoDrives(self._servo, machine, count, self.time_step)
-        )
+        servo, step = self._servo, self.time_step
+        self._contact = Contact(scene.objects, count, step, machine.table, machine.mount.frame)
+        self._drives = None if servo is None else ServoDrives(servo, machine, count, step)
         home = machine.require_inverse(np.array(machine.home))
         self._theta = np.tile(home, (count, 1))
         self._position = np.tile(machine.home, (count, 1))
@@ -100,10 +96,10 @@ class AnalyticEngine:
         self._rates, self._torque, self._force = np.zeros((3, count, 3))
         self._carried = np.zeros(count)  # kg
         self._mode_left = np.zeros(count, dtype=np.int8)
-        self._behind = np.zeros(count, dtype=np.bool_)  # whether ideal motors lacked torque
+        self._behind = np.zeros(count, dtype=np.bool_)  # whether an ideal motor lacked torque
 
     def alter(self, rows: IntArray, plants: Sequence[Plant]) -> None:
-        """See the protocol."""
+        """Implement :meth:`Engine.alter`."""
         machine = self._machine
         if self._built is None and any(p.length_errors or p.link_masses for p in plants):
             self._built = np.tile(machine.built(), (self._count, 1))
@@ -120,7 +116,7 @@ class AnalyticEngine:
         self._contact.alter(rows, np.array(masses), np.array(friction))
 
     def place(self, rows: IntArray, theta: FloatArray, objects: FloatArray) -> None:
-        """See the protocol."""
+        """Implement :meth:`Engine.place`."""
         built = None if self._built is None else self._built[rows]
         self._theta[rows] = theta
         self._position[rows] = self._machine.evaluate(theta, built).position
@@ -132,22 +128,20 @@ class AnalyticEngine:
             self._drives.rest(rows, theta)
         self._contact.place(rows, objects[..., :3], objects[..., 3:])
 
-    # -- a control period -------------------------------------------------------------------
-
     def advance(self, path: Path, vacuum: BoolArray) -> None:
-        """See the protocol."""
+        """Implement :meth:`Engine.advance`."""
         self.torques = None
         if self._drives is None:
             self._follow(path, vacuum)
             return
         steps = ServoSteps(self._drives, self._drives.references(path), self.time_step)
-        self._march(self._rows, steps, vacuum)
+        self._integrate(self._rows, steps, vacuum)
 
     def _follow(self, path: Path, vacuum: BoolArray) -> None:
-        """Let ideal motors take P along its path.
+        """Move all robots with ideal motors along their paths.
 
-        All machines are computed as if their motors could, and once more by forward dynamics those
-        of which one cannot.
+        All robots are first computed without torque limits. The robots that would exceed a limit
+        are then computed again by forward dynamics.
         """
         objects, step = bool(self._scene.objects), self.time_step
         if self._exact:
@@ -161,7 +155,7 @@ class AnalyticEngine:
             late = self._behind | (self._mode_left != 0)
             late |= ~self._machine.same_side(points).all(axis=1)
         start = {name: getattr(self, name) for name in _COURSE}
-        # Without torques, it is known already which machines are computed again.
+        # Save objects that may be computed again. With torques "none", ``late`` is complete here.
         again = objects and (self.physics.torques != "none" or late.any())
         saved = self._contact.copy() if again else None
         push = None
@@ -183,18 +177,18 @@ class AnalyticEngine:
     def _repeat(
         self, rows: IntArray, start: Any, saved: Any, path: Path, vacuum: BoolArray
     ) -> None:
-        """Run the control period of some machines again, by forward dynamics."""
+        """Compute the control period of some robots again, by forward dynamics."""
         for name, values in start.items():
             getattr(self, name)[rows] = values[rows]
         if saved is not None:
             self._contact.repeat(rows, saved)
         joints = np.ascontiguousarray(path.joints()[rows].swapaxes(0, 1))
         steps = IdealSteps(joints, self._effort[rows], self.time_step)
-        self._march(rows, steps, vacuum)
+        self._integrate(rows, steps, vacuum)
         self._behind[rows] = steps.behind
 
-    def _march(self, rows: IntArray, steps: Steps, vacuum: BoolArray) -> None:
-        """Run a control period of some machines by forward dynamics."""
+    def _integrate(self, rows: IntArray, steps: Steps, vacuum: BoolArray) -> None:
+        """Simulate a control period of some robots by forward dynamics."""
         on = vacuum[rows]
 
         def touch(
@@ -223,14 +217,14 @@ class AnalyticEngine:
         path: Path,
         push: FloatArray | None,
     ) -> BoolArray:
-        """Compute what motors apply, and return (n,) whether one would need too much.
+        """Compute the torques, and return whether each robot would exceed a motor's limit, (n,).
 
         Args:
-            start: (n, 3) rad, at the beginning of the control period.
-            rates: (n, 3) rad/s, there.
-            theta: (n, k, 3) rad, at the ends of its last time steps.
-            path: Of the control period.
-            push: (n, K, 3) N on P; None without objects.
+            start: (n, 3) rad, joint positions at the beginning of the control period.
+            rates: (n, 3) rad/s, joint velocities at the beginning of the control period.
+            theta: (n, k, 3) rad, joint positions at the ends of the last k time steps.
+            path: Path of the control period.
+            push: (n, K, 3) N, force of objects on P; None without objects.
         """
         if self.physics.torques == "none":
             self._torque = np.full_like(self._torque, np.nan)
@@ -242,7 +236,7 @@ class AnalyticEngine:
             return _beyond(torques, self._effort)
         last = self._torques(self._rows, theta, push)
         self._torque = last[:, 0].copy()
-        over = _beyond(last, _WATCHFUL * self._effort)
+        over = _beyond(last, _CHECK_ABOVE * self._effort)
         rows = np.flatnonzero(over)
         if len(rows):
             whole = np.concatenate([*lead, path.joints()], axis=1)[rows]
@@ -251,9 +245,9 @@ class AnalyticEngine:
         return over
 
     def _torques(self, rows: IntArray, theta: FloatArray, push: FloatArray | None) -> FloatArray:
-        """Compute the torques (r, m, 3) N m that take motors through theta (r, m + 2, 3) rad.
+        """Compute the torques (r, m, 3) N m for joint positions ``theta`` (r, m + 2, 3) rad.
 
-        The last m time steps of ``push`` (r, K, 3) N act on P.
+        The last m forces of ``push`` (r, K, 3) N act on P.
         """
         rates = np.diff(theta, axis=1) / self.time_step
         changes = np.diff(rates, axis=1) / self.time_step
@@ -264,10 +258,8 @@ class AnalyticEngine:
         )
         return torques
 
-    # -- reading, saving, pictures ----------------------------------------------------------
-
     def read(self) -> Readout:
-        """See the protocol."""
+        """Implement :meth:`Engine.read`."""
         objects = self._contact.read()
         gap, tilt = np.zeros((2, self._count))
         return Readout(
@@ -287,7 +279,7 @@ class AnalyticEngine:
         )
 
     def save(self) -> Any:
-        """See the protocol; a dictionary of arrays by name."""
+        """Implement :meth:`Engine.save`; return a dictionary of arrays."""
         saved = {name.lstrip("_"): getattr(self, name).copy() for name in _COLUMNS}
         saved["objects"] = self._contact.save(self._rows)
         if self._drives is not None:
@@ -295,7 +287,7 @@ class AnalyticEngine:
         return saved
 
     def restore(self, saved: Any) -> None:
-        """See the protocol."""
+        """Implement :meth:`Engine.restore`."""
         for name in _COLUMNS:
             setattr(self, name, saved[name.lstrip("_")].copy())
         self._contact.restore(self._rows, saved["objects"])
@@ -303,11 +295,11 @@ class AnalyticEngine:
             self._drives.memory[:] = saved["drives"]
 
     def show_goal(self, markers: FloatArray) -> None:
-        """See the protocol."""
+        """Implement :meth:`Engine.show_goal`."""
         self._markers = markers
 
     def picture(self, width: int, height: int) -> NDArray[np.uint8]:
-        """See the protocol."""
+        """Implement :meth:`Engine.picture`."""
         first = np.zeros(1, dtype=np.int64)
         if self._artist is None:
             drawn = "pybullet" if find_spec("pybullet") else "mujoco"
@@ -322,13 +314,13 @@ class AnalyticEngine:
         return self._artist.picture(width, height)
 
     def close(self) -> None:
-        """See the protocol."""
+        """Implement :meth:`Engine.close`."""
         if self._artist is not None:
             self._artist.close()
             self._artist = None
 
 
 def _beyond(torques: FloatArray, effort: FloatArray) -> BoolArray:
-    """Return (r,) whether one of torques (r, m, 3) is more than a motor's effort (r, 3)."""
+    """Return (r,) whether any of the torques (r, m, 3) exceeds its motor's limit (r, 3)."""
     beyond: BoolArray = np.any(np.abs(torques) > effort[:, None], axis=(1, 2))
     return beyond

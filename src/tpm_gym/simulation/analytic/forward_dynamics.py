@@ -1,4 +1,4 @@
-"""Motion from torques: joint velocities first, then joint positions, time step by time step."""
+"""Forward dynamics with semi-implicit time steps: joint velocities first, then joint positions."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ __all__ = ["Course", "IdealSteps", "ServoSteps", "Steps", "march"]
 
 
 class Course(NamedTuple):
-    """States of r machines at the end of a time step; machine's frame.
+    """State of r robots at the end of a time step; machine's frame.
 
     Attributes:
-        theta: (r, 3) rad.
-        rates: (r, 3) rad/s.
-        torque: (r, 3) N m, applied by the motors.
+        theta: (r, 3) rad, joint positions.
+        rates: (r, 3) rad/s, joint velocities.
+        torque: (r, 3) N m, torques of the motors.
         position: (r, 3) m, point P.
         before: (r, 3) m, point P a time step earlier.
-        force: (r, 3) N, of objects on P, less what accelerates the carried mass.
-        carried: (r,) kg, moving with P.
-        mode_left: (r,) as :meth:`tpm_gym.Machine.mode_left` codes it.
+        force: (r, 3) N, force of objects on P without the inertial force of the carried mass.
+        carried: (r,) kg, mass of the held object.
+        mode_left: (r,) mode that was left, coded as in :meth:`tpm_gym.Machine.mode_left`.
     """
 
     theta: FloatArray
@@ -41,52 +41,49 @@ class Course(NamedTuple):
 
 
 class Steps(Protocol):
-    """Drives of r machines over a control period."""
+    """Drives of r robots in a control period."""
 
     def move(self, index: int, course: Course, at: Motion, new: tuple[FloatArray, ...]) -> None:
-        """Run a time step; see :func:`tpm_gym.simulation.analytic.steps.servo_step`."""
+        """Compute a time step; arguments as in :func:`servo_step`."""
 
 
 class IdealSteps:
-    """Ideal drives, whose effort is limited.
+    """Ideal drives with limited torques.
 
     Args:
-        references: (K, r, 3) rad.
-        effort: (r, 3) N m.
-        step: s.
-
-    Attributes:
-        behind: (r,) whether a motor was at its limit in one of the last two time steps.
+        references: (K, r, 3) rad, joint positions at the ends of the time steps.
+        effort: (r, 3) N m, largest torques.
+        step: Time step, s.
     """
 
     def __init__(self, references: FloatArray, effort: FloatArray, step: float) -> None:
-        """Start with no motor behind."""
+        """Store the arguments; no motor has been at its limit yet."""
         self._references, self._effort, self._step = references, effort, step
         self._behind = np.zeros((2, len(effort)), dtype=np.bool_)
 
     def move(self, index: int, course: Course, at: Motion, new: tuple[FloatArray, ...]) -> None:
-        """See the protocol."""
+        """Implement :meth:`Steps.move`."""
         ideal_step(
             index, self._references, self._effort, course[:-1], at, self._step, new, self._behind
         )
 
     @property
     def behind(self) -> BoolArray:
-        """See the class."""
+        """Whether a motor was at its limit in one of the last two time steps, (r,)."""
         behind: BoolArray = self._behind[0] | self._behind[1]
         return behind
 
 
 class ServoSteps:
-    """Servo drives; see :class:`tpm_gym.simulation.drives.ServoDrives`."""
+    """Servo drives: :class:`tpm_gym.simulation.drives.ServoDrives` in forward dynamics."""
 
     def __init__(self, drives: ServoDrives, references: References, step: float) -> None:
-        """Compute the inertia for the control period."""
+        """Store the arguments, and begin the control period of ``drives``."""
         self._drives, self._references, self._step = drives, references, step
         drives.begin(references.theta[0])
 
     def move(self, index: int, course: Course, at: Motion, new: tuple[FloatArray, ...]) -> None:
-        """See the protocol."""
+        """Implement :meth:`Steps.move`."""
         drives = self._drives
         servo_step(
             index, self._references, drives.law, drives.friction, course[:-1], at, self._step, new,
@@ -95,8 +92,8 @@ class ServoSteps:
 
 
 Touch = Callable[[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
-"""Function of P (r, 3) m a time step ago, now and at its end; returns the force (r, 3) N on P
-and the mass (r,) kg that moves with it."""
+"""Function of P (r, 3) m before the last time step, now, and after the time step. It returns the
+force (r, 3) N of objects on P and the mass (r,) kg of the held objects."""
 
 
 def march(
@@ -108,21 +105,21 @@ def march(
     step: float,
     touch: Touch,
 ) -> tuple[Course, FloatArray]:
-    """Run ``count`` time steps of some machines by forward dynamics.
+    """Compute ``count`` time steps of r robots by forward dynamics.
 
-    A machine that leaves its modes stays where it was before.
+    A robot that leaves its assembly or working mode stays at its last valid state.
 
     Args:
-        machine: The nominal machine.
-        built: (r, k) parameters of the true machines; None for nominal ones.
-        steps: The drives.
-        count: K.
-        course: Where the machines are.
-        step: s.
-        touch: Lets objects and cups act.
+        machine: Nominal machine.
+        built: (r, k) parameters of the true machines; None for nominal machines.
+        steps: Drives of the robots.
+        count: Number of time steps, K.
+        course: State of the robots at the beginning.
+        step: Time step, s.
+        touch: Function that moves objects and cups, and returns forces on P.
 
     Returns:
-        Where the machines are then, and the torques (K, r, 3) N m.
+        State of the robots at the end, and the torques (K, r, 3) N m in all time steps.
     """
     torques = np.empty((count, *course.theta.shape))
     at = machine.motion(course.theta, course.rates, built)

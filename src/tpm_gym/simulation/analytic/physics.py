@@ -15,14 +15,15 @@ TORQUES = ("none", "last", "every")
 
 @dataclass(frozen=True)
 class Physics(Numerics):
-    """Numerical settings of the engine.
+    """Numerical settings of the analytic engine.
 
     Attributes:
-        time_step: s; a whole fraction of the control period, a third of it at most.
-        torques: Time steps of a control period for which the motors' torques are computed and
-            compared with the motors' effort: ``"none"`` (the State's torques are NaN, and ideal
-            motors have no limit), ``"last"`` or ``"every"``. Every time step is computed where the
-            last torque is more than half of a motor's effort. Servo drives always compute theirs.
+        time_step: Time step, s; the control period must be an integer multiple of it, at least 3.
+        torques: Time steps in which the torques of ideal motors are computed and compared with
+            their largest torques: ``"none"`` (torques in the State are NaN and have no limit),
+            ``"last"`` of a control period, or ``"every"``. With ``"last"``, all time steps are
+            computed if the last torque is above half of a motor's largest torque. Servo drives
+            always compute all torques.
 
     Raises:
         ConfigurationError: If a value is out of range.
@@ -31,7 +32,7 @@ class Physics(Numerics):
     torques: str = "last"
 
     def __post_init__(self) -> None:
-        """Reject impossible settings."""
+        """Check the settings."""
         require_numerics(self, {})
         if self.substeps < 3:
             raise ConfigurationError("time_step", self.time_step, f"at most {CONTROL_PERIOD} s / 3")

@@ -1,6 +1,6 @@
-"""Compiled time steps of forward dynamics, for many machines.
+"""Compiled time steps of forward dynamics, for many robots.
 
-Each machine is computed by itself, so that it has the same bits alone and among thousands.
+Each robot is computed separately, so that its result does not depend on the other robots.
 """
 
 from __future__ import annotations
@@ -19,14 +19,15 @@ from tpm_gym.simulation.vectors import onto, plus, put, put_row, row_of, three
 
 __all__ = ["ideal_step", "modes_left", "resisted", "servo_step"]
 
-_CREEP = 2e-5  # m/s, at which friction gives way, instead of not at all
+_CREEP = 2e-5  # m/s; below this speed, friction falls to zero in proportion to the speed
 _SIGNS = np.array([(i, j, k) for i in (0, 1, -1) for j in (0, 1, -1) for k in (0, 1, -1)], float)
 
 _Course = tuple[Any, ...]
-"""theta to carried of :class:`tpm_gym.simulation.analytic.forward_dynamics.Course`."""
+"""Attributes ``theta`` to ``carried`` of :class:`Course`."""
 _New = tuple[FloatArray, ...]
-"""Results at the end of a time step, each (r, 3): theta; rates; torque; P (2, r, 3) by the joint
-velocities and by its own; acceleration of P by the change of the joint velocities, m/s^2."""
+"""Results at the end of a time step: joint positions, joint velocities and torques (r, 3), P
+predicted from the joint velocities and from its own velocity (2, r, 3) m, and acceleration of P due
+to the change of the joint velocities (r, 3) m/s^2."""
 
 
 @kept
@@ -40,23 +41,23 @@ def ideal_step(
     new: _New,
     behind: BoolArray,
 ) -> None:
-    """Run a time step of ideal drives, which remove their error as far as their effort allows.
+    """Compute a time step of ideal drives with limited torques.
 
     Args:
-        index: Number of the time step.
-        references: (K, r, 3) rad, at the ends of the time steps.
+        index: Index of the time step in the control period.
+        references: (K, r, 3) rad, joint positions at the ends of the time steps.
         effort: (r, 3) N m, largest torques.
-        course: Where the machines are.
-        at: Their motion there.
-        step: s.
-        new: Written.
-        behind: (2, r) whether a motor was at its limit in the last time step and in this; written.
+        course: State of the robots at the beginning of the time step.
+        at: Kinematics and dynamics at the beginning of the time step.
+        step: Time step, s.
+        new: Output.
+        behind: (2, r) whether a motor was at its limit in the last and in this time step; output.
     """
     goal, impulse, limit, short = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     mass, load = np.empty((1, 3, 3)), np.empty(3)
     theta, rates = course[0], course[1]
     for row in range(len(theta)):
-        _feel(row, course, at, step, mass, load)
+        _add_objects(row, course, at, step, mass, load)
         for i in range(3):
             goal[i] = (references[index, row, i] - theta[row, i]) / step
             limit[i] = step * effort[row, i]
@@ -83,24 +84,19 @@ def servo_step(
     new: _New,
     memory: FloatArray,
 ) -> None:
-    """Run a time step of servo drives against Coulomb friction.
+    """Compute a time step of servo drives with Coulomb friction on the motors' axes.
+
+    The arguments index, course, at, step and new are explained in :func:`ideal_step`; references,
+    law and memory in :func:`tpm_gym.simulation.compiled.servo_torques`.
 
     Args:
-        index: Number of the time step.
-        references: See :class:`tpm_gym.simulation.drives.References`.
-        law: See :func:`tpm_gym.simulation.compiled.servo_torques`.
-        friction: (r, 3) N m, on the motors' axes.
-        course: Where the machines are.
-        at: Their motion there.
-        step: s.
-        new: Written.
-        memory: Of the law; overwritten.
+        friction: (r, 3) N m, Coulomb friction on the motors' axes.
     """
     impulse, limit, found = np.empty(3), np.empty(3), np.empty(3)
     mass, load, inverse = np.empty((1, 3, 3)), np.empty(3), np.empty((1, 3, 3))
     theta, rates = course[0], course[1]
     for row in range(len(theta)):
-        _feel(row, course, at, step, mass, load)
+        _add_objects(row, course, at, step, mass, load)
         servo_torque(row, index, references, law, theta, rates, step, memory)
         x, y, z = plus(row_of(memory[0], row), three(load), -1.0)
         put_row(new[2], row, row_of(memory[0], row))
@@ -116,14 +112,14 @@ def servo_step(
         _integrate(row, three(found), course, at, step, new)
 
 
-def _feel(
+def _add_objects(
     row: int, course: _Course, at: Motion, step: float, mass: FloatArray, load: FloatArray
 ) -> None:
-    """Compute the inertia (1, 3, 3) and load (3,) that motors feel, with objects on P.
+    """Write the inertia (1, 3, 3) and load (3,) of robot and objects at the motors' axes.
 
-    The level part of a force that opposes the motion is friction. It is taken as proportional to
-    the velocity at the end of the time step: taken from the beginning, friction would overshoot
-    what it stops, and push it to and fro.
+    A horizontal force on P against the motion of P is friction. It is assumed proportional to the
+    velocity at the end of the time step. With the velocity at the beginning, friction could
+    reverse the motion, and P would oscillate.
     """
     for i in range(3):
         load[i] = at[4][row, i]
@@ -150,7 +146,7 @@ def _feel(
 def _integrate(
     row: int, rates: Vector, course: _Course, at: Motion, step: float, new: _New
 ) -> None:
-    """Integrate joint positions, and predict where P goes."""
+    """Write joint positions, joint velocities, predicted P and acceleration of P to ``new``."""
     zero, position = (0.0, 0.0, 0.0), row_of(course[3], row)
     put_row(new[0], row, plus(row_of(course[0], row), rates, step))
     put_row(new[1], row, rates)
@@ -161,23 +157,23 @@ def _integrate(
     put_row(new[4], row, (x / step, y / step, z / step))
 
 
-compilable(_feel, _integrate)
+compilable(_add_objects, _integrate)
 
 
 @kept
 def modes_left(
     position: FloatArray, side: BoolArray, working: BoolArray, before: NDArray[np.int8]
 ) -> tuple[NDArray[np.int8], bool]:
-    """Find which mode each machine has left, (r,), and whether any has.
+    """Return the mode that each robot has left (r,), and whether any robot has left one.
 
-    Beyond a parallel singularity the joints turn back, so that the positions of the mirrored
-    assembly exist too. Only ``side`` tells them apart.
+    Beyond a parallel singularity the joints turn back, so that forward kinematics still return a
+    position, but of the wrong assembly. Only ``side`` detects this.
 
     Args:
-        position: (r, 3) m, by forward kinematics; NaN where there is none.
-        side: (2, r) whether P was about to stay on its side, by the joint velocities and by its
-            own.
-        working: (r,) whether the machine is in its working mode.
+        position: (r, 3) m, P by forward kinematics; NaN if there is no assembly.
+        side: (2, r) whether P, predicted from the joint velocities and from its own velocity,
+            stays on its side of the singularity.
+        working: (r,) whether the robot is in its working mode.
         before: (r,) mode that was left earlier.
     """
     left, anywhere = before.copy(), False
@@ -193,16 +189,16 @@ def modes_left(
 
 @compiled
 def resisted(mass: FloatArray, impulse: FloatArray, limit: FloatArray, rates: FloatArray) -> None:
-    """Find the rates u (3,) that an impulse gives against Coulomb friction.
+    """Compute the joint velocities u (3,) after an impulse, with Coulomb friction.
 
-    mass u = impulse - resistance. The resistance is limit sign(u), and up to limit where u is zero.
+    mass u = impulse - resistance. The resistance is limit sign(u), or at most limit if u is zero.
     So u minimises u mass u / 2 - impulse u + limit |u|.
 
     Args:
         mass: (3, 3) kg m^2, symmetric.
         impulse: (3,) N m s.
         limit: (3,) N m s, zero or more.
-        rates: (3,) rad/s; written.
+        rates: (3,) rad/s, u; output.
     """
     everything, still = (1.0, 1.0, 1.0), limit[0] == 0 and limit[1] == 0 and limit[2] == 0
     best, found = np.inf, _solved(mass, impulse, limit, (0.0, 0.0, 0.0), everything)
@@ -210,7 +206,7 @@ def resisted(mass: FloatArray, impulse: FloatArray, limit: FloatArray, rates: Fl
         signs = np.sign(found[0]), np.sign(found[1]), np.sign(found[2])
         found = _solved(mass, impulse, limit, signs, everything)
         if not (found[0] * signs[0] > 0 and found[1] * signs[1] > 0 and found[2] * signs[2] > 0):
-            for choice in range(27):  # all ways in which three rates are zero or have a sign
+            for choice in range(27):  # all combinations of u < 0, u = 0 and u > 0
                 signs = row_of(_SIGNS, choice)
                 moving = abs(signs[0]), abs(signs[1]), abs(signs[2])
                 tried, cost = _solved(mass, impulse, limit, signs, moving), 0.0
@@ -226,7 +222,7 @@ def resisted(mass: FloatArray, impulse: FloatArray, limit: FloatArray, rates: Fl
 def _solved(
     mass: FloatArray, impulse: FloatArray, limit: FloatArray, signs: Vector, moving: Vector
 ) -> Vector:
-    """Solve mass u = impulse - limit signs for what moves (1); the rest (0) has u = 0."""
+    """Solve mass u = impulse - limit signs for joints with ``moving`` 1; u = 0 for those with 0."""
     inverse = np.empty((1, 3, 3))
     m0, m1, m2 = moving
     inverted(

@@ -1,4 +1,4 @@
-"""PyBullet as an engine; the only package that imports it."""
+"""Engine that uses PyBullet. No other package imports pybullet."""
 
 from tpm_gym.errors import MissingPackageError
 
@@ -6,7 +6,7 @@ try:
     import pybullet as pybullet
 except ModuleNotFoundError as error:
     hint = (
-        " (compiled for some minutes, except for Linux x86-64 with Python 3.10 and 3.11), or ask "
-        "for engine='mujoco' or engine='analytic'"
+        " (pip compiles it for minutes, except on Linux x86-64 with Python 3.10 or 3.11), or use "
+        "engine='mujoco' or engine='analytic'"
     )
     raise MissingPackageError("pybullet", "pybullet", hint) from error

@@ -1,4 +1,4 @@
-"""PyBullet's functions, bound to one private physics client."""
+"""PyBullet's functions, bound to one physics client."""
 
 from __future__ import annotations
 
@@ -28,28 +28,28 @@ _closed = itertools.count(1)
 
 
 class Client:
-    """A private physics client: pybullet's functions with its number filled in.
+    """Physics client: pybullet's functions with the argument ``physicsClientId`` filled in.
 
-    Unlike BulletClient of pybullet_utils, it looks each function up only once, which halves the
-    time of the cheaper calls, and prints nothing.
+    It replaces BulletClient of pybullet_utils. It looks up each function only once, which halves
+    the time of the cheaper calls, and it prints nothing.
 
     Args:
         physics: Numerical settings.
         gui: Whether to open PyBullet's window.
-        renderer: ``"tiny"`` (None too) draws on the CPU anywhere; ``"egl"`` on a GPU.
+        renderer: ``"tiny"`` or None draws on the CPU; ``"egl"`` draws on a GPU.
 
     Attributes:
-        number: PyBullet's number of the client.
-        renderer: PyBullet's number of the renderer.
+        number: PyBullet's id of the client.
+        renderer: PyBullet's id of the renderer.
 
     Raises:
-        ConfigurationError: If no window opened, or EGL was asked for and is not there.
+        ConfigurationError: If no window can open, or the renderer is not available.
     """
 
     def __init__(self, physics: Physics, gui: bool = False, renderer: str | None = None) -> None:
-        """Connect and configure."""
+        """Connect to PyBullet, load the renderer, and apply the settings."""
         self.number = _connect(gui)
-        # An environment that is dropped without close() would keep its 28 MB until the end.
+        # Without this, an environment that is deleted without close() would keep its 28 MB.
         self._disconnect = weakref.finalize(self, _disconnect, self.number)
         try:
             self.renderer = self._load_renderer(renderer)
@@ -59,7 +59,7 @@ class Client:
             raise
 
     def __getattr__(self, name: str) -> Any:
-        """Return PyBullet's function of that name, bound to this client, or its constant."""
+        """Return the constant ``name`` of pybullet, or its function bound to this client."""
         value = getattr(pybullet, name)
         if callable(value):
             value = partial(value, physicsClientId=self.number)
@@ -67,7 +67,7 @@ class Client:
         return value
 
     def configure(self, physics: Physics) -> None:
-        """Apply all settings, which a reset of the whole client clears."""
+        """Apply all settings; ``resetSimulation`` of PyBullet clears them."""
         self.setGravity(0.0, 0.0, -GRAVITY)
         self.setTimeStep(physics.time_step)
         self.setPhysicsEngineParameter(
@@ -84,49 +84,49 @@ class Client:
         self.configureDebugVisualizer(pybullet.COV_ENABLE_GUI, 0)  # no side panels
 
     def close(self) -> None:
-        """Disconnect; harmless the second time."""
+        """Disconnect from PyBullet; a second call does nothing."""
         self._disconnect()
 
     def _load_renderer(self, renderer: str | None) -> int:
-        """Return PyBullet's number of the renderer, and load the EGL plugin where necessary."""
+        """Return PyBullet's id of the renderer; load the EGL plugin for ``"egl"``."""
         if renderer in (None, "tiny"):
             return int(pybullet.ER_TINY_RENDERER)
         if renderer != "egl":
             raise ConfigurationError("renderer", renderer, "'tiny' or 'egl'")
         spec = importlib.util.find_spec("eglRenderer")
         if spec is None or self.loadPlugin(spec.origin, "_eglRendererPlugin") < 0:
-            valid = "'tiny': this machine has no EGL renderer"
+            valid = "'tiny': this computer has no EGL renderer"
             raise ConfigurationError("renderer", renderer, valid)
         return int(pybullet.ER_BULLET_HARDWARE_OPENGL)
 
 
 def _connect(gui: bool) -> int:
-    """Return the number of a new client, with a window if required."""
+    """Return the id of a new client."""
     if not gui:
         return int(pybullet.connect(pybullet.DIRECT))
     number = -1
     with suppress(pybullet.error):
         number = pybullet.connect(pybullet.GUI) if has_display() else -1
     if number < 0:
-        valid = "None or 'rgb_array': no window opened (it takes a display, one in a process)"
+        valid = "None or 'rgb_array': no window opened (needs a display; one window per process)"
         raise ConfigurationError("render_mode", "human", valid)
     return int(number)
 
 
 def _disconnect(number: int) -> None:
-    # PyBullet may be gone already, at the end of the interpreter or after a fork.
+    # The client may not exist any more at the end of the interpreter or after a fork.
     with suppress(pybullet.error):
         pybullet.disconnect(number)
-    if next(_closed) % 4 == 0:  # glibc would keep the memory until the end; this takes milliseconds
-        with suppress(AttributeError, OSError, TypeError):  # another C library
+    if next(_closed) % 4 == 0:  # glibc keeps free memory; trimming takes ms, so not every time
+        with suppress(AttributeError, OSError, TypeError):  # other C libraries have no malloc_trim
             ctypes.CDLL(None).malloc_trim(0)
 
 
 @contextmanager
 def silence() -> Iterator[None]:
-    """Discard the standard output for a moment, that of C code too.
+    """Discard standard output of Python and C code within the context.
 
-    The whole process is silent meanwhile, so only one thread does this at a time.
+    This affects the whole process. So a lock admits only one thread at a time.
     """
     with _stdout_lock:
         try:
@@ -148,7 +148,6 @@ def silence() -> Iterator[None]:
 
 
 def _flush() -> None:
-    """Flush the buffers of Python and of the C library."""
     with suppress(AttributeError, ValueError, OSError):  # stdout may be None, or closed
         sys.stdout.flush()
     ctypes.CDLL(None).fflush(None)

@@ -1,4 +1,4 @@
-"""The vacuum cup in PyBullet: a fixed joint to the held object, checked after each time step."""
+"""Vacuum cup in PyBullet: a fixed joint (weld) holds an object until the vacuum law releases it."""
 
 from __future__ import annotations
 
@@ -18,33 +18,34 @@ from tpm_gym.simulation.vacuum import CLEARANCE, EMPTY, Hold, Load, hold_after
 
 __all__ = ["Cup", "Grip"]
 
-_WELD_FORCE = 1e4  # N; the weld itself never yields
-_FASTEST = 2.5  # m/s, of the lip towards an object; twice the fastest command
+_WELD_FORCE = 1e4  # N; so large that only the vacuum law ends the weld
+_FASTEST = 2.5  # m/s, largest speed of lip towards object: twice the largest commanded speed
 
 
 class Grip(NamedTuple):
-    """The held object with its vacuum, and its pose in the tool's inertial frame; None for none."""
+    """Held object and vacuum, and the object's pose in the tool's inertial frame (None if none)."""
 
     hold: Hold = EMPTY
     pose: Pose | None = None
 
 
 class Cup:
-    """The cup on a robot's platform, which can hold one of the objects.
+    """Vacuum cup on a robot's platform; it can hold one object.
 
-    The weld puts the lip 20 um above the object's face, so that contact and weld do not fight.
+    The weld keeps a gap of 20 um between lip and object. Without a gap, their contact would act
+    against the weld.
 
     Args:
-        client: The physics client.
+        client: Physics client.
         robot: Robot with the cup.
-        bodies: Numbers of the objects in the client.
-        blocks: The objects.
-        time_step: s.
+        bodies: Body ids of the objects.
+        blocks: Objects of the scene.
+        time_step: Time step, s.
 
     Attributes:
-        grip: The held object.
+        grip: Held object and its weld.
         first: First time step of the control period in which the lip can touch an object.
-        sucks: First time step that needs :meth:`suck`.
+        first_update: First time step of the control period that needs :meth:`update`.
     """
 
     def __init__(
@@ -55,19 +56,19 @@ class Cup:
         blocks: Sequence[Block],
         time_step: float,
     ) -> None:
-        """Start with nothing held."""
+        """Create an empty cup."""
         self._client, self._robot, self._time_step = client, robot, time_step
         self._bodies, self._blocks = bodies, blocks
         self._radii = [block.radius for block in blocks]
         self._weld = -1
         self._near: list[int] = []
-        self._fastest = _FASTEST * time_step  # m in a time step
-        self._wait = 0  # time steps in which the lip cannot come to an object
-        self.first = self.sucks = self._steps = 0
+        self._fastest = _FASTEST * time_step  # m per time step
+        self._wait = 0  # number of time steps in which the lip cannot reach an object
+        self.first = self.first_update = self._steps = 0
         self.grip = Grip()
 
-    def look(self, steps: int, on: bool) -> list[int]:
-        """Find the objects that the lip can touch within the next ``steps`` time steps."""
+    def find_near(self, steps: int, on: bool) -> list[int]:
+        """Return indices of the objects that the lip can touch in the next ``steps`` time steps."""
         self._near, self._wait, self.first, self._steps = [], 0, steps, steps
         if self._bodies:
             lip, number = self._robot.lip(), self._client.number
@@ -78,11 +79,11 @@ class Cup:
                 if wait < steps:
                     self._near.append(index)
                     self.first = min(self.first, wait)
-        self.sucks = 0 if self.grip != Grip() else self.first if on else steps
+        self.first_update = 0 if self.grip != Grip() else self.first if on else steps
         return self._near
 
-    def suck(self, on: bool) -> None:
-        """Apply the vacuum law after a time step: change the pressure, take or drop an object."""
+    def update(self, on: bool) -> None:
+        """Apply the vacuum law after a time step: change the vacuum, hold or release an object."""
         hold, pose = self.grip
         load = Load() if pose is None else self._load()
         touched = self._touched() if on and pose is None else -1
@@ -95,7 +96,7 @@ class Cup:
             self.take(Grip(new, None if new.which < 0 else self._seat(new.which)))
 
     def take(self, grip: Grip) -> None:
-        """Drop the held object, and hold the one of ``grip``."""
+        """Release the held object, then hold the object of ``grip`` if it has one."""
         client, tool = self._client, self._robot.tool
         if self.grip.pose is not None:
             client.removeConstraint(self._weld)
@@ -108,15 +109,15 @@ class Cup:
             client.changeConstraint(self._weld, maxForce=_WELD_FORCE)
 
     def _load(self) -> Load:
-        """Return the force of the weld on the object in the last time step.
+        """Return the force of the weld in the last time step.
 
-        PyBullet reports it along the world's axes. The cup's axis stays vertical.
+        PyBullet reports the force along the world's axes, and the cup's axis is vertical.
         """
         x, y, z, *_ = self._client.getConstraintState(self._weld)
         return Load(-z, math.hypot(x, y))
 
     def _touched(self) -> int:
-        """Return the first near object on which the lip lies; -1 for none."""
+        """Return the index of the first object on which the lip can seal; -1 for none."""
         if self._wait > 0:
             self._wait -= 1
             return -1
@@ -134,7 +135,7 @@ class Cup:
         return -1
 
     def _seat(self, index: int) -> Pose:
-        """Return the pose of an object in the tool's inertial frame, 20 um clear of the cup."""
+        """Return the pose of an object in the tool's inertial frame, 20 um below the cup."""
         client, (body, link) = self._client, self._robot.tool
         state = client.getLinkState(body, link, computeForwardKinematics=True)
         inverse = client.invertTransform(state[0], state[1])

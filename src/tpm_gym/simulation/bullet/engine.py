@@ -1,4 +1,4 @@
-"""PyBullet behind the interface of :class:`tpm_gym.simulation.engine.Engine`: one robot."""
+"""Engine that simulates one robot with PyBullet."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _ZERO: Vector = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class _Saved:
-    joints: tuple[tuple[float, float], ...]  # rad and rad/s, passive ones too
+    joints: tuple[tuple[float, float], ...]  # rad and rad/s, including passive joints
     torque: Vector
     drives: NDArray[Any] | None
     objects: list[tuple[Pose, Twist]]
@@ -39,17 +39,16 @@ class _Saved:
 
 
 class BulletEngine:
-    """See :class:`~tpm_gym.simulation.engine.Engine`.
+    """Engine that simulates one robot with PyBullet.
 
     Args:
         gui: Whether to open PyBullet's window.
-        renderer: ``"tiny"`` (None too) draws on the CPU anywhere; ``"egl"`` on a GPU, where the
-            driver has it.
+        renderer: ``"tiny"`` or None draws on the CPU; ``"egl"`` draws on a GPU.
         physics: A :class:`Physics` or a mapping of its attributes.
-        drive: The motors' servo drives; None for ideal ones, whose torques Bullet's solver finds.
+        drive: Servo drives of the motors; None for ideal drives, which Bullet's solver computes.
 
     Raises:
-        ConfigurationError: If an option is out of range, no window opened, or EGL is not there.
+        ConfigurationError: If an option is out of range, or window or renderer cannot open.
     """
 
     def __init__(
@@ -60,7 +59,7 @@ class BulletEngine:
         physics: Any = None,
         drive: Servo | None = None,
     ) -> None:
-        """Connect."""
+        """Check the options and create the physics client."""
         self.physics = settings_of(Physics, "physics", physics)
         self.time_step = self.physics.time_step
         self._gui, self._renderer, self._servo = gui, renderer, drive
@@ -69,13 +68,13 @@ class BulletEngine:
         self.client = Client(self.physics, gui, renderer)
 
     def load(self, machine: Machine, scene: Scene, count: int) -> None:
-        """See the protocol."""
+        """Implement :meth:`Engine.load`."""
         self._drives = drives_of_one(self._servo, machine, count, self.time_step)
         self._nominal, self._scene, self._plant = machine, scene, NOMINAL
         self._load(machine)
 
     def _load(self, machine: Machine) -> None:
-        """Load a machine and all that stands around it into an empty client."""
+        """Load robot and scene into an empty client."""
         self._machine = machine
         self.robot = Robot(self.client, machine.mechanism, machine.mount)
         scene = self._scene
@@ -91,7 +90,7 @@ class BulletEngine:
         )
 
     def _empty(self) -> None:
-        """Remove everything from the client; a window stays, else a new client leaks least."""
+        """Remove all bodies: reset the client of a window, else replace it, which leaks least."""
         if self._gui:
             self.client.resetSimulation()
             self.client.configure(self.physics)
@@ -100,7 +99,7 @@ class BulletEngine:
             self.client = Client(self.physics, renderer=self._renderer)
 
     def alter(self, rows: IntArray, plants: Sequence[Plant]) -> None:
-        """See the protocol."""
+        """Implement :meth:`Engine.alter`."""
         (plant,) = plants
         if plant.length_errors != self._plant.length_errors:
             self._empty()
@@ -114,7 +113,7 @@ class BulletEngine:
         self._friction.alter(plant.friction)
 
     def place(self, rows: IntArray, theta: FloatArray, objects: FloatArray) -> None:
-        """See the protocol."""
+        """Implement :meth:`Engine.place`."""
         self._cup.take(Grip())
         self.robot.place(self._machine.joint_positions(theta[0]))
         if self._drives is not None:
@@ -124,48 +123,47 @@ class BulletEngine:
         self._torque = _ZERO
 
     def advance(self, path: Path, vacuum: BoolArray) -> None:
-        """See the protocol."""
+        """Implement :meth:`Engine.advance`."""
         cup, friction, step, on = self._cup, self._friction, self.client.stepSimulation, vacuum[0]
         targets, drive = steering(self._drives, path, self.robot)
-        turns = friction.look(cup.look(len(targets), on), cup.first)
-        sucks = cup.sucks
+        near = cup.find_near(len(targets), on)
+        first_scaled, first_update = friction.prepare(near, cup.first), cup.first_update
         for index, target in enumerate(targets):
-            if index >= turns:
-                friction.turn(cup.grip.hold.which)
+            if index >= first_scaled:
+                friction.scale(cup.grip.hold.which)
             drive(target)
             step()
-            if index >= sucks:
-                cup.suck(on)
+            if index >= first_update:
+                cup.update(on)
         self._torque = None
 
     def read(self) -> Readout:
-        """See the protocol."""
+        """Implement :meth:`Engine.read`."""
         truth, hold = self.robot.truth(), self._cup.grip.hold
         return Readout.of_one(self._machine, self._motors(), truth, hold, self._objects())
 
     def _objects(self) -> list[tuple[Pose, Twist]]:
-        """Return poses and velocities of the objects."""
         pose, twist = pybullet.getBasePositionAndOrientation, pybullet.getBaseVelocity
         numbers = [self.client.number] * len(self.bodies)
         poses, twists = map(pose, self.bodies, numbers), map(twist, self.bodies, numbers)
         return list(zip(poses, twists, strict=True))
 
     def _motors(self) -> tuple[Vector, Vector, Vector]:
-        """Return joint positions, velocities and torques of the motors."""
+        """Return joint positions (rad), velocities (rad/s) and torques (N m) of the motors."""
         theta, rates, torque = self.robot.motors()
-        if self._torque is not None:  # at rest after a reset, or restored
+        if self._torque is not None:  # after a reset or restore, Bullet reports no torque
             torque = self._torque
-        elif self._drives is not None:  # Bullet reports the axes' friction
+        elif self._drives is not None:  # with servo drives, Bullet reports the joint friction
             a, b, c = self._drives.memory[0, 0].tolist()
             torque = a, b, c
         return theta, rates, torque
 
     def show_goal(self, markers: FloatArray) -> None:
-        """See the protocol."""
+        """Implement :meth:`Engine.show_goal`."""
         self._scenery.move_markers(markers.tolist())
 
     def save(self) -> Any:
-        """See the protocol."""
+        """Implement :meth:`Engine.save`."""
         return _Saved(
             self.robot.joint_states(),
             self._motors()[2],
@@ -175,7 +173,7 @@ class BulletEngine:
         )
 
     def restore(self, saved: Any) -> None:
-        """See the protocol."""
+        """Implement :meth:`Engine.restore`."""
         self._cup.take(Grip())
         self.robot.set_joint_states(saved.joints)
         self._torque = saved.torque
@@ -186,12 +184,12 @@ class BulletEngine:
         self._cup.take(saved.grip)
 
     def picture(self, width: int, height: int) -> NDArray[np.uint8]:
-        """See the protocol."""
+        """Implement :meth:`Engine.picture`."""
         return self._scenery.picture(width, height, self.client.renderer)
 
     def close(self) -> None:
-        """See the protocol."""
+        """Implement :meth:`Engine.close`."""
         self.client.close()
 
 
-_: type[Engine] = BulletEngine  # so that mypy compares them
+_: type[Engine] = BulletEngine  # mypy checks that the class has the methods of Engine

@@ -1,16 +1,16 @@
 """Coulomb's friction cone for Bullet's direct solver, which has a friction box.
 
-The solver bounds the friction of a contact by mu N along each of two directions. At 45 degrees to
-them the friction is sqrt(2) times too strong, and it does not oppose the slip. On a level face the
-directions are the world's x and y, and Bullet can scale the bounds for each body. This module
-scales them by the direction of the slip, so that the corner of the box lies on the cone, opposite
-to the slip. Where a contact sticks, each bound is what the cone leaves beside the other force of
-the last time step. Where there was no force, the box lies inside the cone.
+The solver limits the friction force of a contact to mu N along each of two directions. At 45
+degrees to these directions, friction is sqrt(2) times too strong, and it does not oppose the slip.
+On a level face the directions are the world's x and y, and Bullet can scale both limits for each
+body. For a slipping contact, this module scales them so that a corner of the box lies on the cone,
+opposite to the slip. For a sticking contact, the limit along x follows from the cone and the last
+force along y, and vice versa. Without a last force, the box lies inside the cone.
 
-Remaining errors, measured in ``tests/simulation/bullet/test_friction.py``: a direction lags by one
-time step. The weaker bound never falls below :data:`_LEAST`. All points of a contact share the
-direction of its middle, so that a spinning block is braked too little. Contacts between objects,
-or with upright faces, keep the box.
+Remaining errors, measured in ``tests/simulation/bullet/test_friction.py``: the direction lags by
+one time step. The smaller scale never falls below :data:`_LEAST`. All points of a contact share
+the slip direction of its middle, so that friction brakes a spinning block too little. Contacts
+between objects and contacts with upright faces keep the box.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ from tpm_gym.simulation.state import Block
 
 __all__ = ["Friction"]
 
-_LEAST = 0.02  # of the scales, so that no row of the solver vanishes
+_LEAST = 0.02  # smallest scale; with 0, a row of the solver would vanish
 _FAST = 1e-2  # m/s; a faster contact slips, whatever the last force was
-_SLIP = 1e-5  # m/s; of a slower contact the next force has the last one's direction
-_LITTLE = 1e-3  # of the cone, squared; after a smaller force the next may have any direction
-_STICKS = 0.98  # of the cone, squared; with a smaller force it sticks, and motion is noise
-_SAME = 0.01  # smaller changes of a scale are not worth a call
-_UNKNOWN = (math.sqrt(0.5), math.sqrt(0.5))
-_BOX = (1.0, 1.0)  # the engine's own
+_SLIP = 1e-5  # m/s; in a slower contact, the next force is assumed along the last force
+_LITTLE = 1e-3  # (force / cone limit)^2; after a smaller force, the next may have any direction
+_STICKS = 0.98  # (force / cone limit)^2; with a smaller force the contact sticks
+_SAME = 0.01  # a smaller change of a scale is ignored, to save a call
+_UNKNOWN = (math.sqrt(0.5), math.sqrt(0.5))  # scales for an unknown direction of the force
+_BOX = (1.0, 1.0)  # Bullet's default scales
 
 
 class _Face:
-    """Level face of a body, on which objects slide, and the scales of its friction."""
+    """Level face on which objects slide, and the scales of its friction along x and y."""
 
     def __init__(self, body: int, link: int) -> None:
         self.body, self.link = body, link
@@ -48,14 +48,15 @@ class _Face:
 
 
 class Friction:
-    """The friction of objects on their tables and below the cup.
+    """Friction of objects on their tables and under the cup.
 
     Args:
-        client: The physics client.
+        client: Physics client.
         robot: Robot with the cup.
-        bodies: Numbers of the objects in the client.
-        tables: Number of each object's own table: objects slide in different directions.
-        blocks: The objects.
+        bodies: Body ids of the objects.
+        tables: Body ids of the tables, one per object, because objects slide in different
+            directions.
+        blocks: Objects of the scene.
     """
 
     def __init__(
@@ -66,8 +67,9 @@ class Friction:
         tables: Sequence[int],
         blocks: Sequence[Block],
     ) -> None:
-        """Start with nothing scaled."""
-        faces = [_Face(table, -1) for table in tables[: len(bodies)]]  # one, without objects
+        """Create the faces of tables and cup, with Bullet's default friction."""
+        # Without objects, ``tables`` still has one table.
+        faces = [_Face(table, -1) for table in tables[: len(bodies)]]
         self._bodies = list(zip(bodies, faces, blocks, strict=True))
         self._cup = _Face(*robot.tool)
         number = client.number
@@ -77,41 +79,43 @@ class Friction:
         self._scale = partial(pybullet.changeDynamics, physicsClientId=number)
 
     def reset(self) -> None:
-        """Start as if nothing had slipped."""
+        """Set the scales of all faces to an unknown direction of the force."""
         for face in (self._cup, *(face for _, face, _ in self._bodies)):
-            face.scales = _BOX  # so that it is set, whatever it is now
+            face.scales = _BOX  # differs from _UNKNOWN, so that _set() sends the scales to Bullet
             self._set(face, _UNKNOWN)
 
     def alter(self, factor: float) -> None:
-        """Make all objects ``factor`` times as rough as nominal."""
+        """Store the factor of the objects' nominal friction coefficients."""
         self._factor = factor
 
-    def look(self, near: Sequence[int], first: int) -> int:
-        """Return the first time step of the next control period that needs :meth:`turn`.
+    def prepare(self, near: Sequence[int], first: int) -> int:
+        """Return the first time step of the next control period that needs :meth:`scale`.
 
-        It is 0 if an object moves, else ``first``, when the cup can touch one of the ``near`` ones.
+        Args:
+            near: Indices of the objects that the cup can touch in the control period.
+            first: First time step in which the cup can touch an object; returned if none moves.
         """
         moving = []
         for index, (body, table, _) in enumerate(self._bodies):
             (x, y, z), _ = pybullet.getBaseVelocity(body, self._number)
-            # Settling after a flat fall does not count.
+            # Vertical settling of an object that lies flat is not a motion.
             settles = table.scales is _UNKNOWN and math.hypot(x, y) <= _SLIP and abs(z) < _FAST
             if not settles and math.hypot(x, y, z) > _SLIP:
                 moving.append(index)
         self._active = sorted({*moving, *near}) if moving else list(near)
-        # A single object rests until the cup comes; several may push each other.
+        # A single object rests until the cup touches it. Several objects may push each other.
         alone = len(self._bodies) == 1
         self._resting = set(near).difference(moving) if alone else set()
         return 0 if moving else first
 
-    def turn(self, held: int) -> None:
-        """Scale the friction of objects that may slip, before a time step."""
+    def scale(self, held: int) -> None:
+        """Scale the friction of objects that may slip; call before each time step."""
         number, cup = self._number, self._cup
         for index in self._active:
             body, table, block = self._bodies[index]
             if index != held and self._rests(index):
                 continue
-            points = pybullet.getContactPoints(body, -1, -2, -2, number)  # with anything
+            points = pybullet.getContactPoints(body, -1, -2, -2, number)  # with all other bodies
             if not points:
                 continue
             below = [point for point in points if point[2] == table.body]
@@ -128,9 +132,9 @@ class Friction:
                 )
 
     def _rests(self, index: int) -> bool:
-        """Return whether an object has not moved since the last look, and nothing touches it.
+        """Return whether an object has not moved since :meth:`prepare`, and the cup is not on it.
 
-        Then nothing has to be turned. Asking costs a third of turning.
+        The friction of such an object needs no scaling. This check takes a third of the time.
         """
         body, table, _ = self._bodies[index]
         if index not in self._resting or table.scales is not _UNKNOWN:
@@ -143,7 +147,7 @@ class Friction:
         return True
 
     def _set(self, face: _Face, scales: tuple[float, float]) -> None:
-        if scales is face.scales:  # unknown as before
+        if scales is face.scales:  # _UNKNOWN, as before
             return
         (a, b), (c, d) = scales, face.scales
         if abs(a - c) > _SAME or abs(b - d) > _SAME or scales is _UNKNOWN:
@@ -152,7 +156,7 @@ class Friction:
 
 
 def _scales(x: float, y: float, points: Sequence[Any], coefficient: float) -> tuple[float, float]:
-    """Return bounds along the world's axes in units of mu N, for a slip (m/s)."""
+    """Return the friction limits along x and y (world) in units of mu N, for a slip (x, y) m/s."""
     speed = math.hypot(x, y)
     if speed > _FAST:
         return _along(x, y)
@@ -165,13 +169,13 @@ def _scales(x: float, y: float, points: Sequence[Any], coefficient: float) -> tu
 
 
 def _along(x: float, y: float) -> tuple[float, float]:
-    """Return the point of the cone's edge in a direction."""
+    """Return the scales whose corner of the box lies on the cone along (x, y)."""
     length = math.hypot(x, y)
     return max(abs(x) / length, _LEAST), max(abs(y) / length, _LEAST)
 
 
 def _used(points: Sequence[Any], coefficient: float) -> tuple[float, float]:
-    """Return the friction of some contacts, along the world's axes, in units of mu N."""
+    """Return the sum of friction forces along the world's x and y, in units of mu N."""
     along_x = along_y = normal = 0.0
     for point in points:
         force, first, (a, b, _), second, (c, d, _) = point[9:]

@@ -11,21 +11,21 @@ __all__ = ["Physics"]
 
 SOLVERS = ("direct", "iterative")
 REGULARISATION = 1e-9
-"""Compliance of the constraints (CFM), so that redundant closures stay solvable."""
+"""Compliance of the constraints (CFM). It keeps redundant closures solvable."""
 MOTOR_GAIN = 1.0
-"""Share of the position error that a motor removes in one time step."""
+"""Fraction of the position error that a motor removes in one time step."""
 
 
 @dataclass(frozen=True)
 class Physics(Numerics):
-    """Numerical settings of the engine.
+    """Numerical settings of PyBullet.
 
     Attributes:
-        time_step: s; a whole fraction of the control period.
+        time_step: Time step, s; the control period must be an integer multiple of it.
         solver: ``"direct"`` solves the constraints of a time step exactly (Dantzig's pivoting);
             ``"iterative"`` is Bullet's default, sequential impulses.
-        iterations: Iterations of the iterative solver in a time step; 25 lose a loop now and then.
-        erp: Share of a constraint's error that is removed in one time step, in (0, 1].
+        iterations: Iterations of the iterative solver per time step; with 25, loops open sometimes.
+        erp: Fraction of a constraint's error that is removed in one time step, in (0, 1].
 
     Raises:
         ConfigurationError: If a value is out of range.
@@ -36,7 +36,7 @@ class Physics(Numerics):
     erp: float = 1.0
 
     def __post_init__(self) -> None:
-        """Reject impossible settings."""
+        """Check the settings."""
         require_numerics(self, {"erp": (lambda value: 0 < value <= 1, "0 < erp <= 1")})
         if self.solver not in SOLVERS:
             raise ConfigurationError("solver", self.solver, " or ".join(map(repr, SOLVERS)))

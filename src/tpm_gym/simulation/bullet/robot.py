@@ -1,9 +1,9 @@
-"""The robot in PyBullet: legs, loop closures, motors, encoders, and the truth.
+"""The robot in PyBullet: legs, loop closures, motors, encoders and true positions.
 
-Each leg of the spanning tree is a multibody of its own, so that every loop closure joins two
-different multibodies. Within one multibody, Bullet's direct solvers are wrong and lose the loops at
-once; between multibodies they are exact (docs/fidelity.md). It also shortens every row of the
-solver.
+Each leg of the spanning tree is loaded as a separate multibody, so that every loop closure joins
+two multibodies. With a closure inside one multibody, Bullet's direct solvers compute wrong forces
+and the loop opens at once; between multibodies they are exact (docs/fidelity.md). Separate
+multibodies also shorten every row of the solver.
 """
 
 from __future__ import annotations
@@ -31,28 +31,23 @@ from tpm_gym.simulation.engine import SPRING_GAIN, transform
 __all__ = ["Robot"]
 
 Address = tuple[int, int]
-"""A body in the client, and one of its links (or the joint above it)."""
+"""Body id in the client, and index of a link (PyBullet gives a joint the index of its child)."""
 
-_CLOSURE_FORCE = 1e6  # N; the loops never yield
+_CLOSURE_FORCE = 1e6  # N; so large that no load opens a loop
 
 
 class Robot:
-    """The mechanism as one multibody for each leg, with closed loops.
-
-    Args:
-        client: The physics client.
-        mechanism: The mechanism to load.
-        mount: Place of the base.
+    """Robot with one multibody per leg and closed loops.
 
     Attributes:
-        bodies: Numbers of the legs in the client.
+        bodies: Body ids of the legs.
         joints: Address of each joint, by name.
-        links: Address of each link but the base, by name.
+        links: Address of each link except the base, by name.
         tool: Address of the link with the vacuum cup.
     """
 
     def __init__(self, client: Client, mechanism: Mechanism, mount: Mount) -> None:
-        """Load the legs, remove PyBullet's own damping and motors, close the loops."""
+        """Load the legs, remove PyBullet's default damping and motors, and close the loops."""
         from tpm_gym.simulation import compiled  # imports Numba
 
         self._truth = compiled.truth
@@ -68,13 +63,8 @@ class Robot:
         assert slide is not None
         self.tool = self.links[mechanism.tool]
         client.changeDynamics(*self.tool, lateralFriction=CUP.friction)
-        client.setJointMotorControl2(
-            *self.tool,
-            client.POSITION_CONTROL,
-            targetPosition=0.0,
-            force=slide.effort,
-            positionGain=SPRING_GAIN,
-        )
+        spring = {"targetPosition": 0.0, "force": slide.effort, "positionGain": SPRING_GAIN}
+        client.setJointMotorControl2(*self.tool, client.POSITION_CONTROL, **spring)
         self._close_loops()
 
     def _load(self, leg: Mechanism, mount: Mount) -> int:
@@ -90,7 +80,7 @@ class Robot:
         for index in range(client.getNumJoints(body)):
             info = client.getJointInfo(body, index)
             self.joints[info[1].decode()] = self.links[info[12].decode()] = (body, index)
-            # PyBullet adds damping to everything and a motor to every joint; we want neither.
+            # PyBullet adds damping to every link and a motor to every joint. Both are removed.
             client.changeDynamics(
                 body, index, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0
             )
@@ -98,29 +88,23 @@ class Robot:
         return body
 
     def _inertia(self, link: Address) -> tuple[float, Vector]:
-        """Return mass and principal moments as loaded."""
+        """Return mass (kg) and principal moments of inertia (kg m^2) of a link."""
         info = self._client.getDynamicsInfo(*link)
         return info[0], info[2]
 
     def _close_loops(self) -> None:
-        """Close the loops; PyBullet takes pivots relative to the centres of mass."""
+        """Create the loop closures. PyBullet requires pivots relative to the centres of mass."""
         client = self._client
         watched = {self.links[self._mechanism.platform]}
         for closure in self._mechanism.closures:
             sides = ((closure.link_a, closure.point_a), (closure.link_b, closure.point_b))
             link_a, link_b = (self.links[name] for name, _ in sides)
             pivots = [self._pivot(name, point) for name, point in sides]
-            constraint = client.createConstraint(
-                *link_a,
-                *link_b,
-                client.JOINT_POINT2POINT,
-                (0.0, 0.0, 0.0),
-                pivots[0].tolist(),
-                pivots[1].tolist(),
-            )
+            ends = (*link_a, *link_b, client.JOINT_POINT2POINT, (0.0, 0.0, 0.0))
+            constraint = client.createConstraint(*ends, *(pivot.tolist() for pivot in pivots))
             client.changeConstraint(constraint, maxForce=_CLOSURE_FORCE)
             watched |= {link_a, link_b}
-        # One call for each leg is cheaper than one for each link.
+        # One call of getLinkStates per leg is cheaper than one call per link.
         order = sorted(watched)
         self._watched = {body: [link for of, link in order if of == body] for body, _ in order}
         at = {name: order.index(link) for name, link in self.links.items() if link in watched}
@@ -131,13 +115,10 @@ class Robot:
         self._pivots = np.array([(c.point_a, c.point_b) for c in closures]).reshape(-1, 2, 3)
 
     def _pivot(self, name: str, point: Vector) -> NDArray[np.float64]:
-        """Return a link's point relative to its centre of mass, m.
-
-        Raises:
-            ConfigurationError: If the link has products of inertia: PyBullet would turn its
-                inertial frame onto the principal axes, and the loop would not close there.
-        """
+        """Convert a point of a link's frame to a point relative to the link's centre of mass, m."""
         link = self._mechanism.link(name)
+        # With products of inertia, PyBullet would rotate the inertial frame to the principal axes,
+        # and the closure would be at a wrong point.
         if not np.allclose(link.inertia, np.diag(np.diag(link.inertia)), rtol=0.0, atol=1e-12):
             valid = "links whose principal axes of inertia are the axes of their frame"
             raise ConfigurationError("mechanism", name, valid)
@@ -145,42 +126,35 @@ class Robot:
         return relative
 
     def paint(self) -> None:
-        """Give each link the colour of its largest solid.
+        """Set the colour of each link to the colour of its largest solid.
 
-        PyBullet's OpenGL pictures use one colour for a link, that of the last solid. The software
-        renderer is right without this.
+        PyBullet's OpenGL renderer draws a whole link in the colour of its last solid. The software
+        renderer draws each solid in its own colour, and does not need this method.
         """
+        base = [(body, -1) for body in self.bodies]
         for link in self._mechanism.links:
             largest = max(link.solids, key=lambda solid: float(np.prod(np.abs(solid.size[:2]))))
-            places = (
-                [(body, -1) for body in self.bodies]
-                if link.joint is None
-                else [self.links[link.name]]
-            )
-            for place in places:
+            for place in base if link.joint is None else [self.links[link.name]]:
                 self._client.changeVisualShape(*place, rgbaColor=urdf.COLOURS[largest.colour])
 
     def place(self, angles: Mapping[str, float]) -> None:
-        """Put every joint at its angle (rad), at rest."""
+        """Set the joint positions (rad) at rest, by joint name."""
         for name, angle in angles.items():
             self._client.resetJointState(*self.joints[name], angle, 0.0)
 
     def alter(self, mass_factors: Sequence[float], motor_strength: Sequence[float]) -> None:
-        """Scale the masses of the moving links (empty: all nominal) and the motors' torques."""
+        """Scale the nominal masses of the moving links (empty: all 1) and the motors' torques."""
         factors = mass_factors or [1.0] * len(self._inertias)
         for (link, (mass, moments)), factor in zip(self._inertias.items(), factors, strict=True):
-            self._client.changeDynamics(
-                *link,
-                mass=factor * mass,
-                localInertiaDiagonal=[factor * moment for moment in moments],
-            )
+            inertia = [factor * moment for moment in moments]
+            self._client.changeDynamics(*link, mass=factor * mass, localInertiaDiagonal=inertia)
         pairs = zip(self._nominal_effort, motor_strength, strict=True)
         self._effort = [effort * strength for effort, strength in pairs]
 
     def drive(self, theta: Vector) -> None:
-        """Let the motors go to ``theta`` rad within the next time step, within their effort."""
-        # Target angle and rate, largest torque, gains, rate limit (none), client; as keywords they
-        # cost half as much again, and a loop as much as one of the calls.
+        """Set the joint positions (rad) that ideal motors reach in the next time step."""
+        # Arguments: target position and velocity, largest torque, gains, velocity limit (none) and
+        # client. Keywords would cost 50% more time, and a loop the time of one call.
         turn, mode = pybullet.setJointMotorControl2, pybullet.POSITION_CONTROL
         number = self._client.number
         (one, i), (two, j), (three, k) = self._motors
@@ -190,7 +164,7 @@ class Robot:
         turn(three, k, mode, c, 0.0, z, MOTOR_GAIN, 1.0, -1.0, number)
 
     def apply(self, torque: Vector) -> None:
-        """Let the motors apply ``torque`` N m in the next time step."""
+        """Set the torques (N m) that the motors apply in the next time step."""
         turn, mode = pybullet.setJointMotorControl2, pybullet.TORQUE_CONTROL
         number = self._client.number
         for (body, joint), one in zip(self._motors, torque, strict=True):
@@ -203,24 +177,24 @@ class Robot:
             turn(*motor, mode, targetVelocity=0.0, force=one)
 
     def motors(self) -> tuple[Vector, Vector, Vector]:
-        """Return joint positions (rad), velocities (rad/s) and last torques (N m) of the motors."""
+        """Return joint positions (rad), velocities (rad/s) and the last torques (N m)."""
         state, number = pybullet.getJointState, self._client.number
         (one, i), (two, j), (three, k) = self._motors
         a, b, c = state(one, i, number), state(two, j, number), state(three, k, number)
         return (a[0], b[0], c[0]), (a[1], b[1], c[1]), (a[3], b[3], c[3])
 
     def joint_states(self) -> tuple[tuple[float, float], ...]:
-        """Return position and velocity of every joint, passive ones too."""
+        """Return position and velocity of every joint, including passive joints."""
         states = (self._client.getJointState(*joint) for joint in self.joints.values())
         return tuple((state[0], state[1]) for state in states)
 
     def set_joint_states(self, states: tuple[tuple[float, float], ...]) -> None:
-        """Restore the positions and velocities of :meth:`joint_states`."""
+        """Restore positions and velocities from :meth:`joint_states`."""
         for joint, (angle, rate) in zip(self.joints.values(), states, strict=True):
             self._client.resetJointState(*joint, angle, rate)
 
     def truth(self) -> tuple[float, Vector, float]:
-        """Return the largest loop gap (m), point P (m, world) and the platform's tilt (rad)."""
+        """Compute the largest loop gap (m), point P (m, world) and the platform's tilt (rad)."""
         number = self._client.number
         frames: list[float] = []
         for body, links in self._watched.items():
@@ -232,23 +206,19 @@ class Robot:
         return gap, (x, y, z), tilt
 
     def lip(self) -> Vector:
-        """Return the centre of the cup's lip, m, world."""
+        """Return the centre of the cup's lip (m, world)."""
         state = pybullet.getLinkState(*self.tool, 0, 1, self._client.number)
         return transform(state[4], state[5], self._mechanism.lip)
 
     def cup_axis(self) -> Vector:
-        """Return the cup's outward axis, world."""
+        """Return the outward axis of the cup (unit vector, world)."""
         state = pybullet.getLinkState(*self.tool, 0, 1, self._client.number)
         return rotate(state[5], (0.0, 0.0, 1.0))
 
 
 @contextmanager
 def _on_disk(text: str) -> Iterator[str]:
-    """Yield the path of a file with this text: PyBullet reads robots from files only.
-
-    Raises:
-        ConfigurationError: If no temporary file can be written.
-    """
+    """Write a temporary file and yield its path. PyBullet loads robots only from files."""
     try:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder, "robot.urdf")

@@ -1,4 +1,4 @@
-"""Everything around the robot in PyBullet: table, floor, goal markers, objects, camera."""
+"""Table, floor, goal markers, objects and camera in PyBullet."""
 
 from __future__ import annotations
 
@@ -18,21 +18,22 @@ __all__ = ["Scenery"]
 
 
 class Scenery:
-    """Everything in the client that is not the robot.
+    """Bodies in the client that do not belong to the robot.
 
     Args:
-        client: The physics client.
+        client: Physics client.
         scene: Objects and markers to load.
-        table: Half edges of the table along x and y, m.
+        table: Half edge lengths of the tables along x and y, m.
 
     Attributes:
-        bodies: Numbers of the objects in the client, in the order of the scene.
-        tables: Numbers of the tables. Each object has its own, all in the same place, because their
-            friction is scaled differently. The first exists without objects too, and is drawn.
+        bodies: Body ids of the objects, in the order of the scene.
+        tables: Body ids of the tables. Each object collides with its own table, because
+            :class:`Friction` scales the friction of each table. All tables are in one place. The
+            first table is drawn, and exists also without objects.
     """
 
     def __init__(self, client: Client, scene: Scene, table: tuple[float, float]) -> None:
-        """Load it."""
+        """Load tables, floor, markers and objects into the client."""
         self._client = client
         self._blocks = scene.objects
         self.tables = [self._add_slab(TABLE, table)]
@@ -50,10 +51,10 @@ class Scenery:
                 client.setCollisionFilterPair(body, top, -1, -1, int(index == other))
 
     def _add_slab(self, slab: Slab, edges: tuple[float, float], drawn: bool = True) -> int:
-        """Add a static board with these half edges, m; return its number."""
+        """Add a static board with half edge lengths ``edges`` (m); return its body id."""
         height = slab.top - slab.half_height
         body = self._add_box((*edges, slab.half_height), height, slab.colour if drawn else None)
-        # PyBullet multiplies the friction of both bodies.
+        # PyBullet multiplies the friction coefficients of both bodies.
         self._client.changeDynamics(body, -1, lateralFriction=slab.friction)
         return body
 
@@ -67,7 +68,7 @@ class Scenery:
     def _add_box(
         self, half: Vector, height: float, colour: Sequence[float] | None, mass: float = 0.0
     ) -> int:
-        """Add a box above the origin; without mass it is static, without colour not drawn."""
+        """Add a box at ``height`` (m): static without mass, invisible without colour."""
         client, shape = self._client, -1
         solid = client.createCollisionShape(client.GEOM_BOX, halfExtents=half)
         if colour is not None:
@@ -76,12 +77,13 @@ class Scenery:
         return int(client.createMultiBody(mass, solid, shape, basePosition=place))
 
     def move_markers(self, positions: Sequence[Vector]) -> None:
-        """Show the goal at these points, m, world."""
+        """Move the goal markers to ``positions`` (m, world)."""
         for marker, position in zip(self._markers, positions, strict=True):
             self._client.resetBasePositionAndOrientation(marker, position, UPRIGHT)
 
     def place(self, placed: Sequence[tuple[Pose, Twist]]) -> None:
-        """Put the objects down, and clear old contacts, which would warm-start the solver."""
+        """Set poses and velocities of the objects, and clear their old contacts."""
+        # Old contacts would warm-start the solver. Detection with distant objects removes them.
         for far, body in enumerate(self.bodies):
             self._client.resetBasePositionAndOrientation(body, (far, 0.0, 5.0), UPRIGHT)
         if self.bodies:
@@ -94,7 +96,7 @@ class Scenery:
             self._client.resetBaseVelocity(body, *twist)
 
     def alter(self, mass: float, friction: float) -> None:
-        """Make the objects ``mass`` times as heavy and ``friction`` times as rough as nominal."""
+        """Scale the nominal masses and friction coefficients of the objects by these factors."""
         for body, nominal in zip(self.bodies, self._blocks, strict=True):
             block = replace(nominal, mass=mass * nominal.mass, friction=friction * nominal.friction)
             moments, rough = block.inertia, block.friction
@@ -103,7 +105,7 @@ class Scenery:
             )
 
     def aim_window(self) -> None:
-        """Point the window's camera like that of :meth:`picture`."""
+        """Set the camera of the window to the view of :meth:`picture`."""
         self._client.resetDebugVisualizerCamera(
             cameraDistance=0.7 * CAMERA.distance,  # the window's field of view is wider
             cameraYaw=CAMERA.yaw,
@@ -112,7 +114,7 @@ class Scenery:
         )
 
     def picture(self, width: int, height: int, renderer: int) -> NDArray[np.uint8]:
-        """Draw the scene as (height, width, 3) RGB."""
+        """Draw the scene as an RGB image (height, width, 3)."""
         client = self._client
         view = client.computeViewMatrixFromYawPitchRoll(
             cameraTargetPosition=CAMERA.target,
@@ -131,7 +133,7 @@ class Scenery:
             viewMatrix=view,
             projectionMatrix=projection,
             lightDirection=LIGHT,
-            shadow=0,  # the software renderer blotches large faces with its shadow map
+            shadow=0,  # the software renderer's shadows leave blotches on large faces
             renderer=renderer,
         )
         pixels = np.asarray(image[2], dtype=np.uint8).reshape(height, width, 4)

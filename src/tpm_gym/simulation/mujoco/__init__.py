@@ -1,4 +1,4 @@
-"""MuJoCo as an engine."""
+"""Engine that uses MuJoCo."""
 
 from tpm_gym.errors import MissingPackageError
 

@@ -1,4 +1,4 @@
-"""The vacuum cup in MuJoCo: a weld to the held object, whose force is checked each time step."""
+"""Vacuum cup in MuJoCo: a weld holds an object until the vacuum law releases it."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ from tpm_gym.simulation.vacuum import CLEARANCE, EMPTY, Hold, Load, hold_after
 __all__ = ["Cup", "Grip"]
 
 _SOFTER = 0.5
-"""Factor of the contacts' stiffness of the held object.
+"""Factor of the contact stiffness of the held object.
 
-With the whole stiffness, the table would throw it against the cup's spring. The spring would then
-press 3% less than in PyBullet, and the motors' torques would be as much smaller.
+With factor 1, the table would push the object against the cup's spring. The spring's force, and
+with it the motors' torques, would be 3% smaller than in PyBullet.
 """
 
 
 class Grip(NamedTuple):
-    """The held object with its vacuum, and its pose in the tool's frame if there is one."""
+    """Held object and vacuum, and the pose of the held object (if any) in the tool's frame."""
 
     hold: Hold = EMPTY
     pose: Pose = Pose((0.0, 0.0, 0.0))
 
 
 class Cup:
-    """The cup on a robot's platform, which can hold one of the objects.
+    """Vacuum cup on a robot's platform; it can hold one object.
 
-    A weld replaces the contact: it keeps the lip 20 um above the object's face and bears pull,
-    pressure and shear. So its force is the load of the seal.
+    A weld replaces the contact between lip and object. It keeps a gap of 20 um and transmits pull,
+    pressure and shear, so its force is the load of the seal.
 
     Attributes:
-        grip: The held object.
+        grip: Held object and its pose.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class Cup:
         scenery: Scenery,
         blocks: tuple[Block, ...],
     ) -> None:
-        """Start with nothing held."""
+        """Create an empty cup."""
         self._model, self._data = model, data
         self._robot, self._scenery, self._blocks = robot, scenery, blocks
         names = range(len(blocks))
@@ -60,12 +60,12 @@ class Cup:
         geoms = [model.geom(object_name(index)).id for index in names]
         self._pairs = [(model.pair_geom1 == g) | (model.pair_geom2 == g) for g in geoms]
         self._stiffness = model.pair_solref[:, 0].copy()
-        self._row = 3 * (model.neq - len(blocks))  # of the weld's force, after the closures'
+        self._row = 3 * (model.neq - len(blocks))  # first row of the weld, after the closures
         self._reach = [math.hypot(*CUP.lip) + block.radius + CUP.seal_gap for block in blocks]
         self.grip = Grip()
 
     def load(self) -> Load:
-        """Return the load of the seal, after the second half of a time step."""
+        """Return the load of the seal; call after the second half of a time step."""
         if self.grip.hold.which < 0:
             return Load()
         row = self._row
@@ -76,7 +76,7 @@ class Cup:
         return Load(tension, shear)
 
     def breathe(self, on: bool, load: Load) -> bool:
-        """Apply the vacuum law of a time step; return whether an object was taken or dropped."""
+        """Apply the vacuum law of a time step; return whether the held object has changed."""
         before, pose = self.grip
         if not on and before == EMPTY:
             return False
@@ -89,7 +89,7 @@ class Cup:
         return True
 
     def set(self, grip: Grip) -> None:
-        """Hold the object of ``grip``, and no other."""
+        """Weld the object of ``grip`` to the cup, if it has one, and release all others."""
         model, active = self._model, self._data.eq_active
         active[self._welds] = 0
         model.pair_solref[:, 0] = self._stiffness
@@ -102,10 +102,10 @@ class Cup:
             model.eq_data[weld, 3:10] = (x, y, z, qw, qx, qy, qz)
 
     def _touched(self) -> int:
-        """Return the index of the first object on whose face the lip lies; -1 for none."""
+        """Return the index of the first object on which the lip can seal; -1 for none."""
         height = self._robot.tool_height()
         for index, (block, reach) in enumerate(zip(self._blocks, self._reach, strict=True)):
-            if height - self._scenery.height(index) <= reach:  # else there is no need to look
+            if height - self._scenery.height(index) <= reach:  # a cheap check before sealed()
                 lip, axis = self._robot.cup()
                 pose = self._scenery.pose(index)
                 if sealed(lip, axis, *pose, (block.width, block.height)):
@@ -113,7 +113,7 @@ class Cup:
         return -1
 
     def _sealed_pose(self, index: int) -> Pose:
-        """Return the pose of an object in the tool's frame, 20 um clear of the cup."""
+        """Return the pose of an object in the tool's frame, at least 20 um below the cup."""
         origin, turn = self._robot.tool()
         position, quaternion = self._scenery.pose(index)
         lip, _ = self._robot.cup()
@@ -131,6 +131,6 @@ def _inverse(quaternion: Quaternion) -> Quaternion:
 
 
 def _in_frame(origin: Vector, quaternion: Quaternion, point: Vector) -> Vector:
-    """Convert a point of the world into a frame."""
+    """Convert a point (m) from the world to a frame with this origin (m) and orientation."""
     (x, y, z), (u, v, w) = point, origin
     return rotate(_inverse(quaternion), (x - u, y - v, z - w))

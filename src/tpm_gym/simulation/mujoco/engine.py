@@ -1,4 +1,4 @@
-"""MuJoCo behind the interface of :class:`tpm_gym.simulation.engine.Engine`: one robot."""
+"""Engine that simulates one robot with MuJoCo."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _STATE = int(
     | mujoco.mjtState.mjSTATE_WARMSTART
     | mujoco.mjtState.mjSTATE_EQ_ACTIVE
 )
-"""Parts of MuJoCo's state that the next time steps depend on."""
+"""Parts of MuJoCo's state that determine the next time steps."""
 
 
 @dataclass(frozen=True)
@@ -43,16 +43,16 @@ class _Saved:
 
 
 class MujocoEngine:
-    """See :class:`~tpm_gym.simulation.engine.Engine`.
+    """Engine that simulates one robot with MuJoCo.
 
-    Between calls, the first half of the next time step (positions, contacts, constraints) is
-    computed already, so that all values that can be read belong to the same moment.
+    Each call ends with the first half of the next time step (positions, contacts, constraints), so
+    that all values that can be read belong to one time.
 
     Args:
-        renderer: ``"egl"``, ``"osmesa"`` or ``"glfw"``; None for that of the environment variable
-            ``MUJOCO_GL``, or else the first that works.
+        renderer: ``"egl"``, ``"osmesa"`` or ``"glfw"``; None for the value of the environment
+            variable ``MUJOCO_GL``, or else the first renderer that works.
         physics: A :class:`Physics` or a mapping of its attributes.
-        drive: The motors' servo drives; None for ideal ones.
+        drive: Servo drives of the motors; None for ideal drives.
 
     Raises:
         ConfigurationError: If an option is out of range.
@@ -69,7 +69,7 @@ class MujocoEngine:
         self._drives: ServoDrives | None = None
 
     def load(self, machine: Machine, scene: Scene, count: int) -> None:
-        """See the protocol."""
+        """Implement :meth:`Engine.load`."""
         self._drives = drives_of_one(self._servo, machine, count, self.time_step)
         self._nominal, self._scene, self._plant = machine, scene, NOMINAL
         self._load(machine)
@@ -84,7 +84,7 @@ class MujocoEngine:
         self._cup = Cup(self.model, self.data, self.robot, self._scenery, self._scene.objects)
 
     def alter(self, rows: IntArray, plants: Sequence[Plant]) -> None:
-        """See the protocol."""
+        """Implement :meth:`Engine.alter`."""
         (plant,) = plants
         if plant.length_errors != self._plant.length_errors:
             self._load(plant.of(self._nominal))
@@ -96,7 +96,7 @@ class MujocoEngine:
         mujoco.mj_setConst(self.model, self.data)
 
     def place(self, rows: IntArray, theta: FloatArray, objects: FloatArray) -> None:
-        """See the protocol."""
+        """Implement :meth:`Engine.place`."""
         self._reset()
         self._cup.set(Grip())
         self.robot.place(self._machine.joint_positions(theta[0]))
@@ -106,16 +106,17 @@ class MujocoEngine:
         mujoco.mj_step1(self.model, self.data)
 
     def _reset(self) -> None:
-        """Clear all motion, and silence MuJoCo's warnings: a lost loop raises an error of ours.
+        """Reset the state, and suppress MuJoCo's warnings.
 
-        MuJoCo would write the first warning of each kind to the console and into a file.
+        MuJoCo writes the first warning of each kind to the console and into a file. An open loop
+        raises ClosureError anyway.
         """
         mujoco.mj_resetData(self.model, self.data)
         for warning in self.data.warning:
             warning.number = 1
 
     def advance(self, path: Path, vacuum: BoolArray) -> None:
-        """See the protocol."""
+        """Implement :meth:`Engine.advance`."""
         model, data, cup, scenery, on = self.model, self.data, self._cup, self._scenery, vacuum[0]
         first_half, second_half = mujoco.mj_step1, mujoco.mj_step2
         targets, drive = steering(self._drives, path, self.robot)
@@ -123,32 +124,32 @@ class MujocoEngine:
             drive(target)
             scenery.keep_sliding()
             second_half(model, data)
-            if not left:
+            if not left:  # the last time step
                 self.robot.note_torque()
             load = cup.load()
             first_half(model, data)
             if cup.breathe(on, load):
-                first_half(model, data)  # with another constraint
+                first_half(model, data)  # again, because a weld was added or removed
 
     def read(self) -> Readout:
-        """See the protocol."""
+        """Implement :meth:`Engine.read`."""
         robot, objects = self.robot, self._scenery.read()
         hold = self._cup.grip.hold
         return Readout.of_one(self._machine, robot.motors(), robot.truth(), hold, objects)
 
     def show_goal(self, markers: FloatArray) -> None:
-        """See the protocol."""
+        """Implement :meth:`Engine.show_goal`."""
         self._scenery.move_markers(markers.tolist())
 
     def save(self) -> Any:
-        """See the protocol."""
+        """Implement :meth:`Engine.save`."""
         numbers = np.empty(mujoco.mj_stateSize(self.model, _STATE))
         mujoco.mj_getState(self.model, self.data, numbers, _STATE)
         memory = None if self._drives is None else self._drives.memory.copy()
         return _Saved(tuple(numbers.tolist()), self.robot.torque, memory, self._cup.grip)
 
     def restore(self, saved: Any) -> None:
-        """See the protocol."""
+        """Implement :meth:`Engine.restore`."""
         mujoco.mj_setState(self.model, self.data, np.array(saved.numbers), _STATE)
         self._cup.set(saved.grip)
         self.robot.torque = saved.torque
@@ -157,12 +158,12 @@ class MujocoEngine:
         mujoco.mj_step1(self.model, self.data)
 
     def picture(self, width: int, height: int) -> NDArray[np.uint8]:
-        """See the protocol."""
+        """Implement :meth:`Engine.picture`."""
         return self._pictures.draw(self.model, self.data, width, height)
 
     def close(self) -> None:
-        """See the protocol."""
+        """Implement :meth:`Engine.close`."""
         self._pictures.close()
 
 
-_: type[Engine] = MujocoEngine  # so that mypy compares them
+_: type[Engine] = MujocoEngine  # mypy checks that the class has the methods of Engine

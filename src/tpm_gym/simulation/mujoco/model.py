@@ -1,4 +1,4 @@
-"""MuJoCo's model of robot, table, floor and objects, with the pairs that may touch."""
+"""MuJoCo model of robot, table, floor and objects, with the pairs of geoms that can collide."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from tpm_gym.simulation.state import Block, Scene
 __all__ = ["compile_model", "grip_name", "marker_name", "object_name"]
 
 _RECOVERY = 0.1
-"""Share of a penetration that a contact removes in one time step; this value bounces least."""
-_MARGIN = 1e-6  # m, so that an object placed exactly on the table is in contact at once
+"""Fraction of a penetration that a contact removes per time step; 0.1 causes the least bouncing."""
+_MARGIN = 1e-6  # m; so an object placed exactly on the table has contact in the first time step
 
-_NO_CONTACT = {"contype": "0", "conaffinity": "0"}  # pairs alone collide
-_OUT_OF_SIGHT = "0 0 -9"  # place of markers that are not shown; at 0 0 0 they could not move
+_NO_CONTACT = {"contype": "0", "conaffinity": "0"}  # only the listed pairs collide
+_OUT_OF_SIGHT = "0 0 -9"  # first position of the markers; at 0 0 0 they could not be moved
 
 
 def compile_model(machine: Machine, scene: Scene, physics: Physics) -> mujoco.MjModel:
-    """Compile the model; equality constraints are the closures, then a grip for each object."""
+    """Compile the model. Its equality constraints are the closures, then one weld per object."""
     root = robot(machine.mechanism, machine.mount, physics.time_step)
     option = SubElement(
         root,
@@ -40,7 +40,7 @@ def compile_model(machine: Machine, scene: Scene, physics: Physics) -> mujoco.Mj
         iterations=str(physics.iterations),
         tolerance=repr(physics.tolerance),
     )
-    # Without a reset by MuJoCo, the caller sees a lost loop.
+    # MuJoCo would reset an unstable simulation. The caller must see the open loop instead.
     SubElement(option, "flag", autoreset="disable")
     world, equality = root.find("worldbody"), root.find("equality")
     assert world is not None
@@ -56,7 +56,7 @@ def compile_model(machine: Machine, scene: Scene, physics: Physics) -> mujoco.Mj
 
 
 def object_name(index: int) -> str:
-    """Return the name of an object's body, joint and geom."""
+    """Return the common name of an object's body, joint and geom."""
     return f"object {index}"
 
 
@@ -66,24 +66,17 @@ def grip_name(index: int) -> str:
 
 
 def marker_name(index: int) -> str:
-    """Return the name of a goal's site."""
+    """Return the name of a goal marker's site."""
     return f"marker {index}"
 
 
 def _light(root: Element, world: Element) -> None:
-    """Add light as in PyBullet's pictures: no shadows, a white sky."""
+    """Add light without shadows and a white sky, as in PyBullet's pictures."""
     visual = SubElement(root, "visual")
     SubElement(visual, "headlight", ambient=".45 .45 .45", diffuse=".2 .2 .2", specular="0 0 0")
-    SubElement(
-        world,
-        "light",
-        directional="true",
-        castshadow="false",
-        pos=numbers(LIGHT),
-        dir=numbers(-part for part in LIGHT),
-        diffuse=".5 .5 .5",
-        specular=".1 .1 .1",
-    )
+    rays = {"pos": numbers(LIGHT), "dir": numbers(-part for part in LIGHT)}
+    colours = {"diffuse": ".5 .5 .5", "specular": ".1 .1 .1"}
+    SubElement(world, "light", rays | colours, directional="true", castshadow="false")
     asset = root.find("asset")
     assert asset is not None
     SubElement(
@@ -93,26 +86,12 @@ def _light(root: Element, world: Element) -> None:
 
 def _surroundings(world: Element, machine: Machine, scene: Scene) -> None:
     """Add table, floor and markers."""
-    SubElement(
-        world,
-        "geom",
-        _NO_CONTACT,
-        name="table",
-        type="box",
-        size=numbers((*machine.table, TABLE.half_height)),
-        pos=numbers((0.0, 0.0, TABLE.top - TABLE.half_height)),
-        rgba=numbers(TABLE.colour),
-    )
-    SubElement(
-        world,
-        "geom",
-        _NO_CONTACT,
-        name="floor",
-        type="plane",
-        size=numbers((FLOOR_EDGE, FLOOR_EDGE, 1.0)),
-        pos=numbers((0.0, 0.0, FLOOR.top)),
-        rgba=numbers(FLOOR.colour),
-    )
+    size, pos = (*machine.table, TABLE.half_height), (0.0, 0.0, TABLE.top - TABLE.half_height)
+    table = {"size": numbers(size), "pos": numbers(pos), "rgba": numbers(TABLE.colour)}
+    SubElement(world, "geom", _NO_CONTACT | table, name="table", type="box")
+    size, pos = (FLOOR_EDGE, FLOOR_EDGE, 1.0), (0.0, 0.0, FLOOR.top)
+    floor = {"size": numbers(size), "pos": numbers(pos), "rgba": numbers(FLOOR.colour)}
+    SubElement(world, "geom", _NO_CONTACT | floor, name="floor", type="plane")
     for index in range(scene.markers):
         looks = {"size": numbers([scene.marker_radius]), "rgba": numbers(MARKER_COLOUR)}
         name = marker_name(index)
@@ -130,7 +109,7 @@ def _object(world: Element, index: int, block: Block) -> None:
 
 
 def _contacts(root: Element, scene: Scene, physics: Physics) -> Element:
-    """Return the pairs that may touch: objects with everything, and the cup with the table."""
+    """Return the pairs that can collide: objects with everything, and the cup with the table."""
     lips = [geom.attrib["name"] for geom in root.iter("geom") if geom.get("class") == SOLID]
     objects = [(object_name(index), block.friction) for index, block in enumerate(scene.objects)]
     table, floor = ("table", TABLE.friction), ("floor", FLOOR.friction)

@@ -11,12 +11,12 @@ __all__ = ["Physics"]
 
 @dataclass(frozen=True)
 class Physics(Numerics):
-    """Numerical settings of the engine.
+    """Numerical settings of MuJoCo.
 
     Attributes:
-        time_step: s; a whole fraction of the control period.
-        iterations: Largest number of iterations of the solver (Newton's method) in a time step.
-        tolerance: Improvement below which the solver stops, in MuJoCo's unit.
+        time_step: Time step, s; the control period must be an integer multiple of it.
+        iterations: Largest number of iterations of the solver (Newton's method) per time step.
+        tolerance: The solver stops when an iteration improves the cost by less (MuJoCo's unit).
 
     Raises:
         ConfigurationError: If a value is out of range.
@@ -26,5 +26,5 @@ class Physics(Numerics):
     tolerance: float = 1e-10
 
     def __post_init__(self) -> None:
-        """Reject impossible settings."""
+        """Check the settings."""
         require_numerics(self, {"tolerance": (lambda value: 0 <= value < 1, "0 <= tolerance < 1")})

@@ -1,4 +1,4 @@
-"""Pictures by MuJoCo, with OpenGL and without a window."""
+"""Pictures of the scene by MuJoCo, without a window."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from tpm_gym.simulation.stage import CAMERA
 __all__ = ["RENDERERS", "Pictures"]
 
 RENDERERS = ("egl", "osmesa", "glfw")
-"""OpenGL backends, in the order in which they are tried: GPU, CPU, window system."""
+"""OpenGL backends, in the order in which they are tried: on the GPU, the CPU, a display."""
 
 _open: weakref.WeakSet[Pictures] = weakref.WeakSet()
 
 
 class Pictures:
-    """Renderer of the scene; it opens OpenGL for the first picture.
+    """Renderer of the scene. It opens an OpenGL context for the first picture.
 
     Args:
-        renderer: One of :data:`RENDERERS`; None for that of the environment variable ``MUJOCO_GL``,
-            or else the first that works.
+        renderer: One of :data:`RENDERERS`; None for the value of the environment variable
+            ``MUJOCO_GL``, or else the first renderer that works.
 
     Raises:
-        ConfigurationError: If there is no renderer of that name.
+        ConfigurationError: If ``renderer`` is another name.
     """
 
     def __init__(self, renderer: str | None) -> None:
-        """Store the choice."""
+        """Check the name of the renderer; OpenGL is opened later."""
         if renderer is not None and renderer not in RENDERERS:
             raise ConfigurationError("renderer", renderer, " or ".join(map(repr, RENDERERS)))
         self._renderer = renderer
@@ -47,7 +47,7 @@ class Pictures:
     def draw(
         self, model: mujoco.MjModel, data: mujoco.MjData, width: int, height: int
     ) -> NDArray[np.uint8]:
-        """Draw the scene as (height, width, 3) RGB.
+        """Draw the scene as an RGB image (height, width, 3).
 
         Raises:
             ConfigurationError: If no OpenGL backend works.
@@ -65,10 +65,10 @@ class Pictures:
         mujoco.mjr_render(place, scene, self._context)
         pixels = np.empty((height, width, 3), np.uint8)
         mujoco.mjr_readPixels(pixels, None, place, self._context)
-        return np.ascontiguousarray(pixels[::-1])  # OpenGL's first row is the lowest
+        return np.ascontiguousarray(pixels[::-1])  # OpenGL returns the lowest row first
 
     def close(self) -> None:
-        """Release OpenGL; harmless the second time."""
+        """Release the OpenGL context; a second call does nothing."""
         self._size = (0, 0)
         if self._context is not None:
             self._opengl.make_current()
@@ -78,7 +78,7 @@ class Pictures:
         self._opengl = self._context = None
 
     def _open(self, model: mujoco.MjModel, width: int, height: int) -> None:
-        """Open OpenGL for pictures of that size."""
+        """Open an OpenGL context for pictures of this size."""
         self.close()
         self._opengl = _opengl(self._renderer, width, height)
         self._opengl.make_current()
@@ -87,7 +87,7 @@ class Pictures:
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
         self._size = (width, height)
-        if not _open:  # before OpenGL ends: contexts that are left print at the end of the process
+        if not _open:  # contexts that are still open at the end of the process print messages
             atexit.register(_close_all)
         _open.add(self)
 
@@ -101,38 +101,34 @@ def _camera() -> mujoco.MjvCamera:
     camera = mujoco.MjvCamera()
     camera.lookat[:] = CAMERA.target
     camera.distance = CAMERA.distance
-    camera.azimuth, camera.elevation = CAMERA.yaw + 90.0, CAMERA.pitch  # at 0 it looks along +x
+    camera.azimuth, camera.elevation = CAMERA.yaw + 90.0, CAMERA.pitch  # azimuth 0 is along +x
     return camera
 
 
 def _opengl(renderer: str | None, width: int, height: int) -> Any:
-    """Open an OpenGL context.
-
-    Raises:
-        ConfigurationError: If no backend works.
-    """
+    """Open an OpenGL context with ``renderer``, or else with the first backend that works."""
     asked = renderer or os.environ.get("MUJOCO_GL", "").lower()
     names = [asked] if asked in RENDERERS else RENDERERS
     found = (_context(name, width, height) for name in names)
     context = next((one for one in found if one is not None), None)
     if context is None:
         valid = (
-            "one that works here: 'egl' needs a driver of a GPU or Mesa, 'osmesa' Mesa's library, "
-            "'glfw' a display; or render_mode=None; engine='pybullet' draws anywhere"
+            "one that works here: 'egl' needs a GPU driver or Mesa, 'osmesa' Mesa's library, "
+            "'glfw' a display; or use render_mode=None; engine='pybullet' draws anywhere"
         )
         raise ConfigurationError("renderer", renderer, valid)
     return context
 
 
 def _context(name: str, width: int, height: int) -> Any:
-    """Open a context of that backend; None if it does not work."""
+    """Open a context of this backend; return None if the backend does not work."""
     if name == "glfw" and not has_display():
-        return None  # GLFW would print, and may end the process
+        return None  # without a display, GLFW prints messages and may end the process
     platform = os.environ.get("PYOPENGL_PLATFORM")
     try:
         return importlib.import_module(f"mujoco.{name}").GLContext(width, height)
-    except Exception:  # from the loader, the driver, or OpenGL
-        # The module has set the variable, which would keep the other backends from importing.
+    except Exception:  # raised by the loader, the driver, or OpenGL
+        # The module has set PYOPENGL_PLATFORM, with which other backends cannot be imported.
         os.environ.pop("PYOPENGL_PLATFORM", None)
         if platform is not None:
             os.environ["PYOPENGL_PLATFORM"] = platform

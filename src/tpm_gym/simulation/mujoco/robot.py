@@ -1,10 +1,10 @@
-"""The robot in MuJoCo: motors, the cup's spring, encoders, and the truth.
+"""The robot in MuJoCo: motors, the cup's spring, encoders and true positions.
 
-Ideal motors reach their references exactly, as far as their effort allows. So they are constraints:
-a velocity at the end of the time step, with a limit of force. MuJoCo has such a constraint, dry
-friction, whose velocity is zero. This module changes the velocity of the friction rows after
-MuJoCo's first half of a time step, which sets them up, and before its second half, which solves
-them.
+Ideal motors reach their references exactly, as far as their largest torque allows. So an ideal
+motor is a constraint on the velocity at the end of the time step, with a limited force. Dry
+friction in MuJoCo is such a constraint, with velocity zero. The first half of a time step
+(``mj_step1``) creates the rows of the friction constraints, and the second half (``mj_step2``)
+solves them. Between both, this module sets the velocity of these rows.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from tpm_gym.simulation.randomisation import NOMINAL, Plant
 
 __all__ = ["Robot"]
 
-_LEAST_EFFORT = 1e-9  # N m, of motors without torque, so that each has its row in the solver
+_LEAST_EFFORT = 1e-9  # N m; with zero torque, a motor would have no row in the solver
 
 
 class Robot:
-    """The mechanism in a model.
+    """Robot in a MuJoCo model.
 
     Args:
-        model: The model.
-        data: Its state.
-        machine: The machine of the model.
+        model: Compiled model.
+        data: State of the model.
+        machine: True machine of the model.
         ideal: Whether the motors have ideal drives; else they apply given torques.
 
     Attributes:
@@ -43,7 +43,7 @@ class Robot:
     def __init__(
         self, model: mujoco.MjModel, data: mujoco.MjData, machine: Machine, ideal: bool
     ) -> None:
-        """Look up the addresses of everything."""
+        """Look up the addresses of joints, bodies and sites in the model."""
         self._model, self._data, self._ideal = model, data, ideal
         mechanism = machine.mechanism
         self._point_p, self._lip = mechanism.point_p, mechanism.lip
@@ -64,7 +64,7 @@ class Robot:
         self._spring = slide.effort
         pairs = [site_names(closure.name) for closure in mechanism.closures]
         self._sides = [[model.site(pair[side]).id for pair in pairs] for side in (0, 1)]
-        # Friction is as stiff as possible, and stops a motion in one time step.
+        # The friction rows are as stiff as possible: they reach their velocity in one time step.
         step = model.opt.timestep
         self._rate = 1 / step
         model.dof_solimp[:] = [float(number) for number in STIFF.split()]
@@ -74,7 +74,7 @@ class Robot:
         self.alter(NOMINAL)
 
     def alter(self, plant: Plant) -> None:
-        """Apply masses, motors and friction of ``plant``."""
+        """Apply the link masses, motor strengths and joint friction of ``plant``."""
         model, rate = self._model, self._rate
         factors = plant.link_masses or [1.0] * len(self._inertias)
         for (body, (mass, moments)), factor in zip(self._inertias.items(), factors, strict=True):
@@ -88,53 +88,53 @@ class Robot:
             model.dof_frictionloss[dof] = loss
         driven = [(*motor, rate) for motor in self._motors] if self._ideal else []
         driven.append((*self._slide, SPRING_GAIN * rate))
-        rough = np.flatnonzero(model.dof_frictionloss).tolist()  # each has a row, in this order
+        rough = np.flatnonzero(model.dof_frictionloss).tolist()  # order of the friction rows
         self._rows = [(rough.index(dof), at, dof, gain) for at, dof, gain in driven]
 
     def place(self, joints: Mapping[str, float]) -> None:
-        """Put every joint at its position (rad, m)."""
+        """Set the joint positions (rad, m for slides), by joint name."""
         for name, position in joints.items():
             self._data.qpos[self._at[name]] = position
         self.torque = (0.0, 0.0, 0.0)
 
     def drive(self, theta: Vector) -> None:
-        """Let ideal motors go to ``theta`` within this time step, within their effort.
+        """Set the joint positions (rad) that ideal motors reach in this time step.
 
         Call this method or :meth:`apply` between the two halves of a time step.
         """
-        self._pull((*theta, 0.0))
+        self._set_targets((*theta, 0.0))
 
     def apply(self, torque: Vector) -> None:
-        """Let the motors apply ``torque`` N m in this time step."""
+        """Set the torques (N m) that the motors apply in this time step."""
         self.torque = torque
         for (_, dof), one in zip(self._motors, torque, strict=True):
             self._data.qfrc_applied[dof] = one
-        self._pull((0.0,))
+        self._set_targets((0.0,))
 
-    def _pull(self, targets: Sequence[float]) -> None:
-        """Drive the motors and the cup's slide to ``targets``, the slide's last."""
+    def _set_targets(self, targets: Sequence[float]) -> None:
+        """Set the targets of ideal motors (rad), if any, and of the cup's slide (m, last)."""
         data, rate, position, speed = self._data, self._rate, self._position, self._speed
         wanted, first = data.efc_aref, data.ne
         for (row, at, dof, gain), target in zip(self._rows, targets, strict=True):
             wanted[first + row] = ((target - position(at)) * gain - speed(dof)) * rate
 
     def note_torque(self) -> None:
-        """Store the torques of the motors, after the second half of a time step."""
+        """Store the torques of ideal motors; call after the second half of a time step."""
         if not self._ideal:
-            return  # apply() has stored them
+            return  # apply() has stored the torques
         force, first = self._data.efc_force.item, self._data.ne
         (a, *_), (b, *_), (c, *_), _ = self._rows
         self.torque = force(first + a), force(first + b), force(first + c)
 
     def motors(self) -> tuple[Vector, Vector, Vector]:
-        """Return joint positions (rad, m), velocities and noted torques (N m, N) of the motors."""
+        """Return joint positions (rad), velocities (rad/s) and stored torques (N m)."""
         position, speed = self._position, self._speed
         (a, i), (b, j), (c, k) = self._motors
         theta = position(a), position(b), position(c)
         return theta, (speed(i), speed(j), speed(k)), self.torque
 
     def truth(self) -> tuple[float, Vector, float]:
-        """Return the largest loop gap (m), point P (m, world) and the platform's tilt (rad)."""
+        """Compute the largest loop gap (m), point P (m, world) and the platform's tilt (rad)."""
         data, (side, other) = self._data, self._sides
         gaps = data.site_xpos[side] - data.site_xpos[other]
         origin, turn = self._frame(self._platform)
@@ -142,7 +142,7 @@ class Robot:
         return gap, transform(origin, turn, self._point_p), Mount.tilt(turn)
 
     def cup(self) -> tuple[Vector, Vector]:
-        """Return the centre of the cup's lip (m) and the cup's outward axis, world."""
+        """Return the centre of the cup's lip (m) and the cup's outward axis; world frame."""
         origin, turn = self._frame(self._tool)
         return transform(origin, turn, self._lip), rotate(turn, (0.0, 0.0, 1.0))
 
@@ -152,7 +152,7 @@ class Robot:
         return height
 
     def tool(self) -> tuple[Vector, Quaternion]:
-        """Return origin (m) and orientation of the cup's link, world."""
+        """Return origin (m) and orientation of the cup's link; world frame."""
         return self._frame(self._tool)
 
     def _frame(self, body: int) -> tuple[Vector, Quaternion]:

@@ -15,25 +15,19 @@ from tpm_gym.simulation.state import Scene
 
 __all__ = ["Scenery"]
 
-_STILL = 1e-4  # m/s and rad/s
-_LOOKS = 5  # iterations at most
-_ALIKE = 1e-3  # m/s
+_STILL = 1e-4  # m/s + rad/s; slower objects are at rest
+_ITERATIONS = 5  # largest number of predictions of the slip
+_CONVERGED = 1e-3  # m/s; largest change of the slip in the last prediction
 
 
 class Scenery:
-    """Everything in the model that moves and is not the robot.
-
-    Args:
-        model: The model.
-        data: Its state.
-        scene: The scene of the model.
-    """
+    """Objects and goal markers of a MuJoCo model."""
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, scene: Scene) -> None:
-        """Look up the addresses of everything."""
+        """Look up the addresses of objects and markers in the model."""
         self._model, self._data, self._blocks = model, data, scene.objects
         self._position, self._speed = data.qpos.item, data.qvel.item
-        self._resting = 4 * len(scene.objects)  # contacts of objects that lie flat
+        self._resting = 4 * len(scene.objects)  # number of contacts if all objects lie flat
         names = [object_name(index) for index in range(len(scene.objects))]
         joints = [model.joint(name) for name in names]
         self._at = [joint.qposadr.item() for joint in joints]
@@ -48,11 +42,11 @@ class Scenery:
         self._markers = [model.site(marker_name(index)).id for index in range(scene.markers)]
 
     def keep_sliding(self) -> None:
-        """Keep sliding objects from hopping; call between the two halves of a time step.
+        """Prevent sliding objects from hopping; call between the two halves of a time step.
 
-        MuJoCo's contacts are convex: it drives two bodies that slide along each other apart, at the
-        coefficient of friction times the speed of the slip. The wanted acceleration along the
-        normal is lowered by as much.
+        MuJoCo's contact model is convex. It separates two sliding bodies at a speed of friction
+        coefficient times slip speed. This method subtracts the corresponding acceleration from the
+        reference acceleration along the normal.
         """
         data = self._data
         if not data.ncon or (data.ncon <= self._resting and not self._moves()):
@@ -63,29 +57,30 @@ class Scenery:
         wanted -= self._hop(slip)
         if not (self._model.geom_bodyid[data.contact.geom] > 0).all(axis=1).any():
             return
-        for _ in range(_LOOKS):  # An object that is struck slides only at the end of the time step.
-            slip, known = self._slip(self._velocity_to_come()), slip
-            if np.abs(slip - known).max() < _ALIKE:
+        # A collision changes the slip within the time step, so the slip at its end is predicted.
+        for _ in range(_ITERATIONS):
+            slip, known = self._slip(self._predicted_velocity()), slip
+            if np.abs(slip - known).max() < _CONVERGED:
                 break
             wanted[:] = before - self._hop(slip)
 
     def _rows(self) -> slice:
-        """Return the rows of the contacts among the constraints: three each, at the end."""
+        """Return the constraint rows of the contacts: the last rows, three per contact."""
         return slice(self._data.nefc - 3 * self._data.ncon, None)
 
     def _slip(self, velocity: FloatArray) -> FloatArray:
-        """Return the speed of each contact's slip, m/s."""
+        """Return the slip speed of each contact, m/s."""
         _, x, y = velocity[self._rows()].reshape(-1, 3).T
         speed: FloatArray = np.hypot(x, y)
         return speed
 
     def _hop(self, slip: FloatArray) -> FloatArray:
-        """Return the acceleration with which MuJoCo drives sliding bodies apart, m/s^2."""
+        """Return the acceleration with which MuJoCo separates sliding bodies, m/s^2."""
         hop: FloatArray = self._data.contact.friction[:, 0] * slip / self._model.opt.timestep
         return hop
 
-    def _velocity_to_come(self) -> FloatArray:
-        """Predict the velocities of the constraints after this time step."""
+    def _predicted_velocity(self) -> FloatArray:
+        """Predict the velocities of all constraint rows at the end of this time step."""
         model, data = self._model, self._data
         mujoco.mj_fwdActuation(model, data)
         mujoco.mj_fwdAcceleration(model, data)
@@ -95,7 +90,7 @@ class Scenery:
         return after
 
     def _moves(self) -> bool:
-        """Return whether an object slides or spins faster than solver noise."""
+        """Return whether an object moves, or spins about its z axis, faster than solver noise."""
         speed = self._speed
         return any(
             abs(speed(dof)) + abs(speed(dof + 1)) + abs(speed(dof + 2)) + abs(speed(dof + 5))
@@ -104,12 +99,12 @@ class Scenery:
         )
 
     def move_markers(self, positions: Sequence[Vector]) -> None:
-        """Show the goal at these points, m, world."""
+        """Move the goal markers to ``positions`` (m, world)."""
         for marker, position in zip(self._markers, positions, strict=True):
             self._model.site_pos[marker] = self._data.site_xpos[marker] = position
 
     def place(self, poses: Sequence[Pose]) -> None:
-        """Put the objects down."""
+        """Set the poses of the objects."""
         for at, (position, (x, y, z, w)) in zip(self._at, poses, strict=True):
             self._data.qpos[at : at + 7] = (*position, w, x, y, z)
 
@@ -129,12 +124,13 @@ class Scenery:
         return Pose((x, y, z), (qx, qy, qz, qw))
 
     def _twist(self, index: int, dof: int) -> Twist:
-        """Return the velocities of an object; MuJoCo has its spin in the object's frame."""
+        """Return the velocities of an object, world frame."""
+        # MuJoCo stores the angular velocity in the object's frame.
         u, v, w, a, b, c = self._data.qvel[dof : dof + 6].tolist()
         return Twist((u, v, w), rotate(self.pose(index).quaternion, (a, b, c)))
 
     def alter(self, mass: float, friction: float) -> None:
-        """Make the objects ``mass`` times as heavy and ``friction`` times as rough as nominal."""
+        """Scale the nominal masses and friction coefficients of the objects by these factors."""
         model = self._model
         model.pair_friction[:] = self._friction
         for body, nominal, pairs in zip(self._bodies, self._blocks, self._touching, strict=True):

@@ -1,4 +1,4 @@
-"""Contacts of objects with each other, with the table and with the cup, for many robots."""
+"""Contacts of objects with other objects, table and cup, for many robots."""
 
 from tpm_gym.simulation.analytic.contact.contact import Contact, Reading
 

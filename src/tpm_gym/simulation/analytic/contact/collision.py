@@ -1,9 +1,9 @@
-"""Contacts between objects, table and lip.
+"""Detection of contacts between objects, table and lip.
 
-Objects are boxes and the lip is an upright cylinder. The normal of two bodies is the direction in
-which they are farthest apart, or overlap least, among the normals of faces and the common normals
-of edges (separating axes). Contacts are found before they close, so that the solver can stop bodies
-at the surface instead of pushing them out again.
+Objects are boxes, and the lip is an upright cylinder. The contact normal of two bodies is the
+direction of their largest gap or smallest overlap. Candidates are the normals of faces and the
+common normals of two edges (separating axes). Contacts are detected before the bodies touch, so
+that the solver can stop the bodies at the surface and no penetration has to be removed.
 """
 
 from __future__ import annotations
@@ -38,21 +38,21 @@ from tpm_gym.simulation.vectors import (
 
 __all__ = ["collide_lip", "collide_objects"]
 
-_NEAR = 1.5e-3  # m, between objects, and between objects and table
-_FLAT = 1e-5  # m; an edge is preferred to a face where it separates by so much more
-_LITTLE = 1e-9
-_STEEP = 0.7  # vertical part of the normal of an upper face
+_NEAR = 1.5e-3  # m; largest gap of a contact between objects, or between object and table
+_FLAT = 1e-5  # m; an edge's normal replaces a face's normal if its gap is larger by more than this
+_LITTLE = 1e-9  # rounding error
+_STEEP = 0.7  # smallest vertical component of the normal of an upper or lower face
 _ZERO: Vector = (0.0, 0.0, 0.0)
 _UP: Vector = (0.0, 0.0, 1.0)
 
 _Place = tuple[int, int]
-"""Number of a contact, and its slot."""
-_Pair = tuple[_Place, float]
-"""Bodies a and b, and the Coulomb coefficient between them."""
+"""Index of a contact, and its slot."""
+_Pair = tuple[tuple[int, int], float]
+"""Indices of the bodies a and b, and the Coulomb coefficient between them."""
 
 
 class _Box(NamedTuple):
-    """An object: centre (m, world), axes, half edges (m)."""
+    """Shape of an object: centre (m, world), axes, half edge lengths (m)."""
 
     middle: Vector
     frame: Frame
@@ -61,7 +61,7 @@ class _Box(NamedTuple):
 
 @compiled
 def _two(a: int, b: int) -> tuple[int, int]:
-    """Return a pair, with the type of variables even of constants: Numba compiles for each type."""
+    """Return a pair of integers. For literal constants, Numba would compile callers again."""
     return 1 * a, 1 * b
 
 
@@ -73,14 +73,14 @@ def _box(item: Record, half: FloatArray) -> _Box:
 
 @compiled
 def _extent(box: _Box, way: Vector) -> float:
-    """Return half the width of a box along a direction, m."""
+    """Return half the width (m) of a box along a direction."""
     (u, v, w), (p, q, r) = box.frame, box.half
     return p * abs(dot(u, way)) + q * abs(dot(v, way)) + r * abs(dot(w, way))
 
 
 @compiled
 def _inner(box: _Box, a: float, b: float, c: float) -> Vector:
-    """Return the world vector of components along a box's axes."""
+    """Convert components along a box's axes to a vector in the world frame."""
     return plus(plus(plus(_ZERO, box.frame[0], a), box.frame[1], b), box.frame[2], c)
 
 
@@ -88,7 +88,7 @@ def _inner(box: _Box, a: float, b: float, c: float) -> Vector:
 def _add(
     contacts: Records, place: _Place, pair: _Pair, arms: Frame, normal: Vector, gap: float
 ) -> int:
-    """Write a contact and return the new number of contacts; of ``arms`` two count."""
+    """Write a contact with the first two of ``arms``; return the new number of contacts."""
     contact = contacts[place[0]]
     contact["slot"] = place[1]
     (contact["a"], contact["b"]), contact["friction"] = pair
@@ -101,7 +101,7 @@ def _add(
 
 @compiled
 def _body(index: int, held: int) -> int:
-    """Return the number of the solver's body for an object."""
+    """Return the index of the solver's body for an object."""
     return 0 if index == held else index + 1
 
 
@@ -117,12 +117,12 @@ def collide_objects(
     """Add contacts of objects with each other and with the table; return the number of contacts.
 
     Args:
-        objects: (k,) the objects.
+        objects: (k,) objects.
         held: Index of the held object; -1 for none.
-        setting: Constants.
-        polygons: (2, 12, 3) workspace.
-        contacts: Receives the contacts.
-        count: Number of contacts so far.
+        setting: Constants of the simulation.
+        polygons: (2, 12, 3) m, workspace.
+        contacts: Output.
+        count: Number of contacts at the call.
     """
     slot = len(objects) * (TABLE_SLOTS + LIP_SLOTS)
     for j in range(len(objects)):
@@ -147,7 +147,7 @@ def collide_objects(
 def _collide_table(
     box: _Box, setting: Setting, contacts: Records, place: _Place, body: tuple[int, float]
 ) -> int:
-    """Add the corners of an object that are near the table, or near the floor beside it."""
+    """Add the corners of an object near the table, or near the floor if it is beside the table."""
     (x, y, z), (count, slot), (edge_x, edge_y) = box.middle, place, setting.table
     over = abs(x) <= edge_x and abs(y) <= edge_y
     height = z - (TABLE.top if over else FLOOR.top)
@@ -170,15 +170,15 @@ def _collide_table(
 def collide_lip(
     objects: Records, held: int, lip: Vector, near: float, setting: Setting, contacts: Records
 ) -> int:
-    """Find contacts of the lip with objects that it does not hold; return their number.
+    """Find contacts of the lip with all objects except the held object; return their number.
 
     Args:
-        objects: (k,) the objects.
+        objects: (k,) objects.
         held: Index of the held object; -1 for none.
         lip: Centre of the lip, m, world.
-        near: Distance up to which there is a contact, m.
-        setting: Constants.
-        contacts: Receives the contacts.
+        near: Largest gap of a contact, m.
+        setting: Constants of the simulation.
+        contacts: Output.
     """
     count = 0
     for i in range(len(objects)):
@@ -197,7 +197,7 @@ def collide_lip(
 def _collide_cylinder(
     box: _Box, lip: Vector, near: float, contacts: Records, place: _Place, pair: _Pair
 ) -> int:
-    """Add contacts of the lip with an object."""
+    """Add the contacts of the lip with an object."""
     under = lip[2] - box.middle[2] - _extent(box, _UP)
     if under > near:
         return place[0]
@@ -210,14 +210,14 @@ def _collide_cylinder(
         if gap > apart + _LITTLE:
             face, apart = k, gap
     if under > apart + _FLAT:
-        face, apart = 3, under  # the lip's own face
+        face, apart = 3, under  # lower face of the lip
     point = _nearest(box, lip)
     x, y = point[0] - lip[0], point[1] - lip[1]
     far = max(level_length(x, y), _LITTLE)
     radial = (x / far, y / far, 0.0)
     beside = dot(radial, away) - _extent(box, radial) - CUP.radius
     if far > _LITTLE and beside > apart + _FLAT:
-        face, apart = 4, beside  # the lip's side at an edge or corner
+        face, apart = 4, beside  # side of the lip, at an edge or corner of the object
     if apart > near:
         return place[0]
     if face == 4:
@@ -231,7 +231,7 @@ def _collide_cylinder(
 
 @compiled
 def _nearest(box: _Box, lip: Vector) -> Vector:
-    """Return the point of a box that is nearest to the axis of the lip, m, world."""
+    """Return the point of a box that is nearest to the lip's axis (m, world)."""
     point, (p, q, r) = box.middle, box.half
     for _ in range(3):
         z = clip(point[2], lip[2], lip[2] + CUP.bellows)
@@ -243,7 +243,7 @@ def _nearest(box: _Box, lip: Vector) -> Vector:
 
 @compiled
 def _press_edge(box: _Box, lip: Vector, contacts: Records, place: _Place, pair: _Pair) -> int:
-    """Add the ends of a tilted object's uppermost edge below the lip."""
+    """Add the two ends of the part of a tilted object's uppermost edge that is below the lip."""
     (u, v, w), (p, q, r), low = box.frame, box.half, 0
     for k in range(1, 3):
         if box.half[k] * abs(box.frame[k][2]) < box.half[low] * abs(box.frame[low][2]):
@@ -251,14 +251,14 @@ def _press_edge(box: _Box, lip: Vector, contacts: Records, place: _Place, pair: 
     ends = math.copysign(p, u[2]), math.copysign(q, v[2]), math.copysign(r, w[2])
     top, along = _inner(box, *ends), plus(_ZERO, box.frame[low], -2 * ends[low])
     x, y = box.middle[0] + top[0] - lip[0], box.middle[1] + top[1] - lip[1]
-    # |(x, y) + t along| <= radius
+    # Solve |(x, y) + t along| = radius for t, the fraction of the edge.
     a, b = along[0] ** 2 + along[1] ** 2, x * along[0] + y * along[1]
     root = b * b - a * (x * x + y * y - CUP.radius**2)
     count, slot = place
     if root > 0 and a > _LITTLE:
         for k in range(2):
-            share = (-b + math.copysign(math.sqrt(root), k - 0.5)) / a
-            arm = plus(top, along, clip(share, 0.0, 1.0))
+            t = (-b + math.copysign(math.sqrt(root), k - 0.5)) / a
+            arm = plus(top, along, clip(t, 0.0, 1.0))
             gap, arms = lip[2] - box.middle[2] - arm[2], (_ZERO, arm, _ZERO)
             count = _add(contacts, (count, slot + k), pair, arms, (0.0, 0.0, -1.0), gap)
     return count
@@ -274,10 +274,10 @@ def _touch_face(
     place: _Place,
     pair: _Pair,
 ) -> int:
-    """Add points at which the lip meets a face of an object.
+    """Add the contact points of the lip on a face of an object.
 
-    On an upper face they are four points of the rim, those outside moved to the face's edge; on a
-    side, the ends of the line on which the lip's own side meets it.
+    On an upper face, these are four points of the rim; points outside are moved to the face's edge.
+    On a side face, these are the ends of the line in which the side of the lip touches the face.
     """
     (which, normal), (count, slot) = face, place
     first, second, steep = (which + 1) % 3, (which + 2) % 3, abs(normal[2]) > _STEEP
@@ -306,7 +306,7 @@ def _touch_face(
 
 @compiled
 def _overlap(box: _Box, first: int, second: int, foot: Vector) -> tuple[float, float]:
-    """Return the lowest and highest point above a foot that is on a side face and on the lip, m."""
+    """Return the lowest and highest height (m) above ``foot`` at which lip and side face touch."""
     low, high = 0.0, CUP.bellows
     for k in (first, second):
         rise, at, half = box.frame[k][2], dot(box.frame[k], foot), box.half[k]
@@ -325,7 +325,7 @@ def _overlap(box: _Box, first: int, second: int, foot: Vector) -> tuple[float, f
 def _collide_boxes(
     one: _Box, two: _Box, polygons: FloatArray, contacts: Records, place: _Place, pair: _Pair
 ) -> int:
-    """Add contacts of two objects."""
+    """Add the contacts of two objects."""
     away = plus(two.middle, one.middle, -1.0)
     face, apart = 0, -math.inf
     for k in range(6):
@@ -353,7 +353,7 @@ def _collide_boxes(
 
 @compiled
 def _cross_edges(one: _Box, two: _Box, normal: Vector, i: int, j: int) -> Frame:
-    """Return the arms, m, to the point at which edges along axes i and j are nearest."""
+    """Return the arms (m) to the nearest points of two edges along axes i and j."""
     a, b, (p, q) = one.middle, two.middle, (one.frame[i], two.frame[j])
     for k in range(3):
         if k != i:
@@ -364,8 +364,8 @@ def _cross_edges(one: _Box, two: _Box, normal: Vector, i: int, j: int) -> Frame:
             b = plus(b, two.frame[k], -sign)
     between = plus(b, a, -1.0)
     u, v, w = dot(p, q), dot(p, between), dot(q, between)
-    share = (v - u * w) / (1 - u * u)
-    a, b = plus(a, p, share), plus(b, q, u * share - w)
+    t = (v - u * w) / (1 - u * u)
+    a, b = plus(a, p, t), plus(b, q, u * t - w)
     return plus(a, one.middle, -1.0), plus(b, two.middle, -1.0), _ZERO
 
 
@@ -380,17 +380,10 @@ def _clip_face(
     place: _Place,
     pair: _Pair,
 ) -> int:
-    """Add the corners of the overlap of a box's face and the face of another that is opposite.
+    """Add the corners of the overlap of a box's face and the opposite face of another box.
 
-    Args:
-        plane: The box with the face.
-        other: The other box.
-        face: Number of the axis of ``plane`` that is normal to the face.
-        sign: 1 where ``plane`` is body a of the pair, -1 where it is body b.
-        polygons: (2, 12, 3) workspace.
-        contacts: Receives the contacts.
-        place: Of the first contact.
-        pair: Bodies and friction.
+    The normal of the face is axis ``face`` of ``plane``. ``sign`` is 1 if ``plane`` is body a of
+    the pair, and -1 if it is body b.
     """
     away, facing = plus(other.middle, plane.middle, -1.0), 0
     normal = plus(_ZERO, plane.frame[face], math.copysign(1.0, dot(plane.frame[face], away)))
@@ -420,7 +413,7 @@ def _clip_face(
 
 @compiled
 def _cut(points: FloatArray, kept: FloatArray, number: int, side: Vector, edge: float) -> int:
-    """Keep the part of a polygon up to a distance along a direction; return its corners' number."""
+    """Clip a polygon to distances up to ``edge`` along ``side``; return the number of corners."""
     left = 0
     for k in range(number):
         here, there = three(points[k]), three(points[(k + 1) % number])

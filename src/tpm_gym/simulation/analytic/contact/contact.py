@@ -1,11 +1,11 @@
-"""Objects on a table, the cup above them, and the vacuum between: many tables, each by itself.
+"""Simulation of objects, cups and vacuum on many independent tables.
 
-A time step (:mod:`.stepping`) finds contacts (:mod:`.collision`), solves them (:mod:`.solver`),
-moves the objects, and lets the vacuum take or drop one (:mod:`.grasp`).
+A time step (:mod:`.stepping`) finds contacts (:mod:`.collision`), computes their impulses
+(:mod:`.solver`), moves the objects, and applies the vacuum law (:mod:`.grasp`).
 
-Left out: an object stands on the table as long as its centre is over it, and then falls past it;
-the stem and the platform pass through objects; the cup's spring has no end stop; the lip passes
-through the table; point P does not yield to contacts.
+Simplifications: The table supports an object only while the object's centre is over the table.
+Stem and platform do not collide with objects. The lip does not collide with the table. The cup's
+spring has no end stop. Within a time step, contacts do not move point P.
 """
 
 from __future__ import annotations
@@ -16,13 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray
-from tpm_gym.simulation.analytic.contact.state import (
-    CUP_STATE,
-    OBJECT,
-    Setting,
-    slots,
-    work_for,
-)
+from tpm_gym.simulation.analytic.contact.state import CUP_STATE, OBJECT, Setting, slots, work_for
 from tpm_gym.simulation.analytic.contact.stepping import advance
 from tpm_gym.simulation.state import Block
 
@@ -30,11 +24,11 @@ __all__ = ["Contact", "Reading"]
 
 
 class Reading(NamedTuple):
-    """State of n tables with k objects each.
+    """State of objects and cups on n tables with k objects each.
 
     Attributes:
-        position: (n, k, 3) m, world, of the centres.
-        quaternion: (n, k, 4), x, y, z, w.
+        position: (n, k, 3) m, world, centres of the objects.
+        quaternion: (n, k, 4), orientations (x, y, z, w) of the objects.
         velocity: (n, k, 3) m/s.
         angular_velocity: (n, k, 3) rad/s, world.
         held: (n,) index of the held object; -1 for none.
@@ -50,14 +44,14 @@ class Reading(NamedTuple):
 
 
 class Contact:
-    """Objects, cups and vacuum of n robots, each over a table of its own.
+    """Objects, cups and vacuum of n robots, each over its own table.
 
     Args:
-        blocks: The objects, k.
-        count: n.
-        time_step: s.
-        table: Half edges of the tables along x and y, m.
-        frame: Factors (3,) and origin (3,) m of the machine's frame.
+        blocks: The k objects on each table.
+        count: Number of tables, n.
+        time_step: Time step, s.
+        table: Half edge lengths of the tables along x and y, m.
+        frame: Factors (3,) and origin (3,) m that convert the machine's frame to the world frame.
     """
 
     def __init__(
@@ -68,7 +62,7 @@ class Contact:
         table: tuple[float, float],
         frame: tuple[FloatArray, FloatArray],
     ) -> None:
-        """Put all objects in the middle of their tables, one on the other."""
+        """Place the objects in the middle of their tables, stacked on each other."""
         self._blocks, number = tuple(blocks), len(blocks)
         half = np.array([block.half for block in blocks]).reshape(number, 3)
         self._setting, self._frame = Setting(half, table, time_step), frame
@@ -82,23 +76,20 @@ class Contact:
         self.place(everything, middle)
 
     def alter(self, rows: Any, mass_factor: FloatArray, friction_factor: FloatArray) -> None:
-        """Make objects ``mass_factor`` (r,) times as heavy as nominal; friction likewise."""
-        mass, friction = (
-            np.array([getattr(block, name) for block in self._blocks])
-            for name in ("mass", "friction")
-        )
-        self._objects["mass"][rows] = mass_factor[:, None] * mass
-        self._objects["friction"][rows] = friction_factor[:, None] * friction
+        """Scale nominal masses and friction coefficients on tables ``rows`` by factors (r,)."""
+        for name, factor in (("mass", mass_factor), ("friction", friction_factor)):
+            nominal = np.array([getattr(block, name) for block in self._blocks])
+            self._objects[name][rows] = factor[:, None] * nominal
 
     def place(
         self, rows: Any, positions: FloatArray, quaternions: FloatArray | None = None
     ) -> None:
-        """Let go, empty the cups, and put objects at rest.
+        """Release held objects, set vacuum to zero, and place all objects at rest.
 
         Args:
-            rows: Which tables, r.
-            positions: (r, k, 3) m, world, of the centres.
-            quaternions: (r, k, 4); None for upright.
+            rows: (r,) indices of the tables.
+            positions: (r, k, 3) m, world, centres of the objects.
+            quaternions: (r, k, 4), orientations (x, y, z, w); None for upright objects.
         """
         objects = self._objects[rows]
         objects["position"] = positions
@@ -114,22 +105,23 @@ class Contact:
     def advance(
         self, rows: IntArray, path: tuple[FloatArray, FloatArray, FloatArray], vacuum_on: BoolArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Run K time steps.
+        """Simulate K time steps on some tables.
 
         Args:
-            rows: (r,) which tables.
+            rows: (r,) indices of the tables.
             path: Point P, m, machine's frame: before the last time step (r, 3), now (r, 3), and
-                after each time step to come (r, K, 3); contiguous.
+                after each of the K time steps (r, K, 3). The arrays must be contiguous.
             vacuum_on: (r,) whether the vacuum is on.
 
         Returns:
-            (r, K, 3) N, machine's frame: force of cup and objects on the platform in each time
-            step, beside weight and inertia of the cup at rest in it. (r,) kg: what the cups hold.
+            Force (r, K, 3) N of cup and objects on the platform in each time step, machine's
+            frame, without weight and inertia of a cup that does not slide. Mass (r,) kg of the held
+            objects.
         """
         force, carried = np.zeros(path[2].shape), np.zeros(len(rows))
         if self._blocks:
             states = self._objects, self._cups, self._forces
-            # Threads may advance different rows at the same time, so each call has its own
+            # Threads may advance different rows at the same time, so each call allocates a Work.
             work = work_for(len(self._blocks))
             advance(states, rows, path, self._frame, vacuum_on, self._setting, work, force, carried)
         return force, carried
@@ -147,21 +139,21 @@ class Contact:
         )
 
     def copy(self) -> tuple[Any, ...]:
-        """Return copies of the records of all tables; several times as fast as :meth:`save`."""
+        """Return copies of all records; several times faster than :meth:`save`."""
         return self._objects.copy(), self._cups.copy(), self._forces.copy()
 
     def repeat(self, rows: IntArray, copies: tuple[Any, ...]) -> None:
-        """Put some tables back to copies of :meth:`copy`."""
+        """Restore some tables from the result of :meth:`copy`."""
         for own, earlier in zip((self._objects, self._cups, self._forces), copies, strict=True):
             own[rows] = earlier[rows]
 
     def save(self, rows: Any) -> FloatArray:
-        """Return everything that the next time steps of some tables depend on, (r, c)."""
+        """Return the state of some tables as an array (r, c)."""
         parts = self._objects[rows], self._cups[rows], self._forces[rows]
         return np.concatenate([p.view(np.float64).reshape(len(p), -1) for p in parts], axis=1)
 
     def restore(self, rows: Any, saved: FloatArray) -> None:
-        """Continue from what :meth:`save` returned."""
+        """Restore some tables from the result of :meth:`save`."""
         parts, first = (self._objects, self._cups, self._forces), 0
         for part in parts:
             plain = part.view(np.float64).reshape(len(part), -1)

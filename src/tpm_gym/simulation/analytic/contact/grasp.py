@@ -1,4 +1,4 @@
-"""The cup on its spring, and the object that its vacuum holds."""
+"""Cup on its spring, and the object that it holds by vacuum."""
 
 from __future__ import annotations
 
@@ -9,14 +9,7 @@ from tpm_gym.compiling import compilable, compiled
 from tpm_gym.mechanism.cup import CUP, sealed
 from tpm_gym.mechanism.mount import GRAVITY
 from tpm_gym.simulation.analytic.contact.state import Record, Records, Setting
-from tpm_gym.simulation.vacuum import (
-    CLEARANCE,
-    Hold,
-    Load,
-    hold_after,
-    holds,
-    pressure_after,
-)
+from tpm_gym.simulation.vacuum import CLEARANCE, Hold, Load, hold_after, holds, pressure_after
 from tpm_gym.simulation.vectors import length, level_length, plus, put, three
 
 __all__ = ["CUP_MASS", "Way", "breathe", "carry", "lip_of"]
@@ -25,11 +18,11 @@ compilable(rotate, sealed, pressure_after, holds, hold_after)
 
 CUP_MASS = CUP.link("platform", (0.0, 0.0, 0.0)).mass
 _DOWN: Vector = (0.0, 0.0, -1.0)
-_EMPTY = 1e-3  # Pa
+_EMPTY = 1e-3  # Pa; a smaller vacuum is set to zero
 
 
 class Way(NamedTuple):
-    """Point P before the last time step, now, and after the time step, m, world."""
+    """Point P before the last time step, now, and after the time step (m, world)."""
 
     before: Vector
     now: Vector
@@ -38,19 +31,19 @@ class Way(NamedTuple):
 
 @compiled
 def lip_of(point: Vector, slide: float) -> Vector:
-    """Return the centre of the lip below a point P, m, world."""
+    """Return the centre of the lip (m, world) from point P (m, world) and slide (m)."""
     return point[0], point[1], point[2] + slide - CUP.length
 
 
 @compiled
 def carry(item: Record, cup: Record, point: Vector, touched: Vector, step: float) -> Vector:
-    """Move the held object with the cup; return the mean force of the cup on it, N, world.
+    """Move the held object with the cup; return the cup's mean force on the object (N, world).
 
     Args:
-        item: The object.
-        cup: The cup, already moved.
+        item: Held object.
+        cup: Cup after the time step.
         point: Point P after the time step, m, world.
-        touched: Impulse of table and other objects on the object in the time step, N s.
+        touched: Impulse of table and other objects on the held object in the time step, N s.
         step: Time step, s.
     """
     x, y, z = plus(point, three(cup["grip"]))
@@ -61,23 +54,23 @@ def carry(item: Record, cup: Record, point: Vector, touched: Vector, step: float
     put(item["position"], place)
     put(item["velocity"], velocity)
     impulse = plus((x, y, z + GRAVITY * step), touched, -1 / item["mass"])
-    share = item["mass"] / step
-    return share * impulse[0], share * impulse[1], share * impulse[2]
+    scale = item["mass"] / step
+    return scale * impulse[0], scale * impulse[1], scale * impulse[2]
 
 
 @compiled
 def breathe(
     objects: Records, cup: Record, way: Way, on: bool, seal: Vector, setting: Setting
 ) -> None:
-    """Update the vacuum after a time step, and take or drop an object.
+    """Apply the vacuum law after a time step: update the vacuum, hold or release an object.
 
     Args:
-        objects: (k,) the objects.
-        cup: The cup.
-        way: Point P.
+        objects: (k,) objects; changed.
+        cup: Cup; changed.
+        way: Motion of point P.
         on: Whether the vacuum is on.
         seal: Force of the cup on the held object, N, world.
-        setting: Constants.
+        setting: Constants of the simulation.
     """
     held, lip, touched = int(cup["held"]), lip_of(way.then, cup["slide"]), -1
     if on and held < 0:
@@ -91,7 +84,8 @@ def breathe(
     if held < 0 <= after.which:
         _take(objects[after.which], cup, way.then, lip, setting.half[after.which][2])
     elif after.which < 0 <= held:
-        # Until now its velocity was the mean over the time step
+        # The velocity of the held object was the mean over the time step. The solver needs the
+        # velocity at the end of the time step.
         velocity, step = objects[held]["velocity"], setting.step
         bend = plus(plus(way.then, way.now, -2.0), way.before)
         put(velocity, plus(three(velocity), bend, 0.5 / step))
@@ -99,7 +93,7 @@ def breathe(
 
 @compiled
 def _seals(item: Record, lip: Vector, index: int, setting: Setting) -> bool:
-    """Return whether the lip lies on the upper face of an object."""
+    """Return whether the lip can seal on the upper face of an object."""
     half, (x, y, z), turn = setting.half[index], three(item["position"]), item["quaternion"]
     away = length(plus((x, y, z), lip, -1.0))
     if away > length(three(half)) + CUP.seal_gap:
@@ -112,7 +106,7 @@ def _seals(item: Record, lip: Vector, index: int, setting: Setting) -> bool:
 
 @compiled
 def _take(item: Record, cup: Record, point: Vector, lip: Vector, half: float) -> None:
-    """Hold an object where it is, but clear of the lip by what engines leave between the two."""
+    """Hold an object at its position, lowered if it is closer to the lip than ``CLEARANCE``."""
     position = three(item["position"])
     x, y, z = plus(position, point, -1.0)
     lower = max(CLEARANCE - (lip[2] - position[2] - half), 0.0)

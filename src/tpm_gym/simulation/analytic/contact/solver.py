@@ -1,7 +1,7 @@
-"""Impulses at contacts: projected Gauss-Seidel with Coulomb's cone.
+"""Contact impulses by projected Gauss-Seidel iterations with Coulomb's friction cone.
 
-Velocities change first, positions after them. There is no restitution. A penetration is taken out
-by a share of its depth. Impulses start from those of the last time step.
+Velocities are computed first, then positions. There is no restitution. A time step removes a
+fraction of each penetration. The iterations start from the impulses of the last time step.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from tpm_gym.simulation.vectors import cross, dot, plus, put, three
 __all__ = ["Motor", "prepare", "solve", "still"]
 
 _SWEEPS = 12
-_HASTE = 1.3  # factor of each step of a normal impulse; below 2 sweeps converge
-_STILL, _UNTURNED = 5e-4, 0.01  # m/s, rad/s: slower objects at rest stay there
-_TOLERANCE = 3e-4  # m/s; a sweep that changes less is the last one
-_RECOVERY = 0.1  # share of a penetration that is taken out
-_SLOP = 1e-5  # m, a penetration that stays
-_FASTEST = 0.3  # m/s, of what is taken out
-_LEAST = 1e-4  # 1/kg; bounds the steps of friction on what cannot yield
-_TRACE = 0.7  # share of the trace that bounds the step of friction; above 0.5 it converges
+_RELAXATION = 1.3  # over-relaxation of normal impulses; the sweeps converge below 2
+_STILL, _UNTURNED = 5e-4, 0.01  # m/s, rad/s: objects below both speeds do not move
+_TOLERANCE = 3e-4  # m/s; a sweep that changes velocities by less is the last sweep
+_RECOVERY = 0.1  # fraction of a penetration that a time step removes
+_SLOP = 1e-5  # m, penetration that is not removed
+_FASTEST = 0.3  # m/s, largest speed at which a penetration is removed
+_LEAST = 1e-4  # 1/kg; limits ease_t of bodies that cannot move sideways
+_TRACE = 0.7  # fraction of the trace that determines ease_t; friction converges above 0.5
 
 
 class Motor(NamedTuple):
-    """The spring that drives the cup's slide.
+    """Spring that drives the cup's slide.
 
     Attributes:
-        speed: Vertical velocity of the cup that it aims at, m/s.
-        mass: Of the cup and what it holds, kg.
-        limit: Largest impulse downwards, N s.
+        speed: Target of the cup's vertical velocity, m/s.
+        mass: Mass of the cup and the held object, kg.
+        limit: Largest downward impulse, N s.
     """
 
     speed: float
@@ -43,7 +43,7 @@ class Motor(NamedTuple):
 
 @compiled
 def _turned(body: Record, moment: Vector) -> Vector:
-    """Return the change of spin by an angular impulse."""
+    """Return the change of angular velocity (rad/s) by an angular impulse (N m s)."""
     axis, across = three(body["axis"]), body["across"]
     about = (body["along"] - across) * dot(axis, moment)
     return (
@@ -55,7 +55,7 @@ def _turned(body: Record, moment: Vector) -> Vector:
 
 @compiled
 def _reply(body: Record, arm: Vector, impulse: Vector) -> Vector:
-    """Return the change of velocity at a point of a body by an impulse there."""
+    """Return the change of velocity (m/s) at a point of a body by an impulse (N s) there."""
     x, y, z = three(body["lightness"])
     return plus(
         (x * impulse[0], y * impulse[1], z * impulse[2]),
@@ -65,7 +65,7 @@ def _reply(body: Record, arm: Vector, impulse: Vector) -> Vector:
 
 @compiled
 def _trace(body: Record, arm: Vector) -> float:
-    """Return the sum of the replies to unit impulses along three perpendicular directions."""
+    """Return the trace of the matrix (1/kg) from an impulse at a point to the velocity there."""
     x, y, z = three(body["lightness"])
     turn = cross(arm, three(body["axis"]))
     spread = 2 * body["across"] * dot(arm, arm)
@@ -75,12 +75,12 @@ def _trace(body: Record, arm: Vector) -> float:
 
 @compiled
 def _push(body: Record, arm: Vector, impulse: Vector, sign: float) -> None:
-    """Apply an impulse to a body."""
+    """Apply sign * impulse (N s) to a point of a body."""
     velocity, spin, light = body["velocity"], body["spin"], body["lightness"]
     velocity[0] += sign * light[0] * impulse[0]
     velocity[1] += sign * light[1] * impulse[1]
     velocity[2] += sign * light[2] * impulse[2]
-    if body["across"] > 0:  # the cup does not turn
+    if body["across"] > 0:  # 0 for the cup, which does not rotate
         turn = _turned(body, cross(arm, impulse))
         spin[0] += sign * turn[0]
         spin[1] += sign * turn[1]
@@ -97,13 +97,13 @@ def _speed(body: Record, arm: Vector) -> Vector:
 def prepare(
     contacts: Records, count: int, bodies: Records, forces: FloatArray, step: float
 ) -> None:
-    """Compute what stays the same over the sweeps and apply the forces of the last time step.
+    """Compute the constants of all contacts, and apply the impulses of the last time step.
 
     Args:
-        contacts: The first ``count`` are used.
+        contacts: Contacts, of which the first ``count`` are used; changed.
         count: Number of contacts.
-        bodies: The bodies that they join.
-        forces: (slots, 3) N, of the last time step.
+        bodies: Bodies of the contacts; their velocities are changed.
+        forces: (slots, 3) N, contact forces of the last time step.
         step: Time step, s.
     """
     for j in range(count):
@@ -116,7 +116,7 @@ def prepare(
             reply, trace = plus(reply, _reply(body, arm, normal)), trace + _trace(body, arm)
         own, gap = dot(normal, reply), contact["gap"]
         put(contact["reply"], reply)
-        contact["ease_n"] = _HASTE / own
+        contact["ease_n"] = _RELAXATION / own
         contact["enough"] = (_TOLERANCE / own) ** 2
         contact["ease_t"] = 1 / max(_TRACE * (trace - own), _LEAST)
         rises = min(_RECOVERY * max(-gap - _SLOP, 0.0) / step, _FASTEST)
@@ -124,9 +124,9 @@ def prepare(
         last = three(forces[contact["slot"]])
         last = last[0] * step, last[1] * step, last[2] * step
         press = max(dot(last, normal), 0.0)
-        rub = plus(last, normal, -dot(last, normal))
-        rub = _within(rub, contact["friction"] * press)
-        impulse = plus(rub, normal, press)
+        friction = plus(last, normal, -dot(last, normal))
+        friction = _within(friction, contact["friction"] * press)
+        impulse = plus(friction, normal, press)
         contact["press"] = press
         put(contact["impulse"], impulse)
         if press > 0:
@@ -135,12 +135,12 @@ def prepare(
 
 @compiled
 def _within(vector: Vector, limit: float) -> Vector:
-    """Shorten a vector to a length."""
+    """Shorten a vector to the length ``limit`` if it is longer."""
     square = dot(vector, vector)
     if square <= limit * limit:
         return vector
-    share = limit / math.sqrt(square)
-    return vector[0] * share, vector[1] * share, vector[2] * share
+    factor = limit / math.sqrt(square)
+    return vector[0] * factor, vector[1] * factor, vector[2] * factor
 
 
 @compiled
@@ -153,7 +153,7 @@ def _apply(contact: Record, bodies: Records, impulse: Vector) -> None:
 
 @compiled
 def _relax(contact: Record, bodies: Records) -> bool:
-    """Solve one contact with all others as they are; return whether it was off by much."""
+    """Update the impulse of one contact; return whether the change was larger than negligible."""
     speed = _speed(bodies[contact["b"]], three(contact["arm_b"]))
     if contact["a"] >= 0:
         own = _speed(bodies[contact["a"]], three(contact["arm_a"]))
@@ -167,8 +167,8 @@ def _relax(contact: Record, bodies: Records) -> bool:
     speed = plus(speed, three(contact["reply"]), press - before)
     slip = plus(speed, normal, -dot(normal, speed))
     old = three(contact["impulse"])
-    rub = plus(plus(old, normal, -before), slip, -contact["ease_t"])
-    new = plus(_within(rub, contact["friction"] * press), normal, press)
+    friction = plus(plus(old, normal, -before), slip, -contact["ease_t"])
+    new = plus(_within(friction, contact["friction"] * press), normal, press)
     change = plus(new, old, -1.0)
     put(contact["impulse"], new)
     _apply(contact, bodies, change)
@@ -178,21 +178,21 @@ def _relax(contact: Record, bodies: Records) -> bool:
 
 @compiled
 def solve(contacts: Records, count: int, bodies: Records, motor: Motor, calm: bool) -> None:
-    """Find impulses at which no contact closes, no friction exceeds its cone, and the spring acts.
+    """Compute the contact impulses and the spring's impulse, and apply them to the bodies.
 
     Args:
-        contacts: The first ``count`` are used, as :func:`prepare` left them.
+        contacts: Contacts after :func:`prepare`, of which the first ``count`` are used; changed.
         count: Number of contacts.
-        bodies: Their velocities are changed.
-        motor: The spring of body 0.
-        calm: Whether to end as soon as all objects are :func:`still`: impulses that balance all
-            forces have been found then.
+        bodies: Bodies of the contacts; their velocities are changed.
+        motor: Spring that drives body 0, the cup.
+        calm: Whether to stop as soon as all objects are :func:`still`. The impulses then balance
+            all forces.
     """
     spring, cup = 0.0, bodies[0]["velocity"]
     for sweep in range(_SWEEPS):
         off = False
         wanted = spring + (motor.speed - cup[2]) * motor.mass
-        wanted = max(wanted, -motor.limit)  # upwards the cup is on its stop
+        wanted = max(wanted, -motor.limit)  # the cup's stop causes upward impulses of any size
         cup[2] += (wanted - spring) / motor.mass
         spring = wanted
         for j in range(count):
@@ -203,7 +203,7 @@ def solve(contacts: Records, count: int, bodies: Records, motor: Motor, calm: bo
 
 @compiled
 def still(bodies: Records) -> bool:
-    """Return whether no object moves."""
+    """Return whether the speeds of all objects are below ``_STILL`` and ``_UNTURNED``."""
     for index in range(1, len(bodies)):
         velocity, spin = three(bodies[index]["velocity"]), three(bodies[index]["spin"])
         if dot(velocity, velocity) > _STILL**2 or dot(spin, spin) > _UNTURNED**2:

@@ -1,4 +1,4 @@
-"""State of the objects on a table and of the cup above them, and the solver's workspace."""
+"""State of objects and cups, and workspace of the contact solver."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ __all__ = [
 ]
 
 Record = Any
-"""One item of a structured array; NumPy has no type for it."""
+"""One element of a structured array; NumPy has no type for such elements."""
 Records = NDArray[np.void]
 """A structured array."""
 
 OBJECT: Final = np.dtype(
     [
-        ("position", "f8", 3),  # of the centre; m, world
+        ("position", "f8", 3),  # centre; m, world
         ("quaternion", "f8", 4),  # x, y, z, w
         ("velocity", "f8", 3),  # m/s
-        ("spin", "f8", 3),  # rad/s, world
+        ("spin", "f8", 3),  # angular velocity; rad/s, world
         ("mass", "f8"),  # kg
         ("friction", "f8"),  # Coulomb coefficient
-        ("rest", "f8"),  # time steps in a row without motion; at rest from AT_REST on
+        ("rest", "f8"),  # number of last time steps without motion; at rest from AT_REST on
     ],
     align=True,
 )
@@ -47,11 +47,11 @@ AT_REST: Final = 2
 
 CUP_STATE: Final = np.dtype(
     [
-        ("slide", "f8"),  # m, by which the cup is pushed back into its stem
+        ("slide", "f8"),  # m, displacement of the cup into its stem
         ("slide_rate", "f8"),  # m/s
         ("vacuum", "f8"),  # Pa
-        ("held", "f8"),  # index of the object; -1 for none
-        ("grip", "f8", 3),  # m, from point P to the centre of the held object at slide 0
+        ("held", "f8"),  # index of the held object; -1 for none
+        ("grip", "f8", 3),  # m, vector from P to the centre of the held object at slide 0
     ],
     align=True,
 )
@@ -59,47 +59,47 @@ CUP_STATE: Final = np.dtype(
 BODY: Final = np.dtype(
     [
         ("velocity", "f8", 3),  # m/s
-        ("spin", "f8", 3),  # rad/s
+        ("spin", "f8", 3),  # rad/s, angular velocity
         ("lightness", "f8", 3),  # 1/kg, inverse mass along the world's axes
-        ("across", "f8"),  # 1/(kg m^2), inverse inertia about the level axes of the block
-        ("along", "f8"),  # 1/(kg m^2), inverse inertia about its third axis
-        ("axis", "f8", 3),  # the third axis, world
+        ("across", "f8"),  # 1/(kg m^2), inverse inertia about the object's x and y axes
+        ("along", "f8"),  # 1/(kg m^2), inverse inertia about the object's z axis
+        ("axis", "f8", 3),  # the object's z axis, world
     ],
     align=True,
 )
-"""A body in the solver: 0 is the cup with what it holds, 1 + i is object i."""
+"""Body in the solver: body 0 is the cup with the held object, body 1 + i is object i."""
 
 CONTACT: Final = np.dtype(
     [
-        ("a", "i8"),  # body; -1 for the table
-        ("b", "i8"),  # body
+        ("a", "i8"),  # index of a body; -1 for the table
+        ("b", "i8"),  # index of a body
         ("arm_a", "f8", 3),  # m, from the centre of the body to the contact
         ("arm_b", "f8", 3),
         ("normal", "f8", 3),  # unit vector from a to b
-        ("gap", "f8"),  # m; negative where the bodies penetrate
+        ("gap", "f8"),  # m; negative if the bodies penetrate
         ("friction", "f8"),  # Coulomb coefficient
-        ("slot", "i8"),  # where the impulse is stored between time steps
+        ("slot", "i8"),  # index of the stored force of the last time step
         ("impulse", "f8", 3),  # N s, on b
-        ("press", "f8"),  # N s, normal part of the impulse
-        ("speed", "f8"),  # m/s, least relative velocity along the normal
-        ("reply", "f8", 3),  # (m/s)/(N s), change of the relative velocity by a normal impulse
-        ("ease_n", "f8"),  # N s/(m/s), step of the normal impulse
-        ("ease_t", "f8"),  # N s/(m/s), step of the friction
-        ("enough", "f8"),  # (N s)^2, square of a change of the impulse that does not count
+        ("press", "f8"),  # N s, normal component of the impulse
+        ("speed", "f8"),  # m/s, smallest allowed relative velocity along the normal
+        ("reply", "f8", 3),  # (m/s)/(N s), relative velocity per unit normal impulse
+        ("ease_n", "f8"),  # N s/(m/s), normal impulse per velocity error in a sweep
+        ("ease_t", "f8"),  # N s/(m/s), friction impulse per slip velocity in a sweep
+        ("enough", "f8"),  # (N s)^2, square of the largest negligible change of the impulse
     ],
     align=True,
 )
 
 TABLE_SLOTS, LIP_SLOTS, PAIR_SLOTS = 8, 4, 8
-"""Contacts of an object with the table, of an object with the lip, and of two objects, at most."""
+"""Largest number of contacts of an object with the table, with the lip, and with another object."""
 
 
 class Setting(NamedTuple):
     """Constants of a simulation.
 
     Attributes:
-        half: Half edges of the objects, (k, 3) m.
-        table: Half edges of the table along x and y, m.
+        half: (k, 3) m, half edge lengths of the objects.
+        table: Half edge lengths of the table along x and y, m.
         step: Time step, s.
     """
 
@@ -109,12 +109,12 @@ class Setting(NamedTuple):
 
 
 class Work(NamedTuple):
-    """Workspace of the solver; holds nothing between time steps.
+    """Workspace of the solver; every time step overwrites it.
 
     Attributes:
-        bodies: (k + 1,) of :data:`BODY`.
-        contacts: As many of :data:`CONTACT` as there can be.
-        polygons: (2, 12, 3) m, for clipping.
+        bodies: (k + 1,) records of :data:`BODY`.
+        contacts: (slots(k),) records of :data:`CONTACT`.
+        polygons: (2, 12, 3) m, corners of two polygons, to clip faces.
     """
 
     bodies: Records
@@ -123,12 +123,12 @@ class Work(NamedTuple):
 
 
 def slots(objects: int) -> int:
-    """Return the largest number of contacts between a number of objects, table and lip."""
+    """Return the largest possible number of contacts between ``objects`` objects, table and lip."""
     pairs = objects * (objects - 1) // 2
     return objects * (TABLE_SLOTS + LIP_SLOTS) + pairs * PAIR_SLOTS
 
 
 def work_for(objects: int) -> Work:
-    """Allocate the workspace for a number of objects."""
+    """Allocate the workspace for ``objects`` objects."""
     bodies, contacts = np.zeros(objects + 1, BODY), np.zeros(slots(objects), CONTACT)
     return Work(bodies, contacts, np.zeros((2, 12, 3)))

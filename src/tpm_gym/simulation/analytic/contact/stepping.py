@@ -1,6 +1,6 @@
-"""A time step of one table: contacts, impulses, motion, and the vacuum after it.
+"""Time steps of objects and cup on each table: contacts, impulses, motion, vacuum.
 
-A table at rest that the lip does not come near costs one comparison in a control period.
+A table is skipped for a whole control period if its objects are at rest and the lip stays away.
 """
 
 from __future__ import annotations
@@ -18,29 +18,19 @@ from tpm_gym.simulation.analytic.contact.grasp import CUP_MASS, Way, breathe, ca
 from tpm_gym.simulation.analytic.contact.solver import Motor, prepare, solve, still
 from tpm_gym.simulation.analytic.contact.state import AT_REST, Record, Records, Setting, Work
 from tpm_gym.simulation.engine import SPRING_GAIN
-from tpm_gym.simulation.vectors import (
-    axes,
-    cross,
-    dot,
-    length,
-    plus,
-    put,
-    put_row,
-    row_of,
-    three,
-)
+from tpm_gym.simulation.vectors import axes, cross, dot, length, plus, put, put_row, row_of, three
 
 __all__ = ["advance"]
 
-_SLOW, _LAZY = 5e-3, 0.3  # m/s, rad/s: slower objects may come to rest
-_SETTLED, _STOPPED = 1e-6, 1e-3  # m, m/s: the cup is back when it is nearer and slower
-_NEARBY = 5e-4  # m; contacts are found so much farther than the lip moves in a time step
-_BESIDE = 0.005  # m; an object at rest that the lip stays farther from is skipped
+_SLOW, _SLOW_SPIN = 5e-3, 0.3  # m/s, rad/s: objects below both speeds may come to rest
+_SETTLED, _STOPPED = 1e-6, 1e-3  # m, m/s: below both, the slide is set to 0
+_NEARBY = 5e-4  # m; margin for contacts of the lip, beyond its motion in a time step
+_BESIDE = 0.005  # m; margin around objects at rest within which the lip ends the skipping
 _FREE_CUP = 4 * CUP_MASS
-"""Inertia of a cup that holds nothing, kg.
+"""Inertia of an empty cup, kg.
 
-About that of an object: the solver converges several times faster than with the true mass. The
-spring still accelerates it at 300 m/s^2.
+It is similar to an object's mass, because the solver then converges several times faster than with
+the true mass. The spring still accelerates the cup at 300 m/s^2.
 """
 _ZERO: Vector = (0.0, 0.0, 0.0)
 
@@ -57,19 +47,14 @@ def advance(
     push: FloatArray,
     carried: FloatArray,
 ) -> None:
-    """Run K time steps of some tables.
+    """Simulate K time steps on some tables.
+
+    The arguments rows, path, frame and on are explained in :class:`.contact.Contact`.
 
     Args:
         states: Objects (n, k), cups (n,) and forces (n, slots, 3) N; changed.
-        rows: (r,) which tables.
-        path: Point P, m, machine's frame: before the last time step (r, 3), now (r, 3), and after
-            each time step to come (r, K, 3).
-        frame: Factors (3,) and origin (3,) m of the machine's frame.
-        on: (r,) whether the vacuum is on.
-        setting: Constants.
-        work: Workspace.
-        push: (r, K, 3) N, machine's frame, on the platform; written where it is not zero.
-        carried: (r,) kg, masses that the cups hold at the end; written likewise.
+        push: (r, K, 3) N, force on the platform, machine's frame; output, initially zero.
+        carried: (r,) kg, masses of the held objects at the end; output, initially zero.
     """
     turn, origin = three(frame[0]), three(frame[1])
     points = np.empty((push.shape[1] + 2, 3))
@@ -82,7 +67,7 @@ def advance(
             point = path[2][i, k - 2, 0], path[2][i, k - 2, 1], path[2][i, k - 2, 2]
             put_row(points, k, _placed(point, turn, origin))
         idle = cup["held"] < 0 and cup["slide"] == 0 and cup["vacuum"] == 0
-        # Views of arrays cost more than all comparisons here.
+        # This reads the fields directly, because array views cost more than all comparisons here.
         for index in range(states[0].shape[1]):
             idle = idle and states[0][row, index]["rest"] >= AT_REST
         if idle and not _reached(states[0], row, points, setting):
@@ -99,7 +84,7 @@ def advance(
 
 @compiled
 def _placed(point: Vector, turn: Vector, origin: Vector) -> Vector:
-    """Convert a point of the machine's frame into the world, or a direction back."""
+    """Convert a point from the machine's frame to the world frame; with origin 0, a vector."""
     return (
         turn[0] * point[0] + origin[0],
         turn[1] * point[1] + origin[1],
@@ -121,14 +106,14 @@ def _slow(objects: Records) -> bool:
     """Return whether all objects move so slowly that they may come to rest."""
     for index in range(len(objects)):
         velocity, spin = three(objects[index]["velocity"]), three(objects[index]["spin"])
-        if dot(velocity, velocity) > _SLOW**2 or dot(spin, spin) > _LAZY**2:
+        if dot(velocity, velocity) > _SLOW**2 or dot(spin, spin) > _SLOW_SPIN**2:
             return False
     return True
 
 
 @compiled
 def _reached(tables: Records, row: int, points: FloatArray, setting: Setting) -> bool:
-    """Return whether the lip may come to touch an object, by boxes around both."""
+    """Return whether the lip may touch an object at ``points``; compare boxes around both."""
     lowest = math.inf
     for k in range(1, len(points)):
         lowest = min(lowest, points[k, 2])
@@ -152,7 +137,7 @@ def _step(
     setting: Setting,
     work: Work,
 ) -> Vector:
-    """Run a time step of a table; return the force on the platform, N."""
+    """Simulate a time step on one table; return the force on the platform (N, world)."""
     held, step, (bodies, contacts, polygons) = int(cup["held"]), setting.step, work
     lip, near = lip_of(way.now, cup["slide"]), length(plus(way.then, way.now, -1.0)) + _NEARBY
     first = collide_lip(objects, held, lip, near, setting, contacts)
@@ -185,7 +170,7 @@ def _step(
 def _fill(
     objects: Records, cup: Record, way: Way, mass: float, setting: Setting, bodies: Records
 ) -> None:
-    """Set the solver's bodies to the velocities without contacts."""
+    """Set the solver's bodies to their masses, and to their velocities without contacts."""
     step, body = setting.step, bodies[0]
     x, y, _ = plus(way.then, way.now, -1.0)
     z = (way.now[2] - way.before[2]) / step + cup["slide_rate"]
@@ -229,7 +214,7 @@ def _read(
 
 @compiled
 def _move(objects: Records, bodies: Records, held: int, stays: bool, step: float) -> None:
-    """Move free objects at the velocities that the solver found, or leave them at rest."""
+    """Move free objects at the velocities of the solver, or set them to rest if ``stays``."""
     quiet = still(bodies)
     for index in range(len(objects)):
         item, body = objects[index], bodies[index + 1]
