@@ -4,7 +4,7 @@ VENV := .venv
 RUN := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
 
-.PHONY: help demo test lint format test-fast test-slow test-wheel urdf pictures figures gradients results bench-kinematics bench-engine bench-transfer bench-engines bench-fidelity bench-evaluate bench-speed soak clean
+.PHONY: help demo test lint format test-fast test-slow test-wheel docs urdf pictures figures gradients results bench-kinematics bench-engine bench-transfer bench-engines bench-fidelity bench-evaluate bench-speed soak clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -13,7 +13,7 @@ help: ## list the targets
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(RUN) -m pip install --upgrade pip
-	$(RUN) -m pip install -c constraints.txt -e ".[train,test]"
+	$(RUN) -m pip install -c constraints.txt -e ".[train,test,docs]"
 	touch $@
 
 demo: $(INSTALLED) ## train pick-and-place in the analytic engine, test it in PyBullet, film it; see runs/demo/
@@ -46,6 +46,9 @@ test-slow: $(INSTALLED) ## tests that take minutes: 1000 expert episodes, traini
 
 test-wheel: $(INSTALLED) ## the wheel in an empty environment: train, kill, resume, evaluate
 	$(RUN) -m pytest -q -m slow tests/learning/test_wheel.py
+
+docs: $(INSTALLED) ## build the documentation in build/docs/html; warnings are errors
+	$(RUN) -m sphinx -E -W --keep-going --nitpicky -b html docs build/docs/html
 
 urdf: $(INSTALLED) ## regenerate urdf/ from the mechanism
 	$(RUN) -m tpm_gym.mechanism.urdf urdf
@@ -91,4 +94,4 @@ soak: $(INSTALLED) ## a million steps over all ids in PyBullet, and in MuJoCo: m
 	$(RUN) benchmarks/soak.py --engine mujoco --json runs/soak_mujoco.json --plot runs/soak_mujoco.png
 
 clean: ## remove the environment and everything generated
-	rm -rf $(VENV) runs dist build .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) runs dist build docs/generated .pytest_cache .mypy_cache .ruff_cache .hypothesis
