@@ -214,8 +214,8 @@ def _expert(ids: Sequence[str]) -> Iterator[str]:
         yield from ("This task has no scripted controller.", "")
         return
     yield from (
-        f"Success of `tpm_gym.tasks.Expert` in {EPISODES} episodes of the analytic engine, measured "
-        "when this page was built:",
+        f"Success of `tpm_gym.tasks.Expert` in {EPISODES} episodes of the analytic engine, "
+        "measured when this page was built:",
         "",
         "| id | success, 95% interval | command |",
         "| --- | --- | --- |",
