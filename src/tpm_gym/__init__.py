@@ -45,7 +45,7 @@ __version__ = "0.2.0"
 
 
 def load_policy(path: str | Path) -> Policy:
-    """Load a policy with :func:`tpm_gym.policy.load_policy`, which imports PyTorch."""
+    """Load a policy with :func:`tpm_gym.policy.load_policy`."""
     from tpm_gym import policy
 
     return policy.load_policy(path)

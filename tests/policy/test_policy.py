@@ -12,6 +12,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import safetensors.numpy
+import safetensors.torch
 import torch
 from gymnasium import spaces
 from policies_on_file import (
@@ -42,7 +43,7 @@ from tpm_gym.resources import POLICIES as PUBLISHED
 def reference(
     observation: dict[str, Any], weights: Weights, activation: Callable[[Any], Any]
 ) -> np.ndarray[Any, Any]:
-    """The same network, in double precision and numpy, before its output is bounded."""
+    """The same network, before its output is bounded."""
     gap = (observation["desired_goal"] - observation["achieved_goal"]) / 0.05
     x = np.concatenate([observation["observation"], gap], axis=1)
     layers = len(weights) // 2
@@ -70,6 +71,31 @@ def test_the_action_is_what_the_layers_say(policy: Policy) -> None:
     assert state is None
     with pytest.raises(ConfigurationError, match="no random actions"):
         policy.predict(batch, deterministic=False)
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in PUBLISHED.glob("*.safetensors")))
+def test_actions_are_those_of_torch_and_the_same_bits_alone_and_in_a_batch(name: str) -> None:
+    policy = load_policy(name)
+    network, space = policy.description.network, policy.description.observation_space
+    weights = safetensors.torch.load_file(PUBLISHED / f"{name}.safetensors")
+    rng = np.random.default_rng(0)
+    batch = {
+        key: (0.3 * rng.uniform(box.low, box.high, (1001, *box.shape))).astype(np.float32)
+        for key, box in space.items()
+    }
+    gap = torch.from_numpy(batch["desired_goal"] - batch["achieved_goal"]) / network.features.unit
+    x = torch.cat([torch.from_numpy(batch["observation"]), gap], dim=1)
+    for i in range(len(network.hidden) + 1):
+        x = getattr(torch, network.activation)(x) if i else x
+        x = torch.nn.functional.linear(
+            x, weights[f"layers.{i}.weight"], weights[f"layers.{i}.bias"]
+        )
+    x = x.tanh() if network.output == "tanh" else x.clip(-1.0, 1.0)
+    actions = policy.act(batch)
+    np.testing.assert_allclose(actions, x.numpy(), rtol=0, atol=2e-5)
+    for i in (0, 500, 1000):
+        one = policy.act({key: values[i] for key, values in batch.items()})
+        np.testing.assert_array_equal(one, actions[i])
 
 
 def test_a_tanh_output_fills_uneven_bounds(tmp_path: Path) -> None:
@@ -120,17 +146,6 @@ def test_observations_that_do_not_fit_are_named(
         policy.act(one | changes)
     with pytest.raises(InputError, match="a mapping"):
         policy.act(np.zeros(4))  # type: ignore[arg-type]
-
-
-# -- numbers that float32 cannot hold --------------------------------------------------------------
-
-
-def test_what_overflows_far_outside_the_observation_space_is_named(policy: Policy) -> None:
-    far = {key: np.full(values[0].shape, 3e38) for key, values in observations(1).items()}
-    for sign in (-1, 1):
-        one = far | {"achieved_goal": sign * far["achieved_goal"]}
-        with pytest.raises(InputError, match="observation must be smaller; the network overflows"):
-            policy.act(one)
 
 
 # -- environments ----------------------------------------------------------------------------------
@@ -195,7 +210,6 @@ def test_what_is_no_policy_is_named(tmp_path: Path) -> None:
         "x" * 5000: "name too long",
         "\0": "no such file",
         "best.zip": "holds pickles.*tpm-gym export.*--trust-pickle",
-        ".": "is a folder",
     }.items():
         with pytest.raises(PolicyFileError, match=message):
             load_policy(tmp_path / name)
@@ -229,19 +243,19 @@ def test_a_published_policy_is_named_by_its_environment(
 # -- what loading needs, and what it leaves alone --------------------------------------------------
 
 
-def test_loading_needs_no_stable_baselines_and_no_engine(tmp_path: Path) -> None:
+def test_loading_needs_neither_torch_nor_an_engine(tmp_path: Path) -> None:
     path = write(tmp_path)
     one = {key: values[0].tolist() for key, values in observations(1).items()}
     code = (
-        "import sys; others = ['stable_baselines3', 'sb3_contrib', 'pybullet', 'matplotlib']\n"
+        "import sys; others = ['torch', 'stable_baselines3', 'pybullet', 'matplotlib']\n"
         "sys.modules.update(dict.fromkeys(others)); import tpm_gym\n"
         f"print(tpm_gym.load_policy({str(path)!r}).act({one}).tolist())"
     )
     printed = printed_by(PYTHON, "-c", code)
-    np.testing.assert_allclose(json.loads(printed), load_policy(path).act(one), atol=1e-6)
+    np.testing.assert_array_equal(json.loads(printed), load_policy(path).act(one).tolist())
 
 
-@pytest.mark.parametrize("package", ["torch", "safetensors", "pydantic"])
+@pytest.mark.parametrize("package", ["safetensors", "pydantic"])
 def test_a_missing_package_is_named_with_its_remedy(tmp_path: Path, package: str) -> None:
     path = write(tmp_path)
     code = (
@@ -258,18 +272,13 @@ def test_a_missing_package_is_named_with_its_remedy(tmp_path: Path, package: str
 
 def test_nothing_is_unpickled_or_evaluated(tmp_path: Path) -> None:
     """In a process of its own, where every way to run what a file says raises."""
-    path = write(tmp_path)
     code = (
-        "import builtins, pickle, _pickle, marshal\n"
-        "import numpy, safetensors, torch, tpm_gym.policy.policy\n"
+        "import builtins, pickle, _pickle, marshal, numpy, tpm_gym.policy.policy\n"
         "def refuse(*args, **kwargs): raise SystemExit('unpickled or evaluated')\n"
-        "class Refused:\n"
-        "    __init__ = refuse\n"
         "for module in (pickle, _pickle, marshal):\n"
         "    module.load = module.loads = refuse\n"
-        "pickle.Unpickler = pickle._Unpickler = _pickle.Unpickler = Refused\n"
-        "torch.load = torch.jit.load = numpy.load = refuse\n"
+        "pickle.Unpickler = pickle._Unpickler = _pickle.Unpickler = numpy.load = refuse\n"
         "builtins.eval = builtins.exec = builtins.compile = refuse\n"
-        f"print(tpm_gym.policy.policy.load_policy({str(path)!r}).description.seed)"
+        f"print(tpm_gym.policy.policy.load_policy({str(write(tmp_path))!r}).description.seed)"
     )
     assert printed_by(PYTHON, "-c", code) == "3\n"

@@ -28,8 +28,9 @@ from tpm_gym.learning.features import GoalGapExtractor
 from tpm_gym.learning.policies import load_model, refused, require_trust, run_config
 from tpm_gym.policy.files import FORMAT, VERSION, digest, files
 
-TOLERANCE: Final = 1e-6
-"""Largest difference of an exported action; relative to half its range if that is above 1."""
+TOLERANCE: Final = 1e-5
+"""Largest difference of an exported action, of rounding to single precision; relative to half its
+range if that is above 1."""
 _TRIALS: Final = 64
 _ACTIVATIONS: Final = {nn.ReLU: "relu", nn.Tanh: "tanh"}
 

@@ -1,6 +1,6 @@
 """Trained policies without pickle: :func:`load_policy` and :class:`Policy`.
 
-PyTorch is imported when either is first used, not with this package.
+Needs the extra ``policy``, which is imported when either name is first used.
 """
 
 from typing import TYPE_CHECKING, Any

@@ -1,12 +1,9 @@
 """Files of a trained policy: their content, and how they are read without trust.
 
 ``NAME.json`` describes the policy: its network, spaces, environment, recipe and versions.
-``NAME.safetensors`` holds the weights. Both are plain data, of a limited size, and nothing in them
-is executed or unpickled.
-
-The JSON holds the SHA-256 of the weights and of its own entries, which shows damage and files that
-do not belong together. An attacker can write new sums: such a policy can act badly, but it cannot
-run code.
+``NAME.safetensors`` holds the weights. Both are plain data of a limited size; nothing in them is
+executed or unpickled. SHA-256 sums in the JSON show damage, and files that do not belong together.
+Who writes new sums can make a policy act badly, but cannot run code.
 """
 
 from __future__ import annotations
@@ -14,11 +11,10 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
-import os
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 from gymnasium import spaces
@@ -72,19 +68,16 @@ class Box(_Entries):
         return spaces.Box(low, high, dtype=dtype)
 
 
-class Concatenate(_Entries):
-    """Input of the first layer: the entries of the observation in the order of ``keys``."""
+class Features(_Entries):
+    """Input of the first layer.
 
-    kind: Literal["concatenate"]
-    keys: tuple[_Name, ...]
+    ``concatenate`` joins the entries of the observation in the order of ``keys``. ``goal_gap``
+    joins ``observation`` and the difference from achieved to desired goal, in units of ``unit`` m.
+    """
 
-
-class GoalGap(_Entries):
-    """Input of the first layer: ``observation``, and the way to the goal in units of ``unit`` m."""
-
-    kind: Literal["goal_gap"]
-    unit: Annotated[float, Field(ge=1e-6, le=1e6)]
-    keys: ClassVar = ("observation", *_GOALS)
+    kind: Literal["concatenate", "goal_gap"]
+    keys: tuple[_Name, ...] = ("observation", *_GOALS)
+    unit: Annotated[float, Field(ge=1e-6, le=1e6)] = 1.0
 
 
 class Network(_Entries):
@@ -94,7 +87,7 @@ class Network(_Entries):
     scaled to the action space, or is clipped to it.
     """
 
-    features: Annotated[Concatenate | GoalGap, Field(discriminator="kind")]
+    features: Features
     hidden: tuple[_Size, ...]
     activation: Literal["relu", "tanh"]
     output: Literal["tanh", "clip"]
@@ -134,8 +127,11 @@ class Description(_Entries):
         boxes, features = self.observations, self.network.features
         if sorted(features.keys) != sorted(boxes):
             raise ValueError("observation_space must hold exactly the keys of the features")
-        if features.kind == "goal_gap" and len({boxes[key].shape for key in _GOALS}) > 1:
-            raise ValueError("the goals in observation_space must be of one shape")
+        if features.kind == "goal_gap":
+            if set(boxes) != {"observation", *_GOALS}:
+                raise ValueError("goal_gap needs an observation and two goals")
+            if len({boxes[key].shape for key in _GOALS}) > 1:
+                raise ValueError("the goals in observation_space must be of one shape")
         return self
 
     @cached_property
@@ -164,8 +160,7 @@ class Description(_Entries):
 def files(path: str | Path) -> tuple[Path, Path]:
     """Return the JSON file and the file of weights; ``path`` is either, or their common name."""
     if not isinstance(path, str | Path) or not str(path):
-        given = path if path == "" else type(path)
-        raise InputError("path", given, "the str or Path of a policy, as in 'runs/reach/best.json'")
+        raise InputError("path", path, "the str or Path of a policy, as in 'runs/reach/best.json'")
     path = Path(path)
     if path.suffix == ".zip":
         raise PolicyFileError(
@@ -173,8 +168,6 @@ def files(path: str | Path) -> tuple[Path, Path]:
             "is an archive of Stable-Baselines3, which holds pickles: loading it can run any code",
             "if you trust it, convert it once: tpm-gym export MODEL.zip OUT --trust-pickle",
         )
-    if os.path.isdir(path):  # path.is_dir() raises if a name is too long
-        raise PolicyFileError(str(path), "is a folder", "name a policy in it, as in FOLDER/best")
     stem = path.with_suffix("") if path.suffix in (".json", ".safetensors") else path
     return Path(f"{stem}.json"), Path(f"{stem}.safetensors")
 

@@ -1,4 +1,4 @@
-"""Trained policies, loaded from safetensors and JSON and run by PyTorch alone."""
+"""Trained policies, loaded from safetensors and JSON and run by NumPy."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from tpm_gym.arrays import numbers
-from tpm_gym.errors import ConfigurationError, InputError, MissingPackageError, PolicyMismatchError
+from tpm_gym.arrays import FloatArray, numbers
+from tpm_gym.errors import ConfigurationError, InputError, PolicyMismatchError
 from tpm_gym.policy.files import Description, files, published, read_description, read_weights
 from tpm_gym.resources import POLICIES
 
-try:
-    import torch
-except ImportError as error:
-    raise MissingPackageError("torch", "policy") from error
+_BLOCK = 8
+"""Rows of a batch that are multiplied at once.
 
-_ACTIVATIONS = {"relu": torch.relu, "tanh": torch.tanh}
+OpenBLAS uses no threads for so few, which would slow each other down on a busy machine, and an
+action has the same bits alone and in a batch.
+"""
 
 
 def load_policy(path: str | Path) -> Policy:
@@ -37,7 +37,7 @@ def load_policy(path: str | Path) -> Policy:
         InputError: ``path`` is neither a str nor a Path, or empty.
         PolicyFileError: A file is missing or no policy file, or ``path`` is an archive of
             Stable-Baselines3, which only unpickling could read.
-        MissingPackageError: PyTorch, safetensors or pydantic is not installed.
+        MissingPackageError: safetensors or pydantic is not installed.
     """
     pair = files(path)
     if path in published() and not any(map(os.path.exists, pair)):
@@ -61,9 +61,10 @@ class Policy:
     ) -> None:
         """Build the network."""
         self.description = description
-        tensors = {name: torch.from_numpy(values) for name, values in weights.items()}
+        # In double precision, so that an action hardly depends on the size of its batch.
+        values = {name: array.astype(np.float64) for name, array in weights.items()}
         self._layers = [
-            (tensors[f"layers.{i}.weight"], tensors[f"layers.{i}.bias"])
+            (values[f"layers.{i}.weight"].T, values[f"layers.{i}.bias"])
             for i in range(len(description.network.hidden) + 1)
         ]
 
@@ -78,28 +79,22 @@ class Policy:
             The action, in the shape, dtype and bounds of the action space; (n, ...) for a batch.
 
         Raises:
-            InputError: An entry is missing, unknown, of the wrong shape, not finite, or so large
-                that the network overflows.
+            InputError: An entry is missing, unknown, of the wrong shape, or not finite.
         """
-        entries, batched = self._check_observation(observation)
+        x, batched = self._features(observation)
         network, space = self.description.network, self.description.action_space
-        with torch.inference_mode():
-            x = self._features(entries)
-            for weight, bias in self._layers[:-1]:
-                x = torch.nn.functional.linear(x, weight, bias)
-                x = _ACTIVATIONS[network.activation](x)
-            x = torch.nn.functional.linear(x, *self._layers[-1])
-            if not x.isfinite().all():
-                largest = max(float(values.abs().max()) for values in entries.values())
-                raise InputError("observation", largest, "smaller; the network overflows")
-            x = (torch.tanh(x) if network.output == "tanh" else x).reshape(-1, *space.shape)
-            actions: NDArray[Any] = x.numpy()
+        count, size = x.shape
+        x = np.concatenate([x, np.zeros((-count % _BLOCK, size))])
+        x = x.reshape(len(x) // _BLOCK, _BLOCK, size)
+        *hidden, (weight, bias) = self._layers
+        for own_weight, own_bias in hidden:
+            x = x @ own_weight + own_bias
+            x = np.tanh(x) if network.activation == "tanh" else np.maximum(x, 0.0)
+        x = (x @ weight + bias).reshape(-1, *space.shape)[:count]
         if network.output == "tanh":
-            actions = space.low + 0.5 * (actions + 1.0) * (space.high - space.low)
-        else:
-            actions = np.clip(actions, space.low, space.high)
-        found = actions.astype(space.dtype)
-        return found if batched else np.asarray(found[0])
+            x = space.low + 0.5 * (np.tanh(x) + 1.0) * (space.high - space.low)
+        actions = np.clip(x, space.low, space.high).astype(space.dtype)
+        return actions if batched else np.asarray(actions[0])
 
     def predict(
         self,
@@ -146,40 +141,37 @@ class Policy:
         about = self.description
         return f"<Policy of {about.env_id}, {about.algorithm}, seed {about.seed}>"
 
-    def _features(self, entries: Mapping[str, torch.Tensor]) -> torch.Tensor:
-        """Return the input of the first layer, (n, size)."""
-        features = self.description.network.features
-        if features.kind == "concatenate":
-            return torch.cat([entries[key] for key in features.keys], dim=1)
-        gap = entries["desired_goal"] - entries["achieved_goal"]
-        return torch.cat([entries["observation"], gap / features.unit], dim=1)
-
-    def _check_observation(
-        self, observation: Mapping[str, Any]
-    ) -> tuple[dict[str, torch.Tensor], bool]:
-        """Return the entries as (n, size), and whether they are a batch."""
-        boxes = self.description.observation_space
+    def _features(self, observation: Mapping[str, Any]) -> tuple[FloatArray, bool]:
+        """Return the input of the first layer, (n, size), and whether it is of a batch."""
+        boxes, features = self.description.observation_space, self.description.network.features
         given = list(observation) if isinstance(observation, Mapping) else type(observation)
         if not isinstance(given, list) or set(given) != set(boxes):
             raise InputError("observation", given, f"a mapping with the keys {', '.join(boxes)}")
-        entries: dict[str, torch.Tensor] = {}
-        leading = set()
-        for name, box in boxes.items():
-            shape = box.shape or ()
-            values = numbers(name, observation[name])
-            batch = values.shape[: values.ndim - len(shape)]
-            if values.shape != batch + shape or len(batch) > 1:
-                raise InputError(name, values.shape, f"of shape {shape} or (n, *{shape}), by shape")
-            with np.errstate(over="ignore"):
-                flat = values.reshape(-1, math.prod(shape)).astype(np.float32)
-            if not np.isfinite(flat).all():
-                odd = float(values.flat[np.isfinite(flat).argmin()])
-                raise InputError(name, odd, "finite in float32")
-            entries[name] = torch.from_numpy(flat)
-            leading.add(batch)
-        if len(leading) > 1:
-            raise InputError("observation", sorted(leading), "of one batch size in all entries")
-        return entries, leading != {()}
+        found = {name: _rows(name, observation[name], box.shape) for name, box in boxes.items()}
+        entries = {name: rows for name, (rows, _) in found.items()}
+        batches = {batch for _, batch in found.values()}
+        if len(batches) > 1:
+            raise InputError("observation", sorted(batches), "of one batch size in all entries")
+        if features.kind == "goal_gap":
+            gap = entries["desired_goal"] - entries["achieved_goal"]
+            parts = [entries["observation"], gap / features.unit]
+        else:
+            parts = [entries[key] for key in features.keys]
+        return np.concatenate(parts, axis=1), batches != {()}
+
+
+def _rows(name: str, value: Any, shape: tuple[int, ...]) -> tuple[FloatArray, tuple[int, ...]]:
+    """Return an entry of an observation as (n, size), rounded as networks get it; and its batch."""
+    values = numbers(name, value)
+    batch = values.shape[: values.ndim - len(shape)]
+    if values.shape != batch + shape or len(batch) > 1:
+        raise InputError(name, values.shape, f"of shape {shape} or (n, *{shape}), by shape")
+    with np.errstate(over="ignore"):
+        rows = values.reshape(-1, math.prod(shape)).astype(np.float32).astype(np.float64)
+    if not np.isfinite(rows).all():
+        odd = float(values.flat[np.isfinite(rows).argmin()])
+        raise InputError(name, odd, "finite in float32")
+    return rows, batch
 
 
 def _control(env: Any) -> str | None:
