@@ -147,7 +147,9 @@ class Policy:
         given = list(observation) if isinstance(observation, Mapping) else type(observation)
         if not isinstance(given, list) or set(given) != set(boxes):
             raise InputError("observation", given, f"a mapping with the keys {', '.join(boxes)}")
-        found = {name: _rows(name, observation[name], box.shape) for name, box in boxes.items()}
+        found = {
+            name: _rows(name, observation[name], box.shape or ()) for name, box in boxes.items()
+        }
         entries = {name: rows for name, (rows, _) in found.items()}
         batches = {batch for _, batch in found.values()}
         if len(batches) > 1:
