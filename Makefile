@@ -81,13 +81,15 @@ bench-engines: $(INSTALLED) ## both engines and theory on the same commands; pol
 bench-engine: $(INSTALLED) ## the analytic engine: speed and agreement, beside PyBullet and panda-gym
 	$(RUN) -m pip install -c constraints.txt -e ".[bench]"
 	$(RUN) benchmarks/bench_engine.py
+	$(RUN) benchmarks/readme_numbers.py
 
 bench-transfer: $(INSTALLED) ## policies trained in one engine (the runs in runs/transfer), tested in all
 	$(RUN) benchmarks/bench_transfer.py --jobs 2
 
 bench-speed: $(INSTALLED) ## steps per second beside panda-gym and Gymnasium-Robotics
 	$(RUN) -m pip install -c constraints.txt -e ".[bench]"
-	$(RUN) benchmarks/bench_speed.py --json runs/speed.json --plot runs/speed.png
+	$(RUN) benchmarks/bench_speed.py --json docs/records/speed.json --plot docs/images/speed.png
+	$(RUN) benchmarks/readme_numbers.py
 
 soak: $(INSTALLED) ## a million steps over all ids in PyBullet, and in MuJoCo: memory, loop gaps, speed; an hour
 	$(RUN) benchmarks/soak.py --json runs/soak.json --plot runs/soak.png

@@ -44,6 +44,18 @@ myst_substitutions = {
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 autodoc_default_options = {"members": True, "show-inheritance": True}
+autodoc_type_aliases = {
+    name: name
+    for name in (
+        "Action",
+        "ArrayLike",
+        "BoolArray",
+        "FloatArray",
+        "IntArray",
+        "Observation",
+        "Vector",
+    )
+}
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
 python_use_unqualified_type_names = True
@@ -58,5 +70,6 @@ html_theme = "furo"
 html_title = f"tpm_gym {release}"
 html_static_path = ["_static"]
 html_css_files = ["wide.css"]
+html_show_copyright = False
 html_copy_source = False
 html_show_sourcelink = False

@@ -1,4 +1,4 @@
-"""Text of docs/results.md: tables computed from the records, and the template page.md.j2."""
+"""Text of docs/results.md and docs/results-runs.md: tables of the records, in two templates."""
 
 import json
 import re
@@ -23,6 +23,8 @@ from .plan import Study, plan_runs
 from .records import RECORDS, Record, read_records
 
 PAGE: Final = Path("docs", "results.md")
+RUNS: Final = "results-runs.md"
+"""Name of the page of every run, beside the page."""
 LEARNED: Final = 0.95
 """Success rate of a policy that has learned its task."""
 ENGINES: Final = {"analytic": "analytic engine", "pybullet": "PyBullet"}
@@ -52,13 +54,13 @@ Frame = Any  # pandas has no types
 
 @dataclass(frozen=True)
 class Write:
-    """Write the page and its figures from the records."""
+    """Write the page, the page of every run and their figures from the records."""
 
     records: Path = RECORDS
     """Folder of the records."""
 
     page: Path = PAGE
-    """The page; figures go to images/ beside it."""
+    """The page; the page of every run goes beside it, figures to images/."""
 
 
 def write(config: Write) -> list[Path]:
@@ -69,17 +71,19 @@ def write(config: Write) -> list[Path]:
     """
     from .figures import draw  # imports matplotlib
 
-    old = config.page
-    if old.exists() and not (old.is_file() and _MARK.encode() in old.read_bytes()):
-        raise ConfigError(
-            f"--page {config.page}: was written by hand, or by another program; "
-            "move it elsewhere, or choose another --page"
-        )
+    runs = config.page.with_name(RUNS)
+    for old in (config.page, runs):
+        if old.exists() and not (old.is_file() and _MARK.encode() in old.read_bytes()):
+            raise ConfigError(
+                f"--page {old}: was written by hand, or by another program; "
+                "move it elsewhere, or choose another --page"
+            )
     records = read_records(config.records)
     figures = draw(records, config.page.parent / "images")
-    text = page(records, [figure.name for figure in figures])
-    write_whole(config.page, lambda part: part.write_text(text, encoding="utf-8"))
-    return [config.page, *figures]
+    texts = {config.page: page(records, [f.name for f in figures]), runs: every_run(records)}
+    for path, text in texts.items():
+        write_whole(path, partial(Path.write_text, data=text, encoding="utf-8"))
+    return [*texts, *figures]
 
 
 def page(records: Sequence[Record], figures: Sequence[str]) -> str:
@@ -90,7 +94,42 @@ def page(records: Sequence[Record], figures: Sequence[str]) -> str:
         figures: File names of the figures to show.
     """
     runs, tempting = split(records)
-    bisections = [record for record in records if "attribute" in record]
+    return _render(
+        "page.md.j2",
+        mark=_MARK,
+        learned=f"{LEARNED:.0%}",
+        safe=PAPER_TPM.safe_conditioning,
+        missing=list(_missing(records)),
+        episodes=_episodes,
+        training=runs,
+        training_table=partial(_training_table, runs),
+        tempting=tempting,
+        penalty_table=partial(_penalty_table, tempting),
+        compared=partial(_compared, tempting),
+        robustness=any("attribute" in record for record in records),
+        figures=figures,
+    )
+
+
+def every_run(records: Sequence[Record]) -> str:
+    """Return the page of every run as Markdown: its tests, robustness, machines, commands."""
+    runs, tempting = split(records)
+    return _render(
+        "runs.md.j2",
+        mark=_MARK,
+        learned=f"{LEARNED:.0%}",
+        failures=_failures,
+        training=runs,
+        runs_table=partial(_runs_table, runs),
+        tempting=tempting,
+        robustness=list(_robustness([record for record in records if "attribute" in record])),
+        machines=_machines(records),
+        commands=[command(study) for study in STUDIES],
+    )
+
+
+def _render(template: str, **values: Any) -> str:
+    """Fill a template of this folder."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         undefined=jinja2.StrictUndefined,
@@ -98,24 +137,7 @@ def page(records: Sequence[Record], figures: Sequence[str]) -> str:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    return environment.get_template("page.md.j2").render(
-        mark=_MARK,
-        learned=f"{LEARNED:.0%}",
-        safe=PAPER_TPM.safe_conditioning,
-        missing=list(_missing(records)),
-        episodes=_episodes,
-        failures=_failures,
-        training=runs,
-        training_table=partial(_training_table, runs),
-        runs_table=partial(_runs_table, runs),
-        tempting=tempting,
-        penalty_table=partial(_penalty_table, tempting),
-        compared=partial(_compared, tempting),
-        robustness=list(_robustness(bisections)),
-        figures=figures,
-        machines=_machines(records),
-        commands=[command(study) for study in STUDIES],
-    )
+    return environment.get_template(template).render(values)
 
 
 def command(study: Study) -> str:

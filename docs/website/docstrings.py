@@ -11,6 +11,12 @@ from typing import Any
 def setup(app: Any) -> None:
     """Convert docstrings before napoleon reads them."""
     app.connect("autodoc-process-docstring", convert, priority=100)
+    app.connect("autodoc-skip-member", skip)
+
+
+def skip(app: Any, what: str, name: str, obj: Any, skipped: bool, options: Any) -> bool | None:
+    """Leave out methods that only repeat those of a base class."""
+    return True if (getattr(obj, "__doc__", "") or "").startswith("See ") else None
 
 
 def convert(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:

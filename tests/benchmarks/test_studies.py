@@ -23,7 +23,7 @@ from processes import PYTHON, signalled
 from studies.__main__ import main
 from studies.bisection import ends, halving, nominal
 from studies.figures import learning_curves, penalty
-from studies.page import PAGE, Write, page, split, write
+from studies.page import PAGE, RUNS, Write, every_run, page, split, write
 from studies.plan import Bisection, Run, Study, plan_runs
 from studies.records import (
     RECORDS,
@@ -267,7 +267,7 @@ def test_a_run_that_broke_off_is_collected_as_far_as_it_was_saved(run: Run, tmp_
     assert [record["finished"] for record in records] == [False, False]
     assert [record["reached"] for record in records] == [200, 60]
     assert records == collected()
-    text = page([r | {"goals": "sampled", "penalty_weight": 1.0} for r in records], [])
+    text = every_run([r | {"goals": "sampled", "penalty_weight": 1.0} for r in records])
     assert "stopped after 200 of 240 steps" in text
     assert "stopped after 60 of 240 steps" in text
     (late / "evaluations.jsonl").write_text("{\n")
@@ -288,7 +288,7 @@ def test_files_of_others_are_not_replaced(run: Run, tmp_path: Path) -> None:
     assert not (tmp_path / "images").exists()
     by_hand.unlink()
     written = write(Write(records, by_hand))
-    assert [path.name for path in written] == ["results.md", "results_penalty.png"]
+    assert [path.name for path in written] == ["results.md", RUNS, "results_penalty.png"]
     before = [path.read_bytes() for path in written]
     main(["write", "--records", str(records), "--page", str(by_hand)])
     assert [path.read_bytes() for path in written] == before
@@ -351,6 +351,9 @@ def test_the_page_is_what_its_records_say() -> None:
     text = (ROOT / PAGE).read_text(encoding="utf-8")
     figures = [name for name in ("results_penalty.png", "results_robustness.png") if name in text]
     assert page(read_records(ROOT / RECORDS), ["results_learning_curves.png", *figures]) == text
+    assert every_run(read_records(ROOT / RECORDS)) == (ROOT / PAGE.with_name(RUNS)).read_text(
+        "utf-8"
+    )
 
 
 @pytest.mark.parametrize(
@@ -367,7 +370,8 @@ def test_the_page_is_what_its_records_say() -> None:
 def test_runs_that_differ_are_told_apart_everywhere(other: Any, labels: list[str]) -> None:
     runs = [changed(0, 0.5), changed(0, 0.6, **other)]
     weighted = [tempting(s, w, **o) for s in range(2) for w in (0.0, 1.0) for o in ({}, other)]
-    text = page([*runs, *weighted], [])
+    records = [*runs, *weighted]
+    text = page(records, []) + every_run(records)
     for label in labels:
         assert len(rows(text, f"| {label} | 0 |")) == 1  # of every run
         assert f"{label}, seed 0: success" in text

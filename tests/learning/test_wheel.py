@@ -54,8 +54,8 @@ def test_a_training_is_killed_resumed_and_evaluated_beside_the_expert_and_a_publ
     assert expert["success_at_end"]["mean"] == published["success_at_end"]["mean"] == 1.0
 
 
-def test_the_readmes_lines_learn_reach(installed: Path, tmp_path: Path) -> None:
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+def test_the_lines_of_the_first_run_learn_reach(installed: Path, tmp_path: Path) -> None:
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs/first-run.md").read_text(), re.DOTALL)
     (script,) = (block for block in blocks if "import recipe" in block)
     output = printed_by(installed / "python", "-c", script, cwd=tmp_path, env=OUTSIDE)
     last = output.splitlines()[-1]

@@ -5,7 +5,6 @@ from contextlib import closing
 from typing import Any
 
 import pytest
-from paths import ROOT
 
 import tpm_gym
 from tpm_gym.learning import policies
@@ -61,12 +60,3 @@ def test_its_motors_need_the_same_torque_in_both_engines(name: str) -> None:
             torques += [[r.torque_rms for r in run_episodes(envs, policy, 40, TEST_SEED)]]
     pybullet, mujoco = (sum(one) for one in torques)
     assert mujoco == pytest.approx(pybullet, rel=0.02)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_the_readme_tells_its_success_and_steps(name: str) -> None:
-    success = evaluation(name)["success_at_end"]
-    mean, low, high = (100 * success[key] for key in ("mean", "low", "high"))
-    steps = tpm_gym.load_policy(POLICIES / name).description.recipe["n_timesteps"]
-    row = f"| `{name}` | {mean:.1f}% [{low:.1f}, {high:.1f}] | {steps:,} steps"
-    assert row in (ROOT / "README.md").read_text(encoding="utf-8")

@@ -1,0 +1,157 @@
+"""Pages are short, their code runs, their commands exist, their numbers are those of records."""
+
+import importlib
+import json
+import re
+import shlex
+import subprocess
+from pathlib import Path
+
+import gymnasium as gym
+import matplotlib
+import pytest
+import tyro
+from benchmarks.studies.__main__ import Command as StudiesCommand
+from pages import DOCS, PAGES, blocks, name_of, read
+from paths import ROOT
+
+import tpm_gym
+from tpm_gym.learning.command_line import Command
+
+MOST_WORDS = 1200
+EVIDENCE = {
+    "docs/paper.md",  # every equation of the paper
+    "docs/loops-sweep.md",  # a table
+    "docs/results-runs.md",  # tables
+}
+FILLED = {
+    "README.md": ["numbers", "policies"],
+    "docs/speed.md": ["speed", "analytic"],
+    "docs/engines.md": ["engines"],
+    "docs/transfer.md": ["transfer"],
+}
+RUN = [page for page in PAGES if blocks(page, "python") and page.name != "extending.md"]
+TYPED = [page for page in PAGES if blocks(page, "bash")]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_a_page_is_short(page):
+    most = 700 if page.name == "README.md" else MOST_WORDS
+    assert name_of(page) in EVIDENCE or len(read(page).split()) <= most
+
+
+@pytest.mark.parametrize("page", RUN, ids=name_of)
+def test_the_python_of_a_page_runs(page, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(gym, "registry", gym.registry.copy())
+    names = {"__name__": page.stem}
+    with matplotlib.rc_context({"backend": "Agg"}):
+        for block in blocks(page, "python"):
+            exec(shortened(block), names)
+    for thing in names.values():
+        if isinstance(thing, gym.Env | gym.vector.VectorEnv):
+            thing.close()
+
+
+def shortened(block):
+    """Train for 100 steps and test one episode; test_wheel.py sees what is learned."""
+    block = re.sub(r"learn\([\d_]+\)", "learn(100)", block)
+    return block.replace("2_000_100", "2_000_001")
+
+
+@pytest.mark.parametrize("page", TYPED, ids=name_of)
+def test_the_commands_of_a_page_are_understood(page):
+    for block in blocks(page, "bash"):
+        for line in block.replace("\\\n", " ").splitlines():
+            understand(shlex.split(line, comments=True))
+
+
+def understand(words):
+    """Parse a command line as its program does, without running it."""
+    match words:
+        case []:
+            pass
+        case ["tpm-gym", *options]:
+            tyro.cli(Command, args=options)
+        case ["python", "-m", "benchmarks.studies", *options]:
+            tyro.cli(StudiesCommand, args=options)
+        case ["make", target]:
+            command = ["make", "--dry-run", "--directory", str(ROOT), target]
+            subprocess.run(command, check=True, capture_output=True)
+        case ["pip", "install", *options]:
+            project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+            for extra in re.findall(r"\[([\w,]+)\]", " ".join(options)):
+                for name in extra.split(","):
+                    assert re.search(rf"^{name} = \[", project, re.MULTILINE), name
+        case _:
+            pytest.fail(f"no test knows the command {shlex.join(words)}")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_the_scripts_and_targets_that_a_page_names_exist(page):
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    for command in re.findall(r"`(?:\w+=\w+ )?((?:make|python) [^`]+)`", read(page)):
+        match command.split():
+            case ["make", *targets]:
+                for target in targets:
+                    assert re.search(rf"^{target}:", makefile, re.MULTILINE), command
+            case ["python", script, *options] if script.endswith(".py"):
+                text = (ROOT / script).read_text(encoding="utf-8")
+                for option in options:
+                    known = not option.startswith("--") or f'"{option}"' in text
+                    assert known or "sys.argv" in text, command
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_every_id_on_a_page_exists(page):
+    learned_elsewhere = re.compile(r"TPM(Stack|Hover|Shove)")
+    for env_id in re.findall(r"\bTPM\w+-v\d", read(page)):
+        assert env_id in tpm_gym.ENV_IDS or learned_elsewhere.match(env_id), env_id
+
+
+@pytest.mark.parametrize(("page", "name"), [(p, n) for p, names in FILLED.items() for n in names])
+def test_the_numbers_of_a_page_are_those_of_its_record(page, name):
+    begin, end = (f"<!-- {name}: {part} -->" for part in ("begin", "end"))
+    found = read(ROOT / page).split(begin)[1].split(end)[0].strip().splitlines()
+    assert found == "\n".join(expected(name)).strip().splitlines()
+
+
+def expected(name):
+    """Return the lines that a benchmark writes between the marks of that name."""
+    module = {
+        "analytic": "analytic_report",
+        "engines": "engine_report",
+        "transfer": "bench_transfer",
+    }.get(name)
+    if module is None:
+        numbers = importlib.import_module("readme_numbers")
+        record = numbers.read_record(numbers.RECORDS / "speed.json")
+        return numbers.speed(record) if name == "speed" else getattr(numbers, name)()
+    report = importlib.import_module(module)
+    return report.lines(json.loads(report.RECORD.read_text()) if report.RECORD.exists() else {})
+
+
+def test_every_page_is_in_a_table_of_contents():
+    trees = "\n".join(
+        block
+        for page in (DOCS / "index.md", DOCS / "tasks.md", DOCS / "api.md")
+        for block in re.findall(r"```{toctree}\n(.*?)```", read(page), re.DOTALL)
+    )
+    listed = {re.sub(r".*<(.*)>", r"\1", line.strip()) for line in trees.splitlines()}
+    for page in PAGES:
+        inside = page.is_relative_to(DOCS) and page.name != "index.md"
+        path = page.relative_to(DOCS).with_suffix("").as_posix() if inside else None
+        assert path is None or path in listed, f"{path} is in no toctree"
+
+
+def test_the_api_has_every_public_name():
+    text = read(DOCS / "api" / "tpm_gym.md")
+    for name in tpm_gym.__all__:
+        assert name == "__version__" or re.search(rf":: tpm_gym\.{name}$", text, re.MULTILINE), name
+
+
+def test_readme_is_short():
+    text = read(ROOT / "README.md")
+    assert text.count("![") == 1
+    assert [len(block.splitlines()) for block in blocks(ROOT / "README.md", "bash")] == [2]
+    assert Path(DOCS / "images" / "pick_and_place.png").exists()
