@@ -13,7 +13,7 @@ from episodes import EVERYTHING, bits, play
 from gymnasium.envs.registration import EnvSpec
 
 from tpm_gym import TPMEnv
-from tpm_gym.envs import single
+from tpm_gym.envs.rendering import RENDER_MODES
 from tpm_gym.errors import ConfigurationError, InputError
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.tpm import PAPER_TPM, WIDE_TPM
@@ -99,11 +99,13 @@ def test_human_mode_without_a_display_is_refused_instead_of_ending_the_process(
 ) -> None:
     monkeypatch.setattr("sys.platform", "linux")
     monkeypatch.delenv("DISPLAY", raising=False)
-    with pytest.raises(ConfigurationError, match="display"):
-        TPMEnv(render_mode="human")
+    for engine in ("pybullet", "mujoco", "analytic"):
+        with pytest.raises(ConfigurationError, match="display") as caught:
+            TPMEnv(engine=engine, render_mode="human")
+        assert (caught.value.name, caught.value.value) == ("render_mode", "human")
     env = TPMEnv()
-    assert env.metadata["render_modes"] == ["rgb_array"]
-    assert TPMEnv.metadata["render_modes"] == ["human", "rgb_array"]
+    assert env.metadata["render_modes"] == list(RENDER_MODES[1:])
+    assert TPMEnv.metadata["render_modes"] == list(RENDER_MODES)
 
 
 def test_rgb_array_gives_pictures_of_the_asked_size() -> None:
@@ -289,16 +291,6 @@ def test_info_tells_the_machine_that_was_drawn() -> None:
     assert "randomisation" not in env.step(np.zeros(4))[4]
     nominal = TPMEnv()
     assert "randomisation" not in nominal.reset(seed=0)[1]
-
-
-def test_a_window_is_refused_by_the_engines_that_open_none(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(single, "has_display", lambda: True)
-    for engine in ("mujoco", "analytic"):
-        with pytest.raises(ConfigurationError, match="opens no window") as caught:
-            TPMEnv(engine=engine, render_mode="human")
-        assert (caught.value.name, caught.value.value) == ("render_mode", "human")
 
 
 # -- snapshots -------------------------------------------------------------------------------------

@@ -233,7 +233,8 @@ def test_options_are_refused_by_name() -> None:
         ({"physics": {"torques": "all"}}, "'every'"),
         ({"machine": "round"}, "'paper', 'wide'"),
         ({"num_envs": 10**12}, "num_envs"),
-        ({"num_envs": 2, "render_mode": "rgb_array"}, "render_mode"),
+        ({"render_mode": "human"}, "render_mode"),
+        ({"num_threads": 2, "observations": "pixels"}, "num_threads"),
         ({"num_threads": 0}, "1 or more"),
     ):
         with pytest.raises(ConfigurationError, match=message):

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tpm_gym import Machine, register_engine
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray
@@ -12,6 +11,7 @@ from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.cup import CUP, sealed
 from tpm_gym.simulation import Plant, Scene
 from tpm_gym.simulation.engine import Path, Pose, Readout, Twist
+from tpm_gym.simulation.imaging import Camera, Picture, View
 from tpm_gym.simulation.randomisation import NOMINAL
 from tpm_gym.simulation.state import CONTROL_PERIOD
 from tpm_gym.simulation.vacuum import EMPTY, Load, hold_after
@@ -65,19 +65,19 @@ class KinematicEngine:
         self._theta, self._rates, self._hold, objects = saved
         self._objects = objects.copy()
 
-    def show_goal(self, markers: FloatArray) -> None:
+    def show(self, camera: Camera, markers: FloatArray) -> None:
         pass
 
-    def picture(self, width: int, height: int) -> NDArray[np.uint8]:
+    def picture(self, row: int, view: View) -> Picture:
         """From above, a metre wide: the blocks."""
-        image = np.full((height, width, 3), 255, np.uint8)
+        image = np.full((view.height, view.width, 3), 255, np.uint8)
         for block, (x, y, *_) in zip(self._blocks, self._objects.tolist(), strict=True):
-            half = max(1, int(block.width * width / 2))
-            row = max(0, height // 2 - int(width * y) - half)
-            column = max(0, width // 2 + int(width * x) - half)
+            half = max(1, int(block.width * view.width / 2))
+            top = max(0, view.height // 2 - int(view.width * y) - half)
+            left = max(0, view.width // 2 + int(view.width * x) - half)
             colour = 255 * np.array(block.colour[:3])
-            image[row : row + 2 * half, column : column + 2 * half] = colour
-        return image
+            image[top : top + 2 * half, left : left + 2 * half] = colour
+        return Picture(image)
 
     def close(self) -> None:
         pass

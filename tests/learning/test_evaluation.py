@@ -101,9 +101,10 @@ def test_every_policy_gets_its_own_video(policies: tuple[str, ...], names: list[
 
 def test_picture_shows_six_moments_of_the_first_episode(tmp_path: Path) -> None:
     path = tmp_path / "new" / "expert.png"
-    config = EvaluationConfig(policy=("expert",), env="TPMReach-v0", episodes=1, picture=path)
+    asked: Any = {"policy": ("expert",), "env": "TPMReach-v0", "camera": "cup"}
+    config = EvaluationConfig(**asked, episodes=1, picture=path)
     evaluate(config, quiet())
-    env = gym.make("TPMReach-v0", render_mode="rgb_array")
+    env = gym.make("TPMReach-v0", render_mode="rgb_array", camera="cup")
     env.reset(seed=config.seed)
     first = env.render()
     env.close()

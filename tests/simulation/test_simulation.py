@@ -13,6 +13,7 @@ from tpm_gym.kinematics import ELBOWS_OUT, inverse, jacobian
 from tpm_gym.mechanism import PAPER_TPM
 from tpm_gym.simulation import Block, Scene, State
 from tpm_gym.simulation.engine import spline_weights
+from tpm_gym.simulation.imaging import View, camera_of
 
 HOME = np.array(PAPER_TPM.home)
 THETA = PAPER_TPM.inverse(PAPER_TPM.home)
@@ -220,15 +221,14 @@ def test_a_reset_forgets_old_contacts(with_block, drift):
 
 def test_pictures_show_the_scene_and_the_goal_marker(simulation):
     simulation.reset(THETA)
-    simulation.show_goal(np.array([(0.0, -0.03, 0.2)]))
-    first = simulation.render(160, 120)
+    view = View(camera_of("table", PAPER_TPM), 160, 120)
+    first = simulation.picture(view, [(0.0, -0.03, 0.2)]).colour
     assert (first.shape, first.dtype) == ((120, 160, 3), np.uint8)
     assert first.std() > 20
-    simulation.show_goal(np.array([(0.1, -0.03, 0.3)]))
-    second = simulation.render(160, 120)
+    second = simulation.picture(view, [(0.1, -0.03, 0.3)]).colour
     assert 0.0 < (first != second).any(axis=-1).mean() < 0.05
     # Equal states give equal pictures.
-    assert np.array_equal(second, simulation.render(160, 120))
+    assert np.array_equal(second, simulation.picture(view, [(0.1, -0.03, 0.3)]).colour)
 
 
 # -- solvers ---------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
 from tpm_gym.arrays import FloatArray, IntArray, numbers
+from tpm_gym.envs.rendering import Pixels, Rendering
 from tpm_gym.errors import ConfigurationError, EpisodeError, InputError
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.drives import Servo, drives_and_randomisation
@@ -29,7 +30,6 @@ __all__ = [
     "Observation",
     "action_space",
     "compute_reward",
-    "observation_space",
 ]
 
 OBSERVATION_BOUND = 10.0
@@ -85,8 +85,13 @@ class Core:
         drive: str | Servo | Mapping[str, Any] | None = None,
         randomisation: Randomisation | Mapping[str, Any] | None = None,
         physics: Any = None,
-        gui: bool = False,
+        observations: str = "state",
+        pixel_size: int = 84,
+        render_mode: str | None = None,
         renderer: str | None = None,
+        camera: Any = "table",
+        width: int = 640,
+        height: int = 480,
     ) -> None:
         """Check the options and start the simulation."""
         self.count = count
@@ -98,6 +103,13 @@ class Core:
         self.control = make_control(control, self.machine)
         self.drive, self.randomisation = drives_and_randomisation(drive, randomisation)
         self._altered = self.randomisation != Randomisation()
+        self._rendering = Rendering(self.machine, render_mode, camera, width, height)
+        self._pixels: Pixels | None = None
+        if observations == "pixels":
+            self._pixels = Pixels(self.task, camera, pixel_size)
+        elif observations != "state":
+            raise ConfigurationError("observations", observations, "'state' or 'pixels'")
+        gui = render_mode == "human"
         self._engine = {"engine": engine, "physics": physics, "gui": gui, "renderer": renderer}
         # As a dictionary, like in a spec that went through JSON.
         settings = is_dataclass(physics) and not isinstance(physics, type)
@@ -109,6 +121,7 @@ class Core:
             "randomisation": self.randomisation,
             "physics": asdict(physics) if settings else physics,
             "number of environments": count,
+            "observations": observations,
         }
         self._home = self.machine.require_inverse(np.array(self.machine.home))
         self._state: State | None = None
@@ -166,7 +179,6 @@ class Core:
         self._state = None
         self.episode[rows] += 1
         self._pending[:, rows] = 0.0
-        self._show_goal()
         noise = self._noise(rows)[rows] if self.randomisation.encoder_noise > 0 else None
         self.simulation.reset(rows, self._home, starts, plants, noise)
         return [self.randomisation.told(plant) if self._altered else {} for plant in plants]
@@ -211,8 +223,13 @@ class Core:
         reward = terms["goal"] + _goal_free(terms)
         if not (sound and math.isfinite(np.vdot(reward, reward))):
             raise _not_finite(task, state, achieved, terms)
+        observation = {"observation": observed, "achieved_goal": achieved, "desired_goal": desired}
+        if self._pixels is not None:
+            chosen = range(self.count) if rows is None else rows.tolist()
+            drawn = [(row, self._markers(row)) for row in chosen]
+            observation = self._pixels.observe(observation, self.simulation, drawn)
         return (
-            {"observation": observed, "achieved_goal": achieved, "desired_goal": desired},
+            observation,
             reward,
             {
                 "is_success": task.success(gap),
@@ -234,8 +251,36 @@ class Core:
             noise[row] = self.rngs[row].normal(0.0, self.randomisation.encoder_noise, 3)
         return noise
 
-    def _show_goal(self) -> None:
-        self.simulation.show_goal(self.task.markers(self.goals[0]))
+    # -- pictures ---------------------------------------------------------------------------
+
+    def frame(self, row: int) -> Any:
+        """Draw an environment as ``render_mode`` says.
+
+        Raises:
+            EpisodeError: If the environments are closed, or before the first reset.
+        """
+        return self._rendering.frame(self.simulation, row, self._markers(row))
+
+    def show(self) -> None:
+        """Update the window."""
+        self.simulation.show(self._rendering.view.camera, self._markers(0))
+
+    def _markers(self, row: int) -> FloatArray:
+        """Return the goal markers (k, 3) m of an environment."""
+        self.require_open()
+        if not self.rngs:
+            raise EpisodeError("there is nothing to draw before the first episode; call reset()")
+        return self.task.markers(self.goals[row])
+
+    @property
+    def observation_space(self) -> spaces.Dict:
+        """Space of one environment's observations."""
+        goal = _box(GOAL_BOUND, self.task.goal_size)
+        observation = _box(OBSERVATION_BOUND, self.task.observation_size)
+        vectors = {"observation": observation, "achieved_goal": goal, "desired_goal": goal}
+        if self._pixels is not None:
+            return spaces.Dict(self._pixels.spaces_of(vectors))
+        return spaces.Dict({**vectors})
 
     # -- state, end -------------------------------------------------------------------------
 
@@ -285,7 +330,6 @@ class Core:
         self._pending = snapshot.columns["pending"].copy()
         self._state = None
         self.episode += 1  # plans for the episode before are void
-        self._show_goal()
         self.simulation.restore(snapshot.simulation)
         return self.report()[0]
 
@@ -320,22 +364,10 @@ class Core:
         if self.closed:
             self.simulation.close()
         elif snapshot is not None:
-            self._show_goal()
             self.simulation.restore(snapshot)
 
 
 # -- observation, reward, info ------------------------------------------------------------------
-
-
-def observation_space(task: Task) -> spaces.Dict:
-    """Return the space of a task's observations."""
-    return spaces.Dict(
-        {
-            "observation": _box(OBSERVATION_BOUND, task.observation_size),
-            "achieved_goal": _box(GOAL_BOUND, task.goal_size),
-            "desired_goal": _box(GOAL_BOUND, task.goal_size),
-        }
-    )
 
 
 def action_space(task: Task) -> spaces.Box:

@@ -11,19 +11,20 @@ import numpy as np
 from gymnasium.utils import seeding
 from numpy.typing import ArrayLike, NDArray
 
-from tpm_gym.arrays import FloatArray, finite, is_whole
+from tpm_gym.arrays import FloatArray, finite
 from tpm_gym.envs.core import (
     Core,
     EnvSnapshot,
     Observation,
     action_space,
     compute_reward,
-    observation_space,
 )
+from tpm_gym.envs.rendering import RENDER_MODES
 from tpm_gym.errors import ActionError, ConfigurationError, ModeChangeError
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.display import has_display
 from tpm_gym.simulation.drives import Servo
+from tpm_gym.simulation.imaging import Camera
 from tpm_gym.simulation.randomisation import Randomisation
 from tpm_gym.simulation.simulation import Simulation
 from tpm_gym.simulation.state import CONTROL_PERIOD, State
@@ -86,6 +87,11 @@ class TPMEnv(gym.Env[Observation, Action]):
     Entries of the object exist in PickAndPlace only. Those of the robot come from the encoders
     alone, never from the simulated platform.
 
+    With ``observations="pixels"`` the dictionary has a fourth entry: ``pixels``, (84, 84, 3) uint8,
+    a picture by the option ``camera``. ``observation`` keeps the entries of the robot, and those of
+    the object are left out. The goals stay vectors, as hindsight needs them. ``achieved_goal``
+    tells where the block is, so a policy that shall see with the camera alone must not use it.
+
     ## Reward
 
     ``goal`` term + ``singularity`` term (+ ``approach`` term in PickAndPlaceDense).
@@ -136,7 +142,8 @@ class TPMEnv(gym.Env[Observation, Action]):
         control: ``"cartesian"`` or ``"joints"``.
         reward: ``"sparse"`` (None too) or ``"dense"``.
         engine: ``"pybullet"``, ``"analytic"``, ``"mujoco"`` (with the extra of that name), or a
-            name that :func:`tpm_gym.register_engine` knows. Only PyBullet opens a window.
+            name that :func:`tpm_gym.register_engine` knows. The analytic engine draws with
+            PyBullet, or with MuJoCo where PyBullet is not installed.
         machine: ``"paper"`` (None too), ``"wide"``, a name that :func:`tpm_gym.register_machine`
             knows, or a :class:`~tpm_gym.Machine`; a spec that goes through JSON needs a name.
         goals: ``"sampled"`` (None too), or ``"tempting"``: goal and start of the block lie next to
@@ -152,9 +159,18 @@ class TPMEnv(gym.Env[Observation, Action]):
             cannot be assembled.
         physics: Numerical settings of the engine, or a mapping of them. All have ``time_step``, s;
             the others are in ``tpm_gym.simulation.{bullet,mujoco,analytic}.physics``.
-        render_mode: None, ``"rgb_array"`` or ``"human"``.
+        observations: ``"state"``, or ``"pixels"``: see above.
+        pixel_size: Width and height of the pictures in pixel observations.
+        render_mode: What ``render()`` gives. None: nothing. ``"human"``: a window, in real time, on
+            a display. ``"rgb_array"``: (height, width, 3) uint8. ``"depth_array"``: (height, width)
+            float32, distance along the camera's axis in m, infinite where there is no body.
+            ``"rgbd_tuple"``: both. ``"segmentation"``: (height, width) int32, 0 background and
+            floor, 1 table, 2 robot, 3 vacuum cup, 4 + k object k. Goal markers have colours only.
         renderer: Renderer of pictures; for PyBullet ``"tiny"`` (any machine) or ``"egl"`` (GPU),
             for MuJoCo ``"egl"``, ``"osmesa"`` or ``"glfw"``; None for the first that works.
+        camera: ``"table"`` (task region, close by), ``"overview"`` (whole robot), ``"cup"``
+            (follows the cup), a :class:`~tpm_gym.simulation.Camera`, or a mapping of its
+            attributes.
         width: Width of pictures, pixels.
         height: Height of pictures, pixels.
 
@@ -171,7 +187,7 @@ class TPMEnv(gym.Env[Observation, Action]):
 
     # Gymnasium declares this as an instance's, so it cannot be a ClassVar.
     metadata: dict[str, Any] = {  # noqa: RUF012
-        "render_modes": ["human", "rgb_array"],
+        "render_modes": list(RENDER_MODES),
         "render_fps": round(1 / CONTROL_PERIOD),
     }
 
@@ -188,8 +204,11 @@ class TPMEnv(gym.Env[Observation, Action]):
         drive: str | Servo | Mapping[str, Any] | None = None,
         randomisation: Randomisation | Mapping[str, Any] | None = None,
         physics: Any = None,
+        observations: str = "state",
+        pixel_size: int = 84,
         render_mode: str | None = None,
         renderer: str | None = None,
+        camera: str | Camera | Mapping[str, Any] = "table",
         width: int = 640,
         height: int = 480,
     ) -> None:
@@ -198,10 +217,9 @@ class TPMEnv(gym.Env[Observation, Action]):
         modes = [mode for mode in self.metadata["render_modes"] if mode != "human" or has_display()]
         self.metadata = {**self.metadata, "render_modes": modes}
         if render_mode is not None and render_mode not in modes:
-            valid = f"None, {', '.join(map(repr, modes))} ('human' needs a display and PyBullet)"
+            valid = f"None, {', '.join(map(repr, modes))} ('human' needs a display)"
             raise ConfigurationError("render_mode", render_mode, valid)
         self.render_mode = render_mode
-        self._size = _pixels("width", width), _pixels("height", height)
         self._core = Core(
             task,
             control,
@@ -213,13 +231,18 @@ class TPMEnv(gym.Env[Observation, Action]):
             drive=drive,
             randomisation=randomisation,
             physics=physics,
-            gui=render_mode == "human",
+            observations=observations,
+            pixel_size=pixel_size,
+            render_mode=render_mode,
             renderer=renderer,
+            camera=camera,
+            width=width,
+            height=height,
         )
         self.task, self.machine = self._core.task, self._core.machine
         self.control, self.drive = self._core.control, self._core.drive
         self.randomisation = self._core.randomisation
-        self.observation_space = observation_space(self.task)
+        self.observation_space = self._core.observation_space
         self.action_space = action_space(self.task)
         self._action = (self.task.action_size,)
         self._shown = 0.0  # when the last frame was due, s of the performance counter
@@ -305,16 +328,24 @@ class TPMEnv(gym.Env[Observation, Action]):
         """
         return compute_reward(self.task, achieved_goal, desired_goal, info)
 
-    def render(self) -> NDArray[np.uint8] | None:
-        """Draw the scene as (height, width, 3) RGB; in ``human`` mode, wait for real time."""
-        self._core.require_open()
-        if self.render_mode == "rgb_array":
-            return self.simulation.render(*self._size)
+    def render(self) -> Any:
+        """Draw the scene as ``render_mode`` says; in ``human`` mode, wait for real time.
+
+        Returns:
+            See the argument ``render_mode`` of the class.
+
+        Raises:
+            EpisodeError: If the environment is closed, or before the first reset.
+            ConfigurationError: If the engine has no such pictures.
+        """
         if self.render_mode == "human":
+            self._core.show()
             now = time.perf_counter()
             self._shown = max(self._shown + CONTROL_PERIOD, now)
             time.sleep(self._shown - now)
-        return None
+            return None
+        self._core.require_open()
+        return None if self.render_mode is None else self._core.frame(0)
 
     def close(self) -> None:
         """Close the simulation; harmless the second time."""
@@ -372,12 +403,6 @@ class TPMEnv(gym.Env[Observation, Action]):
         observation = self._core.restore(snapshot)
         self._np_random = self._core.rngs[0]
         return {name: values[0] for name, values in observation.items()}
-
-
-def _pixels(name: str, value: Any) -> int:
-    if is_whole(value, 16) and value <= 4096:
-        return int(value)
-    raise ConfigurationError(name, value, "a whole number of pixels from 16 to 4096")
 
 
 def _row(

@@ -19,8 +19,8 @@ from tpm_gym.envs.core import (
     Observation,
     action_space,
     compute_reward,
-    observation_space,
 )
+from tpm_gym.envs.rendering import RENDER_MODES
 from tpm_gym.errors import (
     ActionError,
     ConfigurationError,
@@ -29,6 +29,7 @@ from tpm_gym.errors import (
     ResetOptionError,
 )
 from tpm_gym.simulation.engine import most_robots
+from tpm_gym.simulation.imaging import tile
 from tpm_gym.simulation.state import CONTROL_PERIOD, State
 from tpm_gym.tasks.task import Task
 
@@ -61,7 +62,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             ``reset(options={"reset_mask": ...})``).
         stagger: Whether the first episodes after a reset of all have different lengths, so that
             not all end at the same step. It makes on-policy batches more even.
-        render_mode: None, or ``"rgb_array"`` of one environment.
+        render_mode: One of :class:`~tpm_gym.TPMEnv`'s, but not ``"human"``.
         options: Other options of :class:`~tpm_gym.TPMEnv`.
 
     Raises:
@@ -93,14 +94,18 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         if not isinstance(stagger, bool):
             raise ConfigurationError("stagger", stagger, "True or False")
         at_most = most_robots(engine)
-        if render_mode is not None and (render_mode != "rgb_array" or num_envs != 1):
-            valid = "None, or 'rgb_array' of one environment"
+        modes = [mode for mode in RENDER_MODES if mode != "human"]
+        if render_mode is not None and render_mode not in modes:
+            valid = f"None, {', '.join(map(repr, modes))}; windows show single environments"
             raise ConfigurationError("render_mode", render_mode, valid)
+        if num_threads > 1 and options.get("observations") == "pixels":
+            raise ConfigurationError("num_threads", num_threads, "1 with observations='pixels'")
+        options["render_mode"] = render_mode
         self.render_mode = render_mode
         self.num_envs = int(num_envs)
         self.autoreset_mode = _mode_of(autoreset_mode)
         self.metadata = {
-            "render_modes": ["rgb_array"],
+            "render_modes": modes,
             "render_fps": round(1 / CONTROL_PERIOD),
             "autoreset_mode": self.autoreset_mode,
         }
@@ -120,7 +125,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         first = self._parts[0].core
         self.task, self.machine, self.control = first.task, first.machine, first.control
         self.drive, self.randomisation = first.drive, first.randomisation
-        self.single_observation_space = observation_space(self.task)
+        self.single_observation_space = first.observation_space
         self.single_action_space = action_space(self.task)
         self._shape = self.num_envs, self.task.action_size
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -242,10 +247,35 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         }
         return joined, _joined(infos, [part.core.count for part in self._parts])
 
-    def render(self) -> tuple[NDArray[np.uint8], ...]:
-        """Draw the one environment as (480, 640, 3) RGB."""
+    def render(self) -> tuple[Any, ...] | None:
+        """Draw all environments; see :meth:`TPMEnv.render`."""
         self._require_open()
-        return (self._parts[0].core.simulation.render(640, 480),)
+        if self.render_mode is None:
+            return None
+        return tuple(self._frame(row) for row in range(self.num_envs))
+
+    def _frame(self, row: int) -> Any:
+        part = next(k for k, rows in enumerate(self._slices) if row < rows.stop)
+        return self._parts[part].core.frame(row - self._slices[part].start)
+
+    def render_tile(self, count: int = 16, columns: int | None = None) -> NDArray[Any]:
+        """Draw the first environments side by side, as one picture.
+
+        Args:
+            count: Number of environments; all of them if there are fewer.
+            columns: Environments in a row; None for about as many as rows.
+
+        Raises:
+            ConfigurationError: If ``render_mode`` is None or ``"rgbd_tuple"``.
+        """
+        self._require_open()
+        for name, value in (("count", count), ("columns", 1 if columns is None else columns)):
+            if not is_whole(value, 1):
+                raise ConfigurationError(name, value, "a whole number, 1 or more")
+        if self.render_mode in (None, "rgbd_tuple"):
+            valid = "'rgb_array', 'depth_array' or 'segmentation'"
+            raise ConfigurationError("render_mode", self.render_mode, valid)
+        return tile([self._frame(row) for row in range(min(count, self.num_envs))], columns)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the simulations and the threads."""

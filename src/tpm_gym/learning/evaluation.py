@@ -85,6 +85,9 @@ class EvaluationConfig:
     """Write a PNG of six moments of the first episode to this file; several policies get a file
     each."""
 
+    camera: Literal["table", "overview", "cup"] = "table"
+    """Camera of video and picture: the task region, the whole robot, or close to the cup."""
+
     trust_pickle: bool = False
     """Load .zip files of Stable-Baselines3 as well: they hold pickles, which can run any code."""
 
@@ -190,7 +193,8 @@ def _make_envs(
     options: dict[str, Any] = {name: getattr(config, name) for name in ("goals", "penalty_weight")}
     options["randomisation"] = parse_randomisation(config.randomisation)
     options |= config.env_options.given()
-    return make_envs(config.env, count, render_mode=render_mode, **options)
+    pictures = {"render_mode": render_mode, "camera": config.camera}
+    return make_envs(config.env, count, **pictures, **options)
 
 
 def parse_randomisation(entries: Sequence[str]) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from tpm_gym.envs.vector import TPMVectorEnv
 from tpm_gym.learning.provenance import write_whole
 from tpm_gym.learning.rollout import Policy, run_episodes
+from tpm_gym.simulation.imaging import tile
 
 Frame = NDArray[np.uint8]
 
@@ -28,7 +29,9 @@ def write_video(
         writer: Any = imageio.get_writer(part, **options)
         with writer as video:
             add = video.append_data
-            run_episodes(envs, policy, episodes, first_seed, on_frame=lambda: add(envs.render()[0]))
+            run_episodes(
+                envs, policy, episodes, first_seed, on_frame=lambda: add(envs.render_tile(1))
+            )
 
     write_whole(path, write)
 
@@ -38,7 +41,7 @@ def write_contact_sheet(path: Path, envs: TPMVectorEnv, policy: Policy, seed: in
     import imageio.v3 as imageio
 
     frames: list[Any] = []
-    run_episodes(envs, policy, 1, seed, on_frame=lambda: frames.append(envs.render()[0]))
+    run_episodes(envs, policy, 1, seed, on_frame=lambda: frames.append(envs.render_tile(1)))
     sheet = contact_sheet(frames)
     write_whole(path, lambda part: imageio.imwrite(part, sheet))
 
@@ -49,6 +52,4 @@ def contact_sheet(frames: Sequence[Frame]) -> Frame:
     differ = [(frame != frames[-1]).any(axis=-1).mean() > 1e-2 for frame in frames]
     last = max(np.flatnonzero(differ), default=len(frames) - 2) + 1
     moments = np.linspace(0, last, _ROWS * _COLUMNS).round().astype(int)
-    chosen = [frames[moment] for moment in moments]
-    rows = [np.hstack(chosen[row * _COLUMNS : (row + 1) * _COLUMNS]) for row in range(_ROWS)]
-    return np.vstack(rows)
+    return tile([frames[moment] for moment in moments], _COLUMNS)

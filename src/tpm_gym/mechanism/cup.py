@@ -75,7 +75,7 @@ class VacuumCup(NamedTuple):
     def link(self, platform: str, point_p: Vector) -> Link:
         """Build the cup as a link that slides in the platform of that name."""
         size, middle = (self.radius, self.bellows, 0.0), (0.0, 0.0, self.length - self.bellows / 2)
-        bellows = Solid("cylinder", size, middle, _SILICONE, colour="red", collides=True)
+        bellows = Solid("cylinder", size, middle, _SILICONE, colour="violet", collides=True)
         size, middle = (0.003, 0.04, 0.0), (0.0, 0.0, self.length - 0.02)
         plunger = Solid("cylinder", size, middle, STEEL, colour="steel")
         # The stop is 1 mm beyond the rest position; else stop and spring would act on each other.

@@ -141,14 +141,14 @@ def _branch_2(g: Geometry) -> tuple[Link, ...]:
     """Build arm 5, rod 6, link 3', link 7, platform 1, the cup that slides in it, end link 10."""
     minus_y, point_p = (0.0, -1.0, 0.0), (g.l2, 0.0, g.l6)
     # From F1 to D3
-    plate = Solid("box", (2 * g.l2 + 0.04, 0.045, 0.008), point_p, ALUMINIUM, colour="light")
+    plate = Solid("box", (2 * g.l2 + 0.04, 0.045, 0.008), point_p, ALUMINIUM, colour="yellow")
     tube, bore = (3 * g.l5, 0.025, 0.018), (3 * g.l5, 0.019, 0.012)
     link_3p = (
         Solid("box", tube, (1.5 * g.l5, 0.0, 0.0), ALUMINIUM, bore=bore, colour="blue"),
         _bar("y", 0.016, 0.011, density=STEEL),
     )
     link_7 = (
-        Solid("box", (g.l7, 0.020, 0.008), (g.l7 / 2, 0.0, 0.0), ALUMINIUM, colour="yellow"),
+        Solid("box", (g.l7, 0.020, 0.008), (g.l7 / 2, 0.0, 0.0), ALUMINIUM, colour="light"),
         _bar("z", 0.008, 0.011, density=STEEL),
         _bar("z", 0.008, 0.011, (g.l7, 0.0, 0.0), density=STEEL),
     )

@@ -2,12 +2,14 @@
 
 from tpm_gym.simulation.drives import Servo
 from tpm_gym.simulation.engine import Engine, register_engine
+from tpm_gym.simulation.imaging import Camera
 from tpm_gym.simulation.randomisation import Plant, Randomisation
 from tpm_gym.simulation.simulation import Simulation, Snapshot
 from tpm_gym.simulation.state import Block, Scene, State
 
 __all__ = [
     "Block",
+    "Camera",
     "Engine",
     "Plant",
     "Randomisation",

@@ -21,6 +21,7 @@ from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Quaternion, Vector, 
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.drives import Servo, ServoDrives
+from tpm_gym.simulation.imaging import Camera, Picture, View
 from tpm_gym.simulation.randomisation import Plant
 from tpm_gym.simulation.state import Scene
 from tpm_gym.simulation.vacuum import Hold
@@ -302,11 +303,14 @@ class Engine(Protocol):
     def restore(self, saved: Any) -> None:
         """Continue from the result of ``save``; number of robots and plants must be equal."""
 
-    def show_goal(self, markers: FloatArray) -> None:
-        """Move the goal markers of the first robot to ``markers`` (k, 3) m."""
+    def show(self, camera: Camera, markers: FloatArray) -> None:
+        """Update the window: its camera, the first robot, and the goal markers, (k, 3) m.
 
-    def picture(self, width: int, height: int) -> NDArray[np.uint8]:
-        """Draw the first robot and its scene as an RGB image (height, width, 3)."""
+        An engine whose constructor has no keyword ``gui`` is never asked to.
+        """
+
+    def picture(self, row: int, view: View) -> Picture:
+        """Draw the robot of ``row`` and its scene, without goal markers."""
 
     def close(self) -> None:
         """Release all resources; a second call does nothing."""

@@ -11,10 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray, finite
 from tpm_gym.errors import ClosureError
+from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.tpm import PAPER_TPM
 from tpm_gym.simulation.drives import Servo, require_servo
 from tpm_gym.simulation.engine import Engine, Path, Readout, make_engine, spline_weights
+from tpm_gym.simulation.imaging import Camera, Picture, View, paint_markers, paint_shadows
 from tpm_gym.simulation.randomisation import NOMINAL, Plant
 from tpm_gym.simulation.state import CONTROL_PERIOD, Scene, State
 
@@ -182,10 +184,6 @@ class Simulation:
         for k in changed:
             self._plants[rows[k]] = plants[k]
 
-    def show_goal(self, markers: FloatArray) -> None:
-        """Move the goal markers of the first robot to ``markers`` (k, 3) m, world."""
-        self.engine.show_goal(markers)
-
     def move(
         self, commands: FloatArray, vacuum: BoolArray, noise: FloatArray | None = None
     ) -> None:
@@ -301,9 +299,32 @@ class Simulation:
         self._disturbed = bool(self._bias.any() or self._noise.any())
         self._readout = self.engine.read()
 
-    def render(self, width: int, height: int) -> NDArray[np.uint8]:
-        """Draw the first robot and its scene as an RGB image (height, width, 3)."""
-        return self.engine.picture(width, height)
+    def picture(self, view: View, markers: ArrayLike = (), row: int = 0) -> Picture:
+        """Draw a robot and its scene.
+
+        Args:
+            view: Camera, size, and whether the ids of bodies are wanted.
+            markers: (k, 3) m, world, goal markers. They have colours, no depth and no id.
+            row: Robot.
+        """
+        camera = view.camera.following(self._readout.position[row])
+        view = view._replace(camera=camera)
+        picture = self.engine.picture(row, view)
+        paint_shadows(picture, view, self._casters(row))
+        paint_markers(picture, view, markers, self.scene.marker_radius)
+        return picture
+
+    def _casters(self, row: int) -> list[list[float]]:
+        """Return position and radius of the cup and the objects, (k, 4) m."""
+        x, y, z = self._readout.position[row].tolist()
+        widths = [block.width / 2 for block in self.scene.objects]
+        places = self._readout.object_position[row].tolist()
+        objects = [[*place, half] for place, half in zip(places, widths, strict=True)]
+        return [[x, y, z - CUP.length, CUP.radius], *objects]
+
+    def show(self, camera: Camera, markers: FloatArray) -> None:
+        """Update the window with the first robot and goal markers (k, 3) m, world."""
+        self.engine.show(camera.following(self._readout.position[0]), markers)
 
     def close(self) -> None:
         """Close the engine; a second call does nothing."""

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tpm_gym.arrays import BoolArray, FloatArray, finite
-from tpm_gym.errors import ConfigurationError, ResetOptionError, UnreachableError
+from tpm_gym.errors import ConfigurationError, InputError, ResetOptionError, UnreachableError
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
@@ -413,8 +413,15 @@ class Task(ABC):
         return scaled
 
     def decode(self, observation: ArrayLike) -> dict[str, FloatArray]:
-        """Invert :meth:`observe`: name -> (..., k) in SI units."""
+        """Invert :meth:`observe`: name -> (..., k) in SI units.
+
+        Raises:
+            InputError: If the observation has another length, as beside pixels.
+        """
         vector = np.asarray(observation, dtype=np.float64)
+        if vector.shape[-1:] != (self.observation_size,):
+            valid = f"(..., {self.observation_size}), as with observations='state'"
+            raise InputError("observation", vector.shape, valid)
         result, start = {}, 0
         for entry in self.entries:
             stop = start + len(entry.scale)

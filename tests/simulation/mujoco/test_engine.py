@@ -334,8 +334,10 @@ def test_a_mechanism_torn_apart_is_a_typed_error_and_nothing_else(
 # -- what it refuses -------------------------------------------------------------------------------
 
 
-def test_a_window_is_refused_by_name() -> None:
-    with pytest.raises(ConfigurationError, match=r"^render_mode = 'human'.*opens no window"):
+def test_a_window_without_a_display_is_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    with pytest.raises(ConfigurationError, match=r"^render_mode = 'human'.*without a display"):
         Alone(engine="mujoco", gui=True)
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism import PAPER_TPM
 from tpm_gym.simulation import Block, Scene
+from tpm_gym.simulation.imaging import View, camera_of
 from tpm_gym.simulation.mujoco import pictures as module
 
 HOME = PAPER_TPM.home
@@ -31,9 +32,13 @@ def simulation() -> Iterator[Alone]:
     simulation.close()
 
 
-def picture(simulation: Alone) -> NDArray[Any]:
+GOAL = (-0.1, -0.03, 0.2)
+VIEW = View(camera_of("table", PAPER_TPM), WIDTH, HEIGHT)
+
+
+def picture(simulation: Alone, goal: Any = GOAL) -> NDArray[Any]:
     try:
-        return simulation.render(WIDTH, HEIGHT).astype(int)
+        return simulation.picture(VIEW, goal).colour.astype(int)
     except ConfigurationError:
         pytest.skip("needs OpenGL")
 
@@ -45,7 +50,7 @@ def middle(pixels: NDArray[Any]) -> NDArray[Any]:
 
 
 def red(image: NDArray[Any]) -> NDArray[Any]:
-    """The block; the cup's red has less blue."""
+    """The block."""
     colour = np.moveaxis(image, -1, 0) / (image[..., 0] + 1)
     return (image[..., 0] > 100) & (colour[1] < 0.3) & (abs(colour[2] - 0.4) < 0.08)
 
@@ -58,10 +63,7 @@ def green(image: NDArray[Any]) -> NDArray[Any]:
 def test_pictures_are_those_of_the_other_engine(simulation: Alone) -> None:
     other = Alone(Scene(objects=(Block(),)))
     other.reset(THETA, {"object": (0.1, -0.1, 0.015)})
-    goal = np.array([[-0.1, -0.03, 0.2]])
-    for one in (simulation, other):
-        one.show_goal(goal)
-    ours, theirs = picture(simulation), other.render(WIDTH, HEIGHT).astype(int)
+    ours, theirs = picture(simulation), picture(other)
     other.close()
     assert ours.shape == (HEIGHT, WIDTH, 3)
     for marked in (red, green):
@@ -74,10 +76,10 @@ def test_pictures_are_those_of_the_other_engine(simulation: Alone) -> None:
 def test_what_moves_is_drawn_elsewhere_before_the_next_time_step(simulation: Alone) -> None:
     seen = []
     for x in (-0.1, 0.1):
-        simulation.show_goal(np.array([[x, -0.03, 0.2]]))
-        seen.append(middle(green(picture(simulation))))
+        goal = (x, -0.03, 0.2)
+        seen.append(middle(green(picture(simulation, goal))))
         simulation.move(HOME)
-        seen.append(middle(green(picture(simulation))))
+        seen.append(middle(green(picture(simulation, goal))))
     assert np.linalg.norm(seen[0] - seen[2]) > 10
     np.testing.assert_allclose(seen[::2], seen[1::2], atol=0.5)
     before = middle(red(picture(simulation)))
@@ -99,7 +101,8 @@ def test_a_picture_changes_nothing(simulation: Alone) -> None:
 
 def test_sizes_may_change_and_a_closed_one_draws_again(simulation: Alone) -> None:
     picture(simulation)
-    assert simulation.render(64, 48).shape == (48, 64, 3)
+    small = VIEW._replace(width=64, height=48)
+    assert simulation.picture(small).colour.shape == (48, 64, 3)
     simulation.close()
     simulation.close()
     assert picture(simulation).shape == (HEIGHT, WIDTH, 3)
@@ -122,7 +125,7 @@ def test_where_there_is_no_way_to_opengl_the_error_names_what_there_is(
     monkeypatch.setattr(module.importlib, "import_module", missing)
     monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
     with pytest.raises(ConfigurationError, match="engine='pybullet' draws anywhere") as caught:
-        simulation.render(WIDTH, HEIGHT)
+        simulation.picture(VIEW)
     assert caught.value.name == "renderer"
     assert "PYOPENGL_PLATFORM" not in os.environ
     simulation.move(HOME)

@@ -16,7 +16,6 @@ from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray
 from tpm_gym.mechanism.machine import Machine
@@ -31,11 +30,14 @@ from tpm_gym.simulation.analytic.forward_dynamics import (
 from tpm_gym.simulation.analytic.physics import Physics
 from tpm_gym.simulation.drives import Servo, ServoDrives
 from tpm_gym.simulation.engine import Engine, Path, Readout, make_engine
+from tpm_gym.simulation.imaging import Camera, Picture, View
 from tpm_gym.simulation.randomisation import Plant
 from tpm_gym.simulation.settings import settings_of
 from tpm_gym.simulation.state import Scene
 
 __all__ = ["AnalyticEngine"]
+
+_FIRST = np.zeros(1, dtype=np.int64)
 
 _CHECK_ABOVE = 0.5
 """Fraction of a motor's largest torque above which the torques of all time steps are computed."""
@@ -50,6 +52,7 @@ class AnalyticEngine:
     created for the first picture.
 
     Args:
+        gui: Whether to open a window of the engine that draws.
         renderer: Renderer of the engine that draws the pictures.
         physics: A :class:`Physics` or a mapping of its attributes.
         drive: Servo drives of the motors; None for ideal drives.
@@ -63,17 +66,22 @@ class AnalyticEngine:
     """
 
     def __init__(
-        self, *, renderer: str | None = None, physics: Any = None, drive: Servo | None = None
+        self,
+        *,
+        gui: bool = False,
+        renderer: str | None = None,
+        physics: Any = None,
+        drive: Servo | None = None,
     ) -> None:
         """Check the options."""
         self.physics = settings_of(Physics, "physics", physics)
         self.time_step = self.physics.time_step
-        self._servo, self._renderer = drive, renderer
+        self._servo, self._renderer, self._gui = drive, renderer, gui
         self._steps = self.physics.substeps
         # Number of time steps at the end of a control period whose joint positions are needed
         self._tail = {"none": 2, "last": 3, "every": self._steps}[self.physics.torques]
+        self._draws = "pybullet" if find_spec("pybullet") else "mujoco"
         self._artist: Engine | None = None
-        self._markers: FloatArray | None = None
         self.torques: FloatArray | None = None
 
     def load(self, machine: Machine, scene: Scene, count: int) -> None:
@@ -97,6 +105,8 @@ class AnalyticEngine:
         self._carried = np.zeros(count)  # kg
         self._mode_left = np.zeros(count, dtype=np.int8)
         self._behind = np.zeros(count, dtype=np.bool_)  # whether an ideal motor lacked torque
+        if self._gui:
+            self._artist = self._new_artist()
 
     def alter(self, rows: IntArray, plants: Sequence[Plant]) -> None:
         """Implement :meth:`Engine.alter`."""
@@ -294,24 +304,28 @@ class AnalyticEngine:
         if self._drives is not None:
             self._drives.memory[:] = saved["drives"]
 
-    def show_goal(self, markers: FloatArray) -> None:
-        """Implement :meth:`Engine.show_goal`."""
-        self._markers = markers
+    def show(self, camera: Camera, markers: FloatArray) -> None:
+        """Implement :meth:`Engine.show`."""
+        self._pose_artist(0).show(camera, markers)
 
-    def picture(self, width: int, height: int) -> NDArray[np.uint8]:
+    def picture(self, row: int, view: View) -> Picture:
         """Implement :meth:`Engine.picture`."""
-        first = np.zeros(1, dtype=np.int64)
+        return self._pose_artist(row).picture(0, view)
+
+    def _pose_artist(self, row: int) -> Engine:
+        """Return the engine that draws, with the robot of ``row`` and its objects placed."""
         if self._artist is None:
-            drawn = "pybullet" if find_spec("pybullet") else "mujoco"
-            self._artist = make_engine(drawn, renderer=self._renderer)
-            self._artist.load(self._machine, self._scene, 1)
-        theta = self._machine.require_inverse(self._position[:1])
+            self._artist = self._new_artist()
+        theta = self._machine.require_inverse(self._position[[row]])
         now = self._contact.read()
-        objects = np.concatenate([now.position[:1], now.quaternion[:1]], axis=2)
-        self._artist.place(first, theta, objects)
-        if self._markers is not None:
-            self._artist.show_goal(self._markers)
-        return self._artist.picture(width, height)
+        objects = np.concatenate([now.position[[row]], now.quaternion[[row]]], axis=2)
+        self._artist.place(_FIRST, theta, objects)
+        return self._artist
+
+    def _new_artist(self) -> Engine:
+        artist = make_engine(self._draws, gui=self._gui, renderer=self._renderer)
+        artist.load(self._machine, self._scene, 1)
+        return artist
 
     def close(self) -> None:
         """Implement :meth:`Engine.close`."""

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import pybullet
 from numpy.typing import NDArray
 
@@ -20,6 +19,7 @@ from tpm_gym.simulation.bullet.robot import Robot
 from tpm_gym.simulation.bullet.scenery import Scenery
 from tpm_gym.simulation.drives import Servo, ServoDrives
 from tpm_gym.simulation.engine import Engine, Path, Pose, Readout, Twist, drives_of_one, steering
+from tpm_gym.simulation.imaging import Camera, Picture, View
 from tpm_gym.simulation.randomisation import NOMINAL, Plant
 from tpm_gym.simulation.settings import settings_of
 from tpm_gym.simulation.state import Scene
@@ -64,6 +64,7 @@ class BulletEngine:
         self.time_step = self.physics.time_step
         self._gui, self._renderer, self._servo = gui, renderer, drive
         self._drives: ServoDrives | None = None
+        self._aimed: Camera | None = None
         self._torque: Vector | None = _ZERO
         self.client = Client(self.physics, gui, renderer)
 
@@ -78,9 +79,7 @@ class BulletEngine:
         self._machine = machine
         self.robot = Robot(self.client, machine.mechanism, machine.mount)
         scene = self._scene
-        self._scenery = Scenery(self.client, scene, machine.table)
-        if self._gui:
-            self._scenery.aim_window()
+        self._scenery = Scenery(self.client, scene, machine.table, self._gui)
         if self._gui or self._renderer == "egl":
             self.robot.paint()
         self.bodies = self._scenery.bodies
@@ -158,8 +157,11 @@ class BulletEngine:
             torque = a, b, c
         return theta, rates, torque
 
-    def show_goal(self, markers: FloatArray) -> None:
-        """Implement :meth:`Engine.show_goal`."""
+    def show(self, camera: Camera, markers: FloatArray) -> None:
+        """Implement :meth:`Engine.show`."""
+        if camera != self._aimed:  # else the user may move the camera
+            self._aimed = camera
+            self._scenery.aim_window(camera)
         self._scenery.move_markers(markers.tolist())
 
     def save(self) -> Any:
@@ -183,9 +185,9 @@ class BulletEngine:
         self._friction.reset()
         self._cup.take(saved.grip)
 
-    def picture(self, width: int, height: int) -> NDArray[np.uint8]:
+    def picture(self, row: int, view: View) -> Picture:
         """Implement :meth:`Engine.picture`."""
-        return self._scenery.picture(width, height, self.client.renderer)
+        return self._scenery.picture(view, self.robot.tool)
 
     def close(self) -> None:
         """Implement :meth:`Engine.close`."""

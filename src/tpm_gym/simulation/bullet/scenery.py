@@ -11,10 +11,26 @@ from numpy.typing import NDArray
 from tpm_gym.arrays import Vector
 from tpm_gym.simulation.bullet.client import Client
 from tpm_gym.simulation.engine import UPRIGHT, Pose, Twist
-from tpm_gym.simulation.stage import CAMERA, FLOOR, FLOOR_EDGE, LIGHT, MARKER_COLOUR, TABLE, Slab
+from tpm_gym.simulation.imaging import (
+    BACKGROUND,
+    CUP,
+    FAR,
+    NEAR,
+    OBJECTS,
+    ROBOT,
+    TABLETOP,
+    Camera,
+    Picture,
+    View,
+    metres,
+)
+from tpm_gym.simulation.stage import FLOOR, FLOOR_EDGE, LIGHT, MARKER_COLOUR, TABLE, Slab
 from tpm_gym.simulation.state import Block, Scene
 
 __all__ = ["Scenery"]
+
+_WINDOW_OPENING = 45.0  # degrees; vertical field of view of PyBullet's window, which is fixed
+_SHADING = {"lightAmbientCoeff": 0.6, "lightDiffuseCoeff": 0.35, "lightSpecularCoeff": 0.05}
 
 
 class Scenery:
@@ -24,6 +40,7 @@ class Scenery:
         client: Physics client.
         scene: Objects and markers to load.
         table: Half edge lengths of the tables along x and y, m.
+        window: Whether a window shows the scene. Only a window needs bodies as goal markers.
 
     Attributes:
         bodies: Body ids of the objects, in the order of the scene.
@@ -32,19 +49,16 @@ class Scenery:
             first table is drawn, and exists also without objects.
     """
 
-    def __init__(self, client: Client, scene: Scene, table: tuple[float, float]) -> None:
+    def __init__(
+        self, client: Client, scene: Scene, table: tuple[float, float], window: bool
+    ) -> None:
         """Load tables, floor, markers and objects into the client."""
         self._client = client
         self._blocks = scene.objects
         self.tables = [self._add_slab(TABLE, table)]
         self.tables += [self._add_slab(TABLE, table, drawn=False) for _ in self._blocks[1:]]
-        self._add_slab(FLOOR, (FLOOR_EDGE, FLOOR_EDGE))
-        shape = client.createVisualShape(
-            client.GEOM_SPHERE, radius=scene.marker_radius, rgbaColor=MARKER_COLOUR
-        )
-        self._markers = [
-            client.createMultiBody(baseVisualShapeIndex=shape) for _ in range(scene.markers)
-        ]
+        self._floor = self._add_slab(FLOOR, (FLOOR_EDGE, FLOOR_EDGE))
+        self._markers = [self._add_marker(scene) for _ in range(scene.markers)] if window else []
         self.bodies = [self._add_block(block) for block in self._blocks]
         for index, body in enumerate(self.bodies):
             for other, top in enumerate(self.tables):
@@ -76,9 +90,16 @@ class Scenery:
         place = (0.0, 0.0, height)
         return int(client.createMultiBody(mass, solid, shape, basePosition=place))
 
+    def _add_marker(self, scene: Scene) -> int:
+        client = self._client
+        shape = client.createVisualShape(
+            client.GEOM_SPHERE, radius=scene.marker_radius, rgbaColor=MARKER_COLOUR
+        )
+        return int(client.createMultiBody(baseVisualShapeIndex=shape))
+
     def move_markers(self, positions: Sequence[Vector]) -> None:
-        """Move the goal markers to ``positions`` (m, world)."""
-        for marker, position in zip(self._markers, positions, strict=True):
+        """Move the goal markers of the window to ``positions`` (m, world)."""
+        for marker, position in zip(self._markers, positions, strict=False):
             self._client.resetBasePositionAndOrientation(marker, position, UPRIGHT)
 
     def place(self, placed: Sequence[tuple[Pose, Twist]]) -> None:
@@ -104,37 +125,51 @@ class Scenery:
                 body, -1, mass=block.mass, localInertiaDiagonal=moments, lateralFriction=rough
             )
 
-    def aim_window(self) -> None:
-        """Set the camera of the window to the view of :meth:`picture`."""
+    def aim_window(self, camera: Camera) -> None:
+        """Set the camera of the window."""
         self._client.resetDebugVisualizerCamera(
-            cameraDistance=0.7 * CAMERA.distance,  # the window's field of view is wider
-            cameraYaw=CAMERA.yaw,
-            cameraPitch=CAMERA.pitch,
-            cameraTargetPosition=CAMERA.target,
+            cameraDistance=camera.distance * camera.opening / _WINDOW_OPENING,
+            cameraYaw=camera.yaw,
+            cameraPitch=camera.pitch,
+            cameraTargetPosition=camera.target,
         )
 
-    def picture(self, width: int, height: int, renderer: int) -> NDArray[np.uint8]:
-        """Draw the scene as an RGB image (height, width, 3)."""
-        client = self._client
-        view = client.computeViewMatrixFromYawPitchRoll(
-            cameraTargetPosition=CAMERA.target,
-            distance=CAMERA.distance,
-            yaw=CAMERA.yaw,
-            pitch=CAMERA.pitch,
-            roll=0.0,
-            upAxisIndex=2,
+    def picture(self, view: View, tool: tuple[int, int]) -> Picture:
+        """Draw the scene; ``tool`` is the address of the link with the vacuum cup."""
+        client, camera = self._client, view.camera
+        looking = client.computeViewMatrixFromYawPitchRoll(
+            camera.target, camera.distance, camera.yaw, camera.pitch, 0.0, 2
         )
-        projection = client.computeProjectionMatrixFOV(
-            fov=CAMERA.opening, aspect=width / height, nearVal=0.1, farVal=6.0
-        )
-        image = client.getCameraImage(
-            width,
-            height,
-            viewMatrix=view,
+        aspect = view.width / view.height
+        projection = client.computeProjectionMatrixFOV(view.opening, aspect, NEAR, FAR)
+        flags = client.ER_NO_SEGMENTATION_MASK
+        if view.segmented:
+            flags = client.ER_SEGMENTATION_MASK_OBJECT_AND_LINKINDEX
+        _, _, colour, depth, bodies = client.getCameraImage(
+            view.width,
+            view.height,
+            viewMatrix=looking,
             projectionMatrix=projection,
             lightDirection=LIGHT,
             shadow=0,  # the software renderer's shadows leave blotches on large faces
-            renderer=renderer,
+            renderer=client.renderer,
+            flags=flags,
+            **_SHADING,
         )
-        pixels = np.asarray(image[2], dtype=np.uint8).reshape(height, width, 4)
-        return np.array(pixels[..., :3])
+        size = view.height, view.width
+        pixels = np.asarray(colour, dtype=np.uint8).reshape(*size, 4)
+        ids = None
+        if view.segmented:
+            ids = self._ids(np.asarray(bodies, dtype=np.int32).reshape(size), tool)
+        return Picture(np.array(pixels[..., :3]), metres(1 - np.asarray(depth).reshape(size)), ids)
+
+    def _ids(self, bodies: NDArray[np.int32], tool: tuple[int, int]) -> NDArray[np.int32]:
+        """Convert PyBullet's mask to the ids of a segmentation."""
+        body = np.where(bodies < 0, -1, bodies & 0xFFFFFF)
+        ids = np.full(body.shape, ROBOT, dtype=np.int32)
+        ids[(body == tool[0]) & (bodies >> 24 == tool[1] + 1)] = CUP
+        ids[np.isin(body, [-1, self._floor])] = BACKGROUND
+        ids[np.isin(body, self.tables)] = TABLETOP
+        for index, block in enumerate(self.bodies):
+            ids[body == block] = OBJECTS + index
+        return ids

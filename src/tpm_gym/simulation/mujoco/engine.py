@@ -14,12 +14,14 @@ from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.drives import Servo, ServoDrives
 from tpm_gym.simulation.engine import Engine, Path, Pose, Readout, drives_of_one, steering
+from tpm_gym.simulation.imaging import Camera, Picture, View
 from tpm_gym.simulation.mujoco.cup import Cup, Grip
-from tpm_gym.simulation.mujoco.model import compile_model
+from tpm_gym.simulation.mujoco.model import compile_model, segmentation_ids
 from tpm_gym.simulation.mujoco.physics import Physics
 from tpm_gym.simulation.mujoco.pictures import Pictures
 from tpm_gym.simulation.mujoco.robot import Robot
 from tpm_gym.simulation.mujoco.scenery import Scenery
+from tpm_gym.simulation.mujoco.window import Window
 from tpm_gym.simulation.randomisation import NOMINAL, Plant
 from tpm_gym.simulation.settings import settings_of
 from tpm_gym.simulation.state import Scene
@@ -49,22 +51,29 @@ class MujocoEngine:
     that all values that can be read belong to one time.
 
     Args:
+        gui: Whether to open MuJoCo's viewer.
         renderer: ``"egl"``, ``"osmesa"`` or ``"glfw"``; None for the value of the environment
             variable ``MUJOCO_GL``, or else the first renderer that works.
         physics: A :class:`Physics` or a mapping of its attributes.
         drive: Servo drives of the motors; None for ideal drives.
 
     Raises:
-        ConfigurationError: If an option is out of range.
+        ConfigurationError: If an option is out of range, or no window can open.
     """
 
     def __init__(
-        self, *, renderer: str | None = None, physics: Any = None, drive: Servo | None = None
+        self,
+        *,
+        gui: bool = False,
+        renderer: str | None = None,
+        physics: Any = None,
+        drive: Servo | None = None,
     ) -> None:
         """Check the options."""
         self.physics = settings_of(Physics, "physics", physics)
         self.time_step = self.physics.time_step
         self._pictures = Pictures(renderer)
+        self._window = Window() if gui else None
         self._servo = drive
         self._drives: ServoDrives | None = None
 
@@ -77,6 +86,7 @@ class MujocoEngine:
     def _load(self, machine: Machine) -> None:
         self._machine = machine
         self.model = compile_model(machine, self._scene, self.physics)
+        self._ids = segmentation_ids(self.model, machine.mechanism.tool, self._scene)
         self.data = mujoco.MjData(self.model)
         self._reset()
         self.robot = Robot(self.model, self.data, machine, ideal=self._servo is None)
@@ -137,9 +147,10 @@ class MujocoEngine:
         hold = self._cup.grip.hold
         return Readout.of_one(self._machine, robot.motors(), robot.truth(), hold, objects)
 
-    def show_goal(self, markers: FloatArray) -> None:
-        """Implement :meth:`Engine.show_goal`."""
-        self._scenery.move_markers(markers.tolist())
+    def show(self, camera: Camera, markers: FloatArray) -> None:
+        """Implement :meth:`Engine.show`."""
+        if self._window is not None:
+            self._window.show(self.model, self.data, camera, markers, self._scene.marker_radius)
 
     def save(self) -> Any:
         """Implement :meth:`Engine.save`."""
@@ -157,13 +168,15 @@ class MujocoEngine:
             self._drives.memory[:] = saved.drives
         mujoco.mj_step1(self.model, self.data)
 
-    def picture(self, width: int, height: int) -> NDArray[np.uint8]:
+    def picture(self, row: int, view: View) -> Picture:
         """Implement :meth:`Engine.picture`."""
-        return self._pictures.draw(self.model, self.data, width, height)
+        return self._pictures.draw(self.model, self.data, view, self._ids)
 
     def close(self) -> None:
         """Implement :meth:`Engine.close`."""
         self._pictures.close()
+        if self._window is not None:
+            self._window.close()
 
 
 _: type[Engine] = MujocoEngine  # mypy checks that the class has the methods of Engine

@@ -6,24 +6,27 @@ from itertools import combinations
 from xml.etree.ElementTree import Element, SubElement, tostring
 
 import mujoco
+import numpy as np
+from numpy.typing import NDArray
 
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.mjcf import SOLID, STIFF, robot
 from tpm_gym.mechanism.mount import GRAVITY
 from tpm_gym.mechanism.urdf import numbers
+from tpm_gym.simulation.imaging import BACKGROUND, FAR, NEAR, OBJECTS, ROBOT, TABLETOP
+from tpm_gym.simulation.imaging import CUP as CUP_ID
 from tpm_gym.simulation.mujoco.physics import Physics
-from tpm_gym.simulation.stage import FLOOR, FLOOR_EDGE, LIGHT, MARKER_COLOUR, TABLE
+from tpm_gym.simulation.stage import FLOOR, FLOOR_EDGE, LIGHT, TABLE
 from tpm_gym.simulation.state import Block, Scene
 
-__all__ = ["compile_model", "grip_name", "marker_name", "object_name"]
+__all__ = ["compile_model", "grip_name", "object_name", "segmentation_ids"]
 
 _RECOVERY = 0.1
 """Fraction of a penetration that a contact removes per time step; 0.1 causes the least bouncing."""
 _MARGIN = 1e-6  # m; so an object placed exactly on the table has contact in the first time step
 
 _NO_CONTACT = {"contype": "0", "conaffinity": "0"}  # only the listed pairs collide
-_OUT_OF_SIGHT = "0 0 -9"  # first position of the markers; at 0 0 0 they could not be moved
 
 
 def compile_model(machine: Machine, scene: Scene, physics: Physics) -> mujoco.MjModel:
@@ -46,13 +49,24 @@ def compile_model(machine: Machine, scene: Scene, physics: Physics) -> mujoco.Mj
     assert world is not None
     assert equality is not None
     _light(root, world)
-    _surroundings(world, machine, scene)
+    _surroundings(world, machine)
     for index, block in enumerate(scene.objects):
         _object(world, index, block)
         ends = {"body1": machine.mechanism.tool, "body2": object_name(index)}
         SubElement(equality, "weld", ends, name=grip_name(index), active="false")
     root.append(_contacts(root, scene, physics))
     return mujoco.MjModel.from_xml_string(tostring(root, encoding="unicode"))
+
+
+def segmentation_ids(model: mujoco.MjModel, tool: str, scene: Scene) -> NDArray[np.int32]:
+    """Return the id of each geom in a segmentation; ``tool`` is the body with the cup."""
+    bodies = np.full(model.nbody, ROBOT, dtype=np.int32)
+    bodies[model.body(tool).id] = CUP_ID
+    for index in range(len(scene.objects)):
+        bodies[model.body(object_name(index)).id] = OBJECTS + index
+    ids: NDArray[np.int32] = bodies[model.geom_bodyid]
+    ids[model.geom("table").id], ids[model.geom("floor").id] = TABLETOP, BACKGROUND
+    return ids
 
 
 def object_name(index: int) -> str:
@@ -65,14 +79,11 @@ def grip_name(index: int) -> str:
     return f"grip {index}"
 
 
-def marker_name(index: int) -> str:
-    """Return the name of a goal marker's site."""
-    return f"marker {index}"
-
-
 def _light(root: Element, world: Element) -> None:
-    """Add light without shadows and a white sky, as in PyBullet's pictures."""
+    """Add the range of depth, light without shadows, and a white sky, as in PyBullet."""
+    SubElement(root, "statistic", extent="1")  # then the numbers of "map" are metres
     visual = SubElement(root, "visual")
+    SubElement(visual, "map", znear=repr(NEAR), zfar=repr(FAR))
     SubElement(visual, "headlight", ambient=".45 .45 .45", diffuse=".2 .2 .2", specular="0 0 0")
     rays = {"pos": numbers(LIGHT), "dir": numbers(-part for part in LIGHT)}
     colours = {"diffuse": ".5 .5 .5", "specular": ".1 .1 .1"}
@@ -84,18 +95,14 @@ def _light(root: Element, world: Element) -> None:
     )
 
 
-def _surroundings(world: Element, machine: Machine, scene: Scene) -> None:
-    """Add table, floor and markers."""
+def _surroundings(world: Element, machine: Machine) -> None:
+    """Add table and floor."""
     size, pos = (*machine.table, TABLE.half_height), (0.0, 0.0, TABLE.top - TABLE.half_height)
     table = {"size": numbers(size), "pos": numbers(pos), "rgba": numbers(TABLE.colour)}
     SubElement(world, "geom", _NO_CONTACT | table, name="table", type="box")
     size, pos = (FLOOR_EDGE, FLOOR_EDGE, 1.0), (0.0, 0.0, FLOOR.top)
     floor = {"size": numbers(size), "pos": numbers(pos), "rgba": numbers(FLOOR.colour)}
     SubElement(world, "geom", _NO_CONTACT | floor, name="floor", type="plane")
-    for index in range(scene.markers):
-        looks = {"size": numbers([scene.marker_radius]), "rgba": numbers(MARKER_COLOUR)}
-        name = marker_name(index)
-        SubElement(world, "site", looks, name=name, type="sphere", pos=_OUT_OF_SIGHT)
 
 
 def _object(world: Element, index: int, block: Block) -> None:

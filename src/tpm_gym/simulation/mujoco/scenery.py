@@ -1,4 +1,4 @@
-"""Objects and goal markers in MuJoCo."""
+"""Objects in MuJoCo."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from tpm_gym.arrays import FloatArray, Vector, rotate
+from tpm_gym.arrays import FloatArray, rotate
 from tpm_gym.simulation.engine import Pose, Twist
-from tpm_gym.simulation.mujoco.model import marker_name, object_name
+from tpm_gym.simulation.mujoco.model import object_name
 from tpm_gym.simulation.state import Scene
 
 __all__ = ["Scenery"]
@@ -21,10 +21,10 @@ _CONVERGED = 1e-3  # m/s; largest change of the slip in the last prediction
 
 
 class Scenery:
-    """Objects and goal markers of a MuJoCo model."""
+    """Objects of a MuJoCo model."""
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, scene: Scene) -> None:
-        """Look up the addresses of objects and markers in the model."""
+        """Look up the addresses of the objects in the model."""
         self._model, self._data, self._blocks = model, data, scene.objects
         self._position, self._speed = data.qpos.item, data.qvel.item
         self._resting = 4 * len(scene.objects)  # number of contacts if all objects lie flat
@@ -39,7 +39,6 @@ class Scenery:
             for geom in geoms
         ]
         self._friction = model.pair_friction.copy()
-        self._markers = [model.site(marker_name(index)).id for index in range(scene.markers)]
 
     def keep_sliding(self) -> None:
         """Prevent sliding objects from hopping; call between the two halves of a time step.
@@ -97,11 +96,6 @@ class Scenery:
             > _STILL
             for dof in self._dof
         )
-
-    def move_markers(self, positions: Sequence[Vector]) -> None:
-        """Move the goal markers to ``positions`` (m, world)."""
-        for marker, position in zip(self._markers, positions, strict=True):
-            self._model.site_pos[marker] = self._data.site_xpos[marker] = position
 
     def place(self, poses: Sequence[Pose]) -> None:
         """Set the poses of the objects."""

@@ -1,0 +1,19 @@
+"""The first frame of an episode, in every engine."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+
+ENGINES = ("pybullet", "mujoco", "analytic")
+STARTS: dict[str, Any] = {"object": (-0.12, -0.034, 0.015), "goal": (0.05, -0.03, 0.10)}
+
+
+def drawn(engine: str, starts: Any = STARTS, mode: str = "rgb_array", **options: Any) -> Any:
+    """Return the first frame of an episode of pick-and-place."""
+    env = gym.make("TPMPickAndPlace-v0", engine=engine, render_mode=mode, **options)
+    env.reset(seed=0, options=starts)
+    frame: Any = env.render()
+    env.close()
+    return frame
