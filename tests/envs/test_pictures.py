@@ -112,7 +112,7 @@ def test_segmentation_tells_bodies_apart(engine: str) -> None:
     assert (ids.shape, ids.dtype) == ((480, 640), np.int32)
     assert set(np.unique(ids)) == {BACKGROUND, TABLETOP, ROBOT, CUP, OBJECTS}
     depth, image = drawn(engine, mode="depth_array"), drawn(engine)
-    assert np.isfinite(depth[ids != BACKGROUND]).mean() > 0.999  # MuJoCo smooths edges of depth
+    assert np.isfinite(depth[ids != BACKGROUND]).mean() > 0.99  # MuJoCo smooths the edges
     block = ids == OBJECTS
     assert (is_red(image) & block).sum() > 0.9 * block.sum()
 
