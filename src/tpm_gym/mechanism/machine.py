@@ -293,8 +293,9 @@ class Machine(ABC):
         Raises:
             ConfigurationError: If no draw for a region was safe.
         """
-        low, high = (np.array([getattr(r, end) for r in regions]) for end in ("low", "high"))
-        points, rows = np.empty_like(low), np.arange(len(rngs))
+        ends = np.array([region.low + region.high for region in regions])
+        low, high = ends[:, :3], ends[:, 3:]
+        points, rows = np.empty(low.shape), np.arange(len(rngs))
         for _ in range(_ATTEMPTS):
             drawn = np.array([rngs[row].random(3) for row in rows.tolist()])
             points[rows] = low[rows] + (high[rows] - low[rows]) * drawn

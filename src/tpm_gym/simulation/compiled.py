@@ -5,10 +5,18 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tpm_gym.arrays import BoolArray, FloatArray, IntArray
+from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector
 from tpm_gym.compiling import compilable, compiled, kept
 from tpm_gym.simulation.drives import References
-from tpm_gym.simulation.vectors import onto, plus, row_of
+from tpm_gym.simulation.vectors import (
+    inverted,
+    onto,
+    page_row,
+    plus,
+    put_page_row,
+    row_of,
+    spread,
+)
 
 __all__ = [
     "all_within",
@@ -16,13 +24,14 @@ __all__ = [
     "any_outside",
     "bounded",
     "braced_inverse",
+    "ends",
     "in_world",
-    "inverted",
     "limited",
     "measured_object",
     "measured_robot",
     "servo_torque",
     "servo_torques",
+    "shifted",
     "singularity_penalty",
     "spline_points",
     "truth",
@@ -41,24 +50,32 @@ def all_within(points: FloatArray, low: FloatArray, high: FloatArray) -> bool:
 
 
 @kept
-def unusual(
-    gap: FloatArray, limit: float, mode_left: NDArray[np.int8], conditioning: FloatArray
-) -> tuple[bool, bool, bool]:
-    """Return whether any loop is open, any mode was left, and any reading is invalid.
+def shifted(
+    points: FloatArray, parts: FloatArray, step: FloatArray, low: FloatArray, high: FloatArray
+) -> FloatArray:
+    """Return points (m, 3) moved by ``parts`` (m, 3) of a step (3,), and projected into a box."""
+    moved = np.empty_like(points)
+    for row in range(len(points)):
+        for axis in range(3):
+            there = points[row, axis] + parts[row, axis] * step[axis]
+            moved[row, axis] = min(max(there, low[axis]), high[axis])
+    return moved
+
+
+@kept
+def unusual(gap: FloatArray, limit: float, mode_left: NDArray[np.int8]) -> tuple[bool, bool]:
+    """Return whether any loop is open, and whether any mode was left.
 
     Args:
         gap: (n,) m, largest gap of each robot; open if larger than ``limit``, or NaN.
         limit: Largest allowed gap, m.
         mode_left: (n,) mode that each robot left; 0 for none.
-        conditioning: (r,) conditioning of each reading; invalid if NaN.
     """
-    opened = left = invalid = False
+    opened = left = False
     for row in range(len(gap)):
         opened |= not gap[row] <= limit
         left |= mode_left[row] != 0
-    for row in range(len(conditioning)):
-        invalid |= np.isnan(conditioning[row])
-    return opened, left, invalid
+    return opened, left
 
 
 @kept
@@ -260,6 +277,35 @@ def spline_points(commands: FloatArray, weights: FloatArray) -> FloatArray:
 
 
 @kept
+def ends(theta: FloatArray, step: float) -> FloatArray:
+    """Compute the motion in the first and in the last time step of a control period.
+
+    The acceleration jumps between control periods, so the differences use only joint positions of
+    this control period.
+
+    Args:
+        theta: (n, K + 1, 3) rad, from the beginning to the end of the period.
+        step: Time step, s.
+
+    Returns:
+        Joint positions at the beginning of the time step, joint velocities and accelerations
+        (3, 2, n, 3).
+    """
+    last = theta.shape[1] - 1
+    found = np.zeros((3, 2, len(theta), 3))
+    for row in range(len(theta)):
+        for i in range(3):
+            for end, start, first in ((0, 0, 0), (1, last - 1, last - 2)):
+                found[0, end, row, i] = theta[row, start, i]
+                found[1, end, row, i] = (theta[row, start + 1, i] - theta[row, start, i]) / step
+                if last > 1:
+                    before = (theta[row, first + 1, i] - theta[row, first, i]) / step
+                    after = (theta[row, first + 2, i] - theta[row, first + 1, i]) / step
+                    found[2, end, row, i] = (after - before) / step
+    return found
+
+
+@kept
 def along(
     theta: FloatArray, true: FloatArray, torques: FloatArray, step: float, references: References
 ) -> None:
@@ -273,11 +319,11 @@ def along(
         references: Output.
     """
     steps = len(references.theta)
-    for k in range(steps):
-        for row in range(len(theta)):
-            for i in range(3):
-                first, last = torques[0, row, i], torques[1, row, i]
-                slope = (last - first) / max(steps - 1, 1)
+    for row in range(len(theta)):
+        for i in range(3):
+            first, last = torques[0, row, i], torques[1, row, i]
+            slope = (last - first) / max(steps - 1, 1)
+            for k in range(steps):
                 references.theta[k, row, i] = true[row, k + 1, i]
                 references.theta_dot[k, row, i] = (theta[row, k + 1, i] - theta[row, k, i]) / step
                 references.torque[k, row, i] = first + k * slope if k < steps - 1 else last
@@ -287,27 +333,19 @@ def along(
 def braced_inverse(
     mass: FloatArray, stiffness: FloatArray, damping: float, step: float
 ) -> FloatArray:
-    """Return the inverse (n, 3, 3) of mass + step (step stiffness + damping) for each row."""
-    inverse = np.empty_like(mass)
+    """Return the inverse (n, 6) of mass + step (step stiffness + damping) for each row.
+
+    The columns are the upper triangle of the inverse, by rows.
+    """
+    inverse = np.empty((len(mass), 6))
     for row in range(len(mass)):
-        a = mass[row, 0, 0] + step * (step * stiffness[row, 0] + damping)
-        d = mass[row, 1, 1] + step * (step * stiffness[row, 1] + damping)
-        f = mass[row, 2, 2] + step * (step * stiffness[row, 2] + damping)
-        inverted(a, mass[row, 0, 1], mass[row, 0, 2], d, mass[row, 1, 2], f, inverse[row])
+        x, y, z = plus((damping, damping, damping), row_of(stiffness, row), step)
+        a, b, c = page_row(mass, row, 0)
+        _, d, e = page_row(mass, row, 1)
+        found = inverted((a + step * x, b, c, d + step * y, e, mass[row, 2, 2] + step * z))
+        for k in range(6):
+            inverse[row, k] = found[k]
     return inverse
-
-
-@compiled
-def inverted(
-    a: float, b: float, c: float, d: float, e: float, f: float, inverse: FloatArray
-) -> None:
-    """Invert the symmetric matrix ((a, b, c), (b, d, e), (c, e, f)) into ``inverse`` (3, 3)."""
-    p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
-    determinant = a * p + b * q + c * r
-    inverse[0, 0], inverse[0, 1], inverse[0, 2] = p / determinant, q / determinant, r / determinant
-    inverse[1, 0], inverse[2, 0] = inverse[0, 1], inverse[0, 2]
-    inverse[1, 1], inverse[1, 2] = (a * f - c * c) / determinant, (b * c - a * e) / determinant
-    inverse[2, 1], inverse[2, 2] = inverse[1, 2], (a * d - b * b) / determinant
 
 
 @kept
@@ -346,23 +384,34 @@ def servo_torque(
     theta_dot: FloatArray,
     step: float,
     memory: FloatArray,
-) -> None:
-    """Apply the law of the servo drives to one row; arguments as in :func:`servo_torques`."""
+) -> Vector:
+    """Apply the law of the servo drives to one row, and return the torques (N m).
+
+    The arguments are those of :func:`servo_torques`.
+    """
     stiffness, damping, mass, inverse, effort, line = law
-    rates, last = row_of(theta_dot, row), row_of(memory[0], row)
-    x, y, z = plus(rates, row_of(memory[1], row), -1.0)
+    rates, last = row_of(theta_dot, row), page_row(memory, 0, row)
+    x, y, z = plus(rates, page_row(memory, 1, row), -1.0)
     load = onto(last, mass, row, (x / step, y / step, z / step), -1.0)
-    for i in range(3):
-        behind = references[0][index, row, i] - theta[row, i] - step * rates[i]
-        slower = references[1][index, row, i] - rates[i]
-        wanted = stiffness[row, i] * behind + damping * slower + references[2][index, row, i]
-        memory[1, row, i] = wanted - load[i]
-    change = onto((0.0, 0.0, 0.0), inverse, row, row_of(memory[1], row))
-    needed = onto(load, mass, row, change)
-    for i in range(3):
-        corner, speed = line[i, 0], line[i, 1]
-        torque = limited(needed[i], rates[i], effort[row, i], corner, speed)
-        memory[0, row, i], memory[1, row, i] = torque, rates[i]
+    behind = plus(plus(page_row(references[0], index, row), row_of(theta, row), -1.0), rates, -step)
+    slower = plus(page_row(references[1], index, row), rates, -1.0)
+    forward = plus(plus(page_row(references[2], index, row), slower, damping), load, -1.0)
+    x, y, z = row_of(stiffness, row)
+    wanted = plus(forward, (x * behind[0], y * behind[1], z * behind[2]))
+    braced = (
+        inverse[row, 0], inverse[row, 1], inverse[row, 2],
+        inverse[row, 3], inverse[row, 4], inverse[row, 5],
+    )  # fmt: skip
+    change = spread(braced, wanted)
+    x, y, z = onto(load, mass, row, change)
+    torque = (
+        limited(x, rates[0], effort[row, 0], line[0, 0], line[0, 1]),
+        limited(y, rates[1], effort[row, 1], line[1, 0], line[1, 1]),
+        limited(z, rates[2], effort[row, 2], line[2, 0], line[2, 1]),
+    )
+    put_page_row(memory, 0, row, torque)
+    put_page_row(memory, 1, row, rates)
+    return torque
 
 
 compilable(servo_torque)

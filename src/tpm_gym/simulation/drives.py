@@ -210,23 +210,15 @@ class ServoDrives:
         """
         from tpm_gym.simulation import compiled  # imports Numba
 
-        machine, step = path.machine, self._step
-        theta = machine.reach(np.concatenate([path.start[:, None], path.points()], axis=1))
+        theta = path.readings()
         steps = theta.shape[1] - 1
         references = References(*np.empty((3, steps, len(theta), 3)))
         torques = np.zeros((2, len(theta), 3))
         if self._servo.feedforward != "none":
+            there, rates, changes = compiled.ends(theta, self._step)
             moving = float(self._servo.feedforward == "computed")
-            for k, start in enumerate((0, steps - 1)):
-                rates = (theta[:, start + 1] - theta[:, start]) / step
-                changes = np.zeros_like(rates)
-                if steps > 1:
-                    # The acceleration jumps between control periods, so the difference uses only
-                    # joint positions of this control period.
-                    here = theta[:, start : start + 3] if k == 0 else theta[:, -3:]
-                    changes = np.diff(np.diff(here, axis=1) / step, axis=1)[:, 0] / step
-                torques[k] = machine.torque(theta[:, start], moving * rates, moving * changes)
-        compiled.along(theta, path.true(theta), torques, step, references)
+            torques = path.machine.torque(there, moving * rates, moving * changes)
+        compiled.along(theta, path.true(theta), torques, self._step, references)
         return references
 
     def begin(self, theta: FloatArray) -> None:

@@ -45,6 +45,7 @@ __all__ = [
 UPRIGHT: Quaternion = (0.0, 0.0, 0.0, 1.0)
 SPRING_GAIN = 0.2
 """Fraction of its displacement that the cup's spring removes in one time step."""
+_START = np.array([[0.5, 0.5, 0.0]])  # weights of the commands at the beginning of a period
 
 
 def transform(origin: Vector, quaternion: Quaternion, point: Vector) -> Vector:
@@ -177,17 +178,11 @@ class Path:
         bias: FloatArray | None = None,
     ) -> None:
         """Store the arguments."""
-        self.machine, self._commands, self._weights, self._bias = machine, commands, weights, bias
-
-    @property
-    def start(self) -> FloatArray:
-        """Point P at the beginning of the period, (n, 3) m."""
-        start: FloatArray = (self._commands[:, 0] + self._commands[:, 1]) / 2
-        return start
+        self.machine, self.commands, self.weights, self._bias = machine, commands, weights, bias
 
     def points(self, last: int = 0) -> FloatArray:
         """Return point P (n, k, 3) m at the ends of the last k time steps (0: all time steps)."""
-        points: FloatArray = _loops().spline_points(self._commands, self._weights[-last:])
+        points: FloatArray = _loops().spline_points(self.commands, self.weights[-last:])
         return points
 
     def joints(self, last: int = 0) -> FloatArray:
@@ -197,12 +192,24 @@ class Path:
             JointLimitError: If a motor would be beyond a stop.
             UnreachableError: If a point is out of reach.
         """
-        points = self.points(last)
+        return self.true(self._readings(self.points(last)))
+
+    def readings(self) -> FloatArray:
+        """Return encoder readings (n, K + 1, 3) rad, from the beginning to the end of the period.
+
+        Raises:
+            JointLimitError: If a motor would be beyond a stop.
+            UnreachableError: If a point is out of reach.
+        """
+        weights = np.concatenate([_START, self.weights])
+        return self._readings(_loops().spline_points(self.commands, weights))
+
+    def _readings(self, points: FloatArray) -> FloatArray:
         theta = self.machine.inverse(points)
         # all_within() is also False for NaN, and reach() then raises the error.
         if not _loops().all_within(theta.reshape(-1, 3), *self.machine.stops):
             theta = self.machine.reach(points)
-        return theta if self._bias is None else self.true(theta)
+        return theta
 
     def true(self, theta: FloatArray) -> FloatArray:
         """Convert encoder readings (n, ..., 3) rad into true joint positions."""

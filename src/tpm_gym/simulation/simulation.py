@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -155,7 +156,9 @@ class Simulation:
         self._bias[rows], self._mode_left[rows] = bias, 0
         self._noise[rows] = 0.0 if noise is None else noise[:, None]
         self._disturbed = bool(self._bias.any() or self._noise.any())
-        self._read(rows)
+        self._read()
+        if self._disturbed:  # else the reading is already known
+            self._evaluate(rows)
 
     def _built(self, plants: Sequence[Plant]) -> FloatArray:
         """Return the machine parameters (r, k) for the true lengths of the plants."""
@@ -210,28 +213,30 @@ class Simulation:
             self._noise[:, 0] = self._noise[:, 1]
             self._noise[:, 1] = 0.0 if noise is None else noise
             self._disturbed = bool(self._bias.any() or self._noise.any())
-        self._read(slice(None))
+        self._read()
+        self._evaluate(slice(None))
 
     @property
     def mode_left(self) -> NDArray[np.int8]:
         """Mode that each robot left in this episode, (n,): 0 none, 1 assembly, 2 working."""
         return self._mode_left
 
-    def _read(self, rows: IntArray | slice) -> None:
-        """Read the engine, check the loop gaps, and compute the forward kinematics of ``rows``."""
+    def _read(self) -> None:
+        """Read the engine, check the loop gaps, and note modes that were left."""
         now = self._readout = self.engine.read()
-        theta = now.theta[rows]
-        if self._disturbed:
-            theta = theta + self._bias[rows] + self._noise[rows, 1]
-        position, jacobian, conditioning, _ = self.machine.evaluate(theta)
-        opened, left, senseless = self.loops.unusual(
-            now.gap, CLOSURE_LIMIT, now.mode_left, conditioning
-        )
+        opened, left = self.loops.unusual(now.gap, CLOSURE_LIMIT, now.mode_left)
         if opened:
             raise ClosureError(float(now.gap.max()), CLOSURE_LIMIT)
         if left:
             self._mode_left = np.where(self._mode_left, self._mode_left, now.mode_left)
-        if senseless:
+
+    def _evaluate(self, rows: IntArray | slice) -> None:
+        """Compute the forward kinematics of the encoder readings of ``rows``."""
+        theta = self._readout.theta[rows]
+        if self._disturbed:
+            theta = theta + self._bias[rows] + self._noise[rows, 1]
+        position, jacobian, conditioning, _ = self.machine.evaluate(theta)
+        if math.isnan(np.vdot(conditioning, conditioning)):  # faster than isnan().any()
             # With bias and noise, the encoders may report joint positions at which no assembly
             # exists. Then the last valid result is kept, as a real controller would do.
             lost = np.isnan(conditioning)

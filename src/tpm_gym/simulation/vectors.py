@@ -10,22 +10,30 @@ from tpm_gym.compiling import compilable, compiled
 
 __all__ = [
     "Frame",
+    "Symmetric",
     "axes",
     "clip",
     "cross",
     "dot",
+    "inverted",
     "length",
     "level_length",
     "onto",
+    "page_row",
     "plus",
     "put",
+    "put_page_row",
     "put_row",
     "row_of",
+    "solved",
+    "spread",
     "three",
 ]
 
 Frame = tuple[Vector, Vector, Vector]
 """Axes of a body: three unit vectors, world frame."""
+Symmetric = tuple[float, float, float, float, float, float]
+"""Upper triangle of a symmetric matrix (3, 3), by rows."""
 
 
 @compiled
@@ -74,12 +82,45 @@ def row_of(values: Any, row: int) -> Vector:
     return values[row, 0], values[row, 1], values[row, 2]
 
 
+def page_row(values: Any, page: int, row: int) -> Vector:
+    """Return a row of an array (k, n, 3)."""
+    return values[page, row, 0], values[page, row, 1], values[page, row, 2]
+
+
+def put_page_row(values: Any, page: int, row: int, vector: Vector) -> None:
+    """Write a vector into a row of an array (k, n, 3)."""
+    values[page, row, 0], values[page, row, 1], values[page, row, 2] = vector
+
+
 def put_row(values: Any, row: int, vector: Vector) -> None:
     """Write a vector into a row of an array (n, 3)."""
     values[row, 0], values[row, 1], values[row, 2] = vector
 
 
-compilable(onto, row_of, put_row)
+def spread(matrix: Symmetric, a: Vector) -> Vector:
+    """Return matrix a."""
+    p, q, r, s, t, u = matrix
+    x, y, z = a
+    return p * x + q * y + r * z, q * x + s * y + t * z, r * x + t * y + u * z
+
+
+def inverted(matrix: Symmetric) -> Symmetric:
+    """Return the inverse of a matrix."""
+    a, b, c, d, e, f = matrix
+    p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
+    scale = 1 / (a * p + b * q + c * r)
+    return (
+        p * scale, q * scale, r * scale,
+        (a * f - c * c) * scale, (b * c - a * e) * scale, (a * d - b * b) * scale,
+    )  # fmt: skip
+
+
+def solved(matrix: Symmetric, right: Vector) -> Vector:
+    """Return the solution x of matrix x = right."""
+    return spread(inverted(matrix), right)
+
+
+compilable(onto, page_row, put_page_row, row_of, put_row, spread, inverted, solved)
 
 
 @compiled

@@ -63,7 +63,8 @@ def apart_from(
     """
     points = machine.sample(rngs, regions)
     for _ in range(_ATTEMPTS):
-        near = np.linalg.norm(np.subtract(points[:, None], others), axis=-1) < apart
+        gap = np.subtract(points[:, None], others)
+        near = (gap * gap).sum(axis=-1) < apart * apart  # faster than linalg.norm
         rows = np.flatnonzero(near.any(axis=1)).tolist()
         if not rows:
             return points

@@ -409,7 +409,9 @@ class Task(ABC):
         values = []
         for source, columns in self._sources:  # a comprehension would be a call
             values.append(source(state)[:, columns])
-        scaled: FloatArray = (np.concatenate(values, axis=1) - self._centre) / self._scale
+        scaled: FloatArray = np.concatenate(values, axis=1)
+        scaled -= self._centre
+        scaled /= self._scale
         return scaled
 
     def decode(self, observation: ArrayLike) -> dict[str, FloatArray]:

@@ -22,7 +22,7 @@ from tpm_gym.arrays import FloatArray, Vector
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.mount import GRAVITY
 from tpm_gym.mechanism.tpm import WIDE_TPM
-from tpm_gym.simulation.analytic.contact import Contact, Reading
+from tpm_gym.simulation.analytic.contact import Contact, Reading, Route
 from tpm_gym.simulation.engine import spline_weights
 from tpm_gym.simulation.state import Block, Scene
 
@@ -71,8 +71,9 @@ def on_tables(blocks: int, count: int, edges: tuple[float, float] = (9.0, 9.0)) 
 
 def advance(contact: Contact, rows: Any, path: FloatArray, on: FloatArray) -> Any:
     """Lead the cups along paths (r, 2 + K, 3); the forces (r, K, 3) and the carried masses."""
-    way = path[:, 0].copy(), path[:, 1].copy(), path[:, 2:].copy()
-    return contact.advance(rows, way, on)
+    steps = path.shape[1] - 2
+    route = Route(path[:, 0].copy(), path[:, 1].copy(), path[:, 2:].copy(), np.eye(steps))
+    return contact.advance(rows, route, on, steps)
 
 
 def table(places: Sequence[FloatArray], edges: tuple[float, float] = (9.0, 9.0)) -> Contact:

@@ -51,8 +51,9 @@ def test_resistance_is_coulombs_in_every_one_of_the_27_cases() -> None:
     signs = set()
     for _ in range(4000):
         factor, drive, limit = rng.normal(size=(3, 3)), rng.normal(0, 2, 3), rng.uniform(0, 2, 3)
-        mass, rates = factor @ factor.T + 0.1 * np.eye(3), np.empty(3)
-        resisted(mass, drive, limit, rates)
+        mass = factor @ factor.T + 0.1 * np.eye(3)
+        triangle = tuple(mass[np.triu_indices(3)].tolist())
+        rates = np.array(resisted(triangle, tuple(drive.tolist()), tuple(limit.tolist())))
         resistance, moving = drive - mass @ rates, rates != 0
         np.testing.assert_allclose(resistance[moving], (limit * np.sign(rates))[moving], atol=1e-9)
         assert (np.abs(resistance) <= limit + 1e-9).all()

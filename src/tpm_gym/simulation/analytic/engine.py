@@ -19,7 +19,7 @@ import numpy as np
 
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray
 from tpm_gym.mechanism.machine import Machine
-from tpm_gym.simulation.analytic.contact import Contact
+from tpm_gym.simulation.analytic.contact import Contact, Route
 from tpm_gym.simulation.analytic.forward_dynamics import (
     Course,
     IdealSteps,
@@ -88,7 +88,8 @@ class AnalyticEngine:
         """Implement :meth:`Engine.load`."""
         self._machine, self._scene, self._count = machine, scene, count
         self._rows = np.arange(count)
-        self._turn, self._origin = machine.mount.frame
+        # Arrays of equal shapes are faster than a broadcast over three columns
+        self._turn, self._origin = (np.tile(part, (count, 1)) for part in machine.mount.frame)
         self._built: FloatArray | None = None
         self._exact = True  # whether bias and length errors are 0, so that P is on its spline
         self._nominal_effort = np.array([motor.effort for motor in machine.mechanism.motors])
@@ -153,25 +154,22 @@ class AnalyticEngine:
         All robots are first computed without torque limits. The robots that would exceed a limit
         are then computed again by forward dynamics.
         """
-        objects, step = bool(self._scene.objects), self.time_step
+        step = self.time_step
+        late = self._behind | (self._mode_left != 0)
         if self._exact:
-            theta = path.joints(self._tail)
-            points = path.points(self._steps if objects else 2)
-            late = self._behind | (self._mode_left != 0)
+            theta, points = path.joints(self._tail), path.points(3)
+            controls, weights = path.commands, path.weights
         else:
             joints = path.joints()
-            points = self._machine.forward(joints, self._built)
-            theta = joints[:, -self._tail :]
-            late = self._behind | (self._mode_left != 0)
+            controls = points = self._machine.forward(joints, self._built)
+            theta, weights = joints[:, -self._tail :], np.eye(self._steps)
             late |= ~self._machine.same_side(points).all(axis=1)
         start = {name: getattr(self, name) for name in _COURSE}
-        # Save objects that may be computed again. With torques "none", ``late`` is complete here.
-        again = objects and (self.physics.torques != "none" or late.any())
-        saved = self._contact.copy() if again else None
         push = None
-        if objects:
-            way = self._before, self._position, points
-            push, self._carried = self._contact.advance(self._rows, way, vacuum)
+        if self._scene.objects:
+            route = Route(self._before, self._position, controls, weights)
+            last = 1 if self.physics.torques == "none" else self._steps
+            push, self._carried = self._contact.advance(self._rows, route, vacuum, last)
             self._force = push[:, -1].copy()
             if self._carried.any():
                 change = points[:, -1] - 2 * points[:, -2] + points[:, -3]
@@ -182,16 +180,13 @@ class AnalyticEngine:
         late |= self._find_torques(start["_theta"], start["_rates"], theta, path, push)
         rows = np.flatnonzero(late)
         if len(rows):
-            self._repeat(rows, start, saved, path, vacuum)
+            self._repeat(rows, start, path, vacuum)
 
-    def _repeat(
-        self, rows: IntArray, start: Any, saved: Any, path: Path, vacuum: BoolArray
-    ) -> None:
+    def _repeat(self, rows: IntArray, start: Any, path: Path, vacuum: BoolArray) -> None:
         """Compute the control period of some robots again, by forward dynamics."""
         for name, values in start.items():
             getattr(self, name)[rows] = values[rows]
-        if saved is not None:
-            self._contact.repeat(rows, saved)
+        self._contact.undo(rows)
         joints = np.ascontiguousarray(path.joints()[rows].swapaxes(0, 1))
         steps = IdealSteps(joints, self._effort[rows], self.time_step)
         self._integrate(rows, steps, vacuum)
@@ -199,12 +194,13 @@ class AnalyticEngine:
 
     def _integrate(self, rows: IntArray, steps: Steps, vacuum: BoolArray) -> None:
         """Simulate a control period of some robots by forward dynamics."""
-        on = vacuum[rows]
+        on, whole = vacuum[rows], np.ones((1, 1))
 
         def touch(
             before: FloatArray, now: FloatArray, then: FloatArray
         ) -> tuple[FloatArray, FloatArray]:
-            push, carried = self._contact.advance(rows, (before, now, then[:, None]), on)
+            route = Route(before, now, then[:, None], whole)
+            push, carried = self._contact.advance(rows, route, on)
             return push[:, 0], carried
 
         course = Course(*(getattr(self, name)[rows] for name in _COURSE))

@@ -139,6 +139,7 @@ def march(
             gain[gone] = 0.0
             at = machine.motion(theta, rates, built)
         force, carried = touch(course.before, course.position, position)
-        force += np.multiply(gain, carried[:, None], out=gain)
+        if carried.any():
+            force += gain * carried[:, None]
         course = Course(theta, rates, torque, position, course.position, force, carried, mode_left)
     return course, torques

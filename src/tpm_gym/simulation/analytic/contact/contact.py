@@ -15,9 +15,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tpm_gym.arrays import BoolArray, FloatArray, IntArray
-from tpm_gym.simulation.analytic.contact.state import CUP_STATE, OBJECT, Setting, slots, work_for
-from tpm_gym.simulation.analytic.contact.stepping import advance
+from tpm_gym.arrays import BoolArray, FloatArray, IntArray, vector
+from tpm_gym.simulation.analytic.contact.state import (
+    CUP_STATE,
+    Route,
+    Setting,
+    tables_for,
+    work_for,
+)
+from tpm_gym.simulation.analytic.contact.stepping import advance, read
 from tpm_gym.simulation.state import Block
 
 __all__ = ["Contact", "Reading"]
@@ -65,10 +71,10 @@ class Contact:
         """Place the objects in the middle of their tables, stacked on each other."""
         self._blocks, number = tuple(blocks), len(blocks)
         half = np.array([block.half for block in blocks]).reshape(number, 3)
-        self._setting, self._frame = Setting(half, table, time_step), frame
-        self._objects = np.zeros((count, number), OBJECT)
-        self._cups = np.zeros(count, CUP_STATE)
-        self._forces = np.zeros((count, slots(number), 3))
+        turn, origin = (vector("frame", part) for part in frame)
+        self._setting = Setting(half, table, time_step, turn, origin)
+        self._tables, self._earlier = tables_for(count, number), tables_for(count, number)
+        self._work = work_for(number)
         everything = np.arange(count)
         self.alter(everything, np.ones(count), np.ones(count))
         middle = np.zeros((count, number, 3))
@@ -79,7 +85,7 @@ class Contact:
         """Scale nominal masses and friction coefficients on tables ``rows`` by factors (r,)."""
         for name, factor in (("mass", mass_factor), ("friction", friction_factor)):
             nominal = np.array([getattr(block, name) for block in self._blocks])
-            self._objects[name][rows] = factor[:, None] * nominal
+            self._tables.objects[name][rows] = factor[:, None] * nominal
 
     def place(
         self, rows: Any, positions: FloatArray, quaternions: FloatArray | None = None
@@ -91,71 +97,65 @@ class Contact:
             positions: (r, k, 3) m, world, centres of the objects.
             quaternions: (r, k, 4), orientations (x, y, z, w); None for upright objects.
         """
-        objects = self._objects[rows]
+        tables = self._tables
+        objects = tables.objects[rows]
         objects["position"] = positions
         objects["quaternion"] = (0.0, 0.0, 0.0, 1.0) if quaternions is None else quaternions
-        objects["velocity"] = objects["spin"] = 0.0
-        objects["rest"] = 0.0
-        self._objects[rows] = objects
+        objects["velocity"] = objects["spin"] = objects["rest"] = 0.0
         empty = np.zeros((), CUP_STATE)
         empty["held"] = -1
-        self._cups[rows] = empty
-        self._forces[rows] = 0.0
+        tables.objects[rows], tables.cups[rows] = objects, empty
+        tables.forces[rows], tables.awake[rows] = 0.0, True
 
     def advance(
-        self, rows: IntArray, path: tuple[FloatArray, FloatArray, FloatArray], vacuum_on: BoolArray
+        self, rows: IntArray, route: Route, vacuum_on: BoolArray, last: int = 1
     ) -> tuple[FloatArray, FloatArray]:
         """Simulate K time steps on some tables.
 
         Args:
             rows: (r,) indices of the tables.
-            path: Point P, m, machine's frame: before the last time step (r, 3), now (r, 3), and
-                after each of the K time steps (r, K, 3). The arrays must be contiguous.
+            route: Motion of point P.
             vacuum_on: (r,) whether the vacuum is on.
+            last: Number of last time steps whose forces are returned, m.
 
         Returns:
-            Force (r, K, 3) N of cup and objects on the platform in each time step, machine's
+            Force (r, m, 3) N of cup and objects on the platform in each time step, machine's
             frame, without weight and inertia of a cup that does not slide. Mass (r,) kg of the held
             objects.
         """
-        force, carried = np.zeros(path[2].shape), np.zeros(len(rows))
+        force, carried = np.zeros((len(rows), last, 3)), np.zeros(len(rows))
         if self._blocks:
-            states = self._objects, self._cups, self._forces
-            # Threads may advance different rows at the same time, so each call allocates a Work.
-            work = work_for(len(self._blocks))
-            advance(states, rows, path, self._frame, vacuum_on, self._setting, work, force, carried)
+            states = self._tables, self._earlier
+            advance(*states, rows, route, vacuum_on, self._setting, self._work, force, carried)
         return force, carried
 
     def read(self) -> Reading:
         """Return copies of the state of all tables."""
-        objects, cups = self._objects, self._cups
-        return Reading(
-            objects["position"].copy(),
-            objects["quaternion"].copy(),
-            objects["velocity"].copy(),
-            objects["spin"].copy(),
-            cups["held"].astype(np.int64),
-            cups["vacuum"].copy(),
-        )
+        count, number = self._tables.objects.shape
+        position, velocity, spin = np.empty((3, count, number, 3))
+        reading = Reading(
+            position, np.empty((count, number, 4)), velocity, spin,
+            np.empty(count, np.int64), np.empty(count),
+        )  # fmt: skip
+        read(self._tables.objects, self._tables.cups, *reading)
+        return reading
 
-    def copy(self) -> tuple[Any, ...]:
-        """Return copies of all records; several times faster than :meth:`save`."""
-        return self._objects.copy(), self._cups.copy(), self._forces.copy()
-
-    def repeat(self, rows: IntArray, copies: tuple[Any, ...]) -> None:
-        """Restore some tables from the result of :meth:`copy`."""
-        for own, earlier in zip((self._objects, self._cups, self._forces), copies, strict=True):
+    def undo(self, rows: IntArray) -> None:
+        """Undo the last :meth:`advance` of some tables."""
+        rows = rows[self._earlier.awake[rows]]  # the others have not changed
+        for own, earlier in zip(self._tables, self._earlier, strict=True):
             own[rows] = earlier[rows]
 
     def save(self, rows: Any) -> FloatArray:
         """Return the state of some tables as an array (r, c)."""
-        parts = self._objects[rows], self._cups[rows], self._forces[rows]
+        parts = [part[rows] for part in self._tables[:3]]
         return np.concatenate([p.view(np.float64).reshape(len(p), -1) for p in parts], axis=1)
 
     def restore(self, rows: Any, saved: FloatArray) -> None:
         """Restore some tables from the result of :meth:`save`."""
-        parts, first = (self._objects, self._cups, self._forces), 0
-        for part in parts:
+        first = 0
+        for part in self._tables[:3]:
             plain = part.view(np.float64).reshape(len(part), -1)
             plain[rows] = saved[:, first : first + plain.shape[1]]
             first += plain.shape[1]
+        self._tables.awake[rows] = True

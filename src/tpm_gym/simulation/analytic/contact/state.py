@@ -7,7 +7,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tpm_gym.arrays import FloatArray
+from tpm_gym.arrays import BoolArray, FloatArray, Vector
 
 __all__ = [
     "AT_REST",
@@ -20,9 +20,12 @@ __all__ = [
     "TABLE_SLOTS",
     "Record",
     "Records",
+    "Route",
     "Setting",
+    "Tables",
     "Work",
     "slots",
+    "tables_for",
     "work_for",
 ]
 
@@ -101,11 +104,46 @@ class Setting(NamedTuple):
         half: (k, 3) m, half edge lengths of the objects.
         table: Half edge lengths of the table along x and y, m.
         step: Time step, s.
+        turn, origin: Factors, and origin (m), that convert the machine's frame to the world frame.
     """
 
     half: FloatArray
     table: tuple[float, float]
     step: float
+    turn: Vector
+    origin: Vector
+
+
+class Tables(NamedTuple):
+    """State of n tables with k objects each.
+
+    Attributes:
+        objects: (n, k) records of :data:`OBJECT`.
+        cups: (n,) records of :data:`CUP_STATE`.
+        forces: (n, slots(k), 3) N, contact forces of the last time step.
+        awake: (n,) whether objects or cup may change while the lip stays away.
+    """
+
+    objects: Records
+    cups: Records
+    forces: FloatArray
+    awake: BoolArray
+
+
+class Route(NamedTuple):
+    """Motion of point P in K time steps, for r robots; m, machine's frame, contiguous arrays.
+
+    Attributes:
+        before: (r, 3), before the last time step.
+        now: (r, 3), at the beginning.
+        controls: (r, c, 3), control points, whose convex hull contains the motion.
+        weights: (K, c), weights of the control points after each time step.
+    """
+
+    before: FloatArray
+    now: FloatArray
+    controls: FloatArray
+    weights: FloatArray
 
 
 class Work(NamedTuple):
@@ -132,3 +170,9 @@ def work_for(objects: int) -> Work:
     """Allocate the workspace for ``objects`` objects."""
     bodies, contacts = np.zeros(objects + 1, BODY), np.zeros(slots(objects), CONTACT)
     return Work(bodies, contacts, np.zeros((2, 12, 3)))
+
+
+def tables_for(count: int, objects: int) -> Tables:
+    """Allocate the state of ``count`` tables with ``objects`` objects each."""
+    records, cups = np.zeros((count, objects), OBJECT), np.zeros(count, CUP_STATE)
+    return Tables(records, cups, np.zeros((count, slots(objects), 3)), np.zeros(count, np.bool_))

@@ -16,11 +16,19 @@ from tpm_gym.mechanism.mount import GRAVITY
 from tpm_gym.simulation.analytic.contact.collision import collide_lip, collide_objects
 from tpm_gym.simulation.analytic.contact.grasp import CUP_MASS, Way, breathe, carry, lip_of
 from tpm_gym.simulation.analytic.contact.solver import Motor, prepare, solve, still
-from tpm_gym.simulation.analytic.contact.state import AT_REST, Record, Records, Setting, Work
+from tpm_gym.simulation.analytic.contact.state import (
+    AT_REST,
+    Record,
+    Records,
+    Route,
+    Setting,
+    Tables,
+    Work,
+)
 from tpm_gym.simulation.engine import SPRING_GAIN
 from tpm_gym.simulation.vectors import axes, cross, dot, length, plus, put, put_row, row_of, three
 
-__all__ = ["advance"]
+__all__ = ["advance", "read"]
 
 _SLOW, _SLOW_SPIN = 5e-3, 0.3  # m/s, rad/s: objects below both speeds may come to rest
 _SETTLED, _STOPPED = 1e-6, 1e-3  # m, m/s: below both, the slide is set to 0
@@ -37,10 +45,10 @@ _ZERO: Vector = (0.0, 0.0, 0.0)
 
 @kept
 def advance(
-    states: tuple[Records, Records, FloatArray],
+    tables: Tables,
+    earlier: Tables,
     rows: IntArray,
-    path: tuple[FloatArray, FloatArray, FloatArray],
-    frame: tuple[FloatArray, FloatArray],
+    path: Route,
     on: BoolArray,
     setting: Setting,
     work: Work,
@@ -49,37 +57,82 @@ def advance(
 ) -> None:
     """Simulate K time steps on some tables.
 
-    The arguments rows, path, frame and on are explained in :class:`.contact.Contact`.
+    The arguments rows, path and on are explained in :class:`.contact.Contact`.
 
     Args:
-        states: Objects (n, k), cups (n,) and forces (n, slots, 3) N; changed.
-        push: (r, K, 3) N, force on the platform, machine's frame; output, initially zero.
+        tables: State of all tables; changed.
+        earlier: Output; state at the beginning of the tables that are simulated.
+        push: (r, m, 3) N, force on the platform in the last m time steps, machine's frame; output,
+            initially zero.
         carried: (r,) kg, masses of the held objects at the end; output, initially zero.
     """
-    turn, origin = three(frame[0]), three(frame[1])
-    points = np.empty((push.shape[1] + 2, 3))
+    steps, skipped, turn = len(path.weights), len(path.weights) - push.shape[1], setting.turn
+    points = np.empty((steps + 2, 3))
     for i in range(len(rows)):
         row = rows[i]
-        cup = states[1][row]
-        put_row(points, 0, _placed(row_of(path[0], i), turn, origin))
-        put_row(points, 1, _placed(row_of(path[1], i), turn, origin))
-        for k in range(2, len(points)):
-            point = path[2][i, k - 2, 0], path[2][i, k - 2, 1], path[2][i, k - 2, 2]
-            put_row(points, k, _placed(point, turn, origin))
-        idle = cup["held"] < 0 and cup["slide"] == 0 and cup["vacuum"] == 0
-        # This reads the fields directly, because array views cost more than all comparisons here.
-        for index in range(states[0].shape[1]):
-            idle = idle and states[0][row, index]["rest"] >= AT_REST
-        if idle and not _reached(states[0], row, points, setting):
+        earlier.awake[row] = tables.awake[row] or _reached(tables.objects, row, path, i, setting)
+        if not earlier.awake[row]:
             continue
-        objects, forces = states[0][row], states[2][row]
-        for k in range(len(points) - 2):
+        _copy(tables, earlier, row)
+        _place(path, i, setting, points)
+        objects, cup, forces = tables.objects[row], tables.cups[row], tables.forces[row]
+        for k in range(steps):
             way = Way(row_of(points, k), row_of(points, k + 1), row_of(points, k + 2))
             force = _step(objects, cup, forces, way, on[i], setting, work)
-            put(push[i, k], _placed(force, turn, _ZERO))
+            if k >= skipped:
+                put(push[i, k - skipped], _placed(force, turn, _ZERO))
         held = int(cup["held"])
         if held >= 0:
             carried[i] = objects[held]["mass"]
+        empty = held < 0 and cup["slide"] == 0 and cup["vacuum"] == 0
+        tables.awake[row] = not (empty and _at_rest(objects))
+
+
+@kept
+def read(
+    objects: Records,
+    cups: Records,
+    position: FloatArray,
+    quaternion: FloatArray,
+    velocity: FloatArray,
+    spin: FloatArray,
+    held: IntArray,
+    vacuum: FloatArray,
+) -> None:
+    """Write the state of all tables to the attributes of :class:`.contact.Reading`."""
+    for row in range(len(cups)):
+        held[row], vacuum[row] = int(cups[row]["held"]), cups[row]["vacuum"]
+        for index in range(objects.shape[1]):
+            item = objects[row, index]
+            for i in range(3):
+                position[row, index, i] = item["position"][i]
+                velocity[row, index, i] = item["velocity"][i]
+                spin[row, index, i] = item["spin"][i]
+            for i in range(4):
+                quaternion[row, index, i] = item["quaternion"][i]
+
+
+@compiled
+def _copy(tables: Tables, copy: Tables, row: int) -> None:
+    """Copy the objects, cup and forces of a table."""
+    copy.cups[row] = tables.cups[row]
+    for index in range(tables.objects.shape[1]):
+        copy.objects[row, index] = tables.objects[row, index]
+    for slot in range(tables.forces.shape[1]):
+        put_row(copy.forces[row], slot, row_of(tables.forces[row], slot))
+
+
+@compiled
+def _place(path: Route, i: int, setting: Setting, points: FloatArray) -> None:
+    """Write point P (m, world) before and at the beginning, and after each time step."""
+    turn, origin = setting.turn, setting.origin
+    put_row(points, 0, _placed(row_of(path.before, i), turn, origin))
+    put_row(points, 1, _placed(row_of(path.now, i), turn, origin))
+    for k in range(len(path.weights)):
+        point = _ZERO
+        for j in range(path.weights.shape[1]):
+            point = plus(point, row_of(path.controls[i], j), path.weights[k, j])
+        put_row(points, k + 2, _placed(point, turn, origin))
 
 
 @compiled
@@ -112,18 +165,23 @@ def _slow(objects: Records) -> bool:
 
 
 @compiled
-def _reached(tables: Records, row: int, points: FloatArray, setting: Setting) -> bool:
-    """Return whether the lip may touch an object at ``points``; compare boxes around both."""
-    lowest = math.inf
-    for k in range(1, len(points)):
-        lowest = min(lowest, points[k, 2])
-    for index in range(tables.shape[1]):
-        (x, y, z), size = three(tables[row, index]["position"]), length(row_of(setting.half, index))
-        if lowest - CUP.length < z + size + _BESIDE:
-            near = size + CUP.radius + _BESIDE
-            for k in range(1, len(points)):
-                if abs(points[k, 0] - x) < near and abs(points[k, 1] - y) < near:
-                    return True
+def _reached(objects: Records, row: int, path: Route, i: int, setting: Setting) -> bool:
+    """Return whether the lip may touch an object; compare boxes around path and objects."""
+    low = high = _placed(row_of(path.now, i), setting.turn, setting.origin)
+    for j in range(path.controls.shape[1]):
+        x, y, z = path.controls[i, j, 0], path.controls[i, j, 1], path.controls[i, j, 2]
+        x, y, z = _placed((x, y, z), setting.turn, setting.origin)
+        low = min(x, low[0]), min(y, low[1]), min(z, low[2])
+        high = max(x, high[0]), max(y, high[1]), max(z, high[2])
+    for index in range(objects.shape[1]):
+        place, size = objects[row, index]["position"], length(row_of(setting.half, index))
+        near = size + CUP.radius + _BESIDE
+        if (
+            low[2] - CUP.length < place[2] + size + _BESIDE
+            and low[0] - near < place[0] < high[0] + near
+            and low[1] - near < place[1] < high[1] + near
+        ):
+            return True
     return False
 
 
