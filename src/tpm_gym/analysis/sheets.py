@@ -153,6 +153,17 @@ def _arcs(geometry: Geometry, mode: WorkingMode, factor: str) -> tuple[_Arcs, Po
     return arcs, (x, z, p, q), chords.sum(-1)
 
 
+def curves(factor: str, mode: WorkingMode, geometry: Geometry) -> Point:
+    """Return the curves of C1 on which a factor is zero, m in number, in 256 steps each, (m, 257).
+
+    Args:
+        factor: ``"level3"``, ``"planar"``, ``"leg1"``, ``"leg2"`` or ``"elevation"``.
+        mode: The working mode. Points that belong to others are included; see :data:`Point`.
+        geometry: Link lengths.
+    """
+    return _arcs(geometry, mode, factor)[1]
+
+
 def _intervals(real: Callable[[FloatArray], FloatArray]) -> list[tuple[float, float]]:
     """Return the intervals of a turn in which a function is positive, short ones included."""
     t = np.linspace(0.0, 2 * np.pi, _GRID + 1)

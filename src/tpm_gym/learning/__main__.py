@@ -12,7 +12,8 @@ def main() -> None:
     except ModuleNotFoundError as error:
         from tpm_gym.errors import MissingPackageError
 
-        sys.exit(f"error: {MissingPackageError(str(error.name), 'train')}")
+        extra = "view" if sys.argv[1:2] == ["view"] else "train"
+        sys.exit(f"error: {MissingPackageError(str(error.name), extra)}")
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from tyro.conf import Positional, subcommand
 from tpm_gym import TPMError
 from tpm_gym.learning.configuration import ResumeConfig, TrainingConfig, TuneConfig
 from tpm_gym.learning.evaluation import EvaluationConfig, evaluate
+from tpm_gym.viewer import ViewConfig, run
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,7 @@ Command = (
     | Annotated[EvaluationConfig, subcommand("evaluate")]
     | Annotated[ExportConfig, subcommand("export")]
     | Annotated[TuneConfig, subcommand("tune")]
+    | Annotated[ViewConfig, subcommand("view")]
 )
 
 
@@ -52,6 +54,9 @@ def main(words: Sequence[str] | None = None) -> None:
     try:
         if isinstance(command, EvaluationConfig):
             evaluate(command)
+            return
+        if isinstance(command, ViewConfig):
+            run(command)
             return
         # Imported here, since they need PyTorch.
         from tpm_gym.learning import export, model_card, training, tune

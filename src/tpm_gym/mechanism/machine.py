@@ -35,7 +35,15 @@ from tpm_gym.mechanism.bodies import Mechanism
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.mount import Mount
 
-__all__ = ["MODES", "Machine", "Motion", "Reading", "find_machine", "register_machine"]
+__all__ = [
+    "MODES",
+    "Machine",
+    "Motion",
+    "Reading",
+    "find_machine",
+    "machine_names",
+    "register_machine",
+]
 
 MODES: Final = (None, "assembly", "working")
 """Names of the numbers of :meth:`Machine.mode_left`."""
@@ -440,6 +448,11 @@ def register_machine(name: str, machine: Machine | Callable[[], Machine]) -> Non
     if _MACHINES.get(name, machine) != machine:
         raise ConfigurationError("machine", name, f"a name other than {', '.join(_MACHINES)}")
     _MACHINES[name] = machine
+
+
+def machine_names() -> tuple[str, ...]:
+    """Return the names of all registered machines."""
+    return tuple(_MACHINES)
 
 
 def find_machine(machine: Any) -> Machine:

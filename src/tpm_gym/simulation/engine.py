@@ -33,6 +33,7 @@ __all__ = [
     "Readout",
     "Twist",
     "drives_of_one",
+    "engine_names",
     "make_engine",
     "most_robots",
     "register_engine",
@@ -363,6 +364,11 @@ def _path(engine: str | Factory) -> str:
     if isinstance(engine, str):
         return engine
     return f"{engine.__module__}:{getattr(engine, '__qualname__', engine)}"
+
+
+def engine_names() -> tuple[str, ...]:
+    """Return the names of all registered engines."""
+    return tuple(_ENGINES)
 
 
 def require_engine(name: Any) -> None:

@@ -1,0 +1,79 @@
+"""Viewer in the browser: postures, modes, singular surfaces, and episodes of any task.
+
+Needs the extra ``view``. Importing this package does not import viser.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tpm_gym.errors import MissingPackageError
+
+if TYPE_CHECKING:
+    from tpm_gym.mechanism.tpm import TPM
+    from tpm_gym.viewer.viewer import Viewer
+
+__all__ = ["ViewConfig", "open_viewer", "run"]
+
+
+@dataclass(frozen=True)
+class ViewConfig:
+    """Show the robot in the browser: drag it, see its singularities, and play episodes."""
+
+    machine: str = "paper"
+    """Machine that is shown first: paper, wide, or another registered TPM."""
+
+    host: str = "127.0.0.1"
+    """Address to listen on. Other computers reach the page only with another address."""
+
+    port: int = 8080
+    """Port to listen on; if it is taken, the next free one."""
+
+    export: Path | None = None
+    """Folder for index.html, a page with one episode of pick-and-place that needs no server; write
+    it and exit."""
+
+
+def open_viewer(
+    machine: str | TPM = "paper", *, host: str = "127.0.0.1", port: int = 8080
+) -> Viewer:
+    """Start a viewer in the background; ``.address`` is its page and ``.close()`` ends it.
+
+    Args:
+        machine: Name of a machine, or a :class:`tpm_gym.TPM`.
+        host: Address to listen on.
+        port: Port to listen on; if it is taken, the next free one.
+
+    Raises:
+        MissingPackageError: If viser is not installed.
+        ConfigurationError: If the machine is no TPM, or an option is not possible.
+    """
+    try:
+        from tpm_gym.viewer.viewer import Viewer
+    except ModuleNotFoundError as error:
+        raise MissingPackageError(error.name or "viser", "view") from error
+    return Viewer(machine, host, port)
+
+
+def run(config: ViewConfig) -> None:
+    """Run ``tpm-gym view``: serve until Ctrl-C, or export a page.
+
+    Raises:
+        MissingPackageError: If viser is not installed.
+        ConfigurationError: If the machine is no TPM, or an option is not possible.
+    """
+    if config.export is not None:
+        try:
+            from tpm_gym.viewer.export import export
+        except ModuleNotFoundError as error:
+            raise MissingPackageError(error.name or "viser", "view") from error
+        print(export(config.export, config.machine))
+        return
+    viewer = open_viewer(config.machine, host=config.host, port=config.port)
+    print(f"tpm_gym is at {viewer.address} (Ctrl-C ends it)", flush=True)
+    try:
+        viewer.server.sleep_forever()
+    except KeyboardInterrupt:
+        viewer.close()

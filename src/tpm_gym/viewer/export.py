@@ -1,0 +1,70 @@
+"""A page that shows one episode without a server."""
+
+from __future__ import annotations
+
+import io
+from contextlib import redirect_stdout
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from tpm_gym.mechanism.tpm import TPM
+from tpm_gym.simulation.state import CONTROL_PERIOD
+from tpm_gym.viewer.player import Player
+from tpm_gym.viewer.posture import at_joints
+from tpm_gym.viewer.scene import RobotScene, set_camera
+from tpm_gym.viewer.viewer import find_tpm, start_server
+
+__all__ = ["export"]
+
+_ENV: Final = "TPMPickAndPlace-v0"
+_HOLD: Final = 0.8
+"""Time for which the first and the last posture stay, s."""
+
+
+def export(folder: Path, machine: str | TPM = "paper", seed: int = 2) -> Path:
+    """Write ``index.html``: an episode of pick-and-place by the expert, in a loop.
+
+    The page holds everything it needs. The engine is the analytic one.
+
+    Args:
+        folder: Folder of the page; made if missing.
+        machine: Name of a machine, or a TPM.
+        seed: Seed of the episode.
+
+    Returns:
+        Path of the page.
+
+    Raises:
+        ConfigurationError: If the machine is no TPM.
+    """
+    found = find_tpm(machine)
+    server = start_server("127.0.0.1", 8080)
+    player = Player(_ENV, "analytic", found, "expert")
+    try:
+        set_camera(server, found)
+        robot = RobotScene(server.scene, found)
+        robot.set_objects(player.task.scene, player.task.tolerance)
+
+        def draw(theta: np.ndarray) -> None:
+            robot.draw(at_joints(found, theta, found.assembly_mode).places)
+            robot.draw_objects(player.state, player.markers)
+
+        player.reset(seed)
+        draw(player.state.theta)
+        recording = server.get_scene_serializer()
+        recording.insert_sleep(_HOLD)
+        while not player.ended:
+            player.step()
+            draw(player.state.theta)
+            recording.insert_sleep(CONTROL_PERIOD)
+        recording.insert_sleep(_HOLD)
+        folder.mkdir(parents=True, exist_ok=True)
+        page = folder / "index.html"
+        page.write_text(recording.as_html(), encoding="utf-8", newline="\n")
+    finally:
+        player.close()
+        with redirect_stdout(io.StringIO()):
+            server.stop()
+    return page

@@ -1,0 +1,145 @@
+"""Triangle meshes of singular surfaces and of sets of cells; machine's frame, m."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tpm_gym.analysis import sheets
+from tpm_gym.analysis.aspects import Cells
+from tpm_gym.arrays import FloatArray
+from tpm_gym.kinematics import WorkingMode
+from tpm_gym.kinematics.geometry import Geometry
+from tpm_gym.kinematics.workspace import reachable
+
+__all__ = ["SURFACES", "Mesh", "cells_mesh", "grid_mesh", "surface"]
+
+_AROUND = 33  # points along the half circle of link 7
+_SLACK = 1e-9  # share of l4 by which a leg may miss a boundary on which it lies
+_SMOOTHING = 4  # rounds
+
+
+class Mesh(NamedTuple):
+    """Vertices (v, 3) m and triangles (f, 3) of their indices."""
+
+    vertices: FloatArray
+    faces: NDArray[np.int64]
+
+
+def surface(factor: str, mode: WorkingMode, geometry: Geometry) -> Mesh:
+    """Return the part of the singular surface of a factor that a working mode reaches.
+
+    Args:
+        factor: One of :data:`tpm_gym.analysis.singularity.FACTORS`.
+        mode: The working mode.
+        geometry: Link lengths.
+    """
+    points = _POINTS.get(factor, _swept)(factor, mode, geometry)
+    # A leg that is stretched reaches with a longer rod; one that is folded, with a shorter rod.
+    longer, shorter = (replace(geometry, l4=geometry.l4 * (1 + sign * _SLACK)) for sign in (1, -1))
+    there = reachable(points, mode, longer) | reachable(points, mode, shorter)
+    return grid_mesh(np.where(there[..., None], points, np.nan))
+
+
+def _swept(factor: str, mode: WorkingMode, g: Geometry) -> FloatArray:
+    """Return points (m, a, b, 3) of a curve of C1 that link 7 sweeps; NaN in other modes."""
+    x, z, p, q = (part[..., None] for part in sheets.curves(factor, mode, g))
+    beta = np.linspace(-np.pi / 2, np.pi / 2, _AROUND)
+    cos, sin = mode.cos_beta * np.cos(beta), np.sin(beta)
+    points = np.broadcast_arrays(x + g.l2 + g.l7 * cos, g.l7 * sin, z + 2 * g.l6)
+    ours = p + q * cos > 0
+    return np.where(ours[..., None], np.stack(points, axis=-1), np.nan)
+
+
+def _planes(factor: str, mode: WorkingMode, g: Geometry) -> FloatArray:
+    """Return points (m, a, b, 3) of the plane y = 0 of sin(beta), or |y| = l7 of cos(beta)."""
+    del mode
+    reach = g.l3 + g.l4
+    x = np.linspace(-g.l1 - reach - g.l7, g.l1 + reach + g.l7, 241)
+    z = np.linspace(-reach, reach + 2 * g.l6, 181)
+    heights = [0.0] if factor == "sin_beta" else [-g.l7, g.l7]
+    points = np.meshgrid(np.array(heights), x, z, indexing="ij")
+    return np.stack([points[1], points[0], points[2]], axis=-1)
+
+
+def _torus(factor: str, mode: WorkingMode, g: Geometry) -> FloatArray:
+    """Return points (2, a, b, 3) on which leg 3 is stretched or folded: parts of a torus."""
+    del factor, mode
+    turn = np.linspace(0, 2 * np.pi, 257)[:, None]
+    tilt = np.arcsin(min(1.0, g.l7 / g.l4)) * np.linspace(-1, 1, _AROUND)
+    parts = []
+    for side in (1, -1):
+        radius = g.l3 + side * g.l4 * np.cos(tilt)
+        x, z = g.l1 - g.l2 + radius * np.cos(turn), g.l6 + radius * np.sin(turn)
+        parts.append(np.stack(np.broadcast_arrays(x, g.l4 * np.sin(tilt), z), axis=-1))
+    return np.stack(parts)
+
+
+_POINTS: Final[dict[str, Callable[[str, WorkingMode, Geometry], FloatArray]]] = {
+    "sin_beta": _planes,
+    "cos_beta": _planes,
+    "leg3": _torus,
+}
+SURFACES: Final = {
+    "parallel": ("sin_beta", "level3", "planar"),
+    "serial": ("cos_beta", "leg1", "leg2", "leg3"),
+    "constraint": ("elevation",),
+}
+"""Factors by the kind of singularity where they are zero."""
+
+
+def grid_mesh(points: FloatArray) -> Mesh:
+    """Return the triangles of grids of points (m, a, b, 3) without NaN."""
+    real = ~np.isnan(points[..., 0])
+    index = np.arange(real.size).reshape(real.shape)
+    corners = index[:, :-1, :-1], index[:, 1:, :-1], index[:, 1:, 1:], index[:, :-1, 1:]
+    quads = np.stack(corners, axis=-1).reshape(-1, 4)
+    return _compact(points.reshape(-1, 3), quads[real.ravel()[quads].all(axis=1)])
+
+
+def cells_mesh(cells: Cells) -> Mesh:
+    """Return the boundary of a set of cells, smoothed: corners move by less than a cell."""
+    mask = np.pad(cells.mask, 1).astype(np.int8)
+    nx, ny, nz = (n + 1 for n in mask.shape)
+    index = np.arange(nx * ny * nz).reshape(nx, ny, nz)
+    quads = []
+    for axis in range(3):
+        change = np.diff(mask, axis=axis)
+        one, other = (np.eye(3, dtype=np.intp)[k] for k in range(3) if k != axis)
+        around = [0 * one, one, one + other, other]
+        for sign in (1, -1):
+            start = np.argwhere(change == sign)
+            start[:, axis] += 1
+            # Corners run so that the outside is in front; the second axis of three is reversed.
+            forwards = (sign > 0) == (axis == 1)
+            ring = around if forwards else around[::-1]
+            quads.append(np.stack([index[tuple((start + step).T)] for step in ring], axis=1))
+    corners = (np.moveaxis(np.indices(index.shape), 0, -1) - 1.0).reshape(-1, 3)
+    mesh = _compact(np.asarray(cells.low) + corners * cells.spacing, np.concatenate(quads))
+    return Mesh(_smooth(mesh), mesh.faces)
+
+
+def _compact(points: FloatArray, quads: NDArray[Any]) -> Mesh:
+    """Split quadrilaterals into triangles, and keep the points that are used."""
+    used, renamed = np.unique(quads, return_inverse=True)
+    quads = renamed.reshape(quads.shape)
+    faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+    return Mesh(points[used], faces)
+
+
+def _smooth(mesh: Mesh) -> FloatArray:
+    """Move each vertex to the mean of its neighbours, some times."""
+    points, faces = mesh
+    one = faces[:, [0, 1, 2]].ravel()
+    other = faces[:, [1, 2, 0]].ravel()
+    ends, starts = np.concatenate([one, other]), np.concatenate([other, one])
+    count = np.bincount(ends, minlength=len(points))[:, None]
+    for _ in range(_SMOOTHING):
+        total = np.zeros_like(points)
+        np.add.at(total, ends, points[starts])
+        points = total / count
+    return points

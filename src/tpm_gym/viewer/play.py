@@ -1,0 +1,215 @@
+"""Tab "Play": episodes of tasks, with reward terms and torques plotted while they run."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from viser import GuiUplotHandle, ViserServer, uplot
+
+import tpm_gym
+from tpm_gym.mechanism.machine import Machine
+from tpm_gym.simulation.state import CONTROL_PERIOD
+from tpm_gym.viewer.player import Player, installed_engines, policies_for
+from tpm_gym.viewer.worker import Worker
+
+__all__ = ["Play"]
+
+_COLOURS: Final = ("#0969da", "#d63031", "#2ea043", "#db8400", "#823cbe", "#118ab2")
+_MOTORS: Final = ("motor 1", "motor 2", "motor 3")
+_REDRAW: Final = 0.1
+"""Shortest time between two drawings of the plots, s."""
+_PAUSE: Final = 15
+"""Control periods for which the end of an episode stays in view."""
+
+
+class Play:
+    """Controls of episodes.
+
+    Args:
+        server: The viser server; the controls are added to its present container.
+        worker: Thread that runs the episodes.
+        show: Called with the player after every reset and step.
+    """
+
+    def __init__(
+        self, server: ViserServer, worker: Worker, show: Callable[[Player], object]
+    ) -> None:
+        """Add the controls."""
+        self._worker, self._show = worker, show
+        self._machine: Machine
+        self.player: Player | None = None
+        self.playing = False
+        self._drawn, self._rest = 0.0, 0
+        gui = server.gui
+        ids = tpm_gym.ENV_IDS
+        first = "TPMPickAndPlaceDense-v0"
+        self.env_id: Any = gui.add_dropdown("Environment", ids, initial_value=first)
+        self.engine = gui.add_dropdown("Engine", installed_engines())
+        self.policy: Any = gui.add_dropdown("Policy", policies_for(self.env_id.value))
+        self.file = gui.add_text(
+            "Policy file", "", hint="Exported policy (.json); overrides Policy"
+        )
+        self.seed: Any = gui.add_number("Seed", 0, min=0, step=1)
+        self.speed = gui.add_slider("Speed", 0.1, 4.0, 0.1, 1.0, hint="1 is real time")
+        self.buttons = gui.add_button_group("", ("Play", "Pause", "Step", "New episode"))
+        self._status: Any = gui.add_html("")
+        self._gui = gui
+        self._plots: list[GuiUplotHandle] = []
+        self._folder = gui.add_folder(None)
+        self._connect()
+
+    def _connect(self) -> None:
+        for handle in (self.engine, self.policy, self.file):
+            handle.on_update(lambda _: self._put("player", self.discard))
+        self.env_id.on_update(lambda _: self._put("player", self._set_env))
+        self.speed.on_update(lambda _: self._put("speed", self._set_speed))
+        self.seed.on_update(lambda _: self._put("seed", self.discard_episode))
+        jobs = {
+            "Play": self.play, "Pause": self.pause, "Step": self.step, "New episode": self.new
+        }  # fmt: skip
+        self.buttons.on_click(lambda event: self._put("button", jobs[event.target.value]))
+
+    def _put(self, name: str, job: Callable[[], object]) -> None:
+        if not self._worker.here:
+            self._worker.put(name, job)
+
+    # -- what the controls do -----------------------------------------------------------------
+
+    def set_machine(self, machine: Machine) -> None:
+        """Play with another machine from the next episode on."""
+        self._machine = machine
+        self.discard()
+
+    def play(self) -> None:
+        """Run the episode, and the episodes after it, in real time."""
+        self._ready()
+        self.playing = True
+        self._set_speed()
+
+    def pause(self) -> None:
+        """Hold the episode."""
+        self.playing = False
+        self._worker.stop_ticking()
+
+    def step(self) -> None:
+        """Run one control step."""
+        self.pause()
+        self._advance(self._ready())
+
+    def new(self) -> None:
+        """Begin the episode of the next seed."""
+        if self.player is not None and self.player.records:
+            self.seed.value += 1
+        self._begin(self._made())
+
+    def discard(self) -> None:
+        """Close the environment; the next one has the options of the panel."""
+        self.pause()
+        if self.player is not None:
+            self.player.close()
+        self.player = None
+
+    def discard_episode(self) -> None:
+        """Let the next step begin the episode of the panel's seed."""
+        if self.player is not None:
+            self.player.ended = True
+
+    def _set_env(self) -> None:
+        self.discard()
+        self.policy.options = policies_for(self.env_id.value)
+
+    def _set_speed(self) -> None:
+        if self.playing:
+            self._worker.tick(CONTROL_PERIOD / self.speed.value, self._tick)
+
+    # -- running ------------------------------------------------------------------------------
+
+    def _made(self) -> Player:
+        """Return the player, and make it if necessary."""
+        if self.player is None:
+            self._tell("Starting the engine; the first time it compiles for up to a minute.")
+            path = self.file.value.strip()
+            policy = str(Path(path).expanduser()) if path else self.policy.value
+            self.player = Player(self.env_id.value, self.engine.value, self._machine, policy)
+        return self.player
+
+    def _ready(self) -> Player:
+        """Return the player, in an episode."""
+        player = self._made()
+        if player.ended:
+            self._begin(player)
+        return player
+
+    def _begin(self, player: Player) -> None:
+        player.reset(int(self.seed.value))
+        self._rest = _PAUSE
+        self._show(player)
+        self._plot(player, anew=True)
+
+    def _tick(self) -> None:
+        player = self._made()
+        if not player.ended:
+            self._advance(player)
+        elif self._rest > 0:
+            self._rest -= 1
+        else:
+            self.new()
+
+    def _advance(self, player: Player) -> None:
+        player.step()
+        self._show(player)
+        if time.monotonic() - self._drawn > _REDRAW or player.ended or not self.playing:
+            self._plot(player)
+
+    # -- plots --------------------------------------------------------------------------------
+
+    def _plot(self, player: Player, anew: bool = False) -> None:
+        """Draw reward terms and torques, and tell how the episode goes."""
+        self._drawn = time.monotonic()
+        records = player.records
+        names = sorted(records[0].reward_terms) if records else []
+        steps = np.arange(1.0, len(records) + 1)
+        terms = [[record.reward_terms[name] for record in records] for name in names]
+        torques = np.array([record.torque for record in records]).reshape(-1, 3).T
+        if anew or len(self._plots) != 2:
+            for plot in self._plots:
+                plot.remove()
+            self._plots = []
+        if records:
+            self._draw(0, "Reward terms", names, steps, terms, player.length)
+            self._draw(1, "Torques, N m", _MOTORS, steps, torques, player.length)
+        total = sum(sum(record.reward_terms.values()) for record in records)
+        success = bool(records) and records[-1].success
+        verdict = "goal achieved" if success else "ended" if player.ended else "running"
+        self._tell(
+            f"Step {len(records)} of {player.length} · return {total:.2f} · <b>{verdict}</b>"
+        )
+
+    def _draw(
+        self, index: int, title: str, names: Sequence[str], steps: Any, values: Any, length: int
+    ) -> None:
+        data = (steps, *(np.asarray(row, dtype=np.float64) for row in values))
+        if index < len(self._plots):
+            self._plots[index].data = data
+            return
+        series = [
+            uplot.Series(label=name, stroke=paint, width=2)
+            for name, paint in zip(names, _COLOURS, strict=False)
+        ]
+        with self._folder:
+            plot: GuiUplotHandle = self._gui.add_uplot(
+                data,
+                (uplot.Series(label="step"), *series),
+                title=title,
+                height=190,
+                scales={"x": uplot.Scale(time=False, range=(0.0, float(length or len(steps))))},
+                legend=uplot.Legend(show=True),
+            )
+        self._plots.append(plot)
+
+    def _tell(self, text: str) -> None:
+        self._status.content = f'<div style="padding:0 1em 0.5em;font-size:0.85em">{text}</div>'

@@ -1,0 +1,200 @@
+"""Postures of the mechanism on any solution branch, from closed-form kinematics."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from tpm_gym.analysis.singularity import FACTORS, nearest_singularity
+from tpm_gym.arrays import FloatArray, vector
+from tpm_gym.errors import InputError
+from tpm_gym.kinematics import (
+    ASSEMBLY_MODES,
+    ROTATED_MODES,
+    WORKING_MODES,
+    AssemblyMode,
+    RotatedMode,
+    RotatedPostures,
+    WorkingMode,
+    forward,
+    forward_rotated,
+    inverse,
+    inverse_rotated,
+    jacobian,
+    rotated,
+)
+from tpm_gym.kinematics.workspace import assembly_of
+from tpm_gym.mechanism import tree
+from tpm_gym.mechanism.bodies import Place
+from tpm_gym.mechanism.tpm import TPM
+
+__all__ = ["OPERATIONS", "Margin", "Operation", "Posture", "at_joints", "at_point"]
+
+Operation: TypeAlias = Literal["translating", "rotated"]
+OPERATIONS: Final[tuple[Operation, ...]] = ("translating", "rotated")
+
+
+@dataclass(frozen=True)
+class Margin:
+    """Nearest singular position of point P.
+
+    Attributes:
+        distance: Distance from P, m.
+        point: The singular position (3,) m, machine's frame.
+        factor: Name of the factor that is zero there.
+    """
+
+    distance: float
+    point: FloatArray
+    factor: str
+
+
+@dataclass(frozen=True)
+class Posture:
+    """The mechanism with closed loops; machine's frame.
+
+    Attributes:
+        machine: The machine.
+        theta: (3,) rad, joint positions of the motors.
+        position: (3,) m, point P.
+        tilt: Turn of link 3' and the platform about y, rad; 0 in translating operation.
+        working: Working mode: the signs of the serial factors.
+        assembly: Assembly mode; a RotatedMode in rotated operation.
+        joints: Positions of all joints by name, rad or m.
+        conditioning: 1/cond(J) of the motion of P, in [0, 1]; 0 at a singularity.
+    """
+
+    machine: TPM
+    theta: FloatArray
+    position: FloatArray
+    tilt: float
+    working: WorkingMode
+    assembly: AssemblyMode | RotatedMode
+    joints: Mapping[str, float]
+    conditioning: float
+
+    @property
+    def operation(self) -> Operation:
+        """Operation mode."""
+        return "rotated" if isinstance(self.assembly, RotatedMode) else "translating"
+
+    @cached_property
+    def places(self) -> dict[str, Place]:
+        """Positions and orientations of all links in the base's frame, by name."""
+        return self.machine.mechanism.places(self.joints)
+
+    @property
+    def gap(self) -> float:
+        """Largest distance between the two points of a loop closure, m."""
+        ends = [
+            self.places[closure.link_a].point(closure.point_a)
+            - self.places[closure.link_b].point(closure.point_b)
+            for closure in self.machine.mechanism.closures
+        ]
+        return float(np.linalg.norm(ends, axis=-1).max())
+
+    @property
+    def stop_margins(self) -> FloatArray:
+        """Distance of each motor to its nearest stop, (3,) rad; negative beyond the stop."""
+        low, high = self.machine.stops
+        margins: FloatArray = np.minimum(self.theta - low, high - self.theta)
+        return margins
+
+    def singularity_margin(self) -> Margin | None:
+        """Find the nearest singular position of P; None in rotated operation.
+
+        The search takes 5 to 10 ms, unlike everything else here.
+        """
+        if not isinstance(self.assembly, AssemblyMode):
+            return None
+        found = nearest_singularity(
+            self.position, self.working, self.assembly, self.machine.geometry
+        )
+        if not found.valid:
+            return None
+        return Margin(float(found.distance), found.point, FACTORS[int(found.factor)])
+
+
+def at_point(
+    machine: TPM, position: ArrayLike, operation: Operation, working: WorkingMode, tilt: float = 0.0
+) -> Posture:
+    """Solve the posture with P at ``position`` (3,) m, on a working mode.
+
+    Args:
+        machine: The machine.
+        position: Point P, machine's frame.
+        operation: Operation mode.
+        working: Working mode.
+        tilt: Of several rotated postures, the one with the tilt nearest to this is taken, rad.
+
+    Raises:
+        InputError: If position is no three finite numbers, or no such rotated posture exists.
+        UnreachableError: If a leg does not reach.
+    """
+    place, geometry = np.array(vector("position", position)), machine.geometry
+    if operation == "translating":
+        theta = inverse(place, working, geometry)
+        assembly = ASSEMBLY_MODES[int(assembly_of(place, working, geometry))]
+        return _straight(machine, theta, place, working, assembly)
+    found = inverse_rotated(place, geometry)
+    serial = rotated.factors(found).serial
+    ours = found.valid & ((serial > 0) == (np.array(working.signs) > 0)).all(axis=-1)
+    if not ours.any():
+        valid = "where link 3' can be turned in this working mode; "
+        others = int(found.valid.sum())
+        valid += f"other working modes have {others} such postures here" if others else "none has"
+        raise InputError("position", tuple(place.round(4).tolist()), valid)
+    slot = int(np.where(ours, abs(found.tilt - tilt), np.inf).argmin())
+    every = forward_rotated(found.theta[slot], geometry)
+    apart = abs(every.tilt - found.tilt[slot]) + abs(every.beta - found.beta[slot])
+    index = int(np.where(every.valid, apart, np.inf).argmin())
+    return _turned(machine, every, ROTATED_MODES[index])
+
+
+def at_joints(machine: TPM, theta: ArrayLike, assembly: AssemblyMode | RotatedMode) -> Posture:
+    """Solve the posture with the motors at ``theta`` (3,) rad, on an assembly mode.
+
+    Raises:
+        InputError: If theta is no three finite numbers, or a rotated mode does not exist there.
+        UnreachableError: If the assembly mode does not exist there.
+    """
+    angles, geometry = np.array(vector("theta", theta)), machine.geometry
+    if isinstance(assembly, RotatedMode):
+        return _turned(machine, forward_rotated(angles, geometry), assembly)
+    place = forward(angles, assembly, geometry)
+    working = _working(jacobian.factors(angles, assembly, geometry).serial)
+    return _straight(machine, angles, place, working, assembly)
+
+
+def _straight(
+    machine: TPM,
+    theta: FloatArray,
+    place: FloatArray,
+    working: WorkingMode,
+    assembly: AssemblyMode,
+) -> Posture:
+    """Return the posture with link 3' parallel to x."""
+    joints = tree.joint_angles(theta, assembly, machine.geometry)
+    quality = float(jacobian.conditioning(theta, assembly, machine.geometry))
+    return Posture(machine, theta, place, 0.0, working, assembly, joints, quality)
+
+
+def _turned(machine: TPM, found: RotatedPostures, mode: RotatedMode) -> Posture:
+    """Return the posture in one slot of the rotated assemblies at given joint positions."""
+    slot = mode.index
+    joints = tree.rotated_joint_angles(found.theta[slot], mode, machine.geometry)
+    working = _working(rotated.factors(found).serial[slot])
+    place, tilt = found.position[slot], float(found.tilt[slot])
+    sizes = np.linalg.svd(np.nan_to_num(rotated.velocity(found)[slot, :3]), compute_uv=False)
+    quality = float(sizes[2] / sizes[0]) if sizes[0] > 0 else 0.0
+    return Posture(machine, found.theta[slot], place, tilt, working, mode, joints, quality)
+
+
+def _working(serial: FloatArray) -> WorkingMode:
+    """Return the working mode with the signs of the serial factors (4,)."""
+    return WORKING_MODES[int(((serial > 0) * [8, 4, 2, 1]).sum())]

@@ -1,0 +1,132 @@
+"""Robot, table and objects as nodes of a viser scene."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+from viser import SceneApi, ViserServer
+from viser.transforms import SO3
+
+from tpm_gym.arrays import FloatArray
+from tpm_gym.mechanism.bodies import Place, Solid
+from tpm_gym.mechanism.machine import Machine
+from tpm_gym.mechanism.urdf import COLOURS
+from tpm_gym.simulation.stage import FLOOR, TABLE
+from tpm_gym.simulation.state import Scene, State
+
+__all__ = ["ROBOT", "RobotScene", "colour", "set_camera"]
+
+ROBOT: Final = "/robot"
+"""Node whose frame is the machine's frame; everything in that frame hangs below it."""
+
+_TURNS: Final = {
+    "x": (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0),
+    "y": (math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0),
+    "z": (1.0, 0.0, 0.0, 0.0),
+}
+"""Quaternions (w, x, y, z) that turn a cylinder along z onto an axis."""
+_GOAL: Final = (30, 160, 70)
+
+
+def colour(rgba: Sequence[float]) -> tuple[int, int, int]:
+    """Convert a colour with parts from 0 to 1 to whole numbers from 0 to 255."""
+    red, green, blue = (round(255 * part) for part in rgba[:3])
+    return red, green, blue
+
+
+def set_camera(server: ViserServer, machine: Machine) -> None:
+    """Place the camera of new pages, so that the robot fills the picture."""
+    middle = machine.mount.to_world(machine.home) * [1, 0.5, 0] + [
+        0,
+        0,
+        0.55 * machine.mount.height,
+    ]
+    server.initial_camera.look_at = middle
+    server.initial_camera.position = middle + [1.1, -1.65, 0.45]
+    server.initial_camera.fov = math.radians(38)
+
+
+class RobotScene:
+    """One robot over its table, with the objects and goal markers of a task.
+
+    Args:
+        scene: Scene of a viser server or client.
+        machine: The robot.
+    """
+
+    def __init__(self, scene: SceneApi, machine: Machine) -> None:
+        """Add all links and the table to the scene."""
+        self._scene, self._machine = scene, machine
+        turn = _first(machine.mount.quaternion)
+        origin = machine.mount.to_world(np.zeros(3))
+        scene.add_frame(ROBOT, show_axes=False, wxyz=turn, position=origin)
+        self._links = {}
+        for link in machine.mechanism.links:
+            name = f"{ROBOT}/{link.name}"
+            self._links[link.name] = scene.add_frame(name, show_axes=False)
+            for index, solid in enumerate(link.solids):
+                _add_solid(scene, f"{name}/{index}", solid)
+        self._add_table()
+        self._objects: list[Any] = []
+        self._markers: list[Any] = []
+
+    def _add_table(self) -> None:
+        length, width = (2 * half for half in self._machine.table)
+        half = TABLE.half_height
+        size, place = (length, width, 2 * half), (0.0, 0.0, TABLE.top - half)
+        self._scene.add_box("/table", colour(TABLE.colour), size, position=place, cast_shadow=False)
+        self._scene.add_grid(
+            "/floor", 6.0, 6.0, position=(0, 0, FLOOR.top), infinite_grid=True, fade_distance=8.0,
+            cell_color=(225, 228, 232), section_color=(208, 212, 218), shadow_opacity=0.12,
+        )  # fmt: skip
+
+    def draw(self, places: Mapping[str, Place]) -> None:
+        """Move the links to ``places`` in the base's frame."""
+        for name, node in self._links.items():
+            place = places[name]
+            node.position = place.origin
+            node.wxyz = SO3.from_matrix(place.rotation).wxyz
+
+    def set_objects(self, scene: Scene, tolerance: float) -> None:
+        """Replace objects and goal markers by those of a task."""
+        for node in (*self._objects, *self._markers):
+            node.remove()
+        self._objects = [
+            self._scene.add_box(
+                f"/objects/{block.name}", colour(block.colour), 2 * np.array(block.half)
+            )
+            for block in scene.objects
+        ]
+        self._markers = [
+            self._scene.add_icosphere(
+                f"/goals/{index}", tolerance, _GOAL, opacity=0.45, cast_shadow=False
+            )
+            for index in range(scene.markers)
+        ]
+
+    def draw_objects(self, state: State, markers: FloatArray) -> None:
+        """Move objects to their places in the state of one robot, and markers (k, 3) m, world."""
+        for index, node in enumerate(self._objects):
+            node.position = state.object_position[index]
+            node.wxyz = _first(state.object_quaternion[index])
+        for node, place in zip(self._markers, markers, strict=True):
+            node.position = place
+
+
+def _first(quaternion: ArrayLike) -> FloatArray:
+    """Convert a quaternion (x, y, z, w) to viser's order (w, x, y, z)."""
+    return np.roll(np.asarray(quaternion, dtype=np.float64), 1)
+
+
+def _add_solid(scene: SceneApi, name: str, solid: Solid) -> None:
+    paint = colour(COLOURS[solid.colour])
+    if solid.kind == "box":
+        scene.add_box(name, paint, solid.size, position=solid.centre)
+        return
+    radius, length, _ = solid.size
+    turn = _TURNS[solid.axis]
+    scene.add_cylinder(name, radius, length, paint, wxyz=turn, position=solid.centre)

@@ -1,0 +1,207 @@
+"""The viewer: a server of a page with the robot, and the panel beside it."""
+
+from __future__ import annotations
+
+import io
+import math
+import traceback
+from contextlib import redirect_stdout
+from typing import Any, Final
+
+import numpy as np
+from viser import ViserServer
+
+from tpm_gym.errors import ConfigurationError, TPMError
+from tpm_gym.kinematics import AssemblyMode
+from tpm_gym.mechanism.machine import find_machine, machine_names
+from tpm_gym.mechanism.tpm import TPM
+from tpm_gym.viewer.explore import Explore
+from tpm_gym.viewer.layers import BEST, LAYERS, Layers
+from tpm_gym.viewer.play import Play
+from tpm_gym.viewer.player import Player
+from tpm_gym.viewer.posture import Posture, at_joints
+from tpm_gym.viewer.scene import ROBOT, RobotScene, set_camera
+from tpm_gym.viewer.worker import Worker
+
+__all__ = ["Viewer", "start_server"]
+
+_LABELS: Final = {
+    "parallel": "Parallel singularities (red)",
+    "serial": "Serial singularities (blue)",
+    "constraint": "Constraint singularity (purple)",
+    "aspects": "Aspects",
+    "workspace": "Workspace of the working mode",
+    "region": "Task region (black), goals (green)",
+    "conditioning": "Conditioning at the height y of P",
+    "margin": "Margin to the nearest singularity",
+}
+
+
+def find_tpm(machine: Any) -> TPM:
+    """Return a machine by its name, or the machine itself, if it is a TPM.
+
+    Raises:
+        ConfigurationError: If it is not.
+    """
+    found = find_machine(machine)
+    if not isinstance(found, TPM):
+        raise ConfigurationError("machine", machine, "a tpm_gym.TPM: the viewer shows its modes")
+    return found
+
+
+def start_server(host: str, port: int) -> ViserServer:
+    """Start a viser server at the port, or at the next free one; it prints nothing.
+
+    Raises:
+        ConfigurationError: If the address is not this computer's.
+    """
+    try:
+        with redirect_stdout(io.StringIO()):
+            return ViserServer(host=host, port=port, label="tpm_gym", verbose=False)
+    except OSError as error:
+        raise ConfigurationError("host", host, f"an address of this computer ({error})") from error
+
+
+class Viewer:
+    """Page with a robot that can be dragged, and that plays episodes.
+
+    Args:
+        machine: Name of a machine, or a TPM.
+        host: Address to listen on.
+        port: Port to listen on; if it is taken, the next free one.
+
+    Attributes:
+        explore: Controls of the posture.
+        play: Controls of episodes.
+        worker: Thread that runs all changes.
+
+    Raises:
+        ConfigurationError: If the machine is no TPM, or the address is not possible.
+    """
+
+    def __init__(self, machine: str | TPM = "paper", host: str = "127.0.0.1", port: int = 8080):
+        """Start the server, and show the machine at its home."""
+        first = find_tpm(machine)
+        self.server = server = start_server(host, port)
+        self.worker = Worker(self._report)
+        server.gui.configure_theme(
+            control_width="large",
+            show_logo=False,
+            show_share_button=False,
+            brand_color=(9, 105, 218),
+        )
+        server.gui.main_panel.dock_right()
+        gui = server.gui
+        known = map(find_machine, machine_names())
+        self._machines = {one.name: one for one in (*known, first) if isinstance(one, TPM)}
+        self.machine = gui.add_dropdown("Machine", tuple(self._machines), initial_value=first.name)
+        self._numbers: Any = gui.add_html("")
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("Explore"):
+            self.explore = Explore(server, self.worker, self._show)
+        with tabs.add_tab("Show"):
+            self.shown = {
+                name: gui.add_checkbox(label, name == "region") for name, label in _LABELS.items()
+            }
+            gui.add_html(_scale())
+        with tabs.add_tab("Play"):
+            self.play = Play(server, self.worker, self._show_episode)
+        for box in self.shown.values():
+            box.on_update(lambda _: self.worker.put("layers", self._show_layers))
+        self.machine.on_update(lambda _: self.worker.put("machine", self._set_machine))
+        self.worker.put("machine", self._set_machine)
+        self.worker.wait()
+
+    @property
+    def address(self) -> str:
+        """Address of the page."""
+        return f"http://{self.server.get_host()}:{self.server.get_port()}"
+
+    def close(self) -> None:
+        """Stop the server and the worker."""
+        self.worker.put("end", self.play.discard)
+        self.worker.wait(5.0)
+        self.worker.close()
+        with redirect_stdout(io.StringIO()):
+            self.server.stop()
+
+    def _set_machine(self) -> None:
+        machine = self._machines[self.machine.value]
+        self.play.set_machine(machine)
+        self.server.scene.remove_by_name(ROBOT)
+        set_camera(self.server, machine)
+        self.robot = RobotScene(self.server.scene, machine)
+        self.layers = Layers(self.server.scene, machine)
+        self.explore.set_machine(machine)
+
+    # -- drawing ------------------------------------------------------------------------------
+
+    def _show(self, posture: Posture | None) -> None:
+        """Draw a posture of the panel; with None, tell why there is none."""
+        if posture is not None:
+            with self.server.atomic():
+                self.robot.draw(posture.places)
+            self.worker.put("layers", self._show_layers)
+        self._tell_numbers()
+
+    def _show_layers(self) -> None:
+        names = [name for name, box in self.shown.items() if box.value]
+        self.layers.show(names, self.explore.posture)
+
+    def _show_episode(self, player: Player) -> None:
+        """Draw the robot at its encoders' joint positions, and the objects."""
+        state, machine = player.state, self.explore.posture.machine
+        if not player.records:
+            self.robot.set_objects(player.task.scene, player.task.tolerance)
+        with self.server.atomic():
+            self.robot.draw_objects(state, player.markers)
+            self.explore.set(at_joints(machine, state.theta, machine.assembly_mode))
+
+    def _tell_numbers(self) -> None:
+        explore = self.explore
+        self._numbers.content = numbers(explore.posture, explore.problem)
+
+    def _report(self, error: Exception) -> None:
+        """Show an error on all pages; print those that are not ours."""
+        self.play.pause()
+        if not isinstance(error, TPMError):
+            traceback.print_exception(error)
+        for client in self.server.get_clients().values():
+            client.add_notification("That did not work", str(error), color="red")
+
+
+def numbers(posture: Posture, problem: str) -> str:
+    """Return the numbers of a posture as HTML, with a problem if there is one."""
+    x, y, z = 1000 * posture.position
+    u, v, w = 1000 * posture.machine.mount.to_world(posture.position)
+    stops = " / ".join(f"{value:.0f}" for value in np.degrees(posture.stop_margins))
+    rows = {
+        "P, machine's frame": f"{x:.1f} / {y:.1f} / {z:.1f} mm",
+        "P, world": f"{u:.1f} / {v:.1f} / {w:.1f} mm",
+        "Conditioning": f"{posture.conditioning:.3f}",
+        "Motors to their stops": f"{stops} °",
+        "Loops open by": f"{posture.gap:.1e} m",
+    }
+    if not isinstance(posture.assembly, AssemblyMode):
+        rows["Platform tilted by"] = f"{math.degrees(posture.tilt):.1f} °"
+    cells = "".join(
+        f'<tr><td style="color:#667">{name}</td><td style="text-align:right">{value}</td></tr>'
+        for name, value in rows.items()
+    )
+    text = f'<table style="width:100%;font-size:0.85em">{cells}</table>'
+    if problem:
+        text += f'<p style="color:#c0392b;font-size:0.85em"><b>No such posture:</b> {problem}</p>'
+    return f'<div style="padding:0 1em">{text}</div>'
+
+
+def _scale() -> str:
+    """Return the colour map of the conditioning as HTML."""
+    return (
+        '<div style="padding:0 1em;font-size:0.8em"><div style="height:0.7em;background:linear-'
+        "gradient(to right,rgb(68,1,84),rgb(59,82,139),rgb(33,145,140),rgb(94,201,98),"
+        'rgb(253,231,37))"></div><span>0</span><span style="float:right">'
+        f"conditioning {BEST}</span></div>"
+    )
+
+
+assert _LABELS.keys() == LAYERS.keys()
