@@ -31,7 +31,7 @@ from tpm_gym.errors import InputError
 from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode, passive_angles
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.kinematics.modes import ROTATED_MODES, RotatedMode
-from tpm_gym.kinematics.rotated import forward_rotated
+from tpm_gym.kinematics.rotated import RotatedPostures, forward_rotated
 from tpm_gym.mechanism.bodies import ALUMINIUM, STEEL, Closure, Joint, Link, Mechanism, Solid
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.motor import TORQUE_MOTOR
@@ -257,11 +257,17 @@ def rotated_joint_angles(
     if not found.valid[slot]:
         real = [str(mode) for mode in ROTATED_MODES if found.valid[mode.index]]
         raise InputError("branch", branch, f"one that exists at theta: {', '.join(real) or 'none'}")
-    (x, y, z), l4 = found.rods[slot].T, geometry.l4
+    joints = rotated_joint_arrays(found)
+    return {name: float(angles[slot]) for name, angles in joints.items()}
+
+
+def rotated_joint_arrays(postures: RotatedPostures) -> dict[str, FloatArray]:
+    """Compute the angles (...,) of all joints in postures (...,) with link 3' turned, rad."""
+    x, y, z = (np.moveaxis(postures.rods[..., axis], -1, 0) for axis in range(3))
+    l4 = postures.geometry.l4
     swings = *np.arctan2(z[:2], y[:2]), *np.arctan2(z[2:], x[2:])
     tilts = *np.arcsin(x[:2] / l4), np.arcsin(y[3] / l4)
-    joints = _by_joint(np.array(angles), swings, tilts, found.beta[slot], found.tilt[slot])
-    return {name: float(angle) for name, angle in joints.items()}
+    return _by_joint(postures.theta, swings, tilts, postures.beta, postures.tilt)
 
 
 def _by_joint(

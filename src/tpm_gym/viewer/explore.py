@@ -138,6 +138,11 @@ class Explore:
         mode = modes[self.assembly.options.index(self.assembly.value)]
         self._attempt(lambda: at_joints(self._machine, theta, mode))
 
+    def hide_gizmo(self, hidden: bool) -> None:
+        """Hide the gizmo, which covers the cup, or show it again."""
+        if self.gizmo is not None and self.gizmo.visible == hidden:
+            self.gizmo.visible = not hidden
+
     def go_home(self) -> None:
         """Move to the machine's home, in its own modes."""
         machine = self._machine

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Final
 
@@ -11,10 +9,11 @@ import numpy as np
 
 from tpm_gym.mechanism.tpm import TPM
 from tpm_gym.simulation.state import CONTROL_PERIOD
+from tpm_gym.viewer import server
 from tpm_gym.viewer.player import Player
 from tpm_gym.viewer.posture import at_joints
 from tpm_gym.viewer.scene import RobotScene, set_camera
-from tpm_gym.viewer.viewer import find_tpm, start_server
+from tpm_gym.viewer.viewer import find_tpm
 
 __all__ = ["export"]
 
@@ -40,11 +39,11 @@ def export(folder: Path, machine: str | TPM = "paper", seed: int = 2) -> Path:
         ConfigurationError: If the machine is no TPM.
     """
     found = find_tpm(machine)
-    server = start_server("127.0.0.1", 8080)
+    running = server.start("127.0.0.1", 0)
     player = Player(_ENV, "analytic", found, "expert")
     try:
-        set_camera(server, found)
-        robot = RobotScene(server.scene, found)
+        set_camera(running, found)
+        robot = RobotScene(running.scene, found)
         robot.set_objects(player.task.scene, player.task.tolerance)
 
         def draw(theta: np.ndarray) -> None:
@@ -53,7 +52,7 @@ def export(folder: Path, machine: str | TPM = "paper", seed: int = 2) -> Path:
 
         player.reset(seed)
         draw(player.state.theta)
-        recording = server.get_scene_serializer()
+        recording = running.get_scene_serializer()
         recording.insert_sleep(_HOLD)
         while not player.ended:
             player.step()
@@ -65,6 +64,5 @@ def export(folder: Path, machine: str | TPM = "paper", seed: int = 2) -> Path:
         page.write_text(recording.as_html(), encoding="utf-8", newline="\n")
     finally:
         player.close()
-        with redirect_stdout(io.StringIO()):
-            server.stop()
+        server.stop(running)
     return page

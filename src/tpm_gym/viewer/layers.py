@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from viser import SceneApi
 
 from tpm_gym.analysis.aspects import aspects, reachable_set
-from tpm_gym.arrays import FloatArray
+from tpm_gym.arrays import BoolArray, FloatArray
 from tpm_gym.kinematics import AssemblyMode
 from tpm_gym.kinematics.jacobian import conditioning_at
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism.tpm import TPM
-from tpm_gym.viewer.meshes import SURFACES, cells_mesh, grid_mesh, surface
+from tpm_gym.viewer.meshes import SURFACES, cells_mesh, clipped, grid_mesh, surface
 from tpm_gym.viewer.posture import Margin, Posture
 from tpm_gym.viewer.scene import ROBOT
 
@@ -40,7 +40,7 @@ _MAP: Final = np.array(
 )
 BEST: Final = 0.4
 """Conditioning at the end of the colour map."""
-_STEPS: Final = 160
+_STEPS: Final = 200
 _FINE: Final = (96, 24, 128)
 
 
@@ -129,7 +129,11 @@ class Layers:
         paints = {"region": (40, 40, 40), "goals": (30, 160, 70)}
         return [
             self._scene.add_line_segments(
-                f"{ROBOT}/regions/{name}", _edges(region), paints[name], thickness=2.0
+                f"{ROBOT}/regions/{name}",
+                _edges(region),
+                paints[name],
+                thickness=2.0,
+                thickness_units="screen",
             )
             for name, region in regions.items()
         ]
@@ -141,12 +145,15 @@ class Layers:
         reach = geometry.l3 + geometry.l4
         x, z = np.linspace(-reach, reach, _STEPS) + geometry.l2, np.linspace(-reach, reach, _STEPS)
         points = np.stack(np.broadcast_arrays(x, y, z[:, None]), axis=-1)
-        values = conditioning_at(points, posture.working, posture.assembly, geometry)
-        mesh = grid_mesh(np.where(values[..., None] > 0, points, np.nan)[None])
-        at_vertices = conditioning_at(mesh.vertices, posture.working, posture.assembly, geometry)
-        painted = trimesh.Trimesh(
-            mesh.vertices, mesh.faces, vertex_colors=colours(at_vertices), process=False
-        )
+        branches = posture.working, posture.assembly, geometry
+
+        def there(points: FloatArray) -> BoolArray:
+            found: BoolArray = conditioning_at(points, *branches) > 0
+            return found
+
+        vertices, faces = grid_mesh(clipped(points[None], there))
+        paints = colours(conditioning_at(vertices, *branches))
+        painted = trimesh.Trimesh(vertices, faces, vertex_colors=paints, process=False)
         name = f"{ROBOT}/conditioning"
         return [
             self._scene.add_mesh_trimesh(name, painted, cast_shadow=False, receive_shadow=False)
@@ -159,7 +166,9 @@ class Layers:
         name, ends = f"{ROBOT}/margin", np.stack([posture.position, margin.point])
         text = f"{1000 * margin.distance:.1f} mm to {margin.factor} = 0"
         return [
-            self._scene.add_line_segments(name, ends[None], (214, 48, 49), thickness=4.0),
+            self._scene.add_line_segments(
+                name, ends[None], (214, 48, 49), thickness=4.0, thickness_units="screen"
+            ),
             self._scene.add_icosphere(
                 f"{name}_foot", 0.008, (214, 48, 49), position=margin.point, cast_shadow=False
             ),

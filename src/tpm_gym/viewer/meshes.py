@@ -11,16 +11,17 @@ from numpy.typing import NDArray
 
 from tpm_gym.analysis import sheets
 from tpm_gym.analysis.aspects import Cells
-from tpm_gym.arrays import FloatArray
+from tpm_gym.arrays import BoolArray, FloatArray
 from tpm_gym.kinematics import WorkingMode
 from tpm_gym.kinematics.geometry import Geometry
 from tpm_gym.kinematics.workspace import reachable
 
-__all__ = ["SURFACES", "Mesh", "cells_mesh", "grid_mesh", "surface"]
+__all__ = ["SURFACES", "Mesh", "cells_mesh", "clipped", "grid_mesh", "surface"]
 
 _AROUND = 33  # points along the half circle of link 7
 _SLACK = 1e-9  # share of l4 by which a leg may miss a boundary on which it lies
 _SMOOTHING = 4  # rounds
+_HALVINGS = 8
 
 
 class Mesh(NamedTuple):
@@ -41,8 +42,34 @@ def surface(factor: str, mode: WorkingMode, geometry: Geometry) -> Mesh:
     points = _POINTS.get(factor, _swept)(factor, mode, geometry)
     # A leg that is stretched reaches with a longer rod; one that is folded, with a shorter rod.
     longer, shorter = (replace(geometry, l4=geometry.l4 * (1 + sign * _SLACK)) for sign in (1, -1))
-    there = reachable(points, mode, longer) | reachable(points, mode, shorter)
-    return grid_mesh(np.where(there[..., None], points, np.nan))
+
+    def there(points: FloatArray) -> BoolArray:
+        found: BoolArray = reachable(points, mode, longer) | reachable(points, mode, shorter)
+        return found
+
+    if factor in ("sin_beta", "cos_beta"):
+        return grid_mesh(clipped(points, there))
+    return grid_mesh(np.where(there(points)[..., None], points, np.nan))
+
+
+def clipped(points: FloatArray, inside: Callable[[FloatArray], BoolArray]) -> FloatArray:
+    """Move the first points outside of a region to its boundary, in flat grids (m, a, b, 3).
+
+    Points farther outside become NaN.
+    """
+    there = inside(points)
+    found = np.where(there[..., None], points, np.nan)
+    for axis, step in ((1, 1), (1, -1), (2, 1), (2, -1)):
+        beside = np.roll(there, step, axis) & np.isnan(found[..., 0])
+        beside[(slice(None),) * axis + (0 if step > 0 else -1,)] = False
+        within = np.roll(points, step, axis)[beside]
+        beyond = points[beside]
+        for _ in range(_HALVINGS):
+            middle = (within + beyond) / 2
+            kept = inside(middle)[:, None]
+            within, beyond = np.where(kept, middle, within), np.where(kept, beyond, middle)
+        found[beside] = within
+    return found
 
 
 def _swept(factor: str, mode: WorkingMode, g: Geometry) -> FloatArray:
@@ -127,8 +154,9 @@ def _compact(points: FloatArray, quads: NDArray[Any]) -> Mesh:
     """Split quadrilaterals into triangles, and keep the points that are used."""
     used, renamed = np.unique(quads, return_inverse=True)
     quads = renamed.reshape(quads.shape)
-    faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
-    return Mesh(points[used], faces)
+    # Both triangles of a quadrilateral come together. Otherwise two sheets, one behind the other,
+    # would be drawn in turns, and hide parts of each other.
+    return Mesh(points[used], quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3))
 
 
 def _smooth(mesh: Mesh) -> FloatArray:

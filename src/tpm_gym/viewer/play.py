@@ -33,6 +33,9 @@ class Play:
         server: The viser server; the controls are added to its present container.
         worker: Thread that runs the episodes.
         show: Called with the player after every reset and step.
+
+    Attributes:
+        player: The episode; None before the first step, and after another choice.
     """
 
     def __init__(
@@ -58,8 +61,8 @@ class Play:
         self.buttons = gui.add_button_group("", ("Play", "Pause", "Step", "New episode"))
         self._status: Any = gui.add_html("")
         self._gui = gui
-        self._plots: list[GuiUplotHandle] = []
-        self._folder = gui.add_folder(None)
+        self._plots: list[dict[Any, GuiUplotHandle | None]] = [{}, {}]
+        self._folders = [gui.add_folder(None) for _ in self._plots]
         self._connect()
 
     def _connect(self) -> None:
@@ -92,8 +95,11 @@ class Play:
 
     def pause(self) -> None:
         """Hold the episode."""
-        self.playing = False
         self._worker.stop_ticking()
+        if self.playing:
+            self.playing = False
+            if self.player is not None and not self.player.ended:
+                self._show(self.player)
 
     def step(self) -> None:
         """Run one control step."""
@@ -131,7 +137,7 @@ class Play:
     def _made(self) -> Player:
         """Return the player, and make it if necessary."""
         if self.player is None:
-            self._tell("Starting the engine; the first time it compiles for up to a minute.")
+            self.tell("Starting the engine; the first time it compiles for up to a minute.")
             path = self.file.value.strip()
             policy = str(Path(path).expanduser()) if path else self.policy.value
             self.player = Player(self.env_id.value, self.engine.value, self._machine, policy)
@@ -148,7 +154,7 @@ class Play:
         player.reset(int(self.seed.value))
         self._rest = _PAUSE
         self._show(player)
-        self._plot(player, anew=True)
+        self._plot(player)
 
     def _tick(self) -> None:
         player = self._made()
@@ -167,49 +173,58 @@ class Play:
 
     # -- plots --------------------------------------------------------------------------------
 
-    def _plot(self, player: Player, anew: bool = False) -> None:
+    def _plot(self, player: Player) -> None:
         """Draw reward terms and torques, and tell how the episode goes."""
         self._drawn = time.monotonic()
         records = player.records
-        names = sorted(records[0].reward_terms) if records else []
+        names = tuple(records[0].reward_terms) if records else ()
         steps = np.arange(1.0, len(records) + 1)
         terms = [[record.reward_terms[name] for record in records] for name in names]
         torques = np.array([record.torque for record in records]).reshape(-1, 3).T
-        if anew or len(self._plots) != 2:
-            for plot in self._plots:
-                plot.remove()
-            self._plots = []
         if records:
-            self._draw(0, "Reward terms", names, steps, terms, player.length)
-            self._draw(1, "Torques, N m", _MOTORS, steps, torques, player.length)
+            self._draw(0, "Reward terms", names, [steps, *terms], player.length)
+            self._draw(1, "Torques, N m", _MOTORS, [steps, *torques], player.length)
         total = sum(sum(record.reward_terms.values()) for record in records)
         success = bool(records) and records[-1].success
         verdict = "goal achieved" if success else "ended" if player.ended else "running"
-        self._tell(
-            f"Step {len(records)} of {player.length} · return {total:.2f} · <b>{verdict}</b>"
-        )
+        self.tell(f"Step {len(records)} of {player.length} · return {total:.2f} · <b>{verdict}</b>")
 
     def _draw(
-        self, index: int, title: str, names: Sequence[str], steps: Any, values: Any, length: int
+        self, place: int, title: str, names: tuple[str, ...], rows: Sequence[Any], length: int
     ) -> None:
-        data = (steps, *(np.asarray(row, dtype=np.float64) for row in values))
-        if index < len(self._plots):
-            self._plots[index].data = data
+        """Draw curves; one plot for each set of names is kept, as pages may hold updates of it."""
+        key, data = (names, length), tuple(np.asarray(row, dtype=np.float64) for row in rows)
+        shown = self._plots[place].setdefault(key, None)
+        for other, plot in self._plots[place].items():
+            if plot is not None and plot.visible != (other == key):
+                plot.visible = other == key
+        if shown is not None:
+            shown.data = data
             return
         series = [
             uplot.Series(label=name, stroke=paint, width=2)
             for name, paint in zip(names, _COLOURS, strict=False)
         ]
-        with self._folder:
-            plot: GuiUplotHandle = self._gui.add_uplot(
+        with self._folders[place]:
+            self._plots[place][key] = self._gui.add_uplot(
                 data,
                 (uplot.Series(label="step"), *series),
                 title=title,
                 height=190,
-                scales={"x": uplot.Scale(time=False, range=(0.0, float(length or len(steps))))},
-                legend=uplot.Legend(show=True),
+                scales={"x": uplot.Scale(time=False, range=(0.0, float(length or 1000)))},
             )
-        self._plots.append(plot)
 
-    def _tell(self, text: str) -> None:
+    @property
+    def plots(self) -> list[GuiUplotHandle]:
+        """Plots of the reward terms and the torques that are shown."""
+        made = [plot for place in self._plots for plot in place.values() if plot is not None]
+        return [plot for plot in made if plot.visible]
+
+    @property
+    def status(self) -> str:
+        """The line below the buttons, as HTML."""
+        return str(self._status.content)
+
+    def tell(self, text: str) -> None:
+        """Show a line below the buttons."""
         self._status.content = f'<div style="padding:0 1em 0.5em;font-size:0.85em">{text}</div>'

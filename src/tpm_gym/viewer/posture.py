@@ -149,11 +149,11 @@ def at_point(
         others = int(found.valid.sum())
         valid += f"other working modes have {others} such postures here" if others else "none has"
         raise InputError("position", tuple(place.round(4).tolist()), valid)
-    slot = int(np.where(ours, abs(found.tilt - tilt), np.inf).argmin())
-    every = forward_rotated(found.theta[slot], geometry)
-    apart = abs(every.tilt - found.tilt[slot]) + abs(every.beta - found.beta[slot])
+    one = _slot(found, int(np.where(ours, abs(found.tilt - tilt), np.inf).argmin()))
+    every = forward_rotated(one.theta, geometry)
+    apart = abs(every.tilt - one.tilt) + abs(every.beta - one.beta)
     index = int(np.where(every.valid, apart, np.inf).argmin())
-    return _turned(machine, every, ROTATED_MODES[index])
+    return _turned(machine, one, working, ROTATED_MODES[index])
 
 
 def at_joints(machine: TPM, theta: ArrayLike, assembly: AssemblyMode | RotatedMode) -> Posture:
@@ -165,7 +165,12 @@ def at_joints(machine: TPM, theta: ArrayLike, assembly: AssemblyMode | RotatedMo
     """
     angles, geometry = np.array(vector("theta", theta)), machine.geometry
     if isinstance(assembly, RotatedMode):
-        return _turned(machine, forward_rotated(angles, geometry), assembly)
+        found = forward_rotated(angles, geometry)
+        if not found.valid[assembly.index]:
+            valid = f"where this rotated assembly exists; {int(found.valid.sum())} others do"
+            raise InputError("theta", tuple(angles.round(4).tolist()), valid)
+        one = _slot(found, assembly.index)
+        return _turned(machine, one, _working(rotated.factors(one).serial), assembly)
     place = forward(angles, assembly, geometry)
     working = _working(jacobian.factors(angles, assembly, geometry).serial)
     return _straight(machine, angles, place, working, assembly)
@@ -184,15 +189,19 @@ def _straight(
     return Posture(machine, theta, place, 0.0, working, assembly, joints, quality)
 
 
-def _turned(machine: TPM, found: RotatedPostures, mode: RotatedMode) -> Posture:
-    """Return the posture in one slot of the rotated assemblies at given joint positions."""
-    slot = mode.index
-    joints = tree.rotated_joint_angles(found.theta[slot], mode, machine.geometry)
-    working = _working(rotated.factors(found).serial[slot])
-    place, tilt = found.position[slot], float(found.tilt[slot])
-    sizes = np.linalg.svd(np.nan_to_num(rotated.velocity(found)[slot, :3]), compute_uv=False)
+def _turned(machine: TPM, one: RotatedPostures, working: WorkingMode, mode: RotatedMode) -> Posture:
+    """Return a posture with link 3' turned."""
+    joints = {name: float(angle) for name, angle in tree.rotated_joint_arrays(one).items()}
+    sizes = np.linalg.svd(np.nan_to_num(rotated.velocity(one)[:3]), compute_uv=False)
     quality = float(sizes[2] / sizes[0]) if sizes[0] > 0 else 0.0
-    return Posture(machine, found.theta[slot], place, tilt, working, mode, joints, quality)
+    place, tilt = one.position, float(one.tilt)
+    return Posture(machine, one.theta, place, tilt, working, mode, joints, quality)
+
+
+def _slot(found: RotatedPostures, slot: int) -> RotatedPostures:
+    """Return the posture in one slot."""
+    theta, link3, tilt, beta = found.theta[slot], found.link3[slot], found.tilt[slot], found.beta
+    return RotatedPostures(theta, link3, tilt, beta[slot], found.geometry)
 
 
 def _working(serial: FloatArray) -> WorkingMode:

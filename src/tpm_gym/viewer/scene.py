@@ -56,6 +56,9 @@ class RobotScene:
     Args:
         scene: Scene of a viser server or client.
         machine: The robot.
+
+    Attributes:
+        links: Nodes of the links by name, below :data:`ROBOT`.
     """
 
     def __init__(self, scene: SceneApi, machine: Machine) -> None:
@@ -64,10 +67,10 @@ class RobotScene:
         turn = _first(machine.mount.quaternion)
         origin = machine.mount.to_world(np.zeros(3))
         scene.add_frame(ROBOT, show_axes=False, wxyz=turn, position=origin)
-        self._links = {}
+        self.links = {}
         for link in machine.mechanism.links:
             name = f"{ROBOT}/{link.name}"
-            self._links[link.name] = scene.add_frame(name, show_axes=False)
+            self.links[link.name] = scene.add_frame(name, show_axes=False)
             for index, solid in enumerate(link.solids):
                 _add_solid(scene, f"{name}/{index}", solid)
         self._add_table()
@@ -86,7 +89,7 @@ class RobotScene:
 
     def draw(self, places: Mapping[str, Place]) -> None:
         """Move the links to ``places`` in the base's frame."""
-        for name, node in self._links.items():
+        for name, node in self.links.items():
             place = places[name]
             node.position = place.origin
             node.wxyz = SO3.from_matrix(place.rotation).wxyz

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import io
 import math
 import traceback
-from contextlib import redirect_stdout
 from typing import Any, Final
 
 import numpy as np
-from viser import ViserServer
 
 from tpm_gym.errors import ConfigurationError, TPMError
 from tpm_gym.kinematics import AssemblyMode
 from tpm_gym.mechanism.machine import find_machine, machine_names
 from tpm_gym.mechanism.tpm import TPM
+from tpm_gym.viewer import server
 from tpm_gym.viewer.explore import Explore
 from tpm_gym.viewer.layers import BEST, LAYERS, Layers
 from tpm_gym.viewer.play import Play
@@ -23,18 +21,19 @@ from tpm_gym.viewer.posture import Posture, at_joints
 from tpm_gym.viewer.scene import ROBOT, RobotScene, set_camera
 from tpm_gym.viewer.worker import Worker
 
-__all__ = ["Viewer", "start_server"]
+__all__ = ["Viewer", "find_tpm"]
 
 _LABELS: Final = {
-    "parallel": "Parallel singularities (red)",
-    "serial": "Serial singularities (blue)",
-    "constraint": "Constraint singularity (purple)",
-    "aspects": "Aspects",
-    "workspace": "Workspace of the working mode",
-    "region": "Task region (black), goals (green)",
-    "conditioning": "Conditioning at the height y of P",
-    "margin": "Margin to the nearest singularity",
+    "parallel": ("Parallel", "Parallel singularities of the working mode, red"),
+    "serial": ("Serial", "Serial singularities of the working mode, blue"),
+    "constraint": ("Constraint", "Constraint singularity of the working mode, purple"),
+    "aspects": ("Aspects", "Regions of the working mode without singularities, on the side of P"),
+    "workspace": ("Workspace", "Points that the working mode reaches, stops left out"),
+    "region": ("Task region", "Box of the commands (black) and of the goals (green)"),
+    "conditioning": ("Conditioning", "1/cond(J) in the plane of P parallel to xz, in these modes"),
+    "margin": ("Margin", "Way from P to the nearest singularity"),
 }
+"""Label and explanation of each layer."""
 
 
 def find_tpm(machine: Any) -> TPM:
@@ -47,19 +46,6 @@ def find_tpm(machine: Any) -> TPM:
     if not isinstance(found, TPM):
         raise ConfigurationError("machine", machine, "a tpm_gym.TPM: the viewer shows its modes")
     return found
-
-
-def start_server(host: str, port: int) -> ViserServer:
-    """Start a viser server at the port, or at the next free one; it prints nothing.
-
-    Raises:
-        ConfigurationError: If the address is not this computer's.
-    """
-    try:
-        with redirect_stdout(io.StringIO()):
-            return ViserServer(host=host, port=port, label="tpm_gym", verbose=False)
-    except OSError as error:
-        raise ConfigurationError("host", host, f"an address of this computer ({error})") from error
 
 
 class Viewer:
@@ -82,35 +68,41 @@ class Viewer:
     def __init__(self, machine: str | TPM = "paper", host: str = "127.0.0.1", port: int = 8080):
         """Start the server, and show the machine at its home."""
         first = find_tpm(machine)
-        self.server = server = start_server(host, port)
+        self.server = server.start(host, port)
         self.worker = Worker(self._report)
-        server.gui.configure_theme(
+        gui = self.server.gui
+        gui.configure_theme(
             control_width="large",
             show_logo=False,
             show_share_button=False,
             brand_color=(9, 105, 218),
         )
-        server.gui.main_panel.dock_right()
-        gui = server.gui
+        gui.main_panel.dock_right()
         known = map(find_machine, machine_names())
         self._machines = {one.name: one for one in (*known, first) if isinstance(one, TPM)}
         self.machine = gui.add_dropdown("Machine", tuple(self._machines), initial_value=first.name)
         self._numbers: Any = gui.add_html("")
         tabs = gui.add_tab_group()
         with tabs.add_tab("Explore"):
-            self.explore = Explore(server, self.worker, self._show)
+            self.explore = Explore(self.server, self.worker, self._show)
         with tabs.add_tab("Show"):
             self.shown = {
-                name: gui.add_checkbox(label, name == "region") for name, label in _LABELS.items()
+                name: gui.add_checkbox(label, name == "region", hint=hint)
+                for name, (label, hint) in _LABELS.items()
             }
             gui.add_html(_scale())
         with tabs.add_tab("Play"):
-            self.play = Play(server, self.worker, self._show_episode)
+            self.play = Play(self.server, self.worker, self._show_episode)
         for box in self.shown.values():
             box.on_update(lambda _: self.worker.put("layers", self._show_layers))
         self.machine.on_update(lambda _: self.worker.put("machine", self._set_machine))
         self.worker.put("machine", self._set_machine)
         self.worker.wait()
+
+    @property
+    def text(self) -> str:
+        """The numbers of the panel, as HTML."""
+        return str(self._numbers.content)
 
     @property
     def address(self) -> str:
@@ -122,8 +114,7 @@ class Viewer:
         self.worker.put("end", self.play.discard)
         self.worker.wait(5.0)
         self.worker.close()
-        with redirect_stdout(io.StringIO()):
-            self.server.stop()
+        server.stop(self.server)
 
     def _set_machine(self) -> None:
         machine = self._machines[self.machine.value]
@@ -155,6 +146,7 @@ class Viewer:
             self.robot.set_objects(player.task.scene, player.task.tolerance)
         with self.server.atomic():
             self.robot.draw_objects(state, player.markers)
+            self.explore.hide_gizmo(self.play.playing)
             self.explore.set(at_joints(machine, state.theta, machine.assembly_mode))
 
     def _tell_numbers(self) -> None:
@@ -166,6 +158,7 @@ class Viewer:
         self.play.pause()
         if not isinstance(error, TPMError):
             traceback.print_exception(error)
+        self.play.tell(str(error))
         for client in self.server.get_clients().values():
             client.add_notification("That did not work", str(error), color="red")
 

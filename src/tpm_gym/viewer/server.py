@@ -1,0 +1,57 @@
+"""A viser server that listens where it is told, and prints nothing."""
+
+from __future__ import annotations
+
+import errno
+import io
+import socket
+from contextlib import redirect_stdout
+
+from viser import ViserServer
+
+from tpm_gym.arrays import is_whole
+from tpm_gym.errors import ConfigurationError
+
+__all__ = ["start", "stop"]
+
+_TRIES = 100
+_TAKEN = errno.EADDRINUSE, errno.EACCES
+
+
+def start(host: str, port: int) -> ViserServer:
+    """Start a server at the port, or at the next free one; at any free one if the port is 0.
+
+    Raises:
+        ConfigurationError: If the address is not this computer's, or the port is not possible.
+    """
+    if not is_whole(port, 0) or port > 65535:
+        raise ConfigurationError("port", port, "a whole number from 0 to 65535")
+    free = _free_port(host, port)
+    with redirect_stdout(io.StringIO()):
+        return ViserServer(host=host, port=free, label="tpm_gym", verbose=False)
+
+
+def stop(server: ViserServer) -> None:
+    """Stop a server."""
+    with redirect_stdout(io.StringIO()):
+        server.stop()
+
+
+def _free_port(host: str, port: int) -> int:
+    """Return the first free port from ``port`` on; viser would try other ports for ever."""
+    for candidate in range(port, min(port + _TRIES, 65536)):
+        if (found := _bound(host, candidate)) is not None:
+            return found
+    raise ConfigurationError("port", port, f"a port with a free one among the {_TRIES} after it")
+
+
+def _bound(host: str, port: int) -> int | None:
+    """Return the port that a server gets when it asks for ``port``; None if it is taken."""
+    try:
+        family = socket.getaddrinfo(host, port)[0][0]
+        with socket.create_server((host, port), family=family) as found:
+            return int(found.getsockname()[1])
+    except OSError as error:
+        if error.errno in _TAKEN:
+            return None
+        raise ConfigurationError("host", host, f"an address of this computer ({error})") from error

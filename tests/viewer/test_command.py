@@ -1,0 +1,69 @@
+"""``tpm-gym view``: one line, this computer only, a quiet end, and a page without a server."""
+
+import re
+import signal
+import subprocess
+import sys
+import urllib.request
+from pathlib import Path
+
+import psutil
+import pytest
+from processes import TPM_GYM, error_of
+
+from tpm_gym.viewer import ViewConfig, run
+
+
+@pytest.fixture
+def command():
+    process = subprocess.Popen(
+        [*TPM_GYM, "view", "--port", "0", "--machine", "wide"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    yield process
+    process.kill()
+    process.wait()
+
+
+def test_the_command_tells_its_address_serves_this_computer_only_and_ends_quietly(command):
+    line = command.stdout.readline()
+    address = re.search(r"http://127\.0\.0\.1:\d+", line)[0]
+    with urllib.request.urlopen(address) as page:
+        assert b"<html" in page.read().lower()
+    listening = psutil.Process(command.pid).net_connections("inet")
+    assert {c.laddr.ip for c in listening if c.status == psutil.CONN_LISTEN} == {"127.0.0.1"}
+    command.send_signal(signal.SIGINT)
+    out, err = command.communicate(timeout=30)
+    assert (out, err, command.returncode) == ("", "", 0)
+
+
+def test_a_wrong_option_ends_in_one_sentence():
+    said = error_of(*TPM_GYM, "view", "--machine", "nothing")
+    assert said.startswith("error: machine = 'nothing' is not possible")
+
+
+def test_without_viser_the_extra_is_named():
+    code = (
+        "import sys; sys.modules['viser'] = None; sys.argv = ['tpm-gym', 'view'];"
+        "from tpm_gym.learning.__main__ import main; main()"
+    )
+    assert "pip install 'tpm-gym[view]'" in error_of(sys.executable, "-c", code)
+
+
+def test_importing_the_room_imports_no_viser():
+    code = "import sys, tpm_gym.viewer; print('viser' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+
+
+def test_an_export_is_one_page_with_an_episode(tmp_path: Path, capsys):
+    run(ViewConfig(export=tmp_path / "new" / "folder"))
+    page = tmp_path / "new" / "folder" / "index.html"
+    assert capsys.readouterr().out == f"{page}\n"
+    assert [file.name for file in page.parent.iterdir()] == ["index.html"]
+    text = page.read_text(encoding="utf-8")
+    assert "__VISER_EMBED_DATA__=" in text
+    assert page.stat().st_size < 2e6
+    assert not re.search(r"""<(script|link|img)[^>]*(src|href)=["']?https?:""", text)

@@ -1,0 +1,272 @@
+"""The viewer without a browser: its controls act, what it draws closes, and it plays every task."""
+
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from itertools import product
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+import viser
+from gantry import GANTRY
+from postures import drawn_gap
+from websockets.sync.client import connect
+
+import tpm_gym
+from tpm_gym.errors import ConfigurationError
+from tpm_gym.kinematics import RotatedMode
+from tpm_gym.viewer import open_viewer
+from tpm_gym.viewer.layers import LAYERS
+from tpm_gym.viewer.player import Player, installed_engines, policies_for
+from tpm_gym.viewer.viewer import Viewer
+
+
+@pytest.fixture(scope="module")
+def shared() -> Iterator[Viewer]:
+    with closing(open_viewer("wide", port=0)) as viewer:
+        yield viewer
+
+
+@pytest.fixture
+def viewer(shared: Viewer) -> Viewer:
+    """Return the viewer at its home."""
+    choose(shared, shared.machine, "wide")
+    for name, box in shared.shown.items():
+        choose(shared, box, name == "region")
+    do(shared, shared.explore.go_home)
+    return shared
+
+
+def choose(viewer: Viewer, control: Any, value: Any) -> None:
+    """Choose a value, as a user does, and wait until it is drawn."""
+    control.value = value
+    assert viewer.worker.wait()
+
+
+def do(viewer: Viewer, job: Any) -> None:
+    viewer.worker.put("test", job)
+    assert viewer.worker.wait()
+
+
+def test_every_choice_of_modes_draws_a_posture_in_them_or_says_why(viewer):
+    explore, drawn = viewer.explore, set()
+    for operation in ("translating", "rotated"):
+        do(viewer, explore.go_home)
+        choose(viewer, explore.operation, operation)
+        for bends, link_7 in product(explore.bends.options, explore.link_7.options):
+            choose(viewer, explore.bends, bends)
+            choose(viewer, explore.link_7, link_7)
+            if explore.problem:
+                assert explore.problem in viewer.text
+            else:
+                posture = explore.posture
+                assert posture.operation == operation
+                assert (explore.bends.value, explore.link_7.value) == (bends, link_7)
+                assert posture.working == explore.working
+                drawn.add((operation, posture.working))
+            assert drawn_gap(viewer) < 1e-9
+    assert len(drawn) >= 12
+
+
+def test_elbows_out_is_the_working_mode_of_the_machines(viewer):
+    assert viewer.explore.bends.value == "out / out / out"
+    theta = viewer.explore.posture.theta
+    outwards = np.cos(theta) * [1, -1, 1]  # level components of the arms, away from the centre
+    assert (outwards > 0).all()
+
+
+def test_a_motor_turns_in_the_assembly_mode_of_the_panel(viewer):
+    explore = viewer.explore
+    before, mode = explore.posture.position, explore.posture.assembly
+    choose(viewer, explore.motors[0], explore.motors[0].value + 2.0)
+    assert explore.posture.assembly == mode
+    assert np.linalg.norm(explore.posture.position - before) > 1e-3
+    assert explore.gizmo.position == pytest.approx(explore.posture.position)
+    other = next(label for label in explore.assembly.options if label != explore.assembly.value)
+    theta = explore.posture.theta
+    choose(viewer, explore.assembly, other)
+    assert explore.posture.assembly != mode
+    assert explore.posture.theta == pytest.approx(theta, abs=1e-3)  # the slider's step
+    assert drawn_gap(viewer) < 1e-9
+
+
+def test_rotated_assemblies_are_offered_in_rotated_operation(viewer):
+    explore = viewer.explore
+    assert len(explore.assembly.options) == 4
+    choose(viewer, explore.operation, "rotated")
+    assert len(explore.assembly.options) == 8
+    assert isinstance(explore.posture.assembly, RotatedMode)
+    assert explore.posture.tilt != 0
+
+
+def test_out_of_reach_the_robot_stays_and_the_panel_says_why(viewer):
+    explore = viewer.explore
+    before = explore.posture
+    do(viewer, lambda: explore.drag((0.3, 2.0, 0.7)))
+    assert explore.posture is before
+    assert "beta" in explore.problem
+    assert "beta" in viewer.text
+    do(viewer, lambda: explore.drag(before.position))
+    assert explore.problem == ""
+    assert "No such posture" not in viewer.text
+
+
+def test_a_page_that_drags_p_moves_the_robot(viewer):
+    target = viewer.explore.posture.position + [0.02, -0.03, 0.01]
+    message = {
+        "type": "TransformControlsUpdateMessage", "name": "/robot/P", "owner": "",
+        "wxyz": (1.0, 0.0, 0.0, 0.0), "position": target.tolist(),
+    }  # fmt: skip
+    address = viewer.address.replace("http", "ws")
+    with connect(address, subprotocols=[f"viser-v{viser.__version__}"], max_size=None) as page:
+        page.send(msgspec.msgpack.encode(message))
+        until(lambda: np.allclose(viewer.explore.posture.position, target))
+    assert drawn_gap(viewer) < 1e-9
+
+
+def until(true: Any, seconds: float = 20.0) -> None:
+    end = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def test_layers_are_drawn_when_shown_and_gone_when_hidden(viewer):
+    nodes = {
+        "parallel": "singular/level3", "serial": "singular/leg2", "aspects": "aspects/0",
+        "constraint": "singular/elevation", "workspace": "workspace", "region": "regions/goals",
+        "conditioning": "conditioning", "margin": "margin",
+    }  # fmt: skip
+    assert nodes.keys() == LAYERS.keys()
+
+    def drawn() -> set[str]:
+        find = viewer.server.scene.get_handle_by_name
+        return {name for name, node in nodes.items() if find(f"/robot/{node}") is not None}
+
+    assert drawn() == {"region"}
+    for box in viewer.shown.values():
+        choose(viewer, box, True)
+    assert drawn() == nodes.keys()
+    choose(viewer, viewer.explore.operation, "rotated")
+    assert drawn() == {"region"}
+    choose(viewer, viewer.explore.operation, "translating")
+    for name, box in viewer.shown.items():
+        choose(viewer, box, name == "margin")
+    assert drawn() == {"margin"}
+    assert viewer.layers.margin.distance == pytest.approx(0.24)
+
+
+def test_another_machine_is_shown_at_its_home(viewer):
+    choose(viewer, viewer.machine, "paper")
+    assert viewer.explore.posture.machine is tpm_gym.PAPER_TPM
+    assert viewer.explore.posture.position == pytest.approx(tpm_gym.PAPER_TPM.home)
+    assert drawn_gap(viewer) < 1e-9
+
+
+@pytest.mark.parametrize("env_id", tpm_gym.ENV_IDS)
+def test_every_task_is_played_with_closed_loops(viewer, env_id):
+    play = viewer.play
+    choose(viewer, play.env_id, env_id)
+    assert play.policy.value == "expert"
+    for _ in range(3):
+        do(viewer, play.step)
+        assert drawn_gap(viewer) < 1e-9
+    player = play.player
+    assert len(player.records) == 3
+    state = player.state
+    assert viewer.explore.posture.theta == pytest.approx(state.theta)
+    for index, block in enumerate(player.task.scene.objects):
+        node = viewer.server.scene.get_handle_by_name(f"/objects/{block.name}")
+        assert node.position == pytest.approx(state.object_position[index])
+    terms, torques = (plot.data for plot in play.plots)
+    drawn = np.array(terms[1:]).sum(axis=0)
+    assert drawn == pytest.approx([sum(r.reward_terms.values()) for r in player.records])
+    assert pytest.approx(np.array([r.torque for r in player.records])) == np.array(torques[1:]).T
+    do(viewer, play.discard)
+
+
+@pytest.mark.parametrize("engine", installed_engines())
+@pytest.mark.parametrize("policy", ["expert", "random", "TPMReach-v0"])
+def test_every_engine_plays_every_kind_of_policy_the_same_twice(engine, policy):
+    pytest.importorskip("torch")
+    machine, last = tpm_gym.PAPER_TPM, []
+    with closing(Player("TPMReach-v0", engine, machine, policy)) as player:
+        for _ in range(2):
+            player.reset(7)
+            for _ in range(4):
+                player.step()
+            last.append(player.state.platform_position)
+    assert np.array_equal(*last)
+
+
+def test_the_choice_of_engines_begins_with_the_analytic_one_and_lists_what_is_there(monkeypatch):
+    assert installed_engines()[0] == "analytic"
+    monkeypatch.setattr("tpm_gym.viewer.player.find_spec", lambda name: name == "tpm_gym" or None)
+    assert "pybullet" not in installed_engines()
+    assert "mujoco" not in installed_engines()
+
+
+def test_published_policies_are_offered_for_their_task_and_control():
+    assert policies_for("TPMReachDense-v0") == ("expert", "random", "TPMReach-v0")
+    assert policies_for("TPMPickAndPlaceJoints-v0")[2:] == ("TPMPickAndPlaceJoints-v0",)
+
+
+def test_play_goes_on_with_the_next_seed_pauses_and_begins_anew(viewer):
+    play = viewer.play
+    choose(viewer, play.env_id, "TPMReach-v0")
+    choose(viewer, play.seed, 3)
+    choose(viewer, play.speed, 4.0)
+    do(viewer, play.play)
+    until(lambda: play.seed.value >= 4)
+    do(viewer, play.pause)
+    count = len(play.player.records)
+    time.sleep(0.1)
+    assert len(play.player.records) == count
+    do(viewer, play.new)
+    seed = play.seed.value
+    do(viewer, play.step)
+    do(viewer, play.step)
+    assert (len(play.player.records), play.seed.value) == (2, seed)
+    do(viewer, play.new)
+    assert (len(play.player.records), play.seed.value) == (0, seed + 1)
+    do(viewer, play.discard)
+
+
+def test_a_policy_that_is_not_there_is_reported_and_the_viewer_goes_on(viewer):
+    play = viewer.play
+    choose(viewer, play.file, "nowhere/policy.json")
+    do(viewer, play.step)
+    assert "nowhere/policy.json" in play.status
+    choose(viewer, play.file, "")
+    do(viewer, play.step)
+    assert len(play.player.records) == 1
+    do(viewer, play.discard)
+
+
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [
+        ({"machine": "nothing"}, "machine"),
+        ({"port": -1}, "port"),
+        ({"port": 70_000}, "port"),
+        ({"host": "192.0.2.1"}, "host"),  # an address for documentation
+        ({"host": "no such host"}, "host"),
+    ],
+)
+def test_options_that_are_not_possible_are_refused(options, name):
+    with pytest.raises(ConfigurationError) as refused:
+        open_viewer(**options)
+    assert refused.value.name == name
+
+
+def test_a_machine_of_another_kind_is_refused():
+    with pytest.raises(ConfigurationError, match=r"tpm_gym\.TPM"):
+        open_viewer(GANTRY)
+
+
+def test_a_taken_port_gives_another(viewer):
+    taken = viewer.server.get_port()
+    with closing(open_viewer(port=taken)) as other:
+        assert other.server.get_port() != taken
