@@ -48,6 +48,7 @@ test-wheel: $(INSTALLED) ## the wheel in an empty environment: train, kill, resu
 	$(RUN) -m pytest -q -m slow tests/learning/test_wheel.py
 
 docs: $(INSTALLED) ## build the documentation in build/docs/html; warnings are errors
+	$(VENV)/bin/tpm-gym view --export docs/_static/viewer
 	$(RUN) -m sphinx -E -W --keep-going --nitpicky -b html docs build/docs/html
 
 urdf: $(INSTALLED) ## regenerate urdf/ from the mechanism

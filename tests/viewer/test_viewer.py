@@ -159,7 +159,10 @@ def test_layers_are_drawn_when_shown_and_gone_when_hidden(viewer):
 
 
 def test_another_machine_is_shown_at_its_home(viewer):
+    do(viewer, viewer.play.step)
+    assert viewer.server.scene.get_handle_by_name("/objects/object") is not None
     choose(viewer, viewer.machine, "paper")
+    assert viewer.server.scene.get_handle_by_name("/objects/object") is None
     assert viewer.explore.posture.machine is tpm_gym.PAPER_TPM
     assert viewer.explore.posture.position == pytest.approx(tpm_gym.PAPER_TPM.home)
     assert drawn_gap(viewer) < 1e-9
@@ -190,7 +193,6 @@ def test_every_task_is_played_with_closed_loops(viewer, env_id):
 @pytest.mark.parametrize("engine", installed_engines())
 @pytest.mark.parametrize("policy", ["expert", "random", "TPMReach-v0"])
 def test_every_engine_plays_every_kind_of_policy_the_same_twice(engine, policy):
-    pytest.importorskip("torch")
     machine, last = tpm_gym.PAPER_TPM, []
     with closing(Player("TPMReach-v0", engine, machine, policy)) as player:
         for _ in range(2):

@@ -58,7 +58,7 @@ class Play:
         )
         self.seed: Any = gui.add_number("Seed", 0, min=0, step=1)
         self.speed = gui.add_slider("Speed", 0.1, 4.0, 0.1, 1.0, hint="1 is real time")
-        self.buttons = gui.add_button_group("", ("Play", "Pause", "Step", "New episode"))
+        self.buttons = gui.add_button_group("", ("Play", "Pause", "Step", "Next"))
         self._status: Any = gui.add_html("")
         self._gui = gui
         self._plots: list[dict[Any, GuiUplotHandle | None]] = [{}, {}]
@@ -72,7 +72,7 @@ class Play:
         self.speed.on_update(lambda _: self._put("speed", self._set_speed))
         self.seed.on_update(lambda _: self._put("seed", self.discard_episode))
         jobs = {
-            "Play": self.play, "Pause": self.pause, "Step": self.step, "New episode": self.new
+            "Play": self.play, "Pause": self.pause, "Step": self.step, "Next": self.new
         }  # fmt: skip
         self.buttons.on_click(lambda event: self._put("button", jobs[event.target.value]))
 
@@ -210,7 +210,8 @@ class Play:
                 data,
                 (uplot.Series(label="step"), *series),
                 title=title,
-                height=190,
+                height=150,
+                legend=uplot.Legend(show=True, live=False),
                 scales={"x": uplot.Scale(time=False, range=(0.0, float(length or 1000)))},
             )
 

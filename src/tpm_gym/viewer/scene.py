@@ -18,10 +18,13 @@ from tpm_gym.mechanism.urdf import COLOURS
 from tpm_gym.simulation.stage import FLOOR, TABLE
 from tpm_gym.simulation.state import Scene, State
 
-__all__ = ["ROBOT", "RobotScene", "colour", "set_camera"]
+__all__ = ["ROBOT", "TASK_NODES", "RobotScene", "colour", "set_camera"]
 
 ROBOT: Final = "/robot"
 """Node whose frame is the machine's frame; everything in that frame hangs below it."""
+
+TASK_NODES: Final = "/objects", "/goals"
+"""Nodes below which the objects and goal markers of a task hang; world frame."""
 
 _TURNS: Final = {
     "x": (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0),
@@ -29,6 +32,7 @@ _TURNS: Final = {
     "z": (1.0, 0.0, 0.0, 0.0),
 }
 """Quaternions (w, x, y, z) that turn a cylinder along z onto an axis."""
+_PAPER_TABLE: Final = 0.45  # m, half the length for which the camera's distance was chosen
 _GOAL: Final = (30, 160, 70)
 
 
@@ -46,7 +50,8 @@ def set_camera(server: ViserServer, machine: Machine) -> None:
         0.55 * machine.mount.height,
     ]
     server.initial_camera.look_at = middle
-    server.initial_camera.position = middle + [1.1, -1.65, 0.45]
+    size = 1 + max(machine.table) - _PAPER_TABLE
+    server.initial_camera.position = middle + np.array([1.1, -1.65, 0.45]) * size
     server.initial_camera.fov = math.radians(38)
 
 

@@ -18,7 +18,7 @@ from tpm_gym.viewer.layers import BEST, LAYERS, Layers
 from tpm_gym.viewer.play import Play
 from tpm_gym.viewer.player import Player
 from tpm_gym.viewer.posture import Posture, at_joints
-from tpm_gym.viewer.scene import ROBOT, RobotScene, set_camera
+from tpm_gym.viewer.scene import ROBOT, TASK_NODES, RobotScene, set_camera
 from tpm_gym.viewer.worker import Worker
 
 __all__ = ["Viewer", "find_tpm"]
@@ -119,7 +119,8 @@ class Viewer:
     def _set_machine(self) -> None:
         machine = self._machines[self.machine.value]
         self.play.set_machine(machine)
-        self.server.scene.remove_by_name(ROBOT)
+        for name in (ROBOT, *TASK_NODES):
+            self.server.scene.remove_by_name(name)
         set_camera(self.server, machine)
         self.robot = RobotScene(self.server.scene, machine)
         self.layers = Layers(self.server.scene, machine)
@@ -184,7 +185,7 @@ def numbers(posture: Posture, problem: str) -> str:
     text = f'<table style="width:100%;font-size:0.85em">{cells}</table>'
     if problem:
         text += f'<p style="color:#c0392b;font-size:0.85em"><b>No such posture:</b> {problem}</p>'
-    return f'<div style="padding:0 1em">{text}</div>'
+    return f'<div style="padding:0 1em 0.5em">{text}</div>'
 
 
 def _scale() -> str:
