@@ -56,7 +56,8 @@ def study(config: Study) -> None:
         left = [command for run in runs for command in run.left()]
         print(*map(shlex.join, left), sep="\n")
         return
-    print(f"{len(runs)} runs; their output goes to {config.folder}/*.log", flush=True)
+    print(f"{len(runs)} runs; their output goes to {config.folder}/*.log")
+    print("starting Ray, which takes some seconds ...", flush=True)
     if failures := run_all(runs, config):
         raise LearningError(f"{failures} runs failed or were stopped; start again to continue")
 

@@ -1,9 +1,7 @@
 """Studies survive deaths and stops, and the page of results agrees with the records."""
 
 import json
-import os
 import signal
-import subprocess
 import sys
 import threading
 import time
@@ -297,22 +295,6 @@ def test_files_of_others_are_not_replaced(run: Run, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"json is no record: it lacks engine, env"):
         collect(Collect(run.folder.parent, records))
     assert record.read_text() == '{"mine": 1}'
-
-
-def test_a_process_that_is_killed_while_it_draws_leaves_no_file(tmp_path: Path) -> None:
-    drawing = (
-        "import os, sys\n"
-        "from pathlib import Path\n"
-        "from matplotlib.figure import Figure\n"
-        "from tpm_gym.learning.figure_style import save\n"
-        "class Killed(Figure):\n"
-        "    def savefig(self, *arguments, **options):\n"
-        "        super().savefig(*arguments, **options)\n"
-        "        os._exit(9)\n"
-        "save(Killed(), Path(sys.argv[1], 'figure.png'))\n"
-    )
-    assert subprocess.run([PYTHON, "-c", drawing, tmp_path], check=False).returncode == 9
-    assert os.listdir(tmp_path) == []
 
 
 # -- the page -------------------------------------------------------------------------------------

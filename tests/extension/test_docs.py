@@ -30,12 +30,13 @@ def test_a_block_makes_an_environment_that_its_expert_solves(code):
             assert sum(info["reward_terms"].values()) == pytest.approx(reward)
 
 
-def test_the_recipe_is_one_for_the_task_above(tmp_path):
-    file = tmp_path / "stack.yml"
+def test_the_recipes_are_for_the_task_above(tmp_path):
+    file = tmp_path / "hover.yml"
     file.write_text("".join(re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)), encoding="utf-8")
-    recipe = read_recipe(file, "sac", "stacking:TPMStack-v0")
+    recipe = read_recipe(file, "sac", "hover:TPMHover-v0")
     assert recipe.hindsight
     assert recipe.arguments["learning_starts"] >= 100  # steps of an episode
+    assert read_recipe(file, "ppo", "hover:TPMHoverDense-v0").n_envs == 256
 
 
 def test_the_table_counts_lines_as_they_are():

@@ -251,6 +251,7 @@ def run(tmp_path: Path, model: Any) -> Path:
         "seed": 5,
         "recipe": RECIPE,
         "env_options": {"machine": "wide"},
+        "training_seeds": [5, 5],
         "versions": {"torch": "2.0.0", "tpm_gym": None},
     }
     (folder / "config.json").write_text(json.dumps(config))
@@ -261,7 +262,9 @@ def test_what_is_converted_says_what_the_run_says(
     run: Path, model: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
     main(["export", str(run / "last.zip"), str(run / "last.json"), "--trust-pickle"])
-    assert capsys.readouterr().out == f"{run / 'last.json'}\n"
+    started, written = capsys.readouterr().out.splitlines()
+    assert started == f"exporting {run / 'last.zip'} and comparing its actions ..."
+    assert written == str(run / "last.json")
     batch = observations(Blank(), 10)
     loaded = tpm_gym.load_policy(run / "last")
     expected, _ = model.predict(batch, deterministic=True)
@@ -298,7 +301,7 @@ class Trace:
         (["none.zip", "out"], "no such file"),
         (["best.zip", "out.zip"], "not for a .zip"),
         (["broken.zip", "out"], "cannot be loaded as sac"),
-        (["elsewhere/best.zip", "out"], "no config.json"),
+        (["elsewhere/best.zip", "out"], "no config.json of a training"),
         (["best.zip", "/proc/out"], "OUT /proc/out: cannot be written"),
     ],
 )

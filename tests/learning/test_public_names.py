@@ -34,12 +34,15 @@ def test_what_is_not_installed_is_named_with_the_extra_that_installs_it() -> Non
     )
 
 
-@pytest.mark.parametrize("command", ["train", "resume", "evaluate", "export"])
+@pytest.mark.parametrize("command", ["train", "resume", "evaluate", "export", "tune"])
 def test_every_command_has_its_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as caught:
-        main([*command.split(), "--help"])
+        main([command, "--help"])
     assert caught.value.code == 0
-    assert f"usage: tpm-gym {command}" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert f"usage: tpm-gym {command}" in shown
+    assert "None" not in shown
+    assert len(shown.splitlines()) < 75
 
 
 def test_one_root_catches_every_error() -> None:
@@ -55,7 +58,7 @@ def test_a_recipe_is_ready_for_stable_baselines() -> None:
     assert extractor is learning.GoalGapExtractor
     assert keywords["learning_rate"](0.5) == pytest.approx(0.0005)
     assert not {"demonstrations", "n_timesteps", "n_envs"} & set(keywords)
-    with pytest.raises(errors.ConfigError, match="no recipe for TPMReach-v0"):
+    with pytest.raises(errors.ConfigError, match="no recipe of ppo for TPMReach-v0"):
         learning.recipe("TPMReach-v0", "ppo")
     with pytest.raises(errors.ConfigError, match="--engine analytic has one"):
         learning.recipe("TPMPickAndPlaceDense-v0", "ppo")

@@ -17,7 +17,7 @@ from tpm_gym.envs.vector import TPMVectorEnv
 from tpm_gym.learning.environments import make_envs
 from tpm_gym.learning.errors import PolicyError, RolloutError
 from tpm_gym.learning.estimates import bootstrap, wilson
-from tpm_gym.learning.policies import load_policy, trained_in
+from tpm_gym.learning.policies import load_policy
 from tpm_gym.learning.rollout import (
     TEST_SEED,
     Episode,
@@ -193,9 +193,5 @@ def test_summary_keeps_the_worst_of_all_episodes() -> None:
 def test_unknown_policies_say_what_there_is(reach: TPMVectorEnv, tmp_path: Path) -> None:
     with pytest.raises(PolicyError, match=r"expert, random, an exported policy"):
         load_policy("exprt", reach)
-    with pytest.raises(PolicyError, match=r"best\.zip or .*last\.zip"):
+    with pytest.raises(PolicyError, match=r"best\.json or .*last\.json"):
         load_policy(str(tmp_path), reach)
-    (tmp_path / "config.json").write_text('{"algo": "sac"}')
-    (tmp_path / "best.zip").touch()
-    with pytest.raises(PolicyError, match="damaged"):
-        trained_in(str(tmp_path))

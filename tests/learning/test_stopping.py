@@ -19,24 +19,21 @@ from trainings import (
     interrupt_at,
     make_config,
     quiet,
-    read_checkpoint,
     said,
     uninterrupted,
 )
 
 import tpm_gym
 from tpm_gym.learning import (
-    EvaluationConfig,
     ResumeConfig,
     TrainingConfig,
     callbacks,
-    evaluate,
     resume,
     train,
 )
 from tpm_gym.learning.callbacks import Checkpointing
 from tpm_gym.learning.checkpoint import CheckpointStore, Content
-from tpm_gym.learning.errors import CheckpointError, ConfigError, PolicyError, RunError
+from tpm_gym.learning.errors import ConfigError, RunError
 from tpm_gym.learning.run_folder import claimed
 from tpm_gym.learning.signals import SignalListener
 
@@ -234,21 +231,6 @@ def test_nothing_to_resume_is_an_error_that_says_so(tmp_path: Path) -> None:
         assert (tmp_path / "config.json").read_text() == text
 
 
-def test_brackets_without_end_are_no_configuration(half: TrainingConfig) -> None:
-    (half.run / "config.json").write_text("[" * 100_000)
-    (half.run / "tests").mkdir()
-    (half.run / "tests" / "mine.json").write_text("[" * 100_000)
-    assert resume(ResumeConfig(half.run), quiet()) is None  # the checkpoint has the configuration
-    assert_equal_runs(uninterrupted("sac"), half.run)
-    (half.run / "config.json").write_text("[" * 100_000)
-    shutil.rmtree(half.run / "checkpoints")
-    with pytest.raises(RunError, match="holds no run"):
-        resume(ResumeConfig(half.run), quiet())
-    (half.run / "best.json").unlink()
-    with pytest.raises(PolicyError, match=r"config\.json is damaged: it is nested too deeply"):
-        evaluate(EvaluationConfig((str(half.run / "best.zip"),), trust_pickle=True), quiet())
-
-
 @pytest.mark.parametrize("name", ["evaluations.jsonl", "progress.csv"])
 def test_a_folder_in_the_place_of_a_file_is_named(half: TrainingConfig, name: str) -> None:
     (half.run / name).unlink(missing_ok=True)
@@ -256,21 +238,6 @@ def test_a_folder_in_the_place_of_a_file_is_named(half: TrainingConfig, name: st
     with pytest.raises(
         RunError, match=rf"Is a directory: .*{name}.*; put that right, then continue"
     ):
-        resume(ResumeConfig(half.run), quiet())
-
-
-@pytest.mark.parametrize(
-    ("name", "data"),
-    [("state.json", b"{}"), ("state.json", b"[" * 100_000), ("torch.pt", b""), ("torch.pt", b"PK")],
-)
-def test_a_whole_checkpoint_of_another_author_is_named(
-    half: TrainingConfig, name: str, data: bytes
-) -> None:
-    shutil.rmtree(half.run / "checkpoints")
-    content = read_checkpoint(uninterrupted("sac"), 300)
-    changed = replace(content, step=150, finished=False, files={**content.files, name: data})
-    CheckpointStore(half.run / "checkpoints").save(changed)
-    with pytest.raises(CheckpointError, match=r"of step 150 cannot be restored .*--overwrite"):
         resume(ResumeConfig(half.run), quiet())
 
 

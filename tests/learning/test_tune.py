@@ -14,10 +14,13 @@ ANALYTIC = EnvOptions(engine="analytic")
 
 
 @pytest.mark.slow
-def test_the_best_of_a_search_is_a_recipe_that_trains(tmp_path: Path) -> None:
+def test_the_best_of_a_search_is_a_recipe_that_trains(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = tmp_path / "tuned"
     words = "tune --env TPMReachDense-v0 --engine analytic --trials 3 --steps 8192 --jobs 2"
     main([*words.split(), "--folder", str(folder)])
+    assert f"3 trainings of 8,192 steps; their logs: {folder}/NNN.log" in capsys.readouterr().out
     score = {}
     for number in range(3):
         recipe = yaml.safe_load((folder / f"{number:03d}.yml").read_text())
@@ -36,7 +39,7 @@ def test_the_best_of_a_search_is_a_recipe_that_trains(tmp_path: Path) -> None:
     [
         (["--trials", "0"], "--trials 0: must be at least 1"),
         (["--folder", "."], "exists; give another"),
-        (["--env", "TPMReach-v0"], "no recipe for TPMReach-v0"),
+        (["--env", "TPMReach-v0"], "no recipe of ppo for TPMReach-v0"),
     ],
 )
 def test_mistakes_are_named_before_ray_starts(words: list[str], message: str) -> None:

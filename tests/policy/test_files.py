@@ -1,6 +1,5 @@
 """A policy on file loads without trust: damage and ill will are named, and nothing grows."""
 
-import functools
 import json
 import tempfile
 from collections.abc import Sequence
@@ -101,31 +100,21 @@ def put(path: Sequence[Any], value: Any) -> dict[str, Any]:
     [
         ("format", "pickle"),
         ("version", 2),
-        ("version", functools.reduce(lambda inner, _: [inner], range(300), 0)),
-        ("ext\nra" * 99, 1),
-        ("network.features.keys", []),
         ("network.features.kind", "eval"),
         ("network.features.unit", 0),
         ("network.features", {"kind": "concatenate", "keys": ["observation"]}),
         ("network.hidden", [0] * 100_000),
-        ("network.hidden", [4096] * 20),
         ("network.activation", "exec"),
         ("env_options", {"eval": "x"}),
         ("env", "TPMReach-v0\n\x1b[31m"),
         ("seed", -1),
-        ("recipe", {"a\x1b": 0}),
-        ("versions.torch", "\ud800\n"),
         ("observation_space", {}),
-        ("observation_space.desired_goal.shape", [4]),
         ("observation_space.desired_goal.shape", [-1]),
         ("observation_space.desired_goal", box(2, 1.0)),
-        ("observation_space.observation.shape", [4096] * 30),
         ("observation_space.observation.dtype", "object"),
         ("observation_space.observation.low", [11.0] * 4),
-        ("observation_space.observation.low", [-1e31] * 4),
         ("action_space.low", [-1.0]),
         ("weights.bytes", 10**9),
-        ("weights.bytes", 10),
         ("weights.file", "/etc/passwd"),
     ],
 )
@@ -225,36 +214,3 @@ def test_weights_of_an_ill_willed_author_are_refused_or_finite(
     for place, value in changes:
         data[place % header if header_only else place] = value
     assert_refused_or_a_policy(described(bytes(data)), bytes(data))
-
-
-JSON_VALUES = st.recursive(
-    st.none()
-    | st.booleans()
-    | st.integers(-(10**19), 10**19)
-    | st.floats(allow_nan=False, allow_infinity=False)
-    | st.text(max_size=5)
-    | st.sampled_from(["kind", "relu", "clip", "goal_gap", "concatenate"]),
-    lambda inner: (
-        st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3)
-    ),
-    max_leaves=5,
-)
-
-
-def places(value: Any, before: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """Paths to every value inside a value."""
-    items = value.items() if isinstance(value, dict) else enumerate(value)
-    found = []
-    for key, inner in items:
-        found.append((*before, key))
-        if isinstance(inner, dict | list):
-            found += places(inner, (*before, key))
-    return found
-
-
-@settings(max_examples=300, deadline=None)
-@given(place=st.sampled_from(places(described(DATA))), value=JSON_VALUES)
-def test_json_of_an_ill_willed_author_is_refused_or_a_policy(
-    place: tuple[Any, ...], value: Any
-) -> None:
-    assert_refused_or_a_policy(put(place, value), DATA)

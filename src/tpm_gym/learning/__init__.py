@@ -7,6 +7,8 @@ name is imported when it is first used.
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from tpm_gym.errors import MissingPackageError
+
 if TYPE_CHECKING:
     from tpm_gym.learning.configuration import EnvOptions as EnvOptions
     from tpm_gym.learning.configuration import ResumeConfig as ResumeConfig
@@ -41,17 +43,11 @@ __all__ = list(_MODULES)
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name from its module (PEP 562).
-
-    Raises:
-        MissingPackageError: A package of the extra ``train`` is not installed.
-    """
+    """Import a public name from its module (PEP 562)."""
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     try:
         module = importlib.import_module(f"{__name__}.{_MODULES[name]}")
     except ModuleNotFoundError as error:
-        from tpm_gym.errors import MissingPackageError
-
         raise MissingPackageError(error.name or "a package", "train") from error
     return getattr(module, name)

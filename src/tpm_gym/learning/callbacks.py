@@ -129,8 +129,8 @@ class Checkpointing(BaseCallback):
     """Checkpoints between rollouts, and one when the process is asked to stop.
 
     A checkpoint that cannot be written is reported and tried again when the next one is due. The
-    first is saved before anything else is done, so that no policy is without one. ``seconds`` is
-    the time that earlier processes have trained.
+    first is saved before anything else is done, so that no policy is without one. ``restored`` is
+    the extra data of the checkpoint that this process began with.
     """
 
     config: TrainingConfig
@@ -138,7 +138,7 @@ class Checkpointing(BaseCallback):
     evaluation: PeriodicEvaluation
     listener: SignalListener
     console: Console
-    seconds: float
+    restored: Mapping[str, Any]
 
     def __post_init__(self) -> None:
         """Initialise the callback."""
@@ -148,7 +148,7 @@ class Checkpointing(BaseCallback):
 
     def _on_training_start(self) -> None:
         # Times and speeds in the logs count from the beginning of the run.
-        self.model.start_time = int(time.time_ns() - self.seconds * 1e9)
+        self.model.start_time = int(time.time_ns() - self.restored.get("seconds", 0.0) * 1e9)
         self.model._num_timesteps_at_start = 0
         if self._last_step is None:
             self.save()

@@ -21,13 +21,13 @@ from numpy.typing import NDArray
 
 from tpm_gym.learning.errors import CheckpointError
 
-FORMAT: Final = 3
+FORMAT: Final = 4
 KEPT: Final = 2  # checkpoints; the second is used if the first turns out to be damaged
 STATE: Final = "state.json"
 TENSORS: Final = "torch.pt"
 
-_NAME: Final = re.compile(r"(\d{9,})\.checkpoint(\.tmp)?")
 _SUM: Final = hashlib.sha256().digest_size  # bytes
+_NAME: Final = re.compile(r"(\d{9,})\.checkpoint(\.tmp)?")
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class CheckpointStore:
         for step in reversed(steps):
             try:
                 content = _read(self.path(step))
-            except Exception as error:  # whatever NumPy raises on a file that others have signed
+            except Exception as error:  # whatever NumPy raises on a damaged file
                 warn(f"damaged checkpoint: {self.path(step)} ({error}); trying the one before")
                 continue
             # A damaged checkpoint is deleted once a new one can take its place.
@@ -141,19 +141,18 @@ def _read(path: Path) -> Content:
     data = path.read_bytes()
     if hashlib.sha256(memoryview(data)[_SUM:]).digest() != data[:_SUM]:
         raise ValueError("its SHA-256 differs from what was written")
-    stream = io.BytesIO(data)
-    stream.seek(_SUM)
-    with np.load(stream, allow_pickle=False) as loaded:
+    with np.load(io.BytesIO(data[_SUM:]), allow_pickle=False) as loaded:
         entries = {name: loaded[name] for name in loaded.files}
     version, step, finished = entries.pop("head").tolist()
     if version != FORMAT:
         raise ValueError(f"format {version}, this version of tpm_gym reads {FORMAT}")
-    parts: dict[str, dict[str, NDArray[Any]]] = {"files": {}, "arrays": {}}
-    for name, array in entries.items():
-        kind, _, inner = name.partition("/")
-        parts[kind][inner] = array
-    files = {name: array.tobytes() for name, array in parts["files"].items()}
-    return Content(step, bool(finished), files, parts["arrays"])
+    files = {name: array.tobytes() for name, array in starting(entries, "files/").items()}
+    return Content(step, bool(finished), files, starting(entries, "arrays/"))
+
+
+def starting(arrays: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
+    """Return the arrays with a prefix, under their names without it."""
+    return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
 
 
 def _flush_folder(folder: Path) -> None:

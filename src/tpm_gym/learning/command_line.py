@@ -11,26 +11,27 @@ import tyro
 from tyro.conf import Positional, subcommand
 
 from tpm_gym import TPMError
-from tpm_gym.learning.configuration import ResumeConfig, TrainingConfig, TuneConfig
+from tpm_gym.learning.configuration import ResumeConfig, TrainingConfig, unset
 from tpm_gym.learning.evaluation import EvaluationConfig, evaluate
+from tpm_gym.learning.tune import TuneConfig
 from tpm_gym.viewer import ViewConfig, run
 
 
 @dataclass(frozen=True)
 class ExportConfig:
-    """Export a trained policy as safetensors and JSON, which load without trust."""
+    """Write a trained policy as safetensors and JSON, which load without trust."""
 
-    model: Positional[Path]
-    """Archive (.zip) of a training in its run folder, or an exported policy (.json)."""
+    model: Annotated[Positional[Path], tyro.conf.arg(metavar="MODEL")]
+    """best.zip or last.zip in the folder of a run, or an exported policy (.json)."""
 
-    out: Positional[Path]
-    """Common name of the two new files; an earlier policy is replaced, no other files."""
+    out: Annotated[Positional[Path], tyro.conf.arg(metavar="OUT")]
+    """Common name of the new files; an earlier policy is replaced, no other files."""
 
     trust_pickle: bool = False
-    """Load the .zip file, which can run any code."""
+    """Load a .zip file, which can run any code."""
 
-    evaluation: Path | None = None
-    """Results of `tpm-gym evaluate --json`; also write a model card for the Hugging Face Hub."""
+    evaluation: Annotated[Path | None, unset(Path, "no card", "PATH")] = None
+    """Results of evaluate --json, to write a model card for the Hugging Face Hub."""
 
 
 Command = (
@@ -48,8 +49,9 @@ def main(words: Sequence[str] | None = None) -> None:
 
     A command that a signal stops exits with 128 plus the number of the signal, as in shells.
     """
-    about = "Train policies on the environments of tpm_gym, and evaluate them."
-    command: Any = tyro.cli(Command, prog="tpm-gym", description=about, args=words)
+    about = "Train and test policies for the robot of tpm_gym."
+    options: Any = {"config": (tyro.conf.FlagCreatePairsOff,), "args": words}
+    command: Any = tyro.cli(Command, prog="tpm-gym", description=about, **options)
     stopped_by = None
     try:
         if isinstance(command, EvaluationConfig):
@@ -69,6 +71,7 @@ def main(words: Sequence[str] | None = None) -> None:
             case TuneConfig():
                 print(tune.tune(command))
             case ExportConfig():
+                print(f"exporting {command.model} and comparing its actions ...", flush=True)
                 policy = export.convert(
                     command.model, command.out, trust_pickle=command.trust_pickle
                 )

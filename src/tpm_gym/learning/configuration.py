@@ -1,8 +1,7 @@
 """Configuration of a training: the options of the command line, completed and checked."""
 
 import json
-import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -31,25 +30,41 @@ def unset(kind: Any, shown: str, metavar: str, name: str | None = None) -> Any:
     )
 
 
+_RANDOMISED = tyro.conf.arg(metavar="KEY=VALUE ...", help_behavior_hint="(default: none)")
+Randomised = Annotated[tuple[str, ...], _RANDOMISED]
+
+
+def parse_randomisation(words: Sequence[str]) -> dict[str, Any]:
+    """Parse words such as ``friction=0.5:1`` into a mapping; environments check keys and values."""
+    found: dict[str, Any] = {}
+    for word in words:
+        name, _, text = word.partition("=")
+        try:
+            numbers = [int(n) if n.isdecimal() else float(n) for n in text.split(":")]
+        except ValueError:
+            numbers = []
+        if not name or name in found or len(numbers) not in (1, 2):
+            valid = "must be KEY=NUMBER or KEY=LOW:HIGH, each key once"
+            raise ConfigError(f"--randomisation {word}: {valid}")
+        found[name] = numbers[0] if len(numbers) == 1 else tuple(numbers)
+    return found
+
+
 @dataclass(frozen=True)
 class EnvOptions:
-    """Options of an environment, by name; the id decides those that are not given."""
+    """Choices that the id makes where they are not given."""
 
-    machine: Annotated[str, unset(str, "the policy's in evaluate, else the id's", "NAME")] = UNSET
-    """Machine: paper, wide, or one that the module of --env module:id registers."""
+    machine: Annotated[str, unset(str, "the id's; evaluate: the policy's", "NAME")] = UNSET
+    """Robot: paper, wide, or your module's."""
 
     engine: Annotated[str, unset(str, "the id's, mostly pybullet", "NAME")] = UNSET
-    """Engine: pybullet, analytic (many environments at once), mujoco, or one that the module of
-    --env module:id registers."""
+    """Engine: pybullet, mujoco, analytic (many environments at once), or your module's."""
 
     drive: Annotated[
         str,
-        unset(
-            Literal["ideal", "servo"], "the policy's in evaluate, else the id's", "{ideal,servo}"
-        ),
+        unset(Literal["ideal", "servo"], "the id's; evaluate: the policy's", "{ideal,servo}"),
     ] = UNSET
-    """Drives of the motors: ideal ones follow their references exactly, servo drives are torque
-    motors."""
+    """Motors: ideal ones follow every command exactly, servo drives have limited torque."""
 
     @property
     def in_batches(self) -> bool:
@@ -63,68 +78,68 @@ class EnvOptions:
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """Train a policy, and leave everything about the run in one folder."""
+    """Train a policy. Everything about the run goes to one folder."""
 
     algo: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(ALGORITHMS) + "}")] = "sac"
-    """Algorithm. SAC and TQC use hindsight replay on sparse rewards; PPO needs a Dense id."""
+    """Algorithm: sac and tqc for sparse rewards, ppo for a Dense id."""
 
     env: Annotated[str, tyro.conf.arg(metavar="ID")] = "TPMReach-v0"
-    """Environment id, or module:id for one that a module of yours registers."""
+    """Environment id, or module:id if a module of yours registers it."""
 
     seed: int = 0
-    """Seed of the networks, the exploration and the first training environment."""
+    """Seed of everything random."""
 
     steps: Annotated[int, unset(int, "as the recipe says", "INT")] = UNSET
-    """Environment steps, over all environments; rounded up to whole rollouts."""
+    """Steps in all environments together."""
 
     envs: Annotated[int, unset(int, "as the recipe says", "INT")] = UNSET
-    """Parallel environments, each in its own process; in --engine analytic all in one."""
+    """Environments. Each has its own process; in --engine analytic they share one."""
 
     recipe_file: Annotated[Path, unset(Path, "the shipped one of <algo>", "PATH", "recipe")] = UNSET
-    """YAML file of hyperparameters by environment id."""
+    """YAML file of hyperparameters."""
 
     recipe: tyro.conf.Suppress[Annotated[Recipe, unset(type(None), "", "")]] = UNSET
     """Hyperparameters in that file."""
 
     demonstrations: Annotated[int | None, unset(int, "as the recipe says", "INT")] = None
-    """Episodes of the expert in the replay buffer before training starts; 0 trains from scratch."""
+    """Episodes of the expert in the replay buffer at the start; 0 for none."""
 
     run: Annotated[Path, unset(Path, "runs/<env>-<algo>-s<seed>", "FOLDER")] = UNSET
     """Folder of the run."""
 
     penalty_weight: float = 1.0
-    """Weight of the singularity penalty in the reward; 0 switches it off."""
+    """Weight of the singularity penalty in the reward; 0 for none."""
 
     goals: Literal["sampled", "tempting"] = "sampled"
-    """Goals of training and evaluations: as the environment samples them, or tempting towards the
-    singularity."""
+    """Goals: sampled everywhere, or only next to the singularity (tempting)."""
 
     env_options: tyro.conf.OmitArgPrefixes[EnvOptions] = field(default_factory=EnvOptions)
+
+    randomisation: Randomised = ()
+    """Attributes of Randomisation, as in encoder_noise=1e-4 block_mass=0.5:2 (LOW:HIGH)."""
 
     eval_every: Annotated[
         int, unset(int, "a tenth of the steps; a twentieth in --engine analytic", "INT")
     ] = UNSET
-    """Steps between evaluations on held-out seeds."""
+    """Steps between evaluations."""
 
     eval_episodes: Annotated[int, unset(int, "20; 200 in --engine analytic", "INT")] = UNSET
-    """Episodes per evaluation."""
+    """Episodes of an evaluation."""
 
     test_episodes: int = 100
-    """Episodes of the test in PyBullet that ends a training in --engine analytic; 0 for none."""
+    """Episodes of the last test, in PyBullet, of a policy from --engine analytic; 0 for none."""
 
     checkpoint_every: Annotated[int | None, unset(int, "by time", "INT")] = None
-    """Steps between checkpoints. By time: every 30 s, or less often if checkpoints would take more
-    than 2% of the time."""
+    """Steps between checkpoints. By time: every 30 s, for at most 2% of the time."""
 
     threads: int = 1
-    """Threads of PyTorch. With one thread and one environment, or --engine analytic, a seed repeats
-    exactly."""
+    """Threads of PyTorch. One is fastest for small networks, and repeats exactly."""
 
     device: str = "cpu"
-    """Device of PyTorch. The networks are small; a GPU pays only with large batches."""
+    """Device of PyTorch, such as cpu or cuda."""
 
     overwrite: bool = False
-    """Replace an earlier run in the same folder."""
+    """Replace the run that is in the folder."""
 
     @property
     def rollout(self) -> int:
@@ -132,7 +147,7 @@ class TrainingConfig:
         return self.envs * int(self.argument("train_freq") or self.argument("n_steps"))
 
     def argument(self, name: str) -> Any:
-        """Return an argument of the algorithm: the recipe's or its default; None if it has none."""
+        """Return an argument of the algorithm, given or default; None if it has none."""
         return ALGORITHMS[self.algo].argument(self.recipe.arguments, name)
 
     @property
@@ -145,6 +160,20 @@ class TrainingConfig:
         """Number of steps of the demonstrations, over all environments."""
         episodes = int(self.recipe.demonstrations.get("episodes", 0))
         return -(-episodes // self.envs) * self.horizon
+
+    @property
+    def env_arguments(self) -> dict[str, Any]:
+        """Arguments of :func:`~tpm_gym.learning.environments.make_env`."""
+        # A worker process must import the id's module, and may not have the id registered.
+        env = self.env if ":" in self.env else check_env_id(self.env)
+        found: dict[str, Any] = {
+            "env": env,
+            "penalty_weight": self.penalty_weight,
+            "goals": self.goals,
+        }
+        if self.randomisation:
+            found["randomisation"] = parse_randomisation(self.randomisation)
+        return found | self.env_options.given()
 
     @property
     def title(self) -> str:
@@ -162,20 +191,19 @@ class TrainingConfig:
 
 @dataclass(frozen=True)
 class ResumeConfig:
-    """Continue a run from its last checkpoint; options that are not given stay as they are."""
+    """Continue a training from its last checkpoint, with equal results."""
 
     run: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="RUN")]]
     """Folder of the run."""
 
     env: Annotated[str, unset(str, "the run's", "MODULE:ID")] = UNSET
-    """Environment id of the run; needed if it is module:id, since no file decides what is
-    imported."""
+    """Id of the run. Needed if it is module:id: importing a module runs its code."""
 
     steps: Annotated[int, unset(int, "the run's", "INT")] = UNSET
-    """Environment steps in all, rounded up to whole rollouts; may be raised."""
+    """Steps in all, those already taken included."""
 
     eval_every: Annotated[int, unset(int, "the run's", "INT")] = UNSET
-    """Steps between evaluations on held-out seeds."""
+    """Steps between evaluations."""
 
     checkpoint_every: Annotated[int, unset(int, "the run's", "INT")] = UNSET
     """Steps between checkpoints."""
@@ -187,61 +215,31 @@ class ResumeConfig:
     """Device of PyTorch."""
 
 
-@dataclass(frozen=True)
-class TuneConfig:
-    """Search for a recipe: many trainings with varied hyperparameters, several at a time."""
-
-    algo: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(ALGORITHMS) + "}")] = "ppo"
-    """Algorithm."""
-
-    env: Annotated[str, tyro.conf.arg(metavar="ID")] = "TPMReachDense-v0"
-    """Environment id, or module:id for one that a module of yours registers."""
-
-    trials: int = 30
-    """Number of trainings."""
-
-    steps: Annotated[int, unset(int, "as the recipe says", "INT")] = UNSET
-    """Environment steps of each training."""
-
-    jobs: Annotated[int, unset(int, "one for each core", "INT")] = UNSET
-    """Trainings at a time, on this machine or on the Ray cluster that RAY_ADDRESS names."""
-
-    seed: int = 0
-    """Seed of the search; training i has this seed + i."""
-
-    folder: Annotated[Path, unset(Path, "runs/tune-<env>-<algo>", "FOLDER")] = UNSET
-    """Folder of the runs and of the best recipe; must not exist."""
-
-    env_options: tyro.conf.OmitArgPrefixes[EnvOptions] = field(default_factory=EnvOptions)
-
-
 def complete(config: TrainingConfig) -> TrainingConfig:
     """Compute the options that are not given, and check all."""
     import_module_of(config.env)
     check_env_id(config.env)
+    _check_numbers(config)
+    many = config.env_options.in_batches
     shipped = recipe_file(config.algo, config.env_options.engine)
     file = shipped if config.recipe_file is UNSET else config.recipe_file
     recipe = read_recipe(file, config.algo, config.env)
-    if config.demonstrations is not UNSET:
-        check_least(config, 0, "demonstrations")
-        count = config.demonstrations
+    if (count := config.demonstrations) is not UNSET:
         changed = {**recipe.demonstrations, "episodes": count} if count else {}
         recipe = replace(recipe, demonstrations=changed)
         check_recipes(f"--demonstrations {count}", {config.algo: recipe.entries()}, config.algo)
-    steps = recipe.n_timesteps if config.steps is UNSET else config.steps
-    env = config.env.rpartition(":")[2]
     computed: dict[str, Any] = {
-        "steps": steps,
+        "steps": recipe.n_timesteps,
         "envs": recipe.n_envs,
         "recipe_file": file,
-        "run": Path("runs", f"{env}-{config.algo}-s{config.seed}"),
-        "eval_episodes": 200 if config.env_options.in_batches else 20,
+        "run": Path("runs", f"{config.env.rpartition(':')[2]}-{config.algo}-s{config.seed}"),
+        "eval_episodes": 200 if many else 20,
     }
     missing = {name: v for name, v in computed.items() if getattr(config, name) is UNSET}
     config = replace(config, recipe=recipe, **missing)
     if config.eval_every is UNSET:  # more often, it would evaluate equal policies
-        often = steps // (20 if config.env_options.in_batches else 10)
-        config = replace(config, eval_every=max(config.rollout, often))
+        often = max(config.rollout, config.steps // (20 if many else 10))
+        config = replace(config, eval_every=often)
     _check(config)
     return _in_whole_rollouts(config, 0)
 
@@ -275,14 +273,10 @@ def _stored(run: Path, stored: Mapping[str, Any]) -> TrainingConfig:
     kind = TypeAdapter(dict[str, TrainingConfig], config=ConfigDict(strict=True, extra="forbid"))
     try:
         found = kind.validate_json(text)[CONFIG_FILE]
-        TypeAdapter(list[Any]).validate_python(stored.get("resumed", []))
         recipe_file(found.algo)  # refuses an unknown algorithm
         check_recipes(CONFIG_FILE, {"recipe": found.recipe.entries()}, found.algo)
     except (ValidationError, AttributeError, ConfigError) as error:  # a recipe of null
-        problem = str(error)
-        if isinstance(error, ValidationError):
-            first = error.errors()[0]
-            problem = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+        problem = " ".join(str(error).split())
         raise RunError(
             f"the configuration of {run} is damaged: {problem}; start the run anew with tpm-gym "
             "train --overwrite"
@@ -304,22 +298,26 @@ def _refuse(wrong: bool, problem: str) -> None:
 
 
 def _check(config: TrainingConfig) -> None:
+    """Check a completed configuration."""
+    _check_numbers(config)
+    _check_recipe(config)
+    _check_device(config.device)
+
+
+def _check_numbers(config: TrainingConfig) -> None:
+    """Check the numbers that are given; they need no recipe."""
     counts = ("steps", "envs", "eval_every", "eval_episodes", "checkpoint_every", "threads")
     check_least(config, 1, *counts)
-    check_least(config, 0, "test_episodes")
-    envs, seed, most = config.envs, config.seed, TEST_SEED - SELECTION_SEED
-    _refuse(config.eval_episodes > most, f"--eval-episodes: must be at most {most}")
+    check_least(config, 0, "test_episodes", "demonstrations")
+    envs, seed, episodes = config.envs or 1, config.seed, config.eval_episodes or 1
+    most = TEST_SEED - SELECTION_SEED
+    _refuse(episodes > most, f"--eval-episodes {episodes}: must be at most {most:,}")
     most = SELECTION_SEED if config.env_options.in_batches else _MOST_PROCESSES
     problem = f"--envs {envs} (n_envs of the recipe, if not given): must be at most {most:,}"
     _refuse(envs > most, problem)
     most = SELECTION_SEED - envs
     problem = f"must lie in 0 ... {most}: seeds from {SELECTION_SEED} up are held out"
     _refuse(not 0 <= seed <= most, f"--seed {seed}: {problem}")
-    weight = config.penalty_weight
-    problem = f"--penalty-weight {weight}: must be a finite number, 0 or more"
-    _refuse(not 0 <= weight < math.inf, problem)
-    _check_recipe(config)
-    _check_device(config.device)
 
 
 def _check_recipe(config: TrainingConfig) -> None:

@@ -17,23 +17,21 @@ def draw_learning_curve(path: Path, title: str, evaluations: Sequence[Mapping[st
     def values(name: str, part: str = "mean") -> list[float]:
         return [evaluation[name][part] for evaluation in evaluations]
 
+    quality = list(zip(values("success_at_end"), values("return"), strict=True))
+    best = quality.index(max(quality))
     with style():
         figure = Figure(figsize=(WIDTH, 4.8), layout="constrained")
         figure.suptitle(title, weight="bold")
         upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[3, 2])
         upper.plot(steps, values("success_once"), color=GREEN, ls="--", label="success once")
-        for axes, name, label in (
-            (upper, "success_at_end", "success at end"),
-            (lower, "return", "mean"),
-        ):
+        named = (upper, "success_at_end", "success at end"), (lower, "return", "mean")
+        for axes, name, label in named:
             bounds = values(name, "low"), values(name, "high")
             axes.fill_between(steps, *bounds, color=BLUE, alpha=0.16, lw=0, label="95% interval")
             axes.plot(steps, values(name), color=BLUE, marker="o", markersize=3, label=label)
             axes.grid(linewidth=0.4)
-        quality = list(zip(values("success_at_end"), values("return"), strict=True))
-        best = quality.index(max(quality))
-        name = f"best.zip ({quality[best][0]:.0%})"
-        upper.plot(steps[best], quality[best][0], "*", color=ORANGE, markersize=12, label=name)
+        star = {"color": ORANGE, "markersize": 12, "label": f"best.zip ({quality[best][0]:.0%})"}
+        upper.plot(steps[best], quality[best][0], "*", **star)
         upper.set(ylim=(-0.02, 1.04), ylabel="successful episodes")
         upper.yaxis.set_major_formatter(PercentFormatter(xmax=1))
         upper.set_title(f"{evaluations[-1]['episodes']} episodes an evaluation, never trained on")

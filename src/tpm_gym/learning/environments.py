@@ -58,8 +58,8 @@ def make_env(env: str | EnvSpec, *, in_worker: bool = False, **options: Any) -> 
 
     Args:
         env: An id, or its registration, which another process may not have.
-        in_worker: Whether this runs in a worker process. A terminal or a batch system signals all
-            processes, and a worker must outlive the signal until the main process has saved.
+        in_worker: Whether this is a worker process. A terminal signals all processes, and a worker
+            must outlive the signal until the main process has saved.
     """
     if in_worker:
         for number in (signal.SIGINT, signal.SIGTERM):

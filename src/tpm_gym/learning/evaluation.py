@@ -2,8 +2,8 @@
 
 import sys
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import closing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -16,7 +16,14 @@ from rich.table import Table
 
 from tpm_gym.envs.vector import TPMVectorEnv
 from tpm_gym.learning import provenance
-from tpm_gym.learning.configuration import UNSET, EnvOptions, check_least, unset
+from tpm_gym.learning.configuration import (
+    UNSET,
+    EnvOptions,
+    Randomised,
+    check_least,
+    parse_randomisation,
+    unset,
+)
 from tpm_gym.learning.environments import check_env_id, import_module_of, make_envs
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.estimates import Estimate
@@ -41,55 +48,45 @@ _ROWS = (
 
 @dataclass(frozen=True)
 class EvaluationConfig:
-    """Evaluate policies over seeded episodes: a table, and optionally JSON, a video and a picture.
-
-    Machine and drive are those that the policies were trained with, unless others are given.
-    """
+    """Test policies on episodes that no training uses; print a table."""
 
     policy: Annotated[tuple[str, ...], tyro.conf.arg(metavar="POLICY ...")]
-    """Policies: expert, random, the id of a published policy, an exported one (.json), or the
-    folder of a run (its best)."""
+    """expert, random, the id of a published policy, an exported policy or the folder of a run."""
 
     env: Annotated[str, unset(str, "the one the policy was trained on", "ID")] = UNSET
-    """Environment id, or module:id for one that a module of yours registers."""
+    """Environment id, or module:id if a module of yours registers it."""
 
     episodes: int = 100
-    """Episodes per policy."""
+    """Episodes of each policy."""
 
     seed: int = TEST_SEED
-    """Seed of the first episode. The default is used neither in training nor to select policies."""
+    """Seed of the first episode. Training and selection use smaller ones than the default."""
 
     goals: Literal["sampled", "tempting"] = "sampled"
-    """Goals: as the environment samples them, or tempting towards the singularity."""
+    """Goals: sampled everywhere, or only next to the singularity (tempting)."""
 
     penalty_weight: float = 1.0
     """Weight of the singularity penalty in the return."""
 
     env_options: tyro.conf.OmitArgPrefixes[EnvOptions] = field(default_factory=EnvOptions)
 
-    randomisation: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=VALUE ...")] = ()
-    """Differences from the nominal machine: attributes of tpm_gym's Randomisation, each a number,
-    or for factors LOW:HIGH to draw from, for example encoder_noise=1e-4 block_mass=0.5:2.
-    Attributes of the block have no effect in a task without one."""
+    randomisation: Randomised = ()
+    """Attributes of Randomisation, as in encoder_noise=1e-4 block_mass=0.5:2 (LOW:HIGH)."""
 
     json: Annotated[Path | None, unset(Path, "not written", "PATH")] = None
-    """Write metrics, episodes and versions to this file."""
+    """File for metrics, episodes and versions."""
 
     video: Annotated[Path | None, unset(Path, "not written", "PATH")] = None
-    """Write an MP4 of the first episodes to this file; several policies get a file each."""
+    """MP4 of the first episodes; several policies get a file each."""
 
     video_episodes: int = 3
-    """Episodes in a video."""
+    """Episodes of the video."""
 
     picture: Annotated[Path | None, unset(Path, "not written", "PATH")] = None
-    """Write a PNG of six moments of the first episode to this file; several policies get a file
-    each."""
+    """PNG of six moments of the first episode; several policies get a file each."""
 
     camera: Literal["table", "overview", "cup"] = "table"
     """Camera of video and picture: the task region, the whole robot, or close to the cup."""
-
-    trust_pickle: bool = False
-    """Load .zip files of Stable-Baselines3 as well: they hold pickles, which can run any code."""
 
 
 @dataclass(frozen=True)
@@ -197,24 +194,8 @@ def _make_envs(
     return make_envs(config.env, count, **pictures, **options)
 
 
-def parse_randomisation(entries: Sequence[str]) -> dict[str, Any]:
-    """Parse words such as ``friction=0.5:1`` into a mapping; environments check keys and values."""
-    result: dict[str, Any] = {}
-    for entry in entries:
-        name, _, text = entry.partition("=")
-        try:
-            numbers = [int(n) if n.isdecimal() else float(n) for n in text.split(":")]
-        except ValueError:
-            numbers = []
-        if not name or name in result or len(numbers) not in (1, 2):
-            valid = "must be KEY=NUMBER or KEY=LOW:HIGH, each key once"
-            raise ConfigError(f"--randomisation {entry}: {valid}")
-        result[name] = numbers[0] if len(numbers) == 1 else (numbers[0], numbers[1])
-    return result
-
-
 def _load(config: EvaluationConfig, envs: TPMVectorEnv) -> list[Policy]:
-    return [load_policy(spec, envs, trust_pickle=config.trust_pickle) for spec in config.policy]
+    return [load_policy(spec, envs) for spec in config.policy]
 
 
 def _evaluate_one(
@@ -222,11 +203,16 @@ def _evaluate_one(
 ) -> Result:
     """Run the episodes of one policy, with a progress bar on a terminal."""
     start = time.perf_counter()
-    with Progress(console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task(spec, total=config.episodes)
-        advance = partial(bar.advance, task)
+    with _bar(console, spec, config.episodes) as advance:
         records = run_episodes(envs, policy, config.episodes, config.seed, on_episodes=advance)
     return Result(spec, summarise(records), records, time.perf_counter() - start)
+
+
+@contextmanager
+def _bar(console: Console, text: str, total: int) -> Iterator[Callable[[int], object]]:
+    """Show a progress bar on a terminal; yield a function that advances it."""
+    with Progress(console=console, disable=not console.is_terminal) as bar:
+        yield partial(bar.advance, bar.add_task(text, total=total))
 
 
 def _table(config: EvaluationConfig, results: Sequence[Result]) -> Table:
@@ -242,7 +228,10 @@ def _table(config: EvaluationConfig, results: Sequence[Result]) -> Table:
     for result in results:
         table.add_column(result.policy, justify="right", overflow="fold")
     for label, name, factor, form, unit in _ROWS:
-        show = partial(_shown, form, factor)
+
+        def show(value: float, form: str = form, factor: float = factor) -> str:
+            return form.format(value * factor)
+
         found = [result.metrics[name] for result in results]
         cells = [f"{show(e.mean)}{unit} \\[{show(e.low)}, {show(e.high)}]" for e in found]
         table.add_row(label, *cells)
@@ -252,10 +241,6 @@ def _table(config: EvaluationConfig, results: Sequence[Result]) -> Table:
     rates = [f"{result.as_dict()['steps_per_second']:.0f}" for result in results]
     table.add_row("steps per second", *rates)
     return table
-
-
-def _shown(form: str, factor: float, value: float) -> str:
-    return form.format(value * factor)
 
 
 def _description(config: EvaluationConfig, results: Sequence[Result]) -> dict[str, Any]:
@@ -286,14 +271,17 @@ def paths_per_policy(path: Path, policies: Sequence[str]) -> list[Path]:
 
 def _film(config: EvaluationConfig, console: Console) -> None:
     """Run the first episodes again with rendering, which would have slowed the evaluation."""
-    episodes = min(config.video_episodes, config.episodes)
+    count = min(config.video_episodes, config.episodes)
+    frames = 1 + (check_env_id(config.env).max_episode_steps or 0)
+    films = (
+        ("video", config.video, count, write_video),
+        ("picture", config.picture, 1, write_contact_sheet),
+    )
     with closing(_make_envs(config, 1, "rgb_array")) as envs:
-        for i, policy in enumerate(_load(config, envs)):
-            if config.video is not None:
-                path = paths_per_policy(config.video, config.policy)[i]
-                write_video(path, envs, policy, episodes, config.seed)
-                console.print(f"video: {path}", markup=False)
-            if config.picture is not None:
-                path = paths_per_policy(config.picture, config.policy)[i]
-                write_contact_sheet(path, envs, policy, config.seed)
-                console.print(f"picture: {path}", markup=False)
+        policies = _load(config, envs)
+        for kind, file, episodes, write in films:
+            paths = paths_per_policy(file, config.policy) if file is not None else []
+            for path, policy in zip(paths, policies, strict=False):
+                console.print(f"{kind}: {path}, {episodes * frames} frames ...", markup=False)
+                with _bar(console, kind, episodes * frames) as advance:
+                    write(path, envs, policy, episodes, config.seed, partial(advance, 1))

@@ -1,8 +1,6 @@
 """Export of a trained policy as safetensors and JSON, which load without trust."""
 
-import copy
 import io
-import json
 import os
 import shutil
 import tempfile
@@ -23,9 +21,10 @@ from torch import nn
 from tpm_gym import TPMError, load_policy
 from tpm_gym.learning import provenance
 from tpm_gym.learning.algorithms import ALGORITHMS, NAMES, Actor
-from tpm_gym.learning.errors import ConfigError
+from tpm_gym.learning.errors import ConfigError, PolicyError
 from tpm_gym.learning.features import GoalGapExtractor
-from tpm_gym.learning.policies import load_model, refused, require_trust, run_config
+from tpm_gym.learning.policies import refused
+from tpm_gym.learning.run_folder import CONFIG_FILE, description
 from tpm_gym.policy.files import FORMAT, VERSION, digest, files
 
 TOLERANCE: Final = 1e-5
@@ -47,12 +46,12 @@ def save(
 ) -> Path:
     """Write the policy of a model as ``path``.safetensors and ``path``.json; return the latter.
 
-    The files are loaded again, and their actions compared with the model's, before they get their
-    names. A policy that the files cannot express is therefore refused, not changed.
+    The written policy must act like the model before the files get their names. A policy that the
+    files cannot express is therefore refused, not changed.
 
     Args:
         model: SAC, TQC or PPO with a MultiInputPolicy.
-        path: Common name of the files. Missing folders are made, an earlier policy is replaced.
+        path: Common name of the files. An earlier policy is replaced.
         env_options: Machine, engine and drive of the training, if they are not the id's.
         versions: Versions at training; by default the installed ones.
 
@@ -64,9 +63,9 @@ def save(
     try:
         known = (name for name, row in ALGORITHMS.items() if type(model) is row.load_class())
         if (algorithm := next(known, None)) is None:
-            raise _UnfitError(f"{type(model).__name__} is none of {NAMES}")
+            raise PolicyError(f"{type(model).__name__} is none of {NAMES}")
         if not isinstance(model.observation_space, spaces.Dict):
-            raise _UnfitError(f"observations in {model.observation_space}, not in a Dict")
+            raise PolicyError(f"observations in {model.observation_space}, not in a Dict")
         network, weights = _network(model, ALGORITHMS[algorithm].actor)
         data = safetensors_bytes(weights)
         content: dict[str, Any] = {
@@ -86,12 +85,8 @@ def save(
         }
         content["sha256"] = digest(content)
         return _write(path, content, data, model)
-    except (_UnfitError, TPMError) as error:
+    except TPMError as error:
         raise refused(str(path), f"cannot be exported: {error}") from error
-
-
-class _UnfitError(Exception):
-    """A policy cannot be written to files."""
 
 
 def save_archive(model: BaseAlgorithm, path: Path) -> None:
@@ -143,14 +138,39 @@ def convert(archive: Path, path: Path, *, trust_pickle: bool) -> Path:
     name = str(archive)
     if archive.suffix == ".json":
         load_policy(archive)  # raises for a damaged policy
-        for old, new in zip(files(archive.with_suffix("")), files(path), strict=True):
+        for old, new in zip(files(archive), files(path), strict=True):
             provenance.write_whole(new, partial(shutil.copyfile, old))
         return files(path)[0]
-    require_trust(name, archive, trust_pickle)
-    config = run_config(name, archive)
+    if not trust_pickle:
+        raise refused(
+            name,
+            "holds pickles, and loading it can run any code; if you trust its origin, give "
+            "--trust-pickle",
+        )
+    found = (description(folder) for folder in archive.resolve().parents[:2])
+    if (config := next(filter(None, found), None)) is None:
+        where = f"no {CONFIG_FILE} of a training beside it or above it"
+        raise refused(name, f"{where}; keep the file in its run folder")
     about = {key: config[key] for key in ("seed", "recipe", "env_options")}
-    model = load_model(name, archive)
+    model = load_model(archive, config["algo"])
     return save(model, path, env_id=config["env"], versions=config.get("versions"), **about)
+
+
+def load_model(archive: Path, algorithm: str) -> BaseAlgorithm:
+    """Unpickle a saved algorithm for acting only; this can run any code."""
+    if algorithm not in ALGORITHMS:
+        raise refused(str(archive), f"algorithm {algorithm!r} is none of {NAMES}")
+    # Acting needs no replay buffer, and a hindsight buffer would need an environment.
+    unused: dict[str, Any] = {
+        "replay_buffer_class": None,
+        "replay_buffer_kwargs": {},
+        "buffer_size": 1,
+    }
+    try:
+        kind = ALGORITHMS[algorithm].load_class()
+        return kind.load(archive, device="cpu", custom_objects=unused)
+    except Exception as error:  # a damaged archive or pickle can raise anything
+        raise refused(str(archive), f"cannot be loaded as {algorithm}: {error}") from error
 
 
 def _network(
@@ -158,23 +178,23 @@ def _network(
 ) -> tuple[dict[str, Any], dict[str, NDArray[np.float32]]]:
     """Return the description and the weights of the layers of the mean action."""
     if getattr(model, "use_sde", False):
-        raise _UnfitError("state-dependent exploration (use_sde)")
+        raise PolicyError("state-dependent exploration (use_sde)")
     if model.get_vec_normalize_env() is not None:
-        raise _UnfitError("normalised observations (VecNormalize)")
+        raise PolicyError("normalised observations (VecNormalize)")
     part = model.policy.get_submodule
     hidden: Any = part(actor.hidden)
     modules = [*hidden, part(actor.last)]  # linear, activation, linear, ..., linear
     linear: Any = modules[::2]
     kinds = {_ACTIVATIONS.get(type(module)) for module in modules[1::2]} or {"relu"}
     if {type(module) for module in linear} != {nn.Linear} or len(kinds) > 1 or None in kinds:
-        raise _UnfitError(f"only linear layers with ReLU or Tanh can be: {modules}")
+        raise PolicyError(f"only linear layers with ReLU or Tanh can be: {modules}")
     weights = {
         f"layers.{i}.{tensor}": values.detach().cpu().numpy().astype(np.float32)
         for i, module in enumerate(linear)
         for tensor, values in module.named_parameters()
     }
     if not all(np.isfinite(values).all() for values in weights.values()):
-        raise _UnfitError("its weights are not finite: the training diverged")
+        raise PolicyError("its weights are not finite: the training diverged")
     description = {
         "features": _features(part(actor.features)),
         "hidden": [module.out_features for module in linear[:-1]],
@@ -190,12 +210,12 @@ def _features(extractor: nn.Module) -> dict[str, Any]:
         return {"kind": "goal_gap", "unit": extractor.unit}
     if type(extractor) is CombinedExtractor:
         return {"kind": "concatenate", "keys": list(extractor.extractors)}
-    raise _UnfitError(f"features of {type(extractor).__name__}")
+    raise PolicyError(f"features of {type(extractor).__name__}")
 
 
 def _box(space: spaces.Space[Any]) -> dict[str, Any]:
     if not isinstance(space, spaces.Box) or not space.is_bounded() or space.dtype.kind != "f":
-        raise _UnfitError(f"{space} is no bounded Box of floats")
+        raise PolicyError(f"{space} is no bounded Box of floats")
     return {
         "shape": list(space.shape),
         "dtype": space.dtype.name,
@@ -210,8 +230,7 @@ def _write(path: Path, content: Mapping[str, Any], data: bytes, model: BaseAlgor
     json_file.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=json_file.parent, prefix=".export-") as folder:
         new_json, new_weights = files(Path(folder, "policy"))
-        text = json.dumps(content, indent=1, allow_nan=False) + "\n"
-        new_json.write_text(text, encoding="ascii")
+        provenance.write_json(new_json, content)
         new_weights.write_bytes(data)
         _verify(model, new_json)
         # Between the two renames, the sums show a reader that the files do not belong together.
@@ -225,17 +244,13 @@ def _verify(model: BaseAlgorithm, written: Path) -> None:
     """Compare the actions of the written policy with those of the model."""
     rng = np.random.default_rng(0)
     boxes: Any = model.observation_space
+    space: Any = model.action_space
     shapes = {key: (_TRIALS, *box.shape) for key, box in boxes.items()}
     batch = {k: rng.uniform(b.low, b.high, shapes[k]).astype(b.dtype) for k, b in boxes.items()}
-    # PPO's last update leaves its graph in the distribution, and graphs cannot be copied.
     training = model.policy.training
-    model.policy.predict(batch, deterministic=True)
+    expected, _ = model.predict(batch, deterministic=True)  # leaves the training mode
     model.policy.set_training_mode(training)
-    # On the CPU, since a GPU rounds differently; on a copy, so that the model stays as it is.
-    policy: Any = copy.deepcopy(model.policy).to("cpu")
-    space: Any = model.action_space
-    expected, _ = policy.predict(batch, deterministic=True)
     scale = np.maximum(1.0, (space.high - space.low) / 2)
     off = float(np.max(np.abs(load_policy(written).act(batch) - expected) / scale))
     if not off <= TOLERANCE:
-        raise _UnfitError(f"its actions would be off by {off:.2g}")
+        raise PolicyError(f"its actions would be off by {off:.2g}")

@@ -1,12 +1,11 @@
 """Style of all figures: palette, fonts, and saving with equal bytes each time."""
 
 import io
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-import matplotlib
+import matplotlib.style
 from matplotlib.figure import Figure
 
 from tpm_gym.learning.provenance import write_whole
@@ -21,29 +20,20 @@ REACHED, OUTLINE = "#EBEBEB", "#8C8C8C"  # the reachable set, and its edge
 
 _SETTINGS: dict[Any, Any] = {
     "font.size": 8.0,
-    "axes.titlesize": 8.0,
-    "axes.labelsize": 8.0,
-    "xtick.labelsize": 7.0,
-    "ytick.labelsize": 7.0,
-    "legend.fontsize": 7.5,
     "figure.titlesize": 9.5,
-    "axes.linewidth": 0.6,
-    "xtick.major.width": 0.6,
-    "ytick.major.width": 0.6,
+    **dict.fromkeys(("axes.titlesize", "axes.labelsize"), 8.0),
+    **dict.fromkeys(("xtick.labelsize", "ytick.labelsize"), 7.0),
+    **dict.fromkeys(("axes.linewidth", "xtick.major.width", "ytick.major.width"), 0.6),
     "axes.labelpad": 2.0,
+    "legend.fontsize": 7.5,
     "legend.framealpha": 1.0,
     "legend.edgecolor": "0.8",
-    "axes.unicode_minus": True,
 }
 
 
-@contextmanager
-def style() -> Iterator[None]:
+def style() -> AbstractContextManager[None]:
     """Set Matplotlib's defaults and our sizes, regardless of the user's settings."""
-    with matplotlib.rc_context(fname=None):
-        matplotlib.rcdefaults()
-        matplotlib.rcParams.update(_SETTINGS)
-        yield
+    return matplotlib.style.context(["default", _SETTINGS])
 
 
 def save(figure: Figure, path: Path) -> None:

@@ -1,6 +1,6 @@
 """Pictures of a policy at work: a video of episodes, a contact sheet of one."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,12 @@ _ROWS, _COLUMNS = 2, 3
 
 
 def write_video(
-    path: Path, envs: TPMVectorEnv, policy: Policy, episodes: int, first_seed: int
+    path: Path,
+    envs: TPMVectorEnv,
+    policy: Policy,
+    episodes: int,
+    first_seed: int,
+    on_frame: Callable[[], object],
 ) -> None:
     """Write an MP4 of consecutive episodes in real time; ``envs`` renders ``rgb_array``."""
     import imageio.v2 as imageio
@@ -28,22 +33,40 @@ def write_video(
         options = {"fps": envs.metadata["render_fps"], "macro_block_size": 2}
         writer: Any = imageio.get_writer(part, **options)
         with writer as video:
-            add = video.append_data
-            run_episodes(
-                envs, policy, episodes, first_seed, on_frame=lambda: add(envs.render_tile(1))
-            )
+            _film(envs, policy, episodes, first_seed, video.append_data, on_frame)
 
     write_whole(path, write)
 
 
-def write_contact_sheet(path: Path, envs: TPMVectorEnv, policy: Policy, seed: int) -> None:
-    """Write a PNG of six moments of one episode, row by row; ``envs`` renders ``rgb_array``."""
+def write_contact_sheet(
+    path: Path,
+    envs: TPMVectorEnv,
+    policy: Policy,
+    episodes: int,
+    first_seed: int,
+    on_frame: Callable[[], object],
+) -> None:
+    """Write a PNG of six moments of the first episode; arguments as for :func:`write_video`."""
     import imageio.v3 as imageio
 
-    frames: list[Any] = []
-    run_episodes(envs, policy, 1, seed, on_frame=lambda: frames.append(envs.render_tile(1)))
-    sheet = contact_sheet(frames)
-    write_whole(path, lambda part: imageio.imwrite(part, sheet))
+    frames: list[Frame] = []
+    _film(envs, policy, episodes, first_seed, frames.append, on_frame)
+    write_whole(path, lambda part: imageio.imwrite(part, contact_sheet(frames)))
+
+
+def _film(
+    envs: TPMVectorEnv,
+    policy: Policy,
+    episodes: int,
+    first_seed: int,
+    use: Callable[[Frame], object],
+    on_frame: Callable[[], object],
+) -> None:
+    def frame() -> None:
+        use(envs.render_tile(1))
+        on_frame()
+
+    run_episodes(envs, policy, episodes, first_seed, on_frame=frame)
 
 
 def contact_sheet(frames: Sequence[Frame]) -> Frame:

@@ -10,33 +10,6 @@ import yaml
 from tpm_gym.learning import provenance
 from tpm_gym.learning.errors import ConfigError
 
-_TEXT = """---
-{front}---
-
-# {algorithm} on {env}
-
-Policy of [tpm_gym]({home}), trained for {steps:,} steps with {algorithm} (seed {seed}).
-The layers have {hidden} units. The files are safetensors and JSON, and load without pickle.
-
-```python
-import gymnasium as gym
-import tpm_gym
-
-env = gym.make("{env}"{options})
-policy = tpm_gym.load_policy("{name}.json")
-observation, info = env.reset(seed=0)
-action = policy.act(observation)
-```
-
-{episodes:,} episodes with seeds from {first} on, mean and 95% interval:
-
-| quantity | mean | low | high |
-| --- | --- | --- | --- |
-{rows}
-
-Command: `{command}`. Versions: {versions}.
-"""
-_HOME = "https://pypi.org/project/tpm-gym/"
 _ROWS = {
     "success_at_end": "success at the end",
     "return": "return",
@@ -98,9 +71,9 @@ def _text(name: str, content: Mapping[str, Any], tested: Mapping[str, Any]) -> s
         for key, label in _ROWS.items()
     )
     options = content.get("env_options", {})
-    return _TEXT.format(
+    template = Path(__file__).with_suffix(".md").read_text(encoding="utf-8")
+    return template.format(
         front=yaml.safe_dump(front, sort_keys=False),
-        home=_HOME,
         algorithm=content["algorithm"].upper(),
         env=content["env"],
         steps=content["steps"],

@@ -46,17 +46,16 @@ def version(package: str) -> str | None:
 
 
 def git_commit() -> str | None:
-    """Return the commit of the checkout that holds this file; None outside a checkout.
+    """Return the commit of the checkout that holds this file, or None.
 
     ``+modified`` is appended if tracked files differ from the commit.
     """
-    git = ["git", "-C", str(Path(__file__).parent)]
-    words = ["describe", "--always", "--abbrev=40", "--match=", "--dirty=+modified"]
+    words = ["git", "-C", str(Path(__file__).parent), "describe"]
+    words += ["--always", "--abbrev=40", "--match=", "--dirty=+modified"]
     try:
-        found = subprocess.run([*git, *words], capture_output=True, text=True, check=True)
+        return subprocess.run(words, capture_output=True, text=True, check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return None
-    return found.stdout.strip()
 
 
 def machine() -> dict[str, Any]:

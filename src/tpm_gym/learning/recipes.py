@@ -4,7 +4,8 @@ A file has one mapping for each environment id, in the style of rl-baselines3-zo
 arguments of the algorithm's constructor, plus ``n_timesteps``, ``n_envs``, ``policy``, and
 ``demonstrations``: episodes of the expert that are in the replay buffer before training starts.
 Values are plain YAML and nothing is evaluated. Where the zoo evaluates a string such as
-``"dict(net_arch=[64, 64])"``, a mapping is written here, which the zoo reads as well.
+``"dict(net_arch=[64, 64])"``, a mapping is written here, which the zoo reads as well. A file for
+several algorithms has such a mapping under the name of each: ``ppo``, ``sac``, ``tqc``.
 """
 
 import re
@@ -132,9 +133,9 @@ def read_recipe(path: Path, algorithm: str, env_id: str) -> Recipe:
             for file in RECIPES.glob(f"{algorithm}-*.yml")
             if name in read_recipes(file, algorithm)
         ]
-        there = f"there are {', '.join(recipes)}{''.join(elsewhere)}"
+        there = f"it has {', '.join(recipes) or 'none'}{''.join(elsewhere)}"
         own = "a file of yours with one is --recipe FILE"
-        raise ConfigError(f"{path}: no recipe for {name}; {there}; {own}")
+        raise ConfigError(f"{path}: no recipe of {algorithm} for {name}; {there}; {own}")
     arguments = dict(recipes[name])
     return Recipe(
         n_timesteps=arguments.pop("n_timesteps"),
@@ -155,6 +156,8 @@ def read_recipes(path: Path, algorithm: str) -> dict[str, dict[str, Any]]:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         raise ConfigError(f"{path}: is not YAML: {error}") from error
+    if isinstance(content, dict) and content and content.keys() <= ALGORITHMS.keys():
+        content = content.get(algorithm, {})
     check_recipes(str(path), content, algorithm)
     found: dict[str, dict[str, Any]] = content
     return found

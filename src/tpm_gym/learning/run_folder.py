@@ -24,7 +24,6 @@ CHECKPOINTS: Final = "checkpoints"
 TESTS: Final = "tests"
 BEST_FILE: Final = "best.zip"
 LAST_FILE: Final = "last.zip"
-EXPORTED: Final = (".json", ".safetensors")
 WHOLE: Final = "[!.]*.json"
 """Pattern of JSON files, without the hidden parts that a process leaves if it is killed."""
 
@@ -50,8 +49,8 @@ def prepare(run: Path, overwrite: bool) -> None:
         )
     if description(run) is None:
         raise RunError(
-            f"--overwrite would delete {run}, which holds no {CONFIG_FILE} of a training and so is "
-            "no earlier run; choose another folder with --run"
+            f"--overwrite would delete {run}, which holds no {CONFIG_FILE} of a training; choose "
+            "another folder with --run"
         )
     with claimed(run):
         clear(run)
@@ -72,8 +71,8 @@ def description(run: Path) -> dict[str, Any] | None:
 def resume_command(run: Path) -> str:
     """Return the command line that resumes a run.
 
-    The module of an id ``module:id`` is given again, since no file decides what is imported.
-    ``python -m`` finds it in the working folder.
+    No file decides what is imported, so an id ``module:id`` is given again. ``python -m`` finds its
+    module in the working folder.
     """
     env = str((description(run) or {}).get("env", ""))
     if ":" in env:
@@ -82,7 +81,7 @@ def resume_command(run: Path) -> str:
 
 
 def evaluations(run: Path) -> list[dict[str, Any]]:
-    """Return the evaluations of a run, without a last line that was cut off by a kill."""
+    """Return the evaluations of a run, without a last line that a kill cut off."""
     try:
         lines = (run / EVALUATIONS_FILE).read_text(encoding="utf-8").splitlines(keepends=True)
     except FileNotFoundError:
@@ -149,10 +148,7 @@ def claimed(run: Path) -> Iterator[None]:
 
 @contextmanager
 def disk_errors_named(run: Path, store: CheckpointStore) -> Iterator[None]:
-    """Replace errors of a full or broken disk by an error that says how to continue.
-
-    A training without its logs is of no use, so it ends. Only a checkpoint may fail.
-    """
+    """Raise an error of a full or broken disk as one that says how to continue."""
     try:
         yield
     except OSError as error:

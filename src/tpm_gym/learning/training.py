@@ -1,17 +1,16 @@
 """Training with Stable-Baselines3; everything about a run is in one folder.
 
-The run folder holds ``config.json`` (the full configuration, versions and seeds), ``progress.csv``
-and TensorBoard events, ``evaluations.jsonl``, ``checkpoints/``, ``best.zip`` (the policy with the
-best periodic evaluation) and ``last.zip``, both exported as safetensors, and at the end
-``learning_curve.png``. Ctrl-C stops at the end of a rollout, with a checkpoint; a second Ctrl-C
-stops at once.
+The folder holds ``config.json`` (configuration, versions, seeds), ``progress.csv`` and TensorBoard
+events, ``evaluations.jsonl``, ``checkpoints/``, ``best.zip`` (best periodic evaluation) and
+``last.zip``, both exported as safetensors, and at the end ``learning_curve.png``. Ctrl-C stops at
+the end of a rollout, with a checkpoint; a second Ctrl-C stops at once.
 """
 
 import json
 import signal
-from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, closing, contextmanager
-from dataclasses import asdict, fields, replace
+from collections.abc import Mapping
+from contextlib import ExitStack, closing
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from typing import Any
 
@@ -30,14 +29,8 @@ from tpm_gym.learning.algorithms import ALGORITHMS
 from tpm_gym.learning.checkpoint import CheckpointStore, Content
 from tpm_gym.learning.configuration import UNSET, ResumeConfig, TrainingConfig, complete, resumed
 from tpm_gym.learning.demonstrations import Demonstrations
-from tpm_gym.learning.environments import check_env_id, make_env, make_envs
-from tpm_gym.learning.errors import (
-    CheckpointError,
-    ConfigError,
-    DivergedError,
-    PolicyError,
-    RunError,
-)
+from tpm_gym.learning.environments import import_module_of, make_env, make_envs
+from tpm_gym.learning.errors import ConfigError, DivergedError, PolicyError, RunError
 from tpm_gym.learning.evaluation import EvaluationConfig, evaluate
 from tpm_gym.learning.rollout import BATCH, SELECTION_SEED
 from tpm_gym.learning.run_folder import CHECKPOINTS, CONFIG_FILE, CURVE_FILE, TESTS, is_finished
@@ -58,14 +51,19 @@ def train(config: TrainingConfig, console: Console | None = None) -> signal.Sign
         ConfigurationError: There is no such environment.
     """
     console = console or Console()
+    import_module_of(config.env)
+    with closing(make_env(**config.env_arguments)) as env:  # refused before all else
+        size = flatdim(env.observation_space)
     asked, config = config.steps, complete(config)
     asked = config.recipe.n_timesteps if asked is UNSET else asked
-    with closing(make_env(**_env_options(config))) as env:  # refused before anything is deleted
-        _require_room(config, flatdim(env.observation_space))
+    _require_room(config, size)
     run_folder.prepare(config.run, config.overwrite)
     if config.steps != asked:
-        whole = f"whole rollouts of {config.rollout:,} steps"
-        _say(console, f"note: {asked:,} steps were asked for, and rounded up to {whole}")
+        _say(
+            console,
+            f"note: {asked:,} steps were asked for, and rounded up to whole rollouts of "
+            f"{config.rollout:,} steps",
+        )
     if config.recipe.written_for != config.env.rpartition(":")[2]:
         other = config.recipe.written_for
         _say(console, f"note: the recipe is that of {other}; give your own with --recipe FILE")
@@ -80,7 +78,7 @@ def train(config: TrainingConfig, console: Console | None = None) -> signal.Sign
     }
     store = CheckpointStore(config.run / CHECKPOINTS)
     with run_folder.disk_errors_named(config.run, store), run_folder.claimed(config.run):
-        return _learn_and_test(config, console, store, description, None)
+        return _Session(config, console, store, description, None).run()
 
 
 def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signals | None:
@@ -106,8 +104,7 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
             return None
         content = store.load(lambda text: _say(console, f"warning: {text}"))
         if content:
-            with _foreign_files_named(content):
-                stored = dict(json.loads(content.files[CONFIG_FILE]))
+            stored = dict(json.loads(content.files[CONFIG_FILE]))
         elif stored is None:
             raise RunError(f"{run} holds no run of tpm_gym; start one with tpm-gym train")
         elif run_folder.holds_policy(run):
@@ -115,47 +112,129 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
                 f"{run} holds a policy, but no checkpoint to go on from, and beginning again would "
                 "replace it; train into another --run, or here with tpm-gym train --overwrite"
             )
-        step = content.step if content else 0
-        changed = resumed(config, stored, step)
-        resumption = {"from_step": step, **provenance.origin()}
+        changed = resumed(config, stored, content.step if content else 0)
+        resumption = {"from_step": content.step if content else 0, **provenance.origin()}
         changeable = [entry.name for entry in fields(ResumeConfig) if entry.name != "run"]
         description = {
             **stored,
             **{name: getattr(changed, name) for name in changeable},
             "resumed": [*stored.get("resumed", []), resumption],
         }
-        return _learn_and_test(changed, console, store, description, content)
+        return _Session(changed, console, store, description, content).run()
 
 
 def _say(console: Console, text: str) -> None:
     console.print(text, markup=False, soft_wrap=True)
 
 
-@contextmanager
-def _foreign_files_named(content: Content) -> Iterator[None]:
-    """Name a checkpoint that is whole and was not written by this training."""
-    try:
-        yield
-    except TPMError:
-        raise
-    except Exception as error:  # whatever PyTorch raises on a file that others have signed
-        raise CheckpointError(
-            f"the checkpoint of step {content.step:,} cannot be restored "
-            f"({type(error).__name__}), and was not written by this training; start the run anew "
-            "with --overwrite"
-        ) from error
+@dataclass(frozen=True)
+class _Session:
+    """Part of a run in this process, from the beginning or from the checkpoint ``content``."""
 
+    config: TrainingConfig
+    console: Console
+    store: CheckpointStore
+    description: Mapping[str, Any]
+    content: Content | None
 
-def _learn_and_test(
-    config: TrainingConfig,
-    console: Console,
-    store: CheckpointStore,
-    description: Mapping[str, Any],
-    content: Content | None,
-) -> signal.Signals | None:
-    """Learn; then test a policy of the analytic engine there and in PyBullet."""
-    stopped_by = _learn(config, console, store, description, content)
-    if stopped_by is None and config.env_options.in_batches and config.test_episodes:
+    def run(self) -> signal.Signals | None:
+        """Train, save and test; return the signal that stopped it, unless it came too late."""
+        config, listener = self.config, SignalListener()
+        torch.set_num_threads(config.threads)
+        count = min(config.eval_episodes, BATCH) if config.env_options.in_batches else 1
+        with ExitStack() as stack:
+            training_envs = stack.enter_context(closing(make_training_envs(config)))
+            envs = stack.enter_context(closing(make_envs(count=count, **config.env_arguments)))
+            bar = stack.enter_context(closing(callbacks.ProgressBar(self.console)))
+            model = make_model(config, training_envs)
+            restored = self._begin(model)
+            earlier = restored.get("evaluations", [])
+            keep = partial(self._keep, run_folder.BEST_FILE)
+            evaluation = callbacks.PeriodicEvaluation(config, envs, self.console, keep, earlier)
+            checkpointing = callbacks.Checkpointing(
+                config, self.store, evaluation, listener, self.console, restored
+            )
+            stack.callback(model.logger.close)
+            # Checkpointing sets the clock that the callbacks after it read.
+            called: list[BaseCallback] = [checkpointing, bar, evaluation]
+            if config.recipe.demonstrations:
+                called.insert(1, Demonstrations(**config.recipe.demonstrations))
+            with listener.listening():
+                stopped_by = self._learn(model, called, listener)
+                self._keep(run_folder.LAST_FILE, model)
+                if stopped_by is None:
+                    checkpointing.save(finished=True)
+        curve.draw_learning_curve(config.run / CURVE_FILE, config.title, evaluation.evaluations)
+        self._conclude(stopped_by)
+        return stopped_by
+
+    def _begin(self, model: BaseAlgorithm) -> dict[str, Any]:
+        """Set model, files and logs to the beginning or the checkpoint; return its extra data."""
+        config, content, extra = self.config, self.content, {}
+        if content is None:
+            run_folder.clear(config.run)
+        else:  # files change only once the checkpoint is restored
+            extra = training_state.restore(model, content)
+            training_state.restore_files(config.run, content)
+        provenance.write_json(config.run / CONFIG_FILE, self.description)
+        start = f"from step {content.step if content else 0:,} to "
+        start = start if "resumed" in self.description else ""
+        _say(self.console, f"{config.title}, {start}{config.steps:,} steps, in {config.run}")
+        model.set_logger(training_state.make_logger(config.run, content))
+        return extra
+
+    def _learn(
+        self, model: BaseAlgorithm, called: list[BaseCallback], listener: SignalListener
+    ) -> signal.Signals | None:
+        """Take the steps that are left; return the signal that stopped it."""
+        steps = self.config.steps - model.num_timesteps
+        try:
+            model.learn(steps, callback=called, reset_num_timesteps=self.content is None)
+        except callbacks.StopTrainingError:
+            return listener.received
+        except (TPMError, ValueError) as error:
+            # PyTorch refuses NaN in a distribution, environments refuse it in an action.
+            if all(bool(values.isfinite().all()) for values in model.policy.parameters()):
+                raise
+            raise DivergedError(
+                f"the training diverged before step {model.num_timesteps:,}: its networks are no "
+                f"longer finite; lower learning_rate in {self.config.recipe_file} and train again "
+                "with --overwrite"
+            ) from error
+        return None
+
+    def _keep(self, name: str, model: BaseAlgorithm) -> None:
+        """Save a policy in the run folder, and export it."""
+        config = self.config
+        archive = config.run / name
+        path = archive.with_suffix("")
+        recipe, options = asdict(config.recipe), config.env_options.given()
+        try:
+            export.save(
+                model, path, env_id=config.env, seed=config.seed, recipe=recipe, env_options=options
+            )
+        except PolicyError as error:
+            export.remove(path)
+            _say(self.console, f"warning: not exported: {error}")
+        export.save_archive(model, archive)
+
+    def _conclude(self, stopped_by: signal.Signals | None) -> None:
+        """Say how the training ended, and test a policy of the analytic engine."""
+        config = self.config
+        if stopped_by is not None:
+            command, saved = run_folder.resume_command(config.run), "without a checkpoint"
+            if self.store.newest is not None:
+                saved = f"saved at step {self.store.newest:,}; continue with: {command}"
+            _say(self.console, f"stopped early by {stopped_by.name}, {saved}")
+            return
+        _say(self.console, f"finished: {config.run}")
+        if config.env_options.in_batches and config.test_episodes:
+            self._test()
+
+    def _test(self) -> None:
+        """Test the best policy in the analytic engine and in PyBullet."""
+        config = self.config
+        _say(self.console, f"testing {config.test_episodes} held-out episodes in each engine ...")
         rates = []
         for engine in ("analytic", "pybullet"):
             test = EvaluationConfig(
@@ -164,106 +243,14 @@ def _learn_and_test(
                 episodes=config.test_episodes,
                 goals=config.goals,
                 penalty_weight=config.penalty_weight,
+                randomisation=config.randomisation,
                 env_options=replace(config.env_options, engine=engine),
                 json=config.run / TESTS / f"{engine}.json",
             )
             (result,) = evaluate(test, Console(quiet=True))
             rate = result.metrics["success_at_end"]
             rates.append(f"{rate.mean:.1%} [{rate.low:.1%}, {rate.high:.1%}]")
-        shown = ", ".join(rates)
-        _say(console, f"success in the analytic engine and PyBullet, held-out episodes: {shown}")
-    return stopped_by
-
-
-def _learn(
-    config: TrainingConfig,
-    console: Console,
-    store: CheckpointStore,
-    description: Mapping[str, Any],
-    content: Content | None,
-) -> signal.Signals | None:
-    """Build everything, learn from the beginning or from a checkpoint, and save.
-
-    Return the signal that stopped it; one that came too late is not returned.
-    """
-    torch.set_num_threads(config.threads)
-    bar, listener = callbacks.ProgressBar(console), SignalListener()
-    with ExitStack() as stack:
-        training_envs = make_training_envs(config)
-        stack.callback(training_envs.close)
-        count = min(config.eval_episodes, BATCH) if config.env_options.in_batches else 1
-        evaluation_envs = make_envs(count=count, **_env_options(config))
-        stack.callback(evaluation_envs.close)
-        stack.callback(bar.close)
-        model = make_model(config, training_envs)
-        keep = partial(_keep, config, console, run_folder.BEST_FILE)
-        evaluation = callbacks.PeriodicEvaluation(config, evaluation_envs, console, keep)
-        log: dict[str, Any] = {}
-        seconds, step = 0.0, 0
-        # Files change only once the checkpoint is restored.
-        if content:
-            with _foreign_files_named(content):
-                log, extra = training_state.restore(model, content)
-                evaluation.evaluations, seconds = extra["evaluations"], float(extra["seconds"])
-            step = content.step
-            training_state.restore_files(config.run, content)
-        else:
-            run_folder.clear(config.run)
-        provenance.write_json(config.run / CONFIG_FILE, description)
-        way = f"from step {step:,} to {config.steps:,}" if "resumed" in description else ""
-        _say(console, f"{config.title}, {way or f'{config.steps:,} steps'}, in {config.run}")
-        logger = training_state.make_logger(config.run, step if content else None)
-        stack.callback(logger.close)
-        model.set_logger(logger)
-        training_state.restore_log(logger, log)
-        checkpointing = callbacks.Checkpointing(
-            config, store, evaluation, listener, console, seconds
-        )
-        # Checkpointing sets the clock that the callbacks after it read.
-        called: list[BaseCallback] = [checkpointing, bar, evaluation]
-        if config.recipe.demonstrations:
-            called.insert(1, Demonstrations(**config.recipe.demonstrations))
-        stack.enter_context(listener.listening())
-        stopped_by = None
-        try:
-            steps = config.steps - model.num_timesteps
-            model.learn(steps, callback=called, reset_num_timesteps=content is None)
-        except callbacks.StopTrainingError:
-            stopped_by = listener.received
-        except (TPMError, ValueError) as error:
-            # PyTorch refuses NaN in a distribution, environments refuse it in an action.
-            if all(bool(values.isfinite().all()) for values in model.policy.parameters()):
-                raise
-            raise DivergedError(
-                f"the training diverged before step {model.num_timesteps:,}: its networks are no "
-                f"longer finite; lower learning_rate in {config.recipe_file} and train again with "
-                "--overwrite"
-            ) from error
-        _keep(config, console, run_folder.LAST_FILE, model)
-        if stopped_by is None:
-            checkpointing.save(finished=True)
-    curve.draw_learning_curve(config.run / CURVE_FILE, config.title, evaluation.evaluations)
-    command, saved = run_folder.resume_command(config.run), "without a checkpoint"
-    if store.newest is not None:
-        saved = f"saved at step {store.newest:,}; continue with: {command}"
-    stopped = f"stopped early by {stopped_by.name}, {saved}" if stopped_by else ""
-    _say(console, stopped or f"finished: {config.run}")
-    return stopped_by
-
-
-def _keep(config: TrainingConfig, console: Console, name: str, model: BaseAlgorithm) -> None:
-    """Save a policy in the run folder, and export it."""
-    archive = config.run / name
-    path = archive.with_suffix("")
-    recipe, options = asdict(config.recipe), config.env_options.given()
-    try:
-        export.save(
-            model, path, env_id=config.env, seed=config.seed, recipe=recipe, env_options=options
-        )
-    except PolicyError as error:
-        export.remove(path)
-        _say(console, f"warning: not exported: {error}")
-    export.save_archive(model, archive)
+        _say(self.console, f"success in the analytic engine and PyBullet: {', '.join(rates)}")
 
 
 def make_model(config: TrainingConfig, envs: VecEnv) -> BaseAlgorithm:
@@ -288,7 +275,7 @@ def make_training_envs(config: TrainingConfig) -> VecEnv:
     several = config.envs > 1
     if several and config.env_options.in_batches:
         # Episodes that end one by one make the batches of an on-policy algorithm even.
-        options = {**_env_options(config), "autoreset_mode": "SameStep", "stagger": True}
+        options = {**config.env_arguments, "autoreset_mode": "SameStep", "stagger": True}
         envs = AnalyticVecEnv(make_envs(count=config.envs, **options))
         envs.seed(config.seed)
         return envs
@@ -297,14 +284,6 @@ def make_training_envs(config: TrainingConfig) -> VecEnv:
         n_envs=config.envs,
         seed=config.seed,
         wrapper_class=training_state.EpisodeRecorder,
-        env_kwargs={**_env_options(config), "in_worker": several},
+        env_kwargs={**config.env_arguments, "in_worker": several},
         vec_env_cls=SubprocVecEnv if several else DummyVecEnv,
     )
-
-
-def _env_options(config: TrainingConfig) -> dict[str, Any]:
-    """Return the environment of training and evaluations, as arguments of :func:`make_env`."""
-    # A worker process must import the id's module, and may not have the id registered.
-    env = config.env if ":" in config.env else check_env_id(config.env)
-    chosen = {"penalty_weight": config.penalty_weight, "goals": config.goals}
-    return {"env": env, **chosen, **config.env_options.given()}

@@ -30,12 +30,12 @@ from tensorboard.compat.proto.event_pb2 import (  # type: ignore[import-untyped]
 )
 
 from tpm_gym import TPMError
-from tpm_gym.learning.checkpoint import STATE, TENSORS, Content
+from tpm_gym.learning.checkpoint import STATE, TENSORS, Content, starting
 from tpm_gym.learning.errors import CheckpointError
 from tpm_gym.learning.provenance import versions, write_whole
 from tpm_gym.learning.rollout import Action, GoalEnv, Observation
 from tpm_gym.learning.run_folder import LAST, LAST_FILE, PROGRESS_FILE, RESTORED, clear_tests
-from tpm_gym.learning.vec_env import AnalyticVecEnv, starting
+from tpm_gym.learning.vec_env import AnalyticVecEnv
 
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining")
 _PER_KEY = ("observations", "next_observations")
@@ -104,7 +104,7 @@ def capture(
     state = {
         "counters": {name: getattr(model, name) for name in _COUNTERS},
         "statistics": [list(model.ep_info_buffer or ()), list(model.ep_success_buffer or ())],
-        "log": _pending_log(model),
+        "log": [model.logger.name_to_count, model.logger.name_to_excluded],
         "rng": _rng_state(model),
         "episodes": episodes,
         "versions": versions(),
@@ -119,6 +119,8 @@ def capture(
     arrays["episode_starts"] = np.array(model._last_episode_starts)
     arrays |= {f"envs/{name}": values for name, values in columns.items()}
     arrays |= {f"buffer/{name}": array for name, array in _buffer_arrays(model).items()}
+    # Values that are not yet written to the log; arrays keep their types.
+    arrays |= {f"log/{k}": np.asarray(value) for k, value in model.logger.name_to_value.items()}
     return Content(model.num_timesteps, finished, files, arrays)
 
 
@@ -132,11 +134,11 @@ def restore_files(run: Path, content: Content) -> None:
             (run / name).unlink(missing_ok=True)
 
 
-def restore(model: BaseAlgorithm, content: Content) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Restore a training in a new algorithm, built with the same arguments.
+def restore(model: BaseAlgorithm, content: Content) -> dict[str, Any]:
+    """Restore a training in a new algorithm, built with equal arguments.
 
     Returns:
-        The state for :func:`restore_log`, and the ``extra`` of :func:`capture`.
+        The ``extra`` of :func:`capture`.
     """
     state = json.loads(content.files[STATE])
     for name, value in state["counters"].items():
@@ -150,7 +152,8 @@ def restore(model: BaseAlgorithm, content: Content) -> tuple[dict[str, Any], dic
     # The generators last, since the lines above may draw
     _restore_tensors(model, content.files[TENSORS])
     _restore_rng(model, state["rng"])
-    return state["log"], state["extra"]
+    extra: dict[str, Any] = state["extra"]
+    return extra
 
 
 def _tensors(model: BaseAlgorithm) -> bytes:
@@ -242,40 +245,24 @@ def _restore_episodes(
     model._last_obs, model._last_episode_starts = last, arrays["episode_starts"]
 
 
-def _pending_log(model: BaseAlgorithm) -> dict[str, Any]:
-    """Return the values that are not yet written to the log."""
-    logger = model.logger
-    values = dict(logger.name_to_value)
-    return {
-        "values": values,
-        # A float32 is printed with fewer digits.
-        "types": {k: v.dtype.str for k, v in values.items() if isinstance(v, np.generic)},
-        "counts": dict(logger.name_to_count),
-        "excluded": dict(logger.name_to_excluded),
-    }
-
-
-def restore_log(logger: Logger, state: Mapping[str, Any]) -> None:
-    """Restore the values that were not yet written to the log; an empty state has none."""
-    for name, value in state.get("values", {}).items():
-        dtype = state["types"].get(name)
-        logger.name_to_value[name] = np.dtype(dtype).type(value) if dtype else value
-        logger.name_to_excluded[name] = tuple(state["excluded"][name])
-    logger.name_to_count.update(state.get("counts", {}))
-
-
-def make_logger(run: Path, resumed_at: int | None = None) -> Logger:
-    """Open the log of a run; ``resumed_at`` is the step to which progress.csv was set back."""
+def make_logger(run: Path, content: Content | None = None) -> Logger:
+    """Open the log of a run, as it was at a checkpoint."""
     path = run / PROGRESS_FILE
-    before = "" if resumed_at is None or not path.is_file() else path.read_text(encoding="utf-8")
+    before = "" if content is None or not path.is_file() else path.read_text(encoding="utf-8")
     table = CSVOutputFormat(str(path))  # empties the file
     table.file.write(before)
     table.file.flush()
     table.keys = before.split("\n", 1)[0].split(",") if before else []
     events = TensorBoardOutputFormat(str(run))
-    if resumed_at is not None:
+    logger = Logger(str(run), [table, events])
+    if content is not None:
         # TensorBoard then hides events that an earlier process logged after this step.
-        start = Event(step=resumed_at + 1, session_log=SessionLog(status=SessionLog.START))
+        start = Event(step=content.step + 1, session_log=SessionLog(status=SessionLog.START))
         writer: Any = events.writer
         writer._get_file_writer().add_event(start)
-    return Logger(str(run), [table, events])
+        counts, excluded = json.loads(content.files[STATE])["log"]
+        pending: Any = logger.name_to_value
+        pending |= {k: value[()] for k, value in starting(content.arrays, "log/").items()}
+        logger.name_to_count.update(counts)
+        logger.name_to_excluded.update({name: tuple(kinds) for name, kinds in excluded.items()})
+    return logger

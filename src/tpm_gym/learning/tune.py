@@ -8,22 +8,34 @@ return decides between equal successes.
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from statistics import fmean
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
+import tyro
 import yaml
 
 from tpm_gym.errors import MissingPackageError
 from tpm_gym.learning import provenance
 from tpm_gym.learning.algorithms import ALGORITHMS
-from tpm_gym.learning.configuration import TrainingConfig, TuneConfig, check_least, complete
+from tpm_gym.learning.configuration import (
+    UNSET,
+    EnvOptions,
+    Randomised,
+    TrainingConfig,
+    check_least,
+    complete,
+    unset,
+)
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.run_folder import evaluations
 
 RECIPE_FILE: Final = "recipe.yml"
 """File of the best recipe in the folder of a search; give it to ``train --recipe``."""
+
+_SHARED: Final = ("algo", "env", "steps", "env_options", "randomisation")  # with TrainingConfig
 
 _SPACE: Final[Mapping[str, Sequence[float]]] = {
     "learning_rate": (0.0003, 0.0006, 0.001, 0.002, 0.003),
@@ -42,6 +54,37 @@ A learning rate of the recipe that falls to zero falls in the variants too.
 """
 
 
+@dataclass(frozen=True)
+class TuneConfig:
+    """Search for a recipe: many trainings with other hyperparameters, several at a time."""
+
+    algo: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(ALGORITHMS) + "}")] = "ppo"
+    """Algorithm."""
+
+    env: Annotated[str, tyro.conf.arg(metavar="ID")] = "TPMReachDense-v0"
+    """Environment id, or module:id if a module of yours registers it."""
+
+    trials: int = 30
+    """Number of trainings."""
+
+    steps: Annotated[int, unset(int, "as the recipe says", "INT")] = UNSET
+    """Steps of each training."""
+
+    jobs: Annotated[int, unset(int, "one for each core", "INT")] = UNSET
+    """Trainings at a time, on this machine or on the Ray cluster that RAY_ADDRESS names."""
+
+    seed: int = 0
+    """Seed of the search; training i has this seed + i."""
+
+    folder: Annotated[Path, unset(Path, "runs/tune-<env>-<algo>", "FOLDER")] = UNSET
+    """New folder for the runs, their logs and the best recipe."""
+
+    env_options: tyro.conf.OmitArgPrefixes[EnvOptions] = field(default_factory=EnvOptions)
+
+    randomisation: Randomised = ()
+    """Domain randomisation, as in train."""
+
+
 def tune(config: TuneConfig) -> Path:
     """Run a search and write the best recipe; Ray Tune prints a table while it runs.
 
@@ -58,21 +101,14 @@ def tune(config: TuneConfig) -> Path:
     folder = config.folder or Path("runs", f"tune-{name}-{config.algo}")
     if folder.exists():
         raise ConfigError(f"--folder {folder}: exists; give another")
-    base = complete(
-        TrainingConfig(
-            algo=config.algo,
-            env=config.env,
-            steps=config.steps,
-            env_options=config.env_options,
-            test_episodes=0,
-        )
-    )
+    shared = {name: getattr(config, name) for name in _SHARED}
+    base = complete(TrainingConfig(**shared, test_episodes=0))
     provenance.require_writable("--folder", folder)
+    print(f"{config.trials} trainings of {base.steps:,} steps; their logs: {folder}/NNN.log")
+    print("starting Ray, which takes some seconds ...", flush=True)
     best = _search(config, base, folder.resolve())
-    recipe = folder / RECIPE_FILE
-    text = yaml.safe_dump({name: _entries(base, best)}, sort_keys=False)
-    provenance.write_whole(recipe, lambda part: part.write_text(text, encoding="utf-8"))
-    return recipe
+    _write(folder / RECIPE_FILE, base, best)
+    return folder / RECIPE_FILE
 
 
 def _search(config: TuneConfig, base: TrainingConfig, folder: Path) -> Mapping[str, Any]:
@@ -100,7 +136,7 @@ def _search(config: TuneConfig, base: TrainingConfig, folder: Path) -> Mapping[s
     storage = ray_tune.RunConfig(name="ray", storage_path=str(folder), verbose=1)
     results: Any = ray_tune.Tuner(trainable, tune_config=settings, run_config=storage).fit()
     if not (ended := [result for result in results if result.error is None]):
-        raise ConfigError(f"--folder {folder}: no training ended; read {folder}/000.log")
+        raise ConfigError(f"--folder {folder}: no training ended; see {folder}/000.log")
     best: Mapping[str, Any] = max(ended, key=lambda result: result.metrics["score"]).config
     return best
 
@@ -121,11 +157,11 @@ def _train(
     """Train a variant of the recipe in the folder ``here``, and return its score."""
     number = changes["trial"]
     run, recipe, log = (folder / f"{number:03d}{end}" for end in ("", ".yml", ".log"))
-    name = base.env.rpartition(":")[2]
-    recipe.write_text(yaml.safe_dump({name: _entries(base, changes)}), encoding="utf-8")
+    _write(recipe, base, changes)
     options = {"algo": base.algo, "env": base.env, "steps": base.steps, "seed": seed + number}
     options |= {"recipe": recipe, "run": run, "test-episodes": 0, **base.env_options.given()}
     words = [word for key, value in options.items() for word in (f"--{key}", str(value))]
+    words += ["--randomisation", *base.randomisation] if base.randomisation else []
     # In a process of its own: Ray Tune calls this in a thread, which cannot receive signals.
     with log.open("w", encoding="utf-8") as file:
         command = [sys.executable, "-m", "tpm_gym.learning", "train", *words]
@@ -134,10 +170,10 @@ def _train(
     return fmean(e["success_at_end"]["mean"] + e["return"]["mean"] / 1000 for e in last)
 
 
-def _entries(base: TrainingConfig, changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the entries of the recipe with the changes of a trial."""
+def _write(file: Path, base: TrainingConfig, changes: Mapping[str, Any]) -> None:
+    """Write the recipe with the changes of a trial."""
     entries = {**base.recipe.entries(), "n_timesteps": base.steps}
-    policy = dict(entries.pop("policy_kwargs", {}))
+    policy = entries["policy_kwargs"] = dict(entries.get("policy_kwargs", {}))
     for name, value in changes.items():
         if name.startswith("policy_kwargs."):
             policy[name.partition(".")[2]] = value
@@ -145,4 +181,5 @@ def _entries(base: TrainingConfig, changes: Mapping[str, Any]) -> dict[str, Any]
             entries[name] = f"lin_{value}"
         elif name != "trial":
             entries[name] = value
-    return {**entries, "policy_kwargs": policy}
+    text = yaml.safe_dump({base.env.rpartition(":")[2]: entries}, sort_keys=False)
+    provenance.write_whole(file, lambda part: part.write_text(text, encoding="utf-8"))

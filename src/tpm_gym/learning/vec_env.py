@@ -14,11 +14,10 @@ from stable_baselines3.common.vec_env import VecEnv
 from tpm_gym.envs.core import EnvSnapshot
 from tpm_gym.envs.vector import TPMVectorEnv
 from tpm_gym.errors import ConfigurationError
+from tpm_gym.learning.checkpoint import starting
 from tpm_gym.learning.rollout import Observation
 from tpm_gym.simulation.randomisation import NOMINAL, Plant
 from tpm_gym.simulation.simulation import Snapshot
-
-__all__ = ["AnalyticVecEnv"]
 
 _ENVS, _SIMULATION, _ENGINE = "envs/", "simulation/", "engine/"  # prefixes of arrays in a state
 
@@ -119,11 +118,6 @@ class AnalyticVecEnv(VecEnv):
         self._returns, self._lengths = arrays["returns"].copy(), arrays["lengths"].copy()
         moment = Snapshot(plants, simulation, engine)
         return self.envs.restore_state([EnvSnapshot(self.envs.kind, moment, plain["rngs"], envs)])
-
-
-def starting(arrays: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
-    """Return the arrays with a prefix, under their names without it."""
-    return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
 
 
 def _plant(entries: dict[str, Any]) -> Plant:

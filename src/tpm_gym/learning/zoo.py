@@ -16,25 +16,15 @@ from tpm_gym.learning.recipes import read_recipes, recipe_file, with_classes
 
 def hyperparameters(algorithm: str) -> dict[str, dict[str, Any]]:
     """Return the recipes of one algorithm by environment id, in the zoo's form."""
-    recipes = read_recipes(recipe_file(algorithm), algorithm)
-    return {env_id: _translate(entries) for env_id, entries in recipes.items()}
+    found = {}
+    for env_id, entries in read_recipes(recipe_file(algorithm), algorithm).items():
+        found[env_id] = with_classes(entries)
+        if arguments := found[env_id].pop("demonstrations", None):
+            callback = "tpm_gym.learning.demonstrations.Demonstrations"
+            found[env_id]["callback"] = [{callback: dict(arguments)}]
+    return found
 
 
-def _translate(entries: dict[str, Any]) -> dict[str, Any]:
-    """Replace names by classes, and demonstrations by a callback."""
-    translated = with_classes(entries)
-    if "demonstrations" in translated:
-        arguments = translated.pop("demonstrations")
-        callback = "tpm_gym.learning.demonstrations.Demonstrations"
-        translated["callback"] = [{callback: dict(arguments)}]
-    return translated
-
-
-def _algorithm(command_line: list[str]) -> str:
-    """Return the value of ``--algo``, or the zoo's default."""
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--algo", default="ppo")
-    return str(parser.parse_known_args(command_line)[0].algo)
-
-
-hyperparams = hyperparameters(_algorithm(sys.argv))
+_parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+_parser.add_argument("--algo", default="ppo")  # the zoo's default
+hyperparams = hyperparameters(_parser.parse_known_args(sys.argv)[0].algo)
