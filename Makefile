@@ -52,8 +52,7 @@ docs: $(INSTALLED) ## build the documentation in build/docs/html; warnings are e
 	$(RUN) -m sphinx -E -W --keep-going --nitpicky -b html docs build/docs/html
 
 urdf: $(INSTALLED) ## regenerate urdf/ from the mechanism
-	$(RUN) -m tpm_gym.mechanism.urdf urdf
-	$(RUN) -m tpm_gym.mechanism.mjcf urdf
+	$(RUN) -m tpm_gym.mechanism.export urdf
 
 pictures: $(INSTALLED) ## redraw the README's pictures
 	$(RUN) docs/draw_pictures.py

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.patheffects import withStroke
+from numpy.typing import ArrayLike
 
 from figures.postures import STROKES
 from figures.sections import MM, heading, outline_task_region, section_axes
@@ -21,8 +22,8 @@ from tpm_gym.kinematics import (
     forward_rotated,
     inverse_all,
 )
-from tpm_gym.kinematics.geometry import PAPER
-from tpm_gym.kinematics.rotated import inverse_rotated, link3_rotated, transition
+from tpm_gym.kinematics.geometry import PAPER, Geometry
+from tpm_gym.kinematics.rotated import inverse_rotated, link3_rotated
 from tpm_gym.learning import figure_style as style
 from tpm_gym.learning.figure_style import BLACK, BLUE, OUTLINE, PURPLE, VERMILLION
 from tpm_gym.mechanism import PAPER_TPM
@@ -30,6 +31,22 @@ from tpm_gym.mechanism import PAPER_TPM
 THETA = np.deg2rad([90.0, 180.0, 100.0])  # of the drawn postures, and of the path
 HEIGHT = 0.025  # m, value of y of the section
 _HALO = withStroke(linewidth=2.5, foreground="white")  # names stay readable where rods cross
+
+
+@np.errstate(all="ignore")
+def transition(
+    theta_1: ArrayLike, beta: ArrayLike, side: ArrayLike = -1, geometry: Geometry = PAPER
+) -> FloatArray:
+    """Compute points P (..., 3) m of the surface on which both modes meet.
+
+    Angles (...,) rad and ``side`` (...,), the sign of xC, broadcast. The surface is a curve of C1,
+    on which rods 4a and 4b are level in x, swept by link 7. NaN where rods 4 do not reach y = 0;
+    that arms 2 and 3 reach is not checked.
+    """
+    g, (one, turn) = geometry, (np.asarray(theta_1), np.asarray(beta))
+    x_c = np.asarray(side) * np.sqrt(g.l4**2 - (g.l1 + g.l3 * np.cos(one)) ** 2)
+    x, y = x_c + g.l7 * np.cos(turn) + g.l2, g.l7 * np.sin(turn)
+    return np.stack(np.broadcast_arrays(x, y, g.l3 * np.sin(one) + 2 * g.l6), axis=-1)
 
 
 def level_posture(theta: FloatArray) -> RotatedPostures:

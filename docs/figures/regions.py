@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from clearance import clear_of_links
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
@@ -12,7 +13,7 @@ from matplotlib.patches import Patch
 from figures.sections import MM, heading, mode_name, outline_task_region, section_axes
 from figures.zero_sets import Section, parallel_lines, reach_margin, sheets
 from tpm_gym.analysis.aspects import Aspect, aspects
-from tpm_gym.analysis.limits import clear_of_links, within_stops
+from tpm_gym.analysis.limits import within_stops
 from tpm_gym.arrays import FloatArray
 from tpm_gym.kinematics import ELBOWS_OUT, inverse_all
 from tpm_gym.kinematics.geometry import PAPER

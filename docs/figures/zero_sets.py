@@ -146,7 +146,7 @@ def parallel_lines(
 def sheets(points: FloatArray, mode: WorkingMode) -> FloatArray:
     """Return the factors that change sign inside the workspace, (..., 4): det A and elevation."""
     found = factors_at(points, mode)
-    return np.concatenate([found.parallel, found.constraint[..., None]], axis=-1)
+    return np.stack([*found[:3], found.elevation], axis=-1)
 
 
 def serial_lines(

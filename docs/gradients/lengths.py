@@ -70,7 +70,7 @@ def room(design: Tensor) -> Tensor:
     size = high - low
     points = low + nodes(_NODES) * size
     conditioning = conditioning_at(points, geometry=lengths)
-    elevation = factors_at(points, geometry=lengths).constraint  # NaN where P cannot be
+    elevation = factors_at(points, geometry=lengths).elevation  # NaN where P cannot be
     # Link 3' reaches farthest to -x at the box's smallest x and y
     reach7 = torch.sqrt(torch.clip(lengths.l7**2 - low[1] ** 2, min=0.0))
     c2 = low[0] - lengths.l2 - reach7 - 2 * lengths.l5

@@ -1,4 +1,4 @@
-"""The formulas of decoupling are derivatives and inverses, and their zeros are exact."""
+"""The formulas of decoupling are derivatives, and their zeros are exact."""
 
 import re
 from typing import Any
@@ -15,8 +15,6 @@ from torch.autograd.functional import jacobian as derivatives
 from tpm_gym.analysis.decoupling import (
     LINKS,
     PLATFORM,
-    inverse_link_velocity,
-    inverse_velocity,
     link_velocity,
     motors,
     over,
@@ -38,7 +36,7 @@ def regular(branch: AssemblyMode, seed: int, g: Geometry) -> FloatArray:
 
 
 @examples(20, oracle.geometries(), oracle.seeds())
-def test_the_formulas_are_derivatives_and_inverses_with_these_zeros(g: Geometry, seed: int) -> None:
+def test_the_formulas_are_derivatives_with_these_zeros(g: Geometry, seed: int) -> None:
     for branch in ASSEMBLY_MODES:
         theta, slot = regular(branch, seed, g), branch.index
 
@@ -47,18 +45,12 @@ def test_the_formulas_are_derivatives_and_inverses_with_these_zeros(g: Geometry,
             turned = g.l7 * found.beta[:, slot, None]
             return torch.cat([found.link3[:, slot], turned], dim=-1).sum(0)
 
-        found, back = link_velocity(theta, branch, g), inverse_link_velocity(theta, branch, g)
+        found = link_velocity(theta, branch, g)
         slopes = derivatives(links, torch.tensor(theta)).permute(1, 0, 2).numpy()
         np.testing.assert_allclose(found, slopes, rtol=1e-8, atol=1e-9)
-        for one, other in (
-            (found, back),
-            (jacobian.velocity(theta, branch, g), inverse_velocity(theta, branch, g)),
-        ):
-            np.testing.assert_allclose(
-                one @ other, np.broadcast_to(np.eye(3), one.shape), atol=1e-9
-            )
         assert not found[:, ~LINKS].any()
-        assert not back[:, ~LINKS].any()
+        back = np.linalg.inv(found)
+        assert (np.abs(back[:, ~LINKS]) <= 1e-12 * np.abs(back).max(axis=(1, 2))[:, None]).all()
         assert not jacobian.velocity(theta, branch, g)[:, ~PLATFORM].any()
 
 
@@ -68,9 +60,9 @@ def test_nowhere_else_is_a_zero_by_structure() -> None:
     assert len(theta) > 100
     for matrix, pattern in (
         (link_velocity(theta, branch), LINKS),
-        (inverse_link_velocity(theta, branch), LINKS),
+        (np.linalg.inv(link_velocity(theta, branch)), LINKS),
         (jacobian.velocity(theta, branch), PLATFORM),
-        (inverse_velocity(theta, branch), np.ones((3, 3), dtype=bool)),
+        (np.linalg.inv(jacobian.velocity(theta, branch)), np.ones((3, 3), dtype=bool)),
     ):
         assert (np.median(np.abs(matrix), axis=0)[pattern] > 1e-2).all()
 
@@ -82,7 +74,7 @@ def test_motor_3_moves_p_along_the_circle_of_link_7() -> None:
     tangent = oracle.vector(-np.sin(beta), np.cos(beta), 0.0)
     assert np.abs(np.cross(column, tangent)).max() < 1e-12
     # Motors 1 and 2 do not turn for a motion along the tangent.
-    rates = (inverse_velocity(theta) @ tangent[..., None])[..., 0]
+    rates = (np.linalg.inv(jacobian.velocity(theta)) @ tangent[..., None])[..., 0]
     assert np.abs(rates[:, :2]).max() < 1e-12
     assert np.abs(rates[:, 2]).min() > 0.05
 
@@ -145,10 +137,7 @@ def test_what_has_no_answer_raises() -> None:
             over(region)
     with pytest.raises(SingularityError):
         over(Region((0, 0, 0.8), (0, 0, 0.8)))
-    for function in (link_velocity, inverse_link_velocity, inverse_velocity):
-        with pytest.raises(UnreachableError):
-            function([0.0, 0.0, np.pi])
-    with pytest.raises(SingularityError):
-        inverse_velocity(inverse([-0.04, PAPER.l7, 0.80]))  # cos(beta) = 0
+    with pytest.raises(UnreachableError):
+        link_velocity([0.0, 0.0, np.pi])
     with pytest.raises(InputError):
         shares([[1.0, 2.0]])

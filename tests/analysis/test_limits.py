@@ -7,10 +7,11 @@ import mujoco
 import numpy as np
 import oracle
 import pytest
+from clearance import clear_of_links, clearance
 from paths import ROOT
 
 from tpm_gym.analysis import aspects
-from tpm_gym.analysis.limits import clear_of_links, clearance, within_stops
+from tpm_gym.analysis.limits import within_stops
 from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import JointLimitError
 from tpm_gym.kinematics import ASSEMBLY_MODES, ELBOWS_OUT, WORKING_MODES, inverse, workspace
@@ -113,9 +114,9 @@ def test_task_regions_are_within_all_limits() -> None:
 
 
 def test_limits_leave_parts_of_sets_and_of_aspects() -> None:
-    whole = aspects.reachable_set(shape=COARSE).cells
+    whole = aspects.reachable_set(shape=COARSE)
     left = [
-        aspects.reachable_set(shape=COARSE, limits=limits).cells
+        aspects.reachable_set(shape=COARSE, limits=limits)
         for limits in ((within_stops,), (clear_of_links,), (within_stops, clear_of_links))
     ]
     np.testing.assert_array_equal(left[2].mask, left[0].mask & left[1].mask)

@@ -3,6 +3,7 @@
 import numpy as np
 import oracle
 import pytest
+from figures.modes import transition
 from paths import ROOT
 
 from tpm_gym.analysis.topology import mobility, mobility_at
@@ -19,7 +20,7 @@ from tpm_gym.kinematics import (
 )
 from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
 from tpm_gym.mechanism import PAPER_TPM, TPM, WIDE_TPM
-from tpm_gym.mechanism.tree import rotated_joint_angles
+from tpm_gym.mechanism.tree import build, rotated_joint_angles
 
 PAGE = ROOT / "docs" / "operation-modes.md"
 
@@ -27,7 +28,7 @@ PAGE = ROOT / "docs" / "operation-modes.md"
 def on_the_surface(side: int) -> tuple[FloatArray, FloatArray]:
     """Return points P on which both modes meet, and angles of postures there."""
     theta_1, beta = np.meshgrid(np.linspace(0.4, 1.4, 11), np.linspace(0.3, 2.8, 7))
-    points = rotated.transition(theta_1, beta, side)
+    points = transition(theta_1, beta, side)
     found = inverse_all(points)
     turned = np.abs(np.exp(1j * found.theta[..., 0]) - np.exp(1j * theta_1[..., None])) < 1e-9
     folded = np.sign(np.cos(found.beta)) == np.sign(np.cos(beta))[..., None]
@@ -46,7 +47,7 @@ def test_both_modes_meet_on_the_surface(side: int) -> None:
         assert apart[row, best].max() < near
         if near > 1e-9:
             assert np.abs(found.tilt[row, best]).max() < 1e-7
-            assert np.abs(rotated.factors(found).constraint[row, best]).max() < 1e-7
+            assert np.abs(rotated.factors(found).elevation[row, best]).max() < 1e-7
         else:
             z_b = PAPER.l3 * np.sin(theta[:, 0])
             assert np.abs(found.link3[row, best, 1] - z_b).max() < 1e-9
@@ -82,7 +83,7 @@ def test_mobility_by_rank_is_3_and_the_tilt_no_freedom_of_its_own() -> None:
         for branch in ROTATED_MODES:
             clear = np.abs(factors.parallel[branch.index] / [1, PAPER.l4, PAPER.l4**2]).min()
             if found.valid[branch.index] and clear > 1e-2:
-                mobility = mobility_at(rotated_joint_angles(theta, branch))
+                mobility = mobility_at(build(), rotated_joint_angles(theta, branch))
                 assert (mobility.dof, mobility.idle, mobility.rank) == (3, 1, 11)
                 assert str(mobility.platform) == "t^3 r^1"
                 turned = mobility.platform.rotations.basis[0]
@@ -123,7 +124,7 @@ def volumes(machine: TPM) -> tuple[str, ...]:
     there = inverse_rotated(region, g)
     share, least = there.valid.any(axis=-1).mean(), np.degrees(np.nanmin(np.abs(there.tilt)))
     grid = oracle.grid(machine.region.low, machine.region.high, (17, 17, 17))
-    height = jacobian.factors_at(grid, machine.working_mode, g).constraint.min()
+    height = jacobian.factors_at(grid, machine.working_mode, g).elevation.min()
     tilts = f"{100 * share:.0f}%, from {least:.0f}°"
     return (*found, str(back.valid.sum(axis=-1).max()), tilts, f"{1e3 * height:.0f}")
 

@@ -38,17 +38,17 @@ MUTATIONS = [
     Mutation("(1)", POC, "reduce(POCSet.__or__, sets)", "reduce(POCSet.__and__, sets)"),
     Mutation("(1)", POC, "[_1 for unit in self.units]", "[_1 for unit in self.units[1:]]"),
     Mutation("(2)", POC, "reduce(POCSet.__and__, sets)", "reduce(POCSet.__or__, sets)"),
-    Mutation("(3a)", POC, "sum(freedoms) - sum(equations)", "sum(freedoms) - equations[0]"),
+    Mutation("(3a)", POC, "loop.freedoms - loop.equations", "loop.freedoms - 6"),
     Mutation("(3a)", POC, "self.loops[:loops]", "self.loops[:1]"),
-    Mutation("(3b)", POC, "(parallel(previous) | added).dim", "(previous[-1] | added).dim"),
-    Mutation("(3b)", POC, "(parallel(previous) | added).dim", "(parallel(previous) & added).dim"),
+    Mutation("(3b)", POC, "(parallel(sets[:j]) | _1).dim", "(sets[j - 1] | _1).dim"),
+    Mutation("(3b)", POC, "parallel(sets[:j]) | _1", "parallel(sets[:j]) & _1"),
     Mutation(
         "(4), first",
         TOPOLOGY,
         "[_1 for chain in (first, second)]",
         "[_1 for chain in (second, third)]",
     ),
-    Mutation("(4), second", POC, "freedoms - actuated - equations", "freedoms - equations"),
+    Mutation("(4), second", POC, "self.freedoms - self.actuated - _1", "self.freedoms - _1"),
     Mutation("(5)", POC, "min(_1, key=_2, default=_3)", "max(_1, key=_2, default=_3)"),
     Mutation("(5)", POC, "sum(abs(d) for d in run) / 2", "sum(abs(d) for d in run)"),
     Mutation("(6)", EQUATIONS, "g.l1 + cos[0]", "g.l1 - cos[0]"),
@@ -74,9 +74,9 @@ MUTATIONS = [
     # What the text claims
     Mutation("M_HSOC1", TOPOLOGY, "poc.parallel([hsoc_1, hsoc_2])", "hsoc_1"),
     Mutation("xi_L1", POC, "chains[: j + 1]", "chains[:j]"),
-    Mutation("xi_L2", POC, "(parallel(previous) | added).dim", "6"),
+    Mutation("xi_L2", POC, "(parallel(sets[:j]) | _1).dim", "6"),
     Mutation("v = m - n + 1", POC, "range(1, len(order))", "(1,)"),
-    Mutation("Delta_1", POC, "freedoms - actuated - equations", "freedoms - equations"),
+    Mutation("Delta_1", POC, "self.freedoms - self.actuated - _1", "self.freedoms - _1"),
     Mutation("3 degrees", TOPOLOGY, "right[rank:]", "right[rank + 1 :]"),
     Mutation(
         "link 3'",
@@ -86,7 +86,7 @@ MUTATIONS = [
     ),
     Mutation('"complete', EQUATIONS, "cos_beta * turn3", "0 * turn3"),
     Mutation("y_B1", EQUATIONS, "across2 >= _1", "across2 - 1e9 * (abs(y1) < 1e-9) >= _1"),
-    Mutation("16 inverse", POSITION, "4 * leg + (bend + 1)", "4 * leg"),
+    Mutation("16 inverse", POSITION, "leg[bend][side]", "leg[0][side]"),
     Mutation("twice as", DELTA, "direction - fold", "direction"),
     Mutation(
         "the singularities", DELTA, "_1 * across - np.sin(q) * arm", "_1 * across + np.sin(q) * arm"

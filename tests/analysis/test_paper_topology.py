@@ -7,7 +7,7 @@ import numpy as np
 import oracle
 import pytest
 
-from tpm_gym.analysis.poc import POCSet, Subspace, degrees_of_freedom
+from tpm_gym.analysis.poc import POCSet, Subspace
 from tpm_gym.analysis.topology import Structure, analyse, describe
 from tpm_gym.kinematics import AssemblyMode, forward_all, inverse, inverse_all
 from tpm_gym.kinematics.geometry import PAPER
@@ -40,8 +40,8 @@ def test_eq_3b_printed_has_a_sum_on_the_left(structures: list[Structure]) -> Non
 def test_dof_formula_of_loop_2_printed_sums_to_1(structures: list[Structure]) -> None:
     loops = analyse(structures[0]).loops
     freedoms, xi = [loop.freedoms for loop in loops], [loop.equations for loop in loops]
-    assert degrees_of_freedom(freedoms, xi[:1]) == 8  # as printed, j = 1 to 1
-    assert degrees_of_freedom(freedoms, xi) == 3 == analyse(structures[0]).dof()
+    assert sum(freedoms) - sum(xi[:1]) == 8  # as printed, j = 1 to 1
+    assert sum(freedoms) - sum(xi) == 3 == analyse(structures[0]).dof()
 
 
 def test_eq_4_printed_m_i_t2_r2_contradicts_itself_and_is_t3_r2(

@@ -1,5 +1,8 @@
 """POC sets are pairs of subspaces, and Eqs. (1) to (5) combine them as in the paper."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from examples import examples
@@ -10,9 +13,8 @@ from tpm_gym.analysis.poc import (
     POCSet,
     Subspace,
     Unit,
-    constraint_degree,
     coupling_degrees,
-    independent_equations,
+    decompositions,
     parallel,
     parallelogram_4r,
     parallelogram_4s,
@@ -89,7 +91,11 @@ def test_independent_equations_are_those_of_what_the_chains_so_far_share_and_the
     for column in ("translations", "rotations"):
         u, v, w = (getattr(poc, column) for poc in (a, b, c))
         expected += (u & v).dim + w.dim - (u & v & w).dim
-    assert independent_equations([a, b], c) == expected
+    chains: Any = [
+        SimpleNamespace(name="", freedoms=0, actuated=0, poc=lambda _, one=one: one)
+        for one in (a, b, c)
+    ]
+    assert decompositions(chains, np.zeros(3))[0][1].equations == expected
 
 
 def test_equations_1_and_2_need_a_set() -> None:
@@ -186,11 +192,6 @@ def test_coupling_degree_is_half_the_least_sum(
 def test_coupling_degree_needs_balanced_constraint_degrees(decompositions: list[list[int]]) -> None:
     with pytest.raises(InputError):
         coupling_degrees(decompositions)
-
-
-def test_constraint_degree_is_the_paper_s_arithmetic() -> None:
-    assert constraint_degree(5 + 3, 2, 6) == 0
-    assert constraint_degree(6, 1, 5) == 0
 
 
 def test_units_count_their_freedoms() -> None:

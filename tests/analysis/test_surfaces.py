@@ -6,10 +6,9 @@ from typing import Any
 import numpy as np
 import oracle
 import pytest
+from surfaces import CURVES, DEGREES, polynomial
 
-from tpm_gym.analysis.surfaces import CURVES, DEGREES, polynomial
-from tpm_gym.arrays import FloatArray
-from tpm_gym.kinematics import WORKING_MODES, inverse_all
+from tpm_gym.kinematics import WORKING_MODES
 from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
 
 sp = pytest.importorskip("sympy")
@@ -89,50 +88,7 @@ def test_degrees_along_a_line_and_no_u_is_left(name: str) -> None:
 # Against the factors
 
 
-def sheet(name: str, mode: Any, g: Geometry, one: FloatArray, other: FloatArray) -> FloatArray:
-    """Return points (n, 3) where a factor changes its sign between two points (m, 3)."""
-    index = {"level3": 1, "planar": 2}.get(name)
-
-    def value(points: FloatArray) -> FloatArray:
-        parallel, _ = oracle.factors_at(points, mode, g)
-        if index is not None:
-            return parallel[..., index]
-        found = inverse_all(points, g)
-        z_b = g.l3 * np.sin(found.theta[..., mode.index, 0])
-        return np.asarray(points[..., 2] - 2 * g.l6 - z_b)
-
-    across = value(one) * value(other) < 0
-    one, other = one[across], other[across]
-    sign = np.sign(value(one))
-    for _ in range(40):
-        middle = (one + other) / 2
-        same = (np.sign(value(middle)) == sign)[:, None]
-        one, other = np.where(same, middle, one), np.where(same, other, middle)
-    return one
-
-
-def assert_zero(name: str, points: FloatArray, g: Geometry) -> None:
-    """Check for zero, compared with the polynomial 1% of l4 away."""
-    near = [
-        np.abs(polynomial(name, *(points + 0.01 * g.l4 * step).T, g))
-        for step in (*np.eye(3)[[0, 2]], *-np.eye(3)[[0, 2]])
-    ]
-    ratio = np.abs(polynomial(name, *points.T, g)) / np.max(near, axis=0)
-    assert ratio.max() < 1e-9
-
-
 GEOMETRIES = [PAPER, WIDE, Geometry(0.25, 0.06, 0.30, 0.65, 0.08, 0.02, 0.12)]
-
-
-@pytest.mark.parametrize("g", GEOMETRIES)
-@pytest.mark.parametrize("name", ["level3", "planar", "constraint"])
-def test_the_polynomials_vanish_on_the_sheets_of_all_modes(name: str, g: Geometry) -> None:
-    rng = np.random.default_rng(1)
-    one = oracle.reachable_points(rng, 500, g)
-    other = one + rng.normal(0.0, 0.04 * g.l4, one.shape)
-    found = [sheet(name, mode, g, one, other) for mode in WORKING_MODES]
-    assert sum(map(len, found)) > 20
-    assert_zero(name, np.concatenate(found), g)
 
 
 @pytest.mark.parametrize("g", GEOMETRIES)

@@ -23,7 +23,6 @@ from figures import (  # noqa: E402
     parameters,
     postures,
     regions,
-    surfaces,
 )
 from figures.skeleton import skeleton  # noqa: E402
 from figures.zero_sets import (  # noqa: E402
@@ -69,15 +68,6 @@ def test_parallel_lines_are_zeros_with_a_change_of_sign(index, y):
     assert np.abs(sheets(points, ELBOWS_OUT)[..., index]).max() < 1e-10
 
 
-def test_plane_y_0_is_found_in_sections_of_constant_z():
-    y = np.linspace(-0.0529, 0.0529, 60)
-    section = Section("z", 0.75)
-    lines = parallel_lines(0, ELBOWS_OUT, section, X, y)
-    points = section.points(np.concatenate(lines))
-    assert np.abs(points[:, 1]).max() < 1e-12
-    assert np.ptp(points[:, 0]) > 1.2  # from rim to rim
-
-
 @pytest.mark.parametrize("index", [1, 2, 3])
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_serial_lines_are_the_edge_of_the_reach(index, sign):
@@ -91,33 +81,6 @@ def test_serial_lines_are_the_edge_of_the_reach(index, sign):
     around = reachable(points[:, None] + steps, mode)
     ends = np.abs(reach_margin(points, sign)) > 1e-12  # where another leg's edge begins
     assert (around.any(axis=1) & ~around.all(axis=1))[~ends].all()
-
-
-def test_swept_surfaces_stay_singular():
-    """The curves of all factors but the first at one y, swept at constant (xC, zC), stay zeros."""
-    y0, y = 0.025, surfaces.levels(9)[1:-1]
-    y = y[np.abs(y) > 1e-9]
-    for index in (1, 2, 3):
-        line = np.concatenate(parallel_lines(index, ELBOWS_OUT, Section("y", y0), X, Z))
-        mesh = surfaces.sweep(line, y0, y, ELBOWS_OUT.cos_beta)
-        values = sheets(mesh, ELBOWS_OUT)[..., index]
-        assert np.isfinite(values).mean() > 0.9
-        assert np.nanmax(np.abs(values)) < 1e-10
-    for index in (1, 2, 3):
-        lines = serial_lines(index, 1, Section("y", 0.0), X, Z, clipped=False)
-        line = np.concatenate(lines)
-        mesh = surfaces.sweep_leg3(line, 0.0, y) if index == 3 else surfaces.sweep(line, 0.0, y, 1)
-        assert np.abs(serial_squares(mesh, 1)[..., index]).max() < 1e-12
-
-
-def test_platform_runs_free_on_the_second_factor():
-    """Where it vanishes, the same motor angles hold for every beta, as the caption says."""
-    y = np.linspace(0.005, 0.045, 9)
-    line = np.concatenate(parallel_lines(1, ELBOWS_OUT, Section("y", 0.025), X, Z))
-    mesh = surfaces.sweep(line[len(line) // 4 :: 40], 0.025, y, 1)
-    theta = inverse_all(mesh).theta[..., ELBOWS_OUT.index, :]
-    assert np.isfinite(theta).all()
-    assert np.ptp(theta, axis=0).max() < 1e-9
 
 
 @pytest.mark.parametrize("geometry", [PAPER, OTHER])

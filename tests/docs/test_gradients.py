@@ -83,7 +83,7 @@ def test_boxes_keep_their_limits_between_the_nodes_of_the_search(design: lengths
     low, high = np.array(design.box.low), np.array(design.box.high)
     points = low + lengths.nodes((41, 41, 41)).numpy() * (high - low)
     assert conditioning_at(points, geometry=design.geometry).min() >= lengths.THRESHOLD
-    elevation = factors_at(points, geometry=design.geometry).constraint
+    elevation = factors_at(points, geometry=design.geometry).elevation
     assert elevation.min() >= lengths.ELEVATION
     posture = skeleton(points, ELBOWS_OUT, design.geometry)
     joints = [posture.c, posture.d1, posture.e1, posture.f1, posture.d3, posture.a]

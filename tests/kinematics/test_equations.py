@@ -27,7 +27,6 @@ from tpm_gym.kinematics import (
     inverse,
     inverse_all,
     jacobian,
-    passive_angles,
     workspace,
 )
 from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry, Lengths
@@ -52,6 +51,11 @@ def assert_same(tensors: Any, arrays: Any, names: tuple[str, ...], atol: float) 
         found, expected = getattr(tensors, name), getattr(arrays, name)
         assert found.dtype == torch.float64
         np.testing.assert_allclose(found, expected, rtol=0, atol=atol)  # NaN equals NaN
+
+
+def parts(found: Any) -> tuple[Any, ...]:
+    """Return the values of a named tuple or a dataclass."""
+    return tuple(found) if isinstance(found, tuple) else tuple(vars(found).values())
 
 
 # -- the same everywhere ---------------------------------------------------------------------------
@@ -97,10 +101,10 @@ def test_tensors_give_what_arrays_give(g: Geometry) -> None:
     for function in (forward, jacobian.parallel, jacobian.serial, jacobian.conditioning):
         found = function(torch.tensor(thetas), geometry=g)
         np.testing.assert_allclose(found, function(thetas, geometry=g), rtol=0, atol=1e-11)
-    for function in (jacobian.evaluate, jacobian.factors, passive_angles):
-        found, expected = function(torch.tensor(thetas), geometry=g), function(thetas, geometry=g)
-        for name, value in vars(expected).items():
-            np.testing.assert_allclose(getattr(found, name), value, rtol=1e-9, atol=1e-11)
+    for function in (jacobian.evaluate, jacobian.factors):
+        both = function(torch.tensor(thetas), geometry=g), function(thetas, geometry=g)
+        for found, expected in zip(*map(parts, both), strict=True):
+            np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-11)
     at_points = (workspace.reachable, workspace.assembly_of, workspace.conditioning_at)
     for function in at_points:
         found = function(torch.tensor(points), geometry=g)
@@ -134,14 +138,14 @@ def test_torch_is_not_imported_by_who_has_no_tensor() -> None:
 @pytest.mark.parametrize(
     "function",
     [forward, jacobian.parallel, jacobian.serial, jacobian.velocity, jacobian.conditioning]
-    + [jacobian.factors, jacobian.evaluate, passive_angles],
+    + [jacobian.factors, jacobian.evaluate],
 )
 def test_derivatives_are_those_of_finite_differences(
     function: Callable[..., Any], branch: AssemblyMode
 ) -> None:
     def values(theta: torch.Tensor) -> Any:
         found = function(theta, branch)
-        return found if isinstance(found, torch.Tensor) else tuple(vars(found).values())
+        return found if isinstance(found, torch.Tensor) else parts(found)
 
     theta = oracle.angles_on(branch, np.random.default_rng(3), 100, PAPER, clear=0.3)[:3]
     assert len(theta) == 3
@@ -168,7 +172,7 @@ def test_derivatives_by_the_lengths_are_those_of_finite_differences(branch: Work
         g = Lengths(*lengths)
         factors = jacobian.factors_at(points, branch, g)
         found = workspace.conditioning_at(points, branch, ASSEMBLY_MODES[slot], g)
-        return found, *vars(factors).values()
+        return found, *factors
 
     lengths = torch.tensor(np.array(PAPER.lengths), requires_grad=True)
     assert gradcheck(values, (lengths,))

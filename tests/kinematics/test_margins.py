@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from tpm_gym.arrays import FloatArray
-from tpm_gym.errors import InputError, SingularityError, UnreachableError
+from tpm_gym.errors import InputError, UnreachableError
 from tpm_gym.kinematics import (
     ASSEMBLY_MODES,
     ELBOWS_OUT,
@@ -21,14 +21,13 @@ from tpm_gym.kinematics import (
     inverse,
     inverse_all,
     jacobian,
-    passive_angles,
 )
-from tpm_gym.kinematics.geometry import PAPER, Geometry
+from tpm_gym.kinematics.geometry import PAPER
 from tpm_gym.kinematics.namespaces import NUMPY
 
 HOME = np.array([-0.05, 0.03, 0.78])
 OF_ANGLES = (
-    *(forward, passive_angles, jacobian.parallel, jacobian.serial, jacobian.velocity),
+    *(forward, jacobian.parallel, jacobian.serial, jacobian.velocity),
     *(jacobian.conditioning, jacobian.evaluate, jacobian.factors),
 )
 SINGLE_BRANCH = (inverse, *OF_ANGLES)
@@ -198,25 +197,3 @@ def test_the_loop_that_is_blamed_is_the_one_that_fails_and_by_so_much() -> None:
             assert caught.value.margin == pytest.approx(margin, abs=1e-7)
             blamed.add(loop)
     assert blamed == {1, 2}
-
-
-def test_concentric_circles_are_named_without_a_warning() -> None:
-    # 2 l5 = l1: at theta_2 = 90 degrees the centres of both circles of Eq. (6) lie above O.
-    geometry, theta = Geometry(0.3, 0.07, 0.35, 0.8, 0.15, 0.01, 0.05), [np.pi / 2, np.pi / 2, 0.0]
-    assert not forward_all(theta, geometry).valid.any()
-    with pytest.raises(UnreachableError, match="loop 1"):
-        forward(theta, geometry=geometry)
-
-
-@pytest.mark.parametrize(
-    ("theta", "error"),
-    [
-        ([0.0, 0.0, 0.0], UnreachableError),
-        ([np.pi / 2, np.pi, np.pi / 2], UnreachableError),
-        (inverse([-0.04, 0.0, 0.8]), SingularityError),
-    ],
-)
-def test_one_configuration_is_refused_with_nothing_behind_the_error(theta: Any, error: Any) -> None:
-    with pytest.raises(error) as caught:
-        jacobian.evaluate(theta)
-    assert caught.value.__context__ is None

@@ -9,7 +9,6 @@ import pytest
 
 from tpm_gym import kinematics
 from tpm_gym.errors import InputError, UnreachableError
-from tpm_gym.kinematics import modes as branches
 from tpm_gym.kinematics.geometry import PAPER
 from tpm_gym.kinematics.modes import (
     ASSEMBLY_MODES,
@@ -77,10 +76,3 @@ def test_the_default_assembly_holds_the_platform_beyond_the_elbows_at_positive_y
     np.testing.assert_allclose(kinematics.forward(theta, DEFAULT_ASSEMBLY), CENTRE, atol=1e-12)
     heights = PAPER.l3 * np.sin(theta)
     assert (CENTRE[2] > heights).all()
-
-
-def test_kinematics_offers_the_names_of_branches() -> None:
-    for name, value in vars(branches).items():
-        made_there = getattr(value, "__module__", "") == branches.__name__
-        if (made_there or name.endswith("_MODES")) and not name.startswith("_"):
-            assert getattr(kinematics, name) is value

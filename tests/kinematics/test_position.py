@@ -19,7 +19,6 @@ from tpm_gym.kinematics import (
     inverse,
     inverse_all,
     jacobian,
-    passive_angles,
 )
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.mechanism import PAPER_TPM
@@ -117,33 +116,12 @@ def test_results_have_the_leading_shape_of_their_inputs(shape: tuple[int, ...]) 
     for values, trailing in (
         *((theta, (3,)), (found.theta, (16, 3)), (found.beta, (16,)), (found.valid, (16,))),
         *((solutions.position, (4, 3)), (solutions.link3, (4, 2)), (solutions.beta, (4,))),
-        *((solutions.valid, (4,)), (passive_angles(theta).rod4_tilt, ())),
+        (solutions.valid, (4,)),
         *((jacobian.factors(theta).parallel, (3,)), (jacobian.factors(theta).serial, (4,))),
         *((jacobian.conditioning(theta), ()), (forward(theta), (3,))),
         *((function(theta), (3, 3)) for function in (jacobian.parallel, jacobian.velocity)),
     ):
         assert values.shape == (*shape, *trailing)
-
-
-def test_passive_angles_point_along_the_links() -> None:
-    rng = np.random.default_rng(10)
-    for slot, mode in enumerate(ASSEMBLY_MODES):
-        s = assemblies(rng, 4000, PAPER)
-        keep = s.slot == slot
-        found = passive_angles(s.theta[keep], mode)
-
-        def tilted(swing: np.ndarray, tilt: np.ndarray) -> tuple[np.ndarray, ...]:
-            return np.cos(tilt) * np.cos(swing), np.cos(tilt) * np.sin(swing), np.sin(tilt)
-
-        level, up, out = tilted(found.rod4_swing, found.rod4_tilt)
-        rod4 = oracle.vector(out, level, up)
-        rod6 = oracle.vector(np.cos(found.rod6_swing), 0, np.sin(found.rod6_swing))
-        level, up, out = tilted(found.rod11_swing, found.rod11_tilt)
-        rod11 = oracle.vector(level, out, up)
-        directions = np.stack([rod4, rod6, rod11], axis=-2)
-        assert np.abs(PAPER.l4 * directions - oracle.rods(s.p)[keep]).max() < 1e-11
-        link7 = PAPER.l7 * oracle.vector(np.cos(found.beta), np.sin(found.beta), 0)
-        assert np.abs(link7 - (s.p["E1"] - s.p["D1"])[keep]).max() < 1e-11
 
 
 @pytest.mark.parametrize("solve", [forward_all, inverse_all, forward, inverse])

@@ -182,7 +182,7 @@ def test_velocity_is_the_derivative_and_its_determinant_is_the_factors(
     factors, j = rotated.factors(found), rotated.velocity(found)
     size = np.array([1.0, g.l4, g.l4**2])
     far = found.valid & (np.abs(factors.parallel / size).min(axis=-1) > 0.02)
-    far &= np.abs(factors.constraint) > 0.02 * g.l4
+    far &= np.abs(factors.elevation) > 0.02 * g.l4
     assert far.sum() > 10
     for motor, by in enumerate(step * np.eye(3)):
         ahead, behind = forward_rotated(theta + by, g), forward_rotated(theta - by, g)
@@ -205,7 +205,7 @@ def test_where_rods_4a_4b_and_6_meet_in_a_point_the_planar_factor_is_zero() -> N
     """Seen along y, its size over that of rod 6's moment about the crossing is regular."""
     found = forward_rotated(angles(np.random.default_rng(3), 3000))
     factors = rotated.factors(found)
-    clear = found.valid & (np.abs(factors.constraint) > 0.05)
+    clear = found.valid & (np.abs(factors.elevation) > 0.05)
     rods, ends = found.rods[clear][..., [0, 2]], found.ends[clear][..., [0, 2]]
 
     def cross(a: FloatArray, b: FloatArray) -> FloatArray:

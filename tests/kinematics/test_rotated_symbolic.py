@@ -114,5 +114,5 @@ def test_the_code_has_these_factors(g: Geometry) -> None:
         *places, *lengths, found.tilt[real], found.beta[real]
     )
     factors = rotated.factors(found)
-    product = factors.parallel[real].prod(axis=-1) * factors.constraint[real]
+    product = factors.parallel[real].prod(axis=-1) * factors.elevation[real]
     np.testing.assert_allclose(values, -64 * g.l5 * g.l7 * product, rtol=0, atol=1e-13)

@@ -190,7 +190,7 @@ def test_the_code_returns_these_factors_a_and_b(g: Geometry, seed: int) -> None:
         np.testing.assert_allclose(found.parallel, expected["parallel"], rtol=0, atol=1e-12)
         np.testing.assert_allclose(found.serial, expected["serial"], rtol=0, atol=1e-12)
         elevation = expected["constraint"][..., 0]
-        np.testing.assert_allclose(found.constraint, elevation, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(found.elevation, elevation, rtol=0, atol=1e-12)
         det_a = np.linalg.det(jacobian.parallel(theta, branch, g))
         det_b = np.linalg.det(jacobian.serial(theta, branch, g))
         products = [expected[name].prod(axis=-1) for name in ("parallel", "serial")]

@@ -102,23 +102,6 @@ def test_projection_is_inside_idempotent_and_nearest(
         assert region.contains(point) == (distance == 0)
 
 
-@examples(200, triples)
-def test_margin_is_negative_outside_and_the_distance_to_the_faces_inside(
-    point: tuple[float, ...],
-) -> None:
-    for region in (TASK_REGION, Region(low=(-2, -2, -2), high=(2, 1, 2.5))):
-        margin = region.margin(point)
-        assert (margin >= 0) == bool(region.contains(point))
-        gaps = [
-            abs(p - face)
-            for p, *faces in zip(point, region.low, region.high, strict=True)
-            for face in faces
-        ]
-        assert abs(margin) in gaps
-        if margin >= 0:
-            assert margin == min(gaps)
-
-
 @pytest.mark.parametrize("low", [(0.1, 0, 0), (0, 0.1, 0), (0, 0, 0.1), (float("nan"), 0, 0)])
 def test_empty_regions_are_refused(low: tuple[float, float, float]) -> None:
     with pytest.raises(ConfigurationError) as caught:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -12,7 +11,8 @@ from paths import ROOT
 
 from tpm_gym.mechanism import PAPER_TPM, WIDE_TPM, Machine
 from tpm_gym.mechanism.cup import CUP
-from tpm_gym.mechanism.mjcf import MJCF_FILE, mjcf_text, site_names, write
+from tpm_gym.mechanism.export import MJCF_FILE
+from tpm_gym.mechanism.mjcf import mjcf_text, site_names
 from tpm_gym.resources import URDF as FOLDER
 
 MECHANISM = PAPER_TPM.mechanism
@@ -50,13 +50,6 @@ def miss(data: Any) -> float:
     position = platform.xpos + platform.xmat.reshape(3, 3) @ MECHANISM.point_p
     known = PAPER_TPM.mount.to_world(PAPER_TPM.forward(angles(data)))
     return float(np.linalg.norm(position - known))
-
-
-def test_regenerating_gives_the_shipped_file_byte_for_byte(tmp_path: Path) -> None:
-    assert write(tmp_path / "new").read_bytes() == (FOLDER / MJCF_FILE).read_bytes()
-    other = write(tmp_path, WIDE_TPM).read_text(encoding="utf-8")
-    assert other == mjcf_text(WIDE_TPM)
-    assert 'timestep="0.0005"' in other
 
 
 def test_links_are_those_of_the_mechanism(machine: Machine) -> None:

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import yaml
 from machines import anywhere, each_machine
-from motion import IDLE
 from numpy.typing import ArrayLike
 
 from tpm_gym.arrays import FloatArray
@@ -22,10 +21,10 @@ from tpm_gym.kinematics import (
 )
 from tpm_gym.kinematics.geometry import PAPER
 from tpm_gym.mechanism import TPM
-from tpm_gym.mechanism.dynamics import Dynamics
+from tpm_gym.mechanism.export import URDF_FILE, write
 from tpm_gym.mechanism.mount import GRAVITY
 from tpm_gym.mechanism.tree import joint_angles, rotated_joint_angles
-from tpm_gym.mechanism.urdf import LOOPS_FILE, URDF_FILE, write
+from tpm_gym.mechanism.urdf import LOOPS_FILE
 from tpm_gym.resources import URDF as FOLDER
 
 pin = pytest.importorskip(
@@ -111,7 +110,7 @@ class Files:
 
         End link 10 rolls as it likes, and the cup's slide is at rest.
         """
-        idle = [self.column(IDLE), self.column("cup_slide")]
+        idle = [self.column("R33"), self.column("cup_slide")]
         passive = [k for k in self.passive.tolist() if k not in idle]
         v, a = np.zeros((2, self.model.nv))
         v[self.driven], v[idle[0]], a[self.driven] = rate, roll, change
@@ -172,23 +171,13 @@ def test_the_files_close_at_our_joint_angles_all_over_the_workspace(files: Files
         assert files.open_by(files.posture(angles)) < CLOSED
 
 
-def test_what_the_motors_hold_is_what_the_files_weigh(
-    files: Files, found: list[tuple[FloatArray, FloatArray]]
-) -> None:
-    dynamics = Dynamics()
-    for point, posture in found:
-        held = dynamics.gravity(inverse(point))
-        rest = np.zeros(3)
-        np.testing.assert_allclose(files.torque(posture, rest, rest), held, rtol=0, atol=1e-6)
-
-
 @each_machine
 @pytest.mark.parametrize("roll", [0.0, 30.0])
 def test_torques_are_those_of_pinocchio_on_the_files(
     machine: TPM, roll: float, tmp_path: Path
 ) -> None:
     # Measured: 2e-9 of the largest, the digits of the URDF.
-    write(tmp_path, machine.mechanism)
+    write(tmp_path, machine)
     files, rng = Files(tmp_path), np.random.default_rng(0)
     for theta in machine.inverse(anywhere(machine, 10)):
         rate, change = rng.normal(size=3), 10 * rng.normal(size=3)

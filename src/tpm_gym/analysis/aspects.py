@@ -3,8 +3,8 @@
 The platform can move between two points of one aspect (Wenger and Chablat) without a singularity,
 and not between two aspects of one working mode. Sets are grids of cells in the paper frame, in
 metres. The singular planes y = 0 and |y| = l7 are faces of cells, so that only curved surfaces run
-through cells. All factors of :mod:`tpm_gym.analysis.singularity` count. Stops of motors and
-collisions of links count only with ``limits`` (:mod:`tpm_gym.analysis.limits`).
+through cells. All factors of :mod:`tpm_gym.analysis.singularity` count. Other limits, such as
+the stops of the motors, count only if they are given (:mod:`tpm_gym.analysis.limits`).
 """
 
 import math
@@ -65,15 +65,6 @@ class Cells:
 
 
 @dataclass(frozen=True)
-class ReachableSet:
-    """Positions of point P that one working mode can reach."""
-
-    branch: WorkingMode
-    geometry: Geometry
-    cells: Cells
-
-
-@dataclass(frozen=True)
 class Aspect:
     """Connected region of one working mode without singularities, within all limits.
 
@@ -107,7 +98,7 @@ def reachable_set(
     geometry: Geometry = PAPER,
     shape: Shape = DEFAULT_SHAPE,
     limits: tuple[Limit, ...] = (),
-) -> ReachableSet:
+) -> Cells:
     """Find the points that have a posture on ``branch`` and respect all ``limits``.
 
     Args:
@@ -121,7 +112,7 @@ def reachable_set(
         ConfigurationError: The shape is not possible.
     """
     low, spacing, codes = _codes(branch, geometry, shape, limits)
-    return ReachableSet(branch, geometry, Cells(low, spacing, codes >= 0))
+    return Cells(low, spacing, codes >= 0)
 
 
 def aspects(
@@ -234,7 +225,7 @@ def _signs(
 ) -> IntArray:
     """Return the signs of sin(beta), level3, planar, elevation as bits; -1 where P cannot be."""
     found = factors_at(points, branch, geometry)
-    values = np.concatenate([found.parallel, found.constraint[..., None]], axis=-1)
+    values = np.stack([found.sin_beta, found.level3, found.planar, found.elevation], axis=-1)
     codes: IntArray = np.where(np.isnan(values[..., 0]), -1, (values > 0) @ _BITS)
     for limit in limits:
         kept = codes >= 0

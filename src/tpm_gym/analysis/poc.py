@@ -198,21 +198,6 @@ def parallel(sets: Sequence[POCSet]) -> POCSet:
     return reduce(POCSet.__and__, sets)
 
 
-def degrees_of_freedom(freedoms: Sequence[int], equations: Sequence[int]) -> int:
-    """Return F = sum of f_i - sum of xi_Lj, Eq. (3a)."""
-    return sum(freedoms) - sum(equations)
-
-
-def independent_equations(previous: Sequence[POCSet], added: POCSet) -> int:
-    """Return xi_Lj = dim{(intersection of the j previous chains) union chain j + 1}, Eq. (3b)."""
-    return (parallel(previous) | added).dim
-
-
-def constraint_degree(freedoms: int, actuated: int, equations: int) -> int:
-    """Return Delta_j = sum of f_i - I_j - xi_Lj, the second Eq. (4)."""
-    return freedoms - actuated - equations
-
-
 def coupling_degrees(decompositions: Sequence[Sequence[int]]) -> tuple[float, ...]:
     """Return kappa of each Assur kinematic chain (AKC), Eq. (5), from Delta_j by decomposition.
 
@@ -251,8 +236,8 @@ class Loop:
 
     @property
     def constraint(self) -> int:
-        """Constraint degree Delta_j of Eq. (4)."""
-        return constraint_degree(self.freedoms, self.actuated, self.equations)
+        """Constraint degree, Delta_j = sum of f_i - I_j - xi_Lj, the second Eq. (4)."""
+        return self.freedoms - self.actuated - self.equations
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,9 +267,8 @@ class ParallelMechanism:
         return coupling_degrees([[x.constraint for x in loops] for loops in self.decompositions])
 
     def dof(self, loops: int | None = None) -> int:
-        """Return F of Eq. (3a) for the first ``loops`` loops; default: all."""
-        counted = self.loops[:loops]
-        return degrees_of_freedom([x.freedoms for x in counted], [x.equations for x in counted])
+        """Return F = sum of f_i - sum of xi_Lj, Eq. (3a), for the first loops; default: all."""
+        return sum(loop.freedoms - loop.equations for loop in self.loops[:loops])
 
 
 def analyse(chains: Sequence[Chain], point: ArrayLike) -> ParallelMechanism:
@@ -318,5 +302,7 @@ def _loops(order: tuple[tuple[Chain, POCSet], ...]) -> tuple[Loop, ...]:
         freedoms, actuated = (
             sum(getattr(c, key) for c in added) for key in ("freedoms", "actuated")
         )
-        loops.append(Loop(names, freedoms, actuated, independent_equations(sets[:j], sets[j])))
+        # Eq. (3b): xi_Lj = dim{(intersection of the j previous chains) union chain j + 1}
+        equations = (parallel(sets[:j]) | sets[j]).dim
+        loops.append(Loop(names, freedoms, actuated, equations))
     return tuple(loops)

@@ -82,10 +82,7 @@ def dimensionless(values: Factors, geometry: Geometry = PAPER) -> FloatArray:
     level3 and elevation are divided by l4, planar by l4^2, and the legs by l3 l4.
     """
     l3, l4 = geometry.l3, geometry.l4
-    elevation = np.asarray(values.constraint)[..., None]
-    sizes = np.array([1.0, l4, l4**2, 1.0, l3 * l4, l3 * l4, l3 * l4, l4])
-    both: FloatArray = np.concatenate([values.parallel, values.serial, elevation], axis=-1) / sizes
-    return both
+    return np.stack(values, axis=-1) / [1.0, l4, l4**2, 1.0, l3 * l4, l3 * l4, l3 * l4, l4]
 
 
 def classify(

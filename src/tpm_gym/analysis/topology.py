@@ -146,12 +146,11 @@ def mobility(
         SingularityError: theta is so close to a constraint singularity that the rank is uncertain:
             a singular value is between 1e-11 and 1e-7 of the largest.
     """
-    return mobility_at(joint_angles(theta, branch, geometry), geometry)
+    return mobility_at(build(geometry), joint_angles(theta, branch, geometry))
 
 
-def mobility_at(angles: Mapping[str, float], geometry: Geometry = PAPER) -> Mobility:
-    """Count freedoms like :func:`mobility`, from the angle of each joint that turns, rad."""
-    mechanism = build(geometry)
+def mobility_at(mechanism: Mechanism, angles: Mapping[str, float]) -> Mobility:
+    """Count freedoms like :func:`mobility`, of any mechanism, from the angle of each joint, rad."""
     jacobian = closure_jacobian(mechanism, angles)
     _, values, right = np.linalg.svd(jacobian)
     rank = _rank(values)
@@ -159,7 +158,7 @@ def mobility_at(angles: Mapping[str, float], geometry: Geometry = PAPER) -> Mobi
     places = mechanism.places(angles)
     joints = _moving_joints(mechanism)
     linear, angular = _rates(mechanism, places, mechanism.platform, mechanism.point_p)
-    motors = np.eye(len(joints))[[joints.index(name) for name in ACTUATED_JOINTS]]
+    motors = np.eye(len(joints))[[joints.index(name) for name in mechanism.actuated]]
     seen = np.linalg.svd(np.concatenate([linear, angular, motors]) @ free, compute_uv=False)
     dof = _rank(seen)
     platform = POCSet(Subspace.span((linear @ free).T), Subspace.span((angular @ free).T))

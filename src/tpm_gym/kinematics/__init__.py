@@ -12,7 +12,6 @@ from tpm_gym.kinematics.modes import (
     AssemblyMode,
     ForwardSolutions,
     InverseSolutions,
-    PassiveAngles,
     RotatedMode,
     WorkingMode,
 )
@@ -21,7 +20,6 @@ from tpm_gym.kinematics.position import (
     forward_all,
     inverse,
     inverse_all,
-    passive_angles,
 )
 from tpm_gym.kinematics.rotated import RotatedPostures, forward_rotated, inverse_rotated
 
@@ -34,7 +32,6 @@ __all__ = [
     "AssemblyMode",
     "ForwardSolutions",
     "InverseSolutions",
-    "PassiveAngles",
     "RotatedMode",
     "RotatedPostures",
     "WorkingMode",
@@ -44,5 +41,4 @@ __all__ = [
     "inverse",
     "inverse_all",
     "inverse_rotated",
-    "passive_angles",
 ]

@@ -133,6 +133,7 @@ compilable(
     equations.rods,
     equations.factors,
     equations.regular,
+    equations.link_velocity,
     equations.velocity,
     equations.conditioning,
     equations._largest_singular_value,

@@ -19,11 +19,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tpm_gym.arrays import Vector
+from tpm_gym.arrays import FloatArray, Vector
 from tpm_gym.errors import UnreachableError
 from tpm_gym.kinematics.geometry import AnyLengths, Geometry
 from tpm_gym.kinematics.modes import AssemblyMode, WorkingMode
-from tpm_gym.kinematics.namespaces import NUMPY, Namespace, Numbers
+from tpm_gym.kinematics.namespaces import NUMPY, Namespace, Numbers, namespace_of
 
 ROUNDING = 64 * sys.float_info.epsilon
 """Largest amount by which a discriminant (scaled to order one) counts as zero if it is below zero.
@@ -54,6 +54,8 @@ class Assembly(NamedTuple):
 class Factors(NamedTuple):
     """Factors of det A (Eq. 16, corrected) and of det B (Eq. 17, corrected), and the elevation.
 
+    A configuration is singular where one of them is zero.
+
     Attributes:
         level3: l1 + l3 c3 - xC - 2 l2, m.
         planar: Zero where B1C1 and B2C2, projected on y = 0, line up, m^2.
@@ -70,6 +72,18 @@ class Factors(NamedTuple):
     leg2: Numbers
     leg3: Numbers
     elevation: Numbers
+
+    @property
+    def parallel(self) -> FloatArray:
+        """(..., 3), factors of det A: sin_beta, level3, planar."""
+        found: FloatArray = namespace_of(self.planar).stack(self[:3])
+        return found
+
+    @property
+    def serial(self) -> FloatArray:
+        """(..., 4), factors of det B: cos_beta, leg1, leg2, leg3."""
+        found: FloatArray = namespace_of(self.leg1).stack(self[3:7])
+        return found
 
 
 def arms(theta: Triple, g: AnyLengths, ns: Namespace) -> tuple[Triple, Triple]:
@@ -212,19 +226,27 @@ def regular(values: Factors, g: AnyLengths) -> Numbers:
     return turned & (abs(values.level3) >= flat) & (abs(values.planar) >= flat * g.l4)
 
 
-def velocity(bars: tuple[Triple, Triple, Triple], values: Factors) -> tuple[Triple, Triple, Triple]:
-    """Compute the rows of the velocity Jacobian J, v = J theta_dot, m/rad.
+def link_velocity(
+    bars: tuple[Triple, Triple, Triple], values: Factors
+) -> tuple[tuple[Numbers, Numbers], tuple[Numbers, Numbers], Triple]:
+    """Compute the rates of xC, zC and l7 beta for unit rates of the motors, m/rad.
 
-    The closures are solved for the rates of xC, zC and l7 beta, whose matrix has the determinant
-    l7 sin(beta) level3 planar; J exists at the serial singularities too.
+    They solve the closures' derivatives, with the determinant l7 sin(beta) level3 planar. Motor 3
+    does not move link 3'.
     """
-    sin_beta, level3, planar, cos_beta, leg1, leg2, leg3, _ = values
     (r1x, _, r1z), (r2x, _, r2z), (r3x, _, r3z) = bars
-    # For a unit rate of motors 1 and 2; motor 3 moves link 7 alone.
+    leg1, leg2, planar = values.leg1, values.leg2, values.planar
     x1, x2 = r2z * leg1 / planar, -r1z * leg2 / planar
     z1, z2 = -r2x * leg1 / planar, r1x * leg2 / planar
-    k = sin_beta * level3
-    turn1, turn2, turn3 = -(r3x * x1 + r3z * z1) / k, -(r3x * x2 + r3z * z2) / k, leg3 / k
+    k = values.sin_beta * values.level3
+    turn = -(r3x * x1 + r3z * z1) / k, -(r3x * x2 + r3z * z2) / k, values.leg3 / k
+    return (x1, x2), (z1, z2), turn
+
+
+def velocity(bars: tuple[Triple, Triple, Triple], values: Factors) -> tuple[Triple, Triple, Triple]:
+    """Compute the rows of J, v = J theta_dot, m/rad; it exists at serial singularities too."""
+    sin_beta, cos_beta = values.sin_beta, values.cos_beta
+    (x1, x2), (z1, z2), (turn1, turn2, turn3) = link_velocity(bars, values)
     return (
         (x1 - sin_beta * turn1, x2 - sin_beta * turn2, -sin_beta * turn3),
         (cos_beta * turn1, cos_beta * turn2, cos_beta * turn3),
@@ -249,7 +271,10 @@ def conditioning(rows: tuple[Triple, Triple, Triple], ns: Namespace) -> Numbers:
 
 
 def _largest_singular_value(rows: tuple[Triple, Triple, Triple], ns: Namespace) -> Numbers:
-    """Compute it from the trigonometric roots of the characteristic polynomial of M M^T."""
+    """Compute the largest singular value of M, the root of the largest eigenvalue of M M^T.
+
+    The eigenvalues are the trigonometric roots of the characteristic polynomial.
+    """
     (a, b, c), (d, e, f), (g, h, i) = rows
     xx, yy, zz = a * a + b * b + c * c, d * d + e * e + f * f, g * g + h * h + i * i
     xy, xz, yz = a * d + b * e + c * f, a * g + b * h + c * i, d * g + e * h + f * i

@@ -13,7 +13,7 @@ _CLOSE = 1e-4
 
 
 class Lengths(NamedTuple):
-    """l1 to l7 as any numbers, unchecked, such as tensors to differentiate by."""
+    """Lengths l1 to l7 as any kind of numbers, such as tensors; they are not checked."""
 
     l1: Numbers
     l2: Numbers

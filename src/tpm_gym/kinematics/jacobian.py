@@ -10,43 +10,19 @@ raise it also if theta is not finite, and UnreachableError if the branch does no
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from tpm_gym.arrays import FloatArray, finite_points, points
 from tpm_gym.errors import SingularityError
 from tpm_gym.kinematics import equations
+from tpm_gym.kinematics.equations import Factors as Factors
 from tpm_gym.kinematics.geometry import PAPER, AnyLengths, Geometry
 from tpm_gym.kinematics.modes import DEFAULT_ASSEMBLY, ELBOWS_OUT, AssemblyMode, WorkingMode
 from tpm_gym.kinematics.namespaces import Namespace, Numbers, by_rows
-
-_MATRIX = np.arange(9).reshape(3, 3)
-_DIAGONAL = np.array([[0, 3, 3], [3, 1, 3], [3, 3, 2]])  # of three columns and one of zeros
-_COLUMN = np.array(0)
-_PARALLEL = np.arange(3)
-_FACTORS = _PARALLEL, np.arange(3, 7), np.array(7)
-
-
-@dataclass(frozen=True)
-class Factors:
-    """Factors of both Jacobian determinants and of the constraint; singular is where one is zero.
-
-    Attributes:
-        parallel: (..., 3): sin(beta); l1 + l3 c3 - xC - 2 l2 (m); the planar factor (m^2), as in
-            Eq. (16), corrected.
-        serial: (..., 4): cos(beta); B_iC_i . dB_i/dtheta_i (m^2/rad) for i = 1, 2, 3, as in
-            Eq. (17), corrected.
-        constraint: (...,) m, z_C1 - z_B1: zero at a constraint singularity. A factor of neither,
-            but of the closures' determinant once link 3' may turn about y.
-    """
-
-    parallel: FloatArray
-    serial: FloatArray
-    constraint: FloatArray
 
 
 @dataclass(frozen=True)
@@ -71,7 +47,7 @@ class _Configuration(NamedTuple):
     ns: Namespace
 
 
-_Columns = Callable[[_Configuration], list[Numbers]]
+_Results = Callable[[_Configuration], Sequence[Numbers]]
 
 
 def parallel(
@@ -84,13 +60,13 @@ def parallel(
     det A = -cos(beta) times the product of the factors of Eq. (16).
     """
 
-    def columns(c: _Configuration) -> list[Numbers]:
+    def results(c: _Configuration) -> list[Numbers]:
         (r1x, _, r1z), (r2x, _, r2z), r3 = c.rods
         cos, sin = c.factors.cos_beta, c.factors.sin_beta
         # C1 and C2 move with (dx + tan(beta) dy, 0, dz)
-        return [cos * r1x, sin * r1x, cos * r1z, cos * r2x, sin * r2x, cos * r2z, *r3]
+        return [((cos * r1x, sin * r1x, cos * r1z), (cos * r2x, sin * r2x, cos * r2z), r3)]
 
-    return _from_angles(columns, theta, branch, geometry, _MATRIX)[0]
+    return _from_angles(results, theta, branch, geometry)[0]
 
 
 def serial(
@@ -102,11 +78,11 @@ def serial(
     of Eq. (17).
     """
 
-    def columns(c: _Configuration) -> list[Numbers]:
-        f = c.factors
-        return [f.cos_beta * f.leg1, f.cos_beta * f.leg2, f.leg3, 0 * f.leg3]
+    def results(c: _Configuration) -> list[Numbers]:
+        f, no = c.factors, 0 * c.factors.leg3
+        return [((f.cos_beta * f.leg1, no, no), (no, f.cos_beta * f.leg2, no), (no, no, f.leg3))]
 
-    return _from_angles(columns, theta, branch, geometry, _DIAGONAL)[0]
+    return _from_angles(results, theta, branch, geometry)[0]
 
 
 def velocity(
@@ -120,21 +96,30 @@ def velocity(
     Raises:
         SingularityError: If theta is a parallel singularity, where J does not exist.
     """
+    return _regular(lambda c: [_velocity(c)], theta, branch, geometry)[0]
 
-    def columns(c: _Configuration) -> list[Numbers]:
-        return [*c.factors[:3], *_velocity(c)]
 
-    layouts = _PARALLEL, _MATRIX + 3
-    singular, found = _from_angles(columns, theta, branch, geometry, *layouts)
-    require_regular(singular, geometry)
-    return found
+def link_velocity(
+    theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
+) -> FloatArray:
+    """Compute d(xC, zC, l7 beta) / d(theta), (..., 3, 3) m/rad.
+
+    Raises:
+        SingularityError: If theta is a parallel singularity.
+    """
+
+    def results(c: _Configuration) -> list[Numbers]:
+        x, z, turn = equations.link_velocity(c.rods, c.factors)
+        return [((*x, 0 * x[0]), (*z, 0 * z[0]), turn)]
+
+    return _regular(results, theta, branch, geometry)[0]
 
 
 def conditioning(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> FloatArray:
     """Compute 1/cond(J), (...,): 0 at a singularity (up to rounding), 1 where J is isotropic."""
-    return _from_angles(lambda c: [_conditioning(c)], theta, branch, geometry, _COLUMN)[0]
+    return _from_angles(lambda c: [_conditioning(c)], theta, branch, geometry)[0]
 
 
 def conditioning_at(
@@ -149,12 +134,12 @@ def conditioning_at(
     :class:`tpm_gym.kinematics.geometry.Lengths`.
     """
 
-    def columns(c: _Configuration) -> list[Numbers]:
+    def results(c: _Configuration) -> list[Numbers]:
         planar, side = (2.0 * (f > 0) - 1.0 for f in (c.factors.planar, c.factors.sin_beta))
         here = (planar == assembly.planar) & (side == assembly.sin_beta)
         return [c.ns.where(here, _conditioning(c), 0.0)]
 
-    return _from_points(columns, position, branch, geometry, 0.0, _COLUMN)[0]
+    return _from_points(results, position, branch, geometry, 0.0)[0]
 
 
 def evaluate(
@@ -166,70 +151,65 @@ def evaluate(
         SingularityError: If theta is a parallel singularity.
     """
 
-    def columns(c: _Configuration) -> list[Numbers]:
-        return [_conditioning(c), *c.factors[:3], *c.position, *_velocity(c)]
+    def results(c: _Configuration) -> list[Numbers]:
+        return [c.position, _velocity(c), _conditioning(c)]
 
-    layouts = _COLUMN, _PARALLEL + 1, np.arange(4, 7), _MATRIX + 7
-    quality, singular, position, rows = _from_angles(columns, theta, branch, geometry, *layouts)
-    require_regular(singular, geometry)
-    return Evaluation(position, rows, quality)
+    return Evaluation(*_regular(results, theta, branch, geometry))
 
 
 def factors(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> Factors:
-    """Compute the factors of det A and det B (Eqs. 16 and 17, corrected)."""
-    return Factors(*_from_angles(lambda c: [*c.factors], theta, branch, geometry, *_FACTORS))
+    """Compute the factors of det A and det B (Eqs. 16 and 17, corrected), (...,) each."""
+    return Factors(*_from_angles(lambda c: c.factors, theta, branch, geometry))
 
 
 def factors_at(
     position: ArrayLike, branch: WorkingMode = ELBOWS_OUT, geometry: AnyLengths = PAPER
 ) -> Factors:
     """Compute the factors at points, accurately at singularities too; NaN where out of reach."""
-    columns = _from_points(lambda c: [*c.factors], position, branch, geometry, math.nan, *_FACTORS)
-    return Factors(*columns)
+    return Factors(*_from_points(lambda c: c.factors, position, branch, geometry, math.nan))
+
+
+def _regular(
+    results: _Results, theta: ArrayLike, branch: AssemblyMode, g: Geometry
+) -> list[FloatArray]:
+    """Compute results where J exists; raise SingularityError where it does not."""
+    singular, *found = _from_angles(lambda c: [c.factors[:3], *results(c)], theta, branch, g)
+    require_regular(singular, g)
+    return found
 
 
 def _from_angles(
-    columns: _Columns,
-    theta: ArrayLike,
-    branch: AssemblyMode,
-    g: Geometry,
-    *layouts: NDArray[np.intp],
+    results: _Results, theta: ArrayLike, branch: AssemblyMode, g: Geometry
 ) -> list[FloatArray]:
-    """Lay out columns for configurations at joint angles."""
+    """Compute results for configurations at joint angles."""
 
     def text(angles: equations.Triple, ns: Namespace) -> list[Numbers]:
         cos, sin = equations.arms(angles, g, ns)
         found, real, _ = equations.assembly_at(cos, sin, branch.planar, branch.sin_beta, g, ns)
-        missing = ns.where(real, 0.0, 1.0)
-        return [missing, *columns(_configuration(cos, sin, found, g, ns))]
+        return [ns.where(real, 0.0, 1.0), *results(_configuration(cos, sin, found, g, ns))]
 
     angles = finite_points("theta", theta)
-    missing, *results = by_rows(text, angles, _COLUMN, *(layout + 1 for layout in layouts))
+    missing, *found = by_rows(text, angles)
     if missing.any():
         a, b, c = angles[missing != 0][0].tolist()
         raise equations.no_assembly((a, b, c), branch, g)
-    return results
+    return found
 
 
 def _from_points(
-    columns: _Columns,
-    position: ArrayLike,
-    branch: WorkingMode,
-    g: AnyLengths,
-    missing: float,
-    *layouts: NDArray[np.intp],
+    results: _Results, position: ArrayLike, branch: WorkingMode, g: AnyLengths, missing: float
 ) -> list[FloatArray]:
-    """Lay out columns for configurations at points; ``missing`` where there is none."""
+    """Compute results for configurations at points; ``missing`` where there is none."""
 
     def text(point: equations.Triple, ns: Namespace) -> list[Numbers]:
         theta, real, link7, _ = equations.posture_at(point, branch.signs, g, ns)
         cos, sin = equations.arms(theta, g, ns)
         found = _configuration(cos, sin, equations.Assembly(*point, *link7), g, ns)
-        return [ns.where(real, column, missing) for column in columns(found)]
+        return [ns.where(real, column, missing) for column in results(found)]
 
-    return by_rows(text, points("position", position), *layouts)
+    return by_rows(text, points("position", position))
 
 
 def _configuration(
@@ -243,9 +223,9 @@ def _configuration(
     return _Configuration(found[:3], bars, equations.factors(cos, sin, found, bars, g), ns)
 
 
-def _velocity(c: _Configuration) -> list[Numbers]:
+def _velocity(c: _Configuration) -> Numbers:
     first, second, (z1, z2, _) = equations.velocity(c.rods, c.factors)
-    return [*first, *second, z1, z2, 0 * z1]
+    return first, second, (z1, z2, 0 * z1)
 
 
 def _conditioning(c: _Configuration) -> Numbers:

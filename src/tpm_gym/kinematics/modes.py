@@ -156,27 +156,3 @@ class InverseSolutions:
     theta: FloatArray
     beta: FloatArray
     valid: BoolArray
-
-
-@dataclass(frozen=True)
-class PassiveAngles:
-    """Absolute directions of the passive links, each of shape (...,), in rad.
-
-    A "swing" is an angle in the plane of the leg's arm, measured like the arm's theta. A "tilt" is
-    the elevation out of that plane.
-
-    Attributes:
-        beta: Link 7, from +x towards +y.
-        rod4_swing: Rods of the 4S parallelogram (B1C1), in the yz plane, from +y towards +z.
-        rod4_tilt: Rods of the 4S parallelogram, out of the yz plane towards +x.
-        rod6_swing: Rod 6 (B2C2), in the xz plane, from +x towards +z.
-        rod11_swing: Rods of the second parallelogram (B3C3), in the xz plane, from +x towards +z.
-        rod11_tilt: Rods of the second parallelogram, out of the xz plane towards +y.
-    """
-
-    beta: FloatArray
-    rod4_swing: FloatArray
-    rod4_tilt: FloatArray
-    rod6_swing: FloatArray
-    rod11_swing: FloatArray
-    rod11_tilt: FloatArray

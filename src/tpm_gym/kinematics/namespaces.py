@@ -5,13 +5,12 @@ gradients and GPUs. :mod:`tpm_gym.kinematics.compiled` has the same functions fo
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tpm_gym.arrays import FloatArray, is_tensor
 
@@ -36,6 +35,7 @@ class Namespace:
         signs: -1 and 1, in a given shape and as numbers like a given one.
         stack: Join components (...,) along a new last axis.
         join: Broadcast points (..., 3), and join them along their last axis.
+        solve: Solve linear systems (..., k, k) for right sides (..., k).
     """
 
     cos: _One
@@ -53,6 +53,7 @@ class Namespace:
     signs: Callable[[Any, tuple[int, ...]], Any]
     stack: Callable[[Sequence[Any]], Any]
     join: Callable[[Sequence[Any]], Any]
+    solve: Callable[[Any, Any], Any]
 
 
 def namespace_of(value: object) -> Namespace:
@@ -80,6 +81,7 @@ NUMPY = Namespace(
     signs=lambda like, shape: np.array([-1.0, 1.0]).reshape(shape),
     stack=lambda columns: np.stack(columns, axis=-1),
     join=lambda points: np.concatenate(np.broadcast_arrays(*points), axis=-1),
+    solve=lambda matrix, right: np.linalg.solve(matrix, right[..., None])[..., 0],
 )
 
 
@@ -123,38 +125,48 @@ def _torch() -> Namespace:
         signs=lambda other, shape: like([-1.0, 1.0], other).reshape(shape),
         stack=lambda columns: torch.stack(list(columns), -1),
         join=join,
+        solve=torch.linalg.solve,
     )
 
 
 def by_rows(
-    text: Callable[[Any, Namespace], Sequence[Numbers]],
-    points: FloatArray,
-    *layouts: NDArray[np.intp],
+    text: Callable[[Any, Namespace], Sequence[Numbers]], points: FloatArray
 ) -> list[FloatArray]:
-    """Compute columns (n,) from the components (n,) of points (..., k), and arrange them.
+    """Compute results from the components (n,) of points (..., k), a block of rows at a time.
+
+    A result of ``text`` is a column (n,), a tuple of columns, or a tuple of such tuples.
 
     Returns:
-        For each layout, (..., *layout.shape): the columns with the indices in the layout.
+        For each result, (..., m) for a tuple of m, and so on: axes follow those of the points.
     """
     ns, shape = namespace_of(points), points.shape[:-1]
     flat = points.reshape(-1, points.shape[-1])
-    if ns is not NUMPY:
-        table = ns.stack(text(tuple(flat.T), ns))
-        return [table[:, layout].reshape((*shape, *layout.shape)) for layout in layouts]
-    results = [np.empty((len(flat), *layout.shape)) for layout in layouts]
+    step = _BLOCK if ns is NUMPY else max(1, len(flat))
+    blocks = []
     with np.errstate(all="ignore"):
-        for start in range(0, len(flat), _BLOCK):
-            rows = slice(start, start + _BLOCK)
-            columns = text(tuple(np.ascontiguousarray(flat[rows].T)), ns)
-            for result, layout in zip(results, layouts, strict=True):
-                _lay_out(columns, layout, result[rows])
-    return [result.reshape((*shape, *result.shape[1:])) for result in results]
+        for start in range(0, max(1, len(flat)), step):
+            columns = flat[start : start + step].T
+            if ns is NUMPY:
+                columns = np.ascontiguousarray(columns)
+            results = text(tuple(columns), ns)
+            blocks.append([ns.stack([*_columns(result)]) for result in results])
+    tables = [
+        parts[0] if len(parts) == 1 else np.concatenate(parts)
+        for parts in zip(*blocks, strict=True)
+    ]
+    return [
+        table.reshape((*shape, *_axes(result)))
+        for table, result in zip(tables, results, strict=True)
+    ]
 
 
-def _lay_out(columns: Sequence[FloatArray], layout: NDArray[np.intp], out: FloatArray) -> None:
-    if layout.size > 2 * len(columns):  # then whole rows are faster
-        np.take(np.stack(columns, axis=-1), layout, axis=1, out=out, mode="clip")
-        return
-    places = out.reshape(len(out), -1)
-    for place, column in enumerate(layout.flat):
-        places[:, place] = columns[column]
+def _columns(result: Numbers) -> Iterator[Numbers]:
+    if isinstance(result, tuple):
+        for part in result:
+            yield from _columns(part)
+    else:
+        yield result
+
+
+def _axes(result: Numbers) -> tuple[int, ...]:
+    return (len(result), *_axes(result[0])) if isinstance(result, tuple) else ()

@@ -12,7 +12,6 @@ InputError for them, and UnreachableError if the branch does not exist for some 
 import math
 from typing import Any
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from tpm_gym.arrays import FloatArray, finite_points, points
@@ -26,24 +25,9 @@ from tpm_gym.kinematics.modes import (
     AssemblyMode,
     ForwardSolutions,
     InverseSolutions,
-    PassiveAngles,
     WorkingMode,
 )
-from tpm_gym.kinematics.namespaces import Namespace, by_rows, namespace_of
-
-# Which columns of _assemblies a slot holds: x, y, -y, z, beta, -beta, of both planar signs each
-_PLANAR = np.array([(mode.planar + 1) // 2 for mode in ASSEMBLY_MODES])
-_MIRRORED = np.array([2 * (mode.sin_beta < 0) for mode in ASSEMBLY_MODES])
-_POSITION = np.stack([_PLANAR, _PLANAR + 2 + _MIRRORED, _PLANAR + 6], axis=-1)
-_BETA = _PLANAR + 8 + _MIRRORED
-# Which columns of _postures: for each leg, for each bend, both signs of cos(beta); then beta
-_ANGLES = np.array(
-    [
-        [4 * leg + (bend + 1) + (mode.cos_beta + 1) // 2 for leg, bend in enumerate(mode.signs[1:])]
-        for mode in WORKING_MODES
-    ]
-)
-_ANGLE_BETA = np.array([12 + (mode.cos_beta + 1) // 2 for mode in WORKING_MODES])
+from tpm_gym.kinematics.namespaces import Namespace, by_rows
 
 
 def forward_all(theta: ArrayLike, geometry: Geometry = PAPER) -> ForwardSolutions:
@@ -55,7 +39,7 @@ def forward_all(theta: ArrayLike, geometry: Geometry = PAPER) -> ForwardSolution
     """
     require_geometry(geometry)
     angles = points("theta", theta)
-    position, beta = by_rows(lambda t, ns: _assemblies(t, geometry, ns), angles, _POSITION, _BETA)
+    position, beta = by_rows(lambda t, ns: _assemblies(t, geometry, ns), angles)
     return ForwardSolutions(position, beta, beta == beta, geometry)
 
 
@@ -63,7 +47,7 @@ def inverse_all(position: ArrayLike, geometry: Geometry = PAPER) -> InverseSolut
     """Solve the inverse kinematics on all 16 branches, for point P at position (..., 3) m."""
     require_geometry(geometry)
     places = points("position", position)
-    theta, beta = by_rows(lambda p, ns: _postures(p, geometry, ns), places, _ANGLES, _ANGLE_BETA)
+    theta, beta = by_rows(lambda p, ns: _postures(p, geometry, ns), places)
     return InverseSolutions(theta, beta, beta == beta)
 
 
@@ -74,7 +58,7 @@ def forward(
 
     The default branch gives y > 0; ``AssemblyMode(-1, -1)`` gives its mirror image.
     """
-    return _assembled(points("theta", theta), branch, geometry).position[..., branch.index, :]
+    return assembled(theta, branch, geometry).position[..., branch.index, :]
 
 
 def inverse(
@@ -90,40 +74,19 @@ def inverse(
     return solutions.theta[..., branch.index, :]
 
 
-def passive_angles(
-    theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
-) -> PassiveAngles:
-    """Compute the directions of all passive links at theta (..., 3) rad, on one named branch."""
-    angles = points("theta", theta)
-    solutions, slot = _assembled(angles, branch, geometry), branch.index
-    ns, beta, l4 = namespace_of(angles), solutions.beta[..., slot], geometry.l4
-    x, y, z = (solutions.position[..., slot, axis] for axis in range(3))
-    x_c, z_c = (solutions.link3[..., slot, axis] for axis in range(2))
-    cos, sin = equations.arms((angles[..., 0], angles[..., 1], angles[..., 2]), geometry, ns)
-    found = equations.Assembly(x, y, z, x_c, z_c, ns.cos(beta), ns.sin(beta))
-    (r1x, r1y, r1z), (r2x, _, r2z), (r3x, r3y, r3z) = equations.rods(cos, sin, found, geometry)
-    return PassiveAngles(
-        beta=beta,
-        rod4_swing=ns.arctan2(r1z, r1y),
-        rod4_tilt=ns.arcsin(r1x / l4),
-        rod6_swing=ns.arctan2(r2z, r2x),
-        rod11_swing=ns.arctan2(r3z, r3x),
-        rod11_tilt=ns.arcsin(r3y / l4),
-    )
-
-
-def _assembled(theta: FloatArray, branch: AssemblyMode, geometry: Geometry) -> ForwardSolutions:
-    """Compute all solutions, where those of ``branch`` have to exist."""
-    solutions = forward_all(finite_points("theta", theta), geometry)
+def assembled(theta: ArrayLike, branch: AssemblyMode, geometry: Geometry) -> ForwardSolutions:
+    """Compute all solutions as :func:`forward_all` does; those on ``branch`` have to exist."""
+    angles = finite_points("theta", theta)
+    solutions = forward_all(angles, geometry)
     valid = solutions.valid[..., branch.index]
     if not valid.all():
-        a, b, c = theta[~valid][0].tolist()
+        a, b, c = angles[~valid][0].tolist()
         raise equations.no_assembly((a, b, c), branch, geometry)
     return solutions
 
 
 def _assemblies(theta: equations.Triple, g: Geometry, ns: Namespace) -> list[Any]:
-    """Compute both planar signs; the other half is the mirror image."""
+    """Compute position and beta in all slots: both planar signs; y < 0 is the mirror image."""
     cos, sin = equations.arms(theta, g, ns)
     planar = ns.signs(theta[0], (2, 1))
     found, real, (reached, *_) = equations.assembly_at(cos, sin, planar, 1.0, g, ns)
@@ -132,16 +95,29 @@ def _assemblies(theta: equations.Triple, g: Geometry, ns: Namespace) -> list[Any
     )
     z = ns.where(reached, found.z, math.nan)
     beta = ns.arccos(cos_beta)
-    return [*x, *y, *-y, *z, *beta, *-beta]
+    slots = [((mode.planar + 1) // 2, (mode.sin_beta + 1) // 2) for mode in ASSEMBLY_MODES]
+    y, beta = (-y, y), (-beta, beta)
+    return [
+        tuple((x[planar], y[side][planar], z[planar]) for planar, side in slots),
+        tuple(beta[side][planar] for planar, side in slots),
+    ]
 
 
 def _postures(point: equations.Triple, g: Geometry, ns: Namespace) -> list[Any]:
-    """Compute two bends of each leg, for both signs of cos(beta)."""
+    """Compute angles and beta in all slots: two bends of each leg, for both signs of cos(beta)."""
     sides, bends = ns.signs(point[0], (2, 1)), ns.signs(point[0], (2, 1, 1))
     theta, real, (*_, sin_beta), _ = equations.posture_at(
         point, (sides, bends, bends, bends), g, ns
     )
     acute = ns.arcsin(sin_beta)
     obtuse = ns.where(point[1] < 0, -math.pi - acute, math.pi - acute)
-    angles = [row for leg in theta for both in ns.where(real, leg, math.nan) for row in both]
-    return [*angles, ns.where(real[0], obtuse, math.nan), ns.where(real[1], acute, math.nan)]
+    beta = ns.where(real[0], obtuse, math.nan), ns.where(real[1], acute, math.nan)
+    legs = [ns.where(real, leg, math.nan) for leg in theta]
+    slots = [[(sign + 1) // 2 for sign in mode.signs] for mode in WORKING_MODES]
+    return [
+        tuple(
+            tuple(leg[bend][side] for leg, bend in zip(legs, bent, strict=True))
+            for side, *bent in slots
+        ),
+        tuple(beta[side] for side, *_ in slots),
+    ]

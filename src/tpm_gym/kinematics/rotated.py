@@ -24,8 +24,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from tpm_gym.arrays import BoolArray, FloatArray, numbers, points
 from tpm_gym.kinematics import equations
+from tpm_gym.kinematics.equations import Factors
 from tpm_gym.kinematics.geometry import PAPER, Geometry, require_geometry
-from tpm_gym.kinematics.jacobian import Factors
 from tpm_gym.kinematics.namespaces import NUMPY
 
 _Planar = NDArray[np.complex128]
@@ -162,22 +162,6 @@ def inverse_rotated(position: ArrayLike, geometry: Geometry = PAPER) -> RotatedP
     )
     theta, link3 = np.stack([one, two, three], axis=-1), np.stack([x_c, z_c], axis=-1)
     return RotatedPostures(theta, link3, tilt, beta, g)
-
-
-@np.errstate(all="ignore")
-def transition(
-    theta_1: ArrayLike, beta: ArrayLike, side: ArrayLike = -1, geometry: Geometry = PAPER
-) -> FloatArray:
-    """Compute points P (..., 3) m of the surface on which both modes meet.
-
-    Angles (...,) rad and ``side`` (...,), the sign of xC, broadcast. The surface is a curve of C1,
-    on which rods 4a and 4b are level in x, swept by link 7. NaN where rods 4 do not reach y = 0;
-    that arms 2 and 3 reach is not checked.
-    """
-    g, (one, turn) = geometry, (np.asarray(theta_1), np.asarray(beta))
-    x_c = np.asarray(side) * np.sqrt(g.l4**2 - (g.l1 + g.l3 * np.cos(one)) ** 2)
-    x, y = x_c + g.l7 * np.cos(turn) + g.l2, g.l7 * np.sin(turn)
-    return np.stack(np.broadcast_arrays(x, y, g.l3 * np.sin(one) + 2 * g.l6), axis=-1)
 
 
 def _dot(a: _Planar, b: _Planar) -> FloatArray:
@@ -346,12 +330,14 @@ def _link7(
 def factors(postures: RotatedPostures) -> Factors:
     """Compute the factors that are zero where a rotated assembly is singular.
 
-    * parallel (..., 3): sin(beta); level3 = l7 cos(beta) - B3C3 . u (m), with u along link 3';
-      planar = B2C2 . dC2/dphi with motor 1 locked (m^2/rad), zero where the lines of rods 4a, 4b
+    The names are those of :class:`.equations.Factors`, with these formulas, (...,) each:
+
+    * level3 = l7 cos(beta) - B3C3 . u, m, with u along link 3'.
+    * planar = B2C2 . dC2/dphi with motor 1 locked, m^2/rad, zero where the lines of rods 4a, 4b
       and 6, seen along y, meet in one point.
-    * serial (..., 4): cos(beta); leg 1 (m^2/rad), zero where motor 1 turns while P rests and
-      link 3' turns about it; B_iC_i . dB_i/dtheta_i (m^2/rad) for i = 2, 3.
-    * constraint (...,): z_C1 - z_B1 = -rho sin(phi / 2) (m), zero where both modes meet.
+    * leg1, m^2/rad, zero where motor 1 turns while P rests and link 3' turns about it.
+    * leg2 and leg3 = B_iC_i . dB_i/dtheta_i, m^2/rad.
+    * elevation = z_C1 - z_B1 = -rho sin(phi / 2), m, zero where both modes meet.
     """
     g = postures.geometry
     rods, rates = postures.rods, _elbow_rates(postures.theta, g)
@@ -368,11 +354,8 @@ def factors(postures: RotatedPostures) -> Factors:
     leg1 -= up * n.real * (_dot(n, 1j * p) + bend / rho)
     leg2, leg3 = (np.sum(rods[..., i + 1, :] * rates[..., i, :], axis=-1) for i in (1, 2))
     sin, cos = np.sin(postures.beta), np.cos(postures.beta)
-    return Factors(
-        np.stack([sin, g.l7 * cos - _dot(rod11, u), planar], axis=-1),
-        np.stack([cos, leg1, leg2, leg3], axis=-1),
-        c1.imag - b1[..., 2],
-    )
+    level3, elevation = g.l7 * cos - _dot(rod11, u), c1.imag - b1[..., 2]
+    return Factors(sin, level3, planar, cos, leg1, leg2, leg3, elevation)
 
 
 @np.errstate(all="ignore")

@@ -57,11 +57,6 @@ class Region:
         """Yield the eight corners, m."""
         return product(*zip(self.low, self.high, strict=True))  # type: ignore[return-value]
 
-    def margin(self, point: ArrayLike) -> float:
-        """Compute the signed distance of a point (3,) to the nearest face, m; negative outside."""
-        array = np.asarray(point, dtype=np.float64)
-        return float(np.minimum(array - self.low, np.asarray(self.high) - array).min())
-
 
 def reachable(
     position: ArrayLike, branch: WorkingMode = ELBOWS_OUT, geometry: Geometry = PAPER

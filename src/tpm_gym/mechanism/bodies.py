@@ -16,8 +16,6 @@ from numpy.typing import ArrayLike
 
 from tpm_gym.arrays import FloatArray, Vector
 
-__all__ = ["ALUMINIUM", "STEEL", "Closure", "Joint", "Link", "Mechanism", "Place", "Solid"]
-
 ALUMINIUM, STEEL = 2700.0, 7850.0  # kg/m^3
 
 

@@ -12,8 +12,6 @@ from typing import Any, NamedTuple
 from tpm_gym.arrays import Vector, rotate
 from tpm_gym.mechanism.bodies import ALUMINIUM, STEEL, Joint, Link, Solid
 
-__all__ = ["CUP", "VacuumCup", "sealed"]
-
 _SILICONE = 1150.0  # kg/m^3
 
 
@@ -25,7 +23,7 @@ class VacuumCup(NamedTuple):
         radius: Radius of the lip, m.
         bellows: Length of the part with the radius of the lip, m.
         stroke: Distance by which the cup can slide back into its stem, m.
-        preload: Force with which the spring keeps the cup out, N. It exceeds ``pull_off``.
+        preload: Force with which the spring keeps the cup out, N. It exceeds ``vacuum * area``.
         vacuum: Largest pressure difference to the ambient air, Pa.
         area: Area within the lip, on which the vacuum acts, m^2.
         evacuation_time: Time constant with which the vacuum builds up in a sealed cup, s. It is
@@ -54,11 +52,6 @@ class VacuumCup(NamedTuple):
     seal_friction: float = 1.0
     seal_gap: float = 0.002
     seal_tilt: float = math.radians(10.0)
-
-    @property
-    def pull_off(self) -> float:
-        """Largest force that the full vacuum holds, in any direction but up, N."""
-        return self.vacuum * self.area
 
     @property
     def lip(self) -> Vector:

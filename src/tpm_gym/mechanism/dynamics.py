@@ -25,11 +25,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from tpm_gym.arrays import FloatArray, Vector, finite, finite_points, is_tensor, numbers, vector
 from tpm_gym.errors import ConfigurationError, InputError
@@ -42,10 +41,6 @@ from tpm_gym.mechanism import tree
 from tpm_gym.mechanism.inertia import Inertia, Swing, inertia_of
 from tpm_gym.mechanism.mount import GRAVITY
 
-_SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # places in the upper triangle, by rows
-_VECTOR = np.arange(3)
-_MATRIX = np.arange(9).reshape(3, 3)
-_CHECKS = 4  # columns before the results: whether it is not assembled, and the factors of det A
 _REST = (0.0, 0.0, 0.0)
 
 
@@ -162,7 +157,7 @@ def carried(
 
 
 def masses(pose: Pose, j: tuple[Triple, Triple, Triple], m: Inertia) -> tuple[Numbers, ...]:
-    """Compute the upper triangle of M, by rows, from the kinetic energy of :func:`energies`.
+    """Compute the upper triangle of M, by rows, from the bodies' kinetic energy.
 
     Args:
         pose: Configuration.
@@ -199,34 +194,17 @@ def masses(pose: Pose, j: tuple[Triple, Triple, Triple], m: Inertia) -> tuple[Nu
     )  # fmt: skip
 
 
-def energies(pose: Pose, rates: Triple, gravity: Triple, m: Inertia) -> tuple[Numbers, Numbers]:
-    """Compute kinetic and potential energy, J; the latter up to a constant."""
+def potential(pose: Pose, gravity: Triple, m: Inertia) -> Numbers:
+    """Compute the potential energy, J, up to a constant."""
     (c1, c2, c3), (s1, s2, s3), found = pose.cos, pose.sin, pose.found
-    (r1x, r1y, r1z), _, (r3x, r3y, r3z) = pose.rods
-    (u1, u2, u3), (k1, k2, k3), (j1, j2, j3) = rates, m.couples, m.motors
-    v = velocities(pose, rates)
-    (cx, cz), (px, py, pz) = v.link3, v.platform
-    swing1 = (r1y * v.rod1[2] - r1z * v.rod1[1]) / (r1y * r1y + r1z * r1z)
-    swing3 = (r3x * v.rod3[2] - r3z * v.rod3[0]) / (r3x * r3x + r3z * r3z)
-    squares = (
-        j1 * u1 * u1 + j2 * u2 * u2 + j3 * u3 * u3
-        + m.link3 * (cx * cx + cz * cz) + m.platform * (px * px + py * py + pz * pz)
-        + (m.swing1.fixed + m.swing1.spin * r1x * r1x) * swing1 * swing1
-        + (m.swing3.fixed + m.swing3.spin * r3y * r3y) * swing3 * swing3
-    )  # fmt: skip
-    products = (
-        k1 * u1 * c1 * cz + k2 * u2 * (c2 * cz - s2 * cx) + k3 * u3 * (c3 * pz - s3 * px)
-        + m.link7 * (cx * px + cz * pz)
-    )  # fmt: skip
-    gx, gy, gz = gravity
+    (k1, k2, k3), (gx, gy, gz) = m.couples, gravity
     w1, w2, w3 = (weight + couple for weight, couple in zip(m.weights, m.couples, strict=True))
     at_c, at_p = m.link3 + k1 + k2 + m.link7, m.platform + k3 + m.link7
-    potential = -(
+    return -(
         gx * (w2 * c2 + w3 * c3 + at_c * found.x_c + at_p * found.x)
         + gy * (w1 * c1 + at_p * found.y)
         + gz * (w1 * s1 + w2 * s2 + w3 * s3 + at_c * found.z_c + at_p * found.z)
     )
-    return squares / 2 + products, potential
 
 
 def velocities(pose: Pose, rates: Triple) -> Velocities:
@@ -300,19 +278,6 @@ def _swing(rod: Triple, rates: Triple, changes: tuple[Numbers, Numbers], m: Swin
     return -m.spin * out * rate * rate, -z * moment / square, level * moment / square
 
 
-def solve(matrix: tuple[Numbers, ...], right: Triple) -> Triple:
-    """Solve a linear system with a symmetric positive matrix, given by its upper triangle."""
-    (a, b, c, d, e, f), (p, q, r) = matrix, right
-    below, last = b / a, c / a
-    second, rest = d - below * b, e - last * b
-    cross = rest / second
-    q = q - below * p
-    r = r - last * p - cross * q
-    z = r / (f - last * c - cross * rest)
-    y = q / second - cross * z
-    return p / a - below * y - last * z, y, z
-
-
 # -- points and batches ----------------------------------------------------------------------------
 
 
@@ -363,79 +328,80 @@ class Dynamics:
     def torque(self, theta: ArrayLike, theta_dot: ArrayLike, theta_ddot: ArrayLike) -> FloatArray:
         """Compute the motors' torques (..., 3) N m, M theta_ddot + C theta_dot + g."""
         states = {"theta": theta, "theta_dot": theta_dot, "theta_ddot": theta_ddot}
-        return self._rows(self._torques, states, _VECTOR)[0]
+        return self._rows(lambda *state: [self._torques(*state)], states)[0]
 
     def gravity(self, theta: ArrayLike) -> FloatArray:
         """Compute the torques (..., 3) N m that hold the machine at rest."""
-        rest = partial(self._torques, rates=_REST, changes=_REST)
-        return self._rows(rest, {"theta": theta}, _VECTOR)[0]
+        return self._rows(lambda pose: [self._torques(pose, _REST, _REST)], {"theta": theta})[0]
 
     def mass_matrix(self, theta: ArrayLike) -> FloatArray:
         """Compute the mass matrix M, (..., 3, 3) kg m^2, symmetric and positive."""
-        return self._rows(self._masses, {"theta": theta}, _SYMMETRIC)[0]
+        return self._rows(lambda pose: [self._masses(pose)], {"theta": theta})[0]
 
     def coriolis(self, theta: ArrayLike, theta_dot: ArrayLike) -> FloatArray:
         """Compute C (..., 3, 3) kg m^2/s from Christoffel's symbols, so that M' - 2 C is skew."""
 
-        def columns(pose: Pose, rates: Triple) -> list[Numbers]:
+        def results(pose: Pose, rates: Triple) -> list[Numbers]:
             def quadratic(sign: float, k: int) -> Triple:
                 a, b, c = (u + sign * (i == k) for i, u in enumerate(rates))
                 return torques(pose, (a, b, c), _REST, _REST, self.inertia)
 
             # For the part q(u) of the torques that is quadratic, q(u + e) - q(u - e) = 4 C(u) e
             pairs = [(quadratic(1.0, k), quadratic(-1.0, k)) for k in range(3)]
-            return [(up[row] - down[row]) / 4 for row in range(3) for up, down in pairs]
+            return [
+                tuple(tuple((up[row] - down[row]) / 4 for up, down in pairs) for row in range(3))
+            ]
 
-        return self._rows(columns, {"theta": theta, "theta_dot": theta_dot}, _MATRIX)[0]
+        return self._rows(results, {"theta": theta, "theta_dot": theta_dot})[0]
 
     def forward(self, theta: ArrayLike, theta_dot: ArrayLike, torque: ArrayLike) -> FloatArray:
         """Compute accelerations (..., 3) rad/s^2 under the motors' torques (..., 3) N m."""
 
-        def columns(pose: Pose, rates: Triple, given: Triple) -> Triple:
-            one, two, three = self._torques(pose, rates, _REST)
-            rest = given[0] - one, given[1] - two, given[2] - three
-            return solve(self._masses(pose), rest)
+        def results(pose: Pose, rates: Triple, given: Triple) -> list[Numbers]:
+            bias = self._torques(pose, rates, _REST)
+            rest = tuple(one - other for one, other in zip(given, bias, strict=True))
+            return [self._masses(pose), rest]
 
         states = {"theta": theta, "theta_dot": theta_dot, "torque": torque}
-        return self._rows(columns, states, _VECTOR)[0]
+        mass, rest = self._rows(results, states)
+        found: FloatArray = namespace_of(mass).solve(mass, rest)
+        return found
 
     def energy(self, theta: ArrayLike, theta_dot: ArrayLike) -> Energy:
         """Compute kinetic and potential energy, (...,) J."""
 
-        def columns(pose: Pose, rates: Triple) -> tuple[Numbers, Numbers]:
-            return energies(pose, rates, self.free_fall, self.inertia)
+        def results(pose: Pose, rates: Triple) -> list[Numbers]:
+            pairs = zip(self._masses(pose), rates, strict=True)
+            twice = sum(u * m * v for row, u in pairs for m, v in zip(row, rates, strict=True))
+            return [twice / 2, potential(pose, self.free_fall, self.inertia)]
 
-        states = {"theta": theta, "theta_dot": theta_dot}
-        return Energy(*self._rows(columns, states, np.array(0), np.array(1)))
+        return Energy(*self._rows(results, {"theta": theta, "theta_dot": theta_dot}))
 
     def _torques(self, pose: Pose, rates: Triple, changes: Triple) -> Triple:
         return torques(pose, rates, changes, self.free_fall, self.inertia)
 
-    def _masses(self, pose: Pose) -> tuple[Numbers, ...]:
-        return masses(pose, equations.velocity(pose.rods, pose.factors), self.inertia)
+    def _masses(self, pose: Pose) -> tuple[Triple, Triple, Triple]:
+        rows = equations.velocity(pose.rods, pose.factors)
+        a, b, c, d, e, f = masses(pose, rows, self.inertia)
+        return (a, b, c), (b, d, e), (c, e, f)
 
     def _rows(
-        self,
-        text: Callable[..., Sequence[Numbers]],
-        states: Mapping[str, ArrayLike],
-        *layouts: NDArray[np.intp],
+        self, text: Callable[..., Sequence[Numbers]], states: Mapping[str, ArrayLike]
     ) -> list[FloatArray]:
-        """Apply ``text`` to a pose and triples of numbers, for each row of the states."""
+        """Compute the results of ``text`` from a pose and triples, for each row of the states."""
 
-        def columns(values: tuple[Numbers, ...], ns: Namespace) -> list[Numbers]:
+        def results(values: tuple[Numbers, ...], ns: Namespace) -> list[Numbers]:
             theta, *rest = (values[i : i + 3] for i in range(0, len(values), 3))
             pose, real = pose_at(theta, self.branch.signs, self.geometry, ns)
-            missing = ns.where(real, 0.0, 1.0)
-            return [missing, *pose.factors[:3], *text(pose, *rest)]
+            return [ns.where(real, 0.0, 1.0), pose.factors[:3], *text(pose, *rest)]
 
         table = _side_by_side(states)
-        shifted = (layout + _CHECKS for layout in layouts)
-        missing, factors, *results = by_rows(columns, table, np.array(0), _VECTOR + 1, *shifted)
+        missing, factors, *found = by_rows(results, table)
         if missing.any():
             a, b, c = table[..., :3][missing != 0][0].tolist()
             raise equations.no_assembly((a, b, c), self.branch, self.geometry)
         require_regular(factors, self.geometry)
-        return results
+        return found
 
 
 def _side_by_side(states: Mapping[str, ArrayLike]) -> FloatArray:

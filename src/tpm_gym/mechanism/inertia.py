@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.kinematics.geometry import Geometry
 from tpm_gym.kinematics.namespaces import Numbers
@@ -28,7 +29,7 @@ _ROUNDING = 1e-9  # of a centre of mass, m; of two equal moments, relative
 
 
 class Swing(NamedTuple):
-    """Inertia of a leg's swing beside its rods' masses: T = (fixed + spin out^2) rate^2 / 2.
+    """Inertia of a leg's swing without its rods' masses: T = (fixed + spin out^2) rate^2 / 2.
 
     Here ``out`` is the component of BC along the swing's axis, m.
 
@@ -72,16 +73,6 @@ def flat(inertia: Inertia) -> list[float]:
     return [*legs, *points, *inertia.swing1, *inertia.swing3]
 
 
-class _Bar(NamedTuple):
-    near: float
-    couple: float
-    far: float
-
-    def __add__(self, other: _Bar) -> _Bar:  # type: ignore[override]
-        """Two bars between the same points."""
-        return _Bar(*(one + two for one, two in zip(self, other, strict=True)))
-
-
 def inertia_of(
     mechanism: Mechanism,
     geometry: Geometry,
@@ -118,14 +109,15 @@ def inertia_of(
         sum(bodies.moment(f"{rod}{suffix}", along) for suffix in "ab") / l4**2
         for rod, along in (("rod_4", Y), ("rod_11", X))
     )
-    legs = list(zip(arms, rods, elbows, strict=True))
+    _, arm_couple, arm_far = np.transpose(arms)
+    near, couple, far = np.transpose(rods)
     found = Inertia(
-        motors=_three((arm.far + rod.near + elbow) * l3**2 for arm, rod, elbow in legs),
-        weights=_three(arm.couple + arm.far + rod.near + elbow for arm, rod, elbow in legs),
-        couples=_three(rod.couple for rod in rods),
-        link3=bodies.mass("link_3p") + rods[0].far + rods[1].far + link7.near,
-        link7=link7.couple,
-        platform=translating + rods[2].far + link7.far + payload,
+        motors=_three((arm_far + near + elbows) * l3**2),
+        weights=_three(arm_couple + arm_far + near + elbows),
+        couples=_three(couple),
+        link3=bodies.mass("link_3p") + far[0] + far[1] + link7[0],
+        link7=link7[1],
+        platform=translating + far[2] + link7[2] + payload,
         swing1=Swing(crosses[0][1] + crosses[1][1], spin4),
         swing3=Swing(end9[1], spin11),
     )
@@ -159,19 +151,16 @@ class _Bodies:
         self._require_on_axis(name, [k for k in (X, Y, Z) if k != axis])
         return self.mass(name), self.moment(name, axis)
 
-    def bar(self, name: str, along: int, about: int, length: float) -> _Bar:
-        """Compute the constants of a bar that turns in a plane, about an axis across the bar."""
+    def bar(self, name: str, along: int, about: int, length: float) -> FloatArray:
+        """Compute a, b and c of a bar that turns in a plane, about an axis across the bar."""
         self._require_on_axis(name, [k for k in (X, Y, Z) if k not in (along, about)])
         share = float(self._link(name).centre_of_mass[along]) / length
         mass, turning = self.mass(name), self.moment(name, about) / length**2
-        return _Bar(
-            mass * (1 - share) ** 2 + turning,
-            mass * share * (1 - share) - turning,
-            mass * share**2 + turning,
-        )
+        near, far = mass * (1 - share) ** 2 + turning, mass * share**2 + turning
+        return np.array([near, mass * share * (1 - share) - turning, far])
 
-    def round_bar(self, name: str, along: int, length: float) -> _Bar:
-        """Compute the constants of a bar that turns in space, and so must be round."""
+    def round_bar(self, name: str, along: int, length: float) -> FloatArray:
+        """Compute a, b and c of a bar that turns in space, and so must be round."""
         one, other = (k for k in (X, Y, Z) if k != along)
         self._require_on_axis(name, [one, other])
         moments = self._link(name).inertia

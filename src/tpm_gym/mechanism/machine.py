@@ -35,16 +35,6 @@ from tpm_gym.mechanism.bodies import Mechanism
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.mount import Mount
 
-__all__ = [
-    "MODES",
-    "Machine",
-    "Motion",
-    "Reading",
-    "find_machine",
-    "machine_names",
-    "register_machine",
-]
-
 MODES: Final = (None, "assembly", "working")
 """Names of the numbers of :meth:`Machine.mode_left`."""
 
@@ -177,7 +167,7 @@ class Machine(ABC):
 
     @abstractmethod
     def inverse(self, position: ArrayLike, built: FloatArray | None = None) -> FloatArray:
-        """Compute joint positions (..., 3) for P at ``position``, on the machine's working mode.
+        """Compute joint positions (..., 3) for P at ``position``, in the machine's working mode.
 
         Args:
             position: Point P (..., 3) m.
@@ -187,7 +177,7 @@ class Machine(ABC):
 
     @abstractmethod
     def evaluate(self, theta: ArrayLike, built: FloatArray | None = None) -> Reading:
-        """Compute P, J and conditioning at ``theta`` (..., 3), on the machine's assembly mode."""
+        """Compute P, J and conditioning at ``theta`` (..., 3), in the machine's assembly mode."""
 
     def forward(self, theta: ArrayLike, built: FloatArray | None = None) -> FloatArray:
         """Compute P (..., 3) m at ``theta`` (..., 3), in the machine's modes."""
@@ -380,7 +370,7 @@ class Machine(ABC):
 
     @property
     def lengths(self) -> tuple[float, ...]:
-        """The lengths, m, in which a machine as built may differ from its drawing."""
+        """Lengths, m, that can differ between a built machine and the nominal one."""
         return ()
 
     def with_lengths(self, lengths: tuple[float, ...]) -> Machine:

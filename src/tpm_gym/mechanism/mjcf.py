@@ -1,26 +1,18 @@
 """MJCF (the format of MuJoCo): elements of a Mechanism, and a file of the paper's robot.
 
 MuJoCo closes loops itself. Each ball joint of a loop is an equality constraint between two sites.
-Run ``python -m tpm_gym.mechanism.mjcf FOLDER`` to write the file.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterable
-from pathlib import Path
 from xml.etree.ElementTree import Comment, Element, indent, tostring
 
 from tpm_gym.mechanism.bodies import Link, Mechanism, Solid
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.mount import Mount
-from tpm_gym.mechanism.tpm import PAPER_TPM
 from tpm_gym.mechanism.urdf import COLOURS, add, numbers
-
-__all__ = ["MJCF_FILE", "SOLID", "STIFF", "mjcf_text", "robot", "site_names", "write"]
-
-MJCF_FILE = "tpm.xml"
 
 SOLID = "solid"
 """Class of geoms that collide; geoms of the other class are only drawn."""
@@ -114,14 +106,6 @@ def mjcf_text(machine: Machine) -> str:
     return '<?xml version="1.0"?>\n' + tostring(root, encoding="unicode") + "\n"
 
 
-def write(folder: Path, machine: Machine = PAPER_TPM) -> Path:
-    """Write the file into ``folder`` (created if missing), and return its path."""
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / MJCF_FILE
-    path.write_text(mjcf_text(machine), encoding="utf-8", newline="\n")
-    return path
-
-
 def _add_body(world: Element, bodies: dict[str, Element], link: Link, mount: Mount) -> Element:
     """Add a link to its parent, or the base to the world."""
     joint = link.joint
@@ -186,14 +170,3 @@ def _add_home(root: Element, machine: Machine, joints: Iterable[str]) -> None:
     at = machine.joint_positions((a, b, c))
     frames = add(root, "keyframe")
     add(frames, "key", name="home", qpos=[at[name] for name in joints], ctrl=theta)
-
-
-def main() -> None:
-    """Write the file of the paper's robot."""
-    parser = argparse.ArgumentParser(description="Write the robot as MJCF.")
-    parser.add_argument("folder", type=Path)
-    print(write(parser.parse_args().folder))
-
-
-if __name__ == "__main__":
-    main()

@@ -15,14 +15,11 @@ the peak torque T is available up to the corner speed, w0 - T / K^2.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Literal
 
 from tpm_gym.arrays import Vector
 from tpm_gym.mechanism.bodies import ALUMINIUM, STEEL, Solid
-
-__all__ = ["TORQUE_MOTOR", "Motor"]
 
 _FACE = 0.002  # m
 
@@ -31,7 +28,7 @@ Axis = Literal["x", "y", "z"]
 
 @dataclass(frozen=True)
 class Motor:
-    """A frameless torque motor in two equal halves on one shaft, either side of what it turns.
+    """Frameless torque motor: equal halves on one shaft, one on each side of the arm.
 
     Attributes:
         peak_torque: Torque of both halves together, for seconds, N m.
@@ -56,17 +53,6 @@ class Motor:
     stator_radius: float
     end_turns: float
     clearance: float
-
-    @property
-    def shear_stress(self) -> float:
-        """Magnetic shear stress in the air gap at the peak torque, Pa."""
-        return self.peak_torque / (2 * math.pi * self.gap_radius**2 * self.length)
-
-    @property
-    def rotor_inertia(self) -> float:
-        """Moment of inertia of both rings about the shaft, kg m^2."""
-        outer, inner = self.gap_radius, self.gap_radius - self.ring
-        return STEEL * math.pi * self.length * (outer**4 - inner**4) / 2
 
     @property
     def corner_speed(self) -> float:

@@ -12,8 +12,6 @@ from numpy.typing import ArrayLike
 from tpm_gym.arrays import FloatArray, Quaternion, Vector, finite
 from tpm_gym.errors import ConfigurationError
 
-__all__ = ["GRAVITY", "Mount"]
-
 GRAVITY = 9.81
 """m/s^2, along the world's -z."""
 
@@ -36,7 +34,7 @@ class Mount:
     height: float
 
     def __post_init__(self) -> None:
-        """Reject heights that cost coordinates their digits."""
+        """Reject heights so large that coordinates lose precision."""
         if not abs(finite("height", self.height, (), ConfigurationError)) <= 100:
             raise ConfigurationError("height", self.height, "at most 100 m")
 

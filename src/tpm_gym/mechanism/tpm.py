@@ -26,8 +26,6 @@ from tpm_gym.mechanism.inertia import flat, inertia_of
 from tpm_gym.mechanism.machine import Machine, Motion, Reading, register_machine
 from tpm_gym.mechanism.mount import Mount
 
-__all__ = ["ASSEMBLY_LIMIT", "PAPER_TPM", "TPM", "WIDE_TPM"]
-
 ASSEMBLY_LIMIT = 0.010
 """Largest distance between platform and forward kinematics in the same assembly mode, m."""
 

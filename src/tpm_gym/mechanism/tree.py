@@ -28,9 +28,11 @@ from numpy.typing import ArrayLike
 
 from tpm_gym.arrays import FloatArray, Vector, vector
 from tpm_gym.errors import InputError
-from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode, passive_angles
+from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode, equations
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.kinematics.modes import ROTATED_MODES, RotatedMode
+from tpm_gym.kinematics.namespaces import NUMPY
+from tpm_gym.kinematics.position import assembled
 from tpm_gym.kinematics.rotated import RotatedPostures, forward_rotated
 from tpm_gym.mechanism.bodies import ALUMINIUM, STEEL, Closure, Joint, Link, Mechanism, Solid
 from tpm_gym.mechanism.cup import CUP
@@ -237,10 +239,15 @@ def joint_arrays(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> dict[str, FloatArray]:
     """Compute the angles (...,) of all joints for theta (..., 3); see :func:`joint_angles`."""
-    found = passive_angles(theta, branch, geometry)
-    swings = found.rod4_swing, found.rod4_swing, found.rod6_swing, found.rod11_swing
-    tilts = found.rod4_tilt, found.rod4_tilt, found.rod11_tilt
-    return _by_joint(np.asarray(theta, dtype=np.float64), swings, tilts, found.beta)
+    solutions, slot = assembled(theta, branch, geometry), branch.index
+    one, two, three = np.moveaxis(np.asarray(theta, dtype=np.float64), -1, 0)
+    beta = solutions.beta[..., slot]
+    x, y, z = np.moveaxis(solutions.position[..., slot, :], -1, 0)
+    x_c, z_c = np.moveaxis(solutions.link3[..., slot, :], -1, 0)
+    found = equations.Assembly(x, y, z, x_c, z_c, np.cos(beta), np.sin(beta))
+    cos, sin = equations.arms((one, two, three), geometry, NUMPY)
+    rod4, rod6, rod11 = equations.rods(cos, sin, found, geometry)
+    return _by_joint((one, two, three), (rod4, rod4, rod6, rod11), beta, geometry)
 
 
 def rotated_joint_angles(
@@ -263,34 +270,34 @@ def rotated_joint_angles(
 
 def rotated_joint_arrays(postures: RotatedPostures) -> dict[str, FloatArray]:
     """Compute the angles (...,) of all joints in postures (...,) with link 3' turned, rad."""
-    x, y, z = (np.moveaxis(postures.rods[..., axis], -1, 0) for axis in range(3))
-    l4 = postures.geometry.l4
-    swings = *np.arctan2(z[:2], y[:2]), *np.arctan2(z[2:], x[2:])
-    tilts = *np.arcsin(x[:2] / l4), np.arcsin(y[3] / l4)
-    return _by_joint(postures.theta, swings, tilts, postures.beta, postures.tilt)
+    one, two, three = np.moveaxis(postures.theta, -1, 0)
+    rods = [(x, y, z) for x, y, z in np.moveaxis(postures.rods, (-2, -1), (0, 1))]
+    return _by_joint((one, two, three), rods, postures.beta, postures.geometry, postures.tilt)
 
 
 def _by_joint(
-    theta: FloatArray,
-    swings: Sequence[FloatArray],
-    tilts: Sequence[FloatArray],
+    theta: equations.Triple,
+    rods: Sequence[equations.Triple],
     beta: FloatArray,
+    g: Geometry,
     turn: FloatArray | float = 0.0,
 ) -> dict[str, FloatArray]:
-    """Convert absolute directions to joint angles (less those of the parents), all in rad.
+    """Compute joint angles from the rods 4a, 4b, 6 and 11 (x, y, z) m, and link 7's beta, rad.
 
-    Swings are those of rods 4a, 4b, 6 and 11; tilts those of rods 4a, 4b and 11. ``turn`` is the
-    turn of link 3' and the platform about y; joints turn about -y.
+    A swing is the angle of a rod in the plane of its arm, and a tilt its elevation out of this
+    plane. A joint angle is the difference to the parent's. ``turn`` is the turn of link 3' and the
+    platform about y; joints turn about -y.
     """
-    theta_1, theta_2, theta_3 = np.moveaxis(theta, -1, 0)
-    swing_4a, swing_4b, swing_6, swing_11 = swings
-    tilt_4a, tilt_4b, tilt_11 = tilts
+    theta_1, theta_2, theta_3 = theta
+    (x_4a, y_4a, z_4a), (x_4b, y_4b, z_4b), (x_6, _, z_6), (x_11, y_11, z_11) = rods
+    swing_6, swing_11 = np.arctan2(z_6, x_6), np.arctan2(z_11, x_11)
+    tilt_11 = NUMPY.arcsin(y_11 / g.l4)
     return {
         "R11": theta_1,
-        "Sa_swing": swing_4a - theta_1,
-        "Sa_tilt": tilt_4a,
-        "Sb_swing": swing_4b - theta_1,
-        "Sb_tilt": tilt_4b,
+        "Sa_swing": np.arctan2(z_4a, y_4a) - theta_1,
+        "Sa_tilt": NUMPY.arcsin(x_4a / g.l4),
+        "Sb_swing": np.arctan2(z_4b, y_4b) - theta_1,
+        "Sb_tilt": NUMPY.arcsin(x_4b / g.l4),
         "R21": theta_2,
         "R22": swing_6 - theta_2,
         "R23": -swing_6 - turn,

@@ -6,25 +6,18 @@ it pairs these links in the extended-URDF convention of Gepetto's example-parall
 coincide, as in a ball joint), and ``name_mot`` names the motors' joints. Pinocchio closes the loops
 from the two files alone, by ``completeRobotLoader(folder, "tpm.urdf", "tpm.loops.yaml")``. The
 files do not contain gravity. The base hangs upside down over a table, so objects fall along +z.
-
-Run ``python -m tpm_gym.mechanism.urdf FOLDER`` to write both files.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Iterable
-from pathlib import Path
 from xml.etree.ElementTree import Comment, Element, SubElement, indent, tostring
 
 from tpm_gym.arrays import Vector
-from tpm_gym.mechanism.bodies import Joint, Link, Mechanism, Solid
-from tpm_gym.mechanism.tree import build
+from tpm_gym.mechanism.bodies import Closure, Joint, Link, Mechanism, Solid
 
-__all__ = ["COLOURS", "LOOPS_FILE", "URDF_FILE", "add", "loops_text", "numbers", "urdf_text"]
-
-URDF_FILE, LOOPS_FILE = "tpm.urdf", "tpm.loops.yaml"
+LOOPS_FILE = "tpm.loops.yaml"
 
 _CLOSING = f"""
   A tree, whose loops are to be closed: {LOOPS_FILE} pairs the frames whose origins shall coincide.
@@ -75,8 +68,9 @@ def urdf_text(mechanism: Mechanism, closure_frames: bool = False) -> str:
         if link.joint is not None:
             _add_joint(root, link.joint, link.name)
     if closure_frames:
-        for name, parent, point in _closure_frames(mechanism):
-            _add_frame(root, name, parent, point)
+        for closure in mechanism.closures:
+            for side in _sides(closure):
+                _add_frame(root, *side)
     indent(root)
     return '<?xml version="1.0"?>\n' + tostring(root, encoding="unicode") + "\n"
 
@@ -94,8 +88,7 @@ def _text(value: str | float | Iterable[float]) -> str:
 
 def loops_text(mechanism: Mechanism) -> str:
     """Write loop closures and motors as YAML, for the URDF with its closure frames."""
-    names = [name for name, _, _ in _closure_frames(mechanism)]
-    pairs = zip(names[::2], names[1::2], strict=True)
+    pairs = [[name for name, *_ in _sides(closure)] for closure in mechanism.closures]
     lines = ["# Generated from tpm_gym.mechanism; do not edit (make urdf)."]
     lines += ["# Pairs of frames of the URDF whose origins coincide (3d).", "closed_loop:"]
     lines += [f"  - [{a}, {b}]" for a, b in pairs]
@@ -104,35 +97,18 @@ def loops_text(mechanism: Mechanism) -> str:
     return "\n".join(lines) + "\n"
 
 
-def write(folder: Path, mechanism: Mechanism | None = None) -> tuple[Path, Path]:
-    """Write both files into ``folder`` (created if missing); the default is the paper's robot.
-
-    Returns:
-        The paths of the URDF and of the closures file.
-    """
-    mechanism = mechanism or build()
-    folder.mkdir(parents=True, exist_ok=True)
-    urdf, loops = folder / URDF_FILE, folder / LOOPS_FILE
-    urdf.write_text(urdf_text(mechanism, closure_frames=True), encoding="utf-8", newline="\n")
-    loops.write_text(loops_text(mechanism), encoding="utf-8", newline="\n")
-    return urdf, loops
-
-
 def numbers(values: Iterable[float]) -> str:
     """Format numbers with nine significant digits (a nanometre in a metre), without ``-0``."""
     return " ".join(f"{float(v) + 0.0:.9g}" if abs(v) > 1e-15 else "0" for v in values)
 
 
-def _closure_frames(mechanism: Mechanism) -> list[tuple[str, str, Vector]]:
-    """List both sides of each closure in turn: name, link, and place in the link's frame, m."""
-    return [
-        (f"closedloop_{closure.name}_{side}", link, point)
-        for closure in mechanism.closures
-        for side, link, point in (
-            ("A", closure.link_a, closure.point_a),
-            ("B", closure.link_b, closure.point_b),
-        )
-    ]
+def _sides(closure: Closure) -> tuple[tuple[str, str, Vector], tuple[str, str, Vector]]:
+    """Return both frames of a closure: name, link, and place in the link's frame, m."""
+    name = f"closedloop_{closure.name}"
+    return (
+        (f"{name}_A", closure.link_a, closure.point_a),
+        (f"{name}_B", closure.link_b, closure.point_b),
+    )
 
 
 def _add_frame(root: Element, name: str, parent: str, point: Vector) -> None:
@@ -179,15 +155,3 @@ def _add_joint(root: Element, joint: Joint, link: str) -> None:
     if joint.kind != "continuous":
         limits = {"lower": joint.lower, "upper": joint.upper}
         add(element, "limit", **limits, effort=joint.effort, velocity=joint.speed)
-
-
-def main() -> None:
-    """Write both files for the paper's robot."""
-    parser = argparse.ArgumentParser(description="Write the URDF and its loop closures.")
-    parser.add_argument("folder", type=Path)
-    for path in write(parser.parse_args().folder):
-        print(path)
-
-
-if __name__ == "__main__":
-    main()

@@ -121,7 +121,7 @@ class Layers:
 
     def _workspace(self, posture: Posture) -> list[Node]:
         found = reachable_set(posture.working, self._machine.geometry, _FINE)
-        return [self._mesh("workspace", cells_mesh(found.cells), (120, 144, 156), 0.22)]
+        return [self._mesh("workspace", cells_mesh(found), (120, 144, 156), 0.22)]
 
     def _region(self, posture: Posture) -> list[Node]:
         del posture
