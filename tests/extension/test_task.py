@@ -31,10 +31,9 @@ def env():
     return gym.make("TPMStackDense-v0", render_mode="rgb_array")
 
 
-@pytest.mark.parametrize("env_id", ["TPMStack-v0", "TPMStackJointsDense-v0"])
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
-def test_it_conforms(check, env_id):
-    check(lambda: gym.make(env_id))
+def test_it_conforms(check):
+    check(lambda: gym.make("TPMStackJointsDense-v0"))
 
 
 @pytest.mark.parametrize(
@@ -43,13 +42,11 @@ def test_it_conforms(check, env_id):
 )
 def test_its_expert_stacks(env_id, machine):
     env = gym.make(env_id, machine=machine)
-    solved = 0
-    for seed in range(20):
+    for seed in range(5):
         *_, (observation, _, info) = expert_episode(env, seed, steps=100)
         red, blue = np.split(observation["achieved_goal"], 2)
-        assert np.allclose(blue - red, [0.0, 0.0, 0.033], atol=0.004) or not info["is_success"]
-        solved += info["is_success"]
-    assert solved == 20
+        assert np.allclose(blue - red, [0.0, 0.0, 0.033], atol=0.004)
+        assert info["is_success"]
 
 
 def test_its_own_terms_are_part_of_the_reward(env):

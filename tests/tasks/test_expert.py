@@ -15,7 +15,10 @@ from tpm_gym import TPMEnv
 from tpm_gym.errors import ConfigurationError, EpisodeError, InputError
 from tpm_gym.tasks import Expert, Motion, Move, Reach
 
-PLACES = [{"machine": name} for name in ("paper", "wide", "gantry")] + [{"engine": "kinematic"}]
+PLACES = [
+    *({"machine": name} for name in ("paper", "wide", "gantry")),
+    *({"engine": name} for name in ("mujoco", "analytic", "kinematic")),
+]
 SPARSE = [env_id for env_id in tpm_gym.ENV_IDS if "Dense" not in env_id]
 
 
@@ -33,7 +36,7 @@ def solved(env: Any, **options: Any) -> bool:
 @pytest.mark.parametrize("options", PLACES, ids=str)
 @pytest.mark.parametrize("env_id", SPARSE)
 @pytest.mark.parametrize(
-    ("episodes", "wanted"), [(20, 20), pytest.param(1000, 990, marks=pytest.mark.slow)]
+    ("episodes", "wanted"), [(6, 6), pytest.param(500, 495, marks=pytest.mark.slow)]
 )
 def test_it_solves_every_task_clear_of_the_singularity_with_half_the_torque(
     env_id: str, options: dict[str, str], episodes: int, wanted: int
