@@ -337,7 +337,7 @@ def test_a_robot_built_anew_stands_in_the_same_world(simulation: Alone) -> None:
         simulation.reset(THETA, {"object": (0.2, -0.02, 0.5)}, plant=plant)
         client = simulation.engine.client  # perhaps another one now
         assert client.getPhysicsEngineParameters() == settings
-        assert (client.getNumConstraints(), client.getNumBodies()) == (4, 6)
+        assert (client.getNumConstraints(), client.getNumBodies()) == (4, 7)
         falls.append([simulation.move(HOME).object_position[0, 2] for _ in range(15)])
     assert falls[0] == falls[1] == falls[2]
     assert falls[0][0] < 0.5 - 0.007
