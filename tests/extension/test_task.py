@@ -8,7 +8,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from episodes import expert_episode
-from stable_baselines3 import SAC, HerReplayBuffer
 
 import tpm_gym
 from tpm_gym.envs.testing import CHECKS
@@ -85,23 +84,6 @@ def test_the_blocks_are_drawn_in_their_colours(env):
     r, g, b = env.render().astype(int).transpose(2, 0, 1)
     assert ((r > 2 * b) & (r > 2 * g)).sum() > 100
     assert ((b > 2 * r) & (b > 2 * g)).sum() > 100
-
-
-def test_sac_trains_on_it(env):
-    model = SAC(
-        "MultiInputPolicy",
-        env,
-        learning_starts=100,
-        batch_size=64,
-        policy_kwargs={"net_arch": [32, 32]},
-        replay_buffer_class=HerReplayBuffer,
-        replay_buffer_kwargs={"copy_info_dict": True},
-        seed=0,
-    )
-    before = model.policy.state_dict()["actor.mu.weight"].clone()
-    model.learn(200)
-    assert model.num_timesteps == 200
-    assert not before.equal(model.policy.state_dict()["actor.mu.weight"])
 
 
 def test_a_block_that_the_cup_cannot_come_down_to_is_refused(stacking):

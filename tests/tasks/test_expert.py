@@ -137,8 +137,9 @@ def test_before_the_first_episode_it_says_so(env: Any) -> None:
         Expert(env).act({})
 
 
-@pytest.mark.parametrize("engine", ["analytic", "pybullet"])
-@pytest.mark.parametrize("randomisation", [{}, {"latency": 2}], ids=["prompt", "late"])
+@pytest.mark.parametrize(
+    ("engine", "randomisation"), [("analytic", {"latency": 2}), ("pybullet", {})]
+)
 def test_for_a_vector_it_does_what_it_does_for_each_environment(
     engine: str, randomisation: dict[str, Any]
 ) -> None:
