@@ -233,7 +233,13 @@ def test_both_policies_are_exported_and_nothing_is_unpickled_for_it(run: Path) -
 
 
 @pytest.mark.usefixtures("needs_pybullet")
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "status"),
+    [
+        (signal.SIGINT, 130),
+        pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow),
+    ],
+)
 def test_command_line_trains_ppo_in_parallel_and_stops_when_asked_to(
     tmp_path: Path, number: signal.Signals, status: int
 ) -> None:
