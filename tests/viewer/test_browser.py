@@ -33,10 +33,11 @@ def browser(viewer: Viewer) -> Iterator[Browser]:
         assert browser.requested <= {"http://127.0.0.1", "data:", "blob:"}
 
 
-def on_screen(viewer: Viewer, point: np.ndarray, width: int, height: int) -> tuple[float, float]:
+def on_screen(viewer: Viewer, point: np.ndarray) -> tuple[float, float]:
     """Return where the camera of the page sees a point of the machine's frame, pixels."""
     (client,) = viewer.server.get_clients().values()
     camera, machine = client.camera, viewer.explore.posture.machine
+    width, height = camera.image_width, camera.image_height
     forward = camera.look_at - camera.position
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -48,20 +49,13 @@ def on_screen(viewer: Viewer, point: np.ndarray, width: int, height: int) -> tup
 
 
 def test_the_gizmo_drags_the_robot(viewer, browser):
-    size = until(
-        lambda: browser.evaluate(
-            "(() => { const c = document.querySelector('canvas');"
-            "return c && [c.clientWidth, c.clientHeight]; })()"
-        )
-    )
-    until(lambda: next(iter(viewer.server.get_clients().values())).camera.image_width)
     before = viewer.explore.posture.position
 
-    until(lambda: browser.frames(5) < 3.0, 180.0)  # the scene is there
+    until(lambda: browser.frames(5) < 4.0, 180.0)  # the scene is there
 
     def dragged() -> bool:
         """Take the arrow along the machine's x, some way from P."""
-        ends = (on_screen(viewer, before + [reach, 0, 0], *size) for reach in (0.09, 0.15))
+        ends = (on_screen(viewer, before + [reach, 0, 0]) for reach in (0.09, 0.15))
         (x, y), (u, v) = ends
         for share in (-0.05, 0.0):
             browser.move(x + share * (u - x), y)
