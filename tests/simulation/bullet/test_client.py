@@ -264,11 +264,44 @@ if first:
     assert said == (2 * REFUSED if without_glx else f"opened;{REFUSED}opened;")
 
 
+@pytest.mark.parametrize("engine", ["pybullet", "mujoco", "analytic"])
+def test_a_window_shows_robots_of_all_lengths_and_prints_nothing(
+    screen: str, engine: str, request: pytest.FixtureRequest
+) -> None:
+    pytest.importorskip("pybullet" if engine == "analytic" else engine)
+    printed, said = in_a_process(
+        f"""
+try:
+    env = gym.make(
+        "TPMPickAndPlace-v0", engine="{engine}", render_mode="human", camera="cup",
+        randomisation={{"length_error": 1e-4}},
+    )
+    plain = gym.make(env.spec, render_mode=None)
+    for one in (env, plain):
+        for seed in (0, 1):
+            one.reset(seed=seed)
+            one.step(one.action_space.sample() * 0 + 1)
+        print(one.unwrapped.state.theta.tolist(), file=sys.stderr)
+    env.close()
+except tpm_gym.TPMError as error:
+    print(type(error).__name__, error.name, file=sys.stderr)
+""",
+        DISPLAY=screen,
+    )
+    lines = said.splitlines()
+    if "no GLX" in request.node.name:
+        assert lines == ["ConfigurationError render_mode"]
+    else:
+        assert lines[0] == lines[1]
+        assert lines[0].startswith("[")
+    assert printed == ""
+
+
 @pytest.mark.parametrize("how", ["refuses", "raises"])
 def test_a_window_that_does_not_open_is_a_typed_error(
     monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
-    def connect(mode: int) -> int:
+    def connect(mode: int, options: str) -> int:
         if how == "raises":
             raise pybullet.error("Only one local in-process GUI connection allowed.")
         return -1

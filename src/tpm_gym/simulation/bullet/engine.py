@@ -17,6 +17,7 @@ from tpm_gym.simulation.bullet.friction import Friction
 from tpm_gym.simulation.bullet.physics import Physics
 from tpm_gym.simulation.bullet.robot import Robot
 from tpm_gym.simulation.bullet.scenery import Scenery
+from tpm_gym.simulation.bullet.window import Window
 from tpm_gym.simulation.drives import Servo, ServoDrives
 from tpm_gym.simulation.engine import Engine, Path, Pose, Readout, Twist, drives_of_one, steering
 from tpm_gym.simulation.imaging import Camera, Picture, View
@@ -62,11 +63,17 @@ class BulletEngine:
         """Check the options and create the physics client."""
         self.physics = settings_of(Physics, "physics", physics)
         self.time_step = self.physics.time_step
-        self._gui, self._renderer, self._servo = gui, renderer, drive
+        self._renderer, self._servo = renderer, drive
         self._drives: ServoDrives | None = None
-        self._aimed: Camera | None = None
         self._torque: Vector | None = _ZERO
-        self.client = Client(self.physics, gui, renderer)
+        self.client = Client(self.physics, renderer=renderer)
+        self._window: Window | None = None
+        if gui:
+            try:
+                self._window = Window(self.physics)
+            except BaseException:
+                self.close()
+                raise
 
     def load(self, machine: Machine, scene: Scene, count: int) -> None:
         """Implement :meth:`Engine.load`."""
@@ -79,9 +86,11 @@ class BulletEngine:
         self._machine = machine
         self.robot = Robot(self.client, machine.mechanism, machine.mount)
         scene = self._scene
-        self._scenery = Scenery(self.client, scene, machine.table, self._gui)
-        if self._gui or self._renderer == "egl":
+        self._scenery = Scenery(self.client, scene, machine.table)
+        if self._renderer == "egl":
             self.robot.paint()
+        if self._window is not None:
+            self._window.load(machine, scene)
         self.bodies = self._scenery.bodies
         self._cup = Cup(self.client, self.robot, self.bodies, scene.objects, self.time_step)
         self._friction = Friction(
@@ -89,13 +98,9 @@ class BulletEngine:
         )
 
     def _empty(self) -> None:
-        """Remove all bodies: reset the client of a window, else replace it, which leaks least."""
-        if self._gui:
-            self.client.resetSimulation()
-            self.client.configure(self.physics)
-        else:
-            self.client.close()
-            self.client = Client(self.physics, renderer=self._renderer)
+        """Remove all bodies: replace the client, which leaks least."""
+        self.client.close()
+        self.client = Client(self.physics, renderer=self._renderer)
 
     def alter(self, rows: IntArray, plants: Sequence[Plant]) -> None:
         """Implement :meth:`Engine.alter`."""
@@ -159,10 +164,9 @@ class BulletEngine:
 
     def show(self, camera: Camera, markers: FloatArray) -> None:
         """Implement :meth:`Engine.show`."""
-        if camera != self._aimed:  # else the user may move the camera
-            self._aimed = camera
-            self._scenery.aim_window(camera)
-        self._scenery.move_markers(markers.tolist())
+        if self._window is not None:
+            joints, poses = self.robot.joint_states(), [pose for pose, _ in self._objects()]
+            self._window.show([angle for angle, _ in joints], poses, camera, markers)
 
     def save(self) -> Any:
         """Implement :meth:`Engine.save`."""
@@ -192,6 +196,8 @@ class BulletEngine:
     def close(self) -> None:
         """Implement :meth:`Engine.close`."""
         self.client.close()
+        if self._window is not None:
+            self._window.close()
 
 
 _: type[Engine] = BulletEngine  # mypy checks that the class has the methods of Engine
