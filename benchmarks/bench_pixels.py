@@ -45,7 +45,9 @@ def main() -> None:
     parser.add_argument("--sizes", nargs="+", type=int, default=[64, 84])
     parser.add_argument("--seconds", type=float, default=3.0, help="for each number")
     asked = parser.parse_args()
-    print(f"{ENV_ID}, steps per second of CPU time, one environment (tpm_gym {tpm_gym.__version__})")
+    print(
+        f"{ENV_ID} of tpm_gym {tpm_gym.__version__}, one environment, steps per second of CPU time"
+    )
     print("| engine | state |", " | ".join(f"{size} x {size}" for size in asked.sizes), "|")
     for engine in asked.engines:
         rates = [steps_per_second(engine, size, asked.seconds) for size in (None, *asked.sizes)]
