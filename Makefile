@@ -4,7 +4,7 @@ VENV := .venv
 RUN := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
 
-.PHONY: help demo test lint format compiled test-fast test-slow test-wheel docs urdf pictures figures gradients results bench-kinematics bench-engine bench-transfer bench-engines bench-fidelity bench-evaluate bench-speed soak clean
+.PHONY: help demo test lint format compiled test-fast test-slow test-wheel docs urdf pictures figures gradients results bench-kinematics bench-engine bench-transfer bench-engines bench-fidelity bench-evaluate bench-speed bench-first soak clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -90,6 +90,9 @@ bench-engine: $(INSTALLED) ## the analytic engine: speed and agreement, beside P
 
 bench-transfer: $(INSTALLED) ## policies trained in one engine (the runs in runs/transfer), tested in all
 	$(RUN) benchmarks/bench_transfer.py --jobs 2
+
+bench-first: $(INSTALLED) ## from the start of Python to the first step, with and without compiled code on disk
+	$(RUN) benchmarks/bench_first.py
 
 bench-speed: $(INSTALLED) ## steps per second beside panda-gym and Gymnasium-Robotics
 	$(RUN) -m pip install -c constraints.txt -e ".[bench]"

@@ -65,6 +65,8 @@ class BulletEngine:
         self.time_step = self.physics.time_step
         self._renderer, self._servo = renderer, drive
         self._drives: ServoDrives | None = None
+        # Torques at rest and with servo drives, where Bullet reports others (zero after a restore,
+        # the joint friction); None where Bullet's are meant
         self._torque: Vector | None = _ZERO
         self.client = Client(self.physics, renderer=renderer)
         self._window: Window | None = None
@@ -139,28 +141,23 @@ class BulletEngine:
             step()
             if index >= first_update:
                 cup.update(on)
-        self._torque = None
+        if self._drives is None:
+            self._torque = None
+        else:
+            a, b, c = self._drives.memory[0, 0].tolist()
+            self._torque = a, b, c
 
     def read(self) -> Readout:
         """Implement :meth:`Engine.read`."""
-        truth, hold = self.robot.truth(), self._cup.grip.hold
-        return Readout.of_one(self._machine, self._motors(), truth, hold, self._objects())
+        theta, rates, torque = self.robot.motors()
+        motors, hold = (theta, rates, self._torque or torque), self._cup.grip.hold
+        return Readout.of_one(self._machine, motors, self.robot.truth(), hold, self._objects())
 
     def _objects(self) -> list[tuple[Pose, Twist]]:
         pose, twist = pybullet.getBasePositionAndOrientation, pybullet.getBaseVelocity
         numbers = [self.client.number] * len(self.bodies)
         poses, twists = map(pose, self.bodies, numbers), map(twist, self.bodies, numbers)
         return list(zip(poses, twists, strict=True))
-
-    def _motors(self) -> tuple[Vector, Vector, Vector]:
-        """Return joint positions (rad), velocities (rad/s) and torques (N m) of the motors."""
-        theta, rates, torque = self.robot.motors()
-        if self._torque is not None:  # after a reset or restore, Bullet reports no torque
-            torque = self._torque
-        elif self._drives is not None:  # with servo drives, Bullet reports the joint friction
-            a, b, c = self._drives.memory[0, 0].tolist()
-            torque = a, b, c
-        return theta, rates, torque
 
     def show(self, camera: Camera, markers: FloatArray) -> None:
         """Implement :meth:`Engine.show`."""
@@ -172,7 +169,7 @@ class BulletEngine:
         """Implement :meth:`Engine.save`."""
         return _Saved(
             self.robot.joint_states(),
-            self._motors()[2],
+            self._torque or self.robot.motors()[2],
             None if self._drives is None else self._drives.memory.copy(),
             self._objects(),
             self._cup.grip,

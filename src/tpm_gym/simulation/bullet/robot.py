@@ -205,11 +205,10 @@ class Robot:
         frames: list[float] = []
         for body, links in self._watched.items():
             for state in pybullet.getLinkStates(body, links, 0, 1, number):
-                frames += (*state[4], *state[5])
-        gap, x, y, z, tilt = self._truth(
+                frames += state[4] + state[5]
+        return self._truth(
             np.array(frames), self._sides, self._pivots, self._platform, self._point_p
         )
-        return gap, (x, y, z), tilt
 
     def lip(self) -> Vector:
         """Return the centre of the cup's lip (m, world)."""
