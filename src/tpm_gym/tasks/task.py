@@ -82,6 +82,7 @@ class Task(ABC):
             order, or P.
         tolerance: Distance below which a goal is achieved, m.
         samplings: Values of ``goals``.
+        max_episode_steps: Control steps after which ``gym.make`` truncates an episode.
         entries: Entries of the observation vector, in order.
 
     Raises:
@@ -93,6 +94,7 @@ class Task(ABC):
     goal_size: ClassVar[int] = 3
     tolerance: ClassVar[float] = 0.010
     samplings: ClassVar[tuple[str, ...]] = ("sampled",)
+    max_episode_steps: ClassVar[int] = 50
 
     def __init__(
         self,
