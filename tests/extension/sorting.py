@@ -30,7 +30,10 @@ class Sort(Task):
         """Blocks and goals stand on the table, apart from each other."""
         mount, count = self.machine.mount, len(rngs)
         wanted = {"red": (self.red,), "blue": (self.blue,), "goal": (self.red, self.blue)}
-        start, taken = dict(chosen), [place[:, k : k + 3] for place in chosen.values() for k in range(0, place.shape[1], 3)]
+        start, taken = (
+            dict(chosen),
+            [place[:, k : k + 3] for place in chosen.values() for k in range(0, place.shape[1], 3)],
+        )
         for name, blocks in wanted.items():
             if name in chosen:
                 continue

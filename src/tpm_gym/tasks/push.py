@@ -38,9 +38,9 @@ _DRAWS: Final = 8
 class Push(Task):
     """Shove a block over the table with the lip of the cup to the goal; the vacuum stays off.
 
-    The block has to move nearly square to one of its faces, by 60 to 240 mm. The robot can
-    reach the place behind that face. In the paper's machine, whose workspace is thin in y, the block
-    moves along x.
+    The block has to move nearly square to one of its faces, by 60 to 240 mm. The robot can reach
+    the place behind that face. The workspace of the paper's machine is thin in y, so that the block
+    moves along x there.
     """
 
     block = Block(height=0.040)
