@@ -19,6 +19,8 @@ from tpm_gym.tasks.task import Task
 from .bisection import OBJECT_ATTRIBUTES, SERVO_ATTRIBUTES, ends, halving
 
 PENALTY_WEIGHTS: Final = (0.0, 1.0)
+STUDIED: Final = ("Reach", "PickAndPlace")
+"""Tasks of the plans; others are studied where `--envs` names them."""
 
 
 @dataclass(frozen=True)
@@ -194,7 +196,7 @@ def _trainings(study: Study) -> list[Run]:
         for algo in study.algos or usual
         for env, recipe in read_recipes(recipe_file(algo, study.engine), algo).items()
         if not study.envs or env in study.envs
-        if study.plan != "penalty" or "tempting" in _task(env).samplings
+        if env in study.envs or _task(env).__name__ in STUDIED
         for seed in range(study.seeds)
         for run in _runs_of_seed(study, env, algo, seed, "demonstrations" in recipe)
     ]
