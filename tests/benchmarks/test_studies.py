@@ -1,6 +1,7 @@
 """Studies survive deaths and stops, and the page of results agrees with the records."""
 
 import json
+import re
 import signal
 import sys
 import threading
