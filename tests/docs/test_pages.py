@@ -11,9 +11,9 @@ import gymnasium as gym
 import matplotlib
 import pytest
 import tyro
-from benchmarks.studies.__main__ import Command as StudiesCommand
 from pages import DOCS, PAGES, blocks, name_of, read
 from paths import ROOT
+from studies.__main__ import Command as StudiesCommand
 
 import tpm_gym
 from tpm_gym.learning.command_line import Command
@@ -26,6 +26,8 @@ EVIDENCE = {
 }
 FILLED = {
     "README.md": ["numbers", "policies"],
+    "docs/fidelity.md": ["summary", "long"],
+    "docs/analytic-engine.md": ["limits"],
     "docs/speed.md": ["speed", "analytic"],
     "docs/engines.md": ["engines"],
     "docs/transfer.md": ["transfer"],
@@ -121,6 +123,9 @@ def expected(name):
     module = {
         "analytic": "analytic_report",
         "engines": "engine_report",
+        "limits": "engine_limits",
+        "long": "fidelity_long",
+        "summary": "fidelity_long",
         "transfer": "bench_transfer",
     }.get(name)
     if module is None:
@@ -128,7 +133,8 @@ def expected(name):
         record = numbers.read_record(numbers.RECORDS / "speed.json")
         return numbers.speed(record) if name == "speed" else getattr(numbers, name)()
     report = importlib.import_module(module)
-    return report.lines(json.loads(report.RECORD.read_text()) if report.RECORD.exists() else {})
+    write = report.summary if name == "summary" else report.lines
+    return write(json.loads(report.RECORD.read_text()) if report.RECORD.exists() else {})
 
 
 def test_every_page_is_in_a_table_of_contents():
