@@ -4,7 +4,7 @@ VENV := .venv
 RUN := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
 
-.PHONY: help demo test lint format compiled test-fast test-slow test-wheel docs urdf pictures figures gradients results bench-kinematics bench-engine bench-limits bench-transfer bench-engines bench-fidelity bench-evaluate bench-speed bench-first soak clean
+.PHONY: help demo test lint format compiled test-fast test-slow test-wheel docs urdf pictures figures gradients results bench-kinematics bench-engine bench-long bench-limits bench-transfer bench-engines bench-fidelity bench-evaluate bench-speed bench-first soak clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -87,6 +87,9 @@ bench-engine: $(INSTALLED) ## the analytic engine: speed and agreement, beside P
 	$(RUN) -m pip install -c constraints.txt -e ".[bench]"
 	$(RUN) benchmarks/bench_engine.py
 	$(RUN) benchmarks/readme_numbers.py
+
+bench-long: $(INSTALLED) ## loop gaps and FK error over a million time steps a motion; see docs/fidelity.md; minutes
+	$(RUN) benchmarks/bench_fidelity.py --long 1000000
 
 bench-limits: $(INSTALLED) ## success in each engine at two time steps; see docs/analytic-engine.md; minutes
 	$(RUN) benchmarks/engine_limits.py --jobs 2

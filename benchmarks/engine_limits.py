@@ -60,6 +60,9 @@ def publish() -> None:
 
 def lines(record: dict[str, Any]) -> Iterator[str]:
     """Yield the table in Markdown: a row for each noise."""
+    if not record:
+        yield "Not measured on this version yet: `make bench-limits`."
+        return
     found = {
         (cell["noise"], cell["engine"], cell["milliseconds"]): cell["success"]
         for cell in record["cells"]

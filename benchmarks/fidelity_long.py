@@ -181,6 +181,9 @@ def publish() -> None:
 
 def summary(record: dict[str, Any]) -> Iterator[str]:
     """Yield the sentence that begins the page."""
+    if not record:
+        yield "This version has not been measured yet: `make bench-long`."
+        return
     found = record["results"].values()
     gap, apart, tilt = (
         max(motion[name]["max"] for motion in found for name in names)
@@ -197,6 +200,9 @@ def summary(record: dict[str, Any]) -> Iterator[str]:
 
 def lines(record: dict[str, Any]) -> Iterator[str]:
     """Yield the table in Markdown, a column for each motion, lengths in mm."""
+    if not record:
+        yield "Not measured on this version yet: `make bench-long`."
+        return
     results = record["results"]
 
     def largest(motion: dict[str, Any]) -> str:
