@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+import tpm_gym
 from tpm_gym.envs.testing import Step, bits, fingerprint, play, random_episode
 from tpm_gym.tasks.expert import Expert
 
@@ -29,18 +30,16 @@ OF_SERVOS: dict[str, Any] = {"servo_stiffness": (0.5, 2.0), "joint_friction": (0
 """Those of servo drives."""
 
 CASES: list[tuple[str, dict[str, Any]]] = [
-    ("TPMReachJoints-v0", {}),
-    ("TPMPickAndPlaceDense-v0", {}),
-    ("TPMPickAndPlaceJoints-v0", {"engine": "mujoco"}),
-    ("TPMPickAndPlace-v0", {"engine": "analytic", "drive": "servo"}),
-    ("TPMPickAndPlace-v0", {"randomisation": EVERYTHING}),
+    *((env_id, {}) for env_id in tpm_gym.ENV_IDS),
+    ("TPMReachJoints-v0", EVERYTHING),
+    ("TPMPickAndPlace-v0", EVERYTHING),
 ]
-"""Ids and options."""
+"""Ids, and how far their plants may stray."""
 
 
-def make(env_id: str, **options: Any) -> gym.Env[Any, Any]:
+def make(env_id: str, randomisation: dict[str, Any], **options: Any) -> gym.Env[Any, Any]:
     """An environment; also where tpm_gym has not been imported yet."""
-    return gym.make(f"tpm_gym:{env_id}", **options)
+    return gym.make(f"tpm_gym:{env_id}", randomisation=randomisation, **options)
 
 
 def expert_episode(
@@ -58,8 +57,8 @@ def expert_episode(
 def all_fingerprints() -> list[str]:
     """Of an episode in each case."""
     prints = []
-    for env_id, options in CASES:
-        env = make(env_id, **options)
+    for case in CASES:
+        env = make(*case)
         prints.append(fingerprint(expert_episode(env, 6, steps=30)))
         env.close()
     return prints

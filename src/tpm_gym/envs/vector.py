@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from math import isfinite
+from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any
 
 import numpy as np
@@ -134,11 +133,15 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
 
     def _each(self, function: Callable[[_Part, slice], Any]) -> list[Any]:
         """Call a function for each part, on the threads where there are several."""
+        (first, *rest) = zip(self._parts, self._slices, strict=True)
         if self._pool is None:
-            return [
-                function(part, rows) for part, rows in zip(self._parts, self._slices, strict=True)
-            ]
-        return list(self._pool.map(function, self._parts, self._slices))
+            return [function(*pair) for pair in (first, *rest)]
+        others = [self._pool.submit(function, *pair) for pair in rest]
+        try:
+            own = function(*first)  # this thread works too
+        finally:
+            wait(others)
+        return [own, *(other.result() for other in others)]
 
     # -- the Gymnasium interface ----------------------------------------------------------------
 
@@ -208,7 +211,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         """
         plain = type(actions) is np.ndarray and actions.dtype.char in "df"  # as usual
         shape = self._shape
-        if not plain or actions.shape != shape or not isfinite(np.vdot(actions, actions)):
+        if not plain or actions.shape != shape or not np.isfinite(actions).all():
             actions = finite("actions", actions, shape, ActionError)
         self._require_running()
         values = actions.astype(np.float64)

@@ -39,7 +39,9 @@ MODES: Final = (None, "assembly", "working")
 """Names of the numbers of :meth:`Machine.mode_left`."""
 
 _ATTEMPTS = 1000
-_SAME_PLACE = 1e-6  # m; far below the distance between assembly modes at a safe conditioning
+SAME_PLACE: Final = 1e-6
+"""Largest distance between equal positions, m; far below the distance between assembly modes at a
+safe conditioning."""
 
 
 class Reading(NamedTuple):
@@ -262,7 +264,7 @@ class Machine(ABC):
     @cached_property
     def stops(self) -> FloatArray:
         """Lowest and highest joint positions, (2, 3)."""
-        stops: FloatArray = np.array(self.mechanism.stops).T.copy()  # rows in one piece
+        stops: FloatArray = np.array(self.mechanism.stops).T
         return stops
 
     # -- regions ----------------------------------------------------------------------------
@@ -273,7 +275,7 @@ class Machine(ABC):
         It is 0 too where the working mode reaches the position in another assembly mode.
         """
         found, _, conditioning, _ = self.evaluate(self.inverse(position))
-        there = np.abs(np.subtract(found, position)).max(axis=-1) < _SAME_PLACE
+        there = np.abs(np.subtract(found, position)).max(axis=-1) < SAME_PLACE
         known: FloatArray = np.where(there, conditioning, 0.0)
         return known
 

@@ -23,7 +23,7 @@ from tpm_gym.mechanism import tree
 from tpm_gym.mechanism.bodies import Mechanism
 from tpm_gym.mechanism.dynamics import Dynamics
 from tpm_gym.mechanism.inertia import flat, inertia_of
-from tpm_gym.mechanism.machine import Machine, Motion, Reading, register_machine
+from tpm_gym.mechanism.machine import SAME_PLACE, Machine, Motion, Reading, register_machine
 from tpm_gym.mechanism.mount import Mount
 
 ASSEMBLY_LIMIT = 0.010
@@ -82,6 +82,13 @@ class TPM(Machine):
         found = Reading(position, jacobian, empty(count), empty(count, np.bool_))
         _loops().evaluate(flat, *of, *found)
         return found if angles.ndim == 2 else Reading(*_shaped(found, angles))
+
+    def conditioning_at(self, position: ArrayLike) -> FloatArray:
+        """See :class:`Machine`."""
+        points = _rows(position)
+        found = np.empty(points.shape[:-1])
+        _loops().conditioning_at(points.reshape(-1, 3), SAME_PLACE, *self._own, found.reshape(-1))
+        return found
 
     def mode_left(
         self, theta: ArrayLike, position: ArrayLike, built: FloatArray | None = None

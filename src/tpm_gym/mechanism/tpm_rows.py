@@ -80,10 +80,13 @@ def _read(rows: FloatArray, start: int, count: int, columns: FloatArray, first: 
 
 def _write(columns: FloatArray, first: int, start: int, count: int, rows: FloatArray) -> None:
     """Copy columns from ``first`` on to rows (m, 3) or (m, 3, 3)."""
-    flat = rows.reshape(len(rows), rows.size // max(1, len(rows)))
     for j in range(count):
-        for k in range(flat.shape[1]):
-            flat[start + j, k] = columns[first + k, j]
+        for k in range(3):  # loops of constant length are unrolled
+            if rows.ndim == 2:
+                rows[start + j, k] = columns[first + k, j]
+            else:
+                for i in range(3):
+                    rows[start + j, k, i] = columns[first + 3 * k + i, j]
 
 
 def _put(columns: FloatArray, first: int, j: int, values: Triple, real: bool) -> None:
@@ -184,6 +187,34 @@ def evaluate(
         _write(found, 3, start, count, jacobian)
         for j in range(count):
             conditioning[start + j], working[start + j] = found[12, j], found[13, j] > 0.0
+
+
+@kept
+def conditioning_at(
+    position: FloatArray,
+    limit: float,
+    built: FloatArray,
+    machine: FloatArray,
+    conditioning: FloatArray,
+) -> None:
+    """Compute 1/cond(J) (m,) with P at ``position`` (m, 3); 0 where no mode of the machine is."""
+    signs = machine[2], machine[3], machine[4], machine[5]
+    modes = machine[0], machine[1], machine[2]
+    own, given = np.empty((7, _BLOCK)), np.empty((3, _BLOCK))
+    each = len(position) // len(built)
+    for start in range(0, len(position), _BLOCK):
+        count = min(_BLOCK, len(position) - start)
+        _fill(built, start, count, each, own)
+        _read(position, start, count, given, 0)
+        for j in range(count):
+            g, (x, y, z) = _lengths(own, j), _get(given, 0, j)
+            angles, reached, _, _ = equations.posture_at((x, y, z), signs, g, NS)
+            pose, real, _ = _pose(angles, g, modes)
+            there = pose.found
+            near = (abs(there.x - x) < limit) & (abs(there.y - y) < limit)
+            known = reached & real & near & (abs(there.z - z) < limit)
+            rows = equations.velocity(pose.rods, pose.factors)
+            conditioning[start + j] = equations.conditioning(rows, NS) if known else 0.0
 
 
 @kept

@@ -66,7 +66,7 @@ def ideal_step(
         behind: (2, r) whether a motor was at its limit in the last and in this time step; output.
     """
     for row in range(len(effort)):
-        mass, load = _with_objects(row, course, at, step)
+        mass, load = _inertia(row, course, at, step)
         x, y, z = plus(page_row(references, index, row), row_of(course[0], row), -1.0)
         goal = x / step, y / step, z / step
         fast = spread(mass, plus(row_of(course[1], row), goal, -1.0))
@@ -101,7 +101,7 @@ def servo_step(
     """
     theta, rates = course[0], course[1]
     for row in range(len(theta)):
-        mass, load = _with_objects(row, course, at, step)
+        mass, load = _inertia(row, course, at, step)
         torque = servo_torque(row, index, references, law, theta, rates, step, memory)
         put_row(new[2], row, torque)
         before, rubbing = row_of(rates, row), row_of(friction, row)
@@ -110,32 +110,41 @@ def servo_step(
         _integrate(row, found, course, at, step, new)
 
 
-def _with_objects(row: int, course: _Course, at: Motion, step: float) -> tuple[Symmetric, Vector]:
-    """Return the inertia and the load of robot and objects at the motors' axes.
+def _inertia(row: int, course: _Course, at: Motion, step: float) -> tuple[Symmetric, Vector]:
+    """Return the inertia and the load of robot and objects at the motors' axes."""
+    m, load, (x, y, z), carried = at[3], row_of(at[4], row), row_of(course[5], row), course[6][row]
+    mass = m[row, 0, 0], m[row, 0, 1], m[row, 0, 2], m[row, 1, 1], m[row, 1, 2], m[row, 2, 2]
+    if x != 0 or y != 0 or z != 0 or carried != 0:
+        return _with_objects(row, mass, load, course, at[1], step)
+    return mass, load
+
+
+@compiled
+def _with_objects(
+    row: int, mass: Symmetric, load: Vector, course: _Course, jacobian: FloatArray, step: float
+) -> tuple[Symmetric, Vector]:
+    """Add the inertia and the forces of objects.
 
     A horizontal force on P against the motion of P is friction. It is assumed proportional to the
     velocity at the end of the time step. With the velocity at the beginning, friction could
     reverse the motion, and P would oscillate.
     """
-    j, m, load = at[1], at[3], row_of(at[4], row)
-    mass = m[row, 0, 0], m[row, 0, 1], m[row, 0, 2], m[row, 1, 1], m[row, 1, 2], m[row, 2, 2]
     (x, y, z), carried = row_of(course[5], row), course[6][row]
-    if x != 0 or y != 0 or z != 0 or carried != 0:
-        u, v, _ = plus(row_of(course[3], row), row_of(course[4], row), -1.0)
-        u, v = u / step, v / step
-        speed = np.sqrt(u * u + v * v)
-        slow = max(speed, _CREEP)
-        opposing = max(-(x * u + y * v), 0.0)
-        share = speed / slow if opposing > 0 else 1.0
-        level = carried + step * opposing / (max(speed, 1e-12) * slow)
-        for axis, force, inertia in ((0, share * x, level), (1, share * y, level), (2, z, carried)):
-            a, b, c = j[row, axis, 0], j[row, axis, 1], j[row, axis, 2]
-            load = plus(load, (a, b, c), -force)
-            p, q, r, s, t, w = mass
-            mass = (
-                p + inertia * a * a, q + inertia * a * b, r + inertia * a * c,
-                s + inertia * b * b, t + inertia * b * c, w + inertia * c * c,
-            )  # fmt: skip
+    u, v, _ = plus(row_of(course[3], row), row_of(course[4], row), -1.0)
+    u, v = u / step, v / step
+    speed = np.sqrt(u * u + v * v)
+    slow = max(speed, _CREEP)
+    opposing = max(-(x * u + y * v), 0.0)
+    share = speed / slow if opposing > 0 else 1.0
+    level = carried + step * opposing / (max(speed, 1e-12) * slow)
+    for axis, force, inertia in ((0, share * x, level), (1, share * y, level), (2, z, carried)):
+        a, b, c = page_row(jacobian, row, axis)
+        load = plus(load, (a, b, c), -force)
+        p, q, r, s, t, w = mass
+        mass = (
+            p + inertia * a * a, q + inertia * a * b, r + inertia * a * c,
+            s + inertia * b * b, t + inertia * b * c, w + inertia * c * c,
+        )  # fmt: skip
     return mass, load
 
 
@@ -153,7 +162,7 @@ def _integrate(
     put_row(new[4], row, (x / step, y / step, z / step))
 
 
-compilable(_with_objects, _integrate)
+compilable(_inertia, _integrate)
 
 
 @kept

@@ -17,16 +17,21 @@ import numpy as np
 
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray, vector
 from tpm_gym.simulation.analytic.contact.state import (
+    AT_REST,
     CUP_STATE,
+    Records,
     Route,
     Setting,
     tables_for,
     work_for,
 )
 from tpm_gym.simulation.analytic.contact.stepping import advance, read
+from tpm_gym.simulation.stage import TABLE
 from tpm_gym.simulation.state import Block
 
 __all__ = ["Contact", "Reading"]
+
+_LEVEL = 1e-9  # m; an object at most so far above the table top stands on it
 
 
 class Reading(NamedTuple):
@@ -90,7 +95,9 @@ class Contact:
     def place(
         self, rows: Any, positions: FloatArray, quaternions: FloatArray | None = None
     ) -> None:
-        """Release held objects, set vacuum to zero, and place all objects at rest.
+        """Release held objects, set vacuum to zero, and place all objects without motion.
+
+        Tables whose objects all stand upright on the table top are at rest at once.
 
         Args:
             rows: (r,) indices of the tables.
@@ -101,11 +108,21 @@ class Contact:
         objects = tables.objects[rows]
         objects["position"] = positions
         objects["quaternion"] = (0.0, 0.0, 0.0, 1.0) if quaternions is None else quaternions
-        objects["velocity"] = objects["spin"] = objects["rest"] = 0.0
+        objects["velocity"] = objects["spin"] = 0.0
+        standing = self._standing(objects).all(axis=1)
+        objects["rest"] = np.where(standing, AT_REST, 0)[:, None]
         empty = np.zeros((), CUP_STATE)
         empty["held"] = -1
         tables.objects[rows], tables.cups[rows] = objects, empty
-        tables.forces[rows], tables.awake[rows] = 0.0, True
+        tables.forces[rows], tables.awake[rows] = 0.0, ~standing
+
+    def _standing(self, objects: Records) -> BoolArray:
+        """Return whether each of (r, k) objects stands upright on the table top."""
+        place, setting = objects["position"], self._setting
+        on_top = np.abs(place[..., 2] - setting.half[:, 2] - TABLE.top) < _LEVEL
+        over = (np.abs(place[..., :2]) <= setting.table).all(axis=-1)
+        standing: BoolArray = on_top & over & (objects["quaternion"][..., 3] == 1.0)
+        return standing
 
     def advance(
         self, rows: IntArray, route: Route, vacuum_on: BoolArray, last: int = 1

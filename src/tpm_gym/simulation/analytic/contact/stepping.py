@@ -167,22 +167,28 @@ def _slow(objects: Records) -> bool:
 @compiled
 def _reached(objects: Records, row: int, path: Route, i: int, setting: Setting) -> bool:
     """Return whether the lip may touch an object; compare boxes around path and objects."""
-    low = high = _placed(row_of(path.now, i), setting.turn, setting.origin)
-    for j in range(path.controls.shape[1]):
-        x, y, z = path.controls[i, j, 0], path.controls[i, j, 1], path.controls[i, j, 2]
-        x, y, z = _placed((x, y, z), setting.turn, setting.origin)
-        low = min(x, low[0]), min(y, low[1]), min(z, low[2])
-        high = max(x, high[0]), max(y, high[1]), max(z, high[2])
+    lowest, _ = _range(path, i, 2, setting)
     for index in range(objects.shape[1]):
         place, size = objects[row, index]["position"], length(row_of(setting.half, index))
-        near = size + CUP.radius + _BESIDE
-        if (
-            low[2] - CUP.length < place[2] + size + _BESIDE
-            and low[0] - near < place[0] < high[0] + near
-            and low[1] - near < place[1] < high[1] + near
-        ):
-            return True
+        if lowest - CUP.length < place[2] + size + _BESIDE:  # seldom, so it is tried first
+            near, beside = size + CUP.radius + _BESIDE, True
+            for axis in range(2):
+                low, high = _range(path, i, axis, setting)
+                beside = beside and low - near < place[axis] < high + near
+            if beside:
+                return True
     return False
+
+
+@compiled
+def _range(path: Route, i: int, axis: int, setting: Setting) -> tuple[float, float]:
+    """Return lowest and highest coordinate (m, world) of point P at and after the beginning."""
+    turn, origin = setting.turn[axis], setting.origin[axis]
+    low = high = turn * path.now[i, axis] + origin
+    for j in range(path.controls.shape[1]):
+        there = turn * path.controls[i, j, axis] + origin
+        low, high = min(there, low), max(there, high)
+    return low, high
 
 
 @compiled
