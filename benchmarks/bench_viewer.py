@@ -2,7 +2,8 @@
 
 A client drags P through the task region over a websocket, as a page does, as fast as the server
 takes it, and then 60 times a second. An update is handled when its posture is solved and all links
-are on their way to the page. Needs the extra ``view``.
+are on their way to the page. The time of the CPU, of the thread that handles updates, depends less
+on other programs. Needs the extra ``view``.
 
     python benchmarks/bench_viewer.py
 """
@@ -26,17 +27,18 @@ SECONDS = 5.0
 SLACK = 0.5  # s; time for the last updates to arrive
 
 
-def drag(viewer: Viewer, page: ClientConnection, rate: float) -> tuple[int, int]:
-    """Drag P at ``rate`` updates a second; return how many were sent, and how many handled."""
+def drag(viewer: Viewer, page: ClientConnection, rate: float) -> tuple[int, int, float]:
+    """Drag P at ``rate`` updates a second; return counts sent and handled, and ms of CPU each."""
     region = viewer.explore.posture.machine.region
     low, high = np.array(region.low), np.array(region.high)
-    handled = 0
+    handled, clock = 0, [0.0, 0.0]  # time of the thread that handles them, at first and last, s
     draw = viewer.robot.draw
 
     def count(places: Any) -> None:
         nonlocal handled
         draw(places)
         handled += 1
+        clock[min(handled, 2) - 1] = time.thread_time()
 
     viewer.robot.draw = count  # type: ignore[method-assign]
     start, sent = time.perf_counter(), 0
@@ -55,7 +57,7 @@ def drag(viewer: Viewer, page: ClientConnection, rate: float) -> tuple[int, int]
         time.sleep(max(0.0, sent / rate - (time.perf_counter() - start)))
     time.sleep(SLACK)
     viewer.robot.draw = draw  # type: ignore[method-assign]
-    return sent, handled
+    return sent, handled, 1000 * (clock[1] - clock[0]) / (handled - 1)
 
 
 def receive(page: ClientConnection) -> None:
@@ -75,10 +77,10 @@ def main() -> None:
                 viewer.explore.operation.value = operation
                 viewer.worker.wait()
                 for name, rate in (("as fast as possible", 1000.0), ("60 a second", 60.0)):
-                    sent, handled = drag(viewer, page, rate)
+                    sent, handled, cost = drag(viewer, page, rate)
                     print(
                         f"{operation}, {name}: {sent / SECONDS:.0f} a second sent, "
-                        f"{handled / SECONDS:.0f} a second handled"
+                        f"{handled / SECONDS:.0f} a second handled, {cost:.1f} ms of CPU each"
                     )
 
 
