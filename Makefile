@@ -4,7 +4,7 @@ VENV := .venv
 RUN := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
 
-.PHONY: help demo test lint format test-fast test-slow test-wheel docs urdf pictures figures gradients results bench-kinematics bench-engine bench-transfer bench-engines bench-fidelity bench-evaluate bench-speed soak clean
+.PHONY: help demo test lint format compiled test-fast test-slow test-wheel docs urdf pictures figures gradients results bench-kinematics bench-engine bench-long bench-limits bench-transfer bench-engines bench-fidelity bench-evaluate bench-speed bench-first soak clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -26,7 +26,9 @@ demo: $(INSTALLED) ## train pick-and-place in the analytic engine, test it in Py
 		--video runs/demo/pick_and_place.mp4 --picture runs/demo/pick_and_place.png
 	@echo; echo "runs/demo/ now holds:"; ls runs/demo runs/demo/pick_and_place
 
-test: lint test-fast ## the gate, here and in CI: lint, types, fast tests
+test: $(INSTALLED) ## the gate, here and in CI: lint, types, fast tests
+	$(MAKE) -j2 lint compiled
+	$(MAKE) test-fast
 
 lint: $(INSTALLED)
 	$(RUN) -m ruff check .
@@ -38,11 +40,14 @@ format: $(INSTALLED) ## rewrite the code in the house style
 	$(RUN) -m ruff check --fix .
 	$(RUN) -m ruff format .
 
+compiled: $(INSTALLED) # once, before several processes would do it at the same time
+	$(RUN) tests/support/compile_all.py
+
 test-fast: $(INSTALLED)
 	$(RUN) -m pytest -q -n logical --maxprocesses 8 --dist worksteal
 
-test-slow: $(INSTALLED) ## tests that take minutes: 1000 expert episodes, training to success
-	$(RUN) -m pytest -q -m slow
+test-slow: $(INSTALLED) ## tests that take minutes: hundreds of episodes, training to success
+	$(RUN) -m pytest -q -m slow -n logical --maxprocesses 8 --dist worksteal
 
 test-wheel: $(INSTALLED) ## the wheel in an empty environment: train, kill, resume, evaluate
 	$(RUN) -m pytest -q -m slow tests/learning/test_wheel.py
@@ -83,8 +88,17 @@ bench-engine: $(INSTALLED) ## the analytic engine: speed and agreement, beside P
 	$(RUN) benchmarks/bench_engine.py
 	$(RUN) benchmarks/readme_numbers.py
 
+bench-long: $(INSTALLED) ## loop gaps and FK error over a million time steps a motion; see docs/fidelity.md; minutes
+	$(RUN) benchmarks/bench_fidelity.py --long 1000000
+
+bench-limits: $(INSTALLED) ## success in each engine at two time steps; see docs/analytic-engine.md; minutes
+	$(RUN) benchmarks/engine_limits.py --jobs 2
+
 bench-transfer: $(INSTALLED) ## policies trained in one engine (the runs in runs/transfer), tested in all
 	$(RUN) benchmarks/bench_transfer.py --jobs 2
+
+bench-first: $(INSTALLED) ## from the start of Python to the first step, with and without compiled code on disk
+	$(RUN) benchmarks/bench_first.py
 
 bench-speed: $(INSTALLED) ## steps per second beside panda-gym and Gymnasium-Robotics
 	$(RUN) -m pip install -c constraints.txt -e ".[bench]"

@@ -1,26 +1,29 @@
 """Errors of the default settings in the real environment, at each of many time steps.
 
+Results go to docs/records/fidelity.json, and from there to docs/fidelity.md.
+
 Only histograms are kept, so that memory does not grow with the number of time steps.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from fidelity_lab import CONDITIONED, against_kinematics
-from shared import ROOT, provenance
+from shared import ROOT, fill, processor_line, provenance, read_record, table
 
 from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import ClosureError
 from tpm_gym.tasks import Expert
 
 BUFFER = 5000  # time steps whose kinematics are computed at once
-JSON = ROOT / "runs" / "fidelity_long.json"
+RECORD = ROOT / "docs" / "records" / "fidelity.json"
+PAGE = ROOT / "docs" / "fidelity.md"
 
 
 class Histogram:
@@ -145,8 +148,8 @@ def follow(motion: str, steps: int, seed: int = 0) -> dict[str, Any]:
     }
 
 
-def run(steps: int, describe: Callable[[], dict[str, Any]], path: Path = JSON) -> None:
-    """Run random actions and the expert; print and write the results."""
+def run(steps: int, describe: Callable[[], dict[str, Any]], path: Path = RECORD) -> None:
+    """Run random actions and the expert; print and write the results, and fill the page."""
     description = describe()
     results = {motion: follow(motion, steps) for motion in ("random", "expert")}
     for motion, found in results.items():
@@ -165,3 +168,67 @@ def run(steps: int, describe: Callable[[], dict[str, Any]], path: Path = JSON) -
         )
     provenance.write_json(path, {**description, "results": results})
     print(f"wrote {path.relative_to(ROOT)}")
+    if path == RECORD:
+        publish()
+
+
+def publish() -> None:
+    """Fill the page from the record."""
+    record = read_record(RECORD)
+    fill(PAGE, "summary", summary(record))
+    fill(PAGE, "long", lines(record))
+
+
+def summary(record: dict[str, Any]) -> Iterator[str]:
+    """Yield the sentence that begins the page."""
+    if not record:
+        yield "This version has not been measured yet: `make bench-long`."
+        return
+    found = record["results"].values()
+    gap, apart, tilt = (
+        max(motion[name]["max"] for motion in found for name in names)
+        for names in (("gap",), ("fk", "fk_near"), ("tilt",))
+    )
+    steps = sum(motion["steps"] for motion in found)
+    yield (
+        f"In `TPMPickAndPlace-v0`, in PyBullet, at every one of {steps:,} time steps, loops are "
+        f"open by at most **{1e3 * gap:.3f} mm**, and the platform is within "
+        f"**{1e3 * apart:.3f} mm** of the forward kinematics of its encoders. It tilts by at most "
+        f"{np.rad2deg(tilt):.0e} degrees, which is rounding."
+    )
+
+
+def lines(record: dict[str, Any]) -> Iterator[str]:
+    """Yield the table in Markdown, a column for each motion, lengths in mm."""
+    if not record:
+        yield "Not measured on this version yet: `make bench-long`."
+        return
+    results = record["results"]
+
+    def largest(motion: dict[str, Any]) -> str:
+        near = motion["fk_near"]
+        return (
+            f"{1e3 * near['max']:.4f} ({near['samples']:,} time steps)" if near["samples"] else "-"
+        )
+
+    rows = {
+        "gap: mean, 99.9%, max": lambda m: _lengths(m["gap"], "mean", "p999", "max"),
+        "gap below 0.1 mm": lambda m: f"{m['share_gap_below_0.1_mm']:.2%}",
+        f"FK where 1/cond(J) > {CONDITIONED}: 99.9%, max": lambda m: _lengths(
+            m["fk"], "p999", "max"
+        ),
+        "FK elsewhere: max": largest,
+        "tilt: max": lambda m: f"{np.rad2deg(m['tilt']['max']):.1e} degrees",
+        "loops lost, modes left": lambda m: f"{m['lost']}, {m['mode_changes']}",
+        "episodes, successes": lambda m: f"{m['episodes']:,}, {m['successes']:,}",
+    }
+    yield f"`{record['command']}` on {processor_line(record)}."
+    yield ""
+    yield from table(
+        ["mm", *results],
+        [[name, *(form(motion) for motion in results.values())] for name, form in rows.items()],
+    )
+
+
+def _lengths(quantity: dict[str, float], *names: str) -> str:
+    return ", ".join(f"{1e3 * quantity[name]:.4f}" for name in names)

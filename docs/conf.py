@@ -8,7 +8,7 @@ from pathlib import Path
 import tpm_gym
 
 DOCS = Path(__file__).resolve().parent
-sys.path[:0] = [str(DOCS), str(DOCS.parent)]  # website/, and benchmarks/ for the records
+sys.path[:0] = [str(DOCS), str(DOCS.parent / "benchmarks")]  # website/ and studies/
 
 project = "tpm_gym"
 author = "The tpm_gym developers"

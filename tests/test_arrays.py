@@ -1,6 +1,6 @@
 """Numbers are taken as users write them, and whatever is none is refused by a typed error."""
 
-from datetime import date, datetime, timedelta
+from datetime import date
 from typing import Any
 
 import numpy as np
@@ -21,28 +21,22 @@ from tpm_gym.simulation.engine import transform
 
 NO_NUMBERS = {
     "beyond the range of floats": [10**400, 0, 0],
-    "too long to be written": [10**5000, 0, 0],
     "gradients": torch.zeros(3, requires_grad=True),
     "gradients in a list": [torch.tensor(0.0, requires_grad=True), 0.0, 0.0],
     "complex": [1j, 0, 0],
-    "complex array": np.zeros(3, dtype=complex),
     "complex tensor": torch.zeros(3, dtype=torch.complex64),
     "text": "abc",
     "digits": ["1", "2", "3"],
+    "mixed": (0.0, True, "1"),
     "bytes": b"abc",
     "dates": [date(2020, 1, 1)] * 3,
-    "times": [datetime(2020, 1, 1)] * 3,
     "datetime64": np.array(["2020-01-01"] * 3, dtype="M8[D]"),
-    "timedelta64": np.array([1, 2, 3], dtype="m8[s]"),
-    "differences of time": [timedelta(1)] * 3,
     "masked": np.ma.array([1.0, 2.0, 3.0], mask=[True, False, False]),
-    "masked, nothing hidden": np.ma.zeros(3),
     "masked in a list": [np.ma.masked, 0.0, 0.0],
     "ragged": [[1.0], 2.0, 3.0],
     "objects": [object()] * 3,
     "sets": {1, 2, 3},
     "nothing": None,
-    "nothings": [None] * 3,
 }
 
 
@@ -80,7 +74,7 @@ def test_three_numbers_become_plain_floats_whatever_holds_them(value: Any) -> No
     np.testing.assert_array_equal(finite("goal", value, (3,)), found)
 
 
-@pytest.mark.parametrize("bad", [[0, 0], [[0, 0, 0]], 1.0, [], [0, np.nan, 0], [0, 0, -np.inf]])
+@pytest.mark.parametrize("bad", [[0, 0], [[0, 0, 0]], 1.0, [], [0, np.nan, 0], (0, 0, -np.inf)])
 def test_other_shapes_and_numbers_without_end_are_refused_as_the_caller_wishes(bad: Any) -> None:
     for call in (vector, lambda *args: finite(args[0], args[1], (3,), args[2])):
         with pytest.raises(ResetOptionError, match=r"finite numbers.*of shape \(3,\)") as caught:
@@ -88,18 +82,8 @@ def test_other_shapes_and_numbers_without_end_are_refused_as_the_caller_wishes(b
         assert caught.value.name == "goal"
 
 
-@pytest.mark.parametrize(
-    "bad",
-    [(0.0, 0.0), (0.0, np.nan, 0.0), (0.0, -np.inf, np.inf), (0.0, True, "1"), (0.0, 0.0, [])],
-)
-def test_tuples_are_looked_at_as_closely(bad: Any) -> None:
-    with pytest.raises(InputError):
-        vector("goal", bad)
-    assert vector("goal", (1e308, 1e308, 1e308)) == (1e308,) * 3
-
-
-def test_integers_that_only_floats_can_hold_are_numbers() -> None:
-    assert vector("goal", [10**20, 0, 0]) == (1e20, 0.0, 0.0)
+def test_numbers_that_only_floats_can_hold_are_numbers() -> None:
+    assert vector("goal", [10**20, 1e308, 1e308]) == (1e20, 1e308, 1e308)
 
 
 def test_points_keep_leading_shapes_and_may_be_infinite_unless_they_must_not() -> None:

@@ -378,12 +378,15 @@ def _episodes(runs: Frame) -> str:
 
 
 def _successes(group: Frame) -> dict[str, str]:
-    """Return a cell for each engine: median success, and the success of each seed."""
+    """Return a cell for each engine: median success, and the range of the seeds."""
     cells = {}
     for engine, name in ENGINES.items():
         rates = group[f"{engine}.{_SUCCESS}"]
-        seeds = ", ".join(f"{rate * 100:.1f}" for rate in rates.fillna(0.0))
-        cell = NONE if rates.isna().all() else f"{rates.fillna(0.0).median():.1%} ({seeds})"
+        filled = rates.fillna(0.0)
+        spread = (
+            f" ({100 * filled.min():.1f} to {100 * filled.max():.1f})" if len(rates) > 1 else ""
+        )
+        cell = NONE if rates.isna().all() else f"{filled.median():.1%}{spread}"
         cells[f"success ({name})"] = cell
     return cells
 

@@ -14,10 +14,13 @@ from tpm_gym.policy.files import published
 from tpm_gym.simulation.engine import require_engine
 from tpm_gym.simulation.randomisation import LIMITS
 from tpm_gym.tasks.registry import TASKS
+from tpm_gym.tasks.task import Task
 
 from .bisection import OBJECT_ATTRIBUTES, SERVO_ATTRIBUTES, ends, halving
 
 PENALTY_WEIGHTS: Final = (0.0, 1.0)
+STUDIED: Final = ("Reach", "PickAndPlace")
+"""Tasks of the plans; others are studied where `--envs` names them."""
 
 
 @dataclass(frozen=True)
@@ -165,6 +168,10 @@ def plan_runs(study: Study) -> list[Run] | list[Bisection]:
     return runs
 
 
+def _task(env: str) -> type[Task]:
+    return TASKS[gymnasium.spec(env).kwargs["task"]]
+
+
 def _bisections(study: Study) -> list[Bisection]:
     return [
         Bisection(
@@ -177,8 +184,7 @@ def _bisections(study: Study) -> list[Bisection]:
         for env in published()
         if not study.envs or env in study.envs
         for attribute in LIMITS
-        if attribute not in OBJECT_ATTRIBUTES
-        or TASKS[gymnasium.spec(env).kwargs["task"]].scene.objects
+        if attribute not in OBJECT_ATTRIBUTES or _task(env).scene.objects
     ]
 
 
@@ -190,6 +196,7 @@ def _trainings(study: Study) -> list[Run]:
         for algo in study.algos or usual
         for env, recipe in read_recipes(recipe_file(algo, study.engine), algo).items()
         if not study.envs or env in study.envs
+        if env in study.envs or _task(env).__name__ in STUDIED
         for seed in range(study.seeds)
         for run in _runs_of_seed(study, env, algo, seed, "demonstrations" in recipe)
     ]

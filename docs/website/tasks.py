@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-from benchmarks.studies.figures import learning_curves
-from benchmarks.studies.page import groups, split
-from benchmarks.studies.records import read_records
 from PIL import Image
 from sphinx.builders.html import StandaloneHTMLBuilder
+from studies.figures import learning_curves
+from studies.page import groups, split
+from studies.records import read_records
 
 import tpm_gym
 from tpm_gym.errors import ConfigurationError

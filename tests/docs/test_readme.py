@@ -1,5 +1,6 @@
 """What pages say in words is as measured."""
 
+import json
 import re
 
 import numpy as np
@@ -17,6 +18,13 @@ def test_the_numbers_in_the_kinematics_block_are_right():
     assert jacobian.conditioning(theta) == pytest.approx(printed, abs=5e-4)
     assert np.allclose(kinematics.forward(theta), [-0.04, 0.028, 0.80])
     assert kinematics.inverse_all([-0.04, 0.028, 0.80]).theta.shape == (16, 3)
+
+
+def test_the_readmes_training_takes_a_minute_or_two():
+    records = (ROOT / "docs/results").glob("TPMPickAndPlaceDense-v0-ppo-analytic-s?.json")
+    seconds = [json.loads(path.read_text())["evaluations"]["wall_seconds"][-1] for path in records]
+    assert len(seconds) == 5
+    assert 0.5 < np.median(seconds) / 60 < 2.5
 
 
 def test_the_first_run_succeeds():

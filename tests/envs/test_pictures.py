@@ -157,12 +157,17 @@ def test_vector_environments_draw_each_environment(engine: str, mode: str) -> No
     options: Any = {"engine": engine, "render_mode": mode, "width": 48, "height": 32}
     envs = gym.make_vec("TPMPickAndPlace-v0", num_envs=3, **options)
     envs.reset(seed=5)
+    actions = np.random.default_rng(0).uniform(-1, 1, (3, 4))
+    for _ in range(3):
+        envs.step(actions)
     frames: Any = envs.render()
     assert isinstance(frames, tuple)
     assert len(frames) == 3
     for row, frame in enumerate(frames):
         env = gym.make("TPMPickAndPlace-v0", **options)
         env.reset(seed=5 + row)
+        for _ in range(3):
+            env.step(actions[row])
         alone: Any = env.render()
         pairs = zip(frame, alone, strict=True)  # of colours and depth, or of rows of pixels
         assert all(np.array_equal(*pair) for pair in pairs)

@@ -49,10 +49,7 @@ def assert_same(one: Any, other: Any) -> None:
 @pytest.mark.parametrize(
     ("env_id", "options"),
     [
-        (REACH, {}),
-        (REACH, {"randomisation": {"latency": 3}}),
-        (PICK, {"randomisation": EVERYTHING}),
-        (JOINTS, {"machine": "wide"}),
+        (REACH, {"randomisation": {"latency": 3}, "machine": "wide"}),
         (JOINTS, {"drive": "servo", "randomisation": {**EVERYTHING, **OF_SERVOS}}),
         (PICK, {"randomisation": {"link_mass": 2.0, "motor_strength": 0.5}}),
         ("TPMPickAndPlaceJoints-v0", {"randomisation": EVERYTHING, "goals": "tempting"}),
@@ -60,9 +57,9 @@ def assert_same(one: Any, other: Any) -> None:
     ids=str,
 )
 def test_one_alone_has_the_bits_of_one_among_many(env_id: str, options: dict[str, Any]) -> None:
-    count, seed = 65, 3
+    count, seed = 33, 3
     envs = make(env_id, count, **options)
-    watched = {row: gym.make(env_id, engine="analytic", **options) for row in (0, 8, 64)}
+    watched = {row: gym.make(env_id, engine="analytic", **options) for row in (0, 8, 32)}
     observation, _ = envs.reset(seed=seed)
     for row, env in watched.items():
         alone, _ = env.reset(seed=seed + row)
@@ -107,12 +104,11 @@ def test_it_does_what_gymnasiums_vectors_of_single_environments_do(mode: str) ->
                     assert_same(one, other)
 
 
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("drive", ["ideal", "servo"])
+@pytest.mark.parametrize(("mode", "drive"), [*zip(MODES, ["ideal", "servo", "ideal"], strict=True)])
 def test_threads_change_no_bit(mode: str, drive: str) -> None:
     options: Any = {"randomisation": EVERYTHING, "drive": drive, "max_episode_steps": 7}
     runs = []
-    for threads in (1, 2, 3):
+    for threads in (1, 3):
         envs = make(PICK, 5, autoreset_mode=mode, num_threads=threads, **options)
         found = [envs.reset(seed=1)]
         for actions in actions_of(envs, 16):
@@ -127,21 +123,6 @@ def test_threads_change_no_bit(mode: str, drive: str) -> None:
         envs.close()
     for run in runs[1:]:
         assert_same(run, runs[0])
-
-
-@pytest.mark.parametrize("engine", ["pybullet", "mujoco"])
-def test_other_engines_have_a_robot_for_each_environment(engine: str) -> None:
-    envs = gym.make_vec(REACH, num_envs=2, engine=engine)
-    assert isinstance(envs, TPMVectorEnv)
-    alone = gym.make(REACH, engine=engine)
-    observation, _ = envs.reset(seed=3)
-    assert_same({name: values[1] for name, values in observation.items()}, alone.reset(seed=4)[0])
-    for actions in actions_of(envs, 12):
-        observation, rewards, *_ = envs.step(actions)
-        one, reward, *_ = alone.step(actions[1])
-        assert_same({name: values[1] for name, values in observation.items()}, one)
-        assert reward == rewards[1]
-    envs.close()
 
 
 def test_the_first_episodes_are_of_different_lengths_where_that_is_asked_for() -> None:

@@ -8,7 +8,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from episodes import expert_episode
-from stable_baselines3 import SAC, HerReplayBuffer
 
 import tpm_gym
 from tpm_gym.envs.testing import CHECKS
@@ -19,37 +18,32 @@ from tpm_gym.tasks.registry import TASKS
 
 
 @pytest.fixture(scope="module", autouse=True)
-def stacking():
+def sorting():
     """The task's file; what it registers is gone afterwards, for other tests count the ids."""
     with patch.dict(gym.registry), patch.dict(TASKS):
-        sys.modules.pop("stacking", None)
-        yield importlib.import_module("stacking")
+        sys.modules.pop("sorting", None)
+        yield importlib.import_module("sorting")
 
 
 @pytest.fixture
 def env():
-    return gym.make("TPMStackDense-v0", render_mode="rgb_array")
+    return gym.make("TPMSortDense-v0", render_mode="rgb_array")
 
 
-@pytest.mark.parametrize("env_id", ["TPMStack-v0", "TPMStackJointsDense-v0"])
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
-def test_it_conforms(check, env_id):
-    check(lambda: gym.make(env_id))
+def test_it_conforms(check):
+    check(lambda: gym.make("TPMSortJointsDense-v0"))
 
 
 @pytest.mark.parametrize(
     ("env_id", "machine"),
-    [("TPMStack-v0", "paper"), ("TPMStackJoints-v0", "paper"), ("TPMStack-v0", "wide")],
+    [("TPMSort-v0", "paper"), ("TPMSortJoints-v0", "paper"), ("TPMSort-v0", "wide")],
 )
-def test_its_expert_stacks(env_id, machine):
+def test_its_expert_sorts(env_id, machine):
     env = gym.make(env_id, machine=machine)
-    solved = 0
-    for seed in range(20):
-        *_, (observation, _, info) = expert_episode(env, seed, steps=100)
-        red, blue = np.split(observation["achieved_goal"], 2)
-        assert np.allclose(blue - red, [0.0, 0.0, 0.033], atol=0.004) or not info["is_success"]
-        solved += info["is_success"]
-    assert solved == 20
+    for seed in range(5):
+        *_, (_, _, info) = expert_episode(env, seed, steps=100)
+        assert info["is_success"]
 
 
 def test_its_own_terms_are_part_of_the_reward(env):
@@ -60,7 +54,7 @@ def test_its_own_terms_are_part_of_the_reward(env):
 
 
 def test_the_worse_placed_block_decides(env):
-    task, place = env.unwrapped.task, np.array([0.0, -0.03, 0.015, 0.0, -0.03, 0.048])
+    task, place = env.unwrapped.task, np.array([0.0, -0.03, 0.015, -0.1, -0.03, 0.018])
     both, red, blue = np.array([[1, 0, 0, 0, 1, 0], [1, 0, 0, 0, 0, 0], [0, 0, 0, 0, 1, 0]])
     offsets = [0.009 * both, 0.011 * red, 0.011 * blue]
     gaps = [task.gap(place + off, place) for off in offsets]
@@ -69,7 +63,7 @@ def test_the_worse_placed_block_decides(env):
 
 def test_users_place_the_blocks_by_name(env):
     red, blue = (0.05, -0.03, 0.015), (-0.05, -0.03, 0.018)
-    goal = (0.0, -0.03, 0.015, 0.0, -0.03, 0.048)
+    goal = (0.0, -0.03, 0.015, -0.1, -0.03, 0.018)
     observation, _ = env.reset(options={"red": red, "blue": blue, "goal": goal})
     assert np.allclose(observation["desired_goal"], goal, atol=1e-6)
     assert np.allclose(env.unwrapped.goal, goal, atol=1e-6)
@@ -90,26 +84,9 @@ def test_the_blocks_are_drawn_in_their_colours(env):
     assert ((b > 2 * r) & (b > 2 * g)).sum() > 100
 
 
-def test_sac_trains_on_it(env):
-    model = SAC(
-        "MultiInputPolicy",
-        env,
-        learning_starts=100,
-        batch_size=64,
-        policy_kwargs={"net_arch": [32, 32]},
-        replay_buffer_class=HerReplayBuffer,
-        replay_buffer_kwargs={"copy_info_dict": True},
-        seed=0,
-    )
-    before = model.policy.state_dict()["actor.mu.weight"].clone()
-    model.learn(200)
-    assert model.num_timesteps == 200
-    assert not before.equal(model.policy.state_dict()["actor.mu.weight"])
-
-
-def test_a_block_that_the_cup_cannot_come_down_to_is_refused(stacking):
-    class Coin(stacking.Stack):
-        scene = Scene((Block("coin", height=0.020), stacking.Stack.blue), markers=2)
+def test_a_block_that_the_cup_cannot_come_down_to_is_refused(sorting):
+    class Coin(sorting.Sort):
+        scene = Scene((Block("coin", height=0.020), sorting.Sort.blue), markers=2)
 
     with pytest.raises(ConfigurationError, match=r"'coin'.*at least 0\.027 m high"):
         Coin(PAPER_TPM)
@@ -128,16 +105,16 @@ def test_a_block_that_the_cup_cannot_come_down_to_is_refused(stacking):
         ("vacuum", False, "vacuum = False .*: True: the plan of Wrong"),
     ],
 )
-def test_what_is_wrong_in_a_task_is_named(stacking, part, value, message):
-    wrong = type("Wrong", (stacking.Stack,), {part: value})
+def test_what_is_wrong_in_a_task_is_named(sorting, part, value, message):
+    wrong = type("Wrong", (sorting.Sort,), {part: value})
     with pytest.raises(ConfigurationError, match=message):
         list(expert_episode(tpm_gym.TPMEnv(wrong), 0, steps=50))
 
 
-def test_where_there_is_no_room_sampling_says_so(stacking):
-    class Crowd(stacking.Stack):
+def test_where_there_is_no_room_sampling_says_so(sorting):
+    class Crowd(sorting.Sort):
         def sample(self, rngs, chosen):
-            with patch.object(stacking, "APART", 0.5):
+            with patch.object(sorting, "APART", 0.5):
                 return super().sample(rngs, chosen)
 
     env = tpm_gym.TPMEnv(Crowd)

@@ -120,7 +120,7 @@ def test_actions_are_those_of_the_model(
     assert (actions.shape, actions.dtype) == (expected.shape, expected.dtype)
     np.testing.assert_allclose(actions, expected, rtol=0, atol=1e-5)
     assert expected.std(axis=0).min() > 0.01  # the comparison is not one of constants
-    for i in range(1000):
+    for i in range(50):
         one = {key: values[i] for key, values in batch.items()}
         wanted, _ = made.predict(one, deterministic=True)
         action = loaded.act(one)

@@ -32,7 +32,10 @@ def test_every_recipe_is_handed_over_with_classes_for_their_names(algorithm: str
 @pytest.mark.usefixtures("needs_pybullet")
 @pytest.mark.parametrize(
     ("algorithm", "env_id", "steps"),
-    [("sac", "TPMReach-v0", 1020), ("ppo", "TPMReachDense-v0", 1)],
+    [
+        ("sac", "TPMReach-v0", 1020),
+        pytest.param("ppo", "TPMReachDense-v0", 1, marks=pytest.mark.slow),
+    ],
 )
 def test_the_zoo_runs_them(algorithm: str, env_id: str, steps: int, tmp_path: Path) -> None:
     pytest.importorskip("rl_zoo3")

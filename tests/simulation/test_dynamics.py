@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from alone import Alone, motors
-from inside_bullet import around_each_step, push
+from alone import Alone, jumping, motors
+from inside import around_each_step, push, slide
 from machines import anywhere, each_machine, excursions
 from numpy.typing import ArrayLike
 from walk import place, walk
@@ -77,15 +77,12 @@ def jacobian(machine: Machine, theta: Vector) -> FloatArray:
 
 # The engine
 
+each_engine = pytest.mark.parametrize("engine", ["pybullet", "mujoco"])
+NO_TORQUE = Plant(motor_strength=(0.0, 0.0, 0.0))
+
 
 def torques(simulation: Alone) -> FloatArray:
     return np.array(motors(simulation).torque)
-
-
-def switch_motors_off(simulation: Alone) -> None:
-    client, robot = simulation.engine.client, simulation.engine.robot
-    for name in simulation.machine.mechanism.actuated:
-        client.setJointMotorControl2(*robot.joints[name], client.VELOCITY_CONTROL, force=0)
 
 
 def settle(simulation: Alone, point: ArrayLike, periods: int = 3) -> None:
@@ -111,73 +108,95 @@ def total_energy(simulation: Alone) -> tuple[float, float]:
 # Forces at rest
 
 
+@pytest.mark.parametrize(
+    ("engine", "bound"),  # measured: 7e-9 of the largest of the three in PyBullet
+    [("pybullet", 1e-6), ("mujoco", 1e-4), ("analytic", 1e-6)],
+)
 @each_machine
-@pytest.mark.parametrize(("low", "high"), [(1.0, 1.0), (0.5, 2.0)])
-def test_torques_at_rest_carry_the_links(machine: Machine, low: float, high: float) -> None:
-    # Measured: 7e-9 of the largest of the three.
-    simulation, rng = Alone(Scene(), machine=machine), np.random.default_rng(1)
-    for point in anywhere(machine, 10):
-        theta, factors = machine.inverse(point), rng.uniform(low, high, len(links(machine)))
-        plant = Plant(link_masses=tuple(factors.tolist())) if high > low else Plant()
+def test_torques_at_rest_carry_the_links(machine: Machine, engine: str, bound: float) -> None:
+    simulation, rng = Alone(Scene(), engine=engine, machine=machine), np.random.default_rng(1)
+    for index, point in enumerate(anywhere(machine, 10)):
+        theta, factors = machine.inverse(point), rng.uniform(0.5, 2.0, len(links(machine)))
+        altered = index % 3 != 2  # a reset takes it back
+        plant = Plant(link_masses=tuple(factors.tolist())) if altered else Plant()
         assert not simulation.reset(theta, plant=plant).torque.any()
         settle(simulation, point)
-        expected = weights(machine, theta, factors)
+        expected = weights(machine, theta, factors if altered else 1.0)
         error = np.abs(simulation.read().torque - expected).max()
-        assert error < 1e-6 * np.abs(expected).max()
+        assert error < bound * np.abs(expected).max()
 
 
+@pytest.mark.parametrize(
+    ("engine", "bound"),  # measured: 4e-7 of the largest of the three in PyBullet
+    [("pybullet", 1e-5), ("mujoco", 3e-3)],
+)
 @each_machine
-def test_a_force_on_the_platform_loads_the_motors_by_the_jacobian(machine: Machine) -> None:
-    # Measured: 4e-7 of the largest of the three.
-    simulation, force = Alone(Scene(), machine=machine), np.zeros(3)
-    around_each_step(simulation, before=lambda: push(simulation, force))
-    for point in anywhere(machine, 6, seed=2):
-        theta = machine.inverse(point)
-        simulation.reset(theta)
-        settle(simulation, point)
-        alone = torques(simulation)
-        for value in FORCES:
-            force[:] = value
-            settle(simulation, point, 2)
-            expected = -jacobian(machine, theta).T @ force
-            change = torques(simulation) - alone
-            assert np.abs(change - expected).max() < 1e-5 * np.abs(expected).max()
-        force[:] = 0
+def test_a_force_on_the_platform_loads_the_motors_by_the_jacobian(
+    machine: Machine, engine: str, bound: float
+) -> None:
+    simulation, force = Alone(Scene(), engine=engine, machine=machine), np.zeros(3)
+    with around_each_step(simulation, before=lambda: push(simulation, machine.mount.rotate(force))):
+        for point in anywhere(machine, 6, seed=2):
+            theta = machine.inverse(point)
+            simulation.reset(theta)
+            settle(simulation, point)
+            alone = torques(simulation)
+            for value in FORCES:
+                force[:] = value
+                settle(simulation, point, 2)
+                expected = -jacobian(machine, theta).T @ force
+                change = torques(simulation) - alone
+                assert np.abs(change - expected).max() < bound * np.abs(expected).max()
+            force[:] = 0
 
 
 # Motion
 
 
+@each_engine
+def test_ideal_motors_are_where_they_shall_be_at_the_end_of_every_time_step(engine: str) -> None:
+    simulation, before = Alone(Scene(), engine=engine), THETA
+    simulation.reset(THETA)
+    for share in (1 - np.cos(np.linspace(0, np.pi, 100))) / 2:
+        theta = PAPER_TPM.inverse(np.add(HOME, share * np.array((-0.10, 0.010, 0.05))))
+        simulation.engine.advance(jumping(theta), [False])
+        found = motors(simulation)
+        np.testing.assert_allclose(found.theta, theta, atol=2e-6)
+        rates = np.subtract(theta, before) / simulation.engine.time_step
+        np.testing.assert_allclose(found.theta_dot, rates, atol=1e-3)
+        before = theta
+
+
+@each_engine
 @each_machine
-def test_released_it_accelerates_by_its_mass_matrix(machine: Machine) -> None:
-    # Measured: 1e-5, and 3e-5 at y = 13 mm where M has rows 100 times as large as others.
-    simulation = Alone(Scene(), machine=machine)
-    switch_motors_off(simulation)
-    for point in anywhere(machine, 6):
-        theta = machine.inverse(point)
-        mass, load = mass_matrix(machine, theta), weights(machine, theta)
-        j = jacobian(machine, theta)
-        for force in ([0, 0, 0], *FORCES):
-            simulation.reset(theta)
-            push(simulation, force)
-            simulation.engine.client.stepSimulation()
-            rates = np.array(motors(simulation).theta_dot)
-            time_step = simulation.engine.physics.time_step
-            expected = np.linalg.solve(mass, j.T @ force - load) * time_step
-            assert np.abs(rates - expected).max() < 1e-3 * np.abs(expected).max()
+def test_released_it_accelerates_by_its_mass_matrix(machine: Machine, engine: str) -> None:
+    # Measured in PyBullet: 1e-5, and 3e-5 at y = 13 mm where M has rows 100 times as large as
+    # others; in MuJoCo, whose loops yield, 1.4e-2.
+    bound = 1e-3 if engine == "pybullet" else 2e-2
+    simulation, force = Alone(Scene(), engine=engine, machine=machine), np.zeros(3)
+    with around_each_step(simulation, before=lambda: push(simulation, machine.mount.rotate(force))):
+        for point in anywhere(machine, 6):
+            theta = machine.inverse(point)
+            mass, load = mass_matrix(machine, theta), weights(machine, theta)
+            j = jacobian(machine, theta)
+            for force[:] in ([0, 0, 0], *FORCES):
+                simulation.reset(theta, plant=NO_TORQUE)
+                simulation.engine.advance(jumping(theta), [False])
+                rates = np.array(motors(simulation).theta_dot)
+                expected = np.linalg.solve(mass, j.T @ force - load) * simulation.engine.time_step
+                assert np.abs(rates - expected).max() < bound * np.abs(expected).max()
 
 
 def lost_in_free_fall(point: Vector, time_step: float) -> float:
     """Energy lost in 0.2 s without motors, as a share of the kinetic energy gained."""
     simulation = Alone(Scene(), physics={"time_step": time_step})
-    client, tool = simulation.engine.client, simulation.engine.robot.tool
-    simulation.reset(PAPER_TPM.inverse(point))
-    switch_motors_off(simulation)
+    theta = PAPER_TPM.inverse(point)
+    simulation.reset(theta, plant=NO_TORQUE)
     start = sum(total_energy(simulation))
     for _ in range(round(0.2 / time_step)):
-        client.stepSimulation()
+        simulation.engine.advance(jumping(theta), [False])
         # The spring of the cup does no work, and nothing is touched.
-        assert abs(client.getJointState(*tool)[0]) < 1e-9
+        assert abs(slide(simulation)) < 1e-9
     kinetic, potential = total_energy(simulation)
     assert simulation.read().platform_position[2] > CUP.length + 0.01
     return (start - kinetic - potential) / kinetic
@@ -274,48 +293,52 @@ def test_torques_of_a_motion_are_those_of_the_closed_form(machine: Machine) -> N
 # Limits
 
 
-@pytest.mark.parametrize("strength", [(1.0, 1.0, 1.0), (0.5, 0.75, 1.5)])
+@each_engine
 @pytest.mark.parametrize("motor", [0, 1, 2])
 @pytest.mark.parametrize("sign", [-1, 1])
-def test_a_motor_holds_its_effort_and_no_more(
-    simulation: Alone, motor: int, sign: int, strength: Vector
-) -> None:
+def test_a_motor_holds_its_effort_and_no_more(engine: str, motor: int, sign: int) -> None:
+    simulation, strength = Alone(Scene(), engine=engine), (0.5, 0.75, 1.5)
     effort = TORQUE_MOTOR.peak_torque * np.array(strength)
     j, load, force = jacobian(PAPER_TPM, THETA), weights(PAPER_TPM, THETA), np.zeros(3)
-    around_each_step(simulation, before=lambda: push(simulation, force))
-    moved = []
-    for share in (0.99, 1.01):
-        force[:] = 0
-        simulation.reset(THETA, plant=Plant(motor_strength=strength))
-        settle(simulation, HOME)
-        wanted = np.zeros(3)
-        wanted[motor] = sign * share * effort[motor]
-        force[:] = np.linalg.solve(j.T, load - wanted)  # all on one motor, nothing on the others
-        settle(simulation, HOME, 1)
-        found = torques(simulation)
-        moved.append(abs(motors(simulation).theta[motor] - THETA[motor]))
-        if share < 1:
-            np.testing.assert_allclose(found, wanted, atol=1e-3)
-        assert (np.abs(found) <= effort * (1 + 1e-9)).all()
-    assert moved[0] < 1e-8
+    rotate, moved = PAPER_TPM.mount.rotate, []
+    with around_each_step(simulation, before=lambda: push(simulation, rotate(force))):
+        for share in (0.99, 1.01):
+            force[:] = 0
+            simulation.reset(THETA, plant=Plant(motor_strength=strength))
+            settle(simulation, HOME)
+            wanted = np.zeros(3)
+            wanted[motor] = sign * share * effort[motor]
+            force[:] = np.linalg.solve(j.T, load - wanted)  # all on one motor, none on the others
+            settle(simulation, HOME, 1)
+            found = torques(simulation)
+            moved.append(abs(motors(simulation).theta[motor] - THETA[motor]))
+            if share < 1:
+                np.testing.assert_allclose(found, wanted, atol=0.05)
+            assert (np.abs(found) <= effort * (1 + 1e-9)).all()
+    assert moved[0] < 1e-5
     assert moved[1] > 1e-5  # it gives way
 
 
-@pytest.mark.parametrize("drive", [None, Servo()], ids=["ideal", "servo"])
-@pytest.mark.parametrize("engine", ["pybullet", "mujoco"])
+each_drive = pytest.mark.parametrize("drive", [None, Servo()], ids=["ideal", "servo"])
+
+
+@each_drive
+@each_engine
 def test_motors_without_torque_let_the_arm_fall(engine: str, drive: Servo | None) -> None:
     simulation = Alone(Scene(), engine=engine, drive=drive)
-    before = simulation.reset(THETA, plant=Plant(motor_strength=(0.0, 0.0, 0.0)))
+    before = simulation.reset(THETA, plant=NO_TORQUE)
     settle(simulation, HOME, 2)
     state = simulation.read()
     np.testing.assert_allclose(torques(simulation), 0, atol=1e-6)
     assert before.platform_position[2] - state.platform_position[2] > 0.01
 
 
-def test_no_command_draws_more_than_the_motors_have(simulation: Alone) -> None:
-    drawn: list[FloatArray] = []
-    around_each_step(simulation, after=lambda: drawn.append(np.abs(torques(simulation))))
-    simulation.reset(THETA)
-    for jump in (-0.1, 0.1, -0.1, 0.1):  # m in a control period, three times what actions reach
-        simulation.move(np.add(HOME, (0, 0, jump)))
-    np.testing.assert_allclose(np.max(drawn, axis=0), TORQUE_MOTOR.peak_torque, rtol=1e-9)
+@each_drive
+@each_engine
+def test_no_command_draws_more_than_the_motors_have(engine: str, drive: Servo | None) -> None:
+    simulation, drawn = Alone(Scene(), engine=engine, drive=drive), list[FloatArray]()
+    simulation.reset(THETA, plant=Plant(motor_strength=(0.5, 0.5, 0.5)))
+    with around_each_step(simulation, after=lambda: drawn.append(np.abs(torques(simulation)))):
+        for jump in (-0.1, 0.1, -0.1, 0.1):  # m in a control period, three times an action's reach
+            simulation.move(np.add(HOME, (0, 0, jump)))
+    assert np.max(drawn) == pytest.approx(0.5 * TORQUE_MOTOR.peak_torque, rel=1e-9)

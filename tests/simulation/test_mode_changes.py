@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 
-import inside_bullet
+import inside
 import numpy as np
 import pytest
 from alone import Alone
@@ -34,8 +34,8 @@ def true_y(state: State) -> float:
 
 def push(env: TPMEnv, force: Vector) -> Callable[[], None]:
     """Let a force (N, machine's frame) act on the platform from now on; returns what ends it."""
-    simulation = env.simulation
-    return inside_bullet.around_each_step(simulation, lambda: inside_bullet.push(simulation, force))
+    simulation, world = env.simulation, env.machine.mount.rotate(force)
+    return inside.around_each_step(simulation, lambda: inside.push(simulation, world)).close
 
 
 # -- y = 0: the parallel singularity ---------------------------------------------------------------

@@ -13,7 +13,6 @@ import pytest
 import yaml
 from alone import Alone
 from episodes import EVERYTHING, OF_SERVOS, expert_episode, fingerprint, random_episode
-from shared import memory
 
 from tpm_gym import TPMEnv, kinematics
 from tpm_gym.arrays import FloatArray
@@ -60,39 +59,25 @@ def out_of_range() -> Iterator[tuple[str, Any, str]]:
     for name, (low, high) in _RANGES.items():
         limits, pair = f"within {low} to {high}", "(low, high)"
         below, above = low - 1e-9, 1.01 * high
-        for value in (below, above, (below, high), (low, above)):
+        for value in (below, above, (below, high), (low, above), (low, np.nan), True, 10**400):
             yield name, value, limits
-        for value in (-1.0, np.nan, np.inf, (low, np.nan), True, None, "heavy", 10**400):
-            yield name, value, limits
-        for value in ((high, low), (1.0, 1.0, 1.0), (1.0,), {"low": 1.0}, ("1", "2")):
+        for value in ((high, low), (1.0,), {"low": 1.0}, ("1", "2")):
             yield name, value, pair
     for name, largest in _SIZES.items():
-        for value in (
-            -1e-9,
-            1.01 * largest,
-            np.nan,
-            np.inf,
-            True,
-            None,
-            "small",
-            10**400,
-            (0.0, largest),
-        ):
+        for value in (-1e-9, 1.01 * largest, np.nan, True, None, "small", (0.0, largest)):
             yield name, value, f"from 0 to {largest}"
     for value in (6, -1, 0.5, True, None, "one", [1], np.nan):
         yield "latency", value, "from 0 to 5"
 
 
-@pytest.mark.parametrize(("name", "value", "limit"), list(out_of_range()))
-def test_what_is_out_of_range_is_refused_by_name_value_and_limit(
-    name: str, value: Any, limit: str
-) -> None:
-    with pytest.raises(ConfigurationError) as caught:
-        of({name: value})
-    assert caught.value.name == name
-    assert repr(caught.value.value) == repr(value)
-    assert limit in caught.value.valid
-    assert limit in str(caught.value)
+def test_what_is_out_of_range_is_refused_by_name_value_and_limit() -> None:
+    for name, value, limit in out_of_range():
+        with pytest.raises(ConfigurationError) as caught:
+            of({name: value})
+        assert caught.value.name == name
+        assert repr(caught.value.value) == repr(value)
+        assert limit in caught.value.valid
+        assert limit in str(caught.value)
 
 
 def test_the_documentation_states_the_ranges() -> None:
@@ -166,36 +151,15 @@ def test_draws_fill_the_stated_ranges_and_are_independent() -> None:
     assert np.abs(correlations).max() < 0.1
 
 
-@pytest.mark.parametrize("task", ["reach", "pick_and_place"])
-def test_a_machine_without_deviations_is_the_nominal_one_to_the_last_bit(task: str) -> None:
-    prints = []
-    for option in (None, {}, {"link_mass": (1.0, 1.0), "encoder_noise": 0}, Randomisation()):
-        env = TPMEnv(task, randomisation=option)
-        prints.append(fingerprint(random_episode(env, 0)) + fingerprint(random_episode(env, 1)))
-    assert len(set(prints)) == 1
+def test_a_machine_without_deviations_is_the_nominal_one_to_the_last_bit() -> None:
+    prints = set()
+    for option in (None, {"link_mass": (1.0, 1.0), "encoder_noise": 0}, Randomisation()):
+        env = TPMEnv("pick_and_place", randomisation=option)
+        prints.add(fingerprint(random_episode(env, 0, 25)) + fingerprint(random_episode(env, 1, 5)))
+    assert len(prints) == 1
 
 
 # -- masses ----------------------------------------------------------------------------------------
-
-
-def drawn_masses(seed: int) -> tuple[float, ...]:
-    return tuple(np.random.default_rng(seed).uniform(0.5, 2.0, LINKS).tolist())
-
-
-def test_each_link_gets_its_own_mass_and_inertia_and_a_reset_takes_them_back(
-    simulation: Alone,
-) -> None:
-    factors = drawn_masses(2)
-    client, links = simulation.engine.client, PAPER_TPM.mechanism.links[1:]
-    addresses = simulation.engine.robot.links
-    loaded = {link.name: client.getDynamicsInfo(*addresses[link.name])[2] for link in links}
-    for plant in (Plant(link_masses=factors), Plant(link_masses=drawn_masses(3)), NOMINAL):
-        simulation.reset(THETA, ON_TABLE, plant=plant)
-        for link, factor in zip(links, plant.link_masses or (1.0,) * LINKS, strict=True):
-            info = client.getDynamicsInfo(*addresses[link.name])
-            assert info[0] == pytest.approx(factor * link.mass, rel=1e-6), link.name
-            moments = factor * np.array(loaded[link.name])
-            np.testing.assert_allclose(info[2], moments, rtol=1e-9)
 
 
 @pytest.mark.parametrize("factor", [0.1, 1.0, 10.0])
@@ -218,20 +182,6 @@ def test_the_block_weighs_what_it_should_and_a_force_accelerates_it_accordingly(
         steps * simulation.engine.physics.time_step * (np.array(force) / mass - (0, 0, GRAVITY))
     )
     np.testing.assert_allclose(velocity, gained, rtol=1e-6)
-
-
-# -- friction --------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("factor", [0.1, 0.5, 1.0, 1.5])  # beyond 2 it would topple
-def test_a_sliding_block_slows_down_by_mu_g(simulation: Alone, factor: float) -> None:
-    rest(simulation, Plant(friction=factor))
-    client, (block,) = simulation.engine.client, simulation.engine.bodies
-    client.resetBaseVelocity(block, (1.5, 0.0, 0.0), (0.0, 0.0, 0.0))
-    for _ in range(2):
-        state = simulation.move(HOME)
-    lost = factor * Block().friction * GRAVITY * 0.08
-    assert 1.5 - state.object_velocity[0, 0] == pytest.approx(lost, rel=0.1)
 
 
 # -- encoders --------------------------------------------------------------------------------------
@@ -387,23 +337,10 @@ def test_a_robot_built_anew_stands_in_the_same_world(simulation: Alone) -> None:
         simulation.reset(THETA, {"object": (0.2, -0.02, 0.5)}, plant=plant)
         client = simulation.engine.client  # perhaps another one now
         assert client.getPhysicsEngineParameters() == settings
-        assert client.getNumConstraints() == 4
+        assert (client.getNumConstraints(), client.getNumBodies()) == (4, 7)
         falls.append([simulation.move(HOME).object_position[0, 2] for _ in range(15)])
     assert falls[0] == falls[1] == falls[2]
     assert falls[0][0] < 0.5 - 0.007
-
-
-def test_a_hundred_robots_later_the_memory_is_what_it_was() -> None:
-    env = TPMEnv("pick_and_place", randomisation={"length_error": 5e-4})
-    for seed in range(10):
-        env.reset(seed=seed)
-    before, kind = memory()
-    if kind != "resident":
-        pytest.skip("needs Linux")
-    for seed in range(100):
-        env.reset(seed=seed)
-    assert memory()[0] - before < 10
-    assert env.simulation.engine.client.getNumBodies() == 7
 
 
 @pytest.mark.parametrize("bias", [0.0, _SIZES["encoder_bias"]])
@@ -420,11 +357,13 @@ def test_the_arm_at_home_stands_on_its_own_side_at_every_corner_of_the_ranges(bi
 MODERATE = {**EVERYTHING, "motor_strength": (0.8, 1.2), "length_error": 5e-4}
 
 
-@pytest.mark.parametrize("latency", [0, 1])
-@pytest.mark.parametrize("env_id", ["TPMReach-v0", "TPMPickAndPlace-v0", "TPMReachJoints-v0"])
+@pytest.mark.parametrize(
+    ("env_id", "latency"),
+    [("TPMReach-v0", 0), ("TPMPickAndPlace-v0", 1), ("TPMReachJoints-v0", 1)],
+)
 def test_the_expert_succeeds_on_moderately_different_machines(env_id: str, latency: int) -> None:
     env = gym.make(env_id, randomisation={**MODERATE, "latency": latency})
-    for seed in range(20):
+    for seed in range(8):
         *_, (_, _, info) = expert_episode(env, seed)
         assert info["is_success"], seed
 
@@ -440,7 +379,7 @@ EXTREMES: list[dict[str, Any]] = [
 
 @pytest.mark.parametrize("option", EXTREMES)
 @pytest.mark.parametrize(
-    "seeds", [range(2), pytest.param(range(100, 200), marks=pytest.mark.slow)], ids=len
+    "seeds", [range(1), pytest.param(range(100, 140), marks=pytest.mark.slow)], ids=len
 )
 def test_at_the_ends_of_the_ranges_nothing_is_lost_or_it_is_reported(
     option: dict[str, Any], seeds: range

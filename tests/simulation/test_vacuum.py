@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 
-from tpm_gym.compiling import compilable, compiled
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.simulation.vacuum import (
     EMPTY,
@@ -18,7 +17,6 @@ from tpm_gym.simulation.vacuum import (
     pressure_after,
 )
 
-compilable(hold_after, holds, pressure_after)
 STEP = 1 / 250
 FULL = Hold(0, CUP.vacuum)
 NOTHING = Load()
@@ -87,24 +85,3 @@ def test_what_is_pulled_off_vents_the_cup_before_it_can_seal_again() -> None:
         steps += 1
     assert before <= CUP.least_vacuum < before * math.exp(STEP / 0.010)
     assert steps == math.ceil(0.010 * math.log(20) / STEP) + 1
-
-
-@compiled
-def compiled_after(hold: Hold, on: bool, load: Load, touched: int) -> Hold:
-    return hold_after(hold, STEP, on, load, touched)
-
-
-def test_many_cups_at_once_obey_the_same_law() -> None:
-    """Those of the analytic engine: there it is compiled."""
-    rng = np.random.default_rng(0)
-    held, on, touched = rng.random((3, 500)) < 0.5
-    vacuum = CUP.vacuum * rng.random(500) ** 4
-    tension, shear = rng.uniform(-20.0, 15.0, 500), rng.uniform(0.0, 20.0, 500)
-    after = 0
-    for i in range(500):
-        hold = Hold(0 if held[i] else -1, float(vacuum[i]))
-        load, face = Load(float(tension[i]), float(shear[i])), 0 if touched[i] else -1
-        expected = hold_after(hold, STEP, on=bool(on[i]), load=load, touched=face)
-        assert compiled_after(hold, bool(on[i]), load, face) == expected
-        after += expected.which == 0
-    assert 0 < after < 500

@@ -2,12 +2,9 @@
 
 from dataclasses import replace
 from functools import cache
-from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
-from episodes import expert_episode
 from machines import each_machine
 
 from tpm_gym.arrays import FloatArray
@@ -133,23 +130,3 @@ def test_machines_on_which_nothing_can_be_drawn_are_told_instead_of_searched_for
     with pytest.raises(ConfigurationError) as caught:
         Reach(replace(PAPER_TPM, safe_conditioning=0.9)).start(rngs)
     assert caught.value.name == "safe_conditioning"
-
-
-def test_one_who_moves_the_joints_straight_to_the_goal_gets_into_the_unsafe_region() -> None:
-    """And the expert, who goes straight in space, hardly does, and succeeds."""
-    env: Any = gym.make("TPMReachJoints-v0", goals="tempting")
-    inner, careless, careful = env.unwrapped, [], []
-    to_paper = inner.machine.mount.to_paper
-    for seed in range(2_000_000, 2_000_004):
-        _, *steps = expert_episode(env, seed)
-        careful.append(min(info["conditioning"] for *_, info in steps))
-        assert steps[-1][2]["is_success"]
-        env.reset(seed=seed)
-        met = []
-        for _ in range(50):
-            ends = to_paper(inner.goal)[None], to_paper(inner.state.command)[None]
-            action = inner.control.action(*ends)[0]
-            met.append(env.step(action.astype(np.float32))[4]["conditioning"])
-        careless.append(min(met))
-    assert np.mean(careless) < SAFE - 0.002
-    assert min(careful) > SAFE - 0.002

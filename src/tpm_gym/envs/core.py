@@ -381,7 +381,7 @@ def _box(bound: float, length: int) -> spaces.Box:
 
 def _goal_free(terms: Mapping[str, Any]) -> Any:
     """Add the reward's terms that do not depend on the goal."""
-    total: Any = np.float64(0.0)  # in double precision, whatever a task's own terms have
+    total: Any = 0.0
     for name, value in terms.items():
         if name != "goal":
             total = total + value

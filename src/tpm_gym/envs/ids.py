@@ -2,27 +2,28 @@
 
 from __future__ import annotations
 
+import importlib
+import pkgutil
+from collections.abc import Iterator
 from inspect import isabstract
 from typing import Any
 
 import gymnasium as gym
 
+from tpm_gym import tasks
 from tpm_gym.arrays import is_whole
 from tpm_gym.errors import ConfigurationError
-from tpm_gym.tasks.pick_and_place import PickAndPlace
-from tpm_gym.tasks.reach import Reach
 from tpm_gym.tasks.registry import TASKS, option_name
 from tpm_gym.tasks.task import Task
 
-__all__ = ["ENTRY_POINT", "MAX_EPISODE_STEPS", "env_ids", "register_task"]
+__all__ = ["ENTRY_POINT", "env_ids", "register_task"]
 
 ENTRY_POINT = "tpm_gym.envs.single:TPMEnv"
 VECTOR_ENTRY_POINT = "tpm_gym.envs.vector:TPMVectorEnv"
-MAX_EPISODE_STEPS = 50
 
 
 def register_task(
-    name: str, task: type[Task], *, version: int = 0, max_episode_steps: int = MAX_EPISODE_STEPS
+    name: str, task: type[Task], *, version: int = 0, max_episode_steps: int | None = None
 ) -> tuple[str, ...]:
     """Register a task's ids: ``TPM<name>{,Joints}{,Dense}-v<version>``; harmless the second time.
 
@@ -34,7 +35,7 @@ def register_task(
         name: Name in CamelCase, e.g. ``"PickAndPlace"``.
         task: The class. A class that was defined again, as in a notebook, replaces the old one.
         version: Version at the end of the ids.
-        max_episode_steps: Steps after which episodes are truncated.
+        max_episode_steps: Steps after which episodes are truncated; None for the task's own number.
 
     Returns:
         The four ids.
@@ -47,6 +48,8 @@ def register_task(
     if not (isinstance(task, type) and issubclass(task, Task)) or isabstract(task):
         valid = "a class derived from tpm_gym.tasks.Task, with sample and achieved"
         raise ConfigurationError("task", task, valid)
+    if max_episode_steps is None:
+        max_episode_steps = task.max_episode_steps
     for label, number, least in (
         ("version", version, 0),
         ("max_episode_steps", max_episode_steps, 1),
@@ -86,5 +89,14 @@ def _path(task: type[Task]) -> tuple[str, str]:
     return task.__module__, task.__qualname__
 
 
-register_task("Reach", Reach)
-register_task("PickAndPlace", PickAndPlace)
+def _built_in() -> Iterator[type[Task]]:
+    """Yield the tasks of this package: a class in a file of :mod:`tpm_gym.tasks` is one."""
+    for _, name, _ in pkgutil.iter_modules(tasks.__path__, f"{tasks.__name__}."):
+        for value in vars(importlib.import_module(name)).values():
+            own = isinstance(value, type) and issubclass(value, Task) and value.__module__ == name
+            if own and not isabstract(value):
+                yield value
+
+
+for _task in _built_in():
+    register_task(_task.__name__, _task)

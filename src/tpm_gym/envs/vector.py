@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -211,7 +212,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         """
         plain = type(actions) is np.ndarray and actions.dtype.char in "df"  # as usual
         shape = self._shape
-        if not plain or actions.shape != shape or not np.isfinite(actions).all():
+        if not plain or actions.shape != shape or not isfinite(np.vdot(actions, actions)):
             actions = finite("actions", actions, shape, ActionError)
         self._require_running()
         values = actions.astype(np.float64)

@@ -18,6 +18,7 @@ from typing import Any, get_type_hints
 import yaml
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
+from tpm_gym.envs.ids import env_ids
 from tpm_gym.learning.algorithms import ALGORITHMS, NAMES
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.resources import RECIPES
@@ -119,12 +120,12 @@ def with_classes(entries: Mapping[str, Any]) -> dict[str, Any]:
 def read_recipe(path: Path, algorithm: str, env_id: str) -> Recipe:
     """Read the recipe of an environment, ``id`` or ``module:id``, after checking the whole file.
 
-    A ``module:id`` without a recipe gets pick-and-place's, without its demonstrations.
+    An id without a recipe gets that of pick-and-place, without its demonstrations.
     """
     recipes = read_recipes(path, algorithm)
     module, _, name = env_id.rpartition(":")
     known = "TPMPickAndPlace" + "".join(re.findall(r"(?:Joints)?(?:Dense)?-v", name)[-1:]) + "0"
-    if module and name not in recipes and known in recipes:
+    if (module or name in env_ids()) and name not in recipes and known in recipes:
         name = known
         recipes[name].pop("demonstrations", None)
     if name not in recipes:

@@ -264,7 +264,7 @@ class Machine(ABC):
     @cached_property
     def stops(self) -> FloatArray:
         """Lowest and highest joint positions, (2, 3)."""
-        stops: FloatArray = np.array(self.mechanism.stops).T
+        stops: FloatArray = np.array(self.mechanism.stops).T.copy()  # rows in one piece
         return stops
 
     # -- regions ----------------------------------------------------------------------------

@@ -24,11 +24,11 @@ __all__ = [
     "any_outside",
     "bounded",
     "braced_inverse",
+    "distances",
     "ends",
     "in_world",
     "limited",
-    "measured_object",
-    "measured_robot",
+    "measured",
     "servo_torque",
     "servo_torques",
     "shifted",
@@ -108,10 +108,11 @@ def in_world(
     theta_dot: FloatArray,
     commands: FloatArray,
     quaternion: FloatArray,
+    mode_left: NDArray[np.int8],
     turn: FloatArray,
     origin: FloatArray,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Convert P, its velocity and its command to the world frame; compute the objects' z axes.
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, BoolArray, BoolArray]:
+    """Convert P, its velocity and its command to the world frame; find axes and modes.
 
     Args:
         position: (n, 3) m, point P, machine's frame.
@@ -119,15 +120,19 @@ def in_world(
         theta_dot: (n, 3) rad/s.
         commands: (n, 3, 3) m, machine's frame; commands[:, 1] is converted.
         quaternion: (n, k, 4), orientations of the objects, world.
+        mode_left: (n,) mode that each robot left: 1 assembly, 2 working.
         turn: (3,) factors (1 or -1) of the machine's axes in the world frame.
         origin: (3,) m, origin of the machine's frame in the world frame.
 
     Returns:
-        P (n, 3) m, velocity of P (n, 3) m/s, command (n, 3) m, z axes (n, k, 3); world frame.
+        P (n, 3) m, velocity of P (n, 3) m/s, command (n, 3) m, z axes (n, k, 3) of the objects;
+        world frame. Whether the assembly mode and the working mode was left, (n,).
     """
     place, speed = np.empty_like(position), np.empty_like(position)
     wanted, axes = np.empty_like(position), np.empty((*quaternion.shape[:2], 3))
+    assembly, working = np.empty(len(position), np.bool_), np.empty(len(position), np.bool_)
     for row in range(len(position)):
+        assembly[row], working[row] = mode_left[row] == 1, mode_left[row] == 2
         for i in range(3):
             place[row, i] = turn[i] * position[row, i] + origin[i]
             wanted[row, i] = turn[i] * commands[row, 1, i] + origin[i]
@@ -140,54 +145,70 @@ def in_world(
             axes[row, item, 0] = 2 * (x * z + w * y)
             axes[row, item, 1] = 2 * (y * z - w * x)
             axes[row, item, 2] = 1 - 2 * (x * x + y * y)
-    return place, speed, wanted, axes
+    return place, speed, wanted, axes, assembly, working
 
 
 @kept
-def measured_robot(position: FloatArray, velocity: FloatArray, command: FloatArray) -> FloatArray:
-    """Return position, velocity, and command minus position as (n, 9); arguments are (n, 3)."""
-    values = np.empty((len(position), 9))
+def measured(
+    position: FloatArray,
+    velocity: FloatArray,
+    command: FloatArray,
+    places: FloatArray,
+    axes: FloatArray,
+    velocities: FloatArray,
+    held: IntArray,
+    vacuum: FloatArray,
+    lip: FloatArray,
+    halves: FloatArray,
+    most: float,
+) -> FloatArray:
+    """Return what encoders, camera and vacuum gauge measure of the robot and of k objects.
+
+    Args:
+        position: (n, 3) m, point P.
+        velocity: (n, 3) m/s, velocity of P.
+        command: (n, 3) m, commanded P.
+        places: (n, k, 3) m, centres of the objects.
+        axes: (n, k, 3), z axes of the objects.
+        velocities: (n, k, 3) m/s.
+        held: (n,) index of the object in the cup; -1 for none.
+        vacuum: (n,) Pa.
+        lip: (3,) m, from the lip of the cup to P.
+        halves: (k,) m, half heights of the objects.
+        most: Largest vacuum, Pa.
+
+    Returns:
+        (n, 9 + 12 k): position, velocity, command minus position; then for each object its centre,
+        its top minus the lip, its velocity, x and y of its z axis, and its share of the vacuum.
+    """
+    values = np.empty((len(position), 9 + 12 * len(halves)))
     for row in range(len(position)):
         for i in range(3):
             values[row, i] = position[row, i]
             values[row, 3 + i] = velocity[row, i]
             values[row, 6 + i] = command[row, i] - position[row, i]
+        for item in range(len(halves)):
+            own = values[row, 9 + 12 * item :]
+            for i in range(3):
+                place, axis = places[row, item, i], axes[row, item, i]
+                own[i] = place
+                own[3 + i] = place + axis * halves[item] - (position[row, i] - lip[i])
+                own[6 + i] = velocities[row, item, i]
+            own[9], own[10] = axes[row, item, 0], axes[row, item, 1]
+            own[11] = vacuum[row] / most if held[row] == item else 0.0
     return values
 
 
 @kept
-def measured_object(
-    index: int,
-    places: FloatArray,
-    axes: FloatArray,
-    velocities: FloatArray,
-    lips: FloatArray,
-    half: float,
-    held: IntArray,
-    share: FloatArray,
-) -> FloatArray:
-    """Return centre, top minus lip, velocity, x and y of the z axis, and hold of an object (n, 12).
-
-    Args:
-        index: Index of the object.
-        places: (n, k, 3) m, centres of the objects.
-        axes: (n, k, 3), z axes of the objects.
-        velocities: (n, k, 3) m/s.
-        lips: (n, 3) m, centres of the cups' lips.
-        half: Half height of the object, m.
-        held: (n,) index of the object in the cup; -1 for none.
-        share: (n,) vacuum as a fraction of the largest vacuum; the entry "hold" if held, else 0.
-    """
-    values = np.empty((len(places), 12))
-    for row in range(len(places)):
-        for i in range(3):
-            place, axis = places[row, index, i], axes[row, index, i]
-            values[row, i] = place
-            values[row, 3 + i] = place + axis * half - lips[row, i]
-            values[row, 6 + i] = velocities[row, index, i]
-        values[row, 9], values[row, 10] = axes[row, index, 0], axes[row, index, 1]
-        values[row, 11] = share[row] if held[row] == index else 0.0
-    return values
+def distances(points: FloatArray, others: FloatArray) -> FloatArray:
+    """Return the Euclidean distances (n,) between rows of two arrays (n, k)."""
+    found = np.empty(len(points))
+    for row in range(len(points)):
+        squared = 0.0
+        for k in range(points.shape[1]):
+            squared += (points[row, k] - others[row, k]) ** 2
+        found[row] = np.sqrt(squared)
+    return found
 
 
 @kept
@@ -226,8 +247,8 @@ def singularity_penalty(
 @kept
 def truth(
     frames: FloatArray, sides: IntArray, pivots: FloatArray, platform: int, point: FloatArray
-) -> tuple[float, float, float, float, float]:
-    """Compute the largest loop gap (m), x, y, z of P (m, world) and the platform's tilt (rad).
+) -> tuple[float, Vector, float]:
+    """Compute the largest loop gap (m), point P (m, world) and the platform's tilt (rad).
 
     Args:
         frames: (7 l,) origin (m) and orientation (x, y, z, w) of each of l links, world.
@@ -244,9 +265,8 @@ def truth(
         if gap > squared or gap != gap:  # after a NaN, the result stays NaN
             squared = gap
     own = frames[7 * platform :]
-    x, y, z = _placed(own, point)
     sine = np.sqrt(own[4] * own[4] + own[5] * own[5] + own[6] * own[6])
-    return np.sqrt(squared), x, y, z, 2 * np.arcsin(min(1.0, sine))
+    return np.sqrt(squared), _placed(own, point), 2 * np.arcsin(min(1.0, sine))
 
 
 @compiled

@@ -34,6 +34,7 @@ __all__ = [
     "Twist",
     "drives_of_one",
     "engine_names",
+    "loops",
     "make_engine",
     "most_robots",
     "register_engine",
@@ -183,7 +184,7 @@ class Path:
 
     def points(self, last: int = 0) -> FloatArray:
         """Return point P (n, k, 3) m at the ends of the last k time steps (0: all time steps)."""
-        points: FloatArray = _loops().spline_points(self.commands, self.weights[-last:])
+        points: FloatArray = loops().spline_points(self.commands, self.weights[-last:])
         return points
 
     def joints(self, last: int = 0) -> FloatArray:
@@ -193,7 +194,8 @@ class Path:
             JointLimitError: If a motor would be beyond a stop.
             UnreachableError: If a point is out of reach.
         """
-        return self.true(self._readings(self.points(last)))
+        theta = self._readings(self.weights[-last:])
+        return theta if self._bias is None else self.true(theta)
 
     def readings(self) -> FloatArray:
         """Return encoder readings (n, K + 1, 3) rad, from the beginning to the end of the period.
@@ -202,13 +204,13 @@ class Path:
             JointLimitError: If a motor would be beyond a stop.
             UnreachableError: If a point is out of reach.
         """
-        weights = np.concatenate([_START, self.weights])
-        return self._readings(_loops().spline_points(self.commands, weights))
+        return self._readings(np.concatenate([_START, self.weights]))
 
-    def _readings(self, points: FloatArray) -> FloatArray:
+    def _readings(self, weights: FloatArray) -> FloatArray:
+        points: FloatArray = loops().spline_points(self.commands, weights)
         theta = self.machine.inverse(points)
         # all_within() is also False for NaN, and reach() then raises the error.
-        if not _loops().all_within(theta.reshape(-1, 3), *self.machine.stops):
+        if not loops().all_within(theta.reshape(-1, 3), *self.machine.stops):
             theta = self.machine.reach(points)
         return theta
 
@@ -220,8 +222,9 @@ class Path:
 
 
 @cache
-def _loops() -> ModuleType:
-    from tpm_gym.simulation import compiled  # imports Numba
+def loops() -> ModuleType:
+    """Import the compiled loops, :mod:`tpm_gym.simulation.compiled`, and with them Numba."""
+    from tpm_gym.simulation import compiled
 
     return compiled
 

@@ -51,7 +51,7 @@ _WIDEST = 4 / 3  # aspect ratio; narrower pictures get a larger vertical field o
 _SHADOW = 0.5  # darkness of a shadow below a body on the table
 _PENUMBRA = 0.25  # growth of a shadow's radius with the height of the body
 _FLAT = 0.0015  # m; points closer to the table's plane belong to the table
-_HIDDEN = 0.4  # opacity of the part of a marker that is behind or inside a body, as a factor
+_HIDDEN = 0.5  # opacity, as a factor, in the middle of a marker that is behind or inside a body
 
 
 @dataclass(frozen=True)
@@ -257,7 +257,8 @@ def _paint_sphere(
     opacity = MARKER_COLOUR[3] * edge
     if depth is not None:
         front = (along - chord * np.sqrt(square)) / square
-        opacity = np.where(depth < front, _HIDDEN * opacity, opacity)
+        seen_through = _HIDDEN + (1 - _HIDDEN) * (1 - chord / radius)  # mostly its outline
+        opacity = np.where(depth < front, seen_through * opacity, opacity)
     shade = 0.7 + 0.3 * chord / radius
     colour = 255 * np.array(MARKER_COLOUR[:3]) * shade[..., None]
     area[:] = np.rint(area + opacity[..., None] * (colour - area))

@@ -16,7 +16,14 @@ from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.tpm import PAPER_TPM
 from tpm_gym.simulation.drives import Servo, require_servo
-from tpm_gym.simulation.engine import Engine, Path, Readout, make_engine, spline_weights
+from tpm_gym.simulation.engine import (
+    Engine,
+    Path,
+    Readout,
+    loops,
+    make_engine,
+    spline_weights,
+)
 from tpm_gym.simulation.imaging import Camera, Picture, View, paint_markers, paint_shadows
 from tpm_gym.simulation.randomisation import NOMINAL, Plant
 from tpm_gym.simulation.state import CONTROL_PERIOD, Scene, State
@@ -81,9 +88,7 @@ class Simulation:
         renderer: str | None = None,
     ) -> None:
         """Create the engine and load the robots."""
-        from tpm_gym.simulation import compiled  # imports Numba
-
-        self.loops = compiled
+        self.loops = loops()
         self.scene, self.machine, self.count, self.drive = scene, machine, count, drive
         self.engine: Engine = make_engine(
             engine, gui=gui, renderer=renderer, physics=physics, drive=drive
@@ -156,9 +161,7 @@ class Simulation:
         self._bias[rows], self._mode_left[rows] = bias, 0
         self._noise[rows] = 0.0 if noise is None else noise[:, None]
         self._disturbed = bool(self._bias.any() or self._noise.any())
-        self._read()
-        if self._disturbed:  # else the reading is already known
-            self._evaluate(rows)
+        self._read(rows if self._disturbed else None)  # undisturbed readings are known already
 
     def _built(self, plants: Sequence[Plant]) -> FloatArray:
         """Return the machine parameters (r, k) for the true lengths of the plants."""
@@ -208,31 +211,34 @@ class Simulation:
         self._commands[:, 2] = commands
         bias = self._bias if self._disturbed else None
         self.engine.advance(Path(self.machine, self._commands, self._weights, bias), vacuum)
-        self._commands[:, :2] = self._commands[:, 1:]
+        # In turn, because numpy copies what overlaps
+        self._commands[:, 0] = self._commands[:, 1]
+        self._commands[:, 1] = commands
         if self._disturbed or noise is not None:
             self._noise[:, 0] = self._noise[:, 1]
             self._noise[:, 1] = 0.0 if noise is None else noise
             self._disturbed = bool(self._bias.any() or self._noise.any())
-        self._read()
-        self._evaluate(slice(None))
+        self._read(slice(None))
 
     @property
     def mode_left(self) -> NDArray[np.int8]:
         """Mode that each robot left in this episode, (n,): 0 none, 1 assembly, 2 working."""
         return self._mode_left
 
-    def _read(self) -> None:
-        """Read the engine, check the loop gaps, and note modes that were left."""
+    def _read(self, rows: IntArray | slice | None) -> None:
+        """Read the engine, check the loop gaps, and compute forward kinematics of ``rows``, if any.
+
+        The joint positions are those that the encoders report.
+        """
         now = self._readout = self.engine.read()
         opened, left = self.loops.unusual(now.gap, CLOSURE_LIMIT, now.mode_left)
         if opened:
             raise ClosureError(float(now.gap.max()), CLOSURE_LIMIT)
         if left:
             self._mode_left = np.where(self._mode_left, self._mode_left, now.mode_left)
-
-    def _evaluate(self, rows: IntArray | slice) -> None:
-        """Compute the forward kinematics of the encoder readings of ``rows``."""
-        theta = self._readout.theta[rows]
+        if rows is None:
+            return
+        theta = now.theta[rows]
         if self._disturbed:
             theta = theta + self._bias[rows] + self._noise[rows, 1]
         position, jacobian, conditioning, _ = self.machine.evaluate(theta)
@@ -257,9 +263,9 @@ class Simulation:
             before, last = self._noise[:, 0], self._noise[:, 1]
             theta = theta + self._bias + last
             rates = rates + (last - before) / CONTROL_PERIOD
-        place, velocity, command, axis = self.loops.in_world(
+        place, velocity, command, axis, assembly, working = self.loops.in_world(
             self._position, self._jacobian, rates, self._commands,
-            np.ascontiguousarray(now.object_quaternion), turn, origin,
+            np.ascontiguousarray(now.object_quaternion), self._mode_left, turn, origin,
         )  # fmt: skip
         return State(
             theta=theta,
@@ -271,8 +277,8 @@ class Simulation:
             platform_position=now.position,
             platform_tilt=now.tilt,
             closure_error=now.gap,
-            assembly_mode_changed=self._mode_left == 1,
-            working_mode_changed=self._mode_left == 2,
+            assembly_mode_changed=assembly,
+            working_mode_changed=working,
             command=command,
             held=now.held,
             vacuum=now.vacuum,

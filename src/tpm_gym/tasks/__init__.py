@@ -3,7 +3,9 @@
 from tpm_gym.tasks.expert import Expert
 from tpm_gym.tasks.motion import Motion, Move, hanging
 from tpm_gym.tasks.pick_and_place import PickAndPlace
+from tpm_gym.tasks.push import Push
 from tpm_gym.tasks.reach import Reach
+from tpm_gym.tasks.stack import Stack
 from tpm_gym.tasks.task import Entry, Task, dense
 
 __all__ = [
@@ -12,7 +14,9 @@ __all__ = [
     "Motion",
     "Move",
     "PickAndPlace",
+    "Push",
     "Reach",
+    "Stack",
     "Task",
     "dense",
     "hanging",

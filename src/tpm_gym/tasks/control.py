@@ -7,8 +7,6 @@ everything is in the machine's frame.
 
 from __future__ import annotations
 
-from functools import cache
-from types import ModuleType
 from typing import Protocol
 
 import numpy as np
@@ -16,6 +14,7 @@ import numpy as np
 from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.machine import Machine
+from tpm_gym.simulation.engine import loops
 
 __all__ = ["CartesianControl", "Control", "JointControl", "make_control"]
 
@@ -56,7 +55,7 @@ class CartesianControl:
     def command(self, actions: FloatArray, current: FloatArray) -> FloatArray:
         """Add the increments, and project into the region."""
         plain = np.ascontiguousarray
-        commands: FloatArray = _loops().shifted(
+        commands: FloatArray = loops().shifted(
             plain(current), plain(actions), self._step, self._low, self._high
         )
         return commands
@@ -156,13 +155,6 @@ class JointControl:
         turns = np.abs(np.diff(theta, axis=0)).max() * _PARTS
         axes = (np.abs(wanted - current) / self._step).max()
         return float(max(turns / self._machine.joint_limit, axes))
-
-
-@cache
-def _loops() -> ModuleType:
-    from tpm_gym.simulation import compiled  # imports Numba
-
-    return compiled
 
 
 def make_control(kind: str, machine: Machine) -> Control:

@@ -28,6 +28,7 @@ __all__ = [
     "APART",
     "BAND",
     "apart_from",
+    "at_threshold",
     "line_in_joints",
     "tempting",
 ]
@@ -48,6 +49,7 @@ def apart_from(
     machine: Machine,
     regions: Sequence[Region],
     apart: float = APART,
+    near_singularity: bool = False,
 ) -> FloatArray:
     """Draw safe points (r, 3) of regions at least ``apart`` (m) from others.
 
@@ -57,18 +59,20 @@ def apart_from(
         machine: Whose points are safe.
         regions: One for each row.
         apart: m.
+        near_singularity: Whether the points are only just safe.
 
     Raises:
         ConfigurationError: If no draw is far enough.
     """
-    points = machine.sample(rngs, regions)
+    draw = _one_at_threshold if near_singularity else Machine.sample
+    points = draw(machine, rngs, regions)
     for _ in range(_ATTEMPTS):
         gap = np.subtract(points[:, None], others)
         near = (gap * gap).sum(axis=-1) < apart * apart  # faster than linalg.norm
         rows = np.flatnonzero(near.any(axis=1)).tolist()
         if not rows:
             return points
-        points[rows] = machine.sample([rngs[k] for k in rows], [regions[k] for k in rows])
+        points[rows] = draw(machine, [rngs[k] for k in rows], [regions[k] for k in rows])
     valid = f"a larger one: what is drawn lies {apart} m from the start, or from other objects"
     raise ConfigurationError("goal_region", regions[rows[0]], valid)
 
@@ -124,6 +128,30 @@ def line_in_joints(machine: Machine, start: ArrayLike, end: ArrayLike) -> FloatA
     first, last = machine.require_inverse(np.stack(np.broadcast_arrays(start, end)))
     fractions = _FRACTIONS.reshape(-1, *(1,) * first.ndim)
     return machine.conditioning(first + fractions * (last - first))
+
+
+def at_threshold(
+    rng: np.random.Generator, machine: Machine, region: Region, count: int
+) -> FloatArray:
+    """Draw points (count, 3) of a region that are only just safe.
+
+    Raises:
+        ConfigurationError: If no draw was near the threshold.
+    """
+    found: list[FloatArray] = []
+    for _ in range(_ATTEMPTS):
+        found += [*_at_the_threshold(rng, machine, region)]
+        if len(found) >= count:
+            return np.array(found[:count])
+    valid = f"'sampled': on {machine.name!r} the goals are not near a singularity"
+    raise ConfigurationError("goals", "tempting", valid)
+
+
+def _one_at_threshold(
+    machine: Machine, rngs: Sequence[np.random.Generator], regions: Sequence[Region]
+) -> FloatArray:
+    draws = zip(rngs, regions, strict=True)
+    return np.array([at_threshold(rng, machine, region, 1)[0] for rng, region in draws])
 
 
 def _at_the_threshold(rng: np.random.Generator, machine: Machine, region: Region) -> FloatArray:

@@ -13,9 +13,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
-from itertools import cycle, groupby
-from types import ModuleType
+from itertools import cycle, groupby, pairwise
 from typing import Any, ClassVar
 
 import numpy as np
@@ -26,6 +24,7 @@ from tpm_gym.errors import ConfigurationError, InputError, ResetOptionError, Unr
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
+from tpm_gym.simulation.engine import loops
 from tpm_gym.simulation.state import CONTROL_PERIOD, Block, Scene, State
 from tpm_gym.tasks.motion import Motion, Move, hanging
 
@@ -83,6 +82,7 @@ class Task(ABC):
             order, or P.
         tolerance: Distance below which a goal is achieved, m.
         samplings: Values of ``goals``.
+        max_episode_steps: Control steps after which ``gym.make`` truncates an episode.
         entries: Entries of the observation vector, in order.
 
     Raises:
@@ -94,6 +94,7 @@ class Task(ABC):
     goal_size: ClassVar[int] = 3
     tolerance: ClassVar[float] = 0.010
     samplings: ClassVar[tuple[str, ...]] = ("sampled",)
+    max_episode_steps: ClassVar[int] = 50
 
     def __init__(
         self,
@@ -120,6 +121,7 @@ class Task(ABC):
             raise ConfigurationError("markers", self.scene.markers, valid)
         self.machine, self.reward, self.goals = machine, reward, goals
         self._within = self._not_lost()
+        self._halves = np.array([block.height / 2 for block in self.scene.objects])
         self._robot = [("the robot at home", *box) for box in machine.occupied(machine.home)]
         self._set_entries()
 
@@ -198,7 +200,8 @@ class Task(ABC):
     def goal_term(self, gap: FloatArray) -> FloatArray:
         """Return the one term that depends on the goal, (...,), for a gap (...,) m; NaN fails."""
         if self.reward == "sparse":
-            return np.where(gap < self.tolerance, 0.0, -1.0)
+            missed: FloatArray = np.subtract(gap < self.tolerance, 1.0)
+            return missed
         return dense(gap)
 
     def penalty(self, state: State) -> FloatArray:
@@ -210,7 +213,7 @@ class Task(ABC):
         both ends: SAC on goals next to the threshold, joint increments, spent 24% of the time below
         it without a penalty, 19% with the cubic step, 1% with this.
         """
-        values: FloatArray = _loops().singularity_penalty(
+        values: FloatArray = loops().singularity_penalty(
             state.conditioning,
             self.machine.safe_conditioning,
             state.assembly_mode_changed,
@@ -225,10 +228,15 @@ class Task(ABC):
 
     def gap(self, achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
         """Return the Euclidean distance to the goal, (...,) m: reward and success depend on it."""
-        gap: Any = np.subtract(achieved, desired, dtype=np.float64)
-        parts = [*(gap * gap).T]
-        distance: FloatArray = np.sqrt(sum(parts[1:], parts[0])).T  # numpy's sum costs more
-        return distance
+        # Copies: the loop is compiled for one kind of array.
+        first, second = np.array(achieved, np.float64), np.array(desired, np.float64)
+        if first.shape != second.shape:
+            first, second = map(np.copy, np.broadcast_arrays(first, second))
+        if first.ndim == 2:
+            return loops().distances(first, second)  # type: ignore[no-any-return]
+        shape = first.shape
+        rows = loops().distances(first.reshape(-1, shape[-1]), second.reshape(-1, shape[-1]))
+        return rows.reshape(shape[:-1])  # type: ignore[no-any-return]
 
     # -- start of an episode ----------------------------------------------------------------------
 
@@ -346,39 +354,41 @@ class Task(ABC):
     def robot_entries(self) -> tuple[Entry, ...]:
         """Return the entries that encoders and forward kinematics measure."""
         centre, extent, speed, step = self._scales()
+        measure = self._measure
         return (
             Entry("position", "m", "P by forward kinematics of the encoders", centre, extent,
-                  _measure_robot, (0, 3)),
+                  measure, (0, 3)),
             Entry("velocity", "m/s", "J(theta) theta_dot, from the encoders", _ZERO, speed,
-                  _measure_robot, (3, 6)),
-            Entry("command", "m", "commanded P minus position", _ZERO, step,
-                  _measure_robot, (6, 9)),
+                  measure, (3, 6)),
+            Entry("command", "m", "commanded P minus position", _ZERO, step, measure, (6, 9)),
         )  # fmt: skip
 
     def object_entries(self, index: int = 0) -> tuple[Entry, ...]:
         """Return the entries that a camera and the vacuum gauge measure of one object."""
         centre, extent, speed, _ = self._scales()
-        name, measure = self.scene.objects[index].name, partial(self._measure_object, index)
-        near = tuple(min(0.1, max(0.02, half)) for half in extent)
-        return (
-            Entry(f"{name}_position", "m", f"centre of the {name}, from a camera", centre, extent,
-                  measure, (0, 3)),
-            Entry(f"{name}_offset", "m", f"top of the {name} minus lip of the cup", _ZERO, near,
-                  measure, (3, 6)),
-            Entry(f"{name}_velocity", "m/s", f"velocity of the {name}, from a camera", _ZERO, speed,
-                  measure, (6, 9)),
-            Entry(f"{name}_tilt", "-", f"x and y of the {name}'s axis", (0.0, 0.0), (1.0, 1.0),
-                  measure, (9, 11)),
-            Entry(f"{name}_held", "-", f"share of the vacuum that holds the {name}, by a gauge",
-                  (0.5,), (0.5,), measure, (11, 12)),
-        )  # fmt: skip
+        name, near = self.scene.objects[index].name, tuple(min(0.1, max(0.02, e)) for e in extent)
+        rows: tuple[tuple[str, str, str, Values, Values], ...] = (
+            ("position", "m", f"centre of the {name}, from a camera", centre, extent),
+            ("offset", "m", f"top of the {name} minus lip of the cup", _ZERO, near),
+            ("velocity", "m/s", f"velocity of the {name}, from a camera", _ZERO, speed),
+            ("tilt", "-", f"x and y of the {name}'s axis", (0.0, 0.0), (1.0, 1.0)),
+            ("held", "-", f"share of the vacuum that holds the {name}, by a gauge", (0.5,), (0.5,)),
+        )
+        ends = np.cumsum([9 + 12 * index, *(len(row[-1]) for row in rows)]).tolist()
+        return tuple(
+            Entry(f"{name}_{own}", unit, meaning, middle, scale, self._measure, columns)
+            for (own, unit, meaning, middle, scale), columns in zip(
+                rows, pairwise(ends), strict=True
+            )
+        )
 
-    def _measure_object(self, index: int, state: State) -> FloatArray:
-        """Return centre, offset, velocity, tilt and hold (n, 12) of one object."""
-        plain, half = np.ascontiguousarray, self.scene.objects[index].height / 2
-        values: FloatArray = _loops().measured_object(
-            index, plain(state.object_position), state.object_axis, plain(state.object_velocity),
-            state.fk_position - _LIP, half, state.held, state.vacuum / CUP.vacuum,
+    def _measure(self, state: State) -> FloatArray:
+        """Return what is measured of robot and objects, (n, 9 + 12 k)."""
+        plain = np.ascontiguousarray
+        values: FloatArray = loops().measured(
+            state.fk_position, state.fk_velocity, state.command, plain(state.object_position),
+            state.object_axis, plain(state.object_velocity), state.held, state.vacuum,
+            _LIP, self._halves, CUP.vacuum,
         )  # fmt: skip
         return values
 
@@ -458,7 +468,7 @@ class Task(ABC):
     def lost(self, state: State) -> BoolArray:
         """Return whether an object is off the table or out of the robot's reach, (n,)."""
         places = np.ascontiguousarray(state.object_position)
-        lost: BoolArray = _loops().any_outside(places, *self._within)
+        lost: BoolArray = loops().any_outside(places, *self._within)
         return lost
 
 
@@ -468,22 +478,6 @@ def _columns(entries: Sequence[Entry]) -> Any:
         return slice(None)
     chosen = [k for entry in entries for k in range(*entry.columns or (0,))]
     return slice(len(chosen)) if chosen == list(range(len(chosen))) else chosen
-
-
-def _measure_robot(state: State) -> FloatArray:
-    """Return position, velocity and command (n, 9) of the robot."""
-    values: FloatArray = _loops().measured_robot(
-        state.fk_position, state.fk_velocity, state.command
-    )
-    return values
-
-
-@cache
-def _loops() -> ModuleType:
-    """Import the compiled loops, and with them Numba."""
-    from tpm_gym.simulation import compiled
-
-    return compiled
 
 
 def _range(low: ArrayLike, high: ArrayLike) -> str:

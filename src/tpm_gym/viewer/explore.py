@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from html import escape
 from typing import Any, Final
 
 import numpy as np
@@ -36,20 +37,25 @@ class Explore:
     Args:
         server: The viser server; the controls are added to its present container.
         worker: Thread that computes and draws postures.
-        show: Called with each new posture, and after each attempt without one with None.
+        show: Called with each new posture.
+
+    Attributes:
+        posture: The posture that is shown.
+        problem: Reason why there is none as asked for; empty if there is one.
     """
 
     def __init__(
-        self, server: ViserServer, worker: Worker, show: Callable[[Posture | None], object]
+        self, server: ViserServer, worker: Worker, show: Callable[[Posture], object]
     ) -> None:
         """Add the controls."""
         self._server, self._worker, self._show = server, worker, show
-        self.problem = ""
         self.posture: Posture
         self._out = np.ones(3, dtype=int)
         self.gizmo: TransformControlsHandle | None = None
         self._add_modes(server.gui)
         self._add_motors(server.gui)
+        # At the end, where a sentence that comes and goes moves no control.
+        self._refusal: Any = server.gui.add_html("")
 
     def _add_modes(self, gui: GuiApi) -> None:
         bends = [
@@ -150,7 +156,8 @@ class Explore:
 
     def set(self, posture: Posture) -> None:
         """Show a posture, and its modes and motors in the panel."""
-        self.posture, self.problem = posture, ""
+        self.posture = posture
+        self._refuse("")
         _, *bends = posture.working.signs
         self.operation.value = posture.operation
         self._set_assemblies()
@@ -163,13 +170,24 @@ class Explore:
             self.gizmo.position = posture.position
         self._show(posture)
 
+    def _refuse(self, problem: str) -> None:
+        self.problem = problem
+        style = "color:#c0392b;padding:0.5em 1em;font-size:0.85em"
+        said = f'<div style="{style}"><b>No such posture.</b> {escape(problem)}</div>'
+        if self.text != (text := said if problem else ""):
+            self._refusal.content = text
+
+    @property
+    def text(self) -> str:
+        """The reason in the panel, as HTML."""
+        return str(self._refusal.content)
+
     def _attempt(self, solve: Callable[[], Posture]) -> None:
         try:
             posture = solve()
         except TPMError as error:
-            self.problem = str(error)
+            self._refuse(str(error))
             self._set_assemblies()
-            self._show(None)
             return
         self.set(posture)
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 import traceback
+from html import escape
 from typing import Any, Final
 
 import numpy as np
 
 from tpm_gym.errors import ConfigurationError, TPMError
-from tpm_gym.kinematics import AssemblyMode
 from tpm_gym.mechanism.machine import find_machine, machine_names
 from tpm_gym.mechanism.tpm import TPM
 from tpm_gym.viewer import server
@@ -100,11 +100,6 @@ class Viewer:
         self.worker.wait()
 
     @property
-    def text(self) -> str:
-        """The numbers of the panel, as HTML."""
-        return str(self._numbers.content)
-
-    @property
     def address(self) -> str:
         """Address of the page."""
         return f"http://{self.server.get_host()}:{self.server.get_port()}"
@@ -128,13 +123,11 @@ class Viewer:
 
     # -- drawing ------------------------------------------------------------------------------
 
-    def _show(self, posture: Posture | None) -> None:
-        """Draw a posture of the panel; with None, tell why there is none."""
-        if posture is not None:
-            with self.server.atomic():
-                self.robot.draw(posture.places)
-            self.worker.put("layers", self._show_layers)
-        self._tell_numbers()
+    def _show(self, posture: Posture) -> None:
+        with self.server.atomic():
+            self.robot.draw(posture.places)
+        self._numbers.content = numbers(posture)
+        self.worker.put("layers", self._show_layers)
 
     def _show_layers(self) -> None:
         names = [name for name, box in self.shown.items() if box.value]
@@ -150,22 +143,18 @@ class Viewer:
             self.explore.hide_gizmo(self.play.playing)
             self.explore.set(at_joints(machine, state.theta, machine.assembly_mode))
 
-    def _tell_numbers(self) -> None:
-        explore = self.explore
-        self._numbers.content = numbers(explore.posture, explore.problem)
-
     def _report(self, error: Exception) -> None:
         """Show an error on all pages; print those that are not ours."""
         self.play.pause()
         if not isinstance(error, TPMError):
             traceback.print_exception(error)
-        self.play.tell(str(error))
+        self.play.tell(escape(str(error)))
         for client in self.server.get_clients().values():
             client.add_notification("That did not work", str(error), color="red")
 
 
-def numbers(posture: Posture, problem: str) -> str:
-    """Return the numbers of a posture as HTML, with a problem if there is one."""
+def numbers(posture: Posture) -> str:
+    """Return the numbers of a posture as HTML."""
     x, y, z = 1000 * posture.position
     u, v, w = 1000 * posture.machine.mount.to_world(posture.position)
     stops = " / ".join(f"{value:.0f}" for value in np.degrees(posture.stop_margins))
@@ -174,18 +163,15 @@ def numbers(posture: Posture, problem: str) -> str:
         "P, world": f"{u:.1f} / {v:.1f} / {w:.1f} mm",
         "Conditioning": f"{posture.conditioning:.3f}",
         "Motors to their stops": f"{stops} °",
+        "Platform tilted by": f"{math.degrees(posture.tilt):.1f} °",
         "Loops open by": f"{posture.gap:.1e} m",
     }
-    if not isinstance(posture.assembly, AssemblyMode):
-        rows["Platform tilted by"] = f"{math.degrees(posture.tilt):.1f} °"
     cells = "".join(
         f'<tr><td style="color:#667">{name}</td><td style="text-align:right">{value}</td></tr>'
         for name, value in rows.items()
     )
-    text = f'<table style="width:100%;font-size:0.85em">{cells}</table>'
-    if problem:
-        text += f'<p style="color:#c0392b;font-size:0.85em"><b>No such posture:</b> {problem}</p>'
-    return f'<div style="padding:0 1em 0.5em">{text}</div>'
+    table = f'<table style="width:100%;font-size:0.85em">{cells}</table>'
+    return f'<div style="padding:0 1em 0.5em">{table}</div>'
 
 
 def _scale() -> str:

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from alone import Alone, motors
 from episodes import EVERYTHING, OF_SERVOS, expert_episode
-from inside_bullet import around_each_step
+from inside import around_each_step
 
 from tpm_gym.arrays import FloatArray
 from tpm_gym.mechanism import PAPER_TPM
 from tpm_gym.mechanism.dynamics import Dynamics
 from tpm_gym.simulation import Plant, Scene, Servo, Simulation
-from tpm_gym.simulation.analytic.forward_dynamics import Course, IdealSteps, ServoSteps, march
+from tpm_gym.simulation.analytic.forward_dynamics import Course, IdealSteps, march
 from tpm_gym.simulation.analytic.steps import resisted
-from tpm_gym.simulation.drives import References, ServoDrives, drive_of
+from tpm_gym.simulation.drives import drive_of
 from tpm_gym.simulation.randomisation import Randomisation
 
 STEP = 1 / 250
@@ -101,20 +101,6 @@ def test_what_swings_freely_keeps_its_energy_to_the_integrators_order(payload: f
     np.testing.assert_allclose(gained[:-1] / gained[1:], 2.0, atol=0.15)
 
 
-def test_springs_and_dampers_give_nothing_that_was_not_put_in() -> None:
-    law, totals = Servo(feedforward="none"), []
-    theta, goal = PAPER_TPM.inverse([HOME, HOME + (0.02, 0.0, 0.02)])[:, None]
-    drives, course = ServoDrives(law, PAPER_TPM, 1, STEP), at_rest(theta)
-    drives.rest(np.array([0]), theta)
-    steps = ServoSteps(drives, References(goal[None], 0 * goal[None], 0 * goal[None]), STEP)
-    for _ in range(60):
-        course, _ = march(PAPER_TPM, None, steps, 1, course, STEP, untouched)
-        sprung = law.stiffness * np.sum((course.theta - goal) ** 2) / 2
-        totals.append(sum(kinetic_and_potential(course.theta, course.rates))[0] + sprung)
-    assert totals[0] - totals[-1] > 0.1  # J
-    assert np.diff(totals).max() < 1e-3 * (totals[0] - totals[-1])
-
-
 def test_motors_with_torque_to_spare_are_where_they_shall_be() -> None:
     # So forward dynamics give what inverse dynamics give.
     theta = PAPER_TPM.inverse(np.linspace(HOME, HOME + (0.03, 0.01, -0.03), 14))[:, None]
@@ -177,16 +163,6 @@ def test_servos_move_as_in_pybullet(
     assert rms(theirs - ours) < torque * rms(theirs)
     assert rms(position) < point
     assert rms(theta) < 2e-5
-
-
-def test_servos_differ_from_pybullets_as_their_time_steps_do() -> None:
-    apart = []
-    for step in (1 / 250, 1 / 1000):
-        theirs, ours, _, position = followed(commands(False, 12), Plant(), "servo", time_step=step)
-        apart.append((rms(theirs - ours) / rms(theirs), rms(position)))
-    (coarse, far), (fine, near) = apart
-    assert fine < 0.5 * coarse
-    assert near < 0.5 * far
 
 
 def test_a_servo_presses_carries_and_lets_go_as_in_pybullet() -> None:

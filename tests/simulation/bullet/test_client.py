@@ -19,8 +19,7 @@ from tpm_gym.mechanism.mount import GRAVITY
 from tpm_gym.simulation import Scene
 from tpm_gym.simulation.bullet import client as client_module
 from tpm_gym.simulation.bullet.client import Client
-from tpm_gym.simulation.bullet.physics import REGULARISATION, Physics
-from tpm_gym.simulation.display import has_display
+from tpm_gym.simulation.bullet.physics import Physics
 
 posix = pytest.mark.skipif(os.name != "posix", reason="descriptors and X11")
 
@@ -28,14 +27,8 @@ posix = pytest.mark.skipif(os.name != "posix", reason="descriptors and X11")
 def in_a_process(script: str, **variables: str) -> tuple[str, str]:
     """What a script says on stdout and stderr."""
     begin = "import os, sys\nimport gymnasium as gym\nimport tpm_gym\n"
-    done = subprocess.run(
-        [sys.executable, "-c", begin + script],
-        env={**os.environ, **variables},
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
+    command, environment = [sys.executable, "-c", begin + script], os.environ | variables
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     lines = done.stderr.splitlines()
     told = [line for line in lines if not line.startswith("pybullet build time")]
     return done.stdout, "\n".join(told)
@@ -57,15 +50,12 @@ def drop(client: Client) -> int:
     return body
 
 
-def test_functions_act_on_this_client_alone_and_constants_pass_through(client: Client) -> None:
+def test_functions_act_on_this_client_alone(client: Client) -> None:
     other = Client(Physics())
-    assert other.number != client.number
     ball = drop(client)
     assert (client.getNumBodies(), other.getNumBodies()) == (1, 0)
     other.stepSimulation()
     assert client.getBasePositionAndOrientation(ball)[0] == (0.0, 0.0, 1.0)
-    assert client.GEOM_SPHERE == pybullet.GEOM_SPHERE
-    assert client.stepSimulation is client.stepSimulation  # looked up once
     with pytest.raises(AttributeError, match="stepBackwards"):
         _ = client.stepBackwards
     other.close()
@@ -90,27 +80,6 @@ def test_settings_are_in_force_and_again_after_a_reset_of_the_client(physics: Ph
         assert client.getPhysicsEngineParameters()["gravityAccelerationZ"] == 0
         client.configure(physics)
     client.close()
-
-
-def test_the_solver_that_was_asked_for_is_the_one_that_is_set(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    asked: list[dict[str, Any]] = []
-    true = pybullet.setPhysicsEngineParameter
-
-    def spy(**settings: Any) -> None:
-        asked.append(settings)
-        true(**settings)
-
-    monkeypatch.setattr(pybullet, "setPhysicsEngineParameter", spy)
-    for solver in ("direct", "iterative"):
-        asked.clear()
-        Client(Physics(solver=solver, erp=0.7)).close()
-        merged = {name: value for settings in asked for name, value in settings.items()}
-        direct = merged.get("constraintSolverType") == pybullet.CONSTRAINT_SOLVER_LCP_DANTZIG
-        assert direct is (solver == "direct")
-        assert (merged["erp"], merged["globalCFM"]) == (0.7, REGULARISATION)
-        assert merged["deterministicOverlappingPairs"] == 1
 
 
 def test_nothing_is_printed(capfd: pytest.CaptureFixture[str]) -> None:
@@ -146,22 +115,6 @@ def test_what_is_dropped_is_given_back() -> None:
     del first
     assert Alone(Scene()).engine.client.number == number
     kept.stepSimulation()
-
-
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs Linux")
-def test_the_memory_of_many_copies_goes_back_to_the_system() -> None:
-    _, kept = in_a_process("""
-from tpm_gym.simulation.bullet.client import Client, Physics
-def memory():
-    return int(open("/proc/self/statm").read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
-clients = [Client(Physics())]
-before = memory()
-clients += [Client(Physics()) for _ in range(12)]
-most = memory()
-del clients[1:]
-sys.stderr.write(f"{(memory() - before) / (most - before)}")
-""")
-    assert float(kept) < 0.4
 
 
 @pytest.mark.parametrize("renderer", ["raytracer", "", 1])
@@ -201,10 +154,7 @@ def test_where_no_file_can_be_written_the_error_says_so(
 
 
 @posix
-@pytest.mark.parametrize(
-    "gone",
-    ["sys.stdout = None", "sys.stdout.close()", "os.close(1)", "os.close(1); sys.stdout = None"],
-)
+@pytest.mark.parametrize("gone", ["sys.stdout.close()", "os.close(1); sys.stdout = None"])
 def test_environments_are_made_where_there_is_no_standard_output(gone: str) -> None:
     made = f"{gone}\nenv = gym.make('TPMReach-v0')\nenv.reset(seed=0)\nsys.stderr.write('made')"
     assert "made" in in_a_process(made)[1]
@@ -259,15 +209,21 @@ def window():
         return env
     except tpm_gym.TPMError as error:
         sys.stderr.write(f"{type(error).__name__} {error.name};")
-first = window()
 """
 REFUSED = "ConfigurationError render_mode;"
 
 
 @posix
-@pytest.mark.parametrize("display", [":987", "localhost:987", "nonsense", ""])
-def test_a_display_that_does_not_answer_is_a_typed_error(display: str) -> None:
-    assert in_a_process(OPEN, DISPLAY=display)[1] == REFUSED
+def test_a_display_that_does_not_answer_is_a_typed_error() -> None:
+    _, said = in_a_process(
+        OPEN
+        + """
+for display in (":987", "localhost:987", "nonsense", ""):
+    os.environ["DISPLAY"] = display
+    window()
+"""
+    )
+    assert said == 4 * REFUSED
 
 
 SCREENS = [
@@ -294,6 +250,7 @@ def test_a_second_window_is_a_typed_error_and_the_first_goes_on(
     _, said = in_a_process(
         OPEN
         + """
+first = window()
 second = window()
 if first:
     first.reset(seed=0)
@@ -307,11 +264,44 @@ if first:
     assert said == (2 * REFUSED if without_glx else f"opened;{REFUSED}opened;")
 
 
+@pytest.mark.parametrize("engine", ["pybullet", "mujoco", "analytic"])
+def test_a_window_shows_robots_of_all_lengths_and_prints_nothing(
+    screen: str, engine: str, request: pytest.FixtureRequest
+) -> None:
+    pytest.importorskip("pybullet" if engine == "analytic" else engine)
+    printed, said = in_a_process(
+        f"""
+try:
+    env = gym.make(
+        "TPMPickAndPlace-v0", engine="{engine}", render_mode="human", camera="cup",
+        randomisation={{"length_error": 1e-4}},
+    )
+    plain = gym.make(env.spec, render_mode=None)
+    for one in (env, plain):
+        for seed in (0, 1):
+            one.reset(seed=seed)
+            one.step(one.action_space.sample() * 0 + 1)
+        print(one.unwrapped.state.theta.tolist(), file=sys.stderr)
+    env.close()
+except tpm_gym.TPMError as error:
+    print(type(error).__name__, error.name, file=sys.stderr)
+""",
+        DISPLAY=screen,
+    )
+    lines = said.splitlines()
+    if "no GLX" in request.node.name:
+        assert lines == ["ConfigurationError render_mode"]
+    else:
+        assert lines[0] == lines[1]
+        assert lines[0].startswith("[")
+    assert printed == ""
+
+
 @pytest.mark.parametrize("how", ["refuses", "raises"])
 def test_a_window_that_does_not_open_is_a_typed_error(
     monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
-    def connect(mode: int) -> int:
+    def connect(mode: int, options: str) -> int:
         if how == "raises":
             raise pybullet.error("Only one local in-process GUI connection allowed.")
         return -1
@@ -321,12 +311,3 @@ def test_a_window_that_does_not_open_is_a_typed_error(
     with pytest.raises(ConfigurationError, match="no window") as caught:
         Client(Physics(), gui=True)
     assert caught.value.name == "render_mode"
-
-
-@pytest.mark.parametrize(("platform", "expected"), [("linux", False), ("darwin", True)])
-def test_only_linux_needs_a_display(
-    monkeypatch: pytest.MonkeyPatch, platform: str, expected: bool
-) -> None:
-    monkeypatch.setattr("sys.platform", platform)
-    monkeypatch.delenv("DISPLAY", raising=False)
-    assert has_display() is expected

@@ -10,7 +10,7 @@ import sys
 import threading
 import weakref
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from functools import partial
 from typing import Any
 
@@ -22,6 +22,8 @@ from tpm_gym.simulation.bullet.physics import REGULARISATION, Physics
 from tpm_gym.simulation.display import has_display
 
 __all__ = ["Client", "silence"]
+
+_WINDOW = "--width=960 --height=720"  # software OpenGL takes longer for more pixels
 
 _stdout_lock = threading.RLock()
 _closed = itertools.count(1)
@@ -81,7 +83,6 @@ class Client:
                 self.setPhysicsEngineParameter(
                     constraintSolverType=pybullet.CONSTRAINT_SOLVER_LCP_DANTZIG
                 )
-        self.configureDebugVisualizer(pybullet.COV_ENABLE_GUI, 0)  # no side panels
 
     def close(self) -> None:
         """Disconnect from PyBullet; a second call does nothing."""
@@ -105,8 +106,8 @@ def _connect(gui: bool) -> int:
     if not gui:
         return int(pybullet.connect(pybullet.DIRECT))
     number = -1
-    with suppress(pybullet.error):
-        number = pybullet.connect(pybullet.GUI) if has_display() else -1
+    with suppress(pybullet.error), silence():  # PyBullet prints some 30 lines from C
+        number = pybullet.connect(pybullet.GUI, options=_WINDOW) if has_display() else -1
     if number < 0:
         valid = "None or 'rgb_array': no window opened (needs a display; one window per process)"
         raise ConfigurationError("render_mode", "human", valid)
@@ -116,7 +117,9 @@ def _connect(gui: bool) -> int:
 def _disconnect(number: int) -> None:
     # The client may not exist any more at the end of the interpreter or after a fork.
     with suppress(pybullet.error):
-        pybullet.disconnect(number)
+        window = pybullet.getConnectionInfo(number)["connectionMethod"] == pybullet.GUI
+        with silence() if window else nullcontext():
+            pybullet.disconnect(number)
     if next(_closed) % 4 == 0:  # glibc keeps free memory; trimming takes ms, so not every time
         with suppress(AttributeError, OSError, TypeError):  # other C libraries have no malloc_trim
             ctypes.CDLL(None).malloc_trim(0)

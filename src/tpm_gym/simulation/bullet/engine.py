@@ -17,6 +17,7 @@ from tpm_gym.simulation.bullet.friction import Friction
 from tpm_gym.simulation.bullet.physics import Physics
 from tpm_gym.simulation.bullet.robot import Robot
 from tpm_gym.simulation.bullet.scenery import Scenery
+from tpm_gym.simulation.bullet.window import Window
 from tpm_gym.simulation.drives import Servo, ServoDrives
 from tpm_gym.simulation.engine import Engine, Path, Pose, Readout, Twist, drives_of_one, steering
 from tpm_gym.simulation.imaging import Camera, Picture, View
@@ -62,11 +63,19 @@ class BulletEngine:
         """Check the options and create the physics client."""
         self.physics = settings_of(Physics, "physics", physics)
         self.time_step = self.physics.time_step
-        self._gui, self._renderer, self._servo = gui, renderer, drive
+        self._renderer, self._servo = renderer, drive
         self._drives: ServoDrives | None = None
-        self._aimed: Camera | None = None
+        # Torques at rest and with servo drives, where Bullet reports others (zero after a restore,
+        # the joint friction); None where Bullet's are meant
         self._torque: Vector | None = _ZERO
-        self.client = Client(self.physics, gui, renderer)
+        self.client = Client(self.physics, renderer=renderer)
+        self._window: Window | None = None
+        if gui:
+            try:
+                self._window = Window(self.physics)
+            except BaseException:
+                self.close()
+                raise
 
     def load(self, machine: Machine, scene: Scene, count: int) -> None:
         """Implement :meth:`Engine.load`."""
@@ -79,9 +88,11 @@ class BulletEngine:
         self._machine = machine
         self.robot = Robot(self.client, machine.mechanism, machine.mount)
         scene = self._scene
-        self._scenery = Scenery(self.client, scene, machine.table, self._gui)
-        if self._gui or self._renderer == "egl":
+        self._scenery = Scenery(self.client, scene, machine.table)
+        if self._renderer == "egl":
             self.robot.paint()
+        if self._window is not None:
+            self._window.load(machine, scene)
         self.bodies = self._scenery.bodies
         self._cup = Cup(self.client, self.robot, self.bodies, scene.objects, self.time_step)
         self._friction = Friction(
@@ -89,13 +100,9 @@ class BulletEngine:
         )
 
     def _empty(self) -> None:
-        """Remove all bodies: reset the client of a window, else replace it, which leaks least."""
-        if self._gui:
-            self.client.resetSimulation()
-            self.client.configure(self.physics)
-        else:
-            self.client.close()
-            self.client = Client(self.physics, renderer=self._renderer)
+        """Remove all bodies: replace the client, which leaks least."""
+        self.client.close()
+        self.client = Client(self.physics, renderer=self._renderer)
 
     def alter(self, rows: IntArray, plants: Sequence[Plant]) -> None:
         """Implement :meth:`Engine.alter`."""
@@ -134,12 +141,17 @@ class BulletEngine:
             step()
             if index >= first_update:
                 cup.update(on)
-        self._torque = None
+        if self._drives is None:
+            self._torque = None
+        else:
+            a, b, c = self._drives.memory[0, 0].tolist()
+            self._torque = a, b, c
 
     def read(self) -> Readout:
         """Implement :meth:`Engine.read`."""
-        truth, hold = self.robot.truth(), self._cup.grip.hold
-        return Readout.of_one(self._machine, self._motors(), truth, hold, self._objects())
+        theta, rates, torque = self.robot.motors()
+        motors, hold = (theta, rates, self._torque or torque), self._cup.grip.hold
+        return Readout.of_one(self._machine, motors, self.robot.truth(), hold, self._objects())
 
     def _objects(self) -> list[tuple[Pose, Twist]]:
         pose, twist = pybullet.getBasePositionAndOrientation, pybullet.getBaseVelocity
@@ -147,28 +159,17 @@ class BulletEngine:
         poses, twists = map(pose, self.bodies, numbers), map(twist, self.bodies, numbers)
         return list(zip(poses, twists, strict=True))
 
-    def _motors(self) -> tuple[Vector, Vector, Vector]:
-        """Return joint positions (rad), velocities (rad/s) and torques (N m) of the motors."""
-        theta, rates, torque = self.robot.motors()
-        if self._torque is not None:  # after a reset or restore, Bullet reports no torque
-            torque = self._torque
-        elif self._drives is not None:  # with servo drives, Bullet reports the joint friction
-            a, b, c = self._drives.memory[0, 0].tolist()
-            torque = a, b, c
-        return theta, rates, torque
-
     def show(self, camera: Camera, markers: FloatArray) -> None:
         """Implement :meth:`Engine.show`."""
-        if camera != self._aimed:  # else the user may move the camera
-            self._aimed = camera
-            self._scenery.aim_window(camera)
-        self._scenery.move_markers(markers.tolist())
+        if self._window is not None:
+            joints, poses = self.robot.joint_states(), [pose for pose, _ in self._objects()]
+            self._window.show([angle for angle, _ in joints], poses, camera, markers)
 
     def save(self) -> Any:
         """Implement :meth:`Engine.save`."""
         return _Saved(
             self.robot.joint_states(),
-            self._motors()[2],
+            self._torque or self.robot.motors()[2],
             None if self._drives is None else self._drives.memory.copy(),
             self._objects(),
             self._cup.grip,
@@ -192,6 +193,8 @@ class BulletEngine:
     def close(self) -> None:
         """Implement :meth:`Engine.close`."""
         self.client.close()
+        if self._window is not None:
+            self._window.close()
 
 
 _: type[Engine] = BulletEngine  # mypy checks that the class has the methods of Engine

@@ -1,4 +1,4 @@
-"""Table, floor, goal markers, objects and camera in PyBullet."""
+"""Table, floor, objects and camera in PyBullet."""
 
 from __future__ import annotations
 
@@ -19,17 +19,15 @@ from tpm_gym.simulation.imaging import (
     OBJECTS,
     ROBOT,
     TABLETOP,
-    Camera,
     Picture,
     View,
     metres,
 )
-from tpm_gym.simulation.stage import FLOOR, FLOOR_EDGE, LIGHT, MARKER_COLOUR, TABLE, Slab
+from tpm_gym.simulation.stage import FLOOR, FLOOR_EDGE, LIGHT, TABLE, Slab
 from tpm_gym.simulation.state import Block, Scene
 
 __all__ = ["Scenery"]
 
-_WINDOW_OPENING = 45.0  # degrees; vertical field of view of PyBullet's window, which is fixed
 _SHADING = {"lightAmbientCoeff": 0.6, "lightDiffuseCoeff": 0.35, "lightSpecularCoeff": 0.05}
 
 
@@ -38,9 +36,8 @@ class Scenery:
 
     Args:
         client: Physics client.
-        scene: Objects and markers to load.
+        scene: Objects to load.
         table: Half edge lengths of the tables along x and y, m.
-        window: Whether a window shows the scene. Only a window needs bodies as goal markers.
 
     Attributes:
         bodies: Body ids of the objects, in the order of the scene.
@@ -49,16 +46,13 @@ class Scenery:
             first table is drawn, and exists also without objects.
     """
 
-    def __init__(
-        self, client: Client, scene: Scene, table: tuple[float, float], window: bool
-    ) -> None:
-        """Load tables, floor, markers and objects into the client."""
+    def __init__(self, client: Client, scene: Scene, table: tuple[float, float]) -> None:
+        """Load tables, floor and objects into the client."""
         self._client = client
         self._blocks = scene.objects
         self.tables = [self._add_slab(TABLE, table)]
         self.tables += [self._add_slab(TABLE, table, drawn=False) for _ in self._blocks[1:]]
         self._floor = self._add_slab(FLOOR, (FLOOR_EDGE, FLOOR_EDGE))
-        self._markers = [self._add_marker(scene) for _ in range(scene.markers)] if window else []
         self.bodies = [self._add_block(block) for block in self._blocks]
         for index, body in enumerate(self.bodies):
             for other, top in enumerate(self.tables):
@@ -90,18 +84,6 @@ class Scenery:
         place = (0.0, 0.0, height)
         return int(client.createMultiBody(mass, solid, shape, basePosition=place))
 
-    def _add_marker(self, scene: Scene) -> int:
-        client = self._client
-        shape = client.createVisualShape(
-            client.GEOM_SPHERE, radius=scene.marker_radius, rgbaColor=MARKER_COLOUR
-        )
-        return int(client.createMultiBody(baseVisualShapeIndex=shape))
-
-    def move_markers(self, positions: Sequence[Vector]) -> None:
-        """Move the goal markers of the window to ``positions`` (m, world)."""
-        for marker, position in zip(self._markers, positions, strict=False):
-            self._client.resetBasePositionAndOrientation(marker, position, UPRIGHT)
-
     def place(self, placed: Sequence[tuple[Pose, Twist]]) -> None:
         """Set poses and velocities of the objects, and clear their old contacts."""
         # Old contacts would warm-start the solver. Detection with distant objects removes them.
@@ -124,15 +106,6 @@ class Scenery:
             self._client.changeDynamics(
                 body, -1, mass=block.mass, localInertiaDiagonal=moments, lateralFriction=rough
             )
-
-    def aim_window(self, camera: Camera) -> None:
-        """Set the camera of the window."""
-        self._client.resetDebugVisualizerCamera(
-            cameraDistance=camera.distance * camera.opening / _WINDOW_OPENING,
-            cameraYaw=camera.yaw,
-            cameraPitch=camera.pitch,
-            cameraTargetPosition=camera.target,
-        )
 
     def picture(self, view: View, tool: tuple[int, int]) -> Picture:
         """Draw the scene; ``tool`` is the address of the link with the vacuum cup."""

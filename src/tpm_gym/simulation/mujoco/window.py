@@ -43,13 +43,12 @@ class Window:
     ) -> None:
         """Draw the scene with goal markers (k, 3) m as spheres of ``radius`` (m)."""
         if model is not self._model:  # the first model, or a robot with other lengths
-            self._open(model, data)
+            self._open(model, data, camera)
         viewer = self._viewer
         if not viewer.is_running():
             return
         with viewer.lock():
             if camera != self._aimed:  # else the user may move the camera
-                model.vis.global_.fovy = camera.opening
                 aim(viewer.cam, camera)
                 self._aimed = camera
             for geom, place in zip(viewer.user_scn.geoms, markers, strict=False):
@@ -59,10 +58,11 @@ class Window:
             viewer.user_scn.ngeom = len(markers)
         viewer.sync()
 
-    def _open(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    def _open(self, model: mujoco.MjModel, data: mujoco.MjData, camera: Camera) -> None:
         import mujoco.viewer  # imports GLFW
 
         self.close()
+        model.vis.global_.fovy = camera.opening
         panels = {"show_left_ui": False, "show_right_ui": False}
         self._viewer = mujoco.viewer.launch_passive(model, data, **panels)
         self._viewer.opt.sitegroup[:] = 0  # the closures' sites

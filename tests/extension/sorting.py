@@ -1,4 +1,4 @@
-"""Stack: a task with two objects, in one file outside the package."""
+"""Sort: a task with two objects, in one file outside the package."""
 
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -11,33 +11,40 @@ from tpm_gym.simulation import Block, Scene, State
 from tpm_gym.tasks import Entry, Motion, Move, Task, hanging, sampling
 
 CLEARANCE = 0.045  # m; a block that is carried passes over one that stands
-APART = 0.060  # m between the middles of what stands on the table
+APART = 0.045  # m between the middles of what stands on the table
 
 
-class Stack(Task):
-    """Put the red block on the goal, and the blue one on top of it."""
+class Sort(Task):
+    """Put the red block and the blue block on their places."""
 
     red = Block("red", colour=(0.8, 0.1, 0.1, 1.0))
     blue = Block("blue", height=0.036, mass=0.060, colour=(0.1, 0.2, 0.8, 1.0))
     scene = Scene(objects=(red, blue), markers=2)
     vacuum = True
     goal_size = 6
-    tower = np.array([0.0, 0.0, (red.height + blue.height) / 2])
+    max_episode_steps = 100
 
     def sample(
         self, rngs: Sequence[np.random.Generator], chosen: Mapping[str, FloatArray]
     ) -> dict[str, FloatArray]:
-        """Blocks and goal stand on the table, apart from each other."""
-        mount, count, start = self.machine.mount, len(rngs), dict(chosen)
-        for name, block in (("red", self.red), ("blue", self.blue), ("goal", self.red)):
-            if name not in chosen:
-                others = [place[:, :3] + hanging(block) for place in start.values()]
-                taken = mount.to_paper(np.reshape(others, (-1, count, 3)).swapaxes(0, 1))
-                tables = [self.on_table(block)] * count
-                points = sampling.apart_from(taken, rngs, self.machine, tables, APART)
-                places = mount.to_world(points) - hanging(block)
-                goal = np.concatenate([places, places + self.tower], axis=1)
-                start[name] = goal if name == "goal" else places
+        """Blocks and goals stand on the table, apart from each other."""
+        mount, count = self.machine.mount, len(rngs)
+        wanted = {"red": (self.red,), "blue": (self.blue,), "goal": (self.red, self.blue)}
+        start, taken = (
+            dict(chosen),
+            [place[:, k : k + 3] for place in chosen.values() for k in range(0, place.shape[1], 3)],
+        )
+        for name, blocks in wanted.items():
+            if name in chosen:
+                continue
+            places = []
+            for block in blocks:
+                others = np.reshape([place + hanging(block) for place in taken], (-1, count, 3))
+                near, tables = mount.to_paper(others.swapaxes(0, 1)), [self.on_table(block)] * count
+                points = sampling.apart_from(near, rngs, self.machine, tables, APART)
+                places.append(mount.to_world(points) - hanging(block))
+                taken.append(places[-1])
+            start[name] = np.concatenate(places, axis=1)
         return start
 
     def achieved(self, state: State) -> FloatArray:
@@ -62,7 +69,7 @@ class Stack(Task):
         return (*self.robot_entries(), *self.object_entries(0), *self.object_entries(1))
 
     def plan(self, motion: Motion) -> Iterator[Move]:
-        """Red to its place, blue on top of it, and up."""
+        """Each block to its place, and up."""
         up = np.array([0.0, 0.0, -CLEARANCE])  # z points down in the machine's frame
         for block, goal in zip(self.scene.objects, motion.goal.reshape(2, 3), strict=True):
             while not motion.holding(block.name):
@@ -74,4 +81,4 @@ class Stack(Task):
             yield from motion.go([place + up], vacuum=False)
 
 
-IDS = tpm_gym.register_task("Stack", Stack, max_episode_steps=100)
+IDS = tpm_gym.register_task("Sort", Sort)

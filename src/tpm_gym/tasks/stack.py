@@ -1,0 +1,94 @@
+"""Stack: put a block on the goal, and another one on top of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from tpm_gym.arrays import FloatArray
+from tpm_gym.simulation.state import Block, Scene, State
+from tpm_gym.tasks import sampling
+from tpm_gym.tasks.motion import Motion, Move, hanging
+from tpm_gym.tasks.task import Entry, Task, dense
+
+__all__ = ["Stack"]
+
+CLEARANCE: Final = 0.045
+"""Height over a block, or over its place, at which the expert arrives and leaves, m.
+
+A carried block passes over a standing one.
+"""
+APART: Final = 0.045
+"""Smallest distance between the middles of blocks and goal on the table, m."""
+
+
+class Stack(Task):
+    """Put the red block on the goal, and the blue block on top of it.
+
+    The goal has six numbers: the centre of the lower block, then that of the upper block. The
+    block that is farther from its place decides about success.
+    """
+
+    lower = Block("lower")
+    upper = Block("upper", colour=(0.16, 0.36, 0.80, 1.0))
+    scene = Scene(objects=(lower, upper), markers=2)
+    vacuum = True
+    goal_size = 6
+    max_episode_steps = 100
+    samplings = ("sampled", "tempting")
+    tower = np.array([0.0, 0.0, (lower.height + upper.height) / 2])
+    """Way (3,) m from the centre of the lower block to that of the upper block."""
+
+    def sample(
+        self, rngs: Sequence[np.random.Generator], chosen: Mapping[str, FloatArray]
+    ) -> dict[str, FloatArray]:
+        """See the base class."""
+        mount, count, starts = self.machine.mount, len(rngs), dict(chosen)
+        for name, block in (("lower", self.lower), ("upper", self.upper), ("goal", self.lower)):
+            if name not in starts:
+                others = [place[:, :3] + hanging(block) for place in starts.values()]
+                taken = mount.to_paper(np.reshape(others, (-1, count, 3)).swapaxes(0, 1))
+                tables = [self.on_table(block)] * count
+                points = sampling.apart_from(
+                    taken, rngs, self.machine, tables, APART, self.goals == "tempting"
+                )
+                places = mount.to_world(points) - hanging(block)
+                both = np.concatenate([places, places + self.tower], axis=1)
+                starts[name] = both if name == "goal" else places
+        return starts
+
+    def observed(self) -> tuple[Entry, ...]:
+        """Return the entries of the robot, then those of each block."""
+        return (*self.robot_entries(), *self.object_entries(0), *self.object_entries(1))
+
+    def achieved(self, state: State) -> FloatArray:
+        """Return the centres of both blocks."""
+        return state.object_position.reshape(-1, 6)
+
+    def gap(self, achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
+        """Return the distance to the goal of the block that is farther away."""
+        ends = (np.reshape(goal, (*np.shape(goal)[:-1], 2, 3)) for goal in (achieved, desired))
+        largest: FloatArray = super().gap(*ends).max(axis=-1)
+        return largest
+
+    def shaping(self, state: State) -> dict[str, FloatArray]:
+        """Return minus half the distance from cup to the upper block, for a dense reward only."""
+        if self.reward == "sparse":
+            return {}
+        return {"approach": 0.5 * dense(super().gap(self.lip(state), self.top(state, 1)))}
+
+    def plan(self, motion: Motion) -> Iterator[Move]:
+        """Carry the lower block to its place, then the upper block on top of it."""
+        to_paper, up = motion.machine.mount.to_paper, np.array([0.0, 0.0, -CLEARANCE])
+        for block, goal in zip(self.scene.objects, motion.goal.reshape(2, 3), strict=True):
+            while not motion.holding(block.name):
+                yield from motion.pick(block, CLEARANCE)
+            # The cup sits where it took the block, not on the block's middle.
+            grip = motion.seen["position"] - motion.seen[f"{block.name}_position"]
+            place = to_paper(goal + grip)
+            yield from motion.go([motion.command + up, place + up, place], vacuum=True)
+            yield from [Move(place, True), Move(place, True), Move(place, False)]
+            yield from motion.go([place + up], vacuum=False)

@@ -1,0 +1,83 @@
+"""The documentation site: pages made from code, links to code, and the build."""
+
+import subprocess
+import sys
+from unittest.mock import patch
+
+import gymnasium as gym
+import pytest
+from paths import ROOT
+
+from tpm_gym.tasks.registry import TASKS
+
+pytest.importorskip("sphinx")
+from website import docstrings, projects, sources, tasks
+
+
+@pytest.fixture(scope="module")
+def stack():
+    """Return the page of a task that is registered outside the package."""
+    with patch.dict(gym.registry), patch.dict(TASKS):
+        import stacking  # registers TPMStack
+
+        assert stacking
+        return "\n".join(tasks.page("stack"))
+
+
+def test_a_new_task_has_a_page(stack):
+    assert stack.startswith("# Stack\n")
+    assert stacking_doc() in stack.replace("\n", " ")
+    for row in (
+        "| `TPMStackJointsDense-v0` | joint increments | dense |",
+        "| `red` | 36 mm | 30 mm | 50 g |",
+        "| 3 | above 0: vacuum on |",
+        "| `red_position` | 3 | m | centre of the red, from a camera |",
+        "| `singularity` | all |",
+        "No training of this task is on record.",
+    ):
+        assert row in stack
+
+
+def stacking_doc():
+    import stacking
+
+    return stacking.Stack.__doc__.split(". ")[0].split("\n")[0].strip()
+
+
+def test_the_page_tells_how_often_the_expert_succeeds(stack):
+    rates = [line for line in stack.splitlines() if "--policy expert" in line]
+    assert len(rates) == 4
+    assert all("% [" in line for line in rates)
+
+
+def test_links_out_of_docs_lead_to_pages_of_files():
+    text = "[a](../src/tpm_gym/arrays.py) [b](paper.md) [c](../train/recipes) [d](#here)"
+    marked = "[a](source:src/tpm_gym/arrays.py) [b](paper.md) [c](source:train/recipes) [d](#here)"
+    assert sources.mark(text, "extending") == marked
+    assert sources.mark("[a](../../LICENSE)", "generated/x") == "[a](source:LICENSE)"
+    assert sources.mark("[a](../nowhere.py)", "extending") == "[a](../nowhere.py)"
+
+
+def test_links_of_the_projects_files_hold_in_their_copies(tmp_path, monkeypatch):
+    monkeypatch.setattr(projects, "GENERATED", tmp_path)
+    projects.write_pages()
+    text = (tmp_path / "contributing.md").read_text(encoding="utf-8")
+    assert "](../extending.md#a-task)" in text
+    assert "](../../src/tpm_gym/tasks/task.py)" in text
+
+
+def test_tables_and_headings_in_docstrings_become_those_of_sphinx():
+    lines = ["Text |y|.", "", "## Head", "", "| a | b |", "| --- | --- |", "| `x|y` | 2 |"]
+    docstrings.convert(None, "class", "x", None, None, lines)
+    assert lines[0] == r"Text \|y\|."
+    assert ".. rubric:: Head" in lines
+    assert lines[lines.index("   * - a") + 1 :][:3] == ["     - b", "   * - `x|y`", "     - 2"]
+
+
+@pytest.mark.slow
+def test_the_site_builds_without_warnings(tmp_path):
+    command = [sys.executable, "-m", "sphinx", "-E", "-W", "--keep-going", "--nitpicky"]
+    built = subprocess.run([*command, "docs", tmp_path], cwd=ROOT, capture_output=True, text=True)
+    assert built.returncode == 0, built.stderr
+    for page in ("index", "api/tpm_gym", "generated/tasks/reach"):
+        assert (tmp_path / f"{page}.html").exists()
