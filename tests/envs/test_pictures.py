@@ -117,6 +117,15 @@ def test_segmentation_tells_bodies_apart(engine: str) -> None:
     assert (is_red(image) & block).sum() > 0.9 * block.sum()
 
 
+def test_the_table_of_two_blocks_has_one_colour(engine: str) -> None:
+    env = gym.make(
+        "TPMStack-v0", engine=engine, render_mode="rgb_array", camera=Camera(**FROM_ABOVE)
+    )
+    env.reset(seed=0)
+    image: Any = env.render()
+    assert np.ptp(image.reshape(-1, 3), axis=0).max() <= 8
+
+
 def test_engines_draw_the_same_picture() -> None:
     pytest.importorskip("pybullet")
     pytest.importorskip("mujoco")

@@ -42,8 +42,8 @@ class Scenery:
     Attributes:
         bodies: Body ids of the objects, in the order of the scene.
         tables: Body ids of the tables. Each object collides with its own table, because
-            :class:`Friction` scales the friction of each table. All tables are in one place. The
-            first table is drawn, and exists also without objects.
+            :class:`Friction` scales the friction of each table. All tables are in one place and
+            have one colour. The first table exists also without objects.
     """
 
     def __init__(self, client: Client, scene: Scene, table: tuple[float, float]) -> None:
@@ -51,17 +51,17 @@ class Scenery:
         self._client = client
         self._blocks = scene.objects
         self.tables = [self._add_slab(TABLE, table)]
-        self.tables += [self._add_slab(TABLE, table, drawn=False) for _ in self._blocks[1:]]
+        self.tables += [self._add_slab(TABLE, table) for _ in self._blocks[1:]]
         self._floor = self._add_slab(FLOOR, (FLOOR_EDGE, FLOOR_EDGE))
         self.bodies = [self._add_block(block) for block in self._blocks]
         for index, body in enumerate(self.bodies):
             for other, top in enumerate(self.tables):
                 client.setCollisionFilterPair(body, top, -1, -1, int(index == other))
 
-    def _add_slab(self, slab: Slab, edges: tuple[float, float], drawn: bool = True) -> int:
+    def _add_slab(self, slab: Slab, edges: tuple[float, float]) -> int:
         """Add a static board with half edge lengths ``edges`` (m); return its body id."""
         height = slab.top - slab.half_height
-        body = self._add_box((*edges, slab.half_height), height, slab.colour if drawn else None)
+        body = self._add_box((*edges, slab.half_height), height, slab.colour)
         # PyBullet multiplies the friction coefficients of both bodies.
         self._client.changeDynamics(body, -1, lateralFriction=slab.friction)
         return body
@@ -74,13 +74,12 @@ class Scenery:
         return body
 
     def _add_box(
-        self, half: Vector, height: float, colour: Sequence[float] | None, mass: float = 0.0
+        self, half: Vector, height: float, colour: Sequence[float], mass: float = 0.0
     ) -> int:
-        """Add a box at ``height`` (m): static without mass, invisible without colour."""
-        client, shape = self._client, -1
+        """Add a box at ``height`` (m), static without mass."""
+        client = self._client
         solid = client.createCollisionShape(client.GEOM_BOX, halfExtents=half)
-        if colour is not None:
-            shape = client.createVisualShape(client.GEOM_BOX, halfExtents=half, rgbaColor=colour)
+        shape = client.createVisualShape(client.GEOM_BOX, halfExtents=half, rgbaColor=colour)
         place = (0.0, 0.0, height)
         return int(client.createMultiBody(mass, solid, shape, basePosition=place))
 
