@@ -1,8 +1,7 @@
-"""Every error that tpm_gym raises on purpose.
+"""Errors that tpm_gym raises on purpose.
 
-One root, so that ``except TPMError`` catches all of them; each leaf also derives from the built-in
-exception that a caller would expect, and carries the offending values as attributes, so that a
-program can react without parsing the message.
+``except TPMError`` catches all of them. Each error also derives from the built-in exception that a
+caller would expect, and has the offending values as attributes.
 """
 
 from collections.abc import Sequence
@@ -35,7 +34,7 @@ class GeometryError(TPMError, ValueError):
 
 @dataclass(eq=False)
 class InputError(TPMError, ValueError):
-    """An argument has the wrong shape, holds no real numbers, or some that are not finite."""
+    """An argument has the wrong shape, or holds values that are no finite real numbers."""
 
     template: ClassVar[str] = "{name} must be {requirement}, got {value!r}"
     name: str
@@ -67,7 +66,7 @@ class EpisodeError(TPMError, RuntimeError):
 
 @dataclass(eq=False)
 class UnreachableError(TPMError, ValueError):
-    """No solution of the kinematics exists for the input on the branch that was asked for."""
+    """The kinematics have no solution for the input on the requested branch."""
 
     point: Sequence[float]  # m, or joint angles, rad
     leg: str  # what fails: "beta", "leg 1" ..., or "box" for the task's region
@@ -102,7 +101,7 @@ class JointLimitError(TPMError, ValueError):
 
 @dataclass(eq=False)
 class SingularityError(TPMError, ValueError):
-    """A quantity that does not exist at a singularity was asked for there."""
+    """The requested quantity does not exist, because the configuration is singular."""
 
     template: ClassVar[str] = (
         "singular configuration: {factor} = {value:.3g}; stay where the conditioning is above zero "
@@ -126,7 +125,7 @@ class ClosureError(TPMError, RuntimeError):
 
 @dataclass(eq=False)
 class ModeChangeError(TPMError, RuntimeError):
-    """The simulated mechanism has passed a singularity in this episode, and was asked to go on.
+    """A step was requested although the mechanism had passed a singularity in this episode.
 
     In another ``"assembly"`` mode, past a parallel singularity, the forward kinematics no longer
     say where the platform is; in another ``"working"`` mode, past a serial one, the inverse
@@ -141,7 +140,7 @@ class ModeChangeError(TPMError, RuntimeError):
 
 @dataclass(eq=False)
 class ConformanceError(TPMError, AssertionError):
-    """An environment breaks what all of them promise; see :mod:`tpm_gym.envs.testing`."""
+    """An environment fails a conformance check of :mod:`tpm_gym.envs.testing`."""
 
     template: ClassVar[str] = "environments promise that {promise}; here, {found}"
     promise: str
@@ -150,7 +149,7 @@ class ConformanceError(TPMError, AssertionError):
 
 @dataclass(eq=False)
 class PolicyFileError(TPMError, ValueError):
-    """The files of a policy are missing, damaged, or not what they have to be; nothing loaded."""
+    """The files of a policy are missing, damaged or invalid; nothing was loaded."""
 
     template: ClassVar[str] = "policy file {path}: {reason}; {remedy}"
     path: str
@@ -174,7 +173,7 @@ class PolicyMismatchError(TPMError, ValueError):
 
 @dataclass(eq=False)
 class MissingPackageError(TPMError, ImportError):
-    """An optional package is needed for this and is not installed; ``extra`` installs it."""
+    """A required optional package is not installed; the extra ``extra`` installs it."""
 
     template: ClassVar[str] = (
         "this needs {package}, which cannot be imported; pip install 'tpm-gym[{extra}]'{hint}"

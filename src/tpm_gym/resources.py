@@ -1,6 +1,6 @@
-"""Where the files are that come with the package: robot descriptions, recipes, trained policies.
+"""Folders of the package's data: robot descriptions, recipes, trained policies.
 
-The wheel carries them in ``tpm_gym/data``; in a checkout they are where people look for them.
+A wheel has them in ``tpm_gym/data``; a checkout in ``urdf`` and ``train``.
 """
 
 from pathlib import Path

@@ -258,7 +258,7 @@ def _components(codes: IntArray) -> IntArray:
 
 
 def _grown(mask: BoolArray, corners: bool = True) -> BoolArray:
-    """Return the cells of a set and those that touch them at a face, or even at a corner."""
+    """Return a set of cells with its neighbours at faces; with ``corners``, at corners too."""
     grown: BoolArray = mask.copy()
     for before, after in _NEIGHBOURS:
         reached = grown.copy() if corners else mask

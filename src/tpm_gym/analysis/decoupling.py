@@ -71,8 +71,10 @@ def over(
 ) -> Index:
     """Average shares and numbers of motors over a grid of ``shape`` in a region, for x, y, z of P.
 
-    Raises UnreachableError, SingularityError, or ConfigurationError where a point is in another
-    assembly mode.
+    Raises:
+        UnreachableError: If a point is out of reach.
+        SingularityError: If a point is singular.
+        ConfigurationError: If a point is in another assembly mode.
     """
     low, high = np.array(region.low), np.array(region.high)
     cells = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1).reshape(-1, 3)

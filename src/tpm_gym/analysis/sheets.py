@@ -59,7 +59,7 @@ def _tangent(
 def _planar(
     g: Geometry, mode: WorkingMode, t: FloatArray, side: FloatArray, bend: FloatArray
 ) -> Point:
-    """Return points where both rods have one direction psi, over theta_1, and arm 2 reaches."""
+    """Return points where rods 4 and 6 have equal directions and arm 2 reaches, over theta_1."""
     level, up, apart, gap = _tangent(g, t, side)
     with np.errstate(divide="ignore", invalid="ignore"):
         cosine = (g.l3**2 - gap**2 - apart**2) / (2 * gap * apart)
@@ -202,7 +202,7 @@ def _zoom(
 def nearest(
     points: FloatArray, limit: FloatArray, mode: WorkingMode, geometry: Geometry
 ) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Find the nearest point of all these surfaces on a working mode, nearer than a limit.
+    """Find the nearest point of all five surfaces on a working mode, nearer than a limit.
 
     Args:
         points: (n, 3) m, 0 <= y <= l7.
@@ -231,7 +231,7 @@ def nearest(
 def _feet(
     points: FloatArray, limit: FloatArray, mode: WorkingMode, g: Geometry, name: str
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Return row, distance and foot of points of one surface that may be nearer than the limit."""
+    """Return the points that a surface may be near: their rows, distances and feet."""
     arcs, (x, z, p, q), length = _arcs(g, mode, name)
     link3 = points - [g.l2, 0, 2 * g.l6]  # C1 for a link 7 of length 0
 

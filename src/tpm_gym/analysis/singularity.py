@@ -158,7 +158,7 @@ def _classify(values: Factors, geometry: Geometry, tolerance: float) -> Classifi
 
 
 def _edges(points: FloatArray, geometry: Geometry) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Return distance, foot and factor of the nearest of y = 0, y = l7 and the torus of leg 3."""
+    """Compare y = 0, y = l7 and the torus of leg 3; return the nearest: distance, foot, factor."""
     centre = np.array([geometry.l1 - geometry.l2, 0.0, geometry.l6])
     offset = points - centre
     radius = np.hypot(offset[:, 0], offset[:, 2])

@@ -1,4 +1,4 @@
-"""n environments of one task in one engine: what one environment and many have in common."""
+"""Core of n environments of one task in one engine; :class:`TPMEnv` is the case n = 1."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ class EnvSnapshot:
         kind: Task and options, which must be equal where the snapshot is restored.
         simulation: The simulation's part.
         rngs: States of the n generators.
-        columns: Arrays by name: goals and delayed actions, and of a vector environment's episodes
-            their lengths and ends.
+        columns: Arrays by name: goals and delayed actions. Vector environments add the lengths
+            and ends of their episodes.
     """
 
     kind: Mapping[str, Any]
@@ -61,7 +61,7 @@ class EnvSnapshot:
 class Core:
     """n environments of one task in one engine; rows are environments.
 
-    The arguments are those of :class:`tpm_gym.TPMEnv`.
+    The arguments are explained in :class:`tpm_gym.TPMEnv`.
 
     Attributes:
         task: The task.
@@ -154,7 +154,7 @@ class Core:
             options: As in :meth:`tpm_gym.TPMEnv.reset`.
 
         Returns:
-            For each of them the randomisation of the episode; empty dictionaries without one.
+            The randomisation of each episode; empty dictionaries without randomisation.
 
         Raises:
             ResetOptionError: If an option is not possible; nothing has happened then.
@@ -207,7 +207,7 @@ class Core:
         """Read the state, and return observation, reward and info of all or of some environments.
 
         Raises:
-            ConfigurationError: If the task makes something of the state that is not finite.
+            ConfigurationError: If a result of the task is not finite.
         """
         state, goals = self.simulation.state(), self.goals
         self._state = state
@@ -254,7 +254,7 @@ class Core:
     # -- pictures ---------------------------------------------------------------------------
 
     def frame(self, row: int) -> Any:
-        """Draw an environment as ``render_mode`` says.
+        """Draw an environment in its ``render_mode``.
 
         Raises:
             EpisodeError: If the environments are closed, or before the first reset.
@@ -313,7 +313,7 @@ class Core:
 
         Raises:
             EpisodeError: If the environments are closed.
-            InputError: If it is no snapshot, or one of other environments; nothing has happened
+            InputError: If ``snapshot`` is no snapshot of equal environments; nothing has happened
                 then.
         """
         self.require_open()
@@ -339,7 +339,7 @@ class Core:
             raise EpisodeError("the environment is closed; make a new one")
 
     def close(self) -> None:
-        """Close the simulation; harmless the second time."""
+        """Close the simulation; a second call does nothing."""
         if not self.closed:
             self.closed, self._state = True, None
             self.simulation.close()
@@ -357,7 +357,7 @@ class Core:
         return {**vars(self), "simulation": snapshot}
 
     def __setstate__(self, values: dict[str, Any]) -> None:
-        """Start a simulation of its own, and continue where the original was."""
+        """Create a new simulation, and continue from the state of the original."""
         vars(self).update(values)
         snapshot: Snapshot | None = values["simulation"]
         self.simulation = self._start()
@@ -391,7 +391,7 @@ def _goal_free(terms: Mapping[str, Any]) -> Any:
 def _not_finite(
     task: Task, state: State, achieved: NDArray[Any], terms: Mapping[str, Any]
 ) -> ConfigurationError:
-    """Find the value of a task that is not finite."""
+    """Return an error that names the first value of a task that is not finite."""
     values = {
         **{
             f"observed(), {entry.name!r}": entry.source(state)[:, slice(*entry.columns or (None,))]

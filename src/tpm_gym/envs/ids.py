@@ -25,7 +25,7 @@ VECTOR_ENTRY_POINT = "tpm_gym.envs.vector:TPMVectorEnv"
 def register_task(
     name: str, task: type[Task], *, version: int = 0, max_episode_steps: int | None = None
 ) -> tuple[str, ...]:
-    """Register a task's ids: ``TPM<name>{,Joints}{,Dense}-v<version>``; harmless the second time.
+    """Register a task's ids ``TPM<name>{,Joints}{,Dense}-v<version>``; it may be repeated.
 
     ``TPMEnv(task=...)`` takes it too, as ``name`` in snake case. The command line, and worker
     processes that are spawned rather than forked, find ids as ``"module:id"``, where importing the

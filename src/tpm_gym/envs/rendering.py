@@ -74,7 +74,7 @@ class Pixels:
         self._columns = np.flatnonzero(np.concatenate(kept))
 
     def spaces_of(self, vectors: Mapping[str, spaces.Box]) -> dict[str, spaces.Space[Any]]:
-        """Return the spaces of the observations, from those without pictures."""
+        """Add the pictures to the spaces of the observations."""
         view, bound = self._rendering.view, float(vectors["observation"].high[0])
         return {
             **vectors,

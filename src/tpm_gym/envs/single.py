@@ -1,4 +1,4 @@
-"""One environment, as Gymnasium has it."""
+"""Single environment with the interface of Gymnasium."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ class TPMEnv(gym.Env[Observation, Action]):
     ## Ids
 
     ``TPM{Reach,PickAndPlace}{,Joints}{,Dense}-v0``: Cartesian or joint increments, sparse or dense
-    reward. Control steps of 40 ms, episodes of 50 steps, truncation only. The numbers below are of
-    the paper's machine.
+    reward. Control steps of 40 ms, episodes of 50 steps, truncation only. The numbers below apply
+    to the paper's machine.
 
     ## Frames
 
@@ -85,13 +85,13 @@ class TPMEnv(gym.Env[Observation, Action]):
     | object_tilt | 2 | x and y of the object's axis |
     | object_held | 1 | share of the vacuum that holds the object, by a gauge |
 
-    Entries of the object exist in PickAndPlace only. Those of the robot come from the encoders
+    Entries of the object exist in PickAndPlace only. Entries of the robot come from the encoders
     alone, never from the simulated platform.
 
     With ``observations="pixels"`` the dictionary has a fourth entry: ``pixels``, (84, 84, 3) uint8,
     a picture by the option ``camera``. ``observation`` keeps the entries of the robot, and those of
     the object are left out. The goals stay vectors, as hindsight needs them. ``achieved_goal``
-    tells where the block is, so a policy that shall see with the camera alone must not use it.
+    contains the position of the block. A policy for cameras alone must not use it.
 
     ## Reward
 
@@ -105,15 +105,16 @@ class TPMEnv(gym.Env[Observation, Action]):
     | approach | minus half the distance from cup to block in units of 0.1 m |
 
     SB3's HerReplayBuffer calls ``compute_reward`` with an empty info, which gives the goal term
-    alone. ``tpm_gym.learning.PenaltyHerReplayBuffer`` and ``copy_info_dict=True`` keep the others.
+    alone. ``tpm_gym.learning.PenaltyHerReplayBuffer`` keeps the other terms; so does SB3's buffer
+    with ``copy_info_dict=True``.
 
     ## Start
 
     The arm is at rest at home, and the block (square, 36 mm wide, 30 mm high, 50 g) flat on the
     table. The goal is at least 30 mm away from the start of the block (or of P). Goals and objects
     are sampled where 1/cond(J) >= 0.08.
-    ``reset(options={"object": (x, y, z), "goal": (x, y, z)})`` chooses them instead; a block that
-    starts above the table falls.
+    ``reset(options={"object": (x, y, z), "goal": (x, y, z)})`` sets both; a block that starts above
+    the table falls.
 
     ## Info
 
@@ -125,7 +126,7 @@ class TPMEnv(gym.Env[Observation, Action]):
     | ``conditioning`` | 1/cond(J) by the encoders |
     | ``singularity_penalty`` | penalty before weighting, 0 to 1 |
     | ``assembly_mode_changed`` | whether the platform passed y = 0, a parallel singularity |
-    | ``working_mode_changed`` | whether it passed y = l7, a serial singularity |
+    | ``working_mode_changed`` | whether the platform passed y = l7, a serial singularity |
     | ``object_lost`` | whether an object is off the table or out of reach |
     | ``reward_terms`` | the terms above by name; they sum to the reward |
     | ``randomisation`` | after a reset with that option: the episode's plant |
@@ -162,7 +163,7 @@ class TPMEnv(gym.Env[Observation, Action]):
             the others are in ``tpm_gym.simulation.{bullet,mujoco,analytic}.physics``.
         observations: ``"state"``, or ``"pixels"``: see above.
         pixel_size: Width and height of the pictures in pixel observations.
-        render_mode: What ``render()`` gives. None: nothing. ``"human"``: a window, in real time, on
+        render_mode: Result of ``render()``. None: nothing. ``"human"``: a window, in real time, on
             a display. ``"rgb_array"``: (height, width, 3) uint8. ``"depth_array"``: (height, width)
             float32, distance along the camera's axis in m, infinite where there is no body.
             ``"rgbd_tuple"``: both. ``"segmentation"``: (height, width) int32, 0 background and
@@ -289,7 +290,7 @@ class TPMEnv(gym.Env[Observation, Action]):
             EpisodeError: If there is no episode: before reset, after close, after a lost loop.
             ClosureError: If a loop of the mechanism opened.
             ModeChangeError: If the mechanism passed a singularity earlier in this episode.
-            ConfigurationError: If the task makes something of the state that is not finite.
+            ConfigurationError: If a result of the task is not finite.
         """
         core = self._core
         plain = type(action) is np.ndarray and action.dtype.char in "df"  # as usual
@@ -331,7 +332,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         return compute_reward(self.task, achieved_goal, desired_goal, info)
 
     def render(self) -> Any:
-        """Draw the scene as ``render_mode`` says; in ``human`` mode, wait for real time.
+        """Draw the scene in the ``render_mode``; in ``human`` mode, wait for real time.
 
         Returns:
             See the argument ``render_mode`` of the class.
@@ -350,7 +351,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         return None if self.render_mode is None else self._core.frame(0)
 
     def close(self) -> None:
-        """Close the simulation; harmless the second time."""
+        """Close the simulation; a second call does nothing."""
         self._core.close()
 
     # -- beyond Gymnasium -----------------------------------------------------------------------
@@ -399,7 +400,7 @@ class TPMEnv(gym.Env[Observation, Action]):
 
         Raises:
             EpisodeError: If the environment is closed.
-            InputError: If it is no snapshot, or one of another kind of environment; nothing has
+            InputError: If ``snapshot`` is no snapshot of an equal environment; nothing has
                 happened then.
         """
         observation = self._core.restore(snapshot)
@@ -410,7 +411,7 @@ class TPMEnv(gym.Env[Observation, Action]):
 def _row(
     observation: Observation, reward: FloatArray, info: Mapping[str, Any]
 ) -> tuple[Observation, float, dict[str, Any]]:
-    """Take the one row of a report, in Python's own numbers."""
+    """Convert a report of one row to the results of one environment, in Python numbers."""
     plain: dict[str, Any] = {}
     for name, value in info.items():
         if name != "reward_terms":

@@ -1,4 +1,4 @@
-"""Conformance checks for environments with tasks, machines or engines of one's own.
+"""Conformance checks for environments with your own task, machine or engine.
 
 Each check takes a callable that makes an environment through Gymnasium, such as
 ``lambda: gym.make("TPMMine-v0")``. It raises a :class:`~tpm_gym.errors.ConformanceError` that says
@@ -80,7 +80,7 @@ def check_env(make: Make) -> None:
 
 
 def random_episode(env: Env, seed: int, steps: int = 50) -> Iterator[Step]:
-    """Play excursions at full speed, with actions from ``seed`` too; the reset comes first."""
+    """Reset with ``seed``, then step with random actions at full speed; yield every result."""
     rng = np.random.default_rng(seed)
     observation, info = env.reset(seed=seed)
     yield observation, 0.0, info
@@ -124,7 +124,7 @@ def _require(promise: str, kept: Any, found: str = "this does not hold") -> None
 
 
 def _refused(call: Callable[[], Any], *kinds: type[TPMError]) -> TPMError:
-    """Return the error of a call that has to raise one of these."""
+    """Call a function that has to raise one of some errors, and return the error."""
     names = " or ".join(kind.__name__ for kind in kinds)
     try:
         call()
@@ -156,7 +156,7 @@ def passes_the_checkers_of_gymnasium_and_sb3(make: Make) -> None:
 
 
 def gives_observations_of_order_one_and_plain_infos(make: Make) -> None:
-    """Compare observations and infos with what spaces and documentation say."""
+    """Check the types, bounds and keys of observations and infos."""
     largest = 0.0
     with closing(make()) as env:
         for index, (observation, reward, info) in enumerate(random_episode(env, 1)):
@@ -209,7 +209,7 @@ def repeats_resets_with_the_seed(make: Make) -> None:
 
 
 def shares_no_memory(make: Make) -> None:
-    """Write into what was returned, and look whether anything changed."""
+    """Overwrite returned arrays, and check that the environment does not change."""
     with closing(make()) as env:
         steps = list(random_episode(env, 7, steps=3))
         for index, (observation, _, _) in enumerate(steps):
@@ -253,7 +253,7 @@ def computes_rewards_of_batches(make: Make) -> None:
 
 
 def bad_actions(size: int) -> Iterator[Any]:
-    """Yield what is no action of that length."""
+    """Yield values that are no actions of this length."""
     ones = np.ones(size)
     yield from (np.full(size, np.nan), np.where(np.arange(size) == 1, np.inf, ones))
     yield from (np.ones(size + 1), np.ones((1, size)), 0.0, None, [[0.0], [0.0, 1.0]], {})
@@ -265,7 +265,7 @@ def bad_actions(size: int) -> Iterator[Any]:
 
 
 def refuses_bad_actions_and_has_not_moved_then(make: Make) -> None:
-    """Step with what is no action, and compare the steps after it."""
+    """Step with values that are no actions, and compare the steps after it."""
 
     def run(env: Env, hostile: bool) -> Any:
         half: NDArray[Any] = np.full(env.action_space.shape or (), 0.5)
@@ -298,7 +298,7 @@ def clips_actions_and_leaves_them_as_they_are(make: Make) -> None:
 
 
 def refuses_bad_options_and_keeps_the_episode_then(make: Make) -> None:
-    """Reset with options that cannot be, seeds with them, and go on."""
+    """Reset with impossible options, and check that the episode continues unchanged."""
     with closing(make()) as env:
         bare: Any = env.unwrapped
         blocks, size = bare.task.scene.objects, bare.task.goal_size
@@ -355,7 +355,7 @@ def refuses_steps_outside_an_episode(make: Make) -> None:
 
 
 def continues_copies_and_snapshots_equally(make: Make) -> None:
-    """Save, copy and pickle in an episode, and compare all to the end of the next reset."""
+    """Save, copy and pickle in an episode, and compare all of them until the next reset."""
     with closing(make()) as env, closing(make()) as restored:
         steps = min(15, _steps_of(env) // 2)
         for other in (env, restored):  # wrappers count for themselves

@@ -44,25 +44,24 @@ Step = tuple[Observation, FloatArray, BoolArray, BoolArray, dict[str, Any]]
 class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
     """n environments that are stepped together.
 
-    Spaces, rewards, resets from seeds and infos are those of :class:`~tpm_gym.TPMEnv`. With the
-    analytic engine one environment has the same bits alone and among thousands, on one thread and
-    on several. Infos have the form of Gymnasium's vector environments, a mask ``_key`` beside each
-    ``key``.
+    Spaces, rewards, seeds and infos are as in :class:`~tpm_gym.TPMEnv`. In the analytic engine, an
+    environment computes equal bits alone and among thousands, on one thread and on several. Infos
+    have the form of Gymnasium's vector environments, a mask ``_key`` beside each ``key``.
 
     Args:
         task: See :class:`~tpm_gym.TPMEnv`.
         control: See there.
         reward: See there.
         num_envs: Number of environments, n.
-        engine: See there. ``"analytic"`` computes all environments together; of other engines each
-            environment has one of its own, and they are stepped one after another.
+        engine: See there. ``"analytic"`` computes all environments together. With other engines,
+            each environment has its own engine, and they are stepped one after another.
         num_threads: Threads that step the environments of the analytic engine.
         max_episode_steps: Steps after which an episode is truncated; None for no limit.
         autoreset_mode: When environments whose episode ended are reset: ``NEXT_STEP``,
             ``SAME_STEP`` (with ``final_obs`` and ``final_info`` in the infos), or ``DISABLED`` (by
             ``reset(options={"reset_mask": ...})``).
-        stagger: Whether the first episodes after a reset of all have different lengths, so that
-            not all end at the same step. It makes on-policy batches more even.
+        stagger: Whether the first episodes after a full reset have different lengths, so that
+            they do not all end at the same step. This makes on-policy batches more even.
         render_mode: One of :class:`~tpm_gym.TPMEnv`'s, but not ``"human"``.
         options: Other options of :class:`~tpm_gym.TPMEnv`.
 
@@ -155,15 +154,15 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         """Start an episode in all environments, or in those of a mask.
 
         Args:
-            seed: Seed of the first environment, and one more for each of the others; or one for
-                each.
-            options: ``reset_mask``, (n,) of booleans. The rest is that of :meth:`TPMEnv.reset`,
-                the same for all.
+            seed: Seed of the first environment, increased by one for each further environment;
+                or a seed for each.
+            options: ``reset_mask``, (n,) booleans; and the options of :meth:`TPMEnv.reset`, used
+                for all environments.
 
         Raises:
-            InputError: If a seed is not possible, or there is another number of seeds; nothing has
+            InputError: If a seed is not possible, or the number of seeds is not n; nothing has
                 happened then.
-            ResetOptionError: If the mask is not possible; and what ``TPMEnv.reset`` raises.
+            ResetOptionError: If the mask is not possible; also the errors of ``TPMEnv.reset``.
             EpisodeError: If the environments are closed.
         """
         self._require_open()
@@ -192,7 +191,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         return array
 
     def _generators(self, seed: Any) -> list[np.random.Generator | None]:
-        """Return a generator for each seed; None where an environment keeps its own."""
+        """Return a generator for each seed; None where an environment keeps its generator."""
         if seed is None or is_whole(seed, 0):
             seeds = [None if seed is None else int(seed) + k for k in range(self.num_envs)]
         else:
@@ -344,7 +343,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             The observation at that moment.
 
         Raises:
-            InputError: If they are no snapshots, or those of other environments.
+            InputError: If they are no snapshots of equal environments.
         """
         self._require_open()
         if not isinstance(snapshots, list) or len(snapshots) != len(self._parts):
@@ -384,7 +383,7 @@ class _Part:
     def _begin(
         self, rows: IntArray, rngs: Sequence[np.random.Generator], options: Any = None
     ) -> dict[str, Any]:
-        """Start episodes in some environments; return what infos say of their randomisation."""
+        """Start episodes in some environments; return the infos about their randomisation."""
         drawn = self.core.reset(rows, rngs, options)
         self.elapsed[rows] = 0
         self.ended[rows] = False
@@ -417,7 +416,7 @@ class _Part:
         return observation, reward, ended, infos
 
     def _begin_anew(self, observation: Observation, last: Mapping[str, Any]) -> dict[str, Any]:
-        """Reset what has ended, in the observation too; return infos with the last ones."""
+        """Reset ended environments and replace their observations; return the infos of both."""
         core, rows, ended = self.core, np.flatnonzero(self.ended), self.ended.copy()
         final = np.full(core.count, None, dtype=object)
         for row in rows.tolist():
@@ -458,7 +457,7 @@ def _mode_of(value: AutoresetMode | str) -> AutoresetMode:
 
 
 def _masked(info: Mapping[str, Any], rows: IntArray | None, count: int) -> dict[str, Any]:
-    """Put a mask beside each entry (n,), which is true in ``rows``, or everywhere."""
+    """Add a mask to each entry (n,): true in ``rows``, or everywhere without ``rows``."""
     mask = np.ones(count, dtype=np.bool_)
     if rows is not None:
         mask[:] = False

@@ -46,12 +46,12 @@ _THIRD: Final = (
 
 
 def _six(c: tuple[float, ...], k: int, x: float) -> float:
-    """Evaluate the six coefficients from the k-th on; a loop would not be unrolled."""
+    """Evaluate a polynomial with six coefficients from c[k] on, without a loop for speed."""
     return c[k] + x * (c[k + 1] + x * (c[k + 2] + x * (c[k + 3] + x * (c[k + 4] + x * c[k + 5]))))
 
 
 def _sin_cos(x: float) -> tuple[float, float, float]:
-    """Compute sine and cosine of x less whole quarter turns, and their number, 0 to 3."""
+    """Return sine and cosine of x modulo a quarter turn, and the quarter turn of x, 0 to 3."""
     whole = (x * (2.0 / math.pi) + _TO_WHOLE) - _TO_WHOLE
     whole = whole if abs(whole) <= _TURNS else math.nan
     r = ((x - whole * _HALF_PI[0]) - whole * _HALF_PI[1]) - whole * _HALF_PI[2]

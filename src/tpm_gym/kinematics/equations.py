@@ -1,4 +1,4 @@
-"""The equations of the mechanism, in closed form, written once.
+"""Closed-form equations of the mechanism, for floats, arrays and tensors.
 
 The paper's frame O-xyz: origin in the middle of the base, base plane z = 0, z from the base towards
 the platform; metres and radians. The mechanism has two loops of coupling degree zero, so both
@@ -326,7 +326,7 @@ def no_posture(point: Vector, branch: WorkingMode, g: Geometry) -> UnreachableEr
 
 
 def _leg_margin(level: float, vertical: float, out: float, g: Geometry) -> float:
-    """Return by how much the triangle of arm, rod (in the arm's plane) and pivot closes, m."""
+    """Return the margin by which a leg reaches in the arm's plane, m; negative if it does not."""
     if abs(out) >= g.l4:
         return g.l4 - abs(out)
     in_plane, rod = math.hypot(level, vertical), math.sqrt(g.l4**2 - out**2)

@@ -1,4 +1,4 @@
-"""The seven lengths that define the mechanism, validated."""
+"""Seven lengths that define the mechanism, validated."""
 
 from dataclasses import dataclass, fields
 from typing import NamedTuple
@@ -89,7 +89,7 @@ PAPER = Geometry(l1=0.300, l2=0.070, l3=0.350, l4=0.800, l5=0.100, l6=0.010, l7=
 """The paper's case study (section "Case study"), there in millimetres."""
 
 WIDE = Geometry(l1=0.300, l2=0.070, l3=0.350, l4=0.800, l5=0.100, l6=0.010, l7=0.600)
-"""The paper's lengths but for l7, for a workspace of practical depth in y.
+"""The paper's lengths with a longer l7, for a workspace of practical depth in y.
 
 Of l7 = 0.1, 0.2 ... 0.9 m, 0.6 m has the largest axis-aligned box, elbows out, in which the
 conditioning is at least 0.1 (:func:`tpm_gym.analysis.aspects.largest_box`): about 45 litres and

@@ -33,9 +33,8 @@ from tpm_gym.kinematics.namespaces import Namespace, by_rows
 def forward_all(theta: ArrayLike, geometry: Geometry = PAPER) -> ForwardSolutions:
     """Solve the forward kinematics on all 4 branches, at actuated angles theta (..., 3) rad.
 
-    A branch keeps its slot as theta moves, and holds NaN where it is not real, but for z where
-    beta is free. Link 3' translates; assemblies with link 3' turned are those of
-    :func:`.rotated.forward_rotated`.
+    A branch keeps its slot as theta moves. It is NaN where it is not real; only z is a number
+    where beta is free. For assemblies with link 3' turned, see :func:`.rotated.forward_rotated`.
     """
     require_geometry(geometry)
     angles = points("theta", theta)
@@ -75,7 +74,7 @@ def inverse(
 
 
 def assembled(theta: ArrayLike, branch: AssemblyMode, geometry: Geometry) -> ForwardSolutions:
-    """Compute all solutions as :func:`forward_all` does; those on ``branch`` have to exist."""
+    """Compute all solutions; raise UnreachableError where ``branch`` does not exist."""
     angles = finite_points("theta", theta)
     solutions = forward_all(angles, geometry)
     valid = solutions.valid[..., branch.index]

@@ -104,11 +104,11 @@ class RotatedPostures:
 
 @np.errstate(all="ignore")
 def forward_rotated(theta: ArrayLike, geometry: Geometry = PAPER) -> RotatedPostures:
-    """Solve all assemblies with link 3' turned at actuated angles theta (..., 3) rad, (..., 8).
+    """Compute the 8 assemblies with link 3' turned, for actuated angles theta (..., 3) rad.
 
     Link 3' depends on theta_1 and theta_2 alone and has 4 postures at most; link 7 has 2 for each.
-    The slots are those of :data:`.modes.ROTATED_MODES`. Where both modes meet (phi = 0), the
-    assembly is returned too. Entries that are not finite give none.
+    The slots (..., 8) are in the order of :data:`.modes.ROTATED_MODES`. Where both modes meet
+    (phi = 0), the assembly is returned too. Entries that are not finite have no assembly.
 
     Raises:
         InputError: If theta is no array (..., 3) of numbers.
@@ -131,10 +131,10 @@ def forward_rotated(theta: ArrayLike, geometry: Geometry = PAPER) -> RotatedPost
 
 @np.errstate(all="ignore")
 def inverse_rotated(position: ArrayLike, geometry: Geometry = PAPER) -> RotatedPostures:
-    """Solve all postures with link 3' turned and point P at position (..., 3) m, (..., 48).
+    """Compute the postures (..., 48) with link 3' turned and P at position (..., 3) m.
 
     Slots: cos(beta) < 0, then > 0; six tilts, in order; legs 2 and 3, each with
-    B_iC_i . dB_i/dtheta_i < 0, then > 0. Entries that are not finite give none.
+    B_iC_i . dB_i/dtheta_i < 0, then > 0. Entries that are not finite have no posture.
 
     Raises:
         InputError: If position is no array (..., 3) of numbers.
@@ -202,13 +202,13 @@ def _zeros(values: FloatArray) -> tuple[FloatArray, BoolArray]:
 
 @np.errstate(all="ignore")
 def link3_rotated(theta: FloatArray, geometry: Geometry = PAPER) -> tuple[_Planar, FloatArray]:
-    """Solve point C1 (xC + i zC, m) and tilt (rad) of link 3' turned at theta (..., 3), (..., 4).
+    """Compute C1 (xC + i zC, m) and tilt (rad) of link 3' turned at theta (..., 3), each (..., 4).
 
     Missing solutions are NaN. The slots are those of :data:`.modes.ROTATED_MODES`, by pairs.
 
     Seen along y and from B1, C1 = rho n with n = exp(-i phi / 2), since B1C1 halves the angle. Then
-    the closures of rods 4a and 4b are one, and that of rod 6 is linear in rho. Squared, it is a
-    trigonometric polynomial of degree 2, a quartic in tan(phi / 2).
+    the closures of rods 4a and 4b are equal, and the closure of rod 6 is linear in rho. Its square
+    is a trigonometric polynomial of degree 2, a quartic in tan(phi / 2).
     """
     g = geometry
     b1, b2, _ = np.moveaxis(_elbows(theta, g), -2, 0)
@@ -223,7 +223,7 @@ def link3_rotated(theta: FloatArray, geometry: Geometry = PAPER) -> tuple[_Plana
         return rho2, _dot(kappa, n), q
 
     def closures(rho: FloatArray, tilt: FloatArray) -> tuple[_Pair, _Four]:
-        """Return closures of rods 4a and 4b, and of rod 6, m^2; and their slopes."""
+        """Return the closures of rods 4 and of rod 6, m^2, and their slopes."""
         n, u = np.exp(-0.5j * tilt), np.exp(-1j * tilt)
         rod6 = rho * n - 2 * g.l5 * (u - 1) - kappa
         gaps = rho**2 + (2 * g.l5 * n.imag) ** 2 - reach2, abs(rod6) ** 2 - g.l4**2
@@ -300,7 +300,7 @@ def _refined(
 
 
 def _in_slots(c1: _Planar, tilt: FloatArray, sign: FloatArray) -> tuple[_Planar, FloatArray]:
-    """Sort solutions into slots: half have a negative sign, then each half by its turn."""
+    """Sort solutions into slots: negative signs first, then by the tilt."""
     real = ~np.isnan(sign)
     count = real.sum(axis=-1, keepdims=True)
     half = count // 2
@@ -317,7 +317,7 @@ def _in_slots(c1: _Planar, tilt: FloatArray, sign: FloatArray) -> tuple[_Planar,
 def _link7(
     theta: FloatArray, link3: _Planar, tilt: FloatArray, g: Geometry
 ) -> tuple[FloatArray, BoolArray]:
-    """Solve cos(beta), and whether rod 11 closes: Eqs. (9) and (10) in the frame of link 3'."""
+    """Compute cos(beta), and whether rod 11 closes: Eqs. (9), (10) in the frame of link 3'."""
     b3 = _elbows(theta, g)[..., 2, :]
     to_c1 = (link3 - (b3[..., 0, None] + 1j * b3[..., 2, None])) * np.exp(1j * tilt)
     u, w = to_c1.real + 2 * g.l2, to_c1.imag + g.l6
@@ -330,7 +330,7 @@ def _link7(
 def factors(postures: RotatedPostures) -> Factors:
     """Compute the factors that are zero where a rotated assembly is singular.
 
-    The names are those of :class:`.equations.Factors`, with these formulas, (...,) each:
+    The names are as in :class:`.equations.Factors`, with these formulas, (...,) each:
 
     * level3 = l7 cos(beta) - B3C3 . u, m, with u along link 3'.
     * planar = B2C2 . dC2/dphi with motor 1 locked, m^2/rad, zero where the lines of rods 4a, 4b

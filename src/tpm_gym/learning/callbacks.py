@@ -185,5 +185,5 @@ class Checkpointing(BaseCallback):
 
 
 def seconds_trained(model: BaseAlgorithm) -> float:
-    """Return the time that a run has been training, in this process and earlier ones, in s."""
+    """Return the training time of a run in this and earlier processes, s."""
     return (time.time_ns() - model.start_time) / 1e9

@@ -1,8 +1,8 @@
-"""Checkpoints on disk: each is one file that is whole or absent, and that shows any damage.
+"""Checkpoints on disk, each in one file, written atomically and with a checksum.
 
-A checkpoint is ``checkpoints/<step>.checkpoint``: a SHA-256, and the NumPy archive that it is the
-sum of. The file is written under another name, flushed to the disk and renamed, so a kill leaves
-the earlier checkpoints untouched. Nothing is unpickled. Small files (JSON, and tensors for
+A checkpoint is ``checkpoints/<step>.checkpoint``: a NumPy archive after its SHA-256. The file is
+written under another name, flushed to the disk and renamed, so a kill leaves the earlier
+checkpoints untouched. Nothing is unpickled. Small files (JSON, and tensors for
 ``torch.load(weights_only=True)``) are stored as arrays of bytes.
 """
 
@@ -49,7 +49,7 @@ class CheckpointStore:
 
     @property
     def newest(self) -> int | None:
-        """Step of the newest checkpoint that was saved or loaded; None before."""
+        """Step of the checkpoint that was saved or loaded last; None before the first."""
         return self._whole[-1] if self._whole else None
 
     def path(self, step: int) -> Path:
@@ -137,7 +137,7 @@ def _write(path: Path, content: Content) -> None:
 
 
 def _read(path: Path) -> Content:
-    """Read a checkpoint after comparing every byte of it with its sum."""
+    """Read a checkpoint and verify its checksum."""
     data = path.read_bytes()
     if hashlib.sha256(memoryview(data)[_SUM:]).digest() != data[:_SUM]:
         raise ValueError("its SHA-256 differs from what was written")

@@ -52,7 +52,7 @@ def parse_randomisation(words: Sequence[str]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class EnvOptions:
-    """Choices that the id makes where they are not given."""
+    """Options of an environment; an option that is not given keeps the id's value."""
 
     machine: Annotated[str, unset(str, "the id's; evaluate: the policy's", "NAME")] = UNSET
     """Robot: paper, wide, or your module's."""

@@ -168,7 +168,7 @@ def _complete(config: EvaluationConfig) -> EvaluationConfig:
 
 
 def _common(option: str, values: Mapping[str, str]) -> str:
-    """Return the value that all policies have."""
+    """Return the value of an option that all policies share; refuse different values."""
     found = set(values.values())
     if len(found) > 1:
         each = ", ".join(f"{value} ({spec})" for spec, value in values.items())

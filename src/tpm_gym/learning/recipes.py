@@ -30,7 +30,7 @@ class Recipe:
     """Hyperparameters of one algorithm on one environment, as plain data.
 
     Attributes:
-        n_timesteps: Number of environment steps, those of the demonstrations included.
+        n_timesteps: Number of environment steps, including the demonstrations.
         hindsight: Whether the replay buffer relabels goals.
         demonstrations: Arguments of :class:`~tpm_gym.learning.Demonstrations`; empty for none.
         arguments: Other arguments of the algorithm's constructor.
@@ -72,7 +72,7 @@ class Recipe:
 
 
 def _falling(start: float, update: float, remaining: float) -> float:
-    """Return the rate of an update at whose end the share ``remaining`` of the training is left."""
+    """Return the learning rate of an update; ``remaining`` is the share of steps after it."""
     return start * max(0.0, min(1.0, remaining + update))
 
 
@@ -95,7 +95,7 @@ def recipe(env_id: str, algorithm: str = "sac", engine: str | None = None) -> di
 
 
 def recipe_file(algorithm: str, engine: str | None = None) -> Path:
-    """Return the shipped recipes of an algorithm, those for an engine if there are any."""
+    """Return the file of an algorithm's shipped recipes, for an engine if there is such a file."""
     if algorithm not in ALGORITHMS:
         raise ConfigError(f"algorithm {algorithm!r} is none of {NAMES}")
     own = RECIPES / f"{algorithm}-{engine}.yml"

@@ -1,8 +1,8 @@
 """Rollouts of a policy over seeded episodes, and their metrics.
 
-Seeds of training lie below ``SELECTION_SEED``, those of the periodic evaluations that select
-``best.zip`` from there up, and those of ``tpm-gym evaluate`` from ``TEST_SEED`` up. So no result
-comes from episodes that a policy was trained on or selected by.
+Training uses seeds below ``SELECTION_SEED``. The periodic evaluations that select ``best.zip`` use
+seeds from ``SELECTION_SEED`` on, and ``tpm-gym evaluate`` seeds from ``TEST_SEED`` on. So no result
+comes from episodes that trained or selected the policy.
 """
 
 from __future__ import annotations

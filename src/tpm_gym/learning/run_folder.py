@@ -126,7 +126,7 @@ def clear_tests(run: Path) -> None:
 
 @contextmanager
 def claimed(run: Path) -> Iterator[None]:
-    """Lock a run; the system releases the lock however the process ends."""
+    """Lock a run; the system releases the lock when the process ends, even by a kill."""
     if sys.platform == "win32":
         yield
         return
@@ -148,7 +148,7 @@ def claimed(run: Path) -> Iterator[None]:
 
 @contextmanager
 def disk_errors_named(run: Path, store: CheckpointStore) -> Iterator[None]:
-    """Raise an error of a full or broken disk as one that says how to continue."""
+    """Convert errors of a full or broken disk to a RunError that says how to continue."""
     try:
         yield
     except OSError as error:

@@ -138,7 +138,7 @@ class _Session:
     content: Content | None
 
     def run(self) -> signal.Signals | None:
-        """Train, save and test; return the signal that stopped it, unless it came too late."""
+        """Train, save and test; return the signal that stopped the training, None without one."""
         config, listener = self.config, SignalListener()
         torch.set_num_threads(config.threads)
         count = min(config.eval_episodes, BATCH) if config.env_options.in_batches else 1
@@ -219,7 +219,7 @@ class _Session:
         export.save_archive(model, archive)
 
     def _conclude(self, stopped_by: signal.Signals | None) -> None:
-        """Say how the training ended, and test a policy of the analytic engine."""
+        """Report how the training ended, and test a policy of the analytic engine."""
         config = self.config
         if stopped_by is not None:
             command, saved = run_folder.resume_command(config.run), "without a checkpoint"

@@ -125,7 +125,7 @@ def capture(
 
 
 def restore_files(run: Path, content: Content) -> None:
-    """Set the files of a run back to a checkpoint; delete what is of a later policy."""
+    """Set the files of a run back to a checkpoint; delete the files of later policies."""
     clear_tests(run)
     for name in {*RESTORED, *LAST} - {LAST_FILE}:
         if name in content.files:

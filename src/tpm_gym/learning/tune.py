@@ -142,7 +142,7 @@ def _search(config: TuneConfig, base: TrainingConfig, folder: Path) -> Mapping[s
 
 
 def _suggest(algorithm: str, trial: Any) -> dict[str, Any]:
-    """Let a trial of Optuna choose values; return what is not chosen."""
+    """Let a trial of Optuna choose values; return the entries that are not searched."""
     known = ALGORITHMS[algorithm].entries().__annotations__
     for name, values in _SPACE.items():
         entries = known["policy_kwargs"].__annotations__ if "." in name else known

@@ -33,7 +33,7 @@ class AnalyticVecEnv(VecEnv):
             engine="analytic", autoreset_mode="SameStep", stagger=True)``.
 
     Raises:
-        ConfigurationError: ``envs`` are others.
+        ConfigurationError: ``envs`` are no such environments.
     """
 
     def __init__(self, envs: TPMVectorEnv) -> None:

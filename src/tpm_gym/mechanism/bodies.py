@@ -214,7 +214,7 @@ class Mechanism:
         """Return the link of that name.
 
         Raises:
-            KeyError: If there is none.
+            KeyError: If no link has this name.
         """
         return self._by_name[name]
 
@@ -254,7 +254,7 @@ class Mechanism:
         return found
 
     def legs(self) -> tuple[Mechanism, ...]:
-        """Split the spanning tree at the base: one tree for each arm and the links behind it."""
+        """Split the spanning tree at the base into one tree for each leg."""
         arm: dict[str, str] = {}
         for link, joint in self._held:
             arm[link.name] = arm.get(joint.parent, link.name)

@@ -26,8 +26,8 @@ class VacuumCup(NamedTuple):
         preload: Force with which the spring keeps the cup out, N. It exceeds ``vacuum * area``.
         vacuum: Largest pressure difference to the ambient air, Pa.
         area: Area within the lip, on which the vacuum acts, m^2.
-        evacuation_time: Time constant with which the vacuum builds up in a sealed cup, s. It is
-            that of an ejector of 5 l/min on a cup and hose of 1.6 cm^3.
+        evacuation_time: Time constant with which the vacuum builds up in a sealed cup, s, for an
+            ejector of 5 l/min on a cup and hose of 1.6 cm^3.
         venting_time: Time constant with which air comes in, through the valve or below the lip, s.
         least_vacuum: Vacuum at which the lip comes off when the valve is closed, Pa.
         friction: Friction of the open lip. Its product with the object's friction is the Coulomb

@@ -74,9 +74,9 @@ class Pose(NamedTuple):
 
 
 class Velocities(NamedTuple):
-    """First derivatives, m/s: of C1 along x and z, of P, l7 times the rate of beta, and of B_iC_i.
+    """Velocities, m/s: C1 along x and z, P, l7 times the rate of beta, and changes of B_iC_i.
 
-    That of B2C2 is along x and z.
+    The change of B2C2 is given along x and z.
     """
 
     link3: tuple[Numbers, Numbers]
@@ -88,7 +88,7 @@ class Velocities(NamedTuple):
 
 
 class Accelerations(NamedTuple):
-    """Second derivatives, m/s^2: of B1 along y and z, B2, B3 and C1 along x and z, and P."""
+    """Accelerations, m/s^2: B1 along y and z; B2, B3 and C1 along x and z; P."""
 
     elbow1: tuple[Numbers, Numbers]
     elbow2: tuple[Numbers, Numbers]
@@ -255,7 +255,7 @@ def _resolve(pose: Pose, h1: Numbers, h2: Numbers, h3: Numbers) -> Triple:
 
 
 def gather(pose: Pose, at_c: tuple[Numbers, Numbers], at_p: Triple) -> Triple:
-    """Compute the torques that hold forces (N) at C1 (x, z) and at P, by the transposed rates."""
+    """Compute the torques that balance forces (N) at C1 (x, z) and at P (transposed Jacobians)."""
     (r1x, _, r1z), (r2x, _, r2z), (r3x, _, r3z) = pose.rods
     (cx, cz), (px, py, pz), f = at_c, at_p, pose.factors
     rod3 = (f.cos_beta * py - f.sin_beta * px) / pose.k  # its force, over l4
@@ -265,7 +265,7 @@ def gather(pose: Pose, at_c: tuple[Numbers, Numbers], at_p: Triple) -> Triple:
 
 
 def _swing(rod: Triple, rates: Triple, changes: tuple[Numbers, Numbers], m: Swing) -> Triple:
-    """Compute the force at C, opposite to that at B, for the swing of a leg.
+    """Compute the force at C for the swing of a leg; the force at B is opposite.
 
     The rod is along (out, level, z), and the swing is the angle of (level, z). The force follows
     from Lagrange's equation of (fixed + spin out^2) rate^2 / 2.
@@ -288,20 +288,21 @@ class Dynamics:
     Joint angles (rad), rates (rad/s) and their changes (rad/s^2) are arrays (..., 3) that broadcast
     with each other; torch tensors among them give tensors, in float64, that can be differentiated.
 
-    All methods raise InputError for what is no array (..., 3) of finite numbers, UnreachableError
-    if the branch does not exist at some theta, and SingularityError at a parallel singularity.
+    All methods raise InputError for inputs that are no arrays (..., 3) of finite numbers,
+    UnreachableError if the branch does not exist at some theta, and SingularityError at a parallel
+    singularity.
 
     Attributes:
         geometry: Link lengths.
         branch: Assembly mode.
-        link_masses: Factors of mass and inertia, one for each moving link in the order of the
-            mechanism's; empty if all are one.
+        link_masses: Factors of mass and inertia, one for each moving link, in the mechanism's
+            order; empty if all are 1.
         payload: Mass that the cup carries, kg.
         free_fall: Acceleration of gravity in the machine's frame, m/s^2.
 
     Raises:
-        ConfigurationError: If a mass or gravity is not possible, or, at the first use, if the
-            number of factors is another one.
+        ConfigurationError: If a mass or gravity is not possible. If the number of factors is wrong,
+            at the first use.
     """
 
     geometry: Geometry = PAPER

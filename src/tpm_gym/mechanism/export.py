@@ -1,6 +1,6 @@
 """Files of a robot for other tools: URDF with its loop closures, and MJCF.
 
-Run ``python -m tpm_gym.mechanism.export FOLDER`` to write those of the paper's robot.
+Run ``python -m tpm_gym.mechanism.export FOLDER`` to write the files of the paper's robot.
 """
 
 import sys

@@ -147,7 +147,7 @@ class _Bodies:
         return self._factors[name] * float(self._link(name).inertia[axis, axis])
 
     def shaft(self, name: str, axis: int) -> tuple[float, float]:
-        """Return mass, and moment about its own axis, of a body with its centre on that axis."""
+        """Return mass and moment of inertia of a body about its own axis through its centre."""
         self._require_on_axis(name, [k for k in (X, Y, Z) if k != axis])
         return self.mass(name), self.moment(name, axis)
 

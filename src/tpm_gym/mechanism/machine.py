@@ -1,4 +1,4 @@
-"""Robots that environments are built for: translational, with closed-form kinematics, as values.
+"""Machines: translational robots with closed-form kinematics, as frozen values.
 
 A :class:`Machine` has forward and inverse kinematics, the Jacobian, modes, dynamics, regions, and
 the bodies to load. So other robots (a Delta, a gantry) serve the same tasks.
@@ -63,11 +63,11 @@ class Reading(NamedTuple):
 class Motion(NamedTuple):
     """Position, Jacobian and equation of motion: torque = mass theta_ddot + bias.
 
-    The first three attributes are those of :class:`Reading`.
+    The first three attributes are explained in :class:`Reading`.
 
     Attributes:
         mass: Inertia that the motors feel, (..., 3, 3) kg m^2.
-        bias: Torque that weight and rates take, (..., 3) N m.
+        bias: Torque for weight and velocities, (..., 3) N m.
     """
 
     position: FloatArray
@@ -161,7 +161,7 @@ class Machine(ABC):
                 raise ConfigurationError(name, getattr(self, name), valid) from error
 
     def _postures(self, points: FloatArray) -> tuple[FloatArray, NDArray[np.int8]]:
-        """Return joint positions (k, 3) at points (k, 3), and which modes are left there (k,)."""
+        """Return joint positions (k, 3) at points (k, 3), and the mode that is left there (k,)."""
         theta = self.require_inverse(points)
         return theta, self.mode_left(theta, points)
 
@@ -214,10 +214,10 @@ class Machine(ABC):
         return UnreachableError(theta, self.name, 0.0, "choose joint positions in its modes")
 
     def require_inverse(self, position: ArrayLike) -> FloatArray:
-        """Compute joint positions as :meth:`inverse` does, all of which have to exist.
+        """Compute joint positions like :meth:`inverse`; raise an error if some do not exist.
 
         Raises:
-            UnreachableError: If one does not.
+            UnreachableError: If a position is out of reach.
         """
         theta = self.inverse(position)
         if math.isnan(np.vdot(theta, theta)):  # faster than isnan().any()
@@ -225,7 +225,7 @@ class Machine(ABC):
         return theta
 
     def require_evaluate(self, theta: ArrayLike, built: FloatArray | None = None) -> Reading:
-        """Compute P, J and conditioning as :meth:`evaluate` does, all of which have to exist.
+        """Compute P, J and conditioning like :meth:`evaluate`; raise an error if some do not exist.
 
         Raises:
             UnreachableError: If the machine cannot be assembled.
@@ -240,7 +240,7 @@ class Machine(ABC):
         """Refuse joint positions (..., 3) beyond a motor's stop.
 
         Raises:
-            JointLimitError: If there is one.
+            JointLimitError: If a joint position is beyond a stop.
         """
         lower, upper = self.stops
         within = (theta >= lower) & (theta <= upper)
@@ -251,7 +251,7 @@ class Machine(ABC):
             raise JointLimitError(motor.name, float(position), *ends, motor.unit)
 
     def reach(self, position: ArrayLike) -> FloatArray:
-        """Compute joint positions as :meth:`inverse` does, all of which have to be between stops.
+        """Compute joint positions like :meth:`inverse`; raise JointLimitError beyond a stop.
 
         Raises:
             UnreachableError: If a position is out of reach.
@@ -272,7 +272,7 @@ class Machine(ABC):
     def conditioning_at(self, position: ArrayLike) -> FloatArray:
         """Compute 1/cond(J) (...,) with P at ``position`` (..., 3) m; 0 where P cannot be.
 
-        It is 0 too where the working mode reaches the position in another assembly mode.
+        Positions that the working mode reaches in another assembly mode give 0 too.
         """
         found, _, conditioning, _ = self.evaluate(self.inverse(position))
         there = np.abs(np.subtract(found, position)).max(axis=-1) < SAME_PLACE
@@ -314,7 +314,7 @@ class Machine(ABC):
 
     @abstractmethod
     def joint_positions(self, theta: Vector) -> dict[str, float]:
-        """Compute the positions of all joints of :attr:`mechanism` for those of the motors (3,).
+        """Compute the positions of all joints of :attr:`mechanism` from the motors' positions (3,).
 
         Returns:
             Name of the joint -> rad or m.
@@ -451,7 +451,7 @@ def find_machine(machine: Any) -> Machine:
     """Return a machine by its name, or the machine itself.
 
     Raises:
-        ConfigurationError: If there is none of that name, or it is no machine.
+        ConfigurationError: If no machine has this name, or the value is no machine.
     """
     found = _MACHINES.get(machine) if isinstance(machine, str) else machine
     if isinstance(machine, str) and callable(found):

@@ -1,4 +1,4 @@
-"""Motors: torque, size, inertia and speed that belong together.
+"""Motors: consistent torque, size, inertia and speed.
 
 A direct drive has no gear. Its torque follows from the magnetic shear stress sigma in the air gap,
 
@@ -65,7 +65,7 @@ class Motor:
         return self.clearance + self.length / 2 + 2 * self.end_turns
 
     def rotor(self, axis: Axis) -> list[Solid]:
-        """Build the rings along ``axis`` about the origin, all of steel (magnets weigh as much)."""
+        """Build the rotor: steel rings along ``axis`` about the origin (magnets weigh as much)."""
         size = (self.gap_radius, self.length / 2, 0.0)
         bore = (self.gap_radius - self.ring, self.length / 2, 0.0)
         return [

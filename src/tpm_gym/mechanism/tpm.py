@@ -155,7 +155,7 @@ class TPM(Machine):
         return self._nominal, self._constants
 
     def _others(self, built: FloatArray, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the parameters of other machines, and the constants that they share."""
+        """Return the parameters of machines as built, and the constants that they share."""
         rows, count = inputs.size // 3, len(built)
         if not count or rows % count:
             valid = f"parameters of b machines, with b a divisor of {rows} rows"
@@ -233,7 +233,7 @@ def _loops() -> ModuleType:
 
 
 def _rows(values: ArrayLike, length: int = 3, name: str = "vectors") -> FloatArray:
-    """Return vectors (..., length) as the one kind of array for which the loops are compiled."""
+    """Convert vectors (..., length) to the type of array for which the loops are compiled."""
     array = np.ascontiguousarray(values, np.float64)
     if array.shape[-1] != length:
         raise InputError(name, array.shape, f"an array of shape (..., {length}), by shape")

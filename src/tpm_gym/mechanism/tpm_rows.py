@@ -42,7 +42,7 @@ NS: Any = functions
 
 
 def _fill(built: FloatArray, start: int, count: int, each: int, own: FloatArray) -> None:
-    """Copy the parameters of the machines of rows from ``start`` on to as many columns as own has.
+    """Fill the columns ``own`` with the machine parameters of the rows from ``start`` on.
 
     Where all rows are of one machine, the first block's columns serve all.
     """
@@ -101,7 +101,7 @@ def _get(columns: FloatArray, first: int, j: int) -> Triple:
 
 
 def _pose(theta: Triple, g: Lengths, modes: Triple) -> tuple[Pose, bool, bool]:
-    """Assemble the machine; whether that is real and regular, and in the working mode."""
+    """Assemble the machine; return whether it is real and regular, and in the working mode."""
     pose, real = dynamics.pose_at(theta, (modes[0], modes[1]), g, NS)
     working = real & (pose.found.cos_beta * modes[2] > 0.0)
     return pose, real & equations.regular(pose.factors, g), working
@@ -197,7 +197,7 @@ def conditioning_at(
     machine: FloatArray,
     conditioning: FloatArray,
 ) -> None:
-    """Compute 1/cond(J) (m,) with P at ``position`` (m, 3); 0 where no mode of the machine is."""
+    """Compute 1/cond(J) (m,) for P at ``position`` (m, 3); 0 where the machine's modes end."""
     signs = machine[2], machine[3], machine[4], machine[5]
     modes = machine[0], machine[1], machine[2]
     own, given = np.empty((7, _BLOCK)), np.empty((3, _BLOCK))
@@ -297,7 +297,7 @@ def mode_left(
     machine: FloatArray,
     left: IntArray,
 ) -> None:
-    """Find which mode (m,) int8 is left with P at ``position`` (m, 3): 1 assembly, 2 working."""
+    """Find the mode (m,) that is left with P at ``position`` (m, 3): 1 assembly, 2 working."""
     planar, side, turned = machine[0], machine[1], machine[2]
     own, given = np.empty((7, _BLOCK)), np.empty((6, _BLOCK))
     each = len(theta) // len(built)

@@ -140,7 +140,7 @@ def _branch_1(g: Geometry) -> tuple[Link, ...]:
 
 
 def _branch_2(g: Geometry) -> tuple[Link, ...]:
-    """Build arm 5, rod 6, link 3', link 7, platform 1, the cup that slides in it, end link 10."""
+    """Build arm 5, rod 6, link 3', link 7, platform 1, its sliding cup, and end link 10."""
     minus_y, point_p = (0.0, -1.0, 0.0), (g.l2, 0.0, g.l6)
     # From F1 to D3
     plate = Solid("box", (2 * g.l2 + 0.04, 0.045, 0.008), point_p, ALUMINIUM, colour="yellow")
@@ -223,9 +223,9 @@ def build(geometry: Geometry = PAPER) -> Mechanism:
 def joint_angles(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> dict[str, float]:
-    """Compute the angles of all joints of :func:`build` at which the loops close, rad, by name.
+    """Compute the angles of all joints of :func:`build` with closed loops, rad, by name.
 
-    The cup's slide, m, is at rest.
+    The cup's slide (m) is at rest.
 
     Raises:
         InputError: If theta (3,) rad has the wrong shape or is not finite.

@@ -1,9 +1,9 @@
-"""Files of a trained policy: their content, and how they are read without trust.
+"""Files of a trained policy: their content, and reading them without unpickling.
 
 ``NAME.json`` describes the policy: its network, spaces, environment, recipe and versions.
 ``NAME.safetensors`` holds the weights. Both are plain data of a limited size; nothing in them is
 executed or unpickled. SHA-256 sums in the JSON show damage, and files that do not belong together.
-Who writes new sums can make a policy act badly, but cannot run code.
+A forged file with new sums can make a policy act badly, but cannot run code.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ class Weights(_Entries):
 class Description(_Entries):
     """Everything about a policy except its weights.
 
-    ``env_options`` are machine, engine and drive of the training, where they differ from the id's.
+    ``env_options`` are machine, engine and drive of the training if they differ from the id's.
     ``seed`` is None if it is not known, a version if the package was not installed.
     """
 

@@ -113,7 +113,7 @@ class Policy:
         """Check that the policy fits an environment.
 
         Spaces are compared. So is the control of environments of tpm_gym, since Cartesian
-        increments and joint increments have equal spaces. The machine may be another.
+        increments and joint increments have equal spaces. The machine may differ.
 
         Args:
             env: Environment of Gymnasium, wrapped or not, or a vector of Gymnasium or of
@@ -142,7 +142,7 @@ class Policy:
         return f"<Policy of {about.env_id}, {about.algorithm}, seed {about.seed}>"
 
     def _features(self, observation: Mapping[str, Any]) -> tuple[FloatArray, bool]:
-        """Return the input of the first layer, (n, size), and whether it is of a batch."""
+        """Return the input (n, size) of the first layer, and whether the observation is a batch."""
         boxes, features = self.description.observation_space, self.description.network.features
         given = list(observation) if isinstance(observation, Mapping) else type(observation)
         if not isinstance(given, list) or set(given) != set(boxes):
@@ -163,7 +163,7 @@ class Policy:
 
 
 def _rows(name: str, value: Any, shape: tuple[int, ...]) -> tuple[FloatArray, tuple[int, ...]]:
-    """Return an entry of an observation as (n, size), rounded as networks get it; and its batch."""
+    """Return an entry of an observation as (n, size), in float32 precision; and its batch axes."""
     values = numbers(name, value)
     batch = values.shape[: values.ndim - len(shape)]
     if values.shape != batch + shape or len(batch) > 1:

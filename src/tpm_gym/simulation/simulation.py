@@ -178,7 +178,7 @@ class Simulation:
         return places
 
     def _become(self, rows: IntArray, plants: Sequence[Plant]) -> None:
-        """Apply the plants that differ from the present plants of the robots."""
+        """Apply new plants to robots whose plants change."""
         before = [self._plants[row] for row in rows.tolist()]
         changed = [
             k

@@ -1,4 +1,4 @@
-"""Check of a task: its methods for several states at once against the states alone."""
+"""Check of a task: equal results for states together and one by one."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ _EXAMPLES = 7
 
 
 def check(task: Task) -> None:
-    """Compare a task's methods for several states at once with the states alone.
+    """Check that a task's methods give equal results for states together and one by one.
 
     A method that reduces over the robots (``np.linalg.norm(x)`` without ``axis=-1``), or takes
     rows for columns, gives wrong rewards in vector environments without an error.
 
     Raises:
-        ConfigurationError: If a method does not give what it has to, named by the method.
+        ConfigurationError: If a result is wrong; the error names the method.
     """
     several = _example_states(task.machine, task.scene)
     _check_shapes(task, several)
@@ -68,7 +68,7 @@ def _check_shapes(task: Task, state: State) -> None:
 
 
 def _equal(row: Any, single: Any) -> bool:
-    """Return whether a row is what the state alone gives, (1, ...)."""
+    """Return whether a row equals the result of the state alone, (1, ...)."""
     return np.shape(single) == (1, *np.shape(row)) and np.allclose(row, single[0], equal_nan=True)
 
 

@@ -1,7 +1,7 @@
 """Controls: from actions to commands for point P, and back.
 
-Every control ends in a Cartesian command inside the machine's region, at most its step limit away
-from the last command, so that the simulation never gets a target that it cannot follow. Rows first;
+Every control computes a Cartesian command inside the machine's region, at most the step limit away
+from the last command. So the simulation can follow every command. Rows first;
 everything is in the machine's frame.
 """
 
@@ -39,7 +39,7 @@ class Control(Protocol):
         """Return actions (n, 3) that move commands (n, 3) m from current towards wanted."""
 
     def steps(self, wanted: FloatArray, current: FloatArray) -> float:
-        """Return the control steps of a straight way (3,) m at the highest constant speed."""
+        """Return the number of control steps between two points (3,) m at the highest speed."""
 
 
 class CartesianControl:
@@ -74,9 +74,8 @@ class JointControl:
     """Actions are increments of the three joints, in units of the machine's joint limit.
 
     All three joints are slowed down together where the increment would move P farther than the
-    step limit, or into a posture that cannot be assembled. (Along y the TPM often would: the
-    platform is quick there, and near the singularity very quick.) A command beyond the region is
-    projected into it.
+    step limit, or into a posture that cannot be assembled. (This is frequent along y, where small
+    turns of the joints move the platform far.) A command beyond the region is projected into it.
     """
 
     name = "joints"
@@ -148,7 +147,7 @@ class JointControl:
         return action
 
     def steps(self, wanted: FloatArray, current: FloatArray) -> float:
-        """Count the steps of the axis, or of the joint where it turns fastest, with most to do."""
+        """Count the steps of the slowest axis or joint, at the joint's fastest part of the line."""
         parts = np.linspace(0.0, 1.0, _PARTS + 1)[:, None]
         way = current + parts * (wanted - current)
         theta = self._machine.require_inverse(self._machine.region.project(way))
@@ -161,7 +160,7 @@ def make_control(kind: str, machine: Machine) -> Control:
     """Make the control of that name.
 
     Raises:
-        ConfigurationError: If there is none.
+        ConfigurationError: If no control has this name.
     """
     for control in (CartesianControl, JointControl):
         if kind == control.name:

@@ -1,9 +1,9 @@
 """The scripted controller of all tasks, on closed-form kinematics.
 
-It sees the observation that a policy sees. For each robot it follows the task's plan of commands
-for point P with trapezoidal speed, and converts each command into an action of the environment's
-control. Between two points of the safe region its plan stays in the safe region: y, on which the
-conditioning depends, changes along with x and z, never beyond both ends.
+The expert gets the same observation as a policy. For each robot it follows the task's plan, which
+moves point P with trapezoidal speed, and converts each command into an action of the environment's
+control. Between two safe points its plan stays safe: y, on which the conditioning depends, changes
+monotonically along with x and z.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ __all__ = ["Expert"]
 class Expert:
     """Scripted policy for an environment, or for all environments of a vector.
 
-    Call :meth:`act` with each observation. It plans anew whenever an episode has begun.
+    Call :meth:`act` with each observation. A new episode starts a new plan.
 
     Args:
         env: A :class:`~tpm_gym.TPMEnv`, wrapped or not, or a :class:`~tpm_gym.TPMVectorEnv`. Its
             task, control, latency and count of episodes are used, and nothing else.
 
     Raises:
-        InputError: If it is another environment.
+        InputError: If ``env`` is no such environment.
         ConfigurationError: If its task has no plan, on the first action.
     """
 
     def __init__(self, env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]) -> None:
-        """Take what is needed from the environment."""
+        """Store the parts of the environment that the expert uses."""
         inner: Any = getattr(env, "unwrapped", None)
         if not isinstance(getattr(inner, "task", None), Task):
             raise InputError("env", env, "an environment of tpm_gym")
@@ -50,7 +50,7 @@ class Expert:
         self._episodes = np.full(np.shape(np.atleast_1d(inner.episode)), -1)
 
     def reset(self, observation: dict[str, Any]) -> None:
-        """Plan anew for the episodes that ``observation`` belongs to."""
+        """Start new plans for the episodes of ``observation``."""
         self._episodes[:] = -1
         self._look(observation)
 

@@ -1,4 +1,4 @@
-"""Building blocks of plans: what a plan sees of one robot, and ways for point P."""
+"""Building blocks of plans: the view of one robot, and moves of point P."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ __all__ = ["Motion", "Move", "hanging"]
 RAMP = 3
 """Control steps from rest to full speed."""
 ROUNDING = 1e-5
-"""Of a control step; more than the 1e-6 by which single precision is off."""
+"""Tolerance as a fraction of a control step, above the error of single precision, 1e-6."""
 SEAL_STEPS = 4
 """Control steps to wait for the cup to seal before giving up."""
 
 
 def hanging(block: Block) -> FloatArray:
-    """Return the way (3,) m from the centre of a block in the cup to point P."""
+    """Return the vector (3,) m from the centre of a block in the cup to point P."""
     return np.array([0.0, 0.0, block.height / 2 + CUP.length])
 
 
@@ -37,7 +37,7 @@ class Move(NamedTuple):
 
 
 class Motion:
-    """View of a robot for a plan, and ways with trapezoidal speed.
+    """View of a robot for a plan, and moves with trapezoidal speed.
 
     Attributes:
         machine: The machine that moves.
@@ -47,7 +47,7 @@ class Motion:
     """
 
     def __init__(self, machine: Machine, control: Control) -> None:
-        """Start with nothing seen."""
+        """Start without an observation."""
         self.machine, self._control = machine, control
         self.seen: dict[str, FloatArray] = {}
         self.goal: FloatArray = np.empty(0)
@@ -55,7 +55,7 @@ class Motion:
 
     @property
     def command(self) -> FloatArray:
-        """Where P is commanded to be once the actions under way have arrived, machine's frame."""
+        """Command for P after all delayed actions, machine's frame, m."""
         command = self.machine.mount.to_paper(self.seen["position"] + self.seen["command"])
         for action in self.under_way:
             command = self._control.command(action[None], command[None])[0]
@@ -65,7 +65,7 @@ class Motion:
         """Return whether the cup holds the object of that name.
 
         Raises:
-            ConfigurationError: If the task does not observe it.
+            ConfigurationError: If the task does not observe the object.
         """
         return bool(self._see(f"{name}_held")[0] > 0.5)
 
@@ -83,7 +83,7 @@ class Motion:
         Args:
             stops: Points (3,) m.
             vacuum: Whether the vacuum is on.
-            while_holding: Name of an object; the way ends early where the cup loses it.
+            while_holding: Name of an object; the move ends early if the cup loses it.
         """
         for stop in stops:
             start = self.command
@@ -106,7 +106,7 @@ class Motion:
             yield Move(self._above(block), True)
 
     def _above(self, block: Block, clearance: float = 0.0) -> FloatArray:
-        """Return point P, machine's frame, with the lip over the top of a block as it stands."""
+        """Return P (machine's frame) with the lip ``clearance`` above a block's present place."""
         place = self._see(f"{block.name}_position") + hanging(block)
         return self.machine.mount.to_paper(place + (0.0, 0.0, clearance))
 
@@ -114,7 +114,7 @@ class Motion:
         """Return fractions of the way at the control steps from ``start`` to ``stop``.
 
         Speed rises over RAMP steps, holds, and falls. Neither P nor a controlled joint exceeds its
-        limit. Rounding of the observation (float32) takes no step more.
+        limit. Rounding of the observation (float32) does not add a step.
         """
         steps = self._control.steps(stop, start)
         count = int(np.ceil(steps - ROUNDING)) + RAMP - 1

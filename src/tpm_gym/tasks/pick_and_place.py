@@ -55,7 +55,7 @@ class PickAndPlace(Task):
         return starts
 
     def _draw_region(self, rng: np.random.Generator) -> Region:
-        """Draw where P goes with the block: half on the table, half in the air."""
+        """Draw the region of a goal: half on the table, half in the air."""
         table, air = self._regions
         return table if rng.random() < 0.5 else air
 

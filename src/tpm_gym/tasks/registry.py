@@ -19,7 +19,7 @@ def option_name(name: str) -> str:
     """Convert ``"PickAndPlace"`` to the name in options, ``"pick_and_place"``.
 
     Raises:
-        ConfigurationError: If it is no name in CamelCase.
+        ConfigurationError: If ``name`` is not in CamelCase.
     """
     if not isinstance(name, str) or not re.fullmatch(r"([A-Z][a-z0-9]*)+", name, re.ASCII):
         raise ConfigurationError("name", name, "a name in CamelCase, such as 'PickAndPlace'")

@@ -1,13 +1,13 @@
 """Sampling of goals and starts: safe ones, and tempting ones.
 
-Who reaches a tempting goal carelessly passes too near to the singularity. Between two safe points,
-point P stays safe on a straight line (the safe set has no dent; a test draws pairs). So with
-Cartesian actions the temptation lies at the ends: the goal, and an object's start, lie just within
-the threshold, and nearly half of the sphere around the goal lies beyond it. With joint actions the
-temptation lies on the way too: the straight line in the joints from start to goal leads through the
-unsafe region, often all the way. Every pair has both, so that all ids meet the same goals.
+A careless policy that moves to a tempting goal comes too near to the singularity. Straight lines of
+P between safe points are safe (the safe set is convex; a test draws pairs). So with Cartesian
+actions the risk is at the ends: the goal and an object's start are just above the threshold, and
+nearly half of the sphere around the goal is unsafe. With joint actions the risk is on the way too:
+the line in joint space from start to goal is unsafe, often all the way. Every pair has both
+properties, so that all ids have the same goals.
 
-Everything here is about point P, in the machine's frame, m. Every function takes one generator for
+All points are positions of P, in the machine's frame, m. Every function takes one generator for
 each row, and a row draws from its own generator only.
 """
 
@@ -34,9 +34,9 @@ __all__ = [
 ]
 
 APART: Final = 0.030
-"""A goal is at least this far from where its episode starts, m: no success for free."""
+"""Smallest distance from start to goal, m, so that no episode starts with success."""
 BAND: Final = 0.004
-"""How far above the threshold the conditioning of a tempting end may be: less than 1 mm of y."""
+"""Largest excess of a tempting end's conditioning over the threshold; less than 1 mm of y."""
 
 _BATCH: Final = 256
 _ATTEMPTS: Final = 100
@@ -51,15 +51,15 @@ def apart_from(
     apart: float = APART,
     near_singularity: bool = False,
 ) -> FloatArray:
-    """Draw safe points (r, 3) of regions at least ``apart`` (m) from others.
+    """Draw safe points (r, 3) of regions, at least ``apart`` (m) from other points.
 
     Args:
-        others: (k, 3) m for all rows, or (r, k, 3).
+        others: Other points, (k, 3) m for all rows, or (r, k, 3).
         rngs: One for each row.
-        machine: Whose points are safe.
+        machine: Machine that defines the safe points.
         regions: One for each row.
-        apart: m.
-        near_singularity: Whether the points are only just safe.
+        apart: Smallest distance, m.
+        near_singularity: Whether the points are just above the threshold.
 
     Raises:
         ConfigurationError: If no draw is far enough.
@@ -89,10 +89,10 @@ def tempting(
         rngs: One for each row.
         machine: The machine.
         start: Region of the starts, or the start itself.
-        goal: Draws the region of a goal.
+        goal: Function that draws the region of a goal.
 
     Raises:
-        ConfigurationError: If none was drawn: not every machine has some.
+        ConfigurationError: If no pair was found; not every machine has tempting pairs.
     """
     pairs = np.array([_tempting(rng, machine, start, goal) for rng in rngs])
     return pairs[:, 0], pairs[:, 1]
@@ -121,7 +121,7 @@ def _tempting(
 
 
 def line_in_joints(machine: Machine, start: ArrayLike, end: ArrayLike) -> FloatArray:
-    """Return the conditioning (33, ...) along straight lines of the joints between points (..., 3).
+    """Compute the conditioning (33, ...) along lines in joint space between points (..., 3).
 
     It is 0 where the machine cannot be assembled.
     """
@@ -133,7 +133,7 @@ def line_in_joints(machine: Machine, start: ArrayLike, end: ArrayLike) -> FloatA
 def at_threshold(
     rng: np.random.Generator, machine: Machine, region: Region, count: int
 ) -> FloatArray:
-    """Draw points (count, 3) of a region that are only just safe.
+    """Draw points (count, 3) of a region, just above the threshold of safe conditioning.
 
     Raises:
         ConfigurationError: If no draw was near the threshold.
@@ -155,7 +155,7 @@ def _one_at_threshold(
 
 
 def _at_the_threshold(rng: np.random.Generator, machine: Machine, region: Region) -> FloatArray:
-    """Draw points from ``region``, and return those that are only just safe, (n, 3)."""
+    """Draw points from ``region``, and return those just above the threshold, (n, 3)."""
     points = rng.uniform(region.low, region.high, (_BATCH, 3))
     conditioning, safe = machine.conditioning_at(points), machine.safe_conditioning
     chosen: FloatArray = points[(conditioning >= safe) & (conditioning < safe + BAND)]

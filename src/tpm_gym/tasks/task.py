@@ -52,8 +52,8 @@ class Entry:
         meaning: Description, with the sensor.
         centre: Value that is stored as 0.
         scale: Difference that is stored as 1.
-        source: Function that reads values (n, ...) from a state. Entries in a row may share one.
-        columns: The entry's columns (start, stop) of what the source reads; None for all.
+        source: Function that reads values (n, ...) from a state. Adjacent entries may share it.
+        columns: The entry's columns (start, stop) of the source's result; None for all.
     """
 
     name: str
@@ -78,8 +78,7 @@ class Task(ABC):
     Attributes:
         scene: Objects and goal markers.
         vacuum: Whether actions have a fourth entry, which switches the vacuum.
-        goal_size: Length of a goal: three for each point, those of the scene's objects in its
-            order, or P.
+        goal_size: Length of a goal: three for each object in the scene's order, or three for P.
         tolerance: Distance below which a goal is achieved, m.
         samplings: Values of ``goals``.
         max_episode_steps: Control steps after which ``gym.make`` truncates an episode.
@@ -134,12 +133,12 @@ class Task(ABC):
         self._sources = [(source, _columns(list(entries))) for source, entries in groups]
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave the entries out: they hold functions, which cannot be pickled."""
+        """Return the attributes except the entries, whose functions cannot be pickled."""
         own = vars(self).items()
         return {name: value for name, value in own if name not in ("entries", "_sources")}
 
     def __setstate__(self, values: dict[str, Any]) -> None:
-        """Take everything from another task, and make the entries anew."""
+        """Restore the attributes, and rebuild the entries."""
         vars(self).update(values)
         self._set_entries()
 
@@ -149,13 +148,13 @@ class Task(ABC):
     def sample(
         self, rngs: Sequence[np.random.Generator], chosen: Mapping[str, FloatArray]
     ) -> dict[str, FloatArray]:
-        """Draw where r episodes start and what they aim at.
+        """Draw the object positions and goals of r episodes.
 
         Args:
             rngs: A generator for each episode. An episode draws from its own generator only, so
                 that it has the same numbers alone and among thousands.
-            chosen: Entries (r, ...) that the user has chosen, within reach. They are returned as
-                they are; what is sampled beside them keeps clear of them.
+            chosen: Entries (r, ...) that the user has chosen, within reach. They are returned
+                unchanged, and sampled entries keep clear of them.
 
         Returns:
             Centres (r, 3) m of the scene's objects by name, and ``"goal"`` (r, goal_size) m.
@@ -163,13 +162,13 @@ class Task(ABC):
 
     @abstractmethod
     def achieved(self, state: State) -> FloatArray:
-        """Return what is compared with the goal, (n, goal_size) m."""
+        """Return the achieved goal, (n, goal_size) m."""
 
     def plan(self, motion: Motion) -> Iterator[Move]:
         """Yield the moves of the scripted controller for one robot; the last move is kept.
 
         Raises:
-            ConfigurationError: If the task has none.
+            ConfigurationError: If the task has no plan.
         """
         raise ConfigurationError("expert", type(self).__name__, "a task that has a plan")
 
@@ -208,10 +207,10 @@ class Task(ABC):
         """Return the singularity penalty before weighting, (n,) in [0, 1].
 
         It is 1 - (c / safe)^4 for a conditioning c below the machine's ``safe_conditioning``, else
-        0, and 1 past a singularity. It is smooth down to the threshold, and steepest there, so that
-        crossing the threshold has a price. Trained policies ignored a cubic step, which is flat at
-        both ends: SAC on goals next to the threshold, joint increments, spent 24% of the time below
-        it without a penalty, 19% with the cubic step, 1% with this.
+        0, and 1 past a singularity. It is steepest at the threshold, so that crossing the threshold
+        has a price. Policies ignored a cubic step, which is flat at both ends: SAC with joint
+        increments, on goals next to the threshold, spent 24% of the time below it without a
+        penalty, 19% with the cubic step, 1% with this penalty.
         """
         values: FloatArray = loops().singularity_penalty(
             state.conditioning,
@@ -243,7 +242,7 @@ class Task(ABC):
     def start(
         self, rngs: Sequence[np.random.Generator], options: Any = None
     ) -> dict[str, FloatArray]:
-        """Sample the starts of r episodes, with the choices of ``reset(options=...)``.
+        """Sample the starts of r episodes, and apply ``reset(options=...)``.
 
         Returns:
             As :meth:`sample`.
@@ -252,7 +251,7 @@ class Task(ABC):
             ResetOptionError: If an option is unknown, is no such array of finite numbers, or would
                 put an object into another or into the robot.
             UnreachableError: If the robot cannot get to an object or the goal.
-            ConfigurationError: If :meth:`sample` does not return what it has to.
+            ConfigurationError: If the result of :meth:`sample` is wrong.
         """
         chosen = {} if options is None else self._chosen(options)
         given = {name: np.tile(value, (len(rngs), 1)) for name, value in chosen.items()}
@@ -271,11 +270,11 @@ class Task(ABC):
 
     @property
     def _sizes(self) -> dict[str, int]:
-        """Lengths of what is sampled, by name."""
+        """Lengths of the sampled arrays, by name."""
         return {block.name: 3 for block in self.scene.objects} | {"goal": self.goal_size}
 
     def _chosen(self, options: Any) -> dict[str, FloatArray]:
-        """Check what the user has chosen, and return it by name."""
+        """Check the user's options, and return their values by name."""
         objects = self.scene.objects
         known: dict[str, tuple[int, tuple[Block | None, ...]]] = {
             **{block.name: (3, (block,)) for block in objects},
@@ -294,7 +293,7 @@ class Task(ABC):
     def _within_reach(
         self, name: str, value: Any, size: int, blocks: tuple[Block | None, ...]
     ) -> FloatArray:
-        """Return a copy of points (size,) m that the user chose, for P or for blocks in turn."""
+        """Copy points (size,) m that a user chose for P or for blocks; raise if out of reach."""
         points = np.array(finite(name, value, (size,), ResetOptionError))
         for point, block in zip(points.reshape(-1, 3), cycle(blocks), strict=False):
             low, high = self.reach_of(block)
@@ -305,7 +304,7 @@ class Task(ABC):
         return points
 
     def reach_of(self, block: Block | None) -> tuple[FloatArray, FloatArray]:
-        """Return the lowest and highest place (3,) m of point P, or of a block in the cup."""
+        """Return the low and high corners (3,) m of the region of P, or of a block in the cup."""
         region, mount = self.machine.region, self.machine.mount
         corners = np.stack([mount.to_world(corner) for corner in (region.low, region.high)])
         low, high = corners.min(axis=0), corners.max(axis=0)
@@ -316,7 +315,7 @@ class Task(ABC):
         return low, high
 
     def _place_of(self, block: Block) -> tuple[FloatArray, FloatArray]:
-        """Return :meth:`reach_of` for a block that has to be in reach on the table."""
+        """Return :meth:`reach_of` for a block on the table; raise if the table is out of reach."""
         low, high = self.reach_of(block)
         if low[2] > block.height / 2 + 1e-9:
             least = f"at least {low[2] + block.height / 2:.4g} m high"
@@ -393,7 +392,7 @@ class Task(ABC):
         return values
 
     def _scales(self) -> tuple[Values, Values, Values, Values]:
-        """Return centre and extent of the region (m, world), full speed (m/s), largest step (m)."""
+        """Return centre and size of the region (m, world), full speed (m/s), largest step (m)."""
         region, mount, step = self.machine.region, self.machine.mount, self.machine.step_limit
         low, high = np.array(region.low), np.array(region.high)
         columns = (
@@ -405,7 +404,7 @@ class Task(ABC):
         return centre, extent, speed, step
 
     def lip(self, state: State) -> FloatArray:
-        """Return the centre (n, 3) m of the cup's lip, pushed out, by forward kinematics."""
+        """Return the centre (n, 3) m of the extended cup's lip, by forward kinematics."""
         lip: FloatArray = state.fk_position - _LIP
         return lip
 
@@ -428,7 +427,7 @@ class Task(ABC):
         """Invert :meth:`observe`: name -> (..., k) in SI units.
 
         Raises:
-            InputError: If the observation has another length, as beside pixels.
+            InputError: If the observation has another length, as in pixel observations.
         """
         vector = np.asarray(observation, dtype=np.float64)
         if vector.shape[-1:] != (self.observation_size,):
@@ -456,7 +455,7 @@ class Task(ABC):
         return goal.reshape(-1, 3)
 
     def _not_lost(self) -> tuple[FloatArray, FloatArray]:
-        """Return the corners (k, 3) m between which the objects are not lost."""
+        """Return the corners (k, 3) m of the box outside which each object is lost."""
         low, high = np.empty((2, len(self.scene.objects), 3))
         for index, block in enumerate(self.scene.objects):
             least, most = self._place_of(block)

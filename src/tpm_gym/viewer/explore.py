@@ -31,8 +31,8 @@ _LINK_7: Final = {"towards +x": 1, "towards -x": -1}
 class Explore:
     """Controls of the posture, and the gizmo at point P.
 
-    Dragging P keeps the working mode; turning a motor keeps the assembly mode. Where the posture
-    that is asked for does not exist, the last one stays and :attr:`problem` says why.
+    Dragging P keeps the working mode; turning a motor keeps the assembly mode. If the requested
+    posture does not exist, the last posture stays and :attr:`problem` says why.
 
     Args:
         server: The viser server; the controls are added to its present container.

@@ -1,4 +1,4 @@
-"""What can be shown around the robot: singular surfaces, aspects, workspace, regions, slices."""
+"""Layers around the robot: singular surfaces, aspects, workspace, regions, slices."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def colours(values: FloatArray) -> NDArray[np.uint8]:
 
 
 class Layers:
-    """Layers of a scene by name, made when they are shown and made anew when they have changed.
+    """Layers of a scene by name; each is built when it is shown, and rebuilt when it changes.
 
     Args:
         scene: Scene of a viser server.
@@ -210,4 +210,4 @@ LAYERS: Final[Mapping[str, tuple[_Key, _Maker]]] = {
     ),
     "margin": (lambda posture: tuple(posture.position), Layers._margin),
 }
-"""What each layer depends on, and what makes its nodes, by name."""
+"""Layers by name: a function of the values each depends on, and a function that draws it."""

@@ -160,7 +160,7 @@ def _compact(points: FloatArray, quads: NDArray[Any]) -> Mesh:
 
 
 def _smooth(mesh: Mesh) -> FloatArray:
-    """Move each vertex to the mean of its neighbours, some times."""
+    """Move each vertex to the mean of its neighbours, repeatedly."""
     points, faces = mesh
     one = faces[:, [0, 1, 2]].ravel()
     other = faces[:, [1, 2, 0]].ravel()

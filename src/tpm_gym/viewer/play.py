@@ -174,7 +174,7 @@ class Play:
     # -- plots --------------------------------------------------------------------------------
 
     def _plot(self, player: Player) -> None:
-        """Draw reward terms and torques, and tell how the episode goes."""
+        """Plot reward terms and torques, and show the state of the episode."""
         self._drawn = time.monotonic()
         records = player.records
         names = tuple(records[0].reward_terms) if records else ()
@@ -192,7 +192,7 @@ class Play:
     def _draw(
         self, place: int, title: str, names: tuple[str, ...], rows: Sequence[Any], length: int
     ) -> None:
-        """Draw curves; one plot for each set of names is kept, as pages may hold updates of it."""
+        """Draw curves. Keep one plot for each set of names, because pages may still update it."""
         key, data = (names, length), tuple(np.asarray(row, dtype=np.float64) for row in rows)
         shown = self._plots[place].setdefault(key, None)
         for other, plot in self._plots[place].items():

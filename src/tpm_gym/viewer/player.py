@@ -93,7 +93,7 @@ class Player:
         self._rng = np.random.default_rng()
 
     def _load(self, policy: str) -> tuple[Callable[[Any], Any], Callable[[Any, int], None]]:
-        """Return what acts on an observation, and what prepares an episode from its seed."""
+        """Return two functions of a policy: one acts, one prepares an episode from its seed."""
         if policy == "random":
             return self._draw, lambda observation, seed: None
         if policy == "expert":

@@ -1,4 +1,4 @@
-"""A viser server that listens where it is told, and prints nothing."""
+"""Viser server at a given address and port, without console output."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def stop(server: ViserServer) -> None:
 
 
 def _free_port(host: str, port: int) -> int:
-    """Return the first free port from ``port`` on; viser would try other ports for ever."""
+    """Return the first free port from ``port`` on; viser alone would never stop trying."""
     for candidate in range(port, min(port + _TRIES, 65536)):
         if (found := _bound(host, candidate)) is not None:
             return found
@@ -46,7 +46,7 @@ def _free_port(host: str, port: int) -> int:
 
 
 def _bound(host: str, port: int) -> int | None:
-    """Return the port that a server gets when it asks for ``port``; None if it is taken."""
+    """Return the port that a server gets for ``port``; None if the port is taken."""
     try:
         family = socket.getaddrinfo(host, port)[0][0]
         with socket.create_server((host, port), family=family) as found:

@@ -40,7 +40,7 @@ def find_tpm(machine: Any) -> TPM:
     """Return a machine by its name, or the machine itself, if it is a TPM.
 
     Raises:
-        ConfigurationError: If it is not.
+        ConfigurationError: If the machine is no TPM.
     """
     found = find_machine(machine)
     if not isinstance(found, TPM):
@@ -144,7 +144,7 @@ class Viewer:
             self.explore.set(at_joints(machine, state.theta, machine.assembly_mode))
 
     def _report(self, error: Exception) -> None:
-        """Show an error on all pages; print those that are not ours."""
+        """Show an error on all pages; print errors that are no TPMError."""
         self.play.pause()
         if not isinstance(error, TPMError):
             traceback.print_exception(error)

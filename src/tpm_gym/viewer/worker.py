@@ -12,9 +12,9 @@ Job = Callable[[], object]
 
 
 class Worker:
-    """Thread that runs jobs in order; a job that waits is replaced by a newer one of its name.
+    """Thread that runs jobs in order; a new job replaces a waiting job of equal name.
 
-    So a drag of the mouse that is faster than the drawing skips postures, and never lags.
+    So a fast drag of the mouse skips postures instead of lagging behind.
 
     Args:
         on_error: Called with an exception of a job.
@@ -49,12 +49,12 @@ class Worker:
             self._change.notify_all()
 
     def stop_ticking(self) -> None:
-        """Run the periodic job no more."""
+        """Stop the periodic job."""
         with self._change:
             self._ticking = None
 
     def wait(self, timeout: float = 60.0) -> bool:
-        """Wait until no job is left; return whether that came true within ``timeout`` s."""
+        """Wait until no job is left; return False if that takes longer than ``timeout`` s."""
         with self._change:
             return self._change.wait_for(lambda: not self._jobs and not self._busy, timeout)
 
