@@ -355,7 +355,7 @@ def test_a_task_that_is_made_takes_no_options(options: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("task", ["juggle", None, 3, dict, ["reach"]], ids=repr)
 def test_what_is_no_task_is_refused(task: Any) -> None:
-    with pytest.raises(ConfigurationError, match="'reach', 'pick_and_place'") as caught:
+    with pytest.raises(ConfigurationError, match=r"'pick_and_place', .*'reach'") as caught:
         make_task(task)
     assert caught.value.name == "task"
 
