@@ -76,15 +76,15 @@ class _Cache:
         """Load the machine code of a signature; None if it has to be compiled."""
         found = None
         if not isinstance(self._disk, _CACHING.NullCache):
-            # Numba's own stamp covers the function's own file only. It is computed here, because
-            # functions that are defined below a decorated one are unknown to the decorator.
+            # Numba's own stamp covers only the file of the function. This stamp is computed at the
+            # first use, because the decorator does not know functions that are defined later.
             self._disk._cache_file._source_stamp = stamp(self._function)
         try:
             found = self._disk.load_overload(sig, target_context)
         except Exception:  # damaged: unpickling raises almost anything
             with suppress(OSError):
                 self._disk.flush()
-        # Two processes that wrote at the same time may have left another signature's code.
+        # If two processes wrote at the same time, the file may contain another signature's code.
         if found is not None and found.signature.args == sig:
             return found
         self._timer = threading.Timer(PATIENCE, self._announce)

@@ -212,7 +212,7 @@ def _codes(
     x_low = max(l2 - l7 - l4, l2 - l7 + 2 * l5 - l1 - reach, l1 - l2 - reach)
     x_high = min(l2 + l7 + l4, l2 + l7 + 2 * l5 - l1 + reach, l1 - l2 + reach)
     low, high = np.array([x_low, -l7, l6 - reach]), np.array([x_high, l7, 2 * l6 + reach])
-    if x_low >= x_high:  # nothing can be reached, and any grid shows this
+    if x_low >= x_high:  # nothing is reachable; any grid shows this
         low[0], high[0] = l2 - l7 - l4, l2 + l7 + l4
     spacing = (high - low) / shape
     points = low + (np.moveaxis(np.indices(shape), 0, -1) + 0.5) * spacing

@@ -198,7 +198,7 @@ class Core:
         simulation = self.simulation
         commands = self.control.command(actions[:, :3], simulation.commands)
         vacuum = actions[:, 3] > 0 if self.task.vacuum else np.zeros(self.count, dtype=np.bool_)
-        state, self._state = self._state, None  # until the step has gone well
+        state, self._state = self._state, None  # None until the step has succeeded
         noisy = self.randomisation.encoder_noise > 0
         simulation.move(commands, vacuum, self._noise(running) if noisy else None)
         self._state, self._pending = state, late
@@ -302,7 +302,7 @@ class Core:
         Raises:
             EpisodeError: If no episode is running.
         """
-        _ = self.state  # there has to be an episode
+        _ = self.state  # raises without an episode
         rngs = [dict(rng.bit_generator.state) for rng in self.rngs]
         own = {"goals": self.goals, "pending": self._pending, **columns}
         copies = {name: values.copy() for name, values in own.items()}
@@ -329,7 +329,7 @@ class Core:
         self.goals = snapshot.columns["goals"].copy()
         self._pending = snapshot.columns["pending"].copy()
         self._state = None
-        self.episode += 1  # plans for the episode before are void
+        self.episode += 1  # the expert must plan again
         self.simulation.restore(snapshot.simulation)
         return self.report()[0]
 

@@ -27,9 +27,8 @@ def register_task(
 ) -> tuple[str, ...]:
     """Register a task's ids ``TPM<name>{,Joints}{,Dense}-v<version>``; it may be repeated.
 
-    ``TPMEnv(task=...)`` takes it too, as ``name`` in snake case. The command line, and worker
-    processes that are spawned rather than forked, find ids as ``"module:id"``, where importing the
-    module registers them.
+    ``TPMEnv(task=...)`` accepts ``name`` in snake case. The command line, and worker processes that
+    are spawned rather than forked, need ``"module:id"``: importing the module registers the id.
 
     Args:
         name: Name in CamelCase, e.g. ``"PickAndPlace"``.
@@ -90,7 +89,7 @@ def _path(task: type[Task]) -> tuple[str, str]:
 
 
 def _built_in() -> Iterator[type[Task]]:
-    """Yield the tasks of this package: a class in a file of :mod:`tpm_gym.tasks` is one."""
+    """Yield the task classes in the files of :mod:`tpm_gym.tasks`."""
     for _, name, _ in pkgutil.iter_modules(tasks.__path__, f"{tasks.__name__}."):
         for value in vars(importlib.import_module(name)).values():
             own = isinstance(value, type) and issubclass(value, Task) and value.__module__ == name

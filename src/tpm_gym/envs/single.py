@@ -187,7 +187,7 @@ class TPMEnv(gym.Env[Observation, Action]):
     * v0: not released yet; observations and physics still change.
     """
 
-    # Gymnasium declares this as an instance's, so it cannot be a ClassVar.
+    # Gymnasium declares an instance attribute, so this cannot be a ClassVar.
     metadata: dict[str, Any] = {  # noqa: RUF012
         "render_modes": list(RENDER_MODES),
         "render_fps": round(1 / CONTROL_PERIOD),
@@ -293,8 +293,8 @@ class TPMEnv(gym.Env[Observation, Action]):
             ConfigurationError: If a result of the task is not finite.
         """
         core = self._core
-        plain = type(action) is np.ndarray and action.dtype.char in "df"  # as usual
-        # isfinite() costs more; what overflows here is checked by finite().
+        plain = type(action) is np.ndarray and action.dtype.char in "df"
+        # The scalar product is faster than np.isfinite(); if it overflows, finite() decides.
         if not plain or action.shape != self._action or not isfinite(np.vdot(action, action)):
             action = finite("action", action, self._action, ActionError)
         state = core.state

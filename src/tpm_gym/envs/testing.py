@@ -144,7 +144,7 @@ def passes_the_checkers_of_gymnasium_and_sb3(make: Make) -> None:
         warnings.simplefilter("error")
         try:
             inner: Any = env.unwrapped
-            # Engines need not draw anything else.
+            # Engines must draw colours only.
             inner.metadata = {**inner.metadata, "render_modes": ["rgb_array"]}
             check_by_gymnasium(inner)
             if find_spec("stable_baselines3") is not None:
@@ -358,7 +358,7 @@ def continues_copies_and_snapshots_equally(make: Make) -> None:
     """Save, copy and pickle in an episode, and compare all of them until the next reset."""
     with closing(make()) as env, closing(make()) as restored:
         steps = min(15, _steps_of(env) // 2)
-        for other in (env, restored):  # wrappers count for themselves
+        for other in (env, restored):  # wrappers count their own steps
             for _ in random_episode(other, 4, steps=steps):
                 pass
         inner: Any = restored.unwrapped

@@ -209,7 +209,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             ActionError: If the actions have the wrong shape or are not finite.
             EpisodeError: Before reset, after close, or where an episode ended and is not reset.
         """
-        plain = type(actions) is np.ndarray and actions.dtype.char in "df"  # as usual
+        plain = type(actions) is np.ndarray and actions.dtype.char in "df"
         shape = self._shape
         if not plain or actions.shape != shape or not isfinite(np.vdot(actions, actions)):
             actions = finite("actions", actions, shape, ActionError)

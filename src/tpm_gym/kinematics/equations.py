@@ -122,8 +122,8 @@ def assembly_at(
     # Eqs. (9) and (10), with z_C3 = z_C + l6
     u, w = x_c - (cos[2] + (g.l1 - 2.0 * g.l2)), z_c - (sin[2] - g.l6)
     numerator, denominator = l4 * l4 - l7 * l7 - u * u - w * w, 2.0 * l7 * u
-    # Rounding in C1 grows as the inverse of the planar factor, and in cos(beta) again as that of u;
-    # the cap, 64, keeps what the clipped cosine leaves of a gap in rod 11 below l4 / 1e12.
+    # Rounding in C1 grows as 1 / (planar factor), and rounding in cos(beta) also as 1 / u. With the
+    # cap of 64, clipping the cosine leaves a gap in rod 11 below l4 / 1e12.
     blur = (1.0 + l4 * l4 / ns.maximum(distance2 * root, l4 * l4 / 63.0)) * (ROUNDING * l4 * l4)
     turned = abs(denominator)
     reached = meet & (abs(numerator) <= turned + blur)
@@ -180,8 +180,8 @@ def arm(
     l3, l4 = g.l3, g.l4
     radius2 = a * a + b * b
     ratio = (radius2 + out * out + (l3 * l3 - l4 * l4)) / (2.0 * l3 * ns.sqrt(radius2))
-    reaches = abs(ratio) <= _REACH  # not where it is NaN, from lengths without end
-    # The arm is turned from the direction of C by the angle of this cosine and sine.
+    reaches = abs(ratio) <= _REACH  # False for NaN, from infinite lengths
+    # Cosine and sine of the angle between the arm and the direction of C
     cos = ns.clip(ratio)
     sin = bend * ns.root((1.0 - cos) * (1.0 + cos))
     return ns.arctan2(b * cos - a * sin, a * cos + b * sin), reaches

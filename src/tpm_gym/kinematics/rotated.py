@@ -33,8 +33,8 @@ _Pair = tuple[FloatArray, FloatArray]
 _Four = tuple[FloatArray, FloatArray, FloatArray, FloatArray]  # two derivatives of two functions
 
 _NEAR = 1e-5  # largest distance from the unit circle at which an eigenvalue may be on it
-_MERGED = 1e-7  # of l4: eigenvalues that coincide are good to half of the digits
-_STEPS = 4  # of Newton's method, from eigenvalues good to half of the digits or better
+_MERGED = 1e-7  # fraction of l4; coinciding eigenvalues are accurate to half of the digits
+_STEPS = 4  # Newton steps, enough from half of the digits
 _FARTHEST = 0.01  # largest step that begins near a zero, rad or m
 _CLOSED = 1e-13  # largest rounding error of a closure |rod|^2 - l4^2, in l4^2
 
@@ -233,7 +233,7 @@ def link3_rotated(theta: FloatArray, geometry: Geometry = PAPER) -> tuple[_Plana
     rho2, p, q = terms(np.linspace(0.0, 2 * np.pi, 5, endpoint=False))
     tilt, near = _zeros(4 * rho2 * p**2 - q**2)
     rho2, p, q = terms(tilt)
-    # Where p = q = 0, rho has both signs, and two neighbouring zeros are one.
+    # Where p = q = 0, two neighbouring zeros coincide, and rho has both signs.
     rho = np.where(abs(p) < _MERGED * g.l4, [1, -1, 1, -1], np.sign(p * q)) * NUMPY.root(rho2)
     (rho, tilt), gaps, slopes = _refined(closures, rho, tilt)
     # Along the curve rho(phi) the closure of rod 6 changes its sign at every zero.
@@ -294,7 +294,7 @@ def _refined(
         (e, f), (a, b, c, d) = closures(one, two)
         determinant = a * d - b * c
         first, second = (d * e - b * f) / determinant, (a * f - c * e) / determinant
-        small = abs(first) + abs(second) < _FARTHEST  # not where there is nothing to find
+        small = abs(first) + abs(second) < _FARTHEST  # else there is no zero nearby
         one, two = one - np.where(small, first, 0.0), two - np.where(small, second, 0.0)
     return ((one, two), *closures(one, two))
 

@@ -237,7 +237,7 @@ def complete(config: TrainingConfig) -> TrainingConfig:
     }
     missing = {name: v for name, v in computed.items() if getattr(config, name) is UNSET}
     config = replace(config, recipe=recipe, **missing)
-    if config.eval_every is UNSET:  # more often, it would evaluate equal policies
+    if config.eval_every is UNSET:  # between updates the policy does not change
         often = max(config.rollout, config.steps // (20 if many else 10))
         config = replace(config, eval_every=often)
     _check(config)

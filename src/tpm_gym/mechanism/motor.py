@@ -90,9 +90,8 @@ class Motor:
 
 
 TORQUE_MOTOR = Motor(
-    # Experts need 10 N m at most and full reversals 43 N m. So motors of half the strength, the
-    # weakest that randomisation draws, still follow. The shear stress is 44 kPa (peak) and 18 kPa
-    # (continuous).
+    # Experts need at most 10 N m, and reversals at full speed 43 N m. So motors of half this
+    # strength still follow. The shear stress is 44 kPa (peak) and 18 kPa (continuous).
     peak_torque=100.0,
     continuous_torque=40.0,  # 100 W: 0.17 m^2 of housing, 60 K above the room
     motor_constant=4.0,

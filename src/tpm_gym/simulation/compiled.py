@@ -162,7 +162,7 @@ def measured(
     halves: FloatArray,
     most: float,
 ) -> FloatArray:
-    """Return what encoders, camera and vacuum gauge measure of the robot and of k objects.
+    """Return the measurements of encoders, camera and vacuum gauge: robot and k objects.
 
     Args:
         position: (n, 3) m, point P.

@@ -18,9 +18,9 @@ from tpm_gym.simulation.engine import loops
 
 __all__ = ["CartesianControl", "Control", "JointControl", "make_control"]
 
-_TRIES = 6  # of shares of a step
-_AIM = 0.9995  # of the limit, so that a try ends just below it
-_PARTS = 32  # of a way, within which joints turn nearly evenly
+_TRIES = 6  # largest number of shares of a step that are tried
+_AIM = 0.9995  # fraction of the limit that a try aims at
+_PARTS = 32  # parts of a line; within a part, joints turn almost uniformly
 
 
 class Control(Protocol):
@@ -89,7 +89,7 @@ class JointControl:
         machine = self._machine
         theta = machine.inverse(current)
         step = actions * machine.joint_limit
-        # By J, half of this share of the increment uses up the limit; the exact share is near.
+        # Start with twice the share that reaches the limit according to J; the exact share is near.
         rate = np.abs((machine.evaluate(theta).jacobian * step[:, None]).sum(axis=-1))
         share = np.minimum(1.0, 2 * (self._step / np.maximum(rate, 1e-12)).min(axis=-1))
         point, excess = self._tried(current, theta, step, share)

@@ -61,7 +61,7 @@ class Expert:
             EpisodeError: If no episode is running, or a plan has no moves.
             ConfigurationError: If a plan needs a vacuum, or an entry, that the task lacks.
         """
-        _ = self._env.state  # there has to be an episode
+        _ = self._env.state  # raises without an episode
         self._look(observation)
         count = len(self._episodes)
         moves = [self._next(row) for row in range(count)]

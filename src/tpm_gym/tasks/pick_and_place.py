@@ -90,13 +90,13 @@ class PickAndPlace(Task):
             yield from motion.pick(self.block, CLEARANCE)
             if not motion.holding():
                 continue
-            # The cup sits where it took the block, not on the block's middle.
+            # The cup does not hold the block exactly at its middle.
             grip = motion.seen["position"] - motion.seen["object_position"]
             place = to_paper(motion.goal + grip)
             on_table = bool(motion.goal[2] < self.block.height / 2 + 0.005)
             stops = [motion.command + up, place + up, place] if on_table else [place]
             if not on_table:
-                # Off the table first, then straight on.
+                # Lift the block off the table first, then move in a straight line.
                 stops.insert(0, motion.command + up / 2)
             yield from motion.go(stops, vacuum=True, while_holding=self.block.name)
             if motion.holding():

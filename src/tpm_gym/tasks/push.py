@@ -21,11 +21,11 @@ CLEARANCE: Final = 0.008
 """Gap between lip and block where the lip comes down beside the block, and over the block, m."""
 SHORTEST: Final = 0.060
 LONGEST: Final = 0.240
-"""Limits of the way of the block, measured square to the face, m."""
+"""Shortest and longest way of the block along the normal of the pushed face, m."""
 SLOPE: Final = 0.10
-"""Largest slope of the way against the normal of the face that is pushed."""
+"""Largest slope of the way against the normal of the pushed face."""
 PACE: Final = 0.014
-"""Way of the lip in a control step of the expert while it pushes, m."""
+"""Distance that the expert moves the lip in a control step while it pushes, m."""
 SIDEWAYS: Final = 0.15
 """Largest slope of the expert's pushing direction against the normal of the face."""
 CLOSE: Final = 0.001
@@ -87,7 +87,7 @@ class Push(Task):
         return fits
 
     def behind(self, place: FloatArray, way: FloatArray, gap: float) -> FloatArray:
-        """Return point P (..., 3) m, world, with the lip low behind blocks that go along ``way``.
+        """Return P (..., 3) m, world, with the lip low behind blocks that shall move along ``way``.
 
         Args:
             place: Centres (..., 3) m of the blocks.
@@ -128,7 +128,7 @@ class Push(Task):
             remaining = float(left @ ahead)
             if remaining < CLOSE:
                 break
-            # The lip pushes a little from the side, so that the block arrives sideways too.
+            # The lip pushes at a small angle, which corrects the sideways error of the block.
             across = left - remaining * ahead
             tilt = SIDEWAYS / max(SIDEWAYS, float(np.linalg.norm(across)) / remaining)
             step = min(PACE, remaining) * ahead

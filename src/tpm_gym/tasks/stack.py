@@ -19,7 +19,7 @@ __all__ = ["Stack"]
 CLEARANCE: Final = 0.045
 """Height over a block, or over its place, at which the expert arrives and leaves, m.
 
-A carried block passes over a standing one.
+A carried block passes above a standing block.
 """
 APART: Final = 0.045
 """Smallest distance between the middles of blocks and goal on the table, m."""
@@ -40,7 +40,7 @@ class Stack(Task):
     max_episode_steps = 100
     samplings = ("sampled", "tempting")
     tower = np.array([0.0, 0.0, (lower.height + upper.height) / 2])
-    """Way (3,) m from the centre of the lower block to that of the upper block."""
+    """Vector (3,) m from the centre of the lower block to the centre of the upper block."""
 
     def sample(
         self, rngs: Sequence[np.random.Generator], chosen: Mapping[str, FloatArray]
@@ -69,7 +69,7 @@ class Stack(Task):
         return state.object_position.reshape(-1, 6)
 
     def gap(self, achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
-        """Return the distance to the goal of the block that is farther away."""
+        """Return the larger distance of the two blocks to their goals, (...,) m."""
         ends = (np.reshape(goal, (*np.shape(goal)[:-1], 2, 3)) for goal in (achieved, desired))
         largest: FloatArray = super().gap(*ends).max(axis=-1)
         return largest
@@ -86,7 +86,7 @@ class Stack(Task):
         for block, goal in zip(self.scene.objects, motion.goal.reshape(2, 3), strict=True):
             while not motion.holding(block.name):
                 yield from motion.pick(block, CLEARANCE)
-            # The cup sits where it took the block, not on the block's middle.
+            # The cup does not hold the block exactly at its middle.
             grip = motion.seen["position"] - motion.seen[f"{block.name}_position"]
             place = to_paper(goal + grip)
             yield from motion.go([motion.command + up, place + up, place], vacuum=True)

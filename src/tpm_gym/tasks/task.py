@@ -128,7 +128,7 @@ class Task(ABC):
         self.entries = self.observed()
         self._centre = np.concatenate([entry.centre for entry in self.entries])
         self._scale = np.concatenate([entry.scale for entry in self.entries])
-        # Entries in a row that share a source read it once.
+        # The source of adjacent entries is read only once.
         groups = groupby(self.entries, key=lambda entry: entry.source)
         self._sources = [(source, _columns(list(entries))) for source, entries in groups]
 
@@ -335,7 +335,7 @@ class Task(ABC):
         taken = [(block.name, *_boxes(starts[block.name], block)) for block in self.scene.objects]
         for name, low, high in taken:
             for other, least, most in self._robot + taken:
-                mine = name in chosen or other not in chosen  # else it is found the other way round
+                mine = name in chosen or other not in chosen  # else the other object reports it
                 if other == name or not mine:
                     continue
                 inside = np.flatnonzero(((low < most) & (high > least)).all(axis=1))
@@ -382,7 +382,7 @@ class Task(ABC):
         )
 
     def _measure(self, state: State) -> FloatArray:
-        """Return what is measured of robot and objects, (n, 9 + 12 k)."""
+        """Return the measurements of robot and objects, (n, 9 + 12 k)."""
         plain = np.ascontiguousarray
         values: FloatArray = loops().measured(
             state.fk_position, state.fk_velocity, state.command, plain(state.object_position),
@@ -416,7 +416,7 @@ class Task(ABC):
     def observe(self, state: State) -> FloatArray:
         """Return the observation vectors (n, k), each entry of order one."""
         values = []
-        for source, columns in self._sources:  # a comprehension would be a call
+        for source, columns in self._sources:  # a comprehension is slower
             values.append(source(state)[:, columns])
         scaled: FloatArray = np.concatenate(values, axis=1)
         scaled -= self._centre
@@ -459,7 +459,7 @@ class Task(ABC):
         low, high = np.empty((2, len(self.scene.objects), 3))
         for index, block in enumerate(self.scene.objects):
             least, most = self._place_of(block)
-            slack = block.width / 2  # the cup may take it off its middle
+            slack = block.width / 2  # the cup may hold the block off its middle
             low[index, :2], high[index, :2] = least[:2] - slack, most[:2] + slack
         low[:, 2], high[:, 2] = 0.0, np.inf
         return low, high

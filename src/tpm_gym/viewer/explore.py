@@ -54,7 +54,7 @@ class Explore:
         self.gizmo: TransformControlsHandle | None = None
         self._add_modes(server.gui)
         self._add_motors(server.gui)
-        # At the end, where a sentence that comes and goes moves no control.
+        # Last in the panel, so that a message that appears moves no control.
         self._refusal: Any = server.gui.add_html("")
 
     def _add_modes(self, gui: GuiApi) -> None:

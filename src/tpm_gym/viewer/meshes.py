@@ -154,8 +154,8 @@ def _compact(points: FloatArray, quads: NDArray[Any]) -> Mesh:
     """Split quadrilaterals into triangles, and keep the points that are used."""
     used, renamed = np.unique(quads, return_inverse=True)
     quads = renamed.reshape(quads.shape)
-    # Both triangles of a quadrilateral come together. Otherwise two sheets, one behind the other,
-    # would be drawn in turns, and hide parts of each other.
+    # Keep both triangles of a quadrilateral together. Otherwise two sheets, one behind the other,
+    # would be drawn alternately and hide parts of each other.
     return Mesh(points[used], quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3))
 
 

@@ -65,8 +65,8 @@ class BulletEngine:
         self.time_step = self.physics.time_step
         self._renderer, self._servo = renderer, drive
         self._drives: ServoDrives | None = None
-        # Torques at rest and with servo drives, where Bullet reports others (zero after a restore,
-        # the joint friction); None where Bullet's are meant
+        # Torques at rest and of servo drives, for which Bullet reports zero after a restore, or the
+        # joint friction. None: use Bullet's torques.
         self._torque: Vector | None = _ZERO
         self.client = Client(self.physics, renderer=renderer)
         self._window: Window | None = None

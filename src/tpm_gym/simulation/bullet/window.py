@@ -49,7 +49,7 @@ class Window:
         self._aimed: Camera | None = None
 
     def load(self, machine: Machine, scene: Scene) -> None:
-        """Load robot and scene in the place of those before."""
+        """Replace the robot and the scene."""
         client = self._client
         client.resetSimulation()
         client.configureDebugVisualizer(client.COV_ENABLE_RENDERING, 0)
