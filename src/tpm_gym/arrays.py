@@ -20,7 +20,7 @@ BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
-"""x, y, z, w."""
+"""Quaternion (x, y, z, w)."""
 
 _Error = Callable[[str, Any, str], TPMError]
 _LONGEST = 200  # characters of a value in a message

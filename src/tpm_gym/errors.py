@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 class TPMError(Exception):
     """Root of all errors raised by tpm_gym. They survive pickling, as between worker processes.
 
-    Leaves with values are dataclasses; their message is :attr:`template`, filled in with them.
+    Errors with values are dataclasses; :attr:`template` formats the values as a message.
     """
 
     template: ClassVar[str] = ""
@@ -127,9 +127,9 @@ class ClosureError(TPMError, RuntimeError):
 class ModeChangeError(TPMError, RuntimeError):
     """A step was requested although the mechanism had passed a singularity in this episode.
 
-    In another ``"assembly"`` mode, past a parallel singularity, the forward kinematics no longer
-    say where the platform is; in another ``"working"`` mode, past a serial one, the inverse
-    kinematics no longer say how to get where.
+    Mode ``"assembly"``: beyond a parallel singularity, the forward kinematics no longer give the
+    platform's position. Mode ``"working"``: beyond a serial singularity, the inverse kinematics no
+    longer give the joint positions.
     """
 
     template: ClassVar[str] = (

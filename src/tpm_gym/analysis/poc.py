@@ -6,10 +6,9 @@ intersection the common subspace, separately for translations and rotations, as 
 [t; r] of the paper. A revolute joint with axis s through a point p contributes r(|| s). It also
 contributes t along s x (o' - p), unless the axis passes through the base point o' of the end link.
 
-Unlike the paper's notation, there are no symbols for directions, because a subspace holds them, and
-no braces around dependent elements: choose the base point so that no element is dependent. The sets
-are exact for chains that translate and rotate independently, as all chains of this mechanism do.
-They describe one configuration. Dimensions can change at a singularity; elsewhere they are the
+Subspaces replace the paper's symbols for directions. Choose the base point so that no element is
+dependent; there is no notation for dependent elements, as the paper's braces. The sets are exact
+for chains that translate and rotate independently, as all chains of this mechanism do. They describe one configuration. Dimensions can change at a singularity; elsewhere they are the
 full-cycle values of the paper.
 """
 

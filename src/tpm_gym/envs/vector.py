@@ -132,7 +132,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         self.action_space = batch_space(self.single_action_space, num_envs)
 
     def _each(self, function: Callable[[_Part, slice], Any]) -> list[Any]:
-        """Call a function for each part, on the threads where there are several."""
+        """Call a function for each part, in parallel if there are several threads."""
         (first, *rest) = zip(self._parts, self._slices, strict=True)
         if self._pool is None:
             return [function(*pair) for pair in (first, *rest)]
@@ -471,7 +471,7 @@ def _masked(info: Mapping[str, Any], rows: IntArray | None, count: int) -> dict[
 
 
 def _updated(last: Mapping[str, Any], first: Mapping[str, Any], rows: IntArray) -> dict[str, Any]:
-    """Return copies of entries (n,) with other values in some rows."""
+    """Return copies of the entries of ``last``, with the values of ``first`` in some rows."""
     result: dict[str, Any] = {}
     for name, value in last.items():
         if isinstance(value, Mapping):

@@ -27,11 +27,11 @@ from tpm_gym.kinematics.namespaces import NUMPY, Namespace, Numbers, namespace_o
 
 ROUNDING = 64 * sys.float_info.epsilon
 """Largest amount by which a discriminant (scaled to order one) counts as zero if it is below zero.
-Where two solutions merge, rounding alone can push it there. Those are solutions, not misses."""
+Where two solutions merge, rounding can make it negative; they still count as solutions."""
 _REACH = 1.0 + ROUNDING
 SINGULAR = 1e-6
-"""A factor of det A below this counts as zero. cos(beta) is known to about 1e-14; so where it is 1,
-sin(beta) is known to the square root of that only (y to 50 nm)."""
+"""Limit below which a factor of det A counts as zero. cos(beta) has an error of about 1e-14. Where
+cos(beta) is 1, the error of sin(beta) is the square root of that (50 nm in y)."""
 
 _TINY = sys.float_info.min  # the smallest divisor
 
@@ -231,8 +231,8 @@ def link_velocity(
 ) -> tuple[tuple[Numbers, Numbers], tuple[Numbers, Numbers], Triple]:
     """Compute the rates of xC, zC and l7 beta for unit rates of the motors, m/rad.
 
-    They solve the closures' derivatives, with the determinant l7 sin(beta) level3 planar. Motor 3
-    does not move link 3'.
+    The rates solve the derivatives of the closures, with determinant l7 sin(beta) level3 planar.
+    Motor 3 does not move link 3'.
     """
     (r1x, _, r1z), (r2x, _, r2z), (r3x, _, r3z) = bars
     leg1, leg2, planar = values.leg1, values.leg2, values.planar

@@ -9,7 +9,7 @@ from tpm_gym.kinematics.namespaces import Numbers
 
 _CLOSE = 1e-4
 """Share of l1 below which y_B1 counts as 0. The radii of the two circles then differ by less than
-1e-10 of l1, and rounding errors over that difference would spoil their intersections."""
+1e-10 of l1, and their intersections would be inaccurate."""
 
 
 class Lengths(NamedTuple):

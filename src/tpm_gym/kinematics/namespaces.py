@@ -132,7 +132,7 @@ def _torch() -> Namespace:
 def by_rows(
     text: Callable[[Any, Namespace], Sequence[Numbers]], points: FloatArray
 ) -> list[FloatArray]:
-    """Compute results from the components (n,) of points (..., k), a block of rows at a time.
+    """Apply the function ``text`` to the components (n,) of points (..., k), in blocks of rows.
 
     A result of ``text`` is a column (n,), a tuple of columns, or a tuple of such tuples.
 

@@ -252,7 +252,7 @@ def _in_whole_rollouts(config: TrainingConfig, reached: int) -> TrainingConfig:
 
 
 def resumed(config: ResumeConfig, stored: Mapping[str, Any], reached: int) -> TrainingConfig:
-    """Change the configuration ``stored`` of a run that has ``reached`` a step."""
+    """Apply the given options to the ``stored`` configuration of a run at the step ``reached``."""
     found = _stored(config.run, stored)
     if config.env not in (UNSET, found.env):
         raise ConfigError(f"--env {config.env}: the run was trained in {found.env}; give that")

@@ -28,8 +28,7 @@ from tpm_gym.learning.run_folder import CONFIG_FILE, description
 from tpm_gym.policy.files import FORMAT, VERSION, digest, files
 
 TOLERANCE: Final = 1e-5
-"""Largest difference of an exported action, of rounding to single precision; relative to half its
-range if that is above 1."""
+"""Largest rounding error of an exported action, in units of half its range if that is above 1."""
 _TRIALS: Final = 64
 _ACTIVATIONS: Final = {nn.ReLU: "relu", nn.Tanh: "tanh"}
 

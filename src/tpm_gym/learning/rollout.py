@@ -176,8 +176,8 @@ _WORST: Final[Mapping[str, Any]] = {
 def summarise(records: Sequence[Episode]) -> dict[str, Estimate]:
     """Return the metrics of an evaluation by name, each with its 95% interval over episodes.
 
-    Success rates have Wilson intervals, which stay honest at 0 and 1; the others have percentile
-    bootstrap intervals, and extremes of an episode the worst of all episodes.
+    Success rates have Wilson intervals, which are valid at 0 and 1 too. Other metrics have
+    percentile bootstrap intervals. Extremes also have the worst value of all episodes.
     """
     rows = [record.as_dict() for record in records]
     found = {}

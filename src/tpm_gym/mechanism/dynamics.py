@@ -389,7 +389,7 @@ class Dynamics:
     def _rows(
         self, text: Callable[..., Sequence[Numbers]], states: Mapping[str, ArrayLike]
     ) -> list[FloatArray]:
-        """Compute the results of ``text`` from a pose and triples, for each row of the states."""
+        """Apply the function ``text`` of a pose and triples to each row of the states."""
 
         def results(values: tuple[Numbers, ...], ns: Namespace) -> list[Numbers]:
             theta, *rest = (values[i : i + 3] for i in range(0, len(values), 3))

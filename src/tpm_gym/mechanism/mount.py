@@ -13,7 +13,7 @@ from tpm_gym.arrays import FloatArray, Quaternion, Vector, finite
 from tpm_gym.errors import ConfigurationError
 
 GRAVITY = 9.81
-"""m/s^2, along the world's -z."""
+"""Acceleration of gravity along the world's -z, m/s^2."""
 
 _HALF_TURN = np.array([1.0, -1.0, -1.0])
 

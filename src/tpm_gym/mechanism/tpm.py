@@ -241,7 +241,7 @@ def _rows(values: ArrayLike, length: int = 3, name: str = "vectors") -> FloatArr
 
 
 def _shaped(arrays: Iterable[Any], like: FloatArray) -> Iterator[Any]:
-    """Return arrays (m, ...) in the leading shape of an array (..., 3)."""
+    """Reshape arrays (m, ...) to the leading shape of an array (..., 3)."""
     return (array.reshape(like.shape[:-1] + array.shape[1:]) for array in arrays)
 
 

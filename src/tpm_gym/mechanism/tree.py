@@ -85,7 +85,7 @@ def _rod(axis: Literal["x", "y"], length: float) -> tuple[Solid, ...]:
 
 
 def _motor(name: str, axis: Vector, origin: Vector, level: float, sense: int) -> Joint:
-    """Build a motor. Its arm is level outwards at ``level``, and lowers in ``sense`` of theta."""
+    """Build a motor. At theta = ``level`` its arm points outwards; ``sense`` of theta lowers it."""
     lower, upper = sorted((level - sense * ARM_RAISED, level + sense * ARM_LOWERED))
     line = TORQUE_MOTOR.peak_torque, TORQUE_MOTOR.no_load_speed, TORQUE_MOTOR.corner_speed
     return Joint(name, "revolute", "base", origin, axis, lower, upper, *line)

@@ -98,7 +98,7 @@ def put_row(values: Any, row: int, vector: Vector) -> None:
 
 
 def spread(matrix: Symmetric, a: Vector) -> Vector:
-    """Return matrix a."""
+    """Return the product of a matrix and a vector."""
     p, q, r, s, t, u = matrix
     x, y, z = a
     return p * x + q * y + r * z, q * x + s * y + t * z, r * x + t * y + u * z

@@ -147,7 +147,7 @@ class JointControl:
         return action
 
     def steps(self, wanted: FloatArray, current: FloatArray) -> float:
-        """Count the steps of the slowest axis or joint, at the joint's fastest part of the line."""
+        """Return the number of steps that the slowest axis or joint needs."""
         parts = np.linspace(0.0, 1.0, _PARTS + 1)[:, None]
         way = current + parts * (wanted - current)
         theta = self._machine.require_inverse(self._machine.region.project(way))

@@ -144,7 +144,7 @@ class Play:
         return self.player
 
     def _ready(self) -> Player:
-        """Return the player, in an episode."""
+        """Return the player; start an episode if none is running."""
         player = self._made()
         if player.ended:
             self._begin(player)
