@@ -52,7 +52,7 @@ def test_what_the_penalty_does_is_as_measured():
         r"^\| (TPM\w+)-v0 \| PPO .* \| ([01]) \| [^|]* \| ([\d.]+)%", results, re.MULTILINE
     )
     medians = {(env_id, weight): float(median) for env_id, weight, median in rows}
-    successes = re.search(r"a\s+median\s+of\s+(\d+)%\s+instead\s+of\s+(\d+)%", page).groups()
+    successes = re.search(r"the median is (\d+)% instead of (\d+)%", page).groups()
     payer = [round(medians.pop(("TPMReachJointsDense", weight))) for weight in "10"]
     assert payer == [int(value) for value in successes]
     assert all(median >= 99 for (_, weight), median in medians.items() if weight == "1")
