@@ -176,9 +176,9 @@ def sample(rng: np.random.Generator, aspect: Aspect, count: int) -> FloatArray:
 def largest_box(aspect: Aspect, threshold: float) -> Box:
     """Find the largest axis-aligned box in an aspect with 1/cond(J) >= threshold.
 
-    The result is exact on the grid, whose nodes are the centres of cells: no larger box has nodes
-    as corners, all nodes in the aspect, and 1/cond(J) >= threshold at all nodes. The conditioning
-    between nodes is not checked; it varies little from node to node.
+    The nodes of the grid are the centres of cells. No larger box with nodes as corners has all its
+    nodes in the aspect and 1/cond(J) >= threshold at all of them. The conditioning between nodes is
+    not checked; it varies little from node to node.
 
     Raises:
         ConfigurationError: The threshold is not between 0 and 1, or no box of at least two nodes

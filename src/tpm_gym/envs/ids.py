@@ -80,7 +80,7 @@ def register_task(
 
 
 def env_ids() -> tuple[str, ...]:
-    """Return all ids of tpm_gym's environments, those of users' tasks too."""
+    """Return the ids of all environments, including users' tasks."""
     return tuple(env_id for env_id, spec in gym.registry.items() if spec.entry_point == ENTRY_POINT)
 
 

@@ -151,7 +151,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode in all environments, or in those of a mask.
+        """Start an episode in all environments, or in the environments of a mask.
 
         Args:
             seed: Seed of the first environment, increased by one for each further environment;

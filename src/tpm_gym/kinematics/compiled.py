@@ -6,7 +6,7 @@ not depend on a C library. They are accurate to two units in the last place, ``c
 Their polynomials are minimax fits (Remez's exchange, in 60 digits). A test compares the functions
 with mpmath.
 
-Importing this module lets compiled functions call those of :mod:`tpm_gym.kinematics.equations` too.
+After this import, compiled functions can also call :mod:`tpm_gym.kinematics.equations`.
 """
 
 import math

@@ -137,7 +137,7 @@ def by_rows(
     A result of ``text`` is a column (n,), a tuple of columns, or a tuple of such tuples.
 
     Returns:
-        For each result, (..., m) for a tuple of m, and so on: axes follow those of the points.
+        The results as arrays: (...,) for a column, (..., m) for a tuple of m columns.
     """
     ns, shape = namespace_of(points), points.shape[:-1]
     flat = points.reshape(-1, points.shape[-1])

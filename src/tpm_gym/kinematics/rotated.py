@@ -204,7 +204,7 @@ def _zeros(values: FloatArray) -> tuple[FloatArray, BoolArray]:
 def link3_rotated(theta: FloatArray, geometry: Geometry = PAPER) -> tuple[_Planar, FloatArray]:
     """Compute C1 (xC + i zC, m) and tilt (rad) of link 3' turned at theta (..., 3), each (..., 4).
 
-    Missing solutions are NaN. The slots are those of :data:`.modes.ROTATED_MODES`, by pairs.
+    Missing solutions are NaN. There is a slot for each pair of :data:`.modes.ROTATED_MODES`.
 
     Seen along y and from B1, C1 = rho n with n = exp(-i phi / 2), since B1C1 halves the angle. Then
     the closures of rods 4a and 4b are equal, and the closure of rod 6 is linear in rho. Its square

@@ -97,7 +97,7 @@ class Algorithm:
         return found
 
     def argument(self, given: Mapping[str, Any], name: str) -> Any:
-        """Return an argument of the constructor, given or default; None if there is no such one."""
+        """Return an argument of the constructor, given or default; None if it has none."""
         parameters = inspect.signature(self.load_class()).parameters
         return given.get(name, parameters[name].default if name in parameters else None)
 

@@ -45,7 +45,7 @@ Command = (
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    """Run a command line, by default that of the process, and exit with its status.
+    """Run a command line, by default ``sys.argv``, and exit with its status.
 
     A command that a signal stops exits with 128 plus the number of the signal, as in shells.
     """

@@ -111,7 +111,7 @@ class Result:
 
 
 def evaluate(config: EvaluationConfig, console: Console | None = None) -> list[Result]:
-    """Evaluate the policies of a configuration, in order, and write the files it asks for.
+    """Evaluate the policies of a configuration in order, and write the requested files.
 
     The table is printed on ``console``, by default the standard output.
 
@@ -177,7 +177,7 @@ def _common(option: str, values: Mapping[str, str]) -> str:
 
 
 def _conditions(env_id: str, given: Mapping[str, Any]) -> dict[str, str]:
-    """Return the names of machine, engine and drive: those given, else those of the id."""
+    """Return the names of machine, engine and drive, by default the id's."""
     usual = {"machine": "paper", "engine": "pybullet", "drive": "ideal"}
     own = check_env_id(env_id).kwargs
     found = {name: given.get(name) or own.get(name) or value for name, value in usual.items()}
@@ -270,7 +270,7 @@ def paths_per_policy(path: Path, policies: Sequence[str]) -> list[Path]:
 
 
 def _film(config: EvaluationConfig, console: Console) -> None:
-    """Run the first episodes again with rendering, which would have slowed the evaluation."""
+    """Repeat the first episodes with rendering, so that it does not slow the evaluation."""
     count = min(config.video_episodes, config.episodes)
     frames = 1 + (check_env_id(config.env).max_episode_steps or 0)
     films = (

@@ -240,7 +240,7 @@ def _write(path: Path, content: Mapping[str, Any], data: bytes, model: BaseAlgor
 
 
 def _verify(model: BaseAlgorithm, written: Path) -> None:
-    """Compare the actions of the written policy with those of the model."""
+    """Compare the actions of the written policy and of the model."""
     rng = np.random.default_rng(0)
     boxes: Any = model.observation_space
     space: Any = model.action_space

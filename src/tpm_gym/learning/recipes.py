@@ -34,7 +34,7 @@ class Recipe:
         hindsight: Whether the replay buffer relabels goals.
         demonstrations: Arguments of :class:`~tpm_gym.learning.Demonstrations`; empty for none.
         arguments: Other arguments of the algorithm's constructor.
-        written_for: Id that the recipe stands for in its file.
+        written_for: Id under which the recipe is in its file.
     """
 
     n_timesteps: int
@@ -120,7 +120,7 @@ def with_classes(entries: Mapping[str, Any]) -> dict[str, Any]:
 def read_recipe(path: Path, algorithm: str, env_id: str) -> Recipe:
     """Read the recipe of an environment, ``id`` or ``module:id``, after checking the whole file.
 
-    An id without a recipe gets that of pick-and-place, without its demonstrations.
+    An id without a recipe gets the recipe of pick-and-place without demonstrations.
     """
     recipes = read_recipes(path, algorithm)
     module, _, name = env_id.rpartition(":")

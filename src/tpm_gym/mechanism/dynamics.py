@@ -4,9 +4,10 @@
 
 The coupling degree is zero, so every point has a formula, and so have its velocity and
 acceleration. The closures |B_iC_i| = l4, differentiated twice, give the accelerations of C1 and
-then of P from those of B_i, each by one division (:func:`_resolve`). Forces of inertia and weight
-at B_i, C1 and P give the forces in the rods, one division each, and these give the torques of the
-motors (:func:`gather`). Bodies enter by sixteen constants (:mod:`tpm_gym.mechanism.inertia`):
+then of P from the accelerations of B_i, each by one division (:func:`_resolve`). Forces of inertia
+and weight at B_i, C1 and P give the forces in the rods, one division each, and these give the
+torques of the motors (:func:`gather`). Bodies enter by sixteen constants
+(:mod:`tpm_gym.mechanism.inertia`):
 
 * the arms turn about the motors' axes;
 * rods are bars between B_i and C_i, two coupled points each. Rods 4 and 11 turn about their own

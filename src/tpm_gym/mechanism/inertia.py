@@ -88,8 +88,8 @@ def inertia_of(
         payload: Mass that the cup carries, kg.
 
     Raises:
-        ConfigurationError: If there is another number of factors, or if the formulas do not hold
-            for a body.
+        ConfigurationError: If the number of factors is wrong, or if the formulas do not hold for a
+            body.
     """
     bodies = _Bodies(mechanism, link_masses)
     l3, l4, l7 = geometry.l3, geometry.l4, geometry.l7

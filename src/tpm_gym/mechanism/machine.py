@@ -391,7 +391,7 @@ class Machine(ABC):
             link_masses: Factors of the mass and inertia of its moving links; empty if all are 1.
 
         Raises:
-            ConfigurationError: If there is another number of factors.
+            ConfigurationError: If the number of factors is wrong.
         """
         links = self.with_lengths(lengths).mechanism.links[1:]
         if len(link_masses) not in (0, len(links)):

@@ -35,7 +35,7 @@ def torque(
 
     Args:
         mechanism: Bodies.
-        joint_positions: Function from the motors' positions to those of all joints.
+        joint_positions: Function from the motors' positions to all joint positions.
         free_fall: Acceleration of gravity in the machine's frame, m/s^2.
         link_masses: Factors of mass and inertia of the moving links.
         theta: Positions of the motors (3,), rad or m; and their derivatives by time.

@@ -407,7 +407,7 @@ def servo_torque(
 ) -> Vector:
     """Apply the law of the servo drives to one row, and return the torques (N m).
 
-    The arguments are those of :func:`servo_torques`.
+    The arguments are explained in :func:`servo_torques`.
     """
     stiffness, damping, mass, inverse, effort, line = law
     rates, last = row_of(theta_dot, row), page_row(memory, 0, row)

@@ -41,7 +41,7 @@ class Explore:
 
     Attributes:
         posture: The posture that is shown.
-        problem: Reason why there is none as asked for; empty if there is one.
+        problem: Reason why the requested posture does not exist; empty if it exists.
     """
 
     def __init__(

@@ -100,7 +100,7 @@ class RobotScene:
             node.wxyz = SO3.from_matrix(place.rotation).wxyz
 
     def set_objects(self, scene: Scene, tolerance: float) -> None:
-        """Replace objects and goal markers by those of a task."""
+        """Replace objects and goal markers by the task's."""
         for node in (*self._objects, *self._markers):
             node.remove()
         self._objects = [

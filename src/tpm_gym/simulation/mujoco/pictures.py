@@ -47,7 +47,7 @@ class Pictures:
     def draw(
         self, model: mujoco.MjModel, data: mujoco.MjData, view: View, ids: NDArray[np.int32]
     ) -> Picture:
-        """Draw the scene; ``ids`` (number of geoms,) are those of a segmentation.
+        """Draw the scene; ``ids`` (number of geoms,) are the geoms' ids in a segmentation.
 
         Raises:
             ConfigurationError: If no OpenGL backend works.
