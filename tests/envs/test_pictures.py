@@ -214,6 +214,7 @@ def test_a_tile_is_one_picture_of_the_first_environments(engine: str) -> None:
         ({"camera": None}, "camera = None"),
         ({"camera": {"distance": 1.0}}, "camera = .*target"),
         ({"camera": {"target": (0, 0), "distance": 1.0}}, "target"),
+        ({"camera": {"target": (1e300, 0, 0), "distance": 1.0}}, "target .*10.0 m"),
         ({"camera": {"target": (0, 0, 0), "distance": 0.0}}, "distance = 0.0 .*0.05 to 7.0"),
         ({"camera": {"target": (0, 0, 0), "distance": 1, "pitch": 91}}, "pitch"),
         ({"camera": {"target": (0, 0, 0), "distance": 1, "roll": 0}}, "camera = .*keys among"),

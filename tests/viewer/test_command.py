@@ -11,6 +11,7 @@ import psutil
 import pytest
 from processes import TPM_GYM, error_of
 
+from tpm_gym.errors import ConfigurationError
 from tpm_gym.viewer import ViewConfig, run
 
 
@@ -66,4 +67,14 @@ def test_an_export_is_one_page_with_an_episode(tmp_path: Path, capsys):
     text = page.read_text(encoding="utf-8")
     assert "__VISER_EMBED_DATA__=" in text
     assert page.stat().st_size < 2e6
+    run(ViewConfig(export=page.parent))  # an earlier page is replaced
     assert not re.search(r"""<(script|link|img)[^>]*(src|href)=["']?https?:""", text)
+
+
+def test_an_export_replaces_no_page_of_others_and_no_file(tmp_path: Path):
+    page = tmp_path / "index.html"
+    page.write_text("<html>mine</html>")
+    for folder in (tmp_path, page):
+        with pytest.raises(ConfigurationError, match="export"):
+            run(ViewConfig(export=folder))
+    assert page.read_text() == "<html>mine</html>"

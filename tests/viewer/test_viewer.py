@@ -237,6 +237,39 @@ def test_play_goes_on_with_the_next_seed_pauses_and_begins_anew(viewer):
     do(viewer, play.discard)
 
 
+def test_a_page_cannot_choose_what_is_imported(viewer, tmp_path, monkeypatch):
+    (tmp_path / "evil_module.py").write_text("raise SystemExit('imported')")
+    monkeypatch.syspath_prepend(tmp_path)
+    play = viewer.play
+    choose(viewer, play.env_id, "evil_module:TPMReach-v0")  # no such entry in the list
+    do(viewer, play.step)
+    assert "evil_module:TPMReach-v0" in play.status
+    choose(viewer, play.env_id, "TPMReach-v0")
+    do(viewer, play.step)
+    assert len(play.player.records) == 1
+    do(viewer, play.discard)
+
+
+@pytest.mark.parametrize("speed", [0.0, -1.0, 100.0, float("nan")])
+def test_a_speed_that_is_not_on_the_slider_is_refused(viewer, speed):
+    play = viewer.play
+    choose(viewer, play.env_id, "TPMReach-v0")
+    choose(viewer, play.speed, speed)
+    do(viewer, play.play)
+    assert "speed" in play.status
+    assert not play.playing
+    choose(viewer, play.speed, 1.0)
+    do(viewer, play.step)
+    do(viewer, play.discard)
+
+
+def test_a_periodic_job_that_is_always_late_keeps_no_job_waiting(viewer):
+    viewer.worker.tick(0.001, lambda: time.sleep(0.01))
+    time.sleep(0.05)
+    viewer.worker.put("pause", viewer.worker.stop_ticking)
+    assert viewer.worker.wait(2.0)
+
+
 def test_a_policy_that_is_not_there_is_reported_and_the_viewer_goes_on(viewer):
     play = viewer.play
     choose(viewer, play.file, "nowhere/policy.json")

@@ -59,7 +59,7 @@ class Camera:
     """Pose and field of view of a camera; world frame.
 
     Attributes:
-        target: Point in the middle of the picture, m.
+        target: Point in the middle of the picture, m; at most 10 m along each axis.
         distance: Distance from the target, m.
         yaw: Rotation about the vertical, degrees; at 0 the camera looks along +y.
         pitch: Angle above the horizon, degrees; negative to look down.
@@ -81,6 +81,8 @@ class Camera:
     def __post_init__(self) -> None:
         """Check the values."""
         target = finite("target", self.target, (3,), ConfigurationError)
+        if abs(target).max() > _SKY:
+            raise ConfigurationError("target", self.target, f"from {-_SKY} to {_SKY} m each")
         object.__setattr__(self, "target", tuple(target.tolist()))
         for name, low, high in (
             ("distance", NEAR, 0.7 * _SKY),

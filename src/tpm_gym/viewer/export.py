@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
+from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.tpm import TPM
 from tpm_gym.simulation.state import CONTROL_PERIOD
 from tpm_gym.viewer import server
@@ -20,6 +22,8 @@ __all__ = ["export"]
 _ENV: Final = "TPMPickAndPlace-v0"
 _HOLD: Final = 0.8
 """Time for which the first and the last posture stay, s."""
+_OURS: Final = "__VISER_EMBED_DATA__="
+"""Text of a page that viser wrote."""
 
 
 def export(folder: Path, machine: str | TPM = "paper", seed: int = 2) -> Path:
@@ -28,7 +32,7 @@ def export(folder: Path, machine: str | TPM = "paper", seed: int = 2) -> Path:
     The page holds everything it needs. The engine is the analytic one.
 
     Args:
-        folder: Folder of the page; made if missing.
+        folder: Folder of the page; made if missing. An earlier page is replaced.
         machine: Name of a machine, or a TPM.
         seed: Seed of the episode.
 
@@ -36,9 +40,11 @@ def export(folder: Path, machine: str | TPM = "paper", seed: int = 2) -> Path:
         Path of the page.
 
     Raises:
-        ConfigurationError: If the machine is no TPM.
+        ConfigurationError: If the machine is no TPM, the folder cannot be written, or it has an
+            ``index.html`` of another program.
     """
     found = find_tpm(machine)
+    page = _page(folder)
     running = server.start("127.0.0.1", 0)
     player = Player(_ENV, "analytic", found, "expert")
     try:
@@ -59,10 +65,24 @@ def export(folder: Path, machine: str | TPM = "paper", seed: int = 2) -> Path:
             draw(player.state.theta)
             recording.insert_sleep(CONTROL_PERIOD)
         recording.insert_sleep(_HOLD)
-        folder.mkdir(parents=True, exist_ok=True)
-        page = folder / "index.html"
         page.write_text(recording.as_html(), encoding="utf-8", newline="\n")
     finally:
         player.close()
         server.stop(running)
+    return page
+
+
+def _page(folder: Path) -> Path:
+    """Make the folder and return the path of its page; refuse to replace what is not ours."""
+    page = folder / "index.html"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        theirs = page.exists() and _OURS not in page.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise ConfigurationError("export", str(folder), f"a folder ({error.strerror})") from error
+    if theirs:
+        valid = "another folder: this index.html is of another program, and would be replaced"
+        raise ConfigurationError("export", str(page), valid)
+    if not os.access(page if page.exists() else folder, os.W_OK):
+        raise ConfigurationError("export", str(folder), "a folder that you may write to")
     return page

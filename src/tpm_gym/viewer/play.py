@@ -11,6 +11,7 @@ import numpy as np
 from viser import GuiUplotHandle, ViserServer, uplot
 
 import tpm_gym
+from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.state import CONTROL_PERIOD
 from tpm_gym.viewer.player import Player, installed_engines, policies_for
@@ -22,6 +23,8 @@ _COLOURS: Final = ("#0969da", "#d63031", "#2ea043", "#db8400", "#823cbe", "#118a
 _MOTORS: Final = ("motor 1", "motor 2", "motor 3")
 _REDRAW: Final = 0.1
 """Shortest time between two drawings of the plots, s."""
+_SPEEDS: Final = (0.1, 4.0)
+"""Lowest and highest speed."""
 _PAUSE: Final = 15
 """Control periods for which the end of an episode stays in view."""
 
@@ -57,7 +60,7 @@ class Play:
             "Policy file", "", hint="Exported policy (.json); overrides Policy"
         )
         self.seed: Any = gui.add_number("Seed", 0, min=0, step=1)
-        self.speed = gui.add_slider("Speed", 0.1, 4.0, 0.1, 1.0, hint="1 is real time")
+        self.speed = gui.add_slider("Speed", *_SPEEDS, 0.1, 1.0, hint="1 is real time")
         self.buttons = gui.add_button_group("", ("Play", "Pause", "Step", "Next"))
         self._status: Any = gui.add_html("")
         self._gui = gui
@@ -129,6 +132,9 @@ class Play:
         self.policy.options = policies_for(self.env_id.value)
 
     def _set_speed(self) -> None:
+        low, high = _SPEEDS
+        if not low <= self.speed.value <= high:  # pages can send any number
+            raise ConfigurationError("speed", self.speed.value, f"a number from {low} to {high}")
         if self.playing:
             self._worker.tick(CONTROL_PERIOD / self.speed.value, self._tick)
 

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import tpm_gym
-from tpm_gym.errors import EpisodeError
+from tpm_gym.envs.ids import env_ids
+from tpm_gym.errors import ConfigurationError, EpisodeError
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.policy.files import published
 from tpm_gym.simulation.engine import engine_names
@@ -33,7 +34,12 @@ def installed_engines() -> tuple[str, ...]:
 
 
 def policies_for(env_id: str) -> tuple[str, ...]:
-    """Return ``expert``, ``random`` and the published policies for an environment's task."""
+    """Return ``expert``, ``random`` and the published policies for an environment's task.
+
+    Raises:
+        ConfigurationError: If there is no such environment.
+    """
+    _require_id(env_id)
     kwargs = gym.spec(env_id).kwargs
 
     def fits(other: str) -> bool:
@@ -41,6 +47,12 @@ def policies_for(env_id: str) -> tuple[str, ...]:
         return all(own.get(key) == kwargs.get(key) for key in ("task", "control"))
 
     return (*SCRIPTED, *filter(fits, published()))
+
+
+def _require_id(env_id: str) -> None:
+    """Refuse other ids: a page can ask for ``module:id``, and Gymnasium would import the module."""
+    if env_id not in env_ids():
+        raise ConfigurationError("env", env_id, ", ".join(env_ids()))
 
 
 @dataclass(frozen=True)
@@ -81,6 +93,7 @@ class Player:
 
     def __init__(self, env_id: str, engine: str, machine: Machine, policy: str) -> None:
         """Make the environment and load the policy."""
+        _require_id(env_id)
         self._env = gym.make(env_id, engine=engine, machine=machine, disable_env_checker=True)
         try:
             self._act, self._prepare = self._load(policy)

@@ -82,12 +82,13 @@ class Worker:
             self._busy = False
             self._change.notify_all()
             while not self._closed:
+                # Jobs first: a periodic job that is always late would keep the others waiting.
+                if self._jobs:
+                    job = self._jobs.pop(next(iter(self._jobs)))
+                    break
                 if self._ticking is not None and time.monotonic() >= self._due:
                     period, job = self._ticking
                     self._due = max(self._due + period, time.monotonic())
-                    break
-                if self._jobs:
-                    job = self._jobs.pop(next(iter(self._jobs)))
                     break
                 left = None if self._ticking is None else self._due - time.monotonic()
                 self._change.wait(left)
