@@ -101,12 +101,13 @@ def assembly_at(
 
     Eq. (6): C1 is on the circle about (0, z1) with radius^2 = l4^2 - y1^2 and on the circle about
     (dx, z1 + dz) with radius l4. The intersection on the left of the line from the first to the
-    second centre has a positive planar factor, the other one a negative.
+    second centre has a positive planar factor, the other intersection a negative one.
 
     Returns:
-        The assembly; whether it is real; and, for the margins, whether xC and zC are and rod 11
-        fits (for any beta if the assembly is not real, where a2 = b2 = 0), y1, the circles'
-        distance^2, and level and vertical from B3 to where C3 would be without link 7, m.
+        The assembly; whether it is real; and values that explain a failure: whether xC and zC are
+        real and rod 11 fits (if the assembly is not real, it fits for any beta: a2 = b2 = 0), y1,
+        the squared distance of the circles, and the level and vertical distances from B3 to C3 for
+        a link 7 of length 0, m.
     """
     l4, l7 = g.l4, g.l7
     y1, z1 = g.l1 + cos[0], sin[0]

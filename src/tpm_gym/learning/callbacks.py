@@ -129,8 +129,8 @@ class Checkpointing(BaseCallback):
     """Checkpoints between rollouts, and one when the process is asked to stop.
 
     A checkpoint that cannot be written is reported and tried again when the next one is due. The
-    first is saved before anything else is done, so that no policy is without one. ``restored`` is
-    the extra data of the checkpoint that this process began with.
+    first is saved before training, so that each policy has a checkpoint. ``restored`` is the extra
+    data of the checkpoint that this process began with.
     """
 
     config: TrainingConfig

@@ -41,7 +41,7 @@ _Bound = Annotated[float, Field(ge=-1e30, le=1e30)]
 
 
 class _Entries(BaseModel):
-    """Object with exactly these keys."""
+    """Base class of JSON objects; unknown keys are refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 

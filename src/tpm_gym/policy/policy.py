@@ -20,8 +20,8 @@ from tpm_gym.resources import POLICIES
 _BLOCK = 8
 """Rows of a batch that are multiplied at once.
 
-OpenBLAS uses no threads for so few, which would slow each other down on a busy machine, and an
-action has the same bits alone and in a batch.
+OpenBLAS uses no threads for so few rows. So an action has the same bits alone and in a batch, and
+threads do not slow each other down on a busy machine.
 """
 
 
