@@ -232,7 +232,7 @@ def _walk(actions: FloatArray) -> FloatArray:
     """Return the commands (n + 1, 3) m of Cartesian actions (n, 3) that start at HOME."""
     control, commands = CartesianControl(PAPER_TPM), [HOME]
     for action in actions:
-        commands.append(control.command(action, commands[-1]))
+        commands.append(control.command(action[None], np.array([commands[-1]]))[0])
     return np.array(commands)
 
 

@@ -50,7 +50,7 @@ def test_soak_goes_through_everything_and_passes(tmp_path, capsys, monkeypatch):
     for share in ("REOPEN", "RENDER", "SAVE"):
         monkeypatch.setattr(soak, share, 0.6)  # so that a short one sees all of it
     plot = tmp_path / "soak.png"
-    status, content = soaked(tmp_path, "--steps", "2000", "--plot", str(plot))
+    status, content = soaked(tmp_path, "--steps", "4000", "--plot", str(plot))
     output = capsys.readouterr().out
     assert status == 0, output
     assert content["failures"] == []

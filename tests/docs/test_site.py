@@ -18,17 +18,17 @@ from website import docstrings, projects, sources, tasks
 def stack():
     """Return the page of a task that is registered outside the package."""
     with patch.dict(gym.registry), patch.dict(TASKS):
-        import stacking  # registers TPMStack
+        import sorting  # registers TPMSort
 
-        assert stacking
-        return "\n".join(tasks.page("stack"))
+        assert sorting
+        return "\n".join(tasks.page("sort"))
 
 
 def test_a_new_task_has_a_page(stack):
-    assert stack.startswith("# Stack\n")
-    assert stacking_doc() in stack.replace("\n", " ")
+    assert stack.startswith("# Sort\n")
+    assert sorting_doc() in stack.replace("\n", " ")
     for row in (
-        "| `TPMStackJointsDense-v0` | joint increments | dense |",
+        "| `TPMSortJointsDense-v0` | joint increments | dense |",
         "| `red` | 36 mm | 30 mm | 50 g |",
         "| 3 | above 0: vacuum on |",
         "| `red_position` | 3 | m | centre of the red, from a camera |",
@@ -38,10 +38,10 @@ def test_a_new_task_has_a_page(stack):
         assert row in stack
 
 
-def stacking_doc():
-    import stacking
+def sorting_doc():
+    import sorting
 
-    return stacking.Stack.__doc__.split(". ")[0].split("\n")[0].strip()
+    return sorting.Sort.__doc__.split(". ")[0].split("\n")[0].strip()
 
 
 def test_the_page_tells_how_often_the_expert_succeeds(stack):

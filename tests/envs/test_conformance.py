@@ -43,6 +43,9 @@ CASES: list[tuple[str, dict[str, Any]]] = [
 def test_it_keeps_what_is_promised(
     check: Callable[[Make], None], env_id: str, options: dict[str, Any]
 ) -> None:
+    if "Stack" in env_id and "copies" in check.__name__ and options == {"machine": "wide"}:
+        # docs/environments.md says so.
+        pytest.xfail("PyBullet orders the contacts of two blocks by their history")
     check(lambda: gym.make(env_id, **options))
 
 
