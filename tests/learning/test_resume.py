@@ -4,6 +4,7 @@ import json
 import os
 import signal
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -132,6 +133,31 @@ def test_a_damaged_checkpoint_costs_only_time(killed: Kill) -> None:
     assert f"warning: damaged checkpoint: {damaged}" in said(console)
     assert "from step 150 to 300" in said(console)
     assert_equal_runs(uninterrupted("sac"), run)
+
+
+def test_a_checkpoint_that_no_training_wrote_is_refused_and_changes_nothing(killed: Kill) -> None:
+    run = killed(240).run
+    store = CheckpointStore(run / "checkpoints")
+    content = store.load(print)
+    assert content is not None
+    state = json.loads(content.files["state.json"])
+    forged = {
+        "state.json": (
+            b"{}",
+            b"[]",
+            b"[" * 100_000,
+            json.dumps({**state, "counters": {}}).encode(),
+        ),
+        "torch.pt": (b"", b"{}"),
+        "config.json": (b"null", b"[" * 100_000),
+    }
+    before = {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()}
+    for name, texts in forged.items():
+        for text in texts:
+            store.save(replace(content, files={**content.files, name: text}, finished=True))
+            with pytest.raises(CheckpointError, match="start the run anew with --overwrite"):
+                resume(ResumeConfig(run), quiet())
+    assert before == {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()}
 
 
 # -- hindsight over the seam -----------------------------------------------------------------------

@@ -8,12 +8,13 @@ import pytest
 from machines import each_machine
 
 from tpm_gym.arrays import FloatArray
-from tpm_gym.errors import ConfigurationError
+from tpm_gym.errors import ConfigurationError, ResetOptionError
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.tpm import PAPER_TPM, WIDE_TPM
 from tpm_gym.tasks import PickAndPlace, Reach, Task
+from tpm_gym.tasks.push import Push
 from tpm_gym.tasks.sampling import APART, BAND, line_in_joints
 
 SAFE = PAPER_TPM.safe_conditioning
@@ -130,3 +131,10 @@ def test_machines_on_which_nothing_can_be_drawn_are_told_instead_of_searched_for
     with pytest.raises(ConfigurationError) as caught:
         Reach(replace(PAPER_TPM, safe_conditioning=0.9)).start(rngs)
     assert caught.value.name == "safe_conditioning"
+
+
+def test_a_place_from_which_no_block_can_be_pushed_is_refused_by_its_name() -> None:
+    task = Push(PAPER_TPM)
+    for x in (-0.24, 0.12):
+        with pytest.raises(ResetOptionError, match=rf"object = \[{x}, .*0\.06 m"):
+            task.start([np.random.default_rng(0)], {"object": (x, -0.03, 0.02)})

@@ -8,10 +8,11 @@ the end of a rollout, with a checkpoint; a second Ctrl-C stops at once.
 
 import json
 import signal
-from collections.abc import Mapping
-from contextlib import ExitStack, closing
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,13 @@ from tpm_gym.learning.checkpoint import CheckpointStore, Content
 from tpm_gym.learning.configuration import UNSET, ResumeConfig, TrainingConfig, complete, resumed
 from tpm_gym.learning.demonstrations import Demonstrations
 from tpm_gym.learning.environments import import_module_of, make_env, make_envs
-from tpm_gym.learning.errors import ConfigError, DivergedError, PolicyError, RunError
+from tpm_gym.learning.errors import (
+    CheckpointError,
+    ConfigError,
+    DivergedError,
+    PolicyError,
+    RunError,
+)
 from tpm_gym.learning.evaluation import EvaluationConfig, evaluate
 from tpm_gym.learning.rollout import BATCH, SELECTION_SEED
 from tpm_gym.learning.run_folder import CHECKPOINTS, CONFIG_FILE, CURVE_FILE, TESTS, is_finished
@@ -104,7 +111,8 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
             return None
         content = store.load(lambda text: _say(console, f"warning: {text}"))
         if content:
-            stored = dict(json.loads(content.files[CONFIG_FILE]))
+            with _foreign_named(run):
+                stored = dict(json.loads(content.files[CONFIG_FILE]))
         elif stored is None:
             raise RunError(f"{run} holds no run of tpm_gym; start one with tpm-gym train")
         elif run_folder.holds_policy(run):
@@ -121,6 +129,20 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
             "resumed": [*stored.get("resumed", []), resumption],
         }
         return _Session(changed, console, store, description, content).run()
+
+
+@contextmanager
+def _foreign_named(run: Path) -> Iterator[None]:
+    """Raise an error of a checkpoint with a right sum, and entries that no training writes."""
+    try:
+        yield
+    except TPMError:
+        raise
+    except Exception as error:  # whatever JSON, PyTorch and NumPy raise
+        raise CheckpointError(
+            f"the checkpoint of {run} has other entries than a training writes "
+            f"({type(error).__name__}: {str(error)[:100]}); start the run anew with --overwrite"
+        ) from error
 
 
 def _say(console: Console, text: str) -> None:
@@ -174,7 +196,8 @@ class _Session:
         if content is None:
             run_folder.clear(config.run)
         else:  # files change only once the checkpoint is restored
-            extra = training_state.restore(model, content)
+            with _foreign_named(config.run):
+                extra = training_state.restore(model, content)
             training_state.restore_files(config.run, content)
         provenance.write_json(config.run / CONFIG_FILE, self.description)
         start = f"from step {content.step if content else 0:,} to "

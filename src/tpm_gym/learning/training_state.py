@@ -141,8 +141,8 @@ def restore(model: BaseAlgorithm, content: Content) -> dict[str, Any]:
         The ``extra`` of :func:`capture`.
     """
     state = json.loads(content.files[STATE])
-    for name, value in state["counters"].items():
-        setattr(model, name, value)
+    for name in _COUNTERS:
+        setattr(model, name, type(getattr(model, name))(state["counters"][name]))
     size = model._stats_window_size
     model.ep_info_buffer, model.ep_success_buffer = (
         deque(entries, maxlen=size) for entries in state["statistics"]

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from tpm_gym.arrays import BoolArray, FloatArray
-from tpm_gym.errors import ConfigurationError
+from tpm_gym.errors import ConfigurationError, ResetOptionError
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.simulation.state import Block, Scene, State
 from tpm_gym.tasks import sampling
@@ -50,7 +50,7 @@ class Push(Task):
     def sample(
         self, rngs: Sequence[np.random.Generator], chosen: Mapping[str, FloatArray]
     ) -> dict[str, FloatArray]:
-        """See the base class."""
+        """See the base class; a chosen place must leave room for a way."""
         ways = np.empty((len(rngs), 2, 3))  # start and goal
         rows = np.arange(0 if len(chosen) == 2 else len(rngs))
         for _ in range(_ATTEMPTS):
@@ -64,6 +64,10 @@ class Push(Task):
             fits = self._can_push(drawn)
             ways[rows] = drawn[np.arange(len(rows)), fits.argmax(axis=1)]
             rows = rows[~fits.any(axis=1)]
+        if chosen:
+            name, places = next(iter(chosen.items()))
+            valid = f"a place with room for a way of {SHORTEST} m or more that the robot can push"
+            raise ResetOptionError(name, places[rows[0]].tolist(), valid)
         valid = f"one in which a block can be pushed by {SHORTEST} m from its place to the goal"
         raise ConfigurationError("goal_region", self.machine.goal_region, valid)
 
