@@ -12,7 +12,7 @@ import tpm_gym
 from tpm_gym import TPMEnv, register_task
 from tpm_gym.envs.ids import env_ids
 from tpm_gym.errors import ConfigurationError
-from tpm_gym.tasks import PickAndPlace, Push, Reach, Stack
+from tpm_gym.tasks import PickAndPlace, Push, Reach, Stack, Throw
 from tpm_gym.tasks.registry import TASKS
 
 

@@ -7,6 +7,7 @@ from tpm_gym.tasks.push import Push
 from tpm_gym.tasks.reach import Reach
 from tpm_gym.tasks.stack import Stack
 from tpm_gym.tasks.task import Entry, Task, dense
+from tpm_gym.tasks.throw import Throw
 
 __all__ = [
     "Entry",
@@ -18,6 +19,7 @@ __all__ = [
     "Reach",
     "Stack",
     "Task",
+    "Throw",
     "dense",
     "hanging",
 ]

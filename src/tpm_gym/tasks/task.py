@@ -13,7 +13,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import cycle, groupby, pairwise
+from itertools import chain, cycle, groupby, pairwise
 from typing import Any, ClassVar
 
 import numpy as np
@@ -296,12 +296,19 @@ class Task(ABC):
         """Copy points (size,) m that a user chose for P or for blocks; raise if out of reach."""
         points = np.array(finite(name, value, (size,), ResetOptionError))
         for point, block in zip(points.reshape(-1, 3), cycle(blocks), strict=False):
-            low, high = self.reach_of(block)
-            margin = float(np.minimum(point - low, high - point).min())
+            boxes = self.goals_of(block) if name == "goal" else [self.reach_of(block)]
+            margin = max(float(np.minimum(point - low, high - point).min()) for low, high in boxes)
             if margin < -1e-6:
-                hint = f"{name} must lie in {_range(low, high)}"
+                hint = f"{name} must lie in {' or in '.join(_range(*box) for box in boxes)}"
                 raise UnreachableError(point.tolist(), "box", margin, hint)
         return points
+
+    def goals_of(self, block: Block | None) -> list[tuple[FloatArray, FloatArray]]:
+        """Return boxes, as lowest and highest place (3,) m, of goals for point P or for a block.
+
+        They are what the robot can reach. A task that aims elsewhere overrides this.
+        """
+        return [self.reach_of(block)]
 
     def reach_of(self, block: Block | None) -> tuple[FloatArray, FloatArray]:
         """Return the low and high corners (3,) m of the region of P, or of a block in the cup."""
@@ -458,14 +465,16 @@ class Task(ABC):
         """Return the corners (k, 3) m of the box outside which each object is lost."""
         low, high = np.empty((2, len(self.scene.objects), 3))
         for index, block in enumerate(self.scene.objects):
-            least, most = self._place_of(block)
-            slack = block.width / 2  # the cup may hold the block off its middle
-            low[index, :2], high[index, :2] = least[:2] - slack, most[:2] + slack
+            ends = np.stack([*self._place_of(block), *chain(*self.goals_of(block))])
+            # The cup may hold the block off its middle, and the block may stop beside its goal.
+            slack = max(block.width / 2, self.tolerance)
+            low[index, :2] = ends[:, :2].min(axis=0) - slack
+            high[index, :2] = ends[:, :2].max(axis=0) + slack
         low[:, 2], high[:, 2] = 0.0, np.inf
         return low, high
 
     def lost(self, state: State) -> BoolArray:
-        """Return whether an object is off the table or out of the robot's reach, (n,)."""
+        """Return whether an object is off the table, or out of reach and beyond all goals, (n,)."""
         places = np.ascontiguousarray(state.object_position)
         lost: BoolArray = loops().any_outside(places, *self._within)
         return lost

@@ -1,0 +1,191 @@
+"""Throw: let a block go in flight, so that it slides to rest at a goal outside the workspace."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Final
+
+import numpy as np
+
+from tpm_gym.arrays import FloatArray
+from tpm_gym.errors import ConfigurationError
+from tpm_gym.mechanism.cup import CUP
+from tpm_gym.mechanism.mount import GRAVITY
+from tpm_gym.simulation.state import CONTROL_PERIOD, Block, Scene, State
+from tpm_gym.tasks import sampling
+from tpm_gym.tasks.motion import Motion, Move, hanging
+from tpm_gym.tasks.task import Entry, Task, dense
+
+__all__ = ["Throw"]
+
+NEAREST: Final = 0.040
+FARTHEST: Final = 0.150
+"""Limits of the distance of goals from the end of the region, along x, m."""
+CLEARANCE: Final = 0.028
+"""Height over the block at which the expert arrives and to which it leaves, m."""
+DROP: Final = 0.003
+"""Height over the table at which the block is let go, m; low, so that it does not tumble."""
+BRAKING: Final = 0.050
+"""Distance from the place of release to the end of the region, within which P stops, m."""
+RUN_UP: Final = (1 / 3, 2 / 3, 1.0, 1.0, 1.0)
+"""Steps of the command in units of the last one, in which the cup lets go.
+
+The path is a spline of three commands, so that three equal steps give a period of constant speed.
+"""
+VENTED: Final = CUP.venting_time * math.log(CUP.vacuum / CUP.least_vacuum) / CONTROL_PERIOD
+"""Time from the command to let go until the block is free, in control periods."""
+AHEAD: Final = 1.5 - VENTED
+"""Distance from the place of release to the command of that period, in units of its step.
+
+The spline lags the commands by half a period.
+"""
+_RUN_UP_WAY: Final = sum(RUN_UP) - AHEAD  # from its start to the release, in units of its last step
+_BRAKING_WAY: Final = AHEAD + sum(RUN_UP[:2])  # from the release to the stop
+_DRAWS: Final = 256
+_ATTEMPTS: Final = 100
+
+
+class Throw(Task):
+    """Pick up a block and let it go in flight, so that it slides to the goal and stops there.
+
+    The goals lie on the table outside the workspace, 40 to 150 mm beyond either end of the
+    machine's region along x, as far as its table and its speed allow. The block is slippery: at a
+    speed v it slides v^2 / (2 mu g), with mu = 0.1 against the table. The goal is achieved where
+    the centre of the block is within 20 mm of it.
+    """
+
+    block = Block(friction=0.1)
+    scene = Scene(objects=(block,), marker_radius=0.020)
+    vacuum = True
+    tolerance = 0.020
+    samplings = ("sampled", "tempting")
+    max_episode_steps = 75
+
+    def sample(
+        self, rngs: Sequence[np.random.Generator], chosen: Mapping[str, FloatArray]
+    ) -> dict[str, FloatArray]:
+        """See the base class."""
+        starts = dict(chosen)
+        if "object" not in starts:
+            table = self.on_table(self.block)
+            if self.goals == "tempting":
+                drawn = [sampling.at_threshold(rng, self.machine, table, 1) for rng in rngs]
+                points = np.concatenate(drawn)
+            else:
+                points = self.machine.sample(rngs, [table] * len(rngs))
+            starts["object"] = self.machine.mount.to_world(points) - hanging(self.block)
+        if "goal" not in starts:
+            starts["goal"] = np.array([self._draw_goal(rng) for rng in rngs])
+        return starts
+
+    def _draw_goal(self, rng: np.random.Generator) -> FloatArray:
+        """Draw a goal (3,) m for which the way of P with the block is safe."""
+        boxes, table = self.goals_of(self.block), self.on_table(self.block)
+        ends = np.stack([self.machine.mount.to_world(end) for end in (table.low, table.high)])
+        safe = self.machine.safe_conditioning
+        most = safe + sampling.BAND if self.goals == "tempting" else math.inf
+        for _ in range(_ATTEMPTS):
+            goals = rng.uniform(*boxes[rng.integers(len(boxes))], (_DRAWS, 3))
+            goals[:, 1] = rng.uniform(*np.sort(ends[:, 1]), _DRAWS)
+            least = self.machine.conditioning_at(self._lane(goals)).min(axis=-1)
+            fits = np.flatnonzero((least >= safe) & (least < most))
+            if len(fits):
+                goal: FloatArray = goals[fits[0]]
+                return goal
+        valid = f"'sampled' or another machine: {self.machine.name!r} has no such way to throw"
+        raise ConfigurationError("goals", self.goals, valid)
+
+    def goals_of(self, block: Block | None) -> list[tuple[FloatArray, FloatArray]]:
+        """Return the boxes beyond both ends of the region into which the robot can throw.
+
+        Raises:
+            ConfigurationError: If there is none.
+        """
+        low, high = self.reach_of(block)
+        longest = min(self.machine.step_limit[0], (high[0] - low[0] - BRAKING) / _RUN_UP_WAY)
+        slides = (max(longest, 0.0) / CONTROL_PERIOD) ** 2 / (2 * self.block.friction * GRAVITY)
+        edge = self.machine.table[0] - self.block.width / 2 - self.tolerance
+        boxes = []
+        for side, end in ((-1.0, low[0]), (1.0, high[0])):
+            farthest = min(FARTHEST, slides - BRAKING, edge - side * end)
+            if farthest > NEAREST:
+                box = np.array([low, high])
+                box[:, 0] = np.sort(end + side * np.array([NEAREST, farthest]))
+                box[:, 2] = self.block.height / 2
+                boxes.append((box[0], box[1]))
+        if not boxes:
+            beyond = NEAREST + self.block.width / 2 + self.tolerance
+            valid = f"one whose table goes on for more than {beyond:.3g} m beyond its region along x"
+            fast = math.sqrt(2 * self.block.friction * GRAVITY * (BRAKING + NEAREST))
+            valid += f", and that runs up to more than {fast:.2g} m/s within the region"
+            raise ConfigurationError("machine", self.machine.name, valid)
+        return boxes
+
+    def _release(self, goal: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return where the block is let go, (..., 3) m, and the way along x in one step, (...,) m.
+
+        A block that falls by h meets the table with the impulse m sqrt(2 g h), and friction takes
+        mu times that away from the speed v. So it gets v^2 / (2 mu g) + mu h far, fall included.
+        """
+        low, high = self.reach_of(self.block)
+        side = np.where(goal[..., 0] > (low[0] + high[0]) / 2, 1.0, -1.0)
+        place = goal.copy()
+        place[..., 0] = np.where(side > 0, high[0], low[0]) - side * BRAKING
+        place[..., 2] += DROP
+        way, friction = np.abs(goal - place)[..., 0], self.block.friction
+        speed = np.sqrt(2 * friction * GRAVITY * np.maximum(way - friction * DROP, 0.0))
+        return place, side * speed * CONTROL_PERIOD
+
+    def _lane(self, goal: FloatArray) -> FloatArray:
+        """Return where P begins to run up and where it has stopped, (..., 2, 3) m, own frame."""
+        place, step = self._release(goal)
+        lane = np.stack([place, place], axis=-2)
+        lane[..., 0, 0] -= _RUN_UP_WAY * step
+        lane[..., 1, 0] += _BRAKING_WAY * step
+        paper: FloatArray = self.machine.mount.to_paper(lane + hanging(self.block))
+        return paper
+
+    def observed(self) -> tuple[Entry, ...]:
+        """Return the entries of the robot, then those of the block."""
+        return (*self.robot_entries(), *self.object_entries())
+
+    def achieved(self, state: State) -> FloatArray:
+        """Return the centre of the block."""
+        return state.object_position[:, 0]
+
+    def shaping(self, state: State) -> dict[str, FloatArray]:
+        """Return minus half the distance from cup to block, for a dense reward only.
+
+        It is 0 where the block is out of reach: then it has been thrown.
+        """
+        if self.reward == "sparse":
+            return {}
+        place, (low, high) = state.object_position[:, 0, 0], self.reach_of(self.block)
+        within = (place >= low[0]) & (place <= high[0])
+        return {"approach": 0.5 * within * dense(self.gap(self.lip(state), self.top(state)))}
+
+    def plan(self, motion: Motion) -> Iterator[Move]:
+        """Pick up the block, carry it to the run-up, let it go at the speed it needs, and brake."""
+        name, up = self.block.name, np.array([0.0, 0.0, -DROP])  # paper z points down
+        goal, step = motion.goal, float(self._release(motion.goal)[1])
+        while True:
+            yield from motion.pick(self.block, CLEARANCE)
+            if not motion.holding(name):
+                continue
+            # The cup sits where it took the block, not on the block's middle.
+            shift = motion.seen["position"] - motion.seen["object_position"] - hanging(self.block)
+            begin = self._lane(goal)[0] + self.machine.mount.rotate(shift * (1.0, 1.0, 0.0))
+            yield from motion.go([motion.command + up, begin], vacuum=True, while_holding=name)
+            if motion.holding(name):
+                break
+        yield from self._throw(begin, step)
+
+    def _throw(self, point: FloatArray, step: float) -> Iterator[Move]:
+        """Run up from ``point``, switch the vacuum off in the last step, brake and leave."""
+        for index, share in enumerate(RUN_UP, start=1):
+            point = point + (share * step, 0.0, 0.0)
+            yield Move(point, index < len(RUN_UP))
+        for share in reversed(RUN_UP[:2]):
+            point = point + (share * step, 0.0, -CLEARANCE / 2)
+            yield Move(point, False)
