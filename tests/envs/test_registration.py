@@ -23,7 +23,7 @@ def registries() -> Iterator[None]:
         yield
 
 
-TASK_CLASSES = {"Reach": Reach, "PickAndPlace": PickAndPlace, "Push": Push, "Stack": Stack}
+TASK_CLASSES = {kind.__name__: kind for kind in (Reach, PickAndPlace, Push, Stack, Throw)}
 
 
 class Lift(PickAndPlace):
@@ -49,8 +49,8 @@ def test_an_id_means_what_it_says(env_id: str) -> None:
     assert inner.task.reward == ("dense" if "Dense" in env_id else "sparse")
     control = "JointControl" if "Joints" in env_id else "CartesianControl"
     assert type(inner.control).__name__ == control
-    assert env.action_space.shape == ((4,) if name in ("PickAndPlace", "Stack") else (3,))
-    assert env.spec.max_episode_steps == (100 if name == "Stack" else 50)
+    assert env.action_space.shape == ((3,) if name in ("Reach", "Push") else (4,))
+    assert env.spec.max_episode_steps == {"Stack": 100, "Throw": 60}.get(name, 50)
     assert env.metadata["render_fps"] == 25
 
 

@@ -1,5 +1,6 @@
 """The scripted controller solves every task on every machine, and says when it cannot."""
 
+import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -41,8 +42,8 @@ def solved(env: Any, **options: Any) -> bool:
 def test_it_solves_every_task_clear_of_the_singularity_with_half_the_torque(
     env_id: str, options: dict[str, str], episodes: int, wanted: int
 ) -> None:
-    if "Push" in env_id and options.get("engine") == "kinematic":
-        pytest.skip("needs contact between lip and block")
+    if re.search("Push|Throw", env_id) and options.get("engine") == "kinematic":
+        pytest.skip("needs contact, or motion of what is let go")
     env: Any = gym.make(env_id, **options)
     machine, successes, clear = env.unwrapped.machine, 0, 0
     safe, effort = machine.safe_conditioning, [motor.effort for motor in machine.mechanism.motors]

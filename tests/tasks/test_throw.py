@@ -23,10 +23,10 @@ each_engine = pytest.mark.parametrize("engine", ["pybullet", "mujoco", "analytic
 def thrown(env: Any, seed: int, **options: Any) -> tuple[Any, Any]:
     """Final distance from the goal (3,) m, and positions and velocities (k, 2, 3) of the block."""
     rows = []
-    steps = Throw.max_episode_steps
-    for observation, _, info in expert_episode(env, seed, steps, options or None):
+    for last in expert_episode(env, seed, Throw.max_episode_steps, options or None):
         state = env.unwrapped.state
         rows.append((state.object_position[0], state.object_velocity[0]))
+        observation, _, info = last
     miss = observation["achieved_goal"] - observation["desired_goal"]
     assert info["is_success"] == (np.linalg.norm(miss) < Throw.tolerance)
     return miss, np.array(rows)
@@ -34,28 +34,31 @@ def thrown(env: Any, seed: int, **options: Any) -> tuple[Any, Any]:
 
 @each_engine
 @each_machine
-@pytest.mark.parametrize(
-    ("control", "goals", "episodes"),
-    [
-        ("", "sampled", 20),
-        ("Joints", "sampled", 20),
-        ("", "tempting", 6),
-        pytest.param("", "sampled", 200, marks=pytest.mark.slow),
-    ],
-)
-def test_the_expert_throws_to_within_a_third_of_the_tolerance(
-    engine: str, machine: Machine, control: str, goals: str, episodes: int
+@pytest.mark.parametrize("episodes", [20, pytest.param(200, marks=pytest.mark.slow)])
+def test_the_expert_throws_to_within_a_fourth_of_the_tolerance(
+    engine: str, machine: Machine, episodes: int
 ) -> None:
-    env: Any = gym.make(f"TPMThrow{control}-v0", engine=engine, machine=machine, goals=goals)
-    _, high = env.unwrapped.task.reach_of(Throw.block)
-    sides = set()
+    env: Any = gym.make("TPMThrow-v0", engine=engine, machine=machine)
+    low, high = env.unwrapped.task.reach_of(Throw.block)
+    ends = set()
     for seed in range(episodes):
         miss, rows = thrown(env, seed)
-        assert np.linalg.norm(miss) < Throw.tolerance / 3
+        assert np.linalg.norm(miss) < Throw.tolerance / 4
         assert np.linalg.norm(rows[-1, 1]) < 1e-3
-        assert np.abs(rows[:, 0, 2]).max() < 0.06  # it does not tumble
-        sides.add(bool(rows[-1, 0, 0] > high[0]))
-    assert sides == {False, True}
+        place = rows[-1, 0, 0]
+        assert place < low[0] - 0.03 or place > high[0] + 0.03
+        ends.add(bool(place > high[0]))
+    assert ends == {False, True}
+
+
+@each_machine
+def test_tempting_ways_are_only_just_safe(machine: Machine) -> None:
+    env: Any = gym.make("TPMThrow-v0", engine="analytic", machine=machine, goals="tempting")
+    for seed in range(6):
+        *steps, (_, _, info) = expert_episode(env, seed, Throw.max_episode_steps)
+        least = min(info["conditioning"] for _, _, info in steps) / machine.safe_conditioning
+        assert info["is_success"]
+        assert 0.95 < least < 1.1
 
 
 @each_engine
@@ -65,23 +68,26 @@ def test_a_block_slides_as_far_as_its_speed_squared_by_twice_mu_g(engine: str) -
     for end in (low[0] - 0.05, low[0] - 0.14, high[0] + 0.1):
         _, rows = thrown(env, 0, goal=(end, -0.035, 0.015))
         place, speed = rows[:, 0, 0], np.abs(rows[:, 1, 0])
-        first = int(speed.argmax()) + 2  # it has landed
-        assert speed[first] > 0.3
+        first = int(np.flatnonzero((place < low[0]) | (place > high[0]))[0])  # it has landed
+        assert speed[first] > 0.25
         way = abs(place[-1] - place[first])
         # An engine's time step of 4 ms moves it by 2 mm at that speed, and half of that remains.
         assert way == pytest.approx(speed[first] ** 2 / SLIDING, abs=0.0015)
-        braking = (speed[first] - speed[first + 5]) / (5 * CONTROL_PERIOD)
+        braking = (speed[first] - speed[first + 4]) / (4 * CONTROL_PERIOD)
         assert braking == pytest.approx(SLIDING / 2, rel=0.01)
 
 
-@pytest.mark.parametrize("machine", [PAPER_TPM, WIDE_TPM, replace(PAPER_TPM, step_limit=(0.022, 0.005, 0.03))])
+SLOW = replace(PAPER_TPM, step_limit=(0.022, 0.005, 0.030))  # too slow for the longest throws
+
+
+@pytest.mark.parametrize("machine", [PAPER_TPM, WIDE_TPM, SLOW])
 def test_the_expert_throws_to_the_ends_of_the_range(machine: Machine) -> None:
     env: Any = gym.make("TPMThrow-v0", engine="analytic", machine=machine)
     y = machine.mount.to_world(machine.home)[1]
     for box in env.unwrapped.task.goals_of(Throw.block):
         for corner in box:
             miss, _ = thrown(env, 0, goal=(corner[0], y, corner[2]))
-            assert np.linalg.norm(miss) < Throw.tolerance / 3
+            assert np.linalg.norm(miss) < Throw.tolerance / 4
 
 
 @each_machine
@@ -95,7 +101,7 @@ def test_goals_out_of_throwing_range_are_refused_with_the_range(machine: Machine
     assert stop[0] == pytest.approx(high[0] + 0.04)
     wrong = [start[0] + 0.001, stop[0] - 0.001, left[0] - 0.001, right[0] + 0.001, inside[0]]
     for place in (*((x, y, level) for x in wrong), (stop[0], 0.7, level), (stop[0], y, 0.03)):
-        with pytest.raises(UnreachableError, match="goal must lie in .* or in") as caught:
+        with pytest.raises(UnreachableError, match=r"goal must lie in .* or in") as caught:
             task.start(rng, {"goal": place})
         assert caught.value.margin < 0
         assert str(right.round(4).tolist()) in str(caught.value)
@@ -105,9 +111,9 @@ def test_goals_out_of_throwing_range_are_refused_with_the_range(machine: Machine
         task.start(rng, {"object": stop})
 
 
-@pytest.mark.parametrize("change", [{"table": (0.3, 0.3)}, {"step_limit": (0.016, 0.005, 0.03)}])
+@pytest.mark.parametrize("change", [{"table": (0.19, 0.3)}, {"step_limit": (0.016, 0.005, 0.03)}])
 def test_machines_that_cannot_throw_are_refused_by_name(change: dict[str, Any]) -> None:
-    with pytest.raises(ConfigurationError, match="'paper'.*table.*beyond its region") as caught:
+    with pytest.raises(ConfigurationError, match=r"'paper'.*table.*beyond its") as caught:
         Throw(replace(PAPER_TPM, **change))
     assert caught.value.name == "machine"
 
