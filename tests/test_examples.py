@@ -1,0 +1,94 @@
+"""Each example runs, is short, is listed, and prints what a reader can check."""
+
+import importlib.util
+import json
+import os
+import re
+import subprocess
+import sys
+
+import pytest
+from paths import ROOT
+
+EXAMPLES = ROOT / "examples"
+PRINTED = {
+    "behaviour_cloning": ("1", r"network: [\d.]+% of 400 episodes"),
+    "cleanrl_ppo": ("4096", r"4,096 steps: success at the end [\d.]+%"),
+    "kinematics_only": (
+        None,
+        r"Jacobian against differences: \de-0[7-9] m/rad\n(.*\n)*8\d\.\d% of",
+    ),
+    "own_machine": (None, r"the expert succeeds in (9\d|100) of 100 episodes"),
+    "own_task": (None, r"expert: (9\d\.\d|100\.0)% of 200 episodes"),
+    "ppo_analytic": ("4096", r"4,096 steps in \d+ s\nsuccess at the end: [\d.]+% of 500"),
+    "sb3_hindsight": ("200", r"success at the end: [\d.]+% of 200 episodes"),
+    "skrl_ppo": ("4096", r"success at the end: [\d.]+% of 200 episodes"),
+}
+"""Example -> its number of steps in this test, and the pattern of what it prints."""
+NEEDS = {"skrl_ppo": "skrl"}
+
+
+def run(name, folder, *arguments):
+    """Run an example in a folder of its own, and return what it prints."""
+    command = [sys.executable, str(EXAMPLES / f"{name}.py"), *arguments]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def require(name):
+    """Skip the test if a package that an example needs is missing."""
+    if name in NEEDS and importlib.util.find_spec(NEEDS[name]) is None:
+        pytest.skip(f"{NEEDS[name]} is not installed")
+
+
+@pytest.mark.parametrize("name", PRINTED)
+def test_an_example_runs(name, tmp_path):
+    require(name)
+    steps, pattern = PRINTED[name]
+    printed = run(name, tmp_path, *([] if steps is None else [steps]))
+    assert re.search(pattern, printed), printed
+
+
+def test_the_notebook_runs(capsys):
+    if importlib.util.find_spec("nbclient") and importlib.util.find_spec("ipykernel"):
+        import nbclient
+        import nbformat
+
+        nbclient.execute(nbformat.read(EXAMPLES / "first_run.ipynb", as_version=4))
+        return
+    names = {}
+    for cell in json.loads((EXAMPLES / "first_run.ipynb").read_text(encoding="utf-8"))["cells"]:
+        if cell["cell_type"] == "code":
+            exec("".join(cell["source"]), names)
+    printed = capsys.readouterr().out
+    assert "success: True" in printed
+    assert int(re.search(r"of the policy: (\d+) of 100", printed).group(1)) >= 95
+
+
+def test_the_notebook_holds_no_outputs():
+    cells = json.loads((EXAMPLES / "first_run.ipynb").read_text(encoding="utf-8"))["cells"]
+    assert not any(cell.get("outputs") or cell.get("execution_count") for cell in cells)
+
+
+def test_every_example_is_short_tested_and_on_the_page():
+    scripts = sorted(EXAMPLES.glob("*.py"))
+    assert [path.stem for path in scripts] == sorted(PRINTED)
+    page = (ROOT / "docs/examples.md").read_text(encoding="utf-8")
+    for path in (*scripts, EXAMPLES / "first_run.ipynb"):
+        assert f"(../examples/{path.name})" in page, path.name
+    for path in scripts:
+        assert len(path.read_text(encoding="utf-8").splitlines()) < 60, path.name
+
+
+SUCCESS = {"cleanrl_ppo": 90, "ppo_analytic": 90, "sb3_hindsight": 90, "skrl_ppo": 90}
+"""Least success of a whole run, percent."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SUCCESS)
+def test_a_whole_run_succeeds(name, tmp_path):
+    require(name)
+    last = re.findall(r"success at the end:? ([\d.]+)%", run(name, tmp_path))[-1]
+    assert float(last) >= SUCCESS[name]
