@@ -16,7 +16,7 @@ PRINTED = {
     "cleanrl_ppo": ("4096", r"4,096 steps: success at the end [\d.]+%"),
     "kinematics_only": (
         None,
-        r"Jacobian against differences: \de-0[7-9] m/rad\n(.*\n)*8\d\.\d% of",
+        r"Jacobian against differences: [\d.]+e-0[7-9] m/rad\n(.*\n)*8\d\.\d% of",
     ),
     "own_machine": (None, r"the expert succeeds in (9\d|100) of 100 episodes"),
     "own_task": (None, r"expert: (9\d\.\d|100\.0)% of 200 episodes"),
