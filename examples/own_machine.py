@@ -1,7 +1,7 @@
 """A machine with a longer link 7, checked for its region and conditioning, and used in a task.
 
-One learns that other lengths are a value, and how to find a region for them. It takes less than a minute,
-the first compilation included. The expert succeeds in 100 of 100 episodes.
+One learns that other lengths are a value, and how to find a region for them. It takes less than a
+minute, the first compilation included. The expert succeeds in 100 of 100 episodes.
 """
 
 from dataclasses import replace

@@ -1,8 +1,8 @@
 """PPO by skrl (``pip install skrl``) on the vector environment, for the dense Reach.
 
 One learns how a library that wraps ``gymnasium.vector`` takes the environments: skrl flattens the
-observation to achieved goal, desired goal and observation. It takes 24 s of a processor core, and reached
-100.0% success.
+observation to achieved goal, desired goal and observation. It takes 24 s of a
+processor core, and reached 100.0% success.
 """
 
 import sys
