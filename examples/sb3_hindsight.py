@@ -2,7 +2,8 @@
 
 One learns that an environment of this package is an ordinary one, and that the recipe brings the
 replay buffer that keeps the singularity penalty. It needs the installed package with the extra
-``train`` and nothing of the repository. It takes 47 s of a processor core, and reached 100.0% success.
+``train`` and nothing of the repository.
+It takes 47 s of a processor core, and reached 100.0% success.
 """
 
 import sys
