@@ -49,3 +49,23 @@ def test_results_of_something_else_are_rejected(
     with pytest.raises(SystemExit, match=message):
         export(tmp_path / "reach", evaluation)
     assert not (tmp_path / "reach.md").exists()
+
+
+def test_results_with_values_of_other_types_are_rejected(tmp_path: Path) -> None:
+    evaluation = tmp_path / "evaluation.json"
+    evaluation.write_text(json.dumps(json.loads(RESULTS.read_text()) | {"return": "good"}))
+    with pytest.raises(SystemExit, match="is no result of"):
+        export(tmp_path / "reach", evaluation)
+    assert not (tmp_path / "reach.md").exists()
+
+
+def test_a_card_replaces_no_file_of_others(tmp_path: Path) -> None:
+    card = tmp_path / "reach.md"
+    card.write_text("my notes")
+    with pytest.raises(SystemExit, match="no model card of tpm_gym"):
+        export(tmp_path / "reach", RESULTS)
+    assert card.read_text() == "my notes"
+    card.unlink()
+    for _ in range(2):  # an earlier card is replaced
+        export(tmp_path / "reach", RESULTS)
+    assert "library_name: tpm_gym" in card.read_text()

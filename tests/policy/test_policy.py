@@ -108,6 +108,20 @@ def test_a_tanh_output_fills_uneven_bounds(tmp_path: Path) -> None:
     assert actions.dtype == np.float64
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_network_that_overflows_gives_no_action(tmp_path: Path) -> None:
+    sizes = (7, *[2] * 12, 2)
+    weights = {name: np.full_like(values, 3e38) for name, values in some_weights(sizes).items()}
+    weights["layers.0.weight"] *= 0.0
+    weights["layers.12.weight"][:, 1] *= -1.0  # infinity minus infinity
+    data = safetensors.numpy.save(weights)
+    content = described(data)
+    content["network"] |= {"hidden": list(sizes[1:-1]), "output": "clip"}
+    policy = load_policy(write(tmp_path, content, data))
+    with pytest.raises(InputError, match="the network stays finite"):
+        policy.act(observations(4))
+
+
 def test_joined_entries_come_in_the_order_on_file(tmp_path: Path) -> None:
     weights = some_weights((10, 2))
     data = safetensors.numpy.save(weights)

@@ -10,6 +10,8 @@ import yaml
 from tpm_gym.learning import provenance
 from tpm_gym.learning.errors import ConfigError
 
+_OURS = "library_name: tpm_gym"
+_WAY = "`tpm-gym evaluate --policy POLICY --json FILE`, with one policy"
 _ROWS = {
     "success_at_end": "success at the end",
     "return": "return",
@@ -26,7 +28,8 @@ def write(policy: Path, evaluation: Path) -> Path:
         evaluation: JSON file of ``tpm-gym evaluate --json`` with one policy.
 
     Raises:
-        ConfigError: ``evaluation`` is no such file, or belongs to another id.
+        ConfigError: ``evaluation`` is no such file, or belongs to another id, or the card would
+            replace a file of others.
     """
     content = provenance.read_json(policy)
     tested = _read(evaluation)
@@ -35,7 +38,13 @@ def write(policy: Path, evaluation: Path) -> Path:
             f"--evaluation {evaluation}: is of {tested['env']}, the policy is of {content['env']}"
         )
     card = policy.with_suffix(".md")
-    provenance.write_whole(card, lambda part: part.write_text(_text(card.stem, content, tested)))
+    if card.exists() and _OURS not in card.read_text(encoding="utf-8", errors="replace"):
+        raise ConfigError(f"{card}: is no model card of tpm_gym, and would be replaced; move it")
+    try:
+        text = _text(card.stem, content, tested)
+    except (TypeError, KeyError, ValueError, AttributeError) as error:  # values of other types
+        raise ConfigError(f"--evaluation {evaluation}: is no result of {_WAY}") from error
+    provenance.write_whole(card, lambda part: part.write_text(text, encoding="utf-8"))
     return card
 
 
@@ -47,8 +56,7 @@ def _read(evaluation: Path) -> dict[str, Any]:
             return tested
     except (OSError, ValueError) as error:
         raise ConfigError(f"--evaluation {evaluation}: {error}") from error
-    way = "`tpm-gym evaluate --policy POLICY --json FILE`, with one policy"
-    raise ConfigError(f"--evaluation {evaluation}: is no result of {way}")
+    raise ConfigError(f"--evaluation {evaluation}: is no result of {_WAY}")
 
 
 def _text(name: str, content: Mapping[str, Any], tested: Mapping[str, Any]) -> str:

@@ -79,7 +79,8 @@ class Policy:
             The action, in the shape, dtype and bounds of the action space; (n, ...) for a batch.
 
         Raises:
-            InputError: An entry is missing, unknown, of the wrong shape, or not finite.
+            InputError: An entry is missing, unknown, of the wrong shape, or not finite, or the
+                network overflows.
         """
         x, batched = self._features(observation)
         network, space = self.description.network, self.description.action_space
@@ -87,10 +88,14 @@ class Policy:
         x = np.concatenate([x, np.zeros((-count % _BLOCK, size))])
         x = x.reshape(len(x) // _BLOCK, _BLOCK, size)
         *hidden, (weight, bias) = self._layers
-        for own_weight, own_bias in hidden:
-            x = x @ own_weight + own_bias
-            x = np.tanh(x) if network.activation == "tanh" else np.maximum(x, 0.0)
-        x = (x @ weight + bias).reshape(-1, *space.shape)[:count]
+        with np.errstate(over="ignore", invalid="ignore"):
+            for own_weight, own_bias in hidden:
+                x = x @ own_weight + own_bias
+                x = np.tanh(x) if network.activation == "tanh" else np.maximum(x, 0.0)
+            x = (x @ weight + bias).reshape(-1, *space.shape)[:count]
+        if np.isnan(x).any():
+            valid = "entries or weights with which the network stays finite"
+            raise InputError("observation", "an overflow", valid)
         if network.output == "tanh":
             x = space.low + 0.5 * (np.tanh(x) + 1.0) * (space.high - space.low)
         actions = np.clip(x, space.low, space.high).astype(space.dtype)
