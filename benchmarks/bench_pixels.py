@@ -1,4 +1,4 @@
-"""What pixel observations cost: steps per second of CPU time, with and without them.
+"""Measure the cost of pixel observations: steps per second of CPU time, with and without them.
 
 CPU time counts all threads, and hardly depends on what else a machine does.
 

@@ -195,8 +195,7 @@ def _trainings(study: Study) -> list[Run]:
         run
         for algo in study.algos or usual
         for env, recipe in read_recipes(recipe_file(algo, study.engine), algo).items()
-        if not study.envs or env in study.envs
-        if env in study.envs or _task(env).__name__ in STUDIED
+        if (env in study.envs if study.envs else _task(env).__name__ in STUDIED)
         for seed in range(study.seeds)
         for run in _runs_of_seed(study, env, algo, seed, "demonstrations" in recipe)
     ]

@@ -56,7 +56,7 @@ def set_camera(server: ViserServer, machine: Machine) -> None:
 
 
 class RobotScene:
-    """One robot over its table, with the objects and goal markers of a task.
+    """Robot over its table, with the objects and goal markers of a task.
 
     Args:
         scene: Scene of a viser server or client.

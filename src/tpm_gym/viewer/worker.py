@@ -1,4 +1,4 @@
-"""One thread that runs all changes of the viewer, one after the other."""
+"""Thread that runs all changes of the viewer, one after the other."""
 
 from __future__ import annotations
 
