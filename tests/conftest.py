@@ -1,6 +1,5 @@
 """Tests of an engine are skipped where its package is not installed."""
 
-from collections.abc import Generator
 from importlib.util import find_spec
 
 import pytest
@@ -14,8 +13,8 @@ collect_ignore_glob = (
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_runtest_call() -> Generator[None, None, None]:
-    """Skip a test that asked for PyBullet where PyBullet has no wheel."""
+def pytest_runtest_call():
+    """Skip a test that asks for PyBullet where PyBullet has no wheel."""
     try:
         return (yield)
     except MissingPackageError as error:
@@ -24,18 +23,10 @@ def pytest_runtest_call() -> Generator[None, None, None]:
         raise
 
 
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_setup() -> Generator[None, None, None]:
-    """Skip a test whose fixture asked for it."""
-    try:
-        return (yield)
-    except MissingPackageError as error:
-        if error.package == "pybullet":
-            pytest.skip(str(error))
-        raise
+pytest_runtest_setup = pytest_runtest_call  # fixtures may ask for PyBullet too
 
 
 @pytest.fixture(scope="session")
-def needs_pybullet() -> None:
+def needs_pybullet():
     """Skip a test that uses PyBullet in another process."""
     pytest.importorskip("pybullet")

@@ -1,7 +1,6 @@
 """Numbers are taken as users write them, and whatever is none is refused by a typed error."""
 
 from datetime import date
-from typing import Any
 
 import numpy as np
 import pytest
@@ -42,7 +41,7 @@ NO_NUMBERS = {
 
 @pytest.mark.parametrize("function", [numbers, points, finite_points, vector])
 @pytest.mark.parametrize("value", NO_NUMBERS.values(), ids=NO_NUMBERS)
-def test_what_is_no_number_is_refused(function: Any, value: Any) -> None:
+def test_what_is_no_number_is_refused(function, value):
     if value is NO_NUMBERS["gradients"] and function in (points, finite_points):
         assert function("theta", value).requires_grad
         return
@@ -67,7 +66,7 @@ def test_what_is_no_number_is_refused(function: Any, value: Any) -> None:
         list(torch.tensor([1.0, 2.0, 3.0])),
     ],
 )
-def test_three_numbers_become_plain_floats_whatever_holds_them(value: Any) -> None:
+def test_three_numbers_become_plain_floats_whatever_holds_them(value):
     found = vector("goal", value)
     assert found == (1.0, 2.0, 3.0)
     assert {type(v) for v in found} == {float}
@@ -75,18 +74,18 @@ def test_three_numbers_become_plain_floats_whatever_holds_them(value: Any) -> No
 
 
 @pytest.mark.parametrize("bad", [[0, 0], [[0, 0, 0]], 1.0, [], [0, np.nan, 0], (0, 0, -np.inf)])
-def test_other_shapes_and_numbers_without_end_are_refused_as_the_caller_wishes(bad: Any) -> None:
+def test_other_shapes_and_numbers_without_end_are_refused_as_the_caller_wishes(bad):
     for call in (vector, lambda *args: finite(args[0], args[1], (3,), args[2])):
         with pytest.raises(ResetOptionError, match=r"finite numbers.*of shape \(3,\)") as caught:
             call("goal", bad, ResetOptionError)
         assert caught.value.name == "goal"
 
 
-def test_numbers_that_only_floats_can_hold_are_numbers() -> None:
+def test_numbers_that_only_floats_can_hold_are_numbers():
     assert vector("goal", [10**20, 1e308, 1e308]) == (1e20, 1e308, 1e308)
 
 
-def test_points_keep_leading_shapes_and_may_be_infinite_unless_they_must_not() -> None:
+def test_points_keep_leading_shapes_and_may_be_infinite_unless_they_must_not():
     given = np.zeros((4, 5, 3))
     assert points("theta", given) is given
     given[2, 3, 1] = np.inf
@@ -103,14 +102,14 @@ def test_points_keep_leading_shapes_and_may_be_infinite_unless_they_must_not() -
 @pytest.mark.parametrize(
     "tensor", [torch.ones(3).to_sparse(), torch.ones(3) * 1j], ids=["sparse", "complex"]
 )
-def test_tensors_without_real_numbers_are_refused(tensor: Any) -> None:
+def test_tensors_without_real_numbers_are_refused(tensor):
     with pytest.raises(InputError, match="in a dense tensor"):
         points("theta", tensor)
 
 
-def test_points_in_tensors_stay_tensors_in_double_precision() -> None:
+def test_points_in_tensors_stay_tensors_in_double_precision():
     single = torch.ones(2, 3, requires_grad=True)
-    found: Any = points("theta", single)
+    found = points("theta", single)
     assert found.dtype == torch.float64
     found.sum().backward()
     assert single.grad is not None
@@ -119,12 +118,12 @@ def test_points_in_tensors_stay_tensors_in_double_precision() -> None:
 
 
 @pytest.mark.parametrize("count", [True, np.True_, 1.0, np.float64(2.0), "3", None, 0, np.int64(0)])
-def test_what_is_no_whole_number_of_one_or_more_makes_no_vector_environment(count: Any) -> None:
+def test_what_is_no_whole_number_of_one_or_more_makes_no_vector_environment(count):
     with pytest.raises(ConfigurationError, match="num_envs"):
         TPMVectorEnv("reach", num_envs=count)
 
 
-def test_numpys_whole_numbers_are_whole_numbers() -> None:
+def test_numpys_whole_numbers_are_whole_numbers():
     envs = TPMVectorEnv("reach", num_envs=np.int64(2), max_episode_steps=np.int32(5))
     assert envs.num_envs == 2
     assert type(envs.num_envs) is int
@@ -132,7 +131,7 @@ def test_numpys_whole_numbers_are_whole_numbers() -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_rotations_are_those_of_the_quaternions_matrix(seed: int) -> None:
+def test_rotations_are_those_of_the_quaternions_matrix(seed):
     rng = np.random.default_rng(seed)
     quaternion = rng.normal(size=4)
     x, y, z, w = quaternion = quaternion / np.linalg.norm(quaternion)

@@ -1,7 +1,5 @@
 """Compiled functions are those of today's sources, whatever the files on disk say."""
 
-from __future__ import annotations
-
 import importlib
 import logging
 import os
@@ -41,7 +39,7 @@ compilable(below)
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path, monkeypatch):
     (tmp_path / "own").mkdir()
     for name, text in SOURCES.items():
         (tmp_path / "own" / f"{name}.py").write_text(text)
@@ -65,9 +63,7 @@ def called() -> tuple[float, int]:
     return function(1.5), sum(function.stats.cache_hits.values())
 
 
-def test_a_kept_function_is_compiled_again_when_what_is_compiled_into_it_changes(
-    folder: Path,
-) -> None:
+def test_a_kept_function_is_compiled_again_when_what_is_compiled_into_it_changes(folder):
     assert [called(), called()] == [(3.0, 0), (3.0, 1)]
     (folder / "own/other.py").write_text("OTHER = 2\n")
     assert called() == (3.0, 1)
@@ -79,7 +75,7 @@ def test_a_kept_function_is_compiled_again_when_what_is_compiled_into_it_changes
 
 @pytest.mark.parametrize("ending", ["nbi", "nbc"])
 @pytest.mark.parametrize("content", [b"", b"nonsense", None])
-def test_a_damaged_file_is_replaced(folder: Path, ending: str, content: bytes | None) -> None:
+def test_a_damaged_file_is_replaced(folder, ending, content):
     called()
     (damaged,) = folder.glob(f"kept/*/*.{ending}")
     whole = damaged.read_bytes()
@@ -87,7 +83,7 @@ def test_a_damaged_file_is_replaced(folder: Path, ending: str, content: bytes | 
     assert [called(), called()] == [(3.0, 0), (3.0, 1)]
 
 
-def test_where_nothing_can_be_kept_functions_are_compiled_all_the_same(folder: Path) -> None:
+def test_where_nothing_can_be_kept_functions_are_compiled_all_the_same(folder):
     function = fresh()
     place = Path(function.stats.cache_path)
     shutil.rmtree(place)
@@ -98,7 +94,7 @@ def test_where_nothing_can_be_kept_functions_are_compiled_all_the_same(folder: P
     assert scope["triple"](1.5) == 4.5
 
 
-def test_processes_that_start_together_are_all_right(folder: Path) -> None:
+def test_processes_that_start_together_are_all_right(folder):
     paths = os.pathsep.join([str(folder), *sys.path])
     environment = os.environ | {"NUMBA_CACHE_DIR": str(folder / "kept"), "PYTHONPATH": paths}
     command = [sys.executable, "-B", "-c", "from own.main import apply; print(apply(1.5))"]
@@ -123,9 +119,7 @@ class Elapsed:
         """Do nothing: it is too late."""
 
 
-def test_a_long_wait_is_announced_once(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_long_wait_is_announced_once(folder, monkeypatch, caplog):
     # Neither other threads' turns nor loggers that libraries have changed decide what is seen.
     logger = logging.Logger("own")
     logger.addHandler(caplog.handler)

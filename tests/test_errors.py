@@ -81,8 +81,8 @@ CASES: list[tuple[type[TPMError], tuple[Any, ...], type[Exception], str]] = [
 
 @pytest.mark.parametrize(("kind", "values", "builtin", "shown"), CASES)
 def test_errors_carry_their_values_show_them_and_survive_the_way_between_processes(
-    kind: type[TPMError], values: tuple[Any, ...], builtin: type[Exception], shown: str
-) -> None:
+    kind, values, builtin, shown
+):
     error = kind(*values)
     assert isinstance(error, TPMError)
     assert isinstance(error, builtin)
@@ -95,7 +95,7 @@ def test_errors_carry_their_values_show_them_and_survive_the_way_between_process
         assert (str(again), vars(again)) == (str(error), vars(error))
 
 
-def test_every_error_is_a_case_above() -> None:
+def test_every_error_is_a_case_above():
     defined = {
         name
         for name, value in vars(errors).items()

@@ -16,11 +16,11 @@ WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
     ("file", "pattern"),
     [("CITATION.cff", r"^version: (.*)$"), ("conda/recipe.yaml", r'^  version: "(.*)"$')],
 )
-def test_one_version_stands_everywhere(file: str, pattern: str) -> None:
+def test_one_version_stands_everywhere(file, pattern):
     assert re.findall(pattern, (ROOT / file).read_text(), re.MULTILINE) == [tpm_gym.__version__]
 
 
-def test_the_conda_recipe_asks_for_what_the_package_needs() -> None:
+def test_the_conda_recipe_asks_for_what_the_package_needs():
     text = (ROOT / "conda" / "recipe.yaml").read_text()
     required = yaml.safe_load(text)["requirements"]["run"]
     recipe = {line.split()[0]: line.split()[1] for line in required}
@@ -33,7 +33,7 @@ def test_the_conda_recipe_asks_for_what_the_package_needs() -> None:
 
 
 @pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.name)
-def test_workflows_run_only_targets_and_sessions_that_exist(path) -> None:
+def test_workflows_run_only_targets_and_sessions_that_exist(path):
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     sessions = set(re.findall(r"^def ([a-z]+)\(", (ROOT / "noxfile.py").read_text(), re.MULTILINE))
     jobs = yaml.safe_load(path.read_text())["jobs"].values()

@@ -39,7 +39,7 @@ def all_centres(cells: Cells) -> FloatArray:
 
 
 @examples(20, oracle.geometries(), oracle.seeds(), modes)
-def test_the_grid_covers_the_reachable_set(g: Geometry, seed: int, mode: WorkingMode) -> None:
+def test_the_grid_covers_the_reachable_set(g, seed, mode):
     cells = aspects.reachable_set(mode, g, (24, 6, 24))
     reachable = workspace.reachable(all_centres(cells), mode, g)
     np.testing.assert_array_equal(cells.mask.ravel(), reachable)
@@ -52,7 +52,7 @@ def test_the_grid_covers_the_reachable_set(g: Geometry, seed: int, mode: Working
 
 
 @pytest.mark.parametrize("mode", [ELBOWS_OUT, WORKING_MODES[0]])
-def test_volumes_are_those_of_monte_carlo_within_the_stated_error(mode: WorkingMode) -> None:
+def test_volumes_are_those_of_monte_carlo_within_the_stated_error(mode):
     coarse, fine = (aspects.reachable_set(mode, shape=shape) for shape in (COARSE, FINE))
     rng = np.random.default_rng(1)
     low, high = [-1.6, -PAPER.l7, -1.3], [1.6, PAPER.l7, 1.3]
@@ -67,7 +67,7 @@ def test_volumes_are_those_of_monte_carlo_within_the_stated_error(mode: WorkingM
     assert 1.7 < coarse.volume_error / fine.volume_error < 2.3
 
 
-def test_volumes_of_aspects_converge() -> None:
+def test_volumes_of_aspects_converge():
     coarse, fine = (aspects.aspects(shape=shape) for shape in (COARSE, FINE))
     for one, other in zip(coarse[:6], fine[:6], strict=True):
         assert of(one) == of(other)
@@ -88,7 +88,7 @@ VOLUMES = {  # dm^3 by the signs of level3, planar and elevation, in one half
 
 
 @pytest.mark.slow
-def test_elbows_out_has_sixteen_aspects() -> None:
+def test_elbows_out_has_sixteen_aspects():
     found = aspects.aspects(shape=(200, 12, 260))
     assert len(found) == 16
     for side in (-1, 1):
@@ -101,7 +101,7 @@ def test_elbows_out_has_sixteen_aspects() -> None:
             assert volumes[signs] == pytest.approx(expected, rel=0.02)
 
 
-def test_volume_error_counts_no_flat_faces() -> None:
+def test_volume_error_counts_no_flat_faces():
     mask = np.zeros((6, 4, 6), dtype=bool)
     mask[1:5, 2:, 1:5] = True  # against y = 0 and y = l7; 12 of 16 columns are on the rim
     cells = Cells((0, 0, 0), (1, 1, 1), mask)
@@ -112,7 +112,7 @@ def test_volume_error_counts_no_flat_faces() -> None:
 
 
 @examples(20, oracle.geometries(), modes)
-def test_aspects_part_the_reachable_set_by_signs(g: Geometry, mode: WorkingMode) -> None:
+def test_aspects_part_the_reachable_set_by_signs(g, mode):
     shape = (24, 6, 24)
     found = aspects.aspects(mode, g, shape, min_cells=1)
     reachable = aspects.reachable_set(mode, g, shape)
@@ -138,7 +138,7 @@ def test_aspects_part_the_reachable_set_by_signs(g: Geometry, mode: WorkingMode)
 
 
 @examples(15, oracle.geometries(), modes, st.sampled_from([0.5, 4.0]))
-def test_sets_scale_with_the_lengths(g: Geometry, mode: WorkingMode, factor: float) -> None:
+def test_sets_scale_with_the_lengths(g, mode, factor):
     both = (
         aspects.aspects(mode, lengths, (16, 4, 16)) for lengths in (g, oracle.scaled(g, factor))
     )
@@ -169,9 +169,7 @@ def best_by_trying(mask: NDArray[np.bool_]) -> int:
 
 
 @examples(200, shapes, oracle.seeds(), st.floats(0.4, 1.0))
-def test_largest_block_is_that_of_trying_all(
-    shape: tuple[int, int, int], seed: int, density: float
-) -> None:
+def test_largest_block_is_that_of_trying_all(shape, seed, density):
     mask = np.random.default_rng(seed).random(shape) < density
     found, best = aspects._largest_block(mask), best_by_trying(mask)
     if found is None:
@@ -183,7 +181,7 @@ def test_largest_block_is_that_of_trying_all(
 
 
 @pytest.mark.parametrize("threshold", [0.0, 0.05, 0.1])
-def test_boxes_are_in_the_aspect_and_conditioned_well(threshold: float) -> None:
+def test_boxes_are_in_the_aspect_and_conditioned_well(threshold):
     aspect = aspects.aspects(shape=FINE)[1]
     box = aspects.largest_box(aspect, threshold)
     points = oracle.grid(box.region.low, box.region.high, (14, 14, 14))
@@ -201,7 +199,7 @@ def test_boxes_are_in_the_aspect_and_conditioned_well(threshold: float) -> None:
 
 
 @pytest.mark.parametrize("rank", [0, 3, 5])
-def test_samples_are_uniform_over_the_aspect_itself(rank: int) -> None:
+def test_samples_are_uniform_over_the_aspect_itself(rank):
     aspect, count = aspects.aspects(shape=COARSE)[rank], 20_000
     points = aspects.sample(np.random.default_rng(2), aspect, count)
     assert points.shape == (count, 3)
@@ -221,7 +219,7 @@ def test_samples_are_uniform_over_the_aspect_itself(rank: int) -> None:
     assert 0.5 < own.mean() < 0.999
 
 
-def test_samples_depend_on_the_rng_alone_and_are_not_singular() -> None:
+def test_samples_depend_on_the_rng_alone_and_are_not_singular():
     aspect = aspects.aspects(shape=COARSE)[0]
     first, second = (aspects.sample(np.random.default_rng(3), aspect, 50) for _ in range(2))
     np.testing.assert_array_equal(first, second)
@@ -235,7 +233,7 @@ def test_samples_depend_on_the_rng_alone_and_are_not_singular() -> None:
 @pytest.mark.parametrize(
     "shape", [(8, 8), (8, 7, 8), (1, 8, 8), (8, 8, 0), (8.5, 8, 8), (8, -2, 8), (8, 8, 8, 8)]
 )
-def test_grids_that_are_none_are_refused(shape: tuple[int, int, int]) -> None:
+def test_grids_that_are_none_are_refused(shape):
     for function in (aspects.reachable_set, aspects.aspects):
         with pytest.raises(ConfigurationError) as caught:
             function(ELBOWS_OUT, PAPER, shape)
@@ -243,7 +241,7 @@ def test_grids_that_are_none_are_refused(shape: tuple[int, int, int]) -> None:
         assert caught.value.value == shape
 
 
-def test_bad_arguments_are_refused() -> None:
+def test_bad_arguments_are_refused():
     aspect = aspects.aspects(shape=COARSE)[0]
     for threshold in (-0.1, 1.1, float("nan"), 0.9):  # no box is as good as the last
         with pytest.raises(ConfigurationError) as caught:
@@ -259,7 +257,7 @@ def test_bad_arguments_are_refused() -> None:
         aspects.aspects(min_cells=0)
 
 
-def test_mechanisms_that_reach_nothing_have_no_aspects() -> None:
+def test_mechanisms_that_reach_nothing_have_no_aspects():
     g = Geometry(l1=0.3, l2=1.5, l3=0.2, l4=0.15, l5=0.02, l6=0.0, l7=0.05)
     cells = aspects.reachable_set(geometry=g, shape=COARSE)
     assert aspects.aspects(geometry=g, shape=COARSE) == ()
@@ -278,7 +276,7 @@ def largest(g: Geometry, shape: tuple[int, int, int]) -> aspects.Box:
     return max(boxes, key=lambda box: box.volume)
 
 
-def test_wide_is_the_paper_s_mechanism_with_a_deeper_workspace() -> None:
+def test_wide_is_the_paper_s_mechanism_with_a_deeper_workspace():
     assert tpm_gym.WIDE is WIDE
     assert replace(WIDE, l7=PAPER.l7) == PAPER
     narrow, wide = (largest(g, (32, 24, 48)) for g in (PAPER, WIDE))
@@ -289,7 +287,7 @@ def test_wide_is_the_paper_s_mechanism_with_a_deeper_workspace() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("shape", [(64, 32, 80), (96, 64, 120)])
-def test_wide_meets_its_criterion(shape: tuple[int, int, int]) -> None:
+def test_wide_meets_its_criterion(shape):
     lengths = np.arange(1, 10) / 10
     volumes = [largest(replace(PAPER, l7=l7), shape).volume for l7 in lengths]
     assert lengths[np.argmax(volumes)] == WIDE.l7

@@ -1,7 +1,6 @@
 """The formulas of decoupling are derivatives, and their zeros are exact."""
 
 import re
-from typing import Any
 
 import numpy as np
 import oracle
@@ -25,7 +24,7 @@ from tpm_gym.errors import ConfigurationError, InputError, SingularityError, Unr
 from tpm_gym.kinematics import ASSEMBLY_MODES, AssemblyMode, forward_all, inverse, jacobian
 from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
 from tpm_gym.kinematics.workspace import Region
-from tpm_gym.mechanism import PAPER_TPM, WIDE_TPM, Machine
+from tpm_gym.mechanism import PAPER_TPM, WIDE_TPM
 
 
 def regular(branch: AssemblyMode, seed: int, g: Geometry) -> FloatArray:
@@ -36,11 +35,11 @@ def regular(branch: AssemblyMode, seed: int, g: Geometry) -> FloatArray:
 
 
 @examples(20, oracle.geometries(), oracle.seeds())
-def test_the_formulas_are_derivatives_with_these_zeros(g: Geometry, seed: int) -> None:
+def test_the_formulas_are_derivatives_with_these_zeros(g, seed):
     for branch in ASSEMBLY_MODES:
         theta, slot = regular(branch, seed, g), branch.index
 
-        def links(angles: Any, slot: int = slot) -> Any:
+        def links(angles, slot=slot):
             found = forward_all(angles, g)
             turned = g.l7 * found.beta[:, slot, None]
             return torch.cat([found.link3[:, slot], turned], dim=-1).sum(0)
@@ -54,7 +53,7 @@ def test_the_formulas_are_derivatives_with_these_zeros(g: Geometry, seed: int) -
         assert not jacobian.velocity(theta, branch, g)[:, ~PLATFORM].any()
 
 
-def test_nowhere_else_is_a_zero_by_structure() -> None:
+def test_nowhere_else_is_a_zero_by_structure():
     branch = ASSEMBLY_MODES[1]
     theta = regular(branch, 3, PAPER)
     assert len(theta) > 100
@@ -67,7 +66,7 @@ def test_nowhere_else_is_a_zero_by_structure() -> None:
         assert (np.median(np.abs(matrix), axis=0)[pattern] > 1e-2).all()
 
 
-def test_motor_3_moves_p_along_the_circle_of_link_7() -> None:
+def test_motor_3_moves_p_along_the_circle_of_link_7():
     theta = inverse(np.random.default_rng(1).uniform(*_corners(PAPER_TPM.region), (50, 3)))
     beta = forward_all(theta).beta[:, 1]
     column = jacobian.velocity(theta)[..., 2]
@@ -83,7 +82,7 @@ def _corners(region: Region) -> tuple[FloatArray, FloatArray]:
     return np.array(region.low), np.array(region.high)
 
 
-def test_shares_are_parts_of_the_variance() -> None:
+def test_shares_are_parts_of_the_variance():
     rng = np.random.default_rng(2)
     j = jacobian.velocity(inverse([-0.04, 0.028, 0.80]))
     rates = rng.normal(size=(200_000, 3))
@@ -95,7 +94,7 @@ def test_shares_are_parts_of_the_variance() -> None:
     np.testing.assert_allclose(shares(j), shares(-3.0 * j), rtol=1e-14)
 
 
-def test_motors_counts_motors() -> None:
+def test_motors_counts_motors():
     for matrix, expected in (
         (np.diag([1.0, -2.0, 3.0]), [1, 1, 1]),
         ([[0, 5, 0], [1, 1, 0], [1, -1, 1]], [1, 2, 3]),
@@ -106,9 +105,7 @@ def test_motors_counts_motors() -> None:
 
 
 @pytest.mark.parametrize(("machine", "g"), [(PAPER_TPM, PAPER), (WIDE_TPM, WIDE)])
-def test_the_index_over_a_region_is_the_mean_of_random_points(
-    machine: Machine, g: Geometry
-) -> None:
+def test_the_index_over_a_region_is_the_mean_of_random_points(machine, g):
     found = over(machine.region, geometry=g)
     points = np.random.default_rng(3).uniform(*_corners(machine.region), (4000, 3))
     j = jacobian.velocity(inverse(points, geometry=g), geometry=g)
@@ -118,7 +115,7 @@ def test_the_index_over_a_region_is_the_mean_of_random_points(
     assert found.motors[2] <= 2
 
 
-def test_the_documented_index_is_that_of_the_region() -> None:
+def test_the_documented_index_is_that_of_the_region():
     text = (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
     printed = re.search(r"x is moved by ([\d.]+) motors, y by ([\d.]+), z by ([\d.]+)", text)
     assert printed
@@ -127,7 +124,7 @@ def test_the_documented_index_is_that_of_the_region() -> None:
     )
 
 
-def test_what_has_no_answer_raises() -> None:
+def test_what_has_no_answer_raises():
     beyond, across = (
         Region((0, 0.02, 0.7), (0, 0.02, 2.0)),
         Region((0, -0.04, 0.8), (0, -0.03, 0.8)),

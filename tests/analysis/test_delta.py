@@ -48,7 +48,7 @@ def gaps(tripod: Tripod, position: FloatArray, q: FloatArray) -> FloatArray:
 
 
 @both
-def test_the_solutions_close_differ_and_lead_back(name: str) -> None:
+def test_the_solutions_close_differ_and_lead_back(name):
     tripod, points = sample(name, 200, 1)
     q = tripod.inverse_all(points)
     assert q.shape == (200, 8, 3)
@@ -62,7 +62,7 @@ def test_the_solutions_close_differ_and_lead_back(name: str) -> None:
 
 
 @both
-def test_each_leg_has_two_solutions_and_no_more(name: str) -> None:
+def test_each_leg_has_two_solutions_and_no_more(name):
     """So there are 8 in all, half of our 16. Changes of sign along the motor count them."""
     tripod, points = sample(name, 100, 2)
     turns = np.linspace(-np.pi, np.pi, 1440, endpoint=False)[:, None]  # m of a slider
@@ -76,7 +76,7 @@ def test_each_leg_has_two_solutions_and_no_more(name: str) -> None:
 
 
 @both
-def test_velocity_is_the_derivative_of_the_forward_kinematics(name: str) -> None:
+def test_velocity_is_the_derivative_of_the_forward_kinematics(name):
     tripod, points = sample(name, 50, 3)
     step = 1e-6
     for q in np.moveaxis(tripod.inverse_all(points), 1, 0):
@@ -92,7 +92,7 @@ def test_velocity_is_the_derivative_of_the_forward_kinematics(name: str) -> None
             assert (np.abs(j[..., motor] - slope) / size**2).max() < 1e-6
 
 
-def test_the_orthoglide_is_isotropic_at_its_home() -> None:
+def test_the_orthoglide_is_isotropic_at_its_home():
     q = ORTHOGLIDE.inverse_all([0, 0, 0])
     np.testing.assert_allclose(np.abs(q), PAPER.l4, atol=1e-15)
     np.testing.assert_allclose(ORTHOGLIDE.velocity([0, 0, 0], q[0]), np.eye(3), atol=1e-15)
@@ -112,9 +112,7 @@ def freedoms(chains: list[Chain], point: FloatArray) -> tuple[int, int]:
     ("balls", "equations", "degrees", "kappa"),
     [(False, [5, 4], [1, -1], 1), (True, [6, 6], [2, -2], 2)],
 )
-def test_counts(
-    name: str, balls: bool, equations: list[int], degrees: list[int], kappa: int
-) -> None:
+def test_counts(name, balls, equations, degrees, kappa):
     tripod, points = sample(name, 5, 4)
     for point in points:
         for q in tripod.inverse_all(point):
@@ -128,7 +126,7 @@ def test_counts(
             assert freedoms(chains, point) == (3, 0)
 
 
-def test_one_chain_is_no_parallel_mechanism() -> None:
+def test_one_chain_is_no_parallel_mechanism():
     with pytest.raises(InputError):
         analyse(DELTA.chains([0, 0, 0.8], DELTA.inverse_all([0, 0, 0.8])[0])[:1], [0, 0, 0.8])
 
@@ -148,7 +146,7 @@ def as_delta(p: dict[str, FloatArray], row: int) -> Tripod:
     return Tripod((one, two, three))
 
 
-def test_text_on_singularities_three_serial_factors_are_a_delta_s_and_no_parallel_one_is() -> None:
+def test_text_on_singularities_three_serial_factors_are_a_delta_s_and_no_parallel_one_is():
     s = oracle.reachable_postures(np.random.default_rng(5), 60, PAPER)
     parallel, serial = oracle.factors(s.theta, s.x_c, s.z_c, s.beta, PAPER)
     legs, determinants = [], []
@@ -165,14 +163,12 @@ def test_text_on_singularities_three_serial_factors_are_a_delta_s_and_no_paralle
 
 
 @both
-def test_the_platform_may_turn_where_the_planes_of_parallelograms_of_balls_share_a_direction(
-    name: str,
-) -> None:
+def test_the_platform_may_turn_where_the_planes_of_parallelograms_of_balls_share_a_direction(name):
     """A constraint singularity, which parallelograms of revolutes do not have."""
     tripod, rng = BOXES[name][0], np.random.default_rng(6)
     hinges = np.array([leg.hinge for leg in tripod.legs])
 
-    def volume(points: FloatArray) -> FloatArray:
+    def volume(points):
         """Return the volume of the normals of three planes, 0 if the planes share a direction."""
         rods = tripod.parallel(points, tripod.inverse_all(points)[:, 0])
         return np.linalg.det(np.cross(hinges, rods))
@@ -201,7 +197,7 @@ def table() -> dict[str, list[str]]:
     return {cells[0]: cells[1:] for cells in (row.split(" | ") for row in rows)}
 
 
-def test_the_page_s_numbers_are_computed() -> None:
+def test_the_page_s_numbers_are_computed():
     theta = inverse([-0.04, 0.028, 0.80])
     found = [analyse_ours(describe(theta))]
     counts = [over(PAPER_TPM.region).motors]
@@ -225,10 +221,10 @@ def test_the_page_s_numbers_are_computed() -> None:
     assert f'"motors that count" is {counts[2].mean():.2f} there' in TEXT
 
 
-def test_the_page_s_code_runs() -> None:
+def test_the_page_s_code_runs():
     (block,) = re.findall(r"^```python\n(.*?)^```", TEXT, flags=re.MULTILINE | re.DOTALL)
     namespace: dict[str, object] = {}
     exec(block, namespace)
     printed = re.findall(r"# (\S.*)$", block, flags=re.MULTILINE)
-    assert str(namespace["found"].platform) in printed[-1]  # type: ignore[attr-defined]
-    assert str(namespace["found"].coupling) in printed[-1]  # type: ignore[attr-defined]
+    assert str(namespace["found"].platform) in printed[-1]
+    assert str(namespace["found"].coupling) in printed[-1]

@@ -29,13 +29,13 @@ JOINED = [  # by a joint, a closure, or the cross between an arm and its rod
 
 
 def some_points(count: int, machine: Machine, mode: object = ELBOWS_OUT) -> FloatArray:
-    g = machine.geometry  # type: ignore[attr-defined]
+    g = machine.geometry
     points = oracle.reachable_points(np.random.default_rng(0), 4 * count, g)
-    return points[workspace.reachable(points, mode, g)][:count]  # type: ignore[arg-type]
+    return points[workspace.reachable(points, mode, g)][:count]
 
 
 @pytest.mark.parametrize("machine", [PAPER_TPM, WIDE_TPM])
-def test_stops_are_those_that_the_machine_enforces(machine: Machine) -> None:
+def test_stops_are_those_that_the_machine_enforces(machine):
     g = PAPER if machine is PAPER_TPM else WIDE
     points = some_points(400, machine)
     inside = within_stops(points, ELBOWS_OUT, g)
@@ -91,7 +91,7 @@ def nearest_geoms(machine: Machine, points: FloatArray, mode: int) -> list[float
     ("machine", "mode"),
     [(PAPER_TPM, ELBOWS_OUT.index), (PAPER_TPM, 0), (WIDE_TPM, ELBOWS_OUT.index)],
 )
-def test_clearance_is_that_of_mujoco_s_bodies(machine: Machine, mode: int) -> None:
+def test_clearance_is_that_of_mujoco_s_bodies(machine, mode):
     g = PAPER if machine is PAPER_TPM else WIDE
     points = some_points(40, machine, WORKING_MODES[mode])
     found = clearance(points, WORKING_MODES[mode], g)
@@ -106,14 +106,14 @@ def test_clearance_is_that_of_mujoco_s_bodies(machine: Machine, mode: int) -> No
     np.testing.assert_array_equal(clear_of_links(points, WORKING_MODES[mode], g), found > 0)
 
 
-def test_task_regions_are_within_all_limits() -> None:
+def test_task_regions_are_within_all_limits():
     for machine, g in ((PAPER_TPM, PAPER), (WIDE_TPM, WIDE)):
         points = oracle.grid(machine.region.low, machine.region.high, (5, 5, 5)).reshape(-1, 3)
         assert within_stops(points, ELBOWS_OUT, g).all()
         assert clear_of_links(points, ELBOWS_OUT, g).all()
 
 
-def test_limits_leave_parts_of_sets_and_of_aspects() -> None:
+def test_limits_leave_parts_of_sets_and_of_aspects():
     whole = aspects.reachable_set(shape=COARSE)
     left = [
         aspects.reachable_set(shape=COARSE, limits=limits)
@@ -133,7 +133,7 @@ def test_limits_leave_parts_of_sets_and_of_aspects() -> None:
         assert aspects.largest_box(part, 0.02).volume < part.cells.volume
 
 
-def test_the_figures_page_says_what_the_limits_leave() -> None:
+def test_the_figures_page_says_what_the_limits_leave():
     """It has percentages of the elbows-out mode, and of its regions with z_C1 > z_B1."""
     text = " ".join((ROOT / "docs" / "figures.md").read_text(encoding="utf-8").split())
     said = re.search(r"stops leave (\d+)% of it.* and (\d+)% once no two links", text)

@@ -38,7 +38,7 @@ def on_the_surface(side: int) -> tuple[FloatArray, FloatArray]:
 
 
 @pytest.mark.parametrize("side", [-1, 1])
-def test_both_modes_meet_on_the_surface(side: int) -> None:
+def test_both_modes_meet_on_the_surface(side):
     points, theta = on_the_surface(side)
     for found, near in ((forward_all(theta), 1e-9), (forward_rotated(theta), 1e-7)):
         apart = np.linalg.norm(found.position - points[:, None], axis=-1)
@@ -53,7 +53,7 @@ def test_both_modes_meet_on_the_surface(side: int) -> None:
             assert np.abs(found.link3[row, best, 1] - z_b).max() < 1e-9
 
 
-def test_from_there_the_platform_turns_either_way_without_a_jump() -> None:
+def test_from_there_the_platform_turns_either_way_without_a_jump():
     points, theta = on_the_surface(-1)
     steps = np.linspace(-1e-3, 1e-3, 21)
     path = forward_rotated(theta[:, None] + steps[:, None] * [1.0, 0.0, 0.0])
@@ -66,7 +66,7 @@ def test_from_there_the_platform_turns_either_way_without_a_jump() -> None:
     assert (tilt[steady][:, 0] * tilt[steady][:, -1] < 0).all()
 
 
-def test_where_they_meet_mobility_by_rank_is_4() -> None:
+def test_where_they_meet_mobility_by_rank_is_4():
     for theta in on_the_surface(-1)[1][:10]:
         found = forward_all(theta)
         level = np.abs(found.link3[:, 1] - PAPER.l3 * np.sin(theta[0])) < 1e-9
@@ -75,7 +75,7 @@ def test_where_they_meet_mobility_by_rank_is_4() -> None:
             assert (met.dof, met.rank, str(met.platform)) == (4, 10, "t^3 r^1")
 
 
-def test_mobility_by_rank_is_3_and_the_tilt_no_freedom_of_its_own() -> None:
+def test_mobility_by_rank_is_3_and_the_tilt_no_freedom_of_its_own():
     counted = 0
     for theta in np.random.default_rng(0).uniform(-np.pi, np.pi, (200, 3)):
         found = forward_rotated(theta)
@@ -130,7 +130,7 @@ def volumes(machine: TPM) -> tuple[str, ...]:
 
 
 @pytest.mark.slow
-def test_numbers_of_the_page() -> None:
+def test_numbers_of_the_page():
     names = ("postures of link 3' turned: 0, 2, 4", "motor angles with a rotated assembly",
              "1/cond of the rates of P, largest")  # fmt: skip
     for row in zip(names, *map(shares, (PAPER, WIDE)), strict=True):  # fmt: skip

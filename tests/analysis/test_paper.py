@@ -40,7 +40,7 @@ class Sample(SimpleNamespace):
 
 
 @pytest.fixture(scope="module")
-def sample() -> Sample:
+def sample():
     found = oracle.reachable_postures(np.random.default_rng(0), 300, PAPER)
     assert np.abs(gap(found.p["B1"], found.p["C1"])).max() < CLOSED
     return Sample(**vars(found))
@@ -62,7 +62,7 @@ def assert_open(value: FloatArray) -> None:
 # Position analysis
 
 
-def test_text_under_eq_7_y_b1_can_be_zero() -> None:
+def test_text_under_eq_7_y_b1_can_be_zero():
     theta_1 = np.arccos(-l1 / l3)
     assert abs(oracle.points([theta_1, 0, 0], 0, 0, 0, PAPER)["B1"][1]) < 1e-15
     rng = np.random.default_rng(1)
@@ -71,7 +71,7 @@ def test_text_under_eq_7_y_b1_can_be_zero() -> None:
     assert forward_all(theta).valid.any()  # not just on paper: the mechanism can be assembled there
 
 
-def test_text_under_eq_7_a1_and_b1_vanish_together_at_any_l5_but_c1_only_at_l5_equal_l1() -> None:
+def test_text_under_eq_7_a1_and_b1_vanish_together_at_any_l5_but_c1_only_at_l5_equal_l1():
     """If all three are zero, the circles of Eq. (6) coincide, and link 3' moves freely."""
     for half_short in (0.1, 0.2, l1):
         cos_2 = (l1 - 2 * half_short) / l3  # a1 = 0
@@ -90,7 +90,7 @@ def test_text_under_eq_7_a1_and_b1_vanish_together_at_any_l5_but_c1_only_at_l5_e
     assert caught.value.name == "l5"
 
 
-def test_eq_8b_second_line_gives_x_c1_not_z_c1(sample: Sample) -> None:
+def test_eq_8b_second_line_gives_x_c1_not_z_c1(sample):
     (_, y1, z1), (x2, _, z2) = sample["B1"], sample["B2"]
     a1, b1 = 2 * (x2 + 2 * l5), 2 * (z2 - z1)
     c1 = (x2 + 2 * l5) ** 2 + z2**2 - y1**2 - z1**2
@@ -104,7 +104,7 @@ def test_eq_8b_second_line_gives_x_c1_not_z_c1(sample: Sample) -> None:
     assert_open(gap(b, printed))
 
 
-def test_forward_kinematics_prints_f1_equal_to_e1(sample: Sample) -> None:
+def test_forward_kinematics_prints_f1_equal_to_e1(sample):
     """With this P, the section on inverse kinematics does not find the posture."""
     printed_p = sample.p["E1"] + [l2, 0, 0]
     ours_p = sample.p["P"]
@@ -114,7 +114,7 @@ def test_forward_kinematics_prints_f1_equal_to_e1(sample: Sample) -> None:
     np.testing.assert_allclose(printed_p[:, 2] + l6, ours_p[:, 2], atol=1e-15)
 
 
-def test_eq_10_holds_for_our_f1_not_for_the_printed_f1(sample: Sample) -> None:
+def test_eq_10_holds_for_our_f1_not_for_the_printed_f1(sample):
     """Eq. (10) as printed measures leg 3 from z_D1, so it presupposes z_D3 = z_D1 + l6."""
     x3, _, z3 = sample["B3"]
     reach, d1_z = sample["D1"][0] - x3 + 2 * l2, sample["D1"][2]
@@ -126,7 +126,7 @@ def test_eq_10_holds_for_our_f1_not_for_the_printed_f1(sample: Sample) -> None:
     assert_open(a2 * np.cos(sample.beta) - b2_of_printed_points)
 
 
-def test_forward_kinematics_prints_y_d3_minus_l6_as_z_of_c3(sample: Sample) -> None:
+def test_forward_kinematics_prints_y_d3_minus_l6_as_z_of_c3(sample):
     printed = sample.p["C3"].copy()
     printed[:, 2] = sample["D3"][1] - l6
     assert_open(gap(sample.p["B3"], printed))
@@ -166,7 +166,7 @@ def assert_leg(
     assert (~(wrong < OPEN))[:, among].mean() > 0.95  # open, or not even real
 
 
-def test_eq_13_leg_1_printed_swaps_g_and_h(sample: Sample) -> None:
+def test_eq_13_leg_1_printed_swaps_g_and_h(sample):
     x, _, z = sample["C1"]
     minus = (l1 - l3) ** 2 - l4**2 + x**2 + z**2
     plus = (l1 + l3) ** 2 - l4**2 + x**2 + z**2
@@ -177,10 +177,10 @@ def test_eq_13_leg_1_printed_swaps_g_and_h(sample: Sample) -> None:
     np.testing.assert_allclose(np.cos(printed), -np.cos(ours[::-1]), atol=1e-7)
 
 
-def test_eq_13_leg_2_printed_has_x_c1_squared_for_x_c2_squared(sample: Sample) -> None:
+def test_eq_13_leg_2_printed_has_x_c1_squared_for_x_c2_squared(sample):
     x1, (x2, _, z) = sample.x_c, sample["C2"]
 
-    def angles(square: FloatArray) -> FloatArray:
+    def angles(square):
         g = (l1 + l3) ** 2 - l4**2 + square + z**2 + 2 * x2 * (l1 + l3)
         h = (l1 - l3) ** 2 - l4**2 + square + z**2 + 2 * x2 * (l1 - l3)
         return half_angle(z, g, h)
@@ -190,7 +190,7 @@ def test_eq_13_leg_2_printed_has_x_c1_squared_for_x_c2_squared(sample: Sample) -
     assert_leg(sample, 2, angles(x1**2), angles(x2**2), among=apart)
 
 
-def test_eq_15_printed_lacks_the_x_c3_terms(sample: Sample) -> None:
+def test_eq_15_printed_lacks_the_x_c3_terms(sample):
     x, y, z = sample["C3"]
     printed_g, printed_h = ((l1 + s * l3) ** 2 - l4**2 + y**2 + z**2 for s in (-1, 1))
     g = printed_g + x**2 - 2 * x * (l1 - l3)
@@ -198,7 +198,7 @@ def test_eq_15_printed_lacks_the_x_c3_terms(sample: Sample) -> None:
     assert_leg(sample, 3, half_angle(z, printed_g, printed_h), half_angle(z, g, h))
 
 
-def test_inverse_kinematics_prints_one_branch_of_d1(sample: Sample) -> None:
+def test_inverse_kinematics_prints_one_branch_of_d1(sample):
     x, y, z = sample["P"]
     printed = np.stack([x - l2 + np.sqrt(l7**2 - y**2), 0 * x, z - l6], axis=-1)
     found = np.abs(printed - sample.p["D1"]).max(axis=1) < 1e-9
@@ -209,7 +209,7 @@ def test_inverse_kinematics_prints_one_branch_of_d1(sample: Sample) -> None:
     np.testing.assert_allclose(ours, sample.p["D1"], atol=1e-12)
 
 
-def test_number_of_inverse_solutions_is_2_2_2_2_not_4_4_2() -> None:
+def test_number_of_inverse_solutions_is_2_2_2_2_not_4_4_2():
     """The paper multiplies 4 by 4 by 2 to 16. Four theta_1 and four theta_2 share two betas."""
     theta = inverse_all([-0.04, 0.028, 0.80]).theta
     assert np.isfinite(theta).all()
@@ -243,7 +243,7 @@ def numeric_determinant(sample: Sample) -> FloatArray:
     return np.asarray(f1x * f2z - f1z * f2x)
 
 
-def test_eq_16_planar_factor_lacks_its_second_product(sample: Sample) -> None:
+def test_eq_16_planar_factor_lacks_its_second_product(sample):
     s1, s2, c2 = np.sin(sample.theta[:, 0]), np.sin(sample.theta[:, 1]), np.cos(sample.theta[:, 1])
     truth = numeric_determinant(sample) / 4
     ours = sample.x_c * (sample.z_c - l3 * s2)
@@ -257,7 +257,7 @@ def test_eq_16_planar_factor_lacks_its_second_product(sample: Sample) -> None:
     assert wrong_side.mean() > 0.05
 
 
-def test_eq_16_other_factors_are_as_printed_in_centimetres(sample: Sample) -> None:
+def test_eq_16_other_factors_are_as_printed_in_centimetres(sample):
     x3 = sample["B3"][0]
     printed = 35 * np.cos(sample.theta[:, 2]) - 100 * sample.x_c + 16
     np.testing.assert_allclose(printed / 100, x3 - sample.x_c - 2 * l2, atol=1e-12)
@@ -268,7 +268,7 @@ def test_eq_16_other_factors_are_as_printed_in_centimetres(sample: Sample) -> No
 def motor_derivative(sample: Sample, leg: int) -> FloatArray:
     """Return d f_leg / d theta_leg in cm^2/rad, by differences of fourth order."""
 
-    def value(turn: float) -> FloatArray:
+    def value(turn):
         return leg_gaps(sample, leg, sample.theta[:, leg - 1] + turn)[0]
 
     step = 1e-3
@@ -276,7 +276,7 @@ def motor_derivative(sample: Sample, leg: int) -> FloatArray:
     return np.asarray(1e4 * slope / (12 * step))
 
 
-def test_eq_17_theta_1_factor_is_as_printed_in_centimetres(sample: Sample) -> None:
+def test_eq_17_theta_1_factor_is_as_printed_in_centimetres(sample):
     s, c, z = np.sin(sample.theta[:, 0]), np.cos(sample.theta[:, 0]), 100 * sample.z_c
     printed = -2100 * s - 70 * z * c
     np.testing.assert_allclose(printed, motor_derivative(sample, 1), atol=1e-5)
@@ -284,7 +284,7 @@ def test_eq_17_theta_1_factor_is_as_printed_in_centimetres(sample: Sample) -> No
     assert np.median(np.abs(in_millimetres - motor_derivative(sample, 1))) > 1e3
 
 
-def test_eq_17_theta_2_factor_lacks_x_c1(sample: Sample) -> None:
+def test_eq_17_theta_2_factor_lacks_x_c1(sample):
     s, c = np.sin(sample.theta[:, 1]), np.cos(sample.theta[:, 1])
     x, z, truth = 100 * sample.x_c, 100 * sample.z_c, motor_derivative(sample, 2)
     printed = 1400 * s - 70 * z * c
@@ -294,7 +294,7 @@ def test_eq_17_theta_2_factor_lacks_x_c1(sample: Sample) -> None:
     np.testing.assert_allclose(printed - truth, 70 * (10 - x) * s, atol=1e-5)  # right at x_C1 = l5
 
 
-def test_eq_17_theta_3_factor_lacks_l6(sample: Sample) -> None:
+def test_eq_17_theta_3_factor_lacks_l6(sample):
     """It is printed with z_C1 in place of z_C3 = z_C1 + l6, as if F1 were E1; Eq. (10) is right."""
     s, c, cb = np.sin(sample.theta[:, 2]), np.cos(sample.theta[:, 2]), np.cos(sample.beta)
     x, z, truth = 100 * sample.x_c, 100 * sample.z_c, motor_derivative(sample, 3)
@@ -304,7 +304,7 @@ def test_eq_17_theta_3_factor_lacks_l6(sample: Sample) -> None:
     assert np.median(np.abs(printed - truth)) > 10
 
 
-def test_text_on_singularities_beta_pi_over_2_is_serial_and_beta_0_is_parallel() -> None:
+def test_text_on_singularities_beta_pi_over_2_is_serial_and_beta_0_is_parallel():
     at_edge = inverse([-0.04, l7, 0.80])  # beta = pi/2
     beside = jacobian.factors(at_edge)
     assert abs(beside.serial[0]) < 1e-7  # cos(beta), of Eq. (17)
@@ -317,7 +317,7 @@ def test_text_on_singularities_beta_pi_over_2_is_serial_and_beta_0_is_parallel()
     np.testing.assert_allclose(np.divide(sizes[1:], sizes[:-1]), 10, rtol=1e-2)
 
 
-def test_conclusion_decoupling_is_partial() -> None:
+def test_conclusion_decoupling_is_partial():
     """Link 3' follows theta_1 and theta_2 alone, but every coordinate of P follows all three."""
     theta, step = inverse([-0.04, 0.028, 0.80]), 1e-4
     moved = theta + [0, 0, step]
@@ -331,7 +331,7 @@ def test_conclusion_decoupling_is_partial() -> None:
     assert np.count_nonzero(np.abs(j) > 1e-9) == 8  # complete decoupling would leave three
 
 
-def test_singularities_lack_the_constraint_singularity_z_c1_equal_z_b1() -> None:
+def test_singularities_lack_the_constraint_singularity_z_c1_equal_z_b1():
     """There link 3' can turn about y, while every factor of Eqs. (16) and (17) is far from 0."""
     theta_1 = np.arccos(0.6)
     point, branch = oracle.level_rod_4(theta_1, np.arcsin(0.6)), AssemblyMode(1, 1)

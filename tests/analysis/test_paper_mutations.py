@@ -112,7 +112,7 @@ def rows() -> dict[str, list[str]]:
 ROWS = rows()
 
 
-def test_every_row_has_a_mutation_and_every_mutation_a_row() -> None:
+def test_every_row_has_a_mutation_and_every_mutation_a_row():
     assert len(ROWS) > 30
     for mutation in MUTATIONS:
         assert len([label for label in ROWS if label.startswith(mutation.row)]) == 1, mutation.row
@@ -121,7 +121,7 @@ def test_every_row_has_a_mutation_and_every_mutation_a_row() -> None:
 
 
 @pytest.mark.parametrize("mutation", MUTATIONS, ids=lambda m: f"{m.row}: {m.wrong}")
-def test_what_is_replaced_stands_there_once(mutation: Mutation) -> None:
+def test_what_is_replaced_stands_there_once(mutation):
     source = inspect.getsource(importlib.import_module(mutation.module))
     broken, count = mutate(source, mutation.right, mutation.wrong)
     assert count == 1
@@ -130,7 +130,7 @@ def test_what_is_replaced_stands_there_once(mutation: Mutation) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mutation", MUTATIONS, ids=lambda m: f"{m.row}: {m.wrong}")
-def test_the_row_s_tests_see_the_mutation(mutation: Mutation) -> None:
+def test_the_row_s_tests_see_the_mutation(mutation):
     tests = next(named for label, named in ROWS.items() if label.startswith(mutation.row))
     change = [mutation.module, mutation.right, mutation.wrong]
     path = os.pathsep.join(str(ROOT / part) for part in ("tests/support", "src", "docs"))

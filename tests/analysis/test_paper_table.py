@@ -24,29 +24,29 @@ def anchor(heading: str) -> str:
     return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
 
 
-def test_every_equation_has_its_row() -> None:
+def test_every_equation_has_its_row():
     rows = re.findall(r"^\| \((\d+)", TEXT, flags=re.MULTILINE)
     assert {int(number) for number in rows} == set(range(1, 18))
 
 
 @pytest.mark.parametrize(("file", "name"), TESTS)
-def test_named_tests_exist(file: str, name: str) -> None:
+def test_named_tests_exist(file, name):
     assert name in names_of_tests(file)
 
 
 @pytest.mark.parametrize("file", SLIPS)
-def test_every_test_of_a_slip_is_in_the_table(file: str) -> None:
+def test_every_test_of_a_slip_is_in_the_table(file):
     assert names_of_tests(file) <= {name for named, name in TESTS if named == file}
 
 
 @pytest.mark.parametrize("path", FUNCTIONS)
-def test_named_functions_exist(path: str) -> None:
+def test_named_functions_exist(path):
     module, *names = path.split(".")
     room = {"poc": "analysis.", "topology": "analysis.", "jacobian": "kinematics."}.get(module, "")
     assert callable(reduce(getattr, names, importlib.import_module(f"tpm_gym.{room}{module}")))
 
 
-def test_links_lead_to_sections() -> None:
+def test_links_lead_to_sections():
     sections = {anchor(h) for h in re.findall(r"^#+ (.+)$", TEXT, flags=re.MULTILINE)}
     links = set(re.findall(r"\]\(#([^)]+)\)", TEXT))
     assert links

@@ -8,7 +8,7 @@ import oracle
 import pytest
 
 from tpm_gym.analysis.poc import POCSet, Subspace
-from tpm_gym.analysis.topology import Structure, analyse, describe
+from tpm_gym.analysis.topology import analyse, describe
 from tpm_gym.kinematics import AssemblyMode, forward_all, inverse, inverse_all
 from tpm_gym.kinematics.geometry import PAPER
 
@@ -16,7 +16,7 @@ X, Y, Z = np.eye(3)
 
 
 @pytest.fixture(scope="module")
-def structures() -> list[Structure]:
+def structures():
     """The mechanism at random postures."""
     solutions = inverse_all(oracle.reachable_points(np.random.default_rng(0), 300, PAPER))
     found = []
@@ -30,23 +30,21 @@ def structures() -> list[Structure]:
     return found
 
 
-def test_eq_3b_printed_has_a_sum_on_the_left(structures: list[Structure]) -> None:
+def test_eq_3b_printed_has_a_sum_on_the_left(structures):
     """dim{...} of one j is one xi_Lj; the sum over j is 11, which no dim{...} can be."""
     xi = [loop.equations for loop in analyse(structures[0]).loops]
     assert xi == [6, 5]
     assert sum(xi) == 11 > 6
 
 
-def test_dof_formula_of_loop_2_printed_sums_to_1(structures: list[Structure]) -> None:
+def test_dof_formula_of_loop_2_printed_sums_to_1(structures):
     loops = analyse(structures[0]).loops
     freedoms, xi = [loop.freedoms for loop in loops], [loop.equations for loop in loops]
     assert sum(freedoms) - sum(xi[:1]) == 8  # as printed, j = 1 to 1
     assert sum(freedoms) - sum(xi) == 3 == analyse(structures[0]).dof()
 
 
-def test_eq_4_printed_m_i_t2_r2_contradicts_itself_and_is_t3_r2(
-    structures: list[Structure],
-) -> None:
+def test_eq_4_printed_m_i_t2_r2_contradicts_itself_and_is_t3_r2(structures):
     """With t^2 for branch I, Eq. (4) needs t^2 in common with branch II, xi_L1 needs t^3 in all."""
     rng = np.random.default_rng(2)
     branch_2 = Subspace.span([X, Z])
@@ -61,9 +59,7 @@ def test_eq_4_printed_m_i_t2_r2_contradicts_itself_and_is_t3_r2(
         assert ((m_1 & m_2).dim, (m_1 | m_2).dim) == (2, 6)
 
 
-def test_m_hsoc_1_printed_r1_perpendicular_to_bd_is_parallel_to_bd(
-    structures: list[Structure],
-) -> None:
+def test_m_hsoc_1_printed_r1_perpendicular_to_bd_is_parallel_to_bd(structures):
     """Link 3' turns about every axis in the parallelogram's plane, and not about its normal.
 
     The normal is perpendicular to rod bd, so r(perpendicular to bd) may be just what the rods
@@ -81,9 +77,7 @@ def test_m_hsoc_1_printed_r1_perpendicular_to_bd_is_parallel_to_bd(
     assert Subspace.span([short, in_plane]).dim == 1 < rotations.dim == 2
 
 
-def test_m_hsoc_2_printed_t1_parallel_to_r32_holds_at_y_0_only(
-    structures: list[Structure],
-) -> None:
+def test_m_hsoc_2_printed_t1_parallel_to_r32_holds_at_y_0_only(structures):
     """The 4R parallelogram translates along the tangent in its plane, across its rods."""
     for structure in structures:
         unit = next(u for u in structure.branches[2].units if u.name == "Pa(4R)")
@@ -95,9 +89,7 @@ def test_m_hsoc_2_printed_t1_parallel_to_r32_holds_at_y_0_only(
         )  # rods tilt by asin(y/l4)
 
 
-def test_xi_l2_printed_has_r12_r13_where_eq_3b_has_the_sub_mechanism(
-    structures: list[Structure],
-) -> None:
+def test_xi_l2_printed_has_r12_r13_where_eq_3b_has_the_sub_mechanism(structures):
     """It prints t^2(perpendicular to R12) r^1(|| R13); M_Pa(1-2) is t^2 r^0, the plane y = 0."""
     for structure in structures:
         found = analyse(structure)
@@ -110,7 +102,7 @@ def test_xi_l2_printed_has_r12_r13_where_eq_3b_has_the_sub_mechanism(
         assert found.loops[1].equations == 5
 
 
-def test_text_hsoc_2_printed_rpa_lacks_its_two_revolutes(structures: list[Structure]) -> None:
+def test_text_hsoc_2_printed_rpa_lacks_its_two_revolutes(structures):
     """R Pa(4R) alone has two freedoms; three translations and a rotation need R32 and R33 too."""
     for structure in structures:
         third = structure.branches[2]

@@ -1,7 +1,6 @@
 """POC sets are pairs of subspaces, and Eqs. (1) to (5) combine them as in the paper."""
 
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -45,7 +44,7 @@ def holds(whole: Subspace, part: Subspace) -> bool:
 
 
 @examples(200, subspaces, subspaces)
-def test_union_and_intersection_are_those_of_subspaces(a: Subspace, b: Subspace) -> None:
+def test_union_and_intersection_are_those_of_subspaces(a, b):
     union, common = a | b, a & b
     assert union.dim + common.dim == a.dim + b.dim
     assert holds(union, a)
@@ -60,7 +59,7 @@ def test_union_and_intersection_are_those_of_subspaces(a: Subspace, b: Subspace)
 
 
 @examples(100, vectors, st.floats(1e-3, 1e3))
-def test_span_is_the_rank_whatever_the_lengths(rows: list[tuple[int, ...]], scale: float) -> None:
+def test_span_is_the_rank_whatever_the_lengths(rows, scale):
     subspace = Subspace.span(rows)
     assert subspace.dim == (np.linalg.matrix_rank(np.array(rows)) if rows else 0)
     assert same(subspace, Subspace.span(scale * np.array(rows)))
@@ -68,13 +67,13 @@ def test_span_is_the_rank_whatever_the_lengths(rows: list[tuple[int, ...]], scal
 
 
 @pytest.mark.parametrize("bad", [[[1.0, 2.0]], [1.0, 2.0, 3.0], [[np.nan, 0, 0]], [[np.inf, 0, 0]]])
-def test_span_rejects_what_is_no_list_of_vectors(bad: list[list[float]]) -> None:
+def test_span_rejects_what_is_no_list_of_vectors(bad):
     with pytest.raises(InputError):
         Subspace.span(bad)
 
 
 @examples(100, poc_sets, poc_sets)
-def test_poc_sets_combine_by_column(a: POCSet, b: POCSet) -> None:
+def test_poc_sets_combine_by_column(a, b):
     for found, rule in ((serial([a, b]), Subspace.__or__), (parallel([a, b]), Subspace.__and__)):
         assert same(found.translations, rule(a.translations, b.translations))
         assert same(found.rotations, rule(a.rotations, b.rotations))
@@ -83,22 +82,20 @@ def test_poc_sets_combine_by_column(a: POCSet, b: POCSet) -> None:
 
 
 @examples(100, poc_sets, poc_sets, poc_sets)
-def test_independent_equations_are_those_of_what_the_chains_so_far_share_and_the_next(
-    a: POCSet, b: POCSet, c: POCSet
-) -> None:
+def test_independent_equations_are_those_of_what_the_chains_so_far_share_and_the_next(a, b, c):
     """dim(U + V) = dim U + dim V - dim(U intersected with V), in each column."""
     expected = 0
     for column in ("translations", "rotations"):
         u, v, w = (getattr(poc, column) for poc in (a, b, c))
         expected += (u & v).dim + w.dim - (u & v & w).dim
-    chains: Any = [
+    chains = [
         SimpleNamespace(name="", freedoms=0, actuated=0, poc=lambda _, one=one: one)
         for one in (a, b, c)
     ]
     assert decompositions(chains, np.zeros(3))[0][1].equations == expected
 
 
-def test_equations_1_and_2_need_a_set() -> None:
+def test_equations_1_and_2_need_a_set():
     for equation in (serial, parallel):
         with pytest.raises(InputError):
             equation([])
@@ -108,9 +105,7 @@ def test_equations_1_and_2_need_a_set() -> None:
 
 
 @examples(100, directions, directions, directions)
-def test_revolutes_translate_perpendicularly_to_axis_and_arm(
-    axis: tuple[float, ...], point: tuple[float, ...], base: tuple[float, ...]
-) -> None:
+def test_revolutes_translate_perpendicularly_to_axis_and_arm(axis, point, base):
     joint = revolute("R", np.array(axis), np.array(point))
     arm = np.subtract(base, point)
     poc = joint.poc(base)
@@ -124,7 +119,7 @@ def test_revolutes_translate_perpendicularly_to_axis_and_arm(
 
 
 @examples(100, directions, st.integers(0, 2**32 - 1))
-def test_three_parallel_revolutes_give_t2_r1(axis: tuple[float, ...], seed: int) -> None:
+def test_three_parallel_revolutes_give_t2_r1(axis, seed):
     points = np.random.default_rng(seed).normal(size=(3, 3))
     chain = Chain("3R", tuple(revolute("R", np.array(axis), p) for p in points))
     poc = chain.poc([0.1, 0.2, 0.3])
@@ -140,9 +135,7 @@ def far_link_freedoms(short: FloatArray, rod: FloatArray) -> FloatArray:
 
 
 @examples(100, directions, directions)
-def test_4s_parallelogram_has_the_freedoms_that_its_rods_leave(
-    short: tuple[float, ...], rod: tuple[float, ...]
-) -> None:
+def test_4s_parallelogram_has_the_freedoms_that_its_rods_leave(short, rod):
     a, b = np.array(short), np.array(rod)
     if np.linalg.norm(np.cross(a, b)) < 1e-2:
         return
@@ -157,9 +150,7 @@ def test_4s_parallelogram_has_the_freedoms_that_its_rods_leave(
 
 
 @examples(100, directions, directions)
-def test_4r_parallelogram_translates_along_the_tangent(
-    short: tuple[float, ...], rod: tuple[float, ...]
-) -> None:
+def test_4r_parallelogram_translates_along_the_tangent(short, rod):
     a, b = np.array(short), np.array(rod)
     if np.linalg.norm(np.cross(a, b)) < 1e-2:
         return
@@ -182,19 +173,17 @@ def test_4r_parallelogram_translates_along_the_tangent(
         ([[2, -1, -1], [3, -3, 0]], (2,)),
     ],
 )
-def test_coupling_degree_is_half_the_least_sum(
-    decompositions: list[list[int]], kappa: tuple[float, ...]
-) -> None:
+def test_coupling_degree_is_half_the_least_sum(decompositions, kappa):
     assert coupling_degrees(decompositions) == kappa
 
 
 @pytest.mark.parametrize("decompositions", [[], [[]], [[1]], [[0, 2]]])
-def test_coupling_degree_needs_balanced_constraint_degrees(decompositions: list[list[int]]) -> None:
+def test_coupling_degree_needs_balanced_constraint_degrees(decompositions):
     with pytest.raises(InputError):
         coupling_degrees(decompositions)
 
 
-def test_units_count_their_freedoms() -> None:
+def test_units_count_their_freedoms():
     unit = Unit("U", np.zeros(3), np.empty((0, 3)), np.stack([X, Y]))
     assert (unit.freedoms, str(unit.poc(np.zeros(3)))) == (2, "t^0 r^2")
     assert str(unit.poc(Z)) == "t^2 r^2"

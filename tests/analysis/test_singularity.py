@@ -66,7 +66,7 @@ def assert_feet_are_singular(
 
 
 @examples(40, oracle.geometries(), oracle.seeds(), st.sampled_from(WORKING_MODES))
-def test_factors_at_points_are_the_oracle_s(g: Geometry, seed: int, mode: WorkingMode) -> None:
+def test_factors_at_points_are_the_oracle_s(g, seed, mode):
     points = oracle.reachable_points(np.random.default_rng(seed), 100, g)
     found = singularity.factors_at(points, mode, g)
     values = singularity.dimensionless(found, g)
@@ -82,9 +82,7 @@ def test_factors_at_points_are_the_oracle_s(g: Geometry, seed: int, mode: Workin
 
 
 @examples(30, oracle.geometries(), oracle.seeds(), st.sampled_from(WORKING_MODES))
-def test_generic_points_are_regular_and_their_mode_is_their_signs(
-    g: Geometry, seed: int, mode: WorkingMode
-) -> None:
+def test_generic_points_are_regular_and_their_mode_is_their_signs(g, seed, mode):
     points = oracle.reachable_points(np.random.default_rng(seed), 100, g)
     points = points[workspace.reachable(points, mode, g)]
     found = singularity.classify_at(points, mode, g, tolerance=1e-9)
@@ -94,7 +92,7 @@ def test_generic_points_are_regular_and_their_mode_is_their_signs(
 
 
 @pytest.mark.parametrize("mode", WORKING_MODES)
-def test_both_ways_of_naming_a_configuration_agree(mode: WorkingMode) -> None:
+def test_both_ways_of_naming_a_configuration_agree(mode):
     points = oracle.reachable_points(np.random.default_rng(3), 400, PAPER)
     slots = workspace.assembly_of(points, mode)
     for assembly in ASSEMBLY_MODES:
@@ -120,7 +118,7 @@ def edge_of_leg3(x: float, y: float, g: Geometry = PAPER) -> FloatArray:
     return np.array([x, y, g.l6 + np.sqrt(level**2 - (x + g.l2 - g.l1) ** 2)])
 
 
-def test_the_kinds() -> None:
+def test_the_kinds():
     plane, edge = HOME * [1, 0, 1], np.array([HOME[0], PAPER.l7, HOME[2]])
     folded = edge_of_leg3(0.2, 0.03)
     cases = [
@@ -147,7 +145,7 @@ def test_the_kinds() -> None:
     assert SingularityType.BOTH == SingularityType.SERIAL | SingularityType.PARALLEL
 
 
-def test_constraint_singularities_are_those_of_the_arm_that_levels_the_rods() -> None:
+def test_constraint_singularities_are_those_of_the_arm_that_levels_the_rods():
     """z_C1 = z_B1 on half of the modes that reach the point, and no other factor is small there."""
     cos1 = 0.6
     point = oracle.level_rod_4(np.arccos(cos1), beta=0.6)
@@ -172,9 +170,7 @@ def test_constraint_singularities_are_those_of_the_arm_that_levels_the_rods() ->
     [(mode, 1000) for mode in (ELBOWS_OUT, WORKING_MODES[0], WORKING_MODES[14])]
     + [pytest.param(mode, 20_000, marks=pytest.mark.slow) for mode in WORKING_MODES],
 )
-def test_distance_is_that_of_brute_force(
-    mode: WorkingMode, assembly: AssemblyMode, count: int
-) -> None:
+def test_distance_is_that_of_brute_force(mode, assembly, count):
     compare(mode, assembly, PAPER, points=40, count=count)
 
 
@@ -199,13 +195,13 @@ def compare(
 
 
 @examples(4, oracle.geometries(), oracle.seeds(), st.sampled_from(WORKING_MODES))
-def test_distance_for_any_geometry(g: Geometry, seed: int, mode: WorkingMode) -> None:
+def test_distance_for_any_geometry(g, seed, mode):
     for assembly in SIDES:
         compare(mode, assembly, g, points=5, count=200, seed=seed)
 
 
 @examples(4, oracle.geometries(), oracle.seeds(), st.floats(0.1, 10))
-def test_distance_scales_and_is_symmetric_in_y(g: Geometry, seed: int, factor: float) -> None:
+def test_distance_scales_and_is_symmetric_in_y(g, seed, factor):
     points = oracle.reachable_points(np.random.default_rng(seed), 12, g)
     for assembly in SIDES:
         found = nearest_singularity(points, ELBOWS_OUT, assembly, g)
@@ -220,7 +216,7 @@ def test_distance_scales_and_is_symmetric_in_y(g: Geometry, seed: int, factor: f
         np.testing.assert_allclose(factor * found.distance, bigger.distance, rtol=1e-4)
 
 
-def test_distance_to_the_planes_is_exact_in_the_middle_of_the_workspace() -> None:
+def test_distance_to_the_planes_is_exact_in_the_middle_of_the_workspace():
     y = np.linspace(0, PAPER.l7, 11)
     found = nearest_singularity(oracle.vector(-0.05, y, 0.78))
     np.testing.assert_array_equal(found.distance, np.minimum(y, PAPER.l7 - y))
@@ -228,7 +224,7 @@ def test_distance_to_the_planes_is_exact_in_the_middle_of_the_workspace() -> Non
     np.testing.assert_array_equal(found.point[:5], oracle.vector(-0.05, 0 * y[:5], 0.78))
 
 
-def test_every_surface_is_met_somewhere() -> None:
+def test_every_surface_is_met_somewhere():
     points = oracle.reachable_points(np.random.default_rng(5), 6000, PAPER)
     found = nearest_singularity(points[:2500], ELBOWS_OUT, SIDES[0])
     assert set(found.factor[found.valid].tolist()) == set(range(8))
@@ -241,7 +237,7 @@ def test_every_surface_is_met_somewhere() -> None:
 
 
 @pytest.mark.parametrize("shape", [(), (4,), (2, 3), (0,)])
-def test_leading_shapes(shape: tuple[int, ...]) -> None:
+def test_leading_shapes(shape):
     points = np.broadcast_to(HOME, (*shape, 3))
     found = nearest_singularity(points)
     assert found.distance.shape == found.factor.shape == found.valid.shape == shape
@@ -252,7 +248,7 @@ def test_leading_shapes(shape: tuple[int, ...]) -> None:
     assert kinds.vanishing.shape == kinds.factors.shape == (*shape, 8)
 
 
-def test_points_that_are_none_are_masked_in_batches() -> None:
+def test_points_that_are_none_are_masked_in_batches():
     points = np.array([HOME, [np.nan, 0, 0], [np.inf, 0, 1], [1e200, 0.01, 1e200], [0, 0.06, 0.78]])
     found = nearest_singularity(points)
     assert found.valid.tolist() == [True, False, False, False, False]
@@ -262,7 +258,7 @@ def test_points_that_are_none_are_masked_in_batches() -> None:
         assert np.isnan(values[1:]).all()
 
 
-def test_bad_input_is_refused() -> None:
+def test_bad_input_is_refused():
     theta = inverse(HOME)
     for function in (singularity.classify_at, singularity.classify, nearest_singularity):
         for wrong in ([0.0, 0.0], 1.0):

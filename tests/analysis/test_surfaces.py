@@ -46,7 +46,7 @@ def assert_same_up_to_a_number(found: Any, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", list(FACTORS))
-def test_groebner_bases_eliminate_to_these_curves(name: str) -> None:
+def test_groebner_bases_eliminate_to_these_curves(name):
     leg, factor = FACTORS[name]
     angles = [(c1, s1), (c2, s2), (c3, s3, u)][leg]
     basis = sp.groebner([ON_CIRCLE[leg], closures()[leg], factor], *angles, x_c, z_c, order="lex")
@@ -54,7 +54,7 @@ def test_groebner_bases_eliminate_to_these_curves(name: str) -> None:
     assert_same_up_to_a_number(left, name)
 
 
-def test_resultants_eliminate_to_the_planar_curve() -> None:
+def test_resultants_eliminate_to_the_planar_curve():
     first, second, _ = closures()
     b2, b1 = CM.l1 - CM.l3 * c2 - 2 * CM.l5, CM.l3 * s1
     planar = x_c * (z_c - CM.l3 * s2) - (z_c - b1) * (x_c + b2)
@@ -75,7 +75,7 @@ def test_resultants_eliminate_to_the_planar_curve() -> None:
 
 
 @pytest.mark.parametrize("name", list(DEGREES))
-def test_degrees_along_a_line_and_no_u_is_left(name: str) -> None:
+def test_degrees_along_a_line_and_no_u_is_left(name):
     t = sp.Symbol("t")
     x, y, z = (sp.Poly(a + b * t, u, t) for a, b in ((3, 2), (1, 1), (-4, 3)))
     whole = polynomial(name, x, y, z, CM, sp.Poly(u, u, t))
@@ -92,9 +92,7 @@ GEOMETRIES = [PAPER, WIDE, Geometry(0.25, 0.06, 0.30, 0.65, 0.08, 0.02, 0.12)]
 
 
 @pytest.mark.parametrize("g", GEOMETRIES)
-def test_the_polynomials_of_the_legs_are_four_times_the_squares_of_their_factors(
-    g: Geometry,
-) -> None:
+def test_the_polynomials_of_the_legs_are_four_times_the_squares_of_their_factors(g):
     s = oracle.reachable_postures(np.random.default_rng(2), 200, g)
     _, serial = oracle.factors(s.theta, s.x_c, s.z_c, s.beta, g)
     found = [CURVES["leg1"](s.x_c, s.z_c, g), CURVES["leg2"](s.x_c, s.z_c, g)]
@@ -103,7 +101,7 @@ def test_the_polynomials_of_the_legs_are_four_times_the_squares_of_their_factors
 
 
 @pytest.mark.parametrize(("name", "index"), [("level3", 1), ("planar", 2)])
-def test_every_real_zero_within_reach_is_singular_in_some_mode(name: str, index: int) -> None:
+def test_every_real_zero_within_reach_is_singular_in_some_mode(name, index):
     """Elimination adds no zeros: all roots of the polynomial along lines in (xC, zC) count."""
     t = np.cos(np.pi * (np.arange(40) + 0.5) / 40)
     rng, singular, checked = np.random.default_rng(6), 0, 0
@@ -126,7 +124,7 @@ def test_every_real_zero_within_reach_is_singular_in_some_mode(name: str, index:
     assert singular == checked
 
 
-def test_all_surfaces_are_named() -> None:
+def test_all_surfaces_are_named():
     assert set(DEGREES) >= set(CURVES)
     assert polynomial("sin_beta", 1, 0, 1) == 0
     assert polynomial("cos_beta", 1, PAPER.l7, 1) == 0

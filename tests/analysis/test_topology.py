@@ -71,7 +71,7 @@ def assert_paper_topology(structure: Structure) -> None:
     assert found.coupling == (0, 0)
 
 
-def test_topology_is_the_paper_s_at_random_configurations() -> None:
+def test_topology_is_the_paper_s_at_random_configurations():
     sample = configurations(1, 60)
     assert len(sample) > 40
     for theta, branch in sample:
@@ -79,14 +79,14 @@ def test_topology_is_the_paper_s_at_random_configurations() -> None:
 
 
 @examples(15, oracle.geometries(), oracle.seeds())
-def test_topology_and_mobility_do_not_depend_on_lengths(g: Geometry, seed: int) -> None:
+def test_topology_and_mobility_do_not_depend_on_lengths(g, seed):
     for theta, branch in configurations(seed, 8, g):
         assert_paper_topology(describe(theta, branch, g))
         found = mobility(theta, branch, g)
         assert (found.dof, found.idle, str(found.platform)) == (3, 1, "t^3 r^0")
 
 
-def test_structure_has_the_paper_s_joints() -> None:
+def test_structure_has_the_paper_s_joints():
     structure = describe(inverse([-0.04, 0.028, 0.8]))
     names = [[unit.name for unit in chain.units] for chain in structure.branches]
     assert names[0] == ["R11", "Pa(4S)"]
@@ -101,7 +101,7 @@ def test_structure_has_the_paper_s_joints() -> None:
             assert same(Subspace.span(unit.rotations), Subspace.span([axes[unit.name]]))
 
 
-def test_number_of_loops_is_m_minus_n_plus_1() -> None:
+def test_number_of_loops_is_m_minus_n_plus_1():
     structure = describe(inverse([-0.04, 0.028, 0.8]))
     m = sum(chain.freedoms for chain in structure.chains)  # joints of one freedom each
     n = 2 + sum(chain.freedoms - 1 for chain in structure.chains)  # base, link 3', links between
@@ -111,7 +111,7 @@ def test_number_of_loops_is_m_minus_n_plus_1() -> None:
     assert len(build().closures) == 17 - 14 + 1
 
 
-def test_every_decomposition_has_the_same_freedoms_and_the_paper_s_couples_least() -> None:
+def test_every_decomposition_has_the_same_freedoms_and_the_paper_s_couples_least():
     for theta, branch in configurations(2, 12):
         found = analyse(describe(theta, branch))
         assert len(found.decompositions) == 6
@@ -133,7 +133,7 @@ def as_projector(poc: POCSet) -> FloatArray:
     return result
 
 
-def test_screw_theory_finds_the_same_sets() -> None:
+def test_screw_theory_finds_the_same_sets():
     for theta, branch in configurations(3, 40, clear=0.03):
         structure = describe(theta, branch)
         found = analyse(structure)
@@ -164,7 +164,7 @@ def joints_of_the_mechanism() -> list[str]:
     return [name for name in joints if name != "cup_slide"]
 
 
-def test_closure_jacobian_is_the_derivative_of_the_gaps() -> None:
+def test_closure_jacobian_is_the_derivative_of_the_gaps():
     step = 1e-5
     for theta, branch in configurations(4, 8):
         angles = joint_angles(theta, branch)
@@ -178,7 +178,7 @@ def test_closure_jacobian_is_the_derivative_of_the_gaps() -> None:
             np.testing.assert_allclose(found[:, column], slope, atol=1e-9, err_msg=name)
 
 
-def test_mobility_by_rank_agrees_with_the_poc_count() -> None:
+def test_mobility_by_rank_agrees_with_the_poc_count():
     sample = configurations(5, 120)
     assert len(sample) > 80
     for theta, branch in sample:
@@ -190,7 +190,7 @@ def test_mobility_by_rank_agrees_with_the_poc_count() -> None:
         assert found.dof == analyse(describe(theta, branch)).dof()
 
 
-def test_the_idle_freedom_is_end_link_10_about_its_own_axis() -> None:
+def test_the_idle_freedom_is_end_link_10_about_its_own_axis():
     for theta, branch in configurations(6, 8):
         angles = joint_angles(theta, branch)
         rolled = angles | {"R33": angles["R33"] + 1.0}
@@ -218,7 +218,7 @@ def on_constraint_singularity(
 
 @pytest.mark.parametrize("side", [-1, 1])
 @pytest.mark.parametrize("theta_1", [0.7, 0.9273, 1.2])
-def test_both_counts_find_the_constraint_singularity(theta_1: float, side: int) -> None:
+def test_both_counts_find_the_constraint_singularity(theta_1, side):
     sample = on_constraint_singularity(theta_1, side)
     assert sample
     for theta, branch in sample:
@@ -232,7 +232,7 @@ def test_both_counts_find_the_constraint_singularity(theta_1: float, side: int) 
 
 @examples(6, oracle.geometries())
 @example(PAPER)
-def test_the_loops_of_all_passive_joints_have_no_other_singularity(g: Geometry) -> None:
+def test_the_loops_of_all_passive_joints_have_no_other_singularity(g):
     """With the motors locked, the closures' volume is det A's factors, the constraint's, and zero
     else only where a rod lies along the first axis of the universal joint that it is given here."""
     mechanism, names = build(g), joints_of_the_mechanism()
@@ -250,13 +250,13 @@ def test_the_loops_of_all_passive_joints_have_no_other_singularity(g: Geometry) 
     np.testing.assert_allclose(shares, np.median(shares), rtol=0.1)
 
 
-def test_the_task_region_keeps_clear_of_the_constraint_singularity() -> None:
+def test_the_task_region_keeps_clear_of_the_constraint_singularity():
     points = oracle.grid(PAPER_TPM.region.low, PAPER_TPM.region.high, (9, 9, 9))
     z_c = points[..., 2] - 2 * PAPER.l6
     assert (z_c - PAPER.l3 * np.sin(inverse(points)[..., 0])).min() > PAPER.l3
 
 
-def test_doubtful_rank_raises() -> None:
+def test_doubtful_rank_raises():
     raised = 0
     for theta, branch in on_constraint_singularity(0.9273, 1, offset=1e-9):
         with pytest.raises(SingularityError):
@@ -268,7 +268,7 @@ def test_doubtful_rank_raises() -> None:
 
 
 @pytest.mark.parametrize("y", [-PAPER.l7, PAPER.l7])
-def test_at_the_edge_in_y_both_counts_lose_the_translation_but_no_freedom(y: float) -> None:
+def test_at_the_edge_in_y_both_counts_lose_the_translation_but_no_freedom(y):
     theta, branch = inverse([-0.04, y, 0.8]), AssemblyMode(-1, int(np.sign(y)))
     found, topology = mobility(theta, branch), analyse(describe(theta, branch))
     assert found.dof == topology.dof() == 3
@@ -277,14 +277,14 @@ def test_at_the_edge_in_y_both_counts_lose_the_translation_but_no_freedom(y: flo
         assert poc.rotations.dim == 0
 
 
-def test_a_locked_joint_takes_a_freedom() -> None:
+def test_a_locked_joint_takes_a_freedom():
     structure = describe(inverse([-0.04, 0.028, 0.8]))
     first, second, third = structure.branches
     locked = replace(structure, branches=(first, replace(second, units=second.units[1:]), third))
     assert analyse(locked).dof() == 2
 
 
-def test_unreachable_and_malformed_angles_raise() -> None:
+def test_unreachable_and_malformed_angles_raise():
     for function in (describe, mobility):
         with pytest.raises(UnreachableError):
             function([0.0, 0.0, np.pi])

@@ -45,7 +45,7 @@ COMMAND = (PYTHON, "-m", "benchmarks.studies", "run")
 # -- the plan -------------------------------------------------------------------------------------
 
 
-def test_plans_have_every_recipe_and_seed(tmp_path: Path) -> None:
+def test_plans_have_every_recipe_and_seed(tmp_path):
     planned = plan_runs(Study("results", folder=tmp_path))
     scratch = [run for run in planned if "--demonstrations 0" in " ".join(run.options)]
     assert len(scratch) == 3 * 5  # pick-and-place with SAC
@@ -73,18 +73,16 @@ def test_plans_have_every_recipe_and_seed(tmp_path: Path) -> None:
         ("engine = 'bullet'", "robustness", {"engine": "bullet"}),
     ],
 )
-def test_plans_that_cannot_be_are_refused(message: str, plan: Any, options: Any) -> None:
+def test_plans_that_cannot_be_are_refused(message, plan, options):
     with pytest.raises((ConfigError, ConfigurationError), match=message):
         plan_runs(Study(plan, **options))
 
 
-def test_what_is_done_is_skipped_and_what_was_stopped_goes_on(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_done_is_skipped_and_what_was_stopped_goes_on(tmp_path, capsys):
     words = ["--envs", "TPMReach-v0", "--algos", "sac", "--seeds", "1", "--episodes", "7"]
     words = ["run", "--plan", "results", *words, "--folder", str(tmp_path), "--dry-run"]
 
-    def left() -> list[str]:
+    def left():
         main(words)
         return capsys.readouterr().out.split("\n")[:-1]
 
@@ -113,7 +111,7 @@ def test_what_is_done_is_skipped_and_what_was_stopped_goes_on(
 
 
 @pytest.fixture(scope="module")
-def run(needs_pybullet: None, tmp_path_factory: pytest.TempPathFactory) -> Run:
+def run(needs_pybullet, tmp_path_factory):
     """Execute a run of the penalty plan, with a tiny recipe."""
     folder = tmp_path_factory.mktemp("study")
     study = Study("penalty", "analytic", ("TPMReachDense-v0",), seeds=1, episodes=4, folder=folder)
@@ -126,7 +124,7 @@ def run(needs_pybullet: None, tmp_path_factory: pytest.TempPathFactory) -> Run:
     return small
 
 
-def test_a_run_is_tested_in_both_engines_and_its_record_says_what_its_files_say(run: Run) -> None:
+def test_a_run_is_tested_in_both_engines_and_its_record_says_what_its_files_say(run):
     assert run.left() == []
     kept = condense(run.folder)
     assert (kept["engine"], kept["penalty_weight"], kept["goals"]) == ("analytic", 0.0, "tempting")
@@ -146,9 +144,7 @@ def test_a_run_is_tested_in_both_engines_and_its_record_says_what_its_files_say(
 
 
 @pytest.mark.parametrize("program", [list(sys.argv), ["another"]])
-def test_a_training_that_fails_is_told(
-    program: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_training_that_fails_is_told(program, tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", program)
     failing = Run(tmp_path / "runs" / "b", "TPMReach-v0", "sac", ("--steps", "0"), ())
     assert "failed with status 1" in (execute(failing) or "")
@@ -157,7 +153,7 @@ def test_a_training_that_fails_is_told(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there are no such locks")
-def test_a_training_that_outlives_its_node_is_waited_for(tmp_path: Path) -> None:
+def test_a_training_that_outlives_its_node_is_waited_for(tmp_path):
     run = Run(tmp_path / "run", "TPMReach-v0", "sac", (), ())
     run.folder.mkdir()
     (run.folder / "config.json").write_text("{}")
@@ -169,7 +165,7 @@ def test_a_training_that_outlives_its_node_is_waited_for(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "nowhere"])
-def test_an_address_without_a_cluster_is_refused(address: str, tmp_path: Path) -> None:
+def test_an_address_without_a_cluster_is_refused(address, tmp_path):
     with pytest.raises(ConfigError, match=f"--address {address}: no cluster answers"):
         run_all([], Study("results", folder=tmp_path, address=address))
     assert list(tmp_path.iterdir()) == []
@@ -180,9 +176,7 @@ def temporary() -> set[Path]:
 
 
 @pytest.mark.slow
-def test_a_study_of_one_machine_runs_all_and_leaves_nothing_behind(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_study_of_one_machine_runs_all_and_leaves_nothing_behind(tmp_path, capsys):
     before = temporary()
     bisection = Bisection(tmp_path / "bisection", "TPMReach-v0", "latency", 2)
     failing = Run(tmp_path / "failing", "TPMReach-v0", "sac", ("--steps", "0"), ())
@@ -197,9 +191,7 @@ def test_a_study_of_one_machine_runs_all_and_leaves_nothing_behind(
 
 
 @pytest.mark.slow
-def test_nobody_else_can_reach_a_study_and_a_killed_one_leaves_nothing_behind(
-    tmp_path: Path,
-) -> None:
+def test_nobody_else_can_reach_a_study_and_a_killed_one_leaves_nothing_behind(tmp_path):
     before = temporary()
     words = ["--plan", "robustness", "--envs", "TPMReach-v0", "--folder", tmp_path, "--jobs", "1"]
     driver = psutil.Popen([*COMMAND, *map(str, words)], cwd=ROOT)
@@ -227,7 +219,7 @@ def test_nobody_else_can_reach_a_study_and_a_killed_one_leaves_nothing_behind(
 
 
 @pytest.mark.slow
-def test_ctrl_c_stops_a_study_with_checkpoints_saved(tmp_path: Path) -> None:
+def test_ctrl_c_stops_a_study_with_checkpoints_saved(tmp_path):
     """A terminal sends SIGINT to the whole process group; a second signal would kill trainings."""
     before = temporary()
     words = ["--plan", "results", "--envs", "TPMReach-v0", "--algos", "sac", "--seeds", "2"]
@@ -248,7 +240,7 @@ def test_ctrl_c_stops_a_study_with_checkpoints_saved(tmp_path: Path) -> None:
 # -- records --------------------------------------------------------------------------------------
 
 
-def test_a_run_that_broke_off_is_collected_as_far_as_it_was_saved(run: Run, tmp_path: Path) -> None:
+def test_a_run_that_broke_off_is_collected_as_far_as_it_was_saved(run, tmp_path):
     config = json.loads((run.folder / "config.json").read_text())
     early, late = (tmp_path / "runs" / name for name in ("early", "late"))
     for folder in (early, late):
@@ -259,7 +251,7 @@ def test_a_run_that_broke_off_is_collected_as_far_as_it_was_saved(run: Run, tmp_
     # The disk was full.
     (late / "evaluations.jsonl").write_text('{"steps": 60, "wall_seconds": 1.0}\n{"steps": 70, "w')
 
-    def collected() -> list[Any]:
+    def collected():
         return [json.loads(p.read_text()) for p in collect(Collect(tmp_path / "runs", tmp_path))]
 
     records = collected()
@@ -278,7 +270,7 @@ def test_a_run_that_broke_off_is_collected_as_far_as_it_was_saved(run: Run, tmp_
         collected()
 
 
-def test_files_of_others_are_not_replaced(run: Run, tmp_path: Path) -> None:
+def test_files_of_others_are_not_replaced(run, tmp_path):
     records, by_hand = tmp_path / "results", tmp_path / "results.md"
     main(["collect", "--runs", str(run.folder.parent), "--to", str(records)])
     by_hand.write_text("# Results\n\nMy own.\n")
@@ -331,7 +323,7 @@ def rows(text: str, *words: str) -> list[str]:
     ]
 
 
-def test_the_page_is_what_its_records_say() -> None:
+def test_the_page_is_what_its_records_say():
     text = (ROOT / PAGE).read_text(encoding="utf-8")
     figures = [name for name in ("results_penalty.png", "results_robustness.png") if name in text]
     assert page(read_records(ROOT / RECORDS), ["results_learning_curves.png", *figures]) == text
@@ -351,7 +343,7 @@ def test_the_page_is_what_its_records_say() -> None:
         ({"recipe": DEMONSTRATED}, ["SAC + HER", "SAC + HER, demonstrations"]),
     ],
 )
-def test_runs_that_differ_are_told_apart_everywhere(other: Any, labels: list[str]) -> None:
+def test_runs_that_differ_are_told_apart_everywhere(other, labels):
     runs = [changed(0, 0.5), changed(0, 0.6, **other)]
     weighted = [tempting(s, w, **o) for s in range(2) for w in (0.0, 1.0) for o in ({}, other)]
     records = [*runs, *weighted]
@@ -382,14 +374,12 @@ def bisected(attribute: str, end: float, success: Any) -> tuple[Any, dict[float,
 
 
 @given(which=st.sampled_from(GRADUAL), share=st.floats(0.001, 0.999), rate=st.floats(0.3, 1.0))
-def test_success_halves_where_the_bisection_says(
-    which: tuple[str, float], share: float, rate: float
-) -> None:
+def test_success_halves_where_the_bisection_says(which, share, rate):
     attribute, end = which
     start = nominal(attribute)
     edge = start + share * (end - start)
 
-    def success(value: float) -> float:
+    def success(value):
         return rate if abs(value - start) < abs(edge - start) else 0.4 * rate
 
     result, found = bisected(attribute, end, success)

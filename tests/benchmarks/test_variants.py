@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from fidelity_lab import Config, Rig, measure, random_motion
 from machines import anywhere
-from variants import Variant, all_variants, gaps
+from variants import all_variants, gaps
 
 from tpm_gym.mechanism import PAPER_TPM
 from tpm_gym.simulation.simulation import CLOSURE_LIMIT
@@ -24,7 +24,7 @@ def postures(count: int) -> np.ndarray:
 
 
 @each
-def test_loops_close_and_the_platform_stands_as_in_the_default(variant: Variant) -> None:
+def test_loops_close_and_the_platform_stands_as_in_the_default(variant):
     for theta in postures(30):
         angles = variant.angles(theta)
         assert set(angles) == {link.joint.name for link in variant.mechanism.links[1:]}
@@ -43,7 +43,7 @@ def test_loops_close_and_the_platform_stands_as_in_the_default(variant: Variant)
 
 
 @each
-def test_the_engine_closes_the_same_loops(variant: Variant) -> None:
+def test_the_engine_closes_the_same_loops(variant):
     rig = Rig(Config("", "", variant=variant.name))
     for theta in postures(5):
         rig.place(theta)
@@ -54,7 +54,7 @@ def test_the_engine_closes_the_same_loops(variant: Variant) -> None:
 
 
 @pytest.mark.parametrize("name", [v.name for v in VARIANTS if v.name != "one body"])
-def test_the_direct_solver_holds_every_cut_between_multibodies(name: str) -> None:
+def test_the_direct_solver_holds_every_cut_between_multibodies(name):
     errors = measure(Rig(Config("", "", variant=name)), random_motion(20))
     assert errors.lost is None
     assert len(errors.gap) == 20 * 10
@@ -68,7 +68,7 @@ def mean_gap(**settings: object) -> float:
     return float(errors.gap.mean())
 
 
-def test_the_gap_is_the_error_of_the_time_step_and_nothing_else() -> None:
+def test_the_gap_is_the_error_of_the_time_step_and_nothing_else():
     """It is proportional to the squared time step over erp, and does not depend on the cut."""
     default = mean_gap(erp=0.8)
     assert default / mean_gap(erp=0.8, time_step=1 / 500) == pytest.approx(4, rel=0.1)
@@ -78,7 +78,7 @@ def test_the_gap_is_the_error_of_the_time_step_and_nothing_else() -> None:
 
 
 @pytest.mark.parametrize("solver", ["direct", "lcp pgs"])
-def test_the_matrix_solvers_lose_loops_within_one_multibody(solver: str) -> None:
+def test_the_matrix_solvers_lose_loops_within_one_multibody(solver):
     config = Config("", "", variant="one body", solver=solver, iterations=200)
     errors = measure(Rig(config), random_motion(20))
     assert errors.lost is not None
@@ -86,11 +86,11 @@ def test_the_matrix_solvers_lose_loops_within_one_multibody(solver: str) -> None
     assert errors.gap.max(initial=0.0) <= CLOSURE_LIMIT
 
 
-def test_one_step_tells_the_wrong_matrix_from_the_right_one() -> None:
+def test_one_step_tells_the_wrong_matrix_from_the_right_one():
     """Two algorithms on Bullet's matrix agree on a wrong answer; without the matrix it is right."""
     point = np.array((-0.04, 0.028, 0.80))
 
-    def left(variant: str, solver: str) -> float:
+    def left(variant, solver):
         config = Config("", "", variant, solver, iterations=3000, residual=0.0)
         return gauss_seidel.left_over(config, point)
 

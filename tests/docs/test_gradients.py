@@ -25,7 +25,6 @@ from tpm_gym.kinematics.jacobian import factors_at
 from tpm_gym.kinematics.workspace import Region, conditioning_at
 from tpm_gym.mechanism import PAPER_TPM, WIDE_TPM, Mount
 
-Row = dict[str, dict[str, float]]
 RECORD = json.loads(draw_gradients.RECORD.read_text(encoding="utf-8"))
 DESIGNS = {
     name: lengths.Design(Geometry(*row["lengths"]), Region(row["low"], row["high"]))
@@ -46,14 +45,14 @@ each_design = pytest.mark.parametrize("design", DESIGNS.values(), ids=DESIGNS)
 # -- the method ------------------------------------------------------------------------------------
 
 
-def test_the_least_within_limits_is_found_from_inside_and_only_from_there() -> None:
+def test_the_least_within_limits_is_found_from_inside_and_only_from_there():
     seen = []
 
-    def limits(at: torch.Tensor) -> torch.Tensor:
+    def limits(at):
         seen.append(at.detach())
         return 1 - (at**2).sum()[None]
 
-    def aim(at: torch.Tensor) -> torch.Tensor:
+    def aim(at):
         assert (at**2).sum() < 1
         return at[0] + 2 * at[1]
 
@@ -73,13 +72,13 @@ def vector(design: lengths.Design) -> torch.Tensor:
 
 
 @each_design
-def test_gradients_by_lengths_and_box_are_those_of_differences(design: lengths.Design) -> None:
+def test_gradients_by_lengths_and_box_are_those_of_differences(design):
     at = vector(design).double().requires_grad_()
     assert torch.autograd.gradcheck(lengths.room, (at,), rtol=1e-6, fast_mode=True)
 
 
 @each_design
-def test_boxes_keep_their_limits_between_the_nodes_of_the_search(design: lengths.Design) -> None:
+def test_boxes_keep_their_limits_between_the_nodes_of_the_search(design):
     low, high = np.array(design.box.low), np.array(design.box.high)
     points = low + lengths.nodes((41, 41, 41)).numpy() * (high - low)
     assert conditioning_at(points, geometry=design.geometry).min() >= lengths.THRESHOLD
@@ -92,7 +91,7 @@ def test_boxes_keep_their_limits_between_the_nodes_of_the_search(design: lengths
     assert design.geometry.l3 + design.geometry.l4 <= lengths.REACH
 
 
-def test_the_lengths_found_have_the_largest_box_and_all_searches_found_it() -> None:
+def test_the_lengths_found_have_the_largest_box_and_all_searches_found_it():
     volumes = {name: design.volume for name, design in DESIGNS.items()}
     assert volumes["found"] > 1.25 * volumes["wide"] > 10 * volumes["paper"]
     assert max(RECORD["volumes"]) == pytest.approx(volumes["found"], rel=1e-12)
@@ -101,13 +100,13 @@ def test_the_lengths_found_have_the_largest_box_and_all_searches_found_it() -> N
     assert DESIGNS["wide"].geometry == WIDE
 
 
-def test_the_paper_s_box_is_that_of_the_best_grid() -> None:
+def test_the_paper_s_box_is_that_of_the_best_grid():
     grid = aspects(shape=(96, 48, 128))
     boxes = [largest_box(a, lengths.THRESHOLD).volume for a in grid[:2]]
     assert 0.9 * DESIGNS["paper"].volume < max(boxes) < DESIGNS["paper"].volume
 
 
-def test_a_machine_of_the_lengths_found_picks_and_places() -> None:
+def test_a_machine_of_the_lengths_found_picks_and_places():
     box = DESIGNS["found"].box
     machine = replace(
         WIDE_TPM,
@@ -127,7 +126,7 @@ def test_a_machine_of_the_lengths_found_picks_and_places() -> None:
 
 
 @pytest.mark.slow
-def test_a_search_from_other_lengths_ends_there_too() -> None:
+def test_a_search_from_other_lengths_ends_there_too():
     start = lengths.random_lengths(np.random.default_rng(7))
     found = lengths.largest_box(start, free=True)
     assert found.volume == pytest.approx(DESIGNS["found"].volume, rel=1e-3)
@@ -136,7 +135,7 @@ def test_a_search_from_other_lengths_ends_there_too() -> None:
 # -- ways ------------------------------------------------------------------------------------------
 
 
-def test_gradients_by_commands_are_those_of_differences() -> None:
+def test_gradients_by_commands_are_those_of_differences():
     carry, found, _ = CARRIES[2]
     at = found.clone().requires_grad_()
     for function in (lambda way: ways.rms(carry.torque(way)), carry.room):
@@ -144,9 +143,7 @@ def test_gradients_by_commands_are_those_of_differences() -> None:
 
 
 @pytest.mark.parametrize(("carry", "found", "row"), CARRIES)
-def test_ways_take_less_torque_on_the_expert_s_terms(
-    carry: ways.Carry, found: torch.Tensor, row: Row
-) -> None:
+def test_ways_take_less_torque_on_the_expert_s_terms(carry, found, row):
     machine, expert = carry.machine, carry.expert()
     assert found.shape == expert.shape
     for end in (slice(0, 2), slice(-2, None)):  # at rest, in the same places
@@ -165,9 +162,7 @@ def test_ways_take_less_torque_on_the_expert_s_terms(
 
 
 @pytest.mark.parametrize(("carry", "found", "row"), CARRIES[::4])
-def test_ways_take_less_torque_in_pybullet(
-    carry: ways.Carry, found: torch.Tensor, row: Row
-) -> None:
+def test_ways_take_less_torque_in_pybullet(carry, found, row):
     for name, commands in (("expert", carry.expert()), ("found", found)):
         torque, simulated = carry.torque(commands), carry.simulated(commands)
         # A kink of the acceleration is felt a time step earlier or later.
@@ -178,7 +173,7 @@ def test_ways_take_less_torque_in_pybullet(
 
 
 @pytest.mark.slow
-def test_a_way_is_found_again() -> None:
+def test_a_way_is_found_again():
     carry, found, _ = CARRIES[2]
     again, once = (ways.rms(carry.torque(way)).item() for way in (carry.least_torque(), found))
     assert again == pytest.approx(once, rel=1e-3)
@@ -187,7 +182,7 @@ def test_a_way_is_found_again() -> None:
 # -- the page --------------------------------------------------------------------------------------
 
 
-def test_the_page_has_the_record_s_tables_and_its_code_runs() -> None:
+def test_the_page_has_the_record_s_tables_and_its_code_runs():
     page = (ROOT / "docs/gradients.md").read_text(encoding="utf-8")
     tables = [line for line in draw_gradients.report(RECORD).splitlines() if line.startswith("|")]
     assert [line for line in page.splitlines() if line.startswith("|")] == tables

@@ -7,7 +7,7 @@ from tpm_gym.errors import ConfigurationError
 
 
 @pytest.fixture(params=ENGINES)
-def engine(request: pytest.FixtureRequest) -> str:
+def engine(request):
     """Name of an engine that can draw here."""
     name: str = request.param
     if name != "analytic":

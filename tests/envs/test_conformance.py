@@ -1,6 +1,5 @@
 """Every id keeps what tpm_gym promises, on every machine, in every engine."""
 
-from collections.abc import Callable
 from typing import Any
 
 import gantry  # noqa: F401  registers a machine
@@ -11,7 +10,7 @@ import pytest
 from episodes import EVERYTHING, OF_SERVOS
 
 import tpm_gym
-from tpm_gym.envs.testing import CHECKS, Make, check_env
+from tpm_gym.envs.testing import CHECKS, check_env
 from tpm_gym.errors import ConformanceError
 from tpm_gym.tasks import Reach
 
@@ -40,9 +39,7 @@ CASES: list[tuple[str, dict[str, Any]]] = [
 
 @pytest.mark.parametrize(("env_id", "options"), CASES, ids=str)
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
-def test_it_keeps_what_is_promised(
-    check: Callable[[Make], None], env_id: str, options: dict[str, Any]
-) -> None:
+def test_it_keeps_what_is_promised(check, env_id, options):
     if "Stack" in env_id and "copies" in check.__name__ and options == {"machine": "wide"}:
         # docs/environments.md says so.
         pytest.xfail("PyBullet orders the contacts of two blocks by their history")
@@ -72,7 +69,7 @@ class Eager(Reach):
     ("task", "promise"),
     [(Unseeded, "the checkers of Gymnasium"), (Eager, "the goal's term is 0")],
 )
-def test_what_does_not_keep_it_is_found(task: Any, promise: str) -> None:
+def test_what_does_not_keep_it_is_found(task, promise):
     with pytest.raises(ConformanceError, match=promise) as caught:
         check_env(lambda: gym.make("TPMReach-v0", engine="kinematic", task=task))
     assert caught.value.promise in str(caught.value)

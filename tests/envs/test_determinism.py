@@ -5,8 +5,6 @@ import os
 import pickle
 import subprocess
 import sys
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
@@ -31,11 +29,9 @@ from tpm_gym import TPMEnv
 from tpm_gym.errors import ConfigurationError, EpisodeError, ModeChangeError
 from tpm_gym.tasks.expert import Expert
 
-Outcome = tuple[Any, ...]
-
 
 @pytest.fixture(params=CASES, ids=lambda case: "-".join([case[0], *case[1]]))
-def env(request: pytest.FixtureRequest) -> Iterator[gym.Env[Any, Any]]:
+def env(request):
     env_id, options = request.param
     env = make(env_id, **options)
     yield env
@@ -45,7 +41,7 @@ def env(request: pytest.FixtureRequest) -> Iterator[gym.Env[Any, Any]]:
 # -- again, later, elsewhere -----------------------------------------------------------------------
 
 
-def test_first_and_fiftieth_episode_are_equal(env: gym.Env[Any, Any]) -> None:
+def test_first_and_fiftieth_episode_are_equal(env):
     first = fingerprint(expert_episode(env, 5))
     rebuilt = env.unwrapped.randomisation.length_error > 0  # slow, and little to remember
     for seed in range(8 if rebuilt else 48):
@@ -54,7 +50,7 @@ def test_first_and_fiftieth_episode_are_equal(env: gym.Env[Any, Any]) -> None:
     assert fingerprint(expert_episode(env, 5)) == first
 
 
-def test_fresh_processes_give_the_same_and_go_on_with_what_was_pickled(tmp_path: Path) -> None:
+def test_fresh_processes_give_the_same_and_go_on_with_what_was_pickled(tmp_path):
     env = make("TPMPickAndPlace-v0", randomisation=EVERYTHING)
     for _ in expert_episode(env, 8, steps=20):
         pass
@@ -98,9 +94,7 @@ def touching(env: gym.Env[Any, Any]) -> bool:
     ("env_id", "randomisation"),
     [("TPMPickAndPlace-v0", EVERYTHING), ("TPMPickAndPlaceJointsDense-v0", {})],
 )
-def test_saved_states_go_on_equally_on_their_way_in_contact_and_holding(
-    env_id: str, randomisation: dict[str, Any]
-) -> None:
+def test_saved_states_go_on_equally_on_their_way_in_contact_and_holding(env_id, randomisation):
     env = make(env_id, randomisation=randomisation, max_episode_steps=1000)
     bare = env.unwrapped
     # The expert comes down without vacuum first: a contact, then a grasp.
@@ -132,7 +126,7 @@ def test_saved_states_go_on_equally_on_their_way_in_contact_and_holding(
 # -- copied ----------------------------------------------------------------------------------------
 
 
-def test_a_copy_made_before_the_first_reset_or_after_an_episode_starts_equally() -> None:
+def test_a_copy_made_before_the_first_reset_or_after_an_episode_starts_equally():
     env = TPMEnv("pick_and_place", randomisation=EVERYTHING)
     early = copy.deepcopy(env)
     with pytest.raises(EpisodeError, match="reset"):
@@ -149,7 +143,7 @@ def test_a_copy_made_before_the_first_reset_or_after_an_episode_starts_equally()
         one.close()
 
 
-def test_a_copy_of_a_closed_environment_is_closed() -> None:
+def test_a_copy_of_a_closed_environment_is_closed():
     env = TPMEnv("reach")
     env.reset(seed=0)
     env.close()
@@ -161,7 +155,7 @@ def test_a_copy_of_a_closed_environment_is_closed() -> None:
             other.simulation.engine.read()
 
 
-def test_a_copy_of_a_truncated_environment_has_to_be_reset_too() -> None:
+def test_a_copy_of_a_truncated_environment_has_to_be_reset_too():
     env = TPMEnv("reach")
     env.reset(seed=0)
     for y in (0.018, 0.008, -0.002, -0.012):
@@ -175,7 +169,7 @@ def test_a_copy_of_a_truncated_environment_has_to_be_reset_too() -> None:
         one.close()
 
 
-def test_an_environment_with_a_window_refuses_to_be_copied() -> None:
+def test_an_environment_with_a_window_refuses_to_be_copied():
     env = TPMEnv("reach")
     env.reset(seed=0)
     env._core._engine["gui"] = True  # as if it had one

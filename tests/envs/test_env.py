@@ -27,7 +27,7 @@ BLOCK = PickAndPlace.block
 
 
 @pytest.fixture
-def env() -> TPMEnv:
+def env():
     return TPMEnv("pick_and_place")
 
 
@@ -52,7 +52,7 @@ def env() -> TPMEnv:
     ],
     ids=lambda options: str(options)[:50],
 )
-def test_bad_options_are_refused_by_name(options: dict[str, Any]) -> None:
+def test_bad_options_are_refused_by_name(options):
     with pytest.raises(ConfigurationError) as caught:
         TPMEnv(**options)
     name = next(iter(options))
@@ -60,15 +60,15 @@ def test_bad_options_are_refused_by_name(options: dict[str, Any]) -> None:
     assert repr(options[name])[:20] in repr(caught.value.value)
 
 
-def test_unknown_options_raise_a_type_error() -> None:
+def test_unknown_options_raise_a_type_error():
     with pytest.raises(TypeError, match="colour"):
         gym.make("TPMReach-v0", colour="red")
 
 
 @pytest.mark.parametrize("machine", ["wide", WIDE_TPM, replace(PAPER_TPM, name="mine")], ids=str)
-def test_machines_are_taken_by_name_or_value(machine: Any) -> None:
+def test_machines_are_taken_by_name_or_value(machine):
     env = gym.make("TPMReach-v0", machine=machine, engine="pybullet")
-    inner: Any = env.unwrapped
+    inner = env.unwrapped
     assert inner.machine == (WIDE_TPM if machine == "wide" else machine)
     env.reset(seed=0)
     home = inner.machine.mount.to_world(inner.machine.home)
@@ -80,10 +80,10 @@ class Scaled(Reach):
 
     def __init__(self, machine: Machine, tolerance: float, **options: Any) -> None:
         super().__init__(machine, **options)
-        self.tolerance = tolerance  # type: ignore[misc]
+        self.tolerance = tolerance
 
 
-def test_a_task_of_ones_own_goes_along_with_copies() -> None:
+def test_a_task_of_ones_own_goes_along_with_copies():
     task = Scaled(WIDE_TPM, 0.05)
     env = TPMEnv(task)
     assert (env.task, env.machine) == (task, WIDE_TPM)
@@ -94,9 +94,7 @@ def test_a_task_of_ones_own_goes_along_with_copies() -> None:
     assert play(other, [np.full(3, 0.3)] * 5) == play(env, [np.full(3, 0.3)] * 5)
 
 
-def test_human_mode_without_a_display_is_refused_instead_of_ending_the_process(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_human_mode_without_a_display_is_refused_instead_of_ending_the_process(monkeypatch):
     monkeypatch.setattr("sys.platform", "linux")
     monkeypatch.delenv("DISPLAY", raising=False)
     for engine in ("pybullet", "mujoco", "analytic"):
@@ -108,10 +106,10 @@ def test_human_mode_without_a_display_is_refused_instead_of_ending_the_process(
     assert TPMEnv.metadata["render_modes"] == list(RENDER_MODES)
 
 
-def test_rgb_array_gives_pictures_of_the_asked_size() -> None:
+def test_rgb_array_gives_pictures_of_the_asked_size():
     env = gym.make("TPMPickAndPlace-v0", render_mode="rgb_array", width=96, height=64)
     env.reset(seed=0)
-    picture: Any = env.render()
+    picture = env.render()
     assert picture.shape == (64, 96, 3)
     assert picture.dtype == np.uint8
     assert picture.std() > 10
@@ -120,12 +118,12 @@ def test_rgb_array_gives_pictures_of_the_asked_size() -> None:
 PHYSICS = {"time_step": 1 / 500, "erp": 0.9}
 
 
-def test_a_spec_with_physics_and_randomisation_survives_json() -> None:
+def test_a_spec_with_physics_and_randomisation_survives_json():
     from tpm_gym.simulation.bullet.physics import Physics
 
-    physics: Any = Physics(**PHYSICS)
+    physics = Physics(**PHYSICS)
     env = gym.make("TPMReach-v0", physics=physics, randomisation=EVERYTHING, machine="wide")
-    spec: Any = env.spec
+    spec = env.spec
     again = gym.make(EnvSpec.from_json(spec.to_json()))
     inner, other = env.unwrapped, again.unwrapped
     assert inner.simulation.engine.physics == other.simulation.engine.physics == physics
@@ -154,9 +152,9 @@ class Far(Reach):
 
 
 @pytest.mark.parametrize("size", [1e2, 1e5, 1e30])
-def test_observations_are_clipped_into_their_space_and_else_exact(size: float) -> None:
+def test_observations_are_clipped_into_their_space_and_else_exact(size):
     env = TPMEnv(Far)
-    env.task.size = size  # type: ignore[attr-defined]
+    env.task.size = size
     env.reset(seed=0)
     seen = env.step(np.array([1.0, -1.0, 0.5]))[0]
     assert env.observation_space.contains(seen)
@@ -171,7 +169,7 @@ def test_observations_are_clipped_into_their_space_and_else_exact(size: float) -
 MASKED = np.ma.array(np.zeros(3), mask=[True, False, False])
 
 
-def test_goals_that_do_not_go_together_are_refused_and_what_is_nowhere_is_no_success() -> None:
+def test_goals_that_do_not_go_together_are_refused_and_what_is_nowhere_is_no_success():
     env, goals = TPMEnv("reach"), np.zeros((4, 3))
     for wrong in (MASKED, "far", [10**400, 0, 0], np.zeros(2), 0.0, None, [1j] * 3):
         for pair in ((wrong, goals[0]), (goals[0], wrong)):
@@ -181,7 +179,7 @@ def test_goals_that_do_not_go_together_are_refused_and_what_is_nowhere_is_no_suc
         env.compute_reward(goals, goals[:3], {})
     for info in (None, [{}] * 3, 4, [None] * 4, "four", {"reward_terms": None}):
         with pytest.raises(InputError, match="info must be"):
-            env.compute_reward(goals, goals, info)  # type: ignore[arg-type]
+            env.compute_reward(goals, goals, info)
     assert env.compute_reward([np.nan] * 3, [0.0, 0.0, 0.0], {}) == -1.0
     assert env.compute_reward(goals[0], goals[0], [{}]) == 0.0
     with pytest.raises(InputError, match="info must be"):
@@ -201,7 +199,7 @@ class Broken(Reach):
         return {"near": self._factor("reward_terms") * ones, "far": -ones}
 
     def observed(self) -> Any:
-        def source(state: State) -> Any:
+        def source(state):
             return np.full((len(state.held), 1), self._factor("observed"))
 
         return (*super().observed(), Entry("extra", "-", "", (0.0,), (1.0,), source))
@@ -218,14 +216,14 @@ class Broken(Reach):
         ("observed", "observed(), 'extra'"),
     ],
 )
-def test_what_a_task_gives_that_is_no_number_is_named(where: str, what: str) -> None:
+def test_what_a_task_gives_that_is_no_number_is_named(where, what):
     env = TPMEnv(Broken)
     env.reset(seed=0)
-    env.task.where = where  # type: ignore[attr-defined]
+    env.task.where = where
     with pytest.raises(ConfigurationError, match="nan") as caught:
         env.step(np.zeros(3))
     assert caught.value.name == what
-    env.task.where = ""  # type: ignore[attr-defined]
+    env.task.where = ""
     env.reset(seed=0)
     env.step(np.zeros(3))
 
@@ -237,14 +235,14 @@ class Single(Reach):
         return {"own": np.full(len(state.held), -0.1, dtype=np.float32)}
 
 
-def test_a_term_in_single_precision_takes_nothing_from_the_others() -> None:
+def test_a_term_in_single_precision_takes_nothing_from_the_others():
     env = TPMEnv(Single)
     env.reset(seed=0)
     _, reward, _, _, info = env.step(np.ones(3))
     assert reward == pytest.approx(sum(info["reward_terms"].values()), rel=1e-14)
 
 
-def test_the_penalty_grows_towards_the_singularity_and_follows_the_weight() -> None:
+def test_the_penalty_grows_towards_the_singularity_and_follows_the_weight():
     rewards = []
     for weight in (0.0, 1.0, 2.0):
         env = TPMEnv("reach", penalty_weight=weight)
@@ -262,7 +260,7 @@ def test_the_penalty_grows_towards_the_singularity_and_follows_the_weight() -> N
 
 
 @pytest.mark.parametrize("x", [0.2, 0.6], ids=["on the table", "beside it"])
-def test_a_block_that_is_pushed_off_is_lost(env: TPMEnv, x: float) -> None:
+def test_a_block_that_is_pushed_off_is_lost(env, x):
     env.reset(seed=0)
     body, client = env.simulation.engine.bodies[0], env.simulation.engine.client
     client.resetBasePositionAndOrientation(body, (x, -0.03, 0.016), (0, 0, 0, 1))
@@ -272,7 +270,7 @@ def test_a_block_that_is_pushed_off_is_lost(env: TPMEnv, x: float) -> None:
     assert env.reset(seed=0)[1]["object_lost"] is False
 
 
-def test_info_tells_the_machine_that_was_drawn() -> None:
+def test_info_tells_the_machine_that_was_drawn():
     env = TPMEnv("pick_and_place", randomisation=EVERYTHING)
     told = [env.reset(seed=seed)[1]["randomisation"] for seed in (1, 2, None, None, 1)]
     first, *others, again = told
@@ -290,7 +288,7 @@ def test_info_tells_the_machine_that_was_drawn() -> None:
 
 
 @pytest.mark.parametrize("wrong", [None, "x", {}, 10**5000, object()], ids=type)
-def test_what_is_no_snapshot_is_refused_and_touches_nothing(env: TPMEnv, wrong: Any) -> None:
+def test_what_is_no_snapshot_is_refused_and_touches_nothing(env, wrong):
     env.reset(seed=5)
     before = bits(vars(env.state)), env.goal.tolist(), env.np_random.bit_generator.state
     with pytest.raises(InputError, match="snapshot"):
@@ -299,7 +297,7 @@ def test_what_is_no_snapshot_is_refused_and_touches_nothing(env: TPMEnv, wrong: 
     assert after == before
 
 
-def test_a_snapshot_of_another_kind_of_environment_is_refused(env: TPMEnv) -> None:
+def test_a_snapshot_of_another_kind_of_environment_is_refused(env):
     env.reset(seed=0)
     others: list[dict[str, Any]] = [
         {"task": "reach"},
@@ -320,7 +318,7 @@ def test_a_snapshot_of_another_kind_of_environment_is_refused(env: TPMEnv) -> No
 # -- the datasheet ---------------------------------------------------------------------------------
 
 
-def test_the_datasheet_lists_the_entries_and_numbers_that_the_code_uses() -> None:
+def test_the_datasheet_lists_the_entries_and_numbers_that_the_code_uses():
     text = inspect.getdoc(TPMEnv) or ""
     task, machine = PickAndPlace(PAPER_TPM), PAPER_TPM
     rows = re.findall(r"^\| (\w+) \| (\d) \| (.+) \|$", text, flags=re.MULTILINE)
@@ -344,7 +342,7 @@ def test_the_datasheet_lists_the_entries_and_numbers_that_the_code_uses() -> Non
     assert f"at least {1e3 * APART:.0f} mm" in text
 
 
-def test_the_datasheet_lists_all_of_info_and_every_option() -> None:
+def test_the_datasheet_lists_all_of_info_and_every_option():
     text = inspect.getdoc(TPMEnv) or ""
     env = TPMEnv(randomisation=EVERYTHING)
     info = text[text.index("## Info") : text.index("Args:")]

@@ -1,7 +1,5 @@
 """Pictures in every engine: cameras, goal markers, depth, segmentation, and many environments."""
 
-from __future__ import annotations
-
 import contextlib
 from typing import Any
 
@@ -36,9 +34,7 @@ def is_red(image: NDArray[Any]) -> Any:
 
 
 @pytest.mark.parametrize("size", [(640, 480), (320, 240)])
-def test_the_default_picture_shows_block_cup_and_goal_from_close_by(
-    engine: str, size: tuple[int, int]
-) -> None:
+def test_the_default_picture_shows_block_cup_and_goal_from_close_by(engine, size):
     width, height = size
     image = drawn(engine, width=width, height=height)
     assert (image.shape, image.dtype) == ((height, width, 3), np.uint8)
@@ -50,8 +46,8 @@ def test_the_default_picture_shows_block_cup_and_goal_from_close_by(
 
 
 @pytest.mark.parametrize("machine", ["paper", "wide"])
-def test_cameras_show_the_whole_robot_the_region_and_the_cup(engine: str, machine: str) -> None:
-    options: Any = {"machine": machine, "mode": "segmentation", "width": 160, "height": 120}
+def test_cameras_show_the_whole_robot_the_region_and_the_cup(engine, machine):
+    options = {"machine": machine, "mode": "segmentation", "width": 160, "height": 120}
     shares = {}
     for camera in ("overview", "table", "cup"):
         ids = drawn(engine, None, camera=camera, **options)
@@ -63,21 +59,21 @@ def test_cameras_show_the_whole_robot_the_region_and_the_cup(engine: str, machin
     assert shares["cup"][0] > 3 * shares["table"][0] > 0
 
 
-def test_the_cup_camera_follows_the_cup(engine: str) -> None:
+def test_the_cup_camera_follows_the_cup(engine):
     env = gym.make(
         "TPMReach-v0", engine=engine, render_mode="segmentation", camera="cup", width=64, height=64
     )
     env.reset(seed=0)
     seen = []
     for _ in range(2):
-        frame: Any = env.render()
+        frame = env.render()
         seen.append(np.argwhere(frame == CUP).mean(axis=0))
         for _ in range(5):
             env.step(np.array([1.0, 0.0, -1.0]))
     assert np.abs(seen[0] - seen[1]).max() < 1.0  # the cup moves by 0.15 m, 40 pixels
 
 
-def test_goal_markers_are_as_large_as_the_tolerance_and_seen_through(engine: str) -> None:
+def test_goal_markers_are_as_large_as_the_tolerance_and_seen_through(engine):
     goal = np.array(STARTS["goal"])
     camera = Camera(tuple(goal.tolist()), 0.5, yaw=0.0, pitch=0.0, opening=26.0)
     apart = drawn(engine, camera=camera, width=240, height=240)
@@ -86,15 +82,15 @@ def test_goal_markers_are_as_large_as_the_tolerance_and_seen_through(engine: str
     assert np.ptp(columns) + 1 == pytest.approx(0.020 * metre, abs=2)
     assert columns.mean() == pytest.approx(119.5, abs=1)
     behind = {"object": goal + (0.0, 0.005, -0.002), "goal": goal}  # the block, about the marker
-    inside: Any = drawn(engine, behind, camera=camera, width=240, height=240)
+    inside = drawn(engine, behind, camera=camera, width=240, height=240)
     centre, beside = inside[120, 120].astype(int), inside[120, 131].astype(int)
     assert is_red(inside)[120, 131]
     assert centre[1] > beside[1] + 30  # green shines through
     assert centre[0] > 60  # and the block is still seen
 
 
-def test_depth_is_the_distance_along_the_axis_in_metres(engine: str) -> None:
-    options: Any = {"camera": FROM_ABOVE, "width": 64, "height": 48}
+def test_depth_is_the_distance_along_the_axis_in_metres(engine):
+    options = {"camera": FROM_ABOVE, "width": 64, "height": 48}
     depth = drawn(engine, mode="depth_array", **options)
     assert (depth.shape, depth.dtype) == ((48, 64), np.float32)
     np.testing.assert_allclose(depth, 0.5, atol=0.002)  # the table, level with the image
@@ -107,7 +103,7 @@ def test_depth_is_the_distance_along_the_axis_in_metres(engine: str) -> None:
     assert np.array_equal(colour, drawn(engine, **options))
 
 
-def test_segmentation_tells_bodies_apart(engine: str) -> None:
+def test_segmentation_tells_bodies_apart(engine):
     ids = drawn(engine, mode="segmentation")
     assert (ids.shape, ids.dtype) == ((480, 640), np.int32)
     assert set(np.unique(ids)) == {BACKGROUND, TABLETOP, ROBOT, CUP, OBJECTS}
@@ -117,16 +113,16 @@ def test_segmentation_tells_bodies_apart(engine: str) -> None:
     assert (is_red(image) & block).sum() > 0.9 * block.sum()
 
 
-def test_the_table_of_two_blocks_has_one_colour(engine: str) -> None:
+def test_the_table_of_two_blocks_has_one_colour(engine):
     env = gym.make(
         "TPMStack-v0", engine=engine, render_mode="rgb_array", camera=Camera(**FROM_ABOVE)
     )
     env.reset(seed=0)
-    image: Any = env.render()
+    image = env.render()
     assert np.ptp(image.reshape(-1, 3), axis=0).max() <= 8
 
 
-def test_engines_draw_the_same_picture() -> None:
+def test_engines_draw_the_same_picture():
     pytest.importorskip("pybullet")
     pytest.importorskip("mujoco")
     images = {}
@@ -136,7 +132,7 @@ def test_engines_draw_the_same_picture() -> None:
         assert np.abs(image - images["pybullet"]).mean() < 8.0  # of 255
 
 
-def test_bodies_on_the_table_cast_a_shadow_below_them(engine: str) -> None:
+def test_bodies_on_the_table_cast_a_shadow_below_them(engine):
     above = {"target": (-0.1, -0.034, 0.0), "distance": 0.6, "pitch": -20.0}
     ids, image = (drawn(engine, mode=mode, camera=above) for mode in ("segmentation", "rgb_array"))
     rows, columns = np.nonzero(ids == OBJECTS)
@@ -145,7 +141,7 @@ def test_bodies_on_the_table_cast_a_shadow_below_them(engine: str) -> None:
     assert image[row, below].sum() < int(image[row, below + 150].sum()) - 15
 
 
-def test_pictures_change_nothing(engine: str) -> None:
+def test_pictures_change_nothing(engine):
     ends = []
     for mode in (None, "rgb_array"):
         env = gym.make("TPMPickAndPlace-v0", engine=engine, render_mode=mode, width=32, height=32)
@@ -162,14 +158,14 @@ def test_pictures_change_nothing(engine: str) -> None:
 
 
 @pytest.mark.parametrize("mode", ["rgb_array", "depth_array", "rgbd_tuple", "segmentation"])
-def test_vector_environments_draw_each_environment(engine: str, mode: str) -> None:
-    options: Any = {"engine": engine, "render_mode": mode, "width": 48, "height": 32}
+def test_vector_environments_draw_each_environment(engine, mode):
+    options = {"engine": engine, "render_mode": mode, "width": 48, "height": 32}
     envs = gym.make_vec("TPMPickAndPlace-v0", num_envs=3, **options)
     envs.reset(seed=5)
     actions = np.random.default_rng(0).uniform(-1, 1, (3, 4))
     for _ in range(3):
         envs.step(actions)
-    frames: Any = envs.render()
+    frames = envs.render()
     assert isinstance(frames, tuple)
     assert len(frames) == 3
     for row, frame in enumerate(frames):
@@ -177,15 +173,15 @@ def test_vector_environments_draw_each_environment(engine: str, mode: str) -> No
         env.reset(seed=5 + row)
         for _ in range(3):
             env.step(actions[row])
-        alone: Any = env.render()
+        alone = env.render()
         pairs = zip(frame, alone, strict=True)  # of colours and depth, or of rows of pixels
         assert all(np.array_equal(*pair) for pair in pairs)
     envs.close()
 
 
-def test_a_tile_is_one_picture_of_the_first_environments(engine: str) -> None:
-    options: Any = {"engine": engine, "render_mode": "rgb_array", "width": 48, "height": 32}
-    envs: Any = TPMVectorEnv("pick_and_place", num_envs=5, **options)
+def test_a_tile_is_one_picture_of_the_first_environments(engine):
+    options = {"engine": engine, "render_mode": "rgb_array", "width": 48, "height": 32}
+    envs = TPMVectorEnv("pick_and_place", num_envs=5, **options)
     envs.reset(seed=0)
     frames = envs.render()
     whole = envs.render_tile()
@@ -223,18 +219,18 @@ def test_a_tile_is_one_picture_of_the_first_environments(engine: str) -> None:
         ({"render_mode": "depth"}, "render_mode = 'depth' .*'depth_array', 'rgbd_tuple'"),
     ],
 )
-def test_what_cannot_be_drawn_is_refused(options: dict[str, Any], message: str) -> None:
+def test_what_cannot_be_drawn_is_refused(options, message):
     for make in (TPMEnv, TPMVectorEnv):
         with pytest.raises(ConfigurationError, match=message):
             make(**{"engine": "analytic", **options})
 
 
-def test_there_is_nothing_to_draw_before_the_first_episode(engine: str) -> None:
+def test_there_is_nothing_to_draw_before_the_first_episode(engine):
     env = TPMEnv(engine=engine, render_mode="rgb_array")
     with pytest.raises(EpisodeError, match="reset"):
         env.render()
 
 
-def test_gymnasium_accepts_all_render_modes(engine: str) -> None:
+def test_gymnasium_accepts_all_render_modes(engine):
     env = gym.make("TPMPickAndPlace-v0", engine=engine, width=32, height=24)
     check_env(env.unwrapped)

@@ -1,8 +1,5 @@
 """Pixel observations: pictures in the place of what a camera would measure."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -14,7 +11,7 @@ from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
 
 from tpm_gym import TPMEnv, TPMVectorEnv
-from tpm_gym.envs.testing import CHECKS, Make, is_solved_by_its_expert
+from tpm_gym.envs.testing import CHECKS, is_solved_by_its_expert
 from tpm_gym.errors import ConfigurationError, InputError
 from tpm_gym.tasks import Expert
 
@@ -23,10 +20,7 @@ OPTIONS: dict[str, Any] = {"observations": "pixels", "pixel_size": 36}
 
 
 @pytest.mark.parametrize("env_id", ["TPMReach-v0", "TPMPickAndPlaceJointsDense-v0"])
-def test_observations_have_a_picture_and_the_robot_but_not_the_block(
-    engine: str,
-    env_id: str,
-) -> None:
+def test_observations_have_a_picture_and_the_robot_but_not_the_block(engine, env_id):
     env = gym.make(env_id, engine=engine, **OPTIONS)
     plain = gym.make(env_id, engine=engine)
     check_env(env.unwrapped, skip_render_check=True)
@@ -44,8 +38,8 @@ def test_observations_have_a_picture_and_the_robot_but_not_the_block(
             seen, told = env.step(action)[0], plain.step(action)[0]
 
 
-def test_the_picture_is_that_of_render_and_shows_the_present(engine: str) -> None:
-    options: Any = {"camera": "cup", "width": 36, "height": 36, "render_mode": "rgb_array"}
+def test_the_picture_is_that_of_render_and_shows_the_present(engine):
+    options = {"camera": "cup", "width": 36, "height": 36, "render_mode": "rgb_array"}
     env = gym.make("TPMPickAndPlace-v0", engine=engine, **OPTIONS, **options)
     observation, _ = env.reset(seed=0)
     for _ in range(3):
@@ -63,14 +57,11 @@ def test_the_picture_is_that_of_render_and_shows_the_present(engine: str) -> Non
     [check for check in CHECKS if check is not is_solved_by_its_expert],  # it needs the block
     ids=lambda check: check.__name__,
 )
-def test_pixels_keep_what_is_promised(
-    check: Callable[[Make], None],
-    engine: str,
-) -> None:
+def test_pixels_keep_what_is_promised(check, engine):
     check(partial(gym.make, "TPMPickAndPlace-v0", engine=engine, **OPTIONS))
 
 
-def test_the_expert_needs_the_block_and_says_so() -> None:
+def test_the_expert_needs_the_block_and_says_so():
     env = gym.make("TPMPickAndPlace-v0", engine="analytic", **OPTIONS)
     observation, _ = env.reset(seed=0)
     with pytest.raises(InputError, match=r"observations='state'"):
@@ -78,8 +69,8 @@ def test_the_expert_needs_the_block_and_says_so() -> None:
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-def test_pixels_of_vector_environments_follow_autoreset(engine: str, mode: str) -> None:
-    options: Any = {"engine": engine, "autoreset_mode": mode, **OPTIONS}
+def test_pixels_of_vector_environments_follow_autoreset(engine, mode):
+    options = {"engine": engine, "autoreset_mode": mode, **OPTIONS}
     envs = TPMVectorEnv("reach", num_envs=2, max_episode_steps=3, **options)
     first, _ = envs.reset(seed=[0, 1])
     assert envs.observation_space.contains(first)
@@ -93,7 +84,7 @@ def test_pixels_of_vector_environments_follow_autoreset(engine: str, mode: str) 
     envs.close()
 
 
-def test_hindsight_trains_on_pixels(engine: str) -> None:
+def test_hindsight_trains_on_pixels(engine):
     env = gym.make("TPMPickAndPlace-v0", engine=engine, **OPTIONS)
     model = SAC(
         "MultiInputPolicy",
@@ -117,7 +108,7 @@ def test_hindsight_trains_on_pixels(engine: str) -> None:
         ({"observations": "pixels", "pixel_size": 84.0}, "pixel_size"),
     ],
 )
-def test_what_is_no_option_is_refused(options: dict[str, Any], message: str) -> None:
+def test_what_is_no_option_is_refused(options, message):
     for make in (TPMEnv, TPMVectorEnv):
         with pytest.raises(ConfigurationError, match=message):
             make(**{"engine": "analytic", **options})

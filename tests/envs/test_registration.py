@@ -1,8 +1,6 @@
 """Ids mean what they say; users add their own; importing the package imports little."""
 
 import re
-from collections.abc import Iterator
-from typing import Any
 from unittest.mock import patch
 
 import gymnasium as gym
@@ -17,7 +15,7 @@ from tpm_gym.tasks.registry import TASKS
 
 
 @pytest.fixture
-def registries() -> Iterator[None]:
+def registries():
     """What a test registers is forgotten after it."""
     with patch.dict(gym.registry), patch.dict(TASKS):
         yield
@@ -30,7 +28,7 @@ class Lift(PickAndPlace):
     """A user's."""
 
 
-def test_all_ids_are_registered_under_their_documented_names() -> None:
+def test_all_ids_are_registered_under_their_documented_names():
     assert set(tpm_gym.ENV_IDS) == {
         f"TPM{task}{control}{reward}-v0"
         for task in TASK_CLASSES
@@ -41,9 +39,9 @@ def test_all_ids_are_registered_under_their_documented_names() -> None:
 
 
 @pytest.mark.parametrize("env_id", tpm_gym.ENV_IDS)
-def test_an_id_means_what_it_says(env_id: str) -> None:
+def test_an_id_means_what_it_says(env_id):
     env = gym.make(env_id)
-    inner: Any = env.unwrapped
+    inner = env.unwrapped
     name = re.fullmatch("TPM(.*?)(Joints)?(Dense)?-v0", env_id)[1]
     assert type(inner.task) is TASK_CLASSES[name]
     assert inner.task.reward == ("dense" if "Dense" in env_id else "sparse")
@@ -55,7 +53,7 @@ def test_an_id_means_what_it_says(env_id: str) -> None:
 
 
 @pytest.mark.usefixtures("registries")
-def test_a_users_task_gets_four_ids_and_a_name() -> None:
+def test_a_users_task_gets_four_ids_and_a_name():
     ids = register_task("Lift", Lift, version=3, max_episode_steps=7)
     assert ids == ("TPMLift-v3", "TPMLiftDense-v3", "TPMLiftJoints-v3", "TPMLiftJointsDense-v3")
     assert tpm_gym.ENV_IDS[-4:] == ids
@@ -67,7 +65,7 @@ def test_a_users_task_gets_four_ids_and_a_name() -> None:
 
 
 @pytest.mark.usefixtures("registries")
-def test_registering_twice_is_harmless_and_a_class_defined_anew_replaces_its_forerunner() -> None:
+def test_registering_twice_is_harmless_and_a_class_defined_anew_replaces_its_forerunner():
     for name, task in (("Reach", Reach), ("PickAndPlace", PickAndPlace), ("Lift", Lift)):
         register_task(name, task)
         before = dict(gym.registry)
@@ -98,9 +96,7 @@ def test_registering_twice_is_harmless_and_a_class_defined_anew_replaces_its_for
     ],
 )
 @pytest.mark.usefixtures("registries")
-def test_what_cannot_be_registered_is_refused_and_leaves_nothing(
-    name: Any, task: Any, options: dict[str, Any], blamed: str
-) -> None:
+def test_what_cannot_be_registered_is_refused_and_leaves_nothing(name, task, options, blamed):
     ids, tasks = dict(gym.registry), dict(TASKS)
     with pytest.raises(ConfigurationError) as caught:
         register_task(name, task, **options)
@@ -108,7 +104,7 @@ def test_what_cannot_be_registered_is_refused_and_leaves_nothing(
     assert (gym.registry, TASKS) == (ids, tasks)
 
 
-def test_other_ids_are_not_taken_for_ours(registries: None) -> None:
+def test_other_ids_are_not_taken_for_ours(registries):
     gym.register("Elsewhere-v0", entry_point="elsewhere:Env")
     assert "Elsewhere-v0" not in env_ids()
     with pytest.raises(AttributeError, match="ENV_IDX"):

@@ -16,7 +16,7 @@ RECORDED = json.loads((ROOT / "tests" / "data" / "rollouts.json").read_text(enco
 FAST = {("TPMPickAndPlaceDense-v0", "expert"), ("TPMPickAndPlaceJoints-v0", "published")}
 
 
-def test_every_case_is_recorded_and_no_other() -> None:
+def test_every_case_is_recorded_and_no_other():
     assert set(RECORDED) == {f"{env_id} {name}" for env_id, name in cases()}
     assert set(cases()) >= FAST
 
@@ -26,7 +26,7 @@ def marked(case: tuple[str, str]) -> Any:
 
 
 @pytest.mark.parametrize(("env_id", "name"), [marked(case) for case in cases()])
-def test_rollouts_are_those_on_record(env_id: str, name: str) -> None:
+def test_rollouts_are_those_on_record(env_id, name):
     found, recorded = play(env_id, name, Expert), RECORDED[f"{env_id} {name}"]
     # A policy computes in single precision, and its block may be about to slip or to tip.
     near = 1e-4 if name == "published" else 1e-9

@@ -1,11 +1,9 @@
 """One step stays short: few files and few functions, in PyBullet and in a vector environment."""
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -26,7 +24,7 @@ def noted() -> Iterator[Crossed]:
     """
     crossed: Crossed = set()
 
-    def note(frame: FrameType, event: str, _: Any) -> None:
+    def note(frame, event, _):
         code = frame.f_code
         ours = code.co_filename.startswith(SOURCES) and not code.co_name.startswith("<")
         if event == "call" and ours:
@@ -48,7 +46,7 @@ def noted() -> Iterator[Crossed]:
     ],
     ids=["pybullet", "vector"],
 )
-def test_a_step_crosses_few_files_and_functions(make: Callable[[], Any]) -> None:
+def test_a_step_crosses_few_files_and_functions(make):
     env = make()
     env.reset(seed=0)
     action = np.zeros(env.action_space.shape, dtype=np.float32)

@@ -56,7 +56,7 @@ def assert_same(one: Any, other: Any) -> None:
     ],
     ids=str,
 )
-def test_one_alone_has_the_bits_of_one_among_many(env_id: str, options: dict[str, Any]) -> None:
+def test_one_alone_has_the_bits_of_one_among_many(env_id, options):
     count, seed = 33, 3
     envs = make(env_id, count, **options)
     watched = {row: gym.make(env_id, engine="analytic", **options) for row in (0, 8, 32)}
@@ -76,7 +76,7 @@ def test_one_alone_has_the_bits_of_one_among_many(env_id: str, options: dict[str
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_it_does_what_gymnasiums_vectors_of_single_environments_do(mode: str) -> None:
+def test_it_does_what_gymnasiums_vectors_of_single_environments_do(mode):
     count = 3
     options = {"engine": "analytic", "max_episode_steps": 7}
     theirs = SyncVectorEnv(
@@ -105,8 +105,8 @@ def test_it_does_what_gymnasiums_vectors_of_single_environments_do(mode: str) ->
 
 
 @pytest.mark.parametrize(("mode", "drive"), [*zip(MODES, ["ideal", "servo", "ideal"], strict=True)])
-def test_threads_change_no_bit(mode: str, drive: str) -> None:
-    options: Any = {"randomisation": EVERYTHING, "drive": drive, "max_episode_steps": 7}
+def test_threads_change_no_bit(mode, drive):
+    options = {"randomisation": EVERYTHING, "drive": drive, "max_episode_steps": 7}
     runs = []
     for threads in (1, 3):
         envs = make(PICK, 5, autoreset_mode=mode, num_threads=threads, **options)
@@ -125,7 +125,7 @@ def test_threads_change_no_bit(mode: str, drive: str) -> None:
         assert_same(run, runs[0])
 
 
-def test_the_first_episodes_are_of_different_lengths_where_that_is_asked_for() -> None:
+def test_the_first_episodes_are_of_different_lengths_where_that_is_asked_for():
     envs = make(REACH, 10, stagger=True, max_episode_steps=20)
     envs.reset(seed=0)
     ended = [envs.step(actions)[3].sum() for actions in actions_of(envs, 20)]
@@ -134,7 +134,7 @@ def test_the_first_episodes_are_of_different_lengths_where_that_is_asked_for() -
 
 
 @pytest.mark.parametrize("randomisation", [None, EVERYTHING], ids=["nominal", "everything"])
-def test_what_is_saved_goes_on_equally(randomisation: Any) -> None:
+def test_what_is_saved_goes_on_equally(randomisation):
     envs, other, unsaved = (
         make(PICK, 7, randomisation=randomisation, stagger=True) for _ in range(3)
     )
@@ -154,9 +154,7 @@ def test_what_is_saved_goes_on_equally(randomisation: Any) -> None:
 
 
 @pytest.mark.parametrize("env_id", [REACH, PICK])
-def test_resets_draw_what_those_of_one_environment_do_whatever_is_chosen_between(
-    env_id: str,
-) -> None:
+def test_resets_draw_what_those_of_one_environment_do_whatever_is_chosen_between(env_id):
     count = 40
     envs, alone = make(env_id, count), gym.make(env_id, engine="analytic")
     even = np.arange(count) % 2 == 0
@@ -194,16 +192,14 @@ BAD: list[tuple[Callable[[TPMVectorEnv], Any], type[Exception], str]] = [
 
 
 @pytest.mark.parametrize(("misuse", "error", "message"), BAD)
-def test_misuse_is_refused(
-    misuse: Callable[[TPMVectorEnv], Any], error: type[Exception], message: str
-) -> None:
+def test_misuse_is_refused(misuse, error, message):
     envs = make()
     envs.reset(seed=0)
     with pytest.raises(error, match=message):
         misuse(envs)
 
 
-def test_options_are_refused_by_name() -> None:
+def test_options_are_refused_by_name():
     for options, message in (
         ({"num_envs": 0}, "1 or more"),
         ({"max_episode_steps": 0}, "1 or more"),
@@ -229,7 +225,7 @@ def test_options_are_refused_by_name() -> None:
         envs.step(np.zeros((5, 4)))
 
 
-def test_a_reset_for_some_leaves_the_others_as_they_are() -> None:
+def test_a_reset_for_some_leaves_the_others_as_they_are():
     envs, twin = make(PICK, 4), make(PICK, 4)
     for each in (envs, twin):
         each.reset(seed=0)
@@ -250,7 +246,7 @@ def test_a_reset_for_some_leaves_the_others_as_they_are() -> None:
 @pytest.mark.parametrize(
     "wrong", [{"seed": [1, 2, 3, -4]}, {"seed": 5, "options": {"goal": "there"}}], ids=str
 )
-def test_a_refused_reset_seeds_nothing(wrong: Any) -> None:
+def test_a_refused_reset_seeds_nothing(wrong):
     found = []
     for refused in (False, True):
         envs = make(PICK, 4)

@@ -3,7 +3,6 @@
 import math
 import subprocess
 import sys
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -19,8 +18,6 @@ from tpm_gym.kinematics import (
     DEFAULT_ASSEMBLY,
     ELBOWS_OUT,
     WORKING_MODES,
-    AssemblyMode,
-    WorkingMode,
     equations,
     forward,
     forward_all,
@@ -62,7 +59,7 @@ def parts(found: Any) -> tuple[Any, ...]:
 
 
 @pytest.mark.parametrize("g", GEOMETRIES)
-def test_what_rounding_pushes_over_an_edge_is_on_it(g: Geometry) -> None:
+def test_what_rounding_pushes_over_an_edge_is_on_it(g):
     inside, beyond = (0.05, 0.5 * g.l7, 0.75), (0.05, 0.5 * g.l7, 3.0)
     for _ in range(60):  # until nothing lies between the two: leg 1 to 3, whichever ends first
         between = tuple((a + b) / 2 for a, b in zip(inside, beyond, strict=True))
@@ -82,16 +79,14 @@ def test_what_rounding_pushes_over_an_edge_is_on_it(g: Geometry) -> None:
         ((-2.2912464026315247, 0.544275213294847, 0.27117719284950903), WIDE),
     ],
 )
-def test_two_singular_values_that_coincide_are_a_conditioning_too(
-    theta: tuple[float, ...], g: Geometry
-) -> None:
+def test_two_singular_values_that_coincide_are_a_conditioning_too(theta, g):
     single = jacobian.evaluate(theta, DEFAULT_ASSEMBLY, g)
     values = np.linalg.svd(single.velocity, compute_uv=False)
     assert single.conditioning == pytest.approx(values[2] / values[0], abs=1e-8)
 
 
 @pytest.mark.parametrize("g", GEOMETRIES)
-def test_tensors_give_what_arrays_give(g: Geometry) -> None:
+def test_tensors_give_what_arrays_give(g):
     thetas, points = angles(1, 5000), places(2, 5000, g)
     names = ("position", "beta", "link3")
     assert_same(forward_all(torch.tensor(thetas), g), forward_all(thetas, g), names, 1e-12)
@@ -112,7 +107,7 @@ def test_tensors_give_what_arrays_give(g: Geometry) -> None:
 
 
 @pytest.mark.parametrize("shape", [(3,), (0, 3), (2, 5, 3)])
-def test_tensors_stay_on_their_device_in_every_shape(shape: tuple[int, ...]) -> None:
+def test_tensors_stay_on_their_device_in_every_shape(shape):
     # "meta" holds no numbers, and refuses to compute with tensors of another device.
     somewhere = torch.zeros(shape, dtype=torch.float32, device="meta")
     found = [*vars(inverse_all(somewhere)).values(), *vars(forward_all(somewhere)).values()]
@@ -123,7 +118,7 @@ def test_tensors_stay_on_their_device_in_every_shape(shape: tuple[int, ...]) -> 
     assert {value.dtype for value in tensors} == {torch.float64, torch.bool}
 
 
-def test_torch_is_not_imported_by_who_has_no_tensor() -> None:
+def test_torch_is_not_imported_by_who_has_no_tensor():
     code = (
         "import sys; from tpm_gym.kinematics import forward_all, inverse; "
         "forward_all(inverse([[0, 0.03, 0.8]])); sys.exit('torch' in sys.modules)"
@@ -140,10 +135,8 @@ def test_torch_is_not_imported_by_who_has_no_tensor() -> None:
     [forward, jacobian.parallel, jacobian.serial, jacobian.velocity, jacobian.conditioning]
     + [jacobian.factors, jacobian.evaluate],
 )
-def test_derivatives_are_those_of_finite_differences(
-    function: Callable[..., Any], branch: AssemblyMode
-) -> None:
-    def values(theta: torch.Tensor) -> Any:
+def test_derivatives_are_those_of_finite_differences(function, branch):
+    def values(theta):
         found = function(theta, branch)
         return found if isinstance(found, torch.Tensor) else parts(found)
 
@@ -153,7 +146,7 @@ def test_derivatives_are_those_of_finite_differences(
 
 
 @pytest.mark.parametrize("branch", [mode for mode in WORKING_MODES if mode.cos_beta > 0])
-def test_derivatives_at_points_are_those_of_finite_differences(branch: WorkingMode) -> None:
+def test_derivatives_at_points_are_those_of_finite_differences(branch):
     points = np.random.default_rng(4).uniform(LOW, HIGH, (3, 3))
     tensor = torch.tensor(points, requires_grad=True)
     slot = int(workspace.assembly_of(points[0], branch))
@@ -164,11 +157,11 @@ def test_derivatives_at_points_are_those_of_finite_differences(branch: WorkingMo
 
 
 @pytest.mark.parametrize("branch", [mode for mode in WORKING_MODES if mode.cos_beta > 0])
-def test_derivatives_by_the_lengths_are_those_of_finite_differences(branch: WorkingMode) -> None:
+def test_derivatives_by_the_lengths_are_those_of_finite_differences(branch):
     points = torch.tensor(np.random.default_rng(4).uniform(LOW, HIGH, (3, 3)))
     slot = int(workspace.assembly_of(points[0], branch))
 
-    def values(lengths: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    def values(lengths):
         g = Lengths(*lengths)
         factors = jacobian.factors_at(points, branch, g)
         found = workspace.conditioning_at(points, branch, ASSEMBLY_MODES[slot], g)
@@ -178,7 +171,7 @@ def test_derivatives_by_the_lengths_are_those_of_finite_differences(branch: Work
     assert gradcheck(values, (lengths,))
 
 
-def test_branches_that_do_not_exist_leave_the_derivatives_of_the_others_finite() -> None:
+def test_branches_that_do_not_exist_leave_the_derivatives_of_the_others_finite():
     points, thetas = places(5, 3000, PAPER), angles(6, 3000)
     for function, given in ((inverse_all, points), (forward_all, thetas)):
         tensor = torch.tensor(given, requires_grad=True)
@@ -197,7 +190,7 @@ def exists(theta: FloatArray) -> bool:
     return bool(forward_all(theta).valid[DEFAULT_ASSEMBLY.index])
 
 
-def test_where_an_assembly_ends_it_meets_another_and_the_factor_is_named() -> None:
+def test_where_an_assembly_ends_it_meets_another_and_the_factor_is_named():
     factors = set()
     for inside, outside in zip(angles(7, 300), angles(8, 300), strict=True):
         if not exists(inside) or exists(outside):
@@ -229,7 +222,7 @@ def error(matrices: FloatArray) -> float:
     return float(np.abs(found - expected).max())
 
 
-def test_the_conditioning_is_that_of_the_singular_values() -> None:
+def test_the_conditioning_is_that_of_the_singular_values():
     rng = np.random.default_rng(1)
     assert error(rng.normal(size=(500, 3, 3))) < 1e-12
     for exact in ([1, 1, 1], [1, 1, 0], [1, 0, 0], [1, 1, 1e-9], [1, 1e-9, 1e-9], [0, 0, 0]):
@@ -249,9 +242,7 @@ def test_the_conditioning_is_that_of_the_singular_values() -> None:
 
 
 @pytest.mark.parametrize("g", GEOMETRIES)
-def test_the_conditioning_of_the_mechanism_is_that_of_its_singular_values_everywhere(
-    g: Geometry,
-) -> None:
+def test_the_conditioning_of_the_mechanism_is_that_of_its_singular_values_everywhere(g):
     thetas = angles(9, 20_000)
     for branch in ASSEMBLY_MODES:
         real = thetas[forward_all(thetas, g).valid[:, branch.index]]
@@ -260,7 +251,7 @@ def test_the_conditioning_of_the_mechanism_is_that_of_its_singular_values_everyw
         np.testing.assert_allclose(found, values[:, 2] / values[:, 0], rtol=1e-8, atol=1e-12)
 
 
-def test_the_conditioning_falls_to_zero_in_proportion_to_y() -> None:
+def test_the_conditioning_falls_to_zero_in_proportion_to_y():
     points = np.random.default_rng(10).uniform(LOW, HIGH, (200, 3))
     heights = 10.0 ** -np.arange(4, 20)
     ratios = [workspace.conditioning_at(points * [1, 0, 1] + [0, y, 0]) / y for y in heights]
@@ -270,8 +261,8 @@ def test_the_conditioning_falls_to_zero_in_proportion_to_y() -> None:
 
 
 @pytest.mark.parametrize("factor", [1, 2])
-def test_the_conditioning_is_zero_where_level3_or_the_planar_factor_is(factor: int) -> None:
-    def sign(points: FloatArray) -> FloatArray:
+def test_the_conditioning_is_zero_where_level3_or_the_planar_factor_is(factor):
+    def sign(points):
         return np.sign(jacobian.factors_at(points).parallel[:, factor])
 
     one = places(11, 60_000, PAPER)

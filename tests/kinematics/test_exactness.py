@@ -13,7 +13,7 @@ import pytest
 from assemblies import assemblies
 from examples import examples
 from hypothesis import strategies as st
-from roots import Equation, Rows, circle_roots, unit, unmatched
+from roots import circle_roots, unit, unmatched
 
 from tpm_gym.arrays import FloatArray
 from tpm_gym.kinematics import ASSEMBLY_MODES, forward_all, inverse_all, jacobian
@@ -65,14 +65,14 @@ both_lengths = pytest.mark.parametrize("g", [PAPER, WIDE])
 @both_lengths
 @both_ways
 @pytest.mark.parametrize("count", [10_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
-def test_random_inputs_close(count: int, solve: Solve, g: Geometry) -> None:
+def test_random_inputs_close(count, solve, g):
     gap, branches = worst(solve, count, g, seed=1)
     assert gap < CLOSED
     assert branches > 0.2 * count
 
 
 @examples(40, oracle.geometries(), oracle.seeds())
-def test_any_geometry_closes(g: Geometry, seed: int) -> None:
+def test_any_geometry_closes(g, seed):
     assert worst(forward_all, 500, g, seed)[0] < CLOSED
     assert worst(inverse_all, 500, g, seed)[0] < CLOSED
 
@@ -91,8 +91,8 @@ def numeric_inverse(points: FloatArray, g: Geometry) -> list[FloatArray]:
     level = [-g.l1 + 0 * x, x_c - 2 * g.l5 + g.l1, x + g.l2 - g.l1]
     up, across = [z_c, z_c, z - g.l6], [x_c, 0 * x, y]
 
-    def loop(leg: int) -> Equation:
-        def gap(index: Rows, theta: FloatArray) -> FloatArray:
+    def loop(leg):
+        def gap(index, theta):
             a = level[leg][index] - g.l3 * np.cos(theta)
             b = up[leg][index] - g.l3 * np.sin(theta)
             return a**2 + b**2 + across[leg][index] ** 2 - g.l4**2
@@ -137,18 +137,18 @@ def check(solve: Solve, count: int, g: Geometry, seed: int) -> int:
 
 @both_lengths
 @pytest.mark.parametrize("count", [200, pytest.param(10_000, marks=pytest.mark.slow)])
-def test_no_branch_is_missed(count: int, g: Geometry) -> None:
+def test_no_branch_is_missed(count, g):
     assert check(forward_all, count, g, seed=3) > 0.2 * count
     assert check(inverse_all, count, g, seed=4) > 4 * count
 
 
 @examples(10, oracle.geometries(), oracle.seeds())
-def test_no_branch_is_missed_for_any_geometry(g: Geometry, seed: int) -> None:
+def test_no_branch_is_missed_for_any_geometry(g, seed):
     check(forward_all, 40, g, seed)
     check(inverse_all, 40, g, seed)
 
 
-def test_the_root_finder_finds_pairs_between_its_samples() -> None:
+def test_the_root_finder_finds_pairs_between_its_samples():
     offset = np.array([1 - 1e-9, 1 + 1e-9, -1 + 1e-12, 0.3, -1 - 1e-12])
     rows, roots = circle_roots(lambda row, a: np.cos(a - 0.7) - offset[row], 5)
     assert rows.tolist() == [0, 0, 2, 2, 3, 3]
@@ -159,7 +159,7 @@ OFFS = [-1e-6, -1e-9, -1e-11, 1e-11, 1e-9, 1e-6]
 
 
 @pytest.mark.parametrize("off", OFFS)
-def test_postures_about_to_merge_close_and_none_is_missed(off: float) -> None:
+def test_postures_about_to_merge_close_and_none_is_missed(off):
     """Leg 2 within a relative ``off`` of being folded."""
     rng, g = np.random.default_rng(7), PAPER
     points = positions(rng, 400, g)
@@ -176,14 +176,14 @@ def test_postures_about_to_merge_close_and_none_is_missed(off: float) -> None:
 
 
 @pytest.mark.parametrize("off", OFFS)
-def test_circles_about_to_touch_close_and_no_assembly_is_missed(off: float) -> None:
+def test_circles_about_to_touch_close_and_no_assembly_is_missed(off):
     """The circle of B1C1 within a relative ``off`` of touching that of B2C2 from inside."""
     rng, g = np.random.default_rng(8), WIDE
     theta = angles(rng, 400)
     y1, z1 = g.l1 + g.l3 * np.cos(theta[:, 0]), g.l3 * np.sin(theta[:, 0])
     touching = (g.l4 - np.sqrt(g.l4**2 - y1**2)) * (1 + off)
 
-    def apart(row: Rows, turn: FloatArray) -> FloatArray:
+    def apart(row, turn):
         x2, z2 = -g.l1 + g.l3 * np.cos(turn) + 2 * g.l5, g.l3 * np.sin(turn)
         return np.hypot(x2, z2 - z1[row]) - touching[row]
 
@@ -198,7 +198,7 @@ def test_circles_about_to_touch_close_and_no_assembly_is_missed(off: float) -> N
 
 @pytest.mark.parametrize("angle", [1e-1, 1e-2, 1e-4, 1e-5, 1e-6, 1e-7, 0.0])
 @pytest.mark.parametrize("folded", [False, True])
-def test_assemblies_about_to_merge_at_y_0_are_not_missed(angle: float, folded: bool) -> None:
+def test_assemblies_about_to_merge_at_y_0_are_not_missed(angle, folded):
     """Link 7 within ``angle`` of beta = 0 or pi: rounding alone can make cos(beta) exceed 1."""
     g, points = PAPER, positions(np.random.default_rng(9), 1500, PAPER)
     points[:, 1] = g.l7 * np.sin(angle)
@@ -217,7 +217,7 @@ def test_assemblies_about_to_merge_at_y_0_are_not_missed(angle: float, folded: b
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
-def test_the_edge_in_y_belongs_to_the_workspace_and_nothing_beyond(sign: int) -> None:
+def test_the_edge_in_y_belongs_to_the_workspace_and_nothing_beyond(sign):
     points = oracle.vector(-0.05, sign * PAPER.l7 * np.array([1, 1 + 1e-15, 1 + 1e-11]), 0.78)
     found = inverse_all(points)
     assert found.valid.all(axis=-1).tolist() == [True, True, False]
@@ -226,7 +226,7 @@ def test_the_edge_in_y_belongs_to_the_workspace_and_nothing_beyond(sign: int) ->
 
 
 @examples(40, oracle.geometries(), oracle.seeds(), st.floats(0.05, 20))
-def test_lengths_scale_positions_alone(g: Geometry, seed: int, factor: float) -> None:
+def test_lengths_scale_positions_alone(g, seed, factor):
     bigger = oracle.scaled(g, factor)
     rng = np.random.default_rng(seed)
     points = oracle.reachable_points(rng, 50, g)
@@ -245,7 +245,7 @@ def test_lengths_scale_positions_alone(g: Geometry, seed: int, factor: float) ->
 
 
 @examples(40, oracle.geometries(), oracle.seeds())
-def test_the_mechanism_is_symmetric_in_y(g: Geometry, seed: int) -> None:
+def test_the_mechanism_is_symmetric_in_y(g, seed):
     rng = np.random.default_rng(seed)
     points = oracle.reachable_points(rng, 50, g)
     one, other = inverse_all(points, g), inverse_all(points * [1, -1, 1], g)

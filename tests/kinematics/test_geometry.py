@@ -21,7 +21,7 @@ def with_length(name: str, value: Any) -> Geometry:
     return Geometry(**{**asdict(PAPER), name: value})
 
 
-def test_the_paper_s_case_study() -> None:
+def test_the_paper_s_case_study():
     lengths = {"l1": 0.3, "l2": 0.07, "l3": 0.35, "l4": 0.8, "l5": 0.1, "l6": 0.01, "l7": 0.05}
     assert asdict(PAPER) == lengths
 
@@ -33,7 +33,7 @@ NO_LENGTHS = [-0.1, np.nan, np.inf, -np.inf, True, False, "0.3", None, [0.3], 10
     ("name", "value"),
     [*product(LENGTHS, NO_LENGTHS), *product(LENGTHS[:5] + LENGTHS[6:], [0.0])],
 )
-def test_values_that_are_no_length_are_refused_by_name(name: str, value: Any) -> None:
+def test_values_that_are_no_length_are_refused_by_name(name, value):
     with pytest.raises(GeometryError) as caught:
         with_length(name, value)
     assert caught.value.name == name
@@ -41,11 +41,11 @@ def test_values_that_are_no_length_are_refused_by_name(name: str, value: Any) ->
     assert name in str(caught.value)
 
 
-def test_l6_may_be_zero() -> None:
+def test_l6_may_be_zero():
     assert with_length("l6", 0.0).l6 == 0.0
 
 
-def test_integers_are_lengths() -> None:
+def test_integers_are_lengths():
     assert replace(PAPER, l4=1).l4 == 1
 
 
@@ -65,9 +65,7 @@ LONG_BASE = {"l1": 0.5, "l3": 0.25}
         ("l4", [0.1, 0.2, 0.25], LONG_BASE, 0.26),  # rods that cannot reach link 3'
     ],
 )
-def test_combinations_that_make_no_mechanism_are_refused(
-    name: str, bad: list[float], others: dict[str, float], good: float
-) -> None:
+def test_combinations_that_make_no_mechanism_are_refused(name, bad, others, good):
     for value in bad:
         with pytest.raises(GeometryError) as caught:
             replace(PAPER, **others, **{name: value})
@@ -76,7 +74,7 @@ def test_combinations_that_make_no_mechanism_are_refused(
 
 
 @examples(20, oracle.geometries(), oracle.seeds())
-def test_arms_as_long_as_the_base_work(g: Geometry, seed: int) -> None:
+def test_arms_as_long_as_the_base_work(g, seed):
     """The paper's l3 != l1 keeps nothing away: both kinematics close all loops."""
     g = replace(g, l3=g.l1)
     points = oracle.reachable_points(np.random.default_rng(seed), 20, g)
@@ -87,7 +85,7 @@ def test_arms_as_long_as_the_base_work(g: Geometry, seed: int) -> None:
     assert np.nanmin(gaps, axis=-1).max() < 1e-6
 
 
-def test_too_short_rods_never_meet_the_plane_of_link_3() -> None:
+def test_too_short_rods_never_meet_the_plane_of_link_3():
     g = SimpleNamespace(**{**asdict(PAPER), "l1": 0.5, "l3": 0.25, "l4": 0.24})
     turn = np.linspace(0, 2 * np.pi, 3601)
     b1 = oracle.points(np.stack([turn] * 3, axis=-1), 0.0, 0.0, 0.0, g)["B1"]
@@ -95,6 +93,6 @@ def test_too_short_rods_never_meet_the_plane_of_link_3() -> None:
 
 
 @examples(50, oracle.geometries(), oracle.seeds())
-def test_accepted_lengths_can_be_assembled(g: Geometry, seed: int) -> None:
+def test_accepted_lengths_can_be_assembled(g, seed):
     angles = np.random.default_rng(seed).uniform(-np.pi, np.pi, (2000, 3))
     assert forward_all(angles, g).valid.any()

@@ -33,9 +33,7 @@ def assert_derivative(theta: FloatArray, branch: AssemblyMode, g: Geometry) -> N
 
 @examples(25, oracle.geometries(), oracle.seeds())
 @example(PAPER, 1)
-def test_velocity_jacobian_is_the_derivative_of_the_forward_kinematics(
-    g: Geometry, seed: int
-) -> None:
+def test_velocity_jacobian_is_the_derivative_of_the_forward_kinematics(g, seed):
     for branch in ASSEMBLY_MODES:
         count = 1000 if g == PAPER else 100
         theta = oracle.angles_on(branch, np.random.default_rng(seed), count, g, clear=0.2)
@@ -45,7 +43,7 @@ def test_velocity_jacobian_is_the_derivative_of_the_forward_kinematics(
 
 
 @pytest.mark.parametrize("branch", ASSEMBLY_MODES)
-def test_velocity_solves_a_v_equal_b_theta_dot(branch: AssemblyMode) -> None:
+def test_velocity_solves_a_v_equal_b_theta_dot(branch):
     theta = oracle.angles_on(branch, np.random.default_rng(2), 400, PAPER, clear=1e-2)
     a, b = jacobian.parallel(theta, branch), jacobian.serial(theta, branch)
     j = jacobian.velocity(theta, branch)
@@ -58,11 +56,11 @@ def test_velocity_solves_a_v_equal_b_theta_dot(branch: AssemblyMode) -> None:
     assert (np.abs(j[regular] - solved) / size).max() < 1e-9
 
 
-def test_conditioning_at_the_documented_point() -> None:
+def test_conditioning_at_the_documented_point():
     assert jacobian.conditioning(inverse([0, 0.025, 0.75])) == pytest.approx(0.11, abs=0.005)
 
 
-def test_plane_y_0_is_a_parallel_singularity() -> None:
+def test_plane_y_0_is_a_parallel_singularity():
     rng = np.random.default_rng(4)
     low, high = np.array(PAPER_TPM.region.low), np.array(PAPER_TPM.region.high)
     low[1] = high[1] = 0.0
@@ -78,14 +76,14 @@ def test_plane_y_0_is_a_parallel_singularity() -> None:
             assert abs(caught.value.value) < 1e-6
 
 
-def test_one_singular_entry_makes_the_batch_singular() -> None:
+def test_one_singular_entry_makes_the_batch_singular():
     theta = inverse([[0.0, 0.03, 0.78], *oracle.vector(np.linspace(-0.2, 0.1, 50), 0.0, 0.75)])
     with pytest.raises(SingularityError):
         jacobian.velocity(theta)
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
-def test_velocity_is_finite_at_the_edge_of_the_workspace_in_y(sign: int) -> None:
+def test_velocity_is_finite_at_the_edge_of_the_workspace_in_y(sign):
     rng = np.random.default_rng(5)
     branch = AssemblyMode(planar=-1, sin_beta=sign)
     points = rng.uniform([-0.2, 0, 0.68], [0.1, 0, 0.88], (50, 3))
@@ -103,7 +101,7 @@ def test_velocity_is_finite_at_the_edge_of_the_workspace_in_y(sign: int) -> None
     assert_derivative(theta, branch, PAPER)
 
 
-def test_evaluate_equals_the_separate_functions() -> None:
+def test_evaluate_equals_the_separate_functions():
     for branch in ASSEMBLY_MODES:
         theta = oracle.angles_on(branch, np.random.default_rng(6), 200, PAPER, clear=1e-2)
         found = jacobian.evaluate(theta, branch)

@@ -1,8 +1,5 @@
 """What has no solution is told by validity in batches, and explained by the part that fails."""
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 import oracle
 import pytest
@@ -45,9 +42,7 @@ APART = [0.0, np.pi, -2.0], [np.pi / 2, -np.pi / 2 + 0.2, 0.5]
 @pytest.mark.parametrize("function", [forward_all, inverse_all])
 @pytest.mark.parametrize("kind", [np.array, torch.tensor])
 @pytest.mark.parametrize("values", NOT_FINITE)
-def test_values_that_are_not_finite_give_invalid_branches(
-    function: Callable[..., Any], kind: Callable[..., Any], values: list[float]
-) -> None:
+def test_values_that_are_not_finite_give_invalid_branches(function, kind, values):
     with np.errstate(invalid="raise", divide="raise", over="raise"):
         solutions = function(kind([values, HOME.tolist(), values]))
     assert not solutions.valid[[0, 2]].any()
@@ -56,7 +51,7 @@ def test_values_that_are_not_finite_give_invalid_branches(
 
 
 @pytest.mark.parametrize("point", FAR)
-def test_points_out_of_reach_have_no_branch_and_an_error(point: list[float]) -> None:
+def test_points_out_of_reach_have_no_branch_and_an_error(point):
     with np.errstate(invalid="raise", divide="raise", over="raise"):
         solutions = inverse_all(point)
         with pytest.raises(UnreachableError) as caught:
@@ -67,7 +62,7 @@ def test_points_out_of_reach_have_no_branch_and_an_error(point: list[float]) -> 
     assert np.isnan(solutions.beta).all()
 
 
-def test_what_is_found_of_a_branch_is_finite_where_it_is_valid_and_nowhere_else() -> None:
+def test_what_is_found_of_a_branch_is_finite_where_it_is_valid_and_nowhere_else():
     solutions = forward_all(np.random.default_rng(0).uniform(-np.pi, np.pi, (5000, 3)))
     assert not solutions.valid.all()
     for values in (solutions.position, solutions.beta[..., None], solutions.link3):
@@ -76,9 +71,7 @@ def test_what_is_found_of_a_branch_is_finite_where_it_is_valid_and_nowhere_else(
 
 @pytest.mark.parametrize("function", SINGLE_BRANCH)
 @pytest.mark.parametrize("values", NOT_FINITE)
-def test_single_branch_calls_reject_values_that_are_not_finite(
-    function: Callable[..., Any], values: list[float]
-) -> None:
+def test_single_branch_calls_reject_values_that_are_not_finite(function, values):
     for given in (
         values,
         [HOME, values],
@@ -94,13 +87,13 @@ def test_single_branch_calls_reject_values_that_are_not_finite(
 @pytest.mark.parametrize(
     "bad", [1.0, [], [0.0, 0.0], np.zeros((3, 2)), ["1", "2", "3"], [10**400] * 3]
 )
-def test_wrong_shapes_and_types_are_input_errors(function: Callable[..., Any], bad: Any) -> None:
+def test_wrong_shapes_and_types_are_input_errors(function, bad):
     with pytest.raises(InputError, match="shape"):
         function(bad)
 
 
 @pytest.mark.parametrize("y", [0.0501, -0.06, 1.0])
-def test_points_beyond_link_7_blame_beta_and_say_by_how_much(y: float) -> None:
+def test_points_beyond_link_7_blame_beta_and_say_by_how_much(y):
     point = [0.0, y, 0.75]
     with pytest.raises(UnreachableError) as caught:
         inverse([HOME, point])
@@ -122,7 +115,7 @@ def rod_range(point: FloatArray, leg: int, cos_sign: int) -> tuple[float, float]
     return float(lengths.min()), float(lengths.max())
 
 
-def test_the_leg_that_is_blamed_cannot_reach() -> None:
+def test_the_leg_that_is_blamed_cannot_reach():
     rng = np.random.default_rng(1)
     blamed = set()
     for point in rng.uniform([-0.9, -0.049, -1.3], [0.9, 0.049, 1.3], (150, 3)):
@@ -139,7 +132,7 @@ def test_the_leg_that_is_blamed_cannot_reach() -> None:
     assert blamed == {1, 2, 3}
 
 
-def test_margin_of_a_planar_leg_is_the_missing_length() -> None:
+def test_margin_of_a_planar_leg_is_the_missing_length():
     # C2 is 300 mm under A2, nearer than leg 2 can fold: |l3 - l4| = 450 mm.
     x_c, z_c = 2 * PAPER.l5 - PAPER.l1, 0.3
     point = [x_c + PAPER.l2 + PAPER.l7, 0.0, z_c + 2 * PAPER.l6]
@@ -150,7 +143,7 @@ def test_margin_of_a_planar_leg_is_the_missing_length() -> None:
 
 
 @pytest.mark.parametrize("theta", APART)
-def test_loops_that_cannot_be_assembled_are_named(theta: list[float]) -> None:
+def test_loops_that_cannot_be_assembled_are_named(theta):
     assert not forward_all(theta).valid.any()
     home = inverse(HOME)
     for mode in ASSEMBLY_MODES:
@@ -175,7 +168,7 @@ def margin_of_loop_2(theta: FloatArray, mode: AssemblyMode) -> float:
     return float(min(lengths.max() - PAPER.l4, PAPER.l4 - lengths.min()))
 
 
-def test_the_loop_that_is_blamed_is_the_one_that_fails_and_by_so_much() -> None:
+def test_the_loop_that_is_blamed_is_the_one_that_fails_and_by_so_much():
     angles = np.random.default_rng(2).uniform(-np.pi, np.pi, (120, 3))
     blamed = set()
     for theta in angles:

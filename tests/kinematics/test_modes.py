@@ -23,9 +23,7 @@ CENTRE = np.array([-0.06, 0.03, 0.78])
 
 
 @pytest.mark.parametrize(("modes", "count"), [(ASSEMBLY_MODES, 4), (WORKING_MODES, 16)])
-def test_every_combination_of_signs_has_the_slot_of_its_index(
-    modes: tuple[Any, ...], count: int
-) -> None:
+def test_every_combination_of_signs_has_the_slot_of_its_index(modes, count):
     assert len(set(modes)) == len(modes) == count
     assert [mode.index for mode in modes] == list(range(count))
     for mode in modes:
@@ -33,7 +31,7 @@ def test_every_combination_of_signs_has_the_slot_of_its_index(
 
 
 @pytest.mark.parametrize("bad", [0, 2, -2, 0.5, float("nan"), "+", None])
-def test_anything_but_signs_is_refused(bad: Any) -> None:
+def test_anything_but_signs_is_refused(bad):
     for kind, good in ((AssemblyMode, [1, 1]), (WorkingMode, [1, -1, 1, -1])):
         for position in range(len(good)):
             signs: list[Any] = [*good]
@@ -45,7 +43,7 @@ def test_anything_but_signs_is_refused(bad: Any) -> None:
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("kind", [int, float, bool, np.int64, np.float64, np.float32])
-def test_signs_that_were_computed_serve_as_plain_ones(kind: Any) -> None:
+def test_signs_that_were_computed_serve_as_plain_ones(kind):
     mode = AssemblyMode(kind(1), kind(1))
     assert mode == AssemblyMode(1, 1)
     assert all(type(sign) is int for sign in (*mode.signs, *WorkingMode(*[kind(1)] * 4).signs))
@@ -61,7 +59,7 @@ def elbow_distances(mode: WorkingMode) -> np.ndarray:
     return np.array([distance[f"B{i}"] - distance[f"A{i}"] for i in (1, 2, 3)])
 
 
-def test_elbows_out_bends_every_arm_away_from_the_centre_and_the_others_do_not() -> None:
+def test_elbows_out_bends_every_arm_away_from_the_centre_and_the_others_do_not():
     assert (elbow_distances(ELBOWS_OUT) > 0).all()
     assert ELBOWS_OUT.cos_beta == 1
     valid = kinematics.inverse_all(CENTRE).valid
@@ -71,7 +69,7 @@ def test_elbows_out_bends_every_arm_away_from_the_centre_and_the_others_do_not()
         assert (elbow_distances(mode) > 0).all() == (mode == ELBOWS_OUT)
 
 
-def test_the_default_assembly_holds_the_platform_beyond_the_elbows_at_positive_y() -> None:
+def test_the_default_assembly_holds_the_platform_beyond_the_elbows_at_positive_y():
     theta = kinematics.inverse(CENTRE)
     np.testing.assert_allclose(kinematics.forward(theta, DEFAULT_ASSEMBLY), CENTRE, atol=1e-12)
     heights = PAPER.l3 * np.sin(theta)

@@ -1,7 +1,6 @@
 """Forward and inverse kinematics invert each other, on every branch, under the promised labels."""
 
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import oracle
@@ -70,24 +69,24 @@ def assert_theta_found_again(s: SimpleNamespace, g: Geometry) -> None:
     assert np.median(turn) < 1e-14
 
 
-def test_inverse_then_forward_returns_to_10000_points_on_every_branch() -> None:
+def test_inverse_then_forward_returns_to_10000_points_on_every_branch():
     found = oracle.reachable_postures(np.random.default_rng(1), 10_000, PAPER)
     assert set(found.slot) == set(range(16))
     assert_round_trip(found, PAPER)
 
 
-def test_forward_then_inverse_contains_theta_in_the_slot_its_factors_name() -> None:
+def test_forward_then_inverse_contains_theta_in_the_slot_its_factors_name():
     assert_theta_found_again(assemblies(np.random.default_rng(4), 10_000, PAPER), PAPER)
 
 
 @examples(40, oracle.geometries(), oracle.seeds())
-def test_any_geometry_inverts_and_keeps_its_labels(g: Geometry, seed: int) -> None:
+def test_any_geometry_inverts_and_keeps_its_labels(g, seed):
     rng = np.random.default_rng(seed)
     assert_round_trip(oracle.reachable_postures(rng, 100, g), g)
     assert_theta_found_again(assemblies(rng, 1000, g), g)
 
 
-def test_slots_move_continuously_along_a_path_of_theta() -> None:
+def test_slots_move_continuously_along_a_path_of_theta():
     t = np.linspace(0.0, 2 * np.pi, 2001)
     swing = 0.04 * np.stack([np.sin(t), np.sin(2 * t), np.cos(3 * t)], axis=-1)
     solutions = forward_all(np.array([-2.108, 1.853, -2.051]) + swing)
@@ -97,7 +96,7 @@ def test_slots_move_continuously_along_a_path_of_theta() -> None:
     assert np.abs(solutions.position[..., 1]).min() > 0.04
 
 
-def test_angles_are_returned_in_the_ranges_that_are_promised() -> None:
+def test_angles_are_returned_in_the_ranges_that_are_promised():
     found = oracle.reachable_postures(np.random.default_rng(7), 5_000, PAPER)
     theta1, theta2, theta3 = found.theta.T
     assert (theta2 >= 0).all()
@@ -108,7 +107,7 @@ def test_angles_are_returned_in_the_ranges_that_are_promised() -> None:
 
 
 @pytest.mark.parametrize("shape", [(), (5,), (2, 3), (0,)])
-def test_results_have_the_leading_shape_of_their_inputs(shape: tuple[int, ...]) -> None:
+def test_results_have_the_leading_shape_of_their_inputs(shape):
     region = PAPER_TPM.region
     targets = np.random.default_rng(8).uniform(region.low, region.high, (*shape, 3))
     theta = inverse(targets)
@@ -125,14 +124,14 @@ def test_results_have_the_leading_shape_of_their_inputs(shape: tuple[int, ...]) 
 
 
 @pytest.mark.parametrize("solve", [forward_all, inverse_all, forward, inverse])
-def test_what_are_no_lengths_is_refused(solve: Any) -> None:
+def test_what_are_no_lengths_is_refused(solve):
     with pytest.raises(InputError, match=r"geometry must be a tpm_gym\.Geometry"):
         solve(np.zeros((2, 3)), geometry=3)
 
 
 @examples(30, oracle.geometries(), oracle.seeds())
 @example(PAPER, 1)
-def test_free_beta_is_flagged(g: Geometry, seed: int) -> None:
+def test_free_beta_is_flagged(g, seed):
     """At a2 = b2 = 0 of Eq. (10), where level3 vanishes, the angles no longer tell where P is."""
     rng = np.random.default_rng(seed)
     turn, beta = rng.uniform(-np.pi, np.pi, (2, 300))

@@ -82,23 +82,23 @@ def check(count: int, g: Geometry, seed: int) -> None:
 
 
 @pytest.mark.parametrize("g", [PAPER, WIDE, random_geometry(0), random_geometry(1)])
-def test_no_assembly_of_either_mode_is_missed_or_invented(g: Geometry) -> None:
+def test_no_assembly_of_either_mode_is_missed_or_invented(g):
     check(300, g, seed=1)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("g", [PAPER, WIDE, *map(random_geometry, range(20))])
-def test_no_assembly_of_either_mode_is_missed_or_invented_at_10000_angles(g: Geometry) -> None:
+def test_no_assembly_of_either_mode_is_missed_or_invented_at_10000_angles(g):
     check(10_000, g, seed=2)
 
 
-def test_the_assembly_of_an_independent_check() -> None:
+def test_the_assembly_of_an_independent_check():
     found = forward_rotated(TWICE)
     assert np.flatnonzero(found.valid).tolist() == [4, 5]
     np.testing.assert_allclose(np.degrees(found.tilt[4:6]), -127.60, atol=0.005)
 
 
-def test_there_are_eight_at_most_and_eight_there_are() -> None:
+def test_there_are_eight_at_most_and_eight_there_are():
     assert [mode.index for mode in ROTATED_MODES] == list(range(8))
     found = forward_rotated(EIGHT)
     assert found.valid.all()
@@ -110,7 +110,7 @@ def test_there_are_eight_at_most_and_eight_there_are() -> None:
 
 @examples(25, oracle.geometries(), oracle.seeds())
 @example(PAPER, 1)
-def test_slots_have_the_signs_of_their_names(g: Geometry, seed: int) -> None:
+def test_slots_have_the_signs_of_their_names(g, seed):
     found = forward_rotated(angles(np.random.default_rng(seed), 1000), g)
     parallel = rotated.factors(found).parallel
     # Seen along y, rods longer than links 3: else the sign is another one
@@ -128,7 +128,7 @@ def test_slots_have_the_signs_of_their_names(g: Geometry, seed: int) -> None:
 @examples(25, oracle.geometries(), oracle.seeds())
 @example(PAPER, 1)
 @example(WIDE, 1)
-def test_inverse_closes_and_contains_the_angles_again(g: Geometry, seed: int) -> None:
+def test_inverse_closes_and_contains_the_angles_again(g, seed):
     given = forward_rotated(angles(np.random.default_rng(seed), 300), g)
     theta, position = given.theta[given.valid], given.position[given.valid]
     found = inverse_rotated(position, g)
@@ -143,7 +143,7 @@ def test_inverse_closes_and_contains_the_angles_again(g: Geometry, seed: int) ->
 
 
 @examples(25, oracle.geometries(), oracle.seeds())
-def test_inverse_then_forward_returns_in_every_slot(g: Geometry, seed: int) -> None:
+def test_inverse_then_forward_returns_in_every_slot(g, seed):
     reach = g.l3 + g.l4
     low, high = [-reach, -g.l7, -reach], [reach, g.l7, reach]
     some = np.random.default_rng(seed).uniform(low, high, (100, 3))
@@ -158,7 +158,7 @@ def test_inverse_then_forward_returns_in_every_slot(g: Geometry, seed: int) -> N
     assert np.where(again.valid, apart, np.inf).min(axis=-1)[far].max(initial=0) < 1e-9
 
 
-def test_inverse_has_its_slots_in_order() -> None:
+def test_inverse_has_its_slots_in_order():
     points = np.random.default_rng(5).uniform([-0.8, -0.05, -1.1], [0.9, 0.05, 1.1], (2000, 3))
     found = inverse_rotated(points)
     cos, _, leg2, leg3 = np.moveaxis(rotated.factors(found).serial, -1, 0).reshape(
@@ -174,9 +174,7 @@ def test_inverse_has_its_slots_in_order() -> None:
 
 @examples(15, oracle.geometries(), oracle.seeds())
 @example(PAPER, 1)
-def test_velocity_is_the_derivative_and_its_determinant_is_the_factors(
-    g: Geometry, seed: int
-) -> None:
+def test_velocity_is_the_derivative_and_its_determinant_is_the_factors(g, seed):
     theta, step = angles(np.random.default_rng(seed), 500), 1e-6
     found = forward_rotated(theta, g)
     factors, j = rotated.factors(found), rotated.velocity(found)
@@ -201,14 +199,14 @@ def test_velocity_is_the_derivative_and_its_determinant_is_the_factors(
     np.testing.assert_allclose(determinant * products[1], products[0], rtol=1e-8, atol=1e-12)
 
 
-def test_where_rods_4a_4b_and_6_meet_in_a_point_the_planar_factor_is_zero() -> None:
+def test_where_rods_4a_4b_and_6_meet_in_a_point_the_planar_factor_is_zero():
     """Seen along y, its size over that of rod 6's moment about the crossing is regular."""
     found = forward_rotated(angles(np.random.default_rng(3), 3000))
     factors = rotated.factors(found)
     clear = found.valid & (np.abs(factors.elevation) > 0.05)
     rods, ends = found.rods[clear][..., [0, 2]], found.ends[clear][..., [0, 2]]
 
-    def cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    def cross(a, b):
         return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
 
     share = cross(ends[:, 1] - ends[:, 0], rods[:, 1]) / cross(rods[:, 0], rods[:, 1])
@@ -218,7 +216,7 @@ def test_where_rods_4a_4b_and_6_meet_in_a_point_the_planar_factor_is_zero() -> N
     np.testing.assert_allclose(-moment, factors.parallel[clear][:, 2], rtol=0, atol=1e-12)
 
 
-def test_where_eq_6_has_one_circle_twice_both_ways_of_b1c1_are_found() -> None:
+def test_where_eq_6_has_one_circle_twice_both_ways_of_b1c1_are_found():
     """B2 + 2 l5 above B1: two tilts, and for each of them B1C1 can point either way."""
     theta_2 = np.arccos((PAPER.l1 - 2 * PAPER.l5) / PAPER.l3)
     pair = [np.pi - theta_2, theta_2]
@@ -231,7 +229,7 @@ def test_where_eq_6_has_one_circle_twice_both_ways_of_b1c1_are_found() -> None:
     assert compared > 2
 
 
-def test_two_tilts_next_to_each_other_with_b1c1_either_way_are_both_found() -> None:
+def test_two_tilts_next_to_each_other_with_b1c1_either_way_are_both_found():
     """From a search: 7e-4 and 9e-4 rad apart."""
     theta = np.array([[1.688993009, 1.019125755, 2.181463313], [2.024924836, 0.840101917, -2.9699]])
     other, compared, worst = unmatched(
@@ -240,7 +238,7 @@ def test_two_tilts_next_to_each_other_with_b1c1_either_way_are_both_found() -> N
     assert (other, compared, worst < 1e-6) == (0, 8, True)
 
 
-def test_where_b2_is_at_the_foot_of_rod_4b_what_is_found_closes() -> None:
+def test_where_b2_is_at_the_foot_of_rod_4b_what_is_found_closes():
     """Seen along y; there the first coefficient of the polynomial in exp(i phi) is zero."""
     theta_2 = np.arccos((PAPER.l1 - PAPER.l5) / PAPER.l3)
     pairs = [[turn, theta_2, theta_3] for turn in (theta_2, np.pi - theta_2) for theta_3 in THIRD]
@@ -248,7 +246,7 @@ def test_where_b2_is_at_the_foot_of_rod_4b_what_is_found_closes() -> None:
 
 
 @pytest.mark.parametrize("shape", [(), (5,), (2, 3), (0,)])
-def test_leading_shapes(shape: tuple[int, ...]) -> None:
+def test_leading_shapes(shape):
     theta = np.random.default_rng(0).uniform(-3, 3, (*shape, 3))
     found, back = forward_rotated(theta), inverse_rotated(theta)
     for postures, slots in ((found, 8), (back, 48)):
@@ -262,7 +260,7 @@ def test_leading_shapes(shape: tuple[int, ...]) -> None:
         np.testing.assert_array_equal(forward_rotated(theta[index]).tilt, found.tilt[index])
 
 
-def test_what_is_not_finite_has_no_posture_and_what_is_no_array_is_refused() -> None:
+def test_what_is_not_finite_has_no_posture_and_what_is_no_array_is_refused():
     given = np.array([[np.nan, 0, 0], [0, np.inf, 0], TWICE, [0, 0, np.nan], [1e300, 1e300, 0]])
     assert forward_rotated(given).valid.sum(axis=-1).tolist()[:4] == [0, 0, 2, 0]
     assert not inverse_rotated([[np.nan, 0, 0], [0, np.inf, 0], [1e300, 0, 0]]).valid.any()

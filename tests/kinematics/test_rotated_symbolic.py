@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tpm_gym.kinematics import forward_rotated, rotated
-from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
+from tpm_gym.kinematics.geometry import PAPER, WIDE
 
 sp = pytest.importorskip("sympy")
 
@@ -41,7 +41,7 @@ def assert_zero(expression: Any) -> None:
     assert sp.expand(rest) == 0
 
 
-def test_both_rods_4_close_where_link_3p_is_level_or_b1c1_halves_the_angle() -> None:
+def test_both_rods_4_close_where_link_3p_is_level_or_b1c1_halves_the_angle():
     difference = halved(ROD_4A.dot(ROD_4A) - ROD_4B.dot(ROD_4B))
     assert_zero(difference + 8 * l5 * s * (x_c * s + (z_c - z_1) * c))
     assert_zero((x_c * s + (z_c - z_1) * c).subs(TURNED))
@@ -57,7 +57,7 @@ def in_tangent(expression: Any, degree: int) -> Any:
     return sp.Poly(sp.expand(sum(raised)), t)
 
 
-def test_the_motors_allow_four_tilts_at_most() -> None:
+def test_the_motors_allow_four_tilts_at_most():
     rod_6 = halved(ROD_6.dot(ROD_6) - l4**2).subs(TURNED)
     rho2 = l4**2 - y_1**2 - 4 * l5**2 * s**2
     rod_6 = sp.expand(rod_6).subs(rho**2, rho2)
@@ -69,7 +69,7 @@ def test_the_motors_allow_four_tilts_at_most() -> None:
     assert in_tangent(rho2 * p**2 - q**2, 4).degree() == 4
 
 
-def test_point_p_allows_six_tilts_at_most_for_each_sign_of_cos_beta() -> None:
+def test_point_p_allows_six_tilts_at_most_for_each_sign_of_cos_beta():
     l1, l3, along, up, x, z = sp.symbols("l1 l3 along up x z", real=True)
     x_1 = x - along * (c**2 - s**2) - up * 2 * s * c
     z_1 = z - up * (c**2 - s**2) + along * 2 * s * c
@@ -84,7 +84,7 @@ def test_point_p_allows_six_tilts_at_most_for_each_sign_of_cos_beta() -> None:
     assert sextic.degree() == 6
 
 
-def test_the_determinant_is_the_factors() -> None:
+def test_the_determinant_is_the_factors():
     """Of all four closures by (xC, zC, phi, beta), on the mode with link 3' turned."""
     level3 = l7 * cb - halved(ROD_11.dot(U)).subs(TURNED)
     rate = ROD_6.diff(tilt) + ROD_6.jacobian([x_c, z_c]) * sp.Matrix([-s / 2, -c / 2]) * rho
@@ -94,7 +94,7 @@ def test_the_determinant_is_the_factors() -> None:
     assert_zero(halved(DETERMINANT).subs(TURNED) - sp.expand(factors))
 
 
-def test_the_determinant_where_link_3p_is_level_is_eq_16_and_the_constraint_factor() -> None:
+def test_the_determinant_where_link_3p_is_level_is_eq_16_and_the_constraint_factor():
     level3 = l7 * cb - halved(ROD_11.dot(U)).subs({s: 0, c: 1})
     planar = x_c * (z_c - z_2) - (z_c - z_1) * (x_c - 2 * l5 - x_2)
     factors = -32 * l5 * l7 * (z_c - z_1) * sb * level3 * planar
@@ -102,7 +102,7 @@ def test_the_determinant_where_link_3p_is_level_is_eq_16_and_the_constraint_fact
 
 
 @pytest.mark.parametrize("g", [PAPER, WIDE])
-def test_the_code_has_these_factors(g: Geometry) -> None:
+def test_the_code_has_these_factors(g):
     symbols = (*PLACES, l2, l4, l5, l6, l7, tilt, beta)
     found = forward_rotated(np.random.default_rng(0).uniform(-np.pi, np.pi, (500, 3)), g)
     real = found.valid

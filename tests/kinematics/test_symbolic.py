@@ -9,7 +9,7 @@ from examples import examples
 from hypothesis import example
 
 from tpm_gym.kinematics import ASSEMBLY_MODES, forward_all, jacobian
-from tpm_gym.kinematics.geometry import PAPER, Geometry
+from tpm_gym.kinematics.geometry import PAPER
 
 sp = pytest.importorskip("sympy")
 
@@ -65,13 +65,13 @@ def product(factors: list[Any]) -> Any:
     return sp.prod(factors)
 
 
-def test_eq_7_is_the_difference_of_the_two_lines_of_eq_6() -> None:
+def test_eq_7_is_the_difference_of_the_two_lines_of_eq_6():
     a1, b1 = 2 * (B[1][0] + 2 * l5), 2 * (B[1][2] - B[0][2])
     c1 = (B[1][0] + 2 * l5) ** 2 + B[1][2] ** 2 - B[0][1] ** 2 - B[0][2] ** 2
     assert_zero(CLOSURES[0] - CLOSURES[1] - (a1 * x_c + b1 * z_c - c1))
 
 
-def test_eq_8_follows_from_eqs_6_and_7() -> None:
+def test_eq_8_follows_from_eqs_6_and_7():
     a1, b1, c1, y_b, z_b = sp.symbols("a1 b1 c1 y_B1 z_B1", real=True)
     first = (x_c**2 + y_b**2 + (z_c - z_b) ** 2 - l4**2).subs(x_c, (c1 - b1 * z_c) / a1)
     d1, e1 = a1**2 + b1**2, 2 * (b1 * c1 + z_b * a1**2)
@@ -82,7 +82,7 @@ def test_eq_8_follows_from_eqs_6_and_7() -> None:
         assert_zero(d1 * root**2 - e1 * root + f1)
 
 
-def test_eq_10_follows_from_eq_9_with_f1_above_e1() -> None:
+def test_eq_10_follows_from_eq_9_with_f1_above_e1():
     reach = D1[0] - B[2][0] + 2 * l2
     a2 = 2 * l7 * reach
     b2 = l4**2 - l7**2 - reach**2 - (D1[2] - B[2][2]) ** 2
@@ -90,7 +90,7 @@ def test_eq_10_follows_from_eq_9_with_f1_above_e1() -> None:
 
 
 @pytest.mark.parametrize("leg", [0, 1, 2])
-def test_eqs_13_and_15_corrected_are_the_closures_in_the_half_angle(leg: int) -> None:
+def test_eqs_13_and_15_corrected_are_the_closures_in_the_half_angle(leg):
     x, y, z = sp.symbols("x y z", real=True)
     end = [column(x, 0, z), column(x, 0, z), column(x, y, z)][leg]
     theta = THETA[leg]
@@ -112,7 +112,7 @@ def test_eqs_13_and_15_corrected_are_the_closures_in_the_half_angle(leg: int) ->
         assert_zero(g * root**2 - 4 * l3 * z * root + h)
 
 
-def test_eq_16_factors_are_the_determinant_of_the_closures() -> None:
+def test_eq_16_factors_are_the_determinant_of_the_closures():
     parallel = sp.Matrix(CLOSURES).jacobian([x_c, z_c, beta])
     assert_zero(parallel.det() - 8 * l7 * product(PARALLEL))
 
@@ -131,7 +131,7 @@ def turned_closures(phi: Any) -> list[Any]:
     return [rod.dot(rod) - l4**2 for rod in rods]
 
 
-def test_the_complete_determinant_has_the_constraint_as_a_fourth_factor() -> None:
+def test_the_complete_determinant_has_the_constraint_as_a_fourth_factor():
     """Eq. (16) takes for granted that link 3' translates; let it turn, and z_C1 - z_B1 appears."""
     phi = sp.Symbol("phi", real=True)
     closures = turned_closures(phi)
@@ -143,14 +143,14 @@ def test_the_complete_determinant_has_the_constraint_as_a_fourth_factor() -> Non
     assert_zero(complete.det() + 32 * l5 * CONSTRAINT * l7 * product(PARALLEL))
 
 
-def test_eq_17_factors_are_the_derivatives_by_the_motors() -> None:
+def test_eq_17_factors_are_the_derivatives_by_the_motors():
     serial = sp.Matrix(CLOSURES).jacobian(THETA)
     assert serial.is_diagonal()
     for leg in range(3):
         assert_zero(serial[leg, leg] + 2 * SERIAL[leg + 1])
 
 
-def test_determinants_of_a_and_b_are_products_of_the_factors() -> None:
+def test_determinants_of_a_and_b_are_products_of_the_factors():
     """A and B in the velocity of P: rows 1 and 2 times cos(beta), with y = l7 sin(beta)."""
     cos, sin = sp.cos(beta), sp.sin(beta)
     a = sp.Matrix(
@@ -175,7 +175,7 @@ SYMBOLIC = {
 
 @examples(25, oracle.geometries(), oracle.seeds())
 @example(PAPER, 1)
-def test_the_code_returns_these_factors_a_and_b(g: Geometry, seed: int) -> None:
+def test_the_code_returns_these_factors_a_and_b(g, seed):
     for branch in ASSEMBLY_MODES:
         theta = oracle.angles_on(branch, np.random.default_rng(seed), 100, g)
         assert len(theta) > 100 or g != PAPER
@@ -198,7 +198,7 @@ def test_the_code_returns_these_factors_a_and_b(g: Geometry, seed: int) -> None:
         np.testing.assert_allclose(det_b, np.cos(turned) * products[1], rtol=0, atol=1e-12)
 
 
-def test_text_under_eq_7_what_keeps_a1_b1_c1_from_vanishing_together_is_l5() -> None:
+def test_text_under_eq_7_what_keeps_a1_b1_c1_from_vanishing_together_is_l5():
     """a1 = b1 = 0 leaves c1 = -y_B1^2, zero only for l5 = l1 (or the forbidden l5 = 0)."""
     cos_2 = sp.solve(B[1][0] + 2 * l5, sp.cos(t2))[0]  # a1 = 0
     for cos_1 in (cos_2, -cos_2):  # b1 = 0: sin theta_1 = sin theta_2

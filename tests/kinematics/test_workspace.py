@@ -28,7 +28,7 @@ coordinates = st.floats(-3, 3)
 triples = st.tuples(coordinates, coordinates, coordinates)
 
 
-def test_task_region_is_wholly_reachable_with_the_elbows_out_in_the_default_assembly() -> None:
+def test_task_region_is_wholly_reachable_with_the_elbows_out_in_the_default_assembly():
     points = oracle.grid(TASK_REGION.low, TASK_REGION.high, (37, 18, 27))
     assert workspace.reachable(points).all()
     assert (workspace.assembly_of(points) == DEFAULT_ASSEMBLY.index).all()
@@ -37,7 +37,7 @@ def test_task_region_is_wholly_reachable_with_the_elbows_out_in_the_default_asse
     assert max(np.abs(np.diff(theta, axis=axis)).max() for axis in range(3)) < 0.05
 
 
-def test_task_region_lies_between_the_singularities_in_y() -> None:
+def test_task_region_lies_between_the_singularities_in_y():
     assert 0 < TASK_REGION.low[1] < TASK_REGION.high[1] < PAPER.l7
     assert (
         workspace.conditioning_at(oracle.grid(TASK_REGION.low, TASK_REGION.high, (19, 9, 14))).min()
@@ -45,7 +45,7 @@ def test_task_region_lies_between_the_singularities_in_y() -> None:
     )
 
 
-def test_reachable_is_the_validity_of_the_slot() -> None:
+def test_reachable_is_the_validity_of_the_slot():
     points = np.random.default_rng(0).uniform([-1, -0.06, -1.3], [1, 0.06, 1.3], (500, 3))
     points[7] = np.nan
     for mode in WORKING_MODES:
@@ -54,7 +54,7 @@ def test_reachable_is_the_validity_of_the_slot() -> None:
         np.testing.assert_array_equal(workspace.assembly_of(points, mode) >= 0, expected)
 
 
-def test_assembly_of_names_the_signs_of_the_parallel_factors() -> None:
+def test_assembly_of_names_the_signs_of_the_parallel_factors():
     points = oracle.reachable_points(np.random.default_rng(1), 2000, PAPER)
     seen = set()
     for mode in WORKING_MODES:
@@ -66,7 +66,7 @@ def test_assembly_of_names_the_signs_of_the_parallel_factors() -> None:
     assert seen == set(range(len(ASSEMBLY_MODES)))
 
 
-def test_conditioning_at_points_is_that_of_their_posture() -> None:
+def test_conditioning_at_points_is_that_of_their_posture():
     points = oracle.grid(TASK_REGION.low, TASK_REGION.high, (7, 5, 6))
     expected = jacobian.conditioning(inverse(points))
     np.testing.assert_allclose(workspace.conditioning_at(points), expected, rtol=1e-12)
@@ -75,7 +75,7 @@ def test_conditioning_at_points_is_that_of_their_posture() -> None:
     assert single == pytest.approx(expected[1, 2, 3])
 
 
-def test_conditioning_is_zero_where_a_branch_does_not_exist() -> None:
+def test_conditioning_is_zero_where_a_branch_does_not_exist():
     points = np.array([[0, 0.03, 5], [0, 0.06, 0.75], [np.nan, 0, 0], [0, -0.03, 0.75]])
     np.testing.assert_array_equal(workspace.conditioning_at(points), 0)
     assert workspace.conditioning_at(points[0]) == 0
@@ -87,9 +87,7 @@ def test_conditioning_is_zero_where_a_branch_does_not_exist() -> None:
 
 
 @examples(200, triples, triples)
-def test_projection_is_inside_idempotent_and_nearest(
-    point: tuple[float, ...], other: tuple[float, ...]
-) -> None:
+def test_projection_is_inside_idempotent_and_nearest(point, other):
     assert BOX.contains([[point, other]]).tolist() == [[BOX.contains(point), BOX.contains(other)]]
     assert BOX.project([[point, other]]).shape == (1, 2, 3)
     for region in (TASK_REGION, BOX):
@@ -103,7 +101,7 @@ def test_projection_is_inside_idempotent_and_nearest(
 
 
 @pytest.mark.parametrize("low", [(0.1, 0, 0), (0, 0.1, 0), (0, 0, 0.1), (float("nan"), 0, 0)])
-def test_empty_regions_are_refused(low: tuple[float, float, float]) -> None:
+def test_empty_regions_are_refused(low):
     with pytest.raises(ConfigurationError) as caught:
         Region(low=low, high=(0.0, 0.0, 0.0))
     assert caught.value.name == "low"

@@ -10,7 +10,6 @@ import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -43,7 +42,7 @@ def assert_equal(first: Content | None, second: Content) -> None:
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     """A folder with whole checkpoints of steps 1 and 2."""
     store = CheckpointStore(tmp_path / "checkpoints")
     for step in (1, 2):
@@ -59,7 +58,7 @@ def names(folder: Path) -> list[str]:
     return sorted(entry.name for entry in folder.iterdir())
 
 
-def test_what_is_loaded_is_what_was_saved(folder: Path) -> None:
+def test_what_is_loaded_is_what_was_saved(folder):
     store = CheckpointStore(folder)
     assert_equal(store.load(pytest.fail), content(2))
     assert store.newest == 2
@@ -67,7 +66,7 @@ def test_what_is_loaded_is_what_was_saved(folder: Path) -> None:
     assert_equal(CheckpointStore(folder).load(pytest.fail), content(2, finished=True))
 
 
-def test_the_last_two_are_kept_and_nothing_else_is_touched(folder: Path) -> None:
+def test_the_last_two_are_kept_and_nothing_else_is_touched(folder):
     mine = ["1.checkpoint", "123456789.checkpoint.bak", "123456789.npz", "notes.txt"]
     for name in mine:
         (folder / name).write_text("mine")
@@ -95,7 +94,7 @@ def flipped(data: bytes, place: int) -> bytes:
         *(lambda data, p=p: flipped(data, int(p * (len(data) - 1))) for p in (0, 0.001, 0.5, 1)),
     ],
 )
-def test_any_damage_is_named_and_the_one_before_is_used(folder: Path, damage: Any) -> None:
+def test_any_damage_is_named_and_the_one_before_is_used(folder, damage):
     damaged = folder / file_of(2)
     damaged.write_bytes(damage(damaged.read_bytes()))
     warned: list[str] = []
@@ -108,7 +107,7 @@ def test_any_damage_is_named_and_the_one_before_is_used(folder: Path, damage: An
     assert_equal(CheckpointStore(folder).load(pytest.fail), content(2))
 
 
-def test_a_checkpoint_of_another_version_is_named(folder: Path) -> None:
+def test_a_checkpoint_of_another_version_is_named(folder):
     archive = io.BytesIO()
     np.savez(archive, head=np.array([99, 2, 0]))
     signed = hashlib.sha256(archive.getvalue()).digest() + archive.getvalue()
@@ -147,7 +146,7 @@ class Dying:
         self.left = operation
         flush = os.fsync
 
-        def fsync(handle: int) -> None:
+        def fsync(handle):
             self.count()
             flush(handle)
 
@@ -167,9 +166,7 @@ def save_and_die(folder: Path, operation: int) -> None:
     store.save(content(3))
 
 
-def test_a_death_at_any_file_operation_leaves_a_whole_checkpoint(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_a_death_at_any_file_operation_leaves_a_whole_checkpoint(folder, tmp_path):
     seen = set()
     for operation in range(1000):
         copy = tmp_path / f"copy{operation}"
@@ -203,7 +200,7 @@ def save_with_limit(folder: Path, limit: int) -> None:
 
 
 @pytest.mark.parametrize("limit", [0, 10, 100, 12_000])
-def test_a_write_that_fails_half_way_leaves_the_others_whole(folder: Path, limit: int) -> None:
+def test_a_write_that_fails_half_way_leaves_the_others_whole(folder, limit):
     assert in_child(lambda: save_with_limit(folder, limit)) == 0
     assert names(folder) == [file_of(1), file_of(2)]
     assert_equal(CheckpointStore(folder).load(pytest.fail), content(2))

@@ -30,9 +30,9 @@ def filled(envs: int = 1, **options: Any) -> tuple[SAC, Demonstrations]:
     return model, callback
 
 
-def test_the_buffer_holds_what_the_environment_would_do_again() -> None:
+def test_the_buffer_holds_what_the_environment_would_do_again():
     model, _ = filled(episodes=2, noise=0.3)
-    buffer: Any = model.replay_buffer
+    buffer = model.replay_buffer
     env = gym.make("TPMPickAndPlace-v0")
     rng = np.random.default_rng(3)
     # The second episode's seed comes after the first one's, and the noise of its steps.
@@ -48,16 +48,16 @@ def test_the_buffer_holds_what_the_environment_would_do_again() -> None:
     env.close()
 
 
-def test_episodes_end_by_time_and_not_by_failure() -> None:
+def test_episodes_end_by_time_and_not_by_failure():
     model, _ = filled(episodes=2, noise=0.0)
-    buffer: Any = model.replay_buffer
+    buffer = model.replay_buffer
     assert buffer.dones[: 2 * HORIZON, 0].reshape(2, HORIZON)[:, -1].all()
     assert buffer.dones[: 2 * HORIZON].sum() == 2
     # An end by time is no end of the return, so the samples say "not done".
     assert not buffer.sample(64).dones.any()
 
 
-def test_every_second_episode_is_disturbed_and_the_vacuum_never() -> None:
+def test_every_second_episode_is_disturbed_and_the_vacuum_never():
     calm, _ = filled(episodes=2, noise=0.0)
     noisy, _ = filled(episodes=2, noise=0.3)
     before, after = (np.array(m.replay_buffer.actions[: 2 * HORIZON, 0]) for m in (calm, noisy))
@@ -66,14 +66,14 @@ def test_every_second_episode_is_disturbed_and_the_vacuum_never() -> None:
     assert set(after[:, 3]) == {-1.0, 1.0}
 
 
-def test_they_are_not_played_again_when_a_run_goes_on() -> None:
+def test_they_are_not_played_again_when_a_run_goes_on():
     model, callback = filled(episodes=2, noise=0.0)
     model.learn(1, callback=callback, reset_num_timesteps=False)
     assert model.replay_buffer is not None
     assert model.replay_buffer.size() == 2 * HORIZON + 1
 
 
-def test_without_a_replay_buffer_they_are_refused() -> None:
+def test_without_a_replay_buffer_they_are_refused():
     model = PPO("MultiInputPolicy", make_vec_env("TPMReach-v0"), n_steps=8, batch_size=8)
     with pytest.raises(TypeError, match="replay buffer"):
         model.learn(1, callback=Demonstrations(episodes=1))

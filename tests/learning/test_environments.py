@@ -6,8 +6,6 @@ import shlex
 import shutil
 import signal
 import sys
-from collections.abc import Callable
-from pathlib import Path
 from unittest.mock import patch
 
 import gymnasium as gym
@@ -36,12 +34,12 @@ tpm_gym.register_machine("mine", tpm_gym.PAPER_TPM)
 
 
 @pytest.fixture
-def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+def run(tmp_path, monkeypatch):
     """Runs the command as in a folder of which Python has imported nothing."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)  # as ``python -m`` has it
 
-    def run_anew(*words: str) -> None:
+    def run_anew(*words):
         sys.modules.pop("my_tasks", None)
         with (
             patch.dict(gym.registry),
@@ -53,9 +51,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
 
 @pytest.mark.usefixtures("needs_pybullet")
-def test_an_id_of_a_users_module_is_trained_in_workers_resumed_and_evaluated(
-    tmp_path: Path, run: Callable[..., None]
-) -> None:
+def test_an_id_of_a_users_module_is_trained_in_workers_resumed_and_evaluated(tmp_path, run):
     (tmp_path / "my_tasks.py").write_text(MODULE)
     (tmp_path / "sac.yml").write_text(SAC_RECIPE.format(env="TPMMine-v0", train_freq=5))
     words = ["--env", "my_tasks:TPMMine-v0", "--recipe", "sac.yml", "--envs", "2"]
@@ -72,9 +68,7 @@ def test_an_id_of_a_users_module_is_trained_in_workers_resumed_and_evaluated(
     assert [policy["records"][0]["length"] for policy in content["policies"]] == [20, 20]
 
 
-def test_no_file_decides_what_is_imported(
-    tmp_path: Path, run: Callable[..., None], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_no_file_decides_what_is_imported(tmp_path, run, capsys):
     trace = tmp_path / "trace"
     (tmp_path / "my_tasks.py").write_text(f"{MODULE}\nopen({str(trace)!r}, 'w').close()")
     for suffix in (".json", ".safetensors"):
@@ -104,12 +98,7 @@ def test_no_file_decides_what_is_imported(
 
 
 @pytest.mark.usefixtures("needs_pybullet")
-def test_a_stopped_run_says_how_its_module_is_found_again(
-    tmp_path: Path,
-    run: Callable[..., None],
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_stopped_run_says_how_its_module_is_found_again(tmp_path, run, monkeypatch, capsys):
     (tmp_path / "my_tasks.py").write_text(MODULE)
     (tmp_path / "sac.yml").write_text(SAC_RECIPE.format(env="TPMMine-v0", train_freq=5))
     interrupt_at(monkeypatch, 10, lambda: os.kill(os.getpid(), signal.SIGINT))
@@ -132,12 +121,12 @@ def test_a_stopped_run_says_how_its_module_is_found_again(
         ("not an id", "unknown environment"),
     ],
 )
-def test_what_is_no_environment_of_ours_is_refused(env_id: str, message: str) -> None:
+def test_what_is_no_environment_of_ours_is_refused(env_id, message):
     with pytest.raises(ConfigError, match=message):
         complete(TrainingConfig(env=env_id))
 
 
-def test_a_class_that_derives_from_ours_is_accepted_however_it_is_registered() -> None:
+def test_a_class_that_derives_from_ours_is_accepted_however_it_is_registered():
     from tpm_gym import TPMEnv
 
     class Mine(TPMEnv):

@@ -32,9 +32,7 @@ METRICS = (
 
 
 @pytest.fixture(scope="module")
-def written(
-    needs_pybullet: None, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[dict[str, Any], str]:
+def written(needs_pybullet, tmp_path_factory):
     """Return the JSON and the output of the command line, run on one policy."""
     path = tmp_path_factory.mktemp("evaluate") / "deep" / "er" / "expert.json"
     options = f"--policy expert --env TPMReach-v0 --episodes 4 --seed 7 --json {path}".split()
@@ -42,9 +40,7 @@ def written(
     return read_strict(path), output
 
 
-def test_one_policy_has_its_metrics_at_the_top_and_its_records(
-    written: tuple[dict[str, Any], str],
-) -> None:
+def test_one_policy_has_its_metrics_at_the_top_and_its_records(written):
     content, _ = written
     records = content["records"]
     assert [record["seed"] for record in records] == [7, 8, 9, 10]
@@ -63,7 +59,7 @@ def test_one_policy_has_its_metrics_at_the_top_and_its_records(
         assert str(folder) not in json.dumps(content)
 
 
-def test_table_shows_means_and_intervals(written: tuple[dict[str, Any], str]) -> None:
+def test_table_shows_means_and_intervals(written):
     _, output = written
     for shown in ("success at end", "expert", "[51.0, 100.0]"):  # Wilson interval of 4 of 4
         assert shown in output
@@ -71,7 +67,7 @@ def test_table_shows_means_and_intervals(written: tuple[dict[str, Any], str]) ->
 
 # imageio-ffmpeg leaves a pipe to the collector where ffmpeg ends before its reader is closed.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_video_shows_the_first_episodes(tmp_path: Path) -> None:
+def test_video_shows_the_first_episodes(tmp_path):
     path = tmp_path / "films" / "expert.mp4"
     config = EvaluationConfig(
         policy=("expert",), env="TPMReach-v0", episodes=2, video=path, video_episodes=1
@@ -95,15 +91,15 @@ def test_video_shows_the_first_episodes(tmp_path: Path) -> None:
         (("a/best.zip", "b/best.zip"), ["v-1-best.mp4", "v-2-best.mp4"]),
     ],
 )
-def test_every_policy_gets_its_own_video(policies: tuple[str, ...], names: list[str]) -> None:
+def test_every_policy_gets_its_own_video(policies, names):
     paths = evaluation.paths_per_policy(Path("films", "v.mp4"), policies)
     assert [path.name for path in paths] == names
     assert all(path.parent == Path("films") for path in paths)
 
 
-def test_picture_shows_six_moments_of_the_first_episode(tmp_path: Path) -> None:
+def test_picture_shows_six_moments_of_the_first_episode(tmp_path):
     path = tmp_path / "new" / "expert.png"
-    asked: Any = {"policy": ("expert",), "env": "TPMReach-v0", "camera": "cup"}
+    asked = {"policy": ("expert",), "env": "TPMReach-v0", "camera": "cup"}
     config = EvaluationConfig(**asked, episodes=1, picture=path)
     evaluate(config, quiet())
     env = gym.make("TPMReach-v0", render_mode="rgb_array", camera="cup")
@@ -140,15 +136,13 @@ def test_picture_shows_six_moments_of_the_first_episode(tmp_path: Path) -> None:
         ({"env_options": EnvOptions(machine="narrow")}, ConfigurationError, "'paper', 'wide'"),
     ],
 )
-def test_mistakes_are_named(options: dict[str, Any], error: type[Exception], message: str) -> None:
+def test_mistakes_are_named(options, error, message):
     usual = {"policy": ("expert",), "env": "TPMReach-v0"}
     with pytest.raises(error, match=message):
         evaluate(EvaluationConfig(**{**usual, **options}), quiet())
 
 
-def test_conditions_are_recorded_and_the_defaults_are_the_nominal_machine(
-    written: tuple[dict[str, Any], str], tmp_path: Path
-) -> None:
+def test_conditions_are_recorded_and_the_defaults_are_the_nominal_machine(written, tmp_path):
     content, _ = written
     assert (content["goals"], content["penalty_weight"]) == ("sampled", 1.0)
     assert content["randomisation"] == {}
@@ -171,7 +165,7 @@ def test_conditions_are_recorded_and_the_defaults_are_the_nominal_machine(
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run(tmp_path_factory):
     """Return the folder of a run: an untrained policy, as saved and as exported."""
     from stable_baselines3 import PPO
 
@@ -195,9 +189,7 @@ def returns(policy: Path | str, **options: Any) -> list[float]:
     return [record.total_reward for record in evaluate(config, quiet())[0].records]
 
 
-def test_a_policy_is_evaluated_on_its_own_machine_and_drive_unless_others_are_given(
-    run: Path, tmp_path: Path
-) -> None:
+def test_a_policy_is_evaluated_on_its_own_machine_and_drive_unless_others_are_given(run, tmp_path):
     shutil.copytree(run, tmp_path / "run")
     path = tmp_path / "run" / "best.json"
     own = {"machine": "wide", "drive": "servo", "engine": "analytic"}
@@ -223,17 +215,15 @@ def test_a_policy_is_evaluated_on_its_own_machine_and_drive_unless_others_are_gi
     evaluate(EvaluationConfig(both, episodes=1, env_options=chosen), quiet())
 
 
-def test_an_exported_policy_goes_by_any_of_its_names(run: Path) -> None:
+def test_an_exported_policy_goes_by_any_of_its_names(run):
     found = [returns(run / name) for name in ("best.json", "best.safetensors", "best", ".")]
     assert found == [found[0]] * 4
 
 
-def test_an_archive_is_not_unpickled(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_archive_is_not_unpickled(run, tmp_path, monkeypatch):
     import torch
 
-    def refuse(*args: Any, **kwargs: Any) -> None:
+    def refuse(*args, **kwargs):
         raise AssertionError("unpickled")
 
     for owner, name in ((pickle, "load"), (pickle, "loads"), (torch, "load")):
@@ -243,9 +233,7 @@ def test_an_archive_is_not_unpickled(
         returns(run / "best.zip")
 
 
-def test_an_exported_policy_that_is_of_another_task_or_damaged_is_refused(
-    run: Path, tmp_path: Path
-) -> None:
+def test_an_exported_policy_that_is_of_another_task_or_damaged_is_refused(run, tmp_path):
     with pytest.raises(PolicyError, match=r"was trained with observation space .*TPMReach-v0"):
         returns(run / "best.json", env="TPMPickAndPlace-v0")
     (tmp_path / "best.json").write_bytes((run / "best.json").read_bytes())
@@ -254,7 +242,7 @@ def test_an_exported_policy_that_is_of_another_task_or_damaged_is_refused(
         returns(tmp_path)
 
 
-def test_policies_load_no_torch(run: Path) -> None:
+def test_policies_load_no_torch(run):
     specs = ("expert", "random", str(run / "best"))
     program = (
         "import sys; from tpm_gym.learning import EvaluationConfig, evaluate\n"
@@ -264,19 +252,19 @@ def test_policies_load_no_torch(run: Path) -> None:
     printed_by(PYTHON, "-c", program)
 
 
-def test_command_line_errors_are_one_line() -> None:
+def test_command_line_errors_are_one_line():
     error = error_of(*TPM_GYM, "evaluate", "--policy", "expert", "--env", "Nope-v0")
     assert error.startswith("error: unknown environment 'Nope-v0'")
     assert len(error.splitlines()) == 1
 
 
-def test_files_are_written_whole_or_not_at_all(tmp_path: Path) -> None:
+def test_files_are_written_whole_or_not_at_all(tmp_path):
     path = tmp_path / "result.json"
     provenance.write_json(path, {"value": 1})
     with pytest.raises(ValueError, match="not JSON compliant"):
         provenance.write_json(path, {"value": float("nan")})
 
-    def fail(part: Path) -> None:
+    def fail(part):
         part.write_text("half")
         raise OSError("disk full")
 
@@ -286,7 +274,7 @@ def test_files_are_written_whole_or_not_at_all(tmp_path: Path) -> None:
     assert [entry.name for entry in tmp_path.iterdir()] == ["result.json"]
 
 
-def test_command_keeps_no_folder_outside(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_command_keeps_no_folder_outside(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     installed = str(tmp_path.parent / "bin" / "tpm-gym")
     assert provenance.command_line([installed, "resume", "x"]) == "tpm-gym resume x"

@@ -56,7 +56,7 @@ class Blank(gym.Env[dict[str, Any], Any]):
 def make(kind: type[BaseAlgorithm], env: gym.Env[Any, Any], **policy_kwargs: Any) -> Any:
     """Make a model whose weights, biases included, are far from zero."""
     options: dict[str, Any] = {} if kind is PPO else {"buffer_size": 10}
-    made: Any = kind(
+    made = kind(
         "MultiInputPolicy", env, seed=0, device="cpu", policy_kwargs=policy_kwargs, **options
     )
     generator = torch.Generator().manual_seed(1)
@@ -73,7 +73,7 @@ def save(made: BaseAlgorithm, path: Path) -> Path:
 def observations(env: gym.Env[Any, Any], n: int) -> dict[str, Any]:
     """Return goals that lie near each other, and observations over their whole range."""
     rng = np.random.default_rng(3)
-    boxes: Any = env.observation_space
+    boxes = env.observation_space
     found = {
         key: rng.uniform(0.3 * box.low, 0.3 * box.high, (n, *box.shape)).astype(np.float32)
         for key, box in boxes.items()
@@ -103,13 +103,7 @@ UNEVEN = spaces.Box(np.array([-0.2, 0.0], "f"), np.array([0.1, 5.0], "f"))
     ],
     ids=["gap", "joined", "tanh", "linear", "table", "uneven"],
 )
-def test_actions_are_those_of_the_model(
-    tmp_path: Path,
-    kind: type[BaseAlgorithm],
-    policy_kwargs: dict[str, Any],
-    boxes: dict[str, Any],
-    action_space: spaces.Box,
-) -> None:
+def test_actions_are_those_of_the_model(tmp_path, kind, policy_kwargs, boxes, action_space):
     env = Blank(action_space, **boxes)
     made = make(kind, env, **policy_kwargs)
     loaded = tpm_gym.load_policy(save(made, tmp_path / "p"))
@@ -129,11 +123,11 @@ def test_actions_are_those_of_the_model(
 
 
 @pytest.fixture
-def model() -> Any:
+def model():
     return make(SAC, Blank(), net_arch=[8], **GOAL_GAP)
 
 
-def test_the_description_is_that_of_the_model(tmp_path: Path, model: Any) -> None:
+def test_the_description_is_that_of_the_model(tmp_path, model):
     model.num_timesteps = 1234
     path = save(model, tmp_path / "new" / "v1.5")
     assert path == tmp_path / "new" / "v1.5.json"
@@ -159,7 +153,7 @@ def test_the_description_is_that_of_the_model(tmp_path: Path, model: Any) -> Non
     assert str(Path.home()) not in text
 
 
-def test_exporting_leaves_the_model_as_it_was(tmp_path: Path, model: Any) -> None:
+def test_exporting_leaves_the_model_as_it_was(tmp_path, model):
     model.policy.set_training_mode(True)
     weights = {name: value.clone() for name, value in model.policy.state_dict().items()}
     random = torch.get_rng_state()
@@ -202,27 +196,25 @@ def counted() -> Blank:
         ),
     ],
 )
-def test_what_the_files_cannot_hold_is_refused(tmp_path: Path, build: Any, message: str) -> None:
+def test_what_the_files_cannot_hold_is_refused(tmp_path, build, message):
     with pytest.raises(PolicyError, match=message):
         save(build(), tmp_path / "p")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_diverged_policy_is_refused(tmp_path: Path, model: Any) -> None:
+def test_a_diverged_policy_is_refused(tmp_path, model):
     with torch.no_grad():
         model.policy.actor.mu.bias[0] = float("nan")
     with pytest.raises(PolicyError, match="training diverged"):
         save(model, tmp_path / "p")
 
 
-def test_actions_that_differ_are_noticed_and_earlier_files_kept(
-    tmp_path: Path, model: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_actions_that_differ_are_noticed_and_earlier_files_kept(tmp_path, model, monkeypatch):
     path = save(model, tmp_path / "p")
     before = path.read_bytes()
     network = export._network
 
-    def slightly_wrong(*arguments: Any) -> Any:
+    def slightly_wrong(*arguments):
         description, weights = network(*arguments)
         weights["layers.1.bias"][2] += 1e-4
         return description, weights
@@ -239,7 +231,7 @@ def test_actions_that_differ_are_noticed_and_earlier_files_kept(
 
 
 @pytest.fixture
-def run(tmp_path: Path, model: Any) -> Path:
+def run(tmp_path, model):
     """A folder as a training leaves it, as far as matters here."""
     folder = tmp_path / "run"
     folder.mkdir()
@@ -258,9 +250,7 @@ def run(tmp_path: Path, model: Any) -> Path:
     return folder
 
 
-def test_what_is_converted_says_what_the_run_says(
-    run: Path, model: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_converted_says_what_the_run_says(run, model, capsys):
     main(["export", str(run / "last.zip"), str(run / "last.json"), "--trust-pickle"])
     started, written = capsys.readouterr().out.splitlines()
     assert started == f"exporting {run / 'last.zip'} and comparing its actions ..."
@@ -274,7 +264,7 @@ def test_what_is_converted_says_what_the_run_says(
     assert about.versions == {"torch": "2.0.0", "tpm_gym": None}
 
 
-def test_the_command_line_does_not_touch_what_is_not_trusted(run: Path) -> None:
+def test_the_command_line_does_not_touch_what_is_not_trusted(run):
     """In a process of its own, with a file that would leave a trace if it were unpickled."""
     trace = run / "trace"
     (run / "best.zip").write_bytes(pickle.dumps(Trace(str(trace))))
@@ -305,9 +295,7 @@ class Trace:
         (["best.zip", "/proc/out"], "OUT /proc/out: cannot be written"),
     ],
 )
-def test_mistakes_on_the_command_line_are_one_line(
-    run: Path, words: list[str], message: str
-) -> None:
+def test_mistakes_on_the_command_line_are_one_line(run, words, message):
     (run / "broken.zip").write_bytes(b"PK")
     away = run.parent / "a" / "b" / "elsewhere"
     away.mkdir(parents=True)
@@ -318,7 +306,7 @@ def test_mistakes_on_the_command_line_are_one_line(
     assert "\n" not in str(caught.value)
 
 
-def test_files_that_are_no_policy_are_neither_replaced_nor_removed(run: Path) -> None:
+def test_files_that_are_no_policy_are_neither_replaced_nor_removed(run):
     (run / "weights.safetensors").write_bytes(b"of another program")
     (run / "list.json").write_text("[]")
     before = {file: file.read_bytes() for file in run.iterdir()}

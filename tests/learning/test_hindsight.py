@@ -65,10 +65,8 @@ def draw(model: SAC, seed: int = 0, env: VecNormalize | None = None) -> DictRepl
         (3, "episode", "TPMReachDense-v0"),
     ],
 )
-def test_same_samples_and_rewards_as_the_environment_pays_by_copied_infos(
-    n_envs: int, strategy: str, env_id: str
-) -> None:
-    def sampled(buffer: type[HerReplayBuffer], **options: Any) -> DictReplayBufferSamples:
+def test_same_samples_and_rewards_as_the_environment_pays_by_copied_infos(n_envs, strategy, env_id):
+    def sampled(buffer, **options):
         # 130 steps of 3 environments go around the buffer of 200 almost twice.
         envs = DummyVecEnv([partial(penalised, env_id)] * n_envs)
         return draw(filled(buffer, envs, 130, goal_selection_strategy=strategy, **options))
@@ -81,7 +79,7 @@ def test_same_samples_and_rewards_as_the_environment_pays_by_copied_infos(
         np.testing.assert_allclose(value.numpy(), expected, rtol=0, atol=1e-6)
 
 
-def test_observations_may_be_normalised() -> None:
+def test_observations_may_be_normalised():
     envs = VecNormalize(DummyVecEnv([penalised]), norm_reward=False)
     model = filled(PenaltyHerReplayBuffer, envs)
     plain, normalised = draw(model), draw(model, env=envs)
@@ -92,9 +90,7 @@ def test_observations_may_be_normalised() -> None:
     ("norm_reward", "copy_info_dict", "message"),
     [(True, False, "norm_reward=False"), (False, True, "counted twice")],
 )
-def test_what_would_change_the_penalty_is_refused(
-    norm_reward: bool, copy_info_dict: bool, message: str
-) -> None:
+def test_what_would_change_the_penalty_is_refused(norm_reward, copy_info_dict, message):
     envs = VecNormalize(DummyVecEnv([penalised]), norm_reward=norm_reward)
     with pytest.raises(ConfigError, match=message):
         filled(PenaltyHerReplayBuffer, envs, copy_info_dict=copy_info_dict)

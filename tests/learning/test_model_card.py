@@ -20,9 +20,7 @@ def export(out: Path, evaluation: Path) -> None:
 
 
 @pytest.mark.usefixtures("needs_pybullet")
-def test_a_published_policy_gets_a_card_whose_lines_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_published_policy_gets_a_card_whose_lines_run(tmp_path, monkeypatch):
     export(tmp_path / "reach", RESULTS)
     for suffix in (".json", ".safetensors"):
         copied = (tmp_path / f"reach{suffix}").read_bytes()
@@ -40,9 +38,7 @@ def test_a_published_policy_gets_a_card_whose_lines_run(
     ("content", "message"),
     [("[", "Expecting value"), ("{}", "is no result of"), (None, "the policy is of TPMReach-v0")],
 )
-def test_results_of_something_else_are_rejected(
-    content: str | None, message: str, tmp_path: Path
-) -> None:
+def test_results_of_something_else_are_rejected(content, message, tmp_path):
     evaluation = tmp_path / "evaluation.json"
     other = (POLICIES / "TPMPickAndPlace-v0.evaluation.json").read_text()
     evaluation.write_text(other if content is None else content)
@@ -51,7 +47,7 @@ def test_results_of_something_else_are_rejected(
     assert not (tmp_path / "reach.md").exists()
 
 
-def test_results_with_values_of_other_types_are_rejected(tmp_path: Path) -> None:
+def test_results_with_values_of_other_types_are_rejected(tmp_path):
     evaluation = tmp_path / "evaluation.json"
     evaluation.write_text(json.dumps(json.loads(RESULTS.read_text()) | {"return": "good"}))
     with pytest.raises(SystemExit, match="is no result of"):
@@ -59,7 +55,7 @@ def test_results_with_values_of_other_types_are_rejected(tmp_path: Path) -> None
     assert not (tmp_path / "reach.md").exists()
 
 
-def test_a_card_replaces_no_file_of_others(tmp_path: Path) -> None:
+def test_a_card_replaces_no_file_of_others(tmp_path):
     card = tmp_path / "reach.md"
     card.write_text("my notes")
     with pytest.raises(SystemExit, match="no model card of tpm_gym"):

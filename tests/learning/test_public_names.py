@@ -9,20 +9,20 @@ from tpm_gym.learning import errors
 from tpm_gym.learning.command_line import main
 
 
-def test_every_name_is_there_and_unknown_ones_are_not() -> None:
+def test_every_name_is_there_and_unknown_ones_are_not():
     for name in learning.__all__:
         assert getattr(learning, name) is not None
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         learning.nonsense  # noqa: B018
 
 
-def test_neither_the_package_nor_the_help_imports_torch() -> None:
+def test_neither_the_package_nor_the_help_imports_torch():
     heavy = "{'torch', 'stable_baselines3', 'matplotlib', 'pybullet'} & set(sys.modules)"
     for module in ("tpm_gym.learning", "tpm_gym.learning.command_line"):
         printed_by(PYTHON, "-c", f"import sys, {module}; sys.exit(str({heavy}) if {heavy} else 0)")
 
 
-def test_what_is_not_installed_is_named_with_the_extra_that_installs_it() -> None:
+def test_what_is_not_installed_is_named_with_the_extra_that_installs_it():
     printed_by(
         PYTHON,
         "-c",
@@ -35,7 +35,7 @@ def test_what_is_not_installed_is_named_with_the_extra_that_installs_it() -> Non
 
 
 @pytest.mark.parametrize("command", ["train", "resume", "evaluate", "export", "tune"])
-def test_every_command_has_its_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_command_has_its_help(command, capsys):
     with pytest.raises(SystemExit) as caught:
         main([command, "--help"])
     assert caught.value.code == 0
@@ -45,13 +45,13 @@ def test_every_command_has_its_help(command: str, capsys: pytest.CaptureFixture[
     assert len(shown.splitlines()) < 75
 
 
-def test_one_root_catches_every_error() -> None:
+def test_one_root_catches_every_error():
     kinds = [kind for kind in vars(errors).values() if isinstance(kind, type)]
     assert len(kinds) > 5
     assert all(issubclass(kind, TPMError) for kind in kinds)
 
 
-def test_a_recipe_is_ready_for_stable_baselines() -> None:
+def test_a_recipe_is_ready_for_stable_baselines():
     keywords = learning.recipe("TPMPickAndPlace-v0", "tqc")
     assert keywords["replay_buffer_class"] is learning.PenaltyHerReplayBuffer
     extractor = keywords["policy_kwargs"]["features_extractor_class"]

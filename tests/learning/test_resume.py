@@ -3,7 +3,6 @@
 import json
 import os
 import signal
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -35,8 +34,6 @@ from tpm_gym.learning.training_state import EpisodeRecorder
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
 
-Kill = Callable[..., TrainingConfig]
-
 
 # -- killed ---------------------------------------------------------------------------------------
 
@@ -55,15 +52,13 @@ Kill = Callable[..., TrainingConfig]
         ("sac in the analytic engine", 251),
     ],
 )
-def test_a_killed_run_ends_as_if_nothing_had_happened(case: str, step: int, killed: Kill) -> None:
+def test_a_killed_run_ends_as_if_nothing_had_happened(case, step, killed):
     run = killed(step, case).run
     assert resume(ResumeConfig(run), quiet()) is None
     assert_equal_runs(uninterrupted(case), run)
 
 
-def test_a_run_killed_again_and_again_ends_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_killed_again_and_again_ends_the_same(tmp_path, monkeypatch):
     config: TrainingConfig | ResumeConfig = make_config("sac", tmp_path)
     for step in (70, 40, 120, 170, 101, 260):  # some before the step that was reached already
         kill_at(monkeypatch, step, config)
@@ -76,12 +71,10 @@ def test_a_run_killed_again_and_again_ends_the_same(
     assert steps[-1] == 250
 
 
-def test_a_run_killed_before_its_first_checkpoint_begins_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_killed_before_its_first_checkpoint_begins_again(tmp_path, monkeypatch):
     config = make_config("sac", tmp_path)
 
-    def die(*args: object) -> None:
+    def die(*args):
         raise Killed
 
     with monkeypatch.context() as patched:
@@ -97,7 +90,7 @@ def test_a_run_killed_before_its_first_checkpoint_begins_again(
     assert_equal_runs(uninterrupted("sac"), tmp_path / "run")
 
 
-def test_nothing_is_counted_twice(killed: Kill) -> None:
+def test_nothing_is_counted_twice(killed):
     run = killed(290, checkpoint_every=200).run
     assert [line["steps"] for line in evaluations(run)] == [0, 70, 140, 210, 280]
     resume(ResumeConfig(run), quiet())
@@ -110,7 +103,7 @@ def test_nothing_is_counted_twice(killed: Kill) -> None:
     assert logged == [0, 70, 140, 210, 280, 300]
 
 
-def test_logs_of_a_torn_write_are_put_right(killed: Kill) -> None:
+def test_logs_of_a_torn_write_are_put_right(killed):
     run = killed(240).run
     torn = ("progress.csv", "evaluations.jsonl", "best.zip", "best.json", "config.json")
     for name in torn:
@@ -125,7 +118,7 @@ def test_logs_of_a_torn_write_are_put_right(killed: Kill) -> None:
         assert (run / name).read_bytes() == end_of(run).files[name]
 
 
-def test_a_damaged_checkpoint_costs_only_time(killed: Kill) -> None:
+def test_a_damaged_checkpoint_costs_only_time(killed):
     run, console = killed(240).run, quiet()
     damaged = run / "checkpoints" / "000000200.checkpoint"
     os.truncate(damaged, damaged.stat().st_size - 1)
@@ -135,7 +128,7 @@ def test_a_damaged_checkpoint_costs_only_time(killed: Kill) -> None:
     assert_equal_runs(uninterrupted("sac"), run)
 
 
-def test_a_checkpoint_that_no_training_wrote_is_refused_and_changes_nothing(killed: Kill) -> None:
+def test_a_checkpoint_that_no_training_wrote_is_refused_and_changes_nothing(killed):
     run = killed(240).run
     store = CheckpointStore(run / "checkpoints")
     content = store.load(print)
@@ -192,8 +185,8 @@ def takes_another_course(self: EpisodeRecorder, episode: dict[str, Any]) -> Any:
 
 @pytest.mark.parametrize("replay", [takes_another_course, lambda self, episode: None])
 def test_episodes_are_whole_and_a_run_whose_episode_does_not_repeat_is_refused(
-    replay: Callable[..., Any], killed: Kill, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    replay, killed, monkeypatch
+):
     assert_whole_episodes(end_of(uninterrupted("sac")))
     run = killed(140, checkpoint_every=130).run
     monkeypatch.setattr(EpisodeRecorder, "replay", replay)
@@ -201,14 +194,12 @@ def test_episodes_are_whole_and_a_run_whose_episode_does_not_repeat_is_refused(
         resume(ResumeConfig(run), quiet())
 
 
-def test_resuming_neither_acts_at_random_again_nor_runs_a_pickle(
-    killed: Kill, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_resuming_neither_acts_at_random_again_nor_runs_a_pickle(killed, monkeypatch):
     run = killed(180).run
     random_actions = []
     sample = gym.spaces.Box.sample
 
-    def counted(self: gym.spaces.Box, *args: Any, **kwargs: Any) -> Any:
+    def counted(self, *args, **kwargs):
         random_actions.append(1)
         return sample(self, *args, **kwargs)
 
@@ -233,7 +224,7 @@ def newest(run: Path) -> int:
 
 
 @pytest.mark.usefixtures("needs_pybullet")
-def test_kill_9_costs_nothing(tmp_path: Path) -> None:
+def test_kill_9_costs_nothing(tmp_path):
     config = make_config("sac", tmp_path)
     run = tmp_path / "run"
     words = ["train", "--run", str(run), "--recipe", str(config.recipe_file)]

@@ -1,10 +1,9 @@
 """Episodes repeat exactly, records say what happened, and intervals cover what they promise."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,7 +12,6 @@ import pytest
 import scipy.stats
 from numpy.typing import NDArray
 
-from tpm_gym.envs.vector import TPMVectorEnv
 from tpm_gym.learning.environments import make_envs
 from tpm_gym.learning.errors import PolicyError, RolloutError
 from tpm_gym.learning.estimates import bootstrap, wilson
@@ -83,12 +81,12 @@ def scripted_step(
 
 
 @pytest.fixture(scope="module")
-def reach() -> Iterator[TPMVectorEnv]:
+def reach():
     with closing(make_envs("TPMReach-v0", 1)) as envs:
         yield envs
 
 
-def test_record_says_what_happened() -> None:
+def test_record_says_what_happened():
     env = Scripted(
         [
             scripted_step(-1.0, False, 0.5, 1e-5),
@@ -117,7 +115,7 @@ def test_record_says_what_happened() -> None:
     assert record.success_once
 
 
-def test_seeds_count_up_for_environment_and_policy() -> None:
+def test_seeds_count_up_for_environment_and_policy():
     env, policy = Scripted([scripted_step()]), Idle()
     records = run_episodes(env, policy, 3, first_seed=40)
     assert [record.seed for record in records] == env.seeds == policy.seeds == [40, 41, 42]
@@ -125,7 +123,7 @@ def test_seeds_count_up_for_environment_and_policy() -> None:
 
 @pytest.mark.parametrize("name", ["reward", "conditioning", "closure_error", "fk_error", "torque"])
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_values_that_are_not_finite_raise(name: str, value: float) -> None:
+def test_values_that_are_not_finite_raise(name, value):
     wrong = np.array([0.0, value, 0.0]) if name == "torque" else value
     env = Scripted([scripted_step(), scripted_step() | {name: wrong}])
     with pytest.raises(RolloutError, match=f"seed 3, step 1: {name} is {value}"):
@@ -133,7 +131,7 @@ def test_values_that_are_not_finite_raise(name: str, value: float) -> None:
 
 
 @pytest.mark.parametrize("spec", ["random", "expert", PICK])
-def test_batches_give_the_records_of_single_environments(spec: str) -> None:
+def test_batches_give_the_records_of_single_environments(spec):
     """More episodes than environments; returns only to the rounding of the network's batches."""
     options = {"engine": "analytic", "randomisation": {"latency": 1}}
     records = []
@@ -148,7 +146,7 @@ def test_batches_give_the_records_of_single_environments(spec: str) -> None:
 
 
 @pytest.mark.parametrize("spec", ["random", "expert"])
-def test_same_seeds_same_records(reach: TPMVectorEnv, spec: str) -> None:
+def test_same_seeds_same_records(reach, spec):
     policy = load_policy(spec, reach)
     records = run_episodes(reach, policy, 4, first_seed=100)
     assert run_episodes(reach, load_policy(spec, reach), 4, first_seed=100) == records
@@ -158,14 +156,14 @@ def test_same_seeds_same_records(reach: TPMVectorEnv, spec: str) -> None:
 
 
 @pytest.mark.parametrize(("successes", "trials"), [(81, 263), (15, 148), (0, 20), (29, 29), (1, 1)])
-def test_wilson_interval_is_that_of_scipy(successes: int, trials: int) -> None:
+def test_wilson_interval_is_that_of_scipy(successes, trials):
     estimate = wilson([i < successes for i in range(trials)])
     theirs = scipy.stats.binomtest(successes, trials).proportion_ci(method="wilson")
     assert estimate.mean == successes / trials
     assert (estimate.low, estimate.high) == pytest.approx((theirs.low, theirs.high), abs=1e-15)
 
 
-def test_bootstrap_intervals_are_those_of_scipy() -> None:
+def test_bootstrap_intervals_are_those_of_scipy():
     scores = np.random.default_rng(3).random(12)
     found = bootstrap(scores.tolist())
     expected = scipy.stats.bootstrap(
@@ -175,7 +173,7 @@ def test_bootstrap_intervals_are_those_of_scipy() -> None:
     assert found.mean == pytest.approx(scores.mean())
 
 
-def test_summary_keeps_the_worst_of_all_episodes() -> None:
+def test_summary_keeps_the_worst_of_all_episodes():
     steps = [scripted_step(gap=3e-5, conditioning=0.4), scripted_step(gap=9e-5, conditioning=0.2)]
     records = run_episodes(Scripted(steps[:1]), Idle(), 3, 0)
     records += run_episodes(Scripted(steps), Idle(), 1, 3)
@@ -190,7 +188,7 @@ def test_summary_keeps_the_worst_of_all_episodes() -> None:
     assert metrics["success_at_end"].worst is None
 
 
-def test_unknown_policies_say_what_there_is(reach: TPMVectorEnv, tmp_path: Path) -> None:
+def test_unknown_policies_say_what_there_is(reach, tmp_path):
     with pytest.raises(PolicyError, match=r"expert, random, an exported policy"):
         load_policy("exprt", reach)
     with pytest.raises(PolicyError, match=r"best\.json or .*last\.json"):

@@ -16,7 +16,7 @@ OURS = {"algo": "sac", "env": "TPMReach-v0", "training_seeds": [0, 0]}
 
 
 @pytest.fixture
-def run(tmp_path: Path) -> Path:
+def run(tmp_path):
     """A run with files and folders."""
     folder = tmp_path / "run"
     (folder / "checkpoints").mkdir(parents=True)
@@ -33,7 +33,7 @@ def names(folder: Path) -> list[str]:
     return sorted(entry.name for entry in folder.iterdir())
 
 
-def test_a_run_is_replaced_only_if_asked_to(run: Path) -> None:
+def test_a_run_is_replaced_only_if_asked_to(run):
     before = names(run)
     with pytest.raises(RunError, match="--overwrite"):
         prepare(run, overwrite=False)
@@ -43,7 +43,7 @@ def test_a_run_is_replaced_only_if_asked_to(run: Path) -> None:
 
 
 @pytest.mark.parametrize("config", [None, '{"model_type": "bert"}', "{", "[]", '"text"'])
-def test_what_another_program_wrote_is_never_deleted(config: str | None, tmp_path: Path) -> None:
+def test_what_another_program_wrote_is_never_deleted(config, tmp_path):
     (tmp_path / "thesis.tex").write_text("years of work")
     if config is not None:
         (tmp_path / "config.json").write_text(config)
@@ -54,12 +54,10 @@ def test_what_another_program_wrote_is_never_deleted(config: str | None, tmp_pat
     assert names(tmp_path) == before
 
 
-def test_a_death_while_deleting_leaves_a_run_that_can_be_deleted(
-    run: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_death_while_deleting_leaves_a_run_that_can_be_deleted(run, monkeypatch):
     delete = Path.unlink
 
-    def unlink(path: Path, missing_ok: bool = False) -> None:
+    def unlink(path, missing_ok=False):
         if path.name == "config.json":
             raise Killed
         delete(path, missing_ok)
@@ -73,9 +71,7 @@ def test_a_death_while_deleting_leaves_a_run_that_can_be_deleted(
     assert names(run) == []
 
 
-def test_only_what_a_run_writes_is_deleted_and_no_link_is_followed(
-    run: Path, tmp_path: Path
-) -> None:
+def test_only_what_a_run_writes_is_deleted_and_no_link_is_followed(run, tmp_path):
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "elsewhere" / "best.zip").write_text("")
     (run / "link").symlink_to(tmp_path / "elsewhere")
@@ -90,10 +86,8 @@ def test_only_what_a_run_writes_is_deleted_and_no_link_is_followed(
 
 
 @pytest.mark.parametrize("number", [errno.EROFS, errno.EACCES, errno.ENOSPC])
-def test_a_folder_that_cannot_be_made_is_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
-) -> None:
-    def refuse(*args: object, **options: object) -> None:
+def test_a_folder_that_cannot_be_made_is_one_line(tmp_path, monkeypatch, number):
+    def refuse(*args, **options):
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(Path, "mkdir", refuse)

@@ -6,10 +6,8 @@ import os
 import shutil
 import signal
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 from unittest.mock import Mock
 
 import pytest
@@ -26,13 +24,12 @@ from trainings import (
 import tpm_gym
 from tpm_gym.learning import (
     ResumeConfig,
-    TrainingConfig,
     callbacks,
     resume,
     train,
 )
 from tpm_gym.learning.callbacks import Checkpointing
-from tpm_gym.learning.checkpoint import CheckpointStore, Content
+from tpm_gym.learning.checkpoint import CheckpointStore
 from tpm_gym.learning.errors import ConfigError, RunError
 from tpm_gym.learning.run_folder import claimed
 from tpm_gym.learning.signals import SignalListener
@@ -52,13 +49,7 @@ pytestmark = pytest.mark.usefixtures("no_pictures")
         ("ppo", 95, signal.SIGINT),
     ],
 )
-def test_a_stopped_run_saves_and_goes_on(
-    case: str,
-    step: int,
-    number: signal.Signals,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_stopped_run_saves_and_goes_on(case, step, number, tmp_path, monkeypatch):
     config = replace(make_config(case, tmp_path), checkpoint_every=10_000)
     interrupt_at(monkeypatch, step, lambda: os.kill(os.getpid(), number))
     handler, console = signal.getsignal(number), quiet()
@@ -79,12 +70,10 @@ def test_a_stopped_run_saves_and_goes_on(
     assert_equal_runs(uninterrupted(case), tmp_path / "run")
 
 
-def test_a_signal_after_the_last_step_stops_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_signal_after_the_last_step_stops_nothing(tmp_path, monkeypatch):
     ends = callbacks.PeriodicEvaluation._on_training_end
 
-    def interrupted(self: callbacks.PeriodicEvaluation) -> None:
+    def interrupted(self):
         os.kill(os.getpid(), signal.SIGINT)
         ends(self)
 
@@ -96,7 +85,7 @@ def test_a_signal_after_the_last_step_stops_nothing(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_second_signal_leaves_at_once(number: signal.Signals) -> None:
+def test_a_second_signal_leaves_at_once(number):
     listener = SignalListener()
     with listener.listening():
         os.kill(os.getpid(), number)
@@ -111,12 +100,10 @@ NO_SPACE = os.strerror(errno.ENOSPC)
 # -- full disks -----------------------------------------------------------------------------------
 
 
-def test_training_goes_on_without_room_for_checkpoints(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_training_goes_on_without_room_for_checkpoints(tmp_path, monkeypatch):
     save = CheckpointStore.save
 
-    def full(self: CheckpointStore, content: Content) -> None:
+    def full(self, content):
         with monkeypatch.context() as patched:
             if 150 <= content.step < 300:
                 patched.setattr(os, "fsync", Mock(side_effect=OSError(errno.ENOSPC, NO_SPACE)))
@@ -131,10 +118,8 @@ def test_training_goes_on_without_room_for_checkpoints(
     assert_equal_runs(uninterrupted("sac"), tmp_path / "run")
 
 
-def test_a_full_disk_ends_the_run_with_its_last_checkpoint_whole(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(*args: Any) -> None:
+def test_a_full_disk_ends_the_run_with_its_last_checkpoint_whole(tmp_path, monkeypatch):
+    def full(*args):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     config, console = make_config("sac", tmp_path), quiet()
@@ -159,13 +144,13 @@ def contents(folder: Path) -> dict[Path, bytes]:
 
 
 @pytest.fixture
-def half(killed: Callable[..., TrainingConfig]) -> TrainingConfig:
+def half(killed):
     """A run that was killed half way."""
     return killed(160)
 
 
 @pytest.fixture
-def finished(tmp_path: Path) -> Path:
+def finished(tmp_path):
     """A run that went to its end, with a test of its policy."""
     run = tmp_path / "run"
     shutil.copytree(uninterrupted("sac"), run)
@@ -175,9 +160,7 @@ def finished(tmp_path: Path) -> Path:
     return run
 
 
-def test_fewer_steps_than_taken_and_numbers_that_cannot_work_are_refused(
-    half: TrainingConfig,
-) -> None:
+def test_fewer_steps_than_taken_and_numbers_that_cannot_work_are_refused(half):
     before = contents(half.run)
     with pytest.raises(ConfigError, match="--steps 140: the run has already taken 150"):
         resume(ResumeConfig(half.run, steps=140), quiet())
@@ -186,7 +169,7 @@ def test_fewer_steps_than_taken_and_numbers_that_cannot_work_are_refused(
     assert contents(half.run) == before
 
 
-def test_a_finished_run_has_nothing_to_do_unless_it_is_to_take_more_steps(finished: Path) -> None:
+def test_a_finished_run_has_nothing_to_do_unless_it_is_to_take_more_steps(finished):
     before, console = contents(finished), quiet()
     assert resume(ResumeConfig(finished), console) is None
     assert f"nothing to do: {finished} has finished its 300 steps" in said(console)
@@ -197,7 +180,7 @@ def test_a_finished_run_has_nothing_to_do_unless_it_is_to_take_more_steps(finish
     assert not (finished / "tests").exists()  # they were of the policy of step 300
 
 
-def test_a_finished_run_is_finished_without_its_checkpoints(finished: Path) -> None:
+def test_a_finished_run_is_finished_without_its_checkpoints(finished):
     shutil.rmtree(finished / "checkpoints")
     before, console = contents(finished), quiet()
     assert resume(ResumeConfig(finished), console) is None
@@ -208,7 +191,7 @@ def test_a_finished_run_is_finished_without_its_checkpoints(finished: Path) -> N
 
 
 @pytest.mark.parametrize("policy", ["best.zip", "last.zip", "best.json", "last.safetensors"])
-def test_a_policy_is_never_replaced_by_beginning_again(half: TrainingConfig, policy: str) -> None:
+def test_a_policy_is_never_replaced_by_beginning_again(half, policy):
     shutil.rmtree(half.run / "checkpoints")
     for path in (*half.run.glob("best.*"), *half.run.glob("last.*")):
         path.unlink()
@@ -219,7 +202,7 @@ def test_a_policy_is_never_replaced_by_beginning_again(half: TrainingConfig, pol
     assert contents(half.run) == before
 
 
-def test_nothing_to_resume_is_an_error_that_says_so(tmp_path: Path) -> None:
+def test_nothing_to_resume_is_an_error_that_says_so(tmp_path):
     for run in (tmp_path, tmp_path / "nowhere"):
         with pytest.raises(RunError, match="tpm-gym train"):
             resume(ResumeConfig(run), quiet())
@@ -232,7 +215,7 @@ def test_nothing_to_resume_is_an_error_that_says_so(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["evaluations.jsonl", "progress.csv"])
-def test_a_folder_in_the_place_of_a_file_is_named(half: TrainingConfig, name: str) -> None:
+def test_a_folder_in_the_place_of_a_file_is_named(half, name):
     (half.run / name).unlink(missing_ok=True)
     (half.run / name).mkdir()
     with pytest.raises(
@@ -242,7 +225,7 @@ def test_a_folder_in_the_place_of_a_file_is_named(half: TrainingConfig, name: st
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there are no such locks")
-def test_two_processes_cannot_train_in_one_folder(half: TrainingConfig) -> None:
+def test_two_processes_cannot_train_in_one_folder(half):
     before = contents(half.run)
     with claimed(half.run), pytest.raises(RunError, match="another process"):
         resume(ResumeConfig(half.run), quiet())
@@ -251,9 +234,7 @@ def test_two_processes_cannot_train_in_one_folder(half: TrainingConfig) -> None:
     assert contents(half.run) == before
 
 
-def test_checkpoints_take_a_fiftieth_of_the_time_at_most(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_checkpoints_take_a_fiftieth_of_the_time_at_most(tmp_path, monkeypatch):
     """With a clock that only checkpoints (3 s) and rollouts of two steps (2 s) move."""
     clock, saved = [0.0], []
 
@@ -261,13 +242,13 @@ def test_checkpoints_take_a_fiftieth_of_the_time_at_most(
         perf_counter = staticmethod(lambda: clock[0])
         time_ns = staticmethod(lambda: int(clock[0] * 1e9))
 
-    def save(self: CheckpointStore, content: Content) -> None:
+    def save(self, content):
         clock[0] += 3.0
         saved.append(content.step)
 
     rollout_start = Checkpointing._on_rollout_start
 
-    def tick(self: Checkpointing) -> None:
+    def tick(self):
         clock[0] += 2.0
         rollout_start(self)
 

@@ -1,11 +1,9 @@
 """Training repeats exactly, refuses what cannot work, and leaves a complete run folder."""
 
-import io
 import json
 import os
 import signal
 import textwrap
-from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
@@ -25,7 +23,6 @@ from trainings import (
     evaluations,
     make_config,
     quiet,
-    read_checkpoint,
     said,
     table,
     uninterrupted,
@@ -58,7 +55,7 @@ RECIPE = CASES["sac"][2]
 
 
 @pytest.fixture
-def run() -> Path:
+def run():
     """A finished run of SAC with hindsight, not to be changed."""
     return uninterrupted("sac")
 
@@ -69,18 +66,11 @@ def parameters(run: Path, name: str = "last.zip") -> dict[str, Any]:
     return SAC.load(run / name, custom_objects=unused).policy.state_dict()
 
 
-def parameters_at(run: Path, step: int) -> dict[str, Any]:
-    """Return the parameters in a checkpoint."""
-    data = read_checkpoint(run, step).files["torch.pt"]
-    found: dict[str, Any] = torch.load(io.BytesIO(data))["parameters"]["policy"]
-    return found
-
-
 def equal(first: dict[str, Any], second: dict[str, Any]) -> bool:
     return all(torch.equal(value, second[name]) for name, value in first.items())
 
 
-def test_same_seed_same_policy_whatever_is_evaluated(run: Path, tmp_path: Path) -> None:
+def test_same_seed_same_policy_whatever_is_evaluated(run, tmp_path):
     config = replace(make_config("sac", tmp_path), eval_episodes=2, eval_every=1000)
     train(config, quiet())
     assert equal(parameters(run), parameters(config.run))
@@ -88,14 +78,14 @@ def test_same_seed_same_policy_whatever_is_evaluated(run: Path, tmp_path: Path) 
     assert not equal(parameters(run), parameters(tmp_path / "other"))
 
 
-def test_a_learning_rate_falls_to_zero_if_asked_to(run: Path) -> None:
+def test_a_learning_rate_falls_to_zero_if_asked_to(run):
     rates = [float(row["train/learning_rate"]) for row in table(run) if row["train/learning_rate"]]
     assert 0.0001 < rates[0] < 0.0002  # about half way
     assert rates == sorted(rates, reverse=True)
     assert 0 <= rates[-1] <= 0.0003 * 2 / 300  # an update takes two steps
 
 
-def test_steps_are_whole_rollouts_and_no_update_is_without_a_learning_rate(tmp_path: Path) -> None:
+def test_steps_are_whole_rollouts_and_no_update_is_without_a_learning_rate(tmp_path):
     """With 100 steps there are three rollouts of 40; the rate falls by a third after each."""
     config = make_config("ppo", tmp_path)
     text = config.recipe_file.read_text().replace(
@@ -113,7 +103,7 @@ def test_steps_are_whole_rollouts_and_no_update_is_without_a_learning_rate(tmp_p
     assert evaluations(config.run)[-1]["steps"] == 160
 
 
-def test_a_training_that_diverges_says_so(tmp_path: Path) -> None:
+def test_a_training_that_diverges_says_so(tmp_path):
     config = make_config("ppo", tmp_path)
     text = config.recipe_file.read_text().replace("n_epochs", "learning_rate: 1.0e+30\n  n_epochs")
     config.recipe_file.write_text(text)
@@ -121,7 +111,7 @@ def test_a_training_that_diverges_says_so(tmp_path: Path) -> None:
         train(config, quiet())
 
 
-def test_config_records_the_whole_run(run: Path) -> None:
+def test_config_records_the_whole_run(run):
     text = (run / "config.json").read_text(encoding="utf-8")
     content = json.loads(text)
     assert (content["algo"], content["env"], content["seed"]) == ("sac", "TPMReach-v0", 0)
@@ -137,14 +127,12 @@ def test_config_records_the_whole_run(run: Path) -> None:
     assert str(run.parent) not in text
 
 
-def test_what_is_chosen_reaches_every_environment_and_survives_resuming(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_chosen_reaches_every_environment_and_survives_resuming(tmp_path, monkeypatch):
     snug = replace(PAPER_TPM, name="snug", table=(0.4, 0.3))
     tpm_gym.register_machine("snug", snug)
     made: list[Any] = []
 
-    def remember(make: Callable[..., Any], *args: Any, **options: Any) -> Any:
+    def remember(make, *args, **options):
         made.append(make(*args, **options))
         return made[-1]
 
@@ -188,9 +176,7 @@ def test_what_is_chosen_reaches_every_environment_and_survives_resuming(
         ("recipe.arguments", {"train_fred": 2}),
     ],
 )
-def test_a_damaged_configuration_is_named_and_left_as_it_is(
-    name: str, value: Any, run: Path, tmp_path: Path
-) -> None:
+def test_a_damaged_configuration_is_named_and_left_as_it_is(name, value, run, tmp_path):
     stored = json.loads((run / "config.json").read_text(encoding="utf-8"))
     outer, _, inner = name.partition(".")
     changed = {**stored[outer], inner: value} if inner else value
@@ -202,7 +188,7 @@ def test_a_damaged_configuration_is_named_and_left_as_it_is(
     assert (tmp_path / "config.json").read_bytes() == before
 
 
-def test_best_policy_is_the_one_evaluated_best(run: Path) -> None:
+def test_best_policy_is_the_one_evaluated_best(run):
     scores = [
         (entry["success_at_end"]["mean"], entry["return"]["mean"]) for entry in evaluations(run)
     ]
@@ -218,7 +204,7 @@ def score(path: Path) -> tuple[float, float]:
     return record.success_at_end, record.total_reward
 
 
-def test_both_policies_are_exported_and_nothing_is_unpickled_for_it(run: Path) -> None:
+def test_both_policies_are_exported_and_nothing_is_unpickled_for_it(run):
     for name in ("best", "last"):
         exported = tpm_gym.load_policy(run / name)
         saved = load_model(run / f"{name}.zip", "sac")
@@ -241,9 +227,7 @@ def test_both_policies_are_exported_and_nothing_is_unpickled_for_it(run: Path) -
         pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow),
     ],
 )
-def test_command_line_trains_ppo_in_parallel_and_stops_when_asked_to(
-    tmp_path: Path, number: signal.Signals, status: int
-) -> None:
+def test_command_line_trains_ppo_in_parallel_and_stops_when_asked_to(tmp_path, number, status):
     """Signal the whole process group, workers included, as a terminal or a batch system does."""
     config = make_config("ppo in processes", tmp_path)
     folder = config.run
@@ -287,15 +271,13 @@ PICK = {"env": "TPMPickAndPlace-v0", "recipe_file": recipe_file("sac")}
         ({"env_options": EnvOptions(machine="narrow")}, "machine = 'narrow'"),
     ],
 )
-def test_mistakes_are_named_before_anything_is_written(
-    options: dict[str, Any], message: str, tmp_path: Path
-) -> None:
+def test_mistakes_are_named_before_anything_is_written(options, message, tmp_path):
     with pytest.raises(TPMError, match=message):
         train(replace(make_config("sac", tmp_path), **options), quiet())
     assert not (tmp_path / "run").exists()
 
 
-def test_demonstrations_are_as_many_as_asked_for(tmp_path: Path) -> None:
+def test_demonstrations_are_as_many_as_asked_for(tmp_path):
     config = replace(make_config("sac", tmp_path), **PICK)
     for count, found in {None: 400, 10: 10, 0: None}.items():
         recipe = complete(replace(config, steps=30_000, demonstrations=count)).recipe
@@ -325,8 +307,8 @@ def test_demonstrations_are_as_many_as_asked_for(tmp_path: Path) -> None:
     ],
 )
 def test_sizes_that_cannot_be_are_one_line_before_anything_is_written(
-    case: str, before: str, after: str, message: str, tmp_path: Path
-) -> None:
+    case, before, after, message, tmp_path
+):
     config = make_config(case, tmp_path)
     text = config.recipe_file.read_text()
     assert before in text
@@ -348,8 +330,8 @@ SHIPPED = [
 
 @pytest.mark.parametrize(("algorithm", "env_id"), SHIPPED)
 def test_shipped_recipes_are_arguments_of_the_algorithm_and_relabel_sparse_rewards(
-    algorithm: str, env_id: str
-) -> None:
+    algorithm, env_id
+):
     config = complete(TrainingConfig(algo=algorithm, env=env_id))
     recipe = config.recipe
     assert recipe.hindsight == ("Dense" not in env_id)
@@ -357,14 +339,14 @@ def test_shipped_recipes_are_arguments_of_the_algorithm_and_relabel_sparse_rewar
         assert recipe.arguments["n_steps"] * config.envs % recipe.arguments["batch_size"] == 0
     else:  # a buffer of full size takes seconds to build
         recipe = replace(recipe, arguments={**recipe.arguments, "buffer_size": 100})
-    envs: Any = gym.make(env_id)
-    model: Any = make_model(replace(config, recipe=recipe), envs)
+    envs = gym.make(env_id)
+    model = make_model(replace(config, recipe=recipe), envs)
     assert model.gamma == recipe.arguments["gamma"]
     assert model.policy_kwargs["net_arch"] == recipe.arguments["policy_kwargs"]["net_arch"]
     envs.close()
 
 
-def test_recipes_of_the_analytic_engine_are_for_many_environments_and_every_id() -> None:
+def test_recipes_of_the_analytic_engine_are_for_many_environments_and_every_id():
     options = EnvOptions(engine="analytic")
     for algorithm, env_id in product(ALGORITHMS, tpm_gym.ENV_IDS):
         if ("Dense" in env_id) == (algorithm == "ppo") and env_id[3:8] not in ("Stack", "Throw"):
@@ -375,7 +357,7 @@ def test_recipes_of_the_analytic_engine_are_for_many_environments_and_every_id()
             assert env_id in known or "Push" in env_id or "Stack" in env_id
 
 
-def test_one_file_has_recipes_of_several_algorithms(tmp_path: Path) -> None:
+def test_one_file_has_recipes_of_several_algorithms(tmp_path):
     texts = {algorithm: textwrap.indent(CASES[algorithm][2], "  ") for algorithm in ("sac", "ppo")}
     path = tmp_path / "both.yml"
     path.write_text("".join(f"{name}:{text}" for name, text in texts.items()), encoding="utf-8")
@@ -406,9 +388,7 @@ def test_one_file_has_recipes_of_several_algorithms(tmp_path: Path) -> None:
         ("lin_0.0003", "lin_inf", r"learning_rate.*\^lin_"),
     ],
 )
-def test_recipe_mistakes_name_file_key_and_choice(
-    before: str, after: str, message: str, tmp_path: Path
-) -> None:
+def test_recipe_mistakes_name_file_key_and_choice(before, after, message, tmp_path):
     assert before in RECIPE
     path = tmp_path / "wrong.yml"
     path.write_text(RECIPE.replace(before, after), encoding="utf-8")

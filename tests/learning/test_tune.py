@@ -1,7 +1,6 @@
 """Searches with the real Optuna and Ray Tune."""
 
 import json
-from pathlib import Path
 
 import pytest
 import yaml
@@ -14,9 +13,7 @@ ANALYTIC = EnvOptions(engine="analytic")
 
 
 @pytest.mark.slow
-def test_the_best_of_a_search_is_a_recipe_that_trains(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_best_of_a_search_is_a_recipe_that_trains(tmp_path, capsys):
     folder = tmp_path / "tuned"
     words = "tune --env TPMReachDense-v0 --engine analytic --trials 3 --steps 8192 --jobs 2"
     main([*words.split(), "--folder", str(folder)])
@@ -42,14 +39,12 @@ def test_the_best_of_a_search_is_a_recipe_that_trains(
         (["--env", "TPMReach-v0"], "no recipe of ppo for TPMReach-v0"),
     ],
 )
-def test_mistakes_are_named_before_ray_starts(words: list[str], message: str) -> None:
+def test_mistakes_are_named_before_ray_starts(words, message):
     with pytest.raises(SystemExit, match=message):
         main(["tune", *words])
 
 
-def test_a_task_of_the_users_gets_the_recipe_of_pick_and_place(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_task_of_the_users_gets_the_recipe_of_pick_and_place(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "hovering.py").write_text(
         "import tpm_gym\nfrom tpm_gym.tasks import Reach\n\n\nclass Hover(Reach):\n    pass\n\n\n"

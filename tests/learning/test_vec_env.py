@@ -20,7 +20,7 @@ def vec_env(env_id: str = PICK, count: int = 3, **options: Any) -> AnalyticVecEn
     return AnalyticVecEnv(make_envs(env_id, count, **options))
 
 
-def test_it_is_sb3s_own_vector_of_single_environments() -> None:
+def test_it_is_sb3s_own_vector_of_single_environments():
     theirs = DummyVecEnv([lambda: gym.make(PICK, engine="analytic", max_episode_steps=6)] * 3)
     ours = vec_env(max_episode_steps=6)
     for envs in (ours, theirs):
@@ -46,15 +46,15 @@ def test_it_is_sb3s_own_vector_of_single_environments() -> None:
             assert info["episode"]["l"] == 6
 
 
-def test_another_autoreset_is_refused() -> None:
+def test_another_autoreset_is_refused():
     with pytest.raises(tpm_gym.errors.ConfigurationError, match=r"autoreset_mode='SameStep'"):
         vec_env(autoreset_mode="NextStep")
-    one: Any = gym.make(PICK, engine="analytic")
+    one = gym.make(PICK, engine="analytic")
     with pytest.raises(tpm_gym.errors.ConfigurationError, match=r"gym\.make_vec"):
         AnalyticVecEnv(one)
 
 
-def test_ppo_and_hindsight_learn_in_it() -> None:
+def test_ppo_and_hindsight_learn_in_it():
     ppo = PPO("MultiInputPolicy", vec_env("TPMReachDense-v0", 8), n_steps=60, batch_size=120)
     ppo.learn(960)
     assert len(ppo.ep_info_buffer or ()) == 16

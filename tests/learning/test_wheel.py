@@ -22,7 +22,7 @@ OUTSIDE = {name: value for name, value in os.environ.items() if not name.startsw
 
 
 @pytest.fixture(scope="module")
-def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def installed(tmp_path_factory):
     """The programs of an environment in which nothing but the wheel is installed."""
     folder = tmp_path_factory.mktemp("wheel")
     build = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(folder), str(ROOT)]
@@ -37,8 +37,8 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_training_is_killed_resumed_and_evaluated_beside_the_expert_and_a_published_policy(
-    installed: Path, tmp_path: Path
-) -> None:
+    installed, tmp_path
+):
     program = installed / "tpm-gym"
     words = ["train", "--env", "TPMReach-v0", "--steps", "1500", "--eval-episodes", "2"]
     words += ["--checkpoint-every", "100"]
@@ -54,7 +54,7 @@ def test_a_training_is_killed_resumed_and_evaluated_beside_the_expert_and_a_publ
     assert expert["success_at_end"]["mean"] == published["success_at_end"]["mean"] == 1.0
 
 
-def test_the_lines_of_the_first_run_learn_reach(installed: Path, tmp_path: Path) -> None:
+def test_the_lines_of_the_first_run_learn_reach(installed, tmp_path):
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs/first-run.md").read_text(), re.DOTALL)
     (script,) = (block for block in blocks if "import recipe" in block)
     output = printed_by(installed / "python", "-c", script, cwd=tmp_path, env=OUTSIDE)

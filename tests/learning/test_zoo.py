@@ -1,7 +1,5 @@
 """rl-baselines3-zoo trains with our recipes."""
 
-from pathlib import Path
-
 import pytest
 import yaml
 from processes import PYTHON, printed_by
@@ -14,7 +12,7 @@ from tpm_gym.resources import RECIPES
 
 
 @pytest.mark.parametrize("algorithm", ["sac", "tqc", "ppo"])
-def test_every_recipe_is_handed_over_with_classes_for_their_names(algorithm: str) -> None:
+def test_every_recipe_is_handed_over_with_classes_for_their_names(algorithm):
     recipes = yaml.safe_load((RECIPES / f"{algorithm}.yml").read_text(encoding="utf-8"))
     translated = hyperparameters(algorithm)
     assert set(translated) == set(recipes) <= set(tpm_gym.ENV_IDS)
@@ -37,7 +35,7 @@ def test_every_recipe_is_handed_over_with_classes_for_their_names(algorithm: str
         pytest.param("ppo", "TPMReachDense-v0", 1, marks=pytest.mark.slow),
     ],
 )
-def test_the_zoo_runs_them(algorithm: str, env_id: str, steps: int, tmp_path: Path) -> None:
+def test_the_zoo_runs_them(algorithm, env_id, steps, tmp_path):
     pytest.importorskip("rl_zoo3")
     words = ["--algo", algorithm, "--env", env_id, "--n-timesteps", str(steps)]
     words += ["--gym-packages", "tpm_gym", "--conf-file", "tpm_gym.learning.zoo"]

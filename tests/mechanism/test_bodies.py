@@ -81,7 +81,7 @@ def cylinders(draw: st.DrawFn) -> Solid:
 
 
 @examples(150, st.one_of(boxes(), cylinders()))
-def test_mass_and_inertia_of_solids_equal_an_integration(solid: Solid) -> None:
+def test_mass_and_inertia_of_solids_equal_an_integration(solid):
     at, mass = cloud(solid)
     assert solid.mass == pytest.approx(mass.sum(), rel=1e-9)
     tensor = moments(at, mass, np.array(solid.centre))
@@ -89,7 +89,7 @@ def test_mass_and_inertia_of_solids_equal_an_integration(solid: Solid) -> None:
 
 
 @examples(60, st.lists(st.one_of(boxes(), cylinders()), min_size=1, max_size=4))
-def test_mass_properties_of_links_equal_an_integration(solids: list[Solid]) -> None:
+def test_mass_properties_of_links_equal_an_integration(solids):
     link = Link("link", tuple(solids))
     clouds = [cloud(solid) for solid in solids]
     at, mass = (np.concatenate(parts) for parts in zip(*clouds, strict=True))
@@ -100,7 +100,7 @@ def test_mass_properties_of_links_equal_an_integration(solids: list[Solid]) -> N
     np.testing.assert_allclose(link.inertia, tensor, rtol=1e-9, atol=1e-9 * tensor.max())
 
 
-def test_parts_that_are_only_drawn_weigh_nothing() -> None:
+def test_parts_that_are_only_drawn_weigh_nothing():
     drawn = Solid("box", (0.4, 0.2, 0.1), (1.0, 0.0, 0.0), 0.0)
     solid = Solid("cylinder", (0.1, 0.4, 0.0), (0.0, 0.0, 0.0), 1000.0)
     with_drawn, alone = Link("a", (solid, drawn)), Link("a", (solid,))

@@ -16,7 +16,7 @@ DOWN = (0.0, 0.0, -1.0)
 REACH = WIDTH / 2 - CUP.radius
 
 
-def test_the_vacuum_pulls_with_60_kpa_on_the_lip_and_less_than_the_spring() -> None:
+def test_the_vacuum_pulls_with_60_kpa_on_the_lip_and_less_than_the_spring():
     pull_off = CUP.vacuum * CUP.area
     assert pull_off == pytest.approx(60e3 * np.pi * CUP.radius**2, rel=0.02)
     assert pull_off < CUP.preload  # or a heavy block would pull the cup out
@@ -33,13 +33,13 @@ def lies(offset: tuple[float, float, float], tilt: float = 0.0, yaw: float = 0.0
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.7, -2.0])
-def test_it_seals_where_the_whole_lip_is_covered_and_near(yaw: float) -> None:
+def test_it_seals_where_the_whole_lip_is_covered_and_near(yaw):
     for x, y, gap in product((-1.01, -0.99, 0.0, 0.99, 1.01), repeat=3):
         expected = max(abs(x), abs(y), abs(gap)) < 1
         assert lies((x * REACH, y * REACH, gap * CUP.seal_gap), yaw=yaw) is expected
 
 
 @pytest.mark.parametrize("share", [-1.01, -0.99, 0.0, 0.99, 1.01])
-def test_it_seals_on_blocks_that_lean_as_far_as_the_lip_follows(share: float) -> None:
+def test_it_seals_on_blocks_that_lean_as_far_as_the_lip_follows(share):
     assert lies((0.0, 0.0, 0.0), tilt=share * CUP.seal_tilt, yaw=0.3) is (abs(share) < 1)
     assert not lies((0.0, 0.0, 0.0), tilt=math.pi)  # the underside

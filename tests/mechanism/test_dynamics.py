@@ -4,8 +4,6 @@ Independent of the formulas: virtual work by differences, and Pinocchio on the U
 (test_pinocchio.py).
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -18,7 +16,7 @@ import torch
 from examples import examples
 from machines import anywhere, each_machine
 
-from tpm_gym.arrays import FloatArray, Vector
+from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import ConfigurationError, InputError, SingularityError, UnreachableError
 from tpm_gym.kinematics import ASSEMBLY_MODES, AssemblyMode, forward_all, inverse_all, jacobian
 from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
@@ -68,13 +66,13 @@ def close(found: Any, expected: Any, share: float) -> bool:
 
 
 @pytest.mark.parametrize("g", [PAPER, WIDE], ids=["paper", "wide"])
-def test_torques_are_those_of_the_bodies_in_every_assembly_mode(g: Geometry) -> None:
+def test_torques_are_those_of_the_bodies_in_every_assembly_mode(g):
     branches = set().union(*(branches_with_those_of_the_bodies(g, seed) for seed in range(8)))
     assert branches == set(ASSEMBLY_MODES)
 
 
 @examples(15, oracle.geometries(), oracle.seeds())
-def test_torques_are_those_of_the_bodies_for_any_lengths(g: Geometry, seed: int) -> None:
+def test_torques_are_those_of_the_bodies_for_any_lengths(g, seed):
     branches_with_those_of_the_bodies(g, seed)
 
 
@@ -96,7 +94,7 @@ def branches_with_those_of_the_bodies(g: Geometry, seed: int) -> set[AssemblyMod
 
 
 @each_machine
-def test_a_payload_is_a_mass_at_p(machine: TPM) -> None:
+def test_a_payload_is_a_mass_at_p(machine):
     theta, *_ = drawn(machine, 20)
     loaded, empty = replace(machine.dynamics, payload=0.3), machine.dynamics
     j = jacobian.velocity(theta, machine.assembly_mode, machine.geometry)
@@ -107,7 +105,7 @@ def test_a_payload_is_a_mass_at_p(machine: TPM) -> None:
 
 
 @each_machine
-def test_torques_are_those_of_virtual_work_by_differences(machine: TPM) -> None:
+def test_torques_are_those_of_virtual_work_by_differences(machine):
     # What is left is the differences' (2e-4 next to y = 0 in PAPER_TPM) and end link 10's roll.
     for *motion, force in zip(*drawn(machine, 10), drawn(machine, 10, 9)[1], strict=True):
         expected = Machine.torque(machine, *motion, force)
@@ -137,14 +135,12 @@ def with_solid(name: str, solid: Solid) -> Mechanism:
         ("end_link_9", "on its axis", (0.01, 0.01, 0.01), (0.02, 0.0, 0.0)),
     ],
 )
-def test_bodies_for_which_the_formulas_do_not_hold_are_refused(
-    name: str, wanted: str, size: Vector, centre: Vector
-) -> None:
+def test_bodies_for_which_the_formulas_do_not_hold_are_refused(name, wanted, size, centre):
     with pytest.raises(ConfigurationError, match=f"{name}.*{wanted}"):
         inertia_of(with_solid(name, Solid("box", size, centre, 2700.0)), PAPER)
 
 
-def test_links_and_factors_that_are_not_the_mechanisms_are_refused() -> None:
+def test_links_and_factors_that_are_not_the_mechanisms_are_refused():
     mechanism = build()
     other = replace(mechanism.link("cup"), name="gripper")
     with pytest.raises(ConfigurationError, match="gripper"):
@@ -162,7 +158,7 @@ def test_links_and_factors_that_are_not_the_mechanisms_are_refused() -> None:
                 Dynamics(**{name: value})
 
 
-def test_states_that_do_not_go_together_are_named() -> None:
+def test_states_that_do_not_go_together_are_named():
     five, four = np.tile(HOME, (5, 1)), np.zeros((4, 3))
     for batch in (five, torch.tensor(five)):
         with pytest.raises(InputError, match=r"theta, theta_dot must .*\(5, 3\), \(4, 3\)"):
@@ -175,7 +171,7 @@ def test_states_that_do_not_go_together_are_named() -> None:
 
 
 @each_machine
-def test_the_mass_matrix_is_symmetric_and_positive(machine: TPM) -> None:
+def test_the_mass_matrix_is_symmetric_and_positive(machine):
     theta, *_ = drawn(machine, 50)
     mass = machine.dynamics.mass_matrix(theta)
     np.testing.assert_array_equal(mass, np.swapaxes(mass, -1, -2))
@@ -183,7 +179,7 @@ def test_the_mass_matrix_is_symmetric_and_positive(machine: TPM) -> None:
 
 
 @each_machine
-def test_the_rate_of_the_mass_matrix_less_twice_c_is_skew(machine: TPM) -> None:
+def test_the_rate_of_the_mass_matrix_less_twice_c_is_skew(machine):
     theta, rate, _ = drawn(machine, 50)
     dynamics, step = machine.dynamics, 1e-6
     ahead, behind = (dynamics.mass_matrix(theta + by * rate) for by in (step, -step))
@@ -194,7 +190,7 @@ def test_the_rate_of_the_mass_matrix_less_twice_c_is_skew(machine: TPM) -> None:
 
 
 @each_machine
-def test_the_parts_of_the_torque_add_up_and_forward_undoes_it(machine: TPM) -> None:
+def test_the_parts_of_the_torque_add_up_and_forward_undoes_it(machine):
     theta, rate, change = drawn(machine, 50)
     dynamics = replace(machine.dynamics, payload=0.5)
     torque = dynamics.torque(theta, rate, change)
@@ -208,12 +204,12 @@ def test_the_parts_of_the_torque_add_up_and_forward_undoes_it(machine: TPM) -> N
 
 
 @each_machine
-def test_the_power_of_the_torque_is_the_rate_of_the_energy(machine: TPM) -> None:
+def test_the_power_of_the_torque_is_the_rate_of_the_energy(machine):
     theta, rate, change = drawn(machine, 50)
     dynamics = replace(machine.dynamics, payload=0.3, free_fall=LOADED.free_fall)
     step = 1e-6
 
-    def energy(t: float) -> FloatArray:
+    def energy(t):
         at = theta + t * rate + t**2 / 2 * change
         return np.sum(dynamics.energy(at, rate + t * change), axis=0)
 
@@ -229,7 +225,7 @@ def energy_gained_in_free_fall(machine: TPM, steps: int) -> tuple[float, float]:
     x, y, _ = machine.home
     state = np.concatenate([machine.inverse((x, y, machine.region.low[2])), np.zeros(3)])
 
-    def slope(at: FloatArray) -> FloatArray:
+    def slope(at):
         return np.concatenate([at[3:], dynamics.forward(at[:3], at[3:], np.zeros(3))])
 
     start = sum(dynamics.energy(state[:3], state[3:]))
@@ -243,7 +239,7 @@ def energy_gained_in_free_fall(machine: TPM, steps: int) -> tuple[float, float]:
 
 
 @each_machine
-def test_free_motion_keeps_its_energy_to_the_order_of_the_integrator(machine: TPM) -> None:
+def test_free_motion_keeps_its_energy_to_the_order_of_the_integrator(machine):
     errors = []
     for steps in (15, 30, 60):
         gained, kinetic = energy_gained_in_free_fall(machine, steps)
@@ -269,7 +265,7 @@ def calls(d: Dynamics) -> list[tuple[Callable[..., Any], int]]:
 
 
 @each_machine
-def test_batches_are_their_rows(machine: TPM) -> None:
+def test_batches_are_their_rows(machine):
     states = [each.reshape(2, 3, 3) for each in drawn(machine, 6)]
     for function, count in calls(machine.dynamics):
         batch = function(*states[:count])
@@ -283,7 +279,7 @@ def test_batches_are_their_rows(machine: TPM) -> None:
     assert close(motion.bias, bias, 1e-11)
 
 
-def test_states_broadcast_and_may_be_none() -> None:
+def test_states_broadcast_and_may_be_none():
     theta, rate, _ = drawn(PAPER_TPM, 4)
     dynamics = PAPER_TPM.dynamics
     at_rest = dynamics.torque(theta, np.zeros(3), np.zeros(3))
@@ -294,7 +290,7 @@ def test_states_broadcast_and_may_be_none() -> None:
 
 
 @each_machine
-def test_tensors_have_the_derivatives_of_the_values(machine: TPM) -> None:
+def test_tensors_have_the_derivatives_of_the_values(machine):
     states = [torch.tensor(each, requires_grad=True) for each in drawn(machine, 2)]
     dynamics = replace(machine.dynamics, payload=0.2)
     for function, count in (
@@ -315,7 +311,7 @@ def test_tensors_have_the_derivatives_of_the_values(machine: TPM) -> None:
 # What there is no torque for
 
 
-def test_states_without_a_torque_are_refused() -> None:
+def test_states_without_a_torque_are_refused():
     dynamics, rest = PAPER_TPM.dynamics, np.zeros(3)
     apart = np.array([0.0, np.pi, -2.0])
     x, _, z = PAPER_TPM.home

@@ -10,7 +10,6 @@ import pytest
 from machines import anywhere, each_machine, within
 from walk import walk
 
-from tpm_gym.arrays import Vector
 from tpm_gym.errors import (
     ConfigurationError,
     JointLimitError,
@@ -36,7 +35,7 @@ from tpm_gym.mechanism.machine import MODES
 
 
 @each_machine
-def test_kinematics_agree_all_over_the_region(machine: TPM) -> None:
+def test_kinematics_agree_all_over_the_region(machine):
     points = np.array(anywhere(machine, 100))
     theta = machine.require_inverse(points)
     position, rows, conditioning, working = machine.require_evaluate(theta)
@@ -56,7 +55,7 @@ def test_kinematics_agree_all_over_the_region(machine: TPM) -> None:
 
 
 @each_machine
-def test_conditioning_is_0_where_p_cannot_be(machine: TPM) -> None:
+def test_conditioning_is_0_where_p_cannot_be(machine):
     points = np.array(anywhere(machine, 12)).reshape(3, 4, 3)
     theta = machine.inverse(points)
     expected = machine.evaluate(theta).conditioning
@@ -68,7 +67,7 @@ def test_conditioning_is_0_where_p_cannot_be(machine: TPM) -> None:
 
 
 @each_machine
-def test_beyond_a_singularity_the_mode_that_was_left_is_named(machine: TPM) -> None:
+def test_beyond_a_singularity_the_mode_that_was_left_is_named(machine):
     x, y, z = machine.home
     theta, mode = machine.inverse(machine.home), machine.working_mode
     edge = (x, 0.98 * machine.geometry.l7, 0.65)  # near l7, where the two modes meet
@@ -91,7 +90,7 @@ def test_beyond_a_singularity_the_mode_that_was_left_is_named(machine: TPM) -> N
 
 @each_machine
 @pytest.mark.parametrize("place", [0, 1])
-def test_boxes_hold_platform_and_cup_and_no_more(machine: TPM, place: int) -> None:
+def test_boxes_hold_platform_and_cup_and_no_more(machine, place):
     point = anywhere(machine, 2)[place]
     mechanism = machine.mechanism
     frames = walk(mechanism, machine.joint_positions(tuple(machine.inverse(point))))
@@ -150,31 +149,29 @@ LOW, HIGH = PAPER_TPM.region.low, PAPER_TPM.region.high
         ("mount", Mount(height=0.9229), "0.923 m or more"),
     ],
 )
-def test_a_machine_on_which_no_episode_could_run_is_refused_by_name(
-    name: str, value: Any, valid: str
-) -> None:
+def test_a_machine_on_which_no_episode_could_run_is_refused_by_name(name, value, valid):
     with pytest.raises(ConfigurationError, match=valid) as caught:
         replace(PAPER_TPM, **{name: value})
     assert caught.value.name == name
 
 
-def test_a_machine_of_arrays_is_that_of_tuples() -> None:
-    region = Region(np.array(LOW), np.array(HIGH))  # type: ignore[arg-type]
-    values: Any = {"home": np.array(PAPER_TPM.home), "table": list(PAPER_TPM.table)}
+def test_a_machine_of_arrays_is_that_of_tuples():
+    region = Region(np.array(LOW), np.array(HIGH))
+    values = {"home": np.array(PAPER_TPM.home), "table": list(PAPER_TPM.table)}
     made = replace(PAPER_TPM, region=region, **values)
     assert made == PAPER_TPM
     assert hash(made) == hash(PAPER_TPM)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e300, 10**400, "high", (1.0,)])
-def test_a_height_that_cannot_be_is_refused(value: Any) -> None:
+def test_a_height_that_cannot_be_is_refused(value):
     with pytest.raises(ConfigurationError) as caught:
         Mount(value)
     assert caught.value.name == "height"
 
 
 @pytest.mark.parametrize(("name", "value"), [("", PAPER_TPM), (3, PAPER_TPM), ("mine", "paper")])
-def test_what_is_no_machine_is_not_registered(name: Any, value: Any) -> None:
+def test_what_is_no_machine_is_not_registered(name, value):
     with pytest.raises(ConfigurationError) as caught:
         register_machine(name, value)
     assert caught.value.name == ("machine" if name == "mine" else "name")
@@ -183,7 +180,7 @@ def test_what_is_no_machine_is_not_registered(name: Any, value: Any) -> None:
 @pytest.mark.parametrize(
     ("high", "leg"), [((0.12, 0.07, 0.903), "beta"), ((0.12, 0.046, 1.5), "leg")]
 )
-def test_a_region_out_of_reach_is_refused_with_what_fails_where(high: Vector, leg: str) -> None:
+def test_a_region_out_of_reach_is_refused_with_what_fails_where(high, leg):
     with pytest.raises(UnreachableError, match=leg) as caught:
         replace(PAPER_TPM, region=Region(LOW, high))
     assert caught.value.point[1:] in {(high[1], z) for z in (LOW[2], high[2])} | {(LOW[1], high[2])}
@@ -209,7 +206,7 @@ class Stopped(TPM):
         return replace(whole, links=tuple(links))
 
 
-def test_a_region_or_home_beyond_a_stop_is_refused_and_the_stop_is_named() -> None:
+def test_a_region_or_home_beyond_a_stop_is_refused_and_the_stop_is_named():
     region = WIDE_TPM.region
     farthest = max(WIDE_TPM.inverse(corner)[1] for corner in region.corners())
     grid = [
@@ -229,7 +226,7 @@ def test_a_region_or_home_beyond_a_stop_is_refused_and_the_stop_is_named() -> No
 
 
 @each_machine
-def test_the_whole_region_is_between_the_stops(machine: TPM) -> None:
+def test_the_whole_region_is_between_the_stops(machine):
     shares = list(product(np.linspace(0, 1, 9), repeat=3))
     theta = machine.inverse(within(machine, shares))
     machine.require_within_stops(theta)
@@ -238,7 +235,7 @@ def test_the_whole_region_is_between_the_stops(machine: TPM) -> None:
         machine.require_within_stops(theta)
 
 
-def test_the_first_row_without_a_solution_is_explained() -> None:
+def test_the_first_row_without_a_solution_is_explained():
     apart, flat = (0.0, np.pi, -2.0), PAPER_TPM.inverse((0.0, 0.0, 0.8))
     home = PAPER_TPM.inverse(PAPER_TPM.home)
     with pytest.raises(UnreachableError, match="leg") as caught:
@@ -253,10 +250,10 @@ def test_the_first_row_without_a_solution_is_explained() -> None:
         PAPER_TPM.joint_positions(apart)
 
 
-def test_sampling_keeps_to_the_safe_part_and_says_where_there_is_none() -> None:
+def test_sampling_keeps_to_the_safe_part_and_says_where_there_is_none():
     regions = [PAPER_TPM.region, PAPER_TPM.goal_region] * 50
 
-    def generators() -> list[np.random.Generator]:
+    def generators():
         return [np.random.default_rng(seed) for seed in range(100)]
 
     points = PAPER_TPM.sample(generators(), regions)
@@ -275,7 +272,7 @@ def test_sampling_keeps_to_the_safe_part_and_says_where_there_is_none() -> None:
 def scaled(factor: float) -> TPM:
     """A user's own: the paper's, larger."""
 
-    def times(*values: float) -> Any:
+    def times(*values):
         return tuple(factor * value for value in values)
 
     return TPM(
@@ -288,7 +285,7 @@ def scaled(factor: float) -> TPM:
     )
 
 
-def test_lengths_of_a_user_s_own_make_a_machine() -> None:
+def test_lengths_of_a_user_s_own_make_a_machine():
     mine = scaled(1.25)
     points = np.array(anywhere(PAPER_TPM, 10))
     theta = PAPER_TPM.inverse(points)
@@ -302,13 +299,13 @@ def test_lengths_of_a_user_s_own_make_a_machine() -> None:
         mine.with_lengths((0.3, 0.07, 0.35, -0.8, 0.1, 0.01, 0.05))
 
 
-def test_at_the_least_height_the_cup_is_pushed_in_as_far_as_it_goes() -> None:
+def test_at_the_least_height_the_cup_is_pushed_in_as_far_as_it_goes():
     mount = Mount(height=0.923)
     lip = replace(PAPER_TPM, mount=mount).mount.to_world(HIGH) - np.array(CUP.lip)
     assert lip[2] == pytest.approx(-CUP.stroke)
 
 
-def test_machines_are_found_by_name() -> None:
+def test_machines_are_found_by_name():
     assert find_machine("paper") is find_machine(PAPER_TPM) is PAPER_TPM
     assert find_machine("wide") is WIDE_TPM
     made: list[TPM] = []

@@ -1,7 +1,5 @@
 """The MJCF file is what the mechanism's data give, and MuJoCo alone loads and moves it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import mujoco
@@ -19,7 +17,7 @@ MECHANISM = PAPER_TPM.mechanism
 
 
 @pytest.fixture(params=[PAPER_TPM, WIDE_TPM], ids=lambda machine: machine.name)
-def machine(request: pytest.FixtureRequest) -> Machine:
+def machine(request):
     machine: Machine = request.param
     return machine
 
@@ -52,7 +50,7 @@ def miss(data: Any) -> float:
     return float(np.linalg.norm(position - known))
 
 
-def test_links_are_those_of_the_mechanism(machine: Machine) -> None:
+def test_links_are_those_of_the_mechanism(machine):
     model = mujoco.MjModel.from_xml_string(mjcf_text(machine))
     for link in machine.mechanism.links[1:]:
         body, joint = model.body(link.name), link.joint
@@ -72,7 +70,7 @@ def test_links_are_those_of_the_mechanism(machine: Machine) -> None:
             assert model.actuator(joint.name).forcerange.tolist() == [-joint.effort, joint.effort]
 
 
-def test_solids_are_drawn_where_they_are_and_the_lip_alone_collides() -> None:
+def test_solids_are_drawn_where_they_are_and_the_lip_alone_collides():
     model, _ = shipped()
     solids = [(link, solid) for link in MECHANISM.links for solid in link.solids]
     found = [index for index in range(model.ngeom) if model.geom(index).name != "table"]
@@ -96,7 +94,7 @@ def test_solids_are_drawn_where_they_are_and_the_lip_alone_collides() -> None:
             np.testing.assert_allclose(model.geom_pos[index], solid.centre, atol=1e-9)
 
 
-def test_at_home_loops_are_closed_and_p_is_at_home() -> None:
+def test_at_home_loops_are_closed_and_p_is_at_home():
     _, data = shipped()
     assert gap(data) < 1e-8
     assert miss(data) < 1e-8
@@ -104,7 +102,7 @@ def test_at_home_loops_are_closed_and_p_is_at_home() -> None:
     np.testing.assert_allclose(data.ctrl, angles(data), atol=1e-9)
 
 
-def test_it_is_moved_by_ctrl_with_its_loops_closed() -> None:
+def test_it_is_moved_by_ctrl_with_its_loops_closed():
     """Out 150 mm and back within 2 s; measured: loops within 0.02 um, 5 mrad behind."""
     model, data = shipped()
     gaps, misses, lags = [], [], []
@@ -122,7 +120,7 @@ def test_it_is_moved_by_ctrl_with_its_loops_closed() -> None:
     assert lags[-1] < 0.002
 
 
-def test_torques_at_rest_are_those_of_the_closed_form_and_limited() -> None:
+def test_torques_at_rest_are_those_of_the_closed_form_and_limited():
     model, data = shipped()
     for _ in range(1000):
         mujoco.mj_step(model, data)
@@ -133,7 +131,7 @@ def test_torques_at_rest_are_those_of_the_closed_form_and_limited() -> None:
     assert data.actuator_force[0] == model.actuator("R11").forcerange[1]
 
 
-def test_the_cup_yields_at_its_preload() -> None:
+def test_the_cup_yields_at_its_preload():
     model, data = shipped()
     slide = data.joint("cup_slide")
     weight = 9.81 * model.body(MECHANISM.tool).mass.item()
@@ -149,7 +147,7 @@ def test_the_cup_yields_at_its_preload() -> None:
         assert np.mean(positions) == pytest.approx(expected, abs=1e-3)
 
 
-def test_the_scene_shows_the_robot_and_touches_nothing() -> None:
+def test_the_scene_shows_the_robot_and_touches_nothing():
     model = mujoco.MjModel.from_xml_path(str(FOLDER / "scene.xml"))
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)

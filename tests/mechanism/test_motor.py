@@ -1,33 +1,30 @@
 """The motor's torque, size, inertia and speed belong together, and it is in the mechanism."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
 import pytest
 from machines import each_machine
 
-from tpm_gym.mechanism import TPM
 from tpm_gym.mechanism.motor import TORQUE_MOTOR
 from tpm_gym.mechanism.tree import ACTUATED_JOINTS
 
 
-def test_the_torque_is_what_the_air_gap_of_a_torque_motor_gives() -> None:
+def test_the_torque_is_what_the_air_gap_of_a_torque_motor_gives():
     # Textbooks and makers: 30 to 60 kPa at the peak, 10 to 20 kPa for ever in still air.
     gap = 2 * math.pi * TORQUE_MOTOR.gap_radius**2 * TORQUE_MOTOR.length
     assert 30e3 <= TORQUE_MOTOR.peak_torque / gap <= 60e3
     assert 10e3 <= TORQUE_MOTOR.continuous_torque / gap <= 20e3
 
 
-def test_the_continuous_torque_loses_what_the_housing_gives_off_in_still_air() -> None:
+def test_the_continuous_torque_loses_what_the_housing_gives_off_in_still_air():
     lost = (TORQUE_MOTOR.continuous_torque / TORQUE_MOTOR.motor_constant) ** 2
     radius, length = TORQUE_MOTOR.stator_radius, TORQUE_MOTOR.reach - TORQUE_MOTOR.clearance
     area = 2 * (2 * math.pi * radius * length + 2 * math.pi * radius**2)
     assert lost / (10.0 * area) < 65.0  # K above the room, at 10 W/(m^2 K)
 
 
-def test_the_rotor_fits_into_the_housing_round_the_shaft() -> None:
+def test_the_rotor_fits_into_the_housing_round_the_shaft():
     for rotor, stator in zip(
         TORQUE_MOTOR.rotor("x"), TORQUE_MOTOR.stator("x", (0, 0, 0)), strict=True
     ):
@@ -37,7 +34,7 @@ def test_the_rotor_fits_into_the_housing_round_the_shaft() -> None:
 
 
 @each_machine
-def test_the_rotor_is_part_of_every_arm_which_turns_between_its_halves(machine: TPM) -> None:
+def test_the_rotor_is_part_of_every_arm_which_turns_between_its_halves(machine):
     for link in machine.mechanism.links:
         if link.joint is None or link.joint.name not in ACTUATED_JOINTS:
             continue

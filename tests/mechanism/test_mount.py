@@ -6,15 +6,15 @@ from examples import examples
 from hypothesis import strategies as st
 from machines import each_machine
 
-from tpm_gym.arrays import Vector, rotate
-from tpm_gym.mechanism import Machine, Mount
+from tpm_gym.arrays import rotate
+from tpm_gym.mechanism import Mount
 from tpm_gym.mechanism.cup import CUP
 
 coordinates = st.tuples(*[st.floats(-3, 3)] * 3)
 
 
 @examples(100, st.floats(0.1, 2), coordinates, coordinates)
-def test_mounts_are_rigid_and_round_trip(height: float, p: Vector, q: Vector) -> None:
+def test_mounts_are_rigid_and_round_trip(height, p, q):
     mount = Mount(height)
     np.testing.assert_allclose(mount.to_paper(mount.to_world(p)), p, atol=1e-14)
     np.testing.assert_allclose(mount.to_world(mount.to_paper(p)), p, atol=1e-14)
@@ -28,7 +28,7 @@ def test_mounts_are_rigid_and_round_trip(height: float, p: Vector, q: Vector) ->
     np.testing.assert_allclose(moved, mount.rotate(np.subtract(p, q)), atol=1e-14)
 
 
-def test_the_mount_hangs_the_base_upside_down() -> None:
+def test_the_mount_hangs_the_base_upside_down():
     mount = Mount(1.5)
     np.testing.assert_array_equal(mount.to_world([0, 0, 0]), [0, 0, 1.5])
     np.testing.assert_array_equal(mount.to_world([0.1, 0.2, 0.5]), [0.1, -0.2, 1.0])
@@ -38,9 +38,7 @@ def test_the_mount_hangs_the_base_upside_down() -> None:
 
 
 @each_machine
-def test_over_the_whole_region_the_lip_is_above_the_table_and_at_its_end_within_reach(
-    machine: Machine,
-) -> None:
+def test_over_the_whole_region_the_lip_is_above_the_table_and_at_its_end_within_reach(machine):
     highest, lowest = machine.mount.to_world([machine.region.low, machine.region.high])[:, 2]
     assert 0 < lowest - CUP.length < 0.030 < highest - CUP.length
     assert (np.abs([machine.region.low, machine.region.high])[:, :2] <= machine.table).all()

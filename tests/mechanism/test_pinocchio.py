@@ -1,7 +1,5 @@
 """Pinocchio closes the loops, and holds the robot up, from the two files in urdf/ alone."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +18,6 @@ from tpm_gym.kinematics import (
     workspace,
 )
 from tpm_gym.kinematics.geometry import PAPER
-from tpm_gym.mechanism import TPM
 from tpm_gym.mechanism.export import URDF_FILE, write
 from tpm_gym.mechanism.mount import GRAVITY
 from tpm_gym.mechanism.tree import joint_angles, rotated_joint_angles
@@ -131,12 +128,12 @@ class Files:
 
 
 @pytest.fixture(scope="module")
-def files() -> Files:
+def files():
     return Files(FOLDER)
 
 
 @pytest.fixture(scope="module")
-def found(files: Files) -> list[tuple[FloatArray, FloatArray]]:
+def found(files):
     """Random points P with the posture that Pinocchio finds, on a straight way from START."""
     rough = {name: float(np.deg2rad(angle)) for name, angle in ABOUT.items()}
     start = files.close(files.turn_to(files.posture(rough), inverse(START)))
@@ -149,9 +146,7 @@ def found(files: Files) -> list[tuple[FloatArray, FloatArray]]:
     return pairs
 
 
-def test_the_files_close_where_the_closed_form_has_the_platform(
-    files: Files, found: list[tuple[FloatArray, FloatArray]]
-) -> None:
+def test_the_files_close_where_the_closed_form_has_the_platform(files, found):
     platform = files.model.getFrameId("platform")
     for point, posture in found:
         assert files.open_by(posture) < CLOSED
@@ -160,7 +155,7 @@ def test_the_files_close_where_the_closed_form_has_the_platform(
         np.testing.assert_allclose(placed.rotation, np.eye(3), atol=1e-10)
 
 
-def test_the_files_close_at_our_joint_angles_all_over_the_workspace(files: Files) -> None:
+def test_the_files_close_at_our_joint_angles_all_over_the_workspace(files):
     cloud = np.random.default_rng(1).uniform((-0.5, -0.05, 0.1), (0.5, 0.05, 1.1), (2000, 3))
     points = cloud[workspace.reachable(cloud)][:300]
     assert len(points) == 300
@@ -173,9 +168,7 @@ def test_the_files_close_at_our_joint_angles_all_over_the_workspace(files: Files
 
 @each_machine
 @pytest.mark.parametrize("roll", [0.0, 30.0])
-def test_torques_are_those_of_pinocchio_on_the_files(
-    machine: TPM, roll: float, tmp_path: Path
-) -> None:
+def test_torques_are_those_of_pinocchio_on_the_files(machine, roll, tmp_path):
     # Measured: 2e-9 of the largest, the digits of the URDF.
     write(tmp_path, machine)
     files, rng = Files(tmp_path), np.random.default_rng(0)
@@ -187,7 +180,7 @@ def test_torques_are_those_of_pinocchio_on_the_files(
         assert np.abs(found - expected).max() < 1e-8 * np.abs(expected).max()
 
 
-def test_the_files_close_with_link_3p_turned(files: Files) -> None:
+def test_the_files_close_with_link_3p_turned(files):
     platform, closed = files.model.getFrameId("platform"), 0
     for theta in np.random.default_rng(2).uniform(-np.pi, np.pi, (300, 3)):
         solutions = forward_rotated(theta)
@@ -203,9 +196,7 @@ def test_the_files_close_with_link_3p_turned(files: Files) -> None:
     assert closed > 50
 
 
-def test_from_wherever_it_starts_pinocchio_closes_the_loops_in_one_of_the_two_modes(
-    files: Files,
-) -> None:
+def test_from_wherever_it_starts_pinocchio_closes_the_loops_in_one_of_the_two_modes(files):
     """Newton's method on all passive joints, which knows of no mode."""
     rng, platform, seen = np.random.default_rng(3), files.model.getFrameId("platform"), set()
     for theta in ([-2.22, -1.27, -2.11], inverse(START)):

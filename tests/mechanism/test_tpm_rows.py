@@ -1,7 +1,5 @@
 """Compiled rows are what arrays of numpy give; each row is computed by itself."""
 
-from __future__ import annotations
-
 import math
 import subprocess
 import sys
@@ -18,8 +16,6 @@ from tpm_gym.errors import InputError
 from tpm_gym.kinematics import (
     ASSEMBLY_MODES,
     WORKING_MODES,
-    AssemblyMode,
-    WorkingMode,
     forward_all,
     inverse_all,
     jacobian,
@@ -44,7 +40,7 @@ def machine_of(g: Geometry, **modes: Any) -> TPM:
 
 @pytest.mark.parametrize("g", GEOMETRIES)
 @pytest.mark.parametrize("branch", ASSEMBLY_MODES)
-def test_angles_give_what_arrays_of_numpy_give(branch: AssemblyMode, g: Geometry) -> None:
+def test_angles_give_what_arrays_of_numpy_give(branch, g):
     machine = machine_of(g, assembly_mode=branch)
     theta = np.random.default_rng(branch.index).uniform(-math.pi, math.pi, (600, 3))
     solutions = forward_all(theta, g)
@@ -68,7 +64,7 @@ def test_angles_give_what_arrays_of_numpy_give(branch: AssemblyMode, g: Geometry
 
 @pytest.mark.parametrize("g", GEOMETRIES)
 @pytest.mark.parametrize("branch", WORKING_MODES)
-def test_points_give_what_arrays_of_numpy_give(branch: WorkingMode, g: Geometry) -> None:
+def test_points_give_what_arrays_of_numpy_give(branch, g):
     reach = np.array([0.6, 1.1 * g.l7, 1.2])
     points = np.random.default_rng(branch.index).uniform(-reach, reach, (200, 3))
     solutions = inverse_all(points, g)
@@ -82,7 +78,7 @@ def test_points_give_what_arrays_of_numpy_give(branch: WorkingMode, g: Geometry)
         np.testing.assert_allclose(machine.conditioning_at(points), expected, rtol=1e-6, atol=1e-5)
 
 
-def test_where_a_divisor_is_zero_there_is_no_solution() -> None:
+def test_where_a_divisor_is_zero_there_is_no_solution():
     g = replace(PAPER, l6=0.0)
     machine, same = machine_of(g), math.acos((g.l1 - 2 * g.l5) / g.l3)
     concentric = (same, same, 0.5)  # the circles of C1 have one centre
@@ -127,7 +123,7 @@ def parts(found: Any, index: Any) -> Any:
 
 
 @each_machine
-def test_a_row_has_the_same_bits_alone_and_among_thousands(machine: TPM) -> None:
+def test_a_row_has_the_same_bits_alone_and_among_thousands(machine):
     rows = drawn(machine, (1111,))
     for operation in operations(machine):
         whole = operation(*rows, None)
@@ -142,7 +138,7 @@ def test_a_row_has_the_same_bits_alone_and_among_thousands(machine: TPM) -> None
 
 
 @each_machine
-def test_rows_are_of_the_machine_that_was_built(machine: TPM) -> None:
+def test_rows_are_of_the_machine_that_was_built(machine):
     rng, links = np.random.default_rng(3), len(machine.mechanism.links) - 1
     count, steps = 3, 4
     lengths = [tuple(machine.lengths + rng.normal(0.0, 1e-4, 7)) for _ in range(count)]
@@ -167,7 +163,7 @@ def test_rows_are_of_the_machine_that_was_built(machine: TPM) -> None:
             machine.inverse(rows[0][:, :3].reshape(-1, 3), wrong)
 
 
-def test_shapes_that_do_not_go_together_are_refused() -> None:
+def test_shapes_that_do_not_go_together_are_refused():
     for wrong in (np.zeros(2), np.zeros((3, 2)), 0.0):
         with pytest.raises(InputError, match="3"):
             PAPER_TPM.inverse(wrong)
@@ -175,7 +171,7 @@ def test_shapes_that_do_not_go_together_are_refused() -> None:
         PAPER_TPM.motion(np.zeros((2, 3)), np.zeros((3, 3)))
 
 
-def test_all_kinds_of_arrays_share_one_compiled_loop() -> None:
+def test_all_kinds_of_arrays_share_one_compiled_loop():
     points, theta, rate = drawn(PAPER_TPM, (1,))
     expected = PAPER_TPM.motion(theta, rate)
     frozen = rate.copy()
@@ -191,7 +187,7 @@ def test_all_kinds_of_arrays_share_one_compiled_loop() -> None:
     assert [len(loop.signatures) for loop in loops] == [1, 1]
 
 
-def test_numba_is_imported_when_a_machine_first_computes() -> None:
+def test_numba_is_imported_when_a_machine_first_computes():
     code = (
         "import sys, tpm_gym; before = 'numba' in sys.modules; "
         "tpm_gym.PAPER_TPM.inverse(tpm_gym.PAPER_TPM.home); "

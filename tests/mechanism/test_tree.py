@@ -20,7 +20,6 @@ from tpm_gym.kinematics import (
     inverse_all,
 )
 from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
-from tpm_gym.mechanism import TPM
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.motor import TORQUE_MOTOR
 from tpm_gym.mechanism.tree import (
@@ -78,7 +77,7 @@ def assert_assembled(theta: FloatArray, branch: AssemblyMode, g: Geometry) -> No
 
 
 @examples(40, oracle.geometries(), oracle.seeds())
-def test_joint_angles_close_every_loop_and_place_the_platform(g: Geometry, seed: int) -> None:
+def test_joint_angles_close_every_loop_and_place_the_platform(g, seed):
     solutions = inverse_all(oracle.reachable_points(np.random.default_rng(seed), 1, g), g)
     for theta in solutions.theta[solutions.valid][:4]:
         for branch in ASSEMBLY_MODES:
@@ -87,13 +86,13 @@ def test_joint_angles_close_every_loop_and_place_the_platform(g: Geometry, seed:
                 assert_assembled(theta, branch, g)
 
 
-def test_every_link_of_figure_1_is_there_and_nothing_else() -> None:
+def test_every_link_of_figure_1_is_there_and_nothing_else():
     bodies = [name for names in FIG_1.values() for name in names]
     assert sorted(link.name for link in build().links) == sorted(bodies + UNIVERSAL_CROSSES + TOOL)
 
 
 @examples(20, oracle.geometries())
-def test_inertias_of_moving_links_are_along_their_axes(g: Geometry) -> None:
+def test_inertias_of_moving_links_are_along_their_axes(g):
     for link in build(g).links[1:]:
         assert link.mass > 0
         # The URDF gives no rotation of the inertial frame.
@@ -101,7 +100,7 @@ def test_inertias_of_moving_links_are_along_their_axes(g: Geometry) -> None:
         assert np.abs(off_diagonal).max() <= 1e-12
 
 
-def test_legs_part_the_links_and_every_closure_joins_two_of_them() -> None:
+def test_legs_part_the_links_and_every_closure_joins_two_of_them():
     # What makes the direct solver exact: no closure has both ends in one multibody.
     mechanism = build()
     legs = mechanism.legs()
@@ -122,7 +121,7 @@ def test_legs_part_the_links_and_every_closure_joins_two_of_them() -> None:
 
 
 @each_machine
-def test_only_the_three_motors_drive_and_none_meets_its_stops_in_the_region(machine: TPM) -> None:
+def test_only_the_three_motors_drive_and_none_meets_its_stops_in_the_region(machine):
     grid = oracle.grid(machine.region.low, machine.region.high, (9, 9, 9)).reshape(-1, 3)
     theta = np.array([machine.inverse((x, y, z)) for x, y, z in grid.tolist()])
     joints = {link.joint.name: link.joint for link in machine.mechanism.links if link.joint}
@@ -142,9 +141,7 @@ def test_only_the_three_motors_drive_and_none_meets_its_stops_in_the_region(mach
 
 
 @each_machine
-def test_the_cup_is_under_point_p_slides_back_along_its_axis_and_alone_collides(
-    machine: TPM,
-) -> None:
+def test_the_cup_is_under_point_p_slides_back_along_its_axis_and_alone_collides(machine):
     mechanism = machine.mechanism
     rest = machine.joint_positions(machine.inverse(machine.home))
     joint = mechanism.link(mechanism.tool).joint
@@ -166,9 +163,7 @@ def test_the_cup_is_under_point_p_slides_back_along_its_axis_and_alone_collides(
 @examples(4, oracle.geometries(), oracle.seeds())
 @example(PAPER, 1)
 @example(WIDE, 1)
-def test_rotated_joint_angles_close_every_loop_and_turn_the_platform(
-    g: Geometry, seed: int
-) -> None:
+def test_rotated_joint_angles_close_every_loop_and_turn_the_platform(g, seed):
     mechanism = build(g)
     for theta in np.random.default_rng(seed).uniform(-np.pi, np.pi, (20, 3)):
         found = forward_rotated(theta, g)

@@ -1,7 +1,6 @@
 """The files in urdf/ are what the mechanism's data give, number by number."""
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
@@ -34,16 +33,16 @@ def parsed(mechanism: Mechanism) -> ElementTree.Element:
 
 
 @pytest.fixture(params=[PAPER, OTHER], ids=["paper", "other"])
-def mechanism(request: pytest.FixtureRequest) -> Mechanism:
+def mechanism(request):
     return build(request.param)
 
 
-def test_regenerating_gives_the_shipped_files_byte_for_byte(tmp_path: Path) -> None:
+def test_regenerating_gives_the_shipped_files_byte_for_byte(tmp_path):
     for path in write(tmp_path / "new"):
         assert path.read_bytes() == (FOLDER / path.name).read_bytes()
 
 
-def test_joints_have_the_limits_of_the_tree(mechanism: Mechanism) -> None:
+def test_joints_have_the_limits_of_the_tree(mechanism):
     """All else of the joints and links is tested by what Pinocchio makes of the file."""
     elements = {e.get("name"): e for e in parsed(mechanism).findall("joint")}
     for joint in (link.joint for link in mechanism.links if link.joint):
@@ -77,7 +76,7 @@ def assert_same_solid(element: ElementTree.Element, solid: Any) -> None:
         assert found == pytest.approx(solid.size[:2], **DIGITS)
 
 
-def test_solids_are_drawn_as_they_are_and_collide_where_they_should(mechanism: Mechanism) -> None:
+def test_solids_are_drawn_as_they_are_and_collide_where_they_should(mechanism):
     root, used = parsed(mechanism), set()
     for element, link in zip(root.findall("link"), mechanism.links, strict=True):
         for visual, solid in zip(element.findall("visual"), link.solids, strict=True):
@@ -96,5 +95,5 @@ def test_solids_are_drawn_as_they_are_and_collide_where_they_should(mechanism: M
     assert found == COLOURS
 
 
-def test_no_number_is_a_negative_zero(mechanism: Mechanism) -> None:
+def test_no_number_is_a_negative_zero(mechanism):
     assert "-0" not in urdf_text(mechanism, closure_frames=True).replace('"', " ").split()

@@ -15,7 +15,6 @@ from policies_on_file import (
     DATA,
     TEXT,
     WEIGHTS,
-    Weights,
     box,
     described,
     observations,
@@ -32,7 +31,7 @@ from tpm_gym.policy.policy import Policy, load_policy
 
 
 @pytest.fixture(scope="module")
-def intact(tmp_path_factory: pytest.TempPathFactory) -> Policy:
+def intact(tmp_path_factory):
     return load_policy(write(tmp_path_factory.mktemp("intact")))
 
 
@@ -48,7 +47,7 @@ def still_loads(intact: Policy, text: bytes, data: bytes) -> bool:
     return True
 
 
-def test_every_character_of_the_json_counts_but_blanks(intact: Policy) -> None:
+def test_every_character_of_the_json_counts_but_blanks(intact):
     for place in range(len(TEXT)):
         text = bytearray(TEXT)
         text[place] ^= 1
@@ -57,23 +56,21 @@ def test_every_character_of_the_json_counts_but_blanks(intact: Policy) -> None:
 
 @settings(max_examples=200, deadline=None)
 @given(part=st.floats(0, 1, exclude_max=True), more=st.binary(min_size=1, max_size=100))
-def test_files_cut_off_anywhere_or_followed_by_anything_are_refused(
-    intact: Policy, part: float, more: bytes
-) -> None:
+def test_files_cut_off_anywhere_or_followed_by_anything_are_refused(intact, part, more):
     assert not still_loads(intact, TEXT[: int(part * len(TEXT))], DATA)
     assert not still_loads(intact, TEXT, DATA[: int(part * len(DATA))])
     assert not still_loads(intact, TEXT, DATA + more)
     still_loads(intact, TEXT + more, DATA)  # it may be blanks
 
 
-def test_weights_of_another_policy_are_refused(tmp_path: Path) -> None:
+def test_weights_of_another_policy_are_refused(tmp_path):
     changed = {name: values + 1 for name, values in WEIGHTS.items()}
     with pytest.raises(PolicyFileError, match="not that in the JSON"):
         load_policy(write_raw(tmp_path, TEXT, safetensors.numpy.save(changed)))
 
 
 @pytest.mark.parametrize("name", ["p.json", "p.safetensors"])
-def test_a_file_of_a_terabyte_is_refused_before_it_is_read(tmp_path: Path, name: str) -> None:
+def test_a_file_of_a_terabyte_is_refused_before_it_is_read(tmp_path, name):
     write(tmp_path)
     with (tmp_path / name).open("r+b") as file:
         file.truncate(1 << 40)  # sparse: it takes no room
@@ -88,7 +85,7 @@ def put(path: Sequence[Any], value: Any) -> dict[str, Any]:
     """Return the JSON with one entry replaced or added."""
     content = described(DATA)
     *parents, last = path
-    place: Any = content
+    place = content
     for key in parents:
         place = place[key]
     place[last] = value
@@ -118,7 +115,7 @@ def put(path: Sequence[Any], value: Any) -> dict[str, Any]:
         ("weights.file", "/etc/passwd"),
     ],
 )
-def test_entries_that_cannot_be_are_refused(tmp_path: Path, path: str, value: Any) -> None:
+def test_entries_that_cannot_be_are_refused(tmp_path, path, value):
     with pytest.raises(PolicyFileError, match="is not a policy file: ") as caught:
         load_policy(write(tmp_path, put(path.split("."), value)))
     assert caught.value.path.startswith(str(tmp_path / "p"))
@@ -126,7 +123,7 @@ def test_entries_that_cannot_be_are_refused(tmp_path: Path, path: str, value: An
     assert len(caught.value.reason) < 1000
 
 
-def test_no_entry_may_be_missing(tmp_path: Path) -> None:
+def test_no_entry_may_be_missing(tmp_path):
     for key in set(described(DATA)) - {"env_options"}:
         content = described(DATA)
         del content[key]
@@ -154,12 +151,12 @@ def test_no_entry_may_be_missing(tmp_path: Path) -> None:
     ],
     ids=lambda text: ascii(text[:20]),
 )
-def test_json_that_describes_no_policy_is_refused(tmp_path: Path, text: bytes) -> None:
+def test_json_that_describes_no_policy_is_refused(tmp_path, text):
     with pytest.raises(PolicyFileError, match="is not a policy file: "):
         load_policy(write_raw(tmp_path, text))
 
 
-def test_the_layout_of_the_json_does_not_matter(tmp_path: Path) -> None:
+def test_the_layout_of_the_json_does_not_matter(tmp_path):
     intact = load_policy(write(tmp_path))
     content = json.loads(TEXT)
     text = json.dumps(dict(reversed(content.items())), separators=(",", ":"))
@@ -177,9 +174,7 @@ def test_the_layout_of_the_json_does_not_matter(tmp_path: Path) -> None:
         ({"layers.2.bias": np.array([0, -np.inf], np.float32)}, "finite float32"),
     ],
 )
-def test_tensors_are_exactly_those_of_the_network(
-    tmp_path: Path, changes: Weights, message: str
-) -> None:
+def test_tensors_are_exactly_those_of_the_network(tmp_path, changes, message):
     tensors = {name: values for name, values in (WEIGHTS | changes).items() if values is not None}
     data = safetensors.numpy.save(tensors)
     with pytest.raises(PolicyFileError, match=message):
@@ -206,9 +201,7 @@ def assert_refused_or_a_policy(content: dict[str, Any], data: bytes) -> None:
     ),
     header_only=st.booleans(),
 )
-def test_weights_of_an_ill_willed_author_are_refused_or_finite(
-    changes: list[tuple[int, int]], header_only: bool
-) -> None:
+def test_weights_of_an_ill_willed_author_are_refused_or_finite(changes, header_only):
     data = bytearray(DATA)
     header = len(DATA) - 4 * sum(values.size for values in WEIGHTS.values())
     for place, value in changes:

@@ -36,7 +36,7 @@ from tpm_gym.errors import (
     PolicyFileError,
     PolicyMismatchError,
 )
-from tpm_gym.policy import Policy, load_policy
+from tpm_gym.policy import load_policy
 from tpm_gym.resources import POLICIES as PUBLISHED
 
 
@@ -54,14 +54,14 @@ def reference(
 
 
 @pytest.fixture
-def policy(tmp_path: Path) -> Policy:
+def policy(tmp_path):
     return load_policy(write(tmp_path))
 
 
 # -- acting ----------------------------------------------------------------------------------------
 
 
-def test_the_action_is_what_the_layers_say(policy: Policy) -> None:
+def test_the_action_is_what_the_layers_say(policy):
     batch = observations(50)
     expected = np.tanh(reference(batch, WEIGHTS, lambda x: np.maximum(x, 0)))
     np.testing.assert_allclose(policy.act(batch), expected, atol=1e-5)
@@ -74,7 +74,7 @@ def test_the_action_is_what_the_layers_say(policy: Policy) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in PUBLISHED.glob("*.safetensors")))
-def test_actions_are_those_of_torch_and_the_same_bits_alone_and_in_a_batch(name: str) -> None:
+def test_actions_are_those_of_torch_and_the_same_bits_alone_and_in_a_batch(name):
     policy = load_policy(name)
     network, space = policy.description.network, policy.description.observation_space
     weights = safetensors.torch.load_file(PUBLISHED / f"{name}.safetensors")
@@ -98,7 +98,7 @@ def test_actions_are_those_of_torch_and_the_same_bits_alone_and_in_a_batch(name:
         np.testing.assert_array_equal(one, actions[i])
 
 
-def test_a_tanh_output_fills_uneven_bounds(tmp_path: Path) -> None:
+def test_a_tanh_output_fills_uneven_bounds(tmp_path):
     content = described(DATA)
     content["action_space"] |= {"low": [-1.0, 2.0], "high": [3.0, 10.0], "dtype": "float64"}
     batch = observations(50)
@@ -109,7 +109,7 @@ def test_a_tanh_output_fills_uneven_bounds(tmp_path: Path) -> None:
 
 
 @pytest.mark.filterwarnings("error")
-def test_a_network_that_overflows_gives_no_action(tmp_path: Path) -> None:
+def test_a_network_that_overflows_gives_no_action(tmp_path):
     sizes = (7, *[2] * 12, 2)
     weights = {name: np.full_like(values, 3e38) for name, values in some_weights(sizes).items()}
     weights["layers.0.weight"] *= 0.0
@@ -122,7 +122,7 @@ def test_a_network_that_overflows_gives_no_action(tmp_path: Path) -> None:
         policy.act(observations(4))
 
 
-def test_joined_entries_come_in_the_order_on_file(tmp_path: Path) -> None:
+def test_joined_entries_come_in_the_order_on_file(tmp_path):
     weights = some_weights((10, 2))
     data = safetensors.numpy.save(weights)
     batch = observations(9)
@@ -152,20 +152,18 @@ def test_joined_entries_come_in_the_order_on_file(tmp_path: Path) -> None:
         ({"extra": np.zeros(3)}, "keys achieved_goal, desired_goal, observation"),
     ],
 )
-def test_observations_that_do_not_fit_are_named(
-    policy: Policy, changes: dict[str, Any], message: str
-) -> None:
+def test_observations_that_do_not_fit_are_named(policy, changes, message):
     one: dict[str, Any] = {key: values[0] for key, values in observations(1).items()}
     with pytest.raises(InputError, match=message):
         policy.act(one | changes)
     with pytest.raises(InputError, match="a mapping"):
-        policy.act(np.zeros(4))  # type: ignore[arg-type]
+        policy.act(np.zeros(4))
 
 
 # -- environments ----------------------------------------------------------------------------------
 
 
-def test_an_environment_of_another_kind_is_refused(policy: Policy) -> None:
+def test_an_environment_of_another_kind_is_refused(policy):
     fits = SimpleNamespace(
         observation_space=policy.description.observation_space,
         action_space=spaces.Box(-1.0, 1.0, (2,)),
@@ -180,7 +178,7 @@ def test_an_environment_of_another_kind_is_refused(policy: Policy) -> None:
         policy.check(other)
 
 
-def test_joint_increments_are_no_cartesian_ones() -> None:
+def test_joint_increments_are_no_cartesian_ones():
     """Their spaces are equal."""
     policy = load_policy(PUBLISHED / "TPMPickAndPlaceJoints-v0.json")
     for env_id in ("TPMPickAndPlaceJoints-v0", "TPMPickAndPlaceJointsDense-v0"):
@@ -204,7 +202,7 @@ def test_joint_increments_are_no_cartesian_ones() -> None:
 
 
 @pytest.mark.parametrize("name", ["v1.2.json", "v1.2.safetensors", "v1.2"])
-def test_a_policy_is_named_by_either_file_or_by_both(tmp_path: Path, name: str) -> None:
+def test_a_policy_is_named_by_either_file_or_by_both(tmp_path, name):
     path = write(tmp_path)
     path.rename(tmp_path / "v1.2.json")
     path.with_suffix(".safetensors").rename(tmp_path / "v1.2.safetensors")
@@ -212,10 +210,10 @@ def test_a_policy_is_named_by_either_file_or_by_both(tmp_path: Path, name: str) 
     assert tpm_gym.load_policy(str(tmp_path / name)).description.seed == 3
 
 
-def test_what_is_no_policy_is_named(tmp_path: Path) -> None:
+def test_what_is_no_policy_is_named(tmp_path):
     for name in (3, b"best.json", None, ""):
         with pytest.raises(InputError, match="path must be the str or Path of a policy, as in '"):
-            tpm_gym.load_policy(name)  # type: ignore[arg-type]
+            tpm_gym.load_policy(name)
     path = write(tmp_path)
     os.mkfifo(tmp_path / "pipe.json")  # not waited for
     for name, message in {
@@ -237,9 +235,7 @@ def test_what_is_no_policy_is_named(tmp_path: Path) -> None:
     assert caught.value.remedy
 
 
-def test_a_published_policy_is_named_by_its_environment(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_published_policy_is_named_by_its_environment(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for path in PUBLISHED.glob("*.safetensors"):
         found, wanted = tpm_gym.load_policy(path.stem), tpm_gym.load_policy(path)
@@ -257,7 +253,7 @@ def test_a_published_policy_is_named_by_its_environment(
 # -- what loading needs, and what it leaves alone --------------------------------------------------
 
 
-def test_loading_needs_neither_torch_nor_an_engine(tmp_path: Path) -> None:
+def test_loading_needs_neither_torch_nor_an_engine(tmp_path):
     path = write(tmp_path)
     one = {key: values[0].tolist() for key, values in observations(1).items()}
     code = (
@@ -270,7 +266,7 @@ def test_loading_needs_neither_torch_nor_an_engine(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("package", ["safetensors", "pydantic"])
-def test_a_missing_package_is_named_with_its_remedy(tmp_path: Path, package: str) -> None:
+def test_a_missing_package_is_named_with_its_remedy(tmp_path, package):
     path = write(tmp_path)
     code = (
         f"import sys, tpm_gym; sys.modules[{package!r}] = None\n"
@@ -284,7 +280,7 @@ def test_a_missing_package_is_named_with_its_remedy(tmp_path: Path, package: str
     assert "pip install 'tpm-gym[policy]'" in printed
 
 
-def test_nothing_is_unpickled_or_evaluated(tmp_path: Path) -> None:
+def test_nothing_is_unpickled_or_evaluated(tmp_path):
     """In a process of its own, where every way to run what a file says raises."""
     code = (
         "import builtins, pickle, _pickle, marshal, numpy, tpm_gym.policy.policy\n"

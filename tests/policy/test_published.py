@@ -22,12 +22,12 @@ def evaluation(name: str) -> dict[str, Any]:
     return content
 
 
-def test_all_that_are_promised_are_there() -> None:
+def test_all_that_are_promised_are_there():
     assert set(NAMES) >= set(PROMISED)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_evaluation_is_of_this_policy_on_held_out_episodes(name: str) -> None:
+def test_the_evaluation_is_of_this_policy_on_held_out_episodes(name):
     content = evaluation(name)
     trained_in = tpm_gym.load_policy(POLICIES / name).description.env_id
     assert content["env"] == name == trained_in.replace("Dense", "")  # for the same spaces
@@ -38,7 +38,7 @@ def test_the_evaluation_is_of_this_policy_on_held_out_episodes(name: str) -> Non
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_its_episodes_repeat(name: str) -> None:
+def test_its_episodes_repeat(name):
     content = evaluation(name)
     with closing(make_envs(name, 1)) as envs:
         policy = policies.load_policy(str(POLICIES / f"{name}.json"), envs)
@@ -52,7 +52,7 @@ def test_its_episodes_repeat(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if "Pick" in name])
-def test_its_motors_need_the_same_torque_in_both_engines(name: str) -> None:
+def test_its_motors_need_the_same_torque_in_both_engines(name):
     torques = []
     for engine in ("pybullet", "mujoco"):
         with closing(make_envs(name, 1, engine=engine)) as envs:

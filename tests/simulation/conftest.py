@@ -7,12 +7,12 @@ from tpm_gym.simulation import Block, Scene
 
 
 @pytest.fixture
-def simulation() -> Alone:
+def simulation():
     """The paper's machine over an empty table."""
     return Alone()
 
 
 @pytest.fixture
-def with_block() -> Alone:
+def with_block():
     """The same with a block."""
     return Alone(Scene(objects=(Block(),)))

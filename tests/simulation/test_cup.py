@@ -1,7 +1,8 @@
 """The vacuum cup takes, holds, lets go, and never presses harder than its spring."""
 
-from __future__ import annotations
-
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -62,37 +63,28 @@ def holding(engine: str, **options: Any) -> Alone:
     return simulation
 
 
-class Record:
+@contextmanager
+def recorded(simulation: Alone) -> Iterator[SimpleNamespace]:
     """Force of the cup on the block (N, downwards), slide and height of the block, each time step.
 
     The force is known when a time step is solved, the rest when it has ended.
     """
+    seen = SimpleNamespace(forces=[], slides=[], heights=[])
 
-    def __init__(self, simulation: Alone) -> None:
-        self.forces: list[float] = []
-        self.slides: list[float] = []
-        self.heights: list[float] = []
-        self.around = around_each_step(
-            simulation,
-            solved=lambda: self.forces.append(-from_cup(simulation)[2]),
-            after=lambda: (
-                self.slides.append(slide(simulation)),
-                self.heights.append(place_of(simulation)[2]),
-            ),
-        )
+    def after() -> None:
+        seen.slides.append(slide(simulation))
+        seen.heights.append(place_of(simulation)[2])
 
-    def __enter__(self) -> Record:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.around.close()
+    solved = lambda: seen.forces.append(-from_cup(simulation)[2])  # noqa: E731
+    with around_each_step(simulation, solved=solved, after=after):
+        yield seen
 
 
 # -- taken, held, let go ---------------------------------------------------------------------------
 
 
 @each_engine
-def test_it_takes_what_it_touches_lifts_it_and_lets_go(engine: str) -> None:
+def test_it_takes_what_it_touches_lifts_it_and_lets_go(engine):
     simulation = start(engine)
     assert go(simulation, 0.04, 3, vacuum=True).held == -1  # 10 mm above: nothing to suck on
     assert go(simulation, 0.03, 4, vacuum=True).held == 0
@@ -108,9 +100,7 @@ def test_it_takes_what_it_touches_lifts_it_and_lets_go(engine: str) -> None:
 
 @each_engine
 @pytest.mark.parametrize("pressed", [False, True])
-def test_the_block_jumps_neither_when_it_is_taken_nor_when_it_is_let_go(
-    engine: str, pressed: bool
-) -> None:
+def test_the_block_jumps_neither_when_it_is_taken_nor_when_it_is_let_go(engine, pressed):
     simulation = start(engine, offset=(0.006, 0.004))
     before = go(simulation, 0.025 if pressed else 0.031, 4, vacuum=not pressed)
     after = go(simulation, 0.025 if pressed else 0.031, 3, vacuum=True)
@@ -123,7 +113,7 @@ def test_the_block_jumps_neither_when_it_is_taken_nor_when_it_is_let_go(
 
 
 @each_engine
-def test_a_held_block_stays_put_at_full_speed(engine: str) -> None:
+def test_a_held_block_stays_put_at_full_speed(engine):
     simulation = holding(engine)
     state = simulation.read()
     grip, point = state.object_position - state.platform_position, level(0.07)
@@ -137,7 +127,7 @@ def test_a_held_block_stays_put_at_full_speed(engine: str) -> None:
 
 
 @each_engine
-def test_a_held_block_pressed_on_the_table_stays_held(engine: str) -> None:
+def test_a_held_block_pressed_on_the_table_stays_held(engine):
     simulation = holding(engine)
     for height in np.arange(0.06, 0.012, -0.006):
         assert go(simulation, height, 1, vacuum=True).held == 0
@@ -148,11 +138,11 @@ def test_a_held_block_pressed_on_the_table_stays_held(engine: str) -> None:
 
 
 @inside_engines
-def test_in_the_air_it_falls_from_rest(engine: str) -> None:
+def test_in_the_air_it_falls_from_rest(engine):
     simulation, speeds = holding(engine), list[float]()
     step = simulation.engine.time_step
 
-    def note() -> None:
+    def note():
         speeds.append(simulation.engine.read().object_velocity[0, 0, 2])
 
     with around_each_step(simulation, after=note):
@@ -175,13 +165,11 @@ def test_in_the_air_it_falls_from_rest(engine: str) -> None:
         ((-1, 1, -1), 1.0),
     ],
 )
-def test_a_held_block_comes_off_at_the_pull_off_force(
-    engine: str, direction: Any, mass: float
-) -> None:
+def test_a_held_block_comes_off_at_the_pull_off_force(engine, direction, mass):
     simulation, load = holding(engine, mass=mass), 11.5
     along, weight = direction / np.linalg.norm(direction), np.array((0, 0, -mass * G))
 
-    def pull() -> None:
+    def pull():
         nonlocal load
         if simulation.engine._cup.grip.hold.which == 0:
             load += 0.002  # N a time step
@@ -195,7 +183,7 @@ def test_a_held_block_comes_off_at_the_pull_off_force(
 
 @each_engine
 @pytest.mark.parametrize(("mass", "kept"), [(0.2, True), (0.3, False)])
-def test_who_pulls_too_hard_loses_the_block(engine: str, mass: float, kept: bool) -> None:
+def test_who_pulls_too_hard_loses_the_block(engine, mass, kept):
     # Down at full speed and up again: 37.5 m/s^2 and the weight are 9.5 N, and 14.2 N.
     simulation = holding(engine, plant=Plant(block_mass=mass / Block().mass))
     for height in np.arange(0.07, 0.25, 0.012):
@@ -211,7 +199,7 @@ def test_who_pulls_too_hard_loses_the_block(engine: str, mass: float, kept: bool
 
 @each_engine
 @pytest.mark.parametrize("steps", [1, 3, 5])
-def test_a_moment_of_any_pressure_is_gone_back_to_exactly(engine: str, steps: int) -> None:
+def test_a_moment_of_any_pressure_is_gone_back_to_exactly(engine, steps):
     simulation = start(engine, height=0.0315)
     course = (True, True, False, True, True, True)
     for index, vacuum in enumerate(course):
@@ -227,7 +215,7 @@ def test_a_moment_of_any_pressure_is_gone_back_to_exactly(engine: str, steps: in
 
 
 @each_engine
-def test_a_reset_while_holding_lets_go(engine: str) -> None:
+def test_a_reset_while_holding_lets_go(engine):
     simulation = holding(engine)
     state = simulation.reset(PAPER_TPM.inverse(level(0.1)), {"object": (0.0, -0.03, 0.015)})
     assert (state.held, state.vacuum) == (-1, 0)
@@ -241,11 +229,9 @@ def test_a_reset_while_holding_lets_go(engine: str) -> None:
 @inside_engines
 @pytest.mark.parametrize("speed", [0.005, 0.03])  # m a control period; the second is full speed
 @pytest.mark.parametrize("offset", [(0.0, 0.0), (0.012, 0.012)])
-def test_the_cup_yields_to_the_block_at_its_preload_and_comes_out_again(
-    engine: str, speed: float, offset: Any
-) -> None:
+def test_the_cup_yields_to_the_block_at_its_preload_and_comes_out_again(engine, speed, offset):
     simulation = start(engine, height=0.06, offset=offset)
-    with Record(simulation) as seen:
+    with recorded(simulation) as seen:
         for height in np.arange(0.06, 0.012, -speed):
             simulation.move(level(height))
         state = go(simulation, 0.012, 10, vacuum=False)  # 18 mm below the top of the block
@@ -263,7 +249,7 @@ def test_the_cup_yields_to_the_block_at_its_preload_and_comes_out_again(
     assert np.allclose(state.object_quaternion, (0, 0, 0, 1), atol=1e-3)
     assert state.closure_error < 1e-5
     before = state.object_position
-    with Record(simulation) as seen:
+    with recorded(simulation) as seen:
         state = go(simulation, 0.06, 10, vacuum=False)
     assert state.held == -1  # without vacuum
     assert seen.forces[-1] == 0
@@ -272,16 +258,16 @@ def test_the_cup_yields_to_the_block_at_its_preload_and_comes_out_again(
 
 
 @inside_engines
-def test_the_cup_stays_out_in_free_motion_at_full_speed(engine: str) -> None:
+def test_the_cup_stays_out_in_free_motion_at_full_speed(engine):
     simulation = start(engine, height=0.2)
-    with Record(simulation) as seen:
+    with recorded(simulation) as seen:
         for height in 0.2 + 0.03 * np.cumsum((1, 1, -1, -1, -1, 1, -1, 1, 1)):
             simulation.move(level(height))
     assert np.abs(seen.slides).max() < 1e-5
 
 
 @inside_engines
-def test_beyond_its_stroke_the_cup_stops_and_the_block_holds(engine: str) -> None:
+def test_beyond_its_stroke_the_cup_stops_and_the_block_holds(engine):
     simulation = start(engine)
     state = go(simulation, 0.006, 12, vacuum=False)  # 24 mm below the top, 4 mm beyond the stroke
     # In MuJoCo the motors are at their limit.
@@ -291,7 +277,7 @@ def test_beyond_its_stroke_the_cup_stops_and_the_block_holds(engine: str) -> Non
 
 
 @inside_engines
-def test_weld_and_contact_do_not_fight(engine: str) -> None:
+def test_weld_and_contact_do_not_fight(engine):
     simulation, loads = start(engine, height=0.09), list[Any]()
     for height in (0.06, 0.03, 0.012):  # at full speed: half a millimetre into the block
         go(simulation, height, 1, vacuum=False)
@@ -300,7 +286,7 @@ def test_weld_and_contact_do_not_fight(engine: str) -> None:
     assert state.vacuum == pytest.approx(CUP.vacuum, rel=1e-2)
     engine_load = "_load" if engine == "pybullet" else "load"
     note = lambda: loads.append(getattr(simulation.engine._cup, engine_load)())  # noqa: E731
-    with Record(simulation) as seen, around_each_step(simulation, solved=note):
+    with recorded(simulation) as seen, around_each_step(simulation, solved=note):
         # Pressed on the table, taken off it, and at rest.
         for height in (0.012, 0.02, 0.03, 0.03, 0.045, 0.06, 0.06, 0.06, 0.06, 0.06):
             assert go(simulation, height, 1, vacuum=True).held == 0

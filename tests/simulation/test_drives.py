@@ -1,7 +1,5 @@
 """Servo drives: stated stiffness, honest time steps, limits that bite, and what they carry."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import asdict, replace
@@ -18,12 +16,11 @@ from machines import anywhere, each_machine
 from tpm_gym import TPMEnv
 from tpm_gym.arrays import FloatArray, Vector
 from tpm_gym.errors import ConfigurationError
-from tpm_gym.mechanism import PAPER_TPM, TPM, Machine, tree
+from tpm_gym.mechanism import PAPER_TPM, Machine, tree
 from tpm_gym.mechanism.motor import TORQUE_MOTOR
 from tpm_gym.simulation import Plant, Scene, Servo
 from tpm_gym.simulation.compiled import limited
 from tpm_gym.simulation.drives import References, drive_of
-from tpm_gym.simulation.engine import Path
 from tpm_gym.simulation.state import CONTROL_PERIOD
 
 HOME = PAPER_TPM.home
@@ -58,7 +55,7 @@ def watched(simulation: Alone) -> list[tuple[Any, Vector]]:
 
 def hold(simulation: Alone, theta: FloatArray, torque: Vector = REST, periods: int = 1) -> None:
     """Let the servos' references jump to theta and stay there for some control periods."""
-    engine: Any = simulation.engine
+    engine = simulation.engine
     steps = engine.physics.substeps
     constant = References(*(np.tile(v, (steps, 1, 1)) for v in (theta, np.zeros(3), torque)))
     with patch.object(engine._drives, "references", lambda path: constant):
@@ -84,13 +81,13 @@ def hold(simulation: Alone, theta: FloatArray, torque: Vector = REST, periods: i
         ({"feedforward": ["none"]}, "feedforward"),
     ],
 )
-def test_what_is_no_drive_is_refused_by_name(value: Any, name: str) -> None:
+def test_what_is_no_drive_is_refused_by_name(value, name):
     with pytest.raises(ConfigurationError) as caught:
         TPMEnv(drive=value)
     assert caught.value.name == name
 
 
-def test_a_drive_has_many_names() -> None:
+def test_a_drive_has_many_names():
     for value, drive in (
         (None, None),
         ("ideal", None),
@@ -104,7 +101,7 @@ def test_a_drive_has_many_names() -> None:
 
 
 @pytest.mark.parametrize(("name", "value"), [("servo_stiffness", 0.5), ("joint_friction", (0, 1))])
-def test_ideal_drives_refuse_what_only_servos_have_and_say_so(name: str, value: Any) -> None:
+def test_ideal_drives_refuse_what_only_servos_have_and_say_so(name, value):
     with pytest.raises(ConfigurationError, match="drive='servo'") as caught:
         TPMEnv(randomisation={name: value})
     assert caught.value.name == name
@@ -121,7 +118,7 @@ def test_ideal_drives_refuse_what_only_servos_have_and_say_so(name: str, value: 
 
 @each_machine
 @pytest.mark.parametrize("force", [(20.0, 0.0, 0.0), (0.0, 3.0, 0.0), (-5.0, 2.0, 15.0)])
-def test_any_load_turns_a_motor_by_torque_over_stiffness(machine: TPM, force: Vector) -> None:
+def test_any_load_turns_a_motor_by_torque_over_stiffness(machine, force):
     # Also a load that is in no model, and after time steps in which the law cannot know it.
     simulation, home = simulation_of(HELD, machine), machine.inverse(machine.home)
     simulation.reset(home)
@@ -135,7 +132,7 @@ def test_any_load_turns_a_motor_by_torque_over_stiffness(machine: TPM, force: Ve
 
 
 @pytest.mark.parametrize("feedforward", ["none", "gravity", "computed"])
-def test_what_is_fed_forward_need_not_turn_the_motors(feedforward: str) -> None:
+def test_what_is_fed_forward_need_not_turn_the_motors(feedforward):
     servo = Servo(feedforward=feedforward)
     simulation = simulation_of(servo)
     simulation.reset(THETA)
@@ -169,8 +166,8 @@ def step_response(servo: Servo, substeps: int) -> tuple[FloatArray, FloatArray]:
 @pytest.mark.parametrize("substeps", [10, 40])
 @pytest.mark.parametrize("servo", [HELD, Servo(30_000.0, 60.0, "gravity")])
 def test_motion_is_that_of_springs_and_dampers_integrated_by_eulers_backward_method(
-    servo: Servo, substeps: int
-) -> None:
+    servo, substeps
+):
     found, expected = step_response(servo, substeps)
     assert np.abs(expected).max() > 1.5e-4
     np.testing.assert_allclose(found, expected, atol=2e-6)  # 0.02 of the smallest jump
@@ -178,7 +175,7 @@ def test_motion_is_that_of_springs_and_dampers_integrated_by_eulers_backward_met
 
 @pytest.mark.parametrize("masses", [0.5, 1.0, 2.0])
 @pytest.mark.parametrize("stiffness", [1e3, 1e5, 1e7])
-def test_it_is_stable_at_any_stiffness_and_mass(stiffness: float, masses: float) -> None:
+def test_it_is_stable_at_any_stiffness_and_mass(stiffness, masses):
     simulation = simulation_of(Servo(stiffness, 60.0))
     plant = Plant(link_masses=(masses,) * (len(PAPER_TPM.mechanism.links) - 1))
     simulation.reset(THETA, plant=plant)
@@ -190,7 +187,7 @@ def test_it_is_stable_at_any_stiffness_and_mass(stiffness: float, masses: float)
     np.testing.assert_allclose(state.theta, PAPER_TPM.inverse(command), atol=10 / stiffness)
 
 
-def test_springs_and_dampers_give_nothing_that_was_not_put_in() -> None:
+def test_springs_and_dampers_give_nothing_that_was_not_put_in():
     servo, dynamics = Servo(feedforward="none"), PAPER_TPM.dynamics
     simulation = simulation_of(servo)
     simulation.reset(THETA)
@@ -205,7 +202,7 @@ def test_springs_and_dampers_give_nothing_that_was_not_put_in() -> None:
     assert np.diff(total).max() < 1e-3 * (total[0] - total[-1])
 
 
-def test_the_defaults_are_a_good_direct_drives_on_the_lightest_motion() -> None:
+def test_the_defaults_are_a_good_direct_drives_on_the_lightest_motion():
     # Lightest motions of 2000 postures all over the region: 0.097 to 0.125 kg m^2.
     for point in anywhere(PAPER_TPM, 50):
         lightest = np.linalg.eigvalsh(mass_matrix(PAPER_TPM.inverse(point)))[0]
@@ -214,7 +211,7 @@ def test_the_defaults_are_a_good_direct_drives_on_the_lightest_motion() -> None:
         assert 0.9 < Servo().damping / (2 * speed * lightest) < 1.2
 
 
-def test_the_datasheet_tells_the_defaults() -> None:
+def test_the_datasheet_tells_the_defaults():
     text = " ".join((TPMEnv.__doc__ or "").split())
     assert f"{Servo().stiffness:g} N m/rad, {Servo().damping:g} N m s/rad" in text
     assert f"{TORQUE_MOTOR.peak_torque:g} N m up to {TORQUE_MOTOR.corner_speed:g} rad/s" in text
@@ -230,9 +227,7 @@ def test_the_datasheet_tells_the_defaults() -> None:
     [(0.0, 1.0), (15.0, 1.0), (20.0, 0.5), (24.0, 0.1), (25.0, 0.0), (40.0, 0.0),
      (-5.0, 1.0), (-20.0, 1.0), (-40.0, 1.0)],
 )  # fmt: skip
-def test_torque_falls_from_the_corner_to_the_no_load_speed_and_brakes_in_full(
-    speed: float, share: float, sign: int
-) -> None:
+def test_torque_falls_from_the_corner_to_the_no_load_speed_and_brakes_in_full(speed, share, sign):
     for effort in (100.0, 50.0):  # a weak motor's line starts lower
         line = effort, 15.0, 25.0  # N m, rad/s
         given = limited(sign * 1e3, sign * speed, *line)
@@ -251,9 +246,7 @@ def over_the_line(seen: list[tuple[Any, Vector]], motor: Any, strength: float) -
 
 
 @pytest.mark.parametrize(("drive", "beyond"), [(None, True), (Servo(), False)])
-def test_a_slow_motor_keeps_to_its_line(
-    drive: Servo | None, beyond: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_slow_motor_keeps_to_its_line(drive, beyond, monkeypatch):
     # At 1 rad/s the corner, at 2 no torque is left; actions go up to 3 rad/s.
     slow = replace(TORQUE_MOTOR, no_load_speed=2.0, motor_constant=10.0)
     monkeypatch.setattr(tree, "TORQUE_MOTOR", slow)
@@ -271,7 +264,7 @@ def test_a_slow_motor_keeps_to_its_line(
 # -- friction, stiffness ---------------------------------------------------------------------------
 
 
-def test_friction_holds_up_to_its_torque_and_slows_by_it() -> None:
+def test_friction_holds_up_to_its_torque_and_slows_by_it():
     friction, way = 2.0, [(HOME[0] + 0.004 * k, HOME[1], HOME[2]) for k in range(12)]
     torques = []
     for plant in (Plant(), Plant(joint_friction=(friction,) * 3)):
@@ -289,7 +282,7 @@ def test_friction_holds_up_to_its_torque_and_slows_by_it() -> None:
     np.testing.assert_allclose(held.theta, THETA, atol=1e-6)  # it sticks
 
 
-def test_stiffness_is_each_drives_own() -> None:
+def test_stiffness_is_each_drives_own():
     factors = np.array((0.5, 1.0, 4.0))
     simulation = simulation_of(Servo(feedforward="none"))
     simulation.reset(THETA, plant=Plant(servo_stiffness=tuple(factors.tolist())))
@@ -307,10 +300,10 @@ def played(drive: Any, scripted: bool) -> Iterator[tuple[FloatArray, FloatArray]
     """Tracking errors (rad) and torques (N m) of all time steps of a few episodes."""
     with closing(TPMEnv("reach", drive=drive)) as env:
         env.reset(seed=0)
-        engine: Any = env.simulation.engine
+        engine = env.simulation.engine
         advance, wanted = engine.advance, []
 
-        def noted(path: Path, vacuum: bool) -> None:
+        def noted(path, vacuum):
             wanted.extend(path.joints()[0])
             advance(path, vacuum)
 
@@ -328,7 +321,7 @@ def played(drive: Any, scripted: bool) -> Iterator[tuple[FloatArray, FloatArray]
 
 
 @pytest.mark.parametrize("scripted", [True, False], ids=["expert", "random"])
-def test_tracking_and_effort(scripted: bool) -> None:
+def test_tracking_and_effort(scripted):
     # Of 40 episodes: 0.15 mrad and 10 N m (expert), 0.7 mrad and 43 N m (random).
     ((exact, ideal),) = played("ideal", scripted)
     ((errors, effort),) = played("servo", scripted)

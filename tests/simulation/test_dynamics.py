@@ -113,7 +113,7 @@ def total_energy(simulation: Alone) -> tuple[float, float]:
     [("pybullet", 1e-6), ("mujoco", 1e-4), ("analytic", 1e-6)],
 )
 @each_machine
-def test_torques_at_rest_carry_the_links(machine: Machine, engine: str, bound: float) -> None:
+def test_torques_at_rest_carry_the_links(machine, engine, bound):
     simulation, rng = Alone(Scene(), engine=engine, machine=machine), np.random.default_rng(1)
     for index, point in enumerate(anywhere(machine, 10)):
         theta, factors = machine.inverse(point), rng.uniform(0.5, 2.0, len(links(machine)))
@@ -131,9 +131,7 @@ def test_torques_at_rest_carry_the_links(machine: Machine, engine: str, bound: f
     [("pybullet", 1e-5), ("mujoco", 3e-3)],
 )
 @each_machine
-def test_a_force_on_the_platform_loads_the_motors_by_the_jacobian(
-    machine: Machine, engine: str, bound: float
-) -> None:
+def test_a_force_on_the_platform_loads_the_motors_by_the_jacobian(machine, engine, bound):
     simulation, force = Alone(Scene(), engine=engine, machine=machine), np.zeros(3)
     with around_each_step(simulation, before=lambda: push(simulation, machine.mount.rotate(force))):
         for point in anywhere(machine, 6, seed=2):
@@ -154,7 +152,7 @@ def test_a_force_on_the_platform_loads_the_motors_by_the_jacobian(
 
 
 @each_engine
-def test_ideal_motors_are_where_they_shall_be_at_the_end_of_every_time_step(engine: str) -> None:
+def test_ideal_motors_are_where_they_shall_be_at_the_end_of_every_time_step(engine):
     simulation, before = Alone(Scene(), engine=engine), THETA
     simulation.reset(THETA)
     for share in (1 - np.cos(np.linspace(0, np.pi, 100))) / 2:
@@ -169,7 +167,7 @@ def test_ideal_motors_are_where_they_shall_be_at_the_end_of_every_time_step(engi
 
 @each_engine
 @each_machine
-def test_released_it_accelerates_by_its_mass_matrix(machine: Machine, engine: str) -> None:
+def test_released_it_accelerates_by_its_mass_matrix(machine, engine):
     # Measured in PyBullet: 1e-5, and 3e-5 at y = 13 mm where M has rows 100 times as large as
     # others; in MuJoCo, whose loops yield, 1.4e-2.
     bound = 1e-3 if engine == "pybullet" else 2e-2
@@ -203,7 +201,7 @@ def lost_in_free_fall(point: Vector, time_step: float) -> float:
 
 
 @pytest.mark.parametrize("point", [(-0.04, 0.028, 0.67), (0.03, 0.04, 0.68), (-0.12, 0.02, 0.67)])
-def test_energy_is_conserved_up_to_the_integrator(point: Vector) -> None:
+def test_energy_is_conserved_up_to_the_integrator(point):
     # Measured: 2.6 to 2.9 % at 250 Hz and half of that at each half of the time step: first order,
     # so it is the integrator's (semi-implicit Euler), and vanishes with the time step.
     lost = [lost_in_free_fall(point, 1 / rate) for rate in (250, 500, 1000)]
@@ -214,10 +212,10 @@ def test_energy_is_conserved_up_to_the_integrator(point: Vector) -> None:
 def errors_of_velocity(time_step: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """At full speed: platform's speed, what J misses of its velocity, what differences miss."""
     simulation = Alone(Scene(), physics={"time_step": time_step})
-    engine: Any = simulation.engine
+    engine = simulation.engine
     rows = []
 
-    def note() -> None:
+    def note():
         theta, rates, _ = motors(simulation)
         state = engine.client.getLinkState(
             *engine.robot.links["platform"], computeLinkVelocity=True
@@ -243,7 +241,7 @@ def rms(values: FloatArray) -> float:
     return float(np.sqrt(np.square(values).mean()))
 
 
-def test_the_platform_moves_as_joint_rates_and_jacobian_say() -> None:
+def test_the_platform_moves_as_joint_rates_and_jacobian_say():
     # Measured at 250 Hz over 1000 steps: 0.5 % rms, 21 mm/s at worst (what the loops close again);
     # by differences of the position 0.25 % rms, 6 mm/s at worst. Both are first order.
     speed, by_rates, by_differences = errors_of_velocity(1 / 250)
@@ -280,7 +278,7 @@ def all_over(machine: Machine, count: int) -> list[FloatArray]:
 
 
 @each_machine
-def test_torques_of_a_motion_are_those_of_the_closed_form(machine: Machine) -> None:
+def test_torques_of_a_motion_are_those_of_the_closed_form(machine):
     # Measured at 250 Hz: smooth 0.016 and 0.12 %, full speed back and forth 1.9 and 0.5 % of the
     # torques, and half of that at each half of the time step.
     smooth, fast = all_over(machine, 75), list(excursions(machine, 60, seed=1))
@@ -296,7 +294,7 @@ def test_torques_of_a_motion_are_those_of_the_closed_form(machine: Machine) -> N
 @each_engine
 @pytest.mark.parametrize("motor", [0, 1, 2])
 @pytest.mark.parametrize("sign", [-1, 1])
-def test_a_motor_holds_its_effort_and_no_more(engine: str, motor: int, sign: int) -> None:
+def test_a_motor_holds_its_effort_and_no_more(engine, motor, sign):
     simulation, strength = Alone(Scene(), engine=engine), (0.5, 0.75, 1.5)
     effort = TORQUE_MOTOR.peak_torque * np.array(strength)
     j, load, force = jacobian(PAPER_TPM, THETA), weights(PAPER_TPM, THETA), np.zeros(3)
@@ -324,7 +322,7 @@ each_drive = pytest.mark.parametrize("drive", [None, Servo()], ids=["ideal", "se
 
 @each_drive
 @each_engine
-def test_motors_without_torque_let_the_arm_fall(engine: str, drive: Servo | None) -> None:
+def test_motors_without_torque_let_the_arm_fall(engine, drive):
     simulation = Alone(Scene(), engine=engine, drive=drive)
     before = simulation.reset(THETA, plant=NO_TORQUE)
     settle(simulation, HOME, 2)
@@ -335,7 +333,7 @@ def test_motors_without_torque_let_the_arm_fall(engine: str, drive: Servo | None
 
 @each_drive
 @each_engine
-def test_no_command_draws_more_than_the_motors_have(engine: str, drive: Servo | None) -> None:
+def test_no_command_draws_more_than_the_motors_have(engine, drive):
     simulation, drawn = Alone(Scene(), engine=engine, drive=drive), list[FloatArray]()
     simulation.reset(THETA, plant=Plant(motor_strength=(0.5, 0.5, 0.5)))
     with around_each_step(simulation, after=lambda: drawn.append(np.abs(torques(simulation)))):

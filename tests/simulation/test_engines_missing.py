@@ -20,7 +20,7 @@ def run(code: str) -> str:
     return done.stdout
 
 
-def test_the_default_engine_says_what_to_install_and_others_work_without() -> None:
+def test_the_default_engine_says_what_to_install_and_others_work_without():
     said, imported = run(
         """
         try:

@@ -3,8 +3,6 @@
 PyBullet's direct solver has a box by itself; its numbers are in brackets.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -78,15 +76,13 @@ def way_to_stop(simulation: Alone, speed: float, braking: float) -> float:
 @each_engine
 @pytest.mark.parametrize("factor", [0.5, 1.0])
 @pytest.mark.parametrize("degrees", DIRECTIONS)
-def test_what_slides_is_braked_by_mu_n_against_its_way(
-    engine: str, degrees: float, factor: float
-) -> None:
+def test_what_slides_is_braked_by_mu_n_against_its_way(engine, degrees, factor):
     # In PyBullet exact to rounding (box: 41%, 44 degrees off).
     simulation, rows = start(engine, BLOCK, plant=Plant(friction=factor)), list[Any]()
     begin, fast = place_of(simulation), 0.6 * math.sqrt(factor)
     throw(simulation, fast * unit(degrees))
 
-    def note() -> None:
+    def note():
         force = from_table(simulation)
         slip = velocity(simulation)[:2]
         if np.linalg.norm(slip) > 0.05:
@@ -107,19 +103,19 @@ def test_what_slides_is_braked_by_mu_n_against_its_way(
 @each_engine
 @pytest.mark.parametrize("factor", [0.5, 1.0])
 @pytest.mark.parametrize("degrees", DIRECTIONS)
-def test_what_rests_breaks_away_at_mu_n(engine: str, degrees: float, factor: float) -> None:
+def test_what_rests_breaks_away_at_mu_n(engine, degrees, factor):
     # In PyBullet 40 um away at 1.02 to 1.03 of mu N, which the growing load needs to get there; at
     # 0.94 to 0.99 along 22.5 degrees (box: up to 1.43).
     simulation = start(engine, BLOCK, places=[UNDER], plant=Plant(friction=factor))
     limit, share, begin = factor * BLOCK.friction * BLOCK.mass * G, 0.0, place_of(simulation)
     gone: list[float] = []
 
-    def pull() -> None:
+    def pull():
         nonlocal share
         share += 0.002
         push(simulation, share * limit * unit(degrees), 0)
 
-    def note() -> None:
+    def note():
         gone.append(math.hypot(*(place_of(simulation) - begin)[:2]))
 
     with around_each_step(simulation, before=pull, after=note):
@@ -129,19 +125,17 @@ def test_what_rests_breaks_away_at_mu_n(engine: str, degrees: float, factor: flo
 
 
 @pytest.mark.parametrize("blocks", [1, 2])
-def test_what_is_struck_below_the_cup_is_braked_by_mu_n_from_the_second_time_step_on(
-    blocks: int,
-) -> None:
+def test_what_is_struck_below_the_cup_is_braked_by_mu_n_from_the_second_time_step_on(blocks):
     # By a hand from outside, or by another block; the cup is near, and touches neither.
     gap = (UNDER[0] - BLOCK.width - 0.002, UNDER[1])
     simulation = start("pybullet", *(BLOCK, OTHER)[:blocks], places=(UNDER, gap))
     rows: list[Any] = []
 
-    def strike() -> None:
+    def strike():
         if not rows and blocks == 1:
             throw(simulation, (0.5, 0, 0))
 
-    def note() -> None:
+    def note():
         force = from_table(simulation)
         rows.append((velocity(simulation)[0], force[0], force[2]))
 
@@ -157,9 +151,7 @@ def test_what_is_struck_below_the_cup_is_braked_by_mu_n_from_the_second_time_ste
 
 @each_engine
 @pytest.mark.parametrize("degrees", [0.0, 45.0, 90.0, 202.5])
-def test_a_pressing_cup_that_moves_drags_with_mu_n_along_its_way(
-    engine: str, degrees: float
-) -> None:
+def test_a_pressing_cup_that_moves_drags_with_mu_n_along_its_way(engine, degrees):
     # Box: moved along y it dragged along x as well, sqrt(2) too hard.
     simulation, rows = start(engine, BLOCK, places=[UNDER]), list[FloatArray]()
     for height in (0.04, 0.03, 0.022, 0.022, 0.022):
@@ -176,7 +168,7 @@ def test_a_pressing_cup_that_moves_drags_with_mu_n_along_its_way(
 
 
 @each_engine
-def test_two_objects_slide_their_own_ways_at_once(engine: str) -> None:
+def test_two_objects_slide_their_own_ways_at_once(engine):
     simulation = start(engine, BLOCK, OTHER)
     begin, ways = simulation.read().object_position, [unit(30.0), unit(135.0)]
     for body, way in enumerate(ways):
@@ -190,15 +182,13 @@ def test_two_objects_slide_their_own_ways_at_once(engine: str) -> None:
 
 @each_engine
 @pytest.mark.parametrize("spin", [10.0, 30.0, 60.0])  # rad/s
-def test_what_spins_on_the_spot_is_braked_at_its_corners_and_does_not_take_off(
-    engine: str, spin: float
-) -> None:
+def test_what_spins_on_the_spot_is_braked_at_its_corners_and_does_not_take_off(engine, spin):
     # PyBullet: 2 to 23% too far, for all corners share one direction of friction. MuJoCo: 0.01 and
     # 0.02 rad too far, for the load comes onto the corners late.
     simulation, rates = start(engine, BLOCK), list[float]()
     heights: list[float] = []
 
-    def note() -> None:
+    def note():
         now = simulation.engine.read()
         rates.append(now.object_angular_velocity[0, 0, 2])
         heights.append(now.object_position[0, 0, 2])
@@ -222,9 +212,7 @@ def test_what_spins_on_the_spot_is_braked_at_its_corners_and_does_not_take_off(
     [("pybullet", 0.0, 1.0), ("pybullet", 22.5, 0.86), ("pybullet", 45.0, 0.70)]
     + [("mujoco", degrees, 1.0) for degrees in DIRECTIONS],
 )
-def test_what_slides_on_another_object_is_braked_against_its_way(
-    engine: str, degrees: float, share: float
-) -> None:
+def test_what_slides_on_another_object_is_braked_against_its_way(engine, degrees, share):
     simulation = Alone(Scene(objects=(BLOCK, BASE)), engine=engine)
     where = {BLOCK.name: (*AWAY[0], BASE.height + BLOCK.height / 2), BASE.name: (*AWAY[0], 0.010)}
     simulation.reset(PAPER_TPM.inverse(level(0.05)), where)
@@ -240,7 +228,7 @@ def test_what_slides_on_another_object_is_braked_against_its_way(
 
 @each_engine
 @pytest.mark.parametrize("overlap", [0.006, 0.010])  # m; with less it tips
-def test_a_struck_block_slides_and_does_not_take_off(engine: str, overlap: float) -> None:
+def test_a_struck_block_slides_and_does_not_take_off(engine, overlap):
     mount, half = PAPER_TPM.mount, BLOCK.height / 2
     x, y, _ = mount.to_world(PAPER_TPM.home)
     begin = np.array([x, y, 2 * half - overlap + CUP.length])
@@ -254,7 +242,7 @@ def test_a_struck_block_slides_and_does_not_take_off(engine: str, overlap: float
 
 
 @each_engine
-def test_a_resting_block_neither_sinks_nor_moves(engine: str) -> None:
+def test_a_resting_block_neither_sinks_nor_moves(engine):
     simulation, heights = start(engine, BLOCK), list[float]()
     rest(simulation, 5)
     begin = place_of(simulation)

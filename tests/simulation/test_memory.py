@@ -36,6 +36,6 @@ print(memory() - before)
         ("engine='mujoco', randomisation={'length_error': 1e-4}", 10),
     ],
 )
-def test_200_environments_and_copies_are_given_back(options: str, megabytes: float) -> None:
+def test_200_environments_and_copies_are_given_back(options, megabytes):
     said = printed_by(PYTHON, "-c", SCRIPT.replace("{options}", options))
     assert float(said.split()[-1]) < megabytes

@@ -6,7 +6,6 @@ from dataclasses import replace
 import inside
 import numpy as np
 import pytest
-from alone import Alone
 from episodes import fingerprint, random_episode
 from states import apart
 
@@ -23,7 +22,7 @@ IDLE = np.zeros(3)
 
 
 @pytest.fixture
-def env() -> TPMEnv:
+def env():
     return TPMEnv("reach")
 
 
@@ -44,8 +43,8 @@ def push(env: TPMEnv, force: Vector) -> Callable[[], None]:
 @pytest.mark.parametrize("step", [0.0005, 0.002, 0.005, 0.010])
 @pytest.mark.parametrize("x", [-0.20, -0.04, 0.10])
 def test_commands_through_the_plane_are_followed_until_the_step_that_reports_it(
-    simulation: Alone, x: float, step: float
-) -> None:
+    simulation, x, step
+):
     # Far more than any action may ask for: 0.25 m/s along y.
     start = min(0.028, 20 * step)
     state = simulation.reset(PAPER_TPM.inverse((x, start, 0.80)))
@@ -62,9 +61,7 @@ def test_commands_through_the_plane_are_followed_until_the_step_that_reports_it(
     assert state.fk_position[1] < 0  # what the encoders believe: still on the other side
 
 
-def test_once_reported_the_change_stays_reported_and_a_reset_forgets_it(
-    simulation: Alone,
-) -> None:
+def test_once_reported_the_change_stays_reported_and_a_reset_forgets_it(simulation):
     simulation.reset(THETA)
     for y in (0.018, 0.008, -0.002, -0.012):
         simulation.move((HOME[0], y, HOME[2]))
@@ -80,9 +77,7 @@ def test_once_reported_the_change_stays_reported_and_a_reset_forgets_it(
 
 @pytest.mark.parametrize("force", [120.0, 800.0])
 @pytest.mark.parametrize("task", ["reach", "pick_and_place"])
-def test_a_disturbance_through_the_plane_ends_the_episode_and_the_next_reset_recovers(
-    task: str, force: float
-) -> None:
+def test_a_disturbance_through_the_plane_ends_the_episode_and_the_next_reset_recovers(task, force):
     env, fresh = TPMEnv(task), TPMEnv(task)
     idle = np.zeros(env.task.action_size)
     env.reset(seed=3)
@@ -112,9 +107,7 @@ def test_a_disturbance_through_the_plane_ends_the_episode_and_the_next_reset_rec
 # -- y = l7: the serial singularity ----------------------------------------------------------------
 
 
-def test_commands_towards_the_edge_are_followed_and_beyond_it_refused(
-    simulation: Alone,
-) -> None:
+def test_commands_towards_the_edge_are_followed_and_beyond_it_refused(simulation):
     simulation.reset(THETA)
     ways = [0.030, 0.035, 0.040, 0.045, 0.048, 0.049, 0.0495, *[0.0499] * 5]
     states = [simulation.move((HOME[0], y, HOME[2])) for y in ways]
@@ -139,7 +132,7 @@ def test_commands_towards_the_edge_are_followed_and_beyond_it_refused(
 
 
 @pytest.mark.parametrize("force", [500.0, 1000.0])
-def test_a_platform_pushed_over_the_edge_is_a_change_of_the_working_mode(force: float) -> None:
+def test_a_platform_pushed_over_the_edge_is_a_change_of_the_working_mode(force):
     env = TPMEnv("reach", machine=replace(PAPER_TPM, home=(-0.04, 0.045, 0.80)))
     fresh = fingerprint(random_episode(env, 6))
     env.reset(seed=0)
@@ -162,7 +155,7 @@ def test_a_platform_pushed_over_the_edge_is_a_change_of_the_working_mode(force: 
 # -- forces that no machine would stand ------------------------------------------------------------
 
 
-def test_a_loop_torn_open_is_a_typed_error_and_the_next_reset_recovers(env: TPMEnv) -> None:
+def test_a_loop_torn_open_is_a_typed_error_and_the_next_reset_recovers(env):
     fresh = fingerprint(random_episode(env, 7))
     env.reset(seed=0)
     release = push(env, (0.0, 0.0, 3000.0))
@@ -175,7 +168,7 @@ def test_a_loop_torn_open_is_a_typed_error_and_the_next_reset_recovers(env: TPME
     assert fingerprint(random_episode(env, 7)) == fresh
 
 
-def test_no_push_goes_unnoticed(env: TPMEnv) -> None:
+def test_no_push_goes_unnoticed(env):
     """Hard or soft, from any side: until something is reported, P is where the encoders say."""
     rng = np.random.default_rng(0)
     outcomes = set()

@@ -28,7 +28,7 @@ WRONG: dict[str, dict[str, list[Any]]] = {
 
 
 @pytest.mark.parametrize("engine", WRONG)
-def test_settings_that_cannot_work_are_refused_by_name(engine: str) -> None:
+def test_settings_that_cannot_work_are_refused_by_name(engine):
     for name, values in WRONG[engine].items():
         for value in values:
             with pytest.raises(ConfigurationError) as caught:
@@ -38,9 +38,7 @@ def test_settings_that_cannot_work_are_refused_by_name(engine: str) -> None:
 
 @pytest.mark.parametrize("engine", WRONG)
 @pytest.mark.parametrize(("time_step", "count"), [(None, 10), (1e-3, 40), (1 / 225, 9)])
-def test_time_steps_fill_the_control_period(
-    engine: str, time_step: float | None, count: int
-) -> None:
+def test_time_steps_fill_the_control_period(engine, time_step, count):
     simulation = Alone(engine=engine, physics={"time_step": time_step} if time_step else None)
     assert simulation.engine.physics.substeps == count
     assert simulation.engine.time_step * count == pytest.approx(0.04)
@@ -51,7 +49,7 @@ def test_time_steps_fill_the_control_period(
     assert state.platform_position[0] - PAPER_TPM.home[0] == pytest.approx(0.01, abs=2e-4)
 
 
-def test_the_ends_of_the_ranges_are_allowed() -> None:
+def test_the_ends_of_the_ranges_are_allowed():
     for solver in ("direct", "iterative"):
         Alone(physics={"iterations": 1, "erp": 1.0, "solver": solver, "time_step": 0.04}).close()
     Alone(engine="mujoco", physics={"iterations": 1, "tolerance": 0.0, "time_step": 0.04}).close()

@@ -39,7 +39,7 @@ def of(value: Any) -> Randomisation:
 
 
 @pytest.fixture
-def simulation(with_block: Alone) -> Alone:
+def simulation(with_block):
     return with_block
 
 
@@ -70,7 +70,7 @@ def out_of_range() -> Iterator[tuple[str, Any, str]]:
         yield "latency", value, "from 0 to 5"
 
 
-def test_what_is_out_of_range_is_refused_by_name_value_and_limit() -> None:
+def test_what_is_out_of_range_is_refused_by_name_value_and_limit():
     for name, value, limit in out_of_range():
         with pytest.raises(ConfigurationError) as caught:
             of({name: value})
@@ -80,7 +80,7 @@ def test_what_is_out_of_range_is_refused_by_name_value_and_limit() -> None:
         assert limit in str(caught.value)
 
 
-def test_the_documentation_states_the_ranges() -> None:
+def test_the_documentation_states_the_ranges():
     text = inspect.getdoc(Randomisation) or ""
     found = re.findall(r"^ {4}(\w+): (.*(?:\n {8}.*)*)", text, flags=re.MULTILINE)
     entries = {name: " ".join(entry.split()) for name, entry in found}
@@ -95,13 +95,13 @@ def test_the_documentation_states_the_ranges() -> None:
 
 
 @pytest.mark.parametrize("value", [0.1, "all", [("latency", 1)], {"encoder_jitter": 1}, {1: 2}])
-def test_what_is_no_randomisation_is_refused_and_the_keys_are_named(value: Any) -> None:
+def test_what_is_no_randomisation_is_refused_and_the_keys_are_named(value):
     with pytest.raises(ConfigurationError, match="length_error") as caught:
         TPMEnv(randomisation=value)
     assert caught.value.name == "randomisation"
 
 
-def test_a_file_may_say_it_and_a_number_is_a_fixed_factor() -> None:
+def test_a_file_may_say_it_and_a_number_is_a_fixed_factor():
     text = "{link_mass: [0.8, 1.2], block_mass: 2, encoder_noise: 1.0e-4, latency: 1}"
     expected = Randomisation(link_mass=(0.8, 1.2), block_mass=2, encoder_noise=1e-4, latency=1)
     assert of(yaml.safe_load(text)) == expected
@@ -115,7 +115,7 @@ def test_a_file_may_say_it_and_a_number_is_a_fixed_factor() -> None:
 # -- drawing ---------------------------------------------------------------------------------------
 
 
-def test_nothing_is_drawn_for_what_is_not_random() -> None:
+def test_nothing_is_drawn_for_what_is_not_random():
     rng = np.random.default_rng(0)
     before = rng.bit_generator.state
     assert Randomisation().draw(rng, PAPER_TPM) == NOMINAL
@@ -130,7 +130,7 @@ def numbers(plant: Plant) -> FloatArray:
     return np.concatenate([np.ravel(value) for value in vars(plant).values()])
 
 
-def test_draws_fill_the_stated_ranges_and_are_independent() -> None:
+def test_draws_fill_the_stated_ranges_and_are_independent():
     sizes = {name: _SIZES[name] for name in ("encoder_bias", "length_error")}
     wide = Randomisation(**_RANGES, **sizes)
     rng = np.random.default_rng(1)
@@ -151,7 +151,7 @@ def test_draws_fill_the_stated_ranges_and_are_independent() -> None:
     assert np.abs(correlations).max() < 0.1
 
 
-def test_a_machine_without_deviations_is_the_nominal_one_to_the_last_bit() -> None:
+def test_a_machine_without_deviations_is_the_nominal_one_to_the_last_bit():
     prints = set()
     for option in (None, {"link_mass": (1.0, 1.0), "encoder_noise": 0}, Randomisation()):
         env = TPMEnv("pick_and_place", randomisation=option)
@@ -163,9 +163,7 @@ def test_a_machine_without_deviations_is_the_nominal_one_to_the_last_bit() -> No
 
 
 @pytest.mark.parametrize("factor", [0.1, 1.0, 10.0])
-def test_the_block_weighs_what_it_should_and_a_force_accelerates_it_accordingly(
-    simulation: Alone, factor: float
-) -> None:
+def test_the_block_weighs_what_it_should_and_a_force_accelerates_it_accordingly(simulation, factor):
     mass = factor * Block().mass
     rest(simulation, Plant(block_mass=factor))
     client, (block,) = simulation.engine.client, simulation.engine.bodies
@@ -187,7 +185,7 @@ def test_the_block_weighs_what_it_should_and_a_force_accelerates_it_accordingly(
 # -- encoders --------------------------------------------------------------------------------------
 
 
-def test_noise_is_in_what_the_encoders_say_and_not_in_the_truth() -> None:
+def test_noise_is_in_what_the_encoders_say_and_not_in_the_truth():
     size, seen, said = 2e-4, [], []
     env, quiet = TPMEnv("reach", randomisation={"encoder_noise": size}), TPMEnv("reach")
     env.reset(seed=0)
@@ -221,9 +219,7 @@ def test_noise_is_in_what_the_encoders_say_and_not_in_the_truth() -> None:
     np.testing.assert_allclose(np.std(said, axis=0), size * gains, rtol=0.3)
 
 
-def test_a_bias_moves_the_platform_by_minus_j_bias_and_the_encoders_do_not_know(
-    simulation: Alone,
-) -> None:
+def test_a_bias_moves_the_platform_by_minus_j_bias_and_the_encoders_do_not_know(simulation):
     bias = tuple((2e-4 * np.sign(J[1])).tolist())  # the worst for y
     true = rest(simulation, NOMINAL)
     started = simulation.reset(THETA, ON_TABLE, plant=Plant(encoder_bias=bias))
@@ -238,9 +234,7 @@ def test_a_bias_moves_the_platform_by_minus_j_bias_and_the_encoders_do_not_know(
         assert np.linalg.norm(moved) > 3e-4
 
 
-def test_angles_that_cannot_be_assembled_leave_the_last_reading_in_place(
-    simulation: Alone,
-) -> None:
+def test_angles_that_cannot_be_assembled_leave_the_last_reading_in_place(simulation):
     good = simulation.reset(THETA)
     impossible = (3.0, 3.0, 3.0)
     assert np.isnan(PAPER_TPM.forward(np.add(THETA, impossible))).all()
@@ -257,7 +251,7 @@ def test_angles_that_cannot_be_assembled_leave_the_last_reading_in_place(
 
 
 @pytest.mark.parametrize("steps", [1, 3])
-def test_an_action_comes_late_by_so_many_steps_the_vacuum_too(steps: int) -> None:
+def test_an_action_comes_late_by_so_many_steps_the_vacuum_too(steps):
     prompt = TPMEnv("pick_and_place")
     late = TPMEnv("pick_and_place", randomisation=Randomisation(latency=steps))
     actions = np.random.default_rng(6).uniform(-1, 1, (12, 4))
@@ -287,14 +281,12 @@ def lengths(errors: FloatArray) -> Geometry:
     return Geometry(*(np.array(list(vars(PAPER).values())) + errors))
 
 
-def test_with_other_lengths_the_truth_is_elsewhere_by_what_first_order_predicts(
-    simulation: Alone,
-) -> None:
+def test_with_other_lengths_the_truth_is_elsewhere_by_what_first_order_predicts(simulation):
     plant = Plant(length_errors=ERRORS)
     started = simulation.reset(THETA, ON_TABLE, plant=plant)
     settled = rest(simulation, plant)
 
-    def moved(errors: FloatArray) -> FloatArray:
+    def moved(errors):
         return kinematics.forward(THETA, geometry=lengths(errors))
 
     per_length = [(moved(step) - moved(-step)) / 2e-6 for step in 1e-6 * np.eye(7)]
@@ -313,7 +305,7 @@ def test_with_other_lengths_the_truth_is_elsewhere_by_what_first_order_predicts(
     assert np.linalg.norm(predicted) > 5e-4
 
 
-def test_with_other_lengths_the_loops_stay_closed_at_full_speed_and_every_reset_redraws() -> None:
+def test_with_other_lengths_the_loops_stay_closed_at_full_speed_and_every_reset_redraws():
     env = TPMEnv("reach", randomisation={"length_error": 5e-4})
     seen = set()
     for seed in range(4):
@@ -330,7 +322,7 @@ def test_with_other_lengths_the_loops_stay_closed_at_full_speed_and_every_reset_
     assert len(seen) == 4
 
 
-def test_a_robot_built_anew_stands_in_the_same_world(simulation: Alone) -> None:
+def test_a_robot_built_anew_stands_in_the_same_world(simulation):
     settings = simulation.engine.client.getPhysicsEngineParameters()
     bodies = simulation.engine.client.getNumBodies()
     falls = []
@@ -345,7 +337,7 @@ def test_a_robot_built_anew_stands_in_the_same_world(simulation: Alone) -> None:
 
 
 @pytest.mark.parametrize("bias", [0.0, _SIZES["encoder_bias"]])
-def test_the_arm_at_home_stands_on_its_own_side_at_every_corner_of_the_ranges(bias: float) -> None:
+def test_the_arm_at_home_stands_on_its_own_side_at_every_corner_of_the_ranges(bias):
     error = _SIZES["length_error"]
     for signs in itertools.product((-1, 1), repeat=10):
         theta = np.array(THETA) - bias * np.array(signs[:3])
@@ -362,7 +354,7 @@ MODERATE = {**EVERYTHING, "motor_strength": (0.8, 1.2), "length_error": 5e-4}
     ("env_id", "latency"),
     [("TPMReach-v0", 0), ("TPMPickAndPlace-v0", 1), ("TPMReachJoints-v0", 1)],
 )
-def test_the_expert_succeeds_on_moderately_different_machines(env_id: str, latency: int) -> None:
+def test_the_expert_succeeds_on_moderately_different_machines(env_id, latency):
     env = gym.make(env_id, randomisation={**MODERATE, "latency": latency})
     for seed in range(8):
         *_, (_, _, info) = expert_episode(env, seed)
@@ -382,9 +374,7 @@ EXTREMES: list[dict[str, Any]] = [
 @pytest.mark.parametrize(
     "seeds", [range(1), pytest.param(range(100, 140), marks=pytest.mark.slow)], ids=len
 )
-def test_at_the_ends_of_the_ranges_nothing_is_lost_or_it_is_reported(
-    option: dict[str, Any], seeds: range
-) -> None:
+def test_at_the_ends_of_the_ranges_nothing_is_lost_or_it_is_reported(option, seeds):
     drive = "servo" if option.keys() & OF_SERVOS.keys() else "ideal"
     env = TPMEnv("pick_and_place", drive=drive, randomisation=option)
     for seed in seeds:

@@ -17,7 +17,6 @@ from tpm_gym.simulation.imaging import View, camera_of
 
 HOME = np.array(PAPER_TPM.home)
 THETA = PAPER_TPM.inverse(PAPER_TPM.home)
-ON_TABLE = {"object": (0.0, -0.03, 0.015)}
 
 
 def follow(simulation, commands):

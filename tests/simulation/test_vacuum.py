@@ -1,7 +1,5 @@
 """The vacuum's law: how fast it comes and goes, what a seal bears, when it is made and lost."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -23,7 +21,7 @@ NOTHING = Load()
 
 
 @pytest.mark.parametrize("time_step", [1 / 250, 1 / 1000, 1 / 25])
-def test_it_builds_up_and_falls_in_the_stated_times_at_any_time_step(time_step: float) -> None:
+def test_it_builds_up_and_falls_in_the_stated_times_at_any_time_step(time_step):
     times = time_step * np.arange(1, round(0.12 / time_step) + 1)
     rising, falling = [0.0], [CUP.vacuum]
     for _ in times:
@@ -35,14 +33,14 @@ def test_it_builds_up_and_falls_in_the_stated_times_at_any_time_step(time_step: 
 
 @pytest.mark.parametrize("angle", np.radians([0.0, 30.0, 45.0, 60.0, 90.0]))
 @pytest.mark.parametrize("share", [0.3, 1.0])
-def test_the_length_of_the_pull_counts_and_the_pressure(angle: float, share: float) -> None:
+def test_the_length_of_the_pull_counts_and_the_pressure(angle, share):
     limit = share * 12.0  # N: 60 kPa on 200 mm^2
     for force, expected in ((0.999 * limit, True), (1.001 * limit, False)):
         load = Load(force * math.cos(angle), force * math.sin(angle))
         assert holds(share * CUP.vacuum, load) is expected
 
 
-def test_pressing_is_no_pull_and_the_lip_bears_more_shear_for_it() -> None:
+def test_pressing_is_no_pull_and_the_lip_bears_more_shear_for_it():
     assert holds(0.0, Load(-1000.0, 0.0))
     for press in (1.0, 15.0):
         limit = 12.0 + CUP.seal_friction * press
@@ -50,7 +48,7 @@ def test_pressing_is_no_pull_and_the_lip_bears_more_shear_for_it() -> None:
         assert not holds(CUP.vacuum, Load(-press, 1.001 * limit))
 
 
-def test_it_seals_on_what_it_touches_while_on_and_keeps_its_first_choice() -> None:
+def test_it_seals_on_what_it_touches_while_on_and_keeps_its_first_choice():
     assert hold_after(EMPTY, STEP, on=False, load=NOTHING, touched=1) == EMPTY
     assert hold_after(EMPTY, STEP, on=True, load=NOTHING, touched=-1) == EMPTY
     hold = hold_after(EMPTY, STEP, on=True, load=NOTHING, touched=1)
@@ -58,7 +56,7 @@ def test_it_seals_on_what_it_touches_while_on_and_keeps_its_first_choice() -> No
     assert hold_after(hold, STEP, on=True, load=NOTHING, touched=0).which == 1
 
 
-def test_switched_off_it_holds_for_some_milliseconds_and_a_heavy_load_for_fewer() -> None:
+def test_switched_off_it_holds_for_some_milliseconds_and_a_heavy_load_for_fewer():
     left = {}
     for weight in (0.0, 0.49, 5.0):
         hold, steps = FULL, 0
@@ -75,7 +73,7 @@ def test_switched_off_it_holds_for_some_milliseconds_and_a_heavy_load_for_fewer(
     }
 
 
-def test_what_is_pulled_off_vents_the_cup_before_it_can_seal_again() -> None:
+def test_what_is_pulled_off_vents_the_cup_before_it_can_seal_again():
     hold = hold_after(FULL, STEP, on=True, load=Load(12.1), touched=-1)
     assert hold == (-1, pressure_after(CUP.vacuum, STEP, pumped=False))
     steps = 1

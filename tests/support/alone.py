@@ -1,7 +1,5 @@
 """One robot in a simulation, as tests of its physics see it: states without a leading axis."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -34,7 +32,7 @@ class Alone:
         noise: ArrayLike | None = None,
     ) -> State:
         """Place the robot at theta (3,) rad, and objects at (3,) m."""
-        places: Any = {name: [place] for name, place in (objects or {}).items()}
+        places = {name: [place] for name, place in (objects or {}).items()}
         self.simulation.reset(ROW, theta, places, [plant], _row(noise))
         return self.read()
 

@@ -1,9 +1,7 @@
 """All assemblies of the mechanism, by a root finder on the closure equations written out."""
 
-from typing import Any
-
 import numpy as np
-from roots import Rows, circle_roots
+from roots import circle_roots
 
 from tpm_gym.arrays import FloatArray
 from tpm_gym.kinematics.geometry import Geometry
@@ -27,13 +25,13 @@ def assemblies(
     found: list[list[FloatArray]] = [[] for _ in theta]
     for crossed in modes:
 
-        def balls(row: Rows, turn: FloatArray, crossed: bool = crossed) -> tuple[Any, Any]:
+        def balls(row, turn, crossed=crossed):
             foot = -g.l5 + 1j * s[0][row]
             sc = foot + 2 * g.l5 + rod[row] * np.exp(1j * turn)
             line = (sc - foot) / abs(sc - foot)
             return sc, foot + line**2 * np.conj(sc - 2 * g.l5 - foot) if crossed else sc - 2 * g.l5
 
-        def loop1(row: Rows, turn: FloatArray, balls: Any = balls) -> FloatArray:
+        def loop1(row, turn, balls=balls):
             sc, sd = balls(row, turn)
             return np.asarray(abs(sc + 1.5 * (sd - sc) - b2[row]) ** 2 - g.l4**2)
 
@@ -41,11 +39,11 @@ def assemblies(
         sc, sd = balls(row, turn)
         along, c1 = (sc - sd) / (2 * g.l5), (sc + sd) / 2
 
-        def on_platform(i: Rows, beta: FloatArray, x: float, z: float, c1: Any = c1,
-                        along: Any = along) -> Any:  # fmt: skip
+        def on_platform(i, beta, x, z, c1 = c1,
+                        along = along):  # fmt: skip
             return c1[i] + along[i] * (g.l7 * np.cos(beta) + x + 1j * z)
 
-        def loop2(i: Rows, beta: FloatArray, row: Rows = row, place: Any = on_platform) -> Any:
+        def loop2(i, beta, row=row, place=on_platform):
             apart = place(i, beta, 2 * g.l2, g.l6) - b3[row][i]
             return abs(apart) ** 2 + (g.l7 * np.sin(beta)) ** 2 - g.l4**2
 

@@ -1,7 +1,5 @@
 """The first frame of an episode, in every engine."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium as gym
@@ -14,6 +12,6 @@ def drawn(engine: str, starts: Any = STARTS, mode: str = "rgb_array", **options:
     """Return the first frame of an episode of pick-and-place."""
     env = gym.make("TPMPickAndPlace-v0", engine=engine, render_mode=mode, **options)
     env.reset(seed=0, options=starts)
-    frame: Any = env.render()
+    frame = env.render()
     env.close()
     return frame

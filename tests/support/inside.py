@@ -4,8 +4,6 @@ Forces, velocities and positions are in the world. What a time step did is known
 ``solved``; ``after`` it, positions and velocities are those of its end.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any
@@ -36,12 +34,12 @@ def around_each_step(
 
     What is pushed ``before`` a time step is pushed in this one alone.
     """
-    engine: Any = simulation.engine
+    engine = simulation.engine
     stack = ExitStack()
     if in_bullet(simulation):
         step = engine.client.stepSimulation
 
-        def whole() -> None:
+        def whole():
             before()
             step()
             solved()
@@ -53,13 +51,13 @@ def around_each_step(
 
     second_half, breathe = mujoco.mj_step2, engine._cup.breathe
 
-    def step2(model: Any, data: Any) -> None:
+    def step2(model, data):
         data.xfrc_applied[:] = 0
         before()
         second_half(model, data)
         solved()
 
-    def breathed(*state: Any) -> Any:
+    def breathed(*state):
         after()
         return breathe(*state)
 
@@ -71,7 +69,7 @@ def around_each_step(
 
 def push(simulation: Any, force: ArrayLike, body: int | None = None) -> None:
     """Apply a force (3,) N in the next time step: at point P, or in the middle of an object."""
-    engine: Any = simulation.engine
+    engine = simulation.engine
     force = np.asarray(force, dtype=float)
     platform = simulation.machine.mechanism.platform
     if in_bullet(simulation):
@@ -87,7 +85,7 @@ def push(simulation: Any, force: ArrayLike, body: int | None = None) -> None:
 
 def throw(simulation: Alone, velocity: ArrayLike, spin: float = 0.0, body: int = 0) -> None:
     """Give an object a velocity, m/s, and let it turn about the vertical, rad/s."""
-    engine: Any = simulation.engine
+    engine = simulation.engine
     velocity = np.asarray(velocity, dtype=float)
     if in_bullet(simulation):
         engine.client.resetBaseVelocity(engine.bodies[body], velocity.tolist(), (0, 0, spin))
@@ -107,7 +105,7 @@ def place_of(simulation: Any, body: int = 0) -> FloatArray:
 
 def slide(simulation: Any) -> float:
     """How far the cup is out, m; negative where its spring is compressed."""
-    engine: Any = simulation.engine
+    engine = simulation.engine
     if in_bullet(simulation):
         return float(engine.client.getJointState(*engine.robot.tool)[0])
     return float(engine.data.joint("cup_slide").qpos.item())
@@ -115,7 +113,7 @@ def slide(simulation: Any) -> float:
 
 def from_cup(simulation: Any, body: int = 0) -> FloatArray:
     """Force (3,) of the cup's contacts on an object, N; a weld is none."""
-    engine: Any = simulation.engine
+    engine = simulation.engine
     if in_bullet(simulation):
         return _contact_in_bullet(engine, body, engine.robot.tool, -1)
     return _contact_in_mujoco(engine, body, engine.model.body("cup").id)
@@ -123,7 +121,7 @@ def from_cup(simulation: Any, body: int = 0) -> FloatArray:
 
 def from_table(simulation: Any, body: int = 0) -> FloatArray:
     """Force (3,) of the table on an object, N."""
-    engine: Any = simulation.engine
+    engine = simulation.engine
     if in_bullet(simulation):
         return _contact_in_bullet(engine, body, (engine._scenery.tables[body], -1), 1)
     return _contact_in_mujoco(engine, body, 0)

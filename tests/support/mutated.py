@@ -26,7 +26,7 @@ def mutate(source: str, right: str, wrong: str) -> tuple[ast.Module, int]:
     pattern, count = ast.parse(right, mode="eval").body, 0
 
     class Replace(ast.NodeTransformer):
-        def generic_visit(self, node: ast.AST) -> ast.AST:
+        def generic_visit(self, node):
             nonlocal count
             found: dict[str, Any] = {}
             if not _equal(pattern, node, found):

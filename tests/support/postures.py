@@ -10,7 +10,7 @@ def drawn_gap(viewer: Viewer) -> float:
     """Return the largest distance between both ends of a closure of the links in the scene, m."""
     nodes, mechanism = viewer.robot.links, viewer.explore.posture.machine.mechanism
 
-    def place(link: str, point: tuple[float, float, float]) -> np.ndarray:
+    def place(link, point):
         node = nodes[link]
         return node.position + SO3(node.wxyz).as_matrix() @ point
 

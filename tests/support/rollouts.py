@@ -24,8 +24,6 @@ FIRST_SEED = 3_000_000
 KEYS = ("observation", "achieved_goal", "desired_goal")
 NUMBERS = ("closure_error", "conditioning", "singularity_penalty")
 
-Act = Callable[[Mapping[str, Any]], Any]
-
 
 def cases() -> list[tuple[str, str]]:
     """Every id with the scripted expert and random actions; the published policies on theirs."""

@@ -18,10 +18,10 @@ def random_state(
 ) -> State:
     """A state with leading axes ``shape``; ``values`` are taken as they are."""
 
-    def normal(*size: int) -> Any:
+    def normal(*size):
         return rng.normal(size=(*shape, *size))
 
-    def unit(*size: int) -> Any:
+    def unit(*size):
         vectors = normal(*size)
         return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 

@@ -4,7 +4,6 @@ import csv
 import functools
 import io
 import json
-import shutil
 import tempfile
 from collections.abc import Callable
 from dataclasses import replace
@@ -114,7 +113,7 @@ def interrupt_at(
     """Let something happen in the middle of a step."""
     before = Checkpointing._on_step
 
-    def on_step(self: Checkpointing) -> bool:
+    def on_step(self):
         if self.num_timesteps >= step:
             monkeypatch.setattr(Checkpointing, "_on_step", before)
             interruption()
@@ -128,7 +127,7 @@ def kill_at(
 ) -> None:
     """Train, or resume, up to a death at a step."""
 
-    def die() -> None:
+    def die():
         raise Killed
 
     interrupt_at(monkeypatch, step, die)
@@ -138,16 +137,6 @@ def kill_at(
 
 
 # -- comparing whole trainings --------------------------------------------------------------------
-
-
-def read_checkpoint(run: Path, step: int) -> Content:
-    """Return the checkpoint of a step, by way of a folder that holds no other."""
-    with tempfile.TemporaryDirectory() as folder:
-        store = CheckpointStore(Path(folder))
-        shutil.copy(CheckpointStore(run / "checkpoints").path(step), folder)
-        content = store.load(pytest.fail)
-    assert content is not None
-    return content
 
 
 def end_of(run: Path) -> Content:

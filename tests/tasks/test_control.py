@@ -15,8 +15,6 @@ from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.tpm import PAPER_TPM, WIDE_TPM
 from tpm_gym.tasks.control import CartesianControl, Control, JointControl, make_control
 
-Triple = tuple[float, float, float]
-
 
 class One:
     """A control, for one robot."""
@@ -48,9 +46,7 @@ def turn(machine: Machine, start: FloatArray, end: FloatArray) -> FloatArray:
 
 @pytest.mark.parametrize(("kind", "machine"), CONTROLS)
 @examples(300, action=actions, share=shares)
-def test_commands_stay_in_the_region_and_within_the_step_limit(
-    kind: One, machine: Machine, action: Triple, share: Triple
-) -> None:
+def test_commands_stay_in_the_region_and_within_the_step_limit(kind, machine, action, share):
     current = within(machine, share)
     before = current.copy()
     command = kind.command(action, current)
@@ -64,8 +60,8 @@ def test_commands_stay_in_the_region_and_within_the_step_limit(
 @pytest.mark.parametrize(("kind", "machine"), CONTROLS)
 @examples(100, share=shares, far=st.tuples(*[st.floats(-0.5, 1.5)] * 3))
 def test_a_straight_way_takes_as_many_steps_as_it_says_even_from_beyond_the_region(
-    kind: One, machine: Machine, share: Triple, far: Triple
-) -> None:
+    kind, machine, share, far
+):
     start, stop = within(machine, share), within(machine, far)
     count = int(np.ceil(kind.steps(stop, start) * 1.1)) + 1  # joints turn nearly evenly
     project = machine.region.project
@@ -78,8 +74,8 @@ def test_a_straight_way_takes_as_many_steps_as_it_says_even_from_beyond_the_regi
 @pytest.mark.parametrize(("kind", "machine"), CONTROLS)
 @examples(200, share=shares, way=actions, far=shares)
 def test_actions_are_in_the_unit_box_and_reach_every_wanted_point_nearby(
-    kind: One, machine: Machine, share: Triple, way: Triple, far: Triple
-) -> None:
+    kind, machine, share, way, far
+):
     current = within(machine, share)
     wanted = machine.region.project(current + 0.1 * np.array(way) * machine.step_limit)
     assert np.abs(turn(machine, current, wanted)).max() < machine.joint_limit
@@ -98,9 +94,7 @@ def test_actions_are_in_the_unit_box_and_reach_every_wanted_point_nearby(
 
 @each_machine
 @examples(200, action=actions, share=shares)
-def test_cartesian_actions_are_fractions_of_the_step_limit(
-    machine: Machine, action: Triple, share: Triple
-) -> None:
+def test_cartesian_actions_are_fractions_of_the_step_limit(machine, action, share):
     current = within(machine, share)
     free = current + np.array(action) * machine.step_limit
     expected = np.clip(free, machine.region.low, machine.region.high)
@@ -109,7 +103,7 @@ def test_cartesian_actions_are_fractions_of_the_step_limit(
 
 
 @each_machine
-def test_small_joint_actions_turn_the_joints_by_just_that(machine: Machine) -> None:
+def test_small_joint_actions_turn_the_joints_by_just_that(machine):
     rng, control = np.random.default_rng(0), One(JointControl(machine))
     for share in rng.uniform(0.2, 0.8, (100, 3)):
         current, action = within(machine, share), rng.uniform(-0.01, 0.01, 3)
@@ -118,7 +112,7 @@ def test_small_joint_actions_turn_the_joints_by_just_that(machine: Machine) -> N
 
 
 @each_machine
-def test_joint_actions_at_full_scale_are_slowed_down_to_the_limit(machine: Machine) -> None:
+def test_joint_actions_at_full_scale_are_slowed_down_to_the_limit(machine):
     rng = np.random.default_rng(1)
     region = machine.region
     current, actions = (
@@ -146,7 +140,7 @@ def test_joint_actions_at_full_scale_are_slowed_down_to_the_limit(machine: Machi
 
 
 @pytest.mark.parametrize(("kind", "machine"), CONTROLS)
-def test_a_row_has_the_bits_that_it_has_alone(kind: One, machine: Machine) -> None:
+def test_a_row_has_the_bits_that_it_has_alone(kind, machine):
     rng = np.random.default_rng(2)
     current, wanted = rng.uniform(machine.region.low, machine.region.high, (2, 200, 3))
     actions = rng.uniform(-1, 1, (200, 3))
@@ -156,7 +150,7 @@ def test_a_row_has_the_bits_that_it_has_alone(kind: One, machine: Machine) -> No
         np.testing.assert_array_equal(one, (commands[row], back[row]))
 
 
-def test_controls_are_made_by_name() -> None:
+def test_controls_are_made_by_name():
     assert isinstance(make_control("cartesian", PAPER_TPM), CartesianControl)
     assert isinstance(make_control("joints", PAPER_TPM), JointControl)
     with pytest.raises(ConfigurationError, match="'cartesian' or 'joints'") as caught:

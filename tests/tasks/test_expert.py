@@ -24,7 +24,7 @@ SPARSE = [env_id for env_id in tpm_gym.ENV_IDS if "Dense" not in env_id]
 
 
 @pytest.fixture
-def env() -> Any:
+def env():
     return gym.make("TPMPickAndPlace-v0")
 
 
@@ -40,11 +40,11 @@ def solved(env: Any, **options: Any) -> bool:
     ("episodes", "wanted"), [(6, 6), pytest.param(500, 495, marks=pytest.mark.slow)]
 )
 def test_it_solves_every_task_clear_of_the_singularity_with_half_the_torque(
-    env_id: str, options: dict[str, str], episodes: int, wanted: int
-) -> None:
+    env_id, options, episodes, wanted
+):
     if re.search("Push|Throw", env_id) and options.get("engine") == "kinematic":
         pytest.skip("needs contact, or motion of what is let go")
-    env: Any = gym.make(env_id, **options)
+    env = gym.make(env_id, **options)
     machine, successes, clear = env.unwrapped.machine, 0, 0
     safe, effort = machine.safe_conditioning, [motor.effort for motor in machine.mechanism.motors]
     for seed in range(episodes):
@@ -61,13 +61,13 @@ def test_it_solves_every_task_clear_of_the_singularity_with_half_the_torque(
     assert clear >= (0.85 if "Push" in env_id else 1.0) * wanted
 
 
-def test_on_the_table_it_lets_go_and_in_the_air_it_holds(env: Any) -> None:
+def test_on_the_table_it_lets_go_and_in_the_air_it_holds(env):
     for height, held in ((0.015, -1), (0.1, 0)):
         assert solved(env, object=(-0.12, -0.03, 0.015), goal=(0.0, -0.03, height))
         assert env.unwrapped.state.held == held
 
 
-def test_it_tries_again_when_the_block_is_lost(env: Any) -> None:
+def test_it_tries_again_when_the_block_is_lost(env):
     from tpm_gym.simulation.bullet.cup import Grip
 
     options = {"object": (-0.1, -0.03, 0.015), "goal": (0.0, -0.03, 0.1)}
@@ -81,11 +81,11 @@ def test_it_tries_again_when_the_block_is_lost(env: Any) -> None:
     assert successes[-1]
 
 
-def test_the_longest_paths_fit_into_an_episode(env: Any) -> None:
+def test_the_longest_paths_fit_into_an_episode(env):
     assert solved(env, object=(-0.2, -0.04, 0.015), goal=(0.1, -0.027, 0.015))
 
 
-def test_its_commands_start_and_stop_gently_and_respect_the_step_limit() -> None:
+def test_its_commands_start_and_stop_gently_and_respect_the_step_limit():
     env = gym.make("TPMReach-v0")
     machine, rng = env.unwrapped.machine, np.random.default_rng(0)
     motion = Motion(machine, env.unwrapped.control)
@@ -106,13 +106,13 @@ def test_its_commands_start_and_stop_gently_and_respect_the_step_limit() -> None
 # -- when it cannot --------------------------------------------------------------------------------
 
 
-def test_environments_of_others_are_refused() -> None:
+def test_environments_of_others_are_refused():
     for wrong in (gym.make("CartPole-v1"), None, "TPMReach-v0", object()):
         with pytest.raises(InputError, match="an environment of tpm_gym"):
-            Expert(wrong)  # type: ignore[arg-type]
+            Expert(wrong)
 
 
-def test_it_plans_anew_for_every_episode_and_goes_on_after_a_refused_reset(env: Any) -> None:
+def test_it_plans_anew_for_every_episode_and_goes_on_after_a_refused_reset(env):
     observation, _ = env.reset(seed=0)
     expert, inner = Expert(env), env.unwrapped
     expert.act(observation)
@@ -136,7 +136,7 @@ def test_it_plans_anew_for_every_episode_and_goes_on_after_a_refused_reset(env: 
         expert.act(observation)
 
 
-def test_before_the_first_episode_it_says_so(env: Any) -> None:
+def test_before_the_first_episode_it_says_so(env):
     with pytest.raises(EpisodeError, match="reset"):
         Expert(env).act({})
 
@@ -144,10 +144,8 @@ def test_before_the_first_episode_it_says_so(env: Any) -> None:
 @pytest.mark.parametrize(
     ("engine", "randomisation"), [("analytic", {"latency": 2}), ("pybullet", {})]
 )
-def test_for_a_vector_it_does_what_it_does_for_each_environment(
-    engine: str, randomisation: dict[str, Any]
-) -> None:
-    options: Any = {"engine": engine, "randomisation": randomisation}
+def test_for_a_vector_it_does_what_it_does_for_each_environment(engine, randomisation):
+    options = {"engine": engine, "randomisation": randomisation}
     envs = gym.make_vec("TPMPickAndPlace-v0", num_envs=3, **options)
     alone = gym.make("TPMPickAndPlace-v0", **options)
     observation, _ = envs.reset(seed=4)
@@ -179,7 +177,7 @@ class Bare(Planned):
         yield from map(tuple, super().plan(motion))
 
 
-def test_the_last_move_of_a_plan_is_kept() -> None:
+def test_the_last_move_of_a_plan_is_kept():
     env = TPMEnv(Planned)
     expert, (observation, _) = Expert(env), env.reset(seed=0)
     for _ in range(6):
@@ -196,7 +194,7 @@ def test_the_last_move_of_a_plan_is_kept() -> None:
         (Bare, ConfigurationError, r"plan\(\) = .*an iterator of tpm_gym.tasks.Move"),
     ],
 )
-def test_plans_that_cannot_be_followed_are_told(task: Any, error: Any, message: str) -> None:
+def test_plans_that_cannot_be_followed_are_told(task, error, message):
     env = TPMEnv(task)
     observation, _ = env.reset(seed=0)
     with pytest.raises(error, match=message):

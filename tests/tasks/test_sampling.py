@@ -19,7 +19,6 @@ from tpm_gym.tasks.sampling import APART, BAND, line_in_joints
 
 SAFE = PAPER_TPM.safe_conditioning
 BLOCK = PickAndPlace.block
-ON_TABLE = BLOCK.height / 2
 KINDS = [Reach, PickAndPlace]
 
 
@@ -46,7 +45,7 @@ def ends(
 
 @each_machine
 @pytest.mark.parametrize("kind", KINDS)
-def test_sampled_ends_are_safe_apart_and_spread(kind: type[Task], machine: Machine) -> None:
+def test_sampled_ends_are_safe_apart_and_spread(kind, machine):
     starts, goals = ends(kind, machine, "sampled", 200)
     for points in (starts, goals):
         assert machine.region.contains(points).all()
@@ -64,7 +63,7 @@ def test_sampled_ends_are_safe_apart_and_spread(kind: type[Task], machine: Machi
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_tempting_ends_are_safe_and_the_goal_only_just(kind: type[Task]) -> None:
+def test_tempting_ends_are_safe_and_the_goal_only_just(kind):
     starts, goals = ends(kind)
     conditioning = PAPER_TPM.conditioning_at(goals if kind is Reach else np.stack([starts, goals]))
     assert (conditioning >= SAFE - 1e-12).all()
@@ -77,9 +76,7 @@ def test_tempting_ends_are_safe_and_the_goal_only_just(kind: type[Task]) -> None
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_line_in_joints_leads_beyond_the_threshold_and_that_in_space_along_it(
-    kind: type[Task],
-) -> None:
+def test_the_line_in_joints_leads_beyond_the_threshold_and_that_in_space_along_it(kind):
     starts, goals = ends(kind)
     unsafe = line_in_joints(PAPER_TPM, starts, goals) < SAFE  # (33, n)
     assert unsafe.any(axis=0).all()
@@ -90,7 +87,7 @@ def test_the_line_in_joints_leads_beyond_the_threshold_and_that_in_space_along_i
     assert (in_space.min(axis=0) < SAFE + BAND).all()
 
 
-def test_straight_lines_in_space_between_safe_points_stay_safe() -> None:
+def test_straight_lines_in_space_between_safe_points_stay_safe():
     """So with Cartesian actions no pair of safe ends could tempt but by where it ends."""
     region = PAPER_TPM.region
     points = np.random.default_rng(0).uniform(region.low, region.high, (4000, 3))
@@ -100,14 +97,14 @@ def test_straight_lines_in_space_between_safe_points_stay_safe() -> None:
     assert (line_in_space(safe[:half], safe[half : 2 * half]) >= SAFE).all()
 
 
-def test_lines_start_and_end_where_they_should() -> None:
+def test_lines_start_and_end_where_they_should():
     pair = np.array([PAPER_TPM.home, [0.05, 0.025, 0.85]])
     for line in (line_in_space(*pair), line_in_joints(PAPER_TPM, *pair)):
         np.testing.assert_allclose(line[[0, -1]], PAPER_TPM.conditioning_at(pair), rtol=1e-9)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_nearly_half_of_what_reaches_a_tempting_goal_is_unsafe(kind: type[Task]) -> None:
+def test_nearly_half_of_what_reaches_a_tempting_goal_is_unsafe(kind):
     _, goals = ends(kind)
     rng = np.random.default_rng(1)
     offsets = rng.normal(size=(200, 3))
@@ -119,7 +116,7 @@ def test_nearly_half_of_what_reaches_a_tempting_goal_is_unsafe(kind: type[Task])
     assert share.max() < 0.6
 
 
-def test_machines_on_which_nothing_can_be_drawn_are_told_instead_of_searched_for_ever() -> None:
+def test_machines_on_which_nothing_can_be_drawn_are_told_instead_of_searched_for_ever():
     rngs = [np.random.default_rng(0)]
     with pytest.raises(ConfigurationError, match="'sampled': on 'wide'") as caught:
         Reach(WIDE_TPM, goals="tempting").start(rngs)
@@ -133,7 +130,7 @@ def test_machines_on_which_nothing_can_be_drawn_are_told_instead_of_searched_for
     assert caught.value.name == "safe_conditioning"
 
 
-def test_a_place_from_which_no_block_can_be_pushed_is_refused_by_its_name() -> None:
+def test_a_place_from_which_no_block_can_be_pushed_is_refused_by_its_name():
     task = Push(PAPER_TPM)
     for x in (-0.24, 0.12):
         with pytest.raises(ResetOptionError, match=rf"object = \[{x}, .*0\.06 m"):

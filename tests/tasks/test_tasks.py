@@ -39,7 +39,7 @@ class TwoBlocks(PickAndPlace):
 
 
 @pytest.fixture(params=[Reach, PickAndPlace, TwoBlocks])
-def task(request: pytest.FixtureRequest) -> Task:
+def task(request):
     made: Task = request.param(PAPER_TPM, "dense")
     return made
 
@@ -55,13 +55,13 @@ def rngs(*seeds: int) -> list[np.random.Generator]:
     return [np.random.default_rng(seed) for seed in seeds or (0,)]
 
 
-def test_a_row_has_the_bits_that_it_has_alone(task: Task) -> None:
+def test_a_row_has_the_bits_that_it_has_alone(task):
     passed = np.zeros(8, dtype=bool)
     passed[5] = True
     batch = replace(states(task, count=8), working_mode_changed=passed)
     desired = np.random.default_rng(1).normal(size=(8, task.goal_size))
 
-    def results(state: State, goal: Any) -> dict[str, Any]:
+    def results(state, goal):
         achieved, penalty = task.achieved(state), task.penalty(state)
         gap = task.gap(achieved, goal)
         return {
@@ -82,7 +82,7 @@ def test_a_row_has_the_bits_that_it_has_alone(task: Task) -> None:
             np.testing.assert_array_equal(value[0], batched[name][row])
 
 
-def test_decode_is_the_inverse_of_observe(task: Task) -> None:
+def test_decode_is_the_inverse_of_observe(task):
     state = states(task, 1, 5)
     decoded = task.decode(task.observe(state))
     expected = {
@@ -101,14 +101,14 @@ def test_decode_is_the_inverse_of_observe(task: Task) -> None:
     assert set(decoded) == {entry.name for entry in task.entries}
 
 
-def test_the_observation_never_reads_the_platform_of_the_simulator(task: Task) -> None:
+def test_the_observation_never_reads_the_platform_of_the_simulator(task):
     state = states(task, 2)
     other = replace(state, platform_position=np.ones((1, 3)), platform_tilt=np.full(1, 9.0))
     np.testing.assert_array_equal(task.observe(other), task.observe(state))
     np.testing.assert_array_equal(task.achieved(other), task.achieved(state))
 
 
-def test_the_offset_to_the_block_vanishes_when_the_cup_touches_it() -> None:
+def test_the_offset_to_the_block_vanishes_when_the_cup_touches_it():
     task = PickAndPlace(PAPER_TPM)
     state = states(task, 3, object_axis=np.array([[0.0, 0.0, 1.0]]))
     state = replace(state, object_position=(state.fk_position - HANGING)[:, None])
@@ -120,7 +120,7 @@ def test_the_offset_to_the_block_vanishes_when_the_cup_touches_it() -> None:
 # -- reward ----------------------------------------------------------------------------------------
 
 
-def test_the_reward_has_the_documented_terms() -> None:
+def test_the_reward_has_the_documented_terms():
     goal, near = np.array([0.03, 0.0, 0.04]), 1 - 0.5**4
     for kind, reward, names in (
         (Reach, "sparse", {"goal": -1.0, "singularity": -2 * near}),
@@ -139,7 +139,7 @@ def test_the_reward_has_the_documented_terms() -> None:
 
 
 @pytest.mark.parametrize("mode", ["assembly", "working"])
-def test_a_mode_change_costs_the_whole_penalty(mode: str) -> None:
+def test_a_mode_change_costs_the_whole_penalty(mode):
     task = Reach(PAPER_TPM)
     for conditioning in (0.0, 0.05, 0.3):
         state = states(task, conditioning=conditioning, **{f"{mode}_mode_changed": np.True_})
@@ -147,7 +147,7 @@ def test_a_mode_change_costs_the_whole_penalty(mode: str) -> None:
         assert task.reward_terms(state, np.zeros(1), penalty)["singularity"] == -penalty == -1
 
 
-def test_sparse_rewards_follow_success() -> None:
+def test_sparse_rewards_follow_success():
     task = PickAndPlace(PAPER_TPM)
     for off, reward in ((0.0099, 0.0), (0.01, -1.0), (0.0101, -1.0), (np.nan, -1.0)):
         gap = task.gap((off, 0.0, 0.0), np.zeros(3))
@@ -156,7 +156,7 @@ def test_sparse_rewards_follow_success() -> None:
 
 
 @pytest.mark.parametrize("safe", [0.01, 0.08, 0.4, 1.0])
-def test_the_penalty_falls_with_the_conditioning_steepest_at_the_threshold(safe: float) -> None:
+def test_the_penalty_falls_with_the_conditioning_steepest_at_the_threshold(safe):
     # Flat there, crossing it would cost nothing, and policies would not care.
     task, c = Reach(replace(PAPER_TPM, safe_conditioning=safe)), np.linspace(0.0, 1.0, 1001)
     penalty = task.penalty(replace(states(task, count=1001), conditioning=c))
@@ -175,7 +175,7 @@ def test_the_penalty_falls_with_the_conditioning_steepest_at_the_threshold(safe:
         *((tuple(place), True) for place in (0.0, -0.03, 0.015) + np.diag([np.nan] * 3)),
     ],
 )
-def test_an_object_is_lost_off_the_table_and_out_of_reach(place: Any, lost: bool) -> None:
+def test_an_object_is_lost_off_the_table_and_out_of_reach(place, lost):
     task = TwoBlocks(PAPER_TPM)
     near = (0.0, -0.03, 0.015)
     for places in ((near, place), (place, near)):
@@ -186,7 +186,7 @@ def test_an_object_is_lost_off_the_table_and_out_of_reach(place: Any, lost: bool
 # -- starts ----------------------------------------------------------------------------------------
 
 
-def test_starts_repeat_with_the_rng_and_take_what_is_chosen(task: Task) -> None:
+def test_starts_repeat_with_the_rng_and_take_what_is_chosen(task):
     first, again = (task.start(rngs(7)) for _ in range(2))
     assert set(first) == {"goal", *(block.name for block in task.scene.objects)}
     for name, (place,) in first.items():
@@ -203,7 +203,7 @@ def test_starts_repeat_with_the_rng_and_take_what_is_chosen(task: Task) -> None:
 
 
 @each_machine
-def test_many_start_where_each_would(machine: Any) -> None:
+def test_many_start_where_each_would(machine):
     for task in (Reach(machine), PickAndPlace(machine)):
         many = task.start(rngs(*range(60)))
         each = [task.start(rngs(seed)) for seed in range(60)]
@@ -212,7 +212,7 @@ def test_many_start_where_each_would(machine: Any) -> None:
 
 
 @pytest.mark.parametrize("options", [{"gaol": (0, 0, 0)}, [("goal", (0, 0, 0))], {3: 4}, "goal"])
-def test_unknown_options_are_refused_with_the_known_ones(task: Task, options: Any) -> None:
+def test_unknown_options_are_refused_with_the_known_ones(task, options):
     with pytest.raises(ResetOptionError, match="'goal'") as caught:
         task.start(rngs(), options)
     assert all(block.name in str(caught.value) for block in task.scene.objects)
@@ -221,7 +221,7 @@ def test_unknown_options_are_refused_with_the_known_ones(task: Task, options: An
 
 
 @pytest.mark.parametrize("name", ["goal", "object"])
-def test_what_is_out_of_reach_is_refused_with_the_range_that_is_enforced(name: str) -> None:
+def test_what_is_out_of_reach_is_refused_with_the_range_that_is_enforced(name):
     task = PickAndPlace(PAPER_TPM)
     low, high = task.reach_of(BLOCK)
     for place in ((0.0, -0.03, 0.0135), (0.0, -0.03, -0.3), (0.0, 0.2, 0.015), (1.0, -0.03, 0.1)):
@@ -236,7 +236,7 @@ def test_what_is_out_of_reach_is_refused_with_the_range_that_is_enforced(name: s
 
 
 @each_machine
-def test_an_object_does_not_start_inside_the_robot(machine: Any) -> None:
+def test_an_object_does_not_start_inside_the_robot(machine):
     task = PickAndPlace(machine)
     home = machine.mount.to_world(machine.home)
     touching = home - HANGING
@@ -248,7 +248,7 @@ def test_an_object_does_not_start_inside_the_robot(machine: Any) -> None:
         task.start(rngs(), {"object": place})
 
 
-def test_an_object_does_not_start_inside_another() -> None:
+def test_an_object_does_not_start_inside_another():
     task = TwoBlocks(PAPER_TPM)
     task.start(rngs(), {"object": (0.022, -0.03, 0.015)})  # they touch
     for name, place in (("object", (0.023, -0.03, 0.02)), ("other", (0.01, -0.04, 0.04))):
@@ -272,9 +272,9 @@ HOME = PAPER_TPM.mount.to_world(PAPER_TPM.home)
         ({"other": np.array([(0.1, -0.03, 0.015), HOME])}, r"\['other'\] = .*clear of the robot"),
     ],
 )
-def test_a_task_that_samples_what_cannot_be_is_refused(sampled: Any, message: str) -> None:
+def test_a_task_that_samples_what_cannot_be_is_refused(sampled, message):
     class Careless(TwoBlocks):
-        def sample(self, rngs: Any, chosen: Any) -> Any:
+        def sample(self, rngs, chosen):
             start = {**super().sample(rngs, chosen), **sampled}
             return {name: place for name, place in start.items() if place is not None}
 
@@ -283,9 +283,9 @@ def test_a_task_that_samples_what_cannot_be_is_refused(sampled: Any, message: st
     assert not isinstance(caught.value, ResetOptionError)
 
 
-def test_a_sample_that_ignores_what_is_chosen_is_refused() -> None:
+def test_a_sample_that_ignores_what_is_chosen_is_refused():
     class Deaf(Reach):
-        def sample(self, rngs: Any, chosen: Any) -> Any:
+        def sample(self, rngs, chosen):
             return super().sample(rngs, {})
 
     task = Deaf(PAPER_TPM)
@@ -314,9 +314,7 @@ def test_a_sample_that_ignores_what_is_chosen_is_refused() -> None:
          "shaping()['v']"),
     ],
 )  # fmt: skip
-def test_a_method_that_mixes_robots_is_refused_by_name(
-    method: str, value: Any, blamed: str
-) -> None:
+def test_a_method_that_mixes_robots_is_refused_by_name(method, value, blamed):
     wrong = type("Wrong", (Reach,), {method: value})
     for make in (TPMEnv, TPMVectorEnv):
         with pytest.raises(ConfigurationError) as caught:
@@ -327,7 +325,7 @@ def test_a_method_that_mixes_robots_is_refused_by_name(
 # -- made by name, copied --------------------------------------------------------------------------
 
 
-def test_tasks_are_made_by_name_or_class_or_taken_as_they_are() -> None:
+def test_tasks_are_made_by_name_or_class_or_taken_as_they_are():
     by_name = make_task("pick_and_place", machine="wide", reward="dense", penalty_weight=2)
     assert (type(by_name), by_name.machine, by_name.reward) == (PickAndPlace, WIDE_TPM, "dense")
     assert by_name.penalty_weight == 2.0
@@ -347,20 +345,20 @@ def test_tasks_are_made_by_name_or_class_or_taken_as_they_are() -> None:
     ],
     ids=repr,
 )
-def test_a_task_that_is_made_takes_no_options(options: dict[str, Any]) -> None:
+def test_a_task_that_is_made_takes_no_options(options):
     with pytest.raises(ConfigurationError, match="has its own") as caught:
         make_task(Reach(PAPER_TPM), **options)
     assert caught.value.name in options
 
 
 @pytest.mark.parametrize("task", ["juggle", None, 3, dict, ["reach"]], ids=repr)
-def test_what_is_no_task_is_refused(task: Any) -> None:
+def test_what_is_no_task_is_refused(task):
     with pytest.raises(ConfigurationError, match=r"'pick_and_place', .*'reach'") as caught:
         make_task(task)
     assert caught.value.name == "task"
 
 
-def test_markers_that_do_not_fit_the_goal_are_refused_when_the_task_is_made() -> None:
+def test_markers_that_do_not_fit_the_goal_are_refused_when_the_task_is_made():
     class Unmarked(TwoBlocks):
         scene = Scene(objects=TwoBlocks.scene.objects)
 

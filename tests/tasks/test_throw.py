@@ -11,7 +11,7 @@ from machines import each_machine
 from states import random_state
 
 from tpm_gym.errors import ConfigurationError, UnreachableError
-from tpm_gym.mechanism import PAPER_TPM, WIDE_TPM, Machine
+from tpm_gym.mechanism import PAPER_TPM, WIDE_TPM
 from tpm_gym.mechanism.mount import GRAVITY
 from tpm_gym.simulation.state import CONTROL_PERIOD
 from tpm_gym.tasks import Throw
@@ -35,10 +35,8 @@ def thrown(env: Any, seed: int, **options: Any) -> tuple[Any, Any]:
 @each_engine
 @each_machine
 @pytest.mark.parametrize("episodes", [20, pytest.param(200, marks=pytest.mark.slow)])
-def test_the_expert_throws_to_within_a_fourth_of_the_tolerance(
-    engine: str, machine: Machine, episodes: int
-) -> None:
-    env: Any = gym.make("TPMThrow-v0", engine=engine, machine=machine)
+def test_the_expert_throws_to_within_a_fourth_of_the_tolerance(engine, machine, episodes):
+    env = gym.make("TPMThrow-v0", engine=engine, machine=machine)
     low, high = env.unwrapped.task.reach_of(Throw.block)
     ends = set()
     for seed in range(episodes):
@@ -52,8 +50,8 @@ def test_the_expert_throws_to_within_a_fourth_of_the_tolerance(
 
 
 @each_machine
-def test_tempting_ways_are_only_just_safe(machine: Machine) -> None:
-    env: Any = gym.make("TPMThrow-v0", engine="analytic", machine=machine, goals="tempting")
+def test_tempting_ways_are_only_just_safe(machine):
+    env = gym.make("TPMThrow-v0", engine="analytic", machine=machine, goals="tempting")
     for seed in range(6):
         *steps, (_, _, info) = expert_episode(env, seed, Throw.max_episode_steps)
         least = min(info["conditioning"] for _, _, info in steps) / machine.safe_conditioning
@@ -62,8 +60,8 @@ def test_tempting_ways_are_only_just_safe(machine: Machine) -> None:
 
 
 @each_engine
-def test_a_block_slides_as_far_as_its_speed_squared_by_twice_mu_g(engine: str) -> None:
-    env: Any = gym.make("TPMThrow-v0", engine=engine)
+def test_a_block_slides_as_far_as_its_speed_squared_by_twice_mu_g(engine):
+    env = gym.make("TPMThrow-v0", engine=engine)
     low, high = env.unwrapped.task.reach_of(Throw.block)
     for end in (low[0] - 0.05, low[0] - 0.14, high[0] + 0.1):
         _, rows = thrown(env, 0, goal=(end, -0.035, 0.015))
@@ -81,8 +79,8 @@ SLOW = replace(PAPER_TPM, step_limit=(0.022, 0.005, 0.030))  # too slow for the 
 
 
 @pytest.mark.parametrize("machine", [PAPER_TPM, WIDE_TPM, SLOW])
-def test_the_expert_throws_to_the_ends_of_the_range(machine: Machine) -> None:
-    env: Any = gym.make("TPMThrow-v0", engine="analytic", machine=machine)
+def test_the_expert_throws_to_the_ends_of_the_range(machine):
+    env = gym.make("TPMThrow-v0", engine="analytic", machine=machine)
     y = machine.mount.to_world(machine.home)[1]
     for box in env.unwrapped.task.goals_of(Throw.block):
         for corner in box:
@@ -91,7 +89,7 @@ def test_the_expert_throws_to_the_ends_of_the_range(machine: Machine) -> None:
 
 
 @each_machine
-def test_goals_out_of_throwing_range_are_refused_with_the_range(machine: Machine) -> None:
+def test_goals_out_of_throwing_range_are_refused_with_the_range(machine):
     task, rng = Throw(machine), [np.random.default_rng(0)]
     (left, start), (stop, right) = task.goals_of(Throw.block)
     inside = machine.mount.to_world(machine.home)
@@ -112,20 +110,20 @@ def test_goals_out_of_throwing_range_are_refused_with_the_range(machine: Machine
 
 
 @pytest.mark.parametrize("change", [{"table": (0.19, 0.3)}, {"step_limit": (0.016, 0.005, 0.03)}])
-def test_machines_that_cannot_throw_are_refused_by_name(change: dict[str, Any]) -> None:
+def test_machines_that_cannot_throw_are_refused_by_name(change):
     with pytest.raises(ConfigurationError, match=r"'paper'.*table.*beyond its") as caught:
         Throw(replace(PAPER_TPM, **change))
     assert caught.value.name == "machine"
 
 
-def test_a_machine_throws_only_where_its_table_goes_on() -> None:
+def test_a_machine_throws_only_where_its_table_goes_on():
     task = Throw(replace(WIDE_TPM, table=(0.5, 0.65)))
     goals = task.start([np.random.default_rng(seed) for seed in range(20)])["goal"]
     assert (goals[:, 0] < task.reach_of(Throw.block)[0][0]).all()
 
 
 @pytest.mark.parametrize("place", [-0.38, -0.1, 0.26])
-def test_a_block_on_its_way_to_a_goal_is_not_lost_and_costs_no_way_to_the_cup(place: float) -> None:
+def test_a_block_on_its_way_to_a_goal_is_not_lost_and_costs_no_way_to_the_cup(place):
     task = Throw(PAPER_TPM, "dense")
     at = np.array([[[place, -0.03, 0.015]]])
     state = random_state(np.random.default_rng(0), (1,), 1, object_position=at)

@@ -1,8 +1,6 @@
 """The page in Chromium: it loads, is dragged, switches modes and plays, without a complaint."""
 
-from collections.abc import Iterator
 from contextlib import closing
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,13 +17,13 @@ pytestmark = [
 
 
 @pytest.fixture(scope="module")
-def viewer() -> Iterator[Viewer]:
+def viewer():
     with closing(open_viewer("paper", port=0)) as viewer:
         yield viewer
 
 
 @pytest.fixture
-def browser(viewer: Viewer) -> Iterator[Browser]:
+def browser(viewer):
     with closing(Browser(viewer.address)) as browser:
         until(viewer.server.get_clients)
         yield browser
@@ -53,7 +51,7 @@ def test_the_gizmo_drags_the_robot(viewer, browser):
 
     until(lambda: browser.frames(5) < 4.0, 180.0)  # the scene is there
 
-    def dragged() -> bool:
+    def dragged():
         """Take the arrow along the machine's x, some way from P."""
         ends = (on_screen(viewer, before + [reach, 0, 0]) for reach in (0.09, 0.15))
         (x, y), (u, v) = ends
@@ -99,13 +97,13 @@ def test_an_episode_is_played_with_plots(viewer, browser):
     assert drawn_gap(viewer) < 1e-9
 
 
-def test_the_exported_page_moves_without_a_server(tmp_path: Path):
+def test_the_exported_page_moves_without_a_server(tmp_path):
     run(ViewConfig(export=tmp_path))
     with closing(Browser((tmp_path / "index.html").as_uri())) as browser:
         until(lambda: browser.evaluate("!!document.querySelector('canvas')"))
         seen = set()
 
-        def moved() -> bool:
+        def moved():
             browser.picture(tmp_path / "shot.png")
             seen.add((tmp_path / "shot.png").read_bytes())
             return len(seen) > 5

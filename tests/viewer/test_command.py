@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 import urllib.request
-from pathlib import Path
 
 import psutil
 import pytest
@@ -59,7 +58,7 @@ def test_importing_the_room_imports_no_viser():
     assert done.stdout.strip() == "False"
 
 
-def test_an_export_is_one_page_with_an_episode(tmp_path: Path, capsys):
+def test_an_export_is_one_page_with_an_episode(tmp_path, capsys):
     run(ViewConfig(export=tmp_path / "new" / "folder"))
     page = tmp_path / "new" / "folder" / "index.html"
     assert capsys.readouterr().out == f"{page}\n"
@@ -71,7 +70,7 @@ def test_an_export_is_one_page_with_an_episode(tmp_path: Path, capsys):
     assert not re.search(r"""<(script|link|img)[^>]*(src|href)=["']?https?:""", text)
 
 
-def test_an_export_replaces_no_page_of_others_and_no_file(tmp_path: Path):
+def test_an_export_replaces_no_page_of_others_and_no_file(tmp_path):
     page = tmp_path / "index.html"
     page.write_text("<html>mine</html>")
     for folder in (tmp_path, page):

@@ -1,7 +1,6 @@
 """The viewer without a browser: its controls act, what it draws closes, and it plays every task."""
 
 import time
-from collections.abc import Iterator
 from contextlib import closing
 from html import escape
 from itertools import product
@@ -25,13 +24,13 @@ from tpm_gym.viewer.viewer import Viewer
 
 
 @pytest.fixture(scope="module")
-def shared() -> Iterator[Viewer]:
+def shared():
     with closing(open_viewer("wide", port=0)) as viewer:
         yield viewer
 
 
 @pytest.fixture
-def viewer(shared: Viewer) -> Viewer:
+def viewer(shared):
     """Return the viewer at its home."""
     choose(shared, shared.machine, "wide")
     for name, box in shared.shown.items():
@@ -142,7 +141,7 @@ def test_layers_are_drawn_when_shown_and_gone_when_hidden(viewer):
     }  # fmt: skip
     assert nodes.keys() == LAYERS.keys()
 
-    def drawn() -> set[str]:
+    def drawn():
         find = viewer.server.scene.get_handle_by_name
         return {name for name, node in nodes.items() if find(f"/robot/{node}") is not None}
 

@@ -57,9 +57,7 @@ def column(states: Any, episodes: int, name: str) -> FloatArray:
         ("random", 1000, 4e-3),  # 0.3e-2
     ],
 )
-def test_with_free_hands_it_feels_and_sees_what_pybullet_does(
-    policy: str, rate: int, bound: float
-) -> None:
+def test_with_free_hands_it_feels_and_sees_what_pybullet_does(policy, rate, bound):
     episodes, physics = 3, {"time_step": 1 / rate}
     states, actions = played(REACH, policy, episodes, physics=physics)
     found = repeated(REACH, actions, physics=physics)
@@ -80,7 +78,7 @@ def test_with_free_hands_it_feels_and_sees_what_pybullet_does(
         (PICK, 1e-3, 1e-2),  # 2e-5 m; it nudges the block now and then: 5e-3
     ],
 )
-def test_the_block_goes_where_pybullet_takes_it(policy: str, median: float, most: float) -> None:
+def test_the_block_goes_where_pybullet_takes_it(policy, median, most):
     episodes = 6
     states, actions = played(PICK, policy, episodes)
     found = repeated(PICK, actions)
@@ -94,7 +92,7 @@ def test_the_block_goes_where_pybullet_takes_it(policy: str, median: float, most
 
 
 @pytest.mark.slow
-def test_two_blocks_end_where_they_do_in_mujoco() -> None:
+def test_two_blocks_end_where_they_do_in_mujoco():
     some = cases(40)
     found = agreement(play(some, "analytic", 1 / 250), play(some, "mujoco", 1 / 2000))
     assert found["toppled"] >= 0.9
@@ -104,6 +102,6 @@ def test_two_blocks_end_where_they_do_in_mujoco() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("noise", [0.0, 0.3, 0.8])
-def test_success_hardly_depends_on_the_time_step(noise: float) -> None:
+def test_success_hardly_depends_on_the_time_step(noise):
     once, finer = (success("analytic", step, noise, 1000) for step in (1 / 250, 1 / 1000))
     assert once == pytest.approx(finer, abs=0.04)  # 0.015 apart; 0.018 is the standard error

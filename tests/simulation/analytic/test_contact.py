@@ -1,7 +1,5 @@
 """Objects, cups and vacuum of the analytic engine: laws of contact, and MuJoCo's results."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 import os
@@ -16,9 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 from alone import Alone
-from numpy.typing import ArrayLike
 
-from tpm_gym.arrays import FloatArray, Vector
+from tpm_gym.arrays import FloatArray
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.mount import GRAVITY
 from tpm_gym.mechanism.tpm import WIDE_TPM
@@ -110,7 +107,7 @@ def compared(commands: list[FloatArray], on: list[bool]) -> tuple[Run, Run]:
     """One block under a cup that is led by commands: ours, and MuJoCo's."""
     sim, mount = simulation(), WIDE_TPM.mount
 
-    def theta(points: ArrayLike) -> FloatArray:
+    def theta(points):
         return WIDE_TPM.inverse(mount.to_paper(points))
 
     path, switched = spline(commands), np.repeat(on[: len(commands) - 1], STEPS)
@@ -131,7 +128,7 @@ def compared(commands: list[FloatArray], on: list[bool]) -> tuple[Run, Run]:
 # -- as MuJoCo ----------------------------------------------------------------------------------
 
 
-def test_a_pick_a_way_and_a_release_are_those_of_mujoco() -> None:
+def test_a_pick_a_way_and_a_release_are_those_of_mujoco():
     high, low = ON_TOP + [0.003, -0.002, 0.05], ON_TOP + [0.003, -0.002, -0.0006]
     there = low + [0.06, -0.05, 0.0]
     commands = [high, *line(high, low, 5, 3), *line(low, high, 5), *line(high, there, 6, 3)]
@@ -144,7 +141,7 @@ def test_a_pick_a_way_and_a_release_are_those_of_mujoco() -> None:
 
 
 @pytest.mark.parametrize("speed", [0.3, 0.5, 0.6, 0.75])
-def test_what_is_grabbed_in_full_sweep_is_held_or_lost_as_in_mujoco(speed: float) -> None:
+def test_what_is_grabbed_in_full_sweep_is_held_or_lost_as_in_mujoco(speed):
     step = speed * STEP * STEPS * np.array([1.0, 0.0, 0.0])
     commands = [ON_TOP + [0.0, 0.0, 0.02] + (k - 6) * step for k in range(14)]
     for k, command in enumerate(commands):
@@ -154,7 +151,7 @@ def test_what_is_grabbed_in_full_sweep_is_held_or_lost_as_in_mujoco(speed: float
 
 
 @pytest.mark.parametrize("way", [(0.03, 0.0, 0.0), (0.0, 0.02, 0.01), (0.015, -0.02, -0.004)])
-def test_what_is_thrown_comes_to_rest_where_it_does_in_mujoco(way: Vector) -> None:
+def test_what_is_thrown_comes_to_rest_where_it_does_in_mujoco(way):
     top = ON_TOP + [0.0, 0.0, 0.06]
     ends = [top + i * np.array(way) for i in range(6)]
     commands = [ON_TOP, *line(ON_TOP, ON_TOP, 4), *line(ON_TOP, top, 5), *ends[1:], *[ends[-1]] * 9]
@@ -163,7 +160,7 @@ def test_what_is_thrown_comes_to_rest_where_it_does_in_mujoco(way: Vector) -> No
     assert math.dist(ours.position[-1, 0], theirs.position[-1, 0]) < 2e-3
 
 
-def test_a_press_without_vacuum_moves_nothing() -> None:
+def test_a_press_without_vacuum_moves_nothing():
     low = ON_TOP + [0.004, 0.0, -0.0025]
     commands = [ON_TOP + [0.004, 0.0, 0.03], *line(ON_TOP + [0.004, 0.0, 0.03], low, 4, 2)]
     commands += line(low, low + [0.008, 0.0, 0.0], 4, 2)
@@ -176,7 +173,7 @@ def test_a_press_without_vacuum_moves_nothing() -> None:
 
 @pytest.mark.parametrize("way", [(1.0, 0.0, 0.0), (0.0, -1.0, 0.0)])
 @pytest.mark.parametrize("depth", [0.0025, 0.006])
-def test_a_lip_dragged_over_an_edge_tips_it_as_in_mujoco(way: Vector, depth: float) -> None:
+def test_a_lip_dragged_over_an_edge_tips_it_as_in_mujoco(way, depth):
     high, low = ON_TOP + [0.0, 0.0, 0.01], ON_TOP + [0.0, 0.0, -depth]
     end = low + 0.05 * np.array(way)
     commands = [high, *line(high, low, 3, 2), *line(low, end, 4, 8)]
@@ -189,7 +186,7 @@ def test_a_lip_dragged_over_an_edge_tips_it_as_in_mujoco(way: Vector, depth: flo
 # -- by the laws --------------------------------------------------------------------------------
 
 
-def test_what_stands_alone_keeps_its_bits_and_what_falls_comes_to_rest() -> None:
+def test_what_stands_alone_keeps_its_bits_and_what_falls_comes_to_rest():
     contact = table([np.array([0.0, 0.0, 0.015]), np.array([0.1, 0.0, 0.2])])
     heights = wait(contact, 150).position[:, :, 2]
     assert (heights > 0.0145).all()
@@ -200,9 +197,7 @@ def test_what_stands_alone_keeps_its_bits_and_what_falls_comes_to_rest() -> None
 
 
 @pytest.mark.parametrize(("acceleration", "kept"), [(220.0, True), (235.0, False)])
-def test_what_is_pulled_harder_than_the_vacuum_can_comes_off(
-    acceleration: float, kept: bool
-) -> None:
+def test_what_is_pulled_harder_than_the_vacuum_can_comes_off(acceleration, kept):
     # 12 N on 50 g are 230.2 m/s^2 beside the weight
     times = STEP * np.arange(8)
     rise = np.concatenate([np.zeros(62), acceleration * times**2 / 2])
@@ -213,7 +208,7 @@ def test_what_is_pulled_harder_than_the_vacuum_can_comes_off(
         assert ours.force[-1] == pytest.approx([0.0, 0.0, -total], rel=1e-3)
 
 
-def test_a_heavier_one_comes_off_and_a_smoother_one_slides_farther() -> None:
+def test_a_heavier_one_comes_off_and_a_smoother_one_slides_farther():
     contact, every = on_tables(1, 3), np.arange(3)
     contact.place(every, np.tile(MIDDLE, (3, 1, 1)))
     contact.alter(every, np.array([1.0, 1.0, 30.0]), np.array([1.0, 0.5, 1.0]))
@@ -232,7 +227,7 @@ def test_a_heavier_one_comes_off_and_a_smoother_one_slides_farther() -> None:
     assert ways[2] == 0.0
 
 
-def test_friction_is_as_strong_in_all_directions() -> None:
+def test_friction_is_as_strong_in_all_directions():
     speed, slid = 0.5, []
     moving = np.maximum(np.arange(-60, 60), 0) * speed * STEP
     rising = np.minimum(np.maximum(np.arange(-50, 70), 0), 10) * 2e-5
@@ -247,7 +242,7 @@ def test_friction_is_as_strong_in_all_directions() -> None:
     assert max(slid) < 1.01 * min(slid)
 
 
-def test_without_friction_the_platform_takes_what_the_block_gains() -> None:
+def test_without_friction_the_platform_takes_what_the_block_gains():
     contact = table([MIDDLE])
     contact.alter(np.arange(1), np.ones(1), np.full(1, 1e-9))
     start = ON_TOP + [-0.05, 0.005, -0.001]
@@ -257,12 +252,12 @@ def test_without_friction_the_platform_takes_what_the_block_gains() -> None:
     np.testing.assert_allclose(gained[:2], BLOCK.mass * velocity[:2], rtol=1e-3, atol=1e-9)
 
 
-def test_beyond_the_table_it_falls_to_the_floor() -> None:
+def test_beyond_the_table_it_falls_to_the_floor():
     contact = table([np.array([0.29, 0.0, 0.015]), np.array([0.4, 0.0, 0.015])], (0.3, 0.3))
     assert wait(contact, 300).position[-1, :, 2] == pytest.approx([0.015, -0.485], abs=5e-5)
 
 
-def test_without_objects_there_is_nothing_to_report() -> None:
+def test_without_objects_there_is_nothing_to_report():
     contact = on_tables(0, 3)
     found = advance(contact, np.arange(3), np.zeros((3, 12, 3)), np.ones(3, dtype=bool))
     assert not any(part.any() for part in found)
@@ -291,9 +286,7 @@ def stacked(offset: float, angle: float = 0.0) -> Contact:
         (0.027, math.pi / 4, False),
     ],
 )
-def test_a_stack_stands_as_long_as_the_upper_middle_is_over_the_lower_block(
-    offset: float, angle: float, stands: bool
-) -> None:
+def test_a_stack_stands_as_long_as_the_upper_middle_is_over_the_lower_block(offset, angle, stands):
     run = wait(stacked(offset, angle), 150)
     assert (run.tilt.max() < 0.01) == stands
     if stands:
@@ -303,7 +296,7 @@ def test_a_stack_stands_as_long_as_the_upper_middle_is_over_the_lower_block(
         assert run.position[-1, 1, 2] < 0.02
 
 
-def test_the_upper_one_is_taken_and_put_back_and_the_lower_one_stays() -> None:
+def test_the_upper_one_is_taken_and_put_back_and_the_lower_one_stays():
     contact, top = stacked(0.004), ON_TOP + HEIGHT * UP
     commands = [top + 0.03 * UP, *line(top + 0.03 * UP, top, 4, 3)]
     up = commands + line(top, top + 0.05 * UP, 4)
@@ -318,7 +311,7 @@ def test_the_upper_one_is_taken_and_put_back_and_the_lower_one_stays() -> None:
     assert run.tilt.max() < 0.02
 
 
-def test_one_block_shoves_another() -> None:
+def test_one_block_shoves_another():
     contact = table([MIDDLE, MIDDLE + [WIDTH + 0.004, 0.0, 0.0]])
     start = ON_TOP + [-0.05, 0.0, -0.002]
     run = lead(contact, spline([start, *line(start, start + [0.06, 0.0, 0.0], 20, 8)]))
@@ -329,7 +322,7 @@ def test_one_block_shoves_another() -> None:
     assert first[1] == pytest.approx(MIDDLE[1], abs=1e-3)
 
 
-def test_whatever_the_cup_does_all_stays_finite_and_on_the_table() -> None:
+def test_whatever_the_cup_does_all_stays_finite_and_on_the_table():
     rng, rows, count, held = np.random.default_rng(0), 60, 3, list[int]()
     contact = on_tables(count, rows)
     places = np.zeros((rows, count, 3)) + np.arange(count)[:, None] * [0.0, 0.0, HEIGHT]
@@ -382,7 +375,7 @@ def digest() -> str:
     return hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest()
 
 
-def test_compiled_code_gives_the_bits_that_python_gives() -> None:
+def test_compiled_code_gives_the_bits_that_python_gives():
     here = Path(__file__).parent
     script = "import sys; sys.path[:0] = sys.argv[1:]; import test_contact as t; print(t.digest())"
     plain = subprocess.run(
@@ -395,7 +388,7 @@ def test_compiled_code_gives_the_bits_that_python_gives() -> None:
     assert plain.stdout.strip() == digest()
 
 
-def test_a_row_has_the_same_bits_alone_and_among_others() -> None:
+def test_a_row_has_the_same_bits_alone_and_among_others():
     count = 64
     places, ways = crowd(count, seed=0)
     on = np.random.default_rng(1).random((8, count)) < 0.6
@@ -410,7 +403,7 @@ def test_a_row_has_the_same_bits_alone_and_among_others() -> None:
             np.testing.assert_array_equal(part, whole[rows])
 
 
-def test_rows_may_be_advanced_apart_by_any_steps_and_go_on_from_what_was_saved() -> None:
+def test_rows_may_be_advanced_apart_by_any_steps_and_go_on_from_what_was_saved():
     places, ways = crowd(12, seed=3)
     whole = history(places, ways, np.ones((8, 12), dtype=bool))
     made = [on_tables(2, 12) for _ in range(2)]

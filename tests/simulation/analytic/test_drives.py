@@ -1,7 +1,5 @@
 """Drives of the analytic engine: forward dynamics, motors that tire, and PyBullet as the judge."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 
@@ -46,7 +44,7 @@ def at_rest(theta: FloatArray, carried: float = 0.0) -> Course:
     return Course(theta, rates, torque, position, position, force, nothing + carried, nothing)
 
 
-def test_resistance_is_coulombs_in_every_one_of_the_27_cases() -> None:
+def test_resistance_is_coulombs_in_every_one_of_the_27_cases():
     rng = np.random.default_rng(0)
     signs = set()
     for _ in range(4000):
@@ -70,14 +68,12 @@ def energy_gained(time_step: float, payload: float) -> FloatArray:
     fall = np.array(PAPER_TPM.mount.free_fall)
     weight, carried = np.tile(payload * fall, (2, 1)), np.full(2, payload)
 
-    def touch(
-        before: FloatArray, now: FloatArray, then: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def touch(before, now, then):
         points = np.stack([before, now, then], axis=1)
         before, at, now = points.swapaxes(0, 1)
         return weight - payload * (now - 2 * at + before) / time_step**2, carried
 
-    def energy(course: Course) -> tuple[FloatArray, FloatArray]:
+    def energy(course):
         return kinetic_and_potential(course.theta, course.rates, payload)
 
     start, count = at_rest(theta), round(0.08 / time_step)
@@ -95,13 +91,13 @@ def kinetic_and_potential(theta: Any, rates: Any, payload: float = 0.0) -> Any:
 
 
 @pytest.mark.parametrize("payload", [0.0, 0.5])
-def test_what_swings_freely_keeps_its_energy_to_the_integrators_order(payload: float) -> None:
+def test_what_swings_freely_keeps_its_energy_to_the_integrators_order(payload):
     gained = np.array([energy_gained(step, payload) for step in (1e-3, 5e-4, 2.5e-4)])
     assert np.abs(gained[-1]).max() < 5e-3
     np.testing.assert_allclose(gained[:-1] / gained[1:], 2.0, atol=0.15)
 
 
-def test_motors_with_torque_to_spare_are_where_they_shall_be() -> None:
+def test_motors_with_torque_to_spare_are_where_they_shall_be():
     # So forward dynamics give what inverse dynamics give.
     theta = PAPER_TPM.inverse(np.linspace(HOME, HOME + (0.03, 0.01, -0.03), 14))[:, None]
     course = at_rest(theta[1])._replace(rates=(theta[1] - theta[0]) / STEP)
@@ -156,20 +152,18 @@ def followed(way: Iterator[FloatArray], plant: Plant, drive: Any, **physics: Any
     ],
     ids=["smooth", "random", "astray"],
 )
-def test_servos_move_as_in_pybullet(
-    scripted: bool, plant: Plant, torque: float, point: float
-) -> None:
+def test_servos_move_as_in_pybullet(scripted, plant, torque, point):
     theirs, ours, theta, position = followed(commands(scripted), plant, "servo")
     assert rms(theirs - ours) < torque * rms(theirs)
     assert rms(position) < point
     assert rms(theta) < 2e-5
 
 
-def test_a_servo_presses_carries_and_lets_go_as_in_pybullet() -> None:
+def test_a_servo_presses_carries_and_lets_go_as_in_pybullet():
     runs = []
     for engine in ("pybullet", "analytic"):
         env = gym.make("TPMPickAndPlace-v0", engine=engine, drive="servo")
-        inside: Any = env.unwrapped
+        inside = env.unwrapped
         rows = []
         for *_, info in expert_episode(env, 0):
             state = inside.state
@@ -185,7 +179,7 @@ def test_a_servo_presses_carries_and_lets_go_as_in_pybullet() -> None:
     assert np.abs(theirs - ours)[:, 3:6].max() < 2e-4
 
 
-def test_motors_that_tire_do_as_in_pybullet() -> None:
+def test_motors_that_tire_do_as_in_pybullet():
     theirs, ours = (
         Alone(engine=engine, physics={"time_step": 1e-3, **more})
         for engine, more in (("pybullet", {}), ("analytic", {"torques": "every"}))
@@ -218,7 +212,7 @@ def batch_of(plants: list[Plant], **options: Any) -> Any:
     return simulation
 
 
-def test_motors_that_tired_catch_up_and_are_ideal_again() -> None:
+def test_motors_that_tired_catch_up_and_are_ideal_again():
     pair, apart = batch_of([WEAK, Plant()]), []
     for shift in (0.0, 0.03, *[-0.03] * 5):
         command = HOME + (shift, 0.010, -max(0.0, shift))
@@ -232,7 +226,7 @@ def test_motors_that_tired_catch_up_and_are_ideal_again() -> None:
     np.testing.assert_allclose(*state.theta_dot, atol=1e-9)
 
 
-def test_torques_are_of_the_last_time_step_or_of_every_one_or_none() -> None:
+def test_torques_are_of_the_last_time_step_or_of_every_one_or_none():
     runs = {
         kind: batch_of([Plant()], physics={"torques": kind}) for kind in ("none", "last", "every")
     }
@@ -249,9 +243,7 @@ def test_torques_are_of_the_last_time_step_or_of_every_one_or_none() -> None:
 
 
 @pytest.mark.parametrize(("drive", "seed"), [(None, 3), (Servo(), 7)], ids=["ideal", "servo"])
-def test_what_is_thrown_through_the_singularity_says_so_and_waits_for_a_reset(
-    drive: Any, seed: int
-) -> None:
+def test_what_is_thrown_through_the_singularity_says_so_and_waits_for_a_reset(drive, seed):
     simulation, vacuum = batch_of([WEAK, Plant()], drive=drive), np.zeros(2, dtype=bool)
     for command in commands(False, 10, seed):
         simulation.move(np.array([command] * 2), vacuum)

@@ -6,9 +6,6 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import pybullet
 import pytest
@@ -35,7 +32,7 @@ def in_a_process(script: str, **variables: str) -> tuple[str, str]:
 
 
 @pytest.fixture
-def client() -> Iterator[Client]:
+def client():
     gc.collect()  # clients that earlier tests left
     client = Client(Physics())
     yield client
@@ -50,7 +47,7 @@ def drop(client: Client) -> int:
     return body
 
 
-def test_functions_act_on_this_client_alone(client: Client) -> None:
+def test_functions_act_on_this_client_alone(client):
     other = Client(Physics())
     ball = drop(client)
     assert (client.getNumBodies(), other.getNumBodies()) == (1, 0)
@@ -65,7 +62,7 @@ def test_functions_act_on_this_client_alone(client: Client) -> None:
 @pytest.mark.parametrize(
     "physics", [Physics(), Physics(time_step=1 / 500, solver="iterative", iterations=17, erp=0.3)]
 )
-def test_settings_are_in_force_and_again_after_a_reset_of_the_client(physics: Physics) -> None:
+def test_settings_are_in_force_and_again_after_a_reset_of_the_client(physics):
     client = Client(physics)
     for _ in range(2):
         settings = client.getPhysicsEngineParameters()
@@ -82,7 +79,7 @@ def test_settings_are_in_force_and_again_after_a_reset_of_the_client(physics: Ph
     client.close()
 
 
-def test_nothing_is_printed(capfd: pytest.CaptureFixture[str]) -> None:
+def test_nothing_is_printed(capfd):
     print("before", end=" ")
     client = Client(Physics())
     client.configure(Physics())
@@ -91,7 +88,7 @@ def test_nothing_is_printed(capfd: pytest.CaptureFixture[str]) -> None:
     assert capfd.readouterr() == ("before after\n", "")
 
 
-def test_closed_means_closed_and_twice_is_harmless(client: Client) -> None:
+def test_closed_means_closed_and_twice_is_harmless(client):
     numbers = {client.number}
     client.stepSimulation()
     for _ in range(20):
@@ -105,7 +102,7 @@ def test_closed_means_closed_and_twice_is_harmless(client: Client) -> None:
     assert len(numbers) == 1  # given back each time
 
 
-def test_what_is_dropped_is_given_back() -> None:
+def test_what_is_dropped_is_given_back():
     gc.collect()  # clients that earlier tests left
     free = Client(Physics()).number
     kept = Client(Physics())
@@ -118,7 +115,7 @@ def test_what_is_dropped_is_given_back() -> None:
 
 
 @pytest.mark.parametrize("renderer", ["raytracer", "", 1])
-def test_an_unknown_renderer_is_refused_and_the_client_given_back(renderer: Any) -> None:
+def test_an_unknown_renderer_is_refused_and_the_client_given_back(renderer):
     first = Client(Physics())
     free = first.number
     first.close()
@@ -130,15 +127,13 @@ def test_an_unknown_renderer_is_refused_and_the_client_given_back(renderer: Any)
     again.close()
 
 
-def test_egl_that_is_not_there_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_egl_that_is_not_there_is_refused(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(ConfigurationError, match="no EGL"):
         Client(Physics(), renderer="egl")
 
 
-def test_where_no_file_can_be_written_the_error_says_so(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_where_no_file_can_be_written_the_error_says_so(monkeypatch, tmp_path):
     free = Client(Physics()).number
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "missing"))
     with pytest.raises(ConfigurationError, match="folder that can be written to") as caught:
@@ -155,13 +150,13 @@ def test_where_no_file_can_be_written_the_error_says_so(
 
 @posix
 @pytest.mark.parametrize("gone", ["sys.stdout.close()", "os.close(1); sys.stdout = None"])
-def test_environments_are_made_where_there_is_no_standard_output(gone: str) -> None:
+def test_environments_are_made_where_there_is_no_standard_output(gone):
     made = f"{gone}\nenv = gym.make('TPMReach-v0')\nenv.reset(seed=0)\nsys.stderr.write('made')"
     assert "made" in in_a_process(made)[1]
 
 
 @posix
-def test_silence_takes_what_c_writes_too_and_may_be_nested() -> None:
+def test_silence_takes_what_c_writes_too_and_may_be_nested():
     said, _ = in_a_process("""
 import ctypes
 from tpm_gym.simulation.bullet.client import silence
@@ -177,7 +172,7 @@ c.puts(b"c after")
 
 
 @posix
-def test_threads_that_make_environments_leave_standard_output_as_it_was() -> None:
+def test_threads_that_make_environments_leave_standard_output_as_it_was():
     _, said = in_a_process("""
 import time
 from threading import Thread
@@ -214,7 +209,7 @@ REFUSED = "ConfigurationError render_mode;"
 
 
 @posix
-def test_a_display_that_does_not_answer_is_a_typed_error() -> None:
+def test_a_display_that_does_not_answer_is_a_typed_error():
     _, said = in_a_process(
         OPEN
         + """
@@ -233,7 +228,7 @@ SCREENS = [
 
 
 @pytest.fixture(params=SCREENS)
-def screen(request: pytest.FixtureRequest) -> Iterator[str]:
+def screen(request):
     """DISPLAY of an X server that draws into memory."""
     if shutil.which("Xvfb") is None:
         pytest.skip("needs Xvfb")
@@ -244,9 +239,7 @@ def screen(request: pytest.FixtureRequest) -> Iterator[str]:
         server.terminate()
 
 
-def test_a_second_window_is_a_typed_error_and_the_first_goes_on(
-    screen: str, request: pytest.FixtureRequest
-) -> None:
+def test_a_second_window_is_a_typed_error_and_the_first_goes_on(screen, request):
     _, said = in_a_process(
         OPEN
         + """
@@ -265,9 +258,7 @@ if first:
 
 
 @pytest.mark.parametrize("engine", ["pybullet", "mujoco", "analytic"])
-def test_a_window_shows_robots_of_all_lengths_and_prints_nothing(
-    screen: str, engine: str, request: pytest.FixtureRequest
-) -> None:
+def test_a_window_shows_robots_of_all_lengths_and_prints_nothing(screen, engine, request):
     pytest.importorskip("pybullet" if engine == "analytic" else engine)
     printed, said = in_a_process(
         f"""
@@ -298,10 +289,8 @@ except tpm_gym.TPMError as error:
 
 
 @pytest.mark.parametrize("how", ["refuses", "raises"])
-def test_a_window_that_does_not_open_is_a_typed_error(
-    monkeypatch: pytest.MonkeyPatch, how: str
-) -> None:
-    def connect(mode: int, options: str) -> int:
+def test_a_window_that_does_not_open_is_a_typed_error(monkeypatch, how):
+    def connect(mode, options):
         if how == "raises":
             raise pybullet.error("Only one local in-process GUI connection allowed.")
         return -1

@@ -1,7 +1,7 @@
 """urdf/tpm.urdf and its loops in plain PyBullet, without this package's engine."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -73,25 +73,25 @@ class Robot:
 
 
 @pytest.fixture
-def robot() -> Iterator[Robot]:
+def robot():
     loaded = Robot()
     yield loaded
     loaded.client.disconnect()
 
 
-def test_the_loops_hold_with_the_solver_that_its_head_names(robot: Robot) -> None:
+def test_the_loops_hold_with_the_solver_that_its_head_names(robot):
     robot.client.setPhysicsEngineParameter(numSolverIterations=300, erp=1.0)
     assert 0 < robot.largest_gap() < 0.5e-3
 
 
-def test_the_loops_do_not_hold_with_a_direct_solver(robot: Robot) -> None:
+def test_the_loops_do_not_hold_with_a_direct_solver(robot):
     robot.client.setPhysicsEngineParameter(
         constraintSolverType=robot.client.CONSTRAINT_SOLVER_LCP_DANTZIG
     )
     assert robot.largest_gap() > 10e-3
 
 
-def test_the_file_closes_with_link_3p_turned(robot: Robot) -> None:
+def test_the_file_closes_with_link_3p_turned(robot):
     closed = 0
     for theta in np.random.default_rng(4).uniform(-np.pi, np.pi, (300, 3)):
         found = forward_rotated(theta)

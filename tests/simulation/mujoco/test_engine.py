@@ -1,10 +1,6 @@
 """What MuJoCo alone does: its own frames, its console, its missing package."""
 
-from __future__ import annotations
-
 import sys
-from pathlib import Path
-from typing import Any
 from unittest.mock import patch
 
 import gymnasium as gym
@@ -24,10 +20,10 @@ HOME = PAPER_TPM.home
 THETA = PAPER_TPM.inverse(HOME)
 
 
-def test_turning_is_told_in_the_world() -> None:
+def test_turning_is_told_in_the_world():
     simulation = Alone(Scene(objects=(Block(),)), engine="mujoco")
     simulation.reset(THETA, {"object": (0.2, 0.1, 0.3)})
-    engine: Any = simulation.engine
+    engine = simulation.engine
     joint = engine.data.joint(object_name(0))
     joint.qpos[3:] = np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0  # a quarter turn about x
     joint.qvel[3:] = 0.0, 2.0, 0.0  # about its own y, which points up now
@@ -37,7 +33,7 @@ def test_turning_is_told_in_the_world() -> None:
     np.testing.assert_allclose(axis, (0, -1, 0), atol=1e-12)
 
 
-def test_nothing_is_printed(capfd: pytest.CaptureFixture[str]) -> None:
+def test_nothing_is_printed(capfd):
     env = gym.make("TPMPickAndPlace-v0", engine="mujoco")
     list(random_episode(env, 0))
     env.close()
@@ -46,11 +42,8 @@ def test_nothing_is_printed(capfd: pytest.CaptureFixture[str]) -> None:
 
 @pytest.mark.parametrize("newtons", [1e3, 1e8, float("nan")])
 def test_a_mechanism_torn_apart_is_a_typed_error_and_nothing_else(
-    newtons: float,
-    capfd: pytest.CaptureFixture[str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    newtons, capfd, tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)  # where the engine would log
     simulation = Alone(engine="mujoco")
     for _ in range(2):
@@ -67,7 +60,7 @@ def test_a_mechanism_torn_apart_is_a_typed_error_and_nothing_else(
     assert not written
 
 
-def test_without_the_package_the_error_names_the_extra() -> None:
+def test_without_the_package_the_error_names_the_extra():
     ours = [name for name in sys.modules if name.startswith("tpm_gym.simulation.mujoco")]
     with patch.dict(sys.modules, {"mujoco": None}):
         for name in ours:
@@ -76,7 +69,7 @@ def test_without_the_package_the_error_names_the_extra() -> None:
             Alone(engine="mujoco")
 
 
-def test_a_window_without_a_display_is_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_window_without_a_display_is_refused_by_name(monkeypatch):
     monkeypatch.setattr("sys.platform", "linux")
     monkeypatch.delenv("DISPLAY", raising=False)
     with pytest.raises(ConfigurationError, match=r"^render_mode = 'human'.*without a display"):

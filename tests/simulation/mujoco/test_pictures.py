@@ -1,11 +1,8 @@
 """Pictures by MuJoCo: the same as the other engine's, or a typed error where there is no OpenGL."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -25,7 +22,7 @@ WIDTH, HEIGHT = 320, 240
 
 
 @pytest.fixture
-def simulation() -> Iterator[Alone]:
+def simulation():
     simulation = Alone(Scene(objects=(Block(),)), engine="mujoco")
     simulation.reset(THETA, {"object": (0.1, -0.1, 0.015)})
     yield simulation
@@ -60,7 +57,7 @@ def green(image: NDArray[Any]) -> NDArray[Any]:
     return image[..., 1] - image[..., [0, 2]].max(axis=-1) > 40
 
 
-def test_pictures_are_those_of_the_other_engine(simulation: Alone) -> None:
+def test_pictures_are_those_of_the_other_engine(simulation):
     other = Alone(Scene(objects=(Block(),)))
     other.reset(THETA, {"object": (0.1, -0.1, 0.015)})
     ours, theirs = picture(simulation), picture(other)
@@ -73,7 +70,7 @@ def test_pictures_are_those_of_the_other_engine(simulation: Alone) -> None:
     assert (background == 255).all()
 
 
-def test_what_moves_is_drawn_elsewhere_before_the_next_time_step(simulation: Alone) -> None:
+def test_what_moves_is_drawn_elsewhere_before_the_next_time_step(simulation):
     seen = []
     for x in (-0.1, 0.1):
         goal = (x, -0.03, 0.2)
@@ -87,7 +84,7 @@ def test_what_moves_is_drawn_elsewhere_before_the_next_time_step(simulation: Alo
     assert np.linalg.norm(middle(red(picture(simulation))) - before) > 10
 
 
-def test_a_picture_changes_nothing(simulation: Alone) -> None:
+def test_a_picture_changes_nothing(simulation):
     ends = []
     for drawn in (False, True):
         simulation.reset(THETA, {"object": (0.1, -0.1, 0.015)})
@@ -99,7 +96,7 @@ def test_a_picture_changes_nothing(simulation: Alone) -> None:
     assert ends[0] == ends[1]
 
 
-def test_sizes_may_change_and_a_closed_one_draws_again(simulation: Alone) -> None:
+def test_sizes_may_change_and_a_closed_one_draws_again(simulation):
     picture(simulation)
     small = VIEW._replace(width=64, height=48)
     assert simulation.picture(small).colour.shape == (48, 64, 3)
@@ -109,16 +106,14 @@ def test_sizes_may_change_and_a_closed_one_draws_again(simulation: Alone) -> Non
 
 
 @pytest.mark.parametrize("renderer", ["tiny", "", 1])
-def test_an_unknown_renderer_is_refused(renderer: Any) -> None:
+def test_an_unknown_renderer_is_refused(renderer):
     with pytest.raises(ConfigurationError, match="'egl' or 'osmesa' or 'glfw'") as caught:
         Alone(Scene(), engine="mujoco", renderer=renderer)
     assert (caught.value.name, caught.value.value) == ("renderer", renderer)
 
 
-def test_where_there_is_no_way_to_opengl_the_error_names_what_there_is(
-    simulation: Alone, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def missing(name: str) -> Any:
+def test_where_there_is_no_way_to_opengl_the_error_names_what_there_is(simulation, monkeypatch):
+    def missing(name):
         os.environ["PYOPENGL_PLATFORM"] = name
         raise ImportError(name)
 
@@ -131,7 +126,7 @@ def test_where_there_is_no_way_to_opengl_the_error_names_what_there_is(
     simulation.move(HOME)
 
 
-def test_a_process_that_ends_with_pictures_open_says_nothing() -> None:
+def test_a_process_that_ends_with_pictures_open_says_nothing():
     script = """
 import gymnasium as gym, tpm_gym
 envs = [gym.make("TPMReach-v0", engine="mujoco", render_mode="rgb_array") for _ in range(2)]
