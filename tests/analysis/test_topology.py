@@ -12,7 +12,7 @@ from walk import gaps
 
 from tpm_gym.analysis.poc import POCSet, Subspace
 from tpm_gym.analysis.singularity import dimensionless
-from tpm_gym.analysis.topology import Structure, analyse, closure_jacobian, describe, mobility
+from tpm_gym.analysis.topology import Structure, analyse, describe, mobility
 from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import InputError, SingularityError, UnreachableError
 from tpm_gym.kinematics import (
@@ -25,6 +25,7 @@ from tpm_gym.kinematics import (
 )
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.mechanism import PAPER_TPM
+from tpm_gym.mechanism.closures import closure_jacobian
 from tpm_gym.mechanism.tree import ACTUATED_JOINTS, build, joint_angles
 
 X, Y, Z = np.eye(3)

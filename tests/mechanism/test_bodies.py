@@ -6,14 +6,16 @@ import numpy as np
 import pytest
 from examples import examples
 from hypothesis import strategies as st
+from walk import turn
 
-from tpm_gym.arrays import FloatArray
-from tpm_gym.mechanism.bodies import Link, Solid
+from tpm_gym.arrays import FloatArray, Vector
+from tpm_gym.mechanism.bodies import LEVEL, Link, Solid
 
 AXES = ("x", "y", "z")
 lengths = st.floats(0.005, 0.5)
 shares = st.one_of(st.just(0.0), st.floats(0.1, 0.95))
 centres = st.tuples(*[st.floats(-0.5, 0.5)] * 3)
+turns = st.one_of(st.just(LEVEL), st.tuples(*[st.floats(-3.2, 3.2)] * 3))
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(3)
 
 
@@ -36,7 +38,7 @@ def cloud(solid: Solid) -> tuple[FloatArray, FloatArray]:
         at = np.stack(grid, axis=-1).reshape(-1, 3)
         mass = solid.density * np.prod(weight, axis=0).ravel()
         filled = ~(np.abs(at) < bore).all(axis=-1)
-        return at[filled] + solid.centre, mass[filled]
+        return at[filled] @ turned(solid.rpy).T + solid.centre, mass[filled]
     radius, length, _ = solid.size
     r, dr = panels(solid.bore[0], radius)
     h, dh = panels(-length / 2, length / 2)
@@ -47,7 +49,15 @@ def cloud(solid: Solid) -> tuple[FloatArray, FloatArray]:
     at = np.empty((r_.size, 3))
     at[:, along] = h_
     at[:, (along + 1) % 3], at[:, (along + 2) % 3] = r_ * np.cos(turn_), r_ * np.sin(turn_)
-    return at + solid.centre, mass.ravel()
+    return at @ turned(solid.rpy).T + solid.centre, mass.ravel()
+
+
+def turned(rpy: Vector) -> FloatArray:
+    """Turn about x, then y, then z, all fixed."""
+    about_x, about_y, about_z = (
+        turn(tuple(axis), a) for axis, a in zip(np.eye(3), rpy, strict=True)
+    )
+    return about_z @ about_y @ about_x
 
 
 def moments(at: FloatArray, mass: FloatArray, about: FloatArray) -> FloatArray:
@@ -64,7 +74,8 @@ def boxes(draw: st.DrawFn) -> Solid:
     bore = tuple(edge * draw(st.one_of(shares, st.just(1.0))) for edge in size)
     if bore == size:
         bore = (0.0, 0.0, 0.0)
-    return Solid("box", size, draw(centres), draw(st.floats(100, 8000)), bore=bore)
+    density = draw(st.floats(100, 8000))
+    return Solid("box", size, draw(centres), density, bore=bore, rpy=draw(turns))
 
 
 @st.composite
@@ -77,6 +88,7 @@ def cylinders(draw: st.DrawFn) -> Solid:
         draw(st.floats(100, 8000)),
         bore=(radius * draw(shares), length, 0.0),
         axis=draw(st.sampled_from(AXES)),
+        rpy=draw(turns),
     )
 
 
@@ -85,7 +97,8 @@ def test_mass_and_inertia_of_solids_equal_an_integration(solid):
     at, mass = cloud(solid)
     assert solid.mass == pytest.approx(mass.sum(), rel=1e-9)
     tensor = moments(at, mass, np.array(solid.centre))
-    np.testing.assert_allclose(np.diag(solid.inertia), tensor, rtol=1e-9, atol=1e-9 * tensor.max())
+    np.testing.assert_allclose(solid.inertia, tensor, rtol=1e-9, atol=1e-9 * tensor.max())
+    assert (np.abs(at - solid.centre).max(axis=0) <= solid.half_extent + 1e-12).all()
 
 
 @examples(60, st.lists(st.one_of(boxes(), cylinders()), min_size=1, max_size=4))

@@ -43,7 +43,7 @@ def test_the_rotor_is_part_of_every_arm_which_turns_between_its_halves(machine):
         outer = TORQUE_MOTOR.gap_radius
         inner, length = outer - TORQUE_MOTOR.ring, TORQUE_MOTOR.length
         expected = 7850 * math.pi * length * (outer**4 - inner**4) / 2
-        assert sum(ring.inertia[along] for ring in rings) == pytest.approx(expected, rel=1e-12)
+        assert sum(ring.moments[along] for ring in rings) == pytest.approx(expected, rel=1e-12)
         for ring in rings:  # about the pivot, where the link's origin is
             assert np.flatnonzero(ring.centre).tolist() == [along]
         (tube,) = (solid for solid in link.solids if solid.kind == "box")

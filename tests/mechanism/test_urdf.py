@@ -1,13 +1,16 @@
 """The files in urdf/ are what the mechanism's data give, number by number."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from walk import turn
 
 from tpm_gym.kinematics.geometry import PAPER, Geometry
+from tpm_gym.mechanism.bodies import Joint, Link, Solid
 from tpm_gym.mechanism.export import write
 from tpm_gym.mechanism.tree import Mechanism, build
 from tpm_gym.mechanism.urdf import COLOURS, urdf_text
@@ -37,6 +40,23 @@ def mechanism(request):
     return build(request.param)
 
 
+TURNS = [(0.3, -0.7, 2.0), (0.0, 0.0, 2 * np.pi / 3), (0.0, np.pi / 2, 0.4), (1.0, -np.pi / 2, 0.0)]
+
+
+@pytest.mark.parametrize("rpy", TURNS)
+@pytest.mark.parametrize("axis", ["x", "y", "z"])
+def test_turned_solids_and_joints_are_written_as_they_are(rpy, axis):
+    rod = Solid("cylinder", (0.01, 0.3, 0.0), (0.1, 0.0, 0.2), 1000.0, axis=axis, rpy=rpy)
+    box = Solid("box", (0.1, 0.2, 0.3), (0.0, 0.1, 0.0), 500.0, rpy=rpy)
+    joint = Joint("slide", "prismatic", "base", (1.0, 2.0, 3.0), rpy=rpy)
+    links = Link("base", (box,)), Link("rod", (rod, box), joint)
+    root = parsed(replace(build(), links=links))
+    for element, link in zip(root.findall("link"), links, strict=True):
+        for visual, solid in zip(element.findall("visual"), link.solids, strict=True):
+            assert_same_solid(visual, solid)
+    assert numbers(child(root, "joint/origin").get("rpy")) == pytest.approx(rpy, **DIGITS)
+
+
 def test_regenerating_gives_the_shipped_files_byte_for_byte(tmp_path):
     for path in write(tmp_path / "new"):
         assert path.read_bytes() == (FOLDER / path.name).read_bytes()
@@ -54,10 +74,12 @@ def test_joints_have_the_limits_of_the_tree(mechanism):
             assert np.ravel(found) == pytest.approx(expected, **DIGITS)
 
 
-def cylinder_axis(rpy: Sequence[float]) -> np.ndarray:
-    """Where roll, pitch, yaw turn the z axis."""
-    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
-    return np.array([cy * sp * cr + sy * sr, sy * sp * cr - cy * sr, cp * cr])
+def turned(rpy: Sequence[float]) -> np.ndarray:
+    """Turn about x, then y, then z, all fixed."""
+    about_x, about_y, about_z = (
+        turn(tuple(axis), a) for axis, a in zip(np.eye(3), rpy, strict=True)
+    )
+    return about_z @ about_y @ about_x
 
 
 def assert_same_solid(element: ElementTree.Element, solid: Any) -> None:
@@ -65,12 +87,12 @@ def assert_same_solid(element: ElementTree.Element, solid: Any) -> None:
     assert numbers(origin.get("xyz")) == pytest.approx(solid.centre, **DIGITS)
     rpy = numbers(origin.get("rpy"))
     if solid.kind == "box":
-        assert rpy == [0, 0, 0]
+        np.testing.assert_allclose(turned(rpy), turned(solid.rpy), atol=1e-8)
         size = numbers(child(element, "geometry/box").get("size"))
         assert size == pytest.approx(solid.size, **DIGITS)
     else:
-        along = np.abs(cylinder_axis(rpy))
-        np.testing.assert_allclose(along, np.eye(3)["xyz".index(solid.axis)], atol=1e-8)
+        along, axis = turned(rpy)[:, 2], turned(solid.rpy)[:, "xyz".index(solid.axis)]
+        assert abs(along @ axis) == pytest.approx(1.0, abs=1e-8)
         shape = child(element, "geometry/cylinder")
         found = numbers(shape.get("radius")) + numbers(shape.get("length"))
         assert found == pytest.approx(solid.size[:2], **DIGITS)

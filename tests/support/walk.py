@@ -28,9 +28,13 @@ def walk(mechanism: Mechanism, joints: Mapping[str, float]) -> dict[str, Frame]:
         position, rotation = frames[joint.parent]
         value = joints[joint.name]
         slides = joint.kind == "prismatic"
-        origin = np.array(joint.origin) + slides * value * np.array(joint.axis)
-        turned = rotation if slides else rotation @ turn(joint.axis, value)
-        frames[link.name] = (position + rotation @ origin, turned)
+        origin = position + rotation @ joint.origin
+        for axis, angle in zip(np.eye(3)[::-1], joint.rpy[::-1], strict=True):  # yaw, pitch, roll
+            rotation = rotation @ turn(tuple(axis), angle)
+        if slides:
+            frames[link.name] = (origin + value * rotation @ joint.axis, rotation)
+        else:
+            frames[link.name] = (origin, rotation @ turn(joint.axis, value))
     return frames
 
 

@@ -20,16 +20,12 @@ from numpy.typing import ArrayLike
 
 from tpm_gym.analysis import poc
 from tpm_gym.analysis.poc import Chain, POCSet, Subspace, Unit
-from tpm_gym.arrays import FloatArray, Vector
-from tpm_gym.errors import SingularityError
+from tpm_gym.arrays import FloatArray
 from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.mechanism.bodies import Link, Mechanism, Place
+from tpm_gym.mechanism.closures import closure_jacobian, moving_joints, rank_of, rates
 from tpm_gym.mechanism.tree import ACTUATED_JOINTS, build, joint_angles
-
-# Fractions of the largest singular value: zero up to the first, not zero from the second, and
-# uncertain in between. Rounding makes zeros of about 1e-16.
-_ZERO, _NOT_ZERO = 1e-11, 1e-7
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,48 +149,17 @@ def mobility_at(mechanism: Mechanism, angles: Mapping[str, float]) -> Mobility:
     """Count freedoms like :func:`mobility`, of any mechanism, from the angle of each joint, rad."""
     jacobian = closure_jacobian(mechanism, angles)
     _, values, right = np.linalg.svd(jacobian)
-    rank = _rank(values)
+    rank = rank_of(values)
     free = right[rank:].T  # columns: joint rates that keep the loops closed
     places = mechanism.places(angles)
-    joints = _moving_joints(mechanism)
-    linear, angular = _rates(mechanism, places, mechanism.platform, mechanism.point_p)
+    joints = moving_joints(mechanism)
+    linear, angular = rates(mechanism, places, mechanism.platform, mechanism.point_p)
     motors = np.eye(len(joints))[[joints.index(name) for name in mechanism.actuated]]
     seen = np.linalg.svd(np.concatenate([linear, angular, motors]) @ free, compute_uv=False)
-    dof = _rank(seen)
+    dof = rank_of(seen)
     platform = POCSet(Subspace.span((linear @ free).T), Subspace.span((angular @ free).T))
     smallest = float(values[rank - 1] / values[0])
     return Mobility(dof, free.shape[1] - dof, rank, len(jacobian) - rank, smallest, platform)
-
-
-def closure_jacobian(mechanism: Mechanism, angles: Mapping[str, float]) -> FloatArray:
-    """Differentiate the gaps of all closures by the joint angles of the spanning tree, rad.
-
-    Returns:
-        (3 closures, joints) m/rad. Rows are x, y, z of ``point_a - point_b`` in the order of
-        ``mechanism.closures``, columns are in the order of ``mechanism.links``.
-    """
-    places = mechanism.places(angles)
-    return np.concatenate(
-        [
-            _rates(mechanism, places, closure.link_a, closure.point_a)[0]
-            - _rates(mechanism, places, closure.link_b, closure.point_b)[0]
-            for closure in mechanism.closures
-        ]
-    )
-
-
-def _rank(values: FloatArray) -> int:
-    """Return the rank from singular values in descending order; SingularityError if uncertain."""
-    rank = int((values > _ZERO * values[0]).sum())
-    if values[rank - 1] < _NOT_ZERO * values[0]:
-        raise SingularityError("a singular value of the loop closures", values[rank - 1])
-    return rank
-
-
-def _moving_joints(mechanism: Mechanism) -> list[str]:
-    """Return the names of the joints that turn. The slide of the cup belongs to the tool."""
-    joints = (link.joint for link in mechanism.links)
-    return [joint.name for joint in joints if joint and joint.kind != "prismatic"]
 
 
 def _axis(places: Mapping[str, Place], link: Link) -> FloatArray:
@@ -202,18 +167,3 @@ def _axis(places: Mapping[str, Place], link: Link) -> FloatArray:
     assert link.joint is not None
     axis: FloatArray = places[link.name].rotation @ np.asarray(link.joint.axis)
     return axis
-
-
-def _rates(
-    mechanism: Mechanism, places: Mapping[str, Place], name: str, offset: Vector
-) -> tuple[FloatArray, FloatArray]:
-    """Return velocity (3, n) m/rad of a point of a link, and angular velocity (3, n), per joint."""
-    joints, point = _moving_joints(mechanism), places[name].point(offset)
-    linear, angular = np.zeros((3, len(joints))), np.zeros((3, len(joints)))
-    while (joint := (link := mechanism.link(name)).joint) is not None:
-        if joint.kind != "prismatic":
-            column, axis = joints.index(joint.name), _axis(places, link)
-            angular[:, column] = axis
-            linear[:, column] = np.cross(axis, point - places[name].origin)
-        name = joint.parent
-    return linear, angular

@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,6 +17,24 @@ from numpy.typing import ArrayLike
 from tpm_gym.arrays import FloatArray, Vector
 
 ALUMINIUM, STEEL = 2700.0, 7850.0  # kg/m^3
+
+LEVEL: Final = (0.0, 0.0, 0.0)
+"""Roll, pitch and yaw of a frame that is parallel to another."""
+
+ALONG: Final = {"x": (0.0, math.pi / 2, 0.0), "y": (math.pi / 2, 0.0, 0.0), "z": LEVEL}
+"""Roll, pitch and yaw that turn a cylinder along z onto an axis."""
+
+
+def rotation_of(rpy: Vector) -> FloatArray:
+    """Compute the matrix (3, 3) of roll, pitch and yaw, rad, about the fixed x, y and z axes."""
+    (a, b, c), (p, q, r) = np.cos(rpy), np.sin(rpy)
+    return np.array(
+        [
+            [b * c, p * q * c - a * r, a * q * c + p * r],
+            [b * r, p * q * r + a * c, a * q * r - p * c],
+            [-q, p * b, a * b],
+        ]
+    )
 
 
 @dataclass(frozen=True)
@@ -29,9 +47,10 @@ class Solid:
         centre: Position in the link's frame, m.
         density: Density of the material, kg/m^3; zero for parts that are only drawn.
         bore: Box: edges of the hollow (0 for solid faces). Cylinder: (inner radius, length, 0).
-        axis: Axis of a cylinder in the link's frame: ``"x"``, ``"y"`` or ``"z"``.
+        axis: Axis of a cylinder in the solid's frame: ``"x"``, ``"y"`` or ``"z"``.
         colour: Name of a colour in :mod:`tpm_gym.mechanism.urdf`.
         collides: Whether the engine should collide it.
+        rpy: Roll, pitch and yaw of the solid's frame in the link's frame, rad, as in URDF.
     """
 
     kind: Literal["box", "cylinder"]
@@ -42,6 +61,7 @@ class Solid:
     axis: Literal["x", "y", "z"] = "z"
     colour: str = "grey"
     collides: bool = False
+    rpy: Vector = LEVEL
 
     @property
     def mass(self) -> float:
@@ -49,26 +69,41 @@ class Solid:
         return self._mass(self.size) - self._mass(self.bore)
 
     @property
+    def moments(self) -> FloatArray:
+        """Principal moments (3,) about the centre, along the solid's axes, kg m^2."""
+        return self._moments(self.size) - self._moments(self.bore)
+
+    @property
     def inertia(self) -> FloatArray:
-        """Principal moments (3,) about the centre, along the link's axes, kg m^2."""
-        return self._inertia(self.size) - self._inertia(self.bore)
+        """Inertia (3, 3) about the centre, along the link's axes, kg m^2."""
+        if self.rpy == LEVEL:
+            return np.diag(self.moments)
+        turn = rotation_of(self.rpy)
+        return np.asarray(turn @ np.diag(self.moments) @ turn.T)
+
+    @property
+    def rotation(self) -> FloatArray:
+        """Matrix (3, 3) that turns a box, or a cylinder along z, to its place in the link."""
+        turn = rotation_of(self.rpy)
+        return turn if self.kind == "box" else turn @ rotation_of(ALONG[self.axis])
 
     @property
     def half_extent(self) -> FloatArray:
         """Half edges (3,) of the box around the solid, along the link's axes, m."""
         if self.kind == "box":
-            return np.asarray(self.size) / 2
-        radius, length, _ = self.size
-        half = np.full(3, radius)
-        half["xyz".index(self.axis)] = length / 2
-        return half
+            half = np.asarray(self.size) / 2
+        else:
+            radius, length, _ = self.size
+            half = np.full(3, radius)
+            half["xyz".index(self.axis)] = length / 2
+        return half if self.rpy == LEVEL else np.asarray(np.abs(rotation_of(self.rpy)) @ half)
 
     def _mass(self, size: Vector) -> float:
         if self.kind == "box":
             return self.density * size[0] * size[1] * size[2]
         return float(self.density * np.pi * size[0] ** 2 * size[1])
 
-    def _inertia(self, size: Vector) -> FloatArray:
+    def _moments(self, size: Vector) -> FloatArray:
         mass = self._mass(size)
         if self.kind == "box":
             squares: FloatArray = np.square(size)
@@ -95,6 +130,7 @@ class Joint:
         speed: Speed at which the motor has no effort left, rad/s or m/s; zero for passive joints.
         corner: Highest speed with full effort, rad/s or m/s; from there to ``speed`` the effort
             falls linearly.
+        rpy: Roll, pitch and yaw of the joint's frame in the parent's frame, rad, as in URDF.
     """
 
     name: str
@@ -107,6 +143,7 @@ class Joint:
     effort: float = 0.0
     speed: float = 0.0
     corner: float = 0.0
+    rpy: Vector = LEVEL
 
     @property
     def unit(self) -> Literal["rad", "m"]:
@@ -140,7 +177,7 @@ class Link:
         for solid in self.solids:
             arm = np.asarray(solid.centre) - self.centre_of_mass
             steiner = solid.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-            total += np.diag(solid.inertia) + steiner
+            total += solid.inertia + steiner
         return total
 
 
@@ -245,6 +282,8 @@ class Mechanism:
         for link, joint in self._held:
             parent = found[joint.parent]
             origin, rotation = parent.point(joint.origin), parent.rotation
+            if joint.rpy != LEVEL:
+                rotation = rotation @ rotation_of(joint.rpy)
             if joint.kind == "prismatic":
                 slide = np.asarray(joints.get(joint.name, 0.0))[..., None]
                 origin = origin + slide * (rotation @ np.asarray(joint.axis))

@@ -32,6 +32,7 @@ from tpm_gym.kinematics.geometry import Geometry
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism import virtual_work
 from tpm_gym.mechanism.bodies import Mechanism
+from tpm_gym.mechanism.closures import require_sound
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.mount import Mount
 
@@ -96,8 +97,8 @@ class Machine(ABC):
 
     Raises:
         ConfigurationError: If a value is not possible, if home or the goals lie outside the region,
-            or if the region reaches beyond a singularity, a motor's stop or (by more than the
-            cup's stroke) the table.
+            if the region reaches beyond a singularity, a motor's stop or (by more than the cup's
+            stroke) the table, or if the loops of the mechanism do not close at home.
         UnreachableError: If a corner of the region cannot be reached.
     """
 
@@ -125,7 +126,9 @@ class Machine(ABC):
         if not 0 < self.safe_conditioning <= 1:  # the penalty is in units of it
             raise ConfigurationError("safe_conditioning", self.safe_conditioning, "in (0, 1]")
         self._require_usable("region", list(self.region.corners()))
-        self._require_usable("home", [self.home])
+        home = self._require_usable("home", [self.home])
+        a, b, c = home[0].tolist()
+        require_sound(self.mechanism, self.joint_positions((a, b, c)))
         least = self.region.high[2] + CUP.length - CUP.stroke
         if self.mount.height < least - 1e-6:
             valid = f"a height of {least:.6g} m or more: else the region is below the table"
@@ -143,8 +146,8 @@ class Machine(ABC):
         table = finite("table", self.table, (2,), ConfigurationError)
         object.__setattr__(self, "table", tuple(table.tolist()))
 
-    def _require_usable(self, name: str, points: list[Vector]) -> None:
-        """Reject the attribute ``name`` if a point is out of reach or beyond a limit."""
+    def _require_usable(self, name: str, points: list[Vector]) -> FloatArray:
+        """Return joint positions (k, 3); reject ``name`` if a point is beyond reach or a limit."""
         try:
             theta, left = self._postures(np.array(points))
         except UnreachableError as error:
@@ -159,6 +162,7 @@ class Machine(ABC):
             except JointLimitError as error:
                 valid = f"where every motor is between its stops; at {point}, {error}"
                 raise ConfigurationError(name, getattr(self, name), valid) from error
+        return theta
 
     def _postures(self, points: FloatArray) -> tuple[FloatArray, NDArray[np.int8]]:
         """Return joint positions (k, 3) at points (k, 3), and the mode that is left there (k,)."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from xml.etree.ElementTree import Comment, Element, indent, tostring
 
-from tpm_gym.mechanism.bodies import Link, Mechanism, Solid
+from tpm_gym.mechanism.bodies import LEVEL, Link, Mechanism, Solid, rotation_of
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.mount import Mount
@@ -115,6 +115,8 @@ def _add_body(world: Element, bodies: dict[str, Element], link: Link, mount: Mou
         body = add(world, "body", name=link.name, pos=origin, quat=(w, x, y, z))
     else:
         body = add(bodies[joint.parent], "body", name=link.name, pos=joint.origin)
+        if joint.rpy != LEVEL:
+            body.set("xyaxes", numbers(rotation_of(joint.rpy).T[:2].ravel()))
         moments = [link.inertia[at] for at in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
         centre = link.centre_of_mass
         add(body, "inertial", pos=centre, mass=link.mass, fullinertia=moments)
@@ -141,8 +143,10 @@ def _add_geom(body: Element, solid: Solid, link: str) -> None:
         element.set("size", numbers((x / 2, y / 2, z / 2)))
     else:
         element.set("size", numbers((x, y / 2)))
-        if solid.axis != "z":
-            element.set("quat", numbers(_TURN[solid.axis]))
+    if solid.rpy != LEVEL:
+        element.set("xyaxes", numbers(solid.rotation.T[:2].ravel()))
+    elif solid.kind == "cylinder" and solid.axis != "z":
+        element.set("quat", numbers(_TURN[solid.axis]))
     element.set("pos", numbers(solid.centre))
     element.set("material", solid.colour)
 

@@ -15,7 +15,7 @@ from collections.abc import Iterable
 from xml.etree.ElementTree import Comment, Element, SubElement, indent, tostring
 
 from tpm_gym.arrays import Vector
-from tpm_gym.mechanism.bodies import Closure, Joint, Link, Mechanism, Solid
+from tpm_gym.mechanism.bodies import ALONG, LEVEL, Closure, Joint, Link, Mechanism, Solid
 
 LOOPS_FILE = "tpm.loops.yaml"
 
@@ -41,10 +41,6 @@ COLOURS = {
     "violet": (0.46, 0.25, 0.72, 1.0),
 }
 
-# Roll, pitch, yaw that turn a URDF cylinder (along z) onto the named axis.
-_AXIS_RPY = {"x": (0.0, math.pi / 2, 0.0), "y": (math.pi / 2, 0.0, 0.0), "z": (0.0, 0.0, 0.0)}
-
-_LEVEL = (0.0, 0.0, 0.0)
 _MOMENTS = {f"i{'xyz'[i]}{'xyz'[j]}": (i, j) for i in range(3) for j in range(i, 3)}
 
 
@@ -119,13 +115,13 @@ def _add_frame(root: Element, name: str, parent: str, point: Vector) -> None:
     joint = add(root, "joint", name=f"{name}_frame", type="fixed")
     add(joint, "parent", link=parent)
     add(joint, "child", link=name)
-    add(joint, "origin", xyz=point, rpy=_LEVEL)
+    add(joint, "origin", xyz=point, rpy=LEVEL)
 
 
 def _add_link(root: Element, link: Link) -> None:
     element = add(root, "link", name=link.name)
     inertial, moments = add(element, "inertial"), link.inertia
-    add(inertial, "origin", xyz=link.centre_of_mass, rpy=_LEVEL)
+    add(inertial, "origin", xyz=link.centre_of_mass, rpy=LEVEL)
     add(inertial, "mass", value=link.mass)
     add(inertial, "inertia", **{name: moments[at] for name, at in _MOMENTS.items()})
     for solid in link.solids:
@@ -136,8 +132,7 @@ def _add_link(root: Element, link: Link) -> None:
 
 def _add_solid(link: Element, tag: str, solid: Solid) -> Element:
     element = add(link, tag)
-    rpy = _AXIS_RPY[solid.axis] if solid.kind == "cylinder" else _LEVEL
-    add(element, "origin", xyz=solid.centre, rpy=rpy)
+    add(element, "origin", xyz=solid.centre, rpy=_rpy(solid))
     shape = add(element, "geometry")
     if solid.kind == "box":
         add(shape, "box", size=solid.size)
@@ -146,11 +141,22 @@ def _add_solid(link: Element, tag: str, solid: Solid) -> Element:
     return element
 
 
+def _rpy(solid: Solid) -> Vector:
+    """Return roll, pitch and yaw of a box, or of a cylinder along z, in its link, rad."""
+    if solid.rpy == LEVEL:
+        return ALONG[solid.axis] if solid.kind == "cylinder" else LEVEL
+    turn = solid.rotation
+    pitch = math.asin(max(-1.0, min(1.0, -turn[2, 0])))
+    if abs(turn[2, 0]) > 1 - 1e-12:  # roll and yaw turn about one axis: let yaw do it
+        return 0.0, pitch, math.atan2(-turn[0, 1], turn[1, 1])
+    return math.atan2(turn[2, 1], turn[2, 2]), pitch, math.atan2(turn[1, 0], turn[0, 0])
+
+
 def _add_joint(root: Element, joint: Joint, link: str) -> None:
     element = add(root, "joint", name=joint.name, type=joint.kind)
     add(element, "parent", link=joint.parent)
     add(element, "child", link=link)
-    add(element, "origin", xyz=joint.origin, rpy=_LEVEL)
+    add(element, "origin", xyz=joint.origin, rpy=joint.rpy)
     add(element, "axis", xyz=joint.axis)
     if joint.kind != "continuous":
         limits = {"lower": joint.lower, "upper": joint.upper}

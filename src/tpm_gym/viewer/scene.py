@@ -26,12 +26,6 @@ ROBOT: Final = "/robot"
 TASK_NODES: Final = "/objects", "/goals"
 """Nodes below which the objects and goal markers of a task hang; world frame."""
 
-_TURNS: Final = {
-    "x": (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0),
-    "y": (math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0),
-    "z": (1.0, 0.0, 0.0, 0.0),
-}
-"""Quaternions (w, x, y, z) that turn a cylinder along z onto an axis."""
 _PAPER_TABLE: Final = 0.45  # m, half the length for which the camera's distance was chosen
 _GOAL: Final = (30, 160, 70)
 
@@ -132,9 +126,9 @@ def _first(quaternion: ArrayLike) -> FloatArray:
 
 def _add_solid(scene: SceneApi, name: str, solid: Solid) -> None:
     paint = colour(COLOURS[solid.colour])
+    turn = SO3.from_matrix(solid.rotation).wxyz
     if solid.kind == "box":
-        scene.add_box(name, paint, solid.size, position=solid.centre)
+        scene.add_box(name, paint, solid.size, wxyz=turn, position=solid.centre)
         return
     radius, length, _ = solid.size
-    turn = _TURNS[solid.axis]
     scene.add_cylinder(name, radius, length, paint, wxyz=turn, position=solid.centre)
