@@ -127,7 +127,7 @@ def _require_tree(mechanism: Mechanism, joints: Mapping[str, float]) -> None:
     ends = [end for c in mechanism.closures for end in (c.link_a, c.link_b)]
     needed = (
         ("a link", links, [*ends, mechanism.platform, mechanism.tool]),
-        ("a joint", names, mechanism.actuated),
+        ("a joint", names, list(mechanism.actuated)),
         ("a joint with a position", list(joints), names),
     )
     for what, known, given in needed:
