@@ -39,7 +39,6 @@ from speed_report import print_report, save_plot
 
 from tpm_gym import ENV_IDS
 from tpm_gym.simulation.bullet.client import silence
-from tpm_gym.simulation.state import CONTROL_PERIOD
 
 BASELINE = "PandaPickAndPlace-v3"
 PEERS = {
@@ -143,7 +142,7 @@ def _check_rate(env_id: str, env: gym.Env[Any, Any]) -> None:
     """Raise if a control step is not 40 ms, because steps would not be comparable."""
     unwrapped: Any = env.unwrapped
     if env_id in ENV_IDS:
-        period = CONTROL_PERIOD
+        period = unwrapped.task.control_period
     elif PEERS[env_id] == "panda_gym":
         period = unwrapped.sim.dt
     else:

@@ -16,8 +16,9 @@ from tpm_gym.arrays import FloatArray
 from tpm_gym.mechanism import PAPER_TPM
 from tpm_gym.simulation.engine import spline_weights
 from tpm_gym.simulation.randomisation import Plant
+from tpm_gym.simulation.settings import count_steps
 from tpm_gym.simulation.simulation import Simulation
-from tpm_gym.simulation.state import CONTROL_PERIOD, Scene
+from tpm_gym.simulation.state import Scene
 from tpm_gym.tasks import Expert
 from tpm_gym.tasks.motion import hanging
 
@@ -155,7 +156,8 @@ def torque_by_theory(inner: Any, commands: FloatArray) -> FloatArray:
         commands: The last three commands (3, 3) m, world.
     """
     step, machine = inner.simulation.engine.time_step, inner.machine
-    points = spline_weights(round(CONTROL_PERIOD / step))[-3:] @ machine.mount.to_paper(commands)
+    weights = spline_weights(count_steps(inner.task.control_period, step))
+    points = weights[-3:] @ machine.mount.to_paper(commands)
     before, at, after = machine.inverse(points)
     rate, next_rate = (at - before) / step, (after - at) / step
     torque: FloatArray = machine.dynamics.torque(at, rate, (next_rate - rate) / step)

@@ -28,6 +28,7 @@ from tpm_gym.simulation.bullet.client import Client, silence
 from tpm_gym.simulation.bullet.physics import REGULARISATION, Physics
 from tpm_gym.simulation.bullet.robot import Robot
 from tpm_gym.simulation.engine import spline_weights
+from tpm_gym.simulation.settings import count_steps
 from tpm_gym.simulation.simulation import CLOSURE_LIMIT
 from tpm_gym.simulation.state import CONTROL_PERIOD
 from tpm_gym.tasks import Expert
@@ -75,7 +76,7 @@ class Config:
     @property
     def substeps(self) -> int:
         """Number of time steps in a control period."""
-        return self.physics.substeps
+        return count_steps(CONTROL_PERIOD, self.time_step)
 
     @property
     def physics(self) -> Physics:
@@ -178,7 +179,7 @@ class Motion:
 
     def points(self, time_step: float) -> Iterator[FloatArray]:
         """Yield the references of P for each episode, (n + 1, 3) m; the first row is the start."""
-        weights = spline_weights(round(CONTROL_PERIOD / time_step))
+        weights = spline_weights(count_steps(CONTROL_PERIOD, time_step))
         for commands in self.commands:
             padded = np.vstack([commands[:1], commands[:1], commands[1:]])
             splines = [weights @ padded[k : k + 3] for k in range(len(padded) - 2)]

@@ -28,7 +28,6 @@ from tpm_gym.learning.estimates import Estimate, wilson
 from tpm_gym.learning.figure_style import save, style
 from tpm_gym.learning.policies import load_policy
 from tpm_gym.learning.rollout import TEST_SEED, run_episodes
-from tpm_gym.simulation.state import CONTROL_PERIOD
 from tpm_gym.tasks.expert import Expert
 from tpm_gym.tasks.registry import TASKS
 from tpm_gym.tasks.task import Task
@@ -74,7 +73,7 @@ def page(name: str) -> Iterator[str]:
     doc = _sentences(TASKS[name])
     yield from (f"# {title}", "", *doc, "")
     if _film(name).exists():
-        seconds = CONTROL_PERIOD * _steps(ids[0])
+        seconds = task.control_period * _steps(ids[0])
         yield from (f"![The scripted expert in {ids[0]}, {seconds:g} s]({_film(name).name})", "")
     yield from _ids(tasks)
     yield from _scene(task)
@@ -120,7 +119,7 @@ def _ids(tasks: dict[str, Task]) -> Iterator[str]:
     steps = _steps(next(iter(tasks)))
     yield from (
         "",
-        f"An episode is truncated after {steps} control steps of {1e3 * CONTROL_PERIOD:g} ms. "
+        f"An episode is truncated after {steps} control steps of {1e3 * task.control_period:g} ms. "
         f"It is successful if the goal is achieved within {1e3 * task.tolerance:g} mm at its end. "
         "[Options of `gym.make`](../../environments.md#options-of-gym-make) choose engine, machine "
         "and drive.",
@@ -290,7 +289,8 @@ def _draw_film(name: str) -> None:
             frames.append(env.render())
             observation, _, _, done, _ = env.step(expert.act(observation))
     first, *rest = [Image.fromarray(frame) for frame in frames]
-    lasting = [round(1e3 * CONTROL_PERIOD)] * len(rest) + [1500]  # the end stays for a while
+    shown = round(1e3 * TASKS[name].control_period)
+    lasting = [shown] * len(rest) + [1500]  # the end stays for a while
     PAGES.mkdir(parents=True, exist_ok=True)
     first.save(_film(name), save_all=True, append_images=rest, duration=lasting, loop=0, quality=80)
 

@@ -21,6 +21,7 @@ from tpm_gym.mechanism.motor import TORQUE_MOTOR
 from tpm_gym.simulation import Plant, Scene, Servo
 from tpm_gym.simulation.compiled import limited
 from tpm_gym.simulation.drives import References, drive_of
+from tpm_gym.simulation.settings import count_steps
 from tpm_gym.simulation.state import CONTROL_PERIOD
 
 HOME = PAPER_TPM.home
@@ -57,6 +58,8 @@ def hold(simulation: Alone, theta: FloatArray, torque: Vector = REST, periods: i
     """Let the servos' references jump to theta and stay there for some control periods."""
     engine = simulation.engine
     steps = engine.physics.substeps
+    engine: Any = simulation.engine
+    steps = count_steps(CONTROL_PERIOD, engine.time_step)
     constant = References(*(np.tile(v, (steps, 1, 1)) for v in (theta, np.zeros(3), torque)))
     with patch.object(engine._drives, "references", lambda path: constant):
         for _ in range(periods):

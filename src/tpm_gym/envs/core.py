@@ -100,7 +100,7 @@ class Core:
         )
         checking.check(self.task)
         self.machine = self.task.machine
-        self.control = make_control(control, self.machine)
+        self.control = make_control(control, self.machine, self.task.control_period)
         self.drive, self.randomisation = drives_and_randomisation(drive, randomisation)
         self._altered = self.randomisation != Randomisation()
         self._rendering = Rendering(self.machine, render_mode, camera, width, height)
@@ -137,6 +137,7 @@ class Core:
             self.task.scene,
             machine=self.machine,
             count=self.count,
+            control_period=self.task.control_period,
             drive=self.drive,
             **self._engine,
         )

@@ -242,6 +242,7 @@ class TPMEnv(gym.Env[Observation, Action]):
             height=height,
         )
         self.task, self.machine = self._core.task, self._core.machine
+        self.metadata["render_fps"] = round(1 / self.task.control_period)
         self.control, self.drive = self._core.control, self._core.drive
         self.randomisation = self._core.randomisation
         self.observation_space = self._core.observation_space
@@ -283,7 +284,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         return observation, info
 
     def step(self, action: Action) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Run one control step of 40 ms.
+        """Run one control step.
 
         Raises:
             ActionError: If the action has the wrong shape or is not finite; nothing has moved then.
@@ -344,7 +345,7 @@ class TPMEnv(gym.Env[Observation, Action]):
         if self.render_mode == "human":
             self._core.show()
             now = time.perf_counter()
-            self._shown = max(self._shown + CONTROL_PERIOD, now)
+            self._shown = max(self._shown + self.task.control_period, now)
             time.sleep(self._shown - now)
             return None
         self._core.require_open()

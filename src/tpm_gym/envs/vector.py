@@ -31,7 +31,7 @@ from tpm_gym.errors import (
 )
 from tpm_gym.simulation.engine import most_robots
 from tpm_gym.simulation.imaging import tile
-from tpm_gym.simulation.state import CONTROL_PERIOD, State
+from tpm_gym.simulation.state import State
 from tpm_gym.tasks.task import Task
 
 __all__ = ["TPMVectorEnv"]
@@ -106,7 +106,6 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         self.autoreset_mode = _mode_of(autoreset_mode)
         self.metadata = {
             "render_modes": modes,
-            "render_fps": round(1 / CONTROL_PERIOD),
             "autoreset_mode": self.autoreset_mode,
         }
         at_once = self.autoreset_mode == AutoresetMode.SAME_STEP
@@ -123,6 +122,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         self._slices = [slice(a, b) for a, b in zip([0, *ends], ends, strict=False)]
         self._pool = ThreadPoolExecutor(num_threads) if num_threads > 1 else None
         first = self._parts[0].core
+        self.metadata["render_fps"] = round(1 / first.task.control_period)
         self.task, self.machine, self.control = first.task, first.machine, first.control
         self.drive, self.randomisation = first.drive, first.randomisation
         self.single_observation_space = first.observation_space
@@ -203,7 +203,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         return [None if own is None else seeding.np_random(int(own))[0] for own in seeds]
 
     def step(self, actions: NDArray[Any]) -> Step:
-        """Run one control step of 40 ms in all environments, or reset those whose episode ended.
+        """Run one control step in all environments, or reset those whose episode ended.
 
         Raises:
             ActionError: If the actions have the wrong shape or are not finite.

@@ -89,8 +89,8 @@ class Machine(ABC):
         goal_region: Box of positions of P for goals, and for objects on the table. Sampling keeps
             to the part with ``safe_conditioning``.
         home: Position of P at the start of an episode, machine's frame, m.
-        step_limit: Largest change of the command for P along x, y, z in one control step, m.
-        joint_limit: Largest change of a joint's command in one control step, rad (m for a slide).
+        step_limit: Largest change of the command for P along x, y, z in 40 ms, m.
+        joint_limit: Largest change of a joint's command in 40 ms, rad (m for a slide).
         safe_conditioning: Smallest conditioning 1/cond(J) that counts as safe from singularities;
             the penalty of the reward begins below it.
         table: Half edges of the table along x and y, m; its top is the world's z = 0.

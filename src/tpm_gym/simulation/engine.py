@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from types import ModuleType
 from typing import Any, NamedTuple, Protocol
@@ -397,8 +397,17 @@ def make_engine(
     renderer: str | None = None,
     physics: Any = None,
     drive: Servo | None = None,
+    time_step: float | None = None,
 ) -> Engine:
     """Create the engine with this name.
+
+    Args:
+        name: Name of the engine.
+        gui: Whether to open a window.
+        renderer: Renderer of the pictures; None for the engine's default.
+        physics: Numerical settings of the engine; None for the engine's defaults.
+        drive: Servo drives of the motors; None for ideal drives.
+        time_step: Time step, s, if ``physics`` has none; None for the engine's default.
 
     Raises:
         ConfigurationError: If no engine has this name, or the engine does not support an option.
@@ -415,6 +424,8 @@ def make_engine(
     options = {"gui": gui or None, "renderer": renderer, "physics": physics, "drive": drive}
     asked = {option: value for option, value in options.items() if value is not None}
     known = inspect.signature(factory).parameters
+    if time_step is not None and "physics" in known and isinstance(physics or {}, Mapping):
+        asked["physics"] = {"time_step": time_step, **(physics or {})}
     if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in known.values()):
         for option in asked.keys() - known.keys():
             if option == "gui":  # The environment's option has another name: render_mode.

@@ -8,9 +8,8 @@ from typing import Any, TypeVar
 
 from tpm_gym.arrays import is_number, is_whole
 from tpm_gym.errors import ConfigurationError
-from tpm_gym.simulation.state import CONTROL_PERIOD
 
-__all__ = ["Numerics", "require_numerics", "settings_of"]
+__all__ = ["Numerics", "count_steps", "require_numerics", "settings_of"]
 
 T = TypeVar("T")
 
@@ -43,10 +42,19 @@ class Numerics:
 
     time_step: float = 1 / 250
 
-    @property
-    def substeps(self) -> int:
-        """Number of time steps in a control period."""
-        return round(CONTROL_PERIOD / self.time_step)
+
+def count_steps(control_period: float, time_step: float, least: int = 1) -> int:
+    """Return the number of time steps (s) in a control period (s).
+
+    Raises:
+        ConfigurationError: If it is no whole number, or below ``least``.
+    """
+    steps = control_period / time_step
+    if round(steps) < least or abs(steps - round(steps)) >= 1e-6:
+        whole = f"a whole number, {least} or more"
+        valid = f"{control_period:g} s (control period) divided by {whole}"
+        raise ConfigurationError("time_step", time_step, valid)
+    return round(steps)
 
 
 def require_numerics(
@@ -65,10 +73,8 @@ def require_numerics(
         if not is_number(value := getattr(settings, name)):
             raise ConfigurationError(name, value, "a finite number")
     step, count = settings.time_step, getattr(settings, "iterations", 1)
-    steps = CONTROL_PERIOD / step if step > 0 else 0.0
-    if step < _SHORTEST or round(steps) < 1 or abs(steps - round(steps)) >= 1e-6:
-        valid = f"{CONTROL_PERIOD} s (control period) divided by an integer; at least {_SHORTEST} s"
-        raise ConfigurationError("time_step", step, valid)
+    if step < _SHORTEST:
+        raise ConfigurationError("time_step", step, f"at least {_SHORTEST} s")
     if not is_whole(count, 1):
         raise ConfigurationError("iterations", count, "a whole number, 1 or more")
     for name, (fits, valid) in ranges.items():

@@ -26,12 +26,15 @@ from tpm_gym.simulation.engine import (
 )
 from tpm_gym.simulation.imaging import Camera, Picture, View, paint_markers, paint_shadows
 from tpm_gym.simulation.randomisation import NOMINAL, Plant
+from tpm_gym.simulation.settings import count_steps
 from tpm_gym.simulation.state import CONTROL_PERIOD, Scene, State
 
 __all__ = ["Simulation", "Snapshot"]
 
 CLOSURE_LIMIT = 0.005
 """Largest allowed gap at a loop closure, m."""
+
+_STEPS = 10  # time steps in a control period, if neither settings nor engine say
 
 _COLUMNS = ("commands", "noise", "position", "jacobian", "conditioning", "mode_left", "bias")
 
@@ -62,7 +65,9 @@ class Simulation:
         machine: Nominal machine.
         engine: Name of the engine.
         count: Number of robots, n.
-        physics: Numerical settings of the engine; None for the engine's defaults.
+        control_period: Time between two commands, s.
+        physics: Numerical settings of the engine; None for the engine's defaults. A control period
+            other than 40 ms has ten time steps if the settings do not say.
         drive: Servo drives of the motors; None for ideal drives.
         gui: Whether to open a window.
         renderer: Renderer of the pictures; None for the engine's default.
@@ -82,6 +87,7 @@ class Simulation:
         machine: Machine = PAPER_TPM,
         engine: str = "pybullet",
         count: int = 1,
+        control_period: float = CONTROL_PERIOD,
         physics: Any = None,
         drive: Servo | None = None,
         gui: bool = False,
@@ -90,16 +96,25 @@ class Simulation:
         """Create the engine and load the robots."""
         self.loops = loops()
         self.scene, self.machine, self.count, self.drive = scene, machine, count, drive
+        self.control_period = control_period
+        usual = control_period == CONTROL_PERIOD
         self.engine: Engine = make_engine(
-            engine, gui=gui, renderer=renderer, physics=physics, drive=drive
+            engine,
+            gui=gui,
+            renderer=renderer,
+            physics=physics,
+            drive=drive,
+            time_step=None if usual else control_period / _STEPS,
         )
         try:
+            least = getattr(self.engine, "least_steps", 1)
+            steps = count_steps(control_period, self.engine.time_step, least)
             self.engine.load(machine, scene, count)
         except BaseException:
             self.close()
             raise
         self._plants = [NOMINAL] * count
-        self._weights = spline_weights(round(CONTROL_PERIOD / self.engine.time_step))
+        self._weights = spline_weights(steps)
         self._frame = machine.mount.frame
         self._region = np.array(machine.region.low), np.array(machine.region.high)
         # The last two commands and the next command, machine's frame, m
@@ -262,7 +277,7 @@ class Simulation:
         if self._disturbed:
             before, last = self._noise[:, 0], self._noise[:, 1]
             theta = theta + self._bias + last
-            rates = rates + (last - before) / CONTROL_PERIOD
+            rates = rates + (last - before) / self.control_period
         place, velocity, command, axis, assembly, working = self.loops.in_world(
             self._position, self._jacobian, rates, self._commands,
             np.ascontiguousarray(now.object_quaternion), self._mode_left, turn, origin,

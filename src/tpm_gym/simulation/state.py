@@ -12,7 +12,7 @@ from tpm_gym.errors import ConfigurationError
 __all__ = ["CONTROL_PERIOD", "Block", "Scene", "State"]
 
 CONTROL_PERIOD = 1 / 25
-"""Control period: time between two commands of an environment, s."""
+"""Control period of tasks that set no other: time between two commands, s."""
 
 
 @dataclass(frozen=True)

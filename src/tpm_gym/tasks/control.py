@@ -15,6 +15,7 @@ from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.engine import loops
+from tpm_gym.simulation.state import CONTROL_PERIOD
 
 __all__ = ["CartesianControl", "Control", "JointControl", "make_control"]
 
@@ -47,9 +48,9 @@ class CartesianControl:
 
     name = "cartesian"
 
-    def __init__(self, machine: Machine) -> None:
-        """Take the limits of a machine."""
-        self._step = np.array(machine.step_limit)
+    def __init__(self, machine: Machine, period: float = CONTROL_PERIOD) -> None:
+        """Take the limits of a machine in a control period, s."""
+        self._step = np.array(machine.step_limit) * (period / CONTROL_PERIOD)
         self._low, self._high = np.array(machine.region.low), np.array(machine.region.high)
 
     def command(self, actions: FloatArray, current: FloatArray) -> FloatArray:
@@ -80,15 +81,17 @@ class JointControl:
 
     name = "joints"
 
-    def __init__(self, machine: Machine) -> None:
-        """Take the limits of a machine."""
-        self._machine, self._step = machine, np.array(machine.step_limit)
+    def __init__(self, machine: Machine, period: float = CONTROL_PERIOD) -> None:
+        """Take the limits of a machine in a control period, s."""
+        share = period / CONTROL_PERIOD
+        self._machine, self._step = machine, np.array(machine.step_limit) * share
+        self._turn = machine.joint_limit * share
 
     def command(self, actions: FloatArray, current: FloatArray) -> FloatArray:
         """Move P by the joints' increment, slowed down where necessary."""
         machine = self._machine
         theta = machine.inverse(current)
-        step = actions * machine.joint_limit
+        step = actions * self._turn
         # Start with twice the share that reaches the limit according to J; the exact share is near.
         rate = np.abs((machine.evaluate(theta).jacobian * step[:, None]).sum(axis=-1))
         share = np.minimum(1.0, 2 * (self._step / np.maximum(rate, 1e-12)).min(axis=-1))
@@ -141,7 +144,7 @@ class JointControl:
     def action(self, wanted: FloatArray, current: FloatArray) -> FloatArray:
         """Return the joints' increment, scaled down as a whole where it is too large."""
         there, here = self._machine.require_inverse(np.stack([wanted, current]))
-        step = (there - here) / self._machine.joint_limit
+        step = (there - here) / self._turn
         largest = np.maximum(1.0, np.abs(step).max(axis=-1, keepdims=True))
         action: FloatArray = step / largest
         return action
@@ -153,16 +156,16 @@ class JointControl:
         theta = self._machine.require_inverse(self._machine.region.project(way))
         turns = np.abs(np.diff(theta, axis=0)).max() * _PARTS
         axes = (np.abs(wanted - current) / self._step).max()
-        return float(max(turns / self._machine.joint_limit, axes))
+        return float(max(turns / self._turn, axes))
 
 
-def make_control(kind: str, machine: Machine) -> Control:
-    """Make the control of that name.
+def make_control(kind: str, machine: Machine, period: float = CONTROL_PERIOD) -> Control:
+    """Make the control of that name, for a control period in s.
 
     Raises:
         ConfigurationError: If no control has this name.
     """
     for control in (CartesianControl, JointControl):
         if kind == control.name:
-            return control(machine)
+            return control(machine, period)
     raise ConfigurationError("control", kind, "'cartesian' or 'joints'")

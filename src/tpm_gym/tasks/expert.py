@@ -89,7 +89,9 @@ class Expert:
         for row in range(len(episodes)):
             new = episodes[row] != self._episodes[row]
             if new:
-                self._motions[row] = Motion(self._task.machine, self._control)
+                self._motions[row] = Motion(
+                    self._task.machine, self._control, self._task.control_period
+                )
                 self._motions[row].under_way = [np.zeros(3)] * self._latency
             motion = self._motions[row]
             motion.seen = {name: values[row] for name, values in seen.items()}

@@ -11,17 +11,17 @@ from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
-from tpm_gym.simulation.state import Block
+from tpm_gym.simulation.state import CONTROL_PERIOD, Block
 from tpm_gym.tasks.control import Control
 
 __all__ = ["Motion", "Move", "hanging"]
 
-RAMP = 3
-"""Control steps from rest to full speed."""
+RAMP = 0.120
+"""Time from rest to full speed, s."""
 ROUNDING = 1e-5
 """Tolerance as a fraction of a control step, above the error of single precision, 1e-6."""
-SEAL_STEPS = 4
-"""Control steps to wait for the cup to seal before giving up."""
+SEALING = 0.160
+"""Time to wait for the cup to seal before giving up, s."""
 
 
 def hanging(block: Block) -> FloatArray:
@@ -46,9 +46,10 @@ class Motion:
         under_way: Actions (3,) that the environment's latency holds back, oldest first.
     """
 
-    def __init__(self, machine: Machine, control: Control) -> None:
-        """Start without an observation."""
+    def __init__(self, machine: Machine, control: Control, period: float = CONTROL_PERIOD) -> None:
+        """Start without an observation; ``period`` is the control period, s."""
         self.machine, self._control = machine, control
+        self._ramp, self._sealing = (max(1, round(time / period)) for time in (RAMP, SEALING))
         self.seen: dict[str, FloatArray] = {}
         self.goal: FloatArray = np.empty(0)
         self.under_way: list[FloatArray] = []
@@ -100,7 +101,7 @@ class Motion:
         """
         yield from self.go([self._above(block, clearance)], vacuum=False)
         yield from self.go([self._above(block)], vacuum=True)
-        for _ in range(SEAL_STEPS):
+        for _ in range(self._sealing):
             if self.holding(block.name):
                 return
             yield Move(self._above(block), True)
@@ -113,12 +114,12 @@ class Motion:
     def _trapezoid(self, start: FloatArray, stop: FloatArray) -> FloatArray:
         """Return fractions of the way at the control steps from ``start`` to ``stop``.
 
-        Speed rises over RAMP steps, holds, and falls. Neither P nor a controlled joint exceeds its
+        Speed rises over RAMP, holds, and falls. Neither P nor a controlled joint exceeds its
         limit. Rounding of the observation (float32) does not add a step.
         """
         steps = self._control.steps(stop, start)
-        count = int(np.ceil(steps - ROUNDING)) + RAMP - 1
+        count = int(np.ceil(steps - ROUNDING)) + self._ramp - 1
         ramp = np.minimum(np.arange(1, count + 1), np.arange(count, 0, -1))
-        speed = np.minimum(ramp, RAMP).astype(np.float64)
+        speed = np.minimum(ramp, self._ramp).astype(np.float64)
         result: FloatArray = np.cumsum(speed) / speed.sum()
         return result

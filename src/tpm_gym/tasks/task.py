@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tpm_gym.arrays import BoolArray, FloatArray, finite
+from tpm_gym.arrays import BoolArray, FloatArray, finite, is_number
 from tpm_gym.errors import ConfigurationError, InputError, ResetOptionError, UnreachableError
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism.cup import CUP
@@ -81,6 +81,8 @@ class Task(ABC):
         goal_size: Length of a goal: three for each object in the scene's order, or three for P.
         tolerance: Distance below which a goal is achieved, m.
         samplings: Values of ``goals``.
+        control_period: Time between two actions, s. Limits of the machine hold in 40 ms, and are
+            scaled to it.
         max_episode_steps: Control steps after which ``gym.make`` truncates an episode.
         entries: Entries of the observation vector, in order.
 
@@ -93,6 +95,7 @@ class Task(ABC):
     goal_size: ClassVar[int] = 3
     tolerance: ClassVar[float] = 0.010
     samplings: ClassVar[tuple[str, ...]] = ("sampled",)
+    control_period: ClassVar[float] = CONTROL_PERIOD
     max_episode_steps: ClassVar[int] = 50
 
     def __init__(
@@ -114,6 +117,8 @@ class Task(ABC):
             raise ConfigurationError("penalty_weight", penalty_weight, "a number, 0 or more")
         if self.goal_size < 3 or self.goal_size % 3:
             raise ConfigurationError("goal_size", self.goal_size, "three for each point")
+        if not (is_number(self.control_period) and self.control_period > 0):
+            raise ConfigurationError("control_period", self.control_period, "a positive number")
         shown = len(self.markers(np.zeros(self.goal_size)))
         if shown != self.scene.markers:
             valid = f"{shown}, as a goal shows: scene = Scene(..., markers={shown})"
@@ -400,15 +405,17 @@ class Task(ABC):
 
     def _scales(self) -> tuple[Values, Values, Values, Values]:
         """Return centre and size of the region (m, world), full speed (m/s), largest step (m)."""
-        region, mount, step = self.machine.region, self.machine.mount, self.machine.step_limit
+        region, mount = self.machine.region, self.machine.mount
+        step = np.multiply(self.machine.step_limit, self.control_period / CONTROL_PERIOD)
         low, high = np.array(region.low), np.array(region.high)
         columns = (
             mount.to_world((low + high) / 2),
             (high - low) / 2,
-            np.divide(step, CONTROL_PERIOD),
+            step / self.control_period,
+            step,
         )
-        centre, extent, speed = (tuple(column.tolist()) for column in columns)
-        return centre, extent, speed, step
+        centre, extent, speed, largest = (tuple(column.tolist()) for column in columns)
+        return centre, extent, speed, largest
 
     def lip(self, state: State) -> FloatArray:
         """Return the centre (n, 3) m of the extended cup's lip, by forward kinematics."""

@@ -12,7 +12,7 @@ from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.mount import GRAVITY
-from tpm_gym.simulation.state import CONTROL_PERIOD, Block, Scene, State
+from tpm_gym.simulation.state import Block, Scene, State
 from tpm_gym.tasks import sampling
 from tpm_gym.tasks.motion import Motion, Move, hanging
 from tpm_gym.tasks.task import Entry, Task, dense
@@ -33,7 +33,7 @@ RUN_UP: Final = (1 / 3, 2 / 3, 1.0, 1.0, 1.0)
 
 The path is a spline of three commands, so that three equal steps give a period of constant speed.
 """
-VENTED: Final = CUP.venting_time * math.log(CUP.vacuum / CUP.least_vacuum) / CONTROL_PERIOD
+VENTED: Final = CUP.venting_time * math.log(CUP.vacuum / CUP.least_vacuum) / Task.control_period
 """Time from the command to let go until the block is free, in control periods."""
 AHEAD: Final = 1.5 - VENTED
 """Distance from the place of release to the command of that period, in units of its step.
@@ -100,7 +100,8 @@ class Throw(Task):
         """
         low, high = self.reach_of(block)
         longest = min(self.machine.step_limit[0], (high[0] - low[0] - BRAKING) / _RUN_UP_WAY)
-        slides = (max(longest, 0.0) / CONTROL_PERIOD) ** 2 / (2 * self.block.friction * GRAVITY)
+        fastest = max(longest, 0.0) / self.control_period
+        slides = fastest**2 / (2 * self.block.friction * GRAVITY)
         edge = self.machine.table[0] - self.block.width / 2 - self.tolerance
         boxes = []
         for side, end in ((-1.0, low[0]), (1.0, high[0])):
@@ -133,7 +134,7 @@ class Throw(Task):
         place[..., 2] += DROP
         way, friction = np.abs(goal - place)[..., 0], self.block.friction
         speed = np.sqrt(2 * friction * GRAVITY * np.maximum(way - friction * DROP, 0.0))
-        return place, side * speed * CONTROL_PERIOD
+        return place, side * speed * self.control_period
 
     def _lane(self, goal: FloatArray) -> FloatArray:
         """Return where P begins to run up and where it has stopped, (..., 2, 3) m, own frame."""

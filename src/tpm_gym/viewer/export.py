@@ -10,7 +10,6 @@ import numpy as np
 
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.tpm import TPM
-from tpm_gym.simulation.state import CONTROL_PERIOD
 from tpm_gym.viewer import server
 from tpm_gym.viewer.player import Player
 from tpm_gym.viewer.posture import at_joints
@@ -63,7 +62,7 @@ def export(folder: Path, machine: str | TPM = "paper", seed: int = 2) -> Path:
         while not player.ended:
             player.step()
             draw(player.state.theta)
-            recording.insert_sleep(CONTROL_PERIOD)
+            recording.insert_sleep(player.task.control_period)
         recording.insert_sleep(_HOLD)
         page.write_text(recording.as_html(), encoding="utf-8", newline="\n")
     finally:

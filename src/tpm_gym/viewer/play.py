@@ -13,7 +13,6 @@ from viser import GuiUplotHandle, ViserServer, uplot
 import tpm_gym
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.machine import Machine
-from tpm_gym.simulation.state import CONTROL_PERIOD
 from tpm_gym.viewer.player import Player, installed_engines, policies_for
 from tpm_gym.viewer.worker import Worker
 
@@ -136,7 +135,8 @@ class Play:
         if not low <= self.speed.value <= high:  # pages can send any number
             raise ConfigurationError("speed", self.speed.value, f"a number from {low} to {high}")
         if self.playing:
-            self._worker.tick(CONTROL_PERIOD / self.speed.value, self._tick)
+            period = self._made().task.control_period
+            self._worker.tick(period / self.speed.value, self._tick)
 
     # -- running ------------------------------------------------------------------------------
 

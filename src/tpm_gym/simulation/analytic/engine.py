@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from importlib.util import find_spec
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -58,12 +58,16 @@ class AnalyticEngine:
         drive: Servo drives of the motors; None for ideal drives.
 
     Attributes:
+        least_steps: Smallest number of time steps in a control period. Accelerations are found from
+            the last three points of a path.
         torques: (K, n, 3) N m, torques in all time steps of the last control period; None unless
             ``physics.torques`` is ``"every"``.
 
     Raises:
         ConfigurationError: If an option is out of range.
     """
+
+    least_steps: Final = 3
 
     def __init__(
         self,
@@ -77,9 +81,9 @@ class AnalyticEngine:
         self.physics = settings_of(Physics, "physics", physics)
         self.time_step = self.physics.time_step
         self._servo, self._renderer, self._gui = drive, renderer, gui
-        self._steps = self.physics.substeps
-        # Number of time steps at the end of a control period whose joint positions are needed
-        self._tail = {"none": 2, "last": 3, "every": self._steps}[self.physics.torques]
+        # Number of time steps at the end of a control period whose joint positions are needed;
+        # 0 for all
+        self._tail = {"none": 2, "last": 3, "every": 0}[self.physics.torques]
         self._draws = "pybullet" if find_spec("pybullet") else "mujoco"
         self._artist: Engine | None = None
         self.torques: FloatArray | None = None
@@ -146,7 +150,7 @@ class AnalyticEngine:
             self._follow(path, vacuum)
             return
         steps = ServoSteps(self._drives, self._drives.references(path), self.time_step)
-        self._integrate(self._rows, steps, vacuum)
+        self._integrate(self._rows, steps, len(path.weights), vacuum)
 
     def _follow(self, path: Path, vacuum: BoolArray) -> None:
         """Move all robots with ideal motors along their paths.
@@ -162,13 +166,13 @@ class AnalyticEngine:
         else:
             joints = path.joints()
             controls = points = self._machine.forward(joints, self._built)
-            theta, weights = joints[:, -self._tail :], np.eye(self._steps)
+            theta, weights = joints[:, -self._tail :], np.eye(len(path.weights))
             late |= ~self._machine.same_side(points).all(axis=1)
         start = {name: getattr(self, name) for name in _COURSE}
         push = None
         if self._scene.objects:
             route = Route(self._before, self._position, controls, weights)
-            last = 1 if self.physics.torques == "none" else self._steps
+            last = 1 if self.physics.torques == "none" else len(path.weights)
             push, self._carried = self._contact.advance(self._rows, route, vacuum, last)
             self._force = push[:, -1].copy()
             if self._carried.any():
@@ -189,11 +193,11 @@ class AnalyticEngine:
         self._contact.undo(rows)
         joints = np.ascontiguousarray(path.joints()[rows].swapaxes(0, 1))
         steps = IdealSteps(joints, self._effort[rows], self.time_step)
-        self._integrate(rows, steps, vacuum)
+        self._integrate(rows, steps, len(path.weights), vacuum)
         self._behind[rows] = steps.behind
 
-    def _integrate(self, rows: IntArray, steps: Steps, vacuum: BoolArray) -> None:
-        """Simulate a control period of some robots by forward dynamics."""
+    def _integrate(self, rows: IntArray, steps: Steps, count: int, vacuum: BoolArray) -> None:
+        """Simulate a control period of ``count`` time steps of some robots by forward dynamics."""
         on, whole = vacuum[rows], np.ones((1, 1))
 
         def touch(
@@ -205,14 +209,12 @@ class AnalyticEngine:
 
         course = Course(*(getattr(self, name)[rows] for name in _COURSE))
         built = None if self._built is None else self._built[rows]
-        course, torques = march(
-            self._machine, built, steps, self._steps, course, self.time_step, touch
-        )
+        course, torques = march(self._machine, built, steps, count, course, self.time_step, touch)
         for name, values in zip(_COURSE, course, strict=True):
             getattr(self, name)[rows] = values
         if self.physics.torques == "every":
             if self.torques is None:
-                self.torques = np.zeros((self._steps, self._count, 3))
+                self.torques = np.zeros((count, self._count, 3))
             self.torques[:, rows] = torques
 
     def _find_torques(

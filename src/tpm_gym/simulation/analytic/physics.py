@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.simulation.settings import Numerics, require_numerics
-from tpm_gym.simulation.state import CONTROL_PERIOD
 
 __all__ = ["Physics"]
 
@@ -34,7 +33,5 @@ class Physics(Numerics):
     def __post_init__(self) -> None:
         """Check the settings."""
         require_numerics(self, {})
-        if self.substeps < 3:
-            raise ConfigurationError("time_step", self.time_step, f"at most {CONTROL_PERIOD} s / 3")
         if self.torques not in TORQUES:
             raise ConfigurationError("torques", self.torques, ", ".join(map(repr, TORQUES)))
