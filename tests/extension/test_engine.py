@@ -101,5 +101,5 @@ def test_an_engine_of_several_robots_gets_several():
 
 def test_a_control_period_that_is_shorter_than_its_time_step_is_refused():
     task = type("Quick", (tpm_gym.tasks.Reach,), {"control_period": 0.004})
-    with pytest.raises(ConfigurationError, match="time_step = 0.04"):
+    with pytest.raises(ConfigurationError, match=r"time_step = 0\.04"):
         tpm_gym.TPMEnv(task, engine="kinematic")
