@@ -36,6 +36,9 @@ class KinematicEngine:
         self._theta, self._rates, self._hold = theta.copy(), np.zeros_like(theta), EMPTY
         self._objects = objects[0].copy()
 
+    def set_belt(self, rows: IntArray, speed: FloatArray) -> None:
+        raise ConfigurationError("engine", "kinematic", "an engine with friction, for a belt")
+
     def advance(self, path: Path, vacuum: BoolArray) -> None:
         before, theta = self._position(), path.joints(last=1)[:, -1]
         self._rates, self._theta = (theta - self._theta) / self.time_step, theta

@@ -38,5 +38,6 @@ def random_state(
         "object_axis": unit(objects, 3),
         "object_velocity": normal(objects, 3),
         "object_angular_velocity": normal(objects, 3),
+        "belt_speed": rng.normal(size=shape),
     }
     return State(**{**drawn, **values})

@@ -299,6 +299,13 @@ class Engine(Protocol):
             objects: (r, k, 7) centres (m) and orientations (x, y, z, w) of the objects.
         """
 
+    def set_belt(self, rows: IntArray, speed: FloatArray) -> None:
+        """Set the speeds (r,) m/s of the belts of ``rows``; the scene has a belt.
+
+        The contacts of the belt's surface have this velocity along x, and the belt stays in place.
+        The speed is no part of ``save``.
+        """
+
     def advance(self, path: Path, vacuum: BoolArray) -> None:
         """Simulate one control period along ``path``; ``vacuum`` (n,) is True where it is on."""
 

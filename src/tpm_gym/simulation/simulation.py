@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray, finite
-from tpm_gym.errors import ClosureError
+from tpm_gym.errors import ClosureError, ConfigurationError
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.tpm import PAPER_TPM
@@ -36,7 +36,10 @@ CLOSURE_LIMIT = 0.005
 
 _STEPS = 10  # time steps in a control period, if neither settings nor engine say
 
-_COLUMNS = ("commands", "noise", "position", "jacobian", "conditioning", "mode_left", "bias")
+_COLUMNS = (
+    *("commands", "noise", "position", "jacobian", "conditioning", "mode_left", "bias"),
+    "belt_speed",
+)
 
 
 @dataclass(frozen=True)
@@ -127,6 +130,7 @@ class Simulation:
         self._jacobian = np.zeros((count, 3, 3))
         self._conditioning = np.zeros(count)
         self._mode_left = np.zeros(count, dtype=np.int8)
+        self._belt_speed = np.zeros(count)
         self._readout: Readout
 
     def reset(
@@ -136,6 +140,7 @@ class Simulation:
         objects: Mapping[str, FloatArray] | None = None,
         plants: Sequence[Plant] | None = None,
         noise: FloatArray | None = None,
+        belt_speed: FloatArray | None = None,
     ) -> None:
         """Place robots at rest at ``theta``, with closed loops and upright objects.
 
@@ -146,13 +151,17 @@ class Simulation:
                 placed in the middle of the table.
             plants: Plant of each of the r robots; None for nominal robots.
             noise: (r, 3) rad, noise of the first encoder reading; None for zero.
+            belt_speed: (r,) m/s, speeds of the belts' surfaces along x; None for zero.
 
         Raises:
-            ConfigurationError: If a plant needs servo drives, but the drives are ideal.
+            ConfigurationError: If a plant needs servo drives, but the drives are ideal, or a speed
+                is given for a scene without a belt.
             InputError: If theta or a position is not three finite numbers.
             UnreachableError: If a robot cannot be assembled at theta; no robot has moved then.
             JointLimitError: If a motor is beyond a stop at theta; no robot has moved then.
         """
+        if belt_speed is not None and self.scene.belt is None:
+            raise ConfigurationError("belt_speed", belt_speed, "None: the scene has no belt")
         plants = [NOMINAL] * len(rows) if plants is None else plants
         for plant in plants:
             if plant is not NOMINAL:
@@ -166,6 +175,10 @@ class Simulation:
             self.machine.require_evaluate(true, self._built(plants))
         placed = self._places(len(rows), objects or {})
         self._become(rows, plants)
+        if self.scene.belt is not None:
+            speeds = np.zeros(len(rows)) if belt_speed is None else belt_speed
+            self._belt_speed[rows] = finite("belt_speed", speeds, (len(rows),))
+            self.engine.set_belt(rows, self._belt_speed[rows])
         self.engine.place(rows, true, placed)
         # The machine may own these arrays, so they are copied before they are changed.
         self._position, self._jacobian = self._position.copy(), self._jacobian.copy()
@@ -302,6 +315,7 @@ class Simulation:
             object_axis=axis,
             object_velocity=now.object_velocity,
             object_angular_velocity=now.object_angular_velocity,
+            belt_speed=self._belt_speed.copy(),
         )
 
     def save(self) -> Snapshot:
@@ -318,9 +332,11 @@ class Simulation:
     def restore(self, snapshot: Snapshot) -> None:
         """Continue from a snapshot of this simulation, or of one with equal arguments."""
         self._become(np.arange(self.count), snapshot.plants)
-        self.engine.restore(snapshot.engine)
         for name, values in snapshot.columns.items():
             setattr(self, f"_{name}", values.copy())
+        if self.scene.belt is not None:
+            self.engine.set_belt(np.arange(self.count), self._belt_speed)
+        self.engine.restore(snapshot.engine)
         self.commands = self._commands[:, 1]
         self._disturbed = bool(self._bias.any() or self._noise.any())
         self._readout = self.engine.read()

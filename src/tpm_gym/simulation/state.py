@@ -9,7 +9,7 @@ from typing import Any
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector, finite, is_whole
 from tpm_gym.errors import ConfigurationError
 
-__all__ = ["CONTROL_PERIOD", "Block", "Scene", "State"]
+__all__ = ["CONTROL_PERIOD", "Belt", "Block", "Patch", "Scene", "State"]
 
 CONTROL_PERIOD = 1 / 25
 """Control period of tasks that set no other: time between two commands, s."""
@@ -69,13 +69,55 @@ class Block:
 
 
 @dataclass(frozen=True)
+class Belt:
+    """Conveyor belt: a part of the table, over its full width, whose surface moves along x.
+
+    It begins at or beyond the table's lower edge in x. The rest of the table stands still. A
+    positive speed moves objects towards +x.
+
+    Attributes:
+        start: Lowest x, m, world.
+        end: Highest x, m, world.
+
+    Raises:
+        ConfigurationError: If a value is out of range.
+    """
+
+    start: float
+    end: float
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        start = finite("start", self.start, (), ConfigurationError)
+        if not start < finite("end", self.end, (), ConfigurationError):
+            raise ConfigurationError("end", self.end, f"a number above start, {self.start}")
+
+
+@dataclass(frozen=True)
+class Patch:
+    """Painted rectangle on the table. It is drawn, and nothing touches it.
+
+    Attributes:
+        low: Lowest x and y, m, world.
+        high: Highest x and y, m, world.
+        colour: Red, green, blue and opacity, each from 0 to 1.
+    """
+
+    low: tuple[float, float]
+    high: tuple[float, float]
+    colour: tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
 class Scene:
-    """Objects and goal markers that a task adds to robot and table.
+    """Objects, goal markers, belt and paint that a task adds to robot and table.
 
     Attributes:
         objects: The blocks, any number.
         markers: Number of goal markers, drawn as translucent spheres.
         marker_radius: Radius of the markers, m.
+        belt: Conveyor belt; None for a table that stands still.
+        patches: Painted rectangles.
 
     Raises:
         ConfigurationError: If a value is out of range, or two objects have equal names.
@@ -84,13 +126,17 @@ class Scene:
     objects: tuple[Block, ...] = ()
     markers: int = 1
     marker_radius: float = 0.010
+    belt: Belt | None = None
+    patches: tuple[Patch, ...] = ()
 
     def __post_init__(self) -> None:
         """Check the values."""
-        # The options of reset() use these names as keys, next to "goal", so they must be unique.
+        # The options of reset() use these names as keys, next to "goal" and "belt_speed".
         blocks = isinstance(self.objects, tuple) and all(isinstance(b, Block) for b in self.objects)
-        if not blocks or len({"goal", *(b.name for b in self.objects)}) <= len(self.objects):
-            valid = "a tuple of blocks, each with a name of its own, other than 'goal'"
+        if not blocks or len({"goal", "belt_speed", *(b.name for b in self.objects)}) < 2 + len(
+            self.objects
+        ):
+            valid = "a tuple of blocks, each with a name of its own, other than goal, belt_speed"
             raise ConfigurationError("objects", self.objects, valid)
         if not is_whole(self.markers, 0):
             raise ConfigurationError("markers", self.markers, "a whole number, 0 or more")
@@ -124,6 +170,7 @@ class State:
         object_axis: (n, k, 3), z axes of the objects' frames (unit vectors).
         object_velocity: (n, k, 3) m/s, velocities of the objects' centres.
         object_angular_velocity: (n, k, 3) rad/s, angular velocities of the objects.
+        belt_speed: (n,) m/s, speed of the belt's surface along x; zero without a belt.
     """
 
     theta: FloatArray
@@ -145,6 +192,7 @@ class State:
     object_axis: FloatArray
     object_velocity: FloatArray
     object_angular_velocity: FloatArray
+    belt_speed: FloatArray
 
     def take(self, rows: Any) -> State:
         """Return the State of some rows; for an integer, of one robot without the axis n."""

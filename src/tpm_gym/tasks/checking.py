@@ -93,4 +93,5 @@ def _example_states(machine: Machine, scene: Scene) -> State:
         object_position=inside[:, 3:], object_quaternion=turn, object_axis=axis,
         object_velocity=rng.normal(size=(count, objects, 3)),
         object_angular_velocity=rng.normal(size=(count, objects, 3)),
+        belt_speed=rng.normal(size=count),
     )  # fmt: skip

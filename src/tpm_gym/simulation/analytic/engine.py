@@ -100,7 +100,9 @@ class AnalyticEngine:
         self._effort = np.tile(self._nominal_effort, (count, 1))
         self._bias = np.zeros((count, 3))
         servo, step = self._servo, self.time_step
-        self._contact = Contact(scene.objects, count, step, machine.table, machine.mount.frame)
+        self._contact = Contact(
+            scene.objects, count, step, machine.table, machine.mount.frame, scene.belt
+        )
         self._drives = None if servo is None else ServoDrives(servo, machine, count, step)
         home = machine.require_inverse(np.array(machine.home))
         self._theta = np.tile(home, (count, 1))
@@ -142,6 +144,10 @@ class AnalyticEngine:
         if self._drives is not None:
             self._drives.rest(rows, theta)
         self._contact.place(rows, objects[..., :3], objects[..., 3:])
+
+    def set_belt(self, rows: IntArray, speed: FloatArray) -> None:
+        """Implement :meth:`Engine.set_belt`."""
+        self._contact.set_belt(rows, speed)
 
     def advance(self, path: Path, vacuum: BoolArray) -> None:
         """Implement :meth:`Engine.advance`."""

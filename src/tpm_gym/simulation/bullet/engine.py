@@ -95,8 +95,9 @@ class BulletEngine:
             self._window.load(machine, scene)
         self.bodies = self._scenery.bodies
         self._cup = Cup(self.client, self.robot, self.bodies, scene.objects, self.time_step)
+        tables, belts = self._scenery.tables, self._scenery.belts
         self._friction = Friction(
-            self.client, self.robot, self.bodies, self._scenery.tables, scene.objects
+            self.client, self.robot, self.bodies, tables, belts, scene.objects
         )
 
     def _empty(self) -> None:
@@ -128,16 +129,24 @@ class BulletEngine:
         self._friction.reset()
         self._torque = _ZERO
 
+    def set_belt(self, rows: IntArray, speed: FloatArray) -> None:
+        """Implement :meth:`Engine.set_belt`."""
+        self._scenery.belt_speed = float(speed[0])
+        self._friction.set_belt(float(speed[0]))
+
     def advance(self, path: Path, vacuum: BoolArray) -> None:
         """Implement :meth:`Engine.advance`."""
         cup, friction, step, on = self._cup, self._friction, self.client.stepSimulation, vacuum[0]
         targets, drive = steering(self._drives, path, self.robot)
         near = cup.find_near(len(targets), on)
+        scenery, running = self._scenery, self._scenery.belt_speed != 0
         first_scaled, first_update = friction.prepare(near, cup.first), cup.first_update
         for index, target in enumerate(targets):
             if index >= first_scaled:
                 friction.scale(cup.grip.hold.which)
             drive(target)
+            if running:
+                scenery.run_belts()
             step()
             if index >= first_update:
                 cup.update(on)

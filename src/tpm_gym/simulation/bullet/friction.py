@@ -40,11 +40,14 @@ _BOX = (1.0, 1.0)  # Bullet's default scales
 
 
 class _Face:
-    """Level face on which objects slide, and the scales of its friction along x and y."""
+    """Level face on which objects slide, and the scales of its friction along x and y.
+
+    Its surface moves along x at ``speed``, m/s.
+    """
 
     def __init__(self, body: int, link: int) -> None:
         self.body, self.link = body, link
-        self.scales = _BOX
+        self.scales, self.speed = _BOX, 0.0
 
 
 class Friction:
@@ -56,6 +59,7 @@ class Friction:
         bodies: Body ids of the objects.
         tables: Body ids of the tables, one per object, because objects slide in different
             directions.
+        belts: Body ids of the belts, one per object; empty without a belt.
         blocks: Objects of the scene.
     """
 
@@ -65,12 +69,14 @@ class Friction:
         robot: Robot,
         bodies: Sequence[int],
         tables: Sequence[int],
+        belts: Sequence[int],
         blocks: Sequence[Block],
     ) -> None:
-        """Create the faces of tables and cup, with Bullet's default friction."""
-        # Without objects, ``tables`` still has one table.
+        """Create the faces of tables, belts and cup, with Bullet's default friction."""
+        # Without objects, there still is one table.
         faces = [_Face(table, -1) for table in tables[: len(bodies)]]
         self._bodies = list(zip(bodies, faces, blocks, strict=True))
+        self._belts = [_Face(belt, -1) for belt in belts[: len(bodies)]]
         self._cup = _Face(*robot.tool)
         number = client.number
         self._number, self._factor = number, 1.0
@@ -80,9 +86,14 @@ class Friction:
 
     def reset(self) -> None:
         """Set the scales of all faces to an unknown direction of the force."""
-        for face in (self._cup, *(face for _, face, _ in self._bodies)):
+        for face in (self._cup, *self._belts, *(face for _, face, _ in self._bodies)):
             face.scales = _BOX  # differs from _UNKNOWN, so that _set() sends the scales to Bullet
             self._set(face, _UNKNOWN)
+
+    def set_belt(self, speed: float) -> None:
+        """Store the speed of the belts along x, m/s."""
+        for belt in self._belts:
+            belt.speed = speed
 
     def alter(self, factor: float) -> None:
         """Store the factor of the objects' nominal friction coefficients."""
@@ -95,6 +106,9 @@ class Friction:
             near: Indices of the objects that the cup can touch in the control period.
             first: First time step in which the cup can touch an object; returned if none moves.
         """
+        if self._belts and self._belts[0].speed:  # an object at rest on the belt slips
+            self._active, self._resting = list(range(len(self._bodies))), set()
+            return 0
         moving = []
         for index, (body, table, _) in enumerate(self._bodies):
             (x, y, z), _ = pybullet.getBaseVelocity(body, self._number)
@@ -124,6 +138,11 @@ class Friction:
             half, rough = block.height / 2, self._factor * block.friction
             if below:
                 self._set(table, _scales(x - half * q, y + half * p, below, rough))
+            if self._belts:
+                belt = self._belts[index]
+                if on_belt := [point for point in points if point[2] == belt.body]:
+                    slip = x - half * q - belt.speed, y + half * p
+                    self._set(belt, _scales(*slip, on_belt, rough))
             if above and index != held:
                 state = pybullet.getLinkState(cup.body, cup.link, 1, 0, number)
                 u, v, _ = state[6]

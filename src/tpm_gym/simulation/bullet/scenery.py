@@ -23,7 +23,15 @@ from tpm_gym.simulation.imaging import (
     View,
     metres,
 )
-from tpm_gym.simulation.stage import FLOOR, FLOOR_EDGE, LIGHT, TABLE, Slab
+from tpm_gym.simulation.stage import (
+    FLOOR,
+    FLOOR_EDGE,
+    LIGHT,
+    PATCH_HEIGHT,
+    Slab,
+    boards,
+    painted,
+)
 from tpm_gym.simulation.state import Block, Scene
 
 __all__ = ["Scenery"]
@@ -44,44 +52,73 @@ class Scenery:
         tables: Body ids of the tables. Each object collides with its own table, because
             :class:`Friction` scales the friction of each table. All tables are in one place and
             have one colour. The first table exists also without objects.
+        belts: Body ids of the belts, likewise; empty without a belt.
+        belt_speed: Speed of the belts along x, m/s.
     """
 
     def __init__(self, client: Client, scene: Scene, table: tuple[float, float]) -> None:
         """Load tables, floor and objects into the client."""
-        self._client = client
+        self._client, self.belt_speed = client, 0.0
         self._blocks = scene.objects
-        self.tables = [self._add_slab(TABLE, table)]
-        self.tables += [self._add_slab(TABLE, table) for _ in self._blocks[1:]]
-        self._floor = self._add_slab(FLOOR, (FLOOR_EDGE, FLOOR_EDGE))
+        still, *moving = boards(table, scene.belt)
+        copies, width = range(max(1, len(self._blocks))), table[1]
+        self.tables = [self._add_slab(*still, width) for _ in copies]
+        self.belts = [self._add_slab(*board, width) for board in moving for _ in copies]
+        self._floor = self._add_slab(FLOOR, -FLOOR_EDGE, FLOOR_EDGE, FLOOR_EDGE)
+        pose = client.getBasePositionAndOrientation
+        self._belt_places = [pose(belt) for belt in self.belts]
+        self._paint(scene)
         self.bodies = [self._add_block(block) for block in self._blocks]
         for index, body in enumerate(self.bodies):
-            for other, top in enumerate(self.tables):
-                client.setCollisionFilterPair(body, top, -1, -1, int(index == other))
+            for tops in (self.tables, self.belts):
+                for other, top in enumerate(tops):
+                    client.setCollisionFilterPair(body, top, -1, -1, int(index == other))
 
-    def _add_slab(self, slab: Slab, edges: tuple[float, float]) -> int:
-        """Add a static board with half edge lengths ``edges`` (m); return its body id."""
-        height = slab.top - slab.half_height
-        body = self._add_box((*edges, slab.half_height), height, slab.colour)
+    def _add_slab(self, slab: Slab, low: float, high: float, width: float) -> int:
+        """Add a static board between two x (m), with half its width (m); return its body id."""
+        half, height = ((high - low) / 2, width, slab.half_height), slab.top - slab.half_height
+        body = self._add_box(half, ((low + high) / 2, 0.0, height), slab.colour)
         # PyBullet multiplies the friction coefficients of both bodies.
         self._client.changeDynamics(body, -1, lateralFriction=slab.friction)
         return body
 
     def _add_block(self, block: Block) -> int:
-        body = self._add_box(block.half, block.height / 2, block.colour, block.mass)
+        place = (0.0, 0.0, block.height / 2)
+        body = self._add_box(block.half, place, block.colour, block.mass)
         self._client.changeDynamics(
             body, -1, lateralFriction=block.friction, linearDamping=0.0, angularDamping=0.0
         )
         return body
 
     def _add_box(
-        self, half: Vector, height: float, colour: Sequence[float], mass: float = 0.0
+        self, half: Vector, place: Vector, colour: Sequence[float], mass: float = 0.0
     ) -> int:
-        """Add a box at ``height`` (m), static without mass."""
+        """Add a box with its middle at ``place`` (m), static without mass."""
         client = self._client
         solid = client.createCollisionShape(client.GEOM_BOX, halfExtents=half)
         shape = client.createVisualShape(client.GEOM_BOX, halfExtents=half, rgbaColor=colour)
-        place = (0.0, 0.0, height)
         return int(client.createMultiBody(mass, solid, shape, basePosition=place))
+
+    def _paint(self, scene: Scene) -> None:
+        """Add the scene's painted rectangles as bodies that touch nothing."""
+        client, self._patches = self._client, list[int]()
+        for patch in painted(scene):
+            (x, y), (u, v) = patch.low, patch.high
+            half = ((u - x) / 2, (v - y) / 2, PATCH_HEIGHT)
+            shape = client.createVisualShape(
+                client.GEOM_BOX, halfExtents=half, rgbaColor=patch.colour
+            )
+            middle = ((x + u) / 2, (y + v) / 2, 0.0)
+            self._patches.append(client.createMultiBody(0.0, -1, shape, basePosition=middle))
+
+    def run_belts(self) -> None:
+        """Set place and velocity of the belts; call before each time step.
+
+        Contacts see the velocity of a static body's base. But Bullet moves the body, too.
+        """
+        for belt, place in zip(self.belts, self._belt_places, strict=True):
+            self._client.resetBasePositionAndOrientation(belt, *place)
+            self._client.resetBaseVelocity(belt, (self.belt_speed, 0.0, 0.0))
 
     def place(self, placed: Sequence[tuple[Pose, Twist]]) -> None:
         """Set poses and velocities of the objects, and clear their old contacts."""
@@ -141,7 +178,7 @@ class Scenery:
         ids = np.full(body.shape, ROBOT, dtype=np.int32)
         ids[(body == tool[0]) & (bodies >> 24 == tool[1] + 1)] = CUP
         ids[np.isin(body, [-1, self._floor])] = BACKGROUND
-        ids[np.isin(body, self.tables)] = TABLETOP
+        ids[np.isin(body, self.tables + self.belts + self._patches)] = TABLETOP
         for index, block in enumerate(self.bodies):
             ids[body == block] = OBJECTS + index
         return ids

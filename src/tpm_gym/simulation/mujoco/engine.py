@@ -115,6 +115,10 @@ class MujocoEngine:
         self._scenery.place([Pose.of(row) for row in objects[0].tolist()])
         mujoco.mj_step1(self.model, self.data)
 
+    def set_belt(self, rows: IntArray, speed: FloatArray) -> None:
+        """Implement :meth:`Engine.set_belt`."""
+        self._scenery.set_belt(float(speed[0]))
+
     def _reset(self) -> None:
         """Reset the state, and suppress MuJoCo's warnings.
 

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.mjcf import SOLID, STIFF, robot
@@ -17,7 +18,16 @@ from tpm_gym.mechanism.urdf import numbers
 from tpm_gym.simulation.imaging import BACKGROUND, FAR, NEAR, OBJECTS, ROBOT, TABLETOP
 from tpm_gym.simulation.imaging import CUP as CUP_ID
 from tpm_gym.simulation.mujoco.physics import Physics
-from tpm_gym.simulation.stage import FLOOR, FLOOR_EDGE, LIGHT, TABLE
+from tpm_gym.simulation.stage import (
+    BELT,
+    FLOOR,
+    FLOOR_EDGE,
+    LIGHT,
+    PATCH_HEIGHT,
+    TABLE,
+    boards,
+    painted,
+)
 from tpm_gym.simulation.state import Block, Scene
 
 __all__ = ["compile_model", "grip_name", "object_name", "segmentation_ids"]
@@ -49,12 +59,15 @@ def compile_model(machine: Machine, scene: Scene, physics: Physics) -> mujoco.Mj
     assert world is not None
     assert equality is not None
     _light(root, world)
-    _surroundings(world, machine)
+    _surroundings(world, machine, scene)
     for index, block in enumerate(scene.objects):
         _object(world, index, block)
         ends = {"body1": machine.mechanism.tool, "body2": object_name(index)}
         SubElement(equality, "weld", ends, name=grip_name(index), active="false")
     root.append(_contacts(root, scene, physics))
+    if scene.belt is not None and not hasattr(mujoco.MjModel, "geom_surfacevel"):
+        valid = "3.11 or later, for a scene with a belt"
+        raise ConfigurationError("mujoco", mujoco.__version__, valid)
     return mujoco.MjModel.from_xml_string(tostring(root, encoding="unicode"))
 
 
@@ -65,7 +78,8 @@ def segmentation_ids(model: mujoco.MjModel, tool: str, scene: Scene) -> NDArray[
     for index in range(len(scene.objects)):
         bodies[model.body(object_name(index)).id] = OBJECTS + index
     ids: NDArray[np.int32] = bodies[model.geom_bodyid]
-    ids[model.geom("table").id], ids[model.geom("floor").id] = TABLETOP, BACKGROUND
+    ids[model.geom_bodyid == 0] = TABLETOP
+    ids[model.geom("floor").id] = BACKGROUND
     return ids
 
 
@@ -95,11 +109,21 @@ def _light(root: Element, world: Element) -> None:
     )
 
 
-def _surroundings(world: Element, machine: Machine) -> None:
-    """Add table and floor."""
-    size, pos = (*machine.table, TABLE.half_height), (0.0, 0.0, TABLE.top - TABLE.half_height)
-    table = {"size": numbers(size), "pos": numbers(pos), "rgba": numbers(TABLE.colour)}
-    SubElement(world, "geom", _NO_CONTACT | table, name="table", type="box")
+def _surroundings(world: Element, machine: Machine, scene: Scene) -> None:
+    """Add table, belt, paint and floor."""
+    for slab, low, high in boards(machine.table, scene.belt):
+        size = (high - low) / 2, machine.table[1], slab.half_height
+        pos = (low + high) / 2, 0.0, slab.top - slab.half_height
+        board = {"size": numbers(size), "pos": numbers(pos), "rgba": numbers(slab.colour)}
+        # Without a velocity in the file, MuJoCo would leave out the computation for good.
+        moves = {} if slab is TABLE else {"surfacevel": "1 0 0"}
+        name = "table" if slab is TABLE else "belt"
+        SubElement(world, "geom", _NO_CONTACT | board | moves, name=name, type="box")
+    for patch in painted(scene):
+        (x, y), (u, v) = patch.low, patch.high
+        size, pos = ((u - x) / 2, (v - y) / 2, PATCH_HEIGHT), ((x + u) / 2, (y + v) / 2, 0.0)
+        paint = {"size": numbers(size), "pos": numbers(pos), "rgba": numbers(patch.colour)}
+        SubElement(world, "geom", _NO_CONTACT | paint, type="box")
     size, pos = (FLOOR_EDGE, FLOOR_EDGE, 1.0), (0.0, 0.0, FLOOR.top)
     floor = {"size": numbers(size), "pos": numbers(pos), "rgba": numbers(FLOOR.colour)}
     SubElement(world, "geom", _NO_CONTACT | floor, name="floor", type="plane")
@@ -119,12 +143,14 @@ def _contacts(root: Element, scene: Scene, physics: Physics) -> Element:
     """Return the pairs that can collide: objects with everything, and the cup with the table."""
     lips = [geom.attrib["name"] for geom in root.iter("geom") if geom.get("class") == SOLID]
     objects = [(object_name(index), block.friction) for index, block in enumerate(scene.objects)]
-    table, floor = ("table", TABLE.friction), ("floor", FLOOR.friction)
+    tops = [("table", TABLE.friction)]
+    tops += [] if scene.belt is None else [("belt", BELT.friction)]
+    floor = ("floor", FLOOR.friction)
     cups = [(name, CUP.friction) for name in lips]
     pairs = [
-        *((one, other) for one in objects for other in (table, floor, *cups)),
+        *((one, other) for one in objects for other in (*tops, floor, *cups)),
         *combinations(objects, 2),
-        *((cup, table) for cup in cups),
+        *((cup, top) for cup in cups for top in tops),
     ]
     contacts = Element("contact")
     for (name, friction), (other, rough) in pairs:

@@ -39,6 +39,7 @@ class Scenery:
             for geom in geoms
         ]
         self._friction = model.pair_friction.copy()
+        self._belt_speed = 0.0
 
     def keep_sliding(self) -> None:
         """Prevent sliding objects from hopping; call between the two halves of a time step.
@@ -48,7 +49,9 @@ class Scenery:
         reference acceleration along the normal.
         """
         data = self._data
-        if not data.ncon or (data.ncon <= self._resting and not self._moves()):
+        if not data.ncon:
+            return
+        if data.ncon <= self._resting and not (self._belt_speed or self._moves()):
             return
         wanted = data.efc_aref[self._rows()][::3]
         before = wanted.copy()
@@ -86,6 +89,10 @@ class Scenery:
         mujoco.mj_fwdConstraint(model, data)
         after = np.empty(data.nefc)
         mujoco.mj_mulJacVec(model, data, after, data.qvel + model.opt.timestep * data.qacc)
+        if self._belt_speed:  # efc_vel is relative to the belt's surface
+            before = np.empty(data.nefc)
+            mujoco.mj_mulJacVec(model, data, before, data.qvel)
+            after += data.efc_vel - before
         return after
 
     def _moves(self) -> bool:
@@ -96,6 +103,11 @@ class Scenery:
             > _STILL
             for dof in self._dof
         )
+
+    def set_belt(self, speed: float) -> None:
+        """Set the velocity of the belt's surface along x, m/s."""
+        self._belt_speed = speed
+        self._model.geom_surfacevel[self._model.geom("belt").id, 0] = speed
 
     def place(self, poses: Sequence[Pose]) -> None:
         """Set the poses of the objects."""

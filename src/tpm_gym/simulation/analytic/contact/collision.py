@@ -147,18 +147,19 @@ def collide_objects(
 def _collide_table(
     box: _Box, setting: Setting, contacts: Records, place: _Place, body: tuple[int, float]
 ) -> int:
-    """Add the corners of an object near the table, or near the floor if it is beside the table."""
-    (x, y, z), (count, slot), (edge_x, edge_y) = box.middle, place, setting.table
-    over = abs(x) <= edge_x and abs(y) <= edge_y
+    """Add the corners of an object near table or belt, or near the floor if it is beside both."""
+    (x, y, z), (count, slot), (low, high, edge) = box.middle, place, setting.table
+    over = low <= x <= high and abs(y) <= edge
     height = z - (TABLE.top if over else FLOOR.top)
-    pair = _two(-1, body[0]), body[1] * (TABLE.friction if over else FLOOR.friction)
+    friction, belt = body[1] * (TABLE.friction if over else FLOOR.friction), len(setting.half) + 1
     if height - _extent(box, _UP) > _NEAR:
         return count
     for k in range(TABLE_SLOTS):
         p, q, r = box.half
         arm = _inner(box, p if k & 1 else -p, q if k & 2 else -q, r if k & 4 else -r)
         if height + arm[2] < _NEAR:
-            arms = _ZERO, arm, _ZERO
+            arms, top = (_ZERO, arm, _ZERO), belt if over and x + arm[0] < setting.belt_end else -1
+            pair = _two(top, body[0]), friction
             count = _add(contacts, (count, slot + k), pair, arms, _UP, height + arm[2])
     return count
 

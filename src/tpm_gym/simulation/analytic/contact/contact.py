@@ -10,6 +10,7 @@ spring has no end stop. Within a time step, contacts do not move point P.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -26,8 +27,8 @@ from tpm_gym.simulation.analytic.contact.state import (
     work_for,
 )
 from tpm_gym.simulation.analytic.contact.stepping import advance, read
-from tpm_gym.simulation.stage import TABLE
-from tpm_gym.simulation.state import Block
+from tpm_gym.simulation.stage import TABLE, boards
+from tpm_gym.simulation.state import Belt, Block
 
 __all__ = ["Contact", "Reading"]
 
@@ -63,6 +64,7 @@ class Contact:
         time_step: Time step, s.
         table: Half edge lengths of the tables along x and y, m.
         frame: Factors (3,) and origin (3,) m that convert the machine's frame to the world frame.
+        belt: Belt of each table; None for none.
     """
 
     def __init__(
@@ -72,12 +74,14 @@ class Contact:
         time_step: float,
         table: tuple[float, float],
         frame: tuple[FloatArray, FloatArray],
+        belt: Belt | None = None,
     ) -> None:
         """Place the objects in the middle of their tables, stacked on each other."""
         self._blocks, number = tuple(blocks), len(blocks)
         half = np.array([block.half for block in blocks]).reshape(number, 3)
         turn, origin = (vector("frame", part) for part in frame)
-        self._setting = Setting(half, table, time_step, turn, origin)
+        low, end = boards(table, belt)[-1][1], -math.inf if belt is None else belt.end
+        self._setting = Setting(half, (low, *table), end, time_step, turn, origin)
         self._tables, self._earlier = tables_for(count, number), tables_for(count, number)
         self._work = work_for(number)
         everything = np.arange(count)
@@ -92,12 +96,18 @@ class Contact:
             nominal = np.array([getattr(block, name) for block in self._blocks])
             self._tables.objects[name][rows] = factor[:, None] * nominal
 
+    def set_belt(self, rows: Any, speed: FloatArray) -> None:
+        """Set the speeds (r,) m/s of the belts of some tables, along x."""
+        for tables in (self._tables, self._earlier):
+            tables.belts[rows] = speed
+
     def place(
         self, rows: Any, positions: FloatArray, quaternions: FloatArray | None = None
     ) -> None:
         """Release held objects, set vacuum to zero, and place all objects without motion.
 
-        Tables whose objects all stand upright on the table top are at rest at once.
+        Tables whose objects all stand upright on the table top are at rest at once, unless their
+        belt runs.
 
         Args:
             rows: (r,) indices of the tables.
@@ -109,7 +119,7 @@ class Contact:
         objects["position"] = positions
         objects["quaternion"] = (0.0, 0.0, 0.0, 1.0) if quaternions is None else quaternions
         objects["velocity"] = objects["spin"] = 0.0
-        standing = self._standing(objects).all(axis=1)
+        standing = self._standing(objects).all(axis=1) & (tables.belts[rows] == 0)
         objects["rest"] = np.where(standing, AT_REST, 0)[:, None]
         empty = np.zeros((), CUP_STATE)
         empty["held"] = -1
@@ -120,7 +130,8 @@ class Contact:
         """Return whether each of (r, k) objects stands upright on the table top."""
         place, setting = objects["position"], self._setting
         on_top = np.abs(place[..., 2] - setting.half[:, 2] - TABLE.top) < _LEVEL
-        over = (np.abs(place[..., :2]) <= setting.table).all(axis=-1)
+        (low, high, edge), (x, y) = setting.table, np.moveaxis(place[..., :2], -1, 0)
+        over = (x >= low) & (x <= high) & (np.abs(y) <= edge)
         standing: BoolArray = on_top & over & (objects["quaternion"][..., 3] == 1.0)
         return standing
 

@@ -70,7 +70,10 @@ BODY: Final = np.dtype(
     ],
     align=True,
 )
-"""Body in the solver: body 0 is the cup with the held object, body 1 + i is object i."""
+"""Body in the solver: body 0 is the cup with the held object, body 1 + i is object i.
+
+The last body is the belt, which has a velocity and an infinite mass.
+"""
 
 CONTACT: Final = np.dtype(
     [
@@ -102,13 +105,15 @@ class Setting(NamedTuple):
 
     Attributes:
         half: (k, 3) m, half edge lengths of the objects.
-        table: Half edge lengths of the table along x and y, m.
+        table: Lowest and highest x of table and belt, and half their width, m.
+        belt_end: Highest x of the belt, m; minus infinity without a belt.
         step: Time step, s.
         turn, origin: Factors, and origin (m), that convert the machine's frame to the world frame.
     """
 
     half: FloatArray
-    table: tuple[float, float]
+    table: tuple[float, float, float]
+    belt_end: float
     step: float
     turn: Vector
     origin: Vector
@@ -122,12 +127,14 @@ class Tables(NamedTuple):
         cups: (n,) records of :data:`CUP_STATE`.
         forces: (n, slots(k), 3) N, contact forces of the last time step.
         awake: (n,) whether objects or cup may change while the lip stays away.
+        belts: (n,) m/s, speeds of the belts along x.
     """
 
     objects: Records
     cups: Records
     forces: FloatArray
     awake: BoolArray
+    belts: FloatArray
 
 
 class Route(NamedTuple):
@@ -150,7 +157,7 @@ class Work(NamedTuple):
     """Workspace of the solver; every time step overwrites it.
 
     Attributes:
-        bodies: (k + 1,) records of :data:`BODY`.
+        bodies: (k + 2,) records of :data:`BODY`.
         contacts: (slots(k),) records of :data:`CONTACT`.
         polygons: (2, 12, 3) m, corners of two polygons, to clip faces.
     """
@@ -168,11 +175,12 @@ def slots(objects: int) -> int:
 
 def work_for(objects: int) -> Work:
     """Allocate the workspace for ``objects`` objects."""
-    bodies, contacts = np.zeros(objects + 1, BODY), np.zeros(slots(objects), CONTACT)
+    bodies, contacts = np.zeros(objects + 2, BODY), np.zeros(slots(objects), CONTACT)
     return Work(bodies, contacts, np.zeros((2, 12, 3)))
 
 
 def tables_for(count: int, objects: int) -> Tables:
     """Allocate the state of ``count`` tables with ``objects`` objects each."""
     records, cups = np.zeros((count, objects), OBJECT), np.zeros(count, CUP_STATE)
-    return Tables(records, cups, np.zeros((count, slots(objects), 3)), np.zeros(count, np.bool_))
+    forces, awake = np.zeros((count, slots(objects), 3)), np.zeros(count, np.bool_)
+    return Tables(records, cups, forces, awake, np.zeros(count))

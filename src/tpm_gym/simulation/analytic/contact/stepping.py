@@ -76,6 +76,7 @@ def advance(
         _copy(tables, earlier, row)
         _place(path, i, setting, points)
         objects, cup, forces = tables.objects[row], tables.cups[row], tables.forces[row]
+        work.bodies[-1]["velocity"][0] = tables.belts[row]
         for k in range(steps):
             way = Way(row_of(points, k), row_of(points, k + 1), row_of(points, k + 2))
             force = _step(objects, cup, forces, way, on[i], setting, work)
