@@ -38,7 +38,7 @@ from shared import provenance, quartiles
 from speed_report import print_report, save_plot
 
 from tpm_gym import ENV_IDS
-from tpm_gym.simulation.bullet.client import silence
+from tpm_gym.simulation.bullet.silence import silence
 
 BASELINE = "PandaPickAndPlace-v3"
 PEERS = {

@@ -24,9 +24,10 @@ from tpm_gym.kinematics import jacobian
 from tpm_gym.mechanism import PAPER_TPM
 from tpm_gym.mechanism.motor import TORQUE_MOTOR
 from tpm_gym.mechanism.tpm import ASSEMBLY_LIMIT
-from tpm_gym.simulation.bullet.client import Client, silence
+from tpm_gym.simulation.bullet.client import Client
 from tpm_gym.simulation.bullet.physics import REGULARISATION, Physics
 from tpm_gym.simulation.bullet.robot import Robot
+from tpm_gym.simulation.bullet.silence import silence
 from tpm_gym.simulation.engine import spline_weights
 from tpm_gym.simulation.settings import count_steps
 from tpm_gym.simulation.simulation import CLOSURE_LIMIT

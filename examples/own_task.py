@@ -28,10 +28,6 @@ class Land(Task):
         points = sampling.apart_from(self.machine.home, rngs, self.machine, level)
         return {"goal": self.machine.mount.to_world(points), **chosen}
 
-    def achieved(self, state):
-        """Return point P by the encoders, (n, 3) m."""
-        return state.fk_position
-
     def shaping(self, state):
         """Return the cost of sideways speed near the level of the goals, (n,)."""
         level = self.machine.mount.to_world(self.machine.goal_region.high)[2]

@@ -46,6 +46,7 @@ def env():
         {"control": "torque"},
         {"reward": "none"},
         {"goals": "hard"},
+        {"goals": "tempting", "machine": "wide"},
         {"task": "juggle"},
         *({"engine": value} for value in ("havok", None, 3)),
         *({"machine": value} for value in ("delta", 3, object, Machine, {"name": "paper"})),

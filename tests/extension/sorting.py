@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 import tpm_gym
 from tpm_gym.arrays import FloatArray
 from tpm_gym.simulation import Block, Scene, State
-from tpm_gym.tasks import Entry, Motion, Move, Task, hanging, sampling
+from tpm_gym.tasks import Motion, Move, Task, hanging, sampling
 
 CLEARANCE = 0.045  # m; a block that is carried passes over one that stands
 APART = 0.045  # m between the middles of what stands on the table
@@ -47,10 +47,6 @@ class Sort(Task):
             start[name] = np.concatenate(places, axis=1)
         return start
 
-    def achieved(self, state: State) -> FloatArray:
-        """Middles of the two blocks."""
-        return state.object_position.reshape(-1, 6)
-
     def gap(self, achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
         """That of the block that is farther from its place."""
         ends = (np.reshape(goal, (*np.shape(goal)[:-1], 2, 3)) for goal in (achieved, desired))
@@ -63,10 +59,6 @@ class Sort(Task):
             return {}
         tilt = np.linalg.norm(state.object_axis[..., :2], axis=-1).max(axis=-1)
         return {"tilt": -tilt, "empty": -0.1 * (state.held < 0)}
-
-    def observed(self) -> tuple[Entry, ...]:
-        """The robot, then each block."""
-        return (*self.robot_entries(), *self.object_entries(0), *self.object_entries(1))
 
     def plan(self, motion: Motion) -> Iterator[Move]:
         """Each block to its place, and up."""

@@ -101,7 +101,7 @@ def test_a_block_that_the_cup_cannot_come_down_to_is_refused(sorting):
         ("goal_size", 3, "markers = 2 .*valid: 1, .*markers=1"),
         ("achieved", lambda *_: np.zeros(3), r"achieved\(\) = .*\(3,\).*of shape \(n, 6\)"),
         ("shaping", lambda *_: None, r"shaping\(\) = None .*a dictionary"),
-        ("observed", tpm_gym.tasks.Task.observed, r"observed\(\) = .*'red_held'.*object_entries"),
+        ("observed", tpm_gym.tasks.Task.robot_entries, r"observed\(\) = .*'red_held'.*add obj"),
         ("vacuum", False, "vacuum = False .*: True: the plan of Wrong"),
     ],
 )
@@ -117,6 +117,5 @@ def test_where_there_is_no_room_sampling_says_so(sorting):
             with patch.object(sorting, "APART", 0.5):
                 return super().sample(rngs, chosen)
 
-    env = tpm_gym.TPMEnv(Crowd)
     with pytest.raises(ConfigurationError, match="a larger one: what is drawn lies"):
-        env.reset(seed=0)
+        tpm_gym.TPMEnv(Crowd)

@@ -1,8 +1,6 @@
 """The one text gives the same in arrays and tensors, and tensors differentiate it."""
 
 import math
-import subprocess
-import sys
 from typing import Any
 
 import numpy as np
@@ -116,14 +114,6 @@ def test_tensors_stay_on_their_device_in_every_shape(shape):
     assert {value.device.type for value in tensors} == {"meta"}
     assert {value.shape[: len(shape) - 1] for value in tensors} == {shape[:-1]}
     assert {value.dtype for value in tensors} == {torch.float64, torch.bool}
-
-
-def test_torch_is_not_imported_by_who_has_no_tensor():
-    code = (
-        "import sys; from tpm_gym.kinematics import forward_all, inverse; "
-        "forward_all(inverse([[0, 0.03, 0.8]])); sys.exit('torch' in sys.modules)"
-    )
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 # -- derivatives -----------------------------------------------------------------------------------

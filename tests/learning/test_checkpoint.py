@@ -116,7 +116,7 @@ def test_a_checkpoint_of_another_version_is_named(folder):
     warned: list[str] = []
     with pytest.raises(CheckpointError, match=r"is whole; .*--overwrite"):
         CheckpointStore(folder).load(warned.append)
-    assert "format 99, this version of tpm_gym reads 4" in "".join(warned)
+    assert "format 99, this version of tpm_gym reads 5" in "".join(warned)
 
 
 # -- dying ------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 from paths import read_strict
-from processes import PYTHON, TPM_GYM, error_of, printed_by
+from processes import TPM_GYM, error_of, printed_by
 from trainings import quiet, said
 
 from tpm_gym.errors import ConfigurationError
@@ -240,16 +240,6 @@ def test_an_exported_policy_that_is_of_another_task_or_damaged_is_refused(run, t
     (tmp_path / "best.safetensors").write_bytes(b"")
     with pytest.raises(PolicyError, match=r"is not a policy file: .* \(0 of \d+ bytes\)"):
         returns(tmp_path)
-
-
-def test_policies_load_no_torch(run):
-    specs = ("expert", "random", str(run / "best"))
-    program = (
-        "import sys; from tpm_gym.learning import EvaluationConfig, evaluate\n"
-        f"evaluate(EvaluationConfig(policy={specs!r}, env='TPMReach-v0', episodes=1))\n"
-        "assert not {'torch', 'stable_baselines3'} & set(sys.modules)\n"
-    )
-    printed_by(PYTHON, "-c", program)
 
 
 def test_command_line_errors_are_one_line():

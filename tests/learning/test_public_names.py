@@ -1,7 +1,6 @@
 """The package's names are there without the cost of what is behind them."""
 
 import pytest
-from processes import PYTHON, printed_by
 
 from tpm_gym import TPMError, learning
 from tpm_gym.errors import ConfigurationError
@@ -14,24 +13,6 @@ def test_every_name_is_there_and_unknown_ones_are_not():
         assert getattr(learning, name) is not None
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         learning.nonsense  # noqa: B018
-
-
-def test_neither_the_package_nor_the_help_imports_torch():
-    heavy = "{'torch', 'stable_baselines3', 'matplotlib', 'pybullet'} & set(sys.modules)"
-    for module in ("tpm_gym.learning", "tpm_gym.learning.command_line"):
-        printed_by(PYTHON, "-c", f"import sys, {module}; sys.exit(str({heavy}) if {heavy} else 0)")
-
-
-def test_what_is_not_installed_is_named_with_the_extra_that_installs_it():
-    printed_by(
-        PYTHON,
-        "-c",
-        "import sys; sys.modules['stable_baselines3'] = None\n"
-        "import tpm_gym.learning, tpm_gym.errors\n"
-        "try: tpm_gym.learning.PenaltyHerReplayBuffer\n"
-        "except tpm_gym.errors.MissingPackageError as error: assert '[train]' in str(error)\n"
-        "else: sys.exit('imported')\n",
-    )
 
 
 @pytest.mark.parametrize("command", ["train", "resume", "evaluate", "export", "tune"])

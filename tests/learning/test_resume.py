@@ -134,22 +134,33 @@ def test_a_checkpoint_that_no_training_wrote_is_refused_and_changes_nothing(kill
     content = store.load(print)
     assert content is not None
     state = json.loads(content.files["state.json"])
+    changes = {"counters": {}, "log": [], "seconds": "long", "statistics": [[{}], []]}
+    states = [json.dumps({**state, name: value}).encode() for name, value in changes.items()]
     forged = {
-        "state.json": (
-            b"{}",
-            b"[]",
-            b"[" * 100_000,
-            json.dumps({**state, "counters": {}}).encode(),
-        ),
+        "state.json": (b"{}", b"[]", b"[" * 100_000, *states),
         "torch.pt": (b"", b"{}"),
         "config.json": (b"null", b"[" * 100_000),
+        "evaluations.jsonl": (b"[\n", b"{}\n", b"\xff\n"),
+        "progress.csv": (b"\xff",),
     }
+    arrays = (
+        {"last/observation": None},
+        {"last/more": np.zeros(3)},
+        {"episode_starts": np.zeros(7)},
+        {"log/train/loss": np.zeros(2)},
+    )
+    (run / "last.zip").write_text("precious")
     before = {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()}
     for name, texts in forged.items():
         for text in texts:
             store.save(replace(content, files={**content.files, name: text}, finished=True))
             with pytest.raises(CheckpointError, match="start the run anew with --overwrite"):
                 resume(ResumeConfig(run), quiet())
+    for change in arrays:
+        found = {k: v for k, v in {**content.arrays, **change}.items() if v is not None}
+        store.save(replace(content, arrays=found, finished=True))
+        with pytest.raises(CheckpointError, match="start the run anew with --overwrite"):
+            resume(ResumeConfig(run), quiet())
     assert before == {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()}
 
 

@@ -1,8 +1,6 @@
 """Compiled rows are what arrays of numpy give; each row is computed by itself."""
 
 import math
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -185,12 +183,3 @@ def test_all_kinds_of_arrays_share_one_compiled_loop():
     PAPER_TPM.inverse(np.float32(points))
     loops = [vars(tpm_rows)[name] for name in ("motion", "inverse")]
     assert [len(loop.signatures) for loop in loops] == [1, 1]
-
-
-def test_numba_is_imported_when_a_machine_first_computes():
-    code = (
-        "import sys, tpm_gym; before = 'numba' in sys.modules; "
-        "tpm_gym.PAPER_TPM.inverse(tpm_gym.PAPER_TPM.home); "
-        "sys.exit(before or 'numba' not in sys.modules)"
-    )
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

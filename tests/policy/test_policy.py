@@ -1,6 +1,5 @@
 """A loaded policy acts as its layers say, names what does not fit, and needs PyTorch alone."""
 
-import json
 import os
 from collections.abc import Callable
 from contextlib import closing
@@ -251,33 +250,6 @@ def test_a_published_policy_is_named_by_its_environment(tmp_path, monkeypatch):
 
 
 # -- what loading needs, and what it leaves alone --------------------------------------------------
-
-
-def test_loading_needs_neither_torch_nor_an_engine(tmp_path):
-    path = write(tmp_path)
-    one = {key: values[0].tolist() for key, values in observations(1).items()}
-    code = (
-        "import sys; others = ['torch', 'stable_baselines3', 'pybullet', 'matplotlib']\n"
-        "sys.modules.update(dict.fromkeys(others)); import tpm_gym\n"
-        f"print(tpm_gym.load_policy({str(path)!r}).act({one}).tolist())"
-    )
-    printed = printed_by(PYTHON, "-c", code)
-    np.testing.assert_array_equal(json.loads(printed), load_policy(path).act(one).tolist())
-
-
-@pytest.mark.parametrize("package", ["safetensors", "pydantic"])
-def test_a_missing_package_is_named_with_its_remedy(tmp_path, package):
-    path = write(tmp_path)
-    code = (
-        f"import sys, tpm_gym; sys.modules[{package!r}] = None\n"
-        f"try: tpm_gym.load_policy({str(path)!r})\n"
-        "except ImportError as error:\n"
-        "    assert isinstance(error, tpm_gym.TPMError)\n"
-        "    print(error)"
-    )
-    printed = printed_by(PYTHON, "-c", code)
-    assert package in printed
-    assert "pip install 'tpm-gym[policy]'" in printed
 
 
 def test_nothing_is_unpickled_or_evaluated(tmp_path):

@@ -26,16 +26,10 @@ class TwoBlocks(PickAndPlace):
     scene = Scene(objects=(Block(), Block(name="other", width=0.02)), markers=2)
     goal_size = 6
 
-    def observed(self) -> Any:
-        return (*super().observed(), *self.object_entries(1))
-
     def sample(self, rngs: Any, chosen: Any) -> Any:
         places = {"object": [0.0, -0.03, 0.015], "other": [0.05, -0.03, 0.015]}
         places["goal"] = 2 * [-0.05, -0.03, 0.1]
         return {name: np.tile(place, (len(rngs), 1)) for name, place in places.items()} | chosen
-
-    def achieved(self, state: State) -> Any:
-        return state.object_position.reshape(-1, 6)
 
 
 @pytest.fixture(params=[Reach, PickAndPlace, TwoBlocks])

@@ -3,7 +3,6 @@
 import re
 import signal
 import subprocess
-import sys
 import urllib.request
 
 import psutil
@@ -42,20 +41,6 @@ def test_the_command_tells_its_address_serves_this_computer_only_and_ends_quietl
 def test_a_wrong_option_ends_in_one_sentence():
     said = error_of(*TPM_GYM, "view", "--machine", "nothing")
     assert said.startswith("error: machine = 'nothing' is not possible")
-
-
-def test_without_viser_the_extra_is_named():
-    code = (
-        "import sys; sys.modules['viser'] = None; sys.argv = ['tpm-gym', 'view'];"
-        "from tpm_gym.learning.__main__ import main; main()"
-    )
-    assert "pip install 'tpm-gym[view]'" in error_of(sys.executable, "-c", code)
-
-
-def test_importing_the_room_imports_no_viser():
-    code = "import sys, tpm_gym.viewer; print('viser' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "False"
 
 
 def test_an_export_is_one_page_with_an_episode(tmp_path, capsys):

@@ -45,7 +45,7 @@ def register_task(
     """
     option = option_name(name)
     if not (isinstance(task, type) and issubclass(task, Task)) or isabstract(task):
-        valid = "a class derived from tpm_gym.tasks.Task, with sample and achieved"
+        valid = "a class derived from tpm_gym.tasks.Task, with sample"
         raise ConfigurationError("task", task, valid)
     if max_episode_steps is None:
         max_episode_steps = task.max_episode_steps

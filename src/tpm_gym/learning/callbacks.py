@@ -3,7 +3,7 @@
 import json
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Final
 
 from rich.console import Console
@@ -39,7 +39,7 @@ class PeriodicEvaluation(BaseCallback):
     envs: TPMVectorEnv
     console: Console
     keep: Callable[[BaseAlgorithm], object]
-    evaluations: list[dict[str, Any]] = field(default_factory=list)
+    evaluations: list[dict[str, Any]]
 
     def __post_init__(self) -> None:
         """Initialise the callback."""
@@ -129,16 +129,15 @@ class Checkpointing(BaseCallback):
     """Checkpoints between rollouts, and one when the process is asked to stop.
 
     A checkpoint that cannot be written is reported and tried again when the next one is due. The
-    first is saved before training, so that each policy has a checkpoint. ``restored`` is the extra
-    data of the checkpoint that this process began with.
+    first is saved before training, so that each policy has a checkpoint. ``seconds`` is the time of
+    the training in earlier processes.
     """
 
     config: TrainingConfig
     store: CheckpointStore
-    evaluation: PeriodicEvaluation
     listener: SignalListener
     console: Console
-    restored: Mapping[str, Any]
+    seconds: float
 
     def __post_init__(self) -> None:
         """Initialise the callback."""
@@ -148,7 +147,7 @@ class Checkpointing(BaseCallback):
 
     def _on_training_start(self) -> None:
         # Times and speeds in the logs count from the beginning of the run.
-        self.model.start_time = int(time.time_ns() - self.restored.get("seconds", 0.0) * 1e9)
+        self.model.start_time = int(time.time_ns() - self.seconds * 1e9)
         self.model._num_timesteps_at_start = 0
         if self._last_step is None:
             self.save()
@@ -172,9 +171,7 @@ class Checkpointing(BaseCallback):
     def save(self, finished: bool = False) -> None:
         """Save a checkpoint, or report why not."""
         started = time.perf_counter()
-        evaluations = self.evaluation.evaluations
-        extra = {"seconds": seconds_trained(self.model), "evaluations": evaluations}
-        content = capture(self.model, self.config.run, extra, finished)
+        content = capture(self.model, self.config.run, seconds_trained(self.model), finished)
         try:
             self.store.save(content)
         except CheckpointError as error:

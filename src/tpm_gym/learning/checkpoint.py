@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from tpm_gym.learning.errors import CheckpointError
 
-FORMAT: Final = 4
+FORMAT: Final = 5
 KEPT: Final = 2  # checkpoints; the second is used if the first turns out to be damaged
 STATE: Final = "state.json"
 TENSORS: Final = "torch.pt"

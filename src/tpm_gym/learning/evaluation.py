@@ -27,7 +27,7 @@ from tpm_gym.learning.configuration import (
 from tpm_gym.learning.environments import check_env_id, import_module_of, make_envs
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.estimates import Estimate
-from tpm_gym.learning.film import write_contact_sheet, write_video
+from tpm_gym.learning.film import Frame, Play, write_contact_sheet, write_video
 from tpm_gym.learning.policies import load_policy, trained_in
 from tpm_gym.learning.rollout import BATCH, TEST_SEED, Episode, Policy, run_episodes, summarise
 
@@ -273,15 +273,33 @@ def _film(config: EvaluationConfig, console: Console) -> None:
     """Repeat the first episodes with rendering, so that it does not slow the evaluation."""
     count = min(config.video_episodes, config.episodes)
     frames = 1 + (check_env_id(config.env).max_episode_steps or 0)
-    films = (
-        ("video", config.video, count, write_video),
-        ("picture", config.picture, 1, write_contact_sheet),
-    )
     with closing(_make_envs(config, 1, "rgb_array")) as envs:
         policies = _load(config, envs)
+        write_film = partial(write_video, fps=envs.metadata["render_fps"])
+        films: tuple[tuple[str, Path | None, int, Callable[[Path, Play], None]], ...] = (
+            ("video", config.video, count, write_film),
+            ("picture", config.picture, 1, write_contact_sheet),
+        )
         for kind, file, episodes, write in films:
             paths = paths_per_policy(file, config.policy) if file is not None else []
             for path, policy in zip(paths, policies, strict=False):
                 console.print(f"{kind}: {path}, {episodes * frames} frames ...", markup=False)
                 with _bar(console, kind, episodes * frames) as advance:
-                    write(path, envs, policy, episodes, config.seed, partial(advance, 1))
+                    write(path, partial(_play, envs, policy, episodes, config.seed, advance))
+
+
+def _play(
+    envs: TPMVectorEnv,
+    policy: Policy,
+    episodes: int,
+    first_seed: int,
+    advance: Callable[[int], object],
+    use: Callable[[Frame], object],
+) -> None:
+    """Play episodes, and use every frame."""
+
+    def frame() -> None:
+        use(envs.render_tile(1))
+        advance(1)
+
+    run_episodes(envs, policy, episodes, first_seed, on_frame=frame)

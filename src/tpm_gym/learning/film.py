@@ -7,66 +7,36 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tpm_gym.envs.vector import TPMVectorEnv
 from tpm_gym.learning.provenance import write_whole
-from tpm_gym.learning.rollout import Policy, run_episodes
 from tpm_gym.simulation.imaging import tile
 
 Frame = NDArray[np.uint8]
+Play = Callable[[Callable[[Frame], object]], object]
+"""Function that plays episodes, and calls its argument with every frame."""
 
 _ROWS, _COLUMNS = 2, 3
 
 
-def write_video(
-    path: Path,
-    envs: TPMVectorEnv,
-    policy: Policy,
-    episodes: int,
-    first_seed: int,
-    on_frame: Callable[[], object],
-) -> None:
-    """Write an MP4 of consecutive episodes in real time; ``envs`` renders ``rgb_array``."""
+def write_video(path: Path, play: Play, fps: float) -> None:
+    """Write an MP4 of all frames, ``fps`` of them a second."""
     import imageio.v2 as imageio
 
     def write(part: Path) -> None:
         # H.264 needs an even width and height.
-        options = {"fps": envs.metadata["render_fps"], "macro_block_size": 2}
-        writer: Any = imageio.get_writer(part, **options)
+        writer: Any = imageio.get_writer(part, fps=fps, macro_block_size=2)
         with writer as video:
-            _film(envs, policy, episodes, first_seed, video.append_data, on_frame)
+            play(video.append_data)
 
     write_whole(path, write)
 
 
-def write_contact_sheet(
-    path: Path,
-    envs: TPMVectorEnv,
-    policy: Policy,
-    episodes: int,
-    first_seed: int,
-    on_frame: Callable[[], object],
-) -> None:
-    """Write a PNG of six moments of the first episode; arguments as for :func:`write_video`."""
+def write_contact_sheet(path: Path, play: Play) -> None:
+    """Write a PNG of six moments of an episode."""
     import imageio.v3 as imageio
 
     frames: list[Frame] = []
-    _film(envs, policy, episodes, first_seed, frames.append, on_frame)
+    play(frames.append)
     write_whole(path, lambda part: imageio.imwrite(part, contact_sheet(frames)))
-
-
-def _film(
-    envs: TPMVectorEnv,
-    policy: Policy,
-    episodes: int,
-    first_seed: int,
-    use: Callable[[Frame], object],
-    on_frame: Callable[[], object],
-) -> None:
-    def frame() -> None:
-        use(envs.render_tile(1))
-        on_frame()
-
-    run_episodes(envs, policy, episodes, first_seed, on_frame=frame)
 
 
 def contact_sheet(frames: Sequence[Frame]) -> Frame:

@@ -12,6 +12,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
 
+from pydantic import TypeAdapter
+from typing_extensions import TypedDict
+
 from tpm_gym.learning.checkpoint import CheckpointStore
 from tpm_gym.learning.errors import RunError
 from tpm_gym.learning.provenance import read_json
@@ -29,6 +32,25 @@ WHOLE: Final = "[!.]*.json"
 
 _BEST: Final = (BEST_FILE, "best.json", "best.safetensors")
 LAST: Final = (LAST_FILE, "last.json", "last.safetensors")
+
+
+class _Estimate(TypedDict):
+    mean: float
+    low: float
+    high: float
+
+
+_Evaluation = TypedDict(
+    "_Evaluation",
+    {
+        "steps": int,
+        "episodes": int,
+        "success_at_end": _Estimate,
+        "success_once": _Estimate,
+        "return": _Estimate,
+    },
+)
+"""Entries of an evaluation that are read again."""
 RESTORED: Final = (CONFIG_FILE, PROGRESS_FILE, EVALUATIONS_FILE, *_BEST)
 """Files that a checkpoint holds. Resuming sets them back, and writes later entries again."""
 
@@ -83,10 +105,20 @@ def resume_command(run: Path) -> str:
 def evaluations(run: Path) -> list[dict[str, Any]]:
     """Return the evaluations of a run, without a last line that a kill cut off."""
     try:
-        lines = (run / EVALUATIONS_FILE).read_text(encoding="utf-8").splitlines(keepends=True)
+        return _lines((run / EVALUATIONS_FILE).read_bytes())
     except FileNotFoundError:
         return []
-    return [json.loads(line) for line in lines if line.endswith("\n")]
+
+
+def checked(data: bytes) -> list[dict[str, Any]]:
+    """Return the evaluations in the content of a file; raise a ValueError if one is damaged."""
+    found = _lines(data)
+    TypeAdapter(list[_Evaluation]).validate_python(found, strict=True)
+    return found
+
+
+def _lines(data: bytes) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in data.splitlines(keepends=True) if line.endswith(b"\n")]
 
 
 def is_finished(run: Path) -> bool:

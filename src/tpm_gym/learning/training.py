@@ -40,7 +40,14 @@ from tpm_gym.learning.errors import (
 )
 from tpm_gym.learning.evaluation import EvaluationConfig, evaluate
 from tpm_gym.learning.rollout import BATCH, SELECTION_SEED
-from tpm_gym.learning.run_folder import CHECKPOINTS, CONFIG_FILE, CURVE_FILE, TESTS, is_finished
+from tpm_gym.learning.run_folder import (
+    CHECKPOINTS,
+    CONFIG_FILE,
+    CURVE_FILE,
+    EVALUATIONS_FILE,
+    TESTS,
+    is_finished,
+)
 from tpm_gym.learning.signals import SignalListener
 from tpm_gym.learning.vec_env import AnalyticVecEnv
 
@@ -169,12 +176,11 @@ class _Session:
             envs = stack.enter_context(closing(make_envs(count=count, **config.env_arguments)))
             bar = stack.enter_context(closing(callbacks.ProgressBar(self.console)))
             model = make_model(config, training_envs)
-            restored = self._begin(model)
-            earlier = restored.get("evaluations", [])
+            seconds, earlier = self._begin(model)
             keep = partial(self._keep, run_folder.BEST_FILE)
             evaluation = callbacks.PeriodicEvaluation(config, envs, self.console, keep, earlier)
             checkpointing = callbacks.Checkpointing(
-                config, self.store, evaluation, listener, self.console, restored
+                config, self.store, listener, self.console, seconds
             )
             stack.callback(model.logger.close)
             # Checkpointing sets the clock that the callbacks after it read.
@@ -190,21 +196,26 @@ class _Session:
         self._conclude(stopped_by)
         return stopped_by
 
-    def _begin(self, model: BaseAlgorithm) -> dict[str, Any]:
-        """Set model, files and logs to the beginning or the checkpoint; return its extra data."""
-        config, content, extra = self.config, self.content, {}
+    def _begin(self, model: BaseAlgorithm) -> tuple[float, list[dict[str, Any]]]:
+        """Set model, files and logs to the beginning or the checkpoint.
+
+        Returns:
+            Time of the training until now, s, and its evaluations.
+        """
+        config, content, seconds, evaluations = self.config, self.content, 0.0, []
         if content is None:
             run_folder.clear(config.run)
         else:  # files change only once the checkpoint is restored
             with _foreign_named(config.run):
-                extra = training_state.restore(model, content)
+                seconds = training_state.restore(model, content)
+                evaluations = run_folder.checked(content.files.get(EVALUATIONS_FILE, b""))
             training_state.restore_files(config.run, content)
         provenance.write_json(config.run / CONFIG_FILE, self.description)
         start = f"from step {content.step if content else 0:,} to "
         start = start if "resumed" in self.description else ""
         _say(self.console, f"{config.title}, {start}{config.steps:,} steps, in {config.run}")
         model.set_logger(training_state.make_logger(config.run, content))
-        return extra
+        return seconds, evaluations
 
     def _learn(
         self, model: BaseAlgorithm, called: list[BaseCallback], listener: SignalListener

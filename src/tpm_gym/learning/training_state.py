@@ -20,6 +20,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.logger import CSVOutputFormat, Logger, TensorBoardOutputFormat
@@ -28,6 +29,7 @@ from tensorboard.compat.proto.event_pb2 import (  # type: ignore[import-untyped]
     Event,
     SessionLog,
 )
+from typing_extensions import TypedDict
 
 from tpm_gym import TPMError
 from tpm_gym.learning.checkpoint import STATE, TENSORS, Content, starting
@@ -40,6 +42,25 @@ from tpm_gym.learning.vec_env import AnalyticVecEnv
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining")
 _PER_KEY = ("observations", "next_observations")
 _PER_ROW = ("actions", "rewards", "dones", "timeouts", "ep_start", "ep_length")
+
+
+class _Episode(TypedDict):
+    """Return and length of an episode."""
+
+    r: float
+    l: int  # noqa: E741
+
+
+class _State(TypedDict):
+    """State outside PyTorch and arrays, as in the JSON file of a checkpoint."""
+
+    counters: dict[str, float]
+    statistics: tuple[list[_Episode], list[float]]
+    log: tuple[dict[str, int], dict[str, list[str]]]  # counts, and formats that are left out
+    rng: dict[str, Any]
+    episodes: Any
+    versions: dict[str, str | None]
+    seconds: float
 
 
 class EpisodeRecorder(gym.Wrapper[Observation, Action, Observation, Action]):
@@ -86,14 +107,12 @@ class EpisodeRecorder(gym.Wrapper[Observation, Action, Observation, Action]):
         return observation
 
 
-def capture(
-    model: BaseAlgorithm, run: Path, extra: Mapping[str, Any], finished: bool = False
-) -> Content:
+def capture(model: BaseAlgorithm, run: Path, seconds: float, finished: bool = False) -> Content:
     """Return the state of a training between two rollouts; arrays of the buffer are views.
 
     Args:
         model: Its environments are an ``AnalyticVecEnv`` or of :class:`EpisodeRecorder`.
-        extra: Plain data to keep with the state.
+        seconds: Time of the training until now, s.
     """
     envs: Any = model.env
     observations: Any = model._last_obs
@@ -108,7 +127,7 @@ def capture(
         "rng": _rng_state(model),
         "episodes": episodes,
         "versions": versions(),
-        "extra": dict(extra),
+        "seconds": seconds,
     }
     files = {
         STATE: json.dumps(state, default=lambda array: array.tolist()).encode(),
@@ -134,13 +153,17 @@ def restore_files(run: Path, content: Content) -> None:
             (run / name).unlink(missing_ok=True)
 
 
-def restore(model: BaseAlgorithm, content: Content) -> dict[str, Any]:
+def restore(model: BaseAlgorithm, content: Content) -> float:
     """Restore a training in a new algorithm, built with equal arguments.
 
     Returns:
-        The ``extra`` of :func:`capture`.
+        The ``seconds`` of :func:`capture`.
     """
     state = json.loads(content.files[STATE])
+    TypeAdapter(_State).validate_python(state)
+    content.files.get(PROGRESS_FILE, b"").decode("utf-8")
+    if any(value.ndim or value.dtype.kind not in "fiub" for value in _pending(content).values()):
+        raise ValueError("values of the log that are no numbers")
     for name in _COUNTERS:
         setattr(model, name, type(getattr(model, name))(state["counters"][name]))
     size = model._stats_window_size
@@ -152,8 +175,7 @@ def restore(model: BaseAlgorithm, content: Content) -> dict[str, Any]:
     # The generators last, since the lines above may draw
     _restore_tensors(model, content.files[TENSORS])
     _restore_rng(model, state["rng"])
-    extra: dict[str, Any] = state["extra"]
-    return extra
+    return float(state["seconds"])
 
 
 def _tensors(model: BaseAlgorithm) -> bytes:
@@ -233,8 +255,10 @@ def _restore_episodes(
     else:
         each = enumerate(state["episodes"])
         rows = [envs.env_method("replay", episode, indices=[i])[0] for i, episode in each]
-        found = {name: np.array([row[name] for row in rows]) for name in last if None not in rows}
-    if not all(np.array_equal(found.get(name, ()), values) for name, values in last.items()):
+        keys = model.observation_space.spaces if None not in rows else ()  # type: ignore[attr-defined]
+        found = {name: np.array([row[name] for row in rows]) for name in keys}
+    equal = (np.array_equal(found[name], values) for name, values in last.items() if name in found)
+    if last.keys() != found.keys() or not all(equal):
         now, before = versions(), state["versions"]
         changed = [f"{k} {before.get(k)} -> {now[k]}" for k in now if before.get(k) != now[k]]
         raise CheckpointError(
@@ -242,7 +266,13 @@ def _restore_episodes(
             f"({', '.join(changed) or 'with equal versions'}); install the versions of "
             "config.json again, or start the run anew with --overwrite"
         )
-    model._last_obs, model._last_episode_starts = last, arrays["episode_starts"]
+    starts = arrays["episode_starts"].astype(np.bool_).reshape(model.n_envs)
+    model._last_obs, model._last_episode_starts = last, starts
+
+
+def _pending(content: Content) -> dict[str, NDArray[Any]]:
+    """Return the values that were not yet written to the log."""
+    return starting(content.arrays, "log/")
 
 
 def make_logger(run: Path, content: Content | None = None) -> Logger:
@@ -262,7 +292,7 @@ def make_logger(run: Path, content: Content | None = None) -> Logger:
         writer._get_file_writer().add_event(start)
         counts, excluded = json.loads(content.files[STATE])["log"]
         pending: Any = logger.name_to_value
-        pending |= {k: value[()] for k, value in starting(content.arrays, "log/").items()}
+        pending |= {k: value[()] for k, value in _pending(content).items()}
         logger.name_to_count.update(counts)
         logger.name_to_excluded.update({name: tuple(kinds) for name, kinds in excluded.items()})
     return logger

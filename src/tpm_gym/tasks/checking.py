@@ -1,4 +1,4 @@
-"""Check of a task: equal results for states together and one by one."""
+"""Check of a task: it starts, with equal results for states together and one by one."""
 
 from __future__ import annotations
 
@@ -21,14 +21,16 @@ _EXAMPLES = 7
 
 
 def check(task: Task) -> None:
-    """Check that a task's methods give equal results for states together and one by one.
+    """Check that a task has starts, and equal results for states together and one by one.
 
-    A method that reduces over the robots (``np.linalg.norm(x)`` without ``axis=-1``), or takes
-    rows for columns, gives wrong rewards in vector environments without an error.
+    Not every machine has tempting goals, or room for a task. And a method that reduces over the
+    robots (``np.linalg.norm(x)`` without ``axis=-1``), or takes rows for columns, gives wrong
+    rewards in vector environments without an error.
 
     Raises:
-        ConfigurationError: If a result is wrong; the error names the method.
+        ConfigurationError: If there is no start, or a result is wrong; the error names the method.
     """
+    task.start([np.random.default_rng(0)])
     several = _example_states(task.machine, task.scene)
     _check_shapes(task, several)
     together = _results(task, several)

@@ -12,7 +12,7 @@ from tpm_gym.kinematics.workspace import Region
 from tpm_gym.simulation.state import Block, Scene, State
 from tpm_gym.tasks import sampling
 from tpm_gym.tasks.motion import Motion, Move, hanging
-from tpm_gym.tasks.task import Entry, Task, dense
+from tpm_gym.tasks.task import Task, dense
 
 __all__ = ["PickAndPlace"]
 
@@ -65,14 +65,6 @@ class PickAndPlace(Task):
         table = self.on_table(self.block)
         x, y, level = table.high
         return table, Region(self.machine.goal_region.low, (x, y, level - sampling.APART))
-
-    def observed(self) -> tuple[Entry, ...]:
-        """Return the entries of the robot, then those of the block."""
-        return (*self.robot_entries(), *self.object_entries())
-
-    def achieved(self, state: State) -> FloatArray:
-        """Return the centre of the block."""
-        return state.object_position[:, 0]
 
     def shaping(self, state: State) -> dict[str, FloatArray]:
         """Return minus half the distance from cup to block, for a dense reward only."""

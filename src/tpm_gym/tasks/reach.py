@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from tpm_gym.arrays import FloatArray
-from tpm_gym.simulation.state import State
 from tpm_gym.tasks import sampling
 from tpm_gym.tasks.motion import Motion, Move
 from tpm_gym.tasks.task import Task
@@ -35,10 +34,6 @@ class Reach(Task):
         else:
             goals = sampling.apart_from(home, rngs, machine, [region] * len(rngs))
         return {"goal": machine.mount.to_world(goals)}
-
-    def achieved(self, state: State) -> FloatArray:
-        """Return point P by forward kinematics of the encoders."""
-        return state.fk_position
 
     def plan(self, motion: Motion) -> Iterator[Move]:
         """Move straight to the goal."""

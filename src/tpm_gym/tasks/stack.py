@@ -12,7 +12,7 @@ from tpm_gym.arrays import FloatArray
 from tpm_gym.simulation.state import Block, Scene, State
 from tpm_gym.tasks import sampling
 from tpm_gym.tasks.motion import Motion, Move, hanging
-from tpm_gym.tasks.task import Entry, Task, dense
+from tpm_gym.tasks.task import Task, dense
 
 __all__ = ["Stack"]
 
@@ -59,14 +59,6 @@ class Stack(Task):
                 both = np.concatenate([places, places + self.tower], axis=1)
                 starts[name] = both if name == "goal" else places
         return starts
-
-    def observed(self) -> tuple[Entry, ...]:
-        """Return the entries of the robot, then those of each block."""
-        return (*self.robot_entries(), *self.object_entries(0), *self.object_entries(1))
-
-    def achieved(self, state: State) -> FloatArray:
-        """Return the centres of both blocks."""
-        return state.object_position.reshape(-1, 6)
 
     def gap(self, achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
         """Return the larger distance of the two blocks to their goals, (...,) m."""

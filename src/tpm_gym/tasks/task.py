@@ -3,9 +3,8 @@
 A task sees only :class:`~tpm_gym.simulation.state.State`, whose first axis is the robots; goals,
 positions and velocities are in the world frame, in metres and seconds.
 
-A new task is one file: derive from :class:`Task`, write :meth:`~Task.sample`,
-:meth:`~Task.achieved` and, for an expert, :meth:`~Task.plan`; then
-:func:`tpm_gym.register_task`.
+A new task is one file: derive from :class:`Task`, write :meth:`~Task.sample` and, for an expert,
+:meth:`~Task.plan`; then :func:`tpm_gym.register_task`.
 """
 
 from __future__ import annotations
@@ -165,9 +164,13 @@ class Task(ABC):
             Centres (r, 3) m of the scene's objects by name, and ``"goal"`` (r, goal_size) m.
         """
 
-    @abstractmethod
     def achieved(self, state: State) -> FloatArray:
-        """Return the achieved goal, (n, goal_size) m."""
+        """Return the achieved goal, (n, goal_size) m: the objects' centres, or P without objects.
+
+        P is that of the forward kinematics of the encoders.
+        """
+        places = state.object_position
+        return places.reshape(len(places), -1) if self.scene.objects else state.fk_position
 
     def plan(self, motion: Motion) -> Iterator[Move]:
         """Yield the moves of the scripted controller for one robot; the last move is kept.
@@ -183,8 +186,9 @@ class Task(ABC):
         return {}
 
     def observed(self) -> tuple[Entry, ...]:
-        """Return the entries of the observation vector; the robot's own come first."""
-        return self.robot_entries()
+        """Return the entries of the observation vector: the robot's, then those of each object."""
+        objects = (self.object_entries(index) for index in range(len(self.scene.objects)))
+        return (*self.robot_entries(), *chain(*objects))
 
     # -- reward: here and nowhere else ------------------------------------------------------------
 

@@ -15,7 +15,7 @@ from tpm_gym.mechanism.mount import GRAVITY
 from tpm_gym.simulation.state import Block, Scene, State
 from tpm_gym.tasks import sampling
 from tpm_gym.tasks.motion import Motion, Move, hanging
-from tpm_gym.tasks.task import Entry, Task, dense
+from tpm_gym.tasks.task import Task, dense
 
 __all__ = ["Throw"]
 
@@ -144,14 +144,6 @@ class Throw(Task):
         lane[..., 1, 0] += _BRAKING_WAY * step
         paper: FloatArray = self.machine.mount.to_paper(lane + hanging(self.block))
         return paper
-
-    def observed(self) -> tuple[Entry, ...]:
-        """Return the entries of the robot, then those of the block."""
-        return (*self.robot_entries(), *self.object_entries())
-
-    def achieved(self, state: State) -> FloatArray:
-        """Return the centre of the block."""
-        return state.object_position[:, 0]
 
     def shaping(self, state: State) -> dict[str, FloatArray]:
         """Return minus half the distance from cup to block, for a dense reward only.

@@ -1,8 +1,5 @@
 """What MuJoCo alone does: its own frames, its console, its missing package."""
 
-import sys
-from unittest.mock import patch
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -11,7 +8,7 @@ from episodes import random_episode
 from inside import around_each_step, push
 
 from tpm_gym.arrays import rotate
-from tpm_gym.errors import ClosureError, ConfigurationError, MissingPackageError
+from tpm_gym.errors import ClosureError, ConfigurationError
 from tpm_gym.mechanism import PAPER_TPM
 from tpm_gym.simulation import Block, Scene
 from tpm_gym.simulation.mujoco.model import object_name
@@ -58,15 +55,6 @@ def test_a_mechanism_torn_apart_is_a_typed_error_and_nothing_else(
         written = [name for name in written if name != "MUJOCO_LOG.TXT"]
     assert not printed
     assert not written
-
-
-def test_without_the_package_the_error_names_the_extra():
-    ours = [name for name in sys.modules if name.startswith("tpm_gym.simulation.mujoco")]
-    with patch.dict(sys.modules, {"mujoco": None}):
-        for name in ours:
-            del sys.modules[name]
-        with pytest.raises(MissingPackageError, match=r"tpm-gym\[mujoco\]"):
-            Alone(engine="mujoco")
 
 
 def test_a_window_without_a_display_is_refused_by_name(monkeypatch):

@@ -5,12 +5,8 @@ from __future__ import annotations
 import ctypes
 import importlib.util
 import itertools
-import os
-import sys
-import threading
 import weakref
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import nullcontext, suppress
 from functools import partial
 from typing import Any
 
@@ -19,13 +15,13 @@ import pybullet
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.mount import GRAVITY
 from tpm_gym.simulation.bullet.physics import REGULARISATION, Physics
+from tpm_gym.simulation.bullet.silence import silence
 from tpm_gym.simulation.display import has_display
 
-__all__ = ["Client", "silence"]
+__all__ = ["Client"]
 
 _WINDOW = "--width=960 --height=720"  # software OpenGL takes longer for more pixels
 
-_stdout_lock = threading.RLock()
 _closed = itertools.count(1)
 
 
@@ -123,34 +119,3 @@ def _disconnect(number: int) -> None:
     if next(_closed) % 4 == 0:  # glibc keeps free memory; trimming takes ms, so not every time
         with suppress(AttributeError, OSError, TypeError):  # other C libraries have no malloc_trim
             ctypes.CDLL(None).malloc_trim(0)
-
-
-@contextmanager
-def silence() -> Iterator[None]:
-    """Discard standard output of Python and C code within the context.
-
-    This affects the whole process. So a lock admits only one thread at a time.
-    """
-    with _stdout_lock:
-        try:
-            kept = os.dup(1) if os.name == "posix" else -1
-        except OSError:  # there is no standard output
-            kept = -1
-        if kept < 0:
-            yield
-            return
-        _flush()
-        with open(os.devnull, "w") as nowhere:
-            os.dup2(nowhere.fileno(), 1)
-            try:
-                yield
-            finally:
-                _flush()
-                os.dup2(kept, 1)
-                os.close(kept)
-
-
-def _flush() -> None:
-    with suppress(AttributeError, ValueError, OSError):  # stdout may be None, or closed
-        sys.stdout.flush()
-    ctypes.CDLL(None).fflush(None)

@@ -8,10 +8,11 @@ import pybullet
 
 from tpm_gym.arrays import FloatArray
 from tpm_gym.mechanism.machine import Machine
-from tpm_gym.simulation.bullet.client import Client, silence
+from tpm_gym.simulation.bullet.client import Client
 from tpm_gym.simulation.bullet.physics import Physics
 from tpm_gym.simulation.bullet.robot import Robot
 from tpm_gym.simulation.bullet.scenery import Scenery
+from tpm_gym.simulation.bullet.silence import silence
 from tpm_gym.simulation.engine import UPRIGHT, Pose
 from tpm_gym.simulation.imaging import Camera
 from tpm_gym.simulation.stage import MARKER_COLOUR
