@@ -107,15 +107,6 @@ def test_human_mode_without_a_display_is_refused_instead_of_ending_the_process(m
     assert TPMEnv.metadata["render_modes"] == list(RENDER_MODES)
 
 
-def test_rgb_array_gives_pictures_of_the_asked_size():
-    env = gym.make("TPMPickAndPlace-v0", render_mode="rgb_array", width=96, height=64)
-    env.reset(seed=0)
-    picture = env.render()
-    assert picture.shape == (64, 96, 3)
-    assert picture.dtype == np.uint8
-    assert picture.std() > 10
-
-
 PHYSICS = {"time_step": 1 / 500, "erp": 0.9}
 
 

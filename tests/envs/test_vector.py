@@ -225,24 +225,6 @@ def test_options_are_refused_by_name():
         envs.step(np.zeros((5, 4)))
 
 
-def test_a_reset_for_some_leaves_the_others_as_they_are():
-    envs, twin = make(PICK, 4), make(PICK, 4)
-    for each in (envs, twin):
-        each.reset(seed=0)
-    course = actions_of(envs, 20)
-    for actions in course[:10]:
-        envs.step(actions)
-        twin.step(actions)
-    mask = np.array([False, True, False, False])
-    envs.reset(seed=9, options={"reset_mask": mask, "goal": twin.goal[0]})
-    np.testing.assert_array_equal(envs.goal[1], twin.goal[0])
-    others = [0, 2, 3]
-    for actions in course[10:]:
-        one, other = (each.step(actions)[0] for each in (envs, twin))
-        for name, values in one.items():
-            np.testing.assert_array_equal(values[others], other[name][others])
-
-
 @pytest.mark.parametrize(
     "wrong", [{"seed": [1, 2, 3, -4]}, {"seed": 5, "options": {"goal": "there"}}], ids=str
 )

@@ -4,7 +4,6 @@ Independent of the formulas: virtual work by differences, and Pinocchio on the U
 (test_pinocchio.py).
 """
 
-import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
@@ -171,14 +170,6 @@ def test_states_that_do_not_go_together_are_named():
 
 
 @each_machine
-def test_the_mass_matrix_is_symmetric_and_positive(machine):
-    theta, *_ = drawn(machine, 50)
-    mass = machine.dynamics.mass_matrix(theta)
-    np.testing.assert_array_equal(mass, np.swapaxes(mass, -1, -2))
-    assert (np.linalg.eigvalsh(mass) > 0).all()
-
-
-@each_machine
 def test_the_rate_of_the_mass_matrix_less_twice_c_is_skew(machine):
     theta, rate, _ = drawn(machine, 50)
     dynamics, step = machine.dynamics, 1e-6
@@ -217,36 +208,6 @@ def test_the_power_of_the_torque_is_the_rate_of_the_energy(machine):
     np.testing.assert_allclose(
         (energy(step) - energy(-step)) / (2 * step), power, rtol=1e-5, atol=1e-5
     )
-
-
-def energy_gained_in_free_fall(machine: TPM, steps: int) -> tuple[float, float]:
-    """By Runge and Kutta's method over 0.15 s without motors, J; and the kinetic energy then."""
-    dynamics, period = machine.dynamics, 0.15 / steps
-    x, y, _ = machine.home
-    state = np.concatenate([machine.inverse((x, y, machine.region.low[2])), np.zeros(3)])
-
-    def slope(at):
-        return np.concatenate([at[3:], dynamics.forward(at[:3], at[3:], np.zeros(3))])
-
-    start = sum(dynamics.energy(state[:3], state[3:]))
-    for _ in range(steps):
-        one = slope(state)
-        two = slope(state + period / 2 * one)
-        three = slope(state + period / 2 * two)
-        state = state + period / 6 * (one + 2 * two + 2 * three + slope(state + period * three))
-    kinetic, potential = dynamics.energy(state[:3], state[3:])
-    return float(kinetic + potential - start), float(kinetic)
-
-
-@each_machine
-def test_free_motion_keeps_its_energy_to_the_order_of_the_integrator(machine):
-    errors = []
-    for steps in (15, 30, 60):
-        gained, kinetic = energy_gained_in_free_fall(machine, steps)
-        errors.append(abs(gained) / kinetic)
-    assert errors[-1] < 1e-8  # measured: 8e-10
-    for coarse, fine in itertools.pairwise(errors):
-        assert coarse / fine == pytest.approx(16, rel=0.1)
 
 
 # Points, batches and tensors

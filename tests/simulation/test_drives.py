@@ -27,19 +27,12 @@ from tpm_gym.simulation.state import CONTROL_PERIOD
 HOME = PAPER_TPM.home
 THETA = PAPER_TPM.inverse(HOME)
 REST = (0.0, 0.0, 0.0)
+GRAVITY = PAPER_TPM.dynamics.gravity(THETA)
 HELD = Servo(feedforward="gravity")
 
 
 def simulation_of(servo: Servo | None, machine: Machine = PAPER_TPM, **physics: Any) -> Alone:
     return Alone(Scene(), machine=machine, drive=servo, physics=physics)
-
-
-def gravity(theta: Vector = THETA) -> FloatArray:
-    return np.array(PAPER_TPM.torque(theta, REST, REST))
-
-
-def mass_matrix(theta: Vector = THETA) -> FloatArray:
-    return np.array([PAPER_TPM.torque(theta, REST, unit) for unit in np.eye(3)]) - gravity(theta)
 
 
 def watched(simulation: Alone) -> list[tuple[Any, Vector]]:
@@ -141,9 +134,9 @@ def test_what_is_fed_forward_need_not_turn_the_motors(feedforward):
     simulation.reset(THETA)
     for _ in range(25):
         state = simulation.move(HOME)
-    sagged = gravity() if feedforward == "none" else np.zeros(3)
+    sagged = GRAVITY if feedforward == "none" else np.zeros(3)
     np.testing.assert_allclose(servo.stiffness * (THETA - state.theta), sagged, atol=0.03)
-    np.testing.assert_allclose(state.torque, gravity(), atol=0.03)
+    np.testing.assert_allclose(state.torque, GRAVITY, atol=0.03)
 
 
 def step_response(servo: Servo, substeps: int) -> tuple[FloatArray, FloatArray]:
@@ -155,9 +148,9 @@ def step_response(servo: Servo, substeps: int) -> tuple[FloatArray, FloatArray]:
     for _ in range(10):
         start = np.array(simulation.move(HOME).theta)
     seen = watched(simulation)
-    hold(simulation, start + jump, gravity(), periods=3)
+    hold(simulation, start + jump, GRAVITY, periods=3)
     found = np.array([motors.theta for motors, _ in seen]) - start
-    mass, x, v, expected = mass_matrix(), -jump, np.zeros(3), []
+    mass, x, v, expected = PAPER_TPM.dynamics.mass_matrix(THETA), -jump, np.zeros(3), []
     stiff, damping = servo.stiffness * np.eye(3), servo.damping * np.eye(3)
     for _ in seen:
         v = np.linalg.solve(mass + step * damping + step**2 * stiff, mass @ v - step * stiff @ x)
@@ -208,7 +201,7 @@ def test_springs_and_dampers_give_nothing_that_was_not_put_in():
 def test_the_defaults_are_a_good_direct_drives_on_the_lightest_motion():
     # Lightest motions of 2000 postures all over the region: 0.097 to 0.125 kg m^2.
     for point in anywhere(PAPER_TPM, 50):
-        lightest = np.linalg.eigvalsh(mass_matrix(PAPER_TPM.inverse(point)))[0]
+        lightest = np.linalg.eigvalsh(PAPER_TPM.dynamics.mass_matrix(PAPER_TPM.inverse(point)))[0]
         speed = np.sqrt(Servo().stiffness / lightest)  # rad/s
         assert 30 < speed / (2 * np.pi) < 60  # Hz
         assert 0.9 < Servo().damping / (2 * speed * lightest) < 1.2
@@ -292,7 +285,7 @@ def test_stiffness_is_each_drives_own():
     for _ in range(25):
         state = simulation.move(HOME)
     np.testing.assert_allclose(
-        7500.0 * factors * (THETA - state.theta), gravity(), rtol=0.02, atol=0.01
+        7500.0 * factors * (THETA - state.theta), GRAVITY, rtol=0.02, atol=0.01
     )
 
 

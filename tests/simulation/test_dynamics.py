@@ -1,10 +1,10 @@
 """The simulated mechanism against theory: statics, inertia, energy, rates, and its limits.
 
-Theory is the mechanism's data (masses, inertias, frames) moved along the closed form of the
-kinematics, differentiated by central differences. What was measured is in the comments.
+Theory is the closed-form dynamics, which tests/mechanism compares with Pinocchio. What was measured
+is in the comments.
 """
 
-from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,6 @@ from alone import Alone, jumping, motors
 from inside import around_each_step, push, slide
 from machines import anywhere, each_machine, excursions
 from numpy.typing import ArrayLike
-from walk import place, walk
 
 from tpm_gym.arrays import FloatArray, Vector
 from tpm_gym.mechanism import PAPER_TPM, Machine
@@ -35,40 +34,9 @@ def links(machine: Machine) -> Any:
     return machine.mechanism.links[1:]
 
 
-def centres(machine: Machine, theta: FloatArray) -> FloatArray:
-    """Centres of mass (links, 3), world, m."""
-    frames = walk(machine.mechanism, machine.joint_positions(tuple(theta)))
-    return machine.mount.to_world([place(frames, k.name, k.centre_of_mass) for k in links(machine)])
-
-
-def rotations(machine: Machine, theta: FloatArray) -> FloatArray:
-    """Orientations (links, 3, 3) in the machine's frame."""
-    frames = walk(machine.mechanism, machine.joint_positions(tuple(theta)))
-    return np.array([frames[link.name][1] for link in links(machine)])
-
-
-def slopes(function: Callable[..., FloatArray], machine: Machine, theta: Vector) -> FloatArray:
-    """Derivatives by the three motors, stacked in front."""
-    steps = 1e-5 * np.eye(3)
-    pairs = [(function(machine, theta + by), function(machine, theta - by)) for by in steps]
-    return np.array([(up - down) / 2e-5 for up, down in pairs])
-
-
-def weights(machine: Machine, theta: Vector, factors: ArrayLike = 1.0) -> FloatArray:
-    """Torques (3,) N m that carry the links: the gradient of their potential."""
-    masses = np.array([link.mass for link in links(machine)]) * factors
-    return np.asarray(G * slopes(centres, machine, theta)[..., 2] @ masses)
-
-
-def mass_matrix(machine: Machine, theta: Vector) -> FloatArray:
-    """Inertia (3, 3) kg m^2 that the motors feel: kinetic energy is theta_dot M theta_dot / 2."""
-    velocity, rotation = slopes(centres, machine, theta), rotations(machine, np.array(theta))
-    turned = np.swapaxes(rotation, -1, -2)
-    spin = slopes(rotations, machine, theta) @ turned  # cross product matrices
-    omega = np.stack([spin[..., 2, 1], spin[..., 0, 2], spin[..., 1, 0]], axis=-1)
-    moments = rotation @ np.array([k.inertia for k in links(machine)]) @ turned
-    linear = np.einsum("ank,n,bnk->ab", velocity, [k.mass for k in links(machine)], velocity)
-    return np.asarray(linear + np.einsum("ani,nij,bnj->ab", omega, moments, omega))
+def weights(machine, theta: Vector, factors: Vector = ()) -> FloatArray:
+    """Torques (3,) N m that carry the links, whose masses are multiplied by the factors."""
+    return replace(machine.dynamics, link_masses=factors).gravity(theta)
 
 
 def jacobian(machine: Machine, theta: Vector) -> FloatArray:
@@ -116,12 +84,12 @@ def total_energy(simulation: Alone) -> tuple[float, float]:
 def test_torques_at_rest_carry_the_links(machine, engine, bound):
     simulation, rng = Alone(Scene(), engine=engine, machine=machine), np.random.default_rng(1)
     for index, point in enumerate(anywhere(machine, 10)):
-        theta, factors = machine.inverse(point), rng.uniform(0.5, 2.0, len(links(machine)))
-        altered = index % 3 != 2  # a reset takes it back
-        plant = Plant(link_masses=tuple(factors.tolist())) if altered else Plant()
-        assert not simulation.reset(theta, plant=plant).torque.any()
+        theta, factors = machine.inverse(point), ()
+        if index % 3 != 2:  # a reset takes it back
+            factors = tuple(rng.uniform(0.5, 2.0, len(links(machine))).tolist())
+        assert not simulation.reset(theta, plant=Plant(link_masses=factors)).torque.any()
         settle(simulation, point)
-        expected = weights(machine, theta, factors if altered else 1.0)
+        expected = weights(machine, theta, factors)
         error = np.abs(simulation.read().torque - expected).max()
         assert error < bound * np.abs(expected).max()
 
@@ -175,7 +143,7 @@ def test_released_it_accelerates_by_its_mass_matrix(machine, engine):
     with around_each_step(simulation, before=lambda: push(simulation, machine.mount.rotate(force))):
         for point in anywhere(machine, 6):
             theta = machine.inverse(point)
-            mass, load = mass_matrix(machine, theta), weights(machine, theta)
+            mass, load = machine.dynamics.mass_matrix(theta), weights(machine, theta)
             j = jacobian(machine, theta)
             for force[:] in ([0, 0, 0], *FORCES):
                 simulation.reset(theta, plant=NO_TORQUE)

@@ -13,7 +13,6 @@ from tpm_gym.kinematics import ELBOWS_OUT, inverse, jacobian
 from tpm_gym.mechanism import PAPER_TPM
 from tpm_gym.simulation import Block, Scene, Servo, State
 from tpm_gym.simulation.engine import spline_weights
-from tpm_gym.simulation.imaging import View, camera_of
 
 HOME = np.array(PAPER_TPM.home)
 THETA = PAPER_TPM.inverse(PAPER_TPM.home)
@@ -224,18 +223,6 @@ def test_a_reset_forgets_old_contacts(with_block, drift):
         outcomes.append(np.hstack([state.object_position, state.object_quaternion]))
         follow(with_block, [HOME] * 6)
     assert np.array_equal(*outcomes)
-
-
-def test_pictures_show_the_scene_and_the_goal_marker(simulation):
-    simulation.reset(THETA)
-    view = View(camera_of("table", PAPER_TPM), 160, 120)
-    first = simulation.picture(view, [(0.0, -0.03, 0.2)]).colour
-    assert (first.shape, first.dtype) == ((120, 160, 3), np.uint8)
-    assert first.std() > 20
-    second = simulation.picture(view, [(0.1, -0.03, 0.3)]).colour
-    assert 0.0 < (first != second).any(axis=-1).mean() < 0.05
-    # Equal states give equal pictures.
-    assert np.array_equal(second, simulation.picture(view, [(0.1, -0.03, 0.3)]).colour)
 
 
 # -- solvers ---------------------------------------------------------------------------------------

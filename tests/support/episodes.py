@@ -1,13 +1,15 @@
 """Episodes to compare to the last bit. Fresh processes import this too, so it imports little."""
 
 import pickle
-from collections.abc import Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import gymnasium as gym
 import numpy as np
 
+from tpm_gym.envs import testing
 from tpm_gym.envs.testing import Step, bits, fingerprint, play, random_episode
 from tpm_gym.tasks.expert import Expert
 
@@ -53,6 +55,24 @@ def expert_episode(
     for _ in range(steps):
         observation, reward, _, _, info = env.step(expert.act(observation))
         yield observation, float(reward), info
+
+
+ALONE = (
+    testing.passes_the_checkers_of_gymnasium_and_sb3,
+    testing.refuses_steps_outside_an_episode,
+    testing.continues_copies_and_snapshots_equally,
+)
+"""Checks that close or copy their environment."""
+
+
+def conforms(make: testing.Make, without: Collection[Callable[..., None]] = ()) -> None:
+    """Run all checks but some, most of them on one environment, since making one takes longest."""
+    env = make()
+    with patch.object(env, "close"):
+        for check in testing.CHECKS:
+            if check not in without:
+                check(make if check in ALONE else lambda: env)
+    env.close()
 
 
 def all_fingerprints() -> list[str]:

@@ -196,15 +196,6 @@ def test_starts_repeat_with_the_rng_and_take_what_is_chosen(task):
     np.testing.assert_array_equal(kept, first["goal"])
 
 
-@each_machine
-def test_many_start_where_each_would(machine):
-    for task in (Reach(machine), PickAndPlace(machine)):
-        many = task.start(rngs(*range(60)))
-        each = [task.start(rngs(seed)) for seed in range(60)]
-        for name, places in many.items():
-            np.testing.assert_array_equal(places, [start[name][0] for start in each])
-
-
 @pytest.mark.parametrize("options", [{"gaol": (0, 0, 0)}, [("goal", (0, 0, 0))], {3: 4}, "goal"])
 def test_unknown_options_are_refused_with_the_known_ones(task, options):
     with pytest.raises(ResetOptionError, match="'goal'") as caught:

@@ -57,19 +57,6 @@ def green(image: NDArray[Any]) -> NDArray[Any]:
     return image[..., 1] - image[..., [0, 2]].max(axis=-1) > 40
 
 
-def test_pictures_are_those_of_the_other_engine(simulation):
-    other = Alone(Scene(objects=(Block(),)))
-    other.reset(THETA, {"object": (0.1, -0.1, 0.015)})
-    ours, theirs = picture(simulation), picture(other)
-    other.close()
-    assert ours.shape == (HEIGHT, WIDTH, 3)
-    for marked in (red, green):
-        np.testing.assert_allclose(middle(marked(ours)), middle(marked(theirs)), atol=1.5)
-    assert np.abs(ours - theirs).mean() < 8.0  # of 255
-    background = ours[:40, :40]
-    assert (background == 255).all()
-
-
 def test_what_moves_is_drawn_elsewhere_before_the_next_time_step(simulation):
     seen = []
     for x in (-0.1, 0.1):
@@ -82,18 +69,6 @@ def test_what_moves_is_drawn_elsewhere_before_the_next_time_step(simulation):
     before = middle(red(picture(simulation)))
     simulation.reset(THETA, {"object": (-0.1, -0.1, 0.015)})
     assert np.linalg.norm(middle(red(picture(simulation))) - before) > 10
-
-
-def test_a_picture_changes_nothing(simulation):
-    ends = []
-    for drawn in (False, True):
-        simulation.reset(THETA, {"object": (0.1, -0.1, 0.015)})
-        for _ in range(3):
-            state = simulation.move(np.add(HOME, (0.02, 0.0, 0.01)))
-            if drawn:
-                picture(simulation)
-        ends.append(state.theta.tolist())
-    assert ends[0] == ends[1]
 
 
 def test_sizes_may_change_and_a_closed_one_draws_again(simulation):
