@@ -15,7 +15,7 @@ Beside a solution they return whether it is real, and the lengths that explain w
 
 import math
 import sys
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -37,6 +37,18 @@ _TINY = sys.float_info.min  # the smallest divisor
 
 Triple = tuple[Numbers, Numbers, Numbers]
 _Four = tuple[Numbers, Numbers, Numbers, Numbers]
+
+
+class LegLengths(Protocol):
+    """Lengths of arms and rods, m, of any mechanism."""
+
+    @property
+    def l3(self) -> Numbers:
+        """Arms A_iB_i."""
+
+    @property
+    def l4(self) -> Numbers:
+        """Rods B_iC_i."""
 
 
 class Assembly(NamedTuple):
@@ -86,7 +98,7 @@ class Factors(NamedTuple):
         return found
 
 
-def arms(theta: Triple, g: AnyLengths, ns: Namespace) -> tuple[Triple, Triple]:
+def arms(theta: Triple, g: LegLengths, ns: Namespace) -> tuple[Triple, Triple]:
     """Compute the arms A_iB_i in their planes: l3 cos(theta_i), and l3 sin(theta_i), m."""
     one, two, three = theta
     cos, sin, l3 = ns.cos, ns.sin, g.l3
@@ -163,7 +175,7 @@ def posture_at(
 
 
 def arm(
-    a: Numbers, b: Numbers, out: Numbers, bend: Numbers, g: AnyLengths, ns: Namespace
+    a: Numbers, b: Numbers, out: Numbers, bend: Numbers, g: LegLengths, ns: Namespace
 ) -> tuple[Numbers, Numbers]:
     """Compute the arm's angle in (-pi, pi] from |C - A - l3 e(theta)| = l4.
 

@@ -23,33 +23,21 @@ with a Pose take the numbers of :mod:`tpm_gym.kinematics.equations`.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
-from numpy.typing import ArrayLike
-
-from tpm_gym.arrays import FloatArray, Vector, finite, finite_points, is_tensor, numbers, vector
-from tpm_gym.errors import ConfigurationError, InputError
+from tpm_gym.arrays import Vector
+from tpm_gym.errors import SingularityError, UnreachableError
 from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode, equations
 from tpm_gym.kinematics.equations import Triple
 from tpm_gym.kinematics.geometry import PAPER, AnyLengths, Geometry
-from tpm_gym.kinematics.jacobian import require_regular
-from tpm_gym.kinematics.namespaces import Namespace, Numbers, by_rows, namespace_of
+from tpm_gym.kinematics.jacobian import factors, require_regular
+from tpm_gym.kinematics.namespaces import Namespace, Numbers
 from tpm_gym.mechanism import tree
+from tpm_gym.mechanism.equation_of_motion import Energy as Energy
+from tpm_gym.mechanism.equation_of_motion import EquationOfMotion
 from tpm_gym.mechanism.inertia import Inertia, Swing, inertia_of
-from tpm_gym.mechanism.mount import GRAVITY
-
-_REST = (0.0, 0.0, 0.0)
-
-
-class Energy(NamedTuple):
-    """Kinetic and potential energy (...,), J; the latter up to a constant of the machine."""
-
-    kinetic: FloatArray
-    potential: FloatArray
 
 
 class Pose(NamedTuple):
@@ -98,9 +86,6 @@ class Accelerations(NamedTuple):
     platform: Triple
 
 
-# -- over any namespace ----------------------------------------------------------------------------
-
-
 def pose_at(
     theta: Triple, signs: tuple[Numbers, ...], g: AnyLengths, ns: Namespace
 ) -> tuple[Pose, Numbers]:
@@ -131,8 +116,8 @@ def carried(
     """
     (c1, c2, c3), (s1, s2, s3), (r1, _, r3) = pose.cos, pose.sin, pose.rods
     (b1y, b1z), (b2x, b2z), (b3x, b3z), (cx, cz), (px, py, pz) = a
-    f1x, f1y, f1z = _swing(r1, v.rod1, (-b1y, cz - b1z), m.swing1)
-    f3y, f3x, f3z = _swing(
+    f1x, f1y, f1z = swing_force(r1, v.rod1, (-b1y, cz - b1z), m.swing1)
+    f3y, f3x, f3z = swing_force(
         (r3[1], r3[0], r3[2]), (v.rod3[1], v.rod3[0], v.rod3[2]), (px - b3x, pz - b3z), m.swing3
     )
     gx, gy, gz = gravity
@@ -265,7 +250,7 @@ def gather(pose: Pose, at_c: tuple[Numbers, Numbers], at_p: Triple) -> Triple:
     return f.leg1 * rod1, f.leg2 * rod2, f.leg3 * rod3
 
 
-def _swing(rod: Triple, rates: Triple, changes: tuple[Numbers, Numbers], m: Swing) -> Triple:
+def swing_force(rod: Triple, rates: Triple, changes: tuple[Numbers, Numbers], m: Swing) -> Triple:
     """Compute the force at C for the swing of a leg; the force at B is opposite.
 
     The rod is along (out, level, z), and the swing is the angle of (level, z). The force follows
@@ -279,47 +264,17 @@ def _swing(rod: Triple, rates: Triple, changes: tuple[Numbers, Numbers], m: Swin
     return -m.spin * out * rate * rate, -z * moment / square, level * moment / square
 
 
-# -- points and batches ----------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, kw_only=True)
-class Dynamics:
-    """The dynamics of one mechanism, for points and batches.
-
-    Joint angles (rad), rates (rad/s) and their changes (rad/s^2) are arrays (..., 3) that broadcast
-    with each other; torch tensors among them give tensors, in float64, that can be differentiated.
-
-    All methods raise InputError for inputs that are no arrays (..., 3) of finite numbers,
-    UnreachableError if the branch does not exist at some theta, and SingularityError at a parallel
-    singularity.
+class Dynamics(EquationOfMotion):
+    """The dynamics of the TPM; see :class:`EquationOfMotion`.
 
     Attributes:
         geometry: Link lengths.
         branch: Assembly mode.
-        link_masses: Factors of mass and inertia, one for each moving link, in the mechanism's
-            order; empty if all are 1.
-        payload: Mass that the cup carries, kg.
-        free_fall: Acceleration of gravity in the machine's frame, m/s^2.
-
-    Raises:
-        ConfigurationError: If a mass or gravity is not possible. If the number of factors is wrong,
-            at the first use.
     """
 
     geometry: Geometry = PAPER
     branch: AssemblyMode = DEFAULT_ASSEMBLY
-    link_masses: tuple[float, ...] = ()
-    payload: float = 0.0
-    free_fall: Vector = (0.0, 0.0, GRAVITY)
-
-    def __post_init__(self) -> None:
-        """Reject masses that are not possible."""
-        if finite("payload", self.payload, (), ConfigurationError) < 0:
-            raise ConfigurationError("payload", self.payload, "at least 0 kg")
-        factors = numbers("link_masses", self.link_masses, ConfigurationError)
-        if factors.ndim != 1 or not ((factors > 0) & (factors < math.inf)).all():
-            raise ConfigurationError("link_masses", self.link_masses, "positive factors")
-        vector("free_fall", self.free_fall, ConfigurationError)
 
     @cached_property
     def inertia(self) -> Inertia:
@@ -327,93 +282,23 @@ class Dynamics:
         mechanism = tree.build(self.geometry)
         return inertia_of(mechanism, self.geometry, self.link_masses, self.payload)
 
-    def torque(self, theta: ArrayLike, theta_dot: ArrayLike, theta_ddot: ArrayLike) -> FloatArray:
-        """Compute the motors' torques (..., 3) N m, M theta_ddot + C theta_dot + g."""
-        states = {"theta": theta, "theta_dot": theta_dot, "theta_ddot": theta_ddot}
-        return self._rows(lambda *state: [self._torques(*state)], states)[0]
+    def _pose(self, theta: Triple, ns: Namespace) -> tuple[Pose, Numbers, Numbers]:
+        pose, real = pose_at(theta, self.branch.signs, self.geometry, ns)
+        return pose, real, equations.regular(pose.factors, self.geometry)
 
-    def gravity(self, theta: ArrayLike) -> FloatArray:
-        """Compute the torques (..., 3) N m that hold the machine at rest."""
-        return self._rows(lambda pose: [self._torques(pose, _REST, _REST)], {"theta": theta})[0]
+    def _torques(self, pose: Pose, rates: Triple, changes: Triple, gravity: Triple) -> Triple:
+        return torques(pose, rates, changes, gravity, self.inertia)
 
-    def mass_matrix(self, theta: ArrayLike) -> FloatArray:
-        """Compute the mass matrix M, (..., 3, 3) kg m^2, symmetric and positive."""
-        return self._rows(lambda pose: [self._masses(pose)], {"theta": theta})[0]
+    def _masses(self, pose: Pose) -> tuple[Numbers, ...]:
+        return masses(pose, equations.velocity(pose.rods, pose.factors), self.inertia)
 
-    def coriolis(self, theta: ArrayLike, theta_dot: ArrayLike) -> FloatArray:
-        """Compute C (..., 3, 3) kg m^2/s from Christoffel's symbols, so that M' - 2 C is skew."""
+    def _potential(self, pose: Pose) -> Numbers:
+        return potential(pose, self.free_fall, self.inertia)
 
-        def results(pose: Pose, rates: Triple) -> list[Numbers]:
-            def quadratic(sign: float, k: int) -> Triple:
-                a, b, c = (u + sign * (i == k) for i, u in enumerate(rates))
-                return torques(pose, (a, b, c), _REST, _REST, self.inertia)
-
-            # For the part q(u) of the torques that is quadratic, q(u + e) - q(u - e) = 4 C(u) e
-            pairs = [(quadratic(1.0, k), quadratic(-1.0, k)) for k in range(3)]
-            return [
-                tuple(tuple((up[row] - down[row]) / 4 for up, down in pairs) for row in range(3))
-            ]
-
-        return self._rows(results, {"theta": theta, "theta_dot": theta_dot})[0]
-
-    def forward(self, theta: ArrayLike, theta_dot: ArrayLike, torque: ArrayLike) -> FloatArray:
-        """Compute accelerations (..., 3) rad/s^2 under the motors' torques (..., 3) N m."""
-
-        def results(pose: Pose, rates: Triple, given: Triple) -> list[Numbers]:
-            bias = self._torques(pose, rates, _REST)
-            rest = tuple(one - other for one, other in zip(given, bias, strict=True))
-            return [self._masses(pose), rest]
-
-        states = {"theta": theta, "theta_dot": theta_dot, "torque": torque}
-        mass, rest = self._rows(results, states)
-        found: FloatArray = namespace_of(mass).solve(mass, rest)
-        return found
-
-    def energy(self, theta: ArrayLike, theta_dot: ArrayLike) -> Energy:
-        """Compute kinetic and potential energy, (...,) J."""
-
-        def results(pose: Pose, rates: Triple) -> list[Numbers]:
-            pairs = zip(self._masses(pose), rates, strict=True)
-            twice = sum(u * m * v for row, u in pairs for m, v in zip(row, rates, strict=True))
-            return [twice / 2, potential(pose, self.free_fall, self.inertia)]
-
-        return Energy(*self._rows(results, {"theta": theta, "theta_dot": theta_dot}))
-
-    def _torques(self, pose: Pose, rates: Triple, changes: Triple) -> Triple:
-        return torques(pose, rates, changes, self.free_fall, self.inertia)
-
-    def _masses(self, pose: Pose) -> tuple[Triple, Triple, Triple]:
-        rows = equations.velocity(pose.rods, pose.factors)
-        a, b, c, d, e, f = masses(pose, rows, self.inertia)
-        return (a, b, c), (b, d, e), (c, e, f)
-
-    def _rows(
-        self, text: Callable[..., Sequence[Numbers]], states: Mapping[str, ArrayLike]
-    ) -> list[FloatArray]:
-        """Apply the function ``text`` of a pose and triples to each row of the states."""
-
-        def results(values: tuple[Numbers, ...], ns: Namespace) -> list[Numbers]:
-            theta, *rest = (values[i : i + 3] for i in range(0, len(values), 3))
-            pose, real = pose_at(theta, self.branch.signs, self.geometry, ns)
-            return [ns.where(real, 0.0, 1.0), pose.factors[:3], *text(pose, *rest)]
-
-        table = _side_by_side(states)
-        missing, factors, *found = by_rows(results, table)
-        if missing.any():
-            a, b, c = table[..., :3][missing != 0][0].tolist()
-            raise equations.no_assembly((a, b, c), self.branch, self.geometry)
-        require_regular(factors, self.geometry)
-        return found
-
-
-def _side_by_side(states: Mapping[str, ArrayLike]) -> FloatArray:
-    """Broadcast n arrays (..., 3) with each other, and join them to one (..., 3 n)."""
-    arrays = [finite_points(name, state) for name, state in states.items()]
-    like = next((array for array in arrays if is_tensor(array)), arrays[0])
-    try:
-        table: FloatArray = namespace_of(like).join(arrays)
-    except (ValueError, RuntimeError) as error:  # numpy's and torch's
-        shapes = [tuple(array.shape) for array in arrays]
-        valid = "of shapes (..., 3) that go together, by shape"
-        raise InputError(", ".join(states), shapes, valid) from error
-    return table
+    def _refusal(self, theta: Vector) -> UnreachableError | SingularityError:
+        try:
+            found = factors(theta, self.branch, self.geometry)
+            require_regular(found.parallel, self.geometry)
+        except (UnreachableError, SingularityError) as error:
+            return error
+        raise AssertionError(theta)

@@ -91,7 +91,7 @@ def inertia_of(
         ConfigurationError: If the number of factors is wrong, or if the formulas do not hold for a
             body.
     """
-    bodies = _Bodies(mechanism, link_masses)
+    bodies = Bodies(mechanism, link_masses)
     l3, l4, l7 = geometry.l3, geometry.l4, geometry.l7
     turning = ("arm_2", Y, X), ("arm_5", X, Y), ("arm_12", X, Y)
     arms = [bodies.bar(*arm, l3) for arm in turning]
@@ -112,25 +112,24 @@ def inertia_of(
     _, arm_couple, arm_far = np.transpose(arms)
     near, couple, far = np.transpose(rods)
     found = Inertia(
-        motors=_three((arm_far + near + elbows) * l3**2),
-        weights=_three(arm_couple + arm_far + near + elbows),
-        couples=_three(couple),
+        motors=three((arm_far + near + elbows) * l3**2),
+        weights=three(arm_couple + arm_far + near + elbows),
+        couples=three(couple),
         link3=bodies.mass("link_3p") + far[0] + far[1] + link7[0],
         link7=link7[1],
         platform=translating + far[2] + link7[2] + payload,
         swing1=Swing(crosses[0][1] + crosses[1][1], spin4),
         swing3=Swing(end9[1], spin11),
     )
-    left = [k.name for k in mechanism.links[1:] if k.mass and k.name not in bodies.known]
-    if left:
-        raise ConfigurationError("mechanism", left, "the links of mechanism.tree.build alone")
+    bodies.require_all_known()
     return found
 
 
-class _Bodies:
+class Bodies:
     """Links with their factors; keeps the names of the links that were used."""
 
     def __init__(self, mechanism: Mechanism, factors: Sequence[float]) -> None:
+        """Check the number of factors; empty if all are 1."""
         moving = mechanism.links[1:]
         if len(factors) not in (0, len(moving)):
             valid = f"one factor for each of the {len(moving)} moving links, or none"
@@ -139,7 +138,16 @@ class _Bodies:
         self._factors = dict(zip(self._links, factors or [1.0] * len(moving), strict=True))
         self.known: set[str] = set()
 
+    def require_all_known(self) -> None:
+        """Refuse a mechanism with a body that was not used."""
+        left = [name for name, link in self._links.items() if link.mass and name not in self.known]
+        if left:
+            raise ConfigurationError(
+                "mechanism", left, "the links of the mechanism's builder alone"
+            )
+
     def mass(self, name: str) -> float:
+        """Return the mass, kg."""
         return self._factors[name] * self._link(name).mass
 
     def moment(self, name: str, axis: int) -> float:
@@ -180,6 +188,7 @@ class _Bodies:
         return self._links[name]
 
 
-def _three(values: Iterable[float]) -> tuple[float, float, float]:
+def three(values: Iterable[float]) -> tuple[float, float, float]:
+    """Return three numbers as a tuple."""
     one, two, three = values
     return one, two, three

@@ -21,6 +21,7 @@ from tpm_gym.kinematics import equations
 from tpm_gym.kinematics.equations import Triple
 from tpm_gym.kinematics.geometry import Lengths
 from tpm_gym.mechanism import dynamics
+from tpm_gym.mechanism.columns import BLOCK, fill, get, put, read, write
 from tpm_gym.mechanism.dynamics import Pose
 from tpm_gym.mechanism.inertia import Inertia, Swing
 
@@ -33,24 +34,11 @@ compilable(
     dynamics.accelerations,
     dynamics.gather,
     dynamics._resolve,
-    dynamics._swing,
+    dynamics.swing_force,
 )
 
 _NONE = (0.0, 0.0, 0.0)
-_BLOCK = 64  # rows; their columns stay in the cache
 NS: Any = functions
-
-
-def _fill(built: FloatArray, start: int, count: int, each: int, own: FloatArray) -> None:
-    """Fill the columns ``own`` with the machine parameters of the rows from ``start`` on.
-
-    Where all rows are of one machine, the first block's columns serve all.
-    """
-    if start == 0 or len(built) > 1:
-        for j in range(count):
-            machine = (start + j) // each
-            for k in range(len(own)):
-                own[k, j] = built[machine, k]
 
 
 def _lengths(own: FloatArray, j: int) -> Lengths:
@@ -59,45 +47,15 @@ def _lengths(own: FloatArray, j: int) -> Lengths:
 
 def _inertia(own: FloatArray, j: int) -> Inertia:
     return Inertia(
-        _get(own, 7, j),
-        _get(own, 10, j),
-        _get(own, 13, j),
+        get(own, 7, j),
+        get(own, 10, j),
+        get(own, 13, j),
         own[16, j],
         own[17, j],
         own[18, j],
         Swing(own[19, j], own[20, j]),
         Swing(own[21, j], own[22, j]),
     )
-
-
-def _read(rows: FloatArray, start: int, count: int, columns: FloatArray, first: int) -> None:
-    """Copy rows (count, 3) to the columns from ``first`` on."""
-    for j in range(count):
-        columns[first, j] = rows[start + j, 0]
-        columns[first + 1, j] = rows[start + j, 1]
-        columns[first + 2, j] = rows[start + j, 2]
-
-
-def _write(columns: FloatArray, first: int, start: int, count: int, rows: FloatArray) -> None:
-    """Copy columns from ``first`` on to rows (m, 3) or (m, 3, 3)."""
-    for j in range(count):
-        for k in range(3):  # loops of constant length are unrolled
-            if rows.ndim == 2:
-                rows[start + j, k] = columns[first + k, j]
-            else:
-                for i in range(3):
-                    rows[start + j, k, i] = columns[first + 3 * k + i, j]
-
-
-def _put(columns: FloatArray, first: int, j: int, values: Triple, real: bool) -> None:
-    """Set three columns of a row, to NaN if there is no solution."""
-    columns[first, j] = values[0] if real else math.nan
-    columns[first + 1, j] = values[1] if real else math.nan
-    columns[first + 2, j] = values[2] if real else math.nan
-
-
-def _get(columns: FloatArray, first: int, j: int) -> Triple:
-    return columns[first, j], columns[first + 1, j], columns[first + 2, j]
 
 
 def _pose(theta: Triple, g: Lengths, modes: Triple) -> tuple[Pose, bool, bool]:
@@ -110,14 +68,14 @@ def _pose(theta: Triple, g: Lengths, modes: Triple) -> tuple[Pose, bool, bool]:
 def _place(columns: FloatArray, j: int, pose: Pose, real: bool) -> tuple[Triple, Triple, Triple]:
     """Set the first columns of a row to P and to the rows of J, and return these."""
     rows = equations.velocity(pose.rods, pose.factors)
-    _put(columns, 0, j, (pose.found.x, pose.found.y, pose.found.z), real)
-    _put(columns, 3, j, rows[0], real)
-    _put(columns, 6, j, rows[1], real)
-    _put(columns, 9, j, rows[2], real)
+    put(columns, 0, j, (pose.found.x, pose.found.y, pose.found.z), real)
+    put(columns, 3, j, rows[0], real)
+    put(columns, 6, j, rows[1], real)
+    put(columns, 9, j, rows[2], real)
     return rows
 
 
-compilable(_fill, _lengths, _inertia, _read, _write, _put, _get, _pose, _place)
+compilable(_lengths, _inertia, _pose, _place)
 
 
 @kept
@@ -126,17 +84,17 @@ def inverse(
 ) -> None:
     """Compute joint positions (m, 3) for P at ``position`` (m, 3)."""
     signs = machine[2], machine[3], machine[4], machine[5]
-    own, given, found = np.empty((7, _BLOCK)), np.empty((3, _BLOCK)), np.empty((3, _BLOCK))
+    own, given, found = np.empty((7, BLOCK)), np.empty((3, BLOCK)), np.empty((3, BLOCK))
     each = len(position) // len(built)
-    for start in range(0, len(position), _BLOCK):
-        count = min(_BLOCK, len(position) - start)
-        _fill(built, start, count, each, own)
-        _read(position, start, count, given, 0)
+    for start in range(0, len(position), BLOCK):
+        count = min(BLOCK, len(position) - start)
+        fill(built, start, count, each, own)
+        read(position, start, count, given, 0)
         for j in range(count):
             g = _lengths(own, j)
-            angles, real, _, _ = equations.posture_at(_get(given, 0, j), signs, g, NS)
-            _put(found, 0, j, angles, real)
-        _write(found, 0, start, count, theta)
+            angles, real, _, _ = equations.posture_at(get(given, 0, j), signs, g, NS)
+            put(found, 0, j, angles, real)
+        write(found, 0, start, count, theta)
 
 
 @kept
@@ -145,19 +103,19 @@ def forward(
 ) -> None:
     """Compute P (m, 3) at joint positions (m, 3), in the modes of the machine."""
     planar, side, turned = machine[0], machine[1], machine[2]
-    own, given, found = np.empty((7, _BLOCK)), np.empty((3, _BLOCK)), np.empty((3, _BLOCK))
+    own, given, found = np.empty((7, BLOCK)), np.empty((3, BLOCK)), np.empty((3, BLOCK))
     each = len(theta) // len(built)
-    for start in range(0, len(theta), _BLOCK):
-        count = min(_BLOCK, len(theta) - start)
-        _fill(built, start, count, each, own)
-        _read(theta, start, count, given, 0)
+    for start in range(0, len(theta), BLOCK):
+        count = min(BLOCK, len(theta) - start)
+        fill(built, start, count, each, own)
+        read(theta, start, count, given, 0)
         for j in range(count):
             g = _lengths(own, j)
-            cos, sin = equations.arms(_get(given, 0, j), g, NS)
+            cos, sin = equations.arms(get(given, 0, j), g, NS)
             there, real, _ = equations.assembly_at(cos, sin, planar, side, g, NS)
             working = there.cos_beta * turned > 0.0
-            _put(found, 0, j, (there.x, there.y, there.z), real & working)
-        _write(found, 0, start, count, position)
+            put(found, 0, j, (there.x, there.y, there.z), real & working)
+        write(found, 0, start, count, position)
 
 
 @kept
@@ -172,19 +130,19 @@ def evaluate(
 ) -> None:
     """Compute P (m, 3), J (m, 3, 3), 1/cond(J) (m,) and whether in the working mode (m,)."""
     modes = machine[0], machine[1], machine[2]
-    own, given, found = np.empty((7, _BLOCK)), np.empty((3, _BLOCK)), np.empty((14, _BLOCK))
+    own, given, found = np.empty((7, BLOCK)), np.empty((3, BLOCK)), np.empty((14, BLOCK))
     each = len(theta) // len(built)
-    for start in range(0, len(theta), _BLOCK):
-        count = min(_BLOCK, len(theta) - start)
-        _fill(built, start, count, each, own)
-        _read(theta, start, count, given, 0)
+    for start in range(0, len(theta), BLOCK):
+        count = min(BLOCK, len(theta) - start)
+        fill(built, start, count, each, own)
+        read(theta, start, count, given, 0)
         for j in range(count):
             g = _lengths(own, j)
-            pose, real, found[13, j] = _pose(_get(given, 0, j), g, modes)
+            pose, real, found[13, j] = _pose(get(given, 0, j), g, modes)
             rows = _place(found, j, pose, real)
             found[12, j] = equations.conditioning(rows, NS) if real else math.nan
-        _write(found, 0, start, count, position)
-        _write(found, 3, start, count, jacobian)
+        write(found, 0, start, count, position)
+        write(found, 3, start, count, jacobian)
         for j in range(count):
             conditioning[start + j], working[start + j] = found[12, j], found[13, j] > 0.0
 
@@ -200,14 +158,14 @@ def conditioning_at(
     """Compute 1/cond(J) (m,) for P at ``position`` (m, 3); 0 where the machine's modes end."""
     signs = machine[2], machine[3], machine[4], machine[5]
     modes = machine[0], machine[1], machine[2]
-    own, given = np.empty((7, _BLOCK)), np.empty((3, _BLOCK))
+    own, given = np.empty((7, BLOCK)), np.empty((3, BLOCK))
     each = len(position) // len(built)
-    for start in range(0, len(position), _BLOCK):
-        count = min(_BLOCK, len(position) - start)
-        _fill(built, start, count, each, own)
-        _read(position, start, count, given, 0)
+    for start in range(0, len(position), BLOCK):
+        count = min(BLOCK, len(position) - start)
+        fill(built, start, count, each, own)
+        read(position, start, count, given, 0)
         for j in range(count):
-            g, (x, y, z) = _lengths(own, j), _get(given, 0, j)
+            g, (x, y, z) = _lengths(own, j), get(given, 0, j)
             angles, reached, _, _ = equations.posture_at((x, y, z), signs, g, NS)
             pose, real, _ = _pose(angles, g, modes)
             there = pose.found
@@ -229,24 +187,24 @@ def torque(
 ) -> None:
     """Compute the motors' torques (m, 3) N m for a motion against forces on P (m, 3) N."""
     modes, fall = (machine[0], machine[1], machine[2]), (machine[6], machine[7], machine[8])
-    own, given, found = np.empty((23, _BLOCK)), np.zeros((12, _BLOCK)), np.empty((3, _BLOCK))
+    own, given, found = np.empty((23, BLOCK)), np.zeros((12, BLOCK)), np.empty((3, BLOCK))
     each = len(theta) // len(built)
-    for start in range(0, len(theta), _BLOCK):
-        count = min(_BLOCK, len(theta) - start)
-        _fill(built, start, count, each, own)
-        _read(theta, start, count, given, 0)
-        _read(theta_dot, start, count, given, 3)
-        _read(theta_ddot, start, count, given, 6)
+    for start in range(0, len(theta), BLOCK):
+        count = min(BLOCK, len(theta) - start)
+        fill(built, start, count, each, own)
+        read(theta, start, count, given, 0)
+        read(theta_dot, start, count, given, 3)
+        read(theta_ddot, start, count, given, 6)
         if len(force):
-            _read(force, start, count, given, 9)
+            read(force, start, count, given, 9)
         for j in range(count):
             g, inertia = _lengths(own, j), _inertia(own, j)
-            pose, real, _ = _pose(_get(given, 0, j), g, modes)
-            rates, changes = _get(given, 3, j), _get(given, 6, j)
+            pose, real, _ = _pose(get(given, 0, j), g, modes)
+            rates, changes = get(given, 3, j), get(given, 6, j)
             one, two, three = dynamics.torques(pose, rates, changes, fall, inertia)
-            a, b, c = dynamics.gather(pose, (0.0, 0.0), _get(given, 9, j))
-            _put(found, 0, j, (one - a, two - b, three - c), real)
-        _write(found, 0, start, count, torques)
+            a, b, c = dynamics.gather(pose, (0.0, 0.0), get(given, 9, j))
+            put(found, 0, j, (one - a, two - b, three - c), real)
+        write(found, 0, start, count, torques)
 
 
 @kept
@@ -263,27 +221,27 @@ def motion(
 ) -> None:
     """Compute P (m, 3), J (m, 3, 3), the mode (m,), masses (m, 3, 3) and bias (m, 3)."""
     modes, fall = (machine[0], machine[1], machine[2]), (machine[6], machine[7], machine[8])
-    own, given, found = np.empty((23, _BLOCK)), np.empty((6, _BLOCK)), np.empty((25, _BLOCK))
+    own, given, found = np.empty((23, BLOCK)), np.empty((6, BLOCK)), np.empty((25, BLOCK))
     each = len(theta) // len(built)
-    for start in range(0, len(theta), _BLOCK):
-        count = min(_BLOCK, len(theta) - start)
-        _fill(built, start, count, each, own)
-        _read(theta, start, count, given, 0)
-        _read(theta_dot, start, count, given, 3)
+    for start in range(0, len(theta), BLOCK):
+        count = min(BLOCK, len(theta) - start)
+        fill(built, start, count, each, own)
+        read(theta, start, count, given, 0)
+        read(theta_dot, start, count, given, 3)
         for j in range(count):
             g, inertia = _lengths(own, j), _inertia(own, j)
-            pose, real, found[24, j] = _pose(_get(given, 0, j), g, modes)
+            pose, real, found[24, j] = _pose(get(given, 0, j), g, modes)
             rows = _place(found, j, pose, real)
             a, b, c, d, e, f = dynamics.masses(pose, rows, inertia)
-            _put(found, 12, j, (a, b, c), real)
-            _put(found, 15, j, (b, d, e), real)
-            _put(found, 18, j, (c, e, f), real)
-            load = dynamics.torques(pose, _get(given, 3, j), _NONE, fall, inertia)
-            _put(found, 21, j, load, real)
-        _write(found, 0, start, count, position)
-        _write(found, 3, start, count, jacobian)
-        _write(found, 12, start, count, mass)
-        _write(found, 21, start, count, bias)
+            put(found, 12, j, (a, b, c), real)
+            put(found, 15, j, (b, d, e), real)
+            put(found, 18, j, (c, e, f), real)
+            load = dynamics.torques(pose, get(given, 3, j), _NONE, fall, inertia)
+            put(found, 21, j, load, real)
+        write(found, 0, start, count, position)
+        write(found, 3, start, count, jacobian)
+        write(found, 12, start, count, mass)
+        write(found, 21, start, count, bias)
         for j in range(count):
             working[start + j] = found[24, j] > 0.0
 
@@ -299,18 +257,18 @@ def mode_left(
 ) -> None:
     """Find the mode (m,) that is left with P at ``position`` (m, 3): 1 assembly, 2 working."""
     planar, side, turned = machine[0], machine[1], machine[2]
-    own, given = np.empty((7, _BLOCK)), np.empty((6, _BLOCK))
+    own, given = np.empty((7, BLOCK)), np.empty((6, BLOCK))
     each = len(theta) // len(built)
-    for start in range(0, len(theta), _BLOCK):
-        count = min(_BLOCK, len(theta) - start)
-        _fill(built, start, count, each, own)
-        _read(theta, start, count, given, 0)
-        _read(position, start, count, given, 3)
+    for start in range(0, len(theta), BLOCK):
+        count = min(BLOCK, len(theta) - start)
+        fill(built, start, count, each, own)
+        read(theta, start, count, given, 0)
+        read(position, start, count, given, 3)
         for j in range(count):
             g = _lengths(own, j)
-            cos, sin = equations.arms(_get(given, 0, j), g, NS)
+            cos, sin = equations.arms(get(given, 0, j), g, NS)
             there, real, _ = equations.assembly_at(cos, sin, planar, side, g, NS)
-            x, y, z = _get(given, 3, j)
+            x, y, z = get(given, 3, j)
             off2 = (there.x - x) ** 2 + (there.y - y) ** 2 + (there.z - z) ** 2
             kept = real & (y * side > 0.0) & (off2 <= limit * limit)
             left[start + j] = (2 if there.cos_beta * turned <= 0.0 else 0) if kept else 1

@@ -20,7 +20,6 @@ along +y (branch I) or +x (branches II, III). Units: metres, radians, kilograms.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -34,61 +33,13 @@ from tpm_gym.kinematics.modes import ROTATED_MODES, RotatedMode
 from tpm_gym.kinematics.namespaces import NUMPY
 from tpm_gym.kinematics.position import assembled
 from tpm_gym.kinematics.rotated import RotatedPostures, forward_rotated
+from tpm_gym.mechanism import parts
 from tpm_gym.mechanism.bodies import ALUMINIUM, STEEL, Closure, Joint, Link, Mechanism, Solid
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.motor import TORQUE_MOTOR
 
 ACTUATED_JOINTS = ("R11", "R21", "R31")
 """Joints of the motors, in the order of theta_1, theta_2, theta_3."""
-
-CARBON_FIBRE = 1600.0  # kg/m^3
-
-# Largest angles of an arm from level outwards, towards the base and towards the platform.
-ARM_RAISED, ARM_LOWERED = np.deg2rad(75.0), np.deg2rad(115.0)
-
-
-def _vector(axis: str, value: float, centre: Vector = (0.0, 0.0, 0.0)) -> Vector:
-    """Displace ``centre`` by ``value`` along ``axis``."""
-    x, y, z = (c + value if name == axis else c for name, c in zip("xyz", centre, strict=True))
-    return x, y, z
-
-
-def _tube(
-    axis: Literal["x", "y"], length: float, height: float, width: float, wall: float
-) -> Solid:
-    """Build a rectangular aluminium tube from the link's origin along ``axis``."""
-    outer = (length, width, height) if axis == "x" else (width, length, height)
-    inner, low = width - 2 * wall, height - 2 * wall
-    bore = (length, inner, low) if axis == "x" else (inner, length, low)
-    return Solid("box", outer, _vector(axis, length / 2), ALUMINIUM, bore=bore, colour="orange")
-
-
-def _bar(
-    axis: Literal["x", "y", "z"],
-    half: float,
-    radius: float = 0.008,
-    centre: Vector = (0.0, 0.0, 0.0),
-    colour: str = "steel",
-    density: float = ALUMINIUM,
-) -> Solid:
-    """Build a round solid bar of half length ``half`` about ``centre``."""
-    return Solid("cylinder", (radius, 2 * half, 0.0), centre, density, axis=axis, colour=colour)
-
-
-def _rod(axis: Literal["x", "y"], length: float) -> tuple[Solid, ...]:
-    """Build a carbon-fibre tube, 16 mm by 1.5 mm, with a steel rod end at both ends."""
-    tube = _bar(axis, length / 2, 0.008, _vector(axis, length / 2), "carbon", CARBON_FIBRE)
-    ends = (
-        _bar(axis, 0.008, 0.009, _vector(axis, at), density=STEEL) for at in (0.008, length - 0.008)
-    )
-    return (replace(tube, bore=(0.0065, length, 0.0)), *ends)
-
-
-def _motor(name: str, axis: Vector, origin: Vector, level: float, sense: int) -> Joint:
-    """Build a motor. At theta = ``level`` its arm points outwards; ``sense`` of theta lowers it."""
-    lower, upper = sorted((level - sense * ARM_RAISED, level + sense * ARM_LOWERED))
-    line = TORQUE_MOTOR.peak_torque, TORQUE_MOTOR.no_load_speed, TORQUE_MOTOR.corner_speed
-    return Joint(name, "revolute", "base", origin, axis, lower, upper, *line)
 
 
 def _base(g: Geometry) -> Link:
@@ -103,39 +54,28 @@ def _base(g: Geometry) -> Link:
     motors = [solid for axis, at in pivots for solid in TORQUE_MOTOR.stator(axis, at)]
     saddles = [
         Solid("box", (0.06, 0.12, 0.09) if axis == "x" else (0.12, 0.06, 0.09),
-              _vector("z", -0.06, middle), ALUMINIUM, colour="white")
+              parts.displaced("z", -0.06, middle), ALUMINIUM, colour="white")
         for axis, at in pivots
         for middle in TORQUE_MOTOR.halves(axis, at)
     ]  # fmt: skip
     return Link("base", (plate, *saddles, *motors))
 
 
-def _arm(axis: Literal["x", "y"], across: Literal["x", "y"], g: Geometry) -> tuple[Solid, ...]:
-    """Build an actuated arm: motor's shaft and rotor, rectangular tube, elbow bar across."""
-    shaft = _bar(across, TORQUE_MOTOR.reach, 0.022, density=STEEL)
-    return (
-        shaft,
-        *TORQUE_MOTOR.rotor(across),
-        _tube(axis, g.l3, 0.045, 0.030, 0.003),
-        _bar(across, 0.02, 0.015, _vector(axis, g.l3)),
-    )
-
-
 def _branch_1(g: Geometry) -> tuple[Link, ...]:
     """Build arm 2 with short link 3, and the two rods 4 of the 4S parallelogram."""
-    short_link = _bar("x", g.l5, 0.010, (0.0, g.l3, 0.0))
+    short_link = parts.bar("x", g.l5, 0.010, (0.0, g.l3, 0.0))
     arm = Link(
         "arm_2",
-        (*_arm("y", "x", g), short_link),
-        _motor("R11", (1.0, 0.0, 0.0), (0.0, g.l1, 0.0), level=0.0, sense=1),
+        (*parts.arm("y", "x", g.l3), short_link),
+        parts.motor("R11", (1.0, 0.0, 0.0), (0.0, g.l1, 0.0), level=0.0, sense=1),
     )
     links = [arm]
     for suffix, ball, side in (("a", "Sa", 1), ("b", "Sb", -1)):
         origin, cross = (side * g.l5, g.l3, 0.0), f"cross_4{suffix}"
         swing = Joint(f"{ball}_swing", "continuous", "arm_2", origin, (1.0, 0.0, 0.0))
         tilt = Joint(f"{ball}_tilt", "continuous", cross, (0.0, 0.0, 0.0), (0.0, 0.0, -1.0))
-        links.append(Link(cross, (_bar("z", 0.010, 0.009, density=STEEL),), swing))
-        links.append(Link(f"rod_4{suffix}", _rod("y", g.l4), tilt))
+        links.append(Link(cross, (parts.bar("z", 0.010, 0.009, density=STEEL),), swing))
+        links.append(Link(f"rod_4{suffix}", parts.rod("y", g.l4), tilt))
     return tuple(links)
 
 
@@ -147,17 +87,23 @@ def _branch_2(g: Geometry) -> tuple[Link, ...]:
     tube, bore = (3 * g.l5, 0.025, 0.018), (3 * g.l5, 0.019, 0.012)
     link_3p = (
         Solid("box", tube, (1.5 * g.l5, 0.0, 0.0), ALUMINIUM, bore=bore, colour="blue"),
-        _bar("y", 0.016, 0.011, density=STEEL),
+        parts.bar("y", 0.016, 0.011, density=STEEL),
     )
     link_7 = (
         Solid("box", (g.l7, 0.020, 0.008), (g.l7 / 2, 0.0, 0.0), ALUMINIUM, colour="light"),
-        _bar("z", 0.008, 0.011, density=STEEL),
-        _bar("z", 0.008, 0.011, (g.l7, 0.0, 0.0), density=STEEL),
+        parts.bar("z", 0.008, 0.011, density=STEEL),
+        parts.bar("z", 0.008, 0.011, (g.l7, 0.0, 0.0), density=STEEL),
     )
     return (
-        Link("arm_5", _arm("x", "y", g), _motor("R21", minus_y, (-g.l1, 0.0, 0.0), np.pi, -1)),
         Link(
-            "rod_6", _rod("x", g.l4), Joint("R22", "continuous", "arm_5", (g.l3, 0.0, 0.0), minus_y)
+            "arm_5",
+            parts.arm("x", "y", g.l3),
+            parts.motor("R21", minus_y, (-g.l1, 0.0, 0.0), np.pi, -1),
+        ),
+        Link(
+            "rod_6",
+            parts.rod("x", g.l4),
+            Joint("R22", "continuous", "arm_5", (g.l3, 0.0, 0.0), minus_y),
         ),
         Link("link_3p", link_3p, Joint("R23", "continuous", "rod_6", (g.l4, 0.0, 0.0), minus_y)),
         Link("link_7", link_7, Joint("R12", "continuous", "link_3p", (2 * g.l5, 0.0, g.l6))),
@@ -169,7 +115,7 @@ def _branch_2(g: Geometry) -> tuple[Link, ...]:
         CUP.link("platform", point_p),
         Link(
             "end_link_10",
-            (_bar("y", g.l5 + 0.01, 0.007),),
+            (parts.bar("y", g.l5 + 0.01, 0.007),),
             Joint("R33", "continuous", "platform", (2 * g.l2, 0.0, 0.0), minus_y),
         ),
     )
@@ -178,16 +124,18 @@ def _branch_2(g: Geometry) -> tuple[Link, ...]:
 def _branch_3(g: Geometry) -> tuple[Link, ...]:
     """Build arm 12, end link 9, and the two rods 11 of the second parallelogram."""
     minus_y, plus_z = (0.0, -1.0, 0.0), (0.0, 0.0, 1.0)
-    arm = Link("arm_12", _arm("x", "y", g), _motor("R31", minus_y, (g.l1, 0.0, 0.0), 0.0, 1))
+    arm = Link(
+        "arm_12", parts.arm("x", "y", g.l3), parts.motor("R31", minus_y, (g.l1, 0.0, 0.0), 0.0, 1)
+    )
     end_link = Link(
         "end_link_9",
-        (_bar("y", g.l5 + 0.01, 0.008),),
+        (parts.bar("y", g.l5 + 0.01, 0.008),),
         Joint("R32", "continuous", "arm_12", (g.l3, 0.0, 0.0), minus_y),
     )
     rods = tuple(
         Link(
             f"rod_11{suffix}",
-            _rod("x", g.l4),
+            parts.rod("x", g.l4),
             Joint(name, "continuous", "end_link_9", (0.0, side * g.l5, 0.0), plus_z),
         )
         for suffix, name, side in (("a", "Re", 1), ("b", "Rf", -1))

@@ -1,0 +1,154 @@
+"""Machines whose equations are compiled: a module of loops over rows of robots.
+
+The module has the functions of :mod:`tpm_gym.mechanism.tpm_rows`. It is imported when something is
+first computed, since it imports Numba.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tpm_gym.arrays import FloatArray
+from tpm_gym.errors import InputError
+from tpm_gym.mechanism.machine import SAME_PLACE, Machine, Motion, Reading
+
+ASSEMBLY_LIMIT = 0.010
+"""Largest distance between platform and forward kinematics in the same assembly mode, m."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompiledMachine(Machine):
+    """Machine that computes rows by a module of compiled loops."""
+
+    @property
+    @abstractmethod
+    def _loops(self) -> ModuleType:
+        """The compiled loops."""
+
+    @cached_property
+    @abstractmethod
+    def _constants(self) -> FloatArray:
+        """Signs of the modes, and gravity: what all machines as built share."""
+
+    def inverse(self, position: ArrayLike, built: FloatArray | None = None) -> FloatArray:
+        """See :class:`Machine`."""
+        points = _rows(position)
+        theta = np.empty(points.shape)
+        of = self._own if built is None else self._others(built, points)
+        self._loops.inverse(points.reshape(-1, 3), *of, theta.reshape(-1, 3))
+        return theta
+
+    def forward(self, theta: ArrayLike, built: FloatArray | None = None) -> FloatArray:
+        """See :class:`Machine`."""
+        angles = _rows(theta)
+        position = np.empty(angles.shape)
+        of = self._own if built is None else self._others(built, angles)
+        self._loops.forward(angles.reshape(-1, 3), *of, position.reshape(-1, 3))
+        return position
+
+    def evaluate(self, theta: ArrayLike, built: FloatArray | None = None) -> Reading:
+        """See :class:`Machine`."""
+        angles = _rows(theta)
+        flat, empty = angles.reshape(-1, 3), np.empty
+        of = self._own if built is None else self._others(built, angles)
+        count = len(flat)
+        position, jacobian = empty((count, 3)), empty((count, 3, 3))
+        found = Reading(position, jacobian, empty(count), empty(count, np.bool_))
+        self._loops.evaluate(flat, *of, *found)
+        return found if angles.ndim == 2 else Reading(*_shaped(found, angles))
+
+    def conditioning_at(self, position: ArrayLike) -> FloatArray:
+        """See :class:`Machine`."""
+        points = _rows(position)
+        found = np.empty(points.shape[:-1])
+        self._loops.conditioning_at(
+            points.reshape(-1, 3), SAME_PLACE, *self._own, found.reshape(-1)
+        )
+        return found
+
+    def mode_left(
+        self, theta: ArrayLike, position: ArrayLike, built: FloatArray | None = None
+    ) -> NDArray[np.int8]:
+        """See :class:`Machine`."""
+        angles, points = _rows(theta), _rows(position)
+        if points.shape != angles.shape:
+            raise InputError("position", points.shape, f"of shape {angles.shape}, like theta")
+        left = np.empty(angles.shape[:-1], np.int8)
+        of = self._own if built is None else self._others(built, angles)
+        self._loops.mode_left(
+            angles.reshape(-1, 3), points.reshape(-1, 3), ASSEMBLY_LIMIT, *of, left.reshape(-1)
+        )
+        return left
+
+    def torque(
+        self,
+        theta: ArrayLike,
+        theta_dot: ArrayLike,
+        theta_ddot: ArrayLike,
+        force: ArrayLike | None = None,
+        built: FloatArray | None = None,
+    ) -> FloatArray:
+        """See :class:`Machine`."""
+        angles = _rows(theta)
+        others = (theta_dot, theta_ddot, *(() if force is None else (force,)))
+        inputs = [angles, *(_rows(np.broadcast_to(values, angles.shape)) for values in others)]
+        if force is None:
+            inputs.append(np.empty((0, 3)))
+        torques = np.empty(angles.shape)
+        of = self._own if built is None else self._others(built, angles)
+        flat = (values.reshape(-1, 3) for values in inputs)
+        self._loops.torque(*flat, *of, torques.reshape(-1, 3))
+        return torques
+
+    def motion(
+        self, theta: ArrayLike, theta_dot: ArrayLike, built: FloatArray | None = None
+    ) -> Motion:
+        """See :class:`Machine`."""
+        angles = _rows(theta)
+        rates = _rows(np.broadcast_to(theta_dot, angles.shape))
+        flat, empty = angles.reshape(-1, 3), np.empty
+        of = self._own if built is None else self._others(built, angles)
+        count = len(flat)
+        place = empty((count, 3)), empty((count, 3, 3)), empty(count, np.bool_)
+        found = Motion(*place, empty((count, 3, 3)), empty((count, 3)))
+        self._loops.motion(flat, rates.reshape(-1, 3), *of, *found)
+        return found if angles.ndim == 2 else Motion(*_shaped(found, angles))
+
+    @cached_property
+    def _nominal(self) -> FloatArray:
+        """Parameters of the nominal machine, (1, k)."""
+        return self.built()[None]
+
+    @cached_property
+    def _own(self) -> tuple[FloatArray, FloatArray]:
+        """The parameters of the nominal machine, and the constants."""
+        return self._nominal, self._constants
+
+    def _others(self, built: FloatArray, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the parameters of machines as built, and the constants that they share."""
+        rows, count = inputs.size // 3, len(built)
+        if not count or rows % count:
+            valid = f"parameters of b machines, with b a divisor of {rows} rows"
+            raise InputError("built", built.shape, valid)
+        return _rows(built, self._nominal.shape[1], "built"), self._constants
+
+
+def _rows(values: ArrayLike, length: int = 3, name: str = "vectors") -> FloatArray:
+    """Convert vectors (..., length) to the type of array for which the loops are compiled."""
+    array = np.ascontiguousarray(values, np.float64)
+    if array.shape[-1] != length:
+        raise InputError(name, array.shape, f"an array of shape (..., {length}), by shape")
+    return array if array.flags.writeable else array.copy()
+
+
+def _shaped(arrays: Iterable[Any], like: FloatArray) -> Iterator[Any]:
+    """Reshape arrays (m, ...) to the leading shape of an array (..., 3)."""
+    return (array.reshape(like.shape[:-1] + array.shape[1:]) for array in arrays)

@@ -1,0 +1,190 @@
+"""Links, joints and loop closures of a Delta, its inertias, and the angles of its passive joints.
+
+A rod has a universal joint at its arm (a small cross between them), so that it cannot spin about
+its own axis, and a ball joint at the platform, which closes a loop. The platform belongs to no leg:
+three slides and three revolutes, with next to no mass between them, leave it free in the spanning
+tree. So each closure joins two branches of the tree, as PyBullet's direct solver needs it
+(docs/fidelity.md). The frames of an arm, its crosses and its rods have x along the arm or rod and y
+along the hinges when their joints are at zero; that of the platform is parallel to the base's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from tpm_gym.arrays import Vector
+from tpm_gym.kinematics.equations import Triple
+from tpm_gym.kinematics.namespaces import Numbers
+from tpm_gym.mechanism import parts
+from tpm_gym.mechanism.bodies import ALUMINIUM, STEEL, Closure, Joint, Link, Mechanism, Solid
+from tpm_gym.mechanism.cup import CUP
+from tpm_gym.mechanism.delta.equations import ONE, THREE, TWO, Pair, Pose, outwards
+from tpm_gym.mechanism.delta.geometry import DeltaGeometry
+from tpm_gym.mechanism.inertia import Bodies, Swing, X, Y, three
+from tpm_gym.mechanism.motor import TORQUE_MOTOR
+
+LEGS: Final = {1: ONE, 2: TWO, 3: THREE}
+SIDES: Final = {"a": 1.0, "b": -1.0}
+SLIDES: Final = ("platform_x", "platform_y", "platform_z")
+TURNS: Final = ("platform_roll", "platform_pitch", "platform_yaw")
+_FREE = ("along_x", "along_y", "along_z", "rolling", "pitching")
+_AXES: Final[tuple[Vector, ...]] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+_POINT = 0.005  # m, edge of a cube of 1 kg/m^3: 1e-7 kg, far below what a torque shows
+_MINUS_Y, _PLUS_Z, _ORIGIN = (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, 0.0)
+
+
+class Inertia(NamedTuple):
+    """Constants of the dynamics; see :mod:`tpm_gym.mechanism.inertia`.
+
+    Attributes:
+        motors: For each leg, inertia of arm and near ends of rods about the motor, kg m^2.
+        weights: For each leg, mass at B_i less ``couples``, kg.
+        couples: For each leg, b of the two bars B_iC_i, kg.
+        platform: Mass at P, kg.
+        fixed: For each leg, moment of inertia of its crosses about the axis of their swing, kg m^2.
+        spin: For each leg, moment of inertia of the rods about their own axes, over l4^2, kg.
+    """
+
+    motors: Triple
+    weights: Triple
+    couples: Triple
+    platform: Numbers
+    fixed: Triple
+    spin: Triple
+
+    def swing(self, leg: int) -> Swing:
+        """Return the swing of a leg, 0 to 2."""
+        return Swing(self.fixed[leg], self.spin[leg])
+
+
+def build(g: DeltaGeometry) -> Mechanism:
+    """Build the mechanism; cross-sections and materials are those of the TPM."""
+    links, closures = [_base(g)], []
+    for number, leg in LEGS.items():
+        links += _leg(number, leg, g)
+        for suffix, side in SIDES.items():
+            name, end = f"{number}{suffix}", outwards(leg, (g.l2, side * g.l5, 0.0))
+            closures.append(Closure(f"S{name}", f"rod_{name}", (g.l4, 0.0, 0.0), "platform", end))
+    return Mechanism(
+        links=(*links, *_platform(g)),
+        closures=tuple(closures),
+        platform="platform",
+        point_p=_ORIGIN,
+        tool="cup",
+        lip=CUP.lip,
+        actuated=("R1", "R2", "R3"),
+    )
+
+
+def joint_positions(pose: Pose, theta: Vector, l4: float) -> dict[str, float]:
+    """Compute the positions of all joints, rad or m, from a configuration and its angles."""
+    found = {"cup_slide": 0.0} | dict.fromkeys(TURNS, 0.0)
+    found |= dict(zip(SLIDES, map(float, pose.position), strict=True))
+    for number, angle, (x, y, z) in zip(LEGS, theta, pose.rods, strict=True):
+        found[f"R{number}"] = angle
+        for suffix in SIDES:
+            found[f"swing_{number}{suffix}"] = math.atan2(z, x) - angle
+            found[f"tilt_{number}{suffix}"] = math.asin(max(-1.0, min(1.0, y / l4)))
+    return found
+
+
+def inertia_of(
+    mechanism: Mechanism, g: DeltaGeometry, link_masses: Sequence[float] = (), payload: float = 0.0
+) -> Inertia:
+    """Compute the constants of a mechanism of :func:`build`.
+
+    Args:
+        mechanism: Bodies of the mechanism.
+        g: Lengths of the mechanism.
+        link_masses: Factors of mass and inertia, one for each moving link; empty if all are one.
+        payload: Mass that the cup carries, kg.
+
+    Raises:
+        ConfigurationError: If the number of factors is wrong.
+    """
+    bodies = Bodies(mechanism, link_masses)
+    motors, weights, couples, fixed, spin = (np.zeros(3) for _ in range(5))
+    platform = payload + sum(bodies.mass(name) for name in ("platform", "cup", *_FREE))
+    for i, number in enumerate(LEGS):
+        _, couple, far = bodies.bar(f"arm_{number}", X, Y, g.l3)
+        motors[i], weights[i] = far, couple + far
+        for suffix in SIDES:
+            near, between, end = bodies.round_bar(f"rod_{number}{suffix}", X, g.l4)
+            mass, moment = bodies.shaft(f"cross_{number}{suffix}", Y)
+            motors[i] += near + mass
+            weights[i] += near + mass
+            couples[i] += between
+            platform += end
+            fixed[i] += moment
+            spin[i] += bodies.moment(f"rod_{number}{suffix}", X) / g.l4**2
+    bodies.require_all_known()
+    motors *= g.l3**2
+    return Inertia(
+        three(motors), three(weights), three(couples), platform, three(fixed), three(spin)
+    )
+
+
+def _base(g: DeltaGeometry) -> Link:
+    """Build the base, a plate with a motor at each pivot; it never moves."""
+    plate = Solid(
+        "cylinder", (g.l1 + 0.05, 0.02, 0.0), (0.0, 0.0, -0.105), ALUMINIUM, colour="white"
+    )
+    pivot = (g.l1, 0.0, 0.0)
+    saddles = [
+        Solid("box", (0.12, 0.06, 0.09), (x, y, z - 0.06), ALUMINIUM, colour="white")
+        for x, y, z in TORQUE_MOTOR.halves("y", pivot)
+    ]
+    housed = (*saddles, *TORQUE_MOTOR.stator("y", pivot))
+    return Link(
+        "base", (plate, *(_turned(solid, leg) for leg in LEGS.values() for solid in housed))
+    )
+
+
+def _leg(number: int, leg: Pair, g: DeltaGeometry) -> list[Link]:
+    """Build an arm with a short link across, and two rods."""
+    arm, pivot = f"arm_{number}", outwards(leg, (g.l1, 0.0, 0.0))
+    across = parts.bar("y", g.l5, 0.010, (g.l3, 0.0, 0.0))
+    motor = parts.motor(f"R{number}", _MINUS_Y, pivot, level=0.0, sense=1, rpy=_yaw(leg))
+    links = [Link(arm, (*parts.arm("x", "y", g.l3), across), motor)]
+    for suffix, side in SIDES.items():
+        name, cross = f"{number}{suffix}", f"cross_{number}{suffix}"
+        elbow = (g.l3, side * g.l5, 0.0)
+        swing = Joint(f"swing_{name}", "continuous", arm, elbow, _MINUS_Y)
+        tilt = Joint(f"tilt_{name}", "continuous", cross, _ORIGIN, _PLUS_Z)
+        pin = parts.bar("z", 0.010, 0.009, density=STEEL)
+        links.append(Link(cross, (pin,), swing))
+        links.append(Link(f"rod_{name}", parts.rod("x", g.l4), tilt))
+    return links
+
+
+def _platform(g: DeltaGeometry) -> list[Link]:
+    """Build platform and cup, and the links that leave the platform free."""
+    links, parent, far = [], "base", 10 * (g.l3 + g.l4)
+    point = Solid("box", (_POINT,) * 3, _ORIGIN, 1.0, colour="yellow")
+    for name, joint, axis in zip(
+        (*_FREE, "platform"), (*SLIDES, *TURNS), (*_AXES, *_AXES), strict=True
+    ):
+        held = Joint(joint, "continuous", parent, _ORIGIN, axis)
+        if joint in SLIDES:
+            held = replace(held, kind="prismatic", lower=-far, upper=far)
+        links.append(Link(name, (point,), held))
+        parent = name
+    plate = Solid("cylinder", (g.l2 + 0.015, 0.008, 0.0), _ORIGIN, ALUMINIUM, colour="yellow")
+    bar = parts.bar("y", g.l5 + 0.01, 0.007, (g.l2, 0.0, 0.0))
+    solids = (plate, *(_turned(bar, leg) for leg in LEGS.values()), CUP.stem(_ORIGIN))
+    links[-1] = replace(links[-1], solids=solids)
+    return [*links, CUP.link("platform", _ORIGIN)]
+
+
+def _yaw(leg: Pair) -> Vector:
+    return (0.0, 0.0, math.atan2(leg[1], leg[0]))
+
+
+def _turned(solid: Solid, leg: Pair) -> Solid:
+    """Turn a solid of leg 1 about z to another leg."""
+    return replace(solid, centre=outwards(leg, solid.centre), rpy=_yaw(leg))

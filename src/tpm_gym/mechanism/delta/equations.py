@@ -1,0 +1,184 @@
+"""Closed-form equations of the Delta, for floats, arrays and tensors.
+
+Three legs stand at 0, 120 and 240 degrees about z. In the frame of a leg, x points outwards, z from
+the base to the platform, and the arm turns about -y: at theta = 0 it points outwards, at a quarter
+turn to the platform. The platform only translates, so each leg keeps P on a sphere of radius l4
+about the elbow B_i, moved inwards by l2.
+
+* Forward kinematics: P is one of the two points where three spheres intersect.
+* Inverse kinematics: the elbow is one of the two points where a circle and a sphere intersect.
+* Velocity: B_iC_i . v = B_iC_i . dB_i/dtheta_i theta_i', so A v = B theta'. The rods are the rows
+  of A; det A, their volume, is zero at parallel singularities. B is diagonal; its entries are zero
+  at serial singularities.
+* Constraint: each pair of rods keeps the platform from turning about the normal of its plane. Where
+  these three normals are coplanar, the platform can turn.
+
+As in :mod:`tpm_gym.kinematics.equations`, the functions compute with the numbers of a namespace,
+check nothing, and return whether a solution is real.
+"""
+
+import math
+from typing import NamedTuple
+
+from tpm_gym.kinematics.equations import ROUNDING, SINGULAR, Triple, arm, arms
+from tpm_gym.kinematics.namespaces import Namespace, Numbers
+from tpm_gym.mechanism.delta.geometry import AnyDelta
+
+Pair = tuple[float, float]
+
+_HALF, _ROOT = 0.5, math.sqrt(0.75)
+ONE: Pair = (1.0, 0.0)
+"""Direction of leg 1 in the base plane."""
+TWO: Pair = (-_HALF, _ROOT)
+THREE: Pair = (-_HALF, -_ROOT)
+
+
+class Pose(NamedTuple):
+    """Configuration of a Delta.
+
+    Attributes:
+        cos: l3 cos(theta_i), m.
+        sin: l3 sin(theta_i), m.
+        position: Point P, m.
+        rods: Vectors B_iC_i in the frames of their legs, m.
+        bars: Vectors B_iC_i in the base's frame, m.
+        parallel: det A, m^3.
+        serial: B_iC_i . dB_i/dtheta_i, m^2/rad.
+        constraint: Volume of the normals of the legs' planes, m^3.
+    """
+
+    cos: Triple
+    sin: Triple
+    position: Triple
+    rods: tuple[Triple, Triple, Triple]
+    bars: tuple[Triple, Triple, Triple]
+    parallel: Numbers
+    serial: Triple
+    constraint: Numbers
+
+
+def dot(a: Triple, b: Triple) -> Numbers:
+    """Compute the dot product."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def cross(a: Triple, b: Triple) -> Triple:
+    """Compute the cross product."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def inwards(leg: Pair, v: Triple) -> Triple:
+    """Convert a vector from the base's frame to a leg's."""
+    return leg[0] * v[0] + leg[1] * v[1], leg[0] * v[1] - leg[1] * v[0], v[2]
+
+
+def outwards(leg: Pair, v: Triple) -> Triple:
+    """Convert a vector from a leg's frame to the base's."""
+    return leg[0] * v[0] - leg[1] * v[1], leg[0] * v[1] + leg[1] * v[0], v[2]
+
+
+def assembly_at(
+    cos: Triple, sin: Triple, side: Numbers, g: AnyDelta, ns: Namespace
+) -> tuple[Triple, Numbers, Numbers]:
+    """Intersect three spheres, for the sign of det A.
+
+    Returns:
+        P, m; whether it is real; and the squared distance of P to the plane of the centres, m^2.
+    """
+    inner = g.l1 - g.l2
+    b1 = outwards(ONE, (inner + cos[0], 0.0, sin[0]))
+    b2 = outwards(TWO, (inner + cos[1], 0.0, sin[1]))
+    b3 = outwards(THREE, (inner + cos[2], 0.0, sin[2]))
+    a = b2[0] - b1[0], b2[1] - b1[1], b2[2] - b1[2]
+    b = b3[0] - b1[0], b3[1] - b1[1], b3[2] - b1[2]
+    normal = cross(a, b)
+    square = dot(normal, normal)
+    # The middle of the circle through the centres, from the first centre
+    (px, py, pz), (qx, qy, qz) = cross(b, normal), cross(normal, a)
+    f, h = dot(a, a) / (2.0 * square), dot(b, b) / (2.0 * square)
+    foot = f * px + h * qx, f * py + h * qy, f * pz + h * qz
+    height2 = g.l4 * g.l4 - dot(foot, foot)
+    real = height2 >= -ROUNDING * g.l4 * g.l4  # False for NaN: the centres are on a line
+    up = side * ns.root(height2 / square)
+    position = (
+        b1[0] + foot[0] + up * normal[0],
+        b1[1] + foot[1] + up * normal[1],
+        b1[2] + foot[2] + up * normal[2],
+    )
+    return position, real, height2
+
+
+def posture_at(
+    point: Triple, bends: Triple, g: AnyDelta, ns: Namespace
+) -> tuple[Triple, Numbers, Triple]:
+    """Solve inverse kinematics for the signs of a working mode.
+
+    Returns:
+        theta in (-pi, pi], whether it is real, and whether each leg reaches.
+    """
+    inner = g.l2 - g.l1
+    (x1, y1, z), (x2, y2, _) = inwards(ONE, point), inwards(TWO, point)
+    x3, y3, _ = inwards(THREE, point)
+    one, real1 = arm(x1 + inner, z, y1, bends[0], g, ns)
+    two, real2 = arm(x2 + inner, z, y2, bends[1], g, ns)
+    three, real3 = arm(x3 + inner, z, y3, bends[2], g, ns)
+    return (one, two, three), real1 & real2 & real3, (real1, real2, real3)
+
+
+def pose_at(theta: Triple, side: Numbers, g: AnyDelta, ns: Namespace) -> tuple[Pose, Numbers]:
+    """Assemble a Delta; return the configuration, and whether it is real."""
+    cos, sin = arms(theta, g, ns)
+    position, real, _ = assembly_at(cos, sin, side, g, ns)
+    return pose_of(cos, sin, position, g), real
+
+
+def pose_of(cos: Triple, sin: Triple, position: Triple, g: AnyDelta) -> Pose:
+    """Compute the configuration from arms (m) and P (m) that fit together."""
+    r1 = rod(ONE, position, cos[0], sin[0], g)
+    r2 = rod(TWO, position, cos[1], sin[1], g)
+    r3 = rod(THREE, position, cos[2], sin[2], g)
+    bars = outwards(ONE, r1), outwards(TWO, r2), outwards(THREE, r3)
+    parallel = dot(bars[0], cross(bars[1], bars[2]))
+    serial = (
+        r1[2] * cos[0] - r1[0] * sin[0],
+        r2[2] * cos[1] - r2[0] * sin[1],
+        r3[2] * cos[2] - r3[0] * sin[2],
+    )
+    constraint = _ROOT * (r1[0] * r2[2] * r3[2] + r1[2] * r2[0] * r3[2] + r1[2] * r2[2] * r3[0])
+    return Pose(cos, sin, position, (r1, r2, r3), bars, parallel, serial, constraint)
+
+
+def rod(leg: Pair, position: Triple, cos: Numbers, sin: Numbers, g: AnyDelta) -> Triple:
+    """Compute B_iC_i in the frame of a leg, m."""
+    x, y, z = inwards(leg, position)
+    return x + (g.l2 - g.l1) - cos, y, z - sin
+
+
+def regular(pose: Pose, g: AnyDelta) -> Numbers:
+    """Return whether det A is not zero, so that J exists."""
+    return abs(pose.parallel) >= SINGULAR * g.l4 * g.l4 * g.l4
+
+
+def resolve(pose: Pose, h: Triple) -> Triple:
+    """Solve B_iC_i . v = h_i, for a velocity or an acceleration of P."""
+    one, two, three = pose.bars
+    a, b, c = cross(two, three), cross(three, one), cross(one, two)
+    p, q, r = h[0] / pose.parallel, h[1] / pose.parallel, h[2] / pose.parallel
+    return (
+        p * a[0] + q * b[0] + r * c[0],
+        p * a[1] + q * b[1] + r * c[1],
+        p * a[2] + q * b[2] + r * c[2],
+    )
+
+
+def velocity(pose: Pose) -> tuple[Triple, Triple, Triple]:
+    """Compute the rows of J, v = J theta', m/rad; it exists at serial singularities too."""
+    one, two, three = pose.bars
+    a, b, c = cross(two, three), cross(three, one), cross(one, two)
+    p, q, r = pose.serial
+    p, q, r = p / pose.parallel, q / pose.parallel, r / pose.parallel
+    return (
+        (p * a[0], q * b[0], r * c[0]),
+        (p * a[1], q * b[1], r * c[1]),
+        (p * a[2], q * b[2], r * c[2]),
+    )

@@ -1,0 +1,153 @@
+"""Kinematics of the Delta for arrays and tensors.
+
+Points and joint angles are arrays (..., 3), m and rad, or tensors, which can be differentiated.
+Results are NaN where there is no solution. All functions raise InputError for arrays of another
+shape, or numbers that are not finite.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from tpm_gym.arrays import BoolArray, FloatArray, Vector, finite_points
+from tpm_gym.errors import SingularityError, UnreachableError
+from tpm_gym.kinematics.equations import Triple
+from tpm_gym.kinematics.equations import arms as arms_at
+from tpm_gym.kinematics.equations import conditioning as conditioning_of
+from tpm_gym.kinematics.namespaces import NUMPY, Namespace, Numbers, by_rows
+from tpm_gym.mechanism.delta.equations import (
+    ONE,
+    THREE,
+    TWO,
+    assembly_at,
+    inwards,
+    pose_at,
+    pose_of,
+    posture_at,
+    regular,
+    velocity,
+)
+from tpm_gym.mechanism.delta.geometry import (
+    ASSEMBLY_MODES,
+    IRB_360,
+    WORKING_MODES,
+    AnyDelta,
+    DeltaGeometry,
+)
+
+
+class Factors(NamedTuple):
+    """Factors that are zero at the singularities of a kind.
+
+    Attributes:
+        parallel: (...,) det A over l4^3: the rods are parallel to one plane, or P is.
+        serial: (..., 3) B_iC_i . dB_i/dtheta_i over l3 l4: a leg is stretched or folded.
+        constraint: (...,) volume of the normals of the parallelograms, over l4^3.
+    """
+
+    parallel: FloatArray
+    serial: FloatArray
+    constraint: FloatArray
+
+
+def forward_all(theta: ArrayLike, geometry: AnyDelta = IRB_360) -> FloatArray:
+    """Compute P (..., 2, 3) m in both assembly modes, in the order of ASSEMBLY_MODES."""
+
+    def text(angles: Triple, ns: Namespace) -> list[Numbers]:
+        cos, sin = arms_at(angles, geometry, ns)
+        found = [assembly_at(cos, sin, side, geometry, ns) for side in ASSEMBLY_MODES]
+        return [tuple(_or_nan(real, point, ns) for point, real, _ in found)]
+
+    return by_rows(text, finite_points("theta", theta))[0]
+
+
+def inverse_all(position: ArrayLike, geometry: AnyDelta = IRB_360) -> FloatArray:
+    """Compute theta (..., 8, 3) rad in (-pi, pi], in the order of WORKING_MODES."""
+
+    def text(point: Triple, ns: Namespace) -> list[Numbers]:
+        found = [posture_at(point, bends, geometry, ns) for bends in WORKING_MODES]
+        return [tuple(_or_nan(real, angles, ns) for angles, real, _ in found)]
+
+    return by_rows(text, finite_points("position", position))[0]
+
+
+def jacobian(theta: ArrayLike, side: float = 1.0, geometry: AnyDelta = IRB_360) -> FloatArray:
+    """Compute J (..., 3, 3) m/rad, v = J theta', in the assembly mode of this sign of det A."""
+
+    def text(angles: Triple, ns: Namespace) -> list[Numbers]:
+        pose, real = pose_at(angles, side, geometry, ns)
+        real = real & regular(pose, geometry)
+        return [tuple(_or_nan(real, row, ns) for row in velocity(pose))]
+
+    return by_rows(text, finite_points("theta", theta))[0]
+
+
+def factors(theta: ArrayLike, side: float = 1.0, geometry: AnyDelta = IRB_360) -> Factors:
+    """Compute the factors that are zero at singularities, without a unit."""
+    l3, l4 = geometry.l3, geometry.l4
+
+    def text(angles: Triple, ns: Namespace) -> list[Numbers]:
+        pose, real = pose_at(angles, side, geometry, ns)
+        parallel, *serial, constraint = _or_nan(
+            real, (pose.parallel, *pose.serial, pose.constraint), ns
+        )
+        return [parallel / l4**3, tuple(leg / (l3 * l4) for leg in serial), constraint / l4**3]
+
+    return Factors(*by_rows(text, finite_points("theta", theta)))
+
+
+def conditioning_at(
+    position: ArrayLike, bends: Triple = (1.0, 1.0, 1.0), geometry: AnyDelta = IRB_360
+) -> FloatArray:
+    """Compute 1/cond(J) (...,) at points (..., 3) m in a working mode; NaN out of reach."""
+
+    def text(point: Triple, ns: Namespace) -> list[Numbers]:
+        angles, real, _ = posture_at(point, bends, geometry, ns)
+        pose = pose_of(*arms_at(angles, geometry, ns), point, geometry)
+        return list(_or_nan(real, (conditioning_of(velocity(pose), ns),), ns))
+
+    return by_rows(text, finite_points("position", position))[0]
+
+
+def reachable(
+    position: ArrayLike, bends: Triple = (1.0, 1.0, 1.0), geometry: AnyDelta = IRB_360
+) -> BoolArray:
+    """Return whether points (..., 3) m have a posture in a working mode, as (...,)."""
+    slot = WORKING_MODES.index(bends)
+    there: BoolArray = inverse_all(position, geometry)[..., slot, 0] < 4.0
+    return there
+
+
+def no_posture(point: Vector, geometry: DeltaGeometry) -> UnreachableError:
+    """Explain which leg does not reach a point (3) m, and by how much."""
+    g, margins = geometry, []
+    for leg in (ONE, TWO, THREE):
+        level, out, up = inwards(leg, point)
+        in_plane, rod = math.hypot(level + g.l2 - g.l1, up), math.sqrt(max(g.l4**2 - out**2, 0.0))
+        margins.append(min(g.l3 + rod - in_plane, in_plane - abs(g.l3 - rod), g.l4 - abs(out)))
+    worst = margins.index(min(margins))
+    hint = "choose a point of its workspace (tpm_gym.mechanism.delta.kinematics.reachable)"
+    return UnreachableError(point, f"leg {worst + 1}", margins[worst], hint)
+
+
+def no_assembly(
+    theta: Vector, side: float, geometry: DeltaGeometry
+) -> UnreachableError | SingularityError:
+    """Explain why the Delta cannot be assembled at theta (3) rad, or has no velocity."""
+    with np.errstate(all="ignore"):
+        cos, sin = arms_at(tuple(map(np.float64, theta)), geometry, NUMPY)
+        position, real, height2 = assembly_at(cos, sin, side, geometry, NUMPY)
+    if not real:
+        part, hint = "three spheres about the elbows", "choose joint angles within reach"
+        margin = float(height2) / geometry.l4
+        return UnreachableError(theta, part, margin if margin < 0 else 0.0, hint)
+    pose = pose_of(cos, sin, position, geometry)
+    if not regular(pose, geometry):
+        return SingularityError("det A (the rods are coplanar)", float(pose.parallel))
+    return UnreachableError(theta, "working mode", 0.0, "choose joint angles of the working mode")
+
+
+def _or_nan(real: Numbers, values: tuple[Numbers, ...], ns: Namespace) -> tuple[Numbers, ...]:
+    return tuple(ns.where(real, value, float("nan")) for value in values)

@@ -1,0 +1,151 @@
+"""The Delta as a machine, with the lengths of ABB's IRB 360 or others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+from types import ModuleType
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tpm_gym.arrays import BoolArray, FloatArray, Vector
+from tpm_gym.errors import ConfigurationError, SingularityError, UnreachableError
+from tpm_gym.kinematics.equations import Triple
+from tpm_gym.kinematics.namespaces import NUMPY
+from tpm_gym.kinematics.workspace import Region
+from tpm_gym.mechanism.bodies import Mechanism
+from tpm_gym.mechanism.compiled import CompiledMachine
+from tpm_gym.mechanism.delta import bodies, equations, kinematics
+from tpm_gym.mechanism.delta.dynamics import DeltaDynamics
+from tpm_gym.mechanism.delta.geometry import (
+    ASSEMBLY_MODES,
+    ELBOWS_OUT,
+    IRB_360,
+    WORKING_MODES,
+    DeltaGeometry,
+)
+from tpm_gym.mechanism.machine import SAME_PLACE, register_machine
+from tpm_gym.mechanism.mount import Mount
+
+
+@dataclass(frozen=True, kw_only=True)
+class Delta(CompiledMachine):
+    """Delta with any lengths.
+
+    Attributes:
+        geometry: Lengths.
+        working_mode: For each leg, 1 if the elbow is out, and -1 if it is in.
+        assembly_mode: 1 if P is below the elbows, and -1 if it is above.
+    """
+
+    geometry: DeltaGeometry
+    working_mode: Triple = ELBOWS_OUT
+    assembly_mode: float = 1.0
+
+    def __post_init__(self) -> None:
+        """See :class:`Machine`."""
+        if not isinstance(self.geometry, DeltaGeometry):
+            raise ConfigurationError("geometry", self.geometry, "a DeltaGeometry")
+        if self.working_mode not in WORKING_MODES:
+            raise ConfigurationError("working_mode", self.working_mode, "three signs, 1 or -1")
+        if self.assembly_mode not in ASSEMBLY_MODES:
+            raise ConfigurationError("assembly_mode", self.assembly_mode, "1 or -1")
+        super().__post_init__()
+
+    def same_side(self, position: ArrayLike) -> BoolArray:
+        """See :class:`Machine`."""
+        points = np.ascontiguousarray(position, np.float64)
+        found = np.empty(points.shape[:-1], np.bool_)
+        self._loops.same_side(points.reshape(-1, 3), *self._own, found.reshape(-1))
+        return found
+
+    def unreachable(self, position: Vector) -> UnreachableError:
+        """See :class:`Machine`."""
+        return kinematics.no_posture(position, self.geometry)
+
+    def unassembled(self, theta: Vector) -> UnreachableError | SingularityError:
+        """See :class:`Machine`."""
+        return kinematics.no_assembly(theta, self.assembly_mode, self.geometry)
+
+    def _postures(self, points: FloatArray) -> tuple[FloatArray, NDArray[np.int8]]:
+        # By numpy: machines are made when the package is imported, which must not import Numba.
+        slot = WORKING_MODES.index(self.working_mode)
+        theta = kinematics.inverse_all(points, self.geometry)[..., slot, :]
+        lost = np.isnan(theta).any(axis=-1)
+        if lost.any():
+            x, y, z = points[lost][0].tolist()
+            raise self.unreachable((x, y, z))
+        side = ASSEMBLY_MODES.index(self.assembly_mode)
+        there = kinematics.forward_all(theta, self.geometry)[..., side, :]
+        left: NDArray[np.int8] = np.abs(there - points).max(axis=-1) > SAME_PLACE
+        return theta, left.astype(np.int8)
+
+    def built(
+        self, lengths: tuple[float, ...] = (), link_masses: tuple[float, ...] = ()
+    ) -> FloatArray:
+        """Return l1 to l5 (m) and the constants of the dynamics, (21,); see :class:`Machine`."""
+        machine = self.with_lengths(lengths) if lengths else self
+        found = bodies.inertia_of(machine.mechanism, machine.geometry, link_masses)
+        return np.concatenate([machine.geometry.lengths, *map(np.ravel, found)])
+
+    @cached_property
+    def _constants(self) -> FloatArray:
+        """Signs of the modes, and gravity, (7,); see :mod:`tpm_gym.mechanism.delta.rows`."""
+        return np.array([self.assembly_mode, *self.working_mode, *self.mount.free_fall])
+
+    @property
+    def _loops(self) -> ModuleType:
+        return _rows()
+
+    @cached_property
+    def mechanism(self) -> Mechanism:
+        """See :class:`Machine`."""
+        return bodies.build(self.geometry)
+
+    def joint_positions(self, theta: Vector) -> dict[str, float]:
+        """See :class:`Machine`."""
+        pose, real = equations.pose_at(
+            tuple(map(np.float64, theta)), self.assembly_mode, self.geometry, NUMPY
+        )
+        if not real:
+            raise self.unassembled(theta)
+        return bodies.joint_positions(pose, theta, self.geometry.l4)
+
+    @cached_property
+    def dynamics(self) -> DeltaDynamics:
+        """Torques, mass matrix and energy of the nominal machine with an empty cup."""
+        return DeltaDynamics(
+            geometry=self.geometry, side=self.assembly_mode, free_fall=self.mount.free_fall
+        )
+
+    @property
+    def lengths(self) -> tuple[float, ...]:
+        """l1 to l5, m."""
+        return self.geometry.lengths
+
+    def with_lengths(self, lengths: tuple[float, ...]) -> Delta:
+        """Return the machine with these l1 to l5, m."""
+        return replace(self, geometry=DeltaGeometry(*lengths))
+
+
+@cache
+def _rows() -> ModuleType:
+    from tpm_gym.mechanism.delta import rows  # imports Numba
+
+    return rows
+
+
+DELTA = Delta(
+    name="delta",
+    geometry=IRB_360,
+    mount=Mount(height=1.23),
+    # As large as the region of WIDE_TPM, in the middle of a workspace that is 1.6 m wide: with the
+    # step limit, an expert crosses it twice in an episode. The conditioning is 0.36 and more.
+    region=Region(low=(-0.20, -0.20, 0.86), high=(0.20, 0.20, 1.163)),
+    goal_region=Region(low=(-0.17, -0.17, 0.90), high=(0.17, 0.17, 1.16)),
+    home=(0.0, 0.0, 1.03),
+)
+"""Machine with the lengths of ABB's IRB 360, upside down over a table as the TPM."""
+
+register_machine("delta", DELTA)

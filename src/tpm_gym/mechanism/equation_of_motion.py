@@ -1,0 +1,178 @@
+"""The equation of motion of a mechanism in closed form, for points and batches.
+
+torque = M(theta) theta_ddot + C(theta, theta_dot) theta_dot + g(theta)
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from numpy.typing import ArrayLike
+
+from tpm_gym.arrays import FloatArray, Vector, finite, finite_points, is_tensor, numbers, vector
+from tpm_gym.errors import ConfigurationError, InputError, SingularityError, UnreachableError
+from tpm_gym.kinematics.equations import Triple
+from tpm_gym.kinematics.namespaces import Namespace, Numbers, by_rows, namespace_of
+from tpm_gym.mechanism.mount import GRAVITY
+
+_REST = (0.0, 0.0, 0.0)
+
+
+class Energy(NamedTuple):
+    """Kinetic and potential energy (...,), J; the latter up to a constant of the machine."""
+
+    kinetic: FloatArray
+    potential: FloatArray
+
+
+@dataclass(frozen=True, kw_only=True)
+class EquationOfMotion(ABC):
+    """The dynamics of one mechanism, for points and batches.
+
+    Joint angles (rad), rates (rad/s) and their changes (rad/s^2) are arrays (..., 3) that broadcast
+    with each other; torch tensors among them give tensors, in float64, that can be differentiated.
+
+    All methods raise InputError for inputs that are no arrays (..., 3) of finite numbers,
+    UnreachableError if the assembly mode does not exist at some theta, and SingularityError at a
+    parallel singularity.
+
+    Attributes:
+        link_masses: Factors of mass and inertia, one for each moving link, in the mechanism's
+            order; empty if all are 1.
+        payload: Mass that the cup carries, kg.
+        free_fall: Acceleration of gravity in the machine's frame, m/s^2.
+
+    Raises:
+        ConfigurationError: If a mass or gravity is not possible. If the number of factors is wrong,
+            at the first use.
+    """
+
+    link_masses: tuple[float, ...] = ()
+    payload: float = 0.0
+    free_fall: Vector = (0.0, 0.0, GRAVITY)
+
+    def __post_init__(self) -> None:
+        """Reject masses that are not possible."""
+        if finite("payload", self.payload, (), ConfigurationError) < 0:
+            raise ConfigurationError("payload", self.payload, "at least 0 kg")
+        factors = numbers("link_masses", self.link_masses, ConfigurationError)
+        if factors.ndim != 1 or not ((factors > 0) & (factors < math.inf)).all():
+            raise ConfigurationError("link_masses", self.link_masses, "positive factors")
+        vector("free_fall", self.free_fall, ConfigurationError)
+
+    def torque(self, theta: ArrayLike, theta_dot: ArrayLike, theta_ddot: ArrayLike) -> FloatArray:
+        """Compute the motors' torques (..., 3) N m, M theta_ddot + C theta_dot + g."""
+        states = {"theta": theta, "theta_dot": theta_dot, "theta_ddot": theta_ddot}
+
+        def results(pose: Any, rates: Triple, changes: Triple) -> list[Numbers]:
+            return [self._torques(pose, rates, changes, self.free_fall)]
+
+        return self._rows(results, states)[0]
+
+    def gravity(self, theta: ArrayLike) -> FloatArray:
+        """Compute the torques (..., 3) N m that hold the machine at rest."""
+        return self._rows(
+            lambda pose: [self._torques(pose, _REST, _REST, self.free_fall)], {"theta": theta}
+        )[0]
+
+    def mass_matrix(self, theta: ArrayLike) -> FloatArray:
+        """Compute the mass matrix M, (..., 3, 3) kg m^2, symmetric and positive."""
+        return self._rows(lambda pose: [_symmetric(self._masses(pose))], {"theta": theta})[0]
+
+    def coriolis(self, theta: ArrayLike, theta_dot: ArrayLike) -> FloatArray:
+        """Compute C (..., 3, 3) kg m^2/s from Christoffel's symbols, so that M' - 2 C is skew."""
+
+        def results(pose: Any, rates: Triple) -> list[Numbers]:
+            def quadratic(sign: float, k: int) -> Triple:
+                a, b, c = (u + sign * (i == k) for i, u in enumerate(rates))
+                return self._torques(pose, (a, b, c), _REST, _REST)
+
+            # For the part q(u) of the torques that is quadratic, q(u + e) - q(u - e) = 4 C(u) e
+            pairs = [(quadratic(1.0, k), quadratic(-1.0, k)) for k in range(3)]
+            return [
+                tuple(tuple((up[row] - down[row]) / 4 for up, down in pairs) for row in range(3))
+            ]
+
+        return self._rows(results, {"theta": theta, "theta_dot": theta_dot})[0]
+
+    def forward(self, theta: ArrayLike, theta_dot: ArrayLike, torque: ArrayLike) -> FloatArray:
+        """Compute accelerations (..., 3) rad/s^2 under the motors' torques (..., 3) N m."""
+
+        def results(pose: Any, rates: Triple, given: Triple) -> list[Numbers]:
+            bias = self._torques(pose, rates, _REST, self.free_fall)
+            rest = tuple(one - other for one, other in zip(given, bias, strict=True))
+            return [_symmetric(self._masses(pose)), rest]
+
+        states = {"theta": theta, "theta_dot": theta_dot, "torque": torque}
+        mass, rest = self._rows(results, states)
+        found: FloatArray = namespace_of(mass).solve(mass, rest)
+        return found
+
+    def energy(self, theta: ArrayLike, theta_dot: ArrayLike) -> Energy:
+        """Compute kinetic and potential energy, (...,) J."""
+
+        def results(pose: Any, rates: Triple) -> list[Numbers]:
+            pairs = zip(_symmetric(self._masses(pose)), rates, strict=True)
+            twice = sum(u * m * v for row, u in pairs for m, v in zip(row, rates, strict=True))
+            return [twice / 2, self._potential(pose)]
+
+        return Energy(*self._rows(results, {"theta": theta, "theta_dot": theta_dot}))
+
+    @abstractmethod
+    def _pose(self, theta: Triple, ns: Namespace) -> tuple[Any, Numbers, Numbers]:
+        """Assemble the mechanism; return whether it is real, and whether it is regular."""
+
+    @abstractmethod
+    def _torques(self, pose: Any, rates: Triple, changes: Triple, gravity: Triple) -> Triple:
+        """Compute the torques for rates, their changes and gravity."""
+
+    @abstractmethod
+    def _masses(self, pose: Any) -> tuple[Numbers, ...]:
+        """Compute the upper triangle of M, by rows."""
+
+    @abstractmethod
+    def _potential(self, pose: Any) -> Numbers:
+        """Compute the potential energy, J."""
+
+    @abstractmethod
+    def _refusal(self, theta: Vector) -> UnreachableError | SingularityError:
+        """Explain why there is no equation of motion at theta (3,) rad."""
+
+    def _rows(
+        self, text: Callable[..., Sequence[Numbers]], states: Mapping[str, ArrayLike]
+    ) -> list[FloatArray]:
+        """Apply the function ``text`` of a pose and triples to each row of the states."""
+
+        def results(values: tuple[Numbers, ...], ns: Namespace) -> list[Numbers]:
+            theta, *rest = (values[i : i + 3] for i in range(0, len(values), 3))
+            pose, real, regular = self._pose(theta, ns)
+            return [ns.where(real & regular, 0.0, 1.0), *text(pose, *rest)]
+
+        table = _side_by_side(states)
+        missing, *found = by_rows(results, table)
+        if missing.any():
+            a, b, c = table[..., :3][missing != 0][0].tolist()
+            raise self._refusal((a, b, c))
+        return found
+
+
+def _symmetric(upper: tuple[Numbers, ...]) -> tuple[Triple, Triple, Triple]:
+    a, b, c, d, e, f = upper
+    return (a, b, c), (b, d, e), (c, e, f)
+
+
+def _side_by_side(states: Mapping[str, ArrayLike]) -> FloatArray:
+    """Broadcast n arrays (..., 3) with each other, and join them to one (..., 3 n)."""
+    arrays = [finite_points(name, state) for name, state in states.items()]
+    like = next((array for array in arrays if is_tensor(array)), arrays[0])
+    try:
+        table: FloatArray = namespace_of(like).join(arrays)
+    except (ValueError, RuntimeError) as error:  # numpy's and torch's
+        shapes = [tuple(array.shape) for array in arrays]
+        valid = "of shapes (..., 3) that go together, by shape"
+        raise InputError(", ".join(states), shapes, valid) from error
+    return table

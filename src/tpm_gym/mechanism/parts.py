@@ -1,0 +1,73 @@
+"""Arms, rods and motors of which mechanisms are built: their sizes and materials."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+
+from tpm_gym.arrays import Vector
+from tpm_gym.mechanism.bodies import ALUMINIUM, LEVEL, STEEL, Joint, Solid
+from tpm_gym.mechanism.motor import TORQUE_MOTOR
+
+CARBON_FIBRE = 1600.0  # kg/m^3
+
+# Largest angles of an arm from level outwards, towards the base and towards the platform.
+ARM_RAISED, ARM_LOWERED = np.deg2rad(75.0), np.deg2rad(115.0)
+
+
+def displaced(axis: str, value: float, centre: Vector = (0.0, 0.0, 0.0)) -> Vector:
+    """Displace ``centre`` by ``value`` along ``axis``."""
+    x, y, z = (c + value if name == axis else c for name, c in zip("xyz", centre, strict=True))
+    return x, y, z
+
+
+def tube(axis: Literal["x", "y"], length: float, height: float, width: float, wall: float) -> Solid:
+    """Build a rectangular aluminium tube from the link's origin along ``axis``."""
+    outer = (length, width, height) if axis == "x" else (width, length, height)
+    inner, low = width - 2 * wall, height - 2 * wall
+    bore = (length, inner, low) if axis == "x" else (inner, length, low)
+    return Solid("box", outer, displaced(axis, length / 2), ALUMINIUM, bore=bore, colour="orange")
+
+
+def bar(
+    axis: Literal["x", "y", "z"],
+    half: float,
+    radius: float = 0.008,
+    centre: Vector = (0.0, 0.0, 0.0),
+    colour: str = "steel",
+    density: float = ALUMINIUM,
+) -> Solid:
+    """Build a round solid bar of half length ``half`` about ``centre``."""
+    return Solid("cylinder", (radius, 2 * half, 0.0), centre, density, axis=axis, colour=colour)
+
+
+def rod(axis: Literal["x", "y"], length: float) -> tuple[Solid, ...]:
+    """Build a carbon-fibre tube, 16 mm by 1.5 mm, with a steel rod end at both ends."""
+    fibre = bar(axis, length / 2, 0.008, displaced(axis, length / 2), "carbon", CARBON_FIBRE)
+    ends = (
+        bar(axis, 0.008, 0.009, displaced(axis, at), density=STEEL)
+        for at in (0.008, length - 0.008)
+    )
+    return (replace(fibre, bore=(0.0065, length, 0.0)), *ends)
+
+
+def motor(
+    name: str, axis: Vector, origin: Vector, level: float, sense: int, rpy: Vector = LEVEL
+) -> Joint:
+    """Build a motor. At theta = ``level`` its arm points outwards; ``sense`` of theta lowers it."""
+    lower, upper = sorted((level - sense * ARM_RAISED, level + sense * ARM_LOWERED))
+    line = TORQUE_MOTOR.peak_torque, TORQUE_MOTOR.no_load_speed, TORQUE_MOTOR.corner_speed
+    return Joint(name, "revolute", "base", origin, axis, lower, upper, *line, rpy)
+
+
+def arm(axis: Literal["x", "y"], across: Literal["x", "y"], length: float) -> tuple[Solid, ...]:
+    """Build an actuated arm: motor's shaft and rotor, rectangular tube, elbow bar across."""
+    shaft = bar(across, TORQUE_MOTOR.reach, 0.022, density=STEEL)
+    return (
+        shaft,
+        *TORQUE_MOTOR.rotor(across),
+        tube(axis, length, 0.045, 0.030, 0.003),
+        bar(across, 0.02, 0.015, displaced(axis, length)),
+    )
