@@ -59,6 +59,7 @@ def test_every_randomisation_and_drive_runs(engine):
     for seed in range(2):
         for _, _, info in expert_episode(env, seed):
             assert info["closure_error"] < 0.06e-3
+        _, info = env.reset(seed=seed)
         assert len(info["randomisation"]["length_errors"]) == len(DELTA.lengths) == 5
         assert len(info["randomisation"]["link_masses"]) == len(DELTA.mechanism.links) - 1
 
