@@ -18,7 +18,8 @@ import numpy as np
 import tpm_gym
 from tpm_gym.arrays import FloatArray
 from tpm_gym.simulation.state import State
-from tpm_gym.tasks import Entry, PickAndPlace, hanging, rewards, sampling
+from tpm_gym.tasks import Entry, PickAndPlace, hanging, sampling
+from tpm_gym.tasks.task import dense
 
 FARTHEST = 0.100  # largest distance from start to goal, m
 FAST = 0.15  # speed without a penalty, m/s
@@ -40,14 +41,13 @@ class Shove(PickAndPlace):
     ) -> dict[str, FloatArray]:
         """Both on the table, APART to FARTHEST from each other."""
         table, machine = self.on_table(self.block), self.machine
-        first = machine.sample(rngs, [table] * len(rngs))
-        last = first.copy()
+        first, last = np.empty((2, len(rngs), 3))
         rows = np.arange(len(rngs))
         while len(rows):
             own = [rngs[row] for row in rows]
-            last[rows] = machine.sample(own, [table] * len(own))
-            way = rewards.distance(first, last)
-            rows = np.flatnonzero((way < sampling.APART) | (way > FARTHEST))
+            ends = sampling.safe_points(own, machine, {"first": [table], "last": [table]}, {})
+            first[rows], last[rows] = ends["first"], ends["last"]
+            rows = np.flatnonzero(self.gap(first, last) > FARTHEST)
         offset, to_world = hanging(self.block), machine.mount.to_world
         drawn = {"object": to_world(first) - offset, "goal": to_world(last) - offset}
         return {**drawn, **chosen}
@@ -59,9 +59,9 @@ class Shove(PickAndPlace):
     def shaping(self, state: State) -> dict[str, FloatArray]:
         """Return minus the distance from lip to block, and the penalty on speed."""
         speed = np.linalg.norm(state.object_velocity[:, 0], axis=-1)
-        away = rewards.distance(self.lip(state), state.object_position[:, 0])
+        away = self.gap(self.lip(state), state.object_position[:, 0])
         return {
-            "approach": 0.25 * rewards.dense(away),
+            "approach": 0.25 * dense(away),
             "haste": -self.haste * np.maximum(speed - FAST, 0.0),
         }
 

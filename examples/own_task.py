@@ -24,9 +24,10 @@ class Land(Task):
         """Draw a goal for each episode, (r, 3) m in the world frame."""
         x, y, _ = zip(self.machine.goal_region.low, self.machine.goal_region.high, strict=True)
         z = self.machine.goal_region.high[2]  # the machine's z points down
-        level = [Region(low=(x[0], y[0], z), high=(x[1], y[1], z))] * len(rngs)
-        points = sampling.apart_from(self.machine.home, rngs, self.machine, level)
-        return {"goal": self.machine.mount.to_world(points), **chosen}
+        regions = {"goal": [Region(low=(x[0], y[0], z), high=(x[1], y[1], z))]}
+        known = {"home": self.machine.home}  # the goal is apart from it
+        points = sampling.safe_points(rngs, self.machine, regions, known)
+        return {"goal": self.machine.mount.to_world(points["goal"]), **chosen}
 
     def shaping(self, state):
         """Return the cost of sideways speed near the level of the goals, (n,)."""

@@ -171,9 +171,18 @@ def rms(torque: Tensor) -> Tensor:
 def draw(machine: TPM, count: int, seed: int = 0) -> list[Carry]:
     """Sample places as the task does: safe ones on the table, not too near to each other."""
     rng, table = np.random.default_rng(seed), PickAndPlace(machine).on_table(BLOCK)
+    low, high = np.array(table.low), np.array(table.high)
+
+    def place() -> FloatArray:
+        while True:
+            point = low + (high - low) * rng.random(3)
+            if machine.conditioning_at(point) >= machine.safe_conditioning:
+                return point
+
     carries = []
     for _ in range(count):
-        (first,) = machine.sample([rng], [table])
-        (last,) = sampling.apart_from(first, [rng], machine, [table])
+        first, last = place(), place()
+        while np.linalg.norm(last - first) < sampling.APART:
+            last = place()
         carries.append(Carry(machine, first, last))
     return carries

@@ -28,24 +28,17 @@ class Sort(Task):
         self, rngs: Sequence[np.random.Generator], chosen: Mapping[str, FloatArray]
     ) -> dict[str, FloatArray]:
         """Blocks and goals stand on the table, apart from each other."""
-        mount, count = self.machine.mount, len(rngs)
-        wanted = {"red": (self.red,), "blue": (self.blue,), "goal": (self.red, self.blue)}
-        start, taken = (
-            dict(chosen),
-            [place[:, k : k + 3] for place in chosen.values() for k in range(0, place.shape[1], 3)],
-        )
-        for name, blocks in wanted.items():
-            if name in chosen:
-                continue
-            places = []
-            for block in blocks:
-                others = np.reshape([place + hanging(block) for place in taken], (-1, count, 3))
-                near, tables = mount.to_paper(others.swapaxes(0, 1)), [self.on_table(block)] * count
-                points = sampling.apart_from(near, rngs, self.machine, tables, APART)
-                places.append(mount.to_world(points) - hanging(block))
-                taken.append(places[-1])
-            start[name] = np.concatenate(places, axis=1)
-        return start
+        mount = self.machine.mount
+        blocks = {"red": self.red, "blue": self.blue, "goal_red": self.red, "goal_blue": self.blue}
+        parts = dict(chosen)
+        if "goal" in parts:
+            parts["goal_red"], parts["goal_blue"] = np.split(parts.pop("goal"), 2, axis=1)
+        known = {name: mount.to_paper(parts[name] + hanging(blocks[name])) for name in parts}
+        tables = {name: [self.on_table(block)] for name, block in blocks.items()}
+        points = sampling.safe_points(rngs, self.machine, tables, known, APART)
+        places = {name: mount.to_world(points[name]) - hanging(blocks[name]) for name in blocks}
+        goal = np.concatenate([places.pop("goal_red"), places.pop("goal_blue")], axis=1)
+        return {**places, "goal": goal, **chosen}
 
     def gap(self, achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
         """That of the block that is farther from its place."""

@@ -116,5 +116,5 @@ def test_where_there_is_no_room_sampling_says_so(sorting):
             with patch.object(sorting, "APART", 0.5):
                 return super().sample(rngs, chosen)
 
-    with pytest.raises(ConfigurationError, match="a larger one: what is drawn lies"):
+    with pytest.raises(ConfigurationError, match=r"0\.5 m from red, blue"):
         tpm_gym.TPMEnv(Crowd)

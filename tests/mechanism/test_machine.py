@@ -250,22 +250,6 @@ def test_the_first_row_without_a_solution_is_explained():
         PAPER_TPM.joint_positions(apart)
 
 
-def test_sampling_keeps_to_the_safe_part_and_says_where_there_is_none():
-    regions = [PAPER_TPM.region, PAPER_TPM.goal_region] * 50
-
-    def generators():
-        return [np.random.default_rng(seed) for seed in range(100)]
-
-    points = PAPER_TPM.sample(generators(), regions)
-    assert all(region.contains(point) for region, point in zip(regions, points, strict=True))
-    assert PAPER_TPM.conditioning_at(points).min() >= PAPER_TPM.safe_conditioning
-    alone = [PAPER_TPM.sample([rng], [r])[0] for rng, r in zip(generators(), regions, strict=True)]
-    np.testing.assert_array_equal(points, alone)
-    strict = replace(PAPER_TPM, safe_conditioning=0.9)
-    with pytest.raises(ConfigurationError, match="safe_conditioning"):
-        strict.sample(generators()[:1], [strict.region])
-
-
 # -- other machines --------------------------------------------------------------------------------
 
 

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.tpm import PAPER_TPM, WIDE_TPM
 from tpm_gym.tasks import PickAndPlace, Reach, Task
 from tpm_gym.tasks.push import Push
-from tpm_gym.tasks.sampling import APART, BAND, line_in_joints
+from tpm_gym.tasks.sampling import APART, BAND, line_in_joints, safe_points
 
 SAFE = PAPER_TPM.safe_conditioning
 BLOCK = PickAndPlace.block
@@ -60,6 +61,25 @@ def test_sampled_ends_are_safe_apart_and_spread(kind, machine):
         assert 0.4 < on_table.mean() < 0.6
         assert height[~on_table].min() > 0.02
         assert (np.ptp(starts[:, :2], axis=0) > 0.8 * edges[:2]).all()
+
+
+def test_points_are_drawn_by_the_rows_own_generator_and_apart_from_all_others() -> None:
+    regions = {name: [PAPER_TPM.region, PAPER_TPM.goal_region] for name in "abc"}
+    low, high = PAPER_TPM.region.low, PAPER_TPM.region.high
+    known = {"b": np.random.default_rng(1).uniform(low, high, (100, 3))}
+
+    def drawn(seeds: range) -> dict[str, FloatArray]:
+        rngs = [np.random.default_rng(seed) for seed in seeds]
+        own = {name: points[seeds] for name, points in known.items()}
+        return safe_points(rngs, PAPER_TPM, regions, own, 0.1)
+
+    together = drawn(range(100))
+    np.testing.assert_array_equal(together["b"], known["b"])
+    for first, second in combinations(together.values(), 2):
+        assert np.linalg.norm(first - second, axis=1).min() >= 0.1
+    for row in range(100):
+        for name, points in drawn(range(row, row + 1)).items():
+            np.testing.assert_array_equal(points[0], together[name][row])
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -125,9 +145,8 @@ def test_machines_on_which_nothing_can_be_drawn_are_told_instead_of_searched_for
     with pytest.raises(ConfigurationError) as caught:
         Reach(replace(PAPER_TPM, goal_region=Region(home, home))).start(rngs)
     assert caught.value.name == "goal_region"
-    with pytest.raises(ConfigurationError) as caught:
+    with pytest.raises(ConfigurationError, match=r"points of conditioning 0\.9"):
         Reach(replace(PAPER_TPM, safe_conditioning=0.9)).start(rngs)
-    assert caught.value.name == "safe_conditioning"
 
 
 def test_a_place_from_which_no_block_can_be_pushed_is_refused_by_its_name():

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -39,7 +39,6 @@ from tpm_gym.mechanism.mount import Mount
 MODES: Final = (None, "assembly", "working")
 """Names of the numbers of :meth:`Machine.mode_left`."""
 
-_ATTEMPTS = 1000
 SAME_PLACE: Final = 1e-6
 """Largest distance between equal positions, m; far below the distance between assembly modes at a
 safe conditioning."""
@@ -288,26 +287,6 @@ class Machine(ABC):
         found = self.evaluate(theta).conditioning
         known: FloatArray = np.where(np.isnan(found), 0.0, found)
         return known
-
-    def sample(self, rngs: Sequence[np.random.Generator], regions: Sequence[Region]) -> FloatArray:
-        """Draw a point (r, 3) m for each of r generators, uniform over the safe part of its region.
-
-        Each generator draws for its own row only: a row has the same values alone and among many.
-
-        Raises:
-            ConfigurationError: If no draw for a region was safe.
-        """
-        ends = np.array([region.low + region.high for region in regions])
-        low, high = ends[:, :3], ends[:, 3:]
-        points, rows = np.empty(low.shape), np.arange(len(rngs))
-        for _ in range(_ATTEMPTS):
-            drawn = np.array([rngs[row].random(3) for row in rows.tolist()])
-            points[rows] = low[rows] + (high[rows] - low[rows]) * drawn
-            rows = rows[self.conditioning_at(points[rows]) < self.safe_conditioning]
-            if not len(rows):
-                return points
-        valid = f"a value that some point of {regions[rows[0]]} reaches"
-        raise ConfigurationError("safe_conditioning", self.safe_conditioning, valid)
 
     # -- bodies -----------------------------------------------------------------------------
 

@@ -39,32 +39,23 @@ class PickAndPlace(Task):
         self, rngs: Sequence[np.random.Generator], chosen: Mapping[str, FloatArray]
     ) -> dict[str, FloatArray]:
         """See the base class."""
-        machine, offset, starts = self.machine, hanging(self.block), dict(chosen)
-        to_p, from_p = machine.mount.to_paper, machine.mount.to_world
-        table, _ = self._regions
+        machine, offset, regions = self.machine, hanging(self.block), self._regions
         if self.goals == "tempting":
-            pairs = sampling.tempting(rngs, machine, table, self._draw_region)
-            first, last = (from_p(points) - offset for points in pairs)
-            return {"object": first, "goal": last, **starts}
-        if "object" not in starts:
-            starts["object"] = from_p(machine.sample(rngs, [table] * len(rngs))) - offset
-        if "goal" not in starts:
-            begin = to_p(starts["object"] + offset)[:, None]
-            regions = [self._draw_region(rng) for rng in rngs]
-            starts["goal"] = from_p(sampling.apart_from(begin, rngs, machine, regions)) - offset
-        return starts
-
-    def _draw_region(self, rng: np.random.Generator) -> Region:
-        """Draw the region of a goal: half on the table, half in the air."""
-        table, air = self._regions
-        return table if rng.random() < 0.5 else air
+            ends = sampling.tempting(rngs, machine, regions["object"][0], regions["goal"])
+            points = dict(zip(regions, ends, strict=True))
+        else:
+            known = {name: machine.mount.to_paper(place + offset) for name, place in chosen.items()}
+            points = sampling.safe_points(rngs, machine, regions, known)
+        places = {name: machine.mount.to_world(point) - offset for name, point in points.items()}
+        return places | dict(chosen)
 
     @cached_property
-    def _regions(self) -> tuple[Region, Region]:
-        """Regions of P with the block in the cup: on the table, in the air."""
+    def _regions(self) -> dict[str, list[Region]]:
+        """Regions of P with the block in the cup, at the start and at the goal."""
         table = self.on_table(self.block)
         x, y, level = table.high
-        return table, Region(self.machine.goal_region.low, (x, y, level - sampling.APART))
+        air = Region(self.machine.goal_region.low, (x, y, level - sampling.APART))
+        return {"object": [table], "goal": [table, air]}
 
     def shaping(self, state: State) -> dict[str, FloatArray]:
         """Return minus half the distance from cup to block, for a dense reward only."""

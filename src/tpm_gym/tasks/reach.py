@@ -26,13 +26,14 @@ class Reach(Task):
         self, rngs: Sequence[np.random.Generator], chosen: Mapping[str, FloatArray]
     ) -> dict[str, FloatArray]:
         """See the base class."""
-        machine, home, region = self.machine, self.machine.home, self.machine.goal_region
+        machine, home, regions = self.machine, self.machine.home, [self.machine.goal_region]
         if "goal" in chosen:
             return dict(chosen)
         if self.goals == "tempting":
-            _, goals = sampling.tempting(rngs, machine, home, lambda _: region)
+            _, goals = sampling.tempting(rngs, machine, home, regions)
         else:
-            goals = sampling.apart_from(home, rngs, machine, [region] * len(rngs))
+            drawn = sampling.safe_points(rngs, machine, {"goal": regions}, {"home": home})
+            goals = drawn["goal"]
         return {"goal": machine.mount.to_world(goals)}
 
     def plan(self, motion: Motion) -> Iterator[Move]:

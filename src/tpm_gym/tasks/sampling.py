@@ -13,7 +13,8 @@ each row, and a row draws from its own generator only.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -27,9 +28,9 @@ from tpm_gym.mechanism.machine import Machine
 __all__ = [
     "APART",
     "BAND",
-    "apart_from",
     "at_threshold",
     "line_in_joints",
+    "safe_points",
     "tempting",
 ]
 
@@ -38,50 +39,88 @@ APART: Final = 0.030
 BAND: Final = 0.004
 """Largest excess of a tempting end's conditioning over the threshold; less than 1 mm of y."""
 
-_BATCH: Final = 256
+_DRAWS: Final = 4  # points a call, so that nearly every row needs one call only
+_BATCH: Final = 256  # near the singularity, where one point of some 30 fits
 _ATTEMPTS: Final = 100
 _FRACTIONS: Final = np.linspace(0.0, 1.0, 33)
 
 
-def apart_from(
-    others: ArrayLike,
+def safe_points(
     rngs: Sequence[np.random.Generator],
     machine: Machine,
-    regions: Sequence[Region],
+    regions: Mapping[str, Sequence[Region]],
+    known: Mapping[str, ArrayLike],
     apart: float = APART,
     near_singularity: bool = False,
-) -> FloatArray:
-    """Draw safe points (r, 3) of regions, at least ``apart`` (m) from other points.
+) -> dict[str, FloatArray]:
+    """Draw safe points of regions, by name, at least ``apart`` (m) from each other.
 
     Args:
-        others: Other points, (k, 3) m for all rows, or (r, k, 3).
-        rngs: One for each row.
+        rngs: One for each of r rows.
         machine: Machine that defines the safe points.
-        regions: One for each row.
+        regions: For each name, the equally likely regions of its point.
+        known: Points (3,) or (r, 3) m that are not drawn, by name.
         apart: Smallest distance, m.
         near_singularity: Whether the points are just above the threshold.
 
+    Returns:
+        The known and the drawn points, (r, 3) m each.
+
     Raises:
-        ConfigurationError: If no draw is far enough.
+        ConfigurationError: If no draw is safe and far enough.
     """
-    draw = _one_at_threshold if near_singularity else Machine.sample
-    points = draw(machine, rngs, regions)
+    names = [*known, *(name for name in regions if name not in known)]
+    first, rows = len(known), np.arange(len(rngs))
+    points = np.empty((len(rngs), len(names), 3))
+    for index, point in enumerate(known.values()):
+        points[:, index] = point
+    boxes = [np.array([(box.low, box.high) for box in regions[name]]) for name in names[first:]]
+    least, most = _limits(machine, near_singularity)
+    draws = _BATCH if near_singularity else _DRAWS
     for _ in range(_ATTEMPTS):
-        gap = np.subtract(points[:, None], others)
-        near = (gap * gap).sum(axis=-1) < apart * apart  # faster than linalg.norm
-        rows = np.flatnonzero(near.any(axis=1)).tolist()
-        if not rows:
-            return points
-        points[rows] = draw(machine, [rngs[k] for k in rows], [regions[k] for k in rows])
-    valid = f"a larger one: what is drawn lies {apart} m from the start, or from other objects"
-    raise ConfigurationError("goal_region", regions[rows[0]], valid)
+        drawn = _drawn([rngs[row] for row in rows.tolist()], boxes, draws)
+        conditioning = machine.conditioning_at(drawn)
+        safe = (conditioning >= least) & (conditioning < most)
+        found = np.ones(len(rows), dtype=np.bool_)
+        for index in range(len(boxes)):
+            gap = drawn[:, index, :, None] - points[rows, None, : first + index]
+            fits = safe[:, index] & ((gap * gap).sum(axis=-1) >= apart * apart).all(axis=-1)
+            points[rows, first + index] = drawn[np.arange(len(rows)), index, fits.argmax(axis=1)]
+            found &= fits.any(axis=1)
+        rows = rows[~found]
+        if not len(rows):
+            return dict(zip(names, points.swapaxes(0, 1), strict=True))
+    valid = f"with points of conditioning {least} to {most}, {apart} m from {', '.join(names)}"
+    raise ConfigurationError("goal_region", dict(regions), valid)
+
+
+def _drawn(
+    rngs: Sequence[np.random.Generator], boxes: Sequence[FloatArray], count: int
+) -> FloatArray:
+    """Draw points (r, k, count, 3), all k in one of the boxes (c, 2, 3) of their own."""
+    # One call for each generator, because a call takes longer than the numbers.
+    shares = np.empty((len(rngs), len(boxes), count, 4))
+    for rng, own in zip(rngs, shares, strict=True):
+        rng.random(out=own)
+    ends = np.empty((len(rngs), len(boxes), 2, 1, 3))
+    for index, box in enumerate(boxes):
+        ends[:, index, :, 0] = box[(shares[:, index, 0, 3] * len(box)).astype(np.int64)]
+    low, high = ends[:, :, 0], ends[:, :, 1]
+    points: FloatArray = low + (high - low) * shares[..., :3]
+    return points
+
+
+def _limits(machine: Machine, near_singularity: bool) -> tuple[float, float]:
+    """Return the lowest conditioning of points, and the one below which it lies."""
+    safe = machine.safe_conditioning
+    return safe, safe + BAND if near_singularity else math.inf
 
 
 def tempting(
     rngs: Sequence[np.random.Generator],
     machine: Machine,
     start: Region | Vector,
-    goal: Callable[[np.random.Generator], Region],
+    goals: Sequence[Region],
 ) -> tuple[FloatArray, FloatArray]:
     """Draw tempting pairs of starts and goals, (r, 3) each.
 
@@ -89,12 +128,12 @@ def tempting(
         rngs: One for each row.
         machine: The machine.
         start: Region of the starts, or the start itself.
-        goal: Function that draws the region of a goal.
+        goals: Equally likely regions of the goals.
 
     Raises:
         ConfigurationError: If no pair was found; not every machine has tempting pairs.
     """
-    pairs = np.array([_tempting(rng, machine, start, goal) for rng in rngs])
+    pairs = np.array([_tempting(rng, machine, start, goals) for rng in rngs])
     return pairs[:, 0], pairs[:, 1]
 
 
@@ -102,17 +141,17 @@ def _tempting(
     rng: np.random.Generator,
     machine: Machine,
     start: Region | Vector,
-    goal: Callable[[np.random.Generator], Region],
+    goals: Sequence[Region],
 ) -> tuple[FloatArray, FloatArray]:
     """Draw one tempting pair, (3,) each."""
     for _ in range(_ATTEMPTS):
-        goals = _at_the_threshold(rng, machine, goal(rng))  # (n, 3)
+        ends = _at_the_threshold(rng, machine, goals[rng.integers(len(goals))])  # (n, 3)
         starts = (
             _at_the_threshold(rng, machine, start)
             if isinstance(start, Region)
-            else np.tile(start, (len(goals), 1))
+            else np.tile(start, (len(ends), 1))
         )
-        for first, last in zip(starts, goals, strict=False):
+        for first, last in zip(starts, ends, strict=False):
             apart = np.linalg.norm(first - last, axis=-1) >= APART
             if apart and (line_in_joints(machine, first, last) < machine.safe_conditioning).any():
                 return first, last
@@ -147,16 +186,9 @@ def at_threshold(
     raise ConfigurationError("goals", "tempting", valid)
 
 
-def _one_at_threshold(
-    machine: Machine, rngs: Sequence[np.random.Generator], regions: Sequence[Region]
-) -> FloatArray:
-    draws = zip(rngs, regions, strict=True)
-    return np.array([at_threshold(rng, machine, region, 1)[0] for rng, region in draws])
-
-
 def _at_the_threshold(rng: np.random.Generator, machine: Machine, region: Region) -> FloatArray:
     """Draw points from ``region``, and return those just above the threshold, (n, 3)."""
     points = rng.uniform(region.low, region.high, (_BATCH, 3))
-    conditioning, safe = machine.conditioning_at(points), machine.safe_conditioning
-    chosen: FloatArray = points[(conditioning >= safe) & (conditioning < safe + BAND)]
+    conditioning, (low, high) = machine.conditioning_at(points), _limits(machine, True)
+    chosen: FloatArray = points[(conditioning >= low) & (conditioning < high)]
     return chosen

@@ -46,19 +46,15 @@ class Stack(Task):
         self, rngs: Sequence[np.random.Generator], chosen: Mapping[str, FloatArray]
     ) -> dict[str, FloatArray]:
         """See the base class."""
-        mount, count, starts = self.machine.mount, len(rngs), dict(chosen)
-        for name, block in (("lower", self.lower), ("upper", self.upper), ("goal", self.lower)):
-            if name not in starts:
-                others = [place[:, :3] + hanging(block) for place in starts.values()]
-                taken = mount.to_paper(np.reshape(others, (-1, count, 3)).swapaxes(0, 1))
-                tables = [self.on_table(block)] * count
-                points = sampling.apart_from(
-                    taken, rngs, self.machine, tables, APART, self.goals == "tempting"
-                )
-                places = mount.to_world(points) - hanging(block)
-                both = np.concatenate([places, places + self.tower], axis=1)
-                starts[name] = both if name == "goal" else places
-        return starts
+        mount, offset = self.machine.mount, hanging(self.lower)
+        known = {name: mount.to_paper(place[:, :3] + offset) for name, place in chosen.items()}
+        regions = {name: [self.on_table(self.lower)] for name in ("lower", "upper", "goal")}
+        points = sampling.safe_points(
+            rngs, self.machine, regions, known, APART, self.goals == "tempting"
+        )
+        places = {name: mount.to_world(point) - offset for name, point in points.items()}
+        goal = np.concatenate([places["goal"], places["goal"] + self.tower], axis=1)
+        return {**places, "goal": goal, **chosen}
 
     def gap(self, achieved: ArrayLike, desired: ArrayLike) -> FloatArray:
         """Return the larger distance of the two blocks to their goals, (...,) m."""

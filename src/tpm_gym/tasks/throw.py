@@ -69,7 +69,8 @@ class Throw(Task):
         """See the base class."""
         starts = dict(chosen)
         if "object" not in starts:
-            points = self.machine.sample(rngs, [self.on_table(self.block)] * len(rngs))
+            table = {"object": [self.on_table(self.block)]}
+            points = sampling.safe_points(rngs, self.machine, table, {})["object"]
             starts["object"] = self.machine.mount.to_world(points) - hanging(self.block)
         if "goal" not in starts:
             starts["goal"] = np.array([self._draw_goal(rng) for rng in rngs])
