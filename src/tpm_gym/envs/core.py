@@ -199,10 +199,10 @@ class Core:
         simulation = self.simulation
         commands = self.control.command(actions[:, :3], simulation.commands)
         vacuum = actions[:, 3] > 0 if self.task.vacuum else np.zeros(self.count, dtype=np.bool_)
-        state, self._state = self._state, None  # None until the step has succeeded
+        self._state = None
         noisy = self.randomisation.encoder_noise > 0
         simulation.move(commands, vacuum, self._noise(running) if noisy else None)
-        self._state, self._pending = state, late
+        self._pending = late
 
     def report(self, rows: IntArray | None = None) -> Report:
         """Read the state, and return observation, reward and info of all or of some environments.

@@ -29,6 +29,7 @@ __all__ = [
     "in_world",
     "limited",
     "measured",
+    "normalise",
     "servo_torque",
     "servo_torques",
     "shifted",
@@ -197,6 +198,14 @@ def measured(
             own[9], own[10] = axes[row, item, 0], axes[row, item, 1]
             own[11] = vacuum[row] / most if held[row] == item else 0.0
     return values
+
+
+@kept
+def normalise(values: FloatArray, centre: FloatArray, scale: FloatArray) -> None:
+    """Replace values (n, k) by (values - centre) / scale, for centre and scale (k,)."""
+    for row in range(len(values)):
+        for k in range(len(centre)):
+            values[row, k] = (values[row, k] - centre[k]) / scale[k]
 
 
 @kept

@@ -131,7 +131,7 @@ class Simulation:
         self._conditioning = np.zeros(count)
         self._mode_left = np.zeros(count, dtype=np.int8)
         self._belt_speed = np.zeros(count)
-        self._readout: Readout
+        self._last: Readout | None = None  # None until the engine is read after a move or reset
 
     def reset(
         self,
@@ -180,16 +180,17 @@ class Simulation:
             self._belt_speed[rows] = finite("belt_speed", speeds, (len(rows),))
             self.engine.set_belt(rows, self._belt_speed[rows])
         self.engine.place(rows, true, placed)
-        # The machine may own these arrays, so they are copied before they are changed.
-        self._position, self._jacobian = self._position.copy(), self._jacobian.copy()
-        self._conditioning = self._conditioning.copy()
-        self._position[rows], self._jacobian[rows] = reading.position, reading.jacobian
-        self._conditioning[rows] = reading.conditioning
         self._commands[rows] = reading.position
         self._bias[rows], self._mode_left[rows] = bias, 0
         self._noise[rows] = 0.0 if noise is None else noise[:, None]
         self._disturbed = bool(self._bias.any() or self._noise.any())
-        self._read(rows if self._disturbed else None)  # undisturbed readings are known already
+        if self._disturbed:  # then the first reading may have no assembly
+            columns = self._position, self._jacobian, self._conditioning
+            # The machine may own these arrays, so they are copied before they are changed.
+            self._position, self._jacobian, self._conditioning = map(np.copy, columns)
+            self._position[rows], self._jacobian[rows] = reading.position, reading.jacobian
+            self._conditioning[rows] = reading.conditioning
+        self._last = None
 
     def _built(self, plants: Sequence[Plant]) -> FloatArray:
         """Return the machine parameters (r, k) for the true lengths of the plants."""
@@ -231,8 +232,9 @@ class Simulation:
         Raises:
             UnreachableError: If a command is out of reach; no robot has moved then.
             JointLimitError: If a motor would be beyond a stop; no robot has moved then.
-            ClosureError: If a loop opened.
+            ClosureError: If a loop had opened before; see :meth:`state`.
         """
+        self._read()
         if not self.loops.all_within(commands, *self._region):
             # The spline ends before the command, so that the path may not raise the error.
             self.machine.reach(commands)
@@ -246,46 +248,49 @@ class Simulation:
             self._noise[:, 0] = self._noise[:, 1]
             self._noise[:, 1] = 0.0 if noise is None else noise
             self._disturbed = bool(self._bias.any() or self._noise.any())
-        self._read(slice(None))
+        self._last = None
 
     @property
     def mode_left(self) -> NDArray[np.int8]:
         """Mode that each robot left in this episode, (n,): 0 none, 1 assembly, 2 working."""
+        self._read()
         return self._mode_left
 
-    def _read(self, rows: IntArray | slice | None) -> None:
-        """Read the engine, check the loop gaps, and compute forward kinematics of ``rows``, if any.
+    def _read(self) -> Readout:
+        """Read the engine once after moves and resets, check the loop gaps, and find P and J.
 
         The joint positions are those that the encoders report.
         """
-        now = self._readout = self.engine.read()
+        if self._last is not None:
+            return self._last
+        now = self.engine.read()
         opened, left = self.loops.unusual(now.gap, CLOSURE_LIMIT, now.mode_left)
         if opened:
             raise ClosureError(float(now.gap.max()), CLOSURE_LIMIT)
         if left:
             self._mode_left = np.where(self._mode_left, self._mode_left, now.mode_left)
-        if rows is None:
-            return
-        theta = now.theta[rows]
+        theta = now.theta
         if self._disturbed:
-            theta = theta + self._bias[rows] + self._noise[rows, 1]
+            theta = theta + self._bias + self._noise[:, 1]
         position, jacobian, conditioning, _ = self.machine.evaluate(theta)
         if math.isnan(np.vdot(conditioning, conditioning)):  # faster than isnan().any()
             # With bias and noise, the encoders may report joint positions at which no assembly
             # exists. Then the last valid result is kept, as a real controller would do.
             lost = np.isnan(conditioning)
             position, jacobian, conditioning = map(np.array, (position, jacobian, conditioning))
-            position[lost], jacobian[lost] = self._position[rows][lost], self._jacobian[rows][lost]
-            conditioning[lost] = self._conditioning[rows][lost]
-        if isinstance(rows, slice):
-            self._position, self._jacobian, self._conditioning = position, jacobian, conditioning
-            return
-        self._position[rows], self._jacobian[rows] = position, jacobian
-        self._conditioning[rows] = conditioning
+            position[lost], jacobian[lost] = self._position[lost], self._jacobian[lost]
+            conditioning[lost] = self._conditioning[lost]
+        self._position, self._jacobian, self._conditioning = position, jacobian, conditioning
+        self._last = now
+        return now
 
     def state(self) -> State:
-        """Return the state of all robots after the last move or reset."""
-        now, (turn, origin) = self._readout, self._frame
+        """Return the state of all robots after the last move or reset.
+
+        Raises:
+            ClosureError: If a loop has opened.
+        """
+        now, (turn, origin) = self._read(), self._frame
         theta, rates = now.theta, now.theta_dot
         if self._disturbed:
             before, last = self._noise[:, 0], self._noise[:, 1]
@@ -324,6 +329,7 @@ class Simulation:
         Engines have state that cannot be read, such as impulses of old contacts. The restart
         clears this state, so that continuing and :meth:`restore` give equal results.
         """
+        self._read()
         columns = {name: getattr(self, f"_{name}").copy() for name in _COLUMNS}
         snapshot = Snapshot(tuple(self._plants), columns, self.engine.save())
         self.restore(snapshot)
@@ -339,7 +345,7 @@ class Simulation:
         self.engine.restore(snapshot.engine)
         self.commands = self._commands[:, 1]
         self._disturbed = bool(self._bias.any() or self._noise.any())
-        self._readout = self.engine.read()
+        self._last = None
 
     def picture(self, view: View, markers: ArrayLike = (), row: int = 0) -> Picture:
         """Draw a robot and its scene.
@@ -349,7 +355,7 @@ class Simulation:
             markers: (k, 3) m, world, goal markers. They have colours, no depth and no id.
             row: Robot.
         """
-        camera = view.camera.following(self._readout.position[row])
+        camera = view.camera.following(self._read().position[row])
         view = view._replace(camera=camera)
         picture = self.engine.picture(row, view)
         paint_shadows(picture, view, self._casters(row))
@@ -358,15 +364,16 @@ class Simulation:
 
     def _casters(self, row: int) -> list[list[float]]:
         """Return position and radius of the cup and the objects, (k, 4) m."""
-        x, y, z = self._readout.position[row].tolist()
+        now = self._read()
+        x, y, z = now.position[row].tolist()
         widths = [block.width / 2 for block in self.scene.objects]
-        places = self._readout.object_position[row].tolist()
+        places = now.object_position[row].tolist()
         objects = [[*place, half] for place, half in zip(places, widths, strict=True)]
         return [[x, y, z - CUP.length, CUP.radius], *objects]
 
     def show(self, camera: Camera, markers: FloatArray) -> None:
         """Update the window with the first robot and goal markers (k, 3) m, world."""
-        self.engine.show(camera.following(self._readout.position[0]), markers)
+        self.engine.show(camera.following(self._read().position[0]), markers)
 
     def close(self) -> None:
         """Close the engine; a second call does nothing."""

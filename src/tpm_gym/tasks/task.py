@@ -437,8 +437,7 @@ class Task(ABC):
         for source, columns in self._sources:  # a comprehension is slower
             values.append(source(state)[:, columns])
         scaled: FloatArray = np.concatenate(values, axis=1)
-        scaled -= self._centre
-        scaled /= self._scale
+        loops().normalise(scaled, self._centre, self._scale)
         return scaled
 
     def decode(self, observation: ArrayLike) -> dict[str, FloatArray]:

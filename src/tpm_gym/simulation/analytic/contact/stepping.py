@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector
-from tpm_gym.compiling import compiled, kept
+from tpm_gym.compiling import compilable, compiled, kept
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.mount import GRAVITY
 from tpm_gym.simulation.analytic.contact.collision import collide_lip, collide_objects
@@ -165,20 +165,31 @@ def _slow(objects: Records) -> bool:
     return True
 
 
-@compiled
 def _reached(objects: Records, row: int, path: Route, i: int, setting: Setting) -> bool:
-    """Return whether the lip may touch an object; compare boxes around path and objects."""
-    lowest, _ = _range(path, i, 2, setting)
+    """Return whether the lip may touch an object, from boxes around path and objects."""
+    turn, origin, reached = setting.turn[2], setting.origin[2], False
     for index in range(objects.shape[1]):
-        place, size = objects[row, index]["position"], length(row_of(setting.half, index))
-        if lowest - CUP.length < place[2] + size + _BESIDE:  # seldom, so it is tried first
-            near, beside = size + CUP.radius + _BESIDE, True
-            for axis in range(2):
-                low, high = _range(path, i, axis, setting)
-                beside = beside and low - near < place[axis] < high + near
-            if beside:
-                return True
-    return False
+        near = length(row_of(setting.half, index)) + _BESIDE
+        level = objects[row, index]["position"][2] + near + CUP.length
+        low = turn * path.now[i, 2] + origin < level
+        for j in range(path.controls.shape[1]):
+            low |= turn * path.controls[i, j, 2] + origin < level
+        # Seldom true, and so small that the compiler needs no call.
+        reached = reached or (low and _beside(objects[row, index], near, path, i, setting))
+    return reached
+
+
+compilable(_reached)
+
+
+@compiled
+def _beside(item: Record, size: float, path: Route, i: int, setting: Setting) -> bool:
+    """Return whether the box around the path overlaps an object's box along x and y."""
+    near, beside = size + CUP.radius, True
+    for axis in range(2):
+        low, high = _range(path, i, axis, setting)
+        beside = beside and low - near < item["position"][axis] < high + near
+    return beside
 
 
 @compiled
