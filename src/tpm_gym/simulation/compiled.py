@@ -36,7 +36,6 @@ __all__ = [
     "singularity_penalty",
     "spline_points",
     "truth",
-    "unusual",
 ]
 
 
@@ -61,22 +60,6 @@ def shifted(
             there = points[row, axis] + parts[row, axis] * step[axis]
             moved[row, axis] = min(max(there, low[axis]), high[axis])
     return moved
-
-
-@kept
-def unusual(gap: FloatArray, limit: float, mode_left: NDArray[np.int8]) -> tuple[bool, bool]:
-    """Return whether any loop is open, and whether any mode was left.
-
-    Args:
-        gap: (n,) m, largest gap of each robot; open if larger than ``limit``, or NaN.
-        limit: Largest allowed gap, m.
-        mode_left: (n,) mode that each robot left; 0 for none.
-    """
-    opened = left = False
-    for row in range(len(gap)):
-        opened |= not gap[row] <= limit
-        left |= mode_left[row] != 0
-    return opened, left
 
 
 @kept
@@ -109,11 +92,14 @@ def in_world(
     theta_dot: FloatArray,
     commands: FloatArray,
     quaternion: FloatArray,
+    left: NDArray[np.int8],
     mode_left: NDArray[np.int8],
+    gap: FloatArray,
+    limit: float,
     turn: FloatArray,
     origin: FloatArray,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, BoolArray, BoolArray]:
-    """Convert P, its velocity and its command to the world frame; find axes and modes.
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, BoolArray, BoolArray, bool]:
+    """Convert P, its velocity and its command to the world frame; find axes, modes, open loops.
 
     Args:
         position: (n, 3) m, point P, machine's frame.
@@ -121,18 +107,26 @@ def in_world(
         theta_dot: (n, 3) rad/s.
         commands: (n, 3, 3) m, machine's frame; commands[:, 1] is converted.
         quaternion: (n, k, 4), orientations of the objects, world.
-        mode_left: (n,) mode that each robot left: 1 assembly, 2 working.
+        left: (n,) mode that each robot has left now: 1 assembly, 2 working.
+        mode_left: (n,) mode that each robot left first; overwritten.
+        gap: (n,) m, largest gap of each robot; open if larger than ``limit``, or NaN.
+        limit: Largest allowed gap, m.
         turn: (3,) factors (1 or -1) of the machine's axes in the world frame.
         origin: (3,) m, origin of the machine's frame in the world frame.
 
     Returns:
         P (n, 3) m, velocity of P (n, 3) m/s, command (n, 3) m, z axes (n, k, 3) of the objects;
-        world frame. Whether the assembly mode and the working mode was left, (n,).
+        world frame. Whether the assembly mode and the working mode was left, (n,). Whether all
+        loops are closed.
     """
     place, speed = np.empty_like(position), np.empty_like(position)
     wanted, axes = np.empty_like(position), np.empty((*quaternion.shape[:2], 3))
     assembly, working = np.empty(len(position), np.bool_), np.empty(len(position), np.bool_)
+    closed = True
     for row in range(len(position)):
+        closed &= gap[row] <= limit
+        if mode_left[row] == 0:
+            mode_left[row] = left[row]
         assembly[row], working[row] = mode_left[row] == 1, mode_left[row] == 2
         for i in range(3):
             place[row, i] = turn[i] * position[row, i] + origin[i]
@@ -146,7 +140,7 @@ def in_world(
             axes[row, item, 0] = 2 * (x * z + w * y)
             axes[row, item, 1] = 2 * (y * z - w * x)
             axes[row, item, 2] = 1 - 2 * (x * x + y * y)
-    return place, speed, wanted, axes, assembly, working
+    return place, speed, wanted, axes, assembly, working, closed
 
 
 @kept

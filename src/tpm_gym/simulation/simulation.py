@@ -19,7 +19,6 @@ from tpm_gym.simulation.drives import Servo, require_servo
 from tpm_gym.simulation.engine import (
     Engine,
     Path,
-    Readout,
     loops,
     make_engine,
     spline_weights,
@@ -131,7 +130,7 @@ class Simulation:
         self._conditioning = np.zeros(count)
         self._mode_left = np.zeros(count, dtype=np.int8)
         self._belt_speed = np.zeros(count)
-        self._last: Readout | None = None  # None until the engine is read after a move or reset
+        self._state: State | None = None  # None until the engine is read after a move or reset
 
     def reset(
         self,
@@ -190,7 +189,7 @@ class Simulation:
             self._position, self._jacobian, self._conditioning = map(np.copy, columns)
             self._position[rows], self._jacobian[rows] = reading.position, reading.jacobian
             self._conditioning[rows] = reading.conditioning
-        self._last = None
+        self._state = None
 
     def _built(self, plants: Sequence[Plant]) -> FloatArray:
         """Return the machine parameters (r, k) for the true lengths of the plants."""
@@ -234,7 +233,7 @@ class Simulation:
             JointLimitError: If a motor would be beyond a stop; no robot has moved then.
             ClosureError: If a loop had opened before; see :meth:`state`.
         """
-        self._read()
+        self.state()
         if not self.loops.all_within(commands, *self._region):
             # The spline ends before the command, so that the path may not raise the error.
             self.machine.reach(commands)
@@ -248,30 +247,28 @@ class Simulation:
             self._noise[:, 0] = self._noise[:, 1]
             self._noise[:, 1] = 0.0 if noise is None else noise
             self._disturbed = bool(self._bias.any() or self._noise.any())
-        self._last = None
+        self._state = None
 
     @property
     def mode_left(self) -> NDArray[np.int8]:
         """Mode that each robot left in this episode, (n,): 0 none, 1 assembly, 2 working."""
-        self._read()
+        self.state()
         return self._mode_left
 
-    def _read(self) -> Readout:
-        """Read the engine once after moves and resets, check the loop gaps, and find P and J.
+    def state(self) -> State:
+        """Return the state of all robots; after a move or reset, read the engine once.
 
-        The joint positions are those that the encoders report.
+        Raises:
+            ClosureError: If a loop has opened.
         """
-        if self._last is not None:
-            return self._last
+        if self._state is not None:
+            return self._state
         now = self.engine.read()
-        opened, left = self.loops.unusual(now.gap, CLOSURE_LIMIT, now.mode_left)
-        if opened:
-            raise ClosureError(float(now.gap.max()), CLOSURE_LIMIT)
-        if left:
-            self._mode_left = np.where(self._mode_left, self._mode_left, now.mode_left)
-        theta = now.theta
+        theta, rates = now.theta, now.theta_dot
         if self._disturbed:
-            theta = theta + self._bias + self._noise[:, 1]
+            before, last = self._noise[:, 0], self._noise[:, 1]
+            theta = theta + self._bias + last
+            rates = rates + (last - before) / self.control_period
         position, jacobian, conditioning, _ = self.machine.evaluate(theta)
         if math.isnan(np.vdot(conditioning, conditioning)):  # faster than isnan().any()
             # With bias and noise, the encoders may report joint positions at which no assembly
@@ -281,35 +278,24 @@ class Simulation:
             position[lost], jacobian[lost] = self._position[lost], self._jacobian[lost]
             conditioning[lost] = self._conditioning[lost]
         self._position, self._jacobian, self._conditioning = position, jacobian, conditioning
-        self._last = now
-        return now
-
-    def state(self) -> State:
-        """Return the state of all robots after the last move or reset.
-
-        Raises:
-            ClosureError: If a loop has opened.
-        """
-        now, (turn, origin) = self._read(), self._frame
-        theta, rates = now.theta, now.theta_dot
-        if self._disturbed:
-            before, last = self._noise[:, 0], self._noise[:, 1]
-            theta = theta + self._bias + last
-            rates = rates + (last - before) / self.control_period
-        place, velocity, command, axis, assembly, working = self.loops.in_world(
-            self._position, self._jacobian, rates, self._commands,
-            np.ascontiguousarray(now.object_quaternion), self._mode_left, turn, origin,
+        gap = now.gap
+        place, velocity, command, axis, assembly, working, closed = self.loops.in_world(
+            position, jacobian, rates, self._commands,
+            np.ascontiguousarray(now.object_quaternion), now.mode_left, self._mode_left,
+            gap, CLOSURE_LIMIT, *self._frame,
         )  # fmt: skip
-        return State(
+        if not closed:
+            raise ClosureError(float(gap.max()), CLOSURE_LIMIT)
+        self._state = State(
             theta=theta,
             theta_dot=rates,
             torque=now.torque,
             fk_position=place,
             fk_velocity=velocity,
-            conditioning=self._conditioning.copy(),
+            conditioning=conditioning.copy(),
             platform_position=now.position,
             platform_tilt=now.tilt,
-            closure_error=now.gap,
+            closure_error=gap,
             assembly_mode_changed=assembly,
             working_mode_changed=working,
             command=command,
@@ -322,6 +308,7 @@ class Simulation:
             object_angular_velocity=now.object_angular_velocity,
             belt_speed=self._belt_speed.copy(),
         )
+        return self._state
 
     def save(self) -> Snapshot:
         """Return a snapshot, and restart from the snapshot.
@@ -329,7 +316,7 @@ class Simulation:
         Engines have state that cannot be read, such as impulses of old contacts. The restart
         clears this state, so that continuing and :meth:`restore` give equal results.
         """
-        self._read()
+        self.state()
         columns = {name: getattr(self, f"_{name}").copy() for name in _COLUMNS}
         snapshot = Snapshot(tuple(self._plants), columns, self.engine.save())
         self.restore(snapshot)
@@ -345,7 +332,7 @@ class Simulation:
         self.engine.restore(snapshot.engine)
         self.commands = self._commands[:, 1]
         self._disturbed = bool(self._bias.any() or self._noise.any())
-        self._last = None
+        self._state = None
 
     def picture(self, view: View, markers: ArrayLike = (), row: int = 0) -> Picture:
         """Draw a robot and its scene.
@@ -355,7 +342,7 @@ class Simulation:
             markers: (k, 3) m, world, goal markers. They have colours, no depth and no id.
             row: Robot.
         """
-        camera = view.camera.following(self._read().position[row])
+        camera = view.camera.following(self.state().platform_position[row])
         view = view._replace(camera=camera)
         picture = self.engine.picture(row, view)
         paint_shadows(picture, view, self._casters(row))
@@ -364,8 +351,8 @@ class Simulation:
 
     def _casters(self, row: int) -> list[list[float]]:
         """Return position and radius of the cup and the objects, (k, 4) m."""
-        now = self._read()
-        x, y, z = now.position[row].tolist()
+        now = self.state()
+        x, y, z = now.platform_position[row].tolist()
         widths = [block.width / 2 for block in self.scene.objects]
         places = now.object_position[row].tolist()
         objects = [[*place, half] for place, half in zip(places, widths, strict=True)]
@@ -373,7 +360,7 @@ class Simulation:
 
     def show(self, camera: Camera, markers: FloatArray) -> None:
         """Update the window with the first robot and goal markers (k, 3) m, world."""
-        self.engine.show(camera.following(self._read().position[0]), markers)
+        self.engine.show(camera.following(self.state().platform_position[0]), markers)
 
     def close(self) -> None:
         """Close the engine; a second call does nothing."""

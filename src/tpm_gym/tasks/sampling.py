@@ -145,7 +145,7 @@ def _tempting(
 ) -> tuple[FloatArray, FloatArray]:
     """Draw one tempting pair, (3,) each."""
     for _ in range(_ATTEMPTS):
-        ends = _at_the_threshold(rng, machine, goals[rng.integers(len(goals))])  # (n, 3)
+        ends = _at_the_threshold(rng, machine, goals[int(rng.integers(len(goals)))])  # (n, 3)
         starts = (
             _at_the_threshold(rng, machine, start)
             if isinstance(start, Region)
