@@ -60,6 +60,10 @@ BROKEN: dict[str, tuple[Callable[[], Mechanism], str]] = {
         lambda: replace(SOUND, links=(SOUND.links[0], *SOUND.links[:0:-1])),
         "a link before",
     ),
+    "a link without mass": (
+        lambda: replace(SOUND, links=(Link("base", ()), *SOUND.links[1:])),
+        "links with a mass",
+    ),
     "a second base": (
         lambda: replace(SOUND, links=(*SOUND.links, Link("other", ()))),
         "first alone has no joint",

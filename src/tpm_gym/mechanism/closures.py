@@ -120,6 +120,9 @@ def _require_tree(mechanism: Mechanism, joints: Mapping[str, float]) -> None:
         assert isinstance(joint, Joint)
         if joint.parent not in links[:index]:
             raise ConfigurationError("mechanism", joint.parent, f"a link before {links[index]}")
+    for link in mechanism.links:
+        if not link.mass > 0:
+            raise ConfigurationError("mechanism", link.name, "links with a mass, the base too")
     closures = [c.name for c in mechanism.closures]
     for kind, given in (("links", links), ("joints", names), ("closures", closures)):
         if len(set(given)) < len(given):

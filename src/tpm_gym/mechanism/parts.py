@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
 
 from tpm_gym.arrays import Vector
-from tpm_gym.mechanism.bodies import ALUMINIUM, LEVEL, STEEL, Joint, Solid
+from tpm_gym.mechanism.bodies import ALUMINIUM, LEVEL, STEEL, Joint, Link, Solid
 from tpm_gym.mechanism.motor import TORQUE_MOTOR
 
 CARBON_FIBRE = 1600.0  # kg/m^3
+SLIDES: Final = ("platform_x", "platform_y", "platform_z")
+TURNS: Final = ("platform_roll", "platform_pitch", "platform_yaw")
+"""Joints of :func:`free_platform`; their positions are P (m) and 0 (rad)."""
+FREE: Final = ("along_x", "along_y", "along_z", "rolling", "pitching")
+"""Links of :func:`free_platform` between base and platform."""
+
+_AXES: Final[tuple[Vector, ...]] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+_SPECK = 0.005  # m, edge of a cube of 1 kg/m^3: 1e-7 kg, far below what a torque shows
 
 # Largest angles of an arm from level outwards, towards the base and towards the platform.
 ARM_RAISED, ARM_LOWERED = np.deg2rad(75.0), np.deg2rad(115.0)
@@ -71,3 +79,25 @@ def arm(axis: Literal["x", "y"], across: Literal["x", "y"], length: float) -> tu
         tube(axis, length, 0.045, 0.030, 0.003),
         bar(across, 0.02, 0.015, displaced(axis, length)),
     )
+
+
+def free_platform(solids: tuple[Solid, ...], reach: float) -> list[Link]:
+    """Build a platform with its origin at P that belongs to no leg.
+
+    Three slides and three revolutes, with next to no mass between them, leave it free. So every leg
+    can end in loop closures, and none is within one branch of the tree, as PyBullet's direct solver
+    needs it.
+
+    Args:
+        solids: Solids of the platform.
+        reach: Largest distance from the base's origin to P, m.
+    """
+    speck = Solid("box", (_SPECK,) * 3, LEVEL, 1.0, colour="yellow")
+    links, parent = [], "base"
+    for name, joint, axis in zip((*FREE, "platform"), (*SLIDES, *TURNS), _AXES * 2, strict=True):
+        held = Joint(joint, "continuous", parent, LEVEL, axis)
+        if joint in SLIDES:
+            held = replace(held, kind="prismatic", lower=-reach, upper=reach)
+        links.append(Link(name, solids if name == "platform" else (speck,), held))
+        parent = name
+    return links

@@ -1,11 +1,10 @@
 """Links, joints and loop closures of a Delta, its inertias, and the angles of its passive joints.
 
 A rod has a universal joint at its arm (a small cross between them), so that it cannot spin about
-its own axis, and a ball joint at the platform, which closes a loop. The platform belongs to no leg:
-three slides and three revolutes, with next to no mass between them, leave it free in the spanning
-tree. So each closure joins two branches of the tree, as PyBullet's direct solver needs it
-(docs/fidelity.md). The frames of an arm, its crosses and its rods have x along the arm or rod and y
-along the hinges when their joints are at zero; that of the platform is parallel to the base's.
+its own axis, and a ball joint at the platform, which closes a loop. The platform belongs to no leg
+(:func:`tpm_gym.mechanism.parts.free_platform`). The frames of an arm, its crosses and its rods have
+x along the arm or rod and y along the hinges when their joints are at zero; that of the platform is
+parallel to the base's.
 """
 
 from __future__ import annotations
@@ -30,11 +29,6 @@ from tpm_gym.mechanism.motor import TORQUE_MOTOR
 
 LEGS: Final = {1: ONE, 2: TWO, 3: THREE}
 SIDES: Final = {"a": 1.0, "b": -1.0}
-SLIDES: Final = ("platform_x", "platform_y", "platform_z")
-TURNS: Final = ("platform_roll", "platform_pitch", "platform_yaw")
-_FREE = ("along_x", "along_y", "along_z", "rolling", "pitching")
-_AXES: Final[tuple[Vector, ...]] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-_POINT = 0.005  # m, edge of a cube of 1 kg/m^3: 1e-7 kg, far below what a torque shows
 _MINUS_Y, _PLUS_Z, _ORIGIN = (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, 0.0)
 
 
@@ -83,8 +77,8 @@ def build(g: DeltaGeometry) -> Mechanism:
 
 def joint_positions(pose: Pose, theta: Vector, l4: float) -> dict[str, float]:
     """Compute the positions of all joints, rad or m, from a configuration and its angles."""
-    found = {"cup_slide": 0.0} | dict.fromkeys(TURNS, 0.0)
-    found |= dict(zip(SLIDES, map(float, pose.position), strict=True))
+    found = {"cup_slide": 0.0} | dict.fromkeys(parts.TURNS, 0.0)
+    found |= dict(zip(parts.SLIDES, map(float, pose.position), strict=True))
     for number, angle, (x, y, z) in zip(LEGS, theta, pose.rods, strict=True):
         found[f"R{number}"] = angle
         for suffix in SIDES:
@@ -109,7 +103,7 @@ def inertia_of(
     """
     bodies = Bodies(mechanism, link_masses)
     motors, weights, couples, fixed, spin = (np.zeros(3) for _ in range(5))
-    platform = payload + sum(bodies.mass(name) for name in ("platform", "cup", *_FREE))
+    platform = payload + sum(bodies.mass(name) for name in ("platform", "cup", *parts.FREE))
     for i, number in enumerate(LEGS):
         _, couple, far = bodies.bar(f"arm_{number}", X, Y, g.l3)
         motors[i], weights[i] = far, couple + far
@@ -163,22 +157,12 @@ def _leg(number: int, leg: Pair, g: DeltaGeometry) -> list[Link]:
 
 
 def _platform(g: DeltaGeometry) -> list[Link]:
-    """Build platform and cup, and the links that leave the platform free."""
-    links, parent, far = [], "base", 10 * (g.l3 + g.l4)
-    point = Solid("box", (_POINT,) * 3, _ORIGIN, 1.0, colour="yellow")
-    for name, joint, axis in zip(
-        (*_FREE, "platform"), (*SLIDES, *TURNS), (*_AXES, *_AXES), strict=True
-    ):
-        held = Joint(joint, "continuous", parent, _ORIGIN, axis)
-        if joint in SLIDES:
-            held = replace(held, kind="prismatic", lower=-far, upper=far)
-        links.append(Link(name, (point,), held))
-        parent = name
+    """Build platform and cup."""
     plate = Solid("cylinder", (g.l2 + 0.015, 0.008, 0.0), _ORIGIN, ALUMINIUM, colour="yellow")
     bar = parts.bar("y", g.l5 + 0.01, 0.007, (g.l2, 0.0, 0.0))
     solids = (plate, *(_turned(bar, leg) for leg in LEGS.values()), CUP.stem(_ORIGIN))
-    links[-1] = replace(links[-1], solids=solids)
-    return [*links, CUP.link("platform", _ORIGIN)]
+    free = parts.free_platform(solids, 10 * (g.l1 + g.l3 + g.l4))
+    return [*free, CUP.link("platform", _ORIGIN)]
 
 
 def _yaw(leg: Pair) -> Vector:
