@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, is_dataclass
+from dataclasses import asdict, dataclass, is_dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -130,6 +130,8 @@ class Core:
         self.episode = np.zeros(count, dtype=np.int64)
         self.goals = np.full((count, self.task.goal_size), np.nan)
         self._pending = np.zeros((self.randomisation.latency, count, self.task.action_size))
+        # Objects in the last control steps, oldest first, if the camera is late
+        self._views = np.zeros((self.task.camera_delay, count, len(self.task.scene.objects), 9))
         self.simulation = self._start()
 
     def _start(self) -> Simulation:
@@ -181,7 +183,10 @@ class Core:
         self.episode[rows] += 1
         self._pending[:, rows] = 0.0
         noise = self._noise(rows)[rows] if self.randomisation.encoder_noise > 0 else None
-        self.simulation.reset(rows, self._home, starts, plants, noise)
+        speed = starts.pop("belt_speed")[:, 0] if "belt_speed" in starts else None
+        self.simulation.reset(rows, self._home, starts, plants, noise, speed)
+        if len(self._views):
+            self._views[:, rows] = _view(self.simulation.state())[rows]
         return [self.randomisation.told(plant) if self._altered else {} for plant in plants]
 
     def step(self, actions: FloatArray, running: IntArray) -> None:
@@ -199,6 +204,8 @@ class Core:
         simulation = self.simulation
         commands = self.control.command(actions[:, :3], simulation.commands)
         vacuum = actions[:, 3] > 0 if self.task.vacuum else np.zeros(self.count, dtype=np.bool_)
+        if len(self._views):
+            self._views = np.concatenate([self._views[1:], _view(simulation.state())[None]])
         self._state = None
         noisy = self.randomisation.encoder_noise > 0
         simulation.move(commands, vacuum, self._noise(running) if noisy else None)
@@ -211,19 +218,21 @@ class Core:
             ConfigurationError: If a result of the task is not finite.
         """
         state, goals = self.simulation.state(), self.goals
-        self._state = state
+        self._state = seen = state
+        if len(self._views):
+            seen = _seen(state, self._views[0])
         if rows is not None:
-            state, goals = state.take(rows), goals[rows]
+            state, seen, goals = state.take(rows), seen.take(rows), goals[rows]
         task = self.task
-        found = np.ascontiguousarray(task.achieved(state))
+        found = np.ascontiguousarray(task.achieved(seen))
         observed, achieved, desired, sound = self.simulation.loops.bounded(
-            task.observe(state), OBSERVATION_BOUND, found, GOAL_BOUND, goals
+            task.observe(seen), OBSERVATION_BOUND, found, GOAL_BOUND, goals
         )
         gap, penalty = task.gap(achieved, desired), task.penalty(state)
         terms = task.reward_terms(state, gap, penalty)
         reward = terms["goal"] + _goal_free(terms)
         if not (sound and math.isfinite(np.vdot(reward, reward))):
-            raise _not_finite(task, state, achieved, terms)
+            raise _not_finite(task, seen, achieved, terms)
         observation = {"observation": observed, "achieved_goal": achieved, "desired_goal": desired}
         if self._pixels is not None:
             chosen = range(self.count) if rows is None else rows.tolist()
@@ -305,7 +314,7 @@ class Core:
         """
         _ = self.state  # raises without an episode
         rngs = [dict(rng.bit_generator.state) for rng in self.rngs]
-        own = {"goals": self.goals, "pending": self._pending, **columns}
+        own = {"goals": self.goals, "pending": self._pending, "views": self._views, **columns}
         copies = {name: values.copy() for name, values in own.items()}
         return EnvSnapshot(self.kind, self.simulation.save(), rngs, copies)
 
@@ -329,6 +338,7 @@ class Core:
             rng.bit_generator.state = state
         self.goals = snapshot.columns["goals"].copy()
         self._pending = snapshot.columns["pending"].copy()
+        self._views = snapshot.columns["views"].copy()
         self._state = None
         self.episode += 1  # the expert must plan again
         self.simulation.restore(snapshot.simulation)
@@ -366,6 +376,24 @@ class Core:
             self.simulation.close()
         elif snapshot is not None:
             self.simulation.restore(snapshot)
+
+
+def _view(state: State) -> FloatArray:
+    """Return what a camera shows of the objects, (n, k, 9): position, axis, velocity."""
+    parts = state.object_position, state.object_axis, state.object_velocity
+    return np.concatenate(parts, axis=2)
+
+
+def _seen(state: State, view: FloatArray) -> State:
+    """Return a state with objects as in a view (n, k, 9)."""
+    parts = dict(
+        zip(
+            ("object_position", "object_axis", "object_velocity"),
+            np.split(view, 3, axis=2),
+            strict=True,
+        )
+    )
+    return replace(state, **parts)
 
 
 # -- observation, reward, info ------------------------------------------------------------------

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray, finite
-from tpm_gym.errors import ClosureError, ConfigurationError
+from tpm_gym.errors import ClosureError, ConfigurationError, InputError
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.tpm import PAPER_TPM
@@ -176,7 +176,7 @@ class Simulation:
         self._become(rows, plants)
         if self.scene.belt is not None:
             speeds = np.zeros(len(rows)) if belt_speed is None else belt_speed
-            self._belt_speed[rows] = finite("belt_speed", speeds, (len(rows),))
+            self._belt_speed[rows] = self.scene.belt.require(speeds, len(rows), InputError)
             self.engine.set_belt(rows, self._belt_speed[rows])
         self.engine.place(rows, true, placed)
         self._commands[rows] = reading.position

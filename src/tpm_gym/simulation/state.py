@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector, finite, is_whole
-from tpm_gym.errors import ConfigurationError
+from tpm_gym.errors import ConfigurationError, InputError
 
 __all__ = ["CONTROL_PERIOD", "Belt", "Block", "Patch", "Scene", "State"]
 
@@ -78,6 +78,7 @@ class Belt:
     Attributes:
         start: Lowest x, m, world.
         end: Highest x, m, world.
+        fastest: Largest speed in either direction, m/s.
 
     Raises:
         ConfigurationError: If a value is out of range.
@@ -85,12 +86,23 @@ class Belt:
 
     start: float
     end: float
+    fastest: float = 1.0
 
     def __post_init__(self) -> None:
         """Check the values."""
+        _require_positive("fastest", self.fastest)
         start = finite("start", self.start, (), ConfigurationError)
         if not start < finite("end", self.end, (), ConfigurationError):
             raise ConfigurationError("end", self.end, f"a number above start, {self.start}")
+
+    def require(
+        self, speeds: Any, count: int, error: type[ConfigurationError | InputError]
+    ) -> FloatArray:
+        """Check speeds (count,) m/s of this belt, and return them; raise ``error`` otherwise."""
+        found = finite("belt_speed", speeds, (count,), error)
+        if (abs(found) > self.fastest).any():
+            raise error("belt_speed", found.tolist(), f"at most {self.fastest} m/s either way")
+        return found
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """Tasks: scenes, goals, observations, rewards, controls, experts."""
 
+from tpm_gym.tasks.conveyor import Conveyor
 from tpm_gym.tasks.expert import Expert
 from tpm_gym.tasks.motion import Motion, Move, hanging
 from tpm_gym.tasks.pick_and_place import PickAndPlace
@@ -10,6 +11,7 @@ from tpm_gym.tasks.task import Entry, Task, dense
 from tpm_gym.tasks.throw import Throw
 
 __all__ = [
+    "Conveyor",
     "Entry",
     "Expert",
     "Motion",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -41,14 +41,16 @@ class Motion:
 
     Attributes:
         machine: The machine that moves.
+        period: Control period, s.
         seen: The observation in SI units, by entry, world frame.
         goal: The goal, m, world frame.
         under_way: Actions (3,) that the environment's latency holds back, oldest first.
     """
 
     def __init__(self, machine: Machine, control: Control, period: float = CONTROL_PERIOD) -> None:
-        """Start without an observation; ``period`` is the control period, s."""
-        self.machine, self._control = machine, control
+        """Start without an observation."""
+        self.machine, self._control, self.period = machine, control, period
+        self._reach = np.array(machine.step_limit) * (period / CONTROL_PERIOD)
         self._ramp, self._sealing = (max(1, round(time / period)) for time in (RAMP, SEALING))
         self.seen: dict[str, FloatArray] = {}
         self.goal: FloatArray = np.empty(0)
@@ -88,10 +90,27 @@ class Motion:
         """
         for stop in stops:
             start = self.command
-            for fraction in self._trapezoid(start, stop):
+            for fraction in self.trapezoid(start, stop):
                 if while_holding is not None and not self.holding(while_holding):
                     return
                 yield Move(start + fraction * (stop - start), vacuum)
+
+    def meet(
+        self, target: Callable[[], FloatArray], step: FloatArray, vacuum: bool
+    ) -> Iterator[Move]:
+        """Approach a moving target, and end at rest relative to it.
+
+        Args:
+            target: Function that returns the command (3,) m that would meet the target at the end
+                of this control step, machine's frame.
+            step: Way (3,) m of the target in a control step.
+            vacuum: Whether the vacuum is on.
+        """
+        start, first = self.command, target() - step
+        # The way relative to the target is longer, as far as P needs a part of its speed to follow.
+        spare = 1 - np.abs(step) / self._reach
+        for fraction in self.trapezoid(start, start + (first - start) / spare):
+            yield Move(target() - (1 - fraction) * (first - start), vacuum)
 
     def pick(self, block: Block, clearance: float) -> Iterator[Move]:
         """Come down on a block from ``clearance`` (m) above it, and wait for the seal.
@@ -111,7 +130,7 @@ class Motion:
         place = self._see(f"{block.name}_position") + hanging(block)
         return self.machine.mount.to_paper(place + (0.0, 0.0, clearance))
 
-    def _trapezoid(self, start: FloatArray, stop: FloatArray) -> FloatArray:
+    def trapezoid(self, start: FloatArray, stop: FloatArray) -> FloatArray:
         """Return fractions of the way at the control steps from ``start`` to ``stop``.
 
         Speed rises over RAMP, holds, and falls. Neither P nor a controlled joint exceeds its

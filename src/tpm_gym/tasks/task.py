@@ -75,7 +75,7 @@ class Task(ABC):
         penalty_weight: Weight of the singularity penalty; 0 switches it off.
 
     Attributes:
-        scene: Objects and goal markers.
+        scene: Objects, goal markers, belt and paint; a task may set it for each machine.
         vacuum: Whether actions have a fourth entry, which switches the vacuum.
         goal_size: Length of a goal: three for each object in the scene's order, or three for P.
         tolerance: Distance below which a goal is achieved, m.
@@ -83,19 +83,21 @@ class Task(ABC):
         control_period: Time between two actions, s. Limits of the machine hold in 40 ms, and are
             scaled to it.
         max_episode_steps: Control steps after which ``gym.make`` truncates an episode.
+        camera_delay: Control steps by which observation and achieved goal show objects late.
         entries: Entries of the observation vector, in order.
 
     Raises:
         ConfigurationError: If an option is out of range.
     """
 
-    scene: ClassVar[Scene] = Scene()
+    scene: Scene = Scene()
     vacuum: ClassVar[bool] = False
     goal_size: ClassVar[int] = 3
     tolerance: ClassVar[float] = 0.010
     samplings: ClassVar[tuple[str, ...]] = ("sampled",)
     control_period: ClassVar[float] = CONTROL_PERIOD
     max_episode_steps: ClassVar[int] = 50
+    camera_delay: ClassVar[int] = 0
 
     def __init__(
         self,
@@ -161,7 +163,8 @@ class Task(ABC):
                 unchanged, and sampled entries keep clear of them.
 
         Returns:
-            Centres (r, 3) m of the scene's objects by name, and ``"goal"`` (r, goal_size) m.
+            Centres (r, 3) m of the scene's objects by name, and ``"goal"`` (r, goal_size) m. With a
+            belt, also ``"belt_speed"`` (r, 1) m/s.
         """
 
     def achieved(self, state: State) -> FloatArray:
@@ -280,7 +283,8 @@ class Task(ABC):
     @property
     def _sizes(self) -> dict[str, int]:
         """Lengths of the sampled arrays, by name."""
-        return {block.name: 3 for block in self.scene.objects} | {"goal": self.goal_size}
+        sizes = {block.name: 3 for block in self.scene.objects} | {"goal": self.goal_size}
+        return sizes if self.scene.belt is None else sizes | {"belt_speed": 1}
 
     def _chosen(self, options: Any) -> dict[str, FloatArray]:
         """Check the user's options, and return their values by name."""
@@ -289,11 +293,16 @@ class Task(ABC):
             **{block.name: (3, (block,)) for block in objects},
             "goal": (self.goal_size, objects or (None,)),
         }
-        valid = f"a dictionary with keys among {', '.join(map(repr, known))}"
+        belt = self.scene.belt
+        names = [*known] if belt is None else [*known, "belt_speed"]
+        valid = f"a dictionary with keys among {', '.join(map(repr, names))}"
         if not isinstance(options, Mapping):
             raise ResetOptionError("options", options, valid)
         chosen: dict[str, FloatArray] = {}
         for name, value in options.items():
+            if belt is not None and name == "belt_speed":
+                chosen[name] = belt.require(np.reshape(value, -1), 1, ResetOptionError)
+                continue
             if name not in known:
                 raise ResetOptionError(str(name), value, valid)
             chosen[name] = self._within_reach(name, value, *known[name])
@@ -305,12 +314,19 @@ class Task(ABC):
         """Copy points (size,) m that a user chose for P or for blocks; raise if out of reach."""
         points = np.array(finite(name, value, (size,), ResetOptionError))
         for point, block in zip(points.reshape(-1, 3), cycle(blocks), strict=False):
-            boxes = self.goals_of(block) if name == "goal" else [self.reach_of(block)]
+            boxes = self.goals_of(block) if name == "goal" else [self.starts_of(block)]
             margin = max(float(np.minimum(point - low, high - point).min()) for low, high in boxes)
             if margin < -1e-6:
                 hint = f"{name} must lie in {' or in '.join(_range(*box) for box in boxes)}"
                 raise UnreachableError(point.tolist(), "box", margin, hint)
         return points
+
+    def starts_of(self, block: Block | None) -> tuple[FloatArray, FloatArray]:
+        """Return the low and high corners (3,) m of the places where a block may start.
+
+        They are what the robot can reach. A task whose blocks come from elsewhere overrides this.
+        """
+        return self.reach_of(block)
 
     def goals_of(self, block: Block | None) -> list[tuple[FloatArray, FloatArray]]:
         """Return boxes, as lowest and highest place (3,) m, of goals for point P or for a block.
@@ -475,7 +491,8 @@ class Task(ABC):
         """Return the corners (k, 3) m of the box outside which each object is lost."""
         low, high = np.empty((2, len(self.scene.objects), 3))
         for index, block in enumerate(self.scene.objects):
-            ends = np.stack([*self._place_of(block), *chain(*self.goals_of(block))])
+            places = self._place_of(block), self.starts_of(block), *self.goals_of(block)
+            ends = np.stack([*chain(*places)])
             # The cup may hold the block off its middle, and the block may stop beside its goal.
             slack = max(block.width / 2, self.tolerance)
             low[index, :2] = ends[:, :2].min(axis=0) - slack

@@ -1,0 +1,232 @@
+"""Conveyor: pick up a block from a belt that runs, and bring it to the tray."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property, partial
+from itertools import chain, repeat
+from typing import Any, Final
+
+import numpy as np
+
+from tpm_gym.arrays import FloatArray
+from tpm_gym.errors import ConfigurationError
+from tpm_gym.mechanism.machine import Machine
+from tpm_gym.simulation.state import Belt, Block, Patch, Scene, State
+from tpm_gym.tasks import sampling
+from tpm_gym.tasks.motion import Motion, Move, hanging
+from tpm_gym.tasks.task import Entry, Task, dense
+
+__all__ = ["Conveyor"]
+
+SPEEDS: Final = (0.05, 0.20)
+"""Slowest and fastest belt, m/s."""
+LATEST: Final = 1.0
+"""Longest time until the block comes within reach, s."""
+SHARE: Final = 0.55
+"""Share of the machine's region along x that is over the belt."""
+EDGE: Final = 0.030
+"""Distance of goals from the end of the belt, m."""
+UPSTREAM: Final = 0.25
+"""Length of the belt before the region, m."""
+CLEARANCE: Final = 0.028
+"""Height over the block, or over its place, at which the expert arrives and leaves, m."""
+SEALING: Final = 4
+"""Control steps to go along with the block until the cup has sealed."""
+GAP: Final = 0.010
+"""Distance of the tray from the end of the belt, m."""
+TRAY_COLOUR: Final = (0.45, 0.62, 0.80, 1.0)
+_DRAWS: Final = 256
+_ATTEMPTS: Final = 100
+
+
+class Conveyor(Task):
+    """Pick up a block from a running belt with the vacuum cup, and bring it to the tray.
+
+    The belt runs along x, at 0.05 to 0.20 m/s, drawn for each episode. The block comes within reach
+    in the first second. The camera shows it 3 control steps late, in the observation and in the
+    achieved goal. The goal lies in the tray, on the table beyond the belt. With
+    ``goals="tempting"``, block and goal are where the machine is only just safe.
+    """
+
+    block = Block()
+    scene = Scene(objects=(block,))
+    vacuum = True
+    camera_delay = 3
+    samplings = ("sampled", "tempting")
+    max_episode_steps = 80
+
+    def __init__(self, machine: Machine, *args: Any, **options: Any) -> None:
+        """Place belt and tray for the machine; see the base class."""
+        ends = machine.mount.to_world(np.array([machine.region.low, machine.region.high]))
+        low, high, half = ends.min(axis=0), ends.max(axis=0), self.block.width / 2
+        start = float(min(low[0] - UPSTREAM, -machine.table[0]))
+        self.belt = Belt(start, float(low[0] + SHARE * (high[0] - low[0])))
+        tray = Patch(
+            (self.belt.end + GAP, low[1] - half), (high[0] + half, high[1] + half), TRAY_COLOUR
+        )
+        self.scene = replace(type(self).scene, belt=self.belt, patches=(tray,))
+        super().__init__(machine, *args, **options)
+
+    def sample(
+        self, rngs: Sequence[np.random.Generator], chosen: Mapping[str, FloatArray]
+    ) -> dict[str, FloatArray]:
+        """See the base class."""
+        starts, (low, high) = dict(chosen), self._floor
+        if "belt_speed" not in starts:
+            starts["belt_speed"] = np.array([rng.uniform(*SPEEDS, 1) for rng in rngs])
+        if "object" not in starts:
+            early = np.array([rng.uniform(0.0, LATEST, 1) for rng in rngs]) * starts["belt_speed"]
+            lanes = np.array([self._draw(low[0], self.belt.end, rng) for rng in rngs])
+            lanes[:, 0] = np.maximum(low[0] - early[:, 0], self.starts_of(self.block)[0][0])
+            starts["object"] = lanes
+        if "goal" not in starts:
+            first = self.belt.end + EDGE
+            starts["goal"] = np.array([self._draw(first, high[0], rng) for rng in rngs])
+        return starts
+
+    @cached_property
+    def _floor(self) -> tuple[FloatArray, FloatArray]:
+        """Corners (3,) m of the places where the block is picked up and put down."""
+        table, hung = self.on_table(self.block), hanging(self.block)
+        ends = self.machine.mount.to_world(np.array([table.low, table.high])) - hung
+        return ends.min(axis=0), ends.max(axis=0)
+
+    def _draw(self, first: float, last: float, rng: np.random.Generator) -> FloatArray:
+        """Draw a place (3,) m between two x, so that the whole way between them is safe."""
+        (low, high), safe = self._floor, self.machine.safe_conditioning
+        most = safe + sampling.BAND if self.goals == "tempting" else np.inf
+        for _ in range(_ATTEMPTS):
+            places = rng.uniform((first, *low[1:]), (last, *high[1:]), (_DRAWS, 3))
+            ways = np.stack([places, places], axis=1)
+            ways[:, :, 0] = first, last
+            points = self.machine.mount.to_paper(ways + hanging(self.block))
+            least = self.machine.conditioning_at(points).min(axis=-1)
+            fits = np.flatnonzero((least >= safe) & (least < most))
+            if len(fits):
+                place: FloatArray = places[fits[0]]
+                return place
+        valid = f"'sampled' or another machine: {self.machine.name!r} has no such place"
+        raise ConfigurationError("goals", self.goals, valid)
+
+    def starts_of(self, block: Block | None) -> tuple[FloatArray, FloatArray]:
+        """Return the corners of the belt, over the robot's reach in y."""
+        low, high = self.reach_of(block)
+        low[0], high[0] = self.belt.start + self.block.width, self.belt.end
+        high[2] = low[2]
+        return low, high
+
+    def goals_of(self, block: Block | None) -> list[tuple[FloatArray, FloatArray]]:
+        """Return the tray."""
+        low, high = self.reach_of(block)
+        low[0], high[2] = self.belt.end + EDGE, low[2]
+        return [(low, high)]
+
+    def observed(self) -> tuple[Entry, ...]:
+        """Return the entries of the robot, of the block, and of the belt."""
+        middle, half = sum(SPEEDS) / 2, (SPEEDS[1] - SPEEDS[0]) / 2
+        speed = Entry(
+            "belt_speed",
+            "m/s",
+            "speed of the belt, by its encoder",
+            (middle,),
+            (half,),
+            _belt_speed,
+        )
+        return (*self.robot_entries(), *self.object_entries(), speed)
+
+    def achieved(self, state: State) -> FloatArray:
+        """Return the centre of the block."""
+        return state.object_position[:, 0]
+
+    def shaping(self, state: State) -> dict[str, FloatArray]:
+        """Return minus half the distance from cup to block, for a dense reward only."""
+        if self.reward == "sparse":
+            return {}
+        return {"approach": 0.5 * dense(self.gap(self.lip(state), self.top(state)))}
+
+    # -- the expert -------------------------------------------------------------------------------
+
+    def plan(self, motion: Motion) -> Iterator[Move]:
+        """Meet the block on the belt, pick it up while both move, and put it into the tray."""
+        camera, up = _Camera(self, motion), np.array([0.0, 0.0, -CLEARANCE])  # paper z points down
+        while True:
+            yield from camera.watch(self._pick(camera))
+            if not motion.holding():
+                continue
+            yield from camera.watch(motion.go([motion.command + up], True, self.block.name))
+            place = self.machine.mount.to_paper(motion.goal + camera.grip())
+            yield from camera.watch(motion.go([place + up, place], True, self.block.name))
+            if motion.holding():
+                break
+        for _ in range(2):  # the platform lags its command
+            yield Move(place, True)
+        yield Move(place, False)
+        yield from motion.go([place + up], vacuum=False)
+        yield Move(place + up, False)
+
+    def _pick(self, camera: _Camera) -> Iterator[Move]:
+        """Wait where the belt comes within reach, go along with the block, and seal."""
+        motion, first = camera.motion, self._floor[0][0]
+        gate = camera.above(CLEARANCE)
+        gate[0] = self.machine.mount.to_paper(np.array([first, 0.0, 0.0]))[0]
+        for move in chain(motion.go([gate], vacuum=False), repeat(Move(gate, False))):
+            if camera.place()[0] >= first:
+                break
+            yield move
+        for height in (CLEARANCE, 0.0):
+            above = partial(camera.above, height)
+            yield from motion.meet(above, camera.step(), vacuum=height == 0)
+        for _ in range(SEALING):
+            if motion.holding():
+                return
+            yield Move(camera.above(0.0), True)
+
+
+class _Camera:
+    """Estimate of where the block is now, from pictures that are late."""
+
+    def __init__(self, task: Conveyor, motion: Motion) -> None:
+        self.motion, self._task = motion, task
+        self._trail = deque([motion.seen["position"]], maxlen=task.camera_delay + 1)
+
+    def watch(self, moves: Iterator[Move]) -> Iterator[Move]:
+        """Yield moves, and note where P is."""
+        for move in moves:
+            yield move
+            self._trail.append(self.motion.seen["position"])
+
+    def step(self) -> FloatArray:
+        """Return the way (3,) m of the belt in a control step, machine's frame."""
+        speed = float(self.motion.seen["belt_speed"][0])
+        riding = self.motion.seen["object_position"][0] < self._task.belt.end
+        way = np.array([riding * speed * self.motion.period, 0.0, 0.0])
+        return self.motion.machine.mount.rotate(way)
+
+    def place(self) -> FloatArray:
+        """Return the block's centre (3,) m now, world; it rides on the belt since the picture."""
+        steps = len(self._trail) - 1
+        if self.motion.seen["object_velocity"][0] > self.motion.seen["belt_speed"][0] / 2:
+            steps = self._task.camera_delay
+        way: FloatArray = self.motion.machine.mount.rotate(self.step())
+        return self.motion.seen["object_position"] + steps * way
+
+    def above(self, height: float) -> FloatArray:
+        """Return the command (3,) m with which the lip is above the block at the step's end.
+
+        P lags the command by half a control period.
+        """
+        point = self.place() + hanging(self._task.block) + (0.0, 0.0, height)
+        command: FloatArray = self.motion.machine.mount.to_paper(point) + 1.5 * self.step()
+        return command
+
+    def grip(self) -> FloatArray:
+        """Return the vector (3,) m from the held block to P."""
+        grip: FloatArray = self._trail[0] - self.motion.seen["object_position"]
+        return grip
+
+
+def _belt_speed(state: State) -> FloatArray:
+    return state.belt_speed[:, None]
