@@ -29,8 +29,6 @@ SHARE: Final = 0.55
 """Share of the machine's region along x that is over the belt."""
 EDGE: Final = 0.030
 """Distance of goals from the end of the belt, m."""
-UPSTREAM: Final = 0.25
-"""Length of the belt before the region, m."""
 CLEARANCE: Final = 0.028
 """Height over the block, or over its place, at which the expert arrives and leaves, m."""
 SEALING: Final = 4
@@ -48,7 +46,8 @@ class Conveyor(Task):
     The belt runs along x, at 0.05 to 0.20 m/s, drawn for each episode. The block comes within reach
     in the first second. The camera shows it 3 control steps late, in the observation and in the
     achieved goal. The goal lies in the tray, on the table beyond the belt. With
-    ``goals="tempting"``, block and goal are where the machine is only just safe.
+    ``goals="tempting"``, a part of the block's way on the belt, and of the tray at the goal's y, is
+    only just safe.
     """
 
     block = Block()
@@ -57,12 +56,14 @@ class Conveyor(Task):
     camera_delay = 3
     samplings = ("sampled", "tempting")
     max_episode_steps = 80
+    upstream = 0.25
+    """Length of the belt before the region, m."""
 
     def __init__(self, machine: Machine, *args: Any, **options: Any) -> None:
         """Place belt and tray for the machine; see the base class."""
         ends = machine.mount.to_world(np.array([machine.region.low, machine.region.high]))
         low, high, half = ends.min(axis=0), ends.max(axis=0), self.block.width / 2
-        start = float(min(low[0] - UPSTREAM, -machine.table[0]))
+        start = float(min(low[0] - self.upstream, -machine.table[0]))
         self.belt = Belt(start, float(low[0] + SHARE * (high[0] - low[0])))
         tray = Patch(
             (self.belt.end + GAP, low[1] - half), (high[0] + half, high[1] + half), TRAY_COLOUR
@@ -125,7 +126,7 @@ class Conveyor(Task):
         return [(low, high)]
 
     def observed(self) -> tuple[Entry, ...]:
-        """Return the entries of the robot, of the block, and of the belt."""
+        """Return the entries of the robot, of each block, and of the belt."""
         middle, half = sum(SPEEDS) / 2, (SPEEDS[1] - SPEEDS[0]) / 2
         speed = Entry(
             "belt_speed",
@@ -135,11 +136,12 @@ class Conveyor(Task):
             (half,),
             _belt_speed,
         )
-        return (*self.robot_entries(), *self.object_entries(), speed)
+        blocks = chain(*(self.object_entries(k) for k in range(len(self.scene.objects))))
+        return (*self.robot_entries(), *blocks, speed)
 
     def achieved(self, state: State) -> FloatArray:
-        """Return the centre of the block."""
-        return state.object_position[:, 0]
+        """Return the centres of the blocks."""
+        return state.object_position.reshape(-1, self.goal_size)
 
     def shaping(self, state: State) -> dict[str, FloatArray]:
         """Return minus half the distance from cup to block, for a dense reward only."""
@@ -150,22 +152,25 @@ class Conveyor(Task):
     # -- the expert -------------------------------------------------------------------------------
 
     def plan(self, motion: Motion) -> Iterator[Move]:
-        """Meet the block on the belt, pick it up while both move, and put it into the tray."""
-        camera, up = _Camera(self, motion), np.array([0.0, 0.0, -CLEARANCE])  # paper z points down
+        """Bring one block after the other from the belt to its place in the tray."""
+        for block, goal in zip(self.scene.objects, motion.goal.reshape(-1, 3), strict=True):
+            camera = _Camera(self, motion, block)
+            yield from camera.watch(self._deliver(camera, goal))
+
+    def _deliver(self, camera: _Camera, goal: FloatArray) -> Iterator[Move]:
+        """Meet a block on the belt, pick it up while both move, and put it into the tray."""
+        motion, name, up = camera.motion, camera.block.name, np.array([0.0, 0.0, -CLEARANCE])
         while True:
-            yield from camera.watch(self._pick(camera))
-            if not motion.holding():
+            yield from self._pick(camera)
+            if not motion.holding(name):
                 continue
-            yield from camera.watch(motion.go([motion.command + up], True, self.block.name))
-            place = self.machine.mount.to_paper(motion.goal + camera.grip())
-            yield from camera.watch(motion.go([place + up, place], True, self.block.name))
-            if motion.holding():
+            yield from motion.go([motion.command + up], True, name)  # paper z points down
+            place = self.machine.mount.to_paper(goal + camera.grip())
+            yield from motion.go([place + up, place], True, name)
+            if motion.holding(name):
                 break
-        for _ in range(2):  # the platform lags its command
-            yield Move(place, True)
-        yield Move(place, False)
+        yield from [Move(place, True), Move(place, True), Move(place, False)]  # the platform lags
         yield from motion.go([place + up], vacuum=False)
-        yield Move(place + up, False)
 
     def _pick(self, camera: _Camera) -> Iterator[Move]:
         """Wait where the belt comes within reach, go along with the block, and seal."""
@@ -180,16 +185,16 @@ class Conveyor(Task):
             above = partial(camera.above, height)
             yield from motion.meet(above, camera.step(), vacuum=height == 0)
         for _ in range(SEALING):
-            if motion.holding():
+            if motion.holding(camera.block.name):
                 return
             yield Move(camera.above(0.0), True)
 
 
 class _Camera:
-    """Estimate of where the block is now, from pictures that are late."""
+    """Estimate of where a block is now, from pictures that are late."""
 
-    def __init__(self, task: Conveyor, motion: Motion) -> None:
-        self.motion, self._task = motion, task
+    def __init__(self, task: Conveyor, motion: Motion, block: Block) -> None:
+        self.motion, self.block, self._task = motion, block, task
         self._trail = deque([motion.seen["position"]], maxlen=task.camera_delay + 1)
 
     def watch(self, moves: Iterator[Move]) -> Iterator[Move]:
@@ -201,31 +206,34 @@ class _Camera:
     def step(self) -> FloatArray:
         """Return the way (3,) m of the belt in a control step, machine's frame."""
         speed = float(self.motion.seen["belt_speed"][0])
-        riding = self.motion.seen["object_position"][0] < self._task.belt.end
+        riding = self._seen("position")[0] < self._task.belt.end
         way = np.array([riding * speed * self.motion.period, 0.0, 0.0])
         return self.motion.machine.mount.rotate(way)
 
     def place(self) -> FloatArray:
         """Return the block's centre (3,) m now, world; it rides on the belt since the picture."""
         steps = len(self._trail) - 1
-        if self.motion.seen["object_velocity"][0] > self.motion.seen["belt_speed"][0] / 2:
+        if self._seen("velocity")[0] > self.motion.seen["belt_speed"][0] / 2:
             steps = self._task.camera_delay
         way: FloatArray = self.motion.machine.mount.rotate(self.step())
-        return self.motion.seen["object_position"] + steps * way
+        return self._seen("position") + steps * way
 
     def above(self, height: float) -> FloatArray:
         """Return the command (3,) m with which the lip is above the block at the step's end.
 
         P lags the command by half a control period.
         """
-        point = self.place() + hanging(self._task.block) + (0.0, 0.0, height)
+        point = self.place() + hanging(self.block) + (0.0, 0.0, height)
         command: FloatArray = self.motion.machine.mount.to_paper(point) + 1.5 * self.step()
         return command
 
     def grip(self) -> FloatArray:
         """Return the vector (3,) m from the held block to P."""
-        grip: FloatArray = self._trail[0] - self.motion.seen["object_position"]
+        grip: FloatArray = self._trail[0] - self._seen("position")
         return grip
+
+    def _seen(self, entry: str) -> FloatArray:
+        return self.motion.seen[f"{self.block.name}_{entry}"]
 
 
 def _belt_speed(state: State) -> FloatArray:
