@@ -4,7 +4,7 @@ VENV := .venv
 RUN := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
 
-.PHONY: help demo test lint format compiled test-fast test-slow test-wheel docs urdf pictures figures gradients results bench-kinematics bench-engine bench-long bench-limits bench-transfer bench-engines bench-fidelity bench-evaluate bench-speed bench-first soak clean
+.PHONY: help demo test lint format compiled test-fast test-slow test-wheel docs urdf pictures figures gradients results bench-kinematics bench-engine bench-long bench-limits bench-transfer bench-engines bench-fidelity bench-evaluate bench-conveyor bench-speed bench-first soak clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -79,6 +79,9 @@ bench-fidelity: $(INSTALLED) ## loop gaps, FK error and tilt against cost; see d
 
 bench-evaluate: $(INSTALLED) ## what tpm-gym evaluate costs beyond the stepping
 	$(RUN) benchmarks/bench_evaluate.py --json runs/evaluate.json
+
+bench-conveyor: $(INSTALLED) ## picks a minute from a belt, beside supply and bound; see docs/conveyor.md
+	$(RUN) benchmarks/bench_conveyor.py
 
 bench-engines: $(INSTALLED) ## both engines and theory on the same commands; policies over engines and drives
 	$(RUN) benchmarks/bench_engines.py --jobs 2

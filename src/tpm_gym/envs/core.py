@@ -386,14 +386,8 @@ def _view(state: State) -> FloatArray:
 
 def _seen(state: State, view: FloatArray) -> State:
     """Return a state with objects as in a view (n, k, 9)."""
-    parts = dict(
-        zip(
-            ("object_position", "object_axis", "object_velocity"),
-            np.split(view, 3, axis=2),
-            strict=True,
-        )
-    )
-    return replace(state, **parts)
+    position, axis, velocity = np.split(view, 3, axis=2)
+    return replace(state, object_position=position, object_axis=axis, object_velocity=velocity)
 
 
 # -- observation, reward, info ------------------------------------------------------------------
