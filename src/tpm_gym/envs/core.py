@@ -84,6 +84,7 @@ class Core:
         penalty_weight: float | None = None,
         drive: str | Servo | Mapping[str, Any] | None = None,
         randomisation: Randomisation | Mapping[str, Any] | None = None,
+        shield: bool | float = False,
         physics: Any = None,
         observations: str = "state",
         pixel_size: int = 84,
@@ -103,6 +104,11 @@ class Core:
         self.control = make_control(control, self.machine, self.task.control_period)
         self.drive, self.randomisation = drives_and_randomisation(drive, randomisation)
         self._altered = self.randomisation != Randomisation()
+        self._shield = None
+        if shield is not False:
+            from tpm_gym.envs.shield import make_shield  # imports Numba
+
+            self._shield = make_shield(shield, self.machine, self.control)
         self._rendering = Rendering(self.machine, render_mode, camera, width, height)
         self._pixels: Pixels | None = None
         if observations == "pixels":
@@ -120,6 +126,7 @@ class Core:
             "drive": self.drive,
             "randomisation": self.randomisation,
             "physics": asdict(physics) if settings else physics,
+            "shield": shield,
             "number of environments": count,
             "observations": observations,
         }
@@ -203,6 +210,8 @@ class Core:
             actions, late = late[0], late[1:]
         simulation = self.simulation
         commands = self.control.command(actions[:, :3], simulation.commands)
+        if self._shield is not None:
+            commands = self._shield.command(commands, simulation.recent)
         vacuum = actions[:, 3] > 0 if self.task.vacuum else np.zeros(self.count, dtype=np.bool_)
         if len(self._views):
             self._views = np.concatenate([self._views[1:], _view(simulation.state())[None]])

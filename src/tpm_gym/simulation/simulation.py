@@ -77,6 +77,7 @@ class Simulation:
     Attributes:
         loops: Compiled functions, :mod:`tpm_gym.simulation.compiled`.
         commands: (n, 3) m, commanded positions of point P, machine's frame.
+        recent: (n, 2, 3) m, the last two commands, oldest first.
 
     Raises:
         ConfigurationError: If an option is out of range, or the engine does not support it.
@@ -121,7 +122,7 @@ class Simulation:
         self._region = np.array(machine.region.low), np.array(machine.region.high)
         # The last two commands and the next command, machine's frame, m
         self._commands = np.zeros((count, 3, 3))
-        self.commands = self._commands[:, 1]
+        self.commands, self.recent = self._commands[:, 1], self._commands[:, :2]
         self._noise = np.zeros((count, 2, 3))  # noise of the last two encoder readings, rad
         self._bias = np.zeros((count, 3))  # encoder bias, rad
         self._disturbed = False  # whether any encoder has bias or noise
@@ -330,7 +331,7 @@ class Simulation:
         if self.scene.belt is not None:
             self.engine.set_belt(np.arange(self.count), self._belt_speed)
         self.engine.restore(snapshot.engine)
-        self.commands = self._commands[:, 1]
+        self.commands, self.recent = self._commands[:, 1], self._commands[:, :2]
         self._disturbed = bool(self._bias.any() or self._noise.any())
         self._state = None
 

@@ -42,6 +42,9 @@ class Control(Protocol):
     def steps(self, wanted: FloatArray, current: FloatArray) -> float:
         """Return the number of control steps between two points (3,) m at the highest speed."""
 
+    def scaled(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return points (n, 3) m in units of the action, and the motion (n, 3, 3) m of P a unit."""
+
 
 class CartesianControl:
     """Actions are increments of point P along x, y, z, in units of the machine's step limit."""
@@ -69,6 +72,10 @@ class CartesianControl:
     def steps(self, wanted: FloatArray, current: FloatArray) -> float:
         """Count the steps of the axis that has farthest to go."""
         return float((np.abs(wanted - current) / self._step).max())
+
+    def scaled(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Divide by the step limit."""
+        return points / self._step, np.tile(np.diag(self._step), (len(points), 1, 1))
 
 
 class JointControl:
@@ -157,6 +164,11 @@ class JointControl:
         turns = np.abs(np.diff(theta, axis=0)).max() * _PARTS
         axes = (np.abs(wanted - current) / self._step).max()
         return float(max(turns / self._turn, axes))
+
+    def scaled(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Divide the joints by their limit; J is the motion."""
+        theta, limit = self._machine.inverse(points), self._machine.joint_limit
+        return theta / limit, self._machine.evaluate(theta).jacobian * limit
 
 
 def make_control(kind: str, machine: Machine, period: float = CONTROL_PERIOD) -> Control:

@@ -1,0 +1,268 @@
+"""Shield: the nearest command that keeps the machine away from singularities.
+
+In a control period, point P follows the Bezier curve from m to (c + d) / 2 with the control point c:
+c is the last command, d the next one, and m the middle of the last two commands. With the command d
+held, P then moves to d in a straight line. A command is safe if the conditioning 1/cond(J) stays at
+``least`` or above on both. So the last command held is always safe, and there is always a safe
+action.
+
+Curve and line lie in the triangle of m, c and d. The safe part of the region is almost convex, so
+the nearest command is mostly the nearest point of the surface ``conditioning = least``. It is found
+by sequential quadratic programming, and checked on the path. Where the check fails, the command is
+moved towards the last one.
+
+Importing this module imports Numba.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from tpm_gym.arrays import BoolArray, FloatArray, is_number
+from tpm_gym.compiling import kept
+from tpm_gym.errors import ConfigurationError
+from tpm_gym.mechanism.machine import Machine
+from tpm_gym.tasks.control import Control
+
+__all__ = ["Shield", "make_shield"]
+
+TOLERANCE: float = 2e-5
+"""Conditioning above ``least`` that is aimed at; half of it remains for the path between nodes."""
+_FAR = 1.25
+"""Times ``least``: three commands with more conditioning have a safe path between them."""
+_STEPS = 6  # of sequential quadratic programming
+_ROUNDS = 3  # of raising the aim where the path is less safe than its ends
+_HALVINGS = 20
+_SWEEPS = 200  # of the quadratic program, at most
+_NUDGE = 1e-4  # of a step, for derivatives of the conditioning
+
+
+def _nodes() -> FloatArray:
+    """Return weights (7, 3) of m, c, d for points on curve and line: one parabola in turn."""
+    s = np.arange(5)[:, None] / 4  # the curve (1-s)^2 m + 2 s (1-s) c + s^2 (c + d) / 2
+    curve = np.hstack([(1 - s) ** 2, 2 * s * (1 - s) + s**2 / 2, s**2 / 2])
+    return np.vstack([curve, [[0.0, 0.25, 0.75], [0.0, 0.0, 1.0]]])
+
+
+class Shield:
+    """Replacement of unsafe commands by the nearest safe ones, for n robots.
+
+    Distances are Euclidean, in units of the action: Cartesian control compares the increments of P,
+    joint control those of the joints, in their limits. What the control cuts off counts for nothing.
+    The distance is the smallest to about 0.002.
+
+    Args:
+        machine: Nominal machine.
+        control: Control of the environment.
+        least: Smallest conditioning on the path of the commands.
+
+    Raises:
+        ConfigurationError: If the machine's home has less.
+    """
+
+    def __init__(self, machine: Machine, control: Control, least: float) -> None:
+        """Check that home is safe."""
+        self._machine, self._control, self.least = machine, control, least
+        self._nodes, self._step = _nodes(), np.array(machine.step_limit)
+        self._low, self._high = np.array(machine.region.low), np.array(machine.region.high)
+        # The last commands, and how many in turn have been far from the border: a cache, so that
+        # these commands are not computed again.
+        self._last: FloatArray = np.empty((0, 2, 3))
+        self._far = np.empty(0, dtype=np.int64)
+        home = float(machine.conditioning_at(machine.home))
+        if home < least + TOLERANCE:
+            valid = f"at most {home - TOLERANCE:.3g}, the conditioning of {machine.name!r} at home"
+            raise ConfigurationError("shield", least, valid)
+
+    def command(self, wanted: FloatArray, recent: FloatArray) -> FloatArray:
+        """Return the safe commands (n, 3) m that are nearest to the wanted ones.
+
+        Args:
+            wanted: (n, 3) m, commands by the control, machine's frame.
+            recent: (n, 2, 3) m, the last two commands.
+        """
+        if len(self._last) != len(recent):
+            self._last, self._far = np.full_like(recent, np.nan), np.zeros(len(recent), np.int64)
+        self._far[(self._last != recent).any(axis=(1, 2))] = 0
+        far = self._machine.conditioning_at(wanted) >= _FAR * self.least
+        rows = np.flatnonzero(~far | (self._far < 2))
+        command = wanted
+        if len(rows):
+            command = wanted.copy()
+            corners = np.stack([recent.mean(axis=1), recent[:, 1], wanted], axis=1)[rows]
+            rows, corners = _chosen(self._lack(corners) > 0, rows, corners)
+            if len(rows):
+                command[rows] = self._nearest(corners)
+                far[rows] = False
+        self._far = np.where(far, self._far + 1, 0)
+        self._last = np.stack([recent[:, 1], command], axis=1)
+        return command
+
+    def _lack(self, corners: FloatArray) -> FloatArray:
+        """Return the conditioning (r,) that the path with corners (r, 3, 3) m, c, d lacks."""
+        points = placed(corners, self._nodes)
+        return self.least + TOLERANCE / 2 - lowest(self._machine.conditioning_at(points))
+
+    def _nearest(self, corners: FloatArray) -> FloatArray:
+        """Return the safe commands (r, 3) m nearest to the corners d."""
+        wanted, found = corners[:, 2].copy(), corners.copy()
+        aim = np.full(len(corners), self.least + TOLERANCE)
+        rows = np.arange(len(corners))
+        for _ in range(_ROUNDS):
+            own = corners[rows]
+            for _ in range(_STEPS):
+                own[:, 2] = self._improved(own, wanted[rows], aim[rows])
+            found[rows] = own
+            lack = self._lack(own)
+            aim[rows] += 2 * np.maximum(lack, 0.0)
+            (rows,) = _chosen(lack > 0, rows)
+            if not len(rows):
+                return found[:, 2]
+        found[rows, 2] = self._shortened(found[rows])
+        return found[:, 2]
+
+    def _improved(self, corners: FloatArray, wanted: FloatArray, aim: FloatArray) -> FloatArray:
+        """Return commands (r, 3) m after a step of sequential quadratic programming."""
+        last, point = corners[:, 1], np.ascontiguousarray(corners[:, 2])
+        beside = np.concatenate([np.zeros((1, 3)), np.diag(self._step * _NUDGE)])
+        values = self._machine.conditioning_at(point[:, None] + beside)
+        slope = (values[:, 1:] - values[:, :1]) / np.diag(beside[1:])
+        here, rate = self._control.scaled(point)
+        there, start = self._control.scaled(wanted)[0], self._control.scaled(last)[0]
+        low = np.maximum(self._low, last - self._step)
+        high = np.minimum(self._high, last + self._step)
+        return solved(point, here, there, start, rate, slope, aim - values[:, 0], low, high)
+
+    def _shortened(self, corners: FloatArray) -> FloatArray:
+        """Return the safe commands (r, 3) m farthest from c on the straight line from c to d."""
+        tried = corners.copy()
+        last, whole = corners[:, 1], corners[:, 2] - corners[:, 1]
+        low, high = np.zeros((len(corners), 1)), np.ones((len(corners), 1))
+        for _ in range(_HALVINGS):
+            middle = (low + high) / 2
+            tried[:, 2] = last + middle * whole
+            safe = self._lack(tried)[:, None] <= 0
+            low, high = np.where(safe, middle, low), np.where(safe, high, middle)
+        shortened: FloatArray = last + low * whole
+        return shortened
+
+
+def make_shield(shield: Any, machine: Machine, control: Control) -> Shield:
+    """Return the shield of an environment's option.
+
+    Raises:
+        ConfigurationError: If the option is neither True nor a conditioning below home's.
+    """
+    least = machine.safe_conditioning if shield is True else shield
+    if not is_number(least) or not 0 < least <= 1:
+        valid = "False, True, or a conditioning in (0, 1] to keep"
+        raise ConfigurationError("shield", shield, valid)
+    return Shield(machine, control, float(least))
+
+
+def _chosen(which: BoolArray, *arrays: FloatArray) -> list[FloatArray]:
+    return [array[which] for array in arrays]
+
+
+@kept
+def placed(corners: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return points (r, k, 3) with weights (k, 3) of corners (r, 3, 3)."""
+    points = np.empty((len(corners), len(weights), 3))
+    for row in range(len(corners)):
+        for k in range(len(weights)):
+            for axis in range(3):
+                points[row, k, axis] = (
+                    weights[k, 0] * corners[row, 0, axis]
+                    + weights[k, 1] * corners[row, 1, axis]
+                    + weights[k, 2] * corners[row, 2, axis]
+                )
+    return points
+
+
+@kept
+def lowest(values: FloatArray) -> FloatArray:
+    """Return the smallest values (r,) of curve and line that pass through nodes (r, 7).
+
+    Between nodes they are the parabolas through each three in turn.
+    """
+    found = np.empty(len(values))
+    for row in range(len(values)):
+        least = min(values[row, 0], values[row, 6])
+        for k in (1, 2, 3, 5):
+            one, two, three = values[row, k - 1], values[row, k], values[row, k + 1]
+            bend, rise = one - 2 * two + three, (three - one) / 2
+            least = min(least, two)
+            if bend > abs(rise):  # the lowest point lies between the three
+                least = min(least, two - rise * rise / (2 * bend))
+        least = min(least, values[row, 4])
+        found[row] = least if least == least else -np.inf
+    return found
+
+
+@kept
+def solved(
+    point: FloatArray,
+    here: FloatArray,
+    there: FloatArray,
+    start: FloatArray,
+    rate: FloatArray,
+    slope: FloatArray,
+    lack: FloatArray,
+    low: FloatArray,
+    high: FloatArray,
+) -> FloatArray:
+    """Return the points (r, 3) m nearest to the wanted ones, where the conditioning is linearised.
+
+    Hildreth's method: each constraint in turn is fulfilled, or relaxed as far as it has pushed.
+
+    Args:
+        point: (r, 3) m, where the conditioning is linearised.
+        here: (r, 3), the same in units of the action.
+        there: (r, 3), the wanted points.
+        start: (r, 3), the last commands.
+        rate: (r, 3, 3) m, motion of P for unit actions.
+        slope: (r, 3) 1/m, gradient of the conditioning.
+        lack: (r,) conditioning that is lacking at ``point``.
+        low: (r, 3) m, lower corner of the points that the control can command.
+        high: (r, 3) m, upper corner.
+    """
+    found = np.empty_like(point)
+    normal, bound, push = np.zeros((13, 3)), np.zeros(13), np.zeros(13)
+    for row in range(len(point)):
+        for i in range(3):
+            normal[12, i] = 0.0
+            for k in range(3):
+                normal[12, i] += slope[row, k] * rate[row, k, i]
+                normal[i, k], normal[3 + i, k] = rate[row, i, k], -rate[row, i, k]
+            normal[6 + i, i], normal[9 + i, i] = 1.0, -1.0
+            limit = max(1.0, abs(there[row, i] - start[row, i]))
+            done = here[row, i] - start[row, i]
+            bound[i], bound[3 + i] = low[row, i] - point[row, i], point[row, i] - high[row, i]
+            bound[6 + i], bound[9 + i] = -limit - done, done - limit
+        bound[12] = lack[row]
+        push[:] = 0.0
+        move = there[row] - here[row]
+        for _ in range(_SWEEPS):
+            change = 0.0
+            for k in range(13):
+                a, b, c = normal[k]
+                size = a * a + b * b + c * c
+                if size > 0.0:
+                    missing = bound[k] - (a * move[0] + b * move[1] + c * move[2])
+                    more = max(missing / size, -push[k])
+                    push[k] += more
+                    move[0] += more * a
+                    move[1] += more * b
+                    move[2] += more * c
+                    change = max(change, abs(more) * np.sqrt(size))
+            if change < 1e-9:
+                break
+        for i in range(3):
+            moved = point[row, i]
+            for k in range(3):
+                moved += rate[row, i, k] * move[k]
+            moved = moved if moved == moved else point[row, i]  # without an inverse or a Jacobian
+            found[row, i] = min(max(moved, low[row, i]), high[row, i])
+    return found
