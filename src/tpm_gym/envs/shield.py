@@ -16,11 +16,11 @@ Importing this module imports Numba.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from tpm_gym.arrays import BoolArray, FloatArray, is_number
+from tpm_gym.arrays import FloatArray, is_number
 from tpm_gym.compiling import kept
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.machine import Machine
@@ -30,9 +30,10 @@ __all__ = ["Shield", "make_shield"]
 
 TOLERANCE: float = 2e-5
 """Conditioning above ``least`` that is aimed at; half of it remains for the path between nodes."""
-_FAR = 1.25
+_FAR = 1.05
 """Times ``least``: three commands with more conditioning have a safe path between them."""
-_STEPS = 6  # of sequential quadratic programming
+_STEPS = 6  # of sequential quadratic programming, at most
+_CLOSE = 0.005  # last step, in units of the action: the next one would be a hundredth
 _ROUNDS = 3  # of raising the aim where the path is less safe than its ends
 _HALVINGS = 20
 _SWEEPS = 200  # of the quadratic program, at most
@@ -44,6 +45,24 @@ def _nodes() -> FloatArray:
     s = np.arange(5)[:, None] / 4  # the curve (1-s)^2 m + 2 s (1-s) c + s^2 (c + d) / 2
     curve = np.hstack([(1 - s) ** 2, 2 * s * (1 - s) + s**2 / 2, s**2 / 2])
     return np.vstack([curve, [[0.0, 0.25, 0.75], [0.0, 0.0, 1.0]]])
+
+
+class Problem(NamedTuple):
+    """Nearest safe commands of r robots that are looked for.
+
+    Attributes:
+        wanted: (r, 3) wanted commands, in units of the action.
+        last: (r, 3) last commands, in units of the action.
+        low: (r, 3) m, lower corner of the commands that the control can give.
+        high: (r, 3) m, upper corner.
+        aim: (r,) conditioning at the commands.
+    """
+
+    wanted: FloatArray
+    last: FloatArray
+    low: FloatArray
+    high: FloatArray
+    aim: FloatArray
 
 
 class Shield:
@@ -92,10 +111,10 @@ class Shield:
         if len(rows):
             command = wanted.copy()
             corners = np.stack([recent.mean(axis=1), recent[:, 1], wanted], axis=1)[rows]
-            rows, corners = _chosen(self._lack(corners) > 0, rows, corners)
-            if len(rows):
-                command[rows] = self._nearest(corners)
-                far[rows] = False
+            unsafe = self._lack(corners) > 0
+            if unsafe.any():
+                rows = rows[unsafe]
+                command[rows], far[rows] = self._nearest(corners[unsafe]), False
         self._far = np.where(far, self._far + 1, 0)
         self._last = np.stack([recent[:, 1], command], axis=1)
         return command
@@ -107,33 +126,40 @@ class Shield:
 
     def _nearest(self, corners: FloatArray) -> FloatArray:
         """Return the safe commands (r, 3) m nearest to the corners d."""
-        wanted, found = corners[:, 2].copy(), corners.copy()
-        aim = np.full(len(corners), self.least + TOLERANCE)
+        last, found = corners[:, 1], corners.copy()
+        of = Problem(
+            self._control.scaled(corners[:, 2]),
+            self._control.scaled(last),
+            np.maximum(self._low, last - self._step),
+            np.minimum(self._high, last + self._step),
+            np.full(len(corners), self.least + TOLERANCE),
+        )
         rows = np.arange(len(corners))
         for _ in range(_ROUNDS):
-            own = corners[rows]
-            for _ in range(_STEPS):
-                own[:, 2] = self._improved(own, wanted[rows], aim[rows])
-            found[rows] = own
-            lack = self._lack(own)
-            aim[rows] += 2 * np.maximum(lack, 0.0)
-            (rows,) = _chosen(lack > 0, rows)
+            found[rows, 2] = self._solution(found[rows, 2], Problem(*(part[rows] for part in of)))
+            lack = self._lack(found[rows])
+            of.aim[rows] += 2 * np.maximum(lack, 0.0)
+            rows = rows[lack > 0]
             if not len(rows):
                 return found[:, 2]
         found[rows, 2] = self._shortened(found[rows])
         return found[:, 2]
 
-    def _improved(self, corners: FloatArray, wanted: FloatArray, aim: FloatArray) -> FloatArray:
-        """Return commands (r, 3) m after a step of sequential quadratic programming."""
-        last, point = corners[:, 1], np.ascontiguousarray(corners[:, 2])
+    def _solution(self, points: FloatArray, of: Problem) -> FloatArray:
+        """Return the commands (r, 3) m that solve problems, by sequential quadratic programming."""
+        found, rows = points.copy(), np.arange(len(points))
         beside = np.concatenate([np.zeros((1, 3)), np.diag(self._step * _NUDGE)])
-        values = self._machine.conditioning_at(point[:, None] + beside)
-        slope = (values[:, 1:] - values[:, :1]) / np.diag(beside[1:])
-        here, rate = self._control.scaled(point)
-        there, start = self._control.scaled(wanted)[0], self._control.scaled(last)[0]
-        low = np.maximum(self._low, last - self._step)
-        high = np.minimum(self._high, last + self._step)
-        return solved(point, here, there, start, rate, slope, aim - values[:, 0], low, high)
+        for _ in range(_STEPS):
+            values = self._machine.conditioning_at(points[:, None] + beside)
+            slope = (values[:, 1:] - values[:, :1]) / (self._step * _NUDGE)
+            here, rate = self._control.scaled(points), self._control.rate(points)
+            points, moved = solved(points, here, rate, slope, of.aim - values[:, 0], *of[:4])
+            found[rows] = points
+            going = moved > _CLOSE
+            if not going.any():
+                break
+            rows, points, of = rows[going], points[going], Problem(*(part[going] for part in of))
+        return found
 
     def _shortened(self, corners: FloatArray) -> FloatArray:
         """Return the safe commands (r, 3) m farthest from c on the straight line from c to d."""
@@ -160,10 +186,6 @@ def make_shield(shield: Any, machine: Machine, control: Control) -> Shield:
         valid = "False, True, or a conditioning in (0, 1] to keep"
         raise ConfigurationError("shield", shield, valid)
     return Shield(machine, control, float(least))
-
-
-def _chosen(which: BoolArray, *arrays: FloatArray) -> list[FloatArray]:
-    return [array[which] for array in arrays]
 
 
 @kept
@@ -205,30 +227,33 @@ def lowest(values: FloatArray) -> FloatArray:
 def solved(
     point: FloatArray,
     here: FloatArray,
-    there: FloatArray,
-    start: FloatArray,
     rate: FloatArray,
     slope: FloatArray,
     lack: FloatArray,
+    wanted: FloatArray,
+    last: FloatArray,
     low: FloatArray,
     high: FloatArray,
-) -> FloatArray:
-    """Return the points (r, 3) m nearest to the wanted ones, where the conditioning is linearised.
+) -> tuple[FloatArray, FloatArray]:
+    """Solve problems with linearised conditioning, by Hildreth's method.
 
-    Hildreth's method: each constraint in turn is fulfilled, or relaxed as far as it has pushed.
+    Each constraint in turn is fulfilled, or relaxed as far as it has pushed.
 
     Args:
         point: (r, 3) m, where the conditioning is linearised.
         here: (r, 3), the same in units of the action.
-        there: (r, 3), the wanted points.
-        start: (r, 3), the last commands.
         rate: (r, 3, 3) m, motion of P for unit actions.
         slope: (r, 3) 1/m, gradient of the conditioning.
         lack: (r,) conditioning that is lacking at ``point``.
-        low: (r, 3) m, lower corner of the points that the control can command.
-        high: (r, 3) m, upper corner.
+        wanted: See :class:`Problem`, as for the others.
+        last: See there.
+        low: See there.
+        high: See there.
+
+    Returns:
+        Points (r, 3) m, and how far (r,) they are from ``point`` in units of the action.
     """
-    found = np.empty_like(point)
+    found, moved = np.empty_like(point), np.empty(len(point))
     normal, bound, push = np.zeros((13, 3)), np.zeros(13), np.zeros(13)
     for row in range(len(point)):
         for i in range(3):
@@ -237,13 +262,13 @@ def solved(
                 normal[12, i] += slope[row, k] * rate[row, k, i]
                 normal[i, k], normal[3 + i, k] = rate[row, i, k], -rate[row, i, k]
             normal[6 + i, i], normal[9 + i, i] = 1.0, -1.0
-            limit = max(1.0, abs(there[row, i] - start[row, i]))
-            done = here[row, i] - start[row, i]
+            limit = max(1.0, abs(wanted[row, i] - last[row, i]))
+            done = here[row, i] - last[row, i]
             bound[i], bound[3 + i] = low[row, i] - point[row, i], point[row, i] - high[row, i]
             bound[6 + i], bound[9 + i] = -limit - done, done - limit
         bound[12] = lack[row]
         push[:] = 0.0
-        move = there[row] - here[row]
+        move = wanted[row] - here[row]
         for _ in range(_SWEEPS):
             change = 0.0
             for k in range(13):
@@ -257,12 +282,13 @@ def solved(
                     move[1] += more * b
                     move[2] += more * c
                     change = max(change, abs(more) * np.sqrt(size))
-            if change < 1e-9:
+            if change < 1e-6:
                 break
+        moved[row] = np.sqrt(move[0] ** 2 + move[1] ** 2 + move[2] ** 2)
         for i in range(3):
-            moved = point[row, i]
+            there = point[row, i]
             for k in range(3):
-                moved += rate[row, i, k] * move[k]
-            moved = moved if moved == moved else point[row, i]  # without an inverse or a Jacobian
-            found[row, i] = min(max(moved, low[row, i]), high[row, i])
-    return found
+                there += rate[row, i, k] * move[k]
+            there = there if there == there else point[row, i]  # without an inverse or a Jacobian
+            found[row, i] = min(max(there, low[row, i]), high[row, i])
+    return found, moved

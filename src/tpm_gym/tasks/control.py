@@ -42,8 +42,11 @@ class Control(Protocol):
     def steps(self, wanted: FloatArray, current: FloatArray) -> float:
         """Return the number of control steps between two points (3,) m at the highest speed."""
 
-    def scaled(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return points (n, 3) m in units of the action, and the motion (n, 3, 3) m of P a unit."""
+    def scaled(self, points: FloatArray) -> FloatArray:
+        """Return the places (n, 3) of points (n, 3) m, whose differences are actions."""
+
+    def rate(self, points: FloatArray) -> FloatArray:
+        """Return the motion of P at points (n, 3) m for unit actions, (n, 3, 3) m."""
 
 
 class CartesianControl:
@@ -73,9 +76,13 @@ class CartesianControl:
         """Count the steps of the axis that has farthest to go."""
         return float((np.abs(wanted - current) / self._step).max())
 
-    def scaled(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def scaled(self, points: FloatArray) -> FloatArray:
         """Divide by the step limit."""
-        return points / self._step, np.tile(np.diag(self._step), (len(points), 1, 1))
+        return points / self._step
+
+    def rate(self, points: FloatArray) -> FloatArray:
+        """Repeat the step limit, on the diagonal."""
+        return np.tile(np.diag(self._step), (len(points), 1, 1))
 
 
 class JointControl:
@@ -165,10 +172,14 @@ class JointControl:
         axes = (np.abs(wanted - current) / self._step).max()
         return float(max(turns / self._turn, axes))
 
-    def scaled(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Divide the joints by their limit; J is the motion."""
-        theta, limit = self._machine.inverse(points), self._machine.joint_limit
-        return theta / limit, self._machine.evaluate(theta).jacobian * limit
+    def scaled(self, points: FloatArray) -> FloatArray:
+        """Divide the joints by their limit."""
+        return self._machine.inverse(points) / self._machine.joint_limit
+
+    def rate(self, points: FloatArray) -> FloatArray:
+        """Multiply J by the joint limit."""
+        theta = self._machine.inverse(points)
+        return self._machine.evaluate(theta).jacobian * self._machine.joint_limit
 
 
 def make_control(kind: str, machine: Machine, period: float = CONTROL_PERIOD) -> Control:
