@@ -32,6 +32,8 @@ CASES: list[tuple[str, dict[str, Any]]] = [
     ),
     ("TPMPickAndPlaceJoints-v0", {"drive": "servo", "randomisation": EVERYTHING | OF_SERVOS}),
     ("TPMPickAndPlace-v0", {"machine": "gantry"}),
+    ("TPMPickAndPlaceJoints-v0", {"engine": "analytic", "shield": True, "goals": "tempting"}),
+    ("TPMPickAndPlace-v0", {"drive": "servo", "shield": True, "randomisation": {"latency": 2}}),
     ("TPMReach-v0", {"engine": "kinematic"}),
     ("TPMPickAndPlaceJoints-v0", {"engine": "kinematic"}),
 ]

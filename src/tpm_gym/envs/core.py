@@ -108,7 +108,8 @@ class Core:
         if shield is not False:
             from tpm_gym.envs.shield import make_shield  # imports Numba
 
-            self._shield = make_shield(shield, self.machine, self.control)
+            exact = self.drive is None and not self._altered
+            self._shield = make_shield(shield, self.machine, self.control, exact)
         self._rendering = Rendering(self.machine, render_mode, camera, width, height)
         self._pixels: Pixels | None = None
         if observations == "pixels":

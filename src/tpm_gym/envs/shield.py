@@ -1,15 +1,14 @@
 """Shield: the nearest command that keeps the machine away from singularities.
 
-In a control period, point P follows the Bezier curve from m to (c + d) / 2 with the control point c:
-c is the last command, d the next one, and m the middle of the last two commands. With the command d
-held, P then moves to d in a straight line. A command is safe if the conditioning 1/cond(J) stays at
-``least`` or above on both. So the last command held is always safe, and there is always a safe
-action.
+Let c be the last command, d the next one, and m the middle of the last two commands. In a control
+period, point P follows the Bezier curve with the control points m, c and (c + d) / 2. If d is held
+then, P moves on to d in a straight line. The command d is safe if the conditioning 1/cond(J) stays
+at ``least`` or above on both. So it is always safe to hold the last command.
 
-Curve and line lie in the triangle of m, c and d. The safe part of the region is almost convex, so
-the nearest command is mostly the nearest point of the surface ``conditioning = least``. It is found
-by sequential quadratic programming, and checked on the path. Where the check fails, the command is
-moved towards the last one.
+Curve and line lie in the triangle of m, c and d. The safe part of the region is almost convex.
+Therefore the nearest command is mostly the nearest point of the surface ``conditioning = least``.
+It is found by sequential quadratic programming, and the path is checked. Where the check fails, the
+aim is raised, and at last the command is moved towards the last one.
 
 Importing this module imports Numba.
 """
@@ -28,7 +27,9 @@ from tpm_gym.tasks.control import Control
 
 __all__ = ["Shield", "make_shield"]
 
-TOLERANCE: float = 2e-5
+MARGIN = 0.15
+"""Fraction of the safe conditioning that is kept besides with servo drives or other plants."""
+TOLERANCE = 2e-5
 """Conditioning above ``least`` that is aimed at; half of it remains for the path between nodes."""
 _FAR = 1.05
 """Times ``least``: three commands with more conditioning have a safe path between them."""
@@ -68,9 +69,9 @@ class Problem(NamedTuple):
 class Shield:
     """Replacement of unsafe commands by the nearest safe ones, for n robots.
 
-    Distances are Euclidean, in units of the action: Cartesian control compares the increments of P,
-    joint control those of the joints, in their limits. What the control cuts off counts for nothing.
-    The distance is the smallest to about 0.002.
+    Distances between commands are Euclidean, in units of the action: of increments of P with
+    Cartesian control, of the joints with joint control. What the control cuts off from an action
+    does not count. A nearer safe command is nearer by some 0.001 at most.
 
     Args:
         machine: Nominal machine.
@@ -175,13 +176,21 @@ class Shield:
         return shortened
 
 
-def make_shield(shield: Any, machine: Machine, control: Control) -> Shield:
+def make_shield(shield: Any, machine: Machine, control: Control, exact: bool) -> Shield:
     """Return the shield of an environment's option.
+
+    Args:
+        shield: True, or the conditioning to keep.
+        machine: Nominal machine.
+        control: Control of the environment.
+        exact: Whether the robot follows its commands exactly; else True keeps a ``MARGIN``.
 
     Raises:
         ConfigurationError: If the option is neither True nor a conditioning below home's.
     """
-    least = machine.safe_conditioning if shield is True else shield
+    least = shield
+    if shield is True:
+        least = machine.safe_conditioning * (1 if exact else 1 + MARGIN)
     if not is_number(least) or not 0 < least <= 1:
         valid = "False, True, or a conditioning in (0, 1] to keep"
         raise ConfigurationError("shield", shield, valid)

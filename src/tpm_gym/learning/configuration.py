@@ -66,6 +66,9 @@ class EnvOptions:
     ] = UNSET
     """Motors: ideal ones follow every command exactly, servo drives have limited torque."""
 
+    shield: bool = False
+    """Replace actions by the nearest ones that keep clear of singularities."""
+
     @property
     def in_batches(self) -> bool:
         """Whether one process steps many environments at once."""
@@ -73,7 +76,7 @@ class EnvOptions:
 
     def given(self) -> dict[str, Any]:
         """Return the options that are given, as arguments of an environment."""
-        return {name: value for name, value in vars(self).items() if value is not UNSET}
+        return {name: value for name, value in vars(self).items() if value not in (UNSET, False)}
 
 
 @dataclass(frozen=True)

@@ -148,7 +148,7 @@ def _check(config: EvaluationConfig) -> None:
 
 
 def _complete(config: EvaluationConfig) -> EvaluationConfig:
-    """Take environment, machine and drive from the policies if they are not given."""
+    """Take environment, machine, drive and shield from the policies if they are not given."""
     trained = {spec: found for spec in config.policy if (found := trained_in(spec)) is not None}
     if config.env is UNSET:
         if not trained:
@@ -158,16 +158,17 @@ def _complete(config: EvaluationConfig) -> EvaluationConfig:
         env_id = config.env
         import_module_of(env_id)
     given, usual = config.env_options.given(), _conditions(env_id, {})
-    for name in ("machine", "drive"):
+    for name in ("machine", "drive", "shield"):
         if name in given:
             continue
-        values = {spec: options.get(name, usual[name]) for spec, (_, options) in trained.items()}
-        if values and (value := _common(name, values)) != usual[name]:
+        own = usual.get(name, False)
+        values = {spec: options.get(name, own) for spec, (_, options) in trained.items()}
+        if values and (value := _common(name, values)) != own:
             given[name] = value
     return replace(config, env=env_id, env_options=EnvOptions(**given))
 
 
-def _common(option: str, values: Mapping[str, str]) -> str:
+def _common(option: str, values: Mapping[str, Any]) -> Any:
     """Return the value of an option that all policies share; refuse different values."""
     found = set(values.values())
     if len(found) > 1:
@@ -177,8 +178,10 @@ def _common(option: str, values: Mapping[str, str]) -> str:
 
 
 def _conditions(env_id: str, given: Mapping[str, Any]) -> dict[str, str]:
-    """Return the names of machine, engine and drive, by default the id's."""
+    """Return the names of machine, engine and drive, by default the id's, and a shield, if any."""
     usual = {"machine": "paper", "engine": "pybullet", "drive": "ideal"}
+    if given.get("shield"):
+        usual["shield"] = "True"
     own = check_env_id(env_id).kwargs
     found = {name: given.get(name) or own.get(name) or value for name, value in usual.items()}
     return {name: str(getattr(value, "name", value)) for name, value in found.items()}

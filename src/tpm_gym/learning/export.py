@@ -40,7 +40,7 @@ def save(
     env_id: str,
     seed: int | None,
     recipe: Mapping[str, Any],
-    env_options: Mapping[str, str] | None = None,
+    env_options: Mapping[str, Any] | None = None,
     versions: Mapping[str, str | None] | None = None,
 ) -> Path:
     """Write the policy of a model as ``path``.safetensors and ``path``.json; return the latter.
@@ -51,7 +51,7 @@ def save(
     Args:
         model: SAC, TQC or PPO with a MultiInputPolicy.
         path: Common name of the files. An earlier policy is replaced.
-        env_options: Machine, engine and drive of the training, if they are not the id's.
+        env_options: Machine, engine, drive and shield of the training, if they are not the id's.
         versions: Versions at training; by default the installed ones.
 
     Raises:

@@ -87,7 +87,7 @@ def load_policy(spec: str, envs: TPMVectorEnv) -> Policy:
     return TrainedPolicy(policy)
 
 
-def trained_in(spec: str) -> tuple[str, dict[str, str]] | None:
+def trained_in(spec: str) -> tuple[str, dict[str, Any]] | None:
     """Return the environment id and its options that a policy was trained with, if any."""
     if spec in SCRIPTED:
         return None

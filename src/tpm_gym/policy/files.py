@@ -103,14 +103,14 @@ class Weights(_Entries):
 class Description(_Entries):
     """Everything about a policy except its weights.
 
-    ``env_options`` are machine, engine and drive of the training if they differ from the id's.
-    ``seed`` is None if it is not known, a version if the package was not installed.
+    ``env_options`` are machine, engine, drive and shield of the training if they differ from the
+    id's. ``seed`` is None if it is not known, a version if the package was not installed.
     """
 
     format: Literal["tpm_gym.policy"]
     version: Literal[1]
     env_id: _Name = Field(alias="env")
-    env_options: dict[Literal["machine", "engine", "drive"], _Name] = {}
+    env_options: dict[Literal["machine", "engine", "drive", "shield"], _Name | bool] = {}
     algorithm: _Name
     seed: _Count | None
     steps: _Count
