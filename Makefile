@@ -4,7 +4,7 @@ VENV := .venv
 RUN := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
 
-.PHONY: help demo test lint format compiled test-fast test-slow test-wheel docs urdf pictures figures gradients results bench-kinematics bench-engine bench-long bench-limits bench-transfer bench-engines bench-fidelity bench-evaluate bench-conveyor bench-speed bench-first soak clean
+.PHONY: help demo test lint format compiled test-fast test-slow test-wheel docs urdf pictures figures gradients results bench-kinematics bench-engine bench-long bench-limits bench-transfer bench-engines bench-fidelity bench-evaluate bench-conveyor bench-speed bench-shield bench-first soak clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -102,6 +102,11 @@ bench-transfer: $(INSTALLED) ## policies trained in one engine (the runs in runs
 
 bench-first: $(INSTALLED) ## from the start of Python to the first step, with and without compiled code on disk
 	$(RUN) benchmarks/bench_first.py
+
+bench-shield: $(INSTALLED) ## the shield: violations, margins, cost, policies; hours with training
+	for seed in 0 1 2 3 4; do $(VENV)/bin/tpm-gym train --algo ppo --engine analytic --env TPMReachJointsDense-v0 \
+		--goals tempting --shield --test-episodes 0 --seed $$seed --run runs/shield/s$$seed --overwrite; done
+	$(RUN) benchmarks/bench_shield.py
 
 bench-speed: $(INSTALLED) ## steps per second beside panda-gym and Gymnasium-Robotics
 	$(RUN) -m pip install -c constraints.txt -e ".[bench]"

@@ -32,6 +32,7 @@ FILLED = {
     "docs/speed.md": ["speed", "analytic"],
     "docs/engines.md": ["engines"],
     "docs/transfer.md": ["transfer"],
+    "docs/shield.md": ["shield"],
 }
 RUN = [page for page in PAGES if blocks(page, "python") and page.name != "extending.md"]
 TYPED = [page for page in PAGES if blocks(page, "bash")]

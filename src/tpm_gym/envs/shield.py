@@ -142,13 +142,16 @@ class Shield:
             of.aim[rows] += 2 * np.maximum(lack, 0.0)
             rows = rows[lack > 0]
             if not len(rows):
-                return found[:, 2]
-        found[rows, 2] = self._shortened(found[rows])
-        return found[:, 2]
+                break
+        else:
+            found[rows, 2] = self._shortened(found[rows])
+        nearest: FloatArray = found[:, 2]
+        return nearest
 
     def _solution(self, points: FloatArray, of: Problem) -> FloatArray:
         """Return the commands (r, 3) m that solve problems, by sequential quadratic programming."""
-        found, rows = points.copy(), np.arange(len(points))
+        found: FloatArray = points.copy()
+        rows = np.arange(len(points))
         beside = np.concatenate([np.zeros((1, 3)), np.diag(self._step * _NUDGE)])
         for _ in range(_STEPS):
             values = self._machine.conditioning_at(points[:, None] + beside)

@@ -1,0 +1,355 @@
+"""Measure the shield: violations, what margins hold, cost, and success of policies.
+
+    make bench-shield
+    python benchmarks/bench_shield.py --part soak --steps 1000000000
+
+Parts:
+
+- soak: steps of random and adversarial actions in the analytic engine. After each step, the
+  conditioning is computed at 16 points of the path, and from the true joint positions.
+- engines: the same in PyBullet.
+- margins: the same with servo drives and other plants; the smallest true conditioning.
+- cost: steps with and without the shield, in turn.
+- policies: success of the published policies with and without it.
+- training: tests of the runs in ``--runs``, which were trained with ``--goals tempting``.
+
+Results go to docs/records/shield.json, and from there to docs/shield.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+from shared import ROOT, describe, fill, provenance, read_record, table
+
+from tpm_gym.learning.estimates import wilson
+from tpm_gym.learning.policies import load_policy
+from tpm_gym.learning.rollout import TEST_SEED, run_episodes
+from tpm_gym.simulation.engine import spline_weights
+
+RECORD, PAGE = ROOT / "docs" / "records" / "shield.json", ROOT / "docs" / "shield.md"
+PARTS = ("soak", "engines", "margins", "cost", "policies", "training")
+IDS = ("TPMReach-v0", "TPMReachJoints-v0")
+MACHINES = ("paper", "wide")
+PUBLISHED = ("TPMPickAndPlace-v0", "TPMPickAndPlaceJoints-v0", "TPMReach-v0")
+OTHERS: dict[str, dict[str, Any]] = {
+    "servo drives": {"drive": "servo"},
+    "servo drives, masses 0.8 to 1.25, torques 0.8 to 1, friction to 1 N m, noise 0.1 mrad": {
+        "drive": "servo",
+        "randomisation": {
+            "link_mass": (0.8, 1.25),
+            "motor_strength": (0.8, 1.0),
+            "joint_friction": (0.0, 1.0),
+            "encoder_noise": 1e-4,
+        },
+    },
+    "encoder bias 0.1 mrad": {"randomisation": {"encoder_bias": 1e-4}},
+    "encoder bias 1 mrad": {"randomisation": {"encoder_bias": 1e-3}},
+    "length errors 0.1 mm": {"randomisation": {"length_error": 1e-4}},
+    "length errors 0.5 mm": {"randomisation": {"length_error": 5e-4}},
+}
+
+
+class Hostile:
+    """Actions for n environments, a fifth of them of each kind.
+
+    Kinds: uniform; to the corners; corners held for 1 to 20 steps; the steepest descent of the
+    conditioning with noise; the descent to the corners, with x and z that turn back and forth.
+    """
+
+    def __init__(self, envs: Any, seed: int) -> None:
+        """Start with nothing held."""
+        self._envs, self._rng = envs, np.random.default_rng(seed)
+        self._shape: tuple[int, int] = (envs.num_envs, envs.single_action_space.shape[0])
+        self._held, self._left = np.zeros(self._shape), np.zeros(self._shape[0], dtype=int)
+
+    def draw(self, last: NDArray[Any]) -> NDArray[Any]:
+        """Return actions (n, k), for the last commands (n, 3) m."""
+        rng, kind = self._rng, np.arange(len(last)) % 5
+        actions = rng.uniform(-1, 1, self._shape)
+        corners = np.sign(actions)
+        self._left -= 1
+        new = self._left < 0
+        self._held[new], self._left[new] = corners[new], rng.integers(1, 20, int(new.sum()))
+        actions = np.where(kind[:, None] == 1, corners, actions)
+        actions = np.where(kind[:, None] == 2, self._held, actions)
+        down = np.flatnonzero(kind >= 3)
+        descent = self._descent(last[down])
+        noisy = descent + rng.normal(0, 0.3, descent.shape)
+        turning = np.sign(descent)
+        turning[:, [0, 2]] = self._held[down][:, [0, 2]]
+        actions[down, :3] = np.where(kind[down, None] == 3, noisy, turning)
+        return np.clip(actions, -1, 1)
+
+    def _descent(self, last: NDArray[Any]) -> NDArray[Any]:
+        """Return actions (r, 3) along the steepest descent, the largest entry at its limit."""
+        control, machine = self._envs.control, self._envs.machine
+        moved = [control.command(np.tile(one, (len(last), 1)), last) for one in 0.2 * np.eye(3)]
+        values = machine.conditioning_at(np.stack([last, *moved], axis=1))
+        slope = values[:, :1] - values[:, 1:]
+        found: NDArray[Any] = slope / np.maximum(np.abs(slope).max(axis=1, keepdims=True), 1e-12)
+        return found
+
+
+def soak(env_id: str, count: int, steps: int, seed: int, **options: Any) -> dict[str, Any]:
+    """Step ``count`` environments; return the smallest conditionings and how many were below."""
+    envs: Any = gym.make_vec(env_id, num_envs=count, max_episode_steps=250, shield=True, **options)
+    with closing(envs):
+        machine, weights = envs.machine, spline_weights(16)
+        safe, hostile = machine.safe_conditioning, Hostile(envs, seed)
+        envs.reset(seed=seed)
+        lows, below, done, changed = [np.inf, np.inf], 0, 0, 0
+        commands = np.repeat(machine.mount.to_paper(envs.state.command)[:, None], 3, axis=1)
+        while done < steps:
+            before = envs.episode
+            actions = hostile.draw(commands[:, 2])
+            asked = envs.control.command(actions[:, :3], commands[:, 2])
+            envs.step(actions)
+            going = envs.episode == before
+            now = machine.mount.to_paper(envs.state.command)
+            commands = np.concatenate([commands[:, 1:], now[:, None]], axis=1)
+            points = np.einsum("kc,nci->nki", weights, commands[going])
+            path, true = machine.conditioning_at(points).min(axis=1), _true(envs)[going]
+            for k, values in enumerate((path, true)):
+                lows[k] = min(lows[k], values.min(initial=np.inf))
+            below += int((np.minimum(path, true) < safe).sum())
+            changed += int((np.abs(asked - now) > 1e-9).any(axis=1)[going].sum())
+            done += int(going.sum())
+            commands[~going] = now[~going, None]
+    return {
+        "steps": done,
+        "path": lows[0],
+        "true": lows[1],
+        "below": below,
+        "changed": changed,
+    }
+
+
+def _true(envs: Any) -> NDArray[Any]:
+    """Return the conditioning (n,) of the true machines at their true joint positions."""
+    found = []
+    for part in envs._parts:
+        simulation = part.core.simulation
+        built = getattr(simulation.engine, "_built", None)
+        theta = simulation.state().theta - simulation._bias - simulation._noise[:, 1]
+        conditioning = envs.machine.evaluate(theta, built).conditioning
+        left = simulation.mode_left != 0
+        found.append(np.where(left | np.isnan(conditioning), 0.0, conditioning))
+    return np.concatenate(found)
+
+
+def soak_all(content: dict[str, Any], options: argparse.Namespace, engine: str) -> None:
+    """Soak ids and machines in turn, and write the sums after each."""
+    name, count = ("soak", 2000) if engine == "analytic" else ("engines", 4)
+    total = options.steps if engine == "analytic" else options.engine_steps
+    rows = content[name] = {}
+    turn, chunk = 0, min(total // 4, 500_000)
+    while sum(row["steps"] for row in rows.values()) < total:
+        env_id, machine = IDS[turn % 2], MACHINES[turn // 2 % 2]
+        found = soak(env_id, count, chunk, turn, engine=engine, machine=machine)
+        key = f"{env_id}, {machine}"
+        old = rows.setdefault(key, dict.fromkeys(found, 0) | {"path": np.inf, "true": np.inf})
+        for entry, value in found.items():
+            old[entry] = min(old[entry], value) if entry in ("path", "true") else old[entry] + value
+        turn += 1
+        write(content)
+
+
+def margins(content: dict[str, Any], options: argparse.Namespace) -> None:
+    """Soak with drives and plants that do not follow exactly."""
+    rows = content["margins"] = {}
+    for name, others in OTHERS.items():
+        for machine in MACHINES:
+            found = [
+                soak(
+                    env_id,
+                    500,
+                    options.other_steps // 2,
+                    0,
+                    engine="analytic",
+                    machine=machine,
+                    **others,
+                )
+                for env_id in IDS
+            ]
+            rows[f"{name}, {machine}"] = min(entry["true"] for entry in found)
+            write(content)
+
+
+def cost(content: dict[str, Any], options: argparse.Namespace) -> None:
+    """Time steps with and without the shield, and the shield alone; the least of ten rounds."""
+    rows = content["cost"] = {}
+    for env_id, engine, count, steps in (
+        ("TPMReach-v0", "analytic", 1024, 20),
+        ("TPMReachJoints-v0", "analytic", 1024, 20),
+        ("TPMPickAndPlace-v0", "analytic", 1024, 20),
+        ("TPMReach-v0", "pybullet", 1, 200),
+    ):
+        pair: list[Any] = [
+            gym.make_vec(env_id, num_envs=count, engine=engine, shield=on) for on in (False, True)
+        ]
+        rng, least = np.random.default_rng(0), [np.inf, np.inf]
+        for envs in pair:
+            envs.reset(seed=0)
+            for _ in range(25):
+                envs.step(rng.uniform(-1, 1, envs.action_space.shape))
+        for _ in range(10):
+            for k, envs in enumerate(pair):
+                actions = rng.uniform(-1, 1, (steps, *envs.action_space.shape))
+                begun = time.thread_time()
+                for own in actions:
+                    envs.step(own)
+                least[k] = min(least[k], (time.thread_time() - begun) / steps / count)
+        rows[f"{env_id}, {engine}, {count}"] = [1e9 * seconds for seconds in least]
+        for envs in pair:
+            envs.close()
+        write(content)
+
+
+def policies(content: dict[str, Any], options: argparse.Namespace) -> None:
+    """Test published policies with and without the shield, in PyBullet."""
+    rows = content["policies"] = {}
+    for policy in PUBLISHED:
+        for shield in (False, True):
+            rows[f"{policy}, {'shield' if shield else 'without'}"] = tested(
+                policy, policy, options.episodes, "pybullet", 1, shield=shield
+            )
+            write(content)
+
+
+def training(content: dict[str, Any], options: argparse.Namespace) -> None:
+    """Test the policies of training runs on tempting goals, as they were trained."""
+    rows = content["training"] = {}
+    for file in sorted(options.runs.glob("*/config.json")):
+        config = json.loads(file.read_text(encoding="utf-8"))
+        shield = bool(config["env_options"].get("shield"))
+        key = f"{config['env']}, {'shield' if shield else 'penalty alone'}"
+        for engine, count, episodes in (("analytic", 1000, 1000), ("pybullet", 1, 200)):
+            found = tested(
+                str(file.parent),
+                config["env"],
+                episodes,
+                engine,
+                count,
+                shield=shield,
+                goals="tempting",
+            )
+            rows.setdefault(key, {}).setdefault(engine, []).append(found)
+            write(content)
+
+
+def tested(
+    policy: str, env_id: str, episodes: int, engine: str, count: int, **options: Any
+) -> dict[str, Any]:
+    """Return success, and the share of steps below the safe conditioning."""
+    envs: Any = gym.make_vec(env_id, num_envs=count, engine=engine, **options)
+    with closing(envs):
+        records = run_episodes(envs, load_policy(policy, envs), episodes, TEST_SEED)
+    return {
+        "success": wilson([record.success_at_end for record in records]).as_dict(),
+        "penalised": float(np.mean([record.unsafe_share for record in records])),
+    }
+
+
+# -- record and page ------------------------------------------------------------------------------
+
+
+def write(content: dict[str, Any]) -> None:
+    """Write record and page, so that an interrupted run keeps its results."""
+    provenance.write_json(RECORD, content)
+    fill(PAGE, "shield", lines(content))
+
+
+def lines(content: dict[str, Any]) -> Iterator[str]:
+    """Yield the tables of the page."""
+    for name, title in (("soak", "analytic engine"), ("engines", "PyBullet")):
+        yield from section(
+            [f"{title}, ideal drives", "steps", "changed", "below 0.08", "least conditioning"],
+            [
+                [
+                    key,
+                    f"{row['steps']:,}",
+                    f"{row['changed'] / row['steps']:.0%}",
+                    str(row["below"]),
+                    f"{min(row['path'], row['true']):.5f}",
+                ]
+                for key, row in content.get(name, {}).items()
+            ],
+        )
+    yield from section(
+        ["servo drives and other plants, 15% margin", "least true conditioning"],
+        [[key, f"{low:.4f}"] for key, low in content.get("margins", {}).items()],
+    )
+    yield from section(
+        ["a step of one environment, ns of CPU", "without", "with the shield"],
+        [[key, *(f"{ns:,.0f}" for ns in pair)] for key, pair in content.get("cost", {}).items()],
+    )
+    yield from section(
+        ["published policy, in PyBullet", "success, 95% interval", "steps below 0.08"],
+        [
+            [key, _share(row), f"{row['penalised']:.2%}"]
+            for key, row in content.get("policies", {}).items()
+        ],
+    )
+    yield from section(
+        ["trained and tested on tempting goals", "success, median (all seeds)", "steps below 0.08"],
+        [
+            [f"{key}, {engine}", _median(found), f"{_mean_penalised(found):.2%}"]
+            for key, engines in content.get("training", {}).items()
+            for engine, found in engines.items()
+        ],
+    )
+
+
+def section(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
+    """Yield the lines of a table and an empty line; nothing for a part that was not measured."""
+    if rows:
+        yield from table(head, rows)
+        yield ""
+
+
+def _median(found: Sequence[dict[str, Any]]) -> str:
+    rates = sorted(row["success"]["mean"] for row in found)
+    return f"{np.median(rates):.1%} ({', '.join(f'{rate:.1%}' for rate in rates)})"
+
+
+def _mean_penalised(found: Sequence[dict[str, Any]]) -> float:
+    return float(np.mean([row["penalised"] for row in found]))
+
+
+def _share(row: dict[str, Any]) -> str:
+    mean, low, high = (100 * row["success"][name] for name in ("mean", "low", "high"))
+    return f"{mean:.1f}% [{low:.1f}, {high:.1f}]"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run parts and write record and page."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
+    parser.add_argument("--part", nargs="+", choices=PARTS, default=PARTS)
+    parser.add_argument("--steps", type=int, default=100_000_000, help="in the analytic engine")
+    parser.add_argument("--engine-steps", type=int, default=100_000, help="in PyBullet")
+    parser.add_argument("--other-steps", type=int, default=200_000, help="of each margin")
+    parser.add_argument("--episodes", type=int, default=200, help="of each published policy")
+    parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "shield")
+    options = parser.parse_args(arguments)
+    words = sys.argv if arguments is None else ["benchmarks/bench_shield.py", *arguments]
+    content = read_record(RECORD) | describe(words)
+    for part in options.part:
+        if part in ("soak", "engines"):
+            soak_all(content, options, "analytic" if part == "soak" else "pybullet")
+        else:
+            globals()[part](content, options)
+
+
+if __name__ == "__main__":
+    main()
