@@ -1,10 +1,12 @@
 """The Delta against root finders, differences, published numbers, its bodies and Pinocchio."""
 
+import importlib
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
+from mutated import functions_of, install
 from walk import gaps, place, walk
 
 from tpm_gym.errors import ConfigurationError, GeometryError, SingularityError, UnreachableError
@@ -434,3 +436,78 @@ def test_pinocchio_agrees_on_closures_masses_and_torques(tmp_path):
         torque = carried.T @ pin.rnea(model, data, posture, v, a)
         found = DELTA.torque(theta, rate, change)
         assert np.abs(found - torque).max() < 1e-6 * np.abs(torque).max()
+
+
+# Mutations
+
+EQUATIONS, DYNAMICS, BODIES = (
+    f"tpm_gym.mechanism.delta.{k}" for k in ("equations", "dynamics", "bodies")
+)
+FORWARD = partial(test_forward_misses_and_invents_no_solution, 1)
+INVERSE = partial(test_inverse_misses_and_invents_no_solution, 1)
+JACOBIAN = test_jacobian_is_the_derivative_of_the_position
+SINGULAR = test_the_closures_are_singular_where_parallel_or_constraint_factors_are_zero
+PASSIVE = partial(test_passive_angles_close_all_loops_in_every_mode, 1)
+POWER, WORK = (
+    test_power_is_the_change_of_energy,
+    test_torques_are_those_of_virtual_work_on_the_bodies,
+)
+MUTATIONS = [
+    (FORWARD, EQUATIONS, "leg[0] * v[1] + leg[1] * v[0]", "leg[0] * v[1] - leg[1] * v[0]"),
+    (FORWARD, EQUATIONS, "dot(a, a) / (2.0 * square)", "dot(a, b) / (2.0 * square)"),
+    (FORWARD, EQUATIONS, "g.l4 * g.l4 - dot(foot, foot)", "g.l4 * g.l4 + dot(foot, foot)"),
+    (INVERSE, EQUATIONS, "leg[0] * v[1] - leg[1] * v[0]", "leg[0] * v[1] + leg[1] * v[0]"),
+    (INVERSE, EQUATIONS, "arm(x2 + inner, z, y2, _1, g, ns)", "arm(x2 + inner, z, y1, _1, g, ns)"),
+    (INVERSE, EQUATIONS, "arm(x3 + inner, z, y3, _1, g, ns)", "arm(x3, z, y3, _1, g, ns)"),
+    (JACOBIAN, EQUATIONS, "z - sin", "z + sin"),
+    (JACOBIAN, EQUATIONS, "x + (g.l2 - g.l1) - cos", "x + (g.l2 - g.l1) + cos"),
+    (JACOBIAN, EQUATIONS, "r2[2] * cos[1] - r2[0] * sin[1]", "r2[2] * cos[1] + r2[0] * sin[1]"),
+    (JACOBIAN, EQUATIONS, "r3[2] * cos[2]", "r3[1] * cos[2]"),
+    (JACOBIAN, EQUATIONS, "(p * a[1], q * b[1], r * c[1])", "(p * a[1], q * b[2], r * c[1])"),
+    (JACOBIAN, EQUATIONS, "r / pose.parallel", "r * pose.parallel"),
+    (SINGULAR, EQUATIONS, "r1[0] * r2[2] * r3[2]", "r1[0] * r2[2] * r3[0]"),
+    (SINGULAR, EQUATIONS, "r1[2] * r2[0] * r3[2]", "r1[2] * r2[0] * r3[1]"),
+    (SINGULAR, EQUATIONS, "dot(bars[0], cross(bars[1], bars[2]))", "dot(bars[0], bars[2])"),
+    (PASSIVE, BODIES, "math.atan2(z, x) - angle", "math.atan2(z, x) + angle"),
+    (PASSIVE, BODIES, "y / l4", "x / l4"),
+    (WORK, BODIES, "couple + far", "far"),
+    (WORK, BODIES, "g.l3**2", "g.l3"),
+    (POWER, EQUATIONS, "h[1] / pose.parallel", "h[0] / pose.parallel"),
+    (POWER, EQUATIONS, "p * a[2] + q * b[2] + r * c[2]", "p * a[2] + q * b[2] - r * c[2]"),
+    (POWER, DYNAMICS, "m.platform * (a[2] - gravity[2])", "m.platform * a[2]"),
+    (POWER, DYNAMICS, "_drift(two, v2, rates[1])", "_drift(two, v1, rates[1])"),
+    (POWER, DYNAMICS, "dot(force, cross(three, one))", "dot(force, cross(one, three))"),
+    (POWER, DYNAMICS, "p * dot(force, cross(two, three))", "dot(force, cross(two, three))"),
+    (POWER, DYNAMICS, "one.motor + p * dot(a, a) + 2.0 * k1a", "one.motor + p * dot(a, a) + k1a"),
+    (POWER, DYNAMICS, "p * dot(b, c) + k2c", "p * dot(b, c) + k2b"),
+    (POWER, DYNAMICS, "two.weight + two.couple", "two.weight"),
+    (POWER, DYNAMICS, "m.platform + one.couple", "m.platform"),
+    (POWER, DYNAMICS, "x * leg.cos + z * leg.sin", "x * leg.cos - z * leg.sin"),
+    (POWER, DYNAMICS, "u * u + v[1] * v[1] + w * w", "u * u + w * w"),
+    (POWER, DYNAMICS, "_1 - weight * gz - up", "_1 - weight * gz + up"),
+    (POWER, DYNAMICS, "-sin * change - cos * rate * rate", "-sin * change + cos * rate * rate"),
+    (POWER, DYNAMICS, "leg.cos * v[2] - leg.sin * v[0]", "leg.cos * v[2] + leg.sin * v[0]"),
+    (POWER, DYNAMICS, "leg.couple * (_1 - _2)", "leg.weight * (_1 - _2)"),
+    (POWER, DYNAMICS, "x * x + z * z", "x * x"),
+    (POWER, DYNAMICS, "x * (v[2] - _1) - z * _2", "x * (v[2] - _1) + z * _2"),
+    (POWER, DYNAMICS, "leg.swing.spin * out * out", "leg.swing.spin * out"),
+    (POWER, DYNAMICS, "leg.swing.fixed + _1", "_1"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("test", "module", "right", "wrong"), MUTATIONS, ids=lambda v: str(v)[:40])
+def test_a_named_test_sees_two_mutations_of_each_formula(test, module, right, wrong):
+    """The functions of a module get other code while the test runs, and then their own again."""
+    functions = [
+        function
+        for value in vars(importlib.import_module(module)).values()
+        for function in functions_of(value).values()
+    ]
+    codes = [function.__code__ for function in functions]
+    try:
+        install(module, right, wrong)
+        with pytest.raises((AssertionError, ValueError)):
+            test()
+    finally:
+        for function, code in zip(functions, codes, strict=True):
+            function.__code__ = code

@@ -68,7 +68,7 @@ def _equal(pattern: Any, node: Any, found: dict[str, Any]) -> bool:
     return all(_equal(getattr(pattern, f), getattr(node, f), found) for f in fields)
 
 
-def _functions(value: Any) -> dict[str, FunctionType]:
+def functions_of(value: Any) -> dict[str, FunctionType]:
     """Return a function, or the functions and properties that a class defines."""
     found = {"": value} if inspect.isfunction(value) else {}
     if inspect.isclass(value):
@@ -90,8 +90,8 @@ def install(name: str, right: str, wrong: str) -> None:
         if getattr(new, "__module__", name) != name:
             continue
         old = getattr(module, key)
-        for path, function in _functions(old).items():
-            function.__code__ = _functions(new)[path].__code__
+        for path, function in functions_of(old).items():
+            function.__code__ = functions_of(new)[path].__code__
         if not (inspect.isfunction(old) or inspect.isclass(old)):
             setattr(module, key, new)
 
