@@ -21,7 +21,7 @@ from tpm_gym.simulation.engine import Path, spline_weights
 from tpm_gym.simulation.state import CONTROL_PERIOD
 from tpm_gym.tasks import sampling
 from tpm_gym.tasks.control import CartesianControl
-from tpm_gym.tasks.motion import SEAL_STEPS, Motion, hanging
+from tpm_gym.tasks.motion import SEALING, Motion, hanging
 from tpm_gym.tasks.pick_and_place import CLEARANCE, PickAndPlace
 
 WELL = 0.005
@@ -133,7 +133,7 @@ class Carry:
         with closing(Simulation(Scene(objects=(BLOCK,)), machine=self.machine)) as simulation:
             theta, on = self.joints(commands).numpy(), np.array([True])
             simulation.reset(np.array([0]), theta[0], {BLOCK.name: centre[None]})
-            for _ in range(2 * SEAL_STEPS):
+            for _ in range(round(2 * SEALING / CONTROL_PERIOD)):
                 simulation.move(np.array([self.first]), on)
             torques = []
             for joints in theta[1:-2]:

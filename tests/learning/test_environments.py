@@ -103,12 +103,13 @@ def test_a_stopped_run_says_how_its_module_is_found_again(tmp_path, run, monkeyp
     (tmp_path / "sac.yml").write_text(SAC_RECIPE.format(env="TPMMine-v0", train_freq=5))
     interrupt_at(monkeypatch, 10, lambda: os.kill(os.getpid(), signal.SIGINT))
     words = ["--env", "my_tasks:TPMMine-v0", "--recipe", "sac.yml", "--eval-episodes", "1"]
+    words += ["--steps", "110"]
     with pytest.raises(SystemExit):
         run("train", *words, "--run", "a run")
     _, _, command = capsys.readouterr().out.partition("continue with: ")
     program, *words = shlex.split(command)
     assert program == "python"
-    assert "to 300" in printed_by(PYTHON, *words, cwd=tmp_path)
+    assert "to 110" in printed_by(PYTHON, *words, cwd=tmp_path)
 
 
 @pytest.mark.parametrize(

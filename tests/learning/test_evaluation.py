@@ -3,8 +3,10 @@
 import json
 import pickle
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import gymnasium as gym
 import imageio.v3 as imageio
@@ -14,10 +16,13 @@ from paths import read_strict
 from processes import TPM_GYM, error_of, printed_by
 from trainings import quiet, said
 
+import tpm_gym
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.learning import EnvOptions, EvaluationConfig, evaluate, evaluation, provenance
 from tpm_gym.learning.errors import ConfigError, PolicyError
 from tpm_gym.policy.files import digest
+from tpm_gym.tasks import Reach
+from tpm_gym.tasks.registry import TASKS
 
 METRICS = (
     "success_at_end",
@@ -65,12 +70,19 @@ def test_table_shows_means_and_intervals(written):
         assert shown in output
 
 
+@pytest.fixture
+def short() -> Iterator[str]:
+    """Id of a task of six steps, since drawing takes long."""
+    with patch.dict(gym.registry), patch.dict(TASKS):
+        yield tpm_gym.register_task("Short", type("Short", (Reach,), {}), max_episode_steps=6)[0]
+
+
 # imageio-ffmpeg leaves a pipe to the collector where ffmpeg ends before its reader is closed.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_video_shows_the_first_episodes(tmp_path):
+def test_video_shows_the_first_episodes(short, tmp_path):
     path = tmp_path / "films" / "expert.mp4"
     config = EvaluationConfig(
-        policy=("expert",), env="TPMReach-v0", episodes=2, video=path, video_episodes=1
+        policy=("expert",), env=short, episodes=2, video=path, video_episodes=1
     )
     console = quiet()
     (result,) = evaluate(config, console)
@@ -80,7 +92,7 @@ def test_video_shows_the_first_episodes(tmp_path):
     assert (frames[0] != frames[-1]).any()  # and it moves
     assert imageio.immeta(path, plugin="FFMPEG")["fps"] == 25
     assert [entry.name for entry in path.parent.iterdir()] == ["expert.mp4"]
-    assert f"video: {path}, 51 frames ..." in said(console)
+    assert f"video: {path}, 7 frames ..." in said(console)
 
 
 @pytest.mark.parametrize(
@@ -97,12 +109,12 @@ def test_every_policy_gets_its_own_video(policies, names):
     assert all(path.parent == Path("films") for path in paths)
 
 
-def test_picture_shows_six_moments_of_the_first_episode(tmp_path):
+def test_picture_shows_six_moments_of_the_first_episode(short, tmp_path):
     path = tmp_path / "new" / "expert.png"
-    asked = {"policy": ("expert",), "env": "TPMReach-v0", "camera": "cup"}
+    asked = {"policy": ("expert",), "env": short, "camera": "cup"}
     config = EvaluationConfig(**asked, episodes=1, picture=path)
     evaluate(config, quiet())
-    env = gym.make("TPMReach-v0", render_mode="rgb_array", camera="cup")
+    env = gym.make(short, render_mode="rgb_array", camera="cup")
     env.reset(seed=config.seed)
     first = env.render()
     env.close()
