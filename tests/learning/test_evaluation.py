@@ -3,6 +3,7 @@
 import json
 import pickle
 import shutil
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,12 +14,13 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 from paths import read_strict
-from processes import TPM_GYM, error_of, printed_by
+from processes import TPM_GYM, printed_by
 from trainings import quiet, said
 
 import tpm_gym
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.learning import EnvOptions, EvaluationConfig, evaluate, evaluation, provenance
+from tpm_gym.learning.command_line import main
 from tpm_gym.learning.errors import ConfigError, PolicyError
 from tpm_gym.policy.files import digest
 from tpm_gym.tasks import Reach
@@ -154,7 +156,9 @@ def test_mistakes_are_named(options, error, message):
         evaluate(EvaluationConfig(**{**usual, **options}), quiet())
 
 
-def test_conditions_are_recorded_and_the_defaults_are_the_nominal_machine(written, tmp_path):
+def test_conditions_are_recorded_and_the_defaults_are_the_nominal_machine(
+    written, tmp_path, monkeypatch
+):
     content, _ = written
     assert (content["goals"], content["penalty_weight"]) == ("sampled", 1.0)
     assert content["randomisation"] == {}
@@ -164,7 +168,8 @@ def test_conditions_are_recorded_and_the_defaults_are_the_nominal_machine(writte
     words = ["--policy", "random", "--env", "TPMReach-v0", "--episodes", "1", "--json", str(path)]
     words += ["--randomisation", "encoder_noise=1e-4", "friction=0.5:1", "latency=1"]
     words += ["--penalty-weight", "0.5", "--goals", "tempting", "--drive", "servo"]
-    printed_by(*TPM_GYM, "evaluate", *words)
+    monkeypatch.setattr(sys, "argv", ["tpm-gym", "evaluate", *words])
+    main()
     content = read_strict(path)
     assert content["randomisation"] == {
         "encoder_noise": 1e-4,
@@ -254,10 +259,18 @@ def test_an_exported_policy_that_is_of_another_task_or_damaged_is_refused(run, t
         returns(tmp_path)
 
 
-def test_command_line_errors_are_one_line():
-    error = error_of(*TPM_GYM, "evaluate", "--policy", "expert", "--env", "Nope-v0")
-    assert error.startswith("error: unknown environment 'Nope-v0'")
-    assert len(error.splitlines()) == 1
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("evaluate --policy expert --env Nope-v0", "unknown environment 'Nope-v0'"),
+        ("view --machine nothing", "machine = 'nothing' is not possible"),
+    ],
+)
+def test_command_line_errors_are_one_line(words, message):
+    with pytest.raises(SystemExit) as caught:
+        main(words.split())
+    assert str(caught.value).startswith(f"error: {message}")
+    assert "\n" not in str(caught.value)
 
 
 def test_files_are_written_whole_or_not_at_all(tmp_path):

@@ -12,7 +12,7 @@ from tpm_gym.learning.command_line import main
 
 POLICIES = ROOT / "train" / "policies"
 NAME = "TPMReach-v0"
-RESULTS = POLICIES / f"{NAME}.evaluation.json"
+RESULTS, OTHER = (POLICIES / f"{name}.evaluation.json" for name in (NAME, "TPMPickAndPlace-v0"))
 
 
 def export(out: Path, evaluation: Path) -> None:
@@ -36,21 +36,18 @@ def test_a_published_policy_gets_a_card_whose_lines_run(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     ("content", "message"),
-    [("[", "Expecting value"), ("{}", "is no result of"), (None, "the policy is of TPMReach-v0")],
+    [
+        ("[", "Expecting value"),
+        ("{}", "is no result of"),
+        (json.dumps(json.loads(RESULTS.read_text()) | {"return": "good"}), "is no result of"),
+        (OTHER.read_text(), "the policy is of TPMReach-v0"),
+    ],
+    ids=["damaged", "empty", "text", "another"],
 )
 def test_results_of_something_else_are_rejected(content, message, tmp_path):
     evaluation = tmp_path / "evaluation.json"
-    other = (POLICIES / "TPMPickAndPlace-v0.evaluation.json").read_text()
-    evaluation.write_text(other if content is None else content)
+    evaluation.write_text(content)
     with pytest.raises(SystemExit, match=message):
-        export(tmp_path / "reach", evaluation)
-    assert not (tmp_path / "reach.md").exists()
-
-
-def test_results_with_values_of_other_types_are_rejected(tmp_path):
-    evaluation = tmp_path / "evaluation.json"
-    evaluation.write_text(json.dumps(json.loads(RESULTS.read_text()) | {"return": "good"}))
-    with pytest.raises(SystemExit, match="is no result of"):
         export(tmp_path / "reach", evaluation)
     assert not (tmp_path / "reach.md").exists()
 

@@ -7,7 +7,7 @@ import urllib.request
 
 import psutil
 import pytest
-from processes import TPM_GYM, error_of
+from processes import TPM_GYM
 
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.viewer import ViewConfig, run
@@ -15,15 +15,11 @@ from tpm_gym.viewer import ViewConfig, run
 
 @pytest.fixture
 def command():
-    process = subprocess.Popen(
-        [*TPM_GYM, "view", "--port", "0", "--machine", "wide"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    yield process
-    process.kill()
-    process.wait()
+    words = [*TPM_GYM, "view", "--port", "0", "--machine", "wide"]
+    pipes = dict.fromkeys(("stdout", "stderr"), subprocess.PIPE)
+    with subprocess.Popen(words, text=True, **pipes) as process:
+        yield process
+        process.kill()
 
 
 def test_the_command_tells_its_address_serves_this_computer_only_and_ends_quietly(command):
@@ -34,13 +30,8 @@ def test_the_command_tells_its_address_serves_this_computer_only_and_ends_quietl
     listening = psutil.Process(command.pid).net_connections("inet")
     assert {c.laddr.ip for c in listening if c.status == psutil.CONN_LISTEN} == {"127.0.0.1"}
     command.send_signal(signal.SIGINT)
-    out, err = command.communicate(timeout=30)
+    out, err = command.communicate(timeout=120)
     assert (out, err, command.returncode) == ("", "", 0)
-
-
-def test_a_wrong_option_ends_in_one_sentence():
-    said = error_of(*TPM_GYM, "view", "--machine", "nothing")
-    assert said.startswith("error: machine = 'nothing' is not possible")
 
 
 def test_an_export_is_one_page_with_an_episode(tmp_path, capsys):
