@@ -1,10 +1,11 @@
 """What the tests of learning share."""
 
+import shutil
 from dataclasses import replace
 
 import pytest
 import torch
-from trainings import kill_at, make_config
+from trainings import kill_at, killed_half_way, make_config
 
 from tpm_gym.learning import curve
 
@@ -31,3 +32,11 @@ def killed(tmp_path, monkeypatch):
         return config
 
     return train_and_die
+
+
+@pytest.fixture
+def half(tmp_path):
+    """A run that was killed half way."""
+    config = replace(killed_half_way(), run=tmp_path / "run")
+    shutil.copytree(killed_half_way().run, config.run)
+    return config

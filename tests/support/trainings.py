@@ -136,6 +136,15 @@ def kill_at(
         run(config, quiet())
 
 
+@functools.cache
+def killed_half_way() -> TrainingConfig:
+    """Train up to a death at step 160; the run is not to be changed."""
+    config = make_config("sac", Path(_FOLDERS.name, "half"))
+    with pytest.MonkeyPatch.context() as patch:
+        kill_at(patch, 160, config)
+    return config
+
+
 # -- comparing whole trainings --------------------------------------------------------------------
 
 
