@@ -30,7 +30,7 @@ def test_the_command_tells_its_address_serves_this_computer_only_and_ends_quietl
     listening = psutil.Process(command.pid).net_connections("inet")
     assert {c.laddr.ip for c in listening if c.status == psutil.CONN_LISTEN} == {"127.0.0.1"}
     command.send_signal(signal.SIGINT)
-    out, err = command.communicate(timeout=120)
+    out, err = command.communicate(timeout=30)
     assert (out, err, command.returncode) == ("", "", 0)
 
 
