@@ -4,7 +4,7 @@ VENV := .venv
 RUN := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
 
-.PHONY: help demo test lint format compiled test-fast test-slow test-wheel docs urdf pictures figures gradients results bench-kinematics bench-engine bench-long bench-limits bench-transfer bench-engines bench-fidelity bench-evaluate bench-conveyor bench-speed bench-shield bench-first soak clean
+.PHONY: help demo test lint format compiled test-fast test-slow test-wheel docs urdf pictures figures gradients compare results bench-kinematics bench-engine bench-long bench-limits bench-transfer bench-engines bench-fidelity bench-evaluate bench-conveyor bench-speed bench-shield bench-first soak clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -64,6 +64,9 @@ pictures: $(INSTALLED) ## redraw the README's pictures
 
 figures: $(INSTALLED) ## redraw the paper's figures, and more, in docs/images/
 	$(RUN) docs/draw_figures.py
+
+compare: $(INSTALLED) ## the TPM and the Delta, measured; see docs/compare.md
+	$(RUN) benchmarks/compare.py
 
 gradients: $(INSTALLED) ## lengths and ways improved by gradients, again; see docs/gradients.md; minutes
 	$(RUN) docs/draw_gradients.py

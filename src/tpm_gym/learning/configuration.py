@@ -55,7 +55,7 @@ class EnvOptions:
     """Options of an environment; an option that is not given keeps the id's value."""
 
     machine: Annotated[str, unset(str, "the id's; evaluate: the policy's", "NAME")] = UNSET
-    """Robot: paper, wide, or your module's."""
+    """Robot: paper, wide, delta, or your module's."""
 
     engine: Annotated[str, unset(str, "the id's, mostly pybullet", "NAME")] = UNSET
     """Engine: pybullet, mujoco, analytic (many environments at once), or your module's."""
