@@ -69,7 +69,7 @@ class Pixels:
             raise ConfigurationError("pixel_size", size, "a whole number of pixels from 16 to 1024")
         self._rendering = Rendering(task.machine, "rgb_array", camera, size, size)
         blocks = range(len(task.scene.objects))
-        seen = {entry.name for block in blocks for entry in task.object_entries(block)}
+        seen = {entry.name for block in blocks for entry in task.object_entries(block, turn=True)}
         kept = [np.full(len(entry.scale), entry.name not in seen) for entry in task.entries]
         self._columns = np.flatnonzero(np.concatenate(kept))
 

@@ -66,9 +66,8 @@ _ENTRIES: Final[Mapping[str, Any]] = {
     "replay_buffer_kwargs": _keys("Hindsight", _HINDSIGHT, total=False),
 }
 _LEARNED_ENTROPY: Final[Any] = _NOT_NEGATIVE | Annotated[str, Field(pattern=f"^auto(_{_NUMBER})?$")]
-_DEMONSTRATIONS: Final[Any] = _keys(
-    "Demonstrations", {"episodes": Required[_COUNT], "noise": _NOT_NEGATIVE}, total=False
-)
+_RECORDED: Final[Any] = {"episodes": Required[_COUNT], "noise": _NOT_NEGATIVE}
+_CLONED: Final[Any] = {**_RECORDED, "epochs": _COUNT}
 
 
 class Actor(NamedTuple):
@@ -109,8 +108,8 @@ class Algorithm:
         found = {name: entry for name, entry in _ENTRIES.items() if name in arguments}
         if "ent_coef" in found and isinstance(arguments["ent_coef"].default, str):
             found["ent_coef"] = _LEARNED_ENTROPY
-        if "replay_buffer_class" in arguments:
-            found["demonstrations"] = _DEMONSTRATIONS
+        shown = _RECORDED if "replay_buffer_class" in arguments else _CLONED
+        found["demonstrations"] = _keys("Demonstrations", shown, total=False)
         inner = {name: entry for name, entry in _POLICY_ENTRIES.items() if name in policy}
         found |= {
             "n_timesteps": Required[_COUNT],

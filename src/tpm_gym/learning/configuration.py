@@ -105,7 +105,7 @@ class TrainingConfig:
     """Hyperparameters in that file."""
 
     demonstrations: Annotated[int | None, unset(int, "as the recipe says", "INT")] = None
-    """Episodes of the expert in the replay buffer at the start; 0 for none."""
+    """Episodes of the expert that are taught at the start; 0 for none."""
 
     run: Annotated[Path, unset(Path, "runs/<env>-<algo>-s<seed>", "FOLDER")] = UNSET
     """Folder of the run."""

@@ -1,88 +1,135 @@
-"""Episodes of the scripted expert in the replay buffer, before training starts.
+"""Episodes of the scripted expert, from which a training starts.
 
-With demonstrations in the replay buffer, pick-and-place learns from a sparse reward within minutes
-(Nair et al. 2018). They are stored as whole episodes, so that hindsight can relabel them, and count
-as environment steps, so that no learning curve hides them.
+An algorithm with a replay buffer gets them there: so pick-and-place learns from a sparse reward
+within minutes (Nair et al. 2018). They are stored as whole episodes, so that hindsight can relabel
+them. An on-policy algorithm such as PPO gets its networks fitted to them (behaviour cloning), and
+improves what it got (Rajeswaran et al. 2018). In both cases they count as environment steps, so
+that no learning curve hides them.
 """
 
-from typing import Any, Final, cast
+from collections.abc import Iterator, Sequence
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from tpm_gym.envs.vector import TPMVectorEnv
+from tpm_gym.learning.cloning import clone
 from tpm_gym.learning.environments import make_envs
+from tpm_gym.learning.rollout import Action, Observation
 from tpm_gym.tasks.expert import Expert
 
 _OTHER: Final = ("num_envs", "vectorization_mode", "autoreset_mode", "stagger", "render_mode")
 
 
+class _Step(NamedTuple):
+    """A control step of n environments: ``actions`` are those of the expert and the noise."""
+
+    seen: Observation
+    wanted: Action
+    actions: Action
+    after: Observation
+    rewards: NDArray[Any]
+    ended: NDArray[Any]
+    told: dict[str, Any]
+
+
 class Demonstrations(BaseCallback):
-    """Callback that fills the replay buffer with the expert's episodes when training starts.
+    """Callback that plays the expert's episodes when training starts, and teaches them.
 
     Every second episode has normally distributed noise on the motion, so that the policy learns in
-    states that the expert never reaches by itself; some of these episodes fail.
+    states that the expert never reaches by itself; some of these episodes fail. A replay buffer
+    records the actions with their noise. Cloning imitates the expert's action without the noise
+    (Laskey et al. 2017).
 
     ``successes`` is the share of the episodes that ended in success, NaN before they are played.
     """
 
-    def __init__(self, episodes: int, noise: float = 0.3, verbose: int = 0) -> None:
+    def __init__(
+        self, episodes: int, noise: float = 0.3, epochs: int = 10, verbose: int = 0
+    ) -> None:
         """Set the number of episodes and the noise.
 
         Args:
             episodes: Rounded up to a multiple of the number of environments.
             noise: Standard deviation, in units of the largest action.
+            epochs: Passes over the episodes, where the networks are fitted to them.
         """
         super().__init__(verbose)
-        self.episodes, self.noise = episodes, noise
+        self.episodes, self.noise, self.epochs = episodes, noise, epochs
         self.successes = float("nan")
 
     def _on_training_start(self) -> None:
         model = self.model
-        if not isinstance(model, OffPolicyAlgorithm) or model.replay_buffer is None:
-            raise TypeError(f"{type(model).__name__} has no replay buffer to put episodes in")
         if model.num_timesteps > 0:
             return  # a resumed run has them already
+        if isinstance(model, OnPolicyAlgorithm):
+            self._clone(model)
+        elif isinstance(model, OffPolicyAlgorithm) and model.replay_buffer is not None:
+            self._record(model.replay_buffer)
+        else:
+            raise TypeError(f"{type(model).__name__} cannot learn from demonstrations")
+        self.logger.record("demonstrations/success_rate", self.successes)
+
+    def _record(self, buffer: Any) -> None:
+        """Add the steps to a replay buffer."""
+        for step in self._play():
+            infos = [
+                {"reward_terms": {k: v[row] for k, v in step.told["reward_terms"].items()}}
+                | {"TimeLimit.truncated": bool(ended)}
+                for row, ended in enumerate(step.ended)
+            ]
+            buffer.add(step.seen, step.after, step.actions, step.rewards, step.ended, infos)
+
+    def _clone(self, model: OnPolicyAlgorithm) -> None:
+        """Fit the networks to the steps."""
+        steps = list(self._play())
+        seen = {k: np.concatenate([step.seen[k] for step in steps]) for k in steps[0].seen}
+        wanted = np.concatenate([step.wanted for step in steps])
+        returns = np.concatenate(_returns(steps, model.gamma))
+        clone(model, seen, wanted, returns, self.epochs)
+
+    def _play(self) -> Iterator[_Step]:
+        """Play all episodes, each environment one after the other."""
+        model = self.model
         count, spec = self.training_env.num_envs, self.training_env.get_attr("spec")[0]
         options = {name: own for name, own in spec.kwargs.items() if name not in _OTHER}
         envs = make_envs(spec.id, count, autoreset_mode=AutoresetMode.DISABLED, **options)
-        rng = np.random.default_rng(model.seed)
+        expert, rng = Expert(envs), np.random.default_rng(model.seed)
         outcomes: list[bool] = []
         for episode in range(0, self.episodes, count):
             noise = self.noise * (np.arange(episode, episode + count) % 2)
-            outcomes += self._play(model, envs, noise, rng)
+            seen, _ = envs.reset(seed=rng.integers(1_000_000, size=count).tolist())
+            ended = np.zeros(count, dtype=np.bool_)
+            while not ended.all():
+                wanted = expert.act(seen)
+                actions = wanted.copy()
+                actions[:, :3] += noise[:, None] * rng.normal(size=(count, 3))
+                actions = np.clip(actions, -1, 1).astype(np.float32)
+                after, rewards, _, ended, told = envs.step(actions)
+                yield _Step(seen, wanted, actions, after, rewards, ended, told)
+                model.num_timesteps += count
+                seen = after
+            outcomes += [bool(success) for success in told["is_success"]]
         envs.close()
         self.successes = float(np.mean(outcomes))
-        self.logger.record("demonstrations/success_rate", self.successes)
-
-    def _play(
-        self,
-        model: OffPolicyAlgorithm,
-        envs: TPMVectorEnv,
-        noise: NDArray[Any],
-        rng: np.random.Generator,
-    ) -> list[bool]:
-        """Play an episode of equal length in each environment; return whether each succeeded."""
-        expert, count, buffer = Expert(envs), envs.num_envs, cast(Any, model.replay_buffer)
-        seen, _ = envs.reset(seed=rng.integers(1_000_000, size=count).tolist())
-        while True:
-            actions = expert.act(seen)
-            actions[:, :3] += noise[:, None] * rng.normal(size=(count, 3))
-            actions = np.clip(actions, -1, 1).astype(np.float32)
-            after, rewards, _, ended, told = envs.step(actions)
-            infos = [
-                {"reward_terms": {k: v[row] for k, v in told["reward_terms"].items()}}
-                | {"TimeLimit.truncated": bool(ended[row])}
-                for row in range(count)
-            ]
-            buffer.add(seen, after, actions, rewards, ended, infos)
-            model.num_timesteps += count
-            seen = after
-            if ended.all():
-                return [bool(success) for success in told["is_success"]]
 
     def _on_step(self) -> bool:
         return True
+
+
+def _returns(steps: Sequence[_Step], gamma: float) -> list[NDArray[Any]]:
+    """Return the discounted sum of rewards (n,) from each step on.
+
+    The last reward of an episode is taken to go on for ever, since episodes end by time alone.
+    """
+    found: list[NDArray[Any]] = []
+    total = np.zeros(0)
+    for step in reversed(steps):
+        last = step.rewards / (1 - gamma)
+        total = last if step.ended.all() else step.rewards + gamma * total
+        found.append(total)
+    return found[::-1]

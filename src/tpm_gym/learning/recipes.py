@@ -2,7 +2,7 @@
 
 A file has one mapping for each environment id, in the style of rl-baselines3-zoo. Entries are the
 arguments of the algorithm's constructor, plus ``n_timesteps``, ``n_envs``, ``policy``, and
-``demonstrations``: episodes of the expert that are in the replay buffer before training starts.
+``demonstrations``: episodes of the expert that are taught before training starts.
 Values are plain YAML and nothing is evaluated. Where the zoo evaluates a string such as
 ``"dict(net_arch=[64, 64])"``, a mapping is written here, which the zoo reads as well. A file for
 several algorithms has such a mapping under the name of each: ``ppo``, ``sac``, ``tqc``.

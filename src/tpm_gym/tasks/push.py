@@ -13,7 +13,7 @@ from tpm_gym.mechanism.cup import CUP
 from tpm_gym.simulation.state import Block, Scene, State
 from tpm_gym.tasks import sampling
 from tpm_gym.tasks.motion import Motion, Move, hanging
-from tpm_gym.tasks.task import Task, dense
+from tpm_gym.tasks.task import Entry, Task, dense
 
 __all__ = ["Push"]
 
@@ -102,6 +102,10 @@ class Push(Task):
         point: FloatArray = place - (self.block.width / 2 + CUP.radius + gap) * ahead
         point[..., 2] = self.machine.mount.to_world(self.machine.region.high)[2]
         return point
+
+    def observed(self) -> tuple[Entry, ...]:
+        """Return the entries of the robot, then those of the block, which turns when pushed."""
+        return (*self.robot_entries(), *self.object_entries(turn=True))
 
     def shaping(self, state: State) -> dict[str, FloatArray]:
         """Return minus half the distance from cup to block, for a dense reward only."""

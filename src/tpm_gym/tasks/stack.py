@@ -74,9 +74,10 @@ class Stack(Task):
         for block, goal in zip(self.scene.objects, motion.goal.reshape(2, 3), strict=True):
             while not motion.holding(block.name):
                 yield from motion.pick(block, CLEARANCE)
-            # The cup does not hold the block exactly at its middle.
-            grip = motion.seen["position"] - motion.seen[f"{block.name}_position"]
-            place = to_paper(goal + grip)
-            yield from motion.go([motion.command + up, place + up, place], vacuum=True)
-            yield from [Move(place, True), Move(place, True), Move(place, False)]
+                # The cup does not hold the block exactly at its middle.
+                grip = motion.seen["position"] - motion.seen[f"{block.name}_position"]
+                place = to_paper(goal + grip)
+                way = [motion.command + up, place + up, place]
+                yield from motion.go(way, vacuum=True, while_holding=block.name)
+            yield Move(place, False)
             yield from motion.go([place + up], vacuum=False)

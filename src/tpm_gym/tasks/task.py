@@ -12,6 +12,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain, cycle, groupby, pairwise
 from typing import Any, ClassVar
 
@@ -394,8 +395,14 @@ class Task(ABC):
             Entry("command", "m", "commanded P minus position", _ZERO, step, measure, (6, 9)),
         )  # fmt: skip
 
-    def object_entries(self, index: int = 0) -> tuple[Entry, ...]:
-        """Return the entries that a camera and the vacuum gauge measure of one object."""
+    def object_entries(self, index: int = 0, turn: bool = False) -> tuple[Entry, ...]:
+        """Return the entries that a camera and the vacuum gauge measure of one object.
+
+        Args:
+            index: Number of the object in the scene.
+            turn: Whether its rotation about the vertical is measured. Four times the angle has one
+                value for the four orientations in which a block with a square base looks the same.
+        """
         centre, extent, speed, _ = self._scales()
         name, near = self.scene.objects[index].name, tuple(min(0.1, max(0.02, e)) for e in extent)
         rows: tuple[tuple[str, str, str, Values, Values], ...] = (
@@ -406,12 +413,16 @@ class Task(ABC):
             ("held", "-", f"share of the vacuum that holds the {name}, by a gauge", (0.5,), (0.5,)),
         )
         ends = np.cumsum([9 + 12 * index, *(len(row[-1]) for row in rows)]).tolist()
-        return tuple(
+        entries = tuple(
             Entry(f"{name}_{own}", unit, meaning, middle, scale, self._measure, columns)
             for (own, unit, meaning, middle, scale), columns in zip(
                 rows, pairwise(ends), strict=True
             )
         )
+        if not turn:
+            return entries
+        meaning, source = f"cosine and sine of 4 times the yaw of the {name}", partial(_turn, index)
+        return (*entries, Entry(f"{name}_turn", "-", meaning, (0.0, 0.0), (1.0, 1.0), source))
 
     def _measure(self, state: State) -> FloatArray:
         """Return the measurements of robot and objects, (n, 9 + 12 k)."""
@@ -505,6 +516,13 @@ class Task(ABC):
         places = np.ascontiguousarray(state.object_position)
         lost: BoolArray = loops().any_outside(places, *self._within)
         return lost
+
+
+def _turn(index: int, state: State) -> FloatArray:
+    """Return cosine and sine of four times the yaw of an object, (n, 2)."""
+    x, y, z, w = state.object_quaternion[:, index].T
+    angle = 4 * np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 def _columns(entries: Sequence[Entry]) -> Any:

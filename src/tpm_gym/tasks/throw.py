@@ -159,7 +159,7 @@ class Throw(Task):
 
     def plan(self, motion: Motion) -> Iterator[Move]:
         """Pick up the block, carry it to the run-up, let it go at the speed it needs, and brake."""
-        name, up = self.block.name, np.array([0.0, 0.0, -DROP])  # paper z points down
+        name, up = self.block.name, np.array([0.0, 0.0, -CLEARANCE])  # paper z points down
         goal, step = motion.goal, float(self._release(motion.goal)[1])
         while True:
             yield from motion.pick(self.block, CLEARANCE)
@@ -168,7 +168,8 @@ class Throw(Task):
             # The cup sits where it took the block, not on the block's middle.
             shift = motion.seen["position"] - motion.seen["object_position"] - hanging(self.block)
             begin = self._lane(goal)[0] + self.machine.mount.rotate(shift * (1.0, 1.0, 0.0))
-            yield from motion.go([motion.command + up, begin], vacuum=True, while_holding=name)
+            stops = [motion.command + up, begin + up, begin]
+            yield from motion.go(stops, vacuum=True, while_holding=name)
             if motion.holding(name):
                 break
         yield from self._throw(begin, step)
