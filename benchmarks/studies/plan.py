@@ -22,13 +22,16 @@ PENALTY_WEIGHTS: Final = (0.0, 1.0)
 STUDIED: Final = ("Reach", "PickAndPlace")
 """Tasks of the plans; others are studied where `--envs` names them."""
 
+_DEMONSTRATED: Final = {"demonstrations", "replay_buffer_class"}
+"""Entries of recipes that are tried from scratch too: a sparse reward is found by hindsight only."""
+
 
 @dataclass(frozen=True)
 class Study:
     """Run the trainings and tests of docs/results.md, except those that are done.
 
     "results" trains each recipe with each seed, and without demonstrations too if the recipe has
-    some. "penalty" trains without and with the singularity penalty on goals that tempt towards the
+    demonstrations and hindsight. "penalty" trains without and with the singularity penalty on goals that tempt towards the
     singularity. "robustness" tests the published policies on machines that differ in one attribute.
 
     A study can be stopped with Ctrl-C and started again: trainings resume from their last
@@ -197,7 +200,7 @@ def _trainings(study: Study) -> list[Run]:
         for env, recipe in read_recipes(recipe_file(algo, study.engine), algo).items()
         if (env in study.envs if study.envs else _task(env).__name__ in STUDIED)
         for seed in range(study.seeds)
-        for run in _runs_of_seed(study, env, algo, seed, "demonstrations" in recipe)
+        for run in _runs_of_seed(study, env, algo, seed, _DEMONSTRATED <= recipe.keys())
     ]
 
 

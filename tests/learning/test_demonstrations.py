@@ -1,14 +1,16 @@
-"""Demonstrations are whole episodes of the expert, as a replay buffer would have recorded them."""
+"""Demonstrations are whole episodes of the expert, recorded as by a replay buffer, or imitated."""
 
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import pytest
+import torch
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
 
-from tpm_gym.learning import Demonstrations, PenaltyHerReplayBuffer
+from tpm_gym.learning import Demonstrations, GoalGapExtractor, PenaltyHerReplayBuffer
+from tpm_gym.learning.demonstrations import _returns, _Step
+from tpm_gym.tasks.expert import Expert
 
 HORIZON = 50
 
@@ -30,9 +32,9 @@ def filled(envs: int = 1, **options: Any) -> tuple[SAC, Demonstrations]:
     return model, callback
 
 
-def test_the_buffer_holds_what_the_environment_would_do_again():
+def test_the_buffer_holds_what_the_environment_would_do_again() -> None:
     model, _ = filled(episodes=2, noise=0.3)
-    buffer = model.replay_buffer
+    buffer: Any = model.replay_buffer
     env = gym.make("TPMPickAndPlace-v0")
     rng = np.random.default_rng(3)
     # The second episode's seed comes after the first one's, and the noise of its steps.
@@ -48,16 +50,16 @@ def test_the_buffer_holds_what_the_environment_would_do_again():
     env.close()
 
 
-def test_episodes_end_by_time_and_not_by_failure():
+def test_episodes_end_by_time_and_not_by_failure() -> None:
     model, _ = filled(episodes=2, noise=0.0)
-    buffer = model.replay_buffer
+    buffer: Any = model.replay_buffer
     assert buffer.dones[: 2 * HORIZON, 0].reshape(2, HORIZON)[:, -1].all()
     assert buffer.dones[: 2 * HORIZON].sum() == 2
     # An end by time is no end of the return, so the samples say "not done".
     assert not buffer.sample(64).dones.any()
 
 
-def test_every_second_episode_is_disturbed_and_the_vacuum_never():
+def test_every_second_episode_is_disturbed_and_the_vacuum_never() -> None:
     calm, _ = filled(episodes=2, noise=0.0)
     noisy, _ = filled(episodes=2, noise=0.3)
     before, after = (np.array(m.replay_buffer.actions[: 2 * HORIZON, 0]) for m in (calm, noisy))
@@ -66,14 +68,49 @@ def test_every_second_episode_is_disturbed_and_the_vacuum_never():
     assert set(after[:, 3]) == {-1.0, 1.0}
 
 
-def test_they_are_not_played_again_when_a_run_goes_on():
+def test_they_are_not_played_again_when_a_run_goes_on() -> None:
     model, callback = filled(episodes=2, noise=0.0)
     model.learn(1, callback=callback, reset_num_timesteps=False)
     assert model.replay_buffer is not None
     assert model.replay_buffer.size() == 2 * HORIZON + 1
 
 
-def test_without_a_replay_buffer_they_are_refused():
-    model = PPO("MultiInputPolicy", make_vec_env("TPMReach-v0"), n_steps=8, batch_size=8)
-    with pytest.raises(TypeError, match="replay buffer"):
-        model.learn(1, callback=Demonstrations(episodes=1))
+def test_without_a_replay_buffer_the_networks_imitate_them() -> None:
+    venv = make_vec_env("TPMReach-v0", n_envs=1, seed=0)
+    kwargs = {"net_arch": [32], "features_extractor_class": GoalGapExtractor}
+    model = PPO("MultiInputPolicy", venv, n_steps=8, batch_size=8, seed=3, policy_kwargs=kwargs)
+    env = gym.make("TPMReach-v0")
+
+    def expert_and_policy() -> tuple[Any, Any]:
+        expert, (seen, _) = Expert(env), env.reset(seed=77)
+        pairs = []
+        for _ in range(HORIZON):
+            pairs.append((expert.act(seen), model.predict(seen, deterministic=True)[0]))
+            seen, *_ = env.step(pairs[-1][0])
+        wanted, chosen = zip(*pairs, strict=True)
+        return np.array(wanted), np.array(chosen)
+
+    def error() -> float:
+        wanted, chosen = expert_and_policy()
+        return float(np.abs(wanted - chosen).mean())
+
+    before, callback = error(), Demonstrations(episodes=20, noise=0.2, epochs=30)
+    model._setup_learn(1, callback)
+    callback.on_training_start({}, {})
+    assert error() < 0.3 * before
+    assert model.num_timesteps == 20 * HORIZON
+    # An episode's value: -1 for each step until P arrives, then 0.
+    seen, _ = env.reset(seed=77)
+    start = {name: torch.as_tensor(values[None]) for name, values in seen.items()}
+    assert -15 < float(model.policy.predict_values(start)) < -1
+    env.close()
+
+
+def test_returns_go_on_after_the_last_step() -> None:
+    def step(reward: float, ended: bool) -> Any:
+        nothing = np.zeros((1, 0))
+        return _Step({}, nothing, nothing, {}, np.array([reward]), np.array([ended]), {})
+
+    steps = [step(-1, False), step(-1, True), step(0, False), step(-2, True)]
+    found = np.concatenate(_returns(steps, 0.5)).tolist()
+    assert found == [-1 - 0.5 * 2, -2, 0 - 0.5 * 4, -4]

@@ -283,8 +283,12 @@ def test_demonstrations_are_as_many_as_asked_for(tmp_path):
         recipe = complete(replace(config, steps=30_000, demonstrations=count)).recipe
         assert recipe.demonstrations.get("episodes") == found
         assert recipe.demonstrations.get("noise") == (0.3 if found else None)
-    with pytest.raises(ConfigError, match=r"--demonstrations 1: ppo\.demonstrations: unknown"):
-        complete(replace(make_config("ppo", tmp_path), demonstrations=1))
+    cloned = complete(replace(make_config("ppo", tmp_path), demonstrations=1)).recipe
+    assert cloned.demonstrations == {"episodes": 1}
+    recipe = RECIPE + "  demonstrations: {episodes: 1, epochs: 3}\n"
+    config.recipe_file.write_text(recipe, encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"demonstrations.epochs"):  # nothing is fitted to them
+        complete(config)
 
 
 @pytest.mark.parametrize(
