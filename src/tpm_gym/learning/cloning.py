@@ -67,7 +67,7 @@ def _fit(
     """Minimise the loss of rows by Adam, with a learning rate that falls to zero."""
     optimiser = torch.optim.Adam(policy.parameters(), lr=_RATE)
     for epoch in range(epochs):
-        batches = torch.randperm(count).split(_BATCH)
+        batches = torch.split(torch.randperm(count), _BATCH)
         for index, rows in enumerate(batches):
             optimiser.param_groups[0]["lr"] = _RATE * (1 - (epoch + index / len(batches)) / epochs)
             optimiser.zero_grad()
