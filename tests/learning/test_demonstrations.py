@@ -8,9 +8,16 @@ import torch
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
 
-from tpm_gym.learning import Demonstrations, GoalGapExtractor, PenaltyHerReplayBuffer
+from tpm_gym.learning import (
+    AnalyticVecEnv,
+    Demonstrations,
+    GoalGapExtractor,
+    PenaltyHerReplayBuffer,
+)
 from tpm_gym.learning.demonstrations import _returns, _Step
-from tpm_gym.tasks.expert import Expert
+from tpm_gym.learning.environments import make_envs
+from tpm_gym.learning.policies import TrainedPolicy
+from tpm_gym.learning.rollout import TEST_SEED, run_episodes, summarise
 
 HORIZON = 50
 
@@ -76,34 +83,24 @@ def test_they_are_not_played_again_when_a_run_goes_on() -> None:
 
 
 def test_without_a_replay_buffer_the_networks_imitate_them() -> None:
-    venv = make_vec_env("TPMReach-v0", n_envs=1, seed=0)
-    kwargs = {"net_arch": [32], "features_extractor_class": GoalGapExtractor}
-    model = PPO("MultiInputPolicy", venv, n_steps=8, batch_size=8, seed=3, policy_kwargs=kwargs)
-    env = gym.make("TPMReach-v0")
-
-    def expert_and_policy() -> tuple[Any, Any]:
-        expert, (seen, _) = Expert(env), env.reset(seed=77)
-        pairs = []
-        for _ in range(HORIZON):
-            pairs.append((expert.act(seen), model.predict(seen, deterministic=True)[0]))
-            seen, *_ = env.step(pairs[-1][0])
-        wanted, chosen = zip(*pairs, strict=True)
-        return np.array(wanted), np.array(chosen)
-
-    def error() -> float:
-        wanted, chosen = expert_and_policy()
-        return float(np.abs(wanted - chosen).mean())
-
-    before, callback = error(), Demonstrations(episodes=20, noise=0.2, epochs=30)
+    envs = make_envs("TPMReach-v0", 64, engine="analytic", autoreset_mode="SameStep")
+    kwargs = {"net_arch": [64, 64], "features_extractor_class": GoalGapExtractor}
+    venv = AnalyticVecEnv(envs)
+    model = PPO("MultiInputPolicy", venv, 1e-3, 8, gamma=0.9, seed=3, policy_kwargs=kwargs)
+    callback = Demonstrations(episodes=256, noise=0.2, epochs=20)
     model._setup_learn(1, callback)
     callback.on_training_start({}, {})
-    assert error() < 0.3 * before
-    assert model.num_timesteps == 20 * HORIZON
-    # An episode's value: -1 for each step until P arrives, then 0.
-    seen, _ = env.reset(seed=77)
-    start = {name: torch.as_tensor(values[None]) for name, values in seen.items()}
-    assert -15 < float(model.policy.predict_values(start)) < -1
-    env.close()
+    assert model.num_timesteps == 256 * HORIZON
+    test = make_envs("TPMReach-v0", 64, engine="analytic")
+    episodes = run_episodes(test, TrainedPolicy(model), 64, TEST_SEED)
+    assert summarise(episodes)["success_at_end"].mean > 0.9
+    # Each step costs 1 until P arrives, after some ten steps.
+    seen, _ = test.reset(seed=list(range(64)))
+    start = {name: torch.as_tensor(values) for name, values in seen.items()}
+    with torch.no_grad():
+        assert -10 < float(model.policy.predict_values(start).mean()) < -4
+    test.close()
+    venv.close()
 
 
 def test_returns_go_on_after_the_last_step() -> None:
