@@ -39,9 +39,9 @@ def filled(envs: int = 1, **options: Any) -> tuple[SAC, Demonstrations]:
     return model, callback
 
 
-def test_the_buffer_holds_what_the_environment_would_do_again() -> None:
+def test_the_buffer_holds_what_the_environment_would_do_again():
     model, _ = filled(episodes=2, noise=0.3)
-    buffer: Any = model.replay_buffer
+    buffer = model.replay_buffer
     env = gym.make("TPMPickAndPlace-v0")
     rng = np.random.default_rng(3)
     # The second episode's seed comes after the first one's, and the noise of its steps.
@@ -57,16 +57,16 @@ def test_the_buffer_holds_what_the_environment_would_do_again() -> None:
     env.close()
 
 
-def test_episodes_end_by_time_and_not_by_failure() -> None:
+def test_episodes_end_by_time_and_not_by_failure():
     model, _ = filled(episodes=2, noise=0.0)
-    buffer: Any = model.replay_buffer
+    buffer = model.replay_buffer
     assert buffer.dones[: 2 * HORIZON, 0].reshape(2, HORIZON)[:, -1].all()
     assert buffer.dones[: 2 * HORIZON].sum() == 2
     # An end by time is no end of the return, so the samples say "not done".
     assert not buffer.sample(64).dones.any()
 
 
-def test_every_second_episode_is_disturbed_and_the_vacuum_never() -> None:
+def test_every_second_episode_is_disturbed_and_the_vacuum_never():
     calm, _ = filled(episodes=2, noise=0.0)
     noisy, _ = filled(episodes=2, noise=0.3)
     before, after = (np.array(m.replay_buffer.actions[: 2 * HORIZON, 0]) for m in (calm, noisy))
@@ -75,14 +75,14 @@ def test_every_second_episode_is_disturbed_and_the_vacuum_never() -> None:
     assert set(after[:, 3]) == {-1.0, 1.0}
 
 
-def test_they_are_not_played_again_when_a_run_goes_on() -> None:
+def test_they_are_not_played_again_when_a_run_goes_on():
     model, callback = filled(episodes=2, noise=0.0)
     model.learn(1, callback=callback, reset_num_timesteps=False)
     assert model.replay_buffer is not None
     assert model.replay_buffer.size() == 2 * HORIZON + 1
 
 
-def test_without_a_replay_buffer_the_networks_imitate_them() -> None:
+def test_without_a_replay_buffer_the_networks_imitate_them():
     envs = make_envs("TPMReach-v0", 64, engine="analytic", autoreset_mode="SameStep")
     kwargs = {"net_arch": [64, 64], "features_extractor_class": GoalGapExtractor}
     venv = AnalyticVecEnv(envs)
@@ -103,7 +103,7 @@ def test_without_a_replay_buffer_the_networks_imitate_them() -> None:
     venv.close()
 
 
-def test_returns_go_on_after_the_last_step() -> None:
+def test_returns_go_on_after_the_last_step():
     def step(reward: float, ended: bool) -> Any:
         nothing = np.zeros((1, 0))
         return _Step({}, nothing, nothing, {}, np.array([reward]), np.array([ended]), {})
