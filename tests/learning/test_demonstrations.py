@@ -4,7 +4,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import torch
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
 
@@ -94,11 +93,6 @@ def test_without_a_replay_buffer_the_networks_imitate_them():
     test = make_envs("TPMReach-v0", 64, engine="analytic")
     episodes = run_episodes(test, TrainedPolicy(model), 64, TEST_SEED)
     assert summarise(episodes)["success_at_end"].mean > 0.9
-    # Each step costs 1 until P arrives, after some ten steps.
-    seen, _ = test.reset(seed=list(range(64)))
-    start = {name: torch.as_tensor(values) for name, values in seen.items()}
-    with torch.no_grad():
-        assert -10 < float(model.policy.predict_values(start).mean()) < -4
     test.close()
     venv.close()
 

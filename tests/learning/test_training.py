@@ -286,9 +286,9 @@ def test_demonstrations_are_as_many_as_asked_for(tmp_path):
     cloned = complete(replace(make_config("ppo", tmp_path), demonstrations=1)).recipe
     assert cloned.demonstrations == {"episodes": 1}
     recipe = RECIPE + "  demonstrations: {episodes: 1, epochs: 3}\n"
-    config.recipe_file.write_text(recipe, encoding="utf-8")
+    (tmp_path / "own.yml").write_text(recipe, encoding="utf-8")
     with pytest.raises(ConfigError, match=r"demonstrations.epochs"):  # nothing is fitted to them
-        complete(config)
+        complete(replace(make_config("sac", tmp_path), recipe_file=tmp_path / "own.yml"))
 
 
 @pytest.mark.parametrize(
