@@ -27,9 +27,10 @@ STUDIED: Final = ("Reach", "PickAndPlace")
 class Study:
     """Run the trainings and tests of docs/results.md, except those that are done.
 
-    "results" trains each recipe with each seed, and that of sac or tqc without demonstrations too if
-    it has some. "penalty" trains without and with the singularity penalty on goals that tempt towards the
-    singularity. "robustness" tests the published policies on machines that differ in one attribute.
+    "results" trains each recipe with each seed, and that of sac or tqc without demonstrations too
+    if it has some. "penalty" trains without and with the singularity penalty on goals that tempt
+    towards the singularity. "robustness" tests the published policies on machines that differ in
+    one attribute.
 
     A study can be stopped with Ctrl-C and started again: trainings resume from their last
     checkpoint. They also resume, on another node, when their process or node dies.
@@ -197,10 +198,7 @@ def _trainings(study: Study) -> list[Run]:
         for env, recipe in read_recipes(recipe_file(algo, study.engine), algo).items()
         if (env in study.envs if study.envs else _task(env).__name__ in STUDIED)
         for seed in range(study.seeds)
-        # Without demonstrations and hindsight, PPO finds no sparse reward.
-        for run in _runs_of_seed(
-            study, env, algo, seed, "demonstrations" in recipe and algo != "ppo"
-        )
+        for run in _runs_of_seed(study, env, algo, seed, "demonstrations" in recipe)
     ]
 
 
@@ -220,7 +218,9 @@ def _runs_of_seed(study: Study, env: str, algo: str, seed: int, demonstrated: bo
         return Run(folder, env, algo, (*options, *goals, *changes), tests)
 
     if study.plan == "results":
-        from_scratch = [run("-scratch", "--demonstrations", "0")] if demonstrated else []
+        # Without demonstrations and hindsight, PPO finds no sparse reward.
+        tried = demonstrated and algo != "ppo"
+        from_scratch = [run("-scratch", "--demonstrations", "0")] if tried else []
         return [run(""), *from_scratch]
     return [
         run(
