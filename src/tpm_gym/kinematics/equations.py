@@ -248,11 +248,11 @@ def link_velocity(
     Motor 3 does not move link 3'.
     """
     (r1x, _, r1z), (r2x, _, r2z), (r3x, _, r3z) = bars
-    leg1, leg2, planar = values.leg1, values.leg2, values.planar
-    x1, x2 = r2z * leg1 / planar, -r1z * leg2 / planar
-    z1, z2 = -r2x * leg1 / planar, r1x * leg2 / planar
-    k = values.sin_beta * values.level3
-    turn = -(r3x * x1 + r3z * z1) / k, -(r3x * x2 + r3z * z2) / k, values.leg3 / k
+    # Divisions take longer than all else, so each divisor is inverted once.
+    over, per_k = 1.0 / values.planar, 1.0 / (values.sin_beta * values.level3)
+    leg1, leg2 = values.leg1 * over, values.leg2 * over
+    x1, x2, z1, z2 = r2z * leg1, -r1z * leg2, -r2x * leg1, r1x * leg2
+    turn = -(r3x * x1 + r3z * z1) * per_k, -(r3x * x2 + r3z * z2) * per_k, values.leg3 * per_k
     return (x1, x2), (z1, z2), turn
 
 

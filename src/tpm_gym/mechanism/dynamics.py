@@ -49,7 +49,8 @@ class Pose(NamedTuple):
         found: Assembly.
         rods: Vectors B_iC_i, m.
         factors: Factors of the Jacobians' determinants.
-        k: sin(beta) times level3, the determinant of loop 2, m.
+        per_planar: 1 / planar, 1/m^2. Divisions take longest, so each divisor is inverted once.
+        per_k: 1 / k, with k = sin(beta) times level3, the determinant of loop 2, 1/m.
         lengths: Link lengths, m.
     """
 
@@ -58,7 +59,8 @@ class Pose(NamedTuple):
     found: equations.Assembly
     rods: tuple[Triple, Triple, Triple]
     factors: equations.Factors
-    k: Numbers
+    per_planar: Numbers
+    per_k: Numbers
     lengths: AnyLengths
 
 
@@ -98,7 +100,8 @@ def pose_at(
     found, real, _ = equations.assembly_at(cos, sin, signs[0], signs[1], g, ns)
     rods = equations.rods(cos, sin, found, g)
     factors = equations.factors(cos, sin, found, rods, g)
-    return Pose(cos, sin, found, rods, factors, factors.sin_beta * factors.level3, g), real
+    per_k = 1.0 / (factors.sin_beta * factors.level3)
+    return Pose(cos, sin, found, rods, factors, 1.0 / factors.planar, per_k, g), real
 
 
 def torques(pose: Pose, rates: Triple, changes: Triple, gravity: Triple, m: Inertia) -> Triple:
@@ -153,12 +156,12 @@ def masses(pose: Pose, j: tuple[Triple, Triple, Triple], m: Inertia) -> tuple[Nu
     (c1, c2, c3), (s1, s2, s3), f = pose.cos, pose.sin, pose.factors
     (r1x, r1y, r1z), (_, _, r2z), (r3x, r3y, r3z) = pose.rods
     (p1, p2, p3), (q1, q2, q3), (z1, z2, _) = j  # P along x and y; P and C1 along z
-    x1, x2 = r2z * f.leg1 / f.planar, -r1z * f.leg2 / f.planar  # C1
+    x1, x2 = r2z * f.leg1 * pose.per_planar, -r1z * f.leg2 * pose.per_planar  # C1
     (j1, j2, j3), (k1, k2, k3) = m.motors, m.couples
-    square1, square3 = r1y * r1y + r1z * r1z, r3x * r3x + r3z * r3z
-    u1, u2 = (r1y * (z1 - c1) - r1z * s1) / square1, r1y * z2 / square1  # swing of leg 1
-    v1, v2 = (r3x * z1 - r3z * p1) / square3, (r3x * z2 - r3z * p2) / square3  # of leg 3
-    v3 = -(r3x * c3 + r3z * (p3 + s3)) / square3
+    over1, over3 = 1.0 / (r1y * r1y + r1z * r1z), 1.0 / (r3x * r3x + r3z * r3z)
+    u1, u2 = (r1y * (z1 - c1) - r1z * s1) * over1, r1y * z2 * over1  # swing of leg 1
+    v1, v2 = (r3x * z1 - r3z * p1) * over3, (r3x * z2 - r3z * p2) * over3  # of leg 3
+    v3 = -(r3x * c3 + r3z * (p3 + s3)) * over3
     swing1 = m.swing1.fixed + m.swing1.spin * r1x * r1x
     swing3 = m.swing3.fixed + m.swing3.spin * r3y * r3y
     platform, link7, rising = m.platform, m.link7, m.link3 + m.platform + 2 * m.link7
@@ -235,19 +238,17 @@ def _resolve(pose: Pose, h1: Numbers, h2: Numbers, h3: Numbers) -> Triple:
     The a_i are velocities or accelerations of C_i.
     """
     (r1x, _, r1z), (r2x, _, r2z), (r3x, _, r3z) = pose.rods
-    planar = pose.factors.planar
-    x, z = (r2z * h1 - r1z * h2) / planar, (r1x * h2 - r2x * h1) / planar
-    return x, z, (h3 - r3x * x - r3z * z) / pose.k
+    x, z = (r2z * h1 - r1z * h2) * pose.per_planar, (r1x * h2 - r2x * h1) * pose.per_planar
+    return x, z, (h3 - r3x * x - r3z * z) * pose.per_k
 
 
 def gather(pose: Pose, at_c: tuple[Numbers, Numbers], at_p: Triple) -> Triple:
     """Compute the torques that balance forces (N) at C1 (x, z) and at P (transposed Jacobians)."""
     (r1x, _, r1z), (r2x, _, r2z), (r3x, _, r3z) = pose.rods
     (cx, cz), (px, py, pz), f = at_c, at_p, pose.factors
-    rod3 = (f.cos_beta * py - f.sin_beta * px) / pose.k  # its force, over l4
-    x, z = cx + px - rod3 * r3x, cz + pz - rod3 * r3z
-    rod1, rod2 = (x * r2z - z * r2x) / f.planar, (z * r1x - x * r1z) / f.planar
-    return f.leg1 * rod1, f.leg2 * rod2, f.leg3 * rod3
+    rod3 = (f.cos_beta * py - f.sin_beta * px) * pose.per_k  # its force, over l4
+    x, z = (cx + px - rod3 * r3x) * pose.per_planar, (cz + pz - rod3 * r3z) * pose.per_planar
+    return f.leg1 * (x * r2z - z * r2x), f.leg2 * (z * r1x - x * r1z), f.leg3 * rod3
 
 
 def swing_force(rod: Triple, rates: Triple, changes: tuple[Numbers, Numbers], m: Swing) -> Triple:
@@ -257,11 +258,12 @@ def swing_force(rod: Triple, rates: Triple, changes: tuple[Numbers, Numbers], m:
     from Lagrange's equation of (fixed + spin out^2) rate^2 / 2.
     """
     (out, level, z), (out_rate, level_rate, z_rate), (level_change, z_change) = rod, rates, changes
-    square = level * level + z * z
-    rate = (level * z_rate - z * level_rate) / square
+    over = 1.0 / (level * level + z * z)
+    rate = (level * z_rate - z * level_rate) * over
     change = level * z_change - z * level_change - 2 * rate * (level * level_rate + z * z_rate)
-    moment = (m.fixed + m.spin * out * out) * change / square + 2 * m.spin * out * out_rate * rate
-    return -m.spin * out * rate * rate, -z * moment / square, level * moment / square
+    moment = (m.fixed + m.spin * out * out) * change * over + 2 * m.spin * out * out_rate * rate
+    force = moment * over
+    return -m.spin * out * rate * rate, -z * force, level * force
 
 
 @dataclass(frozen=True, kw_only=True)

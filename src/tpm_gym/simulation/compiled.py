@@ -414,8 +414,7 @@ def servo_torque(
     """
     stiffness, damping, mass, inverse, effort, line = law
     rates, last = row_of(theta_dot, row), page_row(memory, 0, row)
-    x, y, z = plus(rates, page_row(memory, 1, row), -1.0)
-    load = onto(last, mass, row, (x / step, y / step, z / step), -1.0)
+    load = onto(last, mass, row, plus(rates, page_row(memory, 1, row), -1.0), -1.0 / step)
     behind = plus(plus(page_row(references[0], index, row), row_of(theta, row), -1.0), rates, -step)
     slower = plus(page_row(references[1], index, row), rates, -1.0)
     forward = plus(plus(page_row(references[2], index, row), slower, damping), load, -1.0)
@@ -447,7 +446,9 @@ def limited(torque: float, rate: float, effort: float, corner: float, speed: flo
     Up to the speed ``corner`` the limit is ``effort``. For a driving motor, the limit then falls
     linearly to zero at the no-load ``speed``. For a braking motor, the limit stays ``effort``.
     """
-    driving = effort * min(1.0, max(0.0, (speed - abs(rate)) / (speed - corner)))
+    driving = effort
+    if abs(rate) > corner:  # seldom, so that most rows need no division
+        driving = effort * max(0.0, (speed - abs(rate)) / (speed - corner))
     high = driving if rate > 0 else effort
     low = -effort if rate > 0 else -driving
     return min(high, max(low, torque))

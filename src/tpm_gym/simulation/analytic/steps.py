@@ -65,17 +65,17 @@ def ideal_step(
         new: Output.
         behind: (2, r) whether a motor was at its limit in the last and in this time step; output.
     """
+    rate = 1.0 / step
     for row in range(len(effort)):
         mass, load = _inertia(row, course, at, step)
-        x, y, z = plus(page_row(references, index, row), row_of(course[0], row), -1.0)
-        goal = x / step, y / step, z / step
+        ahead = plus(page_row(references, index, row), row_of(course[0], row), -1.0)
+        goal = plus(_ZERO, ahead, rate)
         fast = spread(mass, plus(row_of(course[1], row), goal, -1.0))
         impulse = plus(fast, load, -step)
         short = resisted(mass, impulse, plus(_ZERO, row_of(effort, row), step))
         behind[0, row] = behind[1, row]
         behind[1, row] = short[0] != 0 or short[1] != 0 or short[2] != 0
-        x, y, z = plus(spread(mass, short), impulse, -1.0)
-        put_row(new[2], row, (x / step, y / step, z / step))
+        put_row(new[2], row, plus(_ZERO, plus(spread(mass, short), impulse, -1.0), rate))
         _integrate(row, plus(goal, short), course, at, step, new)
 
 
@@ -158,8 +158,8 @@ def _integrate(
     put_page_row(new[3], 0, row, plus(position, onto(_ZERO, at[1], row, rates), step))
     x, y, z = row_of(course[4], row)
     put_page_row(new[3], 1, row, plus((-x, -y, -z), position, 2.0))
-    x, y, z = onto(_ZERO, at[1], row, plus(rates, row_of(course[1], row), -1.0))
-    put_row(new[4], row, (x / step, y / step, z / step))
+    change = onto(_ZERO, at[1], row, plus(rates, row_of(course[1], row), -1.0))
+    put_row(new[4], row, plus(_ZERO, change, 1.0 / step))
 
 
 compilable(_inertia, _integrate)
