@@ -16,7 +16,7 @@ from machines import anywhere, each_machine
 from tpm_gym import TPMEnv
 from tpm_gym.arrays import FloatArray, Vector
 from tpm_gym.errors import ConfigurationError
-from tpm_gym.mechanism import PAPER_TPM, Machine, tree
+from tpm_gym.mechanism import PAPER_TPM, Machine, parts
 from tpm_gym.mechanism.motor import TORQUE_MOTOR
 from tpm_gym.simulation import Plant, Scene, Servo
 from tpm_gym.simulation.compiled import limited
@@ -245,7 +245,7 @@ def over_the_line(seen: list[tuple[Any, Vector]], motor: Any, strength: float) -
 def test_a_slow_motor_keeps_to_its_line(drive, beyond, monkeypatch):
     # At 1 rad/s the corner, at 2 no torque is left; actions go up to 3 rad/s.
     slow = replace(TORQUE_MOTOR, no_load_speed=2.0, motor_constant=10.0)
-    monkeypatch.setattr(tree, "TORQUE_MOTOR", slow)
+    monkeypatch.setattr(parts, "TORQUE_MOTOR", slow)
     machine = replace(PAPER_TPM, name="slow")
     simulation = simulation_of(drive, machine)
     simulation.reset(THETA)
