@@ -15,16 +15,16 @@ from tpm_gym.arrays import FloatArray
 from tpm_gym.mechanism.bodies import Place, Solid
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.urdf import COLOURS
-from tpm_gym.simulation.stage import FLOOR, TABLE
-from tpm_gym.simulation.state import Scene, State
+from tpm_gym.simulation.stage import BELT, FLOOR, PATCH_HEIGHT, TABLE, painted
+from tpm_gym.simulation.state import Patch, Scene, State
 
 __all__ = ["ROBOT", "TASK_NODES", "RobotScene", "colour", "set_camera"]
 
 ROBOT: Final = "/robot"
 """Node whose frame is the machine's frame; everything in that frame hangs below it."""
 
-TASK_NODES: Final = "/objects", "/goals"
-"""Nodes below which the objects and goal markers of a task hang; world frame."""
+TASK_NODES: Final = "/objects", "/goals", "/paint"
+"""Nodes below which objects, goal markers, belt and paint of a task hang; world frame."""
 
 _PAPER_TABLE: Final = 0.45  # m, half the length for which the camera's distance was chosen
 _GOAL: Final = (30, 160, 70)
@@ -74,6 +74,7 @@ class RobotScene:
                 _add_solid(scene, f"{name}/{index}", solid)
         self._add_table()
         self._objects: list[Any] = []
+        self._paint: list[Any] = []
         self._markers: list[Any] = []
 
     def _add_table(self) -> None:
@@ -94,9 +95,15 @@ class RobotScene:
             node.wxyz = SO3.from_matrix(place.rotation).wxyz
 
     def set_objects(self, scene: Scene, tolerance: float) -> None:
-        """Replace objects and goal markers by the task's."""
-        for node in (*self._objects, *self._markers):
+        """Replace objects, goal markers, belt and paint by the task's."""
+        for node in (*self._objects, *self._markers, *self._paint):
             node.remove()
+        patches = painted(scene)
+        if scene.belt is not None:
+            half = self._machine.table[1]
+            ends = (scene.belt.start, -half), (scene.belt.end, half)
+            patches.insert(0, Patch(*ends, BELT.colour))
+        self._paint = [self._add_patch(index, patch) for index, patch in enumerate(patches)]
         self._objects = [
             self._scene.add_box(
                 f"/objects/{block.name}", colour(block.colour), 2 * np.array(block.half)
@@ -109,6 +116,14 @@ class RobotScene:
             )
             for index in range(scene.markers)
         ]
+
+    def _add_patch(self, index: int, patch: Patch) -> Any:
+        """Add a painted rectangle; a later one lies above the earlier ones."""
+        low, high = np.array(patch.low), np.array(patch.high)
+        size, place = (*(high - low), PATCH_HEIGHT), (*(low + high) / 2, min(index, 1) * 1e-4)
+        return self._scene.add_box(
+            f"/paint/{index}", colour(patch.colour), size, position=place, cast_shadow=False
+        )
 
     def draw_objects(self, state: State, markers: FloatArray) -> None:
         """Move objects to their places in the state of one robot, and markers (k, 3) m, world."""
