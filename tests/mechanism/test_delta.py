@@ -384,7 +384,7 @@ def test_compiled_dynamics_are_the_equations():
 
 
 def test_pinocchio_agrees_on_closures_masses_and_torques(tmp_path):
-    """Measured: closures 2e-9 m and torques 5e-8 of the largest: the digits of the URDF."""
+    """Measured: closures 1e-9 m, masses and torques 1e-7 of the largest: the digits of the URDF."""
     pin = pytest.importorskip("pinocchio", reason="Pinocchio has no wheels for Windows")
     yaml = pytest.importorskip("yaml")
     mechanism = DELTA.mechanism

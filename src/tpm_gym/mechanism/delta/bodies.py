@@ -24,7 +24,7 @@ from tpm_gym.mechanism.bodies import ALUMINIUM, STEEL, Closure, Joint, Link, Mec
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.delta.equations import ONE, THREE, TWO, Pair, Pose, outwards
 from tpm_gym.mechanism.delta.geometry import DeltaGeometry
-from tpm_gym.mechanism.inertia import Bodies, Swing, X, Y, three
+from tpm_gym.mechanism.inertia import Bodies, X, Y, three
 from tpm_gym.mechanism.motor import TORQUE_MOTOR
 
 LEGS: Final = {1: ONE, 2: TWO, 3: THREE}
@@ -50,10 +50,6 @@ class Inertia(NamedTuple):
     platform: Numbers
     fixed: Triple
     spin: Triple
-
-    def swing(self, leg: int) -> Swing:
-        """Return the swing of a leg, 0 to 2."""
-        return Swing(self.fixed[leg], self.spin[leg])
 
 
 def build(g: DeltaGeometry) -> Mechanism:
