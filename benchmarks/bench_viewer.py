@@ -1,7 +1,7 @@
 """Updates a second that the viewer handles while point P is dragged.
 
-A client drags P through the task region over a websocket, as a page does, as fast as the server
-takes it, and then 60 times a second. An update is handled when its posture is solved and all links
+A client drags P through the points of the task region that have a posture, over a websocket, as a
+page does, as fast as the server takes it, and then 60 times a second. An update is handled when its posture is solved and all links
 are on their way to the page. The time of the CPU, of the thread that handles updates, depends less
 on other programs. Needs the extra ``view``.
 
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import threading
 import time
-from contextlib import closing
+from contextlib import closing, suppress
 from typing import Any
 
 import msgspec
@@ -20,17 +20,19 @@ import numpy as np
 import viser
 from websockets.sync.client import ClientConnection, connect
 
+from tpm_gym.errors import TPMError
 from tpm_gym.viewer import open_viewer
+from tpm_gym.viewer.posture import at_point
 from tpm_gym.viewer.viewer import Viewer
 
 SECONDS = 5.0
+PACE = 250.0  # 1/s; points of the path
 SLACK = 0.5  # s; time for the last updates to arrive
 
 
 def drag(viewer: Viewer, page: ClientConnection, rate: float) -> tuple[int, int, float]:
     """Drag P at ``rate`` updates a second; return counts sent and handled, and ms of CPU each."""
-    region = viewer.explore.posture.machine.region
-    low, high = np.array(region.low), np.array(region.high)
+    path = points(viewer)
     handled, clock = 0, [0.0, 0.0]  # time of the thread that handles them, at first and last, s
     draw = viewer.robot.draw
 
@@ -43,8 +45,7 @@ def drag(viewer: Viewer, page: ClientConnection, rate: float) -> tuple[int, int,
     viewer.robot.draw = count  # type: ignore[method-assign]
     start, sent = time.perf_counter(), 0
     while (now := time.perf_counter() - start) < SECONDS:
-        share = 0.5 + 0.45 * np.sin(np.array([2.0, 3.0, 5.0]) * now)
-        point = (low + share * (high - low)).tolist()
+        point = path[int(PACE * now) % len(path)].tolist()
         message = {
             "type": "TransformControlsUpdateMessage",
             "name": "/robot/P",
@@ -58,6 +59,20 @@ def drag(viewer: Viewer, page: ClientConnection, rate: float) -> tuple[int, int,
     time.sleep(SLACK)
     viewer.robot.draw = draw  # type: ignore[method-assign]
     return sent, handled, 1000 * (clock[1] - clock[0]) / (handled - 1)
+
+
+def points(viewer: Viewer) -> list[Any]:
+    """Return a curve through the task region, less the points without a posture, m."""
+    region, explore = viewer.explore.posture.machine.region, viewer.explore
+    low, high = np.array(region.low), np.array(region.high)
+    found = []
+    for time in np.arange(0.0, SECONDS, 1 / PACE):
+        share = 0.5 + 0.45 * np.sin(np.array([2.0, 3.0, 5.0]) * time)
+        point, machine = low + share * (high - low), explore.posture.machine
+        with suppress(TPMError):
+            at_point(machine, point, explore.operation.value, explore.working)
+            found.append(point)
+    return found
 
 
 def receive(page: ClientConnection) -> None:

@@ -157,6 +157,14 @@ class Explore:
     def set(self, posture: Posture) -> None:
         """Show a posture, and its modes and motors in the panel."""
         self.posture = posture
+        # All messages at once: each wakes the thread that sends them.
+        with self._server.atomic():
+            self._set_panel(posture)
+            if self.gizmo is not None:
+                self.gizmo.position = posture.position
+            self._show(posture)
+
+    def _set_panel(self, posture: Posture) -> None:
         self._refuse("")
         _, *bends = posture.working.signs
         self.operation.value = posture.operation
@@ -166,9 +174,6 @@ class Explore:
         self.assembly.value = _label(posture.assembly)
         for motor, angle in zip(self.motors, np.degrees(posture.theta), strict=True):
             motor.value = float(motor.min + (angle - motor.min) % 360.0)
-        if self.gizmo is not None:
-            self.gizmo.position = posture.position
-        self._show(posture)
 
     def _refuse(self, problem: str) -> None:
         self.problem = problem

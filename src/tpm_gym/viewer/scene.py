@@ -89,10 +89,10 @@ class RobotScene:
 
     def draw(self, places: Mapping[str, Place]) -> None:
         """Move the links to ``places`` in the base's frame."""
-        for name, node in self.links.items():
-            place = places[name]
-            node.position = place.origin
-            node.wxyz = SO3.from_matrix(place.rotation).wxyz
+        turns = SO3.from_matrix(np.stack([places[name].rotation for name in self.links])).wxyz
+        for (name, node), turn in zip(self.links.items(), turns, strict=True):
+            node.position = places[name].origin
+            node.wxyz = turn
 
     def set_objects(self, scene: Scene, tolerance: float) -> None:
         """Replace objects, goal markers, belt and paint by the task's."""

@@ -124,8 +124,7 @@ class Viewer:
     # -- drawing ------------------------------------------------------------------------------
 
     def _show(self, posture: Posture) -> None:
-        with self.server.atomic():
-            self.robot.draw(posture.places)
+        self.robot.draw(posture.places)
         self._numbers.content = numbers(posture)
         self.worker.put("layers", self._show_layers)
 
