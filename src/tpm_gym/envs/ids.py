@@ -92,8 +92,9 @@ def _built_in() -> Iterator[type[Task]]:
     """Yield the task classes in the files of :mod:`tpm_gym.tasks`."""
     for _, name, _ in pkgutil.iter_modules(tasks.__path__, f"{tasks.__name__}."):
         for value in vars(importlib.import_module(name)).values():
-            own = isinstance(value, type) and issubclass(value, Task) and value.__module__ == name
-            if own and not isabstract(value):
+            # The module first: Python 3.10 takes list[int] for a type, issubclass does not.
+            ours = getattr(value, "__module__", None) == name and isinstance(value, type)
+            if ours and issubclass(value, Task) and not isabstract(value):
                 yield value
 
 
