@@ -3,6 +3,9 @@ PYTHON ?= python3
 VENV := .venv
 RUN := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
+TRAINS := $(VENV)/.trains
+# Python compiles what it imports; compiling all of PyTorch takes longer than that.
+PIP := $(RUN) -m pip install --no-compile -c constraints.txt
 
 .PHONY: help demo test lint format compiled test-fast test-slow test-wheel docs urdf pictures figures gradients compare results bench-kinematics bench-engine bench-long bench-limits bench-transfer bench-engines bench-fidelity bench-evaluate bench-conveyor bench-speed bench-shield bench-first soak clean
 .DEFAULT_GOAL := help
@@ -10,13 +13,17 @@ INSTALLED := $(VENV)/.installed
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
 
-$(INSTALLED): pyproject.toml constraints.txt
-	$(PYTHON) -m venv $(VENV)
-	$(RUN) -m pip install --upgrade pip
-	$(RUN) -m pip install -c constraints.txt -e ".[train,test,docs]"
+$(INSTALLED): $(TRAINS)
+	$(PIP) -e ".[train,test,docs]"
 	touch $@
 
-demo: $(INSTALLED) ## train pick-and-place in the analytic engine, test it in PyBullet, film it; see runs/demo/
+$(TRAINS): pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(RUN) -m pip install --upgrade pip
+	$(PIP) -e ".[train]"
+	touch $@
+
+demo: $(TRAINS) ## train pick-and-place in the analytic engine, test it in PyBullet, film it; see runs/demo/
 	$(VENV)/bin/tpm-gym train --algo ppo --engine analytic --env TPMPickAndPlaceDense-v0 --seed 0 --test-episodes 0 \
 		--run runs/demo/pick_and_place --overwrite
 	cp runs/demo/pick_and_place/learning_curve.png runs/demo/learning_curve.png
@@ -90,7 +97,7 @@ bench-engines: $(INSTALLED) ## both engines and theory on the same commands; pol
 	$(RUN) benchmarks/bench_engines.py --jobs 2
 
 bench-engine: $(INSTALLED) ## the analytic engine: speed and agreement, beside PyBullet and panda-gym
-	$(RUN) -m pip install -c constraints.txt -e ".[bench]"
+	$(PIP) -e ".[bench]"
 	$(RUN) benchmarks/bench_engine.py
 	$(RUN) benchmarks/readme_numbers.py
 
@@ -112,7 +119,7 @@ bench-shield: $(INSTALLED) ## the shield: violations, margins, cost, policies; h
 	$(RUN) benchmarks/bench_shield.py
 
 bench-speed: $(INSTALLED) ## steps per second beside panda-gym and Gymnasium-Robotics
-	$(RUN) -m pip install -c constraints.txt -e ".[bench]"
+	$(PIP) -e ".[bench]"
 	$(RUN) benchmarks/bench_speed.py --json docs/records/speed.json --plot docs/images/speed.png
 	$(RUN) benchmarks/readme_numbers.py
 

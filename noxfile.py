@@ -29,7 +29,7 @@ def newest(session: nox.Session) -> None:
 def lowest(session: nox.Session) -> None:
     """Run the fast tests with the lowest versions that pyproject.toml admits."""
     session.install("--resolution", "lowest-direct", ".[test]")
-    _test(session)
+    _test(session, "-W", "default::DeprecationWarning")  # what old packages use of newer ones
 
 
 @nox.session(python="3.11")
@@ -52,9 +52,9 @@ def package(session: nox.Session) -> None:
     session.run("bash", "-c", f"check-wheel-contents {folder}/*.whl", external=True)
 
 
-def _test(session: nox.Session) -> None:
+def _test(session: nox.Session, *options: str) -> None:
     session.run("uv", "pip", "freeze", external=True)
-    session.run("pytest", "-q", "-n", "logical", "--maxprocesses", "8", *session.posargs)
+    session.run("pytest", "-q", "-n", "logical", "--maxprocesses", "8", *options, *session.posargs)
 
 
 def _pinned(text: str) -> set[str]:
