@@ -4,7 +4,8 @@ VENV := .venv
 RUN := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
 TRAINS := $(VENV)/.trains
-# Python compiles what it imports; compiling all of PyTorch takes longer than that.
+# Python compiles what it imports, and keeps it; compiling all of PyTorch takes longer.
+unexport PYTHONDONTWRITEBYTECODE
 PIP := $(RUN) -m pip install --no-compile -c constraints.txt
 
 .PHONY: help demo test lint format compiled test-fast test-slow test-wheel docs urdf pictures figures gradients compare results bench-kinematics bench-engine bench-long bench-limits bench-transfer bench-engines bench-fidelity bench-evaluate bench-conveyor bench-speed bench-shield bench-first soak clean
@@ -27,11 +28,17 @@ demo: $(TRAINS) ## train pick-and-place in the analytic engine, test it in PyBul
 	$(VENV)/bin/tpm-gym train --algo ppo --engine analytic --env TPMPickAndPlaceDense-v0 --seed 0 --test-episodes 0 \
 		--run runs/demo/pick_and_place --overwrite
 	cp runs/demo/pick_and_place/learning_curve.png runs/demo/learning_curve.png
+	$(MAKE) -j2 demo-table demo-film
+	@echo; echo "runs/demo/ now holds:"; ls runs/demo runs/demo/pick_and_place
+
+.PHONY: demo-table demo-film
+demo-table:
 	$(VENV)/bin/tpm-gym evaluate --policy runs/demo/pick_and_place/best.json expert random \
 		--env TPMPickAndPlaceDense-v0 --episodes 100 --json runs/demo/pick_and_place.json
-	$(VENV)/bin/tpm-gym evaluate --policy runs/demo/pick_and_place/best.json --episodes 3 --seed 2000006 \
+
+demo-film:
+	$(VENV)/bin/tpm-gym evaluate --policy runs/demo/pick_and_place/best.json --episodes 2 --seed 2000006 \
 		--video runs/demo/pick_and_place.mp4 --picture runs/demo/pick_and_place.png
-	@echo; echo "runs/demo/ now holds:"; ls runs/demo runs/demo/pick_and_place
 
 test: $(INSTALLED) ## the gate, here and in CI: lint, types, fast tests
 	$(MAKE) -j2 lint compiled

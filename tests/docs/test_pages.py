@@ -115,6 +115,7 @@ def test_every_id_on_a_page_exists(page):
         assert env_id in tpm_gym.ENV_IDS or learned_elsewhere.match(env_id), env_id
 
 
+@pytest.mark.usefixtures("needs_pybullet")
 @pytest.mark.parametrize(("page", "name"), [(p, n) for p, names in FILLED.items() for n in names])
 def test_the_numbers_of_a_page_are_those_of_its_record(page, name):
     begin, end = (f"<!-- {name}: {part} -->" for part in ("begin", "end"))

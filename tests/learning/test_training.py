@@ -247,6 +247,7 @@ def test_command_line_trains_ppo_in_parallel_and_stops_when_asked_to(tmp_path, n
 PICK = {"env": "TPMPickAndPlace-v0", "recipe_file": recipe_file("sac")}
 
 
+@pytest.mark.usefixtures("needs_pybullet")
 @pytest.mark.parametrize(
     ("options", "message"),
     [
