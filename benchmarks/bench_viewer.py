@@ -1,9 +1,9 @@
 """Updates a second that the viewer handles while point P is dragged.
 
 A client drags P through the points of the task region that have a posture, over a websocket, as a
-page does, as fast as the server takes it, and then 60 times a second. An update is handled when its posture is solved and all links
-are on their way to the page. The time of the CPU, of the thread that handles updates, depends less
-on other programs. Needs the extra ``view``.
+page does: as fast as the server takes it, then 60 times a second. An update is handled when its
+posture is solved and all links are on their way to the page. The CPU time of the thread that
+handles updates depends less on other programs. Needs the extra ``view``.
 
     python benchmarks/bench_viewer.py
 """
@@ -66,8 +66,8 @@ def points(viewer: Viewer) -> list[Any]:
     region, explore = viewer.explore.posture.machine.region, viewer.explore
     low, high = np.array(region.low), np.array(region.high)
     found = []
-    for time in np.arange(0.0, SECONDS, 1 / PACE):
-        share = 0.5 + 0.45 * np.sin(np.array([2.0, 3.0, 5.0]) * time)
+    for moment in np.arange(0.0, SECONDS, 1 / PACE):
+        share = 0.5 + 0.45 * np.sin(np.array([2.0, 3.0, 5.0]) * moment)
         point, machine = low + share * (high - low), explore.posture.machine
         with suppress(TPMError):
             at_point(machine, point, explore.operation.value, explore.working)
