@@ -33,6 +33,12 @@ NONE: Final = "\N{EM DASH}"
 STUDIES: Final = (
     Study("results", engine="analytic"),
     Study("results", engine="analytic", algos=("tqc",), envs=("TPMPickAndPlace-v0",), seeds=1),
+    Study(
+        "results",
+        engine="analytic",
+        algos=("ppo",),
+        envs=("TPMPush-v0", "TPMStack-v0", "TPMThrow-v0"),
+    ),
     Study("penalty", engine="analytic"),
     Study("robustness", engine="analytic"),
     Study("robustness", engine="pybullet", episodes=100),
