@@ -20,7 +20,7 @@ from tpm_gym.simulation.randomisation import NOMINAL, Randomisation
 from tpm_gym.simulation.simulation import Simulation, Snapshot
 from tpm_gym.simulation.state import State
 from tpm_gym.tasks import checking
-from tpm_gym.tasks.control import make_control
+from tpm_gym.tasks.control import accelerated, make_control
 from tpm_gym.tasks.registry import make_task
 from tpm_gym.tasks.task import Task
 
@@ -131,6 +131,13 @@ class Core:
             "number of environments": count,
             "observations": observations,
         }
+        region, limit, period = (
+            self.machine.region,
+            self.task.acceleration_limit,
+            self.task.control_period,
+        )
+        self._region = np.array(region.low), np.array(region.high)
+        self._change = None if limit is None else np.array(limit) * period**2
         self._home = self.machine.require_inverse(np.array(self.machine.home))
         self._state: State | None = None
         self.closed = False
@@ -187,12 +194,14 @@ class Core:
             self.rngs[row] = rng
         self.goals = self.goals.copy()
         self.goals[rows] = starts.pop("goal")
+        departures = self.task.departures(self.goals[rows])
+        home = self._home if departures is None else self.machine.require_inverse(departures)
         self._state = None
         self.episode[rows] += 1
         self._pending[:, rows] = 0.0
         noise = self._noise(rows)[rows] if self.randomisation.encoder_noise > 0 else None
         speed = starts.pop("belt_speed")[:, 0] if "belt_speed" in starts else None
-        self.simulation.reset(rows, self._home, starts, plants, noise, speed)
+        self.simulation.reset(rows, home, starts, plants, noise, speed)
         if len(self._views):
             self._views[:, rows] = _view(self.simulation.state())[rows]
         return [self.randomisation.told(plant) if self._altered else {} for plant in plants]
@@ -211,6 +220,10 @@ class Core:
             actions, late = late[0], late[1:]
         simulation = self.simulation
         commands = self.control.command(actions[:, :3], simulation.commands)
+        if self._change is not None:
+            commands = accelerated(
+                commands, simulation.commands, simulation.recent[:, 0], self._change, self._region
+            )
         if self._shield is not None:
             commands = self._shield.command(commands, simulation.recent)
         vacuum = actions[:, 3] > 0 if self.task.vacuum else np.zeros(self.count, dtype=np.bool_)

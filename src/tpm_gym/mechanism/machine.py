@@ -93,6 +93,7 @@ class Machine(ABC):
         safe_conditioning: Smallest conditioning 1/cond(J) that counts as safe from singularities;
             the penalty of the reward begins below it.
         table: Half edges of the table along x and y, m; its top is the world's z = 0.
+        payload: Mass that a gripper holds at point P, kg; :attr:`mechanism` contains it.
 
     Raises:
         ConfigurationError: If a value is not possible, if home or the goals lie outside the region,
@@ -110,6 +111,7 @@ class Machine(ABC):
     joint_limit: float = 0.08
     safe_conditioning: float = 0.08
     table: tuple[float, float] = (0.45, 0.30)
+    payload: float = 0.0
 
     def __post_init__(self) -> None:
         """Reject machines on which no episode could run."""
@@ -124,6 +126,8 @@ class Machine(ABC):
                 raise ConfigurationError(name, getattr(self, name), "positive")
         if not 0 < self.safe_conditioning <= 1:  # the penalty is in units of it
             raise ConfigurationError("safe_conditioning", self.safe_conditioning, "in (0, 1]")
+        if self.payload < 0:
+            raise ConfigurationError("payload", self.payload, "0 kg or more")
         self._require_usable("region", list(self.region.corners()))
         home = self._require_usable("home", [self.home])
         a, b, c = home[0].tolist()
@@ -140,7 +144,7 @@ class Machine(ABC):
                 raise ConfigurationError(name, getattr(self, name), f"a {kind.__name__}")
         for name in ("home", "step_limit"):
             object.__setattr__(self, name, vector(name, getattr(self, name), ConfigurationError))
-        for name in ("joint_limit", "safe_conditioning"):
+        for name in ("joint_limit", "safe_conditioning", "payload"):
             finite(name, getattr(self, name), (), ConfigurationError)
         table = finite("table", self.table, (2,), ConfigurationError)
         object.__setattr__(self, "table", tuple(table.tolist()))

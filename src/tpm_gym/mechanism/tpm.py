@@ -99,7 +99,7 @@ class TPM(CompiledMachine):
     @cached_property
     def mechanism(self) -> Mechanism:
         """See :class:`Machine`."""
-        return tree.build(self.geometry)
+        return tree.build(self.geometry, self.payload)
 
     def joint_positions(self, theta: Vector) -> dict[str, float]:
         """See :class:`Machine`."""
@@ -109,7 +109,10 @@ class TPM(CompiledMachine):
     def dynamics(self) -> Dynamics:
         """Torques, mass matrix and energy of the nominal machine with an empty cup."""
         return Dynamics(
-            geometry=self.geometry, branch=self.assembly_mode, free_fall=self.mount.free_fall
+            geometry=self.geometry,
+            branch=self.assembly_mode,
+            free_fall=self.mount.free_fall,
+            payload=self.payload,
         )
 
     @property

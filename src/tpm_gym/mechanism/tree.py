@@ -79,11 +79,13 @@ def _branch_1(g: Geometry) -> tuple[Link, ...]:
     return tuple(links)
 
 
-def _branch_2(g: Geometry) -> tuple[Link, ...]:
+def _branch_2(g: Geometry, payload: float) -> tuple[Link, ...]:
     """Build arm 5, rod 6, link 3', link 7, platform 1, its sliding cup, and end link 10."""
     minus_y, point_p = (0.0, -1.0, 0.0), (g.l2, 0.0, g.l6)
     # From F1 to D3
     plate = Solid("box", (2 * g.l2 + 0.04, 0.045, 0.008), point_p, ALUMINIUM, colour="yellow")
+    edge = (payload / STEEL) ** (1 / 3)
+    load = (Solid("box", (edge,) * 3, point_p, STEEL, colour="steel"),) if payload else ()
     tube, bore = (3 * g.l5, 0.025, 0.018), (3 * g.l5, 0.019, 0.012)
     link_3p = (
         Solid("box", tube, (1.5 * g.l5, 0.0, 0.0), ALUMINIUM, bore=bore, colour="blue"),
@@ -109,7 +111,7 @@ def _branch_2(g: Geometry) -> tuple[Link, ...]:
         Link("link_7", link_7, Joint("R12", "continuous", "link_3p", (2 * g.l5, 0.0, g.l6))),
         Link(
             "platform",
-            (plate, CUP.stem(point_p)),
+            (plate, CUP.stem(point_p), *load),
             Joint("R13", "continuous", "link_7", (g.l7, 0.0, 0.0)),
         ),
         CUP.link("platform", point_p),
@@ -143,14 +145,14 @@ def _branch_3(g: Geometry) -> tuple[Link, ...]:
     return (arm, end_link, *rods)
 
 
-def build(geometry: Geometry = PAPER) -> Mechanism:
-    """Build the mechanism for the given lengths.
+def build(geometry: Geometry = PAPER, payload: float = 0.0) -> Mechanism:
+    """Build the mechanism for the given lengths, with a steel cube of ``payload`` (kg) around P.
 
     Cross-sections and materials do not scale with the lengths. They fit a machine of the size of
     the paper's case study.
     """
     g = geometry
-    links = (_base(g), *_branch_1(g), *_branch_2(g), *_branch_3(g))
+    links = (_base(g), *_branch_1(g), *_branch_2(g, payload), *_branch_3(g))
     closures = (
         Closure("Sc", "rod_4a", (0.0, g.l4, 0.0), "link_3p", (3 * g.l5, 0.0, 0.0)),
         Closure("Sd", "rod_4b", (0.0, g.l4, 0.0), "link_3p", (g.l5, 0.0, 0.0)),

@@ -146,7 +146,7 @@ class Simulation:
 
         Args:
             rows: (r,) robots to place.
-            theta: (3,) rad, joint positions as the encoders report them without noise.
+            theta: (3,) or (r, 3) rad, joint positions as the encoders report them without noise.
             objects: Centres (r, 3) m, world, of objects by name. Objects without an entry are
                 placed in the middle of the table.
             plants: Plant of each of the r robots; None for nominal robots.
@@ -166,7 +166,7 @@ class Simulation:
         for plant in plants:
             if plant is not NOMINAL:
                 require_servo(self.drive, plant.servo_stiffness, plant.joint_friction)
-        angles = finite("theta", theta, (3,))
+        angles = finite("theta", theta, (3,) if np.ndim(theta) < 2 else (len(rows), 3))
         reading = self.machine.require_evaluate(angles)
         bias = np.array([plant.encoder_bias for plant in plants])
         true = angles - bias

@@ -17,7 +17,7 @@ from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.engine import loops
 from tpm_gym.simulation.state import CONTROL_PERIOD
 
-__all__ = ["CartesianControl", "Control", "JointControl", "make_control"]
+__all__ = ["CartesianControl", "Control", "JointControl", "accelerated", "make_control"]
 
 _TRIES = 6  # largest number of shares of a step that are tried
 _AIM = 0.9995  # fraction of the limit that a try aims at
@@ -180,6 +180,35 @@ class JointControl:
         """Multiply J by the joint limit."""
         theta = self._machine.inverse(points)
         return self._machine.evaluate(theta).jacobian * self._machine.joint_limit
+
+
+def accelerated(
+    wanted: FloatArray,
+    current: FloatArray,
+    before: FloatArray,
+    change: FloatArray,
+    region: tuple[FloatArray, FloatArray],
+) -> FloatArray:
+    """Return the commands nearest to ``wanted`` that change their steps by ``change`` at most.
+
+    No command goes so fast towards the end of the region that it could not stop before it.
+
+    Args:
+        wanted: (n, 3) m, commands of a control.
+        current: (n, 3) m, the last commands.
+        before: (n, 3) m, the commands before the last.
+        change: (3,) m, largest change of the step from one command to the next, along each axis.
+        region: Low and high corner (3,) m of the region.
+    """
+    last, (low, high) = current - before, region
+    step = np.clip(wanted - current, last - change, last + change)
+    # From a step v the command stops after v + (v - change) + ... = v^2 / (2 change) + v / 2.
+    down, up = (
+        np.sqrt(change**2 / 4 + 2 * change * np.maximum(room, 0.0)) - change / 2
+        for room in (current - low, high - current)
+    )
+    commands: FloatArray = np.clip(current + np.clip(step, -down, up), low, high)
+    return commands
 
 
 def make_control(kind: str, machine: Machine, period: float = CONTROL_PERIOD) -> Control:

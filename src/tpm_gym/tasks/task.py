@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tpm_gym.arrays import BoolArray, FloatArray, finite, is_number
+from tpm_gym.arrays import BoolArray, FloatArray, Vector, finite, is_number
 from tpm_gym.errors import ConfigurationError, InputError, ResetOptionError, UnreachableError
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism.cup import CUP
@@ -83,6 +83,8 @@ class Task(ABC):
         samplings: Values of ``goals``.
         control_period: Time between two actions, s. Limits of the machine hold in 40 ms, and are
             scaled to it.
+        acceleration_limit: Largest acceleration of the command for P along x, y, z, machine's
+            frame, m/s^2; None for any.
         max_episode_steps: Control steps after which ``gym.make`` truncates an episode.
         camera_delay: Control steps by which observation and achieved goal show objects late.
         entries: Entries of the observation vector, in order.
@@ -97,6 +99,7 @@ class Task(ABC):
     tolerance: ClassVar[float] = 0.010
     samplings: ClassVar[tuple[str, ...]] = ("sampled",)
     control_period: ClassVar[float] = CONTROL_PERIOD
+    acceleration_limit: Vector | None = None
     max_episode_steps: ClassVar[int] = 50
     camera_delay: ClassVar[int] = 0
 
@@ -193,6 +196,14 @@ class Task(ABC):
         """Return the entries of the observation vector: the robot's, then those of each object."""
         objects = (self.object_entries(index) for index in range(len(self.scene.objects)))
         return (*self.robot_entries(), *chain(*objects))
+
+    def departures(self, goals: FloatArray) -> FloatArray | None:
+        """Return where P starts in episodes with ``goals`` (r, goal_size) m, world.
+
+        Returns:
+            (r, 3) m, machine's frame; None for the machine's home.
+        """
+        del goals
 
     # -- reward: here and nowhere else ------------------------------------------------------------
 

@@ -1,0 +1,184 @@
+"""Cycle: the pick-and-place cycle by which industry compares fast robots."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from tpm_gym.arrays import FloatArray
+from tpm_gym.errors import ConfigurationError
+from tpm_gym.mechanism.machine import Machine
+from tpm_gym.mechanism.motor import TORQUE_MOTOR
+from tpm_gym.simulation.state import CONTROL_PERIOD, Block, State
+from tpm_gym.tasks import sampling
+from tpm_gym.tasks.motion import Motion, Move
+from tpm_gym.tasks.task import Task
+from tpm_gym.tasks.timing import timed
+
+__all__ = ["Cycle"]
+
+STROKE: Final = 0.305
+RISE: Final = 0.025
+"""Way along x, and way up at either end, m."""
+BLEND: Final = 0.050
+"""Length of a corner along x, m. A corner is a cubic Lame curve, |x / BLEND|^3 + |z / RISE|^3 = 1.
+
+Its curvature is zero at both ends, so that the acceleration does not jump.
+"""
+SPEED: Final = 5.0
+"""Largest speed of the command along x and z, m/s; the motors turn at up to 20 rad/s there."""
+PAYLOAD: Final = 0.1
+"""Payload if the machine has none, kg."""
+CONTINUOUS: Final = TORQUE_MOTOR.continuous_torque / TORQUE_MOTOR.peak_torque
+UNIT: Final = 0.005
+"""Depth below the gate that costs 1 in each step, m."""
+POINTS: Final = 120
+_ATTEMPTS: Final = 1000
+
+
+class Cycle(Task):
+    """Carry a payload 25 mm up, 305 mm across and 25 mm down, as fast as the motors can.
+
+    This is one half of the cycle by which industry compares pick-and-place robots; the other half
+    leads back. P starts at rest at one end and has to stop at the other end, within 2 mm. The
+    direction and the depth y of the way are drawn for each episode. Both corners of the gate
+    between the ends are rounded over 50 mm. The reward has a term for every step in which P is more
+    than 2 mm below the gate.
+
+    Actions come every 4 ms, and the limits are the motors': up to 5 m/s, and the acceleration that
+    a motor's peak torque gives P somewhere on the way. A gripper holds the payload, 0.1 kg or the
+    machine's ``payload``: the vacuum cup holds 12 N, and 0.1 kg needs up to 15 N here.
+    """
+
+    tolerance = 0.002
+    samplings = ("sampled", "tempting")
+    control_period = 0.004
+    max_episode_steps = 75
+
+    def __init__(
+        self,
+        machine: Machine,
+        reward: str = "sparse",
+        goals: str = "sampled",
+        penalty_weight: float = 1.0,
+    ) -> None:
+        """Check the options, and that the way fits into the machine's region."""
+        low, high = machine.region.low, machine.region.high
+        self._ends = (low[0] + high[0]) / 2 + STROKE / 2 * np.array([-1.0, 1.0])
+        self._level = machine.home[2]
+        if high[0] - low[0] < STROKE or self._level - low[2] < RISE:
+            valid = f"one whose region has {STROKE} m along x, and {RISE} m above its home"
+            raise ConfigurationError("machine", machine.name, valid)
+        across = SPEED * CONTROL_PERIOD
+        quick = replace(
+            machine,
+            payload=machine.payload or PAYLOAD,
+            step_limit=(across, machine.step_limit[1], across),
+            joint_limit=TORQUE_MOTOR.corner_speed * CONTROL_PERIOD,
+        )
+        super().__init__(quick, reward, goals, penalty_weight)
+        self._peak = np.array([motor.effort for motor in quick.mechanism.motors])
+        self.acceleration_limit = self._strength()
+
+    def _strength(self) -> tuple[float, float, float]:
+        """Return the acceleration along x, y, z that the peak torque gives P at the best point."""
+        y = (self.machine.goal_region.low[1] + self.machine.goal_region.high[1]) / 2
+        path = self._gate(y)
+        theta = self.machine.require_inverse(path)
+        jacobian = self.machine.evaluate(theta).jacobian
+        still = np.zeros_like(theta)
+        rest = self.machine.torque(theta, still, still)
+        most = []
+        for axis in np.eye(3):
+            turns = np.linalg.solve(jacobian, np.tile(axis[:, None], (len(path), 1, 1)))[..., 0]
+            torque = np.abs(self.machine.torque(theta, still, turns) - rest)
+            most.append(float((self._peak / torque).min(axis=1).max()))
+        return most[0], most[1], most[2]
+
+    # -- the way ------------------------------------------------------------------------------
+
+    def _height(self, way: FloatArray) -> FloatArray:
+        """Return the height of the gate, m, at ``way`` (...,) m from an end."""
+        to_end = np.minimum(way, STROKE - way)
+        share = np.clip(1 - to_end / BLEND, 0.0, 1.0)
+        height: FloatArray = np.where(to_end < 0, 0.0, RISE * np.cbrt(1 - share**3))
+        return height
+
+    def _gate(self, y: float, backwards: bool = False) -> FloatArray:
+        """Return points (POINTS + 1, 3) m of the way at equal distances, machine's frame."""
+        # Points of the corner at equal angles of the Lame curve, then the straight part.
+        angle = np.linspace(0.0, np.pi / 2, 200)
+        way, height = BLEND * (1 - np.cos(angle) ** (2 / 3)), RISE * np.sin(angle) ** (2 / 3)
+        way, height = np.append(way, STROKE - way[::-1]), np.append(height, height[::-1])
+        length = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(way), np.diff(height)))])
+        even = np.linspace(0.0, length[-1], POINTS + 1)
+        x = self._ends[0] + np.interp(even, length, way)
+        z = self._level - np.interp(even, length, height)
+        points = np.stack([x, np.full_like(x, y), z], axis=1)
+        return points[::-1] if backwards else points
+
+    # -- Task -----------------------------------------------------------------------------------
+
+    def sample(
+        self, rngs: Sequence[np.random.Generator], chosen: Mapping[str, FloatArray]
+    ) -> dict[str, FloatArray]:
+        """See the base class."""
+        goals = [] if "goal" in chosen else [self._draw(rng) for rng in rngs]
+        return {"goal": np.array(goals), **chosen}
+
+    def _draw(self, rng: np.random.Generator) -> FloatArray:
+        """Draw a goal (3,) m: an end, and a depth at which the whole way is safe."""
+        low, high = self.machine.goal_region.low[1], self.machine.goal_region.high[1]
+        safe, end = self.machine.safe_conditioning, self._ends[rng.integers(2)]
+        depths = rng.uniform(low, high, _ATTEMPTS)
+        ways = np.stack([self._ends, self._ends, 2 * [self._level]], axis=1)
+        ways = np.tile(ways, (_ATTEMPTS, 1, 1))
+        ways[..., 1] = depths[:, None]
+        least = self.machine.conditioning_at(ways).min(axis=1)
+        most = safe + sampling.BAND if self.goals == "tempting" else np.inf
+        fits = np.flatnonzero((least >= safe) & (least < most))
+        if not len(fits):
+            valid = f"'sampled' or another machine: {self.machine.name!r} has no such way"
+            raise ConfigurationError("goals", self.goals, valid)
+        goal: FloatArray = self.machine.mount.to_world((end, depths[fits[0]], self._level))
+        return goal
+
+    def goals_of(self, block: Block | None) -> list[tuple[FloatArray, FloatArray]]:
+        """Return the two ends, at any depth."""
+        del block
+        depths = self.machine.goal_region.low[1], self.machine.goal_region.high[1]
+        boxes = []
+        for end in self._ends.tolist():
+            corners = [self.machine.mount.to_world((end, y, self._level)) for y in depths]
+            boxes.append((np.min(corners, axis=0), np.max(corners, axis=0)))
+        return boxes
+
+    def departures(self, goals: FloatArray) -> FloatArray:
+        """Return the other ends."""
+        points = self.machine.mount.to_paper(goals).copy()
+        points[:, 0] = self._ends.sum() - points[:, 0]
+        return points
+
+    def achieved(self, state: State) -> FloatArray:
+        """Return point P by forward kinematics."""
+        return state.fk_position
+
+    def shaping(self, state: State) -> dict[str, FloatArray]:
+        """Return minus the depth of P below the gate beyond the tolerance, in units of 5 mm."""
+        points = self.machine.mount.to_paper(state.fk_position)
+        height = self._height(points[:, 0] - self._ends[0])
+        below = height - (self._level - points[:, 2]) - self.tolerance
+        return {"gate": np.minimum(-below / UNIT, 0.0)}
+
+    def plan(self, motion: Motion) -> Iterator[Move]:
+        """Follow the gate in the least time for which motors can repeat the way without end."""
+        start, goal = motion.command, self.machine.mount.to_paper(motion.goal)
+        path = self._gate(start[1], backwards=bool(start[0] > goal[0]))
+        times, _ = timed(self.machine, path, CONTINUOUS * self._peak, self._peak)
+        moments = np.arange(1, np.ceil(times[-1] / self.control_period)) * self.control_period
+        for point in np.stack([np.interp(moments, times, axis) for axis in path.T], axis=1):
+            yield Move(point, False)
+        yield Move(goal, False)

@@ -1,0 +1,159 @@
+"""Timing of a path: as fast as the motors can follow it again and again.
+
+A motor that repeats a motion must not exceed its continuous torque on average (RMS), since the
+winding heats up with the square of the torque. Tools for time-optimal path parameterisation bound
+the torque at every point only. So the timing is found here, as a convex problem.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from tpm_gym.arrays import FloatArray
+from tpm_gym.errors import ConfigurationError
+from tpm_gym.mechanism.machine import Machine
+
+__all__ = ["timed"]
+
+_STEPS: Final = 50
+_TOLERANCE: Final = 1e-9
+"""Relative decrement of the objective at which the search ends."""
+
+
+def timed(
+    machine: Machine, path: FloatArray, continuous: ArrayLike, peak: ArrayLike
+) -> tuple[FloatArray, FloatArray]:
+    """Compute when P passes the points of a path, from rest to rest, as early as torques allow.
+
+    With the path parameter s in [0, 1] and b = (ds/dt)^2, the torque is A b'/2 + B b + g, where A,
+    B and g follow from the closed-form dynamics. The time and the heat of all motors are convex in
+    b, and so is their sum, which Newton's method minimises. Without the weight g, the shape of the
+    optimal b does not depend on how both are weighed. So the shape is found once, and is then
+    scaled in time until the first motor reaches a limit.
+
+    Args:
+        machine: Machine; its payload counts.
+        path: (N + 1, 3) m, machine's frame, points at equal distances.
+        continuous: (3,) N m, largest RMS torque of each motor over the motion.
+        peak: (3,) N m, largest torque of each motor.
+
+    Returns:
+        Times (N + 1,) s of the points, and the torques (N, 3) N m between them.
+
+    Raises:
+        UnreachableError: If a point is out of reach.
+        ConfigurationError: If a motor cannot hold the weight.
+    """
+    theta, count = machine.require_inverse(path), len(path) - 1
+    middle, first = (theta[1:] + theta[:-1]) / 2, np.diff(theta, axis=0) * count
+    second = np.gradient(first, 1 / count, axis=0)
+    rest = machine.torque(middle, 0 * first, 0 * first)
+    along = (machine.torque(middle, 0 * first, first) - rest) * count / 2
+    across = (machine.torque(middle, first, second) - rest) / 2
+    # Torque between points k and k + 1 without weight: end[k] b[k + 1] + begin[k] b[k]
+    begin, end = across - along, across + along
+    squared = _fastest(begin, end)
+    spans, torques = _spans(squared), _torques(squared, begin, end)
+    slower = _scale(spans, torques, rest, np.array(continuous), np.array(peak))
+    times = np.concatenate([[0.0], np.cumsum(spans)]) * slower
+    return times, torques / slower**2 + rest
+
+
+def _spans(squared: FloatArray) -> FloatArray:
+    """Return the time between points, for b (N + 1,) at them."""
+    speed = np.sqrt(squared)
+    spans: FloatArray = 2 / (len(squared) - 1) / (speed[1:] + speed[:-1])
+    return spans
+
+
+def _torques(squared: FloatArray, begin: FloatArray, end: FloatArray) -> FloatArray:
+    """Return the torques (N, 3) between points, without weight."""
+    return begin * squared[:-1, None] + end * squared[1:, None]
+
+
+def _cost(squared: FloatArray, begin: FloatArray, end: FloatArray) -> float:
+    """Return the time plus the heat, the integral of the squared torques."""
+    heat = (_torques(squared, begin, end) ** 2).sum(axis=1)
+    return float(_spans(squared) @ (1 + heat))
+
+
+def _fastest(begin: FloatArray, end: FloatArray) -> FloatArray:
+    """Return b (N + 1,), zero at both ends, with the least time plus heat (Newton's method)."""
+    s = np.linspace(0.0, 1.0, len(begin) + 1)
+    squared = s * (1 - s)
+    heat = (_torques(squared, begin, end) ** 2).sum(axis=1)
+    # The best scale: there the heat is a third of the time.
+    squared /= np.sqrt(3 * (_spans(squared) @ heat) / _spans(squared).sum())
+    for _ in range(_STEPS):
+        gradient, hessian = _derivatives(squared, begin, end)
+        step = np.zeros_like(squared)
+        step[1:-1] = np.linalg.solve(hessian, -gradient)
+        decrement, cost = -gradient @ step[1:-1], _cost(squared, begin, end)
+        if decrement < _TOLERANCE * cost:
+            break
+        share = 1.0
+        while (squared + share * step)[1:-1].min() <= 0 or (
+            _cost(squared + share * step, begin, end) > cost - 1e-4 * share * decrement
+        ):
+            share /= 2
+        squared = squared + share * step
+    return squared
+
+
+def _derivatives(
+    squared: FloatArray, begin: FloatArray, end: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return gradient (N - 1,) and Hessian (N - 1, N - 1) of the cost by the inner b."""
+    count, spans, torques = len(begin), _spans(squared), _torques(squared, begin, end)
+    speed = np.sqrt(squared)
+    weight = 1 + (torques**2).sum(axis=1)
+    gradient, hessian = np.zeros(count + 1), np.zeros((count + 1, count + 1))
+    rows = np.arange(count)
+    sides = ((0, begin), (1, end))
+    slopes, heats = [], []
+    for side, factors in sides:
+        # At rest the slope is infinite, but b is fixed there.
+        own = np.where(speed[rows + side] > 0, speed[rows + side], np.inf)
+        slopes.append(-(spans**2) * count / 4 / own)
+        heats.append(2 * (torques * factors).sum(axis=1))
+        gradient[rows + side] += slopes[side] * weight + spans * heats[side]
+        hessian[rows + side, rows + side] += spans**2 * count / 8 / own**3 * weight
+    for side, factors in sides:
+        for other, others in sides:
+            curvature = 2 * slopes[side] * slopes[other] / spans
+            hessian[rows + side, rows + other] += (
+                curvature * weight
+                + slopes[side] * heats[other]
+                + heats[side] * slopes[other]
+                + 2 * spans * (factors * others).sum(axis=1)
+            )
+    return gradient[1:-1], hessian[1:-1, 1:-1]
+
+
+def _scale(
+    spans: FloatArray,
+    torques: FloatArray,
+    rest: FloatArray,
+    continuous: FloatArray,
+    peak: FloatArray,
+) -> float:
+    """Return the factor of time at which the first motor reaches a limit (bisection)."""
+
+    def fits(factor: float) -> bool:
+        found = torques / factor**2 + rest
+        mean = np.sqrt(spans @ found**2 / spans.sum())
+        return bool((mean <= continuous).all() and (np.abs(found) <= peak).all())
+
+    low, high = 0.0, 1.0
+    while not fits(high):
+        low, high = high, 2 * high
+        if high > 1e6:
+            valid = f"a payload that motors of {continuous.tolist()} N m can hold"
+            raise ConfigurationError("payload", rest.tolist(), valid)
+    for _ in range(50):
+        middle = (low + high) / 2
+        low, high = (low, middle) if fits(middle) else (middle, high)
+    return high
