@@ -20,7 +20,7 @@ from tpm_gym.simulation.randomisation import NOMINAL, Randomisation
 from tpm_gym.simulation.simulation import Simulation, Snapshot
 from tpm_gym.simulation.state import State
 from tpm_gym.tasks import checking
-from tpm_gym.tasks.control import accelerated, make_control
+from tpm_gym.tasks.control import Follower, make_control
 from tpm_gym.tasks.registry import make_task
 from tpm_gym.tasks.task import Task
 
@@ -131,13 +131,10 @@ class Core:
             "number of environments": count,
             "observations": observations,
         }
-        region, limit, period = (
-            self.machine.region,
-            self.task.acceleration_limit,
-            self.task.control_period,
-        )
-        self._region = np.array(region.low), np.array(region.high)
-        self._change = None if limit is None else np.array(limit) * period**2
+        self._follower: Follower | None = None
+        if self.task.accelerations is not None:
+            period = self.task.control_period
+            self._follower = Follower(self.machine, *self.task.accelerations, period)
         self._home = self.machine.require_inverse(np.array(self.machine.home))
         self._state: State | None = None
         self.closed = False
@@ -220,10 +217,8 @@ class Core:
             actions, late = late[0], late[1:]
         simulation = self.simulation
         commands = self.control.command(actions[:, :3], simulation.commands)
-        if self._change is not None:
-            commands = accelerated(
-                commands, simulation.commands, simulation.recent[:, 0], self._change, self._region
-            )
+        if self._follower is not None:
+            commands = self._follower.limit(commands, simulation.commands, simulation.recent[:, 0])
         if self._shield is not None:
             commands = self._shield.command(commands, simulation.recent)
         vacuum = actions[:, 3] > 0 if self.task.vacuum else np.zeros(self.count, dtype=np.bool_)

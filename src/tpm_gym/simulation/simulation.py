@@ -180,7 +180,7 @@ class Simulation:
             self._belt_speed[rows] = self.scene.belt.require(speeds, len(rows), InputError)
             self.engine.set_belt(rows, self._belt_speed[rows])
         self.engine.place(rows, true, placed)
-        self._commands[rows] = reading.position
+        self._commands[rows] = reading.position[..., None, :]
         self._bias[rows], self._mode_left[rows] = bias, 0
         self._noise[rows] = 0.0 if noise is None else noise[:, None]
         self._disturbed = bool(self._bias.any() or self._noise.any())

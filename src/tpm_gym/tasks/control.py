@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import ConfigurationError
@@ -17,10 +18,12 @@ from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.engine import loops
 from tpm_gym.simulation.state import CONTROL_PERIOD
 
-__all__ = ["CartesianControl", "Control", "JointControl", "accelerated", "make_control"]
+__all__ = ["CartesianControl", "Control", "Follower", "JointControl", "make_control"]
 
 _TRIES = 6  # largest number of shares of a step that are tried
 _AIM = 0.9995  # fraction of the limit that a try aims at
+USABLE = 0.95
+"""Share of the peak torque that commands may need; the rest is for what disturbs the robot."""
 _PARTS = 32  # parts of a line; within a part, joints turn almost uniformly
 
 
@@ -182,33 +185,62 @@ class JointControl:
         return self._machine.evaluate(theta).jacobian * self._machine.joint_limit
 
 
-def accelerated(
-    wanted: FloatArray,
-    current: FloatArray,
-    before: FloatArray,
-    change: FloatArray,
-    region: tuple[FloatArray, FloatArray],
-) -> FloatArray:
-    """Return the commands nearest to ``wanted`` that change their steps by ``change`` at most.
+class Follower:
+    """Limit of commands to what the motors can follow, by closed-form dynamics.
 
-    No command goes so fast towards the end of the region that it could not stop before it.
+    The change of the step from one command to the next is limited along each axis. It is then
+    shortened as a whole to what a share of the motors' peak torques allows the nominal machine,
+    :data:`USABLE`. No command goes too fast towards an end of the region to stop there.
 
     Args:
-        wanted: (n, 3) m, commands of a control.
-        current: (n, 3) m, the last commands.
-        before: (n, 3) m, the commands before the last.
-        change: (3,) m, largest change of the step from one command to the next, along each axis.
-        region: Low and high corner (3,) m of the region.
+        machine: Machine; its payload counts.
+        acceleration: (3,) m/s^2, largest acceleration of the command along each axis.
+        braking: (3,) m/s^2, deceleration with which commands stop at an end of the region.
+        period: Control period, s.
     """
-    last, (low, high) = current - before, region
-    step = np.clip(wanted - current, last - change, last + change)
-    # From a step v the command stops after v + (v - change) + ... = v^2 / (2 change) + v / 2.
-    down, up = (
-        np.sqrt(change**2 / 4 + 2 * change * np.maximum(room, 0.0)) - change / 2
-        for room in (current - low, high - current)
-    )
-    commands: FloatArray = np.clip(current + np.clip(step, -down, up), low, high)
-    return commands
+
+    def __init__(
+        self, machine: Machine, acceleration: ArrayLike, braking: ArrayLike, period: float
+    ) -> None:
+        """Take the limits of a machine."""
+        self._machine, self._period = machine, period
+        self._change, self._brake = (np.array(rate) * period**2 for rate in (acceleration, braking))
+        self._low, self._high = np.array(machine.region.low), np.array(machine.region.high)
+        self._most = USABLE * np.array([motor.effort for motor in machine.mechanism.motors])
+
+    def limit(self, wanted: FloatArray, current: FloatArray, before: FloatArray) -> FloatArray:
+        """Return the commands (n, 3) m near ``wanted`` that can be followed.
+
+        Args:
+            wanted: (n, 3) m, commands of a control.
+            current: (n, 3) m, the last commands.
+            before: (n, 3) m, the commands before the last.
+        """
+        last, change, brake = current - before, self._change, self._brake
+        step = np.clip(wanted - current, last - change, last + change)
+        # A command that slows down by b in each step moves v + (v - b) + ... = v^2 / (2 b) + v / 2.
+        down, up = (
+            np.sqrt(brake**2 / 4 + 2 * brake * np.maximum(room, 0.0)) - brake / 2
+            for room in (current - self._low, self._high - current)
+        )
+        step = np.clip(step, -down, up)
+        straight = np.clip(current + last, self._low, self._high)
+        asked = np.clip(current + step, self._low, self._high)
+        steady, most = self._torques(before, current, np.stack([straight, asked]))
+        # Torques are nearly linear in the change of the step; NaN where nothing changes.
+        with np.errstate(divide="ignore", invalid="ignore"):
+            room = np.where(most > steady, self._most - steady, self._most + steady)
+            share = np.nanmin(room / np.abs(most - steady), axis=-1, initial=1.0)
+        commands: FloatArray = straight + np.maximum(share, 0.0)[:, None] * (asked - straight)
+        return commands
+
+    def _torques(self, before: FloatArray, current: FloatArray, then: FloatArray) -> FloatArray:
+        """Return the torques (k, n, 3) N m on the splines to each of k next commands (k, n, 3)."""
+        middle = (before + 6 * current + then) / 8
+        ends = np.broadcast_to((before + current) / 2, then.shape), (current + then) / 2
+        first, now, last = self._machine.inverse(np.stack([ends[0], middle, ends[1]]))
+        rates, changes = (last - first) / self._period, first - 2 * now + last
+        return self._machine.torque(now, rates, changes / (self._period / 2) ** 2)
 
 
 def make_control(kind: str, machine: Machine, period: float = CONTROL_PERIOD) -> Control:

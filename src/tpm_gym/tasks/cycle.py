@@ -14,6 +14,7 @@ from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.motor import TORQUE_MOTOR
 from tpm_gym.simulation.state import CONTROL_PERIOD, Block, State
 from tpm_gym.tasks import sampling
+from tpm_gym.tasks.control import USABLE
 from tpm_gym.tasks.motion import Motion, Move
 from tpm_gym.tasks.task import Task
 from tpm_gym.tasks.timing import timed
@@ -33,6 +34,13 @@ SPEED: Final = 5.0
 PAYLOAD: Final = 0.1
 """Payload if the machine has none, kg."""
 CONTINUOUS: Final = TORQUE_MOTOR.continuous_torque / TORQUE_MOTOR.peak_torque
+SHARES: Final = (0.65, 0.1, 0.65)
+"""Accelerations of the command along x, y, z, as shares of what the peak torque gives P alone."""
+BRAKING: Final = (0.8, 0.8, 0.25)
+"""Decelerations before the ends of the region, as shares of the accelerations.
+
+Along x the way ends close to the region, along z far from it. Both together have to be possible.
+"""
 UNIT: Final = 0.005
 """Depth below the gate that costs 1 in each step, m."""
 POINTS: Final = 120
@@ -48,9 +56,10 @@ class Cycle(Task):
     between the ends are rounded over 50 mm. The reward has a term for every step in which P is more
     than 2 mm below the gate.
 
-    Actions come every 4 ms, and the limits are the motors': up to 5 m/s, and the acceleration that
-    a motor's peak torque gives P somewhere on the way. A gripper holds the payload, 0.1 kg or the
-    machine's ``payload``: the vacuum cup holds 12 N, and 0.1 kg needs up to 15 N here.
+    Actions come every 4 ms, and the limits are the motors': the command moves at up to 5 m/s, and
+    closed-form dynamics shorten a change of its speed that would need more than 95% of the peak
+    torque. A gripper holds the payload, 0.1 kg or the machine's ``payload``. The vacuum cup could
+    not: it holds 12 N, and 0.1 kg needs up to 16 N here.
     """
 
     tolerance = 0.002
@@ -81,12 +90,13 @@ class Cycle(Task):
         )
         super().__init__(quick, reward, goals, penalty_weight)
         self._peak = np.array([motor.effort for motor in quick.mechanism.motors])
-        self.acceleration_limit = self._strength()
+        limits = self._strength()
+        self.accelerations = tuple(limits.tolist()), tuple((limits * np.array(BRAKING)).tolist())
 
-    def _strength(self) -> tuple[float, float, float]:
-        """Return the acceleration along x, y, z that the peak torque gives P at the best point."""
+    def _strength(self) -> FloatArray:
+        """Return the limits of acceleration along x, y, z, m/s^2."""
         y = (self.machine.goal_region.low[1] + self.machine.goal_region.high[1]) / 2
-        path = self._gate(y)
+        path = self.gate(y)
         theta = self.machine.require_inverse(path)
         jacobian = self.machine.evaluate(theta).jacobian
         still = np.zeros_like(theta)
@@ -96,7 +106,8 @@ class Cycle(Task):
             turns = np.linalg.solve(jacobian, np.tile(axis[:, None], (len(path), 1, 1)))[..., 0]
             torque = np.abs(self.machine.torque(theta, still, turns) - rest)
             most.append(float((self._peak / torque).min(axis=1).max()))
-        return most[0], most[1], most[2]
+        limits: FloatArray = np.array(SHARES) * most
+        return limits
 
     # -- the way ------------------------------------------------------------------------------
 
@@ -107,7 +118,7 @@ class Cycle(Task):
         height: FloatArray = np.where(to_end < 0, 0.0, RISE * np.cbrt(1 - share**3))
         return height
 
-    def _gate(self, y: float, backwards: bool = False) -> FloatArray:
+    def gate(self, y: float, backwards: bool = False) -> FloatArray:
         """Return points (POINTS + 1, 3) m of the way at equal distances, machine's frame."""
         # Points of the corner at equal angles of the Lame curve, then the straight part.
         angle = np.linspace(0.0, np.pi / 2, 200)
@@ -158,7 +169,7 @@ class Cycle(Task):
 
     def departures(self, goals: FloatArray) -> FloatArray:
         """Return the other ends."""
-        points = self.machine.mount.to_paper(goals).copy()
+        points: FloatArray = self.machine.mount.to_paper(goals).copy()
         points[:, 0] = self._ends.sum() - points[:, 0]
         return points
 
@@ -176,8 +187,8 @@ class Cycle(Task):
     def plan(self, motion: Motion) -> Iterator[Move]:
         """Follow the gate in the least time for which motors can repeat the way without end."""
         start, goal = motion.command, self.machine.mount.to_paper(motion.goal)
-        path = self._gate(start[1], backwards=bool(start[0] > goal[0]))
-        times, _ = timed(self.machine, path, CONTINUOUS * self._peak, self._peak)
+        path = self.gate(start[1], backwards=bool(start[0] > goal[0]))
+        times, _ = timed(self.machine, path, CONTINUOUS * self._peak, USABLE * self._peak)
         moments = np.arange(1, np.ceil(times[-1] / self.control_period)) * self.control_period
         for point in np.stack([np.interp(moments, times, axis) for axis in path.T], axis=1):
             yield Move(point, False)

@@ -83,8 +83,8 @@ class Task(ABC):
         samplings: Values of ``goals``.
         control_period: Time between two actions, s. Limits of the machine hold in 40 ms, and are
             scaled to it.
-        acceleration_limit: Largest acceleration of the command for P along x, y, z, machine's
-            frame, m/s^2; None for any.
+        accelerations: Largest acceleration of the command for P along x, y, z, machine's frame,
+            and its deceleration before the ends of the region, m/s^2; None for any.
         max_episode_steps: Control steps after which ``gym.make`` truncates an episode.
         camera_delay: Control steps by which observation and achieved goal show objects late.
         entries: Entries of the observation vector, in order.
@@ -99,7 +99,7 @@ class Task(ABC):
     tolerance: ClassVar[float] = 0.010
     samplings: ClassVar[tuple[str, ...]] = ("sampled",)
     control_period: ClassVar[float] = CONTROL_PERIOD
-    acceleration_limit: Vector | None = None
+    accelerations: tuple[Vector, Vector] | None = None
     max_episode_steps: ClassVar[int] = 50
     camera_delay: ClassVar[int] = 0
 
@@ -204,6 +204,7 @@ class Task(ABC):
             (r, 3) m, machine's frame; None for the machine's home.
         """
         del goals
+        return None
 
     # -- reward: here and nowhere else ------------------------------------------------------------
 
