@@ -82,27 +82,31 @@ def cycle(engine: str, payload: float, make: Callable[[Any], Act]) -> dict[str, 
 
 
 def planned(payload: float) -> dict[str, Any]:
-    """Return what the expert plans for both ways: time, RMS and peak of the torques."""
+    """Return what the expert plans for both ways: time, torques, and the motion of P."""
     task = Cycle(replace(PAPER_TPM, payload=payload))
     peak = np.array([motor.effort for motor in task.machine.mechanism.motors])
-    depth = float(np.mean([task.machine.goal_region.low[1], task.machine.goal_region.high[1]]))
-    seconds, heat, most, fastest, hardest = 0.0, np.zeros(3), np.zeros(3), 0.0, 0.0
+    low, high = task.machine.goal_region.low[1], task.machine.goal_region.high[1]
+    weight = np.array(task.machine.mount.free_fall)
+    seconds, heat, speeds, changes, forces, torques = 0.0, np.zeros(3), [], [], [], []
     for backwards in (False, True):
-        path = task.gate(depth, backwards)
-        times, torques = timed(task.machine, path, CONTINUOUS * peak, USABLE * peak)
-        spans = np.diff(times)
-        speeds = np.linalg.norm(np.diff(path, axis=0), axis=1) / spans
-        changes = np.diff(speeds) / ((spans[1:] + spans[:-1]) / 2)
-        seconds, heat = seconds + times[-1], heat + spans @ torques**2
-        most = np.maximum(most, np.abs(torques).max(axis=0))
-        fastest, hardest = max(fastest, speeds.max()), max(hardest, np.abs(changes).max())
+        path = task.gate((low + high) / 2, backwards)
+        times, needed = timed(task.machine, path, CONTINUOUS * peak, USABLE * peak)
+        spans = np.diff(times)[:, None]
+        rates = np.diff(path, axis=0) / spans
+        change = np.diff(rates, axis=0) / ((spans[1:] + spans[:-1]) / 2)
+        seconds, heat = seconds + times[-1], heat + spans[:, 0] @ needed**2
+        speeds.append(np.linalg.norm(rates, axis=1).max())
+        changes.append(np.linalg.norm(change, axis=1).max())
+        forces.append(payload * np.linalg.norm(change - weight, axis=1).max())
+        torques.append(np.abs(needed).max())
     return {
         "payload": payload,
         "seconds": round(seconds, 4),
         "rms": np.sqrt(heat / seconds).round(2).tolist(),
-        "peak": most.round(2).tolist(),
-        "speed": round(fastest, 2),
-        "acceleration": round(hardest, 1),
+        "peak": round(float(max(torques)), 1),
+        "speed": round(float(max(speeds)), 2),
+        "acceleration": round(float(max(changes)), 1),
+        "force": round(float(max(forces)), 1),
     }
 
 
@@ -121,8 +125,8 @@ def success(engine: str, episodes: int) -> dict[str, Any]:
 
 def lines(record: dict[str, Any]) -> Iterator[str]:
     """Yield the tables of the page."""
-    head = ["payload", "planned", *(f"{row['engine']}" for row in record["cycles"][:3])]
-    head += ["RMS", "peak", "1/cond(J)"]
+    head = ["payload", "planned", *(row["engine"] for row in record["cycles"][: len(EPISODES)])]
+    head += ["RMS", "peak", "1/cond(J)", "speed", "acceleration", "force"]
     rows = []
     for plan in record["plans"]:
         own = [row for row in record["cycles"] if row["payload"] == plan["payload"]]
@@ -134,6 +138,9 @@ def lines(record: dict[str, Any]) -> Iterator[str]:
                 f"{max(max(row['rms']) for row in own):.1f} N m",
                 f"{max(max(row['peak']) for row in own):.0f} N m",
                 f"{min(row['conditioning'] for row in own):.3f}",
+                f"{plan['speed']:.1f} m/s",
+                f"{plan['acceleration']:.0f} m/s^2",
+                f"{plan['force']:.0f} N",
             ]
         )
     yield from table(head, rows)
