@@ -34,6 +34,9 @@ CASES: list[tuple[str, dict[str, Any]]] = [
     ("TPMPickAndPlace-v0", {"machine": "gantry"}),
     ("TPMPickAndPlaceJoints-v0", {"engine": "analytic", "shield": True, "goals": "tempting"}),
     ("TPMPickAndPlace-v0", {"drive": "servo", "shield": True, "randomisation": {"latency": 2}}),
+    ("TPMCycleDense-v0", {"engine": "mujoco", "drive": "servo"}),
+    ("TPMCycle-v0", {"engine": "analytic", "drive": "servo", "machine": "wide"}),
+    ("TPMCycleJoints-v0", {"engine": "analytic", "goals": "tempting"}),
     ("TPMReach-v0", {"engine": "kinematic"}),
     ("TPMPickAndPlaceJoints-v0", {"engine": "kinematic"}),
 ]

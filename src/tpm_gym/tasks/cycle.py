@@ -16,7 +16,7 @@ from tpm_gym.simulation.state import CONTROL_PERIOD, Block, State
 from tpm_gym.tasks import sampling
 from tpm_gym.tasks.control import USABLE
 from tpm_gym.tasks.motion import Motion, Move
-from tpm_gym.tasks.task import Task
+from tpm_gym.tasks.task import Task, dense
 from tpm_gym.tasks.timing import timed
 
 __all__ = ["Cycle"]
@@ -41,6 +41,8 @@ BRAKING: Final = (0.8, 0.8, 0.25)
 
 Along x the way ends close to the region, along z far from it. Both together have to be possible.
 """
+NEAR: Final = 0.010
+"""Distance to the end from which on a dense reward costs 1 more, m."""
 UNIT: Final = 0.005
 """Depth below the gate that costs 1 in each step, m."""
 POINTS: Final = 120
@@ -173,9 +175,10 @@ class Cycle(Task):
         points[:, 0] = self._ends.sum() - points[:, 0]
         return points
 
-    def achieved(self, state: State) -> FloatArray:
-        """Return point P by forward kinematics."""
-        return state.fk_position
+    def goal_term(self, gap: FloatArray) -> FloatArray:
+        """See the base class; a dense reward costs up to 1 more in each step before the arrival."""
+        term = super().goal_term(gap)
+        return term if self.reward == "sparse" else term + dense(np.minimum(gap, NEAR), NEAR)
 
     def shaping(self, state: State) -> dict[str, FloatArray]:
         """Return minus the depth of P below the gate beyond the tolerance, in units of 5 mm."""
