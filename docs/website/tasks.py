@@ -141,7 +141,8 @@ def _scene(task: Task) -> Iterator[str]:
 
 
 def _action(task: Task) -> Iterator[str]:
-    step = ", ".join(f"{1e3 * value:g}" for value in task.machine.step_limit)
+    command = next(entry for entry in task.entries if entry.name == "command")
+    step = ", ".join(f"{1e3 * value:.3g}" for value in command.scale)
     yield from (
         "## Action",
         "",
@@ -186,7 +187,9 @@ def _reward(tasks: dict[str, Task]) -> Iterator[str]:
     task = tasks[sparse[0]]
     within = f"{1e3 * task.tolerance:g} mm"
     yield f"| `goal` | sparse | 0 if the distance to the goal is below {within}, else -1 |"
-    yield "| `goal` | dense | minus the distance to the goal, in units of 0.1 m |"
+    own = type(task).goal_term is not Task.goal_term
+    more = ". " + " ".join(_sentences(type(task).goal_term)).removesuffix(".") if own else ""
+    yield f"| `goal` | dense | minus the distance to the goal, in units of 0.1 m{more} |"
     safe = f"{task.machine.safe_conditioning:g}"
     yield (
         f"| `singularity` | all | -(1 - (c / {safe})^4) if the conditioning c = 1/cond(J) is below "
@@ -289,7 +292,7 @@ def _draw_film(name: str) -> None:
             frames.append(env.render())
             observation, _, _, done, _ = env.step(expert.act(observation))
     first, *rest = [Image.fromarray(frame) for frame in frames]
-    shown = round(1e3 * TASKS[name].control_period)
+    shown = max(40, round(1e3 * TASKS[name].control_period))  # ms; faster is not seen
     lasting = [shown] * len(rest) + [1500]  # the end stays for a while
     PAGES.mkdir(parents=True, exist_ok=True)
     first.save(_film(name), save_all=True, append_images=rest, duration=lasting, loop=0, quality=80)

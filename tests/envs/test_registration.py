@@ -10,7 +10,7 @@ import tpm_gym
 from tpm_gym import TPMEnv, register_task
 from tpm_gym.envs.ids import env_ids
 from tpm_gym.errors import ConfigurationError
-from tpm_gym.tasks import Conveyor, PickAndPlace, Push, Reach, Stack, Throw
+from tpm_gym.tasks import Conveyor, Cycle, PickAndPlace, Push, Reach, Stack, Throw
 from tpm_gym.tasks.registry import TASKS
 
 
@@ -21,7 +21,8 @@ def registries():
         yield
 
 
-TASK_CLASSES = {kind.__name__: kind for kind in (Reach, PickAndPlace, Push, Stack, Throw, Conveyor)}
+_CLASSES = (Reach, PickAndPlace, Push, Stack, Throw, Conveyor, Cycle)
+TASK_CLASSES = {kind.__name__: kind for kind in _CLASSES}
 
 
 class Lift(PickAndPlace):
@@ -47,9 +48,10 @@ def test_an_id_means_what_it_says(env_id):
     assert inner.task.reward == ("dense" if "Dense" in env_id else "sparse")
     control = "JointControl" if "Joints" in env_id else "CartesianControl"
     assert type(inner.control).__name__ == control
-    assert env.action_space.shape == ((3,) if name in ("Reach", "Push") else (4,))
-    assert env.spec.max_episode_steps == {"Stack": 100, "Throw": 60, "Conveyor": 80}.get(name, 50)
-    assert env.metadata["render_fps"] == 25
+    assert env.action_space.shape == ((3,) if name in ("Reach", "Push", "Cycle") else (4,))
+    longer = {"Stack": 100, "Throw": 60, "Conveyor": 80, "Cycle": 75}
+    assert env.spec.max_episode_steps == longer.get(name, 50)
+    assert env.metadata["render_fps"] == (250 if name == "Cycle" else 25)
 
 
 @pytest.mark.usefixtures("registries")

@@ -1,6 +1,7 @@
 """Tasks: scenes, goals, observations, rewards, controls, experts."""
 
 from tpm_gym.tasks.conveyor import Conveyor
+from tpm_gym.tasks.cycle import Cycle
 from tpm_gym.tasks.expert import Expert
 from tpm_gym.tasks.motion import Motion, Move, hanging
 from tpm_gym.tasks.pick_and_place import PickAndPlace
@@ -12,6 +13,7 @@ from tpm_gym.tasks.throw import Throw
 
 __all__ = [
     "Conveyor",
+    "Cycle",
     "Entry",
     "Expert",
     "Motion",

@@ -33,7 +33,8 @@ SPEED: Final = 5.0
 """Largest speed of the command along x and z, m/s; the motors turn at up to 20 rad/s there."""
 PAYLOAD: Final = 0.1
 """Payload if the machine has none, kg."""
-CONTINUOUS: Final = TORQUE_MOTOR.continuous_torque / TORQUE_MOTOR.peak_torque
+CONTINUOUS: Final = 0.98 * TORQUE_MOTOR.continuous_torque / TORQUE_MOTOR.peak_torque
+"""Largest RMS torque of the timing, as a share of the peak torque; 2% are for the servos."""
 SHARES: Final = (0.65, 0.1, 0.65)
 """Accelerations of the command along x, y, z, as shares of what the peak torque gives P alone."""
 BRAKING: Final = (0.8, 0.8, 0.25)
@@ -61,7 +62,7 @@ class Cycle(Task):
     Actions come every 4 ms, and the limits are the motors': the command moves at up to 5 m/s, and
     closed-form dynamics shorten a change of its speed that would need more than 95% of the peak
     torque. A gripper holds the payload, 0.1 kg or the machine's ``payload``. The vacuum cup could
-    not: it holds 12 N, and 0.1 kg needs up to 16 N here.
+    not: it holds 12 N, and 0.1 kg needs up to 15 N here.
     """
 
     tolerance = 0.002
@@ -107,7 +108,7 @@ class Cycle(Task):
         for axis in np.eye(3):
             turns = np.linalg.solve(jacobian, np.tile(axis[:, None], (len(path), 1, 1)))[..., 0]
             torque = np.abs(self.machine.torque(theta, still, turns) - rest)
-            most.append(float((self._peak / torque).min(axis=1).max()))
+            most.append(1 / float((torque / self._peak).max(axis=1).min()))
         limits: FloatArray = np.array(SHARES) * most
         return limits
 
@@ -176,7 +177,7 @@ class Cycle(Task):
         return points
 
     def goal_term(self, gap: FloatArray) -> FloatArray:
-        """See the base class; a dense reward costs up to 1 more in each step before the arrival."""
+        """Subtract the distance, up to 10 mm, in units of 10 mm from a dense reward as well."""
         term = super().goal_term(gap)
         return term if self.reward == "sparse" else term + dense(np.minimum(gap, NEAR), NEAR)
 
