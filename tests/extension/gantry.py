@@ -12,6 +12,7 @@ from tpm_gym.mechanism import Machine, Mount
 from tpm_gym.mechanism.bodies import Joint, Link, Mechanism, Solid
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Reading
+from tpm_gym.mechanism.parts import load
 
 ALUMINIUM = 2700.0  # kg/m^3
 SLIDES = ("slide_x", "slide_y", "slide_z")
@@ -63,7 +64,8 @@ class Gantry(Machine):
             Link("trolley", (beam((0.08, 0.08, 0.06), 0.004, (0.0, 0.0, 0.09), "yellow"),),
                  slide(1, "bridge")),
             Link("ram", (beam((0.03, 0.03, 0.9), 0.002, (0.0, 0.0, -0.45), "orange"),
-                         CUP.stem((0.0, 0.0, 0.0))), slide(2, "trolley")),
+                         CUP.stem((0.0, 0.0, 0.0)), *load(self.payload, (0.0, 0.0, 0.0))),
+                 slide(2, "trolley")),
             CUP.link("ram", (0.0, 0.0, 0.0)),
         )  # fmt: skip
         return Mechanism(

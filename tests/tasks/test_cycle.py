@@ -3,12 +3,14 @@
 from contextlib import closing
 from dataclasses import replace
 
+import gantry  # noqa: F401  registers a machine
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 from tpm_gym import PAPER_TPM, WIDE_TPM, TPMEnv, TPMVectorEnv
 from tpm_gym.errors import ConfigurationError, UnreachableError
+from tpm_gym.mechanism.machine import find_machine
 from tpm_gym.tasks import Expert
 from tpm_gym.tasks.control import USABLE, Follower
 from tpm_gym.tasks.cycle import CONTINUOUS, RISE, STROKE, Cycle
@@ -170,3 +172,21 @@ def test_commands_ask_no_more_than_the_motors_have(seed):
         before, current = current, then
     assert np.mean(kept) > 0.99
     assert np.mean(there) > 0.99
+
+
+def test_a_mechanism_without_the_payload_is_refused():
+    class Empty(type(PAPER_TPM)):
+        mechanism = PAPER_TPM.mechanism
+
+    fields = {name: getattr(PAPER_TPM, name) for name in PAPER_TPM.__dataclass_fields__}
+    with pytest.raises(ConfigurationError, match="contains its payload"):
+        Cycle(Empty(**fields))
+
+
+def test_every_machine_carries_the_payload():
+    for name in ("paper", "wide", "delta", "gantry"):
+        machine = find_machine(name)
+        at = machine.inverse(machine.home), np.zeros(3)
+        one, none = (replace(machine, payload=mass).motion(*at) for mass in (1.0, 0.0))
+        pull = np.linalg.inv(none.jacobian)
+        assert_allclose(pull.T @ (one.mass - none.mass) @ pull, np.eye(3), atol=2e-3)

@@ -51,6 +51,12 @@ def bar(
     return Solid("cylinder", (radius, 2 * half, 0.0), centre, density, axis=axis, colour=colour)
 
 
+def load(payload: float, centre: Vector) -> tuple[Solid, ...]:
+    """Build a steel cube of ``payload`` (kg) in a gripper; nothing for 0 kg."""
+    edge = (payload / STEEL) ** (1 / 3)
+    return (Solid("box", (edge, edge, edge), centre, STEEL, colour="steel"),) if payload else ()
+
+
 def rod(axis: Literal["x", "y"], length: float) -> tuple[Solid, ...]:
     """Build a carbon-fibre tube, 16 mm by 1.5 mm, with a steel rod end at both ends."""
     fibre = bar(axis, length / 2, 0.008, displaced(axis, length / 2), "carbon", CARBON_FIBRE)

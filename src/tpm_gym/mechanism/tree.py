@@ -84,8 +84,6 @@ def _branch_2(g: Geometry, payload: float) -> tuple[Link, ...]:
     minus_y, point_p = (0.0, -1.0, 0.0), (g.l2, 0.0, g.l6)
     # From F1 to D3
     plate = Solid("box", (2 * g.l2 + 0.04, 0.045, 0.008), point_p, ALUMINIUM, colour="yellow")
-    edge = (payload / STEEL) ** (1 / 3)
-    load = (Solid("box", (edge,) * 3, point_p, STEEL, colour="steel"),) if payload else ()
     tube, bore = (3 * g.l5, 0.025, 0.018), (3 * g.l5, 0.019, 0.012)
     link_3p = (
         Solid("box", tube, (1.5 * g.l5, 0.0, 0.0), ALUMINIUM, bore=bore, colour="blue"),
@@ -111,7 +109,7 @@ def _branch_2(g: Geometry, payload: float) -> tuple[Link, ...]:
         Link("link_7", link_7, Joint("R12", "continuous", "link_3p", (2 * g.l5, 0.0, g.l6))),
         Link(
             "platform",
-            (plate, CUP.stem(point_p), *load),
+            (plate, CUP.stem(point_p), *parts.load(payload, point_p)),
             Joint("R13", "continuous", "link_7", (g.l7, 0.0, 0.0)),
         ),
         CUP.link("platform", point_p),

@@ -91,6 +91,10 @@ class Cycle(Task):
             step_limit=(across, machine.step_limit[1], across),
             joint_limit=TORQUE_MOTOR.corner_speed * CONTROL_PERIOD,
         )
+        added = _moved(quick) - _moved(replace(quick, payload=0.0))
+        if abs(added - quick.payload) > 1e-9:
+            valid = "one whose mechanism contains its payload (tpm_gym.mechanism.parts.load)"
+            raise ConfigurationError("machine", machine.name, valid)
         super().__init__(quick, reward, goals, penalty_weight)
         self._peak = np.array([motor.effort for motor in quick.mechanism.motors])
         limits = self._strength()
@@ -197,3 +201,8 @@ class Cycle(Task):
         for point in np.stack([np.interp(moments, times, axis) for axis in path.T], axis=1):
             yield Move(point, False)
         yield Move(goal, False)
+
+
+def _moved(machine: Machine) -> float:
+    """Return the mass of the moving links, kg."""
+    return sum(link.mass for link in machine.mechanism.links[1:])

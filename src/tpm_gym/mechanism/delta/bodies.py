@@ -52,8 +52,8 @@ class Inertia(NamedTuple):
     spin: Triple
 
 
-def build(g: DeltaGeometry) -> Mechanism:
-    """Build the mechanism; cross-sections and materials are those of the TPM."""
+def build(g: DeltaGeometry, payload: float = 0.0) -> Mechanism:
+    """Build the mechanism with a payload (kg); cross-sections and materials are the TPM's."""
     links, closures = [_base(g)], []
     for number, leg in LEGS.items():
         links += _leg(number, leg, g)
@@ -61,7 +61,7 @@ def build(g: DeltaGeometry) -> Mechanism:
             name, end = f"{number}{suffix}", outwards(leg, (g.l2, side * g.l5, 0.0))
             closures.append(Closure(f"S{name}", f"rod_{name}", (g.l4, 0.0, 0.0), "platform", end))
     return Mechanism(
-        links=(*links, *_platform(g)),
+        links=(*links, *_platform(g, payload)),
         closures=tuple(closures),
         platform="platform",
         point_p=_ORIGIN,
@@ -152,11 +152,12 @@ def _leg(number: int, leg: Pair, g: DeltaGeometry) -> list[Link]:
     return links
 
 
-def _platform(g: DeltaGeometry) -> list[Link]:
+def _platform(g: DeltaGeometry, payload: float) -> list[Link]:
     """Build platform and cup."""
     plate = Solid("cylinder", (g.l2 + 0.015, 0.008, 0.0), _ORIGIN, ALUMINIUM, colour="yellow")
     bar = parts.bar("y", g.l5 + 0.01, 0.007, (g.l2, 0.0, 0.0))
-    solids = (plate, *(_turned(bar, leg) for leg in LEGS.values()), CUP.stem(_ORIGIN))
+    bars = (_turned(bar, leg) for leg in LEGS.values())
+    solids = (plate, *bars, CUP.stem(_ORIGIN), *parts.load(payload, _ORIGIN))
     free = parts.free_platform(solids, 10 * (g.l1 + g.l3 + g.l4))
     return [*free, CUP.link("platform", _ORIGIN)]
 

@@ -101,7 +101,7 @@ class Delta(CompiledMachine):
     @cached_property
     def mechanism(self) -> Mechanism:
         """See :class:`Machine`."""
-        return bodies.build(self.geometry)
+        return bodies.build(self.geometry, self.payload)
 
     def joint_positions(self, theta: Vector) -> dict[str, float]:
         """See :class:`Machine`."""
@@ -116,7 +116,10 @@ class Delta(CompiledMachine):
     def dynamics(self) -> DeltaDynamics:
         """Torques, mass matrix and energy of the nominal machine with an empty cup."""
         return DeltaDynamics(
-            geometry=self.geometry, side=self.assembly_mode, free_fall=self.mount.free_fall
+            geometry=self.geometry,
+            side=self.assembly_mode,
+            free_fall=self.mount.free_fall,
+            payload=self.payload,
         )
 
     @property
