@@ -13,8 +13,11 @@ from tpm_gym import TPMEnv
 from tpm_gym.arrays import Vector
 from tpm_gym.errors import ClosureError, EpisodeError, ModeChangeError, UnreachableError
 from tpm_gym.kinematics.geometry import PAPER
+from tpm_gym.kinematics.modes import AssemblyMode
 from tpm_gym.mechanism import PAPER_TPM
-from tpm_gym.simulation import State
+from tpm_gym.mechanism.dynamics import Dynamics
+from tpm_gym.simulation import Scene, Servo, State
+from tpm_gym.simulation.simulation import Simulation
 
 HOME = PAPER_TPM.home
 THETA = PAPER_TPM.inverse(HOME)
@@ -150,6 +153,65 @@ def test_a_platform_pushed_over_the_edge_is_a_change_of_the_working_mode(force):
         env.step(IDLE)
     assert caught.value.mode == "working"
     assert fingerprint(random_episode(env, 6)) == fresh
+
+
+# -- through y = 0 by inertia ----------------------------------------------------------------------
+
+
+def cross(engine: str, step: float, drive: Servo | None = None, pause: int = 0) -> State:
+    """Command P from y = 28 mm to -28 mm in equal steps, wait there, and read the state."""
+    simulation = Simulation(Scene(), engine=engine, drive=drive)
+    simulation.reset(np.array([0]), THETA)
+    way = np.arange(0.028, -0.028, -step)
+    middle = int(np.abs(way).argmin())
+    for y in (*way[:middle], *[0.0] * pause, *way[middle:], *[-0.028] * 15):
+        simulation.move(np.array([[HOME[0], y, HOME[2]]]), np.zeros(1, dtype=np.bool_))
+    state = simulation.state().take(0)
+    simulation.close()
+    return state
+
+
+@pytest.mark.parametrize("engine", ["pybullet", "mujoco"])
+@pytest.mark.parametrize("step", [0.0005, 0.002, 0.005, 0.010])
+def test_point_p_coasts_through_the_plane_and_arrives_behind_it(engine, step):
+    state = cross(engine, step)
+    assert state.assembly_mode_changed
+    assert true_y(state) == pytest.approx(-0.028, abs=1e-6)
+    assert state.fk_position[1] == pytest.approx(-0.028, abs=1e-6)  # the mirror image
+
+
+@pytest.mark.parametrize("engine", ["pybullet", "mujoco"])
+def test_a_stop_in_the_plane_leaves_the_side_to_chance(engine):
+    assert true_y(cross(engine, 0.005, pause=20)) == pytest.approx(0.028, abs=1e-6)
+
+
+@pytest.mark.parametrize("engine", ["pybullet", "mujoco"])
+@pytest.mark.parametrize(("step", "side"), [(0.002, -1), (0.010, 1)])
+def test_servo_drives_pass_slowly_and_turn_back_at_250_mm_per_s(engine, step, side):
+    state = cross(engine, step, Servo())
+    assert true_y(state) == pytest.approx(side * 0.028, abs=1e-5)
+
+
+@pytest.mark.parametrize("speed", [-0.125, -0.25, -0.5])
+@pytest.mark.parametrize(("acceleration", "finite"), [(0.0, True), (1.0, False), (-1.0, False)])
+def test_torques_stay_finite_in_the_plane_only_without_acceleration_along_y(
+    speed, acceleration, finite
+):
+    found = []
+    for time in (-4e-3, -1e-3, 1e-3, 4e-3):
+        times = time + np.array([-1e-5, 0.0, 1e-5])
+        y = speed * times + acceleration * times**2 / 2
+        points = np.stack([np.full(3, HOME[0]), y, np.full(3, HOME[2])], axis=1)
+        before, theta, after = PAPER_TPM.inverse(points)
+        # The dynamics of the side where P is.
+        branch = AssemblyMode(PAPER_TPM.assembly_mode.planar, 1 if y[1] > 0 else -1)
+        dynamics = Dynamics(
+            geometry=PAPER_TPM.geometry, branch=branch, free_fall=PAPER_TPM.mount.free_fall
+        )
+        rates, changes = (after - before) / 2e-5, (after - 2 * theta + before) / 1e-10
+        found.append(np.abs(dynamics.torque(theta, rates, changes)).max())
+    # 1 ms from the plane; with an acceleration in proportion to 1 / y
+    assert max(found) < 8 if finite else max(found) > 40
 
 
 # -- forces that no machine would stand ------------------------------------------------------------
