@@ -22,8 +22,8 @@ from tpm_gym import kinematics
 from tpm_gym.arrays import FloatArray
 from tpm_gym.kinematics import jacobian
 from tpm_gym.mechanism import PAPER_TPM
+from tpm_gym.mechanism.compiled import ASSEMBLY_LIMIT
 from tpm_gym.mechanism.motor import TORQUE_MOTOR
-from tpm_gym.mechanism.tpm import ASSEMBLY_LIMIT
 from tpm_gym.simulation.bullet.client import Client
 from tpm_gym.simulation.bullet.physics import REGULARISATION, Physics
 from tpm_gym.simulation.bullet.robot import Robot
