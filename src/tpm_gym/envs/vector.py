@@ -284,7 +284,8 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
     def close_extras(self, **kwargs: Any) -> None:
         """Close the simulations and the threads."""
         del kwargs
-        for part in self._parts:
+        # Gymnasium before 1.3 closes what a constructor that raised left behind, too.
+        for part in getattr(self, "_parts", ()):
             part.core.close()
         if getattr(self, "_pool", None) is not None:
             self._pool.shutdown()  # type: ignore[union-attr]
