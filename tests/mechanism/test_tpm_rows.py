@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -33,7 +33,7 @@ class Anywhere(TPM):
 
 def machine_of(g: Geometry, **modes: Any) -> TPM:
     values = {**vars(PAPER_TPM), "geometry": g, **modes}
-    return Anywhere(**{name: values[name] for name in PAPER_TPM.__dataclass_fields__})
+    return Anywhere(**{field.name: values[field.name] for field in fields(PAPER_TPM)})
 
 
 @pytest.mark.parametrize("g", GEOMETRIES)

@@ -9,9 +9,10 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
+from importlib import import_module
 from types import ModuleType
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,10 +29,12 @@ ASSEMBLY_LIMIT = 0.010
 class CompiledMachine(Machine):
     """Machine that computes rows by a module of compiled loops."""
 
+    _module: ClassVar[str]
+    """Name of the module of compiled loops, which imports Numba."""
+
     @property
-    @abstractmethod
     def _loops(self) -> ModuleType:
-        """The compiled loops."""
+        return _imported(self._module)
 
     @cached_property
     @abstractmethod
@@ -139,6 +142,9 @@ class CompiledMachine(Machine):
             valid = f"parameters of b machines, with b a divisor of {rows} rows"
             raise InputError("built", built.shape, valid)
         return _rows(built, self._nominal.shape[1], "built"), self._constants
+
+
+_imported = cache(import_module)
 
 
 def _rows(values: ArrayLike, length: int = 3, name: str = "vectors") -> FloatArray:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
-from types import ModuleType
+from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -43,6 +43,8 @@ class TPM(CompiledMachine):
     geometry: Geometry
     working_mode: WorkingMode = ELBOWS_OUT
     assembly_mode: AssemblyMode = DEFAULT_ASSEMBLY
+
+    _module: ClassVar = "tpm_gym.mechanism.tpm_rows"
 
     def __post_init__(self) -> None:
         """See :class:`Machine`."""
@@ -90,10 +92,6 @@ class TPM(CompiledMachine):
         signs = *self.assembly_mode.signs, *self.working_mode.signs
         return np.array([*signs, *self.mount.free_fall])
 
-    @property
-    def _loops(self) -> ModuleType:
-        return _rows()
-
     # -- bodies -----------------------------------------------------------------------------
 
     @cached_property
@@ -123,13 +121,6 @@ class TPM(CompiledMachine):
     def with_lengths(self, lengths: tuple[float, ...]) -> TPM:
         """Return the machine with these l1 to l7, m."""
         return replace(self, geometry=Geometry(*lengths))
-
-
-@cache
-def _rows() -> ModuleType:
-    from tpm_gym.mechanism import tpm_rows  # imports Numba
-
-    return tpm_rows
 
 
 PAPER_TPM = TPM(

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
-from types import ModuleType
+from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -42,6 +42,8 @@ class Delta(CompiledMachine):
     geometry: DeltaGeometry
     working_mode: Triple = ELBOWS_OUT
     assembly_mode: float = 1.0
+
+    _module: ClassVar = "tpm_gym.mechanism.delta.rows"
 
     def __post_init__(self) -> None:
         """See :class:`Machine`."""
@@ -94,10 +96,6 @@ class Delta(CompiledMachine):
         """Signs of the modes, and gravity, (7,); see :mod:`tpm_gym.mechanism.delta.rows`."""
         return np.array([self.assembly_mode, *self.working_mode, *self.mount.free_fall])
 
-    @property
-    def _loops(self) -> ModuleType:
-        return _rows()
-
     @cached_property
     def mechanism(self) -> Mechanism:
         """See :class:`Machine`."""
@@ -130,13 +128,6 @@ class Delta(CompiledMachine):
     def with_lengths(self, lengths: tuple[float, ...]) -> Delta:
         """Return the machine with these l1 to l5, m."""
         return replace(self, geometry=DeltaGeometry(*lengths))
-
-
-@cache
-def _rows() -> ModuleType:
-    from tpm_gym.mechanism.delta import rows  # imports Numba
-
-    return rows
 
 
 DELTA = Delta(
