@@ -1,7 +1,7 @@
 """The industry's cycle: what the machine, the control, the gate and the timing of the way are."""
 
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import gantry  # noqa: F401  registers a machine
 import numpy as np
@@ -178,9 +178,9 @@ def test_a_mechanism_without_the_payload_is_refused():
     class Empty(type(PAPER_TPM)):
         mechanism = PAPER_TPM.mechanism
 
-    fields = {name: getattr(PAPER_TPM, name) for name in PAPER_TPM.__dataclass_fields__}
+    values = {field.name: getattr(PAPER_TPM, field.name) for field in fields(PAPER_TPM)}
     with pytest.raises(ConfigurationError, match="contains its payload"):
-        Cycle(Empty(**fields))
+        Cycle(Empty(**values))
 
 
 def test_every_machine_carries_the_payload():

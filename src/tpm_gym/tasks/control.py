@@ -177,12 +177,14 @@ class JointControl:
 
     def scaled(self, points: FloatArray) -> FloatArray:
         """Divide the joints by their limit."""
-        return self._machine.inverse(points) / self._machine.joint_limit
+        places: FloatArray = self._machine.inverse(points) / self._turn
+        return places
 
     def rate(self, points: FloatArray) -> FloatArray:
         """Multiply J by the joint limit."""
         theta = self._machine.inverse(points)
-        return self._machine.evaluate(theta).jacobian * self._machine.joint_limit
+        rate: FloatArray = self._machine.evaluate(theta).jacobian * self._turn
+        return rate
 
 
 class Follower:
