@@ -12,6 +12,7 @@ from typing import Any
 
 import numba
 import pytest
+from processes import printed_by
 
 from tpm_gym import compiling
 
@@ -132,3 +133,29 @@ def test_a_long_wait_is_announced_once(folder, monkeypatch, caplog):
     (message,) = caplog.messages
     assert message.startswith("compiling own.main.apply")
     assert str(folder / "kept") in message
+
+
+STAMPS = """
+import importlib, pkgutil, sys
+import tpm_gym
+from tpm_gym.compiling import stamp
+
+for room in sys.argv[1:]:
+    package = importlib.import_module(f"tpm_gym.{room}")
+    for module in pkgutil.walk_packages(package.__path__, f"tpm_gym.{room}."):
+        importlib.import_module(module.name)
+for name, module in sorted(sys.modules.items()):
+    if name.startswith(("tpm_gym.mechanism", "tpm_gym.simulation.compiled")):
+        for function in vars(module).values():
+            if getattr(function, "py_func", None) and function.__module__ == name:
+                print(name, function.__name__, stamp(function.py_func))
+"""
+
+
+def test_another_process_finds_what_is_kept():
+    few, more = (
+        printed_by(sys.executable, "-c", STAMPS, *rooms).splitlines()
+        for rooms in (["mechanism", "kinematics"], ["tasks", "analysis", "mechanism", "envs"])
+    )
+    assert len(few) > 10
+    assert set(few) <= set(more)

@@ -18,6 +18,7 @@ from types import CodeType, ModuleType
 from typing import Any, Final, TypeVar, cast
 
 import numba
+import numpy as np
 from numba.core import caching
 from numba.extending import register_jitable
 
@@ -112,6 +113,9 @@ class _Cache:
         )
 
 
+_CONSTANTS = (int, float, complex, str, np.generic, np.ndarray)
+
+
 def stamp(function: Callable[..., Any]) -> str:
     """Compute a hash of all that is compiled into a function: its sources and constants."""
     parts = sorted(set(_parts(function, function.__module__.partition(".")[0], set())))
@@ -133,7 +137,7 @@ def _parts(value: Any, package: str, seen: set[int]) -> Iterator[str]:
         yield _text(getattr(sys.modules.get(value.__module__), "__file__", None))
         for used in _used(value) if inspect.isfunction(value) else ():
             yield from _parts(used, package, seen)
-    elif not callable(value) and not inspect.ismodule(value):
+    elif isinstance(value, _CONSTANTS):  # the repr of others may differ between processes
         yield repr(value)
 
 

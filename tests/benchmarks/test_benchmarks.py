@@ -77,11 +77,11 @@ class Raising(gym.Wrapper):
 def test_a_step_that_raises_is_reported_outlived_and_can_be_repeated(tmp_path, capsys):
     def make(env_id, **options):
         env = gym.make(env_id, **options)
-        return Raising(env) if env_id == "TPMReachJoints-v0" else env
+        return Raising(env) if env_id == soak.ENV_IDS[1] else env
 
     status, content = soaked(tmp_path, make=make)
     assert status == 1
     assert content["finished"]  # it went on
     first = content["failures"][0]
-    assert (first["env_id"], first["error"]) == ("TPMReachJoints-v0", "ValueError: injected")
+    assert (first["env_id"], first["error"]) == (soak.ENV_IDS[1], "ValueError: injected")
     assert f"--seed 0 --replay {first['visit']}" in capsys.readouterr().out

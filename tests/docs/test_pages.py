@@ -33,6 +33,8 @@ FILLED = {
     "docs/engines.md": ["engines"],
     "docs/transfer.md": ["transfer"],
     "docs/shield.md": ["shield"],
+    "docs/cycle.md": ["cycle"],
+    "docs/conveyor.md": ["conveyor"],
 }
 RUN = [page for page in PAGES if blocks(page, "python") and page.name != "extending.md"]
 TYPED = [page for page in PAGES if blocks(page, "bash")]
@@ -132,6 +134,9 @@ def expected(name):
         "long": "fidelity_long",
         "summary": "fidelity_long",
         "transfer": "bench_transfer",
+        "shield": "bench_shield",
+        "cycle": "bench_cycle",
+        "conveyor": "bench_conveyor",
     }.get(name)
     if module is None:
         numbers = importlib.import_module("readme_numbers")

@@ -49,7 +49,7 @@ def env():
         {"goals": "tempting", "machine": "wide"},
         {"task": "juggle"},
         *({"engine": value} for value in ("havok", None, 3)),
-        *({"machine": value} for value in ("delta", 3, object, Machine, {"name": "paper"})),
+        *({"machine": value} for value in ("hexapod", 3, object, Machine, {"name": "paper"})),
     ],
     ids=lambda options: str(options)[:50],
 )
