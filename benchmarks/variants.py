@@ -2,7 +2,7 @@
 
 All variants have the same links. Only the spanning tree and the joints at the ends of the rods
 differ. Each variant has closed-form angles at which its loops close. Solids come from
-:func:`tpm_gym.mechanism.tree.build`, so that lengths, masses and inertias are defined once.
+:func:`tpm_gym.mechanism.tpm.bodies.build`, so that lengths, masses and inertias are defined once.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from tpm_gym.arrays import FloatArray, Vector
 from tpm_gym.kinematics.geometry import PAPER
 from tpm_gym.mechanism.bodies import Closure, Joint, Link, Mechanism, Solid
-from tpm_gym.mechanism.tree import build, joint_angles
+from tpm_gym.mechanism.tpm.bodies import build, joint_angles
 
 Angles = dict[str, float]
 

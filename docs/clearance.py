@@ -16,8 +16,8 @@ from tpm_gym.kinematics import ASSEMBLY_MODES, inverse
 from tpm_gym.kinematics.geometry import Geometry
 from tpm_gym.kinematics.modes import WorkingMode
 from tpm_gym.kinematics.workspace import assembly_of
-from tpm_gym.mechanism import tree
 from tpm_gym.mechanism.bodies import Link, Mechanism
+from tpm_gym.mechanism.tpm import bodies
 
 _SLENDER = 2.0  # least ratio of length to width of a solid that counts
 
@@ -41,7 +41,7 @@ def clearance(points: FloatArray, branch: WorkingMode, geometry: Geometry) -> Fl
 
     Links with a common joint and compact solids (hubs, motors, base) do not count.
     """
-    mechanism = tree.build(geometry)
+    mechanism = bodies.build(geometry)
     parts = [part for link in mechanism.links for part in capsules(link)]
     apart = _unjoined(mechanism)
     pairs = [(i, j) for i, j in combinations(range(len(parts)), 2)
@@ -51,7 +51,7 @@ def clearance(points: FloatArray, branch: WorkingMode, geometry: Geometry) -> Fl
     theta = inverse(points, branch, geometry)
     for mode in ASSEMBLY_MODES:
         rows = np.flatnonzero(slots == mode.index)
-        places = mechanism.places(tree.joint_arrays(theta[rows], mode, geometry))
+        places = mechanism.places(bodies.joint_arrays(theta[rows], mode, geometry))
         ends = [tuple(map(places[part.link].point, part[1:3])) for part in parts]
         for i, j in pairs:
             gap = _between(*ends[i], *ends[j]) - parts[i].radius - parts[j].radius

@@ -15,7 +15,7 @@ from tpm_gym.arrays import FloatArray
 from tpm_gym.kinematics import inverse
 from tpm_gym.kinematics.workspace import conditioning_at
 from tpm_gym.mechanism import TPM
-from tpm_gym.mechanism.dynamics import Dynamics
+from tpm_gym.mechanism.tpm.dynamics import Dynamics
 from tpm_gym.simulation import Block, Scene, Simulation
 from tpm_gym.simulation.engine import Path, spline_weights
 from tpm_gym.simulation.state import CONTROL_PERIOD

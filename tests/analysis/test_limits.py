@@ -16,8 +16,9 @@ from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import JointLimitError
 from tpm_gym.kinematics import ASSEMBLY_MODES, ELBOWS_OUT, WORKING_MODES, inverse, workspace
 from tpm_gym.kinematics.geometry import PAPER, WIDE
-from tpm_gym.mechanism import PAPER_TPM, WIDE_TPM, Machine, tree
+from tpm_gym.mechanism import PAPER_TPM, WIDE_TPM, Machine
 from tpm_gym.mechanism.mjcf import mjcf_text
+from tpm_gym.mechanism.tpm.bodies import joint_angles
 
 COARSE = (32, 8, 48)
 JOINED = [  # by a joint, a closure, or the cross between an arm and its rod
@@ -75,7 +76,7 @@ def nearest_geoms(machine: Machine, points: FloatArray, mode: int) -> list[float
     for point in points:
         theta = inverse(point, WORKING_MODES[mode], g)
         slot = int(workspace.assembly_of(point, WORKING_MODES[mode], g))
-        for name, angle in tree.joint_angles(theta, ASSEMBLY_MODES[slot], g).items():
+        for name, angle in joint_angles(theta, ASSEMBLY_MODES[slot], g).items():
             data.joint(name).qpos = angle
         mujoco.mj_kinematics(model, data)
         gaps = [

@@ -20,7 +20,7 @@ from tpm_gym.kinematics import (
 )
 from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
 from tpm_gym.mechanism import PAPER_TPM, TPM, WIDE_TPM
-from tpm_gym.mechanism.tree import build, rotated_joint_angles
+from tpm_gym.mechanism.tpm.bodies import build, rotated_joint_angles
 
 PAGE = ROOT / "docs" / "operation-modes.md"
 

@@ -26,7 +26,7 @@ from tpm_gym.kinematics import (
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.mechanism import PAPER_TPM
 from tpm_gym.mechanism.closures import closure_jacobian
-from tpm_gym.mechanism.tree import ACTUATED_JOINTS, build, joint_angles
+from tpm_gym.mechanism.tpm.bodies import ACTUATED_JOINTS, build, joint_angles
 
 X, Y, Z = np.eye(3)
 

@@ -21,9 +21,10 @@ from tpm_gym.kinematics import ASSEMBLY_MODES, AssemblyMode, forward_all, invers
 from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
 from tpm_gym.mechanism import PAPER_TPM, TPM, Machine, virtual_work
 from tpm_gym.mechanism.bodies import Mechanism, Solid
-from tpm_gym.mechanism.dynamics import Dynamics
-from tpm_gym.mechanism.inertia import inertia_of
-from tpm_gym.mechanism.tree import build, joint_angles
+from tpm_gym.mechanism.inertia import Bodies
+from tpm_gym.mechanism.tpm.bodies import build, joint_angles
+from tpm_gym.mechanism.tpm.dynamics import Dynamics
+from tpm_gym.mechanism.tpm.inertia import inertia_of
 
 LINKS = len(build().links) - 1
 HOME = np.array(PAPER_TPM.inverse(PAPER_TPM.home))
@@ -136,14 +137,14 @@ def with_solid(name: str, solid: Solid) -> Mechanism:
 )
 def test_bodies_for_which_the_formulas_do_not_hold_are_refused(name, wanted, size, centre):
     with pytest.raises(ConfigurationError, match=f"{name}.*{wanted}"):
-        inertia_of(with_solid(name, Solid("box", size, centre, 2700.0)), PAPER)
+        inertia_of(Bodies(with_solid(name, Solid("box", size, centre, 2700.0)), ()), PAPER)
 
 
 def test_links_and_factors_that_are_not_the_mechanisms_are_refused():
     mechanism = build()
     other = replace(mechanism.link("cup"), name="gripper")
     with pytest.raises(ConfigurationError, match="gripper"):
-        inertia_of(replace(mechanism, links=(*mechanism.links, other)), PAPER)
+        inertia_of(Bodies(replace(mechanism, links=(*mechanism.links, other)), ()), PAPER)
     with pytest.raises(ConfigurationError, match=f"{LINKS} moving links"):
         Dynamics(link_masses=(1.0, 2.0)).gravity(HOME)
     odd: dict[str, tuple[Any, ...]] = {

@@ -27,11 +27,11 @@ from tpm_gym.mechanism import (
     Region,
     find_machine,
     register_machine,
-    tree,
 )
 from tpm_gym.mechanism.bodies import Mechanism
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import MODES
+from tpm_gym.mechanism.tpm.bodies import build, joint_angles
 
 
 @each_machine
@@ -50,7 +50,7 @@ def test_kinematics_agree_all_over_the_region(machine):
     np.testing.assert_allclose(conditioning, 1 / np.linalg.cond(rows), rtol=1e-9)
     one = tuple(theta[0].tolist())
     positions = machine.joint_positions(one)
-    assert positions == tree.joint_angles(one, machine.assembly_mode, machine.geometry)
+    assert positions == joint_angles(one, machine.assembly_mode, machine.geometry)
     assert tuple(positions[name] for name in machine.mechanism.actuated) == one
 
 
@@ -196,7 +196,7 @@ class Stopped(TPM):
 
     @cached_property
     def mechanism(self) -> Mechanism:
-        whole = tree.build(self.geometry)
+        whole = build(self.geometry)
         links = [
             replace(link, joint=replace(link.joint, upper=self.stop))
             if link.joint and link.joint.name == "R21"

@@ -7,7 +7,7 @@ import pytest
 from machines import each_machine
 
 from tpm_gym.mechanism.motor import TORQUE_MOTOR
-from tpm_gym.mechanism.tree import ACTUATED_JOINTS
+from tpm_gym.mechanism.tpm.bodies import ACTUATED_JOINTS
 
 
 def test_the_torque_is_what_the_air_gap_of_a_torque_motor_gives():

@@ -20,7 +20,7 @@ from tpm_gym.kinematics import (
 from tpm_gym.kinematics.geometry import PAPER
 from tpm_gym.mechanism.export import URDF_FILE, write
 from tpm_gym.mechanism.mount import GRAVITY
-from tpm_gym.mechanism.tree import joint_angles, rotated_joint_angles
+from tpm_gym.mechanism.tpm.bodies import joint_angles, rotated_joint_angles
 from tpm_gym.mechanism.urdf import LOOPS_FILE
 from tpm_gym.resources import URDF as FOLDER
 

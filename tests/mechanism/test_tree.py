@@ -22,7 +22,7 @@ from tpm_gym.kinematics import (
 from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.motor import TORQUE_MOTOR
-from tpm_gym.mechanism.tree import (
+from tpm_gym.mechanism.tpm.bodies import (
     ACTUATED_JOINTS,
     build,
     joint_angles,

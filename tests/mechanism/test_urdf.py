@@ -12,7 +12,7 @@ from walk import turn
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.mechanism.bodies import Joint, Link, Solid
 from tpm_gym.mechanism.export import write
-from tpm_gym.mechanism.tree import Mechanism, build
+from tpm_gym.mechanism.tpm.bodies import Mechanism, build
 from tpm_gym.mechanism.urdf import COLOURS, urdf_text
 from tpm_gym.resources import URDF as FOLDER
 

@@ -15,7 +15,7 @@ from tpm_gym.errors import ClosureError, EpisodeError, ModeChangeError, Unreacha
 from tpm_gym.kinematics.geometry import PAPER
 from tpm_gym.kinematics.modes import AssemblyMode
 from tpm_gym.mechanism import PAPER_TPM
-from tpm_gym.mechanism.dynamics import Dynamics
+from tpm_gym.mechanism.tpm.dynamics import Dynamics
 from tpm_gym.simulation import Scene, Servo, State
 from tpm_gym.simulation.simulation import Simulation
 

@@ -10,7 +10,7 @@ from tpm_gym.arrays import BoolArray, FloatArray
 from tpm_gym.kinematics import inverse
 from tpm_gym.kinematics.geometry import Geometry
 from tpm_gym.kinematics.modes import WorkingMode
-from tpm_gym.mechanism import tree
+from tpm_gym.mechanism.tpm import bodies
 
 Limit = Callable[[FloatArray, WorkingMode, Geometry], BoolArray]
 """Function of points (n, 3) m that a working mode reaches; it returns (n,), true if allowed."""
@@ -19,6 +19,6 @@ Limit = Callable[[FloatArray, WorkingMode, Geometry], BoolArray]
 def within_stops(points: FloatArray, branch: WorkingMode, geometry: Geometry) -> BoolArray:
     """Return whether all motors are between their stops, (n,)."""
     theta = inverse(points, branch, geometry)
-    motors = tree.build(geometry).motors
+    motors = bodies.build(geometry).motors
     low, high = zip(*((motor.lower, motor.upper) for motor in motors), strict=True)
     return np.asarray(((theta >= low) & (theta <= high)).all(axis=-1))

@@ -25,7 +25,7 @@ from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.mechanism.bodies import Link, Mechanism, Place
 from tpm_gym.mechanism.closures import closure_jacobian, moving_joints, rank_of, rates
-from tpm_gym.mechanism.tree import ACTUATED_JOINTS, build, joint_angles
+from tpm_gym.mechanism.tpm.bodies import ACTUATED_JOINTS, build, joint_angles
 
 
 @dataclass(frozen=True, eq=False)

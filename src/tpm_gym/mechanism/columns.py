@@ -1,4 +1,4 @@
-"""Columns of a block of rows, for compiled loops; see :mod:`tpm_gym.mechanism.tpm_rows`."""
+"""Columns of a block of rows, for compiled loops; see :mod:`tpm_gym.mechanism.tpm.rows`."""
 
 import math
 from typing import Final

@@ -1,6 +1,6 @@
 """Machines whose equations are compiled: a module of loops over rows of robots.
 
-The module has the functions of :mod:`tpm_gym.mechanism.tpm_rows`. It is imported when something is
+The module has the functions of :mod:`tpm_gym.mechanism.tpm.rows`. It is imported when something is
 first computed, since it imports Numba.
 """
 

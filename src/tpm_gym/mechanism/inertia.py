@@ -1,4 +1,4 @@
-"""Sixteen constants of the bodies for the closed-form dynamics.
+"""Constants of bodies for closed-form dynamics.
 
 A rigid bar from B to C, with mass m, length l, its centre at the share s of its length, and moment
 of inertia I across it, has the kinetic energy of two coupled points:
@@ -6,9 +6,9 @@ of inertia I across it, has the kinetic energy of two coupled points:
     T = (a |vB|^2 + 2 b vB . vC + c |vC|^2) / 2,
     a = m (1 - s)^2 + I / l^2,  b = m s (1 - s) - I / l^2,  c = m s^2 + I / l^2.
 
-Arms (with a fixed near end), rods and link 7 are such bars. A body that only translates is a mass
-at the point with which it moves. The crosses and end link 9 also swing with their rods, and rods 4
-and 11 also turn about their own axes.
+Arms (with a fixed near end) and rods are such bars. A body that only translates is a mass at the
+point with which it moves. Some bodies swing with their rods, and some rods also turn about their
+own axes (:class:`Swing`).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 
 from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import ConfigurationError
-from tpm_gym.kinematics.geometry import Geometry
+from tpm_gym.kinematics.equations import Triple
 from tpm_gym.kinematics.namespaces import Numbers
 from tpm_gym.mechanism.bodies import Link, Mechanism
 
@@ -42,94 +42,30 @@ class Swing(NamedTuple):
     spin: Numbers
 
 
-class Inertia(NamedTuple):
-    """Constants of the dynamics.
+def swing_force(rod: Triple, rates: Triple, changes: tuple[Numbers, Numbers], m: Swing) -> Triple:
+    """Compute the force at C for the swing of a leg; the force at B is opposite.
 
-    Attributes:
-        motors: For each leg, inertia of arm and near ends of rods about the motor, kg m^2.
-        weights: For each leg, mass at B_i less ``couples``, kg.
-        couples: For each leg, b of the bars B_iC_i, kg.
-        link3: Mass at C1, kg.
-        link7: b of link 7, kg.
-        platform: Mass at P, kg.
-        swing1: Swing of leg 1, about the axis x.
-        swing3: Swing of leg 3, about the axis y.
+    The rod is along (out, level, z), and the swing is the angle of (level, z). The force follows
+    from Lagrange's equation of (fixed + spin out^2) rate^2 / 2.
     """
-
-    motors: tuple[Numbers, Numbers, Numbers]
-    weights: tuple[Numbers, Numbers, Numbers]
-    couples: tuple[Numbers, Numbers, Numbers]
-    link3: Numbers
-    link7: Numbers
-    platform: Numbers
-    swing1: Swing
-    swing3: Swing
-
-
-def flat(inertia: Inertia) -> list[float]:
-    """List the sixteen constants, in the order of the attributes."""
-    legs = [*inertia.motors, *inertia.weights, *inertia.couples]
-    points = [inertia.link3, inertia.link7, inertia.platform]
-    return [*legs, *points, *inertia.swing1, *inertia.swing3]
-
-
-def inertia_of(
-    mechanism: Mechanism,
-    geometry: Geometry,
-    link_masses: Sequence[float] = (),
-    payload: float = 0.0,
-) -> Inertia:
-    """Compute the constants of a mechanism of :func:`tpm_gym.mechanism.tree.build`.
-
-    Args:
-        mechanism: Bodies of the mechanism.
-        geometry: Lengths of the mechanism.
-        link_masses: Factors of mass and inertia, one for each moving link; empty if all are one.
-        payload: Mass that the cup carries, kg.
-
-    Raises:
-        ConfigurationError: If the number of factors is wrong, or if the formulas do not hold for a
-            body.
-    """
-    bodies = Bodies(mechanism, link_masses)
-    l3, l4, l7 = geometry.l3, geometry.l4, geometry.l7
-    turning = ("arm_2", Y, X), ("arm_5", X, Y), ("arm_12", X, Y)
-    arms = [bodies.bar(*arm, l3) for arm in turning]
-    rods = [
-        bodies.round_bar("rod_4a", Y, l4) + bodies.round_bar("rod_4b", Y, l4),
-        bodies.bar("rod_6", X, Y, l4),
-        bodies.round_bar("rod_11a", X, l4) + bodies.round_bar("rod_11b", X, l4),
-    ]
-    link7 = bodies.bar("link_7", X, Z, l7)
-    crosses = [bodies.shaft(f"cross_4{suffix}", X) for suffix in "ab"]
-    end9, end10 = bodies.shaft("end_link_9", Y), bodies.shaft("end_link_10", Y)
-    elbows = [crosses[0][0] + crosses[1][0], 0.0, end9[0]]
-    translating = bodies.mass("platform") + bodies.mass("cup") + end10[0]
-    spin4, spin11 = (
-        sum(bodies.moment(f"{rod}{suffix}", along) for suffix in "ab") / l4**2
-        for rod, along in (("rod_4", Y), ("rod_11", X))
-    )
-    _, arm_couple, arm_far = np.transpose(arms)
-    near, couple, far = np.transpose(rods)
-    found = Inertia(
-        motors=three((arm_far + near + elbows) * l3**2),
-        weights=three(arm_couple + arm_far + near + elbows),
-        couples=three(couple),
-        link3=bodies.mass("link_3p") + far[0] + far[1] + link7[0],
-        link7=link7[1],
-        platform=translating + far[2] + link7[2] + payload,
-        swing1=Swing(crosses[0][1] + crosses[1][1], spin4),
-        swing3=Swing(end9[1], spin11),
-    )
-    bodies.require_all_known()
-    return found
+    (out, level, z), (out_rate, level_rate, z_rate), (level_change, z_change) = rod, rates, changes
+    over = 1.0 / (level * level + z * z)
+    rate = (level * z_rate - z * level_rate) * over
+    change = level * z_change - z * level_change - 2 * rate * (level * level_rate + z * z_rate)
+    moment = (m.fixed + m.spin * out * out) * change * over + 2 * m.spin * out * out_rate * rate
+    force = moment * over
+    return -m.spin * out * rate * rate, -z * force, level * force
 
 
 class Bodies:
-    """Links with their factors; keeps the names of the links that were used."""
+    """Moving links with their factors; keeps the names of the links that were used."""
 
     def __init__(self, mechanism: Mechanism, factors: Sequence[float]) -> None:
-        """Check the number of factors; empty if all are 1."""
+        """Set the factors of mass and inertia, one for each moving link; empty if all are 1.
+
+        Raises:
+            ConfigurationError: If the number of factors is wrong.
+        """
         moving = mechanism.links[1:]
         if len(factors) not in (0, len(moving)):
             valid = f"one factor for each of the {len(moving)} moving links, or none"

@@ -29,9 +29,8 @@ from tpm_gym.kinematics import (
     rotated,
 )
 from tpm_gym.kinematics.workspace import assembly_of
-from tpm_gym.mechanism import tree
 from tpm_gym.mechanism.bodies import Place
-from tpm_gym.mechanism.tpm import TPM
+from tpm_gym.mechanism.tpm import TPM, bodies
 
 __all__ = ["OPERATIONS", "Margin", "Operation", "Posture", "at_joints", "at_point"]
 
@@ -184,14 +183,14 @@ def _straight(
     assembly: AssemblyMode,
 ) -> Posture:
     """Return the posture with link 3' parallel to x."""
-    joints = tree.joint_angles(theta, assembly, machine.geometry)
+    joints = bodies.joint_angles(theta, assembly, machine.geometry)
     quality = float(jacobian.conditioning(theta, assembly, machine.geometry))
     return Posture(machine, theta, place, 0.0, working, assembly, joints, quality)
 
 
 def _turned(machine: TPM, one: RotatedPostures, working: WorkingMode, mode: RotatedMode) -> Posture:
     """Return a posture with link 3' turned."""
-    joints = {name: float(angle) for name, angle in tree.rotated_joint_arrays(one).items()}
+    joints = {name: float(angle) for name, angle in bodies.rotated_joint_arrays(one).items()}
     sizes = np.linalg.svd(np.nan_to_num(rotated.velocity(one)[:3]), compute_uv=False)
     quality = float(sizes[2] / sizes[0]) if sizes[0] > 0 else 0.0
     place, tilt = one.position, float(one.tilt)

@@ -12,7 +12,7 @@ from inside import around_each_step
 
 from tpm_gym.arrays import FloatArray
 from tpm_gym.mechanism import PAPER_TPM
-from tpm_gym.mechanism.dynamics import Dynamics
+from tpm_gym.mechanism.tpm.dynamics import Dynamics
 from tpm_gym.simulation import Plant, Scene, Servo, Simulation
 from tpm_gym.simulation.analytic.forward_dynamics import Course, IdealSteps, march
 from tpm_gym.simulation.analytic.steps import resisted

@@ -15,7 +15,7 @@ from tpm_gym.arrays import FloatArray
 from tpm_gym.kinematics import ROTATED_MODES, forward_rotated
 from tpm_gym.kinematics.geometry import PAPER
 from tpm_gym.mechanism.export import URDF_FILE
-from tpm_gym.mechanism.tree import rotated_joint_angles
+from tpm_gym.mechanism.tpm.bodies import rotated_joint_angles
 from tpm_gym.mechanism.urdf import LOOPS_FILE
 from tpm_gym.resources import URDF as FOLDER
 

@@ -10,7 +10,6 @@ parallel to the base's.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final, NamedTuple
 
@@ -83,23 +82,10 @@ def joint_positions(pose: Pose, theta: Vector, l4: float) -> dict[str, float]:
     return found
 
 
-def inertia_of(
-    mechanism: Mechanism, g: DeltaGeometry, link_masses: Sequence[float] = (), payload: float = 0.0
-) -> Inertia:
-    """Compute the constants of a mechanism of :func:`build`.
-
-    Args:
-        mechanism: Bodies of the mechanism.
-        g: Lengths of the mechanism.
-        link_masses: Factors of mass and inertia, one for each moving link; empty if all are one.
-        payload: Mass that the cup carries, kg.
-
-    Raises:
-        ConfigurationError: If the number of factors is wrong.
-    """
-    bodies = Bodies(mechanism, link_masses)
+def inertia_of(bodies: Bodies, g: DeltaGeometry) -> Inertia:
+    """Compute the constants from the bodies of :func:`build`."""
     motors, weights, couples, fixed, spin = (np.zeros(3) for _ in range(5))
-    platform = payload + sum(bodies.mass(name) for name in ("platform", "cup", *parts.FREE))
+    platform = sum(bodies.mass(name) for name in ("platform", "cup", *parts.FREE))
     for i, number in enumerate(LEGS):
         _, couple, far = bodies.bar(f"arm_{number}", X, Y, g.l3)
         motors[i], weights[i] = far, couple + far

@@ -38,9 +38,8 @@ from tpm_gym.mechanism.delta.equations import (
 )
 from tpm_gym.mechanism.delta.geometry import IRB_360, DeltaGeometry
 from tpm_gym.mechanism.delta.kinematics import no_assembly
-from tpm_gym.mechanism.dynamics import swing_force
 from tpm_gym.mechanism.equation_of_motion import EquationOfMotion
-from tpm_gym.mechanism.inertia import Swing
+from tpm_gym.mechanism.inertia import Bodies, Swing, swing_force
 
 
 class _Leg(NamedTuple):
@@ -214,7 +213,9 @@ class DeltaDynamics(EquationOfMotion):
     @cached_property
     def inertia(self) -> Inertia:
         """Constants of the bodies."""
-        return inertia_of(build(self.geometry), self.geometry, self.link_masses, self.payload)
+        bodies = Bodies(build(self.geometry), self.link_masses)
+        found = inertia_of(bodies, self.geometry)
+        return found._replace(platform=found.platform + self.payload)
 
     def _pose(self, theta: Triple, ns: Namespace) -> tuple[Pose, Numbers, Numbers]:
         pose, real = pose_at(theta, self.side, self.geometry, ns)

@@ -25,6 +25,7 @@ from tpm_gym.mechanism.delta.geometry import (
     WORKING_MODES,
     DeltaGeometry,
 )
+from tpm_gym.mechanism.inertia import Bodies
 from tpm_gym.mechanism.machine import SAME_PLACE, register_machine
 from tpm_gym.mechanism.mount import Mount
 
@@ -88,8 +89,8 @@ class Delta(CompiledMachine):
     ) -> FloatArray:
         """Return l1 to l5 (m) and the constants of the dynamics, (21,); see :class:`Machine`."""
         machine = self.with_lengths(lengths) if lengths else self
-        found = bodies.inertia_of(machine.mechanism, machine.geometry, link_masses)
-        return np.concatenate([machine.geometry.lengths, *map(np.ravel, found)])
+        found = bodies.inertia_of(Bodies(machine.mechanism, link_masses), machine.geometry)
+        return np.concatenate([machine.lengths, *map(np.ravel, found)])
 
     @cached_property
     def _constants(self) -> FloatArray:

@@ -1,6 +1,6 @@
 """Compiled loops over rows of the Delta's kinematics and dynamics.
 
-They are those of :mod:`tpm_gym.mechanism.tpm_rows`, for another mechanism. A row of ``built``
+They are those of :mod:`tpm_gym.mechanism.tpm.rows`, for another mechanism. A row of ``built``
 (b, 21) holds l1 to l5 (m) and the constants of the dynamics. ``machine`` (7,) holds the sign of the
 assembly mode, the signs of the working mode (3), and gravity (3) m/s^2.
 """
@@ -19,7 +19,7 @@ from tpm_gym.mechanism.delta import dynamics, equations
 from tpm_gym.mechanism.delta.bodies import Inertia
 from tpm_gym.mechanism.delta.equations import Pose
 from tpm_gym.mechanism.delta.geometry import DeltaLengths
-from tpm_gym.mechanism.dynamics import swing_force
+from tpm_gym.mechanism.inertia import swing_force
 
 compilable(
     swing_force,

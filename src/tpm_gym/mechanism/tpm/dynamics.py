@@ -7,7 +7,7 @@ acceleration. The closures |B_iC_i| = l4, differentiated twice, give the acceler
 then of P from the accelerations of B_i, each by one division (:func:`_resolve`). Forces of inertia
 and weight at B_i, C1 and P give the forces in the rods, one division each, and these give the
 torques of the motors (:func:`gather`). Bodies enter by sixteen constants
-(:mod:`tpm_gym.mechanism.inertia`):
+(:mod:`tpm_gym.mechanism.tpm.inertia`):
 
 * the arms turn about the motors' axes;
 * rods are bars between B_i and C_i, two coupled points each. Rods 4 and 11 turn about their own
@@ -34,10 +34,11 @@ from tpm_gym.kinematics.equations import Triple
 from tpm_gym.kinematics.geometry import PAPER, AnyLengths, Geometry
 from tpm_gym.kinematics.jacobian import factors, require_regular
 from tpm_gym.kinematics.namespaces import Namespace, Numbers
-from tpm_gym.mechanism import tree
 from tpm_gym.mechanism.equation_of_motion import Energy as Energy
 from tpm_gym.mechanism.equation_of_motion import EquationOfMotion
-from tpm_gym.mechanism.inertia import Inertia, Swing, inertia_of
+from tpm_gym.mechanism.inertia import Bodies, swing_force
+from tpm_gym.mechanism.tpm.bodies import build
+from tpm_gym.mechanism.tpm.inertia import Inertia, inertia_of
 
 
 class Pose(NamedTuple):
@@ -251,21 +252,6 @@ def gather(pose: Pose, at_c: tuple[Numbers, Numbers], at_p: Triple) -> Triple:
     return f.leg1 * (x * r2z - z * r2x), f.leg2 * (z * r1x - x * r1z), f.leg3 * rod3
 
 
-def swing_force(rod: Triple, rates: Triple, changes: tuple[Numbers, Numbers], m: Swing) -> Triple:
-    """Compute the force at C for the swing of a leg; the force at B is opposite.
-
-    The rod is along (out, level, z), and the swing is the angle of (level, z). The force follows
-    from Lagrange's equation of (fixed + spin out^2) rate^2 / 2.
-    """
-    (out, level, z), (out_rate, level_rate, z_rate), (level_change, z_change) = rod, rates, changes
-    over = 1.0 / (level * level + z * z)
-    rate = (level * z_rate - z * level_rate) * over
-    change = level * z_change - z * level_change - 2 * rate * (level * level_rate + z * z_rate)
-    moment = (m.fixed + m.spin * out * out) * change * over + 2 * m.spin * out * out_rate * rate
-    force = moment * over
-    return -m.spin * out * rate * rate, -z * force, level * force
-
-
 @dataclass(frozen=True, kw_only=True)
 class Dynamics(EquationOfMotion):
     """The dynamics of the TPM; see :class:`EquationOfMotion`.
@@ -281,8 +267,9 @@ class Dynamics(EquationOfMotion):
     @cached_property
     def inertia(self) -> Inertia:
         """Constants of the bodies."""
-        mechanism = tree.build(self.geometry)
-        return inertia_of(mechanism, self.geometry, self.link_masses, self.payload)
+        bodies = Bodies(build(self.geometry), self.link_masses)
+        found = inertia_of(bodies, self.geometry)
+        return found._replace(platform=found.platform + self.payload)
 
     def _pose(self, theta: Triple, ns: Namespace) -> tuple[Pose, Numbers, Numbers]:
         pose, real = pose_at(theta, self.branch.signs, self.geometry, ns)

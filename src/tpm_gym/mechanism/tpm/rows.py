@@ -1,7 +1,7 @@
 """Compiled loops over rows of the TPM's kinematics and dynamics.
 
 Row i of the m rows of an input is of the machine ``built[i // (m // b)]``, of b machines. A row of
-``built`` (b, 23) holds l1 to l7 (m) and the constants of the dynamics (mechanism.inertia).
+``built`` (b, 23) holds l1 to l7 (m) and the constants of the dynamics (tpm.inertia).
 ``machine`` (9,) holds the signs of the assembly mode (2) and of the working mode (4), and gravity
 (3) m/s^2. Results are written to the last arguments, NaN where there is none. Each row is computed
 by itself, so that it has the same bits alone and among thousands.
@@ -20,10 +20,11 @@ from tpm_gym.kinematics import compiled as functions
 from tpm_gym.kinematics import equations
 from tpm_gym.kinematics.equations import Triple
 from tpm_gym.kinematics.geometry import Lengths
-from tpm_gym.mechanism import dynamics
 from tpm_gym.mechanism.columns import BLOCK, fill, get, put, read, write
-from tpm_gym.mechanism.dynamics import Pose
-from tpm_gym.mechanism.inertia import Inertia, Swing
+from tpm_gym.mechanism.inertia import Swing, swing_force
+from tpm_gym.mechanism.tpm import dynamics
+from tpm_gym.mechanism.tpm.dynamics import Pose
+from tpm_gym.mechanism.tpm.inertia import Inertia
 
 compilable(
     dynamics.pose_at,
@@ -34,7 +35,7 @@ compilable(
     dynamics.accelerations,
     dynamics.gather,
     dynamics._resolve,
-    dynamics.swing_force,
+    swing_force,
 )
 
 _NONE = (0.0, 0.0, 0.0)

@@ -17,13 +17,14 @@ from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
 from tpm_gym.kinematics.modes import DEFAULT_ASSEMBLY, ELBOWS_OUT, AssemblyMode, WorkingMode
 from tpm_gym.kinematics.position import inverse
 from tpm_gym.kinematics.workspace import Region
-from tpm_gym.mechanism import tree
 from tpm_gym.mechanism.bodies import Mechanism
 from tpm_gym.mechanism.compiled import CompiledMachine
-from tpm_gym.mechanism.dynamics import Dynamics
-from tpm_gym.mechanism.inertia import flat, inertia_of
+from tpm_gym.mechanism.inertia import Bodies
 from tpm_gym.mechanism.machine import register_machine
 from tpm_gym.mechanism.mount import Mount
+from tpm_gym.mechanism.tpm import bodies
+from tpm_gym.mechanism.tpm.dynamics import Dynamics
+from tpm_gym.mechanism.tpm.inertia import flat, inertia_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +45,7 @@ class TPM(CompiledMachine):
     working_mode: WorkingMode = ELBOWS_OUT
     assembly_mode: AssemblyMode = DEFAULT_ASSEMBLY
 
-    _module: ClassVar = "tpm_gym.mechanism.tpm_rows"
+    _module: ClassVar = "tpm_gym.mechanism.tpm.rows"
 
     def __post_init__(self) -> None:
         """See :class:`Machine`."""
@@ -82,13 +83,12 @@ class TPM(CompiledMachine):
     ) -> FloatArray:
         """Return l1 to l7 (m) and the constants of the dynamics, (23,); see :class:`Machine`."""
         machine = self.with_lengths(lengths) if lengths else self
-        geometry = machine.geometry
-        inertia = inertia_of(machine.mechanism, geometry, link_masses)
-        return np.array([*geometry.lengths, *flat(inertia)])
+        inertia = inertia_of(Bodies(machine.mechanism, link_masses), machine.geometry)
+        return np.array([*machine.lengths, *flat(inertia)])
 
     @cached_property
     def _constants(self) -> FloatArray:
-        """Signs of the modes, and gravity, (9,); see :mod:`tpm_gym.mechanism.tpm_rows`."""
+        """Signs of the modes, and gravity, (9,); see :mod:`tpm_gym.mechanism.tpm.rows`."""
         signs = *self.assembly_mode.signs, *self.working_mode.signs
         return np.array([*signs, *self.mount.free_fall])
 
@@ -97,11 +97,11 @@ class TPM(CompiledMachine):
     @cached_property
     def mechanism(self) -> Mechanism:
         """See :class:`Machine`."""
-        return tree.build(self.geometry, self.payload)
+        return bodies.build(self.geometry, self.payload)
 
     def joint_positions(self, theta: Vector) -> dict[str, float]:
         """See :class:`Machine`."""
-        return tree.joint_angles(theta, self.assembly_mode, self.geometry)
+        return bodies.joint_angles(theta, self.assembly_mode, self.geometry)
 
     @cached_property
     def dynamics(self) -> Dynamics:

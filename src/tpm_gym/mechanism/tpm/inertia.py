@@ -1,0 +1,86 @@
+"""Sixteen constants of the TPM's bodies for its closed-form dynamics.
+
+Arms, rods and link 7 are bars (:mod:`tpm_gym.mechanism.inertia`). The crosses and end link 9 also
+swing with their rods, and rods 4 and 11 also turn about their own axes.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from tpm_gym.kinematics.equations import Triple
+from tpm_gym.kinematics.geometry import Geometry
+from tpm_gym.kinematics.namespaces import Numbers
+from tpm_gym.mechanism.inertia import Bodies, Swing, X, Y, Z, three
+
+
+class Inertia(NamedTuple):
+    """Constants of the dynamics.
+
+    Attributes:
+        motors: For each leg, inertia of arm and near ends of rods about the motor, kg m^2.
+        weights: For each leg, mass at B_i less ``couples``, kg.
+        couples: For each leg, b of the bars B_iC_i, kg.
+        link3: Mass at C1, kg.
+        link7: b of link 7, kg.
+        platform: Mass at P, kg.
+        swing1: Swing of leg 1, about the axis x.
+        swing3: Swing of leg 3, about the axis y.
+    """
+
+    motors: Triple
+    weights: Triple
+    couples: Triple
+    link3: Numbers
+    link7: Numbers
+    platform: Numbers
+    swing1: Swing
+    swing3: Swing
+
+
+def flat(inertia: Inertia) -> list[float]:
+    """List the sixteen constants, in the order of the attributes."""
+    legs = [*inertia.motors, *inertia.weights, *inertia.couples]
+    points = [inertia.link3, inertia.link7, inertia.platform]
+    return [*legs, *points, *inertia.swing1, *inertia.swing3]
+
+
+def inertia_of(bodies: Bodies, geometry: Geometry) -> Inertia:
+    """Compute the constants from the bodies of :func:`tpm_gym.mechanism.tpm.bodies.build`.
+
+    Raises:
+        ConfigurationError: If the formulas do not hold for a body.
+    """
+    l3, l4, l7 = geometry.l3, geometry.l4, geometry.l7
+    turning = ("arm_2", Y, X), ("arm_5", X, Y), ("arm_12", X, Y)
+    arms = [bodies.bar(*arm, l3) for arm in turning]
+    rods = [
+        bodies.round_bar("rod_4a", Y, l4) + bodies.round_bar("rod_4b", Y, l4),
+        bodies.bar("rod_6", X, Y, l4),
+        bodies.round_bar("rod_11a", X, l4) + bodies.round_bar("rod_11b", X, l4),
+    ]
+    link7 = bodies.bar("link_7", X, Z, l7)
+    crosses = [bodies.shaft(f"cross_4{suffix}", X) for suffix in "ab"]
+    end9, end10 = bodies.shaft("end_link_9", Y), bodies.shaft("end_link_10", Y)
+    elbows = [crosses[0][0] + crosses[1][0], 0.0, end9[0]]
+    translating = bodies.mass("platform") + bodies.mass("cup") + end10[0]
+    spin4, spin11 = (
+        sum(bodies.moment(f"{rod}{suffix}", along) for suffix in "ab") / l4**2
+        for rod, along in (("rod_4", Y), ("rod_11", X))
+    )
+    _, arm_couple, arm_far = np.transpose(arms)
+    near, couple, far = np.transpose(rods)
+    found = Inertia(
+        motors=three((arm_far + near + elbows) * l3**2),
+        weights=three(arm_couple + arm_far + near + elbows),
+        couples=three(couple),
+        link3=bodies.mass("link_3p") + far[0] + far[1] + link7[0],
+        link7=link7[1],
+        platform=translating + far[2] + link7[2],
+        swing1=Swing(crosses[0][1] + crosses[1][1], spin4),
+        swing3=Swing(end9[1], spin11),
+    )
+    bodies.require_all_known()
+    return found
