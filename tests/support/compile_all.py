@@ -7,9 +7,16 @@ import gymnasium as gym
 
 import tpm_gym  # noqa: F401  registers the ids
 
-for engine in ("mujoco", "analytic"):
-    for drive in ("ideal", "servo"):
-        env = gym.make("TPMPickAndPlaceJoints-v0", engine=engine, drive=drive)
-        env.reset(seed=0)
-        env.step(env.action_space.sample())
-        env.close()
+for machine in ("paper", "delta"):
+    for engine in ("mujoco", "analytic"):
+        for drive in ("ideal", "servo"):
+            env = gym.make(
+                "TPMPickAndPlaceJoints-v0",
+                engine=engine,
+                machine=machine,
+                drive=drive,
+                shield=drive == "ideal",
+            )
+            env.reset(seed=0)
+            env.step(env.action_space.sample())
+            env.close()
