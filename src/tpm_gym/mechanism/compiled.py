@@ -102,7 +102,7 @@ class CompiledMachine(Machine):
         """See :class:`Machine`."""
         angles = _rows(theta)
         others = (theta_dot, theta_ddot, *(() if force is None else (force,)))
-        inputs = [angles, *(_rows(np.broadcast_to(values, angles.shape)) for values in others)]
+        inputs = [angles, *(_alike(values, angles) for values in others)]
         if force is None:
             inputs.append(np.empty((0, 3)))
         torques = np.empty(angles.shape)
@@ -116,8 +116,7 @@ class CompiledMachine(Machine):
     ) -> Motion:
         """See :class:`Machine`."""
         angles = _rows(theta)
-        rates = _rows(np.broadcast_to(theta_dot, angles.shape))
-        flat, empty = angles.reshape(-1, 3), np.empty
+        flat, rates, empty = angles.reshape(-1, 3), _alike(theta_dot, angles), np.empty
         of = self._own if built is None else self._others(built, angles)
         count = len(flat)
         place = empty((count, 3)), empty((count, 3, 3)), empty(count, np.bool_)
@@ -153,6 +152,12 @@ def _rows(values: ArrayLike, length: int = 3, name: str = "vectors") -> FloatArr
     if array.shape[-1] != length:
         raise InputError(name, array.shape, f"an array of shape (..., {length}), by shape")
     return array if array.flags.writeable else array.copy()
+
+
+def _alike(values: ArrayLike, like: FloatArray) -> FloatArray:
+    """Repeat vectors up to the shape of an array (..., 3)."""
+    array = np.asarray(values)  # broadcast_to() is slow, and its result has to be copied
+    return _rows(array if array.shape == like.shape else np.broadcast_to(array, like.shape))
 
 
 def _shaped(arrays: Iterable[Any], like: FloatArray) -> Iterator[Any]:

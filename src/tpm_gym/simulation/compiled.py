@@ -300,6 +300,69 @@ def spline_points(commands: FloatArray, weights: FloatArray) -> FloatArray:
 
 
 @kept
+def arrived(
+    theta: FloatArray, points: FloatArray, push: FloatArray, carried: FloatArray, step: float
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Find the state of the robots at the end of a path that they have followed exactly.
+
+    Args:
+        theta: (n, k, 3) rad, joint positions at the ends of the last k time steps.
+        points: (n, j, 3) m, P at the ends of the last j time steps.
+        push: (n, m, 3) N, force of the objects on P in the last m time steps.
+        carried: (n,) kg, masses of the held objects.
+        step: Time step, s.
+
+    Returns:
+        P one time step before the end, and at the end (n, 3) m; joint positions (n, 3) rad and
+        velocities (n, 3) rad/s; force on P as if the held objects had no inertia (n, 3) N.
+    """
+    shape, last, now = (len(theta), 3), theta.shape[1] - 1, points.shape[1] - 1
+    before, position, force = np.empty(shape), np.empty(shape), np.empty(shape)
+    angles, rates = np.empty(shape), np.empty(shape)
+    for row in range(len(theta)):
+        for i in range(3):
+            before[row, i], position[row, i] = points[row, now - 1, i], points[row, now, i]
+            angles[row, i] = theta[row, last, i]
+            rates[row, i] = (theta[row, last, i] - theta[row, last - 1, i]) / step
+            force[row, i] = push[row, push.shape[1] - 1, i]
+            if carried[row] != 0:
+                change = position[row, i] - 2 * before[row, i] + points[row, now - 2, i]
+                force[row, i] += carried[row] * change / step**2
+    return before, position, angles, rates, force
+
+
+@kept
+def differences(theta: FloatArray, step: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return joint positions, velocities and accelerations (n, k, 3) in k time steps.
+
+    Args:
+        theta: (n, k + 2, 3) rad, at the ends of time steps.
+        step: Time step, s.
+    """
+    shape = len(theta), theta.shape[1] - 2, 3
+    middle, rates, changes = np.empty(shape), np.empty(shape), np.empty(shape)
+    for row in range(shape[0]):
+        for k in range(shape[1]):
+            for i in range(3):
+                middle[row, k, i] = theta[row, k + 1, i]
+                rates[row, k, i] = (theta[row, k + 1, i] - theta[row, k, i]) / step
+                after = (theta[row, k + 2, i] - theta[row, k + 1, i]) / step
+                changes[row, k, i] = (after - rates[row, k, i]) / step
+    return middle, rates, changes
+
+
+@kept
+def beyond(torques: FloatArray, effort: FloatArray) -> BoolArray:
+    """Return (r,) whether any of the torques (r, m, 3) exceeds its motor's limit (r, 3)."""
+    found = np.zeros(len(torques), np.bool_)
+    for row in range(len(torques)):
+        for k in range(torques.shape[1]):
+            for i in range(3):
+                found[row] |= abs(torques[row, k, i]) > effort[row, i]
+    return found
+
+
+@kept
 def ends(theta: FloatArray, step: float) -> FloatArray:
     """Compute the motion in the first and in the last time step of a control period.
 

@@ -29,7 +29,7 @@ from tpm_gym.simulation.analytic.forward_dynamics import (
 )
 from tpm_gym.simulation.analytic.physics import Physics
 from tpm_gym.simulation.drives import Servo, ServoDrives
-from tpm_gym.simulation.engine import Engine, Path, Readout, make_engine
+from tpm_gym.simulation.engine import Engine, Path, Readout, loops, make_engine
 from tpm_gym.simulation.imaging import Camera, Picture, View
 from tpm_gym.simulation.randomisation import Plant
 from tpm_gym.simulation.settings import settings_of
@@ -109,7 +109,7 @@ class AnalyticEngine:
         self._position = np.tile(machine.home, (count, 1))
         self._before = self._position.copy()
         self._rates, self._torque, self._force = np.zeros((3, count, 3))
-        self._carried = np.zeros(count)  # kg
+        self._carried, self._no_push = np.zeros(count), np.zeros((count, 1, 3))  # kg, N
         self._mode_left = np.zeros(count, dtype=np.int8)
         self._behind = np.zeros(count, dtype=np.bool_)  # whether an ideal motor lacked torque
         if self._gui:
@@ -164,7 +164,6 @@ class AnalyticEngine:
         All robots are first computed without torque limits. The robots that would exceed a limit
         are then computed again by forward dynamics.
         """
-        step = self.time_step
         late = self._behind | (self._mode_left != 0)
         if self._exact:
             theta, points = path.joints(self._tail), path.points(3)
@@ -175,18 +174,14 @@ class AnalyticEngine:
             theta, weights = joints[:, -self._tail :], np.eye(len(path.weights))
             late |= ~self._machine.same_side(points).all(axis=1)
         start = {name: getattr(self, name) for name in _COURSE}
-        push = None
+        push = self._no_push
         if self._scene.objects:
             route = Route(self._before, self._position, controls, weights)
             last = 1 if self.physics.torques == "none" else len(path.weights)
             push, self._carried = self._contact.advance(self._rows, route, vacuum, last)
-            self._force = push[:, -1].copy()
-            if self._carried.any():
-                change = points[:, -1] - 2 * points[:, -2] + points[:, -3]
-                self._force += self._carried[:, None] * change / step**2
-        self._before, self._position = points[:, -2].copy(), points[:, -1].copy()
-        self._theta = theta[:, -1].copy()
-        self._rates = (theta[:, -1] - theta[:, -2]) / step
+        self._before, self._position, self._theta, self._rates, self._force = loops().arrived(
+            theta, points, push, self._carried, self.time_step
+        )
         late |= self._find_torques(start["_theta"], start["_rates"], theta, path, push)
         rows = np.flatnonzero(late)
         if len(rows):
@@ -229,7 +224,7 @@ class AnalyticEngine:
         rates: FloatArray,
         theta: FloatArray,
         path: Path,
-        push: FloatArray | None,
+        push: FloatArray,
     ) -> BoolArray:
         """Compute the torques, and return whether each robot would exceed a motor's limit, (n,).
 
@@ -238,7 +233,7 @@ class AnalyticEngine:
             rates: (n, 3) rad/s, joint velocities at the beginning of the control period.
             theta: (n, k, 3) rad, joint positions at the ends of the last k time steps.
             path: Path of the control period.
-            push: (n, K, 3) N, force of objects on P; None without objects.
+            push: (n, K, 3) N, force of objects on P; (n, 1, 3) zeros without objects.
         """
         if self.physics.torques == "none":
             self._torque = np.full_like(self._torque, np.nan)
@@ -247,29 +242,27 @@ class AnalyticEngine:
         if self.physics.torques == "every":
             torques = self._torques(self._rows, np.concatenate([*lead, theta], axis=1), push)
             self.torques, self._torque = torques.swapaxes(0, 1), torques[:, -1].copy()
-            return _beyond(torques, self._effort)
+            over: BoolArray = loops().beyond(torques, self._effort)
+            return over
         last = self._torques(self._rows, theta, push)
         self._torque = last[:, 0].copy()
-        over = _beyond(last, _CHECK_ABOVE * self._effort)
+        over = loops().beyond(last, _CHECK_ABOVE * self._effort)
         rows = np.flatnonzero(over)
         if len(rows):
             whole = np.concatenate([*lead, path.joints()], axis=1)[rows]
-            torques = self._torques(rows, whole, None if push is None else push[rows])
-            over[rows] = _beyond(torques, self._effort[rows])
+            torques = self._torques(rows, whole, push[rows])
+            over[rows] = loops().beyond(torques, self._effort[rows])
         return over
 
-    def _torques(self, rows: IntArray, theta: FloatArray, push: FloatArray | None) -> FloatArray:
+    def _torques(self, rows: IntArray, theta: FloatArray, push: FloatArray) -> FloatArray:
         """Compute the torques (r, m, 3) N m for joint positions ``theta`` (r, m + 2, 3) rad.
 
         The last m forces of ``push`` (r, K, 3) N act on P.
         """
-        rates = np.diff(theta, axis=1) / self.time_step
-        changes = np.diff(rates, axis=1) / self.time_step
+        joints, rates, changes = loops().differences(theta, self.time_step)
         built = None if self._built is None else self._built[rows]
-        against = None if push is None else push[:, -changes.shape[1] :]
-        torques: FloatArray = self._machine.torque(
-            theta[:, 1:-1], rates[:, :-1], changes, against, built
-        )
+        against = push[:, -changes.shape[1] :] if self._scene.objects else None
+        torques: FloatArray = self._machine.torque(joints, rates, changes, against, built)
         return torques
 
     def read(self) -> Readout:
@@ -336,9 +329,3 @@ class AnalyticEngine:
         if self._artist is not None:
             self._artist.close()
             self._artist = None
-
-
-def _beyond(torques: FloatArray, effort: FloatArray) -> BoolArray:
-    """Return (r,) whether any of the torques (r, m, 3) exceeds its motor's limit (r, 3)."""
-    beyond: BoolArray = np.any(np.abs(torques) > effort[:, None], axis=(1, 2))
-    return beyond
