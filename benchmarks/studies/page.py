@@ -187,6 +187,7 @@ def _row(record: Record) -> dict[str, Any]:
         "recipe": json.dumps(recipe, sort_keys=True),
         "reached": record.get("reached", (steps or [0])[-1]),
         "minutes": (seconds or [0.0])[-1] / 60,
+        "cpu_minutes": curves.get("cpu_seconds", [np.nan])[-1] / 60,
         "learned_steps": np.inf if index is None else steps[index],
         "learned_minutes": np.inf if index is None else seconds[index] / 60,
         "curve": dict(zip(steps, curves.get("success_at_end", []), strict=False)),
@@ -250,6 +251,7 @@ def _training_table(runs: Frame) -> Frame:
             "steps to 95%": _or_never(group.learned_steps.median(), "{:,.0f}"),
             "minutes to 95%": _or_never(group.learned_minutes.median(), "{:.1f}"),
             "minutes in all": f"{group.minutes.median():.1f}",
+            "minutes of CPU": _cell(group.cpu_minutes.median(), "{:.1f}"),
         }
         for group in groups(runs)
         for first in group.head(1).itertuples()
@@ -266,6 +268,7 @@ def _runs_table(runs: Frame) -> Frame:
             "steps to 95%": _or_never(run["learned_steps"], "{:,.0f}"),
             "minutes to 95%": _or_never(run["learned_minutes"], "{:.1f}"),
             "minutes in all": f"{run['minutes']:.1f}",
+            "minutes of CPU": _cell(run["cpu_minutes"], "{:.1f}"),
             "smallest conditioning": _cell(run["pybullet.conditioning_min.worst"], "{:.3f}"),
             "time below safe": _cell(run["pybullet.unsafe_share.mean"], "{:.1%}"),
             "return": _cell(run["pybullet.return.mean"], "{:.2f}"),

@@ -111,6 +111,8 @@ def condense(run: Path) -> Record:
         raise ConfigError(f"--runs {run}: its evaluations are damaged: {error}") from error
     steps = [evaluation["steps"] for evaluation in found]
     curves = {"steps": steps, "wall_seconds": [e["wall_seconds"] for e in found]}
+    if found and "cpu_seconds" in found[-1]:
+        curves["cpu_seconds"] = [e.get("cpu_seconds") for e in found]
     for name in _CURVES:
         if found and all(name in evaluation for evaluation in found):
             curves[name] = [round(evaluation[name]["mean"], 6) for evaluation in found]

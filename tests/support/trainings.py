@@ -158,7 +158,7 @@ def end_of(run: Path) -> Content:
 
 def without_times(value: Any) -> Any:
     """Leave out what a clock has measured."""
-    clocks = ("t", "seconds", "wall_seconds")
+    clocks = ("t", "seconds", "wall_seconds", "cpu_seconds")
     if isinstance(value, dict):
         return {
             name: without_times(entry)

@@ -29,7 +29,8 @@ _LARGEST_SHARE: Final = 0.02  # of the time may go into checkpoints
 class PeriodicEvaluation(BaseCallback):
     """Evaluation of the policy on held-out seeds before, during and after training.
 
-    All evaluations use the same episodes. Each is appended to evaluations.jsonl.
+    All evaluations use the same episodes. Each is appended to evaluations.jsonl, with the time of
+    the training until then: that of a clock, and that of the CPU in this process.
 
     ``envs`` are separate, so that evaluations do not disturb training. ``keep`` is called with the
     model whenever it is the best so far.
@@ -48,6 +49,11 @@ class PeriodicEvaluation(BaseCallback):
     def _on_training_start(self) -> None:
         if not self.evaluations:
             self._evaluate()
+
+    def _init_callback(self) -> None:
+        # A resumed run continues to count from its last evaluation.
+        earlier = self.evaluations[-1].get("cpu_seconds", 0.0) if self.evaluations else 0.0
+        self._cpu_start = time.process_time() - earlier
 
     def _on_step(self) -> bool:
         due = self.num_timesteps - self.evaluations[-1]["steps"] >= self.config.eval_every
@@ -82,6 +88,7 @@ class PeriodicEvaluation(BaseCallback):
             "episodes": self.config.eval_episodes,
             "first_seed": SELECTION_SEED,
             "wall_seconds": round(seconds_trained(self.model), 3),
+            "cpu_seconds": round(time.process_time() - self._cpu_start, 3),
             **metrics,
         }
         self.evaluations.append(line)
