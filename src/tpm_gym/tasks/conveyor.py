@@ -12,7 +12,6 @@ from typing import Any, Final
 import numpy as np
 
 from tpm_gym.arrays import FloatArray
-from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.state import Belt, Block, Patch, Scene, State
 from tpm_gym.tasks import sampling
@@ -37,7 +36,6 @@ GAP: Final = 0.010
 """Distance of the tray from the end of the belt, m."""
 TRAY_COLOUR: Final = (0.45, 0.62, 0.80, 1.0)
 _DRAWS: Final = 256
-_ATTEMPTS: Final = 100
 
 
 class Conveyor(Task):
@@ -97,20 +95,18 @@ class Conveyor(Task):
 
     def _draw(self, first: float, last: float, rng: np.random.Generator) -> FloatArray:
         """Draw a place (3,) m between two x, so that the whole way between them is safe."""
-        (low, high), safe = self._floor, self.machine.safe_conditioning
-        most = safe + sampling.BAND if self.goals == "tempting" else np.inf
-        for _ in range(_ATTEMPTS):
-            places = rng.uniform((first, *low[1:]), (last, *high[1:]), (_DRAWS, 3))
-            ways = np.stack([places, places], axis=1)
-            ways[:, :, 0] = first, last
-            points = self.machine.mount.to_paper(ways + hanging(self.block))
-            least = self.machine.conditioning_at(points).min(axis=-1)
-            fits = np.flatnonzero((least >= safe) & (least < most))
-            if len(fits):
-                place: FloatArray = places[fits[0]]
-                return place
-        valid = f"'sampled' or another machine: {self.machine.name!r} has no such place"
-        raise ConfigurationError("goals", self.goals, valid)
+        low, high = self._floor
+
+        def draw(rng: np.random.Generator) -> FloatArray:
+            return rng.uniform((first, *low[1:]), (last, *high[1:]), (_DRAWS, 3))
+
+        def ways(places: FloatArray) -> FloatArray:
+            ends = np.stack([places, places], axis=1)
+            ends[:, :, 0] = first, last
+            points: FloatArray = self.machine.mount.to_paper(ends + hanging(self.block))
+            return points
+
+        return sampling.safe_draw(rng, self.machine, self.goals, draw, ways)
 
     def starts_of(self, block: Block | None) -> tuple[FloatArray, FloatArray]:
         """Return the corners of the belt, over the robot's reach in y."""

@@ -47,7 +47,7 @@ NEAR: Final = 0.010
 UNIT: Final = 0.005
 """Depth below the gate that costs 1 in each step, m."""
 POINTS: Final = 120
-_ATTEMPTS: Final = 1000
+_DRAWS: Final = 1000
 
 
 class Cycle(Task):
@@ -150,18 +150,20 @@ class Cycle(Task):
     def _draw(self, rng: np.random.Generator) -> FloatArray:
         """Draw a goal (3,) m: an end, and a depth at which the whole way is safe."""
         low, high = self.machine.goal_region.low[1], self.machine.goal_region.high[1]
-        safe, end = self.machine.safe_conditioning, self._ends[rng.integers(2)]
-        depths = rng.uniform(low, high, _ATTEMPTS)
-        ways = np.stack([self._ends, self._ends, 2 * [self._level]], axis=1)
-        ways = np.tile(ways, (_ATTEMPTS, 1, 1))
-        ways[..., 1] = depths[:, None]
-        least = self.machine.conditioning_at(ways).min(axis=1)
-        most = safe + sampling.BAND if self.goals == "tempting" else np.inf
-        fits = np.flatnonzero((least >= safe) & (least < most))
-        if not len(fits):
-            valid = f"'sampled' or another machine: {self.machine.name!r} has no such way"
-            raise ConfigurationError("goals", self.goals, valid)
-        goal: FloatArray = self.machine.mount.to_world((end, depths[fits[0]], self._level))
+
+        def draw(rng: np.random.Generator) -> FloatArray:
+            points = np.full((_DRAWS, 3), self._level)
+            points[:, 0] = self._ends[rng.integers(2)]
+            points[:, 1] = rng.uniform(low, high, _DRAWS)
+            return points
+
+        def ways(points: FloatArray) -> FloatArray:
+            ends = np.stack([points, points], axis=1)
+            ends[:, :, 0] = self._ends
+            return ends
+
+        point = sampling.safe_draw(rng, self.machine, self.goals, draw, ways)
+        goal: FloatArray = self.machine.mount.to_world(point)
         return goal
 
     def goals_of(self, block: Block | None) -> list[tuple[FloatArray, FloatArray]]:

@@ -14,7 +14,7 @@ each row, and a row draws from its own generator only.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -30,6 +30,7 @@ __all__ = [
     "BAND",
     "at_threshold",
     "line_in_joints",
+    "safe_draw",
     "safe_points",
     "tempting",
 ]
@@ -108,6 +109,37 @@ def _drawn(
     low, high = ends[:, :, 0], ends[:, :, 1]
     points: FloatArray = low + (high - low) * shares[..., :3]
     return points
+
+
+def safe_draw(
+    rng: np.random.Generator,
+    machine: Machine,
+    goals: str,
+    draw: Callable[[np.random.Generator], FloatArray],
+    ways: Callable[[FloatArray], FloatArray],
+) -> FloatArray:
+    """Draw points until the way that belongs to one is safe, and return that point (3,).
+
+    Args:
+        rng: Generator of the row.
+        machine: The machine.
+        goals: ``"tempting"`` if a part of the way shall be only just safe.
+        draw: Draw of d points (d, 3) at a time.
+        ways: Ends (d, k, 3) m, machine's frame, of straight parts of the points' ways.
+
+    Raises:
+        ConfigurationError: If no draw has such a way.
+    """
+    least, most = _limits(machine, goals == "tempting")
+    for _ in range(_ATTEMPTS):
+        points = draw(rng)
+        conditioning = machine.conditioning_at(ways(points)).min(axis=-1)
+        fits = np.flatnonzero((conditioning >= least) & (conditioning < most))
+        if len(fits):
+            point: FloatArray = points[fits[0]]
+            return point
+    valid = f"'sampled' or another machine: {machine.name!r} has no such way"
+    raise ConfigurationError("goals", goals, valid)
 
 
 def _limits(machine: Machine, near_singularity: bool) -> tuple[float, float]:

@@ -43,7 +43,6 @@ The spline lags the commands by half a period.
 _RUN_UP_WAY: Final = sum(RUN_UP) - AHEAD  # from its start to the release, in units of its last step
 _BRAKING_WAY: Final = AHEAD + sum(RUN_UP[:2])  # from the release to the stop
 _DRAWS: Final = 256
-_ATTEMPTS: Final = 100
 
 
 class Throw(Task):
@@ -80,18 +79,13 @@ class Throw(Task):
         """Draw a goal (3,) m for which the way of P with the block is safe."""
         boxes, table = self.goals_of(self.block), self.on_table(self.block)
         ends = np.stack([self.machine.mount.to_world(end) for end in (table.low, table.high)])
-        safe = self.machine.safe_conditioning
-        most = safe + sampling.BAND if self.goals == "tempting" else math.inf
-        for _ in range(_ATTEMPTS):
+
+        def draw(rng: np.random.Generator) -> FloatArray:
             goals = rng.uniform(*boxes[rng.integers(len(boxes))], (_DRAWS, 3))
             goals[:, 1] = rng.uniform(ends[:, 1].min(), ends[:, 1].max(), _DRAWS)
-            least = self.machine.conditioning_at(self._lane(goals)).min(axis=-1)
-            fits = np.flatnonzero((least >= safe) & (least < most))
-            if len(fits):
-                goal: FloatArray = goals[fits[0]]
-                return goal
-        valid = f"'sampled' or another machine: {self.machine.name!r} has no such way to throw"
-        raise ConfigurationError("goals", self.goals, valid)
+            return goals
+
+        return sampling.safe_draw(rng, self.machine, self.goals, draw, self._lane)
 
     def goals_of(self, block: Block | None) -> list[tuple[FloatArray, FloatArray]]:
         """Return the boxes beyond both ends of the region into which the robot can throw.
