@@ -44,7 +44,7 @@ def test_tempting_ways_are_only_just_safe():
         assert info["is_success"]
         least = min(info["conditioning"] for _, _, info in steps)
         assert 0.95 < least / PAPER_TPM.safe_conditioning < 1.4
-    with pytest.raises(ConfigurationError, match="no such place"):  # all its table is safe
+    with pytest.raises(ConfigurationError, match="no such way"):  # all its table is safe
         Conveyor(WIDE_TPM, goals="tempting").start([np.random.default_rng(0)])
 
 
