@@ -88,8 +88,11 @@ def test_the_block_goes_where_pybullet_takes_it(policy, median, most):
     assert np.median(apart) < median
     assert apart.max() < most
     held = column(states, episodes, "held")
-    # In one of these six episodes of the policy, the grips differ in five steps.
-    assert (np.stack([state.held for state, _ in found], axis=1) == held).mean() > 0.98
+    other = (np.stack([state.held for state, _ in found], axis=1) != held).sum(axis=1)
+    # The expert's grips are equal in all of 60 episodes. The policy's are equal in 53; they differ
+    # in 1% of all steps, most of them in two episodes that grip again (5 and 19 steps).
+    assert (other > 0).sum() <= (1 if policy == PICK else 0)
+    assert other.sum() <= 0.02 * other.size * 50
 
 
 @pytest.mark.slow
