@@ -4,6 +4,7 @@ import re
 import signal
 import subprocess
 import urllib.request
+from functools import partial
 
 import psutil
 import pytest
@@ -17,7 +18,9 @@ from tpm_gym.viewer import ViewConfig, run
 def command():
     words = [*TPM_GYM, "view", "--port", "0", "--machine", "wide"]
     pipes = dict.fromkeys(("stdout", "stderr"), subprocess.PIPE)
-    with subprocess.Popen(words, text=True, **pipes) as process:
+    # A shell's job in the background is started with SIGINT ignored.
+    heard = partial(signal.signal, signal.SIGINT, signal.default_int_handler)
+    with subprocess.Popen(words, text=True, preexec_fn=heard, **pipes) as process:
         yield process
         process.kill()
 
