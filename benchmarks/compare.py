@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from shared import fill, table
 
-from tpm_gym.analysis.aspects import _largest_block
+from tpm_gym.analysis.aspects import largest_block
 from tpm_gym.analysis.decoupling import motors as motors_of
 from tpm_gym.arrays import BoolArray, FloatArray
 from tpm_gym.kinematics import forward_all, inverse_all
@@ -85,7 +85,7 @@ def workspace(machine: Machine) -> Workspace:
 
 def box(found: Workspace) -> tuple[float, FloatArray]:
     """Return the volume (dm^3) and the edges (mm) of the largest box that is well-conditioned."""
-    low, high = _largest_block(found.conditioning >= CONDITIONING) or ((0, 0, 0), (0, 0, 0))
+    low, high = largest_block(found.conditioning >= CONDITIONING) or ((0, 0, 0), (0, 0, 0))
     edges = found.points[high] - found.points[low]
     return float(1e3 * edges.prod()), 1e3 * edges
 

@@ -9,44 +9,45 @@ from paths import ROOT
 
 from tpm_gym.mechanism import PAPER_TPM, WIDE_TPM, Machine
 from tpm_gym.mechanism.cup import CUP
-from tpm_gym.mechanism.export import MJCF_FILE
+from tpm_gym.mechanism.export import SHIPPED
 from tpm_gym.mechanism.mjcf import mjcf_text, site_names
 from tpm_gym.resources import URDF as FOLDER
 
 MECHANISM = PAPER_TPM.mechanism
+both = pytest.mark.parametrize("machine", SHIPPED, ids=lambda machine: machine.name)
 
 
-@pytest.fixture(params=[PAPER_TPM, WIDE_TPM], ids=lambda machine: machine.name)
+@pytest.fixture(params=[*SHIPPED, WIDE_TPM], ids=lambda machine: machine.name)
 def machine(request):
     machine: Machine = request.param
     return machine
 
 
-def shipped() -> tuple[Any, Any]:
+def shipped(machine: Machine = PAPER_TPM) -> tuple[Any, Any]:
     """Model and data of the file, at its key frame."""
-    model = mujoco.MjModel.from_xml_path(str(FOLDER / MJCF_FILE))
+    model = mujoco.MjModel.from_xml_path(str(FOLDER / f"{machine.mechanism.name}.xml"))
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, model.key("home").id)
     mujoco.mj_forward(model, data)
     return model, data
 
 
-def gap(data: Any) -> float:
+def gap(data: Any, machine: Machine = PAPER_TPM) -> float:
     """The widest of the closures, m."""
-    sides = [site_names(closure.name) for closure in MECHANISM.closures]
+    sides = [site_names(closure.name) for closure in machine.mechanism.closures]
     return max(float(np.linalg.norm(data.site(a).xpos - data.site(b).xpos)) for a, b in sides)
 
 
-def angles(data: Any) -> tuple[float, float, float]:
-    a, b, c = (data.joint(name).qpos.item() for name in MECHANISM.actuated)
+def angles(data: Any, machine: Machine = PAPER_TPM) -> tuple[float, float, float]:
+    a, b, c = (data.joint(name).qpos.item() for name in machine.mechanism.actuated)
     return a, b, c
 
 
-def miss(data: Any) -> float:
+def miss(data: Any, machine: Machine = PAPER_TPM) -> float:
     """From P of the simulated platform to the forward kinematics of the motors' angles, m."""
-    platform = data.body(MECHANISM.platform)
-    position = platform.xpos + platform.xmat.reshape(3, 3) @ MECHANISM.point_p
-    known = PAPER_TPM.mount.to_world(PAPER_TPM.forward(angles(data)))
+    platform = data.body(machine.mechanism.platform)
+    position = platform.xpos + platform.xmat.reshape(3, 3) @ machine.mechanism.point_p
+    known = machine.mount.to_world(machine.forward(angles(data, machine)))
     return float(np.linalg.norm(position - known))
 
 
@@ -94,26 +95,29 @@ def test_solids_are_drawn_where_they_are_and_the_lip_alone_collides():
             np.testing.assert_allclose(model.geom_pos[index], solid.centre, atol=1e-9)
 
 
-def test_at_home_loops_are_closed_and_p_is_at_home():
-    _, data = shipped()
-    assert gap(data) < 1e-8
-    assert miss(data) < 1e-8
-    np.testing.assert_allclose(PAPER_TPM.forward(angles(data)), PAPER_TPM.home, atol=1e-8)
-    np.testing.assert_allclose(data.ctrl, angles(data), atol=1e-9)
+@both
+def test_at_home_loops_are_closed_and_p_is_at_home(machine):
+    _, data = shipped(machine)
+    assert gap(data, machine) < 1e-8
+    assert miss(data, machine) < 1e-8
+    found = angles(data, machine)
+    np.testing.assert_allclose(machine.forward(found), machine.home, atol=1e-8)
+    np.testing.assert_allclose(data.ctrl, found, atol=1e-9)
 
 
-def test_it_is_moved_by_ctrl_with_its_loops_closed():
+@both
+def test_it_is_moved_by_ctrl_with_its_loops_closed(machine):
     """Out 150 mm and back within 2 s; measured: loops within 0.02 um, 5 mrad behind."""
-    model, data = shipped()
+    model, data = shipped(machine)
     gaps, misses, lags = [], [], []
     for share in (1 - np.cos(np.linspace(0, 2 * np.pi, 4000))) / 2:
-        point = np.add(PAPER_TPM.home, share * np.array((-0.15, 0.012, 0.08)))
-        data.ctrl[:] = PAPER_TPM.inverse(tuple(point))
+        point = np.add(machine.home, share * np.array((-0.15, 0.012, 0.08)))
+        data.ctrl[:] = machine.inverse(tuple(point))
         mujoco.mj_step(model, data)
         mujoco.mj_kinematics(model, data)
-        gaps.append(gap(data))
-        misses.append(miss(data))
-        lags.append(np.abs(np.subtract(angles(data), data.ctrl)).max())
+        gaps.append(gap(data, machine))
+        misses.append(miss(data, machine))
+        lags.append(np.abs(np.subtract(angles(data, machine), data.ctrl)).max())
     assert max(gaps) < 1e-6
     assert max(misses) < 1e-6
     assert max(lags) < 0.01

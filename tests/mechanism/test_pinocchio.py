@@ -18,10 +18,9 @@ from tpm_gym.kinematics import (
     workspace,
 )
 from tpm_gym.kinematics.geometry import PAPER
-from tpm_gym.mechanism.export import URDF_FILE, write
+from tpm_gym.mechanism.export import write
 from tpm_gym.mechanism.mount import GRAVITY
 from tpm_gym.mechanism.tpm.bodies import joint_angles, rotated_joint_angles
-from tpm_gym.mechanism.urdf import LOOPS_FILE
 from tpm_gym.resources import URDF as FOLDER
 
 pin = pytest.importorskip(
@@ -41,9 +40,9 @@ class Files:
     """The robot that the two files describe, with gravity as where it hangs upside down."""
 
     def __init__(self, folder: Path) -> None:
-        loops = yaml.safe_load((folder / LOOPS_FILE).read_text(encoding="utf-8"))
+        loops = yaml.safe_load((folder / "tpm.loops.yaml").read_text(encoding="utf-8"))
         assert loops["type"] == ["3d"] * len(loops["closed_loop"])
-        self.model = pin.buildModelFromUrdf(str(folder / URDF_FILE))
+        self.model = pin.buildModelFromUrdf(str(folder / "tpm.urdf"))
         self.model.gravity.linear = np.array([0.0, 0.0, GRAVITY])
         self.data = self.model.createData()
         self.motors = loops["name_mot"]

@@ -20,7 +20,7 @@ from tpm_gym.kinematics import (
 )
 from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
 from tpm_gym.mechanism import PAPER_TPM, TPM
-from tpm_gym.mechanism.tpm import rows
+from tpm_gym.mechanism.tpm.rows import LOOPS
 
 GEOMETRIES = [PAPER, WIDE, Geometry(l1=0.31, l2=0.06, l3=0.36, l4=0.79, l5=0.11, l6=0.02, l7=0.07)]
 
@@ -182,5 +182,5 @@ def test_all_kinds_of_arrays_share_one_compiled_loop():
     for other in (frozen, rate[0], rate.tolist(), wide[:, ::2], np.asfortranarray(rate)):
         assert_equal(PAPER_TPM.motion(theta, other, built), expected)
     PAPER_TPM.inverse(np.float32(points))
-    loops = [vars(rows)[name] for name in ("motion", "inverse")]
+    loops = LOOPS.motion, LOOPS.inverse
     assert [len(loop.signatures) for loop in loops] == [1, 1]

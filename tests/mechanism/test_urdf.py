@@ -11,7 +11,7 @@ from walk import turn
 
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.mechanism.bodies import Joint, Link, Solid
-from tpm_gym.mechanism.export import write
+from tpm_gym.mechanism.export import SHIPPED, write
 from tpm_gym.mechanism.tpm.bodies import Mechanism, build
 from tpm_gym.mechanism.urdf import COLOURS, urdf_text
 from tpm_gym.resources import URDF as FOLDER
@@ -57,8 +57,9 @@ def test_turned_solids_and_joints_are_written_as_they_are(rpy, axis):
     assert numbers(child(root, "joint/origin").get("rpy")) == pytest.approx(rpy, **DIGITS)
 
 
-def test_regenerating_gives_the_shipped_files_byte_for_byte(tmp_path):
-    for path in write(tmp_path / "new"):
+@pytest.mark.parametrize("machine", SHIPPED, ids=lambda machine: machine.name)
+def test_regenerating_gives_the_shipped_files_byte_for_byte(machine, tmp_path):
+    for path in write(tmp_path / "new", machine):
         assert path.read_bytes() == (FOLDER / path.name).read_bytes()
 
 

@@ -135,7 +135,7 @@ def aspects(
     if min_cells < 1:
         raise ConfigurationError("min_cells", min_cells, "at least 1")
     low, spacing, codes = _codes(branch, geometry, shape, limits)
-    labels = _components(codes)
+    labels = components(codes)
     names, first, counts = np.unique(labels, return_index=True, return_counts=True)
     found = []
     for index in np.argsort(-counts, kind="stable"):
@@ -191,7 +191,7 @@ def largest_box(aspect: Aspect, threshold: float) -> Box:
     conditioning[cells.mask] = conditioning_at(
         cells.centres(), aspect.branch, aspect.assembly, aspect.geometry
     )
-    corners = _largest_block(conditioning >= threshold)
+    corners = largest_block(conditioning >= threshold)
     if corners is None:
         raise ConfigurationError("threshold", threshold, "a value that a box of this aspect meets")
     low, high = np.asarray(cells.low) + (np.array(corners) + 0.5) * cells.spacing
@@ -239,7 +239,7 @@ _NEIGHBOURS = [
 ]  # for each axis, two views of a grid whose entries share a face
 
 
-def _components(codes: IntArray) -> IntArray:
+def components(codes: IntArray) -> IntArray:
     """Label the connected sets of equal codes, by union-find on all faces at once."""
     parent = np.arange(codes.size)
     index = parent.reshape(codes.shape)
@@ -267,7 +267,7 @@ def _grown(mask: BoolArray, corners: bool = True) -> BoolArray:
     return grown
 
 
-def _largest_block(mask: BoolArray) -> tuple[Shape, Shape] | None:
+def largest_block(mask: BoolArray) -> tuple[Shape, Shape] | None:
     """Return the first and last node of the largest all-true block; None if none has a volume."""
     # For each range of y and each width in x: the longest run along z of columns true over both.
     nx, ny, nz = mask.shape

@@ -229,6 +229,7 @@ class Mechanism:
         tool: Name of the link that slides in the platform, with the vacuum cup.
         lip: Centre of the cup's lip in the tool's frame, m.
         actuated: Names of the motors' joints, in the order of theta_1, theta_2, theta_3.
+        name: Name in files.
     """
 
     links: tuple[Link, ...]
@@ -238,6 +239,7 @@ class Mechanism:
     tool: str
     lip: Vector
     actuated: tuple[str, ...]
+    name: str = "robot"
 
     @cached_property
     def _by_name(self) -> dict[str, Link]:

@@ -1,7 +1,7 @@
-"""Machines whose equations are compiled: a module of loops over rows of robots.
+"""Machines whose equations are compiled: loops over rows of robots.
 
-The module has the functions of :mod:`tpm_gym.mechanism.tpm.rows`. It is imported when something is
-first computed, since it imports Numba.
+The loops (:mod:`tpm_gym.mechanism.loops`) are imported when something is first computed, since they
+import Numba.
 """
 
 from __future__ import annotations
@@ -11,13 +11,12 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib import import_module
-from types import ModuleType
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tpm_gym.arrays import FloatArray
+from tpm_gym.arrays import BoolArray, FloatArray
 from tpm_gym.errors import InputError
 from tpm_gym.mechanism.machine import SAME_PLACE, Machine, Motion, Reading
 
@@ -30,11 +29,11 @@ class CompiledMachine(Machine):
     """Machine that computes rows by a module of compiled loops."""
 
     _module: ClassVar[str]
-    """Name of the module of compiled loops, which imports Numba."""
+    """Name of the module whose LOOPS are the compiled loops."""
 
     @property
-    def _loops(self) -> ModuleType:
-        return _imported(self._module)
+    def _loops(self) -> Any:
+        return _loops_of(self._module)
 
     @cached_property
     @abstractmethod
@@ -75,6 +74,13 @@ class CompiledMachine(Machine):
         self._loops.conditioning_at(
             points.reshape(-1, 3), SAME_PLACE, *self._own, found.reshape(-1)
         )
+        return found
+
+    def same_side(self, position: ArrayLike) -> BoolArray:
+        """See :class:`Machine`."""
+        points = _rows(position)
+        found = np.empty(points.shape[:-1], np.bool_)
+        self._loops.same_side(points.reshape(-1, 3), *self._own, found.reshape(-1))
         return found
 
     def mode_left(
@@ -143,7 +149,9 @@ class CompiledMachine(Machine):
         return _rows(built, self._nominal.shape[1], "built"), self._constants
 
 
-_imported = cache(import_module)
+@cache
+def _loops_of(module: str) -> Any:
+    return import_module(module).LOOPS
 
 
 def _rows(values: ArrayLike, length: int = 3, name: str = "vectors") -> FloatArray:

@@ -1,31 +1,39 @@
 """Files of a robot for other tools: URDF with its loop closures, and MJCF.
 
-Run ``python -m tpm_gym.mechanism.export FOLDER`` to write the files of the paper's robot.
+Run ``python -m tpm_gym.mechanism.export FOLDER`` to write the files of the paper's robot and of the
+Delta.
 """
 
 import sys
 from pathlib import Path
 
+from tpm_gym.mechanism.delta.machine import DELTA
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.mjcf import mjcf_text
 from tpm_gym.mechanism.tpm import PAPER_TPM
-from tpm_gym.mechanism.urdf import LOOPS_FILE, loops_text, urdf_text
+from tpm_gym.mechanism.urdf import loops_text, urdf_text
 
-URDF_FILE, MJCF_FILE = "tpm.urdf", "tpm.xml"
+SHIPPED = (PAPER_TPM, DELTA)
 
 
 def write(folder: Path, machine: Machine = PAPER_TPM) -> list[Path]:
-    """Write all files of a robot into a folder, which is created if missing; return the paths."""
+    """Write all files of a robot into a folder, which is created if missing; return the paths.
+
+    The names of the files begin with the name of the robot's mechanism.
+    """
     texts = {
-        URDF_FILE: urdf_text(machine.mechanism, closure_frames=True),
-        LOOPS_FILE: loops_text(machine.mechanism),
-        MJCF_FILE: mjcf_text(machine),
+        ".urdf": urdf_text(machine.mechanism, closure_frames=True),
+        ".loops.yaml": loops_text(machine.mechanism),
+        ".xml": mjcf_text(machine),
     }
     folder.mkdir(parents=True, exist_ok=True)
-    for name, text in texts.items():
-        (folder / name).write_text(text, encoding="utf-8", newline="\n")
-    return [folder / name for name in texts]
+    written = []
+    for ending, text in texts.items():
+        written.append(folder / f"{machine.mechanism.name}{ending}")
+        written[-1].write_text(text, encoding="utf-8", newline="\n")
+    return written
 
 
 if __name__ == "__main__":
-    print(*write(Path(sys.argv[1])), sep="\n")
+    for shipped in SHIPPED:
+        print(*write(Path(sys.argv[1]), shipped), sep="\n")

@@ -1,4 +1,4 @@
-"""MJCF (the format of MuJoCo): elements of a Mechanism, and a file of the paper's robot.
+"""MJCF (the format of MuJoCo): elements of a Mechanism, and a file of a robot.
 
 MuJoCo closes loops itself. Each ball joint of a loop is an equality constraint between two sites.
 """
@@ -52,7 +52,7 @@ def robot(mechanism: Mechanism, mount: Mount, time_step: float) -> Element:
         mount: Mount of the robot.
         time_step: Time step, s; the loops close within one.
     """
-    root = Element("mujoco", model="tpm")
+    root = Element("mujoco", model=mechanism.name)
     add(root, "compiler", angle="radian", autolimits="true")
     defaults = add(root, "default")
     # Within two time steps, critically damped: the shortest that MuJoCo allows.

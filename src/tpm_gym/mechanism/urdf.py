@@ -17,12 +17,10 @@ from xml.etree.ElementTree import Comment, Element, SubElement, indent, tostring
 from tpm_gym.arrays import Vector
 from tpm_gym.mechanism.bodies import ALONG, LEVEL, Closure, Joint, Link, Mechanism, Solid
 
-LOOPS_FILE = "tpm.loops.yaml"
-
-_CLOSING = f"""
-  A tree, whose loops are to be closed: {LOOPS_FILE} pairs the frames whose origins shall coincide.
-  At angles of 0 they do not. Angles where they do are in tpm.xml, for one posture (the key frame
-  "home"), and in tpm_gym.PAPER_TPM.joint_positions(theta), for any angles of the motors.
+_CLOSING = """
+  A tree, whose loops are to be closed: {0}.loops.yaml pairs frames whose origins shall coincide.
+  At angles of 0 they do not. Angles where they do are in {0}.xml, for one posture (the key frame
+  "home"), and in joint_positions(theta) of tpm_gym's machine, for any angles of the motors.
 
   PyBullet: a point-to-point constraint for each pair; erp=1, and 300 iterations of its own solver,
   or more. Its direct ones lose loops within one body (docs/fidelity.md), which this is.
@@ -45,17 +43,17 @@ _MOMENTS = {f"i{'xyz'[i]}{'xyz'[j]}": (i, j) for i in range(3) for j in range(i,
 
 
 def urdf_text(mechanism: Mechanism, closure_frames: bool = False) -> str:
-    """Write the spanning tree as URDF, in the paper frame.
+    """Write the spanning tree as URDF, in the machine's frame.
 
     Args:
         mechanism: Links, joints and closures.
         closure_frames: Whether to add the frames that :func:`loops_text` pairs.
     """
-    root = Element("robot", name="tpm")
+    root = Element("robot", name=mechanism.name)
     root.append(Comment(" Generated from tpm_gym.mechanism; do not edit (make urdf). "))
     root.append(Comment(" z points down: where the robot hangs, gravity is along +z. "))
     if closure_frames:
-        root.append(Comment(_CLOSING))
+        root.append(Comment(_CLOSING.format(mechanism.name)))
     for name, rgba in COLOURS.items():
         add(add(root, "material", name=name), "color", rgba=rgba)
     for link in mechanism.links:

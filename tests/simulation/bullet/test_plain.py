@@ -14,9 +14,7 @@ import tpm_gym
 from tpm_gym.arrays import FloatArray
 from tpm_gym.kinematics import ROTATED_MODES, forward_rotated
 from tpm_gym.kinematics.geometry import PAPER
-from tpm_gym.mechanism.export import URDF_FILE
 from tpm_gym.mechanism.tpm.bodies import rotated_joint_angles
-from tpm_gym.mechanism.urdf import LOOPS_FILE
 from tpm_gym.resources import URDF as FOLDER
 
 RATE = 240
@@ -28,13 +26,13 @@ class Robot:
     def __init__(self) -> None:
         self.client: Any = BulletClient(connection_mode=pybullet.DIRECT)
         flags = self.client.URDF_USE_INERTIA_FROM_FILE
-        path = str(FOLDER / URDF_FILE)
+        path = str(FOLDER / "tpm.urdf")
         self.body = self.client.loadURDF(path, useFixedBase=True, flags=flags)
         self.joints, self.links = {}, {}
         for index in range(self.client.getNumJoints(self.body)):
             info = self.client.getJointInfo(self.body, index)
             self.joints[info[1].decode()] = self.links[info[12].decode()] = index
-        loops = yaml.safe_load((FOLDER / LOOPS_FILE).read_text(encoding="utf-8"))
+        loops = yaml.safe_load((FOLDER / "tpm.loops.yaml").read_text(encoding="utf-8"))
         self.pairs, self.motors = loops["closed_loop"], loops["name_mot"]
 
     def put(self, angles: Mapping[str, float]) -> None:

@@ -67,6 +67,7 @@ def build(g: DeltaGeometry, payload: float = 0.0) -> Mechanism:
         tool="cup",
         lip=CUP.lip,
         actuated=("R1", "R2", "R3"),
+        name="delta",
     )
 
 

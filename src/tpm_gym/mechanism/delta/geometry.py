@@ -70,5 +70,8 @@ ASSEMBLY_MODES: Final = (-1.0, 1.0)
 
 IRB_360 = DeltaGeometry(l1=0.164, l2=0.044, l3=0.524, l4=1.244, l5=0.050)
 """ABB's FlexPicker IRB 360-1/1600, with the lengths that R. L. Williams II gives in "The Delta
-Parallel Robot: Kinematics Solutions" (Ohio University, 2016). l5 is ours: with the 65 mm that are
-given there, the ball joints of our rods would touch on the platform."""
+Parallel Robot: Kinematics Solutions" (Ohio University, 2016): triangles of base and platform with
+sides of 0.567 and 0.076 m, whose inner and outer radii are l1 and l2; arms of 0.524 m, and rods of
+1.244 m. Programs that others wrote after this paper have the same numbers, for example
+giridharanponnuvel/Delta-Robot-Inverse-Kinematics on GitHub. l5 is ours: with the paper's 65.5 mm
+the ball joints of our rods would touch on the platform."""

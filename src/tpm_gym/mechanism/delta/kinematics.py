@@ -21,6 +21,7 @@ from tpm_gym.mechanism.delta.equations import (
     ONE,
     THREE,
     TWO,
+    Pose,
     assembly_at,
     inwards,
     pose_at,
@@ -31,6 +32,7 @@ from tpm_gym.mechanism.delta.equations import (
 )
 from tpm_gym.mechanism.delta.geometry import (
     ASSEMBLY_MODES,
+    ELBOWS_OUT,
     IRB_360,
     WORKING_MODES,
     AnyDelta,
@@ -86,20 +88,36 @@ def jacobian(theta: ArrayLike, side: float = 1.0, geometry: AnyDelta = IRB_360) 
 
 def factors(theta: ArrayLike, side: float = 1.0, geometry: AnyDelta = IRB_360) -> Factors:
     """Compute the factors that are zero at singularities, without a unit."""
-    l3, l4 = geometry.l3, geometry.l4
 
     def text(angles: Triple, ns: Namespace) -> list[Numbers]:
-        pose, real = pose_at(angles, side, geometry, ns)
-        parallel, *serial, constraint = _or_nan(
-            real, (pose.parallel, *pose.serial, pose.constraint), ns
-        )
-        return [parallel / l4**3, tuple(leg / (l3 * l4) for leg in serial), constraint / l4**3]
+        return _factors(*pose_at(angles, side, geometry, ns), geometry, ns)
 
     return Factors(*by_rows(text, finite_points("theta", theta)))
 
 
+def factors_at(
+    position: ArrayLike, bends: Triple = ELBOWS_OUT, geometry: AnyDelta = IRB_360
+) -> Factors:
+    """Compute the factors of :func:`factors` at points (..., 3) m in a working mode."""
+
+    def text(point: Triple, ns: Namespace) -> list[Numbers]:
+        angles, real, _ = posture_at(point, bends, geometry, ns)
+        pose = pose_of(*arms_at(angles, geometry, ns), point, geometry)
+        return _factors(pose, real, geometry, ns)
+
+    return Factors(*by_rows(text, finite_points("position", position)))
+
+
+def _factors(pose: Pose, real: Numbers, g: AnyDelta, ns: Namespace) -> list[Numbers]:
+    parallel, *serial, constraint = _or_nan(
+        real, (pose.parallel, *pose.serial, pose.constraint), ns
+    )
+    l3, l4 = g.l3, g.l4
+    return [parallel / l4**3, tuple(leg / (l3 * l4) for leg in serial), constraint / l4**3]
+
+
 def conditioning_at(
-    position: ArrayLike, bends: Triple = (1.0, 1.0, 1.0), geometry: AnyDelta = IRB_360
+    position: ArrayLike, bends: Triple = ELBOWS_OUT, geometry: AnyDelta = IRB_360
 ) -> FloatArray:
     """Compute 1/cond(J) (...,) at points (..., 3) m in a working mode; NaN out of reach."""
 
@@ -112,7 +130,7 @@ def conditioning_at(
 
 
 def reachable(
-    position: ArrayLike, bends: Triple = (1.0, 1.0, 1.0), geometry: AnyDelta = IRB_360
+    position: ArrayLike, bends: Triple = ELBOWS_OUT, geometry: AnyDelta = IRB_360
 ) -> BoolArray:
     """Return whether points (..., 3) m have a posture in a working mode, as (...,)."""
     slot = WORKING_MODES.index(bends)

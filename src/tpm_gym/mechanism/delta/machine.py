@@ -7,9 +7,9 @@ from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from tpm_gym.arrays import BoolArray, FloatArray, Vector
+from tpm_gym.arrays import FloatArray, Vector
 from tpm_gym.errors import ConfigurationError, SingularityError, UnreachableError
 from tpm_gym.kinematics.equations import Triple
 from tpm_gym.kinematics.namespaces import NUMPY
@@ -55,13 +55,6 @@ class Delta(CompiledMachine):
         if self.assembly_mode not in ASSEMBLY_MODES:
             raise ConfigurationError("assembly_mode", self.assembly_mode, "1 or -1")
         super().__post_init__()
-
-    def same_side(self, position: ArrayLike) -> BoolArray:
-        """See :class:`Machine`."""
-        points = np.ascontiguousarray(position, np.float64)
-        found = np.empty(points.shape[:-1], np.bool_)
-        self._loops.same_side(points.reshape(-1, 3), *self._own, found.reshape(-1))
-        return found
 
     def unreachable(self, position: Vector) -> UnreachableError:
         """See :class:`Machine`."""

@@ -165,6 +165,7 @@ def build(geometry: Geometry = PAPER, payload: float = 0.0) -> Mechanism:
         tool="cup",
         lip=CUP.lip,
         actuated=ACTUATED_JOINTS,
+        name="tpm",
     )
 
 

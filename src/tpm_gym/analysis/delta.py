@@ -1,0 +1,134 @@
+"""Topology, workspace and aspects of the Delta, by the counts and grids of the TPM's analysis."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from tpm_gym.analysis.aspects import Cells, Shape, components
+from tpm_gym.analysis.poc import Chain, parallelogram_4r, parallelogram_4s, revolute
+from tpm_gym.arrays import FloatArray, IntArray, vector
+from tpm_gym.errors import ConfigurationError
+from tpm_gym.kinematics.equations import Triple
+from tpm_gym.kinematics.namespaces import NUMPY
+from tpm_gym.mechanism.delta.bodies import LEGS, build
+from tpm_gym.mechanism.delta.equations import outwards, pose_at
+from tpm_gym.mechanism.delta.geometry import ELBOWS_OUT, IRB_360, WORKING_MODES, DeltaGeometry
+from tpm_gym.mechanism.delta.kinematics import factors_at, inverse_all, no_assembly
+
+
+def chains(
+    theta: ArrayLike, side: float = 1.0, geometry: DeltaGeometry = IRB_360, balls: bool = True
+) -> tuple[list[Chain], FloatArray]:
+    """Return the legs and P (3,) m at theta (3,) rad, for :func:`tpm_gym.analysis.poc.analyse`.
+
+    Args:
+        theta: Joint positions.
+        side: Assembly mode, the sign of det A.
+        geometry: Lengths.
+        balls: Whether a leg is a motor and a parallelogram of balls, as those of this package, or
+            motor, R, parallelogram of revolutes, R.
+
+    Raises:
+        InputError: If theta is not three finite numbers.
+        UnreachableError: If the Delta cannot be assembled at theta.
+    """
+    angles, g = vector("theta", theta), geometry
+    pose, real = pose_at(tuple(map(np.float64, angles)), side, g, NUMPY)
+    if not real:
+        raise no_assembly(angles, side, g)
+    found = []
+    for number, leg, cos, sin, rod in zip(
+        LEGS, LEGS.values(), pose.cos, pose.sin, pose.bars, strict=True
+    ):
+        hinge = np.array(outwards(leg, (0.0, -1.0, 0.0)))
+        elbow, bar = np.array(outwards(leg, (g.l1 + cos, 0.0, sin))), np.array(rod)
+        units = [revolute(f"R{number}", hinge, np.array(outwards(leg, (g.l1, 0.0, 0.0))), True)]
+        if balls:
+            units.append(parallelogram_4s("Pa(4S)", hinge, bar, elbow + bar))
+        else:
+            middle = parallelogram_4r("Pa(4R)", hinge, bar, elbow + bar)
+            units += [revolute("R", hinge, elbow), middle, revolute("R", hinge, elbow + bar)]
+        found.append(Chain(f"leg {number}", tuple(units)))
+    return found, np.array(pose.position)
+
+
+@dataclass(frozen=True)
+class Aspect:
+    """Connected region of one working mode without singularities.
+
+    Attributes:
+        assembly: Assembly mode, the sign of det A.
+        constraint: Sign of the volume of the normals of the parallelograms.
+        cells: Cells of the region.
+    """
+
+    assembly: int
+    constraint: int
+    cells: Cells
+
+
+def reachable_set(
+    bends: Triple = ELBOWS_OUT,
+    geometry: DeltaGeometry = IRB_360,
+    shape: Shape = (96, 96, 96),
+    within_stops: bool = False,
+) -> Cells:
+    """Find the points that have a posture in a working mode; see :func:`aspects`."""
+    low, spacing, codes = _codes(bends, geometry, shape, within_stops)
+    return Cells(low, spacing, codes >= 0)
+
+
+def aspects(
+    bends: Triple = ELBOWS_OUT,
+    geometry: DeltaGeometry = IRB_360,
+    shape: Shape = (96, 96, 96),
+    within_stops: bool = False,
+    min_cells: int = 8,
+) -> tuple[Aspect, ...]:
+    """Find all aspects of a working mode, the largest first.
+
+    :func:`tpm_gym.analysis.aspects.aspects` says what a grid can miss.
+
+    Args:
+        bends: Working mode.
+        geometry: Lengths.
+        shape: Numbers of cells along x, y, z of a grid that holds every point in reach.
+        within_stops: Whether to leave out points where a motor is beyond its stop.
+        min_cells: Fewest cells of an aspect.
+
+    Raises:
+        ConfigurationError: The shape is not possible.
+    """
+    low, spacing, codes = _codes(bends, geometry, shape, within_stops)
+    labels = components(codes)
+    names, first, counts = np.unique(labels, return_index=True, return_counts=True)
+    found = []
+    for index in np.argsort(-counts, kind="stable"):
+        code = int(codes.flat[first[index]])
+        if code >= 0 and counts[index] >= min_cells:
+            parallel, constraint = (1 if code & bit else -1 for bit in (1, 2))
+            found.append(Aspect(parallel, constraint, Cells(low, spacing, labels == names[index])))
+    return tuple(found)
+
+
+def _codes(
+    bends: Triple, geometry: DeltaGeometry, shape: Shape, within_stops: bool
+) -> tuple[Triple, Triple, IntArray]:
+    """Return corner and spacing of the grid, and the signs at its cells; -1 where P cannot be."""
+    if len(shape) != 3 or any(int(n) != n or n < 2 for n in shape):
+        raise ConfigurationError("shape", shape, "three integers from 2 up")
+    far = geometry.l3 + geometry.l4
+    wide = far + abs(geometry.l1 - geometry.l2)
+    low, high = np.array([-wide, -wide, -far]), np.array([wide, wide, far])
+    spacing = (high - low) / shape
+    points = low + (np.moveaxis(np.indices(shape), 0, -1) + 0.5) * spacing
+    found = factors_at(points, bends, geometry)
+    values = np.stack([found.parallel, found.constraint], axis=-1)
+    there = ~np.isnan(values[..., 0])
+    if within_stops:
+        theta = inverse_all(points, geometry)[..., WORKING_MODES.index(bends), :]
+        for motor, angle in zip(build(geometry).motors, np.moveaxis(theta, -1, 0), strict=True):
+            there &= (angle >= motor.lower) & (angle <= motor.upper)
+    codes: IntArray = np.where(there, (values > 0) @ (1, 2), -1)
+    return tuple(low.tolist()), tuple(spacing.tolist()), codes
