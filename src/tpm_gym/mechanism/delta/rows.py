@@ -79,7 +79,8 @@ def _position(pose: Pose) -> Triple:
 
 def _same_side(pose: Pose, point: Triple, modes: Modes, g: DeltaLengths) -> bool:
     there = equations.pose_of(pose.cos, pose.sin, point, g)
-    return there.parallel * modes[0] > 0.0
+    side: bool = there.parallel * modes[0] > 0.0
+    return side
 
 
 compilable(_modes, _lengths, _inertia, _posture, _pose, _position, _same_side)

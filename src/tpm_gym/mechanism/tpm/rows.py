@@ -66,7 +66,8 @@ def _position(pose: Pose) -> Triple:
 
 
 def _regular(pose: Pose, g: Lengths) -> bool:
-    return equations.regular(pose.factors, g)
+    regular: bool = equations.regular(pose.factors, g)
+    return regular
 
 
 def _velocity(pose: Pose) -> tuple[Triple, Triple, Triple]:
@@ -74,7 +75,8 @@ def _velocity(pose: Pose) -> tuple[Triple, Triple, Triple]:
 
 
 def _same_side(_at: Pose, point: Triple, modes: Modes, _g: Lengths) -> bool:
-    return point[1] * modes[1] > 0.0
+    side: bool = point[1] * modes[1] > 0.0
+    return side
 
 
 def _gather(pose: Pose, force: Triple) -> Triple:
