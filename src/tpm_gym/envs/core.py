@@ -100,6 +100,9 @@ class Core:
             task, machine=machine, reward=reward, goals=goals, penalty_weight=penalty_weight
         )
         checking.check(self.task)
+        if control not in self.task.controls:
+            valid = f"{' or '.join(map(repr, self.task.controls))} for {type(self.task).__name__}"
+            raise ConfigurationError("control", control, valid)
         self.machine = self.task.machine
         self.control = make_control(control, self.machine, self.task.control_period)
         self.drive, self.randomisation = drives_and_randomisation(drive, randomisation)
@@ -268,6 +271,7 @@ class Core:
                 "assembly_mode_changed": state.assembly_mode_changed,
                 "working_mode_changed": state.working_mode_changed,
                 "object_lost": task.lost(state),
+                **task.events(state),
                 "reward_terms": terms,
             },
         )

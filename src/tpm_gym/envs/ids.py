@@ -27,6 +27,8 @@ def register_task(
 ) -> tuple[str, ...]:
     """Register a task's ids ``TPM<name>{,Joints}{,Dense}-v<version>``; it may be repeated.
 
+    Ids with ``Joints`` are registered if ``task.controls`` has joint control.
+
     ``TPMEnv(task=...)`` accepts ``name`` in snake case. The command line, and worker processes that
     are spawned rather than forked, need ``"module:id"``: importing the module registers the id.
 
@@ -37,7 +39,7 @@ def register_task(
         max_episode_steps: Steps after which episodes are truncated; None for the task's own number.
 
     Returns:
-        The four ids.
+        The ids.
 
     Raises:
         ConfigurationError: If an argument is not possible, or the name or an id is taken; nothing
@@ -65,6 +67,7 @@ def register_task(
             "kwargs": {"task": option, "control": control, "reward": reward},
         }
         for control, joints in (("cartesian", ""), ("joints", "Joints"))
+        if control in task.controls
         for reward, dense in (("sparse", ""), ("dense", "Dense"))
     }
     for env_id, spec in variants.items():

@@ -189,8 +189,12 @@ def make_shield(shield: Any, machine: Machine, control: Control, exact: bool) ->
         exact: Whether the robot follows its commands exactly; else True keeps a ``MARGIN``.
 
     Raises:
-        ConfigurationError: If the option is neither True nor a conditioning below home's.
+        ConfigurationError: If the option is neither True nor a conditioning below home's, or the
+            machine may pass a singularity.
     """
+    if machine.mirror_axis is not None:
+        valid = f"False: {machine.name!r} has to pass a singularity here"
+        raise ConfigurationError("shield", shield, valid)
     least = shield
     if shield is True:
         least = machine.safe_conditioning * (1 if exact else 1 + MARGIN)

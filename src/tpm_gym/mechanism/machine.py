@@ -16,7 +16,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Final, NamedTuple
+from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -94,6 +94,9 @@ class Machine(ABC):
             the penalty of the reward begins below it.
         table: Half edges of the table along x and y, m; its top is the world's z = 0.
         payload: Mass that a gripper holds at point P, kg; :attr:`mechanism` contains it.
+        mirror_axis: Axis (0, 1, 2) normal to a plane of symmetry through the origin. P may pass
+            this plane, a parallel singularity, into the mirror image of the assembly mode. None for
+            a machine that has to stay in its assembly mode.
 
     Raises:
         ConfigurationError: If a value is not possible, if home or the goals lie outside the region,
@@ -112,6 +115,8 @@ class Machine(ABC):
     safe_conditioning: float = 0.08
     table: tuple[float, float] = (0.45, 0.30)
     payload: float = 0.0
+
+    mirror_axis: ClassVar[int | None] = None
 
     def __post_init__(self) -> None:
         """Reject machines on which no episode could run."""
@@ -211,6 +216,10 @@ class Machine(ABC):
     def same_side(self, position: ArrayLike) -> BoolArray:
         """Return whether P at ``position`` (..., 3) is on the assembly mode's side, as (...,)."""
         return np.ones(np.shape(position)[:-1], dtype=np.bool_)
+
+    def mirrored(self) -> Machine:
+        """Return the machine with home and assembly mode beyond the plane of ``mirror_axis``."""
+        raise NotImplementedError(f"{self.name}: mirror_axis is None")
 
     def unreachable(self, position: Vector) -> UnreachableError:
         """Explain why :meth:`inverse` has no solution at a position (3,) m."""

@@ -156,7 +156,8 @@ class ServoDrives:
         law: Parameters of :func:`tpm_gym.simulation.compiled.servo_torques`, from :meth:`begin`.
 
     Raises:
-        ConfigurationError: If a motor of the machine has no torque-speed line.
+        ConfigurationError: If a motor of the machine has no torque-speed line, or the machine may
+            pass a parallel singularity.
     """
 
     def __init__(self, servo: Servo, machine: Machine, count: int, time_step: float) -> None:
@@ -164,6 +165,9 @@ class ServoDrives:
         from tpm_gym.simulation import compiled  # imports Numba
 
         self._step_law, self._braced = compiled.servo_torques, compiled.braced_inverse
+        if machine.mirror_axis is not None:
+            valid = f"'ideal': {machine.name!r} passes a plane in which the inertia is infinite"
+            raise ConfigurationError("drive", servo, valid)
         self._servo, self._machine, self._step = servo, machine, time_step
         motors = machine.mechanism.motors
         for motor in motors:

@@ -35,6 +35,10 @@ CLOSURE_LIMIT = 0.005
 
 _STEPS = 10  # time steps in a control period, if neither settings nor engine say
 
+_BLUR = 0.05
+"""Distance from a plane that the machine may pass, in step limits, at which the observed velocity
+normal to the plane is half of J theta_dot."""
+
 _COLUMNS = (
     *("commands", "noise", "position", "jacobian", "conditioning", "mode_left", "bias"),
     "belt_speed",
@@ -271,6 +275,9 @@ class Simulation:
             theta = theta + self._bias + last
             rates = rates + (last - before) / self.control_period
         position, jacobian, conditioning, _ = self.machine.evaluate(theta)
+        if self.machine.mirror_axis is not None:
+            axis = self.machine.mirror_axis
+            position, jacobian = self._mirrored(axis, now.position, position, jacobian)
         if math.isnan(np.vdot(conditioning, conditioning)):  # faster than isnan().any()
             # With bias and noise, the encoders may report joint positions at which no assembly
             # exists. Then the last valid result is kept, as a real controller would do.
@@ -310,6 +317,35 @@ class Simulation:
             belt_speed=self._belt_speed.copy(),
         )
         return self._state
+
+    def _mirrored(
+        self, axis: int, truth: FloatArray, position: FloatArray, jacobian: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Mirror P (n, 3) m and J (n, 3, 3) of robots beyond the plane that the machine may pass.
+
+        Encoders do not show the side, because joint positions are equal on both sides. It is the
+        sign of a passive joint, which a switch would measure on a real robot.
+
+        Where P did not follow its path through the plane, the commands are mirrored too, which does
+        not change the joint positions on the path.
+
+        Args:
+            axis: Axis normal to the plane.
+            truth: (n, 3) m, P of the platform, world.
+            position: P by forward kinematics in the machine's assembly mode.
+            jacobian: J at ``position``.
+        """
+        machine, there = self.machine, self.machine.mount.to_paper(truth)[:, axis]
+        sign = np.where(there * machine.home[axis] < 0, -1.0, 1.0)
+        position, jacobian = position.copy(), jacobian.copy()
+        position[:, axis] *= sign
+        # In the plane, encoders do not show the velocity normal to it: J is infinite, so damp it.
+        distance, blur = position[:, axis], _BLUR * machine.step_limit[axis]
+        jacobian[:, axis] *= (sign * distance**2 / (distance**2 + blur**2))[:, None]
+        reached = self.recent[:, :, axis].mean(axis=1)  # by the path
+        turned = (there * reached < 0) & (np.abs(reached) > machine.step_limit[axis])
+        self._commands[turned, :, axis] *= -1.0
+        return position, jacobian
 
     def save(self) -> Snapshot:
         """Return a snapshot, and restart from the snapshot.

@@ -1,6 +1,7 @@
 """Tasks: scenes, goals, observations, rewards, controls, experts."""
 
 from tpm_gym.tasks.conveyor import Conveyor
+from tpm_gym.tasks.crossing import Crossing
 from tpm_gym.tasks.cycle import Cycle
 from tpm_gym.tasks.expert import Expert
 from tpm_gym.tasks.motion import Motion, Move, hanging
@@ -13,6 +14,7 @@ from tpm_gym.tasks.throw import Throw
 
 __all__ = [
     "Conveyor",
+    "Crossing",
     "Cycle",
     "Entry",
     "Expert",

@@ -81,6 +81,7 @@ class Task(ABC):
         goal_size: Length of a goal: three for each object in the scene's order, or three for P.
         tolerance: Distance below which a goal is achieved, m.
         samplings: Values of ``goals``.
+        controls: Names of the controls that can perform the task.
         control_period: Time between two actions, s. Limits of the machine hold in 40 ms, and are
             scaled to it.
         accelerations: Largest acceleration of the command for P along x, y, z, machine's frame,
@@ -98,6 +99,7 @@ class Task(ABC):
     goal_size: ClassVar[int] = 3
     tolerance: ClassVar[float] = 0.010
     samplings: ClassVar[tuple[str, ...]] = ("sampled",)
+    controls: ClassVar[tuple[str, ...]] = ("cartesian", "joints")
     control_period: ClassVar[float] = CONTROL_PERIOD
     accelerations: tuple[Vector, Vector] | None = None
     max_episode_steps: ClassVar[int] = 50
@@ -189,6 +191,11 @@ class Task(ABC):
 
     def shaping(self, state: State) -> dict[str, FloatArray]:
         """Return weighted terms of the reward that do not depend on the goal: name -> (n,)."""
+        del state
+        return {}
+
+    def events(self, state: State) -> dict[str, BoolArray]:
+        """Return what ``info`` tells of the task besides its usual entries: name -> (n,)."""
         del state
         return {}
 

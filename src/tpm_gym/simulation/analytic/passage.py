@@ -1,0 +1,153 @@
+"""Forward dynamics of P, for machines that may pass a parallel singularity.
+
+In the plane of the singularity, the inertia at the motors' axes is infinite. The inertia of P is
+not: with theta_dot = K v, it is K^T M K, which is even and smooth in the distance from the plane.
+So here the velocity of P is integrated instead of the joint velocities. In the plane, the column of
+K that is normal to the plane is zero: the motors do not act along it, and P coasts.
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from tpm_gym.arrays import FloatArray
+from tpm_gym.mechanism.machine import Machine, Motion
+from tpm_gym.simulation.analytic.forward_dynamics import Course, Steps, Touch
+
+__all__ = ["pass_through"]
+
+_LIFT: Final = 5e-5
+"""Distance from the plane, m, within which inertia and forces are those at this distance.
+
+They change with its square. Closer to the plane, rounding would be larger.
+"""
+_BESIDE: Final = 1e-4
+"""Distance, m, of the points from which the second derivative of the joint positions is found."""
+_COMPLIANCE: Final = 1e-8
+"""Compliance of ideal motors, as a share of the trace of the inverse inertia at their axes.
+
+It keeps their torques defined in the plane, where the motors' limits bound them.
+"""
+
+
+class _Dynamics(NamedTuple):
+    """Dynamics of P: mass dv/dt + bias = rate^T torque, with theta_dot = rate v.
+
+    Attributes:
+        rate: K, (r, 3, 3) rad/m.
+        inverse: Inverse of the mass, (r, 3, 3) 1/kg.
+        bias: Force for weight and velocity, (r, 3) N.
+    """
+
+    rate: FloatArray
+    inverse: FloatArray
+    bias: FloatArray
+
+
+def pass_through(
+    machine: Machine,
+    built: FloatArray | None,
+    steps: Steps,
+    count: int,
+    course: Course,
+    step: float,
+    touch: Touch,
+) -> tuple[Course, FloatArray]:
+    """Compute ``count`` time steps of r robots with ideal drives.
+
+    Arguments and results are explained in :func:`tpm_gym.simulation.analytic.march`.
+    """
+    torques = np.empty((count, *course.theta.shape))
+    speed = (course.position - course.before) / step
+    for index in range(count):
+        theta, rates, torque = course.theta.copy(), course.rates.copy(), torques[index]
+        # K, and so the change of the joint positions, is accurate in the middle of the time step.
+        at = _dynamics(machine, built, course.position + step / 2 * speed, speed, course.carried)
+        free = speed + step * _times(at.inverse, course.force - at.bias)
+        _drive(index, steps, course, at, free, torque)
+        speed = free + step * _times(at.inverse, _times(at.rate.swapaxes(1, 2), torque))
+        position = course.position + step * speed
+        theta = machine.inverse(position, built)
+        rates = _times(_rate(machine, built, position), speed)
+        mode_left = course.mode_left.copy()
+        mode_left[np.isnan(rates).any(axis=1) & (mode_left == 0)] = 1
+        gone = mode_left != 0
+        for new, old in zip((theta, rates, torque, position), course[:4], strict=True):
+            new[gone] = old[gone]
+        speed[gone] = 0.0
+        force, carried = touch(course.before, course.position, position)
+        course = Course(theta, rates, torque, position, course.position, force, carried, mode_left)
+    return course, torques
+
+
+def _drive(
+    index: int, steps: Steps, course: Course, at: _Dynamics, free: FloatArray, torque: FloatArray
+) -> None:
+    """Find the torques (r, 3) of a time step; without them P would have velocity ``free``."""
+    inverse = at.rate @ at.inverse @ at.rate.swapaxes(1, 2)
+    trace = np.trace(inverse, axis1=1, axis2=2)
+    inverse += _COMPLIANCE * trace[:, None, None] * np.eye(3)
+    still = np.zeros_like(free)
+    motors = course._replace(
+        rates=_times(at.rate, free), force=still, carried=np.zeros(len(free))
+    )
+    working = np.ones(len(free), dtype=np.bool_)
+    motion = Motion(course.position, np.zeros_like(at.rate), working, np.linalg.inv(inverse), still)
+    unused = np.empty((2, *still.shape))
+    steps.move(index, motors, motion, (unused[0], unused[1], torque, np.empty_like(unused), still))
+
+
+def _dynamics(
+    machine: Machine,
+    built: FloatArray | None,
+    position: FloatArray,
+    speed: FloatArray,
+    carried: FloatArray,
+) -> _Dynamics:
+    """Compute the dynamics of P at ``position`` and ``speed`` (r, 3), with carried masses (r,)."""
+    rate = _rate(machine, built, position)
+    points, side = _lifted(machine, position)
+    theta = machine.inverse(points, built)
+    own_rate, own_speed = _rate(machine, built, points), side * speed
+    length = np.linalg.norm(own_speed, axis=1, keepdims=True)
+    beside = _BESIDE * own_speed / np.maximum(length, 1e-12)
+    bend = machine.inverse(points + beside, built) + machine.inverse(points - beside, built)
+    turning = (bend - 2 * theta) * (length / _BESIDE) ** 2  # d2 theta / dt2 at constant velocity
+    motion = machine.motion(theta, _times(own_rate, own_speed), built)
+    back = own_rate.swapaxes(1, 2)
+    mass = back @ motion.mass @ own_rate * (side[:, :, None] * side[:, None, :])
+    mass += carried[:, None, None] * np.eye(3)
+    bias = side * _times(back, _times(motion.mass, turning) + motion.bias)
+    return _Dynamics(rate, np.linalg.inv(mass), bias)
+
+
+def _lifted(machine: Machine, position: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Mirror points (r, 3) to the side of the machine's home, at least _LIFT from the plane.
+
+    Returns:
+        The points, and 1, or -1 for the mirrored component, (r, 3).
+    """
+    axis = machine.mirror_axis or 0
+    home = np.sign(machine.home[axis])
+    points, side = position.copy(), np.ones_like(position)
+    side[position[:, axis] * home < 0, axis] = -1.0
+    points[:, axis] = home * np.maximum(np.abs(position[:, axis]), _LIFT)
+    return points, side
+
+
+def _rate(machine: Machine, built: FloatArray | None, position: FloatArray) -> FloatArray:
+    """Compute K (r, 3, 3), with theta_dot = K v, at points (r, 3)."""
+    axis = machine.mirror_axis or 0
+    points, _ = _lifted(machine, position)
+    rate = np.linalg.inv(machine.evaluate(machine.inverse(points, built), built).jacobian)
+    rate[:, :, axis] *= (position[:, axis] / points[:, axis])[:, None]
+    found: FloatArray = rate
+    return found
+
+
+def _times(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
+    """Multiply matrices (r, 3, 3) and vectors (r, 3)."""
+    product: FloatArray = (matrices * vectors[:, None, :]).sum(axis=-1)
+    return product

@@ -1,0 +1,69 @@
+"""Crossing: pass a parallel singularity by inertia, to a goal on its other side."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from tpm_gym.arrays import BoolArray, FloatArray
+from tpm_gym.mechanism.both_sides import both_sides
+from tpm_gym.mechanism.machine import Machine
+from tpm_gym.simulation.state import Block, State
+from tpm_gym.tasks import sampling
+from tpm_gym.tasks.motion import Motion, Move
+from tpm_gym.tasks.task import Task
+
+__all__ = ["Crossing"]
+
+
+class Crossing(Task):
+    """Bring point P to a goal on the other side of y = 0, and stop there.
+
+    In the plane y = 0, a parallel singularity, no torque of the motors acts along y, and no way
+    leads around the plane. So P has to pass it by inertia. The torques stay finite only if the
+    velocity along y is constant there. The mechanism changes its assembly mode, which does not end
+    the episode. With too little speed, or an acceleration, P turns back; then the command is
+    mirrored to the side where P is.
+
+    P starts at home. Goals are the mirror images of those of Reach. Only Cartesian control can name
+    a side: joint positions are equal on both sides.
+    """
+
+    samplings = ("sampled", "tempting")
+    controls = ("cartesian",)
+
+    def __init__(
+        self,
+        machine: Machine,
+        reward: str = "sparse",
+        goals: str = "sampled",
+        penalty_weight: float = 1.0,
+    ) -> None:
+        """Check the options, and that the machine can pass the plane."""
+        super().__init__(both_sides(machine), reward, goals, penalty_weight)
+
+    def sample(
+        self, rngs: Sequence[np.random.Generator], chosen: Mapping[str, FloatArray]
+    ) -> dict[str, FloatArray]:
+        """See the base class."""
+        if "goal" in chosen:
+            return dict(chosen)
+        machine, near = self.machine, self.goals == "tempting"
+        regions = {"goal": [machine.goal_region]}
+        points = sampling.safe_points(rngs, machine, regions, {}, near_singularity=near)["goal"]
+        points[:, machine.mirror_axis] *= -1.0
+        return {"goal": machine.mount.to_world(points)}
+
+    def events(self, state: State) -> dict[str, BoolArray]:
+        """Return ``crossed``: whether P is on the other side of the plane than home."""
+        axis = self.machine.mirror_axis
+        there = self.machine.mount.to_paper(state.fk_position)[:, axis]
+        return {"crossed": there * self.machine.home[axis] < 0}
+
+    def plan(self, motion: Motion) -> Iterator[Move]:
+        """Move straight to the goal; the velocity is constant but for the ends."""
+        goal = motion.machine.mount.to_paper(motion.goal)
+        yield from motion.go([goal], vacuum=False)
+        while True:
+            yield Move(goal, False)
