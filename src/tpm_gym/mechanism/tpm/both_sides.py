@@ -17,7 +17,7 @@ from tpm_gym.arrays import BoolArray, FloatArray
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism.machine import Machine
-from tpm_gym.mechanism.tpm import TPM
+from tpm_gym.mechanism.tpm.machine import TPM
 
 __all__ = ["BothSides", "both_sides"]
 
