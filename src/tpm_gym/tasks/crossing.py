@@ -7,9 +7,9 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from tpm_gym.arrays import BoolArray, FloatArray
-from tpm_gym.mechanism.tpm.both_sides import both_sides
 from tpm_gym.mechanism.machine import Machine
-from tpm_gym.simulation.state import Block, State
+from tpm_gym.mechanism.tpm.both_sides import both_sides
+from tpm_gym.simulation.state import State
 from tpm_gym.tasks import sampling
 from tpm_gym.tasks.motion import Motion, Move
 from tpm_gym.tasks.task import Task

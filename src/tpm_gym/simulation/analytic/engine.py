@@ -197,7 +197,7 @@ class AnalyticEngine:
             self._repeat(rows, start, path, vacuum)
 
     def _near_plane(self, axis: int, path: Path) -> BoolArray:
-        """Return whether the path is near the plane that the machine may pass, or P beyond it, (n,).
+        """Return whether the path is near the plane, or P is beyond it, (n,).
 
         Near the plane, differences of the joint positions do not give the torques.
         """

@@ -90,9 +90,7 @@ def _drive(
     trace = np.trace(inverse, axis1=1, axis2=2)
     inverse += _COMPLIANCE * trace[:, None, None] * np.eye(3)
     still = np.zeros_like(free)
-    motors = course._replace(
-        rates=_times(at.rate, free), force=still, carried=np.zeros(len(free))
-    )
+    motors = course._replace(rates=_times(at.rate, free), force=still, carried=np.zeros(len(free)))
     working = np.ones(len(free), dtype=np.bool_)
     motion = Motion(course.position, np.zeros_like(at.rate), working, np.linalg.inv(inverse), still)
     unused = np.empty((2, *still.shape))
