@@ -41,7 +41,9 @@ class Crossing(Task):
         penalty_weight: float = 1.0,
     ) -> None:
         """Check the options, and that the machine can pass the plane."""
-        super().__init__(both_sides(machine), reward, goals, penalty_weight)
+        both = both_sides(machine)
+        self._axis = both.mirror_axis
+        super().__init__(both, reward, goals, penalty_weight)
 
     def sample(
         self, rngs: Sequence[np.random.Generator], chosen: Mapping[str, FloatArray]
@@ -52,14 +54,13 @@ class Crossing(Task):
         machine, near = self.machine, self.goals == "tempting"
         regions = {"goal": [machine.goal_region]}
         points = sampling.safe_points(rngs, machine, regions, {}, near_singularity=near)["goal"]
-        points[:, machine.mirror_axis] *= -1.0
+        points[:, self._axis] *= -1.0
         return {"goal": machine.mount.to_world(points)}
 
     def events(self, state: State) -> dict[str, BoolArray]:
         """Return ``crossed``: whether P is on the other side of the plane than home."""
-        axis = self.machine.mirror_axis
-        there = self.machine.mount.to_paper(state.fk_position)[:, axis]
-        return {"crossed": there * self.machine.home[axis] < 0}
+        there = self.machine.mount.to_paper(state.fk_position)[:, self._axis]
+        return {"crossed": there * self.machine.home[self._axis] < 0}
 
     def plan(self, motion: Motion) -> Iterator[Move]:
         """Move straight to the goal; the velocity is constant but for the ends."""

@@ -36,7 +36,7 @@ class BothSides(TPM):
     ``assembly_mode``. Modes and conditioning at a position are those of the position's side.
     """
 
-    mirror_axis: ClassVar = 1
+    mirror_axis: ClassVar[int] = 1
 
     def mode_left(
         self, theta: ArrayLike, position: ArrayLike, built: FloatArray | None = None

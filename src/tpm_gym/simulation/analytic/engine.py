@@ -205,8 +205,8 @@ class AnalyticEngine:
             return np.ones(self._count, dtype=np.bool_)
         along, now = path.commands[:, :, axis], self._position[:, axis, None]
         near = self._machine.step_limit[axis] * _NEAR_PLANE
-        clear = np.minimum(along * np.sign(now), np.abs(now)) > near
-        return ~clear.all(axis=1)
+        clear: BoolArray = np.minimum(along * np.sign(now), np.abs(now)) > near
+        return np.logical_not(clear.all(axis=1))
 
     def _repeat(self, rows: IntArray, start: Any, path: Path, vacuum: BoolArray) -> None:
         """Compute the control period of some robots again, by forward dynamics."""
