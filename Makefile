@@ -8,7 +8,7 @@ TRAINS := $(VENV)/.trains
 unexport PYTHONDONTWRITEBYTECODE
 PIP := $(RUN) -m pip install --no-compile -c constraints.txt
 
-.PHONY: help demo test lint format compiled test-fast test-slow test-wheel docs urdf pictures figures gradients compare results bench-kinematics bench-engine bench-long bench-limits bench-transfer bench-engines bench-fidelity bench-evaluate bench-conveyor bench-speed bench-shield bench-first bench-cycle bench-tasks soak clean
+.PHONY: help demo test lint format compiled test-fast test-slow test-wheel docs urdf pictures figures gradients compare results bench-kinematics bench-engine bench-long bench-limits bench-transfer bench-engines bench-fidelity bench-evaluate bench-conveyor bench-speed bench-shield bench-first bench-crossing bench-cycle bench-tasks soak clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -127,6 +127,9 @@ bench-shield: $(INSTALLED) ## the shield: violations, margins, cost, policies; h
 
 bench-tasks: $(INSTALLED) ## success of the expert in each task, engine and condition; see docs/tasks.md; an hour
 	$(RUN) benchmarks/bench_tasks.py
+
+bench-crossing: $(INSTALLED) ## passages of y = 0 in each engine; see docs/crossing.md; minutes
+	$(RUN) benchmarks/bench_crossing.py
 
 bench-cycle: $(INSTALLED) ## cycle times and torques of 25-305-25 mm in each engine; see docs/cycle.md; minutes
 	$(RUN) benchmarks/bench_cycle.py

@@ -34,6 +34,7 @@ FILLED = {
     "docs/transfer.md": ["transfer"],
     "docs/shield.md": ["shield"],
     "docs/cycle.md": ["cycle"],
+    "docs/crossing.md": ["crossing"],
     "docs/conveyor.md": ["conveyor"],
 }
 RUN = [page for page in PAGES if blocks(page, "python") and page.name != "extending.md"]
@@ -136,6 +137,7 @@ def expected(name):
         "transfer": "bench_transfer",
         "shield": "bench_shield",
         "cycle": "bench_cycle",
+        "crossing": "bench_crossing",
         "conveyor": "bench_conveyor",
     }.get(name)
     if module is None:

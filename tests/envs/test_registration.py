@@ -10,7 +10,7 @@ import tpm_gym
 from tpm_gym import TPMEnv, register_task
 from tpm_gym.envs.ids import env_ids
 from tpm_gym.errors import ConfigurationError
-from tpm_gym.tasks import Conveyor, Cycle, PickAndPlace, Push, Reach, Stack, Throw
+from tpm_gym.tasks import Conveyor, Crossing, Cycle, PickAndPlace, Push, Reach, Stack, Throw
 from tpm_gym.tasks.registry import TASKS
 
 
@@ -21,7 +21,7 @@ def registries():
         yield
 
 
-_CLASSES = (Reach, PickAndPlace, Push, Stack, Throw, Conveyor, Cycle)
+_CLASSES = (Reach, PickAndPlace, Push, Stack, Throw, Conveyor, Crossing, Cycle)
 TASK_CLASSES = {kind.__name__: kind for kind in _CLASSES}
 
 
@@ -32,8 +32,8 @@ class Lift(PickAndPlace):
 def test_all_ids_are_registered_under_their_documented_names():
     assert set(tpm_gym.ENV_IDS) == {
         f"TPM{task}{control}{reward}-v0"
-        for task in TASK_CLASSES
-        for control in ("", "Joints")
+        for task, kind in TASK_CLASSES.items()
+        for control in ("", "Joints")[: len(kind.controls)]
         for reward in ("", "Dense")
     }
     assert set(tpm_gym.ENV_IDS) <= set(gym.registry)
@@ -48,7 +48,8 @@ def test_an_id_means_what_it_says(env_id):
     assert inner.task.reward == ("dense" if "Dense" in env_id else "sparse")
     control = "JointControl" if "Joints" in env_id else "CartesianControl"
     assert type(inner.control).__name__ == control
-    assert env.action_space.shape == ((3,) if name in ("Reach", "Push", "Cycle") else (4,))
+    three = "Reach", "Push", "Crossing", "Cycle"
+    assert env.action_space.shape == ((3,) if name in three else (4,))
     longer = {"Stack": 100, "Throw": 60, "Conveyor": 80, "Cycle": 75}
     assert env.spec.max_episode_steps == longer.get(name, 50)
     assert env.metadata["render_fps"] == (250 if name == "Cycle" else 25)
@@ -59,7 +60,7 @@ def test_a_users_task_gets_four_ids_and_a_name():
     ids = register_task("Lift", Lift, version=3, max_episode_steps=7)
     assert ids == ("TPMLift-v3", "TPMLiftDense-v3", "TPMLiftJoints-v3", "TPMLiftJointsDense-v3")
     assert tpm_gym.ENV_IDS[-4:] == ids
-    assert len(tpm_gym.ENV_IDS) == 4 * len(TASK_CLASSES) + 4
+    assert len(tpm_gym.ENV_IDS) == 2 * sum(len(k.controls) for k in TASK_CLASSES.values()) + 4
     env = gym.make(ids[-1], machine="wide")
     assert type(env.unwrapped.task) is Lift
     assert env.spec.max_episode_steps == 7

@@ -42,6 +42,8 @@ def solved(env: Any, **options: Any) -> bool:
 def test_it_solves_every_task_clear_of_the_singularity_with_half_the_torque(
     env_id, options, episodes, wanted
 ):
+    if "Crossing" in env_id:
+        pytest.skip("passes the singularity: see test_crossing.py")
     if re.search("Push|Throw|Conveyor|Cycle", env_id) and options.get("engine") == "kinematic":
         pytest.skip("needs contact, a belt, motion of what is let go, or short time steps")
     env = gym.make(env_id, **options)

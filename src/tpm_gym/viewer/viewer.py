@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import traceback
+from dataclasses import replace
 from html import escape
 from typing import Any, Final
 
@@ -140,7 +141,10 @@ class Viewer:
         with self.server.atomic():
             self.robot.draw_objects(state, player.markers)
             self.explore.hide_gizmo(self.play.playing)
-            self.explore.set(at_joints(machine, state.theta, machine.assembly_mode))
+            # Joint positions are equal on both sides of y = 0, the assembly modes are not.
+            y = machine.mount.to_paper(state.fk_position)[1]
+            mode = replace(machine.assembly_mode, sin_beta=-1 if y < 0 else 1)
+            self.explore.set(at_joints(machine, state.theta, mode))
 
     def _report(self, error: Exception) -> None:
         """Show an error on all pages; print errors that are no TPMError."""

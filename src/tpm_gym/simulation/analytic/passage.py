@@ -139,7 +139,9 @@ def _rate(machine: Machine, built: FloatArray | None, position: FloatArray) -> F
     """Compute K (r, 3, 3), with theta_dot = K v, at points (r, 3)."""
     axis = machine.mirror_axis or 0
     points, _ = _lifted(machine, position)
-    rate: FloatArray = np.linalg.inv(machine.evaluate(machine.inverse(points, built), built).jacobian)
+    rate: FloatArray = np.linalg.inv(
+        machine.evaluate(machine.inverse(points, built), built).jacobian
+    )
     rate[:, :, axis] *= (position[:, axis] / points[:, axis])[:, None]
     return rate
 
