@@ -231,7 +231,8 @@ class AnalyticEngine:
 
         course = Course(*(getattr(self, name)[rows] for name in _COURSE))
         built = None if self._built is None else self._built[rows]
-        go = march if self._machine.mirror_axis is None else pass_through
+        across = self._machine.mirror_axis is not None and isinstance(steps, IdealSteps)
+        go: Any = pass_through if across else march
         course, torques = go(self._machine, built, steps, count, course, self.time_step, touch)
         for name, values in zip(_COURSE, course, strict=True):
             getattr(self, name)[rows] = values

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from tpm_gym.arrays import BoolArray, FloatArray
 from tpm_gym.mechanism.machine import Machine, Motion
-from tpm_gym.simulation.analytic.steps import ideal_step, modes_left, servo_step
+from tpm_gym.simulation.analytic.steps import ideal_push, ideal_step, modes_left, servo_step
 from tpm_gym.simulation.drives import References, ServoDrives
 
 __all__ = ["Course", "IdealSteps", "ServoSteps", "Steps", "march"]
@@ -66,6 +66,15 @@ class IdealSteps:
         ideal_step(
             index, self._references, self._effort, course[:-1], at, self._step, new, self._behind
         )
+
+    def push(
+        self, index: int, theta: FloatArray, rates: FloatArray, inverse: FloatArray
+    ) -> FloatArray:
+        """Find the torques (r, 3) N m of a time step; arguments as in :func:`ideal_push`."""
+        torque = np.empty_like(theta)
+        references, effort, step = self._references, self._effort, self._step
+        ideal_push(index, references, effort, theta, rates, inverse, step, torque, self._behind)
+        return torque
 
     @property
     def behind(self) -> BoolArray:

@@ -13,8 +13,8 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from tpm_gym.arrays import FloatArray
-from tpm_gym.mechanism.machine import Machine, Motion
-from tpm_gym.simulation.analytic.forward_dynamics import Course, Steps, Touch
+from tpm_gym.mechanism.machine import Machine
+from tpm_gym.simulation.analytic.forward_dynamics import Course, IdealSteps, Touch
 
 __all__ = ["pass_through"]
 
@@ -49,7 +49,7 @@ class _Dynamics(NamedTuple):
 def pass_through(
     machine: Machine,
     built: FloatArray | None,
-    steps: Steps,
+    steps: IdealSteps,
     count: int,
     course: Course,
     step: float,
@@ -62,11 +62,13 @@ def pass_through(
     torques = np.empty((count, *course.theta.shape))
     speed = (course.position - course.before) / step
     for index in range(count):
-        theta, rates, torque = course.theta.copy(), course.rates.copy(), torques[index]
         # K, and so the change of the joint positions, is accurate in the middle of the time step.
         at = _dynamics(machine, built, course.position + step / 2 * speed, speed, course.carried)
         free = speed + step * _times(at.inverse, course.force - at.bias)
-        _drive(index, steps, course, at, free, torque)
+        inverse = at.rate @ at.inverse @ at.rate.swapaxes(1, 2)
+        trace = np.trace(inverse, axis1=1, axis2=2)
+        inverse += _COMPLIANCE * trace[:, None, None] * np.eye(3)
+        torque = steps.push(index, course.theta, _times(at.rate, free), inverse)
         speed = free + step * _times(at.inverse, _times(at.rate.swapaxes(1, 2), torque))
         position = course.position + step * speed
         theta = machine.inverse(position, built)
@@ -76,25 +78,10 @@ def pass_through(
         gone = mode_left != 0
         for new, old in zip((theta, rates, torque, position), course[:4], strict=True):
             new[gone] = old[gone]
-        speed[gone] = 0.0
+        speed[gone], torques[index] = 0.0, torque
         force, carried = touch(course.before, course.position, position)
         course = Course(theta, rates, torque, position, course.position, force, carried, mode_left)
     return course, torques
-
-
-def _drive(
-    index: int, steps: Steps, course: Course, at: _Dynamics, free: FloatArray, torque: FloatArray
-) -> None:
-    """Find the torques (r, 3) of a time step; without them P would have velocity ``free``."""
-    inverse = at.rate @ at.inverse @ at.rate.swapaxes(1, 2)
-    trace = np.trace(inverse, axis1=1, axis2=2)
-    inverse += _COMPLIANCE * trace[:, None, None] * np.eye(3)
-    still = np.zeros_like(free)
-    motors = course._replace(rates=_times(at.rate, free), force=still, carried=np.zeros(len(free)))
-    working = np.ones(len(free), dtype=np.bool_)
-    motion = Motion(course.position, np.zeros_like(at.rate), working, np.linalg.inv(inverse), still)
-    unused = np.empty((2, *still.shape))
-    steps.move(index, motors, motion, (unused[0], unused[1], torque, np.empty_like(unused), still))
 
 
 def _dynamics(

@@ -28,7 +28,7 @@ from tpm_gym.simulation.vectors import (
     spread,
 )
 
-__all__ = ["ideal_step", "modes_left", "resisted", "servo_step"]
+__all__ = ["ideal_push", "ideal_step", "modes_left", "resisted", "servo_step"]
 
 _CREEP = 2e-5  # m/s; below this speed, friction falls to zero in proportion to the speed
 _SIGNS = np.array([(i, j, k) for i in (0, 1, -1) for j in (0, 1, -1) for k in (0, 1, -1)], float)
@@ -77,6 +77,43 @@ def ideal_step(
         behind[1, row] = short[0] != 0 or short[1] != 0 or short[2] != 0
         put_row(new[2], row, plus(_ZERO, plus(spread(mass, short), impulse, -1.0), rate))
         _integrate(row, plus(goal, short), course, at, step, new)
+
+
+@kept
+def ideal_push(
+    index: int,
+    references: FloatArray,
+    effort: FloatArray,
+    theta: FloatArray,
+    rates: FloatArray,
+    inverse: FloatArray,
+    step: float,
+    torque: FloatArray,
+    behind: BoolArray,
+) -> None:
+    """Find the torques of ideal drives from the inverse inertia, which may be singular.
+
+    Other arguments are explained in :func:`ideal_step`.
+
+    Args:
+        theta: (r, 3) rad, joint positions at the beginning of the time step.
+        rates: (r, 3) rad/s, joint velocities at its end without torques.
+        inverse: (r, 3, 3) 1/(kg m^2), inverse inertia at the motors' axes, with their compliance.
+        torque: (r, 3) N m, output.
+    """
+    for row in range(len(effort)):
+        ahead = plus(page_row(references, index, row), row_of(theta, row), -1.0)
+        wanted = plus(plus(_ZERO, ahead, 1.0 / step), row_of(rates, row), -1.0)
+        a, b, c = page_row(inverse, row, 0)
+        _, d, e = page_row(inverse, row, 1)
+        matrix = a, b, c, d, e, inverse[row, 2, 2]
+        most = plus(_ZERO, row_of(effort, row), step)
+        found = _bounded(matrix, wanted, most)
+        behind[0, row] = behind[1, row]
+        behind[1, row] = False
+        for i in range(3):
+            behind[1, row] |= abs(found[i]) >= most[i]
+            torque[row, i] = found[i] / step
 
 
 @kept
@@ -228,3 +265,34 @@ def _moving(mass: Symmetric, impulse: Vector, limit: Vector, signs: Vector) -> V
     x, y, z = impulse
     x, y, z = x - limit[0] * signs[0], y - limit[1] * signs[1], z - limit[2] * signs[2]
     return solved(own, (p * x, q * y, r * z))
+
+
+@compiled
+def _bounded(matrix: Symmetric, wanted: Vector, most: Vector) -> Vector:
+    """Find x within +-most that minimises x matrix x / 2 - wanted x.
+
+    The minimum has some entries at a bound, and is stationary in the others.
+    """
+    found, best = _ZERO, np.inf
+    for choice in range(27):  # all combinations of no bound, upper bound and lower bound
+        u, v, w = row_of(_SIGNS, choice)
+        fixed = u * most[0], v * most[1], w * most[2]
+        x, y, z = _moving(
+            matrix,
+            plus(wanted, spread(matrix, fixed), -1.0),
+            _ZERO,
+            (1.0 - abs(u), 1.0 - abs(v), 1.0 - abs(w)),
+        )
+        p, q, r = plus((x, y, z), fixed)
+        tried = (
+            min(max(p, -most[0]), most[0]),
+            min(max(q, -most[1]), most[1]),
+            min(max(r, -most[2]), most[2]),
+        )
+        a, b, c = spread(matrix, tried)
+        cost = dot(tried, plus((a / 2, b / 2, c / 2), wanted, -1.0))
+        if cost < best:
+            best, found = cost, tried
+        if choice == 0 and tried == (p, q, r):
+            break
+    return found
