@@ -138,7 +138,7 @@ def test_random_actions_near_the_plane_are_never_reported_wrongly(engine):
 
 def test_one_robot_passes_as_among_many():
     actions = np.random.default_rng(0).uniform(-1, 1, (40, 5, 3))
-    actions[:, :, 1] = 1.0  # straight through the plane
+    actions[:, :, 1] = -1.0  # straight through the plane
     found = []
     for count in (1, 5):
         with closing(TPMVectorEnv(Crossing, num_envs=count, engine="analytic")) as envs:
