@@ -259,22 +259,20 @@ class Core:
             chosen = range(self.count) if rows is None else rows.tolist()
             drawn = [(row, self._markers(row)) for row in chosen]
             observation = self._pixels.observe(observation, self.simulation, drawn)
-        return (
-            observation,
-            reward,
-            {
-                "is_success": task.success(gap),
-                "closure_error": state.closure_error,
-                "vacuum": state.vacuum,
-                "conditioning": state.conditioning,
-                "singularity_penalty": penalty,
-                "assembly_mode_changed": state.assembly_mode_changed,
-                "working_mode_changed": state.working_mode_changed,
-                "object_lost": task.lost(state),
-                **task.events(state),
-                "reward_terms": terms,
-            },
-        )
+        info = {
+            "is_success": task.success(gap),
+            "closure_error": state.closure_error,
+            "vacuum": state.vacuum,
+            "conditioning": state.conditioning,
+            "singularity_penalty": penalty,
+            "assembly_mode_changed": state.assembly_mode_changed,
+            "working_mode_changed": state.working_mode_changed,
+            "object_lost": task.lost(state),
+            "reward_terms": terms,
+        }
+        for event in task.events:
+            info[event] = getattr(task, event)(state)
+        return observation, reward, info
 
     def _noise(self, rows: IntArray) -> FloatArray:
         """Draw the errors (n, 3) rad of one reading of the encoders, for some environments."""

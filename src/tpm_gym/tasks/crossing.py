@@ -32,6 +32,7 @@ class Crossing(Task):
 
     samplings = ("sampled", "tempting")
     controls = ("cartesian",)
+    events = ("crossed",)
 
     def __init__(
         self,
@@ -57,10 +58,11 @@ class Crossing(Task):
         points[:, self._axis] *= -1.0
         return {"goal": machine.mount.to_world(points)}
 
-    def events(self, state: State) -> dict[str, BoolArray]:
-        """Return ``crossed``: whether P is on the other side of the plane than home."""
+    def crossed(self, state: State) -> BoolArray:
+        """Return whether P is on the other side of the plane than home, (n,)."""
         there = self.machine.mount.to_paper(state.fk_position)[:, self._axis]
-        return {"crossed": there * self.machine.home[self._axis] < 0}
+        beyond: BoolArray = there * self.machine.home[self._axis] < 0
+        return beyond
 
     def plan(self, motion: Motion) -> Iterator[Move]:
         """Move straight to the goal; the velocity is constant but for the ends."""

@@ -82,6 +82,7 @@ class Task(ABC):
         tolerance: Distance below which a goal is achieved, m.
         samplings: Values of ``goals``.
         controls: Names of the controls that can perform the task.
+        events: Names of methods of the task. ``info`` has their results for the state, (n,) bool.
         control_period: Time between two actions, s. Limits of the machine hold in 40 ms, and are
             scaled to it.
         accelerations: Largest acceleration of the command for P along x, y, z, machine's frame,
@@ -100,6 +101,7 @@ class Task(ABC):
     tolerance: ClassVar[float] = 0.010
     samplings: ClassVar[tuple[str, ...]] = ("sampled",)
     controls: ClassVar[tuple[str, ...]] = ("cartesian", "joints")
+    events: ClassVar[tuple[str, ...]] = ()
     control_period: ClassVar[float] = CONTROL_PERIOD
     accelerations: tuple[Vector, Vector] | None = None
     max_episode_steps: ClassVar[int] = 50
@@ -191,11 +193,6 @@ class Task(ABC):
 
     def shaping(self, state: State) -> dict[str, FloatArray]:
         """Return weighted terms of the reward that do not depend on the goal: name -> (n,)."""
-        del state
-        return {}
-
-    def events(self, state: State) -> dict[str, BoolArray]:
-        """Return what ``info`` tells of the task besides its usual entries: name -> (n,)."""
         del state
         return {}
 
