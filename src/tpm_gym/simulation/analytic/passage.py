@@ -126,10 +126,9 @@ def _rate(machine: Machine, built: FloatArray | None, position: FloatArray) -> F
     """Compute K (r, 3, 3), with theta_dot = K v, at points (r, 3)."""
     axis = machine.mirror_axis or 0
     points, _ = _lifted(machine, position)
-    rate: FloatArray = np.linalg.inv(
-        machine.evaluate(machine.inverse(points, built), built).jacobian
-    )
-    rate[:, :, axis] *= (position[:, axis] / points[:, axis])[:, None]
+    theta, scale = machine.inverse(points, built), np.ones_like(position)
+    scale[:, axis] = position[:, axis] / points[:, axis]
+    rate: FloatArray = np.linalg.inv(machine.evaluate(theta, built).jacobian) * scale[:, None]
     return rate
 
 
