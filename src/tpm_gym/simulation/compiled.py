@@ -16,15 +16,21 @@ from tpm_gym.simulation.vectors import (
     put_page_row,
     row_of,
     spread,
+    three,
 )
 
 __all__ = [
+    "accepted",
     "all_within",
     "along",
     "any_outside",
+    "arrived",
+    "beyond",
     "bounded",
     "braced_inverse",
+    "differences",
     "distances",
+    "drawn",
     "ends",
     "in_world",
     "limited",
@@ -297,6 +303,71 @@ def spline_points(commands: FloatArray, weights: FloatArray) -> FloatArray:
                     weights[k, 0] * one + weights[k, 1] * two + weights[k, 2] * three
                 )
     return points
+
+
+@kept
+def drawn(shares: FloatArray, boxes: FloatArray, counts: IntArray) -> FloatArray:
+    """Return points (r, k, d, 3) in boxes, from random numbers.
+
+    Args:
+        shares: (r, k, d, 4) numbers in [0, 1): the place in the box, and which box. All d points
+            are in the box of the first.
+        boxes: (b, 2, 3) low and high corners; those of the first of k points come first.
+        counts: (k,) number of boxes of each of the k points.
+    """
+    points = np.empty((*shares.shape[:3], 3))
+    for row in range(len(shares)):
+        before = 0
+        for index in range(len(counts)):
+            box = before + int(shares[row, index, 0, 3] * counts[index])
+            before += counts[index]
+            for draw in range(shares.shape[2]):
+                for i in range(3):
+                    low, high = boxes[box, 0, i], boxes[box, 1, i]
+                    points[row, index, draw, i] = low + (high - low) * shares[row, index, draw, i]
+    return points
+
+
+@kept
+def accepted(
+    drawn: FloatArray,
+    conditioning: FloatArray,
+    least: float,
+    most: float,
+    apart: float,
+    rows: IntArray,
+    points: FloatArray,
+) -> BoolArray:
+    """Choose the first draws that are safe and apart from the points before them.
+
+    Args:
+        drawn: (r, k, d, 3) m, draws for the last k points of each row.
+        conditioning: (r, k, d), at the draws.
+        least: Smallest conditioning.
+        most: Conditioning above all that are accepted.
+        apart: Smallest distance from all points before, m.
+        rows: (r,) rows of ``points``.
+        points: (n, j, 3) m; output.
+
+    Returns:
+        Whether all k points of each row were found, (r,).
+    """
+    found = np.zeros(len(rows), np.bool_)
+    first = points.shape[1] - drawn.shape[1]
+    for i in range(len(rows)):
+        mine, index, draw = points[rows[i]], 0, 0
+        while index < drawn.shape[1] and draw < drawn.shape[2]:
+            point = drawn[i, index, draw]
+            fits = least <= conditioning[i, index, draw] < most
+            for other in range(first + index):
+                x, y, z = plus(three(point), row_of(mine, other), -1.0)
+                fits &= x * x + y * y + z * z >= apart * apart
+            draw += 1
+            if fits:
+                mine[first + index] = point
+                index, draw = index + 1, 0
+        found[i] = index == drawn.shape[1]
+    return found
 
 
 @kept

@@ -167,15 +167,17 @@ class Simulation:
         if belt_speed is not None and self.scene.belt is None:
             raise ConfigurationError("belt_speed", belt_speed, "None: the scene has no belt")
         plants = [NOMINAL] * len(rows) if plants is None else plants
-        for plant in plants:
-            if plant is not NOMINAL:
-                require_servo(self.drive, plant.servo_stiffness, plant.joint_friction)
+        nominal = plants.count(NOMINAL) == len(plants)
+        for plant in () if nominal else plants:
+            require_servo(self.drive, plant.servo_stiffness, plant.joint_friction)
         angles = finite("theta", theta, (3,) if np.ndim(theta) < 2 else (len(rows), 3))
         reading = self.machine.require_evaluate(angles)
-        bias = np.array([plant.encoder_bias for plant in plants])
+        bias = np.zeros((len(plants), 3))
+        if not nominal:
+            bias[:] = [plant.encoder_bias for plant in plants]
         true = angles - bias
         self.machine.require_within_stops(true)
-        if any(plant.length_errors for plant in plants):
+        if not nominal and any(plant.length_errors for plant in plants):
             self.machine.require_evaluate(true, self._built(plants))
         placed = self._places(len(rows), objects or {})
         self._become(rows, plants)

@@ -24,6 +24,7 @@ from tpm_gym.arrays import FloatArray, Vector
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism.machine import Machine
+from tpm_gym.simulation.engine import loops
 
 __all__ = [
     "APART",
@@ -75,40 +76,23 @@ def safe_points(
     points = np.empty((len(rngs), len(names), 3))
     for index, point in enumerate(known.values()):
         points[:, index] = point
-    boxes = [np.array([(box.low, box.high) for box in regions[name]]) for name in names[first:]]
+    parts = [regions[name] for name in names[first:]]
+    boxes = np.array([(box.low, box.high) for part in parts for box in part]).reshape(-1, 2, 3)
+    counts = np.array([len(part) for part in parts], dtype=np.int64)
     least, most = _limits(machine, near_singularity)
-    draws = _BATCH if near_singularity else _DRAWS
+    shares = np.empty((len(rngs), len(parts), _BATCH if near_singularity else _DRAWS, 4))
     for _ in range(_ATTEMPTS):
-        drawn = _drawn([rngs[row] for row in rows.tolist()], boxes, draws)
+        # One call for each generator, because a call takes longer than the numbers.
+        for row, own in zip(rows.tolist(), shares, strict=False):
+            rngs[row].random(out=own)
+        drawn = loops().drawn(shares[: len(rows)], boxes, counts)
         conditioning = machine.conditioning_at(drawn)
-        safe = (conditioning >= least) & (conditioning < most)
-        found = np.ones(len(rows), dtype=np.bool_)
-        for index in range(len(boxes)):
-            gap = drawn[:, index, :, None] - points[rows, None, : first + index]
-            fits = safe[:, index] & ((gap * gap).sum(axis=-1) >= apart * apart).all(axis=-1)
-            points[rows, first + index] = drawn[np.arange(len(rows)), index, fits.argmax(axis=1)]
-            found &= fits.any(axis=1)
+        found = loops().accepted(drawn, conditioning, least, most, apart, rows, points)
         rows = rows[~found]
         if not len(rows):
             return dict(zip(names, points.swapaxes(0, 1), strict=True))
     valid = f"with points of conditioning {least} to {most}, {apart} m from {', '.join(names)}"
     raise ConfigurationError("goal_region", dict(regions), valid)
-
-
-def _drawn(
-    rngs: Sequence[np.random.Generator], boxes: Sequence[FloatArray], count: int
-) -> FloatArray:
-    """Draw points (r, k, count, 3), all k in one of the boxes (c, 2, 3) of their own."""
-    # One call for each generator, because a call takes longer than the numbers.
-    shares = np.empty((len(rngs), len(boxes), count, 4))
-    for rng, own in zip(rngs, shares, strict=True):
-        rng.random(out=own)
-    ends = np.empty((len(rngs), len(boxes), 2, 1, 3))
-    for index, box in enumerate(boxes):
-        ends[:, index, :, 0] = box[(shares[:, index, 0, 3] * len(box)).astype(np.int64)]
-    low, high = ends[:, :, 0], ends[:, :, 1]
-    points: FloatArray = low + (high - low) * shares[..., :3]
-    return points
 
 
 def safe_draw(

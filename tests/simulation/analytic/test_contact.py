@@ -66,6 +66,12 @@ def on_tables(blocks: int, count: int, edges: tuple[float, float] = (9.0, 9.0)) 
     return Contact([BLOCK] * blocks, count, STEP, edges, (np.ones(3), np.zeros(3)))
 
 
+def upright(places: FloatArray) -> FloatArray:
+    """Poses (r, k, 7) of upright blocks at places (r, k, 3)."""
+    turn = np.broadcast_to((0.0, 0.0, 0.0, 1.0), (*places.shape[:2], 4))
+    return np.concatenate([places, turn], axis=2)
+
+
 def advance(contact: Contact, rows: Any, path: FloatArray, on: FloatArray) -> Any:
     """Lead the cups along paths (r, 2 + K, 3); the forces (r, K, 3) and the carried masses."""
     steps = path.shape[1] - 2
@@ -76,7 +82,7 @@ def advance(contact: Contact, rows: Any, path: FloatArray, on: FloatArray) -> An
 def table(places: Sequence[FloatArray], edges: tuple[float, float] = (9.0, 9.0)) -> Contact:
     """One table with blocks."""
     contact = on_tables(len(places), 1, edges)
-    contact.place(np.arange(1), np.array([places]))
+    contact.place(np.arange(1), upright(np.array([places])))
     return contact
 
 
@@ -210,7 +216,7 @@ def test_what_is_pulled_harder_than_the_vacuum_can_comes_off(acceleration, kept)
 
 def test_a_heavier_one_comes_off_and_a_smoother_one_slides_farther():
     contact, every = on_tables(1, 3), np.arange(3)
-    contact.place(every, np.tile(MIDDLE, (3, 1, 1)))
+    contact.place(every, upright(np.tile(MIDDLE, (3, 1, 1))))
     contact.alter(every, np.array([1.0, 1.0, 30.0]), np.array([1.0, 0.5, 1.0]))
     rising = np.minimum(np.maximum(np.arange(-92, 90), 0), 20) * 0.0002
     moving = np.maximum(np.arange(-132, 50), 0) * 0.4 * STEP
@@ -328,7 +334,7 @@ def test_whatever_the_cup_does_all_stays_finite_and_on_the_table():
     places = np.zeros((rows, count, 3)) + np.arange(count)[:, None] * [0.0, 0.0, HEIGHT]
     places[..., 2] += HEIGHT / 2
     places[..., :2] += rng.uniform(-0.02, 0.02, (rows, count, 2))
-    contact.place(np.arange(rows), places)
+    contact.place(np.arange(rows), upright(places))
     stops = rng.uniform([-0.06, -0.06, 0.03], [0.06, 0.06, 0.14], (25, rows, 3))
     ways = np.stack([spline(list(stops[:, row])) for row in range(rows)])
     for k in range(0, ways.shape[1] - 2, STEPS):
@@ -360,7 +366,7 @@ def crowd(count: int, seed: int, periods: int = 8) -> tuple[FloatArray, FloatArr
 def history(places: FloatArray, ways: FloatArray, on: FloatArray) -> list[FloatArray]:
     """All that is read, and all forces, after each control period."""
     contact, rows = on_tables(2, len(places)), np.arange(len(places))
-    contact.place(rows, places)
+    contact.place(rows, upright(places))
     seen: list[FloatArray] = []
     for period, k in enumerate(range(0, ways.shape[1] - 2, STEPS)):
         force, _ = advance(contact, rows, ways[:, k : k + STEPS + 2], on[period])
@@ -408,7 +414,7 @@ def test_rows_may_be_advanced_apart_by_any_steps_and_go_on_from_what_was_saved()
     whole = history(places, ways, np.ones((8, 12), dtype=bool))
     made = [on_tables(2, 12) for _ in range(2)]
     every, contact = np.arange(12), made[0]
-    contact.place(every, places)
+    contact.place(every, upright(places))
     for k in range(0, ways.shape[1] - 2, STEPS // 2):
         for rows in (every[1::2], every[::2]):
             steps = ways[rows, k : k + STEPS // 2 + 2]

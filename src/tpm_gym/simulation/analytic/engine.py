@@ -150,7 +150,7 @@ class AnalyticEngine:
         self._mode_left[rows], self._behind[rows] = 0, False
         if self._drives is not None:
             self._drives.rest(rows, theta)
-        self._contact.place(rows, objects[..., :3], objects[..., 3:])
+        self._contact.place(rows, objects)
 
     def set_belt(self, rows: IntArray, speed: FloatArray) -> None:
         """Implement :meth:`Engine.set_belt`."""

@@ -18,21 +18,16 @@ import numpy as np
 
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray, vector
 from tpm_gym.simulation.analytic.contact.state import (
-    AT_REST,
-    CUP_STATE,
-    Records,
     Route,
     Setting,
     tables_for,
     work_for,
 )
-from tpm_gym.simulation.analytic.contact.stepping import advance, read
-from tpm_gym.simulation.stage import TABLE, boards
+from tpm_gym.simulation.analytic.contact.stepping import advance, place, read
+from tpm_gym.simulation.stage import boards
 from tpm_gym.simulation.state import Belt, Block
 
 __all__ = ["Contact", "Reading"]
-
-_LEVEL = 1e-9  # m; an object at most so far above the table top stands on it
 
 
 class Reading(NamedTuple):
@@ -86,8 +81,8 @@ class Contact:
         self._work = work_for(number)
         everything = np.arange(count)
         self.alter(everything, np.ones(count), np.ones(count))
-        middle = np.zeros((count, number, 3))
-        middle[..., 2] = 2 * half[:, 2].cumsum() - half[:, 2]
+        middle = np.zeros((count, number, 7))
+        middle[..., 2], middle[..., 6] = 2 * half[:, 2].cumsum() - half[:, 2], 1.0
         self.place(everything, middle)
 
     def alter(self, rows: Any, mass_factor: FloatArray, friction_factor: FloatArray) -> None:
@@ -101,9 +96,7 @@ class Contact:
         for tables in (self._tables, self._earlier):
             tables.belts[rows] = speed
 
-    def place(
-        self, rows: Any, positions: FloatArray, quaternions: FloatArray | None = None
-    ) -> None:
+    def place(self, rows: IntArray, poses: FloatArray) -> None:
         """Release held objects, set vacuum to zero, and place all objects without motion.
 
         Tables whose objects all stand upright on the table top are at rest at once, unless their
@@ -111,29 +104,9 @@ class Contact:
 
         Args:
             rows: (r,) indices of the tables.
-            positions: (r, k, 3) m, world, centres of the objects.
-            quaternions: (r, k, 4), orientations (x, y, z, w); None for upright objects.
+            poses: (r, k, 7) centres (m) and orientations (x, y, z, w) of the objects, world.
         """
-        tables = self._tables
-        objects = tables.objects[rows]
-        objects["position"] = positions
-        objects["quaternion"] = (0.0, 0.0, 0.0, 1.0) if quaternions is None else quaternions
-        objects["velocity"] = objects["spin"] = 0.0
-        standing = self._standing(objects).all(axis=1) & (tables.belts[rows] == 0)
-        objects["rest"] = np.where(standing, AT_REST, 0)[:, None]
-        empty = np.zeros((), CUP_STATE)
-        empty["held"] = -1
-        tables.objects[rows], tables.cups[rows] = objects, empty
-        tables.forces[rows], tables.awake[rows] = 0.0, ~standing
-
-    def _standing(self, objects: Records) -> BoolArray:
-        """Return whether each of (r, k) objects stands upright on the table top."""
-        place, setting = objects["position"], self._setting
-        on_top = np.abs(place[..., 2] - setting.half[:, 2] - TABLE.top) < _LEVEL
-        (low, high, edge), (x, y) = setting.table, np.moveaxis(place[..., :2], -1, 0)
-        over = (x >= low) & (x <= high) & (np.abs(y) <= edge)
-        standing: BoolArray = on_top & over & (objects["quaternion"][..., 3] == 1.0)
-        return standing
+        place(self._tables, rows, poses, self._setting)
 
     def advance(
         self, rows: IntArray, route: Route, vacuum_on: BoolArray, last: int = 1

@@ -26,12 +26,14 @@ from tpm_gym.simulation.analytic.contact.state import (
     Work,
 )
 from tpm_gym.simulation.engine import SPRING_GAIN
+from tpm_gym.simulation.stage import TABLE
 from tpm_gym.simulation.vectors import axes, cross, dot, length, plus, put, put_row, row_of, three
 
-__all__ = ["advance", "read"]
+__all__ = ["advance", "place", "read"]
 
 _SLOW, _SLOW_SPIN = 5e-3, 0.3  # m/s, rad/s: objects below both speeds may come to rest
 _SETTLED, _STOPPED = 1e-6, 1e-3  # m, m/s: below both, the slide is set to 0
+_LEVEL = 1e-9  # m; an object at most so far above the table top stands on it
 _NEARBY = 5e-4  # m; margin for contacts of the lip, beyond its motion in a time step
 _BESIDE = 0.005  # m; margin around objects at rest within which the lip ends the skipping
 _FREE_CUP = 4 * CUP_MASS
@@ -111,6 +113,41 @@ def read(
                 spin[row, index, i] = item["spin"][i]
             for i in range(4):
                 quaternion[row, index, i] = item["quaternion"][i]
+
+
+@kept
+def place(tables: Tables, rows: IntArray, poses: FloatArray, setting: Setting) -> None:
+    """Place all objects without motion, as explained in :class:`.contact.Contact`.
+
+    Args:
+        poses: (r, k, 7) centres (m) and orientations (x, y, z, w) of the objects, world.
+    """
+    for i in range(len(rows)):
+        row, standing = rows[i], tables.belts[rows[i]] == 0
+        for index in range(poses.shape[1]):
+            item, pose = tables.objects[row, index], poses[i, index]
+            put(item["position"], (pose[0], pose[1], pose[2]))
+            put(item["velocity"], _ZERO)
+            put(item["spin"], _ZERO)
+            for k in range(4):
+                item["quaternion"][k] = pose[3 + k]
+            standing &= _stands(pose, setting.half[index, 2], setting.table)
+        for index in range(poses.shape[1]):
+            tables.objects[row, index]["rest"] = AT_REST if standing else 0
+        cup = tables.cups[row]
+        cup["slide"] = cup["slide_rate"] = cup["vacuum"] = 0.0
+        cup["held"] = -1.0
+        put(cup["grip"], _ZERO)
+        tables.forces[row] = 0.0
+        tables.awake[row] = not standing
+
+
+@compiled
+def _stands(pose: FloatArray, half: float, table: tuple[float, float, float]) -> bool:
+    """Return whether an object at a pose (7,) stands upright on the table top."""
+    low, high, edge = table
+    over = low <= pose[0] <= high and abs(pose[1]) <= edge
+    return bool(over and abs(pose[2] - half - TABLE.top) < _LEVEL and pose[6] == 1.0)
 
 
 @compiled
