@@ -3,8 +3,8 @@
 One learns what a task has to say: starts and goals, what is compared with the goal, a reward term,
 and the expert's plan. ``python own_task.py`` tests the expert, which takes 8 s of
 a processor core; it succeeds in 100.0% of the episodes. In this folder,
-``python -m tpm_gym.learning train --env own_task:TPMLandDense-v0 --algo ppo --engine analytic
---steps 200000 --run runs/land`` trains a policy.
+``tpm-gym train --env own_task:TPMLandDense-v0 --algo ppo --engine analytic --steps 200000
+--run runs/land`` trains a policy.
 """
 
 import gymnasium as gym

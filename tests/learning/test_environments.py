@@ -37,7 +37,7 @@ tpm_gym.register_machine("mine", tpm_gym.PAPER_TPM)
 def run(tmp_path, monkeypatch):
     """Runs the command as in a folder of which Python has imported nothing."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(tmp_path)  # as ``python -m`` has it
+    monkeypatch.setattr(sys, "path", sys.path.copy())  # to which the command adds the folder
 
     def run_anew(*words):
         sys.modules.pop("my_tasks", None)
@@ -108,8 +108,8 @@ def test_a_stopped_run_says_how_its_module_is_found_again(tmp_path, run, monkeyp
         run("train", *words, "--run", "a run")
     _, _, command = capsys.readouterr().out.partition("continue with: ")
     program, *words = shlex.split(command)
-    assert program == "python"
-    assert "to 110" in printed_by(PYTHON, *words, cwd=tmp_path)
+    assert program == "tpm-gym"
+    assert "to 110" in printed_by(PYTHON, "-m", "tpm_gym.learning", *words, cwd=tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -119,7 +119,7 @@ def test_a_stopped_run_says_how_its_module_is_found_again(tmp_path, run, monkeyp
             "TPMRech-v0",
             "unknown environment 'TPMRech-v0'; .*TPMPickAndPlace-v0.*module:id",
         ),
-        ("no_such_module:TPMMine-v0", "cannot import 'no_such_module'.*the folder that holds it"),
+        ("no_such_module:TPMMine-v0", "cannot import 'no_such_module'.*folder that holds it"),
         (".x:TPMReach-v0", "cannot import .*TypeError"),
         ("CartPole-v1", "CartPole-v1 is no environment of tpm_gym"),
         ("not an id", "unknown environment"),

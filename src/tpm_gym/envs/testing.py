@@ -140,6 +140,9 @@ def _refused(call: Callable[[], Any], *kinds: type[TPMError]) -> TPMError:
 
 def passes_the_checkers_of_gymnasium_and_sb3(make: Make) -> None:
     """Run the checkers of other packages; Stable-Baselines3's where it is installed."""
+    sb3 = None
+    if find_spec("stable_baselines3") is not None:  # its own warnings are no errors
+        sb3 = importlib.import_module("stable_baselines3.common.env_checker")
     with closing(make()) as env, warnings.catch_warnings():
         warnings.simplefilter("error")
         try:
@@ -147,8 +150,7 @@ def passes_the_checkers_of_gymnasium_and_sb3(make: Make) -> None:
             # Engines must draw colours only.
             inner.metadata = {**inner.metadata, "render_modes": ["rgb_array"]}
             check_by_gymnasium(inner)
-            if find_spec("stable_baselines3") is not None:
-                sb3 = importlib.import_module("stable_baselines3.common.env_checker")
+            if sb3 is not None:
                 sb3.check_env(env.unwrapped)
         except AssertionError as error:
             promise = "the checkers of Gymnasium and Stable-Baselines3 find nothing"

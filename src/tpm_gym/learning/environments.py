@@ -1,6 +1,7 @@
 """Environments of training, evaluation, demonstrations and films."""
 
 import importlib
+import os
 import signal
 import sys
 from contextlib import suppress
@@ -19,15 +20,18 @@ from tpm_gym.learning.rollout import GoalEnv
 def import_module_of(env_id: str) -> None:
     """Import the module of an id ``module:id`` that the user has typed; do nothing for other ids.
 
-    Ids from files must not come here: a module runs any code when it is imported.
+    The module may be a file of the working folder. Ids from files must not come here: a module runs
+    any code when it is imported.
     """
     module = env_id.rpartition(":")[0]
+    if module and (folder := os.getcwd()) not in sys.path:
+        sys.path.append(folder)  # last, so that its files hide no installed module
     try:
         if module:
             importlib.import_module(module)
     except Exception as error:  # whatever a user's module may raise
         reason = f"{type(error).__name__}: {error}"
-        where = "install it, or say python -m tpm_gym.learning in the folder that holds it"
+        where = "run the command in the folder that holds it, or install it"
         raise ConfigError(f"{env_id}: cannot import {module!r} ({reason}); {where}") from error
 
 

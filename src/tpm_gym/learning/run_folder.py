@@ -93,13 +93,10 @@ def description(run: Path) -> dict[str, Any] | None:
 def resume_command(run: Path) -> str:
     """Return the command line that resumes a run.
 
-    No file decides what is imported, so an id ``module:id`` is given again. ``python -m`` finds its
-    module in the working folder.
+    No file decides what is imported, so an id ``module:id`` is given again.
     """
     env = str((description(run) or {}).get("env", ""))
-    if ":" in env:
-        return f"python -m tpm_gym.learning resume {shlex.join([str(run), '--env', env])}"
-    return f"tpm-gym resume {shlex.quote(str(run))}"
+    return shlex.join(["tpm-gym", "resume", str(run), *(["--env", env] if ":" in env else [])])
 
 
 def evaluations(run: Path) -> list[dict[str, Any]]:
