@@ -123,6 +123,7 @@ def test_a_page_that_drags_p_moves_the_robot(viewer):
     with connect(address, subprotocols=[f"viser-v{viser.__version__}"], max_size=None) as page:
         page.send(msgspec.msgpack.encode(message))
         until(lambda: np.allclose(viewer.explore.posture.position, target))
+    assert viewer.worker.wait()
     assert drawn_gap(viewer) < 1e-9
 
 
