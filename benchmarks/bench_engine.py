@@ -34,10 +34,10 @@ import gymnasium as gym
 import numpy as np
 import shared
 import torch
-from engine_matrix import NOISE, Trembling
+from engine_matrix import NOISE
 from numpy.typing import NDArray
 
-from tpm_gym.learning.policies import load_policy
+from tpm_gym.learning.policies import NoisyPolicy, load_policy
 from tpm_gym.learning.rollout import TEST_SEED
 
 PICK, JOINTS, REACH = "TPMPickAndPlace-v0", "TPMPickAndPlaceJoints-v0", "TPMReach-v0"
@@ -194,7 +194,7 @@ def _run(
     """Run episodes; return actions (episodes, steps, size) and success at the end (episodes,)."""
     taken, ended = [], []
     with closing(gym.make(env_id, engine=engine)) as env:
-        acting = Trembling(load_policy(policy, env), noise)
+        acting = NoisyPolicy(load_policy(policy, env), noise)
         for seed in range(TEST_SEED, TEST_SEED + episodes):
             observation, _ = env.reset(seed=seed)
             acting.reset(observation, [seed])

@@ -18,12 +18,11 @@ from contextlib import closing
 from itertools import product
 from typing import Any
 
-from engine_matrix import Trembling
 from shared import ROOT, describe, fill, provenance, read_record, table
 
 from tpm_gym.learning.environments import make_envs
 from tpm_gym.learning.estimates import wilson
-from tpm_gym.learning.policies import load_policy
+from tpm_gym.learning.policies import NoisyPolicy, load_policy
 from tpm_gym.learning.rollout import TEST_SEED, run_episodes
 
 RECORD = ROOT / "docs" / "records" / "limits.json"
@@ -42,7 +41,7 @@ def run(cell: Cell) -> dict[str, Any]:
     noise, engine, milliseconds, count = cell
     physics = {"time_step": milliseconds / 1000}
     with closing(make_envs(ENV_ID, 1, engine=engine, physics=physics)) as envs:
-        policy = Trembling(load_policy(ENV_ID, envs), noise)
+        policy = NoisyPolicy(load_policy(ENV_ID, envs), noise)
         episodes = run_episodes(envs, policy, count, TEST_SEED)
     successes = [episode.success_at_end for episode in episodes]
     return {

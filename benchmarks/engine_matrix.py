@@ -3,25 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
-import numpy as np
-
 from tpm_gym.learning.environments import make_envs
-from tpm_gym.learning.policies import load_policy
-from tpm_gym.learning.rollout import (
-    TEST_SEED,
-    Action,
-    Observation,
-    Policy,
-    run_episodes,
-    summarise,
-)
+from tpm_gym.learning.policies import NoisyPolicy, load_policy
+from tpm_gym.learning.rollout import TEST_SEED, run_episodes, summarise
 
 IDS = ("TPMPickAndPlace-v0", "TPMPickAndPlaceJoints-v0")
 DRIVES = ("ideal", "servo")
@@ -39,26 +30,6 @@ class Cell:
     engine: str
     drive: str
     episodes: int
-
-
-@dataclass
-class Trembling:
-    """Policy with normal noise on its actions, seeded by the seed of the episode."""
-
-    policy: Policy
-    noise: float
-    rng: np.random.Generator = field(default_factory=np.random.default_rng)
-
-    def reset(self, observation: Observation, seeds: Sequence[int]) -> None:
-        """Reset the policy, and seed the noise with the first seed."""
-        self.rng = np.random.default_rng(seeds[0])
-        self.policy.reset(observation, seeds)
-
-    def act(self, observation: Observation) -> Action:
-        """Return the action of the policy, with noise."""
-        action = self.policy.act(observation)
-        noise = self.rng.normal(0.0, self.noise, action.shape)
-        return np.clip(action + noise, -1.0, 1.0).astype(np.float32)
 
 
 def cells(engines: Iterable[str], episodes: int) -> list[Cell]:
@@ -83,8 +54,8 @@ def run(cell: Cell) -> dict[str, Any]:
     start = time.perf_counter()
     with closing(make_envs(cell.env_id, 1, engine=cell.engine, drive=cell.drive)) as envs:
         policy = load_policy(cell.policy, envs)
-        trembling = Trembling(policy, cell.noise) if cell.noise else policy
-        episodes = run_episodes(envs, trembling, cell.episodes, TEST_SEED)
+        noisy = NoisyPolicy(policy, cell.noise) if cell.noise else policy
+        episodes = run_episodes(envs, noisy, cell.episodes, TEST_SEED)
     metrics = summarise(episodes)
     return {
         **vars(cell),

@@ -41,7 +41,7 @@ none_of("mujoco", "viser")
 from tpm_gym.learning import EnvOptions, EvaluationConfig, evaluate
 one = {"env": "TPMReach-v0", "episodes": 1, "env_options": EnvOptions(engine="analytic")}
 evaluate(EvaluationConfig(policy=("expert", "random", "TPMReach-v0"), **one))
-none_of("viser")
+none_of("viser", "minari")
 """
 
 
@@ -58,6 +58,7 @@ for package, extra, use in (
     ("safetensors", "policy", lambda: tpm_gym.load_policy("TPMReach-v0")),
     ("pydantic", "policy", lambda: tpm_gym.load_policy("TPMReach-v0")),
     ("viser", "view", main),
+    ("minari", "data", lambda: tpm_gym.learning.collect(tpm_gym.learning.CollectConfig())),
     ("stable_baselines3", "train", lambda: tpm_gym.learning.PenaltyHerReplayBuffer),
     ("mujoco", "mujoco", lambda: gymnasium.make("TPMReach-v0", engine="mujoco")),
     ("pybullet", "pybullet", lambda: gymnasium.make("TPMReach-v0")),

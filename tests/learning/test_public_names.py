@@ -15,7 +15,7 @@ def test_every_name_is_there_and_unknown_ones_are_not():
         learning.nonsense  # noqa: B018
 
 
-@pytest.mark.parametrize("command", ["train", "resume", "evaluate", "export", "tune"])
+@pytest.mark.parametrize("command", ["train", "resume", "evaluate", "export", "collect", "tune"])
 def test_every_command_has_its_help(command, capsys):
     with pytest.raises(SystemExit) as caught:
         main([command, "--help"])

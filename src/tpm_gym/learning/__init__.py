@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from tpm_gym.learning.configuration import EnvOptions as EnvOptions
     from tpm_gym.learning.configuration import ResumeConfig as ResumeConfig
     from tpm_gym.learning.configuration import TrainingConfig as TrainingConfig
+    from tpm_gym.learning.datasets import CollectConfig as CollectConfig
+    from tpm_gym.learning.datasets import collect as collect
     from tpm_gym.learning.demonstrations import Demonstrations as Demonstrations
     from tpm_gym.learning.errors import LearningError as LearningError
     from tpm_gym.learning.evaluation import EvaluationConfig as EvaluationConfig
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
 
 _MODULES = {
     "AnalyticVecEnv": "vec_env",
+    "CollectConfig": "datasets",
     "Demonstrations": "demonstrations",
     "EnvOptions": "configuration",
     "EvaluationConfig": "evaluation",
@@ -34,6 +37,7 @@ _MODULES = {
     "PenaltyHerReplayBuffer": "hindsight",
     "ResumeConfig": "configuration",
     "TrainingConfig": "configuration",
+    "collect": "datasets",
     "evaluate": "evaluation",
     "recipe": "recipes",
     "resume": "training",

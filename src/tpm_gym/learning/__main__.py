@@ -12,7 +12,7 @@ def main() -> None:
     except ModuleNotFoundError as error:
         from tpm_gym.errors import MissingPackageError
 
-        extra = "view" if sys.argv[1:2] == ["view"] else "train"
+        extra = {"view": "view", "collect": "data"}.get("".join(sys.argv[1:2]), "train")
         sys.exit(f"error: {MissingPackageError(str(error.name), extra)}")
 
 

@@ -12,6 +12,7 @@ from tyro.conf import Positional, subcommand
 
 from tpm_gym import TPMError
 from tpm_gym.learning.configuration import ResumeConfig, TrainingConfig, unset
+from tpm_gym.learning.datasets import CollectConfig, collect
 from tpm_gym.learning.evaluation import EvaluationConfig, evaluate
 from tpm_gym.learning.tune import TuneConfig
 from tpm_gym.viewer import ViewConfig, run
@@ -39,6 +40,7 @@ Command = (
     | Annotated[ResumeConfig, subcommand("resume")]
     | Annotated[EvaluationConfig, subcommand("evaluate")]
     | Annotated[ExportConfig, subcommand("export")]
+    | Annotated[CollectConfig, subcommand("collect")]
     | Annotated[TuneConfig, subcommand("tune")]
     | Annotated[ViewConfig, subcommand("view")]
 )
@@ -59,6 +61,9 @@ def main(words: Sequence[str] | None = None) -> None:
             return
         if isinstance(command, ViewConfig):
             run(command)
+            return
+        if isinstance(command, CollectConfig):
+            collect(command)
             return
         # Imported here, since they need PyTorch.
         from tpm_gym.learning import export, model_card, training, tune

@@ -57,7 +57,9 @@ class EnvOptions:
     machine: Annotated[str, unset(str, "the id's; evaluate: the policy's", "NAME")] = UNSET
     """Robot: paper, wide, delta, or your module's."""
 
-    engine: Annotated[str, unset(str, "the id's, mostly pybullet", "NAME")] = UNSET
+    engine: Annotated[str, unset(str, "the id's, mostly pybullet; collect: analytic", "NAME")] = (
+        UNSET
+    )
     """Engine: pybullet, mujoco, analytic (many environments at once), or your module's."""
 
     drive: Annotated[

@@ -65,6 +65,29 @@ class ExpertPolicy(Expert):
         super().reset(observation)
 
 
+@dataclass
+class NoisyPolicy:
+    """Policy with normal noise on its actions, with a generator of its own for each episode."""
+
+    policy: Policy
+    noise: float
+    """Standard deviation, in units of the largest action."""
+    rngs: list[np.random.Generator] = field(default_factory=list)
+
+    def reset(self, observation: Observation, seeds: Sequence[int]) -> None:
+        """Reset the policy, and seed a generator for each episode with the episode's seed."""
+        self.rngs = [np.random.default_rng(seed) for seed in seeds]
+        self.policy.reset(observation, seeds)
+
+    def act(self, observation: Observation) -> Action:
+        """Return the actions of the policy, with noise."""
+        actions = self.policy.act(observation)
+        size = actions.shape[-1]
+        noise = np.array([rng.normal(0.0, self.noise, size) for rng in self.rngs])
+        noisy: Action = np.clip(actions + noise.reshape(actions.shape), -1.0, 1.0)
+        return noisy.astype(np.float32)
+
+
 def load_policy(spec: str, envs: TPMVectorEnv) -> Policy:
     """Return a policy that acts in ``envs``.
 

@@ -8,9 +8,9 @@ comes from episodes that trained or selected the policy.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, TypeAlias
 
 import gymnasium as gym
 import numpy as np
@@ -79,6 +79,53 @@ class Episode:
         }
 
 
+class Step(NamedTuple):
+    """A control step of n environments.
+
+    Attributes:
+        seen: Observation before the step.
+        known: Info before the step.
+        running: (n,) whether the episode was running before the step.
+        told: Info after the step.
+    """
+
+    seen: Observation
+    known: dict[str, Any]
+    running: NDArray[np.bool_]
+    action: Action
+    after: Observation
+    reward: NDArray[Any]
+    truncated: NDArray[np.bool_]
+    told: dict[str, Any]
+
+
+def play(
+    envs: TPMVectorEnv,
+    policy: Policy,
+    first_seed: int,
+    count: int,
+    on_frame: Callable[[], object] | None = None,
+) -> Iterator[Step]:
+    """Run an episode in each environment; yield steps until the first ``count`` have ended.
+
+    Args:
+        first_seed: Environment i is reset with ``first_seed + i``.
+        on_frame: Called after the reset and after each step.
+    """
+    seen, known = envs.reset(seed=first_seed)
+    policy.reset(seen, range(first_seed, first_seed + envs.num_envs))
+    if on_frame is not None:
+        on_frame()
+    running = np.ones(envs.num_envs, dtype=np.bool_)
+    while running[:count].any():
+        action = policy.act(seen)
+        after, reward, _, truncated, told = envs.step(action)
+        yield Step(seen, known, running, action, after, reward, truncated, told)
+        seen, known, running = after, told, running & ~truncated
+        if on_frame is not None:
+            on_frame()
+
+
 def run_episodes(
     envs: TPMVectorEnv,
     policy: Policy,
@@ -116,24 +163,15 @@ def _run_together(
     on_frame: Callable[[], object] | None,
 ) -> list[Episode]:
     """Run an episode in each environment; return the records of the first ``count``."""
-    observation, _ = envs.reset(seed=first_seed)
-    policy.reset(observation, range(first_seed, first_seed + envs.num_envs))
-    if on_frame is not None:
-        on_frame()
     steps: list[dict[str, Any]] = []
     lengths = np.zeros(envs.num_envs, dtype=np.int64)
-    running = np.ones(envs.num_envs, dtype=np.bool_)
-    while running[:count].any():
-        observation, reward, _, truncated, info = envs.step(policy.act(observation))
+    for step in play(envs, policy, first_seed, count, on_frame):
         state = envs.state
         gap = state.fk_position - state.platform_position
-        told = {name: info[name] for name in _TOLD}
+        told = {name: step.told[name] for name in _TOLD}
         told["fk_error"] = np.sqrt((gap * gap).sum(axis=-1))
-        steps.append({"reward": reward, "torque": state.torque, **told})
-        lengths += running
-        running &= ~truncated
-        if on_frame is not None:
-            on_frame()
+        steps.append({"reward": step.reward, "torque": state.torque, **told})
+        lengths += step.running
     table = {name: np.array([step[name] for step in steps]) for name in steps[0]}
     return [
         _record(first_seed + k, {name: values[: lengths[k], k] for name, values in table.items()})

@@ -1,0 +1,342 @@
+"""Datasets for offline learning, in the format of Minari.
+
+The episodes of ``expert``, ``noisy`` and ``random`` depend on their seeds alone: the command that
+made a dataset makes it again, equal in every bit, and the first episodes of a long dataset are
+those of a short one. ``replay`` depends on the training, too; see :mod:`tpm_gym.learning.replay`.
+"""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import importlib.util
+import json
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_args
+
+import gymnasium as gym
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+from rich.console import Console
+
+import tpm_gym
+from tpm_gym.errors import MissingPackageError
+from tpm_gym.learning import provenance
+from tpm_gym.learning.configuration import UNSET, EnvOptions, check_least, unset
+from tpm_gym.learning.environments import check_env_id, import_module_of, make_envs
+from tpm_gym.learning.errors import ConfigError
+from tpm_gym.learning.policies import NoisyPolicy, load_policy
+from tpm_gym.learning.rollout import (
+    BATCH,
+    SELECTION_SEED,
+    TEST_SEED,
+    Policy,
+    Step,
+    play,
+    run_episodes,
+    summarise,
+)
+from tpm_gym.tasks.registry import TASKS
+from tpm_gym.tasks.task import Task
+
+if TYPE_CHECKING:
+    from minari.data_collector import EpisodeBuffer
+
+    from tpm_gym.envs.vector import TPMVectorEnv
+
+Kind = Literal["expert", "noisy", "random", "replay"]
+KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
+REFERENCE: Final = 100
+"""Episodes of the reference scores."""
+
+_INFOS: Final = ("conditioning", "is_success", "singularity_penalty")
+_DATA: Final = "data"  # name that Minari expects
+_METADATA: Final = "metadata.json"
+_OURS: Final = "tpm_gym"  # entry of the metadata that marks our datasets
+
+
+@dataclass(frozen=True)
+class CollectConfig:
+    """Collect datasets for offline learning, in the format of Minari.
+
+    The kinds are: the expert's episodes; those of the expert with noise on its actions; uniform
+    random actions; and "replay", the episodes of a policy at ten moments of its training.
+    """
+
+    env: Annotated[tuple[str, ...], unset(tuple[str, ...], "all with an expert", "ID ...")] = UNSET
+    """Environment ids, or module:id if a module of yours registers it."""
+
+    kind: Annotated[tuple[Kind, ...], tyro.conf.arg(metavar="KIND ...")] = KINDS
+    """Kinds of datasets."""
+
+    episodes: int = 1000
+    """Episodes of each dataset."""
+
+    seed: int = 0
+    """Seed of the first episode, and of the training of replay."""
+
+    noise: float = 0.3
+    """Standard deviation of the noise of noisy, in units of the largest action."""
+
+    steps: Annotated[int, unset(int, "as the recipe says", "INT")] = UNSET
+    """Steps of the training of replay."""
+
+    out: Annotated[Path, unset(Path, "Minari's", "FOLDER")] = UNSET
+    """Folder of the datasets. Minari's is $MINARI_DATASETS_PATH, or ~/.minari/datasets."""
+
+    overwrite: bool = False
+    """Replace datasets of this command that are there already."""
+
+    env_options: tyro.conf.OmitArgPrefixes[EnvOptions] = field(
+        default_factory=lambda: EnvOptions(engine="analytic")
+    )
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A dataset to collect: its id in Minari, its folder, and the command's options."""
+
+    config: CollectConfig
+    env: str
+    kind: Kind
+    root: Path
+
+    @property
+    def name(self) -> str:
+        """Id in Minari."""
+        given = {**self.config.env_options.given(), "engine": ""}
+        options = [value if isinstance(value, str) else key for key, value in given.items()]
+        words = "-".join(filter(None, (self.kind, *options)))
+        return f"{self.env.rpartition(':')[2]}/{words}-v0"
+
+    @property
+    def folder(self) -> Path:
+        """Folder, whose ``data`` Minari loads."""
+        return self.root / self.name
+
+
+def collect(config: CollectConfig, console: Console | None = None) -> list[Path]:
+    """Collect the datasets of a configuration; return their folders.
+
+    Raises:
+        ConfigError: An option is not valid, or a dataset is there already.
+        ConfigurationError: The environment has no such option, or not with this value.
+        MissingPackageError: Minari, h5py, or for replay PyTorch is not installed.
+    """
+    console = console or Console()
+    _require_packages(config.kind)
+    from minari.storage import get_dataset_path
+
+    envs = _complete(config)
+    root = get_dataset_path() if config.out is UNSET else config.out
+    todo = [Dataset(config, env, kind, root) for env in envs for kind in config.kind]
+    for dataset in todo:
+        _require_free(dataset)
+    scores: dict[str, tuple[float, float]] = {}
+    for dataset in todo:
+        console.print(f"{dataset.name}: {config.episodes} episodes ...", markup=False)
+        if dataset.env not in scores:
+            scores[dataset.env] = reference_scores(dataset.env, config.env_options)
+        found = _write(dataset, scores[dataset.env])
+        console.print(f"  {dataset.folder}, sha256 {found}", markup=False, soft_wrap=True)
+    return [dataset.folder for dataset in todo]
+
+
+def _require_packages(kinds: Sequence[str]) -> None:
+    """Refuse to start without a package that is needed later."""
+    extras = {"minari": "data", "h5py": "data"}
+    if "replay" in kinds:
+        extras |= {"torch": "train", "stable_baselines3": "train"}
+    for package, extra in extras.items():
+        if importlib.util.find_spec(package) is None:
+            raise MissingPackageError(package, extra)
+
+
+def _complete(config: CollectConfig) -> list[str]:
+    """Check the options; return the ids."""
+    check_least(config, 1, "episodes", "steps")
+    check_least(config, 0, "seed", "noise")
+    most = SELECTION_SEED - config.episodes
+    if config.seed > most:
+        raise ConfigError(f"--seed {config.seed}: must be at most {most}: later ones are held out")
+    if wrong := [kind for kind in config.kind if kind not in KINDS]:
+        raise ConfigError(f"--kind {wrong[0]}: there are {', '.join(KINDS)}")
+    if config.env is UNSET:
+        return [env for env in tpm_gym.ENV_IDS if _has_expert(env)]
+    for env in config.env:
+        import_module_of(env)
+        if not _has_expert(env):
+            raise ConfigError(f"--env {env}: its task has no expert; give it a plan")
+    return list(config.env)
+
+
+def _has_expert(env: str) -> bool:
+    task = TASKS[check_env_id(env).kwargs["task"]]
+    return task.plan is not Task.plan
+
+
+def reference_scores(env: str, options: EnvOptions) -> tuple[float, float]:
+    """Return the mean returns of random actions and of the expert, on held-out seeds."""
+    count = REFERENCE if options.in_batches else 1
+    with closing(make_envs(env, count, **options.given())) as envs:
+        low, high = (
+            summarise(run_episodes(envs, load_policy(name, envs), REFERENCE, TEST_SEED))
+            for name in ("random", "expert")
+        )
+    return low["return"].mean, high["return"].mean
+
+
+# -- episodes -------------------------------------------------------------------------------------
+
+
+def _episodes(dataset: Dataset) -> Iterator[EpisodeBuffer]:
+    """Play the episodes of a dataset."""
+    config, options = dataset.config, dataset.config.env_options
+    if dataset.kind == "replay":
+        from tpm_gym.learning import replay
+
+        yield from replay.episodes(
+            dataset.env, options, config.seed, config.episodes, config.steps, record
+        )
+        return
+    count = min(config.episodes, BATCH) if options.in_batches else 1
+    with closing(make_envs(dataset.env, count, **options.given())) as envs:
+        policy = load_policy("random" if dataset.kind == "random" else "expert", envs)
+        if dataset.kind == "noisy":
+            policy = NoisyPolicy(policy, config.noise)
+        yield from record(envs, policy, config.episodes, config.seed)
+
+
+def record(
+    envs: TPMVectorEnv, policy: Policy, episodes: int, first_seed: int
+) -> Iterator[EpisodeBuffer]:
+    """Play episodes of a policy; episode i is reset with ``first_seed + i``."""
+    for first in range(first_seed, first_seed + episodes, envs.num_envs):
+        count = min(envs.num_envs, first_seed + episodes - first)
+        yield from _split(list(play(envs, policy, first, count)), first, count)
+
+
+def _split(steps: Sequence[Step], first_seed: int, count: int) -> Iterator[EpisodeBuffer]:
+    """Yield the episodes of the first ``count`` rows; observations and infos have one more row."""
+    from minari.data_collector import EpisodeBuffer
+
+    last = steps[-1]
+    seen = [*(step.seen for step in steps), last.after]
+    told = [*(step.known for step in steps), last.told]
+    observations = {name: np.array([each[name] for each in seen]) for name in last.after}
+    infos = {name: np.array([each[name] for each in told]) for name in _INFOS}
+    actions, rewards, truncated = (
+        np.array([getattr(step, name) for step in steps])
+        for name in ("action", "reward", "truncated")
+    )
+    lengths = np.sum([step.running for step in steps], axis=0)
+    for row, length in enumerate(lengths[:count].tolist()):
+        yield EpisodeBuffer(
+            seed=first_seed + row,
+            observations={name: all_[: length + 1, row] for name, all_ in observations.items()},
+            actions=actions[:length, row],
+            rewards=rewards[:length, row],
+            terminations=np.zeros(length, dtype=np.bool_),
+            truncations=truncated[:length, row],
+            infos={name: all_[: length + 1, row] for name, all_ in infos.items()},
+        )
+
+
+# -- files ----------------------------------------------------------------------------------------
+
+
+def _require_free(dataset: Dataset) -> None:
+    """Refuse a folder that is there, unless it holds a dataset of ours that may be replaced."""
+    if not dataset.folder.exists():
+        provenance.require_writable("--out", dataset.folder)
+        return
+    if not dataset.config.overwrite:
+        raise ConfigError(f"{dataset.folder} is there already; give --overwrite, or another --out")
+    try:
+        ours = _OURS in json.loads((dataset.folder / _DATA / _METADATA).read_bytes())
+    except (OSError, ValueError):
+        ours = False
+    if not ours:
+        raise ConfigError(
+            f"{dataset.folder} holds no dataset of tpm-gym collect, and is not replaced; give "
+            "another --out"
+        )
+
+
+def _write(dataset: Dataset, scores: tuple[float, float]) -> str:
+    """Write a dataset under a temporary name and move it; return its digest."""
+    from minari.dataset.minari_storage import MinariStorage
+
+    spec = copy.deepcopy(check_env_id(dataset.env))
+    spec.kwargs |= dataset.config.env_options.given()
+    with closing(gym.make(spec)) as env:
+        spaces = env.observation_space, env.action_space
+    with tempfile.TemporaryDirectory(prefix=".", dir=dataset.root) as part:
+        data = Path(part, _DATA)
+        storage = MinariStorage.new(data, *spaces, env_spec=spec)
+        storage.update_episodes(_episodes(dataset))
+        found = digest(data)
+        storage.update_metadata(_metadata(dataset, scores, found))
+        there = dataset.folder / _DATA
+        there.mkdir(parents=True, exist_ok=True)
+        for file in data.iterdir():  # beside them may be files that are not ours
+            file.replace(there / file.name)
+    return found
+
+
+def _metadata(dataset: Dataset, scores: tuple[float, float], found: str) -> dict[str, Any]:
+    config = dataset.config
+    version = tpm_gym.__version__
+    about = {
+        "expert": "The scripted expert.",
+        "noisy": f"The scripted expert with normal noise of {config.noise:g} on its actions.",
+        "random": "Uniform random actions.",
+        "replay": "A policy at ten moments of its training, with its exploration.",
+    }
+    return {
+        "dataset_id": dataset.name,
+        "algorithm_name": dataset.kind,
+        "author": {"The tpm_gym developers"},
+        "description": about[dataset.kind],
+        "minari_version": provenance.version("minari"),
+        "requirements": [f"tpm-gym=={version}"],
+        "ref_min_score": scores[0],
+        "ref_max_score": scores[1],
+        "num_episodes_average_score": REFERENCE,
+        _OURS: {"sha256": found, "seed": config.seed, **provenance.origin()},
+    }
+
+
+def digest(data: Path, episodes: int | None = None) -> str:
+    """Return the SHA-256 of the arrays and seeds of a dataset.
+
+    Args:
+        data: Folder ``data`` of the dataset.
+        episodes: Number of episodes from the first on; None for all.
+    """
+    from minari.dataset.minari_storage import MinariStorage
+
+    storage, total = MinariStorage.read(data), hashlib.sha256()
+    chosen = range(storage.total_episodes if episodes is None else episodes)
+    pairs = zip(storage.get_episodes(chosen), storage.get_episode_metadata(chosen), strict=True)
+    for episode, known in pairs:
+        total.update(f"{known['seed']}".encode())
+        del episode["id"]
+        _update(total, episode)
+    return total.hexdigest()
+
+
+def _update(total: Any, arrays: Mapping[str, Any]) -> None:
+    """Add arrays, whose names may be nested, to a digest."""
+    for name, value in sorted(arrays.items()):
+        total.update(name.encode())
+        if isinstance(value, Mapping):
+            _update(total, value)
+        else:
+            array: NDArray[Any] = np.ascontiguousarray(value)
+            total.update(f"{array.dtype.str}{array.shape}".encode() + array.tobytes())

@@ -1,0 +1,105 @@
+"""Episodes of a policy at several moments of its training, for datasets of kind ``replay``.
+
+The training is that of the recipe: PPO where it has a recipe for the id, else SAC. The policy acts
+as in training, with its exploration. Episodes are spread evenly over the steps of the training
+after its demonstrations; they have seeds of their own and change nothing about the training.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from typing import Any, Final
+
+import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+
+from tpm_gym.envs.vector import TPMVectorEnv
+from tpm_gym.learning.configuration import EnvOptions, TrainingConfig, complete
+from tpm_gym.learning.demonstrations import Demonstrations
+from tpm_gym.learning.environments import make_envs
+from tpm_gym.learning.policies import TrainedPolicy
+from tpm_gym.learning.recipes import read_recipes, recipe_file
+from tpm_gym.learning.rollout import Action, Observation, Policy
+from tpm_gym.learning.training import make_model, make_training_envs
+
+MOMENTS: Final = 10
+
+Record = Callable[[TPMVectorEnv, Policy, int, int], Iterator[Any]]
+
+
+class _Exploring(TrainedPolicy):
+    """Policy that samples its actions as in training."""
+
+    def act(self, observation: Observation) -> Action:
+        """Return sampled actions for ``observation``."""
+        action, _ = self.model.predict(observation, deterministic=False)
+        return action
+
+
+@dataclass(eq=False)
+class _Moments(BaseCallback):
+    """Callback that calls ``use`` with the model at each moment, from the start to the end."""
+
+    steps: int
+    use: Callable[[BaseAlgorithm, int], object]
+
+    def __post_init__(self) -> None:
+        super().__init__()
+        self._reached = 0
+
+    def _on_training_start(self) -> None:
+        self._first = self.num_timesteps  # after the demonstrations
+
+    def _on_rollout_start(self) -> None:
+        done = (self.num_timesteps - self._first) / (self.steps - self._first)
+        self._use_until(1 + int(done * (MOMENTS - 1)))
+
+    def _on_training_end(self) -> None:
+        self._use_until(MOMENTS)
+
+    def _use_until(self, moment: int) -> None:
+        for index in range(self._reached, moment):
+            self.use(self.model, index)
+        self._reached = moment
+
+    def _on_step(self) -> bool:
+        return True
+
+
+def episodes(
+    env: str, options: EnvOptions, seed: int, count: int, steps: int, record: Record
+) -> list[Any]:
+    """Train, and return ``count`` episodes that ``record`` made.
+
+    Args:
+        seed: Seed of the training, and of the first episode.
+        steps: Steps of the training; UNSET for those of the recipe.
+        record: Called with environments, policy, number of episodes and first seed.
+    """
+    engine = options.engine
+    name = env.rpartition(":")[2]
+    algo = "ppo" if name in read_recipes(recipe_file("ppo", engine), "ppo") else "sac"
+    given = TrainingConfig(algo=algo, env=env, seed=seed, steps=steps, env_options=options)
+    config = complete(given)
+    torch.set_num_threads(config.threads)
+    found: list[Any] = []
+    parts = [count * moment // MOMENTS for moment in range(MOMENTS + 1)]
+    most = -(-count // MOMENTS) if options.in_batches else 1
+    with (
+        closing(make_training_envs(config)) as training_envs,
+        closing(make_envs(env, most, **options.given())) as envs,
+    ):
+
+        def use(model: BaseAlgorithm, moment: int) -> None:
+            first, end = parts[moment : moment + 2]
+            with torch.random.fork_rng(devices=[]):
+                torch.manual_seed(seed + first)
+                found.extend(record(envs, _Exploring(model), end - first, seed + first))
+
+        model = make_model(config, training_envs)
+        called: list[BaseCallback] = [_Moments(config.steps, use)]
+        if config.recipe.demonstrations:
+            called.insert(0, Demonstrations(**config.recipe.demonstrations))
+        model.learn(config.steps, callback=called)
+    return found

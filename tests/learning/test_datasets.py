@@ -1,0 +1,167 @@
+"""Datasets are what Minari loads, what the environment does, and the same each time."""
+
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from trainings import quiet
+
+from tpm_gym.learning.configuration import EnvOptions
+from tpm_gym.learning.datasets import KINDS, CollectConfig, collect, digest
+from tpm_gym.learning.environments import make_envs
+from tpm_gym.learning.errors import ConfigError
+from tpm_gym.learning.policies import load_policy
+from tpm_gym.learning.rollout import TEST_SEED, run_episodes
+
+h5py, minari = map(pytest.importorskip, ("h5py", "minari"))
+
+REACH, PICK = "TPMReachDense-v0", "TPMPickAndPlace-v0"
+FIRST, STEPS = 7, 40_960  # of replay: ten updates
+
+
+def config(root: Path, *kinds: Any, env: str = REACH, **options: Any) -> CollectConfig:
+    given = {"episodes": 12, "seed": FIRST, "steps": STEPS, "out": root, **options}
+    return CollectConfig(env=(env,), kind=kinds, **given)
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory) -> Path:
+    """Datasets of each kind of Reach, and of pick-and-place's expert."""
+    folder = tmp_path_factory.mktemp("datasets")
+    collect(config(folder, *KINDS), quiet())
+    collect(config(folder, "expert", "noisy", env=PICK), quiet())
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def _here(root, monkeypatch):
+    """Minari looks for datasets there."""
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(root))
+
+
+def episodes(name: str) -> Iterator[tuple[int, Any]]:
+    """Yield the seeds and episodes of a dataset."""
+    dataset = minari.load_dataset(name)
+    known = dataset.storage.get_episode_metadata(dataset.episode_indices)
+    return zip([each["seed"] for each in known], dataset, strict=True)
+
+
+NAMES = (*(f"{REACH}/{kind}-v0" for kind in KINDS), f"{PICK}/expert-v0", f"{PICK}/noisy-v0")
+
+
+def test_minari_lists_and_loads_every_dataset(root):
+    assert set(minari.list_local_datasets(compatible_minari_version=True)) == set(NAMES)
+    for name in NAMES:
+        dataset = minari.load_dataset(name)
+        assert (dataset.total_episodes, dataset.total_steps) == (12, 600)
+        for episode in dataset:
+            for row in range(51):
+                seen = {key: values[row] for key, values in episode.observations.items()}
+                assert dataset.observation_space.contains(seen)
+            assert all(map(dataset.action_space.contains, episode.actions))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_environment_repeats_every_episode_to_the_bit(name):
+    with closing(minari.load_dataset(name).recover_environment()) as env:
+        for index, (seed, episode) in enumerate(episodes(name)):
+            assert seed == FIRST + index
+            observation, info = env.reset(seed=seed)
+            for step in range(len(episode.actions) + 1):
+                for key, values in episode.observations.items():
+                    assert np.array_equal(observation[key], values[step])
+                assert {key: info[key] for key in episode.infos} == {
+                    key: values[step] for key, values in episode.infos.items()
+                }
+                if step == len(episode.actions):
+                    break
+                observation, reward, *ends, info = env.step(episode.actions[step])
+                assert reward == episode.rewards[step]
+                assert ends == [episode.terminations[step], episode.truncations[step]]
+            assert ends == [False, True]
+
+
+def arrays(folder: Path) -> dict[str, bytes]:
+    """Return the bytes of every array of a dataset, and the seeds, by name."""
+    found = {}
+
+    def add(name: str, part: Any) -> None:
+        values = part[()] if isinstance(part, h5py.Dataset) else part.attrs.get("seed", -1)
+        found[name] = np.asarray(values).tobytes()
+
+    with h5py.File(folder / "data" / "main_data.hdf5") as file:
+        file.visititems(add)
+    return found
+
+
+def test_two_builds_are_equal_and_a_short_dataset_begins_a_long_one(root, tmp_path):
+    for folder in collect(config(tmp_path, *KINDS), quiet()):
+        again = root / folder.relative_to(tmp_path)
+        assert arrays(folder) == arrays(again)
+        assert digest(folder / "data") == digest(again / "data")
+    kinds = ("expert", "noisy", "random")
+    for folder in collect(config(tmp_path / "short", *kinds, episodes=5), quiet()):
+        long = root / folder.relative_to(tmp_path / "short")
+        assert arrays(folder).items() <= arrays(long).items()
+        assert digest(folder / "data") == digest(long / "data", 5) != digest(long / "data", 6)
+
+
+def test_kinds_are_what_they_say(root, tmp_path):
+    silent = config(tmp_path, "noisy", env=PICK, noise=0.0)
+    assert arrays(collect(silent, quiet())[0]) == arrays(root / PICK / "expert-v0")
+    uniform = np.array([episode.actions for _, episode in episodes(f"{REACH}/random-v0")])
+    assert np.std(uniform) == pytest.approx(3**-0.5, rel=0.05)
+    returns = [episode.rewards.sum() for _, episode in episodes(f"{REACH}/replay-v0")]
+    assert np.mean(returns[-4:]) > np.mean(returns[:4]) + 5
+
+
+def test_scores_are_normalised_by_random_actions_and_the_expert():
+    dataset = minari.load_dataset(f"{REACH}/expert-v0")
+    with closing(make_envs(REACH, 100, engine="analytic")) as envs:
+        for name, score in (("random", 0.0), ("expert", 1.0)):
+            records = run_episodes(envs, load_policy(name, envs), 100, TEST_SEED)
+            mean = np.mean([record.total_reward for record in records])
+            assert minari.get_normalized_score(dataset, mean) == pytest.approx(score, abs=1e-12)
+
+
+def test_options_of_the_environment_are_kept_and_named(tmp_path):
+    options = EnvOptions(engine="analytic", machine="wide", shield=True)
+    (folder,) = collect(config(tmp_path, "random", episodes=1, env_options=options), quiet())
+    assert folder == tmp_path / REACH / "random-wide-shield-v0"
+    with closing(minari.MinariDataset(folder / "data").recover_environment()) as env:
+        assert (env.unwrapped.machine.name, env.spec.kwargs["shield"]) == ("wide", True)
+
+
+@pytest.mark.parametrize(
+    ("message", "changes"),
+    [
+        ("unknown environment 'TPMRaech-v0'; there are .*TPMReach-v0", {"env": ("TPMRaech-v0",)}),
+        ("--kind best: there are expert, noisy, random, replay", {"kind": ("best",)}),
+        ("--episodes 0: must be at least 1", {"episodes": 0}),
+        ("--noise -1: must be at least 0", {"noise": -1}),
+        ("--seed 999999: must be at most 999988", {"seed": 999_999}),
+    ],
+)
+def test_what_cannot_be_collected_is_refused(tmp_path, message, changes):
+    with pytest.raises(ConfigError, match=message):
+        collect(replace(config(tmp_path, "random"), **changes), quiet())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_is_there_is_replaced_only_if_it_is_ours_and_asked_for(tmp_path):
+    given = config(tmp_path, "random", episodes=1)
+    (folder,) = collect(given, quiet())
+    with pytest.raises(ConfigError, match="is there already; give --overwrite"):
+        collect(given, quiet())
+    (again,) = collect(replace(given, overwrite=True, seed=1), quiet())
+    assert again == folder
+    (metadata,) = folder.glob("data/metadata.json")
+    metadata.write_text("{}")
+    (folder / "notes.txt").write_text("mine")
+    with pytest.raises(ConfigError, match="holds no dataset of tpm-gym collect"):
+        collect(replace(given, overwrite=True), quiet())
+    assert (folder / "notes.txt").read_text() == "mine"
