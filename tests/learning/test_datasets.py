@@ -6,6 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import h5py
+import minari
 import numpy as np
 import pytest
 from trainings import quiet
@@ -16,8 +18,6 @@ from tpm_gym.learning.environments import make_envs
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.policies import load_policy
 from tpm_gym.learning.rollout import TEST_SEED, run_episodes
-
-h5py, minari = map(pytest.importorskip, ("h5py", "minari"))
 
 REACH, PICK = "TPMReachDense-v0", "TPMPickAndPlace-v0"
 FIRST, STEPS = 7, 40_960  # of replay: ten updates

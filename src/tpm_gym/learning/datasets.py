@@ -12,9 +12,10 @@ import hashlib
 import importlib.util
 import json
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_args
 
@@ -30,6 +31,7 @@ from tpm_gym.learning import provenance
 from tpm_gym.learning.configuration import UNSET, EnvOptions, check_least, unset
 from tpm_gym.learning.environments import check_env_id, import_module_of, make_envs
 from tpm_gym.learning.errors import ConfigError
+from tpm_gym.learning.evaluation import bar
 from tpm_gym.learning.policies import NoisyPolicy, load_policy
 from tpm_gym.learning.rollout import (
     BATCH,
@@ -49,6 +51,7 @@ if TYPE_CHECKING:
 
     from tpm_gym.envs.vector import TPMVectorEnv
 
+Advance = Callable[[int], object]
 Kind = Literal["expert", "noisy", "random", "replay"]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 REFERENCE: Final = 100
@@ -141,8 +144,8 @@ def collect(config: CollectConfig, console: Console | None = None) -> list[Path]
     for dataset in todo:
         console.print(f"{dataset.name}: {config.episodes} episodes ...", markup=False)
         if dataset.env not in scores:
-            scores[dataset.env] = reference_scores(dataset.env, config.env_options)
-        found = _write(dataset, scores[dataset.env])
+            scores[dataset.env] = _reference_scores(dataset.env, config.env_options)
+        found = _write(dataset, scores[dataset.env], console)
         console.print(f"  {dataset.folder}, sha256 {found}", markup=False, soft_wrap=True)
     return [dataset.folder for dataset in todo]
 
@@ -180,7 +183,7 @@ def _has_expert(env: str) -> bool:
     return task.plan is not Task.plan
 
 
-def reference_scores(env: str, options: EnvOptions) -> tuple[float, float]:
+def _reference_scores(env: str, options: EnvOptions) -> tuple[float, float]:
     """Return the mean returns of random actions and of the expert, on held-out seeds."""
     count = REFERENCE if options.in_batches else 1
     with closing(make_envs(env, count, **options.given())) as envs:
@@ -194,8 +197,9 @@ def reference_scores(env: str, options: EnvOptions) -> tuple[float, float]:
 # -- episodes -------------------------------------------------------------------------------------
 
 
-def _episodes(dataset: Dataset) -> Iterator[EpisodeBuffer]:
+def _episodes(dataset: Dataset, advance: Advance) -> Iterator[EpisodeBuffer]:
     """Play the episodes of a dataset."""
+    record = partial(_record, advance)
     config, options = dataset.config, dataset.config.env_options
     if dataset.kind == "replay":
         from tpm_gym.learning import replay
@@ -212,13 +216,14 @@ def _episodes(dataset: Dataset) -> Iterator[EpisodeBuffer]:
         yield from record(envs, policy, config.episodes, config.seed)
 
 
-def record(
-    envs: TPMVectorEnv, policy: Policy, episodes: int, first_seed: int
+def _record(
+    advance: Advance, envs: TPMVectorEnv, policy: Policy, episodes: int, first_seed: int
 ) -> Iterator[EpisodeBuffer]:
     """Play episodes of a policy; episode i is reset with ``first_seed + i``."""
     for first in range(first_seed, first_seed + episodes, envs.num_envs):
         count = min(envs.num_envs, first_seed + episodes - first)
         yield from _split(list(play(envs, policy, first, count)), first, count)
+        advance(count)
 
 
 def _split(steps: Sequence[Step], first_seed: int, count: int) -> Iterator[EpisodeBuffer]:
@@ -268,7 +273,7 @@ def _require_free(dataset: Dataset) -> None:
         )
 
 
-def _write(dataset: Dataset, scores: tuple[float, float]) -> str:
+def _write(dataset: Dataset, scores: tuple[float, float], console: Console) -> str:
     """Write a dataset under a temporary name and move it; return its digest."""
     from minari.dataset.minari_storage import MinariStorage
 
@@ -279,7 +284,8 @@ def _write(dataset: Dataset, scores: tuple[float, float]) -> str:
     with tempfile.TemporaryDirectory(prefix=".", dir=dataset.root) as part:
         data = Path(part, _DATA)
         storage = MinariStorage.new(data, *spaces, env_spec=spec)
-        storage.update_episodes(_episodes(dataset))
+        with bar(console, dataset.kind, dataset.config.episodes) as advance:
+            storage.update_episodes(_episodes(dataset, advance))
         found = digest(data)
         storage.update_metadata(_metadata(dataset, scores, found))
         there = dataset.folder / _DATA

@@ -206,13 +206,13 @@ def _evaluate_one(
 ) -> Result:
     """Run the episodes of one policy, with a progress bar on a terminal."""
     start = time.perf_counter()
-    with _bar(console, spec, config.episodes) as advance:
+    with bar(console, spec, config.episodes) as advance:
         records = run_episodes(envs, policy, config.episodes, config.seed, on_episodes=advance)
     return Result(spec, summarise(records), records, time.perf_counter() - start)
 
 
 @contextmanager
-def _bar(console: Console, text: str, total: int) -> Iterator[Callable[[int], object]]:
+def bar(console: Console, text: str, total: int) -> Iterator[Callable[[int], object]]:
     """Show a progress bar on a terminal; yield a function that advances it."""
     with Progress(console=console, disable=not console.is_terminal) as bar:
         yield partial(bar.advance, bar.add_task(text, total=total))
@@ -287,7 +287,7 @@ def _film(config: EvaluationConfig, console: Console) -> None:
             paths = paths_per_policy(file, config.policy) if file is not None else []
             for path, policy in zip(paths, policies, strict=False):
                 console.print(f"{kind}: {path}, {episodes * frames} frames ...", markup=False)
-                with _bar(console, kind, episodes * frames) as advance:
+                with bar(console, kind, episodes * frames) as advance:
                     write(path, partial(_play, envs, policy, episodes, config.seed, advance))
 
 
