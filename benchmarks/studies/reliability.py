@@ -40,7 +40,8 @@ def middle(values: NDArray[Any]) -> NDArray[Any]:
     """Return the mean without the lowest and the highest quarter, over the last axis."""
     cut = values.shape[-1] // 4
     kept: NDArray[Any] = np.sort(values)[..., cut : values.shape[-1] - cut]
-    return kept.mean(axis=-1)
+    means: NDArray[Any] = kept.mean(axis=-1)
+    return means
 
 
 def resampled(values: Sequence[NDArray[Any]]) -> list[NDArray[Any]]:
@@ -51,4 +52,5 @@ def resampled(values: Sequence[NDArray[Any]]) -> list[NDArray[Any]]:
 
 def interval(samples: NDArray[Any]) -> NDArray[Any]:
     """Return the 2.5% and the 97.5% quantile over the first axis; samples may be infinite."""
-    return np.quantile(samples, [0.025, 0.975], axis=0, method="nearest")
+    ends: NDArray[Any] = np.quantile(samples, [0.025, 0.975], axis=0, method="nearest")
+    return ends
