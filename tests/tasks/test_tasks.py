@@ -350,3 +350,11 @@ def test_markers_that_do_not_fit_the_goal_are_refused_when_the_task_is_made():
     with pytest.raises(ConfigurationError, match="2, as a goal shows") as caught:
         Unmarked(PAPER_TPM)
     assert caught.value.name == "markers"
+
+
+@each_machine
+def test_blocks_of_a_stack_start_beside_each_other(machine):
+    task = make_task("stack", machine)
+    starts = task.start([np.random.default_rng(seed) for seed in range(3000)])
+    gap = np.abs(starts["lower"] - starts["upper"])[:, :2].max(axis=1)
+    assert (gap > task.scene.objects[0].width).all()

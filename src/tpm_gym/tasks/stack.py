@@ -23,6 +23,8 @@ A carried block passes above a standing block.
 """
 APART: Final = 0.045
 """Smallest distance between the middles of blocks and goal on the table, m."""
+CLEAR: Final = 0.0005
+"""Smallest distance of two blocks corner to corner, m."""
 
 
 class Stack(Task):
@@ -48,9 +50,13 @@ class Stack(Task):
         """See the base class."""
         mount, offset = self.machine.mount, hanging(self.lower)
         known = {name: mount.to_paper(place[:, :3] + offset) for name, place in chosen.items()}
-        regions = {name: [self.on_table(self.lower)] for name in ("lower", "upper", "goal")}
+        table = self.on_table(self.lower)
+        regions = {name: [table] for name in ("lower", "upper", "goal")}
+        # On a table that is deep enough, blocks that overlap can be a diagonal apart.
+        sides = np.minimum(self.lower.width, np.subtract(table.high, table.low)[:2])
+        apart = max(APART, float(np.hypot(*sides)) + CLEAR)
         points = sampling.safe_points(
-            rngs, self.machine, regions, known, APART, self.goals == "tempting"
+            rngs, self.machine, regions, known, apart, self.goals == "tempting"
         )
         places = {name: mount.to_world(point) - offset for name, point in points.items()}
         goal = np.concatenate([places["goal"], places["goal"] + self.tower], axis=1)
