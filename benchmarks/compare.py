@@ -2,14 +2,21 @@
 
     make compare
 
-It writes the table of docs/compare.md and draws docs/images/compare.png. Everything is computed by
-the same functions of a machine, in its assembly and working mode, and only where every motor is
-between its stops.
+Results go to docs/records/compare.json, and from there to the table of docs/compare.md; the figure
+is docs/images/compare.png. Everything is computed by the same functions of a machine, in its
+assembly and working mode, and only where every motor is between its stops.
+
+The rows of learning are read from the trainings of ``python -m benchmarks.studies run --plan
+machines --engine analytic`` in the folder of ``--runs``, and for the paper's machine from
+docs/results. Without these trainings, the rows on record stay.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import argparse
+import json
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -19,14 +26,20 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from shared import fill, table
+from shared import ROOT, describe, fill, provenance, read_record, table
+from studies.page import settled
 
-from tpm_gym.analysis.aspects import largest_block
+from tpm_gym.analysis import delta as delta_analysis
+from tpm_gym.analysis import topology
+from tpm_gym.analysis.aspects import Cells, aspects, largest_block
 from tpm_gym.analysis.decoupling import motors as motors_of
+from tpm_gym.analysis.limits import within_stops
+from tpm_gym.analysis.poc import analyse
 from tpm_gym.arrays import BoolArray, FloatArray
 from tpm_gym.kinematics import forward_all, inverse_all
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.learning import figure_style as style
+from tpm_gym.learning.run_folder import evaluations
 from tpm_gym.mechanism import DELTA, PAPER_TPM, WIDE_TPM, Delta, Machine, Mount
 from tpm_gym.mechanism.delta import kinematics as delta
 from tpm_gym.mechanism.delta.geometry import DeltaGeometry
@@ -34,7 +47,9 @@ from tpm_gym.mechanism.motor import TORQUE_MOTOR
 from tpm_gym.simulation.drives import Servo
 from tpm_gym.tasks import Expert
 
-DOCS = Path(__file__).parents[1] / "docs"
+DOCS = ROOT / "docs"
+RECORD = DOCS / "records" / "compare.json"
+RUNS = "TPMPickAndPlaceDense-v0-ppo-analytic"
 GRID = 0.02  # m
 CONDITIONING = 0.1
 LENGTH_ERROR = 1e-4  # m
@@ -211,6 +226,82 @@ def solutions(machine: Machine) -> str:
     return f"{counts[0]} and {counts[1]}"
 
 
+def coupling(machine: Machine) -> str:
+    """Return the coupling degree of each loop, with parallelograms of revolutes for the Delta."""
+    theta = machine.inverse(machine.home)
+    if isinstance(machine, Delta):
+        chains, point = delta_analysis.chains(theta, geometry=machine.geometry, balls=False)
+        found = analyse(chains, point)
+    else:
+        geometry = machine.geometry  # type: ignore[attr-defined]
+        found = topology.analyse(topology.describe(theta, geometry=geometry))
+    return ", ".join(f"{kappa:g}" for kappa in found.coupling)
+
+
+def largest_aspect(machine: Machine) -> str:
+    """Return the largest aspect of the working mode within the stops, % of all of them."""
+    sets: list[Cells]
+    if isinstance(machine, Delta):
+        of_delta = delta_analysis.aspects(geometry=machine.geometry, within_stops=True)
+        sets = [one.cells for one in of_delta]
+    else:
+        mode, geometry = machine.working_mode, machine.geometry  # type: ignore[attr-defined]
+        sets = [one.cells for one in aspects(mode, geometry, limits=(within_stops,))]
+    volumes = [cells.volume for cells in sets]
+    return f"{100 * volumes[0] / sum(volumes):.0f}"
+
+
+def trainings(machine: Machine, runs: Path) -> Iterator[dict[str, Any]]:
+    """Yield steps and seconds of CPU to 95%, success and time below safe of each training."""
+    if machine is PAPER_TPM:
+        for path in sorted((DOCS / "results").glob(f"{RUNS}-s?.json")):
+            record = json.loads(path.read_text(encoding="utf-8"))
+            yield outcome(record["seed"], record["evaluations"], record["tests"]["pybullet"])
+    for folder in sorted(runs.glob(f"{RUNS}-{machine.name}-s?")):
+        test = folder / "tests" / "pybullet.json"
+        if test.is_file():
+            found = evaluations(folder)
+            curves = {name: [one[name] for one in found] for name in ("steps", "cpu_seconds")}
+            curves["success_at_end"] = [one["success_at_end"]["mean"] for one in found]
+            tested = json.loads(test.read_text(encoding="utf-8"))
+            yield outcome(int(folder.name[-1]), curves, tested)
+
+
+def outcome(seed: int, curves: dict[str, Any], test: dict[str, Any]) -> dict[str, Any]:
+    """Return what a training came to; None for what it never reached, or what is not on record."""
+    index = settled(curves["success_at_end"])
+    seconds = curves.get("cpu_seconds")
+    return {
+        "seed": seed,
+        "steps": None if index is None else curves["steps"][index],
+        "cpu_seconds": None if index is None or seconds is None else seconds[index],
+        "episodes": test["episodes"],
+        "success": test["success_at_end"]["mean"],
+        "unsafe_share": test["unsafe_share"]["mean"],
+    }
+
+
+def learned(found: list[dict[str, Any]]) -> list[str]:
+    """Return the cells of the rows of learning."""
+    if not found:
+        return ["-"] * len(LEARNING)
+
+    def middle(name: str, form: str) -> str:
+        known = [np.inf if one[name] is None else one[name] for one in found]
+        value = float(np.median(known))
+        return "never" if np.isinf(value) else form.format(value)
+
+    timed = all(one["cpu_seconds"] is not None or one["steps"] is None for one in found)
+    success = [100 * one["success"] for one in found]
+    return [
+        f"{len(found)}",
+        middle("steps", "{:,.0f}"),
+        middle("cpu_seconds", "{:.0f}") if timed else "-",
+        f"{np.median(success):.1f} ({min(success):.1f} to {max(success):.1f})",
+        f"{100 * np.mean([one['unsafe_share'] for one in found]):.1f}",
+    ]
+
+
 def moved(machine: Machine) -> float:
     """Return the mass of all moving links, kg."""
     return float(sum(link.mass for link in machine.mechanism.links[1:]))
@@ -245,6 +336,8 @@ def column(machine: Machine) -> list[str]:
         f"{work:.0f}",
         ", ".join("-" if np.isnan(time) else f"{time:.2f}" for time in times),
         solutions(machine),
+        coupling(machine),
+        largest_aspect(machine),
         f"{microseconds(machine.forward, theta):.2f}, {microseconds(machine.inverse, points):.2f}",
     ]
 
@@ -265,7 +358,17 @@ ROWS = (
     "expert's mechanical work in an episode, J",
     "cycle 25-305-25 along x, along y, s",
     "forward and inverse solutions at home",
+    "coupling degrees of the loops",
+    "largest aspect of the working mode within the stops, % of all",
     "time of forward, of inverse, us a row",
+)
+
+LEARNING = (
+    "PPO from nothing: trainings",
+    "steps to 95%, median",
+    "seconds of CPU to 95%, median",
+    "success in PyBullet, median (range), %",
+    "time below safe, mean, %",
 )
 
 
@@ -290,12 +393,27 @@ def figure() -> Figure:
     return drawn
 
 
+def lines(record: dict[str, Any]) -> Iterator[str]:
+    """Yield the table of the page."""
+    columns = [
+        [*record["measured"][name], *learned(record["learning"].get(name, []))] for name in MACHINES
+    ]
+    yield from table(["", *MACHINES], zip((*ROWS, *LEARNING), *columns, strict=True))
+
+
 def main() -> None:
-    """Measure all machines, and write the table."""
-    columns = [column(machine) for machine in MACHINES.values()]
-    lines = list(table(["", *MACHINES], zip(ROWS, *columns, strict=True)))
-    print("\n".join(lines))
-    fill(DOCS / "compare.md", "compare", lines)
+    """Measure all machines, write the record, and fill the page."""
+    parser = argparse.ArgumentParser(description="The TPM and the Delta, measured.")
+    parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "study")
+    options = parser.parse_args()
+    learning = read_record(RECORD).get("learning", {})
+    for name, machine in MACHINES.items():
+        if found := list(trainings(machine, options.runs)):
+            learning[name] = found
+    measured = {name: column(machine) for name, machine in MACHINES.items()}
+    record = {"machine": describe(sys.argv), "measured": measured, "learning": learning}
+    provenance.write_json(RECORD, record)
+    fill(DOCS / "compare.md", "compare", lines(read_record(RECORD)))
     with style.style():
         style.save(figure(), DOCS / "images" / "compare.png")
 

@@ -19,6 +19,8 @@ from tpm_gym.tasks.task import Task
 from .bisection import OBJECT_ATTRIBUTES, SERVO_ATTRIBUTES, ends, halving
 
 PENALTY_WEIGHTS: Final = (0.0, 1.0)
+MACHINES: Final = ("wide", "delta")
+"""Machines that docs/compare.md compares with the paper's, whose runs are those of "results"."""
 STUDIED: Final = ("Reach", "PickAndPlace")
 """Tasks of the plans; others are studied where `--envs` names them."""
 
@@ -29,14 +31,15 @@ class Study:
 
     "results" trains each recipe with each seed, and that of sac or tqc without demonstrations too
     if it has some. "penalty" trains without and with the singularity penalty on goals that tempt
-    towards the singularity. "robustness" tests the published policies on machines that differ in
+    towards the singularity. "machines" trains pick-and-place on other machines than the paper's,
+    for docs/compare.md. "robustness" tests the published policies on machines that differ in
     one attribute.
 
     A study can be stopped with Ctrl-C and started again: trainings resume from their last
     checkpoint. They also resume, on another node, when their process or node dies.
     """
 
-    plan: Literal["results", "penalty", "robustness"]
+    plan: Literal["results", "penalty", "machines", "robustness"]
     """Kind of study."""
 
     engine: str = "pybullet"
@@ -50,7 +53,7 @@ class Study:
     own."""
 
     algos: tuple[str, ...] = ()
-    """Algorithms; default: sac and ppo, for penalty ppo."""
+    """Algorithms; default: sac and ppo, for penalty and machines ppo."""
 
     seeds: int = 5
     """Number of seeds, from 0 up."""
@@ -196,10 +199,15 @@ def _trainings(study: Study) -> list[Run]:
         run
         for algo in study.algos or usual
         for env, recipe in read_recipes(recipe_file(algo, study.engine), algo).items()
-        if (env in study.envs if study.envs else _task(env).__name__ in STUDIED)
+        if (env in study.envs if study.envs else _is_studied(study, env))
         for seed in range(study.seeds)
         for run in _runs_of_seed(study, env, algo, seed, "demonstrations" in recipe)
     ]
+
+
+def _is_studied(study: Study, env: str) -> bool:
+    of_machines = env == "TPMPickAndPlaceDense-v0"
+    return of_machines if study.plan == "machines" else _task(env).__name__ in STUDIED
 
 
 def _runs_of_seed(study: Study, env: str, algo: str, seed: int, demonstrated: bool) -> list[Run]:
@@ -222,6 +230,8 @@ def _runs_of_seed(study: Study, env: str, algo: str, seed: int, demonstrated: bo
         tried = demonstrated and algo != "ppo"
         from_scratch = [run("-scratch", "--demonstrations", "0")] if tried else []
         return [run(""), *from_scratch]
+    if study.plan == "machines":
+        return [run(f"-{machine}", "--machine", machine) for machine in MACHINES]
     return [
         run(
             f"-tempting-w{weight:g}",

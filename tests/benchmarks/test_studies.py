@@ -55,12 +55,14 @@ def test_plans_have_every_recipe_and_seed(tmp_path):
     assert {run.env for run in weighted} == {env for env in dense if re.search("Reach|Pick", env)}
     assert len(weighted) == 4 * 2 * 5
     assert all("--goals" in run.options for run in weighted)
+    machines = plan_runs(Study("machines", folder=tmp_path, engine="analytic", seeds=2))
+    assert [run.options[-1] for run in machines] == ["wide", "delta"] * 2
     longer = plan_runs(Study("penalty", folder=tmp_path, engine="analytic", steps=70_000))
     assert all("--steps 70000" in " ".join(run.left()[0]) for run in longer)
     bisections = plan_runs(Study("robustness", folder=tmp_path))
     assert len(bisections) == 10 + 10 + 8  # without a block there are no mass and friction of it
     elsewhere = plan_runs(Study("results", folder=tmp_path, engine="analytic"))
-    runs = [*planned, *weighted, *longer, *bisections, *elsewhere]
+    runs = [*planned, *weighted, *machines, *longer, *bisections, *elsewhere]
     assert len({run.folder for run in runs}) == len(runs)
 
 

@@ -28,7 +28,7 @@ def test_the_expert_succeeds_with_closed_loops(engine):
 
 
 def test_engines_agree_on_the_torques():
-    """Without contact; measured: 0.001% by rms. Blocks that are pressed make it 1.1%."""
+    """Without contact; measured: 0.001% by rms. docs/compare.md says why contacts make it 1.1%."""
     torques = {}
     for engine in ENGINES:
         env = gym.make("TPMReach-v0", machine="delta", engine=engine)
