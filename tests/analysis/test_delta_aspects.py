@@ -29,6 +29,8 @@ def test_chains_are_those_of_an_independent_model(balls, coupling):
         for ours, theirs in zip(found, other.chains(point, theta, balls), strict=True):
             spans = [projector(twists(chain, at)) for chain in (ours, theirs)]
             np.testing.assert_allclose(*spans, atol=1e-6)
+            ends = [np.array(chain.units[-1].point) for chain in (ours, theirs)]
+            np.testing.assert_allclose(*ends, atol=1e-9)
 
 
 def test_angles_without_an_assembly_have_no_chains():
@@ -51,6 +53,16 @@ def test_aspects_divide_the_reachable_set_and_hold_one_assembly_mode(bends):
         np.testing.assert_allclose(
             forward_all(theta)[regular, side], points[regular], rtol=0, atol=1e-6
         )
+
+
+def test_the_grid_holds_every_point_in_reach():
+    cells = reachable_set(shape=SHAPE)
+    low, high = np.array(cells.low), np.array(cells.low) + SHAPE * np.array(cells.spacing)
+    points = np.random.default_rng(0).uniform(1.5 * low, 1.5 * high, (100_000, 3))
+    reached = points[np.isfinite(inverse_all(points)).all(axis=(1, 2))]
+    assert ((reached > low) & (reached < high)).all()
+    volume = 1.5**3 * np.prod(high - low) * len(reached) / len(points)
+    assert cells.volume == pytest.approx(volume, rel=0.03)
 
 
 def test_the_mirror_at_the_base_of_a_working_mode_is_the_opposite_mode():
