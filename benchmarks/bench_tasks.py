@@ -33,6 +33,8 @@ RECORD, PAGE = ROOT / "docs" / "records" / "tasks.json", ROOT / "docs" / "tasks.
 ENGINES: Final = ("analytic", "pybullet", "mujoco")
 IDS: Final = {f"TPM{kind.__name__}-v0": kind for kind in TASKS.values()}
 OTHERS: Final = ({"machine": "wide"}, {"goals": "tempting"})
+SHOWN: Final = 0.0005
+"""Smallest share of steps below safe that the page shows."""
 _KEY: Final = ("env", "policy", "machine", "goals", "engine")
 
 
@@ -89,7 +91,9 @@ def lines(record: dict[str, Any]) -> Iterator[str]:
             return "-"
         if "refused" in cell:
             return "refused"
-        return f"{cell['success_at_end']['mean']:.1%} of {cell['episodes']:,}"
+        unsafe = cell["unsafe_share"]["mean"]
+        below = f" ({unsafe:.1%})" if unsafe >= SHOWN else ""
+        return f"{cell['success_at_end']['mean']:.1%} of {cell['episodes']:,}{below}"
 
     yield from table(
         ["task", "lines", *(f"expert, {engine}" for engine in ENGINES)],
@@ -109,6 +113,7 @@ def lines(record: dict[str, Any]) -> Iterator[str]:
             [group[0], _controller(group[1]), *group[2:]]
             + [shown(*group, engine) for engine in ENGINES[:2]]
             for group in sorted(groups)
+            if any((*group, engine) in cells for engine in ENGINES)
         ],
     )
     yield ""
