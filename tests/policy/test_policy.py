@@ -218,7 +218,7 @@ def test_what_is_no_policy_is_named(tmp_path):
     for name, message in {
         "none": "no such file",
         "pipe.json": "no such file",
-        "x" * 5000: "name too long",
+        "x" * 5000: "name too long|no such file",  # the second from Python 3.14 on
         "\0": "no such file",
         "best.zip": "holds pickles.*tpm-gym export.*--trust-pickle",
     }.items():
