@@ -255,7 +255,6 @@ def _training_table(runs: Frame) -> Frame:
             "steps": f"{first.steps:,}",
             **_successes(group),
             "steps to 95%": _or_never(group.learned_steps.median(), "{:,.0f}"),
-            "minutes to 95%": _or_never(group.learned_minutes.median(), "{:.1f}"),
             "minutes in all": f"{group.minutes.median():.1f}",
             "minutes of CPU": _cell(group.cpu_minutes.median(), "{:.1f}"),
         }
