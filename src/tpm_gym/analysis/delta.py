@@ -38,12 +38,11 @@ def chains(
     if not real:
         raise no_assembly(angles, side, g)
     found = []
-    for number, leg, cos, sin, rod in zip(
-        LEGS, LEGS.values(), pose.cos, pose.sin, pose.bars, strict=True
-    ):
-        hinge = np.array(outwards(leg, (0.0, -1.0, 0.0)))
-        elbow, bar = np.array(outwards(leg, (g.l1 + cos, 0.0, sin))), np.array(rod)
-        units = [revolute(f"R{number}", hinge, np.array(outwards(leg, (g.l1, 0.0, 0.0))), True)]
+    rows = zip(LEGS.items(), pose.cos, pose.sin, pose.bars, strict=True)
+    for (number, leg), cos, sin, rod in rows:
+        here = (0.0, -1.0, 0.0), (g.l1, 0.0, 0.0), (g.l1 + cos, 0.0, sin)
+        hinge, pivot, elbow = (np.array(outwards(leg, one)) for one in here)
+        bar, units = np.array(rod), [revolute(f"R{number}", hinge, pivot, True)]
         if balls:
             units.append(parallelogram_4s("Pa(4S)", hinge, bar, elbow + bar))
         else:
@@ -107,8 +106,8 @@ def aspects(
     for index in np.argsort(-counts, kind="stable"):
         code = int(codes.flat[first[index]])
         if code >= 0 and counts[index] >= min_cells:
-            parallel, constraint = (1 if code & bit else -1 for bit in (1, 2))
-            found.append(Aspect(parallel, constraint, Cells(low, spacing, labels == names[index])))
+            cells = Cells(low, spacing, labels == names[index])
+            found.append(Aspect(2 * (code & 1) - 1, (code & 2) - 1, cells))
     return tuple(found)
 
 
@@ -118,17 +117,16 @@ def _codes(
     """Return corner and spacing of the grid, and the signs at its cells; -1 where P cannot be."""
     if len(shape) != 3 or any(int(n) != n or n < 2 for n in shape):
         raise ConfigurationError("shape", shape, "three integers from 2 up")
-    far = geometry.l3 + geometry.l4
-    wide = far + abs(geometry.l1 - geometry.l2)
-    low, high = np.array([-wide, -wide, -far]), np.array([wide, wide, far])
-    spacing = (high - low) / shape
+    far, aside = geometry.l3 + geometry.l4, abs(geometry.l1 - geometry.l2)
+    low = -np.array([far + aside, far + aside, far])
+    spacing = -2 * low / shape
     points = low + (np.moveaxis(np.indices(shape), 0, -1) + 0.5) * spacing
     found = factors_at(points, bends, geometry)
     values = np.stack([found.parallel, found.constraint], axis=-1)
     there = ~np.isnan(values[..., 0])
     if within_stops:
         theta = inverse_all(points, geometry)[..., WORKING_MODES.index(bends), :]
-        for motor, angle in zip(build(geometry).motors, np.moveaxis(theta, -1, 0), strict=True):
-            there &= (angle >= motor.lower) & (angle <= motor.upper)
+        low_stops, high_stops = np.array(build(geometry).stops).T
+        there &= ((theta >= low_stops) & (theta <= high_stops)).all(axis=-1)
     codes: IntArray = np.where(there, (values > 0) @ (1, 2), -1)
     return tuple(low.tolist()), tuple(spacing.tolist()), codes

@@ -109,11 +109,10 @@ def factors_at(
 
 
 def _factors(pose: Pose, real: Numbers, g: AnyDelta, ns: Namespace) -> list[Numbers]:
-    parallel, *serial, constraint = _or_nan(
-        real, (pose.parallel, *pose.serial, pose.constraint), ns
-    )
-    l3, l4 = g.l3, g.l4
-    return [parallel / l4**3, tuple(leg / (l3 * l4) for leg in serial), constraint / l4**3]
+    values = pose.parallel, *pose.serial, pose.constraint
+    parallel, *serial, constraint = _or_nan(real, values, ns)
+    cube = g.l4**3
+    return [parallel / cube, tuple(leg / (g.l3 * g.l4) for leg in serial), constraint / cube]
 
 
 def conditioning_at(
