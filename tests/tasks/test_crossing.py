@@ -136,6 +136,15 @@ def test_random_actions_near_the_plane_are_never_reported_wrongly(engine):
     assert passes > 2
 
 
+def test_next_to_the_plane_the_observed_velocity_is_bounded():
+    with closing(TPMEnv(Crossing, engine="mujoco")) as env:
+        env.reset(seed=36)
+        rng = np.random.default_rng(36)  # J theta_dot is 2.35 m/s in step 22
+        for _ in range(25):
+            observation, *_ = env.step(rng.choice([-1.0, 0.0, 1.0], 3))
+            assert np.abs(observation["observation"]).max() < 3
+
+
 def test_one_robot_passes_as_among_many():
     actions = np.random.default_rng(0).uniform(-1, 1, (40, 5, 3))
     actions[:, :, 1] = -1.0  # straight through the plane

@@ -288,6 +288,13 @@ class Simulation:
             position[lost], jacobian[lost] = self._position[lost], self._jacobian[lost]
             conditioning[lost] = self._conditioning[lost]
         self._position, self._jacobian, self._conditioning = position, jacobian, conditioning
+        if self.machine.mirror_axis is not None:
+            # Next to the plane, J theta_dot has no bound. So bound it by twice the fastest command.
+            axis = self.machine.mirror_axis
+            speed = np.abs((jacobian[:, axis] * rates).sum(axis=1))
+            most = 2 * self.machine.step_limit[axis] / CONTROL_PERIOD
+            jacobian = jacobian.copy()
+            jacobian[:, axis] *= (most / np.maximum(speed, most))[:, None]
         gap = now.gap
         place, velocity, command, axis, assembly, working, closed = self.loops.in_world(
             position, jacobian, rates, self._commands,
@@ -341,7 +348,7 @@ class Simulation:
         sign = np.where(there * machine.home[axis] < 0, -1.0, 1.0)
         position, jacobian = position.copy(), jacobian.copy()
         position[:, axis] *= sign
-        # In the plane, encoders do not show the velocity normal to it: J is infinite, so damp it.
+        # In the plane, encoders do not show the velocity normal to it: J is infinite. So damp it.
         distance, blur = position[:, axis], _BLUR * machine.step_limit[axis]
         jacobian[:, axis] *= (sign * distance**2 / (distance**2 + blur**2))[:, None]
         reached = self.recent[:, :, axis].mean(axis=1)  # by the path
