@@ -8,7 +8,7 @@ TRAINS := $(VENV)/.trains
 unexport PYTHONDONTWRITEBYTECODE
 PIP := $(RUN) -m pip install --no-compile -c constraints.txt
 
-.PHONY: help demo test lint format compiled test-fast test-slow test-wheel docs urdf pictures figures gradients compare results bench-kinematics bench-engine bench-long bench-limits bench-transfer bench-engines bench-fidelity bench-evaluate bench-conveyor bench-speed bench-shield bench-first bench-crossing bench-cycle bench-tasks soak clean
+.PHONY: help demo test lint format compiled test-fast test-slow test-wheel docs urdf pictures figures gradients compare results bench-learning bench-cloning bench-kinematics bench-engine bench-long bench-limits bench-transfer bench-engines bench-fidelity bench-evaluate bench-conveyor bench-speed bench-shield bench-first bench-crossing bench-cycle bench-tasks soak clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -87,6 +87,14 @@ gradients: $(INSTALLED) ## lengths and ways improved by gradients, again; see do
 
 results: $(INSTALLED) ## rewrite docs/results.md and its figures from the records in docs/results/
 	$(RUN) -m benchmarks.studies write
+
+bench-learning: $(INSTALLED) ## train and test all ids with five seeds, as far as it is not done; see docs/benchmark.md; hours
+	$(RUN) -m benchmarks.studies run --plan benchmark --engine analytic --folder runs/benchmark
+	$(RUN) -m benchmarks.studies collect --runs runs/benchmark
+	$(MAKE) results
+
+bench-cloning: $(INSTALLED) ## behaviour cloning from 10, 50 and 400 episodes; see docs/datasets.md; an hour
+	$(RUN) benchmarks/bench_cloning.py
 
 bench-kinematics: $(INSTALLED) ## speed of the kinematics against a floor and a general solver
 	$(RUN) benchmarks/bench_kinematics.py

@@ -25,6 +25,8 @@ from .records import RECORDS, Record, read_records
 PAGE: Final = Path("docs", "results.md")
 RUNS: Final = "results-runs.md"
 """Name of the page of every run, beside the page."""
+BENCHMARK: Final = "benchmark.md"
+"""Name of the page of all ids, beside the page."""
 LEARNED: Final = 0.95
 """Success rate of a policy that has learned its task."""
 ENGINES: Final = {"analytic": "analytic engine", "pybullet": "PyBullet"}
@@ -66,13 +68,13 @@ Frame = Any  # pandas has no types
 
 @dataclass(frozen=True)
 class Write:
-    """Write the page, the page of every run and their figures from the records."""
+    """Write the page, those of every run and of the benchmark, and their figures."""
 
     records: Path = RECORDS
     """Folder of the records."""
 
     page: Path = PAGE
-    """The page; the page of every run goes beside it, figures to images/."""
+    """The page; the others go beside it, figures to images/."""
 
 
 def write(config: Write) -> list[Path]:
@@ -81,18 +83,25 @@ def write(config: Write) -> list[Path]:
     Raises:
         ConfigError: A record is damaged, or the page is a file that this function did not write.
     """
-    from .figures import draw  # imports matplotlib
+    from . import benchmark  # these import matplotlib
+    from .figures import draw
 
-    runs = config.page.with_name(RUNS)
-    for old in (config.page, runs):
+    runs, summary = (config.page.with_name(name) for name in (RUNS, BENCHMARK))
+    for old in (config.page, runs, summary):
         if old.exists() and not (old.is_file() and _MARK.encode() in old.read_bytes()):
             raise ConfigError(
                 f"--page {old}: was written by hand, or by another program; "
                 "move it elsewhere, or choose another --page"
             )
     records = read_records(config.records)
-    figures = draw(records, config.page.parent / "images")
-    texts = {config.page: page(records, [f.name for f in figures]), runs: every_run(records)}
+    images = config.page.parent / "images"
+    figures = [*draw(records, images), *benchmark.draw(records, images)]
+    names = [figure.name for figure in figures]
+    texts = {
+        config.page: page(records, names),
+        runs: every_run(records),
+        summary: benchmark.page(records, names),
+    }
     for path, text in texts.items():
         write_whole(path, partial(Path.write_text, data=text, encoding="utf-8"))
     return [*texts, *figures]
@@ -106,10 +115,8 @@ def page(records: Sequence[Record], figures: Sequence[str]) -> str:
         figures: File names of the figures to show.
     """
     runs, tempting = split(records)
-    return _render(
+    return render(
         "page.md.j2",
-        mark=_MARK,
-        learned=f"{LEARNED:.0%}",
         safe=PAPER_TPM.safe_conditioning,
         missing=list(_missing(records)),
         episodes=_episodes,
@@ -126,10 +133,8 @@ def page(records: Sequence[Record], figures: Sequence[str]) -> str:
 def every_run(records: Sequence[Record]) -> str:
     """Return the page of every run as Markdown: its tests, robustness, machines, commands."""
     runs, tempting = split(records)
-    return _render(
+    return render(
         "runs.md.j2",
-        mark=_MARK,
-        learned=f"{LEARNED:.0%}",
         failures=_failures,
         training=runs,
         runs_table=partial(_runs_table, runs),
@@ -140,8 +145,8 @@ def every_run(records: Sequence[Record]) -> str:
     )
 
 
-def _render(template: str, **values: Any) -> str:
-    """Fill a template of this folder."""
+def render(template: str, **values: Any) -> str:
+    """Fill a template of this folder, all of which get ``mark`` and ``learned``."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         undefined=jinja2.StrictUndefined,
@@ -149,7 +154,7 @@ def _render(template: str, **values: Any) -> str:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    return environment.get_template(template).render(values)
+    return environment.get_template(template).render(values, mark=_MARK, learned=f"{LEARNED:.0%}")
 
 
 def command(study: Study) -> str:
@@ -186,7 +191,8 @@ def _row(record: Record) -> dict[str, Any]:
     name = str(record["algo"]).upper() + (" + HER" if recipe["hindsight"] else "")
     tests = pd.json_normalize(record["tests"]).to_dict("records")
     return {
-        **{name: record[name] for name in ("env", "seed", "steps", "envs", "goals", "finished")},
+        **{name: record[name] for name in ("run", "env", "seed", "steps", "envs", "goals")},
+        "finished": record["finished"],
         "penalty_weight": record["penalty_weight"],
         "method": name + (", demonstrations" if recipe["demonstrations"] else ""),
         "engine": ENGINES.get(record["engine"], record["engine"]),

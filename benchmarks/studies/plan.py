@@ -33,13 +33,13 @@ class Study:
     if it has some. "penalty" trains without and with the singularity penalty on goals that tempt
     towards the singularity. "machines" trains pick-and-place on other machines than the paper's,
     for docs/compare.md. "robustness" tests the published policies on machines that differ in
-    one attribute.
+    one attribute. "benchmark" trains each id that has a recipe: with ppo, or else with sac.
 
     A study can be stopped with Ctrl-C and started again: trainings resume from their last
     checkpoint. They also resume, on another node, when their process or node dies.
     """
 
-    plan: Literal["results", "penalty", "machines", "robustness"]
+    plan: Literal["results", "penalty", "machines", "robustness", "benchmark"]
     """Kind of study."""
 
     engine: str = "pybullet"
@@ -53,7 +53,8 @@ class Study:
     own."""
 
     algos: tuple[str, ...] = ()
-    """Algorithms; default: sac and ppo, for penalty and machines ppo."""
+    """Algorithms; default: sac and ppo, for penalty and machines ppo, for
+    benchmark one of both."""
 
     seeds: int = 5
     """Number of seeds, from 0 up."""
@@ -194,8 +195,8 @@ def _bisections(study: Study) -> list[Bisection]:
 
 def _trainings(study: Study) -> list[Run]:
     # TQC takes two and a half times as long as SAC, and has not learned better.
-    usual = ("sac", "ppo") if study.plan == "results" else ("ppo",)
-    return [
+    usual = {"results": ("sac", "ppo"), "benchmark": ("ppo", "sac")}.get(study.plan, ("ppo",))
+    runs = [
         run
         for algo in study.algos or usual
         for env, recipe in read_recipes(recipe_file(algo, study.engine), algo).items()
@@ -203,9 +204,13 @@ def _trainings(study: Study) -> list[Run]:
         for seed in range(study.seeds)
         for run in _runs_of_seed(study, env, algo, seed, "demonstrations" in recipe)
     ]
+    first = {run.env: run.algo for run in reversed(runs)}
+    return [run for run in runs if study.plan != "benchmark" or run.algo == first[run.env]]
 
 
 def _is_studied(study: Study, env: str) -> bool:
+    if study.plan == "benchmark":
+        return True
     of_machines = env == "TPMPickAndPlaceDense-v0"
     return of_machines if study.plan == "machines" else _task(env).__name__ in STUDIED
 
@@ -225,6 +230,8 @@ def _runs_of_seed(study: Study, env: str, algo: str, seed: int, demonstrated: bo
         folder = study.folder / f"{name}{variant}-s{seed}"
         return Run(folder, env, algo, (*options, *goals, *changes), tests)
 
+    if study.plan == "benchmark":
+        return [run("")]
     if study.plan == "results":
         # Without demonstrations and hindsight, PPO finds no sparse reward.
         tried = demonstrated and algo != "ppo"

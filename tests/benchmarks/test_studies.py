@@ -15,14 +15,16 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
+import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
 from paths import ROOT
 from processes import PYTHON, signalled
+from studies import benchmark
 from studies.__main__ import main
 from studies.bisection import ends, halving, nominal
 from studies.figures import learning_curves, penalty
-from studies.page import PAGE, RUNS, Write, every_run, page, split, write
+from studies.page import BENCHMARK, ENGINES, PAGE, RUNS, Write, every_run, page, split, write
 from studies.plan import Bisection, Run, Study, plan_runs
 from studies.records import (
     RECORDS,
@@ -31,6 +33,7 @@ from studies.records import (
     condense,
     read_records,
 )
+from studies.reliability import interquartile_mean, profile
 from studies.running import execute, run_all
 from trainings import PPO_RECIPE
 
@@ -112,18 +115,25 @@ def test_what_is_done_is_skipped_and_what_was_stopped_goes_on(tmp_path, capsys):
 # -- running --------------------------------------------------------------------------------------
 
 
+def tiny(plan: Any, folder: Path, seeds: int = 1) -> list[Run]:
+    """Execute the first runs of a plan for Reach, with a tiny recipe."""
+    study = Study(plan, "analytic", ("TPMReachDense-v0",), seeds=seeds, episodes=4, folder=folder)
+    recipe = folder / "ppo.yml"
+    recipe.write_text(PPO_RECIPE.format(env="TPMReachDense-v0", envs=3), encoding="utf-8")
+    words = ("--recipe", str(recipe), "--steps", "240", "--eval-episodes", "2")
+    small = [
+        replace(planned, options=(*planned.options, *words))
+        for planned in plan_runs(replace(study, pybullet_episodes=3))[:seeds]
+    ]
+    for planned in small:
+        assert execute(planned) is None, planned.folder.with_suffix(".log").read_text()
+    return small
+
+
 @pytest.fixture(scope="module")
 def run(needs_pybullet, tmp_path_factory):
-    """Execute a run of the penalty plan, with a tiny recipe."""
-    folder = tmp_path_factory.mktemp("study")
-    study = Study("penalty", "analytic", ("TPMReachDense-v0",), seeds=1, episodes=4, folder=folder)
-    (planned, _) = plan_runs(replace(study, pybullet_episodes=3))
-    recipe = folder / "ppo.yml"
-    recipe.write_text(PPO_RECIPE.format(env=planned.env, envs=3), encoding="utf-8")
-    words = ("--recipe", str(recipe), "--steps", "240", "--eval-episodes", "2")
-    small = replace(planned, options=(*planned.options, *words))
-    assert execute(small) is None, small.folder.with_suffix(".log").read_text()
-    return small
+    """Execute a run of the penalty plan."""
+    return tiny("penalty", tmp_path_factory.mktemp("study"))[0]
 
 
 def test_a_run_is_tested_in_both_engines_and_its_record_says_what_its_files_say(run):
@@ -282,7 +292,8 @@ def test_files_of_others_are_not_replaced(run, tmp_path):
     assert not (tmp_path / "images").exists()
     by_hand.unlink()
     written = write(Write(records, by_hand))
-    assert [path.name for path in written] == ["results.md", RUNS, "results_penalty.png"]
+    names = ["results.md", RUNS, BENCHMARK, "results_penalty.png"]
+    assert [path.name for path in written] == names
     before = [path.read_bytes() for path in written]
     main(["write", "--records", str(records), "--page", str(by_hand)])
     assert [path.read_bytes() for path in written] == before
@@ -329,9 +340,9 @@ def test_the_page_is_what_its_records_say():
     text = (ROOT / PAGE).read_text(encoding="utf-8")
     figures = [name for name in ("results_penalty.png", "results_robustness.png") if name in text]
     assert page(read_records(ROOT / RECORDS), ["results_learning_curves.png", *figures]) == text
-    assert every_run(read_records(ROOT / RECORDS)) == (ROOT / PAGE.with_name(RUNS)).read_text(
-        "utf-8"
-    )
+    texts = {RUNS: every_run, BENCHMARK: partial(benchmark.page, figures=[benchmark.PICTURE])}
+    for name, written in texts.items():
+        assert written(read_records(ROOT / RECORDS)) == (ROOT / PAGE).with_name(name).read_text()
 
 
 @pytest.mark.parametrize(
@@ -358,6 +369,60 @@ def test_runs_that_differ_are_told_apart_everywhere(other, labels):
     assert [line.get_label() for line in curves.axes[0].lines[:2]] == labels
     ticks = [t.get_text() for t in penalty(split(weighted)[1]).axes[0].get_xticklabels()]
     assert len(set(ticks)) == 4
+
+
+# -- the benchmark --------------------------------------------------------------------------------
+
+
+def test_the_benchmark_trains_each_id_once_a_seed_and_its_page_shows_every_run(
+    needs_pybullet, tmp_path
+):
+    planned = plan_runs(benchmark.PLAN)
+    assert len({(run.env, run.options) for run in planned}) == len(planned)
+    assert {run.env for run in planned} >= {"TPMReach-v0", "TPMReachDense-v0", "TPMPush-v0"}
+    runs = tiny("benchmark", tmp_path, seeds=2)
+    assert {run.folder.name for run in runs} <= {run.folder.name for run in planned}
+    records = [condense(run.folder) for run in runs]
+    text = benchmark.page(records, [])
+    rates = [[100 * r["tests"][e]["success_at_end"]["mean"] for r in records] for e in ENGINES]
+    shown = [f"{np.mean(both):.1f} [{min(both):.1f}, {max(both):.1f}]" for both in rates]
+    ids = "| TPMReachDense-v0 | PPO | 2 |"
+    assert rows(text, ids, *(f"| {cell} |" for cell in shown), "never [never, never]")
+    assert f"{len(planned) - 2} of {len(planned)} runs are not there yet." in text
+    (path,) = benchmark.draw(records, tmp_path)
+    assert path.stat().st_size > 10_000
+
+
+@given(st.lists(st.lists(st.floats(0, 1), min_size=5, max_size=5), min_size=1, max_size=6))
+def test_the_interquartile_mean_is_that_of_scipy(scores):
+    found = interquartile_mean(scores)
+    expected = scipy.stats.trim_mean(np.ravel(scores), 0.25)
+    assert found.mean == pytest.approx(expected, abs=1e-12)
+    assert found.low <= found.mean <= found.high
+
+
+def test_intervals_are_those_of_a_bootstrap_stratified_by_task():
+    scores = np.random.default_rng(0).random((6, 5)) ** 2 + np.arange(6)[:, None]
+
+    def middle(*tasks, axis):
+        return scipy.stats.trim_mean(np.concatenate(tasks, axis), 0.25, axis)
+
+    expected = scipy.stats.bootstrap(
+        tuple(scores), middle, n_resamples=20_000, method="percentile", rng=0
+    ).confidence_interval
+    found = interquartile_mean(list(scores))
+    assert (found.low, found.high) == pytest.approx(tuple(expected), abs=0.02)
+    # Resampled over all tasks together, the interval would be several times as wide.
+    assert found.high - found.low < 0.5
+    never = interquartile_mean([[1.0, 2.0, 3.0, np.inf]])
+    assert (never.mean, never.high) == (2.5, np.inf)
+
+
+def test_profiles_count_the_runs_that_reach_a_limit():
+    share, low, high = profile([[0.2, 0.9], [1.0, 1.0]], [0.0, 0.5, 1.0])
+    assert share.tolist() == [1.0, 0.75, 0.5]
+    assert low.tolist() == [1.0, 0.5, 0.5]
+    assert high.tolist() == [1.0, 1.0, 0.5]
 
 
 # -- bisections -----------------------------------------------------------------------------------

@@ -36,6 +36,7 @@ FILLED = {
     "docs/cycle.md": ["cycle"],
     "docs/crossing.md": ["crossing"],
     "docs/conveyor.md": ["conveyor"],
+    "docs/datasets.md": ["cloning"],
 }
 RUN = [page for page in PAGES if blocks(page, "python") and page.name != "extending.md"]
 TYPED = [page for page in PAGES if blocks(page, "bash")]
@@ -141,6 +142,7 @@ def expected(name):
         "cycle": "bench_cycle",
         "crossing": "bench_crossing",
         "conveyor": "bench_conveyor",
+        "cloning": "bench_cloning",
     }.get(name)
     if module is None:
         numbers = importlib.import_module("readme_numbers")

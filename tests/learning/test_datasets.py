@@ -1,5 +1,6 @@
 """Datasets are what Minari loads, what the environment does, and the same each time."""
 
+import json
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
@@ -10,10 +11,12 @@ import h5py
 import minari
 import numpy as np
 import pytest
+from datasets_on_record import COUNTS, records
+from paths import ROOT
 from trainings import quiet
 
 from tpm_gym.learning.configuration import EnvOptions
-from tpm_gym.learning.datasets import KINDS, CollectConfig, collect, digest
+from tpm_gym.learning.datasets import KINDS, CollectConfig, _complete, collect, digest
 from tpm_gym.learning.environments import make_envs
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.policies import load_policy
@@ -165,3 +168,22 @@ def test_a_folder_that_is_there_is_replaced_only_if_it_is_ours_and_asked_for(tmp
     with pytest.raises(ConfigError, match="holds no dataset of tpm-gym collect"):
         collect(replace(given, overwrite=True), quiet())
     assert (folder / "notes.txt").read_text() == "mine"
+
+
+RECORDED = json.loads((ROOT / "tests" / "data" / "datasets.json").read_text(encoding="utf-8"))
+
+
+def test_every_id_with_an_expert_is_on_record():
+    assert set(RECORDED) == set(_complete(CollectConfig()))
+
+
+@pytest.mark.parametrize(
+    "env_id", [pytest.param(i, marks=[] if i == PICK else [pytest.mark.slow]) for i in RECORDED]
+)
+def test_datasets_are_those_on_record(env_id):
+    """To the bit, or near where a processor rounds otherwise."""
+    for kind, found in records(env_id, min(COUNTS)).items():
+        first = str(min(COUNTS))
+        recorded = RECORDED[env_id][kind][first]
+        if found[first]["sha256"] != recorded["sha256"]:
+            assert found[first]["return"] == pytest.approx(recorded["return"], abs=1e-4)
