@@ -16,7 +16,7 @@ import numpy as np
 import psutil
 import pytest
 import scipy.stats
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from paths import ROOT
 from processes import PYTHON, signalled
@@ -393,6 +393,7 @@ def test_the_benchmark_trains_each_id_once_a_seed_and_its_page_shows_every_run(
     assert path.stat().st_size > 10_000
 
 
+@settings(max_examples=20)
 @given(st.lists(st.lists(st.floats(0, 1), min_size=5, max_size=5), min_size=1, max_size=6))
 def test_the_interquartile_mean_is_that_of_scipy(scores):
     found = interquartile_mean(scores)
