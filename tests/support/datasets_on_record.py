@@ -1,8 +1,9 @@
 """Digests of the first episodes of datasets, and how to record them again.
 
-    python tests/support/datasets_on_record.py tests/data/datasets.json
+    python tests/support/datasets_on_record.py tests/data/datasets.json [ID ...]
 
-Only where the physics, a task or its expert is meant to change are they recorded anew.
+Without ids, all are recorded. Only where the physics, a task or its expert is meant to change are
+they recorded anew.
 """
 
 import json
@@ -45,5 +46,8 @@ def records(env_id: str, episodes: int) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    content = {env_id: records(env_id, max(COUNTS)) for env_id in tpm_gym.ENV_IDS}
-    Path(sys.argv[1]).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    path = Path(sys.argv[1])
+    content = json.loads(path.read_text(encoding="utf-8")) if sys.argv[2:] else {}
+    for env_id in sys.argv[2:] or tpm_gym.ENV_IDS:
+        content[env_id] = records(env_id, max(COUNTS))
+        path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")

@@ -281,7 +281,8 @@ def _write(dataset: Dataset, scores: tuple[float, float], console: Console) -> s
     spec.kwargs |= dataset.config.env_options.given()
     with closing(gym.make(spec)) as env:
         spaces = env.observation_space, env.action_space
-    with tempfile.TemporaryDirectory(prefix=".", dir=dataset.root) as part:
+    # Minari cannot write to a relative path.
+    with tempfile.TemporaryDirectory(prefix=".", dir=dataset.root.absolute()) as part:
         data = Path(part, _DATA)
         storage = MinariStorage.new(data, *spaces, env_spec=spec)
         with bar(console, dataset.kind, dataset.config.episodes) as advance:
