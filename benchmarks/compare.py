@@ -389,7 +389,7 @@ def figure() -> Figure:
         one.add_patch(Rectangle((x0, z0), x1 - x0, z1 - z0, fill=False))
         one.set(title=name, xlabel="x, m", aspect="equal")
     axes[0].set(ylabel="z, m, down", ylim=(1.7, 0.05))
-    drawn.colorbar(colours, ax=axes, label="conditioning 1/cond(J)")
+    drawn.colorbar(colours, ax=axes, label="conditioning 1/cond(J)", shrink=0.7)
     return drawn
 
 

@@ -130,7 +130,7 @@ def _intervals(axes: Axes, of: Sequence[Frame]) -> None:
     axes.set_yticks(range(len(rows)), [name for name, _ in rows])
     axes.invert_yaxis()
     axes.axvline(LEARNED, color=OUTLINE, linewidth=0.6, linestyle=(0, (3, 2)))
-    axes.xaxis.set_major_formatter(PercentFormatter(xmax=1))
+    axes.xaxis.set_major_formatter(PercentFormatter(xmax=1, decimals=0))
     axes.set_xlabel("interquartile mean of success")
 
 
@@ -142,7 +142,7 @@ def _profiles(axes: Axes, of: Sequence[Frame]) -> None:
         axes.fill_between(limits, low, high, step="pre", color=_COLOURS[engine], alpha=0.2, lw=0)
         axes.step(limits, share, where="pre", color=_COLOURS[engine], label=label, linewidth=1.4)
     for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_formatter(PercentFormatter(xmax=1))
+        axis.set_major_formatter(PercentFormatter(xmax=1, decimals=0))
     axes.set_ylim(-0.03, 1.03)
     axes.set_xlabel("success of at least")
     axes.set_ylabel("share of runs")
