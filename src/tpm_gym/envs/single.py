@@ -129,8 +129,9 @@ class TPMEnv(gym.Env[Observation, Action]):
     | ``working_mode_changed`` | whether the platform passed y = l7, a serial singularity |
     | ``object_lost`` | whether an object is off the table or out of reach |
     | ``reward_terms`` | the terms above by name; they sum to the reward |
-    | ``crossed`` | in Crossing: whether P is beyond y = 0, as the task asks |
     | ``randomisation`` | after a reset with that option: the episode's plant |
+
+    Crossing adds ``crossed``: whether P is beyond y = 0, as the task asks.
 
     An environment that is made as ``TPMEnv(...)`` has no time limit; ``gym.make`` adds it.
 
