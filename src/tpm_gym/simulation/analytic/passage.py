@@ -8,9 +8,10 @@ K that is normal to the plane is zero: the motors do not act along it, and P coa
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tpm_gym.arrays import FloatArray
 from tpm_gym.mechanism.machine import Machine
@@ -46,6 +47,24 @@ class _Dynamics(NamedTuple):
     bias: FloatArray
 
 
+class _Lifted(NamedTuple):
+    """Kinematics beside points, on the side of the machine's home.
+
+    Attributes:
+        points: Mirrored points, (r, 3) m.
+        side: 1, or -1 for the mirrored component, (r, 3).
+        theta: Joint positions at ``points``, (r, 3) rad.
+        own_rate: K at ``points``, (r, 3, 3) rad/m, with theta_dot = K v.
+        rate: K at the points themselves, whose column normal to the plane grows with the distance.
+    """
+
+    points: FloatArray
+    side: FloatArray
+    theta: FloatArray
+    own_rate: FloatArray
+    rate: FloatArray
+
+
 def pass_through(
     machine: Machine,
     built: FloatArray | None,
@@ -72,7 +91,7 @@ def pass_through(
         speed = free + step * _times(at.inverse, _times(at.rate.swapaxes(1, 2), torque))
         position = course.position + step * speed
         theta = machine.inverse(position, built)
-        rates = _times(_rate(machine, built, position), speed)
+        rates = _times(_lifted(machine, built, position).rate, speed)
         mode_left = course.mode_left.copy()
         mode_left[np.isnan(rates).any(axis=1) & (mode_left == 0)] = 1
         gone = mode_left != 0
@@ -92,10 +111,8 @@ def _dynamics(
     carried: FloatArray,
 ) -> _Dynamics:
     """Compute the dynamics of P at ``position`` and ``speed`` (r, 3), with carried masses (r,)."""
-    rate = _rate(machine, built, position)
-    points, side = _lifted(machine, position)
-    theta = machine.inverse(points, built)
-    own_rate, own_speed = _rate(machine, built, points), side * speed
+    points, side, theta, own_rate, rate = _lifted(machine, built, position)
+    own_speed = side * speed
     length = np.linalg.norm(own_speed, axis=1, keepdims=True)
     beside = _BESIDE * own_speed / np.maximum(length, 1e-12)
     bend = machine.inverse(points + beside, built) + machine.inverse(points - beside, built)
@@ -108,28 +125,17 @@ def _dynamics(
     return _Dynamics(rate, np.linalg.inv(mass), bias)
 
 
-def _lifted(machine: Machine, position: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Mirror points (r, 3) to the side of the machine's home, at least _LIFT from the plane.
-
-    Returns:
-        The points, and 1, or -1 for the mirrored component, (r, 3).
-    """
+def _lifted(machine: Machine, built: FloatArray | None, position: FloatArray) -> _Lifted:
+    """Mirror points (r, 3) to the side of the machine's home, at least _LIFT from the plane."""
     axis = machine.mirror_axis or 0
     home = np.sign(machine.home[axis])
-    points, side = position.copy(), np.ones_like(position)
+    points, side, scale = position.copy(), np.ones_like(position), np.ones_like(position)
     side[position[:, axis] * home < 0, axis] = -1.0
     points[:, axis] = home * np.maximum(np.abs(position[:, axis]), _LIFT)
-    return points, side
-
-
-def _rate(machine: Machine, built: FloatArray | None, position: FloatArray) -> FloatArray:
-    """Compute K (r, 3, 3), with theta_dot = K v, at points (r, 3)."""
-    axis = machine.mirror_axis or 0
-    points, _ = _lifted(machine, position)
-    theta, scale = machine.inverse(points, built), np.ones_like(position)
     scale[:, axis] = position[:, axis] / points[:, axis]
-    rate: FloatArray = np.linalg.inv(machine.evaluate(theta, built).jacobian) * scale[:, None]
-    return rate
+    theta = machine.inverse(points, built)
+    own_rate: NDArray[Any] = np.linalg.inv(machine.evaluate(theta, built).jacobian)
+    return _Lifted(points, side, theta, own_rate, own_rate * scale[:, None])
 
 
 def _times(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
