@@ -8,6 +8,7 @@ the stops of the motors, count only if they are given (:mod:`tpm_gym.analysis.li
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -135,17 +136,31 @@ def aspects(
     if min_cells < 1:
         raise ConfigurationError("min_cells", min_cells, "at least 1")
     low, spacing, codes = _codes(branch, geometry, shape, limits)
+    found = []
+    for code, cells in regions(low, spacing, codes, min_cells):
+        sin_beta, level3, planar, elevation = (1 if code & bit else -1 for bit in _BITS)
+        assembly = AssemblyMode(planar=planar, sin_beta=sin_beta)
+        found.append(Aspect(branch, assembly, level3, elevation, geometry, limits, cells))
+    return tuple(found)
+
+
+def regions(
+    low: Vector, spacing: Vector, codes: IntArray, min_cells: int
+) -> Iterator[tuple[int, Cells]]:
+    """Yield code and cells of the connected regions of equal code, the largest first.
+
+    Args:
+        low: Corner of the grid with the smallest x, y, z, m.
+        spacing: Edges of a cell, m.
+        codes: (nx, ny, nz); negative for cells of no region.
+        min_cells: Fewest cells of a region.
+    """
     labels = components(codes)
     names, first, counts = np.unique(labels, return_index=True, return_counts=True)
-    found = []
     for index in np.argsort(-counts, kind="stable"):
         code = int(codes.flat[first[index]])
         if code >= 0 and counts[index] >= min_cells:
-            sin_beta, level3, planar, elevation = (1 if code & bit else -1 for bit in _BITS)
-            assembly = AssemblyMode(planar=planar, sin_beta=sin_beta)
-            cells = Cells(low, spacing, labels == names[index])
-            found.append(Aspect(branch, assembly, level3, elevation, geometry, limits, cells))
-    return tuple(found)
+            yield code, Cells(low, spacing, labels == names[index])
 
 
 def sample(rng: np.random.Generator, aspect: Aspect, count: int) -> FloatArray:

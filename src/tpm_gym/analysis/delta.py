@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tpm_gym.analysis.aspects import Cells, Shape, components
+from tpm_gym.analysis.aspects import Cells, Shape, regions
 from tpm_gym.analysis.poc import Chain, parallelogram_4r, parallelogram_4s, revolute
 from tpm_gym.arrays import FloatArray, IntArray, vector
 from tpm_gym.errors import ConfigurationError
@@ -99,16 +99,11 @@ def aspects(
     Raises:
         ConfigurationError: The shape is not possible.
     """
-    low, spacing, codes = _codes(bends, geometry, shape, within_stops)
-    labels = components(codes)
-    names, first, counts = np.unique(labels, return_index=True, return_counts=True)
-    found = []
-    for index in np.argsort(-counts, kind="stable"):
-        code = int(codes.flat[first[index]])
-        if code >= 0 and counts[index] >= min_cells:
-            cells = Cells(low, spacing, labels == names[index])
-            found.append(Aspect(2 * (code & 1) - 1, (code & 2) - 1, cells))
-    return tuple(found)
+    grid = _codes(bends, geometry, shape, within_stops)
+    return tuple(
+        Aspect(2 * (code & 1) - 1, (code & 2) - 1, cells)
+        for code, cells in regions(*grid, min_cells)
+    )
 
 
 def _codes(
