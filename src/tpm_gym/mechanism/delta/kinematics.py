@@ -101,11 +101,14 @@ def factors_at(
     """Compute the factors of :func:`factors` at points (..., 3) m in a working mode."""
 
     def text(point: Triple, ns: Namespace) -> list[Numbers]:
-        angles, real, _ = posture_at(point, bends, geometry, ns)
-        pose = pose_of(*arms_at(angles, geometry, ns), point, geometry)
-        return _factors(pose, real, geometry, ns)
+        return _factors(*_pose_at(point, bends, geometry, ns), geometry, ns)
 
     return Factors(*by_rows(text, finite_points("position", position)))
+
+
+def _pose_at(point: Triple, bends: Triple, g: AnyDelta, ns: Namespace) -> tuple[Pose, Numbers]:
+    angles, real, _ = posture_at(point, bends, g, ns)
+    return pose_of(*arms_at(angles, g, ns), point, g), real
 
 
 def _factors(pose: Pose, real: Numbers, g: AnyDelta, ns: Namespace) -> list[Numbers]:
@@ -121,8 +124,7 @@ def conditioning_at(
     """Compute 1/cond(J) (...,) at points (..., 3) m in a working mode; NaN out of reach."""
 
     def text(point: Triple, ns: Namespace) -> list[Numbers]:
-        angles, real, _ = posture_at(point, bends, geometry, ns)
-        pose = pose_of(*arms_at(angles, geometry, ns), point, geometry)
+        pose, real = _pose_at(point, bends, geometry, ns)
         return list(_or_nan(real, (conditioning_of(velocity(pose), ns),), ns))
 
     return by_rows(text, finite_points("position", position))[0]
