@@ -144,7 +144,7 @@ bench-cycle: $(INSTALLED) ## cycle times and torques of 25-305-25 mm in each eng
 
 bench-speed: $(INSTALLED) ## steps per second beside panda-gym and Gymnasium-Robotics
 	$(PIP) -e ".[bench]"
-	$(RUN) benchmarks/bench_speed.py --json docs/records/speed.json --plot docs/images/speed.png
+	$(RUN) benchmarks/bench_speed.py --json docs/records/speed.json
 	$(RUN) benchmarks/readme_numbers.py
 
 soak: $(INSTALLED) ## a million steps over all ids in PyBullet, and in MuJoCo: memory, loop gaps, speed; an hour
