@@ -28,6 +28,7 @@ from tpm_gym.learning.estimates import Estimate, wilson
 from tpm_gym.learning.figure_style import save, style
 from tpm_gym.learning.policies import load_policy
 from tpm_gym.learning.rollout import TEST_SEED, run_episodes
+from tpm_gym.simulation import Camera
 from tpm_gym.tasks.expert import Expert
 from tpm_gym.tasks.registry import TASKS
 from tpm_gym.tasks.task import Task
@@ -37,6 +38,8 @@ PAGES = GENERATED / "tasks"
 EPISODES = 200
 """Episodes of the expert in each id."""
 WIDTH, HEIGHT = 480, 360
+CAMERAS = {"crossing": Camera((0.0, -0.01, 0.10), 0.75, yaw=85.0, pitch=-22.0)}
+"""Cameras of films that the usual one does not suit: Crossing is seen along the plane it passes."""
 _ROLE = re.compile(r":\w+:`~?(?:[\w.]*\.)?(\w+)`")
 
 
@@ -285,7 +288,8 @@ def _draw_film(name: str) -> None:
     env_id = ids_of(name)[0]
     if importlib.util.find_spec("pybullet") is None or solved(env_id) is None:
         return
-    with closing(gym.make(env_id, render_mode="rgb_array", width=WIDTH, height=HEIGHT)) as env:
+    size: dict[str, Any] = {"width": WIDTH, "height": HEIGHT, "camera": CAMERAS.get(name, "table")}
+    with closing(gym.make(env_id, render_mode="rgb_array", **size)) as env:
         expert, frames, done = Expert(env), [], False
         observation, _ = env.reset(seed=TEST_SEED + 6)
         while not done:

@@ -49,6 +49,16 @@ def crossing(env: Any, seed: int) -> list[tuple[FloatArray, FloatArray, dict[str
 # -- the task --------------------------------------------------------------------------------------
 
 
+def test_a_stripe_on_the_table_shows_the_plane():
+    for machine in (PAPER_TPM, WIDE_TPM):
+        task = Crossing(machine)
+        (stripe,) = task.scene.patches
+        corners = [(*ends, 0.0) for ends in (stripe.low, stripe.high)]
+        near, far = machine.mount.to_paper(np.array(corners))[:, 1]
+        assert near == pytest.approx(-far)
+        assert 0 < abs(near) < 0.005
+
+
 @each_engine
 @each_machine
 @pytest.mark.parametrize("episodes", [4, pytest.param(100, marks=pytest.mark.slow)])

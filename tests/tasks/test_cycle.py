@@ -80,6 +80,19 @@ def test_the_way_is_on_the_gate():
         assert np.ptp(steps) < 1e-2 * steps.mean()
 
 
+def test_a_film_shows_the_payload_and_the_gate():
+    with closing(TPMEnv(Cycle, engine="analytic")) as env:
+        env.reset(seed=0)
+        ends, task = (env.goal, env.state.platform_position), env.task
+        first, *rest = task.markers(env.goal)
+        assert_allclose(np.sort([first, rest[-1]], axis=0), np.sort(ends, axis=0), atol=1e-9)
+        assert max(point[2] for point in rest) == pytest.approx(first[2] + RISE, abs=1e-4)
+        other, *_ = {solid.colour for solid in task.machine.mechanism.link("platform").solids} - {
+            solid.colour for solid in PAPER_TPM.mechanism.link("platform").solids
+        }
+        assert other == "red"
+
+
 @pytest.mark.parametrize("payload", LOADS)
 def test_the_timing_uses_what_the_motors_have_and_no_more(payload):
     task = loaded(payload)

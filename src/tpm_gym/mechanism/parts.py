@@ -54,7 +54,7 @@ def bar(
 def load(payload: float, centre: Vector) -> tuple[Solid, ...]:
     """Build a steel cube of ``payload`` (kg) in a gripper; nothing for 0 kg."""
     edge = (payload / STEEL) ** (1 / 3)
-    return (Solid("box", (edge, edge, edge), centre, STEEL, colour="steel"),) if payload else ()
+    return (Solid("box", (edge, edge, edge), centre, STEEL, colour="red"),) if payload else ()
 
 
 def rod(axis: Literal["x", "y"], length: float) -> tuple[Solid, ...]:

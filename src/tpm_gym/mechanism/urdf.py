@@ -37,6 +37,7 @@ COLOURS = {
     "blue": (0.12, 0.42, 0.78, 1.0),
     "yellow": (0.97, 0.77, 0.14, 1.0),
     "violet": (0.46, 0.25, 0.72, 1.0),
+    "red": (0.83, 0.18, 0.33, 1.0),
 }
 
 _MOMENTS = {f"i{'xyz'[i]}{'xyz'[j]}": (i, j) for i in range(3) for j in range(i, 3)}

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Final
 
 import numpy as np
 
 from tpm_gym.arrays import BoolArray, FloatArray
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.tpm.both_sides import both_sides
-from tpm_gym.simulation.state import State
+from tpm_gym.simulation.state import Patch, State
 from tpm_gym.tasks import sampling
 from tpm_gym.tasks.motion import Motion, Move
 from tpm_gym.tasks.task import Task
 
 __all__ = ["Crossing"]
+
+STRIPE: Final = 0.003
+"""Half width of the stripe that shows the plane on the table, m."""
+STRIPE_COLOUR: Final = (0.83, 0.18, 0.33, 1.0)
 
 
 class Crossing(Task):
@@ -44,6 +50,7 @@ class Crossing(Task):
         """Check the options, and that the machine can pass the plane."""
         both = both_sides(machine)
         self._axis = both.mirror_axis
+        self.scene = replace(type(self).scene, patches=(_stripe(both),))
         super().__init__(both, reward, goals, penalty_weight)
 
     def sample(
@@ -70,3 +77,11 @@ class Crossing(Task):
         yield from motion.go([goal], vacuum=False)
         while True:
             yield Move(goal, False)
+
+
+def _stripe(machine: Machine) -> Patch:
+    """Return a stripe on the table below the plane y = 0."""
+    ends = np.array([machine.region.low, machine.region.high])
+    ends[:, machine.mirror_axis] = -STRIPE, STRIPE
+    low, high = np.sort(machine.mount.to_world(ends)[:, :2], axis=0).tolist()
+    return Patch(tuple(low), tuple(high), STRIPE_COLOUR)

@@ -12,7 +12,7 @@ from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.motor import TORQUE_MOTOR
-from tpm_gym.simulation.state import CONTROL_PERIOD, Block, State
+from tpm_gym.simulation.state import CONTROL_PERIOD, Block, Scene, State
 from tpm_gym.tasks import sampling
 from tpm_gym.tasks.control import USABLE
 from tpm_gym.tasks.motion import Motion, Move
@@ -47,6 +47,8 @@ NEAR: Final = 0.010
 UNIT: Final = 0.005
 """Depth below the gate that costs 1 in each step, m."""
 POINTS: Final = 120
+SHOWN: Final = 12
+"""Number of points of the gate between two markers."""
 _DRAWS: Final = 1000
 
 
@@ -65,6 +67,7 @@ class Cycle(Task):
     not: it holds 12 N, and 0.1 kg needs up to 15 N here.
     """
 
+    scene = Scene(markers=POINTS // SHOWN + 1, marker_radius=0.004)
     tolerance = 0.002
     samplings = ("sampled", "tempting")
     control_period = 0.004
@@ -137,6 +140,12 @@ class Cycle(Task):
         z = self._level - np.interp(even, length, height)
         points = np.stack([x, np.full_like(x, y), z], axis=1)
         return points[::-1] if backwards else points
+
+    def markers(self, goal: FloatArray) -> FloatArray:
+        """Return points (k, 3) m of the gate, world."""
+        y = float(self.machine.mount.to_paper(goal)[1])
+        points: FloatArray = self.machine.mount.to_world(self.gate(y)[::SHOWN])
+        return points
 
     # -- Task -----------------------------------------------------------------------------------
 

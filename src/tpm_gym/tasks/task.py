@@ -128,11 +128,11 @@ class Task(ABC):
             raise ConfigurationError("goal_size", self.goal_size, "three for each point")
         if not (is_number(self.control_period) and self.control_period > 0):
             raise ConfigurationError("control_period", self.control_period, "a positive number")
+        self.machine, self.reward, self.goals = machine, reward, goals
         shown = len(self.markers(np.zeros(self.goal_size)))
         if shown != self.scene.markers:
             valid = f"{shown}, as a goal shows: scene = Scene(..., markers={shown})"
             raise ConfigurationError("markers", self.scene.markers, valid)
-        self.machine, self.reward, self.goals = machine, reward, goals
         self._within = self._not_lost()
         self._halves = np.array([block.height / 2 for block in self.scene.objects])
         self._robot = [("the robot at home", *box) for box in machine.occupied(machine.home)]
