@@ -49,8 +49,9 @@ def soaked(folder: Path, *options: str, **hooks: Any) -> tuple[int, dict[str, An
 def test_soak_goes_through_everything_and_passes(tmp_path, capsys, monkeypatch):
     for share in ("REOPEN", "RENDER", "SAVE"):
         monkeypatch.setattr(soak, share, 0.6)  # so that a short one sees all of it
+    monkeypatch.setattr(soak, "ENV_IDS", ["TPMReach-v0", PICK, "TPMPickAndPlaceJoints-v0"])
     plot = tmp_path / "soak.png"
-    status, content = soaked(tmp_path, "--steps", "4000", "--plot", str(plot))
+    status, content = soaked(tmp_path, "--plot", str(plot))
     output = capsys.readouterr().out
     assert status == 0, output
     assert content["failures"] == []

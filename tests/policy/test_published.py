@@ -57,6 +57,6 @@ def test_its_motors_need_the_same_torque_in_both_engines(name):
     for engine in ("pybullet", "mujoco"):
         with closing(make_envs(name, 1, engine=engine)) as envs:
             policy = policies.load_policy(str(POLICIES / f"{name}.json"), envs)
-            torques += [[r.torque_rms for r in run_episodes(envs, policy, 40, TEST_SEED)]]
+            torques += [[r.torque_rms for r in run_episodes(envs, policy, 20, TEST_SEED)]]
     pybullet, mujoco = (sum(one) for one in torques)
     assert mujoco == pytest.approx(pybullet, rel=0.02)
