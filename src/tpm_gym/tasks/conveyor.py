@@ -30,6 +30,7 @@ EDGE: Final = 0.030
 """Distance of goals from the end of the belt, m."""
 CLEARANCE: Final = 0.028
 """Height over the block, or over its place, at which the expert arrives and leaves, m."""
+UP: Final = np.array([0.0, 0.0, -CLEARANCE])  # paper z points down
 SEALING: Final = 4
 """Control steps to go along with the block until the cup has sealed."""
 GAP: Final = 0.010
@@ -149,37 +150,42 @@ class Conveyor(Task):
 
     def plan(self, motion: Motion) -> Iterator[Move]:
         """Bring one block after the other from the belt to its place in the tray."""
+        leave: list[FloatArray] = []
         for block, goal in zip(self.scene.objects, motion.goal.reshape(-1, 3), strict=True):
             camera = _Camera(self, motion, block)
-            yield from camera.watch(self._deliver(camera, goal))
+            yield from camera.watch(self._deliver(camera, goal, leave))
+            leave = [motion.command + UP]
+        yield from motion.go(leave, vacuum=False)
 
-    def _deliver(self, camera: _Camera, goal: FloatArray) -> Iterator[Move]:
+    def _deliver(
+        self, camera: _Camera, goal: FloatArray, leave: list[FloatArray]
+    ) -> Iterator[Move]:
         """Meet a block on the belt, pick it up while both move, and put it into the tray."""
-        motion, name, up = camera.motion, camera.block.name, np.array([0.0, 0.0, -CLEARANCE])
+        motion, name = camera.motion, camera.block.name
         while True:
-            yield from self._pick(camera)
+            yield from self._pick(camera, leave)
+            leave = []
             if not motion.holding(name):
                 continue
-            yield from motion.go([motion.command + up], True, name)  # paper z points down
+            yield from motion.go([motion.command + UP], True, name)
             place = self.machine.mount.to_paper(goal + camera.grip())
-            yield from motion.go([place + up, place], True, name)
+            yield from motion.go([place + UP, place], True, name, rounded=True)
             if motion.holding(name):
                 break
         yield from [Move(place, True), Move(place, True), Move(place, False)]  # the platform lags
-        yield from motion.go([place + up], vacuum=False)
 
-    def _pick(self, camera: _Camera) -> Iterator[Move]:
+    def _pick(self, camera: _Camera, leave: list[FloatArray]) -> Iterator[Move]:
         """Wait where the belt comes within reach, go along with the block, and seal."""
         motion, first = camera.motion, self._floor[0][0]
         gate = camera.above(CLEARANCE)
         gate[0] = self.machine.mount.to_paper(np.array([first, 0.0, 0.0]))[0]
-        for move in chain(motion.go([gate], vacuum=False), repeat(Move(gate, False))):
-            if camera.place()[0] >= first:
+        lifting = len(motion.trapezoid(motion.command, *leave)) if leave else 0
+        way = motion.go([*leave, gate], vacuum=False, rounded=True)
+        for step, move in enumerate(chain(way, repeat(Move(gate, False)))):
+            if step >= lifting and camera.place()[0] >= first:
                 break
             yield move
-        for height in (CLEARANCE, 0.0):
-            above = partial(camera.above, height)
-            yield from motion.meet(above, camera.step(), vacuum=height == 0)
+        yield from motion.meet(partial(camera.above, 0.0), camera.step(), UP)
         for _ in range(SEALING):
             if motion.holding(camera.block.name):
                 return

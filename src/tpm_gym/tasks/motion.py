@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -79,7 +80,11 @@ class Motion:
         return self.seen[entry]
 
     def go(
-        self, stops: list[FloatArray], vacuum: bool, while_holding: str | None = None
+        self,
+        stops: list[FloatArray],
+        vacuum: bool,
+        while_holding: str | None = None,
+        rounded: bool = False,
     ) -> Iterator[Move]:
         """Move in straight lines through ``stops`` (machine's frame), from rest to rest.
 
@@ -87,30 +92,48 @@ class Motion:
             stops: Points (3,) m.
             vacuum: Whether the vacuum is on.
             while_holding: Name of an object; the move ends early if the cup loses it.
+            rounded: Whether P cuts the corners at the stops instead of coming to rest there.
         """
-        for stop in stops:
-            start = self.command
-            for fraction in self.trapezoid(start, stop):
+        for part in [stops] if rounded else [[stop] for stop in stops]:
+            points = np.array([self.command, *part])
+            ways = [self.trapezoid(*ends) for ends in pairwise(points)]
+            for fractions in self._overlapped(ways):
                 if while_holding is not None and not self.holding(while_holding):
                     return
-                yield Move(start + fraction * (stop - start), vacuum)
+                yield Move(points[0] + fractions @ np.diff(points, axis=0), vacuum)
 
     def meet(
-        self, target: Callable[[], FloatArray], step: FloatArray, vacuum: bool
+        self, target: Callable[[], FloatArray], step: FloatArray, above: FloatArray
     ) -> Iterator[Move]:
-        """Approach a moving target, and end at rest relative to it.
+        """Approach a moving target, come down on it with vacuum, and end at rest relative to it.
 
         Args:
             target: Function that returns the command (3,) m that would meet the target at the end
                 of this control step, machine's frame.
             step: Way (3,) m of the target in a control step.
-            vacuum: Whether the vacuum is on.
+            above: Vector (3,) m from the target to the place from which P comes down.
         """
-        start, first = self.command, target() - step
+        start, place = self.command, target()
+        way = place + above - step - start
         # The way relative to the target is longer, as far as P needs a part of its speed to follow.
         spare = 1 - np.abs(step) / self._reach
-        for fraction in self.trapezoid(start, start + (first - start) / spare):
-            yield Move(target() - (1 - fraction) * (first - start), vacuum)
+        across = self.trapezoid(start, start + way / spare)
+        for done, down in self._overlapped([across, self.trapezoid(place + above, place)]):
+            yield Move(target() + (1 - down) * above - (1 - done) * way, bool(down > 0))
+
+    def _overlapped(self, ways: list[FloatArray]) -> FloatArray:
+        """Return fractions (n, k) of k ways, each begun while the one before slows down.
+
+        The sum of their speeds never exceeds the speed of one way.
+        """
+        lengths = np.array([len(way) for way in ways])
+        begins = np.cumsum([0, *np.maximum(lengths[:-1] - self._ramp + 1, 0)])
+        steps = np.arange((begins + lengths).max())
+        columns = [
+            np.r_[0.0, way][np.clip(steps - begin + 1, 0, len(way))]
+            for begin, way in zip(begins, ways, strict=True)
+        ]
+        return np.stack(columns, axis=1)
 
     def pick(self, block: Block, clearance: float) -> Iterator[Move]:
         """Come down on a block from ``clearance`` (m) above it, and wait for the seal.
