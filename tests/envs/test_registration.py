@@ -39,6 +39,17 @@ def test_all_ids_are_registered_under_their_documented_names():
     assert set(tpm_gym.ENV_IDS) <= set(gym.registry)
 
 
+@pytest.mark.parametrize("name", TASK_CLASSES)
+def test_the_datasheet_tells_sizes_and_lengths(name):
+    env = gym.make(f"TPM{name}-v0", engine="analytic")
+    sizes = [
+        env.action_space.shape[0],
+        *(env.observation_space[part].shape[0] for part in ("observation", "desired_goal")),
+        env.spec.max_episode_steps,
+    ]
+    assert f"| {name} | {' | '.join(map(str, sizes))} |" in TPMEnv.__doc__
+
+
 @pytest.mark.parametrize("env_id", tpm_gym.ENV_IDS)
 def test_an_id_means_what_it_says(env_id):
     env = gym.make(env_id, engine="analytic")  # which is made fastest

@@ -43,8 +43,21 @@ class TPMEnv(gym.Env[Observation, Action]):
 
     ## Ids
 
-    ``TPM{Reach,PickAndPlace}{,Joints}{,Dense}-v0``: Cartesian or joint increments, sparse or dense
-    reward. Control steps of 40 ms, episodes of 50 steps, truncation only. The numbers below apply
+    ``TPM<task>{,Joints}{,Dense}-v0``: Cartesian or joint increments, sparse or dense reward. The
+    classes of :mod:`tpm_gym.tasks` explain the tasks.
+
+    | task | action | observation | goal | steps | what to do |
+    | --- | --- | --- | --- | --- | --- |
+    | Reach | 3 | 9 | 3 | 50 | bring P to the goal |
+    | PickAndPlace | 4 | 21 | 3 | 50 | bring the block to the goal, on the table or above it |
+    | Push | 3 | 23 | 3 | 50 | shove the block to the goal |
+    | Stack | 4 | 33 | 6 | 100 | put the first block on the goal and the second on it |
+    | Throw | 4 | 21 | 3 | 60 | let the block go in flight; it slides to the goal |
+    | Conveyor | 4 | 22 | 3 | 80 | bring the block from the belt to the tray |
+    | Cycle | 3 | 9 | 3 | 75 | carry a payload 25 mm up, 305 mm across, 25 mm down, soon |
+    | Crossing | 3 | 9 | 3 | 50 | pass the parallel singularity; Cartesian increments only |
+
+    A control step takes 40 ms. Episodes are truncated, never terminated. The numbers below apply
     to the paper's machine.
 
     ## Frames
@@ -61,18 +74,19 @@ class TPMEnv(gym.Env[Observation, Action]):
     | --- | --- |
     | 0 to 2, Cartesian | increment of the command for P, paper's x, y, z: at most 30, 5, 30 mm |
     | 0 to 2, joints | increment of theta_1 to theta_3: at most 0.08 rad, P at most as above |
-    | 3 (PickAndPlace) | above 0: vacuum on |
+    | 3, with vacuum | above 0: vacuum on |
 
     Commands accumulate and are projected into the task region; P follows them along a B-spline. The
     region is -0.24 <= x <= 0.12, -0.046 <= y <= -0.012, 0.067 <= z <= 0.31 m for P, world. Small
     turns of the joints move P far along y. Therefore the limit for P slows most random joint
-    actions down to a tenth, all three joints together.
+    actions down to a tenth, all three joints together. Cycle has control steps of 4 ms, smaller
+    increments and bounded accelerations.
 
     ## Observation
 
-    A dictionary. ``achieved_goal`` and ``desired_goal`` are (3,) m in the world frame: point P
-    (Reach) or the centre of the block (PickAndPlace). ``observation``, 9 numbers (Reach) or 21,
-    has these entries, each scaled to order one (``env.unwrapped.task.decode`` gives SI units):
+    A dictionary. ``achieved_goal`` and ``desired_goal`` are points (m) in the world frame: P, or
+    the centre of each block. ``observation`` has these entries, each scaled to order one
+    (``env.unwrapped.task.decode`` gives SI units):
 
     | entry | size | meaning |
     | --- | --- | --- |
@@ -85,8 +99,9 @@ class TPMEnv(gym.Env[Observation, Action]):
     | object_tilt | 2 | x and y of the object's axis |
     | object_held | 1 | share of the vacuum that holds the object, by a gauge |
 
-    Entries of the object exist in PickAndPlace only. Entries of the robot come from the encoders
-    alone, never from the simulated platform.
+    Those of the object are repeated for each object. Push adds the object's turn about the
+    vertical, and Conveyor the speed of the belt. Entries of the robot come from the encoders alone,
+    never from the simulated platform.
 
     With ``observations="pixels"`` the dictionary has a fourth entry: ``pixels``, (84, 84, 3) uint8,
     a picture by the option ``camera``. ``observation`` keeps the entries of the robot, and those of
@@ -95,14 +110,16 @@ class TPMEnv(gym.Env[Observation, Action]):
 
     ## Reward
 
-    ``goal`` term + ``singularity`` term (+ ``approach`` term in PickAndPlaceDense).
+    ``goal`` term + ``singularity`` term (+ in dense rewards ``approach`` where there are objects,
+    or ``gate`` in Cycle).
 
     | term | value |
     | --- | --- |
-    | goal, sparse | 0 if the distance to the goal is below 10 mm, else -1 |
-    | goal, dense | minus the distance in units of 0.1 m |
+    | goal, sparse | 0 if the distance is below the tolerance, else -1: 10 mm, Throw 20, Cycle 2 |
+    | goal, dense | minus the distance in units of 0.1 m; Cycle: more near the goal |
     | singularity | -penalty_weight x (1 - (c / 0.08)^4) where c = 1/cond(J) < 0.08, else 0 |
     | approach | minus half the distance from cup to block in units of 0.1 m |
+    | gate | minus the depth of P below the way over the gate, in units of 5 mm |
 
     SB3's HerReplayBuffer calls ``compute_reward`` with an empty info, which gives the goal term
     alone. ``tpm_gym.learning.PenaltyHerReplayBuffer`` keeps the other terms; so does SB3's buffer
@@ -110,9 +127,9 @@ class TPMEnv(gym.Env[Observation, Action]):
 
     ## Start
 
-    The arm is at rest at home, and the block (square, 36 mm wide, 30 mm high, 50 g) flat on the
-    table. The goal is at least 30 mm away from the start of the block (or of P). Goals and objects
-    are sampled where 1/cond(J) >= 0.08.
+    The arm is at rest at home (Cycle: at one end), and blocks (square, 36 mm wide, 30 mm high,
+    50 g) are flat on the table or the belt. Goals and objects are sampled where
+    1/cond(J) >= 0.08, at least 30 mm away from each other (Reach: from P).
     ``reset(options={"object": (x, y, z), "goal": (x, y, z)})`` sets both; a block that starts above
     the table falls.
 
