@@ -45,6 +45,7 @@ STUDIES: Final = (
             "TPMThrow-v0",
             "TPMConveyorDense-v0",
             "TPMCycle-v0",
+            "TPMCrossing-v0",
         ),
     ),
     Study("penalty", engine="analytic"),
