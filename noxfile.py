@@ -7,6 +7,7 @@ install a CPU build of PyTorch: pip's default on Linux includes CUDA.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import nox
@@ -21,15 +22,14 @@ PYTHONS = ["3.10", "3.11", "3.12", "3.13", "3.14"]
 @nox.session(python=PYTHONS)
 def newest(session: nox.Session) -> None:
     """Run the fast tests with the newest versions that pyproject.toml admits."""
-    session.install("--upgrade", ".[test]")
-    _test(session)
+    _test(session, "--upgrade")
 
 
 @nox.session(python=PYTHONS[0])
 def lowest(session: nox.Session) -> None:
     """Run the fast tests with the lowest versions that pyproject.toml admits."""
-    session.install("--resolution", "lowest-direct", ".[test]")
-    _test(session, "-W", "default::DeprecationWarning")  # what old packages use of newer ones
+    old = ("-W", "default::DeprecationWarning")  # what old packages use of newer ones
+    _test(session, "--resolution", "lowest-direct", options=old)
 
 
 @nox.session(python="3.11")
@@ -52,8 +52,11 @@ def package(session: nox.Session) -> None:
     session.run("bash", "-c", f"check-wheel-contents {folder}/*.whl", external=True)
 
 
-def _test(session: nox.Session, *options: str) -> None:
+def _test(session: nox.Session, *versions: str, options: Sequence[str] = ()) -> None:
+    # uv keeps the wheel of a folder until its pyproject.toml changes.
+    session.install("--reinstall-package", "tpm-gym", *versions, ".[test]")
     session.run("uv", "pip", "freeze", external=True)
+    session.run("python", "tests/support/compile_all.py")
     session.run("pytest", "-q", "-n", "logical", "--maxprocesses", "8", *options, *session.posargs)
 
 
