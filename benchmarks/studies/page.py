@@ -263,7 +263,7 @@ def _training_table(runs: Frame) -> Frame:
             **_successes(group),
             "steps to 95%": _or_never(group.learned_steps.median(), "{:,.0f}"),
             "minutes in all": f"{group.minutes.median():.1f}",
-            "minutes of CPU": _cell(group.cpu_minutes.median(), "{:.1f}"),
+            "minutes of CPU": _cell(group.cpu_minutes.dropna().median(), "{:.1f}"),
         }
         for group in groups(runs)
         for first in group.head(1).itertuples()
