@@ -58,6 +58,7 @@ def write_pages(modules: Sequence[str] = ()) -> None:
         _draw_film(name)
         _draw_curves(name)
         write(PAGES / f"{name}.md", "\n".join(page(name)))
+    write(GENERATED / "tasks.txt", "\n".join(summary()))
     for old in PAGES.glob("*"):
         if not any(old.name.startswith(f"{name}.") or old.stem == name for name in TASKS):
             old.unlink()
@@ -72,9 +73,7 @@ def page(name: str) -> Iterator[str]:
     ids = ids_of(name)
     tasks = {env_id: _task(env_id) for env_id in ids}
     task = next(iter(tasks.values()))
-    title = name.replace("_", " ").capitalize()
-    doc = _sentences(TASKS[name])
-    yield from (f"# {title}", "", *doc, "")
+    yield from (f"# {_title(name)}", "", *_sentences(TASKS[name]), "")
     if _film(name).exists():
         seconds = task.control_period * _steps(ids[0])
         yield from (f"![The scripted expert in {ids[0]}, {seconds:g} s]({_film(name).name})", "")
@@ -87,10 +86,21 @@ def page(name: str) -> Iterator[str]:
     yield from _learning(name)
 
 
+def summary() -> Iterator[str]:
+    """Yield a line of a list for each task: a link to its page, and its first sentence."""
+    for name in sorted(TASKS):
+        first = _sentences(TASKS[name])[0]
+        yield f"- [{_title(name)}](generated/tasks/{name}.md): {first}"
+
+
 def ids_of(name: str) -> list[str]:
     """Return the ids of a task, those with sparse rewards first."""
     specs = [gym.spec(env_id) for env_id in tpm_gym.ENV_IDS]
     return [spec.id for spec in specs if spec.kwargs["task"] == name]
+
+
+def _title(name: str) -> str:
+    return name.replace("_", " ").capitalize()
 
 
 def _task(env_id: str) -> Task:

@@ -11,7 +11,7 @@ from paths import ROOT
 from tpm_gym.tasks.registry import TASKS
 
 pytest.importorskip("sphinx")
-from website import docstrings, projects, sources, tasks
+from website import docstrings, projects, sources, tables, tasks
 
 
 @pytest.fixture(scope="module")
@@ -72,6 +72,19 @@ def test_tables_and_headings_in_docstrings_become_those_of_sphinx():
     assert lines[0] == r"Text \|y\|."
     assert ".. rubric:: Head" in lines
     assert lines[lines.index("   * - a") + 1 :][:3] == ["     - b", "   * - `x|y`", "     - 2"]
+
+
+def test_intervals_and_quantities_in_tables_keep_to_one_line():
+    cell = "| 100.0% [99.1, 100.0] (1.5 to never) at 37 N m of [a, b] |"
+    tied = "| 100.0% [99.1,~100.0] (1.5~to~never) at 37~N~m of [a, b] |"
+    text = f"In [1, 2]\n{cell}"
+    assert tables.whole(text).replace("\N{NO-BREAK SPACE}", "~") == f"In [1, 2]\n{tied}"
+
+
+def test_the_list_of_tasks_has_a_sentence_for_each():
+    lines = list(tasks.summary())
+    assert len(lines) == len(TASKS)
+    assert "- [Reach](generated/tasks/reach.md): Bring point P" in "\n".join(lines)
 
 
 @pytest.mark.slow
