@@ -44,7 +44,7 @@ def test_an_export_is_one_page_with_an_episode(tmp_path, capsys):
     assert [file.name for file in page.parent.iterdir()] == ["index.html"]
     text = page.read_text(encoding="utf-8")
     assert "__VISER_EMBED_DATA__=" in text
-    assert page.stat().st_size < 2e6
+    assert page.stat().st_size < 3e6
     run(ViewConfig(export=page.parent))  # an earlier page is replaced
     assert not re.search(r"""<(script|link|img)[^>]*(src|href)=["']?https?:""", text)
 
