@@ -3,8 +3,9 @@
     python benchmarks/bench_cloning.py
 
 ``tpm-gym collect`` makes the datasets, Minari loads them. Each seed learns from episodes of its
-own. Networks and optimiser are those that PPO starts from with demonstrations; each training takes
-the same number of updates. Policies are tested in the analytic engine, in the episodes that
+own, by the same number of updates of :func:`tpm_gym.learning.cloning.clone`. Speeds and the
+command are hidden from the networks: the last action can be read from them, and a network that sees
+them repeats it. Policies are tested in the analytic engine, in the episodes that
 ``tpm-gym evaluate`` takes. Results go to docs/records/cloning.json, and from there to
 docs/datasets.md.
 """
@@ -14,7 +15,7 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from itertools import product
 from pathlib import Path
@@ -22,6 +23,7 @@ from typing import Any, Final
 
 import numpy as np
 import torch
+from gymnasium import spaces
 from minari import MinariDataset
 from numpy.typing import NDArray
 from shared import ROOT, describe, fill, read_record, table
@@ -46,11 +48,35 @@ UPDATES: Final = 2000
 BATCH: Final = 256  # of clone()
 EPISODES: Final = 200
 """Test episodes of each policy."""
-NETWORK: Final[dict[str, Any]] = {
-    "net_arch": [128, 128],
-    "features_extractor_class": GoalGapExtractor,
-    "features_extractor_kwargs": {"unit": 0.02},
-}
+HIDDEN: Final = ("velocity", "command", "object_velocity")
+"""Entries of the observation that the networks do not see."""
+
+
+class Places(GoalGapExtractor):
+    """Features without the entries of the observation that tell the last action."""
+
+    def __init__(self, observation_space: spaces.Dict, shown: Sequence[bool]) -> None:
+        """Set which numbers of the observation are shown."""
+        super().__init__(observation_space, unit=0.02)
+        self.register_buffer("shown", torch.tensor(shown, dtype=torch.float32))
+
+    def forward(self, observations: dict[str, torch.Tensor]) -> torch.Tensor:
+        """Return the features of a batch."""
+        seen = observations["observation"] * self.shown
+        return super().forward(observations | {"observation": seen})
+
+
+def network(env_id: str, hidden: Sequence[str]) -> dict[str, Any]:
+    """Return the arguments of a policy whose networks do not see the entries ``hidden``."""
+    with closing(make_envs(env_id, 1, engine="analytic")) as envs:
+        entries = envs.task.entries
+    shown = [entry.name not in hidden for entry in entries for _ in entry.scale]
+    return {
+        "net_arch": [128, 128],
+        "activation_fn": torch.nn.ReLU,
+        "features_extractor_class": Places,
+        "features_extractor_kwargs": {"shown": shown},
+    }
 
 
 def steps_of(dataset: MinariDataset, first: int, count: int) -> tuple[dict[str, Any], NDArray[Any]]:
@@ -61,28 +87,32 @@ def steps_of(dataset: MinariDataset, first: int, count: int) -> tuple[dict[str, 
     return seen, np.concatenate([e.actions for e in episodes])
 
 
-def learn(dataset: MinariDataset, env_id: str, size: int, seed: int, updates: int) -> list[bool]:
+def learn(
+    dataset: MinariDataset, env_id: str, size: int, seed: int, options: argparse.Namespace
+) -> list[bool]:
     """Clone a policy from ``size`` episodes; return the outcomes of its test."""
     seen, actions = steps_of(dataset, seed * max(SIZES), size)
     batches = -(-len(actions) // BATCH)
-    options: dict[str, Any] = {"engine": "analytic", "autoreset_mode": "SameStep"}
-    with closing(AnalyticVecEnv(make_envs(env_id, 2, **options))) as few:
-        model = PPO("MultiInputPolicy", few, seed=seed, policy_kwargs=NETWORK, device="cpu")
-        clone(model, seen, actions, np.zeros(len(actions)), -(-updates // batches))
+    made: dict[str, Any] = {"engine": "analytic", "autoreset_mode": "SameStep"}
+    with closing(AnalyticVecEnv(make_envs(env_id, 2, **made))) as few:
+        policy = network(env_id, options.hide)
+        model = PPO("MultiInputPolicy", few, seed=seed, policy_kwargs=policy, device="cpu")
+        clone(model, seen, actions, np.zeros(len(actions)), -(-options.updates // batches))
     with closing(make_envs(env_id, EPISODES, engine="analytic")) as envs:
         records = run_episodes(envs, TrainedPolicy(model), EPISODES, TEST_SEED)
     return [record.success_at_end for record in records]
 
 
-def measure(updates: int, seeds: int, folder: Path) -> Iterator[dict[str, Any]]:
+def measure(options: argparse.Namespace, folder: Path) -> Iterator[dict[str, Any]]:
     """Collect the datasets, and yield a row for each id, kind and size."""
-    episodes = seeds * max(SIZES)
-    collect(CollectConfig(env=IDS, kind=KINDS, episodes=episodes, out=folder))
+    seeds = range(options.seeds)
     for kind, env_id in product(KINDS, IDS):
+        episodes = options.seeds * max(SIZES)
+        collect(CollectConfig(env=(env_id,), kind=(kind,), episodes=episodes, out=folder))
         dataset = MinariDataset(folder / env_id / f"{kind}-v0" / "data")
         shown = [bool(episode.infos["is_success"][-1]) for episode in dataset]
         for size in SIZES:
-            tests = [learn(dataset, env_id, size, seed, updates) for seed in range(seeds)]
+            tests = [learn(dataset, env_id, size, seed, options) for seed in seeds]
             row = {
                 **{"env": env_id, "kind": kind, "episodes": size},
                 "shown": wilson(shown).as_dict(),
@@ -114,6 +144,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--updates", type=int, default=UPDATES, help="updates of each training")
     parser.add_argument("--seeds", type=int, default=SEEDS)
+    parser.add_argument("--hide", nargs="*", default=HIDDEN, help="hidden entries")
     parser.add_argument("--only-page", action="store_true", help="write the page, measure nothing")
     args = parser.parse_args()
     if not args.only_page:
@@ -121,9 +152,9 @@ def main() -> None:
         about = describe(sys.argv)
         with tempfile.TemporaryDirectory() as folder:
             rows = []
-            for row in measure(args.updates, args.seeds, Path(folder)):
+            for row in measure(args, Path(folder)):
                 rows.append(row)
-                counts = {"updates": args.updates, "tested": EPISODES}
+                counts = {"updates": args.updates, "tested": EPISODES, "hidden": list(args.hide)}
                 write_json(RECORD, {**about, **counts, "rows": rows})
     fill(PAGE, "cloning", lines(read_record(RECORD)))
 
