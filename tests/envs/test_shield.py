@@ -1,5 +1,6 @@
 """With a shield, no action leads near a singularity, and the nearest safe one is played."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -115,6 +116,24 @@ def test_safe_commands_stay_as_they_are(machine: Machine, kind: str) -> None:
         np.testing.assert_array_equal(played[safe], wanted[safe])
         kept += int(safe.sum())
     assert kept > 1000
+
+
+def test_the_path_is_safe_where_its_ends_are_and_its_middle_is_not() -> None:
+    def conditioning_at(points: Any) -> Any:
+        return 0.2 - 0.15 * np.exp(-(((np.asarray(points)[..., 0] - home[0] - 0.015) / 0.006) ** 2))
+
+    home, names = np.array(PAPER_TPM.home), ("name", "home", "region", "step_limit")
+    own = {name: getattr(PAPER_TPM, name) for name in names}
+    machine: Any = SimpleNamespace(conditioning_at=conditioning_at, **own)
+    shield = Shield(machine, make_control("cartesian", PAPER_TPM), 0.08)
+    recent = np.tile(home, (1, 2, 1))
+    wanted = home + [[PAPER_TPM.step_limit[0], 0.0, 0.0]]
+    assert conditioning_at(wanted) > 0.15
+    assert (
+        lowest(machine, recent, wanted)
+        < 0.08
+        <= lowest(machine, recent, shield.command(wanted, recent))
+    )
 
 
 @pytest.mark.parametrize("kind", ["cartesian", "joints"])
