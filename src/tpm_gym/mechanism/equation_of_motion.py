@@ -9,7 +9,8 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from functools import cached_property
+from typing import Any, ClassVar, NamedTuple
 
 from numpy.typing import ArrayLike
 
@@ -17,6 +18,8 @@ from tpm_gym.arrays import FloatArray, Vector, finite, finite_points, is_tensor,
 from tpm_gym.errors import ConfigurationError, InputError, SingularityError, UnreachableError
 from tpm_gym.kinematics.equations import Triple
 from tpm_gym.kinematics.namespaces import Namespace, Numbers, by_rows, namespace_of
+from tpm_gym.mechanism.bodies import Mechanism
+from tpm_gym.mechanism.inertia import Bodies
 from tpm_gym.mechanism.mount import GRAVITY
 
 _REST = (0.0, 0.0, 0.0)
@@ -27,6 +30,26 @@ class Energy(NamedTuple):
 
     kinetic: FloatArray
     potential: FloatArray
+
+
+class Formulas(NamedTuple):
+    """Functions of one mechanism, for a geometry, a configuration and constants of the bodies.
+
+    Attributes:
+        build: Mechanism of a geometry.
+        inertia_of: Constants of bodies and a geometry, with the mass ``platform``.
+        torques: Torques for a configuration, rates, their changes, gravity and constants.
+        masses: Upper triangle of M, by rows, for a configuration, J and constants.
+        velocity: Rows of J of a configuration.
+        potential: Potential energy (J) for a configuration, gravity and constants.
+    """
+
+    build: Callable[[Any], Mechanism]
+    inertia_of: Callable[[Bodies, Any], Any]
+    torques: Callable[[Any, Triple, Triple, Triple, Any], Triple]
+    masses: Callable[[Any, tuple[Triple, Triple, Triple], Any], tuple[Numbers, ...]]
+    velocity: Callable[[Any], tuple[Triple, Triple, Triple]]
+    potential: Callable[[Any, Triple, Any], Numbers]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,6 +64,7 @@ class EquationOfMotion(ABC):
     parallel singularity.
 
     Attributes:
+        geometry: Lengths.
         link_masses: Factors of mass and inertia, one for each moving link, in the mechanism's
             order; empty if all are 1.
         payload: Mass that the cup carries, kg.
@@ -51,9 +75,12 @@ class EquationOfMotion(ABC):
             at the first use.
     """
 
+    geometry: Any
     link_masses: tuple[float, ...] = ()
     payload: float = 0.0
     free_fall: Vector = (0.0, 0.0, GRAVITY)
+
+    _formulas: ClassVar[Formulas]
 
     def __post_init__(self) -> None:
         """Reject masses that are not possible."""
@@ -63,6 +90,13 @@ class EquationOfMotion(ABC):
         if factors.ndim != 1 or not ((factors > 0) & (factors < math.inf)).all():
             raise ConfigurationError("link_masses", self.link_masses, "positive factors")
         vector("free_fall", self.free_fall, ConfigurationError)
+
+    @cached_property
+    def inertia(self) -> Any:
+        """Constants of the bodies, with the payload."""
+        bodies = Bodies(self._formulas.build(self.geometry), self.link_masses)
+        found = self._formulas.inertia_of(bodies, self.geometry)
+        return found._replace(platform=found.platform + self.payload)
 
     def torque(self, theta: ArrayLike, theta_dot: ArrayLike, theta_ddot: ArrayLike) -> FloatArray:
         """Compute the motors' torques (..., 3) N m, M theta_ddot + C theta_dot + g."""
@@ -81,7 +115,7 @@ class EquationOfMotion(ABC):
 
     def mass_matrix(self, theta: ArrayLike) -> FloatArray:
         """Compute the mass matrix M, (..., 3, 3) kg m^2, symmetric and positive."""
-        return self._rows(lambda pose: [_symmetric(self._masses(pose))], {"theta": theta})[0]
+        return self._rows(lambda pose: [self._masses(pose)], {"theta": theta})[0]
 
     def coriolis(self, theta: ArrayLike, theta_dot: ArrayLike) -> FloatArray:
         """Compute C (..., 3, 3) kg m^2/s from Christoffel's symbols, so that M' - 2 C is skew."""
@@ -105,7 +139,7 @@ class EquationOfMotion(ABC):
         def results(pose: Any, rates: Triple, given: Triple) -> list[Numbers]:
             bias = self._torques(pose, rates, _REST, self.free_fall)
             rest = tuple(one - other for one, other in zip(given, bias, strict=True))
-            return [_symmetric(self._masses(pose)), rest]
+            return [self._masses(pose), rest]
 
         states = {"theta": theta, "theta_dot": theta_dot, "torque": torque}
         mass, rest = self._rows(results, states)
@@ -116,9 +150,9 @@ class EquationOfMotion(ABC):
         """Compute kinetic and potential energy, (...,) J."""
 
         def results(pose: Any, rates: Triple) -> list[Numbers]:
-            pairs = zip(_symmetric(self._masses(pose)), rates, strict=True)
+            pairs = zip(self._masses(pose), rates, strict=True)
             twice = sum(u * m * v for row, u in pairs for m, v in zip(row, rates, strict=True))
-            return [twice / 2, self._potential(pose)]
+            return [twice / 2, self._formulas.potential(pose, self.free_fall, self.inertia)]
 
         return Energy(*self._rows(results, {"theta": theta, "theta_dot": theta_dot}))
 
@@ -127,20 +161,16 @@ class EquationOfMotion(ABC):
         """Assemble the mechanism; return whether it is real, and whether it is regular."""
 
     @abstractmethod
-    def _torques(self, pose: Any, rates: Triple, changes: Triple, gravity: Triple) -> Triple:
-        """Compute the torques for rates, their changes and gravity."""
-
-    @abstractmethod
-    def _masses(self, pose: Any) -> tuple[Numbers, ...]:
-        """Compute the upper triangle of M, by rows."""
-
-    @abstractmethod
-    def _potential(self, pose: Any) -> Numbers:
-        """Compute the potential energy, J."""
-
-    @abstractmethod
     def _refusal(self, theta: Vector) -> UnreachableError | SingularityError:
         """Explain why there is no equation of motion at theta (3,) rad."""
+
+    def _torques(self, pose: Any, rates: Triple, changes: Triple, gravity: Triple) -> Triple:
+        return self._formulas.torques(pose, rates, changes, gravity, self.inertia)
+
+    def _masses(self, pose: Any) -> tuple[Triple, Triple, Triple]:
+        upper = self._formulas.masses(pose, self._formulas.velocity(pose), self.inertia)
+        a, b, c, d, e, f = upper
+        return (a, b, c), (b, d, e), (c, e, f)
 
     def _rows(
         self, text: Callable[..., Sequence[Numbers]], states: Mapping[str, ArrayLike]
@@ -158,11 +188,6 @@ class EquationOfMotion(ABC):
             a, b, c = table[..., :3][missing != 0][0].tolist()
             raise self._refusal((a, b, c))
         return found
-
-
-def _symmetric(upper: tuple[Numbers, ...]) -> tuple[Triple, Triple, Triple]:
-    a, b, c, d, e, f = upper
-    return (a, b, c), (b, d, e), (c, e, f)
 
 
 def _side_by_side(states: Mapping[str, ArrayLike]) -> FloatArray:

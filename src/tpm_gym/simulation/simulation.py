@@ -277,9 +277,6 @@ class Simulation:
             theta = theta + self._bias + last
             rates = rates + (last - before) / self.control_period
         position, jacobian, conditioning, _ = self.machine.evaluate(theta)
-        if self.machine.mirror_axis is not None:
-            axis = self.machine.mirror_axis
-            position, jacobian = self._mirrored(axis, now.position, position, jacobian)
         if math.isnan(np.vdot(conditioning, conditioning)):  # faster than isnan().any()
             # With bias and noise, the encoders may report joint positions at which no assembly
             # exists. Then the last valid result is kept, as a real controller would do.
@@ -289,12 +286,7 @@ class Simulation:
             conditioning[lost] = self._conditioning[lost]
         self._position, self._jacobian, self._conditioning = position, jacobian, conditioning
         if self.machine.mirror_axis is not None:
-            # Next to the plane, J theta_dot has no bound. So bound it by twice the fastest command.
-            axis = self.machine.mirror_axis
-            speed = np.abs((jacobian[:, axis] * rates).sum(axis=1))
-            most = 2 * self.machine.step_limit[axis] / CONTROL_PERIOD
-            jacobian = jacobian.copy()
-            jacobian[:, axis] *= (most / np.maximum(speed, most))[:, None]
+            position, jacobian = self._mirrored(now.position, rates, position, jacobian)
         gap = now.gap
         place, velocity, command, axis, assembly, working, closed = self.loops.in_world(
             position, jacobian, rates, self._commands,
@@ -328,7 +320,7 @@ class Simulation:
         return self._state
 
     def _mirrored(
-        self, axis: int, truth: FloatArray, position: FloatArray, jacobian: FloatArray
+        self, truth: FloatArray, rates: FloatArray, position: FloatArray, jacobian: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Mirror P (n, 3) m and J (n, 3, 3) of robots beyond the plane that the machine may pass.
 
@@ -339,20 +331,25 @@ class Simulation:
         not change the joint positions on the path.
 
         Args:
-            axis: Axis normal to the plane.
             truth: (n, 3) m, P of the platform, world.
+            rates: (n, 3) rad/s, of the encoders.
             position: P by forward kinematics in the machine's assembly mode.
             jacobian: J at ``position``.
         """
-        machine, there = self.machine, self.machine.mount.to_paper(truth)[:, axis]
+        machine = self.machine
+        axis = machine.mirror_axis or 0
+        there, limit = machine.mount.to_paper(truth)[:, axis], machine.step_limit[axis]
         sign = np.where(there * machine.home[axis] < 0, -1.0, 1.0)
         position, jacobian = position.copy(), jacobian.copy()
         position[:, axis] *= sign
         # In the plane, encoders do not show the velocity normal to it: J is infinite. So damp it.
-        distance, blur = position[:, axis], _BLUR * machine.step_limit[axis]
+        distance, blur = position[:, axis], _BLUR * limit
         jacobian[:, axis] *= (sign * distance**2 / (distance**2 + blur**2))[:, None]
+        # Next to the plane, J theta_dot has no bound. So bound it by twice the fastest command.
+        speed, most = np.abs((jacobian[:, axis] * rates).sum(axis=1)), 2 * limit / CONTROL_PERIOD
+        jacobian[:, axis] *= (most / np.maximum(speed, most))[:, None]
         reached = self.recent[:, :, axis].mean(axis=1)  # by the path
-        turned = (there * reached < 0) & (np.abs(reached) > machine.step_limit[axis])
+        turned = (there * reached < 0) & (np.abs(reached) > limit)
         self._commands[turned, :, axis] *= -1.0
         return position, jacobian
 

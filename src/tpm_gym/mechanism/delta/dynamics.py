@@ -13,8 +13,7 @@ Units are SI. In the base's frame, gravity points along +z, as the base hangs up
 """
 
 from dataclasses import dataclass
-from functools import cached_property
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 from tpm_gym.arrays import Vector
 from tpm_gym.errors import SingularityError, UnreachableError
@@ -38,8 +37,8 @@ from tpm_gym.mechanism.delta.equations import (
 )
 from tpm_gym.mechanism.delta.geometry import IRB_360, DeltaGeometry
 from tpm_gym.mechanism.delta.kinematics import no_assembly
-from tpm_gym.mechanism.equation_of_motion import EquationOfMotion
-from tpm_gym.mechanism.inertia import Bodies, Swing, swing_force
+from tpm_gym.mechanism.equation_of_motion import EquationOfMotion, Formulas
+from tpm_gym.mechanism.inertia import Swing, swing_force
 
 
 class _Leg(NamedTuple):
@@ -210,25 +209,11 @@ class DeltaDynamics(EquationOfMotion):
     geometry: DeltaGeometry = IRB_360
     side: float = 1.0
 
-    @cached_property
-    def inertia(self) -> Inertia:
-        """Constants of the bodies."""
-        bodies = Bodies(build(self.geometry), self.link_masses)
-        found = inertia_of(bodies, self.geometry)
-        return found._replace(platform=found.platform + self.payload)
+    _formulas: ClassVar = Formulas(build, inertia_of, torques, masses, velocity, potential)
 
     def _pose(self, theta: Triple, ns: Namespace) -> tuple[Pose, Numbers, Numbers]:
         pose, real = pose_at(theta, self.side, self.geometry, ns)
         return pose, real, regular(pose, self.geometry)
-
-    def _torques(self, pose: Pose, rates: Triple, changes: Triple, gravity: Triple) -> Triple:
-        return torques(pose, rates, changes, gravity, self.inertia)
-
-    def _masses(self, pose: Pose) -> tuple[Numbers, ...]:
-        return masses(pose, velocity(pose), self.inertia)
-
-    def _potential(self, pose: Pose) -> Numbers:
-        return potential(pose, self.free_fall, self.inertia)
 
     def _refusal(self, theta: Vector) -> UnreachableError | SingularityError:
         return no_assembly(theta, self.side, self.geometry)

@@ -24,8 +24,7 @@ with a Pose take the numbers of :mod:`tpm_gym.kinematics.equations`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 from tpm_gym.arrays import Vector
 from tpm_gym.errors import SingularityError, UnreachableError
@@ -35,8 +34,8 @@ from tpm_gym.kinematics.geometry import PAPER, AnyLengths, Geometry
 from tpm_gym.kinematics.jacobian import factors, require_regular
 from tpm_gym.kinematics.namespaces import Namespace, Numbers
 from tpm_gym.mechanism.equation_of_motion import Energy as Energy
-from tpm_gym.mechanism.equation_of_motion import EquationOfMotion
-from tpm_gym.mechanism.inertia import Bodies, swing_force
+from tpm_gym.mechanism.equation_of_motion import EquationOfMotion, Formulas
+from tpm_gym.mechanism.inertia import swing_force
 from tpm_gym.mechanism.tpm.bodies import build
 from tpm_gym.mechanism.tpm.inertia import Inertia, inertia_of
 
@@ -252,6 +251,11 @@ def gather(pose: Pose, at_c: tuple[Numbers, Numbers], at_p: Triple) -> Triple:
     return f.leg1 * (x * r2z - z * r2x), f.leg2 * (z * r1x - x * r1z), f.leg3 * rod3
 
 
+def velocity(pose: Pose) -> tuple[Triple, Triple, Triple]:
+    """Compute the rows of J, m/rad."""
+    return equations.velocity(pose.rods, pose.factors)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Dynamics(EquationOfMotion):
     """The dynamics of the TPM; see :class:`EquationOfMotion`.
@@ -264,25 +268,11 @@ class Dynamics(EquationOfMotion):
     geometry: Geometry = PAPER
     branch: AssemblyMode = DEFAULT_ASSEMBLY
 
-    @cached_property
-    def inertia(self) -> Inertia:
-        """Constants of the bodies."""
-        bodies = Bodies(build(self.geometry), self.link_masses)
-        found = inertia_of(bodies, self.geometry)
-        return found._replace(platform=found.platform + self.payload)
+    _formulas: ClassVar = Formulas(build, inertia_of, torques, masses, velocity, potential)
 
     def _pose(self, theta: Triple, ns: Namespace) -> tuple[Pose, Numbers, Numbers]:
         pose, real = pose_at(theta, self.branch.signs, self.geometry, ns)
         return pose, real, equations.regular(pose.factors, self.geometry)
-
-    def _torques(self, pose: Pose, rates: Triple, changes: Triple, gravity: Triple) -> Triple:
-        return torques(pose, rates, changes, gravity, self.inertia)
-
-    def _masses(self, pose: Pose) -> tuple[Numbers, ...]:
-        return masses(pose, equations.velocity(pose.rods, pose.factors), self.inertia)
-
-    def _potential(self, pose: Pose) -> Numbers:
-        return potential(pose, self.free_fall, self.inertia)
 
     def _refusal(self, theta: Vector) -> UnreachableError | SingularityError:
         try:

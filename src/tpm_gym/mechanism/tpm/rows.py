@@ -20,6 +20,7 @@ compilable(
     dynamics.torques,
     dynamics.carried,
     dynamics.masses,
+    dynamics.velocity,
     dynamics.velocities,
     dynamics.accelerations,
     dynamics.gather,
@@ -70,10 +71,6 @@ def _regular(pose: Pose, g: Lengths) -> bool:
     return regular
 
 
-def _velocity(pose: Pose) -> tuple[Triple, Triple, Triple]:
-    return equations.velocity(pose.rods, pose.factors)
-
-
 def _same_side(_at: Pose, point: Triple, modes: Modes, _g: Lengths) -> bool:
     side: bool = point[1] * modes[1] > 0.0
     return side
@@ -83,6 +80,7 @@ def _gather(pose: Pose, force: Triple) -> Triple:
     return dynamics.gather(pose, (0.0, 0.0), force)
 
 
-_OWN = _modes, _lengths, _inertia, _posture, _pose, _position, _regular, _velocity, _same_side
-compilable(*_OWN, _gather)
-LOOPS = loops("tpm", 7, 23, Equations(*_OWN, dynamics.torques, _gather, dynamics.masses))
+_OWN = _modes, _lengths, _inertia, _posture, _pose, _position, _regular
+compilable(*_OWN, _same_side, _gather)
+_DYNAMICS = dynamics.torques, _gather, dynamics.masses
+LOOPS = loops("tpm", 7, 23, Equations(*_OWN, dynamics.velocity, _same_side, *_DYNAMICS))
