@@ -45,7 +45,7 @@ class CompiledMachine(Machine):
         points = _rows(position)
         theta = np.empty(points.shape)
         of = self._own if built is None else self._others(built, points)
-        self._loops.inverse(points.reshape(-1, 3), *of, theta.reshape(-1, 3))
+        self._loops.inverse((points.reshape(-1, 3),), 0.0, *of, (theta.reshape(-1, 3),))
         return theta
 
     def forward(self, theta: ArrayLike, built: FloatArray | None = None) -> FloatArray:
@@ -53,7 +53,7 @@ class CompiledMachine(Machine):
         angles = _rows(theta)
         position = np.empty(angles.shape)
         of = self._own if built is None else self._others(built, angles)
-        self._loops.forward(angles.reshape(-1, 3), *of, position.reshape(-1, 3))
+        self._loops.forward((angles.reshape(-1, 3),), 0.0, *of, (position.reshape(-1, 3),))
         return position
 
     def evaluate(self, theta: ArrayLike, built: FloatArray | None = None) -> Reading:
@@ -64,7 +64,7 @@ class CompiledMachine(Machine):
         count = len(flat)
         position, jacobian = empty((count, 3)), empty((count, 3, 3))
         found = Reading(position, jacobian, empty(count), empty(count, np.bool_))
-        self._loops.evaluate(flat, *of, *found)
+        self._loops.evaluate((flat,), 0.0, *of, tuple(found))
         return found if angles.ndim == 2 else Reading(*_shaped(found, angles))
 
     def conditioning_at(self, position: ArrayLike) -> FloatArray:
@@ -72,7 +72,7 @@ class CompiledMachine(Machine):
         points = _rows(position)
         found = np.empty(points.shape[:-1])
         self._loops.conditioning_at(
-            points.reshape(-1, 3), SAME_PLACE, *self._own, found.reshape(-1)
+            (points.reshape(-1, 3),), SAME_PLACE, *self._own, (found.reshape(-1),)
         )
         return found
 
@@ -80,7 +80,7 @@ class CompiledMachine(Machine):
         """See :class:`Machine`."""
         points = _rows(position)
         found = np.empty(points.shape[:-1], np.bool_)
-        self._loops.same_side(points.reshape(-1, 3), *self._own, found.reshape(-1))
+        self._loops.same_side((points.reshape(-1, 3),), 0.0, *self._own, (found.reshape(-1),))
         return found
 
     def mode_left(
@@ -92,9 +92,8 @@ class CompiledMachine(Machine):
             raise InputError("position", points.shape, f"of shape {angles.shape}, like theta")
         left = np.empty(angles.shape[:-1], np.int8)
         of = self._own if built is None else self._others(built, angles)
-        self._loops.mode_left(
-            angles.reshape(-1, 3), points.reshape(-1, 3), ASSEMBLY_LIMIT, *of, left.reshape(-1)
-        )
+        flat = angles.reshape(-1, 3), points.reshape(-1, 3)
+        self._loops.mode_left(flat, ASSEMBLY_LIMIT, *of, (left.reshape(-1),))
         return left
 
     def torque(
@@ -107,14 +106,12 @@ class CompiledMachine(Machine):
     ) -> FloatArray:
         """See :class:`Machine`."""
         angles = _rows(theta)
-        others = (theta_dot, theta_ddot, *(() if force is None else (force,)))
-        inputs = [angles, *(_alike(values, angles) for values in others)]
-        if force is None:
-            inputs.append(np.empty((0, 3)))
+        inputs = [angles, _alike(theta_dot, angles), _alike(theta_ddot, angles)]
+        inputs.append(np.zeros(angles.shape) if force is None else _alike(force, angles))
         torques = np.empty(angles.shape)
         of = self._own if built is None else self._others(built, angles)
-        flat = (values.reshape(-1, 3) for values in inputs)
-        self._loops.torque(*flat, *of, torques.reshape(-1, 3))
+        flat = tuple(values.reshape(-1, 3) for values in inputs)
+        self._loops.torque(flat, 0.0, *of, (torques.reshape(-1, 3),))
         return torques
 
     def motion(
@@ -127,7 +124,7 @@ class CompiledMachine(Machine):
         count = len(flat)
         place = empty((count, 3)), empty((count, 3, 3)), empty(count, np.bool_)
         found = Motion(*place, empty((count, 3, 3)), empty((count, 3)))
-        self._loops.motion(flat, rates.reshape(-1, 3), *of, *found)
+        self._loops.motion((flat, rates.reshape(-1, 3)), 0.0, *of, tuple(found))
         return found if angles.ndim == 2 else Motion(*_shaped(found, angles))
 
     @cached_property

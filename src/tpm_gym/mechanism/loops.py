@@ -1,10 +1,10 @@
 """Compiled loops over rows of a mechanism's kinematics and dynamics.
 
-Row i of the m rows of an input is of the machine ``built[i // (m // b)]``, of b machines. A row of
-``built`` (b, k) holds the lengths (m) and the constants of the dynamics. ``machine`` holds the
-signs of the modes, and at its end gravity (3) m/s^2. Results are written to the last arguments, NaN
-where there is none. Each row is computed by itself, so that it has the same bits alone and among
-thousands.
+A loop takes a tuple of inputs (m, 3), ``limit`` (m), ``built``, ``machine``, and a tuple of arrays
+for its results, which are NaN where there is none. Row i of m is of the machine
+``built[i // (m // b)]``, of b machines. A row of ``built`` (b, k) holds the lengths (m) and the
+constants of the dynamics. ``machine`` holds the signs of the modes, and at its end gravity (3)
+m/s^2. Each row is computed by itself, so that it has the same bits alone and among thousands.
 
 Rows are copied to columns of a block, over which the compiler computes several rows at a time.
 """
@@ -15,8 +15,9 @@ from types import SimpleNamespace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numba import literal_unroll
 
-from tpm_gym.arrays import BoolArray, FloatArray, IntArray
+from tpm_gym.arrays import FloatArray
 from tpm_gym.compiling import compilable, kept
 from tpm_gym.kinematics import compiled as functions
 from tpm_gym.kinematics.equations import Triple, conditioning
@@ -74,6 +75,16 @@ def _put(columns: FloatArray, first: int, j: int, values: Triple, real: bool) ->
     columns[first + 2, j] = values[2] if real else math.nan
 
 
+def _place(
+    columns: FloatArray, j: int, position: Triple, rows: tuple[Triple, Triple, Triple], real: bool
+) -> None:
+    """Set the first columns of a row to P and to the rows of J."""
+    _put(columns, 0, j, position, real)
+    _put(columns, 3, j, rows[0], real)
+    _put(columns, 6, j, rows[1], real)
+    _put(columns, 9, j, rows[2], real)
+
+
 def _fill(built: FloatArray, start: int, count: int, each: int, own: FloatArray) -> None:
     """Fill the columns ``own`` with the machine parameters of the rows from ``start`` on.
 
@@ -94,8 +105,12 @@ def _read(rows: FloatArray, start: int, count: int, columns: FloatArray, first: 
         columns[first + 2, j] = rows[start + j, 2]
 
 
-def _write(columns: FloatArray, first: int, start: int, count: int, rows: FloatArray) -> None:
-    """Copy columns from ``first`` on to rows (m, 3) or (m, 3, 3)."""
+def _write(columns: FloatArray, first: int, start: int, count: int, rows: Any) -> int:
+    """Copy columns to rows (m,), (m, 3) or (m, 3, 3); return the column after them."""
+    if rows.ndim == 1:
+        for j in range(count):
+            rows[start + j] = columns[first, j]
+        return first + 1
     for j in range(count):
         for k in range(3):  # loops of constant length are unrolled
             if rows.ndim == 2:
@@ -103,9 +118,21 @@ def _write(columns: FloatArray, first: int, start: int, count: int, rows: FloatA
             else:
                 for i in range(3):
                     rows[start + j, k, i] = columns[first + 3 * k + i, j]
+    return first + (3 if rows.ndim == 2 else 9)
 
 
-compilable(get, _put, _fill, _read, _write)
+compilable(get, _put, _place, _fill, _read, _write)
+
+
+class _Block(NamedTuple):
+    """Columns of a block: machine parameters, inputs and results; and what all rows share."""
+
+    own: FloatArray
+    given: FloatArray
+    found: FloatArray
+    modes: Any
+    fall: Triple
+    limit: float
 
 
 def loops(name: str, few: int, many: int, equations: Equations) -> SimpleNamespace:
@@ -117,220 +144,121 @@ def loops(name: str, few: int, many: int, equations: Equations) -> SimpleNamespa
         many: Number of lengths and constants of the dynamics.
         equations: Functions of the mechanism.
     """
-    (modes_of, lengths, inertia, posture, pose, position_of, regular, velocity, on_side, torques,
-     gather, masses) = equations  # fmt: skip
+    found = SimpleNamespace()
+    for size, rows in (few, _kinematics(equations)), (many, _dynamics(equations)):
+        for row, width in rows.items():
+            loop = _loop(row, equations.modes, size, width)
+            # Machine code on disk is found by this name: each mechanism needs its own.
+            loop.__qualname__ = f"{name}.{row.__name__}"
+            setattr(found, row.__name__, kept(loop))
+    return found
 
-    def place(columns: FloatArray, j: int, at: Any, real: bool) -> tuple[Triple, Triple, Triple]:
-        """Set the first columns of a row to P and to the rows of J, and return these."""
-        rows: tuple[Triple, Triple, Triple] = velocity(at)
-        _put(columns, 0, j, position_of(at), real)
-        _put(columns, 3, j, rows[0], real)
-        _put(columns, 6, j, rows[1], real)
-        _put(columns, 9, j, rows[2], real)
-        return rows
 
-    compilable(place)
+def _loop(row: Callable[..., None], modes_of: Callable[..., Any], size: int, width: int) -> Any:
+    """Return the loop over blocks that computes column j of ``width`` results by ``row``."""
+    compilable(row)
 
-    def inverse(
-        position: FloatArray, built: FloatArray, machine: FloatArray, theta: FloatArray
+    def loop(
+        inputs: Any, limit: float, built: FloatArray, machine: FloatArray, results: Any
     ) -> None:
-        """Compute joint positions (m, 3) for P at ``position`` (m, 3)."""
-        modes = modes_of(machine)
-        own, given, found = np.empty((few, _BLOCK)), np.empty((3, _BLOCK)), np.empty((3, _BLOCK))
-        each = len(position) // len(built)
-        for start in range(0, len(position), _BLOCK):
-            count = min(_BLOCK, len(position) - start)
-            _fill(built, start, count, each, own)
-            _read(position, start, count, given, 0)
-            for j in range(count):
-                angles, real = posture(get(given, 0, j), modes, lengths(own, j))
-                _put(found, 0, j, angles, real)
-            _write(found, 0, start, count, theta)
-
-    def forward(
-        theta: FloatArray, built: FloatArray, machine: FloatArray, position: FloatArray
-    ) -> None:
-        """Compute P (m, 3) at joint positions (m, 3), in the modes of the machine."""
-        modes = modes_of(machine)
-        own, given, found = np.empty((few, _BLOCK)), np.empty((3, _BLOCK)), np.empty((3, _BLOCK))
-        each = len(theta) // len(built)
-        for start in range(0, len(theta), _BLOCK):
-            count = min(_BLOCK, len(theta) - start)
-            _fill(built, start, count, each, own)
-            _read(theta, start, count, given, 0)
-            for j in range(count):
-                at, _, working = pose(get(given, 0, j), modes, lengths(own, j))
-                _put(found, 0, j, position_of(at), working)
-            _write(found, 0, start, count, position)
-
-    def evaluate(
-        theta: FloatArray,
-        built: FloatArray,
-        machine: FloatArray,
-        position: FloatArray,
-        jacobian: FloatArray,
-        conditionings: FloatArray,
-        working: BoolArray,
-    ) -> None:
-        """Compute P (m, 3), J (m, 3, 3), 1/cond(J) (m,) and whether in the working mode (m,)."""
-        modes = modes_of(machine)
-        own, given, found = np.empty((few, _BLOCK)), np.empty((3, _BLOCK)), np.empty((14, _BLOCK))
-        each = len(theta) // len(built)
-        for start in range(0, len(theta), _BLOCK):
-            count = min(_BLOCK, len(theta) - start)
-            _fill(built, start, count, each, own)
-            _read(theta, start, count, given, 0)
-            for j in range(count):
-                g = lengths(own, j)
-                at, there, found[13, j] = pose(get(given, 0, j), modes, g)
-                real = there & regular(at, g)
-                rows = place(found, j, at, real)
-                found[12, j] = conditioning(rows, NS) if real else math.nan
-            _write(found, 0, start, count, position)
-            _write(found, 3, start, count, jacobian)
-            for j in range(count):
-                conditionings[start + j], working[start + j] = found[12, j], found[13, j] > 0.0
-
-    def conditioning_at(
-        position: FloatArray,
-        limit: float,
-        built: FloatArray,
-        machine: FloatArray,
-        conditionings: FloatArray,
-    ) -> None:
-        """Compute 1/cond(J) (m,) for P at ``position`` (m, 3); 0 where the machine's modes end."""
-        modes = modes_of(machine)
-        own, given = np.empty((few, _BLOCK)), np.empty((3, _BLOCK))
-        each = len(position) // len(built)
-        for start in range(0, len(position), _BLOCK):
-            count = min(_BLOCK, len(position) - start)
-            _fill(built, start, count, each, own)
-            _read(position, start, count, given, 0)
-            for j in range(count):
-                g, point = lengths(own, j), get(given, 0, j)
-                angles, reached = posture(point, modes, g)
-                at, there, _ = pose(angles, modes, g)
-                x, y, z = position_of(at)
-                near = (abs(x - point[0]) < limit) & (abs(y - point[1]) < limit)
-                known = reached & there & regular(at, g) & near & (abs(z - point[2]) < limit)
-                conditionings[start + j] = conditioning(velocity(at), NS) if known else 0.0
-
-    def torque(
-        theta: FloatArray,
-        theta_dot: FloatArray,
-        theta_ddot: FloatArray,
-        force: FloatArray,
-        built: FloatArray,
-        machine: FloatArray,
-        found_torques: FloatArray,
-    ) -> None:
-        """Compute the motors' torques (m, 3) N m for a motion against forces on P (m, 3) N."""
         modes, fall = modes_of(machine), (machine[-3], machine[-2], machine[-1])
-        own, given, found = np.empty((many, _BLOCK)), np.zeros((12, _BLOCK)), np.empty((3, _BLOCK))
-        each = len(theta) // len(built)
-        for start in range(0, len(theta), _BLOCK):
-            count = min(_BLOCK, len(theta) - start)
-            _fill(built, start, count, each, own)
-            _read(theta, start, count, given, 0)
-            _read(theta_dot, start, count, given, 3)
-            _read(theta_ddot, start, count, given, 6)
-            if len(force):
-                _read(force, start, count, given, 9)
+        own, found = np.empty((size, _BLOCK)), np.empty((width, _BLOCK))
+        given, rows = np.empty((3 * len(inputs), _BLOCK)), len(inputs[0])
+        block = _Block(own, given, found, modes, fall, limit)
+        for start in range(0, rows, _BLOCK):
+            count = min(_BLOCK, rows - start)
+            _fill(built, start, count, rows // len(built), own)
+            for k in range(len(inputs)):
+                _read(inputs[k], start, count, given, 3 * k)
             for j in range(count):
-                g, bodies = lengths(own, j), inertia(own, j)
-                at, there, _ = pose(get(given, 0, j), modes, g)
-                one, two, three = torques(at, get(given, 3, j), get(given, 6, j), fall, bodies)
-                a, b, c = gather(at, get(given, 9, j))
-                _put(found, 0, j, (one - a, two - b, three - c), there & regular(at, g))
-            _write(found, 0, start, count, found_torques)
+                row(block, j)
+            first = 0
+            for result in literal_unroll(results):
+                first = _write(found, first, start, count, result)
 
-    def motion(
-        theta: FloatArray,
-        theta_dot: FloatArray,
-        built: FloatArray,
-        machine: FloatArray,
-        position: FloatArray,
-        jacobian: FloatArray,
-        working: BoolArray,
-        mass: FloatArray,
-        bias: FloatArray,
-    ) -> None:
-        """Compute P (m, 3), J (m, 3, 3), the mode (m,), masses (m, 3, 3) and bias (m, 3)."""
-        modes, fall = modes_of(machine), (machine[-3], machine[-2], machine[-1])
-        own, given, found = np.empty((many, _BLOCK)), np.empty((6, _BLOCK)), np.empty((25, _BLOCK))
-        each = len(theta) // len(built)
-        for start in range(0, len(theta), _BLOCK):
-            count = min(_BLOCK, len(theta) - start)
-            _fill(built, start, count, each, own)
-            _read(theta, start, count, given, 0)
-            _read(theta_dot, start, count, given, 3)
-            for j in range(count):
-                g, bodies = lengths(own, j), inertia(own, j)
-                at, there, found[24, j] = pose(get(given, 0, j), modes, g)
-                real = there & regular(at, g)
-                rows = place(found, j, at, real)
-                a, b, c, d, e, f = masses(at, rows, bodies)
-                _put(found, 12, j, (a, b, c), real)
-                _put(found, 15, j, (b, d, e), real)
-                _put(found, 18, j, (c, e, f), real)
-                _put(found, 21, j, torques(at, get(given, 3, j), _NONE, fall, bodies), real)
-            _write(found, 0, start, count, position)
-            _write(found, 3, start, count, jacobian)
-            _write(found, 12, start, count, mass)
-            _write(found, 21, start, count, bias)
-            for j in range(count):
-                working[start + j] = found[24, j] > 0.0
+    return loop
 
-    def mode_left(
-        theta: FloatArray,
-        position: FloatArray,
-        limit: float,
-        built: FloatArray,
-        machine: FloatArray,
-        left: IntArray,
-    ) -> None:
-        """Find the mode (m,) that is left with P at ``position`` (m, 3): 1 assembly, 2 working."""
-        modes = modes_of(machine)
-        own, given = np.empty((few, _BLOCK)), np.empty((6, _BLOCK))
-        each = len(theta) // len(built)
-        for start in range(0, len(theta), _BLOCK):
-            count = min(_BLOCK, len(theta) - start)
-            _fill(built, start, count, each, own)
-            _read(theta, start, count, given, 0)
-            _read(position, start, count, given, 3)
-            for j in range(count):
-                g, point = lengths(own, j), get(given, 3, j)
-                at, there, working = pose(get(given, 0, j), modes, g)
-                x, y, z = position_of(at)
-                off2 = (x - point[0]) ** 2 + (y - point[1]) ** 2 + (z - point[2]) ** 2
-                same = there & on_side(at, point, modes, g) & (off2 <= limit * limit)
-                left[start + j] = (0 if working else 2) if same else 1
 
-    def same_side(
-        position: FloatArray, built: FloatArray, machine: FloatArray, side: BoolArray
-    ) -> None:
-        """Find whether P at ``position`` (m, 3) is not beyond a parallel singularity, (m,).
+def _kinematics(equations: Equations) -> dict[Callable[..., None], int]:
+    """Return functions of row j of a block, which need the lengths alone: {function: results}."""
+    _, lengths, _, posture, pose, position_of, regular, velocity, on_side, *_ = equations
+
+    def inverse(block: _Block, j: int) -> None:
+        """Compute joint positions (3) for P."""
+        angles, real = posture(get(block.given, 0, j), block.modes, lengths(block.own, j))
+        _put(block.found, 0, j, angles, real)
+
+    def forward(block: _Block, j: int) -> None:
+        """Compute P (3) at joint positions, in the modes of the machine."""
+        at, _, working = pose(get(block.given, 0, j), block.modes, lengths(block.own, j))
+        _put(block.found, 0, j, position_of(at), working)
+
+    def evaluate(block: _Block, j: int) -> None:
+        """Compute P (3), J (9), 1/cond(J) and whether in the working mode, at joint positions."""
+        g, found = lengths(block.own, j), block.found
+        at, there, found[13, j] = pose(get(block.given, 0, j), block.modes, g)
+        real, rows = there & regular(at, g), velocity(at)
+        _place(found, j, position_of(at), rows, real)
+        found[12, j] = conditioning(rows, NS) if real else math.nan
+
+    def conditioning_at(block: _Block, j: int) -> None:
+        """Compute 1/cond(J) for P; 0 where P is off by the limit in the machine's modes."""
+        g, point, limit = lengths(block.own, j), get(block.given, 0, j), block.limit
+        angles, reached = posture(point, block.modes, g)
+        at, there, _ = pose(angles, block.modes, g)
+        x, y, z = position_of(at)
+        near = (abs(x - point[0]) < limit) & (abs(y - point[1]) < limit)
+        known = reached & there & regular(at, g) & near & (abs(z - point[2]) < limit)
+        block.found[0, j] = conditioning(velocity(at), NS) if known else 0.0
+
+    def mode_left(block: _Block, j: int) -> None:
+        """Find the mode that is left at joint positions with P: 0, 1 assembly or 2 working."""
+        g, point = lengths(block.own, j), get(block.given, 3, j)
+        at, there, working = pose(get(block.given, 0, j), block.modes, g)
+        x, y, z = position_of(at)
+        off2 = (x - point[0]) ** 2 + (y - point[1]) ** 2 + (z - point[2]) ** 2
+        near = off2 <= block.limit * block.limit
+        same = there & on_side(at, point, block.modes, g) & near
+        block.found[0, j] = (0.0 if working else 2.0) if same else 1.0
+
+    def same_side(block: _Block, j: int) -> None:
+        """Find whether P is not beyond a parallel singularity.
 
         Points out of reach are beyond a serial singularity instead.
         """
-        modes = modes_of(machine)
-        own, given = np.empty((few, _BLOCK)), np.empty((3, _BLOCK))
-        each = len(position) // len(built)
-        for start in range(0, len(position), _BLOCK):
-            count = min(_BLOCK, len(position) - start)
-            _fill(built, start, count, each, own)
-            _read(position, start, count, given, 0)
-            for j in range(count):
-                g, point = lengths(own, j), get(given, 0, j)
-                angles, real = posture(point, modes, g)
-                at, _, _ = pose(angles, modes, g)
-                side[start + j] = (not real) | on_side(at, point, modes, g)
+        g, point = lengths(block.own, j), get(block.given, 0, j)
+        angles, real = posture(point, block.modes, g)
+        at, _, _ = pose(angles, block.modes, g)
+        block.found[0, j] = (not real) | on_side(at, point, block.modes, g)
 
-    found = SimpleNamespace()
-    for loop in (
-        inverse, forward, evaluate, conditioning_at, torque, motion, mode_left, same_side
-    ):  # fmt: skip
-        # Machine code on disk is found by this name: each mechanism needs its own.
-        loop.__qualname__ = f"{name}.{loop.__name__}"
-        setattr(found, loop.__name__, kept(loop))
-    return found
+    return {inverse: 3, forward: 3, evaluate: 14, conditioning_at: 1, mode_left: 1, same_side: 1}
+
+
+def _dynamics(equations: Equations) -> dict[Callable[..., None], int]:
+    """Return functions of row j of a block, which need all constants: {function: results}."""
+    _, lengths, inertia, _, pose, position_of, regular, velocity, _, torques, gather, masses = (
+        equations
+    )
+
+    def torque(block: _Block, j: int) -> None:
+        """Compute the motors' torques (3) N m for a motion (9) against a force on P (3) N."""
+        g, given = lengths(block.own, j), block.given
+        at, there, _ = pose(get(given, 0, j), block.modes, g)
+        rates, changes, bodies = get(given, 3, j), get(given, 6, j), inertia(block.own, j)
+        one, two, three = torques(at, rates, changes, block.fall, bodies)
+        a, b, c = gather(at, get(given, 9, j))
+        _put(block.found, 0, j, (one - a, two - b, three - c), there & regular(at, g))
+
+    def motion(block: _Block, j: int) -> None:
+        """Compute P (3), J (9), whether in the working mode, masses (9) and bias (3)."""
+        g, bodies, found = lengths(block.own, j), inertia(block.own, j), block.found
+        at, there, found[12, j] = pose(get(block.given, 0, j), block.modes, g)
+        real, rows = there & regular(at, g), velocity(at)
+        _place(found, j, position_of(at), rows, real)
+        a, b, c, d, e, f = masses(at, rows, bodies)
+        _put(found, 13, j, (a, b, c), real)
+        _put(found, 16, j, (b, d, e), real)
+        _put(found, 19, j, (c, e, f), real)
+        _put(found, 22, j, torques(at, get(block.given, 3, j), _NONE, block.fall, bodies), real)
+
+    return {torque: 3, motion: 25}
