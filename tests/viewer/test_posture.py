@@ -8,6 +8,8 @@ import pytest
 from tpm_gym import PAPER_TPM, WIDE_TPM, TPMError
 from tpm_gym.errors import InputError, UnreachableError
 from tpm_gym.kinematics import ELBOWS_OUT, WORKING_MODES
+from tpm_gym.mechanism import DELTA
+from tpm_gym.mechanism.delta import geometry as delta
 from tpm_gym.viewer.posture import OPERATIONS, Posture, at_joints, at_point
 
 MACHINES = PAPER_TPM, WIDE_TPM
@@ -49,6 +51,28 @@ def test_the_joints_of_a_posture_lead_back_to_it_in_its_assembly_mode(machine):
         back = at_joints(machine, posture.theta, posture.assembly)
         assert back.position == pytest.approx(posture.position, abs=1e-6)
         assert back.working == posture.working
+
+
+def test_a_delta_closes_in_all_modes_and_its_joints_lead_back():
+    rng, found = np.random.default_rng(0), []
+    for mode in delta.WORKING_MODES:
+        for point in rng.uniform((-0.8, -0.8, -1.4), (0.8, 0.8, 1.4), (25, 3)):
+            try:
+                posture = at_point(DELTA, point, "translating", mode)
+            except UnreachableError:
+                continue
+            found.append(posture)
+            assert posture.working == mode
+            assert posture.gap < 1e-9
+            assert posture.places["platform"].point(DELTA.mechanism.point_p) == pytest.approx(point)
+            if posture.conditioning > 1e-3:
+                back = at_joints(DELTA, posture.theta, posture.assembly)
+                assert back.position == pytest.approx(point, abs=1e-9)
+    assert len({(posture.working, posture.assembly) for posture in found}) == 16
+    home = at_point(DELTA, DELTA.home, "translating", delta.ELBOWS_OUT)
+    assert home.conditioning == pytest.approx(float(DELTA.conditioning_at(DELTA.home)))
+    with pytest.raises(UnreachableError):
+        at_joints(DELTA, (3.0, 0.0, 0.0), 1.0)
 
 
 def test_of_several_tilts_the_nearest_is_taken():

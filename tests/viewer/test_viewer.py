@@ -169,6 +169,27 @@ def test_another_machine_is_shown_at_its_home(viewer):
     assert drawn_gap(viewer) < 1e-9
 
 
+def test_a_delta_is_dragged_turned_and_plays_the_expert(viewer):
+    choose(viewer, viewer.machine, "delta")
+    explore = viewer.explore
+    assert not explore.link_7.visible
+    do(viewer, lambda: explore.drag((0.2, -0.1, 1.0)))
+    assert explore.posture.position == pytest.approx((0.2, -0.1, 1.0))
+    choose(viewer, explore.bends, "out / in / out")
+    assert explore.posture.working == (1.0, -1.0, 1.0)
+    choose(viewer, explore.assembly, "P above the elbows")
+    assert explore.posture.position[2] < 0
+    for name in LAYERS:
+        choose(viewer, viewer.shown[name], True)
+    assert drawn_gap(viewer) < 1e-9
+    choose(viewer, viewer.play.env_id, "TPMPickAndPlace-v0")
+    for _ in range(3):
+        do(viewer, viewer.play.step)
+        assert drawn_gap(viewer) < 1e-9
+    assert explore.posture.theta == pytest.approx(viewer.play.player.state.theta)
+    do(viewer, viewer.play.discard)
+
+
 @pytest.mark.parametrize("env_id", tpm_gym.ENV_IDS)
 def test_every_task_is_played_with_closed_loops(viewer, env_id):
     play = viewer.play
@@ -300,7 +321,7 @@ def test_options_that_are_not_possible_are_refused(options, name):
 
 
 def test_a_machine_of_another_kind_is_refused():
-    with pytest.raises(ConfigurationError, match=r"tpm_gym\.TPM"):
+    with pytest.raises(ConfigurationError, match="a TPM or a Delta"):
         open_viewer(GANTRY)
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from tpm_gym.errors import MissingPackageError
 
 if TYPE_CHECKING:
+    from tpm_gym.mechanism import Delta
     from tpm_gym.mechanism.tpm import TPM
     from tpm_gym.viewer.viewer import Viewer
 
@@ -23,7 +24,7 @@ class ViewConfig:
     """Show the robot in the browser: drag it, see its singularities, and play episodes."""
 
     machine: str = "paper"
-    """Machine that is shown first: paper, wide, or another registered TPM."""
+    """Machine that is shown first: paper, wide, delta, or another registered TPM or Delta."""
 
     host: str = "127.0.0.1"
     """Address to listen on. Other computers reach the page only with another address."""
@@ -37,18 +38,18 @@ class ViewConfig:
 
 
 def open_viewer(
-    machine: str | TPM = "paper", *, host: str = "127.0.0.1", port: int = 8080
+    machine: str | TPM | Delta = "paper", *, host: str = "127.0.0.1", port: int = 8080
 ) -> Viewer:
     """Start a viewer in the background; ``.address`` is its page and ``.close()`` ends it.
 
     Args:
-        machine: Name of a machine, or a :class:`tpm_gym.TPM`.
+        machine: Name of a machine, or a TPM or Delta.
         host: Address to listen on.
         port: Port to listen on; if it is taken, the next free one.
 
     Raises:
         MissingPackageError: If viser is not installed.
-        ConfigurationError: If the machine is no TPM, or an option is not possible.
+        ConfigurationError: If the machine is of another kind, or an option is not possible.
     """
     try:
         from tpm_gym.viewer.viewer import Viewer
@@ -62,7 +63,7 @@ def run(config: ViewConfig) -> None:
 
     Raises:
         MissingPackageError: If viser is not installed.
-        ConfigurationError: If the machine is no TPM, or an option is not possible.
+        ConfigurationError: If the machine is of another kind, or an option is not possible.
     """
     if config.export is not None:
         try:

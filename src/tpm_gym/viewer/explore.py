@@ -17,6 +17,8 @@ from tpm_gym.kinematics import (
     RotatedMode,
     WorkingMode,
 )
+from tpm_gym.mechanism import Delta
+from tpm_gym.mechanism.delta import geometry as delta
 from tpm_gym.mechanism.tpm import TPM
 from tpm_gym.viewer.posture import OPERATIONS, Operation, Posture, at_joints, at_point
 from tpm_gym.viewer.scene import ROBOT
@@ -107,11 +109,16 @@ class Explore:
 
     # -- machine ------------------------------------------------------------------------------
 
-    def set_machine(self, machine: TPM) -> None:
+    def set_machine(self, machine: TPM | Delta) -> None:
         """Show another machine, at its home and in its modes."""
         self._machine = machine
         # Motors whose arms point level outwards, in the machine's own modes: elbows are out.
-        self._out = np.array(machine.working_mode.signs[1:])
+        tpm = isinstance(machine, TPM)
+        self._out = np.array(
+            machine.working_mode.signs[1:] if isinstance(machine, TPM) else delta.ELBOWS_OUT
+        )
+        self.operation.options = OPERATIONS if tpm else OPERATIONS[:1]
+        self.link_7.visible = tpm
         self.gizmo = self._server.scene.add_transform_controls(
             f"{ROBOT}/P", 0.16, disable_rotations=True, depth_test=False, line_width=3.0
         )
@@ -126,10 +133,13 @@ class Explore:
     # -- postures -----------------------------------------------------------------------------
 
     @property
-    def working(self) -> WorkingMode:
+    def working(self) -> Any:
         """Working mode that the panel asks for."""
         bends = [1 if word == "out" else -1 for word in self.bends.value.split(" / ")]
-        return WorkingMode(_LINK_7[self.link_7.value], *(np.array(bends) * self._out))
+        signs = tuple(np.array(bends) * self._out)
+        if isinstance(self._machine, Delta):
+            return signs
+        return WorkingMode(_LINK_7[self.link_7.value], *signs)
 
     def drag(self, position: Any) -> None:
         """Move P to ``position`` (3,) m, machine's frame, in the modes of the panel."""
@@ -166,11 +176,13 @@ class Explore:
 
     def _set_panel(self, posture: Posture) -> None:
         self._refuse("")
-        _, *bends = posture.working.signs
+        working = posture.working
+        bends = working.signs[1:] if isinstance(working, WorkingMode) else working
         self.operation.value = posture.operation
         self._set_assemblies()
         self.bends.value = " / ".join(_BENDS[int(b)] for b in np.array(bends) * self._out)
-        self.link_7.value = next(k for k, v in _LINK_7.items() if v == posture.working.cos_beta)
+        if isinstance(working, WorkingMode):
+            self.link_7.value = next(k for k, v in _LINK_7.items() if v == working.cos_beta)
         self.assembly.value = _label(posture.assembly)
         for motor, angle in zip(self.motors, np.degrees(posture.theta), strict=True):
             motor.value = float(motor.min + (angle - motor.min) % 360.0)
@@ -197,7 +209,9 @@ class Explore:
         self.set(posture)
 
     @property
-    def _assemblies(self) -> tuple[AssemblyMode, ...] | tuple[RotatedMode, ...]:
+    def _assemblies(self) -> tuple[Any, ...]:
+        if isinstance(self._machine, Delta):
+            return delta.ASSEMBLY_MODES
         return ASSEMBLY_MODES if self.operation.value == "translating" else ROTATED_MODES
 
     def _set_assemblies(self) -> None:
@@ -214,7 +228,9 @@ class Explore:
         self.turn(np.radians([motor.value for motor in self.motors]))
 
 
-def _label(mode: AssemblyMode | RotatedMode) -> str:
+def _label(mode: AssemblyMode | RotatedMode | float) -> str:
+    if isinstance(mode, float):
+        return f"P {'below' if mode > 0 else 'above'} the elbows"
     parts = [f"planar {'+' if mode.planar > 0 else '-'}"]
     if isinstance(mode, RotatedMode):
         parts.append("larger tilt" if mode.further > 0 else "smaller tilt")

@@ -9,12 +9,13 @@ from typing import Final
 import numpy as np
 
 from tpm_gym.errors import ConfigurationError
+from tpm_gym.mechanism import Delta
 from tpm_gym.mechanism.tpm import TPM
 from tpm_gym.viewer import server
 from tpm_gym.viewer.player import Player
 from tpm_gym.viewer.posture import at_joints
 from tpm_gym.viewer.scene import RobotScene, set_camera
-from tpm_gym.viewer.viewer import find_tpm
+from tpm_gym.viewer.viewer import find_shown
 
 __all__ = ["export"]
 
@@ -25,24 +26,24 @@ _OURS: Final = "__VISER_EMBED_DATA__="
 """Text of a page that viser wrote."""
 
 
-def export(folder: Path, machine: str | TPM = "paper", seed: int = 2) -> Path:
+def export(folder: Path, machine: str | TPM | Delta = "paper", seed: int = 2) -> Path:
     """Write ``index.html``: an episode of pick-and-place by the expert, in a loop.
 
     The page holds everything it needs. The engine is the analytic one.
 
     Args:
         folder: Folder of the page; made if missing. An earlier page is replaced.
-        machine: Name of a machine, or a TPM.
+        machine: Name of a machine, or a TPM or Delta.
         seed: Seed of the episode.
 
     Returns:
         Path of the page.
 
     Raises:
-        ConfigurationError: If the machine is no TPM, the folder cannot be written, or it has an
-            ``index.html`` of another program.
+        ConfigurationError: If the machine is of another kind, the folder cannot be written, or it
+            has an ``index.html`` of another program.
     """
-    found = find_tpm(machine)
+    found = find_shown(machine)
     page = _page(folder)
     running = server.start("127.0.0.1", 0)
     player = Player(_ENV, "analytic", found, "expert")

@@ -11,11 +11,13 @@ import trimesh
 from numpy.typing import NDArray
 from viser import SceneApi
 
+from tpm_gym.analysis import delta
 from tpm_gym.analysis.aspects import aspects, reachable_set
 from tpm_gym.arrays import BoolArray, FloatArray
 from tpm_gym.kinematics import AssemblyMode
 from tpm_gym.kinematics.jacobian import conditioning_at
 from tpm_gym.kinematics.workspace import Region
+from tpm_gym.mechanism import Delta
 from tpm_gym.mechanism.tpm import TPM
 from tpm_gym.viewer.meshes import SURFACES, cells_mesh, clipped, grid_mesh, surface
 from tpm_gym.viewer.posture import Margin, Posture
@@ -42,6 +44,7 @@ BEST: Final = 0.4
 """Conditioning at the end of the colour map."""
 _STEPS: Final = 200
 _FINE: Final = (96, 24, 128)
+_ROUND: Final = (96, 96, 96)
 
 
 def colours(values: FloatArray) -> NDArray[np.uint8]:
@@ -59,9 +62,10 @@ class Layers:
         machine: The robot.
     """
 
-    def __init__(self, scene: SceneApi, machine: TPM) -> None:
+    def __init__(self, scene: SceneApi, machine: TPM | Delta) -> None:
         """Start with no layer shown."""
         self._scene, self._machine = scene, machine
+        self._geometry: Any = machine.geometry
         self._nodes: dict[str, list[Node]] = {}
         self._keys: dict[str, Any] = {}
         self.margin: Margin | None = None
@@ -69,11 +73,14 @@ class Layers:
     def show(self, names: Collection[str], posture: Posture) -> None:
         """Show these layers for a posture, and hide the others.
 
-        Layers of the translating operation mode are hidden in rotated operation.
+        Layers of the translating operation mode are hidden in rotated operation. A Delta has the
+        task's region and the workspace.
         """
+        possible: Collection[str] = ("region", "workspace")
+        if isinstance(self._machine, TPM):
+            possible = LAYERS if posture.operation == "translating" else ("region",)
         for name, (key, make) in LAYERS.items():
-            translating = isinstance(posture.assembly, AssemblyMode)
-            wanted = key(posture) if name in names and (translating or name == "region") else None
+            wanted = key(posture) if name in names and name in possible else None
             if wanted == self._keys.get(name):
                 continue
             for node in self._nodes.pop(name, []):
@@ -91,7 +98,7 @@ class Layers:
         )  # fmt: skip
 
     def _singular(self, kind: str, posture: Posture) -> list[Node]:
-        geometry, paint = self._machine.geometry, _SINGULAR[kind]
+        geometry, paint = self._geometry, _SINGULAR[kind]
         return [
             self._mesh(f"singular/{factor}", surface(factor, posture.working, geometry), paint, 0.4)
             for factor in SURFACES[kind]
@@ -111,7 +118,7 @@ class Layers:
         side = posture.assembly.sin_beta
         found = [
             aspect
-            for aspect in aspects(posture.working, self._machine.geometry)
+            for aspect in aspects(posture.working, self._geometry)
             if aspect.assembly.sin_beta == side
         ]
         return [
@@ -120,7 +127,9 @@ class Layers:
         ]
 
     def _workspace(self, posture: Posture) -> list[Node]:
-        found = reachable_set(posture.working, self._machine.geometry, _FINE)
+        of_delta = isinstance(self._machine, Delta)
+        find, shape = (delta.reachable_set, _ROUND) if of_delta else (reachable_set, _FINE)
+        found = find(posture.working, self._geometry, shape)
         return [self._mesh("workspace", cells_mesh(found), (120, 144, 156), 0.22)]
 
     def _region(self, posture: Posture) -> list[Node]:
@@ -141,7 +150,7 @@ class Layers:
     def _conditioning(self, posture: Posture) -> list[Node]:
         """Draw the slice of the workspace at the height y of P."""
         assert isinstance(posture.assembly, AssemblyMode)
-        geometry, y = self._machine.geometry, posture.position[1]
+        geometry, y = self._geometry, posture.position[1]
         reach = geometry.l3 + geometry.l4
         x, z = np.linspace(-reach, reach, _STEPS) + geometry.l2, np.linspace(-reach, reach, _STEPS)
         points = np.stack(np.broadcast_arrays(x, y, z[:, None]), axis=-1)

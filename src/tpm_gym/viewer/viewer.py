@@ -11,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from tpm_gym.errors import ConfigurationError, TPMError
+from tpm_gym.mechanism import Delta
 from tpm_gym.mechanism.machine import find_machine, machine_names
 from tpm_gym.mechanism.tpm import TPM
 from tpm_gym.viewer import server
@@ -22,7 +23,7 @@ from tpm_gym.viewer.posture import Posture, at_joints
 from tpm_gym.viewer.scene import ROBOT, TASK_NODES, RobotScene, set_camera
 from tpm_gym.viewer.worker import Worker
 
-__all__ = ["Viewer", "find_tpm"]
+__all__ = ["Viewer", "find_shown"]
 
 _LABELS: Final = {
     "parallel": ("Parallel", "Parallel singularities of the working mode, red"),
@@ -37,15 +38,16 @@ _LABELS: Final = {
 """Label and explanation of each layer."""
 
 
-def find_tpm(machine: Any) -> TPM:
-    """Return a machine by its name, or the machine itself, if it is a TPM.
+def find_shown(machine: Any) -> TPM | Delta:
+    """Return a machine by its name, or the machine itself, if the viewer knows its modes.
 
     Raises:
-        ConfigurationError: If the machine is no TPM.
+        ConfigurationError: If the machine is neither a TPM nor a Delta.
     """
     found = find_machine(machine)
-    if not isinstance(found, TPM):
-        raise ConfigurationError("machine", machine, "a tpm_gym.TPM: the viewer shows its modes")
+    if not isinstance(found, TPM | Delta):
+        valid = "a TPM or a Delta of tpm_gym: the viewer shows its modes"
+        raise ConfigurationError("machine", machine, valid)
     return found
 
 
@@ -53,7 +55,7 @@ class Viewer:
     """Page with a robot that can be dragged, and that plays episodes.
 
     Args:
-        machine: Name of a machine, or a TPM.
+        machine: Name of a machine, or a TPM or Delta.
         host: Address to listen on.
         port: Port to listen on; if it is taken, the next free one.
 
@@ -63,12 +65,14 @@ class Viewer:
         worker: Thread that runs all changes.
 
     Raises:
-        ConfigurationError: If the machine is no TPM, or the address is not possible.
+        ConfigurationError: If the machine is of another kind, or the address is not possible.
     """
 
-    def __init__(self, machine: str | TPM = "paper", host: str = "127.0.0.1", port: int = 8080):
+    def __init__(
+        self, machine: str | TPM | Delta = "paper", host: str = "127.0.0.1", port: int = 8080
+    ):
         """Start the server, and show the machine at its home."""
-        first = find_tpm(machine)
+        first = find_shown(machine)
         self.server = server.start(host, port)
         self.worker = Worker(self._report)
         gui = self.server.gui
@@ -80,7 +84,7 @@ class Viewer:
         )
         gui.main_panel.dock_right()
         known = map(find_machine, machine_names())
-        self._machines = {one.name: one for one in (*known, first) if isinstance(one, TPM)}
+        self._machines = {one.name: one for one in (*known, first) if isinstance(one, TPM | Delta)}
         self.machine = gui.add_dropdown("Machine", tuple(self._machines), initial_value=first.name)
         self._numbers: Any = gui.add_html("")
         tabs = gui.add_tab_group()
@@ -141,9 +145,11 @@ class Viewer:
         with self.server.atomic():
             self.robot.draw_objects(state, player.markers)
             self.explore.hide_gizmo(self.play.playing)
-            # Joint positions are equal on both sides of y = 0, the assembly modes are not.
-            y = machine.mount.to_paper(state.fk_position)[1]
-            mode = replace(machine.assembly_mode, sin_beta=-1 if y < 0 else 1)
+            mode: Any = machine.assembly_mode
+            if isinstance(machine, TPM):
+                # Joint positions are equal on both sides of y = 0, the assembly modes are not.
+                y = machine.mount.to_paper(state.fk_position)[1]
+                mode = replace(machine.assembly_mode, sin_beta=-1 if y < 0 else 1)
             self.explore.set(at_joints(machine, state.theta, mode))
 
     def _report(self, error: Exception) -> None:
