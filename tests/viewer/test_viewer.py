@@ -177,7 +177,9 @@ def test_a_delta_is_dragged_turned_and_plays_the_expert(viewer):
     assert explore.posture.position == pytest.approx((0.2, -0.1, 1.0))
     choose(viewer, explore.bends, "out / in / out")
     assert explore.posture.working == (1.0, -1.0, 1.0)
-    choose(viewer, explore.assembly, "P above the elbows")
+    do(viewer, explore.go_home)
+    assert explore.assembly.value == "det A > 0"
+    choose(viewer, explore.assembly, "det A < 0")
     assert explore.posture.position[2] < 0
     for name in LAYERS:
         choose(viewer, viewer.shown[name], True)

@@ -230,7 +230,7 @@ class Explore:
 
 def _label(mode: AssemblyMode | RotatedMode | float) -> str:
     if isinstance(mode, float):
-        return f"P {'below' if mode > 0 else 'above'} the elbows"
+        return f"det A {'>' if mode > 0 else '<'} 0"
     parts = [f"planar {'+' if mode.planar > 0 else '-'}"]
     if isinstance(mode, RotatedMode):
         parts.append("larger tilt" if mode.further > 0 else "smaller tilt")
