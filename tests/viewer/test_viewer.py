@@ -207,8 +207,8 @@ def test_every_task_is_played_with_closed_loops(viewer, env_id):
     for index, block in enumerate(player.task.scene.objects):
         node = viewer.server.scene.get_handle_by_name(f"/objects/{block.name}")
         assert node.position == pytest.approx(state.object_position[index])
-    belt = viewer.server.scene.get_handle_by_name("/paint/0")
-    assert (belt is None) == (player.task.scene.belt is None)
+    paint, scene = viewer.server.scene.get_handle_by_name("/paint/0"), player.task.scene
+    assert (paint is None) == (scene.belt is None and not scene.patches)
     terms, torques = (plot.data for plot in play.plots)
     drawn = np.array(terms[1:]).sum(axis=0)
     assert drawn == pytest.approx([sum(r.reward_terms.values()) for r in player.records])
