@@ -19,10 +19,11 @@ from typing import Any, Final, TypeVar, cast
 
 import numba
 import numpy as np
+from numba import literal_unroll
 from numba.core import caching
 from numba.extending import register_jitable
 
-__all__ = ["PATIENCE", "compilable", "compiled", "kept", "stamp"]
+__all__ = ["PATIENCE", "compilable", "compiled", "kept", "literal_unroll", "stamp"]
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 

@@ -15,10 +15,9 @@ from types import SimpleNamespace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numba import literal_unroll
 
 from tpm_gym.arrays import FloatArray
-from tpm_gym.compiling import compilable, kept
+from tpm_gym.compiling import compilable, kept, literal_unroll
 from tpm_gym.kinematics import compiled as functions
 from tpm_gym.kinematics.equations import Triple, conditioning
 
