@@ -20,7 +20,7 @@ from tpm_gym.mechanism.tpm import PAPER_TPM, WIDE_TPM
 from tpm_gym.simulation import Plant
 from tpm_gym.simulation.settings import Numerics
 from tpm_gym.simulation.state import State
-from tpm_gym.tasks import Entry, PickAndPlace, Reach, Task
+from tpm_gym.tasks import Cycle, Entry, PickAndPlace, Reach, Task, Throw
 from tpm_gym.tasks.sampling import APART
 
 BLOCK = PickAndPlace.block
@@ -313,10 +313,9 @@ def test_a_snapshot_of_another_kind_of_environment_is_refused(env):
 def test_the_datasheet_lists_the_entries_and_numbers_that_the_code_uses():
     text = inspect.getdoc(TPMEnv) or ""
     task, machine = PickAndPlace(PAPER_TPM), PAPER_TPM
-    rows = re.findall(r"^\| (\w+) \| (\d) \| (.+) \|$", text, flags=re.MULTILINE)
+    entries = text[text.index("## Observation") : text.index("## Reward")]
+    rows = re.findall(r"^\| (\w+) \| (\d) \| (.+) \|$", entries, flags=re.MULTILINE)
     assert rows == [(e.name, str(len(e.scale)), e.meaning) for e in task.entries]
-    sizes = {kind: kind(PAPER_TPM).observation_size for kind in (Reach, PickAndPlace)}
-    assert f"{sizes[Reach]} numbers (Reach) or {sizes[PickAndPlace]}" in text
     steps = ", ".join(f"{1e3 * step:g}" for step in machine.step_limit)
     assert f"at most {steps} mm" in text
     assert f"at most {machine.joint_limit} rad" in text
@@ -330,7 +329,8 @@ def test_the_datasheet_lists_the_entries_and_numbers_that_the_code_uses():
     assert box in text
     size = (1e3 * BLOCK.width, 1e3 * BLOCK.height, 1e3 * BLOCK.mass)
     assert "(square, {:.0f} mm wide, {:.0f} mm high, {:.0f} g)".format(*size) in text
-    assert f"below {1e3 * Task.tolerance:.0f} mm" in text
+    limits = (1e3 * kind.tolerance for kind in (Task, Throw, Cycle))
+    assert "{:.0f} mm, Throw {:.0f}, Cycle {:.0f} |".format(*limits) in text
     assert f"at least {1e3 * APART:.0f} mm" in text
 
 

@@ -127,9 +127,9 @@ class TPMEnv(gym.Env[Observation, Action]):
 
     ## Start
 
-    The arm is at rest at home (Cycle: at one end), and blocks (square, 36 mm wide, 30 mm high,
-    50 g) are flat on the table or the belt. Goals and objects are sampled where
-    1/cond(J) >= 0.08, at least 30 mm away from each other (Reach: from P).
+    The arm is at rest at home (Cycle: at one end). Blocks (square, 36 mm wide, 30 mm high, 50 g)
+    are flat on the table or the belt. Goals and objects are sampled at least 30 mm
+    away from each other (Reach: from P), where 1/cond(J) >= 0.08.
     ``reset(options={"object": (x, y, z), "goal": (x, y, z)})`` sets both; a block that starts above
     the table falls.
 

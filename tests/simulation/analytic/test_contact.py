@@ -367,6 +367,7 @@ def history(places: FloatArray, ways: FloatArray, on: FloatArray) -> list[FloatA
     """All that is read, and all forces, after each control period."""
     contact, rows = on_tables(2, len(places)), np.arange(len(places))
     contact.place(rows, upright(places))
+    on = np.ascontiguousarray(on)  # strided arrays would be compiled for
     seen: list[FloatArray] = []
     for period, k in enumerate(range(0, ways.shape[1] - 2, STEPS)):
         force, _ = advance(contact, rows, ways[:, k : k + STEPS + 2], on[period])
