@@ -1,4 +1,4 @@
-# docker build -t tpm-gym . && docker run --rm -v "$PWD/runs:/work/runs" tpm-gym train --env TPMReach-v0 --steps 5000
+# docker build -t tpm-gym . && docker run --rm -v "$PWD/runs:/data/runs" tpm-gym train --env TPMReach-v0 --steps 5000
 FROM python:3.11-slim
 
 # MuJoCo draws with Mesa's software OpenGL where there is no GPU.
@@ -11,6 +11,6 @@ COPY . /src
 RUN pip install --no-cache-dir --extra-index-url https://download.pytorch.org/whl/cpu \
     -c /src/constraints.txt "/src[train,mujoco]"
 
-WORKDIR /work
+WORKDIR /data
 ENTRYPOINT ["tpm-gym"]
 CMD ["--help"]

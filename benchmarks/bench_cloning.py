@@ -37,6 +37,7 @@ from tpm_gym.learning.estimates import wilson
 from tpm_gym.learning.policies import TrainedPolicy
 from tpm_gym.learning.provenance import write_json
 from tpm_gym.learning.rollout import TEST_SEED, run_episodes
+from tpm_gym.tasks import Task
 
 RECORD = ROOT / "docs" / "records" / "cloning.json"
 PAGE = ROOT / "docs" / "datasets.md"
@@ -66,11 +67,9 @@ class Places(GoalGapExtractor):
         return super().forward(observations | {"observation": seen})
 
 
-def network(env_id: str, hidden: Sequence[str]) -> dict[str, Any]:
+def network(task: Task, hidden: Sequence[str]) -> dict[str, Any]:
     """Return the arguments of a policy whose networks do not see the entries ``hidden``."""
-    with closing(make_envs(env_id, 1, engine="analytic")) as envs:
-        entries = envs.task.entries
-    shown = [entry.name not in hidden for entry in entries for _ in entry.scale]
+    shown = [entry.name not in hidden for entry in task.entries for _ in entry.scale]
     return {
         "net_arch": [128, 128],
         "activation_fn": torch.nn.ReLU,
@@ -94,8 +93,9 @@ def learn(
     seen, actions = steps_of(dataset, seed * max(SIZES), size)
     batches = -(-len(actions) // BATCH)
     made: dict[str, Any] = {"engine": "analytic", "autoreset_mode": "SameStep"}
-    with closing(AnalyticVecEnv(make_envs(env_id, 2, **made))) as few:
-        policy = network(env_id, options.hide)
+    envs = make_envs(env_id, 2, **made)
+    with closing(AnalyticVecEnv(envs)) as few:
+        policy = network(envs.task, options.hide)
         model = PPO("MultiInputPolicy", few, seed=seed, policy_kwargs=policy, device="cpu")
         clone(model, seen, actions, np.zeros(len(actions)), -(-options.updates // batches))
     with closing(make_envs(env_id, EPISODES, engine="analytic")) as envs:

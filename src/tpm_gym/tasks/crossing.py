@@ -11,7 +11,7 @@ import numpy as np
 from tpm_gym.arrays import BoolArray, FloatArray
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.tpm.both_sides import both_sides
-from tpm_gym.simulation.state import Patch, State
+from tpm_gym.simulation.state import Block, Patch, State
 from tpm_gym.tasks import sampling
 from tpm_gym.tasks.motion import Motion, Move
 from tpm_gym.tasks.task import Task
@@ -20,7 +20,6 @@ __all__ = ["Crossing"]
 
 STRIPE: Final = 0.003
 """Half width of the stripe that shows the plane on the table, m."""
-STRIPE_COLOUR: Final = (0.83, 0.18, 0.33, 1.0)
 
 
 class Crossing(Task):
@@ -84,4 +83,4 @@ def _stripe(machine: Machine) -> Patch:
     ends = np.array([machine.region.low, machine.region.high])
     ends[:, machine.mirror_axis] = -STRIPE, STRIPE
     low, high = np.sort(machine.mount.to_world(ends)[:, :2], axis=0).tolist()
-    return Patch(tuple(low), tuple(high), STRIPE_COLOUR)
+    return Patch(tuple(low), tuple(high), Block.colour)
