@@ -117,7 +117,8 @@ def lines(record: dict[str, Any]) -> Iterator[str]:
         ],
     )
     yield ""
-    yield f"{processor_line(record['conditions'])}; `make bench-tasks`."
+    how = "`make bench-tasks`; some cells by its function `measure`, with fewer episodes."
+    yield f"{processor_line(record['conditions'])}; {how}"
 
 
 def _conditions(other: dict[str, str]) -> tuple[str, str]:
