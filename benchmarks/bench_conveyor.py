@@ -13,7 +13,8 @@ A learned policy knows one block, and places on the table. It plays a stream of 
 shown the first one that is not in its place. It never learned to let go, as its task does not ask
 for that: at the place, this script lets go and lifts the cup.
 
-Results go to docs/records/conveyor.json, and from there to docs/conveyor.md.
+Results go to docs/records/conveyor.json, and from there to docs/conveyor.md. A run without
+``--policies`` keeps the rows of policies, and those of the expert in their streams.
 """
 
 from __future__ import annotations
@@ -215,8 +216,9 @@ def lines(record: dict[str, Any]) -> Iterator[str]:
     if not record:
         yield "Not measured on this version yet: `make bench-conveyor`."
         return
-    machine = record["machine"]
-    yield f"`{machine['command']}`, tpm_gym {machine['versions']['tpm_gym']}:"
+    yield f"{_made_by(record['machine'])}:"
+    if "policies_machine" in record:
+        yield f"three blocks by {_made_by(record['policies_machine'])}."
     yield ""
     head = ["player", "engine", "blocks", "time between blocks", "streams complete"]
     yield from table(
@@ -235,6 +237,21 @@ def lines(record: dict[str, Any]) -> Iterator[str]:
             for cell in record["cells"]
         ],
     )
+
+
+def _made_by(machine: dict[str, Any]) -> str:
+    return f"`{machine['command']}`, tpm_gym {machine['versions']['tpm_gym']}"
+
+
+def merged(
+    old: dict[str, Any], machine: dict[str, Any], cells: list[dict[str, Any]]
+) -> dict[str, Any]:
+    """Return the record of new rows; where they have no policies, rows for these stay."""
+    if any(cell["blocks"] == COLUMNS for cell in cells):
+        return {"machine": machine, "cells": cells}
+    kept = [cell for cell in old.get("cells", []) if cell["blocks"] == COLUMNS]
+    made_by = {"policies_machine": old.get("policies_machine", old["machine"])} if kept else {}
+    return {"machine": machine, **made_by, "cells": [*cells, *kept]}
 
 
 def measure(streams: int, fewer: int, policies: Sequence[Path]) -> Iterator[dict[str, Any]]:
@@ -262,7 +279,7 @@ def main() -> None:
     for cell in measure(options.streams, options.fewer, options.policies):
         cells.append(cell)
         print(cell, file=sys.stderr)
-    record = {"machine": describe(sys.argv), "cells": cells}
+    record = merged(read_record(RECORD), describe(sys.argv), cells)
     provenance.write_json(RECORD, record)
     fill(PAGE, "conveyor", lines(read_record(RECORD)))
 

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import bench_conveyor
 import gymnasium as gym
 import pytest
 import soak
@@ -86,3 +87,28 @@ def test_a_step_that_raises_is_reported_outlived_and_can_be_repeated(tmp_path, c
     first = content["failures"][0]
     assert (first["env_id"], first["error"]) == (soak.ENV_IDS[1], "ValueError: injected")
     assert f"--seed 0 --replay {first['visit']}" in capsys.readouterr().out
+
+
+# -- records --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("times", [1, 2])
+def test_a_run_without_policies_keeps_their_rows(times):
+    def about(command):
+        return {"command": command, "versions": {"tpm_gym": "0"}}
+
+    def row(blocks, picks):
+        numbers = dict.fromkeys(("headway", "complete", "streams", "supply", "bound"), 1.0)
+        words = {"player": "expert", "engine": "analytic"}
+        return words | numbers | {"blocks": blocks, "picks_a_minute": picks}
+
+    record = bench_conveyor.merged({}, about("all"), [row(9, 11.0), row(3, 22.0)])
+    for _ in range(times):
+        record = bench_conveyor.merged(record, about("experts"), [row(9, 33.0)])
+    page = "\n".join(bench_conveyor.lines(record))
+    assert [cell["picks_a_minute"] for cell in record["cells"]] == [33.0, 22.0]
+    assert "`experts`" in page
+    assert "three blocks by `all`" in page
+    again = bench_conveyor.merged(record, about("new"), [row(9, 44.0), row(3, 55.0)])
+    assert [cell["picks_a_minute"] for cell in again["cells"]] == [44.0, 55.0]
+    assert "`all`" not in "\n".join(bench_conveyor.lines(again))
