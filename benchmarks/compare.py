@@ -8,7 +8,8 @@ assembly and working mode, and only where every motor is between its stops.
 
 The rows of learning are read from the trainings of ``python -m benchmarks.studies run --plan
 machines --engine analytic`` in the folder of ``--runs``, and for the paper's machine from
-docs/results. Without these trainings, the rows on record stay.
+docs/results. Without these trainings, the rows on record stay. ``--learning-only`` measures nothing
+else.
 """
 
 from __future__ import annotations
@@ -405,15 +406,20 @@ def main() -> None:
     """Measure all machines, write the record, and fill the page."""
     parser = argparse.ArgumentParser(description="The TPM and the Delta, measured.")
     parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "study")
+    parser.add_argument("--learning-only", action="store_true", help="keep what is measured")
     options = parser.parse_args()
-    learning = read_record(RECORD).get("learning", {})
+    record = read_record(RECORD)
+    learning = record.setdefault("learning", {})
     for name, machine in MACHINES.items():
         if found := list(trainings(machine, options.runs)):
             learning[name] = found
-    measured = {name: column(machine) for name, machine in MACHINES.items()}
-    record = {"machine": describe(sys.argv), "measured": measured, "learning": learning}
+    if not options.learning_only:
+        record["measured"] = {name: column(machine) for name, machine in MACHINES.items()}
+        record["machine"] = describe(sys.argv)
     provenance.write_json(RECORD, record)
     fill(DOCS / "compare.md", "compare", lines(read_record(RECORD)))
+    if options.learning_only:
+        return
     with style.style():
         style.save(figure(), DOCS / "images" / "compare.png")
 
