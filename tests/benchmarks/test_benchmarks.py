@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import bench_conveyor
+import bench_cycle
 import gymnasium as gym
 import pytest
 import soak
@@ -112,3 +113,21 @@ def test_a_run_without_policies_keeps_their_rows(times):
     again = bench_conveyor.merged(record, about("new"), [row(9, 44.0), row(3, 55.0)])
     assert [cell["picks_a_minute"] for cell in again["cells"]] == [44.0, 55.0]
     assert "`all`" not in "\n".join(bench_conveyor.lines(again))
+
+
+def test_a_run_of_the_cycle_without_a_policy_keeps_its_rows(tmp_path, monkeypatch):
+    seconds = {"expert": 0.25, "policy": 0.3}
+    for name in ("planned", "success", "fill", "lines"):
+        monkeypatch.setattr(bench_cycle, name, lambda *_: {})
+    monkeypatch.setattr(bench_cycle, "load_policy", lambda path: path)
+    monkeypatch.setattr(bench_cycle, "RECORD", tmp_path / "cycle.json")
+
+    def cycle(engine, payload, make):
+        return {"seconds": seconds["expert" if make is bench_cycle._expert else "policy"]}
+
+    monkeypatch.setattr(bench_cycle, "cycle", cycle)
+    for words in ([], ["--policy", "best.json"], []):
+        bench_cycle.main(words)
+        seconds["expert"] -= 0.05
+    rows = read_strict(tmp_path / "cycle.json")["policy"]
+    assert rows == [{"seconds": 0.3, "slower": 1.0}] * 3  # the expert has 0.15 s now
