@@ -253,12 +253,13 @@ def _missing(records: Sequence[Record]) -> Iterator[tuple[str, str]]:
 
 
 def _training_table(runs: Frame) -> Frame:
-    """Return a row for each group of seeds."""
+    """Return a row for each group of seeds; it tells the engine if there are several."""
+    several = runs["engine"].nunique() > 1
     return pd.DataFrame(
         {
             "id": first.env,
             "method": first.method,
-            "trained in": first.engine,
+            **({"trained in": first.engine} if several else {}),
             "steps": f"{first.steps:,}",
             **_successes(group),
             "steps to 95%": _or_never(group.learned_steps.median(), "{:,.0f}"),
