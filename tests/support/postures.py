@@ -8,6 +8,7 @@ from tpm_gym.viewer.viewer import Viewer
 
 def drawn_gap(viewer: Viewer) -> float:
     """Return the largest distance between both ends of a closure of the links in the scene, m."""
+    assert viewer.worker.wait()  # a posture is set before its links are drawn
     nodes, mechanism = viewer.robot.links, viewer.explore.posture.machine.mechanism
 
     def place(link, point):
