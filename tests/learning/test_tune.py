@@ -1,13 +1,16 @@
 """Searches with the real Optuna and Ray Tune."""
 
 import json
+from unittest.mock import patch
 
+import gymnasium as gym
 import pytest
 import yaml
 
 from tpm_gym.learning.command_line import main
 from tpm_gym.learning.configuration import EnvOptions, TrainingConfig, complete
 from tpm_gym.learning.run_folder import evaluations
+from tpm_gym.tasks.registry import TASKS
 
 ANALYTIC = EnvOptions(engine="analytic")
 
@@ -44,6 +47,14 @@ def test_mistakes_are_named_before_ray_starts(words, message):
         main(["tune", *words])
 
 
+@pytest.fixture
+def registries():
+    """Forget at the end which tasks a test has registered."""
+    with patch.dict(gym.registry), patch.dict(TASKS):
+        yield
+
+
+@pytest.mark.usefixtures("registries")
 def test_a_task_of_the_users_gets_the_recipe_of_pick_and_place(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "hovering.py").write_text(
