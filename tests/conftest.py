@@ -3,6 +3,7 @@
 from importlib.util import find_spec
 
 import pytest
+from registries import registries_put_back
 
 from tpm_gym.errors import MissingPackageError
 
@@ -30,3 +31,10 @@ pytest_runtest_setup = pytest_runtest_call  # fixtures may ask for PyBullet too
 def needs_pybullet():
     """Skip a test that uses PyBullet in another process."""
     pytest.importorskip("pybullet")
+
+
+@pytest.fixture
+def registries():
+    """Forget after a test what it registers."""
+    with registries_put_back():
+        yield

@@ -2,11 +2,10 @@
 
 import subprocess
 import sys
-from unittest.mock import patch
 
-import gymnasium as gym
 import pytest
 from paths import ROOT
+from registries import registries_put_back
 
 from tpm_gym.tasks.registry import TASKS
 
@@ -17,7 +16,7 @@ from website import docstrings, projects, sources, tables, tasks
 @pytest.fixture(scope="module")
 def stack():
     """Return the page of a task that is registered outside the package."""
-    with patch.dict(gym.registry), patch.dict(TASKS):
+    with registries_put_back("sorting"):
         import sorting  # registers TPMSort
 
         assert sorting

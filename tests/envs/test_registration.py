@@ -1,7 +1,6 @@
 """Ids mean what they say; users add their own; importing the package imports little."""
 
 import re
-from unittest.mock import patch
 
 import gymnasium as gym
 import pytest
@@ -12,14 +11,6 @@ from tpm_gym.envs.ids import env_ids
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.tasks import Conveyor, Crossing, Cycle, PickAndPlace, Push, Reach, Stack, Throw
 from tpm_gym.tasks.registry import TASKS
-
-
-@pytest.fixture
-def registries():
-    """What a test registers is forgotten after it."""
-    with patch.dict(gym.registry), patch.dict(TASKS):
-        yield
-
 
 _CLASSES = (Reach, PickAndPlace, Push, Stack, Throw, Conveyor, Crossing, Cycle)
 TASK_CLASSES = {kind.__name__: kind for kind in _CLASSES}

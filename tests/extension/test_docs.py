@@ -2,17 +2,15 @@
 
 import pkgutil
 import re
-from unittest.mock import patch
 
-import gymnasium as gym
 import pytest
 from episodes import expert_episode
 from pages import PAGES, name_of
 from paths import ROOT
+from registries import registries_put_back
 
 import tpm_gym
 from tpm_gym.learning.recipes import read_recipe
-from tpm_gym.tasks.registry import TASKS
 
 PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
@@ -20,7 +18,7 @@ BLOCKS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 
 @pytest.mark.parametrize("code", BLOCKS, ids=["task", "machine", "engine", "checks"])
 def test_a_block_makes_an_environment_that_its_expert_solves(code):
-    with patch.dict(gym.registry), patch.dict(TASKS):
+    with registries_put_back():
         names = {"__name__": "extending"}
         exec(code, names)
         env = names.get("env")

@@ -1,27 +1,25 @@
 """A task that was written outside the package, with two objects."""
 
 import importlib
-import sys
 from unittest.mock import patch
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from episodes import expert_episode
+from registries import registries_put_back
 
 import tpm_gym
 from tpm_gym.envs.testing import check_env
 from tpm_gym.errors import ConfigurationError, ResetOptionError, UnreachableError
 from tpm_gym.mechanism import PAPER_TPM
 from tpm_gym.simulation import Block, Scene
-from tpm_gym.tasks.registry import TASKS
 
 
 @pytest.fixture(scope="module", autouse=True)
 def sorting():
-    """The task's file; what it registers is gone afterwards, for other tests count the ids."""
-    with patch.dict(gym.registry), patch.dict(TASKS):
-        sys.modules.pop("sorting", None)
+    """The task's file; what it registers is gone afterwards."""
+    with registries_put_back("sorting"):
         yield importlib.import_module("sorting")
 
 

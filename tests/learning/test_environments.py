@@ -6,11 +6,11 @@ import shlex
 import shutil
 import signal
 import sys
-from unittest.mock import patch
 
 import gymnasium as gym
 import pytest
 from processes import PYTHON, printed_by
+from registries import registries_put_back
 from trainings import SAC_RECIPE, interrupt_at, uninterrupted
 
 from tpm_gym.learning import TrainingConfig
@@ -20,7 +20,6 @@ from tpm_gym.learning.environments import check_env_id, make_env
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.policy.files import digest
 from tpm_gym.resources import POLICIES
-from tpm_gym.tasks.registry import TASKS
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
 
@@ -40,11 +39,7 @@ def run(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "path", sys.path.copy())  # to which the command adds the folder
 
     def run_anew(*words):
-        sys.modules.pop("my_tasks", None)
-        with (
-            patch.dict(gym.registry),
-            patch.dict(TASKS),
-        ):
+        with registries_put_back("my_tasks"):
             main(words)
 
     return run_anew

@@ -7,7 +7,6 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import gymnasium as gym
 import imageio.v3 as imageio
@@ -15,6 +14,7 @@ import numpy as np
 import pytest
 from paths import read_strict
 from processes import TPM_GYM, printed_by
+from registries import registries_put_back
 from trainings import quiet, said
 
 import tpm_gym
@@ -24,7 +24,6 @@ from tpm_gym.learning.command_line import main
 from tpm_gym.learning.errors import ConfigError, PolicyError
 from tpm_gym.policy.files import digest
 from tpm_gym.tasks import Reach
-from tpm_gym.tasks.registry import TASKS
 
 METRICS = (
     "success_at_end",
@@ -75,7 +74,7 @@ def test_table_shows_means_and_intervals(written):
 @pytest.fixture
 def short() -> Iterator[str]:
     """Id of a task of six steps, since drawing takes long."""
-    with patch.dict(gym.registry), patch.dict(TASKS):
+    with registries_put_back():
         yield tpm_gym.register_task("Short", type("Short", (Reach,), {}), max_episode_steps=6)[0]
 
 

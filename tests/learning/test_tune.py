@@ -1,16 +1,13 @@
 """Searches with the real Optuna and Ray Tune."""
 
 import json
-from unittest.mock import patch
 
-import gymnasium as gym
 import pytest
 import yaml
 
 from tpm_gym.learning.command_line import main
 from tpm_gym.learning.configuration import EnvOptions, TrainingConfig, complete
 from tpm_gym.learning.run_folder import evaluations
-from tpm_gym.tasks.registry import TASKS
 
 ANALYTIC = EnvOptions(engine="analytic")
 
@@ -45,13 +42,6 @@ def test_the_best_of_a_search_is_a_recipe_that_trains(tmp_path, capsys):
 def test_mistakes_are_named_before_ray_starts(words, message):
     with pytest.raises(SystemExit, match=message):
         main(["tune", *words])
-
-
-@pytest.fixture
-def registries():
-    """Forget at the end which tasks a test has registered."""
-    with patch.dict(gym.registry), patch.dict(TASKS):
-        yield
 
 
 @pytest.mark.usefixtures("registries")
