@@ -129,9 +129,9 @@ bench-first: $(INSTALLED) ## from the start of Python to the first step, with an
 	$(RUN) benchmarks/bench_first.py
 
 bench-shield: $(INSTALLED) ## the shield: violations, margins, cost, policies; hours with training
-	for seed in 0 1 2 3 4; do for own in "s$$seed --shield" "p$$seed"; do \
+	for seed in 0 1 2 3 4; do for shield in "" --shield; do \
 		$(VENV)/bin/tpm-gym train --algo ppo --engine analytic --env TPMReachJointsDense-v0 --goals tempting \
-		--test-episodes 0 --seed $$seed --overwrite --run runs/shield/$$own; done; done
+		--test-episodes 0 --seed $$seed $$shield --run runs/shield/s$$seed$$shield --overwrite; done; done
 	$(RUN) benchmarks/bench_shield.py
 
 bench-tasks: $(INSTALLED) ## success of the expert in each task, engine and condition; see docs/tasks.md; an hour

@@ -416,12 +416,10 @@ def main() -> None:
     if not options.learning_only:
         record["measured"] = {name: column(machine) for name, machine in MACHINES.items()}
         record["machine"] = describe(sys.argv)
+        with style.style():
+            style.save(figure(), DOCS / "images" / "compare.png")
     provenance.write_json(RECORD, record)
     fill(DOCS / "compare.md", "compare", lines(read_record(RECORD)))
-    if options.learning_only:
-        return
-    with style.style():
-        style.save(figure(), DOCS / "images" / "compare.png")
 
 
 if __name__ == "__main__":

@@ -25,7 +25,9 @@ def import_module_of(env_id: str) -> None:
     """
     module = env_id.rpartition(":")[0]
     if module and (folder := os.getcwd()) not in sys.path:
-        sys.path.append(folder)  # last, so that its files hide no installed module
+        # Workers import the module too, and they take over sys.path. The folder is the last entry,
+        # so that its files hide no installed module.
+        sys.path.append(folder)
     try:
         if module:
             importlib.import_module(module)
