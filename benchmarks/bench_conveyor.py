@@ -28,7 +28,7 @@ from typing import Any, ClassVar, Final, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from shared import ROOT, describe, fill, provenance, read_record, table
+from shared import ROOT, describe, fill, made_by, provenance, read_record, table
 
 from tpm_gym import TPMVectorEnv, load_policy
 from tpm_gym.arrays import FloatArray
@@ -216,9 +216,9 @@ def lines(record: dict[str, Any]) -> Iterator[str]:
     if not record:
         yield "Not measured on this version yet: `make bench-conveyor`."
         return
-    yield f"{_made_by(record['machine'])}:"
+    yield f"{made_by(record['machine'])}:"
     if "policies_machine" in record:
-        yield f"three blocks by {_made_by(record['policies_machine'])}."
+        yield f"three blocks by {made_by(record['policies_machine'])}."
     yield ""
     head = ["player", "engine", "blocks", "time between blocks", "streams complete"]
     yield from table(
@@ -237,10 +237,6 @@ def lines(record: dict[str, Any]) -> Iterator[str]:
             for cell in record["cells"]
         ],
     )
-
-
-def _made_by(machine: dict[str, Any]) -> str:
-    return f"`{machine['command']}`, tpm_gym {machine['versions']['tpm_gym']}"
 
 
 def merged(

@@ -25,6 +25,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -32,7 +33,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
-from shared import ROOT, describe, fill, provenance, read_record, table
+from shared import ROOT, describe, fill, made_by, provenance, read_record, table
 
 from tpm_gym.learning.estimates import wilson
 from tpm_gym.learning.policies import load_policy
@@ -283,9 +284,11 @@ def write(content: dict[str, Any]) -> None:
 
 
 def lines(content: dict[str, Any]) -> Iterator[str]:
-    """Yield the tables of the page."""
+    """Yield the tables of the page, each with the command that made it."""
+    section = partial(_section, content)
     for name, title in (("soak", "analytic engine"), ("engines", "PyBullet")):
         yield from section(
+            name,
             [f"{title}, ideal drives", "steps", "changed", "below 0.08", "least conditioning"],
             [
                 [
@@ -299,6 +302,7 @@ def lines(content: dict[str, Any]) -> Iterator[str]:
             ],
         )
     yield from section(
+        "margins",
         ["least true conditioning with a margin of", *(f"{margin:.0%}" for margin in MARGINS)],
         [
             [key, *(f"{low:.3f}" for low in lows.values())]
@@ -306,10 +310,12 @@ def lines(content: dict[str, Any]) -> Iterator[str]:
         ],
     )
     yield from section(
+        "cost",
         ["a step of one environment, ns of CPU", "without", "with the shield"],
         [[key, *(f"{ns:,.0f}" for ns in pair)] for key, pair in content.get("cost", {}).items()],
     )
     yield from section(
+        "policies",
         ["published policy, in PyBullet", "success, 95% interval", "steps below 0.08"],
         [
             [key, _share(row), f"{row['penalised']:.2%}"]
@@ -317,6 +323,7 @@ def lines(content: dict[str, Any]) -> Iterator[str]:
         ],
     )
     yield from section(
+        "training",
         ["trained and tested on tempting goals", "success, median (all seeds)", "steps below 0.08"],
         [
             [f"{key}, {engine}", _median(found), f"{_mean_penalised(found):.2%}"]
@@ -326,9 +333,13 @@ def lines(content: dict[str, Any]) -> Iterator[str]:
     )
 
 
-def section(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    """Yield the lines of a table and an empty line; nothing for a part that was not measured."""
+def _section(
+    content: dict[str, Any], part: str, head: Sequence[str], rows: Sequence[Sequence[str]]
+) -> Iterator[str]:
+    """Yield the lines of a part's table; nothing for a part that was not measured."""
     if rows:
+        yield f"{made_by(content[f'{part} made by'])}:"
+        yield ""
         yield from table(head, rows)
         yield ""
 

@@ -51,6 +51,11 @@ def processor_line(description: dict[str, Any]) -> str:
     )
 
 
+def made_by(description: dict[str, Any]) -> str:
+    """Return command and version in a few words, for pages."""
+    return f"`{description['command']}`, tpm_gym {description['versions']['tpm_gym']}"
+
+
 def memory() -> tuple[float, str]:
     """Return the memory of this process, MB (1e6 bytes), and its kind.
 
