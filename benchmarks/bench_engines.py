@@ -2,7 +2,7 @@
 
     make bench-engines
     python benchmarks/bench_engines.py --quick
-    python benchmarks/bench_engines.py --published ID
+    python benchmarks/bench_engines.py --renew motions expert
 
 Agreement: the actions of five motions are recorded once and replayed in each engine. The table has
 the largest loop gap, the largest distance of the platform from the forward kinematics of the
@@ -39,6 +39,8 @@ ROUNDS, BLOCK = 20, 100
 """Rounds of timing, and control steps in a block."""
 EPISODES = 1000
 """Episodes of a cell of the matrix."""
+REPEATS = 20
+"""Episodes of a motion."""
 
 
 def agreement(engines: Sequence[str], episodes: int) -> list[dict[str, Any]]:
@@ -107,12 +109,21 @@ def matrix(todo: list[Cell], jobs: int) -> list[dict[str, Any]]:
     return done
 
 
-def renewed(record: dict[str, Any], ids: Sequence[str], jobs: int) -> dict[str, Any]:
-    """Return a record in which the cells of some published policies are evaluated again."""
-    again = {"renewed": shared.describe(sys.argv)}
-    fresh = matrix([cell for cell in cells(ENGINES, EPISODES) if cell.policy in ids], jobs)
-    kept = [old for old in record["matrix"] if old["policy"] not in ids]
-    return record | again | {"matrix": sorted(kept + fresh, key=lambda cell: cell["env_id"])}
+def renewed(record: dict[str, Any], parts: Sequence[str], jobs: int) -> dict[str, Any]:
+    """Return a record of which some parts are measured again."""
+    again: dict[str, Any] = {"renewed": shared.describe(sys.argv)}
+    if "motions" in parts:
+        again["agreement"] = agreement(ENGINES, REPEATS)
+    if "cost" in parts:
+        again["cost"] = costs(ENGINES, ROUNDS)
+    fresh = matrix([cell for cell in cells(ENGINES, EPISODES) if cell.policy in parts], jobs)
+    kept = [old for old in record["matrix"] if old["policy"] not in parts]
+    return record | again | {"matrix": sorted(kept + fresh, key=_place)}
+
+
+def _place(cell: dict[str, Any]) -> tuple[Any, ...]:
+    """Place of a cell in the table."""
+    return cell["env_id"], cell["policy"] != "expert", cell["noise"]
 
 
 def main() -> None:
@@ -120,20 +131,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Compare engines and theory.")
     parser.add_argument("--quick", action="store_true", help="some minutes; writes no files")
     parser.add_argument("--jobs", type=int, default=1, help="processes for the matrix")
-    parser.add_argument("--published", nargs="+", choices=IDS, help="renew these in the matrix")
-    parser.add_argument("--cost", action="store_true", help="renew the cost of a control step")
+    parts = ("motions", "cost", "expert", *IDS)
+    parser.add_argument("--renew", nargs="+", choices=parts, help="measure only these again")
     parser.add_argument("--redraw", action="store_true", help="picture and page from the records")
     options = parser.parse_args()
-    if options.cost:
-        again = {"renewed": shared.describe(sys.argv), "cost": costs(ENGINES, ROUNDS)}
-        provenance.write_json(RECORD, read_record(RECORD) | again)
-    elif options.published:
-        provenance.write_json(RECORD, renewed(read_record(RECORD), options.published, options.jobs))
+    if options.renew:
+        provenance.write_json(RECORD, renewed(read_record(RECORD), options.renew, options.jobs))
     elif not options.redraw:
         quick = options.quick
         record = {
             "machine": shared.describe(sys.argv),
-            "agreement": agreement(ENGINES, 3 if quick else 20),
+            "agreement": agreement(ENGINES, 3 if quick else REPEATS),
             "energy_lost": {engine: energy_lost(engine) for engine in ENGINES},
             "cost": costs(ENGINES, 4 if quick else ROUNDS),
             "matrix": matrix(cells(ENGINES, 10 if quick else EPISODES), options.jobs),

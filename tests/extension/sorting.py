@@ -59,8 +59,7 @@ class Sort(Task):
         for block, goal in zip(self.scene.objects, motion.goal.reshape(2, 3), strict=True):
             while not motion.holding(block.name):
                 yield from motion.pick(block, CLEARANCE)
-            grip = motion.seen["position"] - motion.seen[f"{block.name}_position"]
-            place = self.machine.mount.to_paper(goal + grip)
+            place = motion.carried_to(goal, block.name)
             yield from motion.go([motion.command + up, place + up, place], vacuum=True)
             yield from [Move(place, True), Move(place, True), Move(place, False)]
             yield from motion.go([place + up], vacuum=False)

@@ -76,13 +76,11 @@ class Stack(Task):
 
     def plan(self, motion: Motion) -> Iterator[Move]:
         """Carry the lower block to its place, then the upper block on top of it."""
-        to_paper, up = motion.machine.mount.to_paper, np.array([0.0, 0.0, -CLEARANCE])
+        up = np.array([0.0, 0.0, -CLEARANCE])  # paper z points down
         for block, goal in zip(self.scene.objects, motion.goal.reshape(2, 3), strict=True):
             while not motion.holding(block.name):
                 yield from motion.pick(block, CLEARANCE)
-                # The cup does not hold the block exactly at its middle.
-                grip = motion.seen["position"] - motion.seen[f"{block.name}_position"]
-                place = to_paper(goal + grip)
+                place = motion.carried_to(goal, block.name)
                 way = [motion.command + up, place + up, place]
                 yield from motion.go(way, vacuum=True, while_holding=block.name)
             yield Move(place, False)
