@@ -1,6 +1,11 @@
 """Tests of an engine are skipped where its package is not installed."""
 
+import os
 from importlib.util import find_spec
+
+# The suite has a process per core, so that the threads of a library would wait for each other.
+# PyTorch and NumPy read this once, when they are imported; tests' own processes inherit it.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
 from registries import registries_put_back

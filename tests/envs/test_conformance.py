@@ -10,6 +10,7 @@ import pytest
 from episodes import EVERYTHING, OF_SERVOS, conforms
 
 import tpm_gym
+from tpm_gym.envs import testing
 from tpm_gym.envs.testing import check_env
 from tpm_gym.errors import ConformanceError
 from tpm_gym.tasks import Reach
@@ -42,9 +43,39 @@ CASES: list[tuple[str, dict[str, Any]]] = [
 ]
 
 
+OF_MOTION = (
+    testing.passes_the_checkers_of_gymnasium_and_sb3,
+    testing.shares_no_memory,
+    testing.refuses_bad_actions_and_has_not_moved_then,
+    testing.clips_actions_and_leaves_them_as_they_are,
+    testing.refuses_bad_options_and_keeps_the_episode_then,
+    testing.refuses_steps_outside_an_episode,
+    testing.continues_copies_and_snapshots_equally,
+    testing.gives_the_rows_of_its_vector_environment,
+    testing.is_solved_by_its_expert,
+)
+"""Checks of what an id with sparse rewards shares with the same id with dense rewards."""
+
+
 @pytest.mark.parametrize(("env_id", "options"), CASES, ids=str)
 def test_it_keeps_what_is_promised(env_id, options):
-    conforms(lambda: gym.make(env_id, **options))
+    also_dense = (env_id.replace("-v0", "Dense-v0"), options) in CASES
+    conforms(lambda: gym.make(env_id, **options), without=OF_MOTION if also_dense else ())
+
+
+def but_the_reward(env_id: str) -> dict[str, Any]:
+    """Return an id's entry in the registry without its name and its kind of reward."""
+    entry = vars(gym.spec(env_id))
+    kwargs = {name: value for name, value in entry["kwargs"].items() if name != "reward"}
+    return {**entry, "id": None, "name": None, "kwargs": kwargs}
+
+
+def test_sparse_and_dense_ids_differ_in_nothing_but_the_reward():
+    """Therefore the checks of motion are not repeated with sparse rewards."""
+    for env_id in tpm_gym.ENV_IDS:
+        dense = env_id.replace("-v0", "Dense-v0")
+        if dense in tpm_gym.ENV_IDS:
+            assert but_the_reward(env_id) == but_the_reward(dense)
 
 
 class Unseeded(Reach):

@@ -391,18 +391,26 @@ def gives_the_rows_of_its_vector_environment(make: Make) -> None:
         shape = (3, *(env.action_space.shape or ()))
         envs: Any = gym.make_vec(spec, num_envs=3)
         with closing(envs):
-            for row in range(3):
-                rng = np.random.default_rng(row)
-                batch, _ = envs.reset(seed=[row, row + 1, row + 2])
-                alone, _ = env.reset(seed=2 * row)
-                for _ in range(min(10, _steps_of(env) - 1)):
-                    found = bits({name: values[row] for name, values in batch.items()})
-                    _require(f"row {row} of a vector is the environment", found == bits(alone))
-                    actions = rng.uniform(-1, 1, shape).astype(np.float32)
-                    batch, rewards, *_ = envs.step(actions)
-                    alone, reward, *_ = env.step(actions[row])
-                    said = f"{rewards[row]} is not {reward}"
-                    _require(f"row {row} of a vector has its reward", rewards[row] == reward, said)
+            envs.reset(seed=9)
+            envs.step(np.zeros(shape, dtype=np.float32))  # so that the next reset ends episodes
+            rng = np.random.default_rng(0)
+            actions = rng.uniform(-1, 1, (min(10, _steps_of(env) - 1), *shape)).astype(np.float32)
+            batch, _ = envs.reset(seed=[0, 1, 2])
+            batches, rewards = [batch], []
+            for taken in actions:
+                batch, paid, *_ = envs.step(taken)
+                batches.append(copy.deepcopy(batch))
+                rewards.append(paid.copy())
+        for row in range(3):
+            alone, _ = env.reset(seed=row)
+            for index, batch in enumerate(batches):
+                if index:
+                    alone, reward, *_ = env.step(actions[index - 1, row])
+                    found = rewards[index - 1][row]
+                    said = f"{found} is not {reward}"
+                    _require(f"row {row} of a vector has its reward", found == reward, said)
+                of_row = bits({name: values[row] for name, values in batch.items()})
+                _require(f"row {row} of a vector is the environment", of_row == bits(alone))
 
 
 def survives_json(make: Make) -> None:
