@@ -82,7 +82,7 @@ def test_a_step_that_raises_is_reported_outlived_and_can_be_repeated(tmp_path, c
         env = gym.make(env_id, **options)
         return Raising(env) if env_id == soak.ENV_IDS[1] else env
 
-    status, content = soaked(tmp_path, make=make)
+    status, content = soaked(tmp_path, "--steps", "600", make=make)
     assert status == 1
     assert content["finished"]  # it went on
     first = content["failures"][0]

@@ -123,13 +123,13 @@ def test_a_full_disk_ends_the_run_with_its_last_checkpoint_whole(tmp_path, monke
 
     config, console = make_config("sac", tmp_path), quiet()
     interrupt_at(
-        monkeypatch, 205, lambda: monkeypatch.setattr(callbacks.PeriodicEvaluation, "_record", full)
+        monkeypatch, 255, lambda: monkeypatch.setattr(callbacks.PeriodicEvaluation, "_record", full)
     )
     with monkeypatch.context() as patched:
         patched.setattr(
             callbacks.PeriodicEvaluation, "_record", callbacks.PeriodicEvaluation._record
         )
-        with pytest.raises(RunError, match=r"from step 200 with: tpm-gym resume .*run"):
+        with pytest.raises(RunError, match=r"from step 250 with: tpm-gym resume .*run"):
             train(config, console)
     assert resume(ResumeConfig(config.run), quiet()) is None
     assert_equal_runs(uninterrupted("sac"), tmp_path / "run")

@@ -115,7 +115,7 @@ def test_config_records_the_whole_run(run):
     text = (run / "config.json").read_text(encoding="utf-8")
     content = json.loads(text)
     assert (content["algo"], content["env"], content["seed"]) == ("sac", "TPMReach-v0", 0)
-    assert (content["steps"], content["eval_every"], content["eval_episodes"]) == (300, 70, 1)
+    assert (content["steps"], content["eval_every"], content["eval_episodes"]) == (300, 140, 1)
     assert content["recipe"]["hindsight"] is True
     assert content["recipe"]["arguments"]["gamma"] == 0.95
     assert content["training_seeds"] == [0, 0]

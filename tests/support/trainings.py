@@ -92,10 +92,10 @@ def make_config(case: str, folder: Path) -> TrainingConfig:
         recipe_file=recipe,
         run=folder / "run",
         eval_episodes=1,
-        eval_every=70,
+        eval_every=140,
         checkpoint_every=50,
         env_options=EnvOptions(engine="analytic") if "analytic" in case else EnvOptions(),
-        test_episodes=2,
+        test_episodes=1,
     )
 
 
