@@ -35,7 +35,6 @@ import speed_scaling
 from numpy.typing import NDArray
 from raw_physics import Floor, Recorder, Tape, record, recording, replay
 from shared import provenance, quartiles
-from speed_report import print_report, save_plot
 
 from tpm_gym import ENV_IDS
 from tpm_gym.simulation.bullet.silence import silence
@@ -257,6 +256,9 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 def main(arguments: Sequence[str] | None = None) -> dict[str, Any]:
     """Measure and print the tables; return the content of --json."""
+    # Imports Matplotlib, which the spawned processes of speed_scaling.py do not need.
+    from speed_report import print_report, save_plot
+
     options = parse(arguments)
     words = sys.argv if arguments is None else ["benchmarks/bench_speed.py", *arguments]
     if options.profile:

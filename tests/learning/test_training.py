@@ -70,6 +70,7 @@ def equal(first: dict[str, Any], second: dict[str, Any]) -> bool:
     return all(torch.equal(value, second[name]) for name, value in first.items())
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_same_seed_same_policy_whatever_is_evaluated(run, tmp_path):
     config = replace(make_config("sac", tmp_path), eval_episodes=2, eval_every=1000)
     train(config, quiet())
@@ -127,6 +128,7 @@ def test_config_records_the_whole_run(run):
     assert str(run.parent) not in text
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_what_is_chosen_reaches_every_environment_and_survives_resuming(tmp_path, monkeypatch):
     snug = replace(PAPER_TPM, name="snug", table=(0.4, 0.3))
     tpm_gym.register_machine("snug", snug)
@@ -232,8 +234,8 @@ def test_command_line_trains_ppo_in_parallel_and_stops_when_asked_to(tmp_path, n
     config = make_config("ppo in processes", tmp_path)
     folder = config.run
     words = ["--algo", "ppo", "--env", config.env, "--steps", "1000000", "--run", str(folder)]
-    words += ["--recipe", str(config.recipe_file), "--checkpoint-every", "240"]
-    saved = folder / "checkpoints" / "000000240.checkpoint"
+    words += ["--recipe", str(config.recipe_file), "--checkpoint-every", "80"]
+    saved = folder / "checkpoints" / "000000080.checkpoint"
     command = [PYTHON, ROOT / "train" / "train.py", *words, "--eval-episodes", "1"]
     returned, output = signalled(command, saved.is_file, number)
     assert returned == status, output
