@@ -106,7 +106,7 @@ def learn(
 def measure(options: argparse.Namespace, folder: Path) -> Iterator[dict[str, Any]]:
     """Collect the datasets, and yield a row for each id, kind and size."""
     seeds = range(options.seeds)
-    for kind, env_id in product(KINDS, IDS):
+    for kind, env_id in product(KINDS, options.envs):
         episodes = options.seeds * max(SIZES)
         collect(CollectConfig(env=(env_id,), kind=(kind,), episodes=episodes, out=folder))
         dataset = MinariDataset(folder / env_id / f"{kind}-v0" / "data")
@@ -139,11 +139,17 @@ def lines(record: dict[str, Any]) -> Iterator[str]:
     yield from table(head, rows)
 
 
+def _place(row: dict[str, Any]) -> tuple[Any, ...]:
+    """Return the place of a row in the table."""
+    return row["kind"], row["env"], row["episodes"]
+
+
 def main() -> None:
     """Measure, or write the page from the record."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--updates", type=int, default=UPDATES, help="updates of each training")
     parser.add_argument("--seeds", type=int, default=SEEDS)
+    parser.add_argument("--envs", nargs="+", choices=IDS, default=IDS, help="keep rows of others")
     parser.add_argument("--hide", nargs="*", default=HIDDEN, help="hidden entries")
     parser.add_argument("--only-page", action="store_true", help="write the page, measure nothing")
     args = parser.parse_args()
@@ -151,11 +157,13 @@ def main() -> None:
         torch.set_num_threads(1)
         about = describe(sys.argv)
         with tempfile.TemporaryDirectory() as folder:
-            rows = []
+            old = read_record(RECORD) or {"rows": []}
+            rows = {_place(row): row for row in old["rows"] if row["env"] not in args.envs}
             for row in measure(args, Path(folder)):
-                rows.append(row)
+                rows[_place(row)] = row
                 counts = {"updates": args.updates, "tested": EPISODES, "hidden": list(args.hide)}
-                write_json(RECORD, {**about, **counts, "rows": rows})
+                sorted_rows = [rows[place] for place in sorted(rows)]
+                write_json(RECORD, {**about, **counts, "rows": sorted_rows})
     fill(PAGE, "cloning", lines(read_record(RECORD)))
 
 
