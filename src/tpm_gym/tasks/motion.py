@@ -15,7 +15,7 @@ from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.state import CONTROL_PERIOD, Block
 from tpm_gym.tasks.control import Control
 
-__all__ = ["HOVER", "Motion", "Move", "hanging"]
+__all__ = ["Motion", "Move", "hanging"]
 
 RAMP = 0.120
 """Time from rest to full speed, s."""
@@ -23,12 +23,6 @@ ROUNDING = 1e-5
 """Tolerance as a fraction of a control step, above the error of single precision, 1e-6."""
 SEALING = 0.160
 """Time to wait for the cup to seal before giving up, s."""
-HOVER = 0.0005
-"""Height of the lip over a block, or of a block over the table, at which nothing presses, m.
-
-Suction bridges it. Motors that press have the torque of a stiff contact, and each engine has its
-own.
-"""
 
 
 def hanging(block: Block) -> FloatArray:
@@ -149,27 +143,20 @@ class Motion:
         ]
         return np.stack(columns, axis=1)
 
-    def pick(self, block: Block, clearance: float, hover: bool = False) -> Iterator[Move]:
+    def pick(self, block: Block, clearance: float) -> Iterator[Move]:
         """Come down on a block from ``clearance`` (m) above it, and wait for the seal.
-
-        Args:
-            hover: Whether P comes to rest HOVER above the block before the vacuum is on. If not,
-                the cup seals on its way, and presses. Networks imitate this with fewer steps.
 
         Raises:
             ConfigurationError: If the task does not observe the block.
         """
-        height = HOVER if hover else 0.0
         yield from self.go([self._above(block, clearance)], vacuum=False)
-        yield from self.go([self._above(block, height)], vacuum=not hover)
-        if hover:
-            yield Move(self._above(block, height), False)  # the platform lags its command
+        yield from self.go([self._above(block)], vacuum=True)
         for _ in range(self._sealing):
             if self.holding(block.name):
                 return
-            yield Move(self._above(block, height), True)
+            yield Move(self._above(block), True)
 
-    def _above(self, block: Block, clearance: float) -> FloatArray:
+    def _above(self, block: Block, clearance: float = 0.0) -> FloatArray:
         """Return P (machine's frame) with the lip ``clearance`` above a block's present place."""
         place = self._see(f"{block.name}_position") + hanging(block)
         return self.machine.mount.to_paper(place + (0.0, 0.0, clearance))

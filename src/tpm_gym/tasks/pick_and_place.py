@@ -11,7 +11,7 @@ from tpm_gym.arrays import FloatArray
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.simulation.state import Block, Scene, State
 from tpm_gym.tasks import sampling
-from tpm_gym.tasks.motion import HOVER, Motion, Move, hanging
+from tpm_gym.tasks.motion import Motion, Move, hanging
 from tpm_gym.tasks.task import Task, dense
 
 __all__ = ["PickAndPlace"]
@@ -69,16 +69,15 @@ class PickAndPlace(Task):
         """Come down on the block, carry it, release it on the table or hold it in the air."""
         up = np.array([0.0, 0.0, -CLEARANCE])  # paper z points down
         while True:
-            yield from motion.pick(self.block, CLEARANCE, hover=True)
+            yield from motion.pick(self.block, CLEARANCE)
             if not motion.holding():
                 continue
+            place = motion.carried_to(motion.goal)
             on_table = bool(motion.goal[2] < self.block.height / 2 + 0.005)
-            place = motion.carried_to(motion.goal + (0.0, 0.0, HOVER * on_table))
-            if on_table:
-                stops = [motion.command + up, place + up, place]
-            else:
+            stops = [motion.command + up, place + up, place] if on_table else [place]
+            if not on_table:
                 # Lift the block off the table first, then move in a straight line.
-                stops = [motion.command + up / 2, place]
+                stops.insert(0, motion.command + up / 2)
             yield from motion.go(stops, vacuum=True, while_holding=self.block.name)
             if motion.holding():
                 break
