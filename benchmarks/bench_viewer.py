@@ -22,7 +22,6 @@ from websockets.sync.client import ClientConnection, connect
 
 from tpm_gym.errors import TPMError
 from tpm_gym.viewer import open_viewer
-from tpm_gym.viewer.posture import at_point
 from tpm_gym.viewer.viewer import Viewer
 
 SECONDS = 5.0
@@ -68,9 +67,9 @@ def points(viewer: Viewer) -> list[Any]:
     found = []
     for moment in np.arange(0.0, SECONDS, 1 / PACE):
         share = 0.5 + 0.45 * np.sin(np.array([2.0, 3.0, 5.0]) * moment)
-        point, machine = low + share * (high - low), explore.posture.machine
+        point = low + share * (high - low)
         with suppress(TPMError):
-            at_point(machine, point, explore.operation.value, explore.working)
+            viewer.kind.at_point(point, explore.operation.value, explore.working)
             found.append(point)
     return found
 

@@ -10,9 +10,10 @@ from tpm_gym.errors import InputError, UnreachableError
 from tpm_gym.kinematics import ELBOWS_OUT, WORKING_MODES
 from tpm_gym.mechanism import DELTA
 from tpm_gym.mechanism.delta import geometry as delta
-from tpm_gym.viewer.posture import OPERATIONS, Posture, at_joints, at_point
+from tpm_gym.viewer.kinds import Posture, find_kind
 
 MACHINES = PAPER_TPM, WIDE_TPM
+OPERATIONS = "translating", "rotated"
 
 
 def postures(machine, count: int = 25) -> list[Posture]:
@@ -23,7 +24,7 @@ def postures(machine, count: int = 25) -> list[Posture]:
     for operation, mode in product(OPERATIONS, WORKING_MODES):
         for point in rng.uniform(-reach, reach, (count, 3)):
             try:
-                found.append(at_point(machine, point, operation, mode))
+                found.append(find_kind(machine).at_point(point, operation, mode))
             except TPMError:
                 continue
             assert found[-1].operation == operation
@@ -48,7 +49,7 @@ def test_the_joints_of_a_posture_lead_back_to_it_in_its_assembly_mode(machine):
     for posture in postures(machine, count=10):
         if posture.conditioning < 1e-3:
             continue  # two assemblies merge
-        back = at_joints(machine, posture.theta, posture.assembly)
+        back = find_kind(machine).at_joints(posture.theta, posture.assembly)
         assert back.position == pytest.approx(posture.position, abs=1e-6)
         assert back.working == posture.working
 
@@ -58,7 +59,7 @@ def test_a_delta_closes_in_all_modes_and_its_joints_lead_back():
     for mode in delta.WORKING_MODES:
         for point in rng.uniform((-0.8, -0.8, -1.4), (0.8, 0.8, 1.4), (25, 3)):
             try:
-                posture = at_point(DELTA, point, "translating", mode)
+                posture = find_kind(DELTA).at_point(point, "translating", mode)
             except UnreachableError:
                 continue
             found.append(posture)
@@ -66,29 +67,30 @@ def test_a_delta_closes_in_all_modes_and_its_joints_lead_back():
             assert posture.gap < 1e-9
             assert posture.places["platform"].point(DELTA.mechanism.point_p) == pytest.approx(point)
             if posture.conditioning > 1e-3:
-                back = at_joints(DELTA, posture.theta, posture.assembly)
+                back = find_kind(DELTA).at_joints(posture.theta, posture.assembly)
                 assert back.position == pytest.approx(point, abs=1e-9)
     assert len({(posture.working, posture.assembly) for posture in found}) == 16
-    home = at_point(DELTA, DELTA.home, "translating", delta.ELBOWS_OUT)
+    home = find_kind(DELTA).at_point(DELTA.home, "translating", delta.ELBOWS_OUT)
     assert home.conditioning == pytest.approx(float(DELTA.conditioning_at(DELTA.home)))
     with pytest.raises(UnreachableError):
-        at_joints(DELTA, (3.0, 0.0, 0.0), 1.0)
+        find_kind(DELTA).at_joints((3.0, 0.0, 0.0), 1.0)
 
 
 def test_of_several_tilts_the_nearest_is_taken():
     machine, home = WIDE_TPM, WIDE_TPM.home
     tilts = {
-        at_point(machine, home, "rotated", ELBOWS_OUT, tilt).tilt
+        find_kind(machine).at_point(home, "rotated", ELBOWS_OUT, tilt).tilt
         for tilt in np.linspace(-np.pi, np.pi, 25)
     }
     for tilt in tilts:
-        near = at_point(machine, home, "rotated", ELBOWS_OUT, tilt + 1e-3)
+        near = find_kind(machine).at_point(home, "rotated", ELBOWS_OUT, tilt + 1e-3)
         assert near.tilt == pytest.approx(tilt, abs=1e-9)
 
 
 def test_margins_are_those_of_the_machine():
-    posture = at_point(PAPER_TPM, PAPER_TPM.home, "translating", ELBOWS_OUT)
-    margin = posture.singularity_margin()
+    posture = find_kind(PAPER_TPM).at_point(PAPER_TPM.home, "translating", ELBOWS_OUT)
+    _, find = find_kind(PAPER_TPM).layers(posture)["margin"]
+    margin = find()
     assert margin is not None
     # y = l7 is nearer than y = 0
     assert margin.distance == pytest.approx(PAPER_TPM.geometry.l7 - posture.position[1])
@@ -102,11 +104,11 @@ def test_margins_are_those_of_the_machine():
 
 def test_what_does_not_exist_is_refused_with_the_reason():
     with pytest.raises(UnreachableError, match="beta"):
-        at_point(PAPER_TPM, (0.0, 0.3, 0.8), "translating", ELBOWS_OUT)
+        find_kind(PAPER_TPM).at_point((0.0, 0.3, 0.8), "translating", ELBOWS_OUT)
     with pytest.raises(InputError, match=r"other working modes|none has"):
-        at_point(WIDE_TPM, (0.0, 0.55, -0.9), "rotated", ELBOWS_OUT)
-    rotated = at_point(PAPER_TPM, PAPER_TPM.home, "rotated", ELBOWS_OUT)
+        find_kind(WIDE_TPM).at_point((0.0, 0.55, -0.9), "rotated", ELBOWS_OUT)
+    rotated = find_kind(PAPER_TPM).at_point(PAPER_TPM.home, "rotated", ELBOWS_OUT)
     with pytest.raises(InputError, match="rotated assembly"):
-        at_joints(PAPER_TPM, rotated.theta + [1.5, 0.0, 0.0], rotated.assembly)
+        find_kind(PAPER_TPM).at_joints(rotated.theta + [1.5, 0.0, 0.0], rotated.assembly)
     with pytest.raises(InputError, match="position"):
-        at_point(PAPER_TPM, (0.0, np.nan, 0.8), "translating", ELBOWS_OUT)
+        find_kind(PAPER_TPM).at_point((0.0, np.nan, 0.8), "translating", ELBOWS_OUT)

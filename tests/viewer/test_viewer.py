@@ -4,7 +4,7 @@ import time
 from contextlib import closing
 from html import escape
 from itertools import product
-from typing import Any
+from typing import Any, ClassVar
 
 import msgspec
 import numpy as np
@@ -18,6 +18,8 @@ import tpm_gym
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.kinematics import RotatedMode
 from tpm_gym.viewer import open_viewer
+from tpm_gym.viewer.kinds import KINDS, Kind
+from tpm_gym.viewer.kinds.kind import Margin
 from tpm_gym.viewer.layers import LAYERS
 from tpm_gym.viewer.player import Player, installed_engines, policies_for
 from tpm_gym.viewer.viewer import Viewer
@@ -52,18 +54,19 @@ def do(viewer: Viewer, job: Any) -> None:
 
 def test_every_choice_of_modes_draws_a_posture_in_them_or_says_why(viewer):
     explore, drawn = viewer.explore, set()
+    elbows, link_7 = explore.working_lists
     for operation in ("translating", "rotated"):
         do(viewer, explore.go_home)
         choose(viewer, explore.operation, operation)
-        for bends, link_7 in product(explore.bends.options, explore.link_7.options):
-            choose(viewer, explore.bends, bends)
-            choose(viewer, explore.link_7, link_7)
+        for bends, side in product(elbows.options, link_7.options):
+            choose(viewer, elbows, bends)
+            choose(viewer, link_7, side)
             if explore.problem:
                 assert escape(explore.problem) in explore.text
             else:
                 posture = explore.posture
                 assert posture.operation == operation
-                assert (explore.bends.value, explore.link_7.value) == (bends, link_7)
+                assert (elbows.value, link_7.value) == (bends, side)
                 assert posture.working == explore.working
                 drawn.add((operation, posture.working))
             assert drawn_gap(viewer) < 1e-9
@@ -71,7 +74,7 @@ def test_every_choice_of_modes_draws_a_posture_in_them_or_says_why(viewer):
 
 
 def test_elbows_out_is_the_working_mode_of_the_machines(viewer):
-    assert viewer.explore.bends.value == "out / out / out"
+    assert viewer.explore.working_lists[0].value == "out / out / out"
     theta = viewer.explore.posture.theta
     outwards = np.cos(theta) * [1, -1, 1]  # level components of the arms, away from the centre
     assert (outwards > 0).all()
@@ -172,10 +175,11 @@ def test_another_machine_is_shown_at_its_home(viewer):
 def test_a_delta_is_dragged_turned_and_plays_the_expert(viewer):
     choose(viewer, viewer.machine, "delta")
     explore = viewer.explore
-    assert not explore.link_7.visible
+    elbows, link_7 = explore.working_lists
+    assert not link_7.visible
     do(viewer, lambda: explore.drag((0.2, -0.1, 1.0)))
     assert explore.posture.position == pytest.approx((0.2, -0.1, 1.0))
-    choose(viewer, explore.bends, "out / in / out")
+    choose(viewer, elbows, "out / in / out")
     assert explore.posture.working == (1.0, -1.0, 1.0)
     do(viewer, explore.go_home)
     assert explore.assembly.value == "det A > 0"
@@ -183,6 +187,8 @@ def test_a_delta_is_dragged_turned_and_plays_the_expert(viewer):
     assert explore.posture.position[2] < 0
     for name in LAYERS:
         choose(viewer, viewer.shown[name], True)
+    find = viewer.server.scene.get_handle_by_name
+    assert all(find(f"/robot/{name}") for name in ("aspects/0", "workspace", "conditioning"))
     assert drawn_gap(viewer) < 1e-9
     choose(viewer, viewer.play.env_id, "TPMPickAndPlace-v0")
     for _ in range(3):
@@ -322,9 +328,32 @@ def test_options_that_are_not_possible_are_refused(options, name):
     assert refused.value.name == name
 
 
-def test_a_machine_of_another_kind_is_refused():
-    with pytest.raises(ConfigurationError, match="a TPM or a Delta"):
-        open_viewer(GANTRY)
+def test_a_machine_without_a_kind_is_shown_in_its_own_modes():
+    with closing(open_viewer(GANTRY, port=0)) as viewer:
+        explore = viewer.explore
+        assert [motor.label for motor in explore.motors] == [f"Motor {k}, mm" for k in (1, 2, 3)]
+        choose(viewer, explore.motors[0], 30.0)
+        assert explore.posture.position == pytest.approx((0.03, 0.0, 0.80))
+        do(viewer, lambda: explore.drag((0.1, -0.05, 0.7)))
+        assert [motor.value for motor in explore.motors] == pytest.approx([100.0, -50.0, 700.0])
+        assert [name for name, box in viewer.shown.items() if box.visible] == ["region"]
+
+
+def test_a_mechanism_with_a_kind_of_its_own_has_its_modes_and_layers(monkeypatch):
+    class Own(Kind):
+        lists: ClassVar = {"Operation": "", "Side": "Of the slides", "Assembly": ""}
+        working: ClassVar = {("left",): 1, ("right",): None}
+
+        def layers(self, posture):
+            where = tuple(posture.position)
+            return {"margin": (where, lambda: Margin(0.1, posture.position + [0.1, 0, 0], "end"))}
+
+    monkeypatch.setitem(KINDS, type(GANTRY), Own)
+    with closing(open_viewer(GANTRY, port=0)) as viewer:
+        side, other = viewer.explore.working_lists
+        assert (side.label, side.options, other.visible) == ("Side", ("left", "right"), False)
+        choose(viewer, viewer.shown["margin"], True)
+        assert viewer.server.scene.get_handle_by_name("/robot/margin") is not None
 
 
 def test_a_taken_port_gives_another(viewer):

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 from tpm_gym.errors import MissingPackageError
 
 if TYPE_CHECKING:
-    from tpm_gym.mechanism import Delta
-    from tpm_gym.mechanism.tpm import TPM
+    from tpm_gym.mechanism import Machine
     from tpm_gym.viewer.viewer import Viewer
 
 __all__ = ["ViewConfig", "open_viewer", "run"]
@@ -24,7 +23,7 @@ class ViewConfig:
     """Show the robot in the browser: drag it, see its singularities, and play episodes."""
 
     machine: str = "paper"
-    """Machine that is shown first: paper, wide, delta, or another registered TPM or Delta."""
+    """Machine that is shown first: paper, wide, delta, or another registered machine."""
 
     host: str = "127.0.0.1"
     """Address to listen on. Other computers reach the page only with another address."""
@@ -38,18 +37,18 @@ class ViewConfig:
 
 
 def open_viewer(
-    machine: str | TPM | Delta = "paper", *, host: str = "127.0.0.1", port: int = 8080
+    machine: str | Machine = "paper", *, host: str = "127.0.0.1", port: int = 8080
 ) -> Viewer:
     """Start a viewer in the background; ``.address`` is its page and ``.close()`` ends it.
 
     Args:
-        machine: Name of a machine, or a TPM or Delta.
+        machine: Name of a machine, or a machine.
         host: Address to listen on.
         port: Port to listen on; if it is taken, the next free one.
 
     Raises:
         MissingPackageError: If viser is not installed.
-        ConfigurationError: If the machine is of another kind, or an option is not possible.
+        ConfigurationError: If no machine has this name, or an option is not possible.
     """
     try:
         from tpm_gym.viewer.viewer import Viewer
@@ -63,7 +62,7 @@ def run(config: ViewConfig) -> None:
 
     Raises:
         MissingPackageError: If viser is not installed.
-        ConfigurationError: If the machine is of another kind, or an option is not possible.
+        ConfigurationError: If no machine has this name, or an option is not possible.
     """
     if config.export is not None:
         try:

@@ -2,32 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterable, Mapping
 from html import escape
-from typing import Any, Final
+from typing import Any, TypeVar
 
-import numpy as np
 from viser import GuiApi, TransformControlsHandle, ViserServer
 
 from tpm_gym.errors import TPMError
-from tpm_gym.kinematics import (
-    ASSEMBLY_MODES,
-    ROTATED_MODES,
-    AssemblyMode,
-    RotatedMode,
-    WorkingMode,
-)
-from tpm_gym.mechanism import Delta
-from tpm_gym.mechanism.delta import geometry as delta
-from tpm_gym.mechanism.tpm import TPM
-from tpm_gym.viewer.posture import OPERATIONS, Operation, Posture, at_joints, at_point
+from tpm_gym.mechanism import Machine
+from tpm_gym.viewer.kinds import Kind, Posture
 from tpm_gym.viewer.scene import ROBOT
 from tpm_gym.viewer.worker import Worker
 
-__all__ = ["Explore"]
+__all__ = ["Explore", "units"]
 
-_BENDS: Final = {1: "out", -1: "in"}
-_LINK_7: Final = {"towards +x": 1, "towards -x": -1}
+_Label = TypeVar("_Label")
 
 
 class Explore:
@@ -52,7 +42,6 @@ class Explore:
         """Add the controls."""
         self._server, self._worker, self._show = server, worker, show
         self.posture: Posture
-        self._out = np.ones(3, dtype=int)
         self.gizmo: TransformControlsHandle | None = None
         self._add_modes(server.gui)
         self._add_motors(server.gui)
@@ -60,38 +49,16 @@ class Explore:
         self._refusal: Any = server.gui.add_html("")
 
     def _add_modes(self, gui: GuiApi) -> None:
-        bends = [
-            f"{one} / {two} / {three}"
-            for one in _BENDS.values()
-            for two in _BENDS.values()
-            for three in _BENDS.values()
-        ]
-        self.operation: Any = gui.add_dropdown(
-            "Operation", OPERATIONS, hint="Link 3' only translates, or is turned about y"
-        )
-        self.bends: Any = gui.add_dropdown(
-            "Elbows 1 / 2 / 3", bends, hint="Working mode: how the three arms are bent"
-        )
-        self.link_7: Any = gui.add_dropdown(
-            "Link 7", tuple(_LINK_7), hint="Working mode: sign of cos(beta)"
-        )
-        self.assembly: Any = gui.add_dropdown(
-            "Assembly",
-            tuple(_label(mode) for mode in ASSEMBLY_MODES),
-            hint="Assembly mode: signs of the planar factor and of sin(beta), which is that of y",
-        )
-        for handle, job in (
-            (self.operation, self._point_again),
-            (self.bends, self._point_again),
-            (self.link_7, self._point_again),
-            (self.assembly, self._joints_again),
-        ):
-            self._on(handle, "modes", job)
+        self.operation: Any = gui.add_dropdown("Operation", ("",))
+        self.working_lists: list[Any] = [gui.add_dropdown("Working", ("",)) for _ in range(2)]
+        self.assembly: Any = gui.add_dropdown("Assembly", ("",))
+        for handle in (self.operation, *self.working_lists):
+            self._on(handle, "modes", self._point_again)
+        self._on(self.assembly, "modes", self._joints_again)
 
     def _add_motors(self, gui: GuiApi) -> None:
         self.motors: list[Any] = [
-            gui.add_slider(f"Motor {k + 1}, °", low, low + 360.0, 0.1, low + 180.0)
-            for k, low in enumerate((-180.0, 0.0, -180.0))
+            gui.add_slider(f"Motor {k + 1}", -180.0, 180.0, 0.1, 0.0) for k in range(3)
         ]
         for motor in self.motors:
             self._on(motor, "motors", self._joints_again)
@@ -109,16 +76,22 @@ class Explore:
 
     # -- machine ------------------------------------------------------------------------------
 
-    def set_machine(self, machine: TPM | Delta) -> None:
+    def set_kind(self, kind: Kind) -> None:
         """Show another machine, at its home and in its modes."""
-        self._machine = machine
-        # Motors whose arms point level outwards, in the machine's own modes: elbows are out.
-        tpm = isinstance(machine, TPM)
-        self._out = np.array(
-            machine.working_mode.signs[1:] if isinstance(machine, TPM) else delta.ELBOWS_OUT
-        )
-        self.operation.options = OPERATIONS if tpm else OPERATIONS[:1]
-        self.link_7.visible = tpm
+        self._kind = kind
+        operation, *parts, assembly = kind.lists.items()
+        _fill(self.operation, operation, kind.assembly)
+        for index, handle in enumerate(self.working_lists):
+            handle.visible = index < len(parts)
+            if handle.visible:
+                _fill(handle, parts[index], (words[index] for words in kind.working))
+        _fill(self.assembly, assembly, kind.assembly[self.operation.value])
+        for k, (motor, (scale, unit)) in enumerate(
+            zip(self.motors, units(kind.machine), strict=True)
+        ):
+            turns, stops = unit == "°", scale * kind.machine.stops[:, k]
+            motor.label = f"Motor {k + 1}, {unit}"
+            motor.min, motor.max = (kind.lows[k], kind.lows[k] + 360.0) if turns else stops.tolist()
         self.gizmo = self._server.scene.add_transform_controls(
             f"{ROBOT}/P", 0.16, disable_rotations=True, depth_test=False, line_width=3.0
         )
@@ -135,24 +108,18 @@ class Explore:
     @property
     def working(self) -> Any:
         """Working mode that the panel asks for."""
-        bends = [1 if word == "out" else -1 for word in self.bends.value.split(" / ")]
-        signs = tuple(np.array(bends) * self._out)
-        if isinstance(self._machine, Delta):
-            return signs
-        return WorkingMode(_LINK_7[self.link_7.value], *signs)
+        words = (handle.value for handle in self.working_lists if handle.visible)
+        return self._kind.working[tuple(words)]
 
     def drag(self, position: Any) -> None:
         """Move P to ``position`` (3,) m, machine's frame, in the modes of the panel."""
-        operation: Operation = self.operation.value
-        self._attempt(
-            lambda: at_point(self._machine, position, operation, self.working, self.posture.tilt)
-        )
+        modes = self.operation.value, self.working
+        self._attempt(lambda: self._kind.at_point(position, *modes, self.posture.tilt))
 
     def turn(self, theta: Any) -> None:
         """Turn the motors to ``theta`` (3,) rad, in the assembly mode of the panel."""
-        modes = self._assemblies
-        mode = modes[self.assembly.options.index(self.assembly.value)]
-        self._attempt(lambda: at_joints(self._machine, theta, mode))
+        mode = self._kind.assembly[self.operation.value][self.assembly.value]
+        self._attempt(lambda: self._kind.at_joints(theta, mode))
 
     def hide_gizmo(self, hidden: bool) -> None:
         """Hide the gizmo, which covers the cup, or show it again."""
@@ -161,8 +128,7 @@ class Explore:
 
     def go_home(self) -> None:
         """Move to the machine's home, in its own modes."""
-        machine = self._machine
-        self.set(at_point(machine, machine.home, "translating", machine.working_mode))
+        self.set(self._kind.home())
 
     def set(self, posture: Posture) -> None:
         """Show a posture, and its modes and motors in the panel."""
@@ -176,16 +142,16 @@ class Explore:
 
     def _set_panel(self, posture: Posture) -> None:
         self._refuse("")
-        working = posture.working
-        bends = working.signs[1:] if isinstance(working, WorkingMode) else working
         self.operation.value = posture.operation
         self._set_assemblies()
-        self.bends.value = " / ".join(_BENDS[int(b)] for b in np.array(bends) * self._out)
-        if isinstance(working, WorkingMode):
-            self.link_7.value = next(k for k, v in _LINK_7.items() if v == working.cos_beta)
-        self.assembly.value = _label(posture.assembly)
-        for motor, angle in zip(self.motors, np.degrees(posture.theta), strict=True):
-            motor.value = float(motor.min + (angle - motor.min) % 360.0)
+        words = _label(self._kind.working, posture.working)
+        for handle, word in zip(self.working_lists, words, strict=False):
+            handle.value = word
+        self.assembly.value = _label(self._kind.assembly[posture.operation], posture.assembly)
+        shown = zip(self.motors, units(posture.machine), posture.theta, strict=True)
+        for motor, (scale, unit), theta in shown:
+            beyond = scale * theta - motor.min
+            motor.value = float(motor.min + (beyond % 360.0 if unit == "°" else beyond))
 
     def _refuse(self, problem: str) -> None:
         self.problem = problem
@@ -208,15 +174,9 @@ class Explore:
             return
         self.set(posture)
 
-    @property
-    def _assemblies(self) -> tuple[Any, ...]:
-        if isinstance(self._machine, Delta):
-            return delta.ASSEMBLY_MODES
-        return ASSEMBLY_MODES if self.operation.value == "translating" else ROTATED_MODES
-
     def _set_assemblies(self) -> None:
         """Offer the assembly modes of the operation mode."""
-        labels = tuple(_label(mode) for mode in self._assemblies)
+        labels = tuple(self._kind.assembly[self.operation.value])
         if self.assembly.options != labels:
             self.assembly.options = labels
 
@@ -225,14 +185,20 @@ class Explore:
         self.drag(self.gizmo.position)
 
     def _joints_again(self) -> None:
-        self.turn(np.radians([motor.value for motor in self.motors]))
+        scales = [scale for scale, _ in units(self._kind.machine)]
+        self.turn([motor.value / scale for motor, scale in zip(self.motors, scales, strict=True)])
 
 
-def _label(mode: AssemblyMode | RotatedMode | float) -> str:
-    if isinstance(mode, float):
-        return f"det A {'>' if mode > 0 else '<'} 0"
-    parts = [f"planar {'+' if mode.planar > 0 else '-'}"]
-    if isinstance(mode, RotatedMode):
-        parts.append("larger tilt" if mode.further > 0 else "smaller tilt")
-    parts.append(f"y {'>' if mode.sin_beta > 0 else '<'} 0")
-    return ", ".join(parts)
+def units(machine: Machine) -> list[tuple[float, str]]:
+    """Return factor and name of the panel's unit of each motor, for rad or m."""
+    of_motor = {"rad": (math.degrees(1.0), "°"), "m": (1000.0, "mm")}
+    return [of_motor[motor.unit] for motor in machine.mechanism.motors]
+
+
+def _fill(handle: Any, label: tuple[str, str], options: Iterable[str]) -> None:
+    """Give a list another label, explanation and options."""
+    (handle.label, handle.hint), handle.options = label, tuple(dict.fromkeys(options))
+
+
+def _label(modes: Mapping[_Label, Any], mode: Any) -> _Label:
+    return next(label for label, one in modes.items() if one == mode)

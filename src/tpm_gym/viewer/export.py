@@ -6,16 +6,12 @@ import os
 from pathlib import Path
 from typing import Final
 
-import numpy as np
-
 from tpm_gym.errors import ConfigurationError
-from tpm_gym.mechanism import Delta
-from tpm_gym.mechanism.tpm import TPM
+from tpm_gym.mechanism import Machine
 from tpm_gym.viewer import server
+from tpm_gym.viewer.kinds import find_kind
 from tpm_gym.viewer.player import Player
-from tpm_gym.viewer.posture import at_joints
 from tpm_gym.viewer.scene import RobotScene, set_camera
-from tpm_gym.viewer.viewer import find_shown
 
 __all__ = ["export"]
 
@@ -26,24 +22,25 @@ _OURS: Final = "__VISER_EMBED_DATA__="
 """Text of a page that viser wrote."""
 
 
-def export(folder: Path, machine: str | TPM | Delta = "paper", seed: int = 2) -> Path:
+def export(folder: Path, machine: str | Machine = "paper", seed: int = 2) -> Path:
     """Write ``index.html``: an episode of pick-and-place by the expert, in a loop.
 
     The page holds everything it needs. The engine is the analytic one.
 
     Args:
         folder: Folder of the page; made if missing. An earlier page is replaced.
-        machine: Name of a machine, or a TPM or Delta.
+        machine: Name of a machine, or a machine.
         seed: Seed of the episode.
 
     Returns:
         Path of the page.
 
     Raises:
-        ConfigurationError: If the machine is of another kind, the folder cannot be written, or it
+        ConfigurationError: If no machine has this name, the folder cannot be written, or it
             has an ``index.html`` of another program.
     """
-    found = find_shown(machine)
+    kind = find_kind(machine)
+    found = kind.machine
     page = _page(folder)
     running = server.start("127.0.0.1", 0)
     player = Player(_ENV, "analytic", found, "expert")
@@ -52,17 +49,17 @@ def export(folder: Path, machine: str | TPM | Delta = "paper", seed: int = 2) ->
         robot = RobotScene(running.scene, found)
         robot.set_objects(player.task.scene, player.task.tolerance)
 
-        def draw(theta: np.ndarray) -> None:
-            robot.draw(at_joints(found, theta, found.assembly_mode).places)
+        def draw() -> None:
+            robot.draw(kind.of_state(player.state).places)
             robot.draw_objects(player.state, player.markers)
 
         player.reset(seed)
-        draw(player.state.theta)
+        draw()
         recording = running.get_scene_serializer()
         recording.insert_sleep(_HOLD)
         while not player.ended:
             player.step()
-            draw(player.state.theta)
+            draw()
             recording.insert_sleep(player.task.control_period)
         recording.insert_sleep(_HOLD)
         page.write_text(recording.as_html(), encoding="utf-8", newline="\n")

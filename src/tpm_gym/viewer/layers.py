@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
-from itertools import product
+from collections.abc import Callable, Collection, Mapping, Sequence
+from itertools import combinations
+from operator import ne
 from typing import Any, Final, TypeAlias
 
 import numpy as np
@@ -11,16 +12,11 @@ import trimesh
 from numpy.typing import NDArray
 from viser import SceneApi
 
-from tpm_gym.analysis import delta
-from tpm_gym.analysis.aspects import aspects, reachable_set
-from tpm_gym.arrays import BoolArray, FloatArray
-from tpm_gym.kinematics import AssemblyMode
-from tpm_gym.kinematics.jacobian import conditioning_at
+from tpm_gym.analysis.aspects import Cells
+from tpm_gym.arrays import FloatArray
 from tpm_gym.kinematics.workspace import Region
-from tpm_gym.mechanism import Delta
-from tpm_gym.mechanism.tpm import TPM
-from tpm_gym.viewer.meshes import SURFACES, cells_mesh, clipped, grid_mesh, surface
-from tpm_gym.viewer.posture import Margin, Posture
+from tpm_gym.viewer.kinds.kind import Found, Kind, Margin, Posture
+from tpm_gym.viewer.meshes import Mesh, cells_mesh
 from tpm_gym.viewer.scene import ROBOT
 
 __all__ = ["BEST", "LAYERS", "Layers", "colours"]
@@ -42,9 +38,6 @@ _MAP: Final = np.array(
 )
 BEST: Final = 0.4
 """Conditioning at the end of the colour map."""
-_STEPS: Final = 200
-_FINE: Final = (96, 24, 128)
-_ROUND: Final = (96, 96, 96)
 
 
 def colours(values: FloatArray) -> NDArray[np.uint8]:
@@ -59,37 +52,36 @@ class Layers:
 
     Args:
         scene: Scene of a viser server.
-        machine: The robot.
+        kind: The robot.
     """
 
-    def __init__(self, scene: SceneApi, machine: TPM | Delta) -> None:
+    def __init__(self, scene: SceneApi, kind: Kind) -> None:
         """Start with no layer shown."""
-        self._scene, self._machine = scene, machine
-        self._geometry: Any = machine.geometry
+        self._scene, self._kind = scene, kind
         self._nodes: dict[str, list[Node]] = {}
         self._keys: dict[str, Any] = {}
         self.margin: Margin | None = None
 
-    def show(self, names: Collection[str], posture: Posture) -> None:
-        """Show these layers for a posture, and hide the others.
+    def around(self, posture: Posture) -> Mapping[str, Found]:
+        """Return the layers that there are around a posture: the task's region, and the kind's."""
+        machine = self._kind.machine
+        regions = {"region": machine.region, "goals": machine.goal_region}
+        return {"region": ("always", lambda: regions), **self._kind.layers(posture)}
 
-        Layers of the translating operation mode are hidden in rotated operation. A Delta has the
-        task's region and the workspace.
-        """
-        possible: Collection[str] = ("region", "workspace")
-        if isinstance(self._machine, TPM):
-            possible = LAYERS if posture.operation == "translating" else ("region",)
-        for name, (key, make) in LAYERS.items():
-            wanted = key(posture) if name in names and name in possible else None
+    def show(self, names: Collection[str], posture: Posture) -> None:
+        """Show these layers for a posture, as far as there are, and hide the others."""
+        there = self.around(posture)
+        for name, (_, _, draw) in LAYERS.items():
+            wanted, find = there[name] if name in names and name in there else (None, None)
             if wanted == self._keys.get(name):
                 continue
             for node in self._nodes.pop(name, []):
                 node.remove()
             self._keys[name] = wanted
-            if wanted is not None:
-                self._nodes[name] = make(self, posture)
+            if find is not None:
+                self._nodes[name] = draw(self, name, posture, find())
 
-    # -- makers of layers ---------------------------------------------------------------------
+    # -- drawing of layers --------------------------------------------------------------------
 
     def _mesh(self, name: str, mesh: Any, paint: tuple[int, int, int], opacity: float) -> Node:
         return self._scene.add_mesh_simple(
@@ -97,82 +89,50 @@ class Layers:
             side="double", cast_shadow=False, receive_shadow=False,
         )  # fmt: skip
 
-    def _singular(self, kind: str, posture: Posture) -> list[Node]:
-        geometry, paint = self._geometry, _SINGULAR[kind]
+    def _singular(self, name: str, posture: Posture, found: Mapping[str, Mesh]) -> list[Node]:
         return [
-            self._mesh(f"singular/{factor}", surface(factor, posture.working, geometry), paint, 0.4)
-            for factor in SURFACES[kind]
+            self._mesh(f"singular/{factor}", mesh, _SINGULAR[name], 0.4)
+            for factor, mesh in found.items()
         ]
 
-    def _parallel(self, posture: Posture) -> list[Node]:
-        return self._singular("parallel", posture)
-
-    def _serial(self, posture: Posture) -> list[Node]:
-        return self._singular("serial", posture)
-
-    def _constraint(self, posture: Posture) -> list[Node]:
-        return self._singular("constraint", posture)
-
-    def _aspects(self, posture: Posture) -> list[Node]:
-        """Draw the aspects on the side of P; those beyond y = 0 are their mirror images."""
-        side = posture.assembly.sin_beta
-        found = [
-            aspect
-            for aspect in aspects(posture.working, self._geometry)
-            if aspect.assembly.sin_beta == side
-        ]
+    def _aspects(self, name: str, posture: Posture, found: Sequence[Cells]) -> list[Node]:
         return [
-            self._mesh(f"aspects/{index}", cells_mesh(aspect.cells), paint, 0.3)
-            for index, (aspect, paint) in enumerate(zip(found, _ASPECTS, strict=False))
+            self._mesh(f"{name}/{index}", cells_mesh(cells), paint, 0.3)
+            for index, (cells, paint) in enumerate(zip(found, _ASPECTS, strict=False))
         ]
 
-    def _workspace(self, posture: Posture) -> list[Node]:
-        of_delta = isinstance(self._machine, Delta)
-        find, shape = (delta.reachable_set, _ROUND) if of_delta else (reachable_set, _FINE)
-        found = find(posture.working, self._geometry, shape)
-        return [self._mesh("workspace", cells_mesh(found), (120, 144, 156), 0.22)]
+    def _workspace(self, name: str, posture: Posture, found: Cells) -> list[Node]:
+        return [self._mesh(name, cells_mesh(found), (120, 144, 156), 0.22)]
 
-    def _region(self, posture: Posture) -> list[Node]:
-        del posture
-        regions = {"region": self._machine.region, "goals": self._machine.goal_region}
+    def _region(self, name: str, posture: Posture, found: Mapping[str, Region]) -> list[Node]:
         paints = {"region": (40, 40, 40), "goals": (30, 160, 70)}
         return [
             self._scene.add_line_segments(
-                f"{ROBOT}/regions/{name}",
+                f"{ROBOT}/regions/{box}",
                 _edges(region),
-                paints[name],
+                paints[box],
                 thickness=2.0,
                 thickness_units="screen",
             )
-            for name, region in regions.items()
+            for box, region in found.items()
         ]
 
-    def _conditioning(self, posture: Posture) -> list[Node]:
-        """Draw the slice of the workspace at the height y of P."""
-        assert isinstance(posture.assembly, AssemblyMode)
-        geometry, y = self._geometry, posture.position[1]
-        reach = geometry.l3 + geometry.l4
-        x, z = np.linspace(-reach, reach, _STEPS) + geometry.l2, np.linspace(-reach, reach, _STEPS)
-        points = np.stack(np.broadcast_arrays(x, y, z[:, None]), axis=-1)
-        branches = posture.working, posture.assembly, geometry
-
-        def there(points: FloatArray) -> BoolArray:
-            found: BoolArray = conditioning_at(points, *branches) > 0
-            return found
-
-        vertices, faces = grid_mesh(clipped(points[None], there))
-        paints = colours(conditioning_at(vertices, *branches))
-        painted = trimesh.Trimesh(vertices, faces, vertex_colors=paints, process=False)
-        name = f"{ROBOT}/conditioning"
+    def _conditioning(
+        self, name: str, posture: Posture, found: tuple[Mesh, FloatArray]
+    ) -> list[Node]:
+        (vertices, faces), values = found
+        painted = trimesh.Trimesh(vertices, faces, vertex_colors=colours(values), process=False)
         return [
-            self._scene.add_mesh_trimesh(name, painted, cast_shadow=False, receive_shadow=False)
+            self._scene.add_mesh_trimesh(
+                f"{ROBOT}/{name}", painted, cast_shadow=False, receive_shadow=False
+            )
         ]
 
-    def _margin(self, posture: Posture) -> list[Node]:
-        self.margin = margin = posture.singularity_margin()
+    def _margin(self, name: str, posture: Posture, found: Margin | None) -> list[Node]:
+        self.margin = margin = found
         if margin is None:
             return []
-        name, ends = f"{ROBOT}/margin", np.stack([posture.position, margin.point])
+        name, ends = f"{ROBOT}/{name}", np.stack([posture.position, margin.point])
         text = f"{1000 * margin.distance:.1f} mm to {margin.factor} = 0"
         return [
             self._scene.add_line_segments(
@@ -187,36 +147,31 @@ class Layers:
 
 def _edges(region: Region) -> FloatArray:
     """Return the twelve edges (12, 2, 3) of a box."""
-    corners = list(product((0, 1), repeat=3))
-    pairs = [(a, b) for a in corners for b in corners if sum(b) - sum(a) == 1 and _joined(a, b)]
-    low, high = np.array(region.low), np.array(region.high)
-    edges: FloatArray = low + np.array(pairs) * (high - low)
-    return edges
+    return np.array([e for e in combinations(region.corners(), 2) if sum(map(ne, *e)) == 1])
 
 
-def _joined(a: tuple[int, ...], b: tuple[int, ...]) -> bool:
-    return sum(abs(p - q) for p, q in zip(a, b, strict=True)) == 1
+_Draw: TypeAlias = Callable[[Layers, str, Posture, Any], list[Node]]
 
-
-_Key: TypeAlias = Callable[[Posture], Any]
-_Maker: TypeAlias = Callable[[Layers, Posture], list[Node]]
-
-
-def _by_mode(posture: Posture) -> Any:
-    return posture.working
-
-
-LAYERS: Final[Mapping[str, tuple[_Key, _Maker]]] = {
-    "parallel": (_by_mode, Layers._parallel),
-    "serial": (_by_mode, Layers._serial),
-    "constraint": (_by_mode, Layers._constraint),
-    "aspects": (lambda posture: (posture.working, posture.assembly.sin_beta), Layers._aspects),
-    "workspace": (_by_mode, Layers._workspace),
-    "region": (lambda posture: "always", Layers._region),
+LAYERS: Final[Mapping[str, tuple[str, str, _Draw]]] = {
+    "parallel": ("Parallel", "Parallel singularities of the working mode, red", Layers._singular),
+    "serial": ("Serial", "Serial singularities of the working mode, blue", Layers._singular),
+    "constraint": (
+        "Constraint", "Constraint singularity of the working mode, purple", Layers._singular
+    ),
+    "aspects": (
+        "Aspects", "Regions of the working mode without singularities, on the side of P",
+        Layers._aspects,
+    ),
+    "workspace": (
+        "Workspace", "Points that the working mode reaches, stops left out", Layers._workspace
+    ),
+    "region": (
+        "Task region", "Box of the commands (black) and of the goals (green)", Layers._region
+    ),
     "conditioning": (
-        lambda posture: (posture.working, posture.assembly, round(posture.position[1], 4)),
+        "Conditioning", "1/cond(J) in the plane of P parallel to xz, in these modes",
         Layers._conditioning,
     ),
-    "margin": (lambda posture: tuple(posture.position), Layers._margin),
-}
-"""Layers by name: a function of the values each depends on, and a function that draws it."""
+    "margin": ("Margin", "Way from P to the nearest singularity", Layers._margin),
+}  # fmt: skip
+"""Layers by name: label, explanation, and a function that draws what a kind has found."""

@@ -11,17 +11,18 @@ from numpy.typing import NDArray
 
 from tpm_gym.analysis import sheets
 from tpm_gym.analysis.aspects import Cells
-from tpm_gym.arrays import BoolArray, FloatArray
+from tpm_gym.arrays import BoolArray, FloatArray, Vector
 from tpm_gym.kinematics import WorkingMode
 from tpm_gym.kinematics.geometry import Geometry
 from tpm_gym.kinematics.workspace import reachable
 
-__all__ = ["SURFACES", "Mesh", "cells_mesh", "clipped", "grid_mesh", "surface"]
+__all__ = ["SURFACES", "Mesh", "cells_mesh", "clipped", "grid_mesh", "slice_mesh", "surface"]
 
 _AROUND = 33  # points along the half circle of link 7
 _SLACK = 1e-9  # share of l4 by which a leg may miss a boundary on which it lies
 _SMOOTHING = 4  # rounds
 _HALVINGS = 8
+_STEPS = 200  # points along each edge of a slice
 
 
 class Mesh(NamedTuple):
@@ -126,6 +127,22 @@ def grid_mesh(points: FloatArray) -> Mesh:
     corners = index[:, :-1, :-1], index[:, 1:, :-1], index[:, 1:, 1:], index[:, :-1, 1:]
     quads = np.stack(corners, axis=-1).reshape(-1, 4)
     return _compact(points.reshape(-1, 3), quads[real.ravel()[quads].all(axis=1)])
+
+
+def slice_mesh(
+    middle: Vector, reach: float, quality: Callable[[FloatArray], FloatArray]
+) -> tuple[Mesh, FloatArray]:
+    """Return the part of a square parallel to xz where a quality is positive, and its values.
+
+    Args:
+        middle: Middle of the square, m.
+        reach: Half an edge of the square, m.
+        quality: Function of points (..., 3) m with values (...,); NaN counts as 0.
+    """
+    steps, (x, y, z) = np.linspace(-reach, reach, _STEPS), middle
+    points = np.stack(np.broadcast_arrays(x + steps, y, (z + steps)[:, None]), axis=-1)
+    mesh = grid_mesh(clipped(points[None], lambda points: quality(points) > 0))
+    return mesh, quality(mesh.vertices)
 
 
 def cells_mesh(cells: Cells) -> Mesh:

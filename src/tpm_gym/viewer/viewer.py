@@ -4,58 +4,28 @@ from __future__ import annotations
 
 import math
 import traceback
-from dataclasses import replace
 from html import escape
-from typing import Any, Final
+from typing import Any
 
-import numpy as np
-
-from tpm_gym.errors import ConfigurationError, TPMError
-from tpm_gym.mechanism import Delta
-from tpm_gym.mechanism.machine import find_machine, machine_names
-from tpm_gym.mechanism.tpm import TPM
+from tpm_gym.errors import TPMError
+from tpm_gym.mechanism.machine import Machine, machine_names
 from tpm_gym.viewer import server
-from tpm_gym.viewer.explore import Explore
+from tpm_gym.viewer.explore import Explore, units
+from tpm_gym.viewer.kinds import Posture, find_kind
 from tpm_gym.viewer.layers import BEST, LAYERS, Layers
 from tpm_gym.viewer.play import Play
 from tpm_gym.viewer.player import Player
-from tpm_gym.viewer.posture import Posture, at_joints
 from tpm_gym.viewer.scene import ROBOT, TASK_NODES, RobotScene, set_camera
 from tpm_gym.viewer.worker import Worker
 
-__all__ = ["Viewer", "find_shown"]
-
-_LABELS: Final = {
-    "parallel": ("Parallel", "Parallel singularities of the working mode, red"),
-    "serial": ("Serial", "Serial singularities of the working mode, blue"),
-    "constraint": ("Constraint", "Constraint singularity of the working mode, purple"),
-    "aspects": ("Aspects", "Regions of the working mode without singularities, on the side of P"),
-    "workspace": ("Workspace", "Points that the working mode reaches, stops left out"),
-    "region": ("Task region", "Box of the commands (black) and of the goals (green)"),
-    "conditioning": ("Conditioning", "1/cond(J) in the plane of P parallel to xz, in these modes"),
-    "margin": ("Margin", "Way from P to the nearest singularity"),
-}
-"""Label and explanation of each layer."""
-
-
-def find_shown(machine: Any) -> TPM | Delta:
-    """Return a machine by its name, or the machine itself, if the viewer knows its modes.
-
-    Raises:
-        ConfigurationError: If the machine is neither a TPM nor a Delta.
-    """
-    found = find_machine(machine)
-    if not isinstance(found, TPM | Delta):
-        valid = "a TPM or a Delta of tpm_gym: the viewer shows its modes"
-        raise ConfigurationError("machine", machine, valid)
-    return found
+__all__ = ["Viewer"]
 
 
 class Viewer:
     """Page with a robot that can be dragged, and that plays episodes.
 
     Args:
-        machine: Name of a machine, or a TPM or Delta.
+        machine: Name of a machine, or a machine.
         host: Address to listen on.
         port: Port to listen on; if it is taken, the next free one.
 
@@ -65,14 +35,12 @@ class Viewer:
         worker: Thread that runs all changes.
 
     Raises:
-        ConfigurationError: If the machine is of another kind, or the address is not possible.
+        ConfigurationError: If no machine has this name, or the address is not possible.
     """
 
-    def __init__(
-        self, machine: str | TPM | Delta = "paper", host: str = "127.0.0.1", port: int = 8080
-    ):
+    def __init__(self, machine: str | Machine = "paper", host: str = "127.0.0.1", port: int = 8080):
         """Start the server, and show the machine at its home."""
-        first = find_shown(machine)
+        first = find_kind(machine)
         self.server = server.start(host, port)
         self.worker = Worker(self._report)
         gui = self.server.gui
@@ -83,9 +51,10 @@ class Viewer:
             brand_color=(9, 105, 218),
         )
         gui.main_panel.dock_right()
-        known = map(find_machine, machine_names())
-        self._machines = {one.name: one for one in (*known, first) if isinstance(one, TPM | Delta)}
-        self.machine = gui.add_dropdown("Machine", tuple(self._machines), initial_value=first.name)
+        known = map(find_kind, machine_names())
+        self._kinds = {kind.machine.name: kind for kind in (*known, first)}
+        names = tuple(self._kinds)
+        self.machine = gui.add_dropdown("Machine", names, initial_value=first.machine.name)
         self._numbers: Any = gui.add_html("")
         tabs = gui.add_tab_group()
         with tabs.add_tab("Explore"):
@@ -93,7 +62,7 @@ class Viewer:
         with tabs.add_tab("Show"):
             self.shown = {
                 name: gui.add_checkbox(label, name == "region", hint=hint)
-                for name, (label, hint) in _LABELS.items()
+                for name, (label, hint, _) in LAYERS.items()
             }
             gui.add_html(_scale())
         with tabs.add_tab("Play"):
@@ -117,14 +86,17 @@ class Viewer:
         server.stop(self.server)
 
     def _set_machine(self) -> None:
-        machine = self._machines[self.machine.value]
-        self.play.set_machine(machine)
+        kind = self.kind = self._kinds[self.machine.value]
+        self.play.set_machine(kind.machine)
         for name in (ROBOT, *TASK_NODES):
             self.server.scene.remove_by_name(name)
-        set_camera(self.server, machine)
-        self.robot = RobotScene(self.server.scene, machine)
-        self.layers = Layers(self.server.scene, machine)
-        self.explore.set_machine(machine)
+        set_camera(self.server, kind.machine)
+        self.robot = RobotScene(self.server.scene, kind.machine)
+        self.layers = Layers(self.server.scene, kind)
+        self.explore.set_kind(kind)
+        there = self.layers.around(self.explore.posture)
+        for name, box in self.shown.items():
+            box.visible = name in there
 
     # -- drawing ------------------------------------------------------------------------------
 
@@ -139,18 +111,12 @@ class Viewer:
 
     def _show_episode(self, player: Player) -> None:
         """Draw the robot at its encoders' joint positions, and the objects."""
-        state, machine = player.state, self.explore.posture.machine
         if not player.records:
             self.robot.set_objects(player.task.scene, player.task.tolerance)
         with self.server.atomic():
-            self.robot.draw_objects(state, player.markers)
+            self.robot.draw_objects(player.state, player.markers)
             self.explore.hide_gizmo(self.play.playing)
-            mode: Any = machine.assembly_mode
-            if isinstance(machine, TPM):
-                # Joint positions are equal on both sides of y = 0, the assembly modes are not.
-                y = machine.mount.to_paper(state.fk_position)[1]
-                mode = replace(machine.assembly_mode, sin_beta=-1 if y < 0 else 1)
-            self.explore.set(at_joints(machine, state.theta, mode))
+            self.explore.set(self.kind.of_state(player.state))
 
     def _report(self, error: Exception) -> None:
         """Show an error on all pages; print errors that are no TPMError."""
@@ -166,12 +132,13 @@ def numbers(posture: Posture) -> str:
     """Return the numbers of a posture as HTML."""
     x, y, z = 1000 * posture.position
     u, v, w = 1000 * posture.machine.mount.to_world(posture.position)
-    stops = " / ".join(f"{value:.0f}" for value in np.degrees(posture.stop_margins))
+    scales, names = zip(*units(posture.machine), strict=True)
+    stops = " / ".join(f"{value:.0f}" for value in scales * posture.stop_margins)
     rows = {
         "P, machine's frame": f"{x:.1f} / {y:.1f} / {z:.1f} mm",
         "P, world": f"{u:.1f} / {v:.1f} / {w:.1f} mm",
         "Conditioning": f"{posture.conditioning:.3f}",
-        "Motors to their stops": f"{stops} °",
+        "Motors to their stops": f"{stops} {' / '.join(dict.fromkeys(names))}",
         "Platform tilted by": f"{math.degrees(posture.tilt):.1f} °",
         "Loops open by": f"{posture.gap:.1e} m",
     }
@@ -191,6 +158,3 @@ def _scale() -> str:
         'rgb(253,231,37))"></div><span>0</span><span style="float:right">'
         f"conditioning {BEST}</span></div>"
     )
-
-
-assert _LABELS.keys() == LAYERS.keys()

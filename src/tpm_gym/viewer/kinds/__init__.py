@@ -1,0 +1,27 @@
+"""Kinds of machines: what differs between mechanisms in the viewer, a file for each."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+from tpm_gym.mechanism import Delta, Machine
+from tpm_gym.mechanism.machine import find_machine
+from tpm_gym.mechanism.tpm import TPM
+from tpm_gym.viewer.kinds.delta import DeltaKind
+from tpm_gym.viewer.kinds.kind import Kind, Posture
+from tpm_gym.viewer.kinds.tpm import TPMKind
+
+__all__ = ["KINDS", "Kind", "Posture", "find_kind"]
+
+KINDS: Final[dict[Any, type[Kind]]] = {Machine: Kind, TPM: TPMKind, Delta: DeltaKind}
+"""Kinds by the class of the machine; the row of the nearest base class counts."""
+
+
+def find_kind(machine: Any) -> Kind:
+    """Return a machine, given by itself or by its name, with its modes and layers.
+
+    Raises:
+        ConfigurationError: If no machine has this name, or the value is no machine.
+    """
+    found = find_machine(machine)
+    return next(KINDS[base] for base in type(found).__mro__ if base in KINDS)(found)
