@@ -5,6 +5,7 @@ import os
 import pickle
 import subprocess
 import sys
+from contextlib import closing
 from typing import Any
 from unittest.mock import patch
 
@@ -121,6 +122,18 @@ def test_saved_states_go_on_equally_on_their_way_in_contact_and_holding(env_id, 
             assert (bits(observation), bits(vars(bare.state))) == expected[step]
             bare.save_state()  # as was done the first time
     env.close()
+
+
+def test_the_state_after_saving_is_that_of_the_snapshot():
+    # A turned block: an engine that restarts from its orientation may round it.
+    with closing(make("TPMConveyorDense-v0", max_episode_steps=1000)) as env:
+        bare = env.unwrapped
+        for _ in random_episode(env, 4, steps=40):
+            pass
+        snapshot = bare.save_state()
+        expected = bits(vars(bare.state))
+        bare.restore_state(snapshot)
+        assert bits(vars(bare.state)) == expected
 
 
 # -- copied ----------------------------------------------------------------------------------------

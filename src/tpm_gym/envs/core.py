@@ -336,7 +336,13 @@ class Core:
         rngs = [dict(rng.bit_generator.state) for rng in self.rngs]
         own = {"goals": self.goals, "pending": self._pending, "views": self._views, **columns}
         copies = {name: values.copy() for name, values in own.items()}
-        return EnvSnapshot(self.kind, self.simulation.save(), rngs, copies)
+        return EnvSnapshot(self.kind, self._save_simulation(), rngs, copies)
+
+    def _save_simulation(self) -> Snapshot:
+        """Return a snapshot; :attr:`state` is that of the restarted simulation then."""
+        snapshot = self.simulation.save()
+        self._state = self.simulation.state()
+        return snapshot
 
     def restore(self, snapshot: Any) -> Observation:
         """Continue from a snapshot of these or equal environments; return the observation.
@@ -384,7 +390,7 @@ class Core:
         if self._engine["gui"]:
             valid = "None or 'rgb_array' for an environment that is copied or pickled"
             raise ConfigurationError("render_mode", "human", valid)
-        snapshot = None if self._state is None else self.simulation.save()
+        snapshot = None if self._state is None else self._save_simulation()
         return {**vars(self), "simulation": snapshot}
 
     def __setstate__(self, values: dict[str, Any]) -> None:
