@@ -38,6 +38,29 @@ compilable(below)
 """,
 }
 
+NESTED = """
+from tpm_gym.compiling import compilable, kept
+from own import law
+
+compilable(law.law)
+
+def rows(law):
+    def evaluate(x: float) -> float:
+        size, width = x + 0.0, "width"
+        return law(size)
+
+    compilable(evaluate)
+    return evaluate
+
+def loop(row):
+    def apply(x: float) -> float:
+        return row(x)
+
+    return apply
+
+apply = kept(loop(rows(law.law)))
+"""
+
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
@@ -72,6 +95,19 @@ def test_a_kept_function_is_compiled_again_when_what_is_compiled_into_it_changes
     assert [called(), called()] == [(6.0, 0), (6.0, 1)]
     (folder / "own/law.py").write_text("def law(x: float) -> float:\n    return x\n")
     assert [called(), called()] == [(1.5, 0), (1.5, 1)]
+
+
+def test_a_function_that_was_compiled_without_bytecode_is_found_with_it(folder):
+    (folder / "own/main.py").write_text(NESTED)
+    code = "from own.main import apply; print(apply(1.5), sum(apply.stats.cache_hits.values()))"
+    paths = os.pathsep.join([str(folder), *sys.path])
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(folder / "kept"), "PYTHONPATH": paths}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
+    found = [
+        subprocess.check_output([sys.executable, "-c", code], env=environment, text=True)
+        for _ in range(2)
+    ]
+    assert found == ["3.0 0\n", "3.0 1\n"]
 
 
 @pytest.mark.parametrize("ending", ["nbi", "nbc"])

@@ -55,6 +55,17 @@ def kept(function: _Function) -> _Function:
     return cast(_Function, dispatcher)
 
 
+class _Disk(_CACHING.FunctionCache):  # type: ignore[misc]  # Numba has no types
+    """Numba's files, found by signature and processor alone.
+
+    Numba also asks for an equal pickle of the closure. But the pickle of a function differs between
+    a process that reads its source and one that reads its bytecode. The stamp covers the closure.
+    """
+
+    def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
+        return sig, codegen.magic_tuple()
+
+
 class _Cache:
     """Numba's cache of a function, renewed with any of the function's sources; never raises."""
 
@@ -65,7 +76,7 @@ class _Cache:
         self._function = function
         self._label = f"{function.__module__}.{function.__qualname__}"
         try:
-            self._disk = _CACHING.FunctionCache(function)
+            self._disk = _Disk(function)
         except (RuntimeError, OSError):
             self._disk = _CACHING.NullCache()
 
