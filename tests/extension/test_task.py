@@ -108,6 +108,17 @@ def test_what_is_wrong_in_a_task_is_named(sorting, part, value, message):
         list(expert_episode(tpm_gym.TPMEnv(wrong), 0, steps=50))
 
 
+def test_an_event_that_mixes_robots_is_named(sorting):
+    class Wrong(sorting.Sort):
+        events = ("fast",)
+
+        def fast(self, state):
+            return np.linalg.norm(state.fk_velocity) > 0.1
+
+    with pytest.raises(ConfigurationError, match=r"fast\(\) = .*of shape \(\) .*reduce by axis=-1"):
+        tpm_gym.TPMEnv(Wrong)
+
+
 def test_where_there_is_no_room_sampling_says_so(sorting):
     class Crowd(sorting.Sort):
         def sample(self, rngs, chosen):

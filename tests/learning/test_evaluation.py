@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import re
 import shutil
 import sys
 from collections.abc import Iterator
@@ -12,6 +13,7 @@ import gymnasium as gym
 import imageio.v3 as imageio
 import numpy as np
 import pytest
+from episodes import expert_episode
 from paths import read_strict
 from processes import TPM_GYM, printed_by
 from registries import registries_put_back
@@ -69,6 +71,31 @@ def test_table_shows_means_and_intervals(written):
     _, output = written
     for shown in ("success at end", "expert", "[51.0, 100.0]"):  # Wilson interval of 4 of 4
         assert shown in output
+
+
+def in_wall(self, state):
+    return np.abs(state.fk_position[:, 0] - 0.02) < 0.01
+
+
+def test_events_of_a_task_are_shown_as_shares_of_episodes(tmp_path):
+    path, seeds, console = tmp_path / "wall.json", range(100, 108), quiet()
+    wall = type("Wall", (Reach,), {"events": ("in_wall",), "in_wall": in_wall})
+    asked = {"episodes": 8, "seed": 100, "env_options": EnvOptions(engine="analytic")}
+    with registries_put_back():
+        env_id = tpm_gym.register_task("Wall", wall)[0]
+        evaluate(EvaluationConfig(("expert",), env=env_id, json=path, **asked), console)
+        env = gym.make(env_id, engine="analytic")
+        told = [[info["in_wall"] for *_, info in expert_episode(env, seed)] for seed in seeds]
+    happened = [any(steps[1:]) for steps in told]  # without the reset
+    assert 0 < sum(happened) < 8
+    assert happened != [steps[-1] for steps in told]  # once is not at the end
+    content = read_strict(path)
+    assert [record["in_wall_once"] for record in content["records"]] == happened
+    share = content["in_wall_once"]
+    assert share["mean"] == sum(happened) / 8
+    row = re.search(r"in wall once +. +(\S+)% \[(\S+), (\S+)\]", said(console)).groups()
+    expected = [100 * share[end] for end in ("mean", "low", "high")]
+    assert [float(number) for number in row] == pytest.approx(expected, abs=0.05)
 
 
 @pytest.fixture

@@ -30,6 +30,7 @@ class Scripted:
     """Vector of one environment that delivers the steps it was given, in every episode."""
 
     num_envs = 1
+    task = SimpleNamespace(events=())
 
     def __init__(self, steps: list[dict[str, Any]]) -> None:
         self.steps = steps
@@ -113,6 +114,18 @@ def test_record_says_what_happened():
     (record,) = run_episodes(Scripted([scripted_step(success=True)]), Idle(), 1, first_seed=0)
     assert record.success_at_end
     assert record.success_once
+
+
+def test_an_event_of_a_single_step_is_recorded():
+    steps = [scripted_step() | {"hit": hit, "left": False} for hit in (False, True, False)]
+    env = Scripted(steps)
+    env.task = SimpleNamespace(events=("hit", "left"))
+    records = run_episodes(env, Idle(), 1, first_seed=5)
+    assert records[0].events == {"hit_once": True, "left_once": False}
+    env.steps = steps[:1]
+    records += run_episodes(env, Idle(), 3, first_seed=6)
+    assert [record.as_dict()["hit_once"] for record in records] == [True, False, False, False]
+    assert summarise(records)["hit_once"] == wilson([True, False, False, False])
 
 
 def test_seeds_count_up_for_environment_and_policy():

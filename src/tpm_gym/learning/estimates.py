@@ -29,7 +29,7 @@ class Estimate:
 
 
 def wilson(outcomes: Sequence[bool]) -> Estimate:
-    """Return a success rate with its 95% Wilson score interval (Wilson 1927)."""
+    """Return a share of outcomes with its 95% Wilson score interval (Wilson 1927)."""
     n = len(outcomes)
     rate = sum(outcomes) / n
     spread = _Z95**2 / n

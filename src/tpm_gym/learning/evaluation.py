@@ -31,10 +31,12 @@ from tpm_gym.learning.film import Frame, Play, write_contact_sheet, write_video
 from tpm_gym.learning.policies import load_policy, trained_in
 from tpm_gym.learning.rollout import BATCH, TEST_SEED, Episode, Policy, run_episodes, summarise
 
-# Label, key, factor, format and unit of each row of the table.
-_ROWS = (
+# Label, key, factor, format and unit of each row of the table; the task's events are in between.
+_SUCCESS = (
     ("success at end", "success_at_end", 100.0, "{:.1f}", "%"),
     ("success once", "success_once", 100.0, "{:.1f}", "%"),
+)
+_ROWS = (
     ("return", "return", 1.0, "{:.2f}", ""),
     ("conditioning, least", "conditioning_min", 1.0, "{:.3f}", ""),
     ("conditioning, mean", "conditioning_mean", 1.0, "{:.3f}", ""),
@@ -53,7 +55,7 @@ class EvaluationConfig:
     policy: Annotated[tuple[str, ...], tyro.conf.arg(metavar="POLICY ...")]
     """expert, random, the id of a published policy, an exported policy or the folder of a run."""
 
-    env: Annotated[str, unset(str, "the one the policy was trained on", "ID")] = UNSET
+    env: Annotated[str, unset(str, "the policy's, unless that is module:id", "ID")] = UNSET
     """Environment id, or module:id if a module of yours registers it."""
 
     episodes: int = 100
@@ -97,6 +99,11 @@ class Result:
     metrics: dict[str, Estimate]
     records: list[Episode]
     wall_seconds: float
+
+    @property
+    def events(self) -> list[str]:
+        """Names of the metrics of the task's events."""
+        return [*self.records[0].events]
 
     def as_dict(self) -> dict[str, Any]:
         """Return the result as plain data, the metrics at its top level."""
@@ -230,7 +237,8 @@ def _table(config: EvaluationConfig, results: Sequence[Result]) -> Table:
     table.add_column("metric", no_wrap=True)
     for result in results:
         table.add_column(result.policy, justify="right", overflow="fold")
-    for label, name, factor, form, unit in _ROWS:
+    events = [(name.replace("_", " "), name, *_SUCCESS[-1][2:]) for name in results[0].events]
+    for label, name, factor, form, unit in (*_SUCCESS, *events, *_ROWS):
 
         def show(value: float, form: str = form, factor: float = factor) -> str:
             return form.format(value * factor)

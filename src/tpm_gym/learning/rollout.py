@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, TypeAlias
 
 import gymnasium as gym
@@ -56,6 +56,8 @@ class Episode:
             from the simulated one, m.
         torque_rms: Root mean square of the motors' torques at the ends of the steps, N m.
         torque_peak: Largest of these torques, N m.
+        events: For each event of the task, as in ``{"crossed_once": True}``, whether it happened
+            after at least one step.
     """
 
     seed: int
@@ -70,13 +72,16 @@ class Episode:
     fk_error_max: float
     torque_rms: float
     torque_peak: float
+    events: Mapping[str, bool] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the episode as plain data, ``total_reward`` under its name ``return``."""
-        return {
+        """Return the episode as plain data: ``total_reward`` as ``return``, each event by name."""
+        values = {
             "return" if name == "total_reward" else name: value
             for name, value in vars(self).items()
         }
+        events: Mapping[str, bool] = values.pop("events")
+        return {**values, **events}
 
 
 class Step(NamedTuple):
@@ -170,16 +175,24 @@ def _run_together(
         gap = state.fk_position - state.platform_position
         told = {name: step.told[name] for name in _TOLD}
         told["fk_error"] = np.sqrt((gap * gap).sum(axis=-1))
+        told |= {event_key(event): step.told[event] for event in envs.task.events}
         steps.append({"reward": step.reward, "torque": state.torque, **told})
         lengths += step.running
     table = {name: np.array([step[name] for step in steps]) for name in steps[0]}
-    return [
-        _record(first_seed + k, {name: values[: lengths[k], k] for name, values in table.items()})
-        for k in range(count)
-    ]
+    events = [event_key(event) for event in envs.task.events]
+    records = []
+    for k in range(count):
+        own = {name: values[: lengths[k], k] for name, values in table.items()}
+        records.append(_record(first_seed + k, own, events))
+    return records
 
 
-def _record(seed: int, steps: Mapping[str, NDArray[Any]]) -> Episode:
+def event_key(event: str) -> str:
+    """Return the name of the metric of a task's event: the share of episodes that had it."""
+    return f"{event}_once"
+
+
+def _record(seed: int, steps: Mapping[str, NDArray[Any]], events: Sequence[str]) -> Episode:
     """Condense an episode from its steps' values (n, ...)."""
     for name, values in steps.items():
         if not np.isfinite(values).all():
@@ -202,6 +215,7 @@ def _record(seed: int, steps: Mapping[str, NDArray[Any]]) -> Episode:
         fk_error_max=float(steps["fk_error"].max()),
         torque_rms=math.hypot(*torques) / math.sqrt(len(torques)),
         torque_peak=max(map(abs, torques)),
+        events={name: bool(steps[name].any()) for name in events},
     )
 
 
@@ -214,13 +228,15 @@ _WORST: Final[Mapping[str, Any]] = {
 def summarise(records: Sequence[Episode]) -> dict[str, Estimate]:
     """Return the metrics of an evaluation by name, each with its 95% interval over episodes.
 
-    Success rates have Wilson intervals, which are valid at 0 and 1 too. Other metrics have
-    percentile bootstrap intervals. Extremes also have the worst value of all episodes.
+    Success rates and shares of episodes with an event have Wilson intervals, which are valid at 0
+    and 1 too. Other metrics have percentile bootstrap intervals. Extremes also have the worst value
+    of all episodes.
     """
     rows = [record.as_dict() for record in records]
     found = {}
     for name in (name for name in rows[0] if name not in ("seed", "length")):
         column = [row[name] for row in rows]
         worst = _WORST[name](column) if name in _WORST else None
-        found[name] = wilson(column) if name.startswith("success") else bootstrap(column, worst)
+        yes_or_no = isinstance(column[0], bool)
+        found[name] = wilson(column) if yes_or_no else bootstrap(column, worst)
     return found

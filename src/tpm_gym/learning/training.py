@@ -266,10 +266,10 @@ class _Session:
             self._test()
 
     def _test(self) -> None:
-        """Test the best policy in the analytic engine and in PyBullet."""
+        """Test the best policy in the analytic engine and in PyBullet; print success and events."""
         config = self.config
         _say(self.console, f"testing {config.test_episodes} held-out episodes in each engine ...")
-        rates = []
+        rates: dict[str, list[str]] = {}
         for engine in ("analytic", "pybullet"):
             test = EvaluationConfig(
                 policy=(str(config.run),),
@@ -282,9 +282,13 @@ class _Session:
                 json=config.run / TESTS / f"{engine}.json",
             )
             (result,) = evaluate(test, Console(quiet=True))
-            rate = result.metrics["success_at_end"]
-            rates.append(f"{rate.mean:.1%} [{rate.low:.1%}, {rate.high:.1%}]")
-        _say(self.console, f"success in the analytic engine and PyBullet: {', '.join(rates)}")
+            for name in ("success_at_end", *result.events):
+                rate = result.metrics[name]
+                label = "success" if name == "success_at_end" else name.replace("_", " ")
+                shown = f"{rate.mean:.1%} [{rate.low:.1%}, {rate.high:.1%}]"
+                rates.setdefault(label, []).append(shown)
+        for label, each in rates.items():
+            _say(self.console, f"{label} in the analytic engine and PyBullet: {', '.join(each)}")
 
 
 def make_model(config: TrainingConfig, envs: VecEnv) -> BaseAlgorithm:

@@ -50,6 +50,7 @@ def _results(task: Task, state: State) -> dict[str, Any]:
         "achieved()": achieved,
         "observe()": task.observe(state),
         **{f"shaping()[{name!r}]": values for name, values in task.shaping(state).items()},
+        **{f"{event}()": getattr(task, event)(state) for event in task.events},
         "gap()": task.gap(achieved, np.zeros((len(state.held), task.goal_size))),
     }
 

@@ -82,7 +82,8 @@ class Task(ABC):
         tolerance: Distance below which a goal is achieved, m.
         samplings: Values of ``goals``.
         controls: Names of the controls that can perform the task.
-        events: Names of methods of the task. ``info`` has their results for the state, (n,) bool.
+        events: Names of methods of the task. ``info`` has their results for the state, (n,) bool,
+            and an evaluation the share of episodes in which each was true after a step.
         control_period: Time between two actions, s. Limits of the machine hold in 40 ms, and are
             scaled to it.
         accelerations: Largest acceleration of the command for P along x, y, z, machine's frame,
