@@ -18,6 +18,10 @@ PRINTED = {
         None,
         r"Jacobian against differences: \S+e-(0[7-9]|1\d) m/rad\n(y = .*\n){4}83\.4% of",
     ),
+    "own_block_task": (
+        None,
+        r"expert: (9[5-9]\.\d|100\.0)% of 200 episodes, in the wall 0\.0%",
+    ),
     "own_machine": (None, r"the expert succeeds in (9\d|100) of 100 episodes"),
     "own_task": (None, r"expert: (9\d\.\d|100\.0)% of 200 episodes"),
     "ppo_analytic": ("4096", r"4,096 steps in \d+ s\nsuccess at the end: [\d.]+% of 500"),

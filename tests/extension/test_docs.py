@@ -28,9 +28,10 @@ def test_a_block_makes_an_environment_that_its_expert_solves(code):
             assert sum(info["reward_terms"].values()) == pytest.approx(reward)
 
 
-def test_the_recipes_are_for_the_task_above(tmp_path):
-    file = tmp_path / "hover.yml"
-    file.write_text("".join(re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)), encoding="utf-8")
+def test_the_recipes_are_for_the_task_of_the_page(tmp_path):
+    file, page = tmp_path / "hover.yml", (ROOT / "docs" / "training.md").read_text("utf-8")
+    file.write_text("".join(re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)), encoding="utf-8")
+    assert 'register_task("Hover"' in PAGE
     recipe = read_recipe(file, "sac", "hover:TPMHover-v0")
     assert recipe.hindsight
     assert recipe.arguments["learning_starts"] >= 100  # steps of an episode
