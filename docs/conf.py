@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
+from typing import Any
 
 import tpm_gym
 
@@ -27,17 +29,26 @@ exclude_patterns = ["figures", "gradients", "records", "results", "website"]
 # -- Markdown --------------------------------------------------------------------------------------
 
 myst_heading_anchors = 4
-myst_enable_extensions = ["attrs_block", "colon_fence", "substitution"]
+myst_enable_extensions = ["attrs_block", "colon_fence"]
 myst_url_schemes = ["http", "https", "mailto", "source"]
 suppress_warnings = ["myst.header"]  # a page of docstrings begins where its room's heading ends
 
 _VIEWER = "_static/viewer/index.html"  # an export of `tpm-gym view`
-_PICTURE = "images/pick_and_place.png"
-myst_substitutions = {
-    "scene": f'<iframe class="viewer" src="{_VIEWER}" title="Robot, to be turned"></iframe>'
-    if (DOCS / _VIEWER).exists()
-    else f"![A trained policy picks up a block and places it at the goal]({_PICTURE})"
-}
+_FRAME = f'<iframe class="viewer" src="{_VIEWER}" title="Robot, to be turned"></iframe>'
+
+
+def setup(app: Any) -> None:
+    """Show the viewer in the place of the front page's picture, if there is an export of it."""
+    app.connect("source-read", show_viewer)
+
+
+def show_viewer(app: Any, page: str, text: list[str]) -> None:
+    """Replace the picture in the source of the front page."""
+    del app
+    if page == "index" and (DOCS / _VIEWER).exists():
+        text[0], count = re.subn(r"!\[.*\]\(images/pick_and_place\.png\)", _FRAME, text[0])
+        assert count == 1, "index.md has no such picture"
+
 
 # -- docstrings ------------------------------------------------------------------------------------
 
