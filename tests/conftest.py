@@ -7,10 +7,15 @@ from importlib.util import find_spec
 # PyTorch and NumPy read this once, when they are imported; tests' own processes inherit it.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import hypothesis
 import pytest
 from registries import registries_put_back
 
 from tpm_gym.errors import MissingPackageError
+
+# How long an example takes depends on what else the machine does.
+hypothesis.settings.register_profile("tpm_gym", deadline=None)
+hypothesis.settings.load_profile("tpm_gym")
 
 # These import PyBullet at their top.
 collect_ignore_glob = (

@@ -54,7 +54,7 @@ def test_every_character_of_the_json_counts_but_blanks(intact):
         assert not still_loads(intact, bytes(text), DATA), text[place - 10 : place + 10]
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(part=st.floats(0, 1, exclude_max=True), more=st.binary(min_size=1, max_size=100))
 def test_files_cut_off_anywhere_or_followed_by_anything_are_refused(intact, part, more):
     assert not still_loads(intact, TEXT[: int(part * len(TEXT))], DATA)
@@ -194,7 +194,7 @@ def assert_refused_or_a_policy(content: dict[str, Any], data: bytes) -> None:
     assert told.isprintable()
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(
     changes=st.lists(
         st.tuples(st.integers(0, len(DATA) - 1), st.integers(0, 255)), min_size=1, max_size=4
