@@ -23,6 +23,11 @@ ROUNDING = 1e-5
 """Tolerance as a fraction of a control step, above the error of single precision, 1e-6."""
 SEALING = 0.160
 """Time to wait for the cup to seal before giving up, s."""
+SLOW_ABOVE = 0.003
+"""Height of the lip over a block from where a gentle pick goes on slowly, m; the cup seals below 2
+mm."""
+SLOW_STEP = 0.001
+"""Way down in a control step of a gentle pick, m."""
 
 
 def hanging(block: Block) -> FloatArray:
@@ -143,18 +148,26 @@ class Motion:
         ]
         return np.stack(columns, axis=1)
 
-    def pick(self, block: Block, clearance: float) -> Iterator[Move]:
+    def pick(self, block: Block, clearance: float, gently: bool = False) -> Iterator[Move]:
         """Come down on a block from ``clearance`` (m) above it, and wait for the seal.
+
+        Args:
+            block: The block.
+            clearance: Height over the block from where P comes down, m.
+            gently: Whether P comes to rest above the block, and goes on slowly until the cup seals.
+                Otherwise it presses the block on the table.
 
         Raises:
             ConfigurationError: If the task does not observe the block.
         """
         yield from self.go([self._above(block, clearance)], vacuum=False)
-        yield from self.go([self._above(block)], vacuum=True)
+        height = SLOW_ABOVE if gently else 0.0
+        yield from self.go([self._above(block, height)], vacuum=True)
         for _ in range(self._sealing):
             if self.holding(block.name):
                 return
-            yield Move(self._above(block), True)
+            height = max(height - SLOW_STEP, 0.0)
+            yield Move(self._above(block, height), True)
 
     def _above(self, block: Block, clearance: float = 0.0) -> FloatArray:
         """Return P (machine's frame) with the lip ``clearance`` above a block's present place."""
