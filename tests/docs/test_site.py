@@ -10,6 +10,8 @@ from registries import registries_put_back
 from tpm_gym.tasks.registry import TASKS
 
 pytest.importorskip("sphinx")
+from docutils import nodes
+from docutils.utils import new_document
 from website import docstrings, projects, sources, tables, tasks
 
 
@@ -74,10 +76,19 @@ def test_tables_and_headings_in_docstrings_become_those_of_sphinx():
 
 
 def test_intervals_and_quantities_in_tables_keep_to_one_line():
-    cell = "| 100.0% [99.1, 100.0] (1.5 to never) at 37 N m of [a, b] |"
-    tied = "| 100.0% [99.1,~100.0] (1.5~to~never) at 37~N~m of [a, b] |"
+    cell = "| 100.0% [99.1, 100.0] (1.5 to never) at 37 N m of [a, b], 99.5% of 1,000 |"
+    tied = "| 100.0% [99.1,~100.0] (1.5~to~never) at 37~N~m of [a, b], 99.5%~of~1,000 |"
     text = f"In [1, 2]\n{cell}"
     assert tables.whole(text).replace("\N{NO-BREAK SPACE}", "~") == f"In [1, 2]\n{tied}"
+
+
+def test_long_cells_and_long_words_of_code_are_marked():
+    page = new_document("page")
+    texts = "word " * 9, "word", "word " * 9, "w" * 45
+    kinds = nodes.entry, nodes.entry, nodes.literal, nodes.literal
+    page += [kind("", nodes.Text(text)) for kind, text in zip(kinds, texts, strict=True)]
+    tables.mark(page)
+    assert [node["classes"] for node in page] == [["long"], [], [], ["long"]]
 
 
 def test_the_list_of_tasks_has_a_sentence_for_each():
