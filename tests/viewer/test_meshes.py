@@ -8,7 +8,7 @@ from tpm_gym.analysis.aspects import aspects
 from tpm_gym.analysis.singularity import FACTORS, dimensionless
 from tpm_gym.kinematics import ELBOWS_OUT, WorkingMode
 from tpm_gym.kinematics.jacobian import factors_at
-from tpm_gym.viewer.meshes import Mesh, cells_mesh, clipped, surface
+from tpm_gym.viewer.meshes import Mesh, cells_mesh, clipped, grid_mesh, surface
 
 MODES = ELBOWS_OUT, WorkingMode(-1, 1, 1, -1)
 
@@ -54,3 +54,8 @@ def test_a_clipped_grid_ends_at_the_boundary():
     assert moved.sum() > 50
     assert radius == pytest.approx(np.full(len(radius), 0.8), abs=0.05 / 2**7)
     assert np.array_equal(points[inside(grid)], grid[inside(grid)])
+    # The mesh has no teeth at the boundary: it fills the disc.
+    a, b, c = np.moveaxis((mesh := grid_mesh(points)).vertices[mesh.faces], 1, 0)
+    areas = np.cross(b - a, c - a)[:, 2] / 2
+    assert (areas >= 0).all()
+    assert areas.sum() == pytest.approx(np.pi * 0.8**2, rel=0.005)

@@ -83,11 +83,21 @@ class Layers:
 
     # -- drawing of layers --------------------------------------------------------------------
 
-    def _mesh(self, name: str, mesh: Any, paint: tuple[int, int, int], opacity: float) -> Node:
-        return self._scene.add_mesh_simple(
-            f"{ROBOT}/{name}", mesh.vertices, mesh.faces, color=paint, opacity=opacity,
-            side="double", cast_shadow=False, receive_shadow=False,
+    def _mesh(self, name: str, mesh: Mesh, paint: tuple[int, int, int], opacity: float) -> Node:
+        # BLEND keeps a sheet from hiding the sheets behind it; viser's simple mesh has no such
+        # option, and shows patches of each.
+        linear = [round(255 * (part / 255) ** 2.2) for part in paint]
+        visual: Any = trimesh.visual
+        material = visual.material.PBRMaterial(
+            baseColorFactor=[*linear, round(255 * opacity)], metallicFactor=0.0,
+            roughnessFactor=1.0, alphaMode="BLEND", doubleSided=True,
         )  # fmt: skip
+        look = visual.TextureVisuals(material=material)
+        painted = trimesh.Trimesh(*mesh, visual=look, process=False)
+        _ = painted.vertex_normals  # written only if known; without them, each triangle is flat
+        return self._scene.add_mesh_trimesh(
+            f"{ROBOT}/{name}", painted, cast_shadow=False, receive_shadow=False
+        )
 
     def _singular(self, name: str, posture: Posture, found: Mapping[str, Mesh]) -> list[Node]:
         return [

@@ -126,7 +126,12 @@ def grid_mesh(points: FloatArray) -> Mesh:
     index = np.arange(real.size).reshape(real.shape)
     corners = index[:, :-1, :-1], index[:, 1:, :-1], index[:, 1:, 1:], index[:, :-1, 1:]
     quads = np.stack(corners, axis=-1).reshape(-1, 4)
-    return _compact(points.reshape(-1, 3), quads[real.ravel()[quads].all(axis=1)])
+    there = real.ravel()[quads]
+    # Three corners make a triangle. Without these, an oblique boundary would have teeth.
+    missing = np.argmin(there, axis=1)[:, None]
+    rest = np.take_along_axis(quads, (missing + [1, 2, 3]) % 4, axis=1)[there.sum(axis=1) == 3]
+    faces = np.concatenate([_triangles(quads[there.all(axis=1)]), rest])
+    return _compact(points.reshape(-1, 3), faces)
 
 
 def slice_mesh(
@@ -163,17 +168,20 @@ def cells_mesh(cells: Cells) -> Mesh:
             ring = around if forwards else around[::-1]
             quads.append(np.stack([index[tuple((start + step).T)] for step in ring], axis=1))
     corners = (np.moveaxis(np.indices(index.shape), 0, -1) - 1.0).reshape(-1, 3)
-    mesh = _compact(np.asarray(cells.low) + corners * cells.spacing, np.concatenate(quads))
+    faces = _triangles(np.concatenate(quads))
+    mesh = _compact(np.asarray(cells.low) + corners * cells.spacing, faces)
     return Mesh(_smooth(mesh), mesh.faces)
 
 
-def _compact(points: FloatArray, quads: NDArray[Any]) -> Mesh:
-    """Split quadrilaterals into triangles, and keep the points that are used."""
-    used, renamed = np.unique(quads, return_inverse=True)
-    quads = renamed.reshape(quads.shape)
-    # Keep both triangles of a quadrilateral together. Otherwise two sheets, one behind the other,
-    # would be drawn alternately and hide parts of each other.
-    return Mesh(points[used], quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3))
+def _triangles(quads: NDArray[Any]) -> NDArray[Any]:
+    """Split quadrilaterals."""
+    return quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
+
+
+def _compact(points: FloatArray, faces: NDArray[Any]) -> Mesh:
+    """Keep the points that are used."""
+    used, renamed = np.unique(faces, return_inverse=True)
+    return Mesh(points[used], renamed.reshape(faces.shape))
 
 
 def _smooth(mesh: Mesh) -> FloatArray:

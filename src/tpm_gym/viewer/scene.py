@@ -27,6 +27,7 @@ TASK_NODES: Final = "/objects", "/goals", "/paint"
 """Nodes below which objects, goal markers, belt and paint of a task hang; world frame."""
 
 _PAPER_TABLE: Final = 0.45  # m, half the length for which the camera's distance was chosen
+_PAPER_HEIGHT: Final = 0.97  # m, of the base
 _GOAL: Final = (30, 160, 70)
 
 
@@ -44,7 +45,7 @@ def set_camera(server: ViserServer, machine: Machine) -> None:
         0.55 * machine.mount.height,
     ]
     server.initial_camera.look_at = middle
-    size = 1 + max(machine.table) - _PAPER_TABLE
+    size = max(1 + max(machine.table) - _PAPER_TABLE, machine.mount.height / _PAPER_HEIGHT)
     server.initial_camera.position = middle + np.array([1.1, -1.65, 0.45]) * size
     server.initial_camera.fov = math.radians(38)
 

@@ -66,12 +66,8 @@ class DeltaKind(Kind):
 
     def layers(self, posture: Posture) -> Mapping[str, Found]:
         """See :class:`Kind`."""
-        modes, g, y = (
-            (posture.working, posture.assembly),
-            self.machine.geometry,
-            posture.position[1],
-        )
-        working, assembly = modes
+        working, assembly = posture.working, posture.assembly
+        g, y = self.machine.geometry, posture.position[1]
 
         def found_aspects() -> list[Cells]:
             return [a.cells for a in aspects(working, g, _SHAPE) if a.assembly == assembly]
@@ -82,7 +78,10 @@ class DeltaKind(Kind):
 
         middle, reach = (0.0, y, 0.0), g.l3 + g.l4 + abs(g.l1 - g.l2)
         return {
-            "aspects": (modes, found_aspects),
+            "aspects": ((working, assembly), found_aspects),
             "workspace": (working, lambda: reachable_set(working, g, _SHAPE)),
-            "conditioning": ((*modes, round(y, 4)), lambda: slice_mesh(middle, reach, quality)),
+            "conditioning": (
+                (working, assembly, round(y, 4)),
+                lambda: slice_mesh(middle, reach, quality),
+            ),
         }

@@ -143,13 +143,8 @@ class TPMKind(Kind):
         """See :class:`Kind`; layers are those of the translating operation mode."""
         if posture.operation == "rotated":
             return {}
-        modes, g, y = (
-            (posture.working, posture.assembly),
-            self.machine.geometry,
-            posture.position[1],
-        )
-        working, assembly = modes
-        side = assembly.sin_beta
+        working, assembly = posture.working, posture.assembly
+        g, y, side = self.machine.geometry, posture.position[1], assembly.sin_beta
 
         def surfaces(factors: tuple[str, ...]) -> Found:
             return working, lambda: {name: surface(name, working, g) for name in factors}
@@ -159,14 +154,17 @@ class TPMKind(Kind):
             return [a.cells for a in aspects(working, g) if a.assembly.sin_beta == side]
 
         def quality(points: FloatArray) -> FloatArray:
-            return jacobian.conditioning_at(points, *modes, g)
+            return jacobian.conditioning_at(points, working, assembly, g)
 
         middle, reach = (g.l2, y, 0.0), g.l3 + g.l4
         return {
             **{name: surfaces(factors) for name, factors in SURFACES.items()},
             "aspects": ((working, side), found_aspects),
             "workspace": (working, lambda: reachable_set(working, g, _FINE)),
-            "conditioning": ((*modes, round(y, 4)), lambda: slice_mesh(middle, reach, quality)),
+            "conditioning": (
+                (working, assembly, round(y, 4)),
+                lambda: slice_mesh(middle, reach, quality),
+            ),
             "margin": (tuple(posture.position), lambda: self.margin(posture)),
         }
 
