@@ -10,6 +10,7 @@ handles updates depends less on other programs. Needs the extra ``view``.
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from contextlib import closing, suppress
@@ -80,22 +81,30 @@ def receive(page: ClientConnection) -> None:
         pass
 
 
-def main() -> None:
-    """Measure both operation modes."""
-    with closing(open_viewer("wide", port=8600)) as viewer:
+def measure(machine: str) -> None:
+    """Measure a machine in all its operation modes."""
+    with closing(open_viewer(machine, port=8600)) as viewer:
         address = viewer.address.replace("http", "ws")
         protocol: Any = f"viser-v{viser.__version__}"
         with connect(address, subprotocols=[protocol], max_size=None) as page:
             threading.Thread(target=receive, args=(page,), daemon=True).start()
-            for operation in ("translating", "rotated"):
+            for operation in viewer.explore.operation.options:
                 viewer.explore.operation.value = operation
                 viewer.worker.wait()
                 for name, rate in (("as fast as possible", 1000.0), ("60 a second", 60.0)):
                     sent, handled, cost = drag(viewer, page, rate)
                     print(
-                        f"{operation}, {name}: {sent / SECONDS:.0f} a second sent, "
-                        f"{handled / SECONDS:.0f} a second handled, {cost:.1f} ms of CPU each"
+                        f"{machine}, {operation}, {name}: {sent / SECONDS:.0f} a second sent, "
+                        f"{handled / SECONDS:.0f} a second handled, {cost:.1f} ms of CPU each",
+                        flush=True,
                     )
+
+
+def main() -> None:
+    """Measure the wide machine, which can be rotated everywhere, and the Delta."""
+    for machine in ("wide", "delta"):
+        measure(machine)
+    print(f"load {os.getloadavg()[0]:.1f}, {os.cpu_count()} cores")
 
 
 if __name__ == "__main__":
