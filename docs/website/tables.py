@@ -26,12 +26,15 @@ def whole(text: str) -> str:
 
 
 def mark(page: nodes.document) -> None:
-    """Give cells with long text, and code with a long word, the class ``long``."""
+    """Give cells with long text and code with a long word the class ``long``; ``short`` to code."""
     for cell in page.findall(nodes.entry):
         if len(cell.astext()) > _LONG:
             cell["classes"].append("long")
     for code in page.findall(nodes.literal):
-        if any(len(word) > _LONG for word in code.astext().split()):
+        text = code.astext()
+        if len(text) <= _LONG:
+            code["classes"].append("short")
+        elif any(len(word) > _LONG for word in text.split()):
             code["classes"].append("long")
 
 

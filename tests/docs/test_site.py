@@ -84,11 +84,11 @@ def test_intervals_and_quantities_in_tables_keep_to_one_line():
 
 def test_long_cells_and_long_words_of_code_are_marked():
     page = new_document("page")
-    texts = "word " * 9, "word", "word " * 9, "w" * 45
-    kinds = nodes.entry, nodes.entry, nodes.literal, nodes.literal
+    texts = "word " * 9, "word", "word " * 9, "w" * 45, "make demo"
+    kinds = nodes.entry, nodes.entry, nodes.literal, nodes.literal, nodes.literal
     page += [kind("", nodes.Text(text)) for kind, text in zip(kinds, texts, strict=True)]
     tables.mark(page)
-    assert [node["classes"] for node in page] == [["long"], [], [], ["long"]]
+    assert [node["classes"] for node in page] == [["long"], [], [], ["long"], ["short"]]
 
 
 def test_the_list_of_tasks_has_a_sentence_for_each():
