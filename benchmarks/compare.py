@@ -376,10 +376,10 @@ LEARNING = (
 def figure() -> Figure:
     """Draw the conditioning over the vertical plane x, z through the middle of each region."""
     drawn, axes = plt.subplots(
-        1, len(MACHINES), figsize=(11, 3.2), sharey=True, layout="constrained"
+        2, 2, figsize=(9, 5.6), sharex=True, sharey=True, layout="constrained"
     )
-    x, z = np.meshgrid(np.linspace(-0.9, 0.9, 241), np.linspace(0.05, 1.7, 221), indexing="ij")
-    for one, (name, machine) in zip(axes, MACHINES.items(), strict=True):
+    x, z = np.meshgrid(np.linspace(-1.5, 1.5, 401), np.linspace(-0.05, 1.85, 255), indexing="ij")
+    for one, (name, machine) in zip(axes.flat, MACHINES.items(), strict=True):
         (x0, y0, z0), (x1, y1, z1) = machine.region.low, machine.region.high
         points = np.stack([x, np.full_like(x, (y0 + y1) / 2), z], axis=-1)
         theta, (lower, upper) = machine.inverse(points), machine.stops
@@ -388,8 +388,10 @@ def figure() -> Figure:
         shown[shown == 0] = np.nan
         colours = one.pcolormesh(x, z, shown, vmin=0, vmax=0.8)
         one.add_patch(Rectangle((x0, z0), x1 - x0, z1 - z0, fill=False))
-        one.set(title=name, xlabel="x, m", aspect="equal")
-    axes[0].set(ylabel="z, m, down", ylim=(1.7, 0.05))
+        one.set(title=name, aspect="equal", ylim=(1.85, -0.05))
+    for last, first in zip(axes[-1], axes[:, 0], strict=True):
+        last.set(xlabel="x, m")
+        first.set(ylabel="z, m, down")
     drawn.colorbar(colours, ax=axes, label="conditioning 1/cond(J)", shrink=0.7)
     return drawn
 
