@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numba
+import numpy as np
 import pytest
 from processes import printed_by
 
@@ -46,8 +47,7 @@ compilable(law.law)
 
 def rows(law):
     def evaluate(x: float) -> float:
-        size, width = x + 0.0, "width"
-        return law(size)
+        return law(x)
 
     compilable(evaluate)
     return evaluate
@@ -108,6 +108,96 @@ def test_a_function_that_was_compiled_without_bytecode_is_found_with_it(folder):
         for _ in range(2)
     ]
     assert found == ["3.0 0\n", "3.0 1\n"]
+
+
+LAWS = """
+import numpy as np
+from beside import root
+from own import law as namespace
+
+HALF = 0.5
+
+def twice(x): return 2.0 * x
+def thrice(x): return 3.0 * x
+def power(x, ns): return ns.law(x)
+def named(x, base=HALF): return base * x
+
+def loop(law=twice, a=2.0, b=3.0, table=np.zeros(2000)):
+    def apply(x): return law(x) * a - b + table[500] + power(x, namespace) + root(x) + named(x)
+
+    return apply
+"""
+
+
+def laws(folder: Path) -> Any:
+    """The module of LAWS, as a new process has it; it uses another package, ``beside``."""
+    sys.modules.pop("beside", None)
+    (folder / "own/main.py").write_text(LAWS)
+    if not (folder / "beside.py").exists():
+        (folder / "beside.py").write_text("def root(x): return x\n")
+    with pytest.raises(AttributeError):  # no function ``apply``
+        fresh()
+    return sys.modules["own.main"]
+
+
+def test_functions_that_differ_in_their_closure_alone_have_different_stamps(folder):
+    main, table = laws(folder), np.zeros(2000)
+    table[500] = 1e-12
+    functions = [
+        main.loop(),
+        main.loop(main.thrice),
+        main.loop(a=3.0, b=2.0),
+        main.loop(b=2.0),
+        main.loop(table=table),
+        main.loop(table=table.astype(np.float32)),
+        main.loop((main.twice, main.thrice, main.twice)),
+        main.loop((main.twice, main.thrice, main.thrice)),
+        main.loop(np.dtype(np.float32)),
+        main.loop(np.dtype(np.float64)),
+        main.loop(None),
+    ]
+    stamps = [compiling.stamp(function) for function in functions]
+    assert len(set(stamps)) == len(stamps)
+    assert compiling.stamp(laws(folder).loop()) == stamps[0]
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new"),
+    [
+        ("beside.py", "return x", "return -x"),  # another package
+        ("own/scale.py", "2.0", "4.0"),  # used by the function of a module that is an argument
+        ("own/law.py", "SCALE * x", "SCALE + x"),
+    ],
+)
+def test_the_stamp_covers_other_packages_and_modules_as_arguments(folder, file, old, new):
+    before = compiling.stamp(laws(folder).loop())
+    (folder / file).write_text((folder / file).read_text().replace(old, new))
+    assert compiling.stamp(laws(folder).loop()) != before
+
+
+def test_a_default_is_in_the_stamp(folder):
+    main = laws(folder)
+    before = compiling.stamp(main.loop())
+    main.named.__defaults__ = (0.25,)
+    assert compiling.stamp(main.loop()) != before
+
+
+def test_a_source_that_is_edited_after_its_import_does_not_spoil_what_is_kept(folder):
+    function = fresh()
+    text = SOURCES["law"].replace("SCALE * x", "SCALE + x")
+    (folder / "own/law.py").write_text(text)
+    assert function(1.5) == 3.0  # the code that was imported
+    assert [called(), called()] == [(3.5, 0), (3.5, 1)]
+
+
+def test_a_process_that_was_killed_between_index_and_code_leaves_no_wrong_code(folder):
+    called()
+    (code,) = folder.glob("kept/*/*.nbc")
+    old = code.read_bytes()
+    (folder / "own/scale.py").write_text("SCALE = 4.0\n")
+    called()
+    code.write_bytes(old)  # the index is new
+    assert [called(), called()] == [(6.0, 0), (6.0, 1)]
 
 
 @pytest.mark.parametrize("ending", ["nbi", "nbc"])

@@ -55,12 +55,37 @@ def kept(function: _Function) -> _Function:
     return cast(_Function, dispatcher)
 
 
-class _Disk(_CACHING.FunctionCache):  # type: ignore[misc]  # Numba has no types
-    """Numba's files, found by signature and processor alone.
+class _Code(_CACHING.CompileResultCacheImpl):  # type: ignore[misc]  # Numba has no types
+    """Numba's contents of a file, with the stamp of the function."""
+
+    stamp = ""
+
+    def reduce(self, cres: Any) -> Any:
+        """Return what is written."""
+        return self.stamp, super().reduce(cres)
+
+    def rebuild(self, target_context: Any, payload: Any) -> Any:
+        """Return the machine code; None if it is of other sources.
+
+        Numba writes a new index first, then the code. A process that is killed in between, or reads
+        in between, would take the code of other sources for this function's.
+        """
+        stamp, code = payload
+        return super().rebuild(target_context, code) if stamp == self.stamp else None
+
+
+class _Disk(_CACHING.FunctionCache):  # type: ignore[misc]
+    """Numba's files, found by stamp, signature and processor.
 
     Numba also asks for an equal pickle of the closure. But the pickle of a function differs between
     a process that reads its source and one that reads its bytecode. The stamp covers the closure.
     """
+
+    _impl_class = _Code
+
+    def renew(self, stamp: str) -> None:
+        """Set the stamp that files must have. Numba's own covers only the function's file."""
+        self._cache_file._source_stamp = self._impl.stamp = stamp
 
     def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
         return sig, codegen.magic_tuple()
@@ -89,9 +114,8 @@ class _Cache:
         """Load the machine code of a signature; None if it has to be compiled."""
         found = None
         if not isinstance(self._disk, _CACHING.NullCache):
-            # Numba's own stamp covers only the file of the function. This stamp is computed at the
-            # first use, because the decorator does not know functions that are defined later.
-            self._disk._cache_file._source_stamp = stamp(self._function)
+            # At the first use, because the decorator does not know functions that are defined later
+            self._disk.renew(stamp(self._function))
         try:
             found = self._disk.load_overload(sig, target_context)
         except Exception:  # damaged: unpickling raises almost anything
@@ -125,42 +149,75 @@ class _Cache:
         )
 
 
-_CONSTANTS = (int, float, complex, str, np.generic, np.ndarray)
+_CONSTANTS = (int, float, complex, str, np.generic, np.dtype, numba.types.Number)
+_LIBRARIES: Final = {"numba", "numpy", *sys.stdlib_module_names}
+"""Packages whose functions are found by name; their sources are not read."""
 
 
 def stamp(function: Callable[..., Any]) -> str:
-    """Compute a hash of all that is compiled into a function: its sources and constants."""
-    parts = sorted(set(_parts(function, function.__module__.partition(".")[0], set())))
-    return hashlib.sha256("\n".join(parts).encode()).hexdigest()
+    """Compute a hash of all that is compiled into a function: code, sources and constants."""
+    return hashlib.sha256("\n".join(_parts(function, {})).encode()).hexdigest()
 
 
-def _parts(value: Any, package: str, seen: set[int]) -> Iterator[str]:
-    """Yield the sources of ``package`` and the constants that a value refers to."""
+def _parts(value: Any, seen: dict[Any, int]) -> Iterator[str]:
+    """Yield text that is equal in all processes if what a value refers to is equal.
+
+    The order counts: the same functions and constants in other places are another function.
+    """
     value = getattr(value, "py_func", value)
-    if id(value) in seen:
-        return
-    seen.add(id(value))
     if isinstance(value, tuple):
+        yield f"tuple of {len(value)}"
         for part in value:
-            yield from _parts(part, package, seen)
-    elif inspect.isfunction(value) or inspect.isclass(value):
-        if value.__module__.partition(".")[0] != package:
-            return
-        yield _text(getattr(sys.modules.get(value.__module__), "__file__", None))
-        for used in _used(value) if inspect.isfunction(value) else ():
-            yield from _parts(used, package, seen)
-    elif isinstance(value, _CONSTANTS):  # the repr of others may differ between processes
+            yield from _parts(part, seen)
+    elif isinstance(value, np.ndarray):
+        yield f"{value.dtype} {value.shape} {value.tobytes().hex()}"
+    elif isinstance(value, _CONSTANTS):
         yield repr(value)
+    elif isinstance(value, CodeType):
+        yield f"{value.co_code.hex()} {value.co_names} {value.co_varnames}"
+        yield from _parts(value.co_consts, seen)
+    elif not (isinstance(value, ModuleType) or inspect.isfunction(value) or inspect.isclass(value)):
+        yield type(value).__qualname__  # the repr may differ between processes
+    elif id(value) in seen:
+        yield f"number {seen[id(value)]}"
+    else:
+        seen[id(value)] = len(seen)
+        yield from _sources(value, seen)
+
+
+def _sources(value: Any, seen: dict[Any, int]) -> Iterator[str]:
+    """Yield the source of a function, class or module, and what the function refers to.
+
+    The code may be older than the source, which may have been edited since it was imported.
+    """
+    module = str(value.__name__ if isinstance(value, ModuleType) else value.__module__)
+    yield f"{module} {getattr(value, '__qualname__', '')}"
+    if module.partition(".")[0] in _LIBRARIES:
+        return
+    file = getattr(sys.modules.get(module), "__file__", None)
+    if file not in seen:
+        seen[file] = len(seen)
+        yield _text(file)
+    if inspect.isfunction(value):
+        for used in (value.__code__, *_used(value)):
+            yield from _parts(used, seen)
+    elif isinstance(value, ModuleType):  # a namespace: others call functions of it by name
+        for _, own in sorted(vars(value).items()):
+            own = getattr(own, "py_func", own)
+            if inspect.isfunction(own) and own.__module__ == module:
+                yield from _parts(own, seen)
 
 
 def _used(function: Any) -> Iterator[Any]:
-    """Yield the values of a function's names: globals, attributes of modules, closure."""
+    """Yield the values of a function's names: globals, attributes of modules, closure, defaults."""
     names, scope = set(_names(function.__code__)), function.__globals__
     yield from (cell.cell_contents for cell in function.__closure__ or ())
-    for name in names & scope.keys():
+    yield function.__defaults__
+    for name in sorted(names & scope.keys()):
         yield scope[name]
         if isinstance(scope[name], ModuleType):
-            yield from (vars(scope[name])[other] for other in names & vars(scope[name]).keys())
+            there = vars(scope[name])
+            yield from (there[other] for other in sorted(names & there.keys()))
 
 
 def _names(code: CodeType) -> Iterator[str]:
@@ -171,6 +228,6 @@ def _names(code: CodeType) -> Iterator[str]:
 
 
 def _text(file: str | None) -> str:
-    with suppress(OSError, TypeError):
+    with suppress(OSError, TypeError, ValueError):  # no file, or no text
         return Path(cast(str, file)).read_text(encoding="utf-8")
     return ""
