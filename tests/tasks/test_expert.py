@@ -163,6 +163,15 @@ def test_for_a_vector_it_does_what_it_does_for_each_environment(engine, randomis
     envs.close()
 
 
+@pytest.mark.parametrize("env_id", ["TPMPickAndPlace-v0", "TPMStack-v0", "TPMThrow-v0"])
+def test_it_waits_for_the_cup_with_the_longest_latency(env_id):
+    envs = gym.make_vec(env_id, num_envs=20, engine="analytic", randomisation={"latency": 5})
+    expert, (observation, _) = Expert(envs), envs.reset(seed=0)
+    for _ in range(envs.spec.max_episode_steps - 1):
+        observation, *_, infos = envs.step(expert.act(observation))
+    assert infos["is_success"].all()
+
+
 class Planned(Reach):
     """Its plan ends."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from itertools import pairwise
 from typing import NamedTuple
@@ -24,10 +25,12 @@ ROUNDING = 1e-5
 SEALING = 0.160
 """Time to wait for the cup to seal before giving up, s."""
 SLOW_ABOVE = 0.003
-"""Height of the lip over a block from where a gentle pick goes on slowly, m; the cup seals below 2
-mm."""
-SLOW_STEP = 0.001
-"""Way down in a control step of a gentle pick, m."""
+"""Height of the lip over a block from where a gentle pick goes on slowly, m.
+
+The cup seals below 2 mm.
+"""
+SLOW_SPEED = 0.025
+"""Speed of a gentle pick below that height, m/s."""
 
 
 def hanging(block: Block) -> FloatArray:
@@ -161,12 +164,13 @@ class Motion:
             ConfigurationError: If the task does not observe the block.
         """
         yield from self.go([self._above(block, clearance)], vacuum=False)
-        height = SLOW_ABOVE if gently else 0.0
+        height, step = SLOW_ABOVE if gently else 0.0, SLOW_SPEED * self.period
         yield from self.go([self._above(block, height)], vacuum=True)
-        for _ in range(self._sealing):
+        # The wait begins on the block, which P reaches after the actions that latency holds back.
+        for _ in range(math.ceil(height / step) + self._sealing + len(self.under_way)):
             if self.holding(block.name):
                 return
-            height = max(height - SLOW_STEP, 0.0)
+            height = max(height - step, 0.0)
             yield Move(self._above(block, height), True)
 
     def _above(self, block: Block, clearance: float = 0.0) -> FloatArray:
