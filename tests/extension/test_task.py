@@ -119,6 +119,21 @@ def test_an_event_that_mixes_robots_is_named(sorting):
         tpm_gym.TPMEnv(Wrong)
 
 
+def test_an_event_is_a_truth_value_with_a_name_of_its_own(sorting):
+    def speed(self, state):
+        return np.linalg.norm(state.fk_velocity, axis=-1)
+
+    def fast(self, state):
+        return speed(self, state) > 0.1
+
+    wrong = type("Wrong", (sorting.Sort,), {"events": ("speed",), "speed": speed})
+    with pytest.raises(ConfigurationError, match=r"speed\(\) = .of type float64. .*bool"):
+        tpm_gym.TPMEnv(wrong)
+    wrong = type("Wrong", (sorting.Sort,), {"events": ("conditioning",), "conditioning": fast})
+    with pytest.raises(ConfigurationError, match=r"events = .conditioning. .*names other than"):
+        tpm_gym.TPMEnv(wrong).reset()
+
+
 def test_where_there_is_no_room_sampling_says_so(sorting):
     class Crowd(sorting.Sort):
         def sample(self, rngs, chosen):

@@ -271,6 +271,8 @@ class Core:
             "reward_terms": terms,
         }
         for event in task.events:
+            if event in info:
+                raise ConfigurationError("events", event, f"names other than {', '.join(info)}")
             info[event] = getattr(task, event)(state)
         return observation, reward, info
 

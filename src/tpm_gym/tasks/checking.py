@@ -68,6 +68,9 @@ def _check_shapes(task: Task, state: State) -> None:
         if name in ("goal", "singularity"):
             raise ConfigurationError("shaping()", name, "names other than goal, singularity")
         finite(f"shaping()[{name!r}]", values, (_EXAMPLES,), ConfigurationError)
+    for event in task.events:
+        if (kind := np.asarray(getattr(task, event)(state)).dtype) != np.bool_:
+            raise ConfigurationError(f"{event}()", f"of type {kind}", "(n,) bool")
 
 
 def _equal(row: Any, single: Any) -> bool:
