@@ -24,11 +24,8 @@ ROUNDING = 1e-5
 """Tolerance as a fraction of a control step, above the error of single precision, 1e-6."""
 SEALING = 0.160
 """Time to wait for the cup to seal before giving up, s."""
-SLOW_ABOVE = 0.003
-"""Height of the lip over a block from where a gentle pick goes on slowly, m.
-
-The cup seals below 2 mm.
-"""
+SLOW_ABOVE = CUP.seal_gap + 0.001
+"""Height of the lip over a block from where a gentle pick goes on slowly, m."""
 SLOW_SPEED = 0.025
 """Speed of a gentle pick below that height, m/s."""
 

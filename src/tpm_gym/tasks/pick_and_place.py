@@ -24,8 +24,8 @@ It is no multiple of the tolerance: otherwise the last bit would decide about su
 RELEASE_HEIGHT = 0.0005
 """Height over the table at which the expert lets go of the block, m.
 
-Where it presses the block on the table, or the cup on the block, friction holds forces that the
-engines share out in different ways (docs/compare.md).
+A block that is pressed on the table has forces of friction that each engine computes differently
+(docs/compare.md).
 """
 
 
