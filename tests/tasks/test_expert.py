@@ -172,6 +172,19 @@ def test_it_waits_for_the_cup_with_the_longest_latency(env_id):
     assert infos["is_success"].all()
 
 
+@pytest.mark.parametrize("engine", ["analytic", "pybullet"])
+def test_it_lets_go_of_a_block_just_above_the_table(engine):
+    env, heights = gym.make("TPMPickAndPlace-v0", engine=engine), []
+    half = env.unwrapped.task.block.height / 2
+    for _ in expert_episode(env, seed=0):  # a goal on the table
+        state = env.unwrapped.state
+        if state.held == 0:
+            heights.append(state.object_position.ravel()[2] - half)
+    assert max(heights) > 0.01
+    assert -5e-5 < heights[-1] < 2e-4
+    env.close()
+
+
 class Planned(Reach):
     """Its plan ends."""
 

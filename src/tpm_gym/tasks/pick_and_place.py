@@ -22,8 +22,9 @@ CLEARANCE = 0.028
 It is no multiple of the tolerance: otherwise the last bit would decide about successes.
 """
 RELEASE_HEIGHT = 0.0005
-"""Height over the table at which the expert lets go of the block, m.
+"""Height over its place on the table to which the expert carries the block, m.
 
+The weight stretches the cup by 0.4 to 0.5 mm, so that the block is let go just above the table.
 A block that is pressed on the table has forces of friction that each engine computes differently
 (docs/compare.md).
 """
