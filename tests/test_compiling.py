@@ -182,6 +182,13 @@ def test_a_default_is_in_the_stamp(folder):
     assert compiling.stamp(main.loop()) != before
 
 
+def test_options_of_compiling_are_in_the_stamp(folder, monkeypatch):
+    function = laws(folder).loop()
+    before = compiling.stamp(function)
+    monkeypatch.setattr(compiling, "__file__", str(folder / "own/law.py"))
+    assert compiling.stamp(function) != before
+
+
 def test_a_source_that_is_edited_after_its_import_does_not_spoil_what_is_kept(folder):
     function = fresh()
     text = SOURCES["law"].replace("SCALE * x", "SCALE + x")

@@ -156,7 +156,8 @@ _LIBRARIES: Final = {"numba", "numpy", *sys.stdlib_module_names}
 
 def stamp(function: Callable[..., Any]) -> str:
     """Compute a hash of all that is compiled into a function: code, sources and constants."""
-    return hashlib.sha256("\n".join(_parts(function, {})).encode()).hexdigest()
+    # The options of Numba are in this file.
+    return hashlib.sha256("\n".join([_text(__file__), *_parts(function, {})]).encode()).hexdigest()
 
 
 def _parts(value: Any, seen: dict[Any, int]) -> Iterator[str]:
