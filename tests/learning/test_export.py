@@ -209,6 +209,14 @@ def test_a_diverged_policy_is_refused(tmp_path, model):
         save(model, tmp_path / "p")
 
 
+def test_rounding_in_a_network_with_large_weights_is_no_error(tmp_path):
+    made = make(SAC, Blank(), net_arch=[64, 64], **GOAL_GAP)
+    with torch.no_grad():  # sums of large terms that cancel are rounded by 1.8e-5
+        made.policy.actor.latent_pi[-2].bias += 30
+        made.policy.actor.mu.bias -= 30 * made.policy.actor.mu.weight.sum(dim=1)
+    save(made, tmp_path / "p")
+
+
 def test_actions_that_differ_are_noticed_and_earlier_files_kept(tmp_path, model, monkeypatch):
     path = save(model, tmp_path / "p")
     before = path.read_bytes()
@@ -216,7 +224,7 @@ def test_actions_that_differ_are_noticed_and_earlier_files_kept(tmp_path, model,
 
     def slightly_wrong(*arguments):
         description, weights = network(*arguments)
-        weights["layers.1.bias"][2] += 1e-4
+        weights["layers.1.bias"][2] += 1e-3
         return description, weights
 
     monkeypatch.setattr(export, "_network", slightly_wrong)
