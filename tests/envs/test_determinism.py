@@ -111,8 +111,9 @@ def test_saved_states_go_on_equally_on_their_way_in_contact_and_holding(env_id, 
         actions.append(action)
         observation = env.step(action)[0]
         expected.append((bits(observation), bits(vars(bare.state))))
-    assert {kind for _, kind in moments.values()} == {"free", "touched", "held"}
-    for stop in (30, 0, 8, 12, 13, 16, 22, 39):
+    stops = (30, 0, 8, 12, 13, 16, 22, 39)
+    assert {moments[stop][1] for stop in stops} == {"free", "touched", "held"}
+    for stop in stops:
         snapshot = moments[stop][0]
         bare.reset(seed=stop)  # somebody else's episode, on another machine
         bare.step(np.ones(4))

@@ -31,16 +31,17 @@ from tpm_gym.learning.film import Frame, Play, write_contact_sheet, write_video
 from tpm_gym.learning.policies import load_policy, trained_in
 from tpm_gym.learning.rollout import BATCH, TEST_SEED, Episode, Policy, run_episodes, summarise
 
+_SHARE = (100.0, "{:.1f}", "%")  # factor, format and unit
 # Label, key, factor, format and unit of each row of the table; the task's events are in between.
 _SUCCESS = (
-    ("success at end", "success_at_end", 100.0, "{:.1f}", "%"),
-    ("success once", "success_once", 100.0, "{:.1f}", "%"),
+    ("success at end", "success_at_end", *_SHARE),
+    ("success once", "success_once", *_SHARE),
 )
 _ROWS = (
     ("return", "return", 1.0, "{:.2f}", ""),
     ("conditioning, least", "conditioning_min", 1.0, "{:.3f}", ""),
     ("conditioning, mean", "conditioning_mean", 1.0, "{:.3f}", ""),
-    ("share of steps below safe", "unsafe_share", 100.0, "{:.1f}", "%"),
+    ("share of steps below safe", "unsafe_share", *_SHARE),
     ("closure error, largest", "closure_error_max", 1e3, "{:.4f}", " mm"),
     ("observed P off, largest", "fk_error_max", 1e3, "{:.4f}", " mm"),
     ("torque, RMS", "torque_rms", 1.0, "{:.1f}", " N m"),
@@ -237,7 +238,7 @@ def _table(config: EvaluationConfig, results: Sequence[Result]) -> Table:
     table.add_column("metric", no_wrap=True)
     for result in results:
         table.add_column(result.policy, justify="right", overflow="fold")
-    events = [(name.replace("_", " "), name, *_SUCCESS[-1][2:]) for name in results[0].events]
+    events = [(name.replace("_", " "), name, *_SHARE) for name in results[0].events]
     for label, name, factor, form, unit in (*_SUCCESS, *events, *_ROWS):
 
         def show(value: float, form: str = form, factor: float = factor) -> str:

@@ -14,6 +14,7 @@ from viser.transforms import SO3
 from tpm_gym.arrays import FloatArray
 from tpm_gym.mechanism.bodies import Place, Solid
 from tpm_gym.mechanism.machine import Machine
+from tpm_gym.mechanism.tpm import PAPER_TPM
 from tpm_gym.mechanism.urdf import COLOURS
 from tpm_gym.simulation.stage import BELT, FLOOR, PATCH_HEIGHT, TABLE, painted
 from tpm_gym.simulation.state import Patch, Scene, State
@@ -26,8 +27,6 @@ ROBOT: Final = "/robot"
 TASK_NODES: Final = "/objects", "/goals", "/paint"
 """Nodes below which objects, goal markers, belt and paint of a task hang; world frame."""
 
-_PAPER_TABLE: Final = 0.45  # m, half the length for which the camera's distance was chosen
-_PAPER_HEIGHT: Final = 0.97  # m, of the base
 _GOAL: Final = (30, 160, 70)
 
 
@@ -45,7 +44,9 @@ def set_camera(server: ViserServer, machine: Machine) -> None:
         0.55 * machine.mount.height,
     ]
     server.initial_camera.look_at = middle
-    size = max(1 + max(machine.table) - _PAPER_TABLE, machine.mount.height / _PAPER_HEIGHT)
+    # The camera's distance was chosen for the paper's machine.
+    longer = max(machine.table) - max(PAPER_TPM.table)
+    size = max(1 + longer, machine.mount.height / PAPER_TPM.mount.height)
     server.initial_camera.position = middle + np.array([1.1, -1.65, 0.45]) * size
     server.initial_camera.fov = math.radians(38)
 
