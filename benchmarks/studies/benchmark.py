@@ -68,7 +68,7 @@ def _row(name: str, method: str, of: Sequence[Frame]) -> dict[str, str]:
         f"success, % ({label})": _cell(_successes(of, engine, 100.0), _RATE)
         for engine, label in ENGINES.items()
     }
-    times = {"steps": ("learned_steps", 1.0, _STEPS), "seconds": ("learned_minutes", 60, _SECONDS)}
+    times = {"steps": ("learned_steps", 1.0, _STEPS), "seconds": ("learned_seconds", 1.0, _SECONDS)}
     return {
         "id": name,
         "method": method,

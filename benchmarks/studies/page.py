@@ -203,6 +203,7 @@ def _row(record: Record) -> dict[str, Any]:
         "cpu_minutes": curves.get("cpu_seconds", [np.nan])[-1] / 60,
         "learned_steps": np.inf if index is None else steps[index],
         "learned_minutes": np.inf if index is None else seconds[index] / 60,
+        "learned_seconds": np.inf if index is None else curves.get("cpu_seconds", seconds)[index],
         "curve": dict(zip(steps, curves.get("success_at_end", []), strict=False)),
         **dict.fromkeys(_METRICS, np.nan),
         **{name: tests[0][name] for name in _METRICS if tests and name in tests[0]},
