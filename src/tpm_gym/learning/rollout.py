@@ -170,26 +170,22 @@ def _run_together(
     """Run an episode in each environment; return the records of the first ``count``."""
     steps: list[dict[str, Any]] = []
     lengths = np.zeros(envs.num_envs, dtype=np.int64)
+    # The metric of an event is the share of episodes that had it.
+    events = {f"{event}_once": event for event in envs.task.events}
     for step in play(envs, policy, first_seed, count, on_frame):
         state = envs.state
         gap = state.fk_position - state.platform_position
         told = {name: step.told[name] for name in _TOLD}
         told["fk_error"] = np.sqrt((gap * gap).sum(axis=-1))
-        told |= {event_key(event): step.told[event] for event in envs.task.events}
+        told |= {metric: step.told[event] for metric, event in events.items()}
         steps.append({"reward": step.reward, "torque": state.torque, **told})
         lengths += step.running
     table = {name: np.array([step[name] for step in steps]) for name in steps[0]}
-    events = [event_key(event) for event in envs.task.events]
     records = []
     for k in range(count):
         own = {name: values[: lengths[k], k] for name, values in table.items()}
-        records.append(_record(first_seed + k, own, events))
+        records.append(_record(first_seed + k, own, [*events]))
     return records
-
-
-def event_key(event: str) -> str:
-    """Return the name of the metric of a task's event: the share of episodes that had it."""
-    return f"{event}_once"
 
 
 def _record(seed: int, steps: Mapping[str, NDArray[Any]], events: Sequence[str]) -> Episode:

@@ -170,7 +170,7 @@ class Motion:
             height = max(height - step, 0.0)
             yield Move(self._above(block, height), True)
 
-    def _above(self, block: Block, clearance: float = 0.0) -> FloatArray:
+    def _above(self, block: Block, clearance: float) -> FloatArray:
         """Return P (machine's frame) with the lip ``clearance`` above a block's present place."""
         place = self._see(f"{block.name}_position") + hanging(block)
         return self.machine.mount.to_paper(place + (0.0, 0.0, clearance))

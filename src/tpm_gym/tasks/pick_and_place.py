@@ -80,11 +80,13 @@ class PickAndPlace(Task):
             if not motion.holding():
                 continue
             on_table = bool(motion.goal[2] < self.block.height / 2 + 0.005)
-            place = motion.carried_to(motion.goal + (0.0, 0.0, RELEASE_HEIGHT if on_table else 0.0))
-            stops = [motion.command + up, place + up, place] if on_table else [place]
-            if not on_table:
+            height = RELEASE_HEIGHT if on_table else 0.0
+            place = motion.carried_to(motion.goal + (0.0, 0.0, height))
+            if on_table:
+                stops = [motion.command + up, place + up, place]
+            else:
                 # Lift the block off the table first, then move in a straight line.
-                stops.insert(0, motion.command + up / 2)
+                stops = [motion.command + up / 2, place]
             yield from motion.go(stops, vacuum=True, while_holding=self.block.name)
             if motion.holding():
                 break
