@@ -81,7 +81,7 @@ def room(design: Tensor) -> Tensor:
 def room_of_lengths(design: Tensor) -> Tensor:
     """Compute the margins to the limits of the lengths."""
     l1, _, l3, l4, *_ = design
-    least = torch.tensor([*vars(LEAST).values()], dtype=torch.float64)
+    least = torch.tensor(LEAST, dtype=torch.float64)
     spare = (design[:7] - least)[_FREE[:6]]
     return torch.cat([spare, torch.stack([FOOTPRINT - l1 - l3, REACH - l3 - l4])])
 
