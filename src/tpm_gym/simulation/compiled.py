@@ -19,31 +19,6 @@ from tpm_gym.simulation.vectors import (
     three,
 )
 
-__all__ = [
-    "accepted",
-    "all_within",
-    "along",
-    "any_outside",
-    "arrived",
-    "beyond",
-    "bounded",
-    "braced_inverse",
-    "differences",
-    "distances",
-    "drawn",
-    "ends",
-    "in_world",
-    "limited",
-    "measured",
-    "normalise",
-    "servo_torque",
-    "servo_torques",
-    "shifted",
-    "singularity_penalty",
-    "spline_points",
-    "truth",
-]
-
 
 @kept
 def all_within(points: FloatArray, low: FloatArray, high: FloatArray) -> bool:

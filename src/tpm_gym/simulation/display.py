@@ -6,8 +6,6 @@ import ctypes
 import os
 import sys
 
-__all__ = ["has_display"]
-
 _kept: list[ctypes.c_void_p] = []  # the first connection to the X server
 
 

@@ -22,15 +22,6 @@ from tpm_gym.simulation.settings import settings_of
 if TYPE_CHECKING:
     from tpm_gym.simulation.engine import Path
 
-__all__ = [
-    "References",
-    "Servo",
-    "ServoDrives",
-    "drive_of",
-    "drives_and_randomisation",
-    "require_servo",
-]
-
 FEEDFORWARDS = ("none", "gravity", "computed")
 
 

@@ -26,24 +26,6 @@ from tpm_gym.simulation.randomisation import Plant
 from tpm_gym.simulation.state import Scene
 from tpm_gym.simulation.vacuum import Hold
 
-__all__ = [
-    "Engine",
-    "Path",
-    "Pose",
-    "Readout",
-    "Twist",
-    "drives_of_one",
-    "engine_names",
-    "loops",
-    "make_engine",
-    "most_robots",
-    "register_engine",
-    "require_engine",
-    "spline_weights",
-    "steering",
-    "transform",
-]
-
 UPRIGHT: Quaternion = (0.0, 0.0, 0.0, 1.0)
 SPRING_GAIN = 0.2
 """Fraction of its displacement that the cup's spring removes in one time step."""

@@ -17,25 +17,6 @@ from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.settings import settings_of
 from tpm_gym.simulation.stage import MARKER_COLOUR, TABLE
 
-__all__ = [
-    "BACKGROUND",
-    "CAMERAS",
-    "CUP",
-    "FAR",
-    "NEAR",
-    "OBJECTS",
-    "ROBOT",
-    "TABLETOP",
-    "Camera",
-    "Picture",
-    "View",
-    "camera_of",
-    "metres",
-    "paint_markers",
-    "paint_shadows",
-    "tile",
-]
-
 BACKGROUND, TABLETOP, ROBOT, CUP, OBJECTS = range(5)
 """Ids of a segmentation; object k has the id ``OBJECTS + k``. The floor is background."""
 

@@ -16,8 +16,6 @@ from tpm_gym.arrays import Vector, is_number
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.machine import Machine
 
-__all__ = ["LIMITS", "NOMINAL", "Plant", "Randomisation"]
-
 Range = tuple[float, float]
 
 # The limits are so wide that trained policies fail within them.

@@ -9,8 +9,6 @@ from typing import Any, TypeVar
 from tpm_gym.arrays import is_number, is_whole
 from tpm_gym.errors import ConfigurationError
 
-__all__ = ["Numerics", "count_steps", "require_numerics", "settings_of"]
-
 T = TypeVar("T")
 
 _SHORTEST = 1e-6  # s; a control step with a shorter time step would take minutes

@@ -28,8 +28,6 @@ from tpm_gym.simulation.randomisation import NOMINAL, Plant
 from tpm_gym.simulation.settings import count_steps
 from tpm_gym.simulation.state import CONTROL_PERIOD, Scene, State
 
-__all__ = ["Simulation", "Snapshot"]
-
 CLOSURE_LIMIT = 0.005
 """Largest allowed gap at a loop closure, m."""
 

@@ -8,19 +8,6 @@ from tpm_gym.arrays import Vector
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.simulation.state import Belt, Patch, Scene
 
-__all__ = [
-    "BELT",
-    "FLOOR",
-    "FLOOR_EDGE",
-    "LIGHT",
-    "MARKER_COLOUR",
-    "PATCH_HEIGHT",
-    "TABLE",
-    "Slab",
-    "boards",
-    "painted",
-]
-
 Colour = tuple[float, float, float, float]
 
 

@@ -9,8 +9,6 @@ from typing import Any
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector, finite, is_whole
 from tpm_gym.errors import ConfigurationError, InputError
 
-__all__ = ["CONTROL_PERIOD", "Belt", "Block", "Patch", "Scene", "State"]
-
 CONTROL_PERIOD = 1 / 25
 """Control period of tasks that set no other: time between two commands, s."""
 

@@ -13,8 +13,6 @@ from typing import Any, NamedTuple
 
 from tpm_gym.mechanism.cup import CUP, VacuumCup
 
-__all__ = ["CLEARANCE", "EMPTY", "Hold", "Load", "hold_after", "holds", "pressure_after"]
-
 CLEARANCE = 2e-5
 """Gap between lip and held object, m. Without a gap, their contact would act against the weld."""
 

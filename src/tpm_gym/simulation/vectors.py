@@ -8,28 +8,6 @@ from typing import Any
 from tpm_gym.arrays import Vector
 from tpm_gym.compiling import compilable, compiled
 
-__all__ = [
-    "Frame",
-    "Symmetric",
-    "axes",
-    "clip",
-    "cross",
-    "dot",
-    "inverted",
-    "length",
-    "level_length",
-    "onto",
-    "page_row",
-    "plus",
-    "put",
-    "put_page_row",
-    "put_row",
-    "row_of",
-    "solved",
-    "spread",
-    "three",
-]
-
 Frame = tuple[Vector, Vector, Vector]
 """Axes of a body: three unit vectors, world frame."""
 Symmetric = tuple[float, float, float, float, float, float]

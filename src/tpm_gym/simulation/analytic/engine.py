@@ -36,8 +36,6 @@ from tpm_gym.simulation.randomisation import Plant
 from tpm_gym.simulation.settings import settings_of
 from tpm_gym.simulation.state import Scene
 
-__all__ = ["AnalyticEngine"]
-
 _FIRST = np.zeros(1, dtype=np.int64)
 
 _CHECK_ABOVE = 0.5

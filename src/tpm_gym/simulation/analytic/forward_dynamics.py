@@ -13,8 +13,6 @@ from tpm_gym.mechanism.machine import Machine, Motion
 from tpm_gym.simulation.analytic.steps import ideal_push, ideal_step, modes_left, servo_step
 from tpm_gym.simulation.drives import References, ServoDrives
 
-__all__ = ["Course", "IdealSteps", "ServoSteps", "Steps", "march"]
-
 
 class Course(NamedTuple):
     """State of r robots at the end of a time step; machine's frame.

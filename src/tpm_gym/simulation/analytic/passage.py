@@ -17,8 +17,6 @@ from tpm_gym.arrays import FloatArray
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.analytic.forward_dynamics import Course, IdealSteps, Touch
 
-__all__ = ["pass_through"]
-
 _LIFT: Final = 5e-5
 """Distance from the plane, m, within which inertia and forces are those at this distance.
 

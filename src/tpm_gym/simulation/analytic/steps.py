@@ -28,8 +28,6 @@ from tpm_gym.simulation.vectors import (
     spread,
 )
 
-__all__ = ["ideal_push", "ideal_step", "modes_left", "resisted", "servo_step"]
-
 _CREEP = 2e-5  # m/s; below this speed, friction falls to zero in proportion to the speed
 _SIGNS = np.array([(i, j, k) for i in (0, 1, -1) for j in (0, 1, -1) for k in (0, 1, -1)], float)
 _ZERO: Vector = (0.0, 0.0, 0.0)

@@ -18,8 +18,6 @@ from tpm_gym.simulation.bullet.physics import REGULARISATION, Physics
 from tpm_gym.simulation.bullet.silence import silence
 from tpm_gym.simulation.display import has_display
 
-__all__ = ["Client"]
-
 _WINDOW = "--width=960 --height=720"  # software OpenGL takes longer for more pixels
 
 _closed = itertools.count(1)

@@ -16,8 +16,6 @@ from tpm_gym.simulation.engine import Pose
 from tpm_gym.simulation.state import Block
 from tpm_gym.simulation.vacuum import CLEARANCE, EMPTY, Hold, Load, hold_after
 
-__all__ = ["Cup", "Grip"]
-
 _WELD_FORCE = 1e4  # N; so large that only the vacuum law ends the weld
 _FASTEST = 2.5  # m/s, largest speed of lip towards object: twice the largest commanded speed
 

@@ -25,8 +25,6 @@ from tpm_gym.simulation.randomisation import NOMINAL, Plant
 from tpm_gym.simulation.settings import settings_of
 from tpm_gym.simulation.state import Scene
 
-__all__ = ["BulletEngine"]
-
 _ZERO: Vector = (0.0, 0.0, 0.0)
 
 

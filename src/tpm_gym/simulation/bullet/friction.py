@@ -27,8 +27,6 @@ from tpm_gym.simulation.bullet.client import Client
 from tpm_gym.simulation.bullet.robot import Robot
 from tpm_gym.simulation.state import Block
 
-__all__ = ["Friction"]
-
 _LEAST = 0.02  # smallest scale; with 0, a row of the solver would vanish
 _FAST = 1e-2  # m/s; a faster contact slips, whatever the last force was
 _SLIP = 1e-5  # m/s; in a slower contact, the next force is assumed along the last force

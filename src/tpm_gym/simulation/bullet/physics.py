@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.simulation.settings import Numerics, require_numerics
 
-__all__ = ["Physics"]
-
 SOLVERS = ("direct", "iterative")
 REGULARISATION = 1e-9
 """Compliance of the constraints (CFM). It keeps redundant closures solvable."""

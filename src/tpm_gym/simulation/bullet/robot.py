@@ -29,8 +29,6 @@ from tpm_gym.simulation.bullet.client import Client
 from tpm_gym.simulation.bullet.physics import MOTOR_GAIN
 from tpm_gym.simulation.engine import SPRING_GAIN, transform
 
-__all__ = ["Robot"]
-
 Address = tuple[int, int]
 """Body id in the client, and index of a link (PyBullet gives a joint the index of its child)."""
 

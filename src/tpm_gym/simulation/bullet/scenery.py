@@ -34,8 +34,6 @@ from tpm_gym.simulation.stage import (
 )
 from tpm_gym.simulation.state import Block, Scene
 
-__all__ = ["Scenery"]
-
 _SHADING = {"lightAmbientCoeff": 0.6, "lightDiffuseCoeff": 0.35, "lightSpecularCoeff": 0.05}
 
 

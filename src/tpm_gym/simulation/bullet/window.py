@@ -18,8 +18,6 @@ from tpm_gym.simulation.imaging import Camera
 from tpm_gym.simulation.stage import MARKER_COLOUR
 from tpm_gym.simulation.state import Scene
 
-__all__ = ["Window"]
-
 _CLOSER = 0.42  # factor of distances: the window's field of view is fixed at 90 degrees
 _OFF = (
     pybullet.COV_ENABLE_GUI,  # side panels

@@ -17,8 +17,6 @@ from tpm_gym.simulation.mujoco.scenery import Scenery
 from tpm_gym.simulation.state import Block
 from tpm_gym.simulation.vacuum import CLEARANCE, EMPTY, Hold, Load, hold_after
 
-__all__ = ["Cup", "Grip"]
-
 _SOFTER = 0.5
 """Factor of the contact stiffness of the held object.
 

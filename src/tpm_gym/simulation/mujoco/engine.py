@@ -26,8 +26,6 @@ from tpm_gym.simulation.randomisation import NOMINAL, Plant
 from tpm_gym.simulation.settings import settings_of
 from tpm_gym.simulation.state import Scene
 
-__all__ = ["MujocoEngine"]
-
 _STATE = int(
     mujoco.mjtState.mjSTATE_FULLPHYSICS
     | mujoco.mjtState.mjSTATE_WARMSTART

@@ -30,8 +30,6 @@ from tpm_gym.simulation.stage import (
 )
 from tpm_gym.simulation.state import Block, Scene
 
-__all__ = ["compile_model", "grip_name", "object_name", "segmentation_ids"]
-
 _RECOVERY = 0.1
 """Fraction of a penetration that a contact removes per time step; 0.1 causes the least bouncing."""
 _MARGIN = 1e-6  # m; so an object placed exactly on the table has contact in the first time step

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 from tpm_gym.simulation.settings import Numerics, require_numerics
 
-__all__ = ["Physics"]
-
 
 @dataclass(frozen=True)
 class Physics(Numerics):

@@ -16,8 +16,6 @@ from tpm_gym.errors import ConfigurationError
 from tpm_gym.simulation.display import has_display
 from tpm_gym.simulation.imaging import BACKGROUND, Camera, Picture, View, metres
 
-__all__ = ["RENDERERS", "Pictures", "aim"]
-
 RENDERERS = ("egl", "osmesa", "glfw")
 """OpenGL backends, in the order in which they are tried: on the GPU, the CPU, a display."""
 

@@ -22,8 +22,6 @@ from tpm_gym.mechanism.mount import Mount
 from tpm_gym.simulation.engine import SPRING_GAIN, transform
 from tpm_gym.simulation.randomisation import NOMINAL, Plant
 
-__all__ = ["Robot"]
-
 _LEAST_EFFORT = 1e-9  # N m; with zero torque, a motor would have no row in the solver
 
 

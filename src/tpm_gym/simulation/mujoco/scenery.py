@@ -13,8 +13,6 @@ from tpm_gym.simulation.engine import Pose, Twist
 from tpm_gym.simulation.mujoco.model import object_name
 from tpm_gym.simulation.state import Scene
 
-__all__ = ["Scenery"]
-
 _STILL = 1e-4  # m/s + rad/s; slower objects are at rest
 _ITERATIONS = 5  # largest number of predictions of the slip
 _CONVERGED = 1e-3  # m/s; largest change of the slip in the last prediction

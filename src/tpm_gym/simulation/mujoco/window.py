@@ -14,8 +14,6 @@ from tpm_gym.simulation.imaging import Camera
 from tpm_gym.simulation.mujoco.pictures import aim
 from tpm_gym.simulation.stage import MARKER_COLOUR
 
-__all__ = ["Window"]
-
 
 class Window:
     """Viewer that opens when it first shows something, and stays closed once the user closes it.

@@ -36,8 +36,6 @@ from tpm_gym.simulation.vectors import (
     three,
 )
 
-__all__ = ["collide_lip", "collide_objects"]
-
 _NEAR = 1.5e-3  # m; largest gap of a contact between objects, or between object and table
 _FLAT = 1e-5  # m; an edge's normal replaces a face's normal if its gap is larger by more than this
 _LITTLE = 1e-9  # rounding error

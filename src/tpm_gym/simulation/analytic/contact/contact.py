@@ -27,8 +27,6 @@ from tpm_gym.simulation.analytic.contact.stepping import advance, place, read
 from tpm_gym.simulation.stage import boards
 from tpm_gym.simulation.state import Belt, Block
 
-__all__ = ["Contact", "Reading"]
-
 
 class Reading(NamedTuple):
     """State of objects and cups on n tables with k objects each.

@@ -12,8 +12,6 @@ from tpm_gym.simulation.analytic.contact.state import Record, Records, Setting
 from tpm_gym.simulation.vacuum import CLEARANCE, Hold, Load, hold_after, holds, pressure_after
 from tpm_gym.simulation.vectors import length, level_length, plus, put, three
 
-__all__ = ["CUP_MASS", "Way", "breathe", "carry", "lip_of"]
-
 compilable(rotate, sealed, pressure_after, holds, hold_after)
 
 CUP_MASS = CUP.link("platform", (0.0, 0.0, 0.0)).mass

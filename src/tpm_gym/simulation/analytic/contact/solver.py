@@ -14,8 +14,6 @@ from tpm_gym.compiling import compiled
 from tpm_gym.simulation.analytic.contact.state import Record, Records
 from tpm_gym.simulation.vectors import cross, dot, plus, put, three
 
-__all__ = ["Motor", "prepare", "solve", "still"]
-
 _SWEEPS = 12
 _RELAXATION = 1.3  # over-relaxation of normal impulses; the sweeps converge below 2
 _STILL, _UNTURNED = 5e-4, 0.01  # m/s, rad/s: objects below both speeds do not move

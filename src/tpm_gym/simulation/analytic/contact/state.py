@@ -9,26 +9,6 @@ from numpy.typing import NDArray
 
 from tpm_gym.arrays import BoolArray, FloatArray, Vector
 
-__all__ = [
-    "AT_REST",
-    "BODY",
-    "CONTACT",
-    "CUP_STATE",
-    "LIP_SLOTS",
-    "OBJECT",
-    "PAIR_SLOTS",
-    "TABLE_SLOTS",
-    "Record",
-    "Records",
-    "Route",
-    "Setting",
-    "Tables",
-    "Work",
-    "slots",
-    "tables_for",
-    "work_for",
-]
-
 Record = Any
 """One element of a structured array; NumPy has no type for such elements."""
 Records = NDArray[np.void]

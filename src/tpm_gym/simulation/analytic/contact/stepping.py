@@ -29,8 +29,6 @@ from tpm_gym.simulation.engine import SPRING_GAIN
 from tpm_gym.simulation.stage import TABLE
 from tpm_gym.simulation.vectors import axes, cross, dot, length, plus, put, put_row, row_of, three
 
-__all__ = ["advance", "place", "read"]
-
 _SLOW, _SLOW_SPIN = 5e-3, 0.3  # m/s, rad/s: objects below both speeds may come to rest
 _SETTLED, _STOPPED = 1e-6, 1e-3  # m, m/s: below both, the slide is set to 0
 _LEVEL = 1e-9  # m; an object at most so far above the table top stands on it
