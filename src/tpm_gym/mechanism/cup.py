@@ -81,14 +81,7 @@ CUP = VacuumCup()
 """Cup of all machines of this package."""
 
 
-def sealed(
-    lip: Any,
-    axis: Any,
-    position: Any,
-    quaternion: Any,
-    size: tuple[float, float],
-    cup: VacuumCup = CUP,
-) -> Any:
+def sealed(lip: Any, axis: Any, position: Any, quaternion: Any, size: tuple[float, float]) -> Any:
     """Return whether the whole lip lies on the top face of a square block.
 
     Arrays (n,) in place of numbers give an array (n,). Vectors are in the world frame.
@@ -99,7 +92,6 @@ def sealed(
         position: Centre of the block, m.
         quaternion: Orientation (x, y, z, w) of the block.
         size: Width and height of the block, m.
-        cup: The cup.
     """
     qx, qy, qz, qw = quaternion
     inverse = (-qx, -qy, -qz, qw)
@@ -107,7 +99,7 @@ def sealed(
     local = rotate(inverse, (lip[0] - x, lip[1] - y, lip[2] - z))
     width, height = size
     gap = local[2] - height / 2
-    margin = width / 2 - cup.radius
+    margin = width / 2 - CUP.radius
     covered = (abs(local[0]) <= margin) & (abs(local[1]) <= margin)
-    aligned = -rotate(inverse, axis)[2] >= math.cos(cup.seal_tilt)
-    return (abs(gap) <= cup.seal_gap) & covered & aligned
+    aligned = -rotate(inverse, axis)[2] >= math.cos(CUP.seal_tilt)
+    return (abs(gap) <= CUP.seal_gap) & covered & aligned

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-from tpm_gym.mechanism.cup import CUP, VacuumCup
+from tpm_gym.mechanism.cup import CUP
 
 CLEARANCE = 2e-5
 """Gap between lip and held object, m. Without a gap, their contact would act against the weld."""
@@ -44,13 +44,13 @@ class Load(NamedTuple):
     shear: float = 0.0
 
 
-def pressure_after(vacuum: float, time_step: float, pumped: bool, cup: VacuumCup = CUP) -> float:
+def pressure_after(vacuum: float, time_step: float, pumped: bool) -> float:
     """Compute the vacuum (Pa) after a time step (s); ``pumped``: vacuum is on and lip is sealed."""
-    final, time = (cup.vacuum, cup.evacuation_time) if pumped else (0.0, cup.venting_time)
+    final, time = (CUP.vacuum, CUP.evacuation_time) if pumped else (0.0, CUP.venting_time)
     return final + (vacuum - final) * math.exp(-time_step / time)
 
 
-def holds(vacuum: Any, load: tuple[Any, Any], cup: VacuumCup = CUP) -> Any:
+def holds(vacuum: Any, load: tuple[Any, Any]) -> Any:
     """Return whether a vacuum (Pa) can carry a load (tension and shear, N); floats or arrays.
 
     The norm of pull and shear must not exceed vacuum times area. Where cup and object are pressed
@@ -58,15 +58,13 @@ def holds(vacuum: Any, load: tuple[Any, Any], cup: VacuumCup = CUP) -> Any:
     """
     tension, shear = load
     pull = (tension > 0) * tension
-    slip = shear + cup.seal_friction * (tension - pull)
+    slip = shear + CUP.seal_friction * (tension - pull)
     slip = (slip > 0) * slip
-    most = cup.area * vacuum
+    most = CUP.area * vacuum
     return pull * pull + slip * slip <= most * most
 
 
-def hold_after(
-    hold: Hold, time_step: float, on: bool, load: Load, touched: int, cup: VacuumCup = CUP
-) -> Hold:
+def hold_after(hold: Hold, time_step: float, on: bool, load: Load, touched: int) -> Hold:
     """Compute held object and vacuum after a time step.
 
     A cup that has lost an object can hold one again after it is vented.
@@ -78,12 +76,11 @@ def hold_after(
         load: Load of the seal in the time step; ignored if no object was held.
         touched: Index of an object on which the lip can seal now; -1 for none. Ignored if an
             object was held.
-        cup: Parameters of the cup.
     """
     if hold.which >= 0:
-        vacuum = pressure_after(hold.vacuum, time_step, on, cup)
-        if holds(vacuum, load, cup) and (on or vacuum > cup.least_vacuum):
+        vacuum = pressure_after(hold.vacuum, time_step, on)
+        if holds(vacuum, load) and (on or vacuum > CUP.least_vacuum):
             return Hold(hold.which, vacuum)
-    elif on and touched >= 0 and hold.vacuum <= cup.least_vacuum:
-        return Hold(touched, pressure_after(hold.vacuum, time_step, True, cup))
-    return Hold(-1, pressure_after(hold.vacuum, time_step, False, cup))
+    elif on and touched >= 0 and hold.vacuum <= CUP.least_vacuum:
+        return Hold(touched, pressure_after(hold.vacuum, time_step, True))
+    return Hold(-1, pressure_after(hold.vacuum, time_step, False))
