@@ -19,6 +19,5 @@ Limit = Callable[[FloatArray, WorkingMode, Geometry], BoolArray]
 def within_stops(points: FloatArray, branch: WorkingMode, geometry: Geometry) -> BoolArray:
     """Return whether all motors are between their stops, (n,)."""
     theta = inverse(points, branch, geometry)
-    motors = bodies.build(geometry).motors
-    low, high = zip(*((motor.lower, motor.upper) for motor in motors), strict=True)
+    low, high = zip(*bodies.build(geometry).stops, strict=True)
     return np.asarray(((theta >= low) & (theta <= high)).all(axis=-1))

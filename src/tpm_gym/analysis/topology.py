@@ -23,7 +23,7 @@ from tpm_gym.analysis.poc import Chain, POCSet, Subspace, Unit
 from tpm_gym.arrays import FloatArray
 from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode
 from tpm_gym.kinematics.geometry import PAPER, Geometry
-from tpm_gym.mechanism.bodies import Link, Mechanism, Place
+from tpm_gym.mechanism.bodies import Mechanism
 from tpm_gym.mechanism.closures import closure_jacobian, moving_joints, rank_of, rates
 from tpm_gym.mechanism.tpm.bodies import ACTUATED_JOINTS, build, joint_angles
 
@@ -57,19 +57,23 @@ def describe(
     """Describe the mechanism at theta (3,) rad, with the names of the paper."""
     mechanism = build(geometry)
     places = mechanism.places(joint_angles(theta, branch, geometry))
-    joints = {link.joint.name: link for link in mechanism.links if link.joint}
+    axes = {
+        joint.name: (places[link.name], joint.axis)
+        for link in mechanism.links
+        if (joint := link.joint)
+    }
     ends = {c.name: places[c.link_b].point(c.point_b) for c in mechanism.closures}
 
     def turning(*names: str) -> tuple[Unit, ...]:
         found = []
         for name in names:
-            axis, origin = _axis(places, joints[name]), places[joints[name].name].origin
-            found.append(poc.revolute(name, axis, origin, name in ACTUATED_JOINTS))
+            (origin, rotation), axis = axes[name]
+            found.append(poc.revolute(name, rotation @ axis, origin, name in ACTUATED_JOINTS))
         return tuple(found)
 
     def sides(near: str, far: str, other: str) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return short link, rod, and middle of the far short link of a parallelogram."""
-        foot = places[joints[near].name].origin
+        foot = axes[near][0].origin
         return ends[far] - ends[other], ends[far] - foot, (ends[far] + ends[other]) / 2
 
     four_s = poc.parallelogram_4s("Pa(4S)", *sides("Sa_swing", "Sc", "Sd"))
@@ -82,7 +86,7 @@ def describe(
         ),
         wrist=Chain("wrist", turning("R12", "R13")),
         link_3p=four_s.point,
-        platform=places[joints["R13"].name].origin,
+        platform=axes["R13"][0].origin,
     )
 
 
@@ -160,10 +164,3 @@ def mobility_at(mechanism: Mechanism, angles: Mapping[str, float]) -> Mobility:
     platform = POCSet(Subspace.span((linear @ free).T), Subspace.span((angular @ free).T))
     smallest = float(values[rank - 1] / values[0])
     return Mobility(dof, free.shape[1] - dof, rank, len(jacobian) - rank, smallest, platform)
-
-
-def _axis(places: Mapping[str, Place], link: Link) -> FloatArray:
-    """Return the axis of the joint that holds a link, in the paper frame."""
-    assert link.joint is not None
-    axis: FloatArray = places[link.name].rotation @ np.asarray(link.joint.axis)
-    return axis

@@ -64,8 +64,8 @@ def inverse(
     position: ArrayLike, branch: WorkingMode = ELBOWS_OUT, geometry: Geometry = PAPER
 ) -> FloatArray:
     """Compute angles (..., 3) rad, in the ranges of :class:`.InverseSolutions`, on one branch."""
-    places = points("position", position)
-    solutions = inverse_all(finite_points("position", places), geometry)
+    places = finite_points("position", position)
+    solutions = inverse_all(places, geometry)
     valid = solutions.valid[..., branch.index]
     if not valid.all():
         a, b, c = places[~valid][0].tolist()

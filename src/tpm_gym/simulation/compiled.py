@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector
 from tpm_gym.compiling import compilable, compiled, kept
 from tpm_gym.simulation.drives import References
+from tpm_gym.simulation.engine import transform
 from tpm_gym.simulation.vectors import (
     inverted,
     onto,
@@ -254,16 +255,13 @@ def truth(
 
 
 @compiled
-def _placed(frame: FloatArray, point: FloatArray) -> tuple[float, float, float]:
+def _placed(frame: FloatArray, point: FloatArray) -> Vector:
     """Convert a point (m) from a frame (origin, orientation) to the world frame."""
-    x, y, z, r = frame[3], frame[4], frame[5], frame[6]
-    a, b, c = point
-    s, t, p = 2 * (y * c - z * b), 2 * (z * a - x * c), 2 * (x * b - y * a)
-    return (
-        frame[0] + (a + r * s + y * p - z * t),
-        frame[1] + (b + r * t + z * s - x * p),
-        frame[2] + (c + r * p + x * t - y * s),
-    )
+    turn = frame[3], frame[4], frame[5], frame[6]
+    return transform(three(frame), turn, three(point))
+
+
+compilable(transform)
 
 
 @kept

@@ -120,7 +120,7 @@ class Simulation:
             raise
         self._plants = [NOMINAL] * count
         self._weights = spline_weights(steps)
-        self._frame = machine.mount.frame
+        self._frame = tuple(map(np.array, machine.mount.frame))
         self._region = np.array(machine.region.low), np.array(machine.region.high)
         # The last two commands and the next command, machine's frame, m
         self._commands = np.zeros((count, 3, 3))
@@ -176,7 +176,8 @@ class Simulation:
         true = angles - bias
         self.machine.require_within_stops(true)
         if not nominal and any(plant.length_errors for plant in plants):
-            self.machine.require_evaluate(true, self._built(plants))
+            lengths = [plant.lengths_of(self.machine) for plant in plants]
+            self.machine.require_evaluate(true, np.array([*map(self.machine.built, lengths)]))
         placed = self._places(len(rows), objects or {})
         self._become(rows, plants)
         if self.scene.belt is not None:
@@ -195,10 +196,6 @@ class Simulation:
             self._position[rows], self._jacobian[rows] = reading.position, reading.jacobian
             self._conditioning[rows] = reading.conditioning
         self._state = None
-
-    def _built(self, plants: Sequence[Plant]) -> FloatArray:
-        """Return the machine parameters (r, k) for the true lengths of the plants."""
-        return np.array([self.machine.built(plant.lengths_of(self.machine)) for plant in plants])
 
     def _places(self, count: int, objects: Mapping[str, ArrayLike]) -> FloatArray:
         """Return upright poses (r, k, 7) of the objects, in the order of the scene."""

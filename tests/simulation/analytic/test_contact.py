@@ -63,7 +63,7 @@ def tilts(reading: Reading) -> FloatArray:
 
 def on_tables(blocks: int, count: int, edges: tuple[float, float] = (9.0, 9.0)) -> Contact:
     """Tables with blocks; the machine's frame is that of the world."""
-    return Contact([BLOCK] * blocks, count, STEP, edges, (np.ones(3), np.zeros(3)))
+    return Contact([BLOCK] * blocks, count, STEP, edges, ((1.0, 1.0, 1.0), (0.0, 0.0, 0.0)))
 
 
 def upright(places: FloatArray) -> FloatArray:

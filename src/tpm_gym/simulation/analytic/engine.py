@@ -24,7 +24,6 @@ from tpm_gym.simulation.analytic.forward_dynamics import (
     Course,
     IdealSteps,
     ServoSteps,
-    Steps,
     march,
 )
 from tpm_gym.simulation.analytic.passage import pass_through
@@ -35,8 +34,6 @@ from tpm_gym.simulation.imaging import Camera, Picture, View
 from tpm_gym.simulation.randomisation import Plant
 from tpm_gym.simulation.settings import settings_of
 from tpm_gym.simulation.state import Scene
-
-_FIRST = np.zeros(1, dtype=np.int64)
 
 _CHECK_ABOVE = 0.5
 """Fraction of a motor's largest torque above which the torques of all time steps are computed."""
@@ -216,7 +213,9 @@ class AnalyticEngine:
         self._integrate(rows, steps, len(path.weights), vacuum)
         self._behind[rows] = steps.behind
 
-    def _integrate(self, rows: IntArray, steps: Steps, count: int, vacuum: BoolArray) -> None:
+    def _integrate(
+        self, rows: IntArray, steps: IdealSteps | ServoSteps, count: int, vacuum: BoolArray
+    ) -> None:
         """Simulate a control period of ``count`` time steps of some robots by forward dynamics."""
         on, whole = vacuum[rows], np.ones((1, 1))
 
@@ -229,8 +228,8 @@ class AnalyticEngine:
 
         course = Course(*(getattr(self, name)[rows] for name in _COURSE))
         built = None if self._built is None else self._built[rows]
-        across = self._machine.mirror_axis is not None and isinstance(steps, IdealSteps)
-        go: Any = pass_through if across else march
+        # A machine with a plane has ideal drives: ServoDrives refuses it.
+        go: Any = march if self._machine.mirror_axis is None else pass_through
         course, torques = go(self._machine, built, steps, count, course, self.time_step, touch)
         for name, values in zip(_COURSE, course, strict=True):
             getattr(self, name)[rows] = values
@@ -343,7 +342,7 @@ class AnalyticEngine:
             self._mirrored = make_engine(self._draws)
             self._mirrored.load(machine.mirrored(), self._scene, 1)
         posed = self._mirrored if beyond and self._mirrored else self._artist
-        posed.place(_FIRST, machine.require_inverse(position), objects)
+        posed.place(self._rows[:1], machine.require_inverse(position), objects)
         if posed is not self._artist:
             self._artist.restore(posed.save())
         return self._artist

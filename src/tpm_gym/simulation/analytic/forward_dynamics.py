@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,13 +38,6 @@ class Course(NamedTuple):
     mode_left: NDArray[np.int8]
 
 
-class Steps(Protocol):
-    """Drives of r robots in a control period."""
-
-    def move(self, index: int, course: Course, at: Motion, new: tuple[FloatArray, ...]) -> None:
-        """Compute a time step; arguments as in :func:`servo_step`."""
-
-
 class IdealSteps:
     """Ideal drives with limited torques.
 
@@ -60,7 +53,7 @@ class IdealSteps:
         self._behind = np.zeros((2, len(effort)), dtype=np.bool_)
 
     def move(self, index: int, course: Course, at: Motion, new: tuple[FloatArray, ...]) -> None:
-        """Implement :meth:`Steps.move`."""
+        """Compute a time step; arguments as in :func:`ideal_step`."""
         ideal_step(
             index, self._references, self._effort, course[:-1], at, self._step, new, self._behind
         )
@@ -90,7 +83,7 @@ class ServoSteps:
         drives.begin(references.theta[0])
 
     def move(self, index: int, course: Course, at: Motion, new: tuple[FloatArray, ...]) -> None:
-        """Implement :meth:`Steps.move`."""
+        """Compute a time step; arguments as in :func:`servo_step`."""
         drives = self._drives
         servo_step(
             index, self._references, drives.law, drives.friction, course[:-1], at, self._step, new,
@@ -106,7 +99,7 @@ force (r, 3) N of objects on P and the mass (r,) kg of the held objects."""
 def march(
     machine: Machine,
     built: FloatArray | None,
-    steps: Steps,
+    steps: IdealSteps | ServoSteps,
     count: int,
     course: Course,
     step: float,

@@ -98,16 +98,12 @@ class BulletEngine:
             self.client, self.robot, self.bodies, tables, belts, scene.objects
         )
 
-    def _empty(self) -> None:
-        """Remove all bodies: replace the client, which leaks least."""
-        self.client.close()
-        self.client = Client(self.physics, renderer=self._renderer)
-
     def alter(self, rows: IntArray, plants: Sequence[Plant]) -> None:
         """Implement :meth:`Engine.alter`."""
         (plant,) = plants
         if plant.length_errors != self._plant.length_errors:
-            self._empty()
+            self.client.close()
+            self.client = Client(self.physics, renderer=self._renderer)  # leaks less than a reset
             self._load(plant.of(self._nominal))
         self._plant = plant
         self.robot.alter(plant.link_masses, plant.motor_strength)

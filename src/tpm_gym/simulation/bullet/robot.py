@@ -27,7 +27,7 @@ from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.mount import Mount
 from tpm_gym.simulation.bullet.client import Client
 from tpm_gym.simulation.bullet.physics import MOTOR_GAIN
-from tpm_gym.simulation.engine import SPRING_GAIN, transform
+from tpm_gym.simulation.engine import SPRING_GAIN, loops, transform
 
 Address = tuple[int, int]
 """Body id in the client, and index of a link (PyBullet gives a joint the index of its child)."""
@@ -35,9 +35,8 @@ Address = tuple[int, int]
 _CLOSURE_FORCE = 1e6  # N; so large that no load opens a loop
 
 
-_urdf_text = lru_cache(maxsize=16)(
-    urdf.urdf_text
-)  # writing it takes a quarter of the time of loading
+# Writing it takes a quarter of the time of loading.
+_urdf_text = lru_cache(maxsize=16)(urdf.urdf_text)
 
 
 class Robot:
@@ -52,9 +51,7 @@ class Robot:
 
     def __init__(self, client: Client, mechanism: Mechanism, mount: Mount) -> None:
         """Load the legs, remove PyBullet's default damping and motors, and close the loops."""
-        from tpm_gym.simulation import compiled  # imports Numba
-
-        self._truth = compiled.truth
+        self._truth = loops().truth
         self._client, self._mechanism = client, mechanism
         self.joints: dict[str, Address] = {}
         self.links: dict[str, Address] = {}
@@ -204,9 +201,9 @@ class Robot:
         for body, links in self._watched.items():
             for state in pybullet.getLinkStates(body, links, 0, 1, number):
                 frames += state[4] + state[5]
-        return self._truth(
-            np.array(frames), self._sides, self._pivots, self._platform, self._point_p
-        )
+        arguments = self._sides, self._pivots, self._platform, self._point_p
+        found: tuple[float, Vector, float] = self._truth(np.array(frames), *arguments)
+        return found
 
     def lip(self) -> Vector:
         """Return the centre of the cup's lip (m, world)."""

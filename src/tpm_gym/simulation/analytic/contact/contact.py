@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tpm_gym.arrays import BoolArray, FloatArray, IntArray, vector
+from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector
 from tpm_gym.simulation.analytic.contact.state import (
     Route,
     Setting,
@@ -56,7 +56,7 @@ class Contact:
         count: Number of tables, n.
         time_step: Time step, s.
         table: Half edge lengths of the tables along x and y, m.
-        frame: Factors (3,) and origin (3,) m that convert the machine's frame to the world frame.
+        frame: Factors and origin (m) that convert the machine's frame to the world frame.
         belt: Belt of each table; None for none.
     """
 
@@ -66,15 +66,14 @@ class Contact:
         count: int,
         time_step: float,
         table: tuple[float, float],
-        frame: tuple[FloatArray, FloatArray],
+        frame: tuple[Vector, Vector],
         belt: Belt | None = None,
     ) -> None:
         """Place the objects in the middle of their tables, stacked on each other."""
         self._blocks, number = tuple(blocks), len(blocks)
         half = np.array([block.half for block in blocks]).reshape(number, 3)
-        turn, origin = (vector("frame", part) for part in frame)
         low, end = boards(table, belt)[-1][1], -math.inf if belt is None else belt.end
-        self._setting = Setting(half, (low, *table), end, time_step, turn, origin)
+        self._setting = Setting(half, (low, *table), end, time_step, *frame)
         self._tables, self._earlier = tables_for(count, number), tables_for(count, number)
         self._work = work_for(number)
         everything = np.arange(count)
