@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from importlib import import_module
 from typing import Any, ClassVar
@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tpm_gym.arrays import BoolArray, FloatArray
 from tpm_gym.errors import InputError
+from tpm_gym.mechanism.inertia import Bodies
 from tpm_gym.mechanism.machine import SAME_PLACE, Machine, Motion, Reading
 
 ASSEMBLY_LIMIT = 0.010
@@ -26,10 +27,18 @@ ASSEMBLY_LIMIT = 0.010
 
 @dataclass(frozen=True, kw_only=True)
 class CompiledMachine(Machine):
-    """Machine that computes rows by a module of compiled loops."""
+    """Machine that computes rows by a module of compiled loops.
+
+    Attributes:
+        geometry: Link lengths.
+    """
+
+    geometry: Any
 
     _module: ClassVar[str]
     """Name of the module whose LOOPS are the compiled loops."""
+    _inertia_of: ClassVar[Any]
+    """Function of :class:`Bodies` and a geometry; it returns the constants of the dynamics."""
 
     @property
     def _loops(self) -> Any:
@@ -126,6 +135,24 @@ class CompiledMachine(Machine):
         found = Motion(*place, empty((count, 3, 3)), empty((count, 3)))
         self._loops.motion((flat, rates.reshape(-1, 3)), 0.0, *of, tuple(found))
         return found if angles.ndim == 2 else Motion(*_shaped(found, angles))
+
+    @property
+    def lengths(self) -> tuple[float, ...]:
+        """All lengths of the geometry, m."""
+        lengths: tuple[float, ...] = self.geometry.lengths
+        return lengths
+
+    def with_lengths(self, lengths: tuple[float, ...]) -> CompiledMachine:
+        """Return the machine with these lengths, m."""
+        return replace(self, geometry=type(self.geometry)(*lengths))
+
+    def built(
+        self, lengths: tuple[float, ...] = (), link_masses: tuple[float, ...] = ()
+    ) -> FloatArray:
+        """Return the lengths (m) and the constants of the dynamics, (k,); see :class:`Machine`."""
+        machine = self.with_lengths(lengths) if lengths else self
+        inertia = self._inertia_of(Bodies(machine.mechanism, link_masses), machine.geometry)
+        return np.concatenate([machine.lengths, *map(np.ravel, inertia)])
 
     @cached_property
     def _nominal(self) -> FloatArray:

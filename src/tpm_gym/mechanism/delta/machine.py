@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar
 
@@ -25,7 +25,6 @@ from tpm_gym.mechanism.delta.geometry import (
     WORKING_MODES,
     DeltaGeometry,
 )
-from tpm_gym.mechanism.inertia import Bodies
 from tpm_gym.mechanism.machine import SAME_PLACE, register_machine
 from tpm_gym.mechanism.mount import Mount
 
@@ -45,6 +44,7 @@ class Delta(CompiledMachine):
     assembly_mode: float = 1.0
 
     _module: ClassVar = "tpm_gym.mechanism.delta.rows"
+    _inertia_of: ClassVar = staticmethod(bodies.inertia_of)
 
     def __post_init__(self) -> None:
         """See :class:`Machine`."""
@@ -77,14 +77,6 @@ class Delta(CompiledMachine):
         left: NDArray[np.int8] = np.abs(there - points).max(axis=-1) > SAME_PLACE
         return theta, left.astype(np.int8)
 
-    def built(
-        self, lengths: tuple[float, ...] = (), link_masses: tuple[float, ...] = ()
-    ) -> FloatArray:
-        """Return l1 to l5 (m) and the constants of the dynamics, (21,); see :class:`Machine`."""
-        machine = self.with_lengths(lengths) if lengths else self
-        found = bodies.inertia_of(Bodies(machine.mechanism, link_masses), machine.geometry)
-        return np.concatenate([machine.lengths, *map(np.ravel, found)])
-
     @cached_property
     def _constants(self) -> FloatArray:
         """Signs of the modes, and gravity, (7,); see :mod:`tpm_gym.mechanism.delta.rows`."""
@@ -113,15 +105,6 @@ class Delta(CompiledMachine):
             free_fall=self.mount.free_fall,
             payload=self.payload,
         )
-
-    @property
-    def lengths(self) -> tuple[float, ...]:
-        """l1 to l5, m."""
-        return self.geometry.lengths
-
-    def with_lengths(self, lengths: tuple[float, ...]) -> Delta:
-        """Return the machine with these l1 to l5, m."""
-        return replace(self, geometry=DeltaGeometry(*lengths))
 
 
 DELTA = Delta(

@@ -40,13 +40,6 @@ class Inertia(NamedTuple):
     swing3: Swing
 
 
-def flat(inertia: Inertia) -> list[float]:
-    """List the sixteen constants, in the order of the attributes."""
-    legs = [*inertia.motors, *inertia.weights, *inertia.couples]
-    points = [inertia.link3, inertia.link7, inertia.platform]
-    return [*legs, *points, *inertia.swing1, *inertia.swing3]
-
-
 def inertia_of(bodies: Bodies, geometry: Geometry) -> Inertia:
     """Compute the constants from the bodies of :func:`tpm_gym.mechanism.tpm.bodies.build`.
 

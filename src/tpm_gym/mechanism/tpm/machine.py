@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar
 
@@ -19,12 +19,11 @@ from tpm_gym.kinematics.position import inverse
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism.bodies import Mechanism
 from tpm_gym.mechanism.compiled import CompiledMachine
-from tpm_gym.mechanism.inertia import Bodies
 from tpm_gym.mechanism.machine import register_machine
 from tpm_gym.mechanism.mount import Mount
 from tpm_gym.mechanism.tpm import bodies
 from tpm_gym.mechanism.tpm.dynamics import Dynamics
-from tpm_gym.mechanism.tpm.inertia import flat, inertia_of
+from tpm_gym.mechanism.tpm.inertia import inertia_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +45,7 @@ class TPM(CompiledMachine):
     assembly_mode: AssemblyMode = DEFAULT_ASSEMBLY
 
     _module: ClassVar = "tpm_gym.mechanism.tpm.rows"
+    _inertia_of: ClassVar = staticmethod(inertia_of)
 
     def __post_init__(self) -> None:
         """See :class:`Machine`."""
@@ -55,8 +55,7 @@ class TPM(CompiledMachine):
 
     def same_side(self, position: ArrayLike) -> BoolArray:
         """See :class:`Machine`."""
-        side: BoolArray = np.asarray(position)[..., 1] * self.assembly_mode.sin_beta > 0
-        return side
+        return np.asarray(position)[..., 1] * self.assembly_mode.sin_beta > 0
 
     def unreachable(self, position: Vector) -> UnreachableError:
         """See :class:`Machine`."""
@@ -77,14 +76,6 @@ class TPM(CompiledMachine):
         theta = inverse(points, self.working_mode, self.geometry)
         slots = workspace.assembly_of(points, self.working_mode, self.geometry)
         return theta, (slots != self.assembly_mode.index).astype(np.int8)
-
-    def built(
-        self, lengths: tuple[float, ...] = (), link_masses: tuple[float, ...] = ()
-    ) -> FloatArray:
-        """Return l1 to l7 (m) and the constants of the dynamics, (23,); see :class:`Machine`."""
-        machine = self.with_lengths(lengths) if lengths else self
-        inertia = inertia_of(Bodies(machine.mechanism, link_masses), machine.geometry)
-        return np.array([*machine.lengths, *flat(inertia)])
 
     @cached_property
     def _constants(self) -> FloatArray:
@@ -112,15 +103,6 @@ class TPM(CompiledMachine):
             free_fall=self.mount.free_fall,
             payload=self.payload,
         )
-
-    @property
-    def lengths(self) -> tuple[float, ...]:
-        """l1 to l7, m."""
-        return self.geometry.lengths
-
-    def with_lengths(self, lengths: tuple[float, ...]) -> TPM:
-        """Return the machine with these l1 to l7, m."""
-        return replace(self, geometry=Geometry(*lengths))
 
 
 PAPER_TPM = TPM(
