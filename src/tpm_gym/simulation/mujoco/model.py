@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from itertools import combinations
-from xml.etree.ElementTree import Element, SubElement, tostring
+from xml.etree.ElementTree import Element, tostring
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from tpm_gym.arrays import Vector
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.mjcf import SOLID, STIFF, robot
 from tpm_gym.mechanism.mount import GRAVITY
-from tpm_gym.mechanism.urdf import numbers
+from tpm_gym.mechanism.urdf import add
 from tpm_gym.simulation.imaging import BACKGROUND, FAR, NEAR, OBJECTS, ROBOT, TABLETOP
 from tpm_gym.simulation.imaging import CUP as CUP_ID
 from tpm_gym.simulation.mujoco.physics import Physics
@@ -25,6 +26,7 @@ from tpm_gym.simulation.stage import (
     LIGHT,
     PATCH_HEIGHT,
     TABLE,
+    Colour,
     boards,
     painted,
 )
@@ -34,25 +36,23 @@ _RECOVERY = 0.1
 """Fraction of a penetration that a contact removes per time step; 0.1 causes the least bouncing."""
 _MARGIN = 1e-6  # m; so an object placed exactly on the table has contact in the first time step
 
-_NO_CONTACT = {"contype": "0", "conaffinity": "0"}  # only the listed pairs collide
-
 
 def compile_model(machine: Machine, scene: Scene, physics: Physics) -> mujoco.MjModel:
     """Compile the model. Its equality constraints are the closures, then one weld per object."""
     root = robot(machine.mechanism, machine.mount, physics.time_step)
-    option = SubElement(
+    option = add(
         root,
         "option",
         timestep=repr(physics.time_step),
-        gravity=numbers((0.0, 0.0, -GRAVITY)),
+        gravity=(0.0, 0.0, -GRAVITY),
         integrator="Euler",
         solver="Newton",
         cone="elliptic",
-        iterations=str(physics.iterations),
+        iterations=physics.iterations,
         tolerance=repr(physics.tolerance),
     )
     # MuJoCo would reset an unstable simulation. The caller must see the open loop instead.
-    SubElement(option, "flag", autoreset="disable")
+    add(option, "flag", autoreset="disable")
     world, equality = root.find("worldbody"), root.find("equality")
     assert world is not None
     assert equality is not None
@@ -60,8 +60,8 @@ def compile_model(machine: Machine, scene: Scene, physics: Physics) -> mujoco.Mj
     _surroundings(world, machine, scene)
     for index, block in enumerate(scene.objects):
         _object(world, index, block)
-        ends = {"body1": machine.mechanism.tool, "body2": object_name(index)}
-        SubElement(equality, "weld", ends, name=grip_name(index), active="false")
+        tool, held = machine.mechanism.tool, object_name(index)
+        add(equality, "weld", name=grip_name(index), body1=tool, body2=held, active="false")
     root.append(_contacts(root, scene, physics))
     if scene.belt is not None and not hasattr(mujoco.MjModel, "geom_surfacevel"):
         valid = "3.11 or later, for a scene with a belt"
@@ -93,18 +93,16 @@ def grip_name(index: int) -> str:
 
 def _light(root: Element, world: Element) -> None:
     """Add the range of depth, light without shadows, and a white sky, as in PyBullet."""
-    SubElement(root, "statistic", extent="1")  # then the numbers of "map" are metres
-    visual = SubElement(root, "visual")
-    SubElement(visual, "map", znear=repr(NEAR), zfar=repr(FAR))
-    SubElement(visual, "headlight", ambient=".45 .45 .45", diffuse=".2 .2 .2", specular="0 0 0")
-    rays = {"pos": numbers(LIGHT), "dir": numbers(-part for part in LIGHT)}
-    colours = {"diffuse": ".5 .5 .5", "specular": ".1 .1 .1"}
-    SubElement(world, "light", rays | colours, directional="true", castshadow="false")
+    add(root, "statistic", extent=1)  # then the numbers of "map" are metres
+    visual = add(root, "visual")
+    add(visual, "map", znear=NEAR, zfar=FAR)
+    add(visual, "headlight", ambient=".45 .45 .45", diffuse=".2 .2 .2", specular="0 0 0")
+    light = add(world, "light", pos=LIGHT, dir=[-part for part in LIGHT])
+    light.attrib |= {"diffuse": ".5 .5 .5", "specular": ".1 .1 .1"}
+    light.attrib |= {"directional": "true", "castshadow": "false"}
     asset = root.find("asset")
     assert asset is not None
-    SubElement(
-        asset, "texture", type="skybox", builtin="flat", rgb1="1 1 1", width="16", height="96"
-    )
+    add(asset, "texture", type="skybox", builtin="flat", rgb1="1 1 1", width=16, height=96)
 
 
 def _surroundings(world: Element, machine: Machine, scene: Scene) -> None:
@@ -112,29 +110,28 @@ def _surroundings(world: Element, machine: Machine, scene: Scene) -> None:
     for slab, low, high in boards(machine.table, scene.belt):
         size = (high - low) / 2, machine.table[1], slab.half_height
         pos = (low + high) / 2, 0.0, slab.top - slab.half_height
-        board = {"size": numbers(size), "pos": numbers(pos), "rgba": numbers(slab.colour)}
         # Without a velocity in the file, MuJoCo would leave out the computation for good.
-        moves = {} if slab is TABLE else {"surfacevel": "1 0 0"}
-        name = "table" if slab is TABLE else "belt"
-        SubElement(world, "geom", _NO_CONTACT | board | moves, name=name, type="box")
+        names = {"name": "table"} if slab is TABLE else {"name": "belt", "surfacevel": "1 0 0"}
+        _geom(world, "box", size, slab.colour, pos=pos, **names)
     for patch in painted(scene):
         (x, y), (u, v) = patch.low, patch.high
         size, pos = ((u - x) / 2, (v - y) / 2, PATCH_HEIGHT), ((x + u) / 2, (y + v) / 2, 0.0)
-        paint = {"size": numbers(size), "pos": numbers(pos), "rgba": numbers(patch.colour)}
-        SubElement(world, "geom", _NO_CONTACT | paint, type="box")
+        _geom(world, "box", size, patch.colour, pos=pos)
     size, pos = (FLOOR_EDGE, FLOOR_EDGE, 1.0), (0.0, 0.0, FLOOR.top)
-    floor = {"size": numbers(size), "pos": numbers(pos), "rgba": numbers(FLOOR.colour)}
-    SubElement(world, "geom", _NO_CONTACT | floor, name="floor", type="plane")
+    _geom(world, "plane", size, FLOOR.colour, name="floor", pos=pos)
+
+
+def _geom(parent: Element, kind: str, size: Vector, colour: Colour, **values: str | Vector) -> None:
+    """Add a geom that collides only in the listed pairs."""
+    add(parent, "geom", type=kind, size=size, rgba=colour, contype=0, conaffinity=0, **values)
 
 
 def _object(world: Element, index: int, block: Block) -> None:
     name = object_name(index)
-    body = SubElement(world, "body", name=name)
-    SubElement(body, "freejoint", name=name)
-    mass, moments = numbers([block.mass]), numbers(block.inertia)
-    SubElement(body, "inertial", pos="0 0 0", mass=mass, diaginertia=moments)
-    size, rgba = numbers(block.half), numbers(block.colour)
-    SubElement(body, "geom", _NO_CONTACT, name=name, type="box", size=size, rgba=rgba)
+    body = add(world, "body", name=name)
+    add(body, "freejoint", name=name)
+    add(body, "inertial", pos="0 0 0", mass=block.mass, diaginertia=block.inertia)
+    _geom(body, "box", block.half, block.colour, name=name)
 
 
 def _contacts(root: Element, scene: Scene, physics: Physics) -> Element:
@@ -152,15 +149,15 @@ def _contacts(root: Element, scene: Scene, physics: Physics) -> Element:
     ]
     contacts = Element("contact")
     for (name, friction), (other, rough) in pairs:
-        SubElement(
+        add(
             contacts,
             "pair",
             geom1=name,
             geom2=other,
             condim="3",
-            friction=numbers((*[friction * rough] * 2, 0.0, 0.0, 0.0)),
-            solref=numbers((-_RECOVERY / physics.time_step**2, -1 / physics.time_step)),
+            friction=(*[friction * rough] * 2, 0.0, 0.0, 0.0),
+            solref=(-_RECOVERY / physics.time_step**2, -1 / physics.time_step),
             solimp=STIFF,
-            margin=numbers([_MARGIN]),
+            margin=_MARGIN,
         )
     return contacts
