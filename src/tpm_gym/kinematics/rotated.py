@@ -67,8 +67,7 @@ class RotatedPostures:
         """Rotation (..., 3, 3) of link 3' and the platform about y, by the tilt."""
         cos, sin, zero = np.cos(self.tilt), np.sin(self.tilt), 0 * self.tilt
         rows = [cos, zero, sin, zero, zero + 1, zero, -sin, zero, cos]
-        matrices: FloatArray = np.stack(rows, axis=-1).reshape(*self.tilt.shape, 3, 3)
-        return matrices
+        return np.stack(rows, axis=-1).reshape(*self.tilt.shape, 3, 3)
 
     @property
     def position(self) -> FloatArray:
@@ -98,8 +97,7 @@ class RotatedPostures:
         cos, sin = np.cos(self.tilt), np.sin(self.tilt)
         along, up = x * cos + z * sin, z * cos - x * sin
         x_c, z_c = self.link3[..., 0], self.link3[..., 1]
-        moved: FloatArray = np.stack([x_c + along, 0 * x_c + y, z_c + up], axis=-1)
-        return moved
+        return np.stack([x_c + along, 0 * x_c + y, z_c + up], axis=-1)
 
 
 @np.errstate(all="ignore")

@@ -50,8 +50,7 @@ class Region:
 
     def project(self, points: ArrayLike) -> FloatArray:
         """Return the nearest points of the box to points (..., 3)."""
-        inside: FloatArray = np.minimum(np.maximum(points, self.low), self.high)
-        return inside
+        return np.minimum(np.maximum(points, self.low), self.high)
 
     def corners(self) -> Iterator[Vector]:
         """Yield the eight corners, m."""
@@ -62,8 +61,7 @@ def reachable(
     position: ArrayLike, branch: WorkingMode = ELBOWS_OUT, geometry: Geometry = PAPER
 ) -> BoolArray:
     """Return whether points (..., 3) m have a posture on ``branch``, as (...,)."""
-    valid: BoolArray = inverse_all(position, geometry).valid[..., branch.index]
-    return valid
+    return inverse_all(position, geometry).valid[..., branch.index]
 
 
 def assembly_of(

@@ -197,8 +197,7 @@ class Machine(ABC):
         """Compute P (..., 3) m at ``theta`` (..., 3), in the machine's modes."""
         position = self.evaluate(theta, built).position
         left = self.mode_left(theta, position, built)
-        found: FloatArray = np.where(left[..., None], np.nan, position)
-        return found
+        return np.where(left[..., None], np.nan, position)
 
     def mode_left(
         self, theta: ArrayLike, position: ArrayLike, built: FloatArray | None = None
@@ -292,14 +291,12 @@ class Machine(ABC):
         """
         found, _, conditioning, _ = self.evaluate(self.inverse(position))
         there = np.abs(np.subtract(found, position)).max(axis=-1) < SAME_PLACE
-        known: FloatArray = np.where(there, conditioning, 0.0)
-        return known
+        return np.where(there, conditioning, 0.0)
 
     def conditioning(self, theta: ArrayLike) -> FloatArray:
         """Compute 1/cond(J) (...,) at ``theta`` (..., 3); 0 where :meth:`evaluate` returns NaN."""
         found = self.evaluate(theta).conditioning
-        known: FloatArray = np.where(np.isnan(found), 0.0, found)
-        return known
+        return np.where(np.isnan(found), 0.0, found)
 
     # -- bodies -----------------------------------------------------------------------------
 
@@ -401,14 +398,12 @@ class Machine(ABC):
         Args:
             position: Point P (3,) m, machine's frame.
         """
-        platform = np.asarray(position, dtype=np.float64) - self.mechanism.point_p
+        a, b, c = self.require_inverse(position).tolist()
+        places = self.mechanism.places(self.joint_positions((a, b, c)))
         boxes = []
         for name in (self.mechanism.platform, self.mechanism.tool):
-            link = self.mechanism.link(name)
-            slides = link.joint is not None and link.joint.parent == self.mechanism.platform
-            origin = platform + link.joint.origin if link.joint and slides else platform
-            for solid in link.solids:
-                centre = self.mount.to_world(origin + np.asarray(solid.centre))
+            for solid in self.mechanism.link(name).solids:
+                centre = self.mount.to_world(places[name].point(solid.centre))
                 boxes.append((centre - solid.half_extent, centre + solid.half_extent))
         return boxes
 

@@ -152,6 +152,9 @@ class Path:
         commands: (n, 3, 3) m, machine's frame: the last three commands, oldest first.
         weights: (K, 3), from :func:`spline_weights`.
         bias: (n, 3) rad, encoder reading minus true joint position; None for zero.
+
+    Methods that return joint positions raise JointLimitError if a motor would be beyond a stop, and
+    UnreachableError if a point is out of reach.
     """
 
     def __init__(
@@ -170,22 +173,12 @@ class Path:
         return points
 
     def joints(self, last: int = 0) -> FloatArray:
-        """Return true joint positions (n, k, 3) rad at the ends of the last k time steps.
-
-        Raises:
-            JointLimitError: If a motor would be beyond a stop.
-            UnreachableError: If a point is out of reach.
-        """
+        """Return true joint positions (n, k, 3) rad at the ends of the last k time steps."""
         theta = self._readings(self.weights[-last:])
         return theta if self._bias is None else self.true(theta)
 
     def readings(self) -> FloatArray:
-        """Return encoder readings (n, K + 1, 3) rad, from the beginning to the end of the period.
-
-        Raises:
-            JointLimitError: If a motor would be beyond a stop.
-            UnreachableError: If a point is out of reach.
-        """
+        """Return encoder readings (n, K + 1, 3) rad, from beginning to end of the period."""
         return self._readings(np.concatenate([_START, self.weights]))
 
     def _readings(self, weights: FloatArray) -> FloatArray:

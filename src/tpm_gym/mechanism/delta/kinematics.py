@@ -135,8 +135,7 @@ def reachable(
 ) -> BoolArray:
     """Return whether points (..., 3) m have a posture in a working mode, as (...,)."""
     slot = WORKING_MODES.index(bends)
-    there: BoolArray = inverse_all(position, geometry)[..., slot, 0] < 4.0
-    return there
+    return inverse_all(position, geometry)[..., slot, 0] < 4.0
 
 
 def no_posture(point: Vector, geometry: DeltaGeometry) -> UnreachableError:

@@ -282,8 +282,7 @@ class AnalyticEngine:
         joints, rates, changes = loops().differences(theta, self.time_step)
         built = None if self._built is None else self._built[rows]
         against = push[:, -changes.shape[1] :] if self._scene.objects else None
-        torques: FloatArray = self._machine.torque(joints, rates, changes, against, built)
-        return torques
+        return self._machine.torque(joints, rates, changes, against, built)
 
     def read(self) -> Readout:
         """Implement :meth:`Engine.read`."""

@@ -123,8 +123,7 @@ class Robot:
         if not np.allclose(link.inertia, np.diag(np.diag(link.inertia)), rtol=0.0, atol=1e-12):
             valid = "links whose principal axes of inertia are the axes of their frame"
             raise ConfigurationError("mechanism", name, valid)
-        relative: NDArray[np.float64] = np.asarray(point) - link.centre_of_mass
-        return relative
+        return np.asarray(point) - link.centre_of_mass
 
     def paint(self) -> None:
         """Set the colour of each link to the colour of its largest solid.

@@ -40,7 +40,6 @@ class Window:
 
     def __init__(self, physics: Physics) -> None:
         """Open an empty window."""
-        self._physics = physics
         with silence():  # the window's thread prints after it has opened
             self._client = Client(physics, gui=True)
             for part in _OFF:

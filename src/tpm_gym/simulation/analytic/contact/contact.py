@@ -29,16 +29,7 @@ from tpm_gym.simulation.state import Belt, Block
 
 
 class Reading(NamedTuple):
-    """State of objects and cups on n tables with k objects each.
-
-    Attributes:
-        position: (n, k, 3) m, world, centres of the objects.
-        quaternion: (n, k, 4), orientations (x, y, z, w) of the objects.
-        velocity: (n, k, 3) m/s.
-        angular_velocity: (n, k, 3) rad/s, world.
-        held: (n,) index of the held object; -1 for none.
-        vacuum: (n,) Pa.
-    """
+    """State of objects and cups on n tables; as in :class:`tpm_gym.simulation.engine.Readout`."""
 
     position: FloatArray
     quaternion: FloatArray
