@@ -139,8 +139,7 @@ class CompiledMachine(Machine):
     @property
     def lengths(self) -> tuple[float, ...]:
         """All lengths of the geometry, m."""
-        lengths: tuple[float, ...] = self.geometry.lengths
-        return lengths
+        return tuple(self.geometry.lengths)
 
     def with_lengths(self, lengths: tuple[float, ...]) -> CompiledMachine:
         """Return the machine with these lengths, m."""
@@ -155,14 +154,9 @@ class CompiledMachine(Machine):
         return np.concatenate([machine.lengths, *map(np.ravel, inertia)])
 
     @cached_property
-    def _nominal(self) -> FloatArray:
-        """Parameters of the nominal machine, (1, k)."""
-        return self.built()[None]
-
-    @cached_property
     def _own(self) -> tuple[FloatArray, FloatArray]:
-        """The parameters of the nominal machine, and the constants."""
-        return self._nominal, self._constants
+        """Parameters of the nominal machine, (1, k), and the constants."""
+        return self.built()[None], self._constants
 
     def _others(self, built: FloatArray, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the parameters of machines as built, and the constants that they share."""
@@ -170,7 +164,8 @@ class CompiledMachine(Machine):
         if not count or rows % count:
             valid = f"parameters of b machines, with b a divisor of {rows} rows"
             raise InputError("built", built.shape, valid)
-        return _rows(built, self._nominal.shape[1], "built"), self._constants
+        nominal, constants = self._own
+        return _rows(built, nominal.shape[1], "built"), constants
 
 
 @cache

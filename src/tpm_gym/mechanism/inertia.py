@@ -58,7 +58,7 @@ def swing_force(rod: Triple, rates: Triple, changes: tuple[Numbers, Numbers], m:
 
 
 class Bodies:
-    """Moving links with their factors; keeps the names of the links that were used."""
+    """Moving links with their factors, by name; keeps the names of the links that were used."""
 
     def __init__(self, mechanism: Mechanism, factors: Sequence[float]) -> None:
         """Set the factors of mass and inertia, one for each moving link; empty if all are 1.
@@ -71,7 +71,7 @@ class Bodies:
             valid = f"one factor for each of the {len(moving)} moving links, or none"
             raise ConfigurationError("link_masses", tuple(factors), valid)
         self._links = {link.name: link for link in moving}
-        self._factors = dict(zip(self._links, factors or [1.0] * len(moving), strict=True))
+        self.factors = dict(zip(self._links, factors or [1.0] * len(moving), strict=True))
         self.known: set[str] = set()
 
     def require_all_known(self) -> None:
@@ -84,11 +84,11 @@ class Bodies:
 
     def mass(self, name: str) -> float:
         """Return the mass, kg."""
-        return self._factors[name] * self._link(name).mass
+        return self.factors[name] * self._link(name).mass
 
     def moment(self, name: str, axis: int) -> float:
         """Return the moment of inertia about an axis through the centre of mass, kg m^2."""
-        return self._factors[name] * float(self._link(name).inertia[axis, axis])
+        return self.factors[name] * float(self._link(name).inertia[axis, axis])
 
     def shaft(self, name: str, axis: int) -> tuple[float, float]:
         """Return mass and moment of inertia of a body about its own axis through its centre."""

@@ -34,6 +34,7 @@ from tpm_gym.mechanism import virtual_work
 from tpm_gym.mechanism.bodies import Mechanism
 from tpm_gym.mechanism.closures import require_sound
 from tpm_gym.mechanism.cup import CUP
+from tpm_gym.mechanism.inertia import Bodies
 from tpm_gym.mechanism.mount import Mount
 
 MODES: Final = (None, "assembly", "working")
@@ -386,11 +387,8 @@ class Machine(ABC):
         Raises:
             ConfigurationError: If the number of factors is wrong.
         """
-        links = self.with_lengths(lengths).mechanism.links[1:]
-        if len(link_masses) not in (0, len(links)):
-            valid = f"one factor for each of the {len(links)} moving links, or none"
-            raise ConfigurationError("link_masses", link_masses, valid)
-        return np.array(link_masses or [1.0] * len(links))
+        bodies = Bodies(self.with_lengths(lengths).mechanism, link_masses)
+        return np.array([*bodies.factors.values()])
 
     def occupied(self, position: ArrayLike) -> list[tuple[FloatArray, FloatArray]]:
         """Compute boxes around platform and tool: low and high corners, m, world.

@@ -197,9 +197,9 @@ def test_what_stands_alone_keeps_its_bits_and_what_falls_comes_to_rest():
     heights = wait(contact, 150).position[:, :, 2]
     assert (heights > 0.0145).all()
     assert heights[-1] == pytest.approx([0.015, 0.015], abs=2e-5)
-    before = contact.save(np.arange(1))
+    before = contact.save()
     wait(contact, 10)
-    np.testing.assert_array_equal(contact.save(np.arange(1)), before)
+    np.testing.assert_array_equal(contact.save(), before)
 
 
 @pytest.mark.parametrize(("acceleration", "kept"), [(220.0, True), (235.0, False)])
@@ -421,7 +421,7 @@ def test_rows_may_be_advanced_apart_by_any_steps_and_go_on_from_what_was_saved()
             steps = ways[rows, k : k + STEPS // 2 + 2]
             advance(contact, rows, steps, np.ones(len(rows), dtype=bool))
         if k == 4 * STEPS:
-            made[1].restore(every, contact.save(every))
+            made[1].restore(contact.save())
             contact = made[1]
     for part, expected in zip(contact.read(), whole[-6:], strict=True):
         np.testing.assert_array_equal(part, expected)

@@ -19,8 +19,6 @@ from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.tpm.machine import TPM
 
-__all__ = ["BothSides", "both_sides"]
-
 _AT_PLANE: Final = 0.05
 """Distance from the plane, as a share of l7, below which the assembly mode is not checked.
 

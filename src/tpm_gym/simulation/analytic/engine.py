@@ -307,7 +307,7 @@ class AnalyticEngine:
     def save(self) -> Any:
         """Implement :meth:`Engine.save`; return a dictionary of arrays."""
         saved = {name.lstrip("_"): getattr(self, name).copy() for name in _COLUMNS}
-        saved["objects"] = self._contact.save(self._rows)
+        saved["objects"] = self._contact.save()
         if self._drives is not None:
             saved["drives"] = self._drives.memory.copy()
         return saved
@@ -316,7 +316,7 @@ class AnalyticEngine:
         """Implement :meth:`Engine.restore`."""
         for name in _COLUMNS:
             setattr(self, name, saved[name.lstrip("_")].copy())
-        self._contact.restore(self._rows, saved["objects"])
+        self._contact.restore(saved["objects"])
         if self._drives is not None:
             self._drives.memory[:] = saved["drives"]
 

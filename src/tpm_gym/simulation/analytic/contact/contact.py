@@ -135,16 +135,18 @@ class Contact:
         for own, earlier in zip(self._tables, self._earlier, strict=True):
             own[rows] = earlier[rows]
 
-    def save(self, rows: Any) -> FloatArray:
-        """Return the state of some tables as an array (r, c)."""
-        parts = [part[rows] for part in self._tables[:3]]
-        return np.concatenate([p.view(np.float64).reshape(len(p), -1) for p in parts], axis=1)
+    def save(self) -> FloatArray:
+        """Return the state of all tables as an array (n, c)."""
+        return np.concatenate(self._plain(), axis=1)
 
-    def restore(self, rows: Any, saved: FloatArray) -> None:
-        """Restore some tables from the result of :meth:`save`."""
+    def restore(self, saved: FloatArray) -> None:
+        """Restore all tables from the result of :meth:`save`."""
         first = 0
-        for part in self._tables[:3]:
-            plain = part.view(np.float64).reshape(len(part), -1)
-            plain[rows] = saved[:, first : first + plain.shape[1]]
+        for plain in self._plain():
+            plain[:] = saved[:, first : first + plain.shape[1]]
             first += plain.shape[1]
-        self._tables.awake[rows] = True
+        self._tables.awake[:] = True
+
+    def _plain(self) -> list[FloatArray]:
+        """Return views (n, ...) of objects, cups and forces as plain numbers."""
+        return [part.view(np.float64).reshape(len(part), -1) for part in self._tables[:3]]
