@@ -334,12 +334,15 @@ def no_posture(point: Vector, branch: WorkingMode, g: Geometry) -> UnreachableEr
             tuple(map(np.float64, point)), branch.signs, g, NUMPY
         )
     legs = (a1, z_c, x_c), (a2, z_c, 0.0), (a3, b3, point[1])
-    margin, leg = min((_leg_margin(*leg, g), i) for i, leg in enumerate(legs, 1))
+    margin, leg = min((leg_margin(*leg, g), i) for i, leg in enumerate(legs, 1))
     return UnreachableError(point, f"leg {leg}", margin, hint)
 
 
-def _leg_margin(level: float, vertical: float, out: float, g: Geometry) -> float:
-    """Return the margin by which a leg reaches in the arm's plane, m; negative if it does not."""
+def leg_margin(level: float, vertical: float, out: float, g: LegLengths) -> Numbers:
+    """Return the margin by which a leg reaches, m; negative if it does not.
+
+    Distances of C from A in m: level and vertical in the arm's plane, and out of it.
+    """
     if abs(out) >= g.l4:
         return g.l4 - abs(out)
     in_plane, rod = math.hypot(level, vertical), math.sqrt(g.l4**2 - out**2)

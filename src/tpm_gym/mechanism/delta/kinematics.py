@@ -5,7 +5,6 @@ Results are NaN where there is no solution. All functions raise InputError for a
 shape, or numbers that are not finite.
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from tpm_gym.arrays import BoolArray, FloatArray, Vector, finite_points
 from tpm_gym.errors import SingularityError, UnreachableError
-from tpm_gym.kinematics.equations import Triple
+from tpm_gym.kinematics.equations import Triple, leg_margin
 from tpm_gym.kinematics.equations import arms as arms_at
 from tpm_gym.kinematics.equations import conditioning as conditioning_of
 from tpm_gym.kinematics.namespaces import NUMPY, Namespace, Numbers, by_rows
@@ -140,11 +139,8 @@ def reachable(
 
 def no_posture(point: Vector, geometry: DeltaGeometry) -> UnreachableError:
     """Explain which leg does not reach a point (3) m, and by how much."""
-    g, margins = geometry, []
-    for leg in (ONE, TWO, THREE):
-        level, out, up = inwards(leg, point)
-        in_plane, rod = math.hypot(level + g.l2 - g.l1, up), math.sqrt(max(g.l4**2 - out**2, 0.0))
-        margins.append(min(g.l3 + rod - in_plane, in_plane - abs(g.l3 - rod), g.l4 - abs(out)))
+    legs, inner = [inwards(leg, point) for leg in (ONE, TWO, THREE)], geometry.l2 - geometry.l1
+    margins = [leg_margin(level + inner, up, out, geometry) for level, out, up in legs]
     worst = margins.index(min(margins))
     hint = "choose a point of its workspace (tpm_gym.mechanism.delta.kinematics.reachable)"
     return UnreachableError(point, f"leg {worst + 1}", margins[worst], hint)

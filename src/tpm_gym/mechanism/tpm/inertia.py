@@ -1,8 +1,4 @@
-"""Sixteen constants of the TPM's bodies for its closed-form dynamics.
-
-Arms, rods and link 7 are bars (:mod:`tpm_gym.mechanism.inertia`). The crosses and end link 9 also
-swing with their rods, and rods 4 and 11 also turn about their own axes.
-"""
+"""Sixteen constants of the TPM's bodies for :mod:`tpm_gym.mechanism.tpm.dynamics`."""
 
 from __future__ import annotations
 
