@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any, TypeVar
 
-from tpm_gym.arrays import is_number, is_whole
+from tpm_gym.arrays import is_number
 from tpm_gym.errors import ConfigurationError
 
 T = TypeVar("T")
@@ -36,9 +36,19 @@ class Numerics:
 
     Attributes:
         time_step: Time step, s; the control period must be an integer multiple of it.
+
+    Raises:
+        ConfigurationError: If the time step is too short, or no number.
     """
 
     time_step: float = 1 / 250
+
+    def __post_init__(self) -> None:
+        """Check the time step."""
+        if not is_number(self.time_step):
+            raise ConfigurationError("time_step", self.time_step, "a finite number")
+        if self.time_step < _SHORTEST:
+            raise ConfigurationError("time_step", self.time_step, f"at least {_SHORTEST} s")
 
 
 def count_steps(control_period: float, time_step: float, least: int = 1) -> int:
@@ -53,28 +63,3 @@ def count_steps(control_period: float, time_step: float, least: int = 1) -> int:
         valid = f"{control_period:g} s (control period) divided by {whole}"
         raise ConfigurationError("time_step", time_step, valid)
     return round(steps)
-
-
-def require_numerics(
-    settings: Numerics, ranges: Mapping[str, tuple[Callable[[float], bool], str]]
-) -> None:
-    """Check the time step, the number of iterations (if any), and further settings.
-
-    Args:
-        settings: Settings of an engine.
-        ranges: Check and description of the valid range, for each further setting.
-
-    Raises:
-        ConfigurationError: If a value is out of range.
-    """
-    for name in ("time_step", *ranges):
-        if not is_number(value := getattr(settings, name)):
-            raise ConfigurationError(name, value, "a finite number")
-    step, count = settings.time_step, getattr(settings, "iterations", 1)
-    if step < _SHORTEST:
-        raise ConfigurationError("time_step", step, f"at least {_SHORTEST} s")
-    if not is_whole(count, 1):
-        raise ConfigurationError("iterations", count, "a whole number, 1 or more")
-    for name, (fits, valid) in ranges.items():
-        if not fits(getattr(settings, name)):
-            raise ConfigurationError(name, getattr(settings, name), valid)

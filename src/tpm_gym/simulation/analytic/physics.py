@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from tpm_gym.errors import ConfigurationError
-from tpm_gym.simulation.settings import Numerics, require_numerics
+from tpm_gym.simulation.settings import Numerics
 
 TORQUES = ("none", "last", "every")
 
@@ -30,6 +30,6 @@ class Physics(Numerics):
 
     def __post_init__(self) -> None:
         """Check the settings."""
-        require_numerics(self, {})
+        super().__post_init__()
         if self.torques not in TORQUES:
             raise ConfigurationError("torques", self.torques, ", ".join(map(repr, TORQUES)))

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from tpm_gym.arrays import is_number, is_whole
 from tpm_gym.errors import ConfigurationError
-from tpm_gym.simulation.settings import Numerics, require_numerics
+from tpm_gym.simulation.settings import Numerics
 
 SOLVERS = ("direct", "iterative")
 REGULARISATION = 1e-9
@@ -35,6 +36,10 @@ class Physics(Numerics):
 
     def __post_init__(self) -> None:
         """Check the settings."""
-        require_numerics(self, {"erp": (lambda value: 0 < value <= 1, "0 < erp <= 1")})
+        super().__post_init__()
+        if not is_whole(self.iterations, 1):
+            raise ConfigurationError("iterations", self.iterations, "a whole number, 1 or more")
+        if not is_number(self.erp) or not 0 < self.erp <= 1:
+            raise ConfigurationError("erp", self.erp, "0 < erp <= 1")
         if self.solver not in SOLVERS:
             raise ConfigurationError("solver", self.solver, " or ".join(map(repr, SOLVERS)))

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from tpm_gym.simulation.settings import Numerics, require_numerics
+from tpm_gym.arrays import is_number, is_whole
+from tpm_gym.errors import ConfigurationError
+from tpm_gym.simulation.settings import Numerics
 
 
 @dataclass(frozen=True)
@@ -25,4 +27,8 @@ class Physics(Numerics):
 
     def __post_init__(self) -> None:
         """Check the settings."""
-        require_numerics(self, {"tolerance": (lambda value: 0 <= value < 1, "0 <= tolerance < 1")})
+        super().__post_init__()
+        if not is_whole(self.iterations, 1):
+            raise ConfigurationError("iterations", self.iterations, "a whole number, 1 or more")
+        if not is_number(self.tolerance) or not 0 <= self.tolerance < 1:
+            raise ConfigurationError("tolerance", self.tolerance, "0 <= tolerance < 1")
